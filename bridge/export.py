@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import operator
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -95,7 +96,7 @@ def _dcf_of(plan: Plan, setup: NodeSetup, name: str) -> str:
         "NodeName": setup.name,
         "Baudrate": str(plan.scene.bus.bitrate // 1000),
         "NetNumber": "1",
-        "NetworkName": plan.scene.bus.channel,
+        "NetworkName": setup.channel,
         "CANopenManager": "0",
     }
     keys = {"fileinfo": {"FileName": name, "LastEDS": source.name}, "devicecomissioning": commissioning}
@@ -189,7 +190,7 @@ class BusNode:
 
 
 def write_bus_yml(plan: Plan, folder: Path) -> list[Path]:
-    """Write ``bus.yml`` and the EDS files that it names.
+    """Write ``bus.yml``, or of several buses ``bus-can0.yml`` and so on, and the EDS files that they name.
 
     Args:
         plan: whose nodes.
@@ -208,12 +209,16 @@ def write_bus_yml(plan: Plan, folder: Path) -> list[Path]:
             with whole_file(path) as part:
                 part.write_bytes(eds_file(eds).read_bytes())
     setups = {setup.node_id: setup for setup in make_setups(plan)}
-    document: dict[str, Any] = {"options": {"dcf_path": "."}, "master": _master(plan)}
-    for node in plan.nodes:
-        document[node.role.replace(" ", "_")] = _slave(plan, node, setups[node.node_id], files[node.eds].name)
-    path = folder / "bus.yml"
-    write_text(path, _dump(yaml, document))
-    return [path, *files.values()]
+    paths = []
+    for bus in plan.buses:
+        document: dict[str, Any] = {"options": {"dcf_path": "."}, "master": _master(plan)}
+        for node in plan.nodes:
+            if node.channel == bus.channel:
+                document[node.role.replace(" ", "_")] = _slave(plan, node, setups[node.node_id], files[node.eds].name)
+        name = "" if len(plan.buses) == 1 else f"-{re.sub(r'[^A-Za-z0-9_.-]', '_', bus.channel)}"
+        paths.append(folder / f"bus{name}.yml")
+        write_text(paths[-1], _dump(yaml, document))
+    return [*paths, *files.values()]
 
 
 class _Hex(int):

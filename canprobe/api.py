@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from types import TracebackType
@@ -15,7 +15,7 @@ from canprobe.cell.cycle import Observation, Observer, Observers
 from canprobe.errors import CanprobeError, ResultsError, UsageError
 from canprobe.planning.make import make_plan
 from canprobe.planning.model import Plan
-from canprobe.results.summary import RunResult, log_columns, summarise, write_files
+from canprobe.results.summary import RunResult, log_columns, summarise, tactile_columns, write_files
 from canprobe.scene.model import Scene
 from canprobe.scene.resolve import resolve
 from canprobe.session.children import Bridges
@@ -23,7 +23,7 @@ from canprobe.session.emulation import emulate, emulate_eds
 from canprobe.session.looking import commission, monitor, scan
 from canprobe.session.session import Say, Session, quiet, resolve_scene
 from canprobe.session.target import LOCKSTEP, Target
-from canprobe.session.up import check_joints, up
+from canprobe.session.up import check_joints, home, up
 from canprobe.tasks.from_plan import make_task
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
 from canprobe.tasks.task import record_of
@@ -42,6 +42,7 @@ __all__ = [
     "commission",
     "emulate",
     "emulate_eds",
+    "home",
     "monitor",
     "open_cell",
     "run",
@@ -57,8 +58,7 @@ def run(
     scene: Scene,
     *,
     interface: str | None = None,
-    channel: str | None = None,
-    sensor_channel: str | None = None,
+    channel: str | Mapping[str, str] | None = None,
     bitrate: int | None = None,
     out: Path | str | None = None,
     seed: int | None = None,
@@ -74,8 +74,8 @@ def run(
 
     Args:
         scene: from `canprobe.load_scene`.
-        interface, channel, bitrate: in the place of the scene's bus.
-        sensor_channel: the sensor's bus, where it is another one.
+        interface, bitrate: in the place of the scene's.
+        channel: in the place of the scene's; ``{"can0": "vcan0", "can1": "vcan1"}`` where it names several.
         out: folder for the files; ``runs/<scene>-<time>`` by default.
         seed, duration_s: in the place of the scene's.
         progress: called with (seconds done, seconds in all).
@@ -91,7 +91,7 @@ def run(
         SafetyStop: the cell was stopped for safety. The drives are disabled and the files written.
         ResultsError: a file could not be written, for example on a full disk. The drives are disabled.
     """
-    target = Target.over(scene, interface, channel, bitrate, sensor_channel)
+    target = Target.over(scene, interface, channel, bitrate)
     resolved = resolve_scene(scene, target, seed=seed, duration_s=duration_s, bridge=bridge)
     folder = results_folder(resolved, out) if files else None
     check_free(folder, force=force)
@@ -156,8 +156,10 @@ def _mapped(
 
 
 def _draw(result: RunResult, out: Path, say: Say) -> None:
-    if not len(result.log["t_s"]):
+    drawn = [name for name in ("report.html", "report.png", "surface.png") if name in result.plan.outputs]
+    if not len(result.log["t_s"]) or not drawn:
         return
+    say(f"draw {', '.join(drawn)}")
     if "report.html" in result.plan.outputs:
         page, recorded = (importlib.import_module(f"canprobe.bridge.view.{name}") for name in ("browser", "recorded"))
         try:
@@ -165,7 +167,7 @@ def _draw(result: RunResult, out: Path, say: Say) -> None:
         except UsageError as error:  # a controller's column that is called like one of ours and is something else
             say(f"report.html is left out: {error}")
         else:
-            page.write_page(shown, out / "report.html")
+            page.write_page(shown, out / "report.html", say)
     if "report.png" in result.plan.outputs:
         from canprobe.results.figures import draw_run
         from canprobe.results.surface_figure import draw_surface
@@ -261,6 +263,8 @@ class OpenCell(Session):
 
     def _conclude(self, failure: BaseException | None) -> None:
         record, start_s = record_of(self._last), self.cell.start_ns * 1e-9
+        if record.shape is not None and self.scene.shape is not None and self.scene.shape.also:
+            self._say(f"estimate again with {', '.join(self.scene.shape.also)}")
         estimates = _estimates(self.scene, record.shape)
         surface_map, consistency, map_summary = _mapped(self.scene, record.shape, start_s)
         summary = summarise(
@@ -280,6 +284,7 @@ class OpenCell(Session):
             self.truth,
             {name: on_run_clock(records, start_s) for name, records in estimates.items()},
             record.taxels,
+            tactile_columns(self.cell),
             surface_map,
             consistency,
             self.out,
@@ -315,8 +320,7 @@ def open_cell(
     scene: Scene,
     *,
     interface: str | None = None,
-    channel: str | None = None,
-    sensor_channel: str | None = None,
+    channel: str | Mapping[str, str] | None = None,
     bitrate: int | None = None,
     out: Path | str | None = None,
     seed: int | None = None,
@@ -338,7 +342,7 @@ def open_cell(
 
     Args:
         scene: from `canprobe.load_scene`.
-        interface, channel, sensor_channel, bitrate, seed: in the place of the scene's.
+        interface, channel, bitrate, seed: in the place of the scene's, as for `run`.
         out: folder for the same files as those of :func:`run`; None writes nothing.
         say: called with each step.
         force, observers, bridge: as for `run`.
@@ -355,7 +359,7 @@ def open_cell(
     Leaving it raises:
         ResultsError: a file could not be written.
     """
-    target = Target.over(scene, interface, channel, bitrate, sensor_channel)
+    target = Target.over(scene, interface, channel, bitrate)
     resolved = resolve_scene(scene, target, seed=seed, bridge=bridge)
     folder = Path(out) if out is not None else None
     check_free(folder, force=force)

@@ -114,3 +114,19 @@ class SafetyStop(CanprobeError):  # noqa: N818 - it is a stop, not a mistake
     def __init__(self, reason: str) -> None:
         self.reason = reason
         super().__init__(reason)
+
+
+def install_line(extra: str) -> str:
+    """What to type to install an extra: from where canprobe itself was installed, if that is known."""
+    import importlib.metadata  # only where something is missing
+    import json
+    from urllib.parse import unquote, urlsplit
+
+    try:
+        origin = json.loads(importlib.metadata.distribution("canprobe").read_text("direct_url.json") or "{}")
+    except importlib.metadata.PackageNotFoundError:  # a tree on the path
+        origin = {}
+    url = urlsplit(origin.get("url", ""))
+    source = unquote(url.path) if url.scheme == "file" and "dir_info" in origin else "canprobe"
+    editable = "-e " if origin.get("dir_info", {}).get("editable") else ""
+    return f"pip install {editable}'{source}[{extra}]'"

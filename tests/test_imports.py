@@ -58,6 +58,7 @@ EXTRAS = {
     "bridge/foxglove_live.py": {"foxglove"},
     "bridge/ros2_dds.py": {"cyclonedds"},
     "bridge/view/stage.py": {"viser"},
+    "bridge/view/links.py": {"trimesh"},
     "results/picture.py": {"matplotlib"},
     "robot/dynamics.py": {"mujoco"},
     "results/figures.py": {"matplotlib"},

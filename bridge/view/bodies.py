@@ -27,16 +27,14 @@ from canprobe.bridge.view.meshes import (
     revolved,
     scale,
 )
-from canprobe.robot.chain import Chain
-from canprobe.robot.model import ArmModel
-from canprobe.robot.puma import dh_rows
+from canprobe.robot.chain import Chain, dh_step
 from canprobe.touch.contact import pad_to_direction
 from canprobe.touch.linear_algebra import tangent_rotation
 from canprobe.touch.objects import Cylinder, Sphere
 from canprobe.touch.pad import Pad
 from canprobe.touch.shapes import Bowl, PlacedShape, Torus, Wave
 
-# The PUMA 260 as solid links, from its Denavit–Hartenberg rows; any other arm as plain joints and bars.
+# The PUMA 260 as solid links, by the lengths of its chain; any other arm as plain joints and bars.
 
 WHITE, GREY, DARK = (236, 233, 224), (150, 156, 163), (76, 84, 94)
 RIM = 5e-3
@@ -46,6 +44,11 @@ PLAIN = 0.045
 """Radius round the first joint of any other arm, m."""
 UPPER_ARM, FOREARM = 0.046, 0.058
 """Thickness of the two long links along the shoulder's axis, m."""
+_TWISTS = 0.5 * math.pi * np.array((1.0, 0.0, -1.0, 1.0, -1.0, 0.0))
+"""Between the axes of a PUMA, rad."""
+_SIZE = (0.2, 0.2)
+"""Upper arm and forearm of the 260, m."""
+_SAME = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,12 +60,14 @@ class Part:
         frame: 0 for the base, i for the frame behind joint i.
         mesh: in that frame, m.
         colour: RGB, 0–255.
+        flat: its triangles are shaded apart: edges stay sharp without doubled vertices.
     """
 
     name: str
     frame: int
     mesh: Mesh
     colour: tuple[int, int, int]
+    flat: bool = False
 
 
 def link_frames(chain: Chain, q: ArrayLike) -> Array:
@@ -82,11 +87,10 @@ def link_frames(chain: Chain, q: ArrayLike) -> Array:
     return frames
 
 
-def arm_parts(model: ArmModel) -> list[Part]:
+def arm_parts(chain: Chain) -> list[Part]:
     """Solids of base and links."""
-    if dh_rows(model) is None:
-        return _plain(model.chain)
-    return [*_trunk(model), *_upper_arm(model), *_forearm(model), *_wrist(model)]
+    puma = _puma(chain)
+    return _plain(chain) if puma is None else [*_trunk(puma), *_upper_arm(puma), *_forearm(puma), *_wrist(puma)]
 
 
 def _plain(chain: Chain) -> list[Part]:
@@ -106,27 +110,45 @@ def _plain(chain: Chain) -> list[Part]:
     return parts
 
 
-def _rows(model: ArmModel) -> Array:
-    rows = dh_rows(model)
-    assert rows is not None
-    return rows
+@dataclass(frozen=True, slots=True)
+class _Puma:
+    """Lengths of a PUMA 260, m, by its standard Denavit-Hartenberg rows."""
+
+    d1: float
+    a2: float
+    d2: float
+    d3: float
+    a3: float
+    d4: float
+    d6: float
+
+    @property
+    def offset(self) -> float:
+        """From the trunk's axis to the forearm, along axis 2."""
+        return self.d2 + self.d3
 
 
-def _lengths(model: ArmModel) -> tuple[float, float, float, float, float, float]:
-    """d1, a2, d2 + d3, a3, d4 and d6 of a PUMA, m: d2 and d3 lie on parallel axes."""
-    a, _, d, _ = _rows(model).T.tolist()
-    return d[0], a[1], d[1] + d[2], a[2], d[3], d[5]
+def _puma(chain: Chain) -> _Puma | None:
+    """The lengths, where a chain has the axes of a PUMA and the size of the 260; None of any other."""
+    steps = (*chain.fixed[1:], chain.T_last_flange)
+    if chain.n != _TWISTS.size or any(chain.prismatic):
+        return None
+    a, d = [float(T[0, 3]) for T in steps], [float(T[2, 3]) for T in steps]
+    rows = [dh_step(*row, 0.0) for row in zip(a, _TWISTS, d, strict=True)]
+    crossing = max(map(abs, (a[0], *a[3:], d[4]))) < _SAME
+    if not (crossing and np.allclose((np.eye(4), *rows), (chain.fixed[0], *steps), rtol=0.0, atol=_SAME)):
+        return None
+    return _Puma(d[0], a[1], d[1], d[2], a[2], d[3], d[5]) if math.dist((a[1], d[3]), _SIZE) < 0.02 else None
 
 
-def _trunk(model: ArmModel) -> list[Part]:
-    d1, _, offset, _, _, _ = _lengths(model)
-    side = math.copysign(1.0, offset)  # on which side of the trunk the arm hangs, along axis 2
+def _trunk(puma: _Puma) -> list[Part]:
+    side = math.copysign(1.0, puma.offset)  # on which side of the trunk the arm hangs, along axis 2
     foot = merged([cylinder(0.092, (0.0, 0.016), 4e-3), cylinder(0.066, (0.016, 0.034), RIM)])
-    column = cylinder(0.054, (0.030, d1 - 0.072), RIM)
+    column = cylinder(0.054, (0.030, puma.d1 - 0.072), RIM)
     # frame 1: z along axis 2, y up along the trunk, origin at the shoulder
     collar = cylinder(0.056, (-0.070, -0.058), 2e-3).moved(_UP)
     neck = cylinder(0.052, (-0.058, 0.0), RIM).moved(_UP)
-    drum = cylinder(SHOULDER, _span(-side * 0.062, side * (_reach(model) - 0.002)), RIM)
+    drum = cylinder(SHOULDER, _span(-side * 0.062, side * (_reach(puma) - 0.002)), RIM)
     return [
         Part("foot", 0, foot, DARK),
         Part("column", 0, column, WHITE),
@@ -135,41 +157,38 @@ def _trunk(model: ArmModel) -> list[Part]:
     ]
 
 
-def _reach(model: ArmModel) -> float:
+def _reach(puma: _Puma) -> float:
     """From the trunk's axis to the near side of the upper arm, m, along axis 2."""
-    return max(abs(_lengths(model)[2]) - 0.5 * FOREARM - 0.004 - UPPER_ARM, 0.02)
+    return max(abs(puma.offset) - 0.5 * FOREARM - 0.004 - UPPER_ARM, 0.02)
 
 
-def _upper_arm(model: ArmModel) -> list[Part]:
-    _, a2, offset, _, _, _ = _lengths(model)
-    side = math.copysign(1.0, offset)
-    shift = float(_rows(model)[2, 2])  # frame 2 lies this far before the plane of the forearm, along axis 2
-    trunk = shift - offset
-    near, far = trunk + side * _reach(model), trunk + side * (_reach(model) + UPPER_ARM)
-    shoulder, elbow = (-a2, 0.0), (0.0, 0.0)
+def _upper_arm(puma: _Puma) -> list[Part]:
+    side = math.copysign(1.0, puma.offset)
+    shift = puma.d3  # frame 2 lies this far before the plane of the forearm, along axis 2
+    trunk = shift - puma.offset
+    near, far = trunk + side * _reach(puma), trunk + side * (_reach(puma) + UPPER_ARM)
+    shoulder, elbow = (-puma.a2, 0.0), (0.0, 0.0)
     beam = link((shoulder, SHOULDER + 0.004), (elbow, ELBOW + 0.002), _span(near, far), 8e-3)
     cap = link((shoulder, SHOULDER - 0.014), (shoulder, SHOULDER - 0.014), _span(far, far + side * 0.006), 2e-3)
     pin = cylinder(ELBOW - 0.014, _span(shift, shift - side * (0.5 * FOREARM + 0.02)))
     return [Part("upper_arm", 2, beam, WHITE), Part("shoulder_cap", 2, merged([cap, pin]), DARK)]
 
 
-def _forearm(model: ArmModel) -> list[Part]:
-    _, _, offset, a3, d4, _ = _lengths(model)
+def _forearm(puma: _Puma) -> list[Part]:
     # frame 3: z along the forearm, y against axis 2; the elbow is at x = −a3
-    half, elbow = 0.5 * FOREARM, (-a3, 0.0)
-    side = math.copysign(half, offset)
-    beam = link((elbow, ELBOW), ((0.0, d4 - 0.062), WRIST + 0.004), (-half, half), 8e-3)
+    half, elbow = 0.5 * FOREARM, (-puma.a3, 0.0)
+    side = math.copysign(half, puma.offset)
+    beam = link((elbow, ELBOW), ((0.0, puma.d4 - 0.062), WRIST + 0.004), (-half, half), 8e-3)
     cap = link((elbow, ELBOW - 0.014), (elbow, ELBOW - 0.014), _span(side, 1.2 * side), 2e-3)
-    ring = cylinder(WRIST - 0.001, (d4 - 0.040, d4 - 0.028), 2e-3)
+    ring = cylinder(WRIST - 0.001, (puma.d4 - 0.040, puma.d4 - 0.028), 2e-3)
     return [Part("forearm", 3, beam.moved(_ZX), WHITE), Part("elbow_cap", 3, merged([cap.moved(_ZX), ring]), DARK)]
 
 
-def _wrist(model: ArmModel) -> list[Part]:
-    d6 = _lengths(model)[5]
+def _wrist(puma: _Puma) -> list[Part]:
     # frame 4: y along the forearm, z along axis 5; frame 5: z along axis 6
     stem = cylinder(WRIST - 0.003, (-0.030, 0.0), 3e-3).moved(_UP)
     hinge = cylinder(0.021, (-0.027, 0.027), 4e-3)
-    hub = link(((0.0, 0.0), 0.018), ((0.0, d6 - 0.024), 0.015), (-0.017, 0.017), 3e-3).moved(_ZX)
+    hub = link(((0.0, 0.0), 0.018), ((0.0, puma.d6 - 0.024), 0.015), (-0.017, 0.017), 3e-3).moved(_ZX)
     flange = cylinder(0.021, (-0.016, 0.0), 2e-3)
     return [
         Part("wrist", 4, merged([stem, hinge]), WHITE),

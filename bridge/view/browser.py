@@ -49,7 +49,7 @@ class LiveView:
         self._stack = ExitStack()
         server = self._server = self._stack.enter_context(open_server(settings.view_port, settings.view_host))
         self._stage = Stage(server, scene)
-        self._panel = Panel(server, scene, errors)
+        self._panel = Panel(server, scene, errors, self._stage.notes)
         self._trail = Trail()
         self._path = GrowingPath(server.scene, self._trail, errors)
         self._follower = Follower(shape)
@@ -111,6 +111,7 @@ def serve_run(
     port: int,
     host: str,
     ready: Callable[[str], None],
+    say: Callable[[str], None],
     whole: Callable[[], AbstractContextManager[None]] = nullcontext,
 ) -> None:
     """Show a run until it is interrupted.
@@ -119,10 +120,13 @@ def serve_run(
         run: from `read_run`.
         port, host: see `open_server`.
         ready: called with the address.
+        say: called with each line about what cannot be drawn.
         whole: what is done within it is not to be interrupted; pictures are made by libraries that take it ill.
     """
     with open_server(port, host) as server:
         player = Player(server, run)
+        for note in player.notes:
+            say(note)
         ready(address(server))
         clock = MonotonicClock()
         next_ns = clock.now_ns()
@@ -139,6 +143,9 @@ class Player:
     Args:
         server: a `viser.ViserServer`.
         run: what is shown.
+
+    Attributes:
+        notes: lines about what cannot be drawn.
     """
 
     def __init__(self, server: Any, run: RecordedRun) -> None:
@@ -153,7 +160,8 @@ class Player:
             self._slider = gui.add_slider("time (s)", start, max(run.duration_s, start + 0.01), 0.01, start)
             self._play = gui.add_checkbox("play", True)
             self._speed = gui.add_dropdown("speed", ("0.25", "0.5", "1", "2", "4"), initial_value="1")
-        self._panel = Panel(server, run.scene, errors)
+        self.notes = self._stage.notes
+        self._panel = Panel(server, run.scene, errors, self.notes)
         times = run.times(max(FRAME_S, run.duration_s / MOST_POINTS))
         self._panel.show(run.at(start), curves_of(row_of(run.at(t)) for t in times))
         self._shown = math.nan
@@ -211,28 +219,32 @@ MOST_FRAMES = 900
 """A longer run is shown in larger steps: the file stays below ten megabytes."""
 
 
-def write_page(run: RecordedRun, file: Path) -> None:
+def write_page(run: RecordedRun, file: Path, say: Callable[[str], None]) -> None:
     """Write the replay of a run into one file.
 
     Args:
         run: from `read_run`.
         file: to write; an older one is replaced.
+        say: called with each line about what cannot be drawn.
 
     Raises:
         UsageError: viser is not installed.
         ResultsError: the file cannot be written.
     """
     times = run.times(max(FRAME_S, run.duration_s / MOST_FRAMES))
-    head, middle, tail = _record(run, times).partition("</head>")
+    recorded, notes = _record(run, times)
+    for note in notes:
+        say(note)
+    head, middle, tail = recorded.partition("</head>")
     panel = files(__package__).joinpath("panel.html").read_text(encoding="utf-8")
-    data = json.dumps(_panel_data(run, times), allow_nan=False, separators=(",", ":")).replace("</", "<\\/")
+    data = json.dumps(_panel_data(run, times, notes), allow_nan=False, separators=(",", ":")).replace("</", "<\\/")
     title = html.escape(f"canprobe: {run.title}", quote=False)
     head = head.replace("<title>Viser</title>", f"<title>{title}</title>")
     write_text(file, f"{head}{panel.replace('/*DATA*/null', data)}{middle}{tail}")
 
 
-def _record(run: RecordedRun, times: Array) -> str:
-    """Viser's page with every frame in it."""
+def _record(run: RecordedRun, times: Array) -> tuple[str, list[str]]:
+    """Viser's page with every frame in it, and lines about what cannot be drawn."""
     with open_server(0) as server:
         stage = Stage(server, run.scene)
         path = LoadedPath(server.scene, trail_of(run), error_scale(shape_of(run)))
@@ -244,10 +256,10 @@ def _record(run: RecordedRun, times: Array) -> str:
                 before = t
                 stage.show(run.at(t))
                 path.until(t)
-        return str(recorder.as_html())
+        return str(recorder.as_html()), stage.notes
 
 
-def _panel_data(run: RecordedRun, times: Array) -> dict[str, Any]:
+def _panel_data(run: RecordedRun, times: Array, notes: list[str]) -> dict[str, Any]:
     """What the panel plots: columns, taxel images, colours; None for what is not finite."""
     moments = [run.at(t) for t in times.tolist()]
     curves = curves_of(map(row_of, moments))
@@ -259,6 +271,7 @@ def _panel_data(run: RecordedRun, times: Array) -> dict[str, Any]:
     taxels = b"".join((blank if m.taxels is None else m.taxels).tobytes() for m in moments) if run.taxels else b""
     return {
         "title": run.title,
+        "notes": notes,
         "scene": run.scene.name,
         "start": float(times[0]),
         "curves": {name: [_short(x) for x in curves[name].tolist()] for name in NAMES},

@@ -8,6 +8,7 @@ import zipfile
 from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -16,21 +17,20 @@ from numpy.typing import NDArray
 from canprobe.bridge.sample import ContactFrame, SurfacePatch
 from canprobe.bridge.view.instants import Answer, Moment, judge
 from canprobe.bridge.view.meshes import Array
-from canprobe.bus.disk import read_candump
-from canprobe.cell.array import make_tactile
+from canprobe.bus.disk import read_npz
+from canprobe.cell.log import joint_positions
 from canprobe.errors import UsageError
-from canprobe.planning.make import make_plan
 from canprobe.results.summary import SCHEMA, check_clock
 from canprobe.scene.geometry import true_object
 from canprobe.scene.load import load_scene
 from canprobe.scene.model import Scene
-from canprobe.scene.resolve import resolve
 from canprobe.tasks.probing import Phase
 from canprobe.touch.linear_algebra import tangent_rotation
 
 _SHAPES: dict[str, tuple[int, ...]] = {
     "t_s": (),
     "q_rad": (-1,),
+    "q_m": (-1,),
     "phase": (),
     "force_n": (),
     "contact_mm": (3,),
@@ -43,7 +43,7 @@ _SHAPES: dict[str, tuple[int, ...]] = {
 """Columns of ``log.npz`` that are shown, and the shape of a row; -1: one value a joint."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)  # without slots: `cached_property`
 class RecordedRun:
     """What is shown of a run.
 
@@ -52,7 +52,7 @@ class RecordedRun:
         log: the columns of `_SHAPES` that the run has; every row one cycle.
         answer_rows: rows at which the estimator gave a new answer.
         answers: at each of them.
-        taxels: (t_s, (rows, columns) uint8 counts) of each tactile frame, by rising time on the clock of the log.
+        taxels: (t_s, (rows, columns) uint8 counts) of each tactile frame, by rising time of the cycle that used it.
     """
 
     scene: Scene
@@ -71,6 +71,11 @@ class RecordedRun:
         """Time of the last cycle, s."""
         return float(self.log["t_s"][-1])
 
+    @cached_property
+    def _q(self) -> Array | None:
+        """(rows, n) rad or m."""
+        return joint_positions(self.log)
+
     def times(self, step_s: float) -> Array:
         """Instants at an even distance from the first cycle to the last, s."""
         start = float(self.log["t_s"][0])
@@ -78,14 +83,14 @@ class RecordedRun:
 
     def at(self, t_s: float) -> Moment:
         """What the cell knew at an instant."""
-        log = self.log
+        log, q = self.log, self._q
         row = max(int(np.searchsorted(log["t_s"], t_s + 1e-9, side="right")) - 1, 0)
         answer = int(np.searchsorted(self.answer_rows, row, side="right")) - 1
         frame = bisect_right(self.taxels, t_s + 1e-9, key=lambda item: item[0]) - 1
         return Moment(
             t_s=float(log["t_s"][row]),
             phase=self._phase(row),
-            q=log["q_rad"][row] if "q_rad" in log and np.isfinite(log["q_rad"][row]).all() else None,
+            q=q[row] if q is not None and np.isfinite(q[row]).all() else None,
             contact=self._contact(row),
             answer=self.answers[answer] if answer >= 0 else None,
             taxels=self.taxels[frame][1] if frame >= 0 else None,
@@ -109,7 +114,7 @@ def read_run(folder: Path) -> RecordedRun:
     """Read what is shown of a run.
 
     Args:
-        folder: that `canprobe run` wrote: ``scene.toml``, ``log.npz`` and, for the taxels, ``bus.log``.
+        folder: that `canprobe run` wrote: ``scene.toml``, ``log.npz`` and, for the taxels, ``tactile.npz``.
 
     Raises:
         UsageError: no such folder, a file that is missing or of another canprobe, or a column that is not as it should
@@ -131,20 +136,15 @@ def read_run(folder: Path) -> RecordedRun:
         log=log,
         answer_rows=rows,
         answers=tuple(judge(_patch(log, row), shape) for row in rows.tolist()),
-        taxels=tuple(_read_taxels(folder / "bus.log", scene)),
+        taxels=tuple(_read_taxels(folder / "tactile.npz")),
     )
 
 
-def _read_taxels(file: Path, scene: Scene) -> Iterator[tuple[float, NDArray[np.uint8]]]:
-    """The tactile frames of a candump log; none where there is no log, or in features mode."""
-    if scene.sensor is None or scene.sensor.mode == "features" or not file.is_file():
-        return
-    receiver = make_tactile(make_plan(resolve(scene)))
-    assert receiver is not None
-    for t_ns, _, can_id, data in read_candump(file, only=frozenset(receiver.cob_ids)):
-        frame = receiver.assemble(can_id, data, t_ns)
-        if frame is not None:
-            yield t_ns * 1e-9, frame.taxels
+def _read_taxels(file: Path) -> Iterator[tuple[float, NDArray[np.uint8]]]:
+    """The images that the cell used; none where there is no file, or of an array that sends features."""
+    columns = read_npz(file) if file.is_file() else {}
+    if columns and np.isnan(columns["features"]).all():
+        yield from zip(columns["t_s"].tolist(), columns["taxels"], strict=True)
 
 
 def _check_schema(file: Path) -> None:

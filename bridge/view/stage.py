@@ -8,7 +8,7 @@ import contextlib
 import importlib
 import io
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from canprobe.bridge.database import need
 from canprobe.bridge.sample import quaternion_of
 from canprobe.bridge.view.bodies import (
-    arm_parts,
     disc_faces,
     disc_points,
     link_frames,
@@ -31,6 +30,7 @@ from canprobe.bridge.view.bodies import (
     tile,
 )
 from canprobe.bridge.view.instants import Curves, Moment
+from canprobe.bridge.view.links import arm_links
 from canprobe.bridge.view.meshes import UNKNOWN, Array, Mesh, linear_light, scale
 from canprobe.bridge.view.path import ErrorScale
 from canprobe.errors import InterfaceError
@@ -57,6 +57,9 @@ class Stage:
     Args:
         server: a `viser.ViserServer`, or a client handle; only its `scene` and `initial_camera` are used.
         scene: which arm, probe and object.
+
+    Attributes:
+        notes: lines about what cannot be drawn.
     """
 
     def __init__(self, server: Any, scene: Scene) -> None:
@@ -67,13 +70,15 @@ class Stage:
         self._shape = None if scene.object is None else true_object(scene.object)
         self._probe = None
         self._tool = np.eye(4) if scene.probe is None else T_flange_probe(scene.probe)
+        self.notes: list[str] = []
         self._light()
         if self._shape is not None:
             self._add_object(self._shape)
-        if self._model is not None:
+        if self._model is not None and scene.arm is not None:
+            parts, self.notes = arm_links(scene.arm, self._model.chain)
             self._links = [self._api.add_frame(f"/arm/{i}", show_axes=False) for i in range(self._model.n + 1)]
-            for part in arm_parts(self._model):
-                self._add(f"/arm/{part.frame}/{part.name}", part.mesh, part.colour)
+            for part in parts:
+                self._add(f"/arm/{part.frame}/{part.name}", part.mesh, part.colour, flat_shading=part.flat)
         if scene.probe is not None:
             self._add_probe(scene.probe.radius_mm * 1e-3, array.pad if array is not None else None)
         self._add_contact()
@@ -262,14 +267,17 @@ class Panel:
         server: a `viser.ViserServer`.
         scene: that is shown.
         errors: what the path's colours mean.
+        notes: lines about what cannot be drawn.
     """
 
-    def __init__(self, server: Any, scene: Scene, errors: ErrorScale) -> None:
+    def __init__(self, server: Any, scene: Scene, errors: ErrorScale, notes: Sequence[str]) -> None:
         gui = server.gui
         gui.configure_theme(control_layout="fixed", control_width="medium", show_logo=False, brand_color=(15, 110, 132))
         gui.set_panel_label(f"canprobe · {scene.name}")
         self._target = scene.task.force_n if scene.task.kind in ("scan", "press") else None
         self._status = gui.add_markdown("")
+        for note in notes:
+            gui.add_markdown(note)
         self._plots: list[tuple[Any, tuple[str, ...]]] = []
         self._taxels = None
         if scene.shape is not None:

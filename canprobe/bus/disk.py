@@ -246,6 +246,11 @@ class RecordingPort(PlainPort):
         """That of the port."""
         return self._port.state
 
+    @property
+    def descriptor(self) -> int | None:
+        """That of the port."""
+        return self._port.descriptor
+
     def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
         """Send `frames` and write them down, with `t_ns` where it is given."""
         sent_ns = self.clock.now_ns() if t_ns is None else t_ns

@@ -14,6 +14,7 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
+import select
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -307,6 +308,15 @@ class Port(Protocol):
         """Whether a received frame carries the time of its arrival; if not, that of the `drain` that returned it."""
         ...
 
+    @property
+    def descriptor(self) -> int | None:
+        """A file descriptor that can be read once `drain` has something; None where the port has none.
+
+        Raises:
+            InterfaceError: the port is closed.
+        """
+        ...
+
     def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
         """Send `frames` in this order.
 
@@ -359,6 +369,11 @@ class Port(Protocol):
 class PlainPort:
     """Base class of ports that wait and drain in two calls, and are woken by every frame."""
 
+    @property
+    def descriptor(self) -> int | None:
+        """None: nothing but the port itself can wait for its frames."""
+        return None
+
     def wait_and_drain(self: Port, until_ns: int) -> list[TimedFrame]:
         """Wait for frames, until `until_ns` at the latest, and return them."""
         self.wait(until_ns)
@@ -374,7 +389,29 @@ class PlainPort:
 # is reported once; then the others go on without it, so that their nodes can be stopped in an orderly way.
 
 _SLICE_NS = 200_000
-"""How long one bus is waited for before the others are looked at again."""
+"""How long one bus without a descriptor is waited for before the others are looked at again."""
+
+
+def wait_for_any(ports: Sequence[Port], until_ns: int) -> None:
+    """Return as soon as `drain` of one of the ports may have something, at `until_ns` at the latest, or earlier.
+
+    Args:
+        ports: at least one, all on one clock.
+        until_ns: on that clock.
+
+    Raises:
+        InterfaceError: one is closed or lost.
+    """
+    clock = ports[0].clock
+    descriptors = [one for port in ports if (one := port.descriptor) is not None]
+    if len(descriptors) == len(ports):
+        select.select(descriptors, (), (), max(0, until_ns - clock.now_ns()) * 1e-9)
+        return
+    for port in ports:
+        end_ns = min(until_ns, clock.now_ns() + _SLICE_NS)
+        port.wait(end_ns)
+        if clock.now_ns() < end_ns:  # something is there
+            return
 
 
 class JoinedPort(PlainPort):
@@ -439,12 +476,8 @@ class JoinedPort(PlainPort):
         clock = self.clock
         self._take()
         while not self._arrived and clock.now_ns() < until_ns:
-            for name, port in self._ports.items():
-                if name not in self._lost:
-                    port.wait(min(until_ns, clock.now_ns() + _SLICE_NS))
-                self._take()
-                if self._arrived:
-                    return
+            wait_for_any([port for name, port in self._ports.items() if name not in self._lost], until_ns)
+            self._take()
 
     def close(self) -> None:
         """Close all of them."""

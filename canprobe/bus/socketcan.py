@@ -114,6 +114,12 @@ class SocketCanPort:
 
     stamps_arrival = True
 
+    @property
+    def descriptor(self) -> int:
+        """The socket; it is not readable for frames that wake nobody (`defer`)."""
+        self._check_open()
+        return self._socket.fileno()
+
     def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
         """Send `frames` in order; a full queue is waited for.
 

@@ -177,7 +177,6 @@ class RawReceiver(ArrayReceiver):
 
     Args:
         array: with a raw wire.
-        channel: of its bus.
         ratio: cycles between two images of a polled device.
 
     Attributes:
@@ -185,9 +184,9 @@ class RawReceiver(ArrayReceiver):
         rate_hz: of its images.
     """
 
-    def __init__(self, array: Array, channel: str, ratio: int) -> None:
+    def __init__(self, array: Array, ratio: int) -> None:
         assert array.raw is not None
-        super().__init__(array.raw.image.ids, channel)
+        super().__init__(array.raw.image.ids, array.channel)
         self.wire: RawWire = array.raw
         self.rate_hz = array.rate_hz
         period_ns = 1e9 / array.rate_hz
@@ -276,9 +275,8 @@ def make_tactile(plan: Plan, sync_overflow: int | None = None) -> ArrayReceiver 
     array = plan.setup.array
     if array is None:
         return None
-    channel = array.channel or plan.setup.bus.channel
     if array.raw is not None:
-        return RawReceiver(array, channel, max(1, round(plan.setup.rate_hz / array.rate_hz)))
+        return RawReceiver(array, max(1, round(plan.setup.rate_hz / array.rate_hz)))
     pdos = plan.pdos_of(array.node_id, "tpdo")
     cob_ids = [pdo.cob_id for pdo in pdos]
     assembler = FrameAssembler(
@@ -289,7 +287,7 @@ def make_tactile(plan: Plan, sync_overflow: int | None = None) -> ArrayReceiver 
         window=int(array.window),
         shape=array.pad.shape,
     )
-    return TactileReceiver(assembler, cob_ids, sync_overflow or plan.sync.overflow, channel)
+    return TactileReceiver(assembler, cob_ids, sync_overflow or plan.sync.overflow, array.channel)
 
 
 def patch_of(sample: TactileSample, calibration: PatchCalibration) -> Patch:

@@ -1,8 +1,8 @@
 """From a silent bus to operational nodes, step by step; `BringUp.run` is the order, the steps follow below it.
 
 1. Listen: where another master is at work nothing is sent.
-2. Reset all nodes and wait for their boot-ups. The reset takes the nodes over: before it no way out sends anything,
-   after it every way out leaves them pre-operational.
+2. Reset all nodes, of drives that are homed only the communication, and wait for their boot-ups. The reset takes the
+   nodes over: before it no way out sends anything, after it every way out leaves them pre-operational.
 3. Identify and configure all nodes side by side, each in its own order (`BringUp._configure`): identity, what the
    device must hold by itself, the writes with read-back, and where asked for storage.
 4. Start all nodes and wait for their heartbeats.
@@ -42,6 +42,7 @@ ERROR_HISTORY = 0x1003
 SOFTWARE_VERSION, STORE_PARAMETERS, VERIFY_CONFIGURATION = 0x100A, 0x1010, 0x1020
 SAVE = int.from_bytes(b"save", "little")
 HEARTBEAT_CONSUMER = 0x1016
+PDO_PARAMETERS = range(0x1400, 0x1C00)
 MODE_DISPLAY = 0x6061
 REVISION = 3
 IDENTITY_NAMES = {1: "vendor id", 2: "product code", 3: "revision number", 4: "serial number"}
@@ -159,7 +160,7 @@ class BringUp:
         self.took_over = True
         for _ in range(1 + self._settings.retries):
             self._say(f"reset nodes {', '.join(str(s.node_id) for s in missing)}")
-            self._network.port.send_batch([pack_nmt(NmtCommand.RESET_NODE, s.node_id) for s in missing])
+            self._network.port.send_batch([pack_nmt(_reset_of(s), s.node_id) for s in missing])
             for setup in missing:
                 resets[setup.node_id] += 1
             self._network.pump_until(lambda: all(boot_ups[i] > before[i] for i in before), self._settings.boot_up_s)
@@ -169,7 +170,7 @@ class BringUp:
         if missing:
             raise self._error(
                 f"({missing[0].name}) sent no boot-up within {self._settings.boot_up_s:g} s of its reset on"
-                f" {self._network.port.channel}{_others('nor did', missing)}"
+                f" {missing[0].channel}{_others('nor did', missing)}"
                 "; check power, node id, bit rate and termination, or mark it emulated in the scene",
                 *missing,
             )
@@ -231,6 +232,7 @@ class BringUp:
         try:
             yield from self._identify(report)
             yield from self._check_given(setup)
+            yield from self._check_units(report)
             report.kept = self._settings.store and (yield from self._is_kept(setup))
             yield from self._write_all(report)
             if self._settings.store and not report.kept:
@@ -245,7 +247,7 @@ class BringUp:
     def _identify(self, report: NodeReport) -> Dialogue:
         setup = report.setup
         for subindex, expected in setup.identity.items():
-            got = yield from self._read(setup, 0x1018, subindex)
+            got = yield from read_entry(setup, 0x1018, subindex)
             if subindex == REVISION and got != expected and _same_major(got, expected):
                 report.remarks.append(
                     f"has revision {got:08X}h, {setup.eds} describes {expected:08X}h: the same major revision, taken"
@@ -265,20 +267,41 @@ class BringUp:
 
     def _check_given(self, setup: NodeSetup) -> Dialogue:
         for given in setup.given:
-            got = yield from self._read(setup, given.index, given.subindex)
+            got = yield from read_entry(setup, given.index, given.subindex)
             if got != given.value:
                 raise NodeError(
                     setup.node_id,
-                    f"({setup.name}) {given.index:04X}h:{given.subindex:02X} expected {given.value}, as the scene's"
-                    f" {given.key} says, got {got}: {given.otherwise}; put right {given.key}",
+                    f"({setup.name}) {given.index:04X}h:{given.subindex:02X} expected {given.value},"
+                    f" {given.says}, got {got}: {given.otherwise}",
                 )
+
+    def _check_units(self, report: NodeReport) -> Dialogue:
+        """How many units of a motor turn the device states; what it does not answer is not compared."""
+        turn = report.setup.turn
+        if turn is None:
+            return
+        quotients = []
+        for index in (turn.feed, turn.ratio):
+            if index is not None:
+                try:
+                    over = yield from read_entry(report.setup, index, 1)
+                    under = yield from read_entry(report.setup, index, 2)
+                except NodeError as error:
+                    if isinstance(error.__cause__, SdoAbortedError):
+                        return
+                    raise
+                if not over or not under:
+                    return
+                quotients.append(over / under)
+        if (mismatch := turn.mismatch(quotients[0], quotients[1] if len(quotients) > 1 else 1.0)) is not None:
+            report.remarks.append(mismatch)
 
     def _is_kept(self, setup: NodeSetup) -> Generator[bytes | None, bytes, bool]:
         """Whether the node reports that it was configured with these very values."""
         if not _can_verify(setup):
             return False
         for subindex, expected in setup.configuration_date.items():
-            if (yield from self._read(setup, VERIFY_CONFIGURATION, subindex)) != expected:
+            if (yield from read_entry(setup, VERIFY_CONFIGURATION, subindex)) != expected:
                 return False
         return True
 
@@ -286,8 +309,8 @@ class BringUp:
         if not _can_verify(setup):
             return
         for subindex, value in setup.configuration_date.items():
-            yield from self._write(setup, Write(VERIFY_CONFIGURATION, subindex, value, "configuration date"))
-        yield from self._write(setup, Write(STORE_PARAMETERS, 1, SAVE, "store", read_back=False))
+            yield from write_entry(setup, Write(VERIFY_CONFIGURATION, subindex, value, "configuration date"))
+        yield from write_entry(setup, Write(STORE_PARAMETERS, 1, SAVE, "store", read_back=False))
 
     # 4. start
 
@@ -339,7 +362,7 @@ class BringUp:
         return Dialogues(self._network, asked, timeout_s=self._settings.sdo_s, retries=self._settings.retries)
 
     def _confirm_mode(self, setup: NodeSetup, mode: int, until_ns: int) -> Dialogue:
-        while (got := (yield from self._read(setup, MODE_DISPLAY, 0))) != mode:
+        while (got := (yield from read_entry(setup, MODE_DISPLAY, 0))) != mode:
             if self._network.port.clock.now_ns() >= until_ns:
                 raise self._error(
                     f"({setup.name}) is in mode {got} (6061h) after 6060h = {mode} was written: it is not enabled;"
@@ -363,7 +386,7 @@ class BringUp:
             if (setup.node_id, HEARTBEAT_CONSUMER) in self._refused:
                 return
             try:
-                yield from self._write(setup, Write(HEARTBEAT_CONSUMER, 1, 0, "the master leaves"))
+                yield from write_entry(setup, Write(HEARTBEAT_CONSUMER, 1, 0, "the master leaves"))
             except NodeError as error:
                 failures.append(error)
 
@@ -376,15 +399,6 @@ class BringUp:
     def _talk(self, dialogues: Mapping[int, Dialogue], timeout_s: float) -> dict[int, int]:
         return hold_dialogues(self._network, dialogues, timeout_s=timeout_s, retries=self._settings.retries)
 
-    def _read(self, setup: NodeSetup, index: int, subindex: int) -> Generator[bytes | None, bytes, int]:
-        variable = _variable(setup, index, subindex)
-        try:
-            return int((yield from read_value(variable)))
-        except (SdoAbortedError, SdoCommunicationError) as error:
-            raise NodeError(
-                setup.node_id, f"({setup.name}) read of {index:04X}h:{subindex:02X} failed: {error}"
-            ) from error
-
     def _write_all(self, report: NodeReport) -> Dialogue:
         """The configuration; what is wished and refused is left out with a remark."""
         setup = report.setup
@@ -394,7 +408,7 @@ class BringUp:
                 continue
             if write.index != INTERPOLATION_TIME:
                 try:
-                    yield from self._write(setup, write)
+                    yield from write_entry(setup, write)
                 except RefusedError as refused:
                     if write.absence is None:
                         raise
@@ -410,7 +424,7 @@ class BringUp:
         for writes in options:
             try:
                 for write in writes:
-                    yield from self._write(report.setup, write)
+                    yield from write_entry(report.setup, write)
             except RefusedError as refused:
                 first = first or refused
             else:
@@ -420,41 +434,6 @@ class BringUp:
                 return
         assert first is not None
         raise first
-
-    def _write(self, setup: NodeSetup, write: Write) -> Dialogue:
-        """Write a value and read it back; one that the device refuses and holds already is as good.
-
-        Raises:
-            RefusedError: the device refuses it, or holds another one.
-            NodeError: there is no answer.
-        """
-        variable = _variable(setup, write.index, write.subindex)
-        value = write.value
-        try:
-            yield from download(write.index, write.subindex, variable.encode_raw(value))
-        except SdoAbortedError as error:
-            try:
-                held = int((yield from read_value(variable)))
-            except (SdoAbortedError, SdoCommunicationError):
-                raise _refused(setup, write, error) from error
-            value = _with_own_bits(write, held)
-            if held == value and write.read_back:
-                return
-            if value == write.value:
-                raise _refused(setup, write, error) from error
-            try:
-                yield from download(write.index, write.subindex, variable.encode_raw(value))
-            except SdoAbortedError as again:
-                raise _refused(setup, write, again) from again
-        except SdoCommunicationError as error:
-            raise NodeError(setup.node_id, _failed(setup, write, error)) from error
-        if not write.read_back:
-            return
-        got = yield from self._read(setup, write.index, write.subindex)
-        if got not in (value, _with_own_bits(write, got)):
-            raise RefusedError(
-                setup.node_id, f"({setup.name}) {write.place} reads back {got:#x} after {write.value:#x} was written"
-            )
 
     def _recall(self, setup: NodeSetup) -> Dialogue:
         """The newest entry in the error history of a node that has failed, unless its EMCY was received."""
@@ -478,8 +457,62 @@ class RefusedError(NodeError):
     """A device refused a value, or holds another one."""
 
 
-def _refused(setup: NodeSetup, write: Write, error: Exception) -> RefusedError:
-    return RefusedError(setup.node_id, _failed(setup, write, error))
+def read_entry(setup: NodeSetup, index: int, subindex: int) -> Generator[bytes | None, bytes, int]:
+    """Read an integer of a node.
+
+    Raises:
+        NodeError: it has no such entry, refuses, or does not answer.
+    """
+    variable = _variable(setup, index, subindex)
+    try:
+        return int((yield from read_value(variable)))
+    except (SdoAbortedError, SdoCommunicationError) as error:
+        raise NodeError(setup.node_id, f"({setup.name}) read of {index:04X}h:{subindex:02X} failed: {error}") from error
+
+
+def write_entry(setup: NodeSetup, write: Write) -> Dialogue:
+    """Write a value and read it back; one that the device refuses and holds already is as good.
+
+    Raises:
+        RefusedError: the device refuses it, or holds another one.
+        NodeError: there is no answer.
+    """
+    variable = _variable(setup, write.index, write.subindex)
+    value = write.value
+    try:
+        yield from download(write.index, write.subindex, variable.encode_raw(value))
+    except SdoAbortedError as error:
+        try:
+            held = int((yield from read_value(variable)))
+        except (SdoAbortedError, SdoCommunicationError):
+            raise _refused(setup, write, error) from error
+        value = _with_own_bits(write, held)
+        if held == value and write.read_back:
+            return
+        if value == write.value:
+            raise _refused(setup, write, error, held) from error
+        try:
+            yield from download(write.index, write.subindex, variable.encode_raw(value))
+        except SdoAbortedError as again:
+            raise _refused(setup, write, again, held) from again
+    except SdoCommunicationError as error:
+        raise NodeError(setup.node_id, _failed(setup, write, error)) from error
+    if not write.read_back:
+        return
+    got = yield from read_entry(setup, write.index, write.subindex)
+    if got not in (value, _with_own_bits(write, got)):
+        raise RefusedError(
+            setup.node_id, f"({setup.name}) {write.place} reads back {got:#x} after {write.value:#x} was written"
+        )
+
+
+def _refused(setup: NodeSetup, write: Write, error: Exception, held: int | None = None) -> RefusedError:
+    text = _failed(setup, write, error)
+    if held is not None:
+        text += f"; it holds {held:#x}"
+        if write.index in PDO_PARAMETERS:
+            text += ": if it is fixed, say so in the EDS (AccessType=const), and the plan takes it as it is"
+    return RefusedError(setup.node_id, text)
 
 
 def _failed(setup: NodeSetup, write: Write, error: Exception) -> str:
@@ -494,6 +527,11 @@ def _with_own_bits(write: Write, held: int) -> int:
 def _same_major(got: int, expected: int) -> bool:
     """Whether a revision is at or above another of the same major number. Source: CiA 301, object 1018h:03."""
     return got >> 16 == expected >> 16 and got >= expected
+
+
+def _reset_of(setup: NodeSetup) -> NmtCommand:
+    """A drive that is homed would lose its zero with the reset of the node."""
+    return NmtCommand.RESET_COMMUNICATION if setup.homing else NmtCommand.RESET_NODE
 
 
 def _others(words: str, setups: Sequence[NodeSetup]) -> str:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from functools import partial
+from pathlib import Path
 from types import TracebackType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -17,7 +18,8 @@ from canprobe.cell.bringup import BringUp
 from canprobe.cell.controller import Command, Controller, Measurement, as_controller
 from canprobe.cell.cycle import Cycle, Observers
 from canprobe.cell.drives import make_drives
-from canprobe.cell.log import Notes, RunLog
+from canprobe.cell.homing import Homing
+from canprobe.cell.log import Notes, RunLog, TactileLog, joint_columns
 from canprobe.cell.supervision import Finding, Reaction, Seen, limits_of
 from canprobe.cell.supervisor import JointGuard, Supervisor
 from canprobe.cell.watch import NodeWatch
@@ -33,7 +35,7 @@ WARM_UP_S = 0.1
 """Cycling before the drives are enabled, until both sides are up to speed."""
 REST_TIMEOUT_S = 2.0
 FREE_IT = "free it; a run does not begin while the array measures a force"
-OWN_COLUMNS = frozenset({"t_s", "q_rad", "statusword", "torque_permille", "q_target_rad"})
+OWN_COLUMNS = frozenset({"t_s", "q_rad", "q_m", "statusword", "torque_permille", "q_target_rad", "q_target_m"})
 """Of the log; a controller's `Command.columns` have other names."""
 STUCK_NS = 1_000_000_000
 """Time in a cycle after which an interrupt does not wait for its end."""
@@ -55,15 +57,19 @@ class Cell:
         observers: called after each cycle.
         rows_kept: cycles whose row of the log is kept; None for all.
         origin_ns: time on the port's clock from which the run counts, as ``bus.log`` does.
+        zeros: file that records the zeros of real drives that are homed.
+        to_home: the drives are about to be homed; else bring-up refuses one that is not.
 
     Attributes:
         drives, tactile: of the arm and the array; None in a scene without one.
         log: one row a cycle, with times since the first SYNC, so that nothing that is computed from them depends on
             how long bring-up took; `start_ns` brings them onto the run's clock.
+        tactile_log: one row a tactile frame, on the same clock.
         notes: what went wrong and was lived with.
         watch: what the nodes report of themselves.
         supervisor: the checks, from bring-up on.
         cycle: None before bring-up is done.
+        homing: of the drives without an absolute encoder; None where there are none.
     """
 
     def __init__(
@@ -76,9 +82,12 @@ class Cell:
         observers: Observers | None = None,
         rows_kept: int | None = None,
         origin_ns: int = 0,
+        zeros: Path | None = None,
+        to_home: bool = False,
     ) -> None:
         setup = plan.setup
         self.log = RunLog(rows_kept)
+        self.tactile_log = TactileLog(rows_kept)
         self.drives = make_drives(plan)
         self.tactile = make_tactile(plan)
         self.notes = Notes()
@@ -87,6 +96,7 @@ class Cell:
         guard = JointGuard(plan) if setup.arm is not None else None
         seen = Seen(limits_of(plan), self.watch, self.drives, self.tactile, port.counters)
         self.supervisor = Supervisor(seen, guard, patch_from(setup) if setup.arm is not None else None)
+        self._slides = np.array([] if setup.arm is None else setup.arm.model.chain.prismatic, dtype=bool)
         self._plan = plan
         self._port = port
         self._to_say = say
@@ -95,7 +105,12 @@ class Cell:
         self._rows_kept = rows_kept
         self._origin_ns = origin_ns
         self._network = PumpedNetwork(port, other=self._other)
-        self._bring_up = BringUp(self._network, self.watch, make_setups(plan), setup.bring_up, self._say)
+        setups = make_setups(plan)
+        self._bring_up = BringUp(self._network, self.watch, setups, setup.bring_up, self._say)
+        homed = any(one.homing for one in setups)
+        besides: dict[str, Any] = {"supervise": self._supervise_homing, "record": zeros, "say": self._say}
+        self.homing = Homing(plan, setups, self._network, self.watch, **besides) if homed else None
+        self._to_home = to_home
         self._array_started = False
         self._holding = False
         self._running = False
@@ -162,6 +177,10 @@ class Cell:
                 kept=self._rows_kept,
             )
             self.watch.start(self._port.clock.now_ns())
+            if self.homing is not None:
+                self.homing.look()
+                if not self._to_home:
+                    self.homing.refuse_unhomed()
         except BaseException:
             self.close()
             raise
@@ -321,12 +340,16 @@ class Cell:
             if all(self.drives.rests):
                 return
             self._cycle_until((), self._one_cycle_s)
-        axis = next(axis for axis, rest in zip(self.drives.axes, self.drives.rests, strict=True) if not rest)
-        raise NodeError(
-            axis.node_id,
-            f"reports no position that stays for {REST_TIMEOUT_S:g} s: moving, or a wrong TPDO"
-            + self.watch.last_words(axis.node_id),
-        )
+        i = self.drives.rests.index(False)
+        node_id, last_ns = self.drives.axes[i].node_id, self._plan.traffic.budget.looks_ns[-1]
+        if (came_ns := self.drives.lateness_ns[i]) > last_ns:
+            why = (
+                f"its TPDO comes {came_ns * 1e-6:.2f} ms behind the SYNC, and the cell waits for it until"
+                f" {last_ns * 1e-6:.2f} ms: lower cycle.rate_hz"
+            )
+        else:
+            why = f"reports no position that stays for {REST_TIMEOUT_S:g} s: moving, or a wrong TPDO"
+        raise NodeError(node_id, why + self.watch.last_words(node_id))
 
     @property
     def _one_cycle_s(self) -> float:
@@ -369,6 +392,12 @@ class Cell:
         finding = self.supervisor.finding(enabling=True)
         if finding is not None and finding.condition.reaction is not Reaction.HOLD:
             raise finding.error
+
+    def _supervise_homing(self) -> None:
+        self._note_alarms()
+        seen = self.supervisor.seen
+        seen.sync_ns, seen.controller_state = self._port.clock.now_ns(), self._port.state
+        self._supervise_enabling()
 
     def _supervise(self, measurement: Measurement) -> bool:
         """Check the table's conditions; True: hold in this cycle."""
@@ -424,16 +453,23 @@ class Cell:
             self.notes.add(event.what, node_id=event.node_id, t_s=(event.t_ns - self._origin_ns) * 1e-9)
 
     def _record(self, measurement: Measurement, command: Command | None) -> None:
-        row: dict[str, object] = {"t_s": measurement.t_ns * 1e-9}
+        assert self.cycle is not None
+        row: dict[str, object] = {"t_s": measurement.t_ns * 1e-9, "sync_late_us": self.cycle.late_ns * 1e-3}
         if self.drives is not None:
-            row["q_rad"] = measurement.q
+            if measurement.q is not None:
+                row.update(joint_columns("q", measurement.q, self._slides))
+            row["q_age"] = measurement.q_age
             row["statusword"] = measurement.statuswords
             if measurement.torque_permille:
                 row["torque_permille"] = measurement.torque_permille
         if command is not None:
             if command.q_target is not None:
-                row["q_target_rad"] = command.q_target
+                row.update(joint_columns("q_target", command.q_target, self._slides))
             row.update(command.columns)
+        if self.tactile is not None:
+            row["tactile_age"] = measurement.tactile_age
+            if measurement.tactile is not None:
+                self.tactile_log.add(measurement.t_ns, measurement.tactile)
         self.log.add(row)
         if self._observers is not None:
             self._observers.cycle(self.start_ns, measurement, command)
@@ -446,6 +482,8 @@ class Cell:
         if force := self.supervisor.pressing():
             self.notes.add(f"the probe is left pressing with {force:.1f} N: {FREE_IT}")
         self._try(self._stop_array)
+        if self.homing is not None:
+            self._try(self.homing.keep)
         self._try(self._bring_up.release)
         self._try(self._port.close)
         for line in self.supervisor.notes():

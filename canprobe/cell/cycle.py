@@ -160,6 +160,7 @@ class Cycle:
         self.t_first_ns = port.clock.now_ns() + plan.sync.period_ns
         self.t_ns = 0
         self.sync_ns = 0
+        self.late_ns = 0
         self._heartbeat_ns = 0
         self._port = port
         self._period_ns = plan.sync.period_ns
@@ -182,7 +183,7 @@ class Cycle:
         counter = self._sync.next()
         self.sync_ns = port.clock.now_ns()
         port.send_batch([pack_sync(counter)], self.sync_ns)
-        late_ns = self.sync_ns - self._deadline
+        self.late_ns = late_ns = self.sync_ns - self._deadline
         self.statistics.period_error_ns.append(late_ns)
         if late_ns > self._period_ns // 2:
             self.statistics.overruns += 1

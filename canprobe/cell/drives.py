@@ -1,4 +1,4 @@
-"""The drives as one: TPDOs in and joint angles out, targets in and RPDOs out.
+"""The drives as one: TPDOs in and joint positions out, targets in and RPDOs out.
 
 The drives hold *motor* positions; gears and couplings are undone here and nowhere else.
 """
@@ -241,6 +241,7 @@ class DriveGroup:
     Attributes:
         torque_permille: of each drive, NaN for one whose TPDO has no torque; empty where none has.
         late, missed, malformed: TPDOs that were not used, or not there.
+        lateness_ns: time of the last late TPDO of each drive behind its SYNC, ns.
         answer_ns: from the SYNC to the last TPDO that was used.
         stopped: node ids of drives that stop while the others go on.
     """
@@ -253,6 +254,7 @@ class DriveGroup:
         with_torque = [any(one.torque is not None for one in sources if one.axis == i) for i in range(len(axes))]
         self.torque_permille = [0 if sent else math.nan for sent in with_torque] if any(with_torque) else []
         self.late = 0
+        self.lateness_ns = dict.fromkeys(range(len(axes)), 0)
         self.missed = 0
         self.malformed = 0
         self.answer_ns = 0
@@ -284,7 +286,7 @@ class DriveGroup:
         self._pending = 0
         self._open = False
         self._cycle = -1
-        self._sync_ns = 0
+        self._sync_ns = self._sync_before_ns = 0
 
     def _places_of(self, axis: int, layout: PdoLayout, picks: tuple[int, ...]) -> list[int]:
         """Where each value of a part stands in controlwords, targets and constants, one after another."""
@@ -306,7 +308,7 @@ class DriveGroup:
         """A new SYNC is out, at ``t_ns``, meant for ``deadline_ns``: every TPDO is expected once more."""
         self._cycle = cycle
         self._deadline_ns = t_ns if deadline_ns is None else deadline_ns
-        self._sync_ns = t_ns
+        self._sync_before_ns, self._sync_ns = self._sync_ns, t_ns
         self._pending = len(self._heard)
         self._open = True
 
@@ -324,6 +326,7 @@ class DriveGroup:
         k, source = self._sources[can_id]
         if not self._open or t_ns < self._sync_ns or self._heard[k] == self._cycle:
             self.late += 1
+            self.lateness_ns[source.axis] = t_ns - (self._sync_ns if t_ns >= self._sync_ns else self._sync_before_ns)
             return
         try:
             values = source.unpack(data)
@@ -367,7 +370,7 @@ class DriveGroup:
         return tuple([track.rested_ns >= REST_NS for track in self._tracks])
 
     def joints(self) -> Vector:
-        """Joint angles (n,), rad or m, at this SYNC; where a report is missing, carried on for a few cycles."""
+        """Joint positions (n,), rad or m, at this SYNC; where a report is missing, carried on for a few cycles."""
         now_ns = self._deadline_ns
         q = units_to_joints(self._model, np.array([t.position(self._cycle, now_ns) for t in self._tracks]))
         q.flags.writeable = False  # it goes into the log as it was measured, whatever a controller does with it

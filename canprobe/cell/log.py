@@ -1,19 +1,21 @@
-"""The run's log: one row a cycle in memory, columns with units as arrays; and the notes of what went wrong."""
+"""The run's log: a row a cycle and a row a tactile frame, in memory; and the notes of what went wrong."""
 
 from __future__ import annotations
 
 import warnings
 from collections import deque
-from collections.abc import Iterable, MutableSequence, Sequence
+from collections.abc import Iterable, Mapping, MutableSequence, Sequence
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field, fields
 from itertools import count, groupby
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.cell.controller import TactileSample
 from canprobe.errors import CanprobeError, NodeError
+from canprobe.protocol.tactile import Features
 
 _NO_NUMBERS = (TypeError, ValueError, OverflowError)
 _Part = tuple[list[int], Sequence[Any] | NDArray[np.float64]]
@@ -67,7 +69,7 @@ class _RowKind:
 class RunLog:
     """Collects named columns row by row; a column that a row lacks is filled with NaN there.
 
-    Column names carry their unit as a suffix (``t_s``, ``q_deg``, ``force_n``). Values are numbers or small vectors.
+    Column names carry their unit as a suffix (``t_s``, ``q_rad``, ``force_n``). Values are numbers or small vectors.
     A row is kept as one block of numbers: sorting its values into columns would cost ten times as much in the cycle,
     keeping them as they come four times the memory. Nothing in it changes with the arrays that were given.
 
@@ -135,6 +137,73 @@ class RunLog:
             )
             warnings.warn(text, stacklevel=3)
         return out
+
+
+# Positions of joints: columns `q_rad` for those that turn, `q_m` for those that slide, one place a joint in each.
+
+
+def joint_columns(name: str, q: NDArray[np.float64], prismatic: NDArray[np.bool_]) -> dict[str, NDArray[np.float64]]:
+    """Joint positions as columns of the log: of an arm whose joints all turn `name_rad` alone, else with `name_m`.
+
+    Args:
+        name: `q` or `q_target`.
+        q: (n,) rad or m.
+        prismatic: (n,) which joints slide.
+
+    Returns:
+        (n,) each, NaN where a joint is of the other kind.
+    """
+    if not prismatic.any():
+        return {f"{name}_rad": q}
+    sliding = {f"{name}_m": np.where(prismatic, q, np.nan)}
+    return sliding if prismatic.all() else {f"{name}_rad": np.where(prismatic, np.nan, q), **sliding}
+
+
+def joint_positions(log: Mapping[str, NDArray[np.float64]], name: str = "q") -> NDArray[np.float64] | None:
+    """The inverse of `joint_columns` for a whole log: (rows, n) rad or m; None where it has no such columns.
+
+    Args:
+        log: columns by name.
+        name: `q` or `q_target`.
+    """
+    turning, sliding = log.get(f"{name}_rad"), log.get(f"{name}_m")
+    if turning is None or sliding is None:
+        return sliding if turning is None else turning
+    return np.where(np.isnan(turning), sliding, turning)
+
+
+class TactileLog:
+    """The tactile frames that the cell used: images and what belongs to them, for `tactile.npz`.
+
+    Args:
+        kept: how many frames are kept, the last ones; None for all.
+    """
+
+    def __init__(self, kept: int | None = None) -> None:
+        self._rows: MutableSequence[tuple[int, TactileSample]] = [] if kept is None else deque(maxlen=kept)
+
+    def add(self, t_ns: int, sample: TactileSample) -> None:
+        """Append the sample that became usable in the cycle at ``t_ns``."""
+        self._rows.append((t_ns, sample))
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """One row a frame (m, ...): when it was usable and sampled, s, taxels, their window, features; empty without.
+
+        Features (m, 7) are NaN in a frame of taxels. A device of raw frames has their values (m, rows, columns, axes).
+        """
+        if not self._rows:
+            return {}
+        frames = [sample.frame for _, sample in self._rows]
+        none = (np.nan,) * len(fields(Features))
+        raw = [frame.raw for frame in frames if frame.raw is not None]
+        return ({"raw": np.array(raw)} if raw else {}) | {
+            "t_s": np.array([t_ns * 1e-9 for t_ns, _ in self._rows]),
+            "t_sample_s": np.array([sample.t_sample_ns * 1e-9 for _, sample in self._rows]),
+            "t_sigma_s": np.array([sample.t_sigma_s for _, sample in self._rows]),
+            "taxels": np.array([frame.taxels for frame in frames]),
+            "window": np.array([frame.window for frame in frames]),
+            "features": np.array([none if f.features is None else astuple(f.features) for f in frames]),
+        }
 
 
 # What went wrong in a run and was lived with: one line a kind, however often it happened.

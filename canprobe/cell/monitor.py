@@ -53,7 +53,7 @@ class CellView:
         channel: of the bus, or buses.
         t_s: since the first frame, s.
         nodes: ascending node ids, the master's heartbeat last.
-        q_deg: joint positions (n,), deg, of prismatic joints mm.
+        q: joint positions (n,), deg or mm.
         units: of each of them.
         force_n: of the last whole tactile frame, N.
         taxels: (rows, columns) counts of that frame.
@@ -67,7 +67,7 @@ class CellView:
     channel: str
     t_s: float = 0.0
     nodes: list[NodeView] = field(default_factory=list)
-    q_deg: list[float] | None = None
+    q: list[float] | None = None
     units: tuple[str, ...] = ()
     force_n: float | None = None
     taxels: NDArray[np.uint8] | None = None
@@ -179,7 +179,7 @@ class Monitor:
         counts = [c for c in self._counts if c is not None]
         if self._model is not None and len(counts) == len(self._counts):
             q, joints = units_to_joints(self._model, np.array(counts, dtype=float)).tolist(), self._model.joints
-            view.q_deg = [joint.shown(value) for joint, value in zip(joints, q, strict=True)]
+            view.q = [joint.shown(value) for joint, value in zip(joints, q, strict=True)]
             view.units = tuple(joint.unit for joint in joints)
         self._measure_bus(view, now_ns)
         return view
@@ -229,9 +229,9 @@ def lines(view: CellView) -> Iterator[str]:
     yield ""
     for node in view.nodes:
         yield _node_line(node)
-    if view.q_deg is not None:
+    if view.q is not None:
         yield ""
-        yield "joints  " + "  ".join(f"{q:8.2f} {unit}" for q, unit in zip(view.q_deg, view.units, strict=True))
+        yield "joints  " + "  ".join(f"{q:8.2f} {unit}" for q, unit in zip(view.q, view.units, strict=True))
     if view.taxels is not None:
         force = "–" if view.force_n is None else f"{view.force_n:.2f} N"
         yield ""

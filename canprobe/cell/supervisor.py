@@ -64,9 +64,11 @@ class JointGuard:
     def __init__(self, plan: Plan) -> None:
         arm, probe, safety = plan.setup.arm, plan.setup.probe, plan.setup.limits
         assert arm is not None
-        model, margin = arm.model, (safety.joint_margin - _ROUNDING) * arm.model.radian
+        model, margin = arm.model, safety.joint_margin - _ROUNDING * arm.model.radian
         self.low, self.high = model.q_min + margin, model.q_max - margin
         self.count = np.abs(model.q_per_unit).sum(axis=1)
+        slides = set(model.chain.prismatic)
+        self._si = "angles, rad" if slides == {False} else "positions, m" if slides == {True} else "positions, rad or m"
         self.slowed = 0
         self._model, self._workspace, self._period_ns = model, safety.workspace, plan.sync.period_ns
         self._T_flange_tip = probe.T_flange_probe.copy()
@@ -112,13 +114,13 @@ class JointGuard:
             given = np.array(None)
         if given.dtype.kind not in _NUMBERS or isinstance(given, np.ma.MaskedArray):
             return GuardedTarget(
-                None, f"the controller's joint target is {q_target!r}: expected {len(self._range)} angles, rad"
+                None, f"the controller's joint target is {q_target!r}: expected {len(self._range)} {self._si}"
             )
         target = np.asarray(given, dtype=np.float64)
         wanted = target.tolist() if target.shape == (len(self._range),) else [math.nan]
         if not all(map(math.isfinite, wanted)):
             return GuardedTarget(
-                None, f"the controller's joint target is {target}: expected {len(self._range)} finite angles, rad"
+                None, f"the controller's joint target is {target}: expected {len(self._range)} finite {self._si}"
             )
         inside = [low <= q <= high for q, (low, high) in zip(wanted, self._range, strict=True)]
         if not all(inside):

@@ -37,6 +37,7 @@ EXAMPLE = """\
 examples:
   canprobe emulate cylinder --channel vcan0
   canprobe emulate cylinder --channel vcan0 --nodes 1-6
+  canprobe emulate two.toml --channel can0=vcan0 --channel can1=vcan1
   canprobe emulate cylinder --channel vcan0 --store nodes/
   canprobe emulate --eds drive.eds --node-id 5 --channel vcan0
   canprobe emulate --eds drive.eds --node-id 5 --eds io.eds --node-id 20 --channel vcan0
@@ -121,7 +122,7 @@ def _scene_server(args: argparse.Namespace) -> Callable[[], None]:
             raise UsageError(f"emulate: --{name} belongs to --eds; of a scene's nodes, choose with --nodes")
     scene = with_realtime(load_scene(args.scene, args.cell), args.realtime)
     wanted = _nodes(args.nodes, scene)
-    target = _scene_target(args, scene, wanted)
+    target = _scene_target(args, scene)
     if absent := sorted(set(args.without_id) - set(wanted)):
         raise UsageError(f"--without-id: {absent} is not among the nodes to serve, {list(wanted)}")
 
@@ -136,6 +137,7 @@ def _scene_server(args: argparse.Namespace) -> Callable[[], None]:
         origin_ns=args.origin,
         store_folder=args.store,
         without_id=args.without_id,
+        homed=args.parent is not None,  # there is nobody who could home the nodes of a run
         say=say,
     )
 
@@ -178,25 +180,15 @@ def _eds_files(args: argparse.Namespace) -> list[tuple[str | Path, int]]:
     return list(zip(args.eds, args.node_id, strict=True))
 
 
-def _scene_target(args: argparse.Namespace, scene: Scene, node_ids: tuple[int, ...]) -> Target:
+def _scene_target(args: argparse.Namespace, scene: Scene) -> Target:
     """The bus of these nodes: a channel without a name is for all of them, else each is on its own of the scene."""
     given = args.channel or []
     real = real_target(args.bus, given[0][1] if given else None, args.bitrate, bitrate_else=scene.bus.bitrate)
     given = given or [(scene.bus.channel, real.channel)]
     args = argparse.Namespace(bus=real.interface, channel=given, bitrate=real.bitrate)
     target = target_of(args, scene)
-    alone = replace(target, sensor_channel=None)
-    if target.sensor_channel in (None, target.channel) or given[0][0] is None:
-        return alone
-    sensors = [node_id for node_id in node_ids if scene.sensor is not None and node_id == scene.sensor.node_id]
-    if not sensors:
-        return alone
-    if len(sensors) == len(node_ids):
-        return replace(alone, channel=target.sensor_channel)
-    raise UsageError(
-        f"emulate: the scene has these nodes on two buses, {target.channel} and {target.sensor_channel}, and emulated"
-        " nodes share one plant: serve all of them on one, by --channel CH without a name, or those of one with --nodes"
-    )
+    one = given[0][1] if given[0][0] is None else None
+    return replace(target, others={name: one or target.others.get(name, name) for name in scene.channels[1:]})
 
 
 def _nodes(wanted: tuple[int, ...] | None, scene: Scene) -> tuple[int, ...]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -48,6 +47,8 @@ def add_arguments(parser: Parser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write cell.toml and first.toml, with the files that they name."""
+    from canprobe.robot.urdf import with_meshes_found
+
     folder: Path = args.folder
     for name in ("cell.toml", "first.toml"):
         if (folder / name).exists():
@@ -61,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     for path in {*args.eds, *([args.urdf] if args.urdf else [])}:
         if path.resolve() != (folder / path.name).resolve():
-            shutil.copy(path, folder / path.name)
+            (folder / path.name).write_bytes(with_meshes_found(path) if path == args.urdf else path.read_bytes())
     (folder / "cell.toml").write_text(cell, encoding="utf-8")
     first = _first_scene(folder)
     (folder / "first.toml").write_text(first, encoding="utf-8")

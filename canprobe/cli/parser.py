@@ -6,7 +6,7 @@ import argparse
 import difflib
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -224,14 +224,13 @@ def target_of(args: argparse.Namespace, scene: Scene) -> Target:
     """
     from canprobe.session.target import LOCKSTEP, Target
 
-    main, bitrate = scene.bus.channel, args.bitrate
-    sensors = scene.sensor.channel if scene.sensor is not None and scene.sensor.channel != "auto" else None
-    channels = _channels(args.channel or [], main, sensors)
-    interface, channel = args.bus, channels.get(main)
+    (main, *_), bitrate = scene.channels, args.bitrate
+    channels = _channels(args.channel or [], scene.channels)
+    interface, channel = args.bus, channels.pop(main, None)
     open_to_configuration = args.bus is None and scene.bus.interface == LOCKSTEP and _has_real_nodes(scene)
     if (args.bus == CONFIG or open_to_configuration) and (found := _configured(args.bus)) is not None:
         interface, channel, bitrate = found.interface, channel or found.channel, bitrate or found.bitrate
-    return Target.over(scene, interface, channel, bitrate, sensors and channels.get(sensors, sensors))
+    return Target.over(scene, interface, channels | ({} if channel is None else {main: channel}), bitrate)
 
 
 def real_target(
@@ -278,9 +277,9 @@ def _has_real_nodes(scene: Scene) -> bool:
     return real_array or not all(scene.drives.values())
 
 
-def _channels(given: list[tuple[str | None, str]], main: str, sensors: str | None) -> dict[str, str]:
-    """What stands for which of the scene's channels; a channel without a name stands for the main one."""
-    names = [main] if sensors in (None, main) else [main, str(sensors)]
+def _channels(given: Sequence[tuple[str | None, str]], names: Sequence[str]) -> dict[str, str]:
+    """What stands for which of the scene's channels; a channel without a name stands for the first."""
+    main = names[0]
     found: dict[str, str] = {}
     for name, target in given:
         if name is not None and name not in names:

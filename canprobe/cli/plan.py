@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from canprobe.cli.output import print_json, say
 from canprobe.cli.parser import Parser, add_options, add_scene
-from canprobe.errors import CanprobeError, PlanError, UsageError
+from canprobe.errors import CanprobeError, PlanError, UsageError, install_line
 
 if TYPE_CHECKING:
     from canprobe.planning.model import Plan
@@ -65,7 +65,7 @@ def _draw(plan: Plan, path: Path) -> Path:
     try:
         from canprobe.results.figures import draw_plan
     except ImportError as error:
-        raise UsageError("--figure needs matplotlib: pip install 'canprobe[study]'") from error
+        raise UsageError(f"--figure needs matplotlib: {install_line('study')}") from error
     if not path.suffix:
         path = path.with_suffix(".png")  # as matplotlib would do without a message
     try:

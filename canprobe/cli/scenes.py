@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 
 from canprobe.cli.output import print_json, print_table
 from canprobe.cli.parser import Parser, add_options
@@ -22,15 +23,22 @@ def add_arguments(parser: Parser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print name and title of every packaged scene, and the folder of their files."""
-    from canprobe.scene.load import packaged_scenes, scenes_folder
+    return print_packaged({"scene": "copy one to change it"}, args)
 
-    scenes, folder = packaged_scenes(), scenes_folder()
+
+def print_packaged(advice: Mapping[str, str], args: argparse.Namespace) -> int:
+    """Print name and title of every packaged file of some kinds, their folders, and what can be done with them."""
+    from canprobe.scene.load import packaged_arrays, packaged_cells, packaged_files, packaged_scenes
+
+    titles = {"scene": packaged_scenes, "cell": packaged_cells, "array": packaged_arrays}
+    document: list[dict[str, str]] = []
+    for kind, then in advice.items():
+        found, paths = titles[kind](), packaged_files(f"{kind}s")
+        if args.json:
+            document += [{"kind": kind, "name": n, "title": title, "path": str(paths[n])} for n, title in found]
+        else:
+            print_table(found)
+            print(f"in {next(iter(paths.values())).parent}; {then}")
     if args.json:
-        paths = (str(folder / f"{name}.toml") for name, _ in scenes)
-        print_json(
-            [{"name": name, "title": title, "path": path} for (name, title), path in zip(scenes, paths, strict=True)]
-        )
-    else:
-        print_table(scenes)
-        print(f"in {folder}; copy one to change it")
+        print_json(document)
     return 0

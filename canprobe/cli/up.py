@@ -17,6 +17,7 @@ EXAMPLE = """\
 examples:
   canprobe up free --bus socketcan --channel can0
   canprobe up free --bus socketcan --channel can0 --check-joints
+  canprobe up cell.toml --bus socketcan --channel can0 --home
 """
 
 
@@ -27,27 +28,37 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--check-joints",
         action="store_true",
-        help="turn one joint after the other by 1 deg and back, compare the encoders, and end; asks before each motion",
+        help="move one joint after the other by 1 deg (3.5 mm where it slides) and back, compare the encoders, and end;"
+        " asks before each motion",
     )
-    parser.add_argument("--yes", action="store_true", help="with --check-joints: do not ask")
+    parser.add_argument(
+        "--home",
+        action="store_true",
+        help='home the joints with zero = "homing" one after the other, and end; asks before each',
+    )
+    parser.add_argument("--yes", action="store_true", help="with --check-joints or --home: do not ask")
 
 
 def run(args: argparse.Namespace) -> int:
     """Hold the cell until Ctrl-C, which is the normal way to leave."""
-    if args.yes and not args.check_joints:
-        raise UsageError("up: --yes goes with --check-joints")
-    if args.bridge and args.check_joints:
-        raise UsageError("up: --check-joints feeds no --bridge")
+    if args.home and args.check_joints:
+        raise UsageError("up: --home and --check-joints are two steps; home the joints first")
+    option = "--home" if args.home else "--check-joints" if args.check_joints else None
+    if args.yes and option is None:
+        raise UsageError("up: --yes goes with --check-joints or --home")
+    if args.bridge and option is not None:
+        raise UsageError(f"up: {option} feeds no --bridge")
     scene = scene_of(args)
-    if args.check_joints and not args.yes and not sys.stdin.isatty():
-        raise UsageError("up --check-joints asks before each motion and needs a terminal; --yes leaves that out")
+    if option is not None and not args.yes and not sys.stdin.isatty():
+        raise UsageError(f"up {option} asks before each motion and needs a terminal; --yes leaves that out")
 
     from canprobe import api
 
-    if args.check_joints:
+    if option is not None:
         from canprobe.cli.operator import TerminalOperator
 
-        api.check_joints(scene, operator=None if args.yes else TerminalOperator(), say=say)
+        step = api.home if args.home else api.check_joints
+        step(scene, operator=None if args.yes else TerminalOperator(), say=say)
         return 0
     with left_by_ctrl_c():
         api.up(scene, bridge=args.bridge, say=say)

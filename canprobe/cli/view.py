@@ -63,10 +63,10 @@ def run(args: argparse.Namespace) -> int:
         recorded = read_run(folder)
         if args.html is not None:
             with interrupts_repeated():
-                write_page(recorded, args.html)
+                write_page(recorded, args.html, say)
             print(args.html)
         else:
-            serve_run(recorded, port=browser.port, host=args.host, ready=browser.show, whole=interrupts_held)
+            serve_run(recorded, port=browser.port, host=args.host, ready=browser.show, say=say, whole=interrupts_held)
     return 0
 
 

@@ -1,4 +1,4 @@
-"""Serves emulated nodes on a real bus, in real time, for any master, and keeps what they store in files."""
+"""Serves emulated nodes on real buses, in real time, for any master, and keeps what they store in files."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 from canprobe.bus.disk import write_text
 from canprobe.bus.lockstep import BusNode, LockstepBus, Participant
-from canprobe.bus.port import Port, TimedFrame, VirtualClock
+from canprobe.bus.port import Port, TimedFrame, VirtualClock, wait_for_any
 from canprobe.bus.scheduling import garbage_collection_paused
 from canprobe.emulator.node.dictionary import Abort, SdoAbort, Value
 from canprobe.emulator.node.slave_node import SlaveNode
@@ -124,32 +124,58 @@ class _Outside(Participant):
     listens = ()
 
 
-def serve(nodes: Sequence[Participant], port: Port, stop: Callable[[], bool]) -> None:
+class _Served:
+    """The nodes of one bus behind its port."""
+
+    def __init__(self, nodes: Sequence[Participant], port: Port, now_ns: int) -> None:
+        self.port = port
+        self.exchange = Exchange(nodes)
+        self._deferred: frozenset[int] = frozenset()
+        if boot_ups := self.exchange.start(now_ns):
+            port.send_batch(boot_ups)
+
+    def get_ready(self) -> int | None:
+        """Before a wait: when a node is due, None without any; the port wakes for what the nodes listen to now."""
+        if self.exchange.rerouted:
+            # Being woken for each RPDO, in the middle of its sender's burst, costs both sides more than all else.
+            self.exchange.rerouted = False
+            if (patient := self.exchange.patient) != self._deferred:
+                self._deferred = patient
+                self.port.defer(patient)
+        return self.exchange.next_deadline_ns()
+
+    def step(self, received: list[TimedFrame], now_ns: int) -> None:
+        """Let the nodes answer what came, and do what is due."""
+        for frames in self.exchange.batches(received, now_ns):
+            self.port.send_batch(frames)
+
+
+def serve(buses: Sequence[tuple[Sequence[Participant], Port]], stop: Callable[[], bool]) -> None:
     """Power on the nodes and serve them until `stop()`; it is called after every wait, of 100 ms at most.
 
+    Nodes hear what is on their own bus. All of them may share one plant: they work one after the other.
+
     Args:
-        nodes: participants, for example `SlaveNode`s.
-        port: of the bus; its clock is the nodes' clock.
+        buses: of each bus its participants, for example `SlaveNode`s, and the port; the clock of the ports is theirs.
         stop: ends the loop when it returns True.
     """
-    exchange, clock = Exchange(nodes), port.clock
+    ports = [port for _, port in buses]
+    clock = ports[0].clock
     with garbage_collection_paused():
         now_ns = clock.now_ns()
-        if boot_ups := exchange.start(now_ns):
-            port.send_batch(boot_ups)
-        deferred: frozenset[int] = frozenset()
+        served = [_Served(nodes, port, now_ns) for nodes, port in buses]
         while not stop():
-            if exchange.rerouted:
-                # Being woken for each RPDO, in the middle of its sender's burst, costs both sides more than all else.
-                exchange.rerouted = False
-                if (patient := exchange.patient) != deferred:
-                    port.defer(deferred := patient)
-            due_ns, until_ns = exchange.next_deadline_ns(), now_ns + _MAX_WAIT_NS
-            received = port.wait_and_drain(until_ns if due_ns is None else min(due_ns, until_ns))
+            until_ns = min([now_ns + _MAX_WAIT_NS, *(due for one in served if (due := one.get_ready()) is not None)])
+            if len(ports) == 1:
+                received = [ports[0].wait_and_drain(until_ns)]
+            else:
+                wait_for_any(ports, until_ns)
+                received = [port.drain() for port in ports]
             # The last arrival is the time to work at: one reading of the clock less before the answers leave.
-            now_ns = max(now_ns, received[-1][2]) if received else clock.now_ns()
-            for frames in exchange.batches(received, now_ns):
-                port.send_batch(frames)
+            arrivals_ns = [frames[-1][2] for frames in received if frames]
+            now_ns = max(now_ns, *arrivals_ns) if arrivals_ns else clock.now_ns()
+            for one, frames in zip(served, received, strict=True):
+                one.step(frames, now_ns)
 
 
 # A node's stored parameters (1010h, 1011h, LSS) in a JSON file, so that they survive a restart of the process.

@@ -25,6 +25,7 @@ from canprobe.emulator.plant.plant import Plant
 from canprobe.emulator.plant.taxels import TaxelConfig
 from canprobe.emulator.raw_array import RawArray
 from canprobe.planning.model import Plan, PlannedNode
+from canprobe.planning.units import FEED, GEAR_RATIO, RESOLUTION
 from canprobe.protocol.frames import SYNC_ID, UNCONFIGURED, Frame
 from canprobe.robot.chain import Array, Chain, forward
 from canprobe.robot.inverse import start_posture
@@ -73,6 +74,15 @@ class TruthRecorder(Participant):
         return columns
 
 
+def _set_turn_units(node: SlaveNode, units: float | None) -> None:
+    """The factor group of a device that was delivered for this cell, where its EDS has one: units of a motor turn."""
+    delivered = node.dictionary.delivered
+    ratio = (delivered(GEAR_RATIO, 1) or 1) / (delivered(GEAR_RATIO, 2) or 1)
+    for index, value in ((RESOLUTION, units), (FEED, None if units is None else units * ratio)):
+        if value is not None and value.is_integer() and delivered(index, 1) and delivered(index, 2) in (0, 1):
+            node.dictionary.set_default(index, 1, int(value))
+
+
 def set_serial_number(node: SlaveNode, serial: int) -> None:
     """Give a device its serial number, by which two of one EDS differ; a device without 1018h:04 has none."""
     if key_of(0x1018, 4) in node.dictionary:
@@ -109,7 +119,14 @@ class World:
         object.__setattr__(self, "participants", [*self.nodes, *others])
 
 
-def make_world(plan: Plan, node_ids: Collection[int], *, truth: bool = True, without_id: Collection[int] = ()) -> World:
+def make_world(
+    plan: Plan,
+    node_ids: Collection[int],
+    *,
+    truth: bool = True,
+    without_id: Collection[int] = (),
+    homed: bool = True,
+) -> World:
     """The emulated nodes of a plan, behind one plant.
 
     Where the scene gives a node no serial number, its node id in the scene is one.
@@ -119,13 +136,15 @@ def make_world(plan: Plan, node_ids: Collection[int], *, truth: bool = True, wit
         node_ids: which of its nodes to emulate.
         truth: whether what is true is recorded.
         without_id: which of them start without a node id and wait for LSS to give them one.
+        homed: drives that have to be homed start with their zeros, and keep them.
     """
     plant = Plant(_plant_config(plan.setup))
     nodes = []
     for node in plan.nodes:
         if node.node_id not in node_ids:
             continue
-        nodes.append(_node(plan.setup, node, UNCONFIGURED if node.node_id in without_id else node.node_id, plant))
+        node_id = UNCONFIGURED if node.node_id in without_id else node.node_id
+        nodes.append(_node(plan.setup, node, node_id, plant, homed))
     return World(tuple(nodes), plant, TruthRecorder(plant) if truth else None, _raw_array(plan.setup, plant))
 
 
@@ -137,7 +156,7 @@ def _raw_array(setup: Setup, plant: Plant) -> RawArray | None:
     return RawArray(array, plant, sync_ratio=max(1, round(setup.rate_hz / array.rate_hz)), seed=setup.seed)
 
 
-def _node(setup: Setup, planned: PlannedNode, node_id: int, plant: Plant) -> SlaveNode:
+def _node(setup: Setup, planned: PlannedNode, node_id: int, plant: Plant, homed: bool) -> SlaveNode:
     dictionary = load_eds(planned.eds, planned.node_id)
     speaks_lss = node_id == UNCONFIGURED or dictionary.device_information.LSS_supported
     od_of = partial(load_eds, planned.eds) if speaks_lss else None
@@ -152,9 +171,10 @@ def _node(setup: Setup, planned: PlannedNode, node_id: int, plant: Plant) -> Sla
             plant,
             od_of,
             quirks=drive.quirks,
-            incremental=drive.incremental,
+            incremental=drive.zero is not None and not homed,
             seed=setup.seed,
         )
+        _set_turn_units(node, drive.turn_units)
     else:
         assert setup.array is not None
         node = make_tactile_node(dictionary, node_id, plant, od_of=od_of, pad=setup.array.pad)

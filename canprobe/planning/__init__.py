@@ -4,9 +4,9 @@ What comes in is a `Setup`; what goes out is a frozen `Plan`, or a `PlanError` w
 changes that would fit. Nothing is opened or sent here.
 
 1. `devices` reads each device's EDS file: which objects, PDOs, mappings and bit rates it really has. `operation` finds
-   the mode of each drive and the period as it can express it, `pdos` the PDOs that carry what is needed, and
-   `configuration` what is written. What a device lacks and what cannot be done without is a reason; what can be done
-   without is listed as not available, with what that means.
+   the mode of each drive and the period as it can express it, `units` compares counts, `pdos` finds the PDOs that carry
+   what is needed, and `configuration` what is written. What a device lacks and what cannot be done without is a reason;
+   what can be done without is listed as not available, with what that means.
 2. `choices` has every decision with its reason: what the setup leaves open ("auto"), the cheapest first; what would
    make it fit; what is left out; warnings. For each candidate `make` plans PDOs and identifiers, and `traffic` checks
    SYNC, load, the peak behind one SYNC and the worst-case response time of every message. `window` compares the window

@@ -126,7 +126,7 @@ def plan_raw_frames(setup: Setup) -> tuple[PlannedFrames, ...]:
     array = setup.array
     if array is None or array.raw is None:
         return ()
-    raw, channel = array.raw, array.channel or setup.bus.channel
+    raw, channel = array.raw, array.channel
 
     def planned(what: What, can_id: int, lengths: list[int], rate_hz: float, *, sent: bool) -> PlannedFrames:
         bits = sum(frame_bits(length, setup.bus) for length in lengths)

@@ -7,7 +7,7 @@ import importlib.util
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from canprobe.errors import UsageError
+from canprobe.errors import UsageError, install_line
 from canprobe.scene.setup import Setup
 
 
@@ -39,7 +39,7 @@ class BridgeInfo:
     @property
     def pip(self) -> str:
         """The line that installs them."""
-        return f"pip install 'canprobe[{self.extra}]'"
+        return install_line(self.extra)
 
 
 BRIDGES: Mapping[str, BridgeInfo] = {

@@ -14,6 +14,7 @@ from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+from canprobe.errors import install_line
 from canprobe.planning.array import support_of
 from canprobe.planning.bridges import bridge_outputs
 from canprobe.planning.model import Choice, PlannedPdo, Traffic
@@ -28,7 +29,7 @@ from canprobe.planning.window import (
 from canprobe.protocol.frame_bits import WORST_ERROR_BITS
 from canprobe.protocol.tactile import WINDOW
 from canprobe.robot.inverse import FIXED_POLE, FULL_POSE, task_rows
-from canprobe.scene.setup import Arm, ArrayMode, Setup, Touch, Touching
+from canprobe.scene.setup import Arm, Array, ArrayMode, Setup, Touch, Touching
 
 # What a scene leaves to the plan ("auto"), and in which order the plan tries it.
 
@@ -61,9 +62,8 @@ class _OpenKey:
         return getattr(getattr(setup, self.part), self.field, None)
 
     def written(self, setup: Setup) -> str:
-        """The value as a scene file writes it; an array without a channel is on the bus of the scene."""
-        value = self.value(setup)
-        return _written(setup.bus.channel if self.field == "channel" and value is None else value)
+        """The value as a scene file writes it."""
+        return _written(self.value(setup))
 
 
 def _written(value: Any) -> str:
@@ -76,8 +76,23 @@ def _modes(setup: Setup) -> list[tuple[ArrayMode, str]]:
 
 
 def _channels(setup: Setup) -> list[tuple[str, str]]:
-    own = (second_channel(setup.bus.channel), "a separate bus for the sensor")
-    return [(setup.bus.channel, "one bus carries everything"), *([own] if setup.arm is not None else [])]
+    if setup.arm is None:
+        return [(setup.bus.channel, "one bus carries everything")]
+    first, *others = dict.fromkeys(drive.channel for drive in setup.arm.drives)
+    return [
+        (first, "beside its drives" if others else "one bus carries everything"),
+        *((channel, "beside its drives") for channel in others),
+        (_free_channel(setup), "a separate bus for the sensor"),
+    ]
+
+
+def _free_channel(setup: Setup) -> str:
+    """The next channel that no node is on."""
+    nodes = (*(setup.arm.drives if setup.arm is not None else ()), *((setup.array,) if setup.array is not None else ()))
+    channel, taken = setup.bus.channel, {setup.bus.channel, *(node.channel for node in nodes)}
+    while channel in taken:
+        channel = second_channel(channel)
+    return channel
 
 
 def second_channel(channel: str) -> str:
@@ -112,7 +127,7 @@ def candidates(setup: Setup) -> Iterator[tuple[Setup, tuple[Choice, ...]]]:
     sensing = [key for key in keys if key.part == "array" and key.field != "channel"]
     wiring = [key for key in keys if key not in sensing]
     for chosen in itertools.product(*(key.options(setup) for key in sensing)):
-        for torque in (True, False) if setup.arm is not None else (True,):
+        for torque in (True, False) if _wants_torque(setup) else (True,):
             for others in itertools.product(*(key.options(setup) for key in wiring)):
                 candidate, choices = setup, []
                 for key, (value, why) in zip((*sensing, *wiring), (*chosen, *others), strict=True):
@@ -130,7 +145,7 @@ def candidates(setup: Setup) -> Iterator[tuple[Setup, tuple[Choice, ...]]]:
 def opened(setup: Setup) -> Setup:
     """The setup with every key left to the plan that stands at its default; what the array sends stays."""
     for key in _KEYS:
-        if getattr(setup, key.part) is not None and key.value(setup) in (None, False, "default"):
+        if getattr(setup, key.part) is not None and key.value(setup) in (setup.bus.channel, False, "default"):
             setup = setup.changed(key.part, **{key.field: AUTO})
     return setup
 
@@ -138,20 +153,25 @@ def opened(setup: Setup) -> Setup:
 # What to change when a scene does not fit its bus: each way is planned too, and only those that fit are named.
 
 FD_ARRAY = "tactile_array_fd.eds"
-Fit = Callable[[Setup], Traffic | None]
-"""Traffic of a changed scene, or None where that does not fit either."""
+Fit = Callable[[Setup], tuple[Setup, Traffic] | None]
+"""A changed setup as the plan closes it and the traffic of its fullest bus; None where that does not fit either."""
 
 
 def ways_out(setup: Setup, fit: Fit) -> list[str]:
     """Changes each of which makes the scene fit, with the load and the longest demand that it leaves."""
     found = []
     for text, changed in (*_changes(setup), *_together(setup, fit), *_quicker(setup, fit), *_slower(setup, fit)):
-        traffic = fit(changed)
-        if traffic is not None:
+        if (fitting := fit(changed)) is not None:
+            closed, traffic = fitting
             peak = max(traffic.demands, key=lambda demand: demand.used_ns / demand.available_ns)
             share = f"{peak.used_ns / 1000:.0f} of {peak.available_ns / 1000:.0f} µs"
-            found.append(f"{text}: load {100 * traffic.load:.0f} %, peak {share}")
+            less = ", without 6077h" if _wants_torque(setup) and not _wants_torque(closed) else ""
+            found.append(f"{text}: load {100 * traffic.load:.0f} %, peak {share}{less}")
     return found or ["fewer nodes or a faster bus"]
+
+
+def _wants_torque(setup: Setup) -> bool:
+    return setup.arm is not None and setup.arm.torque
 
 
 def _changes(setup: Setup) -> Iterator[tuple[str, Setup]]:
@@ -164,12 +184,11 @@ def _changes(setup: Setup) -> Iterator[tuple[str, Setup]]:
         yield text, setup.changed("bus", transmit_queue="priority")
     if setup.arm is not None and not setup.arm.grouped:
         yield "arm.grouped_rpdo = true", setup.changed("arm", grouped=True)
+    yield from _split(setup)
     if array is None:
         return
-    if setup.arm is not None and array.raw is not None and array.channel in (None, bus.channel):
-        own = second_channel(bus.channel)
-        yield f'a separate bus for the sensor (sensor.channel = "{own}")', setup.changed("array", channel=own)
     if array.raw is not None:
+        yield from _own_bus(setup, array)
         return
     if array.mode == "window":
         for side in reversed([side for side in windows_of(array) if side < int(array.window)]):
@@ -177,15 +196,31 @@ def _changes(setup: Setup) -> Iterator[tuple[str, Setup]]:
     if array.mode == "image":
         yield 'sensor.mode = "window"', setup.changed("array", mode="window")
     if array.mode != "features":  # only a window may have another size
-        text = 'sensor.mode = "features"' + " without sensor.window" * (array.window != WINDOW)
+        text = 'sensor.mode = "features"' + " without sensor.window" * (array.mode == "window")
         yield text, setup.changed("array", mode="features", window=WINDOW)
-    if setup.arm is not None and array.channel in (None, bus.channel):
-        own = second_channel(bus.channel)
-        yield f'a separate bus for the sensor (sensor.channel = "{own}")', setup.changed("array", channel=own)
+    yield from _own_bus(setup, array)
     if not bus.fd and array.emulated:
         fd = setup.changed("bus", fd=True)
         yield "bus.fd = true", fd
         yield f'CAN FD: bus.fd = true and sensor.eds = "{FD_ARRAY}"', fd.changed("array", eds=FD_ARRAY)
+
+
+def _own_bus(setup: Setup, array: Array) -> Iterator[tuple[str, Setup]]:
+    """The array on a bus of its own, where it shares one with drives."""
+    if setup.arm is not None and any(array.channel == drive.channel for drive in setup.arm.drives):
+        own = _free_channel(setup)
+        yield f'a separate bus for the sensor (sensor.channel = "{own}")', setup.changed("array", channel=own)
+
+
+def _split(setup: Setup) -> Iterator[tuple[str, Setup]]:
+    """The second half of the drives on a bus of their own."""
+    arm = setup.arm
+    if arm is None or len(arm.drives) < 2 or len({drive.channel for drive in arm.drives}) > 1:
+        return
+    own, kept = _free_channel(setup), len(arm.drives) // 2
+    drives = (*arm.drives[:kept], *(replace(drive, channel=own) for drive in arm.drives[kept:]))
+    keys = " and ".join(f'joints.{joint.name}.channel = "{own}"' for joint in arm.model.joints[kept:])
+    yield f"a second bus for half of the drives ({keys})", setup.changed("arm", drives=drives)
 
 
 def _together(setup: Setup, fit: Fit) -> Iterator[tuple[str, Setup]]:
@@ -202,9 +237,9 @@ def _together(setup: Setup, fit: Fit) -> Iterator[tuple[str, Setup]]:
 def _quicker(setup: Setup, fit: Fit) -> Iterator[tuple[str, Setup]]:
     """A controller that takes no longer than the bus leaves it, in whole microseconds."""
     idle = fit(replace(setup, compute_ns=0))
-    if idle is None or idle.budget.slack_ns is None:
+    if idle is None or (slack_ns := idle[1].budget.slack_ns) is None:
         return
-    left_us = idle.budget.slack_ns // 1000
+    left_us = slack_ns // 1000
     if 0 < left_us * 1000 < setup.compute_ns:
         yield f"cycle.compute_us = {left_us}", replace(setup, compute_ns=left_us * 1000)
 
@@ -316,11 +351,11 @@ def _not_shown(setup: Setup) -> Iterator[tuple[str, str]]:
         yield from ((what, "scene.figures = false") for what in (FIGURE, PAGE))
     else:
         if importlib.util.find_spec("matplotlib") is None:
-            yield FIGURE, "the study extra is not installed: pip install 'canprobe[study]'"
+            yield FIGURE, f"the study extra is not installed: {install_line('study')}"
         if setup.kind == "listen":
             yield PAGE, 'task.kind = "listen": nothing moves'
         elif importlib.util.find_spec("viser") is None:
-            yield PAGE, "the view extra is not installed: pip install 'canprobe[view]'"
+            yield PAGE, f"the view extra is not installed: {install_line('view')}"
     if not setup.bridge.use:
         yield "bridges to other tools", "no [bridge]: no other tool is fed"
 

@@ -10,7 +10,6 @@ impossible where it is required, `NodeSetup.problems`. What only the device refu
 
 from __future__ import annotations
 
-import math
 import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -40,23 +39,26 @@ from canprobe.planning.model import (
     PlannedNode,
     PlannedPdo,
 )
-from canprobe.planning.operation import INTERPOLATION_TIME
+from canprobe.planning.operation import INTERPOLATION_TIME, homing_problems
 from canprobe.planning.traffic import CLASSIC_BYTES
+from canprobe.planning.units import POLARITY, TurnUnits, motor_speed_limit, software_limits, turn_units
 from canprobe.protocol.cia402 import OperationMode
 from canprobe.protocol.tactile import TactileMode
-from canprobe.robot.chain import Array
-from canprobe.robot.model import ArmModel
+from canprobe.robot.model import coupled_joints, drive_position_at, joints_to_units
 
 SYNC_START_VALUE = 1
 EMCY_INHIBIT_100US = 1000
 """At most ten emergencies a second from a node: one for every late SYNC would make the next SYNC late too."""
 MODE = 0x6060
+HOME_OFFSET = 0x607C
+HOMES_HERE = frozenset({35, 37})
+"""Homing methods that take the present position."""
 TARE = 0x65726174  # "tare", as 1010h has "save"
 FOLLOWING_WINDOW_DEG = 5.0
 FOLLOWING_TIMEOUT_MS = 50
-ROUNDING_COUNTS = 2
-"""By which two targets may be rounded apart."""
 QUICK_STOP_AND_DISABLE = 2  # 605Ah: slow down on the quick stop ramp, then switch on disabled
+GO_PRE_OPERATIONAL = 0  # 1029h:01
+STARTUP, NOT_BY_ITSELF = 0x1F80, 1 << 2  # CiA 302-2: the device does not become operational without its master
 ABORT_QUICK_STOP = 3  # 6007h: quick stop when the connection is lost
 MOST_DAYS, DAY_MS = 0xFFFF, 86_400_000
 
@@ -113,14 +115,14 @@ class Given:
     Attributes:
         index, subindex: the entry.
         value: that it must hold.
-        key: of the scene that states the value.
-        otherwise: what would be wrong.
+        says: who states the value.
+        otherwise: what would be wrong, and what puts it right.
     """
 
     index: int
     subindex: int
     value: int
-    key: str
+    says: str
     otherwise: str
 
 
@@ -131,6 +133,7 @@ class NodeSetup:
     Attributes:
         node_id: the node.
         name: for messages, such as ``joint 3``.
+        channel: of the bus that it is on.
         eds: name of its EDS file, for messages.
         dictionary: its object dictionary, from the EDS.
         identity: expected values of 1018h by sub-index; an absent sub-index is not checked.
@@ -140,10 +143,14 @@ class NodeSetup:
         left_out: what the EDS excludes of what the cell would have set.
         problems: what the EDS excludes of what must be set; empty in a plan.
         mode: of operation, which 6061h must confirm; None: no drive.
+        homing: what a drive needs for homing, in order; empty: it is not homed. Where the drive is coupled to other
+            joints, the home offset depends on where they are; here they are in the start posture.
+        turn: units of a motor turn, with which the device's own statement is compared; None: there is none.
     """
 
     node_id: int
     name: str
+    channel: str
     eds: str
     dictionary: ObjectDictionary
     identity: dict[int, int]
@@ -153,6 +160,8 @@ class NodeSetup:
     left_out: tuple[LeftOut, ...] = ()
     problems: tuple[str, ...] = ()
     mode: int | None = None
+    homing: tuple[Write, ...] = ()
+    turn: TurnUnits | None = None
 
     @property
     def configuration_date(self) -> dict[int, int]:
@@ -174,21 +183,28 @@ def _setup(plan: Plan, node: PlannedNode) -> NodeSetup:
     device = Abilities.of(node.eds, node.node_id)
     of_kind = _drive_writes if node.kind == "drive" else _array_writes
     writes, left_out, problems = _possible(
-        device, [*_pdo_writes(plan, node, device), *_common_writes(plan), *of_kind(plan, node, device)]
+        device, [*_pdo_writes(plan, node, device), *_common_writes(plan, device), *of_kind(plan, node, device)]
     )
+    arm = plan.setup.arm
+    drive = arm.drives[arm.node_ids.index(node.node_id)] if arm is not None and node.kind == "drive" else None
     times = [_interpolation_writes(device, time) for time in node.interpolation[1:]]
+    homing, not_homing, no_homing = _possible(device, _homing_writes(plan, node))
+    no_homing += [*homing_problems(device), *_coupling_problems(plan, node)] if homing else []
     return NodeSetup(
         node_id=node.node_id,
         name=node.role,
+        channel=node.channel,
         eds=node.eds,
         dictionary=device.od,
         identity={sub: value for sub, value in enumerate(node.identity.numbers, start=1) if value is not None},
         writes=tuple(writes),
-        given=_array_given(plan, device.od) if node.kind == "tactile" else (),
+        given=_array_given(plan, device.od) if node.kind == "tactile" else _drive_given(device),
         otherwise=tuple(tuple(_possible(device, other)[0]) for other in times),
-        left_out=tuple(left_out),
-        problems=tuple(problems),
+        left_out=(*left_out, *not_homing),
+        problems=(*problems, *no_homing),
         mode=node.mode,
+        homing=tuple(homing),
+        turn=None if drive is None else turn_units(device, drive.turn_units, drive.gear),
     )
 
 
@@ -270,7 +286,7 @@ def _one_pdo(pdo: PlannedPdo, device: Abilities) -> list[Write]:
 _SYNC_PERIOD = "the device does not know how long a cycle is"
 
 
-def _common_writes(plan: Plan) -> list[Write]:
+def _common_writes(plan: Plan, device: Abilities) -> list[Write]:
     counter = [
         Write(0x1006, 0, 0, "1019h may only change while this is 0", _SYNC_PERIOD),
         Write(0x1019, 0, plan.sync.overflow, "overflow of the SYNC counter"),
@@ -281,11 +297,23 @@ def _common_writes(plan: Plan) -> list[Write]:
         Write(0x1015, 0, EMCY_INHIBIT_100US, "shortest time between two emergencies", _EMERGENCIES),
         Write(0x1017, 0, HEARTBEAT_PRODUCED_MS, "period of the node's heartbeat"),
         Write(0x1016, 1, MASTER_NODE_ID << 16 | HEARTBEAT_CONSUMED_MS, "the node notices a dead master", _DEAF),
+        Write(0x1029, 1, GO_PRE_OPERATIONAL, "NMT state of a node that has lost its master", _BY_DEFAULT),
+        *_startup_writes(device),
     ]
+
+
+def _startup_writes(device: Abilities) -> list[Write]:
+    """A device that does not start by itself sends no PDOs before it is configured; one without 1F80h is not asked."""
+    if not device.has(STARTUP):
+        return []
+    value, others = (device.number(STARTUP) or 0) | NOT_BY_ITSELF, 0xFFFFFFFF & ~NOT_BY_ITSELF
+    return [Write(STARTUP, 0, value, "the node waits for its start", _SELF_STARTING, own_bits=others)]
 
 
 _EMERGENCIES = "a faulty device may fill the bus with emergencies"
 _DEAF = "the device will not notice a dead master"
+_BY_DEFAULT = "it goes pre-operational, which is the default of CiA 301, or does what the device has"
+_SELF_STARTING = "the device may become operational before it is configured"
 _MISSED_SYNCS = "SYNCs after which the drive stops by itself"
 
 
@@ -318,30 +346,50 @@ def _drive_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Writ
     ]
 
 
+def _homing_writes(plan: Plan, node: PlannedNode) -> list[Write]:
+    """607Ch is from the home position to the zero: at home the drive is at -607Ch. Source: CiA 402-2, "Homing mode"."""
+    arm = plan.setup.arm
+    axis = arm.node_ids.index(node.node_id) if arm is not None and node.kind == "drive" else None
+    zero = arm.drives[axis].zero if arm is not None and axis is not None else None
+    if arm is None or axis is None or zero is None:
+        return []
+    home = drive_position_at(arm.model, axis, zero.home, joints_to_units(arm.model, arm.q_start))
+    units = abs(float(arm.model.units_per_q[axis, axis]))
+    ramp = "homing accelerates as the device has it"
+    still = f"method {zero.method} does without" if zero.method in HOMES_HERE else None
+    return [
+        Write(0x6098, 0, zero.method, "homing method"),
+        Write(0x6099, 1, max(1, round(zero.speed * units)), "speed of the search for the switch", still),
+        Write(0x6099, 2, max(1, round(zero.zero_speed * units)), "speed of the search for the zero", still),
+        Write(0x609A, 0, max(1, round(zero.acceleration * units)), "acceleration in homing", ramp),
+        Write(HOME_OFFSET, 0, -round(home), "home offset"),
+    ]
+
+
+def _coupling_problems(plan: Plan, node: PlannedNode) -> list[str]:
+    """Where the zero of a drive depends on other joints, they have to be known when it is homed."""
+    arm = plan.setup.arm
+    assert arm is not None
+    axis = arm.node_ids.index(node.node_id)
+    own, joints, problems = arm.drives[axis].zero, arm.model.joints, []
+    for other in sorted(coupled_joints(arm.model, axis)):
+        zero, name = arm.drives[other].zero, joints[other].name
+        if own is None or zero is None or (zero.order, other) < (own.order, axis):
+            continue
+        way = (
+            "each depends on the other: one of them needs an absolute encoder"
+            if axis in coupled_joints(arm.model, other)
+            else f"joints.{name}.homing_order must be lower than {own.order}"
+        )
+        problems.append(f"the zero of {joints[axis].name} depends on {name}, which is homed later: {way}")
+    return problems
+
+
 def _interpolation_writes(device: Abilities, time: Interpolation) -> list[Write]:
     """A device without 60C2h:02 counts in milliseconds."""
     unit = [Write(INTERPOLATION_TIME, 2, time.index, "unit of the interpolation time")]
     value = Write(INTERPOLATION_TIME, 1, time.value, "interpolation time")
     return [value, *(unit if device.has(INTERPOLATION_TIME, 2) else [])]
-
-
-def motor_speed_limit(model: ArmModel, axis: int, share: float, period_ns: int) -> int:
-    """Drive units/s beyond which it must not follow a target: all joints that move the motor, at their limits.
-
-    Args:
-        model: the arm.
-        axis: of the motor, 0-based.
-        share: of the joints' speed limits.
-        period_ns: of the cycle; a target is a whole number of drive units.
-    """
-    fastest = float(np.abs(model.units_per_q[axis]) @ model.qd_max) * share
-    return math.ceil(fastest + ROUNDING_COUNTS * 1e9 / period_ns)
-
-
-def software_limits(model: ArmModel) -> tuple[Array, Array]:
-    """Extremes of each drive (n,) and (n,), units, over the joints' ranges; the coupled ones span both joints'."""
-    a, b, zero = model.units_per_q * model.q_min, model.units_per_q * model.q_max, model.zero_units
-    return np.floor(np.minimum(a, b).sum(axis=1) + zero), np.ceil(np.maximum(a, b).sum(axis=1) + zero)
 
 
 def _array_writes(plan: Plan, _: PlannedNode, device: Abilities) -> list[Write]:
@@ -356,6 +404,14 @@ def _array_writes(plan: Plan, _: PlannedNode, device: Abilities) -> list[Write]:
     return writes
 
 
+def _drive_given(device: Abilities) -> tuple[Given, ...]:
+    """The cell states in `sign` how a drive counts; 607Eh would turn that round."""
+    if not device.has(POLARITY):
+        return ()
+    otherwise = "it would count the other way round than the cell's sign says; set 607Eh back in the drive"
+    return (Given(POLARITY, 0, device.number(POLARITY) or 0, "as its EDS says", otherwise),)
+
+
 def _array_given(plan: Plan, dictionary: Any) -> tuple[Given, ...]:
     """With another full scale the force would be wrong by the ratio of the two."""
     array = plan.setup.array
@@ -363,4 +419,6 @@ def _array_given(plan: Plan, dictionary: Any) -> tuple[Given, ...]:
     if not has_full_scale(dictionary):
         return ()
     pascals = round(array.full_scale)
-    return (Given(FULL_SCALE, 0, pascals, "sensor.full_scale_kpa", "force would be read wrong by their ratio"),)
+    key = "sensor.full_scale_kpa"
+    otherwise = f"force would be read wrong by their ratio; put right {key}"
+    return (Given(FULL_SCALE, 0, pascals, f"as the scene's {key} says", otherwise),)

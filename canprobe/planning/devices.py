@@ -173,13 +173,20 @@ _POOL = range(0x181, 0x580)
 """Identifiers below SYNC, emergencies and TIME and above SDO and heartbeats; restricted ones are left out."""
 
 
-def order_by_deadline(pdos: Sequence[PlannedPdo]) -> list[PlannedPdo]:
+def order_by_deadline(pdos: Sequence[PlannedPdo], devices: Iterable[Abilities] = ()) -> list[PlannedPdo]:
     """The same PDOs with identifiers in the order of their deadlines.
 
     At equal deadlines feedback has priority over commands; otherwise the order stays. An RPDO that several drives read
     keeps one identifier, and so does a PDO whose COB-ID cannot be changed.
+
+    Args:
+        pdos: of all nodes.
+        devices: whose RPDOs may listen to an identifier for ever, which no other PDO gets then.
     """
     fixed = {pdo.cob_id for pdo in pdos if pdo.fixed_id}
+    fixed |= {
+        id_ for one in devices for n in one.pdo_numbers("rpdo") if (id_ := one.fixed_cob_id("rpdo", n)) is not None
+    }
     free = (cob_id for cob_id in _POOL if not is_restricted(cob_id) and cob_id not in fixed)
     first = {pdo.cob_id: pdo for pdo in reversed(pdos) if not pdo.fixed_id}
     ordered = sorted(first.values(), key=lambda pdo: (pdo.deadline_ns, pdo.direction == "rpdo", pdo.cob_id))

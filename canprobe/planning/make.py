@@ -34,6 +34,7 @@ from canprobe.planning.motion import check_motion
 from canprobe.planning.operation import choose_mode, interpolations, operation_problems, period_problem
 from canprobe.planning.pdos import PdoPlanning, plan_drive_pdos, plan_tactile_pdos
 from canprobe.planning.traffic import plan_ratio, plan_sync, plan_traffic
+from canprobe.planning.units import range_problems
 from canprobe.planning.window import cut_patch
 from canprobe.robot.dynamics import dynamics_problem
 from canprobe.scene.setup import Node, Setup
@@ -68,6 +69,7 @@ def make_plan(setup: Setup) -> Plan:
         if cut is not None and not cut.safe:
             problems.append(cut.text)
             ways = ways or [*cut.ways]
+    problems += range_problems(setup)
     joint_speeds, unreachable = check_motion(setup) if not unsuited else (None, [])
     problems += unreachable
     truth, arm = setup.truth, setup.arm
@@ -144,7 +146,8 @@ def _choose(setup: Setup, devices: Mapping[int, Abilities], problems: list[str])
         if not bus.overload and not bus.problems:
             return bus
         found.append(bus)
-    found = [bus for bus in found if bus.setup.arm is None or bus.setup.arm.torque]  # as ways out are planned
+    wanted = setup.arm is None or setup.arm.torque
+    found = [bus for bus in found if bus.setup.arm is None or bus.setup.arm.torque == wanted]
     nearest = min(found, key=lambda bus: bus.misfit)
     if len(found) > 1:
         chosen = ", ".join(f"{choice.key} = {choice.value}" for choice in nearest.choices)
@@ -163,38 +166,27 @@ def _plan_bus(setup: Setup, devices: Mapping[int, Abilities], choices: tuple[Cho
         sync = replace(sync, overflow=0)
         not_available.append(("SYNC counter", f"{', '.join(uncounted)} cannot take one: no 1019h"))
     problems = [*([problem] if problem is not None else []), *found]
-    planning = PdoPlanning(setup, sync, devices, problems=problems, not_available=not_available)
+    channels = _channels(setup)
+    channel_of = {node_id: channel for channel, node_ids in channels.items() for node_id in node_ids}
+    planning = PdoPlanning(setup, sync, devices, channel_of, problems=problems, not_available=not_available)
     plan_drive_pdos(planning)
     plan_tactile_pdos(planning, ratio)
-    planned = order_by_deadline(planning.pdos) if setup.bus.cob_ids == "by_deadline" else planning.pdos
+    by_deadline = setup.bus.cob_ids == "by_deadline"
+    planned = order_by_deadline(planning.pdos, devices.values()) if by_deadline else planning.pdos
     planning.problems += identifier_problems(planned)
     frames = plan_raw_frames(setup)
     if setup.array is not None:
-        planning.problems += raw_frame_problems(frames, planned, _channels(setup), setup.array.name)
-    buses: list[PlannedBus] = []
-    pdos: list[PlannedPdo] = []
-    raw: list[PlannedFrames] = []
-    overload: list[str] = []
-    for channel, node_ids in _channels(setup).items():
-        mine = [replace(pdo, channel=channel) for pdo in planned if pdo.node_id in node_ids]
-        settings = replace(setup.bus, channel=channel)
-        its = [one for one in frames if one.channel == channel]
-        traffic, timed, raw_timed, late = plan_traffic(
-            mine, sync, node_ids, settings, compute_ns=setup.compute_ns, raw=its
-        )
-        buses.append(PlannedBus(channel, node_ids, traffic))
-        pdos += timed
-        raw += raw_timed
-        overload += late
+        planning.problems += raw_frame_problems(frames, planned, channels, setup.array.name)
+    traffic = plan_traffic(planned, sync, channels, setup.bus, setup.compute_ns, raw=frames)
     return _BusPlan(
         setup=setup,
         choices=choices,
         sync=sync,
-        pdos=tuple(pdos),
-        raw=tuple(raw),
-        buses=tuple(buses),
+        pdos=traffic.pdos,
+        raw=traffic.raw,
+        buses=traffic.buses,
         problems=planning.problems,
-        overload=overload,
+        overload=traffic.problems,
         not_available=tuple(dict.fromkeys(planning.not_available)),
     )
 
@@ -206,26 +198,26 @@ def _counts_syncs(device: Abilities) -> bool:
 
 
 def _channels(setup: Setup) -> dict[str, tuple[int, ...]]:
-    """Which nodes are on which bus, the arm's first."""
-    channels: dict[str, tuple[int, ...]] = {}
-    if setup.arm is not None:
-        channels[setup.bus.channel] = tuple(sorted(setup.arm.node_ids))
-    if setup.array is not None:
-        channel = setup.array.channel or setup.bus.channel
-        own = (setup.array.node_id,) if setup.array.raw is None else ()
-        channels[channel] = tuple(sorted((*channels.get(channel, ()), *own)))
-    return channels
+    """Which nodes are on which bus, in the order of `_roles`; an array of raw frames is on one without being a node."""
+    nodes = [node for _, _, node in _roles(setup)]
+    others = [setup.array.channel] if setup.array is not None and setup.array.raw is not None else []
+    names = dict.fromkeys([*(node.channel for node in nodes), *others])
+    return {name: tuple(sorted(node.node_id for node in nodes if node.channel == name)) for name in names}
 
 
-def _fits(setup: Setup, known: frozenset[str]) -> Traffic | None:
-    """The fullest bus of a changed scene if it fits and brings no problem that is not known already."""
+def _fits(setup: Setup, known: frozenset[str]) -> tuple[Setup, Traffic] | None:
+    """A changed setup as it is closed, and its fullest bus, if it fits and brings no problem that is not known already.
+
+    The plan would give up the motor torque for it too.
+    """
     devices, problems = _devices(setup)
     if problems:
         return None
-    bus = _plan_bus(setup, devices)
-    if bus.overload or not known.issuperset(bus.problems):
-        return None
-    return max((one.traffic for one in bus.buses), key=lambda traffic: traffic.load)
+    for candidate, _ in candidates(setup):
+        bus = _plan_bus(candidate, devices)
+        if not bus.overload and known.issuperset(bus.problems):
+            return candidate, max((one.traffic for one in bus.buses), key=lambda traffic: traffic.load)
+    return None
 
 
 def _roles(setup: Setup) -> list[tuple[NodeKind, str, Node]]:
@@ -260,7 +252,6 @@ def _devices(setup: Setup) -> tuple[dict[int, Abilities], list[str]]:
 def _nodes(
     setup: Setup, devices: Mapping[int, Abilities], pdos: tuple[PlannedPdo, ...], sync: SyncPlan
 ) -> tuple[PlannedNode, ...]:
-    channel_of = {node_id: channel for channel, node_ids in _channels(setup).items() for node_id in node_ids}
     nodes = [
         PlannedNode(
             node_id=node.node_id,
@@ -269,7 +260,7 @@ def _nodes(
             eds=node.eds,
             identity=replace(devices[node.node_id].identity, serial_number=node.serial),
             emulated=node.emulated,
-            channel=channel_of[node.node_id],
+            channel=node.channel,
             switched_off=_switched_off(node.node_id, devices[node.node_id], pdos),
             mode=choose_mode(devices[node.node_id]) if kind == "drive" else None,
             interpolation=interpolations(devices[node.node_id], sync.period_us) if kind == "drive" else (),

@@ -96,6 +96,7 @@ class PlannedPdo:
         node_id: the node.
         direction: from the device's view.
         number: 1 for 1400h/1600h or 1800h/1A00h.
+        channel: of the bus that it is on.
         layout: COB-ID, mapping entries and transmission type.
         rate_hz: how often it is on the bus; for an event-driven one the slowest rate.
         bits_worst: length on the wire with worst-case stuffing.
@@ -104,7 +105,6 @@ class PlannedPdo:
             the bus is overloaded.
         event_timer_ms: 14xxh:05, 0 without.
         kind: of the node.
-        channel: of the bus that it is on; empty until that is planned.
         used: False for a TPDO that nobody needs and that cannot be switched off.
         fixed_id: its COB-ID cannot be changed.
         own_bits: bits 29 and 30 of its COB-ID, as the device has them.
@@ -114,6 +114,7 @@ class PlannedPdo:
     node_id: int
     direction: Direction
     number: int
+    channel: str
     layout: PdoLayout
     rate_hz: float
     bits_worst: int
@@ -121,7 +122,6 @@ class PlannedPdo:
     response_ns: int | None = None
     event_timer_ms: int = 0
     kind: NodeKind = "drive"
-    channel: str = ""
     used: bool = True
     fixed_id: bool = False
     own_bits: int = 0
@@ -214,6 +214,8 @@ class Demand:
 class CycleBudget:
     """The worst course of one cycle, ns after its SYNC is due; None without such a part, or without a bound.
 
+    Of several buses each time is that of the last: the controller waits for the feedback of all of them.
+
     Attributes:
         period_ns: of SYNC.
         looks_ns: when the cell looks for TPDOs.
@@ -253,7 +255,7 @@ class Traffic:
         parts: the same by (what, share).
         demands: peaks behind one SYNC.
         sync_response_ns: worst-case response time of SYNC.
-        budget: of one cycle.
+        budget: of one cycle of the cell, with all its buses.
     """
 
     load: float
@@ -295,15 +297,16 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class JointSpeeds:
-    """Fastest joint motion of the task, and what is allowed, one value a joint, deg/s; of a prismatic joint mm/s."""
+    """Fastest joint motion of the task, and what is allowed, one value a joint, each in its unit: deg/s or mm/s."""
 
-    needed_deg_s: tuple[float, ...]
-    limit_deg_s: tuple[float, ...]
+    needed: tuple[float, ...]
+    limit: tuple[float, ...]
+    units: tuple[str, ...]
 
     @property
     def worst_share(self) -> float:
         """Largest share of its limit that a joint is asked for; above 1 it cannot."""
-        return max(need / limit for need, limit in zip(self.needed_deg_s, self.limit_deg_s, strict=True))
+        return max(need / limit for need, limit in zip(self.needed, self.limit, strict=True))
 
 
 @dataclass(frozen=True, slots=True)
@@ -316,7 +319,7 @@ class Plan:
         pdos: by priority on the bus.
         raw: frames of an array that is no CANopen node.
         sync: the cycle.
-        buses: that of the arm first, then one of the sensor's own where it has one.
+        buses: that of the first joint first, then the others in the order of the joints, the array's last.
         choices: what the scene left open; `setup` has the values.
         joint_speeds: None without an arm.
         outputs: files that a run writes.
@@ -345,7 +348,7 @@ class Plan:
 
     @property
     def traffic(self) -> Traffic:
-        """Traffic of the bus that sets the pace: the arm's, or the only one."""
+        """Traffic of the first bus: the only one, or that of the first joint."""
         return self.buses[0].traffic
 
     @property
@@ -359,7 +362,7 @@ class Plan:
         channels = dict.fromkeys(node.channel for node in self.nodes if node.emulated)
         array = self.setup.array
         if array is not None and array.raw is not None and array.emulated:
-            channels[array.channel or self.setup.bus.channel] = None
+            channels[array.channel] = None
         return tuple(channels)
 
     @property

@@ -196,13 +196,13 @@ class _Stops:
     def inside(self, low: Array, high: Array) -> NDArray[np.bool_]:
         """For each joint whether a range of positions, (n,) rad or m each, is allowed."""
         model = self.arm.model
-        margin = self.limits.joint_margin * model.radian
+        margin = self.limits.joint_margin
         inside: NDArray[np.bool_] = (low >= model.q_min + margin) & (high <= model.q_max - margin)
         return inside
 
     def allowed(self, joint: int) -> str:
         """A joint's range, for people."""
-        a, kept = self.arm.model.joints[joint], self.limits.joint_margin * float(self.arm.model.radian[joint])
+        a, kept = self.arm.model.joints[joint], float(self.limits.joint_margin[joint])
         low, high, margin = a.shown(a.q_min), a.shown(a.q_max), a.shown(kept)
         return f"{low + margin:g} to {high - margin:g} {a.unit} ({margin:g} {a.unit} from its stops)"
 
@@ -210,7 +210,7 @@ class _Stops:
         """Joints that would start outside."""
         q, joints = self.arm.q_start, self.arm.model.joints
         return [
-            f"joints.{joints[i].name}.start_deg: at {joints[i].text(q[i], 'g')}, allowed {self.allowed(i)}"
+            f"joints.{joints[i].name}.start_{joints[i].unit}: at {joints[i].text(q[i], 'g')}, allowed {self.allowed(i)}"
             for i in np.flatnonzero(~self.inside(q, q)).tolist()
         ]
 
@@ -229,15 +229,16 @@ class _Stops:
         return JointSpeeds(
             tuple(round(joint.shown(rate), 3) for joint, rate in zip(joints, needed.tolist(), strict=True)),
             tuple(round(joint.shown(rate), 3) for joint, rate in zip(joints, limit.tolist(), strict=True)),
+            tuple(f"{joint.unit}/s" for joint in joints),
         )
 
 
 def _too_fast(arm: Arm, speeds: JointSpeeds, way_out: str) -> list[str]:
     """One line for every joint that the task asks to be too fast."""
-    each = zip(arm.model.joints, speeds.needed_deg_s, speeds.limit_deg_s, strict=True)
+    each = zip(speeds.needed, speeds.limit, speeds.units, strict=True)
     return [
-        f"task: joint {i} would need {need:.0f} {joint.unit}/s, allowed {limit:.0f}; {way_out}"
-        for i, (joint, need, limit) in enumerate(each, start=1)
+        f"task: joint {i} would need {need:.0f} {unit}, allowed {limit:.0f}; {way_out}"
+        for i, (need, limit, unit) in enumerate(each, start=1)
         if need > limit
     ]
 
@@ -286,7 +287,8 @@ def _check_swing(task: Free, stops: _Stops, *, starts: bool) -> tuple[JointSpeed
     speeds = stops.speeds(swing * 2 * math.pi / task.period_s)
     problems = stops.problems(np.array((start - swing, start + swing))) if starts else []
     slower = task.period_s * max(speeds.worst_share, 1.0) * 1.01
-    way_out = f"swing slower (task.swing_period_s = {slower:.3g}) or less (swing_deg of the joints)"
+    keys = " and ".join(dict.fromkeys(f"swing_{joint.unit}" for joint in task.arm.model.joints))
+    way_out = f"swing slower (task.swing_period_s = {slower:.3g}) or less ({keys} of the joints)"
     return speeds, problems + _too_fast(task.arm, speeds, way_out)
 
 

@@ -63,6 +63,15 @@ def operation_problems(device: Abilities) -> list[str]:
     return problems
 
 
+def homing_problems(device: Abilities) -> list[str]:
+    """Why a device cannot be homed, whatever the method."""
+    listed = device.description.modes
+    if listed is None or OperationMode.HOMING in listed:
+        return []
+    names = ", ".join(map(_mode_text, sorted(listed))) or "none"
+    return [f"{device.eds}: its modes (6502h) are {names}; needed: {_mode_text(OperationMode.HOMING)}"]
+
+
 def _modes_offered(device: Abilities) -> str:
     listed = device.description.modes
     lacking = [f"{index:04X}h:{sub:02X}" for mode, (index, sub) in TARGETS.items() if listed is None or mode in listed]

@@ -7,14 +7,16 @@ that cannot be switched off is planned as what it is: traffic.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from canprobe.eds.packaged import has_long_pdos, has_window_size
-from canprobe.planning.devices import COMMUNICATION, Abilities
+from canprobe.planning.devices import COMMUNICATION, INVALID, Abilities
 from canprobe.planning.model import EVERY_SYNC, Direction, NodeKind, PlannedPdo, SyncPlan
 from canprobe.planning.operation import TARGETS, Place, choose_mode
 from canprobe.planning.traffic import SYNCHRONOUS, frame_bits
+from canprobe.protocol.frames import is_restricted
 from canprobe.protocol.pdo import MAX_BITS, PdoEntry, PdoLayout
 from canprobe.protocol.tactile import WINDOW, image_words, window_words
 from canprobe.scene.setup import Array, Setup
@@ -29,7 +31,10 @@ DUMMY_INTEGER32 = 0x0004
 
 DRIVE_TPDOS, DRIVE_RPDOS = (0x180, 0x280, 0x380, 0x480), (0x200, 0x300, 0x400, 0x500)
 """By use: the first PDO of a drive that is used has the first, whatever its number."""
-TACTILE_TPDO1 = 0x511  # 180h + 16 would beat every RPDO; below them all it waits for none of the drives' frames
+TACTILE_TPDO1 = 0x511
+"""Of the array, and those that follow it: 180h + 16 would beat every RPDO; behind them all it delays no drive's frame.
+RPDO4 of nodes 17 to 49 have them by default: where there are such nodes, the array has others."""
+_LAST_COB_ID, _FIRST_COB_ID = 0x57F, 0x481
 TACTILE_DEADLINE_CYCLES = 2
 RESENT_MS, LOST_MS = 100, 250
 """How often a PDO that is sent on a change comes at the slowest, and when its receiver takes it for lost."""
@@ -61,11 +66,13 @@ class PdoPlanning:
         setup: of the scene.
         sync: the cycle.
         devices: what each node can.
+        channels: of the bus that each node is on.
     """
 
     setup: Setup
     sync: SyncPlan
     devices: Mapping[int, Abilities]
+    channels: Mapping[int, str]
     pdos: list[PlannedPdo] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     not_available: list[tuple[str, str]] = field(default_factory=list)
@@ -104,6 +111,7 @@ class PdoPlanning:
                 node_id=node_id,
                 direction=direction,
                 number=number,
+                channel=self.channels[node_id],
                 layout=layout,
                 rate_hz=1000 / RESENT_MS if on_event else self.sync.rate_hz / layout.transmission_type,
                 bits_worst=frame_bits(layout.length, self.setup.bus),
@@ -190,11 +198,14 @@ def plan_drive_pdos(planning: PdoPlanning) -> None:
     for node_id, why in without.items() if arm.grouped else ():
         text = f"{planning.devices[node_id].eds}: {why}, so each drive keeps its own target RPDO"
         planning.not_available.append(("two targets in one RPDO", text))
-    for axis, node_id in enumerate(arm.node_ids):
+    beside: dict[str, list[int]] = {}  # two drives share an RPDO on one bus only
+    for node_id in arm.node_ids:
+        mine = beside.setdefault(planning.channels[node_id], [])
+        mine.append(node_id)
         if not arm.grouped or without:
             _plan_commands(planning, node_id)
         else:
-            _plan_grouped(planning, node_id, arm.node_ids[axis - axis % 2])
+            _plan_grouped(planning, node_id, mine[(len(mine) - 1) // 2 * 2])
     for node_id in arm.node_ids:
         _plan_tolerated(planning, node_id)
 
@@ -303,6 +314,7 @@ def _plan_tolerated(planning: PdoPlanning, node_id: int) -> None:
                 node_id=node_id,
                 direction="tpdo",
                 number=number,
+                channel=planning.channels[node_id],
                 layout=layout,
                 rate_hz=rate,
                 bits_worst=frame_bits(layout.length, planning.setup.bus),
@@ -338,10 +350,11 @@ def plan_tactile_pdos(planning: PdoPlanning, ratio: int) -> None:
         size = next(words for words in FD_WORDS if words <= len(rest)) if long else 1
         parcels.append(rest[:size])
         rest = rest[size:]
+    cob_ids = _tactile_cob_ids(planning, len(parcels))
     for number, objects in enumerate(parcels, start=1):
         entries = planning.entries(array.node_id, "tpdo", *objects)
         if entries and _maps(planning, array.node_id, number, entries):
-            layout = PdoLayout(TACTILE_TPDO1 + number - 1, tuple(entries), ratio, fd=long)
+            layout = PdoLayout(cob_ids[number - 1], tuple(entries), ratio, fd=long)
             cycles = min(TACTILE_DEADLINE_CYCLES, ratio)
             planning.add(array.node_id, "tpdo", number, layout, kind="tactile", cycles=cycles)
 
@@ -356,6 +369,17 @@ def _lacking_words(device: Abilities, array: Array) -> str | None:
         f"{device.eds} has {words} objects of 8 taxels (2100h), and the {taxels} of the array {array.name} need"
         f" {needed}: it is the EDS of another array, or sensor.rows and sensor.columns are wrong"
     )
+
+
+def _tactile_cob_ids(planning: PdoPlanning, count: int) -> list[int]:
+    """The lowest free identifiers from `TACTILE_TPDO1` on, ascending; lower ones where those are not enough."""
+    taken = {pdo.cob_id for pdo in planning.pdos}
+    for device in planning.devices.values():
+        words = [device.number(COMMUNICATION["rpdo"] + number - 1, 1) for number in device.pdo_numbers("rpdo")]
+        taken |= {word & 0x7FF for word in words if word is not None and not word & INVALID}
+    places = (*range(TACTILE_TPDO1, _LAST_COB_ID + 1), *range(TACTILE_TPDO1 - 1, _FIRST_COB_ID - 1, -1))
+    free = (cob_id for cob_id in places if cob_id not in taken and not is_restricted(cob_id))
+    return sorted(itertools.islice(free, count))
 
 
 def _maps(planning: PdoPlanning, node_id: int, number: int, entries: Sequence[PdoEntry]) -> bool:

@@ -266,12 +266,11 @@ def _raw_rows(plan: Plan) -> Iterator[list[str]]:
 
 
 def _speed_rows(plan: Plan) -> Iterator[list[str]]:
-    speeds, arm = plan.joint_speeds, plan.setup.arm
-    if speeds is not None and arm is not None:
-        yield ["joint", "needed deg/s", "allowed deg/s"]
-        rows = zip(arm.model.joints, speeds.needed_deg_s, speeds.limit_deg_s, strict=True)
-        for number, (joint, needed, limit) in enumerate(rows, start=1):
-            yield [f"{number}{' (mm/s)' if joint.prismatic else ''}", f"{needed:.1f}", f"{limit:g}"]
+    if (speeds := plan.joint_speeds) is not None:
+        yield ["joint", "needed", "allowed", "unit"]
+        rows = zip(speeds.needed, speeds.limit, speeds.units, strict=True)
+        for number, (needed, limit, unit) in enumerate(rows, start=1):
+            yield [str(number), f"{needed:.1f}", f"{limit:g}", unit]
 
 
 def _content(entries: Sequence[PdoEntry]) -> str:

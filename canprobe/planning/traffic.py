@@ -13,6 +13,7 @@ from canprobe.planning.model import (
     SYNC_OVERFLOW,
     CycleBudget,
     Demand,
+    PlannedBus,
     PlannedFrames,
     PlannedPdo,
     SyncPlan,
@@ -156,48 +157,75 @@ def wire_ns(bits: int, bitrate: int) -> int:
     return -(-bits * 1_000_000_000 // bitrate)
 
 
+RAW_DEVICE = 0
+"""In the place of a node id: the transmit queue of an array that is no node."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedTraffic:
+    """What is on the buses.
+
+    Attributes:
+        buses: with their traffic.
+        pdos, raw: with their response times.
+        problems: what does not fit.
+    """
+
+    buses: tuple[PlannedBus, ...]
+    pdos: tuple[PlannedPdo, ...]
+    raw: tuple[PlannedFrames, ...]
+    problems: list[str]
+
+
 def plan_traffic(
     pdos: Sequence[PlannedPdo],
     sync: SyncPlan,
-    node_ids: Sequence[int],
+    channels: Mapping[str, tuple[int, ...]],
     bus: Bus,
-    *,
     compute_ns: int = 0,
+    *,
     raw: Sequence[PlannedFrames] = (),
-) -> tuple[Traffic, list[PlannedPdo], list[PlannedFrames], list[str]]:
-    """Traffic of a set of PDOs and raw frames, both with their response times, and what does not fit.
+) -> PlannedTraffic:
+    """The buses with their traffic, PDOs and raw frames with their response times, and what does not fit.
 
     Args:
         pdos: of all nodes.
-        sync: the cycle.
-        node_ids: everything that produces a heartbeat, besides the master.
-        bus: its bit rate.
+        sync: the cycle; every bus has its SYNC.
+        channels: of each bus, with the nodes on it, which produce heartbeats as the master does.
+        bus: bit rate of all of them.
         compute_ns: what the controller takes of a cycle at most.
         raw: of an array that is no CANopen node.
     """
-    wire = on_the_wire(pdos)
-    messages = _messages(wire, sync, node_ids, bus)
-    messages = replace(messages, strangers=(*messages.strangers, *_raw_messages(raw, bus)))
-    analysis, budget = _analyse(messages, compute_ns, bus.bitrate)
-    response_ns = {response.message.cob_id: response.response_ns for response in analysis.responses}
-    bits_per_s = {
-        "SYNC": SYNC_BITS * sync.rate_hz,
-        "drives": sum(pdo.bits_worst * pdo.rate_hz for pdo in wire if pdo.kind == "drive"),
-        "tactile": sum(pdo.bits_worst * pdo.rate_hz for pdo in wire if pdo.kind == "tactile")
-        + sum(frames.bits_worst * frames.rate_hz for frames in raw),
-        "heartbeats": worst_case_bits(1) * 1000 / HEARTBEAT_PRODUCED_MS * (len(node_ids) + 1),
-    }
-    traffic = Traffic(
-        load=analysis.load,
-        parts=tuple((what, bits / bus.bitrate) for what, bits in bits_per_s.items() if bits > 0),
-        demands=tuple(_demands(wire, sync, bus.bitrate)),
-        sync_response_ns=response_ns[SYNC_ID],
-        budget=budget,
-    )
-    timed = [replace(pdo, response_ns=response_ns[pdo.cob_id]) for pdo in pdos]
-    timed.sort(key=lambda pdo: (pdo.cob_id, pdo.node_id))
-    raw_timed = [replace(frames, response_ns=response_ns.get(frames.can_id)) for frames in raw]
-    return traffic, timed, raw_timed, _problems(traffic, analysis.responses, bus)
+    wires = [on_the_wire([pdo for pdo in pdos if pdo.channel == channel]) for channel in channels]
+    raws = [[frames for frames in raw if frames.channel == channel] for channel in channels]
+    messages = [
+        _messages(wire, its, sync, ids, bus) for wire, its, ids in zip(wires, raws, channels.values(), strict=True)
+    ]
+    analyses, budget = _analyse(messages, compute_ns, bus.bitrate)
+    buses: list[PlannedBus] = []
+    timed: list[PlannedPdo] = []
+    raw_timed: list[PlannedFrames] = []
+    for (channel, node_ids), wire, its, analysis in zip(channels.items(), wires, raws, analyses, strict=True):
+        response_ns = {response.message.cob_id: response.response_ns for response in analysis.responses}
+        bits_per_s = {
+            "SYNC": SYNC_BITS * sync.rate_hz,
+            "drives": sum(pdo.bits_worst * pdo.rate_hz for pdo in wire if pdo.kind == "drive"),
+            "tactile": sum(pdo.bits_worst * pdo.rate_hz for pdo in wire if pdo.kind == "tactile")
+            + sum(frames.bits_worst * frames.rate_hz for frames in its),
+            "heartbeats": worst_case_bits(1) * 1000 / HEARTBEAT_PRODUCED_MS * (len(node_ids) + 1),
+        }
+        traffic = Traffic(
+            load=analysis.load,
+            parts=tuple((what, bits / bus.bitrate) for what, bits in bits_per_s.items() if bits > 0),
+            demands=tuple(_demands(wire, sync, bus.bitrate)),
+            sync_response_ns=response_ns[SYNC_ID],
+            budget=budget,
+        )
+        buses.append(PlannedBus(channel, node_ids, traffic))
+        mine = [replace(pdo, response_ns=response_ns[pdo.cob_id]) for pdo in pdos if pdo.channel == channel]
+        timed += sorted(mine, key=lambda pdo: (pdo.cob_id, pdo.node_id))
+        raw_timed += [replace(frames, response_ns=response_ns.get(frames.can_id)) for frames in its]
+    return PlannedTraffic(tuple(buses), tuple(timed), tuple(raw_timed), _problems(buses, analyses, bus))
 
 
 def _raw_messages(raw: Sequence[PlannedFrames], bus: Bus) -> Iterator[Message]:
@@ -213,7 +241,9 @@ def _raw_messages(raw: Sequence[PlannedFrames], bus: Bus) -> Iterator[Message]:
         yield Message(f"raw frames {can_id:03X}h", can_id, length, period, frame_ns=wire_ns(bits, bus.bitrate))
 
 
-def _messages(wire: Sequence[PlannedPdo], sync: SyncPlan, node_ids: Sequence[int], bus: Bus) -> _Messages:
+def _messages(
+    wire: Sequence[PlannedPdo], raw: Sequence[PlannedFrames], sync: SyncPlan, node_ids: Sequence[int], bus: Bus
+) -> _Messages:
     """What SYNC triggers, by its part in the cycle, and what keeps its own time."""
     queues = {"SYNC": MASTER_NODE_ID}
     cyclic: dict[str, list[Message]] = {"feedback": [], "commands": [], "other": []}
@@ -238,6 +268,9 @@ def _messages(wire: Sequence[PlannedPdo], sync: SyncPlan, node_ids: Sequence[int
             feedback_bits += best_case_bits(pdo.layout.length)
         else:
             cyclic["other"].append(message)
+    for message in _raw_messages(raw, bus):
+        strangers.append(message)
+        queues[message.name] = RAW_DEVICE
     for node in (*node_ids, MASTER_NODE_ID):
         name = f"heartbeat of node {node}"
         strangers.append(Message(name, HEARTBEAT_BASE + node, 1, HEARTBEAT_PRODUCED_MS * 1_000_000))
@@ -252,47 +285,73 @@ def _messages(wire: Sequence[PlannedPdo], sync: SyncPlan, node_ids: Sequence[int
     )
 
 
-def _analyse(messages: _Messages, compute_ns: int, bitrate: int) -> tuple[BusAnalysis, CycleBudget]:
-    """Response times behind SYNC (of a stranger behind its own event), and the budget of one cycle."""
-    period, answered = messages.sync.period_ns, messages.best_sync_ns
-    sync_ns, feedback_ns = answered, max(answered, messages.best_feedback_ns)
+def _analyse(buses: Sequence[_Messages], compute_ns: int, bitrate: int) -> tuple[list[BusAnalysis], CycleBudget]:
+    """Response times of each bus behind SYNC (of a stranger behind its own event), and the budget of one cycle.
+
+    The buses hang together by the controller: it starts when the feedback of all of them is in.
+    """
+    period = buses[0].sync.period_ns
+    best_ns = max(one.best_feedback_ns for one in buses) if any(one.feedback for one in buses) else None
+    syncs_ns: list[int] = [one.best_sync_ns for one in buses]
+    feedback_ns = max(*syncs_ns, best_ns or 0)
     for _ in range(ROUNDS):
         looks = look_times(period, feedback_ns)
-        earliest, start = controller_starts(messages, looks, feedback_ns)
-        answers = (*messages.feedback, *messages.other)
-        placed = [
-            replace(messages.sync, offset_ns=0),
-            *(replace(m, offset_ns=answered, jitter_ns=sync_ns - answered) for m in answers),
-            *(replace(m, offset_ns=earliest, jitter_ns=start + compute_ns - earliest) for m in messages.commands),
-            *messages.strangers,
+        starts = controller_starts(best_ns, looks, feedback_ns)
+        analyses = [
+            _placed(one, sync_ns, starts, compute_ns, bitrate) for one, sync_ns in zip(buses, syncs_ns, strict=True)
         ]
-        if messages.fifo_nodes:
-            analysis = worst_case_response_fifo(placed, messages.fifo_nodes, bitrate)
-        else:
-            analysis = worst_case_response(placed, bitrate)
-        late_sync = _last(analysis, (messages.sync,))
-        late_feedback = _last(analysis, messages.feedback) if messages.feedback else late_sync
-        moved = (late_sync, late_feedback) != (sync_ns, feedback_ns)
-        if late_sync is None or late_feedback is None or analysis.load >= 1 or not moved:
+        late_syncs = [_last([analysis], [one.sync]) for one, analysis in zip(buses, analyses, strict=True)]
+        late_feedback = _last(analyses, [m for one in buses for m in (one.feedback or ([] if best_ns else [one.sync]))])
+        moved = (late_syncs, late_feedback) != (syncs_ns, feedback_ns)
+        full = any(analysis.load >= 1 for analysis in analyses)
+        if None in late_syncs or late_feedback is None or full or not moved:
             break
-        sync_ns, feedback_ns = late_sync, late_feedback
+        syncs_ns, feedback_ns = [ns for ns in late_syncs if ns is not None], late_feedback
     else:  # the rounds do not end: there is no bound
-        analysis = replace(analysis, responses=tuple(replace(one, response_ns=None) for one in analysis.responses))
-    feedback, commands = _last(analysis, messages.feedback), _last(analysis, messages.commands)
-    _, start = controller_starts(messages, looks, feedback_ns)
-    known = not messages.feedback or feedback is not None
-    out = commands if messages.commands else start + compute_ns if known else None
-    return analysis, CycleBudget(
+        analyses = [
+            replace(analysis, responses=tuple(replace(one, response_ns=None) for one in analysis.responses))
+            for analysis in analyses
+        ]
+    feedback = _last(analyses, [m for one in buses for m in one.feedback])
+    commands = _last(analyses, [m for one in buses for m in one.commands])
+    _, start = controller_starts(best_ns, looks, feedback_ns)
+    known = best_ns is None or feedback is not None
+    out = commands if any(one.commands for one in buses) else start + compute_ns if known else None
+    return analyses, CycleBudget(
         period_ns=period,
         looks_ns=looks,
-        sync_ns=_last(analysis, (messages.sync,)),
+        sync_ns=_last(analyses, [buses[0].sync]),
         feedback_ns=feedback,
         start_ns=start if known else None,
         compute_ns=compute_ns,
         commands_ns=commands,
-        tactile_ns=_last(analysis, messages.other),
+        tactile_ns=_last(analyses, [m for one in buses for m in one.other]),
         slack_ns=None if out is None else period - out,
     )
+
+
+def _placed(
+    messages: _Messages, sync_ns: int, starts_ns: tuple[int, int], compute_ns: int, bitrate: int
+) -> BusAnalysis:
+    """Response times of one bus.
+
+    Args:
+        messages: on it.
+        sync_ns: by when its SYNC is through.
+        starts_ns: of the controller, the earliest and the latest.
+        compute_ns: what the controller takes at most.
+        bitrate: bit/s.
+    """
+    answered, (earliest, start) = messages.best_sync_ns, starts_ns
+    placed = [
+        replace(messages.sync, offset_ns=0),
+        *(replace(m, offset_ns=answered, jitter_ns=sync_ns - answered) for m in (*messages.feedback, *messages.other)),
+        *(replace(m, offset_ns=earliest, jitter_ns=start + compute_ns - earliest) for m in messages.commands),
+        *messages.strangers,
+    ]
+    if messages.fifo_nodes:
+        return worst_case_response_fifo(placed, messages.fifo_nodes, bitrate)
+    return worst_case_response(placed, bitrate)
 
 
 def look_times(period_ns: int, feedback_ns: int) -> tuple[int, ...]:
@@ -306,18 +365,24 @@ def look_times(period_ns: int, feedback_ns: int) -> tuple[int, ...]:
     return tuple(sorted(look for look in {first, last, min(feedback_ns, period_ns)} if look >= first))
 
 
-def controller_starts(messages: _Messages, looks: Sequence[int], feedback_ns: int) -> tuple[int, int]:
-    """Earliest and latest start of the controller after the SYNC, ns."""
-    if not messages.feedback:
+def controller_starts(best_ns: int | None, looks: Sequence[int], feedback_ns: int) -> tuple[int, int]:
+    """Earliest and latest start of the controller after the SYNC, ns.
+
+    Args:
+        best_ns: when all feedback can be in at the earliest; None where it waits for none.
+        looks: when the cell looks for it.
+        feedback_ns: when it is in at the latest.
+    """
+    if best_ns is None:
         return looks[0], looks[0]
-    earliest = min(max(looks[0], messages.best_feedback_ns), looks[-1])
+    earliest = min(max(looks[0], best_ns), looks[-1])
     return earliest, next((look for look in looks if look >= feedback_ns), looks[-1])
 
 
-def _last(analysis: BusAnalysis, messages: Sequence[Message]) -> int | None:
-    """The latest end of several messages after the SYNC; None without a bound."""
+def _last(analyses: Sequence[BusAnalysis], messages: Sequence[Message]) -> int | None:
+    """The latest end of several messages after the SYNC, on whatever bus; None without a bound."""
     names = {message.name for message in messages}
-    found = [response.response_ns for response in analysis.responses if response.message.name in names]
+    found = [one.response_ns for analysis in analyses for one in analysis.responses if one.message.name in names]
     return None if None in found or not found else max(ns for ns in found if ns is not None)
 
 
@@ -334,35 +399,51 @@ def _demands(wire: Sequence[PlannedPdo], sync: SyncPlan, bitrate: int) -> Iterat
         yield Demand("tactile frame and all above it", cycles, wire_ns(used, bitrate), cycles * sync.period_ns)
 
 
-def _problems(traffic: Traffic, responses: Sequence[Response], bus: Bus) -> list[str]:
-    """What does not fit: load and demands, or else the cycle, or else the first message that is late."""
-    budget, problems = traffic.budget, []
+def _problems(buses: Sequence[PlannedBus], analyses: Sequence[BusAnalysis], bus: Bus) -> list[str]:
+    """What does not fit: load and demands of a bus, or else the cycle, or else the first late message of each bus."""
+    found = [(one.channel, problem) for one in buses for problem in _excess(one.traffic)]
+    if not found and (behind := _behind(buses[0].traffic.budget)) is not None:
+        found = [(" and ".join(one.channel for one in buses), behind)]
+    else:
+        full = {channel for channel, _ in found}
+        for one, analysis in zip(buses, analyses, strict=True):
+            if one.channel not in full and (late := [each for each in analysis.responses if not each.fits]):
+                found.append((one.channel, _lateness(late)))
+    queue = ", every node's oldest frame first" if bus.transmit_queue == "fifo" else ""
+    return [f"bus {channel} at {bus.bitrate} bit/s{queue}: {problem}" for channel, problem in found]
+
+
+def _excess(traffic: Traffic) -> Iterator[str]:
+    """Load and demands of one bus that are more than it carries."""
     if traffic.load > 1:
         parts = ", ".join(f"{what} {100 * share:.0f} %" for what, share in traffic.parts)
-        problems.append(f"worst-case load {100 * traffic.load:.0f} % ({parts})")
-    problems += [
-        f"{demand.what} take {demand.used_ns / 1000:.0f} µs of the {demand.available_ns / 1000:.0f} µs "
-        f"in {demand.cycles} cycle{'s' if demand.cycles > 1 else ''}"
-        for demand in traffic.demands
-        if demand.used_ns > demand.available_ns
-    ]
-    late = [response for response in responses if not response.fits]
-    if problems:
-        pass
-    elif budget.slack_ns is not None and budget.start_ns is not None and budget.slack_ns < 0:
-        last = "the last RPDO is through" if budget.commands_ns is not None else "the controller is done"
-        out_us, behind_us = (budget.period_ns - budget.slack_ns) / 1000, -budget.slack_ns / 1000
-        problems.append(
-            f"one cycle: the controller can start after {budget.start_ns / 1000:.0f} µs, takes "
-            f"{budget.compute_ns / 1000:.0f} µs (cycle.compute_us), and {last} after {out_us:.0f} µs, "
-            f"{behind_us:.0f} µs behind the next SYNC"
-        )
-    elif late:
-        first = late[0]
-        response = "without bound" if first.response_ns is None else f"{first.response_ns / 1000:.0f} µs"
-        problems.append(
-            f"worst-case response time of {first.message.name} is {response}, its deadline "
-            f"{first.message.due_ns / 1000:.0f} µs{f' and {len(late) - 1} more' if len(late) > 1 else ''}"
-        )
-    queue = ", every node's oldest frame first" if bus.transmit_queue == "fifo" else ""
-    return [f"bus {bus.channel} at {bus.bitrate} bit/s{queue}: {problem}" for problem in problems]
+        yield f"worst-case load {100 * traffic.load:.0f} % ({parts})"
+    for demand in traffic.demands:
+        if demand.used_ns > demand.available_ns:
+            yield (
+                f"{demand.what} take {demand.used_ns / 1000:.0f} µs of the {demand.available_ns / 1000:.0f} µs "
+                f"in {demand.cycles} cycle{'s' if demand.cycles > 1 else ''}"
+            )
+
+
+def _behind(budget: CycleBudget) -> str | None:
+    """That the cycle ends behind the next SYNC; None where it does not, or has no bound."""
+    if budget.slack_ns is None or budget.start_ns is None or budget.slack_ns >= 0:
+        return None
+    last = "the last RPDO is through" if budget.commands_ns is not None else "the controller is done"
+    out_us, behind_us = (budget.period_ns - budget.slack_ns) / 1000, -budget.slack_ns / 1000
+    return (
+        f"one cycle: the controller can start after {budget.start_ns / 1000:.0f} µs, takes "
+        f"{budget.compute_ns / 1000:.0f} µs (cycle.compute_us), and {last} after {out_us:.0f} µs, "
+        f"{behind_us:.0f} µs behind the next SYNC"
+    )
+
+
+def _lateness(late: Sequence[Response]) -> str:
+    """The first message of a bus that is late."""
+    first = late[0]
+    response = "without bound" if first.response_ns is None else f"{first.response_ns / 1000:.0f} µs"
+    return (
+        f"worst-case response time of {first.message.name} is {response}, its deadline "
+        f"{first.message.due_ns / 1000:.0f} µs{f' and {len(late) - 1} more' if len(late) > 1 else ''}"
+    )

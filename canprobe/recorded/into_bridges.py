@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from canprobe.bus.disk import read_candump, read_npz
+from canprobe.bus.disk import read_candump
 from canprobe.bus.port import MonotonicClock, TimedFrame
 from canprobe.cell.controller import Command
 from canprobe.cell.cycle import Observation
@@ -19,14 +19,13 @@ from canprobe.planning.make import make_plan
 from canprobe.planning.model import Plan
 from canprobe.protocol.frames import SYNC_ID
 from canprobe.recorded.cycles import LogCycles
-from canprobe.recorded.recording import Recording, read_recording
+from canprobe.recorded.recording import read_recording
 from canprobe.recorded.reestimate import ReplayResult, find_log, replay, scene_of
-from canprobe.results.summary import check_clock
+from canprobe.recorded.run_folder import RunFolder, read_run
 from canprobe.scene.model import BridgeSettings, Scene
 from canprobe.scene.resolve import resolve
 from canprobe.session.children import Bridges
 from canprobe.session.session import Say
-from canprobe.session.target import LOCKSTEP
 from canprobe.touch.estimate.answer import SurfaceEstimate
 
 LOGGED = ("phase", "depth_at_1n_mm")
@@ -95,21 +94,43 @@ def _in_real_time(observations: Iterator[Observation]) -> Iterator[Observation]:
 
 def _observations(plan: Plan, path: Path, folder: Path | None, result: ReplayResult | None) -> Iterator[Observation]:
     """The observations of a recorded log; `folder` of the run, None for another log; `result` of the estimators."""
-    as_taken = folder is not None and plan.scene.bus.interface != LOCKSTEP
-    ours = folder is not None if result is None else result.summary["driven_by"] == "task"
-    recording = read_recording(path, plan, as_taken=as_taken)
-    groups = _frames_by_sync(path, recording)
+    estimates = _estimates(result)
+    run = read_run(folder) if folder is not None else None
+    if run is not None:
+        yield from _observations_of(run, path, plan, estimates)
+        return
+    recording = read_recording(path, plan)
+    groups = frames_by_sync(path, recording.channel, plan)
     before = next(groups)
     if before:
         yield Observation(before[-1][2], None, None, before)
-    cycles = LogCycles(plan, recording, as_taken=as_taken, on_deadlines=ours, drifts=folder is None)
-    columns = _columns(folder, cycles.start_ns, plan.sync.period_ns) if ours else {}
-    estimates = _estimates(result)
-    for cycle, frames in zip(cycles, groups, strict=True):
-        m = cycle.measurement
-        logged, estimate = columns.get(m.t_ns, {}), estimates.get(m.t_ns)
-        command = Command(columns=logged, estimate=estimate) if logged or estimate is not None else None
+    cycles = LogCycles(plan, recording)
+    for m, frames in zip(cycles, groups, strict=True):
+        estimate = estimates.get(m.t_ns)
+        command = None if estimate is None else Command(estimate=estimate)
         yield Observation(cycles.start_ns + m.t_ns, m, command, frames)
+
+
+def _observations_of(
+    run: RunFolder, path: Path, plan: Plan, estimates: dict[int, SurfaceEstimate]
+) -> Iterator[Observation]:
+    """The observations of a run: what its master measured, with the frames from each SYNC to the next."""
+    groups = frames_by_sync(path, plan.buses[0].channel, plan) if path.is_file() else iter(())
+    if before := next(groups, []):
+        yield Observation(before[-1][2], None, None, before)
+    start_ns = round(run.start_s * 1e9)
+    waiting = next(groups, [])
+    deadlines = [*run.times_ns[1:].tolist(), math.inf]
+    names = [name for name in LOGGED if name in run.log]
+    for k, m in enumerate(run.measurements()):
+        frames: list[TimedFrame] = []
+        while waiting and waiting[0][2] - start_ns < deadlines[k]:
+            frames += waiting
+            waiting = next(groups, [])
+        columns = {name: float(run.log[name][k]) for name in names if np.isfinite(run.log[name][k])}
+        estimate = estimates.get(m.t_ns)
+        command = Command(columns=dict(columns), estimate=estimate) if columns or estimate is not None else None
+        yield Observation(start_ns + m.t_ns, m, command, frames)
 
 
 def _estimates(result: ReplayResult | None) -> dict[int, SurfaceEstimate]:
@@ -117,32 +138,14 @@ def _estimates(result: ReplayResult | None) -> dict[int, SurfaceEstimate]:
     return {} if result is None else {round(r.told_s * 1e9): r.estimate for r in result.tracker.records}
 
 
-def _columns(folder: Path | None, start_ns: int, period_ns: int) -> dict[int, dict[str, float | NDArray[np.float64]]]:
-    """The columns of the task that bridges use, from the run's log, by the cycle's time since the first, ns.
-
-    ``start_ns`` comes from the stamps of SYNCs, of which some are late by less than half a period.
-    """
-    if folder is None or not (folder / "log.npz").is_file():
-        return {}
-    log = read_npz(folder / "log.npz")
-    check_clock(folder / "log.npz", log)
-    names = [name for name in LOGGED if name in log]
-    cycles = np.round((log["t_s"] * 1e9 - start_ns) / period_ns) if names else np.empty(0)
-    times = (cycles.astype(np.int64) * period_ns).tolist()
-    rows = zip(*(log[name].tolist() for name in names), strict=True)
-    return {
-        t_ns: {name: value for name, value in zip(names, row, strict=True) if np.isfinite(value)}
-        for t_ns, row in zip(times, rows, strict=False)
-    }
-
-
-def _frames_by_sync(path: Path, recording: Recording) -> Iterator[list[TimedFrame]]:
-    """All frames of the cell's channel: those before the first SYNC, then from each SYNC to the next."""
+def frames_by_sync(path: Path, first: str, plan: Plan) -> Iterator[list[TimedFrame]]:
+    """All frames of the cell's buses: those before the first SYNC, then from each SYNC on the first bus to the next."""
+    others = {bus.channel for bus in plan.buses[1:]}
     frames: list[TimedFrame] = []
     for t_ns, channel, can_id, data in read_candump(path):
-        if channel != recording.channel:
+        if channel != first and channel not in others:
             continue
-        if can_id == SYNC_ID and len(data) <= 1:
+        if can_id == SYNC_ID and len(data) <= 1 and channel not in others:
             yield frames
             frames = []
         frames.append((can_id, data, t_ns))

@@ -1,4 +1,4 @@
-"""A recorded bus as the cell needs it: the frames of the planned nodes, in order, with the deadlines of their SYNCs."""
+"""A recorded bus as the cell needs it: the frames of the planned nodes, in the order of the bus."""
 
 from __future__ import annotations
 
@@ -69,15 +69,13 @@ class _Channel:
     malformed: int = 0
 
 
-def read_recording(path: Path, plan: Plan, *, as_taken: bool) -> Recording:
-    """Read the frames of a plan's nodes from a log.
+def read_recording(path: Path, plan: Plan) -> Recording:
+    """Read the frames of a plan's nodes from a log, sorted into the order of the bus.
 
     Args:
         path: the log; it may hold other nodes, other channels and error frames. The buses of a plan with several of
             them have the plan's names in the log, and are read as one.
         plan: gives the identifiers and lengths.
-        as_taken: keep lines and stamps as they are: a cell on a real bus writes its lines in the order of reception.
-            False sorts them into the order of the bus.
 
     Raises:
         UsageError: no such file, a torn line, a node without any TPDO, no SYNC, or SYNCs of another rate.
@@ -86,7 +84,7 @@ def read_recording(path: Path, plan: Plan, *, as_taken: bool) -> Recording:
     name = max(channels, key=lambda c: (channels[c].answers, len(channels[c].frames)), default="")
     chosen = channels.get(name, _Channel())
     _check_heard(path, plan, name, chosen)
-    frames = chosen.frames if as_taken else _in_bus_order(chosen.frames)
+    frames = _in_bus_order(chosen.frames)
     syncs = [i for i, frame in enumerate(frames) if frame[0] == SYNC_ID]
     times = np.array([frame[2] for frame in frames], np.int64)
     recording = Recording(
@@ -164,90 +162,3 @@ def _check_syncs(recording: Recording, plan: Plan) -> None:
             f"{where} a SYNC every {period * 1e-6:.3f} ms, but scene {plan.setup.name} has one every"
             f" {plan.sync.period_ns * 1e-6:.3f} ms; set cycle.rate_hz"
         )
-
-
-# The deadline of each recorded SYNC, a multiple of the period after the first.
-
-Numbers = NDArray[np.int64]
-_TRIALS = 64
-_EARLIER = 8
-"""The phase may be earlier than that of the least lateness by a period over this."""
-
-
-def find_deadlines(stamps_ns: Numbers, period_ns: int, block: int | None = None) -> tuple[Numbers, Numbers]:
-    """The deadline of each SYNC.
-
-    A SYNC is sent at its deadline or less than a period later, and one deadline never has two. The phase of the
-    deadlines is the one that obeys this with the least lateness; stamps may be a microsecond early.
-
-    Args:
-        stamps_ns: when each SYNC was sent (n,), ns, increasing, in whole microseconds as in candump.
-        period_ns: of the cycle.
-        block: number of SYNCs after which the phase is found again, where the clock of the stamps drifts against the
-            producer's; None where they are the same clock.
-
-    Returns:
-        Number of each deadline (n,), in periods since the first one, strictly increasing; and the deadline itself
-        (n,), ns on the clock of the stamps.
-    """
-    deadlines = np.empty(len(stamps_ns), np.int64)
-    numbers = np.empty(len(stamps_ns), np.int64)
-    phase: int | None = None
-    for first in range(0, len(stamps_ns), block or max(1, len(stamps_ns))):
-        part = stamps_ns[first : first + block] if block else stamps_ns
-        found = _phase(part, period_ns)
-        if phase is not None:  # the same deadlines, drifted: within half a period of the last block's
-            found = phase + (found - phase + period_ns // 2) % period_ns - period_ns // 2
-        phase = found
-        numbers[first : first + len(part)] = (part - phase) // period_ns
-        deadlines[first : first + len(part)] = part - (part - phase) % period_ns
-    place = np.arange(len(numbers))
-    numbers = np.minimum.accumulate((numbers - place)[::-1])[::-1] + place  # of two at one deadline the first is late
-    return np.asarray(numbers - numbers[:1], dtype=np.int64), deadlines
-
-
-def _phase(stamps_ns: Numbers, period_ns: int) -> int:
-    """The deadlines' phase, 0 ≤ phase < period: among the stamps' own, so never later than any of them by chance."""
-    residues = np.sort(stamps_ns % period_ns)
-    candidates, passed = np.unique(residues, return_index=True)
-    lateness = period_ns * passed.astype(float) - float(len(residues)) * candidates
-    order = np.argsort(lateness, kind="stable")[:_TRIALS]
-    trials: list[int] = candidates[order].tolist()
-    best = min(trials, key=lambda phase: _implausibility(stamps_ns, phase, period_ns))
-    return _earliest(candidates, _doubled(stamps_ns, candidates, period_ns), best, period_ns // _EARLIER)
-
-
-def _earliest(candidates: Numbers, doubled: Numbers, best: int, most_ns: int) -> int:
-    """The earliest phase before ``best`` that contradicts no more than it does.
-
-    Where many SYNCs are late, the phase of the least lateness is too late: the punctual SYNCs before it would all be a
-    whole period late.
-    """
-    i = int(np.searchsorted(candidates, best))
-    while i > 0 and doubled[i - 1] <= doubled[i] and best - candidates[i - 1] <= most_ns:
-        i -= 1
-    return int(candidates[i])
-
-
-def _doubled(stamps_ns: Numbers, phases: Numbers, period_ns: int) -> Numbers:
-    """By phase (m,), ascending: how many SYNCs have the deadline of the one before, as none lies between the two."""
-    close = np.flatnonzero(np.diff(stamps_ns) < period_ns)
-    first = np.searchsorted(phases, stamps_ns[close] % period_ns, side="right")
-    end = np.searchsorted(phases, stamps_ns[close + 1] % period_ns, side="right")
-    steps = np.zeros(len(phases) + 1, np.int64)
-    np.add.at(steps, first, 1)
-    np.add.at(steps, end, -1)
-    between = np.cumsum(steps)[:-1] + np.count_nonzero(end < first)
-    return np.asarray(len(close) - between, dtype=np.int64)
-
-
-def _implausibility(stamps_ns: Numbers, phase: int, period_ns: int) -> tuple[int, float]:
-    """Contradictions of a phase; and the lateness, by its root: many punctual and one late, not all a little late.
-
-    Two SYNCs at one deadline contradict it, and so does a first SYNC that is nearly a period late: no SYNC before it
-    distinguishes an early one from a late one.
-    """
-    numbers, lateness = np.divmod(stamps_ns - phase, period_ns)
-    steps, waits = np.diff(numbers), np.diff(stamps_ns)
-    first = bool(len(steps)) and steps[0] > 1 and 2 * waits[0] < 3 * period_ns
-    return int(np.count_nonzero(steps < 1)) + int(first), float(np.sqrt(lateness).sum())

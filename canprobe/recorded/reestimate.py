@@ -1,4 +1,4 @@
-"""A recorded run, estimated again from its log alone: candump in, shape and summary out."""
+"""A run, or a recorded bus, estimated again: measurements in, shape and summary out."""
 
 from __future__ import annotations
 
@@ -14,70 +14,99 @@ from canprobe.bus.disk import read_npz, write_npz
 from canprobe.errors import ProtocolError, UsageError
 from canprobe.planning.make import make_plan
 from canprobe.planning.model import Plan
-from canprobe.recorded.cycles import LogCycles, TaskReplay, replay_contacts, replay_task
-from canprobe.recorded.recording import Recording, read_recording
+from canprobe.recorded.cycles import LogCycles, replay_contacts
+from canprobe.recorded.recording import read_recording
+from canprobe.recorded.run_folder import RunFolder, read_run, replay_task
 from canprobe.results.scores import estimate_columns, map_of_scan
 from canprobe.results.summary import curvature_text, finite_or_none, shape_lines, summarise_shape
 from canprobe.scene.load import load_scene
 from canprobe.scene.model import Scene
 from canprobe.scene.resolve import resolve
-from canprobe.session.target import LOCKSTEP
 from canprobe.tasks.from_plan import estimates_of
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
 from canprobe.touch.estimate.fit import METHODS, unknown_method
 
 Array = NDArray[np.float64]
-SCHEMA = 1
+SCHEMA = 2
 _SCORED = ("kappa", "direction1", "direction2", "contact_normal", "contact_point")
 """Columns of the truth that estimates are scored against."""
 
 
-def summarise_replay(
-    plan: Plan,
-    recording: Recording,
-    cycles: LogCycles,
-    task: TaskReplay,
-    *,
-    tracker: ShapeTracker,
-    unplaced: int,
-    estimates: dict[str, list[ShapeRecord]],
-    folder: Path | None,
-) -> dict[str, Any]:
-    """The summary of a `ReplayResult`; what does not apply is None.
+@dataclass(frozen=True, slots=True)
+class Contacts:
+    """What a record says of the contacts, for estimates and the summary.
 
-    Args:
-        plan: of the scene.
-        recording: the log.
-        cycles: of the log, iterated to the end.
-        task: the comparison with the scene's task.
-        tracker: the contacts.
-        unplaced: number of contacts without the joints of their instant.
-        estimates: by name.
-        folder: of the run, for ``truth.npz`` and ``log.npz``; None for a log alone.
+    Attributes:
+        tracker: the contacts, and the answers of the scene's estimator.
+        driven_by: ``task``: the scene's task made its scan, and was stepped again; ``other``: every contact was used.
+        start_s: time of the first cycle, s, on the record's clock.
+        times_s: time of each cycle (n,), s, since the first.
+        counts: what was counted, by name.
+        channel: of the log; None for the folder of a run.
     """
+
+    tracker: ShapeTracker
+    driven_by: str
+    start_s: float
+    times_s: Array
+    counts: dict[str, int]
+    channel: str | None
+
+
+def _from_run(plan: Plan, run: RunFolder) -> Contacts:
+    """The contacts of a run, as its master measured them."""
+    task = replay_task(plan, run)
+    if task is not None and task.shape is not None and task.shape.samples:
+        tracker, unplaced, driven_by = task.shape, task.record().unplaced, "task"
+    else:
+        tracker, unplaced = replay_contacts(plan, run.measurements())
+        driven_by = "other"
+    counts = {"cycles": len(run.times_ns), "unplaced_contacts": unplaced}
+    return Contacts(tracker, driven_by, run.start_s, run.log["t_s"] - run.start_s, counts, None)
+
+
+def _from_log(plan: Plan, path: Path) -> Contacts:
+    """The contacts in a recorded bus."""
+    recording = read_recording(path, plan)
+    cycles = LogCycles(plan, recording)
+    try:
+        tracker, unplaced = replay_contacts(plan, cycles)
+    except ProtocolError as error:
+        raise UsageError(f"{path}: on {recording.channel}: {error}") from error
+    assert cycles.drives is not None and cycles.tactile is not None
+    counts = {
+        "cycles": len(cycles.sync_times_s),
+        "lost_syncs": cycles.lost_syncs,
+        "missed_pdos": cycles.drives.missed,
+        "malformed_pdos": recording.malformed,
+        "torn_frames": cycles.tactile.torn,
+        "lost_frames": cycles.tactile.lost,
+        "stale_frames": cycles.tactile.stale,
+        "unplaced_contacts": unplaced,
+        "error_frames": recording.error_frames,
+    }
+    times_s = np.array(cycles.sync_times_s)
+    return Contacts(tracker, "other", cycles.start_ns * 1e-9, times_s, counts, recording.channel)
+
+
+def _summarise(
+    plan: Plan, source: Path, contacts: Contacts, estimates: dict[str, list[ShapeRecord]], folder: Path | None
+) -> dict[str, Any]:
+    """The summary of a `ReplayResult`; what does not apply is None. `folder` of the run, for its truth and its log."""
     truth = _truth(folder / "truth.npz") if folder is not None else {}
-    start_s = cycles.start_ns * 1e-9
+    tracker = contacts.tracker
     map_summary = None if plan.scene.shape is None else map_of_scan(tracker, plan.scene.shape.method)[2]
     return {
         "schema": SCHEMA,
         "scene": plan.scene.name,
-        "log": str(recording.path),
-        "channel": recording.channel,
-        "driven_by": "task" if task.drove else "other",
-        "targets": {
-            "compared": task.compared,
-            "differing": task.differing,
-            "worst_counts": task.worst_counts,
-            "lifted_s": None if task.lifted_s is None else start_s + task.lifted_s,
-            "parted_s": None if task.parted_s is None else start_s + task.parted_s,
-        },
-        "cycle": _cycle(cycles, recording, unplaced),
+        "log": str(source),
+        "channel": contacts.channel,
+        "driven_by": contacts.driven_by,
+        "cycle": contacts.counts,
         "contacts": len(tracker.samples),
-        "estimates": {name: _last(records, start_s) for name, records in estimates.items()},
-        "shape": summarise_shape(
-            plan.scene, tracker, estimates, truth, np.array(cycles.sync_times_s), map_summary=map_summary
-        ),
-        "online": _online(folder, tracker.records) if folder is not None and task.drove else None,
+        "estimates": {name: _last(records, contacts.start_s) for name, records in estimates.items()},
+        "shape": summarise_shape(plan.scene, tracker, estimates, truth, contacts.times_s, map_summary=map_summary),
+        "online": _online(folder, tracker.records) if folder is not None and contacts.driven_by == "task" else None,
     }
 
 
@@ -91,22 +120,6 @@ def _truth(path: Path) -> dict[str, Array]:
                 f"{path}: {name}: expected a row of numbers for each SYNC, got {column.dtype} of shape {column.shape}"
             )
     return columns
-
-
-def _cycle(cycles: LogCycles, recording: Recording, unplaced: int) -> dict[str, int]:
-    assert cycles.drives is not None and cycles.tactile is not None
-    return {
-        "cycles": len(cycles.sync_times_s),
-        "lost_syncs": cycles.lost_syncs,
-        "missed_pdos": cycles.drives.missed,
-        "late_pdos": cycles.drives.late,
-        "malformed_pdos": recording.malformed,
-        "torn_frames": cycles.tactile.torn,
-        "lost_frames": cycles.tactile.lost,
-        "stale_frames": cycles.tactile.stale,
-        "unplaced_contacts": unplaced,
-        "error_frames": recording.error_frames,
-    }
 
 
 def _last(records: Sequence[ShapeRecord], start_s: float) -> dict[str, Any]:
@@ -147,25 +160,22 @@ def _changes(K: Array) -> Array:
 
 def replay_text(summary: dict[str, Any]) -> str:
     """A summary as text."""
-    cycle, targets, online = summary["cycle"], summary["targets"], summary["online"]
-    if summary["driven_by"] == "task":
-        how = "the scene's task drove: its scan is replayed"
-        if targets["differing"]:
-            how += f" ({targets['differing']} of {targets['compared']} targets differ)"
-        if targets["lifted_s"] is not None:
-            how += f"; lifted off at {targets['lifted_s']:.2f} s"
-    elif targets["parted_s"] is None and 2 * targets["differing"] < targets["compared"]:
-        how = "the scene's task drove, but not to its scan: every contact is fed to the estimators"
-    elif targets["compared"]:
-        since = "" if targets["parted_s"] is None else f" (since {targets['parted_s']:.2f} s)"
-        how = f"another controller drove{since}: every contact is fed to the estimators"
-    else:
-        how = "no targets are in the log: every contact is fed to the estimators"
+    online = summary["online"]
+    how = (
+        "the scene's task drove: its scan is replayed"
+        if summary["driven_by"] == "task"
+        else "whoever drove: every contact is fed to the estimators"
+    )
+    counts = ", ".join(
+        f"{count} {name.replace('_', ' ').replace('pdos', 'PDOs').replace('syncs', 'SYNCs')}"
+        for name, count in summary["cycle"].items()
+        if count or name == "cycles"
+    )
+    where = summary["log"] if summary["channel"] is None else f"{summary['log']}, {summary['channel']}"
     lines = [
-        f"{summary['log']}, {summary['channel']}: scene {summary['scene']}",
+        f"{where}: scene {summary['scene']}",
         f"  replay     {how}",
-        f"  cycle      {cycle['cycles']}, {cycle['missed_pdos']} missed PDOs, {cycle['torn_frames']} torn frames,"
-        f" {cycle['lost_syncs']} lost SYNCs; {summary['contacts']} contacts",
+        f"  record     {counts}; {summary['contacts']} contacts",
         *_estimate_lines(summary),
     ]
     if online is not None:
@@ -192,10 +202,10 @@ class ReplayResult:
 
     Attributes:
         plan: of the scene.
-        summary: ``schema, scene, log, channel``; ``driven_by`` (``task``: the scene's task made the recorded targets
-            and was stepped again; ``other``: every contact was used) with the comparison of ``targets``; ``cycle``
-            (counts of what is missing); ``contacts``; ``estimates`` (the last of each estimator); ``shape`` as in
-            ``summary.json``; ``online`` (the difference to the run's log, None without one).
+        summary: ``schema, scene, log, channel``; ``driven_by`` (``task``: the scene's task made the scan and was
+            stepped again; ``other``: every contact was used); ``cycle`` (number of cycles, counts of what is missing);
+            ``contacts``; ``estimates`` (the last of each estimator); ``shape`` as in ``summary.json``; ``online`` (the
+            difference to the run's log, None without one).
         estimates: the answers of each estimator, by name; all times are on the log's clock, as in the summary.
         tracker: the contacts, and the answers of the scene's estimator, with times since the first SYNC.
     """
@@ -220,10 +230,10 @@ class ReplayResult:
 def replay(
     log: Path | str, *, scene: Scene | str | Path | None = None, method: str | Sequence[str] | None = None
 ) -> ReplayResult:
-    """Estimate the shape again from a recorded bus.
+    """Estimate the shape again from the folder of a run, or from a recorded bus.
 
-    The log of a run of canprobe gives the online result again. From a log of the same nodes under another master, every
-    contact is used. The summary states which of the two was done.
+    The folder of a run holds what its master measured, and gives the online result again. From a candump log of the
+    same nodes, whoever drove them, every contact is used. The summary states which of the two was done.
 
     Args:
         log: folder of a run, or a candump file.
@@ -237,26 +247,15 @@ def replay(
     path, folder = find_log(Path(log))
     plan = make_plan(resolve(scene_of(path, folder, scene)))
     methods = _methods(plan.scene, method)
-    as_taken = folder is not None and plan.scene.bus.interface != LOCKSTEP
-    recording = read_recording(path, plan, as_taken=as_taken)
-    try:
-        cycles = LogCycles(plan, recording, as_taken=as_taken, drifts=folder is None)
-        task = replay_task(plan, cycles)
-        tracker, unplaced = task.task.shape, task.task.record().unplaced
-        if not task.drove or tracker is None:
-            cycles = LogCycles(plan, recording, as_taken=as_taken, on_deadlines=False)
-            tracker, unplaced = replay_contacts(plan, cycles)
-    except ProtocolError as error:
-        raise UsageError(f"{path}: on {recording.channel}: {error}") from error
-    if not tracker.samples:
-        raise UsageError(f"{path}: nothing was touched in this log: no contact to estimate from")
-    estimates = estimates_of(plan.setup, tracker, methods)
-    summary = summarise_replay(
-        plan, recording, cycles, task, tracker=tracker, unplaced=unplaced, estimates=estimates, folder=folder
-    )
-    start_s = cycles.start_ns * 1e-9
-    on_clock = {name: on_run_clock(records, start_s) for name, records in estimates.items()}
-    return ReplayResult(plan, summary, on_clock, tracker)
+    run = read_run(folder) if folder is not None else None
+    contacts = _from_run(plan, run) if run is not None else _from_log(plan, path)
+    source = path if folder is None or run is None else folder
+    if not contacts.tracker.samples:
+        raise UsageError(f"{source}: nothing was touched in it: no contact to estimate from")
+    estimates = estimates_of(plan.setup, contacts.tracker, methods)
+    summary = _summarise(plan, source, contacts, estimates, folder)
+    on_clock = {name: on_run_clock(records, contacts.start_s) for name, records in estimates.items()}
+    return ReplayResult(plan, summary, on_clock, contacts.tracker)
 
 
 def find_log(log: Path) -> tuple[Path, Path | None]:
@@ -266,7 +265,7 @@ def find_log(log: Path) -> tuple[Path, Path | None]:
     if not log.is_dir():
         return log, None
     path = log / "bus.log"
-    if not path.is_file():
+    if not path.is_file() and not (log / "tactile.npz").is_file():
         raise UsageError(f"{log}: no bus.log in this folder; expected the folder of a run, or a candump file")
     return path, log
 

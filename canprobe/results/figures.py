@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import SubFigure
 from matplotlib.patches import Patch
 
+from canprobe.cell.log import joint_positions
 from canprobe.planning.model import Plan
 from canprobe.planning.report import Part, timeline
 from canprobe.planning.traffic import on_the_wire
@@ -54,7 +55,7 @@ def _rows(result: RunResult) -> list[list[tuple[Panel, float]]]:
         rows = [[*force, *taxels]]
         if result.summary.get("calibration") is not None:
             rows.append([(_draw_tool, 1.0)])
-        elif "q_rad" in log and log["q_rad"].ndim == 2:  # of a failed bring-up nothing may be known
+        elif joint_positions(log) is not None:  # of a failed bring-up nothing may be known
             rows.append([(_draw_joints, 1.0)])
     return [row for row in rows if row]
 
@@ -164,8 +165,9 @@ def _draw_taxels(part: SubFigure, result: RunResult) -> None:
 def _draw_joints(part: SubFigure, result: RunResult) -> None:
     """A panel a joint: joints that move alike would hide each other in one."""
     arm = result.plan.setup.arm
-    assert arm is not None
-    t, q, joints = result.log["t_s"], result.log["q_rad"], arm.model.joints
+    q = joint_positions(result.log)
+    assert arm is not None and q is not None
+    t, joints = result.log["t_s"], arm.model.joints
     columns = min(3, len(joints))
     turns = len({joint.prismatic for joint in joints}) == 1
     grid = part.subplots(-(-len(joints) // columns), columns, squeeze=False, sharex=True, sharey=turns)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.bus.disk import read_npz, whole_file, write_npz
-from canprobe.errors import UsageError
+from canprobe.errors import UsageError, install_line
 from canprobe.touch.surface_map import LocalPatch, SurfaceMap
 
 if TYPE_CHECKING:
@@ -30,10 +30,9 @@ _UNITS = {
     "hz": "Hz", "ns": "ns", "us": "us", "n": "N", "m": "m", "s": "s",
 }  # fmt: skip
 _TRUTH_UNITS = {  # the plant's own columns are SI without a suffix
-    "q": "rad", "probe_centre": "m", "force": "N", "depth": "m", "depth_rate": "m/s", "contact_point": "m",
+    "q": "rad or m", "probe_centre": "m", "force": "N", "depth": "m", "depth_rate": "m/s", "contact_point": "m",
     "kappa": "1/m", "pad_uv": "m",
 }  # fmt: skip
-_EXTRA = "pip install 'canprobe[data]'"
 _ATTRS = b"PANDAS_ATTRS"  # where pandas itself keeps a frame's attrs in Parquet
 
 
@@ -119,7 +118,7 @@ def _need(module: str, purpose: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise UsageError(f"{purpose} needs {module}: {_EXTRA}") from error
+        raise UsageError(f"{purpose} needs {module}: {install_line('data')}") from error
 
 
 # A surface map as a file: ``surface.npz``, plain arrays, no pickle.

@@ -114,6 +114,8 @@ class RunResult:
         truth: the plant's true values, one row per SYNC; empty where nothing was emulated.
         estimates: the answers of each estimator, by name; the online one first.
         taxels: (rows, columns) counts of the task's last tactile frame, or None.
+        tactile: the columns of ``tactile.npz``, one row per tactile frame that the cell used: ``t_s`` of the cycle,
+            ``t_sample_s``, ``taxels`` (m, rows, columns), their ``window``, ``features``; empty where there was none.
         surface_map: the local patches of the online estimator, or None without a shape.
         consistency: the tests at its crossings, or None.
         out: the folder with the files, or None.
@@ -125,6 +127,7 @@ class RunResult:
     truth: dict[str, Array]
     estimates: dict[str, list[ShapeRecord]] = field(default_factory=dict)
     taxels: NDArray[np.uint8] | None = None
+    tactile: dict[str, NDArray[Any]] = field(default_factory=dict)
     surface_map: SurfaceMap | None = None
     consistency: Consistency | None = None
     out: Path | None = None
@@ -231,8 +234,17 @@ def summarise(
 
 def log_columns(cell: Cell) -> dict[str, Array]:
     """The columns of ``log.npz``, on the run's clock; a run that was stopped before its first cycle has no row."""
-    log = {"t_s": np.empty(0), **cell.log.arrays()}
-    return {**log, "t_s": log["t_s"] + cell.start_ns * 1e-9}
+    return _on_run_clock({"t_s": np.empty(0), **cell.log.arrays()}, cell)
+
+
+def tactile_columns(cell: Cell) -> dict[str, NDArray[Any]]:
+    """The columns of ``tactile.npz``, on the run's clock; none where no frame was used."""
+    return _on_run_clock(cell.tactile_log.arrays(), cell)
+
+
+def _on_run_clock(columns: dict[str, NDArray[Any]], cell: Cell) -> dict[str, NDArray[Any]]:
+    start_s = cell.start_ns * 1e-9
+    return {name: column + start_s if name in ("t_s", "t_sample_s") else column for name, column in columns.items()}
 
 
 def check_clock(file: Path, log: Mapping[str, Array]) -> None:
@@ -419,6 +431,8 @@ def write_files(result: RunResult, out: Path) -> None:
     write_text(out / "summary.json", json.dumps(result.summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
     write_scene(result.plan.scene, out)
     write_npz(out / "log.npz", result.log)
+    if result.tactile:
+        write_npz(out / "tactile.npz", result.tactile)
     if (found := result.summary["calibration"]) is not None and (text := tool_text(found, result.plan.scene.name)):
         write_text(out / FILE, text)
     if result.surface_map is not None:

@@ -3,7 +3,6 @@
 - `chain` is the geometry of any serial arm of 1 to 8 joints, revolute or prismatic: poses, Jacobians and velocities
   from one evaluation on plain floats. Chains come from Denavit-Hartenberg rows, or by `urdf` out of a file.
 - `model` puts the joints to a chain (stops, speeds, motors, friction, bodies) and how drive units follow from them.
-  `puma` has both geometries of the PUMA 260 as such data.
 - `inverse` goes from poses to joints numerically: what n joints can hold of a pose, the joints for a pose from a known
   posture on, damped steps of the Jacobian near singular poses, and postures that put the probe on a surface.
 - `dynamics` has mass matrix and bias torques of an arm with what it carries, computed by MuJoCo.

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from canprobe.errors import PlanError
+from canprobe.errors import PlanError, install_line
 from canprobe.robot.chain import Array, Chain
 from canprobe.robot.model import Body
 
@@ -36,7 +36,7 @@ def dynamics_problem(name: str, bodies: Sequence[Body | None] | None) -> str | N
             '(in a URDF <inertial>), or set plant.fidelity = "ideal"'
         )
     if importlib.util.find_spec("mujoco") is None:
-        return f"{lead} needs the package mujoco: pip install 'canprobe[dynamics]'"
+        return f"{lead} needs the package mujoco: {install_line('dynamics')}"
     return None
 
 

@@ -199,6 +199,30 @@ def units_to_joints(model: ArmModel, units: npt.ArrayLike) -> Array:
     return q
 
 
+def coupled_joints(model: ArmModel, axis: int) -> frozenset[int]:
+    """The other joints on which the position of a drive depends, directly or by way of their own drives, from 0."""
+    found: set[int] = set()
+    new = {axis}
+    while new:
+        found |= new
+        new = {int(k) for i in new for k in np.flatnonzero(model.units_per_q[i])} - found
+    return frozenset(found - {axis})
+
+
+def drive_position_at(model: ArmModel, axis: int, q: float, units: npt.ArrayLike) -> float:
+    """Position of one drive, drive units, where its joint is at `q` and the other drives stand still.
+
+    Args:
+        model: the arm.
+        axis: of the drive, from 0.
+        q: position of its joint, rad or m.
+        units: (n,) positions of the drives; that of `axis`, and of drives that it is not coupled to, may be anything.
+    """
+    rows, right = model.units_per_q.copy(), np.asarray(units, dtype=float) - model.zero_units
+    rows[axis], right[axis] = np.eye(model.n)[axis], q
+    return float(model.units_per_q[axis] @ np.linalg.solve(rows, right) + model.zero_units[axis])
+
+
 # Motor coordinates: the position of a drive divided by its units per own joint, so that without coupling they are the
 # joint positions. Rotor inertia, friction and drive torque act there, one motor each; rigid bodies move at the joints.
 

@@ -2,18 +2,21 @@
 
 Fixed joints are folded into the transforms beside them. A joint's own frame is turned until its axis is z, as `Chain`
 has it. What hangs off the path (a gripper, a cover) stands still at its zero and counts as a body of the link that
-carries it.
+carries it. What links look like is read apart (`visuals_of`): only a view needs it.
 
-Source: URDF specification (wiki.ros.org/urdf/XML, joint, link, inertial).
+Source: URDF specification (wiki.ros.org/urdf/XML, joint, link, inertial, visual).
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import unquote
 from xml.etree import ElementTree
+from xml.sax.saxutils import unescape
 
 import numpy as np
 
@@ -83,6 +86,90 @@ def from_urdf(
     return UrdfArm(chain, tuple(joints), tuple(bodies))
 
 
+# What links look like, and where the meshes are that a file names.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Visual:
+    """One solid that a URDF shows.
+
+    Attributes:
+        joint: number of the joint that moves it, from 1; 0 where it stands with the base.
+        T: (4, 4) the solid in the frame of that joint in the chain of `from_urdf`, of the base for 0, m.
+        kind: "mesh", "box", "cylinder" along z, or "sphere".
+        size: of a mesh (3,) what its coordinates are multiplied by; of a box its edges, of a cylinder radius and
+            length, of a sphere its radius, m.
+        mesh: name of the mesh file, as it stands in the URDF; "" of another kind.
+        colour: RGB, 0–255; None where the URDF has none.
+    """
+
+    joint: int
+    T: Array
+    kind: str
+    size: tuple[float, ...]
+    mesh: str
+    colour: tuple[int, int, int] | None
+
+
+def visuals_of(source: str | Path, base: str | None = None, tip: str | None = None) -> list[Visual]:
+    """What the links from base to tip look like, with what hangs on them; as `from_urdf`.
+
+    Args:
+        source: path of the file, or its text.
+        base, tip: links, as of `from_urdf`.
+
+    Raises:
+        PlanError: as `from_urdf`, or a solid without its numbers.
+    """
+    tree = _Tree.read(source)
+    start = base or tree.root()
+    path = tree.path(start, tip or tree.only_end())
+    names = {edge.name for edge in path}
+    found = list(tree.visuals(0, start, names, np.eye(4)))
+    for number, edge in enumerate((edge for edge in path if edge.kind != "fixed"), start=1):
+        found += tree.visuals(number, edge.child, names, _z_along(tree.axis(edge)).T)
+    return found
+
+
+def find_mesh(urdf: Path, name: str) -> Path | None:
+    """The file of a mesh: beside the URDF or in a folder above it; None where it is not there.
+
+    Args:
+        urdf: path of the file that names it.
+        name: a path relative to the URDF, `file://`, or `package://PACKAGE/…`. A package is looked for above the URDF;
+            a folder above it that has the rest of the path will do.
+    """
+    folder, scheme = urdf.absolute().parent, name.partition("://")[0] if "://" in name else ""
+    rest = name.removeprefix(f"{scheme}://")
+    if scheme == "package":
+        inside = rest.partition("/")[2]
+        places = [above / part for above in (folder, *folder.parents) for part in (rest, inside)]
+    else:
+        places = [folder / (unquote(rest) if scheme == "file" else rest)] if scheme in ("", "file") else []
+    return next(filter(_is_file, places), None)
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name that the system refuses
+        return False
+
+
+def with_meshes_found(urdf: Path) -> bytes:
+    """The content of a URDF, with absolute `file://` paths of the meshes that are found: a copy of it finds them too.
+
+    Args:
+        urdf: path of the file.
+    """
+
+    def absolute(match: re.Match[bytes]) -> bytes:
+        found = find_mesh(urdf, unescape(match[2].decode(errors="replace"), {"&quot;": '"', "&apos;": "'"}))
+        return match[0] if found is None else match[1] + found.as_uri().encode() + match[3]
+
+    return re.sub(rb"""(<mesh\b[^>]*?\bfilename\s*=\s*["'])([^"']*)(["'])""", absolute, urdf.read_bytes())
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Edge:
     """A joint of the file."""
@@ -102,6 +189,8 @@ class _Tree:
     where: str
     name: str
     links: dict[str, ElementTree.Element]
+    colours: dict[str, tuple[int, int, int]]
+    """By the names of the materials."""
     into: dict[str, _Edge]
     """The joint that carries each link."""
 
@@ -119,10 +208,14 @@ class _Tree:
             raise PlanError([f"{where}: expected a <robot>, got <{root.tag}>"])
         if any("xacro" in element.tag for element in root.iter()):
             raise PlanError([f"{where}: it is a xacro; expand it first (xacro {Path(text).name} > arm.urdf)"])
-        tree = cls(where, root.get("name", "arm"), {link.get("name", ""): link for link in root.iterfind("link")}, {})
+        links = {link.get("name", ""): link for link in root.iterfind("link")}
+        tree = cls(where, root.get("name", "arm"), links, {}, {})
         for element in root.iterfind("joint"):
             edge = tree._edge(element)
             tree.into[edge.child] = edge
+        for material in root.iter("material"):
+            if (colour := _colour(material)) is not None:
+                tree.colours.setdefault(material.get("name", ""), colour)
         return tree
 
     def _edge(self, element: ElementTree.Element) -> _Edge:
@@ -212,7 +305,8 @@ class _Tree:
 
     def body(self, edge: _Edge, path: set[str], turned: Array) -> Body | None:
         """All that a joint of the path carries up to the next one, with what hangs there, in its turned frame."""
-        found = list(self._masses(edge.child, path, turned.T))
+        parts = ((link, self.links[link].find("inertial"), T) for link, T in self._carried(edge.child, path, turned.T))
+        found = [self._inertial(link, element, T) for link, element, T in parts if element is not None]
         mass = sum(body.mass for body in found)
         if not mass > 0.0:
             return None
@@ -223,14 +317,32 @@ class _Tree:
             tensor += body.tensor + body.mass * (float(off @ off) * np.eye(3) - np.outer(off, off))
         return Body(mass, com, tensor)
 
-    def _masses(self, link: str, path: set[str], T: Array) -> Iterator[Body]:
-        """Bodies of a link and of what it carries, seen from the frame in which the link stands at T."""
-        inertial = self.links[link].find("inertial") if link in self.links else None
-        if inertial is not None:
-            yield self._inertial(link, inertial, T)
+    def visuals(self, joint: int, link: str, path: set[str], T: Array) -> Iterator[Visual]:
+        """Solids of a link and of what it carries, seen from the frame in which the link stands at T."""
+        for name, there in self._carried(link, path, T):
+            for element in self.links[name].iterfind("visual"):
+                place = there @ self._origin(f"link {name}", element.find("origin"))
+                for solid in element.iterfind("geometry/*"):
+                    size = self._size(f"link {name}", solid)
+                    colour = self._colour_of(element.find("material"))
+                    yield Visual(joint, place, solid.tag, size, solid.get("filename", ""), colour)
+
+    def _colour_of(self, material: ElementTree.Element | None) -> tuple[int, int, int] | None:
+        return None if material is None else _colour(material) or self.colours.get(material.get("name", ""))
+
+    def _size(self, name: str, solid: ElementTree.Element) -> tuple[float, ...]:
+        keys = {"mesh": "scale", "box": "size", "cylinder": "radius length", "sphere": "radius"}.get(solid.tag, "")
+        if solid.tag in ("mesh", "box"):
+            return tuple(self._three(name, solid, keys, "1 1 1" if solid.tag == "mesh" else ""))
+        return tuple(self._number(name, solid, key, math.nan) for key in keys.split())
+
+    def _carried(self, link: str, path: set[str], T: Array) -> Iterator[tuple[str, Array]]:
+        """A link that stands at T in some frame, and the links that it carries up to the next joint, there too."""
+        if link in self.links:
+            yield link, T
         for edge in self.into.values():
             if edge.parent == link and not (edge.name in path and edge.kind != "fixed"):
-                yield from self._masses(edge.child, path, T @ edge.T_parent_child)
+                yield from self._carried(edge.child, path, T @ edge.T_parent_child)
 
     def _inertial(self, link: str, element: ElementTree.Element, T: Array) -> Body:
         mass, inertia = element.find("mass"), element.find("inertia")
@@ -269,6 +381,16 @@ class _Tree:
         if not math.isfinite(value):
             raise self.wrong(name, f"a number in {key} of <{element.tag}>", repr(text))
         return value
+
+
+def _colour(material: ElementTree.Element) -> tuple[int, int, int] | None:
+    """RGB of a material; None where it has none, or one that is not four numbers."""
+    element = material.find("color")
+    try:
+        red, green, blue, _ = (round(255 * float(word)) for word in element.get("rgba", "").split())  # type: ignore[union-attr]
+    except (AttributeError, ValueError):
+        return None
+    return red, green, blue
 
 
 def _z_along(axis: Array) -> Array:

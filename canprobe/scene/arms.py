@@ -18,6 +18,7 @@ from canprobe.robot.model import ArmModel, Body, Joint
 from canprobe.robot.urdf import UrdfArm, from_urdf
 from canprobe.scene.geometry import transform
 from canprobe.scene.hardware import ArmSettings, JointSettings
+from canprobe.scene.setup import Homing
 
 Bodies = tuple[Body | None, ...] | None
 
@@ -143,4 +144,23 @@ def per_joint(sections: Mapping[str, JointSettings], key: Literal["start", "swin
             getattr(s, f"{key}_mm") * _MM if s.kind == "prismatic" else math.radians(getattr(s, f"{key}_deg"))
             for s in sections.values()
         ]
+    )
+
+
+def homing_of(section: JointSettings, number: int) -> Homing | None:
+    """How the drive of a joint, by its number from 1, is homed; None where its encoder is absolute."""
+    if section.zero == "absolute":
+        return None
+    slides = section.kind == "prismatic"
+    assert section.homing_method is not None
+    return Homing(
+        section.homing_method,
+        section.homing_order or number,
+        home=(section.home_mm or 0.0) * _MM if slides else math.radians(section.home_deg or 0.0),
+        speed=section.homing_speed_mm_s * _MM if slides else math.radians(section.homing_speed_deg_s),
+        zero_speed=section.homing_zero_speed_mm_s * _MM if slides else math.radians(section.homing_zero_speed_deg_s),
+        acceleration=section.homing_acceleration_mm_s2 * _MM
+        if slides
+        else math.radians(section.homing_acceleration_deg_s2),
+        timeout_s=section.homing_timeout_s,
     )

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from canprobe.scene.checks import DISTINCT, OneOf, Only, Pattern, Range, ScenePath
+from canprobe.scene.checks import DISTINCT, Check, OneOf, Only, Pattern, Range, ScenePath
 
 Auto = Literal["auto"]  # the plan chooses
 JointKind = Literal["revolute", "prismatic"]
@@ -23,6 +23,8 @@ SerialNumber = Annotated[int, Range(0, 0xFFFFFFFF)]
 
 TURNS = Only("kind", ("revolute",))
 SLIDES = Only("kind", ("prismatic",))
+HOMES = Only("zero", ("homing",))
+METHOD = Check("from -128 to 127, but not 0", lambda value: -128 <= value <= 127 and value != 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +114,8 @@ class JointSettings:
     """Amplitude of the swing in `free`."""
     node_id: NodeId | None = None
     """Node id of the drive. Left out: the number of the joint, from 1."""
+    channel: Channel | None = None
+    """Channel of the bus that the drive is on. Left out: `bus.channel`. Node ids differ on all buses together."""
     eds: Annotated[str | None, ScenePath()] = None
     """EDS of the drive. Left out: `arm.eds`."""
     emulated: bool | None = None
@@ -130,6 +134,30 @@ class JointSettings:
     """Position of the drive where the joint is at 0."""
     coupling: Mapping[str, float] | None = None
     """Turns of this motor per turn of other joints, by their names: a wrist whose motors stand in the forearm."""
+    zero: Literal["absolute", "homing"] = "absolute"
+    """absolute: the drive knows its position after power on. homing: it has to be homed, by `canprobe up --home`."""
+    homing_method: Annotated[int | None, METHOD, Only("zero", ("homing",), required=True)] = None
+    """Homing method (6098h), such as 17 for the negative limit switch, 35 or 37 for where the joint stands."""
+    homing_order: Annotated[int | None, Range(1, 1000), HOMES] = None
+    """Joints of lower numbers are homed first. Left out: the number of the joint, from 1."""
+    home_deg: Annotated[float | None, Range(-3600, 3600), TURNS, HOMES] = None
+    """Position of the joint at its home position. The home offset (607Ch) follows from it."""
+    homing_speed_deg_s: Annotated[float, Range(0, 36_000, open_low=True), TURNS, HOMES] = 5.0
+    """Speed of the search for the switch (6099h:01)."""
+    homing_zero_speed_deg_s: Annotated[float, Range(0, 36_000, open_low=True), TURNS, HOMES] = 1.0
+    """Speed of the search for the edge of the switch or the index pulse (6099h:02)."""
+    homing_acceleration_deg_s2: Annotated[float, Range(0, 360_000, open_low=True), TURNS, HOMES] = 20.0
+    """Acceleration in homing (609Ah)."""
+    home_mm: Annotated[float | None, Range(-100_000, 100_000), SLIDES, HOMES] = None
+    """Position of the joint at its home position. The home offset (607Ch) follows from it."""
+    homing_speed_mm_s: Annotated[float, Range(0, 100_000, open_low=True), SLIDES, HOMES] = 10.0
+    """Speed of the search for the switch (6099h:01)."""
+    homing_zero_speed_mm_s: Annotated[float, Range(0, 100_000, open_low=True), SLIDES, HOMES] = 2.0
+    """Speed of the search for the edge of the switch or the index pulse (6099h:02)."""
+    homing_acceleration_mm_s2: Annotated[float, Range(0, 1e6, open_low=True), SLIDES, HOMES] = 50.0
+    """Acceleration in homing (609Ah)."""
+    homing_timeout_s: Annotated[float, Range(1, 3600), HOMES] = 180.0
+    """Longest time of one homing run."""
     noise_counts: Annotated[float, Range(0, 10_000)] = 0.0
     """Standard deviation of the emulated encoder, besides `emulate.noise_counts`."""
     rated_torque_nm: Annotated[float | None, Range(0, 1e6, open_low=True), TURNS] = None

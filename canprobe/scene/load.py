@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from canprobe.errors import SceneError
+from canprobe.robot.urdf import with_meshes_found
 from canprobe.scene.checks import MismatchError, Only, ScenePath, choices_of, conditions_of, convert
 from canprobe.scene.hardware import CellInfo
 from canprobe.scene.model import DEFAULT_ARRAY, ArrayFile, Cell, Scene
@@ -27,16 +28,18 @@ from canprobe.scene.rules import SECTIONS_OF_TASK, broken_rules
 DEFAULT_CELL = "puma260"
 """Cell of a scene that names none."""
 _ALWAYS = ("scene", "task", "bus", "cycle", "limits", "bring_up")
-FILE_KEYS = {"array", "eds", "urdf"}
+FILE_KEYS = {"array", "eds", "urdf", "true_cell"}
 """Keys whose files a saved scene takes along."""
+SAVED_AS = "scene.toml"
+"""Name of a saved scene."""
 _ESCAPES = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\t": "\\t", "\r": "\\r", "\b": "\\b", "\f": "\\f"}
 
 
-def dump_scene(scene: Scene) -> str:
+def dump_scene(scene: Scene | Cell) -> str:
     """The scene as a TOML document that loads back equal, with every value that its kind uses.
 
     Args:
-        scene: a scene as `load_scene` gave it.
+        scene: a scene as `load_scene` gave it, or a cell as `read_cell` gave it.
     """
     tables = []
     for name, part in ((field.name, getattr(scene, field.name)) for field in dataclasses.fields(scene)):
@@ -57,13 +60,18 @@ def _keys(section: Any) -> str:
     return lines
 
 
-def with_files_beside(scene: Scene) -> tuple[Scene, dict[str, Path]]:
-    """The scene with names in the place of the paths of its EDS and URDF files, and the files by these names.
+def with_files_beside(scene: Scene) -> dict[str, bytes]:
+    """The files of a saved scene, by name: `SAVED_AS`, and the EDS, URDF and cell files that it names.
 
-    A folder with `dump_scene` of it and the files loads as the scene, wherever the folder is moved. Packaged files keep
-    their names.
+    A folder with these files loads as the scene, wherever the folder is moved. Packaged files are not among them. A
+    URDF that is taken along has absolute paths of its meshes.
+
+    Raises:
+        OSError: a file cannot be read.
+        SceneError: the true cell cannot be read.
     """
-    files: dict[str, Path] = {}
+    taken: dict[str, Path] = {SAVED_AS: Path()}
+    files: dict[str, bytes] = {}
 
     def beside(section: Any) -> Any:
         annotations = typing.get_type_hints(type(section), include_extras=True)
@@ -74,19 +82,26 @@ def with_files_beside(scene: Scene) -> tuple[Scene, dict[str, Path]]:
                 continue
             path, number = Path(value), 1
             name = path.name
-            while files.setdefault(name, path) != path:
+            while taken.setdefault(name, path) != path:
                 number += 1
                 name = f"{path.stem}-{number}{path.suffix}"
             names[key] = name
+            if key == "true_cell":  # the plant of a true cell has no say
+                files[name] = dump_scene(moved(dataclasses.replace(read_cell(path), plant=None))).encode()
+            else:
+                files[name] = with_meshes_found(path) if key == "urdf" else path.read_bytes()
         return dataclasses.replace(section, **names) if names else section
 
-    parts = {field.name: getattr(scene, field.name) for field in dataclasses.fields(scene)}
-    moved: dict[str, Any] = {
-        name: {key: beside(section) for key, section in part.items()} if isinstance(part, Mapping) else beside(part)
-        for name, part in parts.items()
-        if part is not None
-    }
-    return dataclasses.replace(scene, **moved), files
+    def moved(whole: Any) -> Any:
+        parts = {field.name: getattr(whole, field.name) for field in dataclasses.fields(whole)}
+        changed: dict[str, Any] = {
+            name: {key: beside(section) for key, section in part.items()} if isinstance(part, Mapping) else beside(part)
+            for name, part in parts.items()
+            if part is not None
+        }
+        return dataclasses.replace(whole, **changed)
+
+    return {SAVED_AS: dump_scene(moved(scene)).encode(), **files}
 
 
 def toml_key(key: str) -> str:

@@ -134,7 +134,7 @@ class SensorSettings:
     emulated: bool = True
     """canprobe serves the array. false: the array is real."""
     channel: Channel | None = None
-    """Channel of a separate bus for the array. Left out: the bus of the drives. "auto": the plan chooses."""
+    """Channel of a separate bus for the array. Left out: `bus.channel`. "auto": the plan chooses."""
     mode: TactileModeName = "window"
     """What the array sends: the taxels round the contact, all taxels, or force, centroid and moments that it
     computes from them."""
@@ -331,7 +331,9 @@ class LimitSettings:
     preload_max_n: Annotated[float, Range(0, 50)] = 0.15
     """Highest force before the run. The tare of the array would take it for zero."""
     joint_margin_deg: Annotated[float, Range(0, 45)] = 1.0
-    """Angle that is kept from every joint stop."""
+    """Angle that is kept from the stops of revolute joints."""
+    joint_margin_mm: Annotated[float, Range(0, 1000)] = 3.5
+    """Travel that is kept from the stops of prismatic joints."""
     joint_speed_share: Annotated[float, Range(0.001, 1)] = 1.0
     """Share of the speed limits of the arm."""
     late_cycles_max_percent: Annotated[float, Range(0, 100)] = 10.0
@@ -384,14 +386,14 @@ class PlantSettings:
     """`[plant]`: how the emulated arm, contact and array behave.
 
     With fidelity `ideal` each drive tracks as a second-order system, whatever pushes against it. `dynamic` adds rigid
-    links, friction, the cascade of the drives and the push of the object; it needs `pip install 'canprobe[dynamics]'`.
+    links, friction, the cascade of the drives and the push of the object; it needs the extra `dynamics`.
     """
 
     fidelity: Fidelity = "ideal"
     """Model of the arm."""
     true_cell: Annotated[str | None, ScenePath()] = None
-    """Cell whose chain the emulated arm has where it differs from the one that the controller uses. Its base is placed
-    so that the start point stays where it is."""
+    """Cell whose chain the emulated arm has where it differs from the one that the controller uses: a packaged name, or
+    a path relative to the file. Its base is placed so that the start point stays where it is."""
     integrator: Annotated[Integrator, DYNAMIC] = "rosenbrock"
     """Integrator of the equations of motion."""
     step_us: Annotated[float, Range(10, 2500), DYNAMIC] = 625.0
@@ -528,6 +530,13 @@ class Scene:
     def seed(self) -> int:
         """The seed of everything random."""
         return self.scene.seed
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Channels that the scene names, that of `[bus]` first; not one that is left to the plan."""
+        named = [joint.channel for joint in self.joints.values()]
+        named += [self.sensor.channel] if self.sensor is not None and self.sensor.channel != "auto" else []
+        return tuple(dict.fromkeys((self.bus.channel, *(name for name in named if name is not None))))
 
     @property
     def emulated_node_ids(self) -> tuple[int, ...]:

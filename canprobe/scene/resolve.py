@@ -12,7 +12,7 @@ from canprobe.protocol.frames import Frame
 from canprobe.robot.inverse import FIXED_POLE, task_rows
 from canprobe.robot.model import ArmModel
 from canprobe.robot.tool_calibration import ball_approaches
-from canprobe.scene.arms import Bodies, arm_model, per_joint
+from canprobe.scene.arms import Bodies, arm_model, homing_of, per_joint
 from canprobe.scene.geometry import T_flange_probe, expected_ball, scan_axes, true_object
 from canprobe.scene.hardware import EmulateSettings
 from canprobe.scene.load import read_cell
@@ -86,7 +86,7 @@ def resolve(scene: Scene) -> Setup:
         rate_hz=scene.cycle.rate_hz,
         realtime=scene.cycle.realtime,
         compute_ns=round(scene.cycle.compute_us * 1000),
-        limits=_limits(scene.limits),
+        limits=_limits(scene.limits, arm),
         bring_up=scene.bring_up,
         bridge=scene.bridge or BridgeSettings(),
         arm=arm,
@@ -107,12 +107,18 @@ def _arm(scene: Scene) -> tuple[Arm | None, Bodies]:
     drives = [
         Drive(
             node_id=node_id,
+            channel=joint.channel or scene.bus.channel,
             eds=joint.eds or settings.eds,
             emulated=emulated,
             serial=joint.serial_number,
+            zero=homing_of(joint, number),
+            turn_units=joint.counts_per_turn if joint.kind == "revolute" else None,
+            gear=joint.gear,
             quirks=_quirks(scene.emulate, node_id, joint.noise_counts),
         )
-        for (node_id, emulated), joint in zip(scene.drives.items(), joints.values(), strict=True)
+        for number, ((node_id, emulated), joint) in enumerate(
+            zip(scene.drives.items(), joints.values(), strict=True), start=1
+        )
     ]
     q_start = per_joint(joints, "start")
     arm = Arm(model, tuple(drives), q_start, settings.missed_syncs, settings.grouped_rpdo, settings.torque)
@@ -155,11 +161,11 @@ def _array(scene: Scene, radius: float) -> Array | None:
     )
     return Array(
         node_id=settings.node_id,
+        channel=settings.channel or scene.bus.channel,
         eds=settings.eds,
         emulated=settings.emulated,
         serial=settings.serial_number,
         name=settings.array,
-        channel=settings.channel,
         mode=settings.mode,
         window=settings.window,
         rate_hz=settings.rate_hz,
@@ -190,13 +196,14 @@ def _frame(text: str) -> Frame:
     return int(can_id, 16), bytes.fromhex(data)
 
 
-def _limits(settings: LimitSettings) -> SafetyLimits:
+def _limits(settings: LimitSettings, arm: Arm | None) -> SafetyLimits:
     low, high = settings.workspace_min_mm, settings.workspace_max_mm
+    slides = [] if arm is None else [joint.prismatic for joint in arm.model.joints]
     bounded = low is not None or high is not None
     return SafetyLimits(
         force_max=settings.force_max_n,
         preload_max=settings.preload_max_n,
-        joint_margin=math.radians(settings.joint_margin_deg),
+        joint_margin=np.where(slides, settings.joint_margin_mm * MM, math.radians(settings.joint_margin_deg)),
         speed_share=settings.joint_speed_share,
         late_share=settings.late_cycles_max_percent / 100,
         workspace=np.array([low or (-math.inf,) * 3, high or (math.inf,) * 3]) * MM if bounded else None,

@@ -100,6 +100,9 @@ def _joint_incomplete(joints: Mapping[str, JointSettings], urdf: str | None) -> 
         for key in needed:
             if getattr(joint, key) is None:
                 yield f"joints.{name}.{key}", f"missing: a {joint.kind} joint needs it"
+        home = "home_deg" if turns else "home_mm"
+        if joint.zero == "homing" and getattr(joint, home) is None:
+            yield f"joints.{name}.{home}", 'missing: zero = "homing" needs it'
         for other in joint.coupling or ():
             if other not in joints or other == name:
                 names = ", ".join(key for key in joints if key != name)

@@ -50,13 +50,15 @@ class Node:
     """What every node has.
 
     Attributes:
-        node_id: 1–126.
+        node_id: 1–126, on all buses together.
+        channel: of its bus.
         eds: name or path of its EDS.
         emulated: served by the emulator.
         serial: what 1018h:04 must answer; None: anything.
     """
 
     node_id: int
+    channel: str
     eds: str
     emulated: bool
     serial: int | None
@@ -88,15 +90,42 @@ class Quirks:
 
 
 @dataclass(frozen=True, slots=True)
+class Homing:
+    """How a drive that does not know its zero after power on finds it. Units are rad or m, and s.
+
+    Attributes:
+        method: of CiA 402, 6098h.
+        order: lower numbers are homed first.
+        home: position of the joint at its home position.
+        speed: of the search for the switch.
+        zero_speed: of the search for its edge or the index pulse.
+        acceleration: in homing.
+        timeout_s: longest time that it may take.
+    """
+
+    method: int
+    order: int
+    home: float
+    speed: float
+    zero_speed: float
+    acceleration: float
+    timeout_s: float
+
+
+@dataclass(frozen=True, slots=True)
 class Drive(Node):
     """One joint drive.
 
     Attributes:
-        incremental: it does not know its zero after power on, and has to be homed.
+        zero: how it is homed; None: its encoder is absolute.
+        turn_units: position units of a motor turn; None: of a prismatic joint.
+        gear: turns of the motor per turn of the joint.
         quirks: of an emulated one; None: it has none.
     """
 
-    incremental: bool = False
+    zero: Homing | None = None
+    turn_units: float | None = None
+    gear: float = 1.0
     quirks: Quirks | None = None
 
 
@@ -160,7 +189,6 @@ class Array(Node):
 
     Attributes:
         name: of its file.
-        channel: of its bus; None: the arm's.
         mode: what it sends.
         window: taxels along the window that follows the contact.
         rate_hz: of its images.
@@ -169,7 +197,6 @@ class Array(Node):
     """
 
     name: str
-    channel: str | None
     mode: ArrayMode
     window: int | Auto
     rate_hz: float
@@ -206,7 +233,7 @@ class SafetyLimits:
     Attributes:
         force_max: N.
         preload_max: N before the run, which the array's tare takes for zero.
-        joint_margin: kept from every joint stop, rad.
+        joint_margin: (n,) kept from the stops of each joint, rad or m; empty without an arm.
         speed_share: of the joints' speed limits.
         late_share: of the last second's cycles, late by half a period.
         workspace: box (2, 3) of the probe's tip in base, m; an open side is infinite; None without any.
@@ -214,7 +241,7 @@ class SafetyLimits:
 
     force_max: float
     preload_max: float
-    joint_margin: float
+    joint_margin: Floats
     speed_share: float
     late_share: float
     workspace: Floats | None

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, NoReturn
@@ -62,7 +62,7 @@ class EmulatorChild:
     Args:
         scene: the resolved scene.
         out: folder for ``truth.npz``; None uses a temporary one.
-        channel: the bus of its nodes.
+        channels: the buses of its nodes.
         truth: whether what is true is recorded, which grows with time.
         origin_ns: time that is 0 in ``truth.npz``, on the clock that all processes of a machine share.
 
@@ -70,9 +70,11 @@ class EmulatorChild:
         unwritten: why there is no ``truth.npz`` at the end; None where nothing was wrong with it.
     """
 
-    def __init__(self, scene: Scene, out: Path | None, channel: str, *, truth: bool = True, origin_ns: int = 0) -> None:
+    def __init__(
+        self, scene: Scene, out: Path | None, channels: Sequence[str], *, truth: bool = True, origin_ns: int = 0
+    ) -> None:
         self._scene = scene
-        self._channel = channel
+        self._channels = channels
         self._folder = Path(tempfile.mkdtemp(prefix="canprobe-"))
         self._wants_truth = truth
         self._origin_ns = origin_ns
@@ -90,7 +92,8 @@ class EmulatorChild:
         bus, nodes = self._scene.bus, self._scene.emulated_node_ids
         command = [
             *(sys.executable, "-m", "canprobe", "emulate", str(scene_file)),
-            *("--bus", bus.interface, "--channel", self._channel, "--bitrate", str(bus.bitrate)),
+            *("--bus", bus.interface, "--bitrate", str(bus.bitrate)),
+            *(word for channel in self._channels for word in ("--channel", f"{channel}={channel}")),
             *("--parent", str(os.getpid())),
         ]
         if nodes:
@@ -121,7 +124,7 @@ class EmulatorChild:
         """Wait until it serves, and for the boot-up of each of its nodes, as long as the scene allows.
 
         Args:
-            port: of the nodes' bus.
+            port: of the nodes' buses.
             say: called every 10 s with how long it has taken.
             hear: gets all that arrives meanwhile: another master may begin, or a node report an error.
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from canprobe.bus.disk import write_npz
+from canprobe.bus.port import MonotonicClock
 from canprobe.errors import NodeError, UsageError
 from canprobe.protocol.frames import UNCONFIGURED
 from canprobe.scene.model import Scene
@@ -35,19 +36,21 @@ def emulate(
     origin_ns: int | None = None,
     store_folder: Path | None = None,
     without_id: tuple[int, ...] = (),
+    homed: bool = False,
     say: Say = quiet,
 ) -> None:
     """Serve emulated nodes on a real interface until interrupted, for any master.
 
     Args:
         scene: whose nodes.
-        target: the bus.
+        target: the bus, and what stands for the scene's other channels; a channel that it does not name is the bus.
         node_ids: which nodes.
         seed: in the place of the scene's.
         truth_path: file for the plant's true values, written at the end.
         origin_ns: time on CLOCK_MONOTONIC that is 0 in that file; by default when the nodes begin to be served.
         store_folder: folder with a file for each node, where its 1010h and LSS store; None forgets at the end.
         without_id: which of the nodes start without a node id, for LSS to give them one.
+        homed: drives that have to be homed start with their zeros, and keep them.
         say: called when the nodes are about to be served.
 
     Raises:
@@ -60,24 +63,36 @@ def emulate(
     from canprobe.planning.make import make_plan
     from canprobe.scene.resolve import resolve
 
-    split = scene.sensor is not None and scene.sensor.channel is not None  # then the scene says who is on which bus
-    of_scene = replace(target, channel=scene.bus.channel) if split else target
+    of_scene = replace(target, channel=scene.bus.channel, others={})  # who is on which bus is the scene's
     plan = make_plan(resolve(resolve_scene(scene, of_scene, seed=seed)))
+    names = {scene.bus.channel: target.channel, **target.others}
+    placed = {n.node_id: names.get(n.channel, target.channel) for n in plan.nodes if n.node_id in node_ids}
+    array = plan.setup.array
+    raw_at = names.get(array.channel, target.channel) if array is not None and array.raw and array.emulated else None
     wanted = Expected(target.bitrate, data_bitrate(plan.setup.bus))
     way_out = "end that node, or name others with --nodes"
-    busy = tuple(node_id for node_id in node_ids if node_id not in without_id)
     _make_places(truth_path, store_folder)
-    with _free_port(target, wanted, busy, way_out=way_out, say=say) as port:
+    with contextlib.ExitStack() as stack:
+        ports: dict[str, Port] = {}
+        for channel in dict.fromkeys((*placed.values(), *([raw_at] if raw_at is not None else []))):
+            busy = tuple(i for i, place in placed.items() if place == channel and i not in without_id)
+            one = replace(target, channel=channel)
+            ports[channel] = stack.enter_context(_free_port(one, wanted, busy, way_out=way_out, say=say))
         rehearse(plan)
-        world = make_world(plan, node_ids, truth=truth_path is not None, without_id=without_id)
+        world = make_world(plan, node_ids, truth=truth_path is not None, without_id=without_id, homed=homed)
+        on: dict[str, list[Participant]] = {channel: [] for channel in ports}
+        for node, channel in zip(world.nodes, placed.values(), strict=True):
+            on[channel].append(node)
+        if world.raw_array is not None and raw_at is not None:
+            on[raw_at].append(world.raw_array)
         if world.recorder is not None:
-            world.recorder.origin_ns = port.clock.now_ns() if origin_ns is None else origin_ns
+            world.recorder.origin_ns = MonotonicClock().now_ns() if origin_ns is None else origin_ns
+            next(iter(on.values())).append(world.recorder)
         _keep(world.nodes, store_folder)
         try:
             _serve(
-                world.participants,
+                [(on[channel], port) for channel, port in ports.items()],
                 world.nodes,
-                port,
                 say=say,
                 in_realtime=plan.setup.realtime,
                 cycles_kept=plan.cycles if truth_path is not None else 0,
@@ -137,7 +152,7 @@ def emulate_eds(
             if node.lss is not None:
                 node.lss.bitrate = target.bitrate
         _keep(nodes, store_folder)
-        _serve(nodes, nodes, port, say=say, in_realtime=in_realtime)
+        _serve([(nodes, port)], nodes, say=say, in_realtime=in_realtime)
 
 
 def _make_places(truth_path: Path | None, store_folder: Path | None) -> None:
@@ -157,7 +172,7 @@ def _free_port(
     """A port on a bus where nobody has these node ids; it waits for the bus as a device does."""
     from canprobe.bus.interfaces import open_port
     from canprobe.bus.network import answering_nodes
-    from canprobe.bus.port import MonotonicClock, Reports
+    from canprobe.bus.port import Reports
 
     check_links(target.interface, {target.channel: wanted}, say)
     port = open_port(
@@ -186,9 +201,8 @@ def _check_addresses(nodes: Sequence[SlaveNode]) -> None:
 
 
 def _serve(
-    participants: Sequence[Participant],
+    buses: Sequence[tuple[Sequence[Participant], Port]],
     nodes: Sequence[SlaveNode],
-    port: Port,
     *,
     say: Say,
     in_realtime: bool,
@@ -198,12 +212,14 @@ def _serve(
     from canprobe.emulator.serve import serve
 
     reserve_memory(cycles_kept)
-    port.drain()  # what passed meanwhile
+    for _, port in buses:
+        port.drain()  # what passed meanwhile
     ask_for_processor()
     favour = realtime(DEVICE_PRIORITY, say, processor_from_last=1) if in_realtime else contextlib.nullcontext()
-    say(f"serving {_named(nodes) or 'the array'} on {port.channel}; Ctrl-C stops them")
+    where = " and ".join(port.channel for _, port in buses)
+    say(f"serving {_named(nodes) or 'the array'} on {where}; Ctrl-C stops them")
     with favour:
-        serve(participants, port, lambda: False)
+        serve(buses, lambda: False)
 
 
 def _named(nodes: Sequence[SlaveNode]) -> str:

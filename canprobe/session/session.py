@@ -6,6 +6,7 @@ The composition root: the only place, besides studies and tests, that sees both 
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -17,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.bus.disk import CandumpWriter, RecordingPort, whole_file, write_npz, write_text
+from canprobe.bus.disk import CandumpWriter, RecordingPort, whole_file, write_npz
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.bus.port import Clock, JoinedPort, MonotonicClock, Port, Reports, VirtualClock, elapsed_ns, is_bus_error
 from canprobe.bus.scheduling import MASTER_PRIORITY, garbage_collection_paused, realtime, reserve_memory
@@ -32,7 +33,7 @@ from canprobe.planning.model import Plan
 from canprobe.planning.traffic import exact_frame_bits
 from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits, exact_bits
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE
-from canprobe.scene.load import dump_scene, with_files_beside
+from canprobe.scene.load import with_files_beside
 from canprobe.scene.model import BridgeSettings, Scene
 from canprobe.scene.resolve import resolve
 from canprobe.scene.rules import need_scene, with_values
@@ -138,7 +139,7 @@ def lockstep_bus(scene: Scene, clock: VirtualClock, channel: str) -> LockstepBus
 Array = NDArray[np.float64]
 LEFT_BY_RUNS = (
     *("log.npz", "report.html", "report.png", "run.mcap", "scene.toml", "summary.json", "surface.npz"),
-    *("surface.png", "tool.toml", "truth.npz"),
+    *("surface.png", "tactile.npz", "tool.toml", "truth.npz"),
 )
 """Files of a run's folder besides ``bus.log``."""
 Write = Callable[[int, bytes, int], None]
@@ -181,17 +182,23 @@ def _with_bridges(settings: BridgeSettings | None, names: Sequence[str]) -> Brid
 
 
 def write_scene(scene: Scene, folder: Path) -> None:
-    """Write `scene.toml` into a folder, with the EDS and URDF files that it names beside it.
+    """Write `scene.toml` into a folder, with the EDS, URDF and cell files that it names beside it.
 
     Raises:
         ResultsError: a file cannot be written; no part of it is left.
     """
-    moved, files = with_files_beside(scene)
-    for name, path in files.items():
-        content = path.read_bytes()
+    for name, content in reversed(with_files_beside(scene).items()):
         with whole_file(folder / name) as part:
             part.write_bytes(content)
-    write_text(folder / "scene.toml", dump_scene(moved))
+
+
+def zeros_file(plan: Plan) -> Path | None:
+    """Where the zeros of a cell's real drives are recorded, in the user's state folder; None where none is homed."""
+    arm = plan.setup.arm
+    if arm is None or all(drive.zero is None or drive.emulated for drive in arm.drives):
+        return None
+    folder = os.environ.get("XDG_STATE_HOME") or "~/.local/state"
+    return Path(folder).expanduser() / "canprobe" / f"zeros-{arm.model.name}.json"
 
 
 class Session:
@@ -203,6 +210,7 @@ class Session:
         say: called with each step.
         observers: called after each cycle with its measurement, command and frames.
         rows_kept: cycles whose row of the log is kept, and no truth; None for all.
+        to_home: the drives are about to be homed.
 
     Attributes:
         origin_ns: where the run's clock is 0, on the clock of its bus: every time in its files counts from there.
@@ -216,8 +224,11 @@ class Session:
         say: Say = quiet,
         observers: Sequence[Observer | Callable[[Observation], None]] = (),
         rows_kept: int | None = None,
+        *,
+        to_home: bool = False,
     ) -> None:
         self._rows_kept = rows_kept
+        self._to_home = to_home
         self.plan = scene if isinstance(scene, Plan) else make_plan(resolve(scene))
         self.scene = self.plan.scene
         self.out = out
@@ -291,6 +302,8 @@ class Session:
                 observers=self.observers,
                 rows_kept=self._rows_kept,
                 origin_ns=self.origin_ns,
+                zeros=zeros_file(self.plan),
+                to_home=self._to_home,
             )
             if self.scene.bus.interface != LOCKSTEP:
                 self._get_ready(port)
@@ -416,7 +429,7 @@ class Session:
         array = self.plan.setup.array
         for participant in participants:
             bus = bus_of.get(getattr(participant, "node_id", 0), self.lockstep)
-            if participant is self.world.raw_array and array is not None and array.channel is not None:
+            if participant is self.world.raw_array and array is not None:
                 bus = buses[array.channel]
             bus.attach(participant)
         return self._join({channel: bus.port() for channel, bus in buses.items()})
@@ -437,8 +450,6 @@ class Session:
                 "python-can's virtual bus ends at the process, and emulated nodes have one of their own; use --bus"
                 " lockstep, or --bus socketcan --channel vcan0 by: canprobe vcan -- COMMAND"
             )
-        if len(self.plan.emulated_channels) > 1:
-            raise UsageError("emulated nodes on two buses share one plant: run them in lockstep, or on one bus")
         check_links(bus.interface, expected_of(self.plan), self._say)
         clock = MonotonicClock()
         self.origin_ns = clock.now_ns()
@@ -455,8 +466,8 @@ class Session:
         if self.plan.setup.emulates:
             self.cell.listen()  # they would boot beside those of another master
             self._say("start the emulated nodes")
-            emulated = self.plan.emulated_channels[0]
-            child = EmulatorChild(self.scene, self.out, emulated, truth=self.keeps_all, origin_ns=self.origin_ns)
+            channels = list(self.plan.emulated_channels)
+            child = EmulatorChild(self.scene, self.out, channels, truth=self.keeps_all, origin_ns=self.origin_ns)
             self._stack.callback(self._end_child, child)
             child.start()
         self._say("rehearse in lockstep")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 from canprobe.errors import UsageError
 from canprobe.scene.model import Scene
@@ -17,39 +18,54 @@ class Target:
 
     Attributes:
         interface: `lockstep`, `socketcan` or another interface of python-can.
-        channel: of the interface.
+        channel: of the interface, in the place of the scene's `bus.channel`.
         bitrate: bit/s.
-        sensor_channel: of the sensor's bus; None leaves it where the scene has it.
+        others: what stands for the other channels that the scene names; one that is not here stays as it is.
     """
 
     interface: str
     channel: str
     bitrate: int
-    sensor_channel: str | None = None
+    others: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def over(
         cls,
         scene: Scene,
         interface: str | None = None,
-        channel: str | None = None,
+        channel: str | Mapping[str, str] | None = None,
         bitrate: int | None = None,
-        sensor_channel: str | None = None,
     ) -> Target:
         """The bus of a scene, with what is given in the place of its values.
 
+        Args:
+            scene: whose.
+            interface, bitrate: in the place of the scene's.
+            channel: in the place of `bus.channel`; or what stands for each channel that the scene names.
+
         Raises:
-            UsageError: this is no scene, or a value is none that its file could have.
+            UsageError: this is no scene, it names no such channel, or a value is none that its file could have.
         """
         need_scene(scene)
-        bus = with_values(scene.bus, interface=interface, channel=channel, bitrate=bitrate)
-        return cls(bus.interface, bus.channel, bus.bitrate, sensor_channel)
+        others = dict(channel) if isinstance(channel, Mapping) else {}
+        if unknown := sorted(str(name) for name in others if name not in scene.channels):
+            raise UsageError(f"channel: the scene has no channel {unknown[0]}, only {', '.join(scene.channels)}")
+        others = {name: with_values(scene.bus, channel=new).channel for name, new in others.items()}
+        main = others.pop(scene.bus.channel, None) if isinstance(channel, Mapping) else channel
+        bus = with_values(scene.bus, interface=interface, channel=main, bitrate=bitrate)
+        return cls(bus.interface, bus.channel, bus.bitrate, others)
 
     def applied_to(self, scene: Scene) -> Scene:
         """The scene on this bus."""
         bus = replace(scene.bus, interface=self.interface, channel=self.channel, bitrate=self.bitrate)
-        sensor = scene.sensor and with_values(scene.sensor, channel=self.sensor_channel)
-        return replace(scene, bus=bus, sensor=sensor)
+        names: dict[str | None, str] = {scene.bus.channel: self.channel}
+        names.update(self.others.items())
+        joints = {
+            name: replace(joint, channel=names.get(joint.channel, joint.channel))
+            for name, joint in scene.joints.items()
+        }
+        sensor = scene.sensor and replace(scene.sensor, channel=names.get(scene.sensor.channel, scene.sensor.channel))
+        return replace(scene, bus=bus, joints=joints, sensor=sensor)
 
 
 def need_real_bus(scene: Scene, command: str) -> None:

@@ -15,6 +15,7 @@ from canprobe.session.children import Bridges
 from canprobe.session.session import Say, Session, quiet, resolve_scene
 from canprobe.session.target import need_real_bus
 from canprobe.tasks.from_plan import make_task
+from canprobe.tasks.untouched import Answer
 
 if TYPE_CHECKING:
     from canprobe.robot.model import ArmModel
@@ -70,11 +71,47 @@ def reporting_notes(session: Session, say: Say) -> Iterator[Callable[[Measuremen
             say(f"noted: {line}")
 
 
+# `canprobe up --home`: the drives without absolute encoders find their zeros, joint by joint.
+
+
+def home(scene: Scene, *, operator: Operator | None = None, say: Say = quiet) -> None:
+    """Bring the cell up, home the joints that have `zero = "homing"` one after the other, and stop it safely.
+
+    Args:
+        scene: with an arm.
+        operator: asked before each joint; None leaves the questions out.
+        say: called with each step, and with what became of each joint.
+
+    Raises:
+        UsageError: the scene does not fit, or no joint of it is homed.
+        NodeError: a drive did not find its home position; it is stopped and disabled.
+        BusError, SafetyStop: as :func:`canprobe.run`.
+    """
+    plan = make_plan(resolve(scene))
+    if plan.setup.arm is None or not any(drive.zero for drive in plan.setup.arm.drives):
+        raise UsageError(f'up --home: no joint of scene {scene.name} has zero = "homing"')
+    with Session(plan, None, say, (), ROWS_OF_UP, to_home=True) as session:
+        homing = session.cell.homing
+        assert homing is not None
+        for axis in homing.order:
+            answer = Answer.YES
+            if operator is None:
+                say(homing.question(axis).removesuffix("?"))
+            else:
+                operator.ask(homing.question(axis))
+                while (given := operator.answer()) is None:
+                    homing.keep_alive()
+                answer = given
+            if answer is Answer.QUIT:
+                return
+            say(homing.home(axis) if answer is Answer.YES else f"joint {axis + 1} is left as it is")
+
+
 # `canprobe up --check-joints`: the first motion of an arm, joint by joint, and the pose that its zeros make.
 
 
 def check_joints(scene: Scene, *, operator: Operator | None = None, say: Say = quiet) -> list[JointFinding]:
-    """Bring the cell up, turn each joint by 1 deg at 2 deg/s and back, and stop it safely.
+    """Bring the cell up, move each joint by 1 deg at 2 deg/s (3.5 mm at 7 mm/s) and back, and stop it safely.
 
     Args:
         scene: with an arm.
@@ -116,9 +153,13 @@ def _zero_pose(model: ArmModel, start: Vector) -> str:
     """Where the arm has to be if its zeros are right, for a look at its marks."""
     from canprobe.robot.chain import forward
 
-    angles = ", ".join(f"{joint.shown(q):.2f}" for joint, q in zip(model.joints, start, strict=True))
+    units = [joint.unit for joint in model.joints]
+    each = [f"{joint.shown(q):.2f}" for joint, q in zip(model.joints, start, strict=True)]
+    positions = f"{', '.join(each)} {units[0]}"
+    if len(set(units)) > 1:
+        positions = ", ".join(map(" ".join, zip(each, units, strict=True)))
     x, y, z = forward(model.chain, start)[:3, 3] * 1e3
     return (
-        f"by its encoders the arm stands at {angles} deg, its flange at x {x:.1f}, y {y:.1f}, z {z:.1f} mm: compare"
+        f"by its encoders the arm stands at {positions}, its flange at x {x:.1f}, y {y:.1f}, z {z:.1f} mm: compare"
         " that with its marks; where it differs, a zero is wrong"
     )

@@ -38,11 +38,12 @@ from canprobe.bus.disk import read_candump
 from canprobe.bus.lockstep import Participant
 from canprobe.cell.conditions import BY_KEY
 from canprobe.cell.controller import Controller, Measurement
+from canprobe.cell.log import joint_positions
 from canprobe.cell.supervision import Limits, limits_of
 from canprobe.emulator.node.slave_node import SlaveNode
 from canprobe.emulator.plant.plant import Plant
 from canprobe.errors import CanprobeError, SafetyStop
-from canprobe.planning.configuration import motor_speed_limit
+from canprobe.planning.units import motor_speed_limit
 from canprobe.protocol.cia402 import POWERED_STATES, state_of
 from canprobe.protocol.frames import Frame
 from canprobe.results.summary import summarise
@@ -117,10 +118,16 @@ def _wrong_reach(session: Session) -> float:
     assert scene.arm is not None and scene.probe is not None
     model, share = _model(session), scene.limits.joint_speed_share
     counts = [motor_speed_limit(model, axis, share, period_ns) * period_ns * 1e-9 for axis in range(model.n)]
-    q = session.cell.log.arrays()["q_target_rad"]
+    q = _targets(session)
     angles = q[np.isfinite(q).all(axis=1)][-1]
     T, J = forward_jacobian(model.chain, angles, T_flange_probe(scene.probe))
     return float(np.abs(T[:3, 2] @ J[:3] @ model.q_per_unit * counts).max())
+
+
+def _targets(session: Session) -> NDArray[np.float64]:
+    q = joint_positions(session.cell.log.arrays(), "q_target")
+    assert q is not None
+    return q
 
 
 def _torn_speeds(session: Session) -> NDArray[np.float64]:
@@ -128,8 +135,7 @@ def _torn_speeds(session: Session) -> NDArray[np.float64]:
     scene = session.scene
     assert scene.arm is not None and scene.probe is not None
     model, flange_probe = _model(session), T_flange_probe(scene.probe)
-    columns = session.cell.log.arrays()
-    q, phase = columns["q_target_rad"], columns["phase"]
+    q, phase = _targets(session), session.cell.log.arrays()["phase"]
     near = (phase >= Phase.APPROACH) & (phase <= Phase.RETREAT)
     rates = np.diff(q, axis=0) / (session.plan.sync.period_ns * 1e-9)
     greatest = np.zeros(model.n + 1)

@@ -47,7 +47,7 @@ from time import perf_counter
 from types import MappingProxyType
 from typing import Any
 
-from canprobe.errors import StudyError, UsageError
+from canprobe.errors import StudyError, UsageError, install_line
 from canprobe.session.children import end_with_parent
 from canprobe.studies.harness import CellStore, Say, StudyResult, as_json, cell_key, model_digest
 
@@ -101,7 +101,7 @@ def dask_executor(address: str) -> Iterator[Executor]:
     try:
         from distributed import Client
     except ImportError as error:
-        raise UsageError("--dask needs the package distributed: pip install 'canprobe[dask]'") from error
+        raise UsageError(f"--dask needs the package distributed: {install_line('dask')}") from error
     if not re.search(r":[0-9]+$", address):  # a Client that fails at once takes twenty seconds to end
         raise StudyError(f"--dask {address}: expected the address and port of a Dask scheduler, as tcp://10.0.0.1:8786")
     try:

@@ -31,8 +31,9 @@ from canprobe.emulator.plant.probe import depth_for_force
 from canprobe.results.picture import AMBER, BLUE, GREEN, GREY, INK, ORANGE, PINK, SHADE, legend, log_scale, picture
 from canprobe.robot.chain import tool_z_offset
 from canprobe.robot.inverse import inverse_near, probe_pose, start_posture
-from canprobe.robot.model import joints_to_units, units_per_motor, units_to_joints
-from canprobe.robot.puma import BODIES, UPENN
+from canprobe.robot.model import ArmModel, joints_to_units, units_per_motor, units_to_joints
+from canprobe.scene.arms import Bodies, arm_model
+from canprobe.scene.load import read_cell
 from canprobe.scene.setup import Dynamics
 from canprobe.studies.harness import Array, Column, Row, StudyResult, measuring_facts
 from canprobe.studies.sweep import Sweep
@@ -50,31 +51,40 @@ _NEAR = np.radians((90.0, 65.0, 15.0, 0.0, 100.0, 0.0))
 
 
 @cache
+def _arm() -> tuple[ArmModel, Bodies]:
+    """The packaged PUMA 260, and the bodies of its links."""
+    cell = read_cell("puma260")
+    assert cell.arm is not None
+    return arm_model(cell.cell.name, cell.arm, cell.joints)
+
+
+@cache
 def trial(stiffness_n_m3: float, cycles: int) -> tuple[PlantConfig, Array]:
     """The plant with a layer of a stiffness, and its drives' targets: (cycles + 1, 6) counts, one row per 2.5 ms."""
     pose = np.eye(4)
     pose[:3, 3] = _POINT
+    arm, bodies = _arm()
     shape = make_object("cylinder", T_base_object=pose, radius=_RADIUS)
     depth = depth_for_force(FORCE_N, (1.0 / _RADIUS, 0.0), 0.040, stiffness_n_m3)
-    q = start_posture(UPENN, _POINT, (0, 0, 1), _NEAR, radius_m=0.040, T_flange_probe=_TOOL, clearance_m=-depth)
+    q = start_posture(arm, _POINT, (0, 0, 1), _NEAR, radius_m=0.040, T_flange_probe=_TOOL, clearance_m=-depth)
     targets = []
     for k in range(cycles + 1):
         turn = SPEED_M_S * k * CYCLE_NS * 1e-9 / _RADIUS
         normal = np.array((0.0, math.sin(turn), math.cos(turn)))
         point = _POINT + _RADIUS * (normal - (0.0, 0.0, 1.0))
-        q = inverse_near(UPENN, probe_pose(point, normal, 0.040 - depth, (1, 0, 0)), _TOOL, q)
-        targets.append(np.rint(joints_to_units(UPENN, q)))
+        q = inverse_near(arm, probe_pose(point, normal, 0.040 - depth, (1, 0, 0)), _TOOL, q)
+        targets.append(np.rint(joints_to_units(arm, q)))
     counts = np.array(targets)
-    start = units_to_joints(UPENN, counts[0])  # a posture that the encoders can hold
+    start = units_to_joints(arm, counts[0])  # a posture that the encoders can hold
     return PlantConfig(
-        UPENN, start, object=shape, stiffness_n_m3=stiffness_n_m3, fidelity="dynamic", bodies=BODIES["upenn"]
+        arm, start, object=shape, stiffness_n_m3=stiffness_n_m3, fidelity="dynamic", bodies=bodies
     ), counts
 
 
 def integrated(stiffness_n_m3: float, cycles: int, stepping: Stepping, held: bool) -> Array | None:
     """(cycles, 12) motor counts and rates at the ends of the cycles; None where the integration broke down."""
     config, targets = trial(stiffness_n_m3, cycles)
-    arm = DynamicArm(UPENN, config.q0, make_equations(config, held=held), stepping)
+    arm = DynamicArm(_arm()[0], config.q0, make_equations(config, held=held), stepping)
     seen: list[Any] = []
     with np.errstate(all="ignore"):
         for k in range(cycles):
@@ -92,7 +102,7 @@ def integrated(stiffness_n_m3: float, cycles: int, stepping: Stepping, held: boo
 def stands(stiffness_n_m3: float, cycles: int, stepping: Stepping) -> bool:
     """Whether the arm comes to rest in contact after a nudge of one motor, as a real one does."""
     config, _ = trial(stiffness_n_m3, 1)
-    arm = DynamicArm(UPENN, config.q0, make_equations(config), stepping)
+    arm = DynamicArm(_arm()[0], config.q0, make_equations(config), stepping)
     start, fastest = arm.motor_counts(0), []
     arm.set_ramp(0, start, start + NUDGE_COUNTS, 0, CYCLE_NS)
     with np.errstate(all="ignore"):
@@ -110,7 +120,7 @@ def reference(stiffness_n_m3: float, cycles: int, rtol: float) -> Array:
     from scipy.integrate import solve_ivp
 
     config, targets = trial(stiffness_n_m3, cycles)
-    equations, scale = make_equations(config, held=False), units_per_motor(UPENN)
+    equations, scale = make_equations(config, held=False), units_per_motor(_arm()[0])
     h, seen = CYCLE_NS * 1e-9, []
     y = equations.resting(targets[0] / scale)
     for k in range(cycles):

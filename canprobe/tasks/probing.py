@@ -63,7 +63,7 @@ class ProbeMotion:
         self._workspace, self._radius = safety.workspace, probe.radius
         self._step_max: list[float] = (model.qd_max * safety.speed_share * period_s).tolist()
         self._rest, self._rest_share = self.q, 2.0 * math.pi * REST_HZ * period_s
-        margin = safety.joint_margin * model.radian
+        margin = safety.joint_margin
         self._low, self._high = model.q_min + margin, model.q_max - margin
         self._range: list[tuple[float, float]] = list(zip(self._low.tolist(), self._high.tolist(), strict=True))
         self.pose_matrix, _ = forward_jacobian(model.chain, self.q, flange_probe)

@@ -40,24 +40,24 @@ SPEED_OVER_NS = 10_000_000
 
 
 class JointHistory:
-    """The last joint angles with their times, to be interpolated at a tactile sample's instant."""
+    """The last joint positions with their times, to be interpolated at a tactile sample's instant."""
 
     def __init__(self) -> None:
         self._times: deque[int] = deque(maxlen=HISTORY)
         self._joints: deque[Vector] = deque(maxlen=HISTORY)
 
     def add(self, t_ns: int, q: Vector) -> None:
-        """Remember joint angles (n,), rad or m, at ``t_ns``; times must increase."""
+        """Remember joint positions (n,), rad or m, at ``t_ns``; times must increase."""
         self._times.append(t_ns)
         self._joints.append(q)
 
     @property
     def newest(self) -> Vector:
-        """Joint angles (n,), rad or m, that were added last."""
+        """Joint positions (n,), rad or m, that were added last."""
         return self._joints[-1]
 
     def at(self, t_ns: int) -> Vector | None:
-        """Joint angles (n,), rad or m, at ``t_ns``, linear between SYNCs; None outside the history."""
+        """Joint positions (n,), rad or m, at ``t_ns``, linear between SYNCs; None outside the history."""
         if not self._times or not self._times[0] <= t_ns <= self._times[-1]:
             return None
         for i in range(len(self._times) - 1, -1, -1):

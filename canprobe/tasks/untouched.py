@@ -123,43 +123,48 @@ class Operator(Protocol):
         """The answer to it; None until it is given."""
 
 
+VERBS = {"deg": ("turn", "turned"), "mm": ("move", "moved")}
+"""What a joint does and did, by its unit."""
+
+
 @dataclass(frozen=True, slots=True)
 class JointFinding:
     """What became of one joint.
 
     Attributes:
         joint: from 0.
-        start_deg: where it stood; this and the next two are mm for a prismatic joint.
-        asked_deg: the way of its target; 0 where it was not moved.
-        moved_deg: how far it turned, by its own motor's encoder.
+        start: where it stood, in its unit, as the next two.
+        asked: the way of its target; 0 where it was not moved.
+        moved: how far it moved, by its own motor's encoder.
         unit: deg or mm.
         fault: what is wrong; None where nothing is.
         skipped: why it was not moved; None where it was.
     """
 
     joint: int
-    start_deg: float
-    asked_deg: float = 0.0
-    moved_deg: float = 0.0
+    start: float
+    asked: float = 0.0
+    moved: float = 0.0
     fault: str | None = None
     skipped: str | None = None
     unit: str = "deg"
 
     def __str__(self) -> str:
-        where = f"joint {self.joint + 1} at {self.start_deg:.2f} {self.unit}: "
+        where = f"joint {self.joint + 1} at {self.start:.2f} {self.unit}: "
         if self.skipped is not None:
             return where + f"not moved, {self.skipped}"
-        way = f"asked {self.asked_deg:+.2f} {self.unit}, turned {self.moved_deg:+.2f} {self.unit}"
+        way = f"asked {self.asked:+.2f} {self.unit}, {VERBS[self.unit][1]} {self.moved:+.2f} {self.unit}"
         return where + way + (f": {self.fault}" if self.fault is not None else ": as expected")
 
 
-def find_fault(joint: int, asked: Vector, moved: Vector, rest: Sequence[float]) -> str | None:
+def find_fault(joint: int, asked: Vector, moved: Vector, rest: Sequence[float], unit: str = "deg") -> str | None:
     """What is wrong with the motors' ways, the joint's own first; None where nothing is.
 
     Args:
-        joint: that was to turn, from 0.
+        joint: that was to move, from 0.
         asked, moved: ways of the motors (n,), drive units.
         rest: within which each is at rest (n,), drive units.
+        unit: of the joint, deg or mm.
     """
     least = TOLERANCE_RESTS * np.array(rest)
     tolerance = np.maximum(TOLERANCE * np.abs(asked), least)
@@ -167,10 +172,10 @@ def find_fault(joint: int, asked: Vector, moved: Vector, rest: Sequence[float]) 
     if wrong[joint]:
         share = float(moved[joint] / asked[joint])
         if abs(moved[joint]) <= least[joint]:
-            return "it did not turn"
+            return f"it did not {VERBS[unit][0]}"
         if share < 0:
-            return "it turned the wrong way"
-        return f"it turned {share:.2f} times as far: gear or encoder resolution"
+            return f"it {VERBS[unit][1]} the wrong way"
+        return f"it {VERBS[unit][1]} {share:.2f} times as far: gear or encoder resolution"
     if wrong.any():
         other = int(np.argmax(wrong))
         return (
@@ -180,7 +185,7 @@ def find_fault(joint: int, asked: Vector, moved: Vector, rest: Sequence[float]) 
     return None
 
 
-# First motion: each joint alone by a small angle, slowly, and what every encoder made of it.
+# First motion: each joint alone by a small way, slowly, and what every encoder made of it.
 #
 # Encoders are compared motor by motor, so that a drive that turns the wrong way, by another gear or not at all is named
 # even where wrist joints drag each other's motors along. Whether the joint itself turned the way it must, no encoder
@@ -188,8 +193,9 @@ def find_fault(joint: int, asked: Vector, moved: Vector, rest: Sequence[float]) 
 
 Script = Generator[Command, Measurement, Measurement]
 ANGLE = math.radians(1.0)
+"""Of a prismatic joint its travel by `ArmModel.radian`: 3.5 mm."""
 MOVE_S = 15 / 8 * 0.5
-"""With a highest speed of 2 deg/s: that of the quintic is 15/8 of its mean."""
+"""With a highest speed of 2 deg/s (7 mm/s): that of the quintic is 15/8 of its mean."""
 SETTLE_S = 0.25
 
 
@@ -198,7 +204,7 @@ class JointCheck(Controller):
 
     Args:
         plan: of a cell with an arm; a joint that would leave its limits is moved the other way, or not at all.
-        operator: asked before each motion, and after it whether the joint turned the right way; None: no questions.
+        operator: asked before each motion, and after it whether the joint moved the right way; None: no questions.
 
     Attributes:
         findings: one for each joint that its turn has come to.
@@ -250,27 +256,28 @@ class JointCheck(Controller):
         """Ask, move, look, ask, move back; None where the operator has enough before it has moved."""
         its, units_per_q = self._model.joints[joint], self._model.units_per_q
         stood, unit = its.shown(start[joint]), its.unit
+        verb = VERBS[unit][0]
         way = self._way(joint, start)
         if way is None:
             why = "either way it would leave its limits or the workspace"
             return JointFinding(joint, stood, skipped=why, unit=unit)
         told = its.shown(way[joint])
-        question = f"joint {joint + 1} at {its.text(start[joint], '.2f')}: turn it by {told:+.2f} {unit}?"
+        question = f"joint {joint + 1} at {its.text(start[joint], '.2f')}: {verb} it by {told:+.2f} {unit}?"
         if (yield from self._asked(question, start)) is not Answer.YES:
             return None if self._quits else JointFinding(joint, stood, skipped="as the operator wished", unit=unit)
         before = yield from self._hold(start)
         measured = yield from self._move(start, start + way)
         assert before.q is not None and measured.q is not None
         moved = units_per_q @ (measured.q - before.q)
-        fault = find_fault(joint, units_per_q @ way, moved, rest_counts(self._model))
+        fault = find_fault(joint, units_per_q @ way, moved, rest_counts(self._model), unit)
         positive = "along" if its.prismatic else "by the right hand round"
-        seen = f"did joint {joint + 1} turn by about {told:+.1f} {unit}, positive {positive} its axis?"
+        seen = f"did joint {joint + 1} {verb} by about {told:+.1f} {unit}, positive {positive} its axis?"
         answer = yield from self._asked(seen, start + way)
         yield from self._move(start + way, start)
         if answer is Answer.NO and fault is None:
-            fault = "the operator did not see it turn that way: polarity, gear or another joint's drive"
-        turned = its.shown(float(moved[joint] / units_per_q[joint, joint]))
-        return JointFinding(joint, stood, told, turned, fault, unit=unit)
+            fault = f"the operator did not see it {verb} that way: polarity, gear or another joint's drive"
+        way_made = its.shown(float(moved[joint] / units_per_q[joint, joint]))
+        return JointFinding(joint, stood, told, way_made, fault, unit=unit)
 
     def _way(self, joint: int, start: Vector) -> Vector | None:
         """The change of the joints (n,), rad or m: forwards, or else backwards; None where there is no room."""

@@ -159,16 +159,10 @@ def inverse_transform(T: Array) -> Array:
     return homogeneous(R, -R @ T[:3, 3])
 
 
-def cross(a: Array, b: Array) -> Array:
-    """Cross product of two (3,) vectors without the overhead of `numpy.cross`."""
-    a0, a1, a2 = float(a[0]), float(a[1]), float(a[2])
-    b0, b1, b2 = float(b[0]), float(b[1]), float(b[2])
-    return np.array([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0])
-
-
-def rotation_vector(R: Array) -> Array:
-    """The rotation vector (angle times axis, rad) of a rotation below a half turn."""
-    w = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    sine = 0.5 * math.sqrt(float(w @ w))
-    angle = math.atan2(sine, 0.5 * (float(np.trace(R)) - 1.0))
-    return w * (0.5 if sine < 1e-12 else 0.5 * angle / sine)
+def rotation_vectors(R: Array) -> Array:
+    """The rotation vectors (n, 3) (angle times axis, rad) of rotations (n, 3, 3) below a half turn."""
+    w = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
+    sine = 0.5 * np.linalg.norm(w, axis=1)
+    angle = np.arctan2(sine, 0.5 * (np.trace(R, axis1=1, axis2=2) - 1.0))
+    small = sine < 1e-12
+    return np.asarray(w * np.where(small, 0.5, 0.5 * angle / np.where(small, 1.0, sine))[:, None])

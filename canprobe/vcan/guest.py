@@ -1,11 +1,11 @@
 """A command in a user-mode Linux guest: a Linux kernel with CAN as an ordinary process on this machine's own files.
 
 The guest has the machine's file system as its root (hostfs), so the same programs, interpreters and folders, and a
-vcan0 of its own. The command's output goes to two files that are followed from outside; signals go in as lines on the
-guest's console; the exit status comes out through a file, because the kernel's own status is always 0.
+vcan0 and a vcan1 of its own. The command's output goes to two files that are followed from outside; signals go in as
+lines on the guest's console; the exit status comes out through a file, because the kernel's own status is always 0.
 
     JOB/            a folder under the temporary folder, removed afterwards
-      init          the guest's first process: mounts, modules, vcan0, then the command
+      init          the guest's first process: mounts, modules, vcan0, vcan1, then the command
       command       working folder, environment and arguments of the command
       pid status    written by the guest: the command runs, the command has ended
       stdout stderr console

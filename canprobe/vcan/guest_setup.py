@@ -1,4 +1,4 @@
-"""Runs inside the guest as root, as a script: load the CAN modules and bring vcan0 up, with nothing but Python.
+"""Runs inside the guest as root, as a script: load the CAN modules, bring vcan0 and vcan1 up, with nothing but Python.
 
 Neither kmod nor iproute2 has to be installed: modules go in by finit_module(2), links by rtnetlink(7).
 """
@@ -59,6 +59,7 @@ def _request(kind: int, payload: bytes) -> None:
 
 if __name__ == "__main__":
     load_modules(Path(sys.argv[1]))
-    make_link("vcan0", "vcan")
-    set_link("vcan0", up=True)
+    for channel in ("vcan0", "vcan1"):
+        make_link(channel, "vcan")
+        set_link(channel, up=True)
     set_link("lo", up=True)

@@ -1,8 +1,8 @@
 """Run a command where a real vcan0 exists: here if there is one or one can be made, else in a guest.
 
 In this order: a vcan0 that is up; one in a network namespace of its own; one made by root and removed afterwards; a
-user-mode Linux guest (`canprobe.vcan.guest`). The command finds the way taken in the environment: CANPROBE_VCAN is
-`here`, `namespace`, `link` or `guest`.
+user-mode Linux guest (`canprobe.vcan.guest`). Where a vcan0 is made, a vcan1 is made beside it. The command finds the
+way taken in the environment: CANPROBE_VCAN is `here`, `namespace`, `link` or `guest`.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ class LocalJob:
 
 # Run a command where a real vcan0 exists: here if there is one or one can be made, else in a guest.
 
-CHANNEL = "vcan0"
+CHANNEL, SECOND = "vcan0", "vcan1"
 NO_VCAN = 125
 GUEST_LOST = 123
 WAY = "CANPROBE_VCAN"
@@ -137,8 +137,8 @@ WAY = "CANPROBE_VCAN"
 _MAPPINGS = Path("/proc/sys/vm/max_map_count")
 _ENOUGH_MAPPINGS = 1 << 20  # of 4 KiB: more than the guest's memory
 
-_MAKE_LINK = f"ip link add dev {CHANNEL} type vcan && ip link set {CHANNEL} up"
-_IN_NAMESPACE = f'ip link set lo up; {_MAKE_LINK} && exec "$@"'
+_MAKE_LINK, _MAKE_SECOND = (f"ip link add dev {name} type vcan && ip link set {name} up" for name in (CHANNEL, SECOND))
+_IN_NAMESPACE = f'ip link set lo up; {_MAKE_LINK} && {_MAKE_SECOND} && exec "$@"'
 
 
 def run_with_vcan(
@@ -232,10 +232,12 @@ def _local_way() -> Iterator[tuple[str, list[str]] | None]:
     elif shutil.which("unshare") and _succeeds([*namespace, "true"]):
         yield "namespace", namespace
     elif os.geteuid() == 0 and _succeeds(["sh", "-c", _MAKE_LINK]):
+        made = [CHANNEL, *([SECOND] if _succeeds(["sh", "-c", _MAKE_SECOND]) else [])]  # unless it is there already
         try:
             yield "link", []
         finally:
-            _succeeds(["ip", "link", "delete", CHANNEL])
+            for name in made:
+                _succeeds(["ip", "link", "delete", name])
     else:
         yield None
 

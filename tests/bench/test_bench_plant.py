@@ -5,7 +5,7 @@ Goals on an idle machine: forward 10 us, Jacobian 25, advance 15, truth 40, imag
 
 import numpy as np
 import pytest
-from puma_arm import ELBOW_FORM
+from puma_arm import BODIES, ELBOW_FORM, UPENN
 
 from canprobe.emulator.plant.config import PlantConfig
 from canprobe.emulator.plant.plant import Plant
@@ -14,7 +14,6 @@ from canprobe.emulator.plant.taxels import TaxelArray, TaxelConfig
 from canprobe.robot.chain import forward, forward_jacobian, tool_z_offset
 from canprobe.robot.dynamics import RigidBody
 from canprobe.robot.inverse import damped_step, inverse_near, start_posture
-from canprobe.robot.puma import BODIES, UPENN
 from canprobe.touch.objects import make_object
 
 POINT, TOOL = np.array((-0.120, -0.1225, 0.374)), tool_z_offset(80.0)
@@ -26,7 +25,7 @@ SHAPES = {"cylinder": {"radius": 0.036}, "saddle": {"radius_x": 0.06, "radius_y"
 def plant_of(fidelity):
     q0 = start_posture(UPENN, POINT, (0, 0, 1), ELBOW_FORM, radius_m=0.04, T_flange_probe=TOOL, clearance_m=-0.43e-3)
     shape = make_object("cylinder", T_base_object=POSE, radius=0.036)
-    return Plant(PlantConfig(UPENN, q0, object=shape, fidelity=fidelity, bodies=BODIES["upenn"]))
+    return Plant(PlantConfig(UPENN, q0, object=shape, fidelity=fidelity, bodies=BODIES["puma260"]))
 
 
 @pytest.fixture
@@ -65,7 +64,7 @@ def test_bench_advance_one_cycle(benchmark, plant):
 
 
 def test_bench_rigid_body(benchmark):
-    benchmark(RigidBody(UPENN.chain, BODIES["upenn"]).terms, ELBOW_FORM, np.ones(6))
+    benchmark(RigidBody(UPENN.chain, BODIES["puma260"]).terms, ELBOW_FORM, np.ones(6))
 
 
 def test_bench_dynamic_cycle_in_contact(benchmark):

@@ -6,13 +6,13 @@ import sys
 import cantools
 import numpy as np
 import pytest
+from puma_arm import MODELS
 
 import canprobe
 from canprobe.bridge.database import FORMATS, identifier, plan_database, write_database
 from canprobe.bus.disk import read_candump
 from canprobe.errors import UsageError
 from canprobe.protocol.pdo import PdoEntry
-from canprobe.robot.puma import MODELS
 from canprobe.scene.load import load_scene
 
 
@@ -37,7 +37,7 @@ def test_a_run_decodes_to_what_it_logged(read_back, free_run):
         if 0x181 <= can_id <= 0x186:
             counts[can_id - 0x180].append(read_back.decode_message(can_id, data)["Position_actual_value"])
     motors = np.array([counts[node][-100:-50] for node in range(1, 7)], float)
-    q = np.linalg.solve(MODELS["upenn"].units_per_q, motors).T
+    q = np.linalg.solve(MODELS["puma260"].units_per_q, motors).T
     logged = result.log["q_rad"]
     assert any(np.allclose(logged[i : i + 50], q, atol=1e-9) for i in range(len(logged) - 49))
 
@@ -90,7 +90,7 @@ def test_a_missing_extra_names_the_line_that_installs_it(monkeypatch, press_plan
     for name in [name for name in sys.modules if name.split(".")[0] == "cantools"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "cantools", None)
-    with pytest.raises(UsageError, match=r"needs cantools.*pip install 'canprobe\[can\]'"):
+    with pytest.raises(UsageError, match=r"needs cantools.*pip install .*\[can\]'"):
         write_database(press_plan, tmp_path, "dbc")
 
 

@@ -104,6 +104,17 @@ def concise(data):
     return found
 
 
+def test_each_of_two_buses_has_its_own_bus_yml(tmp_path):
+    scene = load_scene("press")
+    plan = canprobe.plan(dataclasses.replace(scene, sensor=dataclasses.replace(scene.sensor, channel="can1")))
+    names = [path.name for path in write_bus_yml(plan, tmp_path) if path.suffix == ".yml"]
+    assert names == ["bus-can0.yml", "bus-can1.yml"]
+    found = [[node.node_id for node in read_bus_yml(tmp_path / name)] for name in names]
+    assert found == [[1, 2, 3, 4, 5, 6], [16]]
+    write_dcfs(plan, tmp_path)
+    assert "NetworkName=can1" in (tmp_path / "node016.dcf").read_text()
+
+
 def test_bus_yml_comes_back(plan, tmp_path):
     write_bus_yml(plan, tmp_path)
     found = read_bus_yml(tmp_path / "bus.yml")

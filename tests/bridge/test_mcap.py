@@ -159,10 +159,10 @@ def test_both_readers_see_the_same_messages(recorded):
 
 
 def test_a_recorded_run_gives_the_same_messages_again(recorded, tmp_path):
-    """From bus.log alone, everything but the bridge's own state, message by message."""
+    """From what the master measured, everything but the bridge's own state, message by message."""
     folder = tmp_path / "again"
     folder.mkdir()
-    for name in ("bus.log", "scene.toml", "log.npz", "summary.json"):
+    for name in ("bus.log", "scene.toml", "log.npz", "tactile.npz", "summary.json"):
         (folder / name).write_bytes((recorded.folder / name).read_bytes())
     replayed = replay_into(folder, ("mcap",))
     assert replayed.bridges["mcap"]["error"] is None and replayed.bridges["mcap"]["dropped"] == 0

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from puma_arm import MODELS
 from scipy.spatial.transform import Rotation
 
 from canprobe.bridge.sample import flange_transform, link_transforms, quaternion_of
 from canprobe.robot.chain import forward
-from canprobe.robot.puma import MODELS
 
 
 @pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)

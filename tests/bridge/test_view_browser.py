@@ -24,6 +24,7 @@ from zstandard import ZstdDecompressor
 import canprobe
 from canprobe.bridge.process import BridgeProcess
 from canprobe.cli import main
+from canprobe.errors import install_line
 from canprobe.scene.model import BridgeSettings
 
 ROOT = Path(__file__).parents[2]
@@ -116,12 +117,14 @@ def test_without_the_extra_there_is_the_line_that_installs_it(monkeypatch, capsy
     find = importlib.util.find_spec
     monkeypatch.setattr("importlib.util.find_spec", lambda name, *rest: None if name == "viser" else find(name, *rest))
     assert main(["view", str(recorded.folder)]) == 2
-    assert capsys.readouterr().err == "canprobe: bridge view: needs viser: pip install 'canprobe[view]'\n"
+    line = install_line("view")
+    assert re.fullmatch(r"pip install (-e )?'.+\[view\]'", line)
+    assert capsys.readouterr().err == f"canprobe: bridge view: needs viser: {line}\n"
     plan = canprobe.plan(canprobe.load_scene("free"))
     assert "report.html" not in plan.outputs
     assert (
         "replay to share (report.html)",
-        "the view extra is not installed: pip install 'canprobe[view]'",
+        f"the view extra is not installed: {line}",
     ) in plan.left_out
 
 

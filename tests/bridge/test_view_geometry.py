@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from puma_arm import MODELS
 
 from canprobe.bridge.sample import SurfacePatch
 from canprobe.bridge.view import bodies as arm
@@ -16,7 +17,7 @@ from canprobe.bridge.view import meshes
 from canprobe.bridge.view import meshes as colours
 from canprobe.emulator.plant.taxels import pad_coordinates
 from canprobe.robot.chain import forward, posture, tool_z_offset
-from canprobe.robot.puma import MODELS, dh_rows
+from canprobe.scene.load import read_cell
 from canprobe.touch.linear_algebra import homogeneous, tangent_rotation
 from canprobe.touch.objects import OBJECT_PARAMETERS, make_object
 from canprobe.touch.pad import Pad
@@ -103,7 +104,7 @@ def test_link_frames_end_at_the_flange_and_pass_the_wrist(model, q):
 
 @MODEL
 def test_every_link_is_a_closed_body_the_right_way_out(model):
-    parts = arm.arm_parts(model)
+    parts = arm.arm_parts(model.chain)
     assert len({part.name for part in parts}) == len(parts) and {part.frame for part in parts} == set(range(7))
     assert all(volume(part.mesh) > 0 for part in parts)
     for part in parts:
@@ -118,7 +119,8 @@ def test_every_link_is_a_closed_body_the_right_way_out(model):
 @MODEL
 def test_joints_lie_in_the_bodies_that_they_join(model):
     """Each joint's place by the closed form, looked for in the solids on both of its sides, in many postures."""
-    parts = {part.name: part for part in arm.arm_parts(model)}
+    parts = {part.name: part for part in arm.arm_parts(model.chain)}
+    d = [1e-3 * joint.d_mm for joint in read_cell(model.name).joints.values()]
 
     def inside(name, frames, point):
         part = parts[name]
@@ -126,9 +128,9 @@ def test_joints_lie_in_the_bodies_that_they_join(model):
 
     for q in QS:
         frames, c = arm.link_frames(model.chain, q), posture(model.chain, q)
-        axis, offset = np.array(c.axes[1]), float(dh_rows(model)[1:3, 2].sum())
-        shoulder, wrist = np.array([0.0, 0.0, dh_rows(model)[0, 2]]), np.array(c.origins[4])
-        elbow = np.array(c.origins[2]) - dh_rows(model)[1, 2] * axis  # in the plane of joint 1's axis
+        axis, offset = np.array(c.axes[1]), d[1] + d[2]
+        shoulder, wrist = np.array([0.0, 0.0, d[0]]), np.array(c.origins[4])
+        elbow = np.array(c.origins[2]) - d[1] * axis  # in the plane of joint 1's axis
         side = math.copysign(1.0, offset)
         beam = side * (abs(offset) - 0.5 * arm.FOREARM - 0.004 - 0.5 * arm.UPPER_ARM)
         assert inside("shoulder", frames, shoulder)
@@ -140,7 +142,7 @@ def test_joints_lie_in_the_bodies_that_they_join(model):
 
 
 def test_the_two_published_arms_differ_where_their_numbers_do():
-    upenn, unimate = ({p.name: p.mesh for p in arm.arm_parts(MODELS[name])} for name in ("upenn", "unimate"))
+    upenn, unimate = ({p.name: p.mesh for p in arm.arm_parts(model.chain)} for model in MODELS.values())
     length = lambda mesh: float(np.ptp(mesh.vertices[:, 0]))  # noqa: E731
     assert length(upenn["upper_arm"]) - length(unimate["upper_arm"]) == pytest.approx(0.2 * 0.0254, abs=1e-6)
 

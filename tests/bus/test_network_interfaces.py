@@ -206,9 +206,13 @@ def test_channels_of_a_scene_with_two_buses(bare):
     def target(*channels):
         return target_of(Namespace(bus="socketcan", channel=list(channels), bitrate=None), scene)
 
-    assert target() == Target("socketcan", "can0", 1_000_000, "can1")
-    assert target((None, "vcan0")) == Target("socketcan", "vcan0", 1_000_000, "can1")
-    assert target(("can0", "a"), ("can1", "b")) == Target("socketcan", "a", 1_000_000, "b")
+    assert target() == Target("socketcan", "can0", 1_000_000)
+    assert target((None, "vcan0")) == Target("socketcan", "vcan0", 1_000_000)
+    both = target(("can0", "a"), ("can1", "b"))
+    assert both == Target("socketcan", "a", 1_000_000, {"can1": "b"})
+    joint = replace(next(iter(scene.joints.values())), channel="can1")
+    placed = both.applied_to(replace(scene, joints={**scene.joints, "shoulder": joint}))
+    assert (placed.channels, placed.joints["shoulder"].channel) == (("a", "b"), "b")
     with pytest.raises(UsageError, match="no channel can2, only can0, can1; did you mean can1"):
         target(("can2", "x"))
     with pytest.raises(UsageError, match="given 2 times, but the scene has the channels can0 and can1"):

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from puma_arm import MODELS
 
 from canprobe.cell.array import TactileReceiver
 from canprobe.cell.drives import (
@@ -19,11 +20,10 @@ from canprobe.protocol.cia402 import DriveState, OperationMode
 from canprobe.protocol.pdo import PdoEntry, PdoLayout
 from canprobe.protocol.tactile import FrameAssembler, TactileHeader, TactileMode, pack_whole
 from canprobe.robot.model import joints_to_units
-from canprobe.robot.puma import MODELS
 
 STATUS, POSITION, TORQUE = PdoEntry(0x6041, 0, 16), PdoEntry(0x6064, 0, 32, True), PdoEntry(0x6077, 0, 16, True)
 WORD, TARGET, DUMMY = PdoEntry(0x6040, 0, 16), PdoEntry(0x607A, 0, 32, True), PdoEntry(0x0004, 0, 32)
-MODEL = MODELS["upenn"]
+MODEL = MODELS["puma260"]
 BASE = 8
 """Counts: a milliradian of a joint of the PUMA, about."""
 ENABLED = DriveState.OPERATION_ENABLED.value

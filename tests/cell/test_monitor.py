@@ -50,7 +50,7 @@ def in_hold(recorded):
 def test_joints_force_and_image_are_those_of_the_cell(recorded, in_hold):
     result, _ = recorded
     row, _, view = in_hold
-    assert view.q_deg == pytest.approx(np.degrees(result.truth["q"][row]), abs=0.05)
+    assert view.q == pytest.approx(np.degrees(result.truth["q"][row]), abs=0.05)
     assert view.force_n == pytest.approx(result.log["force_n"][row], abs=0.1)
     assert view.taxels.max() > 50 and view.torn_frames == 0
 
@@ -110,7 +110,7 @@ def test_the_screen_is_plain_ansi_in_place(in_hold):
     text = screen(view)
     assert text.startswith("\x1b[H") and text.endswith("\x1b[J") and text.count("\r\n") == len(list(lines(view)))
     assert "node   1  joint 1        OPERATIONAL      OPERATION_ENABLED" in text
-    assert json.loads(json.dumps(view.as_document()))["q_deg"] == view.q_deg
+    assert json.loads(json.dumps(view.as_document()))["q"] == view.q
 
 
 def test_the_image_is_the_right_way_round():
@@ -145,7 +145,7 @@ def test_the_command_listens_to_both_buses(capsys):
     """On python-can's own bus, which ends at the process: the heartbeats are waiting when the monitor opens."""
     buses = {name: can.Bus(interface="virtual", channel=name) for name in ("left", "right")}
     scene = on_two_buses()
-    heard = iter(api.monitor(api.Target.over(scene, "virtual", "left", None, "right").applied_to(scene)))
+    heard = iter(api.monitor(api.Target.over(scene, "virtual", {"can0": "left", "can1": "right"}).applied_to(scene)))
     next(heard)
     for name, node_id in (("left", 4), ("right", 16)):
         buses[name].send(can.Message(arbitration_id=0x700 + node_id, data=b"\x05", is_extended_id=False))
@@ -161,7 +161,7 @@ def test_nothing_heard_is_said_so():
     text = "\n".join(lines(monitor.view(0)))
     assert text.count("not heard") == 8 and "joints" not in text
     monitor.push([(0x181, b"\x00", 5), (0x701, b"", 6), (0x511, bytes(3), 7), (0x081, b"\1", 8)])
-    assert monitor.view(10).q_deg is None
+    assert monitor.view(10).q is None
 
 
 def test_a_lockstep_bus_cannot_be_monitored(capsys):

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from puma_arm import UPENN
 
 import canprobe
 from canprobe.bus.port import ControllerState, PortCounters
@@ -16,7 +17,6 @@ from canprobe.cell.supervisor import JointGuard, Supervisor
 from canprobe.cell.watch import NodeWatch
 from canprobe.protocol.cia402 import DriveState
 from canprobe.protocol.frames import HEARTBEAT_BASE, NmtState
-from canprobe.robot.puma import UPENN
 from canprobe.scene.setup import SafetyLimits
 
 LIMITS = Limits(SafetyLimits(5.0, 0.15, 0.0, 1.0, 0.8, None), period_ns=2_500_000)

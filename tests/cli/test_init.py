@@ -6,6 +6,7 @@ import json
 import shutil
 import tomllib
 
+import numpy as np
 import pytest
 
 from canprobe.cli import main
@@ -49,6 +50,10 @@ def test_the_first_scene_of_an_arm_on_a_rail_runs_at_once(tmp_path, urdf, capsys
     summary = json.loads(capsys.readouterr().out)
     assert summary["completed"]
     assert summary["contact"]["contact_fraction"] == 1.0
+    log = np.load(out / "log.npz")  # the rail in m, the others in rad
+    for name in ("q", "q_target"):
+        slides, turns = np.isfinite(log[f"{name}_m"]).any(axis=0), np.isfinite(log[f"{name}_rad"]).any(axis=0)
+        assert slides.tolist() == [True] + 6 * [False] and turns.tolist() == [False] + 6 * [True]
     cell = tomllib.loads((folder / "cell.toml").read_text())
     assert list(cell["joints"]) == ["rail", "j1", "j2", "j3", "j4", "j5", "j6"]
     assert cell["joints"]["rail"]["kind"] == "prismatic"
@@ -58,12 +63,18 @@ def test_the_first_scene_of_an_arm_on_a_rail_runs_at_once(tmp_path, urdf, capsys
 def test_a_run_takes_the_files_of_its_cell_along(tmp_path, urdf, capsys):
     folder, out = tmp_path / "cell", tmp_path / "run"
     assert main(["init", str(folder), "--urdf", str(urdf)]) == 0
+    text = (folder / "cell.toml").read_text().replace("mount_mm = [0, 0, 0]", "mount_mm = [0, 0, 1]")
+    (folder / "scene.toml").write_text(text)  # a name that the scene of a run has too
+    with (folder / "first.toml").open("a") as first:
+        first.write('[plant]\ntrue_cell = "scene.toml"\n')
     assert main(["run", str(folder / "first.toml"), "--duration", "0.5", "--out", str(out)]) == 0
     before = resolve(load_scene(folder / "first.toml"))
     shutil.rmtree(folder)
     out.rename(tmp_path / "moved")
     again = resolve(load_scene(tmp_path / "moved" / "scene.toml"))
     assert (again.arm.model.chain.fixed == before.arm.model.chain.fixed).all()
+    assert (again.truth.model.chain.fixed == before.truth.model.chain.fixed).all()
+    assert (again.truth.model.chain.fixed != again.arm.model.chain.fixed).any()
     assert main(["replay", str(tmp_path / "moved")]) == 0
 
 

@@ -172,6 +172,7 @@ BUSY = {
     "run": ("run", "free"),
     "up": ("up", "free"),
     "check_joints": ("up", "free", "--check-joints", "--yes"),
+    "home": ("up", "free", "--home", "--yes"),
     "emulate": ("emulate", "free", "--channel", "vcan0"),
     "emulate_eds": ("emulate", "--eds", "puma260_joint.eds", "--node-id", "5", "--channel", "vcan0"),
     "monitor": ("monitor", "free", "--channel", "vcan0"),
@@ -321,32 +322,20 @@ kind = "press"
 
 
 @pytest.mark.parametrize(
-    ("words", "channel", "nodes"),
+    ("words", "arm", "touch"),
     [
-        ("--channel vcan0", "vcan0", (1, 2, 3, 4, 5, 6, 16)),
-        ("--channel vcan0 --nodes 16", "vcan0", (16,)),
-        ("--channel arm=x --channel touch=y --nodes 1-6", "x", (1, 2, 3, 4, 5, 6)),
-        ("--channel arm=x --channel touch=y --nodes 16", "y", (16,)),
-        ("--channel touch=y --nodes 16", "y", (16,)),
-        ("--channel arm=x --nodes 2", "x", (2,)),
-        ("--channel arm=x --channel touch=x", "x", (1, 2, 3, 4, 5, 6, 16)),
+        ("--channel vcan0", "vcan0", "vcan0"),
+        ("--channel arm=x --channel touch=y", "x", "y"),
+        ("--channel touch=y --nodes 16", "arm", "y"),
+        ("--channel arm=x --nodes 2", "x", "touch"),
+        ("--channel arm=x --channel touch=x", "x", "x"),
     ],
 )
-def test_emulate_serves_each_node_on_its_own_bus(words, channel, nodes, calls, tmp_path):
+def test_emulate_serves_each_node_on_its_own_bus(words, arm, touch, calls, tmp_path):
     (tmp_path / "two.toml").write_text(ON_TWO_BUSES)
     assert main(["emulate", str(tmp_path / "two.toml"), *words.split()]) == 0
-    ((_, (_, target), options),) = calls
-    assert (target.channel, options["node_ids"]) == (channel, nodes)
-
-
-@pytest.mark.parametrize(
-    "words", ["--channel arm=x --channel touch=y", "--channel touch=y", "--channel arm=x --nodes 1,16"]
-)
-def test_emulate_drops_no_bus_without_a_word(words, calls, tmp_path, capsys):
-    (tmp_path / "two.toml").write_text(ON_TWO_BUSES)
-    assert main(["emulate", str(tmp_path / "two.toml"), *words.split()]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "on two buses" in line and "share one plant" in line and "--nodes" in line and calls == []
+    ((_, (_, target), _),) = calls
+    assert (target.channel, target.others) == (arm, {"touch": touch})
 
 
 def test_scan_prints_a_table_or_json(calls, capsys):

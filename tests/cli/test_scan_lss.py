@@ -32,7 +32,8 @@ def serve(bus, monkeypatch):
     monkeypatch.setattr("canprobe.bus.scheduling.ask_for_processor", lambda: False)
     nodes = []
 
-    def attach(participants, port, stop):
+    def attach(buses, stop):
+        ((participants, _),) = buses
         nodes[:] = [one for one in participants if hasattr(one, "lss")]
         for node in nodes:
             bus.attach(node)

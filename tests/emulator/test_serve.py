@@ -18,7 +18,7 @@ from canprobe.emulator.serve import Exchange, serve
 from canprobe.emulator.world import TruthRecorder
 from canprobe.errors import BusError
 from canprobe.scene.load import load_scene
-from canprobe.scene.setup import Quirks
+from canprobe.scene.setup import Homing, Quirks
 
 MS = 1_000_000
 CYCLE = 2_500_000
@@ -133,7 +133,7 @@ def test_answers_to_sync_leave_before_another_kind_of_node_starts_to_work():
     a = Scripted([], {0x80: [(0x186, b""), (0x281, b"")], 0x182: [(0x700, b"")]})
     b = Scripted([], {0x80: [(0x182, b"")]})
     slow = Slow(port, {0x80: [(0x150, b"")]})
-    serve([a, b, slow], port, lambda: bool(port.sent))
+    serve([([a, b, slow], port)], lambda: bool(port.sent))
     drives, sensor, late = [(0x182, b""), (0x186, b""), (0x281, b"")], [(0x150, b"")], [(0x700, b"")]
     assert port.sent == [drives, sensor, late]
     assert slow.had_left == [[drives]]
@@ -143,7 +143,7 @@ def test_nodes_hear_the_sync_before_anybody_s_answer_to_it():
     port = OneShot((0x201, b"", 4), (0x80, b"", 5), (0x202, b"", 6))
     a = Scripted([], {0x80: [(0x181, b"")], 0x201: [(0x81, b"")]})
     b, slow = Scripted([], {0x80: [(0x182, b"")]}), Slow(port)
-    serve([a, b, slow], port, lambda: bool(port.sent))
+    serve([([a, b, slow], port)], lambda: bool(port.sent))
     assert port.sent == [[(0x81, b"")], [(0x181, b""), (0x182, b"")]]
     assert a.heard == [0x201, 0x80, 0x182, 0x202]
     assert b.heard == [0x201, 0x81, 0x80, 0x181, 0x202]
@@ -169,12 +169,31 @@ def test_serve_on_a_port_answers_a_master(plant):
             master.send_batch([(0x602, bytes.fromhex("4000100000000000"))])
         return number == 2
 
-    serve(nodes, port, stop)
+    serve([(nodes, port)], stop)
     assert [(can_id, data.hex()) for can_id, data, _ in master.drain()] == [
         (0x701, "00"),
         (0x702, "00"),
         (0x582, "4300100092010200"),
     ]
+
+
+def test_nodes_of_two_buses_hear_their_own_bus_only(plant):
+    clock = VirtualClock()
+    buses = [LockstepBus(clock, name) for name in ("a", "b")]
+    masters = [bus.port() for bus in buses]
+    nodes = [make_drive_node(load_eds("puma260_joint", i), i, i - 1, plant) for i in (1, 2)]
+    turn = itertools.count()
+
+    def stop():
+        number = next(turn)
+        if number == 0:
+            for master in masters:  # both ask node 1, which is on the first bus
+                master.send_batch([(0x601, bytes.fromhex("4000100000000000"))])
+        return number == 2
+
+    serve([([node], bus.port()) for node, bus in zip(nodes, buses, strict=True)], stop)
+    heard = [[can_id for can_id, _, _ in master.drain()] for master in masters]
+    assert heard == [[0x701, 0x581], [0x702]]
 
 
 def test_serve_keeps_the_deadlines_of_its_nodes(plant):
@@ -188,7 +207,7 @@ def test_serve_keeps_the_deadlines_of_its_nodes(plant):
             master.send_batch([(0x601, bytes.fromhex("2b17100064000000"))])  # heartbeat every 100 ms
         return bus.clock.now_ns() >= 300 * MS
 
-    serve([node], port, stop)
+    serve([([node], port)], stop)
     beats = [t_ns for can_id, data, t_ns in master.drain() if (can_id, data) == (0x701, b"\x7f")]
     assert beats[0] == 0  # heartbeats start when they are asked for
     assert beats[1:] == [100 * MS, 200 * MS, 300 * MS]
@@ -290,9 +309,10 @@ def test_quirks_and_encoders_of_the_setup_are_those_of_its_drives():
     plan = canprobe.plan(load_scene("free"))
     assert plan.setup.arm is not None
     first, second, *others = plan.setup.arm.drives
-    drives = (replace(first, quirks=Quirks(boot_ns=5, refuse=(0x605A,))), replace(second, incremental=True), *others)
+    incremental = replace(second, zero=Homing(35, 1, 0.0, 0.1, 0.1, 1.0, 10.0))
+    drives = (replace(first, quirks=Quirks(boot_ns=5, refuse=(0x605A,))), incremental, *others)
     quirky = replace(plan, setup=plan.setup.changed("arm", drives=drives))
-    nodes = build.make_world(quirky, plan.node_ids).nodes
+    nodes = build.make_world(quirky, plan.node_ids, homed=False).nodes
     assert [node.start(0) for node in nodes[:3]] == [[], [(0x702, b"\0")], [(0x703, b"\0")]]
     assert nodes[0].advance(5) == [(0x701, b"\0")]
     assert nodes[0].receive(0x601, bytes.fromhex("2b5a600006000000"), 6)[0][1].hex() == "805a600000000106"

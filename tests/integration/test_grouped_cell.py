@@ -4,12 +4,12 @@ import dataclasses
 
 import numpy as np
 import pytest
+from puma_arm import MODELS
 from undrawn import undrawn_run
 
 import canprobe
 from canprobe.bus.disk import read_candump
 from canprobe.protocol.cia402 import DriveState, state_of
-from canprobe.robot.puma import MODELS
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def test_each_drive_goes_where_its_half_of_the_frame_says(swung):
         if pdo.direction == "tpdo" and pdo.cob_id == can_id
     }
     motors = np.array([reported[node_id] for node_id in range(1, 7)], float)
-    joints = np.linalg.solve(MODELS["upenn"].units_per_q, targets - motors)
+    joints = np.linalg.solve(MODELS["puma260"].units_per_q, targets - motors)
     assert np.abs(joints).max() < 0.02  # rad behind its target
 
 

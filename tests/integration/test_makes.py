@@ -10,12 +10,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from makes import MAKES, changed, pdo, without, word, write_eds
+from makes import MAKES, Entry, changed, pdo, without, word, write_eds
 from scenes import change, reasons
 
 import canprobe
 from canprobe.cell.controller import Command
-from canprobe.emulator.drive import modes
+from canprobe.errors import NodeError
 from canprobe.planning.configuration import make_setups
 from canprobe.planning.make import make_plan
 from canprobe.planning.model import Interpolation
@@ -26,9 +26,7 @@ from canprobe.session.session import Session
 RATE_HZ = 333.333
 SWING = np.radians((3, -3, 3, 3, -3, 3))
 IP, CSP = OperationMode.INTERPOLATED_POSITION, OperationMode.CYCLIC_SYNC_POSITION
-MOVING = {name: CSP for name in MAKES if name not in ("no_cyclic_mode", "interpolated")}
-if hasattr(modes, "InterpolatedPosition"):
-    MOVING["interpolated"] = IP
+MOVING = {name: IP if name == "interpolated" else CSP for name in MAKES if name != "no_cyclic_mode"}
 
 
 def scene_of(make, folder):
@@ -122,8 +120,90 @@ def test_what_a_bare_drive_lacks_is_listed_with_the_consequence(tmp_path):
         "no such object: the device will not notice a dead master"
     )
     assert {what[-9:-1] for what in rows} == {
-        "1016h:01", "2000h:00", "6065h:00", "6066h:00", "607Fh:00", "607Dh:01", "607Dh:02", "605Ah:00", "6007h:00"
+        "1016h:01", "1029h:01", "2000h:00", "6065h:00", "6066h:00", "607Fh:00", "607Dh:01", "607Dh:02", "605Ah:00",
+        "6007h:00",
     }  # fmt: skip
+
+
+def wished(plan, index):
+    """What is written there to the first drive, and how the plan says that it is not."""
+    written = [write.value for write in make_setups(plan)[0].writes if write.index == index]
+    return written, [why for what, why in plan.not_available if f"{index:04X}h" in what]
+
+
+def test_a_lost_master_and_a_start_by_itself_are_settled_where_the_device_can(tmp_path):
+    """1029h:01 = 0, pre-operational; bit 2 of 1F80h, the other bits as the device has them."""
+    make = MAKES["milliseconds_only"]()
+    make.objects[0x1F80, 0] = Entry("NMT startup", "U32", "rw", 8)
+    make.objects[0x1029, 0] = Entry("Highest sub-index supported", "U8", "ro", 1)
+    make.objects[0x1029, 1] = Entry("Communication error", "U8", "rw", 1)
+    plan = canprobe.plan(scene_of(make, tmp_path))
+    assert (wished(plan, 0x1029), wished(plan, 0x1F80)) == (([0], []), ([12], []))
+    said, way, _ = moved(plan, tmp_path / "run")
+    assert way == pytest.approx(SWING, abs=np.radians(0.2)) and not any("1F80h" in line for line in said)
+    changed(make.objects, 0x1F80, access="ro")
+    changed(make.objects, 0x1029, 1, low=1, high=2)
+    plan = canprobe.plan(scene_of(make, tmp_path))
+    assert "it is ro, 8: the device may become operational before it is configured" in wished(plan, 0x1F80)[1][0]
+    assert "it takes 1 to 2: it goes pre-operational" in wished(plan, 0x1029)[1][0]
+
+
+def with_factors(make, **factors):
+    """608Fh, 6091h, 6092h as quotients, and 607Eh."""
+    for name, value in factors.items():
+        index = int(name[1:], 16)
+        if index == 0x607E:
+            make.objects[index, 0] = Entry("Polarity", "U8", "rw", value)
+        else:
+            make.objects[index, 0] = Entry("Highest sub-index supported", "U8", "ro", 2)
+            for subindex in (1, 2):
+                make.objects[index, subindex] = Entry(f"Part {subindex}", "U32", "rw", value[subindex - 1])
+    return make
+
+
+def told_by(scene, change_device):
+    """What bring-up says of the second drive after its device was changed."""
+    said = []
+    session = Session(canprobe.plan(scene), say=said.append)
+    change_device(session.world.nodes[1].dictionary)
+    with session:
+        pass
+    return [line for line in said if "node 2: (joint 2)" in line and "units a motor turn" in line]
+
+
+@pytest.mark.parametrize(
+    ("factors", "place", "value", "counts"),
+    [
+        ({"x6092": (1000, 1), "x6091": (1, 1)}, (0x6092, 1), 4096, "4096 units a motor turn by its 6092h and 6091h"),
+        ({"x6092": (1000, 1), "x6091": (1, 1)}, (0x6091, 1), 8, "125 units a motor turn by its 6092h and 6091h"),
+        ({"x608F": (1000, 1)}, (0x608F, 2), 2, "500 units a motor turn by its 608Fh"),
+    ],
+)
+def test_a_device_that_counts_otherwise_than_the_cell_says_is_told(tmp_path, factors, place, value, counts):
+    scene = scene_of(with_factors(MAKES["milliseconds_only"](), **factors), tmp_path)
+    assert told_by(scene, lambda dictionary: None) == []
+    (line,) = told_by(scene, lambda dictionary: dictionary.set_default(*place, value))
+    assert f"counts {counts}, the cell 1000 (counts_per_turn)" in line
+
+
+def test_a_device_that_takes_the_joint_for_its_shaft_counts_as_the_cell(tmp_path):
+    """6091h is the gear of the joint, and 6092h its turn."""
+    scene = scene_of(with_factors(MAKES["milliseconds_only"](), x6092=(1000, 1), x6091=(1, 1)), tmp_path)
+    gear = list(scene.joints.values())[1].gear
+
+    def by_joint(dictionary):
+        dictionary.set_default(0x6091, 1, round(gear * 1000))
+        dictionary.set_default(0x6091, 2, 1000)
+        dictionary.set_default(0x6092, 1, round(1000 * gear))
+
+    assert told_by(scene, by_joint) == []
+
+
+def test_a_device_whose_polarity_was_turned_is_refused(tmp_path):
+    scene = scene_of(with_factors(MAKES["milliseconds_only"](), x607E=0), tmp_path)
+    said = r"\(joint 2\) 607Eh:00 expected 0, as its EDS says, got 128: it would count the other way round"
+    with pytest.raises(NodeError, match=said):
+        told_by(scene, lambda dictionary: dictionary.set_default(0x607E, 0, 0x80))
 
 
 @pytest.mark.parametrize(
@@ -165,6 +245,27 @@ def test_the_drives_are_disabled_on_the_way_out(tmp_path, make):
         (feedback,) = plan.pdos_of(node_id, "tpdo")
         last = [data for can_id, data in frames if can_id == feedback.cob_id][-1]
         assert feedback.layout.unpack(last)[0] & 0x6F == DriveState.SWITCH_ON_DISABLED.value
+
+
+@pytest.mark.parametrize(
+    ("cell", "quirk", "told"),
+    [
+        (
+            "puma260",
+            {"tpdo_delay_us": 1000.0},
+            r"node \d: its TPDO comes [12]\.\d\d ms behind the SYNC, .* until 1\.\d\d ms",
+        ),
+        (
+            "seven-axis",
+            {"fixed_mapping": True},
+            r"node 1: .*1A00h:00 = 0x2 failed: .*; it holds 0x3: if it is fixed, say so",
+        ),
+    ],
+)
+def test_what_only_the_device_tells_is_said_with_what_there_is(tmp_path, cell, quirk, told):
+    scene = change(canprobe.load_scene("cylinder", cell=cell), emulate=quirk, scene={"figures": False})
+    with pytest.raises(NodeError, match=told), Session(scene, tmp_path) as session:
+        session.run(lambda _: Command(done=True))
 
 
 # What a make may have besides: values that the drives do not take, PDOs with more in them, or with less.

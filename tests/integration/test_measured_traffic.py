@@ -115,7 +115,7 @@ def test_a_bus_with_errors_carries_every_frame_and_the_same_seed_the_same_errors
     assert not measured.as_planned and f"error frames: {measured.error_frames}" in measured.text()
     lines = [line for line in (tmp_path / "bus.log").read_text().splitlines() if " 20000088#" in line]
     assert len(lines) == measured.error_frames
-    recording = read_recording(tmp_path / "bus.log", first.plan, as_taken=False)
+    recording = read_recording(tmp_path / "bus.log", first.plan)
     assert recording.error_frames == measured.error_frames
 
 
@@ -164,7 +164,7 @@ def test_error_frames_of_a_real_bus_are_in_the_log_and_beside_the_plan(real_bus,
     assert all(one["as_planned"] for one in traffic["classes"].values())
     logged = [line.split()[2] for line in (tmp_path / "bus.log").read_text().splitlines() if " 2000" in line]
     assert logged == [f"{can_id:08X}#{'00' * 8}" for can_id in (LOST_ARBITRATION, NO_ACKNOWLEDGEMENT, STUFF_ERROR)]
-    assert read_recording(tmp_path / "bus.log", result.plan, as_taken=True).error_frames == 2
+    assert read_recording(tmp_path / "bus.log", result.plan).error_frames == 2
 
 
 @pytest.mark.parametrize(("errors", "as_planned"), [(2, False), (0, None)])

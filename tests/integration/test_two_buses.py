@@ -1,4 +1,4 @@
-"""The arm on one bus and the sensor on another, end to end in lockstep; and a port over several buses by itself."""
+"""The nodes of a cell on two buses, end to end in lockstep; and a port over several buses by itself."""
 
 import dataclasses
 
@@ -11,7 +11,7 @@ from canprobe.bus.disk import read_candump
 from canprobe.bus.lockstep import LockstepBus, Participant
 from canprobe.bus.port import JoinedPort, VirtualClock
 from canprobe.cell.controller import Command
-from canprobe.errors import InterfaceError, UsageError
+from canprobe.errors import InterfaceError
 from canprobe.protocol.cia402 import POWERED_STATES, state_of
 from canprobe.protocol.frames import NmtState
 from canprobe.recorded.recording import read_recording
@@ -102,17 +102,10 @@ def test_a_joined_port_sends_where_a_frame_belongs_and_hears_all_in_order(joined
         joined.drain()
 
 
-def test_emulated_nodes_on_two_real_buses_are_refused():
-    scene = split_scene()
-    scene = dataclasses.replace(scene, bus=dataclasses.replace(scene.bus, interface="socketcan"))
-    with pytest.raises(UsageError, match="share one plant"):
-        canprobe.run(scene, files=False)
-
-
 def test_the_log_of_two_buses_is_read_as_the_one_the_cell_had(pressed):
     result, frames = pressed
     plan = result.plan
-    recording = read_recording(result.out / "bus.log", plan, as_taken=False)
+    recording = read_recording(result.out / "bus.log", plan)
     main = [frame for frame in frames if frame[1] == "can0" and frame[2] == 0x080]
     assert len(recording.syncs) == len(main)
     for pdo in plan.pdos:
@@ -219,3 +212,76 @@ def test_a_bus_that_is_lost_is_told_once_and_the_others_go_on():
     for _ in range(2):  # nothing is left: that is told again and again
         with pytest.raises(InterfaceError):
             joined.drain()
+
+
+# The drives of one arm on two buses.
+
+
+def spread_scene(scene, first):
+    """A scene whose joints from `first` on, counted from 0, have a bus of their own."""
+    joints = enumerate(scene.joints.items())
+    return dataclasses.replace(
+        scene,
+        joints={k: dataclasses.replace(joint, channel="can1" if i >= first else None) for i, (k, joint) in joints},
+    )
+
+
+@pytest.fixture(scope="module")
+def seven(tmp_path_factory):
+    out = tmp_path_factory.mktemp("seven")
+    scene = spread_scene(canprobe.load_scene("cylinder", "seven-axis"), 4)
+    return undrawn_run(scene, out=out, duration_s=0.3), list(read_candump(out / "bus.log"))
+
+
+def test_seven_drives_on_two_buses_have_room_for_their_torque_and_the_array(seven):
+    result, frames = seven
+    summary, plan = result.summary, result.plan
+    assert plan.setup.arm.torque and plan.sync.period_ns == 2_500_000
+    assert [(bus.channel, bus.node_ids) for bus in plan.buses] == [("can0", (1, 2, 3, 4, 16)), ("can1", (5, 6, 7))]
+    assert summary["completed"] and not summary["faults"] and summary["cycle"]["missed_pdos"] == 0
+    assert summary["contact"]["contact_fraction"] == 1.0
+    assert all(report["as_planned"] for report in summary["traffic"].values())
+    assert not np.isnan(result.log["torque_permille"][-1]).any()
+    ids = {name: {frame[2] for frame in frames if frame[1] == name} for name in ("can0", "can1")}
+    for pdo in plan.pdos:
+        assert [name for name in ids if pdo.cob_id in ids[name]] == [pdo.channel]
+
+
+def test_a_recording_has_the_drives_of_both_buses(seven):
+    result, frames = seven
+    recording = read_recording(result.out / "bus.log", result.plan)
+    for pdo in result.plan.pdos:
+        assert sum(frame[0] == pdo.cob_id for frame in recording.frames) == sum(f[2] == pdo.cob_id for f in frames)
+
+
+def test_the_controller_waits_for_the_slower_bus():
+    """Two drives on one bus, five and the array on the other: one budget, that of the later feedback and commands."""
+    plan = canprobe.plan(spread_scene(canprobe.load_scene("cylinder", "seven-axis"), 5))
+    budgets = [bus.traffic.budget for bus in plan.buses]
+    assert budgets[0] == budgets[1]
+    for what, direction in (("feedback_ns", "tpdo"), ("commands_ns", "rpdo")):
+        of_drives = [p.response_ns for p in plan.pdos if p.kind == "drive" and p.direction == direction]
+        assert getattr(budgets[0], what) == max(of_drives)
+    first = min(p.response_ns for p in plan.pdos if p.direction == "rpdo" and p.channel == "can1")
+    assert first > budgets[0].start_ns + budgets[0].compute_ns
+
+
+def test_targets_share_an_rpdo_only_with_a_drive_on_the_same_bus():
+    scene = spread_scene(canprobe.load_scene("cylinder"), 3)
+    plan = canprobe.plan(dataclasses.replace(scene, arm=dataclasses.replace(scene.arm, grouped_rpdo=True)))
+    shared = {}
+    for pdo in plan.pdos:
+        if pdo.direction == "rpdo" and pdo.number == 2:
+            shared.setdefault((pdo.channel, pdo.cob_id), []).append(pdo.node_id)
+    assert sorted(shared.values()) == [[1, 2], [3], [4, 5], [6]]
+    free = spread_scene(canprobe.load_scene("free"), 3)
+    free = dataclasses.replace(free, arm=dataclasses.replace(free.arm, grouped_rpdo=True))
+    assert canprobe.run(free, files=False, duration_s=0.1).summary["completed"]
+
+
+def test_the_arm_is_stopped_when_one_of_its_buses_is_lost():
+    session = CutSession(spread_scene(canprobe.load_scene("free"), 3), "can1", 1_500_000_000)
+    with pytest.raises(InterfaceError, match="can1: it is gone"), session:
+        session.run(hold)
+    words = [node.dictionary.number(0x6041) for node in session.world.nodes]
+    assert not POWERED_STATES.intersection(map(state_of, words))

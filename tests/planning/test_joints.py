@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+from scenes import with_joints
 
 import canprobe
 from canprobe.errors import PlanError
@@ -61,6 +62,19 @@ def test_a_wide_cylinder_stays_on_the_array_of_a_gantry():
 
 def test_a_calibration_without_tilt_is_refused():
     assert "a calibration tilts the probe" in refusal(load_scene("calibrate", "gantry"))
+
+
+def test_counts_that_leave_32_bits_are_refused_with_joint_drive_and_range():
+    scene = load_scene("free")
+    first, *_ = scene.joints.values()
+    far = with_joints(scene, zero_counts=[(1 << 31) - 1000, 0, 0, 0, 0, 0])
+    said = refusal(far)
+    assert "joints.joint_1: drive 1 would count from" in said
+    assert f"{first.min_deg:.1f} deg to {first.max_deg:.1f} deg" in said and "hold -2147483648 to 2147483647" in said
+    many_turns = with_joints(scene, gear=[1, 1, 1, 1, 1, 1e5], counts_per_turn=[1000, 1000, 1000, 800, 800, 1e6])
+    assert "joints.joint_6: drive 6" in refusal(many_turns)
+    counts = round(1000 * first.gear * max(abs(first.min_deg), abs(first.max_deg)) / 360) + 1
+    assert canprobe.plan(with_joints(scene, zero_counts=[(1 << 31) - 1 - counts, 0, 0, 0, 0, 0]))
 
 
 def test_two_joints_cannot_press():

@@ -24,7 +24,7 @@ def cylinder():
 def test_packaged_scenes_fit(name):
     plan = canprobe.plan(load_scene(name))
     if plan.joint_speeds is not None:
-        pairs = zip(plan.joint_speeds.needed_deg_s, plan.joint_speeds.limit_deg_s, strict=True)
+        pairs = zip(plan.joint_speeds.needed, plan.joint_speeds.limit, strict=True)
         assert all(needed <= 0.6 * limit for needed, limit in pairs), "a packaged scene keeps clear of the limits"
 
 
@@ -77,18 +77,18 @@ def test_speed_beyond_the_joints_is_refused_with_a_speed_that_fits(cylinder):
 
 def test_joint_speeds_scale_with_the_contact_speed(cylinder):
     slow, fast = (canprobe.plan(change(cylinder, task={"speed_mm_s": v})).joint_speeds for v in (10.0, 30.0))
-    np.testing.assert_allclose(np.array(fast.needed_deg_s), 3 * np.array(slow.needed_deg_s), atol=0.01)
+    np.testing.assert_allclose(np.array(fast.needed), 3 * np.array(slow.needed), atol=0.01)
 
 
 def test_rolling_share_lowers_joint_speeds(cylinder):
     pure, half = (canprobe.plan(change(cylinder, task={"rolling_share": v})).joint_speeds for v in (0.0, 0.5))
-    assert max(half.needed_deg_s) < max(pure.needed_deg_s)
+    assert max(half.needed) < max(pure.needed)
 
 
 def test_swing_of_a_free_scene():
     scene = load_scene("free")
     speeds = canprobe.plan(scene).joint_speeds
-    assert speeds.needed_deg_s[0] == pytest.approx(5 * 2 * math.pi / 4, abs=1e-3)
+    assert speeds.needed[0] == pytest.approx(5 * 2 * math.pi / 4, abs=1e-3)
     assert any("joint 1 would move" in p for p in reasons(with_joints(scene, swing_deg=(25.0, 5, 5, 5, 5, 5))))
     assert any("swing slower" in p for p in reasons(change(scene, task={"swing_period_s": 0.1})))
 
@@ -134,7 +134,7 @@ def test_without_an_object_the_expected_plane_is_checked(cylinder):
     )
     plan = canprobe.plan(real)
     assert plan.setup.emulated_node_ids == ()
-    assert plan.joint_speeds.needed_deg_s[0] > 0
+    assert plan.joint_speeds.needed[0] > 0
     path = surface_path(resolve(real).task, None)
     np.testing.assert_allclose(path.normals, np.tile([0, 0, 1], (len(path.normals), 1)))
 

@@ -4,9 +4,9 @@ import dataclasses
 import importlib.resources
 import math
 import re
-from types import SimpleNamespace
 
 import pytest
+from makes import write_eds
 from scenes import change, reasons, refused, ways_out, with_joints, without_torque
 
 import canprobe
@@ -98,17 +98,40 @@ def test_image_beside_the_drives_is_refused_with_numbers_and_ways_out(cylinder):
 )
 def test_ways_out_written_into_the_scene_file_make_it_fit(cylinder, sections):
     """As a user would: what a way out names goes into the file, nothing else."""
-    scene = change(cylinder, **sections)
+    follow_ways_out(change(cylinder, **sections))
+
+
+def follow_ways_out(scene):
+    """Write each way out into the file, plan that, and return what the ways out name."""
+    texts = []
     for way in ways_out(scene):
         text, numbers = way.rsplit(": ", 1)
+        texts.append(text)
         file = dump_scene(scene)
-        for section, key, value in re.findall(r'(\w+)\.(\w+) = ("[^"]*"|[\w.]+)', text):
+        for section, key, value in re.findall(r'(\w+(?:\.\w+)?)\.(\w+) = ("[^"]*"|[\w.]+)', text):
             head, name, tail = file.partition(f"[{section}]\n")
-            file = f"{head}{name}{key} = {value}\n" + re.sub(rf"^{key} = .*\n", "", tail, count=1, flags=re.M)
+            mine, mark, rest = tail.partition("\n[")
+            mine = re.sub(rf"^{key} = .*\n?", "", mine, count=1, flags=re.M)
+            file = f"{head}{name}{key} = {value}\n{mine}{mark}{rest}"
         for key in re.findall(r"without sensor\.(\w+)", text):
             file = re.sub(rf"^{key} = .*\n", "", file, count=1, flags=re.M)
         plan = canprobe.plan(parse_scene(file))
         assert f"load {100 * max(bus.traffic.load for bus in plan.buses):.0f} %" in numbers, way
+        assert ("without 6077h" in numbers) == (scene.arm.torque and not plan.setup.arm.torque), way
+    return texts
+
+
+def eight_drives():
+    scene = load_scene("cylinder", "seven-axis")
+    joints = {**scene.joints, "joint_8": dataclasses.replace(scene.joints["joint_7"], node_id=8)}
+    return dataclasses.replace(scene, joints=joints)
+
+
+def test_eight_drives_with_an_array_need_a_second_bus_or_a_third_of_a_kilohertz():
+    texts = follow_ways_out(eight_drives())
+    assert "cycle.rate_hz = 333.333 with sensor.rate_hz = 166.667" in texts
+    half = " and ".join(f'joints.joint_{n}.channel = "can1"' for n in (5, 6, 7, 8))
+    assert f"a second bus for half of the drives ({half})" in texts
 
 
 def test_average_below_one_but_peak_too_high_is_refused(cylinder):
@@ -248,7 +271,7 @@ def test_order_of_node_ids_is_the_order_of_joints():
 
 def _pdo(cob_id, node_id, direction):
     layout = PdoLayout(cob_id, (PdoEntry(0x6041, 0, 16),))
-    return PlannedPdo(node_id, direction, 1, layout, 400.0, 75, 2_500_000)
+    return PlannedPdo(node_id, direction, 1, "can0", layout, 400.0, 75, 2_500_000)
 
 
 @pytest.mark.parametrize(
@@ -391,8 +414,7 @@ def test_cycle_budget(name, sections, sync_blocked, sneaks_in, compute):
 
 @pytest.mark.parametrize(("best_us", "starts_us"), [(300, (625, 1145)), (900, (900, 1145))])
 def test_a_controller_starts_when_the_last_feedback_comes_or_at_the_next_look(best_us, starts_us):
-    messages = SimpleNamespace(feedback=("some",), best_feedback_ns=best_us * 1000)
-    starts = controller_starts(messages, (625_000, 1_145_000, 1_500_000), 1_145_000)
+    starts = controller_starts(best_us * 1000, (625_000, 1_145_000, 1_500_000), 1_145_000)
     assert starts == tuple(us * 1000 for us in starts_us)
 
 
@@ -428,3 +450,22 @@ def test_a_sensor_alone_has_a_budget_too():
     assert budget.tactile_ns == (HEARTBEAT + SYNC + HEARTBEAT + 9 * FULL) * 1000
     assert budget.looks_ns == (625_000, 1_500_000)
     assert budget.slack_ns == 2_500_000 - 625_000 - 200_000
+
+
+@pytest.mark.parametrize("mode", ["window", "image"])
+@pytest.mark.parametrize("ids", [(17, 18, 19, 20, 21, 49, 126), (120, 121, 122, 123, 124, 125, 126)])
+def test_identifiers_of_the_array_leave_those_of_any_drive_alone(mode, ids, tmp_path):
+    """RPDO4 of nodes 17 to 49 are 511h to 531h, where the array's are otherwise; whatever bus they are on."""
+    scene = load_scene("cylinder", "seven-axis")
+    scene = change(
+        scene,
+        arm={"eds": str(write_eds("milliseconds_only", tmp_path))},
+        cycle={"rate_hz": 333.333},
+        sensor={"mode": mode, "channel": "can1", "rate_hz": 333.333 / 2},
+    )
+    plan = canprobe.plan(with_joints(scene, node_id=ids, channel=["can0"] * 4 + ["can2"] * 3))
+    tactile = [pdo.cob_id for pdo in plan.pdos if pdo.kind == "tactile"]
+    drives = {pdo.cob_id for pdo in plan.pdos if pdo.kind == "drive"} | {0x500 + node_id for node_id in ids}
+    assert drives.isdisjoint(tactile) and len(set(tactile)) == len(tactile)
+    assert tactile == sorted(tactile) and (tactile[0] == 0x511) == (17 not in ids)
+    assert [bus.channel for bus in plan.buses] == ["can0", "can2", "can1"]

@@ -12,11 +12,12 @@ from undrawn import undrawn, undrawn_run
 from wrapped import Wrapped
 
 import canprobe
-from canprobe.bus.disk import CandumpWriter, RecordingPort
+from canprobe.bus.disk import CandumpWriter, RecordingPort, write_npz
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.bus.port import VirtualClock
 from canprobe.cell.cell import Cell
 from canprobe.emulator.world import make_world
+from canprobe.results.summary import log_columns, tactile_columns
 from canprobe.scene.load import dump_scene
 from canprobe.session.session import resolve_scene
 from canprobe.tasks.from_plan import make_task
@@ -123,6 +124,8 @@ def delayed_run(tmp_path_factory):
             cell.run(controller)
     recorded = replace(scene, bus=replace(scene.bus, interface="socketcan"))
     (out / "scene.toml").write_text(dump_scene(recorded))
+    write_npz(out / "log.npz", log_columns(cell))
+    write_npz(out / "tactile.npz", tactile_columns(cell))
     return out, controller.task, cell
 
 
@@ -140,13 +143,13 @@ def other_run(tmp_path_factory):
 
 @pytest.fixture
 def copy_of(tmp_path):
-    """Copy a run's folder with its log's lines changed."""
+    """Copy a run's folder with its log's lines changed, and without what its master measured: only the bus is left."""
 
     def copy(folder: Path, change):
         target = tmp_path / f"{folder.name}-changed"
         target.mkdir()
         for path in folder.iterdir():
-            if path.name != "bus.log":
+            if path.name not in ("bus.log", "log.npz", "tactile.npz"):
                 (target / path.name).write_bytes(path.read_bytes())
         lines = (folder / "bus.log").read_text().splitlines()
         (target / "bus.log").write_text("".join(f"{line}\n" for line in change(lines)))

@@ -1,4 +1,4 @@
-"""Replay: a recorded log gives the online result again, and any log of the same nodes gives a shape."""
+"""Replay: the folder of a run gives the online result again, and any log of the same nodes gives a shape."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import random
 import re
 
 import numpy as np
-import pytest
 from candump_lines import can_id_of, restamped, stamp_us
 from scenes import without_torque
 from undrawn import undrawn_run
@@ -15,7 +14,6 @@ from undrawn import undrawn_run
 import canprobe
 from canprobe.bus.disk import read_candump, read_npz
 from canprobe.cli import main
-from canprobe.tasks.probing import Phase
 
 DRIVES = tuple(f"{0x180 + node:03X}" for node in range(1, 7))
 TRUE_KAPPA = np.array([1 / 0.036, 0.0])
@@ -68,11 +66,9 @@ def largest_deviation(records, reference, *, in_sigmas=False, same_method=False)
     return float(deviation[near].max())
 
 
-def test_the_log_alone_gives_the_online_result_to_the_last_bit(lockstep_run):
+def test_the_folder_of_a_run_gives_the_online_result_to_the_last_bit(lockstep_run):
     result = canprobe.replay(lockstep_run.out)
     assert result.summary["driven_by"] == "task"
-    assert result.summary["targets"]["worst_counts"] == 0
-    assert result.summary["targets"]["compared"] > 900
     assert_same(result.estimates["recursive"], lockstep_run.estimates["recursive"])
     online = json.loads((lockstep_run.out / "summary.json").read_text())
     assert json.loads(json.dumps(result.summary["shape"])) == online["shape"]
@@ -83,7 +79,6 @@ def test_a_run_of_drives_that_send_no_torque_is_replayed_and_shown(lockstep_run,
     run = undrawn_run(scene, out=tmp_path / "run", duration_s=0.8)
     assert "torque_permille" in lockstep_run.log and "torque_permille" not in run.log
     result = canprobe.replay(run.out)
-    assert result.summary["targets"]["worst_counts"] == 0
     assert_same(result.estimates["recursive"], run.estimates["recursive"])
     assert main(["view", str(run.out), "--html", str(tmp_path / "run.html")]) == 0
     assert (tmp_path / "run.html").stat().st_size > 100_000
@@ -118,24 +113,23 @@ def test_a_log_whose_lines_are_in_another_order_is_sorted_by_its_stamps(lockstep
         shift = {stamp_us(line): rng.randrange(4000) for line in lines}
         return sorted(lines, key=lambda line: stamp_us(line) + shift[stamp_us(line)])
 
-    result = canprobe.replay(copy_of(lockstep_run.out, later))
-    assert_same(result.estimates["recursive"], lockstep_run.estimates["recursive"])
+    sorted_again = canprobe.replay(copy_of(lockstep_run.out, later))
+    as_it_was = canprobe.replay(lockstep_run.out / "bus.log", scene=lockstep_run.plan.scene)
+    assert_same(sorted_again.estimates["recursive"], as_it_was.estimates["recursive"])
 
 
-def test_a_real_bus_with_overruns_is_replayed_to_the_last_bit(delayed_run):
+def test_a_bus_with_delays_and_overruns_is_replayed_to_the_last_bit(delayed_run):
     folder, task, cell = delayed_run
     assert cell.cycle.statistics.overruns > 3 and cell.drives.missed > 0 and cell.drives.late > 0
     result = canprobe.replay(folder)
-    assert result.summary["targets"]["worst_counts"] == 0
+    assert result.summary["driven_by"] == "task"
     assert_same(result.tracker.records, task.shape.records)
-    shift_ns = round((result.estimates["recursive"][0].t_s - task.shape.records[0].t_s) * 1e9)
-    assert 0 <= shift_ns - cell.start_ns < 100_000  # by the SYNC that was the least late
-    assert_same(result.estimates["recursive"], task.shape.records, shift_ns)
+    assert_same(result.estimates["recursive"], task.shape.records, cell.start_ns)
 
 
-def test_another_tools_log_of_that_bus_is_within_a_percent(delayed_run, tmp_path):
+def test_another_tools_log_of_that_bus_gives_the_shape(delayed_run, tmp_path):
     """Its stamps are off by up to 100 µs, on a clock of its own; SYNCs are late, periods are skipped."""
-    folder, task, _ = delayed_run
+    folder, _, _ = delayed_run
     rng = random.Random(2)
     lines = []
     for line in sorted((folder / "bus.log").read_text().splitlines(), key=stamp_us):
@@ -144,8 +138,8 @@ def test_another_tools_log_of_that_bus_is_within_a_percent(delayed_run, tmp_path
     log = tmp_path / "candump-2025-11-13.log"
     log.write_text("\n".join(lines) + "\n")
     result = canprobe.replay(log, scene=folder / "scene.toml")
-    assert result.summary["driven_by"] == "task"
-    assert largest_deviation(result.tracker.records, task.shape.records, same_method=True) < 0.01
+    assert result.summary["driven_by"] == "other"
+    np.testing.assert_allclose(result.estimates["recursive"][-1].estimate.kappa, TRUE_KAPPA, atol=2.0)
     assert result.summary["shape"]["kappa_true_per_m"] is None
 
 
@@ -167,7 +161,6 @@ def test_lost_lines_are_counted_and_cost_little(motion_run, copy_of):
     cycle = result.summary["cycle"]
     assert lost["tpdo"] > 10 and cycle["missed_pdos"] <= lost["tpdo"] < cycle["missed_pdos"] + 5  # a few at the end
     assert cycle["torn_frames"] == cycle["lost_frames"] == lost["taxels"] == 1
-    assert result.summary["driven_by"] == "task" and result.summary["targets"]["differing"] > 0
     assert largest_deviation(result.estimates["recursive"], motion_run.estimates["recursive"], in_sigmas=True) < 1.0
 
 
@@ -193,22 +186,9 @@ def test_a_sync_without_a_counter_places_the_frames_by_their_arrival(lockstep_ru
     def bare(lines):
         return [re.sub(r" 080#..$", " 080#", line) for line in lines]
 
-    result = canprobe.replay(copy_of(lockstep_run.out, bare))
-    replayed, online = result.estimates["recursive"], lockstep_run.estimates["recursive"]
-    shift_ns = round((replayed[0].t_s - online[0].t_s) * 1e9)
-    assert 0 < shift_ns < 12_000  # without its byte the SYNC would have ended so much earlier
-    assert_same(replayed, online, shift_ns)
-
-
-def test_a_run_that_ended_before_its_scan_is_still_ours(lockstep_run, copy_of):
-    scan_s = lockstep_run.log["t_s"][np.argmax(lockstep_run.log["phase"] == Phase.SCAN)]
-
-    def until_the_scan(lines):
-        return [line for line in lines if stamp_us(line) < 1e6 * scan_s]
-
-    result = canprobe.replay(copy_of(lockstep_run.out, until_the_scan))
-    assert result.summary["driven_by"] == "other" and result.summary["targets"]["differing"] == 0
-    assert "the scene's task drove, but not to its scan: every contact is fed" in result.text()
+    without = canprobe.replay(copy_of(lockstep_run.out, bare))
+    counted = canprobe.replay(lockstep_run.out / "bus.log", scene=lockstep_run.plan.scene)
+    assert_same(without.estimates["recursive"], counted.estimates["recursive"])
 
 
 def test_another_controllers_log(other_run, tmp_path):
@@ -229,27 +209,13 @@ def test_another_controllers_log(other_run, tmp_path):
     summary = result.summary
     assert (summary["driven_by"], summary["channel"]) == ("other", "can_left")
     assert summary["cycle"]["error_frames"] > 10 and summary["cycle"]["torn_frames"] == 0
-    assert "another controller" in result.text()
     for records in result.estimates.values():
         np.testing.assert_allclose(records[-1].estimate.kappa, TRUE_KAPPA, atol=0.1 * TRUE_KAPPA[0])
-
-
-def test_no_targets_in_the_log_means_every_contact(lockstep_run, copy_of):
-    result = canprobe.replay(
-        copy_of(lockstep_run.out, lambda lines: [x for x in lines if not can_id_of(x).startswith("20")])
-    )
-    assert result.summary["driven_by"] == "other" and result.summary["targets"]["compared"] == 0
-    assert "no targets are in the log" in result.text()
-    start_s = result.estimates["recursive"][0].t_s - result.tracker.records[0].t_s
-    first_s = lockstep_run.estimates["recursive"][0].t_s
-    assert start_s + result.tracker.samples[0].t_s < first_s - 0.4  # from the touch-down on
-    np.testing.assert_allclose(result.estimates["recursive"][-1].estimate.kappa, TRUE_KAPPA, atol=2.0)
 
 
 def test_a_run_of_another_length_parts_from_the_scenes_task(lockstep_run):
     result = canprobe.replay(lockstep_run.out, scene="cylinder", method="recursive")  # which scans for 20 s
     assert result.summary["driven_by"] == "other" and result.summary["online"] is None
-    assert result.summary["targets"]["parted_s"] == pytest.approx(lockstep_run.log["t_s"][-1], abs=0.3)
     assert len(result.tracker.samples) > 200
     np.testing.assert_allclose(result.estimates["recursive"][-1].estimate.kappa, TRUE_KAPPA, atol=2.0)
 

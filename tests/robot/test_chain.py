@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from puma_arm import MODELS
 from serial_arms import five, gantry, random_chain, scara, seven
 
 from canprobe.errors import PlanError
@@ -18,7 +19,6 @@ from canprobe.robot.chain import (
     point_velocity,
     posture,
 )
-from canprobe.robot.puma import MODELS
 
 TOOL = np.array([[0.36, 0.48, -0.8, 0.01], [-0.8, 0.6, 0.0, -0.02], [0.48, 0.64, 0.6, 0.08], [0.0, 0.0, 0.0, 1.0]])
 CHAINS = {model.name: model.chain for model in (*MODELS.values(), gantry(), scara(), five(), seven())}
@@ -146,6 +146,6 @@ def test_rows_have_four_columns(rows):
 
 
 def test_a_chain_is_read_only():
-    for array in (CHAINS["upenn"].fixed, CHAINS["upenn"].T_last_flange):
+    for array in (CHAINS["puma260"].fixed, CHAINS["puma260"].T_last_flange):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 1.0

@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from puma_arm import BODIES, MODELS, UPENN
 
 from canprobe.errors import PlanError
 from canprobe.robot.chain import forward, from_dh, link_transforms, tool_z_offset
 from canprobe.robot.dynamics import RigidBody, ball, dynamics_problem, joined
 from canprobe.robot.model import Body
-from canprobe.robot.puma import BODIES, MODELS, UPENN, dh_rows
+from canprobe.scene.load import read_cell
 
 TOOL = tool_z_offset(80.0)
 BOTH = pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
@@ -94,7 +95,7 @@ def test_a_pendulum_and_a_lift_are_the_closed_forms():
 
 
 def test_weight_of_the_horizontal_arm_is_the_published_one():
-    links = BODIES["upenn"]
+    links = BODIES["puma260"]
     load = ball(0.3, 0.04, (UPENN.chain.T_last_flange @ TOOL)[:3, 3])
     bare = RigidBody(UPENN.chain, links).gravity(HORIZONTAL)[1]
     assert bare == pytest.approx(3.7, abs=0.05)
@@ -146,7 +147,7 @@ def test_bodies_of_the_puma_stand_where_its_denavit_hartenberg_frames_put_them(m
     at = link_transforms(model.chain, np.zeros(6))[0]
     com = at[:3, :3] @ BODIES[model.name][1].com + at[:3, 3]
     assert com[1] == pytest.approx(0.107, abs=1e-12)
-    assert com[0] == pytest.approx(float(dh_rows(model)[1, 0]) - 0.171, abs=1e-12)
+    assert com[0] == pytest.approx(1e-3 * read_cell(model.name).joints["joint_2"].a_mm - 0.171, abs=1e-12)
 
 
 def test_halves_joined_are_the_whole():
@@ -164,5 +165,5 @@ def test_what_is_missing_is_said_with_what_to_type(monkeypatch):
     assert 'plant.fidelity = "ideal"' in dynamics_problem("gantry", None)
     monkeypatch.setitem(sys.modules, "mujoco", None)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(PlanError, match=r"pip install 'canprobe\[dynamics\]'"):
-        RigidBody(UPENN.chain, BODIES["upenn"])
+    with pytest.raises(PlanError, match=r"pip install .*\[dynamics\]'"):
+        RigidBody(UPENN.chain, BODIES["puma260"])

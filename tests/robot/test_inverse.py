@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from puma_arm import ELBOW_FORM
+from puma_arm import ELBOW_FORM, MODELS, UPENN
 from serial_arms import five, gantry, model_of, random_chain, scara, seven
 
 from canprobe.errors import PlanError
@@ -20,7 +20,6 @@ from canprobe.robot.inverse import (
     task_rows,
 )
 from canprobe.robot.model import joints_to_units, units_to_joints
-from canprobe.robot.puma import MODELS, UPENN
 
 TOOL = tool_z_offset(80.0)
 POINT = np.array((-0.120, -0.1225, 0.374))

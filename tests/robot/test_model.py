@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from puma_arm import MODELS, UPENN
 from serial_arms import gantry, scara, seven
 
 from canprobe.errors import PlanError
@@ -19,7 +20,6 @@ from canprobe.robot.model import (
     units_per_motor,
     units_to_joints,
 )
-from canprobe.robot.puma import MODELS, UPENN
 
 ALL = {model.name: model for model in (*MODELS.values(), gantry(), scara(), seven())}
 EACH = pytest.mark.parametrize("model", ALL.values(), ids=ALL)

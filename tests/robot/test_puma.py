@@ -1,14 +1,14 @@
-"""The PUMA 260 as data: published lengths, counts, coupling and poses."""
+"""The packaged cells of the PUMA 260: published lengths, counts, coupling and poses."""
 
 import math
 
 import numpy as np
 import pytest
-from puma_arm import ELBOW_FORM
+from puma_arm import ELBOW_FORM, UPENN
 
-from canprobe.robot.chain import forward, from_dh, tool_z_offset
-from canprobe.robot.model import ArmModel, joints_to_units
-from canprobe.robot.puma import MODELS, UPENN, dh_rows
+from canprobe.robot.chain import forward, tool_z_offset
+from canprobe.robot.model import joints_to_units
+from canprobe.scene.load import read_cell
 
 
 @pytest.mark.parametrize(("joint", "counts_per_turn"), list(enumerate((46720, 69973, 42987, 34809, 31508, 25415))))
@@ -29,20 +29,17 @@ def test_wrist_coupling_signs_and_sizes():
 
 
 @pytest.mark.parametrize(
-    ("name", "lengths_mm"),
-    [("upenn", (330.2, 203.2, -127.0, 0.0, 203.2, 63.5)), ("unimate", (330.2, 198.1, -124.5, -19.05, 203.2, 55.9))],
+    ("cell", "lengths_mm"),
+    [
+        ("puma260", (330.2, 203.2, -127.0, 0.0, 203.2, 63.5)),
+        ("puma260-unimate", (330.2, 198.1, -124.5, -19.05, 203.2, 55.9)),
+    ],
 )
-def test_published_lengths(name, lengths_mm):
-    a, _, d, _ = dh_rows(MODELS[name]).T
+def test_published_lengths(cell, lengths_mm):
+    joints = read_cell(cell).joints.values()
+    a, d = [joint.a_mm for joint in joints], [joint.d_mm for joint in joints]
     # base height, upper arm, shoulder offset, elbow offset, forearm, flange
-    assert 1e3 * np.array((d[0], a[1], d[1] + d[2], a[2], d[3], d[5])) == pytest.approx(lengths_mm, abs=0.05)
-    assert MODELS[name].name == name
-
-
-def test_rows_are_asked_of_a_puma_only():
-    other = ArmModel(from_dh(np.zeros((6, 4)), name="upenn"), UPENN.joints, UPENN.units_per_q, UPENN.zero_units)
-    assert dh_rows(other) is None
-    assert dh_rows(MODELS["unimate"]) is not None
+    assert (d[0], a[1], d[1] + d[2], a[2], d[3], d[5]) == pytest.approx(lengths_mm, abs=0.05)
 
 
 def test_known_poses_of_the_upenn_arm():

@@ -7,7 +7,7 @@ import pytest
 
 from canprobe.errors import PlanError
 from canprobe.robot.chain import Chain, forward, forward_jacobian
-from canprobe.robot.urdf import from_urdf
+from canprobe.robot.urdf import find_mesh, from_urdf, visuals_of, with_meshes_found
 
 ARMS = {
     "panda": ("panda_description/urdf/panda.urdf", "panda_link0", "panda_hand_tcp", 7),
@@ -130,6 +130,34 @@ def test_bodies_make_the_mass_matrix_and_the_height_of_pinocchio(arm):
         assert moments == pytest.approx(gravity[oracle.columns], abs=1e-8)
 
 
+@pytest.mark.parametrize("name", ["panda", "tiago with its torso", "a piece of ur5"])
+def test_meshes_stand_where_pinocchio_has_them_and_are_found(name):
+    pin = pytest.importorskip("pinocchio")
+    file, base, tip, _ = ARMS[name]
+    path = Path(pin.__file__).parents[4] / "share/example-robot-data/robots" / file
+    read, visuals = from_urdf(path, base, tip), visuals_of(path, base, tip)
+    oracle = Oracle(pin, path, read.chain.joints, tip)
+    solids = pin.buildGeomFromUrdf(
+        oracle.model, str(path), pin.GeometryType.VISUAL, package_dirs=[str(path.parents[4])]
+    )
+    q, placed = np.random.default_rng(2).uniform(-1.0, 1.0, read.chain.n), solids.createData()
+    oracle.tool(q, base)
+    pin.updateGeometryPlacements(oracle.model, oracle.data, solids, placed, oracle.q(q))
+    T_base = oracle.data.oMf[oracle.model.getFrameId(base, pin.FrameType.BODY)].inverse()
+    there = [
+        (Path(solid.meshPath).name, (T_base * T).homogeneous)
+        for solid, T in zip(solids.geometryObjects, placed.oMg, strict=True)
+    ]
+    assert len(there) == len(visuals) or base != oracle.model.frames[1].name
+    for visual in (visual for visual in visuals if visual.kind == "mesh"):
+        k, T = visual.joint, visual.T
+        if k:
+            moved = Chain("part", read.chain.joints[:k], read.chain.prismatic[:k], read.chain.fixed[:k], np.eye(4))
+            T = forward(moved, q[:k]) @ T
+        found = find_mesh(path, visual.mesh)
+        assert any(found.name == mesh and np.allclose(T, other, rtol=0, atol=1e-9) for mesh, other in there)
+
+
 # Without the oracle: what a small file means, and what is refused.
 
 LIMIT = '<limit lower="-1" upper="2" velocity="3" effort="4"/>'
@@ -198,3 +226,39 @@ def test_a_continuous_joint_has_a_turn_to_either_side():
     inside = '<limit velocity="3" effort="4"/>'
     read = from_urdf(robot(joint("j", "a", "b", "continuous", inside)), "a", "b")
     assert (read.joints[0].q_min, read.joints[0].q_max) == pytest.approx((-2 * np.pi, 2 * np.pi))
+
+
+SHOWN = """<robot name="r"><material name="blue"><color rgba="0 0 1 1"/></material>
+  <link name="a"><visual><geometry><mesh filename="package://lab/meshes/a.stl"/></geometry></visual>
+    <visual><geometry><cylinder radius="0.1" length="0.4"/></geometry><material name="blue"/></visual></link>
+  <link name="b"><visual><origin xyz="0 0 1"/><geometry><mesh filename='b %2F.obj' scale="1 1 -1"/></geometry>
+    <material name="red"><color rgba="1 0 0 1"/></material></visual></link>
+  <joint name="j" type="continuous"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/></joint></robot>"""
+
+
+def test_what_links_look_like_and_where_their_meshes_are(tmp_path):
+    urdf = tmp_path / "lab" / "urdf" / "r.urdf"
+    for path in (urdf, tmp_path / "lab/meshes/a.stl", urdf.with_name("b %2F.obj")):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(SHOWN)
+    stl, can, obj = visuals_of(urdf)
+    assert [(v.joint, v.kind, v.size, v.colour) for v in (stl, can, obj)] == [
+        (0, "mesh", (1.0, 1.0, 1.0), None),
+        (0, "cylinder", (0.1, 0.4), (0, 0, 255)),
+        (1, "mesh", (1.0, 1.0, -1.0), (255, 0, 0)),
+    ]
+    assert obj.T[2, 3] == 1.0
+    assert find_mesh(urdf, stl.mesh) == tmp_path / "lab/meshes/a.stl"
+    assert find_mesh(urdf, obj.mesh) == urdf.with_name("b %2F.obj")
+    assert find_mesh(urdf, "package://lab/no.stl") is None and find_mesh(urdf, "http://lab/a.stl") is None
+    copy = tmp_path / "elsewhere.urdf"
+    copy.write_bytes(with_meshes_found(urdf))
+    again = visuals_of(copy)
+    assert [find_mesh(copy, v.mesh) for v in (again[0], again[2])] == [find_mesh(urdf, v.mesh) for v in (stl, obj)]
+    assert with_meshes_found(copy) == copy.read_bytes()
+
+
+def test_a_solid_without_its_numbers_is_refused():
+    text = SHOWN.replace('length="0.4"', "")
+    with pytest.raises(PlanError, match="link a: expected a number in length of <cylinder>, got None"):
+        visuals_of(text)

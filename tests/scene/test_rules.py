@@ -14,8 +14,8 @@ from canprobe.session.target import Target
 PRESS = load_scene("press")
 
 
-def put(scene, *, interface=None, channel=None, bitrate=None, sensor_channel=None, **values):
-    return resolve_scene(scene, Target.over(scene, interface, channel, bitrate, sensor_channel), **values)
+def put(scene, *, interface=None, channel=None, bitrate=None, **values):
+    return resolve_scene(scene, Target.over(scene, interface, channel, bitrate), **values)
 
 
 @pytest.mark.parametrize(
@@ -30,7 +30,8 @@ def put(scene, *, interface=None, channel=None, bitrate=None, sensor_channel=Non
         ({"duration_s": 1e9}, "duration_s: expected a number above 0 up to 86400"),
         ({"channel": "a b"}, "channel: expected text without spaces, in ASCII, got 'a b'"),
         ({"channel": "ü"}, "channel: "),
-        ({"sensor_channel": ""}, "channel: "),
+        ({"channel": {"can0": ""}}, "channel: "),
+        ({"channel": {"can1": "vcan1"}}, "channel: the scene has no channel can1, only can0"),
         ({"bitrate": 0}, "bitrate: expected an integer from 10000"),
         ({"interface": 3}, "interface: expected text"),
     ],

@@ -23,7 +23,7 @@ def served(monkeypatch):
         monkeypatch.setattr(
             "canprobe.bus.scheduling.ask_for_processor", lambda: False
         )  # not for the tests' own process
-        monkeypatch.setattr("canprobe.emulator.serve.serve", lambda participants, port, stop: act(participants))
+        monkeypatch.setattr("canprobe.emulator.serve.serve", lambda buses, stop: act(buses[0][0]))
         return main(["emulate", "free", "--channel", "vcan0", "--nodes", "1,2", *options])
 
     return emulate

@@ -1,5 +1,6 @@
 """`up --check-joints` on the whole cell in lockstep, with drives that were set up wrongly."""
 
+import re
 import struct
 from dataclasses import replace
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 import canprobe
+import canprobe.api
 from canprobe.cell.controller import Command
 from canprobe.cli import main
 from canprobe.emulator.node.dictionary import key_of
@@ -101,7 +103,7 @@ def test_a_sound_arm_is_found_so_and_its_pose_is_told(cell):
     cell.operator, said = Watcher(), []
     findings = canprobe.api.check_joints(scene(), operator=cell.operator, say=said.append)
     assert [(f.joint, f.fault, f.skipped) for f in findings] == [(joint, None, None) for joint in range(6)]
-    assert [f.moved_deg for f in findings] == pytest.approx([1.0] * 6, abs=0.03)
+    assert [f.moved for f in findings] == pytest.approx([1.0] * 6, abs=0.03)
     assert said[-1].startswith(f"{REPORTED} 90.00, 65.00, 15.00, 0.00, 100.00, 0.")
     assert_disabled(cell.session)
 
@@ -159,7 +161,10 @@ def test_a_scene_without_an_arm_is_refused():
     ("words", "what"),
     [
         (("--check-joints",), "needs a terminal; --yes leaves that out"),
-        (("--yes",), "--yes goes with --check-joints"),
+        (("--home",), "up --home asks before each motion and needs a terminal; --yes leaves that out"),
+        (("--home", "--yes"), 'no joint of scene free has zero = "homing"'),
+        (("--home", "--check-joints"), "--home and --check-joints are two steps"),
+        (("--yes",), "--yes goes with --check-joints or --home"),
         (("--check-joints", "--yes", "--bridge", "mcap"), "--check-joints feeds no --bridge"),
     ],
 )
@@ -186,5 +191,8 @@ def test_each_kind_is_told_when_it_comes_and_counted_at_the_end():
         session.run(disturb, report_news)
         assert len(lines) == 1, "the second of the same kind is no news"
     what = "noted: node 4: EMCY 8210h, PDO not processed due to length error, "
+    told = [re.findall(r"at ([\d.]+) s", line) for line in lines]
     first, last = (session.cell.start_ns * 1e-9 + cycle * 0.0025 for cycle in (60, 70))  # on the clock of bus.log
-    assert lines == [what + f"at {first:.2f} s", what + f"2 times, first at {first:.2f} s, last at {last:.2f} s"]
+    assert [float(t) for times in told for t in times] == pytest.approx([first, first, last], abs=0.01)
+    (one,), (start, end) = told
+    assert lines == [what + f"at {one} s", what + f"2 times, first at {start} s, last at {end} s"]

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from puma_arm import MODELS
 
 from canprobe.emulator.plant.ideal_arm import natural_frequency
 from canprobe.robot.chain import forward, rotation_rpy
-from canprobe.robot.puma import MODELS
 from canprobe.scene.geometry import T_flange_probe
 from canprobe.studies import stability
 from canprobe.studies.fault_scores import longest_above
@@ -108,7 +108,7 @@ def test_feeling_takes_the_wrong_stiffness_out_of_the_loop_within_its_bound():
 def test_a_posture_touches_where_the_arm_would_be():
     """Joints by the forward kinematics: 10 mm above, the pole points at the place, against its normal."""
     case = stability.cases(False)[16]
-    T = forward(MODELS["upenn"].chain, np.radians(case.posture_deg)) @ T_flange_probe(scene_of(case).probe)
+    T = forward(MODELS["puma260"].chain, np.radians(case.posture_deg)) @ T_flange_probe(scene_of(case).probe)
     tip = 1e3 * T[:3, 3] + 40.0 * T[:3, 2]
     np.testing.assert_allclose(tip + 10.0 * T[:3, 2], case.at_mm, atol=1e-6)
     np.testing.assert_allclose(-T[:3, 2], case.normal, atol=1e-9)

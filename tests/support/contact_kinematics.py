@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from canprobe.errors import UsageError
-from canprobe.touch.linear_algebra import Array, cross, homogeneous, inverse_transform, tangent_rotation
+from canprobe.touch.linear_algebra import Array, homogeneous, inverse_transform, tangent_rotation
 
 
 def probe_contact_frame(direction: Array, radius: float) -> Array:
@@ -38,7 +38,7 @@ def facing_rotation(spin: float = 0.0) -> Array:
 
 def material_velocity(origin: Array, origin_velocity: Array, omega: Array, point: Array) -> Array:
     """V: velocity of the point of a rigid body that is now at `point`."""
-    return origin_velocity + cross(omega, point - origin)
+    return origin_velocity + np.cross(omega, point - origin)
 
 
 def velocity_over_object(v_f: Array, V_f: Array, V_o: Array) -> Array:
@@ -57,7 +57,7 @@ def normal_rate_residual(  # noqa: PLR0917 - the equation's own symbols in its o
         omega_f, omega_o: (3,) rad/s.
         n_o: (3,) outward unit normal of the object.
     """
-    result: Array = K_o @ v_o + K_f @ v_f - cross(omega_f - omega_o, n_o)
+    result: Array = K_o @ v_o + K_f @ v_f - np.cross(omega_f - omega_o, n_o)
     return result
 
 
@@ -81,7 +81,7 @@ def contact_velocities(K_o: Array, K_f: Array, V_rel: Array, omega_rel: Array, n
     relative = P.T @ (K_o + K_f) @ P
     if abs(float(np.linalg.det(relative))) <= 1e-12 * float(np.abs(relative).max()) ** 2:
         raise UsageError("K_o + K_f: expected surfaces that touch at a point, got a singular relative curvature")
-    v_f = P @ np.linalg.solve(relative, P.T @ (cross(omega_rel, n_o) - K_o @ slide))
+    v_f = P @ np.linalg.solve(relative, P.T @ (np.cross(omega_rel, n_o) - K_o @ slide))
     return v_f + slide, v_f
 
 

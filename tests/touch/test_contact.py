@@ -19,7 +19,7 @@ from canprobe.touch.contact import (
     indentation_from_force,
     stiffness_from_slope,
 )
-from canprobe.touch.linear_algebra import homogeneous, rotation_vector, tangent_rotation
+from canprobe.touch.linear_algebra import homogeneous, rotation_vectors, tangent_rotation
 from canprobe.touch.surface import SurfaceMatrix
 
 H = 1e-3
@@ -187,9 +187,9 @@ def test_object_frame_position_and_orientation():
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-10, 0.3, 2.5, 3.1])
-def test_rotation_vector(angle):
+def test_rotation_vectors(angle):
     axis = np.array([0.36, 0.48, 0.8])
-    assert np.allclose(rotation_vector(turn(axis, angle)), angle * axis, atol=1e-12)
+    assert np.allclose(rotation_vectors(turn(axis, angle)[None])[0], angle * axis, atol=1e-12)
 
 
 class TestIndentation:

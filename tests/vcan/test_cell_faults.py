@@ -81,6 +81,6 @@ def test_monitor_sees_the_cell_and_sends_nothing(bench: Any) -> None:
     view = json.loads(monitor.out)
     assert {node["state"] for node in view["nodes"]} == {"OPERATIONAL"}
     assert {node["drive"] for node in view["nodes"][:6]} == {"OPERATION_ENABLED"}
-    assert 50 < view["sync_hz"] < 110 and view["q_deg"][0] == pytest.approx(90, abs=0.1)
+    assert 50 < view["sync_hz"] < 110 and view["q"][0] == pytest.approx(90, abs=0.1)
     command.send(signal.SIGINT)
     command.end(0)

@@ -1,4 +1,4 @@
-"""Real and emulated nodes side by side, the arm on one interface and the sensor on another, as three processes."""
+"""Nodes on two interfaces: real and emulated ones side by side, and an arm whose emulated drives are on both."""
 
 from __future__ import annotations
 
@@ -74,3 +74,47 @@ def test_an_arm_of_another_process_and_an_emulated_sensor_on_its_own_bus(bench: 
     assert last[0x710] == b"\x7f", "the sensor is pre-operational"
     assert not {can_id for can_id in bench.bus.last if 0x511 <= can_id <= 0x531}, "and was never on the arm's bus"
     assert arm.running
+
+
+SPREAD = """\
+[scene]
+name = "spread"
+figures = false
+[cycle]
+rate_hz = 100
+[arm]
+missed_syncs = 40
+[limits]
+late_cycles_max_percent = 100
+[joints.joint_4]
+channel = "can1"
+[joints.joint_5]
+channel = "can1"
+[joints.joint_6]
+channel = "can1"
+[task]
+kind = "free"
+duration_s = 1
+"""
+
+
+def test_emulated_drives_of_one_arm_on_two_interfaces(bench: Any, second_bus: Any) -> None:
+    """One process serves both buses from one plant, and one master runs the arm over both."""
+    scene = bench.folder / "spread.toml"
+    scene.write_text(SPREAD)
+    buses = ("--bus", "socketcan", "--channel", "can0=vcan0", "--channel", f"can1={SECOND}")
+    bench.start("run", scene, *buses, "--out", bench.folder / "run").end(0)
+    results = bench.results("run")
+    assert results.summary["completed"]
+    assert {name: load["measured"] > 0 for name, load in results.summary["bus_load"].items()} == {
+        "vcan0": True,
+        SECOND: True,
+    }
+    on = {name: {row[2] for row in results.frames if row[1] == name} for name in ("vcan0", SECOND)}
+    tpdos, common = {0x180 + node_id for node_id in range(1, 7)}, {0x000, 0x080, 0x77F}
+    assert on["vcan0"] & tpdos == {0x181, 0x182, 0x183} and on[SECOND] & tpdos == {0x184, 0x185, 0x186}
+    assert common <= on["vcan0"] & on[SECOND]
+    syncs = {name: [row[3] for row in results.frames if row[1] == name and row[2] == 0x080] for name in on}
+    assert syncs["vcan0"] == syncs[SECOND]
+    assert {frame[0] for frame in second_bus.drain()} >= {0x080, 0x184, 0x204}
+    bench.assert_left_safe(results.last, 1, 2, 3, 4, 5, 6)

@@ -60,13 +60,13 @@ class CyclicPosition(CyclicMode):
             super().sync(t_ns, counts)
 
     def latch(self, t_ns: int) -> None:
-        """Follow the target from where the reference is."""
+        """Follow the target from the one before it."""
         parameters, units, loop = self._parameters, self._units, self.parts.loop
         target = self.wanted()
         allowed = parameters.clamp(target)
         counts = allowed * units.scale + units.origin
         passed_ns = max(parameters.interpolation_ns, t_ns - self._latched_ns)
-        if abs(counts - self._motion.demand(t_ns)) > parameters.max_speed * passed_ns * 1e-9 + ROUNDING_COUNTS:
+        if abs(counts - self._motion.onset(t_ns)) > parameters.max_speed * passed_ns * 1e-9 + ROUNDING_COUNTS:
             self.parts.fault(REFERENCE_LIMIT, t_ns)
             return
         self._latched_ns = t_ns

@@ -42,20 +42,19 @@ class Units:
         origin: counts at position 0; homing sets it.
     """
 
-    __slots__ = ("_delivered", "_dictionary", "magnitude", "origin", "scale", "speed_scale", "turn")
+    __slots__ = ("_dictionary", "magnitude", "origin", "scale", "speed_scale", "turn")
 
     def __init__(self, dictionary: Dictionary) -> None:
         self._dictionary = dictionary
-        self._delivered = _encoder_counts(dictionary.delivered)
         self.origin = 0.0
         self.read()
 
     def read(self) -> None:
         """Take the present factors."""
         dictionary = self._dictionary
-        resolution = dictionary.number(_RESOLUTION, 1)
-        self.turn = _quotient(dictionary.number, _RESOLUTION) / self._delivered if resolution else DEFAULT_TURN
-        self.magnitude = _encoder_counts(dictionary.number) / self._delivered
+        resolution, delivered = dictionary.number(_RESOLUTION, 1), _encoder_counts(dictionary.delivered)
+        self.turn = _quotient(dictionary.number, _RESOLUTION) / delivered if resolution else DEFAULT_TURN
+        self.magnitude = _encoder_counts(dictionary.number) / delivered
         turned = dictionary.number(0x607E) ^ dictionary.delivered(0x607E)
         self.scale = -self.magnitude if turned >> _POSITION & 1 else self.magnitude
         self.speed_scale = -self.magnitude if turned >> _VELOCITY & 1 else self.magnitude

@@ -7,8 +7,8 @@ equation, draws them towards 0. They are baselines and are reported as they are.
 
 from __future__ import annotations
 
-import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -22,7 +22,7 @@ from canprobe.touch.estimate.likelihood import Touches, fit_ml, make_touches, wo
 from canprobe.touch.estimate.noise import Prior, make_noise
 from canprobe.touch.estimate.online import AGREES, LAST_FEW, Dropped, Gate, looks_changed
 from canprobe.touch.estimate.quadric import TO_Q, decide, size_of
-from canprobe.touch.linear_algebra import Array, cross, rotation_vector, upper_root
+from canprobe.touch.linear_algebra import Array, rotation_vectors, upper_root
 
 # Six-unknown linear estimates from differences of points and normals.
 
@@ -271,20 +271,21 @@ class Chen1996Estimator(WindowEstimator):
         samples = list(self._samples)
         lag = usable_lag(len(samples), self._lag)
         newer = np.arange(lag, len(samples))
-        rates = np.array([paper_rates(samples[i - lag], samples[i]) for i in newer])
-        x, y = rates.transpose(1, 0, 2) @ working_frame(touches)[:3, :3]
+        x, y = np.array(paper_rates(samples[:-lag], samples[lag:])) @ working_frame(touches)[:3, :3]
         return solve_pairs(touches, Pairs(newer, newer - lag, y / touches.extent, -x), "chen1996")
 
 
-def paper_rates(older: ContactSample, newer: ContactSample) -> tuple[Array, Array]:
-    """x (28) and y (29) times the time between two samples, in base axes; the object stands still.
+def paper_rates(older: Sequence[ContactSample], newer: Sequence[ContactSample]) -> tuple[Array, Array]:
+    """x (28) and y (29) (n, 3) times the times between n pairs of samples, in base axes; the object stands still.
 
     `x = ω × n_f + K_f v_f`, `y = V_f + v_f`, everything taken half-way; K_f = 1/|r_probe|.
     """
-    Ra, Rb = older.T_base_probe[:3, :3], newer.T_base_probe[:3, :3]
-    turn = rotation_vector(Rb @ Ra.T)
-    arm = 0.5 * (Ra @ older.r_probe + Rb @ newer.r_probe)
-    slide = 0.5 * (Ra + Rb) @ (newer.r_probe - older.r_probe)
-    radius = math.sqrt(float(newer.r_probe @ newer.r_probe))
-    V = newer.T_base_probe[:3, 3] - older.T_base_probe[:3, 3] + cross(turn, arm)
-    return cross(turn, -0.5 * (older.n_base + newer.n_base)) + slide / radius, V + slide
+    Ta, Tb = (np.array([s.T_base_probe for s in samples]) for samples in (older, newer))
+    ra, rb = (np.array([s.r_probe for s in samples])[:, :, None] for samples in (older, newer))
+    n = 0.5 * np.array([a.n_base + b.n_base for a, b in zip(older, newer, strict=True)])
+    Ra, Rb = Ta[:, :3, :3], Tb[:, :3, :3]
+    turn = rotation_vectors(Rb @ Ra.transpose(0, 2, 1))
+    arm = (0.5 * (Ra @ ra + Rb @ rb))[:, :, 0]
+    slide = (0.5 * (Ra + Rb) @ (rb - ra))[:, :, 0]
+    V = Tb[:, :3, 3] - Ta[:, :3, 3] + np.cross(turn, arm)
+    return slide / np.linalg.norm(rb, axis=1) - np.cross(turn, n), V + slide

@@ -129,7 +129,7 @@ def _on_vcan(node: SlaveNode, stack: ExitStack) -> Bench:
 
     def run() -> None:
         try:
-            serve([node], port, ended.is_set)
+            serve([([node], port)], ended.is_set)
         except BaseException as error:
             failures.append(error)
 

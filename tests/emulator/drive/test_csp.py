@@ -123,6 +123,19 @@ def test_cia402_a_cycle_without_a_target_holds_the_last(master, plant):
     assert position(frames) == 1000
 
 
+@pytest.mark.parametrize(("step", "goes_on"), [(2000, True), (2400, False)])
+def test_cia402_607f_bounds_the_way_from_target_to_target_however_the_syncs_jitter(drive, step, goes_on):
+    master = Master(drive).enable()
+    t_ns = (master.k + 1) * CYCLE
+    for k in range(1, 12):
+        master.k += 1
+        drive.advance(t_ns)
+        drive.send(0x80, f"{(master.k - 1) % 240 + 1:02x}", t_ns)
+        drive.send(0x201, (b"\x0f\0" + (k * step).to_bytes(4, "little")).hex(), t_ns + 300_000)
+        t_ns += CYCLE + (600_000 if k % 2 else -600_000)
+    assert (drive.node.application.state is S.OPERATION_ENABLED) == goes_on
+
+
 @pytest.mark.parametrize(
     ("target", "reached", "limited"), [(900, 900, 0), (1100, 1000, 1), (-1100, -500, 1), (1000, 1000, 0)]
 )

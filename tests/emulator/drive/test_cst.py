@@ -6,7 +6,7 @@ import math
 from itertools import pairwise
 
 import pytest
-from puma_arm import ELBOW_FORM
+from puma_arm import ELBOW_FORM, UPENN
 
 from canprobe.eds.packaged import load_eds
 from canprobe.emulator.drive.drive import make_drive_node
@@ -14,7 +14,6 @@ from canprobe.emulator.drive.reference import torque_run
 from canprobe.emulator.plant.config import PlantConfig
 from canprobe.emulator.plant.ideal_arm import MotorDynamics
 from canprobe.emulator.plant.plant import Plant
-from canprobe.robot.puma import UPENN
 
 GAIN, COULOMB, DAMPING = 100.0, 50.0, 4.0  # of the plant of numbers
 

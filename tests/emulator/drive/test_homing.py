@@ -6,13 +6,12 @@ from copy import deepcopy
 
 import pytest
 from canopen.objectdictionary import ODVariable
-from puma_arm import ELBOW_FORM
+from puma_arm import ELBOW_FORM, UPENN
 
 from canprobe.eds.packaged import load_eds
 from canprobe.emulator.drive.drive import make_drive_node
 from canprobe.emulator.plant.config import PlantConfig
 from canprobe.emulator.plant.plant import Plant
-from canprobe.robot.puma import UPENN
 
 START, HALT = 0x1F, 0x10F
 UNDER_WAY, NOT_STARTED, DONE = (0, 0, 0), (0, 0, 1), (0, 1, 1)

@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
-from puma_arm import ELBOW_FORM
+from puma_arm import BODIES, ELBOW_FORM, UPENN
 
 from canprobe.eds.packaged import load_eds
 from canprobe.emulator.drive.drive import make_drive_node
 from canprobe.emulator.plant.config import PlantConfig
 from canprobe.emulator.plant.plant import Plant
-from canprobe.robot.puma import BODIES, UPENN
 from canprobe.scene.setup import Quirks
 
 CSP, CSV, CST = 8, 9, 10
@@ -17,7 +16,7 @@ HOLD = "0f0000000000"
 
 @pytest.fixture
 def dynamic():
-    return Plant(PlantConfig(UPENN, ELBOW_FORM, taxels=None, fidelity="dynamic", bodies=BODIES["upenn"]))
+    return Plant(PlantConfig(UPENN, ELBOW_FORM, taxels=None, fidelity="dynamic", bodies=BODIES["puma260"]))
 
 
 def at_work(rig, mode, *words):
@@ -115,7 +114,7 @@ def test_torque_fed_forward_pushes_at_once(dynamic):
 
 @pytest.mark.parametrize(("early_ms", "falls"), [(0, False), (60, True)])
 def test_a_brake_that_opens_before_the_torque_comes_lets_a_vertical_axis_fall(rig, early_ms, falls):
-    stretched = Plant(PlantConfig(UPENN, np.zeros(6), taxels=None, fidelity="dynamic", bodies=BODIES["upenn"]))
+    stretched = Plant(PlantConfig(UPENN, np.zeros(6), taxels=None, fidelity="dynamic", bodies=BODIES["puma260"]))
     quirks = Quirks(brake_early_ns=early_ms * 1_000_000)
     node = make_drive_node(load_eds("puma260_joint", 1), 1, 1, stretched, quirks=quirks)
     rig.drive.node, rig.plant = node, stretched

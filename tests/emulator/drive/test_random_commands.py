@@ -6,14 +6,13 @@ import random
 
 import pytest
 from makes import MAKES, write_eds
-from puma_arm import ELBOW_FORM
+from puma_arm import ELBOW_FORM, UPENN
 
 from canprobe.eds.packaged import load_eds
 from canprobe.emulator.drive.drive import make_drive_node
 from canprobe.emulator.plant.config import PlantConfig
 from canprobe.emulator.plant.plant import Plant
 from canprobe.protocol.cia402 import state_of
-from canprobe.robot.puma import UPENN
 
 WRITES = (
     *(0x6007, 0x605A, 0x605B, 0x605C, 0x605D, 0x605E, 0x6065, 0x6066, 0x6067, 0x6068, 0x6071, 0x6072, 0x607A, 0x607C),

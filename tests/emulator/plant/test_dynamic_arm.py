@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from puma_arm import ELBOW_FORM
+from puma_arm import BODIES, ELBOW_FORM, MODELS, UPENN
 from scipy.integrate import solve_ivp
 
 from canprobe.emulator.plant.config import PlantConfig
@@ -17,7 +17,6 @@ from canprobe.errors import PlanError
 from canprobe.robot.chain import Chain, forward, forward_jacobian, from_dh, tool_z_offset
 from canprobe.robot.inverse import start_posture
 from canprobe.robot.model import ArmModel, Body, Joint, joints_per_motor, joints_to_units, units_per_motor
-from canprobe.robot.puma import BODIES, MODELS, UPENN
 from canprobe.scene.setup import Dynamics
 from canprobe.touch.objects import make_object
 
@@ -33,7 +32,7 @@ NOTHING = Effects(gravity=False, coriolis=False, friction=False, links=False, co
 def config(depth=0.43e-3, shape=CYLINDER, **dynamics):
     q0 = start_posture(UPENN, POINT, (0, 0, 1), ELBOW_FORM, radius_m=0.04, T_flange_probe=TOOL, clearance_m=-depth)
     settings = Dynamics(**dynamics)
-    return PlantConfig(UPENN, q0, object=shape, fidelity="dynamic", dynamics=settings, bodies=BODIES["upenn"])
+    return PlantConfig(UPENN, q0, object=shape, fidelity="dynamic", dynamics=settings, bodies=BODIES["puma260"])
 
 
 def state(arm):
@@ -345,5 +344,5 @@ def test_an_ideal_arm_of_any_kind_follows_too(made):
 
 
 def test_an_arm_without_bodies_has_no_dynamics():
-    with pytest.raises(PlanError, match="the masses of arm 'upenn' are not known"):
+    with pytest.raises(PlanError, match="the masses of arm 'puma260' are not known"):
         make_arm(replace(config(), bodies=None))

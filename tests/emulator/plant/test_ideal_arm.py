@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from puma_arm import ELBOW_FORM
+from puma_arm import ELBOW_FORM, UPENN
 from scipy.linalg import expm
 
 from canprobe.emulator.plant.ideal_arm import IdealArm, natural_frequency, transition
 from canprobe.robot.model import joints_to_units
-from canprobe.robot.puma import UPENN
 
 MS = 1_000_000
 DAMPING = pytest.mark.parametrize("z", [0.4, 0.7, 1.0, 1.0000001, 1.8])

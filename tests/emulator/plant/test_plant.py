@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from puma_arm import ELBOW_FORM
+from puma_arm import BODIES, ELBOW_FORM, UPENN
 from scipy.spatial.transform import Rotation
 
 from canprobe.emulator.plant.config import PlantConfig, PressMotion
@@ -15,7 +15,6 @@ from canprobe.errors import PlanError
 from canprobe.robot.chain import forward, forward_jacobian, tool_z_offset
 from canprobe.robot.inverse import inverse_near, start_posture
 from canprobe.robot.model import joints_to_units, units_to_joints
-from canprobe.robot.puma import BODIES, UPENN
 from canprobe.touch.objects import make_object
 
 PITCH_M = 1.5875e-3
@@ -330,7 +329,7 @@ def test_real_centroid_follows_the_true_contact_point():
 
 @pytest.mark.parametrize("fidelity", ["ideal", "dynamic"])
 def test_limit_switches_stand_just_outside_of_the_joints_range_where_the_other_motors_are(fidelity):
-    p = Plant(PlantConfig(UPENN, ELBOW_FORM, taxels=None, fidelity=fidelity, bodies=BODIES["upenn"]))
+    p = Plant(PlantConfig(UPENN, ELBOW_FORM, taxels=None, fidelity=fidelity, bodies=BODIES["puma260"]))
     push(p, ELBOW_FORM + 0.05, 0, 100 * MS)
     p.advance(300 * MS)
     for axis in range(6):

@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from puma_arm import ELBOW_FORM
+from puma_arm import BODIES, ELBOW_FORM, UPENN
 
 from canprobe.emulator.plant.config import PlantConfig
 from canprobe.emulator.plant.dynamic_arm import make_equations
@@ -18,7 +18,6 @@ from canprobe.protocol.tactile import SIDE
 from canprobe.robot.chain import forward, forward_jacobian, tool_z_offset
 from canprobe.robot.inverse import start_posture
 from canprobe.robot.model import joints_per_motor, joints_to_units
-from canprobe.robot.puma import BODIES, UPENN
 from canprobe.scene.setup import Dynamics
 from canprobe.touch.objects import make_object
 from canprobe.touch.shapes import LIP_M
@@ -114,7 +113,7 @@ def test_pieces_of_a_lip_add_up_to_the_law_of_a_point():
 
 def arm_over(shape, depth=2e-4, *, friction=0.0, point=POINT, **config):
     q0 = start_posture(UPENN, point, (0, 0, 1), ELBOW_FORM, radius_m=R, T_flange_probe=TOOL, clearance_m=-depth)
-    settings, bodies = Dynamics(friction=friction), BODIES["upenn"]
+    settings, bodies = Dynamics(friction=friction), BODIES["puma260"]
     return PlantConfig(UPENN, q0, object=shape, fidelity="dynamic", dynamics=settings, bodies=bodies, **config)
 
 

@@ -96,10 +96,10 @@ def test_noise_on_both_sides(noise, lag, percent, within, truth):
 def test_the_papers_rates_are_the_object_fixed_ones(truth):
     path = truth.path("ellipsoid")
     felt = list(truth.felt(path, 0.5e-3, 1))
-    for a, b in zip(felt[:20], felt[5:25], strict=True):
-        x, y = paper_rates(a, b)
-        assert np.allclose(y, b.p_base - a.p_base, atol=2e-6)
-        assert np.allclose(-x, b.n_base - a.n_base, atol=5e-5)
+    older, newer = felt[:20], felt[5:25]
+    x, y = paper_rates(older, newer)
+    assert np.allclose(y, [b.p_base - a.p_base for a, b in zip(older, newer, strict=True)], atol=2e-6)
+    assert np.allclose(-x, [b.n_base - a.n_base for a, b in zip(older, newer, strict=True)], atol=5e-5)
 
 
 def test_the_linear_step_shrinks_curvature(truth):

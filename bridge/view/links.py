@@ -1,0 +1,113 @@
+"""The links of an arm as its URDF shows them: meshes that are found beside it, and plain solids.
+
+Meshes (STL, DAE, OBJ) are read by trimesh (extra `view`). Where a link has nothing to show, or one of its
+meshes is missing or cannot be read, the simple link of `canprobe.bridge.view.bodies` is drawn, and a line says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from canprobe.bridge.database import need
+from canprobe.bridge.view.bodies import WHITE, Part, arm_parts
+from canprobe.bridge.view.meshes import Array, Mesh
+from canprobe.errors import PlanError
+from canprobe.robot.chain import Chain
+from canprobe.robot.urdf import Visual, find_mesh, visuals_of
+from canprobe.scene.geometry import transform
+from canprobe.scene.hardware import ArmSettings
+
+_NAMED = 3
+"""Missing meshes that a line names."""
+_FORMATS = (".stl", ".dae", ".obj")
+
+
+def arm_links(arm: ArmSettings, chain: Chain) -> tuple[list[Part], list[str]]:
+    """What is drawn of an arm, and a line for what its URDF shows and cannot be drawn.
+
+    Args:
+        arm: of the scene.
+        chain: that follows from it.
+    """
+    plain = arm_parts(chain)
+    if arm.urdf is None:
+        return plain, []
+    urdf = Path(arm.urdf)
+    try:
+        visuals = visuals_of(urdf, arm.base, arm.tip)
+    except PlanError as error:
+        return plain, [f"{error}: simple links are drawn"]
+    behind = (np.eye(4), *chain.fixed[1:], chain.T_last_flange)  # where a part's frame stands in that of its joint
+    mount = transform(arm.mount_mm, arm.mount_deg)
+    parts: list[Part] = []
+    lost: dict[str, list[Visual]] = {}
+    for visual in visuals:
+        T = (mount if visual.joint == 0 else np.linalg.inv(behind[visual.joint])) @ visual.T
+        try:
+            for mesh, colour in _solids(urdf, visual):
+                name = f"solid_{len(parts) + 1}"
+                parts.append(Part(name, visual.joint, mesh.moved(T), visual.colour or colour, flat=True))
+        except _LostError as error:
+            lost.setdefault(str(error), []).append(visual)
+    simple = {visual.joint for visuals in lost.values() for visual in visuals}
+    simple |= set(range(chain.n + 1)) - {part.frame for part in parts}
+    return [*(part for part in plain if part.frame in simple), *parts], list(_lines(urdf, lost))
+
+
+def _lines(urdf: Path, lost: dict[str, list[Visual]]) -> Iterator[str]:
+    for why, visuals in lost.items():
+        names = list(dict.fromkeys(visual.mesh.rpartition("/")[2] or visual.kind for visual in visuals))
+        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+        yield f"{urdf.name}: {', '.join(names[:_NAMED])}{more}: {why}; simple links are drawn"
+
+
+class _LostError(Exception):
+    """Why a solid cannot be drawn."""
+
+
+def _solids(urdf: Path, visual: Visual) -> list[tuple[Mesh, tuple[int, int, int]]]:
+    """Triangles and colours of one solid, in its own frame."""
+    trimesh = need("trimesh", "view", "the view")
+    size: Sequence[float] = visual.size
+    if visual.kind == "box":
+        return [(_mesh(trimesh.creation.box(size)), WHITE)]
+    if visual.kind == "cylinder":
+        return [(_mesh(trimesh.creation.cylinder(*size)), WHITE)]
+    if visual.kind == "sphere":
+        return [(_mesh(trimesh.creation.icosphere(radius=size[0])), WHITE)]
+    if visual.kind != "mesh":
+        raise _LostError("not a solid of a URDF")
+    path = find_mesh(urdf, visual.mesh)
+    if path is None:
+        raise _LostError("not found beside the URDF")
+    if path.suffix.lower() not in _FORMATS:
+        raise _LostError(f"expected {', '.join(_FORMATS)}")
+    try:
+        bodies = trimesh.load_scene(path).dump()
+    except Exception as error:  # whatever a reader of foreign files raises, the view goes on
+        raise _LostError(f"cannot be read: {error or type(error).__name__}") from error
+    return [(_scaled(_mesh(body), np.array(size)), _colour(body)) for body in bodies if hasattr(body, "faces")]
+
+
+def _mesh(body: Any) -> Mesh:
+    body.merge_vertices(merge_tex=True, merge_norm=True)
+    return Mesh(np.array(body.vertices, np.float64), np.array(body.faces, np.int64))
+
+
+def _scaled(mesh: Mesh, scale: Array) -> Mesh:
+    faces = mesh.faces if scale.prod() > 0.0 else mesh.faces[:, ::-1]  # mirrored, it would be inside out
+    return Mesh(mesh.vertices * scale, faces)
+
+
+def _colour(body: Any) -> tuple[int, int, int]:
+    """One colour for a body: of its material, or the mean of its faces; white where the file has none."""
+    visual = body.visual
+    if visual.kind is None:
+        return WHITE
+    colour = visual.material.main_color if visual.kind == "texture" else visual.main_color
+    red, green, blue = (int(x) for x in np.asarray(colour)[:3])
+    return red, green, blue
