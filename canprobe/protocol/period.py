@@ -18,7 +18,7 @@ KEPT = 64
 LEAST = 4
 """Arrivals from which there is a fit."""
 OFF = 0.25
-"""Share of the period by which an arrival may be off the fit; beyond it the device has started anew."""
+"""Share of the period by which an arrival, and the fitted period, may be off; beyond it the fit begins anew."""
 
 
 class PeriodFit:
@@ -61,7 +61,7 @@ class PeriodFit:
         period = float(n @ t) / squares
         fitted = t.mean() + period * n
         rest = t - fitted
-        if abs(rest[-1]) > OFF * self._stated_ns:
+        if max(abs(rest[-1]), abs(period - self._stated_ns)) > OFF * self._stated_ns:
             self._arrivals.clear()
             self._arrivals.append((0, t_ns))
             self.period_ns = self._stated_ns

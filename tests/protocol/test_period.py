@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from canprobe.protocol.period import KEPT, PeriodFit
 
@@ -51,3 +53,14 @@ def test_a_restarted_device_is_fitted_anew():
     for k in range(1, 10):
         t, sigma = fit.step(shifted + k * STATED_NS)
     assert t == shifted + 9 * STATED_NS and sigma < 1e-9
+
+
+@given(st.lists(st.integers(0, 10**9), max_size=100))
+def test_no_arrivals_make_it_fail(steps):
+    """Frames of several images may be received at one instant, after a stall."""
+    fit, t = PeriodFit(STATED_NS), 0
+    for step in steps:
+        t += step
+        instant, sigma = fit.step(t)
+        assert abs(instant - t) <= STATED_NS and 0.0 <= sigma < 1e-9 * STATED_NS
+        assert 0.75 * STATED_NS <= fit.period_ns <= 1.25 * STATED_NS
