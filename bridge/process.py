@@ -120,15 +120,16 @@ def _unpack_measurement(parts: Any) -> Measurement:
 def _pack_tactile(sample: TactileSample) -> Any:
     frame = sample.frame
     features = (frame.features.pack(), frame.features.peak) if frame.features is not None else None
-    header, taxels = frame.header.pack(), frame.taxels.tobytes()
-    return sample.t_sample_ns, sample.cycle, header, taxels, frame.window, features, frame.t_ns
+    image = frame.header.pack(), frame.taxels.shape, frame.taxels.tobytes()
+    return sample.t_sample_ns, sample.cycle, sample.t_sigma_s, image, frame.window, features, frame.t_ns
 
 
 def _unpack_tactile(parts: Any) -> TactileSample:
-    t_sample_ns, cycle, header, taxels, window, features, t_ns = parts
-    image = np.frombuffer(taxels, np.uint8).reshape(16, 16)
+    t_sample_ns, cycle, t_sigma_s, (header, shape, taxels), window, features, t_ns = parts
+    image = np.frombuffer(taxels, np.uint8).reshape(shape)
     found = Features.unpack(*features) if features is not None else None
-    return TactileSample(TactileFrame(TactileHeader.unpack(header), image, window, found, t_ns), t_sample_ns, cycle)
+    frame = TactileFrame(TactileHeader.unpack(header), image, window, found, t_ns)
+    return TactileSample(frame, t_sample_ns, cycle, t_sigma_s)
 
 
 def _pack_estimate(estimate: SurfaceEstimate) -> Any:

@@ -54,7 +54,7 @@ class TouchFrame:
 
     Attributes:
         t_ns: when it was sampled, on the clock of the samples.
-        counts: (16, 16) uint8, row by row; zero outside the window; None in features mode.
+        counts: (rows, columns) uint8, row by row; zero outside the window; None in features mode.
         force: (3,) N that the object exerts on the probe, in the probe's centre frame. The array measures pressure
             only: the force runs along the contact normal, without a torque about the sphere's centre.
         contact: None without contact, or without an arm.

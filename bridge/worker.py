@@ -152,7 +152,7 @@ class SampleSource:
         self._sensing = _sensing(plan.setup)
         self._has_arm = arm is not None
         self._radius = probe.radius
-        self._calibration = array_calibration(array.full_scale, probe.radius) if array is not None else None
+        self._calibration = array_calibration(array.pad) if array is not None else None
 
     def sample(self, received: Received) -> Sample:
         """The sample of one observation."""

@@ -50,9 +50,9 @@ A scene is a TOML file. `canprobe scenes` lists the packaged ones and prints the
 change it. `canprobe plan FILE` checks a scene and reports every mistake at once, with the key and, where a name is
 misspelt, the name that was probably meant.
 
-A key that a scene leaves out has the value of its cell ([Your own arm](own-arm.md)), or else its
-default. The suffix of a key is its unit. Numbers may be written with or without
-a decimal point. `"auto"` leaves the choice to the plan, which prints what it chose and why.
+A key that a scene leaves out has the value of its cell ([Your own arm](own-arm.md)), then that of the array file that
+the cell names ([Your own array](own-array.md)), or else its default. The suffix of a key is its unit. Numbers may be
+written with or without a decimal point. `"auto"` leaves the choice to the plan, which prints what it chose and why.
 
 This page is generated from the definition of a scene: `python docs/generate.py`.
 
@@ -60,9 +60,9 @@ This page is generated from the definition of a scene: `python docs/generate.py`
 
 `[scene]` and `[task]` are needed in every scene; `[bus]`, `[cycle]`, `[limits]`, `[bring_up]` and `[bridge]` may stand
 in every scene. `[cell]`, `[arm]`, `[joints.NAME]`, `[sensor]`, `[probe]` and `[emulate]` usually come from the cell
-file. The other sections depend on `task.kind`. *required*: the scene must have the section. *default*: a
-scene without the section has all its defaults. *optional*: a scene without the section does without it. *–*: the
-section is an error.
+file, and `[wire]` from the array file. The other sections depend on `task.kind`. *required*: the scene must have the
+section. *default*: a scene without the section has all its defaults. *optional*: a scene without the section does
+without it. *–*: the section is an error.
 """
 
 

@@ -18,7 +18,7 @@ from canprobe.eds.packaged import eds_path
 from canprobe.planning.bridges import BRIDGES
 from canprobe.scene.checks import convert
 from canprobe.scene.load import load_scene, scenes_folder
-from canprobe.scene.model import Scene
+from canprobe.scene.model import ArrayFile, Scene
 from canprobe.studies.sweep import STUDIES
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -27,7 +27,7 @@ TEXTS = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for
 PATHS = ("canprobe/", "docs/", "tests/", ".ci/")
 SECTIONS = {
     name: typing.get_args(hint)[-1] if name == "joints" else next(iter(typing.get_args(hint)), hint)
-    for name, hint in typing.get_type_hints(Scene).items()
+    for name, hint in {**typing.get_type_hints(ArrayFile), **typing.get_type_hints(Scene)}.items()
 }
 
 

@@ -27,12 +27,11 @@ from canprobe.bridge.view.meshes import (
     revolved,
     scale,
 )
-from canprobe.protocol.tactile import SIDE
 from canprobe.robot.chain import Chain, dh_step
 from canprobe.touch.contact import pad_to_direction
 from canprobe.touch.linear_algebra import tangent_rotation
 from canprobe.touch.objects import Cylinder, Sphere
-from canprobe.touch.patch.image import PatchCalibration
+from canprobe.touch.pad import Pad
 from canprobe.touch.shapes import Bowl, PlacedShape, Torus, Wave
 
 # The PUMA 260 as solid links, by the lengths of its chain; any other arm as plain joints and bars.
@@ -367,28 +366,28 @@ TAXEL_LIFT_M = 2e-4
 """How far above the dome taxels are drawn."""
 
 
-def taxel_poses(radius: float) -> tuple[Array, Array]:
+def taxel_poses(pad: Pad, radius: float) -> tuple[Array, Array]:
     """Where the taxels lie on the probe.
 
     Args:
-        radius: of the probe, m.
+        pad: the taxels.
+        radius: from the origin of the probe's frame to its pole, m.
 
     Returns:
-        (256, 3) positions in the probe frame, m, and (256, 4) unit quaternions w, x, y, z that turn a tile lying in
+        (n, 3) positions in the probe frame, m, and (n, 4) unit quaternions w, x, y, z that turn a tile lying in
         the xy plane to its place; row by row, v and then u rising.
     """
-    pitch = PatchCalibration().pitch_m
-    axis = (np.arange(SIDE) - 0.5 * (SIDE - 1)) * pitch
-    directions = np.array([pad_to_direction(u, v, radius) for v in axis for u in axis])
+    directions = np.array([pad_to_direction(u, v, pad.radius_m) for u, v in pad.uv.tolist()])
     # the shortest turn from z to d: (1 + d_z, z × d), normalised
     turns = np.column_stack([1.0 + directions[:, 2], -directions[:, 1], directions[:, 0], np.zeros(len(directions))])
     turns /= np.linalg.norm(turns, axis=1, keepdims=True)
-    return (radius + TAXEL_LIFT_M) * directions, turns
+    pole = np.array([0.0, 0.0, radius - pad.radius_m])
+    return pole + (pad.radius_m + TAXEL_LIFT_M) * directions, turns
 
 
-def tile() -> tuple[Array, NDArray[np.int64]]:
+def tile(pad: Pad) -> tuple[Array, NDArray[np.int64]]:
     """One taxel: vertices (4, 3), m, and faces (2, 3), front side towards +z."""
-    half = 0.5 * SHARE * PatchCalibration().pitch_m
+    half = 0.5 * SHARE * pad.pitch_m
     corners = half * np.array(((-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)), dtype=np.float64)
     return corners, np.array(((0, 1, 2), (0, 2, 3)))
 
@@ -402,7 +401,7 @@ def taxel_image(taxels: NDArray[np.uint8], pixels: int) -> Colours:
     """The image as RGB, each taxel a square of so many pixels; v rises upward.
 
     Args:
-        taxels: (16, 16) counts, rows v, columns u.
+        taxels: (rows, columns) counts, rows v, columns u.
         pixels: per taxel.
     """
     colours = taxel_colours(taxels[::-1])

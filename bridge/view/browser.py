@@ -266,7 +266,8 @@ def _panel_data(run: RecordedRun, times: Array, notes: list[str]) -> dict[str, A
     shape = shape_of(run)
     errors = error_scale(shape)
     task = run.scene.task
-    blank = np.zeros((16, 16), np.uint8)
+    sensor = run.scene.sensor
+    blank = np.zeros((1, 1) if sensor is None else (sensor.rows, sensor.columns), np.uint8)
     taxels = b"".join((blank if m.taxels is None else m.taxels).tobytes() for m in moments) if run.taxels else b""
     return {
         "title": run.title,
@@ -278,7 +279,9 @@ def _panel_data(run: RecordedRun, times: Array, notes: list[str]) -> dict[str, A
         "target": task.force_n if task.kind in ("scan", "press") else None,
         "truth": shape is not None,
         "shape": run.scene.shape is not None,
-        "sensor": run.scene.sensor is not None,
+        "sensor": sensor is not None,
+        "rows": blank.shape[0],
+        "columns": blank.shape[1],
         "taxels": base64.b64encode(taxels).decode("ascii"),
         "scale": {"high": errors.high, "text": errors.text, "colours": scale(np.linspace(0, 1, 64), 0, 1).tolist()},
         "heat": scale(np.sqrt(np.arange(256.0)), 0.0, math.sqrt(255.0), MAGMA).tolist(),

@@ -46,7 +46,7 @@ class Moment:
         q: (n,) joint positions, rad or m; None without an arm.
         contact: where the probe touches; None without contact.
         answer: the newest one of the estimator; None before the first.
-        taxels: (16, 16) counts of the newest frame; None before the first.
+        taxels: (rows, columns) counts of the newest frame; None before the first.
         force: N, of the newest frame; NaN before the first.
         dropped: samples lost on the way so far.
     """

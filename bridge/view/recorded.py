@@ -52,7 +52,7 @@ class RecordedRun:
         log: the columns of `_SHAPES` that the run has; every row one cycle.
         answer_rows: rows at which the estimator gave a new answer.
         answers: at each of them.
-        taxels: (t_s, (16, 16) uint8 counts) of each tactile frame, by rising time of the cycle that used it.
+        taxels: (t_s, (rows, columns) uint8 counts) of each tactile frame, by rising time of the cycle that used it.
     """
 
     scene: Scene

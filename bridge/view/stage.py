@@ -38,6 +38,7 @@ from canprobe.robot.model import ArmModel
 from canprobe.scene.geometry import T_flange_probe, true_object
 from canprobe.scene.model import Scene
 from canprobe.scene.resolve import resolve
+from canprobe.touch.pad import Pad
 from canprobe.touch.shapes import PlacedShape
 
 # The scene in the browser: arm, probe, object, contact, force, patch and path as viser's nodes.
@@ -63,7 +64,8 @@ class Stage:
 
     def __init__(self, server: Any, scene: Scene) -> None:
         self._api = server.scene
-        arm = resolve(scene).arm
+        setup = resolve(scene)
+        arm, array = setup.arm, setup.array
         self._model = None if arm is None else arm.model
         self._shape = None if scene.object is None else true_object(scene.object)
         self._probe = None
@@ -78,7 +80,7 @@ class Stage:
             for part in parts:
                 self._add(f"/arm/{part.frame}/{part.name}", part.mesh, part.colour, flat_shading=part.flat)
         if scene.probe is not None:
-            self._add_probe(scene.probe.radius_mm * 1e-3, taxels=scene.sensor is not None)
+            self._add_probe(scene.probe.radius_mm * 1e-3, array.pad if array is not None else None)
         self._add_contact()
         self._look(server, scene)
         self._drawn_patch: object = None
@@ -112,14 +114,14 @@ class Stage:
             thickness_units="screen",
         )  # fmt: skip
 
-    def _add_probe(self, radius: float, *, taxels: bool) -> None:
+    def _add_probe(self, radius: float, pad: Pad | None) -> None:
         self._probe = self._api.add_frame("/probe", show_axes=False, position=ALONE)
         holder, elastic = probe_parts(radius, self._tool)
         self._add("/probe/holder", holder, PROBE)
         self._add("/probe/dome", elastic, (120, 128, 140), opacity=0.14, side="double", cast_shadow=False)
-        if taxels:
-            places, turns = taxel_poses(radius)
-            vertices, faces = tile()
+        if pad is not None:
+            places, turns = taxel_poses(pad, radius)
+            vertices, faces = tile(pad)
             blank = np.zeros(len(places), np.uint8)
             self._taxels = self._api.add_batched_meshes_simple(
                 "/probe/taxels", vertices.astype(np.float32), faces.astype(np.uint32), turns, places,
@@ -282,7 +284,7 @@ class Panel:
             bar = np.broadcast_to(scale(np.linspace(0.0, 1.0, 256), 0.0, 1.0), (14, 256, 3))
             gui.add_image(np.ascontiguousarray(bar), label=f"path: 0 … {errors.high:.2g}  {errors.text}", format="png")
         if scene.sensor is not None:
-            blank = np.zeros((16, 16), np.uint8)
+            blank = np.zeros((scene.sensor.rows, scene.sensor.columns), np.uint8)
             self._taxels = gui.add_image(taxel_image(blank, PIXELS), label="taxel image", format="png")
             self._add_plot(gui, "force (N)", ("force", "target"), (FIRST, FAINT))
         if scene.shape is not None:

@@ -457,6 +457,10 @@ class JoinedPort(PlainPort):
 
         self._on_each(send)
 
+    def send_on(self, channel: str, frames: Sequence[Frame]) -> None:
+        """Send frames on one bus, whoever else has their identifiers."""
+        self._on_each(lambda port: port.send_batch(frames) if port is self._ports[channel] else None)
+
     def drain(self) -> list[TimedFrame]:
         """Return every frame that has arrived on any bus, by time.
 
@@ -509,3 +513,11 @@ class JoinedPort(PlainPort):
 
 def _time(frame: TimedFrame) -> int:
     return frame[2]
+
+
+def send_on(port: Port, channel: str, frames: Sequence[Frame]) -> None:
+    """Send frames on the bus of a channel, whether the port is on that one alone or on several."""
+    if isinstance(port, JoinedPort):
+        port.send_on(channel, frames)
+    else:
+        port.send_batch(frames)

@@ -121,6 +121,8 @@ class BringUp:
             BusError: another master uses this bus.
         """
         self.listen()
+        if not self._setups:
+            return
         self._reset()
         self._configure_all()
         self.listen()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
@@ -10,9 +11,9 @@ from typing import Any, TypeVar
 import numpy as np
 
 from canprobe.bus.network import PumpedNetwork
-from canprobe.bus.port import Port, PortCounters, TimedFrame, VirtualClock
+from canprobe.bus.port import Port, PortCounters, TimedFrame, VirtualClock, send_on
 from canprobe.bus.scheduling import Interrupts
-from canprobe.cell.array import make_tactile, patch_from
+from canprobe.cell.array import RawReceiver, make_tactile, patch_from
 from canprobe.cell.bringup import BringUp
 from canprobe.cell.controller import Command, Controller, Measurement, as_controller
 from canprobe.cell.cycle import Cycle, Observers
@@ -22,7 +23,7 @@ from canprobe.cell.log import Notes, RunLog, TactileLog, joint_columns
 from canprobe.cell.supervision import Finding, Reaction, Seen, limits_of
 from canprobe.cell.supervisor import JointGuard, Supervisor
 from canprobe.cell.watch import NodeWatch
-from canprobe.errors import CanprobeError, NodeError, SafetyStop, UsageError
+from canprobe.errors import BusError, CanprobeError, NodeError, SafetyStop, UsageError
 from canprobe.planning.configuration import make_setups
 from canprobe.planning.model import Plan
 from canprobe.protocol.cia402 import POWERED_STATES, DriveState
@@ -110,6 +111,7 @@ class Cell:
         besides: dict[str, Any] = {"supervise": self._supervise_homing, "record": zeros, "say": self._say}
         self.homing = Homing(plan, setups, self._network, self.watch, **besides) if homed else None
         self._to_home = to_home
+        self._array_started = False
         self._holding = False
         self._running = False
         self._retreats_for: CanprobeError | None = None
@@ -163,6 +165,7 @@ class Cell:
     def __enter__(self) -> Cell:
         try:
             self._bring_up.run()
+            self._start_array()
             self.cycle = Cycle(
                 self._port,
                 self._plan,
@@ -182,6 +185,42 @@ class Cell:
             self.close()
             raise
         return self
+
+    def _start_array(self) -> None:
+        """Start an array of raw frames, and wait for as many images as its tare takes, at least one.
+
+        Raises:
+            BusError: they do not come.
+        """
+        array = self.tactile
+        if not isinstance(array, RawReceiver):
+            return
+        wire, clock = array.wire, self._port.clock
+        self._say(f"start the array on {array.channel}")
+        self._array_started = True
+        send_on(self._port, array.channel, wire.start)
+        if wire.sampling == "sync":
+            return  # its images begin with the cycle
+        if wire.tare_images:
+            self._say(f"tare the array: {wire.tare_images} images, with nothing on it")
+        needed, period_s = max(1, wire.tare_images), 1.0 / array.rate_hz
+        end_ns = clock.now_ns() + round(1e9 * (self._plan.setup.bring_up.boot_up_s + 2.0 * needed * period_s))
+        while array.images < needed:
+            if clock.now_ns() >= end_ns:
+                first, last = min(array.cob_ids), max(array.cob_ids)
+                ids = f"{first:03X}h" if first == last else f"{first:03X}h-{last:03X}h"
+                raise BusError(
+                    f"{array.channel}: the array sent {array.images} of {needed} images of its frames {ids} in time"
+                    f" ({array.torn} were not whole); check its power, its channel (sensor.channel), and wire.ids,"
+                    " wire.frames and wire.start of its array file"
+                )
+            if wire.poll:
+                send_on(self._port, array.channel, wire.poll)
+            self._network.pump_until(partial(array.has, array.images + 1), 1.5 * period_s)
+
+    def _stop_array(self) -> None:
+        if isinstance(self.tactile, RawReceiver) and self._array_started:
+            send_on(self._port, self.tactile.channel, self.tactile.wire.stop)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -442,6 +481,7 @@ class Cell:
         self._try(self._stop_drives)
         if force := self.supervisor.pressing():
             self.notes.add(f"the probe is left pressing with {force:.1f} N: {FREE_IT}")
+        self._try(self._stop_array)
         if self.homing is not None:
             self._try(self.homing.keep)
         self._try(self._bring_up.release)

@@ -183,10 +183,7 @@ def _not_heard(seen: Seen, cycles: int, word: str) -> NodeError | None:
 
 @_counted("torn_frame", "tactile frame torn, corrupt or mixed", _frame)
 def _torn_frame(seen: Seen) -> int:
-    if seen.tactile is None:
-        return 0
-    assembler = seen.tactile.assembler
-    return assembler.torn + assembler.crc_errors + assembler.orphans + assembler.malformed + assembler.duplicates
+    return seen.tactile.unusable if seen.tactile is not None else 0
 
 
 @_counted("sync_mismatch", "tactile frame names another SYNC than it followed", _frame)

@@ -26,12 +26,14 @@ class TactileSample:
     Attributes:
         frame: the frame, complete and with the right CRC.
         t_sample_ns: when the array was sampled, in the time of the cycle.
-        cycle: the cycle whose SYNC triggered it.
+        cycle: the cycle whose SYNC triggered it, or the last one before it was sampled.
+        t_sigma_s: standard deviation of that instant, s; 0 where a SYNC triggers the sample.
     """
 
     frame: TactileFrame
     t_sample_ns: int
     cycle: int
+    t_sigma_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

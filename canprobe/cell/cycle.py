@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable, MutableSequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from canprobe.bus.port import Port, TimedFrame, elapsed_ns
-from canprobe.cell.array import TactileReceiver
+from canprobe.bus.port import Port, TimedFrame, elapsed_ns, send_on
+from canprobe.cell.array import ArrayReceiver
 from canprobe.cell.controller import Command, Measurement
 from canprobe.cell.drives import DriveGroup
 from canprobe.cell.watch import NodeWatch
@@ -29,7 +29,7 @@ class Intake:
         sync_overflow: of the SYNC counter (1019h); so many SYNCs are remembered.
     """
 
-    def __init__(self, drives: DriveGroup | None, tactile: TactileReceiver | None, sync_overflow: int) -> None:
+    def __init__(self, drives: DriveGroup | None, tactile: ArrayReceiver | None, sync_overflow: int) -> None:
         self.drives = drives
         self.tactile = tactile
         self.number = -1
@@ -149,7 +149,7 @@ class Cycle:
         plan: Plan,
         *,
         drives: DriveGroup | None,
-        tactile: TactileReceiver | None,
+        tactile: ArrayReceiver | None,
         watch: NodeWatch,
         other: Callable[[list[TimedFrame]], None],
         on_arrival: bool,
@@ -166,7 +166,7 @@ class Cycle:
         self._period_ns = plan.sync.period_ns
         self._looks_ns = plan.traffic.budget.looks_ns
         self._on_arrival = on_arrival
-        self._drives = drives
+        self._drives, self._tactile = drives, tactile
         self._intake = Intake(drives, tactile, plan.sync.overflow or SYNCS_REMEMBERED)
         self._watch = watch
         self._other = other
@@ -241,6 +241,8 @@ class Cycle:
             frames.append(pack_heartbeat(MASTER_NODE_ID, NmtState.OPERATIONAL))
         if frames:
             self._port.send_batch(frames)
+        if self._tactile is not None and (requests := self._tactile.requests(self.number)):
+            send_on(self._port, self._tactile.channel, requests)
         self._sent_ns = elapsed_ns() if self._started_ns else 0
         self._deadline += self._period_ns
 

@@ -189,15 +189,17 @@ class TactileLog:
     def arrays(self) -> dict[str, NDArray[Any]]:
         """One row a frame (m, ...): when it was usable and sampled, s, taxels, their window, features; empty without.
 
-        Features (m, 7) are NaN in a frame of taxels.
+        Features (m, 7) are NaN in a frame of taxels. A device of raw frames has their values (m, rows, columns, axes).
         """
         if not self._rows:
             return {}
         frames = [sample.frame for _, sample in self._rows]
         none = (np.nan,) * len(fields(Features))
-        return {
+        raw = [frame.raw for frame in frames if frame.raw is not None]
+        return ({"raw": np.array(raw)} if raw else {}) | {
             "t_s": np.array([t_ns * 1e-9 for t_ns, _ in self._rows]),
             "t_sample_s": np.array([sample.t_sample_ns * 1e-9 for _, sample in self._rows]),
+            "t_sigma_s": np.array([sample.t_sigma_s for _, sample in self._rows]),
             "taxels": np.array([frame.taxels for frame in frames]),
             "window": np.array([frame.window for frame in frames]),
             "features": np.array([none if f.features is None else astuple(f.features) for f in frames]),

@@ -56,7 +56,7 @@ class CellView:
         q: joint positions (n,), deg or mm.
         units: of each of them.
         force_n: of the last whole tactile frame, N.
-        taxels: (16, 16) counts of that frame.
+        taxels: (rows, columns) counts of that frame.
         frames_per_s: of the last second, on all buses.
         load: of the last second, by channel; without stuff bits, as a share of the bit rate.
         sync_hz: of the last second.
@@ -156,7 +156,7 @@ class Monitor:
 
     def _take_taxels(self, can_id: int, data: bytes, t_ns: int) -> None:
         assert self._tactile is not None
-        frame = self._tactile.assembler.push(can_id, data, t_ns)
+        frame = self._tactile.assemble(can_id, data, t_ns)
         if frame is not None:
             self._view.taxels = frame.taxels
             patch = self._patch_from(TactileSample(frame, t_ns, 0)) if self._patch_from is not None else None
@@ -199,8 +199,7 @@ class Monitor:
             errors = np.abs(np.diff(np.array(self._syncs)) - self._plan.sync.period_ns) * 1e-3
             view.sync_jitter_us = (float(np.percentile(errors, 99)), float(errors.max()))
         if self._tactile is not None:
-            assembler = self._tactile.assembler
-            view.torn_frames = assembler.torn + assembler.crc_errors + assembler.orphans
+            view.torn_frames = self._tactile.torn
 
 
 # A monitored cell as lines for a terminal, in plain ANSI.

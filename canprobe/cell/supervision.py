@@ -12,7 +12,7 @@ from enum import Enum
 from typing import Any
 
 from canprobe.bus.port import ControllerState, PortCounters
-from canprobe.cell.array import TactileReceiver
+from canprobe.cell.array import ArrayReceiver
 from canprobe.cell.controller import Measurement
 from canprobe.cell.drives import DriveGroup
 from canprobe.cell.watch import NodeWatch
@@ -104,7 +104,7 @@ class Seen:
     limits: Limits
     watch: NodeWatch
     drives: DriveGroup | None
-    tactile: TactileReceiver | None
+    tactile: ArrayReceiver | None
     counters: PortCounters
     controller_state: ControllerState = ControllerState.ACTIVE
     measurement: Measurement = field(default_factory=lambda: Measurement(0, 0))

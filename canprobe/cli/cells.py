@@ -1,4 +1,4 @@
-"""List the packaged cells and print the folder of their files."""
+"""List the packaged cells and arrays, and print the folders of their files."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 
 from canprobe.cli import scenes
 
-HELP = "list the packaged cells"
+HELP = "list the packaged cells and arrays"
 EXAMPLE = """\
 examples:
   canprobe cells
@@ -17,5 +17,9 @@ add_arguments = scenes.add_arguments
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print name and title of every packaged cell, and the folder of their files."""
-    return scenes.print_packaged("cells", args, "copy one to change it, or let `canprobe init` write one")
+    """Print name and title of every packaged cell and array, and the folders of their files."""
+    advice = {
+        "cell": "copy one to change it, or let `canprobe init` write one",
+        "array": "copy one to change it, and name it in a cell: array in [sensor]",
+    }
+    return scenes.print_packaged(advice, args)

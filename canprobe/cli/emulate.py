@@ -197,6 +197,6 @@ def _nodes(wanted: tuple[int, ...] | None, scene: Scene) -> tuple[int, ...]:
         wanted = scene.emulated_node_ids
     if missing := sorted(set(wanted) - known):
         raise UsageError(f"--nodes: scene {scene.name} has no node {missing}; it has {sorted(known)}")
-    if not wanted:
+    if not wanted and (scene.sensor is None or scene.array_is_node or not scene.sensor.emulated):
         raise UsageError(f"scene {scene.name} marks no node as emulated; name some with --nodes")
     return wanted

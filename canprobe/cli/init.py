@@ -90,7 +90,8 @@ rate_hz = 400 # of SYNC and servo; `canprobe plan` says what the drives and the 
 
 """
 _TAIL = """
-[sensor] # the tactile array; see the keys
+[sensor]
+array = "inch16" # `canprobe cells` lists more; docs/own-array.md describes one of your own
 node_id = 16
 
 [probe] # the sphere that carries the array, behind the flange

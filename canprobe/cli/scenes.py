@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from typing import Literal
+from collections.abc import Mapping
 
 from canprobe.cli.output import print_json, print_table
 from canprobe.cli.parser import Parser, add_options
@@ -23,17 +23,22 @@ def add_arguments(parser: Parser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print name and title of every packaged scene, and the folder of their files."""
-    return print_packaged("scenes", args, "copy one to change it")
+    return print_packaged({"scene": "copy one to change it"}, args)
 
 
-def print_packaged(what: Literal["scenes", "cells"], args: argparse.Namespace, advice: str) -> int:
-    """Print name and title of every packaged scene or cell, their folder, and what can be done with them."""
-    from canprobe.scene.load import packaged_cells, packaged_files, packaged_scenes
+def print_packaged(advice: Mapping[str, str], args: argparse.Namespace) -> int:
+    """Print name and title of every packaged file of some kinds, their folders, and what can be done with them."""
+    from canprobe.scene.load import packaged_arrays, packaged_cells, packaged_files, packaged_scenes
 
-    found, paths = packaged_scenes() if what == "scenes" else packaged_cells(), packaged_files(what)
+    titles = {"scene": packaged_scenes, "cell": packaged_cells, "array": packaged_arrays}
+    document: list[dict[str, str]] = []
+    for kind, then in advice.items():
+        found, paths = titles[kind](), packaged_files(f"{kind}s")
+        if args.json:
+            document += [{"kind": kind, "name": n, "title": title, "path": str(paths[n])} for n, title in found]
+        else:
+            print_table(found)
+            print(f"in {next(iter(paths.values())).parent}; {then}")
     if args.json:
-        print_json([{"name": name, "title": title, "path": str(paths[name])} for name, title in found])
-    else:
-        print_table(found)
-        print(f"in {next(iter(paths.values())).parent}; {advice}")
+        print_json(document)
     return 0

@@ -1,4 +1,4 @@
-"""The tactile node: 16×16 taxels as window, full image or features, one whole frame a trigger.
+"""The tactile node: its taxels as window, full image or features, one whole frame a trigger.
 
 A trigger is a SYNC at which the header's TPDO is due. The array is sampled there; what goes out is the image of an
 earlier trigger, because a real sensor needs a frame to process it. The header carries the sample's age.
@@ -22,7 +22,17 @@ from canprobe.emulator.node.dictionary import Abort, Dictionary, SdoAbort, Value
 from canprobe.emulator.node.slave_node import Application, OdOf, SlaveNode
 from canprobe.errors import UsageError
 from canprobe.protocol.frames import NmtState
-from canprobe.protocol.tactile import SIDE, WINDOW, WINDOWS, Features, TactileHeader, TactileMode, pack_whole
+from canprobe.protocol.tactile import (
+    SIDE,
+    WINDOW,
+    WINDOWS,
+    Features,
+    Shape,
+    TactileHeader,
+    TactileMode,
+    pack_whole,
+)
+from canprobe.touch.pad import Pad
 
 # What the sensor makes of a raw image: tare, gain, threshold, the window that follows the contact, features.
 
@@ -32,9 +42,6 @@ Raw = NDArray[np.uint8] | NDArray[np.float64]
 FULL_SCALE = 255
 GAIN_ONE = 1000
 _HYSTERESIS = 0.75  # taxels the ideal origin must be away before the window moves; 0.5 would flicker
-_INDEX = np.arange(SIDE, dtype=np.float64)
-_SUMS = np.stack((np.ones(SIDE * SIDE), np.repeat(_INDEX, SIDE), np.tile(_INDEX, SIDE)))  # of 1, row, column
-TAXEL_AREA_M2 = 1.5875e-3**2
 
 
 def is_overloaded(raw: Raw) -> bool:
@@ -45,7 +52,7 @@ def is_overloaded(raw: Raw) -> bool:
 
 
 def correct(raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int, threshold: int) -> Image:
-    """Raw counts (16, 16) → whole counts, tare subtracted, times the gain, saturated, zero below the threshold."""
+    """Raw counts → whole counts, tare subtracted, times the gain, saturated, zero below the threshold."""
     as_sampled = tare is None and gain_permille == GAIN_ONE and raw.dtype == np.uint8
     counts = raw if as_sampled else np.rint(_scaled(raw, tare, gain_permille))
     return _kept(threshold).take(counts.astype(np.intp), mode="clip")
@@ -77,17 +84,24 @@ def _scaled(raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int) -> N
     return counts
 
 
+@cache
+def _sums(rows: int, columns: int) -> NDArray[np.float64]:
+    """(3, rows · columns): 1, row and column of each taxel."""
+    row, column = np.indices((rows, columns), dtype=np.float64)
+    return np.stack((np.ones(rows * columns), row.reshape(-1), column.reshape(-1)))
+
+
 def _moments(image: Raw) -> tuple[float, float, float]:
     """Sum, centroid row, centroid column; the centre of the pad without a contact."""
-    total, rows, columns = _SUMS.dot(image.reshape(-1)).tolist()
+    total, rows, columns = _sums(*image.shape).dot(image.reshape(-1)).tolist()
     if total == 0.0:
-        return 0.0, (SIDE - 1) / 2, (SIDE - 1) / 2
+        return 0.0, (image.shape[0] - 1) / 2, (image.shape[1] - 1) / 2
     return total, rows / total, columns / total
 
 
-def middle(window: int = WINDOW) -> tuple[int, int]:
+def middle(window: int = WINDOW, shape: Shape = (SIDE, SIDE)) -> tuple[int, int]:
     """First taxel (row, column) of a window in the middle of the pad."""
-    return (SIDE - window) // 2, (SIDE - window) // 2
+    return max(shape[0] - window, 0) // 2, max(shape[1] - window, 0) // 2
 
 
 def follow(image: Raw, origin: tuple[int, int], window: int = WINDOW) -> tuple[int, int]:
@@ -98,30 +112,33 @@ def follow(image: Raw, origin: tuple[int, int], window: int = WINDOW) -> tuple[i
     total, row, column = _moments(image)
     if total == 0.0:
         return origin
-    return _shift(origin[0], row, window), _shift(origin[1], column, window)
+    rows, columns = image.shape
+    return _shift(origin[0], row, window, rows), _shift(origin[1], column, window, columns)
 
 
-def _shift(origin: int, centroid: float, window: int) -> int:
+def _shift(origin: int, centroid: float, window: int, taxels: int) -> int:
     ideal = centroid - (window - 1) / 2
     if abs(ideal - origin) <= _HYSTERESIS:
         return origin
-    return min(max(round(ideal), 0), SIDE - window)
+    return max(min(round(ideal), taxels - window), 0)
 
 
-def compute_features(image: Raw, full_scale_pa: float) -> Features:
+def compute_features(image: Raw, full_scale_pa: float, pitch_m: float) -> Features:
     """Force, centroid and central second moments of the whole pad.
 
     Args:
-        image: corrected counts, (16, 16), whole or not.
+        image: corrected counts, (rows, columns), whole or not.
         full_scale_pa: pressure at 255 counts, Pa.
+        pitch_m: of the taxels.
     """
     total, row, column = _moments(image)
     if total == 0.0:
         return Features(0.0, row, column, 0.0, 0.0, 0.0, 0)
     weights = image / total
-    d_row, d_column = _INDEX - row, _INDEX - column
+    rows, columns = image.shape
+    d_row, d_column = np.arange(rows) - row, np.arange(columns) - column
     return Features(
-        force_n=total / FULL_SCALE * full_scale_pa * TAXEL_AREA_M2,
+        force_n=total / FULL_SCALE * full_scale_pa * pitch_m**2,
         row=row,
         col=column,
         var_rr=float(d_row**2 @ weights.sum(axis=1)),
@@ -138,7 +155,6 @@ MODE, THRESHOLD, GAIN, TARE_COMMAND, FULL_SCALE_PA, OVERLOAD, ORIGIN = range(0x2
 IMAGE_ROWS, WINDOW_ROWS, HEADER, FEATURES = 0x2100, 0x2110, 0x2120, 0x2130
 _CONTENT = {TactileMode.FEATURES: FEATURES, TactileMode.WINDOW: WINDOW_ROWS, TactileMode.IMAGE: IMAGE_ROWS}
 _MAX_AGE_US = 0xFFFF
-_TARE_BYTES = SIDE * SIDE * 8
 
 
 class TactilePlant(Protocol):
@@ -148,27 +164,35 @@ class TactilePlant(Protocol):
         """Bring the plant to `t_ns`; idempotent."""
 
     def sample_image(self, t_ns: int) -> Raw:
-        """Raw counts of the array at `t_ns`, (16, 16), 255 at full scale."""
+        """Raw counts of the array at `t_ns`, (rows, columns), 255 at full scale."""
 
 
 class TactileApplication(Application):
     """The sensor function of one node. A tare command takes the mean of the next images as zero."""
 
-    def __init__(self, plant: TactilePlant, latency_frames: int = 1, tare_images: int = 16) -> None:
+    def __init__(
+        self,
+        plant: TactilePlant,
+        latency_frames: int = 1,
+        tare_images: int = 16,
+        pad: Pad | None = None,
+    ) -> None:
         """Make the sensor.
 
         Args:
             plant: shared with the other nodes.
             latency_frames: triggers between sampling an image and sending it.
             tare_images: images averaged by one tare command.
+            pad: its taxels; None: 16×16 over one inch.
         """
         self._plant = plant
+        self._pad = pad or Pad()
         self._latency, self._tare_images = latency_frames, tare_images
         self._pipeline: deque[tuple[int, Raw]] = deque()
         self._tare: NDArray[np.float64] | None = None
         self._taring: list[Raw] | None = None
         self._frames = 0
-        self._origin = middle()
+        self._origin = middle(shape=self._pad.shape)
         self._counter = 0
         self._triggered_ns: int | None = None
 
@@ -201,9 +225,10 @@ class TactileApplication(Application):
 
     def recall(self, kept: bytes) -> None:
         """The tare as it was stored, if any."""
-        if len(kept) not in (0, _TARE_BYTES):
-            raise UsageError(f"{self._node.name}: stored tare: expected {_TARE_BYTES} bytes, got {len(kept)}")
-        self._tare = np.frombuffer(kept).reshape(SIDE, SIDE) if kept else None
+        needed = 8 * self._pad.taxels
+        if len(kept) not in (0, needed):
+            raise UsageError(f"{self._node.name}: stored tare: expected {needed} bytes, got {len(kept)}")
+        self._tare = np.frombuffer(kept).reshape(self._pad.shape) if kept else None
 
     def reset(self, t_ns: int) -> None:
         """Power on."""
@@ -211,7 +236,7 @@ class TactileApplication(Application):
         self._taring = None
         self._frames = 0
         self._read_settings()
-        self._origin = middle(self._window)
+        self._origin = middle(self._window, self._pad.shape)
 
     def entered(self, t_ns: int) -> None:
         """Sample at once on entering operational, so that the first frame shows something real."""
@@ -261,7 +286,7 @@ class TactileApplication(Application):
         content: Image | Features = image
         if mode is TactileMode.FEATURES:
             seen = image if raw.dtype == np.uint8 else correct_finely(raw, *settings)
-            content = compute_features(seen, self._full_scale)
+            content = compute_features(seen, self._full_scale, self._pad.pitch_m)
         whole = pack_whole(header, content)
         words = struct.unpack(f"<{len(whole) // 8}Q", whole)
         dictionary.put(OVERLOAD, 0, int(overload))
@@ -271,14 +296,14 @@ class TactileApplication(Application):
         dictionary.put(HEADER, 0, words[0])
 
     def _check_window(self, subindex: int, value: Value) -> None:
-        if value not in WINDOWS:
+        if value not in WINDOWS or int(value) > min(self._pad.shape):
             raise SdoAbort(Abort.VALUE)
         if self._node.state is NmtState.OPERATIONAL and value != self._window:
             raise SdoAbort(Abort.DEVICE_STATE)
 
     def _begin_window(self, subindex: int, value: Value) -> None:
         self._read_settings()
-        self._origin = middle(self._window)
+        self._origin = middle(self._window, self._pad.shape)
 
     def _begin_tare(self, subindex: int, value: Value) -> None:
         self._tare, self._taring = None, []
@@ -289,7 +314,9 @@ def _members(dictionary: Dictionary, index: int) -> tuple[int, ...]:
     return tuple(takewhile(dictionary.__contains__, (key_of(index, subindex) for subindex in count(1))))
 
 
-def make_tactile_node(od: ObjectDictionary, node_id: int, plant: TactilePlant, od_of: OdOf | None = None) -> SlaveNode:
+def make_tactile_node(
+    od: ObjectDictionary, node_id: int, plant: TactilePlant, od_of: OdOf | None = None, pad: Pad | None = None
+) -> SlaveNode:
     """A tactile node on the plant.
 
     Args:
@@ -297,8 +324,9 @@ def make_tactile_node(od: ObjectDictionary, node_id: int, plant: TactilePlant, o
         node_id: 1–127, or 255 for none.
         plant: shared by all nodes.
         od_of: the EDS for another node id, where LSS may give the node one.
+        pad: its taxels; None: 16×16 over one inch.
     """
-    return SlaveNode(od, node_id, TactileApplication(plant), od_of=od_of)
+    return SlaveNode(od, node_id, TactileApplication(plant, pad=pad), od_of=od_of)
 
 
 def _check_tare(subindex: int, value: Value) -> None:

@@ -23,12 +23,14 @@ from canprobe.emulator.node.slave_node import SlaveNode
 from canprobe.emulator.plant.config import PlantConfig, PressMotion
 from canprobe.emulator.plant.plant import Plant
 from canprobe.emulator.plant.taxels import TaxelConfig
+from canprobe.emulator.raw_array import RawArray
 from canprobe.planning.model import Plan, PlannedNode
 from canprobe.planning.units import FEED, GEAR_RATIO, RESOLUTION
 from canprobe.protocol.frames import SYNC_ID, UNCONFIGURED, Frame
 from canprobe.robot.chain import Array, Chain, forward
 from canprobe.robot.inverse import start_posture
 from canprobe.scene.setup import Arm, Setup
+from canprobe.touch.pad import Pad
 
 
 class TruthRecorder(Participant):
@@ -101,6 +103,7 @@ class World:
         nodes: the slaves, ascending by node id.
         plant: arm, probe, object and array.
         recorder: notes the truth at every SYNC; None where nobody wants it, as it grows with time.
+        raw_array: an array that is no node; None without one.
         participants: what is put on the bus: the nodes, or what stands between them and it (`FaultyNode`), and the
             recorder, which listens only.
     """
@@ -108,11 +111,12 @@ class World:
     nodes: tuple[SlaveNode, ...]
     plant: Plant
     recorder: TruthRecorder | None
+    raw_array: RawArray | None = None
     participants: list[Any] = field(init=False)
 
     def __post_init__(self) -> None:
-        recorders = () if self.recorder is None else (self.recorder,)
-        object.__setattr__(self, "participants", [*self.nodes, *recorders])
+        others = [one for one in (self.raw_array, self.recorder) if one is not None]
+        object.__setattr__(self, "participants", [*self.nodes, *others])
 
 
 def make_world(
@@ -141,7 +145,15 @@ def make_world(
             continue
         node_id = UNCONFIGURED if node.node_id in without_id else node.node_id
         nodes.append(_node(plan.setup, node, node_id, plant, homed))
-    return World(tuple(nodes), plant, TruthRecorder(plant) if truth else None)
+    return World(tuple(nodes), plant, TruthRecorder(plant) if truth else None, _raw_array(plan.setup, plant))
+
+
+def _raw_array(setup: Setup, plant: Plant) -> RawArray | None:
+    """The emulated array of a setup where it is no node."""
+    array = setup.array
+    if array is None or array.raw is None or not array.emulated:
+        return None
+    return RawArray(array, plant, sync_ratio=max(1, round(setup.rate_hz / array.rate_hz)), seed=setup.seed)
 
 
 def _node(setup: Setup, planned: PlannedNode, node_id: int, plant: Plant, homed: bool) -> SlaveNode:
@@ -165,7 +177,7 @@ def _node(setup: Setup, planned: PlannedNode, node_id: int, plant: Plant, homed:
         _set_turn_units(node, drive.turn_units)
     else:
         assert setup.array is not None
-        node = make_tactile_node(dictionary, node_id, plant, od_of=od_of)
+        node = make_tactile_node(dictionary, node_id, plant, od_of=od_of, pad=setup.array.pad)
         if has_full_scale(dictionary):
             node.dictionary.set_default(FULL_SCALE, 0, round(setup.array.full_scale))
     serial = planned.identity.serial_number
@@ -176,7 +188,7 @@ def _node(setup: Setup, planned: PlannedNode, node_id: int, plant: Plant, homed:
 
 
 def _plant_config(setup: Setup) -> PlantConfig:
-    truth, array, touch = setup.truth, setup.array, setup.touch
+    truth, array = setup.truth, setup.array
     config = PlantConfig(
         model=truth.model,
         T_flange_probe_centre=truth.T_flange_probe,
@@ -187,8 +199,9 @@ def _plant_config(setup: Setup) -> PlantConfig:
         taxels=None
         if array is None
         else TaxelConfig(full_scale_pa=array.full_scale, adc_bits=truth.adc_bits).without(*truth.without),
+        pad=array.pad if array is not None else Pad(),
         bandwidth_hz=truth.bandwidth_hz,
-        press=PressMotion(force_n=touch.force) if touch is not None else PressMotion(),
+        press=PressMotion(after_s=_tared_s(setup)),
         seed=setup.seed,
     )
     if setup.arm is None or truth.model is None:
@@ -212,6 +225,15 @@ def _base_offset(believed: Chain, real: Chain, q: Array, T_flange_probe: Array) 
     """
     offset: Array = ((forward(believed, q) - forward(real, q)) @ T_flange_probe)[:3, 3]
     return offset
+
+
+def _tared_s(setup: Setup) -> float:
+    """How long an array that takes its tare at the beginning takes for it, with some to spare, s; 0 for others."""
+    raw = setup.array.raw if setup.array is not None else None
+    if raw is None or not raw.tare_images:
+        return 0.0
+    assert setup.array is not None
+    return 1.5 * raw.tare_images / setup.array.rate_hz
 
 
 def _first_posture(setup: Setup, arm: Arm) -> Array:

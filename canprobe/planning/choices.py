@@ -15,13 +15,21 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from canprobe.errors import install_line
+from canprobe.planning.array import support_of
 from canprobe.planning.bridges import bridge_outputs
 from canprobe.planning.model import Choice, PlannedPdo, Traffic
-from canprobe.planning.window import TOLERATED, cut_patch, measured_share, patch_across_taxels, window_choices
+from canprobe.planning.window import (
+    TOLERATED,
+    cut_patch,
+    measured_share,
+    patch_across_taxels,
+    window_choices,
+    windows_of,
+)
 from canprobe.protocol.frame_bits import WORST_ERROR_BITS
-from canprobe.protocol.tactile import WINDOW, WINDOWS
+from canprobe.protocol.tactile import WINDOW
 from canprobe.robot.inverse import FIXED_POLE, FULL_POSE, task_rows
-from canprobe.scene.setup import Arm, ArrayMode, Setup, Touch, Touching
+from canprobe.scene.setup import Arm, Array, ArrayMode, Setup, Touch, Touching
 
 # What a scene leaves to the plan ("auto"), and in which order the plan tries it.
 
@@ -179,21 +187,29 @@ def _changes(setup: Setup) -> Iterator[tuple[str, Setup]]:
     yield from _split(setup)
     if array is None:
         return
+    if array.raw is not None:
+        yield from _own_bus(setup, array)
+        return
     if array.mode == "window":
-        for side in reversed([side for side in WINDOWS if side < int(array.window)]):
+        for side in reversed([side for side in windows_of(array) if side < int(array.window)]):
             yield f"sensor.window = {side}", setup.changed("array", window=side)
     if array.mode == "image":
         yield 'sensor.mode = "window"', setup.changed("array", mode="window")
     if array.mode != "features":  # only a window may have another size
         text = 'sensor.mode = "features"' + " without sensor.window" * (array.mode == "window")
         yield text, setup.changed("array", mode="features", window=WINDOW)
-    if setup.arm is not None and any(array.channel == drive.channel for drive in setup.arm.drives):
-        own = _free_channel(setup)
-        yield f'a separate bus for the sensor (sensor.channel = "{own}")', setup.changed("array", channel=own)
+    yield from _own_bus(setup, array)
     if not bus.fd and array.emulated:
         fd = setup.changed("bus", fd=True)
         yield "bus.fd = true", fd
         yield f'CAN FD: bus.fd = true and sensor.eds = "{FD_ARRAY}"', fd.changed("array", eds=FD_ARRAY)
+
+
+def _own_bus(setup: Setup, array: Array) -> Iterator[tuple[str, Setup]]:
+    """The array on a bus of its own, where it shares one with drives."""
+    if setup.arm is not None and any(array.channel == drive.channel for drive in setup.arm.drives):
+        own = _free_channel(setup)
+        yield f'a separate bus for the sensor (sensor.channel = "{own}")', setup.changed("array", channel=own)
 
 
 def _split(setup: Setup) -> Iterator[tuple[str, Setup]]:
@@ -273,6 +289,7 @@ _EFFECTS = {
 }
 _BY_ARRAY = f'sensor.mode = "features": {_MODES["features"]}'
 IMAGE, OWN_WINDOW = "full image (32 PDOs)", "window (8 PDOs)"
+RAW_DEVICE = "node of the array, its PDOs and its supervision by heartbeat"
 ESTIMATOR, FIGURE, PAGE = "surface estimator", "figure", "replay to share (report.html)"
 TRUTH = "truth and scores against it"
 
@@ -290,6 +307,8 @@ def _not_sent(setup: Setup) -> Iterator[tuple[str, str]]:
         yield "motor torque (6077h)", "arm.torque is false, or the bus has no room for it beside what the task needs"
     if array is None:
         yield "tactile node and its PDOs", f'no [sensor]: task.kind = "{kind}" feels nothing'
+    elif array.raw is not None:
+        yield RAW_DEVICE, 'wire.kind = "frames": the device knows no CANopen'
     elif array.mode == "window":
         yield IMAGE, _by_window(setup.touch, int(array.window))
     elif array.mode == "image":
@@ -303,7 +322,10 @@ def _not_computed(setup: Setup) -> Iterator[tuple[str, str]]:
     if shape is None:
         yield ESTIMATOR, _NO_SHAPE.get(kind, "no [shape]")
     elif not shape.patch or (array is not None and array.mode == "features"):
-        yield "curvature from the patch", _BY_ARRAY if shape.patch else "shape.patch = false"
+        support = support_of(setup)
+        lacking = support is not None and not support.curvature
+        off = f"the array: {support}" if lacking else "shape.patch = false"
+        yield "curvature from the patch", _BY_ARRAY if shape.patch else off
     if kind in _NO_STRATEGY:
         yield "exploration strategy", _NO_STRATEGY[kind]
     if not isinstance(setup.task, Touch):
@@ -312,7 +334,7 @@ def _not_computed(setup: Setup) -> Iterator[tuple[str, str]]:
 
 def _not_emulated(setup: Setup) -> Iterator[tuple[str, str]]:
     arm, array, kind = setup.arm, setup.array, setup.kind
-    if not setup.emulated_node_ids:
+    if not setup.emulates:
         yield "emulator", "every node is real"
         yield TRUTH, "no emulated node"
     elif setup.truth.object is None and kind != "free":
@@ -342,9 +364,10 @@ def _by_window(touch: Touching | None, side: int) -> str:
     name = f"the {side}×{side} window round the contact"
     if touch is None:
         return f"{name} is sent"
-    if side >= patch_across_taxels(touch.force, touch.probe):
+    pitch = touch.array.pad.pitch_m
+    if side >= patch_across_taxels(touch.force, touch.probe, pitch):
         return f"{name} holds the patch"
-    outside = 1.0 - measured_share(touch.force, touch.probe, side)
+    outside = 1.0 - measured_share(touch.force, touch.probe, side, pitch)
     return f"{name} is sent, with up to {100 * outside:.0f} % of the force outside"
 
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from canprobe.errors import EdsError, PlanError
+from canprobe.planning.array import array_problems, as_supported, plan_raw_frames, raw_frame_problems
 from canprobe.planning.bridges import unavailable_bridges
 from canprobe.planning.choices import candidates, left_out, outputs, warnings, ways_out
 from canprobe.planning.configuration import make_setups
@@ -23,6 +24,7 @@ from canprobe.planning.model import (
     NodeKind,
     Plan,
     PlannedBus,
+    PlannedFrames,
     PlannedNode,
     PlannedPdo,
     SyncPlan,
@@ -52,7 +54,10 @@ def make_plan(setup: Setup) -> Plan:
     Raises:
         PlanError: with every reason why the setup does not fit, its numbers and the ways out.
     """
+    setup = as_supported(setup)
     devices, problems = _devices(setup)
+    unsuited = [*array_problems(setup)]
+    problems += unsuited
     bus = _choose(setup, devices, problems) if not problems else None
     ways: list[str] = []
     if bus is not None:
@@ -65,7 +70,7 @@ def make_plan(setup: Setup) -> Plan:
             problems.append(cut.text)
             ways = ways or [*cut.ways]
     problems += range_problems(setup)
-    joint_speeds, unreachable = check_motion(setup)
+    joint_speeds, unreachable = check_motion(setup) if not unsuited else (None, [])
     problems += unreachable
     truth, arm = setup.truth, setup.arm
     if arm is not None and truth.fidelity == "dynamic" and any(drive.emulated for drive in arm.drives):
@@ -78,6 +83,7 @@ def make_plan(setup: Setup) -> Plan:
         setup=setup,
         nodes=_nodes(setup, devices, bus.pdos, bus.sync),
         pdos=bus.pdos,
+        raw=bus.raw,
         sync=bus.sync,
         buses=bus.buses,
         choices=bus.choices,
@@ -118,6 +124,7 @@ class _BusPlan:
     choices: tuple[Choice, ...]
     sync: SyncPlan
     pdos: tuple[PlannedPdo, ...]
+    raw: tuple[PlannedFrames, ...]
     buses: tuple[PlannedBus, ...]
     problems: list[str]
     overload: list[str]
@@ -167,15 +174,19 @@ def _plan_bus(setup: Setup, devices: Mapping[int, Abilities], choices: tuple[Cho
     by_deadline = setup.bus.cob_ids == "by_deadline"
     planned = order_by_deadline(planning.pdos, devices.values()) if by_deadline else planning.pdos
     planning.problems += identifier_problems(planned)
-    buses, pdos, overload = plan_traffic(planned, sync, channels, setup.bus, setup.compute_ns)
+    frames = plan_raw_frames(setup)
+    if setup.array is not None:
+        planning.problems += raw_frame_problems(frames, planned, channels, setup.array.name)
+    traffic = plan_traffic(planned, sync, channels, setup.bus, setup.compute_ns, raw=frames)
     return _BusPlan(
         setup=setup,
         choices=choices,
         sync=sync,
-        pdos=pdos,
-        buses=buses,
+        pdos=traffic.pdos,
+        raw=traffic.raw,
+        buses=traffic.buses,
         problems=planning.problems,
-        overload=overload,
+        overload=traffic.problems,
         not_available=tuple(dict.fromkeys(planning.not_available)),
     )
 
@@ -187,9 +198,10 @@ def _counts_syncs(device: Abilities) -> bool:
 
 
 def _channels(setup: Setup) -> dict[str, tuple[int, ...]]:
-    """Which nodes are on which bus, in the order of `_roles`."""
+    """Which nodes are on which bus, in the order of `_roles`; an array of raw frames is on one without being a node."""
     nodes = [node for _, _, node in _roles(setup)]
-    names = dict.fromkeys(node.channel for node in nodes)
+    others = [setup.array.channel] if setup.array is not None and setup.array.raw is not None else []
+    names = dict.fromkeys([*(node.channel for node in nodes), *others])
     return {name: tuple(sorted(node.node_id for node in nodes if node.channel == name)) for name in names}
 
 
@@ -214,7 +226,8 @@ def _roles(setup: Setup) -> list[tuple[NodeKind, str, Node]]:
     roles: list[tuple[NodeKind, str, Node]] = [
         ("drive", f"joint {axis}", drive) for axis, drive in enumerate(drives, start=1)
     ]
-    return [*roles, ("tactile", "tactile array", setup.array)] if setup.array is not None else roles
+    array = setup.array
+    return roles if array is None or array.raw is not None else [*roles, ("tactile", "tactile array", array)]
 
 
 def _devices(setup: Setup) -> tuple[dict[int, Abilities], list[str]]:

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan, PlannedBus, PlannedPdo
+from canprobe.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan, PlannedBus, PlannedFrames, PlannedPdo
 from canprobe.planning.traffic import (
     SYNC_BITS,
     SYNC_BITS_LEAST,
@@ -25,7 +25,9 @@ from canprobe.planning.traffic import (
 from canprobe.protocol.frame_bits import FD_LENGTHS, worst_case_bits
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NMT_ID, SDO_RX_BASE, SDO_TX_BASE, SYNC_ID
 
-Kind = Literal["SYNC", "drive TPDO", "drive RPDO", "tactile PDO", "event PDO", "heartbeat", "NMT", "EMCY", "SDO"]
+Kind = Literal[
+    "SYNC", "drive TPDO", "drive RPDO", "tactile PDO", "raw frame", "event PDO", "heartbeat", "NMT", "EMCY", "SDO"
+]
 TOLERANCE = 0.02
 """Share by which a count may differ from the plan; a frame of each message may always be missing at the edges."""
 
@@ -207,6 +209,14 @@ def expected_messages(plan: Plan, bus: PlannedBus) -> dict[int, Expected]:
         triggered = pdo.transmission_type <= SYNCHRONOUS
         latest = pdo.response_ns - shortest_ns if triggered and pdo.response_ns is not None else None
         found.append(Expected(pdo.cob_id, _kind(pdo), pdo.rate_hz, pdo.bits_worst, latest))
+    raw: dict[int, list[PlannedFrames]] = {}
+    for frames in plan.raw:
+        if frames.channel == bus.channel:
+            raw.setdefault(frames.can_id, []).append(frames)
+    for can_id, all_of_it in raw.items():
+        rate = sum(frames.count * frames.rate_hz for frames in all_of_it)
+        longest = max(-(-frames.bits_worst // frames.count) for frames in all_of_it)
+        found.append(Expected(can_id, "raw frame", rate or None, longest))
     beat = 1000 / HEARTBEAT_PRODUCED_MS
     for node in (*bus.node_ids, MASTER_NODE_ID):
         found.append(Expected(HEARTBEAT_BASE + node, "heartbeat", beat, worst_case_bits(1)))

@@ -149,6 +149,34 @@ class PlannedPdo:
 
 
 @dataclass(frozen=True, slots=True)
+class PlannedFrames:
+    """Raw frames of one identifier, of an array that is no CANopen node.
+
+    Attributes:
+        can_id: 11-bit identifier.
+        channel: of the bus that they are on.
+        what: `image`, `start`, `stop` or `poll`.
+        sent: by the master; else by the device.
+        count: of one image, or of one command.
+        length: bytes of the longest.
+        rate_hz: of the images; 0 for what is sent at the beginning and the end.
+        bits_worst: of all of them with worst-case stuffing.
+        response_ns: worst case from the first one's queueing to the last one's end; None where the bus is overloaded,
+            or where they have no rate.
+    """
+
+    can_id: int
+    channel: str
+    what: Literal["image", "start", "stop", "poll"]
+    sent: bool
+    count: int
+    length: int
+    rate_hz: float
+    bits_worst: int
+    response_ns: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class SyncPlan:
     """SYNC as 1005h, 1006h and 1019h express it.
 
@@ -289,6 +317,7 @@ class Plan:
         setup: what it was made from, with nothing open any more.
         nodes: ascending node ids.
         pdos: by priority on the bus.
+        raw: frames of an array that is no CANopen node.
         sync: the cycle.
         buses: that of the first joint first, then the others in the order of the joints, the array's last.
         choices: what the scene left open; `setup` has the values.
@@ -302,6 +331,7 @@ class Plan:
     setup: Setup
     nodes: tuple[PlannedNode, ...]
     pdos: tuple[PlannedPdo, ...]
+    raw: tuple[PlannedFrames, ...]
     sync: SyncPlan
     buses: tuple[PlannedBus, ...]
     choices: tuple[Choice, ...]
@@ -325,6 +355,15 @@ class Plan:
     def cycles(self) -> int:
         """About how many the whole task takes, with the ways to the object and back."""
         return round((self.setup.task.duration_s + AROUND_S) * self.sync.rate_hz)
+
+    @property
+    def emulated_channels(self) -> tuple[str, ...]:
+        """Of the buses on which something is emulated."""
+        channels = dict.fromkeys(node.channel for node in self.nodes if node.emulated)
+        array = self.setup.array
+        if array is not None and array.raw is not None and array.emulated:
+            channels[array.channel] = None
+        return tuple(channels)
 
     @property
     def node_ids(self) -> tuple[int, ...]:

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from canprobe.errors import PlanError
 from canprobe.planning.model import JointSpeeds
-from canprobe.planning.window import PITCH_M
-from canprobe.protocol.tactile import SIDE
 from canprobe.robot.chain import forward, forward_jacobian
 from canprobe.robot.inverse import FIXED_POLE, LENGTH_M, in_rows, inverse_near, probe_pose, task_rows
 from canprobe.scene.setup import Approach, Arm, Calibrate, Free, Probe, SafetyLimits, Setup, Touch
@@ -127,9 +125,10 @@ def _check_first_touch(task: Touch, shape: PlacedShape) -> None:
         deep = 1e3 * (radius - nearest.distance)
         what = f"{deep:.1f} mm in the object before its approach, {math.degrees(tilt):.0f} deg beside it"
         raise PlanError([f"task.clearance_mm = {1e3 * approach.clearance:g}: the probe would be {what}; {mend}"])
-    if radius * tilt > 0.5 * SIDE * PITCH_M:
+    reaches = task.array.pad.reach_m
+    if radius * tilt > reaches:
         beside = f"the first touch would be {1e3 * radius * tilt:.1f} mm beside the middle of the array"
-        reach = f"which reaches {500 * SIDE * PITCH_M:.1f} mm and would not measure it"
+        reach = f"which reaches {1e3 * reaches:.1f} mm and would not measure it"
         raise PlanError([f"task.approach_normal: {beside}, {reach}; {mend}"])
 
 
@@ -265,7 +264,7 @@ def _off_array(task: Touch, path: SurfacePath) -> list[str]:
     if task_rows(task.arm.model) != FIXED_POLE:
         return []  # the servo turns the probe, as far as task.rolling_share lets it
     along = np.clip(np.sum(path.normals * _poles(task, path), axis=1), -1.0, 1.0)
-    most, reach = float(np.arccos(along).max()), 0.5 * SIDE * PITCH_M / task.probe.radius
+    most, reach = float(np.arccos(along).max()), task.array.pad.reach_m / task.probe.radius
     if most <= reach:
         return []
     return [

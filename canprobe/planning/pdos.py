@@ -18,7 +18,7 @@ from canprobe.planning.operation import TARGETS, Place, choose_mode
 from canprobe.planning.traffic import SYNCHRONOUS, frame_bits
 from canprobe.protocol.frames import is_restricted
 from canprobe.protocol.pdo import MAX_BITS, PdoEntry, PdoLayout
-from canprobe.protocol.tactile import WINDOW, window_words
+from canprobe.protocol.tactile import WINDOW, image_words, window_words
 from canprobe.scene.setup import Array, Setup
 
 STATUSWORD, CONTROLWORD = (0x6041, 0), (0x6040, 0)
@@ -41,7 +41,6 @@ RESENT_MS, LOST_MS = 100, 250
 ON_EVENT = 255
 
 HEADER, WINDOW_TAXELS, IMAGE_TAXELS, FEATURES = (0x2120, 0), 0x2110, 0x2100, 0x2130
-IMAGE_WORDS = 32
 FD_WORDS = (8, 6, 4, 3, 2, 1)
 """Objects of 8 bytes that fill a CAN FD frame without a byte left over."""
 
@@ -330,7 +329,7 @@ def _plan_tolerated(planning: PdoPlanning, node_id: int) -> None:
 def plan_tactile_pdos(planning: PdoPlanning, ratio: int) -> None:
     """Header and payload of a tactile frame, all triggered by every `ratio`-th SYNC."""
     array, fd = planning.setup.array, planning.setup.bus.fd
-    if array is None:
+    if array is None or array.raw is not None:
         return
     device = planning.devices[array.node_id]
     long = fd and has_long_pdos(device.od)
@@ -342,6 +341,9 @@ def plan_tactile_pdos(planning: PdoPlanning, ratio: int) -> None:
         planning.not_available.append(("another window", why))
         if array.window != WINDOW:
             planning.problems.append(f"node {array.node_id}: {why}: sensor.window = {WINDOW}, not {array.window}")
+    if (lacking := _lacking_words(device, array)) is not None:
+        planning.problems.append(f"node {array.node_id}: {lacking}")
+        return
     header, *rest = tactile_objects(array)
     parcels = [[header]]  # the header alone, then an object each, or as many as 64 bytes hold
     while rest:
@@ -355,6 +357,18 @@ def plan_tactile_pdos(planning: PdoPlanning, ratio: int) -> None:
             layout = PdoLayout(cob_ids[number - 1], tuple(entries), ratio, fd=long)
             cycles = min(TACTILE_DEADLINE_CYCLES, ratio)
             planning.add(array.node_id, "tpdo", number, layout, kind="tactile", cycles=cycles)
+
+
+def _lacking_words(device: Abilities, array: Array) -> str | None:
+    """That the node has another array than the file says; None where it has objects for all its taxels."""
+    words, needed = device.number(IMAGE_TAXELS), image_words(array.pad.taxels)
+    if words is None or words >= needed:  # one without the object cannot send images, which is said of each of them
+        return None
+    taxels = f"{array.pad.rows} × {array.pad.columns} taxels"
+    return (
+        f"{device.eds} has {words} objects of 8 taxels (2100h), and the {taxels} of the array {array.name} need"
+        f" {needed}: it is the EDS of another array, or sensor.rows and sensor.columns are wrong"
+    )
 
 
 def _tactile_cob_ids(planning: PdoPlanning, count: int) -> list[int]:
@@ -390,5 +404,5 @@ def tactile_objects(array: Array) -> tuple[tuple[int, int], ...]:
     if array.mode == "features":
         return (FEATURES, 1), (FEATURES, 2)
     if array.mode == "image":
-        return HEADER, *((IMAGE_TAXELS, half) for half in range(1, IMAGE_WORDS + 1))
+        return HEADER, *((IMAGE_TAXELS, word) for word in range(1, image_words(array.pad.taxels) + 1))
     return HEADER, *((WINDOW_TAXELS, word) for word in range(1, window_words(int(array.window)) + 1))

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from heapq import heappop, heappush
 from typing import Any, Literal
 
+from canprobe.planning.array import array_text, support_of
 from canprobe.planning.bridges import BRIDGES
 from canprobe.planning.model import (
     HEARTBEAT_CONSUMED_MS,
@@ -22,6 +23,7 @@ from canprobe.planning.model import (
 from canprobe.planning.traffic import SYNC_BITS, SYNCHRONOUS, on_the_wire, wire_ns
 from canprobe.protocol.frames import SYNC_ID
 from canprobe.protocol.pdo import PdoEntry
+from canprobe.scene.setup import Setup
 
 # The cycles of a plan as they go when every frame takes its worst-case length and nobody else speaks.
 #
@@ -195,6 +197,7 @@ def _lines(plan: Plan) -> Iterator[str]:
     yield from (f"warning: {warning}" for warning in plan.warnings)
     yield from _titled("nodes", _node_rows(plan))
     yield from _titled("PDOs, from the device's view, highest priority first", _pdo_rows(plan))
+    yield from _titled("raw frames of the array, which is no CANopen node", _raw_rows(plan))
     for one in plan.buses:
         yield from _titled(f"bus {one.channel}, worst case", _bus_rows(one.traffic))
     title = f"one cycle of {_us(sync.period_ns)} µs, worst case, µs after its SYNC is due"
@@ -226,6 +229,8 @@ def _titled(title: str, rows: Iterable[Sequence[str]]) -> Iterator[str]:
 
 def _node_rows(plan: Plan) -> Iterator[list[str]]:
     several = len(plan.buses) > 1
+    if not plan.nodes:
+        return
     yield ["id", "role", "identity (vendor product revision)", "EDS", "", *["bus"] * several]
     for node in plan.nodes:
         numbers = " ".join("any" if number is None else f"{number:08X}h" for number in node.identity.numbers[:3])
@@ -237,6 +242,8 @@ def _node_rows(plan: Plan) -> Iterator[list[str]]:
 
 def _pdo_rows(plan: Plan) -> Iterator[list[str]]:
     several = len(plan.buses) > 1
+    if not plan.pdos:
+        return
     times = ["response µs", "deadline µs", "slack µs"]
     yield [*["bus"] * several, "COB-ID", "node", "PDO", "type", "Hz", "bytes", "bits", *times, "content"]
     for pdo in plan.pdos:
@@ -245,6 +252,17 @@ def _pdo_rows(plan: Plan) -> Iterator[list[str]]:
         times = [_us(pdo.response_ns), _us(pdo.deadline_ns), _us(pdo.slack_ns)]
         content = _content(pdo.entries) if pdo.used else f"not used: {_content(pdo.entries)}"
         yield [*[pdo.channel] * several, *name, *frame, *times, content]
+
+
+def _raw_rows(plan: Plan) -> Iterator[list[str]]:
+    several = len(plan.buses) > 1
+    if plan.raw:
+        yield [*["bus"] * several, "id", "sent by", "what", "frames", "bytes", "Hz", "bits", "response µs"]
+    for one in plan.raw:
+        sender, repeats = "master" if one.sent else "array", one.rate_hz > 0
+        response = _us(one.response_ns) if repeats else ""
+        frame = [str(one.count), str(one.length), f"{one.rate_hz:g}" if repeats else "", str(one.bits_worst)]
+        yield [*[one.channel] * several, f"{one.can_id:03X}h", sender, one.what, *frame, response]
 
 
 def _speed_rows(plan: Plan) -> Iterator[list[str]]:
@@ -299,17 +317,30 @@ def _budget_rows(budget: CycleBudget) -> Iterator[list[str]]:
 def _use_rows(plan: Plan) -> Iterator[list[str]]:
     setup = plan.setup
     yield ["task", setup.kind]
+    if setup.array is not None:
+        yield ["array", f"{array_text(setup.array)}; {_measured(setup)}"]
     if (scan := setup.scan) is not None:
         yield ["strategy", scan.name]
     if (shape := setup.shape) is not None:
         also = f"; on the same data afterwards: {', '.join(shape.also)}" if shape.also else ""
         yield ["estimator", shape.method + also]
-    if setup.emulated_node_ids:
-        emulated = f"nodes {', '.join(map(str, setup.emulated_node_ids))}"
+    if setup.emulates:
+        nodes = f"nodes {', '.join(map(str, setup.emulated_node_ids))}" if setup.emulated_node_ids else ""
+        raw = "the array" if setup.array is not None and setup.array.raw is not None and setup.array.emulated else ""
+        emulated = " and ".join(filter(None, (nodes, raw)))
         yield ["emulator", f"{emulated}; arm {setup.truth.fidelity}" if setup.arm is not None else emulated]
     for name in setup.bridge.use:
         yield ["bridge", f"{name}: {BRIDGES[name].what}; needs {', '.join(BRIDGES[name].packages)}"]
     yield ["outputs", ", ".join(plan.outputs)]
+
+
+def _measured(setup: Setup) -> str:
+    """What the array measures of the task's contact."""
+    support, array = support_of(setup), setup.array
+    assert support is not None and array is not None
+    if setup.touch is None or array.pad.is_flat:
+        return f"it measures {support}"
+    return f"at {setup.touch.force:g} N on a plane about {support.taxels:.0f} taxels are pressed: {support}"
 
 
 def _us(t_ns: int | None) -> str:
@@ -348,6 +379,8 @@ def plan_dict(plan: Plan) -> dict[str, Any]:
             for node in plan.nodes
         ],
         "pdos": [_pdo(pdo) for pdo in plan.pdos],
+        "raw_frames": [_in_us(asdict(frames)) for frames in plan.raw],
+        "array": _array(setup),
         "bus_load": {one.channel: _bus(one) for one in plan.buses},
         "choices": [asdict(choice) for choice in plan.choices],
         "timeline": [_in_us(asdict(slot)) | {"channel": slot.channel or None} for slot in timeline(plan)],
@@ -355,7 +388,7 @@ def plan_dict(plan: Plan) -> dict[str, Any]:
         "estimator": shape.method if shape is not None else None,
         "offline_estimators": list(shape.also) if shape is not None else [],
         "strategy": setup.scan.name if setup.scan is not None else None,
-        "fidelity": setup.truth.fidelity if setup.emulated_node_ids else None,
+        "fidelity": setup.truth.fidelity if setup.emulates else None,
         "bridges": list(setup.bridge.use),
         "outputs": list(plan.outputs),
         "left_out": [{"what": what, "why": why} for what, why in plan.left_out],
@@ -384,6 +417,24 @@ def _bus(bus: PlannedBus) -> dict[str, Any]:
         "demands": [_in_us(asdict(demand)) for demand in traffic.demands],
         "sync_response_us": _microseconds(traffic.sync_response_ns),
         "budget": _in_us(asdict(budget) | {"bus_ns": budget.bus_ns}),
+    }
+
+
+def _array(setup: Setup) -> dict[str, Any] | None:
+    """The array and what it supports; None without one."""
+    array, support = setup.array, support_of(setup)
+    if array is None or support is None:
+        return None
+    pad, radius = array.pad, array.pad.mount_radius_m
+    return {
+        "name": array.name,
+        "rows": pad.rows,
+        "columns": pad.columns,
+        "pitch_mm": 1e3 * pad.pitch_m,
+        "mount_radius_mm": None if radius is None else 1e3 * radius,
+        "rate_hz": array.rate_hz,
+        "taxels_pressed": support.taxels if setup.touch is not None else None,
+        "supports": {"force": True, "centroid": support.centroid, "curvature": support.curvature},
     }
 
 

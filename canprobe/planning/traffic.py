@@ -14,6 +14,7 @@ from canprobe.planning.model import (
     CycleBudget,
     Demand,
     PlannedBus,
+    PlannedFrames,
     PlannedPdo,
     SyncPlan,
     Traffic,
@@ -54,17 +55,22 @@ def plan_sync(setup: Setup) -> tuple[SyncPlan, bool]:
 
 def plan_ratio(setup: Setup) -> tuple[int, list[str]]:
     """How many SYNCs make one tactile frame (18xxh:02), and why the rate is not possible."""
-    if setup.array is None:
+    array = setup.array
+    if array is None or (array.raw is not None and array.raw.sampling == "free"):
         return 1, []
-    exact = setup.rate_hz / setup.array.rate_hz
+    exact = setup.rate_hz / array.rate_hz
     ratio = max(1, round(exact))
-    if abs(exact / ratio - 1) < _TOLERANCE and SYNC_OVERFLOW % ratio == 0:
+    if abs(exact / ratio - 1) < _TOLERANCE and (SYNC_OVERFLOW % ratio == 0 or array.raw is not None):
         return ratio, []
+    if array.raw is not None:
+        rates = f"{setup.rate_hz / ratio:.6g} or {setup.rate_hz / (ratio + 1):.6g}"
+        what = f"an image every {exact:.4g} cycles cannot be asked for; take {rates} Hz"
+        return ratio, [f"sensor.rate_hz = {array.rate_hz:g}: {what}"]
     fitting = [count for count in range(1, SYNC_OVERFLOW + 1) if SYNC_OVERFLOW % count == 0]
     near = sorted(fitting, key=lambda count: abs(count - exact))[:2]
     rates = " or ".join(f"{setup.rate_hz / count:.6g}" for count in sorted(near))
     return min(ratio, SYNC_OVERFLOW), [
-        f"sensor.rate_hz = {setup.array.rate_hz:g}: a frame every {exact:.4g} SYNCs cannot be triggered; the SYNC "
+        f"sensor.rate_hz = {array.rate_hz:g}: a frame every {exact:.4g} SYNCs cannot be triggered; the SYNC "
         f"counter runs to {SYNC_OVERFLOW}, so cycle.rate_hz must be 1, 2, 3, 4, 5, 6, 8, … times it; take {rates} Hz"
     ]
 
@@ -151,14 +157,36 @@ def wire_ns(bits: int, bitrate: int) -> int:
     return -(-bits * 1_000_000_000 // bitrate)
 
 
+RAW_DEVICE = 0
+"""In the place of a node id: the transmit queue of an array that is no node."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedTraffic:
+    """What is on the buses.
+
+    Attributes:
+        buses: with their traffic.
+        pdos, raw: with their response times.
+        problems: what does not fit.
+    """
+
+    buses: tuple[PlannedBus, ...]
+    pdos: tuple[PlannedPdo, ...]
+    raw: tuple[PlannedFrames, ...]
+    problems: list[str]
+
+
 def plan_traffic(
     pdos: Sequence[PlannedPdo],
     sync: SyncPlan,
     channels: Mapping[str, tuple[int, ...]],
     bus: Bus,
     compute_ns: int = 0,
-) -> tuple[tuple[PlannedBus, ...], tuple[PlannedPdo, ...], list[str]]:
-    """The buses with their traffic, the PDOs with their response times, and what does not fit.
+    *,
+    raw: Sequence[PlannedFrames] = (),
+) -> PlannedTraffic:
+    """The buses with their traffic, PDOs and raw frames with their response times, and what does not fit.
 
     Args:
         pdos: of all nodes.
@@ -166,18 +194,24 @@ def plan_traffic(
         channels: of each bus, with the nodes on it, which produce heartbeats as the master does.
         bus: bit rate of all of them.
         compute_ns: what the controller takes of a cycle at most.
+        raw: of an array that is no CANopen node.
     """
     wires = [on_the_wire([pdo for pdo in pdos if pdo.channel == channel]) for channel in channels]
-    messages = [_messages(wire, sync, ids, bus) for wire, ids in zip(wires, channels.values(), strict=True)]
+    raws = [[frames for frames in raw if frames.channel == channel] for channel in channels]
+    messages = [
+        _messages(wire, its, sync, ids, bus) for wire, its, ids in zip(wires, raws, channels.values(), strict=True)
+    ]
     analyses, budget = _analyse(messages, compute_ns, bus.bitrate)
     buses: list[PlannedBus] = []
     timed: list[PlannedPdo] = []
-    for (channel, node_ids), wire, analysis in zip(channels.items(), wires, analyses, strict=True):
+    raw_timed: list[PlannedFrames] = []
+    for (channel, node_ids), wire, its, analysis in zip(channels.items(), wires, raws, analyses, strict=True):
         response_ns = {response.message.cob_id: response.response_ns for response in analysis.responses}
         bits_per_s = {
             "SYNC": SYNC_BITS * sync.rate_hz,
             "drives": sum(pdo.bits_worst * pdo.rate_hz for pdo in wire if pdo.kind == "drive"),
-            "tactile": sum(pdo.bits_worst * pdo.rate_hz for pdo in wire if pdo.kind == "tactile"),
+            "tactile": sum(pdo.bits_worst * pdo.rate_hz for pdo in wire if pdo.kind == "tactile")
+            + sum(frames.bits_worst * frames.rate_hz for frames in its),
             "heartbeats": worst_case_bits(1) * 1000 / HEARTBEAT_PRODUCED_MS * (len(node_ids) + 1),
         }
         traffic = Traffic(
@@ -190,10 +224,26 @@ def plan_traffic(
         buses.append(PlannedBus(channel, node_ids, traffic))
         mine = [replace(pdo, response_ns=response_ns[pdo.cob_id]) for pdo in pdos if pdo.channel == channel]
         timed += sorted(mine, key=lambda pdo: (pdo.cob_id, pdo.node_id))
-    return tuple(buses), tuple(timed), _problems(buses, analyses, bus)
+        raw_timed += [replace(frames, response_ns=response_ns.get(frames.can_id)) for frames in its]
+    return PlannedTraffic(tuple(buses), tuple(timed), tuple(raw_timed), _problems(buses, analyses, bus))
 
 
-def _messages(wire: Sequence[PlannedPdo], sync: SyncPlan, node_ids: Sequence[int], bus: Bus) -> _Messages:
+def _raw_messages(raw: Sequence[PlannedFrames], bus: Bus) -> Iterator[Message]:
+    """Raw frames that repeat, as one message an identifier: its frames go one behind the other."""
+    repeated: dict[int, list[PlannedFrames]] = {}
+    for frames in raw:
+        if frames.rate_hz > 0:
+            repeated.setdefault(frames.can_id, []).append(frames)
+    for can_id, all_of_it in repeated.items():
+        bits = sum(frames.bits_worst for frames in all_of_it)
+        period = round(1e9 / all_of_it[0].rate_hz)
+        length = max(frames.length for frames in all_of_it)
+        yield Message(f"raw frames {can_id:03X}h", can_id, length, period, frame_ns=wire_ns(bits, bus.bitrate))
+
+
+def _messages(
+    wire: Sequence[PlannedPdo], raw: Sequence[PlannedFrames], sync: SyncPlan, node_ids: Sequence[int], bus: Bus
+) -> _Messages:
     """What SYNC triggers, by its part in the cycle, and what keeps its own time."""
     queues = {"SYNC": MASTER_NODE_ID}
     cyclic: dict[str, list[Message]] = {"feedback": [], "commands": [], "other": []}
@@ -218,6 +268,9 @@ def _messages(wire: Sequence[PlannedPdo], sync: SyncPlan, node_ids: Sequence[int
             feedback_bits += best_case_bits(pdo.layout.length)
         else:
             cyclic["other"].append(message)
+    for message in _raw_messages(raw, bus):
+        strangers.append(message)
+        queues[message.name] = RAW_DEVICE
     for node in (*node_ids, MASTER_NODE_ID):
         name = f"heartbeat of node {node}"
         strangers.append(Message(name, HEARTBEAT_BASE + node, 1, HEARTBEAT_PRODUCED_MS * 1_000_000))

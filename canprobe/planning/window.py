@@ -21,9 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from canprobe.protocol.tactile import WINDOWS
-from canprobe.scene.setup import Probe, Setup
+from canprobe.scene.setup import Array, Probe, Setup
 
-PITCH_M = 1.5875e-3
 FOLLOWING_TAXELS = 0.75
 """By how much the contact's centroid may be off the middle of the window before the window moves."""
 TOLERATED = 0.05
@@ -42,28 +41,30 @@ def patch_radius_m(force_n: float, probe: Probe) -> float:
     return math.sqrt(2.0 * probe.radius * depth)
 
 
-def patch_across_taxels(force_n: float, probe: Probe) -> float:
+def patch_across_taxels(force_n: float, probe: Probe, pitch_m: float) -> float:
     """Diameter of the contact patch on a plane, in taxels."""
-    return 2.0 * patch_radius_m(force_n, probe) / PITCH_M
+    return 2.0 * patch_radius_m(force_n, probe) / pitch_m
 
 
-def taxels_needed(force_n: float, probe: Probe) -> float:
-    """Taxels along a window that always holds the patch."""
-    return patch_across_taxels(force_n, probe) + 2.0 * FOLLOWING_TAXELS
+def windows_of(array: Array) -> tuple[int, ...]:
+    """Taxels along each window that the array has room for."""
+    return tuple(side for side in WINDOWS if side <= min(array.pad.shape))
 
 
 def window_choices(setup: Setup) -> tuple[tuple[int, str], ...]:
     """Windows by preference, with the reason: the smallest that holds the patch; without a force the largest first."""
-    touch = setup.touch
+    touch, array = setup.touch, setup.array
+    windows = windows_of(array) if array is not None else WINDOWS
     if touch is None:
-        return tuple((side, "the largest that fits; nothing is pressed") for side in reversed(WINDOWS))
-    needed = taxels_needed(touch.force, touch.probe)
+        return tuple((side, "the largest that fits; nothing is pressed") for side in reversed(windows))
+    across = patch_across_taxels(touch.force, touch.probe, touch.array.pad.pitch_m)
+    needed = across + 2.0 * FOLLOWING_TAXELS
     patch = (
         f"at {touch.force:g} N the patch on a plane has {2e3 * patch_radius_m(touch.force, touch.probe):.1f} mm across"
         f" and asks for {needed:.1f} taxels with {FOLLOWING_TAXELS:g} on each side for following it"
     )
-    enough = [side for side in WINDOWS if side >= needed]
-    less = [side for side in reversed(WINDOWS) if side < needed]
+    enough = [side for side in windows if side >= needed]
+    less = [side for side in reversed(windows) if side < needed]
     return (
         *((side, f"{patch}: the smallest that holds it") for side in enough[:1]),
         *((side, f"{patch}: the largest that fits, cutting its rim") for side in less),
@@ -71,16 +72,19 @@ def window_choices(setup: Setup) -> tuple[tuple[int, str], ...]:
     )
 
 
-def measured_share(force_n: float, probe: Probe, side: int, off_taxels: float = FOLLOWING_TAXELS) -> float:
+def measured_share(
+    force_n: float, probe: Probe, side: int, pitch_m: float, off_taxels: float = FOLLOWING_TAXELS
+) -> float:
     """Share of a force that a window measures.
 
     Args:
         force_n: on a plane.
         probe: the layer on it.
         side: taxels along the window.
+        pitch_m: of the taxels.
         off_taxels: by how much the window's middle is off the contact's, along one of its sides.
     """
-    radius, half = patch_across_taxels(force_n, probe) / 2, side / 2
+    radius, half = patch_across_taxels(force_n, probe, pitch_m) / 2, side / 2
     first, last = max(-radius, off_taxels - half), min(radius, off_taxels + half)
     width = max(last - first, 0.0) / _STEPS
     x = first + (np.arange(_STEPS) + 0.5) * width
@@ -89,14 +93,14 @@ def measured_share(force_n: float, probe: Probe, side: int, off_taxels: float = 
     return min(width * float(columns.sum()) / (math.pi / 2 * radius**2), 1.0)
 
 
-def true_force_n(force_n: float, probe: Probe, side: int, most_n: float) -> float | None:
+def true_force_n(force_n: float, probe: Probe, side: int, pitch_m: float, most_n: float) -> float | None:
     """The force that presses where a window measures `force_n`, at the most; None where it is above `most_n`."""
-    if most_n * measured_share(most_n, probe, side) < force_n:
+    if most_n * measured_share(most_n, probe, side, pitch_m) < force_n:
         return None
     low, high = force_n, most_n
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
-        low, high = (middle, high) if middle * measured_share(middle, probe, side) < force_n else (low, middle)
+        low, high = (middle, high) if middle * measured_share(middle, probe, side, pitch_m) < force_n else (low, middle)
     return high
 
 
@@ -121,12 +125,14 @@ def cut_patch(setup: Setup) -> CutPatch | None:
     if touch is None or touch.array.mode != "window":
         return None
     force, probe, side, most = touch.force, touch.probe, int(touch.array.window), setup.limits.force_max
-    share = measured_share(force, probe, side)
+    pitch = touch.array.pad.pitch_m
+    share = measured_share(force, probe, side, pitch)
     if share >= 1.0 - TOLERATED:
         return None
-    enough = [wider for wider in WINDOWS if measured_share(force, probe, wider) >= 1.0 - TOLERATED]
+    windows = windows_of(touch.array)
+    enough = [wider for wider in windows if measured_share(force, probe, wider, pitch) >= 1.0 - TOLERATED]
     ways = (f"sensor.window = {enough[0]}" if enough else 'sensor.mode = "image"', "a smaller task.force_n")
-    across = patch_across_taxels(force, probe)
+    across = patch_across_taxels(force, probe, pitch)
     cuts = (
         f"sensor.window = {side} cuts the contact patch, which is {across:.1f} taxels across on a plane at "
         f"{force:g} N; as little as {100 * share:.0f} % of that force lies inside"
@@ -134,7 +140,7 @@ def cut_patch(setup: Setup) -> CutPatch | None:
     if side >= CARRIED_SIDE and share >= CARRIED_SHARE:
         carried = f"the rest is carried on from there, and the force errs by up to {100 * CARRIED_ERROR:.0f} %"
         return CutPatch(f"{cuts}; {carried}", True, ways)
-    true_n = true_force_n(force, probe, side, most)
+    true_n = true_force_n(force, probe, side, pitch, most)
     presses = f"more than limits.force_max_n = {most:g} N" if true_n is None else f"up to {true_n:.2g} N"
     text = f"{cuts}, and where the window measures {force:g} N, {presses} can press"
     return CutPatch(text, true_n is not None, ways)

@@ -8,16 +8,16 @@ Every frame begins with the same 8 bytes, little-endian:
 
 In features mode byte 2 is the peak taxel instead: features have no window. The flags' window is the number of taxels
 along it, 0 for 8 and outside window mode; bit 3 is 0. Then follow, by mode, window: its taxels row by row, 8 to a
-payload, zeros behind the last one (of 8×8 taxels: 8 payloads, a row each); image: 32 payloads, the left then the right
-half of each of 16 rows; lowest byte = lowest column. Features: one payload, a 64-bit little-endian word from its least
-significant bit upward:
+payload, zeros behind the last one (of 8×8 taxels: 8 payloads, a row each); image: all taxels in the same way (of 16×16:
+32 payloads, the left then the right half of each row); lowest byte = lowest column. Features: one payload, a 64-bit
+little-endian word from its least significant bit upward:
 
     field   bits  scale         range, saturating          field   bits  scale          range, saturating
     force   12    1/400 N       0..10.2375 N               var_rr  10    1/64 taxel²    0..15.98 taxel²
     row     11    1/128 taxel   0..15.992                  var_rc  10    1/64 taxel²    −8..7.98 taxel² (signed)
     col     11    1/128 taxel   0..15.992                  var_cc  10    1/64 taxel²    0..15.98 taxel²
 
-One step of the centroid is 12 µm on the pad and half a step the largest error inside the ranges.
+One step of the centroid is 1/128 of the pitch and half a step the largest error inside the ranges.
 """
 
 from __future__ import annotations
@@ -36,7 +36,10 @@ from canprobe.errors import ProtocolError
 
 # Tactile frames on the wire: header, contact features, checksum, payloads in PDO order.
 
-SIDE = 16  # taxels along the pad
+SIDE = 16
+"""Most rows and columns of an array: the header names a taxel in 8 bits."""
+Shape = tuple[int, int]
+"""Rows and columns of an array."""
 WINDOW = 8  # taxels along the window, where nothing else is said
 WINDOWS = (4, 6, 8, 10, 12)
 """Taxels along the window that a sensor can be set to."""
@@ -63,9 +66,14 @@ class TactileMode(IntEnum):
     IMAGE = 2
 
 
+def image_words(taxels: int) -> int:
+    """Payloads of 8 taxels that so many taxels fill."""
+    return -(-taxels // 8)
+
+
 def window_words(side: int) -> int:
     """Payloads of 8 taxels that a window of side × side taxels fills."""
-    return -(-side * side // 8)
+    return image_words(side * side)
 
 
 def crc16_ccitt(data: bytes, crc: int = 0) -> int:
@@ -147,7 +155,7 @@ class TactileHeader:
         if (read := _FLAGS.get(flags)) is None:
             raise ProtocolError(f"tactile header: reserved flags {flags:#04x}")
         header = cls(counter, sync, origin >> 4, origin & 0x0F, read[0], bool(flags & _OVERLOAD), age, crc, read[1])
-        _check_origin(header)
+        _check_origin(header, (SIDE, SIDE))
         return header
 
 
@@ -163,11 +171,13 @@ _FLAGS = {mode | overload: (mode, WINDOW) for mode in TactileMode for overload i
 _LAST_ORIGIN = {TactileMode.FEATURES: SIDE - 1, TactileMode.IMAGE: 0}
 
 
-def _check_origin(header: TactileHeader) -> None:
+def _check_origin(header: TactileHeader, shape: Shape) -> None:
     if header.window not in WINDOWS:
         raise ProtocolError(f"tactile header: a window has {', '.join(map(str, WINDOWS))} taxels, not {header.window}")
-    limit = SIDE - header.window if header.mode is TactileMode.WINDOW else _LAST_ORIGIN[header.mode]
-    if header.origin_row > limit or header.origin_col > limit:
+    last = (_LAST_ORIGIN.get(header.mode, 0),) * 2
+    if header.mode is TactileMode.WINDOW:
+        last = (shape[0] - header.window, shape[1] - header.window)
+    if header.origin_row > last[0] or header.origin_col > last[1]:
         origin = (header.origin_row, header.origin_col)
         raise ProtocolError(f"tactile header: {header.mode.name.lower()} cannot begin at taxel {origin}")
 
@@ -178,7 +188,7 @@ class Features:
 
     Attributes:
         force_n: force over the pad, N.
-        row, col: centroid in taxels of the full pad, 0..15 (7.5 is the middle).
+        row, col: centroid in taxels of the full pad, from 0 (7.5 is the middle of 16).
         var_rr, var_rc, var_cc: central second moments, taxel².
         peak: highest taxel, counts 0..255.
     """
@@ -232,13 +242,15 @@ def _payload_bytes(header: TactileHeader, content: NDArray[np.uint8] | Features)
             raise ProtocolError(f"features given to a frame of mode {header.mode.name}")
         return content.pack()
     side = header.window
-    if content.dtype != np.uint8 or content.shape not in ((SIDE, SIDE), (side, side)):
-        raise ProtocolError(f"taxels: expected uint8 (16, 16) or ({side}, {side}), got {content.dtype} {content.shape}")
-    if header.mode is TactileMode.WINDOW and content.shape == (SIDE, SIDE):
+    if header.mode is TactileMode.WINDOW and content.shape != (side, side):
         row, col = header.origin_row, header.origin_col
         content = content[row : row + side, col : col + side]
-    if content.shape != {TactileMode.WINDOW: (side, side), TactileMode.IMAGE: (SIDE, SIDE)}.get(header.mode):
-        raise ProtocolError(f"taxels of shape {content.shape} given to a frame of mode {header.mode.name}")
+    whole = header.mode is TactileMode.IMAGE and content.ndim == 2
+    if content.dtype != np.uint8 or not (whole or content.shape == (side, side)):
+        raise ProtocolError(
+            f"taxels: expected uint8 that hold the window of {side} × {side} at {header.origin_row, header.origin_col},"
+            f" or a whole image, got {content.dtype} {content.shape} for a frame of mode {header.mode.name}"
+        )
     data = content.tobytes()
     return data + bytes(-len(data) % 8)
 
@@ -248,7 +260,7 @@ def pack_whole(header: TactileHeader, content: NDArray[np.uint8] | Features) -> 
 
     Args:
         header: its crc is ignored; in features mode its origin too (the peak of the features takes that byte).
-        content: taxels uint8, the full pad (16, 16), of which window mode sends its window, or that window; or
+        content: taxels uint8, the full pad (rows, columns), of which window mode sends its window, or that window; or
             features.
 
     Raises:
@@ -258,7 +270,8 @@ def pack_whole(header: TactileHeader, content: NDArray[np.uint8] | Features) -> 
         if not 0 <= content.peak <= 255:
             raise ProtocolError(f"features: peak {content.peak} is not 0..255")
         header = replace(header, origin_row=content.peak >> 4, origin_col=content.peak & 0x0F)
-    _check_origin(header)
+    whole_pad = not isinstance(content, Features) and content.shape != (header.window, header.window)
+    _check_origin(header, content.shape if whole_pad else (SIDE, SIDE))  # type: ignore[union-attr]
     body, start = _payload_bytes(header, content), header.start()
     crc = crc16_ccitt(body, crc16_ccitt(start))
     return start + crc.to_bytes(2, "little") + body
@@ -273,10 +286,11 @@ class TactileFrame:
 
     Attributes:
         header: as received.
-        taxels: uint8 (16, 16), full pad, counts; zero outside the window, all zero in features mode; read-only.
+        taxels: uint8 (rows, columns), full pad, counts; zero outside the window, all zero in features mode; read-only.
         window: (first row, first column, rows, columns) that the taxels cover; (0, 0, 0, 0) in features mode.
         features: contact features, in features mode only.
         t_ns: arrival of the header.
+        raw: (rows, columns, axes) values as they came, of a device of raw frames, whose header is made up; else None.
     """
 
     header: TactileHeader
@@ -284,6 +298,7 @@ class TactileFrame:
     window: tuple[int, int, int, int]
     features: Features | None
     t_ns: int
+    raw: NDArray[np.int64] | None = None
 
 
 class FrameAssembler:
@@ -303,7 +318,7 @@ class FrameAssembler:
     """
 
     __slots__ = (
-        "_deadline_ns", "_last", "_missing", "_mode", "_opened_ns", "_parts", "_sizes", "_slots", "_window",
+        "_deadline_ns", "_last", "_missing", "_mode", "_opened_ns", "_parts", "_shape", "_sizes", "_slots", "_window",
         "crc_errors", "duplicates", "frames", "lost", "malformed", "orphans", "torn",
     )  # fmt: skip
 
@@ -313,7 +328,9 @@ class FrameAssembler:
         mode: TactileMode,
         deadline_ns: int,
         sizes: Sequence[int] | None = None,
+        *,
         window: int = WINDOW,
+        shape: Shape = (SIDE, SIDE),
     ) -> None:
         """Expect the given identifiers.
 
@@ -323,20 +340,22 @@ class FrameAssembler:
             deadline_ns: longest time from header to last PDO; two cycles as a rule.
             sizes: bytes of each PDO; 8 by default, up to 64 on CAN FD.
             window: taxels along the window that the sensor is set to.
+            shape: rows and columns of the array.
 
         Raises:
             ProtocolError: the PDOs do not add up to a frame of the mode, or an identifier is there twice.
         """
         self._slots = {cob_id: slot for slot, cob_id in enumerate(cob_ids)}
         self._sizes = tuple(sizes) if sizes is not None else (8,) * len(cob_ids)
-        payloads = {TactileMode.FEATURES: 1, TactileMode.WINDOW: window_words(window), TactileMode.IMAGE: 32}[mode]
-        needed = 8 * (1 + payloads)
+        whole = image_words(shape[0] * shape[1])
+        payloads = {TactileMode.FEATURES: 1, TactileMode.WINDOW: window_words(window), TactileMode.IMAGE: whole}
+        needed = 8 * (1 + payloads[mode])
         if len(self._slots) != len(cob_ids) or self._sizes[:1] != (8,) or sum(self._sizes) != needed:
             raise ProtocolError(
                 f"{mode.name.lower()} frames need different COB-IDs, a header of 8 bytes first, {needed} bytes in all; "
                 f"got {cob_ids} with {self._sizes} bytes"
             )
-        self._mode, self._window = mode, window
+        self._mode, self._window, self._shape = mode, window, shape
         self._deadline_ns = deadline_ns
         self._parts: list[bytes | None] = []
         self._missing = 0  # 0: no frame is open
@@ -395,6 +414,7 @@ class FrameAssembler:
         body = b"".join(rest)  # type: ignore[arg-type]  # complete: no None is left
         try:
             header = TactileHeader.unpack(start)
+            _check_origin(header, self._shape)
         except ProtocolError:
             self.malformed += 1
             return None
@@ -411,19 +431,19 @@ class FrameAssembler:
             self.lost += (header.frame_counter - self._last - 1) % 256
         self._last = header.frame_counter
         self.frames += 1
-        return _build(header, body, self._opened_ns)
+        return _build(header, body, self._opened_ns, self._shape)
 
 
-def _build(header: TactileHeader, body: bytes, t_ns: int) -> TactileFrame:
-    taxels = np.zeros((SIDE, SIDE), np.uint8)
+def _build(header: TactileHeader, body: bytes, t_ns: int, shape: Shape) -> TactileFrame:
+    taxels = np.zeros(shape, np.uint8)
     window, features = (0, 0, 0, 0), None
     if header.mode is TactileMode.FEATURES:
         features = Features.unpack(body, header.peak)
     else:
-        side = header.window if header.mode is TactileMode.WINDOW else SIDE
+        rows, columns = (header.window, header.window) if header.mode is TactileMode.WINDOW else shape
         row, col = header.origin_row, header.origin_col
-        counts = np.frombuffer(body, np.uint8, side * side).reshape(side, side)
-        taxels[row : row + side, col : col + side] = counts
-        window = (row, col, side, side)
+        counts = np.frombuffer(body, np.uint8, rows * columns).reshape(rows, columns)
+        taxels[row : row + rows, col : col + columns] = counts
+        window = (row, col, rows, columns)
     taxels.flags.writeable = False
     return TactileFrame(header, taxels, window, features, t_ns)

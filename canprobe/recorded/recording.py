@@ -98,6 +98,7 @@ def _read(path: Path, plan: Plan) -> tuple[dict[str, _Channel], int]:
     lengths: dict[int, int] = {pdo.cob_id: pdo.layout.length for pdo in plan.pdos}
     answers = {pdo.cob_id for pdo in plan.pdos if pdo.direction == "tpdo"}
     may_be_longer = {pdo.cob_id for pdo in plan.pdos if pdo.direction == "tpdo" and pdo.kind == "drive"}
+    raw = {(frames.channel, frames.can_id) for frames in plan.raw}  # their formats say what is in them
     channels: dict[str, _Channel] = {}
     error_frames = 0
     main, *others = [bus.channel for bus in plan.buses]
@@ -108,7 +109,7 @@ def _read(path: Path, plan: Plan) -> tuple[dict[str, _Channel], int]:
         channel = channels.get(name)
         if channel is None:
             channel = channels[name] = _Channel()
-        if can_id == SYNC_ID and len(data) <= 1:
+        if (can_id == SYNC_ID and len(data) <= 1) or (on if on in others else main, can_id) in raw:
             channel.frames.append((can_id, data, t_ns))
         elif (length := lengths.get(can_id)) is None:
             channel.other += 1

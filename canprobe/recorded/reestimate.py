@@ -74,14 +74,13 @@ def _from_log(plan: Plan, path: Path) -> Contacts:
     except ProtocolError as error:
         raise UsageError(f"{path}: on {recording.channel}: {error}") from error
     assert cycles.drives is not None and cycles.tactile is not None
-    assembler = cycles.tactile.assembler
     counts = {
         "cycles": len(cycles.sync_times_s),
         "lost_syncs": cycles.lost_syncs,
         "missed_pdos": cycles.drives.missed,
         "malformed_pdos": recording.malformed,
-        "torn_frames": assembler.torn + assembler.crc_errors + assembler.orphans,
-        "lost_frames": assembler.lost,
+        "torn_frames": cycles.tactile.torn,
+        "lost_frames": cycles.tactile.lost,
         "stale_frames": cycles.tactile.stale,
         "unplaced_contacts": unplaced,
         "error_frames": recording.error_frames,

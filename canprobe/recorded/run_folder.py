@@ -79,10 +79,11 @@ class RunFolder:
         if not columns:
             return {}
         used, sampled = self._ns(columns["t_s"]).tolist(), self._ns(columns["t_sample_s"]).tolist()
+        sigmas = columns["t_sigma_s"].tolist()
         triggers = np.searchsorted(self.times_ns, sampled).tolist()
         rows = zip(columns["taxels"], columns["window"].tolist(), columns["features"].tolist(), strict=True)
         return {
-            used[i]: TactileSample(_frame(taxels, tuple(window), features), sampled[i], triggers[i])
+            used[i]: TactileSample(_frame(taxels, tuple(window), features), sampled[i], triggers[i], sigmas[i])
             for i, (taxels, window, features) in enumerate(rows)
         }
 
@@ -114,7 +115,9 @@ def read_run(folder: Path) -> RunFolder | None:
     columns, images = read_npz(log), read_npz(tactile)
     missing = [name for name in ("t_s", "q_age") if name not in columns]
     missing += ["q_rad"] if joint_positions(columns) is None else []
-    missing += [name for name in ("t_s", "t_sample_s", "taxels", "window", "features") if name not in images]
+    missing += [
+        name for name in ("t_s", "t_sample_s", "t_sigma_s", "taxels", "window", "features") if name not in images
+    ]
     if missing:
         raise UsageError(f"{folder}: expected the columns of a run, got none called {', '.join(missing)}; run it again")
     check_clock(log, columns)

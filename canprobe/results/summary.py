@@ -113,9 +113,9 @@ class RunResult:
             and in the estimates counts from the instant that is 0 in ``bus.log``.
         truth: the plant's true values, one row per SYNC; empty where nothing was emulated.
         estimates: the answers of each estimator, by name; the online one first.
-        taxels: (16, 16) counts of the task's last tactile frame, or None.
+        taxels: (rows, columns) counts of the task's last tactile frame, or None.
         tactile: the columns of ``tactile.npz``, one row per tactile frame that the cell used: ``t_s`` of the cycle,
-            ``t_sample_s``, ``taxels`` (m, 16, 16), their ``window``, ``features``; empty where there was none.
+            ``t_sample_s``, ``taxels`` (m, rows, columns), their ``window``, ``features``; empty where there was none.
         surface_map: the local patches of the online estimator, or None without a shape.
         consistency: the tests at its crossings, or None.
         out: the folder with the files, or None.
@@ -392,14 +392,13 @@ def finite_or_none(values: Sequence[float] | Array) -> list[float | None]:
 def _cycle(cell: Cell, record: TaskRecord) -> dict[str, Any]:
     cycle, drives, tactile = cell.cycle, cell.drives, cell.tactile
     statistics = cycle.statistics if cycle is not None else None
-    assembler = tactile.assembler if tactile is not None else None
     return {
         "rate_hz": cycle.number / (cycle.t_ns * 1e-9) if cycle is not None and cycle.t_ns > 0 else None,
         "cycles": cycle.number + 1 if cycle is not None else 0,
         "overruns": statistics.overruns if statistics is not None else 0,
         "missed_pdos": drives.missed if drives is not None else 0,
         "late_pdos": drives.late if drives is not None else 0,
-        "torn_frames": assembler.torn + assembler.crc_errors + assembler.orphans if assembler is not None else 0,
+        "torn_frames": tactile.torn if tactile is not None else 0,
         "stale_frames": tactile.stale if tactile is not None else 0,
         "unplaced_contacts": record.unplaced,
         "slowed_cycles": record.slowed,

@@ -22,13 +22,13 @@ from canprobe.errors import SceneError
 from canprobe.robot.urdf import with_meshes_found
 from canprobe.scene.checks import MismatchError, Only, ScenePath, choices_of, conditions_of, convert
 from canprobe.scene.hardware import CellInfo
-from canprobe.scene.model import Cell, Scene
+from canprobe.scene.model import DEFAULT_ARRAY, ArrayFile, Cell, Scene
 from canprobe.scene.rules import SECTIONS_OF_TASK, broken_rules
 
 DEFAULT_CELL = "puma260"
 """Cell of a scene that names none."""
 _ALWAYS = ("scene", "task", "bus", "cycle", "limits", "bring_up")
-FILE_KEYS = {"eds", "urdf", "true_cell"}
+FILE_KEYS = {"array", "eds", "urdf", "true_cell"}
 """Keys whose files a saved scene takes along."""
 SAVED_AS = "scene.toml"
 """Name of a saved scene."""
@@ -166,15 +166,33 @@ def read_cell(name_or_path: str | Path) -> Cell:
 
 
 def _read_cell(name_or_path: str | Path) -> tuple[Cell, dict[str, Any]]:
+    sections, document = _read_hardware(name_or_path, "cell", Cell)
+    return Cell(**sections), document
+
+
+def _read_hardware(name_or_path: str | Path, what: str, kind: type[Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The sections of a cell or array file, and its document with the paths of the files beside it."""
     name = str(name_or_path)
-    packaged = packaged_files("cells")
-    path = find_file(name, packaged, "cell")
+    packaged = packaged_files(f"{what}s")
+    path = find_file(name, packaged, what)
     file = path.name if name in packaged else name
     document = read_toml(path, file)
     reader = Reader(path.parent)
-    sections = reader.read(Cell, document, ("cell",))
+    sections = reader.read(kind, document, (what,))
     reader.refuse(file)
-    return Cell(**sections), reader.with_paths(document)
+    return sections, reader.with_paths(document)
+
+
+def load_array(name_or_path: str | Path) -> dict[str, Any]:
+    """The document of an array file, as `load_cell` gives that of a cell.
+
+    Args:
+        name_or_path: a packaged array's name, such as `inch16`, or the path of a TOML file.
+
+    Raises:
+        SceneError: with every problem found.
+    """
+    return _read_hardware(name_or_path, "array", ArrayFile)[1]
 
 
 def find_file(name: str, packaged: Mapping[str, Path], what: str) -> Path:
@@ -205,13 +223,18 @@ def packaged_cells() -> list[tuple[str, str]]:
     return _titles("cells", "cell")
 
 
+def packaged_arrays() -> list[tuple[str, str]]:
+    """Name and title of every packaged array, by name."""
+    return _titles("arrays", "array")
+
+
 def _titles(folder: str, section: str) -> list[tuple[str, str]]:
     files = packaged_files(folder)
     return [(name, read_toml(path, path.name)[section].get("title", "")) for name, path in files.items()]
 
 
 def packaged_files(folder: str) -> dict[str, Path]:
-    """Paths of the packaged `scenes` or `cells`, by name."""
+    """Paths of the packaged `scenes`, `cells` or `arrays`, by name."""
     return {path.stem: path for path in sorted((scenes_folder().parent / folder).glob("*.toml"))}
 
 
@@ -263,7 +286,7 @@ def _scene(own: Mapping[str, Any], file: str, folder: Path | None, cell: str | P
     needs = SECTIONS_OF_TASK.get(kind, {}) if isinstance(kind, str) else {}
     defaults = [section for section, (need, _) in needs.items() if need == "default"]
     unused = [section for section, (need, _) in needs.items() if need in ("never", "may")]
-    document = _with_cell(own, file, folder, cell, unused)
+    document = _with_array(_with_cell(own, file, folder, cell, unused), folder)
     reader = Reader(folder)
     values = reader.read(Scene, document, (*_ALWAYS, *defaults))
     for section, (need, why) in needs.items():
@@ -307,6 +330,18 @@ def _with_cell(
         cell = folder / named if folder is not None and isfile(folder / named) else named
     hardware = {name: table for name, table in load_cell(cell).items() if name not in unused}
     return _merged(hardware, {name: table for name, table in own.items() if name != "cell"})
+
+
+def _with_array(document: dict[str, Any], folder: Path | None) -> dict[str, Any]:
+    """A document over that of the array file that its sensor names, key by key."""
+    sensor = document.get("sensor")
+    if not isinstance(sensor, dict):
+        return document
+    named = sensor.get("array", DEFAULT_ARRAY)
+    if not isinstance(named, str):
+        return document  # said when the section is read
+    path = folder / named if folder is not None and isfile(folder / named) else named
+    return _merged({name: table for name, table in load_array(path).items() if name != "array"}, document)
 
 
 def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:

@@ -46,6 +46,12 @@ SCANNING = Only("kind", ("scan",))
 CALIBRATING = Only("kind", ("calibrate",))
 FREE = Only("kind", ("free",))
 DYNAMIC = Only("fidelity", ("dynamic",))
+RAW = Only("kind", ("frames",))
+RAW_NEEDED = Only("kind", ("frames",), required=True)
+IDENTIFIERS = Pattern(r"[0-7]?[0-9A-F]{1,2}h(-[0-7]?[0-9A-F]{1,2}h)?", 'such as "710h" or "710h-71Fh"')
+COMMAND = Pattern(r"[0-7]?[0-9A-F]{1,2}#([0-9A-F]{2}){0,8}", 'such as "201#0700"')
+DEFAULT_ARRAY = "inch16"
+"""Array file of a sensor that names none."""
 TWO_RADII = Only("kind", ("saddle", "ellipsoid"), required=True)
 WAVE = Only("kind", ("wave",), required=True)
 
@@ -102,12 +108,29 @@ class CycleSettings:
 
 @dataclass(frozen=True, slots=True)
 class SensorSettings:
-    """`[sensor]`: the 16×16 tactile array."""
+    """`[sensor]`: the tactile array.
 
+    A key that neither the scene nor its cell gives has the value of the array file that `array` names.
+    """
+
+    array: Annotated[str, ScenePath()] = DEFAULT_ARRAY
+    """Array file: a packaged name, or a path relative to the file."""
+    rows: Annotated[int, Range(1, 64)] = 16
+    """Rows of taxels."""
+    columns: Annotated[int, Range(1, 64)] = 16
+    """Columns of taxels."""
+    pitch_mm: Annotated[float, Range(0.1, 100)] = 1.5875
+    """Distance of neighbouring taxels. Its square is the area that one taxel stands for."""
+    positions_mm: tuple[Vec3, ...] | None = None
+    """Position of each taxel on the array, row by row; z points out of it. Left out: a grid of `pitch_mm`."""
+    normals: tuple[Vec3, ...] | None = None
+    """Outward normal of each taxel, of any length, with `positions_mm`. Left out: z."""
+    mount: Literal["sphere", "flat"] = "sphere"
+    """sphere: wrapped on the sphere of `[probe]`. flat: a flat array listens and presses; it cannot scan."""
     node_id: NodeId = 16
-    """Node id of the array."""
+    """Node id of an array with `wire.kind = "canopen"`."""
     eds: Annotated[str, ScenePath()] = "tactile_array.eds"
-    """EDS of the array: a packaged name, or a path relative to the scene."""
+    """EDS of an array with `wire.kind = "canopen"`: a packaged name, or a path relative to the file."""
     emulated: bool = True
     """canprobe serves the array. false: the array is real."""
     channel: Channel | None = None
@@ -118,11 +141,55 @@ class SensorSettings:
     window: Annotated[Annotated[int, OneOf(WINDOWS)] | Auto, Only("mode", ("window", "auto"))] = 8
     """Side of the window that follows the contact, in taxels."""
     rate_hz: Annotated[float, Range(1, 1000)] = 200.0
-    """Rate of tactile frames. Each is triggered by a SYNC."""
+    """Rate of the images. A SYNC triggers each, or what `wire.sampling` names."""
     full_scale_kpa: Annotated[float, Range(10, 1000)] = 100.0
     """Pressure at the largest count of a taxel."""
     serial_number: SerialNumber | None = None
     """Serial number (1018h:04) that the array must have. Left out: any."""
+
+
+@dataclass(frozen=True, slots=True)
+class WireSettings:
+    """`[wire]`: what the array sends. It stands in the array file.
+
+    `canopen` is a node that maps its images to PDOs. `frames` is a device that knows no CANopen: each image is every
+    frame of `frames` from every identifier of `ids`, once each. The values of an image come in the order of
+    identifiers, frames and letters.
+    """
+
+    kind: Literal["canopen", "frames"] = "canopen"
+    """Kind of device."""
+    ids: Annotated[tuple[Annotated[str, IDENTIFIERS], ...], RAW_NEEDED] = ()
+    """Identifiers of its frames: each a number or a range in hexadecimal, such as "710h-71Fh"."""
+    frames: Annotated[tuple[str, ...], RAW_NEEDED] = ()
+    """Frames of one image from each identifier, two characters a byte: 0-9 and A-F are a tag that must stand there,
+    "." is not read, a small letter is 4 bits of a value, whose values are in the order of the alphabet."""
+    byte_order: Annotated[Literal["big", "little"], RAW] = "big"
+    """Byte order of a value of several bytes."""
+    axes: Annotated[int, Range(1, 3), RAW] = 1
+    """Values of a taxel."""
+    normal_axis: Annotated[int, Range(1, 3), RAW] = 1
+    """Which of them is the normal pressure, from 1."""
+    order: Annotated[Literal["rows", "columns"], RAW] = "rows"
+    """Taxels come row by row, or column by column."""
+    unloaded_counts: Annotated[int, Range(0, 0xFFFFFFFF), RAW] = 0
+    """Value of a taxel without load."""
+    full_scale_counts: Annotated[int, Range(0, 0xFFFFFFFF), RAW] = 255
+    """Value of a taxel at `sensor.full_scale_kpa`: below `unloaded_counts` where values fall with pressure."""
+    tare_images: Annotated[int, Range(0, 10_000), RAW] = 0
+    """Images at the beginning of which the mean is the unloaded value of each taxel. 0: `unloaded_counts` is."""
+    sampling: Annotated[Literal["free", "polled", "sync"], RAW] = "free"
+    """What an image begins with: the time of the device, a poll of the master, or a SYNC."""
+    start: Annotated[tuple[Annotated[str, COMMAND], ...], RAW] = ()
+    """Frames that start the device, as cansend writes them: "201#0700"."""
+    stop: Annotated[tuple[Annotated[str, COMMAND], ...], RAW] = ()
+    """Frames that stop it."""
+    poll: Annotated[tuple[Annotated[str, COMMAND], ...], RAW] = ()
+    """Frames that ask a polled device for one image."""
+    latency_ms: Annotated[float, Range(0, 1000), RAW] = 0.0
+    """From the sample of an image to its first frame on the bus."""
+    latency_sigma_ms: Annotated[float, Range(0, 1000), RAW] = 0.0
+    """Standard deviation of `latency_ms`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -401,10 +468,29 @@ class Cell:
     arm: ArmSettings | None = None
     joints: Mapping[str, JointSettings] = field(default_factory=dict)
     sensor: SensorSettings | None = None
+    wire: WireSettings | None = None
     probe: ProbeSettings | None = None
     servo: ServoSettings | None = None
     plant: PlantSettings | None = None
     emulate: EmulateSettings | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ArrayInfo:
+    """`[array]`: about an array file."""
+
+    title: str = ""
+    """One line about the array."""
+
+
+@dataclass(frozen=True, slots=True)
+class ArrayFile:
+    """What an array file may hold. Those that are None are absent."""
+
+    array: ArrayInfo
+    sensor: SensorSettings
+    wire: WireSettings | None = None
+    probe: ProbeSettings | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -421,6 +507,7 @@ class Scene:
     arm: ArmSettings | None = None
     joints: Mapping[str, JointSettings] = field(default_factory=dict)
     sensor: SensorSettings | None = None
+    wire: WireSettings | None = None
     probe: ProbeSettings | None = None
     object: ObjectSettings | None = None
     shape: ShapeSettings | None = None
@@ -456,7 +543,12 @@ class Scene:
         """The nodes that the scene wants emulated, ascending."""
         drives = [node_id for node_id, emulated in self.drives.items() if emulated]
         sensor = (self.sensor.node_id,) if self.sensor is not None and self.sensor.emulated else ()
-        return tuple(sorted((*drives, *sensor)))
+        return tuple(sorted((*drives, *(sensor if self.array_is_node else ()))))
+
+    @property
+    def array_is_node(self) -> bool:
+        """The array is a CANopen node."""
+        return self.sensor is not None and (self.wire is None or self.wire.kind == "canopen")
 
     @property
     def drives(self) -> dict[int, bool]:

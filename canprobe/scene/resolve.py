@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from canprobe.errors import PlanError
+from canprobe.protocol.frames import Frame
 from canprobe.robot.inverse import FIXED_POLE, task_rows
 from canprobe.robot.model import ArmModel
 from canprobe.robot.tool_calibration import ball_approaches
@@ -25,8 +26,9 @@ from canprobe.scene.model import (
     ServoSettings,
     ShapeSettings,
     TaskSettings,
+    WireSettings,
 )
-from canprobe.scene.rules import need_scene
+from canprobe.scene.rules import image_format, need_scene
 from canprobe.scene.setup import (
     Approach,
     Arm,
@@ -38,6 +40,7 @@ from canprobe.scene.setup import (
     Listen,
     Probe,
     Quirks,
+    RawWire,
     SafetyLimits,
     Scan,
     Setup,
@@ -46,6 +49,7 @@ from canprobe.scene.setup import (
     Touch,
     Truth,
 )
+from canprobe.touch.pad import FLAT_RADIUS_M, Pad
 from canprobe.touch.servo import SurfaceGains, make_strategy
 
 MM = 1e-3
@@ -64,9 +68,14 @@ def resolve(scene: Scene) -> Setup:
     """
     need_scene(scene)
     arm, bodies = _arm(scene)
-    array = _array(scene.sensor, scene.bus.channel) if scene.sensor is not None else None
     settings = scene.probe or ProbeSettings()
-    probe = Probe(T_flange_probe(settings), settings.radius_mm * MM, settings.stiffness_n_m3, settings.mass_kg)
+    array = _array(scene, settings.radius_mm * MM)
+    flat = array is not None and array.pad.is_flat
+    T, radius = T_flange_probe(settings), settings.radius_mm * MM
+    if flat:  # as a sphere so large that it is one: the point of its pole stays
+        T[:3, 3] += (radius - FLAT_RADIUS_M) * T[:3, 2]
+        radius = FLAT_RADIUS_M
+    probe = Probe(T, radius, settings.stiffness_n_m3, settings.mass_kg)
     return Setup(
         scene=scene,
         name=scene.name,
@@ -133,18 +142,58 @@ def _quirks(settings: EmulateSettings | None, node_id: int, noise: float) -> Qui
     return None if quirks == Quirks() else quirks
 
 
-def _array(settings: SensorSettings, channel: str) -> Array:
+def _array(scene: Scene, radius: float) -> Array | None:
+    """The array, and the wire of one that is no CANopen node; `radius` (m) of the sphere that it may be wrapped on."""
+    settings = scene.sensor
+    if settings is None:
+        return None
+    positions, normals = (
+        np.array(one) if one is not None else None for one in (settings.positions_mm, settings.normals)
+    )
+    pad = Pad(
+        rows=settings.rows,
+        columns=settings.columns,
+        pitch_m=settings.pitch_mm * MM,
+        full_scale_pa=settings.full_scale_kpa * 1e3,
+        mount_radius_m=None if settings.mount == "flat" else radius,
+        positions=positions * MM if positions is not None else None,
+        normals=normals / np.linalg.norm(normals, axis=1, keepdims=True) if normals is not None else None,
+    )
     return Array(
         node_id=settings.node_id,
-        channel=settings.channel or channel,
+        channel=settings.channel or scene.bus.channel,
         eds=settings.eds,
         emulated=settings.emulated,
         serial=settings.serial_number,
+        name=settings.array,
         mode=settings.mode,
         window=settings.window,
         rate_hz=settings.rate_hz,
-        full_scale=settings.full_scale_kpa * 1e3,
+        pad=pad,
+        raw=None if scene.array_is_node or scene.wire is None else _raw_wire(scene.wire, settings),
     )
+
+
+def _raw_wire(wire: WireSettings, settings: SensorSettings) -> RawWire:
+    return RawWire(
+        image=image_format(wire, settings.rows, settings.columns),
+        normal=wire.normal_axis - 1,
+        unloaded=wire.unloaded_counts,
+        full_scale=wire.full_scale_counts,
+        tare_images=wire.tare_images,
+        sampling=wire.sampling,
+        start=tuple(map(_frame, wire.start)),
+        stop=tuple(map(_frame, wire.stop)),
+        poll=tuple(map(_frame, wire.poll)),
+        latency_s=wire.latency_ms * 1e-3,
+        latency_sigma_s=wire.latency_sigma_ms * 1e-3,
+    )
+
+
+def _frame(text: str) -> Frame:
+    """A frame as cansend writes it."""
+    can_id, _, data = text.partition("#")
+    return int(can_id, 16), bytes.fromhex(data)
 
 
 def _limits(settings: LimitSettings, arm: Arm | None) -> SafetyLimits:

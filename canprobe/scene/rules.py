@@ -11,15 +11,18 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from canprobe.errors import UsageError
+from canprobe.errors import ProtocolError, UsageError
+from canprobe.protocol.raw_image import FramePattern, ImageFormat
+from canprobe.protocol.tactile import SIDE
 from canprobe.robot.chain import MOST_JOINTS
 from canprobe.scene.checks import MismatchError, convert
 from canprobe.scene.hardware import JointSettings
-from canprobe.scene.model import TOUCH_KINDS, Scene
+from canprobe.scene.model import TOUCH_KINDS, Scene, WireSettings
 
 _USUALLY = {
     "arm": ("may", ""),
     "sensor": ("may", ""),
+    "wire": ("default", ""),
     "probe": ("default", ""),
     "object": ("may", ""),
     "shape": ("default", ""),
@@ -52,6 +55,7 @@ _BESIDES = {
     "free": {
         "arm": ("must", "free motion moves the arm"),
         "sensor": ("never", "free motion measures no contact"),
+        "wire": ("never", "free motion measures no contact"),
         "probe": ("may", ""),
         "object": ("never", "free motion touches nothing"),
         "shape": ("never", "without touch there is no shape to estimate"),
@@ -105,9 +109,9 @@ def _joint_incomplete(joints: Mapping[str, JointSettings], urdf: str | None) -> 
                 yield f"joints.{name}.coupling", f"expected names of other joints ({names}), got {other}"
 
 
-@_across("joints", "sensor.node_id?")
-def _duplicate_node(joints: Mapping[str, JointSettings], sensor: int | None) -> _Complaint:
-    owners = {sensor: "sensor"} if sensor is not None else {}
+@_across("joints", "sensor.node_id?", "wire.kind?")
+def _duplicate_node(joints: Mapping[str, JointSettings], sensor: int | None, wire: str | None) -> _Complaint:
+    owners = {sensor: "sensor"} if sensor is not None and wire != "frames" else {}
     for number, (name, joint) in enumerate(joints.items(), start=1):
         node_id = joint.node_id or number
         other = owners.setdefault(node_id, name)
@@ -178,6 +182,76 @@ def _sensor_rate(cycle: float, sensor: float) -> _Complaint:
     if sensor > cycle:
         why = "frames are triggered by SYNC"
         yield "sensor.rate_hz", f"expected at most cycle.rate_hz = {cycle:g}, got {sensor:g}: {why}"
+
+
+@_across("sensor.rows", "sensor.columns", "sensor.positions_mm?", "sensor.normals?")
+def _taxel_positions(rows: int, columns: int, positions: object, normals: object) -> _Complaint:
+    if positions is None and normals is not None:
+        yield "sensor.normals", "only with sensor.positions_mm"
+    for key, points in (("positions_mm", positions), ("normals", normals)):
+        if isinstance(points, tuple) and len(points) != rows * columns:
+            expects = f"expected {rows * columns} points, sensor.rows × sensor.columns"
+            yield f"sensor.{key}", f"{expects}, got {len(points)}"
+    if isinstance(normals, tuple) and not all(any(normal) for normal in normals):
+        yield "sensor.normals", "expected directions, got one that is all zero"
+
+
+_WIRE = ("ids", "frames", "byte_order", "axes", "normal_axis", "unloaded_counts", "full_scale_counts", "poll")
+
+
+@_across("wire", "sensor.rows", "sensor.columns", "sensor.mode", "sensor.window", *(f"wire.{key}" for key in _WIRE))
+def _array_fits_wire(
+    wire: WireSettings, rows: int, columns: int, mode: str, window: int | str, *_read: object
+) -> _Complaint:
+    if wire.kind == "frames":
+        yield from _raw_frames(wire, rows, columns, mode)
+        return
+    if rows > SIDE or columns > SIDE:
+        key = "rows" if rows > SIDE else "columns"
+        got = f"got {max(rows, columns)}: its header names a taxel in 8 bits"
+        yield f"sensor.{key}", f'expected at most {SIDE} with wire.kind = "canopen", {got}'
+    elif mode == "window" and isinstance(window, int) and window > min(rows, columns):
+        least = min(rows, columns)
+        way_out = 'take a smaller one, or sensor.mode = "image"'
+        yield (
+            "sensor.window",
+            f"expected at most the {least} taxels of sensor.rows and columns, got {window}; {way_out}",
+        )
+
+
+def _raw_frames(wire: WireSettings, rows: int, columns: int, mode: str) -> _Complaint:
+    if mode != "image":
+        yield "sensor.mode", f'expected "image" with wire.kind = "frames", got "{mode}": the device sends whole images'
+    if wire.normal_axis > wire.axes:
+        yield "wire.normal_axis", f"expected at most wire.axes = {wire.axes}, got {wire.normal_axis}"
+    if wire.unloaded_counts == wire.full_scale_counts:
+        yield "wire.full_scale_counts", f"expected another value than wire.unloaded_counts = {wire.unloaded_counts}"
+    if (wire.sampling == "polled") != bool(wire.poll):
+        needs = "missing: a polled device needs it" if not wire.poll else 'only with wire.sampling = "polled"'
+        yield "wire.poll", needs
+    if wire.tare_images and wire.sampling == "sync":
+        yield (
+            "wire.tare_images",
+            'not with wire.sampling = "sync": nothing is sampled before the cycle; give unloaded_counts',
+        )
+    try:
+        image_format(wire, rows, columns)
+    except ProtocolError as error:
+        yield "wire.frames", str(error)
+
+
+def image_format(wire: WireSettings, rows: int, columns: int) -> ImageFormat:
+    """How the images of a device of raw frames lie in them.
+
+    Raises:
+        ProtocolError: its keys contradict each other.
+    """
+    ids: list[int] = []
+    for text in wire.ids:
+        first, _, last = text.replace("h", "").partition("-")
+        ids += range(int(first, 16), int(last or first, 16) + 1)
+    frames = tuple(FramePattern.parse(text, wire.byte_order) for text in wire.frames)
+    return ImageFormat(tuple(ids), frames, rows, columns, wire.axes, wire.order == "columns")
 
 
 @_across("cycle.rate_hz", "cycle.compute_us")

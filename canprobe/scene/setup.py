@@ -19,6 +19,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.protocol.frames import Frame
+from canprobe.protocol.raw_image import ImageFormat
 from canprobe.robot.model import ArmModel, Body
 from canprobe.robot.tool_calibration import BallApproach
 from canprobe.scene.hardware import Auto
@@ -31,6 +33,7 @@ from canprobe.scene.model import (
     TactileModeName,
     TaskKind,
 )
+from canprobe.touch.pad import Pad
 from canprobe.touch.servo import Strategy, SurfaceGains
 from canprobe.touch.shapes import PlacedShape
 
@@ -152,21 +155,58 @@ class Arm:
         return tuple(drive.node_id for drive in self.drives)
 
 
-@dataclass(frozen=True, slots=True)
-class Array(Node):
-    """The tactile array.
+@dataclass(frozen=True, slots=True, eq=False)
+class RawWire:
+    """A device of raw frames, which knows no CANopen.
 
     Attributes:
-        mode: what it sends.
-        window: taxels along the window that follows the contact.
-        rate_hz: of its frames.
-        full_scale: pressure of a full count, Pa.
+        image: how its images lie in frames.
+        normal: which of a taxel's values is the normal pressure, from 0.
+        unloaded, full_scale: that value without load, and at the pad's full scale; it may fall with pressure.
+        tare_images: at the beginning whose mean is the unloaded value of each taxel; 0: `unloaded` is.
+        sampling: what an image begins with.
+        start, stop: frames that start and stop the device.
+        poll: frames that ask for one image.
+        latency_s, latency_sigma_s: from the sample to the first frame, and its standard deviation.
     """
 
+    image: ImageFormat
+    normal: int
+    unloaded: int
+    full_scale: int
+    tare_images: int
+    sampling: Literal["free", "polled", "sync"]
+    start: tuple[Frame, ...]
+    stop: tuple[Frame, ...]
+    poll: tuple[Frame, ...]
+    latency_s: float
+    latency_sigma_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Array(Node):
+    """The tactile array. What makes a node of it counts only without a `raw` wire.
+
+    Attributes:
+        name: of its file.
+        mode: what it sends.
+        window: taxels along the window that follows the contact.
+        rate_hz: of its images.
+        pad: its taxels.
+        raw: what it sends where it is no CANopen node; None: it is one.
+    """
+
+    name: str
     mode: ArrayMode
     window: int | Auto
     rate_hz: float
-    full_scale: float
+    pad: Pad
+    raw: RawWire | None = None
+
+    @property
+    def full_scale(self) -> float:
+        """Pressure of a full count, Pa."""
+        return self.pad.full_scale_pa
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -456,8 +496,15 @@ class Setup:
     @property
     def emulated_node_ids(self) -> tuple[int, ...]:
         """The nodes that are emulated, ascending."""
-        nodes = (*(self.arm.drives if self.arm is not None else ()), *((self.array,) if self.array is not None else ()))
+        array = self.array
+        arrays = (array,) if array is not None and array.raw is None else ()
+        nodes = (*(self.arm.drives if self.arm is not None else ()), *arrays)
         return tuple(sorted(node.node_id for node in nodes if node.emulated))
+
+    @property
+    def emulates(self) -> bool:
+        """Something of it is emulated."""
+        return bool(self.emulated_node_ids) or (self.array is not None and self.array.emulated)
 
     def changed(self, part: Literal["bus", "arm", "array"], **values: Any) -> Setup:
         """With other values of one part, in the task too."""

@@ -35,6 +35,8 @@ from canprobe.tasks.untouched import HoldTask
 
 REPORT_EVERY_S = 10.0
 END_TIMEOUT_S = 10.0
+SERVING = "serving "
+"""What the process says when it serves."""
 TRUTH_SHARE = 0.2
 """Time that the nodes may take at their end to work out what was true, over the time that they ran."""
 _PR_SET_PDEATHSIG = 1
@@ -92,8 +94,10 @@ class EmulatorChild:
             *(sys.executable, "-m", "canprobe", "emulate", str(scene_file)),
             *("--bus", bus.interface, "--bitrate", str(bus.bitrate)),
             *(word for channel in self._channels for word in ("--channel", f"{channel}={channel}")),
-            *("--nodes", ",".join(str(n) for n in nodes), "--parent", str(os.getpid())),
+            *("--parent", str(os.getpid())),
         ]
+        if nodes:
+            command += ["--nodes", ",".join(str(n) for n in nodes)]
         if self._wants_truth:
             command += ["--truth", str(self._truth), "--origin", str(self._origin_ns)]
         self._errors = (self._folder / "stderr").open("w+b")
@@ -117,7 +121,7 @@ class EmulatorChild:
         say: Callable[[str], None] = lambda _: None,
         hear: Callable[[list[TimedFrame]], None] = lambda _: None,
     ) -> None:
-        """Wait for the boot-up of each of its nodes, as long as the scene allows; on a busy machine that takes a while.
+        """Wait until it serves, and for the boot-up of each of its nodes, as long as the scene allows.
 
         Args:
             port: of the nodes' buses.
@@ -134,12 +138,12 @@ class EmulatorChild:
         start = clock.now_ns()
         deadline = start + round(self._scene.bring_up.emulated_s * 1e9)
         report = start + round(REPORT_EVERY_S * 1e9)
-        while waiting:
+        while waiting or not self._serves():
             now = clock.now_ns()
             if self._process.poll() is not None:
                 raise BusError(self._last_words() or f"the emulated nodes ended with status {self._process.returncode}")
             if now >= deadline:
-                self._raise_late(min(waiting))
+                self._raise_late(min(waiting, default=0))
             if now >= report:
                 say(f"the emulated nodes are still starting, after {(now - start) * 1e-9:.0f} s")
                 report += round(REPORT_EVERY_S * 1e9)
@@ -149,6 +153,13 @@ class EmulatorChild:
             for can_id, data, _ in frames:
                 if data == b"\0":
                     waiting.discard(can_id - HEARTBEAT_BASE)
+
+    def _serves(self) -> bool:
+        """An array of raw frames sends no boot-up: the process has said that it is served."""
+        if self._scene.sensor is None or self._scene.array_is_node or not self._scene.sensor.emulated:
+            return True
+        assert self._errors is not None
+        return SERVING.encode() in os.pread(self._errors.fileno(), 1 << 16, 0)  # without moving the child's place in it
 
     def _raise_late(self, node_id: int) -> NoReturn:
         raise NodeError(

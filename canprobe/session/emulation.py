@@ -67,12 +67,14 @@ def emulate(
     plan = make_plan(resolve(resolve_scene(scene, of_scene, seed=seed)))
     names = {scene.bus.channel: target.channel, **target.others}
     placed = {n.node_id: names.get(n.channel, target.channel) for n in plan.nodes if n.node_id in node_ids}
+    array = plan.setup.array
+    raw_at = names.get(array.channel, target.channel) if array is not None and array.raw and array.emulated else None
     wanted = Expected(target.bitrate, data_bitrate(plan.setup.bus))
     way_out = "end that node, or name others with --nodes"
     _make_places(truth_path, store_folder)
     with contextlib.ExitStack() as stack:
         ports: dict[str, Port] = {}
-        for channel in dict.fromkeys(placed.values()):
+        for channel in dict.fromkeys((*placed.values(), *([raw_at] if raw_at is not None else []))):
             busy = tuple(i for i, place in placed.items() if place == channel and i not in without_id)
             one = replace(target, channel=channel)
             ports[channel] = stack.enter_context(_free_port(one, wanted, busy, way_out=way_out, say=say))
@@ -81,6 +83,8 @@ def emulate(
         on: dict[str, list[Participant]] = {channel: [] for channel in ports}
         for node, channel in zip(world.nodes, placed.values(), strict=True):
             on[channel].append(node)
+        if world.raw_array is not None and raw_at is not None:
+            on[raw_at].append(world.raw_array)
         if world.recorder is not None:
             world.recorder.origin_ns = MonotonicClock().now_ns() if origin_ns is None else origin_ns
             next(iter(on.values())).append(world.recorder)
@@ -212,7 +216,8 @@ def _serve(
         port.drain()  # what passed meanwhile
     ask_for_processor()
     favour = realtime(DEVICE_PRIORITY, say, processor_from_last=1) if in_realtime else contextlib.nullcontext()
-    say(f"serving {_named(nodes)} on {' and '.join(port.channel for _, port in buses)}; Ctrl-C stops them")
+    where = " and ".join(port.channel for _, port in buses)
+    say(f"serving {_named(nodes) or 'the array'} on {where}; Ctrl-C stops them")
     with favour:
         serve(buses, lambda: False)
 

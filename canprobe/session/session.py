@@ -111,7 +111,8 @@ def open_ports(
 
 def channel_routes(plan: Plan) -> dict[int, str]:
     """Which bus each identifier belongs to, of those that one node alone sends or reads."""
-    routes = {pdo.cob_id: pdo.channel for pdo in plan.pdos}
+    routes = {frames.can_id: frames.channel for frames in plan.raw}
+    routes |= {pdo.cob_id: pdo.channel for pdo in plan.pdos}
     for node in plan.nodes:
         for base in (SDO_RX_BASE, SDO_TX_BASE, EMCY_BASE, HEARTBEAT_BASE):
             routes[base + node.node_id] = node.channel
@@ -414,6 +415,8 @@ class Session:
         missing = set(self.plan.node_ids) - set(self.scene.emulated_node_ids)
         if missing:
             raise UsageError(f"a lockstep bus has emulated nodes only: node {min(missing)} is marked emulated = false")
+        if self.plan.setup.array is not None and not self.plan.setup.array.emulated:
+            raise UsageError("a lockstep bus has emulated devices only: sensor.emulated = false")
         clock = VirtualClock()
         buses = {bus.channel: lockstep_bus(self.scene, clock, bus.channel) for bus in self.plan.buses}
         for channel, bus in buses.items():
@@ -423,8 +426,12 @@ class Session:
         participants = self.world.participants
         self._stack.callback(self._keep_truth)
         bus_of = {node.node_id: buses[node.channel] for node in self.plan.nodes}
+        array = self.plan.setup.array
         for participant in participants:
-            bus_of.get(getattr(participant, "node_id", 0), self.lockstep).attach(participant)
+            bus = bus_of.get(getattr(participant, "node_id", 0), self.lockstep)
+            if participant is self.world.raw_array and array is not None:
+                bus = buses[array.channel]
+            bus.attach(participant)
         return self._join({channel: bus.port() for channel, bus in buses.items()})
 
     def _keep_truth(self) -> None:
@@ -438,7 +445,7 @@ class Session:
 
     def _open_real(self) -> Port:
         bus = self.scene.bus
-        if bus.interface == "virtual" and self.scene.emulated_node_ids:
+        if bus.interface == "virtual" and self.plan.setup.emulates:
             raise UsageError(
                 "python-can's virtual bus ends at the process, and emulated nodes have one of their own; use --bus"
                 " lockstep, or --bus socketcan --channel vcan0 by: canprobe vcan -- COMMAND"
@@ -456,10 +463,10 @@ class Session:
         from canprobe.session.children import EmulatorChild
 
         child = None
-        if self.scene.emulated_node_ids:
+        if self.plan.setup.emulates:
             self.cell.listen()  # they would boot beside those of another master
             self._say("start the emulated nodes")
-            channels = list(dict.fromkeys(node.channel for node in self.plan.nodes if node.emulated))
+            channels = list(self.plan.emulated_channels)
             child = EmulatorChild(self.scene, self.out, channels, truth=self.keeps_all, origin_ns=self.origin_ns)
             self._stack.callback(self._end_child, child)
             child.start()

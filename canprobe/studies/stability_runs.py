@@ -36,6 +36,7 @@ from canprobe.tasks.from_plan import make_task
 from canprobe.tasks.sensing import ContactSensing
 from canprobe.tasks.touch import TouchTask
 from canprobe.touch.contact import indentation_from_force
+from canprobe.touch.pad import Pad
 from canprobe.touch.patch.array_model import array_calibration
 
 
@@ -369,7 +370,7 @@ def stated_sensing(scene: Scene, kind: type[ContactSensing] = StatedSensing) -> 
     return kind(
         arm_of(scene),
         T_flange_probe(scene.probe),
-        array_calibration(scene.sensor.full_scale_kpa * 1e3, radius),
+        array_calibration(Pad(full_scale_pa=scene.sensor.full_scale_kpa * 1e3, mount_radius_m=radius)),
         radius,
         scene.probe.stiffness_n_m3,
     )

@@ -44,7 +44,7 @@ WITH_PATCH = ("recursive", "ml")
 
 def make_sensing(task: Touch | Calibrate) -> ContactSensing:
     """Contacts from measurements, as the task's arm, probe and array give them."""
-    calibration = array_calibration(task.array.full_scale, task.probe.radius)
+    calibration = array_calibration(task.array.pad)
     return ContactSensing(
         task.arm.model,
         task.probe.T_flange_probe,
@@ -91,7 +91,7 @@ def _with_patch(task: Touch, estimator: Estimator, memory: float) -> Estimator:
     from canprobe.touch.patch.curvature import PatchCurvature, PatchedEstimator
 
     model = moment_model(
-        array_calibration(task.array.full_scale, task.probe.radius),
+        array_calibration(task.array.pad),
         task.probe.stiffness,
         windowed=task.array.mode == "window" and int(task.array.window) <= WINDOW,
     )
@@ -140,7 +140,7 @@ def make_task(plan: Plan) -> Controller:
         return FreeTask(task.swing, task.period_s, task.duration_s, period_s)
     from canprobe.tasks.untouched import ListenTask
 
-    return ListenTask(array_calibration(task.array.full_scale), task.duration_s, period_s)
+    return ListenTask(array_calibration(task.array.pad), task.duration_s, period_s)
 
 
 # A task that a bridge starts, stops and sets while it runs; its requests were checked before.

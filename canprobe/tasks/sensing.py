@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,6 +35,8 @@ HOLLOWEST = 0.9
 
 HISTORY = 64
 """Cycles whose joints are kept."""
+SPEED_OVER_NS = 10_000_000
+"""Time over which the speed of the probe is taken."""
 
 
 class JointHistory:
@@ -172,7 +175,7 @@ class ContactSensing:
             return None
         T_base_probe = forward(self.model.chain, q) @ self.flange_probe
         t_s, uv = sample.t_sample_ns * 1e-9, (patch.u, patch.v)
-        return contact_sample(
+        found = contact_sample(
             t_s=t_s,
             T_base_probe=T_base_probe,
             uv=uv if self._lag is None else self._lag.step(t_s, *uv),
@@ -182,6 +185,19 @@ class ContactSensing:
             moments=self._moments(sample, patch),
             doubts=patch.doubts,
         )
+        if not sample.t_sigma_s:
+            return found
+        return replace(found, sigma_motion=sample.t_sigma_s * self._speed(sample.t_sample_ns, found))
+
+    def _speed(self, t_ns: int, contact: ContactSample) -> float:
+        """Of the probe at the contact, m/s: what an error of the instant displaces the contact by; 0 without a past."""
+        before = self._history.at(t_ns - SPEED_OVER_NS)
+        if before is None:
+            return 0.0
+        earlier = forward(self.model.chain, before) @ self.flange_probe
+        point = np.append(contact.r_probe, 1.0)
+        way = ((contact.T_base_probe - earlier) @ point)[:3]
+        return float(np.linalg.norm(way)) / (1e-9 * SPEED_OVER_NS)
 
     def _moments(self, sample: TactileSample, patch: Patch) -> Moments | None:
         """Second moments of the image; None where they are not wanted, or not those of the whole patch."""

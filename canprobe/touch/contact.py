@@ -42,6 +42,8 @@ class ContactSample:
         sigma_normal: that of the normal per tangent axis, rad; None for the estimator's own.
         moments: second moments uu, uv, vv of the patch along the pad's axes, m² (`patch.moments`); None for none.
         doubts: about the image; estimators give the contact less weight and say so.
+        sigma_motion: standard deviation of the point from an instant that is not known well while the probe moves, m;
+            it comes on top of that of the point.
     """
 
     t_s: float
@@ -54,6 +56,7 @@ class ContactSample:
     sigma_normal: float | None = None
     moments: tuple[float, float, float] | None = None
     doubts: tuple[Doubt, ...] = ()
+    sigma_motion: float = 0.0
 
 
 def pad_to_direction(u: float, v: float, radius: float) -> Array:

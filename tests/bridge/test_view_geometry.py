@@ -20,6 +20,7 @@ from canprobe.robot.chain import forward, posture, tool_z_offset
 from canprobe.scene.load import read_cell
 from canprobe.touch.linear_algebra import homogeneous, tangent_rotation
 from canprobe.touch.objects import OBJECT_PARAMETERS, make_object
+from canprobe.touch.pad import Pad
 
 MODEL = pytest.mark.parametrize("model", MODELS.values(), ids=MODELS.keys())
 QS = np.random.default_rng(2).uniform(-2.5, 2.5, (20, 6))
@@ -161,7 +162,7 @@ def test_the_probe_is_a_ball_with_a_holder_from_the_flange():
 
 def test_taxels_lie_where_the_plant_has_them():
     radius, pitch = 0.04, 0.0254 / 16
-    places, turns = taxels.taxel_poses(radius)
+    places, turns = taxels.taxel_poses(Pad(), radius)
     for k, (place, (w, x, y, z)) in enumerate(zip(places, turns, strict=True)):
         direction = place / np.linalg.norm(place)
         u, v = pad_coordinates(tuple(direction), radius)

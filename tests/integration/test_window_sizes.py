@@ -13,7 +13,7 @@ from canprobe.emulator.plant.probe import elastic_contact
 from canprobe.errors import PlanError, SceneError
 from canprobe.planning.configuration import make_setups
 from canprobe.planning.pdos import tactile_objects
-from canprobe.planning.window import patch_radius_m, taxels_needed, window_choices
+from canprobe.planning.window import patch_across_taxels, patch_radius_m, window_choices
 from canprobe.scene.load import dump_scene, parse_scene
 from canprobe.scene.resolve import resolve
 from canprobe.scene.setup import Probe
@@ -69,7 +69,7 @@ def test_the_planned_patch_is_the_plants_on_a_plane(force, stiffness, radius_mm)
     contact = elastic_contact(radius**2 / (2e-3 * radius_mm), (0.0, 0.0), radius_mm * 1e-3, stiffness)
     assert contact.force == pytest.approx(force, rel=1e-12)
     assert (contact.a, contact.b) == (pytest.approx(radius), pytest.approx(radius))
-    assert taxels_needed(force, probe) == pytest.approx(2e3 * radius / 1.5875 + 1.5)
+    assert patch_across_taxels(force, probe, 1.5875e-3) == pytest.approx(2e3 * radius / 1.5875)
 
 
 def test_the_smallest_that_holds_the_patch_comes_first_then_smaller_then_larger_ones():

@@ -17,7 +17,6 @@ from canprobe.planning.devices import order_by_deadline
 from canprobe.planning.make import make_plan
 from canprobe.planning.report import plan_dict, plan_text
 from canprobe.planning.window import (
-    PITCH_M,
     cut_patch,
     measured_share,
     patch_radius_m,
@@ -178,6 +177,7 @@ def test_the_command_opens_what_stands_at_its_default(capsys):
 
 # A window that cuts the contact patch: how much of the force it feels, and what the plan says and refuses.
 
+PITCH = 1.5875e-3
 PROBE = resolve(load_scene("cylinder")).probe
 
 
@@ -189,25 +189,25 @@ def test_share_against_points_on_a_grid(side, off, force):
     contact = elastic_contact(radius**2 / 0.08, (0.0, 0.0), 0.04, PROBE.stiffness)
     x, y = np.meshgrid(*[np.linspace(-1.0, 1.0, 1001)] * 2)
     pressure = np.clip(1.0 - x**2 - y**2, 0.0, None)
-    half, middle = side / 2 * PITCH_M / contact.a, off * PITCH_M / contact.a
+    half, middle = side / 2 * PITCH / contact.a, off * PITCH / contact.a
     inside = pressure[(np.abs(x - middle) <= half) & (np.abs(y) <= half)].sum() / pressure.sum()
-    assert measured_share(force, PROBE, side, off) == pytest.approx(inside, abs=5e-3)
+    assert measured_share(force, PROBE, side, PITCH, off) == pytest.approx(inside, abs=5e-3)
 
 
 def test_share_of_a_strip_by_hand():
     """A window far longer than the patch whose edge runs through the middle feels half of the force."""
-    assert measured_share(2.0, PROBE, 40, 20.0) == pytest.approx(0.5, abs=1e-6)
-    assert measured_share(2.0, PROBE, 40, 0.0) == pytest.approx(1.0, abs=1e-4)
-    assert measured_share(2.0, PROBE, 40, 30.0) == 0.0
+    assert measured_share(2.0, PROBE, 40, PITCH, 20.0) == pytest.approx(0.5, abs=1e-6)
+    assert measured_share(2.0, PROBE, 40, PITCH, 0.0) == pytest.approx(1.0, abs=1e-4)
+    assert measured_share(2.0, PROBE, 40, PITCH, 30.0) == 0.0
 
 
 @pytest.mark.parametrize("side", [4, 6, 8])
 def test_the_true_force_is_the_one_of_which_the_target_is_inside(side):
-    true = true_force_n(2.0, PROBE, side, 100.0)
-    assert true * measured_share(true, PROBE, side) == pytest.approx(2.0, rel=1e-6)
-    assert true_force_n(2.0, PROBE, side, 0.999 * true) is None
+    true = true_force_n(2.0, PROBE, side, PITCH, 100.0)
+    assert true * measured_share(true, PROBE, side, PITCH) == pytest.approx(2.0, rel=1e-6)
+    assert true_force_n(2.0, PROBE, side, PITCH, 0.999 * true) is None
     stiffer = dataclasses.replace(PROBE, stiffness=10 * PROBE.stiffness)
-    assert true_force_n(2.0, stiffer, side, 100.0) < true
+    assert true_force_n(2.0, stiffer, side, PITCH, 100.0) < true
 
 
 def test_a_window_that_cuts_the_patch_is_a_warning_with_numbers():

@@ -188,7 +188,6 @@ def test_a_window_alone_is_packed_as_the_same_bytes():
         (header(mode=IMAGE, row=1), image()),
         (header(), image().astype(float)),
         (header(), image()[:7, :8]),
-        (header(mode=IMAGE), image()[:8, :8]),
         (header(mode=FEATURES), image()),
         (header(), Features(1, 7, 7, 1, 0, 1)),
         (header(mode=FEATURES), Features(1, 7, 7, 1, 0, 1, peak=256)),

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from canprobe.emulator.array import follow
 from canprobe.emulator.plant.probe import depth_for_force
 from canprobe.emulator.plant.taxels import Image, TaxelArray, TaxelConfig
+from canprobe.touch.pad import Pad
 from canprobe.touch.patch.array_model import array_calibration
 from canprobe.touch.patch.image import PatchCalibration, calibrate_force, compute_patch
 from canprobe.touch.patch.moments import MomentFit, MomentImage, MomentModel, PadMemory, terms
@@ -77,7 +78,7 @@ def random_presses(n: int, seed: int, full_scale_pa: float, *, windowed: bool) -
         windowed: only the 8×8 window that follows the contact is seen.
     """
     rng = np.random.default_rng(seed)
-    calibration = array_calibration(full_scale_pa)
+    calibration = array_calibration(Pad(full_scale_pa=full_scale_pa))
     moment_image = MomentImage(calibration)
     for i in range(n):
         kappa = np.sort(rng.uniform(*KAPPA, 2))[::-1]
@@ -118,7 +119,7 @@ def _images(  # noqa: PLR0917
     windowed: bool,
 ) -> Iterator[tuple[float, Image, float]]:
     """Time (s), image and force (N) through one press."""
-    calibration = array_calibration(full_scale_pa)
+    calibration = array_calibration(Pad(full_scale_pa=full_scale_pa))
     k = (float(kappa[0]), float(kappa[1]))
     depth = depth_for_force(force, k, calibration.radius_m, 1.27e8)
     place, heading = rng.uniform(-OFFSET_M, OFFSET_M, 2), float(rng.uniform(0.0, 2.0 * np.pi))
@@ -143,7 +144,7 @@ def _images(  # noqa: PLR0917
 
 def sensor(full_scale_pa: float, fit: MomentFit = _FLAT) -> MomentModel:
     """The model of such an array on the standard probe."""
-    calibration = array_calibration(full_scale_pa)
+    calibration = array_calibration(Pad(full_scale_pa=full_scale_pa))
     return MomentModel(fit, calibration.radius_m, 1.27e8, MomentImage(calibration).level_pa)
 
 
@@ -230,7 +231,7 @@ def pressed_sums(
         radius: of the probe, m.
         stiffness: K/h of its layer, N/m³.
     """
-    plain = PatchCalibration(full_scale_pa=full_scale_pa, radius_m=radius)
+    plain = PatchCalibration(Pad(full_scale_pa=full_scale_pa, mount_radius_m=radius))
     for seed in seeds:
         rng = np.random.default_rng(seed)
         for kappa in KAPPAS:
@@ -266,4 +267,4 @@ def _press(
 def calibrate(full_scale_pa: float, seeds: Sequence[int], forces: Sequence[float]) -> PatchCalibration:
     """The mean calibration of arrays with this full scale."""
     sums, true = zip(*pressed_sums(full_scale_pa, forces, seeds), strict=True)
-    return replace(calibrate_force(sums, true), full_scale_pa=full_scale_pa)
+    return replace(calibrate_force(sums, true), pad=Pad(full_scale_pa=full_scale_pa))

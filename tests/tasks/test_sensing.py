@@ -5,8 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from canprobe.cell.controller import Measurement, TactileSample
+from canprobe.protocol.tactile import TactileFrame, TactileHeader, TactileMode
+from canprobe.robot.chain import forward
+from canprobe.scene.load import load_scene
+from canprobe.scene.resolve import resolve
+from canprobe.tasks.from_plan import make_sensing
 from canprobe.tasks.sensing import JointHistory, is_too_hollow
 from canprobe.touch.estimate.fit import fit_surface
+from canprobe.touch.estimate.online import Gate
+from canprobe.touch.patch.image import Patch
 from canprobe.touch.surface import SurfaceMatrix
 
 PERIOD = 2_500_000
@@ -67,3 +75,27 @@ def test_a_hollow_as_tight_as_the_probe_is_detected(radius, found):
     assert is_too_hollow(fit_surface(points, normals, sigma_point=2e-5, sigma_normal=1e-3), 0.04) is found
     doubtful = fit_surface(points[-12:], normals[-12:], sigma_point=1e-4, sigma_normal=2e-2)
     assert not is_too_hollow(doubtful, 0.04)  # never on a guess
+
+
+def moving(task, t_sigma_s):
+    """A contact of an arm whose joints turn at constant speed, at an instant that is known so well."""
+    sensing = make_sensing(task)
+    for k in range(12):
+        sensing.step(Measurement(k, k * PERIOD, q=task.arm.q_start + SPEED * k * PERIOD * 1e-9, enabled=True))
+    header = TactileHeader(0, 0, 0, 0, TactileMode.IMAGE, False, 0)
+    frame = TactileFrame(header, np.full((16, 16), 20, np.uint8), (0, 0, 16, 16), None, 0)
+    patch = Patch(2.0, 1e-3, -2e-3, 60, 5e4, False, False, False, False)
+    return sensing.contact(TactileSample(frame, 9 * PERIOD + 700_000, 9, t_sigma_s), patch)
+
+
+def test_an_uncertain_instant_widens_the_contact_by_the_way_of_the_probe():
+    task, sigma_s = resolve(load_scene("plane")).task, 1e-3
+    known, guessed = moving(task, 0.0), moving(task, sigma_s)
+    assert known.sigma_motion == 0.0 and guessed.p_base.tolist() == known.p_base.tolist()
+    t_s, r = 1e-9 * (9 * PERIOD + 700_000), np.append(known.r_probe, 1.0)
+    at = [forward(task.arm.model.chain, task.arm.q_start + SPEED * t) for t in (t_s - sigma_s, t_s)]
+    way = np.linalg.norm(((at[1] - at[0]) @ task.probe.T_flange_probe @ r)[:3])
+    assert guessed.sigma_motion == pytest.approx(way, rel=0.03)
+    gate = Gate(30e-6, 1e-3)
+    assert gate.sigmas(known) == (30e-6, 1e-3)
+    assert gate.sigmas(guessed) == pytest.approx((np.hypot(30e-6, way), 1e-3), rel=0.03)

@@ -10,6 +10,7 @@ from canprobe.emulator.plant.taxels import TaxelConfig
 from canprobe.robot.chain import Array, tool_z_offset
 from canprobe.robot.model import ArmModel, Body
 from canprobe.scene.setup import Dynamics, Fidelity
+from canprobe.touch.pad import Pad
 from canprobe.touch.shapes import PlacedShape
 
 
@@ -21,11 +22,13 @@ class PressMotion:
         force_n: force at the mean depth.
         swing: amplitude of the depth over its mean.
         frequency_hz: of the swing.
+        after_s: from the first image; until then the probe is off the object, as an array that is tared has to be.
     """
 
     force_n: float = 2.0
     swing: float = 0.4
     frequency_hz: float = 0.5
+    after_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +44,7 @@ class PlantConfig:
         damping_s_m: Hunt-Crossley alpha (assumed).
         object: what can be touched; None for nothing.
         taxels: the array's imperfections; None where there is no array.
+        pad: the array's taxels.
         bandwidth_hz: -3 dB frequency of every drive.
         damping_ratio: of every drive.
         press: motion of a probe without an arm.
@@ -60,6 +64,7 @@ class PlantConfig:
     damping_s_m: float = 0.3
     object: PlacedShape | None = None
     taxels: TaxelConfig | None = field(default_factory=TaxelConfig)
+    pad: Pad = field(default_factory=Pad)
     bandwidth_hz: float = 30.0
     damping_ratio: float = 1.0
     press: PressMotion = PressMotion()

@@ -18,7 +18,7 @@ from canprobe.emulator.plant.dynamic_arm import DynamicArm, make_arm
 from canprobe.emulator.plant.ideal_arm import IdealArm, MotorDynamics
 from canprobe.emulator.plant.probe import NO_CONTACT, Contact, PressedProbe, Probe, elastic_contact, in_pad, turned
 from canprobe.emulator.plant.pushing import LEAST_CURVATURE, total_force
-from canprobe.emulator.plant.taxels import SIDE, Image, TaxelArray, Vec, pad_coordinates
+from canprobe.emulator.plant.taxels import Image, TaxelArray, Vec, pad_coordinates
 from canprobe.errors import PlanError
 from canprobe.robot.chain import Array, point_on_flange, point_velocity, posture
 from canprobe.robot.model import ArmModel, units_to_joints
@@ -65,7 +65,13 @@ class Plant:
         self.array: TaxelArray | None = None
         if config.taxels is not None:
             rng = np.random.default_rng(config.seed)
-            self.array = TaxelArray(config.taxels, rng, radius_m=config.radius_m, stiffness_n_m3=config.stiffness_n_m3)
+            self.array = TaxelArray(
+                config.taxels,
+                rng,
+                radius_m=config.radius_m,
+                stiffness_n_m3=config.stiffness_n_m3,
+                pad=config.pad,
+            )
         T_tool = config.T_flange_probe_centre
         self._tool_origin: Vec = tuple(T_tool[:3, 3].tolist())
         # None where the probe's axes are the flange's, the usual case.
@@ -76,6 +82,7 @@ class Plant:
         self._at_zero = _joints_at_zero(config.model)
         self._solved: _Solution | None = None
         self._image: tuple[int, Image] | None = None
+        self._first_image_s: float | None = None
 
     def advance(self, t_ns: int) -> None:
         """Move the present time on; earlier times and repeats change nothing.
@@ -166,24 +173,26 @@ class Plant:
             t_ns: time of the sample, ns.
 
         Returns:
-            (16, 16) counts; zeros without an array.
+            (rows, columns) counts; zeros without an array.
         """
         self.advance(t_ns)
         if self.array is None:
-            return np.zeros((SIDE, SIDE), dtype=np.uint8)
+            return np.zeros(self.config.pad.shape, dtype=np.uint8)
+        if self._image is None:
+            self._first_image_s = 1e-9 * self.t_ns
         if self._image is None or self._image[0] != self.t_ns:
             self._image = (self.t_ns, self._sampled(self.array, self._solution()))
         return self._image[1].copy()
 
     def pressure(self, state: PlantState | None = None) -> Array:
-        """(16, 16) mean pressure of every taxel, Pa, before the array's own imperfections; zeros without an array.
+        """(rows, columns) mean pressure of every taxel, Pa, before the array's imperfections; zeros without an array.
 
         Args:
             state: of this plant; the present one by default.
         """
         s = self._solution() if state is None else self._solve(state)
         if self.array is None or s.depth <= 0.0:
-            return np.zeros((SIDE, SIDE))
+            return np.zeros(self.config.pad.shape)
         field, directions = self.array.field, in_pad(s.foot, s.probe, s.direction)
         means: Array = field.mean_pressure(s.pad_uv, s.depth, s.kappa, directions)
         return means * (self.config.stiffness_n_m3 * s.contact.damping_factor)
@@ -245,7 +254,7 @@ class Plant:
 
     def _probe(self, t_ns: int, q: tuple[float, ...], qd: tuple[float, ...]) -> Probe:
         if self._pressed is not None:
-            return self._pressed.at(1e-9 * t_ns)
+            return self._pressed.at(1e-9 * t_ns, self._first_image_s)
         if self.arm is None:
             return Probe((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 0.0))
         c = posture(self.arm.model.chain, q)

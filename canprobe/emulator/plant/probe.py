@@ -143,6 +143,10 @@ class Probe:
     velocity: Vec
 
 
+OFF = 1e-3
+"""How far the probe is off the object before the press begins, m."""
+
+
 class PressedProbe:
     """Probe without an arm, pole against the object's normal at its origin.
 
@@ -162,12 +166,17 @@ class PressedProbe:
         )
         self._radius, self._press = config.radius_m, config.press
 
-    def at(self, t_s: float) -> Probe:
+    def at(self, t_s: float, first_s: float | None) -> Probe:
         """Where it is.
 
         Args:
             t_s: s.
+            first_s: time of the first image, s; None before it.
         """
+        waits = self._press.after_s
+        if waits and (first_s is None or t_s < first_s + waits):
+            centre = self._origin + (self._radius + OFF) * self._normal
+            return Probe(tuple(centre.tolist()), self._axes, (0.0, 0.0, 0.0))
         rate = 2 * pi * self._press.frequency_hz
         depth = self._mean * (1.0 + self._press.swing * sin(rate * t_s))
         speed = -self._mean * self._press.swing * rate * cos(rate * t_s)

@@ -15,22 +15,22 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from canprobe.touch.pad import Pad
+
 # Pressure on the pad: fine sampling on the exact sphere, averaged over each taxel and blurred by the cover.
 #
 # Finer than the estimators' paraboloid on purpose: the probe's height is the sphere's, taxels lie on the wrapped sphere
 # with their true area, and nine samples make one taxel.
 #
-# Pad frame: x = u = columns, y = v = rows, z = pole of the probe, origin at the centre of the sphere. Taxel (i, j) is
-# centred at u = (j - 7.5) pitch, v = (i - 7.5) pitch; (u, v) lies in the direction of the exponential map of
-# (u, v) / R at the pole.
+# Pad frame: x = u = columns, y = v = rows, z = pole of the probe, origin at the centre of the sphere. Taxel (i, j) of a
+# grid of m rows and n columns is centred at u = (j - (n - 1)/2) pitch, v = (i - (m - 1)/2) pitch; (u, v) lies in the
+# direction of the exponential map of (u, v) / R at the pole. A flat pad is a sphere of `FLAT_RADIUS_M`.
 
 Array = npt.NDArray[np.float64]
 Vec = tuple[float, float, float]
 Directions = tuple[tuple[float, float], tuple[float, float]] | Array
 """(2, 2) rows: principal directions in the basis ``pad_basis`` of the contact direction."""
 
-SIDE = 16
-PITCH_M = 0.0254 / SIDE
 _MARGIN = 2
 """Taxels of pressure beyond the array's edge that still blur into it."""
 _NOTHING = np.array(0.0)
@@ -79,11 +79,11 @@ def pad_basis(direction: Vec) -> tuple[Vec, Vec]:
     return (1.0 - c * x * x, -c * x * y, -x), (-c * x * y, 1.0 - c * y * y, -y)
 
 
-def _averaging_matrix(samples: int, blur_pitch: float) -> Array:
-    """(16, n) weights along one axis: mean over each taxel of the blurred samples."""
-    count = (SIDE + 2 * _MARGIN) * samples
-    mean = np.zeros((SIDE, count))
-    for i in range(SIDE):
+def _averaging_matrix(taxels: int, samples: int, blur_pitch: float) -> Array:
+    """(taxels, n) weights along one axis: mean over each taxel of the blurred samples."""
+    count = (taxels + 2 * _MARGIN) * samples
+    mean = np.zeros((taxels, count))
+    for i in range(taxels):
         start = (i + _MARGIN) * samples
         mean[i, start : start + samples] = 1.0 / samples
     if blur_pitch <= 0.0:
@@ -103,33 +103,36 @@ def _half_axis(depth: float, kappa: float, radius: float) -> float:
 
 
 class PressureField:
-    """Mean pressure of every taxel under one contact.
+    """Mean pressure of every taxel of a grid under one contact.
 
     Args:
         radius_m: probe radius.
+        pad: its taxels.
         blur_pitch: standard deviation of the cover's Gaussian blur, in taxel pitches; 0 for none.
         samples: samples per taxel and axis.
     """
 
-    def __init__(self, radius_m: float, *, blur_pitch: float = 0.65, samples: int = 3) -> None:
+    def __init__(self, radius_m: float, pad: Pad | None = None, *, blur_pitch: float = 0.65, samples: int = 3) -> None:
+        pad = pad or Pad()
         self.radius = radius_m
-        self._step = PITCH_M / samples
-        self._count = (SIDE + 2 * _MARGIN) * samples
-        axis = (np.arange(self._count) + 0.5) * self._step - (SIDE / 2 + _MARGIN) * PITCH_M
-        u, v = np.meshgrid(axis, axis)
-        arc = np.hypot(u, v) / radius_m
-        sinc = np.sinc(arc / np.pi)
-        # Directions of the samples; 1; and the area of a pad cell on the sphere over du dv.
-        self._samples = np.stack((sinc * u / radius_m, sinc * v / radius_m, np.cos(arc), np.ones_like(arc), sinc))
+        self.shape = pad.shape
+        self._step = pad.pitch_m / samples
+        self._counts = (pad.rows + 2 * _MARGIN) * samples, (pad.columns + 2 * _MARGIN) * samples
+        v, u = (
+            (np.arange(count) + 0.5) * self._step - (taxels / 2 + _MARGIN) * pad.pitch_m
+            for count, taxels in zip(self._counts, pad.shape, strict=True)
+        )
+        u, v = np.meshgrid(u, v)
+        self._samples = _sample_rows(u, v, radius_m)
         self._directions, self._area = self._samples[:3], self._samples[4]
-        self._rows = _averaging_matrix(samples, blur_pitch)
-        self._columns = np.ascontiguousarray(self._rows.T)
+        self._rows = _averaging_matrix(pad.rows, samples, blur_pitch)
+        self._columns = np.ascontiguousarray(_averaging_matrix(pad.columns, samples, blur_pitch).T)
 
-    def _span(self, centre: float, half: float) -> tuple[int, int]:
-        """Sample indices that cover centre +- half, clipped to the grid."""
-        middle = centre / self._step + 0.5 * self._count - 0.5
+    def _span(self, centre: float, half: float, count: int) -> tuple[int, int]:
+        """Sample indices along one axis that cover centre +- half, clipped to the grid."""
+        middle = centre / self._step + 0.5 * count - 0.5
         reach = 1.08 * half / self._step + 1.0  # the flat pad stretches arcs across the pole by up to 4 %
-        low, high = floor(max(middle - reach, 0.0)), ceil(min(middle + reach, self._count - 1.0)) + 1
+        low, high = floor(max(middle - reach, 0.0)), ceil(min(middle + reach, count - 1.0)) + 1
         return low, high
 
     def points(self, centre: Array, axes: Array) -> Array:
@@ -148,7 +151,7 @@ class PressureField:
         Args:
             compression: (n,) m, in the order of ``points``; negative for gaps.
         """
-        grid = np.maximum(compression, 0.0).reshape(self._count, self._count) * self._area
+        grid = np.maximum(compression, 0.0).reshape(self._counts) * self._area
         means: Array = self._rows @ grid @ self._columns
         return means
 
@@ -164,40 +167,105 @@ class PressureField:
             directions_pad: of the contact on the pad.
 
         Returns:
-            (16, 16) layer compression, m, times taxel area over pitch^2; times k it is force over pitch^2, Pa.
+            (rows, columns) layer compression, m, times taxel area over pitch^2; times k it is force over pitch^2, Pa.
         """
         if depth <= 0.0:
-            return np.zeros((SIDE, SIDE))
+            return np.zeros(self.shape)
         radius = self.radius
         given = directions_pad.tolist() if isinstance(directions_pad, np.ndarray) else directions_pad
         (m11, m12), (m21, m22) = given
         a, b = _half_axis(depth, kappa[0], radius), _half_axis(depth, kappa[1], radius)
-        r0, r1 = self._span(uv[1], hypot(a * m12, b * m22))
-        c0, c1 = self._span(uv[0], hypot(a * m11, b * m21))
+        r0, r1 = self._span(uv[1], hypot(a * m12, b * m22), self._counts[0])
+        c0, c1 = self._span(uv[0], hypot(a * m11, b * m21), self._counts[1])
         if r0 >= r1 or c0 >= c1:
-            return np.zeros((SIDE, SIDE))
-        d = pad_direction(uv[0], uv[1], radius)
-        (x0, x1, x2), (y0, y1, y2) = pad_basis(d)
-        # Depth less the probe's height above its lowest point, R (1 - s.d), which is exact; roots of the object's
-        # heights along its principal directions.
-        rows = [(radius * d[0], radius * d[1], radius * d[2], depth - radius)]
-        for curvature, mx, my in ((kappa[0], m11, m12), (kappa[1], m21, m22)):
-            if curvature:
-                root = radius * sqrt(0.5 * abs(curvature))
-                a, b = root * mx, root * my
-                rows.append((a * x0 + b * y0, a * x1 + b * y1, a * x2 + b * y2, 0.0))
+            return np.zeros(self.shape)
         samples = self._samples[:, r0:r1, c0:c1].reshape(5, -1)
-        squeeze, *across = np.array(rows).dot(samples[:4])
-        for curvature, height in zip(filter(None, kappa), across, strict=True):
-            np.square(height, out=height)
-            if curvature > 0.0:
-                squeeze -= height
-            else:
-                squeeze += height
-        np.maximum(squeeze, _NOTHING, out=squeeze)
-        squeeze *= samples[4]
+        squeeze = _compression(samples, uv, depth, kappa, directions=given, radius=radius)
         means: Array = self._rows[:, r0:r1].dot(squeeze.reshape(r1 - r0, -1)).dot(self._columns[c0:c1])
         return means
+
+
+class ListField:
+    """As `PressureField`, of taxels at given places: each is a square of its own, without blur.
+
+    Args:
+        radius_m: probe radius.
+        pad: its taxels.
+        samples: samples per taxel and axis.
+    """
+
+    def __init__(self, radius_m: float, pad: Pad, *, samples: int = 3) -> None:
+        self.radius = radius_m
+        self.shape = pad.shape
+        inside = ((np.arange(samples) + 0.5) / samples - 0.5) * pad.pitch_m
+        du, dv = np.meshgrid(inside, inside)
+        u, v = (pad.uv[:, axis, None] + d.reshape(-1) for axis, d in ((0, du), (1, dv)))
+        self._samples = _sample_rows(u, v, radius_m).reshape(5, -1)
+        self._each = samples**2
+
+    def points(self, centre: Array, axes: Array) -> Array:
+        """(n, 3) places of all samples on the undeformed probe, base frame."""
+        places: Array = centre + self.radius * self._samples[:3].T @ axes
+        return places
+
+    def mean_of(self, compression: Array) -> Array:
+        """Taxel means of a compression given at all samples."""
+        means: Array = (np.maximum(compression, 0.0) * self._samples[4]).reshape(-1, self._each).mean(axis=1)
+        return means.reshape(self.shape)
+
+    def mean_pressure(
+        self, uv: tuple[float, float], depth: float, kappa: tuple[float, float], directions_pad: Directions
+    ) -> Array:
+        """Taxel means of the compression under one contact."""
+        if depth <= 0.0:
+            return np.zeros(self.shape)
+        given = directions_pad.tolist() if isinstance(directions_pad, np.ndarray) else directions_pad
+        squeeze = _compression(self._samples, uv, depth, kappa, directions=given, radius=self.radius)
+        means: Array = squeeze.reshape(-1, self._each).mean(axis=1)
+        return means.reshape(self.shape)
+
+
+def _sample_rows(u: Array, v: Array, radius: float) -> Array:
+    """(5, …) of samples at pad points: their directions; 1; and the area of a pad cell on the sphere over du dv."""
+    arc = np.hypot(u, v) / radius
+    sinc = np.sinc(arc / np.pi)
+    return np.stack((sinc * u / radius, sinc * v / radius, np.cos(arc), np.ones_like(arc), sinc))
+
+
+def _compression(
+    samples: Array,
+    uv: tuple[float, float],
+    depth: float,
+    kappa: tuple[float, float],
+    *,
+    directions: Any,
+    radius: float,
+) -> Array:
+    """Compression of the layer at samples (5, n), times the area of their cells.
+
+    Depth less the probe's height above its lowest point, R (1 - s.d), which is exact, less the object's heights along
+    its principal directions.
+    """
+    (m11, m12), (m21, m22) = directions
+    d = pad_direction(uv[0], uv[1], radius)
+    (x0, x1, x2), (y0, y1, y2) = pad_basis(d)
+    rows = [(radius * d[0], radius * d[1], radius * d[2], depth - radius)]  # and the roots of the object's heights
+    for curvature, mx, my in ((kappa[0], m11, m12), (kappa[1], m21, m22)):
+        if curvature:
+            root = radius * sqrt(0.5 * abs(curvature))
+            a, b = root * mx, root * my
+            rows.append((a * x0 + b * y0, a * x1 + b * y1, a * x2 + b * y2, 0.0))
+    squeeze: Array
+    squeeze, *across = np.array(rows).dot(samples[:4])
+    for curvature, height in zip(filter(None, kappa), across, strict=True):
+        np.square(height, out=height)
+        if curvature > 0.0:
+            squeeze -= height
+        else:
+            squeeze += height
+    np.maximum(squeeze, _NOTHING, out=squeeze)
+    squeeze *= samples[4]
+    return squeeze
 
 
 # The tactile array: from pressure on the pad to the counts that the sensor node sends.
@@ -285,6 +353,7 @@ class TaxelArray:
         rng: source of gains and noise.
         radius_m: radius of the sphere it is wrapped on.
         stiffness_n_m3: of the elastic layer.
+        pad: its taxels; None: 16×16 over one inch.
     """
 
     def __init__(
@@ -294,22 +363,27 @@ class TaxelArray:
         *,
         radius_m: float = 0.040,
         stiffness_n_m3: float = 1.27e8,
+        pad: Pad | None = None,
     ) -> None:
         self.config = config
+        self.pad = pad = pad or Pad()
         self._rng = rng
-        self.field = PressureField(radius_m, blur_pitch=config.blur_pitch, samples=config.samples)
-        self.gains = 1.0 + config.gain_error * rng.uniform(-1.0, 1.0, (SIDE, SIDE))
+        self.field: PressureField | ListField
+        if pad.is_grid:
+            self.field = PressureField(radius_m, pad, blur_pitch=config.blur_pitch, samples=config.samples)
+        else:
+            self.field = ListField(radius_m, pad, samples=config.samples)
+        self.gains = 1.0 + config.gain_error * rng.uniform(-1.0, 1.0, pad.shape)
         self._scale = self.gains * (stiffness_n_m3 / config.full_scale_pa)
         half = 0.5 * config.hysteresis
         self._edges = np.array([[[1.0 + half]], [[1.0 - half]]])
-        self._loop = np.zeros((SIDE, SIDE))
+        self._loop = np.zeros(pad.shape)
         # Rows: the relaxations, and the image that drives them; and where the next ones are put.
-        self._creep, self._next = np.zeros((2, len(_CREEP_TIMES_S) + 1, SIDE * SIDE))
+        self._creep, self._next = np.zeros((2, len(_CREEP_TIMES_S) + 1, pad.taxels))
         self._relaxed: dict[int, Array] = {}
         self._t_s: float | None = None
-        others = (np.ones((SIDE, SIDE)) - np.eye(SIDE)) / (SIDE - 1)
-        self._columns = (1.0 - config.crosstalk) * np.eye(SIDE) + config.crosstalk * others
-        self._rows = self._columns * float(config.adc_max)
+        self._columns = _leaks(pad.columns, config.crosstalk)
+        self._rows = _leaks(pad.rows, config.crosstalk) * float(config.adc_max)
         self._noise: list[Array] = []
         self._readings = _readings(config)
         self._has_dead = bool(config.dead)
@@ -336,8 +410,7 @@ class TaxelArray:
             pressure_factor: of the layer's damping.
 
         Returns:
-            (16, 16) counts of 255 at full scale, row i at v = (i - 7.5) pitch, column j at u = (j - 7.5) pitch; whole
-            numbers (uint8) of an ADC of 8 bits, else float.
+            (rows, columns) counts of 255 at full scale; whole numbers (uint8) of an ADC of 8 bits, else float.
         """
         return self.image_of(self.field.mean_pressure(uv, depth, kappa, directions_pad), t_s, pressure_factor)
 
@@ -345,12 +418,12 @@ class TaxelArray:
         """The rest of the pipeline: sample the array once under a known compression of the layer.
 
         Args:
-            compression: (16, 16) taxel means as ``PressureField`` gives them, m; used up.
+            compression: (rows, columns) taxel means as ``PressureField`` gives them, m; used up.
             t_s: time of the sample, s, not before the previous one.
             pressure_factor: of the layer's damping.
 
         Returns:
-            (16, 16) counts.
+            (rows, columns) counts.
         """
         y = compression
         y *= self._scale
@@ -373,7 +446,7 @@ class TaxelArray:
         if self.config.creep_per_decade > 0.0:
             self._creep[-1] = y.reshape(-1)
             self._creep, self._next = np.dot(self._relaxed_by(dt), self._creep, out=self._next), self._creep
-            crept: Array = self._creep[-1].reshape(SIDE, SIDE)
+            crept: Array = self._creep[-1].reshape(self.pad.shape)
             return crept
         return y
 
@@ -408,13 +481,21 @@ class TaxelArray:
         return read
 
     def _drawn(self) -> Array:
-        """(16, 16) noise of one image in counts, and the half count that makes cutting off rounding."""
+        """(rows, columns) noise of one image in counts, and the half count that makes cutting off rounding."""
         if not self._noise:
-            noise = self._rng.standard_normal((_NOISE_IMAGES, SIDE, SIDE))
+            noise = self._rng.standard_normal((_NOISE_IMAGES, *self.pad.shape))
             noise *= self.config.noise * self.config.adc_max
             noise += 0.5
             self._noise = [*noise[::-1]]
         return self._noise.pop()
+
+
+def _leaks(taxels: int, crosstalk: float) -> Array:
+    """(n, n) what becomes of the signals along a row or column: a share of each spreads over the others."""
+    if taxels == 1:
+        return np.ones((1, 1))
+    others = (np.ones((taxels, taxels)) - np.eye(taxels)) / (taxels - 1)
+    return (1.0 - crosstalk) * np.eye(taxels) + crosstalk * others
 
 
 def _readings(config: TaxelConfig) -> npt.NDArray[Any]:

@@ -108,7 +108,8 @@ class Gate:
         """Standard deviations of a sample's point (m) and normal (rad)."""
         wider = max([WIDER[doubt] for doubt in sample.doubts], default=1.0)
         return (
-            wider * (self.sigma_point if sample.sigma_point is None else sample.sigma_point),
+            wider
+            * math.hypot(self.sigma_point if sample.sigma_point is None else sample.sigma_point, sample.sigma_motion),
             wider * (self.sigma_normal if sample.sigma_normal is None else sample.sigma_normal),
         )
 

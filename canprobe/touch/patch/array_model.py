@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from canprobe.touch.pad import Pad
 from canprobe.touch.patch.image import PatchCalibration
 from canprobe.touch.patch.moments import Lag, MomentFit, MomentImage, MomentModel
 
@@ -15,16 +16,11 @@ PAD_LAG = Lag(most=121e-6, reach=200e-6)
 """Least squares over scans of seven scenes, one array: centroids are then off by 24–40 µm RMS instead of 24–55 µm."""
 
 
-def array_calibration(full_scale_pa: float, radius_m: float = 0.040) -> PatchCalibration:
-    """Calibration of an array of this make; a full scale that was never pressed takes its nearest neighbour's gains.
-
-    Args:
-        full_scale_pa: as 2004h tells it.
-        radius_m: of the probe that the array is wrapped on.
-    """
-    nearest = min(FORCE_GAINS, key=lambda pressed: abs(math.log(pressed / full_scale_pa)))
+def array_calibration(pad: Pad) -> PatchCalibration:
+    """Calibration of an array of this make; a full scale that was never pressed takes its nearest neighbour's gains."""
+    nearest = min(FORCE_GAINS, key=lambda pressed: abs(math.log(pressed / pad.full_scale_pa)))
     force_gain, edge_gain = FORCE_GAINS[nearest]
-    return PatchCalibration(full_scale_pa=full_scale_pa, radius_m=radius_m, force_gain=force_gain, edge_gain=edge_gain)
+    return PatchCalibration(pad, force_gain=force_gain, edge_gain=edge_gain)
 
 
 def _floor(moment: float, both: float, shear: float, with_force: float, force: float) -> tuple[tuple[float, ...], ...]:

@@ -1,7 +1,7 @@
 """The contact patch in a tactile image: force and centroid, with what makes them doubtful.
 
-Row i of an image lies at v = (i − 7.5)·pitch, column j at u = (j − 7.5)·pitch; (u, v) are azimuthal-equidistant on the
-sphere, so a taxel's true area is `pitch² · sin(ρ)/ρ` with ρ = √(u² + v²)/R_p.
+Taxels lie as `touch.pad` says; (u, v) are azimuthal-equidistant on the sphere, so a taxel's true area is
+`pitch² · sin(ρ)/ρ` with ρ = √(u² + v²)/R_p.
 
 This is the *inverse* of a sensor, kept apart from any model that makes images: its constants are calibrated ones.
 """
@@ -20,6 +20,7 @@ from scipy.linalg.lapack import dposv
 from canprobe.errors import UsageError
 from canprobe.touch.contact import Doubt
 from canprobe.touch.linear_algebra import Array, checked, positive, read_only
+from canprobe.touch.pad import COUNTS_MAX, Pad
 
 # Dead taxels: found where a taxel reads nothing in the midst of a patch, and bridged by their neighbours.
 #
@@ -39,7 +40,7 @@ Image = NDArray[np.uint8]
 def mended(taxels: Image) -> tuple[Image, int]:
     """The image with its dead taxels bridged, and how many there were.
 
-    The same array (16, 16) where none is dead; else a copy in which each has the mean of its four neighbours.
+    The same array (rows, columns) where none is dead; else a copy in which each has the mean of its four neighbours.
     """
     if _GAP not in taxels.tobytes().translate(_LEVELS):  # the usual case, in a fraction of the whole search
         return taxels, 0
@@ -122,11 +123,6 @@ class Continuation:
 
 
 # The patch.
-
-SIDE = 16
-"""Rows and columns of the array."""
-COUNTS_MAX = 255
-"""Largest count of a taxel."""
 
 OFF_PAD = 0.95
 """Pressure at the pad's edge over the highest from which the contact runs off: a paraboloid has lost a sixth."""
@@ -211,16 +207,13 @@ class PatchCalibration:
     Attributes:
         full_scale_pa: pressure at the largest count.
         threshold_counts: smaller counts are taken as 0.
-        pitch_m: distance of taxels.
-        radius_m: R_p of the probe that the array is wrapped on.
+        pad: the taxels; its pressure at the largest count is `full_scale_pa`.
         force_gain, edge_gain: see above; edge_gain in √N.
         bias: residual standard deviation of the force fit, N; 0 when it was never fitted.
     """
 
-    full_scale_pa: float = 100e3
+    pad: Pad = field(default_factory=Pad)
     threshold_counts: int = 5
-    pitch_m: float = 1.5875e-3
-    radius_m: float = 0.040
     force_gain: float = 1.0
     edge_gain: float = 0.0
     bias: float = 0.0
@@ -228,25 +221,41 @@ class PatchCalibration:
     weights: Array = field(init=False, repr=False)
     continuation: Continuation = field(init=False, repr=False)
 
+    @property
+    def full_scale_pa(self) -> float:
+        """Pressure at the largest count."""
+        return self.pad.full_scale_pa
+
+    @property
+    def pitch_m(self) -> float:
+        """Distance of taxels."""
+        return self.pad.pitch_m
+
+    @property
+    def radius_m(self) -> float:
+        """R_p of the probe that the array is wrapped on; of a flat one, of the sphere that it is taken for."""
+        return self.pad.radius_m
+
     def __post_init__(self) -> None:
-        for name in ("full_scale_pa", "pitch_m", "radius_m", "force_gain"):
-            positive(name, getattr(self, name))
+        positive("force_gain", self.force_gain)
         counts = np.arange(256.0)
         pascals = self.full_scale_pa * (counts / COUNTS_MAX)
         pascals[counts < self.threshold_counts] = 0.0
         object.__setattr__(self, "pascals", read_only(pascals))
-        weights = read_only(_moment_weights(self.pitch_m, self.radius_m))
+        weights = read_only(_moment_weights(self.pad))
         object.__setattr__(self, "weights", weights)
         object.__setattr__(self, "continuation", Continuation(weights, float(pascals[COUNTS_MAX])))
 
 
-def _moment_weights(pitch: float, radius: float) -> Array:
-    """(256, 6): columns area × (1, u, v, uu, uv, vv), lengths in pitches but the area in m²."""
-    k = np.arange(SIDE) - (SIDE - 1) / 2
-    v, u = np.meshgrid(k, k, indexing="ij")
-    angle = np.hypot(u, v) * pitch / radius
-    area = pitch**2 * np.sinc(angle / np.pi)
-    return np.stack([area * m for m in (np.ones_like(u), u, v, u * u, u * v, v * v)], axis=-1).reshape(-1, 6)
+def _moment_weights(pad: Pad) -> Array:
+    """(n, 6): columns area × (1, u, v, uu, uv, vv), lengths in pitches but the area in m²."""
+    if pad.is_grid:
+        k, m = (np.arange(taxels) - (taxels - 1) / 2 for taxels in pad.shape)
+        v, u = np.meshgrid(k, m, indexing="ij")
+        area = pad.pitch_m**2 * np.sinc(np.hypot(u, v) * pad.pitch_m / pad.radius_m / np.pi)
+    else:
+        (u, v), area = pad.uv.T / pad.pitch_m, pad.areas
+    return np.stack([area * moment for moment in (np.ones_like(u), u, v, u * u, u * v, v * v)], axis=-1).reshape(-1, 6)
 
 
 def compute_patch(
@@ -255,21 +264,23 @@ def compute_patch(
     """Patch of an image; without an active taxel its force is 0 and its centroid NaN.
 
     Args:
-        taxels: (16, 16) uint8 counts in pad coordinates, zeros outside the window.
+        taxels: (rows, columns) uint8 counts in pad coordinates, zeros outside the window.
         calibration: of the array.
         window: first row, first column, rows, columns that were sent; None for the whole pad.
 
     Raises:
-        UsageError: when the image is not (16, 16) uint8.
+        UsageError: when the image is not one of the calibration's pad, in uint8.
     """
-    if taxels.shape != (SIDE, SIDE) or taxels.dtype != np.uint8:
-        raise UsageError(f"taxels: expected (16, 16) uint8, got {taxels.shape} {taxels.dtype}")
-    taxels, dead = mended(taxels)
+    pad = calibration.pad
+    if taxels.shape != pad.shape or taxels.dtype != np.uint8:
+        raise UsageError(f"taxels: expected {pad.shape} uint8, got {taxels.shape} {taxels.dtype}")
+    taxels, dead = mended(taxels) if pad.is_grid else (taxels, 0)
     pressure = calibration.pascals[taxels]
     n_active = int(np.count_nonzero(pressure))
     counts = taxels.tobytes()
     peak = max(counts)
-    peak_pa, at_pad, at_window = calibration.pascals.take((peak, *_edges(counts, window))).tolist()
+    edges = _edges(counts, pad.shape, window) if pad.is_grid else (0, 0)  # a list has no edge
+    peak_pa, at_pad, at_window = calibration.pascals.take((peak, *edges)).tolist()
     shows_shape = peak > LEAST_PEAK * calibration.threshold_counts
     if window is not None and at_window > WORTH_COMPLETING * peak_pa and shows_shape:
         pressure = calibration.continuation.completed(pressure, window, peak_pa)
@@ -299,15 +310,16 @@ def _force_and_centroid(total: float, u: float, v: float, calibration: PatchCali
     return force, u * calibration.pitch_m, v * calibration.pitch_m
 
 
-def _edges(counts: bytes, window: Sequence[int] | None) -> tuple[int, int]:
+def _edges(counts: bytes, shape: tuple[int, int], window: Sequence[int] | None) -> tuple[int, int]:
     """Highest count at the pad's edge, and at an edge of the window inside the pad."""
-    at_pad = max(counts[:SIDE] + counts[-SIDE:] + counts[::SIDE] + counts[SIDE - 1 :: SIDE])
+    height, width = shape
+    at_pad = max(counts[:width] + counts[-width:] + counts[::width] + counts[width - 1 :: width])
     if window is None:
         return at_pad, 0
     r0, c0, n_rows, n_cols = window
-    rows = [r for r in (r0, r0 + n_rows - 1) if 0 < r < SIDE - 1]
-    cols = [c for c in (c0, c0 + n_cols - 1) if 0 < c < SIDE - 1]
-    inside = [counts[SIDE * r : SIDE * (r + 1)] for r in rows] + [counts[c::SIDE] for c in cols]
+    rows = [r for r in (r0, r0 + n_rows - 1) if 0 < r < height - 1]
+    cols = [c for c in (c0, c0 + n_cols - 1) if 0 < c < width - 1]
+    inside = [counts[width * r : width * (r + 1)] for r in rows] + [counts[c::width] for c in cols]
     return at_pad, max(b"".join(inside), default=0)
 
 
@@ -322,13 +334,13 @@ def patch_from_features(features: FeaturesLike, calibration: PatchCalibration) -
         features: force in N, row and column in taxels, variances in taxels², peak in counts.
         calibration: of the array.
     """
-    row, col = features.row - (SIDE - 1) / 2, features.col - (SIDE - 1) / 2
+    rows, columns = calibration.pad.shape
+    row, col = features.row - (rows - 1) / 2, features.col - (columns - 1) / 2
     total = max(features.force_n, 0.0)
-    reach = 0.5 * SIDE
-    axes = ((abs(row), features.var_rr), (abs(col), features.var_cc))
-    cut_by_pad = any(c + 2.0 * math.sqrt(max(var, 0.0)) > reach for c, var in axes)
+    axes = ((abs(row) - 0.5 * rows, features.var_rr), (abs(col) - 0.5 * columns, features.var_cc))  # from the edge
+    cut_by_pad = any(c + 2.0 * math.sqrt(max(var, 0.0)) > 0.0 for c, var in axes)
     reached = max(c + OFF_PAD_SIGMAS * math.sqrt(max(var, 0.0) + 1.0 / 12.0) for c, var in axes)
-    at_edge = max(abs(row), abs(col)) > reach - OFF_PAD_TAXELS
+    at_edge = max(c for c, _ in axes) > -OFF_PAD_TAXELS
     peak = min(max(int(features.peak), 0), COUNTS_MAX)
     peak_pa = float(calibration.pascals[peak])
     if total <= 0.0:
@@ -341,7 +353,7 @@ def patch_from_features(features: FeaturesLike, calibration: PatchCalibration) -
         cut_by_window=False,
         cut_by_pad=cut_by_pad,
         too_few=False,
-        off_pad=reached > reach or at_edge,
+        off_pad=reached > 0.0 or at_edge,
     )
 
 

@@ -44,7 +44,7 @@ class MomentImage:
         self._square = calibration.pitch_m**2
 
     def moments(self, taxels: NDArray[np.uint8]) -> Moments | None:
-        """Moments uu, uv, vv (m²) of an image (16, 16) in pad coordinates; None where they are no ellipse."""
+        """Moments uu, uv, vv (m²) of an image (rows, columns) in pad coordinates; None where they are no ellipse."""
         total, u, v, uu, uv, vv = (self._table[taxels].reshape(-1) @ self._weights).tolist()
         if total <= 0.0:
             return None

@@ -10,13 +10,14 @@ from scipy.spatial.transform import Rotation
 from canprobe.emulator.plant.config import PlantConfig, PressMotion
 from canprobe.emulator.plant.plant import Plant
 from canprobe.emulator.plant.probe import depth_for_force
-from canprobe.emulator.plant.taxels import IDEAL_TAXELS, PITCH_M, pad_direction
+from canprobe.emulator.plant.taxels import IDEAL_TAXELS, pad_direction
 from canprobe.errors import PlanError
 from canprobe.robot.chain import forward, forward_jacobian, tool_z_offset
 from canprobe.robot.inverse import inverse_near, start_posture
 from canprobe.robot.model import joints_to_units, units_to_joints
 from canprobe.touch.objects import make_object
 
+PITCH_M = 1.5875e-3
 MS = 1_000_000
 CYCLE = 2_500_000
 POINT = np.array((-0.120, -0.1225, 0.374))

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from canprobe.emulator.plant.probe import depth_for_force
 from canprobe.emulator.plant.taxels import (
     IDEAL_TAXELS,
-    PITCH_M,
     PressureField,
     TaxelArray,
     TaxelConfig,
@@ -22,6 +21,7 @@ from canprobe.emulator.plant.taxels import (
 
 K, R = 1.27e8, 0.040
 PLANE, CYLINDER, SADDLE = (0.0, 0.0), (1 / 0.036, 0.0), (1 / 0.06, -1 / 0.08)
+PITCH_M = 1.5875e-3
 AXIS = (np.arange(16) - 7.5) * PITCH_M
 ALONG_U = np.eye(2)
 LINEAR_TAXELS = IDEAL_TAXELS.without("threshold")
@@ -240,7 +240,7 @@ def test_crosstalk_spreads_over_rows_then_columns_and_keeps_the_sum():
 @pytest.mark.parametrize("kappa", [PLANE, CYLINDER, SADDLE], ids=["plane", "cylinder", "saddle"])
 def test_leaving_out_samples_beside_the_patch_changes_nothing(kappa):
     part, whole = PressureField(R), PressureField(R)
-    whole._span = lambda centre, half: (0, whole._count)
+    whole._span = lambda centre, half, count: (0, count)
     rng = np.random.default_rng(16)
     for _ in range(30):
         uv, angle, depth = rng.uniform(-0.011, 0.011, 2), rng.uniform(0, math.pi), rng.uniform(1e-5, 9e-4)

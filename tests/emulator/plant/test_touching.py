@@ -13,7 +13,8 @@ from canprobe.emulator.plant.equations import Effects, rosenbrock2
 from canprobe.emulator.plant.plant import Plant
 from canprobe.emulator.plant.probe import elastic_contact
 from canprobe.emulator.plant.pushing import force_laws, total_force
-from canprobe.emulator.plant.taxels import IDEAL_TAXELS, SIDE
+from canprobe.emulator.plant.taxels import IDEAL_TAXELS
+from canprobe.protocol.tactile import SIDE
 from canprobe.robot.chain import forward, forward_jacobian, tool_z_offset
 from canprobe.robot.inverse import start_posture
 from canprobe.robot.model import joints_per_motor, joints_to_units

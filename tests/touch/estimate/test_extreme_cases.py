@@ -10,11 +10,12 @@ import pytest
 
 import canprobe
 from canprobe.errors import PlanError, UsageError
+from canprobe.protocol.tactile import SIDE
 from canprobe.scene.load import load_scene
 from canprobe.scene.model import ObjectSettings
 from canprobe.touch.contact import ContactSample, Doubt, indentation_from_force
 from canprobe.touch.estimate.fit import METHODS, fit_surface, make_estimator
-from canprobe.touch.patch.image import SIDE, PatchCalibration, compute_patch
+from canprobe.touch.patch.image import PatchCalibration, compute_patch
 from canprobe.touch.surface import SurfaceMatrix
 
 SIGMA = (2e-5, 1e-3)

@@ -9,6 +9,7 @@ from array_calibration import calibrate, fit_moments, pressed_sums, random_press
 from canprobe.emulator.plant.probe import depth_for_force
 from canprobe.emulator.plant.taxels import TaxelArray, TaxelConfig
 from canprobe.touch.contact import ContactSample
+from canprobe.touch.pad import Pad
 from canprobe.touch.patch.array_model import FORCE_GAINS, MOMENT_FITS, array_calibration, moment_model
 from canprobe.touch.patch.curvature import PatchCurvature, patch_estimate
 from canprobe.touch.patch.image import compute_patch
@@ -26,7 +27,7 @@ def test_procedure_finds_the_shipped_gains():
 
 @pytest.mark.parametrize(("full_scale_pa", "spread"), [(100e3, 0.015), (300e3, 0.03)])
 def test_bias_on_unseen_arrays_is_within_three_percent(full_scale_pa, spread):
-    calibration = array_calibration(full_scale_pa)
+    calibration = array_calibration(Pad(full_scale_pa=full_scale_pa))
     sums, true = map(np.array, zip(*pressed_sums(full_scale_pa, (1.0, 2.0, 3.0), seeds=(77, 78)), strict=True))
     errors = (calibration.force_gain * sums + calibration.edge_gain * np.sqrt(sums)) / true - 1
     assert abs(errors.mean()) < 0.01
@@ -50,7 +51,7 @@ def test_procedure_finds_the_shipped_fit(unseen):
     shipped = MOMENT_FITS[100e3, True]
     assert found.force_ratio == pytest.approx(shipped.force_ratio, abs=0.01)
     assert np.sqrt(found.floor[0][0]) == pytest.approx(np.sqrt(shipped.floor[0][0]), rel=0.35)
-    model = moment_model(array_calibration(100e3), 1.27e8, windowed=True)
+    model = moment_model(array_calibration(Pad()), 1.27e8, windowed=True)
     for k in ((27.8, 0.0, 0.0), (20.0, 0.0, 20.0), (0.0, 0.0, 0.0), (45.0, 0.0, 10.0)):
         again = type(model)(found, model.radius, model.stiffness, model.level_pa, model.pitch)
         assert again.moments(k, 2.0) == pytest.approx(model.moments(k, 2.0), rel=0.026)
@@ -58,7 +59,7 @@ def test_procedure_finds_the_shipped_fit(unseen):
 
 def test_regions_of_one_touch_cover_the_truth_on_unseen_arrays(unseen):
     """Patch alone, blur, gains, hysteresis, creep, crosstalk, noise, 8 bits, threshold and window on."""
-    model = moment_model(array_calibration(100e3), 1.27e8, windowed=True)
+    model = moment_model(array_calibration(Pad()), 1.27e8, windowed=True)
     inside, errors = [], []
     for press in unseen:
         V = press.moments - model.fit.memory * press.remembered
@@ -97,7 +98,7 @@ def test_the_pad_s_memory_is_in_the_images_and_the_fit_takes_it_off():
 
 def rolled(amplitude, place):
     """Mean moment across a cylinder of 36 mm at the end of 9 s of rolling, and the mean way remembered, m²."""
-    calibration = array_calibration(100e3)
+    calibration = array_calibration(Pad())
     image_moments, memory = MomentImage(calibration), PadMemory()
     array = TaxelArray(TaxelConfig(gain_error=0.0), np.random.default_rng(place))
     k, axes = (1 / 0.036, 0.0), np.array([[0.8, 0.6], [-0.6, 0.8]])

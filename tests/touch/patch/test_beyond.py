@@ -9,8 +9,9 @@ from canprobe.emulator.array import follow, middle
 from canprobe.emulator.plant.probe import depth_for_force
 from canprobe.emulator.plant.taxels import TaxelArray, TaxelConfig
 from canprobe.planning.window import CARRIED_ERROR, CARRIED_SHARE, CARRIED_SIDE, measured_share
+from canprobe.protocol.tactile import SIDE
 from canprobe.scene.setup import Probe
-from canprobe.touch.patch.image import SIDE, Continuation, PatchCalibration, compute_patch
+from canprobe.touch.patch.image import Continuation, PatchCalibration, compute_patch
 
 EXACT = PatchCalibration()
 PITCH = EXACT.pitch_m
@@ -111,7 +112,7 @@ def test_force_and_centroid_of_a_soft_contact(shape):
 def test_what_the_plan_says_of_a_window_that_cuts(side, stiffness):
     """2 N on a plane, against the whole image: within the share that `cut_patch` tells."""
     probe = Probe(np.eye(4), EXACT.radius_m, stiffness, 0.3)
-    assert measured_share(2.0, probe, side) >= CARRIED_SHARE and side >= CARRIED_SIDE
+    assert measured_share(2.0, probe, side, PITCH) >= CARRIED_SHARE and side >= CARRIED_SIDE
     depth = depth_for_force(2.0, (0.0, 0.0), EXACT.radius_m, stiffness)
     for seed in range(6):
         rng = np.random.default_rng(seed)

@@ -9,9 +9,10 @@ import pytest
 from canprobe.emulator.plant.probe import depth_for_force
 from canprobe.emulator.plant.taxels import TaxelArray, TaxelConfig
 from canprobe.errors import UsageError
+from canprobe.protocol.tactile import SIDE
 from canprobe.touch.contact import Doubt
+from canprobe.touch.pad import Pad
 from canprobe.touch.patch.image import (
-    SIDE,
     PatchCalibration,
     calibrate_force,
     compute_patch,
@@ -134,7 +135,7 @@ def test_features_say_the_same_as_the_image():
 def test_force_calibration_recovers_a_lossy_sensor():
     forces = np.linspace(0.3, 3.0, 12)
     sums = forces**1.03 * 0.85
-    fitted = calibrate_force(sums, forces, PatchCalibration(full_scale_pa=300e3))
+    fitted = calibrate_force(sums, forces, PatchCalibration(Pad(full_scale_pa=300e3)))
     assert fitted.full_scale_pa == 300e3
     back = fitted.force_gain * sums + fitted.edge_gain * np.sqrt(sums)
     assert np.abs(back / forces - 1).max() < 0.01
@@ -148,7 +149,7 @@ def test_force_calibration_recovers_a_lossy_sensor():
     [
         (lambda: compute_patch(np.zeros((8, 8), np.uint8), EXACT), "taxels"),
         (lambda: compute_patch(np.zeros((16, 16)), EXACT), "taxels"),
-        (lambda: PatchCalibration(pitch_m=0.0), "pitch_m"),
+        (lambda: Pad(pitch_m=0.0), "pitch_m"),
         (lambda: calibrate_force([1, 2], [1, 2]), "sums, forces"),
         (lambda: calibrate_force([1, 2, -3], [1, 2, 3]), "sums, forces"),
     ],

@@ -1,0 +1,72 @@
+"""The instants of a free-running device from the arrivals of its frames: a line through the last of them.
+
+A device that samples on its own time has a steady period; what it sends waits for the bus, for a driver, for the
+receiver. The instants are `t0 + n·T`, fitted by least squares to the last `KEPT` arrivals, each with its number n,
+which steps over images that were lost. A mean delay of the frames is in t0: it is part of the latency.
+Stops being true where the device changes its period, or where arrivals scatter by more than a quarter of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+
+KEPT = 64
+"""Arrivals in the fit."""
+LEAST = 4
+"""Arrivals from which there is a fit."""
+OFF = 0.25
+"""Share of the period by which an arrival, and the fitted period, may be off; beyond it the fit begins anew."""
+
+
+class PeriodFit:
+    """Fits a period to arrivals.
+
+    Args:
+        period_ns: as stated; it tells how many images were lost until there is a fit.
+
+    Attributes:
+        period_ns: fitted.
+        restarts: of the fit.
+    """
+
+    def __init__(self, period_ns: float) -> None:
+        self.period_ns = self._stated_ns = period_ns
+        self.restarts = 0
+        self._arrivals: deque[tuple[int, int]] = deque(maxlen=KEPT)
+
+    def step(self, t_ns: int) -> tuple[int, float]:
+        """Take an arrival.
+
+        Args:
+            t_ns: of the first frame of an image, after the one before.
+
+        Returns:
+            The fitted instant of this image, ns, and its standard deviation, s. Without a fit the arrival, and the
+            deviation of an instant that may be anywhere in a period.
+        """
+        arrivals = self._arrivals
+        number = 0
+        if arrivals:
+            before, last_ns = arrivals[-1]
+            number = before + max(1, round((t_ns - last_ns) / self.period_ns))
+        arrivals.append((number, t_ns))
+        if len(arrivals) < LEAST:
+            return t_ns, 1e-9 * self._stated_ns / math.sqrt(12.0)
+        numbers, times = np.array(arrivals, dtype=np.int64).T
+        n, t = numbers - numbers.mean(), (times - t_ns).astype(np.float64)
+        squares = float(n @ n)
+        period = float(n @ t) / squares
+        fitted = t.mean() + period * n
+        rest = t - fitted
+        if max(abs(rest[-1]), abs(period - self._stated_ns)) > OFF * self._stated_ns:
+            self._arrivals.clear()
+            self._arrivals.append((0, t_ns))
+            self.period_ns = self._stated_ns
+            self.restarts += 1
+            return t_ns, 1e-9 * self._stated_ns / math.sqrt(12.0)
+        self.period_ns = period
+        variance = float(rest @ rest) / (len(n) - 2) * (1.0 / len(n) + float(n[-1]) ** 2 / squares)
+        return t_ns + round(float(fitted[-1])), 1e-9 * math.sqrt(variance)

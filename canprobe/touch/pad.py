@@ -1,0 +1,121 @@
+"""The geometry of a tactile array: where its taxels are, and what their counts mean.
+
+Pad coordinates: u along the columns, v along the rows, z out of the pad, origin in the middle of the array. On a sphere
+(u, v) are lengths along its surface from the pole (exponential map), on a flat array they are its plane.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.errors import UsageError
+
+Array = NDArray[np.float64]
+
+COUNTS_MAX = 255
+"""Counts of an image at full scale; 0 is no pressure. What a device counts instead its wire converts."""
+FLAT_RADIUS_M = 10.0
+"""Radius of the sphere that a flat pad is taken for where a radius is needed: 8 µm deep over one inch."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pad:
+    """Taxels of one array.
+
+    Images of it are (rows, columns) counts, row by row; those of a list of taxels are (rows, columns) too, with
+    `positions` in the same order.
+
+    Attributes:
+        rows, columns: of its images.
+        pitch_m: distance of neighbours; its square is the area that one taxel stands for.
+        full_scale_pa: pressure at `COUNTS_MAX` counts.
+        mount_radius_m: of the sphere that it is wrapped on; None: it is flat.
+        positions: (rows · columns, 3) of a list of taxels, m; None: a grid of the pitch.
+        normals: (rows · columns, 3) outward unit normals of a list of taxels; None: of a grid those of its sphere, else
+            z.
+    """
+
+    rows: int = 16
+    columns: int = 16
+    pitch_m: float = 1.5875e-3
+    full_scale_pa: float = 100e3
+    mount_radius_m: float | None = 0.040
+    positions: Array | None = None
+    normals: Array | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("pitch_m", "full_scale_pa", "radius_m"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
+                raise UsageError(f"{name}: expected a number above 0, got {getattr(self, name)!r}")
+        for name in ("positions", "normals"):
+            given = getattr(self, name)
+            if given is not None and np.shape(given) != (self.taxels, 3):
+                raise UsageError(f"{name}: expected {self.taxels} points of 3 coordinates, got shape {np.shape(given)}")
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Of its images."""
+        return self.rows, self.columns
+
+    @property
+    def taxels(self) -> int:
+        """How many it has."""
+        return self.rows * self.columns
+
+    @property
+    def is_flat(self) -> bool:
+        """It is mounted on no sphere."""
+        return self.mount_radius_m is None
+
+    @property
+    def is_grid(self) -> bool:
+        """Its taxels are a grid of rows, columns and pitch; a scan needs that."""
+        return self.positions is None
+
+    @property
+    def radius_m(self) -> float:
+        """Of the sphere that it is wrapped on, or that a flat pad is taken for."""
+        return FLAT_RADIUS_M if self.mount_radius_m is None else self.mount_radius_m
+
+    @property
+    def reach_m(self) -> float:
+        """From the middle to the nearest edge."""
+        if self.positions is None:
+            return 0.5 * min(self.shape) * self.pitch_m
+        return float(np.abs(self.uv).max(axis=0).min()) + 0.5 * self.pitch_m
+
+    @cached_property
+    def uv(self) -> Array:
+        """(rows · columns, 2) pad coordinates of the taxels, m."""
+        if self.positions is not None:
+            return _read_only(np.array(self.positions, dtype=np.float64)[:, :2])
+        v, u = np.meshgrid(_centred(self.rows), _centred(self.columns), indexing="ij")
+        return _read_only(self.pitch_m * np.stack((u.reshape(-1), v.reshape(-1)), axis=1))
+
+    @cached_property
+    def areas(self) -> Array:
+        """(rows · columns,) area that each taxel stands for, m².
+
+        Of a grid on a sphere `pitch² · sin(ρ)/ρ` with ρ = √(u² + v²)/R; of a list the part across z, so that pressure
+        times area is the force along z.
+        """
+        if self.positions is not None:
+            tilt = 1.0 if self.normals is None else np.asarray(self.normals, dtype=np.float64)[:, 2]
+            return _read_only(np.full(self.taxels, self.pitch_m**2) * tilt)
+        angle = np.hypot(*self.uv.T) / self.radius_m
+        return _read_only(self.pitch_m**2 * np.sinc(angle / math.pi))
+
+
+def _centred(count: int) -> Array:
+    """−(count − 1)/2 … (count − 1)/2."""
+    return np.arange(count, dtype=np.float64) - (count - 1) / 2
+
+
+def _read_only(values: Array) -> Array:
+    values.flags.writeable = False
+    return values
