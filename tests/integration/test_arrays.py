@@ -45,6 +45,17 @@ rotation_deg = [0, 0, 20]
 kind = "{kind}"
 duration_s = 1
 """
+FREE = """rows = 10
+columns = 12
+pitch_mm = 2
+mode = "image"
+channel = "can1"
+[wire]
+kind = "frames"
+ids = ["510h-51Eh"]
+frames = ["ss tt uu vv ww xx yy zz"]
+latency_ms = 4
+latency_sigma_ms = 0.5"""
 RAW = ("uskin4x4", "uskin4x6", "linker12x6", "icub-triangles", "poweron6x6")
 
 
@@ -89,6 +100,15 @@ def test_an_array_of_raw_frames_is_started_listened_to_and_recorded(array, tmp_p
     assert 0.5 < np.nanmax(force) < 6.0  # the plant presses with 2 N on the average, and 3.9 N at most
 
 
+def test_an_array_that_samples_at_sync_is_placed_at_its_syncs(tmp_path):
+    sensor = FREE.replace('channel = "can1"', "rate_hz = 100").replace("[wire]", '[wire]\nsampling = "sync"')
+    tactile = canprobe.run(listen("inch16", sensor, duration=0.5), out=tmp_path / "run").tactile
+    after_sync_s = (tactile["t_sample_s"] - tactile["t_sample_s"][0]) % 0.01  # of every fourth SYNC
+    assert len(tactile["t_s"]) == pytest.approx(50, abs=2)
+    assert np.minimum(after_sync_s, 0.01 - after_sync_s).max() < 0.5e-3  # the first frame's way over the bus
+    assert tactile["raw"].shape[1:] == (10, 12, 1) and (tactile["t_sigma_s"] == 0.5e-3).all()
+
+
 def test_traffic_of_raw_frames_is_as_planned(tmp_path):
     scene = listen("linker12x6")
     result = canprobe.run(scene, out=tmp_path / "run")
@@ -130,19 +150,6 @@ def test_a_flat_array_is_no_probe(kind):
     with pytest.raises(PlanError) as caught:
         plan_of(parse_scene(scene))
     assert len(caught.value.problems) == 1 and "uskin4x4 is flat" in caught.value.problems[0]
-
-
-FREE = """rows = 10
-columns = 12
-pitch_mm = 2
-mode = "image"
-channel = "can1"
-[wire]
-kind = "frames"
-ids = ["510h-51Eh"]
-frames = ["ss tt uu vv ww xx yy zz"]
-latency_ms = 4
-latency_sigma_ms = 0.5"""
 
 
 @pytest.mark.parametrize(
