@@ -57,5 +57,5 @@ def test_a_slide_stops_at_its_end_in_mm():
         motion.step(ProbePose(T[:3, 3] + 1e-4 * k * np.array((1.0, 0.0, 0.0)), T[:3, 2]))
         if motion.limit is not None:
             break
-    assert motion.limit == "joint 1 at 598.1 mm, its stop"
-    assert motion.q[0] == pytest.approx(0.6 - 0.01 * 0.2)
+    assert motion.limit == "joint 1 at 590.1 mm, its stop"
+    assert motion.q[0] == pytest.approx(0.6 - 0.01)
