@@ -27,7 +27,7 @@ from canprobe.scene.rules import SECTIONS_OF_TASK, broken_rules
 DEFAULT_CELL = "puma260"
 """Cell of a scene that names none."""
 _ALWAYS = ("scene", "task", "bus", "cycle", "limits", "bring_up")
-FILE_KEYS = {"eds", "urdf"}
+FILE_KEYS = {"calibration", "eds", "urdf"}
 """Keys whose files a saved scene takes along."""
 _ESCAPES = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\t": "\\t", "\r": "\\r", "\b": "\\b", "\f": "\\f"}
 
@@ -58,7 +58,7 @@ def _keys(section: Any) -> str:
 
 
 def with_files_beside(scene: Scene) -> tuple[Scene, dict[str, Path]]:
-    """The scene with names in the place of the paths of its EDS and URDF files, and the files by these names.
+    """The scene with names in the place of the paths of its EDS, URDF and calibration files; the files by these names.
 
     A folder with `dump_scene` of it and the files loads as the scene, wherever the folder is moved. Packaged files keep
     their names.
@@ -196,7 +196,7 @@ def _titles(folder: str, section: str) -> list[tuple[str, str]]:
 
 
 def packaged_files(folder: str) -> dict[str, Path]:
-    """Paths of the packaged `scenes` or `cells`, by name."""
+    """Paths of the packaged `scenes`, `cells` or `calibrations`, by name."""
     return {path.stem: path for path in sorted((scenes_folder().parent / folder).glob("*.toml"))}
 
 

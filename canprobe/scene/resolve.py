@@ -12,6 +12,7 @@ from canprobe.robot.inverse import FIXED_POLE, task_rows
 from canprobe.robot.model import ArmModel
 from canprobe.robot.tool_calibration import ball_approaches
 from canprobe.scene.arms import Bodies, arm_model, per_joint
+from canprobe.scene.calibrations import load_calibration
 from canprobe.scene.geometry import T_flange_probe, expected_ball, scan_axes, true_object
 from canprobe.scene.hardware import EmulateSettings
 from canprobe.scene.load import read_cell
@@ -49,6 +50,10 @@ from canprobe.scene.setup import (
 from canprobe.touch.servo import SurfaceGains, make_strategy
 
 MM = 1e-3
+LAYER_N_M3 = 1.27e8
+"""Stiffness of the emulated layer where nothing else is stated."""
+EMULATED_ARRAY = "inch16"
+"""Calibration of the emulated array."""
 EFFECTS = ("noise", "gain_error", "blur", "hysteresis", "creep", "crosstalk", "saturation", "threshold")
 
 
@@ -64,9 +69,10 @@ def resolve(scene: Scene) -> Setup:
     """
     need_scene(scene)
     arm, bodies = _arm(scene)
-    array = _array(scene.sensor) if scene.sensor is not None else None
     settings = scene.probe or ProbeSettings()
-    probe = Probe(T_flange_probe(settings), settings.radius_mm * MM, settings.stiffness_n_m3, settings.mass_kg)
+    array = _array(scene.sensor, settings.stiffness_n_m3) if scene.sensor is not None else None
+    stiffness = array.calibration.image.stiffness if array is not None else LAYER_N_M3
+    probe = Probe(T_flange_probe(settings), settings.radius_mm * MM, stiffness, settings.mass_kg)
     return Setup(
         scene=scene,
         name=scene.name,
@@ -127,7 +133,9 @@ def _quirks(settings: EmulateSettings | None, node_id: int, noise: float) -> Qui
     return None if quirks == Quirks() else quirks
 
 
-def _array(settings: SensorSettings) -> Array:
+def _array(settings: SensorSettings, stiffness: float | None) -> Array:
+    """The array, and its calibration; a stated stiffness of the layer (N/m³) replaces the calibrated one."""
+    calibration = load_calibration(settings.calibration or EMULATED_ARRAY)
     return Array(
         node_id=settings.node_id,
         channel=settings.channel,
@@ -138,6 +146,8 @@ def _array(settings: SensorSettings) -> Array:
         window=settings.window,
         rate_hz=settings.rate_hz,
         full_scale=settings.full_scale_kpa * 1e3,
+        calibration=calibration if stiffness is None else calibration.with_stiffness(stiffness),
+        calibrated=settings.calibration is not None or settings.emulated,
     )
 
 
@@ -241,7 +251,7 @@ def _truth(scene: Scene, arm: Arm | None, bodies: Bodies, probe: Probe) -> Truth
         model=model,
         bodies=bodies,
         T_flange_probe=T_flange_there,
-        stiffness=plant.stiffness_n_m3 or probe.stiffness,
+        stiffness=plant.stiffness_n_m3 or (scene.probe.stiffness_n_m3 if scene.probe else None) or LAYER_N_M3,
         damping=plant.contact_damping_s_m,
         bandwidth_hz=plant.drive_bandwidth_hz,
         fidelity=plant.fidelity,

@@ -31,6 +31,7 @@ from canprobe.scene.model import (
     TactileModeName,
     TaskKind,
 )
+from canprobe.touch.patch.array_calibration import NOMINAL, ArrayCalibration
 from canprobe.touch.servo import Strategy, SurfaceGains
 from canprobe.touch.shapes import PlacedShape
 
@@ -133,6 +134,8 @@ class Array(Node):
         window: taxels along the window that follows the contact.
         rate_hz: of its frames.
         full_scale: pressure of a full count, Pa.
+        calibration: of the array, with the stiffness of the layer that `Probe` has.
+        calibrated: it was stated, or the array is the emulated one; else the array is real and nobody calibrated it.
     """
 
     channel: str | None
@@ -140,6 +143,13 @@ class Array(Node):
     window: int | Auto
     rate_hz: float
     full_scale: float
+    calibration: ArrayCalibration
+    calibrated: bool = True
+
+    @property
+    def newtons(self) -> str:
+        """What the array's newtons are, in words."""
+        return self.calibration.newtons if self.calibrated else NOMINAL
 
 
 @dataclass(frozen=True, slots=True, eq=False)

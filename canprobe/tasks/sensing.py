@@ -14,8 +14,9 @@ from canprobe.cell.controller import Measurement, TactileSample
 from canprobe.robot.chain import forward
 from canprobe.robot.model import ArmModel, position_sigma
 from canprobe.touch.contact import ContactSample, contact_sample, indentation_from_force, stiffness_from_slope
+from canprobe.touch.patch.array_calibration import Lag
 from canprobe.touch.patch.image import Patch, PatchCalibration, mended
-from canprobe.touch.patch.moments import Lag, MomentImage, Moments, PadLag
+from canprobe.touch.patch.moments import MomentImage, Moments, PadLag
 
 if TYPE_CHECKING:
     from canprobe.touch.estimate.answer import SurfaceEstimate
