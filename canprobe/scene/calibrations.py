@@ -291,7 +291,8 @@ def dump_calibration(calibration: ArrayCalibration) -> str:
         part = getattr(values, section.name)
         given = {key.name: getattr(part, key.name) for key in dataclasses.fields(part)}
         lines = [f"{key} = {_value(value)}" for key, value in given.items() if value not in (None, ())]
-        sections.append("\n".join([f"[{section.name}]", *lines]) + "\n")
+        if lines:
+            sections.append("\n".join([f"[{section.name}]", *lines]) + "\n")
     newtons = "# Forces and stiffness are in nominal newtons: there was no force reference.\n" if c.nominal else ""
     return f"# Made by `canprobe calibrate array`; see docs/calibration.md.\n{newtons}\n" + "\n".join(sections)
 

@@ -36,14 +36,14 @@ ARRAYS, QUICK_ARRAYS = range(100, 120), range(100, 102)
 """Seeds; the calibration was developed with other arrays than those from 110 on."""
 PRESSES = 20
 WINDOW = 8
-FRAME_S, LOADING_S, DWELL_S = 0.02, 0.5, 3.0
+FRAME_S, LOADING_S, DWELL_S, APART_S = 0.02, 0.5, 3.0, 2.5
 REFERENCE_S = 9.0
 """Reference loads rest longer: what creeps has then crept."""
 REFERENCE_SIGMA = 0.005
 UNREST, UNREST_S = 0.03, 0.1
 """The force wanders under a servo: relative standard deviation, and correlation time."""
 ENCODER_M = 3e-6
-EIGHT_M, STROKE_M = (1.5e-3, 0.6e-3), (0.5e-3, 0.0)
+EIGHT_M, STROKE_M, STROKE_HZ = (1.5e-3, 0.6e-3), (0.5e-3, 0.0), (0.5, 1.5)
 GOALS = {"force_percent": 2.0, "stiffness_percent": 3.0, "curvature_percent": 5.0}
 MODEL = ("touch", "emulator/plant", "studies/arrays.py")
 COLUMNS = (
@@ -85,7 +85,7 @@ def random_array(seed: int) -> tuple[TaxelConfig, float, np.random.Generator]:
 
 
 class Presses:
-    """Presses known shapes on one array, each time as if it had rested before.
+    """Presses known shapes on one array, one after the other: it remembers, until it is left to `rest`.
 
     Args:
         config, stiffness: of the array and its layer, N/m³.
@@ -94,7 +94,7 @@ class Presses:
 
     def __init__(self, config: TaxelConfig, stiffness: float, rng: np.random.Generator) -> None:
         self._config, self._stiffness, self._rng = config, stiffness, rng
-        self._first = TaxelArray(config, rng, radius_m=RADIUS_M, stiffness_n_m3=stiffness)
+        self._array, self._t = TaxelArray(config, rng, radius_m=RADIUS_M, stiffness_n_m3=stiffness), 0.0
 
     def dwell(  # noqa: PLR0917
         self,
@@ -126,7 +126,7 @@ class Presses:
             hz: of the roll, one after the other.
             measured: the true force is told, with the error of a scale.
         """
-        array = self._as_rested()
+        array, began = self._array, self._t
         rng, depth = self._rng, depth_for_force(force, kappa, RADIUS_M, self._stiffness)
         c, s = math.cos(angle), math.sin(angle)
         axes, origin = np.array([[c, s], [-s, c]]), (4, 4)
@@ -142,13 +142,17 @@ class Presses:
             uv = (at[0] + c * x - s * y, at[1] + s * x + c * y)
             now = force * min(1.0, t / LOADING_S) * max(1.0 + unrest, 0.0)
             sunk = depth * math.sqrt(now / force)
-            image = array.image(uv, sunk, kappa, axes, t)
+            image = array.image(uv, sunk, kappa, axes, began + t)
             origin = follow(image, origin)
             seen = np.zeros_like(image)
             part = np.s_[origin[0] : origin[0] + WINDOW, origin[1] : origin[1] + WINDOW]
             seen[part] = image[part]
             rows.append((t, seen, (*origin, WINDOW, WINDOW), uv, sunk + rng.normal(0.0, ENCODER_M), now))
         t_s, images, windows, places, push, forces = zip(*rows, strict=True)
+        self._t = began + t_s[-1]
+        for _ in range(round(APART_S / FRAME_S)):
+            self._t += FRAME_S
+            array.image((0.0, 0.0), 0.0, kappa, axes, self._t)
         mean = float(np.mean(forces[len(forces) // 3 :]))
         return Dwell(
             name=name,
@@ -164,32 +168,40 @@ class Presses:
             to_and_fro=len(hz) > 1,
         )
 
-    def _as_rested(self) -> TaxelArray:
+    def rest(self) -> None:
+        """Let the array forget."""
         array = TaxelArray(self._config, self._rng, radius_m=RADIUS_M, stiffness_n_m3=self._stiffness)
-        array.take_gains(self._first)
-        return array
+        array.take_gains(self._array)
+        self._array, self._t = array, 0.0
 
     def protocol(self) -> Iterator[Dwell]:
-        """The touches of `canprobe calibrate array`."""
+        """The touches of `canprobe calibrate array`, with a rest where it changes the object."""
         flat, ball = (0.0, 0.0), (BALL_PER_M, BALL_PER_M)
         corners = [(x, y) for x in (-2e-3, 2e-3) for y in (-2e-3, 2e-3)]
-        for number, at in enumerate(corners):
-            for force in (0.7, 1.5, 3.0):
+        for force in (0.7, 1.5, 3.0):
+            if force == 3.0:
+                for number, heading in enumerate((0.0, 0.5 * math.pi), start=20):
+                    yield self.dwell(
+                        "plane", 2.0, flat, number, seconds=8.0, heading=heading, roll=STROKE_M, hz=STROKE_HZ
+                    )
+            for number, at in enumerate(corners):
                 yield self.dwell("plane", force, flat, number, at, heading=0.8 * number)
-        for number, force in enumerate((1.0, 2.0, 3.0), start=len(corners)):
-            yield self.dwell("plane", force, flat, number, seconds=REFERENCE_S, measured=True)
-        for number, heading in enumerate((0.0, 0.5 * math.pi), start=len(corners) + 3):
-            yield self.dwell("plane", 2.0, flat, number, seconds=8.0, heading=heading, roll=STROKE_M, hz=(0.5, 1.5))
+        self.rest()
+        for force in (1.0, 2.0, 3.0):
+            yield self.dwell("plane", force, flat, 10, seconds=REFERENCE_S, measured=True)
+        self.rest()
         grid = [(x, y) for x in (-2e-3, 0.0, 2e-3) for y in (-2e-3, 0.0, 2e-3)]
-        for number, at in enumerate(grid):
-            for force in (1.0, 2.5):
+        for force in (0.8, 2.0):
+            for number, at in enumerate(grid):
                 yield self.dwell("ball", force, ball, number, at, heading=0.7 * number)
         for number, angle in enumerate((0.0, 0.25 * math.pi)):
+            self.rest()
             heading = angle + 0.5 * math.pi
             yield self.dwell("rod", 2.0, (BALL_PER_M, 0.0), number, angle=angle, heading=heading, roll=(1.5e-3, 0.0))
 
     def by_chance(self) -> Dwell:
         """A quadric, a force, a place and a time by chance; the true force is told exactly."""
+        self.rest()
         rng = self._rng
         k1, k2 = sorted(rng.uniform(-12.0, 60.0, 2).tolist(), reverse=True)
         x, y = rng.uniform(-2e-3, 2e-3, 2).tolist()

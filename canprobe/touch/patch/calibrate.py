@@ -313,8 +313,10 @@ def _means(t: Array, at: Array) -> Array:
     return ways
 
 
-def fit_centroids(dwells: Sequence[Dwell], shown: Sequence[Shown]) -> CentroidErrors:
-    """Latency and lag from the rolls to and fro, then what is left of all by load, and how long it lasts.
+def fit_centroids(dwells: Sequence[Dwell], shown: Sequence[Shown]) -> tuple[CentroidErrors, Array]:
+    """How centroids err, and the (n,) scatter of those of each touch, m.
+
+    Latency and lag from the rolls to and fro, then what is left of all by load, and how long it lasts.
 
     Hysteresis trails by a way and latency by a time: in the middle of a stroke the ways are alike at any speed. The
     rolls are as short as a scan's: over longer ways the centroid trails further.
@@ -339,7 +341,7 @@ def fit_centroids(dwells: Sequence[Dwell], shown: Sequence[Shown]) -> CentroidEr
     sigma = [_scatter(r, s.way) for r, s in zip(rest, shown, strict=True)]
     power, log_scale = np.polyfit(np.log([s.lightness for s in shown]), np.log(sigma), 1)
     share, length = _lasting(rest, [s.way for s in shown])
-    return CentroidErrors(
+    found = CentroidErrors(
         scale=math.exp(float(log_scale)),
         power=float(power),
         correlation=length,
@@ -348,6 +350,7 @@ def fit_centroids(dwells: Sequence[Dwell], shown: Sequence[Shown]) -> CentroidEr
         latency_sigma_s=latency_sigma,
         lag=Lag(most=max(most, 0.0), reach=abs(reach)),
     )
+    return found, np.array(sigma)
 
 
 def _along(way: Array) -> Array:
@@ -494,6 +497,7 @@ class ArrayFit:
         dwells, shown, forces: the touches that were used, and their forces by it, N.
         errors: (n, 3) relative errors of moments of each touch by a fit that has not seen it.
         curvature_errors: (n, 2) the same of the curvatures, relative to (κ + 1/R_p).
+        scatter: (n,) of the centroids of each touch, m.
         left_out: touches that saturated or ran off the pad.
         gains: (16, 16) of the taxels; with them moments err by `gained`, without by `plain` (RMS, relative).
         offset, object_offset: (2,) of centroids that turns with the probe, and that stays with the object, m; NaN
@@ -506,6 +510,7 @@ class ArrayFit:
     forces: Array
     errors: Array
     curvature_errors: Array
+    scatter: Array
     left_out: int
     gains: Array
     gained: float
@@ -581,20 +586,34 @@ def calibrate_array(
     rods = [(d, s) for d, s in good if d.name == "rod"]
     across = _rms(_checked(first, rods, own, seen)[1][:, 0]) if rods else math.nan
     relative = math.sqrt(float(found.covariance[0, 0]))
+    centroid, scatter = fit_centroids(ds, ss)
     calibration = replace(
         first,
         moments=_moment_errors(errors, ss),
-        centroid=fit_centroids([d for d, _ in good], [s for _, s in good]),
+        centroid=centroid,
         stiffness=StiffnessSources(
             found.parameters.stiffness, found.parameters.stiffness * relative, k, k_sigma, compliance
         ),
         residuals=Residuals(len(fitted), _rms(force_errors), _rms(errors[:, :2]), _rms(curvatures), across),
         dead=dead if own_gains else (),
     )
+    offset, of_object = _offsets(good)
     patch = make_patch_calibration(calibration, full_scale_pa, radius_m)
     forces = np.array([_force(patch, s) for s in ss])
     return ArrayFit(
-        calibration, ds, ss, forces, errors, curvatures, len(every) - len(good), gains, gained, alike, *_offsets(good)
+        calibration=calibration,
+        dwells=ds,
+        shown=ss,
+        forces=forces,
+        errors=errors,
+        curvature_errors=curvatures,
+        scatter=scatter,
+        left_out=len(every) - len(good),
+        gains=gains,
+        gained=gained,
+        plain=alike,
+        offset=offset,
+        object_offset=of_object,
     )
 
 

@@ -41,8 +41,8 @@ USUAL_LIGHTNESS = 0.05
 GAIN_FORCES_N = (0.5, 1.0, 2.0, 4.0)
 GAIN_LIGHTNESS = 0.25
 GAIN_CURVATURES = ((0.0, 0.0), (0.8, 0.8), (1.6, 1.6), (1.2, 0.0), (0.6, -0.5))
-"""Forces, level over peak pressure, and principal curvatures (over that of the probe) between which the force gains hold: plane, balls,
-cylinder, saddle."""
+"""Forces, level over peak pressure, and principal curvatures (over that of the probe) between which the force gains
+hold: plane, balls, cylinder, saddle."""
 _STEP = 1e-3
 """Relative step of the difference quotients, of the curvature relative to the probe and of the force."""
 _ROOT = math.sqrt(2.0)
