@@ -51,7 +51,7 @@ from canprobe.tasks.probing import Phase
 from canprobe.tasks.sensing import ContactSensing
 from canprobe.touch.contact import ContactSample, pad_to_direction
 from canprobe.touch.linear_algebra import homogeneous, tangent_rotation
-from canprobe.touch.patch.array_model import array_calibration
+from canprobe.touch.patch.image_model import make_patch_calibration
 
 # The state of the nodes, about once a second: from heartbeats, emergencies and statuswords.
 
@@ -152,7 +152,7 @@ class SampleSource:
         self._sensing = _sensing(plan.setup)
         self._has_arm = arm is not None
         self._radius = probe.radius
-        self._calibration = array_calibration(array.pad) if array is not None else None
+        self._calibration = make_patch_calibration(array.calibration, array.pad) if array is not None else None
 
     def sample(self, received: Received) -> Sample:
         """The sample of one observation."""

@@ -302,7 +302,7 @@ def patch_from(setup: Setup) -> Callable[[TactileSample], Patch] | None:
     """The patch of a sample of the setup's array; None without one."""
     if setup.array is None:
         return None
-    from canprobe.touch.patch.array_model import array_calibration
+    from canprobe.touch.patch.image_model import make_patch_calibration
 
-    calibration = array_calibration(setup.array.pad)
+    calibration = make_patch_calibration(setup.array.calibration, setup.array.pad)
     return lambda sample: patch_of(sample, calibration)

@@ -32,6 +32,7 @@ COMMANDS = (
     "monitor",
     "replay",
     "view",
+    "calibrate",
     "study",
     "vcan",
     "eds",

@@ -30,6 +30,7 @@ from canprobe.protocol.frame_bits import WORST_ERROR_BITS
 from canprobe.protocol.tactile import WINDOW
 from canprobe.robot.inverse import FIXED_POLE, FULL_POSE, task_rows
 from canprobe.scene.setup import Arm, Array, ArrayMode, Setup, Touch, Touching
+from canprobe.touch.patch.array_calibration import NOMINAL
 
 # What a scene leaves to the plan ("auto"), and in which order the plan tries it.
 
@@ -408,6 +409,11 @@ def _held_rows(arm: Arm) -> str:
 def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
     """What a user has to know before trusting the plan, most important first."""
     cut, bus = cut_patch(setup), setup.bus
+    if setup.array is not None and setup.array.newtons == NOMINAL:
+        yield (
+            "sensor.calibration: the array measures in nominal newtons, as good as its stated full scale;"
+            " `canprobe calibrate array CELL --force-reference scale` gives them a reference"
+        )
     if cut is not None:
         yield f"{cut.text}; {' or '.join(cut.ways)} leaves less than {100 * TOLERATED:.0f} % outside"
     if setup.arm is not None and setup.touch is not None and task_rows(setup.arm.model) < FULL_POSE:

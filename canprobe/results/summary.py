@@ -207,6 +207,7 @@ def summarise(
         "sim_time_s": sim_time,
         "wall_time_s": wall,
         "realtime_factor": sim_time / wall if wall > 0 else None,
+        "newtons": None if session.plan.setup.array is None else session.plan.setup.array.newtons,
         "contact": _contact(session, record, log),
         "shape": summarise_shape(
             scene,
@@ -456,6 +457,10 @@ def summary_text(summary: dict[str, Any], out: Path | None) -> str:
         f" {cycle['missed_pdos']} missed PDOs, {cycle['torn_frames']} torn frames",
     ]
     lines += [f"  plan       {choice}" for choice in summary.get("choices", ())]
+    if (summary.get("newtons") or "").startswith("nominal"):
+        lines.append(
+            f"  newtons    {summary['newtons']} of the array; forces and stiffness are as good as its full scale"
+        )
     if contact["force_rms_error_n"] is not None:
         target = contact["force_target_n"]
         lines.append(

@@ -28,7 +28,7 @@ from canprobe.scene.rules import SECTIONS_OF_TASK, broken_rules
 DEFAULT_CELL = "puma260"
 """Cell of a scene that names none."""
 _ALWAYS = ("scene", "task", "bus", "cycle", "limits", "bring_up")
-FILE_KEYS = {"array", "eds", "urdf", "true_cell"}
+FILE_KEYS = {"array", "calibration", "eds", "urdf", "true_cell"}
 """Keys whose files a saved scene takes along."""
 SAVED_AS = "scene.toml"
 """Name of a saved scene."""
@@ -61,7 +61,7 @@ def _keys(section: Any) -> str:
 
 
 def with_files_beside(scene: Scene) -> dict[str, bytes]:
-    """The files of a saved scene, by name: `SAVED_AS`, and the EDS, URDF and cell files that it names.
+    """The files of a saved scene, by name: `SAVED_AS`, and the EDS, URDF, calibration and cell files that it names.
 
     A folder with these files loads as the scene, wherever the folder is moved. Packaged files are not among them. A
     URDF that is taken along has absolute paths of its meshes.
@@ -234,7 +234,7 @@ def _titles(folder: str, section: str) -> list[tuple[str, str]]:
 
 
 def packaged_files(folder: str) -> dict[str, Path]:
-    """Paths of the packaged `scenes`, `cells` or `arrays`, by name."""
+    """Paths of the packaged `scenes`, `cells`, `arrays` or `calibrations`, by name."""
     return {path.stem: path for path in sorted((scenes_folder().parent / folder).glob("*.toml"))}
 
 

@@ -146,6 +146,9 @@ class SensorSettings:
     """Pressure at the largest count of a taxel."""
     serial_number: SerialNumber | None = None
     """Serial number (1018h:04) that the array must have. Left out: any."""
+    calibration: Annotated[str | None, ScenePath()] = None
+    """Calibration file of the array, by `canprobe calibrate array`: a packaged name, or a path relative to the file.
+    Left out: that of the emulated array; a real array then measures in nominal newtons."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,8 +207,9 @@ class ProbeSettings:
     """Offset of the centre along tool x and y. `canprobe run calibrate` finds it."""
     mass_kg: Annotated[float, Range(0, 5)] = 0.3
     """Mass of the probe; the dynamic arm carries it."""
-    stiffness_n_m3: Annotated[float, Range(1e5, 1e12)] = 1.27e8
-    """Stiffness of the elastic layer: its modulus over its thickness (K/h)."""
+    stiffness_n_m3: Annotated[float, Range(1e5, 1e12)] | None = None
+    """Stiffness of the elastic layer: its modulus over its thickness (K/h). Left out: that of the calibration of the
+    array."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -411,7 +415,7 @@ class PlantSettings:
     tool_error_mm: Vec3 = (0.0, 0.0, 0.0)
     """Error of the centre of the probe: where it is, less where `[probe]` has it, in the flange frame."""
     stiffness_n_m3: Annotated[float, Range(1e5, 1e12)] | None = None
-    """Stiffness K/h of the emulated layer. Left out: that of `[probe]`."""
+    """Stiffness K/h of the emulated layer. Left out: that of `[probe]`, or 1.27e8."""
     contact_damping_s_m: Annotated[float, Range(0, 100)] = 0.3
     """Damping of the contact: α of Hunt and Crossley (assumed)."""
     noise: bool = True

@@ -13,6 +13,7 @@ from canprobe.robot.inverse import FIXED_POLE, task_rows
 from canprobe.robot.model import ArmModel
 from canprobe.robot.tool_calibration import ball_approaches
 from canprobe.scene.arms import Bodies, arm_model, homing_of, per_joint
+from canprobe.scene.calibrations import load_calibration
 from canprobe.scene.geometry import T_flange_probe, expected_ball, scan_axes, true_object
 from canprobe.scene.hardware import EmulateSettings
 from canprobe.scene.load import read_cell
@@ -53,6 +54,10 @@ from canprobe.touch.pad import FLAT_RADIUS_M, Pad
 from canprobe.touch.servo import SurfaceGains, make_strategy
 
 MM = 1e-3
+LAYER_N_M3 = 1.27e8
+"""Stiffness of the emulated layer where nothing else is stated."""
+EMULATED_ARRAY = "inch16"
+"""Calibration of the emulated array."""
 EFFECTS = ("noise", "gain_error", "blur", "hysteresis", "creep", "crosstalk", "saturation", "threshold")
 
 
@@ -69,13 +74,14 @@ def resolve(scene: Scene) -> Setup:
     need_scene(scene)
     arm, bodies = _arm(scene)
     settings = scene.probe or ProbeSettings()
-    array = _array(scene, settings.radius_mm * MM)
+    array = _array(scene, settings.radius_mm * MM, settings.stiffness_n_m3)
     flat = array is not None and array.pad.is_flat
     T, radius = T_flange_probe(settings), settings.radius_mm * MM
     if flat:  # as a sphere so large that it is one: the point of its pole stays
         T[:3, 3] += (radius - FLAT_RADIUS_M) * T[:3, 2]
         radius = FLAT_RADIUS_M
-    probe = Probe(T, radius, settings.stiffness_n_m3, settings.mass_kg)
+    stiffness = array.calibration.image.stiffness if array is not None else LAYER_N_M3
+    probe = Probe(T, radius, stiffness, settings.mass_kg)
     return Setup(
         scene=scene,
         name=scene.name,
@@ -142,11 +148,18 @@ def _quirks(settings: EmulateSettings | None, node_id: int, noise: float) -> Qui
     return None if quirks == Quirks() else quirks
 
 
-def _array(scene: Scene, radius: float) -> Array | None:
-    """The array, and the wire of one that is no CANopen node; `radius` (m) of the sphere that it may be wrapped on."""
+def _array(scene: Scene, radius: float, stiffness: float | None) -> Array | None:
+    """The array with its calibration, and the wire of one that is no CANopen node.
+
+    Args:
+        scene: with or without an array.
+        radius: of the sphere that it may be wrapped on, m.
+        stiffness: of the layer, N/m³, in the place of the calibrated one; None: that.
+    """
     settings = scene.sensor
     if settings is None:
         return None
+    calibration = load_calibration(settings.calibration or EMULATED_ARRAY)
     positions, normals = (
         np.array(one) if one is not None else None for one in (settings.positions_mm, settings.normals)
     )
@@ -170,6 +183,8 @@ def _array(scene: Scene, radius: float) -> Array | None:
         window=settings.window,
         rate_hz=settings.rate_hz,
         pad=pad,
+        calibration=calibration if stiffness is None else calibration.with_stiffness(stiffness),
+        calibrated=settings.calibration is not None or settings.emulated,
         raw=None if scene.array_is_node or scene.wire is None else _raw_wire(scene.wire, settings),
     )
 
@@ -297,7 +312,7 @@ def _truth(scene: Scene, arm: Arm | None, bodies: Bodies, probe: Probe) -> Truth
         model=model,
         bodies=bodies,
         T_flange_probe=T_flange_there,
-        stiffness=plant.stiffness_n_m3 or probe.stiffness,
+        stiffness=plant.stiffness_n_m3 or (scene.probe.stiffness_n_m3 if scene.probe else None) or LAYER_N_M3,
         damping=plant.contact_damping_s_m,
         bandwidth_hz=plant.drive_bandwidth_hz,
         fidelity=plant.fidelity,

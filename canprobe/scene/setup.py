@@ -34,6 +34,7 @@ from canprobe.scene.model import (
     TaskKind,
 )
 from canprobe.touch.pad import Pad
+from canprobe.touch.patch.array_calibration import NOMINAL, ArrayCalibration
 from canprobe.touch.servo import Strategy, SurfaceGains
 from canprobe.touch.shapes import PlacedShape
 
@@ -193,6 +194,8 @@ class Array(Node):
         window: taxels along the window that follows the contact.
         rate_hz: of its images.
         pad: its taxels.
+        calibration: of the array, with the stiffness of the layer that `Probe` has.
+        calibrated: it was stated, or the array is the emulated one; else the array is real and nobody calibrated it.
         raw: what it sends where it is no CANopen node; None: it is one.
     """
 
@@ -201,12 +204,19 @@ class Array(Node):
     window: int | Auto
     rate_hz: float
     pad: Pad
+    calibration: ArrayCalibration
+    calibrated: bool = True
     raw: RawWire | None = None
 
     @property
     def full_scale(self) -> float:
         """Pressure of a full count, Pa."""
         return self.pad.full_scale_pa
+
+    @property
+    def newtons(self) -> str:
+        """What the array's newtons are, in words."""
+        return self.calibration.newtons if self.calibrated else NOMINAL
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -99,7 +99,7 @@ def peak_of(session: Session) -> Peak | None:
     kappa = session.world.plant.truth()["kappa"]
     return Peak(
         limits.safety.force_max,
-        indentation_from_force(1.0, scene.probe.stiffness_n_m3, scene.probe.radius_mm * 1e-3, kappa),
+        indentation_from_force(1.0, session.plan.setup.probe.stiffness, scene.probe.radius_mm * 1e-3, kappa),
         scene.task.approach_mm_s * 1e-3 * blind_s,
         tuple((_torn_speeds(session) * torn_s).tolist()),
         _wrong_reach(session),

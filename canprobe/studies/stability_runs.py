@@ -36,8 +36,7 @@ from canprobe.tasks.from_plan import make_task
 from canprobe.tasks.sensing import ContactSensing
 from canprobe.tasks.touch import TouchTask
 from canprobe.touch.contact import indentation_from_force
-from canprobe.touch.pad import Pad
-from canprobe.touch.patch.array_model import array_calibration
+from canprobe.touch.patch.image_model import make_patch_calibration
 
 
 class LateNode(WrappedNode):
@@ -348,7 +347,7 @@ def loop_of(case: Case) -> ForceLoop:
     assert scene.probe is not None
     radius, kappa = case.probe_mm * 1e-3, _kappa(case)
     slope = 1.0 / float(indentation_from_force(1.0, layer_stiffness(case), radius, kappa))
-    told = 1.0 / float(indentation_from_force(1.0, scene.probe.stiffness_n_m3, radius, np.zeros(2)))
+    told = 1.0 / stated_sensing(scene, ContactSensing).depth(1.0)
     if case.feels:
         sensing = stated_sensing(scene, ContactSensing)
         sensing.set_slope(slope)
@@ -365,15 +364,11 @@ def loop_of(case: Case) -> ForceLoop:
 
 def stated_sensing(scene: Scene, kind: type[ContactSensing] = StatedSensing) -> ContactSensing:
     """The scene's sensing, of another kind."""
-    assert scene.arm is not None and scene.probe is not None and scene.sensor is not None
-    radius = scene.probe.radius_mm * 1e-3
-    return kind(
-        arm_of(scene),
-        T_flange_probe(scene.probe),
-        array_calibration(Pad(full_scale_pa=scene.sensor.full_scale_kpa * 1e3, mount_radius_m=radius)),
-        radius,
-        scene.probe.stiffness_n_m3,
-    )
+    setup = resolve(scene)
+    assert setup.arm is not None and setup.array is not None
+    array, probe = setup.array, setup.probe
+    patch = make_patch_calibration(array.calibration, array.pad)
+    return kind(setup.arm.model, probe.T_flange_probe, patch, probe.radius, probe.stiffness)
 
 
 def carry_out(case: Case) -> Row:

@@ -15,7 +15,7 @@ from canprobe.tasks.probing import ProbingTask
 from canprobe.tasks.sensing import ContactSensing
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker, replay_samples
 from canprobe.tasks.touch import TouchTask
-from canprobe.touch.patch.array_model import PAD_LAG, array_calibration
+from canprobe.touch.patch.image_model import make_image_model, make_patch_calibration
 from canprobe.touch.patch.moments import MomentImage
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ WITH_PATCH = ("recursive", "ml")
 
 def make_sensing(task: Touch | Calibrate) -> ContactSensing:
     """Contacts from measurements, as the task's arm, probe and array give them."""
-    calibration = array_calibration(task.array.pad)
+    calibration = make_patch_calibration(task.array.calibration, task.array.pad)
     return ContactSensing(
         task.arm.model,
         task.probe.T_flange_probe,
@@ -52,7 +52,7 @@ def make_sensing(task: Touch | Calibrate) -> ContactSensing:
         task.probe.radius,
         task.probe.stiffness,
         moment_image=MomentImage(calibration) if isinstance(task, Touch) and _uses_patch(task) else None,
-        lag=PAD_LAG,
+        lag=task.array.calibration.centroid.lag,
     )
 
 
@@ -87,14 +87,12 @@ def make_shape_estimator(task: Touch, method: str) -> Estimator:
 
 def _with_patch(task: Touch, estimator: Estimator, memory: float) -> Estimator:
     """The estimator with the contact patch as its second sensor."""
-    from canprobe.touch.patch.array_model import moment_model
     from canprobe.touch.patch.curvature import PatchCurvature, PatchedEstimator
 
-    model = moment_model(
-        array_calibration(task.array.pad),
-        task.probe.stiffness,
-        windowed=task.array.mode == "window" and int(task.array.window) <= WINDOW,
-    )
+    array = task.array
+    patch = make_patch_calibration(array.calibration, array.pad)
+    windowed = array.mode == "window" and int(array.window) <= WINDOW
+    model = make_image_model(array.calibration, patch, seen=int(array.window) if windowed else None)
     return PatchedEstimator(estimator, PatchCurvature(model, SCANNING), memory)
 
 
@@ -140,7 +138,8 @@ def make_task(plan: Plan) -> Controller:
         return FreeTask(task.swing, task.period_s, task.duration_s, period_s)
     from canprobe.tasks.untouched import ListenTask
 
-    return ListenTask(array_calibration(task.array.pad), task.duration_s, period_s)
+    patch = make_patch_calibration(task.array.calibration, task.array.pad)
+    return ListenTask(patch, task.duration_s, period_s)
 
 
 # A task that a bridge starts, stops and sets while it runs; its requests were checked before.

@@ -15,8 +15,9 @@ from canprobe.cell.controller import Measurement, TactileSample
 from canprobe.robot.chain import forward
 from canprobe.robot.model import ArmModel, position_sigma
 from canprobe.touch.contact import ContactSample, contact_sample, indentation_from_force, stiffness_from_slope
+from canprobe.touch.patch.array_calibration import Lag
 from canprobe.touch.patch.image import Patch, PatchCalibration, mended
-from canprobe.touch.patch.moments import Lag, MomentImage, Moments, PadLag
+from canprobe.touch.patch.moments import MomentImage, Moments, PadLag
 
 if TYPE_CHECKING:
     from canprobe.touch.estimate.answer import SurfaceEstimate
@@ -167,13 +168,17 @@ class ContactSensing:
         """Indentation (m) of the layer at ``force`` (N) on the curvature known so far: the root of the force."""
         return self._depth_at_1_n * math.sqrt(force) if force > 0 else 0.0
 
+    def probe_at(self, t_ns: int) -> Vector | None:
+        """The probe (4, 4) in base at a time of the last cycles; None where the joints of that time are unknown."""
+        q = self._history.at(t_ns)
+        return None if q is None else forward(self.model.chain, q) @ self.flange_probe
+
     def contact(self, sample: TactileSample, patch: Patch) -> ContactSample | None:
         """The contact at the sample's instant, or None (counted) where the joints of that instant are unknown."""
-        q = self._history.at(sample.t_sample_ns)
-        if q is None:
+        T_base_probe = self.probe_at(sample.t_sample_ns)
+        if T_base_probe is None:
             self.dropped += 1
             return None
-        T_base_probe = forward(self.model.chain, q) @ self.flange_probe
         t_s, uv = sample.t_sample_ns * 1e-9, (patch.u, patch.v)
         found = contact_sample(
             t_s=t_s,

@@ -8,14 +8,17 @@ import math
 import numpy as np
 import pytest
 
+from canprobe.scene.calibrations import load_calibration
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimate.fit import make_estimator
 from canprobe.touch.pad import Pad
-from canprobe.touch.patch.array_model import array_calibration, moment_model
 from canprobe.touch.patch.curvature import PatchCurvature, patch_estimate, with_patch
+from canprobe.touch.patch.image_model import make_image_model, make_patch_calibration
 from canprobe.touch.patch.moments import MomentImage
 
-MODEL = moment_model(array_calibration(Pad()), 1.27e8, windowed=True)
+CALIBRATION = load_calibration("inch16")
+PATCH = make_patch_calibration(CALIBRATION, Pad())
+MODEL = make_image_model(CALIBRATION, PATCH, seen=8)
 MOMENTS = MODEL.moments((0.0, 0.0, 27.8), 2.0)
 
 
@@ -40,7 +43,7 @@ def patch():
 def test_bench_moments(benchmark):
     axis = np.arange(16) - 7.5
     field = 120.0 * np.maximum(1.0 - (axis / 2.6) ** 2 - (axis[:, None] / 3.7) ** 2, 0.0)
-    assert benchmark(MomentImage(array_calibration(Pad())).moments, field.astype(np.uint8)) is not None
+    assert benchmark(MomentImage(PATCH).moments, field.astype(np.uint8)) is not None
 
 
 def test_bench_add(benchmark, patch):

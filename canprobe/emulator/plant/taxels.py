@@ -389,6 +389,10 @@ class TaxelArray:
         self._has_dead = bool(config.dead)
         self._dead = tuple(np.array(config.dead, dtype=np.intp).reshape(-1, 2).T)
 
+    def take_gains(self, other: TaxelArray) -> None:
+        """Be the same array as another one of this configuration, with memories of its own."""
+        self.gains, self._scale = other.gains, other._scale
+
     def image(
         self,
         uv: tuple[float, float],

@@ -1,7 +1,7 @@
 """The contact patch as a second sensor: curvature from the second moments of tactile images, fused with the motion's.
 
 The moments are averaged over the last frames, in axes that follow the contact normal, and compared with a calibrated
-model of the sensor (`moments`). What gains, hysteresis and blur do to them is common to all images of a contact:
+model of the sensor (`image_model`). What gains, hysteresis and blur do to them is common to all images of a contact:
 however many are averaged, the patch never knows more than the calibration's floor.
 
 The fusion is that of two measurements: the informations of motion and patch are added, each with its whole
@@ -36,7 +36,8 @@ from canprobe.touch.linear_algebra import (
     tangent_rotation,
     transported_rotation,
 )
-from canprobe.touch.patch.moments import MomentModel, Moments, PadMemory
+from canprobe.touch.patch.image_model import ImageModel
+from canprobe.touch.patch.moments import Moments, PadMemory
 
 LEAST_FRAMES = 8
 """Fewer frames make no estimate."""
@@ -127,7 +128,7 @@ class PatchCurvature:
         refused: contacts without moments (saturated, at the pad's edge, hardly any taxel, or a sensor that sends none).
     """
 
-    def __init__(self, model: MomentModel, spread: float = 1.0) -> None:
+    def __init__(self, model: ImageModel, spread: float = 1.0) -> None:
         self.model = model
         self._spread = positive("spread", spread)
         self.refused = 0
@@ -153,7 +154,7 @@ class PatchCurvature:
             return
         inward = -sample.n_base
         self._axes = transported_rotation(self._axes, inward) if self.frames else tangent_rotation(inward)
-        (uu, uv, vv), memory = sample.moments, self.model.fit.memory
+        (uu, uv, vv), memory = sample.moments, self.model.memory
         uu, uv, vv = uu - memory * was[0], uv - memory * was[1], vv - memory * was[2]
         xx, xy, yy = _turned(uu, uv, vv, *self._pad_axis(direction, sample.T_base_probe))
         self._recent.add(xx, xy, yy)

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 
 from canprobe.errors import UsageError
@@ -202,21 +202,21 @@ class PatchCalibration:
 
     Pressure of a taxel is `full_scale_pa · counts / 255`; force is `force_gain · S + edge_gain · √(S · 1 N)` with
     S the sum of pressure times area: the second term stands for what the patch loses at its rim under the threshold,
-    `calibrate_force` fits both.
+    both follow from the image model (`ArrayCalibration.patch_calibration`).
 
     Attributes:
         full_scale_pa: pressure at the largest count.
         threshold_counts: smaller counts are taken as 0.
         pad: the taxels; its pressure at the largest count is `full_scale_pa`.
         force_gain, edge_gain: see above; edge_gain in √N.
-        bias: residual standard deviation of the force fit, N; 0 when it was never fitted.
+        gains: (rows, columns) of the taxels, over their mean; empty: all are alike.
     """
 
     pad: Pad = field(default_factory=Pad)
     threshold_counts: int = 5
     force_gain: float = 1.0
     edge_gain: float = 0.0
-    bias: float = 0.0
+    gains: tuple[tuple[float, ...], ...] = ()
     pascals: Array = field(init=False, repr=False)
     weights: Array = field(init=False, repr=False)
     continuation: Continuation = field(init=False, repr=False)
@@ -242,9 +242,11 @@ class PatchCalibration:
         pascals = self.full_scale_pa * (counts / COUNTS_MAX)
         pascals[counts < self.threshold_counts] = 0.0
         object.__setattr__(self, "pascals", read_only(pascals))
-        weights = read_only(_moment_weights(self.pad))
-        object.__setattr__(self, "weights", weights)
+        weights = _moment_weights(self.pad)
         object.__setattr__(self, "continuation", Continuation(weights, float(pascals[COUNTS_MAX])))
+        if self.gains:
+            weights = weights / checked("gains", self.gains, self.pad.shape).reshape(-1, 1)
+        object.__setattr__(self, "weights", read_only(weights))
 
 
 def _moment_weights(pad: Pad) -> Array:
@@ -355,29 +357,3 @@ def patch_from_features(features: FeaturesLike, calibration: PatchCalibration) -
         too_few=False,
         off_pad=reached > 0.0 or at_edge,
     )
-
-
-def calibrate_force(
-    sums: ArrayLike, forces: ArrayLike, calibration: PatchCalibration | None = None
-) -> PatchCalibration:
-    """Fit `F = force_gain · S + edge_gain · √(S · 1 N)` to recorded presses, in relative error.
-
-    Args:
-        sums: (n,) plain sums S = Σ pressure · area, N: `compute_patch(...).force` with gains 1 and 0.
-        forces: (n,) true forces, N, all above 0.
-        calibration: whose other constants to keep; None for the default.
-
-    Returns:
-        A calibration with both gains and the residual `bias` (RMS, N).
-
-    Raises:
-        UsageError: on fewer than three presses, or sums or forces not above 0.
-    """
-    s, f = checked("sums", sums, (None,)), checked("forces", forces, (None,))
-    if len(s) < 3 or len(s) != len(f) or min(s.min(), f.min()) <= 0.0:
-        raise UsageError(f"sums, forces: expected at least 3 pairs above 0, got {len(s)} and {len(f)}")
-    basis = np.stack([s, np.sqrt(s)], axis=1)
-    gains, *_ = np.linalg.lstsq(basis / f[:, None], np.ones_like(f), rcond=None)
-    base = PatchCalibration() if calibration is None else calibration
-    bias = float(np.sqrt(np.mean((basis @ gains - f) ** 2)))
-    return replace(base, force_gain=float(gains[0]), edge_gain=float(gains[1]), bias=bias)

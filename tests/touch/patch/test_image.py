@@ -14,7 +14,6 @@ from canprobe.touch.contact import Doubt
 from canprobe.touch.pad import Pad
 from canprobe.touch.patch.image import (
     PatchCalibration,
-    calibrate_force,
     compute_patch,
     mended,
     patch_from_features,
@@ -132,26 +131,13 @@ def test_features_say_the_same_as_the_image():
     assert patch_from_features(nothing, EXACT).too_few
 
 
-def test_force_calibration_recovers_a_lossy_sensor():
-    forces = np.linspace(0.3, 3.0, 12)
-    sums = forces**1.03 * 0.85
-    fitted = calibrate_force(sums, forces, PatchCalibration(Pad(full_scale_pa=300e3)))
-    assert fitted.full_scale_pa == 300e3
-    back = fitted.force_gain * sums + fitted.edge_gain * np.sqrt(sums)
-    assert np.abs(back / forces - 1).max() < 0.01
-    assert fitted.bias < 0.02
-    exact = calibrate_force(forces, 1.2 * forces - 0.1 * np.sqrt(forces))
-    assert (exact.force_gain, exact.edge_gain) == pytest.approx((1.2, -0.1))
-
-
 @pytest.mark.parametrize(
     ("call", "field"),
     [
         (lambda: compute_patch(np.zeros((8, 8), np.uint8), EXACT), "taxels"),
         (lambda: compute_patch(np.zeros((16, 16)), EXACT), "taxels"),
         (lambda: Pad(pitch_m=0.0), "pitch_m"),
-        (lambda: calibrate_force([1, 2], [1, 2]), "sums, forces"),
-        (lambda: calibrate_force([1, 2, -3], [1, 2, 3]), "sums, forces"),
+        (lambda: PatchCalibration(gains=((1.0, 1.0),)), "gains"),
     ],
 )
 def test_errors_name_the_field(call, field):

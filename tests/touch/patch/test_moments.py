@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from canprobe.touch.patch.moments import GAP_S, TIMES_S, Lag, PadLag, PadMemory
+from canprobe.touch.patch.array_calibration import Lag
+from canprobe.touch.patch.moments import GAP_S, TIMES_S, PadLag, PadMemory
 
 
 def remembered(t, uv):

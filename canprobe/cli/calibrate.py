@@ -1,0 +1,120 @@
+"""Calibrate a tactile array by touching a plane, a ball and a rod of known size with the arm of a cell.
+
+39 touches in about five minutes: force, stiffness of the layer, blur, crosstalk, noise and lag of the array. An
+emulated cell has the objects; at a real one you are asked to place them. Images alone do not show newtons: name what
+they rest on, or the calibration is in nominal newtons. The result is a file for the key sensor.calibration.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from datetime import date
+from pathlib import Path
+
+from canprobe.cli.output import print_json, say
+from canprobe.cli.parser import BUS, Parser, add_options, folder_path, seed, target_of, word
+
+HELP = "calibrate a tactile array by touching known things"
+EXAMPLE = """\
+examples:
+  canprobe calibrate array puma260 --force-reference scale --sigma 0.5
+  canprobe calibrate array mycell.toml --bus socketcan --channel can0 --out runs/array
+"""
+
+
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < 1e6:
+        raise argparse.ArgumentTypeError(f"expected a number above 0, got {text!r}")
+    return value
+
+
+def add_arguments(parser: Parser) -> None:
+    """Add the command's arguments."""
+    parser.add_argument("what", metavar="array", choices=["array"], help="what is calibrated")
+    parser.add_argument("cell", metavar="CELL", type=word, help="name of a packaged cell, or path of a cell file")
+    parser.add_argument(
+        "--force-reference",
+        choices=["scale", "weights", "unit", "none"],
+        default="none",
+        help="what newtons rest on: a scale or load cell under the object, known weights, the stated full scale, or"
+        " nothing [none: nominal newtons]",
+    )
+    parser.add_argument(
+        "--sigma", metavar="PERCENT", type=_positive, default=1.0, help="standard deviation of that reference [1]"
+    )
+    parser.add_argument(
+        "--at", metavar=("X", "Y", "Z"), nargs=3, type=float, default=(-120.0, -122.5, 374.0),
+        help="point of the base frame that is touched, mm [-120 -122.5 374]",
+    )  # fmt: skip
+    parser.add_argument("--ball-radius", metavar="MM", type=_positive, default=25.0, help="radius of the ball [25]")
+    parser.add_argument("--rod-radius", metavar="MM", type=_positive, default=25.0, help="radius of the rod [25]")
+    parser.add_argument(
+        "--make", action="store_true", help="calibrate the make: leave out gains and dead taxels of this one array"
+    )
+    parser.add_argument("--yes", action="store_true", help="ask nobody; for an emulated cell, where it is the default")
+    add_options(parser, *BUS)
+    parser.add_argument("--seed", metavar="N", type=seed, default=0, help="seed of the emulation [0]")
+    parser.add_argument(
+        "--out", metavar="DIR", type=folder_path, help="folder of the files [runs/calibrate-array-DATE]"
+    )
+    add_options(parser, "--force", "--json")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Touch, fit, print, and write calibration.toml, calibration.png and the recorded buses."""
+    from canprobe import api
+    from canprobe.bus.disk import write_text
+    from canprobe.results.array_report import as_document, calibration_text, draw_calibration
+    from canprobe.scene.calibrations import dump_calibration
+    from canprobe.scene.load import load_scene
+    from canprobe.session.array_calibration import Request, calibrate
+
+    today = date.today().isoformat()
+    out = args.out or Path("runs") / f"calibrate-array-{today}"
+    api.check_free(out, force=args.force)
+    x, y, z = args.at
+    request = Request(
+        cell=args.cell,
+        target=target_of(args, load_scene("press", args.cell)),
+        at=(x, y, z),
+        ball_radius=1e-3 * args.ball_radius,
+        rod_radius=1e-3 * args.rod_radius,
+        reference=args.force_reference,
+        sigma=1e-2 * args.sigma,
+        own_gains=not args.make,
+        seed=args.seed,
+    )
+    found = calibrate(request, date=today, ask=None if args.yes else _ask, say=_visits_only, out=out)
+    write_text(out / "calibration.toml", dump_calibration(found.fit.calibration))
+    draw_calibration(found.fit, out / "calibration.png")
+    if args.json:
+        document = as_document(found.fit)
+        print_json({**document, "restless": [list(p) for p in found.restless], "notes": list(found.notes)})
+    else:
+        print(calibration_text(found.fit))
+        print(f"  unloaded   {len(found.restless)} taxels show counts, drift {found.drift_counts:.2f} counts")
+        for note in found.notes:
+            print(f"  left out   {note}")
+        print(f'  file       {out / "calibration.toml"}; name it in the cell: [sensor] calibration = "..."')
+    return 0
+
+
+def _visits_only(line: str) -> None:
+    """What is done next; the steps of each bring-up are left out."""
+    if line.startswith(("visit", "warning")):
+        say(line)
+
+
+def _ask(text: str) -> str:
+    sys.stderr.write(text)
+    sys.stderr.flush()
+    answer = sys.stdin.readline()
+    if not answer:
+        raise EOFError("nobody answers: standard input is closed")
+    return answer.strip()
