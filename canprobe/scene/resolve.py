@@ -11,7 +11,7 @@ from canprobe.errors import PlanError
 from canprobe.robot.inverse import FIXED_POLE, task_rows
 from canprobe.robot.model import ArmModel
 from canprobe.robot.tool_calibration import ball_approaches
-from canprobe.scene.arms import Bodies, arm_model, per_joint
+from canprobe.scene.arms import Bodies, arm_model, joint_compliance, per_joint
 from canprobe.scene.calibrations import load_calibration
 from canprobe.scene.geometry import T_flange_probe, expected_ball, scan_axes, true_object
 from canprobe.scene.hardware import EmulateSettings
@@ -250,6 +250,7 @@ def _truth(scene: Scene, arm: Arm | None, bodies: Bodies, probe: Probe) -> Truth
         object=shape,
         model=model,
         bodies=bodies,
+        compliance=joint_compliance(scene.joints),
         T_flange_probe=T_flange_there,
         stiffness=plant.stiffness_n_m3 or (scene.probe.stiffness_n_m3 if scene.probe else None) or LAYER_N_M3,
         damping=plant.contact_damping_s_m,

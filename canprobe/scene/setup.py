@@ -371,6 +371,7 @@ class Truth:
         without: effects of the array that are switched off.
         adc_bits: of the array.
         bodies: (n,) of the joints, without the probe; None where nobody knows them, which refuses "dynamic".
+        compliance: (n,) of the joints between motor and link, rad/(N m) or m/N; None: all are rigid.
     """
 
     object: PlacedShape | None
@@ -384,6 +385,7 @@ class Truth:
     without: tuple[str, ...]
     adc_bits: int
     bodies: tuple[Body | None, ...] | None = None
+    compliance: Floats | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
