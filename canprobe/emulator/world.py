@@ -213,6 +213,7 @@ def _plant_config(setup: Setup) -> PlantConfig:
         fidelity=truth.fidelity,
         dynamics=truth.dynamics,
         bodies=truth.bodies,
+        compliance=truth.compliance,
         base_offset_m=_base_offset(setup.arm.model.chain, truth.model.chain, q0, setup.probe.T_flange_probe),
     )
 

@@ -137,6 +137,12 @@ def _body(section: JointSettings, row: tuple[float, float, float, float], arm: A
     return Body(section.mass_kg or 0.0, np.array(section.com_mm) * _MM, tensor).moved(T)
 
 
+def joint_compliance(sections: Mapping[str, JointSettings]) -> Array | None:
+    """(n,) compliance of the joints, rad/(N m) or m/N; None where all are rigid."""
+    stiffness = [s.stiffness_n_m if s.kind == "prismatic" else s.stiffness_nm_rad for s in sections.values()]
+    return np.array([0.0 if k is None else 1.0 / k for k in stiffness]) if any(stiffness) else None
+
+
 def per_joint(sections: Mapping[str, JointSettings], key: Literal["start", "swing"]) -> Array:
     """(n,) rad or m of a key that is in degrees or in millimetres, as the joint turns or slides."""
     return np.array(

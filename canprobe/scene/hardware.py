@@ -177,6 +177,11 @@ class JointSettings:
     """Coulomb friction. Left out: 20."""
     viscous_n_s_m: Annotated[float | None, Range(0, 1e6), SLIDES] = None
     """Viscous friction. Left out: 20."""
+    stiffness_nm_rad: Annotated[float | None, Range(1, 1e9), TURNS] = None
+    """Stiffness of the emulated joint between its motor, which the encoder is on, and its link. Left out: rigid. Of an
+    ideal arm, that of its own cell."""
+    stiffness_n_m: Annotated[float | None, Range(1, 1e12), SLIDES] = None
+    """The same of a prismatic joint."""
     mass_kg: Annotated[float | None, Range(0, 1e5)] = None
     """Mass of the link behind the joint. Without the masses of all links an arm of rows cannot be `dynamic`."""
     com_mm: Vec3 = (0.0, 0.0, 0.0)

@@ -12,7 +12,7 @@ from canprobe.protocol.frames import Frame
 from canprobe.robot.inverse import FIXED_POLE, task_rows
 from canprobe.robot.model import ArmModel
 from canprobe.robot.tool_calibration import ball_approaches
-from canprobe.scene.arms import Bodies, arm_model, homing_of, per_joint
+from canprobe.scene.arms import Bodies, arm_model, homing_of, joint_compliance, per_joint
 from canprobe.scene.calibrations import load_calibration
 from canprobe.scene.geometry import T_flange_probe, expected_ball, scan_axes, true_object
 from canprobe.scene.hardware import EmulateSettings
@@ -311,6 +311,7 @@ def _truth(scene: Scene, arm: Arm | None, bodies: Bodies, probe: Probe) -> Truth
         object=shape,
         model=model,
         bodies=bodies,
+        compliance=joint_compliance(scene.joints),
         T_flange_probe=T_flange_there,
         stiffness=plant.stiffness_n_m3 or (scene.probe.stiffness_n_m3 if scene.probe else None) or LAYER_N_M3,
         damping=plant.contact_damping_s_m,

@@ -149,6 +149,14 @@ def _heading_along_normal(kind: str, normal: tuple[float, ...], heading: float) 
         yield "task.heading_deg", why
 
 
+@_across("joints", "plant.fidelity")
+def _compliant_dynamic(joints: Mapping[str, JointSettings], fidelity: str) -> _Complaint:
+    for name, joint in joints.items():
+        if fidelity == "dynamic" and (joint.stiffness_nm_rad or joint.stiffness_n_m):
+            key = "stiffness_n_m" if joint.kind == "prismatic" else "stiffness_nm_rad"
+            yield f"joints.{name}.{key}", 'expected plant.fidelity = "ideal": the joints of a dynamic arm are rigid'
+
+
 @_across("task.kind", "object.kind", "object.radius_mm?", "task.ball_radius_mm")
 def _not_a_ball(kind: str, obj: str, radius: float | None, ball: float) -> _Complaint:
     if kind == "calibrate" and (obj, radius) != ("sphere", ball):

@@ -438,6 +438,7 @@ class Truth:
         without: effects of the array that are switched off.
         adc_bits: of the array.
         bodies: (n,) of the joints, without the probe; None where nobody knows them, which refuses "dynamic".
+        compliance: (n,) of the joints between motor and link, rad/(N m) or m/N; None: all are rigid.
     """
 
     object: PlacedShape | None
@@ -451,6 +452,7 @@ class Truth:
     without: tuple[str, ...]
     adc_bits: int
     bodies: tuple[Body | None, ...] | None = None
+    compliance: Floats | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -217,7 +217,7 @@ def calibrate(
         say(f"visit {number} of {len(every)}: {len(visit.presses)} touches of the {visit.known.name}")
         there = replace(there, object=visit.known.settings(request.at))
         folder = None if out is None else out / f"visit-{number:02d}"
-        found, rest = _visit(make_plan(resolve(there)), visit, folder, say, ask if not emulated else None)
+        found, rest = touch_object(make_plan(resolve(there)), visit, folder, say, ask if not emulated else None)
         dwells += found
         unloaded += rest
     setup = resolve(scene)
@@ -269,10 +269,10 @@ def _turned(scene: Scene) -> Scene | None:
     return None
 
 
-def _visit(
+def touch_object(
     plan: Plan, visit: Visit, out: Path | None, say: Say, ask: Ask | None
 ) -> tuple[list[Dwell], list[NDArray[np.uint8]]]:
-    """Bring the cell up, touch, stop; the touches, and what the array showed before."""
+    """Bring the cell up, touch, stop; the touches, and what the array showed before. `ask` reads reference loads."""
     task = plan.setup.task
     assert isinstance(task, Touch)
     presses = [replace(p, heading=_along_rod(plan, visit.known)) if math.isnan(p.heading) else p for p in visit.presses]

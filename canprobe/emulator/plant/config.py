@@ -53,6 +53,7 @@ class PlantConfig:
             of the object.
         dynamics: of a dynamic arm.
         bodies: (n,) of its joints, without the probe; None where nobody knows them.
+        compliance: (n,) of the joints of an ideal arm between motor and link, rad/(N m) or m/N; None: they are rigid.
         base_offset_m: (3,) of the arm's base in the frame that counts as base.
     """
 
@@ -72,4 +73,5 @@ class PlantConfig:
     fidelity: Fidelity = "ideal"
     dynamics: Dynamics = field(default_factory=Dynamics)
     bodies: tuple[Body | None, ...] | None = None
+    compliance: Array | None = None
     base_offset_m: Array = field(default_factory=lambda: np.zeros(3))

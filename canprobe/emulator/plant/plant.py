@@ -1,14 +1,15 @@
 """The plant: arm, probe, object and array as one thing that the emulated nodes share.
 
 Time only moves forward; several calls at one instant are the same as one. Contact is solved once per distinct time
-and only when somebody asks. Contact pushes the dynamic arm back, not the ideal one: its drives are taken as stiff.
+and only when somebody asks. Contact pushes the dynamic arm back, and the ideal one where its joints are compliant: its
+drives are taken as stiff.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import inf
+from math import inf, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ from canprobe.emulator.plant.probe import NO_CONTACT, Contact, PressedProbe, Pro
 from canprobe.emulator.plant.pushing import LEAST_CURVATURE, total_force
 from canprobe.emulator.plant.taxels import Image, TaxelArray, Vec, pad_coordinates
 from canprobe.errors import PlanError
-from canprobe.robot.chain import Array, point_on_flange, point_velocity, posture
+from canprobe.robot.chain import Array, forward_jacobian, point_on_flange, point_velocity, posture
 from canprobe.robot.model import ArmModel, units_to_joints
 from canprobe.touch.shapes import Nearest, Touches
 
@@ -282,6 +283,10 @@ class Plant:
         if config.object is None:
             return _Solution(q, probe, _NOWHERE, 0.0, 0.0, NO_CONTACT, (0.0, 0.0), (0.0, 0.0), _POLE)
         foot = config.object.nearest(probe.centre)
+        if config.compliance is not None and foot.distance < config.radius_m:
+            q = self._given_way(q, foot, config.compliance)
+            probe = self._probe(state.t_ns, q, qd)
+            foot = config.object.nearest(probe.centre)
         nx, ny, nz = foot.normal
         vx, vy, vz = probe.velocity
         depth, rate = config.radius_m - foot.distance, -(nx * vx + ny * vy + nz * vz)
@@ -302,6 +307,25 @@ class Plant:
         d = (-(nx * x0 + ny * x1 + nz * x2), -(nx * y0 + ny * y1 + nz * y2), -(nx * z0 + ny * z1 + nz * z2))
         uv = pad_coordinates(d, config.radius_m)
         return _Solution(q, probe, foot, depth, rate, contact, (k1, k2), uv, d, touches is not None)
+
+    def _given_way(self, q: tuple[float, ...], foot: Nearest, compliance: Array) -> tuple[float, ...]:
+        """Joints (n,) that the contact has pushed back, by torque over stiffness each.
+
+        Model: at rest and linear, `q + C Jᵀ F n` with the motors where they are. F is that of the depth that is left,
+        `F = f(δ − c F)` with `c = nᵀ J C Jᵀ n`; the layer's square law makes that a quadratic. The normal is that
+        before.
+        """
+        assert self.arm is not None
+        config, normal = self.config, np.array(foot.normal)
+        _, J = forward_jacobian(self.arm.model.chain, np.array(q), config.T_flange_probe_centre)
+        lever = J[:3].T @ normal
+        c = float(lever @ (compliance * lever))
+        depth = config.radius_m - foot.distance
+        kappa = (max(foot.kappa[0], self._tightest), max(foot.kappa[1], self._tightest))
+        unit = elastic_contact(1.0, kappa, config.radius_m, config.stiffness_n_m3).force  # F = unit · depth²
+        left = (sqrt(1.0 + 4.0 * unit * c * depth) - 1.0) / (2.0 * unit * c) if c > 0.0 else depth
+        given: tuple[float, ...] = tuple((np.array(q) + compliance * lever * (unit * left * left)).tolist())
+        return given
 
     def _resting(self, touches: Touches, probe: Probe) -> Contact:
         """Several places at once, as one contact with the resultant force; it has no patch of its own."""

@@ -344,3 +344,21 @@ def test_limit_switches_stand_just_outside_of_the_joints_range_where_the_other_m
 
 def test_without_an_arm_there_are_no_limit_switches():
     assert Plant(PlantConfig(None, taxels=None)).limit_switches(0) == (-math.inf, math.inf)
+
+
+def test_a_compliant_joint_gives_way_by_torque_over_stiffness_and_the_encoders_do_not_see_it():
+    """The depth that is left carries the force that pushes the joints back; the motors stay where they are."""
+    compliance = np.array([0.0, 1 / 4000.0, 1 / 2500.0, 0.0, 1 / 500.0, 0.0])
+    rigid, soft = plant(depth=0.5e-3, tilt_deg=8.0), plant(depth=0.5e-3, tilt_deg=8.0, compliance=compliance)
+    stiff_truth, truth = rigid.truth(), soft.truth()
+    assert soft.motor_counts(1) == rigid.motor_counts(1)
+    _, J = forward_jacobian(UPENN.chain, np.array(truth["q"]), TOOL)
+    torque = J[:3].T @ (truth["force"] * truth["contact_normal"])
+    np.testing.assert_allclose(
+        truth["q"] - stiff_truth["q"], compliance * torque, atol=1e-2 * abs(compliance * torque).max()
+    )
+    way = float(truth["contact_normal"] @ (truth["probe_centre"] - stiff_truth["probe_centre"]))
+    assert 20e-6 < way < 0.3e-3
+    assert truth["depth"] == pytest.approx(stiff_truth["depth"] - way, rel=5e-3)
+    assert truth["force"] < 0.95 * stiff_truth["force"]
+    assert plant(depth=-1e-3, compliance=compliance).truth()["q"] == pytest.approx(plant(depth=-1e-3).truth()["q"])
