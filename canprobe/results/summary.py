@@ -355,7 +355,7 @@ def _bound_ratio(
 
     None where the contact patch contributed to most answers: the bound is that of points and normals.
     """
-    from canprobe.tasks.from_plan import SIGMA_NORMAL_RAD, SIGMA_POINT_M, centroid_coupling
+    from canprobe.tasks.from_plan import SIGMA_NORMAL_RAD, centroid_correlation, centroid_coupling
 
     shape = scene.shape
     if tracker is None or shape is None or score.kappa_rms_error_per_m is None or (score.patch_fraction or 0.0) > 0.5:
@@ -365,7 +365,7 @@ def _bound_ratio(
         truth,
         sync_times,
         memory_m=shape.memory_mm * 1e-3,
-        sigma_point=SIGMA_POINT_M,
+        correlation=centroid_correlation(),
         sigma_normal=SIGMA_NORMAL_RAD,
         coupling=centroid_coupling(resolve(scene).probe),
     )

@@ -13,7 +13,13 @@ from canprobe.cell.array import patch_of
 from canprobe.cell.controller import Measurement, TactileSample
 from canprobe.robot.chain import forward
 from canprobe.robot.model import ArmModel, position_sigma
-from canprobe.touch.contact import ContactSample, contact_sample, indentation_from_force, stiffness_from_slope
+from canprobe.touch.contact import (
+    CentroidNoise,
+    ContactSample,
+    contact_sample,
+    indentation_from_force,
+    stiffness_from_slope,
+)
 from canprobe.touch.patch.image import Patch, PatchCalibration, mended
 from canprobe.touch.patch.moments import Lag, MomentImage, Moments, PadLag
 
@@ -87,6 +93,7 @@ class ContactSensing:
         radius: of the probe, m.
         stiffness: K/h of the layer, N/m³.
         moment_image: gives the contacts the second moments of their images; None leaves them out.
+        noise: of the centroids; None: the contacts do not state theirs.
         lag: how far the array's centroids trail the contact; None: they do not.
     """
 
@@ -98,6 +105,7 @@ class ContactSensing:
         radius: float,
         stiffness: float,
         *,
+        noise: CentroidNoise | None = None,
         moment_image: MomentImage | None = None,
         lag: Lag | None = None,
     ) -> None:
@@ -110,6 +118,8 @@ class ContactSensing:
         self.patch: Patch | None = None
         self.dropped = 0
         self._calibration = calibration
+        self._noise = noise
+        self._level_pa = MomentImage(calibration).level_pa
         self._moment_image = moment_image
         self._lag = None if lag is None else PadLag(lag)
         self._history = JointHistory()
@@ -172,13 +182,15 @@ class ContactSensing:
             return None
         T_base_probe = forward(self.model.chain, q) @ self.flange_probe
         t_s, uv = sample.t_sample_ns * 1e-9, (patch.u, patch.v)
+        depth = self.depth(patch.force)
         return contact_sample(
             t_s=t_s,
             T_base_probe=T_base_probe,
             uv=uv if self._lag is None else self._lag.step(t_s, *uv),
-            depth=self.depth(patch.force),
+            depth=depth,
             radius=self.radius,
             force_n=patch.force,
+            sigma_point=None if self._noise is None else self._noise.sigma(self._level_pa, self.stiffness, depth),
             moments=self._moments(sample, patch),
             doubts=patch.doubts,
         )

@@ -56,6 +56,31 @@ class ContactSample:
     doubts: tuple[Doubt, ...] = ()
 
 
+@dataclass(frozen=True, slots=True)
+class CentroidNoise:
+    """Noise of a centroid on the pad, which turns the normal by 1/R_p of it: `scale · t^exponent` per axis.
+
+    t is the level that is taken off the image over the peak pressure: light touches show few taxels. Part of it is
+    alike over some path (gains, hysteresis), the rest is new in every image.
+
+    Attributes:
+        scale: standard deviation at a peak pressure of one level, m.
+        exponent: of t.
+        length: path over which its correlated part is alike, m.
+        share: of the variance that is correlated.
+    """
+
+    scale: float
+    exponent: float
+    length: float
+    share: float
+
+    def sigma(self, level_pa: float, stiffness_n_m3: float, depth: float) -> float:
+        """Standard deviation (m) of a contact that sinks in by a depth (m), a peak pressure of stiffness · depth."""
+        t = level_pa / (stiffness_n_m3 * depth) if depth > 0.0 else 1.0
+        return float(self.scale * min(t, 1.0) ** self.exponent)
+
+
 def pad_to_direction(u: float, v: float, radius: float) -> Array:
     """Direction (3,) of a pad point (u, v), m, as seen from the sphere's centre, in the probe frame.
 
@@ -94,6 +119,7 @@ def contact_sample(
     depth: float,
     radius: float,
     force_n: float,
+    sigma_point: float | None = None,
     moments: tuple[float, float, float] | None = None,
     doubts: tuple[Doubt, ...] = (),
 ) -> ContactSample:
@@ -105,7 +131,7 @@ def contact_sample(
     direction = pad_to_direction(u, v, radius)
     point, normal = contact_on_object(T_base_probe, direction, radius, depth)
     arm = (radius - depth) * direction
-    return ContactSample(t_s, point, normal, T_base_probe, arm, force_n, moments=moments, doubts=doubts)
+    return ContactSample(t_s, point, normal, T_base_probe, arm, force_n, sigma_point, moments=moments, doubts=doubts)
 
 
 def indentation_from_force(force: float, stiffness_n_m3: float, radius: float, kappa: ArrayLike) -> float:

@@ -14,9 +14,9 @@ from canprobe.touch.estimate.quadric import (
     UNIT,
     Decision,
     curvature_jacobian,
+    excited,
     matrix_of,
     outside,
-    spread_share,
     tensor,
     transport,
 )
@@ -321,14 +321,15 @@ def evidence_of(c: Array, covariance: Array, spread: Array | None, length: float
     Args:
         c: (9,) parameters in the contact frame, in units of `length` (m).
         covariance: (3, 3) of (K11, K12, K22) (`curvature_covariance`).
-        spread: (2, 2) covariance of the points in the tangent plane over the variance of their noise: what they were
-            not spread for is weighed down (`quadric.spread_share`). None where that has been seen to.
+        spread: (2, 2) covariance of the points in the tangent plane over the variance of their noise. What they were
+            not spread for is marginalised: noise alone answers it, with −1/R_p where it is that of centroids on a
+            probe. None where a prior answers it.
     """
-    information = inverted(np.outer(TO_Q, TO_Q) * covariance)
-    if spread is not None:
-        share = spread_share(spread)
-        information = share @ information @ share
-    return CurvatureInformation(c[6:] / (UNIT * length), information * length**2)
+    covariance = np.outer(TO_Q, TO_Q) * covariance / length**2
+    axes, wide = (np.eye(3), np.ones(3, dtype=bool)) if spread is None else excited(spread)
+    seen = axes[:, wide]
+    known = inverted(seen.T @ covariance @ seen) if wide.any() else np.zeros((0, 0))
+    return CurvatureInformation(c[6:] / (UNIT * length), seen @ known @ seen.T)
 
 
 def curvature_covariance(c: Array, deviation: Array) -> Array:
