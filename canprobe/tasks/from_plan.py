@@ -31,9 +31,11 @@ CENTROID = CentroidNoise(scale=212e-6, exponent=0.58, length=2e-3, share=0.3)
 the variance at 100 kPa and a fifth at 300 kPa are alike over 2 mm."""
 SIGMA_NORMAL_RAD = 0.3e-3
 """Of what turns no centroid: joint counts displace the probe by 11 µm, and the surface bends by 28 1/m of it."""
-SCANNING = 2.0
-"""Variance of second moments on a pad that slides over changing curvature, over that of the presses that the patch was
-calibrated with: of scans of torus, bowl and wave (seed 0) with the patch alone 1.7, 1.5 and 1.0, rounded up."""
+SIGMA_STIFFNESS = 0.6
+"""Of the logarithm of the layer's stiffness, before any touch."""
+SCALE = 8e-3
+"""Relative error of curvature that no path averages: the centroid shows the ways of the contact over the pad 10 % too
+long or short, and at a rolling share of 0.05 they are a twentieth of what bends the normal."""
 WITH_PATCH = ("recursive", "ml")
 """Estimators whose answers the patch completes and whose regions follow changes; the others stay as they were."""
 
@@ -85,7 +87,7 @@ def make_shape_estimator(task: Touch, method: str) -> Estimator:
         return estimator
     from canprobe.touch.estimate.online import FollowingEstimator
 
-    return FollowingEstimator(_with_patch(task, estimator, memory) if _uses_patch(task) else estimator, memory)
+    return FollowingEstimator(_with_patch(task, estimator, memory) if _uses_patch(task) else estimator, memory, SCALE)
 
 
 def _typical_sigma(task: Touch) -> float:
@@ -106,7 +108,7 @@ def _with_patch(task: Touch, estimator: Estimator, memory: float) -> Estimator:
         task.probe.stiffness,
         windowed=task.array.mode == "window" and int(task.array.window) <= WINDOW,
     )
-    return PatchedEstimator(estimator, PatchCurvature(model, SCANNING), memory)
+    return PatchedEstimator(estimator, PatchCurvature(model, SIGMA_STIFFNESS), memory)
 
 
 def _uses_patch(task: Touch) -> bool:

@@ -16,6 +16,7 @@ from canprobe.robot.model import ArmModel, position_sigma
 from canprobe.touch.contact import (
     CentroidNoise,
     ContactSample,
+    Slope,
     contact_sample,
     indentation_from_force,
     stiffness_from_slope,
@@ -28,12 +29,8 @@ if TYPE_CHECKING:
 
 
 Vector = NDArray[np.float64]
-SETTLING = 0.08
-"""Uncertainty of the curvatures over that of the probe at which the touch yields the layer's stiffness."""
 MOST_RATIO = 6.0
 """Between the slope that is felt and the one of the stated stiffness on a plane; further apart it is not believed."""
-REFUTED = 0.25
-"""Difference of the logarithms of two stiffnesses that the error of a touch does not explain."""
 HOLLOWEST = 0.9
 """Least curvature over −1/radius of the probe at which a patch still makes sense."""
 
@@ -113,7 +110,8 @@ class ContactSensing:
         self.flange_probe = flange_probe
         self.radius = radius
         self.stiffness = stiffness
-        self._slope: float | None = None
+        self._slope: Slope | None = None
+        self._settled = True
         self.set_kappa(np.zeros(2))
         self.patch: Patch | None = None
         self.dropped = 0
@@ -137,38 +135,33 @@ class ContactSensing:
         """Standard deviation of the probe's position along a unit vector (3,), m: joints come in whole counts."""
         return position_sigma(self.model, self._history.newest, self.flange_probe, direction)
 
-    def set_kappa(self, kappa: Vector, sigma: float = 0.0) -> None:
-        """Take the object's principal curvatures (2,), 1/m, as the estimator knows them.
+    def set_kappa(self, kappa: Vector, stiffness: float | None = None) -> None:
+        """Take the object's principal curvatures (2,), 1/m, and the layer's stiffness as the estimator knows them.
 
         An estimate that is no contact of one patch any more (a hollow as tight as the probe) is taken at the limit.
-        Where the stiffness of this very touch was felt, curvatures that are known less well are of no use.
 
         Args:
             kappa: 1/m.
-            sigma: standard deviation of the less certain one, 1/m.
+            stiffness: K/h, N/m³; None from an estimator that has none: what the last touch showed, or else as before.
         """
         possible = np.maximum(kappa, -HOLLOWEST / self.radius)
-        if self._slope is not None:
-            if sigma > SETTLING / self.radius:
-                return
-            self._settle_stiffness(stiffness_from_slope(self._slope, self.radius, possible))
+        if stiffness is not None:
+            self.stiffness = stiffness
+        elif self._slope is not None and not self._settled:
+            self.stiffness = stiffness_from_slope(self._slope.value, self.radius, possible)
+        self._settled = True
         self._depth_at_1_n = float(indentation_from_force(1.0, self.stiffness, self.radius, possible))
 
     def set_depth_at_1_n(self, depth: float) -> None:
         """Place contacts as another sensing did that had this depth at 1 N, m."""
         self._depth_at_1_n = depth
 
-    def set_slope(self, slope: float) -> None:
-        """Take how √F grows with the indentation on this object, √N per m, until its curvature is known."""
+    def set_slope(self, slope: Slope) -> None:
+        """Take what a touch showed; the depth goes by it until the object's curvature is known."""
         flat = 1.0 / float(indentation_from_force(1.0, self.stiffness, self.radius, np.zeros(2)))
-        self._slope = min(max(slope, flat / MOST_RATIO), flat * MOST_RATIO)
-        self._depth_at_1_n = 1.0 / self._slope
-
-    def _settle_stiffness(self, felt: float) -> None:
-        """What was felt, now that the curvature is known: believed where it refutes the stiffness that was stated."""
-        self._slope = None
-        if abs(math.log(felt / self.stiffness)) > REFUTED:
-            self.stiffness = felt
+        self._slope = slope._replace(value=min(max(slope.value, flat / MOST_RATIO), flat * MOST_RATIO))
+        self._settled = False
+        self._depth_at_1_n = 1.0 / self._slope.value
 
     def depth(self, force: float) -> float:
         """Indentation (m) of the layer at ``force`` (N) on the curvature known so far: the root of the force."""
@@ -193,6 +186,7 @@ class ContactSensing:
             sigma_point=None if self._noise is None else self._noise.sigma(self._level_pa, self.stiffness, depth),
             moments=self._moments(sample, patch),
             doubts=patch.doubts,
+            slope=self._slope,
         )
 
     def _moments(self, sample: TactileSample, patch: Patch) -> Moments | None:

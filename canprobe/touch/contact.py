@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,6 +28,13 @@ class Doubt(Enum):
     DEAD = "a dead taxel in the patch"
 
 
+class Slope(NamedTuple):
+    """How √F grows with the indentation in a touch, √N/m, and its standard deviation (`PushFit`)."""
+
+    value: float
+    sigma: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ContactSample:
     """One touch, as the estimators take it.
@@ -42,6 +50,7 @@ class ContactSample:
         sigma_normal: that of the normal per tangent axis, rad; None for the estimator's own.
         moments: second moments uu, uv, vv of the patch along the pad's axes, m² (`patch.moments`); None for none.
         doubts: about the image; estimators give the contact less weight and say so.
+        slope: of the touch that it belongs to; None where it was not felt.
     """
 
     t_s: float
@@ -54,6 +63,7 @@ class ContactSample:
     sigma_normal: float | None = None
     moments: tuple[float, float, float] | None = None
     doubts: tuple[Doubt, ...] = ()
+    slope: Slope | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +132,7 @@ def contact_sample(
     sigma_point: float | None = None,
     moments: tuple[float, float, float] | None = None,
     doubts: tuple[Doubt, ...] = (),
+    slope: Slope | None = None,
 ) -> ContactSample:
     """A sample from the centroid uv (2,) on the pad (m), the indentation (m) and the probe's radius (m).
 
@@ -131,7 +142,9 @@ def contact_sample(
     direction = pad_to_direction(u, v, radius)
     point, normal = contact_on_object(T_base_probe, direction, radius, depth)
     arm = (radius - depth) * direction
-    return ContactSample(t_s, point, normal, T_base_probe, arm, force_n, sigma_point, moments=moments, doubts=doubts)
+    return ContactSample(
+        t_s, point, normal, T_base_probe, arm, force_n, sigma_point, moments=moments, doubts=doubts, slope=slope
+    )
 
 
 def indentation_from_force(force: float, stiffness_n_m3: float, radius: float, kappa: ArrayLike) -> float:

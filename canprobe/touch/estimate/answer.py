@@ -69,6 +69,7 @@ class SurfaceEstimate:
         method: name of the estimator.
         prior: name of what was assumed.
         notes: what a reader should know.
+        stiffness: K/h of the probe's layer, N/m³, from an estimator that knows it; else None.
         problem_root: root of the information (`rootᵀ root`) of the whitened dimensionless least-squares problem.
         model_root: (n, 9) root of the information (`rootᵀ root`, prior included) about the entries of `S` in the
             contact frame, in the order c14, c24, c44, c13, c23, c33, c11, c12, c22; SI units. It holds also what is
@@ -97,6 +98,7 @@ class SurfaceEstimate:
     notes: tuple[str, ...] = ()
     model_root: Array | None = None
     evidence: CurvatureInformation | None = None
+    stiffness: float | None = None
 
     def __post_init__(self) -> None:
         for name in _ARRAYS:
@@ -186,6 +188,7 @@ def build_estimate(
     prior: str,
     notes: tuple[str, ...] = (),
     evidence: CurvatureInformation | None = None,
+    stiffness: float | None = None,
 ) -> SurfaceEstimate:
     """An estimate from a solution in units of `length` (m)."""
     S = matrix_of(solution.c)
@@ -223,6 +226,7 @@ def build_estimate(
         notes=notes,
         model_root=None if solution.root is None else solution.root * [1.0, 1.0, 1.0 / length, *6 * [length]],
         evidence=evidence,
+        stiffness=stiffness,
     )
 
 

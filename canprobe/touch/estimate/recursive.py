@@ -146,6 +146,8 @@ MOST_PENDING = 16
 """Samples of one step that are kept; of a slower motion the last ones."""
 STARTING = 1.6
 """How much higher the alarm's thresholds are during a start: the first answers are soon put right by themselves."""
+ALIKE = 1.4
+"""The same where the errors of neighbours are alike: running means vary more."""
 GENEROUS = 0.5
 """Usual innovation below which the stated noise is not believed where a misfit is looked for."""
 
@@ -201,6 +203,7 @@ class RecursiveEstimator:
         self._prior = Prior.weak(memory_m) if prior is None else prior
         if math.isfinite(self._prior.sigma_curvature):
             raise UsageError("prior: expected none on curvature itself for 'recursive', got " + self._prior.name)
+        self._caution = 1.0 if correlation is None else ALIKE
         self._filter = InformationFilter(self._memory, self._prior, correlation)
         self.reset()
 
@@ -290,7 +293,7 @@ class RecursiveEstimator:
     def _step(self, moved: float) -> None:
         """Take what is pending into the filter or its start; after a change of the surface into a new start."""
         compared = self._compared() if self._settled else None
-        caution = 1.0 if self._start is None else STARTING
+        caution = self._caution if self._start is None else STARTING * self._caution
         if compared and any([self._change.take(square, caution) for square in compared.squares.tolist()]):
             explained = self._explained(compared)
             if explained is None:
