@@ -212,8 +212,8 @@ SPAN = 0.5
 LEAST_SPAN = 0.05
 """The same just after a start."""
 LAG = 0.075
-"""Path, over the memory, that an answer lags behind, one standard deviation: 1.5 mm of 20 mm, half a patch. Set on the
-calibration seeds of `canprobe study pipeline`."""
+"""Path, over the memory, that an answer lags behind, one standard deviation: 1.5 mm of 20 mm, half a patch. Set on
+scans of nine packaged scenes."""
 
 
 class FollowingEstimator:
