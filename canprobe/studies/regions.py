@@ -255,11 +255,12 @@ def findings(rows: Sequence[Row]) -> list[str]:
     for row in rows:
         share = 100 * row["coverage"]
         if row["of"] == "all":
+            answering = row["scenes"] - row["refused"]
             said.append(
                 f"{row['group']} scenes: {share:.1f} % of {row['answers']} regions hold the truth "
                 f"({100 * row['coverage_low']:.1f} to {100 * row['coverage_high']:.1f} by scenes drawn anew; asked "
-                f"for: 93–97 %), below 80 % in {100 * row['below_80']:.1f} % of {row['scenes'] - row['refused']} scenes "
-                f"and below 40 % in {100 * row['below_40']:.1f} %; stated over error {row['stated_over_error']:.2f}; "
+                f"for: 93–97 %), below 80 % in {100 * row['below_80']:.1f} % of {answering} scenes and below 40 % in "
+                f"{100 * row['below_40']:.1f} %; stated over error {row['stated_over_error']:.2f}; "
                 f"{row['refused']} scenes refused."
             )
         elif not ASKED[0] <= row["coverage"] <= ASKED[1]:

@@ -324,9 +324,13 @@ class RecursiveEstimator:
         return left if self._change.usual_again(left.squares) else None
 
     def _judged(self, rows: Array, residuals: Array, unexplained: Array) -> _Compared:
-        """Weighted by their places, and from the 99.9 % point of χ² on by the square of `CHI2_999 / d²`."""
+        """Weighted by their places, and from a limit on by the square of `limit / d²`.
+
+        It is the 99.9 % point of χ², times the running innovation: where all disagree none is wrong.
+        """
         squares = self._filter.squared_innovations(rows, unexplained)
-        weights = np.array([p.weight for p in self._pending]) * np.square(CHI2_999 / np.maximum(squares, CHI2_999))
+        limit = CHI2_999 * max(1.0, self._change.innovation)
+        weights = np.array([p.weight for p in self._pending]) * np.square(limit / np.maximum(squares, limit))
         return _Compared(rows, residuals, squares, weights)
 
     def _absorb(self, compared: _Compared, moved: float) -> None:

@@ -252,8 +252,9 @@ class PatchCurvature:
                 model = self._model(x[3])
                 J[:, :3], r, W = model.linearised(seen.moments, self.force, self.frames, k)
                 if round_ == 0:  # it hardly changes from step to step
-                    stiffer = self._model(x[3] + _STIFFER).linearised(seen.moments, self.force, self.frames, k)[1]
-                    J[:, 3] = (r - stiffer) / _STIFFER
+                    xx, _, yy = seen.moments
+                    there, here = (m.moments(k, self.force) for m in (self._model(x[3] + _STIFFER), model))
+                    J[:, 3] = np.subtract(there, here) / np.array([xx, math.sqrt(xx * yy), yy]) / _STIFFER
                 W = _less_certain(W, seen)
                 W *= model.trust(k, self.force)
                 JW = J.T @ W
