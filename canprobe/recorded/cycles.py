@@ -109,5 +109,5 @@ def replay_contacts(plan: Plan, measurements: Iterable[Measurement]) -> tuple[Sh
         tracker.add(contact)
         estimate = tracker.answer_at_once(measurement.t_ns * 1e-9)
         if estimate is not None and bool(np.all(estimate.observed)):
-            sensing.set_kappa(np.asarray(estimate.kappa))
+            sensing.set_kappa(np.asarray(estimate.kappa), estimate.stiffness)
     return tracker, sensing.dropped

@@ -126,7 +126,7 @@ def _draw_curvature(part: SubFigure, result: RunResult) -> None:
         axes.fill_between(travelled, lower[:, i], upper[:, i], color=colour, alpha=0.22, linewidth=0)
         axes.plot(travelled, kappa[:, i], color=colour, label=f"{name}, {method}, 95 % band")
     known = [band[np.isfinite(band)] for band in (lower, upper)]
-    limits = [np.percentile(band, (10, 90)) for band in known if len(band)]  # how it begins does not set the scale
+    limits = [np.percentile(band, (20, 80)) for band in known if len(band)]  # how it begins does not set the scale
     if result.truth:
         true = result.truth["kappa"][np.searchsorted(result.log["t_s"], [r.t_s - 1e-6 for r in records])]
         axes.plot(travelled, true, color=INK, linestyle="--", label="true")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,9 @@ from canprobe.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.touch.consistency import PARTS, Consistency, check_consistency
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.surface_map import LocalPatch, SurfaceMap, merge_patches
+
+if TYPE_CHECKING:
+    from canprobe.touch.estimate.noise import Correlation
 
 Array = NDArray[np.float64]
 RUN_IN_M = 0.020
@@ -126,13 +129,13 @@ def bound_of_scan(
     sync_times: Array,
     *,
     memory_m: float,
-    sigma_point: float,
     sigma_normal: float,
+    correlation: Correlation,
     coupling: float = 0.0,
 ) -> float | None:
     """Cramér–Rao bound on the RMS Frobenius error of K (1/m), over the run; None where a window leaves K open.
 
-    The limit of unbiased estimates from the last ``memory_m`` of path with independent noise of the stated size, the
+    The limit of unbiased estimates from the last ``memory_m`` of path with noise of the stated size, the
     mean over ``CHECKPOINTS`` places after the run-in. An estimator with a longer memory may be better.
 
     Args:
@@ -140,7 +143,8 @@ def bound_of_scan(
         truth: columns of the plant's truth, one row a SYNC.
         sync_times: time of each SYNC on the master's clock (n,), s.
         memory_m: path that counts, m.
-        sigma_point, sigma_normal: effective noise, m and rad.
+        sigma_normal: of the normals, rad; that of the points is in the samples.
+        correlation: of the noise along the path.
         coupling: of the errors of point and normal (`Noise`), 1/m.
     """
     from canprobe.touch.estimate.likelihood import cramer_rao
@@ -148,6 +152,7 @@ def bound_of_scan(
 
     points = np.array([s.p_base for s in samples])
     normals = np.array([s.n_base for s in samples])
+    sigmas = np.array([s.sigma_point for s in samples], dtype=np.float64)
     path = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
     if len(path) < 3 or path[-1] < max(RUN_IN_M, memory_m):
         return None
@@ -163,7 +168,7 @@ def bound_of_scan(
         surface = SurfaceMatrix.from_curvature(np.diag(truth["kappa"][row])).transformed(np.linalg.inv(T))
         C = cramer_rao(
             points[first : last + 1], normals[first : last + 1], surface,
-            sigma_point=sigma_point, sigma_normal=sigma_normal, coupling=coupling,
+            sigma_point=sigmas[first : last + 1], sigma_normal=sigma_normal, coupling=coupling, correlation=correlation,
         )  # fmt: skip
         squares.append(C[0, 0] + 2 * C[1, 1] + C[2, 2])
     mean = float(np.mean(squares))

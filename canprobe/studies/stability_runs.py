@@ -35,7 +35,7 @@ from canprobe.studies.harness import Array, Row
 from canprobe.tasks.from_plan import make_task
 from canprobe.tasks.sensing import ContactSensing
 from canprobe.tasks.touch import TouchTask
-from canprobe.touch.contact import indentation_from_force
+from canprobe.touch.contact import Slope, indentation_from_force
 from canprobe.touch.patch.image_model import make_patch_calibration
 
 
@@ -241,7 +241,7 @@ class Case:
 class StatedSensing(ContactSensing):
     """Uses the stiffness of the scene, not the one estimated from the touch."""
 
-    def set_slope(self, slope: float) -> None:
+    def set_slope(self, slope: Slope) -> None:
         """Ignore it."""
 
 
@@ -350,7 +350,7 @@ def loop_of(case: Case) -> ForceLoop:
     told = 1.0 / stated_sensing(scene, ContactSensing).depth(1.0)
     if case.feels:
         sensing = stated_sensing(scene, ContactSensing)
-        sensing.set_slope(slope)
+        sensing.set_slope(Slope(slope, 0.0))
         told = 1.0 / sensing.depth(1.0)
     return ForceLoop(
         depth_ratio=slope / told,

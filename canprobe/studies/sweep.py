@@ -286,7 +286,7 @@ STUDIES: Mapping[str, str] = MappingProxyType(
         "estimators": "error of the shape estimators against their run time, with the Cramér–Rao bound",
         "bound": "error and coverage of the estimators over the Cramér–Rao bound: surfaces, sizes, paths and noise",
         "arrays": "how well forty touches calibrate an emulated array that nobody has seen",
-        "pipeline": "whether the online estimator's 95 % regions hold the truth with the whole sensor pipeline on",
+        "regions": "whether the online estimator's 95 % regions hold the truth, over packaged and random scenes",
         "workprec": "error of the dynamic plant against its run time, and of the whole cell against its computing time",
         "stability": "where the force loop settles, predicted and carried out, and how every other touch ends",
         "realtime": "how well the cycle keeps time on a real vcan0, against plain canopen-python; needs that interface",

@@ -15,29 +15,24 @@ from canprobe.tasks.probing import ProbingTask
 from canprobe.tasks.sensing import ContactSensing
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker, replay_samples
 from canprobe.tasks.touch import TouchTask
+from canprobe.touch.contact import indentation_from_force
 from canprobe.touch.patch.image_model import make_image_model, make_patch_calibration
 from canprobe.touch.patch.moments import MomentImage
 
 if TYPE_CHECKING:
+    from canprobe.touch.estimate.noise import Correlation
     from canprobe.touch.estimate.online import Estimator
 
 
 # Plan → the tasks that touch.
 
-SIGMA_POINT_M = 0.09e-3
-SIGMA_NORMAL_RAD = 1.8e-3
-"""Of what no error of the centroid explains: that one turns the normal by 1/R_p of it as well (`Noise.coupling`).
-
-On the calibration seeds 97.6 % of the 95 % regions hold the truth with these, and 86.9 % on the sphere, whose curvature
-is felt 1 % too large. 0.1 mm and 2 mrad make it 98.6 % and 92.2 %, 0.08 mm and 1.6 mrad 95 % and three in four.
-"""
-CORRELATION = (4e-3, 0.015)
-"""Length (m) and share of errors that last: gains, hysteresis and creep err alike for millimetres. Single errors are a
-third of what is stated, so the share is of that. Set on seeds 0 and 1 of nine scenes, and what no centroid explains on
-seeds 100 and 101 of saddle and sphere; `canprobe study pipeline` verifies with others."""
-SCANNING = 2.0
-"""Variance of second moments on a pad that slides over changing curvature, over that of the presses that the patch was
-calibrated with: of scans of torus, bowl and wave (seed 0) with the patch alone 1.7, 1.5 and 1.0, rounded up."""
+SIGMA_NORMAL_RAD = 0.3e-3
+"""Of what turns no centroid: joint counts displace the probe by 11 µm, and the surface bends by 28 1/m of it."""
+SIGMA_STIFFNESS = 0.6
+"""Of the logarithm of the layer's stiffness, before any touch."""
+SCALE = 8e-3
+"""Relative error of curvature that no path averages: the centroid shows the ways of the contact over the pad 10 % too
+long or short, and at a rolling share of 0.05 they are a twentieth of what bends the normal."""
 WITH_PATCH = ("recursive", "ml")
 """Estimators whose answers the patch completes and whose regions follow changes; the others stay as they were."""
 
@@ -51,6 +46,7 @@ def make_sensing(task: Touch | Calibrate) -> ContactSensing:
         calibration,
         task.probe.radius,
         task.probe.stiffness,
+        noise=task.array.calibration.centroid,
         moment_image=MomentImage(calibration) if isinstance(task, Touch) and _uses_patch(task) else None,
         lag=task.array.calibration.centroid.lag,
     )
@@ -61,28 +57,43 @@ def centroid_coupling(probe: Probe) -> float:
     return 1.0 / probe.radius
 
 
+def centroid_correlation(task: Touch) -> Correlation:
+    """Of the noise of contacts along their path."""
+    from canprobe.touch.estimate.noise import Correlation  # only where a shape is asked for
+
+    centroid = task.array.calibration.centroid
+    return Correlation(centroid.correlation, centroid.share)
+
+
 def make_shape_estimator(task: Touch, method: str) -> Estimator:
     """An estimator as a scan's setup has it, by name."""
     from canprobe.touch.estimate.fit import make_estimator  # only where a shape is asked for
-    from canprobe.touch.estimate.noise import Correlation
 
     assert task.shape is not None and task.scan is not None
     memory = task.shape.memory
     window = max(8, round(memory / task.scan.speed * task.array.rate_hz))
     estimator = make_estimator(
         method,
-        sigma_point=SIGMA_POINT_M,
+        sigma_point=_typical_sigma(task),
         sigma_normal=SIGMA_NORMAL_RAD,
         memory_m=memory,
         window=window,
-        correlation=Correlation(*CORRELATION),
+        correlation=centroid_correlation(task),
         coupling=centroid_coupling(task.probe),
     )
     if method not in WITH_PATCH:
         return estimator
     from canprobe.touch.estimate.online import FollowingEstimator
 
-    return FollowingEstimator(_with_patch(task, estimator, memory) if _uses_patch(task) else estimator, memory)
+    return FollowingEstimator(_with_patch(task, estimator, memory) if _uses_patch(task) else estimator, memory, SCALE)
+
+
+def _typical_sigma(task: Touch) -> float:
+    """Standard deviation of a contact at the wanted force on a plane, m: of what has none of its own."""
+    probe = task.probe
+    depth = indentation_from_force(task.force, probe.stiffness, probe.radius, (0.0, 0.0))
+    level_pa = MomentImage(make_patch_calibration(task.array.calibration, task.array.pad)).level_pa
+    return task.array.calibration.centroid.sigma(level_pa / (probe.stiffness * float(depth)))
 
 
 def _with_patch(task: Touch, estimator: Estimator, memory: float) -> Estimator:
@@ -93,7 +104,7 @@ def _with_patch(task: Touch, estimator: Estimator, memory: float) -> Estimator:
     patch = make_patch_calibration(array.calibration, array.pad)
     windowed = array.mode == "window" and int(array.window) <= WINDOW
     model = make_image_model(array.calibration, patch, seen=int(array.window) if windowed else None)
-    return PatchedEstimator(estimator, PatchCurvature(model, SCANNING), memory)
+    return PatchedEstimator(estimator, PatchCurvature(model, SIGMA_STIFFNESS), memory)
 
 
 def _uses_patch(task: Touch) -> bool:

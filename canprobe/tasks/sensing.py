@@ -14,8 +14,8 @@ from canprobe.cell.array import patch_of
 from canprobe.cell.controller import Measurement, TactileSample
 from canprobe.robot.chain import forward
 from canprobe.robot.model import ArmModel, position_sigma
-from canprobe.touch.contact import ContactSample, contact_sample, indentation_from_force, stiffness_from_slope
-from canprobe.touch.patch.array_calibration import Lag
+from canprobe.touch.contact import ContactSample, Slope, contact_sample, indentation_from_force, stiffness_from_slope
+from canprobe.touch.patch.array_calibration import CentroidErrors, Lag
 from canprobe.touch.patch.image import Patch, PatchCalibration, mended
 from canprobe.touch.patch.moments import MomentImage, Moments, PadLag
 
@@ -24,12 +24,8 @@ if TYPE_CHECKING:
 
 
 Vector = NDArray[np.float64]
-SETTLING = 0.08
-"""Uncertainty of the curvatures over that of the probe at which the touch yields the layer's stiffness."""
 MOST_RATIO = 6.0
 """Between the slope that is felt and the one of the stated stiffness on a plane; further apart it is not believed."""
-REFUTED = 0.25
-"""Difference of the logarithms of two stiffnesses that the error of a touch does not explain."""
 HOLLOWEST = 0.9
 """Least curvature over −1/radius of the probe at which a patch still makes sense."""
 
@@ -91,6 +87,7 @@ class ContactSensing:
         radius: of the probe, m.
         stiffness: K/h of the layer, N/m³.
         moment_image: gives the contacts the second moments of their images; None leaves them out.
+        noise: of the centroids; None: the contacts do not state theirs.
         lag: how far the array's centroids trail the contact; None: they do not.
     """
 
@@ -102,6 +99,7 @@ class ContactSensing:
         radius: float,
         stiffness: float,
         *,
+        noise: CentroidErrors | None = None,
         moment_image: MomentImage | None = None,
         lag: Lag | None = None,
     ) -> None:
@@ -109,11 +107,14 @@ class ContactSensing:
         self.flange_probe = flange_probe
         self.radius = radius
         self.stiffness = stiffness
-        self._slope: float | None = None
+        self._slope: Slope | None = None
+        self._settled = True
         self.set_kappa(np.zeros(2))
         self.patch: Patch | None = None
         self.dropped = 0
         self._calibration = calibration
+        self._noise = noise
+        self._level_pa = MomentImage(calibration).level_pa
         self._moment_image = moment_image
         self._lag = None if lag is None else PadLag(lag)
         self._history = JointHistory()
@@ -131,38 +132,33 @@ class ContactSensing:
         """Standard deviation of the probe's position along a unit vector (3,), m: joints come in whole counts."""
         return position_sigma(self.model, self._history.newest, self.flange_probe, direction)
 
-    def set_kappa(self, kappa: Vector, sigma: float = 0.0) -> None:
-        """Take the object's principal curvatures (2,), 1/m, as the estimator knows them.
+    def set_kappa(self, kappa: Vector, stiffness: float | None = None) -> None:
+        """Take the object's principal curvatures (2,), 1/m, and the layer's stiffness as the estimator knows them.
 
         An estimate that is no contact of one patch any more (a hollow as tight as the probe) is taken at the limit.
-        Where the stiffness of this very touch was felt, curvatures that are known less well are of no use.
 
         Args:
             kappa: 1/m.
-            sigma: standard deviation of the less certain one, 1/m.
+            stiffness: K/h, N/m³; None from an estimator that has none: what the last touch showed, or else as before.
         """
         possible = np.maximum(kappa, -HOLLOWEST / self.radius)
-        if self._slope is not None:
-            if sigma > SETTLING / self.radius:
-                return
-            self._settle_stiffness(stiffness_from_slope(self._slope, self.radius, possible))
+        if stiffness is not None:
+            self.stiffness = stiffness
+        elif self._slope is not None and not self._settled:
+            self.stiffness = stiffness_from_slope(self._slope.value, self.radius, possible)
+        self._settled = True
         self._depth_at_1_n = float(indentation_from_force(1.0, self.stiffness, self.radius, possible))
 
     def set_depth_at_1_n(self, depth: float) -> None:
         """Place contacts as another sensing did that had this depth at 1 N, m."""
         self._depth_at_1_n = depth
 
-    def set_slope(self, slope: float) -> None:
-        """Take how √F grows with the indentation on this object, √N per m, until its curvature is known."""
+    def set_slope(self, slope: Slope) -> None:
+        """Take what a touch showed; the depth goes by it until the object's curvature is known."""
         flat = 1.0 / float(indentation_from_force(1.0, self.stiffness, self.radius, np.zeros(2)))
-        self._slope = min(max(slope, flat / MOST_RATIO), flat * MOST_RATIO)
-        self._depth_at_1_n = 1.0 / self._slope
-
-    def _settle_stiffness(self, felt: float) -> None:
-        """What was felt, now that the curvature is known: believed where it refutes the stiffness that was stated."""
-        self._slope = None
-        if abs(math.log(felt / self.stiffness)) > REFUTED:
-            self.stiffness = felt
+        self._slope = slope._replace(value=min(max(slope.value, flat / MOST_RATIO), flat * MOST_RATIO))
+        self._settled = False
+        self._depth_at_1_n = 1.0 / self._slope.value
 
     def depth(self, force: float) -> float:
         """Indentation (m) of the layer at ``force`` (N) on the curvature known so far: the root of the force."""
@@ -180,19 +176,26 @@ class ContactSensing:
             self.dropped += 1
             return None
         t_s, uv = sample.t_sample_ns * 1e-9, (patch.u, patch.v)
+        depth = self.depth(patch.force)
         found = contact_sample(
             t_s=t_s,
             T_base_probe=T_base_probe,
             uv=uv if self._lag is None else self._lag.step(t_s, *uv),
-            depth=self.depth(patch.force),
+            depth=depth,
             radius=self.radius,
             force_n=patch.force,
+            sigma_point=None if self._noise is None else self._noise.sigma(self._lightness(depth)),
             moments=self._moments(sample, patch),
             doubts=patch.doubts,
+            slope=self._slope,
         )
         if not sample.t_sigma_s:
             return found
         return replace(found, sigma_motion=sample.t_sigma_s * self._speed(sample.t_sample_ns, found))
+
+    def _lightness(self, depth: float) -> float:
+        """Level that is taken off the image over the peak pressure of a contact that sinks in by a depth (m)."""
+        return self._level_pa / (self.stiffness * depth) if depth > 0.0 else 1.0
 
     def _speed(self, t_ns: int, contact: ContactSample) -> float:
         """Of the probe at the contact, m/s: what an error of the instant displaces the contact by; 0 without a past."""

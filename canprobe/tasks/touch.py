@@ -19,7 +19,7 @@ from canprobe.tasks.probing import LineMotion, Phase, ProbingTask, smooth_step
 from canprobe.tasks.sensing import ContactSensing, is_too_hollow
 from canprobe.tasks.shape import ShapeTracker
 from canprobe.tasks.task import Loss, TaskRecord
-from canprobe.touch.contact import AtRest, ContactSample, PushFit
+from canprobe.touch.contact import AtRest, ContactSample, PushFit, Slope
 from canprobe.touch.patch.image import Patch
 from canprobe.touch.servo import LocalSurface, PathFollower, ProbePose, TactileServo
 
@@ -216,7 +216,7 @@ class TouchTask(ProbingTask):
         self._push.add(float(normal @ (first - centre)), contact.force_n)
         if self._push.certain(CERTAIN):
             before = self.sensing.depth(contact.force_n)
-            self.sensing.set_slope(self._push.slope)
+            self.sensing.set_slope(Slope(self._push.slope, self._push.sigma))
             rise = self.sensing.depth(contact.force_n) - before
             self._servo.surface.raise_by(rise)
             self._depth0 += rise
@@ -236,8 +236,7 @@ class TouchTask(ProbingTask):
         if bool(np.all(estimate.observed)):
             self._servo.surface.set_curvature(estimate.curvature_tensor_base())
             before = self.sensing.depth(contact.force_n)
-            sigma = float(np.sqrt(np.linalg.eigvalsh(estimate.covariance)[-1]))
-            self.sensing.set_kappa(np.asarray(estimate.kappa), sigma)
+            self.sensing.set_kappa(np.asarray(estimate.kappa), estimate.stiffness)
             # the depth that is aimed at has changed as much: without this the force would jump with the first answer
             self._servo.surface.raise_by(self.sensing.depth(contact.force_n) - before)
             if self.phase not in _LEAVING and is_too_hollow(estimate, self.sensing.radius):

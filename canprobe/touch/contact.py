@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,6 +26,13 @@ class Doubt(Enum):
     CUT = "a patch cut by the pad's edge"
     SMALL = "hardly a patch"
     DEAD = "a dead taxel in the patch"
+
+
+class Slope(NamedTuple):
+    """How √F grows with the indentation in a touch, √N/m, and its standard deviation (`PushFit`)."""
+
+    value: float
+    sigma: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,6 +52,7 @@ class ContactSample:
         doubts: about the image; estimators give the contact less weight and say so.
         sigma_motion: standard deviation of the point from an instant that is not known well while the probe moves, m;
             it comes on top of that of the point.
+        slope: of the touch that it belongs to; None where it was not felt.
     """
 
     t_s: float
@@ -57,6 +66,7 @@ class ContactSample:
     moments: tuple[float, float, float] | None = None
     doubts: tuple[Doubt, ...] = ()
     sigma_motion: float = 0.0
+    slope: Slope | None = None
 
 
 def pad_to_direction(u: float, v: float, radius: float) -> Array:
@@ -97,8 +107,10 @@ def contact_sample(
     depth: float,
     radius: float,
     force_n: float,
+    sigma_point: float | None = None,
     moments: tuple[float, float, float] | None = None,
     doubts: tuple[Doubt, ...] = (),
+    slope: Slope | None = None,
 ) -> ContactSample:
     """A sample from the centroid uv (2,) on the pad (m), the indentation (m) and the probe's radius (m).
 
@@ -108,7 +120,9 @@ def contact_sample(
     direction = pad_to_direction(u, v, radius)
     point, normal = contact_on_object(T_base_probe, direction, radius, depth)
     arm = (radius - depth) * direction
-    return ContactSample(t_s, point, normal, T_base_probe, arm, force_n, moments=moments, doubts=doubts)
+    return ContactSample(
+        t_s, point, normal, T_base_probe, arm, force_n, sigma_point, moments=moments, doubts=doubts, slope=slope
+    )
 
 
 def indentation_from_force(force: float, stiffness_n_m3: float, radius: float, kappa: ArrayLike) -> float:

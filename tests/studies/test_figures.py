@@ -23,9 +23,9 @@ from canprobe.studies import stability as stability_figure
 from canprobe.studies.bound import NOISES, SIZES_M, SURFACES, draw_bound
 from canprobe.studies.estimators import draw_estimators
 from canprobe.studies.faults import draw_ends, draw_faults
-from canprobe.studies.pipeline import draw_pipeline
 from canprobe.studies.realtime import draw_realtime
 from canprobe.studies.realtime_cases import CycleTimes, Measured
+from canprobe.studies.regions import draw_regions
 from canprobe.studies.soak import draw_soak
 from canprobe.studies.workprec import draw_workprec
 from canprobe.studies.workprec_cell import FASTER, FIDELITIES, MODES, RATES_HZ, REAL, draw_cell
@@ -79,14 +79,15 @@ def every_estimator(path):
     draw_estimators(rows, path)
 
 
-def pipeline(path):
-    entries = dict(zip(("z_rms_K11", "z_rms_K12", "z_rms_K22"), (0.4, 0.8, 1.6), strict=True))
+def regions(path):
+    kinds = ("cylinder", "ellipsoid", "fillet", "plane", "saddle", "sphere", "torus", "wave", "100 kPa", "all")
     rows = [
-        {"scene": scene, "seeds": seeds, "coverage": 0.92 + 0.01 * i} | entries
-        for i, scene in enumerate(("cylinder", "ellipsoid", "fillet", "plane", "saddle", "sphere", "torus", "wave"))
-        for seeds in ("calibration", "verification")
+        {"group": group, "of": kind, "coverage": 0.9 + 0.01 * i, "coverage_low": 0.85, "coverage_high": 1.0}
+        | {"stated_over_error": 0.8 + 0.2 * i, "stated_low": 0.6, "stated_high": 3.0}
+        for i, kind in enumerate(kinds)
+        for group in ("packaged", "random")
     ]
-    draw_pipeline(rows, path)
+    draw_regions(rows, path)
 
 
 def plant(path, stiffnesses=workprec.STIFFNESSES, steps=workprec.STEPS_US):
@@ -184,7 +185,7 @@ PICTURES = {
     "plan": lambda path: draw_plan(canprobe.plan(canprobe.load_scene("cylinder")), path),
     "bound": bound,
     "estimators": every_estimator,
-    "pipeline": pipeline,
+    "regions": regions,
     "workprec": plant,
     "workprec, quick": functools.partial(plant, stiffnesses=workprec.STIFFNESSES[:2], steps=workprec.STEPS_US[1:3]),
     "workprec, cell": whole_cell,

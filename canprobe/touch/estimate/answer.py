@@ -14,9 +14,9 @@ from canprobe.touch.estimate.quadric import (
     UNIT,
     Decision,
     curvature_jacobian,
+    excited,
     matrix_of,
     outside,
-    spread_share,
     tensor,
     transport,
 )
@@ -69,6 +69,7 @@ class SurfaceEstimate:
         method: name of the estimator.
         prior: name of what was assumed.
         notes: what a reader should know.
+        stiffness: K/h of the probe's layer, N/m³, from an estimator that knows it; else None.
         problem_root: root of the information (`rootᵀ root`) of the whitened dimensionless least-squares problem.
         model_root: (n, 9) root of the information (`rootᵀ root`, prior included) about the entries of `S` in the
             contact frame, in the order c14, c24, c44, c13, c23, c33, c11, c12, c22; SI units. It holds also what is
@@ -97,6 +98,7 @@ class SurfaceEstimate:
     notes: tuple[str, ...] = ()
     model_root: Array | None = None
     evidence: CurvatureInformation | None = None
+    stiffness: float | None = None
 
     def __post_init__(self) -> None:
         for name in _ARRAYS:
@@ -186,6 +188,7 @@ def build_estimate(
     prior: str,
     notes: tuple[str, ...] = (),
     evidence: CurvatureInformation | None = None,
+    stiffness: float | None = None,
 ) -> SurfaceEstimate:
     """An estimate from a solution in units of `length` (m)."""
     S = matrix_of(solution.c)
@@ -223,6 +226,7 @@ def build_estimate(
         notes=notes,
         model_root=None if solution.root is None else solution.root * [1.0, 1.0, 1.0 / length, *6 * [length]],
         evidence=evidence,
+        stiffness=stiffness,
     )
 
 
@@ -321,14 +325,15 @@ def evidence_of(c: Array, covariance: Array, spread: Array | None, length: float
     Args:
         c: (9,) parameters in the contact frame, in units of `length` (m).
         covariance: (3, 3) of (K11, K12, K22) (`curvature_covariance`).
-        spread: (2, 2) covariance of the points in the tangent plane over the variance of their noise: what they were
-            not spread for is weighed down (`quadric.spread_share`). None where that has been seen to.
+        spread: (2, 2) covariance of the points in the tangent plane over the variance of their noise. What they were
+            not spread for is marginalised: noise alone answers it, with −1/R_p where it is that of centroids on a
+            probe. None where a prior answers it.
     """
-    information = inverted(np.outer(TO_Q, TO_Q) * covariance)
-    if spread is not None:
-        share = spread_share(spread)
-        information = share @ information @ share
-    return CurvatureInformation(c[6:] / (UNIT * length), information * length**2)
+    covariance = np.outer(TO_Q, TO_Q) * covariance / length**2
+    axes, wide = (np.eye(3), np.ones(3, dtype=bool)) if spread is None else excited(spread)
+    seen = axes[:, wide]
+    known = inverted(seen.T @ covariance @ seen) if wide.any() else np.zeros((0, 0))
+    return CurvatureInformation(c[6:] / (UNIT * length), seen @ known @ seen.T)
 
 
 def curvature_covariance(c: Array, deviation: Array) -> Array:

@@ -44,13 +44,11 @@ def make_estimator(
 
     Args:
         method: one of `METHODS`.
-        sigma_point: effective standard deviation of a contact point per axis, m. Along a path a real sensor's errors
-            are correlated: give what independent samples at this density would have to have.
+        sigma_point: effective standard deviation of a contact point per axis, m.
         sigma_normal: of a normal per tangent axis, rad.
         memory_m: path that `recursive` remembers (e-folding), m.
         window: samples that the batch methods keep; for `recursive` the samples on one memory at the nominal pace.
-        prior, lag, correlation, coupling: as for `fit_surface`, the correlation for `recursive` only; the deviations
-            are then those of one sample.
+        prior, lag, correlation, coupling: as for `fit_surface`.
 
     Raises:
         UsageError: on an unknown method or a value out of range.
@@ -67,7 +65,12 @@ def make_estimator(
         )
     if method == "ml":
         return MlEstimator(
-            sigma_point=sigma_point, sigma_normal=sigma_normal, window=window, prior=prior, coupling=coupling
+            sigma_point=sigma_point,
+            sigma_normal=sigma_normal,
+            window=window,
+            prior=prior,
+            coupling=coupling,
+            correlation=correlation,
         )
     if method == "chord":
         return ChordEstimator(sigma_point=sigma_point, sigma_normal=sigma_normal, window=window)

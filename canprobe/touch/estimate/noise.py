@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 from canprobe.errors import UsageError
 from canprobe.touch.linear_algebra import Array, checked, positive
 
-CHI2_MEDIAN, CHI2_99, CHI2_999 = 2.366, 11.34, 16.27
-"""Median, 99 % and 99.9 % points of χ² with three degrees of freedom, which a sample has."""
+CHI2_MEDIAN, CHI2_95, CHI2_99, CHI2_999 = 2.366, 7.815, 11.34, 16.27
+"""Median, 95 %, 99 % and 99.9 % points of χ² with three degrees of freedom, which a sample has."""
 
 
 @dataclass(frozen=True, slots=True)

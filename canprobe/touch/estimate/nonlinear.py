@@ -94,13 +94,13 @@ def fit(d: Design, prior: tuple[Array, Array], independent: Array | None = None)
             c = best + step
             continue
         best, best_cost, halvings = c, cost, 0
-        r, J = r.reshape(-1), J.reshape(-1, 9)
-        chi2 = float(r @ r)
-        target, root, decision = solve_rows(J, J @ c - r, prior, spread, size_of(c), known=decision)
+        A, residuals = J.reshape(-1, 9), r.reshape(-1)
+        b, chi2 = A @ c - residuals, float(residuals @ residuals)
+        target, root, decision = solve_rows(A, b, prior, spread, size_of(c), known=decision)
         step = target - best
         c = target
         if np.abs(step).max() < _TOLERANCE:
-            final = solve_rows(J, J @ best - r, prior, spread, size_of(c))
+            final = solve_rows(A, b, prior, spread, size_of(c))
             if final[2].rank == decision.rank:
                 c, root, decision = final
                 converged = True
@@ -108,7 +108,7 @@ def fit(d: Design, prior: tuple[Array, Array], independent: Array | None = None)
             decision = final[2]
     c = c if converged else best
     has_prior = bool(prior[0][3:].any())
-    free, free_root = (c, root) if has_prior else _freed(best, J, r, root, prior)
+    free, free_root = (c, root) if has_prior else _freed(best, A, residuals, root, prior)
     freedom = max(3 * len(square) - 6 - decision.rank, 1)
     return Fit(c, root, decision, free, free_root, chi2 / freedom, int(np.sum(weight < 1.0)), converged)
 

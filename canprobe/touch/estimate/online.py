@@ -213,8 +213,8 @@ SPAN = 0.5
 LEAST_SPAN = 0.05
 """The same just after a start."""
 LAG = 0.075
-"""Path, over the memory, that an answer lags behind, one standard deviation: 1.5 mm of 20 mm, half a patch. Set on the
-calibration seeds of `canprobe study pipeline`."""
+"""Path, over the memory, that an answer lags behind, one standard deviation: 1.5 mm of 20 mm, half a patch. Set on
+scans of nine packaged scenes."""
 
 
 class FollowingEstimator:
@@ -223,10 +223,12 @@ class FollowingEstimator:
     Args:
         inner: the estimator.
         memory_m: path that it remembers, m.
+        scale: relative error that all curvatures have in common.
     """
 
-    def __init__(self, inner: Estimator, memory_m: float) -> None:
+    def __init__(self, inner: Estimator, memory_m: float, scale: float = 0.0) -> None:
         self._inner = inner
+        self._scale = scale
         self._memory = memory_m
         self._past: deque[tuple[float, Array]] = deque()
         self._place: Array | None = None
@@ -258,7 +260,8 @@ class FollowingEstimator:
         tensor = answer.curvature_tensor_base()
         late = self._late(tensor)
         self._past.append((self._travelled, tensor))
-        return answer if late is None else less_certain(answer, late)
+        answer = answer if late is None else less_certain(answer, late)
+        return answer if self._scale == 0.0 else less_certain(answer, self._scale * tensor)
 
     def _late(self, tensor: Array) -> Array | None:
         """(3, 3) change of the curvature tensor over the path that an answer lags behind; None where there is none."""

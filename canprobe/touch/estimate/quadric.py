@@ -175,7 +175,8 @@ def linear_rows(d: Design) -> tuple[Array, Array]:
 
     The second multiplies the normals' noise into the regressor and shrinks K by some percent: a start, no answer.
     """
-    w_p, w_n = 1.0 / np.sqrt(d.point_variance), 1.0 / np.sqrt(d.normal_variance)
+    w_p = 1.0 / np.sqrt(d.point_variance)
+    w_n = 1.0 / np.sqrt(d.normal_variance + d.noise.coupling**2 * d.point_variance)
     F = terms(d.X, 9)
     A = np.concatenate([F[:, :1] * w_p[:, None, None], d.T @ F[:, 1:] * w_n[:, None, None]], axis=1)
     b = np.stack([d.X[:, 2] * w_p, d.T[:, 0, 2] * w_n, d.T[:, 1, 2] * w_n], axis=1)
@@ -358,8 +359,7 @@ def decide(root_q: Array, spread: Array, curvature: float) -> Decision:
         spread: (2, 2) covariance of the points in the tangent plane over the variance of their noise.
         curvature: ‖K‖, dimensionless.
     """
-    small, large, axes = _axes(spread)
-    wide = np.array([large, 0.5 * (small + large), small]) >= SPREAD
+    axes, wide = excited(spread)
     seen = axes[:, wide]
     root = root_q @ seen
     values, turn = eigen(root.T @ root) if seen.size else (np.zeros(0), np.zeros((0, 0)))
@@ -376,23 +376,12 @@ def _least(curvature: float, largest: float) -> float:
     return max(1.0 / (SIGMA_LIMIT * max(curvature, 1.0)) ** 2, NUMERIC * largest)
 
 
-def _axes(spread: Array) -> tuple[float, float, Array]:
-    """Eigenvalues of the spread and, as columns in q, the curvature along its main axis, the twist, and across."""
-    mean, radius, angle = principal(spread)
-    return mean - radius, mean + radius, turned(angle).T
-
-
-def spread_share(spread: Array) -> Array:
-    """How far each combination may be believed that the points were hardly spread for.
-
-    The noise of the points spreads them as well, and what it says about curvature is false. Where a share s of the
-    spread is noise the information counts (1 − s)²: nothing at s = 1, 0.81 at the threshold of the rank decision. A
-    fusion needs that without a jump. The result is a symmetric F (3, 3): information I becomes F I F.
+def excited(spread: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """As columns (3, 3) in q the curvature along the main axis of a spread, the twist, and across; and for which of
+    them (3,) the points were spread.
     """
-    small, large, axes = _axes(spread)
-    true = [max(0.0, 1.0 - 1.0 / max(s, 1e-300)) for s in (large, 0.5 * (small + large), small)]
-    result: Array = axes * np.array(true) @ axes.T
-    return result
+    mean, radius, angle = principal(spread)
+    return turned(angle).T, np.array([mean + radius, mean, mean - radius]) >= SPREAD
 
 
 def turned(angle: float) -> Array:

@@ -146,6 +146,8 @@ MOST_PENDING = 16
 """Samples of one step that are kept; of a slower motion the last ones."""
 STARTING = 1.6
 """How much higher the alarm's thresholds are during a start: the first answers are soon put right by themselves."""
+ALIKE = 1.4
+"""The same where the errors of neighbours are alike: running means vary more."""
 GENEROUS = 0.5
 """Usual innovation below which the stated noise is not believed where a misfit is looked for."""
 
@@ -201,6 +203,7 @@ class RecursiveEstimator:
         self._prior = Prior.weak(memory_m) if prior is None else prior
         if math.isfinite(self._prior.sigma_curvature):
             raise UsageError("prior: expected none on curvature itself for 'recursive', got " + self._prior.name)
+        self._caution = 1.0 if correlation is None else ALIKE
         self._filter = InformationFilter(self._memory, self._prior, correlation)
         self.reset()
 
@@ -290,7 +293,7 @@ class RecursiveEstimator:
     def _step(self, moved: float) -> None:
         """Take what is pending into the filter or its start; after a change of the surface into a new start."""
         compared = self._compared() if self._settled else None
-        caution = 1.0 if self._start is None else STARTING
+        caution = self._caution if self._start is None else STARTING * self._caution
         if compared and any([self._change.take(square, caution) for square in compared.squares.tolist()]):
             explained = self._explained(compared)
             if explained is None:
@@ -321,9 +324,13 @@ class RecursiveEstimator:
         return left if self._change.usual_again(left.squares) else None
 
     def _judged(self, rows: Array, residuals: Array, unexplained: Array) -> _Compared:
-        """Weighted by their places, and from the 99.9 % point of χ² on by the square of `CHI2_999 / d²`."""
+        """Weighted by their places, and from a limit on by the square of `limit / d²`.
+
+        It is the 99.9 % point of χ², times the running innovation: where all disagree none is wrong.
+        """
         squares = self._filter.squared_innovations(rows, unexplained)
-        weights = np.array([p.weight for p in self._pending]) * np.square(CHI2_999 / np.maximum(squares, CHI2_999))
+        limit = CHI2_999 * max(1.0, self._change.innovation)
+        weights = np.array([p.weight for p in self._pending]) * np.square(limit / np.maximum(squares, limit))
         return _Compared(rows, residuals, squares, weights)
 
     def _absorb(self, compared: _Compared, moved: float) -> None:

@@ -19,7 +19,7 @@ from canprobe.errors import UsageError
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimate.answer import Solution, SurfaceEstimate, build_estimate
 from canprobe.touch.estimate.likelihood import Touches, fit_ml, make_touches, working_frame
-from canprobe.touch.estimate.noise import Prior, make_noise
+from canprobe.touch.estimate.noise import Correlation, Prior, make_noise
 from canprobe.touch.estimate.online import AGREES, LAST_FEW, Dropped, Gate, looks_changed
 from canprobe.touch.estimate.quadric import TO_Q, decide, size_of
 from canprobe.touch.linear_algebra import Array, rotation_vectors, upper_root
@@ -142,6 +142,7 @@ class WindowEstimator:
         window: samples that are kept.
         prior: of `ml`; None for `Prior.weak` over the extent of the window.
         coupling: of the errors of point and normal (`Noise`), 1/m; of `ml`.
+        correlation: of the noise along the path; of `ml`.
     """
 
     least = 2
@@ -155,12 +156,13 @@ class WindowEstimator:
         window: int,
         prior: Prior | None = None,
         coupling: float = 0.0,
+        correlation: Correlation | None = None,
     ) -> None:
         if window < self.least:
             raise UsageError(f"window: expected at least {self.least} samples, got {window}")
         self.dropped = Dropped()
         self._gate = Gate(sigma_point, sigma_normal)
-        self._prior, self._coupling = prior, coupling
+        self._prior, self._coupling, self._correlation = prior, coupling, correlation
         self._samples: deque[ContactSample] = deque(maxlen=window)
         self._answer: SurfaceEstimate | None = None
 
@@ -192,7 +194,8 @@ class WindowEstimator:
         points: Array = np.array([s.p_base for s in self._samples])
         normals: Array = np.array([s.n_base for s in self._samples])
         sigmas = np.array([self._gate.sigmas(s) for s in self._samples])
-        return make_touches(points, normals, make_noise(len(points), sigmas[:, 0], sigmas[:, 1], self._coupling))
+        noise = make_noise(len(points), sigmas[:, 0], sigmas[:, 1], self._coupling)
+        return make_touches(points, normals, noise, self._correlation)
 
 
 class MlEstimator(WindowEstimator):

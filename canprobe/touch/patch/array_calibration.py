@@ -96,7 +96,7 @@ class CentroidErrors:
 
     def sigma(self, level_over_peak: float) -> float:
         """Standard deviation of a centroid per axis, m."""
-        return self.scale * math.pow(max(level_over_peak, 0.0), self.power)
+        return self.scale * math.pow(min(max(level_over_peak, 0.0), 1.0), self.power)
 
 
 @dataclass(frozen=True, slots=True)

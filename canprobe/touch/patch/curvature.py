@@ -4,10 +4,12 @@ The moments are averaged over the last frames, in axes that follow the contact n
 model of the sensor (`image_model`). What gains, hysteresis and blur do to them is common to all images of a contact:
 however many are averaged, the patch never knows more than the calibration's floor.
 
-The fusion is that of two measurements: the informations of motion and patch are added, each with its whole
-covariance, so the patch fades where a path excites all of K and speaks where it does not. Two things bound what it can
-do: outside the calibrated range it counts less and less, and so it does the further it is from what the motion
-knows, by the weight of an outlier.
+The fusion is that of measurements: the informations of motion and patch are added, each with its whole covariance, so
+the patch fades where a path excites all of K and speaks where it does not. The stiffness of the layer is a fourth
+unknown beside q: known from the scene to begin with, then from the slope of a touch together with the first images, and
+in every answer from what the motion adds. Outside the calibrated range the patch counts less and less. Where patch and
+motion contradict each other both count less, by χ² over its 95 % point; where they go on doing so nothing is
+called observed.
 
 Where the surface bends along the path a mean over some millimetres is that of an earlier place. A second, shorter mean
 shows it: how far the two are apart, carried on to now, is an error of the longer one, and counts as such.
@@ -20,11 +22,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from canprobe.touch.contact import ContactSample, direction_to_pad
+from canprobe.touch.contact import ContactSample, Slope, direction_to_pad, stiffness_from_slope
 from canprobe.touch.estimate.answer import CurvatureInformation, Solution, SurfaceEstimate, build_estimate
-from canprobe.touch.estimate.noise import CHI2_999
+from canprobe.touch.estimate.noise import CHI2_95, CHI2_999
 from canprobe.touch.estimate.online import Dropped, Estimator
-from canprobe.touch.estimate.quadric import SIGMA_LIMIT, TO_Q, UNIT, Decision, matrix_of, parameters_of, turned
+from canprobe.touch.estimate.quadric import (
+    SIGMA_LIMIT,
+    TO_Q,
+    UNIT,
+    Decision,
+    matrix_of,
+    nothing_observed,
+    parameters_of,
+    turned,
+)
 from canprobe.touch.linear_algebra import (
     Array,
     eigen,
@@ -53,6 +64,9 @@ GROSS = 0.2
 """Departure from the mean, over its trace, beyond which one image counts less: ten times the noise of a frame."""
 MOST_ROUNDS = 6
 """Gauss–Newton steps; from the last answer one or two do."""
+SLOPE_SIGMA = 0.08
+"""Error of a touch's slope in the logarithm of the stiffness that its own deviation leaves out: that of the force."""
+_STIFFER = 0.01
 SETTLED, UNSETTLED = 0.002, 0.05
 """Step, in units of the probe's curvature, that ends the iteration, and the largest that a last step may have."""
 
@@ -62,13 +76,27 @@ class Fused(NamedTuple):
 
     Attributes:
         q: (3,) 1/m.
-        patch: (3, 3) the patch's part of the information, m².
-        weight: of the patch, 1 unless it is far from what the motion knows.
+        patch: (3, 3) the patch's part of the information, the layer's stiffness unknown, m².
+        cost: of all that disagrees with the answer, χ².
+        stiffness: K/h of the layer, N/m³.
     """
 
     q: Array
     patch: Array
-    weight: float
+    cost: float
+    stiffness: float
+
+    @property
+    def contradicted(self) -> bool:
+        """Patch and motion do not go together."""
+        return self.cost > CHI2_999
+
+
+class LayerStiffness(NamedTuple):
+    """Logarithm of the layer's stiffness over the stated one, and its standard deviation."""
+
+    mean: float
+    sigma: float
 
 
 class _Seen(NamedTuple):
@@ -121,16 +149,16 @@ class PatchCurvature:
 
     Args:
         model: of the sensor.
-        spread: variance of the moments over what the model's calibration found.
+        sigma_stiffness: standard deviation of the logarithm of the model's stiffness, before any touch.
 
     Attributes:
         frames: how many the mean stands for, at most `MOST_FRAMES`.
         refused: contacts without moments (saturated, at the pad's edge, hardly any taxel, or a sensor that sends none).
     """
 
-    def __init__(self, model: ImageModel, spread: float = 1.0) -> None:
+    def __init__(self, model: ImageModel, sigma_stiffness: float = 1e-3) -> None:
         self.model = model
-        self._spread = positive("spread", spread)
+        self._stiffness = LayerStiffness(0.0, positive("sigma_stiffness", sigma_stiffness))
         self.refused = 0
         self.reset()
 
@@ -140,11 +168,15 @@ class PatchCurvature:
         self.force = 0.0
         self._memory = PadMemory()
         self._axes = np.eye(3)
-        self._last: tuple[float, float, float] | None = None
+        self._last: Array | None = None
+        self._slope: Slope | None = None
+        self._touched = False
         self._mean, self._recent = _Mean(MOST_FRAMES, GROSS), _Mean(FEW_FRAMES, FINE)
 
     def add(self, sample: ContactSample) -> None:
         """Take the image of one contact."""
+        if not self._touched:
+            self._slope, self._touched = sample.slope, True
         x, y, z = sample.r_probe.tolist()
         k = 1.0 / math.sqrt(x * x + y * y + z * z)
         direction = k * x, k * y, k * z
@@ -186,52 +218,88 @@ class PatchCurvature:
         known = CurvatureInformation(np.zeros(3), np.zeros((3, 3))) if motion is None else motion
         known = CurvatureInformation(turn @ known.q, turn @ known.information @ turn.T)
         found = self._solve(_Seen((mean + half, 0.0, mean - half), drift), known)
-        return None if found is None else Fused(turn.T @ found.q, turn.T @ found.patch @ turn, found.weight)
+        return None if found is None else found._replace(q=turn.T @ found.q, patch=turn.T @ found.patch @ turn)
 
     def _solve(self, seen: _Seen, motion: CurvatureInformation) -> Fused | None:
-        """From the last answer, and where that fails from the ideal layer; again where patch and motion disagree."""
+        """From the last answer, and where that fails from the ideal layer."""
         last, self._last = self._last, None
-        found = None if last is None else self._iterated(last, seen, motion, 1.0)
-        if found is None and (start := self.model.start(seen.moments, self.force)) is not None:
-            found = self._iterated(start, seen, motion, 1.0)
+        found = None if last is None else self._iterated(last, seen, motion)
+        for guess in self._guesses():
+            start = None if found is not None else self._model(guess).start(seen.moments, self.force)
+            if start is not None:
+                found = self._iterated(np.array([*(TO_Q * start), guess]), seen, motion)
         if found is None:
             return None
-        k, patch, cost = found
-        self._last = k
-        ratio = CHI2_999 / max(cost, CHI2_999)
-        weight = ratio * ratio
-        if weight < 1.0:
-            found = self._iterated(k, seen, motion, weight)
-            if found is None:
-                return None
-            k, patch, _ = found
-        return Fused(TO_Q * k, patch, weight)
+        self._last, fused, stiffness = found
+        if self._slope is not None:
+            # the layer stays what it is; where the touch was is left behind
+            self._slope, self._stiffness = None, stiffness
+        return fused
 
     def _iterated(
-        self, k: Moments, seen: _Seen, motion: CurvatureInformation, weight: float
-    ) -> tuple[Moments, Array, float] | None:
-        """Gauss–Newton from K: K, the patch's information and the cost; None where it does not settle."""
+        self, x: Array, seen: _Seen, motion: CurvatureInformation
+    ) -> tuple[Array, Fused, LayerStiffness] | None:
+        """Gauss–Newton from x = (q, ln of the stiffness over the stated one): where it ends, the answer, and what is
+        known of the stiffness then; None where it does not settle.
+        """
+        known, mean = np.zeros((4, 4)), np.array([*motion.q, self._stiffness.mean])
+        known[:3, :3], known[3, 3] = motion.information, self._stiffness.sigma**-2
+        J = np.empty((3, 4))
         step = math.inf
         try:
-            for _ in range(MOST_ROUNDS):
-                J, r, W = self.model.linearised(seen.moments, self.force, self.frames, k)
+            for round_ in range(MOST_ROUNDS):
+                k: Moments = tuple((x[:3] / TO_Q).tolist())
+                model = self._model(x[3])
+                J[:, :3], r, W = model.linearised(seen.moments, self.force, self.frames, k)
+                if round_ == 0:  # it hardly changes from step to step
+                    xx, _, yy = seen.moments
+                    there, here = (m.moments(k, self.force) for m in (self._model(x[3] + _STIFFER), model))
+                    J[:, 3] = np.subtract(there, here) / np.array([xx, math.sqrt(xx * yy), yy]) / _STIFFER
                 W = _less_certain(W, seen)
-                W *= weight * self.model.trust(k, self.force) / self._spread
-                JW, q = J.T @ W, TO_Q * k
-                patch = JW @ J
-                off = motion.q - q
-                pull = motion.information @ off
-                way = solved(patch + motion.information, JW @ r + pull)
-                cost = float(r @ W @ r + off @ pull)
-                k = tuple(((q + way) / TO_Q).tolist())
-                step = max(map(abs, way.tolist()))
+                W *= model.trust(k, self.force)
+                JW = J.T @ W
+                felt, pull, cost = JW @ J, JW @ r, float(r @ W @ r)
+                if not felt.any():
+                    return None
+                if self._slope is not None:
+                    row, off, weight = self._push(x, k, self._slope)
+                    felt += weight * np.outer(row, row)
+                    pull += weight * off * row
+                    cost += weight * off**2
+                apart = mean - x
+                drawn = known @ apart
+                way = solved(felt + known, pull + drawn)
+                cost += float(apart @ drawn)
+                x = x + way
+                step = float(np.abs(way * [1.0, 1.0, 1.0, 1.0 / self.model.radius]).max())
                 if step < SETTLED / self.model.radius:
                     break
         except (ValueError, np.linalg.LinAlgError):
             return None
-        if step > UNSETTLED / self.model.radius or not patch.any():
+        if step > UNSETTLED / self.model.radius:
             return None
-        return k, patch, cost
+        stiffness = LayerStiffness(float(x[3]), math.sqrt(float(inverted(felt + known)[3, 3])))
+        patch = felt[:3, :3] - np.outer(felt[:3, 3], felt[3, :3]) / (felt[3, 3] + known[3, 3])
+        return x, Fused(x[:3], patch, cost, self.model.stiffness * math.exp(x[3])), stiffness
+
+    def _guesses(self) -> tuple[float, ...]:
+        """What is known of the stiffness, and what the touch would show on a plane."""
+        known, slope = self._stiffness.mean, self._slope
+        if slope is None:
+            return (known,)
+        return known, math.log(stiffness_from_slope(slope.value, self.model.radius, (0.0, 0.0)) / self.model.stiffness)
+
+    def _model(self, stiffer: float) -> ImageModel:
+        return self.model.with_stiffness(self.model.stiffness * math.exp(stiffer))
+
+    def _push(self, x: Array, k: Moments, slope: Slope) -> tuple[Array, float, float]:
+        """Row (4,) of the slope of a touch at x, its residual and its information."""
+        K = np.array([[k[0], k[1]], [k[1], k[2]]])
+        half = 0.5 * inverted(np.eye(2) / self.model.radius + K)
+        kappa = np.linalg.eigvalsh(K)
+        off = math.log(stiffness_from_slope(slope.value, self.model.radius, kappa) / self.model.stiffness) - x[3]
+        row = np.array([-half[0, 0], -2.0 * half[0, 1] / TO_Q[1], -half[1, 1], 1.0])
+        return row, off, 1.0 / ((2.0 * slope.sigma / slope.value) ** 2 + SLOPE_SIGMA**2)
 
 
 def _less_certain(W: Array, seen: _Seen) -> Array:
@@ -254,25 +322,28 @@ def _turned(xx: float, xy: float, yy: float, c: float, s: float) -> tuple[float,
 
 NAMED = 0.1
 """Share of the information about K that the patch gives from which on the estimate's method names it."""
-DOUBTED = 0.5
-"""Weight of the patch below which the estimate says that it contradicts the motion."""
+CONTRADICTED = "the patch contradicts the motion"
+WITHDRAWN = 0.25
+"""Path over the memory after which a contradiction that lasts withdraws that anything was observed."""
 _TO_K = 1.0 / np.outer(TO_Q, TO_Q)
 
 
-def with_patch(motion: SurfaceEstimate, found: Fused, length: float) -> SurfaceEstimate:
+def with_patch(motion: SurfaceEstimate, found: Fused, length: float, *, withdrawn: bool = False) -> SurfaceEstimate:
     """A motion estimate with its `evidence`, and what was found of that and the patch.
 
     Place, normal and c13, c23, c33 stay the motion's; the patch says nothing about them. Curvatures below 1/length (the
-    memory, m) count as flat. The `method` ends in "+patch" where the patch gave at least `NAMED`; a note says how much.
+    memory, m) count as flat; `withdrawn`: nothing is called observed. The `method` ends in "+patch" where the patch
+    gave at least `NAMED`; a note says how much.
     """
     assert motion.evidence is not None
+    weight = CHI2_95 / max(found.cost, CHI2_95)
+    evidence, patch = weight * motion.evidence.information, weight * found.patch
     has_prior = motion.rank < 3 and bool(np.isfinite(motion.covariance).all())
-    data = motion.information if has_prior else motion.evidence.information
-    decision = _decide(data + found.patch, found.q, length)
-    root = None if motion.model_root is None else _joined(motion.model_root, found.patch)
-    total = motion.evidence.information + found.patch
-    inverse = inverted(total)
-    share = float((inverse * found.patch).sum()) / 3.0
+    data = weight * motion.information if has_prior else evidence
+    decision = nothing_observed() if withdrawn else _decide(data + patch, found.q, length)
+    root = None if motion.model_root is None else _joined(math.sqrt(weight) * motion.model_root, patch)
+    inverse = inverted(evidence + patch)
+    share = float((inverse * patch).sum()) / 3.0
     return build_estimate(
         _solution(motion.S, found.q, inverse, decision, has_prior=has_prior, root=root),
         length=1.0,
@@ -284,6 +355,7 @@ def with_patch(motion: SurfaceEstimate, found: Fused, length: float) -> SurfaceE
         method=motion.method + "+patch" if share >= NAMED else motion.method,
         prior=motion.prior,
         notes=(*motion.notes, *_notes(found, share)),
+        stiffness=found.stiffness,
     )
 
 
@@ -303,12 +375,13 @@ def patch_estimate(contact: ContactSample, patch: PatchCurvature, length: float)
         samples=float(patch.frames),
         method="patch",
         prior="none",
+        stiffness=found.stiffness,
     )
 
 
 def _notes(found: Fused, share: float) -> tuple[str, ...]:
     said = (f"{100.0 * share:.0f} % of the curvature from the patch",)
-    return said if found.weight >= DOUBTED else (*said, "the patch contradicts the motion")
+    return (*said, CONTRADICTED) if found.contradicted else said
 
 
 def _joined(model_root: Array, patch: Array) -> Array:
@@ -362,6 +435,8 @@ class PatchedEstimator:
         self._motion = motion
         self._length = length
         self._last: ContactSample | None = None
+        self._place: Array | None = None
+        self._contradicted = 0.0
 
     @property
     def dropped(self) -> Dropped:
@@ -384,10 +459,18 @@ class PatchedEstimator:
         if motion.evidence is None:
             return motion
         found = self.patch.fuse(motion.T_frame_contact, motion.evidence)
-        return motion if found is None else with_patch(motion, found, self._length)
+        if found is None or not found.contradicted:
+            self._contradicted = 0.0
+        elif self._place is not None:
+            self._contradicted += float(np.linalg.norm(motion.point - self._place))
+        self._place = motion.point
+        if found is None:
+            return motion
+        return with_patch(motion, found, self._length, withdrawn=self._contradicted > WITHDRAWN * self._length)
 
     def reset(self) -> None:
         """Forget everything but the settings."""
         self._motion.reset()
         self.patch.reset()
-        self._last = None
+        self._last = self._place = None
+        self._contradicted = 0.0

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -104,6 +105,17 @@ class ImageModel:
     def memory(self) -> float:
         """As `ImageParameters.memory`."""
         return self.parameters.memory
+
+    @property
+    def stiffness(self) -> float:
+        """Of the layer (K/h), N/m³."""
+        return self.parameters.stiffness
+
+    def with_stiffness(self, stiffness: float) -> ImageModel:
+        """The same array on another layer (N/m³): its blur stays."""
+        other = copy(self)
+        object.__setattr__(other, "parameters", replace(self.parameters, stiffness=stiffness))
+        return other
 
     # the forward model
 
