@@ -152,7 +152,9 @@ class SampleSource:
         self._sensing = _sensing(plan.setup)
         self._has_arm = arm is not None
         self._radius = probe.radius
-        self._calibration = make_patch_calibration(array.calibration, array.full_scale, probe.radius) if array is not None else None
+        self._calibration = (
+            None if array is None else make_patch_calibration(array.calibration, array.full_scale, probe.radius)
+        )
 
     def sample(self, received: Received) -> Sample:
         """The sample of one observation."""
