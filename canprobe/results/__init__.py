@@ -5,6 +5,6 @@ session and of the `TaskRecord` of its task; `scores` compares with the plant's 
 writes and reads tables and surface maps with their units. All files of a run count time from the 0 of its `bus.log`,
 and each is whole or not there.
 
-`figures` and `surface_figure` draw a run, a plan and a map in the one look of `picture`; matplotlib is imported there
-only.
+`array_report` says what a calibration of an array found. `figures` and `surface_figure` draw a run, a plan and a map in
+the one look of `picture`; matplotlib is imported there only.
 """

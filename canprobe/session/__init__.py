@@ -12,6 +12,7 @@ the reverse order: drives disabled, logs flushed, bus closed, children ended, tr
     up          a cell that is held for days, or whose joints are checked
     looking     a bus without a cell: scan, node ids, monitor
     emulation   emulated nodes for other masters
+    array_calibration  touches of known objects, visit by visit, and the fit
 
 A session holds the `Scene`, because scenes cross processes as text.
 """

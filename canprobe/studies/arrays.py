@@ -33,8 +33,8 @@ from canprobe.touch.patch.image_model import make_image_model, make_patch_calibr
 
 RADIUS_M = 0.040
 BALL_PER_M = 40.0
-ARRAYS, QUICK_ARRAYS = range(100, 120), range(100, 102)
-"""Seeds; the calibration was developed with other arrays than those from 110 on."""
+ARRAYS, QUICK_ARRAYS = range(120, 140), range(120, 122)
+"""Seeds; the calibration was developed with those from 100 to 119."""
 PRESSES = 20
 WINDOW = 8
 FRAME_S, LOADING_S, DWELL_S, APART_S = 0.02, 0.5, 3.0, 2.5

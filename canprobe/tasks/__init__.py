@@ -3,7 +3,8 @@
 `from_plan.make_task` gives the controller of a plan's task; nothing is imported that the task does not need.
 
 - `touch` approaches, settles, scans or holds, searches for a lost contact, and retreats; `calibrate` touches a ball
-  from several sides. Both derive from `probing.ProbingTask`: the order of a cycle, phases, and the probe's motion.
+  from several sides; `roll` presses and rolls on a known object. All derive from `probing.ProbingTask`: the order of a
+  cycle, phases, and the probe's motion.
 - `sensing` makes a contact of a measurement: joints at the instant of the image, the patch, the squeezed layer.
 - `shape` is the estimator in the loop: contacts go in when they are felt, answers are computed in `update` when the
   commands are out, and are used from the next cycle on.

@@ -80,7 +80,7 @@ def test_the_smallest_that_holds_the_patch_comes_first_then_smaller_then_larger_
     }
     for force, sides in orders.items():
         assert [side for side, _ in window_choices(resolve(change(press, task={"force_n": force})))] == sides
-    assert "10.6 mm across and asks for 8.2 taxels" in window_choices(resolve(press))[0][1]
+    assert "10.7 mm across and asks for 8.2 taxels" in window_choices(resolve(press))[0][1]
     assert [side for side, _ in window_choices(resolve(canprobe.load_scene("listen")))] == [12, 10, 8, 6, 4]
 
 

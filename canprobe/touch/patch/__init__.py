@@ -5,11 +5,12 @@ estimators, a `Patch` (force in N, centroid in m on the pad, what makes it doubt
 
 - `image` sums and centres the pressure, carries a patch on that the window or a dead taxel cuts, and undoes the
   array's hysteresis lag as far as it is calibrated.
-- `moments` is the forward model of second moments: how curvature, force and the array's blur make them.
+- `moments` takes second moments of an image, and knows what the pad remembers.
+- `image_model` is the forward model, physical, of five parameters: how curvature, force and the array make force and
+  moments of an image; its inverse is Gauss-Newton on K.
 - `curvature` inverts it over several images into a likelihood of K, and fuses that with what the motion has shown: a
   straight path leaves the curvature across it open, and one touch with its image closes it.
-- `array_model` has the calibrated numbers of the emulated array's make, found by
-  `tests/support/array_calibration.py`.
+- `array_calibration` is what is known of one array; `calibrate` fits it to touches of known things.
 
 The emulated array (`canprobe.emulator.plant.taxels`) shares no formula with this room: the model that makes the data
 is finer than the one that reads them.

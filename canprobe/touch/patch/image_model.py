@@ -199,14 +199,17 @@ class ImageModel:
         return float(gains[0]), float(gains[1])
 
     def trust(self, k: Moments, force: float) -> float:
-        """1 where the model holds (K in 1/m, force in N), falling to 0 beyond (`SMALLEST`, `LARGEST`, `LIGHTEST`)."""
+        """1 where the model holds (K in 1/m, force in N), falling to 0 beyond `SMALLEST`, `LARGEST` and `LIGHTEST`.
+
+        A peak beyond full scale contradicts an image that is not saturated: the layer is another one.
+        """
         (a, b), _, det = self._principal(k)
         depth = self.depth(force, det)
         least, most = (depth / (6.0 * x * self.pitch**2) for x in (a, b))
-        beyond = (
-            max(SMALLEST / least, most / (LARGEST * (0.5 * self.seen) ** 2), self._lightness(depth) / LIGHTEST) - 1.0
-        )
-        return min(max(1.0 - beyond / TAPER, 0.0), 1.0)
+        light = self._lightness(depth)
+        brightest = self.level / (COUNTS_MAX * self.count)
+        ends = SMALLEST / least, most / (LARGEST * (0.5 * self.seen) ** 2), light / LIGHTEST, brightest / light
+        return min(max(1.0 - (max(ends) - 1.0) / TAPER, 0.0), 1.0)
 
     def _lightness(self, depth: float) -> float:
         """Level over the peak pressure that is shown."""

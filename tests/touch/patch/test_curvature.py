@@ -111,7 +111,7 @@ def test_hollow_as_tight_as_the_probe_is_no_patch():
 
 
 def test_trust_ends_softly_where_the_calibration_ends():
-    k = np.linspace(0.0, 2000.0, 4001)
+    k = np.linspace(0.0, 2000.0, 8001)
     trust = np.array([model().trust((a, 0.0, a), FORCE) for a in k])
     assert trust[0] == model().trust((27.8, 0.0, 0.0), FORCE) == 1.0
     assert trust[-1] == 0.0
