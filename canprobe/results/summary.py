@@ -25,7 +25,6 @@ from canprobe.results.scores import ShapeScore, bound_of_scan, score_contact, sc
 from canprobe.scene.geometry import FILE, calibration_lines, summarise_calibration, tool_text
 from canprobe.scene.model import Scene
 from canprobe.scene.resolve import resolve
-from canprobe.scene.setup import Touch
 from canprobe.session.session import Session, write_scene
 from canprobe.session.target import LOCKSTEP
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker
@@ -371,19 +370,17 @@ def _bound_ratio(
     """
     from canprobe.tasks.from_plan import SIGMA_NORMAL_RAD, centroid_correlation, centroid_coupling
 
-    shape, setup = scene.shape, resolve(scene)
-    if tracker is None or shape is None or not isinstance(setup.task, Touch):
-        return None
-    if score.kappa_rms_error_per_m is None or (score.patch_fraction or 0.0) > 0.5:
+    shape = scene.shape
+    if tracker is None or shape is None or score.kappa_rms_error_per_m is None or (score.patch_fraction or 0.0) > 0.5:
         return None
     bound = bound_of_scan(
         tracker.samples,
         truth,
         sync_times,
         memory_m=shape.memory_mm * 1e-3,
-        correlation=centroid_correlation(setup.task),
+        correlation=centroid_correlation(),
         sigma_normal=SIGMA_NORMAL_RAD,
-        coupling=centroid_coupling(setup.probe),
+        coupling=centroid_coupling(resolve(scene).probe),
     )
     return None if bound is None else score.kappa_rms_error_per_m / bound
 
