@@ -34,7 +34,8 @@ from canprobe.tasks.probing import Phase
 from canprobe.tasks.roll import Press, Pressed, RollTask
 from canprobe.touch.contact import direction_to_pad
 from canprobe.touch.patch.array_calibration import ForceReference
-from canprobe.touch.patch.calibrate import ArrayFit, Dwell, calibrate_array
+from canprobe.touch.patch.calibrate import ArrayFit, calibrate_array
+from canprobe.touch.patch.image_fit import Dwell
 
 Floats = NDArray[np.float64]
 Ask = Callable[[str], str]

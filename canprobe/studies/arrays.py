@@ -27,8 +27,9 @@ from canprobe.results.picture import BLUE, INK, picture
 from canprobe.studies.harness import Array, Column, Row, StudyResult, measuring_facts
 from canprobe.studies.sweep import Sweep
 from canprobe.touch.pad import Pad
-from canprobe.touch.patch.calibrate import Dwell, calibrate_array, curvature_errors, moment_errors, what_is_shown
+from canprobe.touch.patch.calibrate import calibrate_array
 from canprobe.touch.patch.image import PatchCalibration
+from canprobe.touch.patch.image_fit import Dwell, curvature_errors, moment_errors, what_is_shown
 from canprobe.touch.patch.image_model import make_image_model, make_patch_calibration
 
 RADIUS_M = 0.040

@@ -10,7 +10,8 @@ estimators, a `Patch` (force in N, centroid in m on the pad, what makes it doubt
   moments of an image; its inverse is Gauss-Newton on K.
 - `curvature` inverts it over several images into a likelihood of K, and fuses that with what the motion has shown: a
   straight path leaves the curvature across it open, and one touch with its image closes it.
-- `array_calibration` is what is known of one array; `calibrate` fits it to touches of known things.
+- `array_calibration` is what is known of one array; `calibrate` fits it to touches of known things, with
+  `image_fit` and `pad_fit`.
 
 The emulated array (`canprobe.emulator.plant.taxels`) shares no formula with this room: the model that makes the data
 is finer than the one that reads them.
