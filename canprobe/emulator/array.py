@@ -144,6 +144,9 @@ _TARE_BYTES = SIDE * SIDE * 8
 class TactilePlant(Protocol):
     """What the sensor needs of the plant."""
 
+    def begin(self, t_ns: int) -> None:
+        """Time goes on from `t_ns`, unless it does already: the array is triggered."""
+
     def advance(self, t_ns: int) -> None:
         """Bring the plant to `t_ns`; idempotent."""
 
@@ -241,6 +244,7 @@ class TactileApplication(Application):
         if t_ns == self._triggered_ns:
             return  # PDOs of one frame in different groups
         self._triggered_ns = t_ns
+        self._plant.begin(t_ns)
         self._sample(t_ns)
         pipeline = self._pipeline
         while len(pipeline) > self._latency + 1:

@@ -116,7 +116,7 @@ def make_world(plan: Plan, node_ids: Collection[int], *, truth: bool = True, wit
         truth: whether what is true is recorded.
         without_id: which of them start without a node id and wait for LSS to give them one.
     """
-    plant = Plant(_plant_config(plan.setup))
+    plant = Plant(_plant_config(plan.setup), waits=True)
     nodes = []
     for node in plan.nodes:
         if node.node_id not in node_ids:
