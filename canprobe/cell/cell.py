@@ -53,6 +53,8 @@ class Cell:
         log_failure: says why frames are no longer written down, None while they are.
         observers: called after each cycle.
         rows_kept: cycles whose row of the log is kept; None for all.
+        direct: makes the cycle of nodes that are reached without a bus, as `Cycle` is made, and starts them; None: they
+            are brought up and reached over the port.
         origin_ns: time on the port's clock from which the run counts, as ``bus.log`` does.
 
     Attributes:
@@ -74,6 +76,7 @@ class Cell:
         log_failure: Callable[[], str | None] = lambda: None,
         observers: Observers | None = None,
         rows_kept: int | None = None,
+        direct: Callable[..., Cycle] | None = None,
         origin_ns: int = 0,
     ) -> None:
         setup = plan.setup
@@ -94,7 +97,9 @@ class Cell:
         self._rows_kept = rows_kept
         self._origin_ns = origin_ns
         self._network = PumpedNetwork(port, other=self._other)
-        self._bring_up = BringUp(self._network, self.watch, make_setups(plan), setup.bring_up, self._say)
+        self._make_cycle = direct or Cycle
+        to_bring_up = make_setups(plan) if direct is None else ()  # of none only its time passes
+        self._bring_up = BringUp(self._network, self.watch, to_bring_up, setup.bring_up, self._say)
         self._holding = False
         self._running = False
         self._retreats_for: CanprobeError | None = None
@@ -148,7 +153,7 @@ class Cell:
     def __enter__(self) -> Cell:
         try:
             self._bring_up.run()
-            self.cycle = Cycle(
+            self.cycle = self._make_cycle(
                 self._port,
                 self._plan,
                 drives=self.drives,

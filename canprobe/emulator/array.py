@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 from collections import deque
+from collections.abc import Callable
 from functools import cache
 from itertools import count, takewhile
 from typing import Protocol
@@ -155,7 +156,11 @@ class TactilePlant(Protocol):
 
 
 class TactileApplication(Application):
-    """The sensor function of one node. A tare command takes the mean of the next images as zero."""
+    """The sensor function of one node. A tare command takes the mean of the next images as zero.
+
+    Attributes:
+        publish: called with header and content of each frame; it puts them into the objects that the TPDOs carry.
+    """
 
     def __init__(self, plant: TactilePlant, latency_frames: int = 1, tare_images: int = 16) -> None:
         """Make the sensor.
@@ -174,6 +179,7 @@ class TactileApplication(Application):
         self._origin = middle()
         self._counter = 0
         self._triggered_ns: int | None = None
+        self.publish: Callable[[TactileHeader, Image | Features], None] = self._put
 
     def attach(self, node: SlaveNode) -> None:
         """Hang the sensor's objects on the node."""
@@ -253,8 +259,8 @@ class TactileApplication(Application):
         self._show(raw, min((t_ns - sampled_ns) // 1000, _MAX_AGE_US))
 
     def _show(self, raw: Raw, age_us: int) -> None:
-        """Put one frame into the objects that the TPDOs carry."""
-        dictionary, mode, window = self._node.dictionary, self._mode, self._window
+        """Make one frame, and publish it."""
+        mode, window = self._mode, self._window
         settings = self._tare, self._gain, self._threshold
         image = correct(raw, *settings)
         overload = is_overloaded(raw) or is_overloaded(image)
@@ -266,9 +272,14 @@ class TactileApplication(Application):
         if mode is TactileMode.FEATURES:
             seen = image if raw.dtype == np.uint8 else correct_finely(raw, *settings)
             content = compute_features(seen, self._full_scale)
+        self.publish(header, content)
+
+    def _put(self, header: TactileHeader, content: Image | Features) -> None:
+        """Put one frame into the objects that the TPDOs carry."""
+        dictionary, mode = self._node.dictionary, self._mode
         whole = pack_whole(header, content)
         words = struct.unpack(f"<{len(whole) // 8}Q", whole)
-        dictionary.put(OVERLOAD, 0, int(overload))
+        dictionary.put(OVERLOAD, 0, int(header.overload))
         dictionary.put(ORIGIN, 0, self._origin[0] << 4 | self._origin[1])
         content_words = words if mode is TactileMode.FEATURES else words[1:]
         dictionary.values.update(zip(self._content[mode], content_words, strict=False))

@@ -63,6 +63,8 @@ def make_plan(setup: Setup) -> Plan:
         if cut is not None and not cut.safe:
             problems.append(cut.text)
             ways = ways or [*cut.ways]
+    if setup.bus.direct and setup.bus.bit_error_rate > 0:
+        problems.append('bus.interface = "direct" has no wire: bus.bit_error_rate needs a bus, such as lockstep')
     joint_speeds, unreachable = check_motion(setup)
     problems += unreachable
     truth, arm = setup.truth, setup.arm

@@ -268,8 +268,18 @@ def find_log(log: Path) -> tuple[Path, Path | None]:
         return log, None
     path = log / "bus.log"
     if not path.is_file():
+        _refuse_direct(log)
         raise UsageError(f"{log}: no bus.log in this folder; expected the folder of a run, or a candump file")
     return path, log
+
+
+def _refuse_direct(folder: Path) -> None:
+    """A run without a bus has no frames to estimate from."""
+    if (folder / "scene.toml").is_file() and load_scene(folder / "scene.toml").bus.direct:
+        raise UsageError(
+            f"{folder}: a run with --bus direct has no bus.log to replay; run the scene with --bus lockstep, which"
+            " writes one"
+        )
 
 
 def scene_of(path: Path, folder: Path | None, scene: Scene | str | Path | None) -> Scene:
