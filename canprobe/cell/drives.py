@@ -333,14 +333,13 @@ class DriveGroup:
         except ProtocolError:
             self.malformed += 1  # and missed, unless another one comes
             return
-        self._take(k, source, values, t_ns)
+        self.take(can_id, values, t_ns)
 
     def take(self, cob_id: int, values: tuple[int, ...], t_ns: int) -> None:
-        """The values of one TPDO at `t_ns`, from a drive that sends each once for every SYNC; others are not read."""
-        if (found := self._sources.get(cob_id)) is not None:
-            self._take(*found, values, t_ns)
-
-    def _take(self, k: int, source: FeedbackFrame, values: tuple[int, ...], t_ns: int) -> None:
+        """The values of one TPDO at `t_ns`, the first of it for its SYNC; TPDOs of others are not read."""
+        if (found := self._sources.get(cob_id)) is None:
+            return
+        k, source = found
         i = source.axis
         self._heard[k] = self._cycle
         self._pending -= 1

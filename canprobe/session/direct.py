@@ -23,6 +23,7 @@ from canprobe.cell.array import TactileReceiver
 from canprobe.cell.cycle import Cycle
 from canprobe.cell.drives import DriveGroup
 from canprobe.emulator.array import TactileApplication
+from canprobe.emulator.drive.drive import DriveApplication
 from canprobe.emulator.node.dictionary import Dictionary, SdoAbort, nothing
 from canprobe.emulator.node.rpdo_tpdo import Rpdo
 from canprobe.emulator.node.slave_node import SlaveNode
@@ -35,7 +36,6 @@ from canprobe.protocol.frames import SYNC_ID, Frame, NmtCommand, pack_nmt
 from canprobe.protocol.tactile import SIDE, Features, TactileFrame, TactileHeader, TactileMode
 
 HEARTBEAT_CONSUMER = 0x1016
-"""Not configured: the master sends no heartbeat."""
 Hear = Callable[[int, bytes, int], object]
 """Called with (can_id, data, t_ns)."""
 
@@ -149,6 +149,8 @@ def tactile_frame(header: TactileHeader, content: NDArray[np.uint8] | Features, 
 def configure(node: SlaveNode, setup: NodeSetup) -> None:
     """Write a node's configuration into its dictionary, as bring-up does by SDO.
 
+    A node does not watch for its master, which is in the same process and cannot fall silent.
+
     Raises:
         NodeError: the node refuses a value that is required.
     """
@@ -162,6 +164,8 @@ def configure(node: SlaveNode, setup: NodeSetup) -> None:
             taken = write is not times[0][0] or any(all(_takes(node.dictionary, w) for w in time) for time in times)
         if not taken:
             raise NodeError(node.node_id, f"({setup.name}) refuses {write.place} = {write.value:#x} ({write.purpose})")
+    if isinstance(node.application, DriveApplication):
+        node.application.parts.parameters.patience_ns = 0
 
 
 def _takes(dictionary: Dictionary, write: Write) -> bool:
@@ -209,9 +213,10 @@ class DirectCycle(Cycle):
 
     def _collect(self) -> None:
         self._nodes.sync(self.sync_ns, self._counter, self._take)
-        self._clock.sleep_until_ns(self.sync_ns + self._first_look_ns)
-        self._nodes.advance(self._clock.now_ns())
+        look_ns = self.sync_ns + self._first_look_ns
+        self._clock.sleep_until_ns(look_ns)
+        self._nodes.advance(look_ns)
 
     def _send_commands(self) -> None:
         if self._drives is not None:
-            self._nodes.command(self._drives.commands(), self._clock.now_ns())
+            self._nodes.command(self._drives.commands(), self.sync_ns + self._first_look_ns)

@@ -190,9 +190,12 @@ class PdoEngine(Service):
         self._on_sync(t_ns, counter)
         groups = []
         for group in self._groups:
-            if group.first is None and counter == group.start:
-                group.first = count
-            if group.first is not None and (count - group.first) % group.every == 0:
+            first = group.first
+            if first is None:
+                if counter != group.start:
+                    continue
+                first = group.first = count
+            if (count - first) % group.every == 0:
                 groups.append(group)
                 for sampler in group.samplers:
                     sampler(t_ns)
