@@ -102,7 +102,7 @@ class DirectNodes:
         for node in self._nodes:
             core = node.core
             core.now_ns = t_ns
-            for cob_id, values in node.pdos.exchange(t_ns, counter):
+            for cob_id, _, values in node.pdos.exchange(t_ns, counter):
                 take(cob_id, values, t_ns)
             if core.out:
                 frames, core.out = core.out, []
