@@ -57,6 +57,7 @@ class DirectNodes:
         self._hear = hear
         self._see = see
         self._rpdos: dict[int, list[tuple[SlaveNode, Rpdo]]] = {}
+        self._drives = plan.setup.arm.node_ids if plan.setup.arm is not None else ()
         self._plan = plan
 
     def start(self, t_ns: int) -> None:
@@ -75,7 +76,7 @@ class DirectNodes:
         for node in self._nodes:
             self._pass_on(node.receive(*pack_nmt(NmtCommand.START, node.node_id), t_ns), t_ns)
         by_id = {node.node_id: node for node in self._nodes}
-        for node_id in self._plan.setup.arm.node_ids if self._plan.setup.arm is not None else ():
+        for node_id in self._drives:
             for pdo in self._plan.pdos_of(node_id, "rpdo"):
                 rpdo = by_id[node_id].pdos.rpdo(pdo.cob_id)
                 self._rpdos.setdefault(pdo.cob_id, []).append((by_id[node_id], rpdo))
@@ -97,13 +98,15 @@ class DirectNodes:
         Args:
             t_ns: when.
             counter: of the SYNC; 0 where it has none.
-            take: called with the COB-ID of each TPDO, its values, and when.
+            take: called with the COB-ID of each TPDO of a drive, its values, and when.
         """
         for node in self._nodes:
             core = node.core
             core.now_ns = t_ns
-            for cob_id, _, values in node.pdos.exchange(t_ns, counter):
-                take(cob_id, values, t_ns)
+            filled = node.pdos.exchange(t_ns, counter)
+            if node.node_id in self._drives:
+                for cob_id, _, values in filled:
+                    take(cob_id, values, t_ns)
             if core.out:
                 frames, core.out = core.out, []
                 self._pass_on(frames, t_ns)

@@ -17,7 +17,6 @@ from canprobe.emulator.node.error_control import Emergency
 from canprobe.emulator.node.rpdo_tpdo import BUFFERED, Packing, PdoRules, Rpdo, Sampler, Tpdo
 from canprobe.protocol.frames import SYNC_ID, SYNC_LENGTH, SYNC_LOST, Frame, NmtState, is_restricted
 
-
 Filled = tuple[int, Callable[..., bytes], tuple[int, ...]]
 """A TPDO whose turn it is: COB-ID, what packs its values, and they."""
 

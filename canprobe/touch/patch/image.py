@@ -267,9 +267,8 @@ def compute_patch(
     taxels, dead = mended(taxels)
     pressure = calibration.pascals[taxels]
     n_active = int(np.count_nonzero(pressure))
-    counts = taxels.tobytes()
-    peak = max(counts)
-    peak_pa, at_pad, at_window = calibration.pascals.take((peak, *_edges(counts, window))).tolist()
+    peak = int(taxels.max())
+    peak_pa, at_pad, at_window = calibration.pascals.take((peak, *_edges(taxels.tobytes(), window))).tolist()
     shows_shape = peak > LEAST_PEAK * calibration.threshold_counts
     if window is not None and at_window > WORTH_COMPLETING * peak_pa and shows_shape:
         pressure = calibration.continuation.completed(pressure, window, peak_pa)
@@ -301,7 +300,8 @@ def _force_and_centroid(total: float, u: float, v: float, calibration: PatchCali
 
 def _edges(counts: bytes, window: Sequence[int] | None) -> tuple[int, int]:
     """Highest count at the pad's edge, and at an edge of the window inside the pad."""
-    at_pad = max(counts[:SIDE] + counts[-SIDE:] + counts[::SIDE] + counts[SIDE - 1 :: SIDE])
+    edges = counts[:SIDE] + counts[-SIDE:] + counts[::SIDE] + counts[SIDE - 1 :: SIDE]
+    at_pad = max(edges.strip(b"\0"), default=0)  # none is left as a rule
     if window is None:
         return at_pad, 0
     r0, c0, n_rows, n_cols = window
