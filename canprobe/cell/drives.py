@@ -196,6 +196,10 @@ def feedback_frames(axes: Sequence[DriveAxis]) -> tuple[FeedbackFrame, ...]:
     return tuple(frames)
 
 
+DriveCommand = tuple[int, list[Callable[..., bytes]], list[tuple[int, ...]]]
+"""One RPDO: COB-ID, what packs each part of it, and the values of each part; see `CommandFrame`."""
+
+
 @dataclass(frozen=True, slots=True)
 class CommandFrame:
     """One RPDO frame.
@@ -271,16 +275,15 @@ class DriveGroup:
         self._constants: list[int] = []
         self._interpolated = [axis.mode == OperationMode.INTERPOLATED_POSITION for axis in axes]
         self._steady: tuple[object, ...] | None = None
-        commands = command_frames(axes)
-        self._packs = {frame.cob_id: [layout.pack for _, layout, _ in frame.parts] for frame in commands}
         self._plan = [
             (
                 frame.cob_id,
                 frame.every_cycle,
+                [layout.pack for _, layout, _ in frame.parts],
                 [_fetcher(self._places_of(axis, layout, picks)) for axis, layout, picks in frame.parts],
                 tuple(axis for axis, _, _ in frame.parts),
             )
-            for frame in commands
+            for frame in command_frames(axes)
         ]
         self._sent: dict[int, tuple[list[tuple[int, ...]], int]] = {}
         self._repeat = repeat_cycles
@@ -434,16 +437,16 @@ class DriveGroup:
     def frames(self) -> list[Frame]:
         """The RPDOs of this cycle, as `commands`, packed."""
         frames = []
-        for cob_id, parts in self.commands():
-            data = b""
-            for pack, values in zip(self._packs[cob_id], parts, strict=True):
-                part = pack(*values)
-                data = _overlaid(data, part) if data else part
+        for cob_id, packs, parts in self.commands():
+            data = packs[0](*parts[0])
+            if len(parts) > 1:
+                for pack, values in zip(packs[1:], parts[1:], strict=True):
+                    data = _overlaid(data, pack(*values))
             frames.append((cob_id, data))
         return frames
 
-    def commands(self) -> list[tuple[int, list[tuple[int, ...]]]]:
-        """The RPDOs of this cycle, each (COB-ID, the values of each part); see `CommandFrame`.
+    def commands(self) -> list[DriveCommand]:
+        """The RPDOs of this cycle.
 
         Until a target is set, the target of a drive is its reported position. A drive that was never heard gets none.
         """
@@ -458,12 +461,12 @@ class DriveGroup:
         values = [*self._words, *targets, *self._constants]  # an axis and its pick name the place
         self._all_heard = self._all_heard or min(self._heard) >= 0
         commands = []
-        for cob_id, every_cycle, fetches, axes in self._plan:
+        for cob_id, every_cycle, packs, fetches, axes in self._plan:
             if not self._all_heard and any(self._tracks[axis].cycle < 0 for axis in axes):
                 continue
             parts = [fetch(values) for fetch in fetches]
             if every_cycle or self._due(cob_id, parts):
-                commands.append((cob_id, parts))
+                commands.append((cob_id, packs, parts))
         return commands
 
     def _goal_of(self, node_id: int) -> DriveState:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from canprobe.bus.port import Port
 from canprobe.cell.array import TactileReceiver
 from canprobe.cell.cycle import Cycle
-from canprobe.cell.drives import DriveGroup
+from canprobe.cell.drives import DriveCommand, DriveGroup
 from canprobe.emulator.array import TactileApplication
 from canprobe.emulator.drive.drive import DriveApplication
 from canprobe.emulator.node.dictionary import Dictionary, SdoAbort, nothing
@@ -105,7 +105,7 @@ class DirectNodes:
             core.now_ns = t_ns
             filled = node.pdos.exchange(t_ns, counter)
             if node.node_id in self._drives:
-                for cob_id, _, values in filled:
+                for cob_id, values in filled:
                     take(cob_id, values, t_ns)
             if core.out:
                 frames, core.out = core.out, []
@@ -113,9 +113,9 @@ class DirectNodes:
         if self._recorder is not None:
             self._recorder.receive(SYNC_ID, bytes((counter,)), t_ns)
 
-    def command(self, commands: Sequence[tuple[int, list[tuple[int, ...]]]], t_ns: int) -> None:
-        """RPDOs, each (COB-ID, the values of each drive that takes a part of it)."""
-        for cob_id, parts in commands:
+    def command(self, commands: Sequence[DriveCommand], t_ns: int) -> None:
+        """RPDOs, whose parts go to one drive each."""
+        for cob_id, _, parts in commands:
             for (node, rpdo), values in zip(self._rpdos[cob_id], parts, strict=True):
                 node.core.now_ns = t_ns
                 rpdo.take(values)

@@ -17,9 +17,6 @@ from canprobe.emulator.node.error_control import Emergency
 from canprobe.emulator.node.rpdo_tpdo import BUFFERED, Packing, PdoRules, Rpdo, Sampler, Tpdo
 from canprobe.protocol.frames import SYNC_ID, SYNC_LENGTH, SYNC_LOST, Frame, NmtState, is_restricted
 
-Filled = tuple[int, Callable[..., bytes], tuple[int, ...]]
-"""A TPDO whose turn it is: COB-ID, what packs its values, and they."""
-
 
 class _Group:
     """TPDOs that a SYNC triggers together: every `every`-th, counted from the SYNC with counter `start`.
@@ -165,27 +162,33 @@ class PdoEngine(Service):
             elapsed: SYNCs since the last one heard; the counter shows the lost ones, which are included.
         """
         core = self._core
-        frames = self._packed(self.exchange(t_ns, counter, elapsed), t_ns)
-        if frames and core.quirks.tpdo_delay_ns:
-            self._late.append((t_ns + core.quirks.tpdo_delay_ns, frames))
-            self._late_timer.arm(self._late[0][0])
-        else:
-            core.out += frames
+        for group in self._triggered(t_ns, counter, elapsed):
+            frames = self._packed(group, t_ns)
+            if core.quirks.tpdo_delay_ns:
+                self._late.append((t_ns + core.quirks.tpdo_delay_ns, frames))
+                self._late_timer.arm(self._late[0][0])
+            else:
+                core.out += frames
         for tpdo in self._buffered:
             tpdo.sample(t_ns)
         for tpdo in self._on_event:
             if tpdo.requested:
                 tpdo.send(t_ns)
 
-    def exchange(self, t_ns: int, counter: int, elapsed: int = 1) -> list[Filled]:
-        """What a SYNC does before anything is packed, for its arguments see `sync`; the TPDOs whose turn it is."""
+    def exchange(self, t_ns: int, counter: int) -> list[tuple[int, tuple[int, ...]]]:
+        """As `sync`, for a master that takes values: the TPDOs whose turn it is, each (COB-ID, its values)."""
+        groups, values = self._triggered(t_ns, counter, 1), self._core.dictionary.values
+        return [(cob_id, fetch(values)) for group in groups for cob_id, _, fetch in group.packing]
+
+    def _triggered(self, t_ns: int, counter: int, elapsed: int) -> list[_Group]:
+        """What a SYNC does before anything is packed: the TPDOs whose turn it is, their values up to date."""
         self._sync_ns = t_ns
         count = self._count = self._count + elapsed
         for rpdo in self._waiting:
             if rpdo.pending is not None:
                 rpdo.apply(rpdo.pending)
         self._on_sync(t_ns, counter)
-        filled: list[Filled] = []
+        groups = []
         for group in self._groups:
             first = group.first
             if first is None:
@@ -193,19 +196,19 @@ class PdoEngine(Service):
                     continue
                 first = group.first = count
             if (count - first) % group.every == 0:
+                groups.append(group)
                 for sampler in group.samplers:
                     sampler(t_ns)
-                values = self._core.dictionary.values
-                filled += [(cob_id, pack, fetch(values)) for cob_id, pack, fetch in group.packing]
-        return filled
+        return groups
 
-    def _packed(self, filled: Sequence[Filled], t_ns: int) -> list[Frame]:
+    def _packed(self, group: _Group, t_ns: int) -> list[Frame]:
+        values = self._core.dictionary.values
         try:
-            return [(cob_id, pack(*values)) for cob_id, pack, values in filled]
+            return [(cob_id, pack(*fetch(values))) for cob_id, pack, fetch in group.packing]
         except (struct.error, TypeError):
-            for cob_id, _, _ in filled:
-                next(tpdo for tpdo in self._tpdos if tpdo.active and tpdo.packing[0] == cob_id).send(t_ns)
-            raise  # before that the one with the value that does not fit has raised, with its name
+            for tpdo in group.tpdos:
+                tpdo.send(t_ns)  # the one with the value that does not fit raises, with its name
+            raise
 
     def _send_late(self, due_ns: int) -> None:
         """Frames of a node that is slow after SYNC: what they carry is as old as the SYNC."""
