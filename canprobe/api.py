@@ -22,7 +22,7 @@ from canprobe.session.children import Bridges
 from canprobe.session.emulation import emulate, emulate_eds
 from canprobe.session.looking import commission, monitor, scan
 from canprobe.session.session import Say, Session, quiet, resolve_scene
-from canprobe.session.target import LOCKSTEP, Target
+from canprobe.session.target import VIRTUAL, Target
 from canprobe.session.up import check_joints, home, up
 from canprobe.tasks.from_plan import make_task
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
@@ -202,7 +202,7 @@ class OpenCell(Session):
         task: Controller | None = None,
     ) -> None:
         super().__init__(plan, out, say, (), rows_kept)
-        self._bridges = Bridges(plan, out, virtual=plan.scene.bus.interface == LOCKSTEP, say=say)
+        self._bridges = Bridges(plan, out, virtual=plan.scene.bus.interface in VIRTUAL, say=say)
         self._watchers = tuple(observers)
         self._task = task
         self._last: Controller | None = task

@@ -59,8 +59,9 @@ def open_port(
         from canprobe.bus.socketcan import SocketCanPort
 
         return SocketCanPort(channel, clock, bitrate=bitrate, data_bitrate=data_bitrate, waits=waits, reports=reports)
-    if interface == "lockstep":
-        raise UsageError(f"{channel}: a lockstep bus lives inside one run; there is nothing to open")
+    if interface in ("lockstep", "direct"):
+        what = "a lockstep bus lives inside one run" if interface == "lockstep" else "--bus direct has no bus"
+        raise UsageError(f"{channel}: {what}; there is nothing to open")
     return PythonCanPort(interface, channel, bitrate, clock, data_bitrate=data_bitrate, reports=reports)
 
 

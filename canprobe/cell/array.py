@@ -113,7 +113,11 @@ class TactileReceiver(ArrayReceiver):
         """Take one tactile PDO."""
         frame = self.assembler.push(can_id, data, t_ns)
         if frame is not None:
-            self._complete.append(frame)
+            self.put(frame)
+
+    def put(self, frame: TactileFrame) -> None:
+        """Take a whole frame."""
+        self._complete.append(frame)
 
     def take(
         self, cycle: int, sync_counter: int, sync_times: Sequence[int], sync_stamps: Sequence[int] = ()

@@ -155,7 +155,7 @@ class BringUp:
     def _reset(self) -> None:
         boot_ups, missing = self._watch.boot_ups, list(self._setups)
         self._watch.forget()
-        before = dict(boot_ups)
+        before = {setup.node_id: boot_ups[setup.node_id] for setup in missing}
         resets = dict.fromkeys(before, 0)
         self.took_over = True
         for _ in range(1 + self._settings.retries):

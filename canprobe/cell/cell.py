@@ -56,6 +56,8 @@ class Cell:
         log_failure: says why frames are no longer written down, None while they are.
         observers: called after each cycle.
         rows_kept: cycles whose row of the log is kept; None for all.
+        direct: makes the cycle of nodes that are reached without a bus, as `Cycle` is made, and starts them; None: they
+            are brought up and reached over the port.
         origin_ns: time on the port's clock from which the run counts, as ``bus.log`` does.
         zeros: file that records the zeros of real drives that are homed.
         to_home: the drives are about to be homed; else bring-up refuses one that is not.
@@ -81,6 +83,7 @@ class Cell:
         log_failure: Callable[[], str | None] = lambda: None,
         observers: Observers | None = None,
         rows_kept: int | None = None,
+        direct: Callable[..., Cycle] | None = None,
         origin_ns: int = 0,
         zeros: Path | None = None,
         to_home: bool = False,
@@ -105,7 +108,8 @@ class Cell:
         self._rows_kept = rows_kept
         self._origin_ns = origin_ns
         self._network = PumpedNetwork(port, other=self._other)
-        setups = make_setups(plan)
+        self._make_cycle = direct or Cycle
+        setups = make_setups(plan) if direct is None else ()  # of none only its time passes
         self._bring_up = BringUp(self._network, self.watch, setups, setup.bring_up, self._say)
         homed = any(one.homing for one in setups)
         besides: dict[str, Any] = {"supervise": self._supervise_homing, "record": zeros, "say": self._say}
@@ -166,7 +170,7 @@ class Cell:
         try:
             self._bring_up.run()
             self._start_array()
-            self.cycle = Cycle(
+            self.cycle = self._make_cycle(
                 self._port,
                 self._plan,
                 drives=self.drives,

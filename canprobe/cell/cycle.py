@@ -176,13 +176,9 @@ class Cycle:
 
     def begin(self) -> Measurement:
         """Sleep to the deadline, send SYNC, collect the answers."""
-        port = self._port
-        port.clock.sleep_until_ns(self._deadline)
-        if not port.stamps_arrival:  # the only way to separate what came before the SYNC from what came after it
-            self._route(port.drain())
+        self._port.clock.sleep_until_ns(self._deadline)
         counter = self._sync.next()
-        self.sync_ns = port.clock.now_ns()
-        port.send_batch([pack_sync(counter)], self.sync_ns)
+        self._send_sync(counter)
         self.late_ns = late_ns = self.sync_ns - self._deadline
         self.statistics.period_error_ns.append(late_ns)
         if late_ns > self._period_ns // 2:
@@ -192,8 +188,16 @@ class Cycle:
         self.t_ns = self._deadline - self.t_first_ns
         self._intake.begin(self.number, self.t_ns, self.sync_ns)
         self._collect()
+        self._intake.end()
         self._started_ns = elapsed_ns() if self.number % TIMED_CYCLES == 0 else 0
         return self._intake.measure(counter or 0)
+
+    def _send_sync(self, counter: int | None) -> None:
+        port = self._port
+        if not port.stamps_arrival:  # the only way to separate what came before the SYNC from what came after it
+            self._route(port.drain())
+        self.sync_ns = port.clock.now_ns()
+        port.send_batch([pack_sync(counter)], self.sync_ns)
 
     def _collect(self) -> None:
         port, clock, intake, looks_ns = self._port, self._port.clock, self._intake, self._looks_ns
@@ -207,7 +211,6 @@ class Cycle:
                 self._route(port.drain())
                 if intake.complete:
                     break
-        intake.end()
 
     def _collect_on_arrival(self, first_ns: int, last_ns: int) -> None:
         """Look at a time, then whenever something comes, until all TPDOs are in or another time is over."""
@@ -231,11 +234,14 @@ class Cycle:
 
     def end(self, command: Command | None) -> None:
         """Send the commands of this cycle and set the next deadline."""
-        frames = []
-        if self._drives is not None:
-            if command is not None:
-                self._drives.set_target(command.q_target)
-            frames = self._drives.frames()
+        if self._drives is not None and command is not None:
+            self._drives.set_target(command.q_target)
+        self._send_commands()
+        self._sent_ns = elapsed_ns() if self._started_ns else 0
+        self._deadline += self._period_ns
+
+    def _send_commands(self) -> None:
+        frames = self._drives.frames() if self._drives is not None else []
         if self.sync_ns >= self._heartbeat_ns:
             self._heartbeat_ns = self._deadline + HEARTBEAT_PRODUCED_MS * 1_000_000
             frames.append(pack_heartbeat(MASTER_NODE_ID, NmtState.OPERATIONAL))
@@ -243,8 +249,6 @@ class Cycle:
             self._port.send_batch(frames)
         if self._tactile is not None and (requests := self._tactile.requests(self.number)):
             send_on(self._port, self._tactile.channel, requests)
-        self._sent_ns = elapsed_ns() if self._started_ns else 0
-        self._deadline += self._period_ns
 
     def count_work(self) -> None:
         """The controller has done all that it does in this cycle."""

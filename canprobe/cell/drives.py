@@ -6,9 +6,10 @@ The drives hold *motor* positions; gears and couplings are undone here and nowhe
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import copysign
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -195,6 +196,10 @@ def feedback_frames(axes: Sequence[DriveAxis]) -> tuple[FeedbackFrame, ...]:
     return tuple(frames)
 
 
+DriveCommand = tuple[int, list[Callable[..., bytes]], list[tuple[int, ...]]]
+"""One RPDO: COB-ID, what packs each part of it, and the values of each part; see `CommandFrame`."""
+
+
 @dataclass(frozen=True, slots=True)
 class CommandFrame:
     """One RPDO frame.
@@ -276,12 +281,13 @@ class DriveGroup:
             (
                 frame.cob_id,
                 frame.every_cycle,
-                [(layout.pack, self._places_of(axis, layout, picks)) for axis, layout, picks in frame.parts],
+                [layout.pack for _, layout, _ in frame.parts],
+                [_fetcher(self._places_of(axis, layout, picks)) for axis, layout, picks in frame.parts],
                 tuple(axis for axis, _, _ in frame.parts),
             )
             for frame in command_frames(axes)
         ]
-        self._sent: dict[int, tuple[bytes, int]] = {}
+        self._sent: dict[int, tuple[list[tuple[int, ...]], int]] = {}
         self._repeat = repeat_cycles
         self._pending = 0
         self._open = False
@@ -333,6 +339,13 @@ class DriveGroup:
         except ProtocolError:
             self.malformed += 1  # and missed, unless another one comes
             return
+        self.take(can_id, values, t_ns)
+
+    def take(self, cob_id: int, values: tuple[int, ...], t_ns: int) -> None:
+        """The values of one TPDO at `t_ns`, the first of it for its SYNC; TPDOs of others are not read."""
+        if (found := self._sources.get(cob_id)) is None:
+            return
+        k, source = found
         i = source.axis
         self._heard[k] = self._cycle
         self._pending -= 1
@@ -425,9 +438,20 @@ class DriveGroup:
         self._aimed = tuple(targets)
 
     def frames(self) -> list[Frame]:
-        """The RPDOs of this cycle; until a target is set, the target of a drive is its reported position.
+        """The RPDOs of this cycle, as `commands`, packed."""
+        frames = []
+        for cob_id, packs, parts in self.commands():
+            data = packs[0](*parts[0])
+            if len(parts) > 1:
+                for pack, values in zip(packs[1:], parts[1:], strict=True):
+                    data = _overlaid(data, pack(*values))
+            frames.append((cob_id, data))
+        return frames
 
-        A drive that was never heard gets none.
+    def commands(self) -> list[DriveCommand]:
+        """The RPDOs of this cycle.
+
+        Until a target is set, the target of a drive is its reported position. A drive that was never heard gets none.
         """
         targets = self._targets if self._targets is not None else [track.counts for track in self._tracks]
         self.aim(targets)
@@ -439,28 +463,25 @@ class DriveGroup:
             self._words = words
         values = [*self._words, *targets, *self._constants]  # an axis and its pick name the place
         self._all_heard = self._all_heard or min(self._heard) >= 0
-        frames = []
-        for cob_id, every_cycle, parts, axes in self._plan:
+        commands = []
+        for cob_id, every_cycle, packs, fetches, axes in self._plan:
             if not self._all_heard and any(self._tracks[axis].cycle < 0 for axis in axes):
                 continue
-            data = b""
-            for pack, places in parts:
-                part = pack(*[values[place] for place in places])
-                data = _overlaid(data, part) if data else part
-            if every_cycle or self._due(cob_id, data):
-                frames.append((cob_id, data))
-        return frames
+            parts = [fetch(values) for fetch in fetches]
+            if every_cycle or self._due(cob_id, parts):
+                commands.append((cob_id, packs, parts))
+        return commands
 
     def _goal_of(self, node_id: int) -> DriveState:
         held_back = node_id in self.stopped and self.goal is DriveState.OPERATION_ENABLED
         return DriveState.QUICK_STOP_ACTIVE if held_back else self.goal
 
-    def _due(self, cob_id: int, data: bytes) -> bool:
+    def _due(self, cob_id: int, parts: list[tuple[int, ...]]) -> bool:
         """An event-driven frame goes on a change, and again before its receiver's event timer runs out."""
-        sent, cycle = self._sent.get(cob_id, (b"", 0))
-        if data == sent and self._cycle - cycle < self._repeat:
+        sent, cycle = self._sent.get(cob_id, ([], 0))
+        if parts == sent and self._cycle - cycle < self._repeat:
             return False
-        self._sent[cob_id] = (data, self._cycle)
+        self._sent[cob_id] = (parts, self._cycle)
         return True
 
 
@@ -474,6 +495,13 @@ def _controlword(state: DriveState | None, goal: DriveState, previous: int, inte
     word = controlword_toward(state, goal, previous)
     follows = interpolated and state is goal is DriveState.OPERATION_ENABLED
     return word | 1 << ENABLE_INTERPOLATION if follows else word
+
+
+def _fetcher(places: Sequence[int]) -> Callable[[Sequence[int]], tuple[int, ...]]:
+    """All of these places at once, by one call into C."""
+    if len(places) == 1:
+        return lambda values, place=places[0]: (values[place],)  # type: ignore[misc]
+    return itemgetter(*places)
 
 
 def _overlaid(data: bytes, part: bytes) -> bytes:

@@ -128,8 +128,8 @@ OPTIONS: Mapping[str, dict[str, Any]] = {
     "--bus": {
         "metavar": "B",
         "type": word,
-        "help": "lockstep, socketcan or another python-can interface; config: the one that CAN_INTERFACE or"
-        " python-can's configuration files name [the scene's]",
+        "help": "lockstep, direct (no bus), socketcan or another python-can interface; config: the one that"
+        " CAN_INTERFACE or python-can's configuration files name [the scene's]",
     },
     "--channel": {
         "metavar": "[NAME=]CH",

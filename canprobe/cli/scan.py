@@ -77,8 +77,9 @@ def assignment(text: str) -> Assignment:
 
 def run(args: argparse.Namespace) -> int:
     """Print one row a node."""
-    if args.bus == "lockstep":
-        raise UsageError("scan: a lockstep bus lives inside one run; name a real interface with --bus")
+    from canprobe.session.target import refuse_virtual
+
+    refuse_virtual(args.bus, "scan")
     _check(args)
 
     from canprobe import api

@@ -84,6 +84,7 @@ def _run_scene(args: argparse.Namespace, browser: _Browser) -> Path:
     from canprobe import api
     from canprobe.scene.load import load_scene
     from canprobe.scene.model import BridgeSettings
+    from canprobe.session.target import VIRTUAL
 
     scene = load_scene(args.what)
     settings = replace(scene.bridge or BridgeSettings(), view_port=args.port, view_host=args.host)
@@ -97,7 +98,7 @@ def _run_scene(args: argparse.Namespace, browser: _Browser) -> Path:
         duration_s=args.duration,
         force=args.force,
         bridge=("view",) if live else (),
-        observers=[_paced()] if live and scene.bus.interface == "lockstep" else [],
+        observers=[_paced()] if live and scene.bus.interface in VIRTUAL else [],
         say=browser.say,
     )
     return folder

@@ -10,6 +10,6 @@ nodes run in virtual time inside one process, and on a real interface for any ma
 - `faults` injects faults into a node; `serve` serves nodes on a real interface and keeps what a master stores in
   them.
 
-The emulator never imports the cell, nor the reverse: they know each other only by the bus. Each point of the
-conformance list is a test named after its clause.
+The emulator never imports the cell, nor the reverse: they know each other only by the bus, and `session.direct` puts
+them together where there is none. Each point of the conformance list is a test named after its clause.
 """

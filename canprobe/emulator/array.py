@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 from collections import deque
+from collections.abc import Callable
 from functools import cache
 from itertools import count, takewhile
 from typing import Protocol
@@ -160,6 +161,9 @@ _MAX_AGE_US = 0xFFFF
 class TactilePlant(Protocol):
     """What the sensor needs of the plant."""
 
+    def begin(self, t_ns: int) -> None:
+        """Time goes on from `t_ns`, unless it does already: the array is triggered."""
+
     def advance(self, t_ns: int) -> None:
         """Bring the plant to `t_ns`; idempotent."""
 
@@ -168,7 +172,11 @@ class TactilePlant(Protocol):
 
 
 class TactileApplication(Application):
-    """The sensor function of one node. A tare command takes the mean of the next images as zero."""
+    """The sensor function of one node. A tare command takes the mean of the next images as zero.
+
+    Attributes:
+        publish: called with header and content of each frame; it puts them into the objects that the TPDOs carry.
+    """
 
     def __init__(
         self,
@@ -195,6 +203,7 @@ class TactileApplication(Application):
         self._origin = middle(shape=self._pad.shape)
         self._counter = 0
         self._triggered_ns: int | None = None
+        self.publish: Callable[[TactileHeader, Image | Features], None] = self._put
 
     def attach(self, node: SlaveNode) -> None:
         """Hang the sensor's objects on the node."""
@@ -266,6 +275,7 @@ class TactileApplication(Application):
         if t_ns == self._triggered_ns:
             return  # PDOs of one frame in different groups
         self._triggered_ns = t_ns
+        self._plant.begin(t_ns)
         self._sample(t_ns)
         pipeline = self._pipeline
         while len(pipeline) > self._latency + 1:
@@ -274,8 +284,8 @@ class TactileApplication(Application):
         self._show(raw, min((t_ns - sampled_ns) // 1000, _MAX_AGE_US))
 
     def _show(self, raw: Raw, age_us: int) -> None:
-        """Put one frame into the objects that the TPDOs carry."""
-        dictionary, mode, window = self._node.dictionary, self._mode, self._window
+        """Make one frame, and publish it."""
+        mode, window = self._mode, self._window
         settings = self._tare, self._gain, self._threshold
         image = correct(raw, *settings)
         overload = is_overloaded(raw) or is_overloaded(image)
@@ -287,9 +297,14 @@ class TactileApplication(Application):
         if mode is TactileMode.FEATURES:
             seen = image if raw.dtype == np.uint8 else correct_finely(raw, *settings)
             content = compute_features(seen, self._full_scale, self._pad.pitch_m)
+        self.publish(header, content)
+
+    def _put(self, header: TactileHeader, content: Image | Features) -> None:
+        """Put one frame into the objects that the TPDOs carry."""
+        dictionary, mode = self._node.dictionary, self._mode
         whole = pack_whole(header, content)
         words = struct.unpack(f"<{len(whole) // 8}Q", whole)
-        dictionary.put(OVERLOAD, 0, int(overload))
+        dictionary.put(OVERLOAD, 0, int(header.overload))
         dictionary.put(ORIGIN, 0, self._origin[0] << 4 | self._origin[1])
         content_words = words if mode is TactileMode.FEATURES else words[1:]
         dictionary.values.update(zip(self._content[mode], content_words, strict=False))

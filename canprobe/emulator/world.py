@@ -138,7 +138,7 @@ def make_world(
         without_id: which of them start without a node id and wait for LSS to give them one.
         homed: drives that have to be homed start with their zeros, and keep them.
     """
-    plant = Plant(_plant_config(plan.setup))
+    plant = Plant(_plant_config(plan.setup), waits=True)
     nodes = []
     for node in plan.nodes:
         if node.node_id not in node_ids:

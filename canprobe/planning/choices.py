@@ -292,6 +292,7 @@ _BY_ARRAY = f'sensor.mode = "features": {_MODES["features"]}'
 IMAGE, OWN_WINDOW = "full image (32 PDOs)", "window (8 PDOs)"
 RAW_DEVICE = "node of the array, its PDOs and its supervision by heartbeat"
 ESTIMATOR, FIGURE, PAGE = "surface estimator", "figure", "replay to share (report.html)"
+BUS = "bus, bring-up by SDO and their log (bus.log)"
 TRUTH = "truth and scores against it"
 
 
@@ -302,6 +303,8 @@ def left_out(setup: Setup) -> tuple[tuple[str, str], ...]:
 
 def _not_sent(setup: Setup) -> Iterator[tuple[str, str]]:
     array, kind = setup.array, setup.kind
+    if setup.bus.direct:
+        yield BUS, 'bus.interface = "direct": counts and images pass in the place of frames'
     if setup.arm is None:
         yield "drives, their PDOs, joint limits", f'no [arm]: task.kind = "{kind}" moves nothing'
     elif not setup.arm.torque:
@@ -382,7 +385,8 @@ def outputs(setup: Setup, absent: Container[str]) -> tuple[str, ...]:
     written = {
         "summary.json": True,
         "log.npz": True,
-        "bus.log": True,
+        "tactile.npz": setup.array is not None,
+        "bus.log": BUS not in absent,
         "scene.toml": True,
         "truth.npz": TRUTH not in absent,
         "tool.toml": setup.kind == "calibrate",

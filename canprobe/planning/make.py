@@ -70,6 +70,10 @@ def make_plan(setup: Setup) -> Plan:
             problems.append(cut.text)
             ways = ways or [*cut.ways]
     problems += range_problems(setup)
+    if setup.bus.direct and setup.bus.bit_error_rate > 0:
+        problems.append('bus.interface = "direct" has no wire: bus.bit_error_rate needs a bus, such as lockstep')
+    if setup.bus.direct and setup.array is not None and setup.array.raw is not None:
+        problems.append('bus.interface = "direct" has no frames: an array of raw frames needs a bus, such as lockstep')
     joint_speeds, unreachable = check_motion(setup) if not unsuited else (None, [])
     problems += unreachable
     truth, arm = setup.truth, setup.arm

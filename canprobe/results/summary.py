@@ -26,7 +26,7 @@ from canprobe.scene.geometry import FILE, calibration_lines, summarise_calibrati
 from canprobe.scene.model import Scene
 from canprobe.scene.resolve import resolve
 from canprobe.session.session import Session, write_scene
-from canprobe.session.target import LOCKSTEP
+from canprobe.session.target import VIRTUAL
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.tasks.task import TaskRecord
 from canprobe.tasks.touch import losses_text, summarise_losses
@@ -193,7 +193,7 @@ def summarise(
 ) -> dict[str, Any]:
     """The content of ``summary.json``; what does not apply is None."""
     scene, cell = session.scene, session.cell
-    cycle = cell.cycle
+    cycle, direct = cell.cycle, scene.bus.direct
     sim_time = cycle.t_ns * 1e-9 if cycle is not None else 0.0
     wall = session.wall_ns * 1e-9
     log = cell.log.arrays()
@@ -220,11 +220,8 @@ def summarise(
         "calibration": summarise_calibration(scene, record.tool),
         "choices": [f"{choice.key} = {choice.value}: {choice.why}" for choice in session.plan.choices],
         "cycle": _cycle(cell, record) | {"observe_us": _observed(session)},
-        "bus_load": {
-            bus.channel: {"planned_worst": bus.traffic.load, "measured": session.bus_load(bus.channel)}
-            for bus in session.plan.buses
-        },
-        "traffic": _traffic(session),
+        "bus_load": None if direct else _bus_load(session),
+        "traffic": None if direct else _traffic(session),
         "left_out": [f"{what}: {why}" for what, why in (*session.plan.left_out, *session.plan.not_available)],
         "warnings": list(session.plan.warnings),
         "bridges": bridges,
@@ -264,6 +261,13 @@ def _without_nan(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_without_nan(part) for part in value]
     return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def _bus_load(session: Session) -> dict[str, Any]:
+    return {
+        bus.channel: {"planned_worst": bus.traffic.load, "measured": session.bus_load(bus.channel)}
+        for bus in session.plan.buses
+    }
 
 
 def _traffic(session: Session) -> dict[str, Any]:
@@ -447,7 +451,7 @@ def _figure(value: float | None, unit: str, digits: int = 2) -> str:
 def summary_text(summary: dict[str, Any], out: Path | None) -> str:
     """A summary as text."""
     contact, shape, cycle = summary["contact"], summary["shape"], summary["cycle"]
-    pace = f"{summary['realtime_factor']:.1f} × real time" if summary["bus"] == LOCKSTEP else "real time"
+    pace = f"{summary['realtime_factor']:.1f} × real time" if summary["bus"] in VIRTUAL else "real time"
     rate = "no cycle" if cycle["rate_hz"] is None else f"{cycle['cycles']} at {cycle['rate_hz']:.4g} Hz"
     lines = [
         f"{summary['scene']} on {summary['bus']}, seed {summary['seed']}: "

@@ -70,12 +70,17 @@ class SceneInfo:
     """Draw `report.png`, `surface.png` and `report.html` after a run. false saves seconds."""
 
 
+DIRECT = "direct"
+"""The interface that is no bus."""
+
+
 @dataclass(frozen=True, slots=True)
 class BusSettings:
     """`[bus]`: the bus that connects the nodes."""
 
     interface: Annotated[str, Pattern(r"[a-z0-9_-]+", "such as lockstep, socketcan, pcan")] = "lockstep"
-    """`lockstep` (in this process, in virtual time), `socketcan`, or any other python-can interface."""
+    """`lockstep` (in this process, in virtual time), `direct` (the same without a bus: counts and images in the place
+    of frames), `socketcan`, or any other python-can interface."""
     channel: Channel = "can0"
     """Channel of the interface. On a lockstep bus it is only a name in the log."""
     bitrate: Annotated[int, Range(10_000, 1_000_000)] = 1_000_000
@@ -92,6 +97,11 @@ class BusSettings:
     """Bit rate of the data phase of CAN FD frames."""
     cob_ids: CobIds = "default"
     """COB-IDs of the PDOs: the defaults of the cell, or priorities in the order of the deadlines."""
+
+    @property
+    def direct(self) -> bool:
+        """There is no bus."""
+        return self.interface == DIRECT
 
 
 @dataclass(frozen=True, slots=True)

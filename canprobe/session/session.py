@@ -24,7 +24,7 @@ from canprobe.bus.port import Clock, JoinedPort, MonotonicClock, Port, Reports, 
 from canprobe.bus.scheduling import MASTER_PRIORITY, garbage_collection_paused, realtime, reserve_memory
 from canprobe.cell.cell import Cell
 from canprobe.cell.controller import Command, Controller, Measurement
-from canprobe.cell.cycle import Observation, Observer, Observers
+from canprobe.cell.cycle import Cycle, Observation, Observer, Observers
 from canprobe.errors import CanprobeError, UsageError
 from canprobe.planning.bridges import check_bridges
 from canprobe.planning.make import make_plan
@@ -38,7 +38,7 @@ from canprobe.scene.model import BridgeSettings, Scene
 from canprobe.scene.resolve import resolve
 from canprobe.scene.rules import need_scene, with_values
 from canprobe.session.links import check_links, data_bitrate, expected_of, need_controllers
-from canprobe.session.target import LOCKSTEP, Target
+from canprobe.session.target import LOCKSTEP, VIRTUAL, Target
 from canprobe.tasks.from_plan import make_task
 
 if TYPE_CHECKING:
@@ -249,6 +249,7 @@ class Session:
         self._stack = ExitStack()
         self._entered = self._left = False
         self._cell: Cell | None = None
+        self._direct: Callable[..., Cycle] | None = None
 
     @cached_property
     def world(self) -> World:
@@ -273,6 +274,11 @@ class Session:
     def opened(self) -> bool:
         """The nodes were brought up."""
         return self._cell is not None and self._cell.cycle is not None
+
+    @property
+    def virtual(self) -> bool:
+        """It runs in this process, in virtual time."""
+        return self.scene.bus.interface in VIRTUAL
 
     @property
     def keeps_all(self) -> bool:
@@ -301,15 +307,16 @@ class Session:
                 log_failure=self._log_failure,
                 observers=self.observers,
                 rows_kept=self._rows_kept,
+                direct=self._direct,
                 origin_ns=self.origin_ns,
                 zeros=zeros_file(self.plan),
                 to_home=self._to_home,
             )
-            if self.scene.bus.interface != LOCKSTEP:
+            if not self.virtual:
                 self._get_ready(port)
             self._bus_start_ns = port.clock.now_ns()
             self._stack.callback(self._stop_watch, port)
-            self._stack.enter_context(garbage_collection_paused(collect=self.scene.bus.interface != LOCKSTEP))
+            self._stack.enter_context(garbage_collection_paused(collect=not self.virtual))
             self._stack.callback(self._observe_frames, port)
             self._stack.enter_context(self._cell)
             self._observe_frames(port)
@@ -357,22 +364,28 @@ class Session:
     def _stop_watch(self, port: Port) -> None:
         self._bus_time_ns = port.clock.now_ns() - self._bus_start_ns
 
-    # the two kinds of bus
+    # the three kinds of bus
 
     def _open(self) -> Port:
+        if self.scene.bus.direct:
+            return self._open_direct()
         return self._open_lockstep() if self.scene.bus.interface == LOCKSTEP else self._open_real()
+
+    def _make_folder(self, out: Path) -> None:
+        """The run's folder, with its scene and without what an earlier run left there."""
+        out.mkdir(parents=True, exist_ok=True)  # only now: where no bus opens nothing is left behind
+        for name in LEFT_BY_RUNS:
+            (out / name).unlink(missing_ok=True)
+        with contextlib.suppress(CanprobeError):  # it is written again at the end, and a failure reported then
+            write_scene(self.scene, out)
 
     def _writer(self, channel: str) -> Write:
         """What a bus is recorded with: its traffic is counted, written to the log and shown to the observers."""
         write: Write | None = None
         if self.out is not None:
             if self._candump is None:
-                self.out.mkdir(parents=True, exist_ok=True)  # only now: where no bus opens nothing is left behind
+                self._make_folder(self.out)
                 self._candump = self._stack.enter_context(CandumpWriter(self.out / "bus.log", channel, self.origin_ns))
-                for name in LEFT_BY_RUNS:
-                    (self.out / name).unlink(missing_ok=True)  # of an earlier run
-                with contextlib.suppress(CanprobeError):  # it is written again at the end, and a failure reported then
-                    write_scene(self.scene, self.out)
             write = self._candump.on(channel)
         if self.observers is not None:
             self.observers.origin_ns = self.origin_ns
@@ -411,10 +424,24 @@ class Session:
         if self.observers is not None:
             self.observers.frames_alone(port.clock.now_ns())
 
+    def _need_emulated(self, what: str) -> None:
+        if missing := set(self.plan.node_ids) - set(self.scene.emulated_node_ids):
+            raise UsageError(f"{what} emulated nodes only: node {min(missing)} is marked emulated = false")
+
+    def _open_direct(self) -> Port:
+        """Counts and images in the place of frames: the port's bus has nobody on it, its clock is what is used."""
+        from canprobe.session.direct import DirectCycle
+
+        self._need_emulated("without a bus there are")
+        if self.out is not None:
+            self._make_folder(self.out)
+            (self.out / "bus.log").unlink(missing_ok=True)
+        self._stack.callback(self._keep_truth)
+        self._direct = partial(DirectCycle, world=self.world)
+        return LockstepBus(VirtualClock(), self.plan.buses[0].channel).port()
+
     def _open_lockstep(self) -> Port:
-        missing = set(self.plan.node_ids) - set(self.scene.emulated_node_ids)
-        if missing:
-            raise UsageError(f"a lockstep bus has emulated nodes only: node {min(missing)} is marked emulated = false")
+        self._need_emulated("a lockstep bus has")
         if self.plan.setup.array is not None and not self.plan.setup.array.emulated:
             raise UsageError("a lockstep bus has emulated devices only: sensor.emulated = false")
         clock = VirtualClock()

@@ -6,10 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from canprobe.errors import UsageError
-from canprobe.scene.model import Scene
+from canprobe.scene.model import DIRECT, Scene
 from canprobe.scene.rules import need_scene, with_values
 
 LOCKSTEP = "lockstep"
+VIRTUAL = frozenset({LOCKSTEP, DIRECT})
+"""Interfaces in this process, in virtual time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,7 +19,7 @@ class Target:
     """A bus.
 
     Attributes:
-        interface: `lockstep`, `socketcan` or another interface of python-can.
+        interface: `lockstep`, `direct` (no bus), `socketcan` or another interface of python-can.
         channel: of the interface, in the place of the scene's `bus.channel`.
         bitrate: bit/s.
         others: what stands for the other channels that the scene names; one that is not here stays as it is.
@@ -72,7 +74,18 @@ def need_real_bus(scene: Scene, command: str) -> None:
     """Refuse a command that needs a bus which other processes can reach.
 
     Raises:
-        UsageError: the scene's bus is a lockstep bus.
+        UsageError: the scene's bus lives inside one run, or it has none.
     """
-    if scene.bus.interface == LOCKSTEP:
+    refuse_virtual(scene.bus.interface, command)
+
+
+def refuse_virtual(interface: str, command: str) -> None:
+    """Refuse an interface that ends with its run.
+
+    Raises:
+        UsageError: it is one.
+    """
+    if interface == LOCKSTEP:
         raise UsageError(f"{command}: a lockstep bus lives inside one run; name a real interface with --bus")
+    if interface == DIRECT:
+        raise UsageError(f"{command}: there is no bus in --bus direct; name a real interface with --bus")

@@ -151,6 +151,9 @@ class FakePlant:
     switches: tuple[float, float] = (-math.inf, math.inf)
     dynamics: MotorDynamics = field(default_factory=lambda: MotorDynamics(gain=100.0, coulomb=50.0, damping=4.0))
 
+    def begin(self, t_ns: int) -> None:
+        pass
+
     def advance(self, t_ns: int) -> None:
         self.t_ns = max(t_ns, self.t_ns)
         for axis, start, end, t0, t1 in self.ramps:

@@ -133,6 +133,7 @@ class DriveApplication(Application):
 
     def sync(self, t_ns: int, counter: int) -> None:
         """The mode watches and latches, one SYNC after it was enabled at the earliest."""
+        self._plant.begin(t_ns)
         counts = self.parts.feedback.measure(t_ns)
         if self._word_waits:
             self._take_word(t_ns)
@@ -224,6 +225,7 @@ class DriveApplication(Application):
             self._mode.leave(t_ns)
             self.parts.loop.close_brake()
         if new is _ENABLED:
+            self._plant.begin(t_ns)
             here = self._motion.hold(t_ns)
             self.parts.loop.open_brake(t_ns)
             self._node.dictionary.put(0x607A, 0, round(self._parameters.units.position(here)))

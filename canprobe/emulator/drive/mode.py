@@ -220,21 +220,22 @@ class Supervision:
         self.watching = target is not None
         if target is not None:
             self._by_rpdo = self._node.pdos.receives(target)
-            self._wait(t_ns)
+            if patience_ns := self._parameters.patience_ns:
+                self._timer.arm(t_ns + patience_ns)
 
     def stop(self) -> None:
         """Operation is no longer enabled."""
         self.watching = False
         self._timer.cancel()
 
-    def _wait(self, t_ns: int) -> None:
-        if self._parameters.patience_ns:
-            self._timer.arm(t_ns + self._parameters.patience_ns)
-
     def sync(self, fresh: bool, t_ns: int) -> None:
         """A SYNC came, with a target since the last one (fresh) or without."""
-        self._wait(t_ns)
-        self._misses = 0 if fresh or not self._by_rpdo else self._misses + 1
+        if patience_ns := self._parameters.patience_ns:
+            self._timer.arm(t_ns + patience_ns)
+        if fresh or not self._by_rpdo:
+            self._misses = 0
+            return
+        self._misses += 1
         if 0 < self._parameters.misses <= self._misses:
             self._lose(RPDO_TIMEOUT, t_ns)
 

@@ -178,6 +178,9 @@ Done = Callable[[int], None] | None
 class AxisPlant(Protocol):
     """What a drive needs of the plant. Positions are motor counts, calls at one instant are idempotent."""
 
+    def begin(self, t_ns: int) -> None:
+        """Time goes on from `t_ns`, unless it does already: a SYNC came, or a drive was enabled without one."""
+
     def advance(self, t_ns: int) -> None:
         """Bring the plant to `t_ns`."""
 
@@ -346,6 +349,9 @@ class IdealAxis(AxisPlant):
     def __init__(self) -> None:
         self._start = self._end = 0.0
         self._t0 = self._t1 = self._now = 0
+
+    def begin(self, t_ns: int) -> None:
+        """Nothing: it rests until it gets a reference."""
 
     def advance(self, t_ns: int) -> None:
         self._now = max(self._now, t_ns)

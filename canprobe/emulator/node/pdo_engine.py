@@ -134,6 +134,10 @@ class PdoEngine(Service):
 
         return inside_window
 
+    def rpdo(self, cob_id: int) -> Rpdo:
+        """The RPDO with this identifier. StopIteration: none."""
+        return next(rpdo for rpdo in self._rpdos if rpdo.cob_id == cob_id)
+
     def receives(self, index: int) -> bool:
         """Whether an RPDO that is in use carries an object of `index`."""
         return any(key >> 8 == index for rpdo in self._rpdos if rpdo.cob_id is not None for key in rpdo.keys)
@@ -158,31 +162,46 @@ class PdoEngine(Service):
             elapsed: SYNCs since the last one heard; the counter shows the lost ones, which are included.
         """
         core = self._core
-        self._sync_ns = t_ns
-        count = self._count = self._count + elapsed
-        for rpdo in self._waiting:
-            if rpdo.pending is not None:
-                rpdo.apply(rpdo.pending)
-        self._on_sync(t_ns, counter)
-        for group in self._groups:
-            if group.first is None and counter == group.start:
-                group.first = count
-            if group.first is not None and (count - group.first) % group.every == 0:
-                frames = self._packed(group, t_ns)
-                if core.quirks.tpdo_delay_ns:
-                    self._late.append((t_ns + core.quirks.tpdo_delay_ns, frames))
-                    self._late_timer.arm(self._late[0][0])
-                else:
-                    core.out += frames
+        for group in self._triggered(t_ns, counter, elapsed):
+            frames = self._packed(group, t_ns)
+            if core.quirks.tpdo_delay_ns:
+                self._late.append((t_ns + core.quirks.tpdo_delay_ns, frames))
+                self._late_timer.arm(self._late[0][0])
+            else:
+                core.out += frames
         for tpdo in self._buffered:
             tpdo.sample(t_ns)
         for tpdo in self._on_event:
             if tpdo.requested:
                 tpdo.send(t_ns)
 
+    def exchange(self, t_ns: int, counter: int) -> list[tuple[int, tuple[int, ...]]]:
+        """As `sync`, for a master that takes values: the TPDOs whose turn it is, each (COB-ID, its values)."""
+        groups, values = self._triggered(t_ns, counter, 1), self._core.dictionary.values
+        return [(cob_id, fetch(values)) for group in groups for cob_id, _, fetch in group.packing]
+
+    def _triggered(self, t_ns: int, counter: int, elapsed: int) -> list[_Group]:
+        """What a SYNC does before anything is packed: the TPDOs whose turn it is, their values up to date."""
+        self._sync_ns = t_ns
+        count = self._count = self._count + elapsed
+        for rpdo in self._waiting:
+            if rpdo.pending is not None:
+                rpdo.apply(rpdo.pending)
+        self._on_sync(t_ns, counter)
+        groups = []
+        for group in self._groups:
+            first = group.first
+            if first is None:
+                if counter != group.start:
+                    continue
+                first = group.first = count
+            if (count - first) % group.every == 0:
+                groups.append(group)
+                for sampler in group.samplers:
+                    sampler(t_ns)
+        return groups
+
     def _packed(self, group: _Group, t_ns: int) -> list[Frame]:
-        for sampler in group.samplers:
-            sampler(t_ns)
         values = self._core.dictionary.values
         try:
             return [(cob_id, pack(*fetch(values))) for cob_id, pack, fetch in group.packing]

@@ -116,7 +116,7 @@ class Rpdo:
         cob_id: identifier, or None while the PDO is not valid.
         keys: mapped dictionary keys, dummies left out.
         synchronous: applied at the next SYNC (types 0–240).
-        pending: data waiting for that SYNC.
+        pending: values waiting for that SYNC.
     """
 
     def __init__(self, core: NodeCore, emcy: Emergency, rules: PdoRules) -> None:
@@ -129,7 +129,7 @@ class Rpdo:
         self._event_ns = 0
         self.cob_id: int | None = None
         self.synchronous = False
-        self.pending: bytes | None = None
+        self.pending: tuple[int, ...] | None = None
 
     def configure(self) -> None:
         """Read the parameters. A mapping that makes no sense leaves the PDO without values."""
@@ -168,17 +168,21 @@ class Rpdo:
             self._forgive()
         if self._event_ns:
             self._timer.arm(t_ns + self._event_ns)
-        if self.synchronous:
-            self.pending = data
-        else:
-            self.apply(data)
+        self.take(self._unpack(data))
 
-    def apply(self, data: bytes) -> None:
+    def take(self, values: tuple[int, ...]) -> None:
+        """One value for each mapped entry but the dummies, for now or for the next SYNC."""
+        if self.synchronous:
+            self.pending = values
+        else:
+            self.apply(values)
+
+    def apply(self, given: tuple[int, ...]) -> None:
         """Store the values, each as `Dictionary.write_value` does; one that it would refuse is dropped."""
         self.pending = None
         dictionary, reported = self._core.dictionary, []
         values, watched = dictionary.values, dictionary.watched
-        for value, (key, subindex, low, high, checks, hooks) in zip(self._unpack(data), self._slots, strict=True):
+        for value, (key, subindex, low, high, checks, hooks) in zip(given, self._slots, strict=True):
             if not low <= value <= high:
                 continue
             try:

@@ -143,7 +143,12 @@ class IdealArm:
         self.t_ns = 0
         self._axes = [_Axis(c, self.lag_s) for c in joints_to_units(model, q0).tolist()]
         self._phi: dict[int, Transition] = {}
-        self._rows = [[(j, g) for j, g in enumerate(row) if g] for row in model.q_per_unit.tolist()]
+        rows = [[(motor, share) for motor, share in enumerate(row) if share] for row in model.q_per_unit.tolist()]
+        own = np.diag(model.units_per_q).tolist()
+        self._loads = [  # a drive reports torque in its own sense
+            (row, j.rotor_inertia, j.viscous, j.coulomb, j.rated_torque if units > 0.0 else -j.rated_torque)
+            for row, j, units in zip(rows, model.joints, own, strict=True)
+        ]
         self._evaluated: list[State] | None = None
 
     def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
@@ -226,17 +231,17 @@ class IdealArm:
         Returns:
             Permille, within the peak of +-2000.
         """
-        stiffness, damping, joint = self._stiffness, self._damping, self.model.joints[axis]
+        stiffness, damping = self._stiffness, self._damping
+        row, inertia, viscous, coulomb, rated = self._loads[axis]
         states = self._evaluated or self._states()
         rate = acceleration = 0.0
-        for motor, share in self._rows[axis]:
+        for motor, share in row:
             q, v, r = states[motor]
             rate += share * v
             acceleration += share * (stiffness * (r - q) - damping * v)
-        torque: float = joint.rotor_inertia * acceleration + joint.viscous * rate
-        torque += joint.coulomb * tanh(rate / STICTION_RATE)
-        rated = joint.rated_torque if self.model.units_per_q[axis, axis] > 0.0 else -joint.rated_torque
-        permille = round(1000.0 * torque / rated)  # in the drive's own sense
+        torque = inertia * acceleration + viscous * rate
+        torque += coulomb * tanh(rate / STICTION_RATE)
+        permille = round(1000.0 * torque / rated)
         if -PEAK_PERMILLE <= permille <= PEAK_PERMILLE:
             return permille
         return max(-PEAK_PERMILLE, min(PEAK_PERMILLE, permille))

@@ -3,6 +3,9 @@
 Time only moves forward; several calls at one instant are the same as one. Contact is solved once per distinct time
 and only when somebody asks. Contact pushes the dynamic arm back, and the ideal one where its joints are compliant: its
 drives are taken as stiff.
+
+The times of all calls are those of the bus. The plant's own time is 0 at `begin`, so that nothing in it depends on how
+long the nodes took to be brought up.
 """
 
 from __future__ import annotations
@@ -34,7 +37,7 @@ class PlantState(NamedTuple):
     """All that the truth of an instant follows from.
 
     Attributes:
-        t_ns: the instant.
+        t_ns: the instant, in the plant's own time.
         counts, rates: positions (counts) and rates (counts/s) of the motors; empty without an arm.
     """
 
@@ -48,13 +51,16 @@ class Plant:
 
     Args:
         config: what the plant is made of.
+        waits: its time stands at 0 until `begin`; False: it is the time of the calls.
+
     Raises:
         PlanError: for a probe without an arm over a hollow as tight as itself.
     """
 
-    def __init__(self, config: PlantConfig) -> None:
+    def __init__(self, config: PlantConfig, *, waits: bool = False) -> None:
         self.config = config
         self.t_ns = 0
+        self._origin_ns = None if waits else 0
         self.arm: IdealArm | DynamicArm | None = None
         self._pressed: PressedProbe | None = None
         if config.model is not None:
@@ -85,12 +91,24 @@ class Plant:
         self._image: tuple[int, Image] | None = None
         self._first_image_s: float | None = None
 
+    def begin(self, t_ns: int) -> None:
+        """Time goes on from here, unless it does already.
+
+        Args:
+            t_ns: ns.
+        """
+        if self._origin_ns is None:
+            self._origin_ns = t_ns
+
     def advance(self, t_ns: int) -> None:
         """Move the present time on; earlier times and repeats change nothing.
 
         Args:
             t_ns: ns.
         """
+        if self._origin_ns is None:
+            return
+        t_ns -= self._origin_ns
         if t_ns > self.t_ns:
             self.t_ns = t_ns
             self._solved = None
@@ -103,7 +121,8 @@ class Plant:
         Raises:
             RuntimeError: without an arm.
         """
-        (self.arm or self._need_arm()).set_ramp(axis, start_counts, end_counts, t0_ns, t1_ns)
+        origin_ns = t1_ns if self._origin_ns is None else self._origin_ns  # at rest until its time begins
+        (self.arm or self._need_arm()).set_ramp(axis, start_counts, end_counts, t0_ns - origin_ns, t1_ns - origin_ns)
 
     def motor_counts(self, axis: int) -> float:
         """Motor position now, counts, continuous; 0 without an arm.
@@ -181,8 +200,8 @@ class Plant:
             return np.zeros(self.config.pad.shape, dtype=np.uint8)
         if self._image is None:
             self._first_image_s = 1e-9 * self.t_ns
-        if self._image is None or self._image[0] != self.t_ns:
-            self._image = (self.t_ns, self._sampled(self.array, self._solution()))
+        if self._image is None or self._image[0] != t_ns:
+            self._image = (t_ns, self._sampled(self.array, self._solution()))
         return self._image[1].copy()
 
     def pressure(self, state: PlantState | None = None) -> Array:

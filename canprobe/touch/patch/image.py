@@ -279,9 +279,8 @@ def compute_patch(
     taxels, dead = mended(taxels) if pad.is_grid else (taxels, 0)
     pressure = calibration.pascals[taxels]
     n_active = int(np.count_nonzero(pressure))
-    counts = taxels.tobytes()
-    peak = max(counts)
-    edges = _edges(counts, pad.shape, window) if pad.is_grid else (0, 0)  # a list has no edge
+    peak = int(taxels.max())
+    edges = _edges(taxels.tobytes(), pad.shape, window) if pad.is_grid else (0, 0)  # a list has no edge
     peak_pa, at_pad, at_window = calibration.pascals.take((peak, *edges)).tolist()
     shows_shape = peak > LEAST_PEAK * calibration.threshold_counts
     if window is not None and at_window > WORTH_COMPLETING * peak_pa and shows_shape:
@@ -315,7 +314,8 @@ def _force_and_centroid(total: float, u: float, v: float, calibration: PatchCali
 def _edges(counts: bytes, shape: tuple[int, int], window: Sequence[int] | None) -> tuple[int, int]:
     """Highest count at the pad's edge, and at an edge of the window inside the pad."""
     height, width = shape
-    at_pad = max(counts[:width] + counts[-width:] + counts[::width] + counts[width - 1 :: width])
+    edges = counts[:width] + counts[-width:] + counts[::width] + counts[width - 1 :: width]
+    at_pad = max(edges.strip(b"\0"), default=0)  # none is left as a rule
     if window is None:
         return at_pad, 0
     r0, c0, n_rows, n_cols = window

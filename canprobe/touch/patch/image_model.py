@@ -143,10 +143,17 @@ class ImageModel:
         return shown
 
     def moments_of(self, shown: Array) -> list[tuple[float, float]]:
-        """Second moments above the level along both axes, m², of each of the n that `shown` gives."""
+        """Second moments above the level along both axes, m², of each of the n that `shown` gives.
+
+        Raises:
+            ValueError: where nothing is above the level.
+        """
         above = np.maximum(shown - self.level, 0.0).reshape(len(shown), -1)
         square = self.pitch**2
-        return [(square * xx / total, square * yy / total) for total, xx, yy in (above @ self._moments).tolist()]
+        sums = (above @ self._moments).tolist()
+        if not all(total > 0.0 for total, _, _ in sums):
+            raise ValueError("no patch: nothing above the level")
+        return [(square * xx / total, square * yy / total) for total, xx, yy in sums]
 
     def sum_of(self, shown: Array) -> Array:
         """(n,) pressure times area of the taxels at or above the level, N, of what `shown` gives.
@@ -161,7 +168,7 @@ class ImageModel:
         """Second moments of the image (m²) for a shape operator (K11, K12, K22; 1/m) and a force (N).
 
         Raises:
-            ValueError: where the surface is as hollow as the probe.
+            ValueError: where the surface is as hollow as the probe, or nothing is above the level.
         """
         (a, b), axes, det = self._principal(k)
         depth = self.depth(force, det)
@@ -241,7 +248,7 @@ class ImageModel:
             J (3, 3) on q = (K11, √2 K12, K22), m; residual (3,); its inverse covariance (3, 3).
 
         Raises:
-            ValueError: where the surface is as hollow as the probe.
+            ValueError: where the surface is as hollow as the probe, or nothing is above the level.
         """
         (a, b), (c, s), det = self._principal(k)
         h = _STEP * a

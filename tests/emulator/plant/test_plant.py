@@ -362,3 +362,26 @@ def test_a_compliant_joint_gives_way_by_torque_over_stiffness_and_the_encoders_d
     assert truth["depth"] == pytest.approx(stiff_truth["depth"] - way, rel=5e-3)
     assert truth["force"] < 0.95 * stiff_truth["force"]
     assert plant(depth=-1e-3, compliance=compliance).truth()["q"] == pytest.approx(plant(depth=-1e-3).truth()["q"])
+
+
+@pytest.mark.parametrize("fidelity", ["ideal", "dynamic"])
+def test_a_plant_that_waits_does_to_the_last_bit_the_same_whenever_its_time_begins(fidelity):
+    config = PlantConfig(UPENN, ELBOW_FORM, object=placed("sphere"), fidelity=fidelity, bodies=BODIES["puma260"])
+
+    def course(begin_ns):
+        p = Plant(config, waits=True)
+        here = p.motor_counts(1)
+        p.set_ramp(1, here, here, 2 * MS, 3 * MS)  # the drive holds at power on
+        p.advance(begin_ns - 1)
+        p.sample_image(begin_ns - 1)
+        assert p.motor_counts(1) == here
+        p.begin(begin_ns)
+        p.begin(begin_ns + MS)
+        p.set_ramp(1, here, here + 500.0, begin_ns, begin_ns + 5 * MS)
+        states, images = [], []
+        for k in range(4):
+            images.append(p.sample_image(begin_ns + k * 3 * MS + 1).tobytes())
+            states.append(p.state())
+        return states, images
+
+    assert course(5 * MS) == course(314_159_265)
