@@ -507,7 +507,9 @@ class TestFusion:
         scales = np.linspace(0.6, 1.6, 401)
         found = [one for s in scales if (one := self.patch(touches, s).fuse(self.T, motion))]
         assert len(found) > 380
-        assert np.abs(np.diff([one.q for one in found], axis=0)).max() < 0.4
+        believed = [one.q for one in found if not one.contradicted]
+        assert len(believed) > 100
+        assert np.abs(np.diff(believed, axis=0)).max() < 0.4
         assert found[-1].contradicted  # nobody believes moments that are 60 % too large
 
     def test_estimates_along_a_path_that_begins_to_weave_do_not_jump(self):
@@ -601,7 +603,7 @@ def test_a_prior_on_curvature_counts_once_and_the_patch_still_observes():
 @pytest.mark.parametrize("ratio", [0.54, 1.0, 1.85])
 def test_a_layer_of_another_stiffness_than_stated_is_found_from_the_touch(ratio):
     """The slope of the touch and its images give stiffness and curvature, and the stiffness lasts."""
-    stated = replace(model(), stiffness=STIFFNESS / ratio)
+    stated = model().with_stiffness(STIFFNESS / ratio)
     slope = Slope(1.0 / indentation_from_force(1.0, STIFFNESS, RADIUS, (27.8, 0.0)), 30.0)
     patch = PatchCurvature(stated, 0.6)
     T = homogeneous(tangent_rotation(-NORMAL), np.zeros(3))
