@@ -33,9 +33,9 @@ SIGMA_NORMAL_RAD = 0.3e-3
 """Of what turns no centroid: joint counts displace the probe by 11 µm, and the surface bends by 28 1/m of it."""
 SIGMA_STIFFNESS = 0.6
 """Of the logarithm of the layer's stiffness, before any touch."""
-SCALE = 8e-3
-"""Relative error of curvature that no path averages: the centroid shows the ways of the contact over the pad 10 % too
-long or short, and at a rolling share of 0.05 they are a twentieth of what bends the normal."""
+SCALE, SCALE_ROLLING = 4e-3, 0.08
+"""Relative error of curvature that no path averages, and what a probe that keeps its orientation adds to it: creep shows
+the ways of the contact over the pad too short, and the rolling share is their part of what bends the normal."""
 WITH_PATCH = ("recursive", "ml")
 """Estimators whose answers the patch completes and whose regions follow changes; the others stay as they were."""
 
@@ -87,7 +87,8 @@ def make_shape_estimator(task: Touch, method: str) -> Estimator:
         return estimator
     from canprobe.touch.estimate.online import FollowingEstimator
 
-    return FollowingEstimator(_with_patch(task, estimator, memory) if _uses_patch(task) else estimator, memory, SCALE)
+    scale = SCALE + SCALE_ROLLING * task.scan.rolling_share
+    return FollowingEstimator(_with_patch(task, estimator, memory) if _uses_patch(task) else estimator, memory, scale)
 
 
 def _typical_sigma(task: Touch) -> float:
