@@ -34,8 +34,8 @@ SIGMA_NORMAL_RAD = 0.3e-3
 SIGMA_STIFFNESS = 0.6
 """Of the logarithm of the layer's stiffness, before any touch."""
 SCALE, SCALE_ROLLING = 4e-3, 0.08
-"""Relative error of curvature that no path averages, and what a probe that keeps its orientation adds to it: creep shows
-the ways of the contact over the pad too short, and the rolling share is their part of what bends the normal."""
+"""Relative error of curvature that no path averages, and what a probe that keeps its orientation adds to it: creep
+shows the ways of the contact over the pad too short, and the rolling share is their part of what bends the normal."""
 WITH_PATCH = ("recursive", "ml")
 """Estimators whose answers the patch completes and whose regions follow changes; the others stay as they were."""
 
