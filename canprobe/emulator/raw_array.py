@@ -92,6 +92,7 @@ class RawArray(Participant):
         return self._ready(t_ns)
 
     def _sample(self, t_ns: int) -> None:
+        self._plant.begin(t_ns)
         self._plant.advance(t_ns)
         loads = self._plant.sample_image(t_ns).astype(np.float64) / FULL_SCALE
         image = self._wire.image

@@ -384,8 +384,9 @@ class Session:
         write: Write | None = None
         if self.out is not None:
             if self._candump is None:
-                self._make_folder(self.out)
+                self.out.mkdir(parents=True, exist_ok=True)
                 self._candump = self._stack.enter_context(CandumpWriter(self.out / "bus.log", channel, self.origin_ns))
+                self._make_folder(self.out)
             write = self._candump.on(channel)
         if self.observers is not None:
             self.observers.origin_ns = self.origin_ns

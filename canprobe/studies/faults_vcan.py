@@ -127,7 +127,7 @@ def served_scene() -> Scene:
 def row_of(case: ProcessCase) -> Row:
     """Bring the cell up, let the fault happen, and look at what is left: the row of the case."""
     with tempfile.TemporaryDirectory(prefix="canprobe-faults-") as folder:
-        run = _Run(case, EmulatorChild(served_scene(), None, CHANNEL), Path(folder))
+        run = _Run(case, EmulatorChild(served_scene(), None, (CHANNEL,)), Path(folder))
         try:
             status, ended_s, drives = run.carry_out()
         finally:

@@ -99,7 +99,7 @@ def soak(seconds: float) -> list[Row]:
     """Hold the cell; a sample every sixtieth of the time."""
     scene = load_scene("cylinder")
     scene = Target.over(scene, "socketcan", CHANNEL).applied_to(scene)
-    child = EmulatorChild(scene, None, CHANNEL, truth=False)
+    child = EmulatorChild(scene, None, (CHANNEL,), truth=False)
     with served(child):
         session = Session(with_real_nodes(patient(scene)), rows_kept=ROWS_OF_UP)
         soaker = Soaker(session, child.pid, seconds)

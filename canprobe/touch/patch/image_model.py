@@ -291,13 +291,13 @@ def _in_axes(v1: float, v2: float, axes: tuple[float, float]) -> Moments:
 
 
 def make_patch_calibration(calibration: ArrayCalibration, pad: Pad) -> PatchCalibration:
-    """From counts to force, for an array of these taxels; a list of taxels has no image model, and no gains.
+    """From counts to force, for an array of these taxels; without a sphere or a grid the force is that of the pressure.
 
     At another full scale than that of the calibration level, threshold and noise are the same counts of another
     pressure, and layer, blur, crosstalk and scale stay.
     """
-    if not pad.is_grid:
-        return PatchCalibration(pad)
+    if pad.is_flat or not pad.is_grid:
+        return PatchCalibration(pad, force_gain=1.0 / calibration.image.scale)
     plain = PatchCalibration(pad, gains=calibration.gains)
     gain, edge = make_image_model(calibration, plain, seen=None).force_gains(GAIN_FORCES_N, GAIN_CURVATURES)
     return replace(plain, force_gain=gain, edge_gain=edge)
