@@ -39,6 +39,7 @@ from canprobe.scene.geometry import T_flange_probe, true_object
 from canprobe.scene.model import Scene
 from canprobe.scene.resolve import resolve
 from canprobe.touch.pad import Pad
+from canprobe.touch.patch.array_calibration import NOMINAL
 from canprobe.touch.shapes import PlacedShape
 
 # The scene in the browser: arm, probe, object, contact, force, patch and path as viser's nodes.
@@ -59,7 +60,7 @@ class Stage:
         scene: which arm, probe and object.
 
     Attributes:
-        notes: lines about what cannot be drawn.
+        notes: lines about what cannot be drawn, and what the newtons are.
     """
 
     def __init__(self, server: Any, scene: Scene) -> None:
@@ -70,12 +71,13 @@ class Stage:
         self._shape = None if scene.object is None else true_object(scene.object)
         self._probe = None
         self._tool = np.eye(4) if scene.probe is None else T_flange_probe(scene.probe)
-        self.notes: list[str] = []
+        self.notes: list[str] = [] if array is None or array.newtons != NOMINAL else [f"force in {NOMINAL}"]
         self._light()
         if self._shape is not None:
             self._add_object(self._shape)
         if self._model is not None and scene.arm is not None:
-            parts, self.notes = arm_links(scene.arm, self._model.chain)
+            parts, undrawn = arm_links(scene.arm, self._model.chain)
+            self.notes += undrawn
             self._links = [self._api.add_frame(f"/arm/{i}", show_axes=False) for i in range(self._model.n + 1)]
             for part in parts:
                 self._add(f"/arm/{part.frame}/{part.name}", part.mesh, part.colour, flat_shading=part.flat)

@@ -21,6 +21,7 @@ from canprobe.results.summary import RunResult
 from canprobe.results.surface_figure import Array, true_surface
 from canprobe.scene.geometry import true_object
 from canprobe.tasks.shape import ShapeRecord
+from canprobe.touch.patch.array_calibration import NOMINAL
 
 # The figure of a run: contact trajectory like the paper's, force, curvature with its band, taxel image.
 
@@ -63,8 +64,10 @@ def _rows(result: RunResult) -> list[list[tuple[Panel, float]]]:
 def _title(result: RunResult) -> str:
     summary = result.summary
     truth = "the plant's truth is known" if result.truth else "measured only, no truth is known"
+    newtons = f" · {NOMINAL}" if summary["newtons"] == NOMINAL else ""
     end = "" if summary["completed"] else f"\nstopped: {summary['stop_reason']}"
-    return f"{result.plan.scene.title or summary['scene']}\n{summary['bus']}, seed {summary['seed']} · {truth}{end}"
+    scene = result.plan.scene.title or summary["scene"]
+    return f"{scene}\n{summary['bus']}, seed {summary['seed']} · {truth}{newtons}{end}"
 
 
 def _draw_tool(part: SubFigure, result: RunResult) -> None:
