@@ -256,7 +256,7 @@ def find_crossings(surface_map: SurfaceMap, *, radius: float = RADIUS_M, gap: fl
     along = surface_map.travelled
     apart = np.linalg.norm(surface_map.points[:, None] - surface_map.points[None], axis=2)
     facing = surface_map.normals @ surface_map.normals.T > FACING
-    fits = (apart <= limit) & (along[None] - along[:, None] >= least) & facing
+    fits = np.triu((apart <= limit) & (along[None] - along[:, None] >= least) & facing, 1)
     pairs = np.argwhere(fits)[np.argsort(apart[fits], kind="stable")]
     chosen: list[tuple[int, int]] = []
     while len(pairs):

@@ -225,6 +225,8 @@ def test_nothing_to_test_is_no_verdict():
     assert nothing.verdict().tested == 0
     assert math.isnan(nothing.verdict("height").share_below)
     assert check_consistency(merge_patches([], np.zeros((0, 3)))).crossings == ()
+    alone = dataclasses.replace(_exact(SurfaceMatrix.plane(), np.eye(4)), distance_m=0.0)
+    assert find_crossings(SurfaceMap(patches=(alone,), path=np.zeros((0, 3)))) == []  # not with itself
 
 
 def test_fisher_is_scipys():
