@@ -7,6 +7,7 @@ lines on the guest's console; the exit status comes out through a file, because 
     JOB/            a folder under the temporary folder, removed afterwards
       init          the guest's first process: mounts, modules, vcan0, vcan1, then the command
       command       working folder, environment and arguments of the command
+      xstate.so     from `xstate.c`, on processors that need it
       pid status    written by the guest: the command runs, the command has ended
       stdout stderr console
 """
@@ -30,7 +31,9 @@ from canprobe.errors import BusError
 
 PROGRAM = "linux.uml"
 MODULES = Path("/usr/lib/uml/modules")
-PACKAGE = "user-mode-linux"
+PACKAGE, COMPILER_PACKAGE = "user-mode-linux", "build-essential"
+_WIDE_REGISTERS = "amx_tile"
+"""Flag of processors whose extended registers do not fit into the guest's kernel, which then needs `xstate.c`."""
 _PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 _MEMORY = 2 << 30
 _BOOT_S = 60.0
@@ -87,11 +90,19 @@ class GuestError(BusError):
         super().__init__(message)
 
 
-def is_installed() -> bool:
-    """Return whether the guest's kernel and its CAN modules are on this machine."""
-    return shutil.which(PROGRAM, path=_search_path()) is not None and any(
+def missing_packages() -> list[str]:
+    """Debian packages that a guest on this machine needs and that are not installed."""
+    installed = shutil.which(PROGRAM, path=_search_path()) is not None and any(
         MODULES.glob("*/kernel/drivers/net/can/vcan.ko")
     )
+    missing = [] if installed else [PACKAGE]
+    if _has_wide_registers() and shutil.which("cc") is None:
+        missing.append(COMPILER_PACKAGE)
+    return missing
+
+
+def _has_wide_registers() -> bool:
+    return _WIDE_REGISTERS in Path("/proc/cpuinfo").read_text().split()
 
 
 def _search_path() -> str:
@@ -234,6 +245,9 @@ class GuestJob:
         if shutil.which("setpriv"):
             prefix = ["setpriv", "--pdeathsig", "TERM", *prefix]  # the guest ends with us, however we end
         memory_folder, memory = _memory()
+        environment = {**os.environ, "TMPDIR": memory_folder, "PATH": _search_path()}
+        if _has_wide_registers():
+            environment["LD_PRELOAD"] = _compile_xstate(self._job)
         arguments = [
             *("root=/dev/root", "rootfstype=hostfs", "rootflags=/", "rw", f"init={self._job}/init", "quiet"),
             *(f"mem={memory >> 20}M", f"umid=canprobe-{uuid.uuid4().hex[:12]}", f"uml_dir={self._job}/"),
@@ -245,7 +259,7 @@ class GuestJob:
                 stdin=subprocess.PIPE,
                 stdout=console,
                 stderr=console,
-                env={**os.environ, "TMPDIR": memory_folder, "PATH": _search_path()},
+                env=environment,
                 start_new_session=True,
             )
         _favour_session(guest.pid)
@@ -262,6 +276,18 @@ class GuestJob:
             os.close(source)
         self._streams = []
         shutil.rmtree(self._job, ignore_errors=True)
+
+
+def _compile_xstate(folder: Path) -> str:
+    """The library that is loaded before the guest's own; see `xstate.c`."""
+    library = folder / "xstate.so"
+    source = Path(__file__).with_name("xstate.c")
+    command = ["cc", "-shared", "-fPIC", "-O2", "-o", str(library), str(source), "-ldl"]
+    try:
+        subprocess.run(command, check=True, capture_output=True, text=True)
+    except subprocess.CalledProcessError as error:
+        raise GuestError(f"the guest needs {source.name}, which {error.stderr.strip()}", False) from error
+    return str(library)
 
 
 def _job_folder() -> Path:

@@ -20,7 +20,7 @@ from typing import Protocol
 
 from canprobe.bus.socketcan import check_interface, has_socketcan
 from canprobe.errors import InterfaceError
-from canprobe.vcan.guest import PACKAGE, GuestError, GuestJob, is_installed
+from canprobe.vcan.guest import GuestError, GuestJob, missing_packages
 
 # Run one command to its end: signals passed on to it, a time-out, and its exit status as a shell would see it.
 
@@ -173,10 +173,10 @@ def _run_here(command: Sequence[str], way: str, signals: list[int], timeout_s: f
 def _run_in_guest(
     command: Sequence[str], signals: list[int], timeout_s: float | None, install: bool, realtime: bool
 ) -> int:
-    if not is_installed():
-        line = f"{'' if os.geteuid() == 0 else 'sudo '}apt-get install -y {PACKAGE}"
+    if missing := missing_packages():
+        line = f"{'' if os.geteuid() == 0 else 'sudo '}apt-get install -y {' '.join(missing)}"
         if not install:
-            return _no_vcan(f"this kernel has no vcan, and the guest that would is not installed; type:  {line}")
+            return _no_vcan(f"this kernel has no vcan, and what the guest that would needs is missing; type:  {line}")
         if not _install(line):
             return _no_vcan(f"this failed:  {line}")
     try:
@@ -267,7 +267,7 @@ def _install(line: str) -> bool:
             ["/bin/sh", "-c", attempt], stdin=subprocess.DEVNULL, stdout=2, env=environment, check=False
         )
         if done.returncode == 0:
-            return is_installed()
+            return not missing_packages()
     return False
 
 

@@ -11,16 +11,18 @@ from pathlib import Path
 import pytest
 
 from canprobe.bus.socketcan import has_socketcan
-from canprobe.vcan.guest import PROGRAM, GuestError, GuestJob, is_installed
+from canprobe.vcan.guest import PROGRAM, GuestError, GuestJob, missing_packages
 from canprobe.vcan.launch import supervise
 
 CANPROBE = (sys.executable, "-c", "import sys; from canprobe.cli import main; sys.exit(main())")
 ROOT = Path(__file__).parents[2]
 
 pytestmark = pytest.mark.slow
-needs_guest = pytest.mark.skipif(not is_installed(), reason=f"no {PROGRAM}; type: apt-get install -y user-mode-linux")
+needs_guest = pytest.mark.skipif(
+    bool(missing_packages()), reason=f"no {PROGRAM}; type: apt-get install -y {' '.join(missing_packages())}"
+)
 needs_vcan = pytest.mark.skipif(
-    not is_installed() and not has_socketcan(), reason="no vcan; type: canprobe vcan --install -- true"
+    bool(missing_packages()) and not has_socketcan(), reason="no vcan; type: canprobe vcan --install -- true"
 )
 
 

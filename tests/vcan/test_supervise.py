@@ -104,7 +104,7 @@ def test_the_command_line_time_out_and_wrong_use(capfd: pytest.CaptureFixture[st
 def nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
     """A machine without SocketCAN and without the guest."""
     monkeypatch.setattr(vcan, "has_socketcan", lambda: False)
-    monkeypatch.setattr(vcan, "is_installed", lambda: False)
+    monkeypatch.setattr(vcan, "missing_packages", lambda: ["user-mode-linux"])
 
 
 @pytest.mark.usefixtures("nowhere")
