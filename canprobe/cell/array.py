@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 
@@ -176,8 +177,8 @@ class RawReceiver(ArrayReceiver):
     """Collects the raw frames of a device that knows no CANopen.
 
     The normal pressure of each taxel becomes a count as a CANopen array sends it: 0 without load, 255 at full scale.
-    An image was sampled at the arrival of its first frame less the latency; the arrivals of a free-running device are
-    fitted (`PeriodFit`).
+    An image was sampled at the arrival of its first frame less the latency, as stated and as calibrated; the arrivals
+    of a free-running device are fitted (`PeriodFit`).
 
     Args:
         array: with a raw wire.
@@ -225,8 +226,9 @@ class RawReceiver(ArrayReceiver):
         instant, sigma = self._fit.step(image.t_ns) if self._fit is not None else (image.t_ns, 0.0)
         frame = self._frame(image)
         if frame is not None:
-            spread = float(np.hypot(sigma, self.wire.latency_sigma_s))
-            self._complete.append((frame, instant - round(1e9 * self.wire.latency_s), spread))
+            wire = self.wire
+            spread = math.hypot(sigma, wire.latency_sigma_s, wire.found_sigma_s)
+            self._complete.append((frame, instant - round(1e9 * (wire.latency_s + wire.found_s)), spread))
 
     def take(
         self, cycle: int, sync_counter: int, sync_times: Sequence[int], sync_stamps: Sequence[int] = ()

@@ -51,6 +51,7 @@ from canprobe.scene.setup import (
     Truth,
 )
 from canprobe.touch.pad import FLAT_RADIUS_M, Pad
+from canprobe.touch.patch.array_calibration import ArrayCalibration
 from canprobe.touch.servo import SurfaceGains, make_strategy
 
 MM = 1e-3
@@ -58,6 +59,8 @@ LAYER_N_M3 = 1.27e8
 """Stiffness of the emulated layer where nothing else is stated."""
 EMULATED_ARRAY = "inch16"
 """Calibration of the emulated array."""
+SURE = 3.0
+"""Standard deviations of a calibrated latency from which on it is told from none."""
 EFFECTS = ("noise", "gain_error", "blur", "hysteresis", "creep", "crosstalk", "saturation", "threshold")
 
 
@@ -185,11 +188,13 @@ def _array(scene: Scene, radius: float, stiffness: float | None) -> Array | None
         pad=pad,
         calibration=calibration if stiffness is None else calibration.with_stiffness(stiffness),
         calibrated=settings.calibration is not None or settings.emulated,
-        raw=None if scene.array_is_node or scene.wire is None else _raw_wire(scene.wire, settings),
+        raw=None if scene.array_is_node or scene.wire is None else _raw_wire(scene.wire, settings, calibration),
     )
 
 
-def _raw_wire(wire: WireSettings, settings: SensorSettings) -> RawWire:
+def _raw_wire(wire: WireSettings, settings: SensorSettings, calibration: ArrayCalibration) -> RawWire:
+    found = calibration.centroid
+    sure = settings.calibration is not None and abs(found.latency_s) > SURE * found.latency_sigma_s
     return RawWire(
         image=image_format(wire, settings.rows, settings.columns),
         normal=wire.normal_axis - 1,
@@ -202,6 +207,8 @@ def _raw_wire(wire: WireSettings, settings: SensorSettings) -> RawWire:
         poll=tuple(map(_frame, wire.poll)),
         latency_s=wire.latency_ms * 1e-3,
         latency_sigma_s=wire.latency_sigma_ms * 1e-3,
+        found_s=found.latency_s if sure else 0.0,
+        found_sigma_s=found.latency_sigma_s if sure else 0.0,
     )
 
 

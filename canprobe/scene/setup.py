@@ -168,7 +168,8 @@ class RawWire:
         sampling: what an image begins with.
         start, stop: frames that start and stop the device.
         poll: frames that ask for one image.
-        latency_s, latency_sigma_s: from the sample to the first frame, and its standard deviation.
+        latency_s, latency_sigma_s: from the sample to the first frame, as stated, and its standard deviation.
+        found_s, found_sigma_s: what a calibration has found beyond that, and its standard deviation.
     """
 
     image: ImageFormat
@@ -182,6 +183,8 @@ class RawWire:
     poll: tuple[Frame, ...]
     latency_s: float
     latency_sigma_s: float
+    found_s: float = 0.0
+    found_sigma_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,5 +1,6 @@
 """Arrays of other sizes and makes: planned, emulated, listened to and pressed, in lockstep."""
 
+import re
 from dataclasses import replace
 from importlib import resources
 
@@ -107,6 +108,22 @@ def test_an_array_that_samples_at_sync_is_placed_at_its_syncs(tmp_path):
     assert len(tactile["t_s"]) == pytest.approx(50, abs=2)
     assert np.minimum(after_sync_s, 0.01 - after_sync_s).max() < 0.5e-3  # the first frame's way over the bus
     assert tactile["raw"].shape[1:] == (10, 12, 1) and (tactile["t_sigma_s"] == 0.5e-3).all()
+
+
+@pytest.mark.parametrize(("sigma_ms", "applied"), [(0.1, True), (1.0, False)])
+def test_the_latency_of_a_calibration_counts_where_it_is_sure(sigma_ms, applied, tmp_path):
+    text = (resources.files("canprobe") / "calibrations/inch16.toml").read_text()
+    text = re.sub("(?m)^latency_ms.*", "latency_ms = 2.0", text)
+    file = tmp_path / "mine.toml"
+    file.write_text(re.sub("(?m)^latency_sigma_ms.*", f"latency_sigma_ms = {sigma_ms}", text))
+    sensor = FREE.replace('channel = "can1"', "rate_hz = 100").replace("[wire]", '{}\n[wire]\nsampling = "sync"')
+    stated, found = (
+        canprobe.run(listen("inch16", sensor.format(key), duration=0.2), out=tmp_path / name).tactile
+        for name, key in (("stated", ""), ("found", f'calibration = "{file}"'))
+    )
+    earlier_s = stated["t_sample_s"] - found["t_sample_s"]
+    assert earlier_s == pytest.approx(2e-3 if applied else 0.0, abs=1e-6)
+    assert found["t_sigma_s"] == pytest.approx(np.hypot(0.5e-3, 1e-3 * sigma_ms) if applied else 0.5e-3)
 
 
 def test_traffic_of_raw_frames_is_as_planned(tmp_path):
