@@ -296,6 +296,8 @@ def draw_regions(rows: Sequence[Row], path: Path) -> None:
                 axes.errorbar(x, y, yerr=bars, label=f"{group} scenes", **style)
         left.set(title="coverage", ylabel="share of regions")
         right.set(title="stated over error", ylabel="ratio of RMS", yscale="log")
+        right.set_yticks([0.5, 0.7, 1, 1.5, 2, 3], ["0.5", "0.7", "1", "1.5", "2", "3"])
+        right.minorticks_off()
         for axes in (left, right):
             axes.set_xticks(range(len(names)), names, rotation=45, ha="right", rotation_mode="anchor")
             axes.set_xlim(-0.6, len(names) - 0.4)
