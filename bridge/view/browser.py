@@ -17,10 +17,10 @@ import numpy as np
 
 from canprobe.bridge.sample import Context, Sample
 from canprobe.bridge.view.instants import NAMES, Answer, Follower, Moment, curves_of, row_of
-from canprobe.bridge.view.meshes import MAGMA, UNKNOWN, Array, scale
+from canprobe.bridge.view.meshes import MAGMA, Array, scale
 from canprobe.bridge.view.path import OFF_PATH, GrowingPath, LoadedPath, Trail, error_scale
 from canprobe.bridge.view.recorded import RecordedRun
-from canprobe.bridge.view.stage import Panel, Stage, address, open_server
+from canprobe.bridge.view.stage import Panel, Stage, address, legend_of, open_server, place_of
 from canprobe.bus.disk import write_text
 from canprobe.bus.port import MonotonicClock
 from canprobe.scene.geometry import true_object
@@ -49,7 +49,7 @@ class LiveView:
         self._stack = ExitStack()
         server = self._server = self._stack.enter_context(open_server(settings.view_port, settings.view_host))
         self._stage = Stage(server, scene)
-        self._panel = Panel(server, scene, errors, self._stage.notes)
+        self._panel = Panel(server, scene, errors, self._stage)
         self._trail = Trail()
         self._path = GrowingPath(server.scene, self._trail, errors)
         self._follower = Follower(shape)
@@ -155,13 +155,12 @@ class Player:
         self._stage = Stage(server, run.scene)
         self._path = LoadedPath(server.scene, trail_of(run), errors)
         gui = server.gui
-        start = float(run.log["t_s"][0])
-        with gui.add_folder("Replay"):
-            self._slider = gui.add_slider("time (s)", start, max(run.duration_s, start + 0.01), 0.01, start)
-            self._play = gui.add_checkbox("play", True)
-            self._speed = gui.add_dropdown("speed", ("0.25", "0.5", "1", "2", "4"), initial_value="1")
+        start = round(float(run.log["t_s"][0]), 2)
+        self._slider = gui.add_slider("time (s)", start, max(round(run.duration_s, 2), start + 0.01), 0.01, start)
+        self._play = gui.add_checkbox("play", True)
+        self._speed = gui.add_dropdown("speed", ("0.25", "0.5", "1", "2", "4"), initial_value="1")
         self.notes = self._stage.notes
-        self._panel = Panel(server, run.scene, errors, self.notes)
+        self._panel = Panel(server, run.scene, errors, self._stage)
         times = run.times(max(FRAME_S, run.duration_s / MOST_POINTS))
         self._panel.show(run.at(start), curves_of(row_of(run.at(t)) for t in times))
         self._shown = math.nan
@@ -170,8 +169,8 @@ class Player:
         """Go on by so much of the wall's time, and show where the slider stands."""
         t = float(self._slider.value)
         if self._play.value:
-            t += dt_s * float(self._speed.value)
-            t = t if t <= self._run.duration_s else float(self._run.log["t_s"][0])
+            t = round(t + dt_s * float(self._speed.value), 2)
+            t = t if t <= self._run.duration_s else self._slider.min
             self._slider.value = t
         if t == self._shown:
             return
@@ -285,7 +284,8 @@ def _panel_data(run: RecordedRun, times: Array, notes: list[str]) -> dict[str, A
         "taxels": base64.b64encode(taxels).decode("ascii"),
         "scale": {"high": errors.high, "text": errors.text, "colours": scale(np.linspace(0, 1, 64), 0, 1).tolist()},
         "heat": scale(np.sqrt(np.arange(256.0)), 0.0, math.sqrt(255.0), MAGMA).tolist(),
-        "unknown": list(UNKNOWN),
+        "legend": legend_of(run.scene),
+        "centre": place_of(run.scene).tolist(),
     }
 
 

@@ -17,7 +17,7 @@ from canprobe.touch.shapes import PlacedShape
 
 SPACING_M = 4e-4
 """Path between two points that are drawn."""
-LIFT_M = 1e-3
+LIFT_M = 6e-4
 """Off the surface, along the normal, so that the ghost does not hide the path."""
 GAP_M = 8e-3
 """Two contacts farther apart are not joined: the probe was lifted between them."""
@@ -108,7 +108,7 @@ class Trail:
 
 # The path in the browser: a node for each stretch of it, so that a growing path is not sent again and again.
 
-THICKNESS_M = 1.5e-3
+THICKNESS_M = 7e-4
 STRETCH = 150
 """Segments of one node of a live path."""
 
