@@ -18,13 +18,9 @@ from numpy.typing import NDArray
 from canprobe.bridge.database import need
 from canprobe.bridge.sample import quaternion_of
 from canprobe.bridge.view.bodies import (
-    EXAGGERATION,
-    disc_faces,
-    disc_points,
     link_frames,
     object_lines,
     object_mesh,
-    patch_shape,
     probe_parts,
     taxel_colours,
     taxel_image,
@@ -33,8 +29,8 @@ from canprobe.bridge.view.bodies import (
 )
 from canprobe.bridge.view.instants import Curves, Moment
 from canprobe.bridge.view.links import arm_links
-from canprobe.bridge.view.meshes import UNKNOWN, Array, Mesh, linear_light, scale
-from canprobe.bridge.view.path import ErrorScale
+from canprobe.bridge.view.meshes import Array, Mesh, linear_light
+from canprobe.bridge.view.path import PATH, DeviationScale
 from canprobe.errors import InterfaceError
 from canprobe.robot.model import ArmModel
 from canprobe.scene.geometry import T_flange_probe, true_object
@@ -46,8 +42,8 @@ from canprobe.touch.shapes import PlacedShape
 
 # The scene in the browser: arm, probe, object, contact, force, patch and path as viser's nodes.
 
-OBJECT, PROBE, SHELL, PATCH, FORCE = (126, 150, 176), (78, 88, 104), (255, 150, 40), (250, 190, 40), (214, 40, 30)
-FORCE_M_PER_N = 0.02
+OBJECT, PROBE, FORCE = (126, 150, 176), (78, 88, 104), (214, 40, 30)
+FORCE_M_PER_N = 0.012
 """Length of the force arrow."""
 LEAST_FORCE_N = 0.05
 LOOK_ASIDE = math.radians(55.0)
@@ -63,10 +59,9 @@ def legend_of(scene: Scene) -> list[tuple[tuple[int, int, int], str]]:
     rows = []
     if scene.object is not None:
         rows.append((OBJECT, "true object"))
-    if scene.shape is not None:
-        rows.append((PATCH, "estimate at the contact"))
-        rows.append((SHELL, f"± 2 deviations, × {EXAGGERATION:g}"))
-    return [*rows, (FORCE, "contact force")]
+    if scene.probe is not None:
+        rows += [(PATH, "path of the contact"), (FORCE, "contact force")]
+    return rows
 
 
 def place_of(scene: Scene) -> Array:
@@ -113,7 +108,6 @@ class Stage:
             self._add_probe(scene.probe.radius_mm * 1e-3, array.pad if array is not None else None)
         self._add_contact()
         self._look(server, scene)
-        self._drawn_patch: object = None
 
     # building
 
@@ -138,9 +132,9 @@ class Stage:
         )  # fmt: skip
 
     def _add_object(self, shape: PlacedShape) -> None:
-        ghost = self._add("/object/ghost", object_mesh(shape), OBJECT, opacity=0.45, side="double", cast_shadow=False)
+        ghost = self._add("/object/ghost", object_mesh(shape), OBJECT, opacity=0.3, side="double", cast_shadow=False)
         lines = self._api.add_line_segments(
-            "/object/lines", object_lines(shape).astype(np.float32), (96, 116, 140), thickness=1.0,
+            "/object/lines", object_lines(shape).astype(np.float32), (150, 165, 184), thickness=1.0,
             thickness_units="screen",
         )  # fmt: skip
         self._truth = [ghost, lines]
@@ -163,23 +157,15 @@ class Stage:
             self._taxels = None
 
     def _add_contact(self) -> None:
-        api, xy = self._api, disc_points()
-        self._xy = xy
+        api = self._api
         self._contact = api.add_frame(
-            "/contact", axes_length=0.03, axes_radius=0.0007, origin_radius=0.0014, visible=False
+            "/contact", axes_length=0.012, axes_radius=0.0004, origin_radius=0.0008, visible=False
         )
         self._force = api.add_arrows(
-            "/force", np.zeros((1, 2, 3), np.float32), FORCE, shaft_radius=0.0018, head_radius=0.0045,
-            head_length=0.011, visible=False,
+            "/force", np.zeros((1, 2, 3), np.float32), FORCE, shaft_radius=0.0012, head_radius=0.003,
+            head_length=0.007, visible=False,
         )  # fmt: skip
         self._label = api.add_label("/force/label", "", anchor="bottom-center", visible=False)
-        self._patch = api.add_frame("/patch", show_axes=False, visible=False)
-        flat = Mesh(np.column_stack([xy, np.zeros(len(xy))]), disc_faces())
-        self._disc = self._add("/patch/surface", flat, PATCH, opacity=0.85, side="double", cast_shadow=False)
-        self._shells = [
-            self._add(f"/patch/{name}", flat, SHELL, opacity=0.28, side="double", cast_shadow=False)
-            for name in ("above", "below")
-        ]
 
     def _look(self, server: Any, scene: Scene) -> None:
         """At probe and contact, across the line from the base to them: there the arm hides nothing."""
@@ -188,8 +174,8 @@ class Stage:
             place = place_of(scene)
             out, heading = math.atan2(place[1], place[0]), math.radians(scene.task.heading_deg)
             across = max((out - LOOK_ASIDE, out + LOOK_ASIDE), key=lambda angle: abs(math.sin(angle - heading)))
-            target = place + np.array((0.0, 0.0, 0.018))
-            away = 0.29 * np.array((math.cos(across), math.sin(across), 0.5))
+            target = place + np.array((0.0, 0.0, 0.012))
+            away = 0.21 * np.array((math.cos(across), math.sin(across), 0.5))
         elif self._model is not None:
             target, away = np.array((0.0, 0.0, 0.32)), np.array((-1.0, 0.55, 0.3))
         else:
@@ -218,7 +204,6 @@ class Stage:
             self._taxels.batched_colors = linear_light(taxel_colours(counts))
             self._taxels.batched_opacities = _opacities(counts)
         self._show_contact(moment)
-        self._show_patch(moment)
         if moment.contact is not None and self._follows is not None and self._follows.value:
             self._follow(moment.contact.point - self._place)
 
@@ -249,17 +234,6 @@ class Stage:
         self._force.points = np.array([[contact.point, tip]], np.float32)
         self._label.position = tuple(tip)
         self._label.text = f"{moment.force:.2f} N"
-
-    def _show_patch(self, moment: Moment) -> None:
-        patch = moment.answer.patch if moment.answer is not None else None
-        self._patch.visible = patch is not None
-        if patch is None or patch is self._drawn_patch:
-            return
-        self._drawn_patch = patch
-        _place(self._patch, patch.T_base_contact)
-        self._disc.color = PATCH if all(patch.observed) else UNKNOWN
-        for handle, vertices in zip((self._disc, *self._shells), patch_shape(patch, self._xy), strict=True):
-            handle.vertices = vertices.astype(np.float32)
 
 
 def _opacities(counts: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -325,7 +299,7 @@ class Panel:
         stage: what is beside, with lines about what cannot be drawn.
     """
 
-    def __init__(self, server: Any, scene: Scene, errors: ErrorScale, stage: Stage) -> None:
+    def __init__(self, server: Any, scene: Scene, errors: DeviationScale, stage: Stage) -> None:
         gui = server.gui
         gui.configure_theme(control_layout="fixed", control_width="medium", show_logo=False, brand_color=(15, 110, 132))
         gui.set_panel_label(f"canprobe · {scene.name}")
@@ -336,8 +310,10 @@ class Panel:
         self._plots: list[tuple[Any, tuple[str, ...]]] = []
         self._taxels = None
         if scene.shape is not None:
-            bar = np.broadcast_to(scale(np.linspace(0.0, 1.0, 256), 0.0, 1.0), (14, 256, 3))
-            gui.add_image(np.ascontiguousarray(bar), label=f"path: 0 … {errors.high:.2g}  {errors.text}", format="png")
+            bar = np.broadcast_to(errors.colours(np.linspace(0.0, errors.high, 256)), (14, 256, 3))
+            gui.add_image(
+                np.ascontiguousarray(bar), label=f"surface: 0 … {errors.high:.2g}  {errors.text}", format="png"
+            )
         if scene.sensor is not None:
             blank = np.zeros((scene.sensor.rows, scene.sensor.columns), np.uint8)
             self._taxels = gui.add_image(taxel_image(blank, PIXELS), label="taxel image", format="png")
