@@ -14,13 +14,12 @@ from scipy.spatial import cKDTree
 from canprobe.bridge.view.instants import Answer
 from canprobe.bridge.view.meshes import Array
 from canprobe.bridge.view.path import DeviationScale
+from canprobe.touch.blend import REACH_M
 from canprobe.touch.meshing import Mesh
 from canprobe.touch.surface_map import SPACING_M, LocalPatch, SurfaceMap
 
 CELL_M = 1e-3
 """Size of its triangles."""
-NEAR_M = 3e-3
-"""A place is as well known as the best answer within this distance."""
 LIFT_M = 3e-4
 """Off the true surface, outward, so that the two do not flicker through each other."""
 
@@ -53,15 +52,16 @@ class Surface:
     def mesh(self) -> tuple[Mesh, NDArray[np.uint8]]:
         """What is known so far, and the (n, 3) colours of its vertices."""
         mesh = SurfaceMap(patches=tuple(map(_patch, self._answers)), path=np.zeros((0, 3))).mesh(cell=CELL_M)
+        # a place is as well known as the best answer in reach
         sigmas = np.array([answer.sigma for answer in self._answers])
         best = [sigmas[near].min(initial=math.inf) for near in _near(mesh.vertices, self._answers)]
         return mesh, self._scale.colours(np.array(best))
 
 
 def _near(vertices: Array, answers: Sequence[Answer]) -> list[list[int]]:
-    """For each vertex (n, 3) the indices of the answers within `NEAR_M`."""
+    """For each vertex (n, 3) the indices of the answers within `REACH_M`."""
     tree = cKDTree([_point(answer) for answer in answers])
-    return [tree.query_ball_point(vertex, NEAR_M) for vertex in vertices]
+    return [tree.query_ball_point(vertex, REACH_M) for vertex in vertices]
 
 
 def _point(answer: Answer) -> Array:
@@ -75,7 +75,7 @@ def _patch(answer: Answer) -> LocalPatch:
     covariance[6:, 6:] = 0.25 * patch.covariance
     return LocalPatch(
         T_base_contact=patch.T_base_contact, S=S, K_covariance=patch.covariance, S_covariance=covariance,
-        pose_known=False, observed=np.ones(2), combinations=np.eye(3), t_s=0.0, travelled_m=0.0, distance_m=NEAR_M,
+        pose_known=False, observed=np.ones(2), combinations=np.eye(3), t_s=0.0, travelled_m=0.0, distance_m=REACH_M,
         innovation=1.0,
     )  # fmt: skip
 

@@ -228,7 +228,9 @@ def test_ghosts_lie_on_the_exact_surface_with_their_front_outside(name):
 def answer(direction, sigma, radius=0.05):
     """What is stated of a ball in a direction from its centre."""
     T = homogeneous(tangent_rotation(-np.array(direction)), radius * np.array(direction))
-    covariance = np.diag([0.5 * sigma**2, 0.25 * sigma**2, 0.5 * sigma**2])
+    covariance = (
+        np.diag(sigma**2 * np.array([1 / 3, 1 / 6, 1 / 3])) if math.isfinite(sigma) else np.full((3, 3), math.inf)
+    )
     return judge(SurfacePatch(0, T, np.eye(2) / radius, covariance, (True, True)), None)
 
 

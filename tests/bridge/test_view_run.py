@@ -243,7 +243,7 @@ def test_the_page_holds_the_whole_run(page, run):
     names = {message.get("name") for _, message in scene["messages"]}
     assert scene["durationSeconds"] == pytest.approx(run.duration_s - float(run.log["t_s"][0]))
     assert {f"/arm/{i}" for i in range(7)} | {"/object/ghost", "/probe/dome", "/contact", "/force"} <= names
-    assert {"/surface/39", "/probe/taxels", "/path/000"} <= names
+    assert {"/probe/taxels", "/path/000"} <= names and any(str(name).startswith("/surface/") for name in names)
     data = panel_data(page)
     assert data["curves"]["t_s"][-1] == pytest.approx(run.duration_s, rel=1e-4)
     frames = base64.b64decode(data["taxels"])
