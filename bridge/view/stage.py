@@ -180,14 +180,15 @@ class Stage:
             target, away = np.array((0.0, 0.0, 0.32)), np.array((-1.0, 0.55, 0.3))
         else:
             target, away = np.array(ALONE), np.array((-0.12, -0.16, 0.16))
-        camera.look_at, camera.position, camera.up = target, target + away, (0.0, 0.0, 1.0)
+        self._view = target + away, target
+        camera.position, camera.look_at, camera.up = *self._view, (0.0, 0.0, 1.0)
         camera.fov = math.radians(34.0)
 
     def add_switches(self, gui: Any) -> None:
         """Add what decides whether the camera follows, and whether the true object is shown."""
-        self._follows = gui.add_checkbox("follow the probe", True)
+        self._follows = gui.add_checkbox("follow", True)
         if self._truth:
-            gui.add_checkbox("show the true object", True).on_update(self._show_truth)
+            gui.add_checkbox("true object", True).on_update(self._show_truth)
 
     def _show_truth(self, event: Any) -> None:
         for node in self._truth:
@@ -210,11 +211,14 @@ class Stage:
     def _follow(self, away: Array) -> None:
         """Carry every browser's camera along, in steps; how it was turned by hand stays."""
         for number, client in self._server.get_clients().items():
-            step = away - self._moved.get(number, np.zeros(3))
-            if float(np.linalg.norm(step)) > FOLLOW_M:
+            camera = client.camera
+            if number not in self._moved:  # what it reports until it was told anything may be another place
+                position, look_at, step = *self._view, away
+            else:
+                position, look_at, step = camera.position, camera.look_at, away - self._moved[number]
+            if number not in self._moved or float(np.linalg.norm(step)) > FOLLOW_M:
                 self._moved[number] = away
-                position, look_at = client.camera.position + step, client.camera.look_at + step
-                client.camera.position, client.camera.look_at = position, look_at
+                camera.position, camera.look_at = position + step, look_at + step
 
     def _move_arm(self, model: ArmModel, q: Array) -> None:
         frames = link_frames(model.chain, q)
@@ -284,8 +288,8 @@ def address(server: Any) -> str:
 # Beside the scene: what the task does in figures, the taxel image, plots over time.
 
 INK, FIRST, SECOND, FAINT = "#1f2933", "#c2410c", "#0f6e84", "#9aa5b1"
-HEIGHT = 80
-PIXELS = 6
+HEIGHT = 96
+PIXELS = 5
 """Of a taxel in its image."""
 
 
@@ -370,8 +374,11 @@ class Panel:
 _STYLED = '<div style="padding: 0 0.6em 0.4em; font-size: 0.9em; line-height: 1.5">{}</div>'
 
 
+_KEY = '<span style="white-space: nowrap"><span style="color: rgb{}">&#9632;</span> {}</span>'
+
+
 def _legend(scene: Scene, notes: Sequence[str]) -> str:
-    rows = [f'<span style="color: rgb{colour}">&#9632;</span> {html.escape(text)}' for colour, text in legend_of(scene)]
+    rows = [_KEY.format(colour, html.escape(text)) for colour, text in legend_of(scene)]
     return _STYLED.format("<br>".join([" &ensp; ".join(rows), *map(html.escape, notes)]))
 
 
