@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
@@ -65,7 +66,10 @@ def picture(path: Path | str, title: str, height_in: float) -> Iterator[Figure]:
         figure.suptitle("\n".join(lines), x=0.01, ha="left", parse_math=False)
         yield figure
         with whole_file(path) as part:
-            figure.savefig(part, format=path.suffix[1:] or "png")
+            if (form := path.suffix[1:] or "png") == "png":
+                FigureCanvasAgg(figure).print_png(part)  # `savefig` draws everything twice
+            else:
+                figure.savefig(part, format=form)
 
 
 def parts(of: Part, rows: int, columns: int, **ratios: Any) -> list[SubFigure]:
