@@ -67,7 +67,8 @@ def picture(path: Path | str, title: str, height_in: float) -> Iterator[Figure]:
         yield figure
         with whole_file(path) as part:
             if (form := path.suffix[1:] or "png") == "png":
-                FigureCanvasAgg(figure).print_png(part)  # `savefig` draws everything twice
+                canvas: Any = FigureCanvasAgg(figure)
+                canvas.print_png(part)  # `savefig` draws everything twice
             else:
                 figure.savefig(part, format=form)
 
