@@ -1,4 +1,4 @@
-"""The figure of a surface map: local patches over the true object, where passes cross, and their p-values."""
+"""The figure of a surface map: its surface over the true object, where passes cross, and their p-values."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
+from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import SubFigure
 from numpy.typing import NDArray
 
@@ -19,8 +19,9 @@ from canprobe.results.summary import RunResult
 from canprobe.scene.geometry import true_object
 from canprobe.touch.consistency import LEVEL, Consistency, check_consistency
 from canprobe.touch.linear_algebra import tangent_rotation
+from canprobe.touch.meshing import Mesh
 from canprobe.touch.shapes import PlacedShape
-from canprobe.touch.surface_map import LocalPatch, SurfaceMap
+from canprobe.touch.surface_map import SurfaceMap
 
 # What the panels of a surface figure share: the map, its tests, the true object, the plane of the scan.
 
@@ -73,100 +74,58 @@ def true_surface(shape: PlacedShape, path: Array, axes: Array, origin: Array) ->
     return result
 
 
-# Local patches as little curved tiles over the true object.
+# The surface of the map over the true object.
 
-TILE_M, RINGS, SECTORS = 1.8e-3, 3, 20
-"""Radius of a tile; it is drawn as rings of sectors."""
-APART_M = 2.9e-3
-"""Least distance of two tiles: where passes overlap, the best known patch stands for all."""
+CELL_M = 0.75e-3
+"""Of the mesh."""
 
 
-def draw_tiles(part: Part, view: MapView) -> None:
-    """Draw tiles, coloured by the error of K or by mean curvature, path and true surface in three dimensions."""
+def draw_mesh(part: Part, view: MapView) -> None:
+    """Draw the map's one surface, coloured by its distance from the truth or by its own σ, in three dimensions."""
     part, scale = parts(part, 1, 2, width_ratios=(8, 1))
     axes = part.add_subplot(projection="3d", computed_zorder=False)
     path = view.plane(view.map.path)
     if view.shape is not None:
         near = true_surface(view.shape, view.map.path, view.axes, view.origin)
         axes.plot_surface(*near, color=GREY, alpha=0.25, linewidth=0, shade=True, zorder=1)
-    patches = tiles_of(view.map)
-    values = np.array([_value(patch, view.shape) for patch in patches])
-    known = values[np.isfinite(values)]
-    norm, colours = _scale(known, from_zero=view.shape is not None), colormaps["viridis"]
-    for patch, value in zip(patches, values, strict=True):
-        face = colours(norm(value)) if math.isfinite(value) else GREY
-        grid = tile(patch)
-        x, y, z = view.plane(grid.reshape(-1, 3)).T.reshape(3, *grid.shape[:2])
-        axes.plot_surface(x, y, z, color=face, linewidth=0, shade=False, antialiased=False, zorder=2)
+    mesh = view.map.mesh(cell=CELL_M)
+    values, what, colours = _colours(mesh, view.shape)
+    colours = colours.with_extremes(bad=GREY)
+    norm = _scale(values, signed=view.shape is not None)
+    if len(mesh.triangles):
+        x, y, z = view.plane(mesh.vertices).T
+        drawn = axes.plot_trisurf(
+            x, y, z, triangles=mesh.triangles, cmap=colours, norm=norm, linewidth=0, antialiased=False, zorder=2
+        )
+        drawn.set_array(values[mesh.triangles].mean(axis=1))
     axes.plot(*path.T, color=INK, linewidth=0.5, alpha=0.55, zorder=3)
     differ = rejected(view.consistency)
     if differ.any():
         places = np.array([c.T_base_common[:3, 3] for c in view.consistency.crossings])[differ]
         axes.plot(*view.plane(places).T, "o", color=ORANGE, markersize=3.5, zorder=4)
     labels = ("along the scan (mm)", "across (mm)", "outward (mm)")
-    box(part, axes, _title(view, len(patches) - len(known), bool(differ.any())), labels, elev=42, azim=-68)
-    if len(known):
-        what = "mean curvature (1/m)" if view.shape is None else "‖K − K true‖ (1/m)"
-        scale.colorbar(ScalarMappable(norm, colours), cax=scale.subplots(), label=what)
+    shown = ["the map's surface, as far as its patches reach", "line: the contact's path"]
+    shown += ["true surface in light grey"] if view.shape is not None else []
+    shown += ["orange: passes differ, p < 0.05"] if differ.any() else []
+    box(part, axes, " · ".join(shown), labels, elev=42, azim=-68)
+    scale.colorbar(ScalarMappable(norm, colours), cax=scale.subplots(), label=what)
 
 
-def _scale(values: Array, *, from_zero: bool) -> Normalize:
-    if not len(values):
-        return Normalize(0.0, 1.0)
-    low = 0.0 if from_zero else float(values.min())
-    return Normalize(low, max(float(np.percentile(values, 98)), low + 1e-3))
-
-
-def _title(view: MapView, hidden: int, differ: bool) -> str:
-    shown = ["where passes overlap, the best known patch"]
-    if view.shape is not None:
-        shown.append("true surface in light grey")
-    if hidden:
-        shown.append(f"{hidden} in dark grey: not all curvature observed")
-    if differ:
-        shown.append("orange: passes differ, p < 0.05")
-    return "\n".join(" · ".join(shown[i : i + 3]) for i in range(0, len(shown), 3))
-
-
-def tiles_of(surface_map: SurfaceMap) -> list[LocalPatch]:
-    """Patches that are drawn: the best known ones first, none nearer than `APART_M` to one before it."""
-    order = sorted(surface_map.patches, key=_badness)
-    drawn: list[LocalPatch] = []
-    for patch in order:
-        if all(np.linalg.norm(patch.point - other.point) > APART_M for other in drawn):
-            drawn.append(patch)
-    return drawn
-
-
-def _badness(patch: LocalPatch) -> float:
-    trace = float(patch.K_covariance[0, 0] + 2.0 * patch.K_covariance[1, 1] + patch.K_covariance[2, 2])
-    return trace if math.isfinite(trace) else math.inf
-
-
-def tile(patch: LocalPatch) -> Array:
-    """Points (rings + 1, sectors + 1, 3) of a disc on the patch's quadric, base frame, m."""
-    radii = np.linspace(0.0, TILE_M, RINGS + 1)[:, None]
-    angles = np.linspace(0.0, 2.0 * math.pi, SECTORS + 1)[None]
-    x, y = radii * np.cos(angles), radii * np.sin(angles)
-    local = np.stack([x, y, patch.surface.height(x, y)], axis=-1)
-    result: Array = local @ patch.T_base_contact[:3, :3].T + patch.point
-    return result
-
-
-def _value(patch: LocalPatch, shape: PlacedShape | None) -> float:
-    """Error of K against the truth, or its mean curvature; NaN where not all of it was observed."""
-    if patch.rank < 3:
-        return math.nan
-    K = 2.0 * patch.S[:2, :2]
+def _colours(mesh: Mesh, shape: PlacedShape | None) -> tuple[Array, str, Colormap]:
+    """(n,) values at the vertices, µm, what they are, and their colours."""
     if shape is None:
-        return 0.5 * float(np.trace(K))
-    true = shape.closest(patch.point)
-    P = patch.T_base_contact[:3, :2]
-    tensor = (true.directions.T * true.kappa) @ true.directions
-    return float(np.linalg.norm(K - P.T @ tensor @ P))
+        return 1e6 * mesh.sigma, "σ of the surface's height (µm)", colormaps["viridis"]
+    above = np.array([shape.nearest(tuple(p)).distance for p in mesh.vertices.tolist()])
+    return 1e6 * above, "above the true surface (µm)", colormaps["RdBu_r"]
 
 
-# The figure of a surface map: local patches over the true object, where passes cross, and their p-values.
+def _scale(values: Array, *, signed: bool) -> Normalize:
+    known = np.abs(values[np.isfinite(values)])
+    most = max(float(np.percentile(known, 98)), 1.0) if len(known) else 1.0
+    return Normalize(-most if signed else 0.0, most)
+
+
+# The figure of a surface map: its surface over the true object, where passes cross, and their p-values.
 
 PARTS = (("curvature", ORANGE), ("normal", BLUE), ("height", GREEN))
 
@@ -193,13 +152,13 @@ def draw_map(
     shape: PlacedShape | None = None,
     title: str = "",
 ) -> None:
-    """Draw a map: tiles over the true object, crossings in the plane of the scan, their p-values.
+    """Draw a map: its surface over the true object, crossings in the plane of the scan, their p-values.
 
     Args:
         surface_map: with at least one patch.
         path: of the PNG.
         consistency: the tests at its crossings; None for `check_consistency`, which takes a second.
-        shape: the true object, for the ghost below the tiles and for errors; None colours by mean curvature.
+        shape: the true object, for the ghost below the surface and for errors; None colours by σ.
         title: first line.
     """
     view = view_of(surface_map, consistency or check_consistency(surface_map), shape)
@@ -210,7 +169,7 @@ def draw_map(
     )
     with picture(path, told, 7.8) as figure:
         upper, lower = parts(figure, 2, 1, height_ratios=(4, 3))
-        draw_tiles(upper, view)
+        draw_mesh(upper, view)
         left, *right = parts(lower, 1, 2 if crossings else 1)
         _draw_crossings(left, view)
         for part in right:
