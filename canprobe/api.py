@@ -156,11 +156,17 @@ def _mapped(
 
 
 def _draw(result: RunResult, out: Path, say: Say) -> None:
-    drawn = [name for name in ("report.html", "report.png", "surface.png") if name in result.plan.outputs]
-    if not len(result.log["t_s"]) or not drawn:
-        return
-    say(f"draw {', '.join(drawn)}")
-    if "report.html" in result.plan.outputs:
+    """The pictures of a run of at least one cycle; the page of its scene comes last, it takes longest."""
+    outputs = result.plan.outputs if len(result.log["t_s"]) else ()
+    if pictures := [name for name in ("report.png", "surface.png") if name in outputs]:
+        say(f"draw {', '.join(pictures)}")
+        from canprobe.results.figures import draw_run
+        from canprobe.results.surface_figure import draw_surface
+
+        draw_run(result, out / "report.png")
+        draw_surface(result, out / "surface.png")
+    if "report.html" in outputs:
+        say("draw report.html")
         page, recorded = (importlib.import_module(f"canprobe.bridge.view.{name}") for name in ("browser", "recorded"))
         try:
             shown = recorded.read_run(out)
@@ -168,12 +174,6 @@ def _draw(result: RunResult, out: Path, say: Say) -> None:
             say(f"report.html is left out: {error}")
         else:
             page.write_page(shown, out / "report.html", say)
-    if "report.png" in result.plan.outputs:
-        from canprobe.results.figures import draw_run
-        from canprobe.results.surface_figure import draw_surface
-
-        draw_run(result, out / "report.png")
-        draw_surface(result, out / "surface.png")
 
 
 class OpenCell(Session):
