@@ -47,11 +47,12 @@ def _grid(path: Path) -> tuple[Array, float | None]:
     if kind not in HEIGHTS:
         raise ValueError(f"file: expected heights in a file of {', '.join(HEIGHTS)}, got {path.name}")
     try:
-        if kind == ".npz":
-            with np.load(path) as archive:
-                return _of_archive({name: archive[name] for name in archive.files}, path)
-        if kind == ".npy":
-            return np.asarray(np.load(path), dtype=np.float64), None
+        if kind in (".npy", ".npz"):
+            with path.open("rb") as opened:  # numpy leaves a file open that it cannot read
+                read = np.load(opened)
+                if isinstance(read, np.lib.npyio.NpzFile):
+                    return _of_archive({name: read[name] for name in read.files})
+                return np.asarray(read, dtype=np.float64), None
         text = path.read_text(encoding="utf-8-sig").splitlines()
         lines = [line.partition("#")[0].replace(";", ",").replace(",", " ").split() for line in text]
         return np.array([[float(word) for word in line] for line in lines if line]), None
@@ -61,7 +62,7 @@ def _grid(path: Path) -> tuple[Array, float | None]:
         raise ValueError(f"file: {path.name} is no grid of numbers: {error}") from error
 
 
-def _of_archive(arrays: dict[str, Any], path: Path) -> tuple[Array, float | None]:
+def _of_archive(arrays: dict[str, Any]) -> tuple[Array, float | None]:
     heights = arrays.get("heights", next(iter(arrays.values())) if len(arrays) == 1 else None)
     if heights is None:
         raise ValueError(f'expected an array "heights", got {", ".join(arrays) or "none"}')

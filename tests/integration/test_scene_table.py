@@ -16,6 +16,7 @@ TABLE = {
     "fillet": (11.0, 90.0),  # no quadric fits over a jump of curvature
     "bowl": (8.0, 1.5),
     "wave": (5.0, 30.0),  # 7 1/m at most, and it changes within the memory
+    "relief": (6.0, 110.0),  # the true curvature is that of its edges, which are sharper than any patch
     "steel": (13.0, 3.0),
     "foam": (8.0, 8.0),
     "miscalibrated": (28.0, 20.0),  # a wrong tool is none of the noise that the estimator weighs
