@@ -23,6 +23,7 @@ from canprobe.planning.model import Plan
 from canprobe.results.files import save_surface_map
 from canprobe.results.scores import ShapeScore, bound_of_scan, score_contact, score_shape
 from canprobe.scene.geometry import FILE, calibration_lines, summarise_calibration, tool_text
+from canprobe.scene.load import load_scene
 from canprobe.scene.model import Scene
 from canprobe.scene.resolve import resolve
 from canprobe.session.session import Session, write_scene
@@ -43,13 +44,13 @@ LOG = "bus.log"
 
 
 def measure_traffic(
-    log: Path | str, scene: Scene | Plan, *, channel: str | None = None, exact: bool = True
+    log: Path | str, scene: Scene | Plan | str | Path, *, channel: str | None = None, exact: bool = True
 ) -> MeasuredTraffic:
     """Count the frames of a bus and compare them with the plan, message by message.
 
     Args:
         log: a candump log, or the folder of a run.
-        scene: the scene that ran, or its plan.
+        scene: that ran, as for `canprobe.run`, or its plan.
         channel: of the log; by default that of the scene's first bus, or the only one in the log.
         exact: count stuff bits too, which takes a few µs per frame.
 
@@ -62,7 +63,7 @@ def measure_traffic(
         PlanError: the scene does not fit its bus.
     """
     path = Path(log) / LOG if Path(log).is_dir() else Path(log)
-    plan = scene if isinstance(scene, Plan) else make_plan(resolve(scene))
+    plan = scene if isinstance(scene, Plan) else make_plan(resolve(load_scene(scene)))
     meters: dict[str, TrafficMeter] = {}
     syncs: Counter[str] = Counter()
     for t_ns, name, can_id, data in read_candump(path):
