@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from canprobe.results.files import load_surface_map, load_table
     from canprobe.results.summary import RunResult, measure_traffic
     from canprobe.scene.load import load_scene
+    from canprobe.studies.many import Runs, run_many
     from canprobe.touch.estimate.answer import SurfaceEstimate
     from canprobe.touch.estimate.fit import fit_surface
     from canprobe.touch.estimate.likelihood import cramer_rao
@@ -46,6 +47,7 @@ _MODULES = {
     ),
     "canprobe.recorded.reestimate": ("ReplayResult", "replay"),
     "canprobe.scene.load": ("load_scene",),
+    "canprobe.studies.many": ("Runs", "run_many"),
     "canprobe.results.files": ("load_surface_map", "load_table"),
     "canprobe.touch.estimate.likelihood": ("cramer_rao",),
     "canprobe.touch.estimate.answer": ("SurfaceEstimate",),
@@ -70,6 +72,7 @@ __all__ = [
     "ReplayResult",
     "ResultsError",
     "RunResult",
+    "Runs",
     "SafetyStop",
     "SceneError",
     "StudyError",
@@ -88,6 +91,7 @@ __all__ = [
     "plan",
     "replay",
     "run",
+    "run_many",
 ]
 
 

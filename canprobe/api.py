@@ -22,6 +22,7 @@ from canprobe.scene.resolve import resolve
 from canprobe.session.children import Bridges
 from canprobe.session.emulation import emulate, emulate_eds
 from canprobe.session.looking import commission, monitor, scan
+from canprobe.session.progress import Progress
 from canprobe.session.session import Say, Session, quiet, with_bridges
 from canprobe.session.target import VIRTUAL, Target
 from canprobe.session.up import check_joints, home, up
@@ -51,7 +52,6 @@ __all__ = [
     "up",
 ]
 
-Progress = Callable[[float, float], None]
 AnyObserver = Observer | Callable[[Observation], None]
 
 

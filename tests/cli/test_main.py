@@ -16,11 +16,12 @@ from canprobe import api
 from canprobe.bus.scheduling import Terminated
 from canprobe.cell.monitor import Monitor
 from canprobe.cli import COMMANDS, main
-from canprobe.cli.output import print_json, progress_bar, termination_interrupts
+from canprobe.cli.output import print_json, termination_interrupts
 from canprobe.cli.parser import channel, node_ids
 from canprobe.eds.packaged import eds_path
 from canprobe.errors import InterfaceError, NodeError, PlanError, SafetyStop, SceneError, UsageError
 from canprobe.scene.load import load_scene, packaged_scenes
+from canprobe.session.progress import progress_bar
 
 SUMMARY = {"scene": "free", "completed": True, "shape": {"method": None}}
 
