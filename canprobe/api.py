@@ -19,6 +19,7 @@ from canprobe.results.summary import RunResult, log_columns, summarise, tactile_
 from canprobe.scene.load import load_scene
 from canprobe.scene.model import Scene
 from canprobe.scene.resolve import resolve
+from canprobe.scene.setup import Touch
 from canprobe.session.children import Bridges
 from canprobe.session.emulation import emulate, emulate_eds
 from canprobe.session.looking import commission, monitor, scan
@@ -28,9 +29,10 @@ from canprobe.session.target import VIRTUAL, Target
 from canprobe.session.up import check_joints, home, up
 from canprobe.tasks.from_plan import make_task
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
-from canprobe.tasks.task import record_of
+from canprobe.tasks.task import TaskRecord, record_of
 
 if TYPE_CHECKING:
+    from canprobe.results.contacts import Contacts
     from canprobe.touch.consistency import Consistency
     from canprobe.touch.surface_map import SurfaceMap
 
@@ -300,6 +302,7 @@ class OpenCell(Session):
             surface_map,
             consistency,
             self.out,
+            self._contacts(record, start_s),
         )
         if isinstance(failure, CanprobeError):
             failure.summary = summary
@@ -319,6 +322,14 @@ class OpenCell(Session):
         for line in self.unwritten:  # what stopped the run comes first
             if failure is not None and line != str(failure):
                 failure.add_note(line)
+
+    def _contacts(self, record: TaskRecord, start_s: float) -> Contacts | None:
+        task = self.plan.setup.task
+        if record.shape is None or not isinstance(task, Touch):
+            return None
+        from canprobe.results.contacts import contacts_of
+
+        return contacts_of(record.shape.samples, task, start_s)
 
 
 def _reason(failure: BaseException) -> str:
