@@ -7,10 +7,11 @@ process, in real time.
 from __future__ import annotations
 
 import argparse
+import shlex
 from pathlib import Path
 
-from canprobe.cli.output import print_json, progress_bar, say, say_on_terminal
-from canprobe.cli.parser import BUS, Parser, add_options, add_scene, scene_of
+from canprobe.cli.output import print_json, print_summary
+from canprobe.cli.parser import BUS, Parser, add_options, add_scene, add_verbosity, scene_of
 from canprobe.errors import CanprobeError
 
 HELP = "run a scene and write the results"
@@ -31,6 +32,7 @@ def add_arguments(parser: Parser) -> None:
         "--tool", metavar="FILE", type=Path, help="centre of the probe, from the tool.toml of a calibration"
     )
     add_options(parser, "--json")
+    add_verbosity(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -51,8 +53,8 @@ def run(args: argparse.Namespace) -> int:
             seed=args.seed,
             duration_s=args.duration,
             force=args.force,
-            progress=progress_bar(),
-            say=say_on_terminal,
+            progress=args.report.bar(),
+            say=args.report.detail,
             bridge=args.bridge,
         )
     except CanprobeError as error:
@@ -61,10 +63,22 @@ def run(args: argparse.Namespace) -> int:
         raise
     except KeyboardInterrupt:
         where = f"; what was measured until then: {folder}" if folder.exists() else ""
-        say(f"canprobe: interrupted, the cell is stopped{where}")
+        args.report.complain(f"canprobe: interrupted, the cell is stopped{where}")
         raise
     if args.json:
         print_json(result.summary)
     else:
-        print(result.text())
+        print_summary(result.text() + _expected(args))
+        print(f"next: canprobe view {shlex.quote(str(folder))}")
     return 0
+
+
+def _expected(args: argparse.Namespace) -> str:
+    """A line with the figures to expect, where a packaged scene ran as it is."""
+    from canprobe.results.expected import expected_text, read_expected, seeds_text
+
+    read = read_expected()
+    figures = read["scenes"].get(args.scene)
+    if not figures or any(value is not None for value in (args.cell, args.duration, args.tool)):
+        return ""
+    return f"\n  expected   {expected_text(figures)} (seeds {seeds_text(read)})"

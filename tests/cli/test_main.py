@@ -16,7 +16,7 @@ from canprobe import api
 from canprobe.bus.scheduling import Terminated
 from canprobe.cell.monitor import Monitor
 from canprobe.cli import COMMANDS, main
-from canprobe.cli.output import print_json, progress_bar, termination_interrupts
+from canprobe.cli.output import print_json, termination_interrupts
 from canprobe.cli.parser import channel, node_ids
 from canprobe.eds.packaged import eds_path
 from canprobe.errors import InterfaceError, NodeError, PlanError, SafetyStop, SceneError, UsageError
@@ -238,7 +238,7 @@ def test_run_passes_everything_on(calls, tmp_path, capsys):
     assert bus_of(scene) == ("socketcan", "vcan3", 500_000)
     given = {key: kwargs[key] for key in ("seed", "duration_s", "out")}
     assert given == {"seed": 7, "duration_s": 2.5, "out": tmp_path / "out"}
-    assert capsys.readouterr().out == "all went well\n"
+    assert capsys.readouterr().out == f"all went well\nnext: canprobe view {tmp_path / 'out'}\n"
 
 
 @pytest.mark.parametrize("command", ["run", "up"])
@@ -350,8 +350,9 @@ def test_scan_prints_a_table_or_json(calls, capsys):
 
 def test_scenes(capsys):
     assert main(["scenes"]) == 0
-    *lines, last = capsys.readouterr().out.splitlines()
+    *lines, figures, last = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == [n for n, _ in packaged_scenes()]
+    assert figures.startswith("figures: ")
     folder = Path(last.removeprefix("in ").partition(";")[0])
     assert main(["scenes", "--json"]) == 0
     scenes = json.loads(capsys.readouterr().out)
@@ -403,33 +404,6 @@ def test_sigterm_is_left_alone_outside_the_main_thread():
     thread.start()
     thread.join()
     assert signal.getsignal(signal.SIGTERM) is not None
-
-
-class Terminal:
-    """A stream that remembers what is written to it."""
-
-    def __init__(self, tty):
-        self.tty, self.text = tty, ""
-
-    def isatty(self):
-        return self.tty
-
-    def write(self, text):
-        self.text += text
-
-    def flush(self):
-        pass
-
-
-def test_progress_bar_draws_on_terminals_only():
-    assert progress_bar(Terminal(False)) is None
-    terminal = Terminal(True)
-    show = progress_bar(terminal, width=4)
-    for done in (0, 0.01, 5, 10):
-        show(done, 10)
-    assert terminal.text.count("\r") == 3, "drawn again only when the picture changes"
-    assert "██░░  50 %" in terminal.text
-    assert terminal.text.endswith("\n")
 
 
 def run_python(*argv, **kwargs):
