@@ -152,8 +152,8 @@ def with_expected(page: str) -> str:
             found = {name.removesuffix("_per_m"): range_text(name, between) for name, between in figures.items()}
             lines.append(f"| `{scene}` | {' | '.join(found.get(name, '–') for name in columns)} |")
     source = (
-        f"Lowest to highest of the seeds {seeds_text(expected)} on the lockstep bus. Measured by `python docs/measure.py`"
-        f" on {expected['date']} at commit {expected['commit']}: {expected['machine']}."
+        f"Lowest to highest of the seeds {seeds_text(expected)} on the lockstep bus. Measured by"
+        f" `python docs/measure.py` on {expected['date']} at commit {expected['commit']}: {expected['machine']}."
     )
     head, mark, rest = page.partition("<!-- expected -->\n")
     return "".join([head, mark, "\n".join(["", *lines, "", source, "", ""]), rest[rest.index("<!-- /expected -->") :]])

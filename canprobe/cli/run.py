@@ -44,6 +44,7 @@ def run(args: argparse.Namespace) -> int:
         scene = with_tool(scene, args.tool)
 
     from canprobe import api
+    from canprobe.planning.bridges import BRIDGES
 
     folder = api.results_folder(scene, args.out)
     try:
@@ -69,7 +70,8 @@ def run(args: argparse.Namespace) -> int:
         print_json(result.summary)
     else:
         print_summary(result.text() + _expected(args))
-        print(f"next: canprobe view {shlex.quote(str(folder))}")
+        view = BRIDGES["view"]
+        print(f"next: {f'{view.pip} && ' if view.missing else ''}canprobe view {shlex.quote(str(folder))}")
     return 0
 
 
