@@ -23,9 +23,9 @@ from canprobe.scene.setup import Touch
 from canprobe.session.children import Bridges
 from canprobe.session.emulation import emulate, emulate_eds
 from canprobe.session.looking import commission, monitor, scan
-from canprobe.session.progress import Progress
 from canprobe.session.session import Say, Session, quiet, with_bridges
 from canprobe.session.target import VIRTUAL, Target
+from canprobe.session.terminal import Progress
 from canprobe.session.up import check_joints, home, up
 from canprobe.tasks.from_plan import make_task
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
