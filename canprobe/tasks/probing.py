@@ -344,15 +344,14 @@ class ProbingTask(Task):
         self, sample: TactileSample, patch: Patch, contact: ContactSample | None
     ) -> dict[str, float | Vector]:
         """What an image says, for the log."""
-        nothing = np.full(3, np.nan)
         return {
             "phase": float(self.phase),
             "sample_cycle": float(sample.cycle),
             "force_n": patch.force,
             "pad_u_mm": patch.u * 1e3,
             "pad_v_mm": patch.v * 1e3,
-            "contact_mm": contact.p_base * 1e3 if contact is not None else nothing,
-            "normal": contact.n_base if contact is not None else nothing,
+            "contact_mm": contact.p_base * 1e3 if contact is not None else np.full(3, np.nan),
+            "normal": contact.n_base if contact is not None else np.full(3, np.nan),
         }
 
     # phases: each returns the pose for this cycle
