@@ -93,11 +93,10 @@ class Continuation:
     """
 
     def __init__(self, weights: Array, saturated_pa: float) -> None:
-        area = weights[:, :1]
         self._saturated_pa = saturated_pa
-        self._terms = weights / area
-        self._normal = (weights[:, :, None] * weights[:, None, :]).reshape(len(weights), -1)
-        self._right = weights * area
+        self._weights = weights
+        self._area = weights[:, 0].copy()
+        self._terms = weights / weights[:, :1]
         self._corner = float(self._terms[-1, 3])
 
     def completed(self, pressure: Array, window: Sequence[int], peak_pa: float) -> Array:
@@ -118,8 +117,9 @@ class Continuation:
         used = (seen >= LEAST_SHARE * peak_pa) & (seen < self._saturated_pa)
         if np.count_nonzero(used) < LEAST_TAXELS:
             return pressure
-        normal, right = used.astype(float).dot(self._normal[strip]), (used * seen).dot(self._right[strip])
-        _, quadratic, singular = dposv(normal.reshape(6, 6), right)
+        weights = self._weights[strip]
+        used_weights = (weights * used[:, None]).T
+        _, quadratic, singular = dposv(used_weights.dot(weights), used_weights.dot(self._area[strip] * seen))
         _, _, _, uu, uv, vv = quadratic.tolist()
         least_fall = -0.5 * (uu + vv + math.hypot(uu - vv, uv)) * self._corner
         if singular or not least_fall > LEAST_FALL * peak_pa:
