@@ -20,11 +20,11 @@ import numpy as np
 from canprobe.emulator.plant.config import PlantConfig
 from canprobe.emulator.plant.dynamic_arm import DynamicArm, make_arm
 from canprobe.emulator.plant.ideal_arm import IdealArm, MotorDynamics
-from canprobe.emulator.plant.probe import NO_CONTACT, Contact, PressedProbe, Probe, elastic_contact, in_pad, turned
+from canprobe.emulator.plant.probe import NO_CONTACT, Contact, PressedProbe, Probe, elastic_contact, in_pad
 from canprobe.emulator.plant.pushing import LEAST_CURVATURE, total_force
 from canprobe.emulator.plant.taxels import Image, TaxelArray, Vec, pad_coordinates
 from canprobe.errors import PlanError
-from canprobe.robot.chain import Array, forward_jacobian, point_on_flange, point_velocity, posture
+from canprobe.robot.chain import Array, Chain, ending_in, jacobian, point_velocity, posture
 from canprobe.robot.model import ArmModel, units_to_joints
 from canprobe.touch.shapes import Nearest, PlacedShape, Touches
 
@@ -79,11 +79,10 @@ class Plant:
                 stiffness_n_m3=config.stiffness_n_m3,
                 pad=config.pad,
             )
-        T_tool = config.T_flange_probe_centre
-        self._tool_origin: Vec = tuple(T_tool[:3, 3].tolist())
-        # None where the probe's axes are the flange's, the usual case.
-        self._tool_axes: Array | None = None if np.array_equal(T_tool[:3, :3], np.eye(3)) else T_tool[:3, :3]
         self._base: Vec = tuple(config.base_offset_m.tolist())
+        self._chain: Chain | None = None
+        if config.model is not None:
+            self._chain = ending_in(config.model.chain, config.T_flange_probe_centre)
         rows = [] if config.model is None else config.model.q_per_unit.tolist()
         self._shares = [[(motor, share) for motor, share in enumerate(row) if share] for row in rows]
         self._at_zero = _joints_at_zero(config.model)
@@ -286,13 +285,11 @@ class Plant:
     def _probe(self, t_ns: int, q: tuple[float, ...], qd: tuple[float, ...]) -> Probe:
         if self._pressed is not None:
             return self._pressed.at(1e-9 * t_ns, self._first_image_s)
-        if self.arm is None:
+        if self._chain is None:
             return Probe((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 0.0))
-        c = posture(self.arm.model.chain, q)
-        centre = point_on_flange(c, self._tool_origin)
-        axes = (c.x, c.y, c.z) if self._tool_axes is None else turned((c.x, c.y, c.z), self._tool_axes)
-        b0, b1, b2 = self._base
-        return Probe((centre[0] + b0, centre[1] + b1, centre[2] + b2), axes, point_velocity(c, centre, qd))
+        c = posture(self._chain, q)
+        (c0, c1, c2), (b0, b1, b2) = c.flange, self._base
+        return Probe((c0 + b0, c1 + b1, c2 + b2), (c.x, c.y, c.z), point_velocity(c, c.flange, qd))
 
     def _joints(self, motors: Sequence[float]) -> tuple[float, ...]:
         """What the joints do where the motors do something; none without an arm."""
@@ -349,9 +346,10 @@ class Plant:
         `F = f(δ − c F)` with `c = nᵀ J C Jᵀ n`; the layer's square law makes that a quadratic. The normal is that
         before.
         """
-        assert self.arm is not None
+        assert self._chain is not None
         config, normal = self.config, np.array(foot.normal)
-        _, J = forward_jacobian(self.arm.model.chain, np.array(q), config.T_flange_probe_centre)
+        at = posture(self._chain, q)
+        J = jacobian(at, at.flange)
         lever = J[:3].T @ normal
         c = float(lever @ (compliance * lever))
         depth = config.radius_m - foot.distance
