@@ -63,7 +63,7 @@ EXTRAS = {
     "results/picture.py": {"matplotlib"},
     "robot/dynamics.py": {"mujoco"},
     "results/figures.py": {"matplotlib"},
-    "results/surface_figure.py": {"matplotlib"},
+    "results/surface_figure.py": {"matplotlib", "mpl_toolkits"},  # of the same distribution
 }
 
 EDGE_ONLY = {"time", "socket", "threading", "can", "selectors", "asyncio", "sched"}
