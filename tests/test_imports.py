@@ -65,7 +65,7 @@ EXTRAS = {
     "robot/dynamics.py": {"mujoco"},
     "studies/many.py": {"pandas", "xarray"},
     "results/figures.py": {"matplotlib"},
-    "results/surface_figure.py": {"matplotlib"},
+    "results/surface_figure.py": {"matplotlib", "mpl_toolkits"},  # of the same distribution
 }
 
 EDGE_ONLY = {"time", "socket", "threading", "can", "selectors", "asyncio", "sched"}

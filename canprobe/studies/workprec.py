@@ -363,7 +363,8 @@ LABELS = ("force error (%)", "position error (µm)", "taxel error (counts)")
 def draw_workprec(rows: Sequence[Row], floors: Mapping[float, dict[str, float]], default: Row, path: Path) -> None:
     """Error against cost: a row of panels for each measure, a column for each stiffness."""
     title = (
-        "Dynamic plant: error against processor time a cycle of 2.5 ms, each dot a step size\n"
+        "Integrators of the dynamic plant: error over the processor time of a cycle of 2.5 ms; a dot: one step size\n"
+        "columns: stiffness K/h of the layer in contact\n"
         "solid: mass matrix, bias and contact geometry held over a cycle; dotted: evaluated in every call\n"
         "ring: the default; open: rattles against a contact of 10 MN/m; shade: accurate enough"
     )
