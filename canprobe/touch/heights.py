@@ -327,15 +327,19 @@ class Heights(PlacedShape):
     def gaps(self, points_base: Array) -> Array:
         """Distances of (n, 3) points to the tangent over or under them, (n,) m: first order near the surface."""
         x, y, z = self._to_object(points_base).T
-        gaps = np.ones(len(x))
-        inside = (x >= self._x[0]) & (x <= self._x[-1]) & (y >= self._y[0]) & (y <= self._y[-1])
+        gaps, inside = np.ones(len(x)), self.exists(x, y)
+        height, along, across = self.spline.many(x[inside], y[inside])
+        gaps[inside] = (z[inside] - height) / np.sqrt(1.0 + along * along + across * across)
+        return gaps
+
+    def exists(self, x: Array, y: Array) -> npt.NDArray[np.bool_]:
+        """(k,) whether there is a surface over (k,) points x and y of the object's frame, m."""
+        inside: npt.NDArray[np.bool_] = (x >= self._x[0]) & (x <= self._x[-1]) & (y >= self._y[0]) & (y <= self._y[-1])
         if self._missing is not None:
             i = np.rint((x[inside] - self._x[0]) / self._cell[0]).astype(np.intp)
             j = np.rint((y[inside] - self._y[0]) / self._cell[1]).astype(np.intp)
             inside[inside] = ~self._missing[i, j]
-        height, along, across = self.spline.many(x[inside], y[inside])
-        gaps[inside] = (z[inside] - height) / np.sqrt(1.0 + along * along + across * across)
-        return gaps
+        return inside
 
     def squeezed(self, centre_base: Vec, radius: float) -> float:
         """Volume by which the layer of a ball is squeezed, m³; times its stiffness that is the force.
