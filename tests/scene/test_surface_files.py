@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 
 import numpy as np
 import pytest
 
 import canprobe
-from canprobe.errors import PlanError
+from canprobe.errors import PlanError, UsageError
 from canprobe.scene.geometry import true_object
 from canprobe.scene.load import load_scene, with_files_beside
 from canprobe.scene.model import ObjectSettings
@@ -73,6 +74,48 @@ def test_a_grid_without_spacing_and_an_archive_without_heights(tmp_path):
     np.savez(tmp_path / "other.npz", a=BUMP_MM, b=BUMP_MM)
     with pytest.raises(ValueError, match='expected an array "heights", got a, b'):
         true_object(dataclasses.replace(settings, file=str(tmp_path / "other.npz")))
+
+
+def cap(folder, name, *, inside_out=False):
+    """A cap of a ball of 50 mm in metres, its top at x = 10 mm, y = 5 mm, as a file of facets."""
+    trimesh = pytest.importorskip("trimesh")
+    x, y = np.meshgrid(np.arange(-20, 20.1), np.arange(-15, 15.1), indexing="ij")
+    vertices = 1e-3 * np.column_stack([(x + 10).ravel(), (y + 5).ravel(), np.sqrt(2500 - x**2 - y**2).ravel()])
+    index = np.arange(x.size).reshape(x.shape)
+    a, b, c, d = (one.ravel() for one in (index[:-1, :-1], index[1:, :-1], index[:-1, 1:], index[1:, 1:]))
+    faces = np.concatenate((np.column_stack((a, b, d)), np.column_stack((a, d, c))))
+    mesh = trimesh.Trimesh(vertices, faces[:, ::-1] if inside_out else faces, process=False)
+    mesh.export(folder / name)
+    return ObjectSettings("mesh", file=str(folder / name), unit_mm=1000, spacing_mm=2, origin_mm=(10, 5))
+
+
+@pytest.mark.parametrize("name", ["cap.stl", "cap.obj", "cap.ply"])
+def test_a_mesh_is_read_in_its_unit_and_placed_by_its_origin(name, tmp_path):
+    settings = cap(tmp_path, name)
+    T = np.array(true_object(settings).T_base_object)
+    foot = true_object(settings).closest(T[:3, 3] + (0.01, 0.0, 0.02))
+    centre = T[:3, 3] + (0.0, 0.0, -0.05)
+    assert np.linalg.norm(foot.point - centre) == pytest.approx(0.05, abs=1e-7)
+    assert foot.kappa == pytest.approx((20.0, 20.0), rel=5e-3)
+
+
+def test_what_is_said_about_a_mesh_that_cannot_be_taken(tmp_path, monkeypatch):
+    inside_out = cap(tmp_path, "cap.stl", inside_out=True)
+    (tmp_path / "bad.stl").write_bytes(b"solid nothing")
+    for file, message in (
+        ("cap.stl", r"cap.stl: no facet of the mesh faces \+z"),
+        ("gone.stl", "gone.stl: cannot be read: No such file"),
+        ("cap.step", "expected a mesh in a file of .stl, .obj, .ply, got cap.step"),
+        ("bad.stl", "bad.stl"),
+    ):
+        scene = dataclasses.replace(
+            load_scene("relief"), object=dataclasses.replace(inside_out, file=str(tmp_path / file))
+        )
+        with pytest.raises(PlanError, match=message):
+            resolve(scene)
+    monkeypatch.setitem(sys.modules, "trimesh", None)
+    with pytest.raises(UsageError, match=r"a mesh needs trimesh: pip install .*\[mesh\]"):
+        true_object(dataclasses.replace(inside_out, spacing_mm=3.0))
 
 
 def test_a_saved_scene_takes_its_heights_along(tmp_path):
