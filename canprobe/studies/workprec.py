@@ -138,10 +138,10 @@ def observed(stiffness_n_m3: float, cycles: int, states: Array) -> dict[str, Arr
     """Force (n,) N, probe centre (n, 3) m and taxel pressures (n, 256) Pa of states (n, 12), counts and rates."""
     plant = Plant(trial(stiffness_n_m3, cycles)[0])
     at = [PlantState(0, tuple(row[:6].tolist()), tuple(row[6:].tolist())) for row in states]
-    truths = [plant.truth(state) for state in at]
+    truths = plant.truths(at)
     return {
-        "force": np.array([t["force"] for t in truths]),
-        "centre": np.array([t["probe_centre"] for t in truths]),
+        "force": truths["force"],
+        "centre": truths["probe_centre"],
         "taxels": np.array([plant.pressure(state).ravel() for state in at]),
     }
 

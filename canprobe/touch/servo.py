@@ -317,12 +317,13 @@ class TactileServo:
         """One step along the heading, lifted out of the scan plane into the tangent plane."""
         (h0, h1, h2), (c0, c1, c2), (u0, u1, u2) = self._heading, self._across, self._up
         (f0, f1, f2), (n0, n1, n2), (o0, o1, o2) = foot, normal, self._origin
-        offset = f0 - o0, f1 - o1, f2 - o2
-        steep = max(_dot(normal, self._up), STEEPEST)
-        slope_along, slope_across = _dot(normal, self._heading) / steep, _dot(normal, self._across) / steep
+        d0, d1, d2 = f0 - o0, f1 - o1, f2 - o2
+        steep = max(n0 * u0 + n1 * u1 + n2 * u2, STEEPEST)
+        slope_along = (n0 * h0 + n1 * h1 + n2 * h2) / steep
+        slope_across = (n0 * c0 + n1 * c1 + n2 * c2) / steep
         along, across = follower.heading
         in_plane = distance / math.hypot(1.0, slope_along * along + slope_across * across)
-        along, across = follower.step(_dot(self._heading, offset), _dot(self._across, offset), in_plane)
+        along, across = follower.step(h0 * d0 + h1 * d1 + h2 * d2, c0 * d0 + c1 * d1 + c2 * d2, in_plane)
         x, y, z = along * h0 + across * c0, along * h1 + across * c1, along * h2 + across * c2
         fall = slope_along * along + slope_across * across
         x, y, z = x - fall * u0, y - fall * u1, z - fall * u2
@@ -331,10 +332,7 @@ class TactileServo:
         return self.surface.foot((f0 + distance * x, f1 + distance * y, f2 + distance * z))
 
 
-def _dot(a: Floats, b: Floats) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
 def _unit(v: Floats) -> Floats:
-    size = math.sqrt(_dot(v, v))
-    return (v[0] / size, v[1] / size, v[2] / size)
+    x, y, z = v
+    size = math.sqrt(x * x + y * y + z * z)
+    return x / size, y / size, z / size

@@ -260,22 +260,14 @@ class Plant:
             object, contact_normal (3) outward of the object, kappa (2), direction1 (3), direction2 (3), pad_uv (2),
             in_contact.
         """
-        s = self._solution() if state is None else self._solve(state)
-        return {
-            "q": np.array(s.q),
-            "probe_centre": np.array(s.probe.centre),
-            "pole": np.array(s.probe.axes[2]),
-            "force": s.contact.force,
-            "depth": s.depth,
-            "depth_rate": s.depth_rate,
-            "contact_point": np.array(s.foot.point),
-            "contact_normal": np.array(s.foot.normal),
-            "kappa": np.array(s.foot.kappa),
-            "direction1": np.array(s.foot.directions[0]),
-            "direction2": np.array(s.foot.directions[1]),
-            "pad_uv": np.array(s.pad_uv),
-            "in_contact": s.depth > 0.0,
-        }
+        found = _true(self._solution() if state is None else self._solve(state))
+        return {name: np.array(value) if isinstance(value, tuple) else value for name, value in found.items()}
+
+    def truths(self, states: Sequence[PlantState]) -> dict[str, Array]:
+        """The same of many states, one row each; nothing of none."""
+        rows = [tuple(_true(self._solve(state)).values()) for state in states]
+        names = _true(self._solve(states[0])) if states else ()
+        return {name: np.array(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)}
 
     def _solution(self) -> _Solution:
         if self._solved is None:
@@ -398,6 +390,25 @@ class _Solution:
     pad_uv: tuple[float, float]
     direction: Vec  # of the contact from the probe's centre, pad frame
     several: bool = False  # it touches in several places or all over, and these are of the deepest
+
+
+def _true(s: _Solution) -> dict[str, float | tuple[float, ...]]:
+    """What `Plant.truth` says, in plain numbers."""
+    return {
+        "q": s.q,
+        "probe_centre": s.probe.centre,
+        "pole": s.probe.axes[2],
+        "force": s.contact.force,
+        "depth": s.depth,
+        "depth_rate": s.depth_rate,
+        "contact_point": s.foot.point,
+        "contact_normal": s.foot.normal,
+        "kappa": s.foot.kappa,
+        "direction1": s.foot.directions[0],
+        "direction2": s.foot.directions[1],
+        "pad_uv": s.pad_uv,
+        "in_contact": s.depth > 0.0,
+    }
 
 
 _POLE = (0.0, 0.0, 1.0)
