@@ -419,7 +419,10 @@ class Session:
             (self.out / "bus.log").unlink(missing_ok=True)
         self._stack.callback(self._keep_truth)
         self._direct = partial(DirectCycle, world=self.world)
-        return LockstepBus(VirtualClock(), self.plan.buses[0].channel).port()
+        clock = VirtualClock()
+        nobody = LockstepBus(clock, self.plan.buses[0].channel)
+        clock.detach(nobody)
+        return nobody.port()
 
     def _open_lockstep(self) -> Port:
         self._need_emulated("a lockstep bus has")

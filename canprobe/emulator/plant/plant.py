@@ -10,7 +10,7 @@ long the nodes took to be brought up.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import inf, sqrt
 from typing import NamedTuple
@@ -53,6 +53,10 @@ class Plant:
         config: what the plant is made of.
         waits: its time stands at 0 until `begin`; False: it is the time of the calls.
 
+    Attributes:
+        motor_counts, torque_permille: position (counts, continuous) and torque (see ``IdealArm.torque_permille``) of a
+            motor now, of its axis from 0: the arm's own methods; 0 without one.
+
     Raises:
         PlanError: for a probe without an arm over a hollow as tight as itself.
     """
@@ -61,10 +65,13 @@ class Plant:
         self.config = config
         self.t_ns = 0
         self._origin_ns = None if waits else 0
+        self.motor_counts: Callable[[int], float] = lambda axis: 0.0
+        self.torque_permille: Callable[[int], int] = lambda axis: 0
         self.arm: IdealArm | DynamicArm | None = None
         self._pressed: PressedProbe | None = None
         if config.model is not None:
             self.arm = make_arm(config)
+            self.motor_counts, self.torque_permille = self.arm.motor_counts, self.arm.torque_permille
         if config.object is not None and config.model is None:
             _refuse_tight_hollow(config)
             self._pressed = PressedProbe(config)
@@ -122,22 +129,6 @@ class Plant:
         """
         origin_ns = t1_ns if self._origin_ns is None else self._origin_ns  # at rest until its time begins
         (self.arm or self._need_arm()).set_ramp(axis, start_counts, end_counts, t0_ns - origin_ns, t1_ns - origin_ns)
-
-    def motor_counts(self, axis: int) -> float:
-        """Motor position now, counts, continuous; 0 without an arm.
-
-        Args:
-            axis: from 0.
-        """
-        return self.arm.motor_counts(axis) if self.arm is not None else 0.0
-
-    def torque_permille(self, axis: int) -> int:
-        """Torque of one drive now, see ``IdealArm.torque_permille``; 0 without an arm.
-
-        Args:
-            axis: from 0.
-        """
-        return self.arm.torque_permille(axis) if self.arm is not None else 0
 
     def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
         """Torque limit and feed-forwards of one drive, see ``DynamicArm.set_loop``; nothing without an arm.
