@@ -104,7 +104,9 @@ def add_sheet(axes: Any, corners: Array, colours: Array | str, **style: Any) -> 
     cells = np.stack([corners[:-1, :-1], corners[:-1, 1:], corners[1:, 1:], corners[1:, :-1]], axis=2).reshape(-1, 4, 3)
     known = np.isfinite(cells).all(axis=(1, 2))
     faces = colours if isinstance(colours, str) else colours[:-1, :-1].reshape(-1, 4)[known]
-    axes.add_collection3d(Poly3DCollection(cells[known], facecolors=faces, linewidths=0, **style), autolim=False)
+    axes.add_collection3d(
+        Poly3DCollection(cells[known], facecolors=faces, linewidths=0, antialiased=False, **style), autolim=False
+    )
     axes.auto_scale_xyz(*cells[known].reshape(-1, 3).T)
 
 
@@ -248,5 +250,5 @@ def _draw_p_values(part: SubFigure, consistency: Consistency) -> None:
                     label=f"{name}, {way}",
                 )  # fmt: skip
     axes.set(xlim=(0, 1), ylim=(0, 1.02), xlabel="p", ylabel="share of crossings below")
-    axes.set_title("p-values of the tests at the crossings")
+    axes.set_title("p-values of the tests at the crossings\nbelow the dotted line: errors are smaller than stated")
     legend(part)
