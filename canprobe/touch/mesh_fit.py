@@ -4,8 +4,8 @@ The vertices of a mesh of a smooth body lie on the body, its facets do not. A bi
 to the vertices; where facets are larger than the grid's spacing, points of curved triangles (PN triangles, from the
 vertices and their normals) fill them. Edges that turn by more than 30 degrees stay edges, others are taken as curved.
 
-It stops being true at sharp edges, which become round over two spacings to each side; on walls steeper than 70 degrees, which are
-bridged; and under overhangs, which are not seen.
+It stops being true at sharp edges, which become round over two spacings to each side; on walls steeper than 70
+degrees, which are bridged; and under overhangs, which are not seen.
 
 Source: Vlachos et al., Curved PN triangles, I3D 2001; Max, Weights for computing vertex normals, JGT 4, 1999.
 """
@@ -245,9 +245,7 @@ def _fitted(samples: Array, weights: Array, spacing: float, at: Array) -> Fit:
     weighted = A.T @ sparse.diags_array(weights)
     weak = _STIFFNESS * max(count / (m * n), 1.0)
     normal = weighted @ A + weak * (along.T @ along + across.T @ across)
-    factors = splu(
-        normal.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-    )
+    factors = splu(normal.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     found = factors.solve(weighted @ samples[:, 2])
     c = found.reshape(m, n)
     c = (c[:-2] + 4.0 * c[1:-1] + c[2:]) / 6.0
