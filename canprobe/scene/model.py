@@ -483,8 +483,8 @@ class BridgeSettings:
     """Port of the Foxglove server. 0: the system chooses."""
     foxglove_host: Annotated[str, Pattern(r"\S+", "without spaces")] = "127.0.0.1"
     """Address of the Foxglove server. 0.0.0.0 serves other machines."""
-    ros2_domain: Annotated[int, Range(0, 232)] = 0
-    """ROS 2 domain."""
+    ros2_domain: Annotated[int, Range(0, 232)] | None = None
+    """ROS 2 domain; without it that of the environment variable ROS_DOMAIN_ID, or 0."""
     ros2_loopback: bool = True
     """Keep the topics on this machine. false: other machines see them, and may send commands if allowed."""
     view_port: Annotated[int, Range(0, 65_535)] = 8080
@@ -492,7 +492,7 @@ class BridgeSettings:
     view_host: Annotated[str, Pattern(r"\S+", "without spaces")] = "127.0.0.1"
     """Address of the 3-D view. 0.0.0.0 serves other machines."""
     ros2_commands: bool = False
-    """Accept start, stop, target force and speed from ROS 2 topics, within the limits of the scene."""
+    """Accept start, stop, target force, speed and trajectories of a free arm from ROS 2, within the scene's limits."""
 
 
 @dataclass(frozen=True, slots=True)
