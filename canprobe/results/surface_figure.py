@@ -130,11 +130,11 @@ def _draw_map_surface(part: Part, view: MapView) -> None:
     axes.plot(*plane.mm(view.map.path).T, color=INK, linewidth=0.5, alpha=0.55, zorder=3)
     differ = rejected(view.consistency)
     if differ.any():
-        shown.append("orange: passes differ, p < 0.05")
+        shown.append("orange dots: passes differ, p < 0.05")
         places = np.array([c.T_base_common[:3, 3] for c in view.consistency.crossings])[differ]
         axes.plot(*plane.mm(places).T, "o", color=ORANGE, markersize=3.5, zorder=4)
     labels = ("along the scan (mm)", "across (mm)", "outward (mm)")
-    box(part, axes, " · ".join(shown), labels, elev=42, azim=-68)
+    box(part, axes, " · ".join(shown[:3]) + "\n" + " · ".join(shown[3:]), labels, elev=42, azim=-68)
     scale.colorbar(ScalarMappable(norm, colours), cax=scale.subplots(), label=what)
 
 
