@@ -144,7 +144,7 @@ def _condition(only: Only) -> str:
 
 
 def execute_notebooks() -> None:
-    """Run the notebooks and store what they show; needs nbclient and ipykernel."""
+    """Run the notebooks and store what they show; needs the extra `docs`."""
     import nbformat
     from nbclient import NotebookClient
 
