@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from canprobe.bus.disk import write_text
-from canprobe.errors import UsageError
+from canprobe.errors import UsageError, install_line
 from canprobe.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan, PlannedPdo
 from canprobe.planning.traffic import CLASSIC_BYTES, SYNCHRONOUS
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, NmtState
@@ -70,7 +70,7 @@ def need(module: str, extra: str, purpose: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise UsageError(f"{purpose} needs {module}: pip install 'canprobe[{extra}]'") from error
+        raise UsageError(f"{purpose} needs {module}: {install_line(extra)}") from error
 
 
 def identifier(text: str) -> str:

@@ -17,7 +17,7 @@ from mcap.writer import Writer
 
 from canprobe import __version__
 from canprobe.bridge.database import plan_database
-from canprobe.bridge.messages import TOPICS, Encoder, Messages, Topic
+from canprobe.bridge.messages import CLOCK, TOPICS, Encoder, Messages, Topic
 from canprobe.bridge.sample import Context, Sample
 from canprobe.eds.packaged import eds_file
 from canprobe.errors import ResultsError, UsageError
@@ -41,7 +41,7 @@ class McapSink:
         self._path = context.out / str(BRIDGES["mcap"].output)
         self._part = self._path.with_suffix(".mcap.part")  # a run that breaks off leaves no file that looks whole
         self._encoder = Encoder()
-        self._messages = Messages(context.plan, self._encoder)
+        self._messages = Messages(context.plan, self._encoder, lambda topic: topic is not CLOCK)
         self._file = self._part.open("wb")
         self._writer = Writer(self._file)
         self._writer.start(profile="ros2", library=f"canprobe {__version__}")
@@ -59,7 +59,8 @@ class McapSink:
         """Take the epoch; every channel is there from the first message on, whether or not it will have any."""
         self._messages.epoch_ns = epoch_ns
         for topic in TOPICS:
-            self._channels[topic.name] = self._register(topic)
+            if topic is not CLOCK:
+                self._channels[topic.name] = self._register(topic)
 
     def write(self, sample: Sample) -> None:
         """Write the messages of a sample."""

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from canprobe.bridge.description import axis_transforms, robot_description
 from canprobe.bridge.sample import (
     BASE,
     CONTACT,
@@ -33,6 +34,7 @@ from canprobe.planning.traffic import CLASSIC_BYTES
 from canprobe.protocol.frames import EFF_FLAG, RTR_FLAG
 from canprobe.robot.chain import Chain
 from canprobe.scene.geometry import T_flange_probe
+from canprobe.session.target import VIRTUAL
 
 CAN_FRAME = "can_msgs/msg/Frame"
 CAN_FD_FRAME = "ros2_socketcan_msgs/msg/FdFrame"
@@ -142,7 +144,14 @@ CAN_FD_FRAMES = Topic("/can_fd_frames", CAN_FD_FRAME, depth=500)
 CAN_FRAMES = Topic("/can_frames", CAN_FRAME, depth=500)
 DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 
-TOPICS = (JOINT_STATES, WRENCH, TF, TF_STATIC, TAXELS, PATCH, CURVATURE, CAN_FRAMES, CAN_FD_FRAMES, DIAGNOSTICS)
+ROBOT_DESCRIPTION = Topic("/robot_description", "std_msgs/msg/String", depth=1, transient=True)
+CLOCK = Topic("/clock", "rosgraph_msgs/msg/Clock", depth=1)
+"""Of a run in virtual time, for nodes with `use_sim_time`; a recording has its own times, and no clock."""
+
+TOPICS = (
+    *(JOINT_STATES, WRENCH, TF, TF_STATIC, TAXELS, PATCH, CURVATURE, CAN_FRAMES, CAN_FD_FRAMES, DIAGNOSTICS),
+    *(ROBOT_DESCRIPTION, CLOCK),
+)
 
 
 Array = NDArray[np.float64]
@@ -174,6 +183,8 @@ class Messages:
         arm, probe = plan.setup.arm, plan.scene.probe
         self._chain = arm.model.chain if arm is not None else None
         self._T_flange_probe = T_flange_probe(probe) if arm is not None and probe is not None else None
+        self._description = robot_description(plan)
+        self._is_virtual = plan.scene.bus.interface in VIRTUAL
         self._wanted = wanted
         self._static_every_ns = static_every_ns
         self._static_due_ns = -(1 << 62)
@@ -216,6 +227,9 @@ class Messages:
         if self._chain is not None and t_ns >= self._static_due_ns:
             self._static_due_ns = t_ns + self._static_every_ns
             yield TF_STATIC, t_ns, lambda: self._static(t_ns)
+            yield ROBOT_DESCRIPTION, t_ns, lambda: self._make("std_msgs/msg/String", data=self._description)
+        if self._is_virtual and sample.cycle is not None:
+            yield CLOCK, t_ns, lambda: self._make(CLOCK.type_name, clock=self._time(t_ns))
         if q is not None and (chain := self._chain) is not None:
             yield JOINT_STATES, t_ns, lambda: self._joint_state(t_ns, chain, q)
             yield TF, t_ns, lambda: self._tf(t_ns, link_transforms(chain, q))
@@ -245,7 +259,7 @@ class Messages:
         fixed = [flange_transform(self._chain)]
         if self._T_flange_probe is not None:
             fixed.append((FLANGE, PROBE, self._T_flange_probe))
-        return self._tf(t_ns, fixed)
+        return self._tf(t_ns, [*fixed, *axis_transforms(self._chain)])
 
     def _wrench(self, touch: TouchFrame) -> Any:
         force, torque = self._vector(touch.force), self._vector(np.zeros(3))
@@ -305,9 +319,11 @@ class Messages:
         return self._types[type_name](**fields)
 
     def _header(self, t_ns: int, frame_id: str) -> Any:
+        return self._make("std_msgs/msg/Header", stamp=self._time(t_ns), frame_id=frame_id)
+
+    def _time(self, t_ns: int) -> Any:
         seconds, ns = divmod(self._epoch_time(t_ns), 1_000_000_000)
-        stamp = self._make("builtin_interfaces/msg/Time", sec=seconds, nanosec=ns)
-        return self._make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
+        return self._make("builtin_interfaces/msg/Time", sec=seconds, nanosec=ns)
 
     def _vector(self, v: Array) -> Any:
         x, y, z = v.tolist()

@@ -2,7 +2,8 @@
 
 Topics carry the bytes of the one encoder. Commands are taken only where `[bridge] ros2_commands` says so:
 `/canprobe/start` and `/canprobe/stop` (std_msgs/Empty), `/canprobe/target_force` in N and `/canprobe/speed` in m/s
-(std_msgs/Float64). Each is answered on `/canprobe/status`; one that the scene's own limits forbid is refused there.
+(std_msgs/Float64), and the trajectory of a free arm where ros2_control's controller takes it. Each is answered on
+`/canprobe/status`; one that the scene's own limits forbid is refused there.
 
 Source: ROS 2's mapping to DDS names (`rt/` before a topic), REP 2016 (`typehash=…;` in USER_DATA), rmw_cyclonedds.
 """
@@ -12,10 +13,12 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
+import os
 import types as python_types
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 from cyclonedds.core import DDSException, Policy, Qos
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.idl import IdlStruct
@@ -25,6 +28,7 @@ from cyclonedds.pub import DataWriter, Publisher
 from cyclonedds.sub import DataReader, Subscriber
 from cyclonedds.topic import Topic as DdsTopic
 from cyclonedds.util import duration
+from numpy.typing import NDArray
 
 from canprobe.bridge.messages import TOPICS, Encoder, Messages, Topic
 from canprobe.bridge.sample import Context, Sample
@@ -33,6 +37,9 @@ from canprobe.planning.make import make_plan
 from canprobe.planning.model import Plan
 from canprobe.scene.load import dump_scene, parse_scene
 from canprobe.scene.resolve import resolve
+from canprobe.tasks import Trajectory
+
+Array = NDArray[np.float64]
 
 # Whether a command from outside may reach the cell: by the same checks that the scene itself has to pass.
 
@@ -62,6 +69,44 @@ def refuse(plan: Plan, kind: str, value: float | None) -> str | None:
     except UsageError as error:
         return str(error).splitlines()[0].removeprefix("scene: ")
     return None
+
+
+def trajectory_of(plan: Plan, message: Any, q: Array | None) -> dict[str, Any]:
+    """The way that a `trajectory_msgs/msg/JointTrajectory` asks for, checked from where the arm stands.
+
+    Args:
+        plan: of the run.
+        message: with names, points, and positions in each; velocities in all of them or in none.
+        q: (n,) joint positions now, rad or m; None as long as they are not known.
+
+    Returns:
+        `points` and `velocities` of a `canprobe.tasks.Trajectory`.
+
+    Raises:
+        UsageError: the cell cannot or must not follow it.
+    """
+    arm = plan.setup.arm
+    if arm is None or plan.scene.task.kind != "free":
+        raise UsageError(f'task.kind = "{plan.scene.task.kind}" follows none: task.kind = "free" does')
+    if q is None:
+        raise UsageError("the joints have not reported yet")
+    names, known = list(message.joint_names), list(arm.model.chain.joints)
+    if sorted(names) != sorted(known):
+        raise UsageError(f"expected the joints {', '.join(known)}, got {', '.join(names) or 'none'}")
+    order = [names.index(name) for name in known]
+
+    def ordered(values: Any) -> list[float]:
+        if len(values) != len(names):
+            raise UsageError(f"expected {len(names)} numbers for {len(names)} joints, got {len(values)}")
+        return [float(values[i]) for i in order]
+
+    times = [point.time_from_start.sec + 1e-9 * point.time_from_start.nanosec for point in message.points]
+    points = [(t, ordered(point.positions)) for t, point in zip(times, message.points, strict=True)]
+    moving = [point.velocities for point in message.points if len(point.velocities)]
+    velocities = [ordered(one) for one in moving] if moving else None
+    if reason := Trajectory(plan, points, velocities).inspect(q):
+        raise UsageError(reason)
+    return {"points": points, "velocities": velocities}
 
 
 # ROS 2 message types as Cyclone DDS knows types, made from rosbags' definitions: one type store for all sinks.
@@ -152,6 +197,7 @@ def dds_name(type_name: str) -> str:
 EMPTY, FLOAT64, STRING = "std_msgs/msg/Empty", "std_msgs/msg/Float64", "std_msgs/msg/String"
 START, STOP = Topic("/canprobe/start", EMPTY), Topic("/canprobe/stop", EMPTY)
 FORCE, SPEED = Topic("/canprobe/target_force", FLOAT64), Topic("/canprobe/speed", FLOAT64)
+TRAJECTORY = Topic("/joint_trajectory_controller/joint_trajectory", "trajectory_msgs/msg/JointTrajectory", depth=1)
 STATUS = Topic("/canprobe/status", STRING, depth=10, transient=True)
 COMMANDS = {START: "start", STOP: "stop", FORCE: "target_force_n", SPEED: "speed_m_s"}
 POLL_SAMPLES = 8
@@ -221,13 +267,16 @@ class Ros2Sink:
         self._plan = context.plan
         self._send = context.send
         self._encoder = encoder
-        self._node = Ros2Node(settings.ros2_domain, settings.ros2_loopback, encoder)
+        domain = domain_of(settings.ros2_domain)
+        self._node = Ros2Node(domain, settings.ros2_loopback, encoder)
         self._writers = {topic.name: self._node.writer(topic) for topic in TOPICS}
         self._messages = Messages(context.plan, encoder, self._is_read)
-        self._readers = {topic: self._node.reader(topic) for topic in COMMANDS} if settings.ros2_commands else {}
+        topics = (*COMMANDS, TRAJECTORY) if settings.ros2_commands else ()
+        self._readers = {topic: self._node.reader(topic) for topic in topics}
+        self._q: Array | None = None
         self._status = self._node.writer(STATUS) if settings.ros2_commands else None
         self._poll_in = 0
-        self.where = f"domain {settings.ros2_domain}{', this machine only' if settings.ros2_loopback else ''}"
+        self.where = f"domain {domain}{', this machine only' if settings.ros2_loopback else ''}"
 
     def start(self, epoch_ns: int) -> None:
         """Take the epoch."""
@@ -237,12 +286,16 @@ class Ros2Sink:
         """Publish a sample's messages; now and then look for commands."""
         for topic, t_ns, data in self._messages.of(sample):
             self._writers[topic.name].write(self._node.types.carry(topic.type_name, data), t_ns)
+        self._q = sample.q if sample.q is not None else self._q
         self._poll_in -= 1
         if self._poll_in <= 0 and self._readers:
             self._poll_in = POLL_SAMPLES
             for topic, reader in self._readers.items():
                 for message in reader.take(N=10):
-                    self._command(topic, getattr(message, "data", None))
+                    if topic is TRAJECTORY:
+                        self._follow(message)
+                    else:
+                        self._command(topic, getattr(message, "data", None))
 
     def close(self, summary: str | None) -> None:
         """Let the last messages arrive; the domain is left with the last reference, that is with this process."""
@@ -265,10 +318,34 @@ class Ros2Sink:
         shown = kind if value is None else f"{kind} {value:g}"
         self._say(f"{shown}: taken" if why is None else f"{shown}: refused: {why}")
 
+    def _follow(self, message: Any) -> None:
+        """A trajectory; one without points stops the arm, as ros2_control has it."""
+        if not message.points:
+            self._command(STOP, None)
+            return
+        shown = f"trajectory of {len(message.points)} points"
+        try:
+            asked = trajectory_of(self._plan, message, self._q)
+        except UsageError as error:
+            self._say(f"{shown}: refused: {str(error).removeprefix('trajectory: ')}")
+        else:
+            self._send({"request": {"kind": "trajectory", "value": asked}})
+            self._say(f"{shown}: taken")
+
     def _say(self, text: str) -> None:
         assert self._status is not None
         cdr = self._encoder.encode(STRING, self._encoder.store.types[STRING](data=text))
         self._status.write(self._node.types.carry(STRING, cdr))
+
+
+def domain_of(wanted: int | None) -> int:
+    """The scene's domain, else that of ROS_DOMAIN_ID, else 0."""
+    if wanted is not None:
+        return wanted
+    text = os.environ.get("ROS_DOMAIN_ID") or "0"
+    if not text.isdecimal() or int(text) > 232:
+        raise UsageError(f"ROS_DOMAIN_ID={text}: expected 0 to 232")
+    return int(text)
 
 
 open_sink = Ros2Sink

@@ -23,9 +23,9 @@ from canprobe.scene.setup import Touch
 from canprobe.session.children import Bridges
 from canprobe.session.emulation import emulate, emulate_eds
 from canprobe.session.looking import commission, monitor, scan
-from canprobe.session.progress import Progress
 from canprobe.session.session import Say, Session, quiet, with_bridges
 from canprobe.session.target import VIRTUAL, Target
+from canprobe.session.terminal import Progress
 from canprobe.session.up import check_joints, home, up
 from canprobe.tasks.from_plan import make_task
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
@@ -170,11 +170,17 @@ def _mapped(
 
 
 def _draw(result: RunResult, out: Path, say: Say) -> None:
-    drawn = [name for name in ("report.html", "report.png", "surface.png") if name in result.plan.outputs]
-    if not len(result.log["t_s"]) or not drawn:
-        return
-    say(f"draw {', '.join(drawn)}")
-    if "report.html" in result.plan.outputs:
+    """The pictures of a run of at least one cycle; the page of its scene comes last, it takes longest."""
+    outputs = result.plan.outputs if len(result.log["t_s"]) else ()
+    if pictures := [name for name in ("report.png", "surface.png") if name in outputs]:
+        say(f"draw {', '.join(pictures)}")
+        from canprobe.results.figures import draw_run
+        from canprobe.results.surface_figure import draw_surface
+
+        draw_run(result, out / "report.png")
+        draw_surface(result, out / "surface.png")
+    if "report.html" in outputs:
+        say("draw report.html")
         page, recorded = (importlib.import_module(f"canprobe.bridge.view.{name}") for name in ("browser", "recorded"))
         try:
             shown = recorded.read_run(out)
@@ -182,12 +188,6 @@ def _draw(result: RunResult, out: Path, say: Say) -> None:
             say(f"report.html is left out: {error}")
         else:
             page.write_page(shown, out / "report.html", say)
-    if "report.png" in result.plan.outputs:
-        from canprobe.results.figures import draw_run
-        from canprobe.results.surface_figure import draw_surface
-
-        draw_run(result, out / "report.png")
-        draw_surface(result, out / "surface.png")
 
 
 class OpenCell(Session):

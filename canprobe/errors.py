@@ -116,17 +116,44 @@ class SafetyStop(CanprobeError):  # noqa: N818 - it is a stop, not a mistake
         super().__init__(reason)
 
 
+EXTRA_OF = {
+    "matplotlib": "study",
+    "distributed": "dask",
+    "cantools": "can",
+    "yaml": "can",
+    "msgpack": "can",
+    "mcap": "mcap",
+    "rosbags": "mcap",
+    "foxglove": "foxglove",
+    "cyclonedds": "ros2",
+    "viser": "view",
+    "trimesh": "view",
+    "collada": "view",
+    "mujoco": "dynamics",
+    "pandas": "data",
+    "pyarrow": "data",
+}
+"""Extra that brings a package, by the name that is imported."""
+
+
 def install_line(extra: str) -> str:
     """What to type to install an extra: from where canprobe itself was installed, if that is known."""
     import importlib.metadata  # only where something is missing
     import json
+    import os
+    import sys
     from urllib.parse import unquote, urlsplit
 
     try:
         origin = json.loads(importlib.metadata.distribution("canprobe").read_text("direct_url.json") or "{}")
     except importlib.metadata.PackageNotFoundError:  # a tree on the path
         origin = {}
-    url = urlsplit(origin.get("url", ""))
-    source = unquote(url.path) if url.scheme == "file" and "dir_info" in origin else "canprobe"
     editable = "-e " if origin.get("dir_info", {}).get("editable") else ""
-    return f"pip install {editable}'{source}[{extra}]'"
+    wanted = f"canprobe[{extra}]"
+    if "dir_info" in origin:  # a folder
+        wanted = f"{unquote(urlsplit(origin['url']).path)}[{extra}]"
+    elif "url" in origin:  # a wheel, or a repository
+        vcs = origin.get("vcs_info", {}).get("vcs")
+        wanted += f" @ {f'{vcs}+' if vcs else ''}{origin['url']}"
+    by_pipx = os.path.exists(os.path.join(sys.prefix, "pipx_metadata.json"))
+    return f"{'pipx runpip canprobe' if by_pipx else 'pip'} install {editable}'{wanted}'"

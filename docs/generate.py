@@ -1,4 +1,4 @@
-"""What the pages take from the code: all keys of a scene; with `notebooks`, what the notebooks show.
+"""What the pages take from the code: keys of a scene, figures of the packaged ones; with `notebooks`, what these show.
 
 `python docs/generate.py [notebooks]`
 """
@@ -16,6 +16,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from canprobe.results.expected import FIGURES, range_text, read_expected, seeds_text
 from canprobe.scene.checks import Only, conditions_of, expected
 from canprobe.scene.load import toml_value
 from canprobe.scene.model import Scene
@@ -143,6 +144,26 @@ def _condition(only: Only) -> str:
     return f"*{'Required' if only.required else 'Only'} with `{only.key}` = {values}.*"
 
 
+def with_expected(page: str) -> str:
+    """A page with the table of expected figures between its marks."""
+    expected = read_expected()
+    columns = ("contact", "force", "curvature", "normal", "position", "tool")
+    lines = [
+        f"| scene | {' | '.join(FIGURES[name][0] for name in columns)} |",
+        "| --- |" + " --- |" * len(columns),
+    ]
+    for scene, figures in expected["scenes"].items():
+        if figures:
+            found = {name.removesuffix("_per_m"): range_text(name, between) for name, between in figures.items()}
+            lines.append(f"| `{scene}` | {' | '.join(found.get(name, '–') for name in columns)} |")
+    source = (
+        f"Lowest to highest of the seeds {seeds_text(expected)} on the lockstep bus. Measured by"
+        f" `python docs/measure.py` on {expected['date']} at commit {expected['commit']}: {expected['machine']}."
+    )
+    head, mark, rest = page.partition("<!-- expected -->\n")
+    return "".join([head, mark, "\n".join(["", *lines, "", source, "", ""]), rest[rest.index("<!-- /expected -->") :]])
+
+
 def execute_notebooks() -> None:
     """Run the notebooks and store what they show; needs the extra `docs`."""
     import nbformat
@@ -157,6 +178,8 @@ def execute_notebooks() -> None:
 
 
 if __name__ == "__main__":
+    scenes = DOCS / "scenes.md"
+    scenes.write_text(with_expected(scenes.read_text(encoding="utf-8")), encoding="utf-8")
     (DOCS / "scene-keys.md").write_text(scene_keys(), encoding="utf-8")
     if "notebooks" in sys.argv:
         execute_notebooks()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import logging
 from collections import deque
 from collections.abc import Sequence
@@ -23,7 +24,7 @@ from canprobe.bus.port import (
     TimedFrame,
     state_after,
 )
-from canprobe.errors import InterfaceError, UsageError
+from canprobe.errors import InterfaceError, UsageError, install_line
 from canprobe.protocol.frame_bits import FD_LENGTHS
 from canprobe.protocol.frames import EFF_FLAG, RTR_FLAG, Frame
 
@@ -238,11 +239,15 @@ class PythonCanPort(PlainPort):
         self._reports.error_frame(can_id, data, t_ns)
 
 
+def interface_names() -> list[str]:
+    """The interfaces that python-can knows."""
+    return sorted(can.VALID_INTERFACES)
+
+
 def _open(interface: str, channel: str, bitrate: int, data_bitrate: int | None) -> can.BusABC:
     logging.getLogger("can").setLevel(logging.CRITICAL)
-    if interface not in can.VALID_INTERFACES:
-        names = ", ".join(sorted(can.VALID_INTERFACES))
-        raise UsageError(f"{channel}: no interface {interface!r}; python-can has: {names}")
+    if interface not in (names := interface_names()):
+        raise UsageError(f"{channel}: no interface {interface!r}; python-can has: {', '.join(names)}")
     options: dict[str, Any] = {"interface": interface, "channel": channel, "bitrate": bitrate}
     if data_bitrate is not None:
         options |= {"fd": True, "data_bitrate": data_bitrate}
@@ -251,7 +256,9 @@ def _open(interface: str, channel: str, bitrate: int, data_bitrate: int | None) 
     try:
         return can.Bus(**options)
     except (can.CanError, OSError, ValueError, TypeError, ImportError) as error:
-        raise InterfaceError(f"{channel}: {interface} cannot be opened: {error}") from error
+        missing = interface == "udp_multicast" and importlib.util.find_spec("msgpack") is None
+        way = f": {install_line('can')}" if missing else ""
+        raise InterfaceError(f"{channel}: {interface} cannot be opened: {error}{way}") from error
     except Exception as error:  # where a driver's library is missing, python-can trips over anything
         why = f"is its driver installed? python-can says {type(error).__name__}: {error}"
         raise InterfaceError(f"{channel}: {interface} cannot be opened; {why}") from error

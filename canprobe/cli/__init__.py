@@ -1,3 +1,4 @@
+# PYTHON_ARGCOMPLETE_OK
 """The command line: parse, call, print. One module a command, imported only when it is used.
 
 A command module has `HELP`, `EXAMPLE`, `add_arguments(parser)` and `run(args) -> int`; its docstring is the description
@@ -16,9 +17,11 @@ from collections.abc import Sequence
 
 import canprobe
 from canprobe.bus.scheduling import Terminated
+from canprobe.cli.completion import complete
 from canprobe.cli.output import termination_interrupts
 from canprobe.cli.parser import Parser, did_you_mean
-from canprobe.errors import CanprobeError
+from canprobe.errors import EXTRA_OF, CanprobeError, install_line
+from canprobe.session.terminal import Report
 
 COMMANDS = (
     "scenes",
@@ -70,9 +73,13 @@ def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911 - one per w
         an unexpected error.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
+    if "_ARGCOMPLETE" in os.environ:
+        complete(parser_of, COMMANDS)
     _prepare_streams()
+    report = Report()
     try:
         args = parser_of(arguments).parse_args(arguments)
+        args.report, report.verbosity = report, getattr(args, "verbosity", 0)
         with termination_interrupts():
             status = int(args.run(args))
         sys.stdout.flush()
@@ -80,21 +87,25 @@ def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911 - one per w
     except SystemExit as leaving:
         return leaving.code if isinstance(leaving.code, int) else 0
     except CanprobeError as error:
-        return _complain("\n".join([str(error), *getattr(error, "__notes__", ())]), error.exit_status)
+        return _complain(report, "\n".join([str(error), *getattr(error, "__notes__", ())]), error.exit_status)
     except BrokenPipeError:
         _forget_output()
         return 141
     except OSError as error:
         if error.filename is None and error.errno in _NO_ROOM:  # whatever writes a file names it
             _forget_output()
-            return _complain(f"standard output: cannot be written: {error.strerror}", 3)
+            return _complain(report, f"standard output: cannot be written: {error.strerror}", 3)
         where = f"{error.filename}: " if error.filename is not None else ""
-        return _complain(f"{where}{error.strerror or error}", 2 if where and isinstance(error, _WRONG_PATH) else 3)
+        return _complain(
+            report, f"{where}{error.strerror or error}", 2 if where and isinstance(error, _WRONG_PATH) else 3
+        )
     except KeyboardInterrupt as interrupt:
         return 143 if isinstance(interrupt, Terminated) else 130
-    except Exception:
+    except Exception as error:
+        if isinstance(error, ModuleNotFoundError) and (extra := EXTRA_OF.get((error.name or "").partition(".")[0])):
+            return _complain(report, f"{arguments[0]} needs {error.name}: {install_line(extra)}", 2)
         traceback.print_exc()
-        return _complain("this is a fault of canprobe itself: please report it with the lines above", 70)
+        return _complain(report, "this is a fault of canprobe itself: please report it with the lines above", 70)
 
 
 def _prepare_streams() -> None:
@@ -132,7 +143,7 @@ def parser_of(arguments: Sequence[str]) -> Parser:
     return parser
 
 
-def _complain(text: str, status: int) -> int:
+def _complain(report: Report, text: str, status: int) -> int:
     for line in text.splitlines():
-        print(f"canprobe: {line}", file=sys.stderr)
+        report.complain(f"canprobe: {line}")
     return status

@@ -10,11 +10,14 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from collections.abc import Callable
 from datetime import date
 from pathlib import Path
 
-from canprobe.cli.output import print_json, say
-from canprobe.cli.parser import BUS, Parser, add_options, folder_path, seed, target_of, word
+from canprobe.cli.output import print_json
+from canprobe.cli.parser import BUS, Parser, add_options, add_verbosity, folder_path, seed, target_of, word
+from canprobe.errors import install_line
+from canprobe.session.terminal import Report
 
 HELP = "calibrate a tactile array by touching known things"
 EXAMPLE = """\
@@ -64,6 +67,7 @@ def add_arguments(parser: Parser) -> None:
         "--out", metavar="DIR", type=folder_path, help="folder of the files [runs/calibrate-array-DATE]"
     )
     add_options(parser, "--force", "--json")
+    add_verbosity(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -90,9 +94,12 @@ def run(args: argparse.Namespace) -> int:
         own_gains=not args.make,
         seed=args.seed,
     )
-    found = calibrate(request, date=today, ask=None if args.yes else _ask, say=_visits_only, out=out)
+    found = calibrate(request, date=today, ask=None if args.yes else _ask, say=_steps(args.report), out=out)
     write_text(out / "calibration.toml", dump_calibration(found.fit.calibration))
-    draw_calibration(found.fit, out / "calibration.png")
+    try:
+        draw_calibration(found.fit, out / "calibration.png")
+    except ModuleNotFoundError:  # the touches are done: only their picture is missing
+        args.report.say(f"calibration.png is left out: matplotlib is not installed: {install_line('study')}")
     if args.json:
         document = as_document(found.fit)
         print_json({**document, "restless": [list(p) for p in found.restless], "notes": list(found.notes)})
@@ -105,10 +112,14 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _visits_only(line: str) -> None:
-    """What is done next; the steps of each bring-up are left out."""
-    if line.startswith(("visit", "warning")):
-        say(line)
+def _steps(report: Report) -> Callable[[str], None]:
+    """Reports what is done next; the steps of each bring-up only where every step is wanted."""
+
+    def say(line: str) -> None:
+        if report.verbosity > 0 or line.startswith(("visit", "warning")):
+            report.say(line)
+
+    return say
 
 
 def _ask(text: str) -> str:

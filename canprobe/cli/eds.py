@@ -48,7 +48,7 @@ def add_arguments(parser: Parser) -> None:
         description="Print the path of a packaged EDS file.",
         epilog="example:\n  canprobe eds path puma260_joint\n",
     )
-    path.add_argument("name", metavar="NAME", help="name of a packaged file, with or without .eds")
+    path.add_argument("eds", metavar="NAME", help="name of a packaged file, with or without .eds")
     path.set_defaults(run=run, action="path")
     check = actions.add_parser(
         "check",
@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     from canprobe.eds.packaged import eds_names, eds_path
 
     if args.action == "path":
-        print(eds_path(args.name))
+        print(eds_path(args.eds))
     elif args.json:
         print_json(list(eds_names()))
     else:

@@ -12,12 +12,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from canprobe.cli.output import left_by_ctrl_c, say
+from canprobe.cli.output import left_by_ctrl_c
 from canprobe.cli.parser import (
     BUS,
     Parser,
     add_options,
     add_scene,
+    add_verbosity,
     loaded,
     node_id,
     node_ids,
@@ -96,6 +97,7 @@ def add_arguments(parser: Parser) -> None:
     )
     parser.add_argument("--parent", metavar="PID", type=whole(1, 2**31 - 1), help=argparse.SUPPRESS)  # ends with it
     parser.add_argument("--origin", metavar="NS", type=whole(0, 2**63 - 1), help=argparse.SUPPRESS)  # of its times
+    add_verbosity(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -136,7 +138,7 @@ def _scene_server(args: argparse.Namespace) -> Callable[[], None]:
         store_folder=args.store,
         without_id=args.without_id,
         homed=args.parent is not None,  # there is nobody who could home the nodes of a run
-        say=say,
+        say=args.report.say,
     )
 
 
@@ -159,7 +161,7 @@ def _eds_server(args: argparse.Namespace) -> Callable[[], None]:
         store_folder=args.store,
         serial_numbers=args.serial,
         in_realtime=args.realtime,
-        say=say,
+        say=args.report.say,
     )
 
 

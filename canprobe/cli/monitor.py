@@ -9,8 +9,8 @@ import argparse
 import sys
 
 from canprobe.bus.scheduling import Terminated
-from canprobe.cli.output import print_json, say
-from canprobe.cli.parser import BUS, Parser, add_options, add_scene, loaded, seconds, target_of
+from canprobe.cli.output import print_json
+from canprobe.cli.parser import BUS, Parser, add_options, add_scene, add_verbosity, loaded, seconds, target_of
 
 HELP = "watch a running cell"
 EXAMPLE = """\
@@ -29,6 +29,7 @@ def add_arguments(parser: Parser) -> None:
         "--duration", metavar="S", type=seconds, help="end after S seconds [at Ctrl-C on a terminal, else 1]"
     )
     add_options(parser, "--json")
+    add_verbosity(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -43,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     duration_s = args.duration if args.duration is not None or on_terminal else 1.0
     view, ended = None, None
     try:
-        for view in api.monitor(scene, duration_s=duration_s, say=say):
+        for view in api.monitor(scene, duration_s=duration_s, say=args.report.say):
             if on_terminal:
                 sys.stdout.write(screen(view))
                 sys.stdout.flush()

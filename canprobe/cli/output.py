@@ -1,16 +1,20 @@
-"""What commands print: JSON documents and tables; and interrupts that leave a terminal in order."""
+"""What commands print on stdout: JSON documents, tables, summaries; and interrupts that leave a terminal in order."""
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
+import re
 import signal
 import sys
+import textwrap
 from collections.abc import Iterator, Sequence
 
 from canprobe.bus.scheduling import TERMINATIONS, Terminated, raise_terminated
+from canprobe.session.terminal import MARKS, NARROW, columns, painted
 
-# What commands print: JSON documents, tables.
+# Results, on stdout.
 
 
 def print_json(document: object) -> None:
@@ -19,23 +23,40 @@ def print_json(document: object) -> None:
 
 
 def print_table(rows: Sequence[Sequence[str]]) -> None:
-    """Rows in columns as wide as they need to be."""
+    """Rows in columns as wide as they need to be; on a terminal that is too narrow the widest are broken."""
     if not rows:
         return
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    if (window := columns(sys.stdout)) is not None:
+        while sum(widths) + 2 * (len(widths) - 1) > window and max(widths) > NARROW:
+            widths[widths.index(max(widths))] -= 1
     for row in rows:
-        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+        broken = [
+            [cell] if len(cell) <= width else textwrap.wrap(cell, width)
+            for cell, width in zip(row, widths, strict=True)
+        ]
+        for number, line in enumerate(itertools.zip_longest(*broken, fillvalue="")):
+            cells = [cell.ljust(width) for cell, width in zip(line, widths, strict=True)]
+            cells[0] = painted(cells[0], "bold", sys.stdout) if number == 0 else cells[0]
+            print("  ".join(cells).rstrip())
+
+
+def print_summary(text: str) -> None:
+    """A summary: a headline, and lines that begin with what they are about; coloured on a terminal."""
+    head, *lines = text.splitlines()
+    print(painted(head, "green" if head.endswith(": done") else "red", sys.stdout))
+    for line in lines:
+        match = re.match(r"( +)(\S+)(.*)", line)
+        colour = "yellow" if match and match[2] in MARKS else "cyan"
+        print(f"{match[1]}{painted(match[2], colour, sys.stdout)}{match[3]}" if match else line)
+
+
+# Steps and progress, on stderr.
 
 
 def say(line: str) -> None:
-    """Report one step, on stderr."""
+    """Report one line, on stderr."""
     print(line, file=sys.stderr, flush=True)
-
-
-def say_on_terminal(line: str) -> None:
-    """Report one step, if stderr is a terminal."""
-    if sys.stderr.isatty():
-        say(line)
 
 
 # SIGTERM and SIGHUP as interrupts: whatever stops a command, it leaves by the same safe way.

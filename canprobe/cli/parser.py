@@ -205,6 +205,23 @@ def add_options(parser: argparse._ActionsContainer, *names: str) -> None:
         parser.add_argument(name, **OPTIONS[name])
 
 
+def add_verbosity(parser: Parser) -> None:
+    """-v and -q of a command that reports its steps."""
+    either = parser.add_mutually_exclusive_group()
+    either.add_argument(
+        "-v",
+        "--verbose",
+        dest="verbosity",
+        action="store_const",
+        const=1,
+        default=0,
+        help="report every step on stderr, even where that is no terminal",
+    )
+    either.add_argument(
+        "-q", "--quiet", dest="verbosity", action="store_const", const=-1, help="report only warnings and errors"
+    )
+
+
 # Where a command goes: what the command line says, else the scene, else python-can's configuration.
 
 CONFIG = "config"

@@ -8,8 +8,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from canprobe.cli.output import print_json, say
-from canprobe.cli.parser import Parser, add_options
+from canprobe.cli.output import print_json
+from canprobe.cli.parser import Parser, add_options, add_verbosity
 from canprobe.errors import ResultsError
 
 HELP = "estimate the shape again from a recorded bus"
@@ -36,6 +36,7 @@ def add_arguments(parser: Parser) -> None:
     )
     parser.add_argument("--out", metavar="FILE", type=Path, help="write all estimates to this npz file")
     add_options(parser, "--bridge", "--json")
+    add_verbosity(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -59,7 +60,7 @@ def _run_into(args: argparse.Namespace) -> int:
     from canprobe.recorded.into_bridges import replay_into
     from canprobe.results.summary import bridge_lines
 
-    replayed = replay_into(args.log, args.bridge, scene=args.scene, method=args.method, say=say)
+    replayed = replay_into(args.log, args.bridge, scene=args.scene, method=args.method, say=args.report.say)
     if replayed.result is not None and args.out is not None:
         replayed.result.save(args.out)
     if args.json:

@@ -7,12 +7,12 @@ process, in real time.
 from __future__ import annotations
 
 import argparse
+import shlex
 from pathlib import Path
 
-from canprobe.cli.output import print_json, say, say_on_terminal
-from canprobe.cli.parser import BUS, Parser, add_options, add_scene, scene_of
+from canprobe.cli.output import print_json, print_summary
+from canprobe.cli.parser import BUS, Parser, add_options, add_scene, add_verbosity, scene_of
 from canprobe.errors import CanprobeError
-from canprobe.session.progress import progress_bar
 
 HELP = "run a scene and write the results"
 EXAMPLE = """\
@@ -33,6 +33,7 @@ def add_arguments(parser: Parser) -> None:
         "--tool", metavar="FILE", type=Path, help="centre of the probe, from the tool.toml of a calibration"
     )
     add_options(parser, "--json")
+    add_verbosity(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -44,6 +45,7 @@ def run(args: argparse.Namespace) -> int:
         scene = with_tool(scene, args.tool)
 
     from canprobe import api
+    from canprobe.planning.bridges import BRIDGES
 
     folder = api.results_folder(scene, args.out)
     try:
@@ -53,8 +55,8 @@ def run(args: argparse.Namespace) -> int:
             seed=args.seed,
             duration_s=args.duration,
             force=args.force,
-            progress=progress_bar(),
-            say=say_on_terminal,
+            progress=args.report.bar(),
+            say=args.report.detail,
             bridge=args.bridge,
         )
     except CanprobeError as error:
@@ -63,10 +65,23 @@ def run(args: argparse.Namespace) -> int:
         raise
     except KeyboardInterrupt:
         where = f"; what was measured until then: {folder}" if folder.exists() else ""
-        say(f"canprobe: interrupted, the cell is stopped{where}")
+        args.report.complain(f"canprobe: interrupted, the cell is stopped{where}")
         raise
     if args.json:
         print_json(result.summary)
     else:
-        print(result.text())
+        print_summary(result.text() + _expected(args))
+        view = BRIDGES["view"]
+        print(f"next: {f'{view.pip} && ' if view.missing else ''}canprobe view {shlex.quote(str(folder))}")
     return 0
+
+
+def _expected(args: argparse.Namespace) -> str:
+    """A line with the figures to expect, where a packaged scene ran as it is."""
+    from canprobe.results.expected import expected_text, read_expected, seeds_text
+
+    read = read_expected()
+    figures = read["scenes"].get(args.scene)
+    if not figures or any(value is not None for value in (args.cell, args.duration, args.tool)):
+        return ""
+    return f"\n  expected   {expected_text(figures)} (seeds {seeds_text(read)})"

@@ -10,12 +10,13 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from canprobe.cli.output import print_json, print_table, say
+from canprobe.cli.output import print_json, print_table
 from canprobe.cli.parser import (
     OPTIONS,
     Parser,
     add_options,
     add_scene,
+    add_verbosity,
     channel,
     loaded,
     number_of_32_bits,
@@ -64,6 +65,7 @@ def add_arguments(parser: Parser) -> None:
     )
     parser.add_argument("--no-store", action="store_true", help="the devices lose their new ids when they lose power")
     add_options(parser, "--json")
+    add_verbosity(parser)
 
 
 def assignment(text: str) -> Assignment:
@@ -87,14 +89,14 @@ def run(args: argparse.Namespace) -> int:
 
     target = real_target(args.bus, args.channel[1], args.bitrate, channel_else="can0")
     if not args.lss:
-        nodes = api.scan(target, say=say)
+        nodes = api.scan(target, say=args.report.say)
         if args.json:
             print_json(nodes)
         else:
             _print_nodes(nodes, target.channel)
         return 0
     scene = None if args.scene is None else loaded(args)
-    done = api.commission(target, scene=scene, assign=args.assign, store=not args.no_store, say=say)
+    done = api.commission(target, scene=scene, assign=args.assign, store=not args.no_store, say=args.report.say)
     if args.json:
         print_json(done.as_document())
     else:

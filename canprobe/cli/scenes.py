@@ -1,9 +1,14 @@
-"""List the packaged scenes and print the folder of their files."""
+"""List the packaged scenes, with the figures to expect of them, and print the folder of their files.
+
+The figures are the lowest and the highest of some seeds: RMS errors of the contact force, and of the curvature as the
+estimator in the loop has it.
+"""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
+from typing import Any
 
 from canprobe.cli.output import print_json, print_table
 from canprobe.cli.parser import Parser, add_options
@@ -22,22 +27,39 @@ def add_arguments(parser: Parser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print name and title of every packaged scene, and the folder of their files."""
-    return print_packaged({"scene": "copy one to change it"}, args)
+    """Print name, title and figures of every packaged scene, and the folder of their files."""
+    from canprobe.results.expected import read_expected
+
+    return print_packaged({"scene": "copy one to change it"}, args, read_expected())
 
 
-def print_packaged(advice: Mapping[str, str], args: argparse.Namespace) -> int:
-    """Print name and title of every packaged file of some kinds, their folders, and what can be done with them."""
+def print_packaged(
+    advice: Mapping[str, str], args: argparse.Namespace, expected: Mapping[str, Any] | None = None
+) -> int:
+    """Print name and title of every packaged file of some kinds, their folders, and what can be done with them.
+
+    Args:
+        advice: by kind.
+        args: of the command.
+        expected: their figures, as `read_expected` has them.
+    """
+    from canprobe.results.expected import SHORT, expected_text, seeds_text
     from canprobe.scene.load import packaged_arrays, packaged_cells, packaged_files, packaged_scenes
 
     titles = {"scene": packaged_scenes, "cell": packaged_cells, "array": packaged_arrays}
-    document: list[dict[str, str]] = []
+    document: list[dict[str, Any]] = []
     for kind, then in advice.items():
         found, paths = titles[kind](), packaged_files(f"{kind}s")
         if args.json:
-            document += [{"kind": kind, "name": n, "title": title, "path": str(paths[n])} for n, title in found]
+            for name, title in found:
+                figures = {} if expected is None else {"expected": expected["scenes"][name]}
+                document.append({"kind": kind, "name": name, "title": title, "path": str(paths[name]), **figures})
         else:
-            print_table(found)
+            if expected is None:
+                print_table(found)
+            else:
+                print_table([(*row, expected_text(expected["scenes"].get(row[0], {}), SHORT)) for row in found])
+                print(f"figures: RMS errors to expect, lowest–highest of the seeds {seeds_text(expected)}")
             print(f"in {next(iter(paths.values())).parent}; {then}")
     if args.json:
         print_json(document)

@@ -10,9 +10,8 @@ import argparse
 from pathlib import Path
 
 from canprobe.bus.scheduling import interrupts_repeated
-from canprobe.cli.output import print_json, print_table, say
-from canprobe.cli.parser import Parser, add_options, did_you_mean, whole
-from canprobe.session.progress import progress_bar
+from canprobe.cli.output import print_json, print_table
+from canprobe.cli.parser import Parser, add_options, add_verbosity, did_you_mean, whole
 
 HELP = "measure accuracy, limits, faults and timing"
 EXAMPLE = """\
@@ -41,6 +40,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--dask", metavar="ADDRESS", help="compute on the Dask cluster with this scheduler")
     parser.add_argument("--fresh", action="store_true", help="ignore finished cells in DIR")
     add_options(parser, "--json")
+    add_verbosity(parser)
     parser.set_defaults(complain=parser.error)
 
 
@@ -70,10 +70,12 @@ def run(args: argparse.Namespace) -> int:
     out = args.out or Path("runs") / f"study-{args.name}"
     options = {"workers": args.workers, "dask": args.dask, "fresh": args.fresh}
     try:
-        with open_sweep(out, say=say, progress=progress_bar(unit=".0f cells"), **options) as sweep:
+        with open_sweep(out, say=args.report.say, progress=args.report.bar(".0f cells"), **options) as sweep:
             result = run_study(args.name, quick=args.quick, sweep=sweep, vcan=args.vcan)
     except KeyboardInterrupt:
-        say(f"canprobe: interrupted; finished cells are kept in {out}, the same command computes the rest")
+        args.report.complain(
+            f"canprobe: interrupted; finished cells are kept in {out}, the same command computes the rest"
+        )
         raise
     with interrupts_repeated():
         paths = write_study(result, out)
@@ -81,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
         print_json(as_document(result))
     else:
         print(text_of(result), end="")
-    say("wrote " + ", ".join(map(str, paths)))
+    args.report.say("wrote " + ", ".join(map(str, paths)))
     return 0
 
 
@@ -91,7 +93,7 @@ def _replay(args: argparse.Namespace) -> int:
         args.complain(f"--seed: expected study faults, got {args.name}")
     from canprobe.studies.faults import replay
 
-    outcome = replay(args.seed, say)
+    outcome = replay(args.seed, args.report.say)
     if args.json:
         print_json(outcome)
     return 1 if outcome["failures"] else 0

@@ -8,8 +8,8 @@ from __future__ import annotations
 import argparse
 import sys
 
-from canprobe.cli.output import left_by_ctrl_c, say
-from canprobe.cli.parser import BUS, Parser, add_options, add_scene, scene_of
+from canprobe.cli.output import left_by_ctrl_c
+from canprobe.cli.parser import BUS, Parser, add_options, add_scene, add_verbosity, scene_of
 from canprobe.errors import UsageError
 
 HELP = "bring the cell up and hold it"
@@ -37,6 +37,7 @@ def add_arguments(parser: Parser) -> None:
         help='home the joints with zero = "homing" one after the other, and end; asks before each',
     )
     parser.add_argument("--yes", action="store_true", help="with --check-joints or --home: do not ask")
+    add_verbosity(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -58,8 +59,8 @@ def run(args: argparse.Namespace) -> int:
         from canprobe.cli.operator import TerminalOperator
 
         step = api.home if args.home else api.check_joints
-        step(scene, operator=None if args.yes else TerminalOperator(), say=say)
+        step(scene, operator=None if args.yes else TerminalOperator(), say=args.report.say)
         return 0
     with left_by_ctrl_c():
-        api.up(scene, bridge=args.bridge, say=say)
+        api.up(scene, bridge=args.bridge, say=args.report.say)
     return 0

@@ -1,7 +1,8 @@
 """Run a command where a real vcan0 exists: on this machine if possible, else in a small virtual machine.
 
-The command has the working folder and the environment of the caller, separate stdout and stderr, and no stdin. Signals
-are passed on; the third one kills. The virtual machine is a user-mode Linux with the same files and without a network;
+The command has the working folder and the environment of the caller, separate stdout and stderr, and no stdin. Without
+a command a shell is opened, on your terminal or for the lines of standard input; `exit` leaves it. Signals are passed
+on; the third one kills. The virtual machine is a user-mode Linux with the same files and without a network;
 the command runs there as root. CANPROBE_VCAN names the way that was taken: here, namespace, link or guest.
 """
 
@@ -10,7 +11,6 @@ from __future__ import annotations
 import argparse
 
 from canprobe.cli.parser import Parser, seconds
-from canprobe.errors import UsageError
 
 HELP = "run a command where a vcan0 exists"
 EXAMPLE = """\
@@ -19,13 +19,14 @@ machine ended early
 
 examples:
   canprobe vcan -- canprobe run cylinder --bus socketcan --channel vcan0 --patient
+  canprobe vcan
   canprobe vcan --timeout 60 -- sh -c 'cangen vcan0 -n 5 & candump -n 5 vcan0'
 """
 
 
 def add_arguments(parser: Parser) -> None:
     """Add the command's arguments."""
-    parser.usage = "canprobe vcan [--install] [--timeout S] [--realtime] -- COMMAND..."
+    parser.usage = "canprobe vcan [--install] [--timeout S] [--realtime] [-- COMMAND...]"
     parser.add_argument(
         "--install", action="store_true", help="install the Debian package user-mode-linux if it is needed (as root)"
     )
@@ -34,15 +35,13 @@ def add_arguments(parser: Parser) -> None:
         "--realtime", action="store_true", help="pin the virtual machine to one processor under SCHED_FIFO"
     )
     parser.add_argument(
-        "command", metavar="COMMAND", nargs=argparse.REMAINDER, help="command to run, with its arguments"
+        "command", metavar="COMMAND", nargs=argparse.REMAINDER, help="command to run, with its arguments [a shell]"
     )
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the command; return its exit status."""
     command = args.command[1:] if args.command[:1] == ["--"] else args.command
-    if not command:
-        raise UsageError("vcan: COMMAND is missing; for example: canprobe vcan -- ip link show vcan0")
 
     from canprobe.vcan.launch import run_with_vcan
 

@@ -10,12 +10,13 @@ import argparse
 import contextlib
 import os
 import webbrowser
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from canprobe.bus.scheduling import interrupts_held, interrupts_repeated
-from canprobe.cli.output import left_by_ctrl_c, say
-from canprobe.cli.parser import BUS, Parser, add_options, target_of, whole
+from canprobe.cli.output import left_by_ctrl_c
+from canprobe.cli.parser import BUS, Parser, add_options, add_verbosity, target_of, whole
 
 if TYPE_CHECKING:
     from canprobe.api import AnyObserver
@@ -45,6 +46,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--html", metavar="FILE", type=Path, help="write the replay to one HTML file, and end")
     of_scene = parser.add_argument_group("options of a SCENE")
     add_options(of_scene, "--set", *BUS, "--out", "--force", "--seed", "--duration")
+    add_verbosity(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -52,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     from canprobe.planning.bridges import check_bridges
 
     check_bridges(["view"])
-    folder, browser = Path(args.what), _Browser(args.port, quiet=args.no_open)
+    folder, browser = Path(args.what), _Browser(args.port, args.report.say, quiet=args.no_open)
     leave = left_by_ctrl_c() if args.html is None else contextlib.nullcontext()  # the normal end of a page only
     with leave:
         if _is_scene(args.what):
@@ -63,10 +65,17 @@ def run(args: argparse.Namespace) -> int:
         recorded = read_run(folder)
         if args.html is not None:
             with interrupts_repeated():
-                write_page(recorded, args.html, say)
+                write_page(recorded, args.html, args.report.say)
             print(args.html)
         else:
-            serve_run(recorded, port=browser.port, host=args.host, ready=browser.show, say=say, whole=interrupts_held)
+            serve_run(
+                recorded,
+                port=browser.port,
+                host=args.host,
+                ready=browser.show,
+                say=args.report.say,
+                whole=interrupts_held,
+            )
     return 0
 
 
@@ -109,14 +118,16 @@ class _Browser:
 
     Args:
         port: that was asked for.
+        say: reports the other steps.
         quiet: only print the address.
 
     Attributes:
         port: where it was last, so that a page that is open finds the next one there.
     """
 
-    def __init__(self, port: int, *, quiet: bool) -> None:
+    def __init__(self, port: int, say: Callable[[str], None], *, quiet: bool) -> None:
         self.port = port
+        self._say = say
         self._quiet = quiet or not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
     def show(self, address: str) -> None:
@@ -133,7 +144,7 @@ class _Browser:
         if where != line:
             self.show(where)
         else:
-            say(line)
+            self._say(line)
 
 
 def _paced() -> AnyObserver:

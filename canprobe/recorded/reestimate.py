@@ -62,7 +62,7 @@ def _from_run(plan: Plan, run: RunFolder) -> Contacts:
         tracker, unplaced = replay_contacts(plan, run.measurements())
         driven_by = "other"
     counts = {"cycles": len(run.times_ns), "unplaced_contacts": unplaced}
-    return Contacts(tracker, driven_by, run.start_s, run.log["t_s"] - run.start_s, counts, None)
+    return Contacts(tracker, driven_by, run.start_s, run.times_s, counts, None)
 
 
 def _from_log(plan: Plan, path: Path) -> Contacts:

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
@@ -82,7 +83,11 @@ def picture(path: Path | str, title: str, height_in: float) -> Iterator[Figure]:
     with sheet(title, height_in) as figure:
         yield figure
         with whole_file(path) as part:
-            figure.savefig(part, format=path.suffix[1:] or "png")
+            if (form := path.suffix[1:] or "png") == "png":
+                canvas: Any = FigureCanvasAgg(figure)
+                canvas.print_png(part)  # `savefig` draws everything twice
+            else:
+                figure.savefig(part, format=form)
 
 
 def parts(of: Part, rows: int, columns: int, **ratios: Any) -> list[SubFigure]:
@@ -150,8 +155,11 @@ def box(part: Part, axes: Any, title: str, labels: Sequence[str], *, elev: float
         axis.labelpad = 5
         axis.set_tick_params(pad=0)
         count, inset = round(5 * (high - low) / longest), 0.25 * (high - low)
-        two = FixedLocator([round(low + inset), round(high - inset)])
-        axis.set_major_locator(MaxNLocator(count, steps=(1, 2, 5, 10), integer=True) if count > 2 else two)
+        two = count == 2 or part.bbox.height > 4.0 * DPI
+        few = [round(low + inset), round(high - inset)] if two else [round(0.5 * (low + high))]
+        axis.set_major_locator(
+            MaxNLocator(count, steps=(1, 2, 5, 10), integer=True) if count > 2 else FixedLocator(few)
+        )
         axis.pane.set_facecolor("white")
         axis.pane.set_edgecolor(FAINT)
     for artist in axes.get_children():

@@ -30,7 +30,7 @@ DEFAULT_CELL = "puma260"
 CHANGED = " (changed)"
 """Behind the title of a scene whose object or task is no longer that of its file."""
 _ALWAYS = ("scene", "task", "bus", "cycle", "limits", "bring_up")
-FILE_KEYS = {"array", "calibration", "eds", "urdf", "true_cell"}
+FILE_KEYS = {"array", "calibration", "eds", "file", "urdf", "true_cell"}
 """Keys whose files a saved scene takes along."""
 SAVED_AS = "scene.toml"
 """Name of a saved scene."""

@@ -266,7 +266,7 @@ class Bridges:
         from canprobe.tasks.from_plan import RequestedTask
 
         requests = tuple(bridge.requests for bridge in self.observers)
-        return RequestedTask(task, make, requests, self._plan.sync.period_ns * 1e-9)
+        return RequestedTask(task, make, requests, self._plan.sync.period_ns * 1e-9, self._plan)
 
     def status(self) -> dict[str, dict[str, Any]] | None:
         """What stands in the summary of each bridge; None without any."""

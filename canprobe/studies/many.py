@@ -21,9 +21,9 @@ from canprobe.results.files import unit_of
 from canprobe.results.summary import RunResult
 from canprobe.scene.load import dump_scene, load_scene, parse_scene, with_files_beside
 from canprobe.scene.model import Scene
-from canprobe.session.progress import progress_bar
 from canprobe.session.session import Say, quiet
 from canprobe.session.target import VIRTUAL, Target
+from canprobe.session.terminal import Report
 from canprobe.studies.harness import Array, Row, model_digest
 from canprobe.studies.sweep import error_text, open_sweep
 
@@ -143,7 +143,7 @@ def run_many(
             rows.append({**dict(zip(keys, values, strict=True)), "seed": seed})
     folder = Path(out) if out is not None else Path("runs") / f"many-{base.name}"
     where: dict[str, Any] = {"dask": workers} if isinstance(workers, str) else {"workers": workers}
-    bar = progress_bar(unit=".0f runs") if progress else None
+    bar = Report().bar(".0f runs") if progress else None
     with open_sweep(folder, fresh=fresh, say=say, progress=bar, **where) as sweep:
         outcomes = sweep.map(measure, cases)
     return Runs(base, tuple(keys), tuple(rows), tuple(outcomes), tuple(series), every_ms * 1e-3)

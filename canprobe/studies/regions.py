@@ -274,8 +274,9 @@ def draw_regions(rows: Sequence[Row], path: Path) -> None:
     """Coverage, and stated deviation over error, with their intervals."""
     names = list(dict.fromkeys(r["of"] for r in rows))
     title = (
-        "The online estimator with the whole sensor on: share of its 95 % regions that hold the truth, and stated\n"
-        "deviation over error; bars: 95 % of draws of the scenes; shade: target"
+        "Whether the online estimator knows its error: how often its 95 % regions hold the true curvature,\n"
+        "and the standard deviation that it states over its RMS error (above 1: cautious)\n"
+        "by object, over all, by full scale of the array (kPa) and by path; bars: 95 % over scenes; shade: target"
     )
     with picture(path, title, 4.4) as figure:
         left, right = figure.subplots(1, 2)

@@ -50,7 +50,7 @@ from typing import Any
 
 from canprobe.errors import StudyError, UsageError, install_line
 from canprobe.session.children import end_with_parent
-from canprobe.session.progress import Progress
+from canprobe.session.terminal import Progress
 from canprobe.studies.harness import CellStore, Say, StudyResult, as_json, cell_key, model_digest
 
 # Where cells are computed: a pool of processes on this machine, or the workers of a Dask cluster.

@@ -9,8 +9,27 @@
 - `shape` is the estimator in the loop: contacts go in when they are felt, answers are computed in `update` when the
   commands are out, and are used from the next cycle on.
 - `untouched` has the tasks without touch: hold, swing, listen, and the check of each joint's first motion.
+- `trajectory` follows points, for own scripts and for ROS 2: `canprobe.tasks.Trajectory`.
 - `task` is what a task leaves for the summary.
 
 A task guards its own contact (`lets_go`): it decides by the same table of conditions as the cell when to let go. A
 task reads its setup (`canprobe.scene.setup`) and nothing of a scene.
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from canprobe.tasks.trajectory import Trajectory
+
+__all__ = ["Trajectory"]
+
+
+def __getattr__(name: str) -> Any:
+    """Import the public name on first use (PEP 562): no task imports another one."""
+    if name != "Trajectory":
+        raise AttributeError(f"module 'canprobe.tasks' has no attribute {name!r}")
+    from canprobe.tasks.trajectory import Trajectory
+
+    return Trajectory

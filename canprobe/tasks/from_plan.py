@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from canprobe.cell.controller import Command, Controller, Measurement
 from canprobe.planning.model import Plan
 from canprobe.protocol.tactile import WINDOW
+from canprobe.robot.chain import Array as Vector
 from canprobe.scene.setup import Calibrate, Free, Probe, Setup, Touch
 from canprobe.tasks.probing import ProbingTask
 from canprobe.tasks.sensing import ContactSensing
@@ -171,7 +172,8 @@ def make_task(plan: Plan) -> Controller:
 # A new target force or speed is approached at a bounded rate: no request makes a step.
 
 Requests = Sequence[deque[dict[str, Any]]]
-"""Queues of `{"kind": "start" | "stop" | "target_force_n" | "speed_m_s", "value": float | None}`."""
+"""Queues of `{"kind": "start" | "stop" | "target_force_n" | "speed_m_s", "value": float | None}`, and of kind
+"trajectory" with the `points` and `velocities` of a `Trajectory` as its value."""
 FORCE_RATE = 2.0
 """N/s."""
 SPEED_RATE = 0.1
@@ -186,12 +188,21 @@ class RequestedTask(Controller):
         make: makes a new task at every `start`; None where the task runs once, from the beginning.
         requests: where requests arrive.
         period_s: of the cycle.
+        plan: of an arm that follows trajectories on request; without, none is asked for.
     """
 
     def __init__(
-        self, task: Controller | None, make: Callable[[], Controller] | None, requests: Requests, period_s: float
+        self,
+        task: Controller | None,
+        make: Callable[[], Controller] | None,
+        requests: Requests,
+        period_s: float,
+        plan: Plan | None = None,
     ) -> None:
         self._task = task
+        self._plan = plan
+        self._period_s = period_s
+        self._targets: list[Vector] = []
         self._make = make
         self._requests = requests
         self._steps = {"target_force_n": FORCE_RATE * period_s, "speed_m_s": SPEED_RATE * period_s}
@@ -202,7 +213,11 @@ class RequestedTask(Controller):
         """One cycle."""
         for queue in self._requests:
             while queue:
-                self._take(**queue.popleft())
+                request = queue.popleft()
+                if request["kind"] == "trajectory":
+                    self._follow(measurement, **request["value"])
+                else:
+                    self._take(**request)
         if self._task is None:
             return Command()
         columns = self._approach(self._task) if isinstance(self._task, TouchTask) else {}
@@ -211,8 +226,10 @@ class RequestedTask(Controller):
             command = replace(command, columns={**command.columns, **columns})
         if self._stopping and not isinstance(self._task, ProbingTask):
             command = replace(command, done=True)
+        if self._plan is not None and command.q_target is not None:
+            self._targets = [*self._targets[-1:], command.q_target]
         if command.done and self._make is not None:
-            self._task, self._stopping = None, False
+            self._task, self._stopping, self._targets = None, False, []
             return replace(command, done=False)
         return command
 
@@ -238,14 +255,33 @@ class RequestedTask(Controller):
 
     def _take(self, kind: str, value: float | None) -> None:
         if kind == "stop":
-            self._stopping = self._task is not None
             if isinstance(self._task, ProbingTask):
                 self._task.stop()
+            elif self._plan is not None and len(self._targets) == 2:
+                from canprobe.tasks.trajectory import Trajectory
+
+                self._task = Trajectory.braking(self._plan, *self._motion())
+                return
+            self._stopping = self._task is not None
         elif kind == "start":
             if self._task is None and self._make is not None:
                 self._task = self._make()
         elif kind in self._steps and value is not None:
             self._asked[kind] = value
+
+    def _follow(self, measurement: Measurement, **way: Any) -> None:
+        """Leave what the arm does for a trajectory, at the speed that it has; the bridge has checked the way."""
+        from canprobe.tasks.trajectory import Trajectory
+
+        assert self._plan is not None and measurement.q is not None
+        trajectory = Trajectory(self._plan, **way)
+        trajectory.lead(*(self._motion() if len(self._targets) == 2 else (measurement.q, None)))
+        self._task, self._stopping = trajectory, False
+
+    def _motion(self) -> tuple[Vector, Vector]:
+        """Where the last two targets lead in this cycle: position and speed (n,)."""
+        before, last = self._targets
+        return 2.0 * last - before, (last - before) / self._period_s
 
     def _approach(self, task: TouchTask) -> dict[str, float]:
         """Move the task's targets towards what was asked for; what they are now, once anything was asked for."""

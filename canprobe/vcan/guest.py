@@ -3,10 +3,12 @@
 The guest has the machine's file system as its root (hostfs), so the same programs, interpreters and folders, and a
 vcan0 and a vcan1 of its own. The command's output goes to two files that are followed from outside; signals go in as
 lines on the guest's console; the exit status comes out through a file, because the kernel's own status is always 0.
+A shell for the user has a second console on the user's own terminal; what it is given from a pipe goes in as a file.
 
     JOB/            a folder under the temporary folder, removed afterwards
       init          the guest's first process: mounts, modules, vcan0, vcan1, then the command
       command       working folder, environment and arguments of the command
+      stdin         of a shell, where it is no terminal
       xstate.so     from `xstate.c`, on processors that need it
       pid status    written by the guest: the command runs, the command has ended
       stdout stderr console
@@ -22,6 +24,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import termios
 import time
 import uuid
 from collections.abc import Mapping, Sequence
@@ -59,13 +62,14 @@ mount -t tmpfs -o mode=1777 tmpfs /dev/shm
 mount -t devpts devpts /dev/pts
 [ -e /dev/fd ] || ln -s /proc/self/fd /dev/fd
 {realtime}
+{terminal}
 {python} -I -S {setup} {modules} || end
 mknod /run/canprobe.console c 5 1
 (
     while read -r name; do kill -s "$name" -- "-$(cat "$job/pid")"; done < /run/canprobe.console
     end
 ) 2> /dev/null &
-setsid sh "$job/command" < /dev/null {redirection}
+setsid {session}sh "$job/command" {redirection}
 echo $? > "$job/status"
 end
 """
@@ -116,13 +120,18 @@ class GuestJob:
         command: program and arguments.
         environment: the command's whole environment.
         realtime: pin the guest to the last processor under SCHED_FIFO, and keep that one from idling.
+        shell: the command is a shell for the user; it has our standard input, and our terminal if that is one.
 
     Raises:
         GuestError: the guest cannot be started from here.
     """
 
-    def __init__(self, command: Sequence[str], environment: Mapping[str, str], realtime: bool = False) -> None:
+    def __init__(
+        self, command: Sequence[str], environment: Mapping[str, str], realtime: bool = False, shell: bool = False
+    ) -> None:
         self._job = _job_folder()
+        self._terminal = termios.tcgetattr(0) if shell and os.isatty(0) and os.isatty(1) else None
+        self._has_stdin = shell and self._terminal is None
         self._spinner: subprocess.Popen[bytes] | None = None
         self._streams: list[tuple[int, int]] = []
         try:
@@ -192,6 +201,8 @@ class GuestJob:
         if self._process.stdin is not None:
             with contextlib.suppress(BrokenPipeError):
                 self._process.stdin.close()
+        if self._terminal is not None:
+            termios.tcsetattr(0, termios.TCSADRAIN, self._terminal)  # the guest has it raw
         if self._spinner is not None:
             self._spinner.kill()
             self._spinner.wait()
@@ -204,7 +215,11 @@ class GuestJob:
 
     def _write_scripts(self, command: Sequence[str], environment: Mapping[str, str], realtime: bool) -> None:
         job = shlex.quote(str(self._job))
-        merged = _same_file(1, 2)
+        stdin, output = "/dev/null", '>> "$job/stdout" ' + ("2>&1" if _same_file(1, 2) else '2>> "$job/stderr"')
+        if self._has_stdin:
+            stdin = '"$job/stdin"'
+            with (self._job / "stdin").open("wb") as file:
+                shutil.copyfileobj(sys.stdin.buffer, file)
         script = _INIT.format(
             path=_PATH,
             job=job,
@@ -212,7 +227,9 @@ class GuestJob:
             python=shlex.quote(os.path.realpath(sys.executable)),
             setup=shlex.quote(str(Path(__file__).with_name("guest_setup.py"))),
             realtime="echo -1 > /proc/sys/kernel/sched_rt_runtime_us" if realtime else "",
-            redirection='>> "$job/stdout" ' + ("2>&1" if merged else '2>> "$job/stderr"'),
+            terminal="" if self._terminal is None else _second_console(),
+            session="" if self._terminal is None else "--ctty ",
+            redirection=f"< {stdin} {output}" if self._terminal is None else "<> /run/canprobe.tty >&0 2>&1",
         )
         init = self._job / "init"
         init.write_text(script)
@@ -253,6 +270,9 @@ class GuestJob:
             *(f"mem={memory >> 20}M", f"umid=canprobe-{uuid.uuid4().hex[:12]}", f"uml_dir={self._job}/"),
             *("con=null", "con0=fd:0,fd:1", "ssl=null", "panic=-1"),
         ]
+        ours = () if self._terminal is None else (os.dup(0), os.dup(1))
+        if ours:
+            arguments.append("con1=fd:{},fd:{}".format(*ours))
         with (self._job / "console").open("wb") as console:
             guest = subprocess.Popen(
                 [*prefix, PROGRAM, *arguments],
@@ -261,7 +281,10 @@ class GuestJob:
                 stderr=console,
                 env=environment,
                 start_new_session=True,
+                pass_fds=ours,
             )
+        for descriptor in ours:
+            os.close(descriptor)
         _favour_session(guest.pid)
         return guest
 
@@ -276,6 +299,13 @@ class GuestJob:
             os.close(source)
         self._streams = []
         shutil.rmtree(self._job, ignore_errors=True)
+
+
+def _second_console() -> str:
+    """What makes the guest's second console, as large as our terminal."""
+    size = os.get_terminal_size(1)
+    node = "/run/canprobe.tty"
+    return f"mknod {node} c 4 1\nstty -F {node} sane rows {size.lines} cols {size.columns}"
 
 
 def _compile_xstate(folder: Path) -> str:

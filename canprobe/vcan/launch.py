@@ -8,13 +8,14 @@ way taken in the environment: CANPROBE_VCAN is `here`, `namespace`, `link` or `g
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -32,14 +33,19 @@ _FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 
 
 @contextlib.contextmanager
-def caught_signals() -> Iterator[list[int]]:
-    """Yield a list to which SIGINT, SIGTERM, SIGHUP and SIGQUIT are appended within the block; ignored ones stay so."""
+def caught_signals(*, keyboard: bool = True) -> Iterator[list[int]]:
+    """Yield a list to which SIGINT, SIGTERM, SIGHUP and SIGQUIT are appended within the block; ignored ones stay so.
+
+    Args:
+        keyboard: False drops SIGINT and SIGQUIT, which the terminal sends to a shell in this group as well.
+    """
     signals: list[int] = []
     before = {number: signal.getsignal(number) for number in _FORWARDED}
     try:
         for number, handler in before.items():
             if handler != signal.SIG_IGN:
-                signal.signal(number, lambda n, _: signals.append(n))
+                kept = keyboard or number not in (signal.SIGINT, signal.SIGQUIT)
+                signal.signal(number, (lambda n, _: signals.append(n)) if kept else lambda *_: None)
         yield signals
     finally:
         for number, handler in before.items():
@@ -101,14 +107,20 @@ class LocalJob:
     """A command that runs on this machine in a session of its own, without standard input.
 
     It is started by a shell, which says so and ends with 127 or 126 if there is no such program.
+
+    Args:
+        command: program and arguments.
+        environment: the command's whole environment.
+        shell: it is one for the user, with this process's standard input and terminal.
     """
 
-    def __init__(self, command: Sequence[str], environment: Mapping[str, str]) -> None:
+    def __init__(self, command: Sequence[str], environment: Mapping[str, str], shell: bool = False) -> None:
+        self._send = os.kill if shell else os.killpg
         self._process = subprocess.Popen(
             ["/bin/sh", "-c", 'exec "$@"', "sh", *command],
-            stdin=subprocess.DEVNULL,
+            stdin=None if shell else subprocess.DEVNULL,
             env=dict(environment),
-            start_new_session=True,
+            start_new_session=not shell,
         )
 
     def poll(self) -> int | None:
@@ -117,12 +129,12 @@ class LocalJob:
         return 128 - status if status is not None and status < 0 else status
 
     def send_signal(self, number: int) -> None:
-        """Send a signal to its process group."""
+        """Send a signal to its process group, or to the shell."""
         with contextlib.suppress(ProcessLookupError):
-            os.killpg(self._process.pid, number)
+            self._send(self._process.pid, number)
 
     def kill(self) -> None:
-        """Kill its process group."""
+        """Kill its process group, or the shell."""
         self.send_signal(signal.SIGKILL)
         self._process.wait()
 
@@ -147,7 +159,7 @@ def run_with_vcan(
     """Run `command` on a machine that has a vcan0, with the same working folder and environment, without stdin.
 
     Args:
-        command: program and arguments.
+        command: program and arguments; none for the user's shell, which has standard input.
         timeout_s: how long the command may run; booting a guest does not count.
         install: install the guest's Debian package if a guest is needed.
         realtime: steady the guest's timing; see `GuestJob`.
@@ -156,31 +168,37 @@ def run_with_vcan(
         The command's exit status (128 + n after signal n); 124 after the time-out; 125 if no vcan can be had; 123 if
         the guest died under the command. Messages go to stderr.
     """
-    with caught_signals() as signals:
+    shell = not command
+    if shell:
+        command = [os.environ.get("SHELL") or "/bin/sh"]
+    with caught_signals(keyboard=not (shell and has_socketcan())) as signals:
         if has_socketcan():
             with _local_way() as way:
                 if way is not None:
-                    return _run_here([*way[1], *command], way[0], signals, timeout_s)
-        return _run_in_guest(command, signals, timeout_s, install, realtime)
+                    job = LocalJob([*way[1], *command], {**os.environ, WAY: way[0]}, shell)
+                    status, timed_out = supervise(job, signals, timeout_s)
+                    _report_time_out(timed_out, timeout_s)
+                    return status
+        if (status := _check_guest(install)) != 0:
+            return status
+        boot = functools.partial(GuestJob, command, {**os.environ, WAY: "guest"}, realtime, shell)
+        return _run_in_guest(boot, signals, timeout_s)
 
 
-def _run_here(command: Sequence[str], way: str, signals: list[int], timeout_s: float | None) -> int:
-    status, timed_out = supervise(LocalJob(command, {**os.environ, WAY: way}), signals, timeout_s)
-    _report_time_out(timed_out, timeout_s)
-    return status
-
-
-def _run_in_guest(
-    command: Sequence[str], signals: list[int], timeout_s: float | None, install: bool, realtime: bool
-) -> int:
+def _check_guest(install: bool) -> int:
+    """0 where a guest can be started; else 125, with the line to type."""
     if missing := missing_packages():
         line = f"{'' if os.geteuid() == 0 else 'sudo '}apt-get install -y {' '.join(missing)}"
         if not install:
             return _no_vcan(f"this kernel has no vcan, and what the guest that would needs is missing; type:  {line}")
         if not _install(line):
             return _no_vcan(f"this failed:  {line}")
+    return 0
+
+
+def _run_in_guest(boot: Callable[[], GuestJob], signals: list[int], timeout_s: float | None) -> int:
     try:
-        with GuestJob(command, {**os.environ, WAY: "guest"}, realtime) as job:
+        with boot() as job:
             return _supervise_guest(job, signals, timeout_s)
     except GuestError as error:
         if not error.started:

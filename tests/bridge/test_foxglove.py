@@ -90,7 +90,13 @@ def test_a_plain_client_negotiates_lists_and_receives(recorded, bridge):
         assert {(c["topic"], c["schemaName"], c["encoding"], c["schemaEncoding"]) for c in channels.values()} == {
             (topic.name, topic.type_name, "cdr", "ros2msg") for topic in TOPICS
         }
-        asked = {"/joint_states": 7, "/surface_patch": 8, "/tf_static": 9, "/taxels/image": 10}
+        asked = {
+            "/joint_states": 7,
+            "/surface_patch": 8,
+            "/tf_static": 9,
+            "/taxels/image": 10,
+            "/robot_description": 11,
+        }
         subscriptions = [{"id": i, "channelId": channels[topic]["id"]} for topic, i in asked.items()]
         client.send(json.dumps({"op": "subscribe", "subscriptions": subscriptions}))
         got = messages(client, fed(recorded, one), set(asked.values()))
@@ -99,7 +105,8 @@ def test_a_plain_client_negotiates_lists_and_receives(recorded, bridge):
     q = recorded.log("q_rad")
     position = decode(channels["/joint_states"], payload).position
     assert np.abs(q[np.isfinite(q).all(axis=1)] - position).max(axis=1).min() == 0.0  # a logged row, bit by bit
-    assert [t.child_frame_id for t in decode(channels["/tf_static"], got[9][1]).transforms] == ["flange", "probe"]
+    assert [t.child_frame_id for t in decode(channels["/tf_static"], got[9][1]).transforms[:2]] == ["flange", "probe"]
+    assert decode(channels["/robot_description"], got[11][1]).data.startswith('<robot name="cylinder">')
     status = one.end("{}")
     assert status["error"] is None
 

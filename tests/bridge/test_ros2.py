@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+from collections import deque
 
 import numpy as np
 import pytest
@@ -11,12 +12,39 @@ from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 from cyclonedds.core import Policy
 
 import canprobe
-from canprobe.bridge.messages import JOINT_STATES, TAXELS, TF_STATIC, TOPICS, Encoder, Messages, encode_can_frame
+from canprobe.bridge.description import robot_description
+from canprobe.bridge.messages import (
+    CLOCK,
+    JOINT_STATES,
+    ROBOT_DESCRIPTION,
+    TAXELS,
+    TF_STATIC,
+    TOPICS,
+    Encoder,
+    Messages,
+    encode_can_frame,
+)
 from canprobe.bridge.process import BridgeProcess, pack_observation, unpack_observation
-from canprobe.bridge.ros2_dds import EMPTY, FLOAT64, FORCE, SPEED, STATUS, STOP, DdsTypes, Ros2Node, dds_name, refuse
+from canprobe.bridge.ros2_dds import (
+    EMPTY,
+    FLOAT64,
+    FORCE,
+    SPEED,
+    STATUS,
+    STOP,
+    TRAJECTORY,
+    DdsTypes,
+    Ros2Node,
+    dds_name,
+    domain_of,
+    refuse,
+    trajectory_of,
+)
 from canprobe.bridge.worker import SampleSource
+from canprobe.errors import UsageError
 from canprobe.protocol.frames import EFF_FLAG, RTR_FLAG
 from canprobe.scene.load import dump_scene, parse_scene
+from canprobe.tasks.from_plan import RequestedTask
 
 DOMAIN = 90 + os.getpid() % 100  # of this test alone; 232 is the highest
 
@@ -43,7 +71,7 @@ def messages(recorded, encoder):
 @pytest.fixture
 def plan(recorded):
     text = dump_scene(recorded.result.plan.scene)
-    text = text.replace("ros2_domain = 0", f"ros2_domain = {DOMAIN}").replace("commands = false", "commands = true")
+    text = text.replace("ros2_commands = false", f"ros2_domain = {DOMAIN}\nros2_commands = true")
     return canprobe.plan(parse_scene(text))
 
 
@@ -111,7 +139,7 @@ def test_another_process_sees_ros_topics_and_commands_the_cell_within_its_limits
         logged = recorded.log("q_rad")
         assert np.abs(logged[np.isfinite(logged).all(axis=1)] - np.array(first.position)).max(axis=1).min() == 0.0
         fixed = until(lambda: next(iter(static.take(N=1)), None), feed, bridge)  # sent before we were there
-        assert [t.child_frame_id for t in fixed.transforms] == ["flange", "probe"]
+        assert [t.child_frame_id for t in fixed.transforms[:2]] == ["flange", "probe"]
         image = until(lambda: next(iter(taxels.take(N=1)), None), feed, bridge)
         assert len(image.data) == 256
 
@@ -177,3 +205,91 @@ def test_a_speed_that_the_joints_cannot_follow_is_refused_with_the_joint(recorde
     text = dump_scene(recorded.result.plan.scene).replace("joint_speed_share = 1.0", "joint_speed_share = 0.5")
     refused = refuse(canprobe.plan(parse_scene(text)), "speed_m_s", 0.19)
     assert refused is not None and "joint" in refused
+
+
+# A free arm: what RViz needs to show it, and trajectories as ros2_control's controller takes them.
+
+
+@pytest.fixture(scope="module")
+def free():
+    """The scene `free` that takes commands, and what a bridge sees of half a second of it."""
+    text = dump_scene(canprobe.load_scene("free")) + f"[bridge]\nros2_domain = {DOMAIN}\nros2_commands = true\n"
+    scene, seen = parse_scene(text), []
+    canprobe.run(scene, files=False, duration_s=0.3, observers=(seen.append,))
+    return scene, seen
+
+
+def asked_for(node, names, points):
+    """A JointTrajectory as rclpy would make it, encoded by Cyclone: points are (seconds, positions, velocities)."""
+    of = node.types.of
+    duration, stamp = of("builtin_interfaces/msg/Duration"), of("builtin_interfaces/msg/Time")
+    return of(TRAJECTORY.type_name)(
+        header=of("std_msgs/msg/Header")(stamp=stamp(sec=0, nanosec=0), frame_id=""),
+        joint_names=list(names),
+        points=[
+            of("trajectory_msgs/msg/JointTrajectoryPoint")(
+                positions=list(q),
+                velocities=list(qd),
+                accelerations=[],
+                effort=[],
+                time_from_start=duration(sec=int(t), nanosec=round(t % 1 * 1e9)),
+            )
+            for t, q, qd in points
+        ],
+    )
+
+
+def test_a_free_arm_is_described_and_follows_a_trajectory_within_its_limits(free):
+    scene, feed = free
+    plan = canprobe.plan(scene)
+    bridge = BridgeProcess("ros2", plan, None, virtual=True)
+    try:
+        bridge.await_ready()
+        node = Ros2Node(DOMAIN, True, Encoder())
+        description, clock, status = (node.reader(topic) for topic in (ROBOT_DESCRIPTION, CLOCK, STATUS))
+        said = until(lambda: next(iter(description.take(N=1)), None), feed, bridge)  # sent before we were there
+        assert said.data == robot_description(plan)
+        now = until(lambda: next(iter(clock.take(N=1)), None), feed, bridge).clock
+        assert now.sec * 10**9 + now.nanosec in {o.t_ns for o in feed}
+
+        names, q0 = plan.setup.arm.model.chain.joints, plan.setup.arm.q_start
+        writer = node.writer(TRAJECTORY)
+        until(lambda: True if writer.get_matched_subscriptions() else None, feed, bridge)
+
+        def answer_to(message):
+            writer.write(message)
+            return until(lambda: next(iter(status.take(N=1)), None), feed, bridge).data
+
+        goal, still = q0 + 0.1, [()] * 2
+        turned = [(t, q[::-1], qd) for t, q, qd in zip((1.0, 2.0), (q0 + 0.05, goal), still, strict=True)]
+        assert answer_to(asked_for(node, names[::-1], turned)) == "trajectory of 2 points: taken"  # in any order
+        assert "refused: point 1: joint 1 at" in answer_to(asked_for(node, names, [(1.0, q0 + 9.0, ())]))
+        assert "limit" in answer_to(asked_for(node, names, [(0.01, goal, ())]))
+        assert "expected the joints" in answer_to(asked_for(node, names[:3], [(1.0, goal[:3], ())]))
+        assert "expected 6 numbers" in answer_to(asked_for(node, names, [(1.0, goal[:3], ())]))
+        assert "velocities" in answer_to(asked_for(node, names, [(1.0, goal, ()), (2.0, goal, np.zeros(6))]))
+        assert answer_to(asked_for(node, names, [])) == "stop: taken"
+        until(lambda: True if len(bridge.requests) >= 2 else None, feed, bridge)
+        followed, stopped = bridge.requests
+        assert stopped == {"kind": "stop", "value": None}
+        assert bridge.end("{}")["error"] is None
+    finally:
+        bridge.kill()
+    with canprobe.open_cell(scene, interface="direct") as cell:
+        result = cell.run(RequestedTask(None, None, (deque([followed]),), 2.5e-3, cell.plan))
+    np.testing.assert_allclose(result.log["q_rad"][-1], goal, atol=1e-3)
+
+
+def test_a_press_follows_no_trajectory(press_plan):
+    with pytest.raises(UsageError, match=r'task\.kind = "press"'):
+        trajectory_of(press_plan, None, None)
+
+
+def test_the_domain_is_that_of_the_environment_unless_the_scene_has_one(monkeypatch):
+    monkeypatch.setenv("ROS_DOMAIN_ID", "42")
+    assert (domain_of(None), domain_of(7)) == (42, 7)
+    monkeypatch.delenv("ROS_DOMAIN_ID")
+    assert domain_of(None) == 0
+    monkeypatch.setenv("ROS_DOMAIN_ID", "many")
+    with pytest.raises(UsageError, match="ROS_DOMAIN_ID=many: expected 0 to 232"):
+        domain_of(None)

@@ -21,7 +21,6 @@ from canprobe.cli.parser import channel, node_ids
 from canprobe.eds.packaged import eds_path
 from canprobe.errors import InterfaceError, NodeError, PlanError, SafetyStop, SceneError, UsageError
 from canprobe.scene.load import load_scene, packaged_scenes
-from canprobe.session.progress import progress_bar
 
 SUMMARY = {"scene": "free", "completed": True, "shape": {"method": None}}
 
@@ -239,7 +238,7 @@ def test_run_passes_everything_on(calls, tmp_path, capsys):
     assert bus_of(scene) == ("socketcan", "vcan3", 500_000)
     given = {key: kwargs[key] for key in ("seed", "duration_s", "out")}
     assert given == {"seed": 7, "duration_s": 2.5, "out": tmp_path / "out"}
-    assert capsys.readouterr().out == "all went well\n"
+    assert capsys.readouterr().out == f"all went well\nnext: canprobe view {tmp_path / 'out'}\n"
 
 
 @pytest.mark.parametrize("command", ["run", "up"])
@@ -359,8 +358,9 @@ def test_scan_prints_a_table_or_json(calls, capsys):
 
 def test_scenes(capsys):
     assert main(["scenes"]) == 0
-    *lines, last = capsys.readouterr().out.splitlines()
+    *lines, figures, last = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == [n for n, _ in packaged_scenes()]
+    assert figures.startswith("figures: ")
     folder = Path(last.removeprefix("in ").partition(";")[0])
     assert main(["scenes", "--json"]) == 0
     scenes = json.loads(capsys.readouterr().out)
@@ -412,33 +412,6 @@ def test_sigterm_is_left_alone_outside_the_main_thread():
     thread.start()
     thread.join()
     assert signal.getsignal(signal.SIGTERM) is not None
-
-
-class Terminal:
-    """A stream that remembers what is written to it."""
-
-    def __init__(self, tty):
-        self.tty, self.text = tty, ""
-
-    def isatty(self):
-        return self.tty
-
-    def write(self, text):
-        self.text += text
-
-    def flush(self):
-        pass
-
-
-def test_progress_bar_draws_on_terminals_only():
-    assert progress_bar(Terminal(False)) is None
-    terminal = Terminal(True)
-    show = progress_bar(terminal, width=4)
-    for done in (0, 0.01, 5, 10):
-        show(done, 10)
-    assert terminal.text.count("\r") == 3, "drawn again only when the picture changes"
-    assert "██░░  50 %" in terminal.text
-    assert terminal.text.endswith("\n")
 
 
 def run_python(*argv, **kwargs):

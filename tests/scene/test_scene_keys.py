@@ -28,6 +28,8 @@ def test_every_key_has_a_meaning(section):
 def test_the_page_is_what_the_script_prints():
     page = (DOCS / "scene-keys.md").read_text(encoding="utf-8")
     assert page == generate.scene_keys(), "type: python docs/generate.py"
+    scenes = (DOCS / "scenes.md").read_text(encoding="utf-8")
+    assert scenes == generate.with_expected(scenes), "type: python docs/generate.py"
 
 
 def test_a_key_has_its_value_unit_default_condition_and_meaning():

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import pty
 import signal
 import subprocess
 import sys
+import termios
 from pathlib import Path
 
 import pytest
@@ -56,6 +58,50 @@ def test_streams_are_byte_exact_and_surroundings_are_the_same(tmp_path: Path) ->
     assert (folder / "where").read_text() == f"{folder}\n"
     assert (folder / "odd").read_bytes() == os.fsencode(odd)
     assert (folder / "words").read_text() == "".join(f"{word}|" for word in words)
+
+
+@needs_vcan
+def test_without_a_command_a_shell_takes_the_lines_of_standard_input(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [*CANPROBE, "vcan"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "SHELL": "/bin/sh"},
+        input=b"pwd; cat /sys/class/net/vcan0/type; tty; exit 5\n",
+        capture_output=True,
+        check=False,
+    )
+    assert (done.returncode, done.stdout.decode(), done.stderr) == (5, f"{tmp_path}\n280\nnot a tty\n", b"")
+
+
+@needs_vcan
+def test_the_shell_has_the_terminal(tmp_path: Path) -> None:
+    """Echo, job control and Ctrl-C are those of a terminal; ours is as before afterwards."""
+    ours, theirs = pty.openpty()
+    subprocess.run(["stty", "rows", "20", "cols", "77"], stdin=theirs, check=True)
+    before = termios.tcgetattr(theirs)
+    process = subprocess.Popen(
+        [*CANPROBE, "vcan"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "SHELL": "/bin/sh", "PS1": "ready> "},
+        stdin=theirs,
+        stdout=theirs,
+        stderr=theirs,
+        start_new_session=True,
+    )
+    for answer, typed in (
+        (b"ready> ", b"stty size; cat\n"),
+        (b"20 77", b"over\n"),
+        (b"over\r\nover\r\n", b"\x03"),
+        (b"ready> ", b"exit 6\n"),
+    ):
+        shown = b""
+        while answer not in shown:
+            shown += os.read(ours, 1000)
+        os.write(ours, typed)
+    assert process.wait() == 6
+    assert termios.tcgetattr(theirs) == before
+    os.close(theirs)
+    os.close(ours)
 
 
 @needs_vcan

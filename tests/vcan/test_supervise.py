@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -96,8 +98,23 @@ def test_the_command_line_time_out_and_wrong_use(capfd: pytest.CaptureFixture[st
     assert main(["vcan", "--timeout", "0.05", "--", "sleep", "1000"]) == 124
     assert "canprobe: vcan: the command was stopped after 0.05 s" in capfd.readouterr().err
     assert main(["vcan", "--timeout", "-1", "--", "true"]) == 2
-    assert main(["vcan", "--"]) == 2
-    assert "COMMAND is missing" in capfd.readouterr().err
+
+
+def test_without_a_command_a_shell_takes_the_lines_of_standard_input() -> None:
+    """In a process of its own, whose standard input is a pipe; the keyboard's signals are the shell's."""
+    script = """if True:
+        import contextlib, sys
+        from canprobe.cli import main
+        from canprobe.vcan import launch
+        launch.has_socketcan = lambda: True
+        launch._local_way = lambda: contextlib.nullcontext(("here", []))
+        sys.exit(main(["vcan"]))"""
+    lines = "for n in 1 2 3; do kill -INT $PPID; done; echo $CANPROBE_VCAN; exit 5\n"
+    environment = {**os.environ, "SHELL": "/bin/sh"}
+    done = subprocess.run(
+        [sys.executable, "-c", script], input=lines, capture_output=True, text=True, env=environment, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (5, "here\n", "")
 
 
 @pytest.fixture

@@ -1,0 +1,161 @@
+"""The arm of a cell as a URDF whose links are the frames of the bridges: what RViz and Foxglove draw of it.
+
+`link_i` is the frame behind joint i, as `/tf` has it. The solids of an arm from a URDF hang on `axis_i`, the frame that
+the joint turns; `/tf_static` has it behind `link_i`. Any other arm is a drum along every axis and bars between them.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree as Xml
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.bridge.sample import BASE, FLANGE, PROBE
+from canprobe.errors import PlanError
+from canprobe.planning.model import Plan
+from canprobe.robot.chain import Chain
+from canprobe.robot.urdf import Visual, find_mesh, visuals_of
+from canprobe.scene.geometry import transform
+from canprobe.scene.setup import Probe
+from canprobe.touch.linear_algebra import homogeneous, tangent_rotation
+
+Array = NDArray[np.float64]
+WHITE, DARK = (236, 233, 224), (76, 84, 94)
+THICK = 0.045
+"""Radius of the first drum, m; they get thinner towards the flange."""
+
+
+def axis_frame(number: int) -> str:
+    """Name of the frame that joint `number`, from 1, turns about its z axis or slides along it."""
+    return f"axis_{number}"
+
+
+def axis_transforms(chain: Chain) -> list[tuple[str, str, Array]]:
+    """(parent, child, (4, 4) T_parent_child) of the joints' own frames, each behind its link, m."""
+    behind = (*chain.fixed[1:], chain.T_last_flange)
+    return [(f"link_{i}", axis_frame(i), np.linalg.inv(T)) for i, T in enumerate(behind, start=1)]
+
+
+def robot_description(plan: Plan) -> str | None:
+    """The URDF of a plan's arm, with its probe; None of a cell without an arm.
+
+    Joints have the names of the scene, their ranges and speeds. Meshes are named by absolute `file://` addresses; those
+    that are not found are left out.
+    """
+    arm = plan.setup.arm
+    if arm is None:
+        return None
+    model, chain = arm.model, arm.model.chain
+    robot = Xml.Element("robot", name=plan.scene.name)
+    base = Xml.SubElement(robot, "link", name=BASE)
+    frames = {0: base}
+    behind = (*chain.fixed[1:], chain.T_last_flange)
+    for i, (joint, T) in enumerate(zip(model.joints, behind, strict=True), start=1):
+        frames[i] = Xml.SubElement(robot, "link", name=axis_frame(i))
+        kind = "prismatic" if joint.prismatic else "revolute"
+        moving = _joint(robot, chain.joints[i - 1], kind, _link(i - 1), axis_frame(i))
+        _origin(moving, chain.fixed[0] if i == 1 else np.eye(4))
+        Xml.SubElement(moving, "axis", xyz="0 0 1")
+        Xml.SubElement(
+            moving,
+            "limit",
+            lower=f"{joint.q_min:.12g}",
+            upper=f"{joint.q_max:.12g}",
+            velocity=f"{joint.qd_max:.12g}",
+            effort=f"{joint.rated_torque or 0.0:.12g}",
+        )
+        Xml.SubElement(robot, "link", name=_link(i))
+        _origin(_joint(robot, f"{axis_frame(i)}_to_{_link(i)}", "fixed", axis_frame(i), _link(i)), T)
+    _fix(robot, FLANGE, _link(chain.n), np.eye(4))
+    if plan.scene.probe is not None:
+        _probe(robot, plan.setup.probe)
+    if not _shown_by_urdf(plan, frames, chain):
+        _plain(frames, chain)
+    return Xml.tostring(robot, encoding="unicode")
+
+
+def _link(i: int) -> str:
+    return BASE if i == 0 else f"link_{i}"
+
+
+def _joint(robot: Xml.Element, name: str, kind: str, parent: str, child: str) -> Xml.Element:
+    joint = Xml.SubElement(robot, "joint", name=name, type=kind)
+    Xml.SubElement(joint, "parent", link=parent)
+    Xml.SubElement(joint, "child", link=child)
+    return joint
+
+
+def _fix(robot: Xml.Element, name: str, parent: str, T: Array) -> Xml.Element:
+    """A link that stands still in another."""
+    link = Xml.SubElement(robot, "link", name=name)
+    _origin(_joint(robot, f"{name}_fixed", "fixed", parent, name), T)
+    return link
+
+
+def _probe(robot: Xml.Element, probe: Probe) -> None:
+    link = _fix(robot, PROBE, FLANGE, probe.T_flange_probe)
+    _visual(link, np.eye(4), DARK, "sphere", radius=f"{probe.radius:.12g}")
+
+
+def _shown_by_urdf(plan: Plan, frames: dict[int, Xml.Element], chain: Chain) -> bool:
+    """The solids of the arm's own URDF; False where it has none, or none that is found."""
+    arm = plan.scene.arm
+    if arm is None or arm.urdf is None:
+        return False
+    try:
+        visuals = visuals_of(Path(arm.urdf), arm.base, arm.tip)
+    except PlanError:
+        return False
+    mount, shown = transform(arm.mount_mm, arm.mount_deg), False
+    for visual in visuals:
+        attributes = _shape(Path(arm.urdf), visual)
+        if attributes is not None:
+            T = mount @ visual.T if visual.joint == 0 else visual.T
+            _visual(frames[visual.joint], T, visual.colour or WHITE, visual.kind, **attributes)
+            shown = True
+    return shown
+
+
+def _shape(urdf: Path, visual: Visual) -> dict[str, str] | None:
+    size = [f"{value:.12g}" for value in visual.size]
+    if visual.kind == "mesh":
+        path = find_mesh(urdf, visual.mesh)
+        return None if path is None else {"filename": path.as_uri(), "scale": " ".join(size)}
+    if visual.kind == "box":
+        return {"size": " ".join(size)}
+    if visual.kind == "cylinder":
+        return {"radius": size[0], "length": size[1]}
+    return {"radius": size[0]} if visual.kind == "sphere" else None
+
+
+def _plain(frames: dict[int, Xml.Element], chain: Chain) -> None:
+    """A drum along every axis, and a bar to the next one."""
+    for i, T in enumerate((*chain.fixed[1:], chain.T_last_flange), start=1):
+        radius, frame, way = THICK * (1.0 - 0.5 * (i - 1) / chain.n), frames[i], T[:3, 3]
+        _visual(frame, np.eye(4), DARK, "cylinder", radius=f"{radius:.4g}", length=f"{2.0 * radius:.4g}")
+        length = float(np.linalg.norm(way))
+        if length > radius:
+            bar = homogeneous(tangent_rotation(way / length), 0.5 * way)
+            _visual(frame, bar, WHITE, "cylinder", radius=f"{0.7 * radius:.4g}", length=f"{length:.4g}")
+
+
+def _visual(link: Xml.Element, T: Array, colour: tuple[int, int, int], kind: str, **attributes: str) -> None:
+    visual = Xml.SubElement(link, "visual")
+    _origin(visual, T)
+    Xml.SubElement(Xml.SubElement(visual, "geometry"), kind, attributes)
+    material = Xml.SubElement(visual, "material", name="_".join(f"{part:02x}" for part in colour))
+    Xml.SubElement(material, "color", rgba=" ".join(f"{part / 255:.3f}" for part in (*colour, 255)))
+
+
+def _origin(parent: Xml.Element, T: Array) -> None:
+    """Translation, and roll, pitch and yaw about fixed axes, as a URDF has them."""
+    R = T[:3, :3]
+    pitch = float(np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0])))
+    if abs(np.cos(pitch)) > 1e-9:
+        roll, yaw = float(np.arctan2(R[2, 1], R[2, 2])), float(np.arctan2(R[1, 0], R[0, 0]))
+    else:  # straight up or down: only their sum counts
+        roll, yaw = float(np.arctan2(-R[1, 2], R[1, 1])), 0.0
+    xyz, rpy = (" ".join(f"{value + 0.0:.12g}" for value in v) for v in (T[:3, 3], (roll, pitch, yaw)))
+    Xml.SubElement(parent, "origin", xyz=xyz, rpy=rpy)
