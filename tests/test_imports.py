@@ -63,6 +63,7 @@ EXTRAS = {
     "cli/completion.py": {"argcomplete"},
     "results/picture.py": {"matplotlib"},
     "robot/dynamics.py": {"mujoco"},
+    "scene/surface_files.py": {"trimesh"},
     "studies/many.py": {"pandas", "xarray"},
     "results/figures.py": {"matplotlib"},
     "results/surface_figure.py": {"matplotlib", "mpl_toolkits"},  # of the same distribution
