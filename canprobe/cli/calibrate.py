@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
     x, y, z = args.at
     request = Request(
         cell=args.cell,
-        target=target_of(args, load_scene("press", args.cell)),
+        target=target_of(args, load_scene("press", {"cell": args.cell})),
         at=(x, y, z),
         ball_radius=1e-3 * args.ball_radius,
         rod_radius=1e-3 * args.rod_radius,

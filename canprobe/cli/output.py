@@ -1,4 +1,4 @@
-"""What commands print: JSON documents, tables, a progress bar; and interrupts that leave a terminal in order."""
+"""What commands print: JSON documents and tables; and interrupts that leave a terminal in order."""
 
 from __future__ import annotations
 
@@ -6,14 +6,11 @@ import contextlib
 import json
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from typing import TextIO
+from collections.abc import Iterator, Sequence
 
 from canprobe.bus.scheduling import TERMINATIONS, Terminated, raise_terminated
 
-# What commands print: JSON documents, tables, a progress bar.
-
-Progress = Callable[[float, float], None]
+# What commands print: JSON documents, tables.
 
 
 def print_json(document: object) -> None:
@@ -39,37 +36,6 @@ def say_on_terminal(line: str) -> None:
     """Report one step, if stderr is a terminal."""
     if sys.stderr.isatty():
         say(line)
-
-
-def progress_bar(stream: TextIO | None = None, width: int = 40, unit: str = ".1f s") -> Progress | None:
-    """A progress bar on a terminal, None elsewhere.
-
-    Args:
-        stream: stderr by default.
-        width: of the bar, in characters.
-        unit: form of a number, and the unit's name.
-
-    Returns:
-        A function of (done, total), both in the same unit, that redraws only when the picture changes.
-    """
-    out = sys.stderr if stream is None else stream
-    if not out.isatty():
-        return None
-    form, name = unit.split()
-    shown = -1
-
-    def show(done: float, total: float) -> None:
-        nonlocal shown
-        share = min(max(done / total, 0.0), 1.0) if total > 0 else 1.0
-        if (percent := int(100 * share)) == shown:
-            return
-        shown = percent
-        bar = "█" * round(width * share)
-        out.write(f"\r{bar.ljust(width, '░')} {percent:3d} %  {done:{form}} of {total:{form}} {name}")
-        out.write("\n" if percent == 100 else "")
-        out.flush()
-
-    return show
 
 
 # SIGTERM and SIGHUP as interrupts: whatever stops a command, it leaves by the same safe way.

@@ -9,15 +9,17 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from canprobe.cli.output import print_json, progress_bar, say, say_on_terminal
+from canprobe.cli.output import print_json, say, say_on_terminal
 from canprobe.cli.parser import BUS, Parser, add_options, add_scene, scene_of
 from canprobe.errors import CanprobeError
+from canprobe.session.progress import progress_bar
 
 HELP = "run a scene and write the results"
 EXAMPLE = """\
 examples:
   canprobe run cylinder
   canprobe run cylinder --seed 3 --out runs/third --json
+  canprobe run cylinder --set task.force_n=3 --set object.radius_mm=50
   canprobe run cylinder --tool runs/calibrate/tool.toml
   canprobe run cylinder --bus socketcan --channel vcan0 --patient
 """

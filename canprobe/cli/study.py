@@ -10,8 +10,9 @@ import argparse
 from pathlib import Path
 
 from canprobe.bus.scheduling import interrupts_repeated
-from canprobe.cli.output import print_json, print_table, progress_bar, say
+from canprobe.cli.output import print_json, print_table, say
 from canprobe.cli.parser import Parser, add_options, did_you_mean, whole
+from canprobe.session.progress import progress_bar
 
 HELP = "measure accuracy, limits, faults and timing"
 EXAMPLE = """\

@@ -272,8 +272,6 @@ def find_log(log: Path) -> tuple[Path, Path | None]:
 
 def scene_of(path: Path, folder: Path | None, scene: Scene | str | Path | None) -> Scene:
     """The given scene, or the one beside the log; UsageError without either."""
-    if isinstance(scene, Scene):
-        return scene
     if scene is not None:
         return load_scene(scene)
     if folder is None:

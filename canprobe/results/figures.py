@@ -9,14 +9,15 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import SubFigure
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Patch
 
 from canprobe.cell.log import joint_positions
+from canprobe.errors import UsageError
 from canprobe.planning.model import Plan
 from canprobe.planning.report import Part, timeline
 from canprobe.planning.traffic import on_the_wire
-from canprobe.results.picture import AMBER, BLUE, GREY, INK, ORANGE, SHADE, SKY, box, legend, parts, picture
+from canprobe.results.picture import AMBER, BLUE, GREY, INK, ORANGE, SHADE, SKY, box, legend, parts, picture, sheet
 from canprobe.results.summary import RunResult
 from canprobe.results.surface_figure import Array, true_surface
 from canprobe.scene.geometry import true_object
@@ -37,10 +38,28 @@ def draw_run(result: RunResult, path: Path) -> None:
     if not rows:
         return
     with picture(path, _title(result), 0.6 + 2.9 * len(rows)) as figure:
-        for strip, row in zip(parts(figure, len(rows), 1), rows, strict=True):
-            places = parts(strip, 1, len(row), width_ratios=[width for _, width in row])
-            for part, (draw, _) in zip(places, row, strict=True):
-                draw(part, result)
+        _fill(figure, rows, result)
+
+
+def run_figure(result: RunResult) -> Figure:
+    """The same figure, not written.
+
+    Raises:
+        UsageError: the run has nothing to draw.
+    """
+    rows = _rows(result)
+    if not rows:
+        raise UsageError("plot: nothing was measured in this run that a panel shows")
+    with sheet(_title(result), 0.6 + 2.9 * len(rows)) as figure:
+        _fill(figure, rows, result)
+    return figure
+
+
+def _fill(figure: Figure, rows: list[list[tuple[Panel, float]]], result: RunResult) -> None:
+    for strip, row in zip(parts(figure, len(rows), 1), rows, strict=True):
+        places = parts(strip, 1, len(row), width_ratios=[width for _, width in row])
+        for part, (draw, _) in zip(places, row, strict=True):
+            draw(part, result)
 
 
 def _rows(result: RunResult) -> list[list[tuple[Panel, float]]]:

@@ -8,6 +8,7 @@ distinguishes them as well.
 
 from __future__ import annotations
 
+import io
 import math
 import textwrap
 from collections.abc import Iterator, Sequence
@@ -46,6 +47,25 @@ LEAST_DEPTH = 6.0
 """Least height of a box, mm: a plane's is not flat."""
 
 
+class Sheet(Figure):
+    """A figure that a notebook shows, also where `matplotlib.pyplot` was never imported."""
+
+    def _repr_png_(self) -> bytes:
+        drawn = io.BytesIO()
+        self.savefig(drawn, format="png")
+        return drawn.getvalue()
+
+
+@contextmanager
+def sheet(title: str, height_in: float) -> Iterator[Figure]:
+    """A sheet to be drawn on within the block; arguments as for `picture`."""
+    with rc_context(dict(_STYLE)):
+        figure = Sheet(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="constrained")
+        lines = [part for line in title.splitlines() for part in textwrap.wrap(line, 118)]
+        figure.suptitle("\n".join(lines), x=0.01, ha="left", parse_math=False)
+        yield figure
+
+
 @contextmanager
 def picture(path: Path | str, title: str, height_in: float) -> Iterator[Figure]:
     """A sheet that is written, whole, when the block is done.
@@ -59,10 +79,7 @@ def picture(path: Path | str, title: str, height_in: float) -> Iterator[Figure]:
         ValueError: matplotlib knows no such form.
     """
     path = Path(path)
-    with rc_context(dict(_STYLE)):
-        figure = Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="constrained")
-        lines = [part for line in title.splitlines() for part in textwrap.wrap(line, 118)]
-        figure.suptitle("\n".join(lines), x=0.01, ha="left", parse_math=False)
+    with sheet(title, height_in) as figure:
         yield figure
         with whole_file(path) as part:
             figure.savefig(part, format=path.suffix[1:] or "png")

@@ -32,7 +32,7 @@ from canprobe.results.scores import RUN_IN_M, curvature_tensor
 from canprobe.scene.load import load_scene
 from canprobe.scene.model import ObjectSettings, PlantSettings, Scene
 from canprobe.scene.resolve import LAYER_N_M3, resolve
-from canprobe.session.session import Session, resolve_scene
+from canprobe.session.session import Session
 from canprobe.studies.harness import CHI2_95_OF_3, FROBENIUS, Array, Column, Row, StudyResult, measuring_facts
 from canprobe.studies.sweep import Sweep
 from canprobe.tasks.from_plan import make_task
@@ -178,8 +178,7 @@ def measure(case: Case) -> Scan:
     if name == "random":
         scene = random_scene(seed, duration)
     else:
-        scene = resolve_scene(load_scene(name), seed=seed, duration_s=duration)
-        scene = replace(scene, shape=None if scene.shape is None else replace(scene.shape, also=()))
+        scene = load_scene(name, {"scene.seed": seed, "task.duration_s": duration, "shape.also": []})
     assert scene.object is not None and scene.sensor is not None
     words = scene.object.kind, scene.task.strategy, scene.sensor.full_scale_kpa
     try:

@@ -16,11 +16,12 @@ from canprobe import api
 from canprobe.bus.scheduling import Terminated
 from canprobe.cell.monitor import Monitor
 from canprobe.cli import COMMANDS, main
-from canprobe.cli.output import print_json, progress_bar, termination_interrupts
+from canprobe.cli.output import print_json, termination_interrupts
 from canprobe.cli.parser import channel, node_ids
 from canprobe.eds.packaged import eds_path
 from canprobe.errors import InterfaceError, NodeError, PlanError, SafetyStop, SceneError, UsageError
 from canprobe.scene.load import load_scene, packaged_scenes
+from canprobe.session.progress import progress_bar
 
 SUMMARY = {"scene": "free", "completed": True, "shape": {"method": None}}
 
@@ -254,6 +255,14 @@ def test_patience_is_what_is_asked_for_and_for_emulated_nodes_only(command, call
     path.write_text("[scene]\nname = 'real'\n[arm]\nemulated = false\n[task]\nkind = 'free'\n")
     assert main([command, str(path), "--bus", "socketcan", "--patient"]) == 2
     assert "--patient is for emulated nodes" in capsys.readouterr().err and not calls
+
+
+@pytest.mark.parametrize("command", ["run", "up"])
+def test_keys_are_set_as_a_file_has_them(command, calls):
+    words = ["--set", "task.swing_period_s=3", "--set", "scene.title=a = b", "--set", "cycle.realtime = true"]
+    assert main([command, "free", "--bus", "socketcan", *words]) == 0
+    ((_, (scene,), _),) = calls
+    assert (scene.task.swing_period_s, scene.title, scene.cycle.realtime) == (3.0, "a = b", True)
 
 
 def test_run_takes_the_scenes_bus_by_default(calls):

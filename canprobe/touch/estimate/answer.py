@@ -106,6 +106,37 @@ class SurfaceEstimate:
         if self.model_root is not None:
             self.model_root.flags.writeable = False
 
+    @classmethod
+    def of(cls, T_frame_contact: Array, K: Array, *, method: str = "own") -> SurfaceEstimate:
+        """An estimate of which only frame and curvature are known, from an estimator of your own.
+
+        Args:
+            T_frame_contact: (4, 4) contact frame to that of the points: its origin on the surface, z the inward normal.
+            K: (2, 2) shape operator along its x and y, 1/m; positive where the object is convex.
+            method: name of the estimator.
+        """
+        K = np.array(K, dtype=np.float64)
+        T, (kappa, local) = read_only(T_frame_contact), _principal(K)
+        return cls(
+            S=SurfaceMatrix.from_curvature(K).S.copy(),
+            T_frame_contact=T,
+            K=K,
+            kappa=kappa,
+            directions=local @ T[:3, :2].T,
+            covariance=np.full((3, 3), math.inf),
+            observed=np.array([True, True]),
+            rank=3,
+            combinations=np.eye(3),
+            information=np.zeros((3, 3)),
+            umbilic=False,
+            innovation=math.nan,
+            distance=math.nan,
+            samples=math.nan,
+            method=method,
+            prior="none",
+            problem_root=np.eye(3),
+        )
+
     @property
     def condition_number(self) -> float:
         """Of the whitened dimensionless least-squares problem; infinite where it is singular."""
