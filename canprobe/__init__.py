@@ -26,9 +26,12 @@ if TYPE_CHECKING:
         UsageError,
     )
     from canprobe.recorded.reestimate import ReplayResult, replay
+    from canprobe.results.contacts import Contacts
     from canprobe.results.files import load_surface_map, load_table
     from canprobe.results.summary import RunResult, measure_traffic
     from canprobe.scene.load import load_scene
+    from canprobe.studies.many import Runs, run_many
+    from canprobe.touch.contact import ContactSample
     from canprobe.touch.estimate.answer import SurfaceEstimate
     from canprobe.touch.estimate.fit import fit_surface
     from canprobe.touch.estimate.likelihood import cramer_rao
@@ -46,7 +49,10 @@ _MODULES = {
     ),
     "canprobe.recorded.reestimate": ("ReplayResult", "replay"),
     "canprobe.scene.load": ("load_scene",),
+    "canprobe.studies.many": ("Runs", "run_many"),
+    "canprobe.results.contacts": ("Contacts",),
     "canprobe.results.files": ("load_surface_map", "load_table"),
+    "canprobe.touch.contact": ("ContactSample",),
     "canprobe.touch.estimate.likelihood": ("cramer_rao",),
     "canprobe.touch.estimate.answer": ("SurfaceEstimate",),
     "canprobe.touch.estimate.fit": ("fit_surface",),
@@ -60,6 +66,8 @@ __all__ = [
     "BusError",
     "CanprobeError",
     "Command",
+    "ContactSample",
+    "Contacts",
     "Controller",
     "EdsError",
     "InterfaceError",
@@ -70,6 +78,7 @@ __all__ = [
     "ReplayResult",
     "ResultsError",
     "RunResult",
+    "Runs",
     "SafetyStop",
     "SceneError",
     "StudyError",
@@ -88,6 +97,7 @@ __all__ = [
     "plan",
     "replay",
     "run",
+    "run_many",
 ]
 
 

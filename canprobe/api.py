@@ -16,19 +16,23 @@ from canprobe.errors import CanprobeError, ResultsError, UsageError
 from canprobe.planning.make import make_plan
 from canprobe.planning.model import Plan
 from canprobe.results.summary import RunResult, log_columns, summarise, tactile_columns, write_files
+from canprobe.scene.load import load_scene
 from canprobe.scene.model import Scene
 from canprobe.scene.resolve import resolve
+from canprobe.scene.setup import Touch
 from canprobe.session.children import Bridges
 from canprobe.session.emulation import emulate, emulate_eds
 from canprobe.session.looking import commission, monitor, scan
-from canprobe.session.session import Say, Session, quiet, resolve_scene
+from canprobe.session.session import Say, Session, quiet, with_bridges
 from canprobe.session.target import VIRTUAL, Target
+from canprobe.session.terminal import Progress
 from canprobe.session.up import check_joints, home, up
 from canprobe.tasks.from_plan import make_task
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
-from canprobe.tasks.task import record_of
+from canprobe.tasks.task import TaskRecord, record_of
 
 if TYPE_CHECKING:
+    from canprobe.results.contacts import Contacts
     from canprobe.touch.consistency import Consistency
     from canprobe.touch.surface_map import SurfaceMap
 
@@ -50,14 +54,14 @@ __all__ = [
     "up",
 ]
 
-Progress = Callable[[float, float], None]
 AnyObserver = Observer | Callable[[Observation], None]
 
 
 def run(
-    scene: Scene,
+    scene: Scene | str | Path,
+    overrides: Mapping[str, Any] | None = None,
     *,
-    interface: str | None = None,
+    bus: str | None = None,
     channel: str | Mapping[str, str] | None = None,
     bitrate: int | None = None,
     out: Path | str | None = None,
@@ -73,8 +77,10 @@ def run(
     """Carry out a scene's task and write what was measured.
 
     Args:
-        scene: from `canprobe.load_scene`.
-        interface, bitrate: in the place of the scene's.
+        scene: a packaged name, the path of a TOML file, or what `canprobe.load_scene` returns.
+        overrides: values in the place of the scene's, such as ``{"task.force_n": 3}``; see `canprobe.load_scene`.
+        bus: ``lockstep``, ``direct`` (no bus), ``socketcan`` or another interface, in the place of the scene's.
+        bitrate: in the place of the scene's, bit/s.
         channel: in the place of the scene's; ``{"can0": "vcan0", "can1": "vcan1"}`` where it names several.
         out: folder for the files; ``runs/<scene>-<time>`` by default.
         seed, duration_s: in the place of the scene's.
@@ -91,8 +97,8 @@ def run(
         SafetyStop: the cell was stopped for safety. The drives are disabled and the files written.
         ResultsError: a file could not be written, for example on a full disk. The drives are disabled.
     """
-    target = Target.over(scene, interface, channel, bitrate)
-    resolved = resolve_scene(scene, target, seed=seed, duration_s=duration_s, bridge=bridge)
+    scene = load_scene(scene, _over(overrides, {"scene.seed": seed, "task.duration_s": duration_s}))
+    resolved = with_bridges(Target.over(scene, bus, channel, bitrate).applied_to(scene), bridge)
     folder = results_folder(resolved, out) if files else None
     check_free(folder, force=force)
     plan = make_plan(resolve(resolved))
@@ -101,19 +107,27 @@ def run(
         return cell.run(cell.open_to_requests(task), _report(progress, resolved.task.duration_s))
 
 
+def _over(overrides: Mapping[str, Any] | None, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Overrides, and over them what an argument gives."""
+    return {**(overrides or {}), **{key: value for key, value in given.items() if value is not None}}
+
+
 def results_folder(scene: Scene, out: Path | str | None = None) -> Path:
     """Where `run` puts the files: ``out``, or ``runs/<scene>-<time>`` to the millisecond."""
     return Path(out) if out is not None else Path("runs") / f"{scene.name}-{datetime.now():%Y%m%d-%H%M%S-%f}"[:-3]
 
 
-def plan(scene: Scene) -> Plan:
+def plan(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = None) -> Plan:
     """Everything that follows from a scene before anything is started; see `canprobe.planning.make.make_plan`.
 
+    Args:
+        scene, overrides: as for :func:`run`.
+
     Raises:
-        UsageError: this is no scene.
+        UsageError: there is no such scene, or it has mistakes.
         PlanError: with every reason why it does not fit, its numbers and the ways out.
     """
-    return make_plan(resolve(scene))
+    return make_plan(resolve(load_scene(scene, overrides)))
 
 
 def check_free(folder: Path | None, *, force: bool) -> None:
@@ -156,11 +170,17 @@ def _mapped(
 
 
 def _draw(result: RunResult, out: Path, say: Say) -> None:
-    drawn = [name for name in ("report.html", "report.png", "surface.png") if name in result.plan.outputs]
-    if not len(result.log["t_s"]) or not drawn:
-        return
-    say(f"draw {', '.join(drawn)}")
-    if "report.html" in result.plan.outputs:
+    """The pictures of a run of at least one cycle; the page of its scene comes last, it takes longest."""
+    outputs = result.plan.outputs if len(result.log["t_s"]) else ()
+    if pictures := [name for name in ("report.png", "surface.png") if name in outputs]:
+        say(f"draw {', '.join(pictures)}")
+        from canprobe.results.figures import draw_run
+        from canprobe.results.surface_figure import draw_surface
+
+        draw_run(result, out / "report.png")
+        draw_surface(result, out / "surface.png")
+    if "report.html" in outputs:
+        say("draw report.html")
         page, recorded = (importlib.import_module(f"canprobe.bridge.view.{name}") for name in ("browser", "recorded"))
         try:
             shown = recorded.read_run(out)
@@ -168,12 +188,6 @@ def _draw(result: RunResult, out: Path, say: Say) -> None:
             say(f"report.html is left out: {error}")
         else:
             page.write_page(shown, out / "report.html", say)
-    if "report.png" in result.plan.outputs:
-        from canprobe.results.figures import draw_run
-        from canprobe.results.surface_figure import draw_surface
-
-        draw_run(result, out / "report.png")
-        draw_surface(result, out / "surface.png")
 
 
 class OpenCell(Session):
@@ -288,6 +302,7 @@ class OpenCell(Session):
             surface_map,
             consistency,
             self.out,
+            self._contacts(record, start_s),
         )
         if isinstance(failure, CanprobeError):
             failure.summary = summary
@@ -308,6 +323,14 @@ class OpenCell(Session):
             if failure is not None and line != str(failure):
                 failure.add_note(line)
 
+    def _contacts(self, record: TaskRecord, start_s: float) -> Contacts | None:
+        task = self.plan.setup.task
+        if record.shape is None or not isinstance(task, Touch):
+            return None
+        from canprobe.results.contacts import contacts_of
+
+        return contacts_of(record.shape.samples, task, start_s)
+
 
 def _reason(failure: BaseException) -> str:
     """Why a run ended, in words."""
@@ -317,9 +340,10 @@ def _reason(failure: BaseException) -> str:
 
 
 def open_cell(
-    scene: Scene,
+    scene: Scene | str | Path,
+    overrides: Mapping[str, Any] | None = None,
     *,
-    interface: str | None = None,
+    bus: str | None = None,
     channel: str | Mapping[str, str] | None = None,
     bitrate: int | None = None,
     out: Path | str | None = None,
@@ -334,15 +358,14 @@ def open_cell(
 
     Example::
 
-        with canprobe.open_cell(canprobe.load_scene("free"), out="runs/mine") as cell:
+        with canprobe.open_cell("free", out="runs/mine") as cell:
             result = cell.run(my_controller)
         print(result.text())
 
     The block is the run: its result is complete, and its files are written, when it is left, however it is left.
 
     Args:
-        scene: from `canprobe.load_scene`.
-        interface, channel, bitrate, seed: in the place of the scene's, as for `run`.
+        scene, overrides, bus, channel, bitrate, seed: as for `run`.
         out: folder for the same files as those of :func:`run`; None writes nothing.
         say: called with each step.
         force, observers, bridge: as for `run`.
@@ -359,8 +382,8 @@ def open_cell(
     Leaving it raises:
         ResultsError: a file could not be written.
     """
-    target = Target.over(scene, interface, channel, bitrate)
-    resolved = resolve_scene(scene, target, seed=seed, bridge=bridge)
+    scene = load_scene(scene, _over(overrides, {"scene.seed": seed}))
+    resolved = with_bridges(Target.over(scene, bus, channel, bitrate).applied_to(scene), bridge)
     folder = Path(out) if out is not None else None
     check_free(folder, force=force)
     return OpenCell(make_plan(resolve(resolved)), folder, say, observers, rows_kept)

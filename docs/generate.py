@@ -1,4 +1,7 @@
-"""What the pages take from the code: keys of a scene, figures of the packaged ones. `python docs/generate.py`."""
+"""What the pages take from the code: keys of a scene, figures of the packaged ones; with `notebooks`, what these show.
+
+`python docs/generate.py [notebooks]`
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,8 @@ import ast
 import dataclasses
 import inspect
 import itertools
+import sys
+import tempfile
 import typing
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -159,7 +164,22 @@ def with_expected(page: str) -> str:
     return "".join([head, mark, "\n".join(["", *lines, "", source, "", ""]), rest[rest.index("<!-- /expected -->") :]])
 
 
+def execute_notebooks() -> None:
+    """Run the notebooks and store what they show; needs nbclient and ipykernel."""
+    import nbformat
+    from nbclient import NotebookClient
+
+    for path in sorted((DOCS / "notebooks").glob("*.ipynb")):
+        notebook = nbformat.read(path, as_version=4)
+        with tempfile.TemporaryDirectory() as folder:
+            NotebookClient(notebook, resources={"metadata": {"path": folder}}, record_timing=False).execute()
+        notebook.metadata.language_info = {"name": "python"}
+        nbformat.write(notebook, path)
+
+
 if __name__ == "__main__":
     scenes = DOCS / "scenes.md"
     scenes.write_text(with_expected(scenes.read_text(encoding="utf-8")), encoding="utf-8")
     (DOCS / "scene-keys.md").write_text(scene_keys(), encoding="utf-8")
+    if "notebooks" in sys.argv:
+        execute_notebooks()

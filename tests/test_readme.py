@@ -1,6 +1,5 @@
 """README, CONTRIBUTING and docs: Python blocks run as they stand, commands are understood, and the cheap ones run."""
 
-import dataclasses
 import re
 import shutil
 import tomllib
@@ -12,7 +11,6 @@ import pytest
 from command_lines import command_lines, parse
 from undrawn import undrawn_run
 
-import canprobe
 from canprobe.cli import COMMANDS, main
 from canprobe.eds.packaged import eds_path
 from canprobe.planning.bridges import BRIDGES
@@ -65,14 +63,13 @@ def folder(tmp_path_factory):
 
 @pytest.mark.parametrize("block", blocks("python"))
 def test_python_block_runs(block, tmp_path, monkeypatch, capsys):
-    def load_undrawn(name):
-        scene = load_scene(name)
-        return dataclasses.replace(scene, scene=dataclasses.replace(scene.scene, figures=False))
+    def load_undrawn(scene, overrides=None):
+        return load_scene(scene, {"scene.figures": False, **(overrides or {})})
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(canprobe, "load_scene", load_undrawn)
+    monkeypatch.setattr("canprobe.api.load_scene", load_undrawn)
     exec(compile(block, "page", "exec"), {"__name__": "page"})
-    if "fit_surface" in block:
+    if "estimate.kappa" in block:
         first = float(re.search(r"[\d.]+", capsys.readouterr().out)[0])
         assert first == pytest.approx(20.0, abs=0.01)
 

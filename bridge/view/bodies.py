@@ -12,12 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from canprobe.bridge.sample import SurfacePatch, link_transforms
+from canprobe.bridge.sample import link_transforms
 from canprobe.bridge.view.meshes import (
     MAGMA,
     Array,
     Colours,
-    Faces,
     Mesh,
     cylinder,
     dome,
@@ -29,6 +28,7 @@ from canprobe.bridge.view.meshes import (
 )
 from canprobe.robot.chain import Chain, dh_step
 from canprobe.touch.contact import pad_to_direction
+from canprobe.touch.heights import Heights
 from canprobe.touch.linear_algebra import tangent_rotation
 from canprobe.touch.objects import Cylinder, Sphere
 from canprobe.touch.pad import Pad
@@ -235,13 +235,15 @@ WHOLE_M = 0.12
 """Largest radius of a body that is shown whole."""
 STEPS = 40
 LINES = 15
+RELIEF = 161
+"""Points along each side of a grid of heights."""
 
 
 def object_mesh(shape: PlacedShape) -> Mesh:
     """The surface of an object near its origin, base frame.
 
     Balls, cylinders, bowls and rings of ordinary size are shown whole (a cylinder over `REACH_M` to each side),
-    everything else over a square of twice `REACH_M`.
+    heights within `REACH_M`, everything else over a square of twice `REACH_M`.
     """
     radius = getattr(shape, "radius", math.inf)
     if radius <= WHOLE_M and isinstance(shape, Sphere):
@@ -250,6 +252,10 @@ def object_mesh(shape: PlacedShape) -> Mesh:
         return _placed(shape, _tube(radius, REACH_M), -radius)
     if radius <= WHOLE_M and isinstance(shape, Bowl):
         return _placed(shape, _hollow(radius), radius)
+    if isinstance(shape, Heights):
+        points, exists = _relief(shape)
+        mesh = grid(points)
+        return Mesh(mesh.vertices, mesh.faces[exists.ravel()[mesh.faces].all(axis=1)])
     if isinstance(shape, Torus) and shape.ring_radius + radius <= WHOLE_M:
         return _ring(shape)
     return grid(_sheet(shape, REACH_M))
@@ -258,11 +264,32 @@ def object_mesh(shape: PlacedShape) -> Mesh:
 def object_lines(shape: PlacedShape) -> Array:
     """Lines on the surface in two directions, which make its curvature visible: (n, 2, 3) segments, base frame, m."""
     radius = math.inf if isinstance(shape, Cylinder) else getattr(shape, "radius", math.inf)
+    if isinstance(shape, Heights):
+        points, exists = _relief(shape)
+        lines = _lines(np.where(exists[..., None], points, np.nan))
+        return lines[np.isfinite(lines).all(axis=(1, 2))]
     sheet = _sheet(shape, min(REACH_M, 0.7 * radius))  # not over the edge of a body seen from above
-    picked = np.linspace(0, STEPS, LINES).round().astype(int)
-    along = [np.stack([sheet[i, :-1], sheet[i, 1:]], axis=1) for i in picked]
-    across = [np.stack([sheet[:-1, j], sheet[1:, j]], axis=1) for j in picked]
+    return _lines(sheet)
+
+
+def _lines(sheet: Array) -> Array:
+    rows, columns = (np.linspace(0, n - 1, LINES).round().astype(int) for n in sheet.shape[:2])
+    along = [np.stack([sheet[i, :-1], sheet[i, 1:]], axis=1) for i in rows]
+    across = [np.stack([sheet[:-1, j], sheet[1:, j]], axis=1) for j in columns]
     return np.concatenate([*along, *across])
+
+
+def _relief(shape: Heights) -> tuple[Array, NDArray[np.bool_]]:
+    """(m, n, 3) points of heights within `REACH_M` of the origin, base frame, and (m, n) whether the surface exists."""
+    x, y = (
+        np.linspace(max(low, -REACH_M), min(high, REACH_M), RELIEF)
+        for low, high in zip(shape.spline.corner, shape.spline.far, strict=True)
+    )
+    x, y = (one.ravel() for one in np.meshgrid(x, y, indexing="ij"))
+    local = np.column_stack((x, y, shape.spline.many(x, y)[0]))
+    T = shape.T_base_object
+    points: Array = (local @ T[:3, :3].T + T[:3, 3]).reshape(RELIEF, RELIEF, 3)
+    return points, shape.exists(x, y).reshape(RELIEF, RELIEF)
 
 
 def _sheet(shape: PlacedShape, reach_m: float) -> Array:
@@ -307,54 +334,6 @@ def _hollow(radius: float) -> Mesh:
     """The inside of the lower half of a ball."""
     half = dome(radius, math.pi / 2)
     return Mesh(half.vertices * (1.0, -1.0, -1.0), half.faces[:, ::-1])
-
-
-# The estimated patch as a disc on its quadric, and how uncertain its height is: shells at ±2 standard deviations.
-
-RADIUS_M, RINGS, SECTORS = 0.012, 6, 36
-EXAGGERATION = 20.0
-"""The shells stand this many times too far apart: 0.5 1/m is 36 µm at the disc's rim."""
-PATCH_LIFT_M = 3e-4
-"""Off the true surface, outward, so that the two do not flicker through each other."""
-MOST_M = 0.006
-"""Farthest that a shell is drawn from the patch: where curvature was not observed it would be nowhere."""
-
-
-def disc_points() -> Array:
-    """(n, 2) points of the disc in the tangent plane, ring by ring from the middle, m."""
-    radii = np.linspace(0.0, RADIUS_M, RINGS + 1)[1:, None]
-    angles = np.linspace(0.0, 2.0 * math.pi, SECTORS, endpoint=False)[None]
-    rings = np.stack([radii * np.cos(angles), radii * np.sin(angles)], axis=-1).reshape(-1, 2)
-    points: Array = np.vstack([np.zeros((1, 2)), rings])
-    return points
-
-
-def disc_faces() -> Faces:
-    """(m, 3) triangles between the points of the disc; front side towards −z, out of the object."""
-    index = 1 + np.arange(RINGS * SECTORS).reshape(RINGS, SECTORS)
-    turned = np.roll(index, -1, axis=1)
-    middle = np.stack([np.zeros(SECTORS, np.int64), turned[0], index[0]], axis=1)
-    a, b, c, d = (x.ravel() for x in (index[:-1], turned[:-1], turned[1:], index[1:]))
-    return np.concatenate([middle, np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
-
-
-def patch_shape(patch: SurfacePatch, xy: Array) -> tuple[Array, Array, Array]:
-    """What is drawn of an estimate.
-
-    Args:
-        patch: of the estimator.
-        xy: (n, 2) from :func:`disc_points`.
-
-    Returns:
-        Points of the disc, lifted by `PATCH_LIFT_M`, and the shells outside and inside the object, exaggerated, cut off
-        and lifted too, each (n, 3) in the contact frame, m.
-    """
-    x, y = xy.T
-    height, sigma = patch.heights(x, y)
-    shift = np.minimum(2.0 * EXAGGERATION * sigma, MOST_M)
-    drawn = height - PATCH_LIFT_M
-    surface, outside, inside = (np.column_stack([x, y, z]) for z in (drawn, drawn - shift, drawn + shift))
-    return surface, outside, inside
 
 
 # The tactile array on its dome: where each taxel lies, and its image as colours.

@@ -7,7 +7,7 @@ import html
 import json
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from importlib.resources import files
 from pathlib import Path
@@ -17,10 +17,11 @@ import numpy as np
 
 from canprobe.bridge.sample import Context, Sample
 from canprobe.bridge.view.instants import NAMES, Answer, Follower, Moment, curves_of, row_of
-from canprobe.bridge.view.meshes import MAGMA, UNKNOWN, Array, scale
-from canprobe.bridge.view.path import OFF_PATH, GrowingPath, LoadedPath, Trail, error_scale
+from canprobe.bridge.view.meshes import MAGMA, Array, scale
+from canprobe.bridge.view.path import OFF_PATH, GrowingPath, LoadedPath, Trail, deviation_scale
 from canprobe.bridge.view.recorded import RecordedRun
-from canprobe.bridge.view.stage import Panel, Stage, address, open_server
+from canprobe.bridge.view.stage import Panel, Stage, address, legend_of, open_server, place_of
+from canprobe.bridge.view.surface import GrowingSurface, LoadedSurface
 from canprobe.bus.disk import write_text
 from canprobe.bus.port import MonotonicClock
 from canprobe.scene.geometry import true_object
@@ -45,13 +46,14 @@ class LiveView:
     def __init__(self, context: Context) -> None:
         scene, settings = context.plan.scene, context.settings
         shape = None if scene.object is None else true_object(scene.object)
-        errors = error_scale(shape)
+        errors = deviation_scale(shape)
         self._stack = ExitStack()
         server = self._server = self._stack.enter_context(open_server(settings.view_port, settings.view_host))
         self._stage = Stage(server, scene)
-        self._panel = Panel(server, scene, errors, self._stage.notes)
+        self._panel = Panel(server, scene, errors, self._stage)
         self._trail = Trail()
-        self._path = GrowingPath(server.scene, self._trail, errors)
+        self._path = GrowingPath(server.scene, self._trail)
+        self._surface = GrowingSurface(server.scene, errors)
         self._follower = Follower(shape)
         self._rows: deque[tuple[float, ...]] = deque(maxlen=round(WINDOW_S / ROW_S))
         self._clock = MonotonicClock()
@@ -70,8 +72,9 @@ class LiveView:
         moment = self._follower.take(sample)
         contact = sample.touch.contact if sample.touch is not None else None
         if contact is not None and moment.phase not in _OFF_PATH:
-            value = _colour_value(moment.answer, self._follower.shape is not None)
-            self._trail.add(moment.t_s, contact.point, contact.normal, value)
+            self._trail.add(moment.t_s, contact.point, contact.normal)
+        if sample.patch is not None and moment.answer is not None:
+            self._surface.add(moment.answer)
         if sample.cycle is not None and (not self._rows or moment.t_s >= self._rows[-1][0] + ROW_S):
             self._rows.append(row_of(moment))
         now_ns = self._clock.now_ns()
@@ -84,6 +87,7 @@ class LiveView:
         if now_ns - self._plot_ns >= PLOT_NS:
             self._plot_ns = now_ns
             curves = curves_of(self._rows)
+            self._surface.refresh()
         with self._server.atomic():
             self._stage.show(moment)
             self._path.refresh()
@@ -151,17 +155,17 @@ class Player:
     def __init__(self, server: Any, run: RecordedRun) -> None:
         self._server = server
         self._run = run
-        errors = error_scale(shape_of(run))
+        errors = deviation_scale(shape_of(run))
         self._stage = Stage(server, run.scene)
-        self._path = LoadedPath(server.scene, trail_of(run), errors)
+        self._path = LoadedPath(server.scene, trail_of(run))
+        self._surface = LoadedSurface(server.scene, answers_of(run), errors)
         gui = server.gui
-        start = float(run.log["t_s"][0])
-        with gui.add_folder("Replay"):
-            self._slider = gui.add_slider("time (s)", start, max(run.duration_s, start + 0.01), 0.01, start)
-            self._play = gui.add_checkbox("play", True)
-            self._speed = gui.add_dropdown("speed", ("0.25", "0.5", "1", "2", "4"), initial_value="1")
+        start = round(float(run.log["t_s"][0]), 2)
+        self._slider = gui.add_slider("time (s)", start, max(round(run.duration_s, 2), start + 0.01), 0.01, start)
+        self._play = gui.add_checkbox("play", True)
+        self._speed = gui.add_dropdown("speed", ("0.25", "0.5", "1", "2", "4"), initial_value="1")
         self.notes = self._stage.notes
-        self._panel = Panel(server, run.scene, errors, self.notes)
+        self._panel = Panel(server, run.scene, errors, self._stage)
         times = run.times(max(FRAME_S, run.duration_s / MOST_POINTS))
         self._panel.show(run.at(start), curves_of(row_of(run.at(t)) for t in times))
         self._shown = math.nan
@@ -170,8 +174,8 @@ class Player:
         """Go on by so much of the wall's time, and show where the slider stands."""
         t = float(self._slider.value)
         if self._play.value:
-            t += dt_s * float(self._speed.value)
-            t = t if t <= self._run.duration_s else float(self._run.log["t_s"][0])
+            t = round(t + dt_s * float(self._speed.value), 2)
+            t = t if t <= self._run.duration_s else self._slider.min
             self._slider.value = t
         if t == self._shown:
             return
@@ -180,6 +184,7 @@ class Player:
         with self._server.atomic():
             self._stage.show(moment)
             self._path.until(t)
+            self._surface.until(t)
             self._panel.show(moment)
 
 
@@ -188,26 +193,21 @@ def shape_of(run: RecordedRun) -> PlacedShape | None:
     return None if run.scene.object is None else true_object(run.scene.object)
 
 
-def _colour_value(answer: Answer | None, truth: bool) -> float:
-    """What colours the path, see `error_scale`."""
-    if answer is None:
-        return math.nan
-    return answer.error if truth else answer.sigma
+def answers_of(run: RecordedRun) -> Iterator[tuple[float, Answer]]:
+    """The answers of a run's estimator, each with the instant from which it counted, s."""
+    yield from zip(run.log["t_s"][run.answer_rows].tolist(), run.answers, strict=True)
 
 
 def trail_of(run: RecordedRun) -> Trail:
-    """The path of a run's contact, coloured by the error of its estimates; by their deviation without a true object."""
+    """The path of a run's contact."""
     trail, log = Trail(), run.log
     if "contact_mm" not in log:
         return trail
     touched = np.isfinite(log["contact_mm"]).all(axis=1) & ~np.isin(log["phase"], OFF_PATH)
     rows = np.nonzero(touched)[0]
-    latest = np.searchsorted(run.answer_rows, rows, side="right") - 1
-    answers = (*run.answers, None)  # the last for −1: before the first answer
-    values = [_colour_value(answers[at], run.scene.object is not None) for at in latest.tolist()]
     times, points = log["t_s"][rows].tolist(), log["contact_mm"][rows] * 1e-3
-    for t_s, point, normal, value in zip(times, points, log["normal"][rows], values, strict=True):
-        trail.add(t_s, point, normal, value)
+    for t_s, point, normal in zip(times, points, log["normal"][rows], strict=True):
+        trail.add(t_s, point, normal)
     return trail
 
 
@@ -247,7 +247,9 @@ def _record(run: RecordedRun, times: Array) -> tuple[str, list[str]]:
     """Viser's page with every frame in it, and lines about what cannot be drawn."""
     with open_server(0) as server:
         stage = Stage(server, run.scene)
-        path = LoadedPath(server.scene, trail_of(run), error_scale(shape_of(run)))
+        errors = deviation_scale(shape_of(run))
+        path = LoadedPath(server.scene, trail_of(run))
+        surface = LoadedSurface(server.scene, answers_of(run), errors)
         recorder = server.get_scene_serializer()
         before = float(times[0])
         with server.atomic():  # nobody listens: nothing is sent
@@ -256,6 +258,7 @@ def _record(run: RecordedRun, times: Array) -> tuple[str, list[str]]:
                 before = t
                 stage.show(run.at(t))
                 path.until(t)
+                surface.until(t)
         return str(recorder.as_html()), stage.notes
 
 
@@ -264,7 +267,7 @@ def _panel_data(run: RecordedRun, times: Array, notes: list[str]) -> dict[str, A
     moments = [run.at(t) for t in times.tolist()]
     curves = curves_of(map(row_of, moments))
     shape = shape_of(run)
-    errors = error_scale(shape)
+    errors = deviation_scale(shape)
     task = run.scene.task
     sensor = run.scene.sensor
     blank = np.zeros((1, 1) if sensor is None else (sensor.rows, sensor.columns), np.uint8)
@@ -283,9 +286,14 @@ def _panel_data(run: RecordedRun, times: Array, notes: list[str]) -> dict[str, A
         "rows": blank.shape[0],
         "columns": blank.shape[1],
         "taxels": base64.b64encode(taxels).decode("ascii"),
-        "scale": {"high": errors.high, "text": errors.text, "colours": scale(np.linspace(0, 1, 64), 0, 1).tolist()},
+        "scale": {
+            "high": errors.high,
+            "text": errors.text,
+            "colours": errors.colours(np.linspace(0, errors.high, 64)).tolist(),
+        },
         "heat": scale(np.sqrt(np.arange(256.0)), 0.0, math.sqrt(255.0), MAGMA).tolist(),
-        "unknown": list(UNKNOWN),
+        "legend": legend_of(run.scene),
+        "centre": place_of(run.scene).tolist(),
     }
 
 

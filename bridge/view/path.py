@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from canprobe.bridge.view.meshes import Array, Colours, linear_light, scale
+from canprobe.bridge.view.meshes import Array, Colours, scale
 from canprobe.tasks.probing import Phase
 from canprobe.touch.shapes import PlacedShape
 
@@ -17,7 +17,7 @@ from canprobe.touch.shapes import PlacedShape
 
 SPACING_M = 4e-4
 """Path between two points that are drawn."""
-LIFT_M = 1e-3
+LIFT_M = 6e-4
 """Off the surface, along the normal, so that the ghost does not hide the path."""
 GAP_M = 8e-3
 """Two contacts farther apart are not joined: the probe was lifted between them."""
@@ -27,8 +27,8 @@ SHARE, LEAST_PER_M, UNCERTAIN_PER_M = 0.05, 0.5, 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class ErrorScale:
-    """What the colours of the path mean.
+class DeviationScale:
+    """What the colours of the recovered surface mean.
 
     Attributes:
         high: value of the last colour, 1/m; the first is 0.
@@ -39,20 +39,21 @@ class ErrorScale:
     text: str
 
     def colours(self, values: Array) -> Colours:
-        """(n, 3) colours of values (n,), 1/m; grey where a value is not finite."""
-        return scale(values, 0.0, self.high)
+        """(n, 3) colours of values (n,), 1/m, what is well known bright; grey where a value is not finite."""
+        return scale(self.high - np.asarray(values), 0.0, self.high)
 
 
-def error_scale(shape: PlacedShape | None) -> ErrorScale:
-    """Five per cent of the object's curvature; without a known object the stated deviation is coloured.
+def deviation_scale(shape: PlacedShape | None) -> DeviationScale:
+    """Up to five per cent of the object's curvature; up to 2 1/m where no object is known.
 
     Args:
         shape: the true object, or None.
     """
-    if shape is None:
-        return ErrorScale(UNCERTAIN_PER_M, "stated std. deviation of K (1/m)")
-    kappa = shape.closest(shape.T_base_object[:3, 3]).kappa
-    return ErrorScale(max(SHARE * float(np.linalg.norm(kappa)), LEAST_PER_M), "error ‖K − K true‖ (1/m)")
+    high = UNCERTAIN_PER_M
+    if shape is not None:
+        kappa = shape.closest(shape.T_base_object[:3, 3]).kappa
+        high = max(SHARE * float(np.linalg.norm(kappa)), LEAST_PER_M)
+    return DeviationScale(high, "stated deviation of K (1/m)")
 
 
 class Trail:
@@ -61,20 +62,18 @@ class Trail:
     def __init__(self) -> None:
         self._last: Array | None = None
         self.segments: list[Array] = []
-        self.values: list[float] = []
         self.times: list[float] = []
 
     def __len__(self) -> int:
         return len(self.segments)
 
-    def add(self, t_s: float, point: Array, normal: Array, value: float) -> bool:
+    def add(self, t_s: float, point: Array, normal: Array) -> bool:
         """Take one contact; whether a segment has come of it.
 
         Args:
             t_s: its time, s.
             point: (3,) m.
             normal: (3,) outward.
-            value: that colours the segment, 1/m.
         """
         lifted = point + LIFT_M * normal
         if self._last is None:
@@ -86,7 +85,6 @@ class Trail:
         joined = step < GAP_M
         if joined:
             self.segments.append(np.stack([self._last, lifted]))
-            self.values.append(value)
             self.times.append(t_s)
         self._last = lifted
         return joined
@@ -108,7 +106,8 @@ class Trail:
 
 # The path in the browser: a node for each stretch of it, so that a growing path is not sent again and again.
 
-THICKNESS_M = 1.5e-3
+PATH = (40, 44, 52)
+THICKNESS_M = 4e-4
 STRETCH = 150
 """Segments of one node of a live path."""
 
@@ -119,17 +118,16 @@ class LoadedPath:
     Args:
         api: of viser's scene.
         trail: of the run.
-        scale: of its colours.
     """
 
-    def __init__(self, api: Any, trail: Trail, scale: ErrorScale) -> None:
+    def __init__(self, api: Any, trail: Trail) -> None:
         self._starts: list[float] = []
         self._nodes: list[Any] = []
         self._shown = 0
         for chunk in trail.chunks():
             self._starts.append(trail.times[chunk.start])
             name = f"/path/{len(self._nodes):03d}"
-            self._nodes.append(_add(api, name, trail, chunk, scale, visible=False))
+            self._nodes.append(_add(api, name, trail, chunk, visible=False))
 
     def until(self, t_s: float) -> None:
         """Show what was touched until then."""
@@ -146,11 +144,10 @@ class GrowingPath:
     Args:
         api: of viser's scene.
         trail: which grows elsewhere.
-        scale: of its colours.
     """
 
-    def __init__(self, api: Any, trail: Trail, scale: ErrorScale) -> None:
-        self._api, self._trail, self._scale = api, trail, scale
+    def __init__(self, api: Any, trail: Trail) -> None:
+        self._api, self._trail = api, trail
         self._done = self._sent = 0
 
     def refresh(self) -> None:
@@ -158,15 +155,14 @@ class GrowingPath:
         while self._sent < len(self._trail):
             end = min(self._done + STRETCH, len(self._trail))
             name = f"/path/{self._done // STRETCH:04d}"
-            _add(self._api, name, self._trail, slice(self._done, end), self._scale, visible=True)
+            _add(self._api, name, self._trail, slice(self._done, end), visible=True)
             self._sent = end
             if end - self._done == STRETCH:
                 self._done = end
 
 
-def _add(api: Any, name: str, trail: Trail, chunk: slice, scale: ErrorScale, *, visible: bool) -> Any:
-    colours = linear_light(scale.colours(np.array(trail.values[chunk])))
+def _add(api: Any, name: str, trail: Trail, chunk: slice, *, visible: bool) -> Any:
     return api.add_line_segments(
-        name, np.array(trail.segments[chunk], np.float32), np.repeat(colours[:, None], 2, axis=1),
-        thickness=THICKNESS_M, thickness_units="world", visible=visible,
+        name, np.array(trail.segments[chunk], np.float32), PATH, thickness=THICKNESS_M, thickness_units="world",
+        visible=visible,
     )  # fmt: skip

@@ -5,6 +5,7 @@ them.
 from __future__ import annotations
 
 import contextlib
+import html
 import importlib
 import io
 import math
@@ -17,12 +18,9 @@ from numpy.typing import NDArray
 from canprobe.bridge.database import need
 from canprobe.bridge.sample import quaternion_of
 from canprobe.bridge.view.bodies import (
-    disc_faces,
-    disc_points,
     link_frames,
     object_lines,
     object_mesh,
-    patch_shape,
     probe_parts,
     taxel_colours,
     taxel_image,
@@ -31,8 +29,8 @@ from canprobe.bridge.view.bodies import (
 )
 from canprobe.bridge.view.instants import Curves, Moment
 from canprobe.bridge.view.links import arm_links
-from canprobe.bridge.view.meshes import UNKNOWN, Array, Mesh, linear_light, scale
-from canprobe.bridge.view.path import ErrorScale
+from canprobe.bridge.view.meshes import Array, Mesh, linear_light
+from canprobe.bridge.view.path import PATH, DeviationScale
 from canprobe.errors import InterfaceError
 from canprobe.robot.model import ArmModel
 from canprobe.scene.geometry import T_flange_probe, true_object
@@ -44,12 +42,33 @@ from canprobe.touch.shapes import PlacedShape
 
 # The scene in the browser: arm, probe, object, contact, force, patch and path as viser's nodes.
 
-OBJECT, PROBE, SHELL, PATCH, FORCE = (126, 150, 176), (78, 88, 104), (255, 150, 40), (250, 190, 40), (214, 40, 30)
-FORCE_M_PER_N = 0.02
+OBJECT, PROBE, FORCE = (126, 150, 176), (78, 88, 104), (214, 40, 30)
+FORCE_M_PER_N = 0.012
 """Length of the force arrow."""
 LEAST_FORCE_N = 0.05
+LOOK_ASIDE = math.radians(55.0)
+"""Of the camera, from the line that leads from base to contact, seen from above: the arm hides nothing there."""
+FOLLOW_M = 4e-3
+"""The camera of a browser follows the contact in steps of this size: between them it is the user's."""
 ALONE = (0.0, 0.0, 0.12)
 """Where the probe stands, pole up, in a scene without an arm, m."""
+
+
+def legend_of(scene: Scene) -> list[tuple[tuple[int, int, int], str]]:
+    """Colours of what is drawn, and what it is."""
+    rows = []
+    if scene.object is not None:
+        rows.append((OBJECT, "true object"))
+    if scene.probe is not None:
+        rows += [(PATH, "path of the contact"), (FORCE, "contact force")]
+    return rows
+
+
+def place_of(scene: Scene) -> Array:
+    """(3,) where the object's surface is, or where it is looked for, base frame, m."""
+    if scene.object is None:
+        return np.array(scene.task.start_mm) * 1e-3
+    return true_object(scene.object).T_base_object[:3, 3]
 
 
 class Stage:
@@ -72,6 +91,10 @@ class Stage:
         self._probe = None
         self._tool = np.eye(4) if scene.probe is None else T_flange_probe(scene.probe)
         self.notes: list[str] = [] if array is None or array.newtons != NOMINAL else [f"force in {NOMINAL}"]
+        self._place, self._moved = place_of(scene), dict[int, Array]()
+        self._truth: list[Any] = []
+        self._follows = None
+        self._server = server
         self._light()
         if self._shape is not None:
             self._add_object(self._shape)
@@ -85,7 +108,6 @@ class Stage:
             self._add_probe(scene.probe.radius_mm * 1e-3, array.pad if array is not None else None)
         self._add_contact()
         self._look(server, scene)
-        self._drawn_patch: object = None
 
     # building
 
@@ -110,11 +132,12 @@ class Stage:
         )  # fmt: skip
 
     def _add_object(self, shape: PlacedShape) -> None:
-        self._add("/object/ghost", object_mesh(shape), OBJECT, opacity=0.45, side="double", cast_shadow=False)
-        self._api.add_line_segments(
-            "/object/lines", object_lines(shape).astype(np.float32), (96, 116, 140), thickness=1.0,
+        ghost = self._add("/object/ghost", object_mesh(shape), OBJECT, opacity=0.3, side="double", cast_shadow=False)
+        lines = self._api.add_line_segments(
+            "/object/lines", object_lines(shape).astype(np.float32), (150, 165, 184), thickness=1.0,
             thickness_units="screen",
         )  # fmt: skip
+        self._truth = [ghost, lines]
 
     def _add_probe(self, radius: float, pad: Pad | None) -> None:
         self._probe = self._api.add_frame("/probe", show_axes=False, position=ALONE)
@@ -134,36 +157,42 @@ class Stage:
             self._taxels = None
 
     def _add_contact(self) -> None:
-        api, xy = self._api, disc_points()
-        self._xy = xy
+        api = self._api
         self._contact = api.add_frame(
-            "/contact", axes_length=0.03, axes_radius=0.0007, origin_radius=0.0014, visible=False
+            "/contact", axes_length=0.012, axes_radius=0.0004, origin_radius=0.0008, visible=False
         )
         self._force = api.add_arrows(
-            "/force", np.zeros((1, 2, 3), np.float32), FORCE, shaft_radius=0.0018, head_radius=0.0045,
-            head_length=0.011, visible=False,
+            "/force", np.zeros((1, 2, 3), np.float32), FORCE, shaft_radius=0.0012, head_radius=0.003,
+            head_length=0.007, visible=False,
         )  # fmt: skip
         self._label = api.add_label("/force/label", "", anchor="bottom-center", visible=False)
-        self._patch = api.add_frame("/patch", show_axes=False, visible=False)
-        flat = Mesh(np.column_stack([xy, np.zeros(len(xy))]), disc_faces())
-        self._disc = self._add("/patch/surface", flat, PATCH, opacity=0.85, side="double", cast_shadow=False)
-        self._shells = [
-            self._add(f"/patch/{name}", flat, SHELL, opacity=0.28, side="double", cast_shadow=False)
-            for name in ("above", "below")
-        ]
 
     def _look(self, server: Any, scene: Scene) -> None:
-        """From the side on which the arm hides nothing; close where something is touched."""
+        """At probe and contact, across the line from the base to them: there the arm hides nothing."""
         camera = server.initial_camera
         if self._shape is not None or scene.task.kind in ("scan", "press"):
-            place = np.array(scene.task.start_mm) * 1e-3 if self._shape is None else self._shape.T_base_object[:3, 3]
-            target, away = place + np.array((0.0, 0.015, 0.035)), np.array((-0.35, 0.20, 0.18))
+            place = place_of(scene)
+            out, heading = math.atan2(place[1], place[0]), math.radians(scene.task.heading_deg)
+            across = max((out - LOOK_ASIDE, out + LOOK_ASIDE), key=lambda angle: abs(math.sin(angle - heading)))
+            target = place + np.array((0.0, 0.0, 0.012))
+            away = 0.21 * np.array((math.cos(across), math.sin(across), 0.5))
         elif self._model is not None:
             target, away = np.array((0.0, 0.0, 0.32)), np.array((-1.0, 0.55, 0.3))
         else:
             target, away = np.array(ALONE), np.array((-0.12, -0.16, 0.16))
-        camera.look_at, camera.position, camera.up = target, target + away, (0.0, 0.0, 1.0)
-        camera.fov = math.radians(38.0)
+        self._view = target + away, target
+        camera.position, camera.look_at, camera.up = *self._view, (0.0, 0.0, 1.0)
+        camera.fov = math.radians(34.0)
+
+    def add_switches(self, gui: Any) -> None:
+        """Add what decides whether the camera follows, and whether the true object is shown."""
+        self._follows = gui.add_checkbox("follow", True)
+        if self._truth:
+            gui.add_checkbox("true object", True).on_update(self._show_truth)
+
+    def _show_truth(self, event: Any) -> None:
+        for node in self._truth:
+            node.visible = event.target.value
 
     # showing
 
@@ -176,7 +205,20 @@ class Stage:
             self._taxels.batched_colors = linear_light(taxel_colours(counts))
             self._taxels.batched_opacities = _opacities(counts)
         self._show_contact(moment)
-        self._show_patch(moment)
+        if moment.contact is not None and self._follows is not None and self._follows.value:
+            self._follow(moment.contact.point - self._place)
+
+    def _follow(self, away: Array) -> None:
+        """Carry every browser's camera along, in steps; how it was turned by hand stays."""
+        for number, client in self._server.get_clients().items():
+            camera = client.camera
+            if number not in self._moved:  # what it reports until it was told anything may be another place
+                position, look_at, step = *self._view, away
+            else:
+                position, look_at, step = camera.position, camera.look_at, away - self._moved[number]
+            if number not in self._moved or float(np.linalg.norm(step)) > FOLLOW_M:
+                self._moved[number] = away
+                camera.position, camera.look_at = position + step, look_at + step
 
     def _move_arm(self, model: ArmModel, q: Array) -> None:
         frames = link_frames(model.chain, q)
@@ -196,17 +238,6 @@ class Stage:
         self._force.points = np.array([[contact.point, tip]], np.float32)
         self._label.position = tuple(tip)
         self._label.text = f"{moment.force:.2f} N"
-
-    def _show_patch(self, moment: Moment) -> None:
-        patch = moment.answer.patch if moment.answer is not None else None
-        self._patch.visible = patch is not None
-        if patch is None or patch is self._drawn_patch:
-            return
-        self._drawn_patch = patch
-        _place(self._patch, patch.T_base_contact)
-        self._disc.color = PATCH if all(patch.observed) else UNKNOWN
-        for handle, vertices in zip((self._disc, *self._shells), patch_shape(patch, self._xy), strict=True):
-            handle.vertices = vertices.astype(np.float32)
 
 
 def _opacities(counts: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -257,8 +288,8 @@ def address(server: Any) -> str:
 # Beside the scene: what the task does in figures, the taxel image, plots over time.
 
 INK, FIRST, SECOND, FAINT = "#1f2933", "#c2410c", "#0f6e84", "#9aa5b1"
-HEIGHT = 130
-PIXELS = 8
+HEIGHT = 96
+PIXELS = 5
 """Of a taxel in its image."""
 
 
@@ -269,22 +300,24 @@ class Panel:
         server: a `viser.ViserServer`.
         scene: that is shown.
         errors: what the path's colours mean.
-        notes: lines about what cannot be drawn.
+        stage: what is beside, with lines about what cannot be drawn.
     """
 
-    def __init__(self, server: Any, scene: Scene, errors: ErrorScale, notes: Sequence[str]) -> None:
+    def __init__(self, server: Any, scene: Scene, errors: DeviationScale, stage: Stage) -> None:
         gui = server.gui
         gui.configure_theme(control_layout="fixed", control_width="medium", show_logo=False, brand_color=(15, 110, 132))
         gui.set_panel_label(f"canprobe · {scene.name}")
         self._target = scene.task.force_n if scene.task.kind in ("scan", "press") else None
-        self._status = gui.add_markdown("")
-        for note in notes:
-            gui.add_markdown(note)
+        self._status = gui.add_html("")
+        gui.add_html(_legend(scene, stage.notes))
+        stage.add_switches(gui)
         self._plots: list[tuple[Any, tuple[str, ...]]] = []
         self._taxels = None
         if scene.shape is not None:
-            bar = np.broadcast_to(scale(np.linspace(0.0, 1.0, 256), 0.0, 1.0), (14, 256, 3))
-            gui.add_image(np.ascontiguousarray(bar), label=f"path: 0 … {errors.high:.2g}  {errors.text}", format="png")
+            bar = np.broadcast_to(errors.colours(np.linspace(0.0, errors.high, 256)), (14, 256, 3))
+            gui.add_image(
+                np.ascontiguousarray(bar), label=f"surface: 0 … {errors.high:.2g}  {errors.text}", format="png"
+            )
         if scene.sensor is not None:
             blank = np.zeros((scene.sensor.rows, scene.sensor.columns), np.uint8)
             self._taxels = gui.add_image(taxel_image(blank, PIXELS), label="taxel image", format="png")
@@ -310,7 +343,7 @@ class Panel:
 
     def show(self, moment: Moment, curves: Curves | None = None) -> None:
         """Show a moment, and curves where there are new ones."""
-        self._status.content = self._text(moment)
+        self._status.content = _STYLED.format("<br>".join(self._lines(moment)))
         if self._taxels is not None and moment.taxels is not None:
             self._taxels.image = taxel_image(moment.taxels, PIXELS)
         if curves is None or len(curves["t_s"]) < 2:
@@ -325,21 +358,28 @@ class Panel:
             return np.full(len(curves["t_s"]), math.nan if self._target is None else self._target)
         return curves[name]
 
-    def _text(self, moment: Moment) -> str:
-        rows = [("time", f"{moment.t_s:.2f} s")]
-        if moment.phase is not None:
-            rows.append(("phase", moment.phase))
-        if math.isfinite(moment.force):
-            rows.append(("force", f"{moment.force:.2f} N"))
+    def _lines(self, moment: Moment) -> Iterator[str]:
+        force = f" · <b>{moment.force:.2f} N</b>" if math.isfinite(moment.force) else ""
+        yield f"<b>{moment.t_s:.2f} s</b> {moment.phase or ''}{force}"
         if (answer := moment.answer) is not None:
             kappa = ", ".join("not observed" if math.isnan(k) else f"{k:.2f}" for k in answer.patch.kappa)
-            rows.append(("κ", f"{kappa} 1/m"))
+            error = "" if math.isnan(answer.error) else f" · error of K <b>{answer.error:.2f}</b>"
+            yield f"κ <b>{kappa} 1/m</b>{error}"
             if math.isfinite(answer.kappa_true[0]):
-                rows.append(("κ true", f"{answer.kappa_true[0]:.2f}, {answer.kappa_true[1]:.2f} 1/m"))
-            rows.append(("error of K", "–" if math.isnan(answer.error) else f"{answer.error:.2f} 1/m"))
+                yield f"true κ {answer.kappa_true[0]:.2f}, {answer.kappa_true[1]:.2f} 1/m"
         if moment.dropped:
-            rows.append(("samples dropped", str(moment.dropped)))
-        return "| | |\n|:--|:--|\n" + "\n".join(f"| {name} | **{text}** |" for name, text in rows)
+            yield f"samples dropped: {moment.dropped}"
+
+
+_STYLED = '<div style="padding: 0 0.6em 0.4em; font-size: 0.9em; line-height: 1.5">{}</div>'
+
+
+_KEY = '<span style="white-space: nowrap"><span style="color: rgb{}">&#9632;</span> {}</span>'
+
+
+def _legend(scene: Scene, notes: Sequence[str]) -> str:
+    rows = [_KEY.format(colour, html.escape(text)) for colour, text in legend_of(scene)]
+    return _STYLED.format("<br>".join([" &ensp; ".join(rows), *map(html.escape, notes)]))
 
 
 def _scales(times: Any, columns: list[Any]) -> dict[str, Any]:

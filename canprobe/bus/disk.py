@@ -313,9 +313,18 @@ def write_text(path: Path, text: str, *, encoding: str = "utf-8", newline: str |
 
 
 def write_npz(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays into exactly this file, compressed, whole: numpy would append ``.npz`` to a name."""
-    with whole_file(path) as part, part.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **columns)
+    """Write arrays into exactly this file, compressed, whole: numpy would append ``.npz`` to a name.
+
+    The lowest level of compression takes half the time of numpy's; the files are 2 to 6 % larger.
+    """
+    with (
+        whole_file(path) as part,
+        part.open("wb") as file,
+        zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as saved,
+    ):
+        for name, column in columns.items():
+            with saved.open(f"{name}.npy", "w", force_zip64=True) as entry:
+                np.lib.format.write_array(entry, np.asanyarray(column), allow_pickle=False)
 
 
 def read_npz(path: Path, expected: str = "an .npz of a run") -> dict[str, NDArray[Any]]:

@@ -99,7 +99,8 @@ class Cell:
         guard = JointGuard(plan) if setup.arm is not None else None
         seen = Seen(limits_of(plan), self.watch, self.drives, self.tactile, port.counters)
         self.supervisor = Supervisor(seen, guard, patch_from(setup) if setup.arm is not None else None)
-        self._slides = np.array([] if setup.arm is None else setup.arm.model.chain.prismatic, dtype=bool)
+        slides = setup.arm.model.chain.prismatic if setup.arm is not None else ()
+        self._slides = np.array(slides, dtype=bool) if any(slides) else None
         self._plan = plan
         self._port = port
         self._to_say = say

@@ -175,8 +175,9 @@ def _drive_silent(seen: Seen) -> NodeError | None:
 def _not_heard(seen: Seen, cycles: int, word: str) -> NodeError | None:
     """The first drive without a usable TPDO for so many cycles."""
     ages = seen.measurement.q_age
-    if seen.drives is None or max(ages, default=0) < cycles:
+    if not any(ages) or max(ages) < cycles:
         return None
+    assert seen.drives is not None
     i = next(i for i, age in enumerate(ages) if age >= cycles)
     return NodeError(seen.drives.axes[i].node_id, f"{word}no usable TPDO for {ages[i]} cycles")
 

@@ -179,8 +179,10 @@ class FeedbackFrame:
         Raises:
             ProtocolError: it is too short.
         """
-        length = self.layout.length
-        return self.layout.unpack(data if len(data) <= length else data[:length])
+        layout = self.layout
+        if len(data) == layout.length:
+            return layout.raw_unpack(data)
+        return layout.unpack(data[: layout.length])
 
 
 def feedback_frames(axes: Sequence[DriveAxis]) -> tuple[FeedbackFrame, ...]:
@@ -371,7 +373,8 @@ class DriveGroup:
     @property
     def heard_all(self) -> bool:
         """Every drive was heard at least once."""
-        return min(self._heard) >= 0
+        self._all_heard = self._all_heard or min(self._heard) >= 0
+        return self._all_heard
 
     def ages(self) -> tuple[int, ...]:
         """Cycles since each drive last reported a position that can be believed."""
@@ -384,8 +387,9 @@ class DriveGroup:
 
     def joints(self) -> Vector:
         """Joint positions (n,), rad or m, at this SYNC; where a report is missing, carried on for a few cycles."""
-        now_ns = self._deadline_ns
-        q = units_to_joints(self._model, np.array([t.position(self._cycle, now_ns) for t in self._tracks]))
+        now, now_ns = self._cycle, self._deadline_ns
+        counts = [t.counts if t.cycle == now else t.position(now, now_ns) for t in self._tracks]
+        q = units_to_joints(self._model, counts)
         q.flags.writeable = False  # it goes into the log as it was measured, whatever a controller does with it
         return q
 
@@ -462,10 +466,10 @@ class DriveGroup:
             self._steady = key if words == self._words else None
             self._words = words
         values = [*self._words, *targets, *self._constants]  # an axis and its pick name the place
-        self._all_heard = self._all_heard or min(self._heard) >= 0
+        heard_all = self.heard_all
         commands = []
         for cob_id, every_cycle, packs, fetches, axes in self._plan:
-            if not self._all_heard and any(self._tracks[axis].cycle < 0 for axis in axes):
+            if not heard_all and any(self._tracks[axis].cycle < 0 for axis in axes):
                 continue
             parts = [fetch(values) for fetch in fetches]
             if every_cycle or self._due(cob_id, parts):

@@ -142,18 +142,20 @@ class RunLog:
 # Positions of joints: columns `q_rad` for those that turn, `q_m` for those that slide, one place a joint in each.
 
 
-def joint_columns(name: str, q: NDArray[np.float64], prismatic: NDArray[np.bool_]) -> dict[str, NDArray[np.float64]]:
+def joint_columns(
+    name: str, q: NDArray[np.float64], prismatic: NDArray[np.bool_] | None
+) -> dict[str, NDArray[np.float64]]:
     """Joint positions as columns of the log: of an arm whose joints all turn `name_rad` alone, else with `name_m`.
 
     Args:
         name: `q` or `q_target`.
         q: (n,) rad or m.
-        prismatic: (n,) which joints slide.
+        prismatic: (n,) which joints slide; None: none of them.
 
     Returns:
         (n,) each, NaN where a joint is of the other kind.
     """
-    if not prismatic.any():
+    if prismatic is None:
         return {f"{name}_rad": q}
     sliding = {f"{name}_m": np.where(prismatic, q, np.nan)}
     return sliding if prismatic.all() else {f"{name}_rad": np.where(prismatic, np.nan, q), **sliding}

@@ -214,8 +214,7 @@ class Supervisor:
         self._press = Press()
         self._look_ns = 0
         self._untouched = seen.limits.tares
-        period_ns = seen.limits.period_ns
-        self._late = deque((t_ns, 0) for t_ns in range(-SECOND_NS, 0, period_ns))  # before its first it was in time
+        self._late: deque[tuple[int, int]] = deque()  # while one of them is late, the last second's cycles
         self._late_sum = 0
         self._active_ns = 0
         self._enabling = tuple(condition for condition in CYCLE_CHECKS if condition.enabling)
@@ -257,6 +256,13 @@ class Supervisor:
     def _count_late(self, late: int, t_ns: int) -> None:
         """Late cycles are longer than others: the last second has fewer of them."""
         cycles = self._late
+        if not self._late_sum:
+            cycles.clear()
+            if not late:
+                self.seen.late_share = 0.0
+                return
+            in_time = range(self.seen.measurement.t_ns, t_ns - SECOND_NS, -self.seen.limits.period_ns)
+            cycles.extend((before_ns, 0) for before_ns in reversed(in_time))
         cycles.append((t_ns, late))
         self._late_sum += late
         while cycles[0][0] <= t_ns - SECOND_NS:

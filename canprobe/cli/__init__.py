@@ -18,9 +18,10 @@ from collections.abc import Sequence
 import canprobe
 from canprobe.bus.scheduling import Terminated
 from canprobe.cli.completion import complete
-from canprobe.cli.output import Report, termination_interrupts
+from canprobe.cli.output import termination_interrupts
 from canprobe.cli.parser import Parser, did_you_mean
 from canprobe.errors import EXTRA_OF, CanprobeError, install_line
+from canprobe.session.terminal import Report
 
 COMMANDS = (
     "scenes",

@@ -14,9 +14,10 @@ from collections.abc import Callable
 from datetime import date
 from pathlib import Path
 
-from canprobe.cli.output import Report, print_json
+from canprobe.cli.output import print_json
 from canprobe.cli.parser import BUS, Parser, add_options, add_verbosity, folder_path, seed, target_of, word
 from canprobe.errors import install_line
+from canprobe.session.terminal import Report
 
 HELP = "calibrate a tactile array by touching known things"
 EXAMPLE = """\
@@ -84,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
     x, y, z = args.at
     request = Request(
         cell=args.cell,
-        target=target_of(args, load_scene("press", args.cell)),
+        target=target_of(args, load_scene("press", {"cell": args.cell})),
         at=(x, y, z),
         ball_radius=1e-3 * args.ball_radius,
         rod_radius=1e-3 * args.rod_radius,

@@ -19,13 +19,13 @@ from canprobe.cli.parser import (
     add_options,
     add_scene,
     add_verbosity,
+    loaded,
     node_id,
     node_ids,
     number_of_32_bits,
     real_target,
     target_of,
     whole,
-    with_realtime,
 )
 from canprobe.errors import UsageError
 
@@ -116,13 +116,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _scene_server(args: argparse.Namespace) -> Callable[[], None]:
-    from canprobe.scene.load import load_scene
-
     for option in ("node_id", "serial"):
         if getattr(args, option):
             name = option.replace("_", "-")
             raise UsageError(f"emulate: --{name} belongs to --eds; of a scene's nodes, choose with --nodes")
-    scene = with_realtime(load_scene(args.scene, args.cell), args.realtime)
+    scene = loaded(args)
     wanted = _nodes(args.nodes, scene)
     target = _scene_target(args, scene)
     if absent := sorted(set(args.without_id) - set(wanted)):

@@ -10,7 +10,7 @@ import sys
 
 from canprobe.bus.scheduling import Terminated
 from canprobe.cli.output import print_json
-from canprobe.cli.parser import BUS, Parser, add_options, add_scene, add_verbosity, seconds, target_of
+from canprobe.cli.parser import BUS, Parser, add_options, add_scene, add_verbosity, loaded, seconds, target_of
 
 HELP = "watch a running cell"
 EXAMPLE = """\
@@ -34,9 +34,7 @@ def add_arguments(parser: Parser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Show the cell ten times a second; with --json print it once, at the end."""
-    from canprobe.scene.load import load_scene
-
-    scene = load_scene(args.scene, args.cell)
+    scene = loaded(args)
     scene = target_of(args, scene).applied_to(scene)
 
     from canprobe import api

@@ -6,8 +6,8 @@ import argparse
 import difflib
 import math
 import re
+import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -106,6 +106,17 @@ def seconds(text: str) -> float:
     return value
 
 
+def setting(text: str) -> tuple[str, Any]:
+    """An argument type: a key and its value as a scene file writes them; a word needs no quotes."""
+    key, equals, value = text.partition("=")
+    if not key.strip() or not equals:
+        raise argparse.ArgumentTypeError(f"expected KEY=VALUE such as task.force_n=3, got {text!r}")
+    try:
+        return key.strip(), tomllib.loads(f"value = {value}")["value"]
+    except ValueError:
+        return key.strip(), value.strip()
+
+
 def node_ids(text: str) -> tuple[int, ...]:
     """An argument type: node ids such as `1-6,16`, ascending and without repetitions."""
     found: set[int] = set()
@@ -138,6 +149,13 @@ OPTIONS: Mapping[str, dict[str, Any]] = {
         "help": "channel of the interface; NAME=CH replaces the scene's channel NAME and may be repeated [the scene's]",
     },
     "--bitrate": {"metavar": "BIT/S", "type": whole(10_000, 1_000_000), "help": "bit rate [the scene's]"},
+    "--set": {
+        "metavar": "KEY=VALUE",
+        "action": "append",
+        "default": [],
+        "type": setting,
+        "help": "a key of the scene, as `--set task.force_n=3`, checked as in a file; may be repeated",
+    },
     "--realtime": {
         "action": "store_true",
         "help": "request SCHED_FIFO, a processor for the cycle and locked memory; what the system does not permit is"
@@ -178,6 +196,7 @@ def add_scene(parser: Parser, optional: bool = False) -> None:
     parser.add_argument(
         "--cell", metavar="C", type=word, help="a packaged cell (`canprobe cells` lists them) or a path [the scene's]"
     )
+    add_options(parser, "--set")
 
 
 def add_options(parser: argparse._ActionsContainer, *names: str) -> None:
@@ -217,18 +236,25 @@ def scene_of(args: argparse.Namespace) -> Scene:
     """
     from canprobe.scene.load import load_scene
 
-    scene = with_realtime(load_scene(args.scene, args.cell), args.realtime)
+    scene = loaded(args)
     if args.patient:
         if _has_real_nodes(scene):
             raise UsageError("--patient is for emulated nodes: real drives must stop soon after their master")
-        arm = scene.arm and replace(scene.arm, missed_syncs=PATIENT_SYNCS)
-        scene = replace(scene, arm=arm, limits=replace(scene.limits, late_cycles_max_percent=100.0))
+        arm = {} if scene.arm is None else {"arm.missed_syncs": PATIENT_SYNCS}
+        scene = load_scene(scene, {"limits.late_cycles_max_percent": 100.0, **arm})
     return target_of(args, scene).applied_to(scene)
 
 
-def with_realtime(scene: Scene, wanted: bool) -> Scene:
-    """The scene, in real time where the command line wants it."""
-    return replace(scene, cycle=replace(scene.cycle, realtime=True)) if wanted else scene
+def loaded(args: argparse.Namespace) -> Scene:
+    """The scene of a command with `add_scene`, as --cell, --set and --realtime change it."""
+    from canprobe.scene.load import load_scene
+
+    overrides = dict(args.set)
+    if args.cell is not None:
+        overrides["cell"] = args.cell
+    if getattr(args, "realtime", False):
+        overrides["cycle.realtime"] = True
+    return load_scene(args.scene, overrides)
 
 
 def target_of(args: argparse.Namespace, scene: Scene) -> Target:

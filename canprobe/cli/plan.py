@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from canprobe.cli.output import print_json, say
-from canprobe.cli.parser import Parser, add_options, add_scene
+from canprobe.cli.parser import Parser, add_options, add_scene, loaded
 from canprobe.errors import CanprobeError, PlanError, UsageError, install_line
 
 if TYPE_CHECKING:
@@ -80,12 +80,11 @@ def run(args: argparse.Namespace) -> int:
     from canprobe.planning.choices import opened
     from canprobe.planning.make import make_plan
     from canprobe.planning.report import plan_dict, plan_text, refused_dict
-    from canprobe.scene.load import load_scene
     from canprobe.scene.resolve import resolve
 
     if args.measured is not None and (args.export or args.figure is not None):
         raise UsageError("plan: --measured sets a log beside the plan and writes no --export or --figure")
-    scene = load_scene(args.scene, args.cell)
+    scene = loaded(args)
     try:
         setup = resolve(scene)
         plan = make_plan(opened(setup) if args.auto else setup)

@@ -19,6 +19,7 @@ EXAMPLE = """\
 examples:
   canprobe run cylinder
   canprobe run cylinder --seed 3 --out runs/third --json
+  canprobe run cylinder --set task.force_n=3 --set object.radius_mm=50
   canprobe run cylinder --tool runs/calibrate/tool.toml
   canprobe run cylinder --bus socketcan --channel vcan0 --patient
 """

@@ -18,6 +18,7 @@ from canprobe.cli.parser import (
     add_scene,
     add_verbosity,
     channel,
+    loaded,
     number_of_32_bits,
     real_target,
     whole,
@@ -94,11 +95,7 @@ def run(args: argparse.Namespace) -> int:
         else:
             _print_nodes(nodes, target.channel)
         return 0
-    scene = None
-    if args.scene is not None:
-        from canprobe.scene.load import load_scene
-
-        scene = load_scene(args.scene, args.cell)
+    scene = None if args.scene is None else loaded(args)
     done = api.commission(target, scene=scene, assign=args.assign, store=not args.no_store, say=args.report.say)
     if args.json:
         print_json(done.as_document())

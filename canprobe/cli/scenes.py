@@ -58,7 +58,7 @@ def print_packaged(
             if expected is None:
                 print_table(found)
             else:
-                print_table([(*row, expected_text(expected["scenes"][row[0]], SHORT)) for row in found])
+                print_table([(*row, expected_text(expected["scenes"].get(row[0], {}), SHORT)) for row in found])
                 print(f"figures: RMS errors to expect, lowest–highest of the seeds {seeds_text(expected)}")
             print(f"in {next(iter(paths.values())).parent}; {then}")
     if args.json:

@@ -45,7 +45,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--no-open", action="store_true", help="print the address and open no browser")
     parser.add_argument("--html", metavar="FILE", type=Path, help="write the replay to one HTML file, and end")
     of_scene = parser.add_argument_group("options of a SCENE")
-    add_options(of_scene, *BUS, "--out", "--force", "--seed", "--duration")
+    add_options(of_scene, "--set", *BUS, "--out", "--force", "--seed", "--duration")
     add_verbosity(parser)
 
 
@@ -95,7 +95,7 @@ def _run_scene(args: argparse.Namespace, browser: _Browser) -> Path:
     from canprobe.scene.model import BridgeSettings
     from canprobe.session.target import VIRTUAL
 
-    scene = load_scene(args.what)
+    scene = load_scene(args.what, dict(args.set))
     settings = replace(scene.bridge or BridgeSettings(), view_port=args.port, view_host=args.host)
     scene = target_of(args, scene).applied_to(replace(scene, bridge=settings))
     live = args.html is None

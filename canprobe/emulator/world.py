@@ -68,10 +68,7 @@ class TruthRecorder(Participant):
             "sync_count": np.arange(len(self._rows), dtype=np.int64),
             "sync_counter": np.array([counter for _, counter, _ in self._rows], dtype=np.int64),
         }
-        truths = [self._plant.truth(state) for _, _, state in self._rows]
-        for name in truths[0] if truths else ():
-            columns[name] = np.array([truth[name] for truth in truths])
-        return columns
+        return columns | self._plant.truths([state for _, _, state in self._rows])
 
 
 def _set_turn_units(node: SlaveNode, units: float | None) -> None:

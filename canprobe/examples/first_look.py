@@ -3,7 +3,7 @@
 # %% Run the emulated cell, or load a run that is there already: canprobe.load_table("runs/…/log.npz")
 import canprobe
 
-result = canprobe.run(canprobe.load_scene("cylinder"), out="runs/first-look", force=True, duration_s=2.0)
+result = canprobe.run("cylinder", out="runs/first-look", force=True, duration_s=2.0)
 print(result.text())
 
 # %% One row a cycle, by time; every column's unit is in attrs["units"]

@@ -62,7 +62,7 @@ def _from_run(plan: Plan, run: RunFolder) -> Contacts:
         tracker, unplaced = replay_contacts(plan, run.measurements())
         driven_by = "other"
     counts = {"cycles": len(run.times_ns), "unplaced_contacts": unplaced}
-    return Contacts(tracker, driven_by, run.start_s, run.log["t_s"] - run.start_s, counts, None)
+    return Contacts(tracker, driven_by, run.start_s, run.times_s, counts, None)
 
 
 def _from_log(plan: Plan, path: Path) -> Contacts:
@@ -272,8 +272,6 @@ def find_log(log: Path) -> tuple[Path, Path | None]:
 
 def scene_of(path: Path, folder: Path | None, scene: Scene | str | Path | None) -> Scene:
     """The given scene, or the one beside the log; UsageError without either."""
-    if isinstance(scene, Scene):
-        return scene
     if scene is not None:
         return load_scene(scene)
     if folder is None:

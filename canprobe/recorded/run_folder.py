@@ -48,6 +48,11 @@ class RunFolder:
         """Time of each cycle (n,), ns, since the first."""
         return self._ns(self.log["t_s"])
 
+    @property
+    def times_s(self) -> NDArray[np.float64]:
+        """The same in s, to the last bit what the run's estimates were dated by."""
+        return self.times_ns.astype(np.float64) * 1e-9
+
     def measurements(self) -> Iterator[Measurement]:
         """The measurement of each cycle, as the cell had it; times count from the first cycle."""
         log, samples = self.log, self._samples()

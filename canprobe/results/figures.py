@@ -4,22 +4,39 @@ plan.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import SubFigure
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Patch
 
 from canprobe.cell.log import joint_positions
+from canprobe.errors import UsageError
 from canprobe.planning.model import Plan
 from canprobe.planning.report import Part, timeline
 from canprobe.planning.traffic import on_the_wire
-from canprobe.results.picture import AMBER, BLUE, GREY, INK, ORANGE, SHADE, SKY, box, legend, parts, picture
+from canprobe.results.picture import (
+    AMBER,
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    ORANGE,
+    SHADE,
+    SKY,
+    box,
+    legend,
+    parts,
+    picture,
+    sheet,
+)
 from canprobe.results.summary import RunResult
-from canprobe.results.surface_figure import Array, true_surface
+from canprobe.results.surface_figure import Array, Plane, add_sheet, map_surface, true_surface
 from canprobe.scene.geometry import true_object
+from canprobe.tasks.probing import Phase
 from canprobe.tasks.shape import ShapeRecord
 from canprobe.touch.patch.array_calibration import NOMINAL
 
@@ -37,10 +54,28 @@ def draw_run(result: RunResult, path: Path) -> None:
     if not rows:
         return
     with picture(path, _title(result), 0.6 + 2.9 * len(rows)) as figure:
-        for strip, row in zip(parts(figure, len(rows), 1), rows, strict=True):
-            places = parts(strip, 1, len(row), width_ratios=[width for _, width in row])
-            for part, (draw, _) in zip(places, row, strict=True):
-                draw(part, result)
+        _fill(figure, rows, result)
+
+
+def run_figure(result: RunResult) -> Figure:
+    """The same figure, not written.
+
+    Raises:
+        UsageError: the run has nothing to draw.
+    """
+    rows = _rows(result)
+    if not rows:
+        raise UsageError("plot: nothing was measured in this run that a panel shows")
+    with sheet(_title(result), 0.6 + 2.9 * len(rows)) as figure:
+        _fill(figure, rows, result)
+    return figure
+
+
+def _fill(figure: Figure, rows: list[list[tuple[Panel, float]]], result: RunResult) -> None:
+    for strip, row in zip(parts(figure, len(rows), 1), rows, strict=True):
+        places = parts(strip, 1, len(row), width_ratios=[width for _, width in row])
+        for part, (draw, _) in zip(places, row, strict=True):
+            draw(part, result)
 
 
 def _rows(result: RunResult) -> list[list[tuple[Panel, float]]]:
@@ -63,11 +98,11 @@ def _rows(result: RunResult) -> list[list[tuple[Panel, float]]]:
 
 def _title(result: RunResult) -> str:
     summary = result.summary
-    truth = "the plant's truth is known" if result.truth else "measured only, no truth is known"
+    truth = "black and grey: true, of the emulated plant, unknown to the cell" if result.truth else "no truth is known"
     newtons = f" · {NOMINAL}" if summary["newtons"] == NOMINAL else ""
     end = "" if summary["completed"] else f"\nstopped: {summary['stop_reason']}"
     scene = result.plan.scene.title or summary["scene"]
-    return f"{scene}\n{summary['bus']}, seed {summary['seed']} · {truth}{newtons}{end}"
+    return f"{scene}\n{summary['bus']}, seed {summary['seed']} · colour: measured and estimated; {truth}{newtons}{end}"
 
 
 def _draw_tool(part: SubFigure, result: RunResult) -> None:
@@ -93,15 +128,25 @@ def _draw_tool(part: SubFigure, result: RunResult) -> None:
 
 
 def _draw_trajectory(part: SubFigure, result: RunResult) -> None:
+    """The path of the contact and the surface that was recovered from it, over the true one."""
     axes = part.add_subplot(projection="3d", computed_zorder=False)
-    points = result.log["contact_mm"][result.log["phase"] == 3]
-    points = points[np.isfinite(points).all(axis=1)]
-    if result.plan.scene.object is not None and result.truth and len(points):
-        near = true_surface(true_object(result.plan.scene.object), points * 1e-3, np.eye(3), np.zeros(3))
-        axes.plot_surface(*near, color=GREY, alpha=0.3, linewidth=0, shade=True)
-    axes.plot(*points.T, color=ORANGE)
-    title = "contact in the base frame, measured; grey: true surface"
-    box(part, axes, title, ("x (mm)", "y (mm)", "z (mm)"), elev=36, azim=-150)
+    points, normals = result.log["contact_mm"] * 1e-3, result.log["normal"]
+    touched = (result.log["phase"] == Phase.SCAN) & np.isfinite(points).all(axis=1)
+    points, normals = points[touched], normals[touched]
+    axes.plot(*1e3 * points.T, color=ORANGE, linewidth=0.9, zorder=3)
+    shown, azimuth = ["orange: measured path"], -60.0
+    if len(points):
+        plane = Plane.of(points, normals)
+        azimuth = math.degrees(math.atan2(plane.axes[0, 1], plane.axes[0, 0])) - 68.0  # the long side across the page
+        if result.surface_map is not None and len(result.surface_map):
+            shown.append("blue: recovered surface")
+            add_sheet(axes, 1e3 * map_surface(result.surface_map, plane)[0], SKY, alpha=0.8, zorder=2)
+        if result.plan.scene.object is not None and result.truth:
+            shown.append("grey: true one")
+            near = 1e3 * true_surface(true_object(result.plan.scene.object), points, plane)
+            axes.plot_surface(*np.moveaxis(near, 2, 0), color=GREY, alpha=0.3, linewidth=0, shade=True, zorder=1)
+    title = f"contact in the base frame\n{' · '.join(shown)}"
+    box(part, axes, title, ("x (mm)", "y (mm)", "z (mm)"), elev=40, azim=azimuth)
 
 
 def _draw_force(part: SubFigure, result: RunResult) -> None:
@@ -112,7 +157,7 @@ def _draw_force(part: SubFigure, result: RunResult) -> None:
     axes.plot(t, result.log["force_n"], color=BLUE, linewidth=0.9, label="measured (array)")
     target = result.summary["contact"]["force_target_n"]
     if target is not None:
-        axes.axhline(target, color=ORANGE, linestyle="--", label=f"target {target:g} N")
+        axes.axhline(target, color=GREEN, linestyle="--", label=f"target {target:g} N")
     axes.set_ylim(bottom=0)
     axes.set(title="contact force", xlabel="time (s)", ylabel="force (N)")
     legend(part)

@@ -8,6 +8,7 @@ distinguishes them as well.
 
 from __future__ import annotations
 
+import io
 import math
 import textwrap
 from collections.abc import Iterator, Sequence
@@ -20,6 +21,7 @@ from typing import Any
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
@@ -46,6 +48,25 @@ LEAST_DEPTH = 6.0
 """Least height of a box, mm: a plane's is not flat."""
 
 
+class Sheet(Figure):
+    """A figure that a notebook shows, also where `matplotlib.pyplot` was never imported."""
+
+    def _repr_png_(self) -> bytes:
+        drawn = io.BytesIO()
+        self.savefig(drawn, format="png")
+        return drawn.getvalue()
+
+
+@contextmanager
+def sheet(title: str, height_in: float) -> Iterator[Figure]:
+    """A sheet to be drawn on within the block; arguments as for `picture`."""
+    with rc_context(dict(_STYLE)):
+        figure = Sheet(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="constrained")
+        lines = [part for line in title.splitlines() for part in textwrap.wrap(line, 118)]
+        figure.suptitle("\n".join(lines), x=0.01, ha="left", parse_math=False)
+        yield figure
+
+
 @contextmanager
 def picture(path: Path | str, title: str, height_in: float) -> Iterator[Figure]:
     """A sheet that is written, whole, when the block is done.
@@ -59,13 +80,14 @@ def picture(path: Path | str, title: str, height_in: float) -> Iterator[Figure]:
         ValueError: matplotlib knows no such form.
     """
     path = Path(path)
-    with rc_context(dict(_STYLE)):
-        figure = Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="constrained")
-        lines = [part for line in title.splitlines() for part in textwrap.wrap(line, 118)]
-        figure.suptitle("\n".join(lines), x=0.01, ha="left", parse_math=False)
+    with sheet(title, height_in) as figure:
         yield figure
         with whole_file(path) as part:
-            figure.savefig(part, format=path.suffix[1:] or "png")
+            if (form := path.suffix[1:] or "png") == "png":
+                canvas: Any = FigureCanvasAgg(figure)
+                canvas.print_png(part)  # `savefig` draws everything twice
+            else:
+                figure.savefig(part, format=form)
 
 
 def parts(of: Part, rows: int, columns: int, **ratios: Any) -> list[SubFigure]:
@@ -133,8 +155,10 @@ def box(part: Part, axes: Any, title: str, labels: Sequence[str], *, elev: float
         axis.labelpad = 5
         axis.set_tick_params(pad=0)
         count, inset = round(5 * (high - low) / longest), 0.25 * (high - low)
-        two = FixedLocator([round(low + inset), round(high - inset)])
-        axis.set_major_locator(MaxNLocator(count, steps=(1, 2, 5, 10), integer=True) if count > 2 else two)
+        few = [round(low + inset), round(high - inset)] if count == 2 else [round(0.5 * (low + high))]
+        axis.set_major_locator(
+            MaxNLocator(count, steps=(1, 2, 5, 10), integer=True) if count > 2 else FixedLocator(few)
+        )
         axis.pane.set_facecolor("white")
         axis.pane.set_edgecolor(FAINT)
     for artist in axes.get_children():

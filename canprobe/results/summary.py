@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
+import importlib.util
 import json
+import tempfile
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -16,15 +19,17 @@ from numpy.typing import NDArray
 from canprobe.bus.disk import read_candump, write_npz, write_text
 from canprobe.bus.port import ERR_FLAG, is_bus_error
 from canprobe.cell.cell import Cell
-from canprobe.errors import UsageError
+from canprobe.errors import UsageError, install_line
 from canprobe.planning.make import make_plan
 from canprobe.planning.measured import MeasuredTraffic, TrafficMeter
 from canprobe.planning.model import Plan
 from canprobe.results.files import save_surface_map
 from canprobe.results.scores import ShapeScore, bound_of_scan, score_contact, score_shape
 from canprobe.scene.geometry import FILE, calibration_lines, summarise_calibration, tool_text
+from canprobe.scene.load import load_scene
 from canprobe.scene.model import Scene
 from canprobe.scene.resolve import resolve
+from canprobe.scene.setup import Touch
 from canprobe.session.session import Session, write_scene
 from canprobe.session.target import VIRTUAL
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker
@@ -35,6 +40,10 @@ from canprobe.touch.surface_map import SurfaceMap
 
 if TYPE_CHECKING:
     import pandas
+    from matplotlib.figure import Figure
+
+    from canprobe.results.contacts import Contacts, OwnEstimator, Scores
+    from canprobe.results.page import Page
 
 
 # A recorded bus beside the plan of its scene.
@@ -43,13 +52,13 @@ LOG = "bus.log"
 
 
 def measure_traffic(
-    log: Path | str, scene: Scene | Plan, *, channel: str | None = None, exact: bool = True
+    log: Path | str, scene: Scene | Plan | str | Path, *, channel: str | None = None, exact: bool = True
 ) -> MeasuredTraffic:
     """Count the frames of a bus and compare them with the plan, message by message.
 
     Args:
         log: a candump log, or the folder of a run.
-        scene: the scene that ran, or its plan.
+        scene: that ran, as for `canprobe.run`, or its plan.
         channel: of the log; by default that of the scene's first bus, or the only one in the log.
         exact: count stuff bits too, which takes a few µs per frame.
 
@@ -62,7 +71,7 @@ def measure_traffic(
         PlanError: the scene does not fit its bus.
     """
     path = Path(log) / LOG if Path(log).is_dir() else Path(log)
-    plan = scene if isinstance(scene, Plan) else make_plan(resolve(scene))
+    plan = scene if isinstance(scene, Plan) else make_plan(resolve(load_scene(scene)))
     meters: dict[str, TrafficMeter] = {}
     syncs: Counter[str] = Counter()
     for t_ns, name, can_id, data in read_candump(path):
@@ -99,9 +108,9 @@ Array = NDArray[np.float64]
 SCHEMA = 1
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class RunResult:
-    """One finished run.
+    """One finished run; printed, it is its summary.
 
     That of :func:`canprobe.open_cell` is complete when its block is left: until then the drives are not disabled, the
     bus is not closed, and reading an attribute raises.
@@ -119,6 +128,7 @@ class RunResult:
         surface_map: the local patches of the online estimator, or None without a shape.
         consistency: the tests at its crossings, or None.
         out: the folder with the files, or None.
+        contacts: of the scan, as the master measured them; None without a shape.
     """
 
     plan: Plan
@@ -131,6 +141,7 @@ class RunResult:
     surface_map: SurfaceMap | None = None
     consistency: Consistency | None = None
     out: Path | None = None
+    contacts: Contacts | None = None
 
     if not TYPE_CHECKING:
 
@@ -143,6 +154,69 @@ class RunResult:
     def text(self) -> str:
         """The summary as text."""
         return summary_text(self.summary, self.out)
+
+    def __repr__(self) -> str:
+        try:
+            return self.text()
+        except UsageError:
+            return "a run that is under way; complete when the block of open_cell is left"
+
+    def plot(self) -> Figure:
+        """The figure of ``report.png``; a notebook shows it.
+
+        Raises:
+            UsageError: matplotlib is missing, or nothing was measured.
+        """
+        if importlib.util.find_spec("matplotlib") is None:
+            raise UsageError(f"plot needs matplotlib: {install_line('study')}")
+        figures = importlib.import_module("canprobe.results.figures")  # it draws results, and imports this module
+        figure: Figure = figures.run_figure(self)
+        return figure
+
+    def view(self) -> Page:
+        """The run in three dimensions, as one page that replays it: in a notebook, else in a browser.
+
+        It is ``report.html`` of the run's folder, or of a temporary one.
+
+        Raises:
+            UsageError: the extra `view` is missing.
+        """
+        from canprobe.results.page import page_of
+
+        folder = self.out
+        if folder is None:
+            folder = Path(tempfile.mkdtemp(prefix="canprobe-view-"))
+            write_files(self, folder)
+        return page_of(folder)
+
+    def score(self, *methods: str, **own: Callable[[], OwnEstimator]) -> Scores:
+        """The errors of estimators on the contacts of this scan, all asked every 0.1 s, against the plant's truth.
+
+        Example::
+
+            result.score("recursive", "ml", mine=MyEstimator)
+
+        Args:
+            methods: ours, by name; without any, those of the scene.
+            own: makes an estimator of yours, such as its class, by the name that it has in the table. It has
+                ``add(sample)``, which takes a `canprobe.ContactSample`, and ``estimate()``, which returns a
+                `canprobe.SurfaceEstimate` or None. After a loss of contact a new one is made.
+
+        Raises:
+            UsageError: nothing was scanned, no truth is known, or an unknown method.
+        """
+        from canprobe.results.contacts import score_estimators
+
+        task, scene = self.plan.setup.task, self.plan.scene
+        if self.contacts is None or not len(self.contacts) or scene.shape is None or not isinstance(task, Touch):
+            raise UsageError("score: expected a scan that touched its object, got no contacts")
+        if "kappa" not in self.truth:
+            raise UsageError("score: expected an emulated object; nothing is known of the truth")
+        start_s = float(self.contacts.t_s[0] - self.contacts.samples[0].t_s)
+        ours = {name: name for name in methods or (scene.shape.method, *scene.shape.also)}
+        return score_estimators(
+            self.contacts.samples, task, {**ours, **own}, truth=self.truth, sync_times=self.log["t_s"] - start_s
+        )
 
     def to_pandas(self, what: Literal["log", "truth", "estimates"] = "log") -> pandas.DataFrame:
         """A table of the run, by time; vectors are spread over columns, and `attrs["units"]` has every unit.

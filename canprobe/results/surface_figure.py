@@ -1,60 +1,74 @@
-"""The figure of a surface map: local patches over the true object, where passes cross, and their p-values."""
+"""The figure of a surface map: its surface over the true object, where passes cross, and their p-values."""
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
+from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import SubFigure
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from canprobe.results.picture import BLUE, FAINT, GREEN, GREY, INK, ORANGE, Part, box, legend, parts, picture
 from canprobe.results.scores import SAME_DIRECTION_RAD
 from canprobe.results.summary import RunResult
 from canprobe.scene.geometry import true_object
+from canprobe.touch.blend import REACH_M
 from canprobe.touch.consistency import LEVEL, Consistency, check_consistency
 from canprobe.touch.linear_algebra import tangent_rotation
 from canprobe.touch.shapes import PlacedShape
-from canprobe.touch.surface_map import LocalPatch, SurfaceMap
+from canprobe.touch.surface_map import SurfaceMap
 
 # What the panels of a surface figure share: the map, its tests, the true object, the plane of the scan.
 
 Array = NDArray[np.float64]
 MARGIN_M, GRID = 5e-3, 34
-"""How far a drawn surface goes beyond a path, and its points a side."""
+"""How far a true surface is drawn beyond a path, and its points a side."""
+LONG = 64
+"""Points of a map's surface along its longer side."""
 
 
 class MapView(NamedTuple):
-    """A map as seen along its mean normal; `axes` (3, 3) rows along, across, outward, `origin` (3,) its middle, m."""
+    """A map, its tests, and the plane in which both are seen; `shape` is the true object or None."""
 
     map: SurfaceMap
     consistency: Consistency
     shape: PlacedShape | None
+    plane: Plane
+
+
+class Plane(NamedTuple):
+    """The plane of a scan: `axes` (3, 3), rows along, across, outward, and `origin` (3,), the middle of the path, m."""
+
     axes: Array
     origin: Array
 
-    def plane(self, points: Array) -> Array:
-        """(n, 3) mm along, across, outward from the middle of the map."""
+    @classmethod
+    def of(cls, path: Array, normals: Array) -> Plane:
+        """Of points of a path (n, 3), m, and outward normals (m, 3) along it."""
+        middle = 0.5 * (path.min(axis=0) + path.max(axis=0))
+        outward = normals.mean(axis=0)
+        R = tangent_rotation(outward / np.linalg.norm(outward))
+        flat = (path - middle) @ R[:, :2]
+        _, _, main = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)
+        along = R[:, :2] @ main[0]
+        return cls(np.array([along, np.cross(R[:, 2], along), R[:, 2]]), middle)
+
+    def mm(self, points: Array) -> Array:
+        """Points (..., 3) of base, m, as mm along, across, outward."""
         result: Array = (points - self.origin) @ self.axes.T * 1e3
         return result
 
-
-def view_of(surface_map: SurfaceMap, consistency: Consistency, shape: PlacedShape | None) -> MapView:
-    """The view of a map with at least one patch and of its tests; `shape` is the true object or None."""
-    path = surface_map.path if len(surface_map.path) else surface_map.points
-    middle = 0.5 * (path.min(axis=0) + path.max(axis=0))
-    outward = surface_map.normals.mean(axis=0)
-    R = tangent_rotation(outward / np.linalg.norm(outward))
-    flat = (path - middle) @ R[:, :2]
-    _, _, main = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)
-    along = R[:, :2] @ main[0]
-    axes = np.array([along, np.cross(R[:, 2], along), R[:, 2]])
-    return MapView(surface_map, consistency, shape, axes, middle)
+    def base(self, mm: Array) -> Array:
+        """The way back."""
+        result: Array = 1e-3 * mm @ self.axes + self.origin
+        return result
 
 
 def rejected(consistency: Consistency) -> NDArray[np.bool_]:
@@ -62,111 +76,83 @@ def rejected(consistency: Consistency) -> NDArray[np.bool_]:
     return np.array([c.joint.p < LEVEL for c in consistency.crossings], dtype=bool)
 
 
-def true_surface(shape: PlacedShape, path: Array, axes: Array, origin: Array) -> Array:
-    """An object's surface below a path (n, 3): (3, GRID, GRID) mm along the rows of `axes` (3, 3) from `origin`."""
-    flat = (path - origin) @ axes.T
-    low, high = flat.min(axis=0) - MARGIN_M, flat.max(axis=0) + MARGIN_M
+def true_surface(shape: PlacedShape, path: Array, plane: Plane) -> Array:
+    """An object's surface below a path (n, 3): (GRID, GRID, 3) points of base, m."""
+    flat = plane.mm(path)
+    low, high = flat.min(axis=0) - 1e3 * MARGIN_M, flat.max(axis=0) + 1e3 * MARGIN_M
     us, vs = np.meshgrid(np.linspace(low[0], high[0], GRID), np.linspace(low[1], high[1], GRID))
-    above = np.stack((us, vs, np.full_like(us, high[2])), axis=-1) @ axes + origin
-    feet = np.array([shape.closest(point).point for point in above.reshape(-1, 3)])
-    result: Array = ((feet - origin) @ axes.T * 1e3).T.reshape(3, GRID, GRID)
-    return result
+    above = plane.base(np.stack((us, vs, np.full_like(us, high[2])), axis=-1))
+    return np.array([shape.closest(point).point for point in above.reshape(-1, 3)]).reshape(GRID, GRID, 3)
 
 
-# Local patches as little curved tiles over the true object.
+def map_surface(surface_map: SurfaceMap, plane: Plane) -> tuple[Array, Array]:
+    """The one surface of a map: points (rows, columns, 3) of base, m, and its σ there, m; NaN beyond its patches.
 
-TILE_M, RINGS, SECTORS = 1.8e-3, 3, 20
-"""Radius of a tile; it is drawn as rings of sectors."""
-APART_M = 2.9e-3
-"""Least distance of two tiles: where passes overlap, the best known patch stands for all."""
+    A grid over the plane of the scan, in a tenth of the time of the triangles that `SurfaceMap.mesh` finds.
+    """
+    contacts = plane.mm(surface_map.points)
+    low, high = contacts.min(axis=0)[:2] - 1e3 * REACH_M, contacts.max(axis=0)[:2] + 1e3 * REACH_M
+    counts = np.ceil(LONG * (high - low) / (high - low).max()).astype(int)
+    us, vs = np.meshgrid(*(np.linspace(*ends) for ends in zip(low, high, counts, strict=True)))
+    nearest = cKDTree(contacts[:, :2]).query(np.stack((us, vs), axis=-1))[1]
+    feet = surface_map.closest(plane.base(np.stack((us, vs, contacts[nearest, 2]), axis=-1)).reshape(-1, 3))
+    return feet.point.reshape(*us.shape, 3), feet.sigma.reshape(us.shape)
 
 
-def draw_tiles(part: Part, view: MapView) -> None:
-    """Draw tiles, coloured by the error of K or by mean curvature, path and true surface in three dimensions."""
+def add_sheet(axes: Any, corners: Array, colours: Array | str, **style: Any) -> None:
+    """Draw the cells of a grid (rows, columns, 3) that are known at all corners; a colour, or (rows, columns, 4)."""
+    cells = np.stack([corners[:-1, :-1], corners[:-1, 1:], corners[1:, 1:], corners[1:, :-1]], axis=2).reshape(-1, 4, 3)
+    known = np.isfinite(cells).all(axis=(1, 2))
+    faces = colours if isinstance(colours, str) else colours[:-1, :-1].reshape(-1, 4)[known]
+    axes.add_collection3d(Poly3DCollection(cells[known], facecolors=faces, linewidths=0, **style), autolim=False)
+    axes.auto_scale_xyz(*cells[known].reshape(-1, 3).T)
+
+
+# The surface of the map over the true object.
+
+
+def _draw_map_surface(part: Part, view: MapView) -> None:
+    """The map's one surface, coloured by its distance from the truth or by its own σ, in three dimensions."""
     part, scale = parts(part, 1, 2, width_ratios=(8, 1))
     axes = part.add_subplot(projection="3d", computed_zorder=False)
-    path = view.plane(view.map.path)
+    plane = view.plane
+    shown = ["surface: recovered, as far as its patches reach", "line: path of the contact"]
     if view.shape is not None:
-        near = true_surface(view.shape, view.map.path, view.axes, view.origin)
-        axes.plot_surface(*near, color=GREY, alpha=0.25, linewidth=0, shade=True, zorder=1)
-    patches = tiles_of(view.map)
-    values = np.array([_value(patch, view.shape) for patch in patches])
-    known = values[np.isfinite(values)]
-    norm, colours = _scale(known, from_zero=view.shape is not None), colormaps["viridis"]
-    for patch, value in zip(patches, values, strict=True):
-        face = colours(norm(value)) if math.isfinite(value) else GREY
-        grid = tile(patch)
-        x, y, z = view.plane(grid.reshape(-1, 3)).T.reshape(3, *grid.shape[:2])
-        axes.plot_surface(x, y, z, color=face, linewidth=0, shade=False, antialiased=False, zorder=2)
-    axes.plot(*path.T, color=INK, linewidth=0.5, alpha=0.55, zorder=3)
+        shown.append("light grey: true surface")
+        near = plane.mm(true_surface(view.shape, view.map.path, plane))
+        axes.plot_surface(*np.moveaxis(near, 2, 0), color=GREY, alpha=0.25, linewidth=0, shade=True, zorder=1)
+    points, sigma = map_surface(view.map, plane)
+    values, what, colours = _values(points, sigma, view.shape)
+    norm = _scale(values, signed=view.shape is not None)
+    add_sheet(axes, plane.mm(points), colours.with_extremes(bad=GREY)(norm(np.ma.masked_invalid(values))), zorder=2)
+    axes.plot(*plane.mm(view.map.path).T, color=INK, linewidth=0.5, alpha=0.55, zorder=3)
     differ = rejected(view.consistency)
     if differ.any():
-        places = np.array([c.T_base_common[:3, 3] for c in view.consistency.crossings])[differ]
-        axes.plot(*view.plane(places).T, "o", color=ORANGE, markersize=3.5, zorder=4)
-    labels = ("along the scan (mm)", "across (mm)", "outward (mm)")
-    box(part, axes, _title(view, len(patches) - len(known), bool(differ.any())), labels, elev=42, azim=-68)
-    if len(known):
-        what = "mean curvature (1/m)" if view.shape is None else "‖K − K true‖ (1/m)"
-        scale.colorbar(ScalarMappable(norm, colours), cax=scale.subplots(), label=what)
-
-
-def _scale(values: Array, *, from_zero: bool) -> Normalize:
-    if not len(values):
-        return Normalize(0.0, 1.0)
-    low = 0.0 if from_zero else float(values.min())
-    return Normalize(low, max(float(np.percentile(values, 98)), low + 1e-3))
-
-
-def _title(view: MapView, hidden: int, differ: bool) -> str:
-    shown = ["where passes overlap, the best known patch"]
-    if view.shape is not None:
-        shown.append("true surface in light grey")
-    if hidden:
-        shown.append(f"{hidden} in dark grey: not all curvature observed")
-    if differ:
         shown.append("orange: passes differ, p < 0.05")
-    return "\n".join(" · ".join(shown[i : i + 3]) for i in range(0, len(shown), 3))
+        places = np.array([c.T_base_common[:3, 3] for c in view.consistency.crossings])[differ]
+        axes.plot(*plane.mm(places).T, "o", color=ORANGE, markersize=3.5, zorder=4)
+    labels = ("along the scan (mm)", "across (mm)", "outward (mm)")
+    box(part, axes, " · ".join(shown), labels, elev=42, azim=-68)
+    scale.colorbar(ScalarMappable(norm, colours), cax=scale.subplots(), label=what)
 
 
-def tiles_of(surface_map: SurfaceMap) -> list[LocalPatch]:
-    """Patches that are drawn: the best known ones first, none nearer than `APART_M` to one before it."""
-    order = sorted(surface_map.patches, key=_badness)
-    drawn: list[LocalPatch] = []
-    for patch in order:
-        if all(np.linalg.norm(patch.point - other.point) > APART_M for other in drawn):
-            drawn.append(patch)
-    return drawn
-
-
-def _badness(patch: LocalPatch) -> float:
-    trace = float(patch.K_covariance[0, 0] + 2.0 * patch.K_covariance[1, 1] + patch.K_covariance[2, 2])
-    return trace if math.isfinite(trace) else math.inf
-
-
-def tile(patch: LocalPatch) -> Array:
-    """Points (rings + 1, sectors + 1, 3) of a disc on the patch's quadric, base frame, m."""
-    radii = np.linspace(0.0, TILE_M, RINGS + 1)[:, None]
-    angles = np.linspace(0.0, 2.0 * math.pi, SECTORS + 1)[None]
-    x, y = radii * np.cos(angles), radii * np.sin(angles)
-    local = np.stack([x, y, patch.surface.height(x, y)], axis=-1)
-    result: Array = local @ patch.T_base_contact[:3, :3].T + patch.point
-    return result
-
-
-def _value(patch: LocalPatch, shape: PlacedShape | None) -> float:
-    """Error of K against the truth, or its mean curvature; NaN where not all of it was observed."""
-    if patch.rank < 3:
-        return math.nan
-    K = 2.0 * patch.S[:2, :2]
+def _values(points: Array, sigma: Array, shape: PlacedShape | None) -> tuple[Array, str, Colormap]:
+    """Values (rows, columns) of a surface, µm, what they are, and their colours."""
     if shape is None:
-        return 0.5 * float(np.trace(K))
-    true = shape.closest(patch.point)
-    P = patch.T_base_contact[:3, :2]
-    tensor = (true.directions.T * true.kappa) @ true.directions
-    return float(np.linalg.norm(K - P.T @ tensor @ P))
+        return 1e6 * sigma, "σ of the surface's height (µm)", colormaps["viridis"]
+    above = np.full(sigma.shape, np.nan)
+    for place in zip(*np.nonzero(np.isfinite(points[:, :, 0])), strict=True):
+        above[place] = shape.nearest(tuple(points[place].tolist())).distance
+    return 1e6 * above, "above the true surface (µm)", colormaps["RdBu_r"]
 
 
-# The figure of a surface map: local patches over the true object, where passes cross, and their p-values.
+def _scale(values: Array, *, signed: bool) -> Normalize:
+    known = np.abs(values[np.isfinite(values)])
+    most = max(float(np.percentile(known, 98)), 1.0) if len(known) else 1.0
+    return Normalize(-most if signed else 0.0, most)
+
+
+# The figure of a surface map: its surface over the true object, where passes cross, and their p-values.
 
 PARTS = (("curvature", ORANGE), ("normal", BLUE), ("height", GREEN))
 
@@ -193,16 +179,18 @@ def draw_map(
     shape: PlacedShape | None = None,
     title: str = "",
 ) -> None:
-    """Draw a map: tiles over the true object, crossings in the plane of the scan, their p-values.
+    """Draw a map: its surface over the true object, crossings in the plane of the scan, their p-values.
 
     Args:
         surface_map: with at least one patch.
         path: of the PNG.
         consistency: the tests at its crossings; None for `check_consistency`, which takes a second.
-        shape: the true object, for the ghost below the tiles and for errors; None colours by mean curvature.
+        shape: the true object, for the ghost below the surface and for errors; None colours by σ.
         title: first line.
     """
-    view = view_of(surface_map, consistency or check_consistency(surface_map), shape)
+    walked = surface_map.path if len(surface_map.path) else surface_map.points
+    plane = Plane.of(walked, surface_map.normals)
+    view = MapView(surface_map, consistency or check_consistency(surface_map), shape, plane)
     crossings = len(view.consistency.crossings)
     told = (
         f"{title}\n{len(surface_map)} patches over {1e3 * surface_map.travelled[-1]:.0f} mm of path by"
@@ -210,7 +198,7 @@ def draw_map(
     )
     with picture(path, told, 7.8) as figure:
         upper, lower = parts(figure, 2, 1, height_ratios=(4, 3))
-        draw_tiles(upper, view)
+        _draw_map_surface(upper, view)
         left, *right = parts(lower, 1, 2 if crossings else 1)
         _draw_crossings(left, view)
         for part in right:
@@ -219,11 +207,11 @@ def draw_map(
 
 def _draw_crossings(part: SubFigure, view: MapView) -> None:
     axes = part.subplots()
-    path = view.plane(view.map.path)
+    path = view.plane.mm(view.map.path)
     axes.plot(path[:, 0], path[:, 1], color=FAINT, linewidth=0.9, zorder=1)
     crossings = view.consistency.crossings
     if crossings:
-        places = view.plane(np.array([c.T_base_common[:3, 3] for c in crossings]))
+        places = view.plane.mm(np.array([c.T_base_common[:3, 3] for c in crossings]))
         differ = rejected(view.consistency)
         same = np.array([not c.angle >= SAME_DIRECTION_RAD for c in crossings])
         for is_same, marker, where in ((True, "o", "same direction"), (False, "X", "other direction")):

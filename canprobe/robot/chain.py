@@ -16,7 +16,7 @@ coordinates to base.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import atan2, cos, sin
 from typing import Literal, NamedTuple
 
@@ -126,6 +126,11 @@ class Chain:
         object.__setattr__(self, "_last", (cos(before), sin(before)))
 
 
+def ending_in(chain: Chain, T_flange_tool: Array) -> Chain:
+    """The same arm with a tool, (4, 4) in its flange's frame (m), for a flange: its posture is that of the tool."""
+    return replace(chain, T_last_flange=chain.T_last_flange @ T_flange_tool)
+
+
 @dataclass(slots=True, eq=False)
 class Posture:
     """Axes and origins of a chain at some q, and its flange, in the base frame, as plain floats.
@@ -193,7 +198,7 @@ def forward(chain: Chain, q: npt.ArrayLike) -> Array:
     Returns:
         (4, 4) T_base_flange, m.
     """
-    return _pose(posture(chain, q))
+    return pose_of(posture(chain, q))
 
 
 def forward_jacobian(chain: Chain, q: npt.ArrayLike, T_flange_tool: Array) -> tuple[Array, Array]:
@@ -209,52 +214,29 @@ def forward_jacobian(chain: Chain, q: npt.ArrayLike, T_flange_tool: Array) -> tu
         velocity (rad/s), per rate of each joint (rad/s or m/s).
     """
     at = posture(chain, q)
-    T_base_tool = _pose(at) @ T_flange_tool
-    x, y, z = point_jacobian(at, tuple(T_base_tool[:3, 3].tolist()))
-    turns = at.axes
-    if True in at.prismatic:
-        turns = [(0.0, 0.0, 0.0) if slides else axis for axis, slides in zip(turns, at.prismatic, strict=True)]
-    a, b, c = zip(*turns, strict=True)
-    return T_base_tool, np.array((*x, *y, *z, *a, *b, *c)).reshape(6, -1)
+    T_base_tool = pose_of(at) @ T_flange_tool
+    return T_base_tool, jacobian(at, tuple(T_base_tool[:3, 3].tolist()))
 
 
-def point_jacobian(at: Posture, point: Vec) -> tuple[list[float], list[float], list[float]]:
-    """Velocity of a point fixed to the flange, per joint rate.
+def jacobian(at: Posture, point: Vec) -> Array:
+    """Geometric Jacobian of a point fixed to the flange.
 
     Args:
         at: the evaluated chain.
         point: the point now, base frame, m.
 
     Returns:
-        Rows x, y and z (n,) in the base frame, m/s per rad/s or m/s.
+        (6, n) J in the base frame, see `forward_jacobian`.
     """
     px, py, pz = point
-    row_x: list[float] = []
-    row_y: list[float] = []
-    row_z: list[float] = []
+    flat: list[float] = []
     for (ax, ay, az), (ox, oy, oz), slides in zip(at.axes, at.origins, at.prismatic, strict=True):
         if slides:
-            row_x.append(ax)
-            row_y.append(ay)
-            row_z.append(az)
+            flat += (ax, ay, az, 0.0, 0.0, 0.0)
             continue
         dx, dy, dz = px - ox, py - oy, pz - oz
-        row_x.append(ay * dz - az * dy)
-        row_y.append(az * dx - ax * dz)
-        row_z.append(ax * dy - ay * dx)
-    return row_x, row_y, row_z
-
-
-def point_on_flange(at: Posture, offset: Vec) -> Vec:
-    """Place of a point fixed to the flange, base frame, m.
-
-    Args:
-        at: the evaluated chain.
-        offset: of the point in the flange frame, m.
-    """
-    a, b, d = offset
-    (x0, x1, x2), (y0, y1, y2), (z0, z1, z2), (p0, p1, p2) = at.x, at.y, at.z, at.flange
-    return p0 + x0 * a + y0 * b + z0 * d, p1 + x1 * a + y1 * b + z1 * d, p2 + x2 * a + y2 * b + z2 * d
+        flat += (ay * dz - az * dy, az * dx - ax * dz, ax * dy - ay * dx, ax, ay, az)
+    return np.array(flat).reshape(-1, 6).T
 
 
 def point_velocity(at: Posture, point: Vec, qd: npt.ArrayLike) -> Vec:
@@ -297,7 +279,8 @@ def link_transforms(chain: Chain, q: npt.ArrayLike) -> list[Array]:
     return [chain.fixed[0] @ links[0], *links[1:]]
 
 
-def _pose(at: Posture) -> Array:
+def pose_of(at: Posture) -> Array:
+    """(4, 4) T_base_flange, m, of an evaluated chain."""
     (x0, x1, x2), (y0, y1, y2), (z0, z1, z2), (p0, p1, p2) = at.x, at.y, at.z, at.flange
     flat = (x0, y0, z0, p0, x1, y1, z1, p1, x2, y2, z2, p2, 0.0, 0.0, 0.0, 1.0)  # nested ones take numpy longer
     return np.array(flat).reshape(4, 4)

@@ -18,7 +18,7 @@ from os.path import isfile  # False where the system refuses a name, as `Path.is
 from pathlib import Path
 from typing import Any
 
-from canprobe.errors import SceneError
+from canprobe.errors import SceneError, UsageError
 from canprobe.robot.urdf import with_meshes_found
 from canprobe.scene.checks import MismatchError, Only, ScenePath, choices_of, conditions_of, convert
 from canprobe.scene.hardware import CellInfo
@@ -28,7 +28,7 @@ from canprobe.scene.rules import SECTIONS_OF_TASK, broken_rules
 DEFAULT_CELL = "puma260"
 """Cell of a scene that names none."""
 _ALWAYS = ("scene", "task", "bus", "cycle", "limits", "bring_up")
-FILE_KEYS = {"array", "calibration", "eds", "urdf", "true_cell"}
+FILE_KEYS = {"array", "calibration", "eds", "file", "urdf", "true_cell"}
 """Keys whose files a saved scene takes along."""
 SAVED_AS = "scene.toml"
 """Name of a saved scene."""
@@ -128,24 +128,80 @@ def _escaped(character: str) -> str:
     return f"\\u{ord(character):04X}" if ord(character) < 0x20 or ord(character) == 0x7F else character
 
 
-def load_scene(name_or_path: str | Path, cell: str | Path | None = None) -> Scene:
-    """Read a scene.
+def load_scene(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
+    """Read a scene, or change one.
 
     Args:
-        name_or_path: a packaged scene's name, such as `cylinder`, or the path of a TOML file. A cell stands for a scene
-            that moves its arm freely.
-        cell: name or path of the cell, in the place of the scene's own.
+        scene: a packaged scene's name, such as `cylinder`, the path of a TOML file, or a scene. A cell stands for a
+            scene that moves its arm freely.
+        overrides: values in the place of the scene's, by key as a file has them: `{"task.force_n": 3}`. They are
+            checked as those of a file are. None takes a key away, so that its default holds; a table takes the place
+            of a whole section; `{"cell": "puma560"}` names another cell.
 
     Raises:
         SceneError: with every problem found, each with file, key path, what was expected and what was got.
+        UsageError: this is no scene, or these are no overrides.
     """
-    name = str(name_or_path)
-    packaged = packaged_files("scenes")
-    if name not in packaged and name in packaged_files("cells"):
-        packaged = packaged_files("cells")
-    path = find_file(name, packaged, "scene")
-    file = path.name if name in packaged else name
-    return _scene(read_toml(path, file), file, path.parent, cell)
+    if isinstance(scene, Scene):
+        if not overrides:
+            return scene
+        own, file, folder = parse_toml(dump_scene(scene), scene.name), scene.name, None
+    elif isinstance(scene, str | Path):
+        name = str(scene)
+        packaged = packaged_files("scenes")
+        if name not in packaged and name in packaged_files("cells"):
+            packaged = packaged_files("cells")
+        path = find_file(name, packaged, "scene")
+        file, folder = path.name if name in packaged else name, path.parent
+        own = read_toml(path, file)
+    else:
+        raise UsageError(f"scene: expected a packaged name, the path of a TOML file or a Scene, got {scene!r}")
+    if overrides:
+        own, file = _with_overrides(own, overrides, file), f"{file} as changed"
+    return _scene(own, file, folder)
+
+
+def _with_overrides(own: Mapping[str, Any], overrides: Mapping[str, Any], file: str) -> dict[str, Any]:
+    """A document with values put in by key path."""
+    if not isinstance(overrides, Mapping):
+        raise UsageError(f'overrides: expected values by key such as {{"task.force_n": 3}}, got {overrides!r}')
+    if "cell" in overrides and isinstance(own.get("cell"), dict):
+        other = toml_value(_as_toml(overrides["cell"]))
+        raise SceneError([f"{file}: cell: the scene describes its cell itself, got {other} in its place"])
+    changed = dict(own)
+    for path, value in overrides.items():
+        *sections, key = _key_path(path)
+        table = changed
+        for name in sections:
+            within = table.get(name)
+            table[name] = dict(within) if isinstance(within, dict) else {}
+            table = table[name]
+        if value is None:
+            table.pop(key, None)
+        else:
+            table[key] = _as_toml(value)
+    return changed
+
+
+def _key_path(path: str) -> list[str]:
+    """The keys of a dotted path, as TOML reads it."""
+    try:
+        table, keys = tomllib.loads(f"{path} = 0"), []
+    except ValueError:
+        raise UsageError(f"overrides: expected a key such as task.force_n, got {path!r}") from None
+    while isinstance(table, dict):
+        (key, table), *_ = table.items()
+        keys.append(key)
+    return keys
+
+
+def _as_toml(value: Any) -> Any:
+    """A value of Python, numpy or pathlib as `tomllib` would have read it."""
+    if isinstance(value, Mapping):
+        return {key: _as_toml(item) for key, item in value.items()}
+    if isinstance(value, Path):
+        return str(value)
+    return value.tolist() if hasattr(value, "tolist") else value
 
 
 def load_cell(name_or_path: str | Path) -> dict[str, Any]:
@@ -249,7 +305,7 @@ def parse_scene(text: str, *, file: str = "scene", folder: Path | None = None) -
     Raises:
         SceneError: with every problem found.
     """
-    return _scene(parse_toml(text, file), file, folder, None)
+    return _scene(parse_toml(text, file), file, folder)
 
 
 def read_toml(path: Path, file: str) -> dict[str, Any]:
@@ -274,7 +330,7 @@ def parse_toml(text: str, file: str) -> dict[str, Any]:
         raise SceneError([f"{file}: not valid TOML: {error}"]) from error
 
 
-def _scene(own: Mapping[str, Any], file: str, folder: Path | None, cell: str | Path | None) -> Scene:
+def _scene(own: Mapping[str, Any], file: str, folder: Path | None) -> Scene:
     """The scene in a document, with what its cell says and the sections that its task has by default.
 
     Everything is checked together.
@@ -286,7 +342,7 @@ def _scene(own: Mapping[str, Any], file: str, folder: Path | None, cell: str | P
     needs = SECTIONS_OF_TASK.get(kind, {}) if isinstance(kind, str) else {}
     defaults = [section for section, (need, _) in needs.items() if need == "default"]
     unused = [section for section, (need, _) in needs.items() if need in ("never", "may")]
-    document = _with_array(_with_cell(own, file, folder, cell, unused), folder)
+    document = _with_array(_with_cell(own, file, folder, unused), folder)
     reader = Reader(folder)
     values = reader.read(Scene, document, (*_ALWAYS, *defaults))
     for section, (need, why) in needs.items():
@@ -315,19 +371,14 @@ def _free_scene(cell: Mapping[str, Any]) -> dict[str, Any]:
     return {"scene": {"name": name}, "task": {"kind": "free"}, **used}
 
 
-def _with_cell(
-    own: Mapping[str, Any], file: str, folder: Path | None, cell: str | Path | None, unused: Iterable[str]
-) -> dict[str, Any]:
+def _with_cell(own: Mapping[str, Any], file: str, folder: Path | None, unused: Iterable[str]) -> dict[str, Any]:
     """A scene's document over that of its cell, key by key; without the cell's sections that its task does not use."""
     named = own.get("cell", DEFAULT_CELL)
     if isinstance(named, dict):
-        if cell is not None:
-            raise SceneError([f"{file}: cell: the scene describes its cell itself, got {cell} in its place"])
         return dict(own)
     if not isinstance(named, str):
         raise SceneError([f"{file}: cell: expected the name or the path of a cell, got {toml_value(named)}"])
-    if cell is None:
-        cell = folder / named if folder is not None and isfile(folder / named) else named
+    cell = folder / named if folder is not None and isfile(folder / named) else named
     hardware = {name: table for name, table in load_cell(cell).items() if name not in unused}
     return _merged(hardware, {name: table for name, table in own.items() if name != "cell"})
 
@@ -393,7 +444,7 @@ class Reader:
         sections, needed = typing.get_type_hints(file), set(needed)
         for name in document:
             if name not in sections:
-                self.complain(name, f"unknown section{_did_you_mean(name, sections)}")
+                self.complain(name, f"unknown section{_did_you_mean_key(name, sections)}")
         return {
             name: self._named(hint, document.get(name, {}), name)
             if typing.get_origin(hint) is Mapping
@@ -462,6 +513,13 @@ class Reader:
             self.complain(path, f'only with {only.key} = {needed}, got {only.key} = "{actual}"')
         elif not given and only.required and actual in only.values:
             self.complain(path, f'missing: {only.key} = "{actual}" needs it')
+
+
+def _did_you_mean_key(got: str, sections: Mapping[str, Any]) -> str:
+    """For an unknown section: the section of a key of that name, or the nearest section."""
+    classes = {name: next(iter(typing.get_args(hint)), hint) for name, hint in sections.items()}
+    keys = [f"{name}.{got}" for name, cls in classes.items() if got in getattr(cls, "__dataclass_fields__", {})]
+    return f"; did you mean {' or '.join(keys)}?" if keys else _did_you_mean(got, sections)
 
 
 def _did_you_mean(got: str, known: Iterable[str]) -> str:

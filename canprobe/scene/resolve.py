@@ -29,7 +29,7 @@ from canprobe.scene.model import (
     TaskSettings,
     WireSettings,
 )
-from canprobe.scene.rules import image_format, need_scene
+from canprobe.scene.rules import image_format
 from canprobe.scene.setup import (
     Approach,
     Arm,
@@ -71,10 +71,8 @@ def resolve(scene: Scene) -> Setup:
         scene: as `load_scene` gave it, or changed since.
 
     Raises:
-        UsageError: the argument is not a scene.
         PlanError: the scene describes an object without a surface.
     """
-    need_scene(scene)
     arm, bodies = _arm(scene)
     settings = scene.probe or ProbeSettings()
     array = _array(scene, settings.radius_mm * MM, settings.stiffness_n_m3)

@@ -1,21 +1,17 @@
-"""Which parts of a scene go together: sections and kinds of task, rules across keys, and checked new values."""
+"""Which parts of a scene go together: sections and kinds of task, rules across keys, and what a plan chose."""
 
 from __future__ import annotations
 
 import math
 import tomllib
-import typing
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any
 
-import numpy as np
-
-from canprobe.errors import ProtocolError, UsageError
+from canprobe.errors import ProtocolError
 from canprobe.protocol.raw_image import FramePattern, ImageFormat
 from canprobe.protocol.tactile import SIDE
 from canprobe.robot.chain import MOST_JOINTS
-from canprobe.scene.checks import MismatchError, convert
 from canprobe.scene.hardware import JointSettings
 from canprobe.scene.model import TOUCH_KINDS, Scene, WireSettings
 
@@ -283,41 +279,6 @@ def broken_rules(lookup: Callable[[str], Any]) -> Iterator[tuple[str, str]]:
             continue
         if all(value is not None or key.endswith("?") for key, value in zip(keys, values, strict=True)):
             yield from rule(*values)
-
-
-# What a caller puts in the place of a scene's own values: checked as those of a scene file are.
-
-_Section = TypeVar("_Section")
-
-
-def need_scene(scene: object) -> None:
-    """Complain about anything else in the place of a scene, such as its name.
-
-    Raises:
-        UsageError: with what was got.
-    """
-    if not isinstance(scene, Scene):
-        raise UsageError(f"scene: expected what canprobe.load_scene returns, got {scene!r}")
-
-
-def with_values(section: _Section, **values: object) -> _Section:
-    """A section of a scene with some of its values replaced.
-
-    Args:
-        section: one of the dataclasses of `canprobe.scene`.
-        values: by key, numbers of numpy too; None keeps what the section has.
-
-    Raises:
-        UsageError: naming the key, what was expected and what was got.
-    """
-    annotations, changes = typing.get_type_hints(type(section), include_extras=True), {}
-    for key, value in values.items():
-        if value is not None:
-            try:
-                changes[key] = convert(value.item() if isinstance(value, np.generic) else value, annotations[key])
-            except MismatchError as mismatch:
-                raise UsageError(f"{key}: expected {mismatch}, got {value!r}") from None
-    return replace(section, **changes) if changes else section  # type: ignore[type-var]  # a dataclass, as all are
 
 
 def with_choices(scene: Scene, choices: Mapping[str, str]) -> Scene:

@@ -241,7 +241,7 @@ def calibrate(
 
 def _scene(request: Request) -> Scene:
     """A press on the cell; without a time on the wire where it is emulated in lockstep."""
-    scene = load_scene("press", request.cell)
+    scene = load_scene("press", {"cell": request.cell})
     if request.target is not None:
         scene = request.target.applied_to(scene)
     bus = replace(scene.bus, timed=False) if scene.bus.interface == LOCKSTEP else scene.bus

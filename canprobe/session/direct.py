@@ -25,6 +25,7 @@ from canprobe.cell.cycle import Cycle
 from canprobe.cell.drives import DriveCommand, DriveGroup
 from canprobe.emulator.array import TactileApplication
 from canprobe.emulator.drive.drive import DriveApplication
+from canprobe.emulator.node.core import NodeCore
 from canprobe.emulator.node.dictionary import Dictionary, SdoAbort, nothing
 from canprobe.emulator.node.rpdo_tpdo import Rpdo
 from canprobe.emulator.node.slave_node import SlaveNode
@@ -57,8 +58,9 @@ class DirectNodes:
         self._setups = {setup.node_id: setup for setup in make_setups(plan)}
         self._hear = hear
         self._see = see
-        self._rpdos: dict[int, list[tuple[SlaveNode, Rpdo]]] = {}
+        self._rpdos: dict[int, list[tuple[NodeCore, Rpdo]]] = {}
         self._drives = plan.setup.arm.node_ids if plan.setup.arm is not None else ()
+        self._stations = [(node.core, node.pdos.exchange, node.node_id in self._drives) for node in world.nodes]
         self._shape = plan.setup.array.pad.shape if plan.setup.array is not None else (0, 0)
         self._plan = plan
 
@@ -81,7 +83,7 @@ class DirectNodes:
         for node_id in self._drives:
             for pdo in self._plan.pdos_of(node_id, "rpdo"):
                 rpdo = by_id[node_id].pdos.rpdo(pdo.cob_id)
-                self._rpdos.setdefault(pdo.cob_id, []).append((by_id[node_id], rpdo))
+                self._rpdos.setdefault(pdo.cob_id, []).append((by_id[node_id].core, rpdo))
 
     def advance(self, t_ns: int) -> None:
         """Let every node do what is due up to and at `t_ns`, in the order of time."""
@@ -102,11 +104,10 @@ class DirectNodes:
             counter: of the SYNC; 0 where it has none.
             take: called with the COB-ID of each TPDO of a drive, its values, and when.
         """
-        for node in self._nodes:
-            core = node.core
+        for core, exchange, of_drive in self._stations:
             core.now_ns = t_ns
-            filled = node.pdos.exchange(t_ns, counter)
-            if node.node_id in self._drives:
+            filled = exchange(t_ns, counter)
+            if of_drive:
                 for cob_id, values in filled:
                     take(cob_id, values, t_ns)
             if core.out:
@@ -118,8 +119,8 @@ class DirectNodes:
     def command(self, commands: Sequence[DriveCommand], t_ns: int) -> None:
         """RPDOs, whose parts go to one drive each."""
         for cob_id, _, parts in commands:
-            for (node, rpdo), values in zip(self._rpdos[cob_id], parts, strict=True):
-                node.core.now_ns = t_ns
+            for (core, rpdo), values in zip(self._rpdos[cob_id], parts, strict=True):
+                core.now_ns = t_ns
                 rpdo.take(values)
 
     def _pass_on(self, frames: Sequence[Frame], t_ns: int) -> None:

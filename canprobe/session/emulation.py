@@ -17,7 +17,7 @@ from canprobe.errors import NodeError, UsageError
 from canprobe.protocol.frames import UNCONFIGURED
 from canprobe.scene.model import Scene
 from canprobe.session.links import Expected, check_links, data_bitrate
-from canprobe.session.session import Say, quiet, rehearse, resolve_scene
+from canprobe.session.session import Say, quiet, rehearse
 from canprobe.session.target import Target
 
 if TYPE_CHECKING:
@@ -61,10 +61,12 @@ def emulate(
     """
     from canprobe.emulator.world import make_world
     from canprobe.planning.make import make_plan
+    from canprobe.scene.load import load_scene
     from canprobe.scene.resolve import resolve
 
+    scene = load_scene(scene, {} if seed is None else {"scene.seed": seed})
     of_scene = replace(target, channel=scene.bus.channel, others={})  # who is on which bus is the scene's
-    plan = make_plan(resolve(resolve_scene(scene, of_scene, seed=seed)))
+    plan = make_plan(resolve(of_scene.applied_to(scene)))
     names = {scene.bus.channel: target.channel, **target.others}
     placed = {n.node_id: names.get(n.channel, target.channel) for n in plan.nodes if n.node_id in node_ids}
     array = plan.setup.array

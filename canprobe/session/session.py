@@ -36,9 +36,8 @@ from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO
 from canprobe.scene.load import with_files_beside
 from canprobe.scene.model import BridgeSettings, Scene
 from canprobe.scene.resolve import resolve
-from canprobe.scene.rules import need_scene, with_values
 from canprobe.session.links import check_links, data_bitrate, expected_of, need_controllers
-from canprobe.session.target import LOCKSTEP, VIRTUAL, Target
+from canprobe.session.target import LOCKSTEP, VIRTUAL
 from canprobe.tasks.from_plan import make_task
 
 if TYPE_CHECKING:
@@ -151,34 +150,15 @@ def quiet(_: str) -> None:
     """Report nothing."""
 
 
-def resolve_scene(
-    scene: Scene,
-    target: Target | None = None,
-    *,
-    seed: int | None = None,
-    duration_s: float | None = None,
-    bridge: Sequence[str] = (),
-) -> Scene:
-    """The scene on another bus, and with what the caller put in the place of its own values; bridges are added.
-
-    Raises:
-        UsageError: this is no scene, or a value is none that its file could have.
-    """
-    need_scene(scene)
-    info = with_values(scene.scene, seed=seed)
-    task = with_values(scene.task, duration_s=duration_s)
-    scene = replace(scene, scene=info, task=task, bridge=_with_bridges(scene.bridge, bridge))
-    return scene if target is None else target.applied_to(scene)
-
-
-def _with_bridges(settings: BridgeSettings | None, names: Sequence[str]) -> BridgeSettings | None:
-    """The section with more bridges in use; an unknown one is a `UsageError`."""
+def with_bridges(scene: Scene, names: Sequence[str]) -> Scene:
+    """The scene with more bridges in use; an unknown one is a `UsageError`."""
     if not names:
-        return settings
+        return scene
     names = (names,) if isinstance(names, str) else names
     check_bridges(names)
-    known = settings or BridgeSettings()
-    return replace(known, use=tuple(dict.fromkeys((*known.use, *names))))  # type: ignore[arg-type]
+    known = scene.bridge or BridgeSettings()
+    use: Any = tuple(dict.fromkeys((*known.use, *names)))
+    return replace(scene, bridge=replace(known, use=use))
 
 
 def write_scene(scene: Scene, folder: Path) -> None:
@@ -439,7 +419,10 @@ class Session:
             (self.out / "bus.log").unlink(missing_ok=True)
         self._stack.callback(self._keep_truth)
         self._direct = partial(DirectCycle, world=self.world)
-        return LockstepBus(VirtualClock(), self.plan.buses[0].channel).port()
+        clock = VirtualClock()
+        nobody = LockstepBus(clock, self.plan.buses[0].channel)
+        clock.detach(nobody)
+        return nobody.port()
 
     def _open_lockstep(self) -> Port:
         self._need_emulated("a lockstep bus has")

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from canprobe.errors import UsageError
+from canprobe.scene.load import load_scene
 from canprobe.scene.model import DIRECT, Scene
-from canprobe.scene.rules import need_scene, with_values
 
 LOCKSTEP = "lockstep"
 VIRTUAL = frozenset({LOCKSTEP, DIRECT})
@@ -34,7 +34,7 @@ class Target:
     def over(
         cls,
         scene: Scene,
-        interface: str | None = None,
+        bus: str | None = None,
         channel: str | Mapping[str, str] | None = None,
         bitrate: int | None = None,
     ) -> Target:
@@ -42,20 +42,20 @@ class Target:
 
         Args:
             scene: whose.
-            interface, bitrate: in the place of the scene's.
+            bus, bitrate: in the place of the scene's interface and bit rate.
             channel: in the place of `bus.channel`; or what stands for each channel that the scene names.
 
         Raises:
-            UsageError: this is no scene, it names no such channel, or a value is none that its file could have.
+            UsageError: the scene names no such channel, or a value is none that its file could have.
         """
-        need_scene(scene)
         others = dict(channel) if isinstance(channel, Mapping) else {}
         if unknown := sorted(str(name) for name in others if name not in scene.channels):
             raise UsageError(f"channel: the scene has no channel {unknown[0]}, only {', '.join(scene.channels)}")
-        others = {name: with_values(scene.bus, channel=new).channel for name, new in others.items()}
+        others = {name: load_scene(scene, {"bus.channel": new}).bus.channel for name, new in others.items()}
         main = others.pop(scene.bus.channel, None) if isinstance(channel, Mapping) else channel
-        bus = with_values(scene.bus, interface=interface, channel=main, bitrate=bitrate)
-        return cls(bus.interface, bus.channel, bus.bitrate, others)
+        given = {"bus.interface": bus, "bus.channel": main, "bus.bitrate": bitrate}
+        settings = load_scene(scene, {key: value for key, value in given.items() if value is not None}).bus
+        return cls(settings.interface, settings.channel, settings.bitrate, others)
 
     def applied_to(self, scene: Scene) -> Scene:
         """The scene on this bus."""

@@ -12,7 +12,7 @@ from canprobe.planning.make import make_plan
 from canprobe.scene.model import Scene
 from canprobe.scene.resolve import resolve
 from canprobe.session.children import Bridges
-from canprobe.session.session import Say, Session, quiet, resolve_scene
+from canprobe.session.session import Say, Session, quiet, with_bridges
 from canprobe.session.target import need_real_bus
 from canprobe.tasks.from_plan import make_task
 from canprobe.tasks.untouched import Answer
@@ -38,7 +38,7 @@ def up(scene: Scene, *, bridge: Sequence[str] = (), say: Say = quiet) -> None:
         BusError, SafetyStop: as :func:`canprobe.run`.
     """
     need_real_bus(scene, "up")
-    plan = make_plan(resolve(resolve_scene(scene, bridge=bridge)))
+    plan = make_plan(resolve(with_bridges(scene, bridge)))
     with Bridges(plan, None, virtual=False, say=say) as bridges:
         session = Session(plan, None, say, bridges.observers, ROWS_OF_UP)
         with reporting_notes(session, say) as report_news:

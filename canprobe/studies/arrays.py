@@ -274,7 +274,10 @@ def findings(rows: Sequence[Row]) -> list[str]:
 
 def draw_arrays(rows: Sequence[Row], path: Path) -> None:
     """The three errors of each array beside their goals."""
-    with picture(path, "Calibrated by forty touches: errors on arrays drawn at random; lines: goals", 3.6) as figure:
+    title = (
+        "What a calibration by forty touches leaves: error of each of some emulated arrays, drawn at random; line: goal"
+    )
+    with picture(path, title, 3.6) as figure:
         for axes, (key, goal) in zip(figure.subplots(1, 3), GOALS.items(), strict=True):
             axes.bar([str(row["array"]) for row in rows], [abs(row[key]) for row in rows], color=BLUE)
             axes.axhline(goal, color=INK, linewidth=0.8)

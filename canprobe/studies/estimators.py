@@ -243,9 +243,10 @@ def draw_estimators(rows: Sequence[Row], path: Path) -> None:
     surfaces = list(dict.fromkeys(r["surface"] for r in rows))
     noises = list(dict.fromkeys((r["sigma_point_um"], r["sigma_normal_mrad"]) for r in rows))
     title = (
-        "Error of local curvature against the time of one tactile frame with an answer\n"
+        "Error of local curvature against the time of one tactile frame with an answer; lower left is better\n"
         "marker size: window of 40, 80, 160, 320 samples (5–40 mm of path); no marker: not observed\n"
-        "dotted: Cramér–Rao bound of each window, and of all 480 samples (the memory of recursive fades)"
+        "dotted: Cramér–Rao bound of each window, and of all 480 samples (the memory of recursive fades)\n"
+        "lag: samples between the two of a difference"
     )
     with picture(path, title, 1.1 + 2.7 * len(surfaces)) as figure:
         grid = figure.subplots(len(surfaces), len(noises), squeeze=False, sharex=True, sharey=True)

@@ -135,7 +135,10 @@ BIN_N, FEW = 0.05, 20
 def draw_faults(runs: Sequence[Mapping[str, Any]], path: Path) -> None:
     """How the runs with each kind of fault ended, and the true force over all runs."""
     failed = sum(bool(one["failures"]) for one in runs)
-    title = f"{len(runs)} runs with random faults of nodes and links, {failed} failed; in brackets: runs with the fault"
+    title = (
+        f"How {len(runs)} runs with random faults of nodes and links ended; in brackets: runs with the fault\n"
+        f"{failed} failed: they hung or crashed, or force, motion, power or log were not as promised"
+    )
     of_kind = {kind.value: [one["outcome"] for one in runs if kind.value in one["kinds"]] for kind in FaultKind}
     found = {f"{kind} ({len(ends)})": ends for kind, ends in of_kind.items() if ends}
     forces = [one["force_max_n"] for one in runs if one["force_bound_n"] is not None]
@@ -168,7 +171,11 @@ def draw_faults(runs: Sequence[Mapping[str, Any]], path: Path) -> None:
 def draw_ends(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """How long the master took to end, by what happened on vcan0."""
     kinds = list(dict.fromkeys(row["fault"] for row in rows))
-    with picture(path, "How long the master took to end, by what happened on vcan0", 1.6 + 0.25 * len(kinds)) as figure:
+    title = (
+        "How long the master took to end after processes were killed or stopped, or the link failed, on vcan0\n"
+        "failed: it hung, or nodes moved or were enabled afterwards"
+    )
+    with picture(path, title, 1.8 + 0.25 * len(kinds)) as figure:
         axes = figure.subplots()
         for colour, mark, label, failed in ((BLUE, "o", "no failure", False), (ORANGE, "X", "failed", True)):
             some = [row for row in rows if bool(row["failures"]) == failed]

@@ -27,11 +27,9 @@ from canprobe.bus.port import MonotonicClock, Port
 from canprobe.bus.socketcan import check_interface
 from canprobe.errors import CanprobeError
 from canprobe.protocol.cia402 import POWERED_STATES, DriveState, state_of
-from canprobe.scene.load import dump_scene
+from canprobe.scene.load import dump_scene, load_scene
 from canprobe.scene.model import Scene
 from canprobe.session.children import EmulatorChild
-from canprobe.session.session import resolve_scene
-from canprobe.session.target import Target
 from canprobe.studies.faults import draw_ends, scenario_scene
 from canprobe.studies.harness import CHANNEL, Column, Row, StudyResult, measuring_facts
 from canprobe.studies.realtime_cases import LATE_PERCENT, patient, with_real_nodes
@@ -120,8 +118,8 @@ def findings(rows: Sequence[Mapping[str, object]]) -> list[str]:
 def served_scene() -> Scene:
     """A press whose nodes are a separate process, which outlives the master."""
     scene = scenario_scene(SCENARIO, True)
-    scene = resolve_scene(scene, Target.over(scene, "socketcan", CHANNEL), duration_s=HOLD_S)
-    return patient(scene, MISSED_SYNCS)
+    on_bus = {"bus.interface": "socketcan", "bus.channel": CHANNEL, "task.duration_s": HOLD_S}
+    return patient(load_scene(scene, on_bus), MISSED_SYNCS)
 
 
 def row_of(case: ProcessCase) -> Row:

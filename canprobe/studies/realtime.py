@@ -158,7 +158,10 @@ def draw_realtime(measured: Sequence[Measured], path: Path) -> None:
     """Lateness of SYNC, computing time, answer latency, and held over asked rate."""
     scan, plain, bare = measured[:3]
     rate, seconds = f"{scan.rate_hz:g} Hz", f"{scan.times.seconds:.0f} s"
-    title = f"{rate} on a real SocketCAN interface, {seconds}, emulated nodes beside it; from a microsecond up"
+    title = (
+        f"How well the cycle keeps time: {rate} on a real SocketCAN interface for {seconds}, emulated nodes beside it\n"
+        "histograms: all cycles, from a microsecond up; lower right: cycles a second that were reached"
+    )
     with picture(path, title, 6.6) as figure:
         panels = parts(figure, 2, 2)
         late = {"canprobe": scan, "plain canopen": plain, "a loop that does nothing": bare}

@@ -29,8 +29,7 @@ from canprobe.scene.load import load_scene
 from canprobe.scene.model import Scene, TactileModeName
 from canprobe.scene.resolve import resolve
 from canprobe.session.children import EmulatorChild
-from canprobe.session.session import Session, resolve_scene
-from canprobe.session.target import Target
+from canprobe.session.session import Session
 from canprobe.studies.harness import CHANNEL, on_any_bitrate
 from canprobe.tasks.from_plan import make_task
 
@@ -201,9 +200,8 @@ def with_real_nodes(scene: Scene) -> Scene:
 
 def _scene(seconds: float | None = None) -> Scene:
     """The scene `cylinder`, patient; with real-time priority and locked memory where they are permitted."""
-    scene = load_scene("cylinder")
-    scene = resolve_scene(scene, Target.over(scene, "socketcan", CHANNEL), duration_s=seconds)
-    return replace(patient(scene), cycle=replace(scene.cycle, realtime=True))
+    on_bus = {"bus.interface": "socketcan", "bus.channel": CHANNEL, "cycle.realtime": True}
+    return patient(load_scene("cylinder", on_bus if seconds is None else {**on_bus, "task.duration_s": seconds}))
 
 
 def patient(scene: Scene, missed_syncs: int = MISSED_SYNCS) -> Scene:

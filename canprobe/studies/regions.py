@@ -32,7 +32,7 @@ from canprobe.results.scores import RUN_IN_M, curvature_tensor
 from canprobe.scene.load import load_scene
 from canprobe.scene.model import ObjectSettings, PlantSettings, Scene
 from canprobe.scene.resolve import LAYER_N_M3, resolve
-from canprobe.session.session import Session, resolve_scene
+from canprobe.session.session import Session
 from canprobe.studies.harness import CHI2_95_OF_3, FROBENIUS, Array, Column, Row, StudyResult, measuring_facts
 from canprobe.studies.sweep import Sweep
 from canprobe.tasks.from_plan import make_task
@@ -178,8 +178,7 @@ def measure(case: Case) -> Scan:
     if name == "random":
         scene = random_scene(seed, duration)
     else:
-        scene = resolve_scene(load_scene(name), seed=seed, duration_s=duration)
-        scene = replace(scene, shape=None if scene.shape is None else replace(scene.shape, also=()))
+        scene = load_scene(name, {"scene.seed": seed, "task.duration_s": duration, "shape.also": []})
     assert scene.object is not None and scene.sensor is not None
     words = scene.object.kind, scene.task.strategy, scene.sensor.full_scale_kpa
     try:
@@ -275,8 +274,9 @@ def draw_regions(rows: Sequence[Row], path: Path) -> None:
     """Coverage, and stated deviation over error, with their intervals."""
     names = list(dict.fromkeys(r["of"] for r in rows))
     title = (
-        "The online estimator with the whole sensor on: share of its 95 % regions that hold the truth, and stated\n"
-        "deviation over error; bars: 95 % of draws of the scenes; shade: target"
+        "Whether the online estimator knows its error: how often its 95 % regions hold the true curvature,\n"
+        "and the standard deviation that it states over its RMS error (above 1: cautious)\n"
+        "by object, over all, by full scale of the array (kPa) and by path; bars: 95 % over scenes; shade: target"
     )
     with picture(path, title, 4.4) as figure:
         left, right = figure.subplots(1, 2)

@@ -148,7 +148,8 @@ def _growth(samples: Sequence[Row], name: str) -> float:
 
 def draw_soak(samples: Sequence[Row], path: Path) -> None:
     """Memory, answer latency and overruns over time."""
-    with picture(path, f"The cell held for {samples[-1]['t_s']:.0f} s on vcan0", 6.6) as figure:
+    title = f"The cell held for {samples[-1]['t_s']:.0f} s on vcan0: memory, answer time, losses"
+    with picture(path, title, 6.6) as figure:
         panels = parts(figure, 3, 1)
         memory, latency, lost = (part.subplots() for part in panels)
         minutes = [s["t_s"] / 60 for s in samples]

@@ -242,8 +242,8 @@ def draw_stability(rows: Sequence[Row], path: Path) -> None:
     """The map: a panel for each servo and bus; below, how the other cases end."""
     buses = list(dict.fromkeys((r["rate_hz"], r["late_ms"]) for r in rows if r["view"] in VIEWS))
     title = (
-        "Force loop: largest eigenvalue over one period of the sensor, and how touches in lockstep end\n"
-        "shade: the eigenvalue; black line: where it is 1, unstable to the right; marks: touches carried out\n"
+        "Where the force loop settles: predicted by its largest eigenvalue over one period of the sensor (shade;\n"
+        "black line: 1, unstable to the right), and how touches ended that were carried out in lockstep (marks)\n"
         "dotted: from here on the approach at 4 mm/s exceeds the force limit before its first sample can stop it"
     )
     lines = -(-len(buses) // PANELS_IN_A_ROW)
@@ -259,7 +259,7 @@ def draw_stability(rows: Sequence[Row], path: Path) -> None:
             for axes, (rate, late) in zip(grid.flat, buses, strict=False):
                 mine = [r for r in rows if r["view"] == view and (r["rate_hz"], r["late_ms"]) == (rate, late)]
                 _draw_map(axes, stiffness, ratios, loop_of(Case(view, 1e4, rate_hz=rate, late_ms=late)), mine)
-                axes.set_title(f"{rate:g} Hz" + (f", {late:g} ms late" if late else ""))
+                axes.set_title(f"cycle of {rate:g} Hz" + (f", frames {late:g} ms late" if late else ""))
             for axes in grid[-1]:
                 axes.set_xlabel("contact stiffness (N/m)")
             for line in grid:

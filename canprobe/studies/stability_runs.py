@@ -29,7 +29,7 @@ from canprobe.scene.geometry import T_flange_probe, true_object
 from canprobe.scene.load import load_scene
 from canprobe.scene.model import ObjectSettings, PlantSettings, ProbeSettings, Scene, ServoSettings
 from canprobe.scene.resolve import resolve
-from canprobe.session.session import Session, resolve_scene
+from canprobe.session.session import Session
 from canprobe.studies.fault_scores import RELEASE_NS, Witness, longest_above, reaction_ns, run_to_end
 from canprobe.studies.harness import Array, Row
 from canprobe.tasks.from_plan import make_task
@@ -306,7 +306,7 @@ def full_scale_kpa(case: Case, stiffness: float) -> float:
 
 def scene_of(case: Case) -> Scene:
     """The scene of a case; its layer may be harder and its radii larger than a scene file allows."""
-    scene = resolve_scene(load_scene("press" if case.speed_mm_s == 0.0 else "cylinder"), duration_s=case.hold_s)
+    scene = load_scene("press" if case.speed_mm_s == 0.0 else "cylinder", {"task.duration_s": case.hold_s})
     assert scene.arm is not None and scene.sensor is not None and scene.probe is not None
     stiffness = layer_stiffness(case)
     task = replace(scene.task, clearance_mm=0.5, force_n=case.force_n, start_mm=case.at_mm, approach_normal=case.normal)

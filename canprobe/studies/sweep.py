@@ -35,6 +35,7 @@ import os
 import platform
 import re
 import signal
+import sys
 import traceback
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
@@ -44,11 +45,12 @@ from functools import partial
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from time import perf_counter
-from types import MappingProxyType
+from types import MappingProxyType, ModuleType
 from typing import Any
 
 from canprobe.errors import StudyError, UsageError, install_line
 from canprobe.session.children import end_with_parent
+from canprobe.session.terminal import Progress
 from canprobe.studies.harness import CellStore, Say, StudyResult, as_json, cell_key, model_digest
 
 # Where cells are computed: a pool of processes on this machine, or the workers of a Dask cluster.
@@ -101,13 +103,13 @@ def dask_executor(address: str) -> Iterator[Executor]:
     try:
         from distributed import Client
     except ImportError as error:
-        raise UsageError(f"--dask needs the package distributed: {install_line('dask')}") from error
+        raise UsageError(f"a Dask cluster needs the package distributed: {install_line('dask')}") from error
     if not re.search(r":[0-9]+$", address):  # a Client that fails at once takes twenty seconds to end
-        raise StudyError(f"--dask {address}: expected the address and port of a Dask scheduler, as tcp://10.0.0.1:8786")
+        raise StudyError(f"Dask scheduler {address}: expected its address and port, as tcp://10.0.0.1:8786")
     try:
         client = Client(address, timeout=_DASK_WAIT, set_as_default=False)
     except (OSError, ValueError) as error:
-        raise StudyError(f"--dask {address}: expected a Dask scheduler there, got: {error}") from error
+        raise StudyError(f"Dask scheduler {address}: expected it there, got: {error}") from error
     executor = client.get_executor(pure=False)
     try:
         yield executor
@@ -117,7 +119,11 @@ def dask_executor(address: str) -> Iterator[Executor]:
 
 
 class _Deaf(Executor):
-    """Submits with SIGINT blocked: workers inherit that from their first instruction on."""
+    """Submits with SIGINT blocked: workers inherit that from their first instruction on.
+
+    A worker that is started then does not import the script that starts it, which would start its sweep again; cells
+    are measured by functions of modules.
+    """
 
     def __init__(self, pool: ProcessPoolExecutor) -> None:
         self._pool = pool
@@ -125,9 +131,11 @@ class _Deaf(Executor):
     def submit(self, fn, /, *args, **kwargs):  # type: ignore[no-untyped-def]  # as its base has it
         """See `Executor.submit`."""
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        script, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
         try:
             return self._pool.submit(fn, *args, **kwargs)
         finally:
+            sys.modules["__main__"] = script
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
@@ -154,8 +162,6 @@ def _one_blas_thread() -> Iterator[None]:
 
 
 Opener = Callable[[], AbstractContextManager[Executor]]
-Progress = Callable[[float, float], None]
-"""Called with the cells done and all cells."""
 
 
 class Sweep:
@@ -247,8 +253,13 @@ def _compute(measure: Callable[[Any], object], parts: tuple[str, ...], model: st
             return False, f"the worker on {platform.node()} has another canprobe or numpy (model {here}, not {model})"
         return True, as_json(measure(cell))
     except Exception as error:  # raised again in the main process
-        frame = traceback.extract_tb(error.__traceback__)[-1]
-        return False, f"{type(error).__name__}: {error} ({Path(frame.filename).name}:{frame.lineno})"
+        return False, error_text(error)
+
+
+def error_text(error: Exception) -> str:
+    """What was raised, and where, in a line."""
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__}: {error} ({Path(frame.filename).name}:{frame.lineno})"
 
 
 def _collect(

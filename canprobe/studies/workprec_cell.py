@@ -310,9 +310,9 @@ def draw_cell(rows: Sequence[Row], path: Path) -> None:
     """Error against cost: a row of panels for each measure, a column for each fidelity."""
     refused, stopped = (sum(r["ended"] == how for r in rows) for how in ("refused", "stopped"))
     title = (
-        "Whole cell: error against processor time a second of the scan, master, bus, nodes and plant in one process\n"
-        f"ring: the default; star: the knee; not drawn: {refused} settings that the plan refuses, {stopped} scans that "
-        "were stopped for safety"
+        "Whole cell, all in one process: error over the processor time that a second of a scan takes; best lower left\n"
+        "a mark: rate, what the array sends, estimator and bus; ring: the default; star: cheapest that is good enough\n"
+        f"not drawn: {refused} settings that the plan refuses, {stopped} scans that were stopped for safety"
     )
     with picture(path, title, 9.6) as figure:
         grid = figure.subplots(len(PANELS), len(FIDELITIES), squeeze=False, sharex=True, sharey="row")

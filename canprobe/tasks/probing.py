@@ -15,7 +15,7 @@ from canprobe.cell.controller import Command, Measurement, TactileSample
 from canprobe.cell.supervision import Contact, limits_of
 from canprobe.cell.supervisor import outside_workspace
 from canprobe.planning.model import Plan
-from canprobe.robot.chain import forward_jacobian
+from canprobe.robot.chain import Posture, Vec, ending_in, jacobian, pose_of, posture
 from canprobe.robot.inverse import damped_step, in_rows, task_rows
 from canprobe.scene.setup import Arm, Probe, SafetyLimits
 from canprobe.tasks.sensing import ContactSensing
@@ -59,53 +59,62 @@ class ProbeMotion:
         self.q = np.array(q, dtype=float)
         self._model = model = arm.model
         self._rows = task_rows(model)
-        self._flange_probe = flange_probe = probe.T_flange_probe
+        self._chain = ending_in(model.chain, probe.T_flange_probe)
         self._workspace, self._radius = safety.workspace, probe.radius
         self._step_max: list[float] = (model.qd_max * safety.speed_share * period_s).tolist()
         self._rest, self._rest_share = self.q, 2.0 * math.pi * REST_HZ * period_s
         margin = safety.joint_margin
         self._low, self._high = model.q_min + margin, model.q_max - margin
         self._range: list[tuple[float, float]] = list(zip(self._low.tolist(), self._high.tolist(), strict=True))
-        self.pose_matrix, _ = forward_jacobian(model.chain, self.q, flange_probe)
-        self._x_reference: tuple[float, float, float] = tuple(self.pose_matrix[:3, 0].tolist())
+        self._at = posture(self._chain, self.q)
+        self._x_reference = self._at.x
         self.limit: str | None = None
         self.slowed = 0
 
     @property
     def pose(self) -> ProbePose:
         """The commanded pose."""
-        return ProbePose(self.pose_matrix[:3, 3], self.pose_matrix[:3, 2])
+        return ProbePose(np.array(self._at.flange), np.array(self._at.z))
+
+    @property
+    def pose_matrix(self) -> Vector:
+        """The same with the turn about the pole, (4, 4), m."""
+        return pose_of(self._at)
 
     def step(self, pose: ProbePose) -> Vector:
         """Joint targets (n,), rad or m, one step nearer to ``pose``."""
-        T, J = forward_jacobian(self._model.chain, self.q, self._flange_probe)
-        self.pose_matrix = T
+        before = self.q.tolist()
+        self._at = at = posture(self._chain, before)
+        J = jacobian(at, at.flange)
         if self._workspace is not None:
-            self.limit = outside_workspace(T[:3, 3] + self._radius * T[:3, 2], self._workspace)
+            self.limit = outside_workspace(np.array(at.flange) + self._radius * np.array(at.z), self._workspace)
         twist: tuple[float, ...] | Vector
         if self._rows == 6:
-            twist = _pose_error(T.tolist(), pose.centre.tolist(), pose.pole.tolist(), self._x_reference)
+            twist = _pose_error(at, pose.centre.tolist(), pose.pole.tolist(), self._x_reference)
         else:
-            R, six = T[:3, :3], np.concatenate((pose.centre - T[:3, 3], np.cross(T[:3, 2], pose.pole)))
+            six = np.concatenate((pose.centre - at.flange, np.cross(at.z, pose.pole)))
+            R = self.pose_matrix[:3, :3]
             J, twist = in_rows(self._rows, R, J), in_rows(self._rows, R, six)
         dq = self._increment(J, twist)
-        share = max([abs(step) / most for step, most in zip(dq.tolist(), self._step_max, strict=True)])
+        share = max([abs(step) / most for step, most in zip(dq, self._step_max, strict=True)])
         if share > 1.0:
-            dq /= share
+            dq = [step / share for step in dq]
             self.slowed += 1
-        self.q = self.q + dq
-        if not all([low <= q <= high for q, (low, high) in zip(self.q.tolist(), self._range, strict=True)]):
+        targets = [q + step for q, step in zip(before, dq, strict=True)]
+        self.q = np.array(targets)
+        if not all([low <= q <= high for q, (low, high) in zip(targets, self._range, strict=True)]):
             self._stop_at_limit()
         return self.q
 
-    def _increment(self, J: Vector, twist: tuple[float, ...] | Vector) -> Vector:
+    def _increment(self, J: Vector, twist: tuple[float, ...] | Vector) -> list[float]:
         """The exact step; the damped one where the exact step would be no small one, as near a singular pose."""
         if J.shape[0] == J.shape[1]:
             _, _, dq, info = dgesv(J, twist)  # LAPACK itself: numpy's wrapper costs four times as much
-            if info == 0 and max(map(abs, dq.tolist())) < SMALL_STEP:
-                exact: Vector = dq
+            exact: list[float] = dq.tolist()
+            if info == 0 and max(map(abs, exact)) < SMALL_STEP:
                 return exact
-        return damped_step(J, np.asarray(twist), self._rest_share * (self._rest - self.q))
+        damped: list[float] = damped_step(J, np.asarray(twist), self._rest_share * (self._rest - self.q)).tolist()
+        return damped
 
     def _stop_at_limit(self) -> None:
         joint = int(np.flatnonzero((self.q < self._low) | (self.q > self._high))[0])
@@ -113,14 +122,12 @@ class ProbeMotion:
         self.q = np.clip(self.q, self._low, self._high)
 
 
-def _pose_error(
-    T: list[list[float]], centre: list[float], pole: list[float], x_reference: tuple[float, float, float]
-) -> tuple[float, ...]:
-    """Twist (6) from the pose ``T`` to a centre and a pole, x as near to the reference as the pole allows.
+def _pose_error(at: Posture, centre: list[float], pole: list[float], x_reference: Vec) -> tuple[float, ...]:
+    """Twist (6) from a probe's pose to a centre and a pole, x as near to the reference as the pole allows.
 
     Unrolled floats: on 3-vectors numpy costs ten times as much.
     """
-    (r00, r01, r02, t0), (r10, r11, r12, t1), (r20, r21, r22, t2), _ = T
+    (r00, r10, r20), (r01, r11, r21), (r02, r12, r22), (t0, t1, t2) = at.x, at.y, at.z, at.flange
     p0, p1, p2 = pole
     x0, x1, x2 = x_reference
     along = x0 * p0 + x1 * p1 + x2 * p2
@@ -337,15 +344,14 @@ class ProbingTask(Task):
         self, sample: TactileSample, patch: Patch, contact: ContactSample | None
     ) -> dict[str, float | Vector]:
         """What an image says, for the log."""
-        nothing = np.full(3, np.nan)
         return {
             "phase": float(self.phase),
             "sample_cycle": float(sample.cycle),
             "force_n": patch.force,
             "pad_u_mm": patch.u * 1e3,
             "pad_v_mm": patch.v * 1e3,
-            "contact_mm": contact.p_base * 1e3 if contact is not None else nothing,
-            "normal": contact.n_base if contact is not None else nothing,
+            "contact_mm": contact.p_base * 1e3 if contact is not None else np.full(3, np.nan),
+            "normal": contact.n_base if contact is not None else np.full(3, np.nan),
         }
 
     # phases: each returns the pose for this cycle

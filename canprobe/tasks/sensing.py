@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from canprobe.cell.array import patch_of
 from canprobe.cell.controller import Measurement, TactileSample
-from canprobe.robot.chain import forward
+from canprobe.robot.chain import ending_in, forward
 from canprobe.robot.model import ArmModel, position_sigma
 from canprobe.touch.contact import ContactSample, Slope, contact_sample, indentation_from_force, stiffness_from_slope
 from canprobe.touch.patch.array_calibration import CentroidErrors, Lag
@@ -105,6 +105,7 @@ class ContactSensing:
     ) -> None:
         self.model = model
         self.flange_probe = flange_probe
+        self._chain = ending_in(model.chain, flange_probe)
         self.radius = radius
         self.stiffness = stiffness
         self._slope: Slope | None = None
@@ -167,7 +168,7 @@ class ContactSensing:
     def probe_at(self, t_ns: int) -> Vector | None:
         """The probe (4, 4) in base at a time of the last cycles; None where the joints of that time are unknown."""
         q = self._history.at(t_ns)
-        return None if q is None else forward(self.model.chain, q) @ self.flange_probe
+        return None if q is None else forward(self._chain, q)
 
     def contact(self, sample: TactileSample, patch: Patch) -> ContactSample | None:
         """The contact at the sample's instant, or None (counted) where the joints of that instant are unknown."""
@@ -202,7 +203,7 @@ class ContactSensing:
         before = self._history.at(t_ns - SPEED_OVER_NS)
         if before is None:
             return 0.0
-        earlier = forward(self.model.chain, before) @ self.flange_probe
+        earlier = forward(self._chain, before)
         point = np.append(contact.r_probe, 1.0)
         way = ((contact.T_base_probe - earlier) @ point)[:3]
         return float(np.linalg.norm(way)) / (1e-9 * SPEED_OVER_NS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -76,7 +77,7 @@ class ShapeTracker:
                 self._waiting.clear()
                 self._taken, self._found = len(self.samples), None
             else:
-                self.travelled_m += float(np.linalg.norm(sample.p_base - last.p_base))
+                self.travelled_m += math.dist(sample.p_base.tolist(), last.p_base.tolist())
         self.samples.append(sample)
         self._waiting.append(sample)
 

@@ -9,7 +9,8 @@
   squeezed layer; it finds the layer's stiffness from a push.
 - `estimate/` finds the local shape from contacts, online and in batches, with what was not observed.
 - `servo` follows the surface: a local surface that the samples correct, strategies that lead over it, the next pose.
-- `surface_map` keeps a scan as local patches, `consistency` compares passes where they cross.
+- `surface_map` keeps a scan as local patches, `blend` makes one surface of them, `meshing` triangles of that;
+  `consistency` compares passes where they cross.
 - `surface` is the gauge in which every second-order surface is written: XᵀSX = 0 with S symmetric (4, 4), f < 0
   inside, in its own contact frame c14 = c24 = c44 = 0 and c34 = −½, so that K = 2 [[c11, c12], [c12, c22]] is the
   curvature.

@@ -9,10 +9,11 @@ from typing import NamedTuple
 import numpy as np
 
 from canprobe.errors import UsageError
+from canprobe.touch.blend import FACING
 from canprobe.touch.estimate.quadric import TO_Q, curvature_jacobian, transport, turned
 from canprobe.touch.linear_algebra import Array, homogeneous, inverse_transform, positive, tangent_rotation
 from canprobe.touch.surface import SurfaceMatrix
-from canprobe.touch.surface_map import FACING, LocalPatch, SurfaceMap
+from canprobe.touch.surface_map import LocalPatch, SurfaceMap
 
 # A χ² test where the contact's path crosses itself.
 #

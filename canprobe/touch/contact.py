@@ -74,9 +74,13 @@ def pad_to_direction(u: float, v: float, radius: float) -> Array:
 
     The flat array is wrapped azimuthal-equidistantly: the exponential map of (u, v)/R_p at the pole, R_p the radius.
     """
+    return np.array(_direction(u, v, radius))
+
+
+def _direction(u: float, v: float, radius: float) -> tuple[float, float, float]:
     angle = math.hypot(u, v) / radius
     scale = 1.0 / radius if angle < 1e-9 else math.sin(angle) / (angle * radius)
-    return np.array([u * scale, v * scale, math.cos(angle)])
+    return u * scale, v * scale, math.cos(angle)
 
 
 def direction_to_pad(direction: Sequence[float] | Array, radius: float) -> tuple[float, float]:
@@ -87,12 +91,14 @@ def direction_to_pad(direction: Sequence[float] | Array, radius: float) -> tuple
     return x * scale, y * scale
 
 
-def contact_on_object(T_base_probe: Array, direction: Array, radius: float, depth: float) -> tuple[Array, Array]:
+def contact_on_object(
+    T_base_probe: Array, direction: Sequence[float], radius: float, depth: float
+) -> tuple[Array, Array]:
     """The object's contact point and outward normal in base, through the squeezed layer (13), (14), (20).
 
     `p = centre + (R_p − δ) n_f` and `n_o = −n_f`, (3,) each, n_f along a direction (3,) of the probe frame (4, 4).
     """
-    u, v, w = direction.tolist()
+    u, v, w = direction
     (a, b, c, x), (d, e, f, y), (g, h, i, z), _ = T_base_probe.tolist()
     nx, ny, nz = a * u + b * v + c * w, d * u + e * v + f * w, g * u + h * v + i * w
     reach = radius - depth
@@ -117,9 +123,10 @@ def contact_sample(
     The other arguments are those of `ContactSample`; taxels and pose are of one time.
     """
     u, v = uv
-    direction = pad_to_direction(u, v, radius)
+    x, y, z = direction = _direction(u, v, radius)
     point, normal = contact_on_object(T_base_probe, direction, radius, depth)
-    arm = (radius - depth) * direction
+    reach = radius - depth
+    arm = np.array((reach * x, reach * y, reach * z))
     return ContactSample(
         t_s, point, normal, T_base_probe, arm, force_n, sigma_point, moments=moments, doubts=doubts, slope=slope
     )

@@ -13,9 +13,12 @@ from scipy.linalg.lapack import dgeqrf, dgesv, dpotrf, dsyev, dtrtri
 from canprobe.errors import UsageError
 
 Array = NDArray[np.float64]
-_UPPER = np.triu(np.ones((16, 16)))
+Vec = tuple[float, float, float]
+_UPPER, _IDENTITY = np.triu(np.ones((16, 16))), np.eye(16)
 
 # LAPACK is called by its own names: on matrices as small as these, numpy's wrappers cost four times the decomposition.
+# For the same reason what runs in the loop says `A.dot(B)`, which costs half of `A @ B`, and works on single vectors
+# and 2x2 matrices in plain floats.
 
 
 def upper_root(A: Array) -> Array:
@@ -37,7 +40,8 @@ def solved(A: Array, B: Array) -> Array:
 
 def inverted(A: Array) -> Array:
     """A⁻¹; numpy's LinAlgError where A is singular."""
-    return solved(A, np.eye(len(A)))
+    n = len(A)
+    return solved(A, _IDENTITY[:n, :n] if n <= len(_IDENTITY) else np.eye(n))
 
 
 def inverted_upper(R: Array) -> Array:
@@ -60,6 +64,11 @@ def eigen(A: Array) -> tuple[Array, Array]:
 def principal(A: Array) -> tuple[float, float, float]:
     """Mean and half difference of the eigenvalues of a symmetric (2, 2), and the angle (rad) of the larger one."""
     (a, b), (_, d) = A.tolist()
+    return principal_of(a, b, d)
+
+
+def principal_of(a: float, b: float, d: float) -> tuple[float, float, float]:
+    """The same of the matrix a, b; b, d."""
     half = 0.5 * (a - d)
     return 0.5 * (a + d), math.hypot(half, b), 0.5 * math.atan2(b, half)
 
@@ -115,7 +124,7 @@ _AXIS_LIMIT = 0.95
 """Above this |component| of the normal the frame's own x axis is too close to it, and y is used."""
 
 
-def tangent_rotation(z_axis: Array) -> Array:
+def tangent_rotation(z_axis: Sequence[float] | Array) -> Array:
     """Right-handed axes (3, 3), columns x, y, z, with a given unit z; x is the parent frame's x on the tangent plane.
 
     Where z is within 18° of the parent's x axis, the parent's y axis is laid on the plane instead. The choice depends
@@ -131,20 +140,21 @@ def tangent_rotation(z_axis: Array) -> Array:
     return np.array([[xx, zy * xz - zz * xy, zx], [xy, zz * xx - zx * xz, zy], [xz, zx * xy - zy * xx, zz]])
 
 
-def transported_rotation(R: Array, z_axis: Array) -> Array:
-    """Axes (3, 3), turned the shortest way so that their z becomes a unit vector: parallel transport over a step."""
-    x, y, z = R[:, 0].tolist()
-    u, v, w = z_axis.tolist()
+def transported(x_axis: Vec, z_axis: Vec) -> tuple[Vec, Vec]:
+    """Axes x and y, turned the shortest way so that their z becomes a unit vector: parallel transport over a step."""
+    x, y, z = x_axis
+    u, v, w = z_axis
     along = x * u + y * v + z * w
     x, y, z = x - along * u, y - along * v, z - along * w
     size = math.sqrt(x * x + y * y + z * z)
     if size < 1e-6:
-        return tangent_rotation(z_axis)
+        first, second, _ = tangent_rotation(z_axis).T.tolist()
+        return first, second
     x, y, z = x / size, y / size, z / size
-    return np.array([[x, v * z - w * y, u], [y, w * x - u * z, v], [z, u * y - v * x, w]])
+    return (x, y, z), (v * z - w * y, w * x - u * z, u * y - v * x)
 
 
-def homogeneous(R: Array, origin: Array) -> Array:
+def homogeneous(R: Array, origin: Sequence[float] | Array) -> Array:
     """The 4x4 matrix of a rotation and an origin."""
     T = np.zeros((4, 4))
     T[:3, :3] = R

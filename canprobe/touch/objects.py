@@ -9,6 +9,8 @@ from types import MappingProxyType
 import numpy as np
 import numpy.typing as npt
 
+from canprobe.touch.heights import Heights
+from canprobe.touch.mesh_fit import Mesh
 from canprobe.touch.shapes import (
     Bowl,
     Fillet,
@@ -226,6 +228,8 @@ _KINDS: Mapping[str, tuple[type[PlacedShape], tuple[str, ...]]] = MappingProxyTy
         "wave": (Wave, ("amplitude", "wavelength")),
         "fillet": (Fillet, ("radius", "angle")),
         "quadric": (Quadric, ("matrix",)),
+        "heights": (Heights, ("heights", "spacing", "origin")),
+        "mesh": (Mesh, ("vertices", "faces", "spacing", "origin")),
     }
 )
 

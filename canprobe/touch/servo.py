@@ -118,11 +118,12 @@ class PathFollower:
         self._strategy = strategy
         self._gain = cross_track_per_m
         self._phase = 0.0
+        self._tangent = strategy.tangent(0.0)
 
     @property
     def heading(self) -> tuple[float, float]:
         """Unit tangent (along, across) of the curve where the follower is."""
-        tx, ty = self._strategy.tangent(self._phase)
+        tx, ty = self._tangent
         norm = max(math.hypot(tx, ty), 1e-9)
         return tx / norm, ty / norm
 
@@ -131,9 +132,10 @@ class PathFollower:
 
         `distance_m`: how far it moves in that plane until the next call.
         """
-        tx, ty = self._strategy.tangent(self._phase)
+        tx, ty = self._tangent
         norm = math.hypot(tx, ty)
         self._phase += distance_m / max(norm, 1e-4)
+        self._tangent = self._strategy.tangent(self._phase)
         px, py = self._strategy.point(self._phase)
         hx = tx / max(norm, 1e-9) + self._gain * (px - x)
         hy = ty / max(norm, 1e-9) + self._gain * (py - y)
@@ -180,7 +182,7 @@ class LocalSurface:
         self._point: Floats
         self._normal: Floats
         self.move_to(point, normal)
-        self._curvature = self._wanted = [[0.0] * 3] * 3
+        self._curvature = self._wanted = [0.0] * 6  # xx, xy, xz, yy, yz, zz
         self._gains = gains
 
     @property
@@ -203,7 +205,7 @@ class LocalSurface:
         d0, d1, d2 = x[0] - a0, x[1] - a1, x[2] - a2
         height = d0 * m0 + d1 * m1 + d2 * m2
         d0, d1, d2 = d0 - height * m0, d1 - height * m1, d2 - height * m2
-        (k00, k01, k02), (_, k11, k12), (_, _, k22) = self._curvature
+        k00, k01, k02, k11, k12, k22 = self._curvature
         b0 = k00 * d0 + k01 * d1 + k02 * d2
         b1 = k01 * d0 + k11 * d1 + k12 * d2
         b2 = k02 * d0 + k12 * d1 + k22 * d2
@@ -222,23 +224,22 @@ class LocalSurface:
         """
         if dt < 0:
             raise UsageError(f"dt: expected a time that has passed, got {dt:g} s")
-        p, n = point.tolist(), normal.tolist()
-        foot, m = self.foot(p)
-        error: float = sum(mi * (pi - fi) for mi, pi, fi in zip(m, p, foot, strict=True))
+        p0, p1, p2 = p = point.tolist()
+        n0, n1, n2 = normal.tolist()
+        (f0, f1, f2), (m0, m1, m2) = self.foot(p)
+        error: float = m0 * (p0 - f0) + m1 * (p1 - f1) + m2 * (p2 - f2)
         height = 1 - math.exp(-2 * math.pi * self._gains.height_hz * dt)
         tilt = 1 - math.exp(-2 * math.pi * self._gains.tilt_hz * dt)
-        self._point = tuple([fi + mi * height * error for fi, mi in zip(foot, m, strict=True)])
-        self._normal = _unit([mi + (ni - mi) * tilt for mi, ni in zip(m, n, strict=True)])
+        self._point = f0 + m0 * height * error, f1 + m1 * height * error, f2 + m2 * height * error
+        self._normal = _unit((m0 + (n0 - m0) * tilt, m1 + (n1 - m1) * tilt, m2 + (n2 - m2) * tilt))
         share = 1 - math.exp(-2 * math.pi * self._gains.curvature_hz * dt)
-        self._curvature = [
-            [k + share * (w - k) for k, w in zip(row, wanted, strict=True)]
-            for row, wanted in zip(self._curvature, self._wanted, strict=True)
-        ]
+        self._curvature = [k + share * (w - k) for k, w in zip(self._curvature, self._wanted, strict=True)]
         return error
 
     def raise_by(self, height: float) -> None:
         """Move the model outward along its normal by a height, m: what was measured so far lies that much higher."""
-        self._point = tuple([a + height * m for a, m in zip(self._point, self._normal, strict=True)])
+        (a0, a1, a2), (m0, m1, m2) = self._point, self._normal
+        self._point = a0 + height * m0, a1 + height * m1, a2 + height * m2
 
     def move_to(self, point: Vector, normal: Vector) -> None:
         """Stand on another point (3,), m, with an outward unit normal (3,)."""
@@ -247,7 +248,8 @@ class LocalSurface:
 
     def set_curvature(self, tensor: Vector) -> None:
         """Go over, with the next samples, to a curvature tensor (3, 3), symmetric, 1/m, in the same frame."""
-        self._wanted = tensor.tolist()
+        (xx, xy, xz), (_, yy, yz), (_, _, zz) = tensor.tolist()
+        self._wanted = [xx, xy, xz, yy, yz, zz]
 
 
 @dataclass(frozen=True, slots=True)
@@ -315,12 +317,13 @@ class TactileServo:
         """One step along the heading, lifted out of the scan plane into the tangent plane."""
         (h0, h1, h2), (c0, c1, c2), (u0, u1, u2) = self._heading, self._across, self._up
         (f0, f1, f2), (n0, n1, n2), (o0, o1, o2) = foot, normal, self._origin
-        offset = f0 - o0, f1 - o1, f2 - o2
-        steep = max(_dot(normal, self._up), STEEPEST)
-        slope_along, slope_across = _dot(normal, self._heading) / steep, _dot(normal, self._across) / steep
+        d0, d1, d2 = f0 - o0, f1 - o1, f2 - o2
+        steep = max(n0 * u0 + n1 * u1 + n2 * u2, STEEPEST)
+        slope_along = (n0 * h0 + n1 * h1 + n2 * h2) / steep
+        slope_across = (n0 * c0 + n1 * c1 + n2 * c2) / steep
         along, across = follower.heading
         in_plane = distance / math.hypot(1.0, slope_along * along + slope_across * across)
-        along, across = follower.step(_dot(self._heading, offset), _dot(self._across, offset), in_plane)
+        along, across = follower.step(h0 * d0 + h1 * d1 + h2 * d2, c0 * d0 + c1 * d1 + c2 * d2, in_plane)
         x, y, z = along * h0 + across * c0, along * h1 + across * c1, along * h2 + across * c2
         fall = slope_along * along + slope_across * across
         x, y, z = x - fall * u0, y - fall * u1, z - fall * u2
@@ -329,10 +332,7 @@ class TactileServo:
         return self.surface.foot((f0 + distance * x, f1 + distance * y, f2 + distance * z))
 
 
-def _dot(a: Floats, b: Floats) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
 def _unit(v: Floats) -> Floats:
-    size = math.sqrt(_dot(v, v))
-    return (v[0] / size, v[1] / size, v[2] / size)
+    x, y, z = v
+    size = math.sqrt(x * x + y * y + z * z)
+    return x / size, y / size, z / size

@@ -6,19 +6,19 @@ contact frames with their surface matrices.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from canprobe.errors import UsageError
+from canprobe.touch.blend import REACH_M, Feet, Quadrics, feet_on
 from canprobe.touch.estimate.answer import SurfaceEstimate
-from canprobe.touch.estimate.quadric import TO_Q, UNIT, parameters_of, terms
+from canprobe.touch.estimate.quadric import TO_Q, UNIT, parameters_of
 from canprobe.touch.linear_algebra import Array, checked, positive, read_only
+from canprobe.touch.meshing import CELL_M, Mesh, mesh_of
 from canprobe.touch.surface import SurfaceMatrix
 
 WIDE = 10.0
@@ -212,6 +212,45 @@ class SurfaceMap:
         """Longest path that a patch rests on, m; 0 without patches."""
         return max((patch.distance_m for patch in self.patches), default=0.0)
 
+    def closest(self, points: ArrayLike, *, reach: float = REACH_M) -> Feet:
+        """Closest points of the map's surface, its normals and its uncertainty, to points (n, 3), base frame, m.
+
+        The surface is one: the blend of the patches (`touch/blend.py`), continuous where they overlap. A patch no
+        longer counts at a distance of `reach` (m) from its contact; where none is in reach the answer is NaN.
+
+        Raises:
+            UsageError: not finite points (n, 3), or no positive reach.
+        """
+        return feet_on(self._quadrics(), checked("points", points, (None, 3)), positive("reach", reach))
+
+    def distance(self, points: ArrayLike, *, reach: float = REACH_M) -> tuple[Array, Array]:
+        """Signed distances of points (n, 3) from the map's surface, positive outside, and their standard deviations.
+
+        Returns:
+            Two arrays (n,), m; NaN where no patch is in reach, and σ also where no patch in reach knows its height.
+        """
+        feet = self.closest(points, reach=reach)
+        return feet.height, feet.sigma
+
+    def mesh(self, *, cell: float = CELL_M, reach: float = REACH_M) -> Mesh:
+        """The map's surface as triangles with its σ at every vertex; its rim is up to two cells within the reach.
+
+        Args:
+            cell: side of a cell of the lattice in the base frame, about an edge of a triangle, m. The vertices lie
+                on the surface whatever it is; time grows with 1/cell².
+            reach: distance from a contact at which its patch no longer counts, m.
+        """
+        patches, limit = self._quadrics(), positive("reach", reach)
+        return mesh_of(lambda points: feet_on(patches, points, limit), self.points, positive("cell", cell))
+
+    def _quadrics(self) -> Quadrics:
+        return Quadrics.of(
+            np.array([patch.T_base_contact for patch in self.patches]).reshape(-1, 4, 4),
+            np.array([patch.S for patch in self.patches]).reshape(-1, 4, 4),
+            np.array([patch.S_covariance for patch in self.patches]).reshape(-1, 9, 9),
+            np.array([patch.pose_known for patch in self.patches], bool),
+        )
+
     def equals(self, other: SurfaceMap) -> bool:
         """The same patches, path and method, bit by bit."""
         same = len(self) == len(other) and self.method == other.method and np.array_equal(self.path, other.path)
@@ -242,135 +281,3 @@ def merge_patches(
     """
     usable = [patch for patch in patches if patch.rank >= LEAST_RANK]
     return SurfaceMap(patches=tuple(spaced(usable, spacing)), path=np.asarray(path, np.float64), method=method)
-
-
-# Where the surface of a map is: patches near a point, blended by distance and covariance.
-#
-# Each patch within `reach` gives the height of its quadric along one common normal through the query point, and its
-# normal there. Patch i weighs `w_i = (1 − r_i²/reach²)² / v_i`, r_i the distance from its contact to the surface point
-# and v_i the variance of its height there (from `S_covariance`: it grows with the fourth power of the distance from the
-# contact). The first factor vanishes smoothly at `reach`: a patch enters and leaves without a step. The common normal
-# is the blend of the patches' normals, iterated, so that the answer is the closest point.
-#
-# Valid within `reach` of a contact and for a point nearer to the surface than its radius of curvature; with no patch
-# in reach the answer is NaN, never an extrapolation. The blend neither averages noise away in `sigma` nor knows
-# of errors that all patches share (calibration, indentation): neighbours on one pass rest on the same samples.
-
-REACH_M = 4e-3
-"""Default distance from a contact at which its patch no longer counts, m."""
-_ITERATIONS = 40
-"""Most rounds; each shrinks the error of the normal by the height over the radius of curvature."""
-_SETTLED = 1e-10
-FACING = 0.5
-"""Least cosine between a patch's normal and that of the nearest one: others are another side of a thin body."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MapPoint:
-    """The surface of a map near a query point, base frame.
-
-    Attributes:
-        point: (3,) closest point of the blended surface, m; NaN where no patch is in reach.
-        normal: (3,) outward unit normal there; NaN where no patch is in reach.
-        height: signed distance of the query point from the surface, m, positive outside.
-        sigma: standard deviation of the surface's height, the weighted mean of the patches' own, m; NaN where none of
-            them knows it.
-        patches: how many were blended.
-    """
-
-    point: Array
-    normal: Array
-    height: float
-    sigma: float
-    patches: int
-
-
-class _Heights(NamedTuple):
-    """What each patch says along one line: height (m), outward normal (base), its variance (m²), whether it is met.
-
-    Variances are 0 where the pose is not known.
-    """
-
-    height: Array
-    normal: Array
-    variance: Array
-    met: NDArray[np.bool_]
-
-
-def closest(surface_map: SurfaceMap, point: ArrayLike, reach: float = REACH_M) -> MapPoint:
-    """Closest point of a map's surface to a point (3,) nearby, base frame, m.
-
-    `reach` (m) is the distance from a contact at which its patch no longer counts.
-    """
-    p, limit = checked("point", point, (3,)), positive("reach", reach)
-    chosen = _candidates(surface_map, p, limit)
-    nowhere = MapPoint(np.full(3, math.nan), np.full(3, math.nan), math.nan, math.nan, 0)
-    if not len(chosen):
-        return nowhere
-    patches, contacts = [surface_map.patches[i] for i in chosen], surface_map.points[chosen]
-    normal = surface_map.normals[chosen[0]]
-    foot = p - normal * float(normal @ (p - contacts[0]))
-    for _ in range(_ITERATIONS):
-        said = _heights(patches, p, normal)
-        weight = _weights(said, np.linalg.norm(contacts - foot, axis=1), limit)
-        total = float(weight.sum())
-        if not total > 0.0:
-            return nowhere
-        weight = weight / total
-        height = float(weight @ said.height)
-        foot = p + height * normal
-        before, n = normal, weight @ said.normal
-        normal = n / math.sqrt(float(n @ n))
-        if np.abs(normal - before).max() < _SETTLED:
-            break
-    used = weight > 0.0
-    known = bool((said.variance[used] > 0.0).all())
-    sigma = float(np.sqrt(said.variance[used]) @ weight[used]) if known else math.nan
-    return MapPoint(foot, normal, -height, sigma, int(used.sum()))
-
-
-def _candidates(surface_map: SurfaceMap, p: Array, reach: float) -> NDArray[np.intp]:
-    """Indices of the patches whose contact may be in reach of the foot of p, the nearest first."""
-    if not len(surface_map):
-        return np.zeros(0, np.intp)
-    offset = surface_map.points - p
-    distance = np.sqrt(np.einsum("ij,ij->i", offset, offset))
-    first = int(np.argmin(distance))
-    lifted = abs(float(surface_map.normals[first] @ offset[first]))
-    facing = surface_map.normals @ surface_map.normals[first] > FACING
-    # by the triangle inequality, with room for a foot that is not below the point as seen from the nearest patch
-    chosen = np.flatnonzero(facing & (distance <= 1.5 * reach + lifted))
-    return chosen[np.argsort(distance[chosen], kind="stable")]
-
-
-def _weights(said: _Heights, distance: Array, reach: float) -> Array:
-    """(n,) weights, not yet of sum 1; variances count only where every patch in reach has one."""
-    fade: Array = np.maximum(0.0, 1.0 - (distance / reach) ** 2) ** 2
-    fade[~said.met] = 0.0
-    near = fade > 0.0
-    if not (said.variance[near] > 0.0).all():
-        return fade
-    fade[near] /= said.variance[near]
-    return fade
-
-
-def _heights(patches: Sequence[LocalPatch], p: Array, normal: Array) -> _Heights:
-    """Where the line p + t·normal meets each patch."""
-    T, S = np.array([patch.T_base_contact for patch in patches]), np.array([patch.S for patch in patches])
-    R, B, h = T[:, :3, :3], 2.0 * S[:, :3, :3], 2.0 * S[:, :3, 3]
-    x, d = ((p - T[:, :3, 3])[:, None] @ R)[:, 0], normal @ R
-    gx, gd = (x[:, None] @ B)[:, 0] + h, (d[:, None] @ B)[:, 0]
-    # f(x + t d) = ½ a t² + b t + c
-    a, b = np.einsum("ij,ij->i", d, gd), np.einsum("ij,ij->i", d, gx)
-    c = 0.5 * np.einsum("ij,ij->i", x, gx + h)
-    square = b * b - 2.0 * a * c
-    root = b + np.sqrt(np.maximum(square, 0.0))
-    met = (square >= 0.0) & (root > 0.0)
-    t = np.where(met, -2.0 * c / np.where(met, root, 1.0), 0.0)
-    g = gx + t[:, None] * gd
-    F = terms(x + t[:, None] * d, 9)[:, 0]  # df/dc
-    slope = np.where(met, np.einsum("ij,ij->i", g, d), 1.0)
-    covariance = np.array([patch.S_covariance * patch.pose_known for patch in patches])
-    variance = np.einsum("ij,ijk,ik->i", F, covariance, F) / slope**2
-    outward = (R @ g[:, :, None])[:, :, 0] / np.sqrt(np.einsum("ij,ij->i", g, g))[:, None]
-    return _Heights(t, outward, variance, met)

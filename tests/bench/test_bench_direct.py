@@ -7,7 +7,7 @@ from dataclasses import replace
 from statistics import median
 
 from canprobe.scene.load import load_scene
-from canprobe.session.session import Session, resolve_scene
+from canprobe.session.session import Session
 from canprobe.tasks.from_plan import make_task
 
 RUNS = 5
@@ -16,7 +16,7 @@ DURATION_S = 5.0
 
 def run_of(interface):
     """Processor time of a cycle, µs, and the pace of the whole run, × real time."""
-    scene = resolve_scene(load_scene("cylinder"), duration_s=DURATION_S)
+    scene = load_scene("cylinder", {"task.duration_s": DURATION_S})
     with Session(replace(scene, bus=replace(scene.bus, interface=interface))) as session:
         task = make_task(session.plan)
         began_ns = time.process_time_ns()

@@ -17,12 +17,12 @@ from canprobe.bridge import process as process_module
 from canprobe.bridge.process import BridgeProcess
 from canprobe.cell.cycle import Observation
 from canprobe.errors import UsageError
-from canprobe.session.session import Session, resolve_scene
+from canprobe.session.session import Session
 
 
 @pytest.fixture
 def plan():
-    return canprobe.plan(resolve_scene(canprobe.load_scene("free"), duration_s=0.1))
+    return canprobe.plan(canprobe.load_scene("free", {"task.duration_s": 0.1}))
 
 
 @pytest.fixture

@@ -86,7 +86,7 @@ def served(recorded):
 def test_a_run_is_served_until_it_is_told_to_end(served, number, status):
     process, address = served
     assert "<title>Viser</title>" in page_at(address)
-    messages(address, {"/arm/3/forearm", "/object/ghost", "/patch/above", "GuiSliderMessage", "GuiUplotMessage"})
+    messages(address, {"/arm/3/forearm", "/object/ghost", "/path/000", "GuiSliderMessage", "GuiUplotMessage"})
     process.send_signal(number)
     out, err = process.communicate(timeout=30)
     assert (process.returncode, out, err) == (status, "", "")

@@ -11,10 +11,12 @@ from puma_arm import MODELS
 from canprobe.bridge.sample import SurfacePatch
 from canprobe.bridge.view import bodies as arm
 from canprobe.bridge.view import bodies as objects
-from canprobe.bridge.view import bodies as patch
 from canprobe.bridge.view import bodies as taxels
 from canprobe.bridge.view import meshes
 from canprobe.bridge.view import meshes as colours
+from canprobe.bridge.view.instants import judge
+from canprobe.bridge.view.path import deviation_scale
+from canprobe.bridge.view.surface import Surface
 from canprobe.emulator.plant.taxels import pad_coordinates
 from canprobe.robot.chain import forward, posture, tool_z_offset
 from canprobe.scene.load import read_cell
@@ -183,7 +185,11 @@ def test_the_image_has_u_to_the_right_and_v_upward():
 # objects
 
 POSE = homogeneous(tangent_rotation(np.array([0.36, -0.48, 0.8])), np.array([-0.12, 0.1, 0.37]))
+HEIGHTS = -np.add.outer(np.linspace(-0.05, 0.05, 51) ** 2, 2 * np.linspace(-0.04, 0.04, 41) ** 2)
+BALL = meshes.revolved([(0.03 * math.sin(a), 0.03 * math.cos(a)) for a in np.linspace(math.pi, 0, 100)], 200)
 KINDS = {
+    "heights": {"heights": HEIGHTS, "spacing": 2e-3, "origin": (0, 0)},
+    "mesh": {"vertices": BALL.vertices, "faces": BALL.faces, "spacing": 2e-3, "origin": (0, 0)},
     "plane": {},
     "sphere": {"radius": 0.03},
     "large sphere": {"radius": 0.5},
@@ -220,43 +226,38 @@ def test_ghosts_lie_on_the_exact_surface_with_their_front_outside(name):
     assert max(abs(shape.closest(p).distance) for p in lines.reshape(-1, 3)[::7]) < 1e-9
 
 
-# the patch
+# the recovered surface
 
 
-def sphere_patch(radius=0.05, sigma=0.3, known=True):
-    covariance = np.diag([sigma**2, 0.5 * sigma**2, sigma**2])
-    if not known:
-        covariance[2] = covariance[:, 2] = np.nan
-    return SurfacePatch(0, POSE, np.eye(2) / radius, covariance, (True, known))
+def answer(direction, sigma, radius=0.05):
+    """What is stated of a ball in a direction from its centre."""
+    T = homogeneous(tangent_rotation(-np.array(direction)), radius * np.array(direction))
+    covariance = (
+        np.diag(sigma**2 * np.array([1 / 3, 1 / 6, 1 / 3])) if math.isfinite(sigma) else np.full((3, 3), math.inf)
+    )
+    return judge(SurfacePatch(0, T, np.eye(2) / radius, covariance, (True, True)), None)
 
 
-def test_the_patch_of_a_ball_lies_on_the_ball():
-    xy = patch.disc_points()
-    surface, _, _ = patch.patch_shape(sphere_patch(), xy)
-    r = np.hypot(*xy.T)
-    exact = 0.05 - np.sqrt(0.05**2 - r**2)
-    assert np.abs(surface[:, 2] + patch.PATCH_LIFT_M - exact).max() < patch.RADIUS_M**4 / (6 * 0.05**3)
-    mesh = meshes.Mesh(surface, patch.disc_faces())
-    assert (normals(mesh)[:, 2] < 0).all()  # z is the inward normal
-    assert np.linalg.norm(normals(mesh), axis=1).sum() / 2 == pytest.approx(math.pi * patch.RADIUS_M**2, rel=0.04)
+def ring(angles, sigma):
+    return [answer((math.sin(a), 0.0, math.cos(a)), sigma) for a in angles]
 
 
-def test_the_shells_are_two_deviations_away_twenty_times_over():
-    """Against curvatures drawn from the covariance."""
-    xy = patch.disc_points()
-    surface, above, below = patch.patch_shape(sphere_patch(), xy)
-    x, y = xy.T
-    draws = np.random.default_rng(1).multivariate_normal(np.zeros(3), sphere_patch().covariance, 20_000)
-    heights = 0.5 * draws[:, :1] * x**2 + draws[:, 1:2] * x * y + 0.5 * draws[:, 2:] * y**2
-    spread = heights.std(axis=0)
-    assert surface[:, 2] - above[:, 2] == pytest.approx(40 * spread, rel=0.03, abs=1e-12)
-    assert below[:, 2] - surface[:, 2] == pytest.approx(40 * spread, rel=0.03, abs=1e-12)
+def test_the_recovered_surface_lies_on_the_ball_and_has_the_colours_of_what_is_known():
+    scale = deviation_scale(None)
+    surface = Surface(scale)
+    for one in ring(np.arange(-0.5, 0.5, 0.05), sigma=1.0):
+        assert surface.add(one)
+    mesh, rgb = surface.mesh()
+    assert np.linalg.norm(mesh.vertices, axis=1) == pytest.approx(0.05, abs=2e-6)
+    assert np.ptp(np.arctan2(mesh.vertices[:, 0], mesh.vertices[:, 2])) == pytest.approx(1.08, abs=0.06)
+    assert (rgb == scale.colours(np.ones(1))).all()
 
 
-def test_what_was_not_observed_stands_as_far_away_as_is_drawn():
-    surface, above, _ = patch.patch_shape(sphere_patch(known=False), patch.disc_points())
-    gap = surface[:, 2] - above[:, 2]
-    assert gap[0] == 0.0 and gap[1:] == pytest.approx(patch.MOST_M)
+def test_of_two_answers_at_one_place_the_better_known_one_is_drawn():
+    surface = Surface(deviation_scale(None))
+    answers = (*ring([0.0], 1.0), *ring([0.01], 1.5), *ring([0.01], 0.5))
+    assert [surface.add(one) for one in answers] == [True, False, True]
+    assert not surface.add(answer((0.0, 0.0, 1.0), math.inf))
 
 
 # colours

@@ -26,7 +26,7 @@ from canprobe.bridge.view.instants import (
     kappa_sigmas,
     row_of,
 )
-from canprobe.bridge.view.path import GAP_M, LIFT_M, Trail, error_scale
+from canprobe.bridge.view.path import GAP_M, LIFT_M, Trail, deviation_scale
 from canprobe.bridge.view.recorded import read_run
 from canprobe.bridge.worker import SampleSource
 from canprobe.errors import CanprobeError
@@ -176,13 +176,13 @@ def test_curves_hold_the_bands_of_the_answers(run):
 def test_the_trail_is_thinned_lifted_and_broken_where_the_probe_was():
     trail, up = Trail(), np.array([0.0, 0.0, 1.0])
     for i in range(101):
-        trail.add(0.01 * i, np.array([1.01e-4 * i, 0.0, 0.0]), up, float(i))
+        trail.add(0.01 * i, np.array([1.01e-4 * i, 0.0, 0.0]), up)
     points = np.array(trail.segments)
     assert len(trail) == 25 and np.ptp(points[..., 0]) == pytest.approx(0.0101)
     assert points[..., 2] == pytest.approx(LIFT_M)
     assert np.array_equal(points[1:, 0], points[:-1, 1])
-    assert not trail.add(2.0, np.array([0.01 + 2 * GAP_M, 0.0, 0.0]), up, 0.0)
-    assert trail.add(2.1, np.array([0.011 + 2 * GAP_M, 0.0, 0.0]), up, 0.0)
+    assert not trail.add(2.0, np.array([0.01 + 2 * GAP_M, 0.0, 0.0]), up)
+    assert trail.add(2.1, np.array([0.011 + 2 * GAP_M, 0.0, 0.0]), up)
     chunks = trail.chunks(most=10)
     assert [i for c in chunks for i in range(c.start, c.stop)] == list(range(len(trail))) and len(chunks) <= 11
 
@@ -194,11 +194,13 @@ def test_the_path_of_a_run_stays_on_its_object(run):
     assert len(trail) > 20 and height == pytest.approx(LIFT_M, abs=3e-4)
 
 
-def test_colours_of_the_path_span_five_per_cent_of_the_curvature():
+def test_colours_of_the_surface_span_five_per_cent_of_the_curvature():
     shape = make_object("sphere", T_base_object=np.eye(4), radius=0.05)
-    assert error_scale(shape).high == pytest.approx(0.05 * math.sqrt(2) / 0.05)
-    assert error_scale(make_object("plane", T_base_object=np.eye(4))).high == 0.5
-    assert "stated" in error_scale(None).text
+    assert deviation_scale(shape).high == pytest.approx(0.05 * math.sqrt(2) / 0.05)
+    assert deviation_scale(make_object("plane", T_base_object=np.eye(4))).high == 0.5
+    assert "stated" in deviation_scale(None).text
+    known, unsure = deviation_scale(shape).colours(np.array([0.0, 9.0])).tolist()
+    assert sum(known) > sum(unsure)
 
 
 def test_the_true_curvature_is_that_under_the_contact():
@@ -241,7 +243,7 @@ def test_the_page_holds_the_whole_run(page, run):
     names = {message.get("name") for _, message in scene["messages"]}
     assert scene["durationSeconds"] == pytest.approx(run.duration_s - float(run.log["t_s"][0]))
     assert {f"/arm/{i}" for i in range(7)} | {"/object/ghost", "/probe/dome", "/contact", "/force"} <= names
-    assert {"/patch/surface", "/patch/above", "/patch/below", "/probe/taxels", "/path/000"} <= names
+    assert {"/probe/taxels", "/path/000"} <= names and any(str(name).startswith("/surface/") for name in names)
     data = panel_data(page)
     assert data["curves"]["t_s"][-1] == pytest.approx(run.duration_s, rel=1e-4)
     frames = base64.b64decode(data["taxels"])

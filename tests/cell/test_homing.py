@@ -113,7 +113,7 @@ def test_the_index_pulse_behind_the_positive_switch(tmp_path):
 
 
 def test_a_slide_whose_drive_counts_backwards_finds_its_negative_switch_at_its_upper_end(tmp_path):
-    scene = canprobe.load_scene("free", "gantry")
+    scene = canprobe.load_scene("free", {"cell": "gantry"})
     x = replace(scene.joints["x"], sign=-1, zero="homing", homing_method=17, home_mm=404.0, homing_speed_mm_s=100.0)
     scene = replace(scene, joints={**scene.joints, "x": x})
     bench = Bench(change(scene, arm={"emulated": False}, scene={"figures": False}), tmp_path)

@@ -256,6 +256,14 @@ def test_patience_is_what_is_asked_for_and_for_emulated_nodes_only(command, call
     assert "--patient is for emulated nodes" in capsys.readouterr().err and not calls
 
 
+@pytest.mark.parametrize("command", ["run", "up"])
+def test_keys_are_set_as_a_file_has_them(command, calls):
+    words = ["--set", "task.swing_period_s=3", "--set", "scene.title=a = b", "--set", "cycle.realtime = true"]
+    assert main([command, "free", "--bus", "socketcan", *words]) == 0
+    ((_, (scene,), _),) = calls
+    assert (scene.task.swing_period_s, scene.title, scene.cycle.realtime) == (3.0, "a = b", True)
+
+
 def test_run_takes_the_scenes_bus_by_default(calls):
     assert main(["run", "free"]) == 0
     ((_, (scene,), kwargs),) = calls

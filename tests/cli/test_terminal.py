@@ -11,9 +11,10 @@ import pytest
 
 from canprobe import api
 from canprobe.cli import main
-from canprobe.cli.output import Report, painted, print_summary, print_table
+from canprobe.cli.output import print_summary, print_table
 from canprobe.results.expected import expected_text, figures_of, read_expected
 from canprobe.scene.load import packaged_scenes
+from canprobe.session.terminal import Report, painted
 
 
 class Terminal(io.StringIO):

@@ -20,7 +20,7 @@ from canprobe.cell.supervision import TOUCH_FORCE
 from canprobe.emulator.faults import FaultKind
 from canprobe.errors import SafetyStop
 from canprobe.protocol.frames import SYNC_ID, NmtState
-from canprobe.session.session import Session, resolve_scene
+from canprobe.session.session import Session
 from canprobe.tasks.from_plan import make_task
 from canprobe.tasks.probing import Phase
 
@@ -119,7 +119,7 @@ def test_a_light_press_after_a_strong_one_is_told():
 
 def test_what_the_array_remembers_is_no_press_and_what_comes_on_top_of_it_is():
     """After 3 s at 4.5 N the array shows for a while what a touch would."""
-    scene = resolve_scene(canprobe.load_scene("press"), duration_s=3.0)
+    scene = canprobe.load_scene("press", {"task.duration_s": 3.0})
     scene = replace(scene, task=replace(scene.task, force_n=4.5, clearance_mm=0.8))
     scene = replace(scene, limits=replace(scene.limits, force_max_n=8.0))
     remembered = []

@@ -15,14 +15,14 @@ from canprobe.errors import BusError, NodeError, SafetyStop, UsageError
 from canprobe.planning.measured import expected_messages
 from canprobe.protocol.cia402 import POWERED_STATES, state_of
 from canprobe.protocol.frames import NmtState
-from canprobe.session.session import Session, resolve_scene
+from canprobe.session.session import Session
 from canprobe.tasks.from_plan import make_task
 
 SHORT = {"free": 1.0, "listen": 0.5, "press": 0.5}
 
 
 def session_of(name, duration_s=1.0, **changes):
-    scene = resolve_scene(canprobe.load_scene(name), duration_s=duration_s)
+    scene = canprobe.load_scene(name, {"task.duration_s": duration_s})
     return Session(replace(scene, **changes))
 
 

@@ -263,7 +263,7 @@ def test_the_drives_are_disabled_on_the_way_out(tmp_path, make):
     ],
 )
 def test_what_only_the_device_tells_is_said_with_what_there_is(tmp_path, cell, quirk, told):
-    scene = change(canprobe.load_scene("cylinder", cell=cell), emulate=quirk, scene={"figures": False})
+    scene = change(canprobe.load_scene("cylinder", {"cell": cell}), emulate=quirk, scene={"figures": False})
     with pytest.raises(NodeError, match=told), Session(scene, tmp_path) as session:
         session.run(lambda _: Command(done=True))
 
@@ -408,7 +408,7 @@ def test_targets_of_interpolated_position_go_to_60c1h(tmp_path):
 
 
 def test_the_packaged_prbt_joint_is_planned_at_100_hz():
-    scene = canprobe.load_scene("free", "prbt")
+    scene = canprobe.load_scene("free", {"cell": "prbt"})
     plan = canprobe.plan(scene)
     assert {(node.mode, node.interpolation) for node in plan.nodes} == {(IP, (Interpolation(10, -3),))}
     assert [pdo.number for pdo in (*plan.pdos_of(3, "rpdo"), *plan.pdos_of(3, "tpdo"))] == [1, 1]

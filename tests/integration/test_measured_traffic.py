@@ -16,7 +16,7 @@ from canprobe.cli import main
 from canprobe.emulator.world import make_world
 from canprobe.errors import UsageError
 from canprobe.recorded.recording import read_recording
-from canprobe.session.session import Session, resolve_scene
+from canprobe.session.session import Session
 from canprobe.tasks.from_plan import make_task
 
 
@@ -96,7 +96,7 @@ def test_logs_that_cannot_be_measured(press, tmp_path):
 
 
 def carry_out(scene, out=None):
-    session = Session(resolve_scene(scene, duration_s=0.3), out)
+    session = Session(canprobe.load_scene(scene, {"task.duration_s": 0.3}), out)
     with session:
         session.run(make_task(session.plan))
     return session
@@ -126,7 +126,7 @@ def real_bus(monkeypatch):
     scene = canprobe.load_scene("free")
     arm = dataclasses.replace(scene.arm, emulated=False)
     scene = dataclasses.replace(scene, arm=arm, bus=dataclasses.replace(scene.bus, interface="socketcan"))
-    scene = resolve_scene(scene, duration_s=0.3)
+    scene = canprobe.load_scene(scene, {"task.duration_s": 0.3})
     bus, reports = LockstepBus(VirtualClock()), []
     for node in make_world(canprobe.plan(scene), scene.drives).nodes:
         bus.attach(node)

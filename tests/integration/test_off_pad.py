@@ -9,7 +9,7 @@ import canprobe
 from canprobe.cell.conditions import BY_KEY
 from canprobe.cell.supervision import Reaction, limits_of
 from canprobe.errors import SafetyStop
-from canprobe.session.session import Session, resolve_scene
+from canprobe.session.session import Session
 from canprobe.tasks.from_plan import make_task
 
 EDGE_M = 8 * 1.5875e-3
@@ -18,7 +18,7 @@ EDGE_M = 8 * 1.5875e-3
 @pytest.mark.parametrize("mode", ["window", "features"])
 def test_the_probe_lets_go_before_the_force_has_grown(mode):
     """A probe of 135 mm has a pad of 11 degrees, and the edge of the fillet turns by more than that within a second."""
-    scene = resolve_scene(canprobe.load_scene("fillet"), duration_s=3.0)
+    scene = canprobe.load_scene("fillet", {"task.duration_s": 3.0})
     scene = replace(
         scene,
         task=replace(scene.task, strategy="straight", width_mm=9.0, wavelength_mm=12.0, rolling_share=0.36),

@@ -121,7 +121,7 @@ def test_results_replace_others_only_where_that_is_wanted(free, tmp_path, capsys
 def test_a_run_that_does_not_begin_replaces_nothing(free, tmp_path):
     (tmp_path / "summary.json").write_text("of an earlier run")
     with pytest.raises(InterfaceError):
-        canprobe.run(free, interface="socketcan", channel="nobus0", out=tmp_path, force=True)
+        canprobe.run(free, bus="socketcan", channel="nobus0", out=tmp_path, force=True)
     assert [path.read_text() for path in tmp_path.iterdir()] == ["of an earlier run"]
 
 

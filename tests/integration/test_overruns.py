@@ -11,7 +11,7 @@ from wrapped import Wrapped
 import canprobe
 from canprobe.cell.controller import Command, Measurement
 from canprobe.results.summary import summarise
-from canprobe.session.session import Session, resolve_scene
+from canprobe.session.session import Session
 from canprobe.tasks.from_plan import make_task
 
 STALL_NS = 8_000_000
@@ -36,7 +36,7 @@ class Stalls(Wrapped):
 
 @pytest.fixture(scope="module")
 def stalled() -> tuple[Session, Stalls]:
-    scene = resolve_scene(canprobe.load_scene("cylinder"), duration_s=2.0)
+    scene = canprobe.load_scene("cylinder", {"task.duration_s": 2.0})
     session = Session(scene)
     controller = Stalls(session, EVERY)
     with session:

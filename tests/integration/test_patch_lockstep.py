@@ -8,7 +8,7 @@ import pytest
 import canprobe
 from canprobe.results.scores import score_shape
 from canprobe.results.summary import shape_lines, summarise_shape
-from canprobe.session.session import Session, resolve_scene
+from canprobe.session.session import Session
 from canprobe.tasks.from_plan import make_shape_estimator, make_task
 from canprobe.tasks.shape import replay_samples
 
@@ -16,7 +16,7 @@ from canprobe.tasks.shape import replay_samples
 @pytest.fixture(scope="module")
 def axial():
     """The session and its controller after 2 s (50 mm) on the axial scene."""
-    session = Session(resolve_scene(canprobe.load_scene("axial"), duration_s=2.0))
+    session = Session(canprobe.load_scene("axial", {"task.duration_s": 2.0}))
     controller = make_task(session.plan)
     with session:
         session.run(controller)
@@ -80,7 +80,7 @@ def test_ml_takes_the_same_help_and_the_paper_s_method_takes_none(axial):
 
 def test_across_a_circumferential_path_the_curvature_is_0_within_2_per_m():
     """Scored absolutely: there is nothing to divide by."""
-    scene = resolve_scene(canprobe.load_scene("axial"), duration_s=2.4)
+    scene = canprobe.load_scene("axial", {"task.duration_s": 2.4})
     scene = replace(scene, task=replace(scene.task, heading_deg=110.0, length_mm=20.0))
     session = Session(scene)
     controller = make_task(session.plan)

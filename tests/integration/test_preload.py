@@ -12,13 +12,13 @@ from canprobe.errors import SafetyStop
 from canprobe.protocol.cia402 import DriveState, state_of
 from canprobe.protocol.frames import NmtState
 from canprobe.scene.geometry import true_object
-from canprobe.session.session import Session, resolve_scene
+from canprobe.session.session import Session
 from canprobe.tasks.from_plan import make_task
 
 
 def press_begun_pressed(**limits):
     """Reason of the stop, and the session: of a press where the object stands 0.3 mm in the way of the arm at rest."""
-    scene = resolve_scene(canprobe.load_scene("press"), duration_s=3.0)
+    scene = canprobe.load_scene("press", {"task.duration_s": 3.0})
     session = Session(replace(scene, limits=replace(scene.limits, **limits)))
     x, y, z = scene.object.position_mm
     raised = true_object(replace(scene.object, position_mm=(x, y, z + 8.3)))
@@ -50,7 +50,7 @@ def test_a_larger_limit_lets_an_array_with_offsets_begin():
 
 def test_a_force_during_the_run_is_no_preload():
     """Nor while its drives are off afterwards, which must not keep the probe from being taken off the object."""
-    scene = resolve_scene(canprobe.load_scene("press"), duration_s=0.5)
+    scene = canprobe.load_scene("press", {"task.duration_s": 0.5})
     with Session(scene) as session:
         session.run(make_task(session.plan))
     assert session.cell.supervisor.seen.preload < 0.15 and "preload" not in session.cell.supervisor.first

@@ -8,7 +8,7 @@ from wrapped import Wrapped
 
 import canprobe
 from canprobe.scene.model import PlantSettings
-from canprobe.session.session import Session, resolve_scene
+from canprobe.session.session import Session
 from canprobe.studies.fault_scores import Witness
 from canprobe.tasks.from_plan import make_task
 from canprobe.tasks.probing import Phase
@@ -22,7 +22,7 @@ class Disturbed(Wrapped):
     """A scan over the cylinder; in one cycle the object is put somewhere else, or taken away."""
 
     def __init__(self, move_mm, *, share=1.0, duration_s=3.0, **task):
-        scene = resolve_scene(canprobe.load_scene("cylinder"), duration_s=duration_s)
+        scene = canprobe.load_scene("cylinder", {"task.duration_s": duration_s})
         self.session = Session(
             replace(
                 scene,

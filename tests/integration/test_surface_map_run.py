@@ -9,7 +9,6 @@ from undrawn import undrawn_run
 import canprobe
 from canprobe.results.summary import write_files
 from canprobe.scene.geometry import true_object
-from canprobe.touch.surface_map import closest
 
 
 @pytest.fixture(scope="module")
@@ -37,18 +36,16 @@ def test_the_surface_is_near_the_true_object(scan):
     """Within the run's own figures: 0.1 mm and 1° everywhere on the path, half of it RMS (calibration, creep)."""
     result, _ = scan
     shape = true_object(result.plan.scene.object)
-    heights, tilts = [], []
-    for p in result.surface_map.path[::40]:
-        foot = shape.closest(p)
-        answer = closest(result.surface_map, foot.point)
-        heights.append(1e3 * answer.height)
-        tilts.append(np.degrees(np.linalg.norm(np.cross(answer.normal, foot.normal))))
+    feet = [shape.closest(p) for p in result.surface_map.path[::40]]
+    answer = result.surface_map.closest([foot.point for foot in feet])
+    heights = 1e3 * answer.height
+    tilts = np.degrees(np.linalg.norm(np.cross(answer.normal, [foot.normal for foot in feet]), axis=1))
     assert np.isfinite(heights).all()
     assert np.sqrt(np.mean(np.square(heights))) < 0.05
     assert np.abs(heights).max() < 0.1
     assert np.sqrt(np.mean(np.square(tilts))) < 0.5
     away = result.surface_map.path[0] + np.array([0.03, 0.03, 0.0])
-    assert closest(result.surface_map, away).patches == 0
+    assert result.surface_map.closest([away]).patches[0] == 0
 
 
 def test_the_summary_says_what_was_tested(scan):

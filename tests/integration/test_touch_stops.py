@@ -7,7 +7,7 @@ import pytest
 
 import canprobe
 from canprobe.errors import SafetyStop
-from canprobe.session.session import Session, resolve_scene
+from canprobe.session.session import Session
 from canprobe.tasks.from_plan import make_task
 
 
@@ -26,7 +26,7 @@ def run_until_stopped(session, at_cycle=None, action=None):
 
 
 def press_session(**changes):
-    scene = resolve_scene(canprobe.load_scene("press"), duration_s=3.0)
+    scene = canprobe.load_scene("press", {"task.duration_s": 3.0})
     for section, values in changes.items():
         scene = replace(scene, **{section: replace(getattr(scene, section), **values)})
     return Session(scene)

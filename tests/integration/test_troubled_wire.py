@@ -10,7 +10,7 @@ from canprobe.bus.disk import read_candump
 from canprobe.errors import CanprobeError
 from canprobe.protocol.cia402 import POWERED_STATES, state_of
 from canprobe.protocol.frame_bits import exact_bits
-from canprobe.session.session import Session, resolve_scene
+from canprobe.session.session import Session
 from canprobe.tasks.from_plan import make_task
 
 
@@ -21,7 +21,7 @@ def last_statuswords(folder):
 
 def test_a_babbling_idiot_stops_the_cell_and_the_drives_end_without_power(tmp_path):
     """For 150 ms an identifier below SYNC's fills the bus: nobody hears a SYNC, and both sides stop by themselves."""
-    session = Session(resolve_scene(canprobe.load_scene("free"), duration_s=2.0), tmp_path)
+    session = Session(canprobe.load_scene("free", {"task.duration_s": 2.0}), tmp_path)
     shout = (0x001, bytes(8))
     with pytest.raises(CanprobeError), session:
         bus = session.lockstep
@@ -38,7 +38,7 @@ def test_a_babbling_idiot_stops_the_cell_and_the_drives_end_without_power(tmp_pa
 
 def test_a_drive_whose_controller_goes_bus_off_is_missed(tmp_path):
     """32 of its TPDOs in a row are hit; it comes back after 128 times eleven recessive bits."""
-    session = Session(resolve_scene(canprobe.load_scene("free"), duration_s=1.0), tmp_path)
+    session = Session(canprobe.load_scene("free", {"task.duration_s": 1.0}), tmp_path)
     with session:
         bus = session.lockstep
         bus.errors = ErrorsAt({200 + k: 40 for k in range(32)}, can_id=0x183)

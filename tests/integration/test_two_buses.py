@@ -229,7 +229,7 @@ def spread_scene(scene, first):
 @pytest.fixture(scope="module")
 def seven(tmp_path_factory):
     out = tmp_path_factory.mktemp("seven")
-    scene = spread_scene(canprobe.load_scene("cylinder", "seven-axis"), 4)
+    scene = spread_scene(canprobe.load_scene("cylinder", {"cell": "seven-axis"}), 4)
     return undrawn_run(scene, out=out, duration_s=0.3), list(read_candump(out / "bus.log"))
 
 
@@ -256,7 +256,7 @@ def test_a_recording_has_the_drives_of_both_buses(seven):
 
 def test_the_controller_waits_for_the_slower_bus():
     """Two drives on one bus, five and the array on the other: one budget, that of the later feedback and commands."""
-    plan = canprobe.plan(spread_scene(canprobe.load_scene("cylinder", "seven-axis"), 5))
+    plan = canprobe.plan(spread_scene(canprobe.load_scene("cylinder", {"cell": "seven-axis"}), 5))
     budgets = [bus.traffic.budget for bus in plan.buses]
     assert budgets[0] == budgets[1]
     for what, direction in (("feedback_ns", "tpdo"), ("commands_ns", "rpdo")):

@@ -9,7 +9,7 @@ from wrapped import Wrapped
 
 import canprobe
 from canprobe.cell.controller import Command, Controller
-from canprobe.session.session import Session, resolve_scene
+from canprobe.session.session import Session
 from canprobe.tasks.from_plan import make_task
 
 
@@ -32,7 +32,7 @@ class Working(Controller):
 
 
 def test_it_is_called_once_a_step_when_the_rpdos_are_out():
-    session = Session(resolve_scene(canprobe.load_scene("free")))
+    session = Session(canprobe.load_scene("free"))
     controller = Working(session)
     with session:
         session.run(controller)
@@ -67,7 +67,7 @@ def test_what_it_raises_ends_the_run_off_the_object():
 
 def scanned(wrap):
     """Its answers and targets, in a short scan."""
-    session = Session(resolve_scene(canprobe.load_scene("cylinder"), duration_s=0.8))
+    session = Session(canprobe.load_scene("cylinder", {"task.duration_s": 0.8}))
     with session:
         task = make_task(session.plan)
         session.run(wrap(task))

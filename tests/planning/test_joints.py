@@ -44,24 +44,24 @@ def refusal(scene):
 
 
 def test_a_gantry_keeps_its_pole_and_the_plan_says_so():
-    plan = canprobe.plan(load_scene("plane", "gantry"))
+    plan = canprobe.plan(load_scene("plane", {"cell": "gantry"}))
     assert plan.setup.task.scan.rolling_share == 1.0
     assert any("keeps the orientation of the probe" in warning for warning in plan.warnings)
 
 
 def test_a_contact_that_leaves_the_array_is_refused_with_the_angle():
-    said = refusal(load_scene("cylinder", "gantry"))
+    said = refusal(load_scene("cylinder", {"cell": "gantry"}))
     assert "up to 30.0 deg from the probe's pole" in said
     assert "the array reaches 18.2 deg" in said
 
 
 def test_a_wide_cylinder_stays_on_the_array_of_a_gantry():
-    scene = load_scene("cylinder", "gantry")
+    scene = load_scene("cylinder", {"cell": "gantry"})
     canprobe.plan(replace(scene, object=replace(scene.object, radius_mm=100.0)))
 
 
 def test_a_calibration_without_tilt_is_refused():
-    assert "a calibration tilts the probe" in refusal(load_scene("calibrate", "gantry"))
+    assert "a calibration tilts the probe" in refusal(load_scene("calibrate", {"cell": "gantry"}))
 
 
 def test_counts_that_leave_32_bits_are_refused_with_joint_drive_and_range():
@@ -83,4 +83,4 @@ def test_two_joints_cannot_press():
 
 def test_a_full_arm_is_warned_of_nothing():
     for cell in ("puma260", "puma560"):
-        assert canprobe.plan(load_scene("cylinder", cell)).warnings == ()
+        assert canprobe.plan(load_scene("cylinder", {"cell": cell})).warnings == ()

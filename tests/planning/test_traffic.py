@@ -122,7 +122,7 @@ def follow_ways_out(scene):
 
 
 def eight_drives():
-    scene = load_scene("cylinder", "seven-axis")
+    scene = load_scene("cylinder", {"cell": "seven-axis"})
     joints = {**scene.joints, "joint_8": dataclasses.replace(scene.joints["joint_7"], node_id=8)}
     return dataclasses.replace(scene, joints=joints)
 
@@ -456,7 +456,7 @@ def test_a_sensor_alone_has_a_budget_too():
 @pytest.mark.parametrize("ids", [(17, 18, 19, 20, 21, 49, 126), (120, 121, 122, 123, 124, 125, 126)])
 def test_identifiers_of_the_array_leave_those_of_any_drive_alone(mode, ids, tmp_path):
     """RPDO4 of nodes 17 to 49 are 511h to 531h, where the array's are otherwise; whatever bus they are on."""
-    scene = load_scene("cylinder", "seven-axis")
+    scene = load_scene("cylinder", {"cell": "seven-axis"})
     scene = change(
         scene,
         arm={"eds": str(write_eds("milliseconds_only", tmp_path))},

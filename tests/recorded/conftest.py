@@ -19,7 +19,6 @@ from canprobe.cell.cell import Cell
 from canprobe.emulator.world import make_world
 from canprobe.results.summary import log_columns, tactile_columns
 from canprobe.scene.load import dump_scene
-from canprobe.session.session import resolve_scene
 from canprobe.tasks.from_plan import make_task
 
 DURATION_S = 1.1
@@ -27,7 +26,7 @@ DURATION_S = 1.1
 
 def short_scan(*, patch=True, **task):
     """The cylinder with a scan of a second or so, and the online estimator alone."""
-    scene = resolve_scene(canprobe.load_scene("cylinder"), duration_s=DURATION_S)
+    scene = canprobe.load_scene("cylinder", {"task.duration_s": DURATION_S})
     scene = replace(scene, shape=replace(scene.shape, also=(), patch=patch))
     return replace(scene, task=replace(scene.task, clearance_mm=0.8, **task))
 

@@ -14,6 +14,7 @@ from undrawn import undrawn_run
 import canprobe
 from canprobe.bus.disk import read_candump, read_npz
 from canprobe.cli import main
+from canprobe.recorded.run_folder import RunFolder
 
 DRIVES = tuple(f"{0x180 + node:03X}" for node in range(1, 7))
 TRUE_KAPPA = np.array([1 / 0.036, 0.0])
@@ -72,6 +73,14 @@ def test_the_folder_of_a_run_gives_the_online_result_to_the_last_bit(lockstep_ru
     assert_same(result.estimates["recursive"], lockstep_run.estimates["recursive"])
     online = json.loads((lockstep_run.out / "summary.json").read_text())
     assert json.loads(json.dumps(result.summary["shape"])) == online["shape"]
+
+
+def test_the_cycles_of_a_run_have_the_times_that_its_estimates_were_dated_by(tmp_path):
+    """A rounding error more, and an estimate is scored against the truth of the cycle beside it."""
+    times_ns = np.arange(8000, dtype=np.int64) * 2_500_000
+    run = RunFolder(tmp_path, {"t_s": 0.4671 + times_ns * 1e-9}, {})
+    assert np.any(run.log["t_s"] - run.start_s != times_ns * 1e-9)
+    np.testing.assert_array_equal(run.times_s, times_ns * 1e-9)
 
 
 def test_a_run_of_drives_that_send_no_torque_is_replayed_and_shown(lockstep_run, tmp_path):

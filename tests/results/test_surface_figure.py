@@ -1,11 +1,11 @@
-"""The tiles of the surface figure lie on the surface, and the figure is drawn with and without what is optional."""
+"""The surface figure is drawn with and without what is optional."""
 
 import dataclasses
 
 import numpy as np
 import pytest
 
-from canprobe.results.surface_figure import APART_M, TILE_M, draw_map, tile, tiles_of
+from canprobe.results.surface_figure import draw_map
 from canprobe.touch.objects import Sphere
 from canprobe.touch.surface import SurfaceMatrix
 from canprobe.touch.surface_map import LocalPatch, SurfaceMap
@@ -32,26 +32,12 @@ def two_passes():
     return SurfaceMap(patches=tuple(patches), path=np.array([p.point for p in patches]), method="ml")
 
 
-def test_tiles_lie_on_the_surface(two_passes):
-    for patch in two_passes:
-        points = tile(patch).reshape(-1, 3)
-        np.testing.assert_allclose(np.linalg.norm(points + np.array([0, 0, RADIUS]), axis=1), RADIUS, atol=1e-12)
-        assert np.linalg.norm(points - patch.point, axis=1).max() == pytest.approx(TILE_M, rel=1e-3)
-
-
-def test_the_best_known_patch_stands_for_a_place(two_passes):
-    drawn = tiles_of(two_passes)
-    assert drawn[0] is two_passes.patches[-1]
-    places = np.array([patch.point for patch in drawn])
-    apart = np.linalg.norm(places[:, None] - places, axis=2) + np.eye(len(places))
-    assert apart.min() > APART_M
-    assert all(np.linalg.norm(places - patch.point, axis=1).min() <= APART_M for patch in two_passes)
-
-
 def test_it_is_drawn_with_and_without_truth_and_crossings(two_passes, tmp_path):
     T = np.eye(4)
     draw_map(two_passes, tmp_path / "a.png", shape=Sphere(T, RADIUS), title="two passes")
     blind = dataclasses.replace(two_passes.patches[0], combinations=np.eye(3)[:2])
     draw_map(dataclasses.replace(two_passes, patches=(blind,)), tmp_path / "b.png")
-    for name in ("a.png", "b.png"):
+    tiny = dataclasses.replace(two_passes, patches=(dataclasses.replace(blind, pose_known=False),))
+    draw_map(tiny, tmp_path / "c.png")
+    for name in ("a.png", "b.png", "c.png"):
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")

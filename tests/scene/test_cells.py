@@ -33,13 +33,13 @@ def test_packaged_cells_have_titles():
 
 
 def test_a_scene_without_a_cell_has_the_default_cell():
-    assert load_scene("cylinder") == load_scene("cylinder", "puma260")
+    assert load_scene("cylinder") == load_scene("cylinder", {"cell": "puma260"})
 
 
 @pytest.mark.parametrize("cell", CELLS)
 @pytest.mark.parametrize("scene", ["cylinder", "free", "listen"])
 def test_every_scene_reads_with_every_cell_and_is_written_whole(scene, cell):
-    read = load_scene(scene, cell)
+    read = load_scene(scene, cell and {"cell": cell})
     assert parse_scene(dump_scene(read)) == read
     assert read.cell.name == (load_cell(cell)["cell"]["name"])
 
@@ -55,7 +55,7 @@ def test_the_cell_that_is_given_replaces_the_one_that_the_scene_names(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text(f'cell = "puma560"\n{FREE}')
     assert len(load_scene(path).joints) == 6
-    assert len(load_scene(path, "gantry").joints) == 3
+    assert len(load_scene(path, {"cell": "gantry"}).joints) == 3
 
 
 def test_a_scene_finds_its_cell_and_the_cell_its_files_beside_it(tmp_path):
@@ -83,7 +83,7 @@ def load_scene_text(text, cell, folder=None):
     with TemporaryDirectory() as made:
         path = Path(made) / "scene.toml"
         path.write_text(text)
-        return load_scene(path, cell)
+        return load_scene(path, {"cell": cell})
 
 
 def test_a_task_takes_only_the_hardware_that_it_uses():
@@ -123,7 +123,7 @@ def test_mistakes_in_a_cell_name_the_cell_file(tmp_path):
     path = tmp_path / "cell.toml"
     path.write_text(GANTRY.replace("4096", '"many"'))
     with pytest.raises(SceneError, match=r"cell\.toml: joints\.turn\.counts_per_turn: expected a number"):
-        load_scene("free", path)
+        load_scene("free", {"cell": path})
 
 
 def test_all_packaged_scenes_name_cells_that_are_there():

@@ -8,7 +8,7 @@ import canprobe
 from canprobe.cell.controller import Command
 from canprobe.errors import NodeError, PlanError, UsageError
 from canprobe.results.summary import log_columns
-from canprobe.session.session import Session, resolve_scene
+from canprobe.session.session import Session
 from canprobe.session.up import up
 from canprobe.tasks.from_plan import make_task
 
@@ -23,7 +23,7 @@ def on_both(scene, controller=make_task):
 
 
 def loaded(name, cell=None, duration_s=0.2, **sections):
-    scene = resolve_scene(canprobe.load_scene(name, cell), duration_s=duration_s)
+    scene = canprobe.load_scene(name, {"task.duration_s": duration_s} | ({} if cell is None else {"cell": cell}))
     return replace(scene, **{key: replace(getattr(scene, key), **keys) for key, keys in sections.items()})
 
 
@@ -68,7 +68,7 @@ def test_a_drive_that_fails_stops_the_cell_with_the_words_of_a_bus():
 
 def test_a_run_says_what_is_left_out_with_the_bus(tmp_path):
     scene = loaded("listen", scene={"figures": False})
-    result = canprobe.run(scene, interface="direct", out=tmp_path)
+    result = canprobe.run(scene, bus="direct", out=tmp_path)
     assert (result.summary["bus"], result.summary["bus_load"], result.summary["traffic"]) == ("direct", None, None)
     assert any(line.startswith("bus, ") for line in result.summary["left_out"])
     written = {path.name for path in tmp_path.iterdir()}

@@ -307,7 +307,7 @@ def test_a_bring_up_that_fails_names_the_controllers_state(ip, silent_bus, print
     scene = canprobe.load_scene("free")
     scene = replace(scene, arm=replace(scene.arm, emulated=False))
     with pytest.raises(InterfaceError, match=r"^can0: its CAN controller is ") as caught:
-        canprobe.run(scene, interface="socketcan", files=False)
+        canprobe.run(scene, bus="socketcan", files=False)
     assert all(part in str(caught.value) for part in (*told, "; node 1: (joint 1) sent no boot-up"))
     assert caught.value.summary["stop_reason"] == str(caught.value)
 

@@ -8,8 +8,8 @@ import bridges_bench as bridges
 import matplotlib.image
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PathCollection, PolyCollection
-from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.text import Text
 from matplotlib.transforms import Bbox
@@ -233,7 +233,7 @@ def defects(sheet, texts, image):
 def drawn(draw, path, monkeypatch):
     """The sheet as it was saved, and what is written on it with the places."""
     sheets, texts = [], {}
-    write, save = Text.draw, Figure.savefig
+    write, save = Text.draw, FigureCanvasAgg.print_png
 
     def writing(self, renderer):
         if self.get_visible() and self.get_text().strip():
@@ -244,9 +244,9 @@ def drawn(draw, path, monkeypatch):
         with monkeypatch.context() as patch:
             patch.setattr(Text, "draw", writing)
             save(self, *args, **options)
-        sheets.append(self)
+        sheets.append(self.figure)
 
-    monkeypatch.setattr(Figure, "savefig", saving)
+    monkeypatch.setattr(FigureCanvasAgg, "print_png", saving)
     draw(path)
     return sheets[0], list(texts.values())
 

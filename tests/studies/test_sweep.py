@@ -283,7 +283,7 @@ def test_a_dask_cluster_computes_the_same(demo, tmp_path, monkeypatch):
 
 def test_a_dask_address_has_a_port():
     with (
-        pytest.raises(StudyError, match=r"--dask nonsense: expected the address and port .* tcp://"),
+        pytest.raises(StudyError, match=r"Dask scheduler nonsense: expected its address and port, as tcp://"),
         dask_executor("nonsense"),
     ):
         pass

@@ -30,7 +30,7 @@ from canprobe.planning.make import make_plan
 from canprobe.scene.load import load_scene
 from canprobe.scene.resolve import resolve
 from canprobe.session.children import Bridges
-from canprobe.session.session import Session, resolve_scene
+from canprobe.session.session import Session, with_bridges
 from canprobe.studies.harness import Column, Row, StudyResult, measuring_facts, text_of
 from canprobe.tasks.from_plan import make_task
 
@@ -134,7 +134,7 @@ def run(*, quick: bool, sweep: object) -> StudyResult:
 def _record(seconds: float) -> list[Observation]:
     """Every cycle of a scan, as an observer sees it."""
     seen: list[Observation] = []
-    session = Session(resolve_scene(load_scene(SCENE), duration_s=seconds), observers=(seen.append,))
+    session = Session(load_scene(SCENE, {"task.duration_s": seconds}), observers=(seen.append,))
     task = make_task(session.plan)
     with session:
         session.run(task)
@@ -142,7 +142,7 @@ def _record(seconds: float) -> list[Observation]:
 
 
 def _measure(case: Case, observations: Sequence[Observation]) -> Row:
-    plan = make_plan(resolve(resolve_scene(load_scene(SCENE), bridge=case.bridges)))
+    plan = make_plan(resolve(with_bridges(load_scene(SCENE), case.bridges)))
     with (
         tempfile.TemporaryDirectory(prefix="canprobe-") as folder,
         Bridges(plan, Path(folder), virtual=False) as bridges,

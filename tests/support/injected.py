@@ -14,7 +14,7 @@ from canprobe.cell.supervision import limits_of
 from canprobe.emulator.faults import Fault, FaultyNode
 from canprobe.errors import CanprobeError
 from canprobe.protocol.cia402 import POWERED_STATES, state_of
-from canprobe.session.session import Session, resolve_scene
+from canprobe.session.session import Session
 from canprobe.tasks.from_plan import make_task
 from canprobe.tasks.probing import Phase
 
@@ -29,7 +29,7 @@ class Injected:
     """A run in which something happens at one cycle; what came of it, and when."""
 
     def __init__(self, name, at, action, *, until=400, own=False, **changes):
-        scene = resolve_scene(canprobe.load_scene(name), duration_s=3.0)
+        scene = canprobe.load_scene(name, {"task.duration_s": 3.0})
         if scene.task.kind in ("press", "scan"):
             scene = replace(scene, task=replace(scene.task, clearance_mm=0.8))
         scene = replace(scene, **{k: replace(getattr(scene, k), **v) for k, v in changes.items()})

@@ -8,7 +8,7 @@ import pytest
 
 import canprobe
 from canprobe.cell.controller import Command, Controller, Measurement
-from canprobe.session.session import Session, resolve_scene
+from canprobe.session.session import Session
 from canprobe.tasks.from_plan import FORCE_RATE, RequestedTask, make_task
 from canprobe.tasks.task import Loss
 from canprobe.tasks.touch import losses_text, summarise_losses
@@ -43,7 +43,7 @@ def request(kind, value=None):
 
 @pytest.fixture
 def press():
-    return Session(resolve_scene(canprobe.load_scene("press"), duration_s=3.0))
+    return Session(canprobe.load_scene("press", {"task.duration_s": 3.0}))
 
 
 def test_the_force_follows_what_is_asked_for_and_a_stop_ends_it(press):
@@ -79,7 +79,7 @@ def test_the_force_follows_what_is_asked_for_and_a_stop_ends_it(press):
 
 def test_a_stop_lets_a_calibration_go_of_its_ball():
     """Stopped in its second touch, it does not leave the probe pressing."""
-    scene = resolve_scene(canprobe.load_scene("calibrate"))
+    scene = canprobe.load_scene("calibrate")
     session = Session(replace(scene, bus=replace(scene.bus, timed=False)))
     queue, task = deque(), make_task(session.plan)
     controller = RequestedTask(task, None, (queue,), 2.5e-3)

@@ -1,15 +1,18 @@
-"""The map of local patches: what is kept of a path, and the surface that it answers with."""
+"""The map of local patches: what is kept of a path, the surface that it answers with, and its mesh."""
 
 import dataclasses
 import math
 
 import numpy as np
 import pytest
+import trimesh
 
-from canprobe.errors import UsageError
+from canprobe.errors import ResultsError, UsageError
+from canprobe.touch.blend import REACH_M, Feet
 from canprobe.touch.estimate.fit import fit_surface
+from canprobe.touch.meshing import mesh_of
 from canprobe.touch.surface import SurfaceMatrix
-from canprobe.touch.surface_map import WIDE, LocalPatch, SurfaceMap, closest, merge_patches, spaced
+from canprobe.touch.surface_map import WIDE, LocalPatch, SurfaceMap, merge_patches, spaced
 
 RADIUS = 0.05
 SIGMA = {"sigma_point": 2e-5, "sigma_normal": 1e-3}
@@ -55,21 +58,25 @@ def test_exact_patches_give_the_exact_closest_point(truth, height):
     surface_map, pose = exact_map(truth)
     for angle, side in ((0.0, 0.0), (0.131, 0.02), (0.3, -0.05)):
         p, n = at(pose, angle, side, height)
-        answer = closest(surface_map, p)
+        answer = surface_map.closest([p])
         foot, _ = at(pose, angle, side)
-        assert answer.patches >= 2
-        assert answer.height == pytest.approx(height, abs=2e-8)
-        np.testing.assert_allclose(answer.point, foot, atol=2e-8)
-        np.testing.assert_allclose(answer.normal, n, atol=2e-6)
+        assert answer.patches[0] >= 2
+        assert answer.height[0] == pytest.approx(height, abs=2e-8)
+        np.testing.assert_allclose(answer.point[0], foot, atol=2e-8)
+        np.testing.assert_allclose(answer.normal[0], n, atol=2e-6)
 
 
 def test_where_no_patch_is_near_there_is_no_answer(truth):
     surface_map, pose = exact_map(truth)
-    for p in (at(pose, 0.2, 0.09)[0], at(pose, -0.09)[0], pose[:3, 3] - at(pose, 0.2)[1]):
-        answer = closest(surface_map, p)
-        assert answer.patches == 0
-        assert np.isnan([*answer.point, *answer.normal, answer.height, answer.sigma]).all()
-    assert closest(dataclasses.replace(surface_map, patches=()), np.zeros(3)).patches == 0
+    far = np.array([at(pose, 0.2, 0.09)[0], at(pose, -0.09)[0], pose[:3, 3] - at(pose, 0.2)[1]])
+    near = at(pose, 0.2)[0]
+    answer = surface_map.closest([far[0], near, *far[1:]])
+    np.testing.assert_array_equal(answer.patches > 0, [False, True, False, False])
+    for values in answer[:4]:
+        np.testing.assert_array_equal(np.isfinite(values).reshape(4, -1).all(axis=1), [False, True, False, False])
+    empty = dataclasses.replace(surface_map, patches=())
+    assert np.isnan(empty.distance(far)).all()
+    assert [len(values) for values in surface_map.distance(np.zeros((0, 3)))] == [0, 0]
 
 
 def test_a_blend_lies_between_its_patches_and_nearer_to_the_better_known(truth):
@@ -79,21 +86,22 @@ def test_a_blend_lies_between_its_patches_and_nearer_to_the_better_known(truth):
     for variance, share in ((1.0, 0.5), (1 / 9, 0.9), (9.0, 0.1)):
         high = exact_patch(surface, at(pose, 0.04)[0], s=0.1, variance=variance, lifted=1e-4)
         both = SurfaceMap(patches=(low, high), path=[low.point, high.point])
-        answer = closest(both, at(pose, 0.02)[0])
-        assert answer.height == pytest.approx(-share * 1e-4, rel=2e-3)  # a lifted surface is above the point
-        assert answer.patches == 2
+        distance, _ = both.distance([at(pose, 0.02)[0]])
+        assert distance[0] == pytest.approx(-share * 1e-4, rel=2e-3)  # a lifted surface is above the point
 
 
-def test_a_blend_has_no_steps(truth):
+def test_a_blend_has_no_steps_and_no_kinks(truth):
     """Each patch is lifted by its own 0.1 mm or so: along the path the answer still moves by small steps."""
     surface_map, pose = exact_map(truth)
     lifts = np.random.default_rng(0).normal(0.0, 1e-4, len(surface_map))
     rough = [dataclasses.replace(p, T_base_contact=_lifted(p, h)) for p, h in zip(surface_map, lifts, strict=True)]
     rough_map = dataclasses.replace(surface_map, patches=tuple(rough))
-    angles = np.linspace(0.0, 0.4, 401)
-    heights = np.array([closest(rough_map, at(pose, a, 0.01)[0]).height for a in angles])
+    angles = np.linspace(0.0, 0.4, 4001)
+    heights, _ = rough_map.distance([at(pose, a, 0.01)[0] for a in angles])
     assert np.ptp(heights) > 5e-5
-    assert np.abs(np.diff(heights)).max() < 6e-6
+    slopes = np.diff(heights) / (RADIUS * np.diff(angles))
+    assert np.abs(slopes).max() < 0.3
+    assert np.abs(np.diff(slopes)).max() < 0.01  # where a patch enters or leaves, too
 
 
 def _lifted(patch, height):
@@ -111,10 +119,22 @@ def test_sigma_of_the_surface_covers_its_error(truth):
         patch = LocalPatch.of(estimate, t_s=0.0, travelled_m=0.0)
         surface_map = SurfaceMap(patches=(patch,), path=[patch.point])
         beside = path.surface.project(patch.point + 2e-3 * patch.T_base_contact[:3, 0])
-        answer = closest(surface_map, beside)
-        ratios.append(answer.height / answer.sigma)
+        distance, sigma = surface_map.distance([beside])
+        ratios.append(distance[0] / sigma[0])
     assert 0.75 < np.std(ratios) < 1.25
     assert abs(np.mean(ratios)) < 0.4
+
+
+def test_a_patch_that_does_not_know_its_height_says_nothing_about_sigma(truth):
+    surface_map, pose = exact_map(truth)
+    p = [at(pose, 0.2)[0]]
+    distance, sigma = surface_map.distance(p)
+    blind = [dataclasses.replace(patch, pose_known=False) for patch in surface_map]
+    mixed = dataclasses.replace(surface_map, patches=(*surface_map.patches[:5], *blind[5:]))
+    assert mixed.distance(p)[1] == pytest.approx(sigma, rel=0.5)
+    alone = dataclasses.replace(surface_map, patches=tuple(blind)).distance(p)
+    assert alone[0] == pytest.approx(distance, abs=1e-9)
+    assert np.isnan(alone[1]).all()
 
 
 def test_patches_are_kept_by_path_not_by_time(truth):
@@ -160,11 +180,10 @@ def test_what_a_straight_path_leaves_open_is_wide(truth, method):
     assert sigma[1] == pytest.approx(WIDE / estimate.distance, rel=0.05)
     # the height on the path beside the contact is known, across it is not
     surface_map = SurfaceMap(patches=(patch,), path=[patch.point])
-    beside = [
-        closest(surface_map, path.surface.project(patch.point + 2e-3 * np.append(t, 0))) for t in (-along, across)
-    ]
-    assert beside[0].sigma < 3e-5
-    assert beside[1].sigma > 5e-4
+    beside = [path.surface.project(patch.point + 2e-3 * np.append(t, 0)) for t in (-along, across)]
+    _, sigma = surface_map.distance(beside)
+    assert sigma[0] < 3e-5
+    assert sigma[1] > 5e-4
 
 
 @pytest.mark.parametrize("method", ["ml", "chord"])
@@ -214,6 +233,99 @@ def test_bad_maps_and_queries_are_refused(truth):
     with pytest.raises(UsageError, match="spacing: expected a number above 0"):
         merge_patches(surface_map.patches, surface_map.path, spacing=0.0)
     with pytest.raises(UsageError, match="reach: expected a number above 0"):
-        closest(surface_map, [0, 0, 0], reach=-1.0)
-    with pytest.raises(UsageError, match="point: expected finite"):
-        closest(surface_map, [0, 0, math.nan])
+        surface_map.distance([[0, 0, 0]], reach=-1.0)
+    with pytest.raises(UsageError, match="points: expected finite"):
+        surface_map.distance([[0, 0, math.nan]])
+    with pytest.raises(UsageError, match=r"cell: expected at least \S+ m for points so far away, got 1e-09"):
+        surface_map.mesh(cell=1e-9)
+
+
+# Meshes, against a ball in closed form: on the surface, closed, oriented, and read back by another library.
+
+
+def test_the_mesh_of_a_pass_is_a_band_on_the_ball(truth):
+    surface_map, pose = exact_map(truth)
+    mesh = surface_map.mesh()
+    out = mesh.vertices - pose[:3, 3]
+    np.testing.assert_allclose(np.linalg.norm(out, axis=1), RADIUS, atol=2e-8)
+    np.testing.assert_allclose(mesh.normals, out / RADIUS, atol=2e-6)
+    shape = trimesh.Trimesh(mesh.vertices, mesh.triangles, process=False)
+    assert shape.is_winding_consistent
+    assert shape.body_count == 1
+    assert np.einsum("ij,ij->i", shape.face_normals, mesh.normals[mesh.triangles[:, 0]]).min() > 0.99
+    assert np.degrees(shape.face_angles.min()) > 10  # no slivers
+    # 22 mm of path and what is in reach to every side of it, but for up to two cells at the rim
+    least, most = (22e-3 * 2 * r + math.pi * r**2 for r in (REACH_M - 1e-3, REACH_M))
+    assert least < shape.area < most
+    reach = np.linalg.norm(mesh.vertices[:, None] - surface_map.points, axis=2).min(axis=1)
+    assert reach.max() < REACH_M
+    distance, sigma = surface_map.distance(mesh.vertices)
+    assert np.abs(distance).max() < 1e-9
+    np.testing.assert_allclose(mesh.sigma, sigma, rtol=1e-6)
+
+
+def test_patches_all_over_a_ball_make_a_closed_body(truth):
+    pose = truth.any_pose(7)
+    surface = ball(pose)
+    steps = 0.5 + np.arange(300)  # spread over the sphere by the golden angle
+    z, turn = 1 - steps / 150, steps * math.pi * (3 - math.sqrt(5))
+    n = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=1)
+    patches = [exact_patch(surface, p, s=i * 1e-3) for i, p in enumerate(pose[:3, 3] + RADIUS * n)]
+    mesh = SurfaceMap(patches=tuple(patches), path=np.zeros((0, 3))).mesh(cell=5e-3, reach=15e-3)
+    shape = trimesh.Trimesh(mesh.vertices, mesh.triangles, process=False)
+    assert shape.is_watertight
+    assert shape.euler_number == 2
+    assert shape.volume == pytest.approx(4 / 3 * math.pi * RADIUS**3, rel=5e-3)
+
+
+def test_what_is_added_elsewhere_leaves_the_triangles_where_they_were(truth):
+    surface_map, _ = exact_map(truth)
+    fewer = SurfaceMap(patches=surface_map.patches[:6], path=surface_map.path)
+    grown, before = surface_map.mesh(cell=1e-3), fewer.mesh(cell=1e-3)
+    untouched = np.linalg.norm(before.vertices - surface_map.points[6], axis=1) > REACH_M + 2e-3
+    apart = np.linalg.norm(before.vertices[untouched][:, None] - grown.vertices, axis=2).min(axis=1)
+    assert untouched.sum() > 20
+    assert apart.max() == 0.0
+
+
+def test_a_ply_file_is_read_by_another_library(truth, tmp_path):
+    surface_map, _ = exact_map(truth)
+    mesh = surface_map.mesh(cell=1e-3)
+    mesh.save_ply(tmp_path / "map.ply")
+    read = trimesh.load(tmp_path / "map.ply", process=False)
+    np.testing.assert_allclose(read.vertices, mesh.vertices, atol=1e-7)
+    np.testing.assert_array_equal(read.faces, mesh.triangles)
+    np.testing.assert_allclose(read.vertex_normals, mesh.normals, atol=1e-6)
+    np.testing.assert_allclose(read.metadata["_ply_raw"]["vertex"]["data"]["sigma"], mesh.sigma, rtol=1e-6)
+    with pytest.raises(ResultsError, match=r"none/map.ply: cannot be written: No such file"):
+        mesh.save_ply(tmp_path / "none" / "map.ply")
+
+
+def test_without_a_surface_there_are_no_triangles(tmp_path):
+    nothing = SurfaceMap(patches=(), path=np.zeros((0, 3))).mesh()
+    assert (nothing.vertices.shape, nothing.triangles.shape, nothing.sigma.shape) == ((0, 3), (0, 3), (0,))
+    nothing.save_ply(tmp_path / "nothing.ply")
+    assert (tmp_path / "nothing.ply").read_bytes().endswith(b"end_header\n")
+
+
+def test_any_closest_point_can_be_meshed():
+    """A surface that lies on the corners of the lattice, as no scan does."""
+
+    def plane(points):
+        foot = points * [1.0, 1.0, 0.0]
+        inside = (np.abs(points[:, :2]) < 0.0105).all(axis=1)
+        height = np.where(inside, points[:, 2], math.nan)
+        return Feet(foot, np.tile([0.0, 0.0, 1.0], (len(points), 1)), height, 0 * height, inside)
+
+    mesh = mesh_of(plane, np.zeros((1, 3)), 1e-3)
+    shape = trimesh.Trimesh(mesh.vertices, mesh.triangles, process=False)
+    assert shape.area == pytest.approx(19e-3**2)
+    np.testing.assert_allclose(shape.face_normals[:, 2], 1.0)
+
+
+def test_a_point_over_the_middle_of_a_pass_is_as_high_as_it_is(truth):
+    surface_map, pose = exact_map(truth)
+    heights = np.linspace(-2e-3, 2e-3, 9)
+    distance, sigma = surface_map.distance([at(pose, 0.2, 0.0, h)[0] for h in heights])
+    np.testing.assert_allclose(distance, heights, atol=1e-8)
+    assert (sigma > 0).all()

@@ -197,9 +197,10 @@ class DriveFeedback:
 
 
 class Supervision:
-    """Counts missed SYNCs and targets between `start` and `stop`, and times the following error.
+    """Counts missed SYNCs and targets between `start` and `stop`.
 
     Attributes:
+        outside_ns: since when the following error has been outside 6065h; None while it is inside.
         watching: between `start` and `stop`, in a mode that lives by SYNC.
     """
 
@@ -210,12 +211,12 @@ class Supervision:
         self._timer = node.core.timers.new(self._sync_missing)
         self._misses = 0
         self._by_rpdo = False
-        self._outside_ns: int | None = None
+        self.outside_ns: int | None = None
 
     def start(self, target: int | None, t_ns: int) -> None:
         """Operation is enabled, in a mode that lives by SYNC and the object `target`, or by neither (None)."""
         self._misses = 0
-        self._outside_ns = None
+        self.outside_ns = None
         self._timer.cancel()
         self.watching = target is not None
         if target is not None:
@@ -238,15 +239,6 @@ class Supervision:
         self._misses += 1
         if 0 < self._parameters.misses <= self._misses:
             self._lose(RPDO_TIMEOUT, t_ns)
-
-    def following_error(self, error_counts: float, t_ns: int) -> bool:
-        """Whether the error has been outside 6065h for the time of 6066h."""
-        if abs(error_counts) <= self._parameters.following_window:
-            self._outside_ns = None
-            return False
-        if self._outside_ns is None:
-            self._outside_ns = t_ns
-        return t_ns - self._outside_ns >= self._parameters.following_timeout_ns
 
     def _sync_missing(self, due_ns: int) -> None:
         self._lose(SYNC_LOST, due_ns)
@@ -377,7 +369,13 @@ class DriveMode:
 
     def _lags(self, t_ns: int, counts: float) -> bool:
         """Watch the following error; True when it has become a fault."""
-        if not self._supervision.following_error(self._motion.demand(t_ns) - counts, t_ns):
+        error, supervision = self._motion.demand(t_ns) - counts, self._supervision
+        if abs(error) <= self._parameters.following_window:
+            supervision.outside_ns = None
+            return False
+        if supervision.outside_ns is None:
+            supervision.outside_ns = t_ns
+        if t_ns - supervision.outside_ns < self._parameters.following_timeout_ns:
             return False
         self.parts.fault(FOLLOWING_ERROR, t_ns)
         return True
@@ -410,10 +408,11 @@ class CyclicMode(DriveMode):
 
     Attributes:
         repeats: without a new target the last one is latched again.
+        lags: the following error is watched.
     """
 
     target: int
-    repeats = True
+    repeats, lags = True, False
 
     def __init__(self, parts: DriveParts) -> None:
         super().__init__(parts)
@@ -430,7 +429,9 @@ class CyclicMode(DriveMode):
         return super().status() if self.halted else FOLLOWS
 
     def sync(self, t_ns: int, counts: float) -> None:
-        """Watch the master, latch the target."""
+        """Watch the following error and the master, latch the target."""
+        if self.lags and self._lags(t_ns, counts):
+            return
         fresh, self._fresh = self._fresh, False
         supervision = self._supervision
         supervision.sync(fresh, t_ns)

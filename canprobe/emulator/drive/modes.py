@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 from canprobe.emulator.drive.homing import Homing
 from canprobe.emulator.drive.mode import REACHED, CyclicMode, DriveMode, DriveParts, ProfiledMode
+from canprobe.emulator.drive.parameters import PEAK_PERMILLE
 from canprobe.emulator.drive.reference import STEP_NS, Rates, torque_run, uniform
 from canprobe.emulator.node.dictionary import Abort, SdoAbort, Value, key_of
 from canprobe.protocol.cia402 import (
@@ -34,46 +35,47 @@ _POSITION_OFFSET = key_of(0x60B0)
 
 
 class CyclicPosition(CyclicMode):
-    """Mode 8. A ramp under way is not begun again where a target is missing."""
+    """Mode 8. A ramp under way is not begun again where a target is missing.
+
+    Attributes:
+        wanted: dictionary keys whose sum is the target, position units.
+    """
 
     number = OperationMode.CYCLIC_SYNC_POSITION
     target = 0x607A
     needs = (key_of(target),)
-    repeats = False
+    repeats, lags = False, True
+    wanted = _POSITION_TARGET, _POSITION_OFFSET
 
     def __init__(self, parts: DriveParts) -> None:
         super().__init__(parts)
         self._latched_ns = 0
-
-    def wanted(self) -> int:
-        """The target, position units."""
-        return int(self._values[_POSITION_TARGET]) + int(self._values.get(_POSITION_OFFSET, 0))
 
     def start(self, word: int, t_ns: int) -> None:
         """The first target is as far away as the time since now allows."""
         self._latched_ns = t_ns
         super().start(word, t_ns)
 
-    def sync(self, t_ns: int, counts: float) -> None:
-        """Watch the following error too."""
-        if not self._lags(t_ns, counts):
-            super().sync(t_ns, counts)
-
     def latch(self, t_ns: int) -> None:
         """Follow the target from the one before it."""
-        parameters, units, loop = self._parameters, self._units, self.parts.loop
-        target = self.wanted()
-        allowed = parameters.clamp(target)
-        counts = allowed * units.scale + units.origin
-        passed_ns = max(parameters.interpolation_ns, t_ns - self._latched_ns)
-        if abs(counts - self._motion.onset(t_ns)) > parameters.max_speed * passed_ns * 1e-9 + ROUNDING_COUNTS:
+        parameters, units, motion, values = self._parameters, self._units, self._motion, self._values
+        key, offset = self.wanted
+        target: int = values[key] + values.get(offset, 0)  # type: ignore[assignment, operator]  # of whole numbers
+        low, high = parameters.low, parameters.high
+        allowed = target if low <= target <= high else parameters.clamp(target)
+        counts, onset = allowed * units.scale + units.origin, motion.onset(t_ns)
+        reach_ns, passed_ns = parameters.interpolation_ns, t_ns - self._latched_ns
+        passed_ns = passed_ns if passed_ns > reach_ns else reach_ns
+        if abs(counts - onset) > parameters.max_speed * passed_ns * 1e-9 + ROUNDING_COUNTS:
             self.parts.fault(REFERENCE_LIMIT, t_ns)
             return
         self._latched_ns = t_ns
-        if loop.changed:
-            loop.feed_forward()
-        self._motion.reach(counts, t_ns, parameters.interpolation_ns)
-        self._limit(allowed != target or self._strains())
+        if self.parts.loop.changed:
+            self.parts.loop.feed_forward()
+        motion.reach(onset, counts, t_ns, t_ns + reach_ns)
+        limited = allowed != target or (parameters.max_torque < PEAK_PERMILLE and self._strains())
+        if limited is not self.limited:
+            self._limit(limited)
 
 
 # Interpolated position: 60C1h:01 is the target of the next SYNC, as 607Ah is in mode 8, while controlword bit 4 is set.
@@ -93,6 +95,7 @@ class InterpolatedPosition(CyclicPosition):
     number = OperationMode.INTERPOLATED_POSITION
     target = 0x60C1
     needs = (_RECORD,)
+    wanted = _RECORD, 0  # 0000h has no value
 
     def __init__(self, parts: DriveParts) -> None:
         super().__init__(parts)
@@ -103,10 +106,6 @@ class InterpolatedPosition(CyclicPosition):
         """Active at once where bit 4 is set already."""
         super().start(word, t_ns)
         self._active = self._fresh = bool(word >> ENABLE_INTERPOLATION & 1)
-
-    def wanted(self) -> int:
-        """The data record, position units."""
-        return int(self._values[_RECORD])
 
     def status(self) -> int:
         """Interpolation active; with halt, or without bit 4, at rest."""

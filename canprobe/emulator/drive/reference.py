@@ -247,13 +247,12 @@ class Motion:
         """Where a new ramp begins, counts: at the target before it, whenever the SYNC comes, or on a trajectory."""
         return self._end if self._timer.due_ns is None else self.demand(t_ns)
 
-    def reach(self, counts: float, t_ns: int, duration_ns: int) -> None:
-        """From the end of the present ramp to `counts`, in `duration_ns` from now."""
-        start, end_ns = self.onset(t_ns), t_ns + duration_ns
+    def reach(self, onset: float, counts: float, t_ns: int, end_ns: int) -> None:
+        """From `onset` to `counts`, from now to `end_ns`."""
         if self._timer.due_ns is not None:
             self._stop()
-        self._start, self._end, self._t0, self._t1 = start, counts, t_ns, end_ns  # as `_ramp`, in every cycle
-        self._plant.set_ramp(self._axis, start, counts, t_ns, end_ns)
+        self._start, self._end, self._t0, self._t1 = onset, counts, t_ns, end_ns  # as `_ramp`, in every cycle
+        self._plant.set_ramp(self._axis, onset, counts, t_ns, end_ns)
 
     def demand(self, t_ns: int) -> float:
         """The reference at `t_ns`, counts."""

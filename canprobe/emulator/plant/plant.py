@@ -10,7 +10,7 @@ long the nodes took to be brought up.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import inf, sqrt
 from typing import NamedTuple
@@ -20,13 +20,13 @@ import numpy as np
 from canprobe.emulator.plant.config import PlantConfig
 from canprobe.emulator.plant.dynamic_arm import DynamicArm, make_arm
 from canprobe.emulator.plant.ideal_arm import IdealArm, MotorDynamics
-from canprobe.emulator.plant.probe import NO_CONTACT, Contact, PressedProbe, Probe, elastic_contact, in_pad, turned
+from canprobe.emulator.plant.probe import NO_CONTACT, Contact, PressedProbe, Probe, elastic_contact, in_pad
 from canprobe.emulator.plant.pushing import LEAST_CURVATURE, total_force
 from canprobe.emulator.plant.taxels import Image, TaxelArray, Vec, pad_coordinates
 from canprobe.errors import PlanError
-from canprobe.robot.chain import Array, forward_jacobian, point_on_flange, point_velocity, posture
+from canprobe.robot.chain import Array, Chain, ending_in, jacobian, point_velocity, posture
 from canprobe.robot.model import ArmModel, units_to_joints
-from canprobe.touch.shapes import Nearest, Touches
+from canprobe.touch.shapes import Nearest, PlacedShape, Touches
 
 Truth = dict[str, float | bool | Array]
 SWITCH_BEYOND = 0.01
@@ -53,6 +53,10 @@ class Plant:
         config: what the plant is made of.
         waits: its time stands at 0 until `begin`; False: it is the time of the calls.
 
+    Attributes:
+        motor_counts, torque_permille: position (counts, continuous) and torque (see ``IdealArm.torque_permille``) of a
+            motor now, of its axis from 0: the arm's own methods; 0 without one.
+
     Raises:
         PlanError: for a probe without an arm over a hollow as tight as itself.
     """
@@ -61,10 +65,13 @@ class Plant:
         self.config = config
         self.t_ns = 0
         self._origin_ns = None if waits else 0
+        self.motor_counts: Callable[[int], float] = lambda axis: 0.0
+        self.torque_permille: Callable[[int], int] = lambda axis: 0
         self.arm: IdealArm | DynamicArm | None = None
         self._pressed: PressedProbe | None = None
         if config.model is not None:
             self.arm = make_arm(config)
+            self.motor_counts, self.torque_permille = self.arm.motor_counts, self.arm.torque_permille
         if config.object is not None and config.model is None:
             _refuse_tight_hollow(config)
             self._pressed = PressedProbe(config)
@@ -79,11 +86,10 @@ class Plant:
                 stiffness_n_m3=config.stiffness_n_m3,
                 pad=config.pad,
             )
-        T_tool = config.T_flange_probe_centre
-        self._tool_origin: Vec = tuple(T_tool[:3, 3].tolist())
-        # None where the probe's axes are the flange's, the usual case.
-        self._tool_axes: Array | None = None if np.array_equal(T_tool[:3, :3], np.eye(3)) else T_tool[:3, :3]
         self._base: Vec = tuple(config.base_offset_m.tolist())
+        self._chain: Chain | None = None
+        if config.model is not None:
+            self._chain = ending_in(config.model.chain, config.T_flange_probe_centre)
         rows = [] if config.model is None else config.model.q_per_unit.tolist()
         self._shares = [[(motor, share) for motor, share in enumerate(row) if share] for row in rows]
         self._at_zero = _joints_at_zero(config.model)
@@ -123,22 +129,6 @@ class Plant:
         """
         origin_ns = t1_ns if self._origin_ns is None else self._origin_ns  # at rest until its time begins
         (self.arm or self._need_arm()).set_ramp(axis, start_counts, end_counts, t0_ns - origin_ns, t1_ns - origin_ns)
-
-    def motor_counts(self, axis: int) -> float:
-        """Motor position now, counts, continuous; 0 without an arm.
-
-        Args:
-            axis: from 0.
-        """
-        return self.arm.motor_counts(axis) if self.arm is not None else 0.0
-
-    def torque_permille(self, axis: int) -> int:
-        """Torque of one drive now, see ``IdealArm.torque_permille``; 0 without an arm.
-
-        Args:
-            axis: from 0.
-        """
-        return self.arm.torque_permille(axis) if self.arm is not None else 0
 
     def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
         """Torque limit and feed-forwards of one drive, see ``DynamicArm.set_loop``; nothing without an arm.
@@ -213,14 +203,20 @@ class Plant:
         s = self._solution() if state is None else self._solve(state)
         if self.array is None or s.depth <= 0.0:
             return np.zeros(self.config.pad.shape)
-        field, directions = self.array.field, in_pad(s.foot, s.probe, s.direction)
-        means: Array = field.mean_pressure(s.pad_uv, s.depth, s.kappa, directions)
+        means: Array
+        if self.config.object is not None and self.config.object.by_gaps:
+            means = self._over_gaps(self.array, self.config.object, s)
+        else:
+            means = self.array.field.mean_pressure(s.pad_uv, s.depth, s.kappa, in_pad(s.foot, s.probe, s.direction))
         return means * (self.config.stiffness_n_m3 * s.contact.damping_factor)
 
     def _sampled(self, array: TaxelArray, s: _Solution) -> Image:
-        if s.several and self.config.object is not None:
-            points = array.field.points(np.array(s.probe.centre), np.array(s.probe.axes))
-            return array.image_of(array.field.mean_of(-self.config.object.gaps(points)), 1e-9 * self.t_ns)
+        shape = self.config.object
+        if s.several and shape is not None:
+            if shape.by_gaps and s.depth <= 0.0:
+                return array.image_of(np.zeros(array.pad.shape), 1e-9 * self.t_ns)
+            means = self._over_gaps(array, shape, s)
+            return array.image_of(means * s.contact.damping_factor, 1e-9 * self.t_ns)
         return array.image(
             s.pad_uv,
             s.depth,
@@ -229,6 +225,11 @@ class Plant:
             1e-9 * self.t_ns,
             pressure_factor=s.contact.damping_factor,
         )
+
+    def _over_gaps(self, array: TaxelArray, shape: PlacedShape, s: _Solution) -> Array:
+        """(rows, columns) taxel means of the layer's compression, m, from the gaps all over the pad."""
+        points = array.field.points(np.array(s.probe.centre), np.array(s.probe.axes))
+        return array.field.mean_of(-shape.gaps(points))
 
     def state(self) -> PlantState:
         """The present state: cheap to take, `truth` can be asked for it at any time."""
@@ -250,22 +251,14 @@ class Plant:
             object, contact_normal (3) outward of the object, kappa (2), direction1 (3), direction2 (3), pad_uv (2),
             in_contact.
         """
-        s = self._solution() if state is None else self._solve(state)
-        return {
-            "q": np.array(s.q),
-            "probe_centre": np.array(s.probe.centre),
-            "pole": np.array(s.probe.axes[2]),
-            "force": s.contact.force,
-            "depth": s.depth,
-            "depth_rate": s.depth_rate,
-            "contact_point": np.array(s.foot.point),
-            "contact_normal": np.array(s.foot.normal),
-            "kappa": np.array(s.foot.kappa),
-            "direction1": np.array(s.foot.directions[0]),
-            "direction2": np.array(s.foot.directions[1]),
-            "pad_uv": np.array(s.pad_uv),
-            "in_contact": s.depth > 0.0,
-        }
+        found = _true(self._solution() if state is None else self._solve(state))
+        return {name: np.array(value) if isinstance(value, tuple) else value for name, value in found.items()}
+
+    def truths(self, states: Sequence[PlantState]) -> dict[str, Array]:
+        """The same of many states, one row each; nothing of none."""
+        rows = [tuple(_true(self._solve(state)).values()) for state in states]
+        names = _true(self._solve(states[0])) if states else ()
+        return {name: np.array(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)}
 
     def _solution(self) -> _Solution:
         if self._solved is None:
@@ -275,13 +268,11 @@ class Plant:
     def _probe(self, t_ns: int, q: tuple[float, ...], qd: tuple[float, ...]) -> Probe:
         if self._pressed is not None:
             return self._pressed.at(1e-9 * t_ns, self._first_image_s)
-        if self.arm is None:
+        if self._chain is None:
             return Probe((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 0.0))
-        c = posture(self.arm.model.chain, q)
-        centre = point_on_flange(c, self._tool_origin)
-        axes = (c.x, c.y, c.z) if self._tool_axes is None else turned((c.x, c.y, c.z), self._tool_axes)
-        b0, b1, b2 = self._base
-        return Probe((centre[0] + b0, centre[1] + b1, centre[2] + b2), axes, point_velocity(c, centre, qd))
+        c = posture(self._chain, q)
+        (c0, c1, c2), (b0, b1, b2) = c.flange, self._base
+        return Probe((c0 + b0, c1 + b1, c2 + b2), (c.x, c.y, c.z), point_velocity(c, c.flange, qd))
 
     def _joints(self, motors: Sequence[float]) -> tuple[float, ...]:
         """What the joints do where the motors do something; none without an arm."""
@@ -310,22 +301,26 @@ class Plant:
         vx, vy, vz = probe.velocity
         depth, rate = config.radius_m - foot.distance, -(nx * vx + ny * vy + nz * vz)
         k1, k2 = foot.kappa
-        touches = config.object.touches(probe.centre, config.radius_m)
-        contact = elastic_contact(
-            depth,
-            (max(k1, self._tightest), max(k2, self._tightest)),
-            config.radius_m,
-            config.stiffness_n_m3,
-            depth_rate=rate,
-            damping=config.damping_s_m,
-        )
-        if touches is not None:
-            contact = self._resting(touches, probe)
+        if config.object.by_gaps:
+            several, contact = True, self._squeezed(config.object, probe, depth, rate)
+        else:
+            touches = config.object.touches(probe.centre, config.radius_m)
+            several = touches is not None
+            contact = elastic_contact(
+                depth,
+                (max(k1, self._tightest), max(k2, self._tightest)),
+                config.radius_m,
+                config.stiffness_n_m3,
+                depth_rate=rate,
+                damping=config.damping_s_m,
+            )
+            if touches is not None:
+                contact = self._resting(touches, probe)
         # Contact direction on the probe: from its centre against the object's outward normal.
         (x0, x1, x2), (y0, y1, y2), (z0, z1, z2) = probe.axes
         d = (-(nx * x0 + ny * x1 + nz * x2), -(nx * y0 + ny * y1 + nz * y2), -(nx * z0 + ny * z1 + nz * z2))
         uv = pad_coordinates(d, config.radius_m)
-        return _Solution(q, probe, foot, depth, rate, contact, (k1, k2), uv, d, touches is not None)
+        return _Solution(q, probe, foot, depth, rate, contact, (k1, k2), uv, d, several)
 
     def _given_way(self, q: tuple[float, ...], foot: Nearest, compliance: Array) -> tuple[float, ...]:
         """Joints (n,) that the contact has pushed back, by torque over stiffness each.
@@ -334,9 +329,10 @@ class Plant:
         `F = f(δ − c F)` with `c = nᵀ J C Jᵀ n`; the layer's square law makes that a quadratic. The normal is that
         before.
         """
-        assert self.arm is not None
+        assert self._chain is not None
         config, normal = self.config, np.array(foot.normal)
-        _, J = forward_jacobian(self.arm.model.chain, np.array(q), config.T_flange_probe_centre)
+        at = posture(self._chain, q)
+        J = jacobian(at, at.flange)
         lever = J[:3].T @ normal
         c = float(lever @ (compliance * lever))
         depth = config.radius_m - foot.distance
@@ -345,6 +341,15 @@ class Plant:
         left = (sqrt(1.0 + 4.0 * unit * c * depth) - 1.0) / (2.0 * unit * c) if c > 0.0 else depth
         given: tuple[float, ...] = tuple((np.array(q) + compliance * lever * (unit * left * left)).tolist())
         return given
+
+    def _squeezed(self, shape: PlacedShape, probe: Probe, depth: float, rate: float) -> Contact:
+        """The force of all that is pressed in, whatever its shape; it has no patch of its own."""
+        if depth <= 0.0:
+            return NO_CONTACT
+        config = self.config
+        factor = max(0.0, 1.0 + 1.5 * config.damping_s_m * rate)
+        force = factor * config.stiffness_n_m3 * shape.squeezed(probe.centre, config.radius_m)
+        return NO_CONTACT._replace(force=force, damping_factor=factor)
 
     def _resting(self, touches: Touches, probe: Probe) -> Contact:
         """Several places at once, as one contact with the resultant force; it has no patch of its own."""
@@ -375,7 +380,26 @@ class _Solution:
     kappa: tuple[float, float]
     pad_uv: tuple[float, float]
     direction: Vec  # of the contact from the probe's centre, pad frame
-    several: bool = False  # it touches in several places, and these are of the deepest
+    several: bool = False  # it touches in several places or all over, and these are of the deepest
+
+
+def _true(s: _Solution) -> dict[str, float | tuple[float, ...]]:
+    """What `Plant.truth` says, in plain numbers."""
+    return {
+        "q": s.q,
+        "probe_centre": s.probe.centre,
+        "pole": s.probe.axes[2],
+        "force": s.contact.force,
+        "depth": s.depth,
+        "depth_rate": s.depth_rate,
+        "contact_point": s.foot.point,
+        "contact_normal": s.foot.normal,
+        "kappa": s.foot.kappa,
+        "direction1": s.foot.directions[0],
+        "direction2": s.foot.directions[1],
+        "pad_uv": s.pad_uv,
+        "in_contact": s.depth > 0.0,
+    }
 
 
 _POLE = (0.0, 0.0, 1.0)

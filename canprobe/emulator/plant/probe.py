@@ -10,7 +10,6 @@ import numpy as np
 
 from canprobe.emulator.plant.config import PlantConfig
 from canprobe.emulator.plant.taxels import Directions, Vec, pad_basis
-from canprobe.robot.chain import Array
 from canprobe.touch.shapes import Nearest
 
 # Contact of the probe's elastic layer with a surface of known curvature.
@@ -182,17 +181,6 @@ class PressedProbe:
         speed = -self._mean * self._press.swing * rate * cos(rate * t_s)
         centre, velocity = self._origin + (self._radius - depth) * self._normal, speed * self._normal
         return Probe(tuple(centre.tolist()), self._axes, tuple(velocity.tolist()))
-
-
-def turned(axes: Axes, R: Array) -> Axes:
-    """Columns of ``[axes] R``.
-
-    Args:
-        axes: three columns.
-        R: (3, 3).
-    """
-    x, y, z = (R.T @ np.array(axes)).tolist()
-    return tuple(x), tuple(y), tuple(z)
 
 
 def in_pad(foot: Nearest, probe: Probe, d: Vec) -> Directions:

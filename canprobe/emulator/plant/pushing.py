@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from canprobe.robot.chain import Array, Chain, Vec, point_jacobian, point_on_flange, posture
+from canprobe.robot.chain import Array, Chain, Vec, ending_in, jacobian, posture
 from canprobe.touch.shapes import PlacedShape, Touches
 
 SLIP_M_S = 1e-3
@@ -181,10 +181,9 @@ class Neighbourhood:
         stiffness_n_m3: float,
         rubbing: Rubbing,
     ) -> None:
-        self.chain, self.shape, self.radius = chain, shape, radius
+        self.chain, self.shape, self.radius = ending_in(chain, T_flange_probe), shape, radius
         self.stiffness_n_m3, self.rubbing = stiffness_n_m3, rubbing
         self._joints_per_motor, self._base = joints_per_motor, base_offset
-        self._tool: Vec = tuple(T_flange_probe[:3, 3].tolist())
 
     def __call__(self, theta: Array) -> Contact | None:
         """Contact held at a posture of the motors; None where the object is farther than a cycle's way.
@@ -193,7 +192,7 @@ class Neighbourhood:
             theta: (n,) motor coordinates.
         """
         at = posture(self.chain, self._joints_per_motor @ theta)
-        own = np.array(point_on_flange(at, self._tool))  # in the arm's own base
+        own = np.array(at.flange)  # in the arm's own base
         centre: Vec = tuple((own + self._base).tolist())
         foot = self.shape.nearest(centre)
         if foot.distance - self.radius > NEAR_M:
@@ -206,7 +205,7 @@ class Neighbourhood:
         frames = np.array((normals, *_tangents(normals)))
         # The probe's point that touches lies inside the undeformed ball where it is indented.
         touched = own + np.minimum(touches.distances, self.radius)[:, None] * -normals
-        J = np.array([point_jacobian(at, tuple(point)) for point in touched.tolist()])
+        J = np.array([jacobian(at, tuple(point))[:3] for point in touched.tolist()])
         coefficient, exponent = force_laws(touches, self.radius, self.stiffness_n_m3)
         return Contact(
             theta,

@@ -22,6 +22,7 @@ from canprobe.touch.estimate.quadric import (
 )
 from canprobe.touch.linear_algebra import (
     Array,
+    Vec,
     homogeneous,
     inverted,
     principal,
@@ -36,6 +37,7 @@ _ENTRY_LIMIT = 0.02
 _DIRECTION_LIMIT = 0.05
 """The same for the normal curvature along a direction."""
 _UMBILIC_CHI2 = 5.99
+_TO_Q_SQUARED = np.outer(TO_Q, TO_Q)
 _ARRAYS = (
     *("S", "T_frame_contact", "K", "kappa", "directions", "covariance"),
     *("observed", "combinations", "information"),
@@ -102,9 +104,40 @@ class SurfaceEstimate:
 
     def __post_init__(self) -> None:
         for name in _ARRAYS:
-            getattr(self, name).flags.writeable = False
+            getattr(self, name).setflags(write=False)
         if self.model_root is not None:
-            self.model_root.flags.writeable = False
+            self.model_root.setflags(write=False)
+
+    @classmethod
+    def of(cls, T_frame_contact: Array, K: Array, *, method: str = "own") -> SurfaceEstimate:
+        """An estimate of which only frame and curvature are known, from an estimator of your own.
+
+        Args:
+            T_frame_contact: (4, 4) contact frame to that of the points: its origin on the surface, z the inward normal.
+            K: (2, 2) shape operator along its x and y, 1/m; positive where the object is convex.
+            method: name of the estimator.
+        """
+        K = np.array(K, dtype=np.float64)
+        T, (kappa, local) = read_only(T_frame_contact), _principal(K)
+        return cls(
+            S=SurfaceMatrix.from_curvature(K).S.copy(),
+            T_frame_contact=T,
+            K=K,
+            kappa=kappa,
+            directions=local @ T[:3, :2].T,
+            covariance=np.full((3, 3), math.inf),
+            observed=np.array([True, True]),
+            rank=3,
+            combinations=np.eye(3),
+            information=np.zeros((3, 3)),
+            umbilic=False,
+            innovation=math.nan,
+            distance=math.nan,
+            samples=math.nan,
+            method=method,
+            prior="none",
+            problem_root=np.eye(3),
+        )
 
     @property
     def condition_number(self) -> float:
@@ -138,7 +171,7 @@ class SurfaceEstimate:
         From `S`, so always finite; it says nothing where `observed` is False.
         """
         P = self.T_frame_contact[:3, :2]
-        result: Array = P @ (2.0 * self.S[:2, :2]) @ P.T
+        result: Array = P.dot(2.0 * self.S[:2, :2]).dot(P.T)
         return result
 
     def predict(self, point: Array) -> tuple[Array, Array]:
@@ -210,12 +243,12 @@ def build_estimate(
         T_frame_contact=T,
         K=k,
         kappa=kappa,
-        directions=local @ T[:3, :2].T,
+        directions=local.dot(T[:3, :2].T),
         covariance=covariance,
         observed=observed,
         rank=decision.rank,
         combinations=V[:, decision.passed].T.copy(),
-        information=(V * decision.information) @ V.T * length**2,
+        information=(V * decision.information).dot(V.T) * length**2,
         umbilic=umbilic,
         problem_root=problem_root,
         innovation=innovation,
@@ -329,11 +362,14 @@ def evidence_of(c: Array, covariance: Array, spread: Array | None, length: float
             not spread for is marginalised: noise alone answers it, with −1/R_p where it is that of centroids on a
             probe. None where a prior answers it.
     """
-    covariance = np.outer(TO_Q, TO_Q) * covariance / length**2
+    covariance = _TO_Q_SQUARED * covariance / length**2
+    q = c[6:] / (UNIT * length)
     axes, wide = (np.eye(3), np.ones(3, dtype=bool)) if spread is None else excited(spread)
+    if wide.all():
+        return CurvatureInformation(q, inverted(covariance))
     seen = axes[:, wide]
-    known = inverted(seen.T @ covariance @ seen) if wide.any() else np.zeros((0, 0))
-    return CurvatureInformation(c[6:] / (UNIT * length), seen @ known @ seen.T)
+    known = inverted(seen.T.dot(covariance).dot(seen)) if wide.any() else np.zeros((0, 0))
+    return CurvatureInformation(q, seen.dot(known).dot(seen.T))
 
 
 def curvature_covariance(c: Array, deviation: Array) -> Array:
@@ -349,11 +385,11 @@ def curvature_covariance(c: Array, deviation: Array) -> Array:
 
     Source: Judge and Bock, "The statistical implications of pre-test and Stein-rule estimators in econometrics", 1978.
     """
-    D, others = curvature_jacobian(c) @ deviation, deviation[3:6]
-    cross = D @ others.T
-    by_others = cross @ solved(others @ others.T, cross.T)
-    own = D @ D.T - by_others
-    chi2 = 4.0 * float(c[6:] @ solved(own, c[6:]))
+    D, others = curvature_jacobian(c).dot(deviation), deviation[3:6]
+    cross = D.dot(others.T)
+    by_others = cross.dot(solved(others.dot(others.T), cross.T))
+    own = D.dot(D.T) - by_others
+    chi2 = 4.0 * float(c[6:].dot(solved(own, c[6:])))
     refuted = 1.0 - (CHI2_99 / max(chi2, CHI2_99)) ** 2
     return np.asarray(own + refuted * by_others, dtype=np.float64)
 
@@ -377,27 +413,32 @@ class Anchor(NamedTuple):
     turn: float
 
 
-def foot(c: Array, start: Array) -> tuple[Array, Array]:
-    """Foot of a nearby point (3,) on the model's surface and the inward unit normal there, dimensionless."""
-    S = matrix_of(c)
-    B, h = 2.0 * S[:3, :3], 2.0 * S[:3, 3]
-    x, g = start, B @ start + h
+def foot(c: Array, start: Vec) -> tuple[Vec, Vec]:
+    """Foot of a nearby point on the model's surface and the inward unit normal there, dimensionless."""
+    half0, half1, constant, *entries = c.tolist()
+    b02, b12, b22, b00, b01, b11 = [2.0 * entry for entry in entries]
+    h0, h1, h2 = 2.0 * half0, 2.0 * half1, -1.0
+    p, q, r = x, y, z = start
+    u, v, w = b00 * x + b01 * y + b02 * z + h0, b01 * x + b11 * y + b12 * z + h1, b02 * x + b12 * y + b22 * z + h2
     for _ in range(4):
         # along the gradient to the surface, and back over the start along the tangent plane
-        f = 0.5 * float(x @ (g + h)) + float(S[3, 3])
-        x = start + g * ((float((x - start) @ g) - f) / float(g @ g))
-        g = B @ x + h
-    return x, -g / math.sqrt(float(g @ g))
+        f = 0.5 * (x * (u + h0) + y * (v + h1) + z * (w + h2)) + constant
+        share = ((x - p) * u + (y - q) * v + (z - r) * w - f) / (u * u + v * v + w * w)
+        x, y, z = p + share * u, q + share * v, r + share * w
+        u, v, w = b00 * x + b01 * y + b02 * z + h0, b01 * x + b11 * y + b12 * z + h1, b02 * x + b12 * y + b22 * z + h2
+    size = math.sqrt(u * u + v * v + w * w)
+    return (x, y, z), (-u / size, -v / size, -w / size)
 
 
-def anchor(c: Array, T_frame_work: Array, point: Array, length: float) -> Anchor:
-    """A model at the foot of a point; c (9,) and the point (3,) in the working frame, in units of `length` (m)."""
+def anchor(c: Array, T_frame_work: Array, point: Vec, length: float) -> Anchor:
+    """A model at the foot of a point; c (9,) and the point in the working frame, in units of `length` (m)."""
     x, z = foot(c, point)
     R_work = T_frame_work[:3, :3]
-    R = tangent_rotation(R_work @ z)
-    R_work_contact = R_work.T @ R
+    R = tangent_rotation(R_work.dot(z).tolist())
+    R_work_contact = R_work.T.dot(R)
     c_new, M = transport(c, homogeneous(R_work_contact, x))
     c_new[:3] = 0.0
-    origin = T_frame_work[:3, 3] + R_work @ (length * x)
-    turn = math.atan2(R_work_contact[1, 0] - R_work_contact[0, 1], R_work_contact[0, 0] + R_work_contact[1, 1])
+    origin = T_frame_work[:3, 3] + length * R_work.dot(x)
+    (xx, xy, _), (yx, yy, _), _ = R_work_contact.tolist()
+    turn = math.atan2(yx - xy, xx + yy)
     return Anchor(c_new, M, homogeneous(R, origin), turn)

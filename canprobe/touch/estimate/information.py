@@ -19,12 +19,13 @@ from canprobe.touch.estimate.nonlinear import DIFFUSE, Averaged, averaged, scale
 from canprobe.touch.estimate.quadric import Design, design, linearise, sharpest, shifted, size_of, transport
 from canprobe.touch.linear_algebra import (
     Array,
+    Vec,
     eigen,
     homogeneous,
     inverted,
     inverted_upper,
     solved,
-    transported_rotation,
+    transported,
     upper_root,
 )
 
@@ -45,10 +46,10 @@ class Touch(NamedTuple):
 def batch_design(T_base_work: Array, length: float, touches: Sequence[Touch]) -> Design:
     """Contacts (`quadric.design`) in a working frame (4, 4), in units of a length (m)."""
     R = T_base_work[:3, :3]
-    points = (np.array([t.point for t in touches]) - T_base_work[:3, 3]) @ R / length
+    points = (np.array([t.point for t in touches]) - T_base_work[:3, 3]).dot(R) / length
     sigma_point = np.array([t.sigma_point for t in touches]) / length
     noise = Noise(sigma_point, np.array([t.sigma_normal for t in touches]), touches[0].coupling * length)
-    return design(points, np.array([t.normal for t in touches]) @ R, noise)
+    return design(points, np.array([t.normal for t in touches]).dot(R), noise)
 
 
 # What the noise of weighted and forgotten rows does to an answer: the middle of the sandwich covariance.
@@ -70,6 +71,7 @@ class Score:
     def __init__(self, prior: Array, correlation: Correlation | None) -> None:
         self._prior = prior
         self._correlation = correlation
+        self._shares = np.zeros((3, 1)) if correlation is None else correlation.shares[:, None]
         self.reset()
 
     def reset(self) -> None:
@@ -88,7 +90,7 @@ class Score:
         places = np.linspace(0.0, travelled, len(J))
         self.matrix += rows.T @ mixed(self._correlation.matrix(places), J).reshape(-1, k)
         fades = np.exp((places - travelled) / self._correlation.length)
-        self._recent = self._correlation.shares[:, None] * (fades @ J.reshape(-1, 3 * k)).reshape(3, k)
+        self._recent = self._shares * (fades @ J.reshape(-1, 3 * k)).reshape(3, k)
 
     def take(self, J: Array, moved: float, kept: float, known: float) -> None:
         """Take new whitened rows (3n, k) over a step (m) of the path, which leaves `kept` of the information.
@@ -99,24 +101,24 @@ class Score:
 
     def carry(self, back: Array) -> None:
         """Go over to other parameters; back (k, k) is d(old)/d(new)."""
-        self.matrix = back.T @ self.matrix @ back
-        self._recent = self._recent @ back
+        self.matrix = back.T.dot(self.matrix).dot(back)
+        self._recent = self._recent.dot(back)
 
     def _added(self, J: Array, moved: float, kept: float) -> Array:
         """What new rows add: with each other, and with earlier ones that they resemble."""
         if self._correlation is None:
-            return np.asarray(J.T @ J, dtype=np.float64)
+            return np.asarray(J.T.dot(J), dtype=np.float64)
         n, k = len(J) // 3, J.shape[1]
         fade = math.exp(-moved / (n * self._correlation.length))
-        shared = self._correlation.shares[:, None] * J.reshape(n, 3, k)
+        shared = self._shares * J.reshape(n, 3, k)
         recent, past = kept * self._recent, np.empty((n, 3, k))
         for i in range(n):
             recent *= fade
             past[i] = recent
             recent += shared[i]
         self._recent = recent
-        cross = J.T @ past.reshape(-1, k)
-        return np.asarray(J.T @ J + cross + cross.T, dtype=np.float64)
+        cross = J.T.dot(past.reshape(-1, k))
+        return np.asarray(J.T.dot(J) + cross + cross.T, dtype=np.float64)
 
 
 # What a filter knows about the terms that a quadric leaves out, in constant time and memory.
@@ -204,51 +206,51 @@ class LeftOut:
     ) -> None:
         """Take new rows (3n, 18), minus their residuals (3n,) before the parameters made a step (9,)."""
         self.score.take(rows, moved, kept, known)
-        self._information = kept * self._information + rows.T @ rows
-        self._slope = kept * self._slope + rows[:, 9:].T @ residuals - self._information[9:, :9] @ step
+        self._information = kept * self._information + rows.T.dot(rows)
+        self._slope = kept * self._slope + rows[:, 9:].T.dot(residuals) - self._information[9:, :9].dot(step)
 
     def carry(self, back: Array, x: float, y: float) -> None:
         """Go over to a frame at (x, y); back (9, 9) is d(old)/d(new) of the parameters."""
         A, Q = shifted(x, y)
         away = 2.0 * np.eye(9) - A  # its inverse: a quartic term leaves cubic ones behind, a cubic one none
         wide = np.zeros((18, 18))
-        wide[:9, :9], wide[:9, 9:], wide[9:, 9:] = back, -(back @ Q) @ away, away
+        wide[:9, :9], wide[:9, 9:], wide[9:, 9:] = back, -back.dot(Q).dot(away), away
         self.score.carry(wide)
-        self._information = wide.T @ self._information @ wide
-        self._slope = away.T @ self._slope
+        self._information = wide.T.dot(self._information).dot(wide)
+        self._slope = away.T.dot(self._slope)
 
-    def amend(self, c: Array, H: Array, place: Array, expected: Expected) -> Amended:
-        """Average an answer at a place (3,) over the terms; c (9,) of the filter, H (9, 9) the inverse of its
+    def amend(self, c: Array, H: Array, place: Vec, expected: Expected) -> Amended:
+        """Average an answer at a place over the terms; c (9,) of the filter, H (9, 9) the inverse of its
         information.
         """
         a = self._along(c, H, expected, place)
-        both = H @ a.shared[:9] @ (a.weighted * a.found.share) @ a.off.T
+        both = H.dot(a.shared[:9]).dot(a.weighted * a.found.share).dot(a.off.T)
         return Amended(c + a.found.shift, a.found.spread + both + both.T, a.found.misfit, a.found.trusted)
 
     def explanation(self, c: Array, H: Array, expected: Expected) -> Array:
         """What the terms most likely are: (18,) what they add to the filter's parameters, and the terms."""
-        a = self._along(c, H, expected, np.zeros(3))
+        a = self._along(c, H, expected, (0.0, 0.0, 0.0))
         return np.concatenate([a.found.shift, a.terms @ a.found.terms])
 
-    def _along(self, c: Array, H: Array, expected: Expected, place: Array) -> _Along:
+    def _along(self, c: Array, H: Array, expected: Expected, place: Vec) -> _Along:
         curvature = max(size_of(c), expected.curvature)
         D = scales(curvature)
         X = np.zeros((18, 9))  # what a unit of each term does to the parameters, and the term itself
-        X[:9] = H @ self._information[:9, 9:] * -D
+        X[:9] = H.dot(self._information[:9, 9:]) * -D
         X[9:].flat[::10] = D
-        shared = self.score.matrix @ X
-        V = X.T @ shared  # of y = m a + noise, all that the samples say about the terms
+        shared = self.score.matrix.dot(X)
+        V = X.T.dot(shared)  # of y = m a + noise, all that the samples say about the terms
         V.flat[::10] += _REGULAR * V.trace()
-        m = D[:, None] * (self._information[9:] @ X)
+        m = D[:, None] * self._information[9:].dot(X)
         weighted = solved(V, m)
-        values, U = eigen(m @ weighted)
+        values, U = eigen(m.dot(weighted))
         information = np.maximum(values, 0.0) / expected.noise
-        s = U.T @ (weighted.T @ (D * self._slope)) / expected.noise
+        s = U.T.dot(weighted.T.dot(D * self._slope)) / expected.noise
         blur = sharpest(c) * expected.sigma_point * math.sqrt(expected.noise)
-        off, terms = X[:9] @ U, D[:, None] * U
-        off[6:] += shifted(float(place[0]), float(place[1]))[1][6:] @ terms
+        off, terms = X[:9].dot(U), D[:, None] * U
+        off[6:] += shifted(place[0], place[1])[1][6:].dot(terms)
         found = averaged(information, s, -off, curvature, blur)
-        return _Along(found, off, terms, shared, weighted @ U)
+        return _Along(found, off, terms, shared, weighted.dot(U))
 
 
 # The filter, and how it is carried from frame to frame.
@@ -326,11 +328,11 @@ class InformationFilter:
         lost = math.sqrt(share - left) * self._prior_rows
         stacked = np.empty((18 + len(rows), 10))
         stacked[:9, :9], stacked[:9, 9] = math.sqrt(kept) * self.root, 0.0
-        stacked[9:18, :9], stacked[9:18, 9] = lost, -(lost @ self.c)
+        stacked[9:18, :9], stacked[9:18, 9] = lost, -lost.dot(self.c)
         stacked[18:, :9], stacked[18:, 9] = rows[:, :9], residuals
         full = upper_root(stacked)
         self._set_root(full[:9, :9])
-        step = self.inverse @ full[:9, 9]
+        step = self.inverse.dot(full[:9, 9])
         self.c = self.c + step
         self.left_out.take(rows, residuals, step, moved, kept, share**2 - left**2)
 
@@ -345,25 +347,25 @@ class InformationFilter:
         result: Array = (np.square(residuals) / variance).sum(axis=1)
         return result
 
-    def place(self, point: Array) -> Array:
+    def place(self, point: Array) -> Vec:
         """A point (3,) of base in the working frame, dimensionless."""
-        result: Array = (point - self.T[:3, 3]) @ self.T[:3, :3] / self.length
-        return result
+        x, y, z = (point - self.T[:3, 3]).dot(self.T[:3, :3]).tolist()
+        return x / self.length, y / self.length, z / self.length
 
     def follow(self, point: Array) -> None:
         """Carry everything to a contact frame at the foot of a point (3,) of base, once that is far enough away."""
-        x = self.place(point)
-        if float(x @ x) < ANCHOR**2:
+        near = u, v, w = self.place(point)
+        if u * u + v * v + w * w < ANCHOR**2:
             return
-        x, z = foot(self.c, x)
-        turned = transported_rotation(np.eye(3), z)
+        x, z_axis = foot(self.c, near)
+        turned = np.array((*transported((1.0, 0.0, 0.0), z_axis), z_axis)).T
         self.c, M = transport(self.c, homogeneous(turned, x))
         self.c[:3] = 0.0
         back = inverted(M)
-        self.root, self.inverse = self.root @ back, M @ self.inverse
-        self.left_out.carry(back, float(x[0]), float(x[1]))
+        self.root, self.inverse = self.root.dot(back), M.dot(self.inverse)
+        self.left_out.carry(back, x[0], x[1])
         R = self.T[:3, :3]
-        self.T = homogeneous(R @ turned, self.T[:3, 3] + R @ (self.length * x))
+        self.T = homogeneous(R.dot(turned), self.T[:3, 3] + self.length * R.dot(x))
 
     def _set_root(self, root: Array) -> None:
         """Take an upper triangular root."""

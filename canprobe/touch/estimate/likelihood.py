@@ -126,13 +126,13 @@ def fit_ml(touches: Touches, prior: Prior | None, quadric: bool = False) -> Surf
         else:
             result = result._replace(decision=nothing_observed(), free_root=DIFFUSE * np.eye(9))
     has_prior = math.isfinite(stated.sigma_curvature)
-    a = anchor(result.c, T, np.zeros(3), length)
+    a = anchor(result.c, T, (0.0, 0.0, 0.0), length)
     decision = result.decision._replace(vectors=turned(a.turn) @ result.decision.vectors)
     if decision.rank == 3 or has_prior:
         covariance = curvature_covariance(a.c, a.M @ inverted(result.root))
     else:
         covariance = np.full((3, 3), math.nan)
-    free = anchor(result.free, T, np.zeros(3), length)
+    free = anchor(result.free, T, (0.0, 0.0, 0.0), length)
     spread = None if has_prior else _turned_spread(spread_of(d.X, d.point_variance), free.turn)
     deviation = solved(result.free_root.T, free.M.T).T
     if result.outliers:

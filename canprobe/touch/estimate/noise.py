@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from canprobe.errors import UsageError
-from canprobe.touch.linear_algebra import Array, checked, positive
+from canprobe.touch.linear_algebra import Array, checked, inverted_upper, lower_root, positive
 
 CHI2_MEDIAN, CHI2_95, CHI2_99, CHI2_999 = 2.366, 7.815, 11.34, 16.27
 """Median, 95 %, 99 % and 99.9 % points of χ² with three degrees of freedom, which a sample has."""
@@ -53,8 +53,9 @@ class Correlation:
 
     def whitener(self, path: Array) -> Array:
         """(3, n, n): inverse lower Cholesky factors of `matrix`; samples at one place are told apart by 1e-9."""
-        R = self.matrix(path) + 1e-9 * np.eye(len(path))
-        return np.asarray(np.linalg.inv(np.linalg.cholesky(R)), dtype=np.float64)
+        of = {share: R + 1e-9 * np.eye(len(path)) for share, R in zip(self.shares, self.matrix(path), strict=True)}
+        found = {share: inverted_upper(lower_root(R).T).T for share, R in of.items()}  # once for rows that are alike
+        return np.array([found[share] for share in self.shares])
 
 
 def mixed(matrices: Array, rows: Array) -> Array:

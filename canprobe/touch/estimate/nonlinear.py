@@ -296,20 +296,20 @@ def averaged(m: Array, s: Array, carried: Array, curvature: float, blur: float =
     variance[len(_USUAL) :] /= max(float(m.max()), 1e-300)
     wider = 1.0 + variance[:, None] * m
     share = variance[:, None] / wider
-    likelihood = 0.5 * (share @ (s * s) - np.log(wider).sum(axis=1))
+    likelihood = 0.5 * (share.dot(s * s) - np.log(wider).sum(axis=1))
     evidence = np.exp(likelihood - likelihood.max())
     weight = _prior(blur) * evidence
     weight /= weight.sum()
-    shifts = -(share * s) @ carried.T
-    mean = weight @ shifts
+    shifts = -(share * s).dot(carried.T)
+    mean = weight.dot(shifts)
     apart = shifts - mean
-    left = weight @ share
-    spread = (carried * left) @ carried.T + (apart.T * weight) @ apart
-    changed = float(weight @ np.square(shifts[:, 6:]) @ _PER_SQUARE)
+    left = weight.dot(share)
+    spread = (carried * left).dot(carried.T) + (apart.T * weight).dot(apart)
+    changed = float(weight.dot(np.square(shifts[:, 6:])).dot(_PER_SQUARE))
     spread.flat[60::10] += LEFT_OUT**2 * changed / _PER_SQUARE  # of K
     trusted = changed <= (TRUST * max(curvature, 1.0)) ** 2
-    shown = 1.0 - NONE * float(evidence[0] / (_PRIOR @ evidence))
-    return Averaged(mean, spread, left, weight @ (share * s), shown, trusted)
+    shown = 1.0 - NONE * float(evidence[0] / _PRIOR.dot(evidence))
+    return Averaged(mean, spread, left, weight.dot(share * s), shown, trusted)
 
 
 def _prior(blur: float) -> Array:

@@ -260,8 +260,10 @@ class FollowingEstimator:
         tensor = answer.curvature_tensor_base()
         late = self._late(tensor)
         self._past.append((self._travelled, tensor))
-        answer = answer if late is None else less_certain(answer, late)
-        return answer if self._scale == 0.0 else less_certain(answer, self._scale * tensor)
+        errors = [] if late is None else [late]
+        if self._scale != 0.0:
+            errors.append(self._scale * tensor)
+        return less_certain(answer, *errors)
 
     def _late(self, tensor: Array) -> Array | None:
         """(3, 3) change of the curvature tensor over the path that an answer lags behind; None where there is none."""
@@ -275,17 +277,19 @@ class FollowingEstimator:
         return result
 
 
-def less_certain(answer: SurfaceEstimate, late: Array) -> SurfaceEstimate:
-    """An answer, everything observed, whose curvature is also off by a tensor (3, 3, 1/m) times a normal variate."""
+def less_certain(answer: SurfaceEstimate, *errors: Array) -> SurfaceEstimate:
+    """An answer, all observed, whose curvature is also off by tensors (3, 3, 1/m), each times a normal variate."""
     P = answer.T_frame_contact[:3, :2]
-    (k11, k12), (_, k22) = (P.T @ late @ P).tolist()
-    entries = np.array([k11, k12, k22])
-    covariance = answer.covariance + np.outer(entries, entries)
-    root = answer.model_root
-    if root is not None:
-        root = _with_error(root, np.array([0.0] * 6 + [0.5 * k11, 0.5 * k12, 0.5 * k22]))
-    seen = answer.information @ (TO_Q * entries)
-    information = answer.information - np.outer(seen, seen) / (1.0 + float(TO_Q * entries @ seen))
+    covariance, information, root = answer.covariance, answer.information, answer.model_root
+    for error in errors:
+        (k11, k12), (_, k22) = P.T.dot(error).dot(P).tolist()
+        entries = np.array([k11, k12, k22])
+        covariance = covariance + entries[:, None] * entries
+        if root is not None:
+            root = _with_error(root, 0.5 * entries)
+        of_q = TO_Q * entries
+        seen = information.dot(of_q)
+        information = information - seen[:, None] * seen / (1.0 + float(of_q.dot(seen)))
     return replace(
         answer,
         covariance=covariance,
@@ -296,11 +300,11 @@ def less_certain(answer: SurfaceEstimate, late: Array) -> SurfaceEstimate:
 
 
 def _with_error(root: Array, error: Array) -> Array:
-    """A root (n, k) of an information once the parameters have one more error (k,) of random size."""
-    u = root @ error
-    square = float(u @ u)
+    """A root (n, k) of an information once the last parameters have one more error (3,) of random size."""
+    u = root[:, -len(error) :].dot(error)
+    square = float(u.dot(u))
     if square == 0.0:
         return root
     share = (1.0 - 1.0 / math.sqrt(1.0 + square)) / square
-    result: Array = root - np.outer(share * u, u @ root)
+    result: Array = root - (share * u)[:, None] * u.dot(root)
     return result

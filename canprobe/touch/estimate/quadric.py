@@ -30,6 +30,8 @@ _BASIS = np.zeros((9, 4, 4))
 """S = Σ c_k _BASIS_k + _CONSTANT."""
 for _k, (_i, _j) in enumerate(_INDEX):
     _BASIS[_k, _i, _j] = _BASIS[_k, _j, _i] = 1.0
+_FLAT = _BASIS.reshape(9, 16)
+_PLACES = np.array([4 * i + j for i, j in _INDEX])
 _CONSTANT = np.zeros((4, 4))
 _CONSTANT[2, 3] = _CONSTANT[3, 2] = -0.5
 _WIDE = np.concatenate([_BASIS, _CONSTANT[None]]).transpose(1, 0, 2).reshape(4, 40)
@@ -40,12 +42,15 @@ _ENTRIES = np.array([[40 * i + 4 * k + j for k in range(10)] for i, j in (*_INDE
 
 def matrix_of(c: Array) -> Array:
     """S (4, 4) of parameters (9,)."""
-    return (c @ _BASIS.reshape(9, 16)).reshape(4, 4) + _CONSTANT
+    S: Array = c.dot(_FLAT).reshape(4, 4)
+    S += _CONSTANT
+    return S
 
 
 def parameters_of(S: Array) -> Array:
     """Parameters (9,) of S (4, 4), scaled to c34 = −½."""
-    result: Array = np.array([S[i, j] for i, j in _INDEX]) * (-0.5 / S[2, 3])
+    result: Array = S.take(_PLACES)
+    result *= -0.5 / S[2, 3]
     return result
 
 
@@ -84,7 +89,7 @@ def _monomials(x: Any, y: Any, z: Any) -> Array:
     """The 19 monomials of `_POWERS` at a place, (19,), or at places given as arrays, (19, n)."""
     xx, xy, yy = x * x, x * y, y * y
     rest = [xx * x, xx * y, x * yy, yy * y, xx * xx, xx * xy, xx * yy, xy * yy, yy * yy]
-    return np.array([1.0 + 0.0 * x, x, y, z, xx, xy, yy, x * z, y * z, z * z, *rest])
+    return np.array((1.0 + 0.0 * x, x, y, z, xx, xy, yy, x * z, y * z, z * z, *rest))
 
 
 def _derivatives() -> Array:
@@ -119,7 +124,8 @@ _TABLE = {count: _derivatives()[:, :, :count].reshape(len(_POWERS), -1) for coun
 
 def terms(X: Array, count: int = 18) -> Array:
     """Values and derivatives by x, y, z (n, 4, count) of the first terms of f, the quadric's nine first, at (n, 3)."""
-    return (_monomials(*X.T).T @ _TABLE[count]).reshape(len(X), 4, count)
+    values: Array = _monomials(*X.T).T.dot(_TABLE[count]).reshape(len(X), 4, count)
+    return values
 
 
 def shifted(x: float, y: float) -> tuple[Array, Array]:
@@ -128,7 +134,7 @@ def shifted(x: float, y: float) -> tuple[Array, Array]:
     Returns:
         A (9, 9) and Q (9, 9): terms a become terms `A a` there, and `Q a` more in the nine parameters.
     """
-    both = (_monomials(x, y, 0.0) @ _SHIFT).reshape(18, 9)
+    both = _monomials(x, y, 0.0).dot(_SHIFT).reshape(18, 9)
     return both[:9], both[9:]
 
 
@@ -227,23 +233,23 @@ def linearise(c: Array, d: Design) -> Linearised:
     """The model at parameters (9,) with samples."""
     S = matrix_of(c)
     B, h = 2.0 * S[:3, :3], 2.0 * S[:3, 3]
-    g = d.X @ B + h
+    g = d.X.dot(B) + h
     square = np.einsum("ij,ij->i", g, g)
     f = 0.5 * np.einsum("ij,ij->i", d.X, g + h) + S[3, 3]
     X = d.X - g * (f / square)[:, None]
     r = np.empty((len(X), 3))
     r[:, 0] = f / np.sqrt(square)
-    g = X @ B + h
+    g = X.dot(B) + h
     inverse = 1.0 / np.sqrt(np.einsum("ij,ij->i", g, g))
     V = np.empty((len(X), 3, 3))
     V[:, 0], V[:, 1:] = g * inverse[:, None], d.T
     r[:, 1:] = (d.T @ V[:, 0, :, None])[:, :, 0]
-    bend = (V.reshape(-1, 3) @ B).reshape(V.shape) @ d.T.mT * inverse[:, None, None]
+    bend = V.reshape(-1, 3).dot(B).reshape(V.shape) @ d.T.mT * inverse[:, None, None]
     felt = bend[:, 1:] + d.noise.coupling * np.eye(2)  # turn against the surface that an error of the point is felt as
     W = _whitener(felt, V[:, 0], d)
     r = (W @ r[:, :, None])[:, :, 0]
     X = _likely_places(d, X, (r[:, None] @ W)[:, 0], felt, V[:, 0])
-    g = X @ B + h
+    g = X.dot(B) + h
     inverse = 1.0 / np.sqrt(np.einsum("ij,ij->i", g, g))
     V[:, 0] = g * inverse[:, None]
     return Linearised(r, X, V, bend, inverse, W)
@@ -283,8 +289,8 @@ def transport(c: Array, T: Array) -> tuple[Array, Array]:
 
     T (4, 4) takes new coordinates to old, lengths in the problem's unit.
     """
-    moved = ((T.T @ _WIDE).reshape(40, 4) @ T).reshape(-1).take(_ENTRIES)
-    entries = moved[:, :9] @ c + moved[:, 9]
+    moved = T.T.dot(_WIDE).reshape(40, 4).dot(T).take(_ENTRIES)
+    entries = moved[:, :9].dot(c) + moved[:, 9]
     scale = -0.5 / float(entries[9])
     c_new = scale * entries[:9]
     M: Array = scale * (moved[:9, :9] + (2.0 * c_new)[:, None] * moved[9, :9])
@@ -360,14 +366,18 @@ def decide(root_q: Array, spread: Array, curvature: float) -> Decision:
         curvature: ‖K‖, dimensionless.
     """
     axes, wide = excited(spread)
+    if wide.all():
+        root = root_q.dot(axes)
+        values, turn = eigen(root.T.dot(root))
+        return Decision(values, axes.dot(turn), values >= _least(curvature, float(values[-1])))
     seen = axes[:, wide]
-    root = root_q @ seen
-    values, turn = eigen(root.T @ root) if seen.size else (np.zeros(0), np.zeros((0, 0)))
+    root = root_q.dot(seen)
+    values, turn = eigen(root.T.dot(root)) if seen.size else (np.zeros(0), np.zeros((0, 0)))
     least = _least(curvature, float(values.max(initial=0.0)))
     unseen = int(np.count_nonzero(~wide))
     return Decision(
         np.concatenate([np.zeros(unseen), values]),
-        np.concatenate([axes[:, ~wide], seen @ turn], axis=1),
+        np.concatenate([axes[:, ~wide], seen.dot(turn)], axis=1),
         np.concatenate([np.zeros(unseen, dtype=bool), values >= least]),
     )
 

@@ -135,7 +135,7 @@ class Spread:
             self._origin = points[0].copy()
         X = np.ones((len(points), 4))
         X[:, :3] = points - self._origin
-        self._moments += (X.T * weights) @ X
+        self._moments += (X.T * weights).dot(X)
 
 
 STEP = 0.025
@@ -242,22 +242,22 @@ class RecursiveEstimator:
         # what has not settled is not called observed
         certain = float(self._settled) / self._gate.sigma_point**2
         P = a.T_frame_contact[:3, :2]
-        flat = P.T @ (self._spread.covariance * certain) @ P
-        q = a.M[6:] @ state.inverse / UNIT[:, None]
+        flat = P.T.dot(self._spread.covariance * certain).dot(P)
+        q = a.M[6:].dot(state.inverse) / UNIT[:, None]
         decision = decide(inverted_upper(upper_root(q.T)).T, flat, size_of(a.c))
         # the sandwich: A⁻¹ = inverse inverseᵀ, the score between
-        noise = state.inverse.T @ state.left_out.score.matrix[:9, :9] @ state.inverse
+        noise = state.inverse.T.dot(state.left_out.score.matrix[:9, :9]).dot(state.inverse)
         believed = True
         if decision.rank == 3 and not self._quadric:
-            amended = state.left_out.amend(state.c, state.inverse @ state.inverse.T, place, self._expected())
+            amended = state.left_out.amend(state.c, state.inverse.dot(state.inverse.T), place, self._expected())
             notes += misfit_notes(amended.misfit, trusted=amended.trusted)
             believed = amended.trusted
             if believed:
                 a = anchor(amended.c, state.T, place, state.length)
-                noise += state.root @ amended.covariance @ state.root.T
+                noise += state.root.dot(amended.covariance).dot(state.root.T)
             else:
                 decision = nothing_observed()
-        deviation = a.M @ (state.inverse @ lower_root(noise) if believed else np.eye(9) / DIFFUSE)
+        deviation = a.M.dot(state.inverse.dot(lower_root(noise)) if believed else np.eye(9) / DIFFUSE)
         covariance = curvature_covariance(a.c, deviation)
         evidence = evidence_of(a.c, covariance, flat, state.length)
         if decision.rank < 3:
@@ -319,7 +319,7 @@ class RecursiveEstimator:
         if self._quadric:
             return None
         f = self._filter
-        terms = f.left_out.explanation(f.c, f.inverse @ f.inverse.T, self._expected())
+        terms = f.left_out.explanation(f.c, f.inverse.dot(f.inverse.T), self._expected())
         left = self._judged(found.rows, found.residuals, found.residuals - found.rows @ terms)
         return left if self._change.usual_again(left.squares) else None
 

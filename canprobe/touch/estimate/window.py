@@ -163,18 +163,18 @@ class WindowEstimator:
         self.dropped = Dropped()
         self._gate = Gate(sigma_point, sigma_normal)
         self._prior, self._coupling, self._correlation = prior, coupling, correlation
-        self._samples: deque[ContactSample] = deque(maxlen=window)
+        self._rows: deque[Sequence[float]] = deque(maxlen=window)
         self._answer: SurfaceEstimate | None = None
 
     def add(self, sample: ContactSample) -> None:
         """Take one contact."""
         if self._gate.passes(sample, self.dropped):
-            self._samples.append(sample)
+            self._rows.append(self._row(sample))
             self._answer = None
 
     def estimate(self) -> SurfaceEstimate | None:
         """The answer over the samples kept; None from fewer than `least`, or where they face more than 90° apart."""
-        if self._answer is None and len(self._samples) >= self.least:
+        if self._answer is None and len(self._rows) >= self.least:
             touches = self._touches()
             if float((touches.normals @ touches.normals[-1]).min()) > 0.0:
                 answer = self._solve(touches)
@@ -183,19 +183,21 @@ class WindowEstimator:
 
     def reset(self) -> None:
         """Forget all samples."""
-        self._samples.clear()
+        self._rows.clear()
         self._gate.reset()
         self._answer = None
 
     def _solve(self, touches: Touches) -> SurfaceEstimate:
         raise NotImplementedError
 
+    def _row(self, sample: ContactSample) -> Sequence[float]:
+        """What is kept of a sample: point, normal, their standard deviations; a subclass adds what it needs."""
+        return (*sample.p_base.tolist(), *sample.n_base.tolist(), *self._gate.sigmas(sample))
+
     def _touches(self) -> Touches:
-        points: Array = np.array([s.p_base for s in self._samples])
-        normals: Array = np.array([s.n_base for s in self._samples])
-        sigmas = np.array([self._gate.sigmas(s) for s in self._samples])
-        noise = make_noise(len(points), sigmas[:, 0], sigmas[:, 1], self._coupling)
-        return make_touches(points, normals, noise, self._correlation)
+        rows = np.array(self._rows)
+        noise = make_noise(len(rows), rows[:, 6], rows[:, 7], self._coupling)
+        return make_touches(rows[:, :3], rows[:, 3:6], noise, self._correlation)
 
 
 class MlEstimator(WindowEstimator):
@@ -212,7 +214,7 @@ class MlEstimator(WindowEstimator):
             return answer
         agree = np.flatnonzero(squares <= AGREES * float(np.median(squares)))
         for _ in range(min(int(agree[-1]) + 1, len(squares) - LAST_FEW)):
-            self._samples.popleft()
+            self._rows.popleft()
         answer = fit_ml(self._touches(), self._prior)
         return replace(answer, notes=(*answer.notes, "the surface changed: memory shortened"))
 
@@ -270,25 +272,35 @@ class Chen1996Estimator(WindowEstimator):
             raise UsageError(f"lag: expected at least 1 sample, got {lag}")
         self._lag = lag
 
+    def _row(self, sample: ContactSample) -> Sequence[float]:
+        """With the probe's pose, row by row, and the contact in its frame."""
+        return (*super()._row(sample), *sample.T_base_probe[:3].ravel().tolist(), *sample.r_probe.tolist())
+
     def _solve(self, touches: Touches) -> SurfaceEstimate:
-        samples = list(self._samples)
-        lag = usable_lag(len(samples), self._lag)
-        newer = np.arange(lag, len(samples))
-        x, y = np.array(paper_rates(samples[:-lag], samples[lag:])) @ working_frame(touches)[:3, :3]
+        rows = np.array(self._rows)
+        lag = usable_lag(len(rows), self._lag)
+        newer = np.arange(lag, len(rows))
+        rates = paper_rates(rows[:, 8:20].reshape(-1, 3, 4), rows[:, 20:], touches.normals, lag)
+        x, y = np.array(rates) @ working_frame(touches)[:3, :3]
         return solve_pairs(touches, Pairs(newer, newer - lag, y / touches.extent, -x), "chen1996")
 
 
-def paper_rates(older: Sequence[ContactSample], newer: Sequence[ContactSample]) -> tuple[Array, Array]:
-    """x (28) and y (29) (n, 3) times the times between n pairs of samples, in base axes; the object stands still.
+def paper_rates(T_base_probe: Array, r_probe: Array, n_base: Array, lag: int) -> tuple[Array, Array]:
+    """x (28) and y (29) (n − lag, 3) times the time between samples `lag` apart, in base axes; the object stands still.
 
     `x = ω × n_f + K_f v_f`, `y = V_f + v_f`, everything taken half-way; K_f = 1/|r_probe|.
+
+    Args:
+        T_base_probe: (n, 3 or 4, 4) poses of the probe.
+        r_probe: (n, 3) contact points in its frame, m.
+        n_base: (n, 3) outward normals of the object there.
+        lag: samples between the two of a difference.
     """
-    Ta, Tb = (np.array([s.T_base_probe for s in samples]) for samples in (older, newer))
-    ra, rb = (np.array([s.r_probe for s in samples])[:, :, None] for samples in (older, newer))
-    n = 0.5 * np.array([a.n_base + b.n_base for a, b in zip(older, newer, strict=True)])
-    Ra, Rb = Ta[:, :3, :3], Tb[:, :3, :3]
+    R, r = T_base_probe[:, :3, :3], r_probe[:, :, None]
+    Ra, Rb, ra, rb = R[:-lag], R[lag:], r[:-lag], r[lag:]
+    n = 0.5 * (n_base[:-lag] + n_base[lag:])
     turn = rotation_vectors(Rb @ Ra.transpose(0, 2, 1))
     arm = (0.5 * (Ra @ ra + Rb @ rb))[:, :, 0]
     slide = (0.5 * (Ra + Rb) @ (rb - ra))[:, :, 0]
-    V = Tb[:, :3, 3] - Ta[:, :3, 3] + np.cross(turn, arm)
+    V = T_base_probe[lag:, :3, 3] - T_base_probe[:-lag, :3, 3] + np.cross(turn, arm)
     return slide / np.linalg.norm(rb, axis=1) - np.cross(turn, n), V + slide

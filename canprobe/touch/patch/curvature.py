@@ -38,14 +38,15 @@ from canprobe.touch.estimate.quadric import (
 )
 from canprobe.touch.linear_algebra import (
     Array,
+    Vec,
     eigen,
     homogeneous,
     inverted,
     positive,
-    principal,
+    principal_of,
     solved,
     tangent_rotation,
-    transported_rotation,
+    transported,
 )
 from canprobe.touch.patch.image_model import ImageModel
 from canprobe.touch.patch.moments import Moments, PadMemory
@@ -67,6 +68,7 @@ MOST_ROUNDS = 6
 SLOPE_SIGMA = 0.08
 """Error of a touch's slope in the logarithm of the stiffness that its own deviation leaves out: that of the force."""
 _STIFFER = 0.01
+_ROOT2 = math.sqrt(2.0)
 SETTLED, UNSETTLED = 0.002, 0.05
 """Step, in units of the probe's curvature, that ends the iteration, and the largest that a last step may have."""
 
@@ -167,7 +169,7 @@ class PatchCurvature:
         self.frames = 0
         self.force = 0.0
         self._memory = PadMemory()
-        self._axes = np.eye(3)
+        self._axes: tuple[Vec, Vec] = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
         self._last: Array | None = None
         self._slope: Slope | None = None
         self._touched = False
@@ -184,8 +186,10 @@ class PatchCurvature:
         if sample.moments is None:
             self.refused += 1
             return
-        inward = -sample.n_base
-        self._axes = transported_rotation(self._axes, inward) if self.frames else tangent_rotation(inward)
+        nx, ny, nz = sample.n_base.tolist()
+        inward = -nx, -ny, -nz
+        x_axis = self._axes[0] if self.frames else tangent_rotation(inward)[:, 0].tolist()
+        self._axes = transported(x_axis, inward)
         (uu, uv, vv), memory = sample.moments, self.model.memory
         uu, uv, vv = uu - memory * was[0], uv - memory * was[1], vv - memory * was[2]
         xx, xy, yy = _turned(uu, uv, vv, *self._pad_axis(direction, sample.T_base_probe))
@@ -198,11 +202,14 @@ class PatchCurvature:
         """Cosine and sine of the angle from x of the carried axes to u of the pad, both about the inward normal."""
         x, y, z = direction
         bend = x / (1.0 + z)  # the pad's u axis, turned from the pole to the contact the shortest way
-        return self._in_axes(T_base_probe[:3, :3] @ [1.0 - bend * x, -bend * y, -x])
+        u, v, w = 1.0 - bend * x, -bend * y, -x
+        (a, b, c, _), (d, e, f, _), (g, h, i, _), _ = T_base_probe.tolist()
+        return self._in_axes((a * u + b * v + c * w, d * u + e * v + f * w, g * u + h * v + i * w))
 
-    def _in_axes(self, u: Array) -> tuple[float, float]:
-        """Direction of a vector (3,) of base in the carried tangent plane: cosine, sine."""
-        x, y, _ = (u @ self._axes).tolist()
+    def _in_axes(self, u: Vec) -> tuple[float, float]:
+        """Direction of a vector of base in the carried tangent plane: cosine, sine."""
+        (a, b, c), ((x0, x1, x2), (y0, y1, y2)) = u, self._axes
+        x, y = a * x0 + b * x1 + c * x2, a * y0 + b * y1 + c * y2
         size = 1.0 / math.hypot(x, y)
         return x * size, y * size
 
@@ -210,15 +217,18 @@ class PatchCurvature:
         """The patch, with what the motion knows about q, in a contact frame (4, 4); None where it knows nothing."""
         if self.frames < LEAST_FRAMES:
             return None
-        c, s = self._in_axes(T_base_contact[:3, 0])
+        c, s = self._in_axes(T_base_contact[:3, 0].tolist())
         xx, xy, yy = _turned(*self._mean.moments, c, -s)
-        mean, half, angle = principal(np.array([[xx, xy], [xy, yy]]))
+        mean, half, angle = principal_of(xx, xy, yy)
         drift = _turned(*_turned(*self._mean.drift_from(self._recent), c, -s), math.cos(angle), -math.sin(angle))
         turn = turned(angle)  # q in the contact frame to q in the patch's principal axes
         known = CurvatureInformation(np.zeros(3), np.zeros((3, 3))) if motion is None else motion
-        known = CurvatureInformation(turn @ known.q, turn @ known.information @ turn.T)
+        known = CurvatureInformation(turn.dot(known.q), turn.dot(known.information).dot(turn.T))
         found = self._solve(_Seen((mean + half, 0.0, mean - half), drift), known)
-        return None if found is None else found._replace(q=turn.T @ found.q, patch=turn.T @ found.patch @ turn)
+        if found is None:
+            return None
+        q, patch = turn.T.dot(found.q), turn.T.dot(found.patch).dot(turn)
+        return Fused(q, patch, found.cost, found.stiffness)
 
     def _solve(self, seen: _Seen, motion: CurvatureInformation) -> Fused | None:
         """From the last answer, and where that fails from the ideal layer."""
@@ -245,20 +255,23 @@ class PatchCurvature:
         known, mean = np.zeros((4, 4)), np.array([*motion.q, self._stiffness.mean])
         known[:3, :3], known[3, 3] = motion.information, self._stiffness.sigma**-2
         J = np.empty((3, 4))
+        xx, _, yy = seen.moments
+        scale = np.array([xx, math.sqrt(xx * yy), yy])
         step = math.inf
         try:
             for round_ in range(MOST_ROUNDS):
-                k: Moments = tuple((x[:3] / TO_Q).tolist())
-                model = self._model(x[3])
+                q1, q2, q3, stiffer = x.tolist()
+                k: Moments = q1, q2 / _ROOT2, q3
+                model = self._model(stiffer)
                 J[:, :3], r, W = model.linearised(seen.moments, self.force, self.frames, k)
                 if round_ == 0:  # it hardly changes from step to step
-                    xx, _, yy = seen.moments
-                    there, here = (m.moments(k, self.force) for m in (self._model(x[3] + _STIFFER), model))
-                    J[:, 3] = np.subtract(there, here) / np.array([xx, math.sqrt(xx * yy), yy]) / _STIFFER
+                    here = np.array(seen.moments) - scale * r
+                    there = self._model(stiffer + _STIFFER).moments(k, self.force)
+                    J[:, 3] = (there - here) / scale / _STIFFER
                 W = _less_certain(W, seen)
                 W *= model.trust(k, self.force)
-                JW = J.T @ W
-                felt, pull, cost = JW @ J, JW @ r, float(r @ W @ r)
+                JW = J.T.dot(W)
+                felt, pull, cost = JW.dot(J), JW.dot(r), float(r.dot(W).dot(r))
                 if not felt.any():
                     return None
                 if self._slope is not None:
@@ -267,11 +280,12 @@ class PatchCurvature:
                     pull += weight * off * row
                     cost += weight * off**2
                 apart = mean - x
-                drawn = known @ apart
+                drawn = known.dot(apart)
                 way = solved(felt + known, pull + drawn)
-                cost += float(apart @ drawn)
+                cost += float(apart.dot(drawn))
                 x = x + way
-                step = float(np.abs(way * [1.0, 1.0, 1.0, 1.0 / self.model.radius]).max())
+                *of_q, of_stiffness = map(abs, way.tolist())
+                step = max(*of_q, of_stiffness / self.model.radius)
                 if step < SETTLED / self.model.radius:
                     break
         except (ValueError, np.linalg.LinAlgError):
@@ -279,7 +293,7 @@ class PatchCurvature:
         if step > UNSETTLED / self.model.radius:
             return None
         stiffness = LayerStiffness(float(x[3]), math.sqrt(float(inverted(felt + known)[3, 3])))
-        patch = felt[:3, :3] - np.outer(felt[:3, 3], felt[3, :3]) / (felt[3, 3] + known[3, 3])
+        patch = felt[:3, :3] - felt[:3, 3, None] * felt[3, :3] / (felt[3, 3] + known[3, 3])
         return x, Fused(x[:3], patch, cost, self.model.stiffness * math.exp(x[3])), stiffness
 
     def _guesses(self) -> tuple[float, ...]:
@@ -306,9 +320,8 @@ def _less_certain(W: Array, seen: _Seen) -> Array:
     """Information (3, 3) of relative moments that are also off by a drift of unknown sign."""
     (v1, _, v2), (xx, xy, yy) = seen.moments, seen.drift
     relative = np.array([xx / v1, xy / math.sqrt(v1 * v2), yy / v2])
-    b = W @ relative
-    size = float(b @ relative)
-    result: Array = W - np.outer(b, b) / (1.0 + size)
+    b = W.dot(relative)
+    result: Array = W - b[:, None] * b / (1.0 + float(b.dot(relative)))
     return result
 
 

@@ -42,7 +42,7 @@ def mended(taxels: Image) -> tuple[Image, int]:
 
     The same array (rows, columns) where none is dead; else a copy in which each has the mean of its four neighbours.
     """
-    if _GAP not in taxels.tobytes().translate(_LEVELS):  # the usual case, in a fraction of the whole search
+    if not _may_be_dead(taxels.tobytes()):
         return taxels, 0
     inner = taxels[1:-1, 1:-1]
     sides = (taxels[:-2, 1:-1], taxels[2:, 1:-1], taxels[1:-1, :-2], taxels[1:-1, 2:])
@@ -55,6 +55,11 @@ def mended(taxels: Image) -> tuple[Image, int]:
     whole = taxels.copy()
     whole[1:-1, 1:-1][dead] = np.rint(mean[dead]).astype(np.uint8)
     return whole, n
+
+
+def _may_be_dead(counts: bytes) -> bool:
+    """Whether a taxel reads nothing between two pressed ones: no as a rule, and in a fraction of the whole search."""
+    return _GAP in counts.translate(_LEVELS)
 
 
 # What a window cuts off the contact patch: carried on from what is in it.
@@ -88,11 +93,10 @@ class Continuation:
     """
 
     def __init__(self, weights: Array, saturated_pa: float) -> None:
-        area = weights[:, :1]
         self._saturated_pa = saturated_pa
-        self._terms = weights / area
-        self._normal = (weights[:, :, None] * weights[:, None, :]).reshape(len(weights), -1)
-        self._right = weights * area
+        self._weights = weights
+        self._area = weights[:, 0].copy()
+        self._terms = weights / weights[:, :1]
         self._corner = float(self._terms[-1, 3])
 
     def completed(self, pressure: Array, window: Sequence[int], peak_pa: float) -> Array:
@@ -106,17 +110,21 @@ class Continuation:
         Returns:
             A filled copy; the same array where the taxels show no quadratic with a summit.
         """
-        seen = pressure.reshape(-1)
-        used = ((seen >= LEAST_SHARE * peak_pa) & (seen < self._saturated_pa)).astype(float)
-        if used.sum() < LEAST_TAXELS:
+        row, column, rows, columns = window
+        width = pressure.shape[1]
+        strip = slice(width * row, width * (row + rows))  # the rows of the window: all else is 0
+        seen = pressure.reshape(-1)[strip]
+        used = (seen >= LEAST_SHARE * peak_pa) & (seen < self._saturated_pa)
+        if np.count_nonzero(used) < LEAST_TAXELS:
             return pressure
-        _, quadratic, singular = dposv((used @ self._normal).reshape(6, 6), (used * seen) @ self._right)
+        weights = self._weights[strip]
+        used_weights = (weights * used[:, None]).T
+        _, quadratic, singular = dposv(used_weights.dot(weights), used_weights.dot(self._area[strip] * seen))
         _, _, _, uu, uv, vv = quadratic.tolist()
         least_fall = -0.5 * (uu + vv + math.hypot(uu - vv, uv)) * self._corner
         if singular or not least_fall > LEAST_FALL * peak_pa:
             return pressure
-        whole: Array = np.maximum(self._terms @ quadratic, 0.0).reshape(pressure.shape)
-        row, column, rows, columns = window
+        whole: Array = np.maximum(self._terms.dot(quadratic), 0.0).reshape(pressure.shape)
         inside = slice(row, row + rows), slice(column, column + columns)
         whole[inside] = pressure[inside]
         return whole
@@ -130,6 +138,7 @@ OFF_PAD_SIGMAS, OFF_PAD_TAXELS = 1.55, 1.0
 """The same where only moments are known: from the centroid to the edge, a taxel's own width included in σ. A paraboloid
 has lost a fourth by then, and one of which only a rim is left lies in the last row of taxels."""
 _TOO_FEW = 4
+_COUNTS = bytes(range(COUNTS_MAX + 1))
 
 
 class FeaturesLike(Protocol):
@@ -276,16 +285,21 @@ def compute_patch(
     pad = calibration.pad
     if taxels.shape != pad.shape or taxels.dtype != np.uint8:
         raise UsageError(f"taxels: expected {pad.shape} uint8, got {taxels.shape} {taxels.dtype}")
-    taxels, dead = mended(taxels) if pad.is_grid else (taxels, 0)
-    pressure = calibration.pascals[taxels]
-    n_active = int(np.count_nonzero(pressure))
-    peak = int(taxels.max())
-    edges = _edges(taxels.tobytes(), pad.shape, window) if pad.is_grid else (0, 0)  # a list has no edge
-    peak_pa, at_pad, at_window = calibration.pascals.take((peak, *edges)).tolist()
+    counts, dead, edges = taxels.tobytes(), 0, (0, 0)
+    if pad.is_grid:  # a list has neither neighbours nor an edge
+        if _may_be_dead(counts):
+            taxels, dead = mended(taxels)
+            counts = taxels.tobytes()
+        edges = _edges(counts, pad.shape, window)
+    active = counts.translate(None, _COUNTS[: max(calibration.threshold_counts, 1)])
+    n_active, peak = len(active), max(active, default=0)
+    pascals = calibration.pascals
+    peak_pa, at_pad, at_window = [pascals.item(count) for count in (peak, *edges)]
+    pressure = pascals.take(taxels)
     shows_shape = peak > LEAST_PEAK * calibration.threshold_counts
     if window is not None and at_window > WORTH_COMPLETING * peak_pa and shows_shape:
         pressure = calibration.continuation.completed(pressure, window, peak_pa)
-    total, u, v, *_ = (pressure.reshape(-1) @ calibration.weights).tolist()
+    total, u, v, *_ = pressure.reshape(-1).dot(calibration.weights).tolist()
     if total <= 0.0:
         return _nothing(peak_pa)._replace(dead=dead)
     return Patch(
@@ -319,10 +333,14 @@ def _edges(counts: bytes, shape: tuple[int, int], window: Sequence[int] | None) 
     if window is None:
         return at_pad, 0
     r0, c0, n_rows, n_cols = window
-    rows = [r for r in (r0, r0 + n_rows - 1) if 0 < r < height - 1]
-    cols = [c for c in (c0, c0 + n_cols - 1) if 0 < c < width - 1]
-    inside = [counts[width * r : width * (r + 1)] for r in rows] + [counts[c::width] for c in cols]
-    return at_pad, max(b"".join(inside), default=0)
+    inside = b""
+    for row in (r0, r0 + n_rows - 1):
+        if 0 < row < height - 1:
+            inside += counts[width * row : width * (row + 1)]
+    for column in (c0, c0 + n_cols - 1):
+        if 0 < column < width - 1:
+            inside += counts[column::width]
+    return at_pad, max(inside, default=0)
 
 
 def patch_from_features(features: FeaturesLike, calibration: PatchCalibration) -> Patch:

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -113,8 +112,10 @@ class ImageModel:
 
     def with_stiffness(self, stiffness: float) -> ImageModel:
         """The same array on another layer (N/m³): its blur stays."""
-        other = copy(self)
-        object.__setattr__(other, "parameters", replace(self.parameters, stiffness=stiffness))
+        other, p = object.__new__(ImageModel), self.parameters
+        for name in self.__slots__:
+            object.__setattr__(other, name, getattr(self, name))
+        object.__setattr__(other, "parameters", ImageParameters(stiffness, p.scale, p.blur, p.crosstalk, p.memory))
         return other
 
     # the forward model
@@ -150,7 +151,7 @@ class ImageModel:
         """
         above = np.maximum(shown - self.level, 0.0).reshape(len(shown), -1)
         square = self.pitch**2
-        sums = (above @ self._moments).tolist()
+        sums = above.dot(self._moments).tolist()
         if not all(total > 0.0 for total, _, _ in sums):
             raise ValueError("no patch: nothing above the level")
         return [(square * xx / total, square * yy / total) for total, xx, yy in sums]

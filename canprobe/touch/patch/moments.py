@@ -35,7 +35,7 @@ class MomentImage:
 
     def moments(self, taxels: NDArray[np.uint8]) -> Moments | None:
         """Moments uu, uv, vv (m²) of an image (rows, columns) in pad coordinates; None where they are no ellipse."""
-        total, u, v, uu, uv, vv = (self._table[taxels].reshape(-1) @ self._weights).tolist()
+        total, u, v, uu, uv, vv = self._table.take(taxels).reshape(-1).dot(self._weights).tolist()
         if total <= 0.0:
             return None
         scale = self._square / total

@@ -1,0 +1,46 @@
+"""A run in three dimensions, from Python: its page in a notebook or a browser."""
+
+from __future__ import annotations
+
+import html
+import importlib
+import os
+import sys
+import webbrowser
+from dataclasses import dataclass
+from pathlib import Path
+
+from canprobe.planning.bridges import check_bridges
+from canprobe.session.session import quiet
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """One HTML file; a notebook shows it, and it can be kept and mailed.
+
+    Attributes:
+        path: of the file.
+    """
+
+    path: Path
+
+    def _repr_html_(self) -> str:
+        text = html.escape(self.path.read_text(encoding="utf-8"))
+        return f'<iframe srcdoc="{text}" style="width: 100%; height: 640px; border: 0"></iframe>'
+
+
+def page_of(folder: Path) -> Page:
+    """The page of a run's folder, written where it is missing; opened in a browser if there is one and no notebook.
+
+    Raises:
+        UsageError: the extra `view` is missing, or a controller's column has the name of one of ours.
+    """
+    page = Page(folder / "report.html")
+    if not page.path.is_file():
+        check_bridges(["view"])
+        view = "canprobe.bridge.view"
+        browser, recorded = (importlib.import_module(f"{view}.{name}") for name in ("browser", "recorded"))
+        browser.write_page(recorded.read_run(folder), page.path, quiet)
+    if "ipykernel" not in sys.modules and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        webbrowser.open(page.path.resolve().as_uri())
+    return page

@@ -1,0 +1,108 @@
+"""Objects whose surface is read from a file: a grid of heights, or a mesh."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.errors import UsageError, install_line
+from canprobe.scene.model import ObjectSettings
+from canprobe.touch.heights import Heights
+from canprobe.touch.mesh_fit import Fit, fit_mesh
+from canprobe.touch.objects import make_object
+from canprobe.touch.shapes import PlacedShape
+
+Array = NDArray[np.float64]
+
+HEIGHTS = (".npy", ".npz", ".csv", ".txt")
+MESHES = (".stl", ".obj", ".ply")
+_MM = 1e-3
+_SPACING_MM = 1.0
+
+
+def object_of_file(settings: ObjectSettings, T_base_object: Array) -> PlacedShape:
+    """The object whose surface is read from a file.
+
+    Raises:
+        ValueError: the file cannot be read, or holds no surface; with what was expected and found.
+        UsageError: a mesh, and no trimesh is installed.
+    """
+    assert settings.file is not None
+    path = Path(settings.file)
+    if settings.kind == "heights":
+        return make_object("heights", T_base_object=T_base_object, **_heights(settings, path))
+    if path.suffix.lower() not in MESHES:
+        raise ValueError(f"file: expected a mesh in a file of {', '.join(MESHES)}, got {path.name}")
+    try:
+        changed_ns = path.stat().st_mtime_ns
+    except OSError as error:
+        raise ValueError(f"file: {path}: cannot be read: {error.strerror}") from error
+    spacing = (settings.spacing_mm or _SPACING_MM) * _MM
+    fit = _mesh(path, changed_ns, settings.unit_mm * _MM, spacing, settings.origin_mm)
+    return Heights(T_base_object, fit.heights, fit.spacing, fit.origin, fit.there)
+
+
+@lru_cache(maxsize=4)
+def _mesh(path: Path, changed_ns: int, unit: float, spacing: float, origin_mm: tuple[float, float] | None) -> Fit:
+    """The surface of a mesh; of a file that has not changed it is fitted once."""
+    try:
+        import trimesh
+    except ImportError as error:
+        raise UsageError(f"object.file: a mesh needs trimesh: {install_line('mesh')}") from error
+    try:
+        read = trimesh.load_mesh(path, process=False)
+    except Exception as error:  # each of its readers has its own
+        raise ValueError(f"file: {path.name} is no mesh that can be read: {error}") from error
+    origin = None if origin_mm is None else np.array(origin_mm) * _MM
+    try:
+        return fit_mesh(read.vertices * unit, read.faces, spacing, origin)
+    except (ValueError, AttributeError) as error:
+        raise ValueError(f"file: {path.name}: {error}") from error
+
+
+def _heights(settings: ObjectSettings, path: Path) -> dict[str, Any]:
+    z, spacing = _grid(path)
+    if settings.spacing_mm is not None:
+        spacing = settings.spacing_mm / settings.unit_mm
+    if spacing is None:
+        raise ValueError("spacing_mm: missing: the file holds heights only; give the spacing of their grid")
+    if z.ndim != 2:
+        raise ValueError(f"file: expected a grid of heights (rows × columns), got shape {z.shape} in {path.name}")
+    unit = settings.unit_mm * _MM
+    middle = 0.5 * spacing * unit * (np.array(z.shape) - 1)
+    origin = np.zeros(2) if settings.origin_mm is None else np.array(settings.origin_mm) * _MM - middle
+    return {"heights": z * unit, "spacing": spacing * unit, "origin": origin}
+
+
+def _grid(path: Path) -> tuple[Array, float | None]:
+    """Heights in the file's unit, and their spacing where the file holds it."""
+    kind = path.suffix.lower()
+    if kind not in HEIGHTS:
+        raise ValueError(f"file: expected heights in a file of {', '.join(HEIGHTS)}, got {path.name}")
+    try:
+        if kind in (".npy", ".npz"):
+            with path.open("rb") as opened:  # numpy leaves a file open that it cannot read
+                read = np.load(opened)
+                if isinstance(read, np.lib.npyio.NpzFile):
+                    return _of_archive({name: read[name] for name in read.files})
+                return np.asarray(read, dtype=np.float64), None
+        text = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = [line.partition("#")[0].replace(";", ",").replace(",", " ").split() for line in text]
+        return np.array([[float(word) for word in line] for line in lines if line]), None
+    except OSError as error:
+        raise ValueError(f"file: {path}: cannot be read: {error.strerror or error}") from error
+    except (ValueError, TypeError, EOFError, BadZipFile) as error:
+        raise ValueError(f"file: {path.name} is no grid of numbers: {error}") from error
+
+
+def _of_archive(arrays: dict[str, Any]) -> tuple[Array, float | None]:
+    heights = arrays.get("heights", next(iter(arrays.values())) if len(arrays) == 1 else None)
+    if heights is None:
+        raise ValueError(f'expected an array "heights", got {", ".join(arrays) or "none"}')
+    spacing = float(arrays["spacing"]) if "spacing" in arrays else None
+    return np.asarray(heights, dtype=np.float64), spacing
