@@ -131,6 +131,7 @@ EXTRA_OF = {
     "collada": "view",
     "mujoco": "dynamics",
     "pandas": "data",
+    "xarray": "data",
     "pyarrow": "data",
 }
 """Extra that brings a package, by the name that is imported."""

@@ -82,6 +82,6 @@ def _expected(args: argparse.Namespace) -> str:
 
     read = read_expected()
     figures = read["scenes"].get(args.scene)
-    if not figures or any(value is not None for value in (args.cell, args.duration, args.tool)):
+    if not figures or any(value is not None for value in (args.cell, args.duration, args.tool, args.set or None)):
         return ""
     return f"\n  expected   {expected_text(figures)} (seeds {seeds_text(read)})"

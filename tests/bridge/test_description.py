@@ -17,7 +17,7 @@ MESH = """<visual><geometry><mesh filename="arm.stl" scale="2 2 2"/></geometry><
 
 @pytest.fixture(params=["puma260", "puma560", "gantry", "seven-axis", "prbt"])
 def plan(request):
-    return canprobe.plan(canprobe.load_scene("free", request.param))
+    return canprobe.plan(canprobe.load_scene("free", {"cell": request.param}))
 
 
 def test_pinocchio_finds_every_frame_where_tf_has_it(plan):
@@ -69,7 +69,7 @@ def test_meshes_of_a_urdf_are_named_by_absolute_paths_where_they_are_found(tmp_p
         gear = 100
         """
     )
-    plan = canprobe.plan(canprobe.load_scene("free", tmp_path / "cell.toml"))
+    plan = canprobe.plan(canprobe.load_scene("free", {"cell": str(tmp_path / "cell.toml")}))
     (mesh,) = ElementTree.fromstring(robot_description(plan)).findall("link[@name='axis_1']/visual/geometry/mesh")
     assert mesh.attrib == {"filename": (tmp_path / "arm.stl").as_uri(), "scale": "2 2 2"}
 

@@ -275,7 +275,7 @@ def test_a_free_arm_is_described_and_follows_a_trajectory_within_its_limits(free
         assert bridge.end("{}")["error"] is None
     finally:
         bridge.kill()
-    with canprobe.open_cell(scene, interface="direct") as cell:
+    with canprobe.open_cell(scene, bus="direct") as cell:
         result = cell.run(RequestedTask(None, None, (deque([followed]),), 2.5e-3, cell.plan))
     np.testing.assert_allclose(result.log["q_rad"][-1], goal, atol=1e-3)
 

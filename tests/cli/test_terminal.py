@@ -151,7 +151,8 @@ def test_a_run_of_a_packaged_scene_as_it_is_shows_what_to_expect(capsys, tmp_pat
     assert err == ""
     summary = json.loads((tmp_path / "a b" / "summary.json").read_text())
     assert figures_of(summary).keys() == read_expected()["scenes"]["press"].keys()
-    assert main(["run", "press", "--bus", "direct", "--duration", "0.5", "--out", str(tmp_path / "c")]) == 0
+    changed = ["--duration", "0.5", "--set", "scene.figures=false"]
+    assert main(["run", "press", "--bus", "direct", *changed, "--out", str(tmp_path / "c")]) == 0
     assert "expected" not in capsys.readouterr().out
 
 

@@ -77,7 +77,7 @@ def test_a_way_that_cannot_be_gone_is_refused_before_anything_moves(points, velo
     assert Trajectory(PLAN, points, velocities).inspect(Q0) is not None
     with (
         pytest.raises(SafetyStop, match=complaint),
-        canprobe.open_cell(canprobe.load_scene("free"), interface="direct") as cell,
+        canprobe.open_cell(canprobe.load_scene("free"), bus="direct") as cell,
     ):
         cell.run(Trajectory(cell.plan, points, velocities))
 
@@ -92,7 +92,7 @@ def test_a_way_out_of_the_workspace_is_refused():
 
 
 def test_a_cell_follows_it_and_holds_the_end():
-    with canprobe.open_cell(canprobe.load_scene("free"), interface="direct") as cell:
+    with canprobe.open_cell(canprobe.load_scene("free"), bus="direct") as cell:
         result = cell.run(Trajectory(cell.plan, [(0.0, Q0 + 0.001), (1.0, Q0 + 0.1), (2.0, Q0)], hold_s=0.25))
     q, t = result.log["q_rad"], result.log["t_s"]
     assert np.abs(q - Q0).max(axis=0) == pytest.approx(np.full(6, 0.1), abs=1e-3)
