@@ -165,7 +165,7 @@ def with_expected(page: str) -> str:
 
 
 def execute_notebooks() -> None:
-    """Run the notebooks and store what they show; needs nbclient and ipykernel."""
+    """Run the notebooks and store what they show; needs the extra `docs`."""
     import nbformat
     from nbclient import NotebookClient
 

@@ -1,7 +1,7 @@
 """The rooms of the package: who may import whom, read from the source; no circles, no crowded folder.
 
 errors < protocol, eds, robot, touch < scene < planning < bus < vcan, cell < tasks | emulator < session < results
-< recorded < bridge, api < studies < cli
+< recorded < bridge, api < gym, studies < cli
 """
 
 import ast
@@ -43,9 +43,10 @@ ALLOWED = {
     "recorded": BOTH | {"results"},
     "bridge": BOTH | {"results", "recorded"},
     "api": BOTH | {"results"},
+    "gym": BOTH | {"api"},
     "studies": BOTH | {"results", "recorded", "api"},
     "cli": BOTH | {"results", "recorded", "api", "studies", "bridge", "vcan"},
-    "examples": {"package", "api"},
+    "examples": {"package", "api", "gym"},
     "package": {*MASTER, "api", "cli", "session", "results", "recorded", "studies"},
 }
 ROOT = {"__init__", "__main__", "api", "errors"}
@@ -63,9 +64,14 @@ EXTRAS = {
     "cli/completion.py": {"argcomplete"},
     "results/picture.py": {"matplotlib"},
     "robot/dynamics.py": {"mujoco"},
+    "scene/surface_files.py": {"trimesh"},
     "studies/many.py": {"pandas", "xarray"},
     "results/figures.py": {"matplotlib"},
     "results/surface_figure.py": {"matplotlib", "mpl_toolkits"},  # of the same distribution
+    "gym/__init__.py": {"gymnasium"},
+    "gym/env.py": {"gymnasium"},
+    "examples/learn_touch_scan.py": {"gymnasium"},
+    "gym/observations.py": {"gymnasium"},
 }
 
 EDGE_ONLY = {"time", "socket", "threading", "can", "selectors", "asyncio", "sched"}

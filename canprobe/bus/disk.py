@@ -13,6 +13,7 @@ import re
 import zipfile
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from io import FileIO
+from itertools import starmap
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -41,7 +42,12 @@ _LINES = 256
 """Lines that are joined before they go to the file."""
 
 
-_Format = Callable[[int, bytes, int], str]
+Take = Callable[[Sequence[TimedFrame]], None]
+"""Takes frames, some at a time."""
+
+
+def _nobody(_: Sequence[TimedFrame]) -> None:
+    """Takes nothing."""
 
 
 class CandumpWriter:
@@ -68,16 +74,30 @@ class CandumpWriter:
         self._path = path
         self._file = _opened_alone(path)
         self._size = 0
-        self._frames: list[tuple[_Format, int, bytes, int]] = []
+        self._frames: list[TimedFrame] = []  # of the channel that takes them
+        self._take: Take = _nobody
         self._lines: list[str] = []
         self.write = self.on(channel)
 
-    def on(self, channel: str) -> Callable[[int, bytes, int], None]:
-        """A recorder of the frames of one channel: called with (can_id, data, t_ns), it adds a line to this file."""
-        frames, form = self._frames, _ChannelLines(channel, self._t0_ns).line
+    def on(self, channel: str, also: Take = _nobody) -> Callable[[int, bytes, int], None]:
+        """A recorder of the frames of one channel: called with (can_id, data, t_ns), it adds a line to this file.
+
+        Args:
+            channel: the name in its lines.
+            also: takes the same frames.
+        """
+        form = _ChannelLines(channel, self._t0_ns).line
+
+        def take(frames: Sequence[TimedFrame]) -> None:
+            self._lines += starmap(form, frames)
+            also(frames)
 
         def write(can_id: int, data: bytes, t_ns: int) -> None:
-            frames.append((form, can_id, data, t_ns))
+            if self._take is not take:
+                self._form_lines()
+                self._take = take
+            frames = self._frames
+            frames.append((can_id, data, t_ns))
             if len(frames) >= _FRAMES:
                 self._form_lines()
                 if len(self._lines) >= _LINES:
@@ -86,8 +106,8 @@ class CandumpWriter:
         return write
 
     def _form_lines(self) -> None:
-        self._lines += [form(can_id, data, t_ns) for form, can_id, data, t_ns in self._frames]
-        self._frames.clear()
+        frames, self._frames = self._frames, []
+        self._take(frames)
 
     def flush(self) -> None:
         """Hand what was written to the file."""

@@ -196,21 +196,28 @@ class TimedBus(LockstepBus):
         """Frame after frame without errors, in the order of `settle`; False where errors came up before the end."""
         self._first_due = super().next_deadline_ns()
         self._stale, self._settling = False, True
-        clock, controllers, length, bit_ns = self.clock, self._controllers, self._length, self._bit_ns
+        move_ns, controllers, length = self.clock.move_ns, self._controllers, self._length
+        bit_ns, gap_ns = self._bit_ns, self._gap_ns
         try:
             while self.errors is None and not controllers.troubled:
                 due, entry = self._first_due, self._flying
                 if entry is None and self._ready:
                     start = self._free_ns if self._free_ns > self._since_ns else self._since_ns
                     if start <= until_ns and (due is None or start < due):
-                        entry = heappop(self._ready)
+                        entry, self._hit = heappop(self._ready), False  # as `_fly`, of every frame
                         bits = length(*entry[3]) - INTERMISSION_BITS
-                        self._fly(entry, start, start + (bits * bit_ns or self._bits_ns(bits)))
+                        self._end_ns = end_ns = start + (bits * bit_ns or self._bits_ns(bits))
+                        self._free_ns = end_ns + gap_ns
+                        self.busy_ns += end_ns + gap_ns - start
+                        self._flying = entry
                 if entry is not None and (due is None or self._end_ns <= due):
                     if self._end_ns > until_ns:
                         return True
-                    clock.move_ns(self._end_ns)
-                    self._finish()
+                    move_ns(self._end_ns)
+                    if self._hit:
+                        return False
+                    self._flying = None
+                    self._deliver_frame(entry[2], entry[3], self._end_ns)
                 elif due is None or due > until_ns:
                     return True
                 else:
@@ -332,33 +339,31 @@ class TimedBus(LockstepBus):
         if self._hit:
             self._fail(entry, t_ns)
             return
-        self.frames += 1
-        if self._fifo and sender.outbox:
-            self._compete(sender, (sender.outbox.popleft(),))
         off: Sequence[BusNode] = ()
         if self._controllers.troubled:
             self._controllers.succeed(sender, t_ns)
             off = self._controllers.off()
+        self._deliver_frame(sender, frame, t_ns, off)
+
+    def _deliver_frame(self, sender: BusNode, frame: Frame, t_ns: int, off: Sequence[BusNode] = ()) -> None:
+        """Everybody but its sender hears a frame, and those that are bus off; the answers are queued."""
+        self.frames += 1
+        if self._fifo and sender.outbox:
+            self._compete(sender, (sender.outbox.popleft(),))
         can_id, data = frame
         if self.recorder is not None:
             self.recorder(can_id, data, t_ns)
-        for receive, receiver in self._listeners_of(sender, can_id):
-            if receiver in off:
+        moved = False
+        for receive, receiver in sender.listeners.get(can_id) or self._listeners_of(sender, can_id):
+            if off and receiver in off:
                 continue
             answers = receive(can_id, data, t_ns)
             due = receiver.owner.next_deadline_ns
             if due != receiver.due:
-                self._reschedule(receiver, due)
+                receiver.due, moved = due, True
             if answers:
                 self._queue(receiver, answers)
-
-    def _reschedule(self, node: BusNode, due_ns: int | None) -> None:
-        """A participant's deadline has moved."""
-        before, node.due = node.due, due_ns
-        first = self._first_due
-        if due_ns is not None and (first is None or due_ns < first):
-            self._first_due = due_ns
-        elif before == first:
+        if moved:
             self._first_due = self._earliest()
 
     # errors

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from functools import partial
+from itertools import repeat
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
@@ -250,15 +252,42 @@ class Cell:
             NodeError: a node was lost or failed.
             InterfaceError: the bus was lost.
         """
+        self.start(controller)
+        self.advance(None, progress)
+
+    def start(self, controller: Controller | Callable[[Measurement], Command]) -> None:
+        """The first half of `run`: enable the drives for a controller, which `advance` then runs."""
         runs = as_controller(controller)
+        with self._one_at_a_time():
+            self._controller, self._retreats_for = runs, None
+            self._enable()
+
+    def advance(self, cycles: int | None, progress: Callable[[Measurement], None] = lambda _: None) -> bool:
+        """The second half of `run`, in pieces: nothing happens between two calls, and virtual time stands still.
+
+        On a real bus the drives stop by themselves where the next call does not come within a cycle.
+
+        Args:
+            cycles: at most so many; None until the controller is done.
+            progress: called after each cycle.
+
+        Returns:
+            Whether the controller is done.
+        """
+        with self._one_at_a_time(), Interrupts(self._stuck) as interrupts:
+            for _ in repeat(None) if cycles is None else range(cycles):
+                if self._run_cycle(interrupts, progress):
+                    return True
+        return False
+
+    @contextmanager
+    def _one_at_a_time(self) -> Iterator[None]:
+        """Refuse a controller that runs another one in its step."""
         if self._running:
             raise UsageError("the cell runs a controller already, which must not run another one in its step")
-        self._controller, self._retreats_for, self._running = runs, None, True
+        self._running = True
         try:
-            self._enable()
-            with Interrupts(self._stuck) as interrupts:
-                while not self._run_cycle(interrupts, progress):
-                    pass
+            yield
         finally:
             self._running = False
 

@@ -108,37 +108,36 @@ class JointGuard:
 
     def command(self, q_target: Vector, measurement: Measurement) -> GuardedTarget:
         """The target that may be sent for `q_target` (n,), rad or m."""
-        try:
-            given = np.asanyarray(q_target)
-        except (TypeError, ValueError):
-            given = np.array(None)
-        if given.dtype.kind not in _NUMBERS or isinstance(given, np.ma.MaskedArray):
-            return GuardedTarget(
-                None, f"the controller's joint target is {q_target!r}: expected {len(self._range)} {self._si}"
-            )
-        target = np.asarray(given, dtype=np.float64)
-        wanted = target.tolist() if target.shape == (len(self._range),) else [math.nan]
-        if not all(map(math.isfinite, wanted)):
-            return GuardedTarget(
-                None, f"the controller's joint target is {target}: expected {len(self._range)} finite {self._si}"
-            )
+        n = len(self._range)
+        if type(q_target) is not np.ndarray or q_target.dtype != np.float64:
+            try:
+                given = np.asanyarray(q_target)
+            except (TypeError, ValueError):
+                given = np.array(None)
+            if given.dtype.kind not in _NUMBERS or isinstance(given, np.ma.MaskedArray):
+                return GuardedTarget(None, f"the controller's joint target is {q_target!r}: expected {n} {self._si}")
+            target = np.asarray(given, dtype=np.float64)
+        else:
+            target = q_target
+        wanted: list[float] = target.tolist() if target.shape == (n,) else [math.nan] * n
         inside = [low <= q <= high for q, (low, high) in zip(wanted, self._range, strict=True)]
         if not all(inside):
+            if not all(map(math.isfinite, wanted)):
+                return GuardedTarget(None, f"the controller's joint target is {target}: expected {n} finite {self._si}")
             joint = inside.index(False)
             where = self._model.joints[joint].text(wanted[joint])
             return GuardedTarget(None, f"joint {joint + 1} at {where}, its stop")
-        if (left := self.outside(target)) is not None:
+        if self._workspace is not None and (left := self.outside(target)) is not None:
             return GuardedTarget(None, left)
         last = self._target
         if last is None and measurement.q is not None:
             last = measurement.q.tolist()
         if last is not None:
-            steps = [q - was for q, was in zip(wanted, last, strict=True)]
-            share = max([abs(step) / speed for step, speed in zip(steps, self._speed, strict=True)])
-            share /= self._period_ns * 1e-9
+            joints = zip(wanted, last, self._speed, strict=True)
+            share = max([abs(q - was) / speed for q, was, speed in joints]) / (self._period_ns * 1e-9)
             if share > 1.0 + _ROUNDING:
                 self.slowed += 1
-                self._target = [was + step / share for was, step in zip(last, steps, strict=True)]
+                self._target = [was + (q - was) / share for q, was in zip(wanted, last, strict=True)]
                 return GuardedTarget(np.array(self._target))
         self._target = wanted
         return GuardedTarget(q_target)

@@ -178,7 +178,10 @@ def _draw_curvature(part: SubFigure, result: RunResult) -> None:
     if result.truth:
         true = result.truth["kappa"][np.searchsorted(result.log["t_s"], [r.t_s - 1e-6 for r in records])]
         axes.plot(travelled, true, color=INK, linestyle="--", label="true")
-        limits.append(true)
+        seen = kappa[np.isfinite(kappa)]
+        if len(seen):  # nor does an edge that is far sharper than all that was estimated
+            span = max(np.ptp(seen), LEAST_SPAN)
+            limits.append(np.clip(true, seen.min() - span, seen.max() + span))
     if limits:
         low, high = min(map(np.min, limits)), max(map(np.max, limits))
         spare = max(0.12 * (high - low), 0.5 * (LEAST_SPAN - (high - low)))

@@ -155,7 +155,8 @@ def box(part: Part, axes: Any, title: str, labels: Sequence[str], *, elev: float
         axis.labelpad = 5
         axis.set_tick_params(pad=0)
         count, inset = round(5 * (high - low) / longest), 0.25 * (high - low)
-        few = [round(low + inset), round(high - inset)] if count == 2 else [round(0.5 * (low + high))]
+        two = count == 2 or part.bbox.height > 4.0 * DPI
+        few = [round(low + inset), round(high - inset)] if two else [round(0.5 * (low + high))]
         axis.set_major_locator(
             MaxNLocator(count, steps=(1, 2, 5, 10), integer=True) if count > 2 else FixedLocator(few)
         )

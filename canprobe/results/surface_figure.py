@@ -104,7 +104,9 @@ def add_sheet(axes: Any, corners: Array, colours: Array | str, **style: Any) -> 
     cells = np.stack([corners[:-1, :-1], corners[:-1, 1:], corners[1:, 1:], corners[1:, :-1]], axis=2).reshape(-1, 4, 3)
     known = np.isfinite(cells).all(axis=(1, 2))
     faces = colours if isinstance(colours, str) else colours[:-1, :-1].reshape(-1, 4)[known]
-    axes.add_collection3d(Poly3DCollection(cells[known], facecolors=faces, linewidths=0, **style), autolim=False)
+    axes.add_collection3d(
+        Poly3DCollection(cells[known], facecolors=faces, linewidths=0, antialiased=False, **style), autolim=False
+    )
     axes.auto_scale_xyz(*cells[known].reshape(-1, 3).T)
 
 
@@ -128,11 +130,11 @@ def _draw_map_surface(part: Part, view: MapView) -> None:
     axes.plot(*plane.mm(view.map.path).T, color=INK, linewidth=0.5, alpha=0.55, zorder=3)
     differ = rejected(view.consistency)
     if differ.any():
-        shown.append("orange: passes differ, p < 0.05")
+        shown.append("orange dots: passes differ, p < 0.05")
         places = np.array([c.T_base_common[:3, 3] for c in view.consistency.crossings])[differ]
         axes.plot(*plane.mm(places).T, "o", color=ORANGE, markersize=3.5, zorder=4)
     labels = ("along the scan (mm)", "across (mm)", "outward (mm)")
-    box(part, axes, " · ".join(shown), labels, elev=42, azim=-68)
+    box(part, axes, " · ".join(shown[:3]) + "\n" + " · ".join(shown[3:]), labels, elev=42, azim=-68)
     scale.colorbar(ScalarMappable(norm, colours), cax=scale.subplots(), label=what)
 
 
@@ -248,5 +250,5 @@ def _draw_p_values(part: SubFigure, consistency: Consistency) -> None:
                     label=f"{name}, {way}",
                 )  # fmt: skip
     axes.set(xlim=(0, 1), ylim=(0, 1.02), xlabel="p", ylabel="share of crossings below")
-    axes.set_title("p-values of the tests at the crossings")
+    axes.set_title("p-values of the tests at the crossings\nbelow the dotted line: errors are smaller than stated")
     legend(part)

@@ -127,7 +127,11 @@ class Chain:
 
 
 def ending_in(chain: Chain, T_flange_tool: Array) -> Chain:
-    """The same arm with a tool, (4, 4) in its flange's frame (m), for a flange: its posture is that of the tool."""
+    """The same arm with a tool, (4, 4) in its flange's frame (m), for a flange: its posture is that of the tool.
+
+    Raises:
+        PlanError: the tool's frame is not a rotation with a translation.
+    """
     return replace(chain, T_last_flange=chain.T_last_flange @ T_flange_tool)
 
 

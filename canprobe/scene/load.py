@@ -27,6 +27,8 @@ from canprobe.scene.rules import SECTIONS_OF_TASK, broken_rules
 
 DEFAULT_CELL = "puma260"
 """Cell of a scene that names none."""
+CHANGED = " (changed)"
+"""Behind the title of a scene whose object or task is no longer that of its file."""
 _ALWAYS = ("scene", "task", "bus", "cycle", "limits", "bring_up")
 FILE_KEYS = {"array", "calibration", "eds", "file", "urdf", "true_cell"}
 """Keys whose files a saved scene takes along."""
@@ -180,6 +182,9 @@ def _with_overrides(own: Mapping[str, Any], overrides: Mapping[str, Any], file: 
             table.pop(key, None)
         else:
             table[key] = _as_toml(value)
+    info, touched = changed.get("scene"), {path.partition(".")[0] for path in overrides if path != "task.duration_s"}
+    if isinstance(info, dict) and info.get("title") and touched & {"object", "task"} and "scene.title" not in overrides:
+        changed["scene"] = {**info, "title": f"{str(info['title']).removesuffix(CHANGED)}{CHANGED}"}
     return changed
 
 

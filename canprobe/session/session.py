@@ -20,7 +20,17 @@ from numpy.typing import NDArray
 
 from canprobe.bus.disk import CandumpWriter, RecordingPort, whole_file, write_npz
 from canprobe.bus.lockstep import LockstepBus
-from canprobe.bus.port import Clock, JoinedPort, MonotonicClock, Port, Reports, VirtualClock, elapsed_ns, is_bus_error
+from canprobe.bus.port import (
+    Clock,
+    JoinedPort,
+    MonotonicClock,
+    Port,
+    Reports,
+    TimedFrame,
+    VirtualClock,
+    elapsed_ns,
+    is_bus_error,
+)
 from canprobe.bus.scheduling import MASTER_PRIORITY, garbage_collection_paused, realtime, reserve_memory
 from canprobe.cell.cell import Cell
 from canprobe.cell.controller import Command, Controller, Measurement
@@ -77,6 +87,11 @@ class TrafficCounter:
     def write(self, can_id: int, data: bytes, t_ns: int) -> None:
         """Count one frame."""
         self._by_length[len(data)] += 1
+
+    def take(self, frames: Sequence[TimedFrame]) -> None:
+        """Count some."""
+        for _, data, _ in frames:
+            self._by_length[len(data)] += 1
 
 
 @contextmanager
@@ -361,30 +376,22 @@ class Session:
 
     def _writer(self, channel: str) -> Write:
         """What a bus is recorded with: its traffic is counted, written to the log and shown to the observers."""
-        write: Write | None = None
-        if self.out is not None:
-            if self._candump is None:
-                self.out.mkdir(parents=True, exist_ok=True)
-                self._candump = self._stack.enter_context(CandumpWriter(self.out / "bus.log", channel, self.origin_ns))
-                self._make_folder(self.out)
-            write = self._candump.on(channel)
-        if self.observers is not None:
-            self.observers.origin_ns = self.origin_ns
-            write = self.observers.tap(write or (lambda _id, _data, _t: None))
         if self.scene.bus.interface == LOCKSTEP:
             self.meters[channel] = TrafficMeter(self.plan, channel, exact=False)
             self.traffic[channel] = self.meters[channel]
         else:  # set beside the plan afterwards, from the log
             self.traffic[channel] = TrafficCounter(self.scene.bus.data_bitrate / self.scene.bus.bitrate)
-        count, pass_on = self.traffic[channel].write, write
-        if pass_on is None:
-            return count
-
-        def both(can_id: int, data: bytes, t_ns: int) -> None:
-            count(can_id, data, t_ns)
-            pass_on(can_id, data, t_ns)
-
-        return both
+        write: Write = self.traffic[channel].write
+        if self.out is not None:
+            if self._candump is None:
+                self.out.mkdir(parents=True, exist_ok=True)
+                self._candump = self._stack.enter_context(CandumpWriter(self.out / "bus.log", channel, self.origin_ns))
+                self._make_folder(self.out)
+            write = self._candump.on(channel, self.traffic[channel].take)
+        if self.observers is not None:
+            self.observers.origin_ns = self.origin_ns
+            write = self.observers.tap(write)
+        return write
 
     def _error_writer(self, channel: str) -> Write:
         """Error frames go into the log, and beside the plan."""

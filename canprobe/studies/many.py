@@ -19,7 +19,7 @@ from canprobe.api import run
 from canprobe.errors import CanprobeError, SafetyStop, UsageError, install_line
 from canprobe.results.files import unit_of
 from canprobe.results.summary import RunResult
-from canprobe.scene.load import dump_scene, load_scene, parse_scene, with_files_beside
+from canprobe.scene.load import SAVED_AS, dump_scene, load_scene, parse_scene, with_files_beside
 from canprobe.scene.model import Scene
 from canprobe.session.session import Say, quiet
 from canprobe.session.target import VIRTUAL, Target
@@ -165,8 +165,8 @@ def _seeds(scene: Scene, seeds: int | Iterable[int] | None) -> list[int]:
 
 
 def _digest(scene: Scene) -> str:
-    files = with_files_beside(scene)
-    return hashlib.sha256(b"".join(name.encode() + files[name] for name in sorted(files)[1:])).hexdigest()[:16]
+    files = sorted((name, content) for name, content in with_files_beside(scene).items() if name != SAVED_AS)
+    return hashlib.sha256(b"".join(name.encode() + content for name, content in files)).hexdigest()[:16]
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

@@ -301,7 +301,7 @@ class TouchTask(ProbingTask):
         surface = LocalSurface(contact.p_base, contact.n_base, self._task.gains)
         self._servo = TactileServo(
             surface,
-            PathFollower(scan.strategy) if scan is not None else None,
+            self._follower(),
             axes=self._task.approach.axes,
             origin=contact.p_base,
             probe_radius=self.sensing.radius,
@@ -309,6 +309,11 @@ class TouchTask(ProbingTask):
         )
         self._sink_from(contact, pose)
         self._enter(Phase.SETTLE)
+
+    def _follower(self) -> PathFollower | None:
+        """What leads the contact over the surface; None holds it where it is."""
+        scan = self._task.scan
+        return PathFollower(scan.strategy) if scan is not None else None
 
     def _sink_from(self, contact: ContactSample, pose: ProbePose) -> None:
         """Remember how deep and with which pole the probe touches, to go on from there without a bump."""

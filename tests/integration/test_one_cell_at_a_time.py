@@ -149,6 +149,21 @@ def test_a_controller_does_not_run_another_one_in_its_step(free):
     assert inner == []
 
 
+def test_a_controller_advances_in_pieces_as_in_one_run(free):
+    seen = {"whole": [], "pieces": []}
+
+    def swing(measurement, into):
+        into.append((measurement.cycle, measurement.t_ns, measurement.enabled, *measurement.q))
+        return Command(q_target=measurement.q + 1e-3 * np.sin(measurement.cycle / 10), done=len(into) == 40)
+
+    with canprobe.open_cell(free) as cell:
+        cell.run(lambda measurement: swing(measurement, seen["whole"]))
+    with canprobe.open_cell(free) as cell:
+        cell.cell.start(lambda measurement: swing(measurement, seen["pieces"]))
+        assert [cell.cell.advance(16) for _ in range(3)] == [False, False, True]
+    assert seen["pieces"] == seen["whole"] and len(seen["whole"]) == 40
+
+
 @pytest.mark.parametrize("done", [np.array([True, False]), "no", None])
 def test_done_is_true_or_false(free, done):
     with canprobe.open_cell(free) as cell, pytest.raises(UsageError, match="expected done to be True or False"):

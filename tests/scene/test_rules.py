@@ -49,8 +49,16 @@ def test_a_changed_scene_is_that_of_a_changed_file(tmp_path):
         text = text.replace(old, new, 1)
     (tmp_path / "mine.toml").write_text(text.replace('also = ["ml", "chen1996"]', "also = []"))
     by_file = load_scene(tmp_path / "mine.toml")
-    assert load_scene("cylinder", wanted) == load_scene(load_scene("cylinder"), wanted) == by_file
+    told = {"scene.title": by_file.title}
+    assert load_scene("cylinder", wanted | told) == load_scene(load_scene("cylinder"), wanted | told) == by_file
     assert load_scene("cylinder", {"cell": "puma560"}).cell.name == "puma560"
+
+
+def test_the_title_says_that_object_or_task_were_changed():
+    title = PRESS.title
+    assert load_scene(PRESS, {"scene.seed": 3, "task.duration_s": 1}).title == title
+    once = load_scene("press", {"task.force_n": 1})
+    assert once.title == load_scene(once, {"task.force_n": 3}).title == f"{title} (changed)"
 
 
 def test_none_takes_a_key_or_a_section_away_and_a_table_takes_the_place_of_one():

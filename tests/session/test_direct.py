@@ -1,6 +1,7 @@
 """A run without a bus: to the last bit that of a lockstep bus whose frames take no time, and what it leaves out."""
 
 from dataclasses import replace
+from itertools import count
 
 import pytest
 
@@ -8,6 +9,7 @@ import canprobe
 from canprobe.cell.controller import Command
 from canprobe.errors import NodeError, PlanError, UsageError
 from canprobe.results.summary import log_columns
+from canprobe.scene.load import packaged_scenes
 from canprobe.session.session import Session
 from canprobe.session.up import up
 from canprobe.tasks.from_plan import make_task
@@ -27,6 +29,14 @@ def loaded(name, cell=None, duration_s=0.2, **sections):
     return replace(scene, **{key: replace(getattr(scene, key), **keys) for key, keys in sections.items()})
 
 
+def assert_same(direct, lockstep):
+    for ours, theirs in ((log_columns(direct.cell), log_columns(lockstep.cell)), (direct.truth, lockstep.truth)):
+        assert ours.keys() == theirs.keys()
+        assert [name for name in ours if ours[name].tobytes() != theirs[name].tobytes()] == []
+    assert len(direct.truth["t_s"]) == len(direct.cell.log) > 30
+    assert direct.cell.faults == lockstep.cell.faults == []
+
+
 @pytest.mark.parametrize(
     "scene",
     [
@@ -40,12 +50,25 @@ def loaded(name, cell=None, duration_s=0.2, **sections):
     ],
 )
 def test_log_and_truth_are_those_of_an_untimed_lockstep_bus_to_the_last_bit(scene):
-    direct, lockstep = on_both(scene)
-    for ours, theirs in ((log_columns(direct.cell), log_columns(lockstep.cell)), (direct.truth, lockstep.truth)):
-        assert ours.keys() == theirs.keys()
-        assert [name for name in ours if ours[name].tobytes() != theirs[name].tobytes()] == []
-    assert len(direct.truth["t_s"]) == len(direct.cell.log) > 30
-    assert direct.cell.faults == lockstep.cell.faults == []
+    assert_same(*on_both(scene))
+
+
+def the_beginning(plan):
+    """The scene's own task, cut off after a tenth of a second."""
+    task, steps = make_task(plan), count(1)
+
+    def step(measurement):
+        command = task.step(measurement)
+        task.update()
+        return replace(command, done=command.done or next(steps) == 40)
+
+    return step
+
+
+@pytest.mark.parametrize("name", [name for name, _ in packaged_scenes()])
+def test_every_packaged_scene_begins_as_on_an_untimed_lockstep_bus(name):
+    direct, lockstep = on_both(loaded(name), the_beginning)
+    assert_same(direct, lockstep)
 
 
 def test_a_drive_that_fails_stops_the_cell_with_the_words_of_a_bus():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import canprobe
+from canprobe.eds.packaged import eds_path
 from canprobe.errors import SceneError, UsageError
 from canprobe.studies import many
 from canprobe.studies.many import run_many
@@ -72,6 +73,20 @@ def test_a_fault_of_one_run_costs_that_run(monkeypatch, out):
     monkeypatch.setattr(many, "run", lambda *_, **__: {}["nothing"])
     outcome = many.measure(case)
     assert outcome["status"] == "failed" and outcome["reason"].startswith("KeyError: 'nothing' (test_many.py:")
+
+
+def test_a_run_is_another_once_a_file_that_its_scene_names_has_changed(tmp_path):
+    copy = tmp_path / "a.eds"
+    copy.write_bytes(eds_path("tactile_array").read_bytes())
+    scene = canprobe.load_scene("press", {"sensor.eds": copy})
+    before = many._digest(scene)
+    assert (
+        before
+        == many._digest(canprobe.load_scene(scene, {"task.force_n": 1}))
+        != many._digest(canprobe.load_scene("press"))
+    )
+    copy.write_bytes(copy.read_bytes() + b"\n; a comment\n")
+    assert many._digest(scene) != before
 
 
 @pytest.mark.parametrize(

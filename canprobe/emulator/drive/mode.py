@@ -180,13 +180,13 @@ class DriveFeedback:
 
     def _sampler(self, index: int, limit: int) -> Callable[[int], None]:
         """What puts a value into the dictionary, as a whole number within +-limit."""
-        values, key, sources = self._core.dictionary.values, index << 8, self._sources
+        values, key, sources, least, most = self._core.dictionary.values, index << 8, self._sources, -limit, limit - 1
 
         def sample(t_ns: int) -> None:
             if t_ns != self._t_ns:
                 self.measure(t_ns)
             number = round(sources[index]())
-            values[key] = number if -limit <= number < limit else min(max(number, -limit), limit - 1)
+            values[key] = number if least <= number <= most else min(max(number, least), most)
 
         return sample
 

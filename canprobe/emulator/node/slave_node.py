@@ -162,7 +162,9 @@ class SlaveNode(Participant):
             self._run(t_ns)
         core.now_ns = t_ns
         route(data, t_ns)
-        return self._taken()
+        if out := core.out:
+            core.out = []
+        return out
 
     def advance(self, t_ns: int) -> list[Frame]:
         """Do everything that is due up to and at `t_ns`."""
