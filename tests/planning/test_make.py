@@ -141,7 +141,7 @@ def test_help_imports_not_even_numpy():
     ("changes", "match"),
     [
         ({"bodies": None}, r"the masses of arm 'puma260' are not known; give .* or set plant.fidelity = \"ideal\""),
-        ({}, r"pip install .*\[dynamics\]'"),
+        ({}, r"pip install .*\[dynamics\]"),
     ],
     ids=["no bodies", "no extra"],
 )

@@ -165,5 +165,5 @@ def test_what_is_missing_is_said_with_what_to_type(monkeypatch):
     assert 'plant.fidelity = "ideal"' in dynamics_problem("gantry", None)
     monkeypatch.setitem(sys.modules, "mujoco", None)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(PlanError, match=r"pip install .*\[dynamics\]'"):
+    with pytest.raises(PlanError, match=r"pip install .*\[dynamics\]"):
         RigidBody(UPENN.chain, BODIES["puma260"])
