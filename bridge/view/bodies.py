@@ -29,6 +29,7 @@ from canprobe.bridge.view.meshes import (
 )
 from canprobe.robot.chain import Chain, dh_step
 from canprobe.touch.contact import pad_to_direction
+from canprobe.touch.heights import Heights
 from canprobe.touch.linear_algebra import tangent_rotation
 from canprobe.touch.objects import Cylinder, Sphere
 from canprobe.touch.pad import Pad
@@ -235,13 +236,15 @@ WHOLE_M = 0.12
 """Largest radius of a body that is shown whole."""
 STEPS = 40
 LINES = 15
+RELIEF = 161
+"""Points along each side of a grid of heights."""
 
 
 def object_mesh(shape: PlacedShape) -> Mesh:
     """The surface of an object near its origin, base frame.
 
     Balls, cylinders, bowls and rings of ordinary size are shown whole (a cylinder over `REACH_M` to each side),
-    everything else over a square of twice `REACH_M`.
+    heights within `REACH_M`, everything else over a square of twice `REACH_M`.
     """
     radius = getattr(shape, "radius", math.inf)
     if radius <= WHOLE_M and isinstance(shape, Sphere):
@@ -250,6 +253,8 @@ def object_mesh(shape: PlacedShape) -> Mesh:
         return _placed(shape, _tube(radius, REACH_M), -radius)
     if radius <= WHOLE_M and isinstance(shape, Bowl):
         return _placed(shape, _hollow(radius), radius)
+    if isinstance(shape, Heights):
+        return grid(_relief(shape))
     if isinstance(shape, Torus) and shape.ring_radius + radius <= WHOLE_M:
         return _ring(shape)
     return grid(_sheet(shape, REACH_M))
@@ -258,11 +263,30 @@ def object_mesh(shape: PlacedShape) -> Mesh:
 def object_lines(shape: PlacedShape) -> Array:
     """Lines on the surface in two directions, which make its curvature visible: (n, 2, 3) segments, base frame, m."""
     radius = math.inf if isinstance(shape, Cylinder) else getattr(shape, "radius", math.inf)
+    if isinstance(shape, Heights):
+        return _lines(_relief(shape))
     sheet = _sheet(shape, min(REACH_M, 0.7 * radius))  # not over the edge of a body seen from above
-    picked = np.linspace(0, STEPS, LINES).round().astype(int)
-    along = [np.stack([sheet[i, :-1], sheet[i, 1:]], axis=1) for i in picked]
-    across = [np.stack([sheet[:-1, j], sheet[1:, j]], axis=1) for j in picked]
+    return _lines(sheet)
+
+
+def _lines(sheet: Array) -> Array:
+    rows, columns = (np.linspace(0, n - 1, LINES).round().astype(int) for n in sheet.shape[:2])
+    along = [np.stack([sheet[i, :-1], sheet[i, 1:]], axis=1) for i in rows]
+    across = [np.stack([sheet[:-1, j], sheet[1:, j]], axis=1) for j in columns]
     return np.concatenate([*along, *across])
+
+
+def _relief(shape: Heights) -> Array:
+    """(m, n, 3) points of a grid of heights within `REACH_M` of the origin, base frame, close enough for its edges."""
+    x, y = (
+        np.linspace(max(low, -REACH_M), min(high, REACH_M), RELIEF)
+        for low, high in zip(shape.spline.corner, shape.spline.far, strict=True)
+    )
+    x, y = (one.ravel() for one in np.meshgrid(x, y, indexing="ij"))
+    local = np.column_stack((x, y, shape.spline.many(x, y)[0]))
+    T = shape.T_base_object
+    points: Array = (local @ T[:3, :3].T + T[:3, 3]).reshape(RELIEF, RELIEF, 3)
+    return points
 
 
 def _sheet(shape: PlacedShape, reach_m: float) -> Array:

@@ -23,6 +23,9 @@ SAMPLES = 240
 _STEEPEST = math.radians(70.0)  # the servo steers in the scan plane: steeper than this it cannot follow
 _BRANCH_RAD = 0.3  # between two points of a path; farther away lies another branch
 _SINGULAR = 1e-3  # of the Jacobian in rows of a posture from which an arm cannot go on
+_RESTS_M = 5e-6  # of a ball, which may stand on two places that differ by so much
+_PATCH_M = 2e-3  # half of the width of a patch
+_BESIDE_M = 1e-6  # of a foot that does not lie under its point along the normal: on the surface's border
 _TOUCH_TO_TOUCH_RAD = 1.0  # between the touches of a calibration
 
 
@@ -61,10 +64,11 @@ def surface_path(task: Touch, shape: PlacedShape | None) -> SurfacePath:
         plane = approach.start + np.array(flat) @ approach.axes[:2]
     if shape is None:
         return SurfacePath(plane, np.tile(down, (len(plane), 1)), math.inf)
-    _check_approach(approach, _along(shape, approach.start, down))
+    radius = task.probe.radius if shape.by_gaps else 0.0  # a ball bridges what a point would fall into
+    _check_approach(approach, _along(shape, approach.start, down, radius))
     contacts = []
     for point in plane:
-        height = _along(shape, point, down)
+        height = _along(shape, point, down, radius)
         if height is None:
             raise PlanError(
                 [
@@ -73,12 +77,22 @@ def surface_path(task: Touch, shape: PlacedShape | None) -> SurfacePath:
                     "task.heading_deg"
                 ]
             )
-        contacts.append(shape.closest(point + height * down))
+        contacts.append(shape.closest(point + (height + radius) * down))
     points, normals = np.array([c.point for c in contacts]), np.array([c.normal for c in contacts])
     path = SurfacePath(points, normals, shape.tightest_concave_radius(points))
+    if shape.by_gaps:
+        path = _over_patches(path, plane, radius)
     if path.hollow_radius > task.probe.radius:  # a tighter hollow is refused as that
         _check_first_touch(task, shape)
     return path
+
+
+def _over_patches(path: SurfacePath, plane: Array, radius: float) -> SurfacePath:
+    """A ball's path with the normals as its pad shows them, which averages over a patch."""
+    apart = np.linalg.norm(plane[:, None] - plane, axis=2)
+    normals = np.exp(-0.5 * (apart / _PATCH_M) ** 2) @ path.normals
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    return SurfacePath(path.points + radius * (path.normals - normals), normals, path.hollow_radius)
 
 
 def _mm(point: Array) -> str:
@@ -86,17 +100,21 @@ def _mm(point: Array) -> str:
     return f"({x:.1f}, {y:.1f}, {z:.1f})"
 
 
-def _along(shape: PlacedShape, point: Array, up: Array) -> float | None:
-    """Height of the surface over `point` along `up`, m, by Newton; None where the line misses or grazes it."""
+def _along(shape: PlacedShape, point: Array, up: Array, radius: float = 0.0) -> float | None:
+    """Height along `up` over `point` at which the foot of a ball of `radius` rests on the surface, m, by Newton.
+
+    None where the line misses or grazes the surface, or the ball rests on its border.
+    """
     height = 0.0
     for _ in range(50):
-        foot = shape.closest(point + height * up)
+        at = point + (height + radius) * up
+        foot = shape.closest(at)
         steepness = float(foot.normal @ up)
-        if steepness < math.cos(_STEEPEST):
+        if steepness < math.cos(_STEEPEST) or np.abs(at - foot.point - foot.distance * foot.normal).max() > _BESIDE_M:
             return None
-        if abs(foot.distance) < 1e-9:
+        if abs(foot.distance - radius) < (_RESTS_M if radius else 1e-9):
             return height
-        height -= foot.distance / steepness
+        height -= (foot.distance - radius) / steepness
     return None
 
 

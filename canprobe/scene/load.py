@@ -28,7 +28,7 @@ from canprobe.scene.rules import SECTIONS_OF_TASK, broken_rules
 DEFAULT_CELL = "puma260"
 """Cell of a scene that names none."""
 _ALWAYS = ("scene", "task", "bus", "cycle", "limits", "bring_up")
-FILE_KEYS = {"array", "calibration", "eds", "urdf", "true_cell"}
+FILE_KEYS = {"array", "calibration", "eds", "file", "urdf", "true_cell"}
 """Keys whose files a saved scene takes along."""
 SAVED_AS = "scene.toml"
 """Name of a saved scene."""

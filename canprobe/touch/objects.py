@@ -9,6 +9,7 @@ from types import MappingProxyType
 import numpy as np
 import numpy.typing as npt
 
+from canprobe.touch.heights import Heights
 from canprobe.touch.shapes import (
     Bowl,
     Fillet,
@@ -226,6 +227,7 @@ _KINDS: Mapping[str, tuple[type[PlacedShape], tuple[str, ...]]] = MappingProxyTy
         "wave": (Wave, ("amplitude", "wavelength")),
         "fillet": (Fillet, ("radius", "angle")),
         "quadric": (Quadric, ("matrix",)),
+        "heights": (Heights, ("heights", "spacing", "origin")),
     }
 )
 

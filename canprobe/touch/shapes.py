@@ -79,6 +79,9 @@ class PlacedShape:
         ValueError: for a pose that is not a rotation and a translation.
     """
 
+    by_gaps = False
+    """Whether force and pressure follow from the gaps all over a ball, not from the curvature where it touches."""
+
     def __init__(self, T_base_object: npt.ArrayLike) -> None:
         pose = np.array(T_base_object, dtype=float)
         if pose.shape != (4, 4) or not np.all(np.isfinite(pose)):
@@ -134,6 +137,10 @@ class PlacedShape:
         """Signed distances (n,) of points (n, 3) of the base frame, m, positive outside."""
         return np.array([self.closest(p).distance for p in points_base])
 
+    def squeezed(self, centre_base: Vec, radius: float) -> float:
+        """Volume (m³) by which the layer of a ball is squeezed; of surfaces that press by their gaps only."""
+        raise NotImplementedError
+
     def _to_object(self, points_base: Array) -> Array:
         """(n, 3) points of the base frame in the object's."""
         local: Array = (points_base - self._pose[:3, 3]) @ self._pose[:3, :3]
@@ -149,7 +156,8 @@ class PlacedShape:
 
         Args:
             region: (n, 3) base points; answers for their closest surface points. None: the whole surface
-                (for a general quadric: the surface within 50 mm of the object's origin, sampled).
+                (for a general quadric: the surface within 50 mm of the object's origin, sampled; for heights: the
+                origin).
 
         Returns:
             Radius, m; inf where nothing is concave.

@@ -26,7 +26,7 @@ from canprobe.emulator.plant.taxels import Image, TaxelArray, Vec, pad_coordinat
 from canprobe.errors import PlanError
 from canprobe.robot.chain import Array, forward_jacobian, point_on_flange, point_velocity, posture
 from canprobe.robot.model import ArmModel, units_to_joints
-from canprobe.touch.shapes import Nearest, Touches
+from canprobe.touch.shapes import Nearest, PlacedShape, Touches
 
 Truth = dict[str, float | bool | Array]
 SWITCH_BEYOND = 0.01
@@ -213,14 +213,20 @@ class Plant:
         s = self._solution() if state is None else self._solve(state)
         if self.array is None or s.depth <= 0.0:
             return np.zeros(self.config.pad.shape)
-        field, directions = self.array.field, in_pad(s.foot, s.probe, s.direction)
-        means: Array = field.mean_pressure(s.pad_uv, s.depth, s.kappa, directions)
+        means: Array
+        if self.config.object is not None and self.config.object.by_gaps:
+            means = self._over_gaps(self.array, self.config.object, s)
+        else:
+            means = self.array.field.mean_pressure(s.pad_uv, s.depth, s.kappa, in_pad(s.foot, s.probe, s.direction))
         return means * (self.config.stiffness_n_m3 * s.contact.damping_factor)
 
     def _sampled(self, array: TaxelArray, s: _Solution) -> Image:
-        if s.several and self.config.object is not None:
-            points = array.field.points(np.array(s.probe.centre), np.array(s.probe.axes))
-            return array.image_of(array.field.mean_of(-self.config.object.gaps(points)), 1e-9 * self.t_ns)
+        shape = self.config.object
+        if s.several and shape is not None:
+            if shape.by_gaps and s.depth <= 0.0:
+                return array.image_of(np.zeros(array.pad.shape), 1e-9 * self.t_ns)
+            means = self._over_gaps(array, shape, s)
+            return array.image_of(means * s.contact.damping_factor, 1e-9 * self.t_ns)
         return array.image(
             s.pad_uv,
             s.depth,
@@ -229,6 +235,11 @@ class Plant:
             1e-9 * self.t_ns,
             pressure_factor=s.contact.damping_factor,
         )
+
+    def _over_gaps(self, array: TaxelArray, shape: PlacedShape, s: _Solution) -> Array:
+        """(rows, columns) taxel means of the layer's compression, m, from the gaps all over the pad."""
+        points = array.field.points(np.array(s.probe.centre), np.array(s.probe.axes))
+        return array.field.mean_of(-shape.gaps(points))
 
     def state(self) -> PlantState:
         """The present state: cheap to take, `truth` can be asked for it at any time."""
@@ -310,22 +321,26 @@ class Plant:
         vx, vy, vz = probe.velocity
         depth, rate = config.radius_m - foot.distance, -(nx * vx + ny * vy + nz * vz)
         k1, k2 = foot.kappa
-        touches = config.object.touches(probe.centre, config.radius_m)
-        contact = elastic_contact(
-            depth,
-            (max(k1, self._tightest), max(k2, self._tightest)),
-            config.radius_m,
-            config.stiffness_n_m3,
-            depth_rate=rate,
-            damping=config.damping_s_m,
-        )
-        if touches is not None:
-            contact = self._resting(touches, probe)
+        if config.object.by_gaps:
+            several, contact = True, self._squeezed(config.object, probe, depth, rate)
+        else:
+            touches = config.object.touches(probe.centre, config.radius_m)
+            several = touches is not None
+            contact = elastic_contact(
+                depth,
+                (max(k1, self._tightest), max(k2, self._tightest)),
+                config.radius_m,
+                config.stiffness_n_m3,
+                depth_rate=rate,
+                damping=config.damping_s_m,
+            )
+            if touches is not None:
+                contact = self._resting(touches, probe)
         # Contact direction on the probe: from its centre against the object's outward normal.
         (x0, x1, x2), (y0, y1, y2), (z0, z1, z2) = probe.axes
         d = (-(nx * x0 + ny * x1 + nz * x2), -(nx * y0 + ny * y1 + nz * y2), -(nx * z0 + ny * z1 + nz * z2))
         uv = pad_coordinates(d, config.radius_m)
-        return _Solution(q, probe, foot, depth, rate, contact, (k1, k2), uv, d, touches is not None)
+        return _Solution(q, probe, foot, depth, rate, contact, (k1, k2), uv, d, several)
 
     def _given_way(self, q: tuple[float, ...], foot: Nearest, compliance: Array) -> tuple[float, ...]:
         """Joints (n,) that the contact has pushed back, by torque over stiffness each.
@@ -345,6 +360,15 @@ class Plant:
         left = (sqrt(1.0 + 4.0 * unit * c * depth) - 1.0) / (2.0 * unit * c) if c > 0.0 else depth
         given: tuple[float, ...] = tuple((np.array(q) + compliance * lever * (unit * left * left)).tolist())
         return given
+
+    def _squeezed(self, shape: PlacedShape, probe: Probe, depth: float, rate: float) -> Contact:
+        """The force of all that is pressed in, whatever its shape; it has no patch of its own."""
+        if depth <= 0.0:
+            return NO_CONTACT
+        config = self.config
+        factor = max(0.0, 1.0 + 1.5 * config.damping_s_m * rate)
+        force = factor * config.stiffness_n_m3 * shape.squeezed(probe.centre, config.radius_m)
+        return NO_CONTACT._replace(force=force, damping_factor=factor)
 
     def _resting(self, touches: Touches, probe: Probe) -> Contact:
         """Several places at once, as one contact with the resultant force; it has no patch of its own."""
@@ -375,7 +399,7 @@ class _Solution:
     kappa: tuple[float, float]
     pad_uv: tuple[float, float]
     direction: Vec  # of the contact from the probe's centre, pad frame
-    several: bool = False  # it touches in several places, and these are of the deepest
+    several: bool = False  # it touches in several places or all over, and these are of the deepest
 
 
 _POLE = (0.0, 0.0, 1.0)
