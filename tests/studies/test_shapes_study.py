@@ -206,8 +206,9 @@ def test_the_words_name_what_is_better():
     assert math.isnan(row["nll"])
     keys = [c.key for c in COLUMNS if isinstance(c, Column)]
     base = {**dict.fromkeys(keys, 1.0), "unit": "mm"}
-    said = findings([base | {"method": "ml"}, base | {"method": "quadrics", "accuracy_um": 0.5, "nll": 2.0}], TEST)
-    assert any(line.startswith("  accuracy: baseline better") for line in said)
+    rows = [base | {"method": "ml"}, base | {"method": "quadrics", "accuracy_um": 0.5, "nll": 2.0}]
+    said = findings(rows, [[rows[0], rows[0]], [rows[1] | {"accuracy_um": 0.4}, rows[1] | {"accuracy_um": 0.6}]])
+    assert any(line.startswith("  accuracy: baseline better") and "0.5 (0.4 to 0.6)" in line for line in said)
     assert any(line.startswith("  NLL: ours better") for line in said)
 
 
