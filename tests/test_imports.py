@@ -62,6 +62,7 @@ EXTRAS = {
     "bridge/view/links.py": {"trimesh"},
     "results/picture.py": {"matplotlib"},
     "robot/dynamics.py": {"mujoco"},
+    "scene/surface_files.py": {"trimesh"},
     "results/figures.py": {"matplotlib"},
     "results/surface_figure.py": {"matplotlib"},
 }

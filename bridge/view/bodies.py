@@ -254,7 +254,9 @@ def object_mesh(shape: PlacedShape) -> Mesh:
     if radius <= WHOLE_M and isinstance(shape, Bowl):
         return _placed(shape, _hollow(radius), radius)
     if isinstance(shape, Heights):
-        return grid(_relief(shape))
+        points, exists = _relief(shape)
+        mesh = grid(points)
+        return Mesh(mesh.vertices, mesh.faces[exists.ravel()[mesh.faces].all(axis=1)])
     if isinstance(shape, Torus) and shape.ring_radius + radius <= WHOLE_M:
         return _ring(shape)
     return grid(_sheet(shape, REACH_M))
@@ -264,7 +266,9 @@ def object_lines(shape: PlacedShape) -> Array:
     """Lines on the surface in two directions, which make its curvature visible: (n, 2, 3) segments, base frame, m."""
     radius = math.inf if isinstance(shape, Cylinder) else getattr(shape, "radius", math.inf)
     if isinstance(shape, Heights):
-        return _lines(_relief(shape))
+        points, exists = _relief(shape)
+        lines = _lines(np.where(exists[..., None], points, np.nan))
+        return lines[np.isfinite(lines).all(axis=(1, 2))]
     sheet = _sheet(shape, min(REACH_M, 0.7 * radius))  # not over the edge of a body seen from above
     return _lines(sheet)
 
@@ -276,8 +280,8 @@ def _lines(sheet: Array) -> Array:
     return np.concatenate([*along, *across])
 
 
-def _relief(shape: Heights) -> Array:
-    """(m, n, 3) points of a grid of heights within `REACH_M` of the origin, base frame, close enough for its edges."""
+def _relief(shape: Heights) -> tuple[Array, NDArray[np.bool_]]:
+    """(m, n, 3) points of heights within `REACH_M` of the origin, base frame, and (m, n) whether the surface exists."""
     x, y = (
         np.linspace(max(low, -REACH_M), min(high, REACH_M), RELIEF)
         for low, high in zip(shape.spline.corner, shape.spline.far, strict=True)
@@ -286,7 +290,7 @@ def _relief(shape: Heights) -> Array:
     local = np.column_stack((x, y, shape.spline.many(x, y)[0]))
     T = shape.T_base_object
     points: Array = (local @ T[:3, :3].T + T[:3, 3]).reshape(RELIEF, RELIEF, 3)
-    return points
+    return points, shape.exists(x, y).reshape(RELIEF, RELIEF)
 
 
 def _sheet(shape: PlacedShape, reach_m: float) -> Array:

@@ -24,6 +24,7 @@ _STEEPEST = math.radians(70.0)  # the servo steers in the scan plane: steeper th
 _BRANCH_RAD = 0.3  # between two points of a path; farther away lies another branch
 _SINGULAR = 1e-3  # of the Jacobian in rows of a posture from which an arm cannot go on
 _RESTS_M = 5e-6  # of a ball, which may stand on two places that differ by so much
+_BALL_STEPS = 6  # halves what is left of the way from under the centre to the contact
 _PATCH_M = 2e-3  # half of the width of a patch
 _BESIDE_M = 1e-6  # of a foot that does not lie under its point along the normal: on the surface's border
 _TOUCH_TO_TOUCH_RAD = 1.0  # between the touches of a calibration
@@ -64,11 +65,22 @@ def surface_path(task: Touch, shape: PlacedShape | None) -> SurfacePath:
         plane = approach.start + np.array(flat) @ approach.axes[:2]
     if shape is None:
         return SurfacePath(plane, np.tile(down, (len(plane), 1)), math.inf)
-    radius = task.probe.radius if shape.by_gaps else 0.0  # a ball bridges what a point would fall into
+    # A ball bridges what a point would fall into.
+    radius = task.probe.radius if shape.by_gaps and not task.array.pad.is_flat else 0.0
     _check_approach(approach, _along(shape, approach.start, down, radius))
+    path = _contacts(shape, plane, down, radius)
+    if shape.by_gaps:
+        path = _under_ball(shape, path, plane, down, radius)
+    if path.hollow_radius > task.probe.radius:  # a tighter hollow is refused as that
+        _check_first_touch(task, shape)
+    return path
+
+
+def _contacts(shape: PlacedShape, plane: Array, up: Array, radius: float) -> SurfacePath:
+    """Where a ball of `radius` over each point (n, 3) rests, or the surface itself with 0."""
     contacts = []
     for point in plane:
-        height = _along(shape, point, down, radius)
+        height = _along(shape, point, up, radius)
         if height is None:
             raise PlanError(
                 [
@@ -77,20 +89,30 @@ def surface_path(task: Touch, shape: PlacedShape | None) -> SurfacePath:
                     "task.heading_deg"
                 ]
             )
-        contacts.append(shape.closest(point + (height + radius) * down))
+        contacts.append(shape.closest(point + (height + radius) * up))
     points, normals = np.array([c.point for c in contacts]), np.array([c.normal for c in contacts])
-    path = SurfacePath(points, normals, shape.tightest_concave_radius(points))
-    if shape.by_gaps:
+    return SurfacePath(points, normals, shape.tightest_concave_radius(points))
+
+
+def _under_ball(shape: PlacedShape, path: SurfacePath, plane: Array, up: Array, radius: float) -> SurfacePath:
+    """The path of a ball whose contacts, not whose centre, lie over the points of the plane."""
+    over = plane
+    for _ in range(_BALL_STEPS):
         path = _over_patches(path, plane, radius)
-    if path.hollow_radius > task.probe.radius:  # a tighter hollow is refused as that
-        _check_first_touch(task, shape)
-    return path
+        beside = plane - path.points
+        over = over + beside - np.outer(beside @ up, up)
+        path = _contacts(shape, over, up, radius)
+    return _over_patches(path, plane, radius)
 
 
 def _over_patches(path: SurfacePath, plane: Array, radius: float) -> SurfacePath:
-    """A ball's path with the normals as its pad shows them, which averages over a patch."""
-    apart = np.linalg.norm(plane[:, None] - plane, axis=2)
-    normals = np.exp(-0.5 * (apart / _PATCH_M) ** 2) @ path.normals
+    """A ball's path with the normals as its pad shows them: of each point from a linear fit to those near it."""
+    beside = plane[None] - plane[:, None]
+    weights = np.exp(-0.5 * np.sum((beside / _PATCH_M) ** 2, axis=2))
+    terms = np.concatenate((np.ones((*weights.shape, 1)), beside / _PATCH_M), axis=2)
+    weighted = (weights[..., None] * terms).transpose(0, 2, 1)
+    moments = weighted @ terms + 1e-6 * np.eye(4)  # along a line, nothing is known beside it
+    normals = np.linalg.solve(moments, weighted @ path.normals)[:, 0]
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     return SurfacePath(path.points + radius * (path.normals - normals), normals, path.hollow_radius)
 

@@ -17,7 +17,7 @@ from canprobe.robot.tool_calibration import ToolEstimate
 from canprobe.scene.hardware import Vec3
 from canprobe.scene.load import Reader, read_toml
 from canprobe.scene.model import ObjectSettings, PlantSettings, ProbeSettings, Scene, TaskSettings
-from canprobe.scene.surface_files import surface_of_file
+from canprobe.scene.surface_files import object_of_file
 from canprobe.touch.objects import OBJECT_PARAMETERS, make_object
 from canprobe.touch.shapes import PlacedShape
 
@@ -43,9 +43,10 @@ def true_object(settings: ObjectSettings) -> PlacedShape:
     Raises:
         ValueError: for a matrix that describes no surface through the object's origin with z outward, or a file that
             holds none.
+        UsageError: a mesh, and no trimesh is installed.
     """
     if settings.file is not None:
-        return make_object(settings.kind, T_base_object=T_base_object(settings), **surface_of_file(settings))
+        return object_of_file(settings, T_base_object(settings))
     values: dict[str, object] = {"matrix": np.array(settings.matrix), "angle": math.radians(settings.angle_deg or 0.0)}
     params = {
         name: values[name] if name in values else getattr(settings, f"{name}_mm") * 1e-3

@@ -31,7 +31,18 @@ TactileModeName = Literal["window", "image", "features", "auto"]
 CobIds = Literal["default", "by_deadline", "auto"]
 ShapeMethod = Literal["recursive", "ml", "chord", "chen1996"]
 ObjectKind = Literal[
-    "plane", "sphere", "cylinder", "ellipsoid", "saddle", "bowl", "torus", "wave", "fillet", "quadric", "heights"
+    "plane",
+    "sphere",
+    "cylinder",
+    "ellipsoid",
+    "saddle",
+    "bowl",
+    "torus",
+    "wave",
+    "fillet",
+    "quadric",
+    "heights",
+    "mesh",
 ]
 Fidelity = Literal["ideal", "dynamic"]
 Integrator = Literal["semi-implicit", "rk4", "implicit", "rosenbrock", "exponential", "adaptive"]
@@ -56,7 +67,7 @@ DEFAULT_ARRAY = "inch16"
 """Array file of a sensor that names none."""
 TWO_RADII = Only("kind", ("saddle", "ellipsoid"), required=True)
 WAVE = Only("kind", ("wave",), required=True)
-OF_A_FILE = Only("kind", ("heights",))
+OF_A_FILE = Only("kind", ("heights", "mesh"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,8 +245,8 @@ class ObjectSettings:
     it turns the normal by the angle. A saddle is z = −x²/(2 radius_x) − y²/(2 radius_y) with radii of opposite sign
     (positive: convex). An ellipsoid has three positive semi-axes. A torus lies flat; the origin is on its crown, and x
     points away from its axis. A bowl is the inside of a sphere with the origin at its bottom. A quadric is XᵀSX = 0
-    with S = matrix, in metres, negative inside. Heights are a grid of z over x and y, read from a file
-    and taken as one smooth surface (docs/scenes.md).
+    with S = matrix, in metres, negative inside. Heights are a grid of z over x and y; a mesh is what is
+    seen of it from +z. Both are read from a file and taken as one smooth surface (docs/scenes.md).
     """
 
     kind: ObjectKind
@@ -262,15 +273,16 @@ class ObjectSettings:
     """Angle between the two normals."""
     matrix: Annotated[tuple[Row4, Row4, Row4, Row4] | None, SYMMETRIC, Only("kind", ("quadric",), required=True)] = None
     """Matrix S of the quadric XᵀSX = 0, with lengths in metres."""
-    file: Annotated[str | None, ScenePath(), Only("kind", ("heights",), required=True)] = None
-    """Heights: a .npy, .npz, .csv or .txt file, a row of which is a line along y."""
+    file: Annotated[str | None, ScenePath(), Only("kind", ("heights", "mesh"), required=True)] = None
+    """Heights: a .npy, .npz, .csv or .txt file, a row of which is a line along y. Mesh: an STL, OBJ or PLY file."""
     unit_mm: Annotated[float, Range(1e-6, 1e6), OF_A_FILE] = 1.0
     """Unit of the lengths in the file: 1000 for metres, 25.4 for inches."""
     spacing_mm: Annotated[float | None, Range(1e-3, 1000), OF_A_FILE] = None
-    """Spacing of the grid of heights; left out: the `spacing` in a .npz file, in its unit."""
+    """Spacing of the grid of heights; left out: the `spacing` in a .npz file, in its unit. Of a mesh: that of the grid
+    that is fitted to it, best twice the length of the mesh's edges; left out: 1 mm."""
     origin_mm: Annotated[Vec2 | None, OF_A_FILE] = None
     """Point x, y of the file that is the origin of the object frame; left out: the middle. x and y of heights are
-    counted from the grid's first corner."""
+    counted from the grid's first corner, those of a mesh are its own."""
     position_mm: Vec3 = (-120.0, -122.5, 374.0)
     """Origin of the object frame in the base frame: a point of the surface."""
     rotation_deg: Vec3 = (0.0, 0.0, 0.0)

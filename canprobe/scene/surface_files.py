@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -9,22 +10,59 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.errors import UsageError, install_line
 from canprobe.scene.model import ObjectSettings
+from canprobe.touch.heights import Heights
+from canprobe.touch.mesh_fit import Fit, fit_mesh
+from canprobe.touch.objects import make_object
+from canprobe.touch.shapes import PlacedShape
 
 Array = NDArray[np.float64]
 
 HEIGHTS = (".npy", ".npz", ".csv", ".txt")
+MESHES = (".stl", ".obj", ".ply")
 _MM = 1e-3
+_SPACING_MM = 1.0
 
 
-def surface_of_file(settings: ObjectSettings) -> dict[str, Any]:
-    """The parameters of `make_object` for a kind that is read from a file, in m.
+def object_of_file(settings: ObjectSettings, T_base_object: Array) -> PlacedShape:
+    """The object whose surface is read from a file.
 
     Raises:
         ValueError: the file cannot be read, or holds no surface; with what was expected and found.
+        UsageError: a mesh, and no trimesh is installed.
     """
     assert settings.file is not None
-    return _heights(settings, Path(settings.file))
+    path = Path(settings.file)
+    if settings.kind == "heights":
+        return make_object("heights", T_base_object=T_base_object, **_heights(settings, path))
+    if path.suffix.lower() not in MESHES:
+        raise ValueError(f"file: expected a mesh in a file of {', '.join(MESHES)}, got {path.name}")
+    try:
+        changed_ns = path.stat().st_mtime_ns
+    except OSError as error:
+        raise ValueError(f"file: {path}: cannot be read: {error.strerror}") from error
+    spacing = (settings.spacing_mm or _SPACING_MM) * _MM
+    fit = _mesh(path, changed_ns, settings.unit_mm * _MM, spacing, settings.origin_mm)
+    return Heights(T_base_object, fit.heights, fit.spacing, fit.origin, fit.there)
+
+
+@lru_cache(maxsize=4)
+def _mesh(path: Path, changed_ns: int, unit: float, spacing: float, origin_mm: tuple[float, float] | None) -> Fit:
+    """The surface of a mesh; of a file that has not changed it is fitted once."""
+    try:
+        import trimesh
+    except ImportError as error:
+        raise UsageError(f"object.file: a mesh needs trimesh: {install_line('mesh')}") from error
+    try:
+        read = trimesh.load_mesh(path, process=False)
+    except Exception as error:  # each of its readers has its own
+        raise ValueError(f"file: {path.name} is no mesh that can be read: {error}") from error
+    origin = None if origin_mm is None else np.array(origin_mm) * _MM
+    try:
+        return fit_mesh(read.vertices * unit, read.faces, spacing, origin)
+    except (ValueError, AttributeError) as error:
+        raise ValueError(f"file: {path.name}: {error}") from error
 
 
 def _heights(settings: ObjectSettings, path: Path) -> dict[str, Any]:
@@ -47,11 +85,12 @@ def _grid(path: Path) -> tuple[Array, float | None]:
     if kind not in HEIGHTS:
         raise ValueError(f"file: expected heights in a file of {', '.join(HEIGHTS)}, got {path.name}")
     try:
-        if kind == ".npz":
-            with np.load(path) as archive:
-                return _of_archive({name: archive[name] for name in archive.files}, path)
-        if kind == ".npy":
-            return np.asarray(np.load(path), dtype=np.float64), None
+        if kind in (".npy", ".npz"):
+            with path.open("rb") as opened:  # numpy leaves a file open that it cannot read
+                read = np.load(opened)
+                if isinstance(read, np.lib.npyio.NpzFile):
+                    return _of_archive({name: read[name] for name in read.files})
+                return np.asarray(read, dtype=np.float64), None
         text = path.read_text(encoding="utf-8-sig").splitlines()
         lines = [line.partition("#")[0].replace(";", ",").replace(",", " ").split() for line in text]
         return np.array([[float(word) for word in line] for line in lines if line]), None
@@ -61,7 +100,7 @@ def _grid(path: Path) -> tuple[Array, float | None]:
         raise ValueError(f"file: {path.name} is no grid of numbers: {error}") from error
 
 
-def _of_archive(arrays: dict[str, Any], path: Path) -> tuple[Array, float | None]:
+def _of_archive(arrays: dict[str, Any]) -> tuple[Array, float | None]:
     heights = arrays.get("heights", next(iter(arrays.values())) if len(arrays) == 1 else None)
     if heights is None:
         raise ValueError(f'expected an array "heights", got {", ".join(arrays) or "none"}')

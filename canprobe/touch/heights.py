@@ -31,6 +31,8 @@ _MARGIN_M = 1.5e-4
 _DEEPEST_M = 3e-4
 """Indentation up to which that window holds all that a ball presses on."""
 _BLOCK = 4
+_OVER_NODES_M = 5e-5
+"""How far the surface may rise between its nodes, on the safe side."""
 _NEWTON = 40
 _LAST_M = 1e-8
 """A Newton step after which the rest, its square over a radius of curvature, is below 1e-12 m."""
@@ -207,6 +209,9 @@ class Heights(PlacedShape):
             self._z[self._missing] = _NOWHERE_M
         starts = [np.arange(0, n, _BLOCK) for n in shape]
         self._tops = np.maximum.reduceat(np.maximum.reduceat(self._z, starts[0], axis=0), starts[1], axis=1)
+        lids = np.pad(self._tops, 1, mode="edge") + _OVER_NODES_M
+        lids = np.maximum(np.maximum(lids[:-2], lids[1:-1]), lids[2:])
+        self._lids = np.maximum(np.maximum(lids[:, :-2], lids[:, 1:-1]), lids[:, 2:])
         self._boxes = [
             (at[start], at[np.minimum(start + _BLOCK, len(at)) - 1])
             for at, start in zip((self._x, self._y), starts, strict=True)
@@ -325,17 +330,27 @@ class Heights(PlacedShape):
         return self._placed(feet[:, :3], feet[:, 3:6], feet[:, 6], feet[:, 7:9], np.zeros(len(feet)))
 
     def gaps(self, points_base: Array) -> Array:
-        """Distances of (n, 3) points to the tangent over or under them, (n,) m: first order near the surface."""
+        """Distances of (n, 3) points to the tangent over or under them, (n,) m: first order near the surface.
+
+        Of points higher than all of the surface near them it is only known that they do not touch; 1 m stands for that.
+        """
         x, y, z = self._to_object(points_base).T
-        gaps = np.ones(len(x))
-        inside = (x >= self._x[0]) & (x <= self._x[-1]) & (y >= self._y[0]) & (y <= self._y[-1])
+        gaps, near = np.ones(len(x)), self.exists(x, y)
+        i = ((x[near] - self._x[0]) * (1.0 / (_BLOCK * self._cell[0]))).astype(np.intp)
+        j = ((y[near] - self._y[0]) * (1.0 / (_BLOCK * self._cell[1]))).astype(np.intp)
+        near[near] = z[near] < self._lids[i, j]
+        height, along, across = self.spline.many(x[near], y[near])
+        gaps[near] = (z[near] - height) / np.sqrt(1.0 + along * along + across * across)
+        return gaps
+
+    def exists(self, x: Array, y: Array) -> npt.NDArray[np.bool_]:
+        """(k,) whether there is a surface over (k,) points x and y of the object's frame, m."""
+        inside: npt.NDArray[np.bool_] = (x >= self._x[0]) & (x <= self._x[-1]) & (y >= self._y[0]) & (y <= self._y[-1])
         if self._missing is not None:
             i = np.rint((x[inside] - self._x[0]) / self._cell[0]).astype(np.intp)
             j = np.rint((y[inside] - self._y[0]) / self._cell[1]).astype(np.intp)
             inside[inside] = ~self._missing[i, j]
-        height, along, across = self.spline.many(x[inside], y[inside])
-        gaps[inside] = (z[inside] - height) / np.sqrt(1.0 + along * along + across * across)
-        return gaps
+        return inside
 
     def squeezed(self, centre_base: Vec, radius: float) -> float:
         """Volume by which the layer of a ball is squeezed, m³; times its stiffness that is the force.

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from canprobe.touch.heights import Heights
+from canprobe.touch.mesh_fit import Mesh
 from canprobe.touch.shapes import (
     Bowl,
     Fillet,
@@ -228,6 +229,7 @@ _KINDS: Mapping[str, tuple[type[PlacedShape], tuple[str, ...]]] = MappingProxyTy
         "fillet": (Fillet, ("radius", "angle")),
         "quadric": (Quadric, ("matrix",)),
         "heights": (Heights, ("heights", "spacing", "origin")),
+        "mesh": (Mesh, ("vertices", "faces", "spacing", "origin")),
     }
 )
 

@@ -184,8 +184,10 @@ def test_the_image_has_u_to_the_right_and_v_upward():
 
 POSE = homogeneous(tangent_rotation(np.array([0.36, -0.48, 0.8])), np.array([-0.12, 0.1, 0.37]))
 HEIGHTS = -np.add.outer(np.linspace(-0.05, 0.05, 51) ** 2, 2 * np.linspace(-0.04, 0.04, 41) ** 2)
+BALL = meshes.revolved([(0.03 * math.sin(a), 0.03 * math.cos(a)) for a in np.linspace(math.pi, 0, 100)], 200)
 KINDS = {
     "heights": {"heights": HEIGHTS, "spacing": 2e-3, "origin": (0, 0)},
+    "mesh": {"vertices": BALL.vertices, "faces": BALL.faces, "spacing": 2e-3, "origin": (0, 0)},
     "plane": {},
     "sphere": {"radius": 0.03},
     "large sphere": {"radius": 0.5},

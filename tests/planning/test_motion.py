@@ -13,6 +13,7 @@ from canprobe.scene.geometry import true_object
 from canprobe.scene.load import load_scene, packaged_scenes
 from canprobe.scene.model import ObjectSettings
 from canprobe.scene.resolve import resolve
+from canprobe.touch.objects import make_object
 
 
 @pytest.fixture(scope="module")
@@ -165,3 +166,15 @@ def test_a_probe_that_would_be_in_the_object_before_its_approach_is_refused(cyli
     deep = 40.0 - 43.0 * math.cos(math.radians(25.0))
     assert f"the probe would be {deep:.1f} mm in the object before its approach, 25 deg beside it" in problem
     assert "first touch would be" in reasons(tilted(cylinder, 25.0, clearance_mm=6.0))[0]
+
+
+def test_the_path_over_heights_of_a_cylinder_is_that_over_the_cylinder():
+    """A ball rolls over heights, and its contacts lie where a path over the formula has them."""
+    setup = resolve(load_scene("cylinder"))
+    y = np.arange(-0.025, 0.0251, 5e-4)
+    z = np.tile(np.sqrt(0.036**2 - y**2) - 0.036, (161, 1))
+    shape = setup.truth.object
+    heights = make_object("heights", T_base_object=shape.T_base_object, heights=z, spacing=5e-4, origin=(0, 0))
+    exact, rolled = surface_path(setup.task, shape), surface_path(setup.task, heights)
+    assert np.linalg.norm(exact.points - rolled.points, axis=1).max() < 5e-4
+    assert np.sum(exact.normals * rolled.normals, axis=1).min() > math.cos(math.radians(1.0))

@@ -1,4 +1,4 @@
-"""Heights over a grid as one smooth surface: against the formulae that they were taken from, and against brute force."""
+"""Heights over a grid as one smooth surface: against the formulae that they are of, and against brute force."""
 
 import math
 
@@ -37,7 +37,7 @@ EXACT = {
 
 @pytest.mark.parametrize("kind", EXACT)
 def test_heights_of_a_formula_are_its_surface(kind):
-    """Every 0.5 mm: point within 5 µm, normal 0.5 mrad, curvature 1 %, as they are asked for; they are 100 times nearer."""
+    """Every 0.5 mm; a hundred times nearer than the 5 µm, 0.5 mrad and 1 % that are asked for."""
     params, z = EXACT[kind]
     exact, read = make_object(kind, T_base_object=POSE, **params), heights(z)
     for local in np.random.default_rng(1).uniform((-0.01, -0.01, 0.02), (0.01, 0.01, 0.03), (60, 3)):
@@ -84,7 +84,7 @@ def test_an_answer_does_not_depend_on_what_was_asked_before():
 def test_gaps_are_signed_distances_near_the_surface():
     shape = heights(rough())
     for local in np.random.default_rng(4).uniform((-0.01, -0.01, 0), (0.01, 0.01, 0), (20, 3)):
-        foot = shape.closest(POSE[:3, :3] @ (local + (0, 0, 1e-3)) + POSE[:3, 3])
+        foot = shape.closest(POSE[:3, :3] @ (local + np.array((0, 0, 1e-3))) + POSE[:3, 3])
         beside = np.array([foot.point + gap * foot.normal for gap in (-2e-6, 0.0, 2e-6)])
         assert shape.gaps(beside) == pytest.approx([-2e-6, 0.0, 2e-6], abs=1e-8)
     assert shape.gaps(POSE[:3, 3] + POSE[:3, 0][None]) > 0  # nothing is beside the grid

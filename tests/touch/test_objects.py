@@ -297,5 +297,5 @@ def test_a_pose_that_is_not_rigid_is_refused(bad):
 def test_every_kind_lists_its_parameters():
     assert OBJECT_PARAMETERS["cylinder"] == ("radius",)
     assert set(OBJECT_PARAMETERS) == {"plane", "sphere", "cylinder", "saddle", "bowl", "quadric"} | {
-        "ellipsoid", "torus", "wave", "fillet", "heights",
+        "ellipsoid", "torus", "wave", "fillet", "heights", "mesh",
     }  # fmt: skip

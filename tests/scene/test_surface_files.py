@@ -1,0 +1,137 @@
+"""Objects from files: what is read, what a run takes along, and what is said about files that hold no surface."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+
+import numpy as np
+import pytest
+
+import canprobe
+from canprobe.errors import PlanError, UsageError
+from canprobe.scene.geometry import true_object
+from canprobe.scene.load import load_scene, with_files_beside
+from canprobe.scene.model import ObjectSettings
+from canprobe.scene.resolve import resolve
+
+X, Y = np.meshgrid(np.arange(-20, 20.1), np.arange(-15, 15.1), indexing="ij")
+BUMP_MM = 1.5 * np.exp(-((X - 4) ** 2 + 2 * Y**2) / 200)
+
+
+def write(folder, name, z, **arrays):
+    path = folder / name
+    if name.endswith(".npy"):
+        np.save(path, z)
+    elif name.endswith(".npz"):
+        np.savez(path, heights=z, **arrays)
+    else:
+        np.savetxt(path, z, fmt="%.17g", delimiter="," if name.endswith(".csv") else " ", header="a bump, mm")
+    return str(path)
+
+
+def kappa_over(settings, x, y):
+    T = np.array(true_object(settings).T_base_object)
+    return true_object(settings).closest(T[:3, :3] @ (x, y, 0.02) + T[:3, 3]).kappa
+
+
+@pytest.mark.parametrize("name", ["bump.npy", "bump.npz", "bump.csv", "bump.txt"])
+def test_heights_of_every_kind_of_file_are_the_same_surface(name, tmp_path):
+    z = BUMP_MM / 25.4
+    file = write(tmp_path, name, z, spacing=1 / 25.4)
+    spacing = None if name.endswith("npz") else 1.0
+    settings = ObjectSettings("heights", file=file, unit_mm=25.4, spacing_mm=spacing, origin_mm=(24, 15))
+    middle = dataclasses.replace(settings, origin_mm=None)
+    assert kappa_over(settings, 0.0, 0.0) == pytest.approx((30.0, 15.0), rel=0.01)  # 1.5 · 4/200 and 1.5 · 2/200, 1/mm
+    assert kappa_over(middle, 0.004, 0.0) == pytest.approx(kappa_over(settings, 0.0, 0.0), rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("gone.npy", None, "gone.npy: cannot be read: No such file"),
+        ("bump.png", b"", "expected heights in a file of .npy, .npz, .csv, .txt, got bump.png"),
+        ("bump.csv", b"1, 2\n3, four\n", "bump.csv is no grid of numbers: could not convert string to float: 'four'"),
+        ("bump.csv", b"1, 2\n3\n", "no grid of numbers"),
+        ("bump.txt", b"", "grid of heights"),
+        ("bump.npy", b"\x93NUMPY", "bump.npy is no grid of numbers"),
+        ("bump.npz", b"PK\x03\x04", "bump.npz is no grid of numbers"),
+    ],
+)
+def test_a_file_without_a_surface_is_refused_with_its_reason(name, content, message, tmp_path):
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    settings = ObjectSettings("heights", file=str(tmp_path / name), spacing_mm=1.0)
+    scene = dataclasses.replace(load_scene("relief"), object=settings)
+    with pytest.raises(PlanError, match=message.replace("(", "\\(")):
+        resolve(scene)
+
+
+def test_a_grid_without_spacing_and_an_archive_without_heights(tmp_path):
+    settings = ObjectSettings("heights", file=write(tmp_path, "bump.npy", BUMP_MM))
+    with pytest.raises(ValueError, match="spacing_mm: missing"):
+        true_object(settings)
+    np.savez(tmp_path / "other.npz", a=BUMP_MM, b=BUMP_MM)
+    with pytest.raises(ValueError, match='expected an array "heights", got a, b'):
+        true_object(dataclasses.replace(settings, file=str(tmp_path / "other.npz")))
+
+
+def cap(folder, name, *, inside_out=False):
+    """A cap of a ball of 50 mm in metres, its top at x = 10 mm, y = 5 mm, as a file of facets."""
+    trimesh = pytest.importorskip("trimesh")
+    x, y = np.meshgrid(np.arange(-20, 20.1), np.arange(-15, 15.1), indexing="ij")
+    vertices = 1e-3 * np.column_stack([(x + 10).ravel(), (y + 5).ravel(), np.sqrt(2500 - x**2 - y**2).ravel()])
+    index = np.arange(x.size).reshape(x.shape)
+    a, b, c, d = (one.ravel() for one in (index[:-1, :-1], index[1:, :-1], index[:-1, 1:], index[1:, 1:]))
+    faces = np.concatenate((np.column_stack((a, b, d)), np.column_stack((a, d, c))))
+    mesh = trimesh.Trimesh(vertices, faces[:, ::-1] if inside_out else faces, process=False)
+    mesh.export(folder / name)
+    return ObjectSettings("mesh", file=str(folder / name), unit_mm=1000, spacing_mm=2, origin_mm=(10, 5))
+
+
+@pytest.mark.parametrize("name", ["cap.stl", "cap.obj", "cap.ply"])
+def test_a_mesh_is_read_in_its_unit_and_placed_by_its_origin(name, tmp_path):
+    settings = cap(tmp_path, name)
+    T = np.array(true_object(settings).T_base_object)
+    foot = true_object(settings).closest(T[:3, 3] + (0.01, 0.0, 0.02))
+    centre = T[:3, 3] + (0.0, 0.0, -0.05)
+    assert np.linalg.norm(foot.point - centre) == pytest.approx(0.05, abs=1e-7)
+    assert foot.kappa == pytest.approx((20.0, 20.0), rel=5e-3)
+
+
+def test_what_is_said_about_a_mesh_that_cannot_be_taken(tmp_path, monkeypatch):
+    inside_out = cap(tmp_path, "cap.stl", inside_out=True)
+    (tmp_path / "bad.stl").write_bytes(b"solid nothing")
+    for file, message in (
+        ("cap.stl", r"cap.stl: no facet of the mesh faces \+z"),
+        ("gone.stl", "gone.stl: cannot be read: No such file"),
+        ("cap.step", "expected a mesh in a file of .stl, .obj, .ply, got cap.step"),
+        ("bad.stl", "bad.stl"),
+    ):
+        scene = dataclasses.replace(
+            load_scene("relief"), object=dataclasses.replace(inside_out, file=str(tmp_path / file))
+        )
+        with pytest.raises(PlanError, match=message):
+            resolve(scene)
+    monkeypatch.setitem(sys.modules, "trimesh", None)
+    with pytest.raises(UsageError, match=r"a mesh needs trimesh: pip install .*\[mesh\]"):
+        true_object(dataclasses.replace(inside_out, spacing_mm=3.0))
+
+
+def test_a_saved_scene_takes_its_heights_along(tmp_path):
+    scene = load_scene("relief")
+    for name, content in with_files_beside(scene).items():
+        (tmp_path / name).write_bytes(content)
+    assert (tmp_path / "relief.npz").is_file()
+    there = load_scene(tmp_path / "scene.toml")
+    assert there.object.file == str(tmp_path / "relief.npz")
+    assert true_object(there.object).closest((-0.12, -0.12, 0.4)).point == pytest.approx(
+        true_object(scene.object).closest((-0.12, -0.12, 0.4)).point, abs=0.0
+    )
+
+
+def test_a_path_that_leaves_the_surface_is_refused():
+    scene = load_scene("relief")
+    long = dataclasses.replace(scene, task=dataclasses.replace(scene.task, length_mm=120.0))
+    with pytest.raises(PlanError, match="the path leaves the object"):
+        canprobe.plan(long)
