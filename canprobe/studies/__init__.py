@@ -8,7 +8,8 @@ function that draws them. `--quick` takes fewer cases and repeats. No other room
 on a cluster, keeps what is finished, and lists the studies.
 
 Estimators: `estimators` (error against run time), `bound` (error and coverage over the Cramér–Rao bound), `regions`
-(coverage with the whole sensor, packaged and random scenes), `arrays` (calibration of unseen arrays). Plant and loop:
+(coverage with the whole sensor, packaged and random scenes), `shapes` (whole surfaces beside those of other methods),
+`arrays` (calibration of unseen arrays). Plant and loop:
 `workprec`, `workprec_cell`, `stability` with `stability_runs`. Robustness: `faults` with `fault_scores`, `faults_vcan`.
 Real time: `realtime` with `realtime_cases`, `soak`.
 """

@@ -172,10 +172,14 @@ class Sweep:
         store: finished cells.
         say: called with each step.
         progress: called after each cell.
+
+    Attributes:
+        folder: of the store, for what a study publishes besides its table.
     """
 
     def __init__(self, executor: Opener, store: CellStore, *, say: Say, progress: Progress | None = None) -> None:
         self.say = say
+        self.folder = store.path.parent
         self._executor, self._store, self._progress = executor, store, progress
         if store.damaged:
             say(f"{store.path}: {store.damaged} damaged lines left out; their cells are computed again")
@@ -298,6 +302,7 @@ STUDIES: Mapping[str, str] = MappingProxyType(
         "bound": "error and coverage of the estimators over the Cramér–Rao bound: surfaces, sizes, paths and noise",
         "arrays": "how well forty touches calibrate an emulated array that nobody has seen",
         "regions": "whether the online estimator's 95 % regions hold the truth, over packaged and random scenes",
+        "shapes": "surfaces of unknown shapes by every estimator, by local fits and by Gaussian processes",
         "workprec": "error of the dynamic plant against its run time, and of the whole cell against its computing time",
         "stability": "where the force loop settles, predicted and carried out, and how every other touch ends",
         "realtime": "how well the cycle keeps time on a real vcan0, against plain canopen-python; needs that interface",
