@@ -1,4 +1,4 @@
-"""Learn how fast to go and how hard to press: a policy of seven numbers, by the cross-entropy method.
+"""Learn how fast to go and how hard to press: a policy of five numbers, by the cross-entropy method.
 
 The path is given: lanes over the region, for the policy and the baselines alike. Needs the extra `gym`; copy the file
 and go on from here. Run it with `python -m canprobe.examples.learn_touch_scan`.
@@ -19,14 +19,11 @@ Array = np.ndarray[Any, Any]
 
 LANES = [(11, 0), (11, 3), (-11, 3), (-11, 6), (11, 6), (11, -3), (-11, -3), (-11, 0), (-2, 0), (-11, -6), (11, -6)]
 """Corners of the path, mm along the heading and across it."""
-NAMES = [
-    *("speed", "slower by the error of the force", "slower by its spread", "slower by the turn of the normal"),
-    *("more force", "correct the force", "more force at speed"),
-]
+NAMES = ["speed", "slower by the error of the force", "slower by the turn", "correct the force", "more force at speed"]
 
 
 class Agent:
-    """Follows the lanes; `theta` (7,) says how fast and how hard, see `NAMES`."""
+    """Follows the lanes; `theta` (5,) says how fast and how hard, see `NAMES`."""
 
     def __init__(self, theta: Array, names: Sequence[str]) -> None:
         self.theta, self.at = theta, {name: i for i, name in enumerate(names)}
@@ -34,12 +31,12 @@ class Agent:
 
     def act(self, observation: Array) -> Array:
         """The action for an observation."""
-        place, normal, (wanted, force, spread) = (
+        place, normal, (wanted, force) = (
             np.array([observation[self.at[name]] for name in names])
             for names in (
                 ("along_mm", "across_mm"),
                 ("normal_along", "normal_across"),
-                ("wanted_force_n", "force_n", "force_spread_n"),
+                ("wanted_force_n", "force_n"),
             )
         )
         if np.hypot(*(LANES[self.corner] - place)) < 2.0 and self.corner < len(LANES) - 1:
@@ -47,16 +44,16 @@ class Agent:
         way = LANES[self.corner] - place
         turn = np.nan_to_num(np.hypot(*(normal - self.normal)))
         error = (force - wanted) / wanted
-        base, by_error, by_spread, by_turn, more, correct, at_speed = self.theta
-        speed = 1 / (1 + np.exp(-base + 10 * (by_error * abs(error) + by_spread * spread / wanted + by_turn * turn)))
-        press = 0.1 * more - 0.5 * correct * error + 0.1 * at_speed * speed
+        base, by_error, by_turn, correct, at_speed = self.theta
+        speed = 1 / (1 + np.exp(-base + 10 * by_error * abs(error) + 10 * by_turn * turn))
+        press = 0.1 * at_speed * speed - 0.5 * correct * error
         self.normal = normal
         return np.array([*(speed * way / np.hypot(*way)), press], dtype=np.float32)
 
 
 def fixed(speed: float) -> Array:
     """The policy that keeps to a speed, as a share of the highest, and to the wanted force."""
-    return np.array([np.log(speed / (1 - speed)), 0, 0, 0, 0, 0, 0])
+    return np.array([np.log(speed / (1 - speed)), 0, 0, 0, 0])
 
 
 # %% Episodes, on every processor
@@ -85,11 +82,11 @@ def returns(pool: Any, thetas: Sequence[Array] | Array, seeds: Sequence[int], ob
 
 # %% Learn it, and compare it with the wanted force at fixed speeds
 def learn(pool: Any, seed: int, generations: int, population: int, episodes: int) -> Array:
-    """The mean of the last elite (7,)."""
+    """The mean of the last elite (5,)."""
     rng = np.random.default_rng(seed)
-    mean, sigma = fixed(0.7), np.ones(7)
+    mean, sigma = fixed(0.6), np.ones(5)
     for generation in range(generations):
-        thetas = mean + sigma * rng.standard_normal((population, 7))
+        thetas = mean + sigma * rng.standard_normal((population, 5))
         scores = returns(pool, thetas, rng.integers(2**31, size=episodes).tolist(), "train").mean(axis=1)
         elite = thetas[np.argsort(scores)[-max(2, population // 3) :]]
         mean, sigma = elite.mean(axis=0), 0.8 * elite.std(axis=0) + 0.2 * sigma
@@ -100,7 +97,7 @@ def learn(pool: Any, seed: int, generations: int, population: int, episodes: int
 def main(arguments: Sequence[str] | None = None) -> None:
     """Train from several seeds, and test on episodes that no training has seen."""
     parser = argparse.ArgumentParser(description="Learn how fast to go and how hard to press.")
-    for name, default in {"seeds": 5, "generations": 4, "population": 10, "episodes": 3, "test": 10}.items():
+    for name, default in {"seeds": 5, "generations": 3, "population": 8, "episodes": 3, "test": 6}.items():
         parser.add_argument(f"--{name}", type=int, default=default, help="[%(default)s]")
     args = parser.parse_args(arguments)
     with Pool(2, open_environment) as pool:

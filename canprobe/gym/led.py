@@ -64,9 +64,9 @@ class LedTask(TouchTask):
         self.start: Vector = np.asarray(task.approach.start, dtype=float)
         self.wanted_force = task.force
         self.top_speed = task.scan.speed
-        self.velocity = np.zeros(2)
+        self.velocity = 0.0, 0.0
         self._heading = _Heading()
-        self._change: Vector = np.zeros(3)
+        self._change = 0.0, 0.0, 0.0
         self._left = 0
         self._speed = 0.0
         self._newest: ContactSample | None = None
@@ -116,8 +116,9 @@ class LedTask(TouchTask):
 
     def lead(self, velocity: Vector, force: float, cycles: int) -> None:
         """Go over to a velocity of the contact (2,), m/s, and a force, N, evenly within so many cycles."""
-        wanted, now = np.array((*velocity, force)), np.array((*self.velocity, self._target_force))
-        self._change, self._left = (wanted - now) / cycles, cycles
+        vx, vy = self.velocity
+        dx, dy, more = float(velocity[0]) - vx, float(velocity[1]) - vy, force - self._target_force
+        self._change, self._left = (dx / cycles, dy / cycles, more / cycles), cycles
 
     def _feel(self, sample: TactileSample, patch: Patch) -> None:
         super()._feel(sample, patch)
@@ -128,15 +129,18 @@ class LedTask(TouchTask):
 
     def _scan(self) -> ProbePose:
         assert self._servo is not None
+        vx, vy = self.velocity
         if self._left:
             self._left -= 1
-            self.velocity = self.velocity + self._change[:2]
-            self._target_force += float(self._change[2])
-        self._speed = math.hypot(*self.velocity)
+            dx, dy, more = self._change
+            self.velocity = vx, vy = vx + dx, vy + dy
+            self._target_force += more
+        self._speed = math.hypot(vx, vy)
         if self._speed > 0.0:
-            x, y, _ = self.frame(self._servo.surface.normal)
-            way = self.velocity[0] * x + self.velocity[1] * y
-            along, across = float(way @ self.axes[0]), float(way @ self.axes[1])
+            # x = (h − (n·h) n)/s with s its length and y = n × x, seen from above the scan plane of h, c = u × h and u
+            nh, nc, nu = (self.axes @ self._servo.surface.normal).tolist()
+            s = math.sqrt(1.0 - nh * nh)
+            along, across = vx * s, (vy * nu - vx * nh * nc) / s
             in_plane = math.hypot(along, across)
             self._heading.direction = (along / in_plane, across / in_plane)
         return super()._scan()

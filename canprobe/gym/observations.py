@@ -170,7 +170,7 @@ class Observations:
             float(np.mean(forces)),
             float(np.std(forces)),
             *(1e3 * uv for uv in task.pad_uv),
-            *(1e3 * task.velocity).tolist(),
+            *(1e3 * v for v in task.velocity),
             *(1e3 * along, 1e3 * across, 1e3 * up),
             *(task.axes[:2] @ contact.n_base).tolist(),
             coverage.share,
