@@ -74,16 +74,17 @@ def run(
     observers: Sequence[AnyObserver] = (),
     bridge: Sequence[str] = (),
 ) -> RunResult:
-    """Carry out a scene's task and write what was measured.
+    """Run a scene's task and write what was measured.
 
     Args:
         scene: a packaged name, the path of a TOML file, or what `canprobe.load_scene` returns.
         overrides: values in the place of the scene's, such as ``{"task.force_n": 3}``; see `canprobe.load_scene`.
         bus: ``lockstep``, ``direct`` (no bus), ``socketcan`` or another interface, in the place of the scene's.
-        bitrate: in the place of the scene's, bit/s.
         channel: in the place of the scene's; ``{"can0": "vcan0", "can1": "vcan1"}`` where it names several.
+        bitrate: in the place of the scene's, bit/s.
         out: folder for the files; ``runs/<scene>-<time>`` by default.
-        seed, duration_s: in the place of the scene's.
+        seed: of the emulation, in the place of the scene's.
+        duration_s: of the task, in the place of the scene's, s.
         progress: called with (seconds done, seconds in all).
         say: called with each step of bring-up and stop.
         files: False writes nothing.
@@ -91,8 +92,13 @@ def run(
         observers: called after each cycle with its measurement, command and frames (`Observation`).
         bridge: names of bridges to other tools, besides those of the scene; see `canprobe.planning.bridges`.
 
+    Returns:
+        The finished run.
+
     Raises:
-        UsageError: the scene does not fit; nothing was started.
+        SceneError: the scene has mistakes; nothing was started.
+        PlanError: the scene does not fit; nothing was started.
+        UsageError: an argument is wrong, or ``out`` is not empty; nothing was started.
         BusError: an interface or a node failed. The drives are disabled and the files written, unless no bus opened.
         SafetyStop: the cell was stopped for safety. The drives are disabled and the files written.
         ResultsError: a file could not be written, for example on a full disk. The drives are disabled.
@@ -123,8 +129,12 @@ def plan(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = None) 
     Args:
         scene, overrides: as for :func:`run`.
 
+    Returns:
+        The plan.
+
     Raises:
-        UsageError: there is no such scene, or it has mistakes.
+        UsageError: there is no such scene.
+        SceneError: the scene has mistakes.
         PlanError: with every reason why it does not fit, its numbers and the ways out.
     """
     return make_plan(resolve(load_scene(scene, overrides)))
@@ -370,17 +380,18 @@ def open_cell(
         say: called with each step.
         force, observers, bridge: as for `run`.
         rows_kept: cycles whose row of the log is kept; all by default, which grows by about 1 KiB a cycle. With a
-            number nothing is kept of the truth, and the scan is not scored.
+            number the truth is not kept, and the scan is not scored.
+
+    Returns:
+        The cell; ``with`` brings it up.
 
     Raises:
-        UsageError: the scene does not fit, or ``out`` is not empty; nothing was started.
-
-    Entering the block raises:
-        BusError: an interface or a node failed.
-        SafetyStop: the probe is pressed on.
-
-    Leaving it raises:
-        ResultsError: a file could not be written.
+        SceneError: the scene has mistakes; nothing was started.
+        PlanError: the scene does not fit; nothing was started.
+        UsageError: an argument is wrong, or ``out`` is not empty; nothing was started.
+        BusError: when the block is entered: an interface or a node failed.
+        SafetyStop: when the block is entered: the probe is pressed.
+        ResultsError: when the block is left: a file could not be written.
     """
     scene = load_scene(scene, _over(overrides, {"scene.seed": seed}))
     resolved = with_bridges(Target.over(scene, bus, channel, bitrate).applied_to(scene), bridge)

@@ -11,7 +11,7 @@ CanprobeError
 ├── StudyError           3  a study's worker, cell or files failed
 ├── ResultsError         3  a file that cannot be written: no room on the disk, say
 ├── SafetyStop           1  the cell was stopped for safety; the drives are disabled
-└── ProtocolError        3  bytes on the bus that mean nothing where they stand
+└── ProtocolError        3  bytes on the bus that cannot be decoded
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class CanprobeError(Exception):
     """Base of every error that canprobe raises on purpose.
 
     Attributes:
-        summary: of the run that it ended, as in ``summary.json``; None where nothing had been brought up.
+        summary: of the run that the error ended, as in ``summary.json``; None where nothing had been brought up.
     """
 
     exit_status = 3
@@ -91,15 +91,15 @@ class NodeError(BusError):
 
 
 class StudyError(CanprobeError):
-    """A cell of a study, a worker, or the files that it keeps failed."""
+    """A case of a study, a worker process, or the files that a study keeps failed."""
 
 
 class ProtocolError(BusError):
-    """Bytes that do not decode to what they must be where they stand."""
+    """Bytes on the bus that cannot be decoded as what their identifier means."""
 
 
 class ResultsError(CanprobeError):
-    """A file cannot be written, for want of room say; where a cell was running, its drives are disabled."""
+    """A file cannot be written, for example on a full disk; the drives of a running cell are disabled."""
 
 
 class SafetyStop(CanprobeError):  # noqa: N818 - it is a stop, not a mistake

@@ -11,6 +11,8 @@ import pytest
 from command_lines import command_lines, parse
 from undrawn import undrawn_run
 
+import canprobe.errors
+import canprobe.tasks
 from canprobe.cli import COMMANDS, main
 from canprobe.eds.packaged import eds_path
 from canprobe.planning.bridges import BRIDGES
@@ -115,6 +117,14 @@ def test_links_pictures_and_names_of_commands(page):
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", TEXTS[page]):
         assert ((ROOT / page).parent / target).is_file(), target
     assert set(re.findall(r"`canprobe (\w+)", TEXTS[page])) <= set(COMMANDS)
+
+
+def test_the_api_reference_has_every_public_name():
+    rendered = set(re.findall(r"^::: ([\w.]+)$", TEXTS["docs/api.md"], re.M))
+    errors = {name for name, kind in vars(canprobe.errors).items() if isinstance(kind, type)}
+    public = set(canprobe.__all__) - errors - {"__version__"}
+    modules = {"canprobe.errors", *(f"canprobe.tasks.{name}" for name in canprobe.tasks.__all__)}
+    assert rendered >= {*modules, *(f"canprobe.{name}" for name in public)}
 
 
 def test_the_readme_stays_short():

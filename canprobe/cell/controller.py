@@ -1,4 +1,4 @@
-"""What a controller sees and says in one cycle."""
+"""What a controller gets and returns in one cycle."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Measurement:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """What a controller wants in this cycle.
+    """What a controller returns for one cycle.
 
     Attributes:
         q_target: joint positions to reach two cycles later (n,), rad or m; None leaves the drives where they are.
@@ -85,32 +85,52 @@ class Command:
 
 
 class Controller:
-    """Base of everything that a cell can run: `step` decides a cycle, the rest does nothing unless it is overridden.
+    """Base of everything that a cell can run: `step` decides a cycle, the other methods do nothing by default.
 
     Attributes:
-        lets_go: it guards its contact itself, and takes the probe off the object when `retreat` asks for that. Without,
-            the cell does both.
+        lets_go: True: the controller supervises its contact and takes the probe off the object when `retreat` is
+            called. False, the default: the cell does both.
     """
 
     lets_go: bool = False
 
     def step(self, measurement: Measurement) -> Command:
-        """Decide one cycle."""
+        """Decide one cycle. Called when its TPDOs are in; the command is sent at once.
+
+        Args:
+            measurement: the state of the cell at the SYNC of this cycle.
+
+        Returns:
+            The joint targets of this cycle, or the end of the run.
+        """
         raise NotImplementedError(f"{type(self).__name__} has no step(measurement)")
 
     def inspect(self, q: Vector) -> str | None:
-        """Why the drives must not be enabled where the joints are, q (n,) rad; None: they may."""
+        """Check the joint positions before the drives are enabled.
+
+        Args:
+            q: (n,) positions, rad or m.
+
+        Returns:
+            Why the drives must not be enabled here; None where they may.
+        """
         return None
 
     def update(self) -> None:
-        """Work that the next step needs and this cycle's commands need not wait for; called when they are out."""
+        """Do work that the next step needs. Called once a cycle, after the commands of the cycle were sent."""
 
     def retreat(self, reason: str) -> None:
-        """Let go, and end with this reason; asked of controllers with `lets_go` where there is time for it."""
+        """Take the probe off the object in the next steps, then end with this reason.
+
+        Called once, and only where `lets_go` is True and the condition leaves time for it.
+
+        Args:
+            reason: for `Command.stop_reason`.
+        """
 
     @property
     def restarts(self) -> int:
-        """How often its estimator diverged and started afresh."""
+        """How often the estimator of this controller diverged and started again."""
         return 0
 
 

@@ -45,13 +45,13 @@ class TouchScan(gymnasium.Env[Any, NDArray[np.float32]]):
     """Lead the probe over an unknown surface, and touch as much of it as possible with the wanted force.
 
     Action (3,), each in [−1, 1]: velocity of the contact along x and y of the contact frame, in shares of
-    `task.speed_mm_s` (together at most 1), and force set-point, `task.force_n` × (1 + action/2). The cell goes over to
-    it evenly within the step. x is the heading of the scan laid into the tangent plane, z the outward normal.
+    `task.speed_mm_s` (together at most 1), and force set-point, `task.force_n` × (1 + action/2). The cell changes to
+    these values evenly within the step. x is the heading of the scan laid into the tangent plane, z the outward normal.
 
     Reward of a step: area of the region that was touched for the first time, in mm², times exp(−½ (ΔF/σ)²) with ΔF
     the error of the true force at the end of the step and σ 5 % of the wanted force. The region is `task.length_mm` ×
     `task.width_mm` round the first contact; what is within 1.5 mm of the contact counts as touched. Where the
-    supervision ends the episode 20 are taken off. The return of an episode is the area that was touched well, in mm².
+    supervision ends the episode, 20 mm² are subtracted. The return of an episode is the area that was touched well.
 
     Args:
         scene: of a scan: a packaged name, a path or a `Scene`; None for `cylinder` with `DEFAULT_SCENE`.

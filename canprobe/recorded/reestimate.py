@@ -240,9 +240,12 @@ def replay(
         scene: describes nodes and estimators; by default the ``scene.toml`` beside the log.
         method: the estimators, one or several; by default the scene's.
 
+    Returns:
+        The estimates, and a summary.
+
     Raises:
-        UsageError: no log or scene, an unknown method, a line that is not candump's, a node without any TPDO, no SYNC,
-            or no contact.
+        UsageError: no log or scene, an unknown method, a line that is not in candump format, a node without any TPDO,
+            no SYNC, or no contact.
     """
     path, folder = find_log(Path(log))
     plan = make_plan(resolve(scene_of(path, folder, scene)))

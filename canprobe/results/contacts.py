@@ -28,19 +28,19 @@ ASKED_EVERY_S = 0.1
 class Contacts:
     """What the master measured of the contact during a scan, one row a tactile frame; base frame, SI.
 
-    The errors of a point and its normal are one where both come from one centroid: an error e of the point along the
-    surface comes with one of −e · coupling of the normal. With that, `canprobe.fit_surface` takes them as
+    Point and normal of a contact come from one centroid, so their errors are coupled: an error e of the point along
+    the surface comes with an error of −e · coupling of the normal. With that, `canprobe.fit_surface` takes them as
     ``fit_surface(c.points, c.normals, sigma_point=c.covariances, sigma_normal=c.sigma_normal, coupling=c.coupling)``.
 
     Attributes:
-        t_s: instants (n,), s, on the clock of the log.
-        points: contact points on the object (n, 3), m.
-        normals: outward unit normals of the object there (n, 3).
-        forces: (n,), N.
-        covariances: of the points (n, 3, 3), m².
-        normal_covariances: of the normals (n, 3, 3), what comes with the error of the point included.
-        sigma_normal: standard deviation of a normal apart from that, rad.
-        coupling: 1/m.
+        t_s: (n,) instants, s, on the clock of the log.
+        points: (n, 3) contact points on the object, m.
+        normals: (n, 3) outward unit normals of the object there.
+        forces: (n,) contact forces, N.
+        covariances: (n, 3, 3) of the points, m².
+        normal_covariances: (n, 3, 3) of the normals, rad²; the part that is coupled to the point is included.
+        sigma_normal: standard deviation of a normal per tangent axis without the coupled part, rad.
+        coupling: 1/m; 0 where the errors are independent.
         samples: as the estimators took them, with times since the first SYNC, s.
     """
 

@@ -67,6 +67,12 @@ def to_frame(columns: Mapping[str, NDArray[Any]], attrs: Mapping[str, Any] | Non
 def load_table(path: Path | str) -> pandas.DataFrame:
     """A table from a `.npz` of a run (`log.npz`, `truth.npz`) or from Parquet.
 
+    Args:
+        path: of the file; the suffix `.npz` names the first kind.
+
+    Returns:
+        The frame, by `t_s` where there is one; vectors are spread over columns, and `attrs["units"]` has every unit.
+
     Raises:
         UsageError: no such file, another kind of file, or the extra is missing.
     """
@@ -183,6 +189,9 @@ def load_surface_map(path: str | PathLike[str]) -> SurfaceMap:
 
     Args:
         path: of the file, or of the folder of a run.
+
+    Returns:
+        The map.
 
     Raises:
         UsageError: no such file, not a surface map, another version, or a column that is missing, unknown or wrong;

@@ -140,9 +140,12 @@ def load_scene(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = 
             checked as those of a file are. None takes a key away, so that its default holds; a table takes the place
             of a whole section; `{"cell": "puma560"}` names another cell.
 
+    Returns:
+        The scene, checked; its attributes are the sections and keys of a scene file.
+
     Raises:
         SceneError: with every problem found, each with file, key path, what was expected and what was got.
-        UsageError: this is no scene, or these are no overrides.
+        UsageError: there is no such scene, or `overrides` is not a mapping.
     """
     if isinstance(scene, Scene):
         if not overrides:

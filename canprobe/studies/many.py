@@ -114,15 +114,18 @@ def run_many(
         seeds: how many, from 0 on, or which; the scene's by default.
         bus: ``direct`` or ``lockstep``; the scene's by default. Where the wire is of no interest, ``direct`` gives the
             results of a lockstep bus without delays, several times as fast.
-        duration_s: in the place of the scene's.
+        duration_s: in the place of the scene's, s.
         workers: number of processes, one for each core by default; or the address of a Dask scheduler, such as
             ``tcp://10.0.0.1:8786``, whose workers have the same canprobe.
         out: folder of the finished runs; ``runs/many-<scene>`` by default.
         fresh: forget what is in ``out``.
         series: columns of the log to keep over time for `Runs.to_xarray`; ``truth.force`` is one of the truth.
-        every_ms: time between two of their values.
+        every_ms: time between two of their values, ms.
         progress: show a bar on a terminal or in a notebook.
         say: called with each step.
+
+    Returns:
+        All runs, those that were finished before included.
 
     Raises:
         UsageError: a combination has mistakes, or the bus is a real one; nothing was started.

@@ -27,10 +27,10 @@ class Trajectory(Controller):
     """Leads the joints from where they stand through points, and holds the last one.
 
     Between two points each joint follows a cubic in time. Without velocities of the points it passes each as a monotone
-    cubic does (Fritsch and Butland): it never leaves the range of the two points, and stands still in an extreme one.
-    Speeds are continuous, accelerations are not. It starts and ends at rest. What leaves the range of a joint, the
-    workspace, or is faster than `limits.joint_speed_share` of a joint's speed is refused before anything moves; the
-    drives' own lag and torque are not considered. A trajectory is followed once.
+    cubic does (Fritsch and Butland): it stays between the two points, and has speed 0 in a point that is an extreme.
+    Speeds are continuous, accelerations are not. The motion starts and ends at rest. A motion that leaves the range of
+    a joint or the workspace, or is faster than `limits.joint_speed_share` of a joint's speed, is refused before the
+    drives are enabled. Lag and torque of the drives are not considered. A trajectory is followed once.
 
     Args:
         plan: of a cell with an arm.
@@ -69,11 +69,11 @@ class Trajectory(Controller):
 
     @property
     def duration_s(self) -> float:
-        """Time of the last point."""
+        """Time of the last point, s from the start."""
         return float(self._times[-1])
 
     def inspect(self, q: Vector) -> str | None:
-        """Why the way from where the joints are, q (n,) rad or m, must not be gone; None: it may."""
+        """Why the motion from the joint positions q (n,), rad or m, is refused; None where it is allowed."""
         if self._times[0] == 0.0:
             away = np.abs(self._q[0] - q) / self._model.radian
             if away.max() > NEAR_RAD:
@@ -86,11 +86,11 @@ class Trajectory(Controller):
         return None if reason is None else f"trajectory: {reason}"
 
     def lead(self, q: Vector, qd: Vector | None = None) -> None:
-        """Begin the way where the joints are, without a check.
+        """Start the motion at the joint positions q, without a check.
 
         Args:
             q: (n,) rad or m.
-            qd: (n,) speed there, rad/s or m/s; at rest by default.
+            qd: (n,) speeds there, rad/s or m/s; 0 by default.
         """
         if self._times[0] == 0.0:
             self._q[0] = q
@@ -114,7 +114,7 @@ class Trajectory(Controller):
         return way
 
     def at(self, t_s: float) -> Vector:
-        """Joint positions (n,), rad or m, at a time from the start; of the last point after it."""
+        """Joint positions (n,), rad or m, at a time from the start, s; after the last point those at it."""
         t = min(max(t_s, 0.0), self.duration_s)
         k = min(int(np.searchsorted(self._times, t, side="right")) - 1, len(self._times) - 2)
         h = self._times[k + 1] - self._times[k]

@@ -52,7 +52,7 @@ class ContactSample:
         doubts: about the image; estimators give the contact less weight and say so.
         sigma_motion: standard deviation of the point from an instant that is not known well while the probe moves, m;
             it comes on top of that of the point.
-        slope: of the touch that it belongs to; None where it was not felt.
+        slope: of √F over the indentation in its touch; None where it was not measured.
     """
 
     t_s: float

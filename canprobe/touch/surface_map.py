@@ -39,14 +39,14 @@ _Q_TO_C = UNIT[:, None]
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class LocalPatch:
-    """A quadric that describes the surface round one contact.
+    """A quadric that describes the surface near one contact.
 
     Attributes:
         T_base_contact: (4, 4) contact frame to base, m; z is the inward normal.
         S: (4, 4) in the contact frame, c14 = c24 = c44 = 0, c34 = −½; unobserved combinations nearest to flat.
         K_covariance: (3, 3) of (K11, K12, K22), 1/m²; NaN or infinite where not observed, as in `SurfaceEstimate`.
         S_covariance: (9, 9) of (c14, c24, c44, c13, c23, c33, c11, c12, c22), SI units, always finite: a combination
-            that the data did not observe stands in it with `WIDE`, whatever a prior said of it. c44 is the height,
+            that the data did not observe has the variance of `WIDE` there, whatever the prior. c44 is the height,
             2 c14 and 2 c24 are the tilt.
         pose_known: the part of `S_covariance` about height and tilt is the estimator's; False from methods that do
             not know it, which leave zeros there.
@@ -167,7 +167,7 @@ LEAST_RANK = 1
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class SurfaceMap:
-    """Local patches in the order in which they were felt, and the path of the contact.
+    """Local patches in the order in which they were measured, and the path of the contact.
 
     Attributes:
         patches: each with its frame, matrix and covariance, by increasing `travelled_m`.
@@ -213,10 +213,16 @@ class SurfaceMap:
         return max((patch.distance_m for patch in self.patches), default=0.0)
 
     def closest(self, points: ArrayLike, *, reach: float = REACH_M) -> Feet:
-        """Closest points of the map's surface, its normals and its uncertainty, to points (n, 3), base frame, m.
+        """The points of the map's surface that are closest to given points, with normals and uncertainty.
 
-        The surface is one: the blend of the patches (`touch/blend.py`), continuous where they overlap. A patch no
-        longer counts at a distance of `reach` (m) from its contact; where none is in reach the answer is NaN.
+        The surface is one: the blend of the patches (`touch/blend.py`), continuous where they overlap.
+
+        Args:
+            points: (n, 3) base frame, m.
+            reach: distance from a contact at which its patch no longer counts, m.
+
+        Returns:
+            One row a point; NaN where no patch is in reach.
 
         Raises:
             UsageError: not finite points (n, 3), or no positive reach.
@@ -224,21 +230,30 @@ class SurfaceMap:
         return feet_on(self._quadrics(), checked("points", points, (None, 3)), positive("reach", reach))
 
     def distance(self, points: ArrayLike, *, reach: float = REACH_M) -> tuple[Array, Array]:
-        """Signed distances of points (n, 3) from the map's surface, positive outside, and their standard deviations.
+        """Signed distances of points from the map's surface, positive outside, and their standard deviations.
+
+        Args:
+            points, reach: as for `closest`.
 
         Returns:
             Two arrays (n,), m; NaN where no patch is in reach, and σ also where no patch in reach knows its height.
+
+        Raises:
+            UsageError: as for `closest`.
         """
         feet = self.closest(points, reach=reach)
         return feet.height, feet.sigma
 
     def mesh(self, *, cell: float = CELL_M, reach: float = REACH_M) -> Mesh:
-        """The map's surface as triangles with its σ at every vertex; its rim is up to two cells within the reach.
+        """The map's surface as triangles with its σ at every vertex; it ends up to two cells inside the reach.
 
         Args:
             cell: side of a cell of the lattice in the base frame, about an edge of a triangle, m. The vertices lie
                 on the surface whatever it is; time grows with 1/cell².
             reach: distance from a contact at which its patch no longer counts, m.
+
+        Raises:
+            UsageError: `cell` or `reach` is not positive, or `cell` is too small for the size of the coordinates.
         """
         patches, limit = self._quadrics(), positive("reach", reach)
         return mesh_of(lambda points: feet_on(patches, points, limit), self.points, positive("cell", cell))
