@@ -10,6 +10,7 @@ from gymnasium.utils.env_checker import check_env
 
 import canprobe.gym
 from canprobe.errors import SceneError, UsageError
+from canprobe.examples import learn_touch_scan
 from canprobe.gym.observations import BRUSH, SIGHT, Coverage
 from canprobe.protocol.cia402 import DriveState
 from canprobe.results.files import load_table
@@ -170,6 +171,12 @@ def test_an_episode_can_be_recorded(make, tmp_path):
     log = load_table(tmp_path / "episode-0001" / "log.npz")
     assert (log.phase == 3).sum() == 5 * 16 + 1
     assert (tmp_path / "episode-0001" / "summary.json").is_file()
+
+
+def test_the_agent_of_the_example_scans_its_lanes():
+    learn_touch_scan.open_environment()
+    assert 60 < learn_touch_scan.episode_return((learn_touch_scan.fixed(0.4), 2, "train")) < 24 * 16
+    learn_touch_scan.env.close()
 
 
 @pytest.mark.parametrize(
