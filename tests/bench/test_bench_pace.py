@@ -21,8 +21,8 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 REFERENCE = "c54f9ca"
-TURNS = int(os.environ.get("CANPROBE_TURNS", "7"))
-DURATION_S, PERIOD_US = 10.0, 2500.0
+TURNS = int(os.environ.get("CANPROBE_TURNS", "5"))
+DURATION_S, PERIOD_US = 8.0, 2500.0
 CHILD = """
 import json, sys, tempfile
 from time import perf_counter, process_time
@@ -74,6 +74,7 @@ def reference(tmp_path):
     return tmp_path
 
 
+@pytest.mark.timeout(0)
 def test_bench_pace(benchmark, reference):
     cores = len(os.sched_getaffinity(0))
     cases = {"reference": (reference, "lockstep"), "lockstep": (ROOT, "lockstep"), "direct": (ROOT, "direct")}
@@ -92,7 +93,7 @@ def test_bench_pace(benchmark, reference):
 
     cost = {name: median(turn[name]["us"] for turn in turns) for name in cases}
     after = {name: median(turn[name]["after_s"] for turn in turns) for name in cases}
-    print(f"\n{date.today()}, {machine()}; medians of {TURNS} turns of {DURATION_S:g} s of scan\n")
+    print(f"\n{date.today()}, {machine()}; medians of {TURNS} turns, {DURATION_S:g} s of scan each\n")
     rows = [
         ("", "measured", "goal"),
         ("---", "---", "---"),
