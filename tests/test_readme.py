@@ -114,7 +114,7 @@ def test_paths_and_programs_of_a_shell_block_exist(block):
 
 @pytest.mark.parametrize("page", TEXTS)
 def test_links_pictures_and_names_of_commands(page):
-    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", TEXTS[page]):
+    for target in re.findall(r"\]\((?!https://)([^)#]+)[^)]*\)", TEXTS[page]):
         assert ((ROOT / page).parent / target).is_file(), target
     assert set(re.findall(r"`canprobe (\w+)", TEXTS[page])) <= set(COMMANDS)
 
@@ -129,3 +129,12 @@ def test_the_api_reference_has_every_public_name():
 
 def test_the_readme_stays_short():
     assert TEXTS["README.md"].count("\n") <= 180
+
+
+def test_messages_on_the_page_of_troubles_are_those_of_the_code():
+    source = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "canprobe").rglob("*.py"))
+    source = re.sub(r'"\s*\n\s*f?"', "", source)  # a string in several parts
+    rows = re.findall(r"^\| (.*?) \|", TEXTS["docs/troubleshooting.md"], re.M)
+    for message in [text for row in rows for text in re.findall(r"`([^`]+)`", row)]:
+        for part in filter(None, (part.strip() for part in message.split("…"))):
+            assert part in source, message

@@ -51,7 +51,7 @@ class TouchScan(gymnasium.Env[Any, NDArray[np.float32]]):
     Reward of a step: area of the region that was touched for the first time, in mm², times exp(−½ (ΔF/σ)²) with ΔF
     the error of the true force at the end of the step and σ 5 % of the wanted force. The region is `task.length_mm` ×
     `task.width_mm` round the first contact; what is within 1.5 mm of the contact counts as touched. Where the
-    supervision ends the episode, 20 mm² are subtracted. The return of an episode is the area that was touched well.
+    supervision ends the episode, 20 mm² are subtracted. The return of an episode, in mm², is the area touched well.
 
     Args:
         scene: of a scan: a packaged name, a path or a `Scene`; None for `cylinder` with `DEFAULT_SCENE`.
