@@ -156,6 +156,8 @@ def measure(case: Case) -> dict[str, Any]:
     assert scene.shape is not None
     scene = replace(
         scene,
+        scene=replace(scene.scene, seed=case.seed),
+        task=replace(scene.task, duration_s=case.duration_s),
         shape=replace(scene.shape, method=case.method),  # type: ignore[arg-type]
         plant=replace(
             scene.plant or PlantSettings(),
@@ -166,7 +168,7 @@ def measure(case: Case) -> dict[str, Any]:
     spent: list[float] = []
     try:
         result = run_scene(
-            scene, files=False, seed=case.seed, duration_s=case.duration_s,
+            scene, files=False,
             observers=[lambda seen: spent.append(process_time()) if seen.measurement is not None else None],
         )  # fmt: skip
     except SafetyStop as stop:

@@ -215,11 +215,12 @@ def test_every_kind_of_object_has_a_ghost_here():
 def test_ghosts_lie_on_the_exact_surface_with_their_front_outside(name):
     shape = make_object(name.split()[-1], T_base_object=POSE, **KINDS[name])
     mesh = objects.object_mesh(shape)
-    feet = [shape.closest(vertex) for vertex in mesh.vertices]
+    some = 9 if name in ("heights", "mesh") else 1  # whose feet take longer
+    feet = [shape.closest(vertex) for vertex in mesh.vertices[::some]]
     assert max(abs(foot.distance) for foot in feet) < 1e-9
     flat = np.linalg.norm(normals(mesh), axis=1) < 1e-12
-    outward = np.array([shape.closest(p).normal for p in face_middles(mesh)[~flat]])
-    n = normals(mesh)[~flat]
+    outward = np.array([shape.closest(p).normal for p in face_middles(mesh)[~flat][::some]])
+    n = normals(mesh)[~flat][::some]
     assert np.einsum("ij,ij->i", n / np.linalg.norm(n, axis=1, keepdims=True), outward).min() > 0.9
     assert np.linalg.norm(mesh.vertices - POSE[:3, 3], axis=1).min() < 0.006  # it is there where it is touched
     lines = objects.object_lines(shape)

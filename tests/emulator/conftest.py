@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -188,8 +188,8 @@ class FakePlant:
     def state(self) -> int:
         return self.t_ns
 
-    def truth(self, state: int) -> dict[str, object]:
-        return {"q": np.full(6, state * 1e-9), "force": 2.0}
+    def truths(self, states: Sequence[int]) -> dict[str, np.ndarray]:
+        return {"q": np.outer(states, np.full(6, 1e-9)), "force": np.full(len(states), 2.0)}
 
 
 @pytest.fixture(scope="session")

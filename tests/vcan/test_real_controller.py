@@ -16,6 +16,7 @@ from canprobe.bus.port import MonotonicClock, Reports
 from canprobe.bus.socketcan import SocketCanPort
 from canprobe.cli import main
 from canprobe.errors import InterfaceError
+from canprobe.session.terminal import Report
 
 pytestmark = pytest.mark.vcan
 MakeAdapter = Callable[..., SerialAdapter]
@@ -120,12 +121,12 @@ def test_emulated_nodes_wait_for_their_bus_until_ctrl_c(
     adapter.acknowledge(False)
     told: list[str] = []
 
-    def say(line: str) -> None:
+    def say(_: Report, line: str) -> None:
         told.append(line)
         if "waiting for the bus" in line:
             os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr("canprobe.cli.emulate.say", say)
+    monkeypatch.setattr(Report, "say", say)
     nodes = [word for n in range(1, 7) for word in ("--eds", "puma260_joint", "--node-id", str(n))]
     assert main(["emulate", *nodes, "--channel", adapter.name]) == 0
     assert told[-1] == f"{adapter.name}: frames that nobody acknowledged were dropped from its transmit queue"
