@@ -23,6 +23,11 @@ MASTER_PRIORITY = 40
 DEVICE_PRIORITY = 50
 """SCHED_FIFO priorities. Emulated nodes come first: a real device answers whatever the master is busy with."""
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
+BLAS_THREADS = (
+    "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS", "VECLIB_MAXIMUM_THREADS",
+)  # fmt: skip
+"""Variables that a BLAS reads when it is loaded. Matrices here are small: threads only wait for each other, on busy
+processors ten times as long as one thread computes."""
 
 
 def ask_for_processor() -> bool:

@@ -16,7 +16,7 @@ import traceback
 from collections.abc import Sequence
 
 import canprobe
-from canprobe.bus.scheduling import Terminated
+from canprobe.bus.scheduling import BLAS_THREADS, Terminated
 from canprobe.cli.completion import complete
 from canprobe.cli.output import termination_interrupts
 from canprobe.cli.parser import Parser, did_you_mean
@@ -76,6 +76,8 @@ def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911 - one per w
     if "_ARGCOMPLETE" in os.environ:
         complete(parser_of, COMMANDS)
     _prepare_streams()
+    for name in BLAS_THREADS:  # before numpy is loaded
+        os.environ.setdefault(name, "1")
     report = Report()
     try:
         args = parser_of(arguments).parse_args(arguments)

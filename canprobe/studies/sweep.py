@@ -48,6 +48,7 @@ from time import perf_counter
 from types import MappingProxyType, ModuleType
 from typing import Any
 
+from canprobe.bus.scheduling import BLAS_THREADS
 from canprobe.errors import StudyError, UsageError, install_line
 from canprobe.session.children import end_with_parent
 from canprobe.session.terminal import Progress
@@ -55,8 +56,6 @@ from canprobe.studies.harness import CellStore, Say, StudyResult, as_json, cell_
 
 # Where cells are computed: a pool of processes on this machine, or the workers of a Dask cluster.
 
-THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
-"""Variables that a BLAS reads when it is loaded."""
 _DASK_WAIT = "10s"
 _GRACE_S = 1.0
 """For workers to end by themselves: a run catches SIGTERM, stops, and its worker continues."""
@@ -151,12 +150,12 @@ def _end(workers: Collection[BaseProcess]) -> None:
 
 @contextlib.contextmanager
 def _one_blas_thread() -> Iterator[None]:
-    before = {name: os.environ[name] for name in THREADS if name in os.environ}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
+    before = {name: os.environ[name] for name in BLAS_THREADS if name in os.environ}
+    os.environ.update(dict.fromkeys(BLAS_THREADS, "1"))
     try:
         yield
     finally:
-        for name in THREADS:
+        for name in BLAS_THREADS:
             del os.environ[name]
         os.environ.update(before)
 

@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 from waiting import wait_until
 
+from canprobe.bus.scheduling import BLAS_THREADS
 from canprobe.cli import main
 from canprobe.errors import StudyError, UsageError
 from canprobe.studies import harness as sweep_store
 from canprobe.studies import sweep
 from canprobe.studies.harness import CellStore, as_json, cell_key, model_digest
-from canprobe.studies.sweep import THREADS, Sweep, dask_executor, open_sweep, process_pool
+from canprobe.studies.sweep import Sweep, dask_executor, open_sweep, process_pool
 
 DEMO = '''
 """A study of six cells; what happens in the fourth is set by the environment. Every measurement leaves a line."""
@@ -110,7 +111,7 @@ def here(store, said=None):
 def test_cells_run_in_processes_of_one_thread_and_are_found_again(demo, tmp_path):
     cells = [demo.Case(x) for x in (2, 0, 1, 2)]
     said, progress = [], []
-    before = {name: os.environ.get(name) for name in THREADS}
+    before = {name: os.environ.get(name) for name in BLAS_THREADS}
     with open_sweep(tmp_path / "a", say=said.append, progress=lambda *at: progress.append(at), workers=2) as opened:
         answers = opened.map(demo.measure, cells, model=("touch",))
         assert [a["square"] for a in answers] == [4, 0, 1, 4]
@@ -118,7 +119,7 @@ def test_cells_run_in_processes_of_one_thread_and_are_found_again(demo, tmp_path
         assert answers[0]["pair"] == [2, np.pi]  # as JSON gives it, also when it was not read from a file
         assert progress == [(1, 3), (2, 3), (3, 3)]
         assert not any(pid == os.getpid() for _, pid in measured(tmp_path))
-    assert {name: os.environ.get(name) for name in THREADS} == before
+    assert {name: os.environ.get(name) for name in BLAS_THREADS} == before
     with open_sweep(tmp_path / "a", say=said.append) as opened:
         assert opened.map(demo.measure, cells, model=("touch",)) == answers
         assert "3 of 3 cells are kept" in said[-1]
