@@ -12,6 +12,8 @@
     ├── ResultsError         3  a file that cannot be written: on a full disk, for example
     ├── SafetyStop           1  the cell was stopped for safety; the drives are disabled
     └── ProtocolError        3  bytes on the bus that cannot be decoded
+
+All can be imported from `canprobe`.
 """
 
 from __future__ import annotations
