@@ -127,7 +127,7 @@ def plan(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = None) 
     """Everything that follows from a scene before anything is started; see `canprobe.planning.make.make_plan`.
 
     Args:
-        scene, overrides: as for :func:`run`.
+        scene, overrides: as for `run`.
 
     Returns:
         The plan.
@@ -262,10 +262,19 @@ class OpenCell(Session):
         controller: Controller | Callable[[Measurement], Command],
         progress: Callable[[Measurement], None] = lambda _: None,
     ) -> RunResult:
-        """Run a controller until it is done; see :meth:`canprobe.cell.cell.Cell.run`.
+        """Run a controller until it is done.
+
+        Args:
+            controller: a `Controller`, or a function of the measurement that returns a `Command`.
+            progress: called with the measurement of each cycle.
 
         Returns:
             The result of the whole block, the same from every call; it is complete when the block is left.
+
+        Raises:
+            UsageError: this is no controller, or its step returned no command.
+            BusError: the interface or a node failed.
+            SafetyStop: the cell was stopped for safety, or the controller gave a `stop_reason`.
         """
         runs = as_controller(controller)
         if self._task is None:
@@ -376,7 +385,7 @@ def open_cell(
 
     Args:
         scene, overrides, bus, channel, bitrate, seed: as for `run`.
-        out: folder for the same files as those of :func:`run`; None writes nothing.
+        out: folder for the same files as those of `run`; None writes nothing.
         say: called with each step.
         force, observers, bridge: as for `run`.
         rows_kept: cycles whose row of the log is kept; all by default, which grows by about 1 KiB a cycle. With a

@@ -1,17 +1,19 @@
 """Exceptions of canprobe, and the exit status that each one means to the command line.
 
-CanprobeError
-├── UsageError           2  wrong usage
-│   ├── SceneError       2  the scene file is wrong; carries every problem found
-│   ├── PlanError        2  the scene is right but does not fit (bus, reach, geometry)
-│   └── EdsError         2  an EDS file cannot be used
-├── BusError             3  interface missing or lost, node missing, node refused
-│   ├── InterfaceError   3  the CAN interface itself
-│   └── NodeError        3  one node: absent, wrong identity, refused an access, failed
-├── StudyError           3  a study's worker, cell or files failed
-├── ResultsError         3  a file that cannot be written: no room on the disk, say
-├── SafetyStop           1  the cell was stopped for safety; the drives are disabled
-└── ProtocolError        3  bytes on the bus that cannot be decoded
+    CanprobeError
+    ├── UsageError           2  wrong usage
+    │   ├── SceneError       2  the scene file is wrong; carries every problem found
+    │   ├── PlanError        2  the scene is right but does not fit (bus, reach, geometry)
+    │   └── EdsError         2  an EDS file cannot be used
+    ├── BusError             3  interface missing or lost, node missing, node refused
+    │   ├── InterfaceError   3  the CAN interface itself
+    │   └── NodeError        3  one node: absent, wrong identity, refused an access, failed
+    ├── StudyError           3  a case, a worker or the files of a study failed
+    ├── ResultsError         3  a file that cannot be written: on a full disk, for example
+    ├── SafetyStop           1  the cell was stopped for safety; the drives are disabled
+    └── ProtocolError        3  bytes on the bus that cannot be decoded
+
+All can be imported from `canprobe`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""What the pages take from the code: keys of a scene, figures of the packaged ones; with `notebooks`, what these show.
+"""What the pages take from the code: keys of a scene, figures and gallery of the packaged ones; with `notebooks`, what
+these show.
 
 `python docs/generate.py [notebooks]`
 """
@@ -9,6 +10,7 @@ import ast
 import dataclasses
 import inspect
 import itertools
+import re
 import sys
 import tempfile
 import typing
@@ -16,9 +18,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from canprobe.results.expected import FIGURES, range_text, read_expected, seeds_text
+from canprobe.results.expected import FIGURES, expected_text, range_text, read_expected, seeds_text
 from canprobe.scene.checks import Only, conditions_of, expected
-from canprobe.scene.load import toml_value
+from canprobe.scene.load import packaged_scenes, toml_value
 from canprobe.scene.model import Scene
 from canprobe.scene.rules import SECTIONS_OF_TASK
 
@@ -48,6 +50,15 @@ UNITS = {  # the longest suffix that fits
     "n": "N",
     "s": "s",
 }
+GALLERY = """\
+# Gallery of scenes
+
+One picture for each packaged scene, with the figures to expect of it. In scans orange is the measured path of the
+contact, blue the recovered surface, grey the true one. The pictures are panels of `report.png`, drawn by
+`python docs/gallery.py` from one run each with `--bus direct`, seed 0. `canprobe run NAME` makes the whole report,
+`canprobe view NAME` shows the scene in three dimensions.
+
+What the figures mean, and why three scenes have large errors: [scenes and plans](scenes.md#packaged-scenes)."""
 NEEDS = {"must": "required", "default": "default", "may": "optional", "never": "–"}
 INTRODUCTION = """\
 # Scene keys
@@ -156,12 +167,55 @@ def with_expected(page: str) -> str:
         if figures:
             found = {name.removesuffix("_per_m"): range_text(name, between) for name, between in figures.items()}
             lines.append(f"| `{scene}` | {' | '.join(found.get(name, '–') for name in columns)} |")
-    source = (
-        f"Lowest to highest of the seeds {seeds_text(expected)} on the lockstep bus. Measured by"
-        f" `python docs/measure.py` on {expected['date']} at commit {expected['commit']}: {expected['machine']}."
+    return _between(page, [*lines, "", _source(expected, seeds_text(expected))])
+
+
+def _source(expected: Mapping[str, Any], seeds: str, scene: str | None = None) -> str:
+    """Where figures come from: those of one scene, or of all, with the ones that were measured apart."""
+    apart = expected.get("apart", {})
+    head = apart.get(scene, expected)
+    where = f"on {head['date']} at commit {head['commit']}: {head['machine']}"
+    others = "" if scene else "".join(f"; `{k}` on {v['date']} at commit {v['commit']}" for k, v in apart.items())
+    what = f"Lowest to highest of the seeds {seeds} on the lockstep bus"
+    return f"{what}. Measured by `python docs/measure.py` {where}{others}."
+
+
+def with_accuracy(readme: str) -> str:
+    """The README with the errors of the default scan in its sentence on them."""
+    figures = read_expected()["one_scan"]["figures"]
+    force, curvature = (
+        next(f"{low:g}–{high:g} %" for what, (low, high) in figures.items() if what.startswith(start))
+        for start in ("true force, RMS", "curvature after")
     )
+    readme = re.sub(r"(errs\sby\s)[\d.–]+ %(\s\(RMS\))", rf"\g<1>{force}\2", readme)
+    return re.sub(r"(and the curvature\sby\s)[\d.–]+ %", rf"\g<1>{curvature}", readme)
+
+
+def _between(page: str, lines: list[str]) -> str:
+    """A page with lines between its marks."""
     head, mark, rest = page.partition("<!-- expected -->\n")
-    return "".join([head, mark, "\n".join(["", *lines, "", source, "", ""]), rest[rest.index("<!-- /expected -->") :]])
+    return "".join([head, mark, "\n".join(["", *lines, "", ""]), rest[rest.index("<!-- /expected -->") :]])
+
+
+def with_one_scan(page: str) -> str:
+    """The page on accuracy with the figures of the default scan between its marks."""
+    expected = read_expected()
+    seeds, rows = expected["one_scan"]["seeds"], expected["one_scan"]["figures"]
+    lines = ["| figure | reached |", "| --- | --- |"]
+    for what, (low, high) in rows.items():
+        lines.append(f"| {what} | {low:g}{'' if low == high else f'–{high:g}'} |")
+    return _between(page, [*lines, "", _source(expected, f"{seeds[0]} to {seeds[-1]}", "cylinder")])
+
+
+def gallery() -> str:
+    """The page of pictures; `python docs/gallery.py` draws them."""
+    expected = read_expected()
+    rows = [GALLERY, _source(expected, seeds_text(expected))]
+    for name, title in packaged_scenes():
+        figures = expected_text(expected["scenes"].get(name, {}))
+        rows += [f"## `{name}`", f"{title}.", *([f"To expect: {figures}."] if figures else [])]
+        rows += [f"![A panel of the report of {name}](img/scenes/{name}.png)"]
+    return "\n\n".join(rows) + "\n"
 
 
 def execute_notebooks() -> None:
@@ -180,6 +234,11 @@ def execute_notebooks() -> None:
 if __name__ == "__main__":
     scenes = DOCS / "scenes.md"
     scenes.write_text(with_expected(scenes.read_text(encoding="utf-8")), encoding="utf-8")
+    readme = DOCS.parent / "README.md"
+    readme.write_text(with_accuracy(readme.read_text(encoding="utf-8")), encoding="utf-8")
+    accuracy = DOCS / "accuracy.md"
+    accuracy.write_text(with_one_scan(accuracy.read_text(encoding="utf-8")), encoding="utf-8")
+    (DOCS / "gallery.md").write_text(gallery(), encoding="utf-8")
     (DOCS / "scene-keys.md").write_text(scene_keys(), encoding="utf-8")
     if "notebooks" in sys.argv:
         execute_notebooks()

@@ -272,8 +272,8 @@ class Observation:
     Attributes:
         t_ns: deadline of its SYNC on the run's clock, ns, as in `bus.log`. A time of the cycle's own, such as
             `measurement.t_ns` or a tactile sample's, is on this clock with `t_ns - measurement.t_ns` added.
-        measurement: what the cell saw; None in an observation of frames alone, at bring-up and after the last cycle.
-        command: what the controller said; None while the drives are enabled and stopped.
+        measurement: what the controller got; None where there are frames alone, at bring-up and after the last cycle.
+        command: what the controller returned; None while the drives are enabled and stopped.
         frames: what was on the bus since the last observation, (can_id, data, t_ns).
     """
 

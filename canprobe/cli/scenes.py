@@ -52,7 +52,7 @@ def print_packaged(
         found, paths = titles[kind](), packaged_files(f"{kind}s")
         if args.json:
             for name, title in found:
-                figures = {} if expected is None else {"expected": expected["scenes"][name]}
+                figures = {} if expected is None else {"expected": expected["scenes"].get(name, {})}
                 document.append({"kind": kind, "name": name, "title": title, "path": str(paths[name]), **figures})
         else:
             if expected is None:

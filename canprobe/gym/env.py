@@ -136,7 +136,13 @@ class TouchScan(gymnasium.Env[Any, NDArray[np.float32]]):
         return self._observe(self.episode), self.episode.info() | {"overrides": overrides}
 
     def step(self, action: NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Lead the probe for one step; see the class for action and reward.
+        """Lead the probe for one step.
+
+        Args:
+            action: (3,) as the class describes it.
+
+        Returns:
+            Observation, reward in mm², terminated, truncated, and `info` with the truth.
 
         Raises:
             UsageError: no episode is under way, or the action is not three finite numbers.

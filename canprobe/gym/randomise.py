@@ -17,7 +17,12 @@ Values = Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Uniform:
-    """Drawn uniformly between two numbers, or two tuples of them, element by element."""
+    """A value that is drawn uniformly for each episode.
+
+    Attributes:
+        low: least number, or a tuple of them, in the unit of the key.
+        high: largest one; tuples are drawn element by element.
+    """
 
     low: float | tuple[float, ...]
     high: float | tuple[float, ...]
@@ -30,7 +35,11 @@ class Uniform:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """One of several values, each as likely; values may be draws themselves, or tables with draws in them."""
+    """A value that is one of several, each as likely, for each episode.
+
+    Attributes:
+        values: of the key; they may be draws themselves, or tables with draws in them.
+    """
 
     values: Sequence[Any]
 

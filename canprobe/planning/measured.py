@@ -85,17 +85,17 @@ class ClassTraffic:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredTraffic:
-    """A bus as it was, beside its plan.
+    """The measured traffic of a bus, compared with its plan.
 
     Attributes:
-        duration_s: from the first SYNC to the last one.
+        duration_s: from the first SYNC to the last one, s.
         bitrate: bit/s.
         exact: bits were counted with their stuff bits.
-        classes: by kind.
+        classes: counts, bits and times of each kind of message.
         unlisted: identifiers that the plan does not list, with their counts; in the whole log.
-        missing: planned PDOs that never came.
+        missing: COB-IDs of planned PDOs that never came.
         error_frames: bus errors in the whole log.
-        planned_worst: load of the plan.
+        planned_worst: load in the worst case by the plan, as a share of the bit rate.
     """
 
     duration_s: float
@@ -118,7 +118,7 @@ class MeasuredTraffic:
 
     @property
     def as_planned(self) -> bool:
-        """Every class is, nothing is missing, nothing else was on the bus, and no frame went wrong."""
+        """Every class is as planned, nothing is missing, nothing else was on the bus, and there was no bus error."""
         nothing_else = not self.unlisted and not self.missing and not self.error_frames
         return nothing_else and all(one.as_planned for one in self.classes)
 
@@ -149,7 +149,7 @@ class MeasuredTraffic:
         }
 
     def text(self) -> str:
-        """For people."""
+        """The comparison as text."""
         return "\n".join(self._lines()) + "\n"
 
     def _lines(self) -> Iterator[str]:

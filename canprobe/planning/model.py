@@ -314,18 +314,18 @@ class Plan:
     """Everything that follows from a scene before anything is started.
 
     Attributes:
-        setup: what it was made from, with nothing open any more.
-        nodes: ascending node ids.
-        pdos: by priority on the bus.
+        setup: the resolved scene in SI units, with every choice of the plan.
+        nodes: that are brought up, by node id.
+        pdos: of all nodes, by priority on the bus.
         raw: frames of an array that is no CANopen node.
         sync: the cycle.
         buses: that of the first joint first, then the others in the order of the joints, the array's last.
-        choices: what the scene left open; `setup` has the values.
-        joint_speeds: None without an arm.
+        choices: values that the scene left to the plan, with reasons.
+        joint_speeds: needed and allowed; None without an arm.
         outputs: files that a run writes.
         left_out: what this scene does not bring up, and why.
         not_available: what the EDS files could not give.
-        warnings: what is carried out all the same, but not as the numbers say.
+        warnings: what is carried out although a number of the plan does not hold for it.
     """
 
     setup: Setup
@@ -343,12 +343,12 @@ class Plan:
 
     @property
     def scene(self) -> Scene:
-        """The scene with nothing open any more, for who writes, sends or changes it."""
+        """The scene with every choice of the plan filled in."""
         return with_choices(self.setup.scene, {choice.key: choice.value for choice in self.choices})
 
     @property
     def traffic(self) -> Traffic:
-        """Traffic of the first bus: the only one, or that of the first joint."""
+        """Traffic of the first bus, which is that of the first joint."""
         return self.buses[0].traffic
 
     @property

@@ -112,7 +112,7 @@ SCHEMA = 1
 class RunResult:
     """One finished run; printed, it is its summary.
 
-    That of :func:`canprobe.open_cell` is complete when its block is left: until then the drives are not disabled, the
+    That of `canprobe.open_cell` is complete when its block is left: until then the drives are not disabled, the
     bus is not closed, and reading an attribute raises.
 
     Attributes:

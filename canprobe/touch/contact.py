@@ -37,7 +37,7 @@ class Slope(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ContactSample:
-    """One touch, as the estimators take it.
+    """One contact, as the estimators take it.
 
     Attributes:
         t_s: time, s.
@@ -45,11 +45,11 @@ class ContactSample:
         n_base: (3,) outward unit normal of the object there, in base.
         T_base_probe: (4, 4) probe frame (origin at the sphere's centre, z through the pole of the pad) to base.
         r_probe: (3,) contact point in the probe frame, m.
-        force_n: N.
+        force_n: contact force, N.
         sigma_point: effective standard deviation of the point per axis, m; None for the estimator's own.
         sigma_normal: that of the normal per tangent axis, rad; None for the estimator's own.
-        moments: second moments uu, uv, vv of the patch along the pad's axes, m² (`patch.moments`); None for none.
-        doubts: about the image; estimators give the contact less weight and say so.
+        moments: second moments uu, uv, vv of the patch along the pad's axes, m² (`patch.moments`); or None.
+        doubts: about the image; estimators give the contact less weight and note it.
         sigma_motion: standard deviation of the point from an instant that is not known well while the probe moves, m;
             it comes on top of that of the point.
         slope: of √F over the indentation in its touch; None where it was not measured.

@@ -38,10 +38,10 @@ _AROUND = np.array([[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mesh:
-    """Triangles.
+    """A surface as triangles.
 
     Attributes:
-        vertices: (n, 3) m.
+        vertices: (n, 3) points on the surface, m.
         triangles: (m, 3) indices of vertices, anticlockwise seen from outside the body.
         normals: (n, 3) outward unit normals of the surface at the vertices.
         sigma: (n,) standard deviation of the surface's height at the vertices, m; NaN where it is not known.

@@ -89,7 +89,7 @@ class SurfaceMatrix:
 
         The zero set of a sum is neither body nor their union: it passes through the curve that both surfaces share.
         Of two surfaces normalised in one contact frame the sum is the blend whose curvature there is the mean of the
-        two; weights are had by scaling (`0.25 * a + 0.75 * b`).
+        two; scaling gives other weights (`0.25 * a + 0.75 * b`).
         """
         return SurfaceMatrix(self.S + other.S)
 
@@ -141,8 +141,11 @@ class SurfaceMatrix:
     def curvature_at(self, point: ArrayLike) -> tuple[Array, Array]:
         """Shape operator at a point of the surface.
 
+        Args:
+            point: (3,) m.
+
         Returns:
-            K (2, 2) in 1/m, positive where convex, and its tangent basis (3, 2): the x and y axes of
+            The shape operator (2, 2) in 1/m, positive where convex, and its tangent basis (3, 2), the x and y axes of
             `contact_frame(point)`.
         """
         basis = self.contact_frame(point)[:3, :2]
@@ -162,6 +165,9 @@ class SurfaceMatrix:
 
         Args:
             x, y: m, in a contact frame (or any frame where the z axis crosses the surface near the origin).
+
+        Returns:
+            z, m, in the shape of x and y.
         """
         s = self.S
         x_, y_ = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)

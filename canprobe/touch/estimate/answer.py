@@ -64,7 +64,7 @@ class SurfaceEstimate:
         rank: how many independent combinations of (K11, K12, K22) were observed, 0–3 (thresholds: `quadric`).
         combinations: (rank, 3) rows: the observed ones as weights of (K11, √2 K12, K22).
         information: (3, 3) information of the data about (K11, √2 K12, K22), m²; finite also where nothing is observed.
-        umbilic: κ1 and κ2 cannot be told apart at 95 %: the directions mean nothing.
+        umbilic: κ1 and κ2 do not differ significantly (95 %): the directions mean nothing.
         innovation: mean squared whitened residual per degree of freedom; about 1 when the model and the σ's are right.
         distance: path that the estimate rests on, m.
         samples: number of samples it rests on (effective, with forgetting).
@@ -168,7 +168,7 @@ class SurfaceEstimate:
     def curvature_tensor_base(self) -> Array:
         """(3, 3) shape operator as a tensor in the frame of the points, `P K Pᵀ`, 1/m.
 
-        From `S`, so always finite; it says nothing where `observed` is False.
+        From `S`, so always finite; it means nothing where `observed` is False.
         """
         P = self.T_frame_contact[:3, :2]
         result: Array = P.dot(2.0 * self.S[:2, :2]).dot(P.T)
@@ -178,10 +178,10 @@ class SurfaceEstimate:
         """Surface point and outward unit normal over (along the contact normal) a place near the contact.
 
         Args:
-            point: (3,) in the frame of the points.
+            point: (3,) in the frame of the points, m.
 
         Returns:
-            (3,), (3,) in the frame of the points; NaN where the quadric has no point there.
+            Point (3,), m, and normal (3,), in the frame of the points; NaN where the quadric has no point there.
         """
         R, origin = self.T_frame_contact[:3, :3], self.T_frame_contact[:3, 3]
         local = R.T @ (point - origin)

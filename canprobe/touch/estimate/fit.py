@@ -116,7 +116,7 @@ def fit_surface(
         correlation: of the noise along the path, for "ml", which weighs the samples by it, and "recursive", whose
             covariance grows by it; None for independent samples.
         coupling: for "ml" and "recursive": 1/R_p where point and normal come from one centroid on a spherical probe, so
-            that their errors are one (`Noise`); 0 for independent ones.
+            that their errors are coupled (`Noise`); 0 for independent ones.
         quadric: for "ml" and "recursive": the surface is known to be one. Otherwise its cubic and quartic terms are
             corrected for where they show and allowed for in the covariance where they could hide (`nonlinear`).
 
@@ -128,7 +128,7 @@ def fit_surface(
 
     Example:
         >>> import numpy as np
-        >>> from canprobe.touch.estimate.fit import fit_surface
+        >>> from canprobe import fit_surface
         >>> a = np.linspace(-0.2, 0.0, 40)
         >>> n = np.stack([np.sin(a), 0.3 * np.sin(20 * a), -np.cos(a)], axis=1)
         >>> n /= np.linalg.norm(n, axis=1, keepdims=True)
