@@ -37,7 +37,7 @@ def progress(*_):
     cycles += 1
 
 interface, seconds = sys.argv[1], float(sys.argv[2])
-where = {} if interface == "lockstep" else {"interface": interface}
+where = {} if interface == "lockstep" else {"bus": interface}
 with tempfile.TemporaryDirectory() as folder:
     canprobe.run(canprobe.load_scene("cylinder"), duration_s=seconds, progress=progress, out=folder + "/run", **where)
     end = process_time()
