@@ -112,7 +112,29 @@ STRETCH = 150
 """Segments of one node of a live path."""
 
 
-class LoadedPath:
+class Parts:
+    """Nodes of viser's scene that appear one after the other."""
+
+    def __init__(self) -> None:
+        self._starts: list[float] = []
+        self._nodes: list[Any] = []
+        self._shown = 0
+
+    def add(self, t_s: float, node: Any) -> None:
+        """A hidden node that appears at an instant, s, no earlier than those before."""
+        self._starts.append(t_s)
+        self._nodes.append(node)
+
+    def until(self, t_s: float) -> None:
+        """Show what has appeared by an instant, and hide the rest."""
+        wanted = int(np.searchsorted(self._starts, t_s, side="right"))
+        low, high = sorted((self._shown, wanted))
+        for node in self._nodes[low:high]:
+            node.visible = wanted > self._shown
+        self._shown = wanted
+
+
+class LoadedPath(Parts):
     """A whole recorded path, shown up to an instant.
 
     Args:
@@ -121,21 +143,9 @@ class LoadedPath:
     """
 
     def __init__(self, api: Any, trail: Trail) -> None:
-        self._starts: list[float] = []
-        self._nodes: list[Any] = []
-        self._shown = 0
-        for chunk in trail.chunks():
-            self._starts.append(trail.times[chunk.start])
-            name = f"/path/{len(self._nodes):03d}"
-            self._nodes.append(_add(api, name, trail, chunk, visible=False))
-
-    def until(self, t_s: float) -> None:
-        """Show what was touched until then."""
-        wanted = int(np.searchsorted(self._starts, t_s, side="right"))
-        low, high = sorted((self._shown, wanted))
-        for node in self._nodes[low:high]:
-            node.visible = wanted > self._shown
-        self._shown = wanted
+        super().__init__()
+        for number, chunk in enumerate(trail.chunks()):
+            self.add(trail.times[chunk.start], _add(api, f"/path/{number:03d}", trail, chunk, visible=False))
 
 
 class GrowingPath:

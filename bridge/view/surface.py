@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from canprobe.bridge.view.instants import Answer
 from canprobe.bridge.view.meshes import Array
-from canprobe.bridge.view.path import DeviationScale
+from canprobe.bridge.view.path import DeviationScale, Parts
 from canprobe.touch.blend import REACH_M
 from canprobe.touch.meshing import Mesh
 from canprobe.touch.surface_map import SPACING_M, LocalPatch, SurfaceMap
@@ -107,7 +107,7 @@ STAGES = 40
 """Parts of a recorded surface."""
 
 
-class LoadedSurface:
+class LoadedSurface(Parts):
     """The surface of a recorded run as it is known at the end, shown as far as it was touched by an instant.
 
     Args:
@@ -122,26 +122,15 @@ class LoadedSurface:
             surface.add(answer)
             times.append(t_s)
             shown.append(answer)
-        self._starts: list[float] = []
-        self._nodes: list[Any] = []
-        self._shown = 0
+        super().__init__()
         if not surface:
             return
         mesh, colours = surface.mesh()
         first = np.array([min(near, default=len(times) - 1) for near in _near(mesh.vertices, shown)])
         stage = first[mesh.triangles].max(axis=1) * STAGES // len(times)
         for number in np.unique(stage):
-            self._starts.append(times[-(-number * len(times) // STAGES)])
-            name = f"/surface/{number:02d}"
-            self._nodes.append(_add(api, name, mesh, mesh.triangles[stage == number], colours, visible=False))
-
-    def until(self, t_s: float) -> None:
-        """Show what was known then."""
-        wanted = int(np.searchsorted(self._starts, t_s, side="right"))
-        low, high = sorted((self._shown, wanted))
-        for node in self._nodes[low:high]:
-            node.visible = wanted > self._shown
-        self._shown = wanted
+            node = _add(api, f"/surface/{number:02d}", mesh, mesh.triangles[stage == number], colours, visible=False)
+            self.add(times[-(-number * len(times) // STAGES)], node)
 
 
 def _add(api: Any, name: str, mesh: Mesh, triangles: Any, colours: Any, *, visible: bool = True) -> Any:
