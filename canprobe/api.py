@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
@@ -191,13 +190,12 @@ def _draw(result: RunResult, out: Path, say: Say) -> None:
         draw_surface(result, out / "surface.png")
     if "report.html" in outputs:
         say("draw report.html")
-        page, recorded = (importlib.import_module(f"canprobe.bridge.view.{name}") for name in ("browser", "recorded"))
+        from canprobe.results.page import write_page_of
+
         try:
-            shown = recorded.read_run(out)
+            write_page_of(out, say)
         except UsageError as error:  # a controller's column that is called like one of ours and is something else
             say(f"report.html is left out: {error}")
-        else:
-            page.write_page(shown, out / "report.html", say)
 
 
 class OpenCell(Session):

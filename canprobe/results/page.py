@@ -7,6 +7,7 @@ import importlib
 import os
 import sys
 import webbrowser
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,6 +30,16 @@ class Page:
         return f'<iframe srcdoc="{text}" style="width: 100%; height: 640px; border: 0"></iframe>'
 
 
+def write_page_of(folder: Path, say: Callable[[str], None]) -> None:
+    """Write ``report.html`` into a run's folder; `say` is called with each line about what cannot be drawn.
+
+    Raises:
+        UsageError: a controller's column has the name of one of ours.
+    """
+    browser, recorded = (importlib.import_module(f"canprobe.bridge.view.{name}") for name in ("browser", "recorded"))
+    browser.write_page(recorded.read_run(folder), folder / "report.html", say)
+
+
 def page_of(folder: Path) -> Page:
     """The page of a run's folder, written where it is missing; opened in a browser if there is one and no notebook.
 
@@ -38,9 +49,7 @@ def page_of(folder: Path) -> Page:
     page = Page(folder / "report.html")
     if not page.path.is_file():
         check_bridges(["view"])
-        view = "canprobe.bridge.view"
-        browser, recorded = (importlib.import_module(f"{view}.{name}") for name in ("browser", "recorded"))
-        browser.write_page(recorded.read_run(folder), page.path, quiet)
+        write_page_of(folder, quiet)
     if "ipykernel" not in sys.modules and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         webbrowser.open(page.path.resolve().as_uri())
     return page
