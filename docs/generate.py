@@ -1,5 +1,5 @@
-"""What the pages take from the code: keys of a scene, figures and gallery of the packaged ones; with `notebooks`, what
-these show.
+"""What pages do not say by themselves: keys of a scene, from the code; all that was measured, from docs/measured.json;
+with `notebooks`, what these show. The figures of the packaged scenes go into the package too.
 
 `python docs/generate.py [notebooks]`
 """
@@ -10,21 +10,24 @@ import ast
 import dataclasses
 import inspect
 import itertools
+import json
 import re
 import sys
 import tempfile
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from canprobe.results.expected import FIGURES, expected_text, range_text, read_expected, seeds_text
+from canprobe.results.expected import FIGURES, expected_text, range_text, seeds_text
 from canprobe.scene.checks import Only, conditions_of, expected
 from canprobe.scene.load import packaged_scenes, toml_value
 from canprobe.scene.model import Scene
 from canprobe.scene.rules import SECTIONS_OF_TASK
 
 DOCS = Path(__file__).parent
+EXPECTED = DOCS.parent / "canprobe" / "scenes" / "expected.json"
+MARKED = re.compile(r"(<!-- measured (\w+) -->).*?(<!-- /measured -->)", re.DOTALL)
 UNITS = {  # the longest suffix that fits
     "bitrate": "bit/s",
     "n_m3": "N/m³",
@@ -155,67 +158,105 @@ def _condition(only: Only) -> str:
     return f"*{'Required' if only.required else 'Only'} with `{only.key}` = {values}.*"
 
 
-def with_expected(page: str) -> str:
-    """A page with the table of expected figures between its marks."""
-    expected = read_expected()
+def read_measured() -> dict[str, Any]:
+    """What `python docs/measure.py` wrote: by scene, study and bench, with command, date, commit and machine."""
+    measured: dict[str, Any] = json.loads((DOCS / "measured.json").read_text(encoding="utf-8"))
+    return measured
+
+
+def with_measured(page: str, measured: Mapping[str, Any]) -> str:
+    """A page with what was measured between its marks: `<!-- measured NAME -->` and `<!-- /measured -->`."""
+    return MARKED.sub(lambda found: f"{found[1]}\n\n{_block(found[2], measured)}\n\n{found[3]}", page)
+
+
+def _block(name: str, measured: Mapping[str, Any]) -> str:
+    entry = measured[name]
+    if name == "scenes":
+        return f"{_table(_scene_rows(entry))}\n\n{_source_of_scenes(entry)}"
+    parts = [_table(entry["table"])] if "table" in entry else []
+    if "findings" in entry:
+        parts.append("\n".join(_item(line) for line in entry["findings"]))
+    return "\n\n".join([*parts, f"Measured by `{entry['command']}` {_where(entry)}."])
+
+
+def _table(rows: Iterable[Sequence[str]]) -> str:
+    head, *rest = rows
+    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rest))
+
+
+def _item(line: str) -> str:
+    """A finding as an item of a list; one that is set in belongs to the item before."""
+    text = line.strip()
+    return f"{'    ' if line[0] == ' ' else ''}- {text[0].upper()}{text[1:].rstrip('.')}."
+
+
+def _where(entry: Mapping[str, Any]) -> str:
+    return f"on {entry['date']} at commit {entry['commit']}: {entry['machine']}"
+
+
+def _scene_rows(scenes: Mapping[str, Any]) -> Iterator[list[str]]:
     columns = ("contact", "force", "curvature", "normal", "position", "tool")
-    lines = [
-        f"| scene | {' | '.join(FIGURES[name][0] for name in columns)} |",
-        "| --- |" + " --- |" * len(columns),
-    ]
-    for scene, figures in expected["scenes"].items():
-        if figures:
-            found = {name.removesuffix("_per_m"): range_text(name, between) for name, between in figures.items()}
-            lines.append(f"| `{scene}` | {' | '.join(found.get(name, '–') for name in columns)} |")
-    return _between(page, [*lines, "", _source(expected, seeds_text(expected))])
+    yield ["scene", *(FIGURES[name][0] for name in columns)]
+    for scene, entry in scenes.items():
+        found = {name.removesuffix("_per_m"): range_text(name, ends) for name, ends in entry["figures"].items()}
+        if found:
+            yield [f"`{scene}`", *(found.get(name, "–") for name in columns)]
 
 
-def _source(expected: Mapping[str, Any], seeds: str, scene: str | None = None) -> str:
-    """Where figures come from: those of one scene, or of all, with the ones that were measured apart."""
-    apart = expected.get("apart", {})
-    head = apart.get(scene, expected)
-    where = f"on {head['date']} at commit {head['commit']}: {head['machine']}"
-    others = "" if scene else "".join(f"; `{k}` on {v['date']} at commit {v['commit']}" for k, v in apart.items())
+def _source_of_scenes(scenes: Mapping[str, Any]) -> str:
+    """Where the figures of the scenes come from: those of most, then those that were measured at another time."""
+    by_origin: dict[str, list[str]] = {}
+    for name, entry in scenes.items():
+        by_origin.setdefault(_where(entry), []).append(name)
+    (most, _), *others = sorted(by_origin.items(), key=lambda item: -len(item[1]))
+    apart = "".join(f"; {', '.join(f'`{name}`' for name in names)} {where}" for where, names in others)
+    seeds = seeds_text(next(iter(scenes.values())))
     what = f"Lowest to highest of the seeds {seeds} on the lockstep bus"
-    return f"{what}. Measured by `python docs/measure.py` {where}{others}."
+    return f"{what}. Measured by `python docs/measure.py` {most}{apart}."
 
 
-def with_accuracy(readme: str) -> str:
+def expected_figures(measured: Mapping[str, Any]) -> str:
+    """The figures of the scenes, for the package: `canprobe scenes` and `run` show them."""
+    scenes: Mapping[str, Any] = measured["scenes"]
+    lines = ",\n".join(f"    {json.dumps(name)}: {json.dumps(entry['figures'])}" for name, entry in scenes.items())
+    seeds = next(iter(scenes.values()))["seeds"]
+    return f'{{\n  "seeds": {json.dumps(seeds)},\n  "scenes": {{\n{lines}\n  }}\n}}\n'
+
+
+def with_accuracy(readme: str, measured: Mapping[str, Any]) -> str:
     """The README with the errors of the default scan in its sentence on them."""
-    figures = read_expected()["one_scan"]["figures"]
+    rows = dict(measured["one_scan"]["table"])
     force, curvature = (
-        next(f"{low:g}–{high:g} %" for what, (low, high) in figures.items() if what.startswith(start))
+        next(f"{reached} %" for what, reached in rows.items() if what.startswith(start))
         for start in ("true force, RMS", "curvature after")
     )
     readme = re.sub(r"(errs\sby\s)[\d.–]+ %(\s\(RMS\))", rf"\g<1>{force}\2", readme)
     return re.sub(r"(and the curvature\sby\s)[\d.–]+ %", rf"\g<1>{curvature}", readme)
 
 
-def _between(page: str, lines: list[str]) -> str:
-    """A page with lines between its marks."""
-    head, mark, rest = page.partition("<!-- expected -->\n")
-    return "".join([head, mark, "\n".join(["", *lines, "", ""]), rest[rest.index("<!-- /expected -->") :]])
-
-
-def with_one_scan(page: str) -> str:
-    """The page on accuracy with the figures of the default scan between its marks."""
-    expected = read_expected()
-    seeds, rows = expected["one_scan"]["seeds"], expected["one_scan"]["figures"]
-    lines = ["| figure | reached |", "| --- | --- |"]
-    for what, (low, high) in rows.items():
-        lines.append(f"| {what} | {low:g}{'' if low == high else f'–{high:g}'} |")
-    return _between(page, [*lines, "", _source(expected, f"{seeds[0]} to {seeds[-1]}", "cylinder")])
-
-
-def gallery() -> str:
+def gallery(measured: Mapping[str, Any]) -> str:
     """The page of pictures; `python docs/gallery.py` draws them."""
-    expected = read_expected()
-    rows = [GALLERY, _source(expected, seeds_text(expected))]
+    scenes = measured["scenes"]
+    rows = [GALLERY, _source_of_scenes(scenes)]
     for name, title in packaged_scenes():
-        figures = expected_text(expected["scenes"].get(name, {}))
+        figures = expected_text(scenes[name]["figures"])
         rows += [f"## `{name}`", f"{title}.", *([f"To expect: {figures}."] if figures else [])]
         rows += [f"![A panel of the report of {name}](img/scenes/{name}.png)"]
     return "\n\n".join(rows) + "\n"
+
+
+def pages() -> Iterator[tuple[Path, str]]:
+    """Every file that is generated, wholly or between marks, and its text."""
+    measured = read_measured()
+    yield EXPECTED, expected_figures(measured)
+    yield DOCS / "gallery.md", gallery(measured)
+    yield DOCS / "scene-keys.md", scene_keys()
+    readme = DOCS.parent / "README.md"
+    yield readme, with_accuracy(readme.read_text(encoding="utf-8"), measured)
+    for page in sorted(DOCS.glob("*.md")):
+        text = page.read_text(encoding="utf-8")
+        if MARKED.search(text):
+            yield page, with_measured(text, measured)
 
 
 def execute_notebooks() -> None:
@@ -232,13 +273,7 @@ def execute_notebooks() -> None:
 
 
 if __name__ == "__main__":
-    scenes = DOCS / "scenes.md"
-    scenes.write_text(with_expected(scenes.read_text(encoding="utf-8")), encoding="utf-8")
-    readme = DOCS.parent / "README.md"
-    readme.write_text(with_accuracy(readme.read_text(encoding="utf-8")), encoding="utf-8")
-    accuracy = DOCS / "accuracy.md"
-    accuracy.write_text(with_one_scan(accuracy.read_text(encoding="utf-8")), encoding="utf-8")
-    (DOCS / "gallery.md").write_text(gallery(), encoding="utf-8")
-    (DOCS / "scene-keys.md").write_text(scene_keys(), encoding="utf-8")
+    for path, text in pages():
+        path.write_text(text, encoding="utf-8")
     if "notebooks" in sys.argv:
         execute_notebooks()

@@ -1,51 +1,155 @@
-"""Measure what the packaged scenes do, and write canprobe/scenes/expected.json. `python docs/measure.py [SCENE …]`
+"""Measure what the pages say, and write docs/measured.json. `python docs/measure.py [NAME …]`
 
-Each scene runs with three seeds on the lockstep bus, as `canprobe run SCENE --seed N` does; the default scene,
-`cylinder`, runs with ten, for the table of the page on accuracy. Ten to fifteen minutes in all, on a machine that does
-nothing else: pace and computing time are among the figures. Then `python docs/generate.py` writes them into the pages.
-
-Of scenes that are named the figures are replaced, and the file says when and at which commit.
+A name is that of a packaged scene, of a study, or of one of the functions below: `one_scan`, `vcan0`, `pace`, `gym`,
+`learning`, `bridges`. Without names everything is measured but what takes more than half an hour (`LONG`). Measure on a
+machine that does nothing else: computing time is among the figures. Every entry has its own command, date, commit and
+machine, so that one can be measured anew without the others. Then `python docs/generate.py` writes the pages.
 """
 
 from __future__ import annotations
 
 import datetime
 import json
+import os
 import platform
+import shlex
 import subprocess
 import sys
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from PIL import Image
 
 import canprobe
 from canprobe.results.expected import figures_of
 from canprobe.scene.load import packaged_scenes
 
-ROOT = Path(__file__).resolve().parent.parent
-FILE = ROOT / "canprobe" / "scenes" / "expected.json"
-SEEDS = (0, 1, 2)
-ONE_SCAN, SEEDS_OF_ONE_SCAN = "cylinder", tuple(range(10))
+DOCS = Path(__file__).resolve().parent
+FILE = DOCS / "measured.json"
+RUNS = DOCS.parent / "runs" / "measured"
+"""Where studies and runs on vcan0 leave their files; finished cells of a study are used again."""
+SEEDS, SEEDS_OF_ONE_SCAN = (0, 1, 2), range(10)
+IN_GUEST = "canprobe vcan --realtime -- "
+ON_VCAN0 = "canprobe run cylinder --bus socketcan --channel vcan0 --realtime --patient"
+LONG = ("faults", "soak")
+INTERPRETED = {"python": [sys.executable], "canprobe": [sys.executable, "-m", "canprobe"]}
+COLOURS = 64
+"""Of a picture in the documentation."""
+
+Entry = dict[str, Any]
+Row = Mapping[str, Any]
+Columns = Mapping[str, str]
+"""Headings, each with the form that a row of a study's result is printed in."""
+
+TABLES: Mapping[str, tuple[Callable[[Sequence[Row]], Sequence[Row]], Columns]] = {
+    "regions": (
+        lambda rows: [row for row in rows if row["group"] == "random"],
+        {
+            "random scenes with": "{of}",
+            "scenes": "{scenes}",
+            "regions that hold the truth": "{coverage:.1%} ({coverage_low:.1%} to {coverage_high:.1%})",
+            "scenes below 80 %": "{below_80:.1%}",
+            "below 40 %": "{below_40:.1%}",
+            "stated over error": "{stated_over_error:.2f}",
+            "error, 1/m": "{error_per_m:.2f}",
+        },
+    ),
+    "shapes": (
+        lambda rows: [
+            min((row for row in rows if row["method"] == name), key=lambda row: row["curvature_per_m"])
+            for name in dict.fromkeys(row["method"] for row in rows)
+        ],
+        {
+            "method, at its best budget": "{method}, {budget:g} {unit}",
+            "accuracy, completeness, µm": "{accuracy_um:.0f}, {completeness_um:.0f}",
+            "F at 0.05 mm": "{f_0.05mm:.3f}",
+            "normals, mrad": "{normal_mrad:.1f}",
+            "curvature, 1/m": "{curvature_per_m:.1f}",
+            "bands that hold the truth": "{coverage:.0%}",
+            "time, s": "{cpu_s:.2f}",
+        },
+    ),
+    "bridges": (
+        list,
+        {
+            "bridge": "{bridge}",
+            "watched": "{watched}",
+            "added to a cycle of 2500 µs, median, 99 %": "{added_p50_us:.0f}, {added_p99_us:.0f} µs",
+            "dropped of": "{dropped} of {samples}",
+            "its process, of one processor": "{processor_percent:.0f}%",
+            "extra, installed": "{installed_mb:.0f} MB",
+        },
+    ),
+}
+"""Rows and columns of a study's table that its page shows; of the other studies it shows the findings only."""
 
 
-def between(runs: list[dict[str, float]]) -> dict[str, list[float]]:
+def origin(command: str) -> Entry:
+    """The beginning of an entry: command, date, commit and machine."""
+    commit = subprocess.run(
+        ["git", "describe", "--always", "--dirty"], cwd=DOCS, capture_output=True, text=True, check=True
+    )
+    cpuinfo = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    models = [line.partition(": ")[2] for line in cpuinfo if "model name" in line]
+    cores = len(os.sched_getaffinity(0))
+    return {
+        "command": command,
+        "date": datetime.date.today().isoformat(),
+        "commit": commit.stdout.strip(),
+        "machine": f"{next(iter(models), platform.machine())}, {cores} cores, Python {platform.python_version()}",
+    }
+
+
+def printed(command: str) -> str:
+    """Run a command of canprobe or Python with this interpreter, and what it prints."""
+    words = [w for word in shlex.split(command) for w in INTERPRETED.get(word, [word])]
+    return subprocess.run(words, cwd=DOCS.parent, stdout=subprocess.PIPE, text=True, check=True).stdout
+
+
+def between(runs: Sequence[Mapping[str, float]]) -> dict[str, list[float]]:
     """Lowest and highest of each figure of some runs."""
     return {figure: [round(f(run[figure] for run in runs), 4) for f in (min, max)] for figure in runs[0]}
 
 
-def measure(name: str, seeds: tuple[int, ...]) -> list[dict[str, Any]]:
-    """The summaries of a scene."""
-    return [canprobe.run(canprobe.load_scene(name), seed=seed, files=False).summary for seed in seeds]
+def scene(name: str) -> Entry:
+    """Figures of a packaged scene."""
+    runs = [canprobe.run(name, seed=seed, files=False).summary for seed in SEEDS]
+    return origin("python docs/measure.py") | {
+        "seeds": list(SEEDS),
+        "figures": between([figures_of(run) for run in runs]),
+    }
 
 
-def one_scan(summary: Mapping[str, Any]) -> dict[str, float]:
-    """Rows of the table of one scan on the page on accuracy."""
+def one_scan() -> Entry:
+    """The default scan in lockstep."""
+    runs = [canprobe.run("cylinder", seed=seed, files=False).summary for seed in SEEDS_OF_ONE_SCAN]
+    return origin("canprobe run cylinder --seed 0 … --seed 9") | {"table": _scan_table(runs)}
+
+
+def vcan0() -> Entry:
+    """The same on a real vcan0."""
+    folders = [RUNS / "vcan0" / str(seed) for seed in SEEDS_OF_ONE_SCAN]
+    for seed, folder in zip(SEEDS_OF_ONE_SCAN, folders, strict=True):
+        printed(f"{IN_GUEST}{ON_VCAN0} --force --seed {seed} --out {folder}")
+    runs = [json.loads((folder / "summary.json").read_text(encoding="utf-8")) for folder in folders]
+    return origin(f"{IN_GUEST}{ON_VCAN0} --seed 0 … --seed 9") | {"table": _scan_table(runs)}
+
+
+def _scan_table(runs: Sequence[Row]) -> list[list[str]]:
+    spread = between([_scan_figures(run) for run in runs])
+    rows = [[what, f"{low:g}{'' if low == high else f'–{high:g}'}"] for what, (low, high) in spread.items()]
+    return [["figure", "lowest to highest of the seeds"], *rows]
+
+
+def _scan_figures(summary: Row) -> dict[str, float]:
     contact, shape, cycle = summary["contact"], summary["shape"], summary["cycle"]
     percent = 100.0 / contact["force_target_n"]
     curvature = {name: score["kappa_rms_error_percent"] for name, score in shape["methods"].items()}
     lost = ("missed_pdos", "late_pdos", "torn_frames", "stale_frames", "dropped_frames")
     return {
-        "contact kept during the scan, %": 100.0 * contact["contact_fraction"],
+        "contact kept during the scan, %": round(100.0 * contact["contact_fraction"], 1),
         "contact speed, target 25 mm/s": round(1e3 * contact["speed_mean_m_s"], 2),
         "true force, RMS error, % of 2 N": round(percent * contact["force_rms_error_n"], 1),
         "true force, highest, N": round(contact["force_max_n"], 2),
@@ -58,6 +162,8 @@ def one_scan(summary: Mapping[str, Any]) -> dict[str, float]:
         "contact normal, RMS error, degrees": round(shape["normal_rms_deg"], 2),
         "contact position, RMS error, mm": round(shape["position_rms_mm"], 2),
         "PDOs and tactile frames lost, torn or late": sum(cycle[name] for name in lost),
+        "cycles a second": round(cycle["rate_hz"], 1),
+        "overruns": cycle["overruns"],
         "pace, × real time": round(summary["realtime_factor"], 1),
         "computing time of a cycle of 2.5 ms, median, ms": round(1e-3 * cycle["compute_us"]["p50"], 2),
         "the same, 99 %, ms": round(1e-3 * cycle["compute_us"]["p99"], 2),
@@ -66,49 +172,100 @@ def one_scan(summary: Mapping[str, Any]) -> dict[str, float]:
     }
 
 
-def origin() -> dict[str, str]:
-    """Commit, date and machine: processor, system and Python."""
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    cpuinfo = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    models = [line.partition(": ")[2] for line in cpuinfo if "model name" in line]
-    return {
-        "commit": commit.stdout.strip(),
-        "date": datetime.date.today().isoformat(),
-        "machine": f"{next(iter(models), platform.machine())}, Linux, Python {platform.python_version()}",
+def study(name: str) -> Entry:
+    """Findings and table of a study; its pictures, where the pages show them, are drawn anew."""
+    command = f"canprobe study {name}"
+    if name in ("realtime", "soak"):
+        command = IN_GUEST + command
+    out = RUNS / name
+    printed(f"{command} --out {out}")
+    entry = origin(command) | _found(name, json.loads((out / f"{name}.json").read_text(encoding="utf-8")))
+    for picture in out.glob("*.png"):
+        if (shown := DOCS / "img" / picture.name).exists():
+            Image.open(picture).convert("RGB").quantize(COLOURS).save(shown, optimize=True)
+    return entry
+
+
+def _found(name: str, result: Row) -> Entry:
+    """Findings and table of a study's document."""
+    entry: Entry = {"findings": [line for part in (result, *result.get("more", ())) for line in part["findings"]]}
+    if name in TABLES:
+        chosen, columns = TABLES[name]
+        rows = ([_cell(form, row) for form in columns.values()] for row in chosen(result["rows"]))
+        entry["table"] = [list(columns), *rows]
+    return entry
+
+
+def _cell(form: str, row: Row) -> str:
+    try:
+        return form.format_map(row).replace("%", " %")
+    except TypeError:  # None: does not apply
+        return "–"
+
+
+def bench(file: str) -> list[Row]:
+    """What pytest-benchmark measures of a file of `tests/bench`."""
+    with tempfile.NamedTemporaryFile(suffix=".json") as written:
+        printed(f"python -m pytest -n0 --benchmark-only --benchmark-json={written.name} tests/bench/{file}")
+        benchmarks: list[Row] = json.loads(Path(written.name).read_text(encoding="utf-8"))["benchmarks"]
+    return benchmarks
+
+
+def pace() -> Entry:
+    """What a cycle costs."""
+    command = "python -m pytest -n0 --benchmark-only -s tests/bench/test_bench_pace.py"
+    return origin(command) | {"table": bench("test_bench_pace.py")[0]["extra_info"]["table"]}
+
+
+def gym() -> Entry:
+    """What a step of the environment costs."""
+    ms = {one["name"]: 1e3 * one["stats"]["median"] for one in bench("test_bench_gym.py")}
+    steps = {
+        "step without the estimate": (ms["test_step[without]"], 40.0),
+        "step with it": (ms["test_step[estimate]"], 40.0),
+        "step of two environments in two processes, without it": (ms["test_step_of_two_processes"], 80.0),
     }
+    rows = [[what, f"{each:.1f} ms", f"{of / each:.1f}"] for what, (each, of) in steps.items()]
+    reset = ["reset: plan, bring-up, approach, touch-down, settling", f"{ms['test_reset']:.0f} ms", ""]
+    command = "python -m pytest -n0 --benchmark-only tests/bench/test_bench_gym.py"
+    return origin(command) | {"table": [["", "median", "× real time"], *rows, reset]}
 
 
-def write(measured: Mapping[str, Any]) -> None:
-    """Write the file, a line a scene."""
-    parts = []
-    for key, value in measured.items():
-        text = json.dumps(value, ensure_ascii=False)
-        if key == "scenes":
-            rows = (f"    {json.dumps(name)}: {json.dumps(value[name])}" for name in sorted(value))
-            text = "{\n" + ",\n".join(rows) + "\n  }"
-        parts.append(f"  {json.dumps(key)}: {text}")
-    FILE.write_text("{\n" + ",\n".join(parts) + "\n}\n", encoding="utf-8")
+def learning() -> Entry:
+    """What the example of a policy learns."""
+    command = "python -m canprobe.examples.learn_touch_scan"
+    return origin(command) | {"findings": [line for line in printed(command).splitlines() if "mm², best" not in line]}
 
 
-def main(wanted: list[str]) -> None:
-    """Measure the scenes that are named, or all; the others keep their figures."""
-    head = origin()
-    measured = json.loads(FILE.read_text(encoding="utf-8"))
-    if not wanted:
-        measured = {"seeds": list(SEEDS), "bus": "lockstep", **head, "apart": {}, "one_scan": {}, "scenes": {}}
-    for name, _ in packaged_scenes():
-        if not wanted or name in wanted:
-            summaries = measure(name, SEEDS_OF_ONE_SCAN if name == ONE_SCAN else SEEDS)
-            figures = measured["scenes"][name] = between([figures_of(one) for one in summaries[: len(SEEDS)]])
-            if name == ONE_SCAN:
-                rows = between([one_scan(summary) for summary in summaries])
-                measured["one_scan"] = {"seeds": list(SEEDS_OF_ONE_SCAN), "figures": rows}
-            if wanted:
-                measured["apart"][name] = head
-            print(name, figures, flush=True)
-    write(measured)
+def bridges() -> Entry:
+    """What bridges add to a cycle."""
+    command = "python tests/support/bridges_bench.py"
+    return origin(command) | _found("bridges", json.loads(printed(f"{command} --json")))
+
+
+OTHERS: Mapping[str, Callable[[], Entry]] = {
+    "one_scan": one_scan,
+    "vcan0": vcan0,
+    "pace": pace,
+    "gym": gym,
+    "learning": learning,
+    "bridges": bridges,
+}
+STUDIES = ("estimators", "bound", "arrays", "regions", "shapes", "workprec", "stability", "realtime", *LONG)
+
+
+def main(wanted: Sequence[str]) -> None:
+    """Measure what is named, or all; the rest keeps its figures. The file is written after each."""
+    scenes = [name for name, _ in packaged_scenes()]
+    known = [*scenes, *OTHERS, *STUDIES]
+    if unknown := set(wanted) - set(known):
+        raise SystemExit(f"expected names among {', '.join(known)}; got {', '.join(sorted(unknown))}")
+    for name in wanted or [name for name in known if name not in LONG]:
+        print(name, flush=True)
+        entry = scene(name) if name in scenes else OTHERS[name]() if name in OTHERS else study(name)
+        measured = json.loads(FILE.read_text(encoding="utf-8")) if FILE.exists() else {"scenes": {}}
+        (measured["scenes"] if name in scenes else measured)[name] = entry
+        FILE.write_text(json.dumps(measured, indent=1, ensure_ascii=False, sort_keys=True) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

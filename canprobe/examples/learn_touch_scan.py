@@ -106,7 +106,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             print("; ".join(f"{name} {value:.2f}" for name, value in zip(NAMES, theta, strict=True)))
         for objects in canprobe.gym.OBJECTS:
             test = range(10_000, 10_000 + args.test)
-            for speed in (0.4, 0.6, 0.8):
+            for speed in (0.3, 0.4, 0.6, 0.8):
                 mean = returns(pool, [fixed(speed)], test, objects).mean()
                 print(f"{objects}: fixed force, {speed:.0%} of the highest speed: {mean:.1f} mm²", flush=True)
             means = returns(pool, learned, test, objects).mean(axis=1)

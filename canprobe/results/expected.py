@@ -1,4 +1,5 @@
-"""What the packaged scenes are measured to do: `scenes/expected.json`, which `python docs/measure.py` writes.
+"""What the packaged scenes are measured to do: `scenes/expected.json`, which `python docs/generate.py` takes from what
+`python docs/measure.py` measured.
 
 A figure is the lowest and the highest value over some seeds of the emulation. It says whether an own run is as good as
 it should be: the scenes differ in what can be had of them.
@@ -26,7 +27,7 @@ SHORT = ("force", "curvature", "curvature_per_m", "tool")
 
 
 def read_expected() -> dict[str, Any]:
-    """The whole file: `seeds`, `bus`, `commit`, `date`, `machine`, and by scene the figures."""
+    """The whole file: `seeds`, and `scenes` with the figures of each."""
     file = resources.files("canprobe") / "scenes" / "expected.json"
     read: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
     return read

@@ -251,19 +251,21 @@ def _interval(values: Array) -> tuple[float, float]:
 def findings(rows: Sequence[Row]) -> list[str]:
     """Coverage of each group, and the kinds outside what is asked for."""
     said = []
-    for row in rows:
-        share = 100 * row["coverage"]
-        if row["of"] == "all":
-            answering = row["scenes"] - row["refused"]
-            said.append(
-                f"{row['group']} scenes: {share:.1f} % of {row['answers']} regions hold the truth "
-                f"({100 * row['coverage_low']:.1f} to {100 * row['coverage_high']:.1f} by scenes drawn anew; asked "
-                f"for: 93–97 %), below 80 % in {100 * row['below_80']:.1f} % of {answering} scenes and below 40 % in "
-                f"{100 * row['below_40']:.1f} %; stated over error {row['stated_over_error']:.2f}; "
-                f"{row['refused']} scenes refused."
-            )
-        elif not ASKED[0] <= row["coverage"] <= ASKED[1]:
-            said.append(f"  {row['group']}, {row['of']}: {share:.1f} %.")
+    for whole in (row for row in rows if row["of"] == "all"):
+        answering = whole["scenes"] - whole["refused"]
+        said.append(
+            f"{whole['group']} scenes: {100 * whole['coverage']:.1f} % of {whole['answers']} regions hold the truth "
+            f"({100 * whole['coverage_low']:.1f} to {100 * whole['coverage_high']:.1f} by scenes drawn anew; asked "
+            f"for: 93–97 %), below 80 % in {100 * whole['below_80']:.1f} % of {answering} scenes and below 40 % in "
+            f"{100 * whole['below_40']:.1f} %; stated over error {whole['stated_over_error']:.2f}; "
+            f"{100 * whole['observed']:.1f} % of the answers observe all of K; {whole['refused']} scenes refused."
+        )
+        outside = [
+            f"{row['of']} {100 * row['coverage']:.1f} %"
+            for row in rows
+            if row["group"] == whole["group"] and row is not whole and not ASKED[0] <= row["coverage"] <= ASKED[1]
+        ]
+        said.append(f"  outside what is asked for: {', '.join(outside) or 'none'}.")
     return said
 
 

@@ -3,17 +3,15 @@
 Each figure comes from runs in processes of their own, one after the other in turn, so that what else the machine does
 hits all of them. A cycle's cost is processor time from the first to the last cycle of the task, without bring-up; a
 ratio is the median over the turns of the ratio within a turn. The reference is an older commit, taken from the history.
-The table is the one of docs/accuracy.md.
+The table is that of docs/accuracy.md: `python docs/measure.py pace` writes it there.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import platform
 import subprocess
 import sys
-from datetime import date
 from pathlib import Path
 from statistics import median
 
@@ -93,10 +91,8 @@ def test_bench_pace(benchmark, reference):
 
     cost = {name: median(turn[name]["us"] for turn in turns) for name in cases}
     after = {name: median(turn[name]["after_s"] for turn in turns) for name in cases}
-    print(f"\n{date.today()}, {machine()}; medians of {TURNS} turns, {DURATION_S:g} s of scan each\n")
     rows = [
-        ("", "measured", "goal"),
-        ("---", "---", "---"),
+        (f"medians of {TURNS} turns, {DURATION_S:g} s of scan each", "measured", "goal"),
         *(
             (f"{name}, processor time a cycle", f"{us:.0f} µs, {PERIOD_US / us:.1f} × real time", "")
             for name, us in cost.items()
@@ -111,11 +107,5 @@ def test_bench_pace(benchmark, reference):
         ),
         ("behind the last cycle", f"{after['lockstep']:.1f} s, {REFERENCE}: {after['reference']:.1f} s", "1.0 s"),
     ]
-    print("\n".join(f"| {' | '.join(row)} |" for row in rows))
-
-
-def machine():
-    """Processor and Python."""
-    lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    name = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())
-    return f"{name}, {len(os.sched_getaffinity(0))} cores, Python {platform.python_version()}"
+    benchmark.extra_info["table"] = rows
+    print("\n" + "\n".join(f"| {' | '.join(row)} |" for row in rows))

@@ -1,4 +1,4 @@
-"""The reference of all scene keys: generated from the dataclasses, whole, and up to date."""
+"""What `docs/generate.py` writes: the reference of all scene keys, whole, and all that was measured; up to date."""
 
 import dataclasses
 import importlib.util
@@ -25,11 +25,17 @@ def test_every_key_has_a_meaning(section):
     assert all(text.endswith(".") for text in texts.values())
 
 
-def test_the_page_is_what_the_script_prints():
-    page = (DOCS / "scene-keys.md").read_text(encoding="utf-8")
-    assert page == generate.scene_keys(), "type: python docs/generate.py"
-    scenes = (DOCS / "scenes.md").read_text(encoding="utf-8")
-    assert scenes == generate.with_expected(scenes), "type: python docs/generate.py"
+def test_all_files_are_what_the_script_writes():
+    files = dict(generate.pages())
+    assert {path.name for path in files} >= {"expected.json", "README.md", "scene-keys.md", "gallery.md", "accuracy.md"}
+    for path, text in files.items():
+        assert path.read_text(encoding="utf-8") == text, "type: python docs/generate.py"
+
+
+def test_all_that_was_measured_is_on_a_page():
+    """So that no figure is measured for nothing, and no page names what was not measured."""
+    named = [found[2] for page in DOCS.glob("*.md") for found in generate.MARKED.finditer(page.read_text("utf-8"))]
+    assert sorted(named) == sorted(set(named)) == sorted(generate.read_measured())
 
 
 def test_a_key_has_its_value_unit_default_condition_and_meaning():

@@ -7,6 +7,7 @@ included. The first second does not count.
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
@@ -31,7 +32,7 @@ from canprobe.scene.load import load_scene
 from canprobe.scene.resolve import resolve
 from canprobe.session.children import Bridges
 from canprobe.session.session import Session, with_bridges
-from canprobe.studies.harness import Column, Row, StudyResult, measuring_facts, text_of
+from canprobe.studies.harness import Column, Row, StudyResult, as_document, measuring_facts, text_of
 from canprobe.tasks.from_plan import make_task
 
 # What packages take on disk, with everything that they need and canprobe itself does not.
@@ -231,5 +232,6 @@ def _draw(rows: Sequence[Row], path: Path) -> None:
         legend(figure)
 
 
-if __name__ == "__main__":  # python tests/support/bridges_bench.py [--quick]
-    print(text_of(run(quick="--quick" in sys.argv, sweep=None)))
+if __name__ == "__main__":  # python tests/support/bridges_bench.py [--quick] [--json]
+    found = run(quick="--quick" in sys.argv, sweep=None)
+    print(json.dumps(as_document(found)) if "--json" in sys.argv else text_of(found))
