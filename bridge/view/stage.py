@@ -309,7 +309,7 @@ class Panel:
         gui.set_panel_label(f"canprobe · {scene.name}")
         self._target = scene.task.force_n if scene.task.kind in ("scan", "press") else None
         self._status = gui.add_html("")
-        gui.add_html(_legend(scene, stage.notes))
+        gui.add_html(_PHONE + _legend(scene, stage.notes))
         stage.add_switches(gui)
         self._plots: list[tuple[Any, tuple[str, ...]]] = []
         self._taxels = None
@@ -371,6 +371,13 @@ class Panel:
             yield f"samples dropped: {moment.dropped}"
 
 
+_PHONE = """<style>
+@media (max-width: 36em) { /* where viser lays its panel over the lower part of the picture: below it, as wide as both */
+  #root:has([aria-hidden="false"] .mantine-InputWrapper-root) > div { height: 58vh !important; }
+  .mantine-Paper-root[style*="position: fixed"] { max-height: 42vh !important; width: 100% !important; }
+  .mantine-Paper-root[style*="position: fixed"] .mantine-ScrollArea-content > div { width: 100% !important; }
+}
+</style>"""
 _STYLED = '<div style="padding: 0 0.6em 0.4em; font-size: 0.9em; line-height: 1.5">{}</div>'
 
 
