@@ -166,7 +166,11 @@ def read_measured() -> dict[str, Any]:
 
 def with_measured(page: str, measured: Mapping[str, Any]) -> str:
     """A page with what was measured between its marks: `<!-- measured NAME -->` and `<!-- /measured -->`."""
-    return MARKED.sub(lambda found: f"{found[1]}\n\n{_block(found[2], measured)}\n\n{found[3]}", page)
+
+    def block(found: re.Match[str]) -> str:
+        return f"{found[1]}\n\n{_block(found[2], measured)}\n\n{found[3]}" if found[2] in measured else found[0]
+
+    return MARKED.sub(block, page)
 
 
 def _block(name: str, measured: Mapping[str, Any]) -> str:

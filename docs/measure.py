@@ -86,18 +86,17 @@ TABLES: Mapping[str, tuple[Callable[[Sequence[Row]], Sequence[Row]], Columns]] =
 """Rows and columns of a study's table that its page shows; of the other studies it shows the findings only."""
 
 
-def origin(command: str) -> Entry:
-    """The beginning of an entry: command, date, commit and machine."""
-    commit = subprocess.run(
-        ["git", "describe", "--always", "--dirty"], cwd=DOCS, capture_output=True, text=True, check=True
-    )
+def origin() -> Entry:
+    """Date, commit and machine, as they are when a measurement begins."""
+    git = ["git", "-C", str(DOCS.parent)]
+    commit = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
+    changed = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", "canprobe", "bridge", "eds", "tests"], check=False)
     cpuinfo = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     models = [line.partition(": ")[2] for line in cpuinfo if "model name" in line]
     cores = len(os.sched_getaffinity(0))
     return {
-        "command": command,
         "date": datetime.date.today().isoformat(),
-        "commit": commit.stdout.strip(),
+        "commit": commit.stdout.strip() + ("-dirty" if changed.returncode else ""),
         "machine": f"{next(iter(models), platform.machine())}, {cores} cores, Python {platform.python_version()}",
     }
 
@@ -116,7 +115,8 @@ def between(runs: Sequence[Mapping[str, float]]) -> dict[str, list[float]]:
 def scene(name: str) -> Entry:
     """Figures of a packaged scene."""
     runs = [canprobe.run(name, seed=seed, files=False).summary for seed in SEEDS]
-    return origin("python docs/measure.py") | {
+    return {
+        "command": "python docs/measure.py",
         "seeds": list(SEEDS),
         "figures": between([figures_of(run) for run in runs]),
     }
@@ -125,7 +125,7 @@ def scene(name: str) -> Entry:
 def one_scan() -> Entry:
     """The default scan in lockstep."""
     runs = [canprobe.run("cylinder", seed=seed, files=False).summary for seed in SEEDS_OF_ONE_SCAN]
-    return origin("canprobe run cylinder --seed 0 … --seed 9") | {"table": _scan_table(runs)}
+    return {"command": "canprobe run cylinder --seed 0 … --seed 9", "table": _scan_table(runs)}
 
 
 def vcan0() -> Entry:
@@ -134,7 +134,7 @@ def vcan0() -> Entry:
     for seed, folder in zip(SEEDS_OF_ONE_SCAN, folders, strict=True):
         printed(f"{IN_GUEST}{ON_VCAN0} --force --seed {seed} --out {folder}")
     runs = [json.loads((folder / "summary.json").read_text(encoding="utf-8")) for folder in folders]
-    return origin(f"{IN_GUEST}{ON_VCAN0} --seed 0 … --seed 9") | {"table": _scan_table(runs)}
+    return {"command": f"{IN_GUEST}{ON_VCAN0} --seed 0 … --seed 9", "table": _scan_table(runs)}
 
 
 def _scan_table(runs: Sequence[Row]) -> list[list[str]]:
@@ -179,7 +179,7 @@ def study(name: str) -> Entry:
         command = IN_GUEST + command
     out = RUNS / name
     printed(f"{command} --out {out}")
-    entry = origin(command) | _found(name, json.loads((out / f"{name}.json").read_text(encoding="utf-8")))
+    entry = {"command": command} | _found(name, json.loads((out / f"{name}.json").read_text(encoding="utf-8")))
     for picture in out.glob("*.png"):
         if (shown := DOCS / "img" / picture.name).exists():
             Image.open(picture).convert("RGB").quantize(COLOURS).save(shown, optimize=True)
@@ -214,7 +214,7 @@ def bench(file: str) -> list[Row]:
 def pace() -> Entry:
     """What a cycle costs."""
     command = "python -m pytest -n0 --benchmark-only -s tests/bench/test_bench_pace.py"
-    return origin(command) | {"table": bench("test_bench_pace.py")[0]["extra_info"]["table"]}
+    return {"command": command, "table": bench("test_bench_pace.py")[0]["extra_info"]["table"]}
 
 
 def gym() -> Entry:
@@ -228,19 +228,19 @@ def gym() -> Entry:
     rows = [[what, f"{each:.1f} ms", f"{of / each:.1f}"] for what, (each, of) in steps.items()]
     reset = ["reset: plan, bring-up, approach, touch-down, settling", f"{ms['test_reset']:.0f} ms", ""]
     command = "python -m pytest -n0 --benchmark-only tests/bench/test_bench_gym.py"
-    return origin(command) | {"table": [["", "median", "× real time"], *rows, reset]}
+    return {"command": command, "table": [["", "median", "× real time"], *rows, reset]}
 
 
 def learning() -> Entry:
     """What the example of a policy learns."""
     command = "python -m canprobe.examples.learn_touch_scan"
-    return origin(command) | {"findings": [line for line in printed(command).splitlines() if "mm², best" not in line]}
+    return {"command": command, "findings": [line for line in printed(command).splitlines() if "mm², best" not in line]}
 
 
 def bridges() -> Entry:
     """What bridges add to a cycle."""
     command = "python tests/support/bridges_bench.py"
-    return origin(command) | _found("bridges", json.loads(printed(f"{command} --json")))
+    return {"command": command} | _found("bridges", json.loads(printed(f"{command} --json")))
 
 
 OTHERS: Mapping[str, Callable[[], Entry]] = {
@@ -262,7 +262,8 @@ def main(wanted: Sequence[str]) -> None:
         raise SystemExit(f"expected names among {', '.join(known)}; got {', '.join(sorted(unknown))}")
     for name in wanted or [name for name in known if name not in LONG]:
         print(name, flush=True)
-        entry = scene(name) if name in scenes else OTHERS[name]() if name in OTHERS else study(name)
+        where = origin()
+        entry = where | (scene(name) if name in scenes else OTHERS[name]() if name in OTHERS else study(name))
         measured = json.loads(FILE.read_text(encoding="utf-8")) if FILE.exists() else {"scenes": {}}
         (measured["scenes"] if name in scenes else measured)[name] = entry
         FILE.write_text(json.dumps(measured, indent=1, ensure_ascii=False, sort_keys=True) + "\n", encoding="utf-8")
