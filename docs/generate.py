@@ -190,8 +190,7 @@ def _table(rows: Iterable[Sequence[str]]) -> str:
 
 def _item(line: str) -> str:
     """A finding as an item of a list; one that is set in belongs to the item before."""
-    text = line.strip()
-    return f"{'    ' if line[0] == ' ' else ''}- {text[0].upper()}{text[1:].rstrip('.')}."
+    return f"{'    ' if line[0] == ' ' else ''}- {line.strip()}"
 
 
 def _where(entry: Mapping[str, Any]) -> str:
