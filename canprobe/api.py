@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
+from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from canprobe.bus.scheduling import interrupts_held, interrupts_repeated
-from canprobe.cell.controller import Command, Controller, Measurement, as_controller
+from canprobe.cell.array import patch_from
+from canprobe.cell.controller import Command, Controller, Measurement, TactileSample, as_controller
 from canprobe.cell.cycle import Observation, Observer, Observers
 from canprobe.errors import CanprobeError, ResultsError, UsageError
 from canprobe.planning.make import make_plan
 from canprobe.planning.model import Plan
 from canprobe.results.summary import RunResult, log_columns, summarise, tactile_columns, write_files
+from canprobe.robot.chain import Array, forward_jacobian
 from canprobe.scene.load import load_scene
 from canprobe.scene.model import Scene
 from canprobe.scene.resolve import resolve
@@ -31,8 +34,11 @@ from canprobe.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
 from canprobe.tasks.task import TaskRecord, record_of
 
 if TYPE_CHECKING:
+    import numpy.typing as npt
+
     from canprobe.results.contacts import Contacts
     from canprobe.touch.consistency import Consistency
+    from canprobe.touch.patch.image import Patch
     from canprobe.touch.surface_map import SurfaceMap
 
 __all__ = [
@@ -254,6 +260,41 @@ class OpenCell(Session):
             raise
         finally:
             self._finish(failure)
+
+    def patch(self, sample: TactileSample) -> Patch:
+        """What the array says of the contact: force, N, and place on the pad, m, with what makes them doubtful.
+
+        Args:
+            sample: of a measurement, `measurement.tactile`.
+
+        Raises:
+            UsageError: the scene has no array.
+        """
+        if self._patch_from is None:
+            raise UsageError(f"{self.plan.setup.name}: expected a scene with an array; got one without")
+        return self._patch_from(sample)
+
+    @cached_property
+    def _patch_from(self) -> Callable[[TactileSample], Patch] | None:
+        return patch_from(self.plan.setup)
+
+    def probe(self, q: npt.ArrayLike) -> tuple[Array, Array]:
+        """Where joint positions put the probe, and how it moves with them.
+
+        Args:
+            q: (n,) joint positions, rad or m.
+
+        Returns:
+            (4, 4) pose of the probe's centre in the base frame, m, whose z axis is the pole; and (6, n) its Jacobian:
+            velocity (rows 0-2) and angular velocity (3-5) in the base frame, per rate of each joint.
+
+        Raises:
+            UsageError: the scene has no arm.
+        """
+        setup = self.plan.setup
+        if setup.arm is None:
+            raise UsageError(f"{setup.name}: expected a scene with an arm; got one without")
+        return forward_jacobian(setup.arm.model.chain, q, setup.probe.T_flange_probe)
 
     def run(  # type: ignore[override]
         self,

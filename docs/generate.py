@@ -70,6 +70,10 @@ A scene is a TOML file. `canprobe scenes` lists the packaged ones and prints the
 change it. `canprobe plan FILE` checks a scene and reports every mistake at once, with the key and, where a name is
 misspelt, the name that was probably meant.
 
+`cell = "NAME"` above the first section names the cell, arm and array, that the scene runs on: a packaged one
+(`canprobe cells`) or the path of a file; `puma260` without this line. `[arm]` and `[sensor]` say that the scene uses
+the arm and the array of the cell, and may be empty.
+
 A key that a scene leaves out has the value of its cell ([Your own arm](own-arm.md)), then that of the array file that
 the cell names ([Your own array](own-array.md)), or else its default. The suffix of a key is its unit. Numbers may be
 written with or without a decimal point. `"auto"` leaves the choice to the plan, which prints what it chose and why.

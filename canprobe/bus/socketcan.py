@@ -326,8 +326,8 @@ def check_interface(channel: str, setting: str | None = None) -> None:
     if not has_socketcan():
         raise InterfaceError(
             f"{channel}: this kernel has no SocketCAN (AF_CAN); without it run on --bus lockstep (virtual time) or"
-            " --bus udp_multicast --channel 239.74.163.2 (real time), or run COMMAND with a real vcan0 in a virtual"
-            " machine: canprobe vcan -- COMMAND"
+            " --bus udp_multicast --channel 239.74.163.2 --patient (real time), or run COMMAND with a real vcan0 in a"
+            " virtual machine: canprobe vcan -- COMMAND"
         )
     with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as probe:
         try:

@@ -250,7 +250,7 @@ def _overruns(seen: Seen) -> SafetyStop | None:
     if seen.late_share <= seen.limits.safety.late_share:
         return None
     return SafetyStop(
-        f"{100 * seen.late_share:.0f} % of the last second's cycles came more than half a period late,"
+        f"{100 * seen.late_share:.1f} % of the last second's cycles came more than half a period late,"
         f" limit {100 * seen.limits.safety.late_share:.0f} %"
     )
 

@@ -239,7 +239,10 @@ def scene_of(args: argparse.Namespace) -> Scene:
     scene = loaded(args)
     if args.patient:
         if _has_real_nodes(scene):
-            raise UsageError("--patient is for emulated nodes: real drives must stop soon after their master")
+            raise UsageError(
+                "--patient is for emulated nodes: real drives must stop soon after their master; for nodes of `canprobe"
+                f" emulate`: --set arm.missed_syncs={PATIENT_SYNCS} --set limits.late_cycles_max_percent=100"
+            )
         arm = {} if scene.arm is None else {"arm.missed_syncs": PATIENT_SYNCS}
         scene = load_scene(scene, {"limits.late_cycles_max_percent": 100.0, **arm})
     return target_of(args, scene).applied_to(scene)

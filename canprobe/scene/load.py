@@ -487,7 +487,8 @@ class Reader:
         annotations = typing.get_type_hints(cls, include_extras=True)
         for key in table:
             if key not in annotations:
-                self.complain(f"{name}.{key}", f"unknown key{_did_you_mean(key, annotations)}")
+                above = '; cell = "NAME" stands above the first section' if key == "cell" else ""
+                self.complain(f"{name}.{key}", f"unknown key{above or _did_you_mean(key, annotations)}")
         values: dict[str, Any] = {}
         for field in dataclasses.fields(cls):
             path, annotation = f"{name}.{field.name}", annotations[field.name]

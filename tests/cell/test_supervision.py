@@ -50,7 +50,7 @@ def touch(force=2.0, age=2, lost_s=0.0):
         ("contact_lost", touch(lost_s=0.0299), touch(lost_s=0.0301), "contact lost"),
         ("drive_late", with_ages(0, 2), with_ages(0, 3), "node 2: no usable TPDO for 3 cycles"),
         ("drive_silent", with_ages(5, 0), with_ages(6, 0), "node 1: lost: no usable TPDO for 6 cycles"),
-        ("overruns", seen(late_share=0.8), seen(late_share=0.81), "81 % of the last second's cycles"),
+        ("overruns", seen(late_share=0.8), seen(late_share=0.81), "81.0 % of the last second's cycles"),
         (
             "error_passive_long",
             seen(passive_ns=1_000_000_000, **PASSIVE),
