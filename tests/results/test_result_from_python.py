@@ -127,3 +127,36 @@ def test_the_page_is_written_once_and_opened_where_there_is_a_browser(result, mo
     monkeypatch.delenv("DISPLAY")
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     assert page.page_of(tmp_path)._repr_html_().startswith('<iframe srcdoc="&lt;p&gt;kept"') and len(opened) == 1
+
+
+# What a cell tells a controller of one's own.
+
+
+def test_a_controller_is_told_the_force_and_the_pose_of_the_probe():
+    """Pressed down along the pole: the force that the array feels is that of the plant, the pose that of the probe."""
+    felt, q = [], None
+
+    def press(measurement):
+        nonlocal q
+        T_base_probe, J = cell.probe(measurement.q if q is None else q)
+        assert J.shape == (6, 6)
+        down = np.linalg.lstsq(J, np.concatenate([5e-6 * T_base_probe[:3, 2], np.zeros(3)]), rcond=None)[0]
+        q = (measurement.q if q is None else q) + down
+        if measurement.tactile is not None:
+            felt.append(cell.patch(measurement.tactile))
+        return canprobe.Command(q_target=q, done=bool(felt) and felt[-1].force > 0.5)
+
+    with canprobe.open_cell("press", bus="direct") as cell:
+        result = cell.run(press)
+    assert felt[-1].good
+    late = result.truth["force"][-40:]
+    assert late.min() * 0.9 < felt[-1].force < late.max() * 1.1
+    T_base_probe, _ = cell.probe(result.truth["q"][-1])
+    assert T_base_probe[:3, 3] == pytest.approx(result.truth["probe_centre"][-1], abs=1e-9)
+
+
+@pytest.mark.parametrize(("scene", "method", "lacks"), [("free", "patch", "an array"), ("listen", "probe", "an arm")])
+def test_a_cell_without_array_or_arm_says_so(scene, method, lacks):
+    cell = canprobe.open_cell(scene)
+    with pytest.raises(UsageError, match=f"^{scene}: expected a scene with {lacks}; got one without$"):
+        getattr(cell, method)(None)
