@@ -372,7 +372,7 @@ class Panel:
 
 
 _PHONE = """<style>
-@media (max-width: 36em) { /* where viser lays its panel over the lower part of the picture: below it, as wide as both */
+@media (max-width: 36em) { /* where viser lays its panel over the lower part of the picture: below it, as wide */
   #root:has([aria-hidden="false"] .mantine-InputWrapper-root) > div { height: 58vh !important; }
   .mantine-Paper-root[style*="position: fixed"] { max-height: 42vh !important; width: 100% !important; }
   .mantine-Paper-root[style*="position: fixed"] .mantine-ScrollArea-content > div { width: 100% !important; }
