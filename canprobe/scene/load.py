@@ -485,9 +485,15 @@ class Reader:
         if not isinstance(table, dict):
             return self.complain(name, f"expected a section [{name}], got {toml_value(table)}")
         annotations = typing.get_type_hints(cls, include_extras=True)
+        defaults = {field.name: field.default for field in dataclasses.fields(cls)}
+        belong = [
+            key
+            for key, annotation in annotations.items()
+            if all({**defaults, **table}[only.key] in only.values for only in conditions_of(annotation, Only))
+        ]
         for key in table:
             if key not in annotations:
-                self.complain(f"{name}.{key}", f"unknown key{_did_you_mean(key, annotations)}")
+                self.complain(f"{name}.{key}", f"unknown key{_did_you_mean(key, belong)}")
         values: dict[str, Any] = {}
         for field in dataclasses.fields(cls):
             path, annotation = f"{name}.{field.name}", annotations[field.name]
