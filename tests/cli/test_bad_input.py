@@ -109,10 +109,18 @@ def test_a_hollow_tighter_than_the_probe(command, tmp_path):
 
 
 @pytest.mark.parametrize("command", ["run", "plan"])
-def test_an_object_out_of_reach(command, tmp_path):
-    scene = edited(tmp_path, "cylinder", ("[-120, -122.5, 374]", "[-500, -122.5, 374]"))
+@pytest.mark.parametrize(
+    ("place", "contact"),
+    [
+        ("[-500, -122.5, 374]", "(-500.0, -122.5, 377.0) mm out of reach"),
+        ("[-0.5, -0.1225, 0.374]", "(-0.5, -0.1, 3.4) mm (are these metres?) out of reach"),
+    ],
+)
+def test_an_object_out_of_reach(command, place, contact, tmp_path):
+    scene = edited(tmp_path, "cylinder", ("[-120, -122.5, 374]", place))
     (line,) = lines_of(tmp_path, 2, command, scene)
-    assert line.startswith("canprobe: task: contact at (-500.0, -122.5, 377.0) mm out of reach")
+    assert line.startswith(f"canprobe: task: contact at {contact}")
+    assert line.count("move the object") == 1
 
 
 def test_an_eds_file_that_does_not_exist(tmp_path):
