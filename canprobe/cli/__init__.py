@@ -73,6 +73,8 @@ def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911 - one per w
         an unexpected error.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
+    if arguments[:1] == ["help"]:
+        arguments = [*arguments[1:], "--help"]
     if "_ARGCOMPLETE" in os.environ:
         complete(parser_of, COMMANDS)
     _prepare_streams()
@@ -136,6 +138,8 @@ def parser_of(arguments: Sequence[str]) -> Parser:
     named = next((word for word in arguments if not word.startswith("-")), None)
     if named is not None and named not in COMMANDS:
         parser.error(f"unknown command {named!r}{did_you_mean(named, COMMANDS)}; commands: {', '.join(COMMANDS)}")
+    if named is None and (unknown := [word for word in arguments if word not in parser._option_string_actions]):
+        parser.refuse_unknown(unknown)
     commands = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
     for name in (named,) if named else COMMANDS:
         command = importlib.import_module(f"canprobe.cli.{name}")

@@ -66,8 +66,9 @@ def test_help_has_examples_of_its_command_that_parse(command, capsys):
         parse(line)
 
 
-def test_help_lists_every_command(capsys):
-    main(["--help"])
+@pytest.mark.parametrize("word", ["--help", "help"])
+def test_help_lists_every_command(word, capsys):
+    assert main([word]) == 0
     out = capsys.readouterr().out
     assert all(f"    {command}" in out for command in COMMANDS)
 
@@ -83,7 +84,9 @@ def test_version(capsys):
         ([], ("COMMAND",)),
         (["runn"], ("unknown command 'runn'", "did you mean run?")),
         (["run"], ("SCENE",)),
-        (["run", "cylinder", "--sead", "3"], ("--sead",)),
+        (["--versoin"], ("unrecognized arguments: --versoin; did you mean --version?",)),
+        (["run", "cylinder", "--sead", "3"], ("--sead 3; did you mean --seed?", "see canprobe run --help")),
+        (["eds", "list", "--no-such"], ("see canprobe eds list --help",)),
         (["run", "cylinder", "--seed", "-1"], ("--seed", "'-1'")),
         (["run", "cylinder", "--seed", "x"], ("--seed", "an integer from 0")),
         (["run", "cylinder", "--duration", "0"], ("--duration", "seconds above 0")),
