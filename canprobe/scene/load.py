@@ -158,7 +158,7 @@ def load_scene(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = 
             packaged = packaged_files("cells")
         path = find_file(name, packaged, "scene")
         file, folder = path.name if name in packaged else name, path.parent
-        own = read_toml(path, file)
+        own = read_toml(path, file, "; `canprobe scenes` lists the packaged ones")
     else:
         raise UsageError(f"scene: expected a packaged name, the path of a TOML file or a Scene, got {scene!r}")
     if overrides:
@@ -316,8 +316,8 @@ def parse_scene(text: str, *, file: str = "scene", folder: Path | None = None) -
     return _scene(parse_toml(text, file), file, folder)
 
 
-def read_toml(path: Path, file: str) -> dict[str, Any]:
-    """The document of a TOML file, whose messages call it `file`.
+def read_toml(path: Path, file: str, else_what: str = "") -> dict[str, Any]:
+    """The document of a TOML file, whose messages call it `file`; `else_what` ends that of a file that is missing.
 
     Raises:
         SceneError: it cannot be read, or is not TOML.
@@ -325,7 +325,8 @@ def read_toml(path: Path, file: str) -> dict[str, Any]:
     try:
         return parse_toml(path.read_text(encoding="utf-8-sig"), file)  # some editors begin with a byte order mark
     except OSError as error:
-        raise SceneError([f"{file}: cannot be read: {error.strerror}"]) from error
+        hint = else_what if isinstance(error, FileNotFoundError) else ""
+        raise SceneError([f"{file}: cannot be read: {error.strerror}{hint}"]) from error
     except UnicodeDecodeError as error:
         raise SceneError([f"{file}: not UTF-8 text: byte {error.start} is {error.object[error.start]:#04x}"]) from error
 

@@ -77,6 +77,12 @@ def test_unknown_scene(command, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_view_says_that_a_folder_was_possible_too(tmp_path):
+    scene, folder = lines_of(tmp_path, 2, "view", "nope", "--no-open")
+    assert "no such scene or file" in scene and "nor is there a folder of a run" in folder
+    assert len(lines_of(tmp_path, 2, "view", "press", "--set", "task.forc_n=3")) == 1
+
+
 def test_wrong_keys_are_all_told_with_file_path_and_suggestion(tmp_path):
     scene = edited(tmp_path, "cylinder", ("force_n = 2", "force_m = 2"), ("[arm]", "[arm]\nemulatd = true"))
     assert lines_of(tmp_path, 2, "run", scene) == [

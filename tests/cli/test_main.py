@@ -98,7 +98,7 @@ def test_version(capsys):
         (["run", "cylinder", "--channel", "can1=vcan0"], ("no channel can1", "only can0", "did you mean can0?")),
         (["run", "cylinder", "--channel", "vcan0", "--channel", "vcan1"], ("given 2 times",)),
         (["run", "cilinder"], ("no such scene", "did you mean cylinder?")),
-        (["plan", "none.toml"], ("none.toml", "cannot be read")),
+        (["plan", "none.toml"], ("none.toml", "cannot be read", "`canprobe scenes` lists the packaged ones")),
         (["plan", "free", "--measured", "run", "--export", "dcf"], ("--measured", "no --export or --figure")),
         (["emulate", "cylinder"], ("--channel", "missing")),
         (["emulate", "cylinder", "--channel", "vcan0", "--nodes", "6-1"], ("--nodes", "1-6,16")),
