@@ -6,6 +6,7 @@ import argparse
 import difflib
 import math
 import re
+import textwrap
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -22,11 +23,21 @@ if TYPE_CHECKING:
 # One clear line for a wrong command line.
 
 
+class _Formatter(argparse.RawDescriptionHelpFormatter):
+    """Paragraphs are as wide as the terminal; lists and examples, which are indented, stay as written."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        return "\n\n".join(
+            part if "\n " in part else textwrap.fill(part, width, break_on_hyphens=False, break_long_words=False)
+            for part in text.split("\n\n")
+        )
+
+
 class Parser(argparse.ArgumentParser):
     """An argument parser that keeps examples as written and complains in one line."""
 
     def __init__(self, **settings: object) -> None:
-        settings.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
+        settings.setdefault("formatter_class", _Formatter)
         settings.setdefault("allow_abbrev", False)
         super().__init__(**settings)  # type: ignore[arg-type]
 
