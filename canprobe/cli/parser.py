@@ -258,6 +258,7 @@ def scene_of(args: argparse.Namespace) -> Scene:
         UsageError: --patient is given and a node is real, or as `target_of`.
     """
     from canprobe.scene.load import load_scene
+    from canprobe.session.target import VIRTUAL
 
     scene = loaded(args)
     if args.patient:
@@ -265,7 +266,10 @@ def scene_of(args: argparse.Namespace) -> Scene:
             raise UsageError("--patient is for emulated nodes: real drives must stop soon after their master")
         arm = {} if scene.arm is None else {"arm.missed_syncs": PATIENT_SYNCS}
         scene = load_scene(scene, {"limits.late_cycles_max_percent": 100.0, **arm})
-    return target_of(args, scene).applied_to(scene)
+    scene = target_of(args, scene).applied_to(scene)
+    if args.realtime and scene.bus.interface in VIRTUAL:
+        args.report.say(f"warning: --realtime has no effect on bus {scene.bus.interface}, whose time is virtual")
+    return scene
 
 
 def loaded(args: argparse.Namespace) -> Scene:

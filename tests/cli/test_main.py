@@ -267,6 +267,12 @@ def test_keys_are_set_as_a_file_has_them(command, calls):
     assert (scene.task.swing_period_s, scene.title, scene.cycle.realtime) == (3.0, "a = b", True)
 
 
+@pytest.mark.parametrize(("bus", "said"), [("lockstep", True), ("direct", True), ("socketcan", False)])
+def test_realtime_on_a_bus_in_virtual_time_is_said_to_have_no_effect(bus, said, calls, capsys):
+    assert main(["run", "free", "--bus", bus, "--realtime"]) == 0
+    assert ("warning: --realtime has no effect" in capsys.readouterr().err) == said
+
+
 def test_run_takes_the_scenes_bus_by_default(calls):
     assert main(["run", "free"]) == 0
     ((_, (scene,), kwargs),) = calls
