@@ -106,8 +106,9 @@ def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911 - one per w
     except KeyboardInterrupt as interrupt:
         return 143 if isinstance(interrupt, Terminated) else 130
     except Exception as error:
-        if isinstance(error, ModuleNotFoundError) and (extra := EXTRA_OF.get((error.name or "").partition(".")[0])):
-            return _complain(report, f"{arguments[0]} needs {error.name}: {install_line(extra)}", 2)
+        package = (error.name or "").partition(".")[0] if isinstance(error, ModuleNotFoundError) else ""
+        if package in EXTRA_OF:
+            return _complain(report, f"{arguments[0]}: needs {package}; type: {install_line(EXTRA_OF[package])}", 2)
         traceback.print_exc()
         return _complain(report, "this is a fault of canprobe itself: please report it with the lines above", 70)
 

@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     """Show it until Ctrl-C, or write the file."""
     from canprobe.planning.bridges import check_bridges
 
-    check_bridges(["view"])
+    check_bridges(["view"], "")
     folder, browser = Path(args.what), _Browser(args.port, args.report.say, quiet=args.no_open)
     leave = left_by_ctrl_c() if args.html is None else contextlib.nullcontext()  # the normal end of a page only
     with leave:
