@@ -100,7 +100,7 @@ def _run_scene(args: argparse.Namespace, browser: _Browser) -> Path:
         scene = load_scene(args.what, dict(args.set))
     except SceneError as error:
         if not os.path.exists(args.what) and args.what not in {**packaged_files("scenes"), **packaged_files("cells")}:
-            error.add_note(f"{args.what}: nor is there a folder of a run of that name")
+            raise SceneError([f"{error}; nor is there a folder of a run of that name"]) from error
         raise
     settings = replace(scene.bridge or BridgeSettings(), view_port=args.port, view_host=args.host)
     scene = target_of(args, scene).applied_to(replace(scene, bridge=settings))
