@@ -70,7 +70,7 @@ def need(module: str, extra: str, purpose: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise UsageError(f"{purpose} needs {module}: {install_line(extra)}") from error
+        raise UsageError(f"{purpose} needs {module.partition('.')[0]}; type: {install_line(extra)}") from error
 
 
 def identifier(text: str) -> str:

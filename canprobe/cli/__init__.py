@@ -73,6 +73,8 @@ def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911 - one per w
         an unexpected error.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
+    if arguments[:1] == ["help"]:
+        arguments = [*arguments[1:], "--help"]
     if "_ARGCOMPLETE" in os.environ:
         complete(parser_of, COMMANDS)
     _prepare_streams()
@@ -104,8 +106,9 @@ def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911 - one per w
     except KeyboardInterrupt as interrupt:
         return 143 if isinstance(interrupt, Terminated) else 130
     except Exception as error:
-        if isinstance(error, ModuleNotFoundError) and (extra := EXTRA_OF.get((error.name or "").partition(".")[0])):
-            return _complain(report, f"{arguments[0]} needs {error.name}: {install_line(extra)}", 2)
+        package = (error.name or "").partition(".")[0] if isinstance(error, ModuleNotFoundError) else ""
+        if package in EXTRA_OF:
+            return _complain(report, f"{arguments[0]}: needs {package}; type: {install_line(EXTRA_OF[package])}", 2)
         traceback.print_exc()
         return _complain(report, "this is a fault of canprobe itself: please report it with the lines above", 70)
 
@@ -136,6 +139,8 @@ def parser_of(arguments: Sequence[str]) -> Parser:
     named = next((word for word in arguments if not word.startswith("-")), None)
     if named is not None and named not in COMMANDS:
         parser.error(f"unknown command {named!r}{did_you_mean(named, COMMANDS)}; commands: {', '.join(COMMANDS)}")
+    if named is None and (unknown := [word for word in arguments if word not in parser._option_string_actions]):
+        parser.refuse_unknown(unknown)
     commands = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
     for name in (named,) if named else COMMANDS:
         command = importlib.import_module(f"canprobe.cli.{name}")

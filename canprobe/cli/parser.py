@@ -6,6 +6,7 @@ import argparse
 import difflib
 import math
 import re
+import textwrap
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -22,11 +23,21 @@ if TYPE_CHECKING:
 # One clear line for a wrong command line.
 
 
+class _Formatter(argparse.RawDescriptionHelpFormatter):
+    """Paragraphs are as wide as the terminal; lists and examples, which are indented, stay as written."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        return "\n\n".join(
+            part if "\n " in part else textwrap.fill(part, width, break_on_hyphens=False, break_long_words=False)
+            for part in text.split("\n\n")
+        )
+
+
 class Parser(argparse.ArgumentParser):
     """An argument parser that keeps examples as written and complains in one line."""
 
     def __init__(self, **settings: object) -> None:
-        settings.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
+        settings.setdefault("formatter_class", _Formatter)
         settings.setdefault("allow_abbrev", False)
         super().__init__(**settings)  # type: ignore[arg-type]
 
@@ -34,10 +45,22 @@ class Parser(argparse.ArgumentParser):
         """Say what is wrong in one line and leave with status 2."""
         self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
 
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """As argparse does it; what is left over is said by the command that has no such argument, not by the root."""
+        found, rest = super().parse_known_args(args, namespace)
+        if rest:
+            self.refuse_unknown(rest)
+        return found, rest
 
-def did_you_mean(got: str, known: Iterable[str]) -> str:
+    def refuse_unknown(self, words: Sequence[str]) -> NoReturn:
+        """Complain about arguments that nothing takes."""
+        hint = did_you_mean(words[0], self._option_string_actions, 0.7) if words[0].startswith("-") else ""
+        self.error(f"unrecognized arguments: {' '.join(words)}{hint}")
+
+
+def did_you_mean(got: str, known: Iterable[str], cutoff: float = 0.5) -> str:
     """`; did you mean X?`, or nothing when no known word is close."""
-    close = difflib.get_close_matches(got, list(known), n=1, cutoff=0.5)
+    close = difflib.get_close_matches(got, list(known), n=1, cutoff=cutoff)
     return f"; did you mean {close[0]}?" if close else ""
 
 
@@ -235,6 +258,7 @@ def scene_of(args: argparse.Namespace) -> Scene:
         UsageError: --patient is given and a node is real, or as `target_of`.
     """
     from canprobe.scene.load import load_scene
+    from canprobe.session.target import VIRTUAL
 
     scene = loaded(args)
     if args.patient:
@@ -245,7 +269,10 @@ def scene_of(args: argparse.Namespace) -> Scene:
             )
         arm = {} if scene.arm is None else {"arm.missed_syncs": PATIENT_SYNCS}
         scene = load_scene(scene, {"limits.late_cycles_max_percent": 100.0, **arm})
-    return target_of(args, scene).applied_to(scene)
+    scene = target_of(args, scene).applied_to(scene)
+    if args.realtime and scene.bus.interface in VIRTUAL:
+        args.report.say(f"warning: --realtime has no effect on bus {scene.bus.interface}, whose time is virtual")
+    return scene
 
 
 def loaded(args: argparse.Namespace) -> Scene:

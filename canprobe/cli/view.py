@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     """Show it until Ctrl-C, or write the file."""
     from canprobe.planning.bridges import check_bridges
 
-    check_bridges(["view"])
+    check_bridges(["view"], "")
     folder, browser = Path(args.what), _Browser(args.port, args.report.say, quiet=args.no_open)
     leave = left_by_ctrl_c() if args.html is None else contextlib.nullcontext()  # the normal end of a page only
     with leave:
@@ -91,11 +91,17 @@ def _run_scene(args: argparse.Namespace, browser: _Browser) -> Path:
     from dataclasses import replace
 
     from canprobe import api
-    from canprobe.scene.load import load_scene
+    from canprobe.errors import SceneError
+    from canprobe.scene.load import load_scene, packaged_files
     from canprobe.scene.model import BridgeSettings
     from canprobe.session.target import VIRTUAL
 
-    scene = load_scene(args.what, dict(args.set))
+    try:
+        scene = load_scene(args.what, dict(args.set))
+    except SceneError as error:
+        if not os.path.exists(args.what) and args.what not in {**packaged_files("scenes"), **packaged_files("cells")}:
+            raise SceneError([f"{error}; nor is there a folder of a run of that name"]) from error
+        raise
     settings = replace(scene.bridge or BridgeSettings(), view_port=args.port, view_host=args.host)
     scene = target_of(args, scene).applied_to(replace(scene, bridge=settings))
     live = args.html is None

@@ -6,6 +6,8 @@ and go on from here. Run it with `python -m canprobe.examples.learn_touch_scan`.
 
 # %% A policy that follows a path over the region of the environment
 import argparse
+import signal
+import sys
 from collections.abc import Sequence
 from multiprocessing import Pool
 from typing import Any
@@ -62,6 +64,12 @@ def open_environment() -> None:
     globals()["env"] = gymnasium.make("canprobe/TouchScan-v0", estimate=False)
 
 
+def start_worker() -> None:
+    """A process of the pool, which leaves Ctrl-C to its parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    open_environment()
+
+
 def episode_return(job: tuple[Array, int, str]) -> float:
     """The area that one episode touched well, mm²; a job is (theta, seed, objects)."""
     theta, seed, objects = job
@@ -100,7 +108,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name, default in {"seeds": 5, "generations": 3, "population": 8, "episodes": 3, "test": 6}.items():
         parser.add_argument(f"--{name}", type=int, default=default, help="[%(default)s]")
     args = parser.parse_args(arguments)
-    with Pool(2, open_environment) as pool:
+    with Pool(2, start_worker) as pool:
         learned = [learn(pool, seed, args.generations, args.population, args.episodes) for seed in range(args.seeds)]
         for theta in learned:
             print("; ".join(f"{name} {value:.2f}" for name, value in zip(NAMES, theta, strict=True)))
@@ -114,4 +122,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(130)

@@ -64,8 +64,8 @@ BRIDGES: Mapping[str, BridgeInfo] = {
 }
 
 
-def check_bridges(names: Iterable[str]) -> None:
-    """Every name is a bridge, and what it needs is installed.
+def check_bridges(names: Iterable[str], what: str = "bridge ") -> None:
+    """Every name is a bridge, and what it needs is installed; `what` precedes the name in what is said.
 
     Raises:
         UsageError: with what there is, or the line that installs what is missing; nothing was started.
@@ -78,7 +78,7 @@ def check_bridges(names: Iterable[str]) -> None:
             raise UsageError(f"bridge {name!r}: there is no such bridge{hint}; there are: {known}")
         info = BRIDGES[name]
         if info.missing:
-            raise UsageError(f"bridge {name}: needs {', '.join(info.missing)}: {info.pip}")
+            raise UsageError(f"{what}{name}: needs {', '.join(info.missing)}; type: {info.pip}")
 
 
 def unavailable_bridges(setup: Setup) -> tuple[tuple[str, str], ...]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from canprobe.errors import EdsError, PlanError
@@ -81,7 +82,7 @@ def make_plan(setup: Setup) -> Plan:
         problem = dynamics_problem(arm.model.name, truth.bodies)
         problems += [problem] if problem is not None else []
     if problems or bus is None:
-        raise PlanError(problems, ways)
+        raise PlanError(_shared(problems), ways)
     absent = left_out(setup)
     plan = Plan(
         setup=setup,
@@ -100,6 +101,16 @@ def make_plan(setup: Setup) -> Plan:
     return _with_configuration(plan)
 
 
+def _shared(problems: Sequence[str]) -> list[str]:
+    """The problems; what several nodes have alike is one, with their numbers."""
+    nodes: dict[str, list[str]] = {}
+    for problem in problems:
+        node, text = re.fullmatch(r"(?:node (\d+): )?(.*)", problem, re.DOTALL).groups()  # type: ignore[union-attr]
+        nodes.setdefault(text, []).extend([node] if node is not None else [])
+    lists = {text: ", ".join(dict.fromkeys(numbers)) for text, numbers in nodes.items()}
+    return [f"node{'s' * (',' in its)} {its}: {text}" if its else text for text, its in lists.items()]
+
+
 def _with_configuration(plan: Plan) -> Plan:
     """The plan with what its devices cannot take of their configuration.
 
@@ -108,7 +119,7 @@ def _with_configuration(plan: Plan) -> Plan:
     """
     setups = make_setups(plan)
     if problems := [problem for setup in setups for problem in setup.problems]:
-        raise PlanError(list(dict.fromkeys(problems)))
+        raise PlanError(_shared(problems))
     lacks = [(one.what, f"{setup.eds}: {one.why}: {one.write.absence}") for setup in setups for one in setup.left_out]
     return replace(plan, not_available=tuple(dict.fromkeys((*plan.not_available, *lacks))))
 

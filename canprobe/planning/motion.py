@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 SAMPLES = 240
 """Points of a path."""
 _STEEPEST = math.radians(70.0)  # the servo steers in the scan plane: steeper than this it cannot follow
+_METRES = 6e-3  # a place so near the origin of the base was hardly meant in mm; the lifted start may add some mm
 _BRANCH_RAD = 0.3  # between two points of a path; farther away lies another branch
 _SINGULAR = 1e-3  # of the Jacobian in rows of a posture from which an arm cannot go on
 _RESTS_M = 5e-6  # of a ball, which may stand on two places that differ by so much
@@ -364,9 +365,10 @@ def _along_path(task: Touch, path: SurfacePath) -> Iterator[_Pose]:
     lifted = path.points[0] + path.normals[0] * task.approach.clearance
     contacts = zip((lifted, *path.points), (path.normals[0], *path.normals), (poles[0], *poles), strict=True)
     for point, normal, pole in contacts:
+        metres = " (are these metres?)" if np.abs(point).max() < _METRES else ""
         out_of_reach = (
-            f"task: contact at {_mm(point)} mm out of reach: {{why}}; move the object, shorten the "
-            "path, or set start_deg of the joints to another branch"
+            f"task: contact at {_mm(point)} mm{metres} out of reach: {{why}}; move the object, shorten the probe "
+            "or the path, or set start_deg of the joints to another branch"
         )
         yield _Pose(point + radius * normal, pole, _BRANCH_RAD, out_of_reach)
 

@@ -48,7 +48,7 @@ def page_of(folder: Path) -> Page:
     """
     page = Page(folder / "report.html")
     if not page.path.is_file():
-        check_bridges(["view"])
+        check_bridges(["view"], "")
         write_page_of(folder, quiet)
     if "ipykernel" not in sys.modules and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         webbrowser.open(page.path.resolve().as_uri())

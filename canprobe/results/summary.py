@@ -271,6 +271,7 @@ def summarise(
     sim_time = cycle.t_ns * 1e-9 if cycle is not None else 0.0
     wall = session.wall_ns * 1e-9
     log = cell.log.arrays()
+    contact = _contact(session, record, log)
     summary = {
         "schema": SCHEMA,
         "scene": scene.name,
@@ -282,7 +283,7 @@ def summarise(
         "wall_time_s": wall,
         "realtime_factor": sim_time / wall if wall > 0 else None,
         "newtons": None if session.plan.setup.array is None else session.plan.setup.array.newtons,
-        "contact": _contact(session, record, log),
+        "contact": contact,
         "shape": summarise_shape(
             scene,
             record.shape,
@@ -297,7 +298,7 @@ def summarise(
         "bus_load": None if direct else _bus_load(session),
         "traffic": None if direct else _traffic(session),
         "left_out": [f"{what}: {why}" for what, why in (*session.plan.left_out, *session.plan.not_available)],
-        "warnings": list(session.plan.warnings),
+        "warnings": [*session.plan.warnings, *_hidden_force(session, contact["force_max_n"], log)],
         "bridges": bridges,
         "faults": [*cell.faults, *(session.observers.faults if session.observers is not None else ())],
     }
@@ -382,6 +383,17 @@ def _contact(session: Session, record: TaskRecord, log: dict[str, Array]) -> dic
     return {"force_target_n": target, **figures, "force_measured_rms_error_n": measured} | {
         "losses": summarise_losses(record.losses)
     }
+
+
+def _hidden_force(session: Session, highest: float | None, log: dict[str, Array]) -> list[str]:
+    """That the true force was above the limit, which acts on what the array measures."""
+    limit = session.scene.limits.force_max_n
+    if not _truth(session) or highest is None or highest <= limit:
+        return []
+    return [
+        f"the true force rose to {highest:.2f} N, above limits.force_max_n = {limit:g}: the array measured at most"
+        f" {np.nanmax(log['force_n'], initial=0.0):.2f} N"
+    ]
 
 
 def _rms_error(values: Array, target: float) -> float | None:

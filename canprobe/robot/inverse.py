@@ -232,10 +232,7 @@ def _out_of_reach(pose: _Pose, q: Array) -> str:
     ]
     nearest = f"nearest reachable: {_place(T)}, {away:.1f} mm and {turned:.1f} deg away"
     because = f" with {', '.join(stops)}" if stops else ""
-    return (
-        f"{_place(pose.T_base_tool)}: out of reach of the {model.name} arm; {nearest}{because}; move the object or "
-        "shorten the probe"
-    )
+    return f"{_place(pose.T_base_tool)}: out of reach of the {model.name} arm; {nearest}{because}"
 
 
 def _place(T_base_tool: Array) -> str:

@@ -158,7 +158,7 @@ def load_scene(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = 
             packaged = packaged_files("cells")
         path = find_file(name, packaged, "scene")
         file, folder = path.name if name in packaged else name, path.parent
-        own = read_toml(path, file)
+        own = read_toml(path, file, "; `canprobe scenes` lists the packaged ones")
     else:
         raise UsageError(f"scene: expected a packaged name, the path of a TOML file or a Scene, got {scene!r}")
     if overrides:
@@ -316,8 +316,8 @@ def parse_scene(text: str, *, file: str = "scene", folder: Path | None = None) -
     return _scene(parse_toml(text, file), file, folder)
 
 
-def read_toml(path: Path, file: str) -> dict[str, Any]:
-    """The document of a TOML file, whose messages call it `file`.
+def read_toml(path: Path, file: str, else_what: str = "") -> dict[str, Any]:
+    """The document of a TOML file, whose messages call it `file`; `else_what` ends that of a file that is missing.
 
     Raises:
         SceneError: it cannot be read, or is not TOML.
@@ -325,7 +325,8 @@ def read_toml(path: Path, file: str) -> dict[str, Any]:
     try:
         return parse_toml(path.read_text(encoding="utf-8-sig"), file)  # some editors begin with a byte order mark
     except OSError as error:
-        raise SceneError([f"{file}: cannot be read: {error.strerror}"]) from error
+        hint = else_what if isinstance(error, FileNotFoundError) else ""
+        raise SceneError([f"{file}: cannot be read: {error.strerror}{hint}"]) from error
     except UnicodeDecodeError as error:
         raise SceneError([f"{file}: not UTF-8 text: byte {error.start} is {error.object[error.start]:#04x}"]) from error
 
@@ -485,10 +486,16 @@ class Reader:
         if not isinstance(table, dict):
             return self.complain(name, f"expected a section [{name}], got {toml_value(table)}")
         annotations = typing.get_type_hints(cls, include_extras=True)
+        defaults = {field.name: field.default for field in dataclasses.fields(cls)}
+        belong = [
+            key
+            for key, annotation in annotations.items()
+            if all({**defaults, **table}[only.key] in only.values for only in conditions_of(annotation, Only))
+        ]
         for key in table:
             if key not in annotations:
                 above = '; cell = "NAME" stands above the first section' if key == "cell" else ""
-                self.complain(f"{name}.{key}", f"unknown key{above or _did_you_mean(key, annotations)}")
+                self.complain(f"{name}.{key}", f"unknown key{above or _did_you_mean(key, belong)}")
         values: dict[str, Any] = {}
         for field in dataclasses.fields(cls):
             path, annotation = f"{name}.{field.name}", annotations[field.name]

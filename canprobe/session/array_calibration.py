@@ -215,7 +215,8 @@ def calibrate(
         if ask is not None and not emulated and visit.known != placed:
             ask(f"{visit.known.asked_for(request.at)} Then press Enter: ")
         placed = visit.known
-        say(f"visit {number} of {len(every)}: {len(visit.presses)} touches of the {visit.known.name}")
+        touches = f"{len(visit.presses)} touch{'es' * (len(visit.presses) != 1)}"
+        say(f"visit {number} of {len(every)}: {touches} of the {visit.known.name}")
         there = replace(there, object=visit.known.settings(request.at))
         folder = None if out is None else out / f"visit-{number:02d}"
         found, rest = touch_object(make_plan(resolve(there)), visit, folder, say, ask if not emulated else None)

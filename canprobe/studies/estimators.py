@@ -101,7 +101,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     grounds = GROUNDS[:1] if quick else GROUNDS
     sweep.say(f"costs of {len(settings(quick))} settings at {len(NOISES)} noises, one after another")
     costs = sweep.time(measure_costs, [(noise, quick, turns) for noise in NOISES], model=MODEL)
-    sweep.say(f"errors on {len(grounds)} surfaces, {seeds} seeds each")
+    sweep.say(f"errors on {len(grounds)} surface{'s' * (len(grounds) != 1)}, {seeds} seeds each")
     cells = [(place, noise, quick, seed) for noise in NOISES for place in grounds for seed in range(seeds)]
     errors = iter(sweep.map(measure_errors, cells, model=MODEL))
     rows = []

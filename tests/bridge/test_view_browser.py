@@ -129,7 +129,7 @@ def test_without_the_extra_there_is_the_line_that_installs_it(monkeypatch, capsy
     assert main(["view", str(recorded.folder)]) == 2
     line = install_line("view")
     assert re.fullmatch(r"pip install (-e )?'.+\[view\]'", line)
-    assert capsys.readouterr().err == f"canprobe: bridge view: needs viser: {line}\n"
+    assert capsys.readouterr().err == f"canprobe: view: needs viser; type: {line}\n"
     plan = canprobe.plan(canprobe.load_scene("free"))
     assert "report.html" not in plan.outputs
     assert (

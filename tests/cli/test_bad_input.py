@@ -77,6 +77,13 @@ def test_unknown_scene(command, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_view_says_that_a_folder_was_possible_too(tmp_path):
+    (line,) = lines_of(tmp_path, 2, "view", "nope", "--no-open")
+    assert "no such scene or file" in line and line.endswith("nor is there a folder of a run of that name")
+    (line,) = lines_of(tmp_path, 2, "view", "press", "--set", "task.forc_n=3")
+    assert "folder" not in line
+
+
 def test_wrong_keys_are_all_told_with_file_path_and_suggestion(tmp_path):
     scene = edited(tmp_path, "cylinder", ("force_n = 2", "force_m = 2"), ("[arm]", "[arm]\nemulatd = true"))
     assert lines_of(tmp_path, 2, "run", scene) == [
@@ -109,10 +116,18 @@ def test_a_hollow_tighter_than_the_probe(command, tmp_path):
 
 
 @pytest.mark.parametrize("command", ["run", "plan"])
-def test_an_object_out_of_reach(command, tmp_path):
-    scene = edited(tmp_path, "cylinder", ("[-120, -122.5, 374]", "[-500, -122.5, 374]"))
+@pytest.mark.parametrize(
+    ("place", "contact"),
+    [
+        ("[-500, -122.5, 374]", "(-500.0, -122.5, 377.0) mm out of reach"),
+        ("[-0.5, -0.1225, 0.374]", "(-0.5, -0.1, 3.4) mm (are these metres?) out of reach"),
+    ],
+)
+def test_an_object_out_of_reach(command, place, contact, tmp_path):
+    scene = edited(tmp_path, "cylinder", ("[-120, -122.5, 374]", place))
     (line,) = lines_of(tmp_path, 2, command, scene)
-    assert line.startswith("canprobe: task: contact at (-500.0, -122.5, 377.0) mm out of reach")
+    assert line.startswith(f"canprobe: task: contact at {contact}")
+    assert line.count("move the object") == 1
 
 
 def test_an_eds_file_that_does_not_exist(tmp_path):

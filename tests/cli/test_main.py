@@ -66,8 +66,9 @@ def test_help_has_examples_of_its_command_that_parse(command, capsys):
         parse(line)
 
 
-def test_help_lists_every_command(capsys):
-    main(["--help"])
+@pytest.mark.parametrize("word", ["--help", "help"])
+def test_help_lists_every_command(word, capsys):
+    assert main([word]) == 0
     out = capsys.readouterr().out
     assert all(f"    {command}" in out for command in COMMANDS)
 
@@ -83,7 +84,9 @@ def test_version(capsys):
         ([], ("COMMAND",)),
         (["runn"], ("unknown command 'runn'", "did you mean run?")),
         (["run"], ("SCENE",)),
-        (["run", "cylinder", "--sead", "3"], ("--sead",)),
+        (["--versoin"], ("unrecognized arguments: --versoin; did you mean --version?",)),
+        (["run", "cylinder", "--sead", "3"], ("--sead 3; did you mean --seed?", "see canprobe run --help")),
+        (["eds", "list", "--no-such"], ("see canprobe eds list --help",)),
         (["run", "cylinder", "--seed", "-1"], ("--seed", "'-1'")),
         (["run", "cylinder", "--seed", "x"], ("--seed", "an integer from 0")),
         (["run", "cylinder", "--duration", "0"], ("--duration", "seconds above 0")),
@@ -95,7 +98,7 @@ def test_version(capsys):
         (["run", "cylinder", "--channel", "can1=vcan0"], ("no channel can1", "only can0", "did you mean can0?")),
         (["run", "cylinder", "--channel", "vcan0", "--channel", "vcan1"], ("given 2 times",)),
         (["run", "cilinder"], ("no such scene", "did you mean cylinder?")),
-        (["plan", "none.toml"], ("none.toml", "cannot be read")),
+        (["plan", "none.toml"], ("none.toml", "cannot be read", "`canprobe scenes` lists the packaged ones")),
         (["plan", "free", "--measured", "run", "--export", "dcf"], ("--measured", "no --export or --figure")),
         (["emulate", "cylinder"], ("--channel", "missing")),
         (["emulate", "cylinder", "--channel", "vcan0", "--nodes", "6-1"], ("--nodes", "1-6,16")),
@@ -262,6 +265,12 @@ def test_keys_are_set_as_a_file_has_them(command, calls):
     assert main([command, "free", "--bus", "socketcan", *words]) == 0
     ((_, (scene,), _),) = calls
     assert (scene.task.swing_period_s, scene.title, scene.cycle.realtime) == (3.0, "a = b", True)
+
+
+@pytest.mark.parametrize(("bus", "said"), [("lockstep", True), ("direct", True), ("socketcan", False)])
+def test_realtime_on_a_bus_in_virtual_time_is_said_to_have_no_effect(bus, said, calls, capsys):
+    assert main(["run", "free", "--bus", bus, "--realtime"]) == 0
+    assert ("warning: --realtime has no effect" in capsys.readouterr().err) == said
 
 
 def test_run_takes_the_scenes_bus_by_default(calls):

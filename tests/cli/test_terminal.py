@@ -10,7 +10,7 @@ import sys
 import pytest
 
 from canprobe import api
-from canprobe.cli import main
+from canprobe.cli import COMMANDS, main
 from canprobe.cli.output import print_summary, print_table
 from canprobe.results.expected import expected_text, figures_of, read_expected
 from canprobe.scene.load import packaged_scenes
@@ -28,6 +28,7 @@ class Terminal(io.StringIO):
 def plain(monkeypatch):
     monkeypatch.setenv("NO_COLOR", "1")
     monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.delenv("COLUMNS", raising=False)
 
 
 def test_bar_is_as_wide_as_the_terminal_and_redraws_only_what_changes():
@@ -107,18 +108,31 @@ def test_colours_change_no_word_of_a_summary(monkeypatch):
     assert shown == text + "\n"
 
 
-def test_table_breaks_the_widest_columns_on_a_terminal_only(monkeypatch, capsys):
+def test_table_breaks_the_widest_columns_where_there_is_a_width(monkeypatch, capsys):
     rows = [("one", "word " * 12, "more " * 10), ("another", "short", "")]
     print_table(rows)
     assert capsys.readouterr().out.splitlines() == [
         f"one      {'word ' * 12}  {'more ' * 10}".rstrip(),
         "another  short",
     ]
-    monkeypatch.setattr(sys, "stdout", Terminal())
-    print_table(rows)
-    shown = sys.stdout.getvalue()
-    assert max(map(len, shown.splitlines())) <= 80
-    assert shown.split() == ["one", *_interleaved(shown), "another", "short"]
+    for stream, width in ((Terminal(), 80), (io.StringIO(), 60)):
+        monkeypatch.setattr(sys, "stdout", stream)
+        if width == 60:
+            monkeypatch.setenv("COLUMNS", "60")
+        print_table(rows)
+        shown = sys.stdout.getvalue()
+        assert max(map(len, shown.splitlines())) <= width
+        assert shown.split() == ["one", *_interleaved(shown), "another", "short"]
+    assert Report(stream=io.StringIO()).bar() is None, "a width is no terminal"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_is_as_wide_as_the_terminal(command, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "70")
+    assert main([command, "--help"]) == 0
+    _, _, described = capsys.readouterr().out.partition("\n\n")
+    described, _, _ = described.partition(":\n")
+    assert max(map(len, described.splitlines())) <= 70
 
 
 def _interleaved(shown):
@@ -154,6 +168,15 @@ def test_a_run_of_a_packaged_scene_as_it_is_shows_what_to_expect(capsys, tmp_pat
     changed = ["--duration", "0.5", "--set", "scene.figures=false"]
     assert main(["run", "press", "--bus", "direct", *changed, "--out", str(tmp_path / "c")]) == 0
     assert "expected" not in capsys.readouterr().out
+
+
+def test_a_true_force_above_the_limit_is_a_warning_of_the_summary(capsys, tmp_path):
+    stiff = ["--set", "plant.stiffness_n_m3=5e9", "--duration", "0.5", "--out", str(tmp_path / "run")]
+    assert main(["run", "press", "--bus", "direct", *stiff]) == 0
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    (warning,) = summary["warnings"]
+    assert f"{summary['contact']['force_max_n']:.2f} N, above limits.force_max_n = 5" in warning
+    assert f"  warning    {warning}" in capsys.readouterr().out
 
 
 # A real terminal, and the shell.

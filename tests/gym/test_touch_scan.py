@@ -1,5 +1,8 @@
 """The environment as an agent meets it: spaces, actions, ends of an episode, options, and the cell behind it."""
 
+import os
+import signal
+import subprocess
 import sys
 import warnings
 
@@ -197,6 +200,16 @@ def test_without_gymnasium_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "gymnasium", None)
     with pytest.raises(UsageError, match=r"canprobe\.gym needs the package gymnasium: pip install .*\[gym\]"):
         __import__("canprobe.gym")
+
+
+def test_the_example_ends_in_one_line_at_ctrl_c():
+    command = [sys.executable, "-m", "canprobe.examples.learn_touch_scan", "--population", "2", "--episodes", "1"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
+    with subprocess.Popen(command, **pipes) as process:
+        assert process.stdout.readline().startswith("seed 0, generation 0")
+        os.killpg(process.pid, signal.SIGINT)
+        _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (130, "interrupted\n")
 
 
 def test_coverage_counts_each_part_once():

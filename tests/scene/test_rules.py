@@ -23,6 +23,8 @@ PRESS = load_scene("press")
         ({"scene.seed": True}, r"scene\.seed: "),
         ({"task.duration_s": float("nan")}, r"task\.duration_s: expected a number above 0 up to 86400, got nan"),
         ({"task.force_N": 3}, r"task\.force_N: unknown key; did you mean force_n\?"),
+        ({"object": {"kind": "ellipsoid", "semi_axes_mm": 9}}, r"object\.semi_axes_mm: unknown key\n"),
+        ({"object": {"kind": "ellipsoid", "radis_y_mm": 9}}, r"unknown key; did you mean radius_y_mm\?"),
         ({"tsk.force_n": 3}, r"tsk: unknown section; did you mean task\?"),
         ({"force_n": 3}, r"force_n: unknown section; did you mean task\.force_n\?"),
         ({"rate_hz": 3}, r"did you mean cycle\.rate_hz or sensor\.rate_hz\?"),
