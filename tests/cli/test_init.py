@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from canprobe.cli import main
+from canprobe.eds.packaged import eds_path
 from canprobe.scene.load import load_scene
 from canprobe.scene.resolve import resolve
 
@@ -88,6 +89,28 @@ def test_a_cell_alone_is_planned_as_free_motion(tmp_path, urdf, capsys):
     assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf)]) == 0
     assert main(["plan", str(tmp_path / "cell" / "cell.toml")]) == 0
     assert "free" in capsys.readouterr().out
+
+
+def test_the_cell_has_the_rate_of_its_drives_and_images_that_divide_it(tmp_path, urdf, capsys):
+    eds = tmp_path / "4ms.eds"
+    text = eds_path("puma260_joint").read_text()
+    head, _, rest = text.partition("[60C2sub1]")
+    section, mark, tail = rest.partition("\n[")
+    section = section.replace("AccessType=rw", "AccessType=ro").replace("DefaultValue=25", "DefaultValue=4")
+    eds.write_text(f"{head}[60C2sub1]{section}{mark}{tail}")
+    assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf), "--eds", str(eds)]) == 0
+    cell = tomllib.loads((tmp_path / "cell" / "cell.toml").read_text())
+    assert (cell["cycle"]["rate_hz"], cell["sensor"]["rate_hz"]) == (250, 125)
+    first = tomllib.loads((tmp_path / "cell" / "first.toml").read_text())
+    assert first["task"]["kind"] == "scan" and not {"cycle", "sensor"} & set(first)
+    assert main(["plan", str(tmp_path / "cell" / "cell.toml")]) == 0
+
+
+def test_why_the_first_scene_does_not_scan_is_said(tmp_path, urdf, capsys):
+    assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf), "--tip", "l1"]) == 0
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "freely" in line]
+    assert "a scan was refused: joints: in its start posture" in line
+    assert 'kind = "free"' in (tmp_path / "cell" / "first.toml").read_text()
 
 
 @pytest.mark.parametrize(
