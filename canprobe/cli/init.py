@@ -225,7 +225,8 @@ def _first_scene(folder: Path, cell: str) -> tuple[str, str | None]:
                     problems = problems or list(error.problems)
                 else:
                     return text, refused[rate] if scenes is _free else None
-    raise PlanError([*problems, f"{folder / 'cell.toml'} was written: correct it, then write a scene for it"])
+    way = f"correct the EDS (or the URDF) that this names, remove the folder {folder}, and type the command again"
+    raise PlanError([*problems, way])
 
 
 def _at_rate(cell: str, rate: float) -> str:

@@ -106,6 +106,14 @@ def test_the_cell_has_the_rate_of_its_drives_and_images_that_divide_it(tmp_path,
     assert main(["plan", str(tmp_path / "cell" / "cell.toml")]) == 0
 
 
+def test_an_eds_that_cannot_be_driven_is_to_be_corrected(tmp_path, urdf, capsys):
+    eds = tmp_path / "bad.eds"
+    eds.write_text(eds_path("puma260_joint").read_text().replace("=0x60C2\n", "=0x6100\n").replace("[60C2", "[6100"))
+    assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf), "--eds", str(eds)]) == 2
+    said = capsys.readouterr().err
+    assert "60C2h" in said and f"correct the EDS (or the URDF) that this names, remove the folder {tmp_path}" in said
+
+
 def test_why_the_first_scene_does_not_scan_is_said(tmp_path, urdf, capsys):
     assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf), "--tip", "l1"]) == 0
     (line,) = [line for line in capsys.readouterr().out.splitlines() if "freely" in line]
