@@ -121,6 +121,15 @@ def test_why_the_first_scene_does_not_scan_is_said(tmp_path, urdf, capsys):
     assert 'kind = "free"' in (tmp_path / "cell" / "first.toml").read_text()
 
 
+def test_a_misspelt_joint_is_said_with_all_other_mistakes(tmp_path, urdf, capsys):
+    assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf)]) == 0
+    cell = tmp_path / "cell" / "cell.toml"
+    cell.write_text(cell.read_text().replace("[joints.rail]", "[joints.rial]").replace("gear =", "gera ="))
+    assert main(["plan", str(tmp_path / "cell" / "first.toml")]) == 2
+    said = capsys.readouterr().err
+    assert "joints.rial: no joint of" in said and "did you mean rail?" in said and "joints.j6.gera: unknown key" in said
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
