@@ -244,15 +244,14 @@ def _read_hardware(name_or_path: str | Path, what: str, kind: type[Any]) -> tupl
     document = read_toml(path, file)
     reader = Reader(path.parent)
     sections = reader.read(kind, document, (what,))
-    if reader.problems:
-        _complain_of_names(reader, sections.get("arm"), document.get("joints"))
+    _complain_of_names(reader, sections.get("arm"), document.get("joints"))
     reader.refuse(file)
     return sections, reader.with_paths(document)
 
 
 def _complain_of_names(reader: Reader, arm: ArmSettings | None, joints: object) -> None:
     """Joints that the URDF does not have; where nothing else is wrong, `arm_model` says so with the order."""
-    if arm is None or not arm.urdf or not isinstance(joints, dict):
+    if not reader.problems or arm is None or not arm.urdf or not isinstance(joints, dict):
         return
     with contextlib.suppress(PlanError):  # the URDF's own faults come once the cell can be read
         names = from_urdf(arm.urdf, arm.base, arm.tip).chain.joints
@@ -383,6 +382,7 @@ def _scene(own: Mapping[str, Any], file: str, folder: Path | None) -> Scene:
 
     for where, complaint in broken_rules(lookup):
         reader.complain(where, complaint)
+    _complain_of_names(reader, values.get("arm"), document.get("joints"))
     reader.refuse(file)
     return Scene(**values)
 

@@ -125,6 +125,8 @@ def test_a_misspelt_joint_is_said_with_all_other_mistakes(tmp_path, urdf, capsys
     assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf)]) == 0
     cell = tmp_path / "cell" / "cell.toml"
     cell.write_text(cell.read_text().replace("[joints.rail]", "[joints.rial]").replace("gear =", "gera ="))
+    assert main(["plan", str(cell)]) == 2
+    assert "joints.rial: no joint of" in capsys.readouterr().err
     assert main(["plan", str(tmp_path / "cell" / "first.toml")]) == 2
     said = capsys.readouterr().err
     assert "joints.rial: no joint of" in said and "did you mean rail?" in said and "joints.j6.gera: unknown key" in said
