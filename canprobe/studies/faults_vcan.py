@@ -29,7 +29,7 @@ from canprobe.errors import CanprobeError
 from canprobe.protocol.cia402 import POWERED_STATES, DriveState, state_of
 from canprobe.scene.load import dump_scene, load_scene
 from canprobe.scene.model import Scene
-from canprobe.session.children import EmulatorChild
+from canprobe.session.children import EmulatorChild, with_our_imports
 from canprobe.studies.faults import draw_ends, scenario_scene
 from canprobe.studies.harness import CHANNEL, Column, Row, StudyResult, measuring_facts
 from canprobe.studies.realtime_cases import LATE_PERCENT, patient, with_real_nodes
@@ -195,9 +195,15 @@ class _Run:
         scene = with_real_nodes(served_scene())
         path = self.folder / "scene.toml"
         path.write_text(dump_scene(replace(scene, scene=replace(scene.scene, figures=False))), encoding="utf-8")
-        command = [sys.executable, "-m", "canprobe", "run", str(path), "--out", str(self.folder / "run")]
+        command = [sys.executable, "-P", "-m", "canprobe", "run", str(path), "--out", str(self.folder / "run")]
         with (self.folder / "stderr").open("wb") as errors:
-            return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=errors)
+            return subprocess.Popen(
+                command,
+                env=with_our_imports(),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=errors,
+            )
 
     def _await_enabled(self, port: Port, master: subprocess.Popen[bytes]) -> bool:
         """Wait until the first drive reports operation enabled."""
