@@ -22,10 +22,11 @@ from random import Random
 
 from canprobe.bus.disk import read_candump
 from canprobe.bus.interfaces import open_port
+from canprobe.bus.link import missing_ip
 from canprobe.bus.network import PumpedNetwork, hold_dialogues, upload
 from canprobe.bus.port import MonotonicClock, Port
 from canprobe.bus.socketcan import check_interface
-from canprobe.errors import CanprobeError
+from canprobe.errors import CanprobeError, InterfaceError
 from canprobe.protocol.cia402 import POWERED_STATES, DriveState, state_of
 from canprobe.scene.load import dump_scene, load_scene
 from canprobe.scene.model import Scene
@@ -92,6 +93,8 @@ def draw_process_case(seed: int) -> ProcessCase:
 def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     """Carry out the campaign: forty runs, or one of each kind with `quick`."""
     check_interface(CHANNEL)
+    if (missing := missing_ip()) is not None:
+        raise InterfaceError(f"{CHANNEL}: the study takes it down and up: {missing}")
     rows = []
     total = len(ProcessFault) if quick else RUNS
     for seed in range(total):
