@@ -31,6 +31,7 @@ from canprobe.errors import UsageError
 from canprobe.planning.model import Plan
 from canprobe.protocol.tactile import Features, TactileFrame, TactileHeader
 from canprobe.scene.load import dump_scene
+from canprobe.session.children import with_our_imports
 
 if TYPE_CHECKING:
     from canprobe.touch.estimate.answer import SurfaceEstimate
@@ -290,7 +291,8 @@ class BridgeProcess:
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed by end
         reader, writer = os.pipe()
         self._process = subprocess.Popen(  # a new session: Ctrl-C is for the cell
-            [sys.executable, "-m", "canprobe.bridge.worker", name],
+            [sys.executable, "-P", "-m", "canprobe.bridge.worker", name],
+            env=with_our_imports(),
             stdin=reader,
             stdout=subprocess.PIPE,
             stderr=self._errors,

@@ -125,7 +125,12 @@ def _over(overrides: Mapping[str, Any] | None, given: Mapping[str, Any]) -> dict
 
 def results_folder(scene: Scene, out: Path | str | None = None) -> Path:
     """Where `run` puts the files: ``out``, or ``runs/<scene>-<time>`` to the millisecond."""
-    return Path(out) if out is not None else Path("runs") / f"{scene.name}-{datetime.now():%Y%m%d-%H%M%S-%f}"[:-3]
+    return Path(out) if out is not None else timed_folder(scene.name)
+
+
+def timed_folder(name: str) -> Path:
+    """``runs/<name>-<time>`` to the millisecond."""
+    return Path("runs") / f"{name}-{datetime.now():%Y%m%d-%H%M%S-%f}"[:-3]
 
 
 def plan(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = None) -> Plan:

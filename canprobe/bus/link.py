@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 from dataclasses import dataclass
 from typing import Any
@@ -147,6 +148,13 @@ def drop_queued(name: str) -> bool:
 def ip_line(*settings: str) -> str:
     """The line to type that sets links one way after the other, with `sudo` for who needs it."""
     return " && ".join(f"{sudo()}ip link set {setting}" for setting in settings)
+
+
+def missing_ip() -> str | None:
+    """What is said where there is no `ip`, with the line to type; None where there is one."""
+    if shutil.which("ip") is not None:
+        return None
+    return f"`ip` is not installed; type:  {sudo()}apt-get install -y iproute2"
 
 
 def sudo() -> str:

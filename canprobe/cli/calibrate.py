@@ -12,7 +12,6 @@ import math
 import sys
 from collections.abc import Callable
 from datetime import date
-from pathlib import Path
 
 from canprobe.cli.output import print_json
 from canprobe.cli.parser import BUS, Parser, add_options, add_verbosity, folder_path, seed, target_of, word
@@ -52,8 +51,8 @@ def add_arguments(parser: Parser) -> None:
         "--sigma", metavar="PERCENT", type=_positive, default=1.0, help="standard deviation of that reference [1]"
     )
     parser.add_argument(
-        "--at", metavar=("X", "Y", "Z"), nargs=3, type=float, default=(-120.0, -122.5, 374.0),
-        help="point of the base frame that is touched, mm [-120 -122.5 374]",
+        "--at", metavar=("X", "Y", "Z"), nargs=3, type=float,
+        help="point of the base frame that is touched, mm [of a cell file: under the probe in its start posture]",
     )  # fmt: skip
     parser.add_argument("--ball-radius", metavar="MM", type=_positive, default=25.0, help="radius of the ball [25]")
     parser.add_argument("--rod-radius", metavar="MM", type=_positive, default=25.0, help="radius of the rod [25]")
@@ -64,7 +63,7 @@ def add_arguments(parser: Parser) -> None:
     add_options(parser, *BUS)
     parser.add_argument("--seed", metavar="N", type=seed, default=0, help="seed of the emulation [0]")
     parser.add_argument(
-        "--out", metavar="DIR", type=folder_path, help="folder of the files [runs/calibrate-array-DATE]"
+        "--out", metavar="DIR", type=folder_path, help="folder of the files [runs/calibrate-array-<cell>-<time>]"
     )
     add_options(parser, "--force", "--json")
     add_verbosity(parser)
@@ -76,17 +75,16 @@ def run(args: argparse.Namespace) -> int:
     from canprobe.bus.disk import write_text
     from canprobe.results.array_report import as_document, calibration_text, draw_calibration
     from canprobe.scene.calibrations import dump_calibration
-    from canprobe.scene.load import load_scene
+    from canprobe.scene.load import load_scene, read_cell
     from canprobe.session.array_calibration import Request, calibrate
 
     today = date.today().isoformat()
-    out = args.out or Path("runs") / f"calibrate-array-{today}"
+    out = args.out or api.timed_folder(f"calibrate-array-{read_cell(args.cell).cell.name}")
     api.check_free(out, force=args.force)
-    x, y, z = args.at
     request = Request(
         cell=args.cell,
         target=target_of(args, load_scene("press", {"cell": args.cell})),
-        at=(x, y, z),
+        at=args.at and tuple(args.at),
         ball_radius=1e-3 * args.ball_radius,
         rod_radius=1e-3 * args.rod_radius,
         reference=args.force_reference,

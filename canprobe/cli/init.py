@@ -28,8 +28,8 @@ examples:
   canprobe init my-cell --urdf arm.urdf --tip tool0 --eds drive.eds
   canprobe run my-cell/first.toml
 """
-_RATES_HZ = (400.0, 1000 / 3, 250.0, 200.0, 125.0, 100.0, 50.0)
-_SENSOR_HZ = 200.0
+_RATES_HZ = (400, 1000 / 3, 250, 200, 125, 100, 50)
+_SENSOR_HZ = 200
 _TRIES = 400
 _GEAR, _COUNTS_PER_TURN, _COUNTS_PER_M = 100, 10_000, 1_000_000
 
@@ -63,10 +63,11 @@ def run(args: argparse.Namespace) -> int:
     for path in {*args.eds, *([args.urdf] if args.urdf else [])}:
         if path.resolve() != (folder / path.name).resolve():
             (folder / path.name).write_bytes(with_meshes_found(path) if path == args.urdf else path.read_bytes())
-    (folder / "cell.toml").write_text(cell, encoding="utf-8")
-    first = _first_scene(folder)
+    first, no_scan = _first_scene(folder, cell)
     (folder / "first.toml").write_text(first, encoding="utf-8")
     print(f"wrote {folder / 'cell.toml'} and {folder / 'first.toml'}")
+    if no_scan:
+        print(f"first.toml moves the arm freely: a scan was refused: {no_scan}")
     print(f"next: canprobe plan {folder / 'first.toml'}")
     print(f"      canprobe run {folder / 'first.toml'}")
     return 0
@@ -85,8 +86,10 @@ title = "{name}"
 [bus]
 bitrate = 1000000
 
+"""
+_CYCLE = """\
 [cycle]
-rate_hz = 400 # of SYNC and servo; `canprobe plan` says what the drives and the bus can do
+rate_hz = {rate:.12g} # of SYNC and servo; `canprobe plan` says what the drives and the bus can do
 
 """
 _TAIL = """
@@ -204,39 +207,53 @@ def _rounded(found: UrdfArm) -> list[float]:
     return [round(value) for value in shown]
 
 
-def _first_scene(folder: Path) -> str:
-    """The first of some scenes, from demanding to plain, that the cell can do as it stands."""
+def _first_scene(folder: Path, cell: str) -> tuple[str, str | None]:
+    """Write the cell at the fastest rate at which it can do a scan, else free motion; the scene, and why no scan."""
     from canprobe.api import plan
     from canprobe.scene.load import parse_scene
 
+    refused: dict[float, str] = {}
     problems: list[str] = []
-    for text in _candidates(folder):
-        try:
-            plan(parse_scene(text, file="first.toml", folder=folder))
-        except PlanError as error:
-            problems = problems or list(error.problems)
-        else:
-            return text
-    raise PlanError([*problems, f"{folder / 'cell.toml'} was written: correct it, then write a scene for it"])
+    for scenes in (_scans, _free):
+        for rate in _RATES_HZ:
+            (folder / "cell.toml").write_text(_at_rate(cell, rate), encoding="utf-8")
+            for text in scenes(folder):
+                try:
+                    plan(parse_scene(text, file="first.toml", folder=folder))
+                except PlanError as error:
+                    refused.setdefault(rate, error.problems[0])
+                    problems = problems or list(error.problems)
+                else:
+                    return text, refused[rate] if scenes is _free else None
+    way = f"correct the EDS (or the URDF) that this names, remove the folder {folder}, and type the command again"
+    raise PlanError([*problems, way])
 
 
-def _candidates(folder: Path) -> Iterator[str]:
+def _at_rate(cell: str, rate: float) -> str:
+    """The cell file at a rate of the cycle, Hz, with the fastest images up to the array's 200 Hz that divide it."""
+    images = rate / math.ceil(rate / _SENSOR_HZ)
+    text = cell.replace("[arm]\n", _CYCLE.format(rate=rate) + "[arm]\n", 1)
+    if images == _SENSOR_HZ:
+        return text
+    return text.replace("[sensor]\n", f"[sensor]\nrate_hz = {images:.12g} # images; the cycle is a multiple\n", 1)
+
+
+_FIRST = 'cell = "cell.toml"\n\n[scene]\nname = "first"\ntitle = "First run on the emulator"\n'
+
+
+def _free(_: Path) -> Iterator[str]:
+    yield _FIRST + '\n[task]\nkind = "free"\nduration_s = 5\n'
+
+
+def _scans(folder: Path) -> Iterator[str]:
+    """From demanding to plain."""
     from canprobe.scene.load import parse_scene
     from canprobe.scene.resolve import resolve
 
-    plain = []
-    for rate in _RATES_HZ:
-        head = 'cell = "cell.toml"\n\n[scene]\nname = "first"\ntitle = "First run on the emulator"\n'
-        cycle = "" if rate == _RATES_HZ[0] else f"\n[cycle]\nrate_hz = {rate!r}\n"
-        sensor = f"\n[sensor]\nrate_hz = {rate!r}\n" if rate < _SENSOR_HZ else ""
-        free = head + cycle + '\n[task]\nkind = "free"\nduration_s = 5\n'
-        setup = resolve(parse_scene(free, folder=folder))
-        assert setup.arm is not None
-        for speed, length in ((10, 20), (5, 10)):
-            touch = _touch(setup.arm.model, setup.arm.q_start, setup.probe.T_flange_probe, speed, length)
-            yield head + cycle + sensor + touch
-        plain.append(free)
-    yield from plain
+    setup = resolve(parse_scene(next(_free(folder)), folder=folder))
+    assert setup.arm is not None
+    for speed, length in ((10, 20), (5, 10)):
+        yield _FIRST + _touch(setup.arm.model, setup.arm.q_start, setup.probe.T_flange_probe, speed, length)
 
 
 def _touch(model: ArmModel, q: NDArray[Any], T_flange_probe: NDArray[Any], speed: float, length: float) -> str:

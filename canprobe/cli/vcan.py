@@ -28,7 +28,9 @@ def add_arguments(parser: Parser) -> None:
     """Add the command's arguments."""
     parser.usage = "canprobe vcan [--install] [--timeout S] [--realtime] [-- COMMAND...]"
     parser.add_argument(
-        "--install", action="store_true", help="install the Debian package user-mode-linux if it is needed (as root)"
+        "--install",
+        action="store_true",
+        help="install the Debian packages user-mode-linux and iproute2 if they are needed (as root)",
     )
     parser.add_argument("--timeout", metavar="S", type=seconds, help="stop the command after S seconds")
     parser.add_argument(

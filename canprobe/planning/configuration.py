@@ -41,7 +41,7 @@ from canprobe.planning.model import (
 )
 from canprobe.planning.operation import INTERPOLATION_TIME, homing_problems
 from canprobe.planning.traffic import CLASSIC_BYTES
-from canprobe.planning.units import POLARITY, TurnUnits, motor_speed_limit, software_limits, turn_units
+from canprobe.planning.units import POLARITY, POSITION_LIMITS, TurnUnits, motor_speed_limit, software_limits, turn_units
 from canprobe.protocol.cia402 import OperationMode
 from canprobe.protocol.tactile import TactileMode
 from canprobe.robot.model import coupled_joints, drive_position_at, joints_to_units
@@ -328,7 +328,7 @@ def _drive_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Writ
     following = "a drive that does not follow is noticed as the device has it"
     lag = "a drive that lags is given as long as the device has it"
     fast = "the drive itself does not limit its speed"
-    stops = "the drive itself does not guard the ends of the joint"
+    stops = "the drive guards the ends of the joint as the device has it, or not at all"
     quick = "a quick stop goes and ends as the device has it"
     lost = "a drive that loses its master does what the device has"
     return [
@@ -339,8 +339,8 @@ def _drive_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Writ
         Write(0x6065, 0, window, "following error window", following),
         Write(0x6066, 0, FOLLOWING_TIMEOUT_MS, "following error time-out", lag),
         Write(0x607F, 0, speed, "highest speed of the motor", fast),
-        Write(0x607D, 1, int(low[axis]), "lowest position", stops),
-        Write(0x607D, 2, int(high[axis]), "highest position", stops),
+        Write(POSITION_LIMITS, 1, int(low[axis]), "lowest position", stops),
+        Write(POSITION_LIMITS, 2, int(high[axis]), "highest position", stops),
         Write(0x605A, 0, QUICK_STOP_AND_DISABLE, "what a quick stop does", quick),
         Write(0x6007, 0, ABORT_QUICK_STOP, "what a lost connection does", lost),
     ]

@@ -35,7 +35,7 @@ from canprobe.planning.motion import check_motion
 from canprobe.planning.operation import choose_mode, interpolations, operation_problems, period_problem
 from canprobe.planning.pdos import PdoPlanning, plan_drive_pdos, plan_tactile_pdos
 from canprobe.planning.traffic import plan_ratio, plan_sync, plan_traffic
-from canprobe.planning.units import range_problems
+from canprobe.planning.units import range_problems, within_drives
 from canprobe.planning.window import cut_patch
 from canprobe.robot.dynamics import dynamics_problem
 from canprobe.scene.setup import Node, Setup
@@ -57,6 +57,8 @@ def make_plan(setup: Setup) -> Plan:
     """
     setup = as_supported(setup)
     devices, problems = _devices(setup)
+    beyond = [*range_problems(setup)]
+    setup, narrowed = within_drives(setup, devices) if not problems and not beyond else (setup, ())
     unsuited = [*array_problems(setup)]
     problems += unsuited
     bus = _choose(setup, devices, problems) if not problems else None
@@ -70,13 +72,13 @@ def make_plan(setup: Setup) -> Plan:
         if cut is not None and not cut.safe:
             problems.append(cut.text)
             ways = ways or [*cut.ways]
-    problems += range_problems(setup)
+    problems += beyond
     if setup.bus.direct and setup.bus.bit_error_rate > 0:
         problems.append('bus.interface = "direct" has no wire: bus.bit_error_rate needs a bus, such as lockstep')
     if setup.bus.direct and setup.array is not None and setup.array.raw is not None:
         problems.append('bus.interface = "direct" has no frames: an array of raw frames needs a bus, such as lockstep')
     joint_speeds, unreachable = check_motion(setup) if not unsuited else (None, [])
-    problems += unreachable
+    problems += [*narrowed, *unreachable] if unreachable else []
     truth, arm = setup.truth, setup.arm
     if arm is not None and truth.fidelity == "dynamic" and any(drive.emulated for drive in arm.drives):
         problem = dynamics_problem(arm.model.name, truth.bodies)
@@ -96,7 +98,7 @@ def make_plan(setup: Setup) -> Plan:
         outputs=outputs(setup, dict(absent)),
         left_out=absent,
         not_available=(*bus.not_available, *unavailable_bridges(setup)),
-        warnings=tuple(warnings(setup, bus.pdos)),
+        warnings=(*narrowed, *warnings(setup, bus.pdos)),
     )
     return _with_configuration(plan)
 

@@ -203,6 +203,21 @@ def check_motion(setup: Setup) -> tuple[JointSpeeds | None, list[str]]:
     return speeds, problems + found
 
 
+def reach_problems(setup: Setup, task: Touch, poses: Iterable[tuple[Array, Array]]) -> list[str]:
+    """Why the arm of a touch cannot go through poses of its probe.
+
+    Args:
+        setup: whole.
+        task: of it.
+        poses: centre (3,), m, and pole (3,) away from the object, base frame.
+    """
+    targets = [_Pose(centre, pole, _TOUCH_TO_TOUCH_RAD, "out of reach: {why}") for centre, pole in poses]
+    try:
+        return _Stops(task.arm, setup.limits).problems(_follow(task.arm, task.probe, targets))
+    except PlanError as error:
+        return list(error.problems)
+
+
 def _lacking_rows(setup: Setup) -> str | None:
     """What the task needs of the probe's pose and the arm cannot do, whatever the path; None where nothing."""
     arm, task = setup.arm, setup.task

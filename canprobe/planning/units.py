@@ -4,14 +4,15 @@ A cell states the units of a drive (`counts_per_turn`, `gear`, `sign`, `zero_cou
 device is changed for them. Where a device has the factor group of CiA 402, its own statement is compared with the
 cell's at bring-up, and 607Eh, which turns positions round, must be as its EDS has it.
 
-Source: CiA 402-2, "Factor group": 607Eh, 608Fh, 6091h, 6092h; 6064h and 607Ah are INTEGER32.
+Source: CiA 402-2, "Factor group": 607Eh, 608Fh, 6091h, 6092h; "Software position limit": 607Dh; 6064h and 607Ah are
+INTEGER32.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from canprobe.robot.chain import Array
 from canprobe.robot.model import ArmModel
 from canprobe.scene.setup import Setup
 
-POLARITY, RESOLUTION, GEAR_RATIO, FEED = 0x607E, 0x608F, 0x6091, 0x6092
+POSITION_LIMITS, POLARITY, RESOLUTION, GEAR_RATIO, FEED = 0x607D, 0x607E, 0x608F, 0x6091, 0x6092
 ROUNDING_COUNTS = 2
 """By which two targets may be rounded apart."""
 _LOWEST, _HIGHEST = -(1 << 31), (1 << 31) - 1
@@ -90,8 +91,8 @@ def range_problems(setup: Setup) -> Iterator[str]:
             yield (
                 f"joints.{joint.name}: drive {drive.node_id} would count from {least:.0f} to {most:.0f} over the range"
                 f" of the joint, {joint.text(joint.q_min)} to {joint.text(joint.q_max)}, and 6064h and 607Ah hold"
-                f" {_LOWEST} to {_HIGHEST}: set zero_counts nearer to 0, by homing the drive elsewhere, or let it count"
-                " in coarser units"
+                f" {_LOWEST} to {_HIGHEST}: check counts_per_turn and gear, then zero_counts; if they are right, home"
+                " the drive elsewhere, or let it count in coarser units"
             )
 
 
@@ -112,3 +113,45 @@ def software_limits(model: ArmModel) -> tuple[Array, Array]:
     """Extremes of each drive (n,) and (n,), units, over the joints' ranges; the coupled ones span both joints'."""
     a, b, zero = model.units_per_q * model.q_min, model.units_per_q * model.q_max, model.zero_units
     return np.floor(np.minimum(a, b).sum(axis=1) + zero), np.ceil(np.maximum(a, b).sum(axis=1) + zero)
+
+
+def within_drives(setup: Setup, devices: Mapping[int, Abilities]) -> tuple[Setup, tuple[str, ...]]:
+    """The setup whose joints keep within what the 607Dh of their drives can allow, and a warning where that is less.
+
+    Beyond its 607Dh a drive faults. One that moves with several joints is left as it is.
+    """
+    arm, narrower = setup.arm, []
+    if arm is None:
+        return setup, ()
+    joints = list(arm.model.joints)
+    low, high = software_limits(arm.model)
+    for axis, (joint, drive) in enumerate(zip(arm.model.joints, arm.drives, strict=True)):
+        least, most = _guarded(devices[drive.node_id], low[axis], high[axis])
+        if (least, most) == (low[axis], high[axis]) or np.count_nonzero(arm.model.units_per_q[axis]) > 1:
+            continue
+        # a unit inside, so that rounding stays within
+        ends = (np.array((least + 1, most - 1)) - arm.model.zero_units[axis]) / arm.model.units_per_q[axis, axis]
+        joints[axis] = replace(joint, q_min=max(joint.q_min, min(ends)), q_max=min(joint.q_max, max(ends)))
+        narrower.append(f"{joint.name} {joint.shown(min(ends)):.1f} to {joint.text(max(ends))}")
+    if not narrower:
+        return setup, ()
+    warning = (
+        f"607Dh: drives that fault before the ends of their joints; the plan keeps within {', '.join(narrower)}. If"
+        " that is wrong, check counts_per_turn and gear, then zero_counts"
+    )
+    return setup.changed("arm", model=replace(arm.model, joints=tuple(joints))), (warning,)
+
+
+def _guarded(device: Abilities, low: float, high: float) -> tuple[float, float]:
+    """How much of a range of positions a drive's 607Dh can allow."""
+    entries = [device.description.entry(POSITION_LIMITS, subindex) for subindex in (1, 2)]
+    if None in entries:
+        return low, high
+    least, most = (
+        (entry.low if number == 0 else entry.high) if entry.writable else entry.initial
+        for number, entry in enumerate(entry for entry in entries if entry is not None)
+    )
+    least, most = (end if isinstance(end, int) else None for end in (least, most))
+    if least is not None and most is not None and least >= most:  # no limits
+        return low, high
+    return low if least is None else max(low, least), high if most is None else min(high, most)

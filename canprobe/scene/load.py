@@ -7,6 +7,7 @@ checks and default (`canprobe.scene.model`). What goes together across keys stan
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
 import re
@@ -18,10 +19,10 @@ from os.path import isfile  # False where the system refuses a name, as `Path.is
 from pathlib import Path
 from typing import Any
 
-from canprobe.errors import SceneError, UsageError
-from canprobe.robot.urdf import with_meshes_found
+from canprobe.errors import PlanError, SceneError, UsageError
+from canprobe.robot.urdf import from_urdf, with_meshes_found
 from canprobe.scene.checks import MismatchError, Only, ScenePath, choices_of, conditions_of, convert
-from canprobe.scene.hardware import CellInfo
+from canprobe.scene.hardware import ArmSettings, CellInfo
 from canprobe.scene.model import DEFAULT_ARRAY, ArrayFile, Cell, Scene
 from canprobe.scene.rules import SECTIONS_OF_TASK, broken_rules
 
@@ -243,8 +244,21 @@ def _read_hardware(name_or_path: str | Path, what: str, kind: type[Any]) -> tupl
     document = read_toml(path, file)
     reader = Reader(path.parent)
     sections = reader.read(kind, document, (what,))
+    _complain_of_names(reader, sections.get("arm"), document.get("joints"))
     reader.refuse(file)
     return sections, reader.with_paths(document)
+
+
+def _complain_of_names(reader: Reader, arm: ArmSettings | None, joints: object) -> None:
+    """Joints that the URDF does not have; where nothing else is wrong, `arm_model` says so with the order."""
+    if not reader.problems or arm is None or not arm.urdf or not isinstance(joints, dict):
+        return
+    with contextlib.suppress(PlanError):  # the URDF's own faults come once the cell can be read
+        names = from_urdf(arm.urdf, arm.base, arm.tip).chain.joints
+        for name in joints:
+            if name not in names:
+                hint = _did_you_mean(name, names)
+                reader.complain(f"joints.{toml_key(name)}", f"no joint of {arm.urdf}{hint}")
 
 
 def load_array(name_or_path: str | Path) -> dict[str, Any]:
@@ -369,6 +383,7 @@ def _scene(own: Mapping[str, Any], file: str, folder: Path | None) -> Scene:
 
     for where, complaint in broken_rules(lookup):
         reader.complain(where, complaint)
+    _complain_of_names(reader, values.get("arm"), document.get("joints"))
     reader.refuse(file)
     return Scene(**values)
 

@@ -17,13 +17,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.errors import UsageError
+from canprobe.errors import PlanError, UsageError
 from canprobe.planning.make import make_plan
 from canprobe.planning.model import Plan
+from canprobe.planning.motion import reach_problems
 from canprobe.robot.chain import forward
 from canprobe.robot.inverse import task_rows
 from canprobe.scene.hardware import Vec3
-from canprobe.scene.load import load_scene
+from canprobe.scene.load import load_scene, packaged_files
 from canprobe.scene.model import ObjectSettings, Scene
 from canprobe.scene.resolve import resolve
 from canprobe.scene.setup import Touch
@@ -41,6 +42,10 @@ Floats = NDArray[np.float64]
 Ask = Callable[[str], str]
 """Asks a person: takes the text, gives the answer."""
 
+PACKAGED_AT: Vec3 = (-120.0, -122.5, 374.0)
+"""The point of a packaged cell, mm."""
+BELOW_M = 5e-3
+"""From the probe in the start posture down to the point that is touched."""
 REST_S = 30.0
 PLANE_FORCES_N, BALL_FORCES_N, LOADS_N = (0.7, 1.5, 3.0), (0.8, 2.0), (1.0, 2.0, 3.0)
 CORNERS_M = tuple((u, v) for u in (-2e-3, 2e-3) for v in (-2e-3, 2e-3))
@@ -143,7 +148,8 @@ class Request:
     Attributes:
         cell: name or path.
         target: interface and channels; None: the cell's.
-        at: point that is touched first, mm, base frame.
+        at: point that is touched first, mm, base frame; None: the point under the probe in the start posture, or
+            `PACKAGED_AT` of a packaged cell.
         ball_radius, rod_radius: m.
         reference: what newtons rest on.
         sigma: its relative standard deviation.
@@ -153,7 +159,7 @@ class Request:
 
     cell: str | Path
     target: Target | None = None
-    at: Vec3 = (-120.0, -122.5, 374.0)
+    at: Vec3 | None = None
     ball_radius: float = 0.025
     rod_radius: float = 0.025
     reference: ForceReference = "none"
@@ -197,29 +203,32 @@ def calibrate(
         SafetyStop, BusError: as of a run.
     """
     scene = _scene(request)
+    at = scene.task.start_mm
     assert scene.sensor is not None and scene.arm is not None
     emulated = scene.sensor.emulated
     if not emulated and ask is None:
         raise UsageError("a real array: somebody has to place the objects; leave --yes out")
     loads = request.reference in ("scale", "weights")
     every = list(visits(request.ball_radius, request.rod_radius, loads=loads, one_by_one=not emulated))
-    dwells: list[Dwell] = []
-    unloaded: list[NDArray[np.uint8]] = []
     notes: list[str] = []
-    placed: KnownObject | None = None
+    planned: list[tuple[int, Visit, Plan]] = []
     for number, visit in enumerate(every, start=1):
         there = _turned(scene) if visit.turned else scene
         if there is None:
             notes.append(f"the {visit.known.name} with the probe turned: the last joint cannot turn by half a turn")
             continue
+        planned.append((number, visit, _plan(replace(there, object=visit.known.settings(at)), visit)))
+    dwells: list[Dwell] = []
+    unloaded: list[NDArray[np.uint8]] = []
+    placed: KnownObject | None = None
+    for number, visit, plan in planned:
         if ask is not None and not emulated and visit.known != placed:
-            ask(f"{visit.known.asked_for(request.at)} Then press Enter: ")
+            ask(f"{visit.known.asked_for(at)} Then press Enter: ")
         placed = visit.known
         touches = f"{len(visit.presses)} touch{'es' * (len(visit.presses) != 1)}"
         say(f"visit {number} of {len(every)}: {touches} of the {visit.known.name}")
-        there = replace(there, object=visit.known.settings(request.at))
         folder = None if out is None else out / f"visit-{number:02d}"
-        found, rest = touch_object(make_plan(resolve(there)), visit, folder, say, ask if not emulated else None)
+        found, rest = touch_object(plan, visit, folder, say, ask if not emulated else None)
         dwells += found
         unloaded += rest
     setup = resolve(scene)
@@ -247,14 +256,45 @@ def _scene(request: Request) -> Scene:
         scene = request.target.applied_to(scene)
     bus = replace(scene.bus, timed=False) if scene.bus.interface == LOCKSTEP else scene.bus
     info = replace(scene.scene, name="calibrate-array", seed=request.seed, figures=False)
-    task = replace(scene.task, start_mm=request.at, approach_normal=(0.0, 0.0, 1.0), force_n=max(PLANE_FORCES_N))
-    scene = replace(scene, scene=info, bus=bus, task=task, object=ObjectSettings("plane", position_mm=request.at))
+    at = request.at or (PACKAGED_AT if str(request.cell) in packaged_files("cells") else _under_probe(scene))
+    task = replace(scene.task, start_mm=at, approach_normal=(0.0, 0.0, 1.0), force_n=max(PLANE_FORCES_N))
+    scene = replace(scene, scene=info, bus=bus, task=task, object=ObjectSettings("plane", position_mm=at))
     setup = resolve(scene)
     if setup.array is not None and setup.array.mode == "features":
         raise UsageError("sensor.mode: a calibration needs images, and this array sends features")
     if setup.arm is not None and task_rows(setup.arm.model) < 5:
         raise UsageError(f"{request.cell}: a calibration tilts the probe, and this arm holds its orientation")
     return scene
+
+
+def _under_probe(scene: Scene) -> Vec3:
+    """The point under the probe in the start posture, mm."""
+    setup = resolve(scene)
+    assert setup.arm is not None
+    centre = (forward(setup.arm.model.chain, setup.arm.q_start) @ setup.probe.T_flange_probe)[:3, 3]
+    x, y, z = (1e3 * (centre - (0.0, 0.0, setup.probe.radius + BELOW_M))).round(1).tolist()
+    return x, y, z
+
+
+def _plan(scene: Scene, visit: Visit) -> Plan:
+    """The plan of a visit, whose touches and rolls the arm reaches.
+
+    Raises:
+        PlanError: it does not; with the option to type.
+    """
+    where = f"{visit.known.name} at ({', '.join(f'{value:g}' for value in scene.task.start_mm)}) mm"
+    try:
+        plan = make_plan(resolve(scene))
+        arm, task = plan.setup.arm, plan.setup.task
+        assert arm is not None and isinstance(task, Touch)
+        x = (forward(arm.model.chain, arm.q_start) @ task.probe.T_flange_probe)[:3, 0]
+        poses = _roll_task(plan, visit).poses(x)
+        if problems := reach_problems(plan.setup, task, [(pose.centre, -pose.pole) for pose in poses]):
+            raise PlanError(problems)
+    except PlanError as error:
+        way = "if the arm does not reach it, give another point with --at X Y Z, or another start posture in the cell"
+        raise PlanError([*(f"{where}: {problem}" for problem in error.problems), way], error.ways_out) from error
+    return plan
 
 
 def _turned(scene: Scene) -> Scene | None:
@@ -275,14 +315,12 @@ def touch_object(
     plan: Plan, visit: Visit, out: Path | None, say: Say, ask: Ask | None
 ) -> tuple[list[Dwell], list[NDArray[np.uint8]]]:
     """Bring the cell up, touch, stop; the touches, and what the array showed before. `ask` reads reference loads."""
-    task = plan.setup.task
+    task, roll = plan.setup.task, _roll_task(plan, visit)
     assert isinstance(task, Touch)
-    presses = [replace(p, heading=_along_rod(plan, visit.known)) if math.isnan(p.heading) else p for p in visit.presses]
-    radius = math.inf if visit.known.name == "rod" else visit.known.radius
-    roll = RollTask(plan, task, make_sensing(task), presses, radius, visit.rest_s)
     with Session(plan, out, say) as session:
         session.run(roll)
     log, truth = session.cell.log.arrays(), session.truth
+    presses = roll.presses
     places = list(dict.fromkeys(p.at if not p.hz[1:] else (p.at, p.heading) for p in presses))
     dwells = []
     for i, pressed in enumerate(roll.pressed):
@@ -298,6 +336,14 @@ def touch_object(
         place += 50 * bool(press.hz[1:])
         dwells.append(as_dwell(pressed, visit, task.approach.start, task.probe.radius, place, force))
     return dwells, roll.unloaded
+
+
+def _roll_task(plan: Plan, visit: Visit) -> RollTask:
+    task = plan.setup.task
+    assert isinstance(task, Touch)
+    presses = [replace(p, heading=_along_rod(plan, visit.known)) if math.isnan(p.heading) else p for p in visit.presses]
+    radius = math.inf if visit.known.name == "rod" else visit.known.radius
+    return RollTask(plan, task, make_sensing(task), presses, radius, visit.rest_s)
 
 
 def _read(ask: Ask | None, force: float) -> float:

@@ -42,6 +42,11 @@ TRUTH_SHARE = 0.2
 _PR_SET_PDEATHSIG = 1
 
 
+def with_our_imports() -> dict[str, str]:
+    """The environment in which `python -P -m` imports what this process does, whatever lies in the working folder."""
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(os.path.abspath(path) for path in sys.path)}
+
+
 def end_with_parent(parent: int) -> None:
     """In the child: get SIGTERM when the parent is killed. Linux only, and only a second line of defence.
 
@@ -91,7 +96,7 @@ class EmulatorChild:
         write_text(scene_file, dump_scene(self._scene))
         bus, nodes = self._scene.bus, self._scene.emulated_node_ids
         command = [
-            *(sys.executable, "-m", "canprobe", "emulate", str(scene_file)),
+            *(sys.executable, "-P", "-m", "canprobe", "emulate", str(scene_file)),
             *("--bus", bus.interface, "--bitrate", str(bus.bitrate)),
             *(word for channel in self._channels for word in ("--channel", f"{channel}={channel}")),
             *("--parent", str(os.getpid())),
@@ -103,6 +108,7 @@ class EmulatorChild:
         self._errors = (self._folder / "stderr").open("w+b")
         self._process = subprocess.Popen(  # no preexec_fn: fork would make the master's first cycles copy its pages
             command,
+            env=with_our_imports(),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=self._errors,

@@ -46,13 +46,15 @@ def check_links(
     """
     if interface != SOCKETCAN:
         return
-    from canprobe.bus.link import read_link
+    from canprobe.bus.link import missing_ip, read_link
+    from canprobe.bus.socketcan import has_socketcan
 
     errors: list[str] = []
     for channel, expected in channels.items():
         link = read_link(channel)
         if link is None:
-            say(f"{channel}: its setting is not checked: `ip` of iproute2 does not show it")
+            if has_socketcan():  # else opening it fails, which says so
+                say(f"{channel}: its setting is not checked: {missing_ip() or '`ip` of iproute2 does not show it'}")
         elif link.is_up:  # else opening it fails, with the line to type
             for remark in check_link(link, expected):
                 if must and remark.is_error:

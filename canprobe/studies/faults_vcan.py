@@ -22,14 +22,15 @@ from random import Random
 
 from canprobe.bus.disk import read_candump
 from canprobe.bus.interfaces import open_port
+from canprobe.bus.link import missing_ip
 from canprobe.bus.network import PumpedNetwork, hold_dialogues, upload
 from canprobe.bus.port import MonotonicClock, Port
 from canprobe.bus.socketcan import check_interface
-from canprobe.errors import CanprobeError
+from canprobe.errors import CanprobeError, InterfaceError
 from canprobe.protocol.cia402 import POWERED_STATES, DriveState, state_of
 from canprobe.scene.load import dump_scene, load_scene
 from canprobe.scene.model import Scene
-from canprobe.session.children import EmulatorChild
+from canprobe.session.children import EmulatorChild, with_our_imports
 from canprobe.studies.faults import draw_ends, scenario_scene
 from canprobe.studies.harness import CHANNEL, Column, Row, StudyResult, measuring_facts
 from canprobe.studies.realtime_cases import LATE_PERCENT, patient, with_real_nodes
@@ -92,6 +93,8 @@ def draw_process_case(seed: int) -> ProcessCase:
 def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     """Carry out the campaign: forty runs, or one of each kind with `quick`."""
     check_interface(CHANNEL)
+    if (missing := missing_ip()) is not None:
+        raise InterfaceError(f"{CHANNEL}: the study takes it down and up: {missing}")
     rows = []
     total = len(ProcessFault) if quick else RUNS
     for seed in range(total):
@@ -195,9 +198,15 @@ class _Run:
         scene = with_real_nodes(served_scene())
         path = self.folder / "scene.toml"
         path.write_text(dump_scene(replace(scene, scene=replace(scene.scene, figures=False))), encoding="utf-8")
-        command = [sys.executable, "-m", "canprobe", "run", str(path), "--out", str(self.folder / "run")]
+        command = [sys.executable, "-P", "-m", "canprobe", "run", str(path), "--out", str(self.folder / "run")]
         with (self.folder / "stderr").open("wb") as errors:
-            return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=errors)
+            return subprocess.Popen(
+                command,
+                env=with_our_imports(),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=errors,
+            )
 
     def _await_enabled(self, port: Port, master: subprocess.Popen[bytes]) -> bool:
         """Wait until the first drive reports operation enabled."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -27,6 +27,8 @@ FORCE_HZ = 0.5
 """Bandwidth with which the force is held; slower than a roll, so that its images have one depth."""
 MOST_DEPTH = 3e-3
 """Way beyond the first touch, m, at which the object gives way."""
+ROLL_SAMPLES = 24
+"""Poses of a roll whose reach is checked."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +96,7 @@ class RollTask(ProbingTask):
         rest_s: how long the array is listened to before the first touch.
 
     Attributes:
+        presses: as given.
         pressed: what was recorded, touch by touch.
         unloaded: images before the first touch.
     """
@@ -105,7 +108,7 @@ class RollTask(ProbingTask):
         self.pressed: list[Pressed] = []
         self.unloaded: list[NDArray[np.uint8]] = []
         self._approach_of = task.approach
-        self._presses, self._radius, self._rest_s = presses, radius, rest_s
+        self.presses, self._radius, self._rest_s = presses, radius, rest_s
         self._number = 0
         self._gone = self._touched_at = 0.0
         self._axes = np.eye(3)
@@ -119,7 +122,7 @@ class RollTask(ProbingTask):
 
     def stop(self) -> None:
         """Let go and be done."""
-        self._number = len(self._presses)
+        self._number = len(self.presses)
         if self.phase not in (Phase.RETREAT, Phase.DONE) and self._motion is not None:
             self._let_go()
 
@@ -147,9 +150,25 @@ class RollTask(ProbingTask):
 
     # where the probe is
 
+    def poses(self, x: Vector) -> Iterator[ProbePose]:
+        """Above each touch, and round its roll, for a probe that begins with its x axis along `x` (3,)."""
+        self._set_axes(x)
+        for number, press in enumerate(self.presses):
+            self._number = number
+            yield self._pose((0.0, 0.0), -self._approach_of.clearance)
+            for t in np.linspace(0.0, press.seconds, ROLL_SAMPLES):
+                yield self._pose(press.way(float(t)), 0.0)
+        self._number = 0
+
+    def _set_axes(self, x: Vector) -> None:
+        inward = -self._approach_of.normal
+        x = x - inward * float(inward @ x)
+        x = x / np.linalg.norm(x)
+        self._axes = np.array([x, np.cross(inward, x), inward])
+
     def _pose(self, way: tuple[float, float], gone: float) -> ProbePose:
         """Rolled by a way over the pad (m), its surface a way beyond the object's, both as they are expected."""
-        press = self._presses[min(self._number, len(self._presses) - 1)]
+        press = self.presses[min(self._number, len(self.presses) - 1)]
         x_axis, y_axis, inward = self._axes
         along = way[0] * x_axis + way[1] * y_axis
         arc = float(np.linalg.norm(along))
@@ -174,12 +193,8 @@ class RollTask(ProbingTask):
         """To the next touch, or to the end."""
         assert self._motion is not None
         if self._number == 0:
-            inward = -self._approach_of.normal
-            x = self._motion.pose_matrix[:3, 0]
-            x = x - inward * float(inward @ x)
-            x = x / np.linalg.norm(x)
-            self._axes = np.array([x, np.cross(inward, x), inward])
-        if self.reason is not None or self._number >= len(self._presses):
+            self._set_axes(self._motion.pose_matrix[:3, 0])
+        if self.reason is not None or self._number >= len(self.presses):
             return self._enter(Phase.DONE)
         self._line = LineMotion(pose, self._pose((0.0, 0.0), -self._approach_of.clearance), MOVE_SPEED)
         self._enter(Phase.MOVE)
@@ -207,7 +222,7 @@ class RollTask(ProbingTask):
 
     def _settle(self) -> ProbePose:
         """On, slowly, until the force is there."""
-        press = self._presses[self._number]
+        press = self.presses[self._number]
         if self._touch.force >= press.force:
             self.pressed.append(Pressed(press))
             self._enter(Phase.SCAN)
@@ -218,7 +233,7 @@ class RollTask(ProbingTask):
         return self._pose((0.0, 0.0), self._gone)
 
     def _scan(self) -> ProbePose:
-        press = self._presses[self._number]
+        press = self.presses[self._number]
         depth = self.sensing.depth(press.force)
         error = depth * (1.0 - math.sqrt(max(self._touch.force, 0.0) / press.force))
         self._gone += 2.0 * math.pi * FORCE_HZ * self._dt * error

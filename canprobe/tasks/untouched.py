@@ -238,7 +238,8 @@ class JointCheck(Controller):
         its = self._model.joints[joint]
         return (
             f"joint {joint + 1} stands at {its.text(q[joint])}, outside {its.shown(self._guard.low[joint]):.1f} to "
-            f"{its.text(self._guard.high[joint])}: move it there by hand, or its zero is wrong"
+            f"{its.text(self._guard.high[joint])}: check counts_per_turn and gear, then sign and zero_counts; if they "
+            "are right, move it there by hand"
         )
 
     def _all_joints(self) -> Generator[Command, Measurement, None]:

@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
 
+from canprobe.bus.link import missing_ip, sudo
 from canprobe.bus.socketcan import check_interface, has_socketcan
 from canprobe.errors import InterfaceError
 from canprobe.vcan.guest import GuestError, GuestJob, missing_packages
@@ -161,7 +162,7 @@ def run_with_vcan(
     Args:
         command: program and arguments; none for the user's shell, which has standard input.
         timeout_s: how long the command may run; booting a guest does not count.
-        install: install the guest's Debian package if a guest is needed.
+        install: install the guest's Debian package if a guest is needed, and iproute2 where `ip` is missing.
         realtime: steady the guest's timing; see `GuestJob`.
 
     Returns:
@@ -187,10 +188,17 @@ def run_with_vcan(
 
 def _check_guest(install: bool) -> int:
     """0 where a guest can be started; else 125, with the line to type."""
-    if missing := missing_packages():
-        line = f"{'' if os.geteuid() == 0 else 'sudo '}apt-get install -y {' '.join(missing)}"
+    missing = missing_packages()
+    if install and missing_ip() is not None:
+        missing.append("iproute2")  # for commands in the guest
+    if missing:
+        line = f"{sudo()}apt-get install -y {' '.join(missing)}"
         if not install:
-            return _no_vcan(f"this kernel has no vcan, and what the guest that would needs is missing; type:  {line}")
+            return _no_vcan(
+                f"this kernel has no vcan, and what the guest that would needs is missing; on Debian type:  {line}"
+                f"  elsewhere take a kernel with vcan ({sudo()}modprobe vcan; Ubuntu has it in the package"
+                " linux-modules-extra-$(uname -r)), or --bus udp_multicast --patient"
+            )
         if not _install(line):
             return _no_vcan(f"this failed:  {line}")
     return 0

@@ -95,3 +95,11 @@ def test_a_run_without_a_bridge_imports_none():
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
     assert done.stdout == "[]\n"
+
+
+def test_children_import_our_package_and_the_bridge_is_named_before_the_run(tmp_path, monkeypatch, capsys):
+    (tmp_path / "canprobe").mkdir()
+    (tmp_path / "canprobe" / "__init__.py").write_text("raise ImportError('of the working folder')")
+    monkeypatch.chdir(tmp_path)
+    assert main(["run", "press", "--bridge", "mcap", "--duration", "0.5", "--out", "out"]) == 0
+    assert "bridge mcap: " in capsys.readouterr().err, "also without a terminal"

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from canprobe.cli import main
+from canprobe.eds.packaged import eds_path
 from canprobe.scene.load import load_scene
 from canprobe.scene.resolve import resolve
 
@@ -88,6 +89,47 @@ def test_a_cell_alone_is_planned_as_free_motion(tmp_path, urdf, capsys):
     assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf)]) == 0
     assert main(["plan", str(tmp_path / "cell" / "cell.toml")]) == 0
     assert "free" in capsys.readouterr().out
+
+
+def test_the_cell_has_the_rate_of_its_drives_and_images_that_divide_it(tmp_path, urdf, capsys):
+    eds = tmp_path / "4ms.eds"
+    text = eds_path("puma260_joint").read_text()
+    head, _, rest = text.partition("[60C2sub1]")
+    section, mark, tail = rest.partition("\n[")
+    section = section.replace("AccessType=rw", "AccessType=ro").replace("DefaultValue=25", "DefaultValue=4")
+    eds.write_text(f"{head}[60C2sub1]{section}{mark}{tail}")
+    assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf), "--eds", str(eds)]) == 0
+    cell = tomllib.loads((tmp_path / "cell" / "cell.toml").read_text())
+    assert (cell["cycle"]["rate_hz"], cell["sensor"]["rate_hz"]) == (250, 125)
+    first = tomllib.loads((tmp_path / "cell" / "first.toml").read_text())
+    assert first["task"]["kind"] == "scan" and not {"cycle", "sensor"} & set(first)
+    assert main(["plan", str(tmp_path / "cell" / "cell.toml")]) == 0
+
+
+def test_an_eds_that_cannot_be_driven_is_to_be_corrected(tmp_path, urdf, capsys):
+    eds = tmp_path / "bad.eds"
+    eds.write_text(eds_path("puma260_joint").read_text().replace("=0x60C2\n", "=0x6100\n").replace("[60C2", "[6100"))
+    assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf), "--eds", str(eds)]) == 2
+    said = capsys.readouterr().err
+    assert "60C2h" in said and f"correct the EDS (or the URDF) that this names, remove the folder {tmp_path}" in said
+
+
+def test_why_the_first_scene_does_not_scan_is_said(tmp_path, urdf, capsys):
+    assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf), "--tip", "l1"]) == 0
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "freely" in line]
+    assert "a scan was refused: joints: in its start posture" in line
+    assert 'kind = "free"' in (tmp_path / "cell" / "first.toml").read_text()
+
+
+def test_a_misspelt_joint_is_said_with_all_other_mistakes(tmp_path, urdf, capsys):
+    assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf)]) == 0
+    cell = tmp_path / "cell" / "cell.toml"
+    cell.write_text(cell.read_text().replace("[joints.rail]", "[joints.rial]").replace("gear =", "gera ="))
+    assert main(["plan", str(cell)]) == 2
+    assert "joints.rial: no joint of" in capsys.readouterr().err
+    assert main(["plan", str(tmp_path / "cell" / "first.toml")]) == 2
+    said = capsys.readouterr().err
+    assert "joints.rial: no joint of" in said and "did you mean rail?" in said and "joints.j6.gera: unknown key" in said
 
 
 @pytest.mark.parametrize(

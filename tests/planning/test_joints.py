@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from scenes import with_joints
 
 import canprobe
+from canprobe.eds.packaged import eds_path
 from canprobe.errors import PlanError
 from canprobe.scene.load import load_scene, parse_scene
 
@@ -74,7 +76,26 @@ def test_counts_that_leave_32_bits_are_refused_with_joint_drive_and_range():
     many_turns = with_joints(scene, gear=[1, 1, 1, 1, 1, 1e5], counts_per_turn=[1000, 1000, 1000, 800, 800, 1e6])
     assert "joints.joint_6: drive 6" in refusal(many_turns)
     counts = round(1000 * first.gear * max(abs(first.min_deg), abs(first.max_deg)) / 360) + 1
-    assert canprobe.plan(with_joints(scene, zero_counts=[(1 << 31) - 1 - counts, 0, 0, 0, 0, 0]))
+    fits = refusal(with_joints(scene, zero_counts=[(1 << 31) - 1 - counts, 0, 0, 0, 0, 0]))
+    assert "would count from" not in fits and "607Dh" in fits, "the packaged drive's 607Dh holds 24 bits"
+
+
+@pytest.mark.parametrize("access", ["rw", "ro"])
+def test_a_joint_keeps_within_a_drive_that_guards_less_than_its_range(tmp_path, access):
+    text = eds_path("puma260_joint").read_text()
+    for sub, old, new in ((1, "8388608", "20000"), (2, "8388607", "20000")):
+        head, mark, rest = text.partition(f"[607Dsub{sub}]")
+        section, end, tail = rest.partition("\n[")
+        text = head + mark + section.replace(old, new).replace("=rw", f"={access}") + end + tail
+    (tmp_path / "narrow.eds").write_text(text)
+    scene = load_scene("free")
+    scene = replace(scene, arm=replace(scene.arm, eds=str(tmp_path / "narrow.eds")))
+    plan = canprobe.plan(scene)
+    model, before = plan.setup.arm.model, canprobe.plan("free").setup.arm.model
+    assert plan.setup.task.arm.model is model and "fault before the ends of their joints" in plan.warnings[0]
+    units = model.units_per_q[0, 0] * np.array((model.q_min[0], model.q_max[0]))
+    assert np.abs(units).max() <= 20000 < np.abs(before.units_per_q[0, 0] * before.q_min[0])
+    assert "joints.joint_1.start_deg" in refusal(with_joints(scene, start_deg=[-154, 0, 0, 0, 0, 0]))
 
 
 def test_two_joints_cannot_press():

@@ -14,6 +14,7 @@ from canprobe.cli import main
 from canprobe.planning.make import make_plan
 from canprobe.scene.load import load_scene, packaged_files
 from canprobe.scene.resolve import resolve
+from canprobe.session import array_calibration
 from canprobe.session.array_calibration import KnownObject, Visit, touch_object, visits
 from canprobe.tasks.roll import Press
 
@@ -75,6 +76,29 @@ def test_there_are_at_most_forty_touches_and_forces_only_grow_on_an_object():
 def test_what_cannot_be_calibrated_is_said(argv, said, tmp_path, capsys):
     assert main(["calibrate", "array", *argv, "--out", str(tmp_path / "out")]) == 2
     assert said in capsys.readouterr().err
+
+
+def test_the_reach_of_every_roll_is_checked_before_anything_moves(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["calibrate", "array", "puma260", "--at", "-104", "-122.5", "374"]) == 2
+    said = capsys.readouterr().err
+    assert "give another point with --at" in said and "visit" not in said
+    assert "contact at" not in said, "the plan of a press alone accepts it"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_a_point_a_cell_file_has_the_one_under_its_probe(tmp_path, monkeypatch):
+    cell = tmp_path / "mine.toml"
+    cell.write_text(packaged_files("cells")["puma260"].read_text())
+    asked = []
+    monkeypatch.setattr(array_calibration, "touch_object", lambda plan, *_: asked.append(plan.scene) or 1 / 0)
+    for name in ("puma260", cell):
+        with pytest.raises(ZeroDivisionError):
+            array_calibration.calibrate(array_calibration.Request(name), date="2026-01-01")
+        at = asked[-1].task.start_mm
+        assert asked[-1].object.position_mm == at
+        assert (at == AT) == (name == "puma260")
+        assert at == pytest.approx(AT, abs=15)
 
 
 def test_a_real_array_needs_somebody_to_place_things(tmp_path, capsys):

@@ -145,6 +145,7 @@ def ip(monkeypatch):
         return subprocess.CompletedProcess(command, 1 if error else 0, text, error)
 
     monkeypatch.setattr("canprobe.bus.link.subprocess.run", run)
+    monkeypatch.setattr("canprobe.bus.socketcan.has_socketcan", lambda: True)
     return answers
 
 
@@ -176,12 +177,18 @@ def test_of_a_virtual_interface_nothing_is_said(ip):
     assert check("vcan0") == []
 
 
-def test_without_ip_it_says_so(ip):
-    ip["can0"] = (None, "")
-    said = check()
+def test_without_ip_it_says_so_with_the_line_to_type(ip, monkeypatch):
     ip["can0"] = ("not JSON", "")
-    assert said == check() == ["can0: its setting is not checked: `ip` of iproute2 does not show it"]
+    monkeypatch.setattr("shutil.which", lambda _: "/usr/sbin/ip")
+    assert check() == ["can0: its setting is not checked: `ip` of iproute2 does not show it"]
+    ip["can0"] = (None, "")
+    monkeypatch.setattr("shutil.which", lambda _: None)
+    (line,) = check()
+    assert line.startswith("can0: its setting is not checked: `ip` is not installed; type:")
+    assert line.endswith("apt-get install -y iproute2")
     assert read_link("can0") is None
+    monkeypatch.setattr("canprobe.bus.socketcan.has_socketcan", lambda: False)
+    assert check() == [], "opening it says so"
 
 
 def test_other_buses_and_interfaces_that_are_down_or_missing_are_left_to_who_opens_them(ip):

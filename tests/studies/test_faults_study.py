@@ -234,6 +234,14 @@ def test_failures_are_told():
     assert findings_on_vcan(rows)[0] == "2 runs on vcan0, 1 failed." and "node 3 moves" in findings_on_vcan(rows)[1]
 
 
+def test_without_ip_the_study_on_vcan_names_the_package(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("canprobe.studies.faults_vcan.check_interface", lambda _: None)
+    monkeypatch.setattr("shutil.which", lambda _: None)
+    assert main(["study", "faults", "--vcan"]) == 3
+    assert "apt-get install -y iproute2" in capsys.readouterr().err
+
+
 def test_vcan_belongs_to_faults_and_knows_no_seed(capsys):
     assert main(["study", "bound", "--vcan"]) == 2
     assert main(["study", "faults", "--vcan", "--seed", "3"]) == 2

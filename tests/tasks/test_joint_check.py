@@ -129,8 +129,10 @@ def test_beyond_a_stop_nothing_moves(plan, guard):
     start[4] = guard.low[4] - math.radians(2.0)
     check = JointCheck(plan, None)
     assert check.inspect(START) is None
-    assert check.inspect(start) == "joint 5 stands at -31.0 deg, outside -29.0 to 199.0 deg: move it there by hand," + (
-        " or its zero is wrong"
+    assert check.inspect(
+        start
+    ) == "joint 5 stands at -31.0 deg, outside -29.0 to 199.0 deg: check counts_per_turn and" + (
+        " gear, then sign and zero_counts; if they are right, move it there by hand"
     )
 
 

@@ -130,7 +130,8 @@ def test_no_vcan_is_125_with_the_line_to_type(capfd: pytest.CaptureFixture[str])
     out, err = capfd.readouterr()
     assert out == ""
     assert err.count("\n") == 1
-    assert "apt-get install -y user-mode-linux" in err
+    assert "on Debian type:" in err and "apt-get install -y user-mode-linux" in err
+    assert "modprobe vcan" in err and "--bus udp_multicast --patient" in err
 
 
 @pytest.mark.usefixtures("nowhere")
@@ -143,7 +144,7 @@ def test_install_runs_that_line_updates_once_and_gives_up_clearly(
     (tmp_path / "sudo").symlink_to("/usr/bin/env")
     monkeypatch.setenv("PATH", str(tmp_path))
     assert main(["vcan", "--install", "--", "true"]) == 125
-    install = "install -y user-mode-linux"
+    install = "install -y user-mode-linux iproute2"  # this PATH has no `ip`
     assert (tmp_path / "calls").read_text().splitlines() == [install, "update", install]
     out, err = capfd.readouterr()
     assert (out, err.count("from apt")) == ("", 3)
