@@ -35,7 +35,7 @@ IN_GUEST = "canprobe vcan --realtime -- "
 ON_VCAN0 = "canprobe run cylinder --bus socketcan --channel vcan0 --realtime --patient"
 LONG = ("faults", "soak")
 INTERPRETED = {"python": [sys.executable], "canprobe": [sys.executable, "-m", "canprobe"]}
-COLOURS = 64
+COLOURS = 256
 """Of a picture in the documentation."""
 
 Entry = dict[str, Any]
@@ -186,7 +186,7 @@ def study(name: str) -> Entry:
     entry = {"command": command} | _found(name, json.loads((out / f"{name}.json").read_text(encoding="utf-8")))
     for picture in out.glob("*.png"):
         if (shown := DOCS / "img" / picture.name).exists():
-            Image.open(picture).convert("RGB").quantize(COLOURS).save(shown, optimize=True)
+            Image.open(picture).convert("RGB").quantize(COLOURS, Image.Quantize.MAXCOVERAGE).save(shown, optimize=True)
     return entry
 
 
