@@ -63,5 +63,5 @@ def test_a_package_that_a_command_misses_is_told_with_that_line(tmp_path):
     words = ("study", "bound", "--quick", "--out", str(tmp_path / "out"))
     done = subprocess.run([sys.executable, "-c", script, *words], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("canprobe: study needs matplotlib") and "[study]" in done.stderr
+    assert done.stderr.startswith("canprobe: study: needs matplotlib; type: ") and "[study]" in done.stderr
     assert done.stderr.count("\n") == 1

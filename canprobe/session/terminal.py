@@ -19,9 +19,7 @@ MARKS = ("warning", "noted", "fault")
 
 
 def columns(stream: TextIO) -> int | None:
-    """Width of the terminal behind a stream, or what COLUMNS says; None where there is neither."""
-    if (given := os.environ.get("COLUMNS", "")).isdecimal() and int(given):
-        return int(given)
+    """Width of the terminal behind a stream; None where there is none: in a pipe a line stays whole."""
     if not stream.isatty():
         return None
     try:
@@ -77,7 +75,7 @@ class Report:
         Returns:
             A function of (done, total), both in the same unit, that redraws only when the picture changes.
         """
-        if self.verbosity < 0 or (not self._stream.isatty() and "ipykernel" not in sys.modules):
+        if self.verbosity < 0 or (columns(self._stream) is None and "ipykernel" not in sys.modules):
             return None
         form, name = unit.split()
         shown = ""

@@ -54,7 +54,8 @@ def test_a_row_tells_overconfidence_and_its_interval_is_over_scenes():
     assert row["coverage_low"] < 0.75
     assert row["coverage_high"] > 0.99
     assert row["stated_over_error"] < 0.3
-    assert any("sphere" in line for line in findings([row]))
+    said = findings([row, {**row, "of": "all"}])
+    assert len(said) == 2 and f"sphere {100 * row['coverage']:.1f} %" in said[1]
 
 
 def test_random_scenes_differ_and_nearly_all_can_be_planned():
