@@ -9,6 +9,7 @@ import html
 import importlib
 import io
 import math
+import time
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -50,6 +51,8 @@ LOOK_ASIDE = math.radians(55.0)
 """Of the camera, from the line that leads from base to contact, seen from above: the arm hides nothing there."""
 FOLLOW_M = 4e-3
 """The camera of a browser follows the contact in steps of this size: between them it is the user's."""
+ARRIVING_S = 3.0
+"""From the first time that it was moved; until then a page may set its camera anew while it is laid out."""
 ALONE = (0.0, 0.0, 0.12)
 """Where the probe stands, pole up, in a scene without an arm, m."""
 
@@ -91,7 +94,7 @@ class Stage:
         self._probe = None
         self._tool = np.eye(4) if scene.probe is None else T_flange_probe(scene.probe)
         self.notes: list[str] = [] if array is None or array.newtons != NOMINAL else [f"force in {NOMINAL}"]
-        self._place, self._moved = place_of(scene), dict[int, Array]()
+        self._place, self._moved, self._met = place_of(scene), dict[int, Array](), dict[int, float]()
         self._truth: list[Any] = []
         self._follows = None
         self._server = server
@@ -210,9 +213,10 @@ class Stage:
 
     def _follow(self, away: Array) -> None:
         """Carry every browser's camera along, in steps; how it was turned by hand stays."""
+        now = time.monotonic()
         for number, client in self._server.get_clients().items():
             camera = client.camera
-            if number not in self._moved:  # what it reports until it was told anything may be another place
+            if now - self._met.setdefault(number, now) < ARRIVING_S:  # a page that is being laid out has other places
                 position, look_at, step = *self._view, away
             else:
                 position, look_at, step = camera.position, camera.look_at, away - self._moved[number]
