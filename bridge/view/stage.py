@@ -9,7 +9,6 @@ import html
 import importlib
 import io
 import math
-import time
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -32,6 +31,7 @@ from canprobe.bridge.view.instants import Curves, Moment
 from canprobe.bridge.view.links import arm_links
 from canprobe.bridge.view.meshes import Array, Mesh, linear_light
 from canprobe.bridge.view.path import PATH, DeviationScale
+from canprobe.bus.port import MonotonicClock
 from canprobe.errors import InterfaceError
 from canprobe.robot.model import ArmModel
 from canprobe.scene.geometry import T_flange_probe, true_object
@@ -95,6 +95,7 @@ class Stage:
         self._tool = np.eye(4) if scene.probe is None else T_flange_probe(scene.probe)
         self.notes: list[str] = [] if array is None or array.newtons != NOMINAL else [f"force in {NOMINAL}"]
         self._place, self._moved, self._met = place_of(scene), dict[int, Array](), dict[int, float]()
+        self._clock = MonotonicClock()
         self._truth: list[Any] = []
         self._follows = None
         self._server = server
@@ -213,7 +214,7 @@ class Stage:
 
     def _follow(self, away: Array) -> None:
         """Carry every browser's camera along, in steps; how it was turned by hand stays."""
-        now = time.monotonic()
+        now = 1e-9 * self._clock.now_ns()
         for number, client in self._server.get_clients().items():
             camera = client.camera
             if now - self._met.setdefault(number, now) < ARRIVING_S:  # a page that is being laid out has other places
