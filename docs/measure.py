@@ -25,6 +25,8 @@ from PIL import Image
 import canprobe
 from canprobe.results.expected import figures_of
 from canprobe.scene.load import packaged_scenes
+from canprobe.studies.harness import processor
+from canprobe.studies.sweep import STUDIES
 
 DOCS = Path(__file__).resolve().parent
 FILE = DOCS / "measured.json"
@@ -33,6 +35,7 @@ RUNS = DOCS.parent / "runs" / "measured"
 SEEDS, SEEDS_OF_ONE_SCAN = (0, 1, 2), range(10)
 IN_GUEST = "canprobe vcan --realtime -- "
 ON_VCAN0 = "canprobe run cylinder --bus socketcan --channel vcan0 --realtime --patient"
+BENCH = "python -m pytest -n0 --benchmark-only tests/bench/"
 LONG = ("faults", "soak")
 INTERPRETED = {"python": [sys.executable], "canprobe": [sys.executable, "-m", "canprobe"]}
 COLOURS = 256
@@ -91,13 +94,11 @@ def origin() -> Entry:
     git = ["git", "-C", str(DOCS.parent)]
     commit = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
     changed = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", "canprobe", "bridge", "eds", "tests"], check=False)
-    cpuinfo = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    models = [line.partition(": ")[2] for line in cpuinfo if "model name" in line]
     cores = len(os.sched_getaffinity(0))
     return {
         "date": datetime.date.today().isoformat(),
         "commit": commit.stdout.strip() + ("-dirty" if changed.returncode else ""),
-        "machine": f"{next(iter(models), platform.machine())}, {cores} cores, Python {platform.python_version()}",
+        "machine": f"{processor()}, {cores} cores, Python {platform.python_version()}",
     }
 
 
@@ -210,20 +211,21 @@ def _cell(form: str, row: Row) -> str:
 def bench(file: str) -> list[Row]:
     """What pytest-benchmark measures of a file of `tests/bench`."""
     with tempfile.NamedTemporaryFile(suffix=".json") as written:
-        printed(f"python -m pytest -n0 --benchmark-only --benchmark-json={written.name} tests/bench/{file}")
+        printed(f"{BENCH}{file} --benchmark-json={written.name}")
         benchmarks: list[Row] = json.loads(Path(written.name).read_text(encoding="utf-8"))["benchmarks"]
     return benchmarks
 
 
 def pace() -> Entry:
     """What a cycle costs."""
-    command = "python -m pytest -n0 --benchmark-only -s tests/bench/test_bench_pace.py"
-    return {"command": command, "table": bench("test_bench_pace.py")[0]["extra_info"]["table"]}
+    file = "test_bench_pace.py"
+    return {"command": f"{BENCH}{file} -s", "table": bench(file)[0]["extra_info"]["table"]}
 
 
 def gym() -> Entry:
     """What a step of the environment costs."""
-    ms = {one["name"]: 1e3 * one["stats"]["median"] for one in bench("test_bench_gym.py")}
+    file = "test_bench_gym.py"
+    ms = {one["name"]: 1e3 * one["stats"]["median"] for one in bench(file)}
     steps = {
         "step without the estimate": (ms["test_step[without]"], 40.0),
         "step with it": (ms["test_step[estimate]"], 40.0),
@@ -231,8 +233,7 @@ def gym() -> Entry:
     }
     rows = [[what, f"{each:.1f} ms", f"{of / each:.1f}"] for what, (each, of) in steps.items()]
     reset = ["reset: plan, bring-up, approach, touch-down, settling", f"{ms['test_reset']:.0f} ms", ""]
-    command = "python -m pytest -n0 --benchmark-only tests/bench/test_bench_gym.py"
-    return {"command": command, "table": [["", "median", "× real time"], *rows, reset]}
+    return {"command": f"{BENCH}{file}", "table": [["", "median", "× real time"], *rows, reset]}
 
 
 def learning() -> Entry:
@@ -258,7 +259,6 @@ OTHERS: Mapping[str, Callable[[], Entry]] = {
     "learning": learning,
     "bridges": bridges,
 }
-STUDIES = ("estimators", "bound", "arrays", "regions", "shapes", "workprec", "stability", "realtime", *LONG)
 
 
 def main(wanted: Sequence[str]) -> None:

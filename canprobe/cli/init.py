@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -212,19 +212,20 @@ def _first_scene(folder: Path, cell: str) -> tuple[str, str | None]:
     from canprobe.api import plan
     from canprobe.scene.load import parse_scene
 
+    (folder / "cell.toml").write_text(_at_rate(cell, _RATES_HZ[0]), encoding="utf-8")
     refused: dict[float, str] = {}
     problems: list[str] = []
-    for scenes in (_scans, _free):
+    for scenes in (_scans(folder), (_FREE,)):
         for rate in _RATES_HZ:
             (folder / "cell.toml").write_text(_at_rate(cell, rate), encoding="utf-8")
-            for text in scenes(folder):
+            for text in scenes:
                 try:
                     plan(parse_scene(text, file="first.toml", folder=folder))
                 except PlanError as error:
                     refused.setdefault(rate, error.problems[0])
                     problems = problems or list(error.problems)
                 else:
-                    return text, refused[rate] if scenes is _free else None
+                    return text, refused[rate] if text is _FREE else None
     way = f"correct the EDS (or the URDF) that this names, remove the folder {folder}, and type the command again"
     raise PlanError([*problems, way])
 
@@ -240,20 +241,18 @@ def _at_rate(cell: str, rate: float) -> str:
 
 _FIRST = 'cell = "cell.toml"\n\n[scene]\nname = "first"\ntitle = "First run on the emulator"\n'
 
-
-def _free(_: Path) -> Iterator[str]:
-    yield _FIRST + '\n[task]\nkind = "free"\nduration_s = 5\n'
+_FREE = _FIRST + '\n[task]\nkind = "free"\nduration_s = 5\n'
 
 
-def _scans(folder: Path) -> Iterator[str]:
-    """From demanding to plain."""
+def _scans(folder: Path) -> tuple[str, ...]:
+    """Scans of the cell in a folder, from demanding to plain: the same at every rate."""
     from canprobe.scene.load import parse_scene
     from canprobe.scene.resolve import resolve
 
-    setup = resolve(parse_scene(next(_free(folder)), folder=folder))
+    setup = resolve(parse_scene(_FREE, folder=folder))
     assert setup.arm is not None
-    for speed, length in ((10, 20), (5, 10)):
-        yield _FIRST + _touch(setup.arm.model, setup.arm.q_start, setup.probe.T_flange_probe, speed, length)
+    touched = (setup.arm.model, setup.arm.q_start, setup.probe.T_flange_probe)
+    return tuple(_FIRST + _touch(*touched, speed, length) for speed, length in ((10, 20), (5, 10)))
 
 
 def _touch(model: ArmModel, q: NDArray[Any], T_flange_probe: NDArray[Any], speed: float, length: float) -> str:

@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
             duration_s=args.duration,
             force=args.force,
             progress=args.report.bar(),
-            say=lambda line: (args.report.say if line.startswith("bridge ") else args.report.detail)(line),
+            say=args.report.detail,
             bridge=args.bridge,
         )
     except CanprobeError as error:

@@ -144,14 +144,11 @@ def within_drives(setup: Setup, devices: Mapping[int, Abilities]) -> tuple[Setup
 
 def _guarded(device: Abilities, low: float, high: float) -> tuple[float, float]:
     """How much of a range of positions a drive's 607Dh can allow."""
-    entries = [device.description.entry(POSITION_LIMITS, subindex) for subindex in (1, 2)]
-    if None in entries:
+    lowest, highest = (device.description.entry(POSITION_LIMITS, subindex) for subindex in (1, 2))
+    if lowest is None or highest is None:
         return low, high
-    least, most = (
-        (entry.low if number == 0 else entry.high) if entry.writable else entry.initial
-        for number, entry in enumerate(entry for entry in entries if entry is not None)
-    )
-    least, most = (end if isinstance(end, int) else None for end in (least, most))
+    ends = (lowest.low if lowest.writable else lowest.initial, highest.high if highest.writable else highest.initial)
+    least, most = (end if isinstance(end, int) else None for end in ends)
     if least is not None and most is not None and least >= most:  # no limits
         return low, high
     return low if least is None else max(low, least), high if most is None else min(high, most)

@@ -501,16 +501,11 @@ class Reader:
         if not isinstance(table, dict):
             return self.complain(name, f"expected a section [{name}], got {toml_value(table)}")
         annotations = typing.get_type_hints(cls, include_extras=True)
-        defaults = {field.name: field.default for field in dataclasses.fields(cls)}
-        belong = [
-            key
-            for key, annotation in annotations.items()
-            if all({**defaults, **table}[only.key] in only.values for only in conditions_of(annotation, Only))
-        ]
         for key in table:
             if key not in annotations:
                 above = '; cell = "NAME" stands above the first section' if key == "cell" else ""
-                self.complain(f"{name}.{key}", f"unknown key{above or _did_you_mean(key, belong)}")
+                hint = above or _did_you_mean(key, _keys_that_belong(cls, annotations, table))
+                self.complain(f"{name}.{key}", f"unknown key{hint}")
         values: dict[str, Any] = {}
         for field in dataclasses.fields(cls):
             path, annotation = f"{name}.{field.name}", annotations[field.name]
@@ -544,6 +539,16 @@ class Reader:
             self.complain(path, f'only with {only.key} = {needed}, got {only.key} = "{actual}"')
         elif not given and only.required and actual in only.values:
             self.complain(path, f'missing: {only.key} = "{actual}" needs it')
+
+
+def _keys_that_belong(cls: type[Any], annotations: Mapping[str, Any], table: Mapping[str, Any]) -> list[str]:
+    """The keys of a section whose conditions hold in it."""
+    values = {field.name: field.default for field in dataclasses.fields(cls)} | dict(table)
+    return [
+        key
+        for key, annotation in annotations.items()
+        if all(values[only.key] in only.values for only in conditions_of(annotation, Only))
+    ]
 
 
 def _did_you_mean_key(got: str, sections: Mapping[str, Any]) -> str:

@@ -56,8 +56,11 @@ class Report:
         self._write(line if mark is None else painted(mark, "yellow", self._stream) + line.removeprefix(mark))
 
     def detail(self, line: str) -> None:
-        """Report one step of a command whose result says it all: a terminal shows it, and `-v` does everywhere."""
-        if self.verbosity > 0 or self._stream.isatty():
+        """Report one step of a command whose result says it all: a terminal shows it, and `-v` does everywhere.
+
+        Where a bridge is to be found is shown everywhere: it is gone with the run.
+        """
+        if self.verbosity > 0 or self._stream.isatty() or line.startswith("bridge "):
             self.say(line)
 
     def complain(self, line: str) -> None:

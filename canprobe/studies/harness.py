@@ -222,23 +222,29 @@ SIGMA_COLUMNS = (
 
 def measuring_facts(quick: bool, seeds: int, model: Sequence[str] = ()) -> dict[str, Any]:
     """Machine, versions and settings of a study; `model` as for `Sweep.map`."""
-    commit, names = "", [platform.machine()]
+    commit = ""
     with contextlib.suppress(OSError, subprocess.TimeoutExpired):
         command = ["git", "-C", str(PACKAGE), "describe", "--always", "--dirty"]
         commit = subprocess.run(command, capture_output=True, text=True, check=False, timeout=5.0).stdout.strip()
-    with contextlib.suppress(OSError):
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")] or names
     return {
         "canprobe": canprobe.__version__,
         "commit": commit or None,
         "model": model_digest(tuple(model)),
         "python": platform.python_version(),
         "numpy": np.__version__,
-        "machine": names[0],
+        "machine": processor(),
         "quick": quick,
         "seeds": seeds,
     }
+
+
+def processor() -> str:
+    """The name of this machine's processor, or else its architecture."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.machine()
 
 
 def sigma_values(sigma_point: float, sigma_normal: float) -> dict[str, float]:
