@@ -32,6 +32,7 @@ from canprobe.planning.model import Plan
 from canprobe.protocol.tactile import Features, TactileFrame, TactileHeader
 from canprobe.scene.load import dump_scene
 from canprobe.session.children import with_our_imports
+from canprobe.tasks.from_plan import Request
 
 if TYPE_CHECKING:
     from canprobe.touch.estimate.answer import SurfaceEstimate
@@ -277,7 +278,7 @@ class BridgeProcess:
 
     def __init__(self, name: str, plan: Plan, out: Path | None, *, virtual: bool) -> None:
         self.name = name
-        self.requests: deque[dict[str, Any]] = deque(maxlen=100)
+        self.requests: deque[Request] = deque(maxlen=100)
         self._config = {"scene": dump_scene(plan.scene), "out": str(out.resolve()) if out is not None else None}
         self._virtual = virtual
         self._takes_requests = name == "ros2" and bool(plan.scene.bridge and plan.scene.bridge.ros2_commands)
@@ -363,8 +364,11 @@ class BridgeProcess:
         if "done" in document:
             self._received = document["done"]["received"]
             self._ends_by_ns = elapsed_ns() + round(CLOSE_TIMEOUT_S * 1e9)
-        if "request" in document:
-            self.requests.append(document["request"])
+        if "request" in document and self._takes_requests:
+            try:
+                self.requests.append(Request(**document["request"]))
+            except (UsageError, TypeError) as error:  # it is not carried out, and the cell goes on
+                self._error = f"refused: {error}"
 
     # the end
 

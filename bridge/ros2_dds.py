@@ -3,7 +3,8 @@
 Topics carry the bytes of the one encoder. Commands are taken only where `[bridge] ros2_commands` says so:
 `/canprobe/start` and `/canprobe/stop` (std_msgs/Empty), `/canprobe/target_force` in N and `/canprobe/speed` in m/s
 (std_msgs/Float64), and the trajectory of a free arm where ros2_control's controller takes it. Each is answered on
-`/canprobe/status`; one that the scene's own limits forbid is refused there.
+`/canprobe/status`; one that the scene's own limits forbid is refused there. A sample without valid data, as
+DDS delivers it when the last writer of a topic leaves or dies, is no command.
 
 Source: ROS 2's mapping to DDS names (`rt/` before a topic), REP 2016 (`typehash=…;` in USER_DATA), rmw_cyclonedds.
 """
@@ -291,11 +292,10 @@ class Ros2Sink:
         if self._poll_in <= 0 and self._readers:
             self._poll_in = POLL_SAMPLES
             for topic, reader in self._readers.items():
+                kind = self._node.types.of(topic.type_name)
                 for message in reader.take(N=10):
-                    if topic is TRAJECTORY:
-                        self._follow(message)
-                    else:
-                        self._command(topic, getattr(message, "data", None))
+                    if isinstance(message, kind):  # the last writer's exit or death comes as a sample without data
+                        self._take(topic, message)
 
     def close(self, summary: str | None) -> None:
         """Let the last messages arrive; the domain is left with the last reference, that is with this process."""
@@ -309,6 +309,13 @@ class Ros2Sink:
     def _is_read(self, topic: Topic) -> bool:
         """Nothing is made for a topic without a reader, unless one that comes later is to have it."""
         return topic.transient or bool(self._writers[topic.name].get_matched_subscriptions())
+
+    def _take(self, topic: Topic, message: Any) -> None:
+        """A command; it is a message of the topic's type."""
+        if topic is TRAJECTORY:
+            self._follow(message)
+        else:
+            self._command(topic, message.data if topic.type_name == FLOAT64 else None)
 
     def _command(self, topic: Topic, value: float | None) -> None:
         kind = COMMANDS[topic]

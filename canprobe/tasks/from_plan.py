@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from canprobe.cell.controller import Command, Controller, Measurement
+from canprobe.errors import UsageError
 from canprobe.planning.model import Plan
 from canprobe.protocol.tactile import WINDOW
 from canprobe.robot.chain import Array as Vector
@@ -171,9 +173,48 @@ def make_task(plan: Plan) -> Controller:
 #
 # A new target force or speed is approached at a bounded rate: no request makes a step.
 
-Requests = Sequence[deque[dict[str, Any]]]
-"""Queues of `{"kind": "start" | "stop" | "target_force_n" | "speed_m_s", "value": float | None}`, and of kind
-"trajectory" with the `points` and `velocities` of a `Trajectory` as its value."""
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _is_way(value: object) -> bool:
+    return isinstance(value, dict) and value.keys() == {"points", "velocities"}
+
+
+_VALUES: dict[str, Callable[[object], bool]] = {
+    "start": lambda value: value is None,
+    "stop": lambda value: value is None,
+    "target_force_n": _is_number,
+    "speed_m_s": _is_number,
+    "trajectory": _is_way,
+}
+"""The kinds of requests, and whether something can be the value of one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What another tool asks of a running task; it cannot be made of anything else.
+
+    Args:
+        kind: start, stop, target_force_n, speed_m_s or trajectory.
+        value: None for start and stop; N or m/s, finite; the arguments `points` and `velocities` of a `Trajectory`.
+
+    Raises:
+        UsageError: the kind is unknown, or the value has another type.
+    """
+
+    kind: str
+    value: Any = None
+
+    def __post_init__(self) -> None:
+        fits = _VALUES.get(self.kind)
+        if fits is None or not fits(self.value):
+            kinds = ", ".join(_VALUES)
+            got = f"{self.kind!r} with the value {self.value!r}"
+            raise UsageError(f"request: expected one of {kinds}, each with a value of its type, got {got}")
+
+
 FORCE_RATE = 2.0
 """N/s."""
 SPEED_RATE = 0.1
@@ -195,7 +236,7 @@ class RequestedTask(Controller):
         self,
         task: Controller | None,
         make: Callable[[], Controller] | None,
-        requests: Requests,
+        requests: Sequence[deque[Request]],
         period_s: float,
         plan: Plan | None = None,
     ) -> None:
@@ -214,10 +255,10 @@ class RequestedTask(Controller):
         for queue in self._requests:
             while queue:
                 request = queue.popleft()
-                if request["kind"] == "trajectory":
-                    self._follow(measurement, **request["value"])
+                if request.kind == "trajectory":
+                    self._follow(measurement, **request.value)
                 else:
-                    self._take(**request)
+                    self._take(request)
         if self._task is None:
             return Command()
         columns = self._approach(self._task) if isinstance(self._task, TouchTask) else {}
@@ -253,8 +294,8 @@ class RequestedTask(Controller):
         """Of the task's estimator."""
         return 0 if self._task is None else self._task.restarts
 
-    def _take(self, kind: str, value: float | None) -> None:
-        if kind == "stop":
+    def _take(self, request: Request) -> None:
+        if request.kind == "stop":
             if isinstance(self._task, ProbingTask):
                 self._task.stop()
             elif self._plan is not None and len(self._targets) == 2:
@@ -263,11 +304,11 @@ class RequestedTask(Controller):
                 self._task = Trajectory.braking(self._plan, *self._motion())
                 return
             self._stopping = self._task is not None
-        elif kind == "start":
+        elif request.kind == "start":
             if self._task is None and self._make is not None:
                 self._task = self._make()
-        elif kind in self._steps and value is not None:
-            self._asked[kind] = value
+        else:
+            self._asked[request.kind] = request.value
 
     def _follow(self, measurement: Measurement, **way: Any) -> None:
         """Leave what the arm does for a trajectory, at the speed that it has; the bridge has checked the way."""

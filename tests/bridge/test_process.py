@@ -17,7 +17,9 @@ from canprobe.bridge import process as process_module
 from canprobe.bridge.process import BridgeProcess
 from canprobe.cell.cycle import Observation
 from canprobe.errors import UsageError
+from canprobe.scene.load import dump_scene, parse_scene
 from canprobe.session.session import Session
+from canprobe.tasks.from_plan import Request
 
 
 @pytest.fixture
@@ -60,6 +62,22 @@ def test_a_crash_in_the_middle_of_a_run_costs_samples_only(plan, bridge):
     assert session.cell.faults == [] and session.observers.faults == []
     assert status["samples"] == len(seen) and status["dropped"] >= len(seen) - 50 - bridge._batch
     assert "ended with status" in status["error"]
+
+
+@pytest.mark.parametrize(("commands", "taken"), [("true", 1), ("false", 0)])
+def test_what_comes_back_counts_as_a_command_only_if_it_is_one_and_only_where_commands_are_allowed(commands, taken):
+    scene = parse_scene(dump_scene(canprobe.load_scene("free")) + f"[bridge]\nros2_commands = {commands}\n")
+    bridge = BridgeProcess("ros2", canprobe.plan(scene), None, virtual=True)
+    try:
+        bridge._back, back = os.pipe()
+        asked = ['{"kind": "start", "value": 0}', '{"value": null}', '{"kind": ["stop"]}', "7", '{"kind": "stop"}']
+        os.write(back, "".join(f'{{"request": {one}}}\n' for one in asked).encode())
+        assert bridge._listen(0.0)
+        assert list(bridge.requests) == [Request("stop")] * taken
+    finally:
+        bridge.kill()
+        os.close(bridge._back)
+        os.close(back)
 
 
 def test_one_that_stands_still_is_left_behind(plan, bridge, monkeypatch):

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import itertools
 import os
+import subprocess
+import sys
 from collections import deque
+from itertools import count
 
 import numpy as np
 import pytest
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 from cyclonedds.core import Policy
+from waiting import wait_until
 
 import canprobe
 from canprobe.bridge.description import robot_description
@@ -29,24 +33,30 @@ from canprobe.bridge.ros2_dds import (
     EMPTY,
     FLOAT64,
     FORCE,
+    POLL_SAMPLES,
     SPEED,
+    START,
     STATUS,
     STOP,
     TRAJECTORY,
     DdsTypes,
     Ros2Node,
+    Ros2Sink,
     dds_name,
     domain_of,
     refuse,
     trajectory_of,
 )
+from canprobe.bridge.sample import Context, Sample
 from canprobe.bridge.worker import SampleSource
 from canprobe.errors import UsageError
 from canprobe.protocol.frames import EFF_FLAG, RTR_FLAG
 from canprobe.scene.load import dump_scene, parse_scene
-from canprobe.tasks.from_plan import RequestedTask
+from canprobe.tasks.from_plan import Request, RequestedTask
 
 DOMAIN = 90 + os.getpid() % 100  # of this test alone; 232 is the highest
+SINK_DOMAIN = DOMAIN - 90
+"""A process opens a domain once."""
 
 JAZZY = {  # as `ros2 topic info --verbose` of ROS 2 Jazzy prints them
     "sensor_msgs/msg/JointState": "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
@@ -174,13 +184,67 @@ def test_another_process_sees_ros_topics_and_commands_the_cell_within_its_limits
         assert said[1].startswith("target_force_n 50: refused: task.force_n: expected")
         assert said[2].startswith("speed_m_s -0.01: refused: task.speed_mm_s: expected")
         assert said[3] == "stop: taken"
-        assert list(bridge.requests) == [
-            {"kind": "target_force_n", "value": 3.0},
-            {"kind": "stop", "value": None},
-        ]
+        assert list(bridge.requests) == [Request("target_force_n", 3.0), Request("stop")]
         assert bridge.end("{}")["error"] is None
     finally:
         bridge.kill()
+
+
+PUBLISHER = """
+import sys
+from canprobe.bridge import ros2_dds as ros2
+ros2.LOOPBACK = ros2.LOOPBACK.replace("<Discovery>", "<Discovery><LeaseDuration>300ms</LeaseDuration>")
+node = ros2.Ros2Node(int(sys.argv[1]), True, ros2.Encoder())
+of, topics = node.types.of, {name: getattr(ros2, name) for name in sys.argv[2:]}
+writers = {name: node.writer(topic) for name, topic in topics.items()}
+for line in sys.stdin:
+    name, _, fields = line.partition(" ")
+    writers[name].write(of(topics[name].type_name)(*eval(fields)))
+"""
+"""Writes a message for each line, a topic and its fields; leaves at their end. Killed, it is dead after 300 ms."""
+NO_POINTS = "of('std_msgs/msg/Header')(of('builtin_interfaces/msg/Time')(0, 0), ''), [], []"
+
+
+def test_a_writer_that_leaves_or_dies_commands_nothing(free):
+    """DDS delivers a sample without data then: an exit must not start an arm that was stopped, nor end the bridge."""
+    text = dump_scene(free[0]).replace(f"ros2_domain = {DOMAIN}", f"ros2_domain = {SINK_DOMAIN}")
+    plan, got = canprobe.plan(parse_scene(text)), []
+    sink = Ros2Sink(Context(plan, plan.scene.bridge, None, lambda document: got.append(document["request"]["kind"])))
+
+    def until(done):
+        looks = count()
+
+        def looked():
+            sink.write(Sample(0))
+            return done()
+
+        wait_until(looked, lambda: next(looks) < 2000, lambda: got)
+        for _ in range(2 * POLL_SAMPLES):  # what came with it is taken, too
+            sink.write(Sample(0))
+
+    def open_publisher(*names):
+        command = [sys.executable, "-c", PUBLISHER, str(SINK_DOMAIN), *names]
+        return subprocess.Popen(command, stdin=subprocess.PIPE, text=True)
+
+    def writers(*topics):
+        return [bool(sink._readers[topic].get_matched_publications()) for topic in topics]
+
+    with open_publisher("START", "TRAJECTORY") as leaves, open_publisher("STOP") as dies:
+        try:
+            until(lambda: all(writers(START, TRAJECTORY, STOP)))
+            for publisher, line in ((leaves, "START 0,"), (leaves, f"TRAJECTORY {NO_POINTS}"), (dies, "STOP 0,")):
+                print(line, file=publisher.stdin, flush=True)
+                got.append(None)
+                until(lambda: got[-1] is not None)
+            assert list(filter(None, got)) == ["start", "stop", "stop"]
+            leaves.stdin.close()
+            until(lambda: not any(writers(START, TRAJECTORY)))
+            dies.kill()
+            until(lambda: not any(writers(STOP)))
+        finally:
+            leaves.kill()
+            dies.kill()
+    assert list(filter(None, got)) == ["start", "stop", "stop"]
 
 
 @pytest.mark.parametrize(
@@ -271,7 +335,7 @@ def test_a_free_arm_is_described_and_follows_a_trajectory_within_its_limits(free
         assert answer_to(asked_for(node, names, [])) == "stop: taken"
         until(lambda: True if len(bridge.requests) >= 2 else None, feed, bridge)
         followed, stopped = bridge.requests
-        assert stopped == {"kind": "stop", "value": None}
+        assert stopped == Request("stop")
         assert bridge.end("{}")["error"] is None
     finally:
         bridge.kill()

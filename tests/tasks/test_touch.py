@@ -1,5 +1,6 @@
 """How a summary tells of contact that a scan lost."""
 
+import math
 from collections import deque
 from dataclasses import replace
 
@@ -8,8 +9,9 @@ import pytest
 
 import canprobe
 from canprobe.cell.controller import Command, Controller, Measurement
+from canprobe.errors import UsageError
 from canprobe.session.session import Session
-from canprobe.tasks.from_plan import FORCE_RATE, RequestedTask, make_task
+from canprobe.tasks.from_plan import FORCE_RATE, Request, RequestedTask, make_task
 from canprobe.tasks.task import Loss
 from canprobe.tasks.touch import losses_text, summarise_losses
 
@@ -37,8 +39,26 @@ def test_a_loss_is_summed_up_in_the_units_of_the_summary():
 # A task under requests: it follows them without a step, and stops in its own orderly way.
 
 
-def request(kind, value=None):
-    return {"kind": kind, "value": value}
+@pytest.mark.parametrize(
+    ("kind", "value"),
+    [
+        ("start", 1.0),
+        ("stop", False),
+        ("Start", None),
+        ("home", None),
+        (None, None),
+        ("target_force_n", None),
+        ("target_force_n", "3"),
+        ("target_force_n", True),
+        ("speed_m_s", math.nan),
+        ("speed_m_s", [0.02]),
+        ("trajectory", None),
+        ("trajectory", {"points": []}),
+    ],
+)
+def test_what_is_no_command_cannot_be_requested(kind, value):
+    with pytest.raises(UsageError, match="expected one of start, stop, target_force_n"):
+        Request(kind, value)
 
 
 @pytest.fixture
@@ -59,9 +79,9 @@ def test_the_force_follows_what_is_asked_for_and_a_stop_ends_it(press):
         nonlocal held
         held += task.phase == 3
         if held == 1:
-            queue.append(request("target_force_n", 3.0))
+            queue.append(Request("target_force_n", 3.0))
         elif held == 480:  # 1.2 s of 3 s
-            queue.append(request("stop"))
+            queue.append(Request("stop"))
         return controller.step(measurement)
 
     with press:
@@ -86,7 +106,7 @@ def test_a_stop_lets_a_calibration_go_of_its_ball():
 
     def step(measurement):
         if len(task.touches) == 1 and task.phase == 3 and not queue:
-            queue.append(request("stop"))
+            queue.append(Request("stop"))
         return controller.step(measurement)
 
     with session:
@@ -111,7 +131,7 @@ def test_up_holds_until_a_start_and_holds_again_after_a_stop():
     moved = []
     for cycle in range(80):
         if cycle in asks:
-            queue.append(request(asks[cycle]))
+            queue.append(Request(asks[cycle]))
         command = controller.step(Measurement(cycle, cycle * 2_500_000))
         assert not command.done
         moved.append(command.q_target is not None)
@@ -120,7 +140,7 @@ def test_up_holds_until_a_start_and_holds_again_after_a_stop():
 
 
 def test_what_is_asked_before_the_start_holds_for_the_task_that_comes(press):
-    queue = deque([request("target_force_n", 2.5), request("start")])
+    queue = deque([Request("target_force_n", 2.5), Request("start")])
     controller = RequestedTask(None, lambda: make_task(press.plan), (queue,), 2.5e-3)
     columns = [controller.step(Measurement(i, i * 2_500_000, q=q0(), enabled=True)).columns for i in range(200)]
     assert columns[-1]["target_force_n"] == 2.5

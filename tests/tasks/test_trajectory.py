@@ -11,7 +11,7 @@ from canprobe.cell.controller import Measurement
 from canprobe.errors import SafetyStop, UsageError
 from canprobe.scene.load import dump_scene, parse_scene
 from canprobe.tasks import Trajectory
-from canprobe.tasks.from_plan import RequestedTask
+from canprobe.tasks.from_plan import Request, RequestedTask
 
 PLAN = canprobe.plan(canprobe.load_scene("free"))
 Q0 = PLAN.setup.arm.q_start
@@ -105,7 +105,7 @@ def requested(*requests):
     queue, targets = deque(), []
     controller = RequestedTask(None, None, (queue,), 2.5e-3, PLAN)
     for k in range(1200):
-        queue += [{"kind": kind, "value": value} for at, kind, value in requests if at == k]
+        queue += [Request(kind, value) for at, kind, value in requests if at == k]
         command = controller.step(Measurement(k, k * 2_500_000, Q0))
         if command.q_target is not None:
             targets.append(command.q_target)
