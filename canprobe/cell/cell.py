@@ -188,8 +188,9 @@ class Cell:
                 self.homing.look()
                 if not self._to_home:
                     self.homing.refuse_unhomed()
-        except BaseException:
+        except BaseException as error:
             self.close()
+            self._name_another_master(error)
             raise
         return self
 
@@ -233,6 +234,8 @@ class Cell:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+        if error is not None:
+            self._name_another_master(error)
 
     def run(
         self,
@@ -258,7 +261,7 @@ class Cell:
     def start(self, controller: Controller | Callable[[Measurement], Command]) -> None:
         """The first half of `run`: enable the drives for a controller, which `advance` then runs."""
         runs = as_controller(controller)
-        with self._one_at_a_time():
+        with self._one_at_a_time(), self._naming_another_master():
             self._controller, self._retreats_for = runs, None
             self._enable()
 
@@ -274,7 +277,7 @@ class Cell:
         Returns:
             Whether the controller is done.
         """
-        with self._one_at_a_time(), Interrupts(self._stuck) as interrupts:
+        with self._one_at_a_time(), self._naming_another_master(), Interrupts(self._stuck) as interrupts:
             for _ in repeat(None) if cycles is None else range(cycles):
                 if self._run_cycle(interrupts, progress):
                     return True
@@ -290,6 +293,24 @@ class Cell:
             yield
         finally:
             self._running = False
+
+    @contextmanager
+    def _naming_another_master(self) -> Iterator[None]:
+        """Whatever ends the cell names another master that was heard: it may be the cause."""
+        try:
+            yield
+        except BaseException as error:
+            self._name_another_master(error)
+            raise
+
+    def _name_another_master(self, error: BaseException) -> None:
+        words = self.watch.another_master
+        if words is None or str(self.watch.foreign) in str(error):
+            return
+        if isinstance(error, CanprobeError):
+            error.args = (f"{error}; {words}",)
+        elif words not in self.faults:
+            self.notes.add(words)
 
     def _run_cycle(self, interrupts: Interrupts, progress: Callable[[Measurement], None]) -> bool:
         """One cycle of the controller; True where it is done."""

@@ -88,7 +88,13 @@ def _lost(limits: Limits) -> int:
     return LOST_NS + _sample(limits) + ARRAY_RECOVERY_NS
 
 
-# nodes
+# nodes; another master first: what the nodes then report is what it made of them
+
+
+@_checked("foreign_master", "another master on the bus", Reaction.STOP, _cycles(2), enabling=True)
+def _foreign_master(seen: Seen) -> SafetyStop | None:
+    words = seen.watch.another_master
+    return SafetyStop(words) if words is not None else None
 
 
 @_checked("heartbeat", "heartbeat of a node lost", Reaction.LIFT, _after(HEARTBEAT_CONSUMED_MS * MS), enabling=True)
@@ -146,12 +152,6 @@ def _emcy(seen: Seen) -> NodeError | None:
 @_counted("emcy_communication", "EMCY of communication (81xxh, 82xxh)", _cycles(2))
 def _emcy_communication(seen: Seen) -> int:
     return seen.watch.communication
-
-
-@_checked("foreign_master", "another master on the bus", Reaction.STOP, _cycles(2), enabling=True)
-def _foreign_master(seen: Seen) -> SafetyStop | None:
-    foreign = seen.watch.foreign
-    return SafetyStop(f"another master is on the bus: {foreign}") if foreign is not None else None
 
 
 # PDOs

@@ -143,6 +143,4 @@ def _obeys(watch: NodeWatch, node_id: int, error: BaseException) -> bool:
     """Whether a node obeys by NMT and EMCY: not the one that the cell is stopped for."""
     if isinstance(error, NodeError) and error.node_id == node_id:
         return False
-    alarm = watch.device_alarm
-    operational = watch.states.get(node_id) is NmtState.OPERATIONAL
-    return operational and (alarm is None or alarm.node_id != node_id)
+    return watch.states.get(node_id) is NmtState.OPERATIONAL and node_id not in watch.alarmed

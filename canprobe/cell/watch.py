@@ -57,6 +57,7 @@ class NodeWatch:
         last_emcy: the last EMCY of each node, the end of an error too.
         last_alarm: the last EMCY of each node that reports an error, not its end.
         device_alarm: the first one since the start that is about a device rather than frames; None without one.
+        alarmed: nodes that have sent one since the start.
         communication: how many were about frames.
         foreign: what another master sent first.
     """
@@ -68,6 +69,7 @@ class NodeWatch:
         self.last_emcy: dict[int, EmcyEvent] = {}
         self.last_alarm: dict[int, EmcyEvent] = {}
         self.device_alarm: EmcyEvent | None = None
+        self.alarmed: set[int] = set()
         self.communication = 0
         self.foreign: str | None = None
         self._untold: deque[EmcyEvent] = deque(maxlen=UNTOLD)
@@ -111,8 +113,9 @@ class NodeWatch:
         self._untold.append(event)
         if event.is_communication:
             self.communication += 1
-        elif self.device_alarm is None:
-            self.device_alarm = event
+        else:
+            self.device_alarm = self.device_alarm or event
+            self.alarmed.add(node_id)
 
     def news(self) -> list[EmcyEvent]:
         """Alarms since the last call, the last `UNTOLD` of them."""
@@ -121,6 +124,11 @@ class NodeWatch:
         news = list(self._untold)
         self._untold.clear()
         return news
+
+    @property
+    def another_master(self) -> str | None:
+        """That another master was heard, and by what; None where none was."""
+        return None if self.foreign is None else f"another master is on the bus: {self.foreign}"
 
     def last_words(self, node_id: int) -> str:
         """The node's last alarm, to be put behind an error; empty without one."""
@@ -135,6 +143,7 @@ class NodeWatch:
     def start(self, t_ns: int) -> None:
         """Expect every node's heartbeat from now on; what a device reported until now is over."""
         self.device_alarm = None
+        self.alarmed.clear()
         self._heard = dict.fromkeys(self.node_ids, t_ns)
 
     def silent(self, t_ns: int) -> int | None:

@@ -19,7 +19,7 @@ from canprobe.cell.lift_off import WAY
 from canprobe.cell.supervision import TOUCH_FORCE
 from canprobe.emulator.faults import FaultKind
 from canprobe.errors import SafetyStop
-from canprobe.protocol.frames import SYNC_ID, NmtState
+from canprobe.protocol.frames import EMCY_BASE, SYNC_ID, Emcy, NmtCommand, NmtState, pack_nmt
 from canprobe.session.session import Session
 from canprobe.tasks.from_plan import make_task
 from canprobe.tasks.probing import Phase
@@ -31,6 +31,11 @@ def lifted(run):
     way = truth["probe_centre"][-1] - truth["probe_centre"][run.at]
     back = -float(way @ truth["pole"][run.at])
     return back, float(np.linalg.norm(way + back * truth["pole"][run.at]))
+
+
+def turned(run):
+    """How far each motor turned after the fault, counts."""
+    return np.ptp(run.session.truth["q"][run.at :] @ run.session.cell.drives._model.units_per_q.T, axis=0)
 
 
 def mute(node_id):
@@ -58,11 +63,9 @@ def test_the_probe_is_taken_off(what):
     assert 0.95 * WAY < back < 1.2 * WAY and aside < 0.05 * WAY, "without a sensor the task begins to retreat by itself"
     assert any(fault.startswith("lift off, at ") for fault in run.session.cell.faults)
     if what.startswith("joint"):
-        motors = run.session.truth["q"][run.at :] @ run.session.cell.drives._model.units_per_q.T
         lost = int(what.split()[1]) - 1
-        turned = np.ptp(motors, axis=0)
-        assert turned[lost] < 30, "it stood still"
-        assert turned.max() > 100, "others did not"
+        assert turned(run)[lost] < 30, "it stood still"
+        assert turned(run).max() > 100, "others did not"
 
 
 def test_two_lost_drives_leave_four():
@@ -97,6 +100,111 @@ def test_with_another_master_nothing_moves():
         fault.endswith("free it; a run does not begin while the array measures a force")
         for fault in run.session.cell.faults
     )
+
+
+@pytest.mark.parametrize("command", [NmtCommand.STOP, NmtCommand.RESET_NODE])
+def test_with_a_node_that_another_master_took_nothing_moves(command):
+    """The node has left operation, for which the others would lift."""
+    run = Injected("press", HOLD_CYCLE, lambda r: send(r, pack_nmt(command, 16)))
+    pressed_on(run, "another master is on the bus: an NMT command")
+    assert not any("lift off" in fault for fault in run.session.cell.faults)
+
+
+@pytest.mark.parametrize("other", ["bus-off", "a jump"])
+def test_nothing_lifts_where_another_condition_says_stop(other):
+    """A drive is lost in the same cycle: the reaction to that alone would be to lift."""
+
+    def both(run):
+        run.fault(FaultKind.REBOOT, 3, duration_ns=1_000_000)
+        if other == "bus-off":
+            run.session.cell._port.state = ControllerState.BUS_OFF
+        else:
+            run.session.cell.supervisor._guard.measure = lambda _: "joint 2 reports a motion"
+
+    run = Injected("press", HOLD_CYCLE, both)
+    pressed_on(run, "node 3: left operation")
+    assert not any("lift off" in fault for fault in run.session.cell.faults)
+
+
+def interrupted(number):
+    return lambda run: signal.raise_signal(number)
+
+
+def failing(_):
+    raise ZeroDivisionError
+
+
+class Twice(Injected):
+    """Ctrl-C in contact, and something else 20 cycles into the lift-off, which takes 128."""
+
+    def __init__(self, second):
+        self.second, self.lifting = second, 0
+        super().__init__("press", HOLD_CYCLE, interrupted(signal.SIGINT))
+
+    def _say(self, text):
+        super()._say(text)
+        if text.startswith("lift off"):
+            inner = self.session.cell.log.add
+
+            def add(row):
+                inner(row)
+                self.lifting += 1
+                if self.lifting == 20:
+                    self.second(self)
+
+            self.session.cell.log.add = add
+
+
+def master_heard(run):
+    send(run, (SYNC_ID, b""))
+
+
+def bus_off(run):
+    run.session.cell._port.state = ControllerState.BUS_OFF
+
+
+def drive_fault(run):
+    run.nodes[4].node.application.inject_fault(0x4310)
+
+
+def disabled(node_id):
+    """A drive that is switched off without a word, as by its enable input."""
+    return lambda run: altered(run.nodes[node_id], 0x180 + node_id, lambda d: b"\x50\x06" + d[2:])
+
+
+@pytest.mark.parametrize("second", [master_heard, bus_off, drive_fault, disabled(4), mute(5)[1]])
+def test_a_lift_off_does_not_go_on_when_something_else_comes(second):
+    run = Twice(second)
+    assert type(run.error) is KeyboardInterrupt
+    back, _ = lifted(run)
+    assert 0.2 * WAY < back < 0.5 * WAY, "as far as it was, and the cycles until it shows"
+    if second is master_heard:
+        assert "another master is on the bus: SYNC from another master" in run.session.cell.faults
+
+
+def test_a_disabled_drive_stands_still_and_the_others_lift():
+    """The sensor is what the cell is stopped for; the drive is found by its power state alone."""
+
+    def both(run):
+        run.fault(FaultKind.REBOOT, 16, duration_ns=1_000_000)
+        disabled(2)(run)
+
+    run = Injected("press", HOLD_CYCLE, both)
+    assert "node 16: left operation" in str(run.error)
+    assert run.session.truth["force"][-1] == 0.0
+    assert turned(run)[1] < 30 and turned(run).max() > 100
+
+
+def test_a_drive_with_an_alarm_stands_still_also_where_another_one_had_one_before():
+    def alarms(run):
+        run.nodes[1].node.application.inject_fault(0x4310)
+        send(run, (EMCY_BASE + 1, Emcy(0x4310, 0x09).pack()))
+        send(run, (EMCY_BASE + 2, Emcy(0x4210, 0x09).pack()))
+
+    run = Injected("press", HOLD_CYCLE, alarms)
+    assert run.error.node_id == 1
+    assert run.session.truth["force"][-1] == 0.0
+    assert turned(run)[1] < 30 and turned(run).max() > 100
 
 
 def left_pressing(session):
@@ -141,14 +249,6 @@ def test_after_bus_off_nothing_can_be_sent():
         run.session.cell._port.state = ControllerState.BUS_OFF
 
     pressed_on(Injected("press", HOLD_CYCLE, off), "left pressing")
-
-
-def interrupted(number):
-    return lambda run: signal.raise_signal(number)
-
-
-def failing(_):
-    raise ZeroDivisionError
 
 
 LEFT = {

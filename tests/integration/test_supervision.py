@@ -19,9 +19,9 @@ from canprobe.cell.controller import Command
 from canprobe.cell.supervision import Reaction
 from canprobe.cell.supervisor import JointGuard
 from canprobe.emulator.faults import FaultKind, FaultyNode
-from canprobe.errors import InterfaceError, NodeError, ResultsError, SafetyStop
+from canprobe.errors import CanprobeError, InterfaceError, NodeError, ResultsError, SafetyStop
 from canprobe.protocol.cia402 import DriveState, state_of
-from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, Emcy, NmtState
+from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, Emcy, NmtCommand, NmtState, pack_nmt
 from canprobe.session.session import Session
 from canprobe.tasks.probing import Phase
 
@@ -77,6 +77,31 @@ def test_another_master():
     run = Injected("free", FREE_CYCLE, lambda r: send(r, (SYNC_ID, b"")))
     run.assert_within("foreign_master")
     assert isinstance(run.error, SafetyStop) and "another master" in str(run.error)
+
+
+@pytest.mark.parametrize("command", [NmtCommand.STOP, NmtCommand.PRE_OPERATIONAL, NmtCommand.RESET_NODE])
+@pytest.mark.parametrize("node_id", [0, 3])
+def test_another_master_is_named_by_what_it_sent_and_not_by_what_the_nodes_made_of_it(command, node_id):
+    run = Injected("free", FREE_CYCLE, lambda r: send(r, pack_nmt(command, node_id)))
+    run.assert_within("foreign_master")
+    assert str(run.error) == "another master is on the bus: an NMT command from another master"
+
+
+@pytest.mark.parametrize("step", ["identify", "start all", "enable"])
+def test_another_master_that_interferes_before_the_run_is_named_and_nothing_is_enabled(step):
+    said = []
+
+    def say(text):
+        said.append(text)
+        if text.startswith(step):
+            session.lockstep.port().send_batch([pack_nmt(NmtCommand.STOP, 4)])
+
+    session = Session(canprobe.load_scene("free"), say=say)
+    with pytest.raises(CanprobeError, match="an NMT command from another master"), session:
+        session.run(lambda _: Command())
+    assert said[-1] != "enable the drives" or session.cell.log.arrays()["statusword"].size
+    for row in session.cell.log.arrays().get("statusword", ()):
+        assert DriveState.OPERATION_ENABLED not in map(state_of, map(int, row))
 
 
 # PDOs
