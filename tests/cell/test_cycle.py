@@ -9,10 +9,11 @@ from undrawn import undrawn, undrawn_run
 import canprobe
 from canprobe.bus.disk import read_candump
 from canprobe.cell.controller import Command
-from canprobe.cell.cycle import MOST_FRAMES, Cycle, Observers
+from canprobe.cell.cycle import MOST_FRAMES, SYNCS_REMEMBERED, Cycle, Intake, Observers
 from canprobe.protocol.frames import SYNC_ID
 
 TPDOS = (0x181, 0x182)
+PERIOD_NS = 2_500_000
 LOOKS = (625, 1145, 1500)
 """µs."""
 
@@ -70,14 +71,13 @@ class Drives:
         return ()
 
 
-def goes_on_at(arrivals, *, on_arrival=True, drives=True):
-    """µs after the SYNC at which a cycle has its measurement, and how often it has looked."""
-    port = Port(arrivals)
+def a_cycle(port, *, on_arrival=True, drives=True):
+    """A cycle of 2.5 ms that looks at `LOOKS`."""
     budget = SimpleNamespace(looks_ns=tuple(look * 1000 for look in LOOKS))
     plan = SimpleNamespace(
-        sync=SimpleNamespace(period_ns=2_500_000, overflow=0), traffic=SimpleNamespace(budget=budget)
+        sync=SimpleNamespace(period_ns=PERIOD_NS, overflow=0), traffic=SimpleNamespace(budget=budget)
     )
-    cycle = Cycle(
+    return Cycle(
         port,
         plan,
         drives=Drives() if drives else None,
@@ -86,6 +86,12 @@ def goes_on_at(arrivals, *, on_arrival=True, drives=True):
         other=lambda _: None,
         on_arrival=on_arrival,
     )
+
+
+def goes_on_at(arrivals, *, on_arrival=True, drives=True):
+    """µs after the SYNC at which a cycle has its measurement, and how often it has looked."""
+    port = Port(arrivals)
+    cycle = a_cycle(port, on_arrival=on_arrival, drives=drives)
     for _ in range(3):
         port.drains = 0
         cycle.begin()
@@ -121,6 +127,32 @@ def test_in_lockstep_it_goes_on_at_a_look(last_us, begins_us):
 
 def test_without_drives_there_is_nothing_to_go_on_with_before_the_first_look():
     assert goes_on_at([], drives=False)[0] == LOOKS[0]
+
+
+@pytest.mark.parametrize(
+    ("late_periods", "overruns", "left_out"), [(0.5, 0, 0), (0.501, 1, 0), (0.9, 1, 0), (1.2, 1, 1), (3.7, 1, 3)]
+)
+def test_a_sync_more_than_half_a_period_late_is_an_overrun(late_periods, overruns, left_out):
+    """The next deadline is on the grid of the first one: whole periods are left out, not caught up."""
+    port = Port([])
+    cycle = a_cycle(port, drives=False)
+    cycle.begin()
+    cycle.end(None)
+    port.sleep_until_ns(cycle.t_first_ns + round((1 + late_periods) * PERIOD_NS))
+    cycle.begin()
+    assert cycle.statistics.overruns == overruns
+    assert cycle.t_ns == (1 + left_out) * PERIOD_NS
+    cycle.end(None)
+    cycle.begin()
+    assert cycle.statistics.overruns == overruns and cycle.t_ns == (2 + left_out) * PERIOD_NS
+
+
+def test_an_array_that_was_never_heard_is_as_old_as_the_run():
+    silent = SimpleNamespace(cob_ids=(), newest_cycle=None, take=lambda *_: None)
+    intake = Intake(None, silent, SYNCS_REMEMBERED)
+    for number in range(21):
+        intake.begin(number, number * PERIOD_NS, number * PERIOD_NS)
+    assert intake.measure(0).tactile_age == 20
 
 
 # Observers of a cell: what they see, and that they cannot harm it.

@@ -110,6 +110,18 @@ def test_without_a_target_each_drive_is_told_to_stay():
     assert group.frames()[5] == (0x206, (15).to_bytes(2, "little") + (-66).to_bytes(4, "little", signed=True))
 
 
+def test_a_drive_that_is_stopped_among_others_that_go_on_is_commanded_so_at_once():
+    """As in a lift-off, where nothing else changes: neither the goal nor a statusword."""
+    group, words = make_group(), []
+    for cycle in range(4):
+        if cycle == 3:
+            group.stopped = frozenset({2})
+        group.begin(cycle)
+        hear(group, [0] * 6)
+        words.append([int.from_bytes(data[:2], "little") for _, data in group.frames()])
+    assert words == [[0x0F] * 6] * 3 + [[0x0F, 0x02, 0x0F, 0x0F, 0x0F, 0x0F]]
+
+
 def test_grouped_targets_share_a_frame_and_the_controlword_goes_on_change():
     group = make_group(grouped=True, repeat=3)
     group.begin(0)

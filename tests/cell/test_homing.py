@@ -20,7 +20,7 @@ from canprobe.cell.controller import Command
 from canprobe.emulator.faults import Fault, FaultKind, FaultyNode
 from canprobe.emulator.plant.plant import Plant
 from canprobe.emulator.world import make_world
-from canprobe.errors import NodeError, UsageError
+from canprobe.errors import CanprobeError, NodeError, UsageError
 from canprobe.protocol.cia402 import DriveState
 from canprobe.protocol.frames import NmtCommand, pack_nmt
 from canprobe.session.session import Session
@@ -338,6 +338,23 @@ def test_ctrl_c_stops_and_disables_the_drive(tmp_path):
     before = bench.world.plant.truth()["q"]
     assert "is not homed" in refusal(bench)
     assert bench.world.plant.truth()["q"] == pytest.approx(before, abs=1e-6)
+
+
+@pytest.mark.parametrize("state", [DriveState.SWITCH_ON_DISABLED, DriveState.QUICK_STOP_ACTIVE, DriveState.SWITCHED_ON])
+def test_a_drive_that_leaves_operation_while_homing_is_noticed(tmp_path, state):
+    """As by its enable input: no EMCY, no homing error, and a heartbeat as always."""
+    bench = Bench(scene_of([17], homing_speed_deg_s=10.0), tmp_path)
+    drive = bench.world.nodes[0].application
+    bench.bus.attach(Once(lambda: drive._go(state, bench.bus.clock.now_ns())))
+    told = failure(bench)
+    assert told == f"node 1: (joint 1) could not find its home position by method 17: it is {state.name}"
+
+
+def test_another_master_that_comes_while_homing_is_named(tmp_path):
+    bench = Bench(scene_of([17], homing_speed_deg_s=10.0), tmp_path)
+    bench.bus.attach(Once(lambda: bench.bus.port().send_batch([pack_nmt(NmtCommand.STOP, 1)])))
+    with pytest.raises(CanprobeError, match="an NMT command from another master"):
+        bench.home()
 
 
 def test_a_node_that_is_lost_stops_the_joint_that_is_homed(tmp_path):

@@ -159,6 +159,33 @@ def test_nor_may_its_contact_run_off_the_array():
     )
 
 
+def test_a_press_between_two_retreats_is_not_forgotten():
+    """4 N for 30 ms, then 4 mm straight back within 200 ms: what the array still shows is its memory, and no press."""
+    force, back = [0.0], [0.0]
+
+    class Guard:
+        measure = staticmethod(lambda _: None)
+
+        def T_base_tip(self, _):
+            T = np.eye(4)
+            T[2, 3] = -back[0]
+            return T
+
+    watched = Supervisor(
+        Seen(LIMITS, NodeWatch(()), None, None, PortCounters()), Guard(), lambda _: SimpleNamespace(force=force[0])
+    )
+    for cycle in range(80):
+        force[0] = 4.0 if 4 <= cycle < 16 else 0.3 * (cycle >= 16)
+        back[0] = max(cycle - 16, 0) / 64 * 4e-3
+        sample = SimpleNamespace(cycle=cycle, t_sample_ns=0)
+        measurement = Measurement(cycle, cycle * 2_500_000, q=np.zeros(6), q_age=(0,) * 6, tactile=sample)
+        more = {"counters": PortCounters(), "controller_state": ControllerState.ACTIVE}
+        watched.step(measurement, sync_ns=0, overruns=0, **more)
+        if cycle == 20:
+            assert watched.pressing() == 0.3, "not yet clear of it"
+    assert watched.pressing() == 0.0
+
+
 # The joint guard at its borders: range, speed, and what a measured joint can have done.
 
 GUARD_PERIOD_NS = 2_500_000

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import sys
 
+import pytest
+
 from canprobe.cell.watch import UNTOLD, NodeWatch
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, Emcy
 
@@ -37,11 +39,24 @@ def test_a_device_error_is_found_among_many_about_frames():
     assert watch.last_words(3) == ""
 
 
+@pytest.mark.parametrize(
+    ("code", "of_frames"),
+    [(0x8100, True), (0x8110, True), (0x81FF, True), (0x8250, True), (0x8000, False), (0x8311, False), (0x8611, False)],
+)
+def test_following_errors_and_the_like_are_about_the_device(code, of_frames):
+    """81xxh and 82xxh are about frames; of the same thousand 8611h is a following error, 83xxh torque."""
+    watch = a_watch()
+    told(watch, 2, code)
+    assert (watch.communication, watch.device_alarm is None, watch.alarmed) == (
+        (1, True, set()) if of_frames else (0, False, {2})
+    )
+
+
 def test_what_a_device_said_before_the_start_is_over():
     watch = a_watch()
     told(watch, 1, OVERHEATED)
     watch.start(0)
-    assert watch.device_alarm is None
+    assert watch.device_alarm is None and not watch.alarmed
     assert [event.emcy.code for event in watch.news()] == [OVERHEATED]  # but it is told
     assert watch.news() == []
 

@@ -104,6 +104,39 @@ def test_another_master_that_interferes_before_the_run_is_named_and_nothing_is_e
         assert DriveState.OPERATION_ENABLED not in map(state_of, map(int, row))
 
 
+@pytest.mark.parametrize("what", ["bus-off", "EMCY 4210h"])
+def test_what_comes_while_the_drives_are_being_enabled_ends_that(what):
+    def say(text):
+        if text != "enable the drives":
+            return
+        if what == "bus-off":
+            session.cell._port.state = ControllerState.BUS_OFF
+        else:
+            session.lockstep.port().send_batch([(EMCY_BASE + 4, Emcy(0x4210, 1).pack())])
+
+    session = Session(canprobe.load_scene("free"), say=say)
+    with pytest.raises(CanprobeError, match=what), session:
+        session.run(lambda _: Command(done=True))
+    words = session.cell.log.arrays()["statusword"]
+    assert DriveState.OPERATION_ENABLED not in {state_of(int(word)) for word in words.ravel()}
+
+
+class NeverHeard(Injected):
+    """An array that lives and sends no frame."""
+
+    def _join(self, node):
+        joined = super()._join(node)
+        for pdo in self.session.plan.pdos_of(16, "tpdo") if node.node_id == 16 else ():
+            altered(joined, pdo.cob_id, lambda _: None)
+        return joined
+
+
+def test_an_own_controller_does_not_go_on_with_an_array_that_was_never_heard():
+    run = NeverHeard("press", FREE_CYCLE, lambda _: None, own=True)
+    assert "no tactile frame for" in str(run.error)
+    assert run.injected_ns is None, "it came to no cycle of a touch"
+
+
 # PDOs
 
 
