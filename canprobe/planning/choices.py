@@ -8,6 +8,7 @@ from the array last of all. What a scene writes is kept.
 from __future__ import annotations
 
 import importlib.util
+import ipaddress
 import itertools
 import re
 from collections.abc import Callable, Container, Iterator, Sequence
@@ -407,12 +408,40 @@ def _held_rows(arm: Arm) -> str:
     return f"{name} holds position and pole of the probe and leaves the turn about the pole free"
 
 
-# What a plan carries out and yet says first: where the numbers in it do not hold.
+# What a plan carries out and yet says first: who else can command it, and where the numbers in it do not hold.
+
+ON_THIS_MACHINE = "ff11::ca"
+"""A multicast group of interface-local scope, which no packet leaves or enters. Source: RFC 4291, 2.7."""
+
+
+def _open_to_others(setup: Setup) -> Iterator[str]:
+    """What lets other machines reach the cell, and what to write to keep it on this one."""
+    bus, bridge = setup.bus, setup.bridge
+    if bus.interface == "udp_multicast" and not _is_interface_local(bus.channel):
+        yield (
+            f"bus.channel = {bus.channel}: every machine on this network segment hears this bus and can command its"
+            f" nodes; --channel {ON_THIS_MACHINE} keeps it on this machine"
+        )
+    if "ros2" in bridge.use and not bridge.ros2_loopback:
+        may = "can start, stop and move the cell" if bridge.ros2_commands else "sees the cell"
+        yield (
+            f"bridge.ros2_loopback = false: every machine on this network segment {may};"
+            " bridge.ros2_loopback = true keeps its topics on this machine, CYCLONEDDS_URI on some interfaces"
+        )
+
+
+def _is_interface_local(channel: str) -> bool:
+    try:
+        group = ipaddress.ip_address(channel)
+    except ValueError:
+        return False
+    return group.version == 6 and group.is_multicast and int(group) >> 112 & 0xF == 1
 
 
 def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
     """What a user has to know before trusting the plan, most important first."""
     cut, bus = cut_patch(setup), setup.bus
+    yield from _open_to_others(setup)
     if setup.array is not None and setup.array.newtons == NOMINAL:
         yield (
             "sensor.calibration: the array measures in nominal newtons, as good as its stated full scale;"

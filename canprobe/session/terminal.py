@@ -58,9 +58,9 @@ class Report:
     def detail(self, line: str) -> None:
         """Report one step of a command whose result says it all: a terminal shows it, and `-v` does everywhere.
 
-        Where a bridge is to be found is shown everywhere: it is gone with the run.
+        Where a bridge is to be found is shown everywhere: it is gone with the run; and so are warnings.
         """
-        if self.verbosity > 0 or self._stream.isatty() or line.startswith("bridge "):
+        if self.verbosity > 0 or self._stream.isatty() or line.startswith(("bridge ", "warning:")):
             self.say(line)
 
     def complain(self, line: str) -> None:

@@ -58,10 +58,10 @@ def test_a_step_stands_above_the_bar_and_an_error_below():
 @pytest.mark.parametrize(
     ("verbosity", "terminal", "lines"),
     [
-        (-1, True, ["warning: hot"]),
-        (0, True, ["warning: hot", "said", "detail"]),
-        (0, False, ["warning: hot", "said"]),
-        (1, False, ["warning: hot", "said", "detail"]),
+        (-1, True, ["warning: hot", "warning: open"]),
+        (0, True, ["warning: hot", "said", "detail", "warning: open"]),
+        (0, False, ["warning: hot", "said", "warning: open"]),
+        (1, False, ["warning: hot", "said", "detail", "warning: open"]),
     ],
 )
 def test_quiet_and_verbose(verbosity, terminal, lines):
@@ -70,6 +70,7 @@ def test_quiet_and_verbose(verbosity, terminal, lines):
     report.say("warning: hot")
     report.say("said")
     report.detail("detail")
+    report.detail("warning: open")
     assert stream.getvalue().splitlines() == lines
 
 

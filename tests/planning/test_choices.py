@@ -12,7 +12,7 @@ import canprobe
 from canprobe.cli import main
 from canprobe.emulator.plant.probe import elastic_contact
 from canprobe.errors import PlanError, SceneError
-from canprobe.planning.choices import opened, second_channel
+from canprobe.planning.choices import ON_THIS_MACHINE, opened, second_channel
 from canprobe.planning.devices import order_by_deadline
 from canprobe.planning.make import make_plan
 from canprobe.planning.report import plan_dict, plan_text
@@ -240,6 +240,42 @@ def test_more_than_the_force_limit_unfelt_is_refused(tmp_path, capsys):
 def test_features_and_the_whole_image_cut_nothing():
     for mode in ("features", "image"):
         assert cut_patch(resolve(change(load_scene("foam"), sensor={"mode": mode, "window": 4}))) is None
+
+
+@pytest.mark.parametrize(
+    ("channel", "local"),
+    [
+        ("239.74.163.2", False),
+        ("ff15:7079:7468:6f6e:6465:6d6f:6d63:6173", False),
+        ("ff02::1", False),
+        ("fd00::1", False),
+        (ON_THIS_MACHINE, True),
+        ("ff01::2", True),
+    ],
+)
+def test_a_bus_that_other_machines_hear_is_a_warning_with_the_way_to_restrict_it(channel, local):
+    plan = canprobe.plan(change(load_scene("free"), bus={"interface": "udp_multicast", "channel": channel}))
+    assert len(plan.warnings) == (not local)
+    for warning in plan.warnings:
+        assert warning.startswith(f"bus.channel = {channel}: every machine on this network segment hears this bus")
+        assert warning.endswith(f"--channel {ON_THIS_MACHINE} keeps it on this machine")
+
+
+@pytest.mark.parametrize(
+    ("section", "told"),
+    [
+        ('use = ["ros2"]\nros2_commands = true', None),
+        ('use = ["mcap"]\nros2_loopback = false\nros2_commands = true', None),
+        ('use = ["ros2"]\nros2_loopback = false', "segment sees the cell; bridge.ros2_loopback = true keeps"),
+        (
+            'use = ["ros2"]\nros2_loopback = false\nros2_commands = true',
+            "segment can start, stop and move the cell; bridge.ros2_loopback = true keeps",
+        ),
+    ],
+)
+def test_topics_that_leave_this_machine_are_a_warning(section, told):
+    warnings = canprobe.plan(parse_scene(f"{dump_scene(load_scene('free'))}[bridge]\n{section}\n")).warnings
+    assert warnings == () if told is None else told in warnings[0]
 
 
 def test_errors_on_the_wire_are_a_warning():
