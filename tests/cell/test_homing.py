@@ -350,6 +350,16 @@ def test_a_drive_that_leaves_operation_while_homing_is_noticed(tmp_path, state):
     assert told == f"node 1: (joint 1) could not find its home position by method 17: it is {state.name}"
 
 
+def test_a_record_is_gone_before_the_drive_moves(tmp_path):
+    """Whatever happens then, up to a power cut of the master: the zero that it had is not taken for the new one."""
+    bench = Bench(scene_of([17]), tmp_path)
+    bench.home()
+    kept = []
+    bench.bus.attach(Once(lambda: kept.append(json.loads(bench.record.read_text())["nodes"])))
+    bench.home()
+    assert kept == [{}] and json.loads(bench.record.read_text())["nodes"].keys() == {"1"}
+
+
 def test_another_master_that_comes_while_homing_is_named(tmp_path):
     bench = Bench(scene_of([17], homing_speed_deg_s=10.0), tmp_path)
     bench.bus.attach(Once(lambda: bench.bus.port().send_batch([pack_nmt(NmtCommand.STOP, 1)])))

@@ -19,7 +19,8 @@ from canprobe.cell.lift_off import WAY
 from canprobe.cell.supervision import TOUCH_FORCE
 from canprobe.emulator.faults import FaultKind
 from canprobe.errors import SafetyStop
-from canprobe.protocol.frames import EMCY_BASE, SYNC_ID, Emcy, NmtCommand, NmtState, pack_nmt
+from canprobe.protocol.cia402 import DriveState, state_of
+from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, Emcy, NmtCommand, NmtState, pack_nmt
 from canprobe.session.session import Session
 from canprobe.tasks.from_plan import make_task
 from canprobe.tasks.probing import Phase
@@ -48,6 +49,7 @@ LOST = {
     "joint 5 has a fault": ("drive_fault", lambda r: r.nodes[5].node.application.inject_fault(0x4310)),
     "joint 6 is frozen": ("drive_silent", lambda r: r.fault(FaultKind.FREEZE, 6)),
     "joint 2 tells no state": ("drive_fault", lambda r: altered(r.nodes[2], 0x182, lambda d: b"\x01\x06" + d[2:])),
+    "joint 4 has no heartbeat": ("heartbeat", lambda r: altered(r.nodes[4], HEARTBEAT_BASE + 4, lambda _: None)),
     "the sensor is stopped": ("nmt_state", lambda r: r.nodes[16].node._enter(NmtState.STOPPED, r.now())),
 }
 
@@ -148,8 +150,8 @@ class Twice(Injected):
 
             def add(row):
                 inner(row)
-                self.lifting += 1
-                if self.lifting == 20:
+                self.lifting += "q_target_rad" in row
+                if self.lifting == 20 and "q_target_rad" in row:
                     self.second(self)
 
             self.session.cell.log.add = add
@@ -172,12 +174,20 @@ def disabled(node_id):
     return lambda run: altered(run.nodes[node_id], 0x180 + node_id, lambda d: b"\x50\x06" + d[2:])
 
 
-@pytest.mark.parametrize("second", [master_heard, bus_off, drive_fault, disabled(4), mute(5)[1]])
-def test_a_lift_off_does_not_go_on_when_something_else_comes(second):
+def moving(run):
+    """A drive reports what it cannot have reached."""
+    altered(run.nodes[2], 0x182, lambda d: d[:2] + pack("<i", unpack("<i", d[2:6])[0] + 2000) + d[6:])
+
+
+@pytest.mark.parametrize(
+    ("second", "cycles"),
+    [(master_heard, 1), (bus_off, 0), (drive_fault, 2), (disabled(4), 1), (moving, 1), (mute(5)[1], 3)],
+)
+def test_a_lift_off_does_not_go_on_when_something_else_comes(second, cycles):
     run = Twice(second)
     assert type(run.error) is KeyboardInterrupt
-    back, _ = lifted(run)
-    assert 0.2 * WAY < back < 0.5 * WAY, "as far as it was, and the cycles until it shows"
+    assert 20 <= run.lifting <= 20 + cycles
+    assert 0.2 * WAY < lifted(run)[0] < 0.5 * WAY, "as far as it was, and what is left of the motion"
     if second is master_heard:
         assert "another master is on the bus: SYNC from another master" in run.session.cell.faults
 
@@ -205,6 +215,21 @@ def test_a_drive_with_an_alarm_stands_still_also_where_another_one_had_one_befor
     assert run.error.node_id == 1
     assert run.session.truth["force"][-1] == 0.0
     assert turned(run)[1] < 30 and turned(run).max() > 100
+    words = run.session.cell.log.arrays()["statusword"][run.at + 60].astype(int).tolist()
+    assert [state_of(word) is DriveState.OPERATION_ENABLED for word in words] == [False, False, True, True, True, True]
+
+
+def test_a_drive_that_left_operation_beside_the_one_that_is_named_does_not_lift():
+    """Both are still enabled by their statuswords, and follow targets."""
+
+    def left(run):
+        for node_id in (3, 5):
+            send(run, (HEARTBEAT_BASE + node_id, bytes((NmtState.PRE_OPERATIONAL,))))
+
+    run = Injected("press", HOLD_CYCLE, left)
+    assert "node 3: left operation" in str(run.error)
+    assert run.session.truth["force"][-1] == 0.0
+    assert max(turned(run)[2], turned(run)[4]) < 30 and turned(run).max() > 100
 
 
 def left_pressing(session):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import signal
 from dataclasses import replace
+from itertools import chain, count, repeat
 from pathlib import Path
 from struct import pack, unpack
 
@@ -119,6 +120,68 @@ def test_what_comes_while_the_drives_are_being_enabled_ends_that(what):
         session.run(lambda _: Command(done=True))
     words = session.cell.log.arrays()["statusword"]
     assert DriveState.OPERATION_ENABLED not in {state_of(int(word)) for word in words.ravel()}
+
+
+def not_enabled(told, *changes):
+    """Ends so where nodes send other data from `enable the drives` on, by (node id, COB-ID, change)."""
+
+    def say(text):
+        if text == "enable the drives":
+            for node_id, cob_id, change in changes:
+                altered(participants[node_id - 1], cob_id, change)
+
+    session = Session(canprobe.load_scene("free"), say=say)
+    participants = session.world.participants
+    participants[:6] = map(FaultyNode, participants[:6])
+    with pytest.raises(CanprobeError, match=told), session:
+        session.run(lambda _: Command(done=True))
+    words = session.cell.log.arrays()["statusword"]
+    assert DriveState.OPERATION_ENABLED not in {state_of(int(word)) for word in words.ravel()}
+
+
+def moved(data, counts):
+    return data[:2] + pack("<i", unpack("<i", data[2:6])[0] + counts) + data[6:]
+
+
+def test_an_arm_that_does_not_stand_still_is_not_enabled():
+    way = count(0, 20)
+    not_enabled("node 2: reports no position that stays for 2 s", (2, 0x182, lambda d: moved(d, next(way))))
+
+
+def test_a_jump_while_the_drives_are_being_enabled_ends_that():
+    ready = DriveState.READY_TO_SWITCH_ON
+    change = lambda d: moved(d, 20_000) if state_of(unpack("<H", d[:2])[0]) is ready else d  # noqa: E731
+    not_enabled("joint 2 reports a motion of", (2, 0x182, change))
+
+
+def test_a_heartbeat_that_is_lost_before_the_drives_are_enabled_ends_that():
+    """They are enabled only once joint 2 stands still, which here takes longer than the time-out."""
+    way = chain(range(0, 3000, 20), repeat(3000))
+    not_enabled(
+        "node 3: lost: no heartbeat",
+        (2, 0x182, lambda d: moved(d, next(way))),
+        (3, HEARTBEAT_BASE + 3, lambda _: None),
+    )
+
+
+def test_a_moving_arm_is_stopped_before_it_is_disabled():
+    """A drive that loses its power while it moves coasts."""
+    sent = []
+
+    def interrupt(run):
+        inner = run.session.lockstep.recorder
+
+        def recorder(can_id, data, t_ns):
+            sent.append((can_id, data[:2]))
+            inner(can_id, data, t_ns)
+
+        run.session.lockstep.recorder = recorder
+        raise KeyboardInterrupt
+
+    Injected("free", FREE_CYCLE, interrupt).assert_drives_off()
+    for cob_id in range(0x201, 0x207):
+        words = [int.from_bytes(word, "little") for can_id, word in sent if can_id == cob_id]
+        assert list(dict.fromkeys(words))[:2] == [0x02, 0x00]
 
 
 class NeverHeard(Injected):
