@@ -49,7 +49,7 @@ LOST = {
     "joint 5 has a fault": ("drive_fault", lambda r: r.nodes[5].node.application.inject_fault(0x4310)),
     "joint 6 is frozen": ("drive_silent", lambda r: r.fault(FaultKind.FREEZE, 6)),
     "joint 2 tells no state": ("drive_fault", lambda r: altered(r.nodes[2], 0x182, lambda d: b"\x01\x06" + d[2:])),
-    "joint 4 has no heartbeat": ("heartbeat", lambda r: altered(r.nodes[4], HEARTBEAT_BASE + 4, lambda _: None)),
+    "joint 3 has no heartbeat": ("heartbeat", lambda r: altered(r.nodes[3], HEARTBEAT_BASE + 3, lambda _: None)),
     "the sensor is stopped": ("nmt_state", lambda r: r.nodes[16].node._enter(NmtState.STOPPED, r.now())),
 }
 
