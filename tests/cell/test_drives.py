@@ -241,9 +241,7 @@ def test_after_a_late_cycle_a_motion_is_carried_on_for_three_periods_of_time(per
 
 
 @pytest.mark.parametrize("rate", [10, -10])
-@pytest.mark.parametrize(
-    ("periods", "followed"), [(1, 1), (2, 2), (12, 12), (20, 20), (34, 20)], ids=lambda value: str(value)
-)
+@pytest.mark.parametrize(("periods", "followed"), [(1, 1), (2, 2), (12, 12), (20, 20), (34, 20)], ids=str)
 def test_a_report_after_a_late_cycle_is_believed_as_far_as_the_drive_can_have_come(rate, periods, followed):
     """It goes on as before for three periods at most, and follows within twenty what its targets asked of it."""
     carried = min(periods, 3)
@@ -278,10 +276,10 @@ def test_a_drive_that_was_not_heard_while_it_moved_is_believed_when_all_hold(tur
     """Its way since the last report does not fade, however long nobody hears it: it went there."""
     track = moving(20)
     position = 20 * 19
-    for k in range(20, 24):
+    for _ in range(20, 24):
         position += turned * 40
         track.aim(40)
-    for k in range(24, 60):
+    for _ in range(24, 60):
         track.aim(0)
     assert track.take(position, 60, 60 * PERIOD, guarded=True)
 

@@ -11,8 +11,8 @@ from injected import Injected
 from wrapped import Wrapped
 
 import canprobe
-from canprobe.cli.parser import PATIENT_SYNCS
 from canprobe.cell.controller import Command, Measurement
+from canprobe.cli.parser import PATIENT_SYNCS
 from canprobe.results.summary import summarise
 from canprobe.session.session import Session
 from canprobe.tasks.from_plan import make_task
