@@ -352,8 +352,10 @@ class SocketCanPort:
     def _stamped_now(self, rows: Sequence[Row], step_ns: int) -> list[Row]:
         """The wall clock was set: some of these frames came before that and some after it, all of them until now."""
         self.counters.clock_steps += 1
-        way = "back" if step_ns < 0 else "forward"
-        self._reports.say(f"warning: {self.channel}: the wall clock was set {way} by {abs(step_ns) * 1e-6:.1f} ms")
+        if self.counters.clock_steps == 1:
+            way = "back" if step_ns < 0 else "forward"
+            what = f"the wall clock was set {way} by {abs(step_ns) * 1e-6:.1f} ms"
+            self._reports.say(f"{self.channel}: {what}; frames keep their time, further times are only counted")
         stamp_ns = self.clock.now_ns() + self._stamps.offset_ns
         return [(can_id, data, stamp_ns, drops) for can_id, data, _, drops in rows]
 
