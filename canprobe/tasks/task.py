@@ -16,6 +16,15 @@ if TYPE_CHECKING:
     from canprobe.tasks.shape import ShapeTracker
 
 
+LONGEST_STEP = 4
+"""Periods that one command makes up for at most after an overrun; the rest of a longer stall is lost time."""
+
+
+def step_ns(t_ns: int, last_ns: int, period_ns: int) -> int:
+    """By how much a motion goes on from one cycle to the next, ns: the time between them, within a bound."""
+    return min(t_ns - last_ns, LONGEST_STEP * period_ns)
+
+
 @dataclass(slots=True)
 class Loss:
     """One time that a scan lost its contact.
