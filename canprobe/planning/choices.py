@@ -404,9 +404,9 @@ def _long_waits(missed_syncs: int, rate_hz: float) -> Iterator[str]:
         return
     waited_ms = 1e3 * missed_syncs / rate_hz
     yield (
-        f"arm.missed_syncs = {missed_syncs}: real drives stay enabled for {waited_ms:g} ms after the last SYNC of a"
-        " master that stalls or dies, and a drive that falls silent is waited for as long: an object that moves is pressed"
-        f" without supervision until then; leave it at {MISSED_SYNCS_REAL} or below, more is for emulated nodes"
+        f"arm.missed_syncs = {missed_syncs}: real drives stay enabled for {waited_ms:g} ms after the last SYNC of"
+        " a master that stalls or dies, and a drive that falls silent is waited for as long: an object that moves is"
+        f" pressed without supervision until then; leave it at {MISSED_SYNCS_REAL} or below, more is for emulated nodes"
     )
 
 

@@ -15,7 +15,7 @@ from canprobe.scene.setup import Calibrate, Free, Probe, Setup, Touch
 from canprobe.tasks.probing import ProbingTask
 from canprobe.tasks.sensing import ContactSensing
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker, replay_samples
-from canprobe.tasks.task import step_ns
+from canprobe.tasks.task import MotionTime
 from canprobe.tasks.touch import TouchTask
 from canprobe.touch.contact import indentation_from_force
 from canprobe.touch.patch.array_calibration import CentroidErrors
@@ -203,7 +203,9 @@ class RequestedTask(Controller):
         self._task = task
         self._plan = plan
         self._period_s = period_s
-        self._targets: list[tuple[int, Vector]] = []
+        self._time = MotionTime(round(1e9 * period_s))
+        self._step_s = period_s
+        self._targets: list[Vector] = []
         self._make = make
         self._requests = requests
         self._steps = {"target_force_n": FORCE_RATE * period_s, "speed_m_s": SPEED_RATE * period_s}
@@ -219,6 +221,7 @@ class RequestedTask(Controller):
                     self._follow(measurement, **request["value"])
                 else:
                     self._take(**request)
+        self._step_s = 1e-9 * self._time.step(measurement.t_ns)
         if self._task is None:
             return Command()
         columns = self._approach(self._task) if isinstance(self._task, TouchTask) else {}
@@ -228,7 +231,7 @@ class RequestedTask(Controller):
         if self._stopping and not isinstance(self._task, ProbingTask):
             command = replace(command, done=True)
         if self._plan is not None and command.q_target is not None:
-            self._targets = [*self._targets[-1:], (measurement.t_ns, command.q_target)]
+            self._targets = [*self._targets[-1:], command.q_target]
         if command.done and self._make is not None:
             self._task, self._stopping, self._targets = None, False, []
             return replace(command, done=False)
@@ -281,8 +284,8 @@ class RequestedTask(Controller):
 
     def _motion(self) -> tuple[Vector, Vector]:
         """Where the last two targets lead in this cycle: position and speed (n,)."""
-        (before_ns, before), (last_ns, last) = self._targets
-        qd = (last - before) / (1e-9 * step_ns(last_ns, before_ns, round(1e9 * self._period_s)))
+        before, last = self._targets
+        qd = (last - before) / self._step_s
         return last + qd * self._period_s, qd
 
     def _approach(self, task: TouchTask) -> dict[str, float]:

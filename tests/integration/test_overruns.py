@@ -86,7 +86,7 @@ def test_the_contact_keeps_its_speed_and_the_surface(stalled: tuple[Session, Sta
 
 FIRST, SPACING = 850, 36
 STALLS_MS = (15, 45, int((PATIENT_SYNCS - 1) * 2.5))
-LOST, JOINTS = (0, 1, 3), ((1,), (2,), (3,), (4, 5, 6), (1, 2, 3, 4, 5, 6))
+LOST, JOINTS = (0, 1, 3), ((1,), (3,), (4, 5, 6), (1, 2, 3, 4, 5, 6))
 EPISODES = [
     (stall_ms, lost, joints)
     for stall_ms, lost, joints in product(STALLS_MS, LOST, JOINTS)
@@ -128,9 +128,9 @@ class PatientScan(Injected):
         self._stall(measurement, late_sync=1)
 
 
-@pytest.fixture(scope="module")
-def patient() -> PatientScan:
-    return PatientScan("cylinder")
+@pytest.fixture(scope="module", params=["cylinder", "steel"])
+def patient(request: pytest.FixtureRequest) -> PatientScan:
+    return PatientScan(request.param)
 
 
 def test_no_stall_with_lost_tpdos_ends_a_patient_scan(patient: PatientScan) -> None:
