@@ -474,8 +474,9 @@ class DriveGroup:
 
     def aim(self, targets: Sequence[int]) -> None:
         """The drives get `targets` (counts) in this cycle, which bound what they may do next."""
-        before = self._aimed if self._aimed is not None else [track.counts for track in self._tracks]
-        periods = max((self._deadline_ns - self._aimed_ns) / self._period_ns, 1.0)
+        before, periods = self._aimed, max((self._deadline_ns - self._aimed_ns) / self._period_ns, 1.0)
+        if before is None:
+            before, periods = tuple([track.counts for track in self._tracks]), 1.0
         for track, target, last in zip(self._tracks, targets, before, strict=True):
             track.aim(abs(target - last), periods)
         self._aimed, self._aimed_ns = tuple(targets), self._deadline_ns
