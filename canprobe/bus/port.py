@@ -248,6 +248,7 @@ class PortCounters:
             overflows of the controller's buffers.
         transmit_full: times that the transmit queue was full, retries included.
         ignored: frames that classic CAN cannot carry (CAN FD) and that were dropped.
+        clock_steps: times that the wall clock, by which the kernel stamps frames, was set.
     """
 
     sent: int = 0
@@ -256,6 +257,7 @@ class PortCounters:
     overruns: int = 0
     transmit_full: int = 0
     ignored: int = 0
+    clock_steps: int = 0
 
     def note_error(self, can_id: int, data: bytes) -> None:
         """Count an error frame for what it is; an overflow is one lost frame, whichever way it was to go."""
@@ -433,9 +435,11 @@ class JoinedPort(PlainPort):
 
     @property
     def counters(self) -> PortCounters:
-        """What has passed through all of them."""
+        """What has passed through all of them; each of them notices a step of the one wall clock."""
         every = [port.counters for port in self._ports.values()]
-        return PortCounters(*(sum(getattr(one, field.name) for one in every) for field in fields(PortCounters)))
+        total = PortCounters(*(sum(getattr(one, field.name) for one in every) for field in fields(PortCounters)))
+        total.clock_steps = max(one.clock_steps for one in every)
+        return total
 
     @property
     def state(self) -> ControllerState:

@@ -1,7 +1,7 @@
 """A `Port` on a SocketCAN interface, with a raw socket of its own: bursts of frames a system call, kernel time stamps.
 
 Time stamps are those of the kernel at reception (CLOCK_REALTIME), brought to CLOCK_MONOTONIC by the difference between
-the two clocks, which is measured when the port opens and again when the stamps have moved on by a second or stepped.
+the two clocks, which is looked at in every cycle (`StampClock`): a wall clock that is set is noticed and counted.
 29-bit identifiers and remote requests are passed with `EFF_FLAG` and `RTR_FLAG`. With a data bit rate frames of more
 than 8 bytes are CAN FD frames with bit-rate switch; without it none are received.
 
@@ -19,7 +19,7 @@ import select
 import socket
 import struct
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 from canprobe.bus.link import TX_QUEUE, drop_queued, emptying_line, ip_line, setting_line, sudo
 from canprobe.bus.mmsg import CLASSIC_BYTES, SO_RXQ_OVFL, SO_TIMESTAMPNS, FrameSocket, Row
@@ -59,7 +59,60 @@ _TELL_NS = 1_000_000_000
 """A port that waits reports a queue that has been full for so long."""
 _STUCK_NS, _LINGER_NS = 100_000_000, 1_000_000_000
 """How long a port that closes waits for the next queued frame to leave, and for all of them."""
-_RECALIBRATE_NS = 1_000_000_000
+_COMPARE_NS = 1_000_000
+"""Time of stamps after which the two clocks are compared again: less than a cycle."""
+_ALIKE_NS = 50_000
+"""Difference that is none: reading both clocks takes as long in a virtual machine. No TPDO follows its SYNC sooner."""
+
+
+class StampClock:
+    """Brings stamps of CLOCK_REALTIME to CLOCK_MONOTONIC, and notices when the wall clock was set.
+
+    NTP slows down and speeds up both clocks alike, so their difference stays the same until somebody sets the wall
+    clock: chrony or ntpd after a long absence, `date`, a leap second. Two readings tell whether it is the same.
+
+    Args:
+        realtime_ns, monotonic_ns: read the clocks.
+
+    Attributes:
+        offset_ns: realtime minus monotonic.
+    """
+
+    def __init__(
+        self, realtime_ns: Callable[[], int] = time.time_ns, monotonic_ns: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        self._realtime_ns, self._monotonic_ns = realtime_ns, monotonic_ns
+        self._compared_ns = 0
+        self.offset_ns, _ = self._measure()
+
+    def follow(self, stamp_ns: int) -> int:
+        """Compare the clocks, unless they were compared up to a millisecond before this stamp.
+
+        Returns:
+            By how much the wall clock was set since the last comparison, ns, negative for back; 0 where it was not.
+        """
+        if 0 <= stamp_ns - self._compared_ns < _COMPARE_NS:
+            return 0
+        self._compared_ns = stamp_ns
+        if abs(self._realtime_ns() - self._monotonic_ns() - self.offset_ns) <= _ALIKE_NS:
+            return 0
+        offset_ns, doubt_ns = self._measure()  # this process may only have waited between the two readings
+        step_ns = offset_ns - self.offset_ns
+        if abs(step_ns) <= _ALIKE_NS + doubt_ns:
+            return 0
+        self.offset_ns = offset_ns
+        return step_ns
+
+    def _measure(self) -> tuple[int, int]:
+        """The difference of the clocks and what it may be off by, ns, from the quickest of three readings."""
+        readings = []
+        for _ in range(3):
+            before = self._monotonic_ns()
+            realtime = self._realtime_ns()
+            after = self._monotonic_ns()
+            readings.append((after - before, realtime - (before + after) // 2))
+        doubt_ns, offset_ns = min(readings)
+        return offset_ns, doubt_ns
 
 
 class SocketCanPort:
@@ -110,7 +163,8 @@ class SocketCanPort:
         self._dropped = [0, 0]
         self._poll = _Poll(self._socket.fileno())
         self._blocks = False
-        self._offset_ns = self._calibrated_ns = self._told_ns = 0
+        self._stamps = StampClock(monotonic_ns=clock.now_ns)
+        self._told_ns = 0
 
     stamps_arrival = True
 
@@ -152,14 +206,18 @@ class SocketCanPort:
             rows = self._frames.receive(wait)
         except OSError as error:
             raise self._failed(error) from error
+        if rows:
+            self._count_drops(0, rows)
         if self._patient_frames is not None and (patient := self._patient_frames.receive()):
             self._count_drops(1, patient)
-            rows = sorted(patient + rows, key=_stamp) if rows else patient
+            rows = patient + rows
         if not rows:
             return []
-        self._follow_clock(rows[-1][2])
-        self._count_drops(0, rows)
-        offset_ns = self._offset_ns
+        if step_ns := self._stamps.follow(rows[-1][2]):
+            rows = self._stamped_now(rows, step_ns)
+        elif self._patient_frames is not None:
+            rows = sorted(rows, key=_stamp)
+        offset_ns = self._stamps.offset_ns
         frames = [(can_id, data, t_ns - offset_ns) for can_id, data, t_ns, _ in rows if not can_id & ERR_FLAG]
         if len(frames) < len(rows):
             self._note_errors(rows, offset_ns)
@@ -291,10 +349,15 @@ class SocketCanPort:
         self._dropped[which] += dropped
         self.counters.overruns += dropped
 
-    def _follow_clock(self, stamp_ns: int) -> None:
-        if not 0 <= stamp_ns - self._calibrated_ns < _RECALIBRATE_NS:
-            self._calibrated_ns = stamp_ns
-            self._offset_ns = _realtime_minus_monotonic()
+    def _stamped_now(self, rows: Sequence[Row], step_ns: int) -> list[Row]:
+        """The wall clock was set: some of these frames came before that and some after it, all of them until now."""
+        self.counters.clock_steps += 1
+        if self.counters.clock_steps == 1:
+            way = "back" if step_ns < 0 else "forward"
+            what = f"the wall clock was set {way} by {abs(step_ns) * 1e-6:.1f} ms"
+            self._reports.say(f"{self.channel}: {what}; frames keep their time, further times are only counted")
+        stamp_ns = self.clock.now_ns() + self._stamps.offset_ns
+        return [(can_id, data, stamp_ns, drops) for can_id, data, _, drops in rows]
 
     def _note_errors(self, rows: Sequence[Row], offset_ns: int) -> None:
         for can_id, data, t_ns, _ in rows:
@@ -403,17 +466,6 @@ def _enlarge_buffer(sock: socket.socket) -> None:
         sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _RECEIVE_BUFFER)
     except PermissionError:  # needs CAP_NET_ADMIN; without it the kernel caps the size at net.core.rmem_max
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
-
-
-def _realtime_minus_monotonic() -> int:
-    """Return the difference of the clocks in ns, from the quickest of three readings."""
-    readings = []
-    for _ in range(3):
-        before = time.monotonic_ns()
-        realtime = time.time_ns()
-        after = time.monotonic_ns()
-        readings.append((after - before, realtime - (before + after) // 2))
-    return min(readings)[1]
 
 
 class _PollFd(ctypes.Structure):

@@ -245,6 +245,11 @@ _unchecked("interface", "interface removed or down", Reaction.STOP, _cycles(1))
 # time
 
 
+@_counted("clock_step", "wall clock set", _cycles(2))
+def _clock_step(seen: Seen) -> int:
+    return seen.counters.clock_steps
+
+
 @_checked("overruns", "overrun budget used up", Reaction.RETREAT, _after(HOLD_NS, 2))
 def _overruns(seen: Seen) -> SafetyStop | None:
     if seen.late_share <= seen.limits.safety.late_share:

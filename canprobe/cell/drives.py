@@ -38,9 +38,14 @@ REST_RAD = 1e-3
 REST_COUNTS_LEAST = 8
 """The same of a coarse encoder, which has a count or two a milliradian: it dithers, and its drive starts in steps."""
 CARRIED_CYCLES = 3
-"""Cycles for which a motion is carried on without a report."""
+"""Periods for which a motion is carried on without a report. After a late cycle too: a drive that gets no new target
+stops at its last one, however long the cycle lasts."""
+FOLLOWED_CYCLES = 20
+"""Periods within which a drive has followed its target."""
 _FORGET = 0.9
-"""Share of the largest step of the target that still counts one cycle later: a drive follows within twenty cycles."""
+"""Share of the largest step of the target that still counts one period later: an eighth after `FOLLOWED_CYCLES`."""
+PERIOD_NS = 2_500_000
+"""Of a cycle at 400 Hz."""
 
 
 class PositionTrack:
@@ -52,6 +57,7 @@ class PositionTrack:
 
     Args:
         base: what a report may be off by, whatever the motion, counts: see `rest_counts`.
+        period_ns: of the cycle. A late cycle lasts many periods: all bounds are times.
 
     Attributes:
         counts: the last position that was believed.
@@ -59,22 +65,43 @@ class PositionTrack:
         rested_ns: how long the reports have stayed within ``base`` of the first of them.
     """
 
-    __slots__ = ("_asked", "_base", "_rate", "_still", "_still_ns", "_t_ns", "counts", "cycle", "rested_ns")
+    __slots__ = (
+        "_asked",
+        "_base",
+        "_heard",
+        "_period_ns",
+        "_periods",
+        "_rate",
+        "_still",
+        "_still_ns",
+        "_t_ns",
+        "_way",
+        "counts",
+        "cycle",
+        "rested_ns",
+    )
 
-    def __init__(self, base: float) -> None:
+    def __init__(self, base: float, period_ns: int = PERIOD_NS) -> None:
         self.counts = 0
         self.cycle = -1
         self.rested_ns = 0
         self._base = base
+        self._period_ns = period_ns
         self._still: int | None = None
         self._still_ns = 0
         self._t_ns = 0
         self._rate = 0.0  # counts per ns
-        self._asked = 0.0  # counts per cycle
+        self._asked = 0.0  # counts per period
+        self._heard = False  # since the target moved on
+        self._way, self._periods = 0.0, 0.0  # what was asked since the last report, up to the last target; counts
 
-    def aim(self, step_counts: float) -> None:
-        """The target moves on by this much in this cycle."""
-        faded = _FORGET * self._asked
+    def aim(self, step_counts: float, periods: float = 1.0) -> None:
+        """The target moves on by this much, so many periods after it did so last."""
+        if not self._heard:
+            self._way += self._followed(periods)
+            self._periods += periods
+        self._heard = False
+        faded = _FORGET**periods * self._asked
         self._asked = step_counts if step_counts > faded else faded
 
     def take(self, counts: int, cycle: int, t_ns: int, *, guarded: bool) -> bool:
@@ -96,23 +123,30 @@ class PositionTrack:
             step, passed_ns = counts - self.counts, t_ns - self._t_ns
             moved: float = step
             if guarded:
-                carried = self._rate * passed_ns
-                asked = (cycle - self.cycle) * self._asked
+                carried = self._carried(passed_ns)
+                asked = self._way + self._followed(passed_ns / self._period_ns - self._periods)
                 if abs(step - carried) > self._base + abs(carried) + asked:
                     return False
                 moved = step if abs(step) <= asked else copysign(asked, step)
             if passed_ns > 0:
                 self._rate = moved / passed_ns
         self.counts, self.cycle, self._t_ns = counts, cycle, t_ns
+        self._heard, self._way, self._periods = True, 0.0, 0.0
         return True
 
     def position(self, cycle: int, t_ns: int) -> float:
-        """Where the motor is at a SYNC: as reported, or carried on by its rate."""
-        age = cycle - self.cycle
-        if age <= 0 or self.cycle < 0:
+        """Where the motor is at a SYNC: as reported, or carried on by its rate for a bounded time."""
+        if cycle <= self.cycle or self.cycle < 0:
             return float(self.counts)
-        passed_ns = (t_ns - self._t_ns) * min(age, CARRIED_CYCLES) / age
-        return self.counts + self._rate * passed_ns
+        return self.counts + self._carried(t_ns - self._t_ns)
+
+    def _followed(self, periods: float) -> float:
+        """How far a drive can have followed its last targets after so many periods, counts."""
+        return min(periods, FOLLOWED_CYCLES) * self._asked
+
+    def _carried(self, passed_ns: int) -> float:
+        """How far the motion has gone on since the last report, counts, as far as that can be said."""
+        return self._rate * min(passed_ns, CARRIED_CYCLES * self._period_ns)
 
 
 def rest_counts(model: ArmModel) -> list[float]:
@@ -244,6 +278,7 @@ class DriveGroup:
         axes: the drives, joint 1 first.
         model: the arm, for drive units ↔ joint positions.
         repeat_cycles: after how many cycles an event-driven RPDO is sent again without a change.
+        period_ns: of the cycle.
 
     Attributes:
         torque_permille: of each drive, NaN for one whose TPDO has no torque; empty where none has.
@@ -253,7 +288,9 @@ class DriveGroup:
         stopped: node ids of drives that stop while the others go on.
     """
 
-    def __init__(self, axes: tuple[DriveAxis, ...], model: ArmModel, repeat_cycles: int = 40) -> None:
+    def __init__(
+        self, axes: tuple[DriveAxis, ...], model: ArmModel, repeat_cycles: int = 40, period_ns: int = PERIOD_NS
+    ) -> None:
         self.axes = axes
         self.goal = DriveState.OPERATION_ENABLED
         self.statuswords = [0] * len(axes)
@@ -269,8 +306,9 @@ class DriveGroup:
         self.stopped: frozenset[int] = frozenset()
         self._model = model
         self._sources = {one.layout.cob_id: (k, one) for k, one in enumerate(sources)}
-        self._tracks = tuple(map(PositionTrack, rest_counts(model)))
-        self._deadline_ns = 0
+        self._tracks = tuple([PositionTrack(base, period_ns) for base in rest_counts(model)])
+        self._period_ns = period_ns
+        self._deadline_ns = self._aimed_ns = 0
         self._heard = [-1] * len(sources)
         self._all_heard = False
         self._targets: list[int] | None = None
@@ -386,7 +424,7 @@ class DriveGroup:
         return tuple([track.rested_ns >= REST_NS for track in self._tracks])
 
     def joints(self) -> Vector:
-        """Joint positions (n,), rad or m, at this SYNC; where a report is missing, carried on for a few cycles."""
+        """Joint positions (n,), rad or m, at this SYNC; where a report is missing, carried on for a short time."""
         now, now_ns = self._cycle, self._deadline_ns
         counts = [t.counts if t.cycle == now else t.position(now, now_ns) for t in self._tracks]
         q = units_to_joints(self._model, counts)
@@ -436,10 +474,12 @@ class DriveGroup:
 
     def aim(self, targets: Sequence[int]) -> None:
         """The drives get `targets` (counts) in this cycle, which bound what they may do next."""
-        before = self._aimed if self._aimed is not None else [track.counts for track in self._tracks]
+        before, periods = self._aimed, max((self._deadline_ns - self._aimed_ns) / self._period_ns, 1.0)
+        if before is None:
+            before, periods = tuple([track.counts for track in self._tracks]), 1.0
         for track, target, last in zip(self._tracks, targets, before, strict=True):
-            track.aim(abs(target - last))
-        self._aimed = tuple(targets)
+            track.aim(abs(target - last), periods)
+        self._aimed, self._aimed_ns = tuple(targets), self._deadline_ns
 
     def frames(self) -> list[Frame]:
         """The RPDOs of this cycle, as `commands`, packed."""
@@ -518,7 +558,8 @@ def make_drives(plan: Plan) -> DriveGroup | None:
     arm = plan.setup.arm
     if arm is None:
         return None
-    return DriveGroup(drive_axes(plan), arm.model, max(1, COMMAND_REPEAT_NS // plan.sync.period_ns))
+    period_ns = plan.sync.period_ns
+    return DriveGroup(drive_axes(plan), arm.model, max(1, COMMAND_REPEAT_NS // period_ns), period_ns)
 
 
 def drive_axes(plan: Plan) -> tuple[DriveAxis, ...]:

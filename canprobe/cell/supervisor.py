@@ -143,7 +143,7 @@ class JointGuard:
         return GuardedTarget(q_target)
 
 
-NOTED_ONCE = ("error_frames", "frames_dropped", "estimator")
+NOTED_ONCE = ("error_frames", "frames_dropped", "clock_step", "estimator")
 """Conditions that the cell lives with and notes once; the others are figures of the summary."""
 SECOND_NS = 1_000_000_000
 LOOK_NS = 20_000_000

@@ -281,7 +281,7 @@ class TactileApplication(Application):
         while len(pipeline) > self._latency + 1:
             pipeline.popleft()
         sampled_ns, raw = pipeline.popleft() if len(pipeline) > self._latency else pipeline[0]
-        self._show(raw, min((t_ns - sampled_ns) // 1000, _MAX_AGE_US))
+        self._show(raw, min(max(t_ns - sampled_ns, 0) // 1000, _MAX_AGE_US))
 
     def _show(self, raw: Raw, age_us: int) -> None:
         """Make one frame, and publish it."""

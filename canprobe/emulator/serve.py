@@ -38,6 +38,7 @@ class Exchange(LockstepBus):
         self._sent: list[Frame] = []
         self.recorder = lambda can_id, data, _t_ns: self._sent.append((can_id, data))
         self.skipped = 0
+        self._heard_ns = 0
         self.rerouted = True
 
     def _forget_listeners(self) -> None:
@@ -62,7 +63,7 @@ class Exchange(LockstepBus):
 
         Args:
             frames: (can_id, data, time of reception in ns), in order.
-            t_ns: now; receptions in the future count as now.
+            t_ns: now; receptions in the future count as now, and none is earlier than the one before it.
         """
         return [frame for batch in self.batches(frames, t_ns) for frame in batch]
 
@@ -75,7 +76,7 @@ class Exchange(LockstepBus):
         self.clock.move_ns(t_ns)
         syncs = [can_id for can_id, _, _ in frames].count(SYNC_ID)
         for can_id, data, received_ns in frames:
-            heard_ns = min(received_ns, t_ns)
+            heard_ns = self._heard_ns = max(self._heard_ns, min(received_ns, t_ns))
             if can_id != SYNC_ID:
                 self._hand_over(self._outside, can_id, data, heard_ns)
                 continue

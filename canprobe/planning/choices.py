@@ -399,6 +399,18 @@ def outputs(setup: Setup, absent: Container[str]) -> tuple[str, ...]:
     return (*(file for file, is_written in written.items() if is_written), *bridge_outputs(setup))
 
 
+def _long_waits(missed_syncs: int, rate_hz: float) -> Iterator[str]:
+    """What real drives may do that wait for long."""
+    if missed_syncs <= MISSED_SYNCS_REAL:
+        return
+    waited_ms = 1e3 * missed_syncs / rate_hz
+    yield (
+        f"arm.missed_syncs = {missed_syncs}: real drives stay enabled for {waited_ms:g} ms after the last SYNC of"
+        " a master that stalls or dies, and a drive that falls silent is waited for as long: an object that moves is"
+        f" pressed without supervision until then; leave it at {MISSED_SYNCS_REAL} or below, more is for emulated nodes"
+    )
+
+
 def _held_rows(arm: Arm) -> str:
     name = f"the {arm.model.name} arm of {arm.model.n} joints"
     if task_rows(arm.model) == FIXED_POLE:
@@ -437,11 +449,16 @@ def _is_interface_local(channel: str) -> bool:
         return False
     return group.version == 6 and group.is_multicast and int(group) >> 112 & 0xF == 1
 
+MISSED_SYNCS_REAL = 10
+"""SYNC periods for which real drives and their master may wait for each other without a warning."""
+
 
 def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
     """What a user has to know before trusting the plan, most important first."""
     cut, bus = cut_patch(setup), setup.bus
     yield from _open_to_others(setup)
+    if setup.arm is not None and not all(drive.emulated for drive in setup.arm.drives):
+        yield from _long_waits(setup.arm.missed_syncs, setup.rate_hz)
     if setup.array is not None and setup.array.newtons == NOMINAL:
         yield (
             "sensor.calibration: the array measures in nominal newtons, as good as its stated full scale;"

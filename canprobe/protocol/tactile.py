@@ -95,7 +95,7 @@ class TactileHeader:
         origin_row, origin_col: window's first taxel in the full pad; in features mode together the peak.
         mode: what follows.
         overload: a taxel reached full scale.
-        sample_age_us: trigger SYNC minus sample time, µs.
+        sample_age_us: trigger SYNC minus sample time, µs; 65535 is that or more.
         crc: over the six bytes before it and the payloads after; `pack_whole` computes it.
         window: taxels along the window.
     """

@@ -494,6 +494,7 @@ def _cycle(cell: Cell, record: TaskRecord) -> dict[str, Any]:
         "unplaced_contacts": record.unplaced,
         "slowed_cycles": record.slowed,
         "dropped_frames": cell.counters.overruns,
+        "clock_steps": cell.counters.clock_steps,
         "period_error_us": _percentiles(statistics.period_error_ns if statistics is not None else []),
         "response_us": _percentiles(statistics.response_ns if statistics is not None else []),
         "compute_us": _percentiles(statistics.compute_ns if statistics is not None else []),

@@ -17,6 +17,7 @@ from canprobe.scene.setup import Calibrate, Free, Probe, Setup, Touch
 from canprobe.tasks.probing import ProbingTask
 from canprobe.tasks.sensing import ContactSensing
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker, replay_samples
+from canprobe.tasks.task import MotionTime
 from canprobe.tasks.touch import TouchTask
 from canprobe.touch.contact import indentation_from_force
 from canprobe.touch.patch.array_calibration import CentroidErrors
@@ -243,6 +244,8 @@ class RequestedTask(Controller):
         self._task = task
         self._plan = plan
         self._period_s = period_s
+        self._time = MotionTime(round(1e9 * period_s))
+        self._step_s = period_s
         self._targets: list[Vector] = []
         self._make = make
         self._requests = requests
@@ -259,6 +262,7 @@ class RequestedTask(Controller):
                     self._follow(measurement, **request.value)
                 else:
                     self._take(request)
+        self._step_s = 1e-9 * self._time.step(measurement.t_ns)
         if self._task is None:
             return Command()
         columns = self._approach(self._task) if isinstance(self._task, TouchTask) else {}
@@ -322,7 +326,8 @@ class RequestedTask(Controller):
     def _motion(self) -> tuple[Vector, Vector]:
         """Where the last two targets lead in this cycle: position and speed (n,)."""
         before, last = self._targets
-        return 2.0 * last - before, (last - before) / self._period_s
+        qd = (last - before) / self._step_s
+        return last + qd * self._period_s, qd
 
     def _approach(self, task: TouchTask) -> dict[str, float]:
         """Move the task's targets towards what was asked for; what they are now, once anything was asked for."""

@@ -19,7 +19,7 @@ from canprobe.robot.chain import Posture, Vec, ending_in, jacobian, pose_of, pos
 from canprobe.robot.inverse import damped_step, in_rows, task_rows
 from canprobe.scene.setup import Arm, Probe, SafetyLimits
 from canprobe.tasks.sensing import ContactSensing
-from canprobe.tasks.task import Task, TaskRecord
+from canprobe.tasks.task import MotionTime, Task, TaskRecord
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.patch.image import Patch
 from canprobe.touch.servo import ProbePose
@@ -215,8 +215,6 @@ CYCLES_TO_EFFECT = 2
 """From a SYNC to the moment its command begins to take effect, behind which the drives lag."""
 RETREAT_SPEED = 20e-3
 """m/s."""
-LONGEST_STEP = 4
-"""Periods that one command makes up for at most after an overrun; the rest of a longer stall is lost time."""
 
 
 class Phase(IntEnum):
@@ -256,11 +254,11 @@ class ProbingTask(Task):
         self._setup = plan.setup
         self._touch = Contact(limits_of(plan))
         self._period_s = self._dt = plan.sync.period_ns * 1e-9
+        self._time = MotionTime(plan.sync.period_ns)
         self._lead_s = CYCLES_TO_EFFECT * self._period_s + lag_s
         self._motion: ProbeMotion | None = None
         self._line: LineMotion | ArcMotion | None = None
         self._cycle = 0
-        self._last_ns: int | None = None
         self._t = 0.0
         self._floor = 0.0
         self._columns: dict[str, float | Vector] = {}
@@ -283,7 +281,7 @@ class ProbingTask(Task):
     def step(self, measurement: Measurement) -> Command:
         """One cycle."""
         self._cycle = measurement.cycle
-        self._pass_time(measurement.t_ns)
+        self._dt = self._time.step(measurement.t_ns) * 1e-9
         if self._motion is None:
             setup = self._setup
             assert measurement.q is not None and setup.arm is not None
@@ -305,12 +303,6 @@ class ProbingTask(Task):
     def stop(self) -> None:
         """Let go and be done, from whatever phase."""
         raise NotImplementedError
-
-    def _pass_time(self, t_ns: int) -> None:
-        """Where an overrun has swallowed cycles the motion goes on by the time that has passed, within a bound."""
-        passed = self._period_s if self._last_ns is None else (t_ns - self._last_ns) * 1e-9
-        self._last_ns = t_ns
-        self._dt = min(passed, LONGEST_STEP * self._period_s)
 
     def _begin(self, pose: ProbePose) -> None:
         """Start the first move, from where the probe is."""

@@ -16,6 +16,37 @@ if TYPE_CHECKING:
     from canprobe.tasks.shape import ShapeTracker
 
 
+LONGEST_STEP = 4
+"""Periods by which a motion goes on in one cycle at most, and for which it makes up later; the rest is lost time."""
+QUICKER = 8
+"""Part of a period by which one step of a motion may be longer than the one before."""
+
+
+class MotionTime:
+    """The time of a motion. It follows the cycles, also where all of them take long, but not from one to the next.
+
+    After a late cycle the target goes on with an eighth more in each cycle until the motion has made up for it: at
+    once, the probe would be pushed by the way of four cycles into what it touches.
+
+    Args:
+        period_ns: of the cycle.
+    """
+
+    def __init__(self, period_ns: int) -> None:
+        self._period_ns = period_ns
+        self._last_ns: int | None = None
+        self._step_ns, self._owed_ns = period_ns, 0
+
+    def step(self, t_ns: int) -> int:
+        """By how much the motion goes on in the cycle at ``t_ns``, ns; one period in the first."""
+        passed_ns = self._period_ns if self._last_ns is None else t_ns - self._last_ns
+        self._last_ns = t_ns
+        due_ns, longest_ns = self._owed_ns + passed_ns, LONGEST_STEP * self._period_ns
+        self._step_ns = min(due_ns, self._step_ns + self._period_ns // QUICKER, longest_ns)
+        self._owed_ns = min(due_ns - self._step_ns, longest_ns)
+        return self._step_ns
+
+
 @dataclass(slots=True)
 class Loss:
     """One time that a scan lost its contact.

@@ -13,6 +13,7 @@ from canprobe.errors import UsageError
 from canprobe.planning.model import Plan
 from canprobe.robot.model import ArmModel
 from canprobe.scene.setup import SafetyLimits
+from canprobe.tasks.task import MotionTime
 
 Vector = NDArray[np.float64]
 NEAR_RAD = 0.01
@@ -30,7 +31,8 @@ class Trajectory(Controller):
     cubic does (Fritsch and Butland): it stays between the two points, and has speed 0 in a point that is an extreme.
     Speeds are continuous, accelerations are not. The motion starts and ends at rest. A motion that leaves the range of
     a joint or the workspace, or is faster than `limits.joint_speed_share` of a joint's speed, is refused before the
-    drives are enabled. Lag and torque of the drives are not considered. A trajectory is followed once.
+    drives are enabled. Lag and torque of the drives are not considered. A trajectory is followed once. Of a stall it
+    makes up for four periods, little by little, and ends later by the rest.
 
     Args:
         plan: of a cell with an arm.
@@ -62,7 +64,8 @@ class Trajectory(Controller):
         self._times, self._q = _table(points, arm.model.n)
         self._given = None if velocities is None else _velocities(velocities, self._q.shape)
         self._hold_s = hold_s
-        self._start_ns: int | None = None
+        self._time = MotionTime(plan.sync.period_ns)
+        self._gone_ns: int | None = None
         self._qd = np.empty(0)
         if reason := self._outside_range():
             raise UsageError(f"trajectory: {reason}")
@@ -123,12 +126,14 @@ class Trajectory(Controller):
 
     def step(self, measurement: Measurement) -> Command:
         """One cycle."""
-        if self._start_ns is None:
+        passed_ns = self._time.step(measurement.t_ns)
+        if self._gone_ns is None:
             assert measurement.q is not None
             if not self._qd.size and (reason := self.inspect(measurement.q)):
                 raise UsageError(reason)
-            self._start_ns = measurement.t_ns
-        t = (measurement.t_ns - self._start_ns) * 1e-9
+            passed_ns = self._gone_ns = 0
+        self._gone_ns += passed_ns
+        t = self._gone_ns * 1e-9
         return Command(q_target=self.at(t), done=t >= self.duration_s + self._hold_s)
 
     def _outside_range(self) -> str | None:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import signal
+import socket
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 
 import pytest
 
-from canprobe.bus.port import MonotonicClock, VirtualClock
+from canprobe.bus.mmsg import Row
+from canprobe.bus.port import JoinedPort, MonotonicClock, Reports, VirtualClock
+from canprobe.bus.socketcan import SocketCanPort, StampClock
 
 
 def test_virtual_time_stands_still_and_jumps() -> None:
@@ -74,3 +77,145 @@ def test_a_time_that_is_past_asks_nothing_of_the_kernel(monkeypatch: pytest.Monk
     assert not asked
     clock.sleep_until_ns(clock.now_ns() + 10_000_000)
     assert len(asked) == 1
+
+
+# Stamps of the wall clock, which somebody sets while frames come.
+
+MS = 1_000_000
+WALL_NS = 1_700_000_000_000_000_000
+STEPS_MS = [-3_600_000, -300, -20, -0.2, 0.2, 20, 300, 1000]
+
+
+class Machine:
+    """A monotonic clock, a wall clock, and a CAN socket whose frames the kernel stamps by the wall clock."""
+
+    def __init__(self, reading_ns: int = 0) -> None:
+        self.monotonic, self.offset = VirtualClock(5 * MS), WALL_NS
+        self.reading_ns = reading_ns
+        self.readings = 0
+        self.waiting: list[Row] = []
+
+    def now_ns(self) -> int:
+        self.readings += 1
+        self.pass_ns(self.reading_ns)
+        return self.monotonic.now_ns()
+
+    def sleep_until_ns(self, t_ns: int) -> None:
+        self.monotonic.sleep_until_ns(t_ns)
+
+    def wall_ns(self) -> int:
+        return self.now_ns() + self.offset
+
+    def pass_ns(self, ns: int) -> None:
+        self.monotonic.move_ns(self.monotonic.now_ns() + ns)
+
+    def set_wall(self, ms: float) -> None:
+        self.offset += round(ms * MS)
+
+    def arrive(self, can_id: int = 0x181) -> int:
+        """A frame; when it came, on the monotonic clock."""
+        t_ns = self.monotonic.now_ns()
+        self.waiting.append((can_id, b"", t_ns + self.offset, 0))
+        return t_ns
+
+    def receive(self, wait: bool = False) -> list[Row]:
+        rows, self.waiting = self.waiting, []
+        return rows
+
+
+Open = Callable[..., tuple[SocketCanPort, list[str]]]
+
+
+@pytest.fixture
+def opened(monkeypatch: pytest.MonkeyPatch) -> Iterator[Open]:
+    """Opens a port on a machine's socket; with the port comes the list of what it says."""
+    with ExitStack() as stack:
+
+        def open_port(machine: Machine, channel: str = "can7") -> tuple[SocketCanPort, list[str]]:
+            said: list[str] = []
+            for name, stand_in in {
+                "check_interface": lambda *_: None,
+                "_open": lambda *_, **__: stack.enter_context(socket.socket()),
+                "FrameSocket": lambda *_: machine,
+                "StampClock": lambda monotonic_ns: StampClock(machine.wall_ns, monotonic_ns),
+            }.items():
+                monkeypatch.setattr(f"canprobe.bus.socketcan.{name}", stand_in)
+            return SocketCanPort(channel, machine, reports=Reports(say=said.append)), said
+
+        yield open_port
+
+
+@pytest.mark.parametrize("ms", STEPS_MS)
+@pytest.mark.parametrize("reading_ns", [60, 35_000], ids=["native", "guest"])
+def test_a_wall_clock_that_is_set_misplaces_no_frame_by_a_cycle(ms: float, reading_ns: int, opened: Open) -> None:
+    """Frames every half a millisecond: none is read as of before the drain in front of it, none as of the future."""
+    machine = Machine(reading_ns)
+    port, said = opened(machine)
+    before_ns = machine.monotonic.now_ns()
+    for number in range(60):
+        if number == 30:
+            machine.set_wall(ms)
+        machine.pass_ns(500_000)
+        came_ns = machine.arrive()
+        machine.pass_ns(20_000)
+        ((_, _, read_ns),) = port.drain()
+        if abs(ms) >= 1 or number not in (30, 31):  # of a smaller step two may be read before it is looked for
+            assert before_ns - reading_ns <= read_ns <= machine.monotonic.now_ns() + reading_ns
+            assert abs(read_ns - came_ns) < 500_000
+        before_ns = machine.monotonic.now_ns()
+    way = "back" if ms < 0 else "forward"
+    assert port.counters.clock_steps == 1
+    assert len(said) == 1 and said[0].startswith(f"can7: the wall clock was set {way} by {abs(ms):.1f} ms;")
+    machine.set_wall(1.0)
+    machine.pass_ns(MS)
+    machine.arrive()
+    port.drain()
+    assert (port.counters.clock_steps, len(said)) == (2, 1), "a clock that is set again and again does not fill a log"
+
+
+def test_frames_from_before_and_after_the_step_keep_their_order(opened: Open) -> None:
+    machine = Machine()
+    port, _ = opened(machine)
+    for can_id in (0x181, 0x182, 0x183, 0x184):
+        machine.pass_ns(100_000)
+        machine.arrive(can_id)
+        if can_id == 0x182:
+            machine.set_wall(-200)
+    now_ns = machine.monotonic.now_ns()
+    assert port.drain() == [(can_id, b"", now_ns) for can_id in (0x181, 0x182, 0x183, 0x184)]
+
+
+def test_a_clock_that_nobody_sets_costs_two_readings_a_millisecond_and_no_step(opened: Open) -> None:
+    machine = Machine(35_000)
+    port, said = opened(machine)
+    machine.readings = 0
+    start_ns, came = machine.monotonic.now_ns(), 0
+    while machine.monotonic.now_ns() < start_ns + 200 * MS:
+        machine.pass_ns(100_000)
+        machine.arrive()
+        came += len(port.drain())
+    assert came > 1000 and machine.readings <= 2 * 200 + 2
+    assert (port.counters.clock_steps, said) == (0, [])
+
+
+def test_a_process_that_waits_between_two_readings_takes_that_for_no_step(opened: Open) -> None:
+    machine = Machine()
+    port, _ = opened(machine)
+    for number in range(40):
+        machine.pass_ns(2 * MS)
+        came_ns = machine.arrive()
+        machine.reading_ns = 7 * MS if number % 10 == 9 else 0
+        assert port.drain() == [(0x181, b"", came_ns)]
+    assert port.counters.clock_steps == 0
+
+
+def test_two_buses_see_one_step_of_the_one_wall_clock(opened: Open) -> None:
+    machine = Machine()
+    ports = {name: opened(machine, name)[0] for name in ("can0", "can1")}
+    both = JoinedPort(ports, {})
+    machine.set_wall(-100)
+    for port in ports.values():
+        machine.pass_ns(2 * MS)
+        machine.arrive()
+        port.drain()
+    assert both.counters.clock_steps == 1

@@ -8,7 +8,6 @@ from puma_arm import MODELS
 
 from canprobe.cell.array import TactileReceiver
 from canprobe.cell.drives import (
-    CARRIED_CYCLES,
     REST_COUNTS_LEAST,
     REST_NS,
     DriveAxis,
@@ -19,7 +18,7 @@ from canprobe.cell.drives import (
 from canprobe.protocol.cia402 import DriveState, OperationMode
 from canprobe.protocol.pdo import PdoEntry, PdoLayout
 from canprobe.protocol.tactile import FrameAssembler, TactileHeader, TactileMode, pack_whole
-from canprobe.robot.model import joints_to_units
+from canprobe.robot.model import joints_to_units, units_to_joints
 
 STATUS, POSITION, TORQUE = PdoEntry(0x6041, 0, 16), PdoEntry(0x6064, 0, 32, True), PdoEntry(0x6077, 0, 16, True)
 WORD, TARGET, DUMMY = PdoEntry(0x6040, 0, 16), PdoEntry(0x607A, 0, 32, True), PdoEntry(0x0004, 0, 32)
@@ -229,11 +228,11 @@ def test_interpolated_position_sets_bit_4_while_operation_is_enabled():
 PERIOD = 2_500_000
 
 
-def moving(rate=10, cycles=20, track=None):
+def moving(rate=10, cycles=20, track=None, period_ns=PERIOD):
     track = track or PositionTrack(BASE)
     for k in range(cycles):
         track.aim(abs(rate))
-        assert track.take(rate * k, k, k * PERIOD, guarded=True) or k == 0
+        assert track.take(rate * k, k, k * period_ns, guarded=True) or k == 0
     return track
 
 
@@ -241,8 +240,84 @@ def moving(rate=10, cycles=20, track=None):
 def test_a_steady_motion_is_believed_and_carried_on(rate):
     track = moving(rate)
     for age in range(1, 8):
-        assert track.position(19 + age, (19 + age) * PERIOD) == pytest.approx(rate * (19 + min(age, CARRIED_CYCLES)))
+        assert track.position(19 + age, (19 + age) * PERIOD) == pytest.approx(rate * (19 + min(age, 3)))
     assert track.position(19, 19 * PERIOD) == rate * 19
+
+
+@pytest.mark.parametrize("period_ns", [1_000_000, PERIOD, 20_000_000])
+@pytest.mark.parametrize(("periods", "carried"), [(1, 1), (2.5, 2.5), (3, 3), (4, 3), (34, 3), (250, 3)])
+def test_after_a_late_cycle_a_motion_is_carried_on_for_three_periods_of_time(period_ns, periods, carried):
+    """One cycle, one missed TPDO, and a SYNC that comes many periods late."""
+    track = moving(-10, track=PositionTrack(BASE, period_ns), period_ns=period_ns)
+    assert track.position(20, round((19 + periods) * period_ns)) == pytest.approx(-10 * (19 + carried))
+
+
+@pytest.mark.parametrize("rate", [10, -10])
+@pytest.mark.parametrize(("periods", "followed"), [(1, 1), (2, 2), (12, 12), (20, 20), (34, 20)], ids=str)
+def test_a_report_after_a_late_cycle_is_believed_as_far_as_the_drive_can_have_come(rate, periods, followed):
+    """It goes on as before for three periods at most, and follows within twenty what its targets asked of it."""
+    carried = min(periods, 3)
+    most = carried * 10 + BASE + carried * 10 + followed * 10
+    for way, believed in (
+        (most, True),
+        (most + 1, False),
+        (-BASE - followed * 10, True),
+        (-BASE - followed * 10 - 1, False),
+    ):
+        track = moving(rate)
+        report = rate * 19 + way * (1 if rate > 0 else -1)
+        assert track.take(report, 20, (19 + periods) * PERIOD, guarded=True) is believed, way
+
+
+def test_what_a_target_asked_fades_with_the_time_and_not_with_the_cycles():
+    """Twenty periods later an eighth of it counts, whether they are one cycle or twenty."""
+    for cycles in (1, 20):
+        track = moving(0)
+        track.aim(1000)
+        for _ in range(cycles):
+            track.aim(0, 20 / cycles)
+        track.take(0, 20, 40 * PERIOD, guarded=True)
+        left = 1000 * 0.9**20
+        assert track.take(round(left) + BASE - 1, 21, 41 * PERIOD, guarded=True)
+        track.take(0, 22, 42 * PERIOD, guarded=False)
+        assert not track.take(round(left) + BASE + 5, 23, 43 * PERIOD, guarded=True)
+
+
+@pytest.mark.parametrize("turned", [1, -1])
+def test_a_drive_that_was_not_heard_while_it_moved_is_believed_when_all_hold(turned):
+    """Its way since the last report does not fade, however long nobody hears it: it went there."""
+    track = moving(20)
+    position = 20 * 19
+    for _ in range(20, 24):
+        position += turned * 40
+        track.aim(40)
+    for _ in range(24, 60):
+        track.aim(0)
+    assert track.take(position, 60, 60 * PERIOD, guarded=True)
+
+
+def test_the_group_takes_the_time_from_its_syncs():
+    group = make_group()
+    for cycle in range(20):
+        group.begin(cycle, 0, cycle * PERIOD)
+        hear(group, [10 * cycle] * 6)
+        group.set_target(units_to_joints(MODEL, np.full(6, 10.0 * (cycle + 1))))
+        group.frames()
+    group.begin(20, 0, (19 + 34) * PERIOD)
+    hear(group, [190] * 6, skip=(2,))
+    group.end_collect()
+    assert joints_to_units(MODEL, group.joints()) == pytest.approx([190, 190, 220, 190, 190, 190])
+
+
+def test_drives_that_are_stopped_get_a_quick_stop_and_the_others_go_on():
+    group = make_group()
+    group.begin(0)
+    hear(group, [0] * 6)
+    group.stopped = frozenset({2, 5})
+    words = {can_id - 0x200: int.from_bytes(data[:2], "little") for can_id, data in group.frames()}
+    assert words == {1: 0x0F, 2: 0x02, 3: 0x0F, 4: 0x0F, 5: 0x02, 6: 0x0F}
+    group.goal = DriveState.SWITCH_ON_DISABLED
+    assert {int.from_bytes(data[:2], "little") for _, data in group.frames()} == {0x00}, "the way out is for all"
 
 
 @pytest.mark.parametrize("sign", [1, -1])

@@ -137,6 +137,12 @@ def test_sensor_age_saturates(make):
     assert sensor.frames(1)[0].header.sample_age_us == 0xFFFF
 
 
+def test_sensor_a_trigger_that_is_stamped_before_its_sample_has_age_0(make):
+    """As by a receiver whose clock was set back; the header has no negative age."""
+    sensor = make().go(t_ns=100 * MS)
+    assert [frame.header.sample_age_us for frame in sensor.frames(2)] == [0, 5000]
+
+
 @pytest.mark.parametrize(("start", "counters"), [(1, [1, 3, 5]), (2, [2, 4, 6]), (0, [2, 4, 6])])
 def test_sensor_start_value_sets_the_phase(make, start, counters):
     sensor = make(start=start).go()

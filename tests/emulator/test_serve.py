@@ -92,6 +92,18 @@ def test_of_several_syncs_the_last_is_answered_and_witnesses_hear_all():
     assert exchange.skipped == 2
 
 
+def test_receptions_never_go_back_in_time():
+    """As where their stamps come from a clock that is set; what is in the future is now."""
+    heard = []
+    node = Scripted([])
+    node.receive = lambda can_id, data, t_ns: heard.append(t_ns) or []
+    exchange = Exchange([node])
+    exchange.start(0)
+    exchange.step([(0x80, b"", 50), (0x201, b"", 45), (0x80, b"", 400)], 60)
+    exchange.step([(0x201, b"", 10), (0x80, b"", 20), (0x201, b"", 70)], 90)
+    assert heard == [50, 60, 60, 60, 70]
+
+
 def test_nodes_that_answer_each_other_for_ever_are_caught():
     a, b = Scripted([(1, b"")], {2: [(1, b"")]}), Scripted([], {1: [(2, b"")]})
     with pytest.raises(BusError, match=r"no end at .* 001 from Scripted is frame 20001"):

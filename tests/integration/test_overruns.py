@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import re
+from itertools import product
 
 import numpy as np
 import pytest
+from injected import Injected
 from wrapped import Wrapped
 
 import canprobe
 from canprobe.cell.controller import Command, Measurement
+from canprobe.cli.parser import PATIENT_SYNCS
 from canprobe.results.summary import summarise
 from canprobe.session.session import Session
 from canprobe.tasks.from_plan import make_task
@@ -77,3 +80,69 @@ def test_the_contact_keeps_its_speed_and_the_surface(stalled: tuple[Session, Sta
     steady = slice(first + 60, last - 60)
     path = np.linalg.norm(np.diff(points[steady], axis=0), axis=1).sum()
     assert path / (t[steady][-1] - t[steady][0]) == pytest.approx(0.025, rel=0.02)
+
+
+# Stalls up to the limit of `--patient`, each with TPDOs lost behind it: the force of the touch stays below its limit.
+
+FIRST, SPACING = 850, 36
+STALLS_MS = (15, 45, int((PATIENT_SYNCS - 1) * 2.5))
+LOST, JOINTS = (0, 1, 3), ((1,), (3,), (4, 5, 6), (1, 2, 3, 4, 5, 6))
+EPISODES = [
+    (stall_ms, lost, joints)
+    for stall_ms, lost, joints in product(STALLS_MS, LOST, JOINTS)
+    if lost or joints == JOINTS[0]
+]
+
+
+class PatientScan(Injected):
+    """A scan at 25 mm/s whose master is held up again and again, by turns before its SYNC and before its RPDOs."""
+
+    def __init__(self, scene: str) -> None:
+        self.lost: tuple[int, ...] = ()
+        self.measured: list[int] = []
+        changes = {"arm": {"missed_syncs": PATIENT_SYNCS}, "task": {"speed_mm_s": 25.0, "duration_s": 20.0}}
+        super().__init__(scene, FIRST, lambda _: None, until=SPACING * len(EPISODES), **changes)
+
+    def _join(self, node):
+        faulty = super()._join(node)
+        send, cob_id = faulty._sent, 0x180 + node.node_id
+        faulty._sent = lambda frames, t_ns: send(
+            [frame for frame in frames if frame[0] != cob_id or node.node_id not in self.lost], t_ns
+        )
+        return faulty
+
+    def _stall(self, measurement, late_sync):
+        number, since = divmod(measurement.cycle - FIRST, SPACING)
+        if since == 0 and 0 <= number < len(EPISODES) and number % 2 == late_sync:
+            clock = self.session.lockstep.clock
+            clock.sleep_until_ns(clock.now_ns() + EPISODES[number][0] * 1_000_000)
+
+    def command(self, measurement, command):
+        self._stall(measurement, late_sync=0)
+        return command
+
+    def after(self, measurement):
+        number, since = divmod(measurement.cycle - FIRST, SPACING)
+        within = 0 <= number < len(EPISODES)
+        self.lost = EPISODES[number][2] if within and since < EPISODES[number][1] else ()
+        self._stall(measurement, late_sync=1)
+
+
+@pytest.fixture(scope="module", params=["cylinder", "steel"])
+def patient(request: pytest.FixtureRequest) -> PatientScan:
+    return PatientScan(request.param)
+
+
+def test_no_stall_with_lost_tpdos_ends_a_patient_scan(patient: PatientScan) -> None:
+    assert patient.error is None
+    assert patient.session.cell.cycle.statistics.overruns >= len(EPISODES)
+
+
+@pytest.mark.parametrize("episode", range(len(EPISODES)), ids=[str(episode) for episode in EPISODES])
+def test_no_stall_with_lost_tpdos_presses_harder_than_the_limit(patient: PatientScan, episode: int) -> None:
+    """The true force between this stall and the next, not only the one that the array measured."""
+    limit = patient.session.scene.limits.force_max_n
+    starts = np.flatnonzero(np.diff(patient.session.truth["t_s"]) > 9e-3)
+    first = starts[episode]
+    assert len(starts) == len(EPISODES)
+    assert patient.session.truth["force"][first : first + SPACING + 2].max() < limit

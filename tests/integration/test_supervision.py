@@ -288,13 +288,15 @@ def test_a_wrong_position_is_not_believed():
 # the bus
 
 
-def test_error_frames_and_dropped_frames_are_noted():
+def test_error_frames_dropped_frames_and_a_wall_clock_that_is_set_are_noted():
     def count(run):
         run.session.cell._port.counters.error_frames += 3
         run.session.cell._port.counters.overruns += 2
+        run.session.cell._port.counters.clock_steps += 1
 
     run = Injected("free", FREE_CYCLE, count, until=10)
-    run.assert_counted("error_frames").assert_counted("frames_dropped")
+    run.assert_counted("error_frames").assert_counted("frames_dropped").assert_counted("clock_step")
+    assert f"wall clock set: 1, the first in cycle {FREE_CYCLE + 1}" in run.session.cell.faults
     assert any("bus error frames: 3" in fault for fault in run.session.cell.faults)
     assert any("dropped by the kernel or the controller: 2" in fault for fault in run.session.cell.faults)
 

@@ -282,3 +282,16 @@ def test_errors_on_the_wire_are_a_warning():
     """135 bits: 31 more for the error, and 1 - (1 - 1e-3)^135 of them are hit."""
     (warning,) = canprobe.plan(change(load_scene("free"), bus={"bit_error_rate": 1e-3})).warnings
     assert "up to 166 µs" in warning and f"{100 * (1 - math.exp(135 * math.log1p(-1e-3))):.2g} % of the" in warning
+
+
+@pytest.mark.parametrize(("emulated", "missed_syncs", "warned"), [(False, 10, 0), (False, 11, 1), (True, 250, 0)])
+def test_real_drives_that_wait_long_for_their_master_are_a_warning(emulated, missed_syncs, warned):
+    plan = canprobe.plan(change(load_scene("free"), arm={"emulated": emulated, "missed_syncs": missed_syncs}))
+    found = [warning for warning in plan.warnings if warning.startswith("arm.missed_syncs = 11: real drives")]
+    assert len(found) == warned
+    assert all(f"stay enabled for {11 / plan.setup.rate_hz * 1e3:g} ms after" in warning for warning in found)
+
+
+def test_one_real_drive_is_enough_for_that_warning():
+    scene = change(load_scene("free", {"joints.joint_3.emulated": False}), arm={"missed_syncs": 40})
+    assert any("stay enabled for 100 ms after" in warning for warning in canprobe.plan(scene).warnings)

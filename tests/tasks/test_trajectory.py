@@ -100,13 +100,34 @@ def test_a_cell_follows_it_and_holds_the_end():
     assert t[-1] - t[0] > 2.25
 
 
-def requested(*requests):
-    """Targets of an arm at rest that gets each request in its cycle: (cycle, kind, value)."""
+@pytest.mark.parametrize("late", [1, 4, 34])
+def test_the_first_target_after_a_late_cycle_does_not_jump(late):
+    """The motion makes up for four periods, an eighth more in each cycle, and still ends in its last point."""
+    way = led([(2.0, Q0 + 0.2)], hold_s=0.0)
+    targets, done, k = [], False, 0
+    while not done:
+        passed = k if k < 400 else k + late - 1
+        command = way.step(Measurement(k, passed * 2_500_000, Q0))
+        targets, done, k = [*targets, command.q_target], command.done, k + 1
+    steps = np.abs(np.diff(targets, axis=0)).max(axis=1)
+    assert np.diff(steps).max() < 0.13 * steps[398]
+    assert steps[398] == pytest.approx(steps[396], rel=0.01)
+    assert steps[399] == pytest.approx((1.0 if late == 1 else 1.125) * steps[398], rel=0.01)
+    assert len(steps) == 800 - min(late - 1, 4)
+    assert targets[-1] == pytest.approx(Q0 + 0.2)
+
+
+def requested(*requests, late=()):
+    """Targets of an arm at rest that gets each request in its cycle: (cycle, kind, value).
+
+    Cycles that are `late` come three periods after the one before.
+    """
     queue, targets = deque(), []
     controller = RequestedTask(None, None, (queue,), 2.5e-3, PLAN)
     for k in range(1200):
         queue += [Request(kind, value) for at, kind, value in requests if at == k]
-        command = controller.step(Measurement(k, k * 2_500_000, Q0))
+        passed = k + 2 * sum(at <= k for at in late)
+        command = controller.step(Measurement(k, passed * 2_500_000, Q0))
         if command.q_target is not None:
             targets.append(command.q_target)
         if command.done:
@@ -122,3 +143,12 @@ def test_a_new_trajectory_and_a_stop_take_over_the_speed_of_the_arm():
         jump = np.abs(np.diff(targets, 2, axis=0)).max() / 2.5e-3  # of the speed, from cycle to cycle
         assert jump < 0.01
         assert np.abs(np.diff(targets[-3:], axis=0)).max() / 2.5e-3 < 0.01
+
+
+def test_a_stop_behind_a_late_cycle_takes_over_the_speed_and_not_the_step():
+    """The last step of the target was a longer one, and the arm is no faster for it."""
+    first = {"points": [(2.0, Q0 + 0.2)], "velocities": None}
+    targets = requested((0, "trajectory", first), (400, "stop", None), late=(399,))
+    steps = np.abs(np.diff(targets, axis=0)).max(axis=1)
+    assert steps[398] == pytest.approx(1.125 * steps[397], rel=0.01)
+    assert steps[399:].max() < 1.01 * steps[397]
