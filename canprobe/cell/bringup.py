@@ -22,10 +22,12 @@ from canopen.objectdictionary import ODVariable
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from canprobe.bus.network import (
+    SECOND_S,
     UPLOAD_DEVICE_TYPE,
     Dialogues,
     PumpedNetwork,
     SdoTimeoutError,
+    decode_text,
     download,
     hold_dialogues,
     read_value,
@@ -35,7 +37,7 @@ from canprobe.cell.watch import NodeWatch
 from canprobe.errors import BusError, NodeError
 from canprobe.planning.configuration import NodeSetup, Write
 from canprobe.planning.operation import INTERPOLATION_TIME
-from canprobe.protocol.frames import NO_ERROR, SDO_RX_BASE, SDO_TX_BASE, NmtCommand, NmtState, describe, pack_nmt
+from canprobe.protocol.frames import SDO_RX_BASE, SDO_TX_BASE, NmtCommand, NmtState, describe, is_no_error, pack_nmt
 from canprobe.scene.setup import BringUpTimes as Settings
 
 ERROR_HISTORY = 0x1003
@@ -46,8 +48,6 @@ PDO_PARAMETERS = range(0x1400, 0x1C00)
 MODE_DISPLAY = 0x6061
 REVISION = 3
 IDENTITY_NAMES = {1: "vendor id", 2: "product code", 3: "revision number", 4: "serial number"}
-SECOND_S = 0.05
-"""In which a second boot-up, or a second answer to one request, is waited for."""
 RELEASE_S = 0.1
 """For one answer of a node that is released."""
 Dialogue = Generator[bytes | None, bytes, None]
@@ -263,7 +263,7 @@ class BringUp:
                 version = yield from upload(SOFTWARE_VERSION, 0)
             except (SdoAbortedError, SdoCommunicationError):
                 return
-            report.software = version.decode("latin-1").rstrip("\0")
+            report.software = decode_text(version)
 
     def _check_given(self, setup: NodeSetup) -> Dialogue:
         for given in setup.given:
@@ -443,7 +443,7 @@ class BringUp:
             newest = yield from upload(ERROR_HISTORY, 1)
         except (SdoAbortedError, SdoCommunicationError):
             return  # it is empty
-        if (code := int.from_bytes(newest[:2], "little")) != NO_ERROR:
+        if not is_no_error(code := int.from_bytes(newest[:2], "little")):
             words = f"; its error history (1003h) begins with {code:04X}h, {describe(code)}"
             self._history[setup.node_id] = words
 
