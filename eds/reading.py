@@ -161,6 +161,11 @@ class _Repair:
             self._fill((0x1000, 0), _SERVO_DRIVE, text)
         for subindex, number in self._identity.items():
             self._fill((0x1018, subindex), number, f"missing; {number:#x} taken, as [DeviceInfo] has it")
+        for subindex, name in _IDENTITY.items():
+            variable = variable_at(self._od, 0x1018, subindex)
+            if variable is not None and _present(variable) == 0 and _text(variable)[0] != "empty":
+                text = f"0, as where nobody has filled it in; bring-up does not compare the {name}"
+                self._warn((0x1018, subindex), text, _text(variable)[1])
         self._repair_sdo_server()
         self._repair_identifiers()
         for index in self._od:

@@ -466,7 +466,7 @@ def read_entry(setup: NodeSetup, index: int, subindex: int) -> Generator[bytes |
     variable = _variable(setup, index, subindex)
     try:
         return int((yield from read_value(variable)))
-    except (SdoAbortedError, SdoCommunicationError) as error:
+    except (SdoAbortedError, SdoCommunicationError, ValueError) as error:  # ValueError: octets are no integer
         raise NodeError(setup.node_id, f"({setup.name}) read of {index:04X}h:{subindex:02X} failed: {error}") from error
 
 

@@ -29,6 +29,7 @@ from canprobe.eds.packaged import (
     has_missed_syncs,
     has_window_size,
 )
+from canprobe.eds.variables import name_of
 from canprobe.planning.devices import COMMUNICATION, INVALID, MAPPING, OWN_BITS, Abilities
 from canprobe.planning.model import (
     HEARTBEAT_CONSUMED_MS,
@@ -229,6 +230,8 @@ def _excluded(device: Abilities, write: Write) -> str | None:
     entry = device.description.entry(write.index, write.subindex)
     if entry is None or (write.purpose == _MISSED_SYNCS and not has_missed_syncs(device.od)):
         return "no such object"
+    if not entry.is_integer:
+        return f"its data type is {name_of(entry.data_type)}, not an integer"
     if not entry.writable:
         same = entry.initial == write.value
         return "" if same else f"it is {entry.access}{'' if entry.initial is None else f', {entry.initial!r}'}"

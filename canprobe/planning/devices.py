@@ -54,8 +54,8 @@ class Abilities:
 
     @property
     def identity(self) -> Identity:
-        """Vendor, product and revision of 1018h."""
-        return Identity(*(self.number(0x1018, subindex) for subindex in (1, 2, 3)))
+        """Vendor, product and revision of 1018h; None where the file states none, or 0, as where nobody filled it in."""
+        return Identity(*(self.number(0x1018, subindex) or None for subindex in (1, 2, 3)))
 
     def has(self, index: int, subindex: int = 0) -> bool:
         """Whether the object exists."""
