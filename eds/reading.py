@@ -30,6 +30,7 @@ _DRIVE_PROFILE = 402
 _SERVO_DRIVE = 0x00020192
 """Device type of a servo drive of CiA 402."""
 _DRIVE_OBJECTS = (0x6040, 0x6041)
+_FURTHER_CONTROLWORDS = range(0x6840, 0xA000, 0x800)
 _MODES_OF_OPERATION = 0x6060
 _IDENTITY = {1: "vendor", 2: "product", 3: "revision"}
 """Whose number is at which sub-index of 1018h, as [DeviceInfo] and canopen call it."""
@@ -107,6 +108,11 @@ def read_eds(path: Path, node_id: int | None, *, serving: bool = True) -> Readin
         build_objects(source, heads, subs, od)
         check_lists(source, {**{index: next(iter(members.values())) for index, members in subs.items()}, **heads})
         _Repair(source, heads, od).run(serving)
+        if is_drive(od) and (more := [index for index in _FURTHER_CONTROLWORDS if index in heads]):
+            words = ", ".join(f"{index:04X}h" for index in more)
+            source.warn(
+                heads[more[0]], "", f"the device has further axes (controlwords {words}); only the first is driven"
+            )
         if device_profile(od) == _DRIVE_PROFILE and not is_drive(od):
             text = "the profile is CiA 402, but controlword or statusword is not described; served, but not as a drive"
             faults.warn(0, "1000", "", text)

@@ -433,7 +433,7 @@ class BringUp:
                     report.remarks.append(f"takes {values}, which means the same as what it refused")
                 return
         assert first is not None
-        raise first
+        raise RefusedError(first.node_id, first.reason + (yield from _fitting_rate(report.setup, options))) from first
 
     def _recall(self, setup: NodeSetup) -> Dialogue:
         """The newest entry in the error history of a node that has failed, unless its EMCY was received."""
@@ -504,6 +504,23 @@ def write_entry(setup: NodeSetup, write: Write) -> Dialogue:
         raise RefusedError(
             setup.node_id, f"({setup.name}) {write.place} reads back {got:#x} after {write.value:#x} was written"
         )
+
+
+def _fitting_rate(setup: NodeSetup, options: Sequence[Sequence[Write]]) -> Generator[bytes | None, bytes, str]:
+    """The rates that fit a drive which keeps its own 60C2h, for the end of a message; empty where it does not answer."""
+    try:
+        held = yield from read_entry(setup, INTERPOLATION_TIME, 1)
+        has_unit = any(write.subindex == 2 for write in options[0])
+        index = (yield from read_entry(setup, INTERPOLATION_TIME, 2)) if has_unit else -3
+    except NodeError:
+        return ""
+    unit, unit_text = 10.0**index, f"10^{index} s"
+    if held not in {write.value for writes in options for write in writes if write.subindex == 1}:
+        return f"; it keeps {held} · {unit_text}: cycle.rate_hz = {1 / (held * unit):.6g} fits it" if held > 0 else ""
+    value, *others = options[0]  # the value was taken, its unit was not
+    wanted_s = value.value * 10.0 ** (others[0].value if others else -3)
+    counts = [count for count in (int(wanted_s / unit) + 1, int(wanted_s / unit)) if count]
+    return f"; it counts in {unit_text}: {' or '.join(f'cycle.rate_hz = {1 / (n * unit):.6g}' for n in counts)} fits it"
 
 
 def _refused(setup: NodeSetup, write: Write, error: Exception, held: int | None = None) -> RefusedError:

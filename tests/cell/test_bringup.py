@@ -602,5 +602,40 @@ def test_an_interpolation_time_that_cannot_be_written_must_be_the_right_one(tmp_
         with session:
             assert done_to(session) == ["configured, software 1.0"] * 6
     else:
-        with pytest.raises(NodeError, match=r"^node 5: \(joint 5\) write of 60C2h:01 = 0x32 failed"):
+        with pytest.raises(
+            NodeError,
+            match=r"^node 5: \(joint 5\) write of 60C2h:01 = 0x32 failed.* it keeps 25 · 10\^-4 s: cycle.rate_hz = 400 ",
+        ):
             session.__enter__()
+
+
+def test_a_drive_whose_unit_is_fixed_is_given_the_rates_that_fit(tmp_path):
+    """60C2h:01 is taken and :02 stays at milliseconds: 2.5 ms lie between 3 ms and 2 ms."""
+
+    def fix(node):
+        if node.node_id == 5:
+            node.dictionary.set_default(0x60C2, 2, -3)
+            node.dictionary.on_check(0x60C2, refuse_units)
+
+    def refuse_units(subindex, value):
+        if subindex == 2 and value != -3:
+            raise SdoAbort(Abort.VALUE)
+
+    with pytest.raises(NodeError, match=r"counts in 10\^-3 s: cycle.rate_hz = 333.333 or cycle.rate_hz = 500 fits"):
+        open_session(tmp_path, change=fix).__enter__()
+
+
+def test_a_drive_without_60c2h_follows_the_period_of_sync(tmp_path):
+    """1006h alone tells it the period, so the write of it is required, and the emulated drive takes it."""
+    eds = tmp_path / "follower.eds"
+    eds.write_text(re.sub(r"(?s)\[60C2(sub\d)?\].*?(?=\n\[)", "", eds_path("puma260_joint").read_text()))
+    scene = canprobe.load_scene("free")
+    scene = replace(scene, arm=replace(scene.arm, eds=str(eds)))
+    plan = canprobe.plan(scene)
+    (write,) = [one for one in make_setups(plan)[0].writes if one.index == 0x1006 and one.value]
+    assert (write.value, write.absence, plan.nodes[0].interpolation) == (2500, None, ())
+    told = undrawn_run(canprobe.load_scene("free"), out=tmp_path / "told", duration_s=0.5)
+    result = undrawn_run(scene, out=tmp_path / "out", duration_s=0.5)
+    assert result.summary["completed"] and result.summary["faults"] == []
+    assert np.ptp(result.truth["q"][:, 5]) > 0.01
+    assert np.array_equal(result.truth["q"], told.truth["q"]), "as the drive that is given 60C2h"

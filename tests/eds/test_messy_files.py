@@ -198,6 +198,15 @@ def test_a_master_takes_the_file_at_its_word_and_a_served_node_is_complete():
     assert {0x1000, 0x1018} <= set(check_eds(path, NODE_ID).dictionary)
 
 
+def test_of_a_drive_with_several_axes_the_check_says_which_is_driven(tmp_path):
+    """CiA 402-1: the objects of axis n are 800h · (n - 1) above those of the first."""
+    path = tmp_path / "axes.eds"
+    section = "\n[{:X}]\nParameterName=Controlword\nObjectType=7\nDataType=6\nAccessType=rw\n"
+    path.write_text(eds_path("puma260_joint").read_text() + section.format(0x6840) + section.format(0x7040))
+    said = [str(one) for one in check_eds(path).warnings]
+    assert any("further axes (controlwords 6840h, 7040h); only the first is driven" in one for one in said)
+
+
 @pytest.mark.parametrize("name", ["puma260_joint", "tactile_array"])
 def test_our_own_files_are_clean_and_read_as_canopen_reads_them(name):
     """The other parser is the reference, attribute by attribute."""
