@@ -507,7 +507,7 @@ def write_entry(setup: NodeSetup, write: Write) -> Dialogue:
 
 
 def _fitting_rate(setup: NodeSetup, options: Sequence[Sequence[Write]]) -> Generator[bytes | None, bytes, str]:
-    """The rates that fit a drive which keeps its own 60C2h, for the end of a message; empty where it does not answer."""
+    """The rates that fit a drive which keeps its 60C2h, for the end of a message; empty where it does not answer."""
     try:
         held = yield from read_entry(setup, INTERPOLATION_TIME, 1)
         has_unit = any(write.subindex == 2 for write in options[0])

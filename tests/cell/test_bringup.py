@@ -604,7 +604,7 @@ def test_an_interpolation_time_that_cannot_be_written_must_be_the_right_one(tmp_
     else:
         with pytest.raises(
             NodeError,
-            match=r"^node 5: \(joint 5\) write of 60C2h:01 = 0x32 failed.* it keeps 25 · 10\^-4 s: cycle.rate_hz = 400 ",
+            match=r"^node 5: \(joint 5\) write of 60C2h:01 = 0x32 failed.* keeps 25 · 10\^-4 s: cycle.rate_hz = 400 ",
         ):
             session.__enter__()
 
