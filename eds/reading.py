@@ -1,7 +1,7 @@
 """Any vendor's EDS or DCF file → an object dictionary and the list of what is wrong with the file.
 
-Faults are of two kinds: what *prevents* serving (the answer of the device cannot be known from the file) and
-warnings (the meaning is clear, or the rest can be served). What a file leaves out or gets wrong although the standard
+Faults are of two kinds: what *prevents* serving (it is not known what the device is, or which PDOs it has) and warnings
+(the meaning is clear, or the rest can be served without it). What a file leaves out or gets wrong although the standard
 fixes it (mandatory objects, identifiers, mappings) is put right with a warning.
 
 Source: CiA 306-1, "Device information"; CiA 301, objects 1000h, 1001h, 1018h, "Pre-defined connection set", "PDO

@@ -34,6 +34,14 @@ _READ_ONLY = frozenset(
         *(0x603F, 0x6041, 0x6061, 0x6062, 0x6063, 0x6064, 0x606B, 0x606C, 0x6074, 0x6077, 0x60F4, 0x6502),
     }
 )
+_MISSING = {
+    **{(index, 0): _I16 for index in (0x6007, *range(0x605A, 0x605F), 0x60C0)},
+    **{(index, 0): _U32 for index in (0x6065, 0x607F, 0x6080, 0x6083, 0x6084, 0x6085, 0x609A)},
+    **{(0x6066, 0): _U16, (0x607C, 0): _I32, (0x607E, 0): _U8, (0x6098, 0): _I8},
+    **{(0x607D, 1): _I32, (0x607D, 2): _I32, (0x6099, 1): _U32, (0x6099, 2): _U32},
+    **{(0x60C1, 1): _I32, (0x60C2, 1): _U8, (0x60C2, 2): _I8},
+}
+"""Types of a drive's objects that makers change, by index and sub-index: taken where a file states none."""
 _COMMUNICATION = {1: _U32, 2: _U8, 3: _U16, 5: _U16, 6: _U8}
 _CHOICES = frozenset({0x6007, *range(0x605A, 0x605F), 0x6086, 0x6098, 0x60C0})
 """Objects of a drive whose 0 is a choice and may be the only one, such as a linear ramp."""
@@ -202,9 +210,9 @@ def data_type_of(source: Source, section: Section, index: int, subindex: int, co
     """The data type that a section means, one of `KNOWN`; None where it cannot be known."""
     text = section.value("DataType")
     demanded = standard_type(index, subindex, source.drive)
-    counts = _U8 if composite and subindex == 0 else None
+    usual = _U8 if composite and subindex == 0 else _MISSING.get((index, subindex)) if source.drive else None
     if not text:
-        return _untyped(source, section, demanded or counts, "missing")
+        return _untyped(source, section, demanded or usual, "missing")
     if (named := _named_type(text)) is not None:
         source.warn(section, "DataType", f"{text} is read as {named:#06x}")
         data_type = named
@@ -212,7 +220,7 @@ def data_type_of(source: Source, section: Section, index: int, subindex: int, co
         try:
             data_type = parse_integer(text, source.remark(section, "DataType"))
         except ValueError:
-            return _untyped(source, section, demanded or counts, f"{text!r} is not a data type")
+            return _untyped(source, section, demanded or usual, f"{text!r} is not a data type")
     if data_type not in KNOWN:
         data_type = _foreign(source, section, data_type)
     if demanded is not None and data_type != demanded:
@@ -229,7 +237,7 @@ def _named_type(text: str) -> int | None:
 
 def _untyped(source: Source, section: Section, demanded: int | None, why: str) -> int | None:
     if demanded is not None:
-        source.warn(section, "DataType", f"{why}; the standard demands {name_of(demanded)}")
+        source.warn(section, "DataType", f"{why}; the standard demands {name_of(demanded)}; taken")
     elif section.value("ObjectType") and source.number(section, "ObjectType") == _OBJECT_DOMAIN:
         return int(datatypes.DOMAIN)
     else:

@@ -104,7 +104,9 @@ class _Offer:
 
     def __str__(self) -> str:
         if not self.values:
-            return "60C2h:01 takes no value by the EDS: it is read-only without a default, or its limits leave none"
+            return (
+                "60C2h:01 takes no value by the EDS: no integer, read-only without a default, or limits that leave none"
+            )
         if not self.indices:
             return f"60C2h:02 takes no unit of 10^{_FINEST} to 10^{_COARSEST} s by the EDS"
         values = f"{self.values[0]} to {self.values[-1]}" if len(self.values) > 1 else str(self.values[0])

@@ -564,6 +564,25 @@ def test_drives_of_another_make_are_brought_up_and_moved(tmp_path):
     assert undrawn_run(scene, out=tmp_path / "again", duration_s=0.2).plan.nodes[0].identity.vendor_id == 0xAB
 
 
+def test_drives_whose_file_has_oddities_that_nobody_uses_are_planned_and_run(tmp_path):
+    """Values and types that other tools read or that mean nothing, limits and a revision that nobody filled in."""
+    odd = [("0x7", "0.0"), ("0x15", "0x1234LL"), ("0x7", "0x00 00 01 00"), ("UDINT", "1"), ("", "1"), ("0x5", "off")]
+    text = eds_path("puma260_joint").read_text(encoding="ascii")
+    text = re.sub(r"(\[1018sub3\][^\[]*DefaultValue=)\w+", r"\g<1>0", text)
+    text = re.sub(r"\[607A\]", "[607A]\nLowLimit=0x7FFFFFFF\nHighLimit=0x80000000", text)
+    text = re.sub(r"\[(1017|60C2sub1)\]", r"[\1]\nLowLimit=0\nHighLimit=0", text)
+    for number, (kind, value) in enumerate(odd):
+        text += (
+            f"\n[5FF{number}]\nParameterName=X\nObjectType=7\nDataType={kind}\nAccessType=rw\nDefaultValue={value}\n"
+        )
+    (tmp_path / "odd.eds").write_text(text)
+    scene = canprobe.load_scene("free")
+    scene = replace(scene, arm=replace(scene.arm, eds=str(tmp_path / "odd.eds")))
+    assert canprobe.plan(scene).nodes[0].identity.revision_number is None
+    result = undrawn_run(scene, out=tmp_path / "out", duration_s=0.2)
+    assert result.summary["completed"] and result.summary["faults"] == []
+
+
 @pytest.mark.parametrize("fixed", [True, False])
 def test_drives_that_send_no_torque_are_run_and_logged_without(tmp_path, fixed):
     scene = without_torque(canprobe.load_scene("free"), tmp_path, fixed=fixed)

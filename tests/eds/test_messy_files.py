@@ -198,6 +198,18 @@ def test_a_master_takes_the_file_at_its_word_and_a_served_node_is_complete():
     assert {0x1000, 0x1018} <= set(check_eds(path, NODE_ID).dictionary)
 
 
+def test_a_type_that_the_file_lacks_is_that_of_the_standard(tmp_path):
+    """CiA 402-2: 60C2h:01 is UNSIGNED8, 607Fh UNSIGNED32, 605Ah INTEGER16; CiA 301: each sub-index 0 is UNSIGNED8."""
+    path, text = tmp_path / "untyped.eds", eds_path("puma260_joint").read_text()
+    for name in ("60C2sub0", "60C2sub1", "607F", "605A"):
+        text = re.sub(rf"(\[{name}\][^\[]*?)DataType=\w+\n", r"\1", text)
+    path.write_text(text)
+    od = load_eds(path, 1)
+    found = [od[0x60C2][0], od[0x60C2][1], od[0x607F], od[0x605A]]
+    assert [(one.data_type, one.default) for one in found[:2]] == [(5, 2), (5, 25)]
+    assert [one.data_type for one in found] == [5, 5, 7, 3]
+
+
 def test_of_a_drive_with_several_axes_the_check_says_which_is_driven(tmp_path):
     """CiA 402-1: the objects of axis n are 800h · (n - 1) above those of the first."""
     path = tmp_path / "axes.eds"

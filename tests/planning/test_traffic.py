@@ -391,9 +391,9 @@ class TestOtherDevices:
             (
                 1,
                 r"AccessType=ro\nDefaultValue=",
-                "60C2h:01 takes no value by the EDS: it is read-only without a default",
+                "60C2h:01 takes no value by the EDS: no integer, read-only without a default",
             ),
-            (1, r"DataType=\nLowLimit=", "60C2h:01 takes no value by the EDS"),
+            (1, r"DataType=0x9", "60C2h:01 takes no value by the EDS"),
             (2, r"AccessType=ro\nDefaultValue=3", "60C2h:02 takes no unit of 10^-6 to 10^0 s by the EDS"),
         ],
     )
