@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
 import itertools
 import operator
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from canprobe.bridge.database import need, write_database
 from canprobe.bus.disk import whole_file, write_text
 from canprobe.eds.packaged import eds_file
 from canprobe.eds.sections import LINE_END, Faults, Section, Sections, decode, split_sections
+from canprobe.eds.structure import commissioned_node
 from canprobe.errors import UsageError
 from canprobe.planning.configuration import SYNC_START_VALUE, NodeSetup, Write, make_setups
 from canprobe.planning.devices import INVALID, MAPPING
@@ -159,17 +161,34 @@ def _number(value: int) -> str:
 
 # ros2_canopen's `bus.yml`: a plan written as one, and the nodes of one read.
 #
-# The file's keys are those of Lely's dcfgen, which makes the master's configuration of it; ros2_canopen adds `driver`
-# and `package`. dcfgen maps neither dummies nor PDOs of CAN FD: such a one is written by `sdo` entries, in the order of
-# bring-up, and the master's side of it has to be configured by hand. Source: ros2_canopen manual, "Bus configuration
-# file"; lely-core's dcfgen.
+# The file's keys are those of Lely's dcfgen, which makes the master's configuration of it; ros2_canopen adds those of
+# its drivers, and `defaults` and `nodes`: the slaves stand under `nodes`, where dcfgen has them beside `master`. dcfgen
+# maps neither dummies nor PDOs of CAN FD: such a one is written by `sdo` entries, in the order of bring-up, and the
+# master's side of it has to be configured by hand. Source: ros2_canopen manual, "Bus configuration file"; lely-core's
+# dcfgen.
 
 _PURPOSE = "a bus.yml"
 _DRIVERS = {
     "drive": ("ros2_canopen::Cia402Driver", "canopen_402_driver"),
     "tactile": ("ros2_canopen::ProxyDriver", "canopen_proxy_driver"),
 }
-_NOT_SLAVES = ("options", "master", "defaults")
+_NOT_SLAVES = ("options", "master", "defaults", "nodes")
+_DCFGEN_KEYS = frozenset({
+    "node_id", "dcf", "dcf_path", "revision_number", "serial_number", "heartbeat_multiplier", "heartbeat_consumer",
+    "heartbeat_producer", "time_cob_id", "retry_factor", "guard_time", "life_time_factor", "error_behavior", "rpdo",
+    "tpdo", "boot", "mandatory", "reset_communication", "software_file", "software_version", "configuration_file",
+    "restore_configuration", "sdo",
+})  # fmt: skip
+_DRIVER_KEYS = frozenset({
+    "driver", "package", "namespace", "enable_lazy_load", "polling", "period", "diagnostics", "sdo_timeout_ms",
+    "switching_state", "position_mode", "velocity_mode", "torque_mode", "scale_pos_to_dev", "scale_pos_from_dev",
+    "scale_vel_to_dev", "scale_vel_from_dev", "scale_eff_to_dev", "scale_eff_from_dev", "offset_pos_to_dev",
+    "offset_pos_from_dev", "homing_timeout_seconds", "num_channels", "joint_name", "vendor_id", "product_code",
+})  # fmt: skip
+_EDS_KEYS = ("dcf", "eds")
+_SLAVE_KEYS = _DCFGEN_KEYS | _DRIVER_KEYS | frozenset(_EDS_KEYS)
+_OPTION_KEYS = frozenset(("dcf_path", "heartbeat_multiplier"))
+_FOLDER_VARIABLE = "@BUS_CONFIG_PATH@"
 _PDO_OBJECTS = range(0x1400, 0x1C00)
 _OWN_KEYS = (0x1016, 0x1017)  # dcfgen writes them from heartbeat_producer and heartbeat_consumer
 
@@ -302,12 +321,13 @@ def _pdo(pdo: PlannedPdo, written: set[int]) -> dict[str, Any]:
     return found
 
 
-def read_bus_yml(path: Path | str) -> list[BusNode]:
-    """Read the nodes of a bus.yml.
+def read_bus_yml(path: Path | str, say: Callable[[str], None] = lambda _: None) -> list[BusNode]:
+    """Read the nodes of a bus.yml, whether they stand under `nodes` or beside `master`.
 
     Args:
-        path: of the file; `dcf` paths are looked up beside it, and beside it by their last part where they begin with
-            a variable such as ``@BUS_CONFIG_PATH@``.
+        path: of the file; ``@BUS_CONFIG_PATH@`` is its folder. `dcf` paths are looked up in `dcf_path`, then beside the
+            file, and at last there by their names alone, as other folders are those of another machine.
+        say: called with what is not understood, and is passed over.
 
     Returns:
         The slaves by rising node id.
@@ -325,11 +345,24 @@ def read_bus_yml(path: Path | str) -> list[BusNode]:
         raise UsageError(f"{path}: no YAML: {' '.join(str(error).split())}") from error
     if not isinstance(document, Mapping):
         raise UsageError(f"{path}: expected the nodes of a bus by name, got {type(document).__name__}")
-    options, defaults = (_mapping(path, document, key) for key in ("options", "defaults"))
-    names = [str(name) for name in document if name not in _NOT_SLAVES]
-    nodes = [_read_node(path, name, {**defaults, **_mapping(path, document, name)}, options) for name in names]
+    options, defaults, under = (_mapping(path, document, key) for key in ("options", "defaults", "nodes"))
+    beside = {str(name): keys for name, keys in document.items() if name not in _NOT_SLAVES}
+    if under:  # then beside them stands a node only where it says so
+        for name in [name for name, keys in beside.items() if not isinstance(keys, Mapping) or "node_id" not in keys]:
+            say(f"{path}: {name}: not understood, passed over")
+            del beside[name]
+    slaves = {**beside, **{str(name): keys for name, keys in under.items()}}
+    if both := sorted(beside.keys() & set(map(str, under))):
+        raise UsageError(f"{path}: {both[0]}: stands under nodes and beside master; which one counts?")
+    _name_unknown(path, "options", options, _OPTION_KEYS, say)
+    _name_unknown(path, "defaults", defaults, _SLAVE_KEYS, say)
+    nodes = []
+    for name in slaves:
+        keys = _mapping(path, slaves, name)
+        _name_unknown(path, name, keys, _SLAVE_KEYS, say)
+        nodes.append(_read_node(path, name, {**defaults, **keys}, options))
     if not nodes:
-        raise UsageError(f"{path}: no node besides {', '.join(_NOT_SLAVES)}")
+        raise UsageError(f"{path}: no node under nodes, and none besides {', '.join(_NOT_SLAVES)}")
     nodes.sort(key=lambda node: node.node_id)  # of two with the same node id the first stays first
     for node, following in itertools.pairwise(nodes):
         if node.node_id == following.node_id:
@@ -346,19 +379,39 @@ def _mapping(path: Path, document: Mapping[Any, Any], name: str) -> Mapping[str,
     return found
 
 
+def _name_unknown(
+    path: Path, name: str, keys: Mapping[str, Any], known: frozenset[str], say: Callable[[str], None]
+) -> None:
+    for key in keys:
+        if key not in known:
+            near = difflib.get_close_matches(str(key), known, n=1)
+            hint = f"; did you mean {near[0]}?" if near else ""
+            say(f"{path}: {name}: {key}: not understood, passed over{hint}")
+
+
 def _read_node(path: Path, name: str, keys: Mapping[str, Any], options: Mapping[str, Any]) -> BusNode:
-    node_id = _integer(path, name, keys.get("node_id"))
+    key = next((key for key in _EDS_KEYS if key in keys), _EDS_KEYS[0])
+    dcf = keys.get(key)
+    if not isinstance(dcf, str) or not dcf:
+        raise UsageError(f"{path}: {name}: {key}: expected the name of an EDS or DCF file, got {dcf!r}")
+    eds = _find(path, dcf, str(keys.get("dcf_path", options.get("dcf_path", "."))))
+    if eds is None:
+        raise UsageError(f"{path}: {name}: {key}: no file {dcf} beside the bus.yml, nor in its dcf_path")
+    stated = keys.get("node_id")
+    if stated is None:  # that of the DCF
+        stated = commissioned_node(split_sections(decode(eds.read_bytes(), Faults()), Faults()))
+    node_id = _integer(path, name, stated)
     if not 1 <= node_id <= 127:
         raise UsageError(f"{path}: {name}: node_id: expected 1 to 127, got {node_id}")
-    dcf = keys.get("dcf")
-    if not isinstance(dcf, str) or not dcf:
-        raise UsageError(f"{path}: {name}: dcf: expected the name of an EDS or DCF file, got {dcf!r}")
-    folders = [path.parent, path.parent / str(keys.get("dcf_path", options.get("dcf_path", ".")))]
-    tried = [folder / part for folder in folders for part in (dcf, Path(dcf).name)]
-    eds = next((candidate for candidate in tried if candidate.is_file()), None)
-    if eds is None:
-        raise UsageError(f"{path}: {name}: dcf: no file {dcf} beside the bus.yml")
     return BusNode(name, node_id, eds)
+
+
+def _find(path: Path, dcf: str, dcf_path: str) -> Path | None:
+    """The file that `dcf` means; None where it is nowhere."""
+    beside, named = path.parent, Path(dcf.replace(_FOLDER_VARIABLE, str(path.parent.resolve())))
+    folder = beside / dcf_path.replace(_FOLDER_VARIABLE, str(beside.resolve()))
+    tried = (folder / named, beside / named, folder / named.name, beside / named.name)
+    return next((candidate for candidate in tried if candidate.is_file()), None)
 
 
 def _integer(path: Path, name: str, value: Any) -> int:

@@ -54,6 +54,11 @@ class Entry:
         return self.default if self.configured is None else self.configured
 
     @property
+    def is_integer(self) -> bool:
+        """Whether it holds an integer: not a real number, text or octets."""
+        return self.data_type in SIGNED or self.data_type in UNSIGNED
+
+    @property
     def readable(self) -> bool:
         """Whether SDO may read it."""
         return self.access != "wo"
@@ -76,7 +81,7 @@ class Entry:
     def allows(self, value: float) -> bool:
         """Whether a number lies within LowLimit and HighLimit, and within the range of an integer type."""
         low, high = self.low, self.high
-        if self.data_type in SIGNED or self.data_type in UNSIGNED:
+        if self.is_integer:
             least = -(1 << self.bits - 1) if self.signed else 0
             most = least + (1 << self.bits) - 1
             low, high = least if low is None else max(low, least), most if high is None else min(high, most)

@@ -1,7 +1,7 @@
 """Any vendor's EDS or DCF file → an object dictionary and the list of what is wrong with the file.
 
-Faults are of two kinds: what *prevents* serving (the answer of the device cannot be known from the file) and
-warnings (the meaning is clear, or the rest can be served). What a file leaves out or gets wrong although the standard
+Faults are of two kinds: what *prevents* serving (it is not known what the device is, or which PDOs it has) and warnings
+(the meaning is clear, or the rest can be served without it). What a file leaves out or gets wrong although the standard
 fixes it (mandatory objects, identifiers, mappings) is put right with a warning.
 
 Source: CiA 306-1, "Device information"; CiA 301, objects 1000h, 1001h, 1018h, "Pre-defined connection set", "PDO
@@ -30,6 +30,7 @@ _DRIVE_PROFILE = 402
 _SERVO_DRIVE = 0x00020192
 """Device type of a servo drive of CiA 402."""
 _DRIVE_OBJECTS = (0x6040, 0x6041)
+_FURTHER_CONTROLWORDS = range(0x6840, 0xA000, 0x800)
 _MODES_OF_OPERATION = 0x6060
 _IDENTITY = {1: "vendor", 2: "product", 3: "revision"}
 """Whose number is at which sub-index of 1018h, as [DeviceInfo] and canopen call it."""
@@ -107,6 +108,11 @@ def read_eds(path: Path, node_id: int | None, *, serving: bool = True) -> Readin
         build_objects(source, heads, subs, od)
         check_lists(source, {**{index: next(iter(members.values())) for index, members in subs.items()}, **heads})
         _Repair(source, heads, od).run(serving)
+        if is_drive(od) and (more := [index for index in _FURTHER_CONTROLWORDS if index in heads]):
+            words = ", ".join(f"{index:04X}h" for index in more)
+            source.warn(
+                heads[more[0]], "", f"the device has further axes (controlwords {words}); only the first is driven"
+            )
         if device_profile(od) == _DRIVE_PROFILE and not is_drive(od):
             text = "the profile is CiA 402, but controlword or statusword is not described; served, but not as a drive"
             faults.warn(0, "1000", "", text)
@@ -161,6 +167,11 @@ class _Repair:
             self._fill((0x1000, 0), _SERVO_DRIVE, text)
         for subindex, number in self._identity.items():
             self._fill((0x1018, subindex), number, f"missing; {number:#x} taken, as [DeviceInfo] has it")
+        for subindex, name in _IDENTITY.items():
+            variable = variable_at(self._od, 0x1018, subindex)
+            if variable is not None and _present(variable) == 0 and _text(variable)[0] != "empty":
+                text = f"0, as where nobody has filled it in; bring-up does not compare the {name}"
+                self._warn((0x1018, subindex), text, _text(variable)[1])
         self._repair_sdo_server()
         self._repair_identifiers()
         for index in self._od:

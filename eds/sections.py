@@ -177,7 +177,11 @@ Remark = Callable[[str], None]
 _HEX = re.compile(r"([+-]?)0x([0-9a-f]+)", re.IGNORECASE)
 _HEX_SUFFIX = re.compile(r"()([0-9][0-9a-f]*)h", re.IGNORECASE)
 _DECIMAL = re.compile(r"[+-]?[0-9]+")
+_WHOLE_REAL = re.compile(r"([+-]?[0-9]+)[.,]0*")
+_C_SUFFIX = re.compile(r"(.*[0-9a-f])(?:u|l|ul|lu|ll|ull|llu)", re.IGNORECASE)
+_GROUPED = re.compile(r"[+-]?(?:0x[0-9a-f]+(?:[ _]+[0-9a-f]+)+|[0-9]+(?:_+[0-9]+)+)", re.IGNORECASE)
 _NODE_ID = re.compile(r"\$node_?id", re.IGNORECASE)
+_ODD_NODE_ID = re.compile(r"\$?\(?\$?\{?\s*node[ _-]?id\s*\}?\)?", re.IGNORECASE)
 
 
 def parse_integer(text: str, remark: Remark) -> int:
@@ -196,8 +200,21 @@ def parse_integer(text: str, remark: Remark) -> int:
         remark(f"{text} is read as {int(match[2], 16):#x}; hexadecimal numbers begin with 0x")
         return int(match[2], 16)
     if not _DECIMAL.fullmatch(text):
-        raise ValueError(f"{text!r} is not a number")
+        return _written_as_elsewhere(text, remark)
     return _leading_zeros(text, remark)
+
+
+def _written_as_elsewhere(text: str, remark: Remark) -> int:
+    """A whole number as programming languages write it: 0.0, 100UL, 0x0001_0000, 0x00 01."""
+    if (match := _C_SUFFIX.fullmatch(text)) or (match := _WHOLE_REAL.fullmatch(text)):
+        plain = match[1]
+    elif _GROUPED.fullmatch(text):
+        plain = text.replace(" ", "").replace("_", "")
+    else:
+        raise ValueError(f"{text!r} is not a number")
+    number = parse_integer(plain, remark)
+    remark(f"{text} is read as {plain}")
+    return number
 
 
 def _leading_zeros(text: str, remark: Remark) -> int:
@@ -223,14 +240,28 @@ def parse_sum(text: str, node_id: int, remark: Remark) -> tuple[int, bool]:
         ValueError: it is not a number.
     """
     total, relative = 0, False
-    for term in map(str.strip, text.split("+")):
+    for term in map(str.strip, _terms(text, remark)):
         if _NODE_ID.fullmatch(term):
+            total, relative = total + node_id, True
+        elif _ODD_NODE_ID.fullmatch(term):
+            remark(f"{term} is read as $NODEID")
             total, relative = total + node_id, True
         elif term:
             total += parse_integer(term, remark)
         else:
             raise ValueError(f"{text!r} is not a number")
     return total, relative
+
+
+def _terms(text: str, remark: Remark) -> list[str]:
+    """What is added up: without brackets round all of it, or a plus before a number."""
+    whole = text.strip()
+    if whole[:1] == "(" and whole[-1:] == ")" and "+" in whole:
+        remark(f"{text} is read without its brackets")
+        whole = whole[1:-1].strip()
+    if whole[:1] == "+" and whole[1:2].isdigit():
+        whole = whole[1:]
+    return whole.split("+")
 
 
 _WORDS = {"true": True, "yes": True, "false": False, "no": False}

@@ -45,9 +45,7 @@ def build_composite(source: Source, index: int, head: Section, subs: Subs, kind:
     built = (ODArray if kind == ARRAY else ODRecord)(name, index)
     members = _compact_members(source, index, head)
     for subindex in subs:
-        variable = build_variable(source, subs[subindex], index, subindex, composite=True)
-        if variable is not None:
-            members[subindex] = variable
+        members[subindex] = build_variable(source, subs[subindex], index, subindex, composite=True)
     if not members:
         source.warn(head, "", "no section describes a sub-object of it; left out")
         return None
@@ -66,8 +64,6 @@ def _compact_members(source: Source, index: int, head: Section) -> dict[int, ODV
             source.warn(head, "CompactSubObj", f"{count} is not 1..{_MOST_COMPACT}; ignored")
         return {}
     template = build_variable(source, head, index, 1, composite=True)
-    if template is None:
-        return {}
     members = {0: _count_of(index, 0 if index in COUNTING else count)}
     names = source.sections.get(f"{index:04x}name")
     values = source.sections.get(f"{index:04x}value")

@@ -34,7 +34,17 @@ _READ_ONLY = frozenset(
         *(0x603F, 0x6041, 0x6061, 0x6062, 0x6063, 0x6064, 0x606B, 0x606C, 0x6074, 0x6077, 0x60F4, 0x6502),
     }
 )
+_MISSING = {
+    **{(index, 0): _I16 for index in (0x6007, *range(0x605A, 0x605F), 0x60C0)},
+    **{(index, 0): _U32 for index in (0x6065, 0x607F, 0x6080, 0x6083, 0x6084, 0x6085, 0x609A)},
+    **{(0x6066, 0): _U16, (0x607C, 0): _I32, (0x607E, 0): _U8, (0x6098, 0): _I8},
+    **{(0x607D, 1): _I32, (0x607D, 2): _I32, (0x6099, 1): _U32, (0x6099, 2): _U32},
+    **{(0x60C1, 1): _I32, (0x60C2, 1): _U8, (0x60C2, 2): _I8},
+}
+"""Types of a drive's objects that makers change, by index and sub-index: taken where a file states none."""
 _COMMUNICATION = {1: _U32, 2: _U8, 3: _U16, 5: _U16, 6: _U8}
+_CHOICES = frozenset({0x6007, *range(0x605A, 0x605F), 0x6086, 0x6098, 0x60C0})
+"""Objects of a drive whose 0 is a choice and may be the only one, such as a linear ramp."""
 COUNTING = frozenset({0x1003, *range(0x1600, 0x1800), *range(0x1A00, 0x1C00)})
 """Where sub-index 0 says how many entries are in use, and can be written."""
 _PROFILE_AREA = 0x6000
@@ -44,6 +54,11 @@ _PROFILE_AREA = 0x6000
 def is_variable(index: int, drive: bool) -> bool:
     """Whether a standard has a plain variable at this index of a device, which may be a drive."""
     return index in _VARIABLES and (drive or index < _PROFILE_AREA)
+
+
+def decides(index: int) -> bool:
+    """Whether values of an object decide what the device is and which PDOs it has: the profile, the identity, PDOs."""
+    return index in (0x1000, 0x1018) or 0x1400 <= index < 0x1C00
 
 
 def standard_type(index: int, subindex: int, drive: bool) -> int | None:
@@ -83,6 +98,16 @@ TIMES = {datatypes.TIME_OF_DAY, datatypes.TIME_DIFFERENCE}
 KNOWN = {datatypes.BOOLEAN, *SIGNED, *UNSIGNED, *REALS, *TEXTS, *OCTETS, *TIMES}
 NAMES = {name: number for name, number in vars(datatypes).items() if name.isupper() and isinstance(number, int)}
 _NAME_OF = {number: name for name, number in NAMES.items()}
+_WORDS_OF_TYPES = {
+    **{f"INT{bits}": number for number, bits in SIGNED.items()},
+    **{f"UINT{bits}": number for number, bits in UNSIGNED.items()},
+    **{f"I{bits}": number for number, bits in SIGNED.items()},
+    **{f"U{bits}": number for number, bits in UNSIGNED.items()},
+    **{"BOOL": 0x01, "SINT": 0x02, "INT": 0x03, "DINT": 0x04, "LINT": 0x15},
+    **{"USINT": 0x05, "UINT": 0x06, "UDINT": 0x07, "ULINT": 0x1B, "REAL": 0x08, "LREAL": 0x11},
+    **{"FLOAT": 0x08, "DOUBLE": 0x11, "STRING": 0x09},
+}
+"""Names of data types elsewhere. Source: IEC 61131-3, "Elementary data types"; C's <stdint.h>."""
 _TIME_BYTES = 6
 
 
@@ -181,20 +206,21 @@ def _decimal(text: str, remark: Remark) -> float:
 _OBJECT_DOMAIN = 2
 
 
-def data_type_of(source: Source, section: Section, index: int, subindex: int) -> int | None:
-    """The data type that a section means, one of `KNOWN`; None where it cannot be known (a fault)."""
+def data_type_of(source: Source, section: Section, index: int, subindex: int, composite: bool) -> int | None:
+    """The data type that a section means, one of `KNOWN`; None where it cannot be known."""
     text = section.value("DataType")
     demanded = standard_type(index, subindex, source.drive)
+    usual = _U8 if composite and subindex == 0 else _MISSING.get((index, subindex)) if source.drive else None
     if not text:
-        return _untyped(source, section, demanded)
-    if (named := NAMES.get(text.upper())) is not None:
+        return _untyped(source, section, demanded or usual, "missing")
+    if (named := _named_type(text)) is not None:
         source.warn(section, "DataType", f"{text} is read as {named:#06x}")
-        return named
-    try:
-        data_type = parse_integer(text, source.remark(section, "DataType"))
-    except ValueError:
-        source.fault(section, "DataType", f"{text!r} is not a data type")
-        return None
+        data_type = named
+    else:
+        try:
+            data_type = parse_integer(text, source.remark(section, "DataType"))
+        except ValueError:
+            return _untyped(source, section, demanded or usual, f"{text!r} is not a data type")
     if data_type not in KNOWN:
         data_type = _foreign(source, section, data_type)
     if demanded is not None and data_type != demanded:
@@ -203,13 +229,19 @@ def data_type_of(source: Source, section: Section, index: int, subindex: int) ->
     return data_type
 
 
-def _untyped(source: Source, section: Section, demanded: int | None) -> int | None:
-    if section.value("ObjectType") and source.number(section, "ObjectType") == _OBJECT_DOMAIN:
+def _named_type(text: str) -> int | None:
+    word = re.sub(r"[\s_]", "", text.upper())
+    named = NAMES.get(text.upper(), _WORDS_OF_TYPES.get(word.removesuffix("T") if word[-2:-1].isdigit() else word))
+    return named if named in KNOWN else None
+
+
+def _untyped(source: Source, section: Section, demanded: int | None, why: str) -> int | None:
+    if demanded is not None:
+        source.warn(section, "DataType", f"{why}; the standard demands {name_of(demanded)}; taken")
+    elif section.value("ObjectType") and source.number(section, "ObjectType") == _OBJECT_DOMAIN:
         return int(datatypes.DOMAIN)
-    if demanded is None:
-        source.fault(section, "DataType", "missing, so the length of the object cannot be known")
     else:
-        source.warn(section, "DataType", f"missing; the standard demands {name_of(demanded)}")
+        source.warn(section, "DataType", f"{why}, so the length of the object is not known; served as octets")
     return demanded
 
 
@@ -229,10 +261,8 @@ _ACCESS = frozenset({"ro", "wo", "rw", "rwr", "rww", "const"})
 _ACCESS_WORDS = {"r": "ro", "w": "wo", "wr": "rw", "readonly": "ro", "writeonly": "wo", "readwrite": "rw", "c": "const"}
 
 
-def build_variable(
-    source: Source, section: Section, index: int, subindex: int, composite: bool = False
-) -> ODVariable | None:
-    """The variable that a section describes, or None where its data type cannot be known (a fault).
+def build_variable(source: Source, section: Section, index: int, subindex: int, composite: bool = False) -> ODVariable:
+    """The variable that a section describes; one whose data type cannot be known holds octets and has no value.
 
     Args:
         source: the file.
@@ -240,16 +270,16 @@ def build_variable(
         index, subindex: of the variable.
         composite: it is part of an array or record.
     """
-    data_type = data_type_of(source, section, index, subindex)
-    if data_type is None:
-        return None
+    known = data_type_of(source, section, index, subindex, composite)
+    data_type = int(datatypes.DOMAIN) if known is None else known
     variable = ODVariable(_name(source, section, index, subindex), index, subindex)
     variable.data_type = data_type
     variable.access_type = _access(source, section, index, subindex, composite)
     variable.pdo_mappable = _flag(source, section, "PDOMapping")
     _set_limits(source, section, variable, data_type)
-    set_value(source, section, "DefaultValue", variable)
-    set_value(source, section, "ParameterValue", variable)
+    if known is not None:
+        set_value(source, section, "DefaultValue", variable)
+        set_value(source, section, "ParameterValue", variable)
     default, low, high = variable.default, variable.min, variable.max
     if isinstance(default, int | float) and (
         (low is not None and default < low) or (high is not None and default > high)
@@ -271,7 +301,11 @@ def set_value(source: Source, section: Section, key: str, variable: ODVariable, 
     try:
         setattr(variable, field, convert(text, data_type, source.node_id, source.remark(section, where)))
     except (ValueError, OverflowError):
-        source.fault(section, where, f"{text!r} is not a value of type {name_of(data_type)}")
+        wrong = f"{text!r} is not a value of type {name_of(data_type)}"
+        if decides(variable.index):
+            source.fault(section, where, wrong)
+        else:
+            source.warn(section, where, f"{wrong}; left out, as if the file had none")
         return
     if field == "default" and "$" in text and data_type not in TEXTS:
         with suppress(ValueError):
@@ -312,6 +346,11 @@ def _flag(source: Source, section: Section, key: str) -> bool:
 def _set_limits(source: Source, section: Section, variable: ODVariable, data_type: int) -> None:
     low = _limit(source, section, "LowLimit", data_type)
     high = _limit(source, section, "HighLimit", data_type)
+    if low == high == 0 and not (source.drive and variable.index in _CHOICES):
+        source.warn(
+            section, "LowLimit", "0, and HighLimit 0 too, as editors fill in what nobody stated; neither is used"
+        )
+        return
     if low is not None and high is not None and low > high:
         source.warn(section, "LowLimit", f"{low} is above HighLimit {high}; neither is used")
         return

@@ -5,9 +5,10 @@ identifier and everything else to a callback, so that nothing is lost. Time-outs
 `LockstepBus` they cost no real time. Not for the cycle, which has its own way to the port.
 
 SDO. A *dialogue* is a generator: it yields the 8 bytes of a request, or None to wait on, and is sent the 8 bytes of
-each answer. `upload` and `download` are parts of such dialogues (`yield from`). What a node needs is written as a plain
-sequence, and `hold_dialogues` waits for all nodes together: the accesses of one node come one after another, those of
-different nodes side by side. canopen's client is not used, because it waits for a thread and for one node at a time.
+each answer; an abort that it yields is sent, and nobody answers it. `upload` and `download` are parts of such dialogues
+(`yield from`). What a node needs is written as a plain sequence, and `hold_dialogues` waits for all nodes together: the
+accesses of one node come one after another, those of different nodes side by side. canopen's client is not used,
+because it waits for a thread and for one node at a time.
 
 Source: CiA 301, SDO protocols (expedited download, expedited and segmented upload, abort); CiA 305 (LSS).
 """
@@ -15,7 +16,7 @@ Source: CiA 301, SDO protocols (expedited download, expedited and segmented uplo
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Mapping
-from typing import Any
+from typing import Any, NoReturn
 
 from canopen.objectdictionary import ODVariable
 from canopen.objectdictionary.datatypes import SIGNED_TYPES
@@ -109,7 +110,12 @@ Dialogue = Generator[bytes | None, bytes, Any]
 _LENGTH = 8
 _ABORT, _DOWNLOADED, _UPLOADED, _SEGMENT, _EXPEDITED, _SIZED = 0x80, 0x60, 0x40, 0x00, 0x02, 0x01
 _MOST_EXPEDITED = 4
-_TIMED_OUT = 0x05040000
+_NOT_TOGGLED, _TIMED_OUT, _OUT_OF_MEMORY = 0x05030000, 0x05040000, 0x05040005
+_TOO_LONG, _TOO_SHORT, _GENERAL = 0x06070012, 0x06070013, 0x08000000
+MAX_UPLOAD_BYTES = 4096
+"""Longest value that is read: names and numbers are far shorter. A node that sends more is not asked for the rest."""
+TRANSFER_TIMEOUTS = 10
+"""Longest time of one transfer of several segments, in time-outs of one answer."""
 ROUND_S = 0.02
 """How long the others wait for the slowest answer: asking again at once, low node ids would take the whole bus."""
 
@@ -159,12 +165,23 @@ def upload(index: int, subindex: int, size: int = _MOST_EXPEDITED) -> Generator[
 
     Raises:
         SdoAbortedError: the node refused.
-        SdoCommunicationError: no answer, or one segment twice.
+        SdoCommunicationError: no answer, one segment twice, more or fewer bytes than the node announced, or more than
+            `MAX_UPLOAD_BYTES`. The node got an abort.
     """
     answer = yield from _answered(b"\x40", index, subindex, bytes(4), _UPLOADED)
     if answer[0] & _EXPEDITED:
         return answer[4 : 8 - (answer[0] >> 2 & 3)] if answer[0] & _SIZED else answer[4 : 4 + size]
-    return (yield from _segments())
+    announced = int.from_bytes(answer[4:], "little") if answer[0] & _SIZED else None
+    return (yield from _segments(answer[1:4], announced))
+
+
+def decode_text(data: bytes) -> str:
+    """A VISIBLE_STRING as devices send it: UTF-8 or else Latin-1, up to the first zero byte."""
+    text = data.partition(b"\0")[0]
+    try:
+        return text.decode()
+    except UnicodeDecodeError:
+        return text.decode("latin-1")
 
 
 def _answered(
@@ -178,7 +195,9 @@ def _answered(
     return answer
 
 
-def _segments() -> Generator[bytes | None, bytes, bytes]:
+def _segments(multiplexer: bytes, announced: int | None) -> Generator[bytes | None, bytes, bytes]:
+    if announced is not None and announced > MAX_UPLOAD_BYTES:
+        yield from _give_up(multiplexer, _OUT_OF_MEMORY, f"{announced} bytes announced, {MAX_UPLOAD_BYTES} at most")
     data, toggle, last = b"", 0, False
     while not last:
         answer = yield bytes((0x60 | toggle,)) + bytes(7)
@@ -186,11 +205,30 @@ def _segments() -> Generator[bytes | None, bytes, bytes]:
             answer = yield None
         _check_abort(answer)
         if answer[0] & 0xF0 != toggle:
-            raise SdoCommunicationError("Toggle bit mismatch")
-        data += answer[1 : 8 - (answer[0] >> 1 & 7)]
+            yield from _give_up(multiplexer, _NOT_TOGGLED, "Toggle bit mismatch")
+        piece = answer[1 : 8 - (answer[0] >> 1 & 7)]
+        data += piece
         toggle ^= 0x10
         last = bool(answer[0] & 1)
+        if announced is not None and len(data) > announced:
+            yield from _give_up(multiplexer, _TOO_LONG, f"{announced} bytes announced, more sent")
+        if len(data) > MAX_UPLOAD_BYTES:
+            yield from _give_up(multiplexer, _OUT_OF_MEMORY, f"no end after {MAX_UPLOAD_BYTES} bytes")
+        if not piece and not last:
+            yield from _give_up(multiplexer, _GENERAL, "a segment without a byte that is not the last")
+    if announced is not None and len(data) < announced:
+        yield from _give_up(multiplexer, _TOO_SHORT, f"{announced} bytes announced, {len(data)} sent")
     return data
+
+
+def _give_up(multiplexer: bytes, code: int, why: str) -> Generator[bytes | None, bytes, NoReturn]:
+    """Tell the node that its transfer is over."""
+    yield _abort(multiplexer, code)
+    raise SdoCommunicationError(f"transfer aborted: {why}")
+
+
+def _abort(multiplexer: bytes, code: int) -> bytes:
+    return bytes((_ABORT,)) + multiplexer + code.to_bytes(4, "little")
 
 
 def _check_abort(answer: bytes) -> None:
@@ -212,6 +250,8 @@ class _Talk:
         self._timeout_ns = timeout_ns
         self._retries = retries
         self._request = b""
+        self._multiplexer = b""  # of the transfer: a request for a segment has none
+        self._end_ns = 0  # of the transfer
         self._tries = 0
         self._go_on(lambda: next(dialogue))
 
@@ -227,18 +267,31 @@ class _Talk:
             self._go_on(lambda answer=answer: self._dialogue.send(answer))  # type: ignore[misc]
         if self.over or self.due_ns > self._network.port.clock.now_ns():
             return
-        self._transmit(bytes((_ABORT,)) + self._request[1:4] + _TIMED_OUT.to_bytes(4, "little"))
-        if self._tries <= self._retries and self._request[0] >> 5 != 3:  # a segment cannot be asked for twice
+        self._transmit(_abort(self._multiplexer, _TIMED_OUT))
+        if self._tries <= self._retries and not self._asks_for_segment:  # which cannot be asked for twice
             self.repeated += 1
             self._ask()
         else:
-            tries = f", {self._tries} times" if self._tries > 1 else ""
-            late = SdoTimeoutError(f"No SDO response received within {self._timeout_ns * 1e-9:g} s{tries}")
+            late = SdoTimeoutError(self._lateness())
             self._go_on(lambda: self._dialogue.throw(late))
+
+    @property
+    def _asks_for_segment(self) -> bool:
+        return self._request[0] >> 5 == 3
+
+    def _lateness(self) -> str:
+        timeout_s = self._timeout_ns * 1e-9
+        if self._asks_for_segment and self._network.port.clock.now_ns() >= self._end_ns:
+            return f"SDO transfer not complete after {TRANSFER_TIMEOUTS * timeout_s:g} s"
+        tries = f", {self._tries} times" if self._tries > 1 else ""
+        return f"No SDO response received within {timeout_s:g} s{tries}"
 
     def _go_on(self, step: Callable[[], bytes | None]) -> None:
         try:
             request = step()
+            while request is not None and request[0] == _ABORT:
+                self._transmit(request)
+                request = next(self._dialogue)
         except StopIteration:
             self.over = True
             return
@@ -250,6 +303,11 @@ class _Talk:
     def _ask(self) -> None:
         self._tries += 1
         self.due_ns = self._network.port.clock.now_ns() + self._timeout_ns
+        if self._asks_for_segment:
+            self.due_ns = min(self.due_ns, self._end_ns)
+        else:
+            self._multiplexer = self._request[1:4]
+            self._end_ns = self.due_ns + (TRANSFER_TIMEOUTS - 1) * self._timeout_ns
         self._transmit(self._request)
 
     def _transmit(self, data: bytes) -> None:
@@ -449,16 +507,18 @@ class Lss:
 
 # Who is there? One SDO read of 1000h to each node id, all at once; any answer counts, an abort too.
 
+SECOND_S = 0.05
+"""In which a second answer to one request is waited for: two devices have one node id."""
 UPLOAD_DEVICE_TYPE = bytes((0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0))
 BURST = 8
-BURST_PAUSE_NS = 2_000_000
+BURST_PAUSE_S = 0.002
 
 
-def answering_nodes(port: Port, node_ids: Iterable[int], timeout_s: float) -> tuple[int, ...]:
-    """Node ids, ascending, whose SDO server answers within the time-out. Every other frame that arrives is dropped.
+def answering_nodes(network: PumpedNetwork, node_ids: Iterable[int], timeout_s: float) -> tuple[int, ...]:
+    """Node ids, ascending, whose SDO server answers within the time-out.
 
     Args:
-        port: the bus.
+        network: pumped meanwhile.
         node_ids: whom to ask, 1–127.
         timeout_s: after the last question.
 
@@ -467,14 +527,18 @@ def answering_nodes(port: Port, node_ids: Iterable[int], timeout_s: float) -> tu
     """
     asked = sorted(set(node_ids))
     found: set[int] = set()
-    for first in range(0, len(asked), BURST):
-        port.send_batch([(SDO_RX_BASE + n, UPLOAD_DEVICE_TYPE) for n in asked[first : first + BURST]])
-        _listen(port, asked, found, port.clock.now_ns() + BURST_PAUSE_NS)
-    _listen(port, asked, found, port.clock.now_ns() + round(timeout_s * 1e9))
+
+    def take(can_id: int, _data: bytes, _t_ns: int) -> None:
+        found.add(can_id - SDO_TX_BASE)
+
+    for node_id in asked:
+        network.subscribe(SDO_TX_BASE + node_id, take)
+    try:
+        for first in range(0, len(asked), BURST):
+            network.port.send_batch([(SDO_RX_BASE + n, UPLOAD_DEVICE_TYPE) for n in asked[first : first + BURST]])
+            network.pump_until(lambda: len(found) == len(asked), BURST_PAUSE_S)
+        network.pump_until(lambda: len(found) == len(asked), timeout_s)
+    finally:
+        for node_id in asked:
+            network.unsubscribe(SDO_TX_BASE + node_id, take)
     return tuple(sorted(found))
-
-
-def _listen(port: Port, asked: list[int], found: set[int], until_ns: int) -> None:
-    while len(found) < len(asked) and port.clock.now_ns() < until_ns:
-        port.wait(until_ns)
-        found.update(can_id - SDO_TX_BASE for can_id, _, _ in port.drain() if can_id - SDO_TX_BASE in asked)

@@ -22,10 +22,12 @@ from canopen.objectdictionary import ODVariable
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from canprobe.bus.network import (
+    SECOND_S,
     UPLOAD_DEVICE_TYPE,
     Dialogues,
     PumpedNetwork,
     SdoTimeoutError,
+    decode_text,
     download,
     hold_dialogues,
     read_value,
@@ -35,7 +37,7 @@ from canprobe.cell.watch import NodeWatch
 from canprobe.errors import BusError, NodeError
 from canprobe.planning.configuration import NodeSetup, Write
 from canprobe.planning.operation import INTERPOLATION_TIME
-from canprobe.protocol.frames import NO_ERROR, SDO_RX_BASE, SDO_TX_BASE, NmtCommand, NmtState, describe, pack_nmt
+from canprobe.protocol.frames import SDO_RX_BASE, SDO_TX_BASE, NmtCommand, NmtState, describe, is_no_error, pack_nmt
 from canprobe.scene.setup import BringUpTimes as Settings
 
 ERROR_HISTORY = 0x1003
@@ -46,8 +48,6 @@ PDO_PARAMETERS = range(0x1400, 0x1C00)
 MODE_DISPLAY = 0x6061
 REVISION = 3
 IDENTITY_NAMES = {1: "vendor id", 2: "product code", 3: "revision number", 4: "serial number"}
-SECOND_S = 0.05
-"""In which a second boot-up, or a second answer to one request, is waited for."""
 RELEASE_S = 0.1
 """For one answer of a node that is released."""
 Dialogue = Generator[bytes | None, bytes, None]
@@ -263,7 +263,7 @@ class BringUp:
                 version = yield from upload(SOFTWARE_VERSION, 0)
             except (SdoAbortedError, SdoCommunicationError):
                 return
-            report.software = version.decode("latin-1").rstrip("\0")
+            report.software = decode_text(version)
 
     def _check_given(self, setup: NodeSetup) -> Dialogue:
         for given in setup.given:
@@ -433,7 +433,7 @@ class BringUp:
                     report.remarks.append(f"takes {values}, which means the same as what it refused")
                 return
         assert first is not None
-        raise first
+        raise RefusedError(first.node_id, first.reason + (yield from _fitting_rate(report.setup, options))) from first
 
     def _recall(self, setup: NodeSetup) -> Dialogue:
         """The newest entry in the error history of a node that has failed, unless its EMCY was received."""
@@ -443,7 +443,7 @@ class BringUp:
             newest = yield from upload(ERROR_HISTORY, 1)
         except (SdoAbortedError, SdoCommunicationError):
             return  # it is empty
-        if (code := int.from_bytes(newest[:2], "little")) != NO_ERROR:
+        if not is_no_error(code := int.from_bytes(newest[:2], "little")):
             words = f"; its error history (1003h) begins with {code:04X}h, {describe(code)}"
             self._history[setup.node_id] = words
 
@@ -466,7 +466,7 @@ def read_entry(setup: NodeSetup, index: int, subindex: int) -> Generator[bytes |
     variable = _variable(setup, index, subindex)
     try:
         return int((yield from read_value(variable)))
-    except (SdoAbortedError, SdoCommunicationError) as error:
+    except (SdoAbortedError, SdoCommunicationError, ValueError) as error:  # ValueError: octets are no integer
         raise NodeError(setup.node_id, f"({setup.name}) read of {index:04X}h:{subindex:02X} failed: {error}") from error
 
 
@@ -504,6 +504,23 @@ def write_entry(setup: NodeSetup, write: Write) -> Dialogue:
         raise RefusedError(
             setup.node_id, f"({setup.name}) {write.place} reads back {got:#x} after {write.value:#x} was written"
         )
+
+
+def _fitting_rate(setup: NodeSetup, options: Sequence[Sequence[Write]]) -> Generator[bytes | None, bytes, str]:
+    """The rates that fit a drive which keeps its 60C2h, for the end of a message; empty where it does not answer."""
+    try:
+        held = yield from read_entry(setup, INTERPOLATION_TIME, 1)
+        has_unit = any(write.subindex == 2 for write in options[0])
+        index = (yield from read_entry(setup, INTERPOLATION_TIME, 2)) if has_unit else -3
+    except NodeError:
+        return ""
+    unit, unit_text = 10.0**index, f"10^{index} s"
+    if held not in {write.value for writes in options for write in writes if write.subindex == 1}:
+        return f"; it keeps {held} · {unit_text}: cycle.rate_hz = {1 / (held * unit):.6g} fits it" if held > 0 else ""
+    value, *others = options[0]  # the value was taken, its unit was not
+    wanted_s = value.value * 10.0 ** (others[0].value if others else -3)
+    counts = [count for count in (int(wanted_s / unit) + 1, int(wanted_s / unit)) if count]
+    return f"; it counts in {unit_text}: {' or '.join(f'cycle.rate_hz = {1 / (n * unit):.6g}' for n in counts)} fits it"
 
 
 def _refused(setup: NodeSetup, write: Write, error: Exception, held: int | None = None) -> RefusedError:

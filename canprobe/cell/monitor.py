@@ -18,7 +18,7 @@ from canprobe.errors import ProtocolError
 from canprobe.planning.model import MASTER_NODE_ID, Plan
 from canprobe.protocol.cia402 import describe_state
 from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits
-from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NO_ERROR, SYNC_ID, Emcy, describe, unpack_heartbeat
+from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, Emcy, describe, is_no_error, unpack_heartbeat
 from canprobe.robot.model import units_to_joints
 
 SECOND_NS = 1_000_000_000
@@ -141,7 +141,7 @@ class Monitor:
             self._take_heartbeat(node, data, t_ns)
         elif node is not None and can_id == EMCY_BASE + node.node_id and len(data) == CLASSIC_BYTES:
             emcy = Emcy.unpack(data)
-            node.emcy = None if emcy.code == NO_ERROR else f"{emcy.code:04X}h, {describe(emcy.code)}"
+            node.emcy = None if is_no_error(emcy.code) else f"{emcy.code:04X}h, {describe(emcy.code)}"
 
     def _take_feedback(self, can_id: int, data: bytes) -> None:
         node_id, frame = self._feedback[can_id]

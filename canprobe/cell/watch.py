@@ -11,11 +11,11 @@ from canprobe.protocol.frames import (
     EMCY_BASE,
     HEARTBEAT_BASE,
     NMT_ID,
-    NO_ERROR,
     SYNC_ID,
     Emcy,
     NmtState,
     describe,
+    is_no_error,
     unpack_heartbeat,
 )
 
@@ -107,7 +107,7 @@ class NodeWatch:
         except ProtocolError:
             return
         self.last_emcy[node_id] = event
-        if event.emcy.code == NO_ERROR:
+        if is_no_error(event.emcy.code):
             return
         self.last_alarm[node_id] = event
         self._untold.append(event)

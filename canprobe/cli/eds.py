@@ -20,8 +20,8 @@ examples:
   canprobe eds check drive.eds
 """
 _CHECK = """\
-A fault means that the file leaves open how the device answers: it cannot be served. A warning names what was corrected
-or ignored.
+A fault means that the file leaves open what the device is or which PDOs it has: it cannot be served. A warning names
+what was corrected or ignored.
 
 exit status: 0 without faults, 2 with faults
 

@@ -172,7 +172,7 @@ def _eds_files(args: argparse.Namespace) -> list[tuple[str | Path, int]]:
 
         if args.node_id or args.serial:
             raise UsageError("emulate: --node-id and --serial belong to --eds; a bus.yml has its own")
-        return [(node.eds, node.node_id) for node in read_bus_yml(args.bus_yml)]
+        return [(node.eds, node.node_id) for node in read_bus_yml(args.bus_yml, args.report.say)]
     if len(args.eds) != len(args.node_id):
         raise UsageError(f"emulate: {len(args.eds)} --eds, but {len(args.node_id)} --node-id; each file needs its own")
     if len(args.serial) > len(args.eds):

@@ -1,8 +1,8 @@
 """Write a cell file for your own arm and a first scene that runs on the emulator at once.
 
-The chain comes from a URDF; without one the file begins with the rows of a PUMA 560, to be replaced. EDS files are
-copied beside the cell file: one for all drives, or one for each joint from the base. What neither file says (counts a
-turn, gears) has a placeholder with a comment.
+The chain comes from a URDF; without one the file begins with the rows of a PUMA 560, to be replaced. EDS or DCF files
+are copied beside the cell file: one for all drives, or one for each joint from the base. The bus has the fastest bit
+rate that all of them and the array have. What no file says (counts a turn, gears) has a placeholder with a comment.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ examples:
   canprobe init my-cell --urdf arm.urdf --tip tool0 --eds drive.eds
   canprobe run my-cell/first.toml
 """
+_ARRAY_EDS = "tactile_array"
 _RATES_HZ = (400, 1000 / 3, 250, 200, 125, 100, 50)
 _SENSOR_HZ = 200
 _TRIES = 400
@@ -41,7 +42,12 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--base", metavar="LINK", help="link of the URDF that is the base [its root]")
     parser.add_argument("--tip", metavar="LINK", help="link of the URDF that is the flange [its only end]")
     parser.add_argument(
-        "--eds", metavar="FILE", type=Path, action="append", default=[], help="EDS of the drives; once, or once a joint"
+        "--eds",
+        metavar="FILE",
+        type=Path,
+        action="append",
+        default=[],
+        help="EDS or DCF of the drives; once, or once a joint",
     )
 
 
@@ -84,7 +90,7 @@ name = "{name}"
 title = "{name}"
 
 [bus]
-bitrate = 1000000
+bitrate = {bitrate}
 
 """
 _CYCLE = """\
@@ -115,7 +121,7 @@ def _urdf_cell(args: argparse.Namespace) -> str:
     from canprobe.robot.urdf import from_urdf
 
     found = from_urdf(args.urdf, args.base, args.tip)
-    text = _HEAD.format(name=_cell_name(args.folder))
+    text = _HEAD.format(name=_cell_name(args.folder), bitrate=_common_bitrate(args.eds))
     text += "[arm]\n" + f'urdf = "{args.urdf.name}"\n'
     text += "".join(f'{key} = "{link}"\n' for key, link in (("base", args.base), ("tip", args.tip)) if link)
     text += "mount_mm = [0, 0, 0] # where the arm's base stands; the scene's coordinates count from there\n"
@@ -124,6 +130,24 @@ def _urdf_cell(args: argparse.Namespace) -> str:
     for number, (joint, start) in enumerate(zip(found.joints, postures, strict=True), start=1):
         text += "\n" + _joint_section(number, joint, start, args.eds)
     return text
+
+
+def _common_bitrate(eds: Sequence[Path]) -> int:
+    """The fastest bit rate, bit/s, that all EDS files have; a file that lists none has any.
+
+    Raises:
+        UsageError: they have none in common.
+    """
+    from canprobe.eds.description import Description
+    from canprobe.eds.packaged import check_eds
+
+    rates = {str(path): set(Description(check_eds(path).dictionary).bitrates) for path in dict.fromkeys(eds)}
+    rates[_ARRAY_EDS] = set(Description(check_eds(_ARRAY_EDS).dictionary).bitrates)
+    listed = {name: has for name, has in rates.items() if has}
+    if common := set.intersection(*listed.values()):
+        return max(common)
+    lists = "; ".join(f"{name} has {', '.join(map(str, sorted(has)))} bit/s" for name, has in listed.items())
+    raise UsageError(f"--eds: no bit rate is common to all devices of the bus: {lists}; the cell needs other devices")
 
 
 def _common_eds(eds: Sequence[Path], joints: int) -> str:
@@ -168,6 +192,7 @@ def _dh_cell(args: argparse.Namespace) -> str:
         'title = "PUMA 560 with the array and the probe of the PUMA 260"', f'title = "{name}: rows of a PUMA 560"'
     )
     if args.eds:
+        text = text.replace("[arm]\n", f"[bus]\nbitrate = {_common_bitrate(args.eds)}\n\n[arm]\n", 1)
         eds = _common_eds(args.eds, 6)
         text = text.replace('eds = "puma260_joint.eds"\n', eds)
         if len(args.eds) == 6:
@@ -209,8 +234,9 @@ def _rounded(found: UrdfArm) -> list[float]:
 
 def _first_scene(folder: Path, cell: str) -> tuple[str, str | None]:
     """Write the cell at the fastest rate at which it can do a scan, else free motion; the scene, and why no scan."""
-    from canprobe.api import plan
+    from canprobe.planning.make import make_plan
     from canprobe.scene.load import parse_scene
+    from canprobe.scene.resolve import resolve
 
     (folder / "cell.toml").write_text(_at_rate(cell, _RATES_HZ[0]), encoding="utf-8")
     refused: dict[float, str] = {}
@@ -220,13 +246,16 @@ def _first_scene(folder: Path, cell: str) -> tuple[str, str | None]:
             (folder / "cell.toml").write_text(_at_rate(cell, rate), encoding="utf-8")
             for text in scenes:
                 try:
-                    plan(parse_scene(text, file="first.toml", folder=folder))
+                    make_plan(resolve(parse_scene(text, file="first.toml", folder=folder)), find_ways=False)
                 except PlanError as error:
                     refused.setdefault(rate, error.problems[0])
                     problems = problems or list(error.problems)
                 else:
                     return text, refused[rate] if text is _FREE else None
-    way = f"correct the EDS (or the URDF) that this names, remove the folder {folder}, and type the command again"
+    way = (
+        "if the EDS or the URDF that this names is wrong, correct it; if it is right, this cell needs other devices;"
+        f" then remove the folder {folder}, and type the command again"
+    )
     raise PlanError([*problems, way])
 
 

@@ -3,6 +3,9 @@
 LSS (CiA 305) finds nodes without an id by vendor, product, revision and serial number (1018h). --assign gives an id to
 one device. With a SCENE, its nodes get their ids; EDS files and serial_numbers identify the devices. A device
 boots with its new id at once and keeps it, unless --no-store is given.
+
+A node that only sends heartbeats is listed with its state, and a node id that two devices have with both serial
+numbers. "-" stands for what a node does not answer.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ from canprobe.cli.parser import (
     loaded,
     number_of_32_bits,
     real_target,
+    seconds,
     whole,
 )
 from canprobe.errors import UsageError
@@ -32,6 +36,7 @@ HELP = "list the nodes on a bus"
 EXAMPLE = """\
 examples:
   canprobe scan --bus socketcan --channel can0
+  canprobe scan --channel can0 --timeout 2             # nodes that are slow to answer
   canprobe scan --lss --channel can0                   # also the nodes without an id
   canprobe scan --lss --assign 3 --channel can0        # the only node without an id gets 3
   canprobe scan --lss --assign 0x4711=3 --assign 0x4712=4 --channel can0
@@ -39,6 +44,7 @@ examples:
 """
 _COLUMNS = ("node_id", "state", "vendor_id", "product_code", "revision_number", "serial_number", "device_name")
 _NUMBERS = 4
+_STOPPED = "a stopped node answers none (CiA 301): a master must take it out of that state"
 Assignment = tuple[tuple[int | None, int | None, int | None, int | None], int]
 
 
@@ -54,6 +60,12 @@ def add_arguments(parser: Parser) -> None:
         "--channel", metavar="CH", type=channel, default=(None, None), help="channel of the interface [can0]"
     )
     parser.add_argument("--bitrate", **OPTIONS["--bitrate"] | {"help": "bit rate [1000000]"})
+    parser.add_argument(
+        "--timeout",
+        metavar="S",
+        type=seconds,
+        help="longest time to one SDO answer in seconds [0.5, as bring-up waits; the scene's bring_up.sdo_s]",
+    )
     parser.add_argument("--lss", action="store_true", help="also find nodes without an id")
     parser.add_argument(
         "--assign",
@@ -89,14 +101,21 @@ def run(args: argparse.Namespace) -> int:
 
     target = real_target(args.bus, args.channel[1], args.bitrate, channel_else="can0")
     if not args.lss:
-        nodes = api.scan(target, say=args.report.say)
+        nodes = api.scan(target, timeout_s=args.timeout, say=args.report.say)
         if args.json:
             print_json(nodes)
         else:
             _print_nodes(nodes, target.channel)
         return 0
     scene = None if args.scene is None else loaded(args)
-    done = api.commission(target, scene=scene, assign=args.assign, store=not args.no_store, say=args.report.say)
+    done = api.commission(
+        target,
+        scene=scene,
+        assign=args.assign,
+        store=not args.no_store,
+        timeout_s=args.timeout,
+        say=args.report.say,
+    )
     if args.json:
         print_json(done.as_document())
     else:
@@ -119,8 +138,19 @@ def _print_nodes(nodes: list[dict[str, Any]], where: str) -> None:
     if not nodes:
         print(f"no node answers on {where}")
         return
-    keys = [key for key in _COLUMNS if any(key in node for node in nodes)]
-    print_table([keys, *([_cell(key, node.get(key)) for key in keys] for node in nodes)])
+    print_table([_COLUMNS, *([_cell(key, node[key]) for key in _COLUMNS] for node in nodes)])
+    for node in nodes:
+        name = f"node {node['node_id']}"
+        if node["devices"] > 1:
+            serials = " and ".join(f"{number:#x}" for number in node["serial_numbers"]) or "not stated"
+            print(
+                f"{name}: {node['devices']} devices answer with this id, serial numbers {serials}:"
+                " disconnect one and give the other another id"
+            )
+        elif not node["devices"]:
+            state = node["state"]
+            way = _STOPPED if state == "STOPPED" else "if it is only slow, give a larger --timeout"
+            print(f"{name}: sends heartbeats ({state}), but answers no SDO request; {way}")
 
 
 def _print_commissioned(done: Commissioned, where: str) -> None:
@@ -137,4 +167,6 @@ def _print_commissioned(done: Commissioned, where: str) -> None:
 def _cell(key: str, value: object) -> str:
     if value is None:
         return "-"
-    return f"{value:#x}" if isinstance(value, int) and key != "node_id" else str(value)
+    if isinstance(value, int):
+        return str(value) if key == "node_id" else f"{value:#x}"
+    return "".join(c if c.isprintable() else "?" for c in str(value))

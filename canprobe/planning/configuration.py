@@ -29,6 +29,7 @@ from canprobe.eds.packaged import (
     has_missed_syncs,
     has_window_size,
 )
+from canprobe.eds.variables import name_of
 from canprobe.planning.devices import COMMUNICATION, INVALID, MAPPING, OWN_BITS, Abilities
 from canprobe.planning.model import (
     HEARTBEAT_CONSUMED_MS,
@@ -39,7 +40,7 @@ from canprobe.planning.model import (
     PlannedNode,
     PlannedPdo,
 )
-from canprobe.planning.operation import INTERPOLATION_TIME, homing_problems
+from canprobe.planning.operation import INTERPOLATION_TIME, SYNC_PERIOD, follows_sync_period, homing_problems
 from canprobe.planning.traffic import CLASSIC_BYTES
 from canprobe.planning.units import POLARITY, POSITION_LIMITS, TurnUnits, motor_speed_limit, software_limits, turn_units
 from canprobe.protocol.cia402 import OperationMode
@@ -229,6 +230,8 @@ def _excluded(device: Abilities, write: Write) -> str | None:
     entry = device.description.entry(write.index, write.subindex)
     if entry is None or (write.purpose == _MISSED_SYNCS and not has_missed_syncs(device.od)):
         return "no such object"
+    if not entry.is_integer:
+        return f"its data type is {name_of(entry.data_type)}, not an integer"
     if not entry.writable:
         same = entry.initial == write.value
         return "" if same else f"it is {entry.access}{'' if entry.initial is None else f', {entry.initial!r}'}"
@@ -283,17 +286,17 @@ def _one_pdo(pdo: PlannedPdo, device: Abilities) -> list[Write]:
     )
 
 
-_SYNC_PERIOD = "the device does not know how long a cycle is"
+_UNTIMED = "the device does not know how long a cycle is"
 
 
 def _common_writes(plan: Plan, device: Abilities) -> list[Write]:
     counter = [
-        Write(0x1006, 0, 0, "1019h may only change while this is 0", _SYNC_PERIOD),
+        Write(SYNC_PERIOD, 0, 0, "1019h may only change while this is 0", _UNTIMED),
         Write(0x1019, 0, plan.sync.overflow, "overflow of the SYNC counter"),
     ]
     return [
         *(counter if plan.sync.overflow else []),
-        Write(0x1006, 0, plan.sync.period_us, "period of SYNC", _SYNC_PERIOD),
+        Write(SYNC_PERIOD, 0, plan.sync.period_us, "period of SYNC", None if follows_sync_period(device) else _UNTIMED),
         Write(0x1015, 0, EMCY_INHIBIT_100US, "shortest time between two emergencies", _EMERGENCIES),
         Write(0x1017, 0, HEARTBEAT_PRODUCED_MS, "period of the node's heartbeat"),
         Write(0x1016, 1, MASTER_NODE_ID << 16 | HEARTBEAT_CONSUMED_MS, "the node notices a dead master", _DEAF),
@@ -335,7 +338,7 @@ def _drive_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Writ
         Write(MISSED_SYNCS, 0, arm.missed_syncs, _MISSED_SYNCS, "a drive may go on without SYNC"),
         Write(MODE, 0, node.mode, "mode of operation"),
         *([Write(0x60C0, 0, 0, "linear interpolation", "the device interpolates in its way")] if interpolated else []),
-        *_interpolation_writes(device, node.interpolation[0]),
+        *(_interpolation_writes(device, node.interpolation[0]) if node.interpolation else []),
         Write(0x6065, 0, window, "following error window", following),
         Write(0x6066, 0, FOLLOWING_TIMEOUT_MS, "following error time-out", lag),
         Write(0x607F, 0, speed, "highest speed of the motor", fast),

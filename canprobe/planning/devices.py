@@ -23,6 +23,7 @@ INVALID = 1 << 31
 OWN_BITS = 0x6000_0000
 """Bits 29 and 30 of a COB-ID, which are the device's: its frame format, and that it sends nothing on request (RTR)."""
 MOST_ENTRIES = 64
+_MOST_AXES = 8
 _IDENTIFIER = 0x7FF
 
 
@@ -54,12 +55,17 @@ class Abilities:
 
     @property
     def identity(self) -> Identity:
-        """Vendor, product and revision of 1018h."""
-        return Identity(*(self.number(0x1018, subindex) for subindex in (1, 2, 3)))
+        """Vendor, product and revision of 1018h; None where the file states none, or 0 as nobody filled it in."""
+        return Identity(*(self.number(0x1018, subindex) or None for subindex in (1, 2, 3)))
 
     def has(self, index: int, subindex: int = 0) -> bool:
         """Whether the object exists."""
         return self.description.entry(index, subindex) is not None
+
+    @property
+    def axes(self) -> tuple[int, ...]:
+        """Axes of a drive from 1: those whose controlword is described, 800h apart. Source: CiA 402-1."""
+        return tuple(axis for axis in range(1, _MOST_AXES + 1) if self.has(0x6040 + 0x800 * (axis - 1)))
 
     def number(self, index: int, subindex: int = 0) -> int | None:
         """The integer that the entry holds at boot; None where it is missing or not stated."""

@@ -43,11 +43,12 @@ from canprobe.scene.setup import Node, Setup
 SYNC_COUNTER = 0x1019
 
 
-def make_plan(setup: Setup) -> Plan:
+def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
     """Derive the plan of a setup; what it leaves open ("auto") is chosen so that it fits.
 
     Args:
         setup: of a scene; see `canprobe.scene.resolve.resolve`.
+        find_ways: look for ways out where the bus is overloaded, which takes far longer than the plan.
 
     Returns:
         Nodes, PDOs, bus load, what is left out and why. Its setup has nothing open any more.
@@ -65,7 +66,7 @@ def make_plan(setup: Setup) -> Plan:
     ways: list[str] = []
     if bus is not None:
         setup = bus.setup
-        if bus.overload:
+        if bus.overload and find_ways:
             known = frozenset(bus.problems)
             ways += ways_out(setup, lambda changed: _fits(changed, known))
         cut = cut_patch(setup)
@@ -96,7 +97,7 @@ def make_plan(setup: Setup) -> Plan:
         choices=bus.choices,
         joint_speeds=joint_speeds,
         outputs=outputs(setup, dict(absent)),
-        left_out=absent,
+        left_out=(*absent, *_unused_axes(setup, devices)),
         not_available=(*bus.not_available, *unavailable_bridges(setup)),
         warnings=(*narrowed, *warnings(setup, bus.pdos)),
     )
@@ -212,6 +213,21 @@ def _counts_syncs(device: Abilities) -> bool:
     """Whether a device can take a SYNC with our counter."""
     entry = device.description.entry(SYNC_COUNTER)
     return entry is not None and (entry.initial == SYNC_OVERFLOW or (entry.writable and entry.allows(SYNC_OVERFLOW)))
+
+
+def _unused_axes(setup: Setup, devices: Mapping[int, Abilities]) -> list[tuple[str, str]]:
+    """The axes of drives of several axes that the cell does not drive, as (what, why)."""
+    unused = []
+    for kind, role, node in _roles(setup):
+        if kind == "drive" and (others := [axis for axis in devices[node.node_id].axes if axis > 1]):
+            objects = ", ".join(f"{0x6000 + 0x800 * (axis - 1):04X}h" for axis in others)
+            what = (
+                f"ax{'es' if len(others) > 1 else 'is'} {', '.join(map(str, others))} of node {node.node_id} ({role})"
+            )
+            unused.append(
+                (what, f"{node.eds} has objects of more axes, from {objects}: a joint has the first of its node")
+            )
+    return unused
 
 
 def _channels(setup: Setup) -> dict[str, tuple[int, ...]]:

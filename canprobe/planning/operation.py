@@ -2,8 +2,9 @@
 
 Cyclic synchronous position is taken where the drive has it, else interpolated position. 60C2h is value · 10^index s;
 devices take whole milliseconds only, or anything down to microseconds. The default index of the device comes first, as
-it is the one that surely works; then the others from milliseconds down.
-Source: CiA 402-2, objects 6060h, 60C1h, 60C2h, 6502h.
+it is the one that surely works; then the others from milliseconds down. A drive without 60C2h takes the period from
+1006h, where it has that.
+Source: CiA 402-2, objects 6060h, 60C1h, 60C2h, 6502h; CiA 301, object 1006h.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ TARGETS: Mapping[OperationMode, Place] = {
 }
 """Modes in which the cell can drive, the best first, with the object of their target."""
 INTERPOLATION_TIME = 0x60C2
+SYNC_PERIOD = 0x1006
 _MODE_NAMES: Mapping[int, str] = {
     1: "profile position",
     2: "velocity",
@@ -58,9 +60,15 @@ def operation_problems(device: Abilities) -> list[str]:
     problems = []
     if choose_mode(device) is None:
         problems.append(f"{device.eds}: {_modes_offered(device)}; needed: {_mode_text(8)}, or {_mode_text(7)}")
-    if not device.has(INTERPOLATION_TIME, 1):
-        problems.append(f"{device.eds}: object 60C2h (interpolation time period) is missing")
+    if not device.has(INTERPOLATION_TIME, 1) and not device.has(SYNC_PERIOD):
+        missing = "objects 60C2h (interpolation time period) and 1006h (period of SYNC) are missing"
+        problems.append(f"{device.eds}: {missing}; the drive needs one of them to know the period of its targets")
     return problems
+
+
+def follows_sync_period(device: Abilities) -> bool:
+    """Whether a drive knows the period of its targets only by 1006h."""
+    return not device.has(INTERPOLATION_TIME, 1) and device.has(SYNC_PERIOD)
 
 
 def homing_problems(device: Abilities) -> list[str]:
@@ -95,7 +103,13 @@ class _Offer:
     indices: tuple[int, ...]
 
     def __str__(self) -> str:
-        values = f"{self.values[0]} to {self.values[-1]}" if len(self.values) > 1 else ", ".join(map(str, self.values))
+        if not self.values:
+            return (
+                "60C2h:01 takes no value by the EDS: no integer, read-only without a default, or limits that leave none"
+            )
+        if not self.indices:
+            return f"60C2h:02 takes no unit of 10^{_FINEST} to 10^{_COARSEST} s by the EDS"
+        values = f"{self.values[0]} to {self.values[-1]}" if len(self.values) > 1 else str(self.values[0])
         return f"60C2h takes {values} · 10^{' or '.join(map(str, sorted(self.indices)))} s"
 
 
@@ -128,6 +142,27 @@ def interpolations(device: Abilities, period_us: int) -> tuple[Interpolation, ..
     return tuple(found)
 
 
+def _can_take(device: Abilities, period_us: int) -> bool:
+    """Whether a drive can be given a period, by 60C2h or else by 1006h."""
+    if not follows_sync_period(device):
+        return bool(interpolations(device, period_us))
+    entry = device.description.entry(SYNC_PERIOD)
+    assert entry is not None
+    return entry.allows(period_us) if entry.writable else entry.initial == period_us
+
+
+def _period_offer(device: Abilities) -> str:
+    """What periods a drive takes, in words."""
+    if not follows_sync_period(device):
+        return str(_offer(device))
+    entry = device.description.entry(SYNC_PERIOD)
+    assert entry is not None
+    if not entry.writable:
+        return f"1006h is {entry.access}, {'without a value' if entry.initial is None else f'{entry.initial!r} µs'}"
+    low, high = 1 if entry.low is None else entry.low, (1 << entry.bits) - 1 if entry.high is None else entry.high
+    return f"1006h takes {low} to {high} µs"
+
+
 def period_problem(rate_hz: float, period_us: int, exact: bool, devices: Iterable[Abilities]) -> str | None:
     """Why a rate cannot be set, with the nearest rates that every drive can; None where it can.
 
@@ -138,10 +173,10 @@ def period_problem(rate_hz: float, period_us: int, exact: bool, devices: Iterabl
         devices: the drives; without any, 1006h decides.
     """
     makes = {device.eds: device for device in devices}
-    unable = [device for device in makes.values() if not interpolations(device, period_us)]
+    unable = [device for device in makes.values() if not _can_take(device, period_us)]
     if exact and not unable:
         return None
-    why = "1006h counts µs" if not exact else "; ".join(f"{device.eds}: {_offer(device)}" for device in unable)
+    why = "1006h counts µs" if not exact else "; ".join(f"{device.eds}: {_period_offer(device)}" for device in unable)
     near = _nearest_rates(1e6 / rate_hz, list(makes.values()))
     take = f"take {' or '.join(f'{rate:.6g}' for rate in near)} Hz" if near else "no period suits all drives"
     return f"cycle.rate_hz = {rate_hz:g}: a SYNC period of {1e6 / rate_hz:.6g} µs cannot be set ({why}); {take}"
@@ -149,9 +184,14 @@ def period_problem(rate_hz: float, period_us: int, exact: bool, devices: Iterabl
 
 def _nearest_rates(period_us: float, devices: Sequence[Abilities]) -> list[float]:
     """The rates next to a period that every device can express, Hz, ascending."""
-    if not devices:
-        return sorted(1e6 / count for count in (int(period_us), int(period_us) + 1) if count)
-    common = set.intersection(*map(_periods, devices))
+    timed = [device for device in devices if not follows_sync_period(device)]
+    if timed:
+        wanted = set.intersection(*map(_periods, timed))
+    else:
+        limits = [device.description.entry(SYNC_PERIOD) for device in devices]
+        stated = {value for entry in limits if entry is not None for value in (entry.low, entry.high, entry.initial)}
+        wanted = {int(period_us), int(period_us) + 1, *(int(us) for us in stated if isinstance(us, int | float))}
+    common = {us for us in wanted if us > 0 and all(_can_take(device, us) for device in devices)}
     longer, shorter = [us for us in common if us >= period_us], [us for us in common if us < period_us]
     return [1e6 / us for us in (min(longer, default=0), max(shorter, default=0)) if us]
 

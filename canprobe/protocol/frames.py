@@ -155,6 +155,7 @@ def pack_sync(counter: int | None = None) -> Frame:
 _FORM = struct.Struct("<HB5s")
 
 NO_ERROR = 0x0000
+"""What a node sends when an error is over."""
 HEARTBEAT_LOST = 0x8130
 SYNC_LOST = 0x8100
 PDO_TOO_SHORT = 0x8210
@@ -262,13 +263,20 @@ class Emcy:
         return EMCY_BASE + node_id, self.pack()
 
 
+def is_no_error(code: int) -> bool:
+    """Whether an emergency error code reports no error. Source: CiA 301, emergency error codes, 00xxh."""
+    return code >> 8 == 0
+
+
 def describe(code: int) -> str:
     """An emergency error code in words: the most specific entry of CiA 301 or CiA 402 that covers it."""
+    if is_no_error(code):
+        return _WORDS[NO_ERROR]
     for mask in _MASKS:
         words = _WORDS.get(code & mask)
-        if words is not None and (code & mask or code == 0):
+        if words is not None and code & mask:
             return words
-    return f"unknown emergency code {code:04X}h" if code & 0xF000 else "error reset, no error"
+    return f"unknown emergency code {code:04X}h"
 
 
 # Layer setting services as bytes: identifiers, command specifiers, LSS addresses, and the table of bit rates.

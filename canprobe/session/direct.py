@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.bus.network import SECOND_S
 from canprobe.bus.port import Port
 from canprobe.cell.array import TactileReceiver
-from canprobe.cell.bringup import SECOND_S
 from canprobe.cell.cycle import Cycle
 from canprobe.cell.drives import DriveCommand, DriveGroup
 from canprobe.emulator.array import TactileApplication

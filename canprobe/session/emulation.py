@@ -173,7 +173,7 @@ def _free_port(
 ) -> Iterator[Port]:
     """A port on a bus where nobody has these node ids; it waits for the bus as a device does."""
     from canprobe.bus.interfaces import open_port
-    from canprobe.bus.network import answering_nodes
+    from canprobe.bus.network import PumpedNetwork, answering_nodes
     from canprobe.bus.port import Reports
 
     check_links(target.interface, {target.channel: wanted}, say)
@@ -187,7 +187,7 @@ def _free_port(
         reports=Reports(say=say),
     )
     try:
-        if busy := answering_nodes(port, node_ids, 0.1):
+        if busy := answering_nodes(PumpedNetwork(port), node_ids, 0.1):
             raise NodeError(busy[0], f"is on {target.channel} already; its id is busy: {way_out}")
         yield port
     finally:

@@ -13,30 +13,30 @@ from canprobe.cell.commission import commission as commission_nodes
 from canprobe.cell.monitor import CellView, Monitor
 from canprobe.errors import BusError
 from canprobe.planning.make import make_plan
-from canprobe.scene.model import Scene
+from canprobe.scene.model import BringUpSettings, Scene
 from canprobe.scene.resolve import resolve
 from canprobe.session.links import Expected, check_links, expected_of, need_controllers
 from canprobe.session.session import Say, open_ports, quiet
 from canprobe.session.target import Target, need_real_bus
 
-ANSWER_S = 0.2
 MONITOR_PERIOD_NS = 100_000_000
 SILENCE_NS = 1_000_000_000
 """After so long without a frame on a bus the state of its controller is read."""
 
 
-def scan(target: Target, *, say: Say = quiet) -> list[dict[str, Any]]:
-    """List the nodes that answer on a bus, with the identity that 1018h gives.
+def scan(target: Target, *, timeout_s: float | None = None, say: Say = quiet) -> list[dict[str, Any]]:
+    """List the nodes that answer or send heartbeats on a bus, with the identity that 1018h gives.
 
     Args:
         target: the bus.
+        timeout_s: longest time to one SDO answer; that of a bring-up by default.
         say: called with each warning about the interface's setting.
 
     Raises:
         InterfaceError: no such interface, or no node answers and the CAN controller's state is why.
     """
     with _open(target, say) as port:
-        nodes = scan_nodes(port, ANSWER_S)
+        nodes = scan_nodes(port, timeout_s or BringUpSettings().sdo_s)
     if not nodes:
         need_controllers(target.interface, {target.channel: port})
     return nodes
@@ -48,6 +48,7 @@ def commission(
     scene: Scene | None = None,
     assign: Sequence[tuple[tuple[int | None, int | None, int | None, int | None], int]] = (),
     store: bool = True,
+    timeout_s: float | None = None,
     say: Say = quiet,
 ) -> Commissioned:
     """Find the nodes that have no id and give them theirs by LSS (CiA 305).
@@ -57,6 +58,7 @@ def commission(
         scene: whose nodes get their ids, as far as EDS files and serial numbers show which device is which.
         assign: or else ((vendor, product, revision, serial number), node id), None for a number that may be any.
         store: let the devices keep their ids when their power goes.
+        timeout_s: longest time to one SDO answer; by default that of the scene, or else of a bring-up.
         say: called with each warning about the interface's setting.
 
     Raises:
@@ -68,8 +70,9 @@ def commission(
     if scene is not None:
         on_interface = replace(Target.over(scene), interface=target.interface)
         wanted = wanted_by(make_plan(resolve(on_interface.applied_to(scene))))
+    answer_s = timeout_s or (BringUpSettings() if scene is None else scene.bring_up).sdo_s
     with _open(target, say) as port:
-        done = commission_nodes(port, wanted, must=scene is None, store=store, timeout_s=ANSWER_S)
+        done = commission_nodes(port, wanted, must=scene is None, store=store, timeout_s=answer_s)
     if not done.nodes and not done.unconfigured:
         need_controllers(target.interface, {target.channel: port})
     return done

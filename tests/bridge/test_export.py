@@ -143,12 +143,52 @@ def test_a_file_as_ros2_canopen_has_them_is_read(tmp_path):
     ]  # fmt: skip
 
 
+OF_TODAY = """\
+options: {dcf_path: "@BUS_CONFIG_PATH@/files"}
+master: {node_id: 1, driver: "ros2_canopen::MasterDriver", package: canopen_master_driver, sync_period: 10000}
+defaults: {dcf: "drive.eds", driver: "ros2_canopen::Cia402Driver", package: canopen_402_driver, perod: 10}
+nodes:
+  axis_1: {node_id: 2, diagnostics: {enable: true, period: 1000}}
+  axis_2: {node_id: 3, dcf: "@BUS_CONFIG_PATH@/files/more/drive.eds"}
+  axis_3: {node_id: 4, eds: drive.eds, dcf_path: "/elsewhere/install/share"}
+  axis_4: {dcf: made.dcf, dcf_path: "."}
+boot_timeout: 3000
+"""
+
+
+def test_slaves_under_nodes_with_common_keys_and_folders_are_read(tmp_path):
+    """The third folder is that of another machine, the fourth node has its id from the DCF."""
+    (tmp_path / "files" / "more").mkdir(parents=True)
+    for place in ("files/drive.eds", "files/more/drive.eds", "drive.eds"):
+        (tmp_path / place).write_text("[FileInfo]\n")
+    (tmp_path / "made.dcf").write_text("[DeviceComissioning]\nNodeID=5\n")
+    (tmp_path / "bus.yml").write_text(OF_TODAY)
+    said = []
+    found = read_bus_yml(tmp_path / "bus.yml", said.append)
+    assert [(node.name, node.node_id, str(node.eds.resolve().relative_to(tmp_path.resolve()))) for node in found] == [
+        ("axis_1", 2, "files/drive.eds"),
+        ("axis_2", 3, "files/more/drive.eds"),
+        ("axis_3", 4, "drive.eds"),
+        ("axis_4", 5, "made.dcf"),
+    ]
+    assert [line.partition(": ")[2] for line in said] == [
+        "boot_timeout: not understood, passed over",
+        "defaults: perod: not understood, passed over; did you mean period?",
+    ]
+
+
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
         ("- 1", "expected the nodes of a bus by name, got list"),
         ("a: {", "no YAML"),
-        ("master: {node_id: 1}", "no node besides"),
+        ("master: {node_id: 1}", "no node under nodes, and none besides"),
+        (
+            "nodes: {a: {node_id: 2, dcf: x.eds}}\na: {node_id: 3, dcf: x.eds}",
+            "a: stands under nodes and beside master",
+        ),
+        ("nodes: [a]", "nodes: expected keys and values"),
+        ("nodes: {a: {dcf: x.eds}}", "a: node_id: expected an integer, got None"),
         ("a: 3", "a: expected keys and values"),
         ("a: {node_id: 200, dcf: x.eds}", "a: node_id: expected 1 to 127, got 200"),
         ("a: {node_id: two, dcf: x.eds}", "a: node_id: expected an integer, got 'two'"),

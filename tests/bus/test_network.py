@@ -12,6 +12,8 @@ from canopen.sdo import SdoAbortedError, SdoCommunicationError
 
 from canprobe.bus.lockstep import LockstepBus, Participant
 from canprobe.bus.network import (
+    MAX_UPLOAD_BYTES,
+    TRANSFER_TIMEOUTS,
     Lss,
     LssAnswerError,
     PumpedNetwork,
@@ -131,6 +133,92 @@ def test_nodes_are_served_side_by_side_and_requests_sent_again_are_counted(cell:
     assert hold_dialogues(network, {6: keep(6), 5: keep(5)}, timeout_s=0.2, retries=2) == {6: 1, 5: 0}
     assert (list(read), read[6]) == ([5, 6], b"\x78\x56\x34\x12")
     assert bus.clock.now_ns() == 300 * MS
+
+
+class Segments(LocalServer):
+    """Answers a read of 1008h:00 with given segments, the last of them again and again, each after a delay."""
+
+    def __init__(self, announced: int | None, *segments: str, delay_ns: int = 0) -> None:
+        super().__init__(5)
+        size = (announced or 0).to_bytes(4, "little")
+        self.head = bytes((0x40 if announced is None else 0x41, 0x08, 0x10, 0x00)) + size
+        self.segments, self.delay_ns = list(segments), delay_ns
+        self.asked = 0
+        self.aborts: list[tuple[str, int]] = []
+
+    def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
+        if data[0] == 0x80:
+            self.aborts.append((data[1:4].hex(), int.from_bytes(data[4:], "little")))
+            return ()
+        if data[0] == 0x40:
+            self.asked = 0
+            return [(0x585, self.head)]
+        segment = bytes.fromhex(self.segments[min(self.asked, len(self.segments) - 1)])
+        self.asked += 1
+        answer = (0x585, (bytes((segment[0] | data[0] & 0x10,)) + segment[1:]).ljust(8, b"\0"))
+        if not self.delay_ns:
+            return [answer]
+        self.say(t_ns + self.delay_ns, *answer)
+        return ()
+
+
+FULL, EMPTY = "00" + b"abcdefg".hex(), "0e"
+
+
+@pytest.mark.parametrize(
+    ("server", "code", "why"),
+    [
+        (Segments(20, FULL), 0x06070012, "20 bytes announced, more sent"),
+        (Segments(20, FULL, "0b6162"), 0x06070013, "20 bytes announced, 9 sent"),
+        (Segments(9, FULL, "01" + b"abcdefg".hex()), 0x06070012, "9 bytes announced, more sent"),
+        (Segments(0, "0d61"), 0x06070012, "0 bytes announced, more sent"),
+        (Segments(None, FULL), 0x05040005, f"no end after {MAX_UPLOAD_BYTES} bytes"),
+        (Segments(0xFFFFFFFF, FULL), 0x05040005, f"announced, {MAX_UPLOAD_BYTES} at most"),
+        (Segments(None, EMPTY), 0x08000000, "a segment without a byte that is not the last"),
+        (Segments(20, FULL, EMPTY), 0x08000000, "a segment without a byte that is not the last"),
+        (Segments(14, "10" + b"abcdefg".hex()), 0x05030000, "Toggle bit mismatch"),
+    ],
+)
+def test_a_transfer_that_is_not_as_announced_is_one_failed_read_with_an_abort(
+    server: Segments, code: int, why: str
+) -> None:
+    """CiA 301, SDO abort codes: too long, too short, out of memory, general error, toggle bit not alternated."""
+    bus = LockstepBus(VirtualClock())
+    bus.attach(server)
+    network = PumpedNetwork(bus.port())
+    with pytest.raises(SdoCommunicationError, match=why):
+        held(network, upload(0x1008, 0))
+    assert server.aborts == [("081000", code)]
+    assert server.asked <= MAX_UPLOAD_BYTES // 7 + 1
+    server.head, server.segments = b"\x41\x08\x10\x00\x07\0\0\0", ["01" + b"abcdefg".hex()]
+    assert held(network, upload(0x1008, 0)) == b"abcdefg", "the next read is as if nothing had been"
+
+
+@pytest.mark.parametrize(
+    ("announced", "segments", "data"),
+    [
+        (600, [FULL] * 85 + ["05" + b"abcde".hex()], b"abcdefg" * 85 + b"abcde"),
+        (None, [FULL] * 85 + ["05" + b"abcde".hex()], b"abcdefg" * 85 + b"abcde"),
+        (14, [FULL, FULL, "0f"], b"abcdefg" * 2),
+        (0, ["0f"], b""),
+    ],
+)
+def test_a_size_that_is_announced_and_delivered_is_taken(
+    announced: int | None, segments: list[str], data: bytes
+) -> None:
+    bus = LockstepBus(VirtualClock())
+    bus.attach(server := Segments(announced, *segments))
+    assert (held(PumpedNetwork(bus.port()), upload(0x1008, 0)), server.aborts) == (data, [])
+
+
+def test_a_transfer_that_creeps_ends_with_one_failed_read() -> None:
+    """Each segment comes in time, and there is no end of them."""
+    bus, server = LockstepBus(VirtualClock()), Segments(None, "0c61", delay_ns=400 * MS)
+    bus.attach(server)
+    with pytest.raises(SdoTimeoutError, match="SDO transfer not complete after 5 s"):
+        held(PumpedNetwork(bus.port()), upload(0x1008, 0), timeout_s=0.5, retries=2)
+    assert bus.clock.now_ns() == 500 * MS * TRANSFER_TIMEOUTS
+    assert server.aborts == [("081000", 0x05040000)]
 
 
 @pytest.mark.parametrize("stale", [b"\x43\x18\x10\x01\x01\0\0\0", b"\x60\x00\x20\x00\0\0\0\0", b"\x43\x00\x20"])

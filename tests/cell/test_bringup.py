@@ -564,6 +564,25 @@ def test_drives_of_another_make_are_brought_up_and_moved(tmp_path):
     assert undrawn_run(scene, out=tmp_path / "again", duration_s=0.2).plan.nodes[0].identity.vendor_id == 0xAB
 
 
+def test_drives_whose_file_has_oddities_that_nobody_uses_are_planned_and_run(tmp_path):
+    """Values and types that other tools read or that mean nothing, limits and a revision that nobody filled in."""
+    odd = [("0x7", "0.0"), ("0x15", "0x1234LL"), ("0x7", "0x00 00 01 00"), ("UDINT", "1"), ("", "1"), ("0x5", "off")]
+    text = eds_path("puma260_joint").read_text(encoding="ascii")
+    text = re.sub(r"(\[1018sub3\][^\[]*DefaultValue=)\w+", r"\g<1>0", text)
+    text = re.sub(r"\[607A\]", "[607A]\nLowLimit=0x7FFFFFFF\nHighLimit=0x80000000", text)
+    text = re.sub(r"\[(1017|60C2sub1)\]", r"[\1]\nLowLimit=0\nHighLimit=0", text)
+    for number, (kind, value) in enumerate(odd):
+        text += (
+            f"\n[5FF{number}]\nParameterName=X\nObjectType=7\nDataType={kind}\nAccessType=rw\nDefaultValue={value}\n"
+        )
+    (tmp_path / "odd.eds").write_text(text)
+    scene = canprobe.load_scene("free")
+    scene = replace(scene, arm=replace(scene.arm, eds=str(tmp_path / "odd.eds")))
+    assert canprobe.plan(scene).nodes[0].identity.revision_number is None
+    result = undrawn_run(scene, out=tmp_path / "out", duration_s=0.2)
+    assert result.summary["completed"] and result.summary["faults"] == []
+
+
 @pytest.mark.parametrize("fixed", [True, False])
 def test_drives_that_send_no_torque_are_run_and_logged_without(tmp_path, fixed):
     scene = without_torque(canprobe.load_scene("free"), tmp_path, fixed=fixed)
@@ -602,5 +621,40 @@ def test_an_interpolation_time_that_cannot_be_written_must_be_the_right_one(tmp_
         with session:
             assert done_to(session) == ["configured, software 1.0"] * 6
     else:
-        with pytest.raises(NodeError, match=r"^node 5: \(joint 5\) write of 60C2h:01 = 0x32 failed"):
+        with pytest.raises(
+            NodeError,
+            match=r"^node 5: \(joint 5\) write of 60C2h:01 = 0x32 failed.* keeps 25 · 10\^-4 s: cycle.rate_hz = 400 ",
+        ):
             session.__enter__()
+
+
+def test_a_drive_whose_unit_is_fixed_is_given_the_rates_that_fit(tmp_path):
+    """60C2h:01 is taken and :02 stays at milliseconds: 2.5 ms lie between 3 ms and 2 ms."""
+
+    def fix(node):
+        if node.node_id == 5:
+            node.dictionary.set_default(0x60C2, 2, -3)
+            node.dictionary.on_check(0x60C2, refuse_units)
+
+    def refuse_units(subindex, value):
+        if subindex == 2 and value != -3:
+            raise SdoAbort(Abort.VALUE)
+
+    with pytest.raises(NodeError, match=r"counts in 10\^-3 s: cycle.rate_hz = 333.333 or cycle.rate_hz = 500 fits"):
+        open_session(tmp_path, change=fix).__enter__()
+
+
+def test_a_drive_without_60c2h_follows_the_period_of_sync(tmp_path):
+    """1006h alone tells it the period, so the write of it is required, and the emulated drive takes it."""
+    eds = tmp_path / "follower.eds"
+    eds.write_text(re.sub(r"(?s)\[60C2(sub\d)?\].*?(?=\n\[)", "", eds_path("puma260_joint").read_text()))
+    scene = canprobe.load_scene("free")
+    scene = replace(scene, arm=replace(scene.arm, eds=str(eds)))
+    plan = canprobe.plan(scene)
+    (write,) = [one for one in make_setups(plan)[0].writes if one.index == 0x1006 and one.value]
+    assert (write.value, write.absence, plan.nodes[0].interpolation) == (2500, None, ())
+    told = undrawn_run(canprobe.load_scene("free"), out=tmp_path / "told", duration_s=0.5)
+    result = undrawn_run(scene, out=tmp_path / "out", duration_s=0.5)
+    assert result.summary["completed"] and result.summary["faults"] == []
+    assert np.ptp(result.truth["q"][:, 5]) > 0.01
+    assert np.array_equal(result.truth["q"], told.truth["q"]), "as the drive that is given 60C2h"

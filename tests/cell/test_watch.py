@@ -61,6 +61,15 @@ def test_what_a_device_said_before_the_start_is_over():
     assert watch.news() == []
 
 
+@pytest.mark.parametrize(("code", "alarms"), [(0x0000, 0), (0x00FF, 0), (0x0100, 1), (0x0856, 1)])
+def test_only_00xxh_is_no_error(code, alarms):
+    """Source: CiA 301, emergency error codes."""
+    watch = a_watch()
+    told(watch, 1, code)
+    assert len(watch.news()) == alarms
+    assert (watch.device_alarm is not None) == bool(alarms)
+
+
 def test_memory_does_not_grow_with_what_is_said():
     watch = a_watch()
     for _ in range(UNTOLD):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import tomllib
 
@@ -108,10 +109,40 @@ def test_the_cell_has_the_rate_of_its_drives_and_images_that_divide_it(tmp_path,
 
 def test_an_eds_that_cannot_be_driven_is_to_be_corrected(tmp_path, urdf, capsys):
     eds = tmp_path / "bad.eds"
-    eds.write_text(eds_path("puma260_joint").read_text().replace("=0x60C2\n", "=0x6100\n").replace("[60C2", "[6100"))
+    eds.write_text(eds_path("puma260_joint").read_text().replace("60C2", "6100").replace("1006", "1FF6"))
     assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf), "--eds", str(eds)]) == 2
     said = capsys.readouterr().err
-    assert "60C2h" in said and f"correct the EDS (or the URDF) that this names, remove the folder {tmp_path}" in said
+    assert (
+        "60C2h" in said and f"if it is right, this cell needs other devices; then remove the folder {tmp_path}" in said
+    )
+
+
+def only(folder, name, *rates):
+    """The EDS of the packaged drive with these bit rates, kbit/s."""
+    path = folder / name
+    text = eds_path("puma260_joint").read_text()
+    path.write_text(re.sub(r"BaudRate_(\d+)=\d", lambda m: f"BaudRate_{m[1]}={int(int(m[1]) in rates)}", text))
+    return str(path)
+
+
+def test_the_bus_has_the_fastest_bit_rate_that_all_files_have(tmp_path, capsys):
+    files = [only(tmp_path, "slow.eds", 125, 500), *[only(tmp_path, "fast.eds", 125, 500, 1000)] * 5]
+    assert main(["init", str(tmp_path / "cell"), *(word for file in files for word in ("--eds", file))]) == 0
+    assert tomllib.loads((tmp_path / "cell" / "cell.toml").read_text())["bus"]["bitrate"] == 500_000
+
+
+def test_a_drive_of_250_kbit_is_planned_at_once(tmp_path, urdf, capsys):
+    eds = only(tmp_path, "only_250k.eds", 250)
+    assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf), "--eds", eds]) == 0
+    assert tomllib.loads((tmp_path / "cell" / "cell.toml").read_text())["bus"]["bitrate"] == 250_000
+    assert main(["plan", str(tmp_path / "cell" / "first.toml")]) == 0
+
+
+def test_files_without_a_common_bit_rate_are_named(tmp_path, urdf, capsys):
+    eds = only(tmp_path, "odd.eds", 800)
+    assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf), "--eds", eds]) == 2
+    said = capsys.readouterr().err
+    assert f"{eds} has 800000 bit/s; tactile_array has" in said and "correct" not in said
 
 
 def test_why_the_first_scene_does_not_scan_is_said(tmp_path, urdf, capsys):

@@ -7,7 +7,7 @@ import json
 import pytest
 
 import canprobe
-from canprobe.bus.lockstep import LockstepBus
+from canprobe.bus.lockstep import LockstepBus, Participant
 from canprobe.bus.port import VirtualClock
 from canprobe.cli import main
 from canprobe.emulator.world import make_world
@@ -53,6 +53,98 @@ def ids(nodes):
 
 def scan(*words):
     return main(["scan", *words, *CHANNEL])
+
+
+class Answering(Participant):
+    """A node that answers reads with given values, late, on request also from a second device; or only beats."""
+
+    def __init__(self, node_id, values=None, *, late_s=0.0, serials=(9,), beats=b""):
+        self.node_id, self.values, self.late_ns, self.serials = node_id, values, round(late_s * 1e9), serials
+        self.beats, self.unsent, self.later = beats, b"", []
+
+    @property
+    def next_deadline_ns(self):
+        return min((t_ns for t_ns, _ in self.later), default=None)
+
+    def start(self, t_ns):
+        if self.beats:
+            self.later.append((t_ns + 900_000_000, (0x700 + self.node_id, self.beats)))
+        return ()
+
+    def advance(self, t_ns):
+        due = [frame for at_ns, frame in self.later if at_ns <= t_ns]
+        self.later = [entry for entry in self.later if entry[0] > t_ns]
+        if (0x700 + self.node_id, self.beats) in due:
+            self.start(t_ns)
+        return due
+
+    def receive(self, can_id, data, t_ns):
+        if can_id != 0x600 + self.node_id or self.values is None or data[0] == 0x80:
+            return ()
+        frames = [(0x580 + self.node_id, answer.ljust(8, b"\0")) for answer in self.answers(data)]
+        self.later += [(t_ns + self.late_ns, frame) for frame in frames if self.late_ns]
+        return () if self.late_ns else frames
+
+    def answers(self, data):
+        place = data[1:4]
+        if data[0] & 0xE0 == 0x60:
+            piece, self.unsent = self.unsent[:7], self.unsent[7:]
+            return [bytes((data[0] & 0x10 | 7 - len(piece) << 1 | (not self.unsent),)) + piece.ljust(7, b"\0")]
+        value = self.values.get((place[0] | place[1] << 8, place[2]))
+        if place == b"\x18\x10\x04":
+            return [b"\x43" + place + serial.to_bytes(4, "little") for serial in self.serials]
+        if value is None:
+            return [b"\x80" + place + 0x06020000.to_bytes(4, "little")]
+        if len(value) <= 4:
+            return [bytes((0x43 | 4 - len(value) << 2,)) + place + value.ljust(4, b"\0")]
+        self.unsent = value
+        return [b"\x41" + place + len(value).to_bytes(4, "little")]
+
+
+IDENTITY = {(0x1018, sub): number.to_bytes(4, "little") for sub, number in ((1, 0x2E), (2, 0x77), (3, 0x10001))}
+
+
+def scanned(capsys, *words):
+    assert scan("--json", *words) == 0
+    return {node["node_id"]: node for node in json.loads(capsys.readouterr().out)}
+
+
+def test_a_scan_lists_nodes_that_are_late_short_doubled_or_only_beat(bus, capsys):
+    """Right values: 49 µ in Latin-1 is B5h, in UTF-8 C2h B5h; 1018h has numbers of four bytes; 4 is stopped."""
+    names = {10: "µDrive, long".encode(), 11: "µDrive, long".encode("latin-1")}
+    for node_id, name in names.items():
+        bus.attach(Answering(node_id, {**IDENTITY, (0x1008, 0): name}))
+    bus.attach(Answering(13, IDENTITY, late_s=0.4))
+    bus.attach(Answering(14, IDENTITY, serials=(9, 10), beats=b"\x7f"))
+    bus.attach(Answering(20, {**IDENTITY, (0x1018, 1): b"\x2e\0"}))
+    bus.attach(Answering(22, beats=b"\x04"))
+    bus.attach(Answering(23, beats=b"\x05"))
+    found = scanned(capsys)
+    assert list(found) == [10, 11, 13, 14, 20, 22, 23]
+    assert [found[n]["device_name"] for n in (10, 11, 13)] == ["µDrive, long", "µDrive, long", None]
+    assert {found[n]["serial_number"] for n in (10, 11, 13, 14, 20)} == {9}
+    assert (found[20]["vendor_id"], found[20]["product_code"]) == (None, 0x77)
+    assert {n: (node["devices"], node["state"]) for n, node in found.items()} == {
+        **dict.fromkeys((10, 11, 13, 20), (1, None)),
+        14: (2, "PRE_OPERATIONAL"),
+        22: (0, "STOPPED"),
+        23: (0, "OPERATIONAL"),
+    }
+    assert found[14]["serial_numbers"] == [9, 10]
+    assert scan() == 0
+    out = capsys.readouterr().out
+    assert "node 14: 2 devices answer with this id, serial numbers 0x9 and 0xa: disconnect one" in out
+    assert "node 22: sends heartbeats (STOPPED), but answers no SDO request; a stopped node answers none" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "serials"),
+    [((), {13: 9, 15: None}), (("--timeout", "0.3"), {13: None}), (("--timeout", "2"), {13: 9, 15: 9})],
+)
+def test_a_scan_waits_as_long_as_bring_up_or_as_asked(bus, capsys, words, serials):
+    bus.attach(Answering(13, IDENTITY, late_s=0.45))
+    bus.attach(Answering(15, IDENTITY, late_s=1.9))
+    assert {node_id: node["serial_number"] for node_id, node in scanned(capsys, *words).items()} == serials
 
 
 def test_a_user_finds_the_blank_nodes_names_them_and_scans_again(serve, capsys):

@@ -386,8 +386,10 @@ def test_what_cannot_be_loaded_is_named(source, node_id, words):
         (b"", "no object"),
         (b"[DeviceInfo]\n", "no object"),
         (b"\xff\xfe\x00", "text"),
-        (b"[DeviceInfo]\n[2000]\nObjectType=0x7\n", "line 2 [2000] DataType: missing"),
-        (b"[DeviceInfo]\n[1000]\nParameterName=x\nDataType=seven\nAccessType=ro\n", "seven"),
+        (
+            b"[DeviceInfo]\n[1018]\nObjectType=9\n[1018sub1]\nDataType=7\nDefaultValue=who\n",
+            "line 6 [1018sub1] DefaultValue: 'who'",
+        ),
         (
             b"[DeviceInfo]\n[1000sub1]\nParameterName=x\nDataType=0x7\nAccessType=ro\n",
             "[1000]: the standard has a variable",

@@ -35,6 +35,26 @@ def test_sums_in_any_order_and_case(number, node_id, order, word):
     assert parse_sum(terms[1], node_id, silent) == (number, False)
 
 
+@pytest.mark.parametrize(
+    ("text", "number"),
+    [
+        ("0.0", 0), ("12.", 12), ("-3.00", -3), ("0x1234LL", 0x1234), ("100UL", 100), ("7u", 7), ("0xFFul", 0xFF),
+        ("0x00 00 01 00", 256), ("0x0001_0000", 0x10000), ("1_000_000", 10**6), ("0x10+NODEID", 21),
+        ("($NODEID + 0x180)", 0x185), ("${NODEID}+1", 6), ("$(NODEID)+1", 6), ("Node-ID + 1", 6), ("+5", 5),
+    ],
+)  # fmt: skip
+def test_numbers_as_other_tools_write_them_are_taken_with_a_remark(text, number):
+    remarks = []
+    assert parse_sum(text, 5, remarks.append)[0] == number
+    assert bool(remarks) == (text != "+5")
+
+
+@pytest.mark.parametrize("text", ["0.5", "1_", "0x1__", "0x 1", "L", "UL", "1.0.0", "(1", "NODE", "1 000"])
+def test_what_other_tools_do_not_write_is_no_number(text):
+    with pytest.raises(ValueError):
+        parse_sum(text, 1, silent)
+
+
 @pytest.mark.parametrize("text", ["", "x", "1A", "0x", "--1", "1 2", "$NODEID+", "+$NODEID", "0xG", "1e3", "٣"])
 def test_what_is_no_number(text):
     with pytest.raises(ValueError):

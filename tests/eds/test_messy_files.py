@@ -66,6 +66,16 @@ VALUES = {
     "bare.eds": {(0x1000, 0): 0, (0x1001, 0): None, (0x1018, 1): 0, (0x1800, 0): 3, (0x2000, 0): 0x1234},
     "duplicates.eds": {(0x1018, 1): 0x123, (0x2000, 0): 1, (0x20AB, 0): 4},
     "limits.eds": {(0x2001, 0): 50},
+    "unreadable.eds": {
+        **{(index, 0): None for index in range(0x2001, 0x2007)},
+        (0x2007, 0): 0,
+        (0x2008, 0): 0x1234,
+        (0x2009, 0): 100,
+        (0x200A, 0): 0x100,
+        (0x200B, 0): 0x10000,
+        (0x200C, 0): 0x185,
+        (0x200D, 0): 0xFFFFFFFF,
+    },
     "types.eds": {
         (0x1017, 0): 200,
         (0x2002, 0): 5,
@@ -186,6 +196,27 @@ def test_a_master_takes_the_file_at_its_word_and_a_served_node_is_complete():
     path = FOLDER / "bare.eds"
     assert not {0x1000, 0x1018} & set(load_eds(path, NODE_ID))
     assert {0x1000, 0x1018} <= set(check_eds(path, NODE_ID).dictionary)
+
+
+def test_a_type_that_the_file_lacks_is_that_of_the_standard(tmp_path):
+    """CiA 402-2: 60C2h:01 is UNSIGNED8, 607Fh UNSIGNED32, 605Ah INTEGER16; CiA 301: each sub-index 0 is UNSIGNED8."""
+    path, text = tmp_path / "untyped.eds", eds_path("puma260_joint").read_text()
+    for name in ("60C2sub0", "60C2sub1", "607F", "605A"):
+        text = re.sub(rf"(\[{name}\][^\[]*?)DataType=\w+\n", r"\1", text)
+    path.write_text(text)
+    od = load_eds(path, 1)
+    found = [od[0x60C2][0], od[0x60C2][1], od[0x607F], od[0x605A]]
+    assert [(one.data_type, one.default) for one in found[:2]] == [(5, 2), (5, 25)]
+    assert [one.data_type for one in found] == [5, 5, 7, 3]
+
+
+def test_of_a_drive_with_several_axes_the_check_says_which_is_driven(tmp_path):
+    """CiA 402-1: the objects of axis n are 800h · (n - 1) above those of the first."""
+    path = tmp_path / "axes.eds"
+    section = "\n[{:X}]\nParameterName=Controlword\nObjectType=7\nDataType=6\nAccessType=rw\n"
+    path.write_text(eds_path("puma260_joint").read_text() + section.format(0x6840) + section.format(0x7040))
+    said = [str(one) for one in check_eds(path).warnings]
+    assert any("further axes (controlwords 6840h, 7040h); only the first is driven" in one for one in said)
 
 
 @pytest.mark.parametrize("name", ["puma260_joint", "tactile_array"])

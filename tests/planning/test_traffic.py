@@ -362,8 +362,52 @@ class TestOtherDevices:
         assert "RPDO1 has the fixed mapping 60400010h, 60FF0020h" in problem
 
     def test_missing_objects_are_named(self, edit):
-        problems = reasons(edit((r"\[60C2\]", "[5FFF]"), (r"\[60C2sub", "[5FFFsub"), (r"=0x60C2", "=0x5FFF")))
-        assert any("60C2h (interpolation time period) is missing" in problem for problem in problems)
+        no_60c2 = (r"\[60C2\]", "[5FFF]"), (r"\[60C2sub", "[5FFFsub"), (r"=0x60C2", "=0x5FFF")
+        problems = reasons(edit(*no_60c2, (r"\[1006\]", "[5FFE]"), (r"=0x1006", "=0x5FFE")))
+        said = "objects 60C2h (interpolation time period) and 1006h (period of SYNC) are missing"
+        assert any(said in problem for problem in problems)
+
+    @pytest.mark.parametrize(
+        ("keys", "said"),
+        [
+            (r"AccessType=ro", "(other.eds: 1006h is ro, 0 µs); no period suits all drives"),
+            (r"AccessType=ro\nDefaultValue=2500", None),
+            (r"AccessType=ro\nDefaultValue=4000", "1006h is ro, 4000 µs); take 250 Hz"),
+            (r"LowLimit=4000", "1006h takes 4000 to 4294967295 µs); take 250 Hz"),
+        ],
+    )
+    def test_a_drive_without_60c2h_takes_the_period_that_1006h_takes(self, edit, keys, said):
+        """Of two equal keys in a section the first counts."""
+        no_60c2 = (r"\[60C2\]", "[5FFF]"), (r"\[60C2sub", "[5FFFsub"), (r"=0x60C2", "=0x5FFF")
+        scene = edit(*no_60c2, (r"\[1006\]", rf"[1006]\n{keys}"))
+        if said is None:
+            assert canprobe.plan(scene)
+        else:
+            assert any(said in problem.replace(f"{scene.arm.eds}", "other.eds") for problem in reasons(scene))
+
+    @pytest.mark.parametrize(
+        ("sub", "keys", "said"),
+        [
+            (
+                1,
+                r"AccessType=ro\nDefaultValue=",
+                "60C2h:01 takes no value by the EDS: no integer, read-only without a default",
+            ),
+            (1, r"DataType=0x9", "60C2h:01 takes no value by the EDS"),
+            (2, r"AccessType=ro\nDefaultValue=3", "60C2h:02 takes no unit of 10^-6 to 10^0 s by the EDS"),
+        ],
+    )
+    def test_an_interpolation_time_that_nothing_fits_is_said_without_a_hole(self, edit, sub, keys, said):
+        problems = reasons(edit((rf"\[60C2sub{sub}\]", rf"[60C2sub{sub}]\n{keys}")))
+        assert any(said in problem for problem in problems)
+
+    def test_axes_beyond_the_first_are_left_out_and_named(self, edit):
+        more = "".join(
+            f"[{index:X}]\nParameterName=Controlword\nObjectType=7\nDataType=6\nAccessType=rw\n\n"
+            for index in (0x6840, 0x7040)
+        )
+        left = dict(canprobe.plan(edit((r"\[6041\]", more + "[6041]"))).left_out)
+        assert "has objects of more axes, from 6800h, 7000h" in left["axes 2, 3 of node 4 (joint 4)"]
 
     def test_abilities_read_from_the_packaged_eds(self):
         device = Abilities.of("puma260_joint.eds", 1)

@@ -139,6 +139,8 @@ def test_short_emcy_data_are_filled():
     [
         (0x0000, "no error"),
         (0x0012, "no error"),
+        (0x0100, "unknown"),
+        (0x0856, "unknown"),
         (0x1234, "generic error"),
         (0x2311, "over-current"),
         (0x3199, "mains voltage"),

@@ -104,7 +104,7 @@ class DriveParameters:
 
     Attributes:
         units: the factor group.
-        interpolation_ns: 60C2h, time to reach a latched target; never 0.
+        interpolation_ns: 60C2h, or 1006h of a drive without it: time to reach a latched target; never 0.
         following_window, following_timeout_ns: 6065h (counts, infinite for none), 6066h.
         position_window, position_time_ns: 6067h (counts, infinite for none), 6068h.
         misses: SYNCs missed before the master is taken for dead: 2000h or 200Eh, whichever the make has; 0: any number.
@@ -134,13 +134,14 @@ class DriveParameters:
         """Take the present values of the dictionary."""
         number = self._dictionary.number
         self.units.read()
-        period_ns = number(0x60C2, 1, 25) * 10 ** max(0, 9 + number(0x60C2, 2, -4))
+        sync_ns, value = number(0x1006) * 1000, number(0x60C2, 1, -1)
+        period_ns = sync_ns if value < 0 else value * 10 ** max(0, 9 + number(0x60C2, 2, -4))
         self.interpolation_ns = period_ns or CONTROL_NS
         self.following_window, self.following_timeout_ns = self._window(0x6065), number(0x6066) * 1_000_000
         self.position_window = self._window(0x6067, DEFAULT_WINDOW)
         self.position_time_ns = number(0x6068) * 1_000_000
         self.misses = number(self._misses[0]) if self._misses else DEFAULT_MISSES
-        cycle_ns = number(0x1006) * 1000 or period_ns
+        cycle_ns = sync_ns or period_ns
         self.patience_ns = self.misses * cycle_ns + cycle_ns // 2 if self.misses else 0
         self.low, self.high = number(0x607D, 1), number(0x607D, 2)
         self.abort_connection, self.quick_stop = number(0x6007, 0, 3), number(0x605A, 0, 2)
