@@ -261,7 +261,7 @@ class CandumpReader:
             self._piped = path.read_bytes()
         if self._piped is None:
             return path.open("rb")
-        return BufferedReader(BytesIO(self._piped))  # type: ignore[arg-type]
+        return BufferedReader(BytesIO(self._piped))
 
     def _no_line(self, text: str) -> UsageError:
         where = f"{self._path}:{self.number}: no candump line: {text[:60]!r}"
