@@ -93,8 +93,8 @@ class Body:
         return Body(self.mass, R @ self.com + T[:3, 3], R @ self.tensor @ R.T)
 
 
-INERTIA_TOLERANCE = 0.01
-"""Share of the largest moment by which the others may miss the triangle inequality: files round their numbers."""
+INERTIA_TOLERANCE = 0.1
+"""Share of the largest moment by which the others may miss the triangle inequality: published numbers are measured."""
 
 
 def impossible_inertia(tensor: Array) -> str | None:

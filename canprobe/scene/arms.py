@@ -136,7 +136,9 @@ def _tensor(section: JointSettings) -> Array:
 
 
 def _refuse_impossible_inertia(sections: Mapping[str, JointSettings]) -> None:
-    found = {name: impossible_inertia(_tensor(section)) for name, section in sections.items()}
+    """Moments of 0 beside others are not known, as of a link that only turns about one axis: they are not compared."""
+    given = {name: section for name, section in sections.items() if min(section.inertia_kg_m2[:3]) != 0.0}
+    found = {name: impossible_inertia(_tensor(section)) for name, section in given.items()}
     problems = [
         f"joints.{name}.inertia_kg_m2: expected xx, yy, zz, xy, xz, yz that a body can have, got {why}"
         for name, why in found.items()

@@ -270,7 +270,10 @@ def load_array(name_or_path: str | Path) -> dict[str, Any]:
     Raises:
         SceneError: with every problem found.
     """
-    return _read_hardware(name_or_path, "array", ArrayFile)[1]
+    document = _read_hardware(name_or_path, "array", ArrayFile)[1]
+    if "sensor" not in document:
+        raise SceneError([f"{name_or_path}: expected an array file, got none of its keys: it needs a section [sensor]"])
+    return document
 
 
 def find_file(name: str, packaged: Mapping[str, Path], what: str) -> Path:
