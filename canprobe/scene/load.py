@@ -23,7 +23,7 @@ from canprobe.errors import PlanError, SceneError, UsageError
 from canprobe.robot.urdf import from_urdf, with_meshes_found
 from canprobe.scene.checks import MismatchError, Only, ScenePath, choices_of, conditions_of, convert
 from canprobe.scene.hardware import ArmSettings, CellInfo
-from canprobe.scene.model import DEFAULT_ARRAY, ArrayFile, Cell, Scene
+from canprobe.scene.model import DEFAULT_ARRAY, TOUCH_KINDS, ArrayFile, Cell, Scene
 from canprobe.scene.rules import SECTIONS_OF_TASK, broken_rules
 
 DEFAULT_CELL = "puma260"
@@ -376,6 +376,11 @@ def _scene(own: Mapping[str, Any], file: str, folder: Path | None) -> Scene:
             reader.complain(section, f'missing: task.kind = "{kind}" needs a section [{section}]: {why}')
         elif need == "never" and section in document:
             reader.complain(section, f'not with task.kind = "{kind}": {why}; remove the section')
+
+    cell = own.get("cell", DEFAULT_CELL)
+    name = cell.get("name") if isinstance(cell, dict) else cell
+    if kind in TOUCH_KINDS and isinstance(task, dict) and "start_mm" not in task and name != DEFAULT_CELL:
+        reader.complain("task.start_mm", f"missing: left out, it is a place of the cell {DEFAULT_CELL}, not of {name}")
 
     def lookup(path: str) -> Any:
         section, _, key = path.partition(".")

@@ -29,7 +29,7 @@ COARSE_RAD = np.radians(15.0)
 STEEPEST = np.cos(np.radians(70.0))
 LAYER = 6.0
 """Spacings below the highest sample of a cell from which on a sample is taken as hidden."""
-EMPTY = 0.02
+EMPTY = 0.1
 """Share of a mesh's grid that has a surface, below which single vertices far away make the grid."""
 MOST_NODES = 1_000_000
 MOST_SAMPLES = 8_000_000

@@ -143,3 +143,10 @@ def test_an_inertia_that_no_body_has_is_refused(moments, why):
     odd = {**sections, name: replace(sections[name], mass_kg=1.0, inertia_kg_m2=tuple(map(float, moments)))}
     with pytest.raises(PlanError, match=rf"joints\.{name}\.inertia_kg_m2: expected .* {why}"):
         arm_model("odd", load_scene("cylinder").arm, odd)
+
+
+def test_a_scene_of_another_cell_says_where_it_touches():
+    text = 'cell = "puma560"\n[scene]\nname = "mine"\n[task]\nkind = "press"\n[object]\nkind = "plane"\n'
+    with pytest.raises(SceneError, match=r"task\.start_mm: missing: .* place of the cell puma260, not of puma560"):
+        parse_scene(text)
+    assert parse_scene(text.replace('"puma560"', '"puma260"')).task.start_mm == (-120.0, -122.5, 374.0)
