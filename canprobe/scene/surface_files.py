@@ -51,7 +51,12 @@ def object_of_file(settings: ObjectSettings, T_base_object: Array) -> PlacedShap
         raise ValueError(f"file: {path}: cannot be read: {error.strerror}") from error
     spacing = (settings.spacing_mm or _SPACING_MM) * _MM
     fit = _mesh(path, changed_ns, settings.unit_mm * _MM, spacing, settings.origin_mm)
-    return Heights(T_base_object, fit.heights, fit.spacing, fit.origin, fit.there)
+    try:
+        return Heights(T_base_object, fit.heights, fit.spacing, fit.origin, fit.there)
+    except ValueError as error:
+        x, y = (1e3 * fit.spacing * (nodes - 1) for nodes in fit.heights.shape)
+        way_out = "remove vertices far away, or give origin_mm"
+        raise ValueError(f"file: {path.name}: the mesh is {x:.3g} mm by {y:.3g} mm; {error}: {way_out}") from error
 
 
 @lru_cache(maxsize=4)
