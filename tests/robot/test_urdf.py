@@ -89,7 +89,7 @@ def test_poses_and_jacobians_are_those_of_pinocchio(arm):
 
 def test_stops_speeds_and_friction_are_those_of_pinocchio(arm):
     read, oracle, _ = arm
-    controllers = {j.get("name"): j.find("safety_controller") for j in ElementTree.parse(oracle.path).iter("joint")}
+    controllers = {j.get("name"): j.find("safety_controller") for j in ElementTree.parse(oracle.path).iterfind("joint")}
     for joint in read.joints:
         its, column = oracle.model.joints[oracle.model.getJointId(joint.name)], oracle.column(joint.name)
         assert joint.prismatic == its.shortname().startswith("JointModelP")
