@@ -11,8 +11,9 @@ import contextlib
 import fcntl
 import re
 import zipfile
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
-from io import FileIO
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from io import BufferedReader, BytesIO, FileIO, TextIOWrapper
 from itertools import starmap
 from pathlib import Path
 from types import TracebackType
@@ -26,12 +27,26 @@ from canprobe.errors import ResultsError, UsageError
 from canprobe.protocol.frames import EFF_FLAG, RTR_FLAG, Frame
 
 # candump log files: `(0000000000.002500) can0 181#37060000`, time with six digits, from 0 in a recording of ours.
+# candump pads the channel on the left (several interfaces), writes nine digits with -N, the DLC of a frame of 8 bytes
+# behind "_" with -8, and a line of its own for lost frames with -d.
 
 _LINE = re.compile(
-    r"\((?P<s>\d+)\.(?P<us>\d{6})\) (?P<channel>\S+) (?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#"
-    r"(?:R(?P<length>[0-8]?)|#(?P<flags>[0-9A-Fa-f])(?P<fd>(?:[0-9A-Fa-f]{2}){0,64})|"
-    r"(?P<data>(?:[0-9A-Fa-f]{2}){0,8}))(?: [RT])?"
+    r"\((?P<s>\d+)\.(?P<fraction>\d{6}(?:\d{3})?)\) +(?P<channel>\S+) (?:(?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#"
+    r"(?:R(?:[0-7]?|8(?:_[9A-Fa-f])?)|#[0-9A-Fa-f](?P<fd>(?:[0-9A-Fa-f]{2}){0,64})|"
+    r"(?P<data>(?:[0-9A-Fa-f]{2}){0,7}|(?:[0-9A-Fa-f]{2}){8}(?:_[9A-Fa-f])?))|"
+    r"(?P<xl>[0-9A-Fa-f]{5}#[0-9A-Fa-f]{2}:[0-9A-Fa-f]{2}:[0-9A-Fa-f]{8}#(?:[0-9A-Fa-f]{2})*))(?: [RT])?|"
+    r"DROPCOUNT: dropped (?P<dropped>\d+) CAN frames? on '(?P<socket>[^']+)' socket \(total drops \d+\)"
 )
+_ON_SCREEN = re.compile(r" *(?P<stamp>\([-0-9: .]+\))? *\S+ +(?:TX|RX)?[ \-BE]*[0-9A-Fa-f]{3,8} +\[ *\d+\].*")
+"""What candump prints without -l and -L: `(000.002500)  can0  181   [4]  37 06 00 00`."""
+_ENCODINGS = {
+    b"\xff\xfe": "utf-16",
+    b"\xfe\xff": "utf-16",
+    b"(\0": "utf-16-le",
+    b"\0(": "utf-16-be",
+    b"\xef\xbb": "utf-8-sig",
+}
+"""By the first two bytes; anything else is ASCII."""
 
 
 CLASSIC_BYTES = 8
@@ -187,54 +202,85 @@ def _opened_alone(path: str | Path) -> FileIO:
     return file
 
 
-def read_candump(
-    path: str | Path, only: Container[int] | None = None, *, whole: bool = False
-) -> Iterator[tuple[int, str, int, bytes]]:
-    """Read a candump log.
+CandumpLine = tuple[int, str, int, bytes]
+"""A frame of a log: t_ns, channel, can_id with the flags of `canprobe.bus.port`, data."""
+
+
+class CandumpReader:
+    """Reads a candump log, line by line: an iterable of `CandumpLine`. What is no CAN or CAN FD frame is counted.
 
     Args:
-        path: the log.
-        only: 11-bit identifiers that are wanted; other lines are passed over unread, a torn one too. None: all.
+        path: the log, in ASCII, UTF-8 or UTF-16.
         whole: a torn last line is an error like any other; else it is passed over, as a logger that is killed leaves
             one.
 
-    Yields:
-        (t_ns, channel, can_id, data) of each line; can_id with the flags of `canprobe.bus.port`.
-
-    Raises:
-        UsageError: the file cannot be read, or a line is not one of candump's; with file and line number.
+    Attributes:
+        number: of the line that was read last, from 1.
+        lost: frames of each channel that candump did not receive (its option -d).
+        xl: CAN XL frames of each channel.
     """
-    try:
-        with Path(path).open(encoding="ascii", errors="replace") as file:
-            for number, line in enumerate(file, 1):
-                if only is not None and _id_of(line) not in only:
-                    continue
-                text = line.rstrip("\r\n")
-                if text and (whole or line.endswith("\n") or _LINE.fullmatch(text)):
-                    yield _parse_line(text, path, number)
-    except OSError as error:
-        raise UsageError(f"{path}: {error.strerror}") from error
 
+    def __init__(self, path: str | Path, *, whole: bool = False) -> None:
+        self.number = 0
+        self.lost: Counter[str] = Counter()
+        self.xl: Counter[str] = Counter()
+        self._path, self._whole = path, whole
+        self._piped: bytes | None = None
 
-def _id_of(line: str) -> int:
-    """The 11-bit identifier of a line without reading the rest of it; −1 where there is none."""
-    name = line.partition("#")[0].rpartition(" ")[2]
-    try:
-        return int(name, 16) if len(name) == 3 else -1
-    except ValueError:
-        return -1
+    def __iter__(self) -> Iterator[CandumpLine]:
+        """Yield the frames.
 
+        Raises:
+            UsageError: the file cannot be read, or a line is not one of candump's; with file and line number.
+        """
+        try:
+            file = self._opened()
+            encoding = _ENCODINGS.get(file.peek(2)[:2], "ascii")
+            with TextIOWrapper(file, encoding, errors="replace") as lines:
+                for self.number, line in enumerate(lines, 1):
+                    text = line.rstrip("\r\n")
+                    match = _LINE.fullmatch(text)
+                    if match is None:
+                        if text and (self._whole or line.endswith("\n")):
+                            raise self._no_line(text)
+                    elif match["dropped"]:
+                        self.lost[match["socket"]] += int(match["dropped"])
+                    elif match["xl"]:
+                        self.xl[match["channel"]] += 1
+                    else:
+                        yield _frame_of(match)
+        except OSError as error:
+            raise UsageError(f"{self._path}: {error.strerror}") from error
 
-def _parse_line(text: str, path: str | Path, number: int) -> tuple[int, str, int, bytes]:
-    match = _LINE.fullmatch(text)
-    if match is None:
+    def _opened(self) -> BufferedReader:
+        """The file from its start; what comes through a pipe is kept, as it comes once."""
+        self.lost.clear()
+        self.xl.clear()
+        path = Path(self._path)
+        if self._piped is None and path.is_fifo():
+            self._piped = path.read_bytes()
+        if self._piped is None:
+            return path.open("rb")
+        return BufferedReader(BytesIO(self._piped))
+
+    def _no_line(self, text: str) -> UsageError:
+        where = f"{self._path}:{self.number}: no candump line: {text[:60]!r}"
+        if (shown := _ON_SCREEN.fullmatch(text)) is not None:
+            short = re.fullmatch(r"\(\d{3}\.\d+\)", shown["stamp"] or "")
+            stamps = " with stamps that are differences (-td) or count from its first frame (-tz)" if short else ""
+            return UsageError(f"{where}; it is what candump prints on a screen{stamps}; record with `candump -l` or -L")
         form = "(seconds.microseconds) channel ID#DATA, or ID##fDATA for CAN FD"
-        raise UsageError(
-            f"{path}:{number}: no candump line: {text[:60]!r}; expected '{form}'; python-can's can_logconvert converts"
-            " other logs"
-        )
-    t_ns = (int(match["s"]) * 1_000_000 + int(match["us"])) * 1000
-    return t_ns, match["channel"], _parse_id(match), bytes.fromhex(match["fd"] or match["data"] or "")
+        return UsageError(f"{where}; expected '{form}'; python-can's can_logconvert converts other logs")
+
+
+def read_candump(path: str | Path, *, whole: bool = False) -> Iterator[CandumpLine]:
+    """Read the frames of a candump log as they stand there: see `CandumpReader`."""
+    return iter(CandumpReader(path, whole=whole))
+
+
+def _frame_of(match: re.Match[str]) -> CandumpLine:
+    t_ns = int(match["s"]) * 1_000_000_000 + int(match["fraction"].ljust(9, "0"))
+    return t_ns, match["channel"], _parse_id(match), bytes.fromhex(match["fd"] or (match["data"] or "")[:16])
 
 
 def _parse_id(match: re.Match[str]) -> int:

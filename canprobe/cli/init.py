@@ -8,11 +8,13 @@ rate that all of them and the array have. What no file says (counts a turn, gear
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from canprobe.cli.output import say
 from canprobe.cli.parser import Parser, folder_path
 from canprobe.errors import PlanError, UsageError
 
@@ -32,6 +34,7 @@ _ARRAY_EDS = "tactile_array"
 _RATES_HZ = (400, 1000 / 3, 250, 200, 125, 100, 50)
 _SENSOR_HZ = 200
 _TRIES = 400
+_TILT_TOLD_RAD = math.radians(20)
 _GEAR, _COUNTS_PER_TURN, _COUNTS_PER_M = 100, 10_000, 1_000_000
 
 
@@ -65,18 +68,34 @@ def run(args: argparse.Namespace) -> int:
     if args.urdf is None and (args.base or args.tip):
         raise UsageError("--base and --tip are links of a URDF: give it with --urdf FILE")
     cell = _urdf_cell(args) if args.urdf else _dh_cell(args)
-    folder.mkdir(parents=True, exist_ok=True)
-    for path in {*args.eds, *([args.urdf] if args.urdf else [])}:
-        if path.resolve() != (folder / path.name).resolve():
-            (folder / path.name).write_bytes(with_meshes_found(path) if path == args.urdf else path.read_bytes())
-    first, no_scan = _first_scene(folder, cell)
-    (folder / "first.toml").write_text(first, encoding="utf-8")
+    with _folder_or_nothing(folder):
+        for path in {*args.eds, *([args.urdf] if args.urdf else [])}:
+            if path.resolve() != (folder / path.name).resolve():
+                (folder / path.name).write_bytes(with_meshes_found(path) if path == args.urdf else path.read_bytes())
+        first, no_scan = _first_scene(folder, cell)
+        (folder / "first.toml").write_text(first, encoding="utf-8")
     print(f"wrote {folder / 'cell.toml'} and {folder / 'first.toml'}")
     if no_scan:
         print(f"first.toml moves the arm freely: a scan was refused: {no_scan}")
     print(f"next: canprobe plan {folder / 'first.toml'}")
     print(f"      canprobe run {folder / 'first.toml'}")
     return 0
+
+
+@contextlib.contextmanager
+def _folder_or_nothing(folder: Path) -> Iterator[None]:
+    """The folder for the files that the block writes; where the block fails, neither it nor they are left."""
+    new = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    before = set(folder.iterdir())
+    try:
+        yield
+    except BaseException:
+        for path in set(folder.iterdir()) - before:
+            path.unlink()
+        for path in new:
+            path.rmdir()
+        raise
 
 
 # The cell file.
@@ -121,12 +140,20 @@ def _urdf_cell(args: argparse.Namespace) -> str:
     from canprobe.robot.urdf import from_urdf
 
     found = from_urdf(args.urdf, args.base, args.tip)
+    for warning in found.warnings:
+        say(f"canprobe: {warning}; correct it, or set min_deg and max_deg of the joint")
     text = _HEAD.format(name=_cell_name(args.folder), bitrate=_common_bitrate(args.eds))
     text += "[arm]\n" + f'urdf = "{args.urdf.name}"\n'
     text += "".join(f'{key} = "{link}"\n' for key, link in (("base", args.base), ("tip", args.tip)) if link)
     text += "mount_mm = [0, 0, 0] # where the arm's base stands; the scene's coordinates count from there\n"
     text += _common_eds(args.eds, len(found.joints)) + _TAIL
-    postures = _rounded(found)
+    postures, tilt = _rounded(found)
+    if tilt > _TILT_TOLD_RAD:
+        say(
+            f"canprobe: the start posture tilts the probe by {math.degrees(tilt):.0f} deg from straight down: of"
+            f" {_TRIES} tried postures within the ranges of the joints it is the best of pointing down and being"
+            " far from a singularity; the first scene touches a plane as tilted"
+        )
     for number, (joint, start) in enumerate(zip(found.joints, postures, strict=True), start=1):
         text += "\n" + _joint_section(number, joint, start, args.eds)
     return text
@@ -168,6 +195,9 @@ def _joint_section(number: int, joint: Joint, start: float, eds: Sequence[Path])
         lines += ['kind = "prismatic"', f"start_mm = {start:g}"]
     else:
         lines += [f"start_deg = {start:g}"]
+    if joint.q_min == joint.q_max:
+        low, high = (round(joint.shown(q)) for q in _range(joint))
+        lines += [f"min_{joint.unit} = {low} # check", f"max_{joint.unit} = {high} # check"]
     if not joint.qd_max > 0.0:
         lines += ["speed_mm_s = 100 # check" if joint.prismatic else "speed_deg_s = 30 # check"]
     lines += [f"node_id = {number} # check"]
@@ -180,6 +210,13 @@ def _joint_section(number: int, joint: Joint, start: float, eds: Sequence[Path])
         lines += [f"gear = {_GEAR} # check: motor turns per turn of the joint"]
     lines += ["sign = 1 # check: -1 where the drive counts the other way", "zero_counts = 0 # check"]
     return "\n".join(lines) + "\n"
+
+
+def _range(joint: Joint) -> tuple[float, float]:
+    """Its stops, rad or m; those of a joint without any room between them are placeholders."""
+    if joint.q_min < joint.q_max:
+        return joint.q_min, joint.q_max
+    return (0.0, 0.1) if joint.prismatic else (-math.pi, math.pi)
 
 
 def _dh_cell(args: argparse.Namespace) -> str:
@@ -209,27 +246,26 @@ def _cell_name(folder: Path) -> str:
 # The first scene: a straight scan over a plane under the probe, where the arm moves well.
 
 
-def _rounded(found: UrdfArm) -> list[float]:
-    """A posture from which the probe points down as far as the arm can, in deg and mm."""
+def _rounded(found: UrdfArm) -> tuple[list[float], float]:
+    """A posture from which the probe points down as far as the arm can, in deg and mm; its tilt from there, rad."""
     import numpy as np
 
     from canprobe.robot.chain import forward_jacobian, tool_z_offset
 
     tool, rng = tool_z_offset(80.0), np.random.default_rng(0)
-    low = np.array([joint.q_min for joint in found.joints])
-    high = np.array([joint.q_max for joint in found.joints])
+    low, high = np.array([_range(joint) for joint in found.joints]).T
     turning = np.array([not joint.prismatic for joint in found.joints])
     low, high = np.where(turning, np.maximum(low, -math.pi), low), np.where(turning, np.minimum(high, math.pi), high)
-    best, most = (low + high) / 2, -math.inf
+    best, most, tilt = (low + high) / 2, -math.inf, 0.0
     for _ in range(_TRIES):
         q = low + (high - low) * rng.uniform(0.15, 0.85, len(low))
         T, J = forward_jacobian(found.chain, q, tool)
         singular = np.linalg.svd(J * np.array((5.0, 5.0, 5.0, 1.0, 1.0, 1.0))[:, None], compute_uv=False)
         score = 3.0 * -float(T[2, 2]) + float(singular[min(len(low), 6) - 1]) + 2.0 * min(0.0, float(T[2, 3]))
         if score > most:
-            best, most = q, score
+            best, most, tilt = q, score, math.acos(min(1.0, max(-1.0, -float(T[2, 2]))))
     shown = [joint.shown(float(value)) for joint, value in zip(found.joints, best, strict=True)]
-    return [round(value) for value in shown]
+    return [round(value) for value in shown], tilt
 
 
 def _first_scene(folder: Path, cell: str) -> tuple[str, str | None]:
@@ -253,8 +289,8 @@ def _first_scene(folder: Path, cell: str) -> tuple[str, str | None]:
                 else:
                     return text, refused[rate] if text is _FREE else None
     way = (
-        "if the EDS or the URDF that this names is wrong, correct it; if it is right, this cell needs other devices;"
-        f" then remove the folder {folder}, and type the command again"
+        "if the EDS or the URDF that this names is wrong, correct it and type the command again; if it is right, this"
+        " cell needs other devices; nothing was written"
     )
     raise PlanError([*problems, way])
 

@@ -96,6 +96,9 @@ class MeasuredTraffic:
         missing: COB-IDs of planned PDOs that never came.
         error_frames: bus errors in the whole log.
         planned_worst: load in the worst case by the plan, as a share of the bit rate.
+        xl_frames: CAN XL frames, which no plan lists; in the whole log.
+        lost_by_candump: frames that candump did not receive.
+        notes: what was mended in the log.
     """
 
     duration_s: float
@@ -106,6 +109,9 @@ class MeasuredTraffic:
     missing: tuple[int, ...]
     error_frames: int
     planned_worst: float
+    xl_frames: int = 0
+    lost_by_candump: int = 0
+    notes: tuple[str, ...] = ()
 
     @property
     def load(self) -> float:
@@ -119,7 +125,7 @@ class MeasuredTraffic:
     @property
     def as_planned(self) -> bool:
         """Every class is as planned, nothing is missing, nothing else was on the bus, and there was no bus error."""
-        nothing_else = not self.unlisted and not self.missing and not self.error_frames
+        nothing_else = not (self.unlisted or self.missing or self.error_frames or self.xl_frames)
         return nothing_else and all(one.as_planned for one in self.classes)
 
     def as_dict(self) -> dict[str, Any]:
@@ -146,6 +152,9 @@ class MeasuredTraffic:
             "unlisted": [{"cob_id": cob_id, "frames": frames} for cob_id, frames in sorted(self.unlisted.items())],
             "missing": list(self.missing),
             "error_frames": self.error_frames,
+            "xl_frames": self.xl_frames,
+            "lost_by_candump": self.lost_by_candump,
+            "notes": list(self.notes),
         }
 
     def text(self) -> str:
@@ -172,6 +181,11 @@ class MeasuredTraffic:
             yield f"  never came: {cob_id:03X}h"
         if self.error_frames:
             yield f"  error frames: {self.error_frames}"
+        if self.xl_frames:
+            yield f"  not in the plan: {self.xl_frames} CAN XL frames"
+        if self.lost_by_candump:
+            yield f"  lost by candump: {self.lost_by_candump} frames"
+        yield from (f"  {note}" for note in self.notes)
 
 
 # Counts what is on a bus, thousands of frames at a time, which is quicker than cycle by cycle.

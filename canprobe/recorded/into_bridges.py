@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from canprobe.bus.disk import read_candump
+from canprobe.bus.clock_steps import RecordedBus
 from canprobe.bus.port import MonotonicClock, TimedFrame
 from canprobe.cell.controller import Command
 from canprobe.cell.cycle import Observation
@@ -142,7 +142,7 @@ def frames_by_sync(path: Path, first: str, plan: Plan) -> Iterator[list[TimedFra
     """All frames of the cell's buses: those before the first SYNC, then from each SYNC on the first bus to the next."""
     others = {bus.channel for bus in plan.buses[1:]}
     frames: list[TimedFrame] = []
-    for t_ns, channel, can_id, data in read_candump(path):
+    for t_ns, channel, can_id, data in RecordedBus(path):
         if channel != first and channel not in others:
             continue
         if can_id == SYNC_ID and len(data) <= 1 and channel not in others:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.bus.disk import read_candump
+from canprobe.bus.clock_steps import RecordedBus
 from canprobe.bus.port import TimedFrame, is_bus_error
 from canprobe.errors import UsageError
 from canprobe.planning.model import Plan
@@ -34,6 +35,7 @@ class Recording:
         other: number of other frames on this channel.
         malformed: number of PDOs of a wrong length, left out.
         error_frames: bus errors on all channels.
+        bus: the log itself: where its clock was set, and what candump lost.
     """
 
     path: Path
@@ -44,6 +46,7 @@ class Recording:
     other: int
     malformed: int
     error_frames: int
+    bus: RecordedBus
 
     @property
     def sync_stamps(self) -> NDArray[np.int64]:
@@ -67,6 +70,7 @@ class _Channel:
     answers: int = 0
     other: int = 0
     malformed: int = 0
+    long_syncs: Counter[int] = field(default_factory=Counter)
 
 
 def read_recording(path: Path, plan: Plan) -> Recording:
@@ -80,7 +84,8 @@ def read_recording(path: Path, plan: Plan) -> Recording:
     Raises:
         UsageError: no such file, a torn line, a node without any TPDO, no SYNC, or SYNCs of another rate.
     """
-    channels, error_frames = _read(path, plan)
+    bus = RecordedBus(path)
+    channels, error_frames = _read(bus, plan)
     name = max(channels, key=lambda c: (channels[c].answers, len(channels[c].frames)), default="")
     chosen = channels.get(name, _Channel())
     _check_heard(path, plan, name, chosen)
@@ -88,13 +93,13 @@ def read_recording(path: Path, plan: Plan) -> Recording:
     syncs = [i for i, frame in enumerate(frames) if frame[0] == SYNC_ID]
     times = np.array([frame[2] for frame in frames], np.int64)
     recording = Recording(
-        path, name, frames, times, np.array(syncs, np.int64), chosen.other, chosen.malformed, error_frames
+        path, name, frames, times, np.array(syncs, np.int64), chosen.other, chosen.malformed, error_frames, bus
     )
-    _check_syncs(recording, plan)
+    _check_syncs(recording, plan, chosen.long_syncs)
     return recording
 
 
-def _read(path: Path, plan: Plan) -> tuple[dict[str, _Channel], int]:
+def _read(bus: RecordedBus, plan: Plan) -> tuple[dict[str, _Channel], int]:
     lengths: dict[int, int] = {pdo.cob_id: pdo.layout.length for pdo in plan.pdos}
     answers = {pdo.cob_id for pdo in plan.pdos if pdo.direction == "tpdo"}
     may_be_longer = {pdo.cob_id for pdo in plan.pdos if pdo.direction == "tpdo" and pdo.kind == "drive"}
@@ -102,7 +107,7 @@ def _read(path: Path, plan: Plan) -> tuple[dict[str, _Channel], int]:
     channels: dict[str, _Channel] = {}
     error_frames = 0
     main, *others = [bus.channel for bus in plan.buses]
-    for t_ns, on, can_id, data in read_candump(path):
+    for t_ns, on, can_id, data in bus:
         if on in others and can_id == SYNC_ID:
             continue  # the cell sends one SYNC to all its buses
         name = main if on in others else on
@@ -113,6 +118,8 @@ def _read(path: Path, plan: Plan) -> tuple[dict[str, _Channel], int]:
             channel.frames.append((can_id, data, t_ns))
         elif (length := lengths.get(can_id)) is None:
             channel.other += 1
+            if can_id == SYNC_ID:
+                channel.long_syncs[len(data)] += 1
             error_frames += is_bus_error(can_id)
         elif len(data) < length or (len(data) > length and can_id not in may_be_longer):
             channel.malformed += 1
@@ -121,6 +128,9 @@ def _read(path: Path, plan: Plan) -> tuple[dict[str, _Channel], int]:
             if can_id in answers:
                 channel.heard.add(can_id)
                 channel.answers += 1
+    for name, count in bus.xl.items():
+        if name in channels:
+            channels[name].other += count
     return channels, error_frames
 
 
@@ -146,10 +156,12 @@ def _check_heard(path: Path, plan: Plan, name: str, channel: _Channel) -> None:
         raise UsageError("\n".join(f"{where} {line}{wrong}" for line in silent))
 
 
-def _check_syncs(recording: Recording, plan: Plan) -> None:
+def _check_syncs(recording: Recording, plan: Plan, long_syncs: Counter[int]) -> None:
     where = f"{recording.path}: on {recording.channel}"
     if len(recording.syncs) < 2:
-        raise UsageError(f"{where} {len(recording.syncs)} SYNC (080h); a replay goes from SYNC to SYNC")
+        longer = [f"{count} frames 080h of {length} bytes" for length, count in sorted(long_syncs.items())]
+        but = f" of 0 or 1 byte, but {', '.join(longer)}, which CiA 301 does not know" if longer else ""
+        raise UsageError(f"{where} {len(recording.syncs)} SYNC (080h){but}; a replay goes from SYNC to SYNC")
     steps = np.diff(recording.sync_stamps)
     if 3 * (twice := np.count_nonzero(steps < STAMP_JITTER_NS)) > len(steps):
         raise UsageError(

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.bus.clock_steps import RecordedBus
 from canprobe.bus.disk import read_npz, write_npz
 from canprobe.errors import ProtocolError, UsageError
 from canprobe.planning.make import make_plan
@@ -43,6 +44,7 @@ class Contacts:
         times_s: time of each cycle (n,), s, since the first.
         counts: what was counted, by name.
         channel: of the log; None for the folder of a run.
+        bus: the log; None for the folder of a run.
     """
 
     tracker: ShapeTracker
@@ -51,6 +53,7 @@ class Contacts:
     times_s: Array
     counts: dict[str, int]
     channel: str | None
+    bus: RecordedBus | None = None
 
 
 def _from_run(plan: Plan, run: RunFolder) -> Contacts:
@@ -84,9 +87,11 @@ def _from_log(plan: Plan, path: Path) -> Contacts:
         "stale_frames": cycles.tactile.stale,
         "unplaced_contacts": unplaced,
         "error_frames": recording.error_frames,
+        "other_frames": recording.other,
+        "frames_lost_by_candump": sum(recording.bus.lost.values()),
     }
     times_s = np.array(cycles.sync_times_s)
-    return Contacts(tracker, "other", cycles.start_ns * 1e-9, times_s, counts, recording.channel)
+    return Contacts(tracker, "other", cycles.start_ns * 1e-9, times_s, counts, recording.channel, recording.bus)
 
 
 def _summarise(
@@ -101,6 +106,7 @@ def _summarise(
         "scene": plan.scene.name,
         "log": str(source),
         "channel": contacts.channel,
+        "notes": [] if contacts.bus is None else contacts.bus.notes(),
         "driven_by": contacts.driven_by,
         "cycle": contacts.counts,
         "contacts": len(tracker.samples),
@@ -176,6 +182,7 @@ def replay_text(summary: dict[str, Any]) -> str:
         f"{where}: scene {summary['scene']}",
         f"  replay     {how}",
         f"  record     {counts}; {summary['contacts']} contacts",
+        *(f"  log        {note}" for note in summary["notes"]),
         *_estimate_lines(summary),
     ]
     if online is not None:

@@ -9,14 +9,15 @@ import json
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.bus.disk import read_candump, write_npz, write_text
+from canprobe.bus.clock_steps import RecordedBus
+from canprobe.bus.disk import write_npz, write_text
 from canprobe.bus.port import ERR_FLAG, is_bus_error
 from canprobe.cell.cell import Cell
 from canprobe.errors import UsageError, install_line
@@ -74,7 +75,8 @@ def measure_traffic(
     plan = scene if isinstance(scene, Plan) else make_plan(resolve(load_scene(scene)))
     meters: dict[str, TrafficMeter] = {}
     syncs: Counter[str] = Counter()
-    for t_ns, name, can_id, data in read_candump(path):
+    bus = RecordedBus(path)
+    for t_ns, name, can_id, data in bus:
         meter = meters.get(name)
         if meter is None:
             meter = meters[name] = TrafficMeter(plan, name, exact)
@@ -83,18 +85,22 @@ def measure_traffic(
         else:
             meter.write(can_id, data, t_ns)
             syncs[name] += can_id == 0x080
-    return _chosen(path, meters, syncs, plan, channel).report()
+    name = _chosen(path, syncs, plan, channel)
+    return replace(
+        meters[name].report(),
+        notes=tuple(bus.notes()),
+        xl_frames=bus.xl.get(name, 0),
+        lost_by_candump=bus.lost.get(name, 0),
+    )
 
 
-def _chosen(
-    path: Path, meters: dict[str, TrafficMeter], syncs: Counter[str], plan: Plan, channel: str | None
-) -> TrafficMeter:
-    with_sync = [name for name in meters if syncs[name]]
+def _chosen(path: Path, syncs: Counter[str], plan: Plan, channel: str | None) -> str:
+    with_sync = [name for name in syncs if syncs[name]]
     wanted = plan.buses[0].channel if channel is None else channel
     if wanted in with_sync:
-        return meters[wanted]
+        return wanted
     if channel is None and len(with_sync) == 1:
-        return meters[with_sync[0]]
+        return with_sync[0]
     if not with_sync:
         raise UsageError(f"{path}: no SYNC (080h) on any channel; expected the log of a cell that ran")
     raise UsageError(

@@ -93,6 +93,23 @@ class Body:
         return Body(self.mass, R @ self.com + T[:3, 3], R @ self.tensor @ R.T)
 
 
+INERTIA_TOLERANCE = 0.1
+"""Share of the largest moment by which the others may miss the triangle inequality: published numbers are measured."""
+
+
+def impossible_inertia(tensor: Array) -> str | None:
+    """Why a (3, 3) tensor is the inertia of no body; None where it may be one.
+
+    A body has principal moments that are not negative, and none exceeds the sum of the other two.
+    """
+    low, middle, high = np.linalg.eigvalsh(tensor).tolist()
+    if low >= -INERTIA_TOLERANCE * abs(high) and low + middle >= high * (1.0 - INERTIA_TOLERANCE):
+        return None
+    moments = f"{low:.4g}, {middle:.4g}, {high:.4g} kg m^2"
+    rule = "negative" if low < 0.0 else "larger than the sum of the others"
+    return f"principal moments of inertia of {moments}, of which one is {rule}"
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ArmModel:
     """Geometry, joints and drive units of one arm; compared by identity.

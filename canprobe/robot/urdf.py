@@ -16,17 +16,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import unquote
 from xml.etree import ElementTree
+from xml.parsers import expat
 from xml.sax.saxutils import unescape
 
 import numpy as np
 
 from canprobe.errors import PlanError
-from canprobe.robot.chain import Array, Chain, rotation_rpy
-from canprobe.robot.model import Body, Joint
+from canprobe.robot.chain import MOST_JOINTS, Array, Chain, rotation_rpy
+from canprobe.robot.model import Body, Joint, impossible_inertia
 
 CONTINUOUS_RAD = 2 * math.pi
 """Stops of a continuous joint to either side: it has none itself, but cables and the counts of a drive have."""
+LARGEST_RAD = 4 * math.pi
+"""A stop of a revolute joint beyond it looks like one in degrees."""
 _MOVING = {"revolute", "continuous", "prismatic"}
+_DEFINITIONS = {"xacro:property", "xacro:macro", "xacro:arg"}
+_LATE_DECLARATION = re.compile(rb"\A(?P<before>(?:\s|<!--.*?-->)+)(?P<declaration><\?xml\b.*?\?>)", re.DOTALL)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,11 +43,13 @@ class UrdfArm:
         joints: stops, speeds, friction; the effort limit stands for the rated torque. What the file leaves out has the
             defaults of `Joint`, but a speed limit that is missing is 0, which an `ArmModel` refuses.
         bodies: (n,) of the joints; None for one without any inertial.
+        warnings: what the file says and hardly means.
     """
 
     chain: Chain
     joints: tuple[Joint, ...]
     bodies: tuple[Body | None, ...]
+    warnings: tuple[str, ...] = ()
 
 
 def from_urdf(
@@ -62,6 +69,15 @@ def from_urdf(
     """
     tree = _Tree.read(source)
     path = tree.path(base or tree.root(), tip or tree.only_end())
+    moving = [edge for edge in path if edge.kind != "fixed"]
+    if len(moving) > MOST_JOINTS:
+        raise PlanError(
+            [
+                f"{tree.where}: {len(moving)} joints move between {path[0].parent!r} and {path[-1].child!r}, at most"
+                f" {MOST_JOINTS} can; choose a base nearer to the tip, such as --base {moving[-MOST_JOINTS].parent}"
+                " (arm.base)"
+            ]
+        )
     places, joints, bodies = [], [], []
     T = np.eye(4)  # from the last joint's frame, its axis along z, to where the path has come
     turned = np.eye(4)  # of that frame within the frame that the file gives the joint
@@ -83,7 +99,12 @@ def from_urdf(
         fixed=np.array(places),
         T_last_flange=T,
     )
-    return UrdfArm(chain, tuple(joints), tuple(bodies))
+    warnings = (
+        f"{tree.where}: {joint.name}: <limit> from {joint.q_min:g} to {joint.q_max:g} rad looks like degrees"
+        for joint in joints
+        if not joint.prismatic and max(-joint.q_min, joint.q_max) > LARGEST_RAD
+    )
+    return UrdfArm(chain, tuple(joints), tuple(bodies), tuple(warnings))
 
 
 # What links look like, and where the meshes are that a file names.
@@ -199,20 +220,28 @@ class _Tree:
         text = str(source)
         where = "URDF text" if text.lstrip().startswith("<") else f"URDF {text}"
         try:
-            root = ElementTree.fromstring(text if where == "URDF text" else Path(source).read_bytes())
+            root = _parsed(text.encode() if where == "URDF text" else Path(source).read_bytes())
         except OSError as error:
             raise PlanError([f"{where}: cannot be read: {error.strerror or error}"]) from error
-        except ElementTree.ParseError as error:
+        except expat.ExpatError as error:
             raise PlanError([f"{where}: expected XML: {error}"]) from error
         if root.tag != "robot":
             raise PlanError([f"{where}: expected a <robot>, got <{root.tag}>"])
-        if any("xacro" in element.tag for element in root.iter()):
-            raise PlanError([f"{where}: it is a xacro; expand it first (xacro {Path(text).name} > arm.urdf)"])
-        links = {link.get("name", ""): link for link in root.iterfind("link")}
+        if _is_xacro(root):
+            name = "arm.xacro" if where == "URDF text" else Path(text).name
+            raise PlanError([f"{where}: it is a xacro; expand it first: pip install xacro; xacro {name} > arm.urdf"])
+        links: dict[str, ElementTree.Element] = {}
+        for link in root.iterfind("link"):
+            if (name := link.get("name", "")) in links:
+                raise PlanError([f"{where}: link {name}: expected one <link> of this name, got two; rename one"])
+            links[name] = link
         tree = cls(where, root.get("name", "arm"), links, {}, {})
         for element in root.iterfind("joint"):
             edge = tree._edge(element)
+            if (other := tree.into.get(edge.child)) is not None:
+                raise tree.wrong(edge.name, "a child that hangs on one joint", f"{edge.child!r}, as of {other.name}")
             tree.into[edge.child] = edge
+        tree.root()  # every file has one
         for material in root.iter("material"):
             if (colour := _colour(material)) is not None:
                 tree.colours.setdefault(material.get("name", ""), colour)
@@ -223,12 +252,15 @@ class _Tree:
         parent, child = element.find("parent"), element.find("child")
         if parent is None or child is None:
             raise self.wrong(name, "<parent> and <child>", "one of them is missing")
+        for end in (parent, child):
+            if end.get("link") not in self.links:
+                raise self.wrong(name, f"a link of the file in <{end.tag}>", repr(end.get("link")))
         return _Edge(
             element=element,
             name=name,
             kind=element.get("type", "?"),
-            parent=parent.get("link", "?"),
-            child=child.get("link", "?"),
+            parent=parent.get("link", ""),
+            child=child.get("link", ""),
             T_parent_child=self._origin(name, element.find("origin")),
         )
 
@@ -238,14 +270,19 @@ class _Tree:
 
     def root(self) -> str:
         """The link that hangs on no other."""
-        return next(iter(link for link in self.links if link not in self.into), "")
+        roots = [link for link in self.links if link not in self.into]
+        if len(roots) != 1:
+            got = f"{len(roots)}: {', '.join(roots)}; join them" if roots else "none: its joints make a loop"
+            raise PlanError([f"{self.where}: expected one <link> that hangs on no other, got {got}"])
+        return roots[0]
 
     def only_end(self) -> str:
-        """The link that carries no other."""
+        """The link that carries no other; of several, that which a joint moves."""
         parents = {edge.parent for edge in self.into.values()}
         ends = [link for link in self.links if link not in parents]
+        moved = [link for link in ends if any(edge.kind != "fixed" for edge in self.path(self.root(), link))]
         if len(ends) != 1:
-            raise PlanError([f"{self.where}: name the tip: one of {', '.join(ends)}"])
+            raise PlanError([f"{self.where}: name the tip (--tip LINK, or arm.tip): one of {', '.join(moved or ends)}"])
         return ends[0]
 
     def path(self, base: str, tip: str) -> list[_Edge]:
@@ -279,6 +316,9 @@ class _Tree:
             if limit is None:
                 raise self.wrong(edge.name, "a <limit> with lower, upper and velocity", "none")
             low, high = self._number(edge.name, limit, "lower", 0.0), self._number(edge.name, limit, "upper", 0.0)
+            if low > high:
+                raise self.wrong(edge.name, "lower below upper in its <limit>", f"{low:g} and {high:g}")
+        low, high = self._softened(edge, low, high)
         given = {
             "rated_torque": 0.0 if limit is None else self._number(edge.name, limit, "effort", 0.0),
             "coulomb": 0.0 if dynamics is None else self._number(edge.name, dynamics, "friction", 0.0),
@@ -292,6 +332,20 @@ class _Tree:
             qd_max=0.0 if limit is None else self._number(edge.name, limit, "velocity", 0.0),
             **{key: value for key, value in given.items() if value > 0.0},
         )
+
+    def _softened(self, edge: _Edge, low: float, high: float) -> tuple[float, float]:
+        """The range within the soft limits of a <safety_controller>, which has none where both are 0."""
+        safety = edge.element.find("safety_controller")
+        if safety is None:
+            return low, high
+        soft = [self._number(edge.name, safety, f"soft_{end}_limit", 0.0) for end in ("lower", "upper")]
+        if soft == [0.0, 0.0]:
+            return low, high
+        inside = max(low, soft[0]), min(high, soft[1])
+        if inside[0] > inside[1]:
+            expected = f"soft limits in {low:g} to {high:g} in its <safety_controller>"
+            raise self.wrong(edge.name, expected, f"{soft[0]:g} and {soft[1]:g}")
+        return inside
 
     def axis(self, edge: _Edge) -> Array:
         """(3,) unit vector in the joint's frame."""
@@ -315,6 +369,9 @@ class _Tree:
         for body in found:
             off = body.com - com
             tensor += body.tensor + body.mass * (float(off @ off) * np.eye(3) - np.outer(off, off))
+        # of all together: real files have sensors and fingertips with numbers that no body has
+        if (why := impossible_inertia(tensor)) is not None:
+            raise self.wrong(f"link {edge.child}, with what it carries", "an <inertia> that a body can have", why)
         return Body(mass, com, tensor)
 
     def visuals(self, joint: int, link: str, path: set[str], T: Array) -> Iterator[Visual]:
@@ -351,6 +408,8 @@ class _Tree:
         names = ("ixx", "ixy", "ixz", "ixy", "iyy", "iyz", "ixz", "iyz", "izz")
         tensor = np.array([self._number(f"link {link}", inertia, name, 0.0) for name in names]).reshape(3, 3)
         body = Body(self._number(f"link {link}", mass, "value", 0.0), np.zeros(3), tensor)
+        if body.mass < 0.0:
+            raise self.wrong(f"link {link}", "a value in <mass> that is not negative", f"{body.mass:g}")
         return body.moved(T @ self._origin(f"link {link}", element.find("origin")))
 
     def _origin(self, name: str, element: ElementTree.Element | None) -> Array:
@@ -381,6 +440,32 @@ class _Tree:
         if not math.isfinite(value):
             raise self.wrong(name, f"a number in {key} of <{element.tag}>", repr(text))
         return value
+
+
+def _parsed(content: bytes) -> ElementTree.Element:
+    """The XML of a URDF as its readers take it: prefixes, which nobody declares, are a part of names."""
+    content = content.removeprefix(b"\xef\xbb\xbf")
+    if late := _LATE_DECLARATION.match(content):
+        content = late["declaration"] + late["before"] + content[late.end() :]
+    builder = ElementTree.TreeBuilder()
+    parser = expat.ParserCreate()
+    parser.StartElementHandler = builder.start
+    parser.EndElementHandler = builder.end
+    parser.Parse(content, True)
+    root: ElementTree.Element = builder.close()
+    return root
+
+
+def _is_xacro(element: ElementTree.Element) -> bool:
+    """Whether something is still to be expanded; definitions that nothing uses are left over."""
+    for child in element:
+        if child.tag in _DEFINITIONS:
+            continue
+        if child.tag.startswith("xacro:") or any("${" in value or "$(" in value for value in child.attrib.values()):
+            return True
+        if _is_xacro(child):
+            return True
+    return element.tag == "robot" and element.find("link") is None and any(c.tag in _DEFINITIONS for c in element)
 
 
 def _colour(material: ElementTree.Element) -> tuple[int, int, int] | None:

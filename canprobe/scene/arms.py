@@ -14,7 +14,7 @@ import numpy as np
 
 from canprobe.errors import PlanError
 from canprobe.robot.chain import Array, Chain, dh_step, from_dh
-from canprobe.robot.model import ArmModel, Body, Joint
+from canprobe.robot.model import ArmModel, Body, Joint, impossible_inertia
 from canprobe.robot.urdf import UrdfArm, from_urdf
 from canprobe.scene.geometry import transform
 from canprobe.scene.hardware import ArmSettings, JointSettings
@@ -81,6 +81,7 @@ def arm_model(name: str, arm: ArmSettings, sections: Mapping[str, JointSettings]
         joints = [_joint(section, _bare(joint, section)) for joint, section in sections.items()]
         known = all(section.mass_kg is not None for section in sections.values())
         each = zip(sections.values(), rows, strict=True)
+        _refuse_impossible_inertia(sections)
         bodies = tuple(_body(section, row, arm) for section, row in each) if known else None
     model = ArmModel(chain, tuple(joints), _units_per_q(sections), np.array([s.zero_counts for s in sections.values()]))
     return model, bodies
@@ -129,12 +130,28 @@ def _units_per_q(sections: Mapping[str, JointSettings]) -> Array:
     return scaled
 
 
+def _tensor(section: JointSettings) -> Array:
+    xx, yy, zz, xy, xz, yz = section.inertia_kg_m2
+    return np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
+
+
+def _refuse_impossible_inertia(sections: Mapping[str, JointSettings]) -> None:
+    """Moments of 0 beside others are not known, as of a link that only turns about one axis: they are not compared."""
+    given = {name: section for name, section in sections.items() if min(section.inertia_kg_m2[:3]) != 0.0}
+    found = {name: impossible_inertia(_tensor(section)) for name, section in given.items()}
+    problems = [
+        f"joints.{name}.inertia_kg_m2: expected xx, yy, zz, xy, xz, yz that a body can have, got {why}"
+        for name, why in found.items()
+        if why is not None
+    ]
+    if problems:
+        raise PlanError(problems)
+
+
 def _body(section: JointSettings, row: tuple[float, float, float, float], arm: ArmSettings) -> Body:
     """The link behind a joint, in the frame of the joint; a row gives it in the frame that the row leads to."""
     T = np.eye(4) if arm.convention == "modified" else dh_step(*row)
-    xx, yy, zz, xy, xz, yz = section.inertia_kg_m2
-    tensor = np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
-    return Body(section.mass_kg or 0.0, np.array(section.com_mm) * _MM, tensor).moved(T)
+    return Body(section.mass_kg or 0.0, np.array(section.com_mm) * _MM, _tensor(section)).moved(T)
 
 
 def joint_compliance(sections: Mapping[str, JointSettings]) -> Array | None:

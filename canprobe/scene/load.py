@@ -23,7 +23,7 @@ from canprobe.errors import PlanError, SceneError, UsageError
 from canprobe.robot.urdf import from_urdf, with_meshes_found
 from canprobe.scene.checks import MismatchError, Only, ScenePath, choices_of, conditions_of, convert
 from canprobe.scene.hardware import ArmSettings, CellInfo
-from canprobe.scene.model import DEFAULT_ARRAY, ArrayFile, Cell, Scene
+from canprobe.scene.model import DEFAULT_ARRAY, TOUCH_KINDS, ArrayFile, Cell, Scene
 from canprobe.scene.rules import SECTIONS_OF_TASK, broken_rules
 
 DEFAULT_CELL = "puma260"
@@ -270,7 +270,10 @@ def load_array(name_or_path: str | Path) -> dict[str, Any]:
     Raises:
         SceneError: with every problem found.
     """
-    return _read_hardware(name_or_path, "array", ArrayFile)[1]
+    document = _read_hardware(name_or_path, "array", ArrayFile)[1]
+    if "sensor" not in document:
+        raise SceneError([f"{name_or_path}: expected an array file, got none of its keys: it needs a section [sensor]"])
+    return document
 
 
 def find_file(name: str, packaged: Mapping[str, Path], what: str) -> Path:
@@ -373,6 +376,11 @@ def _scene(own: Mapping[str, Any], file: str, folder: Path | None) -> Scene:
             reader.complain(section, f'missing: task.kind = "{kind}" needs a section [{section}]: {why}')
         elif need == "never" and section in document:
             reader.complain(section, f'not with task.kind = "{kind}": {why}; remove the section')
+
+    cell = own.get("cell", DEFAULT_CELL)
+    named = isinstance(cell, str) and cell != DEFAULT_CELL
+    if kind in TOUCH_KINDS and named and isinstance(task, dict) and "start_mm" not in task:
+        reader.complain("task.start_mm", f"missing: left out, it is a place of the cell {DEFAULT_CELL}, not of {cell}")
 
     def lookup(path: str) -> Any:
         section, _, key = path.partition(".")

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 from canprobe.errors import ProtocolError
 from canprobe.protocol.raw_image import FramePattern, ImageFormat
-from canprobe.protocol.tactile import SIDE
+from canprobe.protocol.tactile import SIDE, WINDOWS
 from canprobe.robot.chain import MOST_JOINTS
-from canprobe.scene.hardware import JointSettings
+from canprobe.scene.hardware import JointSettings, Vec3
 from canprobe.scene.model import TOUCH_KINDS, Scene, WireSettings
 
 _USUALLY = {
@@ -188,8 +188,8 @@ def _sensor_rate(cycle: float, sensor: float) -> _Complaint:
         yield "sensor.rate_hz", f"expected at most cycle.rate_hz = {cycle:g}, got {sensor:g}: {why}"
 
 
-@_across("sensor.rows", "sensor.columns", "sensor.positions_mm?", "sensor.normals?")
-def _taxel_positions(rows: int, columns: int, positions: object, normals: object) -> _Complaint:
+@_across("sensor.rows", "sensor.columns", "sensor.pitch_mm", "sensor.positions_mm?", "sensor.normals?")
+def _taxel_positions(rows: int, columns: int, pitch: float, positions: object, normals: object) -> _Complaint:
     if positions is None and normals is not None:
         yield "sensor.normals", "only with sensor.positions_mm"
     for key, points in (("positions_mm", positions), ("normals", normals)):
@@ -198,8 +198,33 @@ def _taxel_positions(rows: int, columns: int, positions: object, normals: object
             yield f"sensor.{key}", f"{expects}, got {len(points)}"
     if isinstance(normals, tuple) and not all(any(normal) for normal in normals):
         yield "sensor.normals", "expected directions, got one that is all zero"
+    if isinstance(positions, tuple) and len(positions) == rows * columns > 1:
+        yield from _taxels_apart(positions, pitch)
+    if isinstance(normals, tuple) and sum(normal[2] for normal in normals) < 0.0:
+        yield (
+            "sensor.normals",
+            "expected outward normals, z away from the flange, got most that point inside: turn them",
+        )
 
 
+def _taxels_apart(positions: Sequence[Vec3], pitch: float) -> _Complaint:
+    """Complaint about taxels in one place, or whose places are in another unit: the pitch gives their distance."""
+    first: dict[Vec3, int] = {}
+    for number, place in enumerate(positions, 1):
+        if (other := first.setdefault(place, number)) != number:
+            yield "sensor.positions_mm", f"expected a place for each taxel, got {list(place)} for {other} and {number}"
+            return
+    across = max(math.dist(positions[0], place) for place in positions)
+    if across < TINY_SHARE * pitch:
+        yield (
+            "sensor.positions_mm",
+            f"expected taxels about sensor.pitch_mm = {pitch:g} apart, got {across:g} mm from one end to the other;"
+            " are they in metres? multiply by 1000",
+        )
+
+
+TINY_SHARE = 0.1
+"""Width of an array by its pitch, below which its places are in another unit."""
 _WIRE = ("ids", "frames", "byte_order", "axes", "normal_axis", "unloaded_counts", "full_scale_counts", "poll")
 
 
@@ -217,6 +242,8 @@ def _array_fits_wire(
     elif mode == "window" and isinstance(window, int) and window > min(rows, columns):
         least = min(rows, columns)
         way_out = 'take a smaller one, or sensor.mode = "image"'
+        if least < min(WINDOWS):
+            way_out = f'the smallest window has {min(WINDOWS)}: set sensor.mode = "image"'
         yield (
             "sensor.window",
             f"expected at most the {least} taxels of sensor.rows and columns, got {window}; {way_out}",
@@ -239,9 +266,15 @@ def _raw_frames(wire: WireSettings, rows: int, columns: int, mode: str) -> _Comp
             'not with wire.sampling = "sync": nothing is sampled before the cycle; give unloaded_counts',
         )
     try:
-        image_format(wire, rows, columns)
+        bits = image_format(wire, rows, columns).bits
     except ProtocolError as error:
         yield "wire.frames", str(error)
+        return
+    if (counts := wire.full_scale_counts) >= 1 << bits:
+        yield (
+            "wire.full_scale_counts",
+            f"expected at most {(1 << bits) - 1} in {bits} bits of wire.frames, got {counts}",
+        )
 
 
 def image_format(wire: WireSettings, rows: int, columns: int) -> ImageFormat:

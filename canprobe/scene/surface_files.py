@@ -23,6 +23,13 @@ HEIGHTS = (".npy", ".npz", ".csv", ".txt")
 MESHES = (".stl", ".obj", ".ply")
 _MM = 1e-3
 _SPACING_MM = 1.0
+NO_DATA = (-9999.0, -99999.0, -32768.0, -32767.0, 65535.0)
+"""What programs of measuring machines and maps write where they saw nothing; a far outlier only then."""
+_HUGE, _FAR = 1e30, 10.0
+_FLATTEST, _STEEP = 5e-4, 20.0
+"""Rise of a surface by the width of its grid, outside of which one of the two is in another unit."""
+_NARROWEST_MM = 1.0
+_STL_HEADER = 84
 
 
 def object_of_file(settings: ObjectSettings, T_base_object: Array) -> PlacedShape:
@@ -44,7 +51,12 @@ def object_of_file(settings: ObjectSettings, T_base_object: Array) -> PlacedShap
         raise ValueError(f"file: {path}: cannot be read: {error.strerror}") from error
     spacing = (settings.spacing_mm or _SPACING_MM) * _MM
     fit = _mesh(path, changed_ns, settings.unit_mm * _MM, spacing, settings.origin_mm)
-    return Heights(T_base_object, fit.heights, fit.spacing, fit.origin, fit.there)
+    try:
+        return Heights(T_base_object, fit.heights, fit.spacing, fit.origin, fit.there)
+    except ValueError as error:
+        x, y = (1e3 * fit.spacing * (nodes - 1) for nodes in fit.heights.shape)
+        way_out = "remove vertices far away, or give origin_mm"
+        raise ValueError(f"file: {path.name}: the mesh is {x:.3g} mm by {y:.3g} mm; {error}: {way_out}") from error
 
 
 @lru_cache(maxsize=4)
@@ -54,6 +66,7 @@ def _mesh(path: Path, changed_ns: int, unit: float, spacing: float, origin_mm: t
         import trimesh
     except ImportError as error:
         raise UsageError(f"object.file: a mesh needs trimesh: {install_line('mesh')}") from error
+    _refuse_other_content(path)
     try:
         read = trimesh.load_mesh(path, process=False)
     except Exception as error:  # each of its readers has its own
@@ -62,7 +75,29 @@ def _mesh(path: Path, changed_ns: int, unit: float, spacing: float, origin_mm: t
     try:
         return fit_mesh(read.vertices * unit, read.faces, spacing, origin)
     except (ValueError, AttributeError) as error:
-        raise ValueError(f"file: {path.name}: {error}") from error
+        units = f"; is unit_mm = {1e3 * unit:g} the unit of the file?" if "narrower" in str(error) else ""
+        raise ValueError(f"file: {path.name}: {error}{units}") from error
+
+
+def _refuse_other_content(path: Path) -> None:
+    """Name what stands in the place of a file that was not downloaded, or not whole."""
+    try:
+        with path.open("rb") as file:
+            start = file.read(200)
+    except OSError:  # which its reader names
+        return
+    if not start.strip():
+        raise ValueError(f"file: {path.name} is empty")
+    if start.startswith(b"version https://git-lfs"):
+        raise ValueError(
+            f"file: {path.name} is a pointer of Git LFS, not the file: type `git lfs pull` where it is from"
+        )
+    if start.lstrip().lower().startswith((b"<!doctype html", b"<html")):
+        raise ValueError(f"file: {path.name} is an HTML page: download the file itself (raw)")
+    if path.suffix.lower() == ".stl" and not start.lstrip().startswith(b"solid"):
+        whole, size = _STL_HEADER + 50 * int.from_bytes(start[80:84], "little"), path.stat().st_size
+        if len(start) < _STL_HEADER or size != whole:
+            raise ValueError(f"file: {path.name} is a damaged STL: {size} bytes, by its header {whole}; get it again")
 
 
 def _heights(settings: ObjectSettings, path: Path) -> dict[str, Any]:
@@ -73,10 +108,30 @@ def _heights(settings: ObjectSettings, path: Path) -> dict[str, Any]:
         raise ValueError("spacing_mm: missing: the file holds heights only; give the spacing of their grid")
     if z.ndim != 2:
         raise ValueError(f"file: expected a grid of heights (rows × columns), got shape {z.shape} in {path.name}")
+    if (gaps := z[np.isin(z, NO_DATA) | (np.abs(z) > _HUGE)]).size and np.ptp(z) > _FAR * np.ptp(_without(z, gaps[0])):
+        raise ValueError(
+            f"file: {path.name}: {gaps.size} of {z.size} heights are {gaps[0]:g}: no data; fill gaps first"
+        )
+    _refuse_other_unit(z, spacing, settings.unit_mm)
     unit = settings.unit_mm * _MM
     middle = 0.5 * spacing * unit * (np.array(z.shape) - 1)
     origin = np.zeros(2) if settings.origin_mm is None else np.array(settings.origin_mm) * _MM - middle
     return {"heights": z * unit, "spacing": spacing * unit, "origin": origin}
+
+
+def _without(z: Array, value: float) -> Array:
+    rest: Array = z[z != value]
+    return rest if rest.size else np.zeros(1)
+
+
+def _refuse_other_unit(z: Array, spacing: float, unit_mm: float) -> None:
+    """Heights and spacing of one unit give a surface: neither a wall nor, unless it is a plane, a flat."""
+    rise, width = float(np.ptp(z)), spacing * min(z.shape)
+    if unit_mm * width < _NARROWEST_MM or (np.isfinite(rise) and rise > 0.0 and not _FLATTEST < rise / width < _STEEP):
+        raise ValueError(
+            f"file: its heights rise by {unit_mm * rise:.3g} mm over a grid {unit_mm * width:.3g} mm wide: are heights"
+            f" and spacing in one unit, and is unit_mm = {unit_mm:g} that unit?"
+        )
 
 
 def _grid(path: Path) -> tuple[Array, float | None]:
@@ -84,6 +139,7 @@ def _grid(path: Path) -> tuple[Array, float | None]:
     kind = path.suffix.lower()
     if kind not in HEIGHTS:
         raise ValueError(f"file: expected heights in a file of {', '.join(HEIGHTS)}, got {path.name}")
+    _refuse_other_content(path)
     try:
         if kind in (".npy", ".npz"):
             with path.open("rb") as opened:  # numpy leaves a file open that it cannot read
@@ -92,7 +148,10 @@ def _grid(path: Path) -> tuple[Array, float | None]:
                     return _of_archive({name: read[name] for name in read.files})
                 return np.asarray(read, dtype=np.float64), None
         text = path.read_text(encoding="utf-8-sig").splitlines()
-        lines = [line.partition("#")[0].replace(";", ",").replace(",", " ").split() for line in text]
+        rows = [line.partition("#")[0] for line in text]
+        if any(";" in row for row in rows):  # then a comma is a decimal one
+            rows = [row.replace(",", ".").replace(";", " ") for row in rows]
+        lines = [row.replace(",", " ").split() for row in rows]
         return np.array([[float(word) for word in line] for line in lines if line]), None
     except OSError as error:
         raise ValueError(f"file: {path}: cannot be read: {error.strerror or error}") from error

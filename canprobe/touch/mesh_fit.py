@@ -29,6 +29,8 @@ COARSE_RAD = np.radians(15.0)
 STEEPEST = np.cos(np.radians(70.0))
 LAYER = 6.0
 """Spacings below the highest sample of a cell from which on a sample is taken as hidden."""
+EMPTY = 0.1
+"""Share of a mesh's grid that has a surface, below which single vertices far away make the grid."""
 MOST_NODES = 1_000_000
 MOST_SAMPLES = 8_000_000
 RINGING, EDGE_NODES = 0.02, 3
@@ -102,6 +104,11 @@ def fit_mesh(vertices: npt.ArrayLike, faces: npt.ArrayLike, spacing: float, orig
         raise ValueError("no facet of the mesh faces +z: its faces are inside out, or it must be turned")
     _refuse_coarse(points, corners[up], normals[up])
     low, high = points.min(axis=0)[:2], points.max(axis=0)[:2]
+    if (high - low < (LEAST_NODES - 1) * spacing * (1.0 - 1e-9)).any():
+        x, y = 1e3 * (high - low)
+        raise ValueError(
+            f"the mesh is {x:.3g} mm by {y:.3g} mm, narrower than {LEAST_NODES - 1} spacings of {1e3 * spacing:.3g} mm"
+        )
     at = 0.5 * (low + high) if origin is None else np.asarray(origin, dtype=float)
     exact, filled = points[np.unique(corners[up])], _samples(points, corners, normals, up, spacing)
     weights = np.repeat((1.0, FILL_WEIGHT), (len(exact), len(filled)))
@@ -245,7 +252,13 @@ def _fitted(samples: Array, weights: Array, spacing: float, at: Array) -> Fit:
     weighted = A.T @ sparse.diags_array(weights)
     weak = _STIFFNESS * max(count / (m * n), 1.0)
     normal = weighted @ A + weak * (along.T @ along + across.T @ across)
-    factors = splu(normal.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    try:
+        factors = splu(
+            normal.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        )
+    except RuntimeError as error:  # singular: nearly all of the grid is empty
+        x, y = 1e3 * (high - low)
+        raise ValueError(f"the mesh is {x:.3g} mm by {y:.3g} mm and nearly empty: remove vertices far away") from error
     found = factors.solve(weighted @ samples[:, 2])
     c = found.reshape(m, n)
     c = (c[:-2] + 4.0 * c[1:-1] + c[2:]) / 6.0
@@ -262,6 +275,9 @@ def _fitted(samples: Array, weights: Array, spacing: float, at: Array) -> Fit:
     filled = np.zeros((m - 1, n - 1), dtype=bool)
     filled[cell[:, 0] + 1, cell[:, 1] + 1] = True
     there = filled[:-1, :-1] | filled[1:, :-1] | filled[:-1, 1:] | filled[1:, 1:]
+    if there.mean() < EMPTY:
+        x, y = 1e3 * (high - low)
+        raise ValueError(f"the mesh is {x:.3g} mm by {y:.3g} mm and nearly empty: remove vertices far away")
     ox, oy = (at - 0.5 * (low + high)).tolist()
     return Fit(heights, spacing, (ox, oy), there)
 

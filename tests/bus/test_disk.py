@@ -3,6 +3,7 @@
 import contextlib
 import io
 import os
+import threading
 from pathlib import Path
 
 import can
@@ -12,7 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import canprobe
+from canprobe.bus.clock_steps import RecordedBus
 from canprobe.bus.disk import (
+    CandumpReader,
     CandumpWriter,
     RecordingPort,
     read_candump,
@@ -50,6 +53,10 @@ def test_lines_both_ways(tmp_path: Path, line: str, frame: tuple[int, str, int, 
     [
         ("(0000000000.000001) can0 181#0a T", (1000, "can0", 0x181, b"\x0a")),
         ("(0000000000.000001) can0 701#R1", (1000, "can0", 0x701 | RTR_FLAG, b"")),
+        ("(0000000000.000001234) can0 181#0A", (1234, "can0", 0x181, b"\x0a")),
+        ("(000.000001)  can0 181#0A", (1000, "can0", 0x181, b"\x0a")),
+        ("(0000000000.000001) can0 181#0102030405060708_F", (1000, "can0", 0x181, bytes(range(1, 9)))),
+        ("(0000000000.000001) can0 701#R8_9", (1000, "can0", 0x701 | RTR_FLAG, b"")),
         ("(0000000000.000001) can0 20000004#0000000000000000", (1000, "can0", ERR_FLAG | 4, bytes(8))),
     ],
 )
@@ -69,6 +76,11 @@ def test_lines_of_other_writers_are_read(tmp_path: Path, line: str, frame: tuple
         "(0000000000.002500) can0 181##1" + "00" * 65,
         "(0000000000.002500) can0 181##0011",
         "(0000000000.002500) can0 181#00 X",
+        "(0000000000.0025001) can0 181#00",
+        "(0000000000.002500) can0 181#00_F",
+        "(0000000000.002500) can0 181#0102030405060708_8",
+        "(0000000000.002500) can0 45123#81:00:1234567#11",
+        "DROPCOUNT: dropped some CAN frames",
         " (0000000000.002500) can0 181#00",
         "0.002500 can0 181#00",
         "can0  181   [1]  00",
@@ -79,6 +91,51 @@ def test_anything_else_is_refused_with_its_line_number(tmp_path: Path, line: str
     log.write_text(f"{LINES[0][0]}\n{line}\n")
     with pytest.raises(UsageError, match=r"bus\.log:2: "):
         list(read_candump(log))
+
+
+def test_lines_for_lost_frames_and_of_can_xl_are_counted_and_no_frames(tmp_path: Path) -> None:
+    log = tmp_path / "bus.log"
+    log.write_text(
+        f"{LINES[0][0]}\n"
+        "DROPCOUNT: dropped 1 CAN frame on 'can0' socket (total drops 1)\n"
+        "DROPCOUNT: dropped 3 CAN frames on 'can0' socket (total drops 4)\n"
+        "(0000000000.002600) vcan0 45123#81:00:12345678#11223344\n"
+    )
+    reader = CandumpReader(log)
+    for _ in range(2):
+        assert list(reader) == [LINES[0][1]]
+        assert (reader.lost, reader.xl) == ({"can0": 4}, {"vcan0": 1})
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "utf-16-be"])
+def test_a_log_that_another_system_wrote_again_is_read(tmp_path: Path, encoding: str) -> None:
+    log = tmp_path / "bus.log"
+    log.write_text("".join(f"{line}\r\n" for line, _ in LINES), encoding=encoding)
+    assert list(read_candump(log)) == [frame for _, frame in LINES]
+
+
+@pytest.mark.parametrize(
+    ("line", "differences"),
+    [
+        (" (000.002500)  can0  181   [4]  37 06 00 00", True),
+        (" (1763000000.002500)  vcan0  00000001   [0]", False),
+        ("  can0  181   [1]  00   '.'", False),
+    ],
+)
+def test_what_candump_prints_on_a_screen_is_named(tmp_path: Path, line: str, differences: bool) -> None:
+    log = tmp_path / "bus.log"
+    log.write_text(f"{line}\n")
+    with pytest.raises(UsageError, match=r"on a screen.*; record with `candump -l` or -L") as caught:
+        list(read_candump(log))
+    assert ("differences (-td)" in str(caught.value)) == differences
+
+
+def test_a_log_that_comes_through_a_pipe_is_read_twice(tmp_path: Path) -> None:
+    os.mkfifo(pipe := tmp_path / "pipe")
+    writer = threading.Thread(target=pipe.write_text, args=(LINES[0][0] + "\n",))
+    writer.start()
+    assert list(RecordedBus(pipe)) == [LINES[0][1]]
+    writer.join()
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:

@@ -183,3 +183,32 @@ def test_nothing_is_overwritten(tmp_path, urdf, capsys):
     assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf)]) == 0
     assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf)]) == 2
     assert "exists already" in capsys.readouterr().err
+
+
+def test_a_failed_init_leaves_nothing_behind(tmp_path, urdf, capsys):
+    (eds := tmp_path / "drive.eds").write_text("[FileInfo]\n")
+    folder = tmp_path / "new" / "cell"
+    command = ["init", str(folder), "--urdf", str(urdf), "--eds", str(eds)]
+    assert main(command) == 2
+    assert "drive.eds" in capsys.readouterr().err
+    assert not folder.parent.exists()
+    folder.mkdir(parents=True)
+    (folder / "mine.txt").write_text("kept")
+    assert main(command) == 2
+    assert [path.name for path in folder.iterdir()] == ["mine.txt"]
+
+
+def test_a_joint_without_range_gets_a_placeholder_and_a_tilt_is_explained(tmp_path, urdf, capsys):
+    fixed = 'lower="0.3" upper="0.3"'
+    urdf.write_text(URDF.replace('lower="-2.5" upper="2.5"', 'effort="1"', 1).replace('effort="1" effort', "effort"))
+    urdf.write_text(urdf.read_text().replace('lower="-2" upper="2" effort="20"', f'{fixed} effort="20"'))
+    assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf)]) == 0
+    joints = tomllib.loads((tmp_path / "cell" / "cell.toml").read_text())["joints"]
+    for name in ("j3", "j5"):
+        assert (joints[name]["min_deg"], joints[name]["max_deg"]) == (-180, 180)
+    assert "min_deg" not in joints["j1"]
+    assert "tilts the probe" not in capsys.readouterr().err
+    few = URDF.replace('type="revolute"', 'type="fixed"', 3).replace('lower="-2" upper="2"', 'lower="-0.2" upper="0.2"')
+    urdf.write_text(few)
+    main(["init", str(tmp_path / "stiff"), "--urdf", str(urdf)])
+    assert "from straight down: of 400 tried postures" in capsys.readouterr().err

@@ -1,6 +1,9 @@
 """URDFs against Pinocchio: arms that we did not describe, all that is read of them; and what is refused."""
 
+import re
+from itertools import pairwise
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -27,7 +30,7 @@ class Oracle:
     """An arm in Pinocchio: the joints between two links, the others locked at zero; a tool on its tip."""
 
     def __init__(self, pinocchio, path, names, tip):
-        whole = pinocchio.buildModelFromUrdf(str(path))
+        self.path, whole = path, pinocchio.buildModelFromUrdf(str(path))
         locked = [i for i, name in enumerate(whole.names) if i and name not in names]
         self.pin, self.model = pinocchio, pinocchio.buildReducedModel(whole, locked, pinocchio.neutral(whole))
         at = self.model.frames[self.model.getFrameId(tip, pinocchio.FrameType.BODY)]
@@ -86,6 +89,7 @@ def test_poses_and_jacobians_are_those_of_pinocchio(arm):
 
 def test_stops_speeds_and_friction_are_those_of_pinocchio(arm):
     read, oracle, _ = arm
+    controllers = {j.get("name"): j.find("safety_controller") for j in ElementTree.parse(oracle.path).iterfind("joint")}
     for joint in read.joints:
         its, column = oracle.model.joints[oracle.model.getJointId(joint.name)], oracle.column(joint.name)
         assert joint.prismatic == its.shortname().startswith("JointModelP")
@@ -93,6 +97,9 @@ def test_stops_speeds_and_friction_are_those_of_pinocchio(arm):
             low, high = (
                 limit[its.idx_q] for limit in (oracle.model.lowerPositionLimit, oracle.model.upperPositionLimit)
             )
+            if (safety := controllers[joint.name]) is not None:  # which Pinocchio does not read
+                soft = [float(safety.get(f"soft_{end}_limit", 0.0)) for end in ("lower", "upper")]
+                low, high = (max(low, soft[0]), min(high, soft[1])) if any(soft) else (low, high)
             assert (joint.q_min, joint.q_max) == (low, high)
         else:
             assert joint.q_max == -joint.q_min == pytest.approx(2 * np.pi)
@@ -167,8 +174,52 @@ def joint(name, parent, child, kind="revolute", inside=LIMIT):
     return f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>{inside}</joint>'
 
 
-def robot(*joints, links="abcdef"):
+def robot(*joints, links=None):
+    links = links or sorted(set(re.findall(r'link="(.)"', "".join(joints)))) or "a"
     return f'<robot name="r">{"".join(f"""<link name="{x}"/>""" for x in links)}{"".join(joints)}</robot>'
+
+
+def weighed(mass, diagonal):
+    moments = " ".join(f'i{x}{x}="{value}"' for x, value in zip("xyz", diagonal.split(), strict=True))
+    inertial = f'<inertial><mass value="{mass}"/><inertia {moments}/></inertial>'
+    return robot(joint("j", "a", "b")).replace('<link name="b"/>', f'<link name="b">{inertial}</link>')
+
+
+PLAIN = robot(joint("j", "a", "b"))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        PLAIN.replace("<robot ", '<robot xmlns="http://www.ros.org/wiki/urdf" '),
+        PLAIN.replace("</robot>", "<gz:plugin a:b='1'/></robot>"),
+        f'\n <?xml version="1.0"?>{PLAIN}',
+        f'<!-- made by X -->\n<?xml version="1.0" encoding="utf-8"?>{PLAIN}',
+        PLAIN.replace("</robot>", '<xacro:property name="w" value="${2}"/><xacro:macro name="m"/></robot>'),
+        PLAIN.replace(LIMIT, LIMIT + '<safety_controller k_velocity="1"/>'),
+        PLAIN.replace(LIMIT, LIMIT + '<safety_controller soft_lower_limit="-9" soft_upper_limit="9"/>'),
+        weighed("0", "0 0 0"),
+        weighed("1", "1 1 2.01"),
+    ],
+    ids=["namespace", "prefixes", "blank", "comment", "xacro", "no soft", "wide soft", "no mass", "rounded"],
+)
+def test_a_file_that_urdfdom_takes_is_read_alike(tmp_path, text):
+    path = tmp_path / "r.urdf"
+    path.write_text(text)
+    for read in (from_urdf(path), from_urdf(text)):
+        assert read.joints == from_urdf(PLAIN).joints and read.warnings == ()
+
+
+def test_soft_limits_narrow_the_range():
+    soft = '<safety_controller soft_lower_limit="-0.5" soft_upper_limit="1.5" k_velocity="1"/>'
+    (found,) = from_urdf(PLAIN.replace(LIMIT, LIMIT + soft)).joints
+    assert (found.q_min, found.q_max) == (-0.5, 1.5)
+
+
+def test_limits_that_look_like_degrees_are_warned_of():
+    (warning,) = from_urdf(PLAIN.replace('upper="2"', 'upper="170"')).warnings
+    assert "j: <limit> from -1 to 170 rad looks like degrees" in warning
+    assert from_urdf(robot(joint("j", "a", "b", "prismatic", LIMIT.replace('"2"', '"170"')))).warnings == ()
 
 
 def test_a_small_file_from_its_text():
@@ -194,7 +245,47 @@ def test_a_small_file_from_its_text():
         ("<sdf/>", "a", "b", "expected a <robot>, got <sdf>"),
         (robot(joint("j", "a", "b")), "a", "x", "no link 'x'; it has a, b"),
         (robot(joint("j", "a", "b")), "b", "a", "'a' does not hang on 'b', but on 'a'"),
-        (robot(joint("j", "a", "b"), joint("k", "b", "a")), "c", "a", "does not hang on 'c'"),
+        (robot(joint("j", "a", "b"), joint("k", "b", "a")), "a", "b", "got none: its joints make a loop"),
+        (robot(joint("j", "a", "b"), joint("k", "c", "b")), "a", "b", "k: expected a child .* got 'b', as of j"),
+        (robot(joint("j", "a", "b"), links="abc"), "a", "b", "one <link> that hangs on no other, got 2: a, c"),
+        (robot(joint("j", "a", "b"), links="abb"), "a", "b", "link b: expected one <link> of this name, got two"),
+        (robot(joint("j", "a", "b"), links="a"), "a", "b", "j: expected a link of the file in <child>, got 'b'"),
+        (robot(joint("j", "x", "b"), links="ab"), "a", "b", "j: expected a link of the file in <parent>, got 'x'"),
+        (
+            robot(joint("j", "a", "b", inside='<limit lower="2" upper="1" velocity="1"/>')),
+            "a",
+            "b",
+            "j: expected lower below upper in its <limit>, got 2 and 1",
+        ),
+        (
+            robot(
+                joint("j", "a", "b", inside=LIMIT + '<safety_controller soft_lower_limit="3" soft_upper_limit="4"/>')
+            ),
+            "a",
+            "b",
+            "j: expected soft limits in -1 to 2 in its <safety_controller>, got 3 and 4",
+        ),
+        (weighed("-1", "1 1 1"), "a", "b", "link b: expected a value in <mass> that is not negative, got -1"),
+        (weighed("1", "-1 1 9"), "a", "b", "link b, with.*principal moments of inertia of -1, 1, 9 .* negative"),
+        (weighed("1", "1 1 9"), "a", "b", "link b, with.* larger than the sum of the others"),
+        (
+            robot(*(joint(f"j{a}", a, b) for a, b in pairwise("abcdefghij"))),
+            "a",
+            "j",
+            "9 joints move between 'a' and 'j', at most 8 can; .* --base b ",
+        ),
+        (
+            robot(
+                joint("j", "a", "b"),
+                joint("k", "b", "c", "fixed"),
+                joint("m", "b", "d", "fixed"),
+                joint("o", "a", "e", "fixed"),
+            ),
+            None,
+            None,
+            r"name the tip \(--tip LINK, or arm.tip\): one of c, d$",
+        ),
+        (robot(joint("j", "a", "b")).replace('"-1"', '"${-1}"'), "a", "b", "xacro; .*: pip install xacro; xacro arm"),
         (robot(joint("j", "a", "b", "fixed")), "a", "b", "no joint moves between 'a' and 'b'"),
         (robot(joint("j", "a", "b", "floating")), "a", "b", "j: expected revolute, .* got floating"),
         (

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
-from canprobe.errors import SceneError
+from canprobe.errors import PlanError, SceneError
+from canprobe.scene.arms import arm_model
 from canprobe.scene.load import dump_scene, load_cell, load_scene, packaged_cells, packaged_scenes, parse_scene
 
 FREE = '[scene]\nname = "mine"\n[task]\nkind = "free"\n'
@@ -128,3 +131,22 @@ def test_mistakes_in_a_cell_name_the_cell_file(tmp_path):
 
 def test_all_packaged_scenes_name_cells_that_are_there():
     assert all(load_scene(name).cell.name for name, _ in packaged_scenes())
+
+
+@pytest.mark.parametrize(
+    ("moments", "why"),
+    [((-1, 1, 1, 0, 0, 0), "negative"), ((1, 1, 9, 0, 0, 0), "larger than the sum"), ((1, 1, 1, 5, 0, 0), "negative")],
+)
+def test_an_inertia_that_no_body_has_is_refused(moments, why):
+    sections = load_scene("cylinder").joints
+    name = next(iter(sections))
+    odd = {**sections, name: replace(sections[name], mass_kg=1.0, inertia_kg_m2=tuple(map(float, moments)))}
+    with pytest.raises(PlanError, match=rf"joints\.{name}\.inertia_kg_m2: expected .* {why}"):
+        arm_model("odd", load_scene("cylinder").arm, odd)
+
+
+def test_a_scene_of_another_cell_says_where_it_touches():
+    text = 'cell = "puma560"\n[scene]\nname = "mine"\n[task]\nkind = "press"\n[object]\nkind = "plane"\n'
+    with pytest.raises(SceneError, match=r"task\.start_mm: missing: .* place of the cell puma260, not of puma560"):
+        parse_scene(text)
+    assert parse_scene(text.replace('"puma560"', '"puma260"')).task.start_mm == (-120.0, -122.5, 374.0)

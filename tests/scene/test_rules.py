@@ -8,7 +8,7 @@ import pytest
 
 import canprobe
 from canprobe.errors import SceneError, UsageError
-from canprobe.scene.load import load_scene
+from canprobe.scene.load import load_scene, parse_scene
 from canprobe.session.target import Target
 
 PRESS = load_scene("press")
@@ -113,3 +113,29 @@ def test_what_is_no_scene(call):
         call("pres")
     with pytest.raises(SceneError, match=r"did you mean force_n\?"):
         call("press", {"task.force": 3})
+
+
+TAXELS = [[x, y, 0.0] for x in (0.0, 4.0) for y in (0.0, 4.0)]
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        (f"positions_mm = {TAXELS[:3] + TAXELS[:1]}", r"positions_mm: expected a place for each taxel, got .* 1 and 4"),
+        (f"positions_mm = {[[x / 1e3 for x in t] for t in TAXELS]}", r"positions_mm: .* are they in metres\?"),
+        (f"positions_mm = {TAXELS}\nnormals = {[[0.1, 0, -1]] * 4}", "normals: expected outward normals"),
+        ('mode = "window"', 'window: .* the smallest window has 4: set sensor.mode = "image"'),
+    ],
+)
+def test_an_array_in_another_unit_or_inside_out_is_refused(keys, message):
+    text = '[scene]\nname = "mine"\n[task]\nkind = "press"\n[sensor]\nrows = 2\ncolumns = 2\npitch_mm = 4\n'
+    with pytest.raises(SceneError, match=rf"sensor\.{message}"):
+        parse_scene(text + keys + '\n[object]\nkind = "plane"\n')
+
+
+def test_counts_that_do_not_fit_the_field_are_refused():
+    wire = '[wire]\nkind = "frames"\nids = ["480h"]\nframes = ["aa bb cc dd"]\nsampling = "free"\nunloaded_counts = 1\n'
+    text = '[scene]\nname = "mine"\n[task]\nkind = "press"\n[object]\nkind = "plane"\n'
+    text += '[sensor]\nrows = 2\ncolumns = 2\nmode = "image"\n'
+    with pytest.raises(SceneError, match=r"wire\.full_scale_counts: expected at most 255 in 8 bits .* got 256"):
+        parse_scene(f"{text}{wire}full_scale_counts = 256\n")

@@ -53,7 +53,13 @@ def test_heights_of_every_kind_of_file_are_the_same_surface(name, tmp_path):
         ("bump.png", b"", "expected heights in a file of .npy, .npz, .csv, .txt, got bump.png"),
         ("bump.csv", b"1, 2\n3, four\n", "bump.csv is no grid of numbers: could not convert string to float: 'four'"),
         ("bump.csv", b"1, 2\n3\n", "no grid of numbers"),
-        ("bump.txt", b"", "grid of heights"),
+        ("bump.txt", b"", "bump.txt is empty"),
+        ("bump.txt", b"# nothing but this", "grid of heights"),
+        ("bump.csv", b"version https://git-lfs.github.com/spec/v1\noid", "bump.csv is a pointer of Git LFS"),
+        ("bump.csv", b"<!DOCTYPE html>\n<html>", "bump.csv is an HTML page"),
+        ("bump.csv", b"0;0,5\n0;-9999\n0;0", "1 of 6 heights are -9999: no data"),
+        ("bump.csv", b"0;0,5\n0;500\n0;0", "heights rise by 500 mm over a grid 2 mm wide: .* unit_mm = 1 "),
+        ("bump.csv", b"0;0,0005\n0;0\n0;0", "heights rise by 0.0005 mm over a grid 2 mm wide"),
         ("bump.npy", b"\x93NUMPY", "bump.npy is no grid of numbers"),
         ("bump.npz", b"PK\x03\x04", "bump.npz is no grid of numbers"),
     ],
@@ -65,6 +71,14 @@ def test_a_file_without_a_surface_is_refused_with_its_reason(name, content, mess
     scene = dataclasses.replace(load_scene("relief"), object=settings)
     with pytest.raises(PlanError, match=message.replace("(", "\\(")):
         resolve(scene)
+
+
+def test_a_decimal_comma_between_semicolons(tmp_path):
+    point, comma = tmp_path / "point.csv", tmp_path / "comma.csv"
+    np.savetxt(point, BUMP_MM, fmt="%.6f", delimiter=",")
+    comma.write_text(point.read_text().replace(",", ";").replace(".", ","))
+    found = [kappa_over(ObjectSettings("heights", file=str(f), spacing_mm=1.0), 0.004, 0.0) for f in (point, comma)]
+    np.testing.assert_array_equal(*found)
 
 
 def test_a_grid_without_spacing_and_an_archive_without_heights(tmp_path):

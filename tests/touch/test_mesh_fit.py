@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import Delaunay
 
+from canprobe.touch.mesh_fit import fit_mesh
 from canprobe.touch.objects import make_object
 
 EDGE, SPACING = 5e-4, 1e-3
@@ -132,3 +133,17 @@ def test_an_open_mesh_that_faces_down_and_an_origin_beside_it():
         mesh(vertices, faces[:, ::-1])
     with pytest.raises(ValueError, match="beside the surface"):
         mesh(vertices, faces, origin=(0.1, 0.0))
+
+
+def test_a_mesh_narrower_than_seven_spacings_or_with_a_far_vertex_is_refused():
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-4.0, 4.1), np.arange(-4.0, 4.1), indexing="ij"))
+    points = 1e-3 * np.column_stack((x, y, -0.01 * (x * x + y * y)))
+    corner = np.array([9 * i + j for i in range(8) for j in range(8)])[:, None]
+    faces = np.concatenate((corner + np.array((0, 9, 1)), corner + np.array((1, 9, 10))))
+    assert fit_mesh(points, faces, 1e-3).there.any()
+    with pytest.raises(ValueError, match=r"8 mm by 8 mm, narrower than 7 spacings of 1.5 mm"):
+        fit_mesh(points, faces, 1.5e-3)
+    for far in (0.1, 0.2):
+        odd = np.concatenate((points, [[far, far, 0.0]])), np.concatenate((faces, [[0, len(points), 1]]))
+        with pytest.raises(ValueError, match=r"mm and nearly empty: remove vertices far away"):
+            fit_mesh(*odd, 1e-3)
