@@ -17,6 +17,7 @@ from canprobe.eds.packaged import FULL_SCALE, has_full_scale, load_eds
 from canprobe.eds.reading import is_drive
 from canprobe.emulator.array import make_tactile_node
 from canprobe.emulator.drive.drive import make_drive_node
+from canprobe.emulator.drive.parameters import Delivery
 from canprobe.emulator.drive.reference import IdealAxis
 from canprobe.emulator.node.dictionary import key_of
 from canprobe.emulator.node.slave_node import SlaveNode
@@ -167,6 +168,7 @@ def _node(setup: Setup, planned: PlannedNode, node_id: int, plant: Plant, homed:
             axis,
             plant,
             od_of,
+            delivery=Delivery(drive.turn_units, drive.metre_units, setup.arm.missed_syncs),
             quirks=drive.quirks,
             incremental=drive.zero is not None and not homed,
             seed=setup.seed,
