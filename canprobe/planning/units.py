@@ -28,8 +28,6 @@ PROFILE_SPEED_LIMIT, MOTOR_SPEED_LIMIT = 0x607F, 0x6080
 ROUNDING_COUNTS = 2
 """By which two targets may be rounded apart."""
 _LOWEST, _HIGHEST = -(1 << 31), (1 << 31) - 1
-_LEAST_SPEED = 1e-3
-"""Position units/s, of a drive whose limit is below the rounding of its targets: no task can be done with it."""
 _TOLERANCE = 1e-3
 """Share by which units may differ: a factor of the device is a quotient of integers."""
 
@@ -126,6 +124,19 @@ def range_problems(setup: Setup) -> Iterator[str]:
             )
 
 
+def speed_problems(setup: Setup, devices: Mapping[int, Abilities]) -> Iterator[str]:
+    """Drives whose limit of speed is no more than what whole targets differ by from cycle to cycle."""
+    arm, rounding = setup.arm, ROUNDING_COUNTS * setup.rate_hz
+    for joint, drive in zip(arm.model.joints, arm.drives, strict=True) if arm is not None else ():
+        most, index = _allowed_speed(devices[drive.node_id], drive, math.inf)
+        if most <= rounding:
+            yield (
+                f"joints.{joint.name}: drive {drive.node_id} allows {most:.4g} units/s by its {index:04X}h, and whole"
+                f" targets differ by as much as {rounding:g} units/s at cycle.rate_hz = {setup.rate_hz:g}: check 60A9h"
+                " in the EDS, then counts_per_turn and gear; if they are right, lower cycle.rate_hz"
+            )
+
+
 def motor_speed_limit(model: ArmModel, axis: int, share: float, period_ns: int) -> int:
     """Drive units/s beyond which it must not follow a target: all joints that move the motor, at their limits.
 
@@ -165,7 +176,7 @@ def _within_speeds(setup: Setup, arm: Arm, devices: Mapping[int, Abilities]) -> 
         if wanted + rounding <= most:
             continue
         moved = np.flatnonzero(model.units_per_q[axis])
-        slowest[moved] = np.minimum(slowest[moved], max(most - rounding, _LEAST_SPEED) / wanted)
+        slowest[moved] = np.minimum(slowest[moved], (most - rounding) / wanted)
         slower.append((model.joints[axis].name, index))
     if not slower:
         return setup, ()
@@ -187,7 +198,9 @@ def _allowed_speed(device: Abilities, drive: Drive, wanted: float) -> tuple[floa
     """The lowest of the limits that stand in a drive, position units/s, and its object; infinite without any."""
     limits = [(math.inf, PROFILE_SPEED_LIMIT)]
     entry, unit = device.description.entry(PROFILE_SPEED_LIMIT), speed_unit(device, drive, VELOCITY)
-    if entry is not None and unit is not None and not (entry.writable and entry.allows(math.ceil(wanted / unit))):
+    if entry is not None and unit is not None and not (
+        entry.writable and (wanted == math.inf or entry.allows(math.ceil(wanted / unit)))
+    ):
         held = device.number(PROFILE_SPEED_LIMIT)
         limits += [(held * unit, PROFILE_SPEED_LIMIT)] if held else []
     turn, _ = _motor_turn(device, drive)
