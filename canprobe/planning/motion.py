@@ -421,7 +421,7 @@ def _along_path(task: Touch, path: SurfacePath) -> Iterator[_Pose]:
     above = approach.start + approach.normal * approach.clearance
     lifted = path.points[0] + path.normals[0] * approach.clearance
     points, normals = (above, lifted, *path.points), (approach.normal, path.normals[0], *path.normals)
-    turns = (math.inf, _TOUCH_TO_TOUCH_RAD, *(_BRANCH_RAD for _ in path.points))
+    turns = (math.inf, _TOUCH_TO_TOUCH_RAD, _TOUCH_TO_TOUCH_RAD, *(_BRANCH_RAD for _ in path.points[1:]))
     for point, normal, pole, most_rad in zip(points, normals, (approach.normal, poles[0], *poles), turns, strict=True):
         metres = " (are these metres?)" if np.abs(point).max() < _METRES else ""
         out_of_reach = (
