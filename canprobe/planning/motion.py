@@ -192,12 +192,13 @@ def check_motion(setup: Setup) -> tuple[JointSpeeds | None, list[str]]:
             case Free() as task:
                 speeds, found = _check_swing(task, stops, starts=not problems)
             case Calibrate() as task:
-                joints = _follow(task.arm, task.probe, _over_ball(task), _beginning(setup, task.arm))
+                joints = _follow(task.arm, task.probe, _over_ball(task), _beginning(setup, task, _over_ball(task)))
                 speeds, found = stops.speeds(np.zeros_like(task.arm.q_start)), stops.problems(joints)
             case Touch() as task:
                 path = surface_path(task, setup.truth.object)
                 problems += _hollow_problems(path, task.probe)
-                speeds, found = _check_touch(task, path, stops, _beginning(setup, task.arm))
+                contacts = [*_along_path(task, path)][_BEFORE_CONTACT:]
+                speeds, found = _check_touch(task, path, stops, _beginning(setup, task, contacts))
             case _:
                 return None, problems
     except PlanError as error:
@@ -330,9 +331,19 @@ def _too_fast(arm: Arm, speeds: JointSpeeds, way_out: str) -> list[str]:
     ]
 
 
-def _beginning(setup: Setup, arm: Arm) -> Array:
-    """Where the arm moves from, (n,) rad or m, as far as it is known."""
-    return parked_posture(setup, arm) if setup.emulates else arm.q_start
+def _beginning(setup: Setup, task: Touch | Calibrate, contacts: Iterable[_Pose]) -> Array:
+    """Where the arm moves from, (n,) rad or m, as far as it is known.
+
+    Raises:
+        PlanError: an emulated arm cannot be parked; or the contacts are out of reach, which matters more.
+    """
+    if not setup.emulates:
+        return task.arm.q_start
+    try:
+        return parked_posture(setup, task.arm)
+    except PlanError:
+        _follow(task.arm, task.probe, contacts, task.arm.q_start)
+        raise
 
 
 def _check_touch(
