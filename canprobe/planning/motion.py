@@ -354,6 +354,10 @@ def _check_touch(
         return None, problems
     joints = _follow(task.arm, task.probe, _along_path(task, path), q_start)
     problems = stops.problems(np.vstack((q_start, joints)))
+    approach = task.approach
+    down = stops.speeds(np.abs(joints[_BEFORE_CONTACT] - joints[1]) / approach.clearance * approach.speed)
+    slowly = 1e3 * approach.speed / max(down.worst_share, 1.0) * 0.99
+    problems += _too_fast(task.arm, down, f"lower task.approach_mm_s to {slowly:.3g}")
     if task.scan is None:
         return stops.speeds(np.zeros_like(task.arm.q_start)), problems
     steps = np.linalg.norm(np.diff(path.points, axis=0), axis=1)

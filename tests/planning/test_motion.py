@@ -187,3 +187,11 @@ def test_a_posture_in_which_an_emulated_arm_is_parked_must_be_in_reach(cylinder)
     assert canprobe.plan(high)
     (problem,) = reasons(change(high, task={"clearance_mm": 50.0}))
     assert problem.startswith("task.clearance_mm = 50: an emulated arm begins 5 mm above it, and cannot: ")
+
+
+def test_an_approach_beyond_the_joints_is_refused_with_a_speed_that_fits():
+    """The arm would lag behind the approach, which then finds no object."""
+    slow = change(load_scene("press"), limits={"joint_speed_share": 0.002})
+    (problem, *_) = reasons(slow)
+    fitting = float(problem.split("task.approach_mm_s to ")[1])
+    assert canprobe.plan(change(slow, task={"approach_mm_s": fitting}))
