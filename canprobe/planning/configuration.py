@@ -340,7 +340,8 @@ def _drive_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Writ
     window = round(abs(float(model.units_per_q[axis, axis] * model.radian[axis])) * np.radians(FOLLOWING_WINDOW_DEG))
     limit = motor_speed_limit(model, axis, setup.limits.speed_share, plan.sync.period_ns)
     unit = speed_unit(device, arm.drives[axis], VELOCITY)
-    speed = [Write(PROFILE_SPEED_LIMIT, 0, math.ceil(limit / unit), "highest speed of the motor", _FAST)] if unit else []
+    fastest = "highest speed of the motor"
+    speed = [Write(PROFILE_SPEED_LIMIT, 0, math.ceil(limit / unit), fastest, _FAST)] if unit else []
     interpolated = node.mode is OperationMode.INTERPOLATED_POSITION
     following = "a drive that does not follow is noticed as the device has it"
     lag = "a drive that lags is given as long as the device has it"

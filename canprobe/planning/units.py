@@ -188,8 +188,8 @@ def _within_speeds(setup: Setup, arm: Arm, devices: Mapping[int, Abilities]) -> 
     )
     objects = " and ".join(sorted({f"{index:04X}h" for _, index in slower}))
     warning = (
-        f"{objects}: drives that fault below the speeds of their joints; the plan keeps within {told}. If that is wrong,"
-        " check 60A9h in the EDS, then counts_per_turn and gear"
+        f"{objects}: drives that fault below the speeds of their joints; the plan keeps within {told}. If that is"
+        " wrong, check 60A9h in the EDS, then counts_per_turn and gear"
     )
     return setup.changed("arm", model=replace(model, joints=tuple(limits))), (warning,)
 

@@ -1,7 +1,7 @@
 """Cells drawn by seed from other people's arms, drives and arrays: what `plan` accepts, `run` completes.
 
-An arm is one of the URDFs of example-robot-data or a packaged cell, a drive one of `makes` with what vendors' files have
-besides, an array packaged or drawn. Each combination is a folder with files of the user's kind, so that
+An arm is one of the URDFs of example-robot-data or a packaged cell, a drive one of `makes` with what vendors' files
+have besides, an array packaged or drawn. Each combination is a folder with files of the user's kind, so that
 `canprobe plan FOLDER/scene.toml` repeats it. From the command line:
 
     python tests/support/combinations.py --count 200 --seed 1 --keep /tmp/combinations
@@ -275,7 +275,8 @@ def draw_array(rng: Random, folder: Path, kind: str, rate_hz: float) -> tuple[st
     sides, pitches = ((10, 12, 16, 16), (1, 1.6, 1.6, 2.5)) if moves else ((1, 4, 8, 12, 16, 24), (1, 1.6, 4, 10, 30))
     rows, columns, pitch = rng.choice(sides), rng.choice(sides), rng.choice(pitches)
     rate = image_hz if rng.random() < 0.8 else rng.choice((50, 100, 200))
-    mode, mount = rng.choice(("window", "window", "image", "features")), rng.choice(("sphere",) * 3 + ("flat",) * (not moves))
+    mode = rng.choice(("window", "window", "image", "features"))
+    mount = rng.choice(("sphere",) * 3 + ("flat",) * (not moves))
     lines = [f"rows = {rows}", f"columns = {columns}", f"pitch_mm = {pitch}", f'mount = "{mount}"', f'mode = "{mode}"']
     if mode == "window":
         lines.append(f"window = {rng.choice([side for side in (4, 6, 8, 10) if side <= min(rows, columns)] or [4])}")
