@@ -257,7 +257,7 @@ class Homing:
         if inside != zero.home and _has_profile_position(setup):
             with self._left_disabled(setup):
                 target = round(drive_position_at(self._model, axis, inside, units))
-                self._move(setup, zero, target, max(1, round(zero.speed * per_q)))
+                self._move(setup, zero, target, max(1, round(zero.speed * per_q / setup.speed_unit)))
             stands = f"it stands at {joint.text(inside, '.2f')}, inside its range"
         elif inside != zero.home:
             stands = "it stands there, outside its range: move it inside by hand before a run"

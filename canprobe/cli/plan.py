@@ -1,17 +1,20 @@
 """Show what a scene would send on the bus, whether it fits, and what it leaves out. No bus is opened.
 
-A scene that does not fit is refused with status 2, with every reason and with changes that make it fit.
+A scene that does not fit is refused with status 2, with every reason and with changes that make it fit. --rehearse also
+brings the cell up in lockstep with every node emulated, and carries out the beginning of its task.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from canprobe.cli.output import print_json, say
 from canprobe.cli.parser import Parser, add_options, add_scene, loaded
 from canprobe.errors import CanprobeError, PlanError, UsageError, install_line
+from canprobe.session.terminal import columns
 
 if TYPE_CHECKING:
     from canprobe.planning.model import Plan
@@ -28,6 +31,7 @@ files of --export:
 examples:
   canprobe plan cylinder
   canprobe plan mine.toml --auto
+  canprobe plan mine.toml --rehearse
   canprobe plan cylinder --measured runs/cylinder-20260101-120000-000
   canprobe plan cylinder --export dbc --export dcf --out config/
   canprobe plan cylinder --figure plan.png
@@ -40,6 +44,11 @@ def add_arguments(parser: Parser) -> None:
     add_scene(parser)
     parser.add_argument(
         "--measured", metavar="LOG", type=Path, help="compare a candump log or the folder of a run with the plan"
+    )
+    parser.add_argument(
+        "--rehearse",
+        action="store_true",
+        help="bring the cell up in lockstep, all of it emulated, and touch; status 2 with the cause where that fails",
     )
     parser.add_argument(
         "--auto",
@@ -84,10 +93,13 @@ def run(args: argparse.Namespace) -> int:
 
     if args.measured is not None and (args.export or args.figure is not None):
         raise UsageError("plan: --measured sets a log beside the plan and writes no --export or --figure")
+    if args.measured is not None and args.rehearse:
+        raise UsageError("plan: --measured sets a log beside the plan and rehearses nothing: leave out one of both")
     scene = loaded(args)
     try:
         setup = resolve(scene)
         plan = make_plan(opened(setup) if args.auto else setup)
+        rehearsed = _rehearse(plan) if args.rehearse else None
     except PlanError as error:
         if args.json:
             print_json(refused_dict(scene.name, error.problems, error.ways_out))
@@ -100,12 +112,33 @@ def run(args: argparse.Namespace) -> int:
 
         files += export_plan(plan, args.out, args.export)
     if args.json:
-        print_json(plan_dict(plan) | ({"files": [str(file) for file in files]} if files else {}))
+        more = {"rehearsed": rehearsed} if rehearsed is not None else {}
+        print_json(plan_dict(plan) | more | ({"files": [str(file) for file in files]} if files else {}))
     elif files:
         print("\n".join(str(file) for file in files))
     else:
-        print(plan_text(plan), end="")
+        print(plan_text(plan, columns(sys.stdout)), end="")
+    if rehearsed is not None and not args.json:
+        print(f"\nrehearsed in lockstep: {rehearsed}")
     return 0
+
+
+def _rehearse(plan: Plan) -> str:
+    """Run the beginning of a plan, all of it emulated; what was done, for people.
+
+    Raises:
+        PlanError: it did not come to its end.
+    """
+    from canprobe.session.session import run_beginning
+
+    what = f'{len(plan.nodes)} nodes brought up, then {{time:.2f}} s of task.kind = "{plan.setup.kind}"'
+    try:
+        session = run_beginning(plan)
+    except PlanError:
+        raise
+    except CanprobeError as error:
+        raise PlanError([f"the rehearsal failed ({type(error).__name__}): {error}"]) from error
+    return what.format(time=len(session.cell.log) / plan.sync.rate_hz) + ": done"
 
 
 def _scene_beside(log: Path) -> str | None:

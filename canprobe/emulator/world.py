@@ -17,6 +17,7 @@ from canprobe.eds.packaged import FULL_SCALE, has_full_scale, load_eds
 from canprobe.eds.reading import is_drive
 from canprobe.emulator.array import make_tactile_node
 from canprobe.emulator.drive.drive import make_drive_node
+from canprobe.emulator.drive.parameters import Delivery
 from canprobe.emulator.drive.reference import IdealAxis
 from canprobe.emulator.node.dictionary import key_of
 from canprobe.emulator.node.slave_node import SlaveNode
@@ -25,10 +26,10 @@ from canprobe.emulator.plant.plant import Plant
 from canprobe.emulator.plant.taxels import TaxelConfig
 from canprobe.emulator.raw_array import RawArray
 from canprobe.planning.model import Plan, PlannedNode
+from canprobe.planning.motion import parked_posture
 from canprobe.planning.units import FEED, GEAR_RATIO, RESOLUTION
 from canprobe.protocol.frames import SYNC_ID, UNCONFIGURED, Frame
 from canprobe.robot.chain import Array, Chain, forward
-from canprobe.robot.inverse import start_posture
 from canprobe.scene.setup import Arm, Setup
 from canprobe.touch.pad import Pad
 
@@ -87,9 +88,6 @@ def set_serial_number(node: SlaveNode, serial: int) -> None:
 
 
 # Plan → the emulated side: one plant, its nodes, and the recorder of what is true.
-
-PARKED_ABOVE = 5e-3
-"""How far above the approach's first point an emulated arm stands at power on, m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,6 +165,7 @@ def _node(setup: Setup, planned: PlannedNode, node_id: int, plant: Plant, homed:
             axis,
             plant,
             od_of,
+            delivery=Delivery(drive.turn_units, drive.metre_units, setup.arm.missed_syncs),
             quirks=drive.quirks,
             incremental=drive.zero is not None and not homed,
             seed=setup.seed,
@@ -203,7 +202,7 @@ def _plant_config(setup: Setup) -> PlantConfig:
     )
     if setup.arm is None or truth.model is None:
         return config
-    q0 = _first_posture(setup, setup.arm)
+    q0 = parked_posture(setup, setup.arm)
     return replace(
         config,
         q0=q0,
@@ -232,22 +231,6 @@ def _tared_s(setup: Setup) -> float:
         return 0.0
     assert setup.array is not None
     return 1.5 * raw.tare_images / setup.array.rate_hz
-
-
-def _first_posture(setup: Setup, arm: Arm) -> Array:
-    """Joint positions (n,), rad or m, at power on: above the start point of a touch, else as in the scene."""
-    touch = setup.touch
-    if touch is None:
-        return arm.q_start
-    return start_posture(
-        arm.model,
-        touch.approach.start,
-        touch.approach.normal,
-        arm.q_start,
-        radius_m=touch.probe.radius,
-        T_flange_probe=touch.probe.T_flange_probe,
-        clearance_m=touch.approach.clearance + PARKED_ABOVE,
-    )
 
 
 # A node from an EDS alone, of any make: the values of the file, and a drive where the file describes one.

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from canprobe.errors import UsageError
 from canprobe.planning.model import MASTER_NODE_ID, PlannedFrames, PlannedPdo
 from canprobe.planning.traffic import frame_bits
 from canprobe.planning.window import patch_radius_m
@@ -96,6 +97,7 @@ def array_problems(setup: Setup) -> Iterator[str]:
     array, task, support = setup.array, setup.task, support_of(setup)
     if array is None or support is None:
         return
+    yield from _unreadable(array)
     what = 'task.kind = "scan"' if setup.scan is not None else 'task.kind = "calibrate"'
     if setup.scan is not None or isinstance(task, Calibrate):
         needs = "its contact must be able to move over the sphere of a probe; press or listen with it"
@@ -116,6 +118,21 @@ def array_problems(setup: Setup) -> Iterator[str]:
                 f" the next (sensor.rate_hz = {array.rate_hz:g}), more than the {1e3 * array.pad.pitch_m:g} mm between"
                 f" taxels; lower it to {1e3 * most:.3g}"
             )
+
+
+def _unreadable(array: Array) -> Iterator[str]:
+    """That no force can be read from the array, because a contact falls between its taxels."""
+    from canprobe.touch.patch.image_model import make_patch_calibration  # late, as it imports scipy
+
+    try:
+        make_patch_calibration(array.calibration, array.pad)
+    except UsageError:
+        pad = array.pad
+        yield (
+            f"sensor.pitch_mm = {1e3 * pad.pitch_m:g}: on the sphere of probe.radius_mm = {1e3 * pad.radius_m:g} a"
+            f" contact is too small for taxels so far apart, and the array {array.name} shows no force; take a finer"
+            " array, or a larger sphere"
+        )
 
 
 # Raw frames.

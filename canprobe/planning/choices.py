@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib.util
 import ipaddress
 import itertools
+import math
 import re
 from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -251,15 +252,15 @@ _DIVISORS_US = [us for us in range(500, 1_000_000, 100) if 1_000_000 % us == 0]
 
 
 def _slower(setup: Setup, fit: Fit) -> Iterator[tuple[str, Setup]]:
-    """The fastest cycle of whole hertz, or of whole milliseconds, that fits, at as many cycles a tactile frame."""
+    """The fastest cycle of whole hertz, or of whole milliseconds, that fits, with images as fast as the scene's."""
     periods_us = {us for us in range(1000, _SLOWEST_US, 1000)} | {us for us in _DIVISORS_US if us < _SLOWEST_US}
     rates = sorted((float(f"{1e6 / us:.6g}") for us in periods_us), reverse=True)
     for rate in (rate for rate in rates if rate < setup.rate_hz):
         changed, text = replace(setup, rate_hz=rate), f"cycle.rate_hz = {rate:.6g}"
         if setup.array is not None:
-            tactile = rate * setup.array.rate_hz / setup.rate_hz
+            tactile = rate / math.ceil(rate / setup.array.rate_hz)  # the cycle is a multiple
             changed = changed.changed("array", rate_hz=tactile)
-            text += f" with sensor.rate_hz = {tactile:.6g}"
+            text += f" with sensor.rate_hz = {tactile:.6g}" * (tactile != setup.array.rate_hz)
         if fit(changed) is not None:
             yield text, changed
             return

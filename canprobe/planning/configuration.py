@@ -10,6 +10,7 @@ impossible where it is required, `NodeSetup.problems`. What only the device refu
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -42,8 +43,18 @@ from canprobe.planning.model import (
 )
 from canprobe.planning.operation import INTERPOLATION_TIME, SYNC_PERIOD, follows_sync_period, homing_problems
 from canprobe.planning.traffic import CLASSIC_BYTES
-from canprobe.planning.units import POLARITY, POSITION_LIMITS, TurnUnits, motor_speed_limit, software_limits, turn_units
+from canprobe.planning.units import (
+    POLARITY,
+    POSITION_LIMITS,
+    PROFILE_SPEED_LIMIT,
+    TurnUnits,
+    motor_speed_limit,
+    software_limits,
+    speed_unit,
+    turn_units,
+)
 from canprobe.protocol.cia402 import OperationMode
+from canprobe.protocol.si_unit import ACCELERATION, VELOCITY
 from canprobe.protocol.tactile import TactileMode
 from canprobe.robot.model import coupled_joints, drive_position_at, joints_to_units
 
@@ -147,6 +158,7 @@ class NodeSetup:
         homing: what a drive needs for homing, in order; empty: it is not homed. Where the drive is coupled to other
             joints, the home offset depends on where they are; here they are in the start posture.
         turn: units of a motor turn, with which the device's own statement is compared; None: there is none.
+        speed_unit: position units/s of what the drive has for a velocity.
     """
 
     node_id: int
@@ -163,6 +175,7 @@ class NodeSetup:
     mode: int | None = None
     homing: tuple[Write, ...] = ()
     turn: TurnUnits | None = None
+    speed_unit: float = 1.0
 
     @property
     def configuration_date(self) -> dict[int, int]:
@@ -189,7 +202,7 @@ def _setup(plan: Plan, node: PlannedNode) -> NodeSetup:
     arm = plan.setup.arm
     drive = arm.drives[arm.node_ids.index(node.node_id)] if arm is not None and node.kind == "drive" else None
     times = [_interpolation_writes(device, time) for time in node.interpolation[1:]]
-    homing, not_homing, no_homing = _possible(device, _homing_writes(plan, node))
+    homing, not_homing, no_homing = _possible(device, _homing_writes(plan, node, device))
     no_homing += [*homing_problems(device), *_coupling_problems(plan, node)] if homing else []
     return NodeSetup(
         node_id=node.node_id,
@@ -206,6 +219,7 @@ def _setup(plan: Plan, node: PlannedNode) -> NodeSetup:
         mode=node.mode,
         homing=tuple(homing),
         turn=None if drive is None else turn_units(device, drive.turn_units, drive.gear),
+        speed_unit=1.0 if drive is None else speed_unit(device, drive, VELOCITY) or 1.0,
     )
 
 
@@ -318,6 +332,7 @@ _DEAF = "the device will not notice a dead master"
 _BY_DEFAULT = "it goes pre-operational, which is the default of CiA 301, or does what the device has"
 _SELF_STARTING = "the device may become operational before it is configured"
 _MISSED_SYNCS = "SYNCs after which the drive stops by itself"
+_FAST = "the drive itself limits its speed as the device has it, or not at all"
 
 
 def _drive_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Write]:
@@ -326,11 +341,13 @@ def _drive_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Writ
     model, axis = arm.model, arm.node_ids.index(node.node_id)
     low, high = software_limits(model)
     window = round(abs(float(model.units_per_q[axis, axis] * model.radian[axis])) * np.radians(FOLLOWING_WINDOW_DEG))
-    speed = motor_speed_limit(model, axis, setup.limits.speed_share, plan.sync.period_ns)
+    limit = motor_speed_limit(model, axis, setup.limits.speed_share, plan.sync.period_ns)
+    unit = speed_unit(device, arm.drives[axis], VELOCITY)
+    fastest = "highest speed of the motor"
+    speed = [Write(PROFILE_SPEED_LIMIT, 0, math.ceil(limit / unit), fastest, _FAST)] if unit else []
     interpolated = node.mode is OperationMode.INTERPOLATED_POSITION
     following = "a drive that does not follow is noticed as the device has it"
     lag = "a drive that lags is given as long as the device has it"
-    fast = "the drive itself does not limit its speed"
     stops = "the drive guards the ends of the joint as the device has it, or not at all"
     quick = "a quick stop goes and ends as the device has it"
     lost = "a drive that loses its master does what the device has"
@@ -341,7 +358,7 @@ def _drive_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Writ
         *(_interpolation_writes(device, node.interpolation[0]) if node.interpolation else []),
         Write(0x6065, 0, window, "following error window", following),
         Write(0x6066, 0, FOLLOWING_TIMEOUT_MS, "following error time-out", lag),
-        Write(0x607F, 0, speed, "highest speed of the motor", fast),
+        *speed,
         Write(POSITION_LIMITS, 1, int(low[axis]), "lowest position", stops),
         Write(POSITION_LIMITS, 2, int(high[axis]), "highest position", stops),
         Write(0x605A, 0, QUICK_STOP_AND_DISABLE, "what a quick stop does", quick),
@@ -349,7 +366,7 @@ def _drive_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Writ
     ]
 
 
-def _homing_writes(plan: Plan, node: PlannedNode) -> list[Write]:
+def _homing_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Write]:
     """607Ch is from the home position to the zero: at home the drive is at -607Ch. Source: CiA 402-2, "Homing mode"."""
     arm = plan.setup.arm
     axis = arm.node_ids.index(node.node_id) if arm is not None and node.kind == "drive" else None
@@ -358,13 +375,16 @@ def _homing_writes(plan: Plan, node: PlannedNode) -> list[Write]:
         return []
     home = drive_position_at(arm.model, axis, zero.home, joints_to_units(arm.model, arm.q_start))
     units = abs(float(arm.model.units_per_q[axis, axis]))
+    speed, acceleration = (
+        units / (speed_unit(device, arm.drives[axis], index) or 1.0) for index in (VELOCITY, ACCELERATION)
+    )
     ramp = "homing accelerates as the device has it"
     still = f"method {zero.method} does without" if zero.method in HOMES_HERE else None
     return [
         Write(0x6098, 0, zero.method, "homing method"),
-        Write(0x6099, 1, max(1, round(zero.speed * units)), "speed of the search for the switch", still),
-        Write(0x6099, 2, max(1, round(zero.zero_speed * units)), "speed of the search for the zero", still),
-        Write(0x609A, 0, max(1, round(zero.acceleration * units)), "acceleration in homing", ramp),
+        Write(0x6099, 1, max(1, round(zero.speed * speed)), "speed of the search for the switch", still),
+        Write(0x6099, 2, max(1, round(zero.zero_speed * speed)), "speed of the search for the zero", still),
+        Write(0x609A, 0, max(1, round(zero.acceleration * acceleration)), "acceleration in homing", ramp),
         Write(HOME_OFFSET, 0, -round(home), "home offset"),
     ]
 
@@ -408,11 +428,17 @@ def _array_writes(plan: Plan, _: PlannedNode, device: Abilities) -> list[Write]:
 
 
 def _drive_given(device: Abilities) -> tuple[Given, ...]:
-    """The cell states in `sign` how a drive counts; 607Eh would turn that round."""
-    if not device.has(POLARITY):
-        return ()
-    otherwise = "it would count the other way round than the cell's sign says; set 607Eh back in the drive"
-    return (Given(POLARITY, 0, device.number(POLARITY) or 0, "as its EDS says", otherwise),)
+    """The cell states in `sign` how a drive counts; 607Eh would turn that round. Speeds are written in unit 60A9h."""
+    otherwise = {
+        POLARITY: "it would count the other way round than the cell's sign says; set 607Eh back in the drive",
+        VELOCITY: "limits of speed would be wrong by the ratio of the units; set 60A9h back in the drive, or take the"
+        " drive's value into the EDS",
+    }
+    return tuple(
+        Given(index, 0, device.number(index) or 0, "as its EDS says", text)
+        for index, text in otherwise.items()
+        if device.has(index)
+    )
 
 
 def _array_given(plan: Plan, dictionary: Any) -> tuple[Given, ...]:

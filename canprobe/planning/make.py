@@ -35,7 +35,7 @@ from canprobe.planning.motion import check_motion
 from canprobe.planning.operation import choose_mode, interpolations, operation_problems, period_problem
 from canprobe.planning.pdos import PdoPlanning, plan_drive_pdos, plan_tactile_pdos
 from canprobe.planning.traffic import plan_ratio, plan_sync, plan_traffic
-from canprobe.planning.units import range_problems, within_drives
+from canprobe.planning.units import range_problems, speed_problems, within_drives
 from canprobe.planning.window import cut_patch
 from canprobe.robot.dynamics import dynamics_problem
 from canprobe.scene.setup import Node, Setup
@@ -58,7 +58,7 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
     """
     setup = as_supported(setup)
     devices, problems = _devices(setup)
-    beyond = [*range_problems(setup)]
+    beyond = [*range_problems(setup), *(speed_problems(setup, devices) if not problems else ())]
     setup, narrowed = within_drives(setup, devices) if not problems and not beyond else (setup, ())
     unsuited = [*array_problems(setup)]
     problems += unsuited

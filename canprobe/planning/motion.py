@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from canprobe.errors import PlanError
 from canprobe.planning.model import JointSpeeds
 from canprobe.robot.chain import forward, forward_jacobian
-from canprobe.robot.inverse import FIXED_POLE, LENGTH_M, in_rows, inverse_near, probe_pose, task_rows
+from canprobe.robot.inverse import FIXED_POLE, LENGTH_M, in_rows, inverse_near, probe_pose, start_posture, task_rows
 from canprobe.scene.setup import Approach, Arm, Calibrate, Free, Probe, SafetyLimits, Setup, Touch
 from canprobe.touch.shapes import PlacedShape
 
@@ -28,7 +28,9 @@ _RESTS_M = 5e-6  # of a ball, which may stand on two places that differ by so mu
 _BALL_STEPS = 6  # halves what is left of the way from under the centre to the contact
 _PATCH_M = 2e-3  # half of the width of a patch
 _BESIDE_M = 1e-6  # of a foot that does not lie under its point along the normal: on the surface's border
-_TOUCH_TO_TOUCH_RAD = 1.0  # between the touches of a calibration
+_TOUCH_TO_TOUCH_RAD = 1.0  # between the touches of a calibration, and from the approach to the first contact
+PARKED_ABOVE = 5e-3
+"""How far above the approach's first point an emulated arm stands at power on, m."""
 
 
 # The path that a task will take over the object as the scene describes it: points, normals, curvature.
@@ -190,17 +192,47 @@ def check_motion(setup: Setup) -> tuple[JointSpeeds | None, list[str]]:
             case Free() as task:
                 speeds, found = _check_swing(task, stops, starts=not problems)
             case Calibrate() as task:
-                joints = _follow(task.arm, task.probe, _over_ball(task))
+                joints = _follow(task.arm, task.probe, _over_ball(task), _beginning(setup, task, _over_ball(task)))
                 speeds, found = stops.speeds(np.zeros_like(task.arm.q_start)), stops.problems(joints)
             case Touch() as task:
                 path = surface_path(task, setup.truth.object)
                 problems += _hollow_problems(path, task.probe)
-                speeds, found = _check_touch(task, path, stops)
+                contacts = [*_along_path(task, path)][_BEFORE_CONTACT:]
+                speeds, found = _check_touch(task, path, stops, _beginning(setup, task, contacts))
             case _:
                 return None, problems
     except PlanError as error:
         return None, [*problems, *error.problems]
     return speeds, problems + found
+
+
+def parked_posture(setup: Setup, arm: Arm) -> Array:
+    """Where an emulated arm stands at power on, (n,) rad or m: above the start of a touch, else as in the scene.
+
+    Raises:
+        PlanError: it cannot stand there.
+    """
+    touch = setup.touch
+    if touch is None:
+        return arm.q_start
+    clearance = touch.approach.clearance
+    try:
+        return start_posture(
+            arm.model,
+            touch.approach.start,
+            touch.approach.normal,
+            arm.q_start,
+            radius_m=touch.probe.radius,
+            T_flange_probe=touch.probe.T_flange_probe,
+            clearance_m=clearance + PARKED_ABOVE,
+        )
+    except (PlanError, ValueError) as error:
+        raise PlanError(
+            [
+                f"task.clearance_mm = {1e3 * clearance:g}: an emulated arm begins {1e3 * PARKED_ABOVE:g} mm above it,"
+                f" and cannot: {error}; lower it, move the object, or set start_deg of the joints to another branch"
+            ]
+        ) from error
 
 
 def reach_problems(setup: Setup, task: Touch, poses: Iterable[tuple[Array, Array]]) -> list[str]:
@@ -213,7 +245,7 @@ def reach_problems(setup: Setup, task: Touch, poses: Iterable[tuple[Array, Array
     """
     targets = [_Pose(centre, pole, _TOUCH_TO_TOUCH_RAD, "out of reach: {why}") for centre, pole in poses]
     try:
-        return _Stops(task.arm, setup.limits).problems(_follow(task.arm, task.probe, targets))
+        return _Stops(task.arm, setup.limits).problems(_follow(task.arm, task.probe, targets, task.arm.q_start))
     except PlanError as error:
         return list(error.problems)
 
@@ -299,16 +331,37 @@ def _too_fast(arm: Arm, speeds: JointSpeeds, way_out: str) -> list[str]:
     ]
 
 
-def _check_touch(task: Touch, path: SurfacePath, stops: _Stops) -> tuple[JointSpeeds | None, list[str]]:
+def _beginning(setup: Setup, task: Touch | Calibrate, contacts: Iterable[_Pose]) -> Array:
+    """Where the arm moves from, (n,) rad or m, as far as it is known.
+
+    Raises:
+        PlanError: an emulated arm cannot be parked; or the contacts are out of reach, which matters more.
+    """
+    if not setup.emulates:
+        return task.arm.q_start
+    try:
+        return parked_posture(setup, task.arm)
+    except PlanError:
+        _follow(task.arm, task.probe, contacts, task.arm.q_start)
+        raise
+
+
+def _check_touch(
+    task: Touch, path: SurfacePath, stops: _Stops, q_start: Array
+) -> tuple[JointSpeeds | None, list[str]]:
     problems = _off_array(task, path)
     if problems:
         return None, problems
-    joints = _follow(task.arm, task.probe, _along_path(task, path))
-    problems = stops.problems(joints)
+    joints = _follow(task.arm, task.probe, _along_path(task, path), q_start)
+    problems = stops.problems(np.vstack((q_start, joints)))
+    approach = task.approach
+    down = stops.speeds(np.abs(joints[_BEFORE_CONTACT] - joints[1]) / approach.clearance * approach.speed)
+    slowly = 1e3 * approach.speed / max(down.worst_share, 1.0) * 0.99
+    problems += _too_fast(task.arm, down, f"lower task.approach_mm_s to {slowly:.3g}")
     if task.scan is None:
         return stops.speeds(np.zeros_like(task.arm.q_start)), problems
     steps = np.linalg.norm(np.diff(path.points, axis=0), axis=1)
-    rates = np.abs(np.diff(joints[1:], axis=0)) / steps[:, None] * task.scan.speed
+    rates = np.abs(np.diff(joints[_BEFORE_CONTACT:], axis=0)) / steps[:, None] * task.scan.speed
     speeds = stops.speeds(rates.max(axis=0))
     possible = 1e3 * task.scan.speed / max(speeds.worst_share, 1.0) * 0.99
     way_out = f"lower task.speed_mm_s to {possible:.3g}, turn task.heading_deg, or raise task.rolling_share"
@@ -374,18 +427,23 @@ class _Pose:
     out_of_reach: str
 
 
+_BEFORE_CONTACT = 2
+
+
 def _along_path(task: Touch, path: SurfacePath) -> Iterator[_Pose]:
-    """The lifted start, then the contacts."""
-    radius, poles = task.probe.radius, _poles(task, path)
-    lifted = path.points[0] + path.normals[0] * task.approach.clearance
-    contacts = zip((lifted, *path.points), (path.normals[0], *path.normals), (poles[0], *poles), strict=True)
-    for point, normal, pole in contacts:
+    """The beginning of the approach and the lifted start, then the contacts."""
+    radius, poles, approach = task.probe.radius, _poles(task, path), task.approach
+    above = approach.start + approach.normal * approach.clearance
+    lifted = path.points[0] + path.normals[0] * approach.clearance
+    points, normals = (above, lifted, *path.points), (approach.normal, path.normals[0], *path.normals)
+    turns = (math.inf, _TOUCH_TO_TOUCH_RAD, _TOUCH_TO_TOUCH_RAD, *(_BRANCH_RAD for _ in path.points[1:]))
+    for point, normal, pole, most_rad in zip(points, normals, (approach.normal, poles[0], *poles), turns, strict=True):
         metres = " (are these metres?)" if np.abs(point).max() < _METRES else ""
         out_of_reach = (
             f"task: contact at {_mm(point)} mm{metres} out of reach: {{why}}; move the object, shorten the probe "
             "or the path, or set start_deg of the joints to another branch"
         )
-        yield _Pose(point + radius * normal, pole, _BRANCH_RAD, out_of_reach)
+        yield _Pose(point + radius * normal, pole, most_rad, out_of_reach)
 
 
 def _over_ball(task: Calibrate) -> Iterator[_Pose]:
@@ -400,20 +458,20 @@ def _over_ball(task: Calibrate) -> Iterator[_Pose]:
             yield _Pose(centre, -touch.pole_base, _TOUCH_TO_TOUCH_RAD, out_of_reach)
 
 
-def _follow(arm: Arm, probe: Probe, poses: Iterable[_Pose]) -> Array:
-    """Joint positions at the poses (m, n), rad or m, each near the one before.
+def _follow(arm: Arm, probe: Probe, poses: Iterable[_Pose], q_start: Array) -> Array:
+    """Joint positions at the poses (m, n), rad or m, each near the one before, from those at the beginning (n,) on.
 
     Raises:
         PlanError: the first pose that is out of reach.
     """
-    q = arm.q_start
+    q = q_start
     x_hint = (forward(arm.model.chain, q) @ probe.T_flange_probe)[:3, 0]
     found: list[Array] = []
     for pose in poses:
         try:
             T_base_probe = probe_pose(pose.centre, pose.pole, 0.0, x_hint)
-            most_rad, q_rest = (pose.most_rad, found[0]) if found else (math.inf, q)
-            q = inverse_near(arm.model, T_base_probe, probe.T_flange_probe, q, max_move_rad=most_rad, q_rest=q_rest)
+            most_rad = pose.most_rad if found else math.inf
+            q = inverse_near(arm.model, T_base_probe, probe.T_flange_probe, q, max_move_rad=most_rad, q_rest=q_start)
         except (PlanError, ValueError) as error:
             raise PlanError([pose.out_of_reach.format(why=error)]) from error
         found.append(q)

@@ -141,7 +141,8 @@ class PdoPlanning:
                     alone.append((False, ChosenPdo(number, mapped)))
             elif not device.capacity(direction, number):
                 one = ChosenPdo(number, tuple(map(device.mapped_entry, device.fixed_mapping(direction, number))))
-                if 0 < sum(entry.bits for entry in one.entries) <= MAX_BITS and all(e.bits for e in one.entries):
+                sends = all(entry.bits and _exists(device, entry) for entry in one.entries)
+                if sends and 0 < sum(entry.bits for entry in one.entries) <= MAX_BITS:
                     fixed.append(one)
                     if set(needed) <= _places(one):
                         alone.append((len(one.entries) > len(needed), one))
@@ -172,6 +173,11 @@ class PdoPlanning:
         return (device.number(COMMUNICATION[direction] + number - 1, 1) or wanted) & 0x7FF
 
 
+def _exists(device: Abilities, entry: PdoEntry) -> bool:
+    """Whether the object of a mapping is in the EDS, or is a dummy."""
+    return entry.is_dummy or device.has(entry.index, entry.subindex)
+
+
 def _places(chosen: ChosenPdo) -> set[Place]:
     return {(entry.index, entry.subindex) for entry in chosen.entries}
 
@@ -183,8 +189,10 @@ def _offered(device: Abilities, direction: Direction, number: int, count: int) -
         return f"{name} cannot follow every SYNC"
     if capacity := device.capacity(direction, number):
         return f"{name} maps at most {capacity} objects"
-    fixed = ", ".join(f"{word:08X}h" for word in device.fixed_mapping(direction, number))
-    return f"{name} has the fixed mapping {fixed or 'none'}"
+    words = device.fixed_mapping(direction, number)
+    fixed = ", ".join(f"{word:08X}h" for word in words) or "none"
+    lost = [f"{entry.index:04X}h" for entry in map(device.mapped_entry, words) if not _exists(device, entry)]
+    return f"{name} has the fixed mapping {fixed}" + (f", and the EDS has no {' or '.join(lost)}" if lost else "")
 
 
 def plan_drive_pdos(planning: PdoPlanning) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import re
+import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from heapq import heappop, heappush
@@ -168,14 +170,31 @@ def timeline_rows(plan: Plan, width: int = 80) -> list[list[str]]:
 
 TIMELINE_WIDTH = 100
 """Characters of a cycle."""
+NARROWEST = 40
+"""Characters below which no line is broken."""
+_BESIDE_TIMELINE, _NARROW, _LAST = 24, 8, 12
 
 
-def plan_text(plan: Plan) -> str:
-    """The whole plan, ending with a newline."""
-    return "\n".join(_lines(plan)) + "\n"
+def plan_text(plan: Plan, width: int | None = None) -> str:
+    """The whole plan, ending with a newline.
+
+    Args:
+        plan: that fits.
+        width: characters of a line, which are broken there; None: lines stay whole.
+    """
+    room = None if width is None else max(width, NARROWEST)
+    lines = (part for line in _lines(plan, room) for part in _broken(line, room))
+    return "\n".join(lines) + "\n"
 
 
-def _lines(plan: Plan) -> Iterator[str]:
+def _broken(line: str, width: int | None) -> list[str]:
+    """A line in parts of a width, the later ones indented."""
+    if width is None or len(line) <= width:
+        return [line]
+    return textwrap.wrap(line, width, subsequent_indent=" " * (len(line) - len(line.lstrip()) + 2))
+
+
+def _lines(plan: Plan, width: int | None) -> Iterator[str]:
     bus, sync = plan.setup.bus, plan.sync
     yield f"{plan.setup.name}: {plan.setup.title}" if plan.setup.title else plan.setup.name
     channels = " and ".join(one.channel for one in plan.buses)
@@ -195,26 +214,30 @@ def _lines(plan: Plan) -> Iterator[str]:
     if bus.transmit_queue == "fifo":
         yield 'bus.transmit_queue = "fifo": nodes send their oldest frame first; a heartbeat delays what follows it'
     yield from (f"warning: {warning}" for warning in plan.warnings)
-    yield from _titled("nodes", _node_rows(plan))
-    yield from _titled("PDOs, from the device's view, highest priority first", _pdo_rows(plan))
-    yield from _titled("raw frames of the array, which is no CANopen node", _raw_rows(plan))
+    yield from _titled("nodes", _node_rows(plan), width)
+    yield from _titled("PDOs, from the device's view, highest priority first", _pdo_rows(plan), width)
+    yield from _titled("raw frames of the array, which is no CANopen node", _raw_rows(plan), width)
     for one in plan.buses:
-        yield from _titled(f"bus {one.channel}, worst case", _bus_rows(one.traffic))
+        yield from _titled(f"bus {one.channel}, worst case", _bus_rows(one.traffic), width)
     title = f"one cycle of {_us(sync.period_ns)} µs, worst case, µs after its SYNC is due"
-    yield from _titled(title, _budget_rows(plan.traffic.budget))
-    each = f"as it goes, worst-case lengths, one character {_us(sync.period_ns // TIMELINE_WIDTH)} µs"
+    yield from _titled(title, _budget_rows(plan.traffic.budget), width)
+    characters = TIMELINE_WIDTH if width is None else min(TIMELINE_WIDTH, width - _BESIDE_TIMELINE)
+    each = f"as it goes, worst-case lengths, one character {_us(sync.period_ns // characters)} µs"
     other = "" if all(pdo.used for pdo in plan.pdos) else ", o not used"
     parts = f"(S SYNC, f feedback, C controller, r commands, t tactile{other})"
-    yield from _titled(f"{each} {parts}", timeline_rows(plan, TIMELINE_WIDTH))
-    yield from _titled("chosen by the plan", ((f"{one.key} = {one.value}", one.why) for one in plan.choices))
-    yield from _titled("joint speeds", _speed_rows(plan))
-    yield from _titled("uses", _use_rows(plan))
-    yield from _titled("leaves out", plan.left_out)
-    yield from _titled("could not have", plan.not_available)
+    yield from _titled(f"{each} {parts}", timeline_rows(plan, characters), width)
+    yield from _titled("chosen by the plan", ((f"{one.key} = {one.value}", one.why) for one in plan.choices), width)
+    yield from _titled("joint speeds", _speed_rows(plan), width)
+    yield from _titled("uses", _use_rows(plan), width)
+    yield from _titled("leaves out", plan.left_out, width)
+    yield from _titled("could not have", plan.not_available, width)
 
 
-def _titled(title: str, rows: Iterable[Sequence[str]]) -> Iterator[str]:
-    """A table with its title; numbers, and a time without a bound, at the right; nothing without rows."""
+def _titled(title: str, rows: Iterable[Sequence[str]], width: int | None = None) -> Iterator[str]:
+    """A table with its title; numbers, and a time without a bound, at the right; nothing without rows.
+
+    Where it is wider than `width` its widest columns are broken, and the last one is set below where little is left.
+    """
     if not (rows := list(rows)):
         return
     columns = list(zip(*rows, strict=True))
@@ -222,9 +245,18 @@ def _titled(title: str, rows: Iterable[Sequence[str]]) -> Iterator[str]:
     number = re.compile(r"-?[\d.]+( %)?|unbounded")
     numeric = [len(rows) > 1 and all(map(number.fullmatch, column[1:])) for column in columns]
     yield from ("", f"{title}:")
+    below = width is not None and sum(widths) + 2 * len(widths) > width < sum(widths[:-1]) + 2 * len(widths) + _LAST
+    if below:
+        widths.pop()
+    while width is not None and sum(widths) + 2 * len(widths) > width and max(widths) > _NARROW:
+        widths[widths.index(max(widths))] -= 1
     for row in rows:
-        cells = zip(row, widths, numeric, strict=True)
-        yield "  " + "  ".join(f"{cell:{'>' if right else '<'}{width}}" for cell, width, right in cells).rstrip()
+        broken = [textwrap.wrap(cell, wide) or [""] for cell, wide in zip(row, widths, strict=False)]
+        for line in itertools.zip_longest(*broken, fillvalue=""):
+            cells = zip(line, widths, numeric, strict=False)
+            yield "  " + "  ".join(f"{cell:{'>' if right else '<'}{wide}}" for cell, wide, right in cells).rstrip()
+        if below and row[-1]:
+            yield "      " + row[-1]
 
 
 def _node_rows(plan: Plan) -> Iterator[list[str]]:

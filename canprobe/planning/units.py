@@ -1,11 +1,12 @@
-"""Position units of the drives: what the cell states, whether its counts fit 32 bits, and what a device says of them.
+"""Units of the drives: what the cell states, whether its counts fit 32 bits, and what a device says of them.
 
 A cell states the units of a drive (`counts_per_turn`, `gear`, `sign`, `zero_counts`), and they count: nothing in a
 device is changed for them. Where a device has the factor group of CiA 402, its own statement is compared with the
-cell's at bring-up, and 607Eh, which turns positions round, must be as its EDS has it.
+cell's at bring-up, and 607Eh, which turns positions round, must be as its EDS has it. Speeds and accelerations are
+written in the units of 60A9h and 60AAh, which must be as the EDS has them, too.
 
-Source: CiA 402-2, "Factor group": 607Eh, 608Fh, 6091h, 6092h; "Software position limit": 607Dh; 6064h and 607Ah are
-INTEGER32.
+Source: CiA 402-2, "Factor group": 607Eh, 608Fh, 6091h, 6092h, 60A9h, 60AAh; "Software position limit": 607Dh; 607Fh,
+6080h; 6064h and 607Ah are INTEGER32.
 """
 
 from __future__ import annotations
@@ -17,11 +18,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from canprobe.planning.devices import Abilities
+from canprobe.protocol.si_unit import VELOCITY, rate_unit
 from canprobe.robot.chain import Array
 from canprobe.robot.model import ArmModel
-from canprobe.scene.setup import Setup
+from canprobe.scene.setup import Arm, Drive, Setup
 
 POSITION_LIMITS, POLARITY, RESOLUTION, GEAR_RATIO, FEED = 0x607D, 0x607E, 0x608F, 0x6091, 0x6092
+PROFILE_SPEED_LIMIT, MOTOR_SPEED_LIMIT = 0x607F, 0x6080
 ROUNDING_COUNTS = 2
 """By which two targets may be rounded apart."""
 _LOWEST, _HIGHEST = -(1 << 31), (1 << 31) - 1
@@ -80,6 +83,31 @@ def turn_units(device: Abilities, units: float | None, gear: float) -> TurnUnits
     return TurnUnits(units, gear, FEED, GEAR_RATIO if whole[GEAR_RATIO] else None)
 
 
+def speed_unit(device: Abilities, drive: Drive, index: int) -> float | None:
+    """Position units/s, or /s², of what the device has for a velocity (60A9h) or an acceleration (60AAh).
+
+    None where its EDS names a unit that cannot be expressed in what the cell states.
+    """
+    turn, ratio = _motor_turn(device, drive)
+    return rate_unit(device.number(index) or 0, turn=turn and turn * ratio, metre=drive.metre_units)
+
+
+def _motor_turn(device: Abilities, drive: Drive) -> tuple[float | None, float]:
+    """Position units of a motor turn, None where nobody states them; and motor turns of a turn of the shaft."""
+    feed = _quotient(device, FEED)
+    ratio = (_quotient(device, GEAR_RATIO) or 1.0) if feed else 1.0
+    if drive.turn_units is not None:
+        return drive.turn_units, ratio
+    lines = _quotient(device, RESOLUTION)
+    return (feed / ratio if feed and lines else lines), ratio
+
+
+def _quotient(device: Abilities, index: int) -> float | None:
+    """Of :01 and :02 as delivered; None where the device has none."""
+    over, under = device.number(index, 1), device.number(index, 2)
+    return over / (under or 1) if over else None
+
+
 def range_problems(setup: Setup) -> Iterator[str]:
     """Joints whose positions leave the 32 bits of 6064h and 607Ah, where they would wrap round."""
     arm = setup.arm
@@ -93,6 +121,19 @@ def range_problems(setup: Setup) -> Iterator[str]:
                 f" of the joint, {joint.text(joint.q_min)} to {joint.text(joint.q_max)}, and 6064h and 607Ah hold"
                 f" {_LOWEST} to {_HIGHEST}: check counts_per_turn and gear, then zero_counts; if they are right, home"
                 " the drive elsewhere, or let it count in coarser units"
+            )
+
+
+def speed_problems(setup: Setup, devices: Mapping[int, Abilities]) -> Iterator[str]:
+    """Drives whose limit of speed is no more than what whole targets differ by from cycle to cycle."""
+    arm, rounding = setup.arm, ROUNDING_COUNTS * setup.rate_hz
+    for joint, drive in zip(arm.model.joints, arm.drives, strict=True) if arm is not None else ():
+        most, index = _allowed_speed(devices[drive.node_id], drive, math.inf)
+        if most <= rounding:
+            yield (
+                f"joints.{joint.name}: drive {drive.node_id} allows {most:.4g} units/s by its {index:04X}h, and whole"
+                f" targets differ by as much as {rounding:g} units/s at cycle.rate_hz = {setup.rate_hz:g}: check 60A9h"
+                " in the EDS, then counts_per_turn and gear; if they are right, lower cycle.rate_hz"
             )
 
 
@@ -116,13 +157,64 @@ def software_limits(model: ArmModel) -> tuple[Array, Array]:
 
 
 def within_drives(setup: Setup, devices: Mapping[int, Abilities]) -> tuple[Setup, tuple[str, ...]]:
-    """The setup whose joints keep within what the 607Dh of their drives can allow, and a warning where that is less.
-
-    Beyond its 607Dh a drive faults. One that moves with several joints is left as it is.
-    """
-    arm, narrower = setup.arm, []
-    if arm is None:
+    """The setup whose joints keep within the positions and speeds that their drives can allow, and what is less."""
+    if setup.arm is None:
         return setup, ()
+    setup, ranges = _within_ranges(setup, setup.arm, devices)
+    assert setup.arm is not None
+    setup, speeds = _within_speeds(setup, setup.arm, devices)
+    return setup, (*ranges, *speeds)
+
+
+def _within_speeds(setup: Setup, arm: Arm, devices: Mapping[int, Abilities]) -> tuple[Setup, tuple[str, ...]]:
+    """Joints no faster than the 607Fh and 6080h that stand in their drives: beyond them a drive faults."""
+    model, share = arm.model, setup.limits.speed_share
+    rounding, slowest, slower = ROUNDING_COUNTS * setup.rate_hz, np.ones(model.n), []
+    for axis, drive in enumerate(arm.drives):
+        wanted = float(np.abs(model.units_per_q[axis]) @ model.qd_max) * share
+        most, index = _allowed_speed(devices[drive.node_id], drive, wanted + rounding)
+        if wanted + rounding <= most:
+            continue
+        moved = np.flatnonzero(model.units_per_q[axis])
+        slowest[moved] = np.minimum(slowest[moved], (most - rounding) / wanted)
+        slower.append((model.joints[axis].name, index))
+    if not slower:
+        return setup, ()
+    limits = [replace(joint, qd_max=joint.qd_max * factor) for joint, factor in zip(model.joints, slowest, strict=True)]
+    told = ", ".join(
+        f"{joint.name} {joint.text(joint.qd_max * share, '.3g')}/s"
+        for joint, factor in zip(limits, slowest.tolist(), strict=True)
+        if factor < 1.0
+    )
+    objects = " and ".join(sorted({f"{index:04X}h" for _, index in slower}))
+    warning = (
+        f"{objects}: drives that fault below the speeds of their joints; the plan keeps within {told}. If that is"
+        " wrong, check 60A9h in the EDS, then counts_per_turn and gear"
+    )
+    return setup.changed("arm", model=replace(model, joints=tuple(limits))), (warning,)
+
+
+def _allowed_speed(device: Abilities, drive: Drive, wanted: float) -> tuple[float, int]:
+    """The lowest of the limits that stand in a drive, position units/s, and its object; infinite without any."""
+    limits = [(math.inf, PROFILE_SPEED_LIMIT)]
+    entry, unit = device.description.entry(PROFILE_SPEED_LIMIT), speed_unit(device, drive, VELOCITY)
+    if entry is not None and unit is not None and not (
+        entry.writable and (wanted == math.inf or entry.allows(math.ceil(wanted / unit)))
+    ):
+        held = device.number(PROFILE_SPEED_LIMIT)
+        limits += [(held * unit, PROFILE_SPEED_LIMIT)] if held else []
+    turn, _ = _motor_turn(device, drive)
+    if (rpm := device.number(MOTOR_SPEED_LIMIT)) and turn is not None:
+        limits.append((rpm / 60.0 * turn, MOTOR_SPEED_LIMIT))
+    return min(limits)
+
+
+def _within_ranges(setup: Setup, arm: Arm, devices: Mapping[int, Abilities]) -> tuple[Setup, tuple[str, ...]]:
+    """Joints within what the 607Dh of their drives can allow: beyond it a drive faults.
+
+    One that moves with several joints is left as it is.
+    """
+    narrower = []
     joints = list(arm.model.joints)
     low, high = software_limits(arm.model)
     for axis, (joint, drive) in enumerate(zip(arm.model.joints, arm.drives, strict=True)):

@@ -120,6 +120,7 @@ def _arm(scene: Scene) -> tuple[Arm | None, Bodies]:
             serial=joint.serial_number,
             zero=homing_of(joint, number),
             turn_units=joint.counts_per_turn if joint.kind == "revolute" else None,
+            metre_units=joint.counts_per_m if joint.kind == "prismatic" else None,
             gear=joint.gear,
             quirks=_quirks(scene.emulate, node_id, joint.noise_counts),
         )

@@ -120,12 +120,14 @@ class Drive(Node):
     Attributes:
         zero: how it is homed; None: its encoder is absolute.
         turn_units: position units of a motor turn; None: of a prismatic joint.
+        metre_units: position units of a metre; None: of a revolute joint.
         gear: turns of the motor per turn of the joint.
         quirks: of an emulated one; None: it has none.
     """
 
     zero: Homing | None = None
     turn_units: float | None = None
+    metre_units: float | None = None
     gear: float = 1.0
     quirks: Quirks | None = None
 

@@ -519,11 +519,22 @@ def rehearse(plan: Plan) -> None:
     Args:
         plan: what is about to run on a real bus.
     """
-    with (
-        contextlib.suppress(CanprobeError),
-        Session(replace(plan, setup=resolve(shortened(plan.scene)), choices=())) as session,
-    ):
+    with contextlib.suppress(CanprobeError):
+        run_beginning(plan)
+
+
+def run_beginning(plan: Plan) -> Session:
+    """Bring the cell of a plan up in lockstep with every node emulated, and carry out the beginning of its task.
+
+    Returns:
+        The session, closed.
+
+    Raises:
+        CanprobeError: what goes wrong in it.
+    """
+    with Session(replace(plan, setup=resolve(shortened(plan.scene)), choices=())) as session:
         session.run(make_task(session.plan))
+    return session
 
 
 def shortened(scene: Scene) -> Scene:

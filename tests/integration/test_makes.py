@@ -413,3 +413,48 @@ def test_the_packaged_prbt_joint_is_planned_at_100_hz():
     assert {(node.mode, node.interpolation) for node in plan.nodes} == {(IP, (Interpolation(10, -3),))}
     assert [pdo.number for pdo in (*plan.pdos_of(3, "rpdo"), *plan.pdos_of(3, "tpdo"))] == [1, 1]
     assert "what a quick stop does (605Ah:00)" in dict(plan.not_available)
+
+
+RPM = 0x00B44700
+
+
+def speed_limited(most, unit=RPM, **values):
+    """607Fh in the unit of 60A9h."""
+
+    def change_objects(objects):
+        objects[0x60A9, 0] = Entry("SI unit velocity", "U32", "ro", unit)
+        changed(objects, 0x607F, default=most, **values)
+
+    return variant(change_objects)
+
+
+def test_a_limit_of_speed_is_written_in_the_unit_of_the_drive(tmp_path):
+    """Joint 1 of the PUMA 260: all its speed in counts a second, and 60 / 1000 of that in turns a minute."""
+    folders = [tmp_path / "turns", tmp_path / "counts"]
+    for folder in folders:
+        folder.mkdir()
+    limited = zip((RPM, 0), folders, strict=True)
+    plans = [canprobe.plan(scene_of(speed_limited(1300, unit), folder)) for unit, folder in limited]
+    rpm, counts = (next(w.value for w in make_setups(plan)[0].writes if w.index == 0x607F) for plan in plans)
+    assert 0.0 <= rpm - counts * 60 / 1000 <= 1.0
+
+
+def test_joints_keep_within_a_limit_of_speed_that_stands_in_the_drive(tmp_path):
+    plan = canprobe.plan(scene_of(speed_limited(1300, access="ro"), tmp_path))
+    model = plan.setup.arm.model
+    fastest = np.abs(model.units_per_q[:4]) @ model.qd_max
+    assert fastest.max() == pytest.approx(1300 * 1000 / 60 - 2 * plan.sync.rate_hz)
+    assert "607Fh: drives that fault below the speeds of their joints" in plan.warnings[0]
+    _, way, _ = moved(plan, tmp_path / "run")
+    assert way == pytest.approx(SWING, abs=np.radians(0.2))
+
+
+def test_a_limit_of_speed_below_the_rounding_of_targets_is_refused(tmp_path):
+    problems = reasons(scene_of(speed_limited(10, access="ro"), tmp_path))
+    assert re.match(r"joints\.joint_1: drive 1 allows 166\.7 units/s by its 607Fh", problems[0])
+
+
+def test_a_drive_without_an_object_for_it_waits_for_arm_missed_syncs(tmp_path):
+    scene = change(scene_of("milliseconds_only", tmp_path), arm={"missed_syncs": 40})
+    drive = Session(canprobe.plan(scene)).world.nodes[0].application
+    assert drive.parts.parameters.misses == 40

@@ -178,3 +178,20 @@ def test_the_path_over_heights_of_a_cylinder_is_that_over_the_cylinder():
     exact, rolled = surface_path(setup.task, shape), surface_path(setup.task, heights)
     assert np.linalg.norm(exact.points - rolled.points, axis=1).max() < 5e-4
     assert np.sum(exact.normals * rolled.normals, axis=1).min() > math.cos(math.radians(1.0))
+
+
+def test_a_posture_in_which_an_emulated_arm_is_parked_must_be_in_reach(cylinder):
+    """The arm reaches the contact, and not the place 5 mm above the clearance, where it stands at power on."""
+    place = (-120.0, -122.5, 490.0)
+    high = change(load_scene("press"), object={"position_mm": place}, task={"start_mm": place, "clearance_mm": 3.0})
+    assert canprobe.plan(high)
+    (problem,) = reasons(change(high, task={"clearance_mm": 50.0}))
+    assert problem.startswith("task.clearance_mm = 50: an emulated arm begins 5 mm above it, and cannot: ")
+
+
+def test_an_approach_beyond_the_joints_is_refused_with_a_speed_that_fits():
+    """The arm would lag behind the approach, which then finds no object."""
+    slow = change(load_scene("press"), limits={"joint_speed_share": 0.002})
+    (problem, *_) = reasons(slow)
+    fitting = float(problem.split("task.approach_mm_s to ")[1])
+    assert canprobe.plan(change(slow, task={"approach_mm_s": fitting}))

@@ -16,7 +16,7 @@ from canopen.objectdictionary import ObjectDictionary
 
 from canprobe.emulator.drive.mode import DriveParts
 from canprobe.emulator.drive.modes import make_modes
-from canprobe.emulator.drive.parameters import FACTORS, STAYS_STOPPED
+from canprobe.emulator.drive.parameters import FACTORS, STAYS_STOPPED, Delivery
 from canprobe.emulator.drive.reference import STEP_NS, AxisPlant
 from canprobe.emulator.node.dictionary import Abort, SdoAbort, Value, key_of
 from canprobe.emulator.node.slave_node import Application, OdOf, SlaveNode
@@ -38,6 +38,8 @@ _STATUSWORD = key_of(0x6041)
 _VOLATILE = frozenset({0x6040, 0x6071, 0x607A, 0x60B0, 0x60B1, 0x60B2, 0x60C1, 0x60FF})
 _ABORT_COMMANDS = {2: Command.DISABLE_VOLTAGE, 3: Command.QUICK_STOP}  # of 6007h; 1 is a fault, 0 nothing
 _ENABLED = DriveState.OPERATION_ENABLED
+STAND_ALONE = Delivery()
+"""Of a drive that belongs to no cell."""
 
 
 class DriveApplication(Application):
@@ -52,17 +54,25 @@ class DriveApplication(Application):
     """
 
     def __init__(
-        self, axis: int, plant: AxisPlant, *, incremental: bool = False, noise: Callable[[], float] | None = None
+        self,
+        axis: int,
+        plant: AxisPlant,
+        *,
+        delivery: Delivery = STAND_ALONE,
+        incremental: bool = False,
+        noise: Callable[[], float] | None = None,
     ) -> None:
         """Make the drive of one axis.
 
         Args:
             axis: of the plant, 0-based.
             plant: shared with the other nodes.
+            delivery: what its EDS does not say.
             incremental: its encoder counts from 0 at every power on and node reset, wherever the motor is.
             noise: what the encoder adds to a position, counts; None: nothing.
         """
         self._axis, self._plant, self._incremental, self._noise = axis, plant, incremental, noise
+        self._delivery = delivery
         self.state = INITIAL_STATE
         self._command: Command | None = None  # the one that stands
         self._word = 0  # the last controlword
@@ -82,6 +92,7 @@ class DriveApplication(Application):
             fault=self._find_fault,
             on_loss=self._abort_connection,
             show=self._show,
+            delivery=self._delivery,
             noise=self._noise,
         )
         self._parameters, self._motion = parts.parameters, parts.motion
@@ -315,6 +326,7 @@ def make_drive_node(
     plant: AxisPlant,
     od_of: OdOf | None = None,
     *,
+    delivery: Delivery = STAND_ALONE,
     quirks: Quirks | None = None,
     incremental: bool = False,
     seed: int = 0,
@@ -327,11 +339,12 @@ def make_drive_node(
         axis: of the plant, 0-based.
         plant: shared by all nodes.
         od_of: the EDS for another node id, where LSS may give the node one.
+        delivery: what its EDS does not say.
         quirks: what makes it difficult; None: nothing.
         incremental: it forgets its zero with the power and has to be homed.
         seed: of the encoder's noise.
     """
     sigma = quirks.noise_counts if quirks is not None else 0.0
     noise = partial(random.Random(f"{seed} {axis}").gauss, 0.0, sigma) if sigma else None
-    application = DriveApplication(axis, plant, incremental=incremental, noise=noise)
+    application = DriveApplication(axis, plant, delivery=delivery, incremental=incremental, noise=noise)
     return SlaveNode(od, node_id, application, od_of=od_of, quirks=quirks)

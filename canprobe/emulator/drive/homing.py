@@ -174,7 +174,7 @@ class Homing(ProfiledMode):
         self._motion.move(counts, t_ns, Rates(self._speed(speed), rate, rate), self._arrived)
 
     def _speed(self, subindex: int) -> float:
-        wanted = self.parts.node.dictionary.number(0x6099, subindex) * self._units.magnitude
+        wanted = self.parts.node.dictionary.number(0x6099, subindex) * self._units.speed
         return min(wanted, self._parameters.max_speed)
 
     def _arrived(self, t_ns: int) -> None:

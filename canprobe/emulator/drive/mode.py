@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-from canprobe.emulator.drive.parameters import PEAK_PERMILLE, DriveParameters, Units
+from canprobe.emulator.drive.parameters import PEAK_PERMILLE, Delivery, DriveParameters, Units
 from canprobe.emulator.drive.reference import STEP_NS, AxisPlant, Motion
 from canprobe.emulator.node.dictionary import Value
 from canprobe.emulator.node.slave_node import SlaveNode
@@ -264,6 +264,7 @@ class DriveParts:
         fault: `fault(code, t_ns)` when a mode has found one.
         on_loss: `on_loss(code, t_ns)` when the master is taken for dead.
         show: the mode's part of the statusword may have changed.
+        delivery: what its EDS does not say.
         noise: of the encoder, counts; None: it has none.
     """
 
@@ -276,10 +277,11 @@ class DriveParts:
         fault: Callable[[int, int], None],
         on_loss: Callable[[int, int], None],
         show: Callable[[], None],
+        delivery: Delivery,
         noise: Callable[[], float] | None,
     ) -> None:
         self.node, self.axis, self.plant, self.fault, self.show = node, axis, plant, fault, show
-        self.parameters = DriveParameters(node.dictionary)
+        self.parameters = DriveParameters(node.dictionary, delivery)
         self.motion = Motion(axis, plant, node.core.timers)
         self.feedback = DriveFeedback(node, axis, plant, self.motion, self.parameters.units, noise=noise)
         self.supervision = Supervision(node, self.parameters, on_loss)

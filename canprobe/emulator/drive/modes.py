@@ -294,7 +294,7 @@ class ProfilePosition(ProfiledMode):
         parameters, units = self._parameters, self._units
         wanted = int(self._values[_POSITION_TARGET]) + (self._last if relative else 0)
         target = self._last = parameters.clamp(wanted)
-        speed = min(int(self._values.get(_PROFILE_SPEED, 0)) * units.magnitude, parameters.max_speed)
+        speed = min(int(self._values.get(_PROFILE_SPEED, 0)) * units.speed, parameters.max_speed)
         rates = Rates(speed, parameters.acceleration, parameters.deceleration or parameters.acceleration)
         return SetPoint(units.counts(target), rates, limited=target != wanted)
 

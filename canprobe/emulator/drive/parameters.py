@@ -6,26 +6,46 @@ Source: CiA 402-2, objects 6007h, 605Ah–605Eh, 6065h–6068h, 6072h, 607Dh, 60
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from math import inf
 
 from canprobe.eds.packaged import MISSED_SYNCS, MISSED_SYNCS_NAME, SYNC_FACTOR, SYNC_FACTOR_NAME
 from canprobe.emulator.node.dictionary import Abort, Dictionary, SdoAbort, Value
+from canprobe.protocol.si_unit import ACCELERATION, VELOCITY, rate_unit
 
 # Factor group: the master's position units ↔ units of the plant's axis, polarity, and where the zero is.
 #
 #     position = (counts - origin) · 6092h / (608Fh · 6091h),   each a quotient :01 / :02
 #
 # A count is the position unit of the drive as delivered, whatever factors its EDS has: a cell states the units of its
-# drives, not the lines of their encoders. An object that the EDS lacks counts as 1.
-# Source: CiA 402-2, "Factor group", objects 607Eh (bit 7 position, bit 6 velocity), 608Fh, 6091h, 6092h.
+# drives, not the lines of their encoders. An object that the EDS lacks counts as 1. Velocities and accelerations are in
+# the units of 60A9h and 60AAh, whose turns are those of the shaft: 6091h motor turns each.
+# Source: CiA 402-2, "Factor group", objects 607Eh (bit 7 position, bit 6 velocity), 608Fh, 6091h, 6092h, 60A9h, 60AAh.
 
-FACTORS = (0x607E, 0x608F, 0x6091, 0x6092)
-_RESOLUTION, _GEAR, _FEED = FACTORS[1:]
+FACTORS = (0x607E, 0x608F, 0x6091, 0x6092, VELOCITY, ACCELERATION)
+_RESOLUTION, _GEAR, _FEED = FACTORS[1:4]
 _POSITION, _VELOCITY = 7, 6  # bits of 607Eh
 DEFAULT_TURN = 4096.0
 """Counts of a motor turn, of a drive whose EDS has no 608Fh."""
+DEFAULT_MISSES = 5
+"""Of a drive whose EDS has no object for it."""
 _Number = Callable[[int, int], int]
+
+
+@dataclass(frozen=True, slots=True)
+class Delivery:
+    """What a drive is delivered with for its cell, where its EDS has no object that says so.
+
+    Attributes:
+        turn: position units of a motor turn; None: unknown.
+        metre: position units of a metre; None: unknown.
+        misses: SYNCs missed before the master is taken for dead.
+    """
+
+    turn: float | None = DEFAULT_TURN
+    metre: float | None = None
+    misses: int = DEFAULT_MISSES
 
 
 class Units:
@@ -33,31 +53,50 @@ class Units:
 
     Args:
         dictionary: of the drive; its defaults are the factors as delivered.
+        delivery: a turn and a metre of its axis.
 
     Attributes:
         scale: counts per position unit; negative where 607Eh turns positions round.
-        speed_scale: the same for velocities, with their own polarity.
-        magnitude: without sign, for windows, speeds and accelerations.
+        magnitude: the same without sign, for windows.
+        speed: counts/s per unit of velocity, without sign.
+        speed_scale: the same with the polarity of velocities.
+        acceleration: counts/s² per unit of acceleration.
         turn: counts of one motor turn, 608Fh; also the distance of the index pulses.
+        knows_turn, knows_speed: speeds in turns, and those in the unit of 60A9h, can be converted.
         origin: counts at position 0; homing sets it.
     """
 
-    __slots__ = ("_dictionary", "magnitude", "origin", "scale", "speed_scale", "turn")
+    __slots__ = (
+        *("_delivery", "_dictionary", "acceleration", "knows_speed", "knows_turn", "magnitude", "origin", "scale"),
+        *("speed", "speed_scale", "turn"),
+    )
 
-    def __init__(self, dictionary: Dictionary) -> None:
+    def __init__(self, dictionary: Dictionary, delivery: Delivery) -> None:
         self._dictionary = dictionary
+        self._delivery = delivery
         self.origin = 0.0
         self.read()
 
     def read(self) -> None:
         """Take the present factors."""
-        dictionary = self._dictionary
+        dictionary, delivery = self._dictionary, self._delivery
         resolution, delivered = dictionary.number(_RESOLUTION, 1), _encoder_counts(dictionary.delivered)
-        self.turn = _quotient(dictionary.number, _RESOLUTION) / delivered if resolution else DEFAULT_TURN
-        self.magnitude = _encoder_counts(dictionary.number) / delivered
+        self.turn = delivery.turn or DEFAULT_TURN
+        if resolution:
+            self.turn = _quotient(dictionary.number, _RESOLUTION) / delivered
+        self.knows_turn = bool(resolution) or delivery.turn is not None
+        self.magnitude = magnitude = _encoder_counts(dictionary.number) / delivered
+        shaft = self.turn * (_quotient(dictionary.number, _GEAR) if dictionary.number(_FEED, 1) else 1.0)
+        turn = shaft / magnitude if self.knows_turn else None
+        metre = None if delivery.metre is None else delivery.metre / magnitude
+        speed = rate_unit(dictionary.number(VELOCITY), turn=turn, metre=metre)
+        acceleration = rate_unit(dictionary.number(ACCELERATION), turn=turn, metre=metre)
+        self.knows_speed = speed is not None
+        self.speed = magnitude * (speed or 1.0)
+        self.acceleration = magnitude * (acceleration or 1.0)
         turned = dictionary.number(0x607E) ^ dictionary.delivered(0x607E)
-        self.scale = -self.magnitude if turned >> _POSITION & 1 else self.magnitude
-        self.speed_scale = -self.magnitude if turned >> _VELOCITY & 1 else self.magnitude
+        self.scale = -magnitude if turned >> _POSITION & 1 else magnitude
+        self.speed_scale = -self.speed if turned >> _VELOCITY & 1 else self.speed
 
     def position(self, counts: float) -> float:
         """Motor counts → position units."""
@@ -81,8 +120,6 @@ def _quotient(number: _Number, index: int) -> float:
 
 STAYS_STOPPED = frozenset({5, 6})  # of 605Ah: remain in QUICK_STOP_ACTIVE
 NO_WINDOW = 0xFFFFFFFF
-DEFAULT_MISSES = 5
-"""Of a drive whose EDS has no object for it."""
 DEFAULT_ACCELERATION = 100_000
 """Position units/s², of a drive whose EDS has no profile acceleration."""
 DEFAULT_WINDOW = 10
@@ -119,11 +156,12 @@ class DriveParameters:
         max_torque: 6072h, permille.
     """
 
-    def __init__(self, dictionary: Dictionary) -> None:
+    def __init__(self, dictionary: Dictionary, delivery: Delivery) -> None:
         self._dictionary = dictionary
+        self._delivered_misses = delivery.misses
         named = ((MISSED_SYNCS, MISSED_SYNCS_NAME), (SYNC_FACTOR, SYNC_FACTOR_NAME))
         self._misses = [index for index, name in named if dictionary.has_named(index, name)]
-        self.units = Units(dictionary)
+        self.units = Units(dictionary, delivery)
         self.read()
         dictionary.on_change(self.read, *_INDICES)
         for index, allowed in _OPTIONS.items():
@@ -140,22 +178,23 @@ class DriveParameters:
         self.following_window, self.following_timeout_ns = self._window(0x6065), number(0x6066) * 1_000_000
         self.position_window = self._window(0x6067, DEFAULT_WINDOW)
         self.position_time_ns = number(0x6068) * 1_000_000
-        self.misses = number(self._misses[0]) if self._misses else DEFAULT_MISSES
+        self.misses = number(self._misses[0]) if self._misses else self._delivered_misses
         cycle_ns = sync_ns or period_ns
         self.patience_ns = self.misses * cycle_ns + cycle_ns // 2 if self.misses else 0
         self.low, self.high = number(0x607D, 1), number(0x607D, 2)
         self.abort_connection, self.quick_stop = number(0x6007, 0, 3), number(0x605A, 0, 2)
         self.shutdown, self.disable = number(0x605B, 0, 0), number(0x605C, 0, 1)
-        magnitude = self.units.magnitude
-        slow, quick = number(0x6084) * magnitude, number(0x6085) * magnitude
-        self.acceleration = (number(0x6083) or DEFAULT_ACCELERATION) * magnitude
-        self.homing_acceleration = (number(0x609A) or DEFAULT_ACCELERATION) * magnitude
+        units = self.units
+        slow, quick = number(0x6084) * units.acceleration, number(0x6085) * units.acceleration
+        self.acceleration = number(0x6083) * units.acceleration or DEFAULT_ACCELERATION * units.magnitude
+        self.homing_acceleration = number(0x609A) * units.acceleration or DEFAULT_ACCELERATION * units.magnitude
         self.deceleration = slow
         self.quick_stop_rate = slow if self.quick_stop in (1, 5) else quick
         self.halt_rate = quick if number(0x605D, 0, 1) == 2 else slow
         self.fault_rate = {1: slow, 2: quick}.get(number(0x605E, 0, 2), 0)
-        turns_per_s = number(0x6080) / 60.0
-        self.max_speed = min(number(0x607F) * magnitude or inf, turns_per_s * self.units.turn or inf)
+        profile = number(0x607F) * units.speed if units.knows_speed else 0.0
+        motor = number(0x6080) / 60.0 * units.turn if units.knows_turn else 0.0
+        self.max_speed = min(profile or inf, motor or inf)
         self.max_torque = min(number(0x6072, 0, PEAK_PERMILLE), PEAK_PERMILLE)
 
     def _window(self, index: int, absent: int = NO_WINDOW) -> float:
