@@ -11,6 +11,7 @@ import json
 import marshal
 import os
 import select
+import shutil
 import struct
 import subprocess
 import sys
@@ -30,8 +31,9 @@ from canprobe.cell.cycle import Observation
 from canprobe.errors import UsageError
 from canprobe.planning.model import Plan
 from canprobe.protocol.tactile import Features, TactileFrame, TactileHeader
-from canprobe.scene.load import dump_scene
+from canprobe.scene.load import SAVED_AS
 from canprobe.session.children import with_our_imports
+from canprobe.session.session import write_scene
 
 if TYPE_CHECKING:
     from canprobe.touch.estimate.answer import SurfaceEstimate
@@ -278,7 +280,12 @@ class BridgeProcess:
     def __init__(self, name: str, plan: Plan, out: Path | None, *, virtual: bool) -> None:
         self.name = name
         self.requests: deque[dict[str, Any]] = deque(maxlen=100)
-        self._config = {"scene": dump_scene(plan.scene), "out": str(out.resolve()) if out is not None else None}
+        self._folder = Path(tempfile.mkdtemp(prefix="canprobe-"))
+        write_scene(plan, self._folder)
+        self._config = {
+            "scene": str(self._folder / SAVED_AS),
+            "out": str(out.resolve()) if out is not None else None,
+        }
         self._virtual = virtual
         self._takes_requests = name == "ros2" and bool(plan.scene.bridge and plan.scene.bridge.ros2_commands)
         self._epoch: bytes | None = None
@@ -418,6 +425,7 @@ class BridgeProcess:
             self._process.wait(KILL_TIMEOUT_S)
         if self._process.stdout is not None:
             self._process.stdout.close()
+        shutil.rmtree(self._folder, ignore_errors=True)
         self._errors.close()
 
     def _last_words(self) -> str:

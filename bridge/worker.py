@@ -43,7 +43,7 @@ from canprobe.planning.make import make_plan
 from canprobe.planning.model import HEARTBEAT_CONSUMED_MS, Plan, PlannedNode
 from canprobe.protocol.cia402 import DriveState, known_state
 from canprobe.protocol.frames import NO_ERROR, NmtState, describe
-from canprobe.scene.load import parse_scene
+from canprobe.scene.load import load_scene
 from canprobe.scene.model import BridgeSettings
 from canprobe.scene.resolve import resolve
 from canprobe.scene.setup import Setup, Touch
@@ -258,7 +258,7 @@ def run(name: str, records: Iterator[bytes], fd: int) -> int:
 
 
 def _context(config: dict[str, Any], send: Callable[[dict[str, object]], None]) -> Context:
-    plan = make_plan(resolve(parse_scene(config["scene"])))
+    plan = make_plan(resolve(load_scene(config["scene"])))
     out = Path(config["out"]) if config["out"] is not None else None
     return Context(plan, plan.scene.bridge or BridgeSettings(), out, send)
 

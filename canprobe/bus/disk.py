@@ -62,6 +62,7 @@ class CandumpWriter:
         t0_ns: the time on the frames' clock that is written as 0.
 
     Raises:
+        ResultsError: the file cannot be opened.
         UsageError: somebody else writes this file just now.
 
     Attributes:
@@ -72,7 +73,8 @@ class CandumpWriter:
         self._t0_ns = t0_ns
         self.failure: str | None = None
         self._path = path
-        self._file = _opened_alone(path)
+        with writing(Path(path)):
+            self._file = _opened_alone(path)
         self._size = 0
         self._frames: list[TimedFrame] = []  # of the channel that takes them
         self._take: Take = _nobody
@@ -288,7 +290,30 @@ class RecordingPort(PlainPort):
 
 # Files that are whole or not there, whatever stops the writing.
 
-_WRONG_PATH = (FileNotFoundError, NotADirectoryError, IsADirectoryError, PermissionError)
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """A block that writes a file, or makes or removes one.
+
+    Raises:
+        ResultsError: the system refuses that: a full disk, no permission, no such folder, another file in the way.
+    """
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise ResultsError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder for files, and those above it, where they are missing.
+
+    Raises:
+        ResultsError: it cannot be made, or is no folder.
+    """
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
 
 
 @contextlib.contextmanager
@@ -302,8 +327,8 @@ def whole_file(path: Path) -> Iterator[Path]:
         path: what it is called afterwards; an older one is replaced, a link followed, a device or a pipe written to.
 
     Raises:
-        ResultsError: it cannot be written, for example on a full disk; an older one is as it was.
-        UsageError: it cannot be there: no such folder, or no permission to write.
+        ResultsError: it cannot be written, for example on a full disk or without permission; an older one is as it
+            was.
     """
     whole = path.resolve()
     part = whole if path.exists() and not path.is_file() else whole.with_name(f".part-{whole.name}")
@@ -315,12 +340,10 @@ def whole_file(path: Path) -> Iterator[Path]:
         if part != whole:
             with contextlib.suppress(OSError):
                 part.unlink(missing_ok=True)
-        if not isinstance(error, OSError) or isinstance(error, BrokenPipeError):
-            raise
-        if error.filename not in (None, str(part)):  # of something else
-            raise
-        kind = UsageError if isinstance(error, _WRONG_PATH) else ResultsError
-        raise kind(f"{path}: cannot be written: {error.strerror or error}") from error
+        if isinstance(error, OSError) and error.filename in (None, str(part)):  # else of something else
+            with writing(path):
+                raise
+        raise
 
 
 def write_text(path: Path, text: str, *, encoding: str = "utf-8", newline: str | None = None) -> None:

@@ -154,7 +154,7 @@ def _raw_array(setup: Setup, plant: Plant) -> RawArray | None:
 
 
 def _node(setup: Setup, planned: PlannedNode, node_id: int, plant: Plant, homed: bool) -> SlaveNode:
-    dictionary = load_eds(planned.eds, planned.node_id)
+    dictionary = planned.dictionary
     speaks_lss = node_id == UNCONFIGURED or dictionary.device_information.LSS_supported
     od_of = partial(load_eds, planned.eds) if speaks_lss else None
     if planned.kind == "drive":

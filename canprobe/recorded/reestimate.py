@@ -105,7 +105,7 @@ def _summarise(
         "cycle": contacts.counts,
         "contacts": len(tracker.samples),
         "estimates": {name: _last(records, contacts.start_s) for name, records in estimates.items()},
-        "shape": summarise_shape(plan.scene, tracker, estimates, truth, contacts.times_s, map_summary=map_summary),
+        "shape": summarise_shape(plan.setup, tracker, estimates, truth, contacts.times_s, map_summary=map_summary),
         "online": _online(folder, tracker.records) if folder is not None and contacts.driven_by == "task" else None,
     }
 

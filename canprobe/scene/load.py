@@ -63,15 +63,14 @@ def _keys(section: Any) -> str:
     return lines
 
 
-def with_files_beside(scene: Scene) -> dict[str, bytes]:
-    """The files of a saved scene, by name: `SAVED_AS`, and the EDS, URDF, calibration and cell files that it names.
+def gathered(scene: Scene) -> tuple[Scene, dict[str, bytes]]:
+    """A scene that names its EDS, URDF, calibration, surface and cell files as they stand beside it, and those files.
 
-    A folder with these files loads as the scene, wherever the folder is moved. Packaged files are not among them. A
-    URDF that is taken along has absolute paths of its meshes.
+    A folder with these files, and the scene as `SAVED_AS`, loads as the scene, wherever the folder is moved. Packaged
+    files are not among them. A URDF that is taken along has absolute paths of its meshes.
 
     Raises:
-        OSError: a file cannot be read.
-        SceneError: the true cell cannot be read.
+        SceneError: a file, or the true cell, cannot be read.
     """
     taken: dict[str, Path] = {SAVED_AS: Path()}
     files: dict[str, bytes] = {}
@@ -91,8 +90,11 @@ def with_files_beside(scene: Scene) -> dict[str, bytes]:
             names[key] = name
             if key == "true_cell":  # the plant of a true cell has no say
                 files[name] = dump_scene(moved(dataclasses.replace(read_cell(path), plant=None))).encode()
-            else:
+                continue
+            try:
                 files[name] = with_meshes_found(path) if key == "urdf" else path.read_bytes()
+            except OSError as error:
+                raise SceneError([f"{path}: cannot be read: {error.strerror}"]) from error
         return dataclasses.replace(section, **names) if names else section
 
     def moved(whole: Any) -> Any:
@@ -104,7 +106,7 @@ def with_files_beside(scene: Scene) -> dict[str, bytes]:
         }
         return dataclasses.replace(whole, **changed)
 
-    return {SAVED_AS: dump_scene(moved(scene)).encode(), **files}
+    return moved(scene), files
 
 
 def toml_key(key: str) -> str:
