@@ -77,7 +77,7 @@ def recalibrate(folder: Path) -> None:
     """Another array: its layer is twice as stiff, and the drives and the surface are others too."""
     for name, old, new in (
         ("calibration.toml", "stiffness_n_m3 = ", "stiffness_n_m3 = 2"),
-        ("joint.eds", "ProductNumber=0x0260", "ProductNumber=0x0261"),
+        ("joint.eds", "DefaultValue=0x00000260", "DefaultValue=0x00000261"),
         ("real.toml", "d_mm = 330.2", "d_mm = 331.2"),
     ):
         text = (folder / name).read_text()
