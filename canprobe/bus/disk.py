@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import math
 import re
 import zipfile
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
@@ -22,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.bus.port import ControllerState, PlainPort, Port, TimedFrame
-from canprobe.errors import ResultsError, UsageError
+from canprobe.errors import ResultsError, UsageError, regular_file
 from canprobe.protocol.frames import EFF_FLAG, RTR_FLAG, Frame
 
 # candump log files: `(0000000000.002500) can0 181#37060000`, time with six digits, from 0 in a recording of ours.
@@ -207,7 +208,7 @@ def read_candump(
         UsageError: the file cannot be read, or a line is not one of candump's; with file and line number.
     """
     try:
-        with Path(path).open(encoding="ascii", errors="replace") as file:
+        with regular_file(Path(path)).open(encoding="ascii", errors="replace") as file:
             for number, line in enumerate(file, 1):
                 if only is not None and _id_of(line) not in only:
                     continue
@@ -378,13 +379,34 @@ def read_npz(path: Path, expected: str = "an .npz of a run") -> dict[str, NDArra
         expected: what it should be, in words.
 
     Raises:
-        UsageError: no such file, or it is cut off, empty or something else.
+        UsageError: no such file, or it is cut off, empty or something else; memory is asked for what is in the file,
+            whatever its headers say.
     """
     try:
-        with path.open("rb") as opened:  # numpy leaves a file open that it cannot read
-            saved = np.load(opened, allow_pickle=False)
-            if not isinstance(saved, np.lib.npyio.NpzFile):
-                raise UsageError(f"{path}: expected {expected}, got a single array")
-            return {name: saved[name] for name in saved.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise UsageError(f"{path}: expected {expected}; cannot be read: {error}") from error
+        with regular_file(path).open("rb") as opened:
+            if opened.read(len(np.lib.format.MAGIC_PREFIX)) == np.lib.format.MAGIC_PREFIX:
+                raise ValueError("a single array")
+            with zipfile.ZipFile(opened) as saved:
+                return {entry.filename.removesuffix(".npy"): _read_array(saved, entry) for entry in saved.infolist()}
+    except Exception as error:  # zip files, their compression and numpy's headers each have their own
+        raise UsageError(f"{path}: expected {expected}; cannot be read: {_why(error)}") from error
+
+
+def _why(error: Exception) -> str:
+    """What a reader of files says, in a line."""
+    text = error.strerror if isinstance(error, OSError) else None
+    return (text or str(error) or type(error).__name__).partition("\n")[0]
+
+
+def _read_array(saved: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any]:
+    """One array of plain values, whose header and size agree."""
+    with saved.open(entry) as file:
+        version = np.lib.format.read_magic(file)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, fortran, dtype = read(file)
+        if dtype.hasobject:
+            raise ValueError(f"{entry.filename} holds Python objects")
+        if math.prod(shape) * dtype.itemsize != entry.file_size - file.tell():
+            raise ValueError(f"{entry.filename} is no array of shape {shape}, as its header says")
+        flat = np.frombuffer(bytearray(file.read()), dtype)
+    return flat.reshape(shape, order="F" if fortran else "C")

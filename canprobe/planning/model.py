@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 from canprobe.protocol.cia402 import OperationMode
 from canprobe.protocol.pdo import PdoEntry, PdoLayout
-from canprobe.scene.load import SAVED_AS, dump_scene
+from canprobe.scene.load import SAVED_AS, dump_scene, written_by_line
 from canprobe.scene.model import Scene
 from canprobe.scene.rules import with_choices
 from canprobe.scene.setup import Setup
@@ -355,7 +355,8 @@ class Plan:
     @property
     def files(self) -> dict[str, bytes]:
         """The files of the scene by name, `SAVED_AS` and those that it names, as they were read for this plan."""
-        return {SAVED_AS: dump_scene(self._chosen(self.setup.saved)).encode(), **self.setup.files}
+        text = f"{written_by_line()}\n{dump_scene(self._chosen(self.setup.saved))}"
+        return {SAVED_AS: text.encode(), **self.setup.files}
 
     def _chosen(self, scene: Scene) -> Scene:
         return with_choices(scene, {choice.key: choice.value for choice in self.choices})

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe import __version__
 from canprobe.bus.disk import read_candump, write_npz, write_text
 from canprobe.bus.port import ERR_FLAG, is_bus_error
 from canprobe.cell.cell import Cell
@@ -24,6 +25,7 @@ from canprobe.planning.make import make_plan
 from canprobe.planning.measured import MeasuredTraffic, TrafficMeter
 from canprobe.planning.model import Plan
 from canprobe.results.files import save_surface_map
+from canprobe.results.run_files import SCHEMA
 from canprobe.results.scores import ShapeScore, bound_of_scan, score_contact, score_shape
 from canprobe.scene.geometry import FILE, calibration_lines, summarise_calibration, tool_text
 from canprobe.scene.load import load_scene
@@ -105,7 +107,6 @@ def _chosen(
 # The result of a run, its summary and its files.
 
 Array = NDArray[np.float64]
-SCHEMA = 1
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -275,6 +276,7 @@ def summarise(
     contact = _contact(session, record, log)
     summary = {
         "schema": SCHEMA,
+        "written_by": f"canprobe {__version__}",
         "scene": scene.name,
         "bus": scene.bus.interface,
         "seed": scene.seed,
@@ -319,15 +321,6 @@ def tactile_columns(cell: Cell) -> dict[str, NDArray[Any]]:
 def _on_run_clock(columns: dict[str, NDArray[Any]], cell: Cell) -> dict[str, NDArray[Any]]:
     start_s = cell.start_ns * 1e-9
     return {name: column + start_s if name in ("t_s", "t_sample_s") else column for name, column in columns.items()}
-
-
-def check_clock(file: Path, log: Mapping[str, Array]) -> None:
-    """Raise UsageError for the log of an earlier canprobe, whose times count from the first SYNC: it begins at 0."""
-    if np.size(log["t_s"]) and log["t_s"][0] == 0.0:
-        raise UsageError(
-            f"{file}: expected t_s on the clock of bus.log, got times since the first SYNC, as an earlier canprobe"
-            " wrote them; run the scene again"
-        )
 
 
 def _without_nan(value: Any) -> Any:

@@ -20,12 +20,14 @@ from xml.sax.saxutils import unescape
 
 import numpy as np
 
-from canprobe.errors import PlanError
+from canprobe.errors import PlanError, regular_file
 from canprobe.robot.chain import Array, Chain, rotation_rpy
 from canprobe.robot.model import Body, Joint
 
 CONTINUOUS_RAD = 2 * math.pi
 """Stops of a continuous joint to either side: it has none itself, but cables and the counts of a drive have."""
+MOST_BYTES = 64 << 20
+"""Size of a URDF."""
 _MOVING = {"revolute", "continuous", "prismatic"}
 
 
@@ -167,7 +169,11 @@ def with_meshes_found(urdf: Path) -> bytes:
         found = find_mesh(urdf, unescape(match[2].decode(errors="replace"), {"&quot;": '"', "&apos;": "'"}))
         return match[0] if found is None else match[1] + found.as_uri().encode() + match[3]
 
-    return re.sub(rb"""(<mesh\b[^>]*?\bfilename\s*=\s*["'])([^"']*)(["'])""", absolute, urdf.read_bytes())
+    return re.sub(
+        rb"""(<mesh\b[^>]*?\bfilename\s*=\s*["'])([^"']*)(["'])""",
+        absolute,
+        regular_file(urdf, MOST_BYTES).read_bytes(),
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -199,7 +205,9 @@ class _Tree:
         text = str(source)
         where = "URDF text" if text.lstrip().startswith("<") else f"URDF {text}"
         try:
-            root = ElementTree.fromstring(text if where == "URDF text" else Path(source).read_bytes())
+            root = ElementTree.fromstring(
+                text if where == "URDF text" else regular_file(Path(source), MOST_BYTES).read_bytes()
+            )
         except OSError as error:
             raise PlanError([f"{where}: cannot be read: {error.strerror or error}"]) from error
         except ElementTree.ParseError as error:

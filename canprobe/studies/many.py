@@ -179,7 +179,7 @@ def _seeds(scene: Scene, seeds: SupportsIndex | Iterable[SupportsIndex] | None) 
     if seeds is None:
         return [scene.seed]
     try:
-        wanted = list(map(operator.index, seeds if _is_list(seeds) else range(operator.index(seeds))))
+        wanted = list(map(operator.index, seeds if isinstance(seeds, Iterable) else range(operator.index(seeds))))
     except TypeError:
         raise UsageError(f"seeds: expected how many, or a list of integers, got {seeds!r}") from None
     if not wanted:
