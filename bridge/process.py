@@ -28,7 +28,7 @@ from canprobe.bridge.sample import SurfacePatch
 from canprobe.bus.port import TimedFrame, elapsed_ns, epoch_now_ns
 from canprobe.cell.controller import Measurement, TactileSample
 from canprobe.cell.cycle import Observation
-from canprobe.errors import UsageError
+from canprobe.errors import ResultsError, UsageError
 from canprobe.planning.model import Plan
 from canprobe.protocol.tactile import Features, TactileFrame, TactileHeader
 from canprobe.scene.load import SAVED_AS
@@ -291,6 +291,7 @@ class BridgeProcess:
         self._epoch: bytes | None = None
         self._where: str | None = None
         self._error: str | None = None
+        self._unwritten = False
         self._received: int | None = None
         self._ends_by_ns: int | None = None
         self._text = b""
@@ -321,6 +322,7 @@ class BridgeProcess:
 
         Raises:
             UsageError: it could not begin; with its own words.
+            ResultsError: it could not write where it is to write.
         """
         if self._where is not None:
             return self._where
@@ -335,7 +337,7 @@ class BridgeProcess:
             elif not self._listen(left):
                 self._error = self._last_words() or "ended before it began"
         if self._where is None:
-            raise UsageError(f"bridge {self.name}: {self._error}")
+            raise (ResultsError if self._unwritten else UsageError)(f"bridge {self.name}: {self._error}")
         return self._where
 
     def observe(self, observation: Observation) -> None:
@@ -367,6 +369,7 @@ class BridgeProcess:
     def _take(self, document: dict[str, Any]) -> None:
         self._where = document.get("ready", self._where)
         self._error = document.get("error", self._error)
+        self._unwritten = document.get("unwritten", self._unwritten)
         if "done" in document:
             self._received = document["done"]["received"]
             self._ends_by_ns = elapsed_ns() + round(CLOSE_TIMEOUT_S * 1e9)

@@ -37,7 +37,7 @@ from canprobe.cell.array import patch_of
 from canprobe.cell.controller import Measurement
 from canprobe.cell.supervision import TOUCH_FORCE
 from canprobe.cell.watch import NodeWatch
-from canprobe.errors import CanprobeError
+from canprobe.errors import CanprobeError, ResultsError
 from canprobe.planning.bridges import BRIDGES
 from canprobe.planning.make import make_plan
 from canprobe.planning.model import HEARTBEAT_CONSUMED_MS, Plan, PlannedNode
@@ -248,7 +248,7 @@ def run(name: str, records: Iterator[bytes], fd: int) -> int:
     except BrokenPipeError:
         return 1  # the cell is gone, and the sink is closed
     except (CanprobeError, OSError) as error:
-        send({"error": str(error)})
+        send({"error": str(error), "unwritten": isinstance(error, ResultsError)})
         return 1
     except Exception as error:  # a line for the cell, the whole for whoever looks for it
         traceback.print_exc()

@@ -139,7 +139,7 @@ def regular_file(path: Path, most_bytes: int | None = None) -> Path:
     if not stat.S_ISREG(found.st_mode):
         raise OSError(errno.EINVAL, "expected a regular file, got a device or a pipe", str(path))
     if most_bytes is not None and found.st_size > most_bytes:
-        raise OSError(errno.EFBIG, f"expected at most {most_bytes >> 20} MiB, got {found.st_size >> 20}", str(path))
+        raise OSError(errno.EFBIG, f"expected at most {most_bytes >> 20} MiB, got {found.st_size >> 20} MiB", str(path))
     return path
 
 
