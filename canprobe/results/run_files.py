@@ -186,7 +186,7 @@ def _read(file: Path, what: str, shapes: _Shapes, setup: Setup | None) -> Column
             size in (None, got) for size, got in zip(wanted, column.shape, strict=True)
         )
         if not fits or column.dtype.kind not in kinds:
-            shape = ", ".join("any" if size is None else str(size) for size in wanted)
+            shape = ", ".join("any" if size is None else str(size) for size in wanted) + "," * (len(wanted) == 1)
             raise UsageError(
                 f"{_named(file)}: {name}: expected {_KINDS[kinds]} of shape ({shape}), got {column.dtype} of shape"
                 f" {column.shape}"
