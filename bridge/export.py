@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from canprobe.bridge.database import need, write_database
-from canprobe.bus.disk import whole_file, write_text
+from canprobe.bus.disk import make_folder, whole_file, write_text
 from canprobe.eds.packaged import eds_file
 from canprobe.eds.sections import LINE_END, Faults, Section, Sections, decode, split_sections
 from canprobe.eds.structure import commissioned_node
-from canprobe.errors import UsageError
+from canprobe.errors import UsageError, regular_file
 from canprobe.planning.configuration import SYNC_START_VALUE, NodeSetup, Write, make_setups
 from canprobe.planning.devices import INVALID, MAPPING
 from canprobe.planning.model import (
@@ -29,6 +29,7 @@ from canprobe.planning.model import (
     PlannedPdo,
 )
 from canprobe.planning.traffic import CLASSIC_BYTES
+from canprobe.scene.load import MOST_BYTES
 
 
 def export_plan(plan: Plan, folder: Path, formats: Iterable[str]) -> list[Path]:
@@ -44,10 +45,9 @@ def export_plan(plan: Plan, folder: Path, formats: Iterable[str]) -> list[Path]:
 
     Raises:
         UsageError: an extra is missing.
-        ResultsError: a file cannot be written.
-        OSError: the folder cannot be made.
+        ResultsError: the folder or a file cannot be written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     files = []
     for form in dict.fromkeys(formats):
         if form == "dcf":
@@ -338,10 +338,10 @@ def read_bus_yml(path: Path | str, say: Callable[[str], None] = lambda _: None) 
     yaml = need("yaml", "can", _PURPOSE)
     path = Path(path)
     try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+        document = yaml.safe_load(regular_file(path, MOST_BYTES).read_text(encoding="utf-8"))
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise UsageError(f"{path}: no YAML: {' '.join(str(error).split())}") from error
     if not isinstance(document, Mapping):
         raise UsageError(f"{path}: expected the nodes of a bus by name, got {type(document).__name__}")

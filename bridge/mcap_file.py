@@ -19,6 +19,7 @@ from canprobe import __version__
 from canprobe.bridge.database import plan_database
 from canprobe.bridge.messages import CLOCK, TOPICS, Encoder, Messages, Topic
 from canprobe.bridge.sample import Context, Sample
+from canprobe.bus.disk import make_folder
 from canprobe.eds.packaged import eds_file
 from canprobe.errors import ResultsError, UsageError
 from canprobe.planning.bridges import BRIDGES
@@ -36,7 +37,7 @@ class McapSink:
     def __init__(self, context: Context) -> None:
         if context.out is None:
             raise UsageError("it writes a file, and this run writes none: name a folder (out=, --out)")
-        context.out.mkdir(parents=True, exist_ok=True)
+        make_folder(context.out)
         self._context = context
         self._path = context.out / str(BRIDGES["mcap"].output)
         self._part = self._path.with_suffix(".mcap.part")  # a run that breaks off leaves no file that looks whole

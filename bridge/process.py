@@ -11,6 +11,7 @@ import json
 import marshal
 import os
 import select
+import shutil
 import struct
 import subprocess
 import sys
@@ -27,11 +28,12 @@ from canprobe.bridge.sample import SurfacePatch
 from canprobe.bus.port import TimedFrame, elapsed_ns, epoch_now_ns
 from canprobe.cell.controller import Measurement, TactileSample
 from canprobe.cell.cycle import Observation
-from canprobe.errors import UsageError
+from canprobe.errors import ResultsError, UsageError
 from canprobe.planning.model import Plan
 from canprobe.protocol.tactile import Features, TactileFrame, TactileHeader
-from canprobe.scene.load import dump_scene
+from canprobe.scene.load import SAVED_AS
 from canprobe.session.children import with_our_imports
+from canprobe.session.session import write_scene
 from canprobe.tasks.from_plan import Request
 
 if TYPE_CHECKING:
@@ -279,12 +281,18 @@ class BridgeProcess:
     def __init__(self, name: str, plan: Plan, out: Path | None, *, virtual: bool) -> None:
         self.name = name
         self.requests: deque[Request] = deque(maxlen=100)
-        self._config = {"scene": dump_scene(plan.scene), "out": str(out.resolve()) if out is not None else None}
+        self._folder = Path(tempfile.mkdtemp(prefix="canprobe-"))
+        write_scene(plan, self._folder)
+        self._config = {
+            "scene": str(self._folder / SAVED_AS),
+            "out": str(out.resolve()) if out is not None else None,
+        }
         self._virtual = virtual
         self._takes_requests = name == "ros2" and bool(plan.scene.bridge and plan.scene.bridge.ros2_commands)
         self._epoch: bytes | None = None
         self._where: str | None = None
         self._error: str | None = None
+        self._unwritten = False
         self._received: int | None = None
         self._ends_by_ns: int | None = None
         self._text = b""
@@ -315,6 +323,7 @@ class BridgeProcess:
 
         Raises:
             UsageError: it could not begin; with its own words.
+            ResultsError: it could not write where it is to write.
         """
         if self._where is not None:
             return self._where
@@ -329,7 +338,7 @@ class BridgeProcess:
             elif not self._listen(left):
                 self._error = self._last_words() or "ended before it began"
         if self._where is None:
-            raise UsageError(f"bridge {self.name}: {self._error}")
+            raise (ResultsError if self._unwritten else UsageError)(f"bridge {self.name}: {self._error}")
         return self._where
 
     def observe(self, observation: Observation) -> None:
@@ -361,6 +370,7 @@ class BridgeProcess:
     def _take(self, document: dict[str, Any]) -> None:
         self._where = document.get("ready", self._where)
         self._error = document.get("error", self._error)
+        self._unwritten = document.get("unwritten", self._unwritten)
         if "done" in document:
             self._received = document["done"]["received"]
             self._ends_by_ns = elapsed_ns() + round(CLOSE_TIMEOUT_S * 1e9)
@@ -422,6 +432,7 @@ class BridgeProcess:
             self._process.wait(KILL_TIMEOUT_S)
         if self._process.stdout is not None:
             self._process.stdout.close()
+        shutil.rmtree(self._folder, ignore_errors=True)
         self._errors.close()
 
     def _last_words(self) -> str:

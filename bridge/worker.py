@@ -37,13 +37,13 @@ from canprobe.cell.array import patch_of
 from canprobe.cell.controller import Measurement
 from canprobe.cell.supervision import TOUCH_FORCE
 from canprobe.cell.watch import NodeWatch
-from canprobe.errors import CanprobeError
+from canprobe.errors import CanprobeError, ResultsError
 from canprobe.planning.bridges import BRIDGES
 from canprobe.planning.make import make_plan
 from canprobe.planning.model import HEARTBEAT_CONSUMED_MS, Plan, PlannedNode
 from canprobe.protocol.cia402 import DriveState, known_state
 from canprobe.protocol.frames import NO_ERROR, NmtState, describe
-from canprobe.scene.load import parse_scene
+from canprobe.scene.load import load_scene
 from canprobe.scene.model import BridgeSettings
 from canprobe.scene.resolve import resolve
 from canprobe.scene.setup import Setup, Touch
@@ -248,7 +248,7 @@ def run(name: str, records: Iterator[bytes], fd: int) -> int:
     except BrokenPipeError:
         return 1  # the cell is gone, and the sink is closed
     except (CanprobeError, OSError) as error:
-        send({"error": str(error)})
+        send({"error": str(error), "unwritten": isinstance(error, ResultsError)})
         return 1
     except Exception as error:  # a line for the cell, the whole for whoever looks for it
         traceback.print_exc()
@@ -258,7 +258,7 @@ def run(name: str, records: Iterator[bytes], fd: int) -> int:
 
 
 def _context(config: dict[str, Any], send: Callable[[dict[str, object]], None]) -> Context:
-    plan = make_plan(resolve(parse_scene(config["scene"])))
+    plan = make_plan(resolve(load_scene(config["scene"])))
     out = Path(config["out"]) if config["out"] is not None else None
     return Context(plan, plan.scene.bridge or BridgeSettings(), out, send)
 

@@ -16,12 +16,12 @@ from canprobe.cell.cycle import Observation, Observer, Observers
 from canprobe.errors import CanprobeError, ResultsError, UsageError
 from canprobe.planning.make import make_plan
 from canprobe.planning.model import Plan
-from canprobe.results.summary import RunResult, log_columns, summarise, tactile_columns, write_files
+from canprobe.results.summary import RunResult, log_columns, summarise, tactile_columns, write_columns, write_files
 from canprobe.robot.chain import Array, forward_jacobian
 from canprobe.scene.load import load_scene
 from canprobe.scene.model import Scene
 from canprobe.scene.resolve import resolve
-from canprobe.scene.setup import Touch
+from canprobe.scene.setup import Setup, Touch
 from canprobe.session.children import Bridges
 from canprobe.session.emulation import emulate, emulate_eds
 from canprobe.session.looking import commission, monitor, scan
@@ -169,44 +169,62 @@ def _report(progress: Progress | None, total_s: float) -> Callable[[Measurement]
     return lambda measurement: progress(min(measurement.t_ns * 1e-9, total_s), total_s)
 
 
-def _estimates(scene: Scene, tracker: ShapeTracker | None) -> dict[str, list[ShapeRecord]]:
+def _estimates(setup: Setup, tracker: ShapeTracker | None) -> dict[str, list[ShapeRecord]]:
     """The answers of the estimator in the loop, and of the others on the same contacts."""
-    if tracker is None or scene.shape is None:
+    if tracker is None or setup.shape is None:
         return {}
     from canprobe.tasks.from_plan import estimates_of
 
-    return estimates_of(resolve(scene), tracker, (scene.shape.method, *scene.shape.also))
+    return estimates_of(setup, tracker, (setup.shape.method, *setup.shape.also))
 
 
 def _mapped(
-    scene: Scene, tracker: ShapeTracker | None, start_s: float
+    setup: Setup, tracker: ShapeTracker | None, start_s: float
 ) -> tuple[SurfaceMap | None, Consistency | None, dict[str, Any] | None]:
     """The surface map of a scan, the tests at its crossings (they take a second), and both for the summary."""
-    if tracker is None or scene.shape is None:
+    if tracker is None or setup.shape is None:
         return None, None, None
     from canprobe.results.scores import map_of_scan
 
-    return map_of_scan(tracker, scene.shape.method, start_s)
+    return map_of_scan(tracker, setup.shape.method, start_s)
 
 
-def _draw(result: RunResult, out: Path, say: Say) -> None:
-    """The pictures of a run of at least one cycle; the page of its scene comes last, it takes longest."""
-    outputs = result.plan.outputs if len(result.log["t_s"]) else ()
-    if pictures := [name for name in ("report.png", "surface.png") if name in outputs]:
-        say(f"draw {', '.join(pictures)}")
+def _drawings(result: RunResult, out: Path, say: Say) -> dict[str, Callable[[], None]]:
+    """What draws each picture of a run of at least one cycle; the page of its scene comes last, it takes longest."""
+
+    def report() -> None:
         from canprobe.results.figures import draw_run
-        from canprobe.results.surface_figure import draw_surface
 
         draw_run(result, out / "report.png")
+
+    def surface() -> None:
+        from canprobe.results.surface_figure import draw_surface
+
         draw_surface(result, out / "surface.png")
-    if "report.html" in outputs:
-        say("draw report.html")
+
+    def page() -> None:
         from canprobe.results.page import write_page_of
 
         try:
             write_page_of(out, say)
         except UsageError as error:  # a controller's column that is called like one of ours and is something else
             say(f"report.html is left out: {error}")
+
+    outputs = result.plan.outputs if len(result.log["t_s"]) else ()
+    known = {"report.png": report, "surface.png": surface, "report.html": page}
+    return {name: draw for name, draw in known.items() if name in outputs}
+
+
+def _draw(name: str, draw: Callable[[], None]) -> str | None:
+    """Draw one picture; why that failed. Whatever a library of pictures raises, the run's results are written."""
+    try:
+        with interrupts_repeated():
+            draw()
+    except (CanprobeError, OSError) as error:
+        return str(error)
+    except Exception as error:
+        return f"{name}: cannot be drawn: {type(error).__name__}: {error}"
+    return None
 
 
 class OpenCell(Session):
@@ -339,11 +357,39 @@ class OpenCell(Session):
             self._bridges.end(None)
 
     def _conclude(self, failure: BaseException | None) -> None:
-        record, start_s = record_of(self._last), self.cell.start_ns * 1e-9
-        if record.shape is not None and self.scene.shape is not None and self.scene.shape.also:
-            self._say(f"estimate again with {', '.join(self.scene.shape.also)}")
-        estimates = _estimates(self.scene, record.shape)
-        surface_map, consistency, map_summary = _mapped(self.scene, record.shape, start_s)
+        log, tactile = log_columns(self.cell), tactile_columns(self.cell)
+        try:
+            self._score(log, tactile, failure)
+        except BaseException:  # what was measured is kept all the same
+            self._write(lambda out: write_columns(log, tactile, out))
+            raise
+        summary = self._result.summary
+        if isinstance(failure, CanprobeError):
+            failure.summary = summary
+        self._write(lambda out: write_files(self._result, out))
+        if self.out is not None:
+            for name, draw in _drawings(self._result, self.out, self._say).items():
+                self._say(f"draw {name}")
+                if (why := _draw(name, draw)) is not None:
+                    self._note_unwritten(why)
+        summary["faults"] += [line for line in self.unwritten if line not in summary["faults"]]
+        if self.unwritten and failure is None:
+            unwritten = ResultsError("\n".join(self.unwritten))
+            unwritten.summary = summary
+            raise unwritten
+        for line in self.unwritten:  # what stopped the run comes first
+            if failure is not None and line != str(failure):
+                failure.add_note(line)
+
+    def _score(
+        self, log: dict[str, Array], tactile: dict[str, npt.NDArray[Any]], failure: BaseException | None
+    ) -> None:
+        """Make the run's result of what was measured, by the plan that it ran with."""
+        record, start_s, setup = record_of(self._last), self.cell.start_ns * 1e-9, self.plan.setup
+        if record.shape is not None and setup.shape is not None and setup.shape.also:
+            self._say(f"estimate again with {', '.join(setup.shape.also)}")
+        estimates = _estimates(setup, record.shape)
+        surface_map, consistency, map_summary = _mapped(setup, record.shape, start_s)
         summary = summarise(
             self,
             record,
@@ -357,34 +403,27 @@ class OpenCell(Session):
             self._result,
             self.plan,
             summary,
-            log_columns(self.cell),
+            log,
             self.truth,
             {name: on_run_clock(records, start_s) for name, records in estimates.items()},
             record.taxels,
-            tactile_columns(self.cell),
+            tactile,
             surface_map,
             consistency,
             self.out,
             self._contacts(record, start_s),
         )
-        if isinstance(failure, CanprobeError):
-            failure.summary = summary
-        if self.out is not None:
-            try:
-                with interrupts_held():
-                    write_files(self._result, self.out)
-                with interrupts_repeated():
-                    _draw(self._result, self.out, self._say)
-            except (CanprobeError, OSError) as error:
-                summary["faults"].append(str(error))
-                self.unwritten.append(str(error))
-        if self.unwritten and failure is None:
-            unwritten = ResultsError("\n".join(self.unwritten))
-            unwritten.summary = summary
-            raise unwritten
-        for line in self.unwritten:  # what stopped the run comes first
-            if failure is not None and line != str(failure):
-                failure.add_note(line)
+
+    def _write(self, write: Callable[[Path], None]) -> None:
+        """Write files into the run's folder; what cannot be written is noted, and raised at the end."""
+        if self.out is None:
+            return
+        try:
+            with interrupts_held():
+                write(self.out)
+        except ResultsError as error:
+            for line in str(error).splitlines():
+                self._note_unwritten(line)
 
     def _contacts(self, record: TaskRecord, start_s: float) -> Contacts | None:
         task = self.plan.setup.task

@@ -18,7 +18,10 @@ All can be imported from `canprobe`.
 
 from __future__ import annotations
 
+import errno
+import stat
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 
@@ -116,6 +119,28 @@ class SafetyStop(CanprobeError):  # noqa: N818 - it is a stop, not a mistake
     def __init__(self, reason: str) -> None:
         self.reason = reason
         super().__init__(reason)
+
+
+def regular_file(path: Path, most_bytes: int | None = None) -> Path:
+    """A path to read from, if a file with an end is there: a device or a pipe may never end.
+
+    It stands here, as every wing reads files, and raises what the opening of a file raises.
+
+    Args:
+        path: of the file.
+        most_bytes: size up to which it is read whole; None: it is not.
+
+    Raises:
+        OSError: there is none, it is something else, or it is larger.
+    """
+    found = path.stat()
+    if stat.S_ISDIR(found.st_mode):
+        raise IsADirectoryError(errno.EISDIR, "Is a directory", str(path))
+    if not stat.S_ISREG(found.st_mode):
+        raise OSError(errno.EINVAL, "expected a regular file, got a device or a pipe", str(path))
+    if most_bytes is not None and found.st_size > most_bytes:
+        raise OSError(errno.EFBIG, f"expected at most {most_bytes >> 20} MiB, got {found.st_size >> 20} MiB", str(path))
+    return path
 
 
 EXTRA_OF = {

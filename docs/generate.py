@@ -72,7 +72,8 @@ misspelt, the name that was probably meant.
 
 `cell = "NAME"` above the first section names the cell, arm and array, that the scene runs on: a packaged one
 (`canprobe cells`) or the path of a file; `puma260` without this line. `[arm]` and `[sensor]` say that the scene uses
-the arm and the array of the cell, and may be empty.
+the arm and the array of the cell, and may be empty. `written_by` above the first section of a file that canprobe wrote
+says by which version; a file of your own needs none.
 
 A key that a scene leaves out has the value of its cell ([Your own arm](own-arm.md)), then that of the array file that
 the cell names ([Your own array](own-array.md)), or else its default. The suffix of a key is its unit. Numbers may be

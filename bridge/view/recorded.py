@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import math
-import zipfile
 from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,30 +15,15 @@ from numpy.typing import NDArray
 from canprobe.bridge.sample import ContactFrame, SurfacePatch
 from canprobe.bridge.view.instants import Answer, Moment, judge
 from canprobe.bridge.view.meshes import Array
-from canprobe.bus.disk import read_npz
 from canprobe.cell.log import joint_positions
 from canprobe.errors import UsageError
-from canprobe.results.summary import SCHEMA, check_clock
-from canprobe.scene.geometry import true_object
-from canprobe.scene.load import load_scene
+from canprobe.results.run_files import LOG, TACTILE, read_log, read_scene, read_summary, read_tactile
+from canprobe.scene.load import SAVED_AS
 from canprobe.scene.model import Scene
+from canprobe.scene.resolve import resolve
+from canprobe.scene.setup import Setup
 from canprobe.tasks.probing import Phase
 from canprobe.touch.linear_algebra import tangent_rotation
-
-_SHAPES: dict[str, tuple[int, ...]] = {
-    "t_s": (),
-    "q_rad": (-1,),
-    "q_m": (-1,),
-    "phase": (),
-    "force_n": (),
-    "contact_mm": (3,),
-    "normal": (3,),
-    "kappa_per_m": (2,),
-    "T_base_contact_m": (4, 4),
-    "K_per_m": (2, 2),
-    "K_covariance_per_m2": (3, 3),
-}
-"""Columns of ``log.npz`` that are shown, and the shape of a row; -1: one value a joint."""
 
 
 @dataclass(frozen=True, eq=False)  # without slots: `cached_property`
@@ -49,7 +32,7 @@ class RecordedRun:
 
     Attributes:
         scene: as resolved.
-        log: the columns of `_SHAPES` that the run has; every row one cycle.
+        log: the columns of ``log.npz``; every row one cycle.
         answer_rows: rows at which the estimator gave a new answer.
         answers: at each of them.
         taxels: (t_s, (rows, columns) uint8 counts) of each tactile frame, by rising time of the cycle that used it.
@@ -123,60 +106,31 @@ def read_run(folder: Path) -> RecordedRun:
     """
     if not folder.is_dir():
         raise UsageError(f"{folder}: no such folder; expected one that `canprobe run --out DIR` wrote")
-    for name in ("scene.toml", "log.npz"):
-        if not (folder / name).is_file():
+    for name in (SAVED_AS, LOG):
+        if not (folder / name).exists():
             raise UsageError(f"{folder}: no {name} in this folder; expected one that `canprobe run --out DIR` wrote")
-    _check_schema(folder / "summary.json")
-    scene = load_scene(folder / "scene.toml")
-    log = _read_log(folder / "log.npz", len(scene.drives))
+    read_summary(folder)
+    scene = read_scene(folder)
+    setup = resolve(scene)
+    log = read_log(folder / LOG, setup)
+    if not len(log["t_s"]):
+        raise UsageError(f"{folder / LOG}: expected a row for each cycle, got none")
     rows = _new_answers(log)
-    shape = None if scene.object is None else true_object(scene.object)
+    shape = setup.truth.object
     return RecordedRun(
         scene=scene,
         log=log,
         answer_rows=rows,
         answers=tuple(judge(_patch(log, row), shape) for row in rows.tolist()),
-        taxels=tuple(_read_taxels(folder / "tactile.npz")),
+        taxels=tuple(_read_taxels(folder / TACTILE, setup)),
     )
 
 
-def _read_taxels(file: Path) -> Iterator[tuple[float, NDArray[np.uint8]]]:
+def _read_taxels(file: Path, setup: Setup) -> Iterator[tuple[float, NDArray[np.uint8]]]:
     """The images that the cell used; none where there is no file, or of an array that sends features."""
-    columns = read_npz(file) if file.is_file() else {}
+    columns = read_tactile(file, setup) if file.exists() else {}
     if columns and np.isnan(columns["features"]).all():
         yield from zip(columns["t_s"].tolist(), columns["taxels"], strict=True)
-
-
-def _check_schema(file: Path) -> None:
-    if not file.is_file():
-        return
-    try:
-        summary = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise UsageError(f"{file}: expected the summary of a run; cannot be read: {error}") from error
-    found = summary.get("schema") if isinstance(summary, dict) else None
-    if found != SCHEMA:
-        raise UsageError(f"{file}: expected schema {SCHEMA}, got {found!r}; run the scene again with this canprobe")
-
-
-def _read_log(file: Path, joints: int) -> dict[str, Array]:
-    try:
-        with file.open("rb") as opened:  # numpy leaves a file open that it cannot read
-            saved = np.load(opened, allow_pickle=False)
-            if isinstance(saved, np.ndarray):
-                raise UsageError(f"{file}: expected the log of a run, got a single array")
-            log = {name: saved[name] for name in saved.files if name in _SHAPES}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise UsageError(f"{file}: expected the log of a run; cannot be read: {error}") from error
-    rows = len(log["t_s"]) if "t_s" in log and log["t_s"].ndim else 0
-    if rows == 0:
-        raise UsageError(f"{file}: expected a column 't_s' with a row for each cycle, got none")
-    check_clock(file, log)
-    for name, values in log.items():
-        shape = (rows, *(joints if size < 0 else size for size in _SHAPES[name]))
-        if values.shape != shape or values.dtype.kind != "f":
-            raise UsageError(f"{file}: {name}: expected floats of shape {shape}, got {values.dtype} of {values.shape}")
-    return log
 
 
 def _new_answers(log: dict[str, Array]) -> NDArray[np.int64]:

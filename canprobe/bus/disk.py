@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import math
 import re
 import zipfile
 from collections import Counter
@@ -23,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.bus.port import ControllerState, PlainPort, Port, TimedFrame
-from canprobe.errors import ResultsError, UsageError
+from canprobe.errors import ResultsError, UsageError, regular_file
 from canprobe.protocol.frames import EFF_FLAG, RTR_FLAG, Frame
 
 # candump log files: `(0000000000.002500) can0 181#37060000`, time with six digits, from 0 in a recording of ours.
@@ -77,6 +78,7 @@ class CandumpWriter:
         t0_ns: the time on the frames' clock that is written as 0.
 
     Raises:
+        ResultsError: the file cannot be opened.
         UsageError: somebody else writes this file just now.
 
     Attributes:
@@ -87,7 +89,8 @@ class CandumpWriter:
         self._t0_ns = t0_ns
         self.failure: str | None = None
         self._path = path
-        self._file = _opened_alone(path)
+        with writing(Path(path)):
+            self._file = _opened_alone(path)
         self._size = 0
         self._frames: list[TimedFrame] = []  # of the channel that takes them
         self._take: Take = _nobody
@@ -260,7 +263,7 @@ class CandumpReader:
         if self._piped is None and path.is_fifo():
             self._piped = path.read_bytes()
         if self._piped is None:
-            return path.open("rb")
+            return regular_file(path).open("rb")
         return BufferedReader(BytesIO(self._piped))
 
     def _no_line(self, text: str) -> UsageError:
@@ -334,7 +337,30 @@ class RecordingPort(PlainPort):
 
 # Files that are whole or not there, whatever stops the writing.
 
-_WRONG_PATH = (FileNotFoundError, NotADirectoryError, IsADirectoryError, PermissionError)
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """A block that writes a file, or makes or removes one.
+
+    Raises:
+        ResultsError: the system refuses that: a full disk, no permission, no such folder, another file in the way.
+    """
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise ResultsError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder for files, and those above it, where they are missing.
+
+    Raises:
+        ResultsError: it cannot be made, or is no folder.
+    """
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
 
 
 @contextlib.contextmanager
@@ -348,8 +374,8 @@ def whole_file(path: Path) -> Iterator[Path]:
         path: what it is called afterwards; an older one is replaced, a link followed, a device or a pipe written to.
 
     Raises:
-        ResultsError: it cannot be written, for example on a full disk; an older one is as it was.
-        UsageError: it cannot be there: no such folder, or no permission to write.
+        ResultsError: it cannot be written, for example on a full disk or without permission; an older one is as it
+            was.
     """
     whole = path.resolve()
     part = whole if path.exists() and not path.is_file() else whole.with_name(f".part-{whole.name}")
@@ -361,12 +387,10 @@ def whole_file(path: Path) -> Iterator[Path]:
         if part != whole:
             with contextlib.suppress(OSError):
                 part.unlink(missing_ok=True)
-        if not isinstance(error, OSError) or isinstance(error, BrokenPipeError):
-            raise
-        if error.filename not in (None, str(part)):  # of something else
-            raise
-        kind = UsageError if isinstance(error, _WRONG_PATH) else ResultsError
-        raise kind(f"{path}: cannot be written: {error.strerror or error}") from error
+        if isinstance(error, OSError) and error.filename in (None, str(part)):  # else of something else
+            with writing(path):
+                raise
+        raise
 
 
 def write_text(path: Path, text: str, *, encoding: str = "utf-8", newline: str | None = None) -> None:
@@ -401,13 +425,34 @@ def read_npz(path: Path, expected: str = "an .npz of a run") -> dict[str, NDArra
         expected: what it should be, in words.
 
     Raises:
-        UsageError: no such file, or it is cut off, empty or something else.
+        UsageError: no such file, or it is cut off, empty or something else; memory is asked for what is in the file,
+            whatever its headers say.
     """
     try:
-        with path.open("rb") as opened:  # numpy leaves a file open that it cannot read
-            saved = np.load(opened, allow_pickle=False)
-            if not isinstance(saved, np.lib.npyio.NpzFile):
-                raise UsageError(f"{path}: expected {expected}, got a single array")
-            return {name: saved[name] for name in saved.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise UsageError(f"{path}: expected {expected}; cannot be read: {error}") from error
+        with regular_file(path).open("rb") as opened:
+            if opened.read(len(np.lib.format.MAGIC_PREFIX)) == np.lib.format.MAGIC_PREFIX:
+                raise ValueError("a single array")
+            with zipfile.ZipFile(opened) as saved:
+                return {entry.filename.removesuffix(".npy"): _read_array(saved, entry) for entry in saved.infolist()}
+    except Exception as error:  # zip files, their compression and numpy's headers each have their own
+        raise UsageError(f"{path}: expected {expected}; cannot be read: {_why(error)}") from error
+
+
+def _why(error: Exception) -> str:
+    """What a reader of files says, in a line."""
+    text = error.strerror if isinstance(error, OSError) else None
+    return (text or str(error) or type(error).__name__).partition("\n")[0]
+
+
+def _read_array(saved: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any]:
+    """One array of plain values, whose header and size agree."""
+    with saved.open(entry) as file:
+        version = np.lib.format.read_magic(file)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, fortran, dtype = read(file)
+        if dtype.hasobject:
+            raise ValueError(f"{entry.filename} holds Python objects")
+        if math.prod(shape) * dtype.itemsize != entry.file_size - file.tell():
+            raise ValueError(f"{entry.filename} is no array of shape {shape}, as its header says")
+        flat = np.frombuffer(bytearray(file.read()), dtype)
+    return flat.reshape(shape, order="F" if fortran else "C")

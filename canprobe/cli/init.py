@@ -56,7 +56,9 @@ def add_arguments(parser: Parser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write cell.toml and first.toml, with the files that they name."""
+    from canprobe.bus.disk import write_text, writing
     from canprobe.robot.urdf import with_meshes_found
+    from canprobe.scene.load import written_by_line
 
     folder: Path = args.folder
     for name in ("cell.toml", "first.toml"):
@@ -67,13 +69,16 @@ def run(args: argparse.Namespace) -> int:
             raise UsageError(f"{path}: no such file")
     if args.urdf is None and (args.base or args.tip):
         raise UsageError("--base and --tip are links of a URDF: give it with --urdf FILE")
-    cell = _urdf_cell(args) if args.urdf else _dh_cell(args)
+    cell = f"{written_by_line()}{_urdf_cell(args) if args.urdf else _dh_cell(args)}"
     with _folder_or_nothing(folder):
         for path in {*args.eds, *([args.urdf] if args.urdf else [])}:
             if path.resolve() != (folder / path.name).resolve():
-                (folder / path.name).write_bytes(with_meshes_found(path) if path == args.urdf else path.read_bytes())
+                with writing(folder / path.name):
+                    (folder / path.name).write_bytes(
+                        with_meshes_found(path) if path == args.urdf else path.read_bytes()
+                    )
         first, no_scan = _first_scene(folder, cell)
-        (folder / "first.toml").write_text(first, encoding="utf-8")
+        write_text(folder / "first.toml", f"{written_by_line()}{first}")
     print(f"wrote {folder / 'cell.toml'} and {folder / 'first.toml'}")
     if no_scan:
         print(f"first.toml moves the arm freely: a scan was refused: {no_scan}")
@@ -85,8 +90,10 @@ def run(args: argparse.Namespace) -> int:
 @contextlib.contextmanager
 def _folder_or_nothing(folder: Path) -> Iterator[None]:
     """The folder for the files that the block writes; where the block fails, neither it nor they are left."""
+    from canprobe.bus.disk import make_folder
+
     new = [path for path in (folder, *folder.parents) if not path.exists()]
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     before = set(folder.iterdir())
     try:
         yield
@@ -270,16 +277,17 @@ def _rounded(found: UrdfArm) -> tuple[list[float], float]:
 
 def _first_scene(folder: Path, cell: str) -> tuple[str, str | None]:
     """Write the cell at the fastest rate at which it can do a scan, else free motion; the scene, and why no scan."""
+    from canprobe.bus.disk import write_text
     from canprobe.planning.make import make_plan
     from canprobe.scene.load import parse_scene
     from canprobe.scene.resolve import resolve
 
-    (folder / "cell.toml").write_text(_at_rate(cell, _RATES_HZ[0]), encoding="utf-8")
+    write_text(folder / "cell.toml", _at_rate(cell, _RATES_HZ[0]))
     refused: dict[float, str] = {}
     problems: list[str] = []
     for scenes in (_scans(folder), (_FREE,)):
         for rate in _RATES_HZ:
-            (folder / "cell.toml").write_text(_at_rate(cell, rate), encoding="utf-8")
+            write_text(folder / "cell.toml", _at_rate(cell, rate))
             for text in scenes:
                 try:
                     make_plan(resolve(parse_scene(text, file="first.toml", folder=folder)), find_ways=False)

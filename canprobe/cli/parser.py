@@ -138,6 +138,8 @@ def setting(text: str) -> tuple[str, Any]:
         return key.strip(), tomllib.loads(f"value = {value}")["value"]
     except ValueError:
         return key.strip(), value.strip()
+    except RecursionError:
+        raise argparse.ArgumentTypeError(f"expected KEY=VALUE, got one of too many brackets: {text[:40]}…") from None
 
 
 def node_ids(text: str) -> tuple[int, ...]:

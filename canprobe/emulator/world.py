@@ -30,7 +30,7 @@ from canprobe.planning.motion import parked_posture
 from canprobe.planning.units import FEED, GEAR_RATIO, RESOLUTION
 from canprobe.protocol.frames import SYNC_ID, UNCONFIGURED, Frame
 from canprobe.robot.chain import Array, Chain, forward
-from canprobe.scene.setup import Arm, Setup
+from canprobe.scene.setup import Setup
 from canprobe.touch.pad import Pad
 
 
@@ -152,7 +152,7 @@ def _raw_array(setup: Setup, plant: Plant) -> RawArray | None:
 
 
 def _node(setup: Setup, planned: PlannedNode, node_id: int, plant: Plant, homed: bool) -> SlaveNode:
-    dictionary = load_eds(planned.eds, planned.node_id)
+    dictionary = planned.dictionary
     speaks_lss = node_id == UNCONFIGURED or dictionary.device_information.LSS_supported
     od_of = partial(load_eds, planned.eds) if speaks_lss else None
     if planned.kind == "drive":

@@ -450,6 +450,7 @@ def _is_interface_local(channel: str) -> bool:
         return False
     return group.version == 6 and group.is_multicast and int(group) >> 112 & 0xF == 1
 
+
 MISSED_SYNCS_REAL = 10
 """SYNC periods for which real drives and their master may wait for each other without a warning."""
 

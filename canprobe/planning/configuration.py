@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from canopen import ObjectDictionary
 
-from canprobe.eds.description import Entry
+from canprobe.eds.description import Description, Entry
 from canprobe.eds.packaged import (
     FULL_SCALE,
     LONG_PDOS,
@@ -194,7 +194,7 @@ def make_setups(plan: Plan) -> tuple[NodeSetup, ...]:
 
 
 def _setup(plan: Plan, node: PlannedNode) -> NodeSetup:
-    device = Abilities.of(node.eds, node.node_id)
+    device = Abilities(node.eds, Description(node.dictionary))
     of_kind = _drive_writes if node.kind == "drive" else _array_writes
     writes, left_out, problems = _possible(
         device, [*_pdo_writes(plan, node, device), *_common_writes(plan, device), *of_kind(plan, node, device)]

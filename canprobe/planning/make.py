@@ -291,6 +291,7 @@ def _nodes(
             kind=kind,
             role=role,
             eds=node.eds,
+            dictionary=devices[node.node_id].od,
             identity=replace(devices[node.node_id].identity, serial_number=node.serial),
             emulated=node.emulated,
             channel=node.channel,

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
 
 from canprobe.protocol.cia402 import OperationMode
 from canprobe.protocol.pdo import PdoEntry, PdoLayout
+from canprobe.scene.load import SAVED_AS, dump_scene, written_by_line
 from canprobe.scene.model import Scene
 from canprobe.scene.rules import with_choices
 from canprobe.scene.setup import Setup
+
+if TYPE_CHECKING:
+    from canopen import ObjectDictionary
 
 MASTER_NODE_ID = 127
 HEARTBEAT_PRODUCED_MS = 100
@@ -74,12 +78,14 @@ class PlannedNode:
         switched_off: PDOs of the EDS that the scene does not need, (direction, number).
         mode: of operation, 6060h; None: no drive.
         interpolation: the period as 60C2h may express it, the first as it is written; empty: no drive.
+        dictionary: canopen's object dictionary, as the EDS was read for this plan. Treat it as read-only.
     """
 
     node_id: int
     kind: NodeKind
     role: str
     eds: str
+    dictionary: ObjectDictionary = field(repr=False, compare=False)
     identity: Identity
     emulated: bool
     channel: str
@@ -344,7 +350,16 @@ class Plan:
     @property
     def scene(self) -> Scene:
         """The scene with every choice of the plan filled in."""
-        return with_choices(self.setup.scene, {choice.key: choice.value for choice in self.choices})
+        return self._chosen(self.setup.scene)
+
+    @property
+    def files(self) -> dict[str, bytes]:
+        """The files of the scene by name, `SAVED_AS` and those that it names, as they were read for this plan."""
+        text = f"{written_by_line()}\n{dump_scene(self._chosen(self.setup.saved))}"
+        return {SAVED_AS: text.encode(), **self.setup.files}
+
+    def _chosen(self, scene: Scene) -> Scene:
+        return with_choices(scene, {choice.key: choice.value for choice in self.choices})
 
     @property
     def traffic(self) -> Traffic:

@@ -346,9 +346,7 @@ def _beginning(setup: Setup, task: Touch | Calibrate, contacts: Iterable[_Pose])
         raise
 
 
-def _check_touch(
-    task: Touch, path: SurfacePath, stops: _Stops, q_start: Array
-) -> tuple[JointSpeeds | None, list[str]]:
+def _check_touch(task: Touch, path: SurfacePath, stops: _Stops, q_start: Array) -> tuple[JointSpeeds | None, list[str]]:
     problems = _off_array(task, path)
     if problems:
         return None, problems

@@ -198,8 +198,10 @@ def _allowed_speed(device: Abilities, drive: Drive, wanted: float) -> tuple[floa
     """The lowest of the limits that stand in a drive, position units/s, and its object; infinite without any."""
     limits = [(math.inf, PROFILE_SPEED_LIMIT)]
     entry, unit = device.description.entry(PROFILE_SPEED_LIMIT), speed_unit(device, drive, VELOCITY)
-    if entry is not None and unit is not None and not (
-        entry.writable and (wanted == math.inf or entry.allows(math.ceil(wanted / unit)))
+    if (
+        entry is not None
+        and unit is not None
+        and not (entry.writable and (wanted == math.inf or entry.allows(math.ceil(wanted / unit))))
     ):
         held = device.number(PROFILE_SPEED_LIMIT)
         limits += [(held * unit, PROFILE_SPEED_LIMIT)] if held else []

@@ -95,7 +95,7 @@ def _in_real_time(observations: Iterator[Observation]) -> Iterator[Observation]:
 def _observations(plan: Plan, path: Path, folder: Path | None, result: ReplayResult | None) -> Iterator[Observation]:
     """The observations of a recorded log; `folder` of the run, None for another log; `result` of the estimators."""
     estimates = _estimates(result)
-    run = read_run(folder) if folder is not None else None
+    run = read_run(folder, plan.setup) if folder is not None else None
     if run is not None:
         yield from _observations_of(run, path, plan, estimates)
         return

@@ -11,18 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.bus.clock_steps import RecordedBus
-from canprobe.bus.disk import read_npz, write_npz
+from canprobe.bus.disk import write_npz
 from canprobe.errors import ProtocolError, UsageError
 from canprobe.planning.make import make_plan
 from canprobe.planning.model import Plan
 from canprobe.recorded.cycles import LogCycles, replay_contacts
 from canprobe.recorded.recording import read_recording
 from canprobe.recorded.run_folder import RunFolder, read_run, replay_task
+from canprobe.results.run_files import LOG, TACTILE, TRUTH, needed, read_log, read_scene, read_truth
 from canprobe.results.scores import estimate_columns, map_of_scan
 from canprobe.results.summary import curvature_text, finite_or_none, shape_lines, summarise_shape
 from canprobe.scene.load import load_scene
 from canprobe.scene.model import Scene
 from canprobe.scene.resolve import resolve
+from canprobe.scene.setup import Setup
 from canprobe.tasks.from_plan import estimates_of
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
 from canprobe.touch.estimate.fit import METHODS, unknown_method
@@ -98,7 +100,7 @@ def _summarise(
     plan: Plan, source: Path, contacts: Contacts, estimates: dict[str, list[ShapeRecord]], folder: Path | None
 ) -> dict[str, Any]:
     """The summary of a `ReplayResult`; what does not apply is None. `folder` of the run, for its truth and its log."""
-    truth = _truth(folder / "truth.npz") if folder is not None else {}
+    truth = _truth(folder / TRUTH, plan.setup) if folder is not None else {}
     tracker = contacts.tracker
     map_summary = None if plan.scene.shape is None else map_of_scan(tracker, plan.scene.shape.method)[2]
     return {
@@ -111,20 +113,19 @@ def _summarise(
         "cycle": contacts.counts,
         "contacts": len(tracker.samples),
         "estimates": {name: _last(records, contacts.start_s) for name, records in estimates.items()},
-        "shape": summarise_shape(plan.scene, tracker, estimates, truth, contacts.times_s, map_summary=map_summary),
-        "online": _online(folder, tracker.records) if folder is not None and contacts.driven_by == "task" else None,
+        "shape": summarise_shape(plan.setup, tracker, estimates, truth, contacts.times_s, map_summary=map_summary),
+        "online": _online(folder, plan.setup, tracker.records)
+        if folder is not None and contacts.driven_by == "task"
+        else None,
     }
 
 
-def _truth(path: Path) -> dict[str, Array]:
-    """The plant's truth, one row per SYNC; empty without the file."""
-    columns = read_npz(path) if path.is_file() else {}
-    for name in _SCORED if columns else ():
-        column = columns.get(name, np.zeros(0))
-        if column.dtype.kind != "f" or column.ndim != 2:
-            raise UsageError(
-                f"{path}: {name}: expected a row of numbers for each SYNC, got {column.dtype} of shape {column.shape}"
-            )
+def _truth(file: Path, setup: Setup) -> dict[str, Array]:
+    """The plant's truth, one row per SYNC; empty without the file, or where nothing happened."""
+    columns = read_truth(file, setup) if file.exists() else {}
+    if not columns or not len(next(iter(columns.values()))):
+        return {}
+    needed(columns, _SCORED, file)
     return columns
 
 
@@ -141,10 +142,10 @@ def _last(records: Sequence[ShapeRecord], start_s: float) -> dict[str, Any]:
     }
 
 
-def _online(folder: Path, records: Sequence[ShapeRecord]) -> dict[str, Any] | None:
+def _online(folder: Path, setup: Setup, records: Sequence[ShapeRecord]) -> dict[str, Any] | None:
     """Difference of the replayed curvature of the estimator in the loop and the logged one, number by number."""
-    path = folder / "log.npz"
-    logged = read_npz(path).get("K_per_m") if path.is_file() else None
+    path = folder / LOG
+    logged = read_log(path, setup).get("K_per_m") if path.exists() else None
     if logged is None:
         return None
     online = _changes(logged[np.isfinite(logged).all(axis=(1, 2))])
@@ -257,7 +258,7 @@ def replay(
     path, folder = find_log(Path(log))
     plan = make_plan(resolve(scene_of(path, folder, scene)))
     methods = _methods(plan.scene, method)
-    run = read_run(folder) if folder is not None else None
+    run = read_run(folder, plan.setup) if folder is not None else None
     contacts = _from_run(plan, run) if run is not None else _from_log(plan, path)
     source = path if folder is None or run is None else folder
     if not contacts.tracker.samples:
@@ -275,7 +276,7 @@ def find_log(log: Path) -> tuple[Path, Path | None]:
     if not log.is_dir():
         return log, None
     path = log / "bus.log"
-    if not path.is_file() and not (log / "tactile.npz").is_file():
+    if not path.exists() and not (log / TACTILE).exists():
         raise UsageError(f"{log}: no bus.log in this folder; expected the folder of a run, or a candump file")
     return path, log
 
@@ -286,9 +287,7 @@ def scene_of(path: Path, folder: Path | None, scene: Scene | str | Path | None) 
         return load_scene(scene)
     if folder is None:
         raise UsageError(f"{path}: a log alone does not describe its nodes: name the scene (--scene)")
-    if not (folder / "scene.toml").is_file():
-        raise UsageError(f"{folder}: no scene.toml in this folder: name the scene (--scene)")
-    return load_scene(folder / "scene.toml")
+    return read_scene(folder)
 
 
 def _methods(scene: Scene, method: str | Sequence[str] | None) -> tuple[str, ...]:

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.bus.disk import read_npz
 from canprobe.cell.controller import Measurement, TactileSample
 from canprobe.cell.log import joint_positions
 from canprobe.errors import UsageError
 from canprobe.planning.model import Plan
 from canprobe.protocol.cia402 import DriveState, known_state
 from canprobe.protocol.tactile import Features, TactileFrame, TactileHeader, TactileMode
-from canprobe.results.summary import check_clock
+from canprobe.results.run_files import LOG, TACTILE, needed, read_log, read_summary, read_tactile
+from canprobe.scene.setup import Setup
 from canprobe.tasks.from_plan import make_task
 from canprobe.tasks.probing import Phase
 from canprobe.tasks.touch import TouchTask
@@ -60,8 +60,9 @@ class RunFolder:
         joints = joint_positions(log)
         if joints is None:
             joints = np.full((rows, 1), np.nan)
-        ages = log.get("q_age", np.zeros((rows, 0))).astype(int)
-        words = log.get("statusword", np.zeros((rows, 0))).astype(int)
+        ages, words = (
+            np.nan_to_num(log.get(name, np.zeros((rows, 0)))).astype(int) for name in ("q_age", "statusword")
+        )
         torques = log.get("torque_permille", np.zeros((rows, 0)))
         tactile_ages = log.get("tactile_age", np.full(rows, np.nan))
         for k, t_ns in enumerate(self.times_ns.tolist()):
@@ -108,24 +109,24 @@ def _frame(taxels: NDArray[np.uint8], window: tuple[int, int, int, int], feature
     return TactileFrame(header, taxels, window, told, 0)
 
 
-def read_run(folder: Path) -> RunFolder | None:
+def read_run(folder: Path, setup: Setup) -> RunFolder | None:
     """The measurements of a run; None where the folder has none, as that of a run that was killed.
+
+    Args:
+        folder: of the run.
+        setup: of its scene.
 
     Raises:
         UsageError: a file of another canprobe, or one that cannot be read.
     """
-    log, tactile = folder / "log.npz", folder / "tactile.npz"
-    if not log.is_file() or not tactile.is_file():
+    read_summary(folder)
+    log, tactile = folder / LOG, folder / TACTILE
+    if not log.exists() or not tactile.exists():
         return None
-    columns, images = read_npz(log), read_npz(tactile)
-    missing = [name for name in ("t_s", "q_age") if name not in columns]
-    missing += ["q_rad"] if joint_positions(columns) is None else []
-    missing += [
-        name for name in ("t_s", "t_sample_s", "t_sigma_s", "taxels", "window", "features") if name not in images
-    ]
-    if missing:
-        raise UsageError(f"{folder}: expected the columns of a run, got none called {', '.join(missing)}; run it again")
-    check_clock(log, columns)
+    columns, images = read_log(log, setup), read_tactile(tactile, setup)
+    needed(columns, ("q_age", *(("q_rad",) if joint_positions(columns) is None else ())), log)
+    if not len(columns["t_s"]):
+        raise UsageError(f"{log}: expected a row for each cycle, got none: the run was stopped before its first")
     return RunFolder(folder, columns, images)
 
 

@@ -35,7 +35,6 @@ from canprobe.results.picture import (
 )
 from canprobe.results.summary import RunResult
 from canprobe.results.surface_figure import Array, Plane, add_sheet, map_surface, true_surface
-from canprobe.scene.geometry import true_object
 from canprobe.tasks.probing import Phase
 from canprobe.tasks.shape import ShapeRecord
 from canprobe.touch.patch.array_calibration import NOMINAL
@@ -141,9 +140,9 @@ def _draw_trajectory(part: SubFigure, result: RunResult) -> None:
         if result.surface_map is not None and len(result.surface_map):
             shown.append("blue: recovered surface")
             add_sheet(axes, 1e3 * map_surface(result.surface_map, plane)[0], SKY, alpha=0.8, zorder=2)
-        if result.plan.scene.object is not None and result.truth:
+        if (shape := result.plan.setup.truth.object) is not None and result.truth:
             shown.append("grey: true one")
-            near = 1e3 * true_surface(true_object(result.plan.scene.object), points, plane)
+            near = 1e3 * true_surface(shape, points, plane)
             axes.plot_surface(*np.moveaxis(near, 2, 0), color=GREY, alpha=0.3, linewidth=0, shade=True, zorder=1)
     title = f"contact in the base frame\n{' · '.join(shown)}"
     box(part, axes, title, ("x (mm)", "y (mm)", "z (mm)"), elev=40, azim=azimuth)

@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.bus.disk import read_npz, whole_file, write_npz
-from canprobe.errors import UsageError, install_line
+from canprobe.errors import UsageError, install_line, regular_file
+from canprobe.results.run_files import READERS
 from canprobe.touch.surface_map import LocalPatch, SurfaceMap
 
 if TYPE_CHECKING:
@@ -78,12 +79,10 @@ def load_table(path: Path | str) -> pandas.DataFrame:
     """
     source = Path(path)
     if source.suffix == ".npz":
-        return to_frame(read_npz(source))
+        return to_frame(READERS.get(source.name, read_npz)(source))
     reader, arrow = _need("pandas", "a table"), _need("pyarrow", "Parquet")
-    if not source.exists():
-        raise UsageError(f"{source}: no such file")
     try:
-        frame: pandas.DataFrame = reader.read_parquet(source, engine="pyarrow")
+        frame: pandas.DataFrame = reader.read_parquet(regular_file(source), engine="pyarrow")
     except (OSError, arrow.ArrowException) as error:
         raise UsageError(f"{source}: expected Parquet: {error}") from error
     return frame.set_index("t_s") if "t_s" in frame else frame
@@ -109,6 +108,8 @@ def write_parquet(
 
 def _scalars(columns: Mapping[str, NDArray[Any]]) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
     """Columns with one number per row, and their units."""
+    if single := [name for name, values in columns.items() if not values.ndim]:
+        raise UsageError(f"columns of a table have a value in each row, {', '.join(single)} has one in all")
     lengths = {len(values) for values in columns.values()}
     if len(lengths) > 1:
         raise UsageError(f"columns of {', '.join(map(str, sorted(lengths)))} rows do not make one table")

@@ -16,21 +16,23 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe import __version__
 from canprobe.bus.clock_steps import RecordedBus
 from canprobe.bus.disk import write_npz, write_text
 from canprobe.bus.port import ERR_FLAG, is_bus_error
 from canprobe.cell.cell import Cell
-from canprobe.errors import UsageError, install_line
+from canprobe.errors import ResultsError, UsageError, install_line
 from canprobe.planning.make import make_plan
 from canprobe.planning.measured import MeasuredTraffic, TrafficMeter
 from canprobe.planning.model import Plan
 from canprobe.results.files import save_surface_map
+from canprobe.results.run_files import SCHEMA
 from canprobe.results.scores import ShapeScore, bound_of_scan, score_contact, score_shape
 from canprobe.scene.geometry import FILE, calibration_lines, summarise_calibration, tool_text
 from canprobe.scene.load import load_scene
 from canprobe.scene.model import Scene
 from canprobe.scene.resolve import resolve
-from canprobe.scene.setup import Touch
+from canprobe.scene.setup import Setup, Touch
 from canprobe.session.session import Session, write_scene
 from canprobe.session.target import VIRTUAL
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker
@@ -111,7 +113,6 @@ def _chosen(path: Path, syncs: Counter[str], plan: Plan, channel: str | None) ->
 # The result of a run, its summary and its files.
 
 Array = NDArray[np.float64]
-SCHEMA = 1
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -192,6 +193,7 @@ class RunResult:
         folder = self.out
         if folder is None:
             folder = Path(tempfile.mkdtemp(prefix="canprobe-view-"))
+            write_scene(self.plan, folder)
             write_files(self, folder)
         return page_of(folder)
 
@@ -280,6 +282,7 @@ def summarise(
     contact = _contact(session, record, log)
     summary = {
         "schema": SCHEMA,
+        "written_by": f"canprobe {__version__}",
         "scene": scene.name,
         "bus": scene.bus.interface,
         "seed": scene.seed,
@@ -291,7 +294,7 @@ def summarise(
         "newtons": None if session.plan.setup.array is None else session.plan.setup.array.newtons,
         "contact": contact,
         "shape": summarise_shape(
-            scene,
+            session.plan.setup,
             record.shape,
             estimates,
             _truth(session),
@@ -324,15 +327,6 @@ def tactile_columns(cell: Cell) -> dict[str, NDArray[Any]]:
 def _on_run_clock(columns: dict[str, NDArray[Any]], cell: Cell) -> dict[str, NDArray[Any]]:
     start_s = cell.start_ns * 1e-9
     return {name: column + start_s if name in ("t_s", "t_sample_s") else column for name, column in columns.items()}
-
-
-def check_clock(file: Path, log: Mapping[str, Array]) -> None:
-    """Raise UsageError for the log of an earlier canprobe, whose times count from the first SYNC: it begins at 0."""
-    if np.size(log["t_s"]) and log["t_s"][0] == 0.0:
-        raise UsageError(
-            f"{file}: expected t_s on the clock of bus.log, got times since the first SYNC, as an earlier canprobe"
-            " wrote them; run the scene again"
-        )
 
 
 def _without_nan(value: Any) -> Any:
@@ -409,7 +403,7 @@ def _rms_error(values: Array, target: float) -> float | None:
 
 
 def summarise_shape(
-    scene: Scene,
+    setup: Setup,
     tracker: ShapeTracker | None,
     estimates: dict[str, list[ShapeRecord]],
     truth: Mapping[str, Array],
@@ -420,7 +414,7 @@ def summarise_shape(
     """The section ``shape`` of ``summary.json``, of the first estimator and a table of all.
 
     Args:
-        scene: of the run.
+        setup: of the run.
         tracker: its contacts; None without a shape.
         estimates: the answers of each estimator, by name.
         truth: columns of the plant's truth, one row per SYNC; empty without a truth.
@@ -448,7 +442,7 @@ def summarise_shape(
     score = asdict(scores[method])
     score["kappa_est_per_m"] = score["kappa_est_per_m"] or shape["kappa_est_per_m"]
     shape |= {name: value for name, value in score.items() if name in names}
-    shape["cramer_rao_ratio"] = _bound_ratio(scene, tracker, scores[method], truth, sync_times)
+    shape["cramer_rao_ratio"] = _bound_ratio(setup, tracker, scores[method], truth, sync_times)
     of_run = ("kappa_true_per_m", "kappa_est_per_m")
     shape["methods"] = {
         method: {name: value for name, value in asdict(one).items() if name not in of_run}
@@ -458,7 +452,7 @@ def summarise_shape(
 
 
 def _bound_ratio(
-    scene: Scene, tracker: ShapeTracker | None, score: ShapeScore, truth: Mapping[str, Array], sync_times: Array
+    setup: Setup, tracker: ShapeTracker | None, score: ShapeScore, truth: Mapping[str, Array], sync_times: Array
 ) -> float | None:
     """Error of the online estimator over the Cramér–Rao bound of one memory at the stated noise.
 
@@ -466,17 +460,17 @@ def _bound_ratio(
     """
     from canprobe.tasks.from_plan import SIGMA_NORMAL_RAD, centroid_correlation, centroid_coupling
 
-    shape = scene.shape
+    shape = setup.shape
     if tracker is None or shape is None or score.kappa_rms_error_per_m is None or (score.patch_fraction or 0.0) > 0.5:
         return None
     bound = bound_of_scan(
         tracker.samples,
         truth,
         sync_times,
-        memory_m=shape.memory_mm * 1e-3,
+        memory_m=shape.memory,
         correlation=centroid_correlation(),
         sigma_normal=SIGMA_NORMAL_RAD,
-        coupling=centroid_coupling(resolve(scene).probe),
+        coupling=centroid_coupling(setup.probe),
     )
     return None if bound is None else score.kappa_rms_error_per_m / bound
 
@@ -520,21 +514,41 @@ def _percentiles(values_ns: Sequence[int]) -> dict[str, float | None]:
     return {"p50": p50, "p99": p99, "p999": p999, "max": float(us.max())}
 
 
+def write_columns(log: Mapping[str, Array], tactile: Mapping[str, NDArray[Any]], out: Path) -> None:
+    """Write what a run measured, ``log.npz`` and ``tactile.npz``; as `write_files`."""
+    _write_each(
+        lambda: write_npz(out / "log.npz", log),
+        lambda: write_npz(out / "tactile.npz", tactile) if tactile else None,
+    )
+
+
 def write_files(result: RunResult, out: Path) -> None:
     """Write the files of a run into ``out`` that the session has not written, without the figures.
 
     Raises:
-        ResultsError: a file cannot be written; no part of it is left.
+        ResultsError: a file cannot be written; no part of it is left, and the others are written all the same.
     """
-    write_text(out / "summary.json", json.dumps(result.summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
-    write_scene(result.plan.scene, out)
-    write_npz(out / "log.npz", result.log)
-    if result.tactile:
-        write_npz(out / "tactile.npz", result.tactile)
-    if (found := result.summary["calibration"]) is not None and (text := tool_text(found, result.plan.scene.name)):
-        write_text(out / FILE, text)
-    if result.surface_map is not None:
-        save_surface_map(result.surface_map, out / "surface.npz")
+    text = json.dumps(result.summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    found, surface_map = result.summary["calibration"], result.surface_map
+    tool = None if found is None else tool_text(found, result.plan.scene.name)
+    _write_each(
+        lambda: write_text(out / "summary.json", text),
+        lambda: write_columns(result.log, result.tactile, out),
+        lambda: write_text(out / FILE, tool) if tool is not None else None,
+        lambda: save_surface_map(surface_map, out / "surface.npz") if surface_map is not None else None,
+    )
+
+
+def _write_each(*writers: Callable[[], None]) -> None:
+    """Write file by file; one that cannot be written does not cost the others."""
+    failed = []
+    for write in writers:
+        try:
+            write()
+        except ResultsError as error:
+            failed.append(str(error))
+    if failed:
+        raise ResultsError("\n".join(failed))
 
 
 def _figure(value: float | None, unit: str, digits: int = 2) -> str:

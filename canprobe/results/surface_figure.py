@@ -18,7 +18,6 @@ from scipy.spatial import cKDTree
 from canprobe.results.picture import BLUE, FAINT, GREEN, GREY, INK, ORANGE, Part, box, legend, parts, picture
 from canprobe.results.scores import SAME_DIRECTION_RAD
 from canprobe.results.summary import RunResult
-from canprobe.scene.geometry import true_object
 from canprobe.touch.blend import REACH_M
 from canprobe.touch.consistency import LEVEL, Consistency, check_consistency
 from canprobe.touch.linear_algebra import tangent_rotation
@@ -163,12 +162,11 @@ def draw_surface(result: RunResult, path: Path) -> None:
     """Draw a run's surface map and write a PNG; nothing where there is none."""
     if result.surface_map is None or result.consistency is None or not len(result.surface_map):
         return
-    settings = result.plan.scene.object
     draw_map(
         result.surface_map,
         path,
         consistency=result.consistency,
-        shape=None if settings is None else true_object(settings),
+        shape=result.plan.setup.truth.object,
         title=result.plan.scene.title or result.plan.scene.name,
     )
 

@@ -21,7 +21,7 @@ from xml.sax.saxutils import unescape
 
 import numpy as np
 
-from canprobe.errors import PlanError
+from canprobe.errors import PlanError, regular_file
 from canprobe.robot.chain import MOST_JOINTS, Array, Chain, rotation_rpy
 from canprobe.robot.model import Body, Joint, impossible_inertia
 
@@ -29,6 +29,8 @@ CONTINUOUS_RAD = 2 * math.pi
 """Stops of a continuous joint to either side: it has none itself, but cables and the counts of a drive have."""
 LARGEST_RAD = 4 * math.pi
 """A stop of a revolute joint beyond it looks like one in degrees."""
+MOST_BYTES = 64 << 20
+"""Size of a URDF."""
 _MOVING = {"revolute", "continuous", "prismatic"}
 _DEFINITIONS = {"xacro:property", "xacro:macro", "xacro:arg"}
 _LATE_DECLARATION = re.compile(rb"\A(?P<before>(?:\s|<!--.*?-->)+)(?P<declaration><\?xml\b.*?\?>)", re.DOTALL)
@@ -188,7 +190,11 @@ def with_meshes_found(urdf: Path) -> bytes:
         found = find_mesh(urdf, unescape(match[2].decode(errors="replace"), {"&quot;": '"', "&apos;": "'"}))
         return match[0] if found is None else match[1] + found.as_uri().encode() + match[3]
 
-    return re.sub(rb"""(<mesh\b[^>]*?\bfilename\s*=\s*["'])([^"']*)(["'])""", absolute, urdf.read_bytes())
+    return re.sub(
+        rb"""(<mesh\b[^>]*?\bfilename\s*=\s*["'])([^"']*)(["'])""",
+        absolute,
+        regular_file(urdf, MOST_BYTES).read_bytes(),
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -220,7 +226,8 @@ class _Tree:
         text = str(source)
         where = "URDF text" if text.lstrip().startswith("<") else f"URDF {text}"
         try:
-            root = _parsed(text.encode() if where == "URDF text" else Path(source).read_bytes())
+            is_text = where == "URDF text"
+            root = _parsed(text.encode() if is_text else regular_file(Path(source), MOST_BYTES).read_bytes())
         except OSError as error:
             raise PlanError([f"{where}: cannot be read: {error.strerror or error}"]) from error
         except expat.ExpatError as error:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated
 
 from canprobe.scene.checks import OneOf, Range
-from canprobe.scene.load import Reader, find_file, packaged_files, read_toml, toml_value
+from canprobe.scene.load import Reader, find_file, packaged_files, read_toml, toml_value, with_writer, written_by_line
 from canprobe.touch.patch.array_calibration import (
     ArrayCalibration,
     CentroidErrors,
@@ -169,9 +169,10 @@ def load_calibration(name_or_path: str | Path) -> ArrayCalibration:
     packaged = packaged_files("calibrations")
     path = find_file(name, packaged, "calibration")
     file = path.name if name in packaged else name
+    document, file = with_writer(read_toml(path, file), file)
     reader = Reader(path.parent)
     needed = [field.name for field in dataclasses.fields(CalibrationFile)]
-    found = CalibrationFile(**reader.read(CalibrationFile, read_toml(path, file), needed))
+    found = CalibrationFile(**reader.read(CalibrationFile, document, needed))
     if not reader.problems:
         rows = found.taxels.gains
         if rows and (len({len(row) for row in rows}) > 1 or min(map(min, rows)) <= 0.0):
@@ -294,7 +295,8 @@ def dump_calibration(calibration: ArrayCalibration) -> str:
         if lines:
             sections.append("\n".join([f"[{section.name}]", *lines]) + "\n")
     newtons = "# Forces and stiffness are in nominal newtons: there was no force reference.\n" if c.nominal else ""
-    return f"# Made by `canprobe calibrate array`; see docs/calibration.md.\n{newtons}\n" + "\n".join(sections)
+    head = written_by_line()
+    return f"# Made by `canprobe calibrate array`; see docs/calibration.md.\n{newtons}{head}\n" + "\n".join(sections)
 
 
 def _value(value: object) -> str:

@@ -15,7 +15,7 @@ from canprobe.errors import SceneError
 from canprobe.robot.chain import rotation_rpy, tool_z_offset
 from canprobe.robot.tool_calibration import ToolEstimate
 from canprobe.scene.hardware import Vec3
-from canprobe.scene.load import Reader, read_toml
+from canprobe.scene.load import Reader, read_toml, with_writer, written_by_line
 from canprobe.scene.model import ObjectSettings, PlantSettings, ProbeSettings, Scene, TaskSettings
 from canprobe.scene.surface_files import object_of_file
 from canprobe.touch.objects import OBJECT_PARAMETERS, make_object
@@ -152,6 +152,7 @@ def tool_text(found: Mapping[str, Any], name: str) -> str | None:
     return (
         f"# The probe's centre on the flange, by {found['touches']} touches of a ball (scene {name}); standard\n"
         f"# deviation of x, y, z: {sigma} mm. For a scene's own [probe], or: canprobe run SCENE --tool THIS_FILE\n\n"
+        f"{written_by_line()}\n"
         f"[probe]\ncentre_offset_mm = {z:.4f}\ncentre_lateral_mm = [{x:.4f}, {y:.4f}]\n"
     )
 
@@ -168,13 +169,13 @@ def with_tool(scene: Scene, path: Path | str) -> Scene:
     Raises:
         SceneError: the file cannot be read or has other content, or the scene has no probe.
     """
-    document, reader = read_toml(Path(path), str(path)), Reader()
+    (document, file), reader = with_writer(read_toml(Path(path), str(path)), str(path)), Reader()
     table = document.get("probe")
     if set(document) != {"probe"} or not isinstance(table, dict) or set(table) != set(KEYS):
-        raise SceneError([f"{path}: expected the section [probe] with {' and '.join(KEYS)}, and nothing else"])
+        raise SceneError([f"{file}: expected the section [probe] with {' and '.join(KEYS)}, and nothing else"])
     found = reader.section(ProbeSettings, table, "probe")
     if reader.problems:
-        raise SceneError([f"{path}: {problem}" for problem in reader.problems])
+        raise SceneError([f"{file}: {problem}" for problem in reader.problems])
     if scene.probe is None:
         raise SceneError([f"{path}: scene {scene.name} has no probe that could be calibrated"])
     probe = replace(scene.probe, **{key: getattr(found, key) for key in KEYS})

@@ -19,7 +19,8 @@ from os.path import isfile  # False where the system refuses a name, as `Path.is
 from pathlib import Path
 from typing import Any
 
-from canprobe.errors import PlanError, SceneError, UsageError
+from canprobe import __version__
+from canprobe.errors import PlanError, SceneError, UsageError, regular_file
 from canprobe.robot.urdf import from_urdf, with_meshes_found
 from canprobe.scene.checks import MismatchError, Only, ScenePath, choices_of, conditions_of, convert
 from canprobe.scene.hardware import ArmSettings, CellInfo
@@ -35,6 +36,10 @@ FILE_KEYS = {"array", "calibration", "eds", "file", "urdf", "true_cell"}
 """Keys whose files a saved scene takes along."""
 SAVED_AS = "scene.toml"
 """Name of a saved scene."""
+WRITTEN_BY = "written_by"
+"""Key above the sections of a file that canprobe wrote: by which version."""
+MOST_BYTES, MOST_DEPTH = 64 << 20, 32
+"""Size of a TOML file, and how deep its tables and lists may be nested."""
 _ESCAPES = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\t": "\\t", "\r": "\\r", "\b": "\\b", "\f": "\\f"}
 
 
@@ -63,15 +68,32 @@ def _keys(section: Any) -> str:
     return lines
 
 
-def with_files_beside(scene: Scene) -> dict[str, bytes]:
-    """The files of a saved scene, by name: `SAVED_AS`, and the EDS, URDF, calibration and cell files that it names.
+def written_by_line() -> str:
+    """The first line of a file that this canprobe writes."""
+    return f"{WRITTEN_BY} = {toml_value(f'canprobe {__version__}')}\n"
 
-    A folder with these files loads as the scene, wherever the folder is moved. Packaged files are not among them. A
-    URDF that is taken along has absolute paths of its meshes.
+
+def with_writer(document: Mapping[str, Any], file: str) -> tuple[dict[str, Any], str]:
+    """A document without `WRITTEN_BY`, and what messages call its file: with its writer, where that is another one."""
+    writer = document.get(WRITTEN_BY, f"canprobe {__version__}")
+    rest = {name: value for name, value in document.items() if name != WRITTEN_BY}
+    return rest, f"{file}{written_by_other(writer)}"
+
+
+def written_by_other(writer: object) -> str:
+    """`: written by canprobe …` for messages about a file of another version; empty for one of this version."""
+    own = f"canprobe {__version__}"
+    return "" if writer == own else f": written by {writer or 'an earlier canprobe'}, this is {own}"
+
+
+def gathered(scene: Scene) -> tuple[Scene, dict[str, bytes]]:
+    """A scene that names its EDS, URDF, calibration, surface and cell files as they stand beside it, and those files.
+
+    A folder with these files, and the scene as `SAVED_AS`, loads as the scene, wherever the folder is moved. Packaged
+    files are not among them. A URDF that is taken along has absolute paths of its meshes.
 
     Raises:
-        OSError: a file cannot be read.
-        SceneError: the true cell cannot be read.
+        SceneError: a file, or the true cell, cannot be read.
     """
     taken: dict[str, Path] = {SAVED_AS: Path()}
     files: dict[str, bytes] = {}
@@ -90,9 +112,13 @@ def with_files_beside(scene: Scene) -> dict[str, bytes]:
                 name = f"{path.stem}-{number}{path.suffix}"
             names[key] = name
             if key == "true_cell":  # the plant of a true cell has no say
-                files[name] = dump_scene(moved(dataclasses.replace(read_cell(path), plant=None))).encode()
-            else:
+                cell = moved(dataclasses.replace(read_cell(path), plant=None))
+                files[name] = f"{written_by_line()}\n{dump_scene(cell)}".encode()
+                continue
+            try:
                 files[name] = with_meshes_found(path) if key == "urdf" else path.read_bytes()
+            except OSError as error:
+                raise SceneError([f"{path}: cannot be read: {error.strerror}"]) from error
         return dataclasses.replace(section, **names) if names else section
 
     def moved(whole: Any) -> Any:
@@ -104,7 +130,7 @@ def with_files_beside(scene: Scene) -> dict[str, bytes]:
         }
         return dataclasses.replace(whole, **changed)
 
-    return {SAVED_AS: dump_scene(moved(scene)).encode(), **files}
+    return moved(scene), files
 
 
 def toml_key(key: str) -> str:
@@ -164,6 +190,7 @@ def load_scene(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = 
         raise UsageError(f"scene: expected a packaged name, the path of a TOML file or a Scene, got {scene!r}")
     if overrides:
         own, file = _with_overrides(own, overrides, file), f"{file} as changed"
+        _refuse_deep(own, file)
     return _scene(own, file, folder)
 
 
@@ -196,7 +223,7 @@ def _key_path(path: str) -> list[str]:
     """The keys of a dotted path, as TOML reads it."""
     try:
         table, keys = tomllib.loads(f"{path} = 0"), []
-    except ValueError:
+    except (ValueError, RecursionError):
         raise UsageError(f"overrides: expected a key such as task.force_n, got {path!r}") from None
     while isinstance(table, dict):
         (key, table), *_ = table.items()
@@ -241,7 +268,7 @@ def _read_hardware(name_or_path: str | Path, what: str, kind: type[Any]) -> tupl
     packaged = packaged_files(f"{what}s")
     path = find_file(name, packaged, what)
     file = path.name if name in packaged else name
-    document = read_toml(path, file)
+    document, file = with_writer(read_toml(path, file), file)
     reader = Reader(path.parent)
     sections = reader.read(kind, document, (what,))
     _complain_of_names(reader, sections.get("arm"), document.get("joints"))
@@ -340,20 +367,42 @@ def read_toml(path: Path, file: str, else_what: str = "") -> dict[str, Any]:
         SceneError: it cannot be read, or is not TOML.
     """
     try:
-        return parse_toml(path.read_text(encoding="utf-8-sig"), file)  # some editors begin with a byte order mark
+        text = regular_file(path, MOST_BYTES).read_text(
+            encoding="utf-8-sig"
+        )  # some editors begin with a byte order mark
     except OSError as error:
         hint = else_what if isinstance(error, FileNotFoundError) else ""
         raise SceneError([f"{file}: cannot be read: {error.strerror}{hint}"]) from error
     except UnicodeDecodeError as error:
         raise SceneError([f"{file}: not UTF-8 text: byte {error.start} is {error.object[error.start]:#04x}"]) from error
+    return parse_toml(text, file)
 
 
 def parse_toml(text: str, file: str) -> dict[str, Any]:
     """The document in a TOML text; as `read_toml`."""
     try:
-        return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # an integer of thousands of digits is no TOMLDecodeError
+        document = tomllib.loads(text)
+    except ValueError as error:  # an integer of thousands of digits is no TOMLDecodeError
         raise SceneError([f"{file}: not valid TOML: {error}"]) from error
+    except RecursionError:
+        raise _too_deep(file) from None
+    _refuse_deep(document, file)
+    return document
+
+
+def _refuse_deep(document: Mapping[str, Any], file: str) -> None:
+    """Raise SceneError for tables and lists in each other that no scene has; others go through them by recursion."""
+    values: list[Any] = [document]
+    for _ in range(MOST_DEPTH):
+        inner = [value.values() if isinstance(value, Mapping) else value for value in values]
+        values = [value for part in inner for value in part if isinstance(value, Mapping | list | tuple)]
+        if not values:
+            return
+    raise _too_deep(file)
+
+
+def _too_deep(file: str) -> SceneError:
+    return SceneError([f"{file}: expected tables and lists of at most {MOST_DEPTH} levels, got more of them"])
 
 
 def _scene(own: Mapping[str, Any], file: str, folder: Path | None) -> Scene:
@@ -361,6 +410,7 @@ def _scene(own: Mapping[str, Any], file: str, folder: Path | None) -> Scene:
 
     Everything is checked together.
     """
+    own, file = with_writer(own, file)
     if _are_tables(own.get("cell")) and not {"scene", "task"} & set(own):
         own = _free_scene(own)
     task = own.get("task")

@@ -16,7 +16,7 @@ from canprobe.scene.arms import Bodies, arm_model, homing_of, joint_compliance, 
 from canprobe.scene.calibrations import load_calibration
 from canprobe.scene.geometry import T_flange_probe, expected_ball, scan_axes, true_object
 from canprobe.scene.hardware import EmulateSettings
-from canprobe.scene.load import read_cell
+from canprobe.scene.load import gathered, read_cell
 from canprobe.scene.model import (
     BridgeSettings,
     LimitSettings,
@@ -72,7 +72,9 @@ def resolve(scene: Scene) -> Setup:
 
     Raises:
         PlanError: the scene describes an object without a surface.
+        SceneError: a file that it names cannot be read.
     """
+    saved, files = gathered(scene)
     arm, bodies = _arm(scene)
     settings = scene.probe or ProbeSettings()
     array = _array(scene, settings.radius_mm * MM, settings.stiffness_n_m3)
@@ -85,6 +87,8 @@ def resolve(scene: Scene) -> Setup:
     probe = Probe(T, radius, stiffness, settings.mass_kg)
     return Setup(
         scene=scene,
+        saved=saved,
+        files=files,
         name=scene.name,
         title=scene.title,
         seed=scene.seed,

@@ -12,7 +12,7 @@ scene whose values are SI already (`[bus]`, `[bring_up]`, `[bridge]`) are taken 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -466,6 +466,8 @@ class Setup:
 
     Attributes:
         scene: the user's words, for who writes, sends or changes them. Nobody who plans, drives or emulates reads it.
+        saved, files: the scene as it names its files beside it, and their contents by name, as they were read for this
+            setup. Who writes the scene, or hands it to another process, takes them, whatever became of the originals.
         name, title, seed: of the scene.
         figures: whether its run is drawn.
         bus: interface, channel, bit rates and what a lockstep bus is like.
@@ -477,6 +479,8 @@ class Setup:
     """
 
     scene: Scene
+    saved: Scene
+    files: Mapping[str, bytes]
     name: str
     title: str
     seed: int

@@ -10,7 +10,7 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.errors import UsageError, install_line
+from canprobe.errors import UsageError, install_line, regular_file
 from canprobe.scene.model import ObjectSettings
 from canprobe.touch.heights import Heights
 from canprobe.touch.mesh_fit import Fit, fit_mesh
@@ -46,7 +46,7 @@ def object_of_file(settings: ObjectSettings, T_base_object: Array) -> PlacedShap
     if path.suffix.lower() not in MESHES:
         raise ValueError(f"file: expected a mesh in a file of {', '.join(MESHES)}, got {path.name}")
     try:
-        changed_ns = path.stat().st_mtime_ns
+        changed_ns = regular_file(path).stat().st_mtime_ns
     except OSError as error:
         raise ValueError(f"file: {path}: cannot be read: {error.strerror}") from error
     spacing = (settings.spacing_mm or _SPACING_MM) * _MM
@@ -142,12 +142,12 @@ def _grid(path: Path) -> tuple[Array, float | None]:
     _refuse_other_content(path)
     try:
         if kind in (".npy", ".npz"):
-            with path.open("rb") as opened:  # numpy leaves a file open that it cannot read
+            with regular_file(path).open("rb") as opened:  # numpy leaves a file open that it cannot read
                 read = np.load(opened)
                 if isinstance(read, np.lib.npyio.NpzFile):
                     return _of_archive({name: read[name] for name in read.files})
                 return np.asarray(read, dtype=np.float64), None
-        text = path.read_text(encoding="utf-8-sig").splitlines()
+        text = regular_file(path).read_text(encoding="utf-8-sig").splitlines()
         rows = [line.partition("#")[0] for line in text]
         if any(";" in row for row in rows):  # then a comma is a decimal one
             rows = [row.replace(",", ".").replace(";", " ") for row in rows]
@@ -155,7 +155,7 @@ def _grid(path: Path) -> tuple[Array, float | None]:
         return np.array([[float(word) for word in line] for line in lines if line]), None
     except OSError as error:
         raise ValueError(f"file: {path}: cannot be read: {error.strerror or error}") from error
-    except (ValueError, TypeError, EOFError, BadZipFile) as error:
+    except (ValueError, TypeError, EOFError, BadZipFile, MemoryError) as error:  # a header may claim terabytes
         raise ValueError(f"file: {path.name} is no grid of numbers: {error}") from error
 
 

@@ -218,6 +218,8 @@ def calibrate(
             notes.append(f"the {visit.known.name} with the probe turned: the last joint cannot turn by half a turn")
             continue
         planned.append((number, visit, _plan(replace(there, object=visit.known.settings(at)), visit)))
+    array = resolve(scene).array  # as it is now: its files may change while it is touched
+    assert array is not None
     dwells: list[Dwell] = []
     unloaded: list[NDArray[np.uint8]] = []
     placed: KnownObject | None = None
@@ -231,14 +233,12 @@ def calibrate(
         found, rest = touch_object(plan, visit, folder, say, ask if not emulated else None)
         dwells += found
         unloaded += rest
-    setup = resolve(scene)
-    assert setup.array is not None
-    who = f"{scene.sensor.eds.rsplit('/', 1)[-1]}, node {setup.array.node_id}"
+    who = f"{scene.sensor.eds.rsplit('/', 1)[-1]}, node {array.node_id}"
     serial = f", serial number {scene.sensor.serial_number}" if scene.sensor.serial_number is not None else ""
     moved = f"{'emulated ' if scene.arm.emulated else ''}cell {Path(request.cell).stem}"
     fit = calibrate_array(
         dwells,
-        pad=setup.array.pad,
+        pad=array.pad,
         reference=request.reference,
         reference_sigma=request.sigma,
         array=f"{'emulated ' if emulated else ''}{who}{serial}" + (f", seed {request.seed}" if emulated else ""),
@@ -246,7 +246,7 @@ def calibrate(
         made_on=f"{moved}; plane, ball of {1e3 * request.ball_radius:g} mm, rod of {1e3 * request.rod_radius:g} mm",
         own_gains=request.own_gains,
     )
-    return Calibrated(fit, *_without_load(unloaded, setup.array.rate_hz), tuple(notes))
+    return Calibrated(fit, *_without_load(unloaded, array.rate_hz), tuple(notes))
 
 
 def _scene(request: Request) -> Scene:

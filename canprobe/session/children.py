@@ -20,15 +20,13 @@ from typing import IO, Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.bus.disk import write_text
 from canprobe.bus.port import MonotonicClock, Port, TimedFrame
 from canprobe.cell.controller import Controller
 from canprobe.errors import BusError, NodeError
 from canprobe.planning.bridges import check_bridges
 from canprobe.planning.model import Plan
 from canprobe.protocol.frames import HEARTBEAT_BASE
-from canprobe.scene.load import dump_scene
-from canprobe.scene.model import Scene
+from canprobe.scene.load import SAVED_AS
 from canprobe.tasks.untouched import HoldTask
 
 # The emulated nodes of a run in a process of their own: started, awaited, and ended on every way out.
@@ -47,16 +45,17 @@ def with_our_imports() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": os.pathsep.join(os.path.abspath(path) for path in sys.path)}
 
 
-def end_with_parent(parent: int) -> None:
-    """In the child: get SIGTERM when the parent is killed. Linux only, and only a second line of defence.
+def end_with_parent(parent: int, number: int = signal.SIGTERM) -> None:
+    """In the child: get a signal when the parent is killed. Linux only, and only a second line of defence.
 
     Args:
-        parent: its process id; if it has gone already, this process stops at once.
+        parent: its process id; if it has gone already, this process gets the signal at once.
+        number: of the signal.
     """
     with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
         if os.getppid() != parent:
-            os.kill(os.getpid(), signal.SIGTERM)
+            os.kill(os.getpid(), number)
 
 
 class EmulatorChild:
@@ -65,7 +64,7 @@ class EmulatorChild:
     It runs in another session, so that Ctrl-C reaches only the master, which stops the drives before their process.
 
     Args:
-        scene: the resolved scene.
+        plan: whose nodes; the process reads the files of its scene as they were read for the plan.
         out: folder for ``truth.npz``; None uses a temporary one.
         channels: the buses of its nodes.
         truth: whether what is true is recorded, which grows with time.
@@ -76,9 +75,10 @@ class EmulatorChild:
     """
 
     def __init__(
-        self, scene: Scene, out: Path | None, channels: Sequence[str], *, truth: bool = True, origin_ns: int = 0
+        self, plan: Plan, out: Path | None, channels: Sequence[str], *, truth: bool = True, origin_ns: int = 0
     ) -> None:
-        self._scene = scene
+        self._plan = plan
+        self._scene = plan.scene
         self._channels = channels
         self._folder = Path(tempfile.mkdtemp(prefix="canprobe-"))
         self._wants_truth = truth
@@ -92,11 +92,11 @@ class EmulatorChild:
 
     def start(self) -> None:
         """Start the process."""
-        scene_file = self._folder / "scene.toml"
-        write_text(scene_file, dump_scene(self._scene))
+        for name, content in self._plan.files.items():
+            (self._folder / name).write_bytes(content)
         bus, nodes = self._scene.bus, self._scene.emulated_node_ids
         command = [
-            *(sys.executable, "-P", "-m", "canprobe", "emulate", str(scene_file)),
+            *(sys.executable, "-P", "-m", "canprobe", "emulate", str(self._folder / SAVED_AS)),
             *("--bus", bus.interface, "--bitrate", str(bus.bitrate)),
             *(word for channel in self._channels for word in ("--channel", f"{channel}={channel}")),
             *("--parent", str(os.getpid())),

@@ -11,9 +11,9 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from canprobe.bus.disk import write_npz
+from canprobe.bus.disk import make_folder, write_npz
 from canprobe.bus.port import MonotonicClock
-from canprobe.errors import NodeError, UsageError
+from canprobe.errors import NodeError, ResultsError, UsageError
 from canprobe.protocol.frames import UNCONFIGURED
 from canprobe.scene.model import Scene
 from canprobe.session.links import Expected, check_links, data_bitrate
@@ -57,7 +57,7 @@ def emulate(
         UsageError: the scene does not fit, or a file of `store_folder` is not of its node.
         InterfaceError: no such interface.
         NodeError: somebody on the bus has one of the node ids already.
-        OSError: `truth_path` or `store_folder` cannot be written; raised before anything is served.
+        ResultsError: `truth_path` or `store_folder` cannot be written; raised before anything is served.
     """
     from canprobe.emulator.world import make_world
     from canprobe.planning.make import make_plan
@@ -129,7 +129,7 @@ def emulate_eds(
             not of its node.
         InterfaceError: no such interface.
         NodeError: somebody on the bus has one of the node ids already.
-        OSError: `store_folder` cannot be written.
+        ResultsError: `store_folder` cannot be written.
     """
     from canprobe.eds.packaged import check_eds
     from canprobe.emulator.world import make_eds_node
@@ -160,11 +160,11 @@ def emulate_eds(
 def _make_places(truth_path: Path | None, store_folder: Path | None) -> None:
     """Make the folders of the files, so that a place that cannot be written fails at the beginning."""
     if store_folder is not None:
-        store_folder.mkdir(parents=True, exist_ok=True)
+        make_folder(store_folder)
     if truth_path is not None:
-        truth_path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(truth_path.parent)
         if truth_path.is_dir():
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(truth_path))
+            raise ResultsError(f"{truth_path}: cannot be written: {os.strerror(errno.EISDIR)}")
 
 
 @contextlib.contextmanager

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.bus.disk import CandumpWriter, RecordingPort, whole_file, write_npz
+from canprobe.bus.disk import CandumpWriter, RecordingPort, make_folder, whole_file, write_npz, writing
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.bus.port import (
     Clock,
@@ -43,7 +43,6 @@ from canprobe.planning.model import Plan
 from canprobe.planning.traffic import exact_frame_bits
 from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits, exact_bits
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE
-from canprobe.scene.load import with_files_beside
 from canprobe.scene.model import BridgeSettings, Scene
 from canprobe.scene.resolve import resolve
 from canprobe.session.links import check_links, data_bitrate, expected_of, need_controllers
@@ -176,13 +175,13 @@ def with_bridges(scene: Scene, names: Sequence[str]) -> Scene:
     return replace(scene, bridge=replace(known, use=use))
 
 
-def write_scene(scene: Scene, folder: Path) -> None:
-    """Write `scene.toml` into a folder, with the EDS, URDF and cell files that it names beside it.
+def write_scene(plan: Plan, folder: Path) -> None:
+    """Write `scene.toml` into a folder, with the files that it names beside it, as they were read for the plan.
 
     Raises:
         ResultsError: a file cannot be written; no part of it is left.
     """
-    for name, content in reversed(with_files_beside(scene).items()):
+    for name, content in reversed(plan.files.items()):
         with whole_file(folder / name) as part:
             part.write_bytes(content)
 
@@ -368,11 +367,11 @@ class Session:
 
     def _make_folder(self, out: Path) -> None:
         """The run's folder, with its scene and without what an earlier run left there."""
-        out.mkdir(parents=True, exist_ok=True)  # only now: where no bus opens nothing is left behind
+        make_folder(out)  # only now: where no bus opens nothing is left behind
         for name in LEFT_BY_RUNS:
-            (out / name).unlink(missing_ok=True)
-        with contextlib.suppress(CanprobeError):  # it is written again at the end, and a failure reported then
-            write_scene(self.scene, out)
+            with writing(out / name):
+                (out / name).unlink(missing_ok=True)
+        write_scene(self.plan, out)
 
     def _writer(self, channel: str) -> Write:
         """What a bus is recorded with: its traffic is counted, written to the log and shown to the observers."""
@@ -384,7 +383,7 @@ class Session:
         write: Write = self.traffic[channel].write
         if self.out is not None:
             if self._candump is None:
-                self.out.mkdir(parents=True, exist_ok=True)
+                make_folder(self.out)
                 self._candump = self._stack.enter_context(CandumpWriter(self.out / "bus.log", channel, self.origin_ns))
                 self._make_folder(self.out)
             write = self._candump.on(channel, self.traffic[channel].take)
@@ -423,7 +422,8 @@ class Session:
         self._need_emulated("without a bus there are")
         if self.out is not None:
             self._make_folder(self.out)
-            (self.out / "bus.log").unlink(missing_ok=True)
+            with writing(self.out / "bus.log"):
+                (self.out / "bus.log").unlink(missing_ok=True)
         self._stack.callback(self._keep_truth)
         self._direct = partial(DirectCycle, world=self.world)
         clock = VirtualClock()
@@ -485,7 +485,7 @@ class Session:
             self.cell.listen()  # they would boot beside those of another master
             self._say("start the emulated nodes")
             channels = list(self.plan.emulated_channels)
-            child = EmulatorChild(self.scene, self.out, channels, truth=self.keeps_all, origin_ns=self.origin_ns)
+            child = EmulatorChild(self.plan, self.out, channels, truth=self.keeps_all, origin_ns=self.origin_ns)
             self._stack.callback(self._end_child, child)
             child.start()
         self._say("rehearse in lockstep")

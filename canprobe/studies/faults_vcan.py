@@ -27,9 +27,11 @@ from canprobe.bus.network import PumpedNetwork, hold_dialogues, upload
 from canprobe.bus.port import MonotonicClock, Port
 from canprobe.bus.socketcan import check_interface
 from canprobe.errors import CanprobeError, InterfaceError
+from canprobe.planning.make import make_plan
 from canprobe.protocol.cia402 import POWERED_STATES, DriveState, state_of
 from canprobe.scene.load import dump_scene, load_scene
 from canprobe.scene.model import Scene
+from canprobe.scene.resolve import resolve
 from canprobe.session.children import EmulatorChild, with_our_imports
 from canprobe.studies.faults import draw_ends, scenario_scene
 from canprobe.studies.harness import CHANNEL, Column, Row, StudyResult, measuring_facts
@@ -128,7 +130,7 @@ def served_scene() -> Scene:
 def row_of(case: ProcessCase) -> Row:
     """Bring the cell up, let the fault happen, and look at what is left: the row of the case."""
     with tempfile.TemporaryDirectory(prefix="canprobe-faults-") as folder:
-        run = _Run(case, EmulatorChild(served_scene(), None, (CHANNEL,)), Path(folder))
+        run = _Run(case, EmulatorChild(make_plan(resolve(served_scene())), None, (CHANNEL,)), Path(folder))
         try:
             status, ended_s, drives = run.carry_out()
         finally:

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import canprobe
-from canprobe.bus.disk import whole_file, write_text
+from canprobe.bus.disk import make_folder, whole_file, write_text, writing
 from canprobe.eds.packaged import eds_file
 from canprobe.errors import ResultsError, StudyError
 from canprobe.scene.model import Scene
@@ -145,15 +145,17 @@ class CellStore:
         damaged: number of lines that were left out because they were cut short or changed.
 
     Raises:
+        ResultsError: the folder cannot be written.
         StudyError: another process has it open.
     """
 
     def __init__(self, folder: Path, *, fresh: bool = False) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         self.path = folder / "cells.jsonl"
         self.damaged = 0
         self._answers: dict[str, str] = {}
-        self._file: IO[str] = self.path.open("a+", encoding="utf-8", errors="replace")
+        with writing(self.path):
+            self._file: IO[str] = self.path.open("a+", encoding="utf-8", errors="replace")
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -294,7 +296,7 @@ def write_study(result: StudyResult, out: Path) -> list[Path]:
     Raises:
         ResultsError: one cannot be written.
     """
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     paths = [out / f"{result.name}.{end}" for end in ("csv", "txt", "json")]
     keys = list(dict.fromkeys(key for row in result.rows for key in row))
     with whole_file(paths[0]) as part, part.open("w", newline="", encoding="utf-8") as file:

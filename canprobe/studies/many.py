@@ -5,21 +5,23 @@ from __future__ import annotations
 import hashlib
 import html
 import importlib.util
+import operator
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, SupportsIndex, TypeGuard
 
 import numpy as np
 
 import canprobe
 from canprobe.api import run
+from canprobe.bus.disk import make_folder, whole_file
 from canprobe.errors import CanprobeError, SafetyStop, UsageError, install_line
 from canprobe.results.files import unit_of
 from canprobe.results.summary import RunResult
-from canprobe.scene.load import SAVED_AS, dump_scene, load_scene, parse_scene, with_files_beside
+from canprobe.scene.load import dump_scene, gathered, load_scene, parse_scene
 from canprobe.scene.model import Scene
 from canprobe.session.session import Say, quiet
 from canprobe.session.target import VIRTUAL, Target
@@ -91,7 +93,7 @@ def run_many(
     scene: Scene | str | Path,
     vary: Mapping[str, Sequence[Any]] | None = None,
     *,
-    seeds: int | Iterable[int] | None = None,
+    seeds: SupportsIndex | Iterable[SupportsIndex] | None = None,
     bus: str | None = None,
     duration_s: float | None = None,
     workers: int | str | None = None,
@@ -105,7 +107,8 @@ def run_many(
     """Run every combination of values, with every seed.
 
     Finished runs are kept in ``out``: the same call computes what is missing, after an interrupt or a crash too. Runs
-    of another canprobe are computed again. A run that fails is a row with its reason.
+    of another canprobe are computed again. A run that fails is a row with its reason. Files that the scene names are
+    copied into ``out`` before the first run, and all runs use the copies.
 
     Args:
         scene: as for `canprobe.run`.
@@ -128,7 +131,8 @@ def run_many(
         All runs, those that were finished before included.
 
     Raises:
-        UsageError: a combination has mistakes, or the bus is a real one; nothing was started.
+        UsageError: a combination has mistakes, a list is empty, or the bus is a real one; nothing was started.
+        ResultsError: ``out`` cannot be written.
         StudyError: a worker was killed, no scheduler answers, or another process uses ``out``.
     """
     given = {} if duration_s is None else {"task.duration_s": duration_s}
@@ -137,14 +141,15 @@ def run_many(
     if (name := base.bus.interface) not in VIRTUAL:
         raise UsageError(f'run_many: runs share no bus: expected bus="direct" or "lockstep", got "{name}"')
     keys, combinations = _combinations(vary or {})
-    cases, rows = [], []
-    for values in combinations:
-        changed = load_scene(base, dict(zip(keys, values, strict=True)))
-        text, files = dump_scene(changed), _digest(changed)
-        for seed in _seeds(base, seeds):
-            cases.append(Case(text, files, seed, tuple(series), float(every_ms)))
-            rows.append({**dict(zip(keys, values, strict=True)), "seed": seed})
+    wanted = _seeds(base, seeds)
+    changes = [dict(zip(keys, values, strict=True)) for values in combinations]
+    scenes = [load_scene(base, change) for change in changes]  # all are checked before anything is written
     folder = Path(out) if out is not None else Path("runs") / f"many-{base.name}"
+    cases, rows = [], []
+    for change, changed in zip(changes, scenes, strict=True):
+        text, digest = _with_own_files(changed, folder)
+        cases += [Case(text, digest, seed, tuple(series), float(every_ms)) for seed in wanted]
+        rows += [{**change, "seed": seed} for seed in wanted]
     where: dict[str, Any] = {"dask": workers} if isinstance(workers, str) else {"workers": workers}
     bar = Report().bar(".0f runs") if progress else None
     with open_sweep(folder, fresh=fresh, say=say, progress=bar, **where) as sweep:
@@ -154,22 +159,46 @@ def run_many(
 
 def _combinations(vary: Mapping[str, Sequence[Any]]) -> tuple[list[str], list[tuple[Any, ...]]]:
     for key, values in vary.items():
-        if isinstance(values, str | Mapping) or not isinstance(values, Iterable):
+        if not _is_list(values):
             raise UsageError(f"vary: {key}: expected a list of values, got {values!r}")
     plain = [[value.item() if isinstance(value, np.generic) else value for value in values] for values in vary.values()]
+    for key, values in zip(vary, plain, strict=True):
+        if not values:
+            raise UsageError(f"vary: {key}: expected at least one value, got an empty list")
     return list(vary), list(product(*plain))
 
 
-def _seeds(scene: Scene, seeds: int | Iterable[int] | None) -> list[int]:
+def _is_list(values: object) -> TypeGuard[Iterable[Any]]:
+    """Whether it has elements; an array of numpy without dimensions has none."""
+    return (
+        isinstance(values, Iterable) and not isinstance(values, str | Mapping) and getattr(values, "shape", None) != ()
+    )
+
+
+def _seeds(scene: Scene, seeds: SupportsIndex | Iterable[SupportsIndex] | None) -> list[int]:
     if seeds is None:
         return [scene.seed]
-    wanted = range(seeds) if isinstance(seeds, int) else list(seeds)
+    try:
+        wanted = list(map(operator.index, seeds if isinstance(seeds, Iterable) else range(operator.index(seeds))))
+    except TypeError:
+        raise UsageError(f"seeds: expected how many, or a list of integers, got {seeds!r}") from None
+    if not wanted:
+        raise UsageError(f"seeds: expected at least one, got {seeds!r}")
     return [load_scene(scene, {"scene.seed": seed}).seed for seed in wanted]
 
 
-def _digest(scene: Scene) -> str:
-    files = sorted((name, content) for name, content in with_files_beside(scene).items() if name != SAVED_AS)
-    return hashlib.sha256(b"".join(name.encode() + content for name, content in files)).hexdigest()[:16]
+def _with_own_files(scene: Scene, folder: Path) -> tuple[str, str]:
+    """The scene as TOML that names copies of its files in a folder, and the digest of their contents."""
+    saved, files = gathered(scene)
+    digest = hashlib.sha256(b"".join(name.encode() + files[name] for name in sorted(files))).hexdigest()[:16]
+    if not files:
+        return dump_scene(scene), digest
+    copies = folder / f"files-{digest}"
+    make_folder(copies)
+    for name, content in files.items():
+        with whole_file(copies / name) as part:
+            part.write_bytes(content)
+    return dump_scene(parse_scene(dump_scene(saved), folder=copies)), digest
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

@@ -234,7 +234,7 @@ class Hold(Controller):
 def served(child: EmulatorChild | None = None) -> Iterator[None]:
     """The nodes of `cylinder` in a child process; they take rates and mappings from the master."""
     scene = _scene()
-    child = child or EmulatorChild(scene, None, (CHANNEL,))
+    child = child or EmulatorChild(make_plan(resolve(scene)), None, (CHANNEL,))
     port = open_port("socketcan", CHANNEL, scene.bus.bitrate, MonotonicClock())
     try:
         child.start()

@@ -16,8 +16,10 @@ import numpy as np
 
 from canprobe.bus.socketcan import check_interface
 from canprobe.cell.controller import Command, Controller, Measurement
+from canprobe.planning.make import make_plan
 from canprobe.results.picture import BLUE, ORANGE, legend, parts, picture
 from canprobe.scene.load import load_scene
+from canprobe.scene.resolve import resolve
 from canprobe.session.children import EmulatorChild
 from canprobe.session.session import Session
 from canprobe.session.target import Target
@@ -99,7 +101,7 @@ def soak(seconds: float) -> list[Row]:
     """Hold the cell; a sample every sixtieth of the time."""
     scene = load_scene("cylinder")
     scene = Target.over(scene, "socketcan", CHANNEL).applied_to(scene)
-    child = EmulatorChild(scene, None, (CHANNEL,), truth=False)
+    child = EmulatorChild(make_plan(resolve(scene)), None, (CHANNEL,), truth=False)
     with served(child):
         session = Session(with_real_nodes(patient(scene)), rows_kept=ROWS_OF_UP)
         soaker = Soaker(session, child.pid, seconds)

@@ -75,7 +75,7 @@ def process_pool(workers: int | None = None) -> Iterator[Executor]:
         workers or len(os.sched_getaffinity(0)),
         multiprocessing.get_context("spawn"),
         initializer=end_with_parent,
-        initargs=(os.getpid(),),
+        initargs=(os.getpid(), signal.SIGKILL),  # nothing in a worker moves, and whatever it does cannot ignore that
     )
     try:
         with _one_blas_thread():  # workers start when cells are submitted

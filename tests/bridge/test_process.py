@@ -16,7 +16,7 @@ import canprobe
 from canprobe.bridge import process as process_module
 from canprobe.bridge.process import BridgeProcess
 from canprobe.cell.cycle import Observation
-from canprobe.errors import UsageError
+from canprobe.errors import ResultsError
 from canprobe.scene.load import dump_scene, parse_scene
 from canprobe.session.session import Session
 from canprobe.tasks.from_plan import Request
@@ -113,7 +113,7 @@ def test_a_cell_that_vanishes_leaves_a_whole_file(bridge, tmp_path):
 def test_one_that_cannot_begin_stops_the_run_before_anything_is_sent(tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("")
-    with pytest.raises(UsageError, match=r"bridge mcap: .*(Not a directory|File exists)"):
+    with pytest.raises(ResultsError, match=r"bridge mcap: .*(Not a directory|File exists)"):
         canprobe.run(canprobe.load_scene("free"), out=blocked / "run", bridge=("mcap",), duration_s=0.1)
 
 

@@ -297,7 +297,7 @@ ROWS = {"t_s": np.arange(0.5, 3.0)}
         ("log.npz", None, r"no log\.npz in this folder; expected one that `canprobe run --out DIR` wrote"),
         ("scene.toml", None, r"no scene\.toml in this folder"),
         ("log.npz", b"no zip", r"log\.npz: expected the log of a run; cannot be read"),
-        ("log.npz", {"q_rad": np.zeros((3, 6))}, r"log\.npz: expected a column 't_s'"),
+        ("log.npz", {"q_rad": np.zeros((3, 6))}, r"log\.npz: expected the columns of a run, got none called t_s"),
         ("log.npz", {**ROWS, "q_rad": np.zeros((3, 5))}, r"q_rad: expected floats of shape \(3, 6\), got .*\(3, 5\)"),
         (
             "log.npz",
@@ -305,7 +305,11 @@ ROWS = {"t_s": np.arange(0.5, 3.0)}
             r"log\.npz: expected t_s on the clock of bus\.log, .* run the scene again",
         ),
         ("log.npz", {**ROWS, "force_n": np.array(["a"] * 3)}, r"force_n: expected floats of shape \(3,\), got <U1"),
-        ("summary.json", b'{"schema": 99}', r"summary\.json: expected schema 1, got 99; run the scene again"),
+        (
+            "summary.json",
+            b'{"schema": 99}',
+            r"json: written by an earlier canprobe, .*: expected schema 1, got 99; run the scene",
+        ),
         ("summary.json", b"{", r"summary\.json: expected the summary of a run; cannot be read"),
     ],
 )

@@ -18,6 +18,7 @@ from canprobe.bus.disk import (
     CandumpReader,
     CandumpWriter,
     RecordingPort,
+    make_folder,
     read_candump,
     read_npz,
     whole_file,
@@ -266,9 +267,16 @@ def test_a_file_is_written_whole_or_not_at_all(error, older, tmp_path):
     assert [(file, file.read_bytes()) for file in tmp_path.iterdir()] == [(path, WHOLE_TEXT)] * older
 
 
-def test_where_no_file_can_be_is_wrong_usage(tmp_path):
-    with pytest.raises(UsageError, match=r"none/a\.txt: cannot be written: No such file or directory"):
+def test_where_no_file_can_be_it_is_named(tmp_path):
+    with pytest.raises(ResultsError, match=r"none/a\.txt: cannot be written: No such file or directory"):
         write_text(tmp_path / "none" / "a.txt", "")
+    (tmp_path / "way").write_text("")
+    with pytest.raises(ResultsError, match=r"way/in/it: cannot be written: Not a directory"):
+        make_folder(tmp_path / "way" / "in" / "it")
+    with pytest.raises(ResultsError, match=r"way: cannot be written: File exists"):
+        make_folder(tmp_path / "way")
+    with pytest.raises(ResultsError, match=r": cannot be written: Is a directory"):
+        CandumpWriter(tmp_path, "can0")
 
 
 def test_a_block_that_writes_nothing_changes_nothing(tmp_path):

@@ -5,6 +5,7 @@ Each case is a process of its own; nothing here needs a CAN interface.
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from waiting import wait_for_size
 
 from canprobe.bus.disk import read_candump
 from canprobe.bus.socketcan import has_socketcan
+from canprobe.cli import main
 from canprobe.protocol.cia402 import POWERED_STATES, state_of
 
 ROOT = Path(__file__).parents[2]
@@ -187,8 +189,73 @@ def test_wrong_use(words, text, tmp_path):
 
 def test_a_folder_that_cannot_be_made(tmp_path):
     (tmp_path / "file").write_text("")
-    (line,) = lines_of(tmp_path, 2, "run", "press", "--out", "file/results")
-    assert line == "canprobe: file/results: Not a directory"
+    (line,) = lines_of(tmp_path, 3, "run", "press", "--out", "file/results")
+    assert line == "canprobe: file/results: cannot be written: Not a directory"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("run", "listen", "--out", "file"),
+        ("run", "listen", "--bus", "direct", "--out", "file/x"),
+        ("plan", "press", "--export", "dcf", "--out", "file/x"),
+        ("plan", "press", "--export", "dbc", "--out", "file"),
+        ("plan", "press", "--figure", "file/x.png"),
+        ("view", "listen", "--bus", "direct", "--html", "x.html", "--out", "file/x"),
+        ("init", "file/x"),
+        ("init", "file"),
+        ("study", "bound", "--quick", "--out", "file/x"),
+        ("emulate", "press", "--bus", "virtual", "--channel", "x", "--truth", "file/x.npz"),
+        ("emulate", "press", "--bus", "virtual", "--channel", "x", "--truth", "folder"),
+        ("emulate", "press", "--bus", "virtual", "--channel", "x", "--store", "file"),
+    ],
+)
+def test_every_output_that_cannot_be_written_has_the_same_status(words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("")
+    (tmp_path / "folder").mkdir()
+    assert main(words) == 3
+    assert re.fullmatch(r"canprobe: (file|folder)\S*: cannot be written: [A-Z][a-z ]+\n", capsys.readouterr().err)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("plan", "/dev/zero"),
+        ("plan", "cylinder", "--cell", "/dev/zero"),
+        ("plan", "cylinder", "--set", "sensor.array=/dev/zero"),
+        ("plan", "cylinder", "--set", "sensor.calibration=/dev/zero"),
+        ("plan", "cylinder", "--set", "sensor.eds=/dev/zero"),
+        ("plan", "cylinder", "--set", "arm.urdf=/dev/zero"),
+        ("plan", "relief", "--set", "object.file=endless.csv"),
+        ("plan", "cylinder", "--measured", "/dev/zero"),
+        ("run", "cylinder", "--tool", "/dev/zero"),
+        ("replay", "/dev/zero", "--scene", "cylinder"),
+        ("emulate", "--bus-yml", "/dev/zero", "--channel", "vcan0"),
+        ("emulate", "--eds", "/dev/zero", "--node-id", "3", "--channel", "vcan0"),
+        ("eds", "check", "/dev/zero"),
+        ("init", "new", "--urdf", "/dev/zero"),
+    ],
+)
+def test_an_input_without_an_end_is_refused(words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("endless.csv")
+    assert main(words) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "expected a regular file, got a device or a pipe" in line or "no such file" in line
+
+
+def test_brackets_without_an_end(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["plan", "press", "--set", f"task.force_n={'[' * 500}"]) == 2
+    assert "argument --set: expected KEY=VALUE, got one of too many brackets" in capsys.readouterr().err
+    for text in ("[" * 500, "[" * 5000, f"{'[' * 100}{']' * 100}", f"{'{a = ' * 100}1{'}' * 100}"):
+        (tmp_path / "deep.toml").write_text(f"x = {text}")
+        assert main(["plan", "./deep.toml"]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line == "canprobe: ./deep.toml: expected tables and lists of at most 32 levels, got more of them"
+    assert main(["plan", "press", "--set", f"{'.'.join('a' * 100)}=1"]) == 2
+    assert "press.toml as changed: expected tables and lists of at most 32" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -256,9 +323,9 @@ def test_closed_standard_streams(words, status, out, tmp_path):
 def test_truth_and_store_that_have_no_place_are_told_before_anything_is_served(tmp_path):
     (tmp_path / "file").write_text("")
     emulate = ("emulate", "press", "--bus", "virtual", "--channel", "x")
-    (line,) = lines_of(tmp_path, 2, *emulate, "--truth", ".")
-    assert line == "canprobe: .: Is a directory"
-    (line,) = lines_of(tmp_path, 2, *emulate, "--store", "file")
-    assert line == "canprobe: file: File exists"
-    (line,) = lines_of(tmp_path, 2, *emulate, "--truth", "file/truth.npz")
+    (line,) = lines_of(tmp_path, 3, *emulate, "--truth", ".")
+    assert line == "canprobe: .: cannot be written: Is a directory"
+    (line,) = lines_of(tmp_path, 3, *emulate, "--store", "file")
+    assert line == "canprobe: file: cannot be written: File exists"
+    (line,) = lines_of(tmp_path, 3, *emulate, "--truth", "file/truth.npz")
     assert line.startswith("canprobe: file")

@@ -192,7 +192,7 @@ def test_one_bridge_may_be_named_as_it_is(free, tmp_path):
     assert (tmp_path / "run.mcap").stat().st_size > 0
 
 
-@pytest.mark.parametrize("name", ["log.npz", "summary.json", "scene.toml"])
+@pytest.mark.parametrize("name", ["log.npz", "summary.json"])
 def test_an_interrupt_waits_until_the_results_are_written(free, tmp_path, monkeypatch, name):
     for write in (results.write_text, results.write_npz):
 
@@ -202,14 +202,6 @@ def test_an_interrupt_waits_until_the_results_are_written(free, tmp_path, monkey
             write(path, content)
 
         monkeypatch.setattr(results, write.__name__, interrupted)
-    if name == "scene.toml":
-        written = results.write_scene
-
-        def interrupted_scene(scene, folder):
-            signal.raise_signal(signal.SIGINT)
-            written(scene, folder)
-
-        monkeypatch.setattr(results, "write_scene", interrupted_scene)
     with pytest.raises(KeyboardInterrupt):
         undrawn_run(free, out=tmp_path, duration_s=0.1)
     assert {path.name for path in tmp_path.iterdir()} >= {"summary.json", "log.npz", "scene.toml", "bus.log"}

@@ -11,9 +11,10 @@ import pytest
 import canprobe
 from canprobe.errors import PlanError, UsageError
 from canprobe.scene.geometry import true_object
-from canprobe.scene.load import load_scene, with_files_beside
+from canprobe.scene.load import load_scene
 from canprobe.scene.model import ObjectSettings
 from canprobe.scene.resolve import resolve
+from canprobe.session.session import write_scene
 
 X, Y = np.meshgrid(np.arange(-20, 20.1), np.arange(-15, 15.1), indexing="ij")
 BUMP_MM = 1.5 * np.exp(-((X - 4) ** 2 + 2 * Y**2) / 200)
@@ -134,8 +135,7 @@ def test_what_is_said_about_a_mesh_that_cannot_be_taken(tmp_path, monkeypatch):
 
 def test_a_saved_scene_takes_its_heights_along(tmp_path):
     scene = load_scene("relief")
-    for name, content in with_files_beside(scene).items():
-        (tmp_path / name).write_bytes(content)
+    write_scene(canprobe.plan(scene), tmp_path)
     assert (tmp_path / "relief.npz").is_file()
     there = load_scene(tmp_path / "scene.toml")
     assert there.object.file == str(tmp_path / "relief.npz")

@@ -47,7 +47,7 @@ def await_on(
 ) -> list[str]:
     scene = canprobe.load_scene("free")
     scene = replace(scene, bring_up=replace(scene.bring_up, emulated_s=60.0))
-    child = EmulatorChild(scene, folder, "lockstep")
+    child = EmulatorChild(canprobe.plan(scene), folder, "lockstep")
     child._process = SimpleNamespace(poll=lambda: status, returncode=status)  # type: ignore[assignment]
     child._errors = (folder / "stderr").open("w+b")
     child._errors.write(b"a warning\ncanprobe: vcan0: no such interface\n")
@@ -76,7 +76,8 @@ def test_a_node_that_does_not_boot_in_time_is_named_with_the_way_out(tmp_path: P
 def test_in_the_background_of_a_script_it_ends_at_once_too(tmp_path: Path) -> None:
     """A shell without job control starts there with SIGINT ignored, and the nodes' process inherits it."""
     free = canprobe.load_scene("free")
-    child = EmulatorChild(replace(free, bus=replace(free.bus, interface="virtual")), tmp_path, "nodes")
+    plan = canprobe.plan(replace(free, bus=replace(free.bus, interface="virtual")))
+    child = EmulatorChild(plan, tmp_path, "nodes")
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         child.start()

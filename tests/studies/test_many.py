@@ -12,6 +12,7 @@ from canprobe.eds.packaged import eds_path
 from canprobe.errors import SceneError, UsageError
 from canprobe.studies import many
 from canprobe.studies.many import run_many
+from canprobe.studies.sweep import Sweep
 
 QUICK = {"task.clearance_mm": 0.5, "task.duration_s": 0.2}
 VARY = {"limits.force_max_n": [5.0, np.float64(2.01)], "bus.bit_error_rate": [0.0, 1e-5]}
@@ -75,18 +76,38 @@ def test_a_fault_of_one_run_costs_that_run(monkeypatch, out):
     assert outcome["status"] == "failed" and outcome["reason"].startswith("KeyError: 'nothing' (test_many.py:")
 
 
-def test_a_run_is_another_once_a_file_that_its_scene_names_has_changed(tmp_path):
-    copy = tmp_path / "a.eds"
-    copy.write_bytes(eds_path("tactile_array").read_bytes())
-    scene = canprobe.load_scene("press", {"sensor.eds": copy})
-    before = many._digest(scene)
-    assert (
-        before
-        == many._digest(canprobe.load_scene(scene, {"task.force_n": 1}))
-        != many._digest(canprobe.load_scene("press"))
-    )
-    copy.write_bytes(copy.read_bytes() + b"\n; a comment\n")
-    assert many._digest(scene) != before
+def test_all_runs_use_the_files_as_they_were_and_changed_files_are_other_runs(tmp_path, monkeypatch):
+    """The file is removed once the first run is done; what ran is found again by its content, and by nothing else."""
+    mine, out, done = tmp_path / "mine.eds", tmp_path / "out", []
+    text = eds_path("tactile_array").read_bytes()
+    mine.write_bytes(text)
+    scene = canprobe.load_scene("listen", {"sensor.eds": mine, "task.duration_s": 0.05})
+
+    def in_this_process(sweep, measure, cells):
+        for case in cells:
+            done.append((case.files, measure(case)["status"]))
+            mine.unlink(missing_ok=True)
+        return [{"status": status} for _, status in done]
+
+    monkeypatch.setattr(Sweep, "map", in_this_process)
+    run_many(scene, seeds=2, bus="direct", out=out)
+    assert [status for _, status in done] == ["done", "done"]
+    (copy,) = out.glob("files-*/mine.eds")
+    assert copy.read_bytes() == text
+    for content in (text, text + b"\n; a comment\n"):
+        mine.write_bytes(content)
+        run_many(scene, seeds=1, bus="direct", out=out)
+    first, second, same, other = (digest for digest, _ in done)
+    assert first == second == same != other
+
+
+def test_numbers_of_numpy_are_integers_as_others(tmp_path, monkeypatch):
+    monkeypatch.setattr(Sweep, "map", lambda *_: [])
+    seeds = [np.int64(3), np.uint8(4), 5]
+    runs = run_many("free", seeds=seeds, bus="direct", out=tmp_path)
+    assert [row["seed"] for row in runs.rows] == [3, 4, 5]
+    assert [row["seed"] for row in run_many("free", seeds=np.int32(2), bus="direct", out=tmp_path).rows] == [0, 1]
+    assert [row["seed"] for row in run_many("free", seeds=np.arange(2), bus="direct", out=tmp_path).rows] == [0, 1]
 
 
 @pytest.mark.parametrize(
@@ -94,7 +115,13 @@ def test_a_run_is_another_once_a_file_that_its_scene_names_has_changed(tmp_path)
     [
         ({"vary": {"task.force_n": 3}}, "vary: task.force_n: expected a list of values, got 3"),
         ({"vary": {"task.force": [3]}}, r"task\.force: unknown key; did you mean force_n\?"),
+        ({"vary": {"task.force_n": []}}, r"vary: task\.force_n: expected at least one value, got an empty list"),
+        ({"vary": {"task.force_n": np.array(3.0)}}, r"vary: task\.force_n: expected a list of values, got array\(3"),
         ({"seeds": [-1]}, r"scene\.seed: expected an integer from 0"),
+        ({"seeds": 0}, "seeds: expected at least one, got 0"),
+        ({"seeds": []}, r"seeds: expected at least one, got \[\]"),
+        ({"seeds": 1.5}, "seeds: expected how many, or a list of integers, got 1.5"),
+        ({"seeds": [1.5]}, r"seeds: expected how many, or a list of integers, got \[1\.5\]"),
         ({"bus": "socketcan"}, 'runs share no bus: expected bus="direct" or "lockstep"'),
     ],
 )

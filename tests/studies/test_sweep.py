@@ -264,6 +264,30 @@ def test_workers_that_do_not_hear_are_ended_too(demo, tmp_path):
     assert deaf[-1].cancelled()
 
 
+def test_a_killed_process_leaves_no_worker(tmp_path):
+    """Not even one that ignores SIGTERM, as those of a study in the background of a script may."""
+    (tmp_path / "script.py").write_text(
+        "import os, signal\n"
+        "from canprobe.studies.sweep import process_pool\n"
+        "if __name__ == '__main__':\n"
+        "    with process_pool(1) as pool:\n"
+        "        pool.submit(signal.signal, signal.SIGTERM, signal.SIG_IGN).result()\n"
+        "        pool.submit(signal.pause)\n"
+        "        print('under way', flush=True)\n"
+        "        signal.pause()\n"
+    )
+    process = subprocess.Popen([sys.executable, tmp_path / "script.py"], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdout.readline() == b"under way\n"
+    process.kill()
+    process.communicate(timeout=60)  # a worker that is left would hold the streams open
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_a_child_whose_parent_is_gone_before_it_asks_ends_at_once(number):
+    command = f"from canprobe.session.children import end_with_parent; end_with_parent(1 << 22, {int(number)})"
+    assert subprocess.run([sys.executable, "-c", command], check=False, timeout=60).returncode == -number
+
+
 @pytest.mark.filterwarnings("default")
 def test_a_dask_cluster_computes_the_same(demo, tmp_path, monkeypatch):
     import distributed
