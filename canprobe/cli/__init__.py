@@ -42,6 +42,8 @@ COMMANDS = (
 )
 
 _WRONG_PATH = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
+_RAISING = ("strict", "surrogateescape")
+"""Handlers of a stream that raise an error on a character that its encoding does not have."""
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _EXAMPLE = """\
 `canprobe COMMAND --help` describes a command, with examples. Defaults stand in [brackets].
@@ -114,13 +116,16 @@ def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911 - one per w
 
 
 def _prepare_streams() -> None:
-    """Closed standard streams (`>&-`) take and give nothing; in an encoding that has no µ a ? stands in its place."""
+    """Closed standard streams (`>&-`) take and give nothing; what an encoding does not have is printed as `\\xb5`.
+
+    Unless PYTHONIOENCODING says otherwise. Strict streams raise, and so do those of the C locale (`surrogateescape`).
+    """
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         stream = getattr(sys, name)
         if stream is None:
             setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115 - as long as the process
-        elif mode == "w" and isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
-            stream.reconfigure(errors="replace")
+        elif mode == "w" and isinstance(stream, io.TextIOWrapper) and stream.errors in _RAISING:
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _forget_output() -> None:

@@ -161,12 +161,13 @@ def fit_surface(
 
 def _run_filter(touches: Touches, prior: Prior | None, quadric: bool) -> SurfaceEstimate:
     """The answer of `recursive` after samples of which only place and normal are known."""
+    memory = _memory_of(touches)
     point, normal = np.sqrt(touches.noise.point_variance), np.sqrt(touches.noise.normal_variance)
     estimator = RecursiveEstimator(
         sigma_point=math.sqrt(float(np.mean(point**2))),
         sigma_normal=math.sqrt(float(np.mean(normal**2))),
-        memory_m=max(touches.distance, touches.extent),
-        window=len(point),
+        memory_m=memory,
+        window=max(1, round(len(point) * memory / max(touches.distance, touches.extent))),
         prior=prior,
         correlation=touches.correlation,
         coupling=touches.noise.coupling,
@@ -178,6 +179,23 @@ def _run_filter(touches: Touches, prior: Prior | None, quadric: bool) -> Surface
     answer = estimator.estimate()
     if answer is None:
         raise UsageError(
-            f"points: expected a path that moves beyond its noise for 'recursive', got {touches.distance:.3g} in all"
+            f"points: expected a path that moves beyond its noise for 'recursive', got {touches.distance:.3g} in all "
+            f"with sigma_point {math.sqrt(float(np.mean(point**2))):.3g}"
         )
     return answer
+
+
+EXTENTS = 2.0
+"""Longest memory over the extent of the points: a weave or a circle has seen all directions by then."""
+
+
+def _memory_of(touches: Touches) -> float:
+    """Path for `recursive` to remember, m: all of a short one, of a longer one what a local quadric can describe.
+
+    That is what the points' extent and the surface's radius allow. The filter's unit of length, its steps and its prior
+    go by the memory, so that a long way over a small patch must not make it longer than the patch.
+    """
+    off, turned = touches.points - touches.points[-1], touches.normals - touches.normals[-1]
+    square = float(np.square(turned).sum())
+    radius = math.sqrt(float(np.square(off).sum()) / square) if square > 0.0 else math.inf  # exact on a sphere
+    return min(max(touches.distance, touches.extent), EXTENTS * touches.extent, max(radius, 0.5*touches.extent))
