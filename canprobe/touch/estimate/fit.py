@@ -108,8 +108,8 @@ def fit_surface(
         normals: (n, 3) outward unit normals of the object there.
         sigma_point: standard deviation of a point per axis: a number, (n,), or covariances (3, 3) or (n, 3, 3).
         sigma_normal: the same of a normal, rad (of a covariance only the tangential part counts).
-        method: "ml" (reaches the Cramér–Rao bound), "recursive" (the online filter run over the points, its memory the
-            length of the path), "chord", or "chen1996". The last has no robot here: its rates are differences of
+        method: "ml" (reaches the Cramér–Rao bound), "recursive" (the online filter run over the points; it
+            remembers the whole of a short path, of a longer one twice the points' extent or the surface's radius), "chord", or "chen1996". The last has no robot here: its rates are differences of
             points and normals `lag` apart, (16) with the object at rest.
         prior: for "ml" and "recursive"; None for `Prior.weak` over the path, nothing on curvature itself.
         lag: for "chen1996".
@@ -190,12 +190,12 @@ EXTENTS = 2.0
 
 
 def _memory_of(touches: Touches) -> float:
-    """Path for `recursive` to remember, m: all of a short one, of a longer one what a local quadric can describe.
+    """Path that `recursive` remembers, m: all of a short one; of a longer one as much as extent and radius allow.
 
-    That is what the points' extent and the surface's radius allow. The filter's unit of length, its steps and its prior
-    go by the memory, so that a long way over a small patch must not make it longer than the patch.
+    The filter's unit of length, its steps and its prior are shares of the memory. On a long path over a small patch the
+    length of the path would make steps larger than the patch.
     """
     off, turned = touches.points - touches.points[-1], touches.normals - touches.normals[-1]
     square = float(np.square(turned).sum())
     radius = math.sqrt(float(np.square(off).sum()) / square) if square > 0.0 else math.inf  # exact on a sphere
-    return min(max(touches.distance, touches.extent), EXTENTS * touches.extent, max(radius, 0.5*touches.extent))
+    return min(max(touches.distance, touches.extent), EXTENTS * touches.extent, max(radius, 0.5 * touches.extent))

@@ -11,6 +11,7 @@ from canprobe.errors import UsageError
 from canprobe.touch.estimate.fit import METHODS, fit_surface
 from canprobe.touch.estimate.likelihood import cramer_rao
 from canprobe.touch.estimate.noise import Prior
+from canprobe.touch.surface import SurfaceMatrix
 
 TINY = {"sigma_point": 1e-9, "sigma_normal": 1e-9}
 WEIGHT = np.array([1.0, 2.0, 1.0])
@@ -96,6 +97,26 @@ def test_tight_curvature_needs_the_points_noise_in_the_normals(truth):
     assert frobenius(np.mean(errors, axis=0)) < 0.4 * bound
 
 
+@pytest.mark.parametrize("method", ["chord", "chen1996"])
+@pytest.mark.parametrize(("count", "rank"), [(3, 2), (4, 3), (40, 3)])
+def test_differences_of_three_points_leave_one_combination_open(count, rank, method):
+    """S y is known of two y: S may have any multiple of m mᵀ more, m across both; on a curve m is not the normal."""
+    surface = SurfaceMatrix.sphere(0.05)
+    x, y = np.random.default_rng(0).uniform(-0.01, 0.01, size=(2, count))
+    points = np.stack([x, y, surface.height(x, y)], axis=1)
+    e = fit_surface(points, surface.normal(points), sigma_point=1e-6, sigma_normal=1e-5, method=method, lag=1)
+    assert e.rank == rank
+    assert e.observed.tolist() == [True, rank == 3]
+    if rank == 3:
+        assert e.kappa == pytest.approx([20.0, 20.0], rel=1e-6)
+        return
+    first, second = (points[-1] - points[:-1]) @ e.T_frame_contact[:3, :3]
+    m = np.cross(first, second)
+    hidden = m[[0, 0, 1]] * m[[0, 1, 1]] * [1.0, math.sqrt(2.0), 1.0]
+    assert np.allclose(e.combinations @ hidden, 0.0, atol=1e-9 * np.linalg.norm(hidden))
+    assert np.isnan(e.kappa[1])
+
+
 class TestUnobserved:
     NOISE = ((5e-5, 3e-3), (2e-5, 1e-3))
 
@@ -144,6 +165,47 @@ class TestUnobserved:
         C = cramer_rao(path.points, path.normals, path.surface, sigma_point=2e-5, sigma_normal=1e-3)
         assert np.isfinite(C[:2, :2]).all()
         assert np.isinf(C[2, 2])
+
+
+def long_path(kind, size):
+    """x, y of a long path over a patch of a size (m) that ends inside it, 1/80 of the size a sample."""
+    t = np.linspace(0.0, 1.0, 20_001)
+    if kind == "spiral":
+        x, y = (0.5 * (1.0 - t) * f(24.0 * np.pi * t) for f in (np.cos, np.sin))
+    elif kind == "circles":
+        x, y = (0.5 * f(20.0 * np.pi * t) for f in (np.cos, np.sin))
+    else:  # lines there and back, each a little further on
+        lines = 4 if kind == "dwell" else 20
+        x, y = np.abs(lines * t % 2.0 - 1.0) - 0.5, t - 0.5
+    s = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
+    at = np.arange(0.0, s[-1], 1 / 80)
+    if kind == "dwell":
+        at = np.sort(np.concatenate([at, np.full(1000, 0.6 * s[-1])]))
+    return size * np.interp(at, s, x), size * np.interp(at, s, y)
+
+
+@pytest.mark.parametrize("kind", ["zigzag", "spiral", "circles", "dwell"])
+@pytest.mark.parametrize(
+    ("radius", "K"), [(5e-3, [[1, 0], [0, 1]]), (0.05, [[1, 0], [0, 0]]), (10.0, [[1, 0], [0, -0.5]])]
+)
+def test_recursive_on_a_long_path_over_a_small_patch(radius, K, kind, truth):
+    """Up to 31 times the patch's size of path: its memory goes by the patch and by the surface's radius."""
+    size = min(0.4 * radius, 0.02)
+    path = truth.placed(SurfaceMatrix.from_curvature(np.array(K) / radius), *long_path(kind, size))
+    noise = {"sigma_point": size / 600, "sigma_normal": 1e-3}
+    for seed in range(2):
+        e = fit_surface(*path.noisy(*noise.values(), seed), **noise, method="recursive")
+        error = path.error(e)
+        assert e.rank == 3
+        assert error @ np.linalg.solve(e.covariance, error) < 16.27  # 99.9 %
+        assert frobenius(error) * size < 0.02
+        assert e.distance <= 3.0 * size
+
+
+def test_recursive_refuses_only_what_does_not_move(truth):
+    rest = truth.placed(truth.surface("cylinder"), np.zeros(400), np.zeros(400))
+    with pytest.raises(UsageError, match="beyond its noise"):
+        fit_surface(*rest.noisy(2e-5, 1e-3, 0), sigma_point=2e-5, sigma_normal=1e-3, method="recursive")
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -232,8 +294,6 @@ def test_the_bound_scales_with_noise_and_samples(truth):
 
 def test_the_bound_against_numerical_information():
     """One unknown at a time cannot be checked in closed form, a plane can: slopes of normals over places."""
-    from canprobe.touch.surface import SurfaceMatrix
-
     rng = np.random.default_rng(0)
     p = np.zeros((50, 3))
     p[:, :2] = rng.uniform(-0.01, 0.01, size=(50, 2))
