@@ -160,6 +160,10 @@ def _turned_spread(spread: Array, angle: float) -> Array:
     return result
 
 
+OFF_SURFACE = 10.0
+"""Distance of a point from the surface over its standard deviation, beyond which the point is taken to be off it."""
+
+
 def cramer_rao(
     points: ArrayLike,
     normals: ArrayLike,
@@ -177,7 +181,8 @@ def cramer_rao(
     method. Sorted principal curvatures are not differentiable at umbilics, so the bound is on the entries of K.
 
     Args:
-        points: (n, 3) m, on the true surface (or measured); the last row is now.
+        points: (n, 3) m, on the true surface, or measured: not further off than `OFF_SURFACE` times their noise; the
+            last row is now.
         normals: (n, 3) outward unit normals.
         S: (4, 4) the true surface in the frame of the points.
         sigma_point, sigma_normal, prior, correlation, coupling: as for `fit_surface`; the prior that the estimator has.
@@ -194,6 +199,21 @@ def cramer_rao(
     p, n = checked_arrays(points, normals, 1)
     touches = make_touches(p, n, make_noise(len(p), sigma_point, sigma_normal, coupling), correlation)
     surface = S if isinstance(S, SurfaceMatrix) else SurfaceMatrix(checked("S", S, (4, 4)))
+    gradient = surface.gradient(p)
+    off = np.abs(surface.value(p)) / np.maximum(np.sqrt(np.einsum("ij,ij->i", gradient, gradient)), 1e-300)
+    limit = OFF_SURFACE * np.sqrt(touches.noise.point_variance) + 1e-9 * np.abs(p).max()  # and rounding
+    worst = int(np.argmax(off / limit))
+    if off[worst] > limit[worst]:
+        raise UsageError(
+            f"points: expected all on S, up to {limit[worst]:.3g} off ({OFF_SURFACE:g} sigma_point), got one "
+            f"{off[worst]:.3g} off at index {worst}; S is expected in the frame and unit of the points"
+        )
+    return osculating_bound(touches, surface, prior)
+
+
+def osculating_bound(touches: Touches, surface: SurfaceMatrix, prior: Prior | None = None) -> Array:
+    """As `cramer_rao`, for a quadric that need only osculate the surface at the last point."""
+    p, n = touches.points, touches.normals
     origin = surface.project(p[-1])
     T = surface.contact_frame(origin)
     length, R = touches.extent, T[:3, :3]

@@ -306,6 +306,20 @@ def test_the_bound_against_numerical_information():
     assert np.allclose(C, np.linalg.inv(information), rtol=1e-6)
 
 
+@pytest.mark.parametrize("off", [3e-4, 1e-2, 50.0])
+@pytest.mark.parametrize("index", [0, -1])
+def test_the_bound_refuses_points_off_the_surface(index, off, truth):
+    path = truth.path("ellipsoid")
+    noise = {"sigma_point": 2e-5, "sigma_normal": 1e-3}
+    assert np.isfinite(cramer_rao(*path.noisy(2e-5, 1e-3, 0), path.surface, **noise)).all()
+    points = path.points.copy()
+    points[index] += off * path.normals[index]
+    with pytest.raises(UsageError, match=rf"^points: expected all on S, .*at index {index % 160};"):
+        cramer_rao(points, path.normals, path.surface, **noise)
+    with pytest.raises(UsageError, match="^points: expected all on S"):
+        cramer_rao(1e3 * path.points, path.normals, path.surface, **noise)
+
+
 def bad(points=None, normals=None, **kw):
     p = np.zeros((5, 3)) if points is None else points
     n = np.tile([0.0, 0.0, 1.0], (len(p), 1)) if normals is None else normals
