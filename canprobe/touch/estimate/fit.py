@@ -24,6 +24,7 @@ from canprobe.touch.estimate.window import (
     solve_pairs,
     usable_lag,
 )
+from canprobe.touch.linear_algebra import whole
 
 METHODS = ("chen1996", "chord", "ml", "recursive")
 
@@ -108,9 +109,10 @@ def fit_surface(
         normals: (n, 3) outward unit normals of the object there.
         sigma_point: standard deviation of a point per axis: a number, (n,), or covariances (3, 3) or (n, 3, 3).
         sigma_normal: the same of a normal, rad (of a covariance only the tangential part counts).
-        method: "ml" (reaches the Cramér–Rao bound), "recursive" (the online filter run over the points; it
-            remembers the whole of a short path, of a longer one twice the points' extent or the surface's radius), "chord", or "chen1996". The last has no robot here: its rates are differences of
-            points and normals `lag` apart, (16) with the object at rest.
+        method: "ml" (reaches the Cramér–Rao bound), "recursive" (the online filter run over the points; it remembers
+            all of a short path, of a longer one at most twice the points' extent and the surface's radius), "chord",
+            or "chen1996". The last has no robot here: its rates are differences of points and normals `lag` apart,
+            (16) with the object at rest.
         prior: for "ml" and "recursive"; None for `Prior.weak` over the path, nothing on curvature itself.
         lag: for "chen1996".
         correlation: of the noise along the path, for "ml", which weighs the samples by it, and "recursive", whose
@@ -143,7 +145,7 @@ def fit_surface(
         try:
             with np.errstate(over="ignore", invalid="ignore"):  # what is not finite has no root
                 return fitted(touches, prior, quadric)
-        except np.linalg.LinAlgError as error:
+        except (np.linalg.LinAlgError, OverflowError) as error:
             raise UsageError(
                 f"sigma_point, sigma_normal: expected those of real noise, got {sigma_point!r} and {sigma_normal!r}, "
                 f"with which the equations cannot be solved in double precision: {error}"
@@ -153,9 +155,8 @@ def fit_surface(
     if method == "chord":
         return solve_pairs(touches, chord_pairs(touches), "chord")
     if method == "chen1996":
-        if lag < 1 or lag != int(lag):
-            raise UsageError(f"lag: expected at least 1 sample, a whole number of them, got {lag}")
-        return solve_pairs(touches, lag_pairs(touches, usable_lag(len(p), int(lag))), "chen1996")
+        apart = usable_lag(len(p), whole("lag", lag, 1, "sample"))
+        return solve_pairs(touches, lag_pairs(touches, apart), "chen1996")
     raise unknown_method(method)
 
 

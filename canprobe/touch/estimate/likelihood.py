@@ -31,7 +31,16 @@ from canprobe.touch.estimate.quadric import (
     spread_of,
     turned,
 )
-from canprobe.touch.linear_algebra import Array, checked, homogeneous, inverted, solved, tangent_rotation, upper_root
+from canprobe.touch.linear_algebra import (
+    Array,
+    checked,
+    homogeneous,
+    instance,
+    inverted,
+    solved,
+    tangent_rotation,
+    upper_root,
+)
 from canprobe.touch.surface import SurfaceMatrix
 
 _FLOOR = 20.0
@@ -67,6 +76,8 @@ class Touches(NamedTuple):
 
 def make_touches(points: Array, normals: Array, noise: Noise, correlation: Correlation | None = None) -> Touches:
     """Extent and length of arrays that are already checked."""
+    if correlation is not None:
+        instance("correlation", correlation, Correlation)
     floor = _FLOOR * math.sqrt(float(np.median(noise.point_variance)))
     offset = points - points[-1]
     extent = max(math.sqrt(float(np.einsum("ij,ij->i", offset, offset).max())), floor)
@@ -108,7 +119,7 @@ def fit_ml(touches: Touches, prior: Prior | None, quadric: bool = False) -> Surf
     `fit_surface`.
     """
     length = touches.extent
-    stated = Prior.weak(length) if prior is None else prior
+    stated = Prior.weak(length) if prior is None else instance("prior", prior, Prior)
     T = working_frame(touches)
     R = T[:3, :3]
     d = design((touches.points - T[:3, 3]) @ R / length, touches.normals @ R, touches.noise.scaled(length, R))
@@ -224,7 +235,7 @@ def osculating_bound(touches: Touches, surface: SurfaceMatrix, prior: Prior | No
     J = linearise(c, d).jacobian()
     independent = touches.whitener()
     J = (J if independent is None else mixed(independent, J)).reshape(-1, 9)
-    stated = Prior.weak(length) if prior is None else prior
+    stated = Prior.weak(length) if prior is None else instance("prior", prior, Prior)
     root = upper_root(np.concatenate([J, stated.rows(length)[0]]))
     wide = 1e30 * np.eye(2)
     decision = decide(root[6:, 6:] * UNIT, wide, math.inf)

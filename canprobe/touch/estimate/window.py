@@ -15,14 +15,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.errors import UsageError
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimate.answer import Solution, SurfaceEstimate, build_estimate
 from canprobe.touch.estimate.likelihood import Touches, fit_ml, make_touches, working_frame
 from canprobe.touch.estimate.noise import Correlation, Prior, make_noise
 from canprobe.touch.estimate.online import AGREES, LAST_FEW, Dropped, Gate, looks_changed
 from canprobe.touch.estimate.quadric import TO_Q, decide, size_of
-from canprobe.touch.linear_algebra import Array, rotation_vectors, upper_root
+from canprobe.touch.linear_algebra import Array, rotation_vectors, upper_root, whole
 
 # Six-unknown linear estimates from differences of points and normals.
 
@@ -169,12 +168,11 @@ class WindowEstimator:
         coupling: float = 0.0,
         correlation: Correlation | None = None,
     ) -> None:
-        if window < self.least:
-            raise UsageError(f"window: expected at least {self.least} samples, got {window}")
+        kept = whole("window", window, self.least, "samples")
         self.dropped = Dropped()
         self._gate = Gate(sigma_point, sigma_normal)
         self._prior, self._coupling, self._correlation = prior, coupling, correlation
-        self._rows: deque[Sequence[float]] = deque(maxlen=window)
+        self._rows: deque[Sequence[float]] = deque(maxlen=kept)
         self._answer: SurfaceEstimate | None = None
 
     def add(self, sample: ContactSample) -> None:
@@ -279,9 +277,7 @@ class Chen1996Estimator(WindowEstimator):
 
     def __init__(self, *, sigma_point: float, sigma_normal: float, window: int, lag: int = 10) -> None:
         super().__init__(sigma_point=sigma_point, sigma_normal=sigma_normal, window=window)
-        if lag < 1:
-            raise UsageError(f"lag: expected at least 1 sample, got {lag}")
-        self._lag = lag
+        self._lag = whole("lag", lag, 1, "sample")
 
     def _row(self, sample: ContactSample) -> Sequence[float]:
         """With the probe's pose, row by row, and the contact in its frame."""

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from canprobe.errors import UsageError
-from canprobe.touch.estimate.fit import METHODS, fit_surface
+from canprobe.touch.estimate.answer import SurfaceEstimate
+from canprobe.touch.estimate.fit import METHODS, fit_surface, make_estimator
 from canprobe.touch.estimate.likelihood import cramer_rao
-from canprobe.touch.estimate.noise import Prior
+from canprobe.touch.estimate.noise import Correlation, Prior
 from canprobe.touch.surface import SurfaceMatrix
+from canprobe.touch.surface_map import SurfaceMap
 
 TINY = {"sigma_point": 1e-9, "sigma_normal": 1e-9}
 WEIGHT = np.array([1.0, 2.0, 1.0])
@@ -316,7 +318,7 @@ def test_the_bound_refuses_points_off_the_surface(index, off, truth):
     points[index] += off * path.normals[index]
     with pytest.raises(UsageError, match=rf"^points: expected all on S, .*at index {index % 160};"):
         cramer_rao(points, path.normals, path.surface, **noise)
-    with pytest.raises(UsageError, match="^points: expected all on S"):
+    with pytest.raises(UsageError, match=r"^points: expected all on S"):
         cramer_rao(1e3 * path.points, path.normals, path.surface, **noise)
 
 
@@ -347,6 +349,34 @@ def bad(points=None, normals=None, **kw):
         (bad(points=np.ma.masked_equal(np.eye(5, 3), 1.0)), "points"),
         (bad(sigma_point="fine"), "sigma_point"),
         (bad(coupling=np.nan), "coupling"),
+        (bad(coupling="no"), "coupling"),
+        (bad(points=[]), "points"),
+        (bad(points=np.zeros((5, 3)) + 1j), "points"),
+        (bad(points=np.full((5, 3), "1")), "points"),
+        (bad(points=[[0, 0, 10**400]] * 5), "points"),
+        (bad(sigma_point="1e-5"), "sigma_point"),
+        (bad(sigma_normal=1e-3 + 0j), "sigma_normal"),
+        (bad(method="chen1996", lag="10"), "lag"),
+        (bad(prior="flat"), "prior"),
+        (bad(method="recursive", prior=0.1), "prior"),
+        (bad(correlation=0.002), "correlation"),
+        (lambda: Correlation("2 mm"), "correlation.length"),
+        (lambda: Correlation(2e-3, 0.5, "all"), "correlation.point_share"),
+        (lambda: Prior("x", "1", 1.0, 1.0), "prior.sigma_c13"),
+        (lambda: Prior.weak("20 mm"), "length"),
+        (lambda: SurfaceMatrix([]), "S"),
+        (lambda: SurfaceMatrix.cylinder(0.1, axis=[1, 0, 0]), "axis"),
+        (lambda: SurfaceMatrix.from_curvature(np.eye(2), c13="1"), "c13, c23, c33"),
+        (lambda: SurfaceMatrix.plane() + 1.0, "sum"),
+        (lambda: "2" * SurfaceMatrix.plane(), "factor"),
+        (lambda: SurfaceMatrix.plane().value([1j, 0, 0]), "points"),
+        (lambda: SurfaceMatrix.plane().normal([0, 0]), "points"),
+        (lambda: SurfaceMatrix.plane().height("0", 0.0), "x"),
+        (lambda: SurfaceMap(patches=None, path=np.zeros((1, 3))), "patches"),
+        (lambda: SurfaceMap(patches=(), path=[]), "path"),
+        (lambda: SurfaceEstimate.of(np.eye(4), "K"), "K"),
+        (lambda: make_estimator("ml", sigma_point=1e-5, sigma_normal=1e-3, window="many"), "window"),
+        (lambda: make_estimator("recursive", sigma_point=1e-5, sigma_normal=1e-3, memory_m="20 mm"), "memory_m"),
         (lambda: cramer_rao(np.zeros((5, 3)), np.eye(3)[[2] * 5], "S", sigma_point=1, sigma_normal=1), "S"),
         (lambda: Prior("x", 0.0, 1.0, 1.0), "prior.sigma_c13"),
     ],
