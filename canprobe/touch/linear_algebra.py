@@ -106,7 +106,7 @@ def real_numbers(values: Any) -> Array:
         raise ValueError(str(error)) from error
 
 
-def real(name: str, values: ArrayLike, form: str = "") -> Array:
+def real(name: str, values: Any, form: str = "") -> Array:
     """Values as floats, of any shape and also NaN; else a UsageError that names the field."""
     try:
         return real_numbers(values)
@@ -114,7 +114,7 @@ def real(name: str, values: ArrayLike, form: str = "") -> Array:
         raise UsageError(f"{name}: expected real numbers{form}, got {values!r}") from error
 
 
-def checked(name: str, values: ArrayLike, shape: Sequence[int | None]) -> Array:
+def checked(name: str, values: Any, shape: Sequence[int | None]) -> Array:
     """Values as floats of a shape (None: any length), all finite; else a UsageError that names the field."""
     if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
         raise UsageError(f"{name}: expected numbers, got masked ones; leave those rows out")

@@ -181,7 +181,7 @@ class Prior:
         checked("curvature", self.curvature, ())
         for field in ("sigma_c13", "sigma_c23", "sigma_c33", "sigma_curvature"):
             value = getattr(self, field)
-            if not (isinstance(value, Real) and value > 0.0):  # infinite: none
+            if not (isinstance(value, Real) and float(value) > 0.0):  # infinite: none
                 raise UsageError(f"prior.{field}: expected a number above 0, got {value!r}")
 
     @classmethod

@@ -141,9 +141,9 @@ def calibrate_array(
         first, found = fit(fitted, own)
     errors, curvatures, force_errors = _held_out(fitted, lambda pairs: fit(pairs, own)[0], own, seen)
     ds, ss = [d for d, _ in fitted], [s for _, s in fitted]
-    by_images = found.parameters.stiffness
-    relative = math.sqrt(float(found.covariance[0, 0]))
-    by_depth = stiffness_by_depth(ds, ss, found.forces.tolist(), pad.radius_m, by_images, by_images * relative)
+    stiffness = found.parameters.stiffness
+    by_images = stiffness, stiffness * math.sqrt(float(found.covariance[0, 0]))
+    by_depth = stiffness_by_depth(ds, ss, found.forces.tolist(), pad.radius_m, by_images)
     rods = [(d, s) for d, s in good if d.name == "rod"]
     across = _rms(_checked(first, rods, own, seen)[1][:, 0]) if rods else math.nan
     centroid, scatter = fit_centroids(ds, ss)
@@ -151,7 +151,7 @@ def calibrate_array(
         first,
         moments=_moment_errors(errors, ss),
         centroid=centroid,
-        stiffness=StiffnessSources(by_images, by_images * relative, *by_depth),
+        stiffness=StiffnessSources(*by_images, *by_depth),
         residuals=Residuals(len(fitted), _rms(force_errors), _rms(errors[:, :2]), _rms(curvatures), across),
         dead=dead if own_gains else (),
     )
