@@ -232,5 +232,5 @@ def test_an_action_that_is_not_three_finite_numbers_is_refused(make):
     env = make()
     env.reset(seed=0)
     for action in ([np.inf, 0, 0], [np.nan, 0, 0], ["1", "0", "0"], [1j, 0, 0], [], [0, 0], None):
-        with pytest.raises(UsageError, match="^action: expected"):
+        with pytest.raises(UsageError, match=r"^action: expected"):
             env.step(action)
