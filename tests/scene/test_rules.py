@@ -1,6 +1,7 @@
 """What callers put in the place of a scene's values: as strict as the file, and open to numpy's numbers and paths."""
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -113,3 +114,12 @@ def test_what_is_no_scene(call):
         call("pres")
     with pytest.raises(SceneError, match=r"did you mean force_n\?"):
         call("press", {"task.force": 3})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("overrides", 3.0), ("out", []), ("out", b"runs"), ("observers", math.inf), ("bridge", 1j)]
+)
+def test_an_argument_of_another_kind_is_refused_before_anything_is_started(name, value):
+    for call in (canprobe.run, canprobe.open_cell):
+        with pytest.raises(UsageError, match=f"^{name}: expected .*, got "):
+            call("free", **{name: value})
