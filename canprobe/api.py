@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
-from types import TracebackType
+from types import NoneType, TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from canprobe.bus.scheduling import interrupts_held, interrupts_repeated
@@ -108,6 +109,7 @@ def run(
         SafetyStop: the cell was stopped for safety. The drives are disabled and the files written.
         ResultsError: a file could not be written, for example on a full disk. The drives are disabled.
     """
+    _refuse_wrong(overrides, out, observers, bridge)
     scene = load_scene(scene, _over(overrides, {"scene.seed": seed, "task.duration_s": duration_s}))
     resolved = with_bridges(Target.over(scene, bus, channel, bitrate).applied_to(scene), bridge)
     folder = results_folder(resolved, out) if files else None
@@ -116,6 +118,18 @@ def run(
     task = make_task(plan)
     with OpenCell(plan, folder, say, observers, task=task) as cell:
         return cell.run(cell.open_to_requests(task), _report(progress, resolved.task.duration_s))
+
+
+def _refuse_wrong(overrides: object, out: object, observers: object, bridge: object) -> None:
+    """Raise a UsageError where an argument of `run` or `open_cell` is of another kind than it must be."""
+    for name, value, kinds, expected in (
+        ("overrides", overrides, (Mapping, NoneType), 'values by key such as {"task.force_n": 3}'),
+        ("out", out, (str, os.PathLike, NoneType), "the path of a folder"),
+        ("observers", observers, (list, tuple), "a list of observers"),
+        ("bridge", bridge, (list, tuple, str), "a list of names of bridges"),
+    ):
+        if not isinstance(value, kinds):
+            raise UsageError(f"{name}: expected {expected}, got {value!r}")
 
 
 def _over(overrides: Mapping[str, Any] | None, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -485,6 +499,7 @@ def open_cell(
         SafetyStop: when the block is entered: the probe is pressed.
         ResultsError: when the block is left: a file could not be written.
     """
+    _refuse_wrong(overrides, out, observers, bridge)
     scene = load_scene(scene, _over(overrides, {"scene.seed": seed}))
     resolved = with_bridges(Target.over(scene, bus, channel, bitrate).applied_to(scene), bridge)
     folder = Path(out) if out is not None else None

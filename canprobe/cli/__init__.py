@@ -7,10 +7,13 @@ in its help. What it needs beyond argparse it imports inside `run`: `canprobe --
 
 from __future__ import annotations
 
+import argparse
 import errno
 import importlib
 import io
 import os
+import re
+import shlex
 import sys
 import traceback
 from collections.abc import Sequence
@@ -42,6 +45,8 @@ COMMANDS = (
 )
 
 _WRONG_PATH = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
+_RAISING = ("strict", "surrogateescape")
+"""Handlers of a stream that raise an error on a character that its encoding does not have."""
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _EXAMPLE = """\
 `canprobe COMMAND --help` describes a command, with examples. Defaults stand in [brackets].
@@ -80,7 +85,7 @@ def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911 - one per w
     _prepare_streams()
     for name in BLAS_THREADS:  # before numpy is loaded
         os.environ.setdefault(name, "1")
-    report = Report()
+    report, args = Report(), argparse.Namespace()
     try:
         args = parser_of(arguments).parse_args(arguments)
         args.report, report.verbosity = report, getattr(args, "verbosity", 0)
@@ -91,7 +96,8 @@ def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911 - one per w
     except SystemExit as leaving:
         return leaving.code if isinstance(leaving.code, int) else 0
     except CanprobeError as error:
-        return _complain(report, "\n".join([str(error), *getattr(error, "__notes__", ())]), error.exit_status)
+        text = "\n".join([str(error), *getattr(error, "__notes__", ())])
+        return _complain(report, _with_scene(text, args), error.exit_status)
     except BrokenPipeError:
         _forget_output()
         return 141
@@ -114,13 +120,16 @@ def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911 - one per w
 
 
 def _prepare_streams() -> None:
-    """Closed standard streams (`>&-`) take and give nothing; in an encoding that has no µ a ? stands in its place."""
+    """Closed standard streams (`>&-`) take and give nothing; what an encoding does not have is printed as `\\xb5`.
+
+    Unless PYTHONIOENCODING says otherwise. Strict streams raise, and so do those of the C locale (`surrogateescape`).
+    """
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         stream = getattr(sys, name)
         if stream is None:
             setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115 - as long as the process
-        elif mode == "w" and isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
-            stream.reconfigure(errors="replace")
+        elif mode == "w" and isinstance(stream, io.TextIOWrapper) and stream.errors in _RAISING:
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _forget_output() -> None:
@@ -148,6 +157,14 @@ def parser_of(arguments: Sequence[str]) -> Parser:
         one.set_defaults(run=command.run)
         command.add_arguments(one)
     return parser
+
+
+def _with_scene(text: str, args: argparse.Namespace) -> str:
+    """A message whose line to type has the scene that was given; only the command line knows its name or path."""
+    if getattr(args, "scene", None) is None:
+        return text
+    cell = f" --cell {shlex.quote(args.cell)}" if getattr(args, "cell", None) else ""
+    return re.sub(r"(?<=type: canprobe up )SCENE\b", lambda _: shlex.quote(str(args.scene)) + cell, text)
 
 
 def _complain(report: Report, text: str, status: int) -> int:

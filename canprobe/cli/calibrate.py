@@ -22,7 +22,7 @@ HELP = "calibrate a tactile array by touching known things"
 EXAMPLE = """\
 examples:
   canprobe calibrate array puma260 --force-reference scale --sigma 0.5
-  canprobe calibrate array mycell.toml --bus socketcan --channel can0 --out runs/array
+  canprobe calibrate array mycell.toml --bus socketcan --channel can0
 """
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import itertools
 import json
@@ -18,8 +19,13 @@ from canprobe.session.terminal import MARKS, NARROW, columns, painted
 
 
 def print_json(document: object) -> None:
-    """One JSON document on stdout; NaN is refused rather than written."""
-    print(json.dumps(document, indent=2, allow_nan=False, ensure_ascii=False))
+    """One JSON document on stdout; NaN is refused rather than written.
+
+    Where stdout is not UTF-8 the document is ASCII: JSON has its own escapes, not those of the stream.
+    """
+    encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
+    ascii_only = codecs.lookup(encoding).name != "utf-8"
+    print(json.dumps(document, indent=2, allow_nan=False, ensure_ascii=ascii_only))
 
 
 def print_table(rows: Sequence[Sequence[str]]) -> None:

@@ -23,6 +23,7 @@ from canprobe.scene.load import load_scene
 from canprobe.scene.model import Scene
 from canprobe.scene.resolve import resolve
 from canprobe.session.target import VIRTUAL
+from canprobe.touch.linear_algebra import checked
 
 DEFAULT_SCENE: Mapping[str, Any] = {
     "object.position_mm": START_MM,
@@ -150,10 +151,7 @@ class TouchScan(gymnasium.Env[Any, NDArray[np.float32]]):
         episode = self.episode
         if episode is None or episode.over:
             raise UsageError("no episode is under way: call reset()")
-        wanted = np.clip(np.asarray(action, dtype=float), -1.0, 1.0)
-        if wanted.shape != (3,) or not np.isfinite(wanted).all():
-            raise UsageError(f"action: expected three finite numbers, got {action!r}")
-        reward = episode.step(wanted)
+        reward = episode.step(np.clip(checked("action", action, (3,)), -1.0, 1.0))
         terminated = episode.reason is not None
         return self._observe(episode), reward, terminated, episode.over and not terminated, episode.info()
 

@@ -20,7 +20,8 @@ def calibration_text(fit: ArrayFit) -> str:
         f"  force      {c.newtons}; scale {image.scale:.3f}" + _percent(c.residuals.force, ", held-out error"),
         f"  stiffness  {k.moments:.4g} {unit}/m³ ± {100 * k.moments_sigma / k.moments:.1f} % by the images;"
         f" {k.depth:.4g} ± {100 * k.depth_sigma / k.depth:.1f} % by the arm's way",
-        f"  arm        {1e6 * k.arm_compliance:.1f} µm/{unit}: the difference of both",
+        f"  arm        {1e6 * k.arm_compliance:.1f} ± {1e6 * k.arm_compliance_sigma:.1f} µm/{unit}:"
+        " the difference of both",
         f"  image      blur {1e3 * image.blur:.2f} mm, crosstalk {100 * image.crosstalk:.1f} %,"
         f" memory {100 * image.memory:.1f} %",
         f"  moments    held-out error{_percent(c.residuals.moments)}; frame to frame"
@@ -63,6 +64,7 @@ def as_document(fit: ArrayFit) -> dict[str, Any]:
         "stiffness_sigma_n_m3": c.stiffness.moments_sigma,
         "stiffness_by_depth_n_m3": known(c.stiffness.depth),
         "arm_compliance_um_n": known(1e6 * c.stiffness.arm_compliance),
+        "arm_compliance_sigma_um_n": known(1e6 * c.stiffness.arm_compliance_sigma),
         "scale": c.image.scale,
         "blur_mm": 1e3 * c.image.blur,
         "crosstalk": c.image.crosstalk,

@@ -147,7 +147,8 @@ def bound_of_scan(
         correlation: of the noise along the path.
         coupling: of the errors of point and normal (`Noise`), 1/m.
     """
-    from canprobe.touch.estimate.likelihood import cramer_rao
+    from canprobe.touch.estimate.likelihood import make_touches, osculating_bound
+    from canprobe.touch.estimate.noise import make_noise
     from canprobe.touch.surface import SurfaceMatrix
 
     points = np.array([s.p_base for s in samples])
@@ -166,10 +167,9 @@ def bound_of_scan(
         T[:3, 0] = truth["direction1"][row]
         T[:3, 1] = np.cross(T[:3, 2], T[:3, 0])
         surface = SurfaceMatrix.from_curvature(np.diag(truth["kappa"][row])).transformed(np.linalg.inv(T))
-        C = cramer_rao(
-            points[first : last + 1], normals[first : last + 1], surface,
-            sigma_point=sigmas[first : last + 1], sigma_normal=sigma_normal, coupling=coupling, correlation=correlation,
-        )  # fmt: skip
+        recent = slice(first, last + 1)
+        noise = make_noise(last + 1 - first, sigmas[recent], sigma_normal, coupling)
+        C = osculating_bound(make_touches(points[recent], normals[recent], noise, correlation), surface)
         squares.append(C[0, 0] + 2 * C[1, 1] + C[2, 2])
     mean = float(np.mean(squares))
     return float(np.sqrt(mean)) if np.isfinite(mean) else None

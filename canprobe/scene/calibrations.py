@@ -115,6 +115,8 @@ class StiffnessKeys:
     """Its standard deviation."""
     arm_compliance_um_n: float | None = None
     """Compliance of what carries the probe."""
+    arm_compliance_sigma_um_n: float | None = None
+    """Its standard deviation."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,6 +216,7 @@ def _calibration(file: CalibrationFile) -> ArrayCalibration:
             _or_nan(file.stiffness.depth_n_m3),
             _or_nan(file.stiffness.depth_n_m3) * _share(file.stiffness.depth_sigma_percent),
             1e-6 * _or_nan(file.stiffness.arm_compliance_um_n),
+            1e-6 * _or_nan(file.stiffness.arm_compliance_sigma_um_n),
         ),
         residuals=Residuals(
             file.residuals.touches,
@@ -277,6 +280,7 @@ def dump_calibration(calibration: ArrayCalibration) -> str:
             _known(c.stiffness.depth),
             _known(1e2 * c.stiffness.depth_sigma / c.stiffness.depth),
             _known(1e6 * c.stiffness.arm_compliance),
+            _known(1e6 * c.stiffness.arm_compliance_sigma),
         ),
         ResidualKeys(
             c.residuals.touches,

@@ -14,6 +14,7 @@ from canprobe.planning.model import Plan
 from canprobe.robot.model import ArmModel
 from canprobe.scene.setup import SafetyLimits
 from canprobe.tasks.task import MotionTime
+from canprobe.touch.linear_algebra import checked, instance, real_numbers
 
 Vector = NDArray[np.float64]
 NEAR_RAD = 0.01
@@ -55,15 +56,15 @@ class Trajectory(Controller):
         *,
         hold_s: float = 0.5,
     ) -> None:
-        arm = plan.setup.arm
+        arm = instance("trajectory: plan", plan, Plan).setup.arm
         if arm is None:
-            raise UsageError("trajectory: this scene has no arm")
+            raise UsageError("trajectory: expected a scene with an arm; got one without")
         self._model: ArmModel = arm.model
         self._limits: SafetyLimits = plan.setup.limits
         self._guard = JointGuard(plan)
         self._times, self._q = _table(points, arm.model.n)
         self._given = None if velocities is None else _velocities(velocities, self._q.shape)
-        self._hold_s = hold_s
+        self._hold_s = float(checked("trajectory: hold_s", hold_s, ()))
         self._time = MotionTime(plan.sync.period_ns)
         self._gone_ns: int | None = None
         self._qd = np.empty(0)
@@ -168,14 +169,19 @@ class Trajectory(Controller):
 
 def _table(points: Iterable[tuple[float, ArrayLike]], n: int) -> tuple[Vector, Vector]:
     """Times (m,) s and positions (m, n) of the points, finite and in the order of time."""
-    rows = list(points)
-    if not rows:
-        raise UsageError("trajectory: no point")
     try:
-        times = np.array([time for time, _ in rows], np.float64)
-        q = np.array([positions for _, positions in rows], np.float64)
+        rows = list(points)
+    except TypeError as error:
+        raise UsageError(f"trajectory: expected (time, positions) of each point, got {points!r}") from error
+    if not rows:
+        raise UsageError("trajectory: expected (time, positions) of each point, got no point")
+    try:
+        times = real_numbers([time for time, _ in rows])
+        q = real_numbers([positions for _, positions in rows])
     except (TypeError, ValueError) as error:
         raise UsageError(f"trajectory: expected (time, positions) of each point: {error}") from error
+    if times.shape != (len(rows),):
+        raise UsageError(f"trajectory: expected one time in each point, got shape {times.shape[1:]}")
     if q.shape != (len(rows), n):
         raise UsageError(f"trajectory: expected {n} positions in each point, got {q.shape[1:]}")
     if not (np.isfinite(times).all() and np.isfinite(q).all()):
@@ -186,10 +192,7 @@ def _table(points: Iterable[tuple[float, ArrayLike]], n: int) -> tuple[Vector, V
 
 
 def _velocities(velocities: Sequence[ArrayLike], shape: tuple[int, ...]) -> Vector:
-    qd = np.array(velocities, np.float64)
-    if qd.shape != shape or not np.isfinite(qd).all():
-        raise UsageError(f"trajectory: expected velocities {shape}, finite, got {qd.shape}")
-    return qd
+    return checked("trajectory: velocities", velocities, shape).copy()
 
 
 def _slopes(times: Vector, q: Vector) -> Vector:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +14,7 @@ from canprobe.errors import UsageError
 
 Array = NDArray[np.float64]
 Vec = tuple[float, float, float]
+_T = TypeVar("_T")
 _UPPER, _IDENTITY = np.triu(np.ones((16, 16))), np.eye(16)
 
 # LAPACK is called by its own names: on matrices as small as these, numpy's wrappers cost four times the decomposition.
@@ -89,16 +90,37 @@ def read_only(values: ArrayLike) -> Array:
     return array
 
 
-def checked(name: str, values: ArrayLike, shape: Sequence[int | None]) -> Array:
-    """Values as floats of a shape (None: any length), all finite; else a UsageError that names the field."""
+def real_numbers(values: Any) -> Array:
+    """Values as floats.
+
+    Raises:
+        TypeError, ValueError: one is no real number, as text and complex numbers are not; or rows differ in length.
+    """
+    found = np.asarray(values)
+    texts = found.dtype == object and any(isinstance(value, str | bytes) for value in found.flat)
+    if texts or found.dtype.kind not in "biufO":
+        raise TypeError(f"expected real numbers, got {found.dtype}")
     try:
-        array = np.asarray(values, dtype=np.float64)
+        return np.asarray(found, dtype=np.float64)
+    except OverflowError as error:
+        raise ValueError(str(error)) from error
+
+
+def real(name: str, values: Any, form: str = "") -> Array:
+    """Values as floats, of any shape and also NaN; else a UsageError that names the field."""
+    try:
+        return real_numbers(values)
     except (TypeError, ValueError) as error:
-        raise UsageError(f"{name}: expected numbers of shape {_spell(shape)}, got {values!r}") from error
-    if len(array.shape) != len(shape) or any(e is not None and e != g for e, g in zip(shape, array.shape, strict=True)):
-        raise UsageError(f"{name}: expected shape {_spell(shape)}, got {array.shape}")
+        raise UsageError(f"{name}: expected real numbers{form}, got {values!r}") from error
+
+
+def checked(name: str, values: Any, shape: Sequence[int | None]) -> Array:
+    """Values as floats of a shape (None: any length), all finite; else a UsageError that names the field."""
     if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
         raise UsageError(f"{name}: expected numbers, got masked ones; leave those rows out")
+    array = real(name, values, f" of shape {_spell(shape)}")
+    if len(array.shape) != len(shape) or any(e is not None and e != g for e, g in zip(shape, array.shape, strict=True)):
+        raise UsageError(f"{name}: expected shape {_spell(shape)}, got {array.shape}")
     if not np.isfinite(array).all():
         first = np.argwhere(~np.isfinite(array))[0].tolist()
         raise UsageError(f"{name}: expected finite numbers, got {array[tuple(first)]} at index {first}")
@@ -111,6 +133,21 @@ def positive(name: str, value: Any) -> float:
     if not number > 0.0:
         raise UsageError(f"{name}: expected a number above 0, got {number}")
     return number
+
+
+def whole(name: str, value: Any, least: int, unit: str) -> int:
+    """A whole number, not below `least`; else a UsageError that names the field."""
+    number = float(checked(name, value, ()))
+    if number < least or number != int(number):
+        raise UsageError(f"{name}: expected at least {least} {unit}, a whole number of them, got {value!r}")
+    return int(number)
+
+
+def instance(name: str, value: Any, kind: type[_T]) -> _T:
+    """A value of a class; else a UsageError that names the field."""
+    if not isinstance(value, kind):
+        raise UsageError(f"{name}: expected a {kind.__name__}, got {value!r}")
+    return value
 
 
 def _spell(shape: Sequence[int | None]) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from canprobe.errors import UsageError
-from canprobe.touch.linear_algebra import Array, checked, homogeneous, read_only, tangent_rotation
+from canprobe.touch.linear_algebra import Array, checked, homogeneous, instance, read_only, real, tangent_rotation
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,9 +63,13 @@ class SurfaceMatrix:
             axis: direction of the centre line in the tangent plane, "x", "y" or an angle from x in rad.
         """
         named = {"x": (0.0, 1.0), "y": (1.0, 0.0)}
-        if isinstance(axis, str) and axis not in named:
-            raise UsageError(f'axis: expected "x", "y" or an angle in rad, got {axis!r}')
-        across = named[axis] if isinstance(axis, str) else (-math.sin(axis), math.cos(axis))
+        if isinstance(axis, str):
+            if axis not in named:
+                raise UsageError(f'axis: expected "x", "y" or an angle in rad, got {axis!r}')
+            across = named[axis]
+        else:
+            angle = float(checked("axis", axis, ()))
+            across = -math.sin(angle), math.cos(angle)
         k = 1.0 / _nonzero("radius", radius)
         return cls.from_curvature(k * np.outer(across, across), c33=0.5 * k)
 
@@ -76,11 +80,11 @@ class SurfaceMatrix:
         c13, c23, c33 (1/m) are the entries that K leaves open.
         """
         k = checked("K", K, (2, 2))
+        others = checked("c13, c23, c33", [c13, c23, c33], (3,))
         S = np.zeros((4, 4))
         S[:2, :2] = 0.5 * k
-        S[0, 2] = S[2, 0] = c13
-        S[1, 2] = S[2, 1] = c23
-        S[2, 2] = c33
+        S[:2, 2] = S[2, :2] = others[:2]
+        S[2, 2] = others[2]
         S[2, 3] = S[3, 2] = -0.5
         return cls(S)
 
@@ -91,15 +95,15 @@ class SurfaceMatrix:
         Of two surfaces normalised in one contact frame the sum is the blend whose curvature there is the mean of the
         two; scaling gives other weights (`0.25 * a + 0.75 * b`).
         """
-        return SurfaceMatrix(self.S + other.S)
+        return SurfaceMatrix(self.S + instance("sum", other, SurfaceMatrix).S)
 
     def __sub__(self, other: SurfaceMatrix) -> SurfaceMatrix:
         """The difference of the two polynomials (7): zero where both have the same value, no body by itself."""
-        return SurfaceMatrix(self.S - other.S)
+        return SurfaceMatrix(self.S - instance("difference", other, SurfaceMatrix).S)
 
     def __mul__(self, factor: float) -> SurfaceMatrix:
         """The polynomial times a number; a positive one leaves the surface what it was."""
-        return SurfaceMatrix(float(factor) * self.S)
+        return SurfaceMatrix(float(checked("factor", factor, ())) * self.S)
 
     __rmul__ = __mul__
 
@@ -115,13 +119,13 @@ class SurfaceMatrix:
 
     def value(self, points: ArrayLike) -> Array:
         """f at points (…, 3); negative inside the body."""
-        p = np.asarray(points, dtype=np.float64)
+        p = _places(points)
         result: Array = np.einsum("...i,...i->...", p @ self.S[:3, :3] + 2.0 * self.S[:3, 3], p) + self.S[3, 3]
         return result
 
     def gradient(self, points: ArrayLike) -> Array:
         """∇f = 2 (S X)₁..₃ at points (…, 3); points outward."""
-        result: Array = 2.0 * (np.asarray(points, dtype=np.float64) @ self.S[:3, :3] + self.S[:3, 3])
+        result: Array = 2.0 * (_places(points) @ self.S[:3, :3] + self.S[:3, 3])
         return result
 
     def normal(self, points: ArrayLike) -> Array:
@@ -170,7 +174,7 @@ class SurfaceMatrix:
             z, m, in the shape of x and y.
         """
         s = self.S
-        x_, y_ = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
+        x_, y_ = real("x", x), real("y", y)
         b = s[0, 2] * x_ + s[1, 2] * y_ + s[2, 3]
         c = s[0, 0] * x_**2 + 2 * s[0, 1] * x_ * y_ + s[1, 1] * y_**2 + 2 * (s[0, 3] * x_ + s[1, 3] * y_) + s[3, 3]
         square = b * b - s[2, 2] * c
@@ -211,6 +215,14 @@ class SurfaceMatrix:
         if not size > 0.0:
             raise UsageError(f"point: expected one where the surface has a normal, got {np.asarray(point).tolist()}")
         return size
+
+
+def _places(points: ArrayLike) -> Array:
+    """Points (…, 3) as floats."""
+    p = real("points", points, " of shape (…, 3)")
+    if p.shape[-1:] != (3,):
+        raise UsageError(f"points: expected shape (…, 3), got {p.shape}")
+    return p
 
 
 def _nonzero(name: str, value: float) -> float:

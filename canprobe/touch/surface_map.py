@@ -190,6 +190,8 @@ class SurfaceMap:
             object.__setattr__(self, name, read_only(values))
 
         keep("path", checked("path", self.path, (None, 3)))
+        if not (isinstance(self.patches, tuple) and all(isinstance(patch, LocalPatch) for patch in self.patches)):
+            raise UsageError(f"patches: expected a tuple of LocalPatch, got {self.patches!r}")
         keep("points", np.array([patch.point for patch in self.patches]).reshape(-1, 3))
         keep("normals", np.array([patch.normal for patch in self.patches]).reshape(-1, 3))
         keep("travelled", [patch.travelled_m for patch in self.patches])

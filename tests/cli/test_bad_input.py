@@ -294,13 +294,28 @@ def test_a_run_that_ignores_the_terminal_is_ended_by_sigterm(tmp_path):
     assert json.loads((tmp_path / "results" / "summary.json").read_text())["stop_reason"] == "interrupted"
 
 
-def test_a_terminal_without_our_letters(tmp_path, monkeypatch):
-    monkeypatch.setenv("PYTHONIOENCODING", "ascii")
-    for words in (("plan", "cylinder"), ("plan", "cylinder", "--json")):
-        process = start(tmp_path, *words)
-        out, err = process.communicate()
-        assert (process.returncode, err) == (0, "")
-        assert "--json" not in words or json.loads(out)["scene"] == "cylinder"
+# the C locale without coercion has an ASCII stream whose handler is no "strict" one, and yet raises
+ENCODINGS = {
+    "cp1252": {"PYTHONIOENCODING": "cp1252"},
+    "the C locale": {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+}
+
+
+@pytest.mark.parametrize("name", ENCODINGS)
+def test_what_an_encoding_does_not_have_is_printed_escaped(name, tmp_path):
+    encoding = "cp1252" if name == "cp1252" else "ascii"
+
+    def printed(variables, *words):
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), **variables}
+        command = [sys.executable, "-m", "canprobe", "plan", "cylinder", *words]
+        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, check=False)
+        assert (done.returncode, done.stderr) == (0, b"")
+        return done.stdout
+
+    whole = printed({"PYTHONIOENCODING": "utf-8"}).decode()
+    assert printed(ENCODINGS[name]) == whole.encode(encoding, "backslashreplace")
+    documents = [json.loads(printed(v, "--json")) for v in ({"PYTHONIOENCODING": "utf-8"}, ENCODINGS[name])]
+    assert documents[0] == documents[1]
 
 
 @pytest.mark.parametrize(

@@ -226,3 +226,11 @@ def test_coverage_counts_each_part_once():
     corner = coverage.left(np.array((19.9e-3, 9.9e-3)))
     assert corner[0] == corner[1] == corner[2] == 0.0 and corner[5] == 1.0
     assert coverage.touch(np.array((20e-3 + SIGHT, 0.0))) == 0.0
+
+
+def test_an_action_that_is_not_three_finite_numbers_is_refused(make):
+    env = make()
+    env.reset(seed=0)
+    for action in ([np.inf, 0, 0], [np.nan, 0, 0], ["1", "0", "0"], [1j, 0, 0], [], [0, 0], None):
+        with pytest.raises(UsageError, match=r"^action: expected"):
+            env.step(action)

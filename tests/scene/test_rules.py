@@ -1,6 +1,7 @@
 """What callers put in the place of a scene's values: as strict as the file, and open to numpy's numbers and paths."""
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -139,3 +140,12 @@ def test_counts_that_do_not_fit_the_field_are_refused():
     text += '[sensor]\nrows = 2\ncolumns = 2\nmode = "image"\n'
     with pytest.raises(SceneError, match=r"wire\.full_scale_counts: expected at most 255 in 8 bits .* got 256"):
         parse_scene(f"{text}{wire}full_scale_counts = 256\n")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("overrides", 3.0), ("out", []), ("out", b"runs"), ("observers", math.inf), ("bridge", 1j)]
+)
+def test_an_argument_of_another_kind_is_refused_before_anything_is_started(name, value):
+    for call in (canprobe.run, canprobe.open_cell):
+        with pytest.raises(UsageError, match=f"^{name}: expected .*, got "):
+            call("free", **{name: value})

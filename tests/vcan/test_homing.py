@@ -33,7 +33,7 @@ def test_a_run_after_up_home(bench: Any, monkeypatch: pytest.MonkeyPatch) -> Non
     line = bench.start("run", scene, *ON_VCAN0, "--out", "early").end(3)[-1]
     assert line == (
         "canprobe: node 1: (joint 1) is not homed, or was switched off or moved since; nor are 6 (joint 6); type:"
-        " canprobe up SCENE --home --bus socketcan --channel vcan0"
+        f" canprobe up {scene} --home --bus socketcan --channel vcan0"
     )
     told = bench.start("up", scene, *ON_VCAN0, "--home", "--yes").end(0)
     assert "joint 6 (joint_6) is homed: home is at 0.00 deg; it stands there" in told

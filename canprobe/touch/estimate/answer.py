@@ -23,6 +23,7 @@ from canprobe.touch.estimate.quadric import (
 from canprobe.touch.linear_algebra import (
     Array,
     Vec,
+    checked,
     homogeneous,
     inverted,
     principal,
@@ -117,7 +118,8 @@ class SurfaceEstimate:
             K: (2, 2) shape operator along its x and y, 1/m; positive where the object is convex.
             method: name of the estimator.
         """
-        K = np.array(K, dtype=np.float64)
+        K = checked("K", K, (2, 2)).copy()
+        T_frame_contact = checked("T_frame_contact", T_frame_contact, (4, 4))
         T, (kappa, local) = read_only(T_frame_contact), _principal(K)
         return cls(
             S=SurfaceMatrix.from_curvature(K).S.copy(),

@@ -24,6 +24,7 @@ from canprobe.touch.estimate.window import (
     solve_pairs,
     usable_lag,
 )
+from canprobe.touch.linear_algebra import whole
 
 METHODS = ("chen1996", "chord", "ml", "recursive")
 
@@ -108,9 +109,10 @@ def fit_surface(
         normals: (n, 3) outward unit normals of the object there.
         sigma_point: standard deviation of a point per axis: a number, (n,), or covariances (3, 3) or (n, 3, 3).
         sigma_normal: the same of a normal, rad (of a covariance only the tangential part counts).
-        method: "ml" (reaches the Cramér–Rao bound), "recursive" (the online filter run over the points, its memory the
-            length of the path), "chord", or "chen1996". The last has no robot here: its rates are differences of
-            points and normals `lag` apart, (16) with the object at rest.
+        method: "ml" (reaches the Cramér–Rao bound), "recursive" (the online filter run over the points; it remembers
+            all of a short path, of a longer one at most twice the points' extent and the surface's radius), "chord",
+            or "chen1996". The last has no robot here: its rates are differences of points and normals `lag` apart,
+            (16) with the object at rest.
         prior: for "ml" and "recursive"; None for `Prior.weak` over the path, nothing on curvature itself.
         lag: for "chen1996".
         correlation: of the noise along the path, for "ml", which weighs the samples by it, and "recursive", whose
@@ -143,7 +145,7 @@ def fit_surface(
         try:
             with np.errstate(over="ignore", invalid="ignore"):  # what is not finite has no root
                 return fitted(touches, prior, quadric)
-        except np.linalg.LinAlgError as error:
+        except (np.linalg.LinAlgError, OverflowError) as error:
             raise UsageError(
                 f"sigma_point, sigma_normal: expected those of real noise, got {sigma_point!r} and {sigma_normal!r}, "
                 f"with which the equations cannot be solved in double precision: {error}"
@@ -153,20 +155,20 @@ def fit_surface(
     if method == "chord":
         return solve_pairs(touches, chord_pairs(touches), "chord")
     if method == "chen1996":
-        if lag < 1 or lag != int(lag):
-            raise UsageError(f"lag: expected at least 1 sample, a whole number of them, got {lag}")
-        return solve_pairs(touches, lag_pairs(touches, usable_lag(len(p), int(lag))), "chen1996")
+        apart = usable_lag(len(p), whole("lag", lag, 1, "sample"))
+        return solve_pairs(touches, lag_pairs(touches, apart), "chen1996")
     raise unknown_method(method)
 
 
 def _run_filter(touches: Touches, prior: Prior | None, quadric: bool) -> SurfaceEstimate:
     """The answer of `recursive` after samples of which only place and normal are known."""
+    memory = _memory_of(touches)
     point, normal = np.sqrt(touches.noise.point_variance), np.sqrt(touches.noise.normal_variance)
     estimator = RecursiveEstimator(
         sigma_point=math.sqrt(float(np.mean(point**2))),
         sigma_normal=math.sqrt(float(np.mean(normal**2))),
-        memory_m=max(touches.distance, touches.extent),
-        window=len(point),
+        memory_m=memory,
+        window=max(1, round(len(point) * memory / max(touches.distance, touches.extent))),
         prior=prior,
         correlation=touches.correlation,
         coupling=touches.noise.coupling,
@@ -178,6 +180,23 @@ def _run_filter(touches: Touches, prior: Prior | None, quadric: bool) -> Surface
     answer = estimator.estimate()
     if answer is None:
         raise UsageError(
-            f"points: expected a path that moves beyond its noise for 'recursive', got {touches.distance:.3g} in all"
+            f"points: expected a path that moves beyond its noise for 'recursive', got {touches.distance:.3g} in all "
+            f"with sigma_point {math.sqrt(float(np.mean(point**2))):.3g}"
         )
     return answer
+
+
+EXTENTS = 2.0
+"""Longest memory over the extent of the points: a weave or a circle has seen all directions by then."""
+
+
+def _memory_of(touches: Touches) -> float:
+    """Path that `recursive` remembers, m: all of a short one; of a longer one as much as extent and radius allow.
+
+    The filter's unit of length, its steps and its prior are shares of the memory. On a long path over a small patch the
+    length of the path would make steps larger than the patch.
+    """
+    off, turned = touches.points - touches.points[-1], touches.normals - touches.normals[-1]
+    square = float(np.square(turned).sum())
+    radius = math.sqrt(float(np.square(off).sum()) / square) if square > 0.0 else math.inf  # exact on a sphere
+    return min(max(touches.distance, touches.extent), EXTENTS * touches.extent, max(radius, 0.5 * touches.extent))

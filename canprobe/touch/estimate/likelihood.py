@@ -31,7 +31,16 @@ from canprobe.touch.estimate.quadric import (
     spread_of,
     turned,
 )
-from canprobe.touch.linear_algebra import Array, checked, homogeneous, inverted, solved, tangent_rotation, upper_root
+from canprobe.touch.linear_algebra import (
+    Array,
+    checked,
+    homogeneous,
+    instance,
+    inverted,
+    solved,
+    tangent_rotation,
+    upper_root,
+)
 from canprobe.touch.surface import SurfaceMatrix
 
 _FLOOR = 20.0
@@ -67,6 +76,8 @@ class Touches(NamedTuple):
 
 def make_touches(points: Array, normals: Array, noise: Noise, correlation: Correlation | None = None) -> Touches:
     """Extent and length of arrays that are already checked."""
+    if correlation is not None:
+        instance("correlation", correlation, Correlation)
     floor = _FLOOR * math.sqrt(float(np.median(noise.point_variance)))
     offset = points - points[-1]
     extent = max(math.sqrt(float(np.einsum("ij,ij->i", offset, offset).max())), floor)
@@ -108,7 +119,7 @@ def fit_ml(touches: Touches, prior: Prior | None, quadric: bool = False) -> Surf
     `fit_surface`.
     """
     length = touches.extent
-    stated = Prior.weak(length) if prior is None else prior
+    stated = Prior.weak(length) if prior is None else instance("prior", prior, Prior)
     T = working_frame(touches)
     R = T[:3, :3]
     d = design((touches.points - T[:3, 3]) @ R / length, touches.normals @ R, touches.noise.scaled(length, R))
@@ -160,6 +171,10 @@ def _turned_spread(spread: Array, angle: float) -> Array:
     return result
 
 
+OFF_SURFACE = 10.0
+"""Distance of a point from the surface over its standard deviation, beyond which the point is taken to be off it."""
+
+
 def cramer_rao(
     points: ArrayLike,
     normals: ArrayLike,
@@ -177,7 +192,8 @@ def cramer_rao(
     method. Sorted principal curvatures are not differentiable at umbilics, so the bound is on the entries of K.
 
     Args:
-        points: (n, 3) m, on the true surface (or measured); the last row is now.
+        points: (n, 3) m, on the true surface, or measured: not further off than `OFF_SURFACE` times their noise; the
+            last row is now.
         normals: (n, 3) outward unit normals.
         S: (4, 4) the true surface in the frame of the points.
         sigma_point, sigma_normal, prior, correlation, coupling: as for `fit_surface`; the prior that the estimator has.
@@ -194,6 +210,21 @@ def cramer_rao(
     p, n = checked_arrays(points, normals, 1)
     touches = make_touches(p, n, make_noise(len(p), sigma_point, sigma_normal, coupling), correlation)
     surface = S if isinstance(S, SurfaceMatrix) else SurfaceMatrix(checked("S", S, (4, 4)))
+    gradient = surface.gradient(p)
+    off = np.abs(surface.value(p)) / np.maximum(np.sqrt(np.einsum("ij,ij->i", gradient, gradient)), 1e-300)
+    limit = OFF_SURFACE * np.sqrt(touches.noise.point_variance) + 1e-9 * np.abs(p).max()  # and rounding
+    worst = int(np.argmax(off / limit))
+    if off[worst] > limit[worst]:
+        raise UsageError(
+            f"points: expected all on S, up to {limit[worst]:.3g} off ({OFF_SURFACE:g} sigma_point), got one "
+            f"{off[worst]:.3g} off at index {worst}; S is expected in the frame and unit of the points"
+        )
+    return osculating_bound(touches, surface, prior)
+
+
+def osculating_bound(touches: Touches, surface: SurfaceMatrix, prior: Prior | None = None) -> Array:
+    """As `cramer_rao`, for a quadric that need only osculate the surface at the last point."""
+    p, n = touches.points, touches.normals
     origin = surface.project(p[-1])
     T = surface.contact_frame(origin)
     length, R = touches.extent, T[:3, :3]
@@ -204,7 +235,7 @@ def cramer_rao(
     J = linearise(c, d).jacobian()
     independent = touches.whitener()
     J = (J if independent is None else mixed(independent, J)).reshape(-1, 9)
-    stated = Prior.weak(length) if prior is None else prior
+    stated = Prior.weak(length) if prior is None else instance("prior", prior, Prior)
     root = upper_root(np.concatenate([J, stated.rows(length)[0]]))
     wide = 1e30 * np.eye(2)
     decision = decide(root[6:, 6:] * UNIT, wide, math.inf)

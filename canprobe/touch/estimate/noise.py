@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from canprobe.errors import UsageError
-from canprobe.touch.linear_algebra import Array, checked, inverted_upper, lower_root, positive
+from canprobe.touch.linear_algebra import Array, checked, inverted_upper, lower_root, positive, real_numbers
 
 CHI2_MEDIAN, CHI2_95, CHI2_99, CHI2_999 = 2.366, 7.815, 11.34, 16.27
 """Median, 95 %, 99 % and 99.9 % points of χ² with three degrees of freedom, which a sample has."""
@@ -35,7 +36,9 @@ class Correlation:
 
     def __post_init__(self) -> None:
         positive("correlation.length", self.length)
-        for name, share in (("share", self.share), ("point_share", self.shares[0])):
+        others = {} if self.point_share is None else {"point_share": self.point_share}
+        for name, value in {"share": self.share, **others}.items():
+            share = float(checked(f"correlation.{name}", value, ()))
             if not 0.0 <= share <= 1.0:
                 raise UsageError(f"correlation.{name}: expected a number from 0 to 1, got {share}")
 
@@ -112,15 +115,14 @@ def make_noise(n: int, sigma_point: ArrayLike, sigma_normal: ArrayLike, coupling
     Raises:
         UsageError: naming the field, when it has another shape, or is not finite and above 0 (definite).
     """
-    if not math.isfinite(coupling):
-        raise UsageError(f"coupling: expected a finite number, got {coupling}")
-    return Noise(_one(n, "sigma_point", sigma_point), _one(n, "sigma_normal", sigma_normal), coupling)
+    alike = float(checked("coupling", coupling, ()))
+    return Noise(_one(n, "sigma_point", sigma_point), _one(n, "sigma_normal", sigma_normal), alike)
 
 
 def _one(n: int, name: str, value: ArrayLike) -> Array:
     wanted = f"{name}: expected a number above 0, ({n},) of them, or definite covariances (3, 3) or ({n}, 3, 3)"
     try:
-        sigma = np.asarray(value, dtype=np.float64)
+        sigma = real_numbers(value)
     except (TypeError, ValueError) as error:
         raise UsageError(f"{wanted}, got {value!r}") from error
     if not np.isfinite(sigma).all():
@@ -178,19 +180,21 @@ class Prior:
     def __post_init__(self) -> None:
         checked("curvature", self.curvature, ())
         for field in ("sigma_c13", "sigma_c23", "sigma_c33", "sigma_curvature"):
-            if not getattr(self, field) > 0.0:
-                raise UsageError(f"prior.{field}: expected a number above 0, got {getattr(self, field)}")
+            value = getattr(self, field)
+            if not (isinstance(value, Real) and float(value) > 0.0):  # infinite: none
+                raise UsageError(f"prior.{field}: expected a number above 0, got {value!r}")
 
     @classmethod
     def weak(cls, length: float) -> Prior:
         """The default: nothing on curvature, `NUISANCE / length` on c13, c23, c33."""
-        s13, s23, s33 = (s / length for s in NUISANCE)
+        s13, s23, s33 = (s / positive("length", length) for s in NUISANCE)
         return cls("weak on c13, c23, c33", s13, s23, s33)
 
     @classmethod
     def flat(cls, length: float, sigma_curvature: float) -> Prior:
         """Weak on c13, c23, c33, and curvature 0 ± sigma_curvature (1/m) in every direction."""
-        s13, s23, s33 = (s / length for s in NUISANCE)
+        s13, s23, s33 = (s / positive("length", length) for s in NUISANCE)
+        sigma_curvature = positive("sigma_curvature", sigma_curvature)
         return cls(f"curvature 0 ± {sigma_curvature:.4g} per unit length", s13, s23, s33, 0.0, sigma_curvature)
 
     def rows(self, length: float) -> tuple[Array, Array]:

@@ -33,6 +33,7 @@ from canprobe.touch.estimate.start import Start
 from canprobe.touch.linear_algebra import (
     Array,
     homogeneous,
+    instance,
     inverted,
     inverted_upper,
     lower_root,
@@ -199,8 +200,8 @@ class RecursiveEstimator:
         self._gate = Gate(sigma_point, sigma_normal)
         self._memory = positive("memory_m", memory_m)
         self._quadric = quadric
-        self._crowd = CROWD * positive("window", window) / memory_m
-        self._prior = Prior.weak(memory_m) if prior is None else prior
+        self._crowd = CROWD * positive("window", window) / self._memory
+        self._prior = Prior.weak(self._memory) if prior is None else instance("prior", prior, Prior)
         if math.isfinite(self._prior.sigma_curvature):
             raise UsageError("prior: expected none on curvature itself for 'recursive', got " + self._prior.name)
         self._caution = 1.0 if correlation is None else ALIKE

@@ -15,14 +15,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.errors import UsageError
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimate.answer import Solution, SurfaceEstimate, build_estimate
 from canprobe.touch.estimate.likelihood import Touches, fit_ml, make_touches, working_frame
 from canprobe.touch.estimate.noise import Correlation, Prior, make_noise
 from canprobe.touch.estimate.online import AGREES, LAST_FEW, Dropped, Gate, looks_changed
 from canprobe.touch.estimate.quadric import TO_Q, decide, size_of
-from canprobe.touch.linear_algebra import Array, rotation_vectors, upper_root
+from canprobe.touch.linear_algebra import Array, rotation_vectors, upper_root, whole
 
 # Six-unknown linear estimates from differences of points and normals.
 
@@ -31,7 +30,11 @@ _COLUMNS = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
 """Columns of c11 c12 c13 c22 c23 c33 in the rows of S₃ y."""
 _FROM_SIX = [2, 4, 5, 0, 1, 3]
 """c13 c23 c33 c11 c12 c22 of the nine-parameter order, as places among the six."""
+_K_OF_SIX = [0, 1, 3]
+"""2 c11, 2 c12, 2 c22, which are K itself, among the six."""
 _NUMERIC = 1e-10
+_OPEN = 1e-8
+"""Part of K in a unit vector of the six that the differences leave open, from which it is no rounding."""
 
 
 class Pairs(NamedTuple):
@@ -83,23 +86,25 @@ def three_rows(y: Array) -> Array:
 def solve_pairs(touches: Touches, data: Pairs, method: str) -> SurfaceEstimate:
     """Least squares for 2 S₃, in the contact frame of the last *measured* point and normal.
 
-    By SVD; singular values below 1e-10 of the largest are left out. The covariance is propagated from the samples'
-    noise; it does not know the method's bias.
+    By SVD; singular values below 1e-10 of the largest are left out, and what of K lies along their vectors is not
+    observed: three points leave one open that mixes c33 with K. The covariance is propagated from the samples' noise;
+    it does not know the method's bias.
     """
     length = touches.extent
     A, b = three_rows(data.points), data.normals.reshape(-1)
-    U, s, Vt = np.linalg.svd(A, full_matrices=False)
-    kept = s > _NUMERIC * max(float(s[0]), 1e-300)
-    inverse = (Vt[kept].T / s[kept]) @ U[:, kept].T
+    U, s, Vt = np.linalg.svd(A, full_matrices=len(A) < 6)  # all six of Vt, however few the rows
+    rank = int(np.count_nonzero(s > _NUMERIC * max(float(s[0]), 1e-300)))
+    inverse = (Vt[:rank].T / s[:rank]) @ U[:, :rank].T
     double = inverse @ b
     residual = b - A @ double
     c = np.concatenate([np.zeros(3), 0.5 * double[_FROM_SIX]])
     size = size_of(c)
     vp = float(touches.noise.point_variance.mean()) / length**2
     variance = float(touches.noise.normal_variance.mean()) + size**2 * vp
-    k = variance * _propagated(data, inverse)[np.ix_([0, 1, 3], [0, 1, 3])]  # of 2 c11, 2 c12, 2 c22: of K itself
+    k = variance * _propagated(data, inverse)[np.ix_(_K_OF_SIX, _K_OF_SIX)]
     flat = data.points[:, :2]
-    decision = decide(_root_of(k * np.outer(TO_Q, TO_Q)), flat.T @ flat / (len(flat) * 2.0 * vp), size)
+    root_q = _root_of(k * np.outer(TO_Q, TO_Q), TO_Q[:, None] * Vt[rank:, _K_OF_SIX].T)
+    decision = decide(root_q, flat.T @ flat / (len(flat) * 2.0 * vp), size)
     return build_estimate(
         Solution(c, k, decision, has_prior=False),
         length=length,
@@ -123,11 +128,16 @@ def _propagated(data: Pairs, inverse: Array) -> Array:
     return result
 
 
-def _root_of(covariance: Array) -> Array:
-    """A root (3, 3) of the inverse of a covariance that may vanish or be singular (then: nothing is known there)."""
-    values, vectors = np.linalg.eigh(covariance)
-    inverse = np.where(values > 1e-14 * max(float(values[-1]), 1e-300), 1.0 / np.maximum(values, 1e-300), 0.0)
-    result: Array = np.sqrt(inverse)[:, None] * vectors.T
+def _root_of(covariance: Array, open_ways: Array) -> Array:
+    """A root (k, 3) of the inverse of a covariance that may vanish or be singular (then: nothing is known there).
+
+    Nothing is known along the columns of `open_ways` (3, m) either.
+    """
+    ways, sizes, _ = np.linalg.svd(open_ways)
+    known = ways[:, np.count_nonzero(sizes > _OPEN) :]
+    values, vectors = np.linalg.eigh(known.T @ covariance @ known)
+    inverse = np.where(values > 1e-14 * values.max(initial=1e-300), 1.0 / np.maximum(values, 1e-300), 0.0)
+    result: Array = np.sqrt(inverse)[:, None] * (known @ vectors).T
     return result
 
 
@@ -158,12 +168,11 @@ class WindowEstimator:
         coupling: float = 0.0,
         correlation: Correlation | None = None,
     ) -> None:
-        if window < self.least:
-            raise UsageError(f"window: expected at least {self.least} samples, got {window}")
+        kept = whole("window", window, self.least, "samples")
         self.dropped = Dropped()
         self._gate = Gate(sigma_point, sigma_normal)
         self._prior, self._coupling, self._correlation = prior, coupling, correlation
-        self._rows: deque[Sequence[float]] = deque(maxlen=window)
+        self._rows: deque[Sequence[float]] = deque(maxlen=kept)
         self._answer: SurfaceEstimate | None = None
 
     def add(self, sample: ContactSample) -> None:
@@ -268,9 +277,7 @@ class Chen1996Estimator(WindowEstimator):
 
     def __init__(self, *, sigma_point: float, sigma_normal: float, window: int, lag: int = 10) -> None:
         super().__init__(sigma_point=sigma_point, sigma_normal=sigma_normal, window=window)
-        if lag < 1:
-            raise UsageError(f"lag: expected at least 1 sample, got {lag}")
-        self._lag = lag
+        self._lag = whole("lag", lag, 1, "sample")
 
     def _row(self, sample: ContactSample) -> Sequence[float]:
         """With the probe's pose, row by row, and the contact in its frame."""

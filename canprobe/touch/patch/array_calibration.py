@@ -112,6 +112,7 @@ class StiffnessSources:
     depth_sigma: float
     arm_compliance: float
     """m/N: of what the probe stands on, from the difference of both."""
+    arm_compliance_sigma: float
 
 
 @dataclass(frozen=True, slots=True)

@@ -141,20 +141,17 @@ def calibrate_array(
         first, found = fit(fitted, own)
     errors, curvatures, force_errors = _held_out(fitted, lambda pairs: fit(pairs, own)[0], own, seen)
     ds, ss = [d for d, _ in fitted], [s for _, s in fitted]
-    k, k_sigma, compliance, _ = stiffness_by_depth(
-        ds, ss, found.forces.tolist(), pad.radius_m, found.parameters.stiffness
-    )
+    stiffness = found.parameters.stiffness
+    by_images = stiffness, stiffness * math.sqrt(float(found.covariance[0, 0]))
+    by_depth = stiffness_by_depth(ds, ss, found.forces.tolist(), pad.radius_m, by_images)
     rods = [(d, s) for d, s in good if d.name == "rod"]
     across = _rms(_checked(first, rods, own, seen)[1][:, 0]) if rods else math.nan
-    relative = math.sqrt(float(found.covariance[0, 0]))
     centroid, scatter = fit_centroids(ds, ss)
     calibration = replace(
         first,
         moments=_moment_errors(errors, ss),
         centroid=centroid,
-        stiffness=StiffnessSources(
-            found.parameters.stiffness, found.parameters.stiffness * relative, k, k_sigma, compliance
-        ),
+        stiffness=StiffnessSources(*by_images, *by_depth),
         residuals=Residuals(len(fitted), _rms(force_errors), _rms(errors[:, :2]), _rms(curvatures), across),
         dead=dead if own_gains else (),
     )
@@ -196,7 +193,7 @@ def _blank(  # noqa: PLR0917
         ImageParameters(1.0, 1.0, 1.0, 0.0, 0.0),
         NO_ERRORS,
         CentroidErrors(nan, nan, nan, nan, nan, nan, Lag(0.0, 1.0)),
-        StiffnessSources(nan, nan, nan, nan, nan),
+        StiffnessSources(nan, nan, nan, nan, nan, nan),
         Residuals(0, nan, nan, nan, nan),
     )
 

@@ -182,16 +182,22 @@ def taxel_gains(
 
 
 def stiffness_by_depth(
-    dwells: Sequence[Dwell], shown: Sequence[Shown], forces: Sequence[float], radius: float, stiffness: float
+    dwells: Sequence[Dwell],
+    shown: Sequence[Shown],
+    forces: Sequence[float],
+    radius: float,
+    by_images: tuple[float, float],
 ) -> tuple[float, float, float, float]:
     """K/h (N/m³) by how far the arm went in between touches of one place; the arm's compliance (m/N); each with its σ.
 
     On a stiff arm the way between two forces at one place is that of the layer, `δ = √(2 F √det A / (π k))`. What the
-    way has more than `stiffness`, which the images show, grows with the force: the arm's compliance.
+    way has more than the stiffness that the images show (with its σ) grows with the force: the arm's compliance. Its
+    σ is that of the ways' scatter and of that stiffness.
 
     Returns:
         NaN where no place was touched with two forces.
     """
+    stiffness, stiffness_sigma = by_images
     rows = []
     for name, place, turn in sorted({(d.name, d.place, d.turn) for d in dwells}):
         group = [i for i, d in enumerate(dwells) if (d.name, d.place, d.turn) == (name, place, turn)]
@@ -208,6 +214,8 @@ def stiffness_by_depth(
     more = push - unit / math.sqrt(stiffness)
     compliance = float(force @ more / (force @ force))
     scatter = math.sqrt(float(np.mean((more - compliance * force) ** 2)) / float(force @ force))
+    of_stiffness = 0.5 * stiffness_sigma * stiffness**-1.5 * abs(float(force @ unit)) / float(force @ force)
+    compliance_sigma = math.hypot(scatter, of_stiffness)
     if root <= 0.0:
-        return math.nan, math.nan, compliance, scatter
-    return root**-2, 2.0 * sigma / root**3, compliance, scatter
+        return math.nan, math.nan, compliance, compliance_sigma
+    return root**-2, 2.0 * sigma / root**3, compliance, compliance_sigma

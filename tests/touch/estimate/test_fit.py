@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 
 from canprobe.errors import UsageError
-from canprobe.touch.estimate.fit import METHODS, fit_surface
+from canprobe.touch.estimate.answer import SurfaceEstimate
+from canprobe.touch.estimate.fit import METHODS, fit_surface, make_estimator
 from canprobe.touch.estimate.likelihood import cramer_rao
-from canprobe.touch.estimate.noise import Prior
+from canprobe.touch.estimate.noise import Correlation, Prior
+from canprobe.touch.surface import SurfaceMatrix
+from canprobe.touch.surface_map import SurfaceMap
 
 TINY = {"sigma_point": 1e-9, "sigma_normal": 1e-9}
 WEIGHT = np.array([1.0, 2.0, 1.0])
@@ -96,6 +99,26 @@ def test_tight_curvature_needs_the_points_noise_in_the_normals(truth):
     assert frobenius(np.mean(errors, axis=0)) < 0.4 * bound
 
 
+@pytest.mark.parametrize("method", ["chord", "chen1996"])
+@pytest.mark.parametrize(("count", "rank"), [(3, 2), (4, 3), (40, 3)])
+def test_differences_of_three_points_leave_one_combination_open(count, rank, method):
+    """S y is known of two y: S may have any multiple of m mᵀ more, m across both; on a curve m is not the normal."""
+    surface = SurfaceMatrix.sphere(0.05)
+    x, y = np.random.default_rng(0).uniform(-0.01, 0.01, size=(2, count))
+    points = np.stack([x, y, surface.height(x, y)], axis=1)
+    e = fit_surface(points, surface.normal(points), sigma_point=1e-6, sigma_normal=1e-5, method=method, lag=1)
+    assert e.rank == rank
+    assert e.observed.tolist() == [True, rank == 3]
+    if rank == 3:
+        assert e.kappa == pytest.approx([20.0, 20.0], rel=1e-6)
+        return
+    first, second = (points[-1] - points[:-1]) @ e.T_frame_contact[:3, :3]
+    m = np.cross(first, second)
+    hidden = m[[0, 0, 1]] * m[[0, 1, 1]] * [1.0, math.sqrt(2.0), 1.0]
+    assert np.allclose(e.combinations @ hidden, 0.0, atol=1e-9 * np.linalg.norm(hidden))
+    assert np.isnan(e.kappa[1])
+
+
 class TestUnobserved:
     NOISE = ((5e-5, 3e-3), (2e-5, 1e-3))
 
@@ -144,6 +167,47 @@ class TestUnobserved:
         C = cramer_rao(path.points, path.normals, path.surface, sigma_point=2e-5, sigma_normal=1e-3)
         assert np.isfinite(C[:2, :2]).all()
         assert np.isinf(C[2, 2])
+
+
+def long_path(kind, size):
+    """x, y of a long path over a patch of a size (m) that ends inside it, 1/80 of the size a sample."""
+    t = np.linspace(0.0, 1.0, 20_001)
+    if kind == "spiral":
+        x, y = (0.5 * (1.0 - t) * f(24.0 * np.pi * t) for f in (np.cos, np.sin))
+    elif kind == "circles":
+        x, y = (0.5 * f(20.0 * np.pi * t) for f in (np.cos, np.sin))
+    else:  # lines there and back, each a little further on
+        lines = 4 if kind == "dwell" else 20
+        x, y = np.abs(lines * t % 2.0 - 1.0) - 0.5, t - 0.5
+    s = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
+    at = np.arange(0.0, s[-1], 1 / 80)
+    if kind == "dwell":
+        at = np.sort(np.concatenate([at, np.full(1000, 0.6 * s[-1])]))
+    return size * np.interp(at, s, x), size * np.interp(at, s, y)
+
+
+@pytest.mark.parametrize("kind", ["zigzag", "spiral", "circles", "dwell"])
+@pytest.mark.parametrize(
+    ("radius", "K"), [(5e-3, [[1, 0], [0, 1]]), (0.05, [[1, 0], [0, 0]]), (10.0, [[1, 0], [0, -0.5]])]
+)
+def test_recursive_on_a_long_path_over_a_small_patch(radius, K, kind, truth):
+    """Up to 31 times the patch's size of path: its memory goes by the patch and by the surface's radius."""
+    size = min(0.4 * radius, 0.02)
+    path = truth.placed(SurfaceMatrix.from_curvature(np.array(K) / radius), *long_path(kind, size))
+    noise = {"sigma_point": size / 600, "sigma_normal": 1e-3}
+    for seed in range(2):
+        e = fit_surface(*path.noisy(*noise.values(), seed), **noise, method="recursive")
+        error = path.error(e)
+        assert e.rank == 3
+        assert error @ np.linalg.solve(e.covariance, error) < 16.27  # 99.9 %
+        assert frobenius(error) * size < 0.02
+        assert e.distance <= 3.0 * size
+
+
+def test_recursive_refuses_only_what_does_not_move(truth):
+    rest = truth.placed(truth.surface("cylinder"), np.zeros(400), np.zeros(400))
+    with pytest.raises(UsageError, match="beyond its noise"):
+        fit_surface(*rest.noisy(2e-5, 1e-3, 0), sigma_point=2e-5, sigma_normal=1e-3, method="recursive")
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -232,8 +296,6 @@ def test_the_bound_scales_with_noise_and_samples(truth):
 
 def test_the_bound_against_numerical_information():
     """One unknown at a time cannot be checked in closed form, a plane can: slopes of normals over places."""
-    from canprobe.touch.surface import SurfaceMatrix
-
     rng = np.random.default_rng(0)
     p = np.zeros((50, 3))
     p[:, :2] = rng.uniform(-0.01, 0.01, size=(50, 2))
@@ -244,6 +306,20 @@ def test_the_bound_against_numerical_information():
     xx, xy, yy = x[:, 0] @ x[:, 0], x[:, 0] @ x[:, 1], x[:, 1] @ x[:, 1]
     information = np.array([[xx, xy, 0], [xy, xx + yy, xy], [0, xy, yy]]) / 1e-6
     assert np.allclose(C, np.linalg.inv(information), rtol=1e-6)
+
+
+@pytest.mark.parametrize("off", [3e-4, 1e-2, 50.0])
+@pytest.mark.parametrize("index", [0, -1])
+def test_the_bound_refuses_points_off_the_surface(index, off, truth):
+    path = truth.path("ellipsoid")
+    noise = {"sigma_point": 2e-5, "sigma_normal": 1e-3}
+    assert np.isfinite(cramer_rao(*path.noisy(2e-5, 1e-3, 0), path.surface, **noise)).all()
+    points = path.points.copy()
+    points[index] += off * path.normals[index]
+    with pytest.raises(UsageError, match=rf"^points: expected all on S, .*at index {index % 160};"):
+        cramer_rao(points, path.normals, path.surface, **noise)
+    with pytest.raises(UsageError, match=r"^points: expected all on S"):
+        cramer_rao(1e3 * path.points, path.normals, path.surface, **noise)
 
 
 def bad(points=None, normals=None, **kw):
@@ -273,6 +349,34 @@ def bad(points=None, normals=None, **kw):
         (bad(points=np.ma.masked_equal(np.eye(5, 3), 1.0)), "points"),
         (bad(sigma_point="fine"), "sigma_point"),
         (bad(coupling=np.nan), "coupling"),
+        (bad(coupling="no"), "coupling"),
+        (bad(points=[]), "points"),
+        (bad(points=np.zeros((5, 3)) + 1j), "points"),
+        (bad(points=np.full((5, 3), "1")), "points"),
+        (bad(points=[[0, 0, 10**400]] * 5), "points"),
+        (bad(sigma_point="1e-5"), "sigma_point"),
+        (bad(sigma_normal=1e-3 + 0j), "sigma_normal"),
+        (bad(method="chen1996", lag="10"), "lag"),
+        (bad(prior="flat"), "prior"),
+        (bad(method="recursive", prior=0.1), "prior"),
+        (bad(correlation=0.002), "correlation"),
+        (lambda: Correlation("2 mm"), "correlation.length"),
+        (lambda: Correlation(2e-3, 0.5, "all"), "correlation.point_share"),
+        (lambda: Prior("x", "1", 1.0, 1.0), "prior.sigma_c13"),
+        (lambda: Prior.weak("20 mm"), "length"),
+        (lambda: SurfaceMatrix([]), "S"),
+        (lambda: SurfaceMatrix.cylinder(0.1, axis=[1, 0, 0]), "axis"),
+        (lambda: SurfaceMatrix.from_curvature(np.eye(2), c13="1"), "c13, c23, c33"),
+        (lambda: SurfaceMatrix.plane() + 1.0, "sum"),
+        (lambda: "2" * SurfaceMatrix.plane(), "factor"),
+        (lambda: SurfaceMatrix.plane().value([1j, 0, 0]), "points"),
+        (lambda: SurfaceMatrix.plane().normal([0, 0]), "points"),
+        (lambda: SurfaceMatrix.plane().height("0", 0.0), "x"),
+        (lambda: SurfaceMap(patches=None, path=np.zeros((1, 3))), "patches"),
+        (lambda: SurfaceMap(patches=(), path=[]), "path"),
+        (lambda: SurfaceEstimate.of(np.eye(4), "K"), "K"),
+        (lambda: make_estimator("ml", sigma_point=1e-5, sigma_normal=1e-3, window="many"), "window"),
+        (lambda: make_estimator("recursive", sigma_point=1e-5, sigma_normal=1e-3, memory_m="20 mm"), "memory_m"),
         (lambda: cramer_rao(np.zeros((5, 3)), np.eye(3)[[2] * 5], "S", sigma_point=1, sigma_normal=1), "S"),
         (lambda: Prior("x", 0.0, 1.0, 1.0), "prior.sigma_c13"),
     ],

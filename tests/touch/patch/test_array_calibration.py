@@ -9,6 +9,7 @@ import pytest
 from canprobe.emulator.plant.probe import depth_for_force
 from canprobe.emulator.plant.taxels import TaxelArray, TaxelConfig
 from canprobe.errors import SceneError, UsageError
+from canprobe.results.array_report import as_document, calibration_text
 from canprobe.scene.calibrations import dump_calibration, load_calibration
 from canprobe.studies.arrays import RADIUS_M, Presses, measure, random_array
 from canprobe.touch.pad import Pad
@@ -60,6 +61,17 @@ def test_gains_of_the_taxels_are_found(fit, touched):
     assert np.corrcoef(fit.gains[known], gains[known])[0, 1] > 0.8
     assert fit.gained < fit.plain
     assert fit.calibration.gains == () or np.shape(fit.calibration.gains) == (16, 16)
+
+
+def test_the_arms_compliance_has_its_deviation(fit):
+    """Nothing gives in this setup: the compliance is 0 within what is stated, and the text and file say so."""
+    k = fit.calibration.stiffness
+    assert 0.0 < k.arm_compliance_sigma < 5e-6
+    assert abs(k.arm_compliance) < 3.0 * k.arm_compliance_sigma
+    shown = f"{1e6 * k.arm_compliance:.1f} ± {1e6 * k.arm_compliance_sigma:.1f} µm/N"
+    assert shown in calibration_text(fit)
+    assert as_document(fit)["arm_compliance_sigma_um_n"] == 1e6 * k.arm_compliance_sigma
+    assert "arm_compliance_sigma_um_n = " in dump_calibration(fit.calibration)
 
 
 def test_without_a_reference_newtons_are_nominal_and_stiffness_goes_with_them(fit, touched):
