@@ -229,7 +229,10 @@ class OuterRun:
         (folder / "items.json").write_text(json.dumps(nodeids))
         (folder / "reports.jsonl").touch()
         files = dict.fromkeys(nodeid.partition("::")[0] for nodeid in nodeids)
-        options = ["-n0", "-m", "vcan", f"--rootdir={self._config.rootpath}", f"--tb={self._config.option.tbstyle}"]
+        options = [
+            *("-n0", "-m", "vcan", f"--rootdir={self._config.rootpath}", f"--tb={self._config.option.tbstyle}"),
+            f"--basetemp={folder / 'tmp'}",  # a guest's root refuses a folder of pytest's that a user has made
+        ]
         end_with_us = ["setpriv", "--pdeathsig", "TERM"] if shutil.which("setpriv") else []  # however we end
         with (folder / "output").open("wb") as output:
             self._process = subprocess.Popen(

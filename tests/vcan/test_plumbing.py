@@ -40,8 +40,9 @@ import pytest
 pytestmark = pytest.mark.vcan
 
 @pytest.mark.parametrize("n", [1, 2])
-def test_inside(vcan0, n):
+def test_inside(vcan0, n, tmp_path):
     assert (vcan0, os.environ["INSIDE"]) == ("vcan0", "1")
+    assert tmp_path.is_relative_to(os.environ["CANPROBE_TEST_VCAN_FOLDER"]), "not one that another user may own"
 
 def test_bad(vcan0):
     print("said before")
