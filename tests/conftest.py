@@ -6,7 +6,7 @@ they are skipped, and the summary says what to type. Folders of tests are shared
 the vcan tests, one after the other, are the share of one worker, which waits for the guest on a processor of its own.
 
     CANPROBE_NO_SKIPS=1   a test that is skipped has failed, unless its reason is one of `ALLOWED_SKIPS`
-    CANPROBE_INSTALL=1    install the guest's Debian package if it is missing (needs root)
+    CANPROBE_INSTALL=1    install the Debian packages that tests use and that are missing, with sudo (`system_packages`)
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ import hypothesis
 import pytest
 import sharing
 import standstill
+import system_packages
 
 from canprobe.bus.socketcan import check_interface
 from canprobe.errors import InterfaceError
@@ -76,10 +77,10 @@ def pytest_configure(config: pytest.Config) -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)  # or no child would hear the interrupt of its test
     if folder := os.environ.get(_INNER):
         config.pluginmanager.register(InnerRun(config, Path(folder)))
-    elif not _has_interface():
-        if os.environ.get("CANPROBE_INSTALL") == "1" and not sharing.is_worker(config):
-            install = [*_CANPROBE, "vcan", "--install", "--", "true"]
-            subprocess.run(install, cwd=config.rootpath, stdin=subprocess.DEVNULL, check=False)
+        return
+    if os.environ.get("CANPROBE_INSTALL") == "1" and not sharing.is_worker(config):
+        system_packages.install_missing()
+    if not _has_interface():
         config.pluginmanager.register(OuterRun(config))
 
 
@@ -228,7 +229,10 @@ class OuterRun:
         (folder / "items.json").write_text(json.dumps(nodeids))
         (folder / "reports.jsonl").touch()
         files = dict.fromkeys(nodeid.partition("::")[0] for nodeid in nodeids)
-        options = ["-n0", "-m", "vcan", f"--rootdir={self._config.rootpath}", f"--tb={self._config.option.tbstyle}"]
+        options = [
+            *("-n0", "-m", "vcan", f"--rootdir={self._config.rootpath}", f"--tb={self._config.option.tbstyle}"),
+            f"--basetemp={folder / 'tmp'}",  # a guest's root refuses a folder of pytest's that a user has made
+        ]
         end_with_us = ["setpriv", "--pdeathsig", "TERM"] if shutil.which("setpriv") else []  # however we end
         with (folder / "output").open("wb") as output:
             self._process = subprocess.Popen(

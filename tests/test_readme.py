@@ -8,6 +8,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
+import system_packages
 from command_lines import command_lines, parse
 from undrawn import undrawn_run
 
@@ -125,6 +126,20 @@ def test_the_api_reference_has_every_public_name():
     public = set(canprobe.__all__) - errors - {"__version__"}
     modules = {"canprobe.errors", *(f"canprobe.tasks.{name}" for name in canprobe.tasks.__all__)}
     assert rendered >= {*modules, *(f"canprobe.{name}" for name in public)}
+
+
+def test_the_first_screen_has_two_lines_to_type_with_all_of_their_set_up():
+    """`.ci/fresh` types them on a fresh machine."""
+    screen = "\n".join(TEXTS["README.md"].splitlines()[:24])
+    first, tests = re.findall(r"^```\w*\n(.*?)\n```$", screen, re.S | re.M)
+    for line in (first, tests):
+        assert "\n" not in line and line.startswith("sudo apt-get update && sudo apt-get install -y python3-venv && ")
+    assert first.endswith(" && canprobe run cylinder") and tests.endswith(" && CANPROBE_INSTALL=1 python -m pytest")
+
+
+def test_the_readme_names_each_package_that_pytest_installs():
+    named = set(re.findall(r"`([\w-]+)`", TEXTS["README.md"]))
+    assert named >= {*system_packages.PROGRAMS, *system_packages.LIBRARIES}
 
 
 def test_the_readme_stays_short():

@@ -261,8 +261,8 @@ class GuestJob:
         prefix, self._spinner = _pin() if realtime else (_favour(), None)
         if shutil.which("setpriv"):
             prefix = ["setpriv", "--pdeathsig", "TERM", *prefix]  # the guest ends with us, however we end
-        memory_folder, memory = _memory()
-        environment = {**os.environ, "TMPDIR": memory_folder, "PATH": _search_path()}
+        folder, memory = memory_folder(("/dev/shm", tempfile.gettempdir(), "/tmp", "/var/tmp"))
+        environment = {**os.environ, "TMPDIR": folder, "PATH": _search_path()}
         if _has_wide_registers():
             environment["LD_PRELOAD"] = _compile_xstate(self._job)
         arguments = [
@@ -341,14 +341,32 @@ def _hidden(folder: str) -> bool:
     return any(path == top or path.startswith(top + "/") for top in _HIDDEN)
 
 
-def _memory() -> tuple[str, int]:
-    """Return where the guest's memory file lies and its bytes: in RAM if that may be executed, else on disk."""
-    with contextlib.suppress(OSError):
-        state = os.statvfs("/dev/shm")
+def memory_folder(folders: Sequence[str]) -> tuple[str, int]:
+    """Return the first folder that can hold the guest's memory file, and the bytes for it.
+
+    Args:
+        folders: what is tried, one after the other; one in RAM is quicker than one on a disk.
+
+    Raises:
+        GuestError: none of them can, each with its reason.
+    """
+    problems = []
+    for folder in dict.fromkeys(folders):
+        try:
+            state = os.statvfs(folder)
+            tempfile.TemporaryFile(dir=folder).close()  # what access(2) says of root is not always true
+        except OSError as error:
+            problems.append(f"{folder} cannot be written ({error.strerror})")
+            continue
         free = state.f_bavail * state.f_frsize
-        if not state.f_flag & os.ST_NOEXEC and free >= _MEMORY // 4:
-            return "/dev/shm", min(_MEMORY, free)
-    return tempfile.gettempdir(), _MEMORY
+        if state.f_flag & os.ST_NOEXEC:
+            problems.append(f"{folder} is mounted noexec")
+        elif free < _MEMORY // 4:
+            problems.append(f"{folder} has {free >> 20} MiB free, of {_MEMORY // 4 >> 20}")
+        else:
+            return folder, min(_MEMORY, free)
+    wanted = f"a folder that can be written, is not mounted noexec and has {_MEMORY // 4 >> 20} MiB free"
+    raise GuestError(f"no folder for the guest's memory: {'; '.join(problems)}; set TMPDIR to {wanted}", False)
 
 
 def _on_last_processor() -> list[str]:

@@ -10,7 +10,7 @@ import pytest
 
 import canprobe
 import canprobe.cli
-from canprobe.bus.link import LinkState, parse_link, read_link, setting_line
+from canprobe.bus.link import LinkState, parse_link, read_link, setting_line, sudo
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.bus.port import ControllerState, VirtualClock
 from canprobe.errors import InterfaceError
@@ -159,7 +159,7 @@ def test_a_wrong_bit_rate_ends_it_and_the_rest_is_said(ip):
     ip["can0"] = (PASSIVE, "")
     said = []
     with pytest.raises(
-        InterfaceError, match=r"^can0: its bit rate is 250000 bit/s, the scene's 1000000; type: ip link"
+        InterfaceError, match=rf"^can0: its bit rate is 250000 bit/s, the scene's 1000000; type: {sudo()}ip link"
     ):
         check_links("socketcan", {"can0": EXPECTED}, said.append)
     assert len(said) == 1 and said[0].startswith("warning: can0: it is error-passive")
@@ -284,8 +284,8 @@ def test_whoever_only_looks_is_warned_of_a_wrong_bit_rate_and_goes_on(ip, silent
 
 
 RESTART, EMPTY = (
-    "then type: ip link set can0 type can restart",
-    "then type: ip link set can0 down && ip link set can0 up",
+    f"then type: {sudo()}ip link set can0 type can restart",
+    f"then type: {sudo()}ip link set can0 down && {sudo()}ip link set can0 up",
 )
 UNHEARD, BROKEN = "nobody acknowledges what it sends", "frames arrive broken"
 TROUBLES = [

@@ -9,11 +9,13 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from canprobe.cli import main
 from canprobe.vcan import launch as vcan
+from canprobe.vcan.guest import GuestError, memory_folder
 from canprobe.vcan.launch import LocalJob, caught_signals, supervise
 
 
@@ -122,6 +124,30 @@ def nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
     """A machine without SocketCAN and without the guest."""
     monkeypatch.setattr(vcan, "has_socketcan", lambda: False)
     monkeypatch.setattr(vcan, "missing_packages", lambda: ["user-mode-linux"])
+
+
+def test_the_guests_memory_is_where_it_can_be_written_or_it_says_why_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken, small, barred, good = (tmp_path / name for name in ("taken", "small", "barred", "good"))
+    taken.write_bytes(b"")
+    for folder in (small, barred, good):
+        folder.mkdir()
+
+    def statvfs(folder: str) -> SimpleNamespace:
+        free, flags = (300 if folder == str(small) else 800), (os.ST_NOEXEC if folder == str(barred) else 0)
+        return SimpleNamespace(f_bavail=free, f_frsize=1 << 20, f_flag=flags)
+
+    monkeypatch.setattr("canprobe.vcan.guest.os.statvfs", statvfs)
+    bad = [str(tmp_path / "absent"), str(taken), str(small), str(barred)]
+    assert memory_folder([*bad, str(good)]) == (str(good), 800 << 20)
+    with pytest.raises(GuestError) as caught:
+        memory_folder(bad)
+    absent, file, full, noexec, advice = str(caught.value).removeprefix("no folder for the guest's memory: ").split(";")
+    assert absent.endswith("absent cannot be written (No such file or directory)")
+    assert file.endswith("taken cannot be written (Not a directory)")
+    assert full.endswith("small has 300 MiB free, of 512") and noexec.endswith("barred is mounted noexec")
+    assert "set TMPDIR to a folder that can be written" in advice and not caught.value.started
 
 
 @pytest.mark.usefixtures("nowhere")
