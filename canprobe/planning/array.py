@@ -97,7 +97,8 @@ def array_problems(setup: Setup) -> Iterator[str]:
     array, task, support = setup.array, setup.task, support_of(setup)
     if array is None or support is None:
         return
-    yield from _unreadable(array)
+    if not support.centroid:
+        yield from _unreadable(array)
     what = 'task.kind = "scan"' if setup.scan is not None else 'task.kind = "calibrate"'
     if setup.scan is not None or isinstance(task, Calibrate):
         needs = "its contact must be able to move over the sphere of a probe; press or listen with it"

@@ -6,7 +6,7 @@ import itertools
 import re
 import textwrap
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from heapq import heappop, heappush
 from typing import Any, Literal
 
@@ -19,6 +19,7 @@ from canprobe.planning.model import (
     CycleBudget,
     Plan,
     PlannedBus,
+    PlannedNode,
     PlannedPdo,
     Traffic,
 )
@@ -406,10 +407,7 @@ def plan_dict(plan: Plan) -> dict[str, Any]:
             "produced_ms": HEARTBEAT_PRODUCED_MS,
             "consumed_ms": HEARTBEAT_CONSUMED_MS,
         },
-        "nodes": [
-            asdict(node) | {"switched_off": [{"direction": way, "number": number} for way, number in node.switched_off]}
-            for node in plan.nodes
-        ],
+        "nodes": [_node(node) for node in plan.nodes],
         "pdos": [_pdo(pdo) for pdo in plan.pdos],
         "raw_frames": [_in_us(asdict(frames)) for frames in plan.raw],
         "array": _array(setup),
@@ -467,6 +465,15 @@ def _array(setup: Setup) -> dict[str, Any] | None:
         "rate_hz": array.rate_hz,
         "taxels_pressed": support.taxels if setup.touch is not None else None,
         "supports": {"force": True, "centroid": support.centroid, "curvature": support.curvature},
+    }
+
+
+def _node(node: PlannedNode) -> dict[str, Any]:
+    """A node without its dictionary, which is as large as its EDS."""
+    return {item.name: getattr(node, item.name) for item in fields(node) if item.name != "dictionary"} | {
+        "identity": asdict(node.identity),
+        "switched_off": [{"direction": way, "number": number} for way, number in node.switched_off],
+        "interpolation": [asdict(period) for period in node.interpolation],
     }
 
 
