@@ -121,8 +121,8 @@ def test_a_hollow_tighter_than_the_probe(command, tmp_path):
 @pytest.mark.parametrize(
     ("place", "contact"),
     [
-        ("[-500, -122.5, 374]", "(-500.0, -122.5, 377.0) mm out of reach"),
-        ("[-0.5, -0.1225, 0.374]", "(-0.5, -0.1, 3.4) mm (are these metres?) out of reach"),
+        ("[-500, -122.5, 374]", "(-500.0, -122.5, 374.0) mm out of reach"),
+        ("[-0.5, -0.1225, 0.374]", "(-0.5, -0.1, 0.4) mm (are these metres?) out of reach"),
     ],
 )
 def test_an_object_out_of_reach(command, place, contact, tmp_path):
