@@ -82,7 +82,7 @@ def _mesh(path: Path, changed_ns: int, unit: float, spacing: float, origin_mm: t
 def _refuse_other_content(path: Path) -> None:
     """Name what stands in the place of a file that was not downloaded, or not whole."""
     try:
-        with path.open("rb") as file:
+        with regular_file(path).open("rb") as file:
             start = file.read(200)
     except OSError:  # which its reader names
         return
