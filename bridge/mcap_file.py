@@ -24,7 +24,7 @@ from canprobe.eds.packaged import eds_file
 from canprobe.errors import ResultsError, UsageError
 from canprobe.planning.bridges import BRIDGES
 from canprobe.planning.model import Plan
-from canprobe.scene.load import dump_scene
+from canprobe.scene.load import SAVED_AS
 
 
 class McapSink:
@@ -124,7 +124,7 @@ def _qos_yaml(topic: Topic) -> str:
 
 def _attachments(plan: Plan, folder: Path, summary: str | None) -> Iterator[tuple[str, str, bytes]]:
     """Name, media type and content of what a recording carries; without a summary the one in the folder, if any."""
-    yield "scene.toml", "application/toml", dump_scene(plan.scene).encode()
+    yield SAVED_AS, "application/toml", plan.files[SAVED_AS]
     for eds in dict.fromkeys(node.eds for node in plan.nodes):
         path = eds_file(eds)
         yield path.name, "text/plain", path.read_bytes()

@@ -213,5 +213,5 @@ def test_the_command_writes_every_format(tmp_path, capsys):
     assert {path.name for path in (tmp_path / "new").iterdir()} == {file.rpartition("/")[2] for file in files}
     assert len(files) == 6 + 1 + 1 + 2
     (tmp_path / "taken").write_text("")
-    assert main(["plan", "free", "--export", "dcf", "--out", str(tmp_path / "taken")]) == 2
-    assert "taken: File exists" in capsys.readouterr().err
+    assert main(["plan", "free", "--export", "dcf", "--out", str(tmp_path / "taken")]) == 3
+    assert "taken: cannot be written: File exists" in capsys.readouterr().err
