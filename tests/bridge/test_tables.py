@@ -83,7 +83,7 @@ def test_what_is_no_table_is_refused_in_a_line(tmp_path):
     with pytest.raises(UsageError, match="columns of 2, 3 rows"):
         to_frame({"a": np.zeros(2), "b": np.zeros(3)})
     (tmp_path / "a.parquet").write_text("nothing")
-    for name, said in (("a.parquet", "expected Parquet"), ("b.parquet", "no such file"), ("b.npz", "No such file")):
+    for name, said in (("a.parquet", "expected Parquet"), ("b.parquet", "No such file"), ("b.npz", "No such file")):
         with pytest.raises(UsageError, match=f"{name}.*{said}"):
             load_table(tmp_path / name)
 
