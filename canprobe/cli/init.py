@@ -72,11 +72,10 @@ def run(args: argparse.Namespace) -> int:
     cell = f"{written_by_line()}{_urdf_cell(args) if args.urdf else _dh_cell(args)}"
     with _folder_or_nothing(folder):
         for path in {*args.eds, *([args.urdf] if args.urdf else [])}:
-            if path.resolve() != (folder / path.name).resolve():
-                with writing(folder / path.name):
-                    (folder / path.name).write_bytes(
-                        with_meshes_found(path) if path == args.urdf else path.read_bytes()
-                    )
+            copy = folder / path.name
+            if path.resolve() != copy.resolve():
+                with writing(copy):
+                    copy.write_bytes(with_meshes_found(path) if path == args.urdf else path.read_bytes())
         first, no_scan = _first_scene(folder, cell)
         write_text(folder / "first.toml", f"{written_by_line()}{first}")
     print(f"wrote {folder / 'cell.toml'} and {folder / 'first.toml'}")

@@ -244,6 +244,13 @@ def _fitted(samples: Array, weights: Array, spacing: float, at: Array) -> Fit:
     cell = np.clip(place.astype(np.intp), 0, cells - 1)
     (bx, by) = (_basis((place - cell)[:, axis]) for axis in (0, 1))
     columns = (cell[:, 0, None] + np.arange(4))[:, :, None] * n + (cell[:, 1, None] + np.arange(4))[:, None, :]
+    filled = np.zeros((m - 1, n - 1), dtype=bool)
+    filled[cell[:, 0] + 1, cell[:, 1] + 1] = True
+    there = filled[:-1, :-1] | filled[1:, :-1] | filled[:-1, 1:] | filled[1:, 1:]
+    x, y = 1e3 * (high - low)
+    nearly_empty = f"the mesh is {x:.3g} mm by {y:.3g} mm and nearly empty: remove vertices far away"
+    if there.mean() < EMPTY:
+        raise ValueError(nearly_empty)
     values = bx[:, :, None] * by[:, None, :]
     count = len(samples)
     A = sparse.csr_array((values.ravel(), (np.repeat(np.arange(count), 16), columns.ravel())), shape=(count, m * n))
@@ -256,9 +263,8 @@ def _fitted(samples: Array, weights: Array, spacing: float, at: Array) -> Fit:
         factors = splu(
             normal.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
         )
-    except RuntimeError as error:  # singular: nearly all of the grid is empty
-        x, y = 1e3 * (high - low)
-        raise ValueError(f"the mesh is {x:.3g} mm by {y:.3g} mm and nearly empty: remove vertices far away") from error
+    except RuntimeError as error:  # singular
+        raise ValueError(nearly_empty) from error
     found = factors.solve(weighted @ samples[:, 2])
     c = found.reshape(m, n)
     c = (c[:-2] + 4.0 * c[1:-1] + c[2:]) / 6.0
@@ -272,12 +278,6 @@ def _fitted(samples: Array, weights: Array, spacing: float, at: Array) -> Fit:
         near = (A.T @ np.ones(count)).reshape(m, n)[1:-1, 1:-1]
         edges &= near > 0.0
         heights[edges] = (A.T @ samples[:, 2]).reshape(m, n)[1:-1, 1:-1][edges] / near[edges]
-    filled = np.zeros((m - 1, n - 1), dtype=bool)
-    filled[cell[:, 0] + 1, cell[:, 1] + 1] = True
-    there = filled[:-1, :-1] | filled[1:, :-1] | filled[:-1, 1:] | filled[1:, 1:]
-    if there.mean() < EMPTY:
-        x, y = 1e3 * (high - low)
-        raise ValueError(f"the mesh is {x:.3g} mm by {y:.3g} mm and nearly empty: remove vertices far away")
     ox, oy = (at - 0.5 * (low + high)).tolist()
     return Fit(heights, spacing, (ox, oy), there)
 
