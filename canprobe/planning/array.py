@@ -29,6 +29,8 @@ from canprobe.scene.setup import Array, Calibrate, Setup, Touch
 What = Literal["image", "start", "stop", "poll"]
 CENTROID_TAXELS, CURVATURE_TAXELS = 4, 16
 """Taxels under the patch from which there is a centroid, and second moments."""
+COARSE_SHARE = 0.1
+"""Share of a sphere's radius: taxels that are nearer to each other than this see the contact of 1 N from all sides."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +99,7 @@ def array_problems(setup: Setup) -> Iterator[str]:
     array, task, support = setup.array, setup.task, support_of(setup)
     if array is None or support is None:
         return
-    if not support.centroid:
+    if not array.pad.is_flat and array.pad.pitch_m > COARSE_SHARE * array.pad.radius_m:
         yield from _unreadable(array)
     what = 'task.kind = "scan"' if setup.scan is not None else 'task.kind = "calibrate"'
     if setup.scan is not None or isinstance(task, Calibrate):

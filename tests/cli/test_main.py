@@ -50,7 +50,8 @@ def calls(monkeypatch):
     fake("run", FakeResult())
     fake("up")
     fake("emulate")
-    fake("scan", [{"node_id": 1, "state": "pre-operational", "vendor_id": 0xCA5E, "product_code": None}])
+    one = dict.fromkeys(("product_code", "revision_number", "serial_number", "device_name"))
+    fake("scan", [{"node_id": 1, "state": "PRE_OPERATIONAL", "devices": 1, "vendor_id": 0xCA5E, **one}])
     return seen
 
 
@@ -360,8 +361,9 @@ def test_scan_prints_a_table_or_json(calls, capsys):
     assert json.loads(capsys.readouterr().out)[0]["vendor_id"] == 0xCA5E
     assert main(["scan", "--channel", "vcan0"]) == 0
     header, row = capsys.readouterr().out.splitlines()
-    assert header.split() == ["node_id", "state", "vendor_id", "product_code"]
-    assert row.split() == ["1", "pre-operational", "0xca5e", "-"]
+    numbers = ["vendor_id", "product_code", "revision_number", "serial_number"]
+    assert header.split() == ["node_id", "state", *numbers, "device_name"]
+    assert row.split() == ["1", "PRE_OPERATIONAL", "0xca5e", "-", "-", "-", "-"]
     assert calls[0][:2] == ("scan", (api.Target("socketcan", "vcan0", 1_000_000),))
 
 

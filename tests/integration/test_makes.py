@@ -362,18 +362,8 @@ def test_the_pdo_that_carries_nothing_else_is_preferred(tmp_path):
 
 def test_a_fixed_pdo_whose_other_values_have_no_safe_default_is_refused(tmp_path):
     make = fixed_pdos(("tpdo", 1, (S, P), {}))
-    make.objects.update(
-        pdo(
-            "rpdo",
-            1,
-            (
-                W,
-                word(0x60FF, 0, 32),
-            ),
-            fixed=True,
-        )
-        | pdo("rpdo", 2, (T,), fixed=True)
-    )
+    make.objects[0x60FF, 0] = Entry("Target velocity", "I32", "rw", "", mappable=True)
+    make.objects.update(pdo("rpdo", 1, (W, word(0x60FF, 0, 32)), fixed=True) | pdo("rpdo", 2, (T,), fixed=True))
     (problem,) = reasons(scene_of(make, tmp_path))
     assert problem.startswith("nodes 1, 2, 3, 4, 5, 6: ")
     assert "RPDO1 also writes 60FFh:00, whose EDS entry has no default" in problem

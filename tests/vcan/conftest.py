@@ -88,13 +88,17 @@ class Command:
         return status
 
     def end(self, status: int) -> list[str]:
-        """Wait for the end with this status; return the lines on stderr. Nothing may be left of it."""
+        """Wait for the end with this status. Nothing may be left of it.
+
+        Returns:
+            The lines on stderr, without the warning of the patience that the scenes of a slow machine need.
+        """
         ended = self._process.wait(PATIENCE_S)
         assert ended == status, f"ended with {ended}: {self.err}"
         assert "Traceback" not in self.err
         assert self.children == []
         assert list(self.temporary.iterdir()) == [], "temporary files are left"
-        return self.err.splitlines()
+        return [line for line in self.err.splitlines() if not line.startswith("warning: arm.missed_syncs = ")]
 
     def kill(self) -> None:
         for pid in self.children:
