@@ -255,7 +255,8 @@ def object_mesh(shape: PlacedShape) -> Mesh:
     if isinstance(shape, Heights):
         points, exists = _relief(shape)
         mesh = grid(points)
-        return Mesh(mesh.vertices, mesh.faces[exists.ravel()[mesh.faces].all(axis=1)])
+        used, faces = np.unique(mesh.faces[exists.ravel()[mesh.faces].all(axis=1)], return_inverse=True)
+        return Mesh(mesh.vertices[used], faces.reshape(-1, 3))
     if isinstance(shape, Torus) and shape.ring_radius + radius <= WHOLE_M:
         return _ring(shape)
     return grid(_sheet(shape, REACH_M))

@@ -50,6 +50,8 @@ from canprobe.scene.setup import (
     Touch,
     Truth,
 )
+from canprobe.scene.surface_files import refuse_narrow
+from canprobe.touch.heights import Heights
 from canprobe.touch.pad import FLAT_RADIUS_M, Pad
 from canprobe.touch.patch.array_calibration import ArrayCalibration
 from canprobe.touch.servo import SurfaceGains, make_strategy
@@ -105,7 +107,7 @@ def resolve(scene: Scene) -> Setup:
         probe=probe,
         kind=scene.task.kind,
         task=_task(scene, arm, array, probe),
-        truth=_truth(scene, arm, bodies, probe),
+        truth=_truth(scene, arm, array, bodies, probe),
     )
 
 
@@ -308,10 +310,12 @@ def _true_arm(scene: Scene, arm: Arm | None, bodies: Bodies) -> tuple[ArmModel |
     return arm_model(cell.cell.name, cell.arm, cell.joints)
 
 
-def _truth(scene: Scene, arm: Arm | None, bodies: Bodies, probe: Probe) -> Truth:
+def _truth(scene: Scene, arm: Arm | None, array: Array | None, bodies: Bodies, probe: Probe) -> Truth:
     plant = scene.plant or PlantSettings()
     try:
         shape = true_object(scene.object) if scene.object is not None else None
+        if scene.object is not None and isinstance(shape, Heights) and array is not None:
+            refuse_narrow(scene.object, shape, array.pad)
     except ValueError as error:
         raise PlanError([f"object: {error}"]) from error
     T_flange_there = probe.T_flange_probe.copy()

@@ -15,6 +15,7 @@ from canprobe.scene.model import ObjectSettings
 from canprobe.touch.heights import Heights
 from canprobe.touch.mesh_fit import Fit, fit_mesh
 from canprobe.touch.objects import make_object
+from canprobe.touch.pad import Pad
 from canprobe.touch.shapes import PlacedShape
 
 Array = NDArray[np.float64]
@@ -57,6 +58,18 @@ def object_of_file(settings: ObjectSettings, T_base_object: Array) -> PlacedShap
         x, y = (1e3 * fit.spacing * (nodes - 1) for nodes in fit.heights.shape)
         way_out = "remove vertices far away, or give origin_mm"
         raise ValueError(f"file: {path.name}: the mesh is {x:.3g} mm by {y:.3g} mm; {error}: {way_out}") from error
+
+
+def refuse_narrow(settings: ObjectSettings, shape: Heights, pad: Pad) -> None:
+    """Raise ValueError for a surface of a file that ends within the pad which is to touch it."""
+    x, y = (1e3 * (far - near) for near, far in zip(shape.spline.corner, shape.spline.far, strict=True))
+    pad_mm = 2e3 * pad.reach_m
+    if settings.file is not None and min(x, y) < pad_mm:
+        raise ValueError(
+            f"file: {Path(settings.file).name}: its surface is {x:.3g} mm by {y:.3g} mm, narrower than the pad of"
+            f" {pad_mm:.3g} mm that touches it; is unit_mm = {settings.unit_mm:g} the unit of the file? If it is, touch"
+            " a wider surface"
+        )
 
 
 @lru_cache(maxsize=4)

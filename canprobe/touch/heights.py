@@ -38,6 +38,8 @@ _LAST_M = 1e-8
 """A Newton step after which the rest, its square over a radius of curvature, is below 1e-12 m."""
 _SAME_M = 1e-6
 _NOWHERE_M = -1e3
+_SIDE = 1e-6
+"""Spacings to the cells on both sides of a node."""
 
 _Bends = tuple[float, float, float, float, float, float]
 _Place = tuple[float, float, float, _Bends]
@@ -154,7 +156,8 @@ class Heights(PlacedShape):
         spacing: of the grid, m.
         origin: (2,) point of the grid that is the object's origin, from the grid's middle, m; the surface there gets
             the height 0.
-        there: (m, n) whether the surface exists at a node; None: everywhere.
+        there: (m, n) whether the surface exists at a node; between nodes it does where it exists at all four round the
+            place. None: everywhere.
 
     Raises:
         ValueError: for heights that are no finite grid, or an origin beside the surface.
@@ -202,11 +205,10 @@ class Heights(PlacedShape):
         shape = len(self._x), len(self._y)
         x, y = (one.ravel() for one in np.meshgrid(self._x, self._y, indexing="ij"))
         self._z, self._zx, self._zy = (one.reshape(shape) for one in spline.many(x, y))
-        self._missing: npt.NDArray[np.bool_] | None = None
-        if there is not None:
-            nearest = [np.rint((at - at[0]) / spline.spacing).astype(np.intp) for at in (self._x, self._y)]
-            self._missing = ~there[np.ix_(*nearest)]
-            self._z[self._missing] = _NOWHERE_M
+        self._cells: npt.NDArray[np.bool_] | None = None
+        if there is not None and not there.all():
+            self._cells = there[:-1, :-1] & there[1:, :-1] & there[:-1, 1:] & there[1:, 1:]
+            self._z[~self.exists(x, y).reshape(shape)] = _NOWHERE_M
         starts = [np.arange(0, n, _BLOCK) for n in shape]
         self._tops = np.maximum.reduceat(np.maximum.reduceat(self._z, starts[0], axis=0), starts[1], axis=1)
         lids = np.pad(self._tops, 1, mode="edge") + _OVER_NODES_M
@@ -267,7 +269,7 @@ class Heights(PlacedShape):
 
     def _polished(self, u: float, v: float, x: float, y: float, z: float) -> _Place:
         """The stationary point of the distance near (u, v), by Newton of at most a node's spacing a step."""
-        at, most = self.spline.at, self._step
+        at, most, node = self.spline.at, self._step, (u, v)
         (u0, v0), (u1, v1) = self.spline.corner, self.spline.far
         for _ in range(_NEWTON):
             h, hx, hy, hxx, hxy, hyy = at(u, v)
@@ -287,6 +289,11 @@ class Heights(PlacedShape):
             u, v = new_u, new_v
             if moved < _LAST_M:
                 break
+        if self._cells is not None:
+            i, j = int((u - u0) / self.spline.spacing), int((v - v0) / self.spline.spacing)
+            within = self._cells[min(i, self._cells.shape[0] - 1), min(j, self._cells.shape[1] - 1)]
+            if not within and not self.exists(np.array((u,)), np.array((v,)))[0]:
+                u, v = node  # beyond the surface: its nearest node is on the border
         here = at(u, v)
         return (u - x) ** 2 + (v - y) ** 2 + (here[0] - z) ** 2, u, v, here
 
@@ -346,10 +353,12 @@ class Heights(PlacedShape):
     def exists(self, x: Array, y: Array) -> npt.NDArray[np.bool_]:
         """(k,) whether there is a surface over (k,) points x and y of the object's frame, m."""
         inside: npt.NDArray[np.bool_] = (x >= self._x[0]) & (x <= self._x[-1]) & (y >= self._y[0]) & (y <= self._y[-1])
-        if self._missing is not None:
-            i = np.rint((x[inside] - self._x[0]) / self._cell[0]).astype(np.intp)
-            j = np.rint((y[inside] - self._y[0]) / self._cell[1]).astype(np.intp)
-            inside[inside] = ~self._missing[i, j]
+        if self._cells is not None:
+            (x0, y0), (m, n) = self.spline.corner, self._cells.shape
+            s, t = (x[inside] - x0) / self.spline.spacing, (y[inside] - y0) / self.spline.spacing
+            rows = [(s + side).astype(np.intp).clip(0, m - 1) for side in (-_SIDE, _SIDE)]  # of both cells on a border
+            columns = [(t + side).astype(np.intp).clip(0, n - 1) for side in (-_SIDE, _SIDE)]
+            inside[inside] = np.any([self._cells[i, j] for i in rows for j in columns], axis=0)
         return inside
 
     def squeezed(self, centre_base: Vec, radius: float) -> float:

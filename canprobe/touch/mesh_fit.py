@@ -3,6 +3,7 @@
 The vertices of a mesh of a smooth body lie on the body, its facets do not. A bicubic spline is fitted by least squares
 to the vertices; where facets are larger than the grid's spacing, points of curved triangles (PN triangles, from the
 vertices and their normals) fill them. Edges that turn by more than 30 degrees stay edges, others are taken as curved.
+The surface ends with the facets: a node beyond their border, or over a hole that they leave, is none of it.
 
 It stops being true at sharp edges, which become round over two spacings to each side; on walls steeper than 70
 degrees, which are bridged; and under overhangs, which are not seen.
@@ -37,6 +38,8 @@ RINGING, EDGE_NODES = 0.02, 3
 """Distance of a sample from the fit, in spacings, that tells a wall; and how many nodes round it are rounded off."""
 FILL_WEIGHT = 0.01
 """Of a point of a curved triangle in the fit: a vertex is exact, and only where there are none these count."""
+ON_BORDER = 1e-3
+"""Spacings beyond the border up to which a node lies on it: files have single precision."""
 _STIFFNESS = 1e-7
 """Of the fit against second differences, per sample of a cell: it only matters where there are no samples."""
 
@@ -103,18 +106,14 @@ def fit_mesh(vertices: npt.ArrayLike, faces: npt.ArrayLike, spacing: float, orig
     if not up.any():
         raise ValueError("no facet of the mesh faces +z: its faces are inside out, or it must be turned")
     _refuse_coarse(points, corners[up], normals[up])
-    low, high = points.min(axis=0)[:2], points.max(axis=0)[:2]
-    if (high - low < (LEAST_NODES - 1) * spacing * (1.0 - 1e-9)).any():
-        x, y = 1e3 * (high - low)
-        raise ValueError(
-            f"the mesh is {x:.3g} mm by {y:.3g} mm, narrower than {LEAST_NODES - 1} spacings of {1e3 * spacing:.3g} mm"
-        )
-    at = 0.5 * (low + high) if origin is None else np.asarray(origin, dtype=float)
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))[:2]
+    at = middle if origin is None else np.asarray(origin, dtype=float)
     exact, filled = points[np.unique(corners[up])], _samples(points, corners, normals, up, spacing)
     weights = np.repeat((1.0, FILL_WEIGHT), (len(exact), len(filled)))
     samples = np.concatenate((exact, filled))
     seen = _seen(samples, spacing)
-    return _fitted(samples[seen], weights[seen], spacing, at)
+    facing = points[corners[normals[:, 2] > 0.0]]  # walls too, as they are bridged
+    return _fitted(samples[seen], weights[seen], facing[:, :, :2], spacing, at)
 
 
 def _merged(points: Array, corners: Index) -> tuple[Array, Index]:
@@ -229,25 +228,51 @@ def _seen(samples: Array, spacing: float) -> npt.NDArray[np.bool_]:
     return seen
 
 
-def _fitted(samples: Array, weights: Array, spacing: float, at: Array) -> Fit:
-    """The least-squares spline, at the grid's nodes."""
+def _covered(triangles: Array, shape: tuple[int, ...]) -> npt.NDArray[np.bool_]:
+    """Which nodes of a grid lie in triangles (f, 3, 2) over it, in spacings from its corner."""
+    first = np.ceil(triangles[:, :, 0].min(axis=1) - ON_BORDER).astype(np.intp).clip(0)
+    last = np.floor(triangles[:, :, 0].max(axis=1) + ON_BORDER).astype(np.intp).clip(max=shape[0] - 1)
+    rows = (last - first + 1).clip(0)
+    row = np.arange(rows.sum()) + np.repeat(first - np.cumsum(rows) + rows, rows)
+    a = np.repeat(triangles, rows, axis=0)
+    b = np.roll(a, 1, axis=1)
+    ends = np.sort(np.stack((a[:, :, 0], b[:, :, 0])), axis=0)
+    crossed = (ends[0] <= row[:, None] + ON_BORDER) & (row[:, None] - ON_BORDER <= ends[1])
+    along = np.where(ends[1] > ends[0], b[:, :, 0] - a[:, :, 0], 1.0)
+    share = ((row[:, None] - a[:, :, 0]) / along).clip(0.0, 1.0)
+    y = a[:, :, 1] + share * (b[:, :, 1] - a[:, :, 1])  # where the row crosses each side
+    low = np.ceil(np.where(crossed, y, np.inf).min(axis=1) - ON_BORDER).clip(0, shape[1]).astype(np.intp)
+    high = np.floor(np.where(crossed, y, -np.inf).max(axis=1) + ON_BORDER).clip(-1, shape[1] - 1).astype(np.intp)
+    begun = np.zeros((shape[0], shape[1] + 1), dtype=np.intp)
+    np.add.at(begun, (row, low), 1)
+    np.add.at(begun, (row, np.maximum(high + 1, low)), -1)
+    covered: npt.NDArray[np.bool_] = np.cumsum(begun, axis=1)[:, :-1] > 0
+    return covered
+
+
+def _fitted(samples: Array, weights: Array, facing: Array, spacing: float, at: Array) -> Fit:
+    """The least-squares spline, at the grid's nodes; `facing` (f, 3, 2) are all facets that face upwards."""
     from scipy import ndimage, sparse  # only where a mesh is read
     from scipy.sparse.linalg import splu
 
     low, high = samples[:, :2].min(axis=0), samples[:, :2].max(axis=0)
-    cells = np.maximum(np.ceil((high - low) / spacing - 1e-6).astype(int), LEAST_NODES - 1)
+    cells = np.floor((high - low) / spacing + ON_BORDER).astype(int)  # the grid ends within the samples
+    x, y = 1e3 * (high - low)
+    if cells.min() < LEAST_NODES - 1:
+        least = f"narrower than {LEAST_NODES - 1} spacings of {1e3 * spacing:.3g} mm"
+        raise ValueError(f"what is seen of the mesh from +z is {x:.3g} mm by {y:.3g} mm, {least}")
     if np.prod(cells + 1.0) > MOST_NODES:
         raise ValueError(f"the mesh is {high - low} m wide: more than {MOST_NODES:.0g} nodes; widen the spacing")
     corner = 0.5 * (low + high) - 0.5 * cells * spacing
     m, n = (int(one) + 3 for one in cells)  # coefficients along x and y
     place = (samples[:, :2] - corner) / spacing
-    cell = np.clip(place.astype(np.intp), 0, cells - 1)
+    cell = np.clip(place.astype(np.intp), 0, cells - 1)  # those beyond the grid belong to the cubics of its border
     (bx, by) = (_basis((place - cell)[:, axis]) for axis in (0, 1))
     columns = (cell[:, 0, None] + np.arange(4))[:, :, None] * n + (cell[:, 1, None] + np.arange(4))[:, None, :]
     filled = np.zeros((m - 1, n - 1), dtype=bool)
     filled[cell[:, 0] + 1, cell[:, 1] + 1] = True
     there = filled[:-1, :-1] | filled[1:, :-1] | filled[:-1, 1:] | filled[1:, 1:]
-    x, y = 1e3 * (high - low)
+    there &= _covered((facing - corner) / spacing, there.shape)
     nearly_empty = f"the mesh is {x:.3g} mm by {y:.3g} mm and nearly empty: remove vertices far away"
     if there.mean() < EMPTY:
         raise ValueError(nearly_empty)

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import sys
 
 import numpy as np
 import pytest
 
 import canprobe
+from canprobe.cli import main
 from canprobe.errors import PlanError, UsageError
 from canprobe.scene.geometry import true_object
-from canprobe.scene.load import load_scene
+from canprobe.scene.load import load_scene, scenes_folder
 from canprobe.scene.model import ObjectSettings
 from canprobe.scene.resolve import resolve
 from canprobe.session.session import write_scene
@@ -142,6 +144,45 @@ def test_a_saved_scene_takes_its_heights_along(tmp_path):
     assert true_object(there.object).closest((-0.12, -0.12, 0.4)).point == pytest.approx(
         true_object(scene.object).closest((-0.12, -0.12, 0.4)).point, abs=0.0
     )
+
+
+@pytest.mark.parametrize(
+    ("unit_mm", "size"), [(500, "20 mm by 15 mm"), (1e3 / 25.4, "narrower than 7 spacings"), (1, "0.04 mm by 0.03 mm")]
+)
+def test_a_mesh_narrower_than_the_pad_is_refused_with_its_size_and_unit(unit_mm, size, tmp_path):
+    mesh = dataclasses.replace(cap(tmp_path, "cap.stl"), unit_mm=unit_mm, origin_mm=None, spacing_mm=1)
+    with pytest.raises(PlanError, match=r"unit_mm = .* the unit of the file") as refused:
+        resolve(dataclasses.replace(load_scene("relief"), object=mesh))
+    assert size in str(refused.value)
+
+
+def test_heights_narrower_than_the_pad_are_refused_and_without_an_array_nothing_is(tmp_path):
+    heights = ObjectSettings("heights", file=write(tmp_path, "bump.npy", BUMP_MM), spacing_mm=0.8)
+    scene = dataclasses.replace(load_scene("relief"), object=heights)
+    with pytest.raises(PlanError, match=r"32 mm by 24 mm, narrower than the pad of 25\.4 mm that touches it"):
+        resolve(scene)
+    assert resolve(dataclasses.replace(scene, object=dataclasses.replace(heights, spacing_mm=0.9))).truth.object
+
+
+def disc(folder):
+    """A shallow dome of 24 mm radius as a scene for the relief's path."""
+    trimesh = pytest.importorskip("trimesh")
+    x, y = (one.ravel() for one in np.meshgrid(*[np.linspace(-24, 24, 49)] * 2, indexing="ij"))
+    corner = np.array([49 * i + j for i in range(48) for j in range(48)])[:, None]
+    faces = np.concatenate((corner + np.array((0, 49, 1)), corner + np.array((1, 49, 50))))
+    faces = faces[(np.hypot(x, y) <= 24)[faces].all(axis=1)]
+    trimesh.Trimesh(np.column_stack((x, y, -(x * x + y * y) / 400)), faces, process=False).export(folder / "disc.stl")
+    text = (scenes_folder() / "relief.toml").read_text().replace("width_mm = 6", "width_mm = 2")
+    text = text.replace('"heights"', '"mesh"').replace("relief.npz", "disc.stl")
+    (folder / "disc.toml").write_text(text)
+    return str(folder / "disc.toml")
+
+
+def test_a_path_beyond_the_border_of_a_mesh_is_refused(tmp_path, capsys):
+    scene = disc(tmp_path)
+    assert main(["plan", scene, "--set", "task.length_mm=42"]) == 0
+    assert main(["plan", scene, "--set", "task.length_mm=49"]) == 2  # inside of the square round the disc
+    assert re.search(r"at \(-1\d\d\.\d, .* mm the path leaves the object .* shorten task", capsys.readouterr().err)
 
 
 def test_a_path_that_leaves_the_surface_is_refused():
