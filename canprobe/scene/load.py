@@ -428,9 +428,9 @@ def _scene(own: Mapping[str, Any], file: str, folder: Path | None) -> Scene:
             reader.complain(section, f'not with task.kind = "{kind}": {why}; remove the section')
 
     cell = own.get("cell", DEFAULT_CELL)
-    named = isinstance(cell, str) and cell != DEFAULT_CELL
-    if kind in TOUCH_KINDS and named and isinstance(task, dict) and "start_mm" not in task:
-        reader.complain("task.start_mm", f"missing: left out, it is a place of the cell {DEFAULT_CELL}, not of {cell}")
+    if kind in TOUCH_KINDS and cell != DEFAULT_CELL and isinstance(task, dict) and "start_mm" not in task:
+        other = cell if isinstance(cell, str) else "the scene's own [cell]"
+        reader.complain("task.start_mm", f"missing: left out, it is a place of the cell {DEFAULT_CELL}, not of {other}")
 
     def lookup(path: str) -> Any:
         section, _, key = path.partition(".")

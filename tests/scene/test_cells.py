@@ -150,3 +150,7 @@ def test_a_scene_of_another_cell_says_where_it_touches():
     with pytest.raises(SceneError, match=r"task\.start_mm: missing: .* place of the cell puma260, not of puma560"):
         parse_scene(text)
     assert parse_scene(text.replace('"puma560"', '"puma260"')).task.start_mm == (-120.0, -122.5, 374.0)
+    own = dump_scene(load_scene("cylinder"))
+    assert parse_scene(own).task.start_mm == (-120.0, -122.5, 374.0)
+    with pytest.raises(SceneError, match=r"task\.start_mm: missing: .* puma260, not of the scene's own \[cell\]"):
+        parse_scene(own.replace("start_mm = [-120.0, -122.5, 374.0]\n", ""))
