@@ -147,7 +147,7 @@ def _urdf_cell(args: argparse.Namespace) -> str:
 
     found = from_urdf(args.urdf, args.base, args.tip)
     for warning in found.warnings:
-        say(f"canprobe: {warning}; correct it, or set min_deg and max_deg of the joint")
+        say(f"canprobe: {warning}")
     text = _HEAD.format(name=_cell_name(args.folder), bitrate=_common_bitrate(args.eds))
     text += "[arm]\n" + f'urdf = "{args.urdf.name}"\n'
     text += "".join(f'{key} = "{link}"\n' for key, link in (("base", args.base), ("tip", args.tip)) if link)

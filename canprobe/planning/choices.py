@@ -459,6 +459,8 @@ def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
     """What a user has to know before trusting the plan, most important first."""
     cut, bus = cut_patch(setup), setup.bus
     yield from _open_to_others(setup)
+    if setup.arm is not None:
+        yield from setup.arm.warnings
     if setup.arm is not None and not all(drive.emulated for drive in setup.arm.drives):
         yield from _long_waits(setup.arm.missed_syncs, setup.rate_hz)
     if setup.array is not None and setup.array.newtons == NOMINAL:

@@ -94,20 +94,29 @@ class Body:
 
 
 INERTIA_TOLERANCE = 0.1
-"""Share of the largest moment by which the others may miss the triangle inequality: published numbers are measured."""
+"""Share of the largest moment by which the others may miss the rules of a body: published numbers are measured."""
+ROUNDED_KG_M2 = 1e-12
+"""A moment of inertia that is 0 but for rounding."""
 
 
-def impossible_inertia(tensor: Array) -> str | None:
-    """Why a (3, 3) tensor is the inertia of no body; None where it may be one.
-
-    A body has principal moments that are not negative, and none exceeds the sum of the other two.
-    """
-    low, middle, high = np.linalg.eigvalsh(tensor).tolist()
-    if low >= -INERTIA_TOLERANCE * abs(high) and low + middle >= high * (1.0 - INERTIA_TOLERANCE):
+def negative_inertia(tensor: Array) -> str | None:
+    """Why a (3, 3) tensor cannot be moved: a principal moment is negative, which needs no torque; None where it can."""
+    low, _, high = np.linalg.eigvalsh(tensor).tolist()
+    if low >= -max(INERTIA_TOLERANCE * high, ROUNDED_KG_M2):
         return None
-    moments = f"{low:.4g}, {middle:.4g}, {high:.4g} kg m^2"
-    rule = "negative" if low < 0.0 else "larger than the sum of the others"
-    return f"principal moments of inertia of {moments}, of which one is {rule}"
+    return f"{_principal_moments(tensor)}, of which one is negative"
+
+
+def lopsided_inertia(tensor: Array) -> str | None:
+    """Why a (3, 3) tensor is the inertia of no body: one moment exceeds the sum of the others; None where none does."""
+    low, middle, high = np.linalg.eigvalsh(tensor).tolist()
+    if low + middle >= high * (1.0 - INERTIA_TOLERANCE) - ROUNDED_KG_M2:
+        return None
+    return f"{_principal_moments(tensor)}, of which one is larger than the sum of the others"
+
+
+def _principal_moments(tensor: Array) -> str:
+    return f"principal moments of inertia of {', '.join(f'{one:.4g}' for one in np.linalg.eigvalsh(tensor))} kg m^2"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

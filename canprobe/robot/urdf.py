@@ -23,7 +23,7 @@ import numpy as np
 
 from canprobe.errors import PlanError, regular_file
 from canprobe.robot.chain import MOST_JOINTS, Array, Chain, rotation_rpy
-from canprobe.robot.model import Body, Joint, impossible_inertia
+from canprobe.robot.model import Body, Joint, lopsided_inertia, negative_inertia
 
 CONTINUOUS_RAD = 2 * math.pi
 """Stops of a continuous joint to either side: it has none itself, but cables and the counts of a drive have."""
@@ -101,12 +101,26 @@ def from_urdf(
         fixed=np.array(places),
         T_last_flange=T,
     )
-    warnings = (
-        f"{tree.where}: {joint.name}: <limit> from {joint.q_min:g} to {joint.q_max:g} rad looks like degrees"
-        for joint in joints
-        if not joint.prismatic and max(-joint.q_min, joint.q_max) > LARGEST_RAD
+    warnings = [limit_warning(source, joint) for joint in joints]
+    for edge, body in zip(moving, bodies, strict=True):
+        if body is not None and (why := lopsided_inertia(body.tensor)) is not None:
+            warnings.append(f"{tree.where}: link {edge.child}, with what it carries: no body has {why}; correct it")
+    return UrdfArm(chain, tuple(joints), tuple(bodies), tuple(filter(None, warnings)))
+
+
+def limit_warning(source: str | Path, joint: Joint) -> str | None:
+    """What is said of the stops of a joint that look like degrees; None where they do not.
+
+    Args:
+        source: path of the file, or its text.
+        joint: as `from_urdf` read it.
+    """
+    if joint.prismatic or max(-joint.q_min, joint.q_max) <= LARGEST_RAD:
+        return None
+    return (
+        f"{_named(source)}: {joint.name}: <limit> from {joint.q_min:g} to {joint.q_max:g} rad looks like degrees;"
+        " correct it, or set min_deg and max_deg of the joint"
     )
-    return UrdfArm(chain, tuple(joints), tuple(bodies), tuple(warnings))
 
 
 # What links look like, and where the meshes are that a file names.
@@ -223,8 +237,7 @@ class _Tree:
 
     @classmethod
     def read(cls, source: str | Path) -> _Tree:
-        text = str(source)
-        where = "URDF text" if text.lstrip().startswith("<") else f"URDF {text}"
+        text, where = str(source), _named(source)
         try:
             is_text = where == "URDF text"
             root = _parsed(text.encode() if is_text else regular_file(Path(source), MOST_BYTES).read_bytes())
@@ -377,7 +390,7 @@ class _Tree:
             off = body.com - com
             tensor += body.tensor + body.mass * (float(off @ off) * np.eye(3) - np.outer(off, off))
         # of all together: real files have sensors and fingertips with numbers that no body has
-        if (why := impossible_inertia(tensor)) is not None:
+        if (why := negative_inertia(tensor)) is not None:
             raise self.wrong(f"link {edge.child}, with what it carries", "an <inertia> that a body can have", why)
         return Body(mass, com, tensor)
 
@@ -447,6 +460,11 @@ class _Tree:
         if not math.isfinite(value):
             raise self.wrong(name, f"a number in {key} of <{element.tag}>", repr(text))
         return value
+
+
+def _named(source: str | Path) -> str:
+    """What messages call a file, or its text."""
+    return "URDF text" if str(source).lstrip().startswith("<") else f"URDF {source}"
 
 
 def _parsed(content: bytes) -> ElementTree.Element:

@@ -14,8 +14,8 @@ import numpy as np
 
 from canprobe.errors import PlanError
 from canprobe.robot.chain import Array, Chain, dh_step, from_dh
-from canprobe.robot.model import ArmModel, Body, Joint, impossible_inertia
-from canprobe.robot.urdf import UrdfArm, from_urdf
+from canprobe.robot.model import ArmModel, Body, Joint, lopsided_inertia, negative_inertia
+from canprobe.robot.urdf import UrdfArm, from_urdf, limit_warning
 from canprobe.scene.geometry import transform
 from canprobe.scene.hardware import ArmSettings, JointSettings
 from canprobe.scene.setup import Homing
@@ -45,8 +45,10 @@ _OF_PRISMATIC = {
 _PRISMATIC_DEFAULTS = {"rated_torque": 200.0, "rotor_inertia": 5.0, "coulomb": 20.0, "viscous": 20.0}
 
 
-def arm_model(name: str, arm: ArmSettings, sections: Mapping[str, JointSettings]) -> tuple[ArmModel, Bodies]:
-    """The arm of a cell, and the bodies of its links; None where masses are not known.
+def arm_model(
+    name: str, arm: ArmSettings, sections: Mapping[str, JointSettings]
+) -> tuple[ArmModel, Bodies, tuple[str, ...]]:
+    """The arm of a cell, the bodies of its links, None where masses are not known, and what its URDF hardly means.
 
     Args:
         name: of the cell.
@@ -63,6 +65,12 @@ def arm_model(name: str, arm: ArmSettings, sections: Mapping[str, JointSettings]
         chain = _moved(found.chain, mount, flange)
         joints = [_joint(section, joint) for section, joint in zip(sections.values(), found.joints, strict=True)]
         bodies: Bodies = found.bodies if any(found.bodies) else None
+        settled = {
+            limit_warning(arm.urdf, joint)
+            for joint, section in zip(found.joints, sections.values(), strict=True)
+            if section.min_deg is not None or section.max_deg is not None
+        }
+        warnings = tuple(warning for warning in found.warnings if warning not in settled)
     else:
         rows = [
             (s.a_mm * _MM, math.radians(s.alpha_deg), s.d_mm * _MM, math.radians(s.theta_deg))
@@ -83,8 +91,9 @@ def arm_model(name: str, arm: ArmSettings, sections: Mapping[str, JointSettings]
         each = zip(sections.values(), rows, strict=True)
         _refuse_impossible_inertia(sections)
         bodies = tuple(_body(section, row, arm) for section, row in each) if known else None
+        warnings = ()
     model = ArmModel(chain, tuple(joints), _units_per_q(sections), np.array([s.zero_counts for s in sections.values()]))
-    return model, bodies
+    return model, bodies, warnings
 
 
 def _refuse_other_names(found: UrdfArm, sections: Mapping[str, JointSettings], arm: ArmSettings) -> None:
@@ -138,7 +147,8 @@ def _tensor(section: JointSettings) -> Array:
 def _refuse_impossible_inertia(sections: Mapping[str, JointSettings]) -> None:
     """Moments of 0 beside others are not known, as of a link that only turns about one axis: they are not compared."""
     given = {name: section for name, section in sections.items() if min(section.inertia_kg_m2[:3]) != 0.0}
-    found = {name: impossible_inertia(_tensor(section)) for name, section in given.items()}
+    tensors = {name: _tensor(section) for name, section in given.items()}
+    found = {name: negative_inertia(tensor) or lopsided_inertia(tensor) for name, tensor in tensors.items()}
     problems = [
         f"joints.{name}.inertia_kg_m2: expected xx, yy, zz, xy, xz, yz that a body can have, got {why}"
         for name, why in found.items()

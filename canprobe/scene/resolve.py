@@ -116,7 +116,7 @@ def _arm(scene: Scene) -> tuple[Arm | None, Bodies]:
     if scene.arm is None:
         return None, None
     settings, joints = scene.arm, scene.joints
-    model, bodies = arm_model(scene.cell.name, settings, joints)
+    model, bodies, warnings = arm_model(scene.cell.name, settings, joints)
     drives = [
         Drive(
             node_id=node_id,
@@ -135,7 +135,7 @@ def _arm(scene: Scene) -> tuple[Arm | None, Bodies]:
         )
     ]
     q_start = per_joint(joints, "start")
-    arm = Arm(model, tuple(drives), q_start, settings.missed_syncs, settings.grouped_rpdo, settings.torque)
+    arm = Arm(model, tuple(drives), q_start, settings.missed_syncs, settings.grouped_rpdo, settings.torque, warnings)
     return arm, bodies
 
 
@@ -307,7 +307,7 @@ def _true_arm(scene: Scene, arm: Arm | None, bodies: Bodies) -> tuple[ArmModel |
     cell = read_cell(other)
     if cell.arm is None or len(cell.joints) != arm.model.n:
         raise PlanError([f"plant.true_cell: expected a cell with an arm of {arm.model.n} joints, got {other}"])
-    return arm_model(cell.cell.name, cell.arm, cell.joints)
+    return arm_model(cell.cell.name, cell.arm, cell.joints)[:2]
 
 
 def _truth(scene: Scene, arm: Arm | None, array: Array | None, bodies: Bodies, probe: Probe) -> Truth:

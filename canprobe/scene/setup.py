@@ -143,6 +143,7 @@ class Arm:
         missed_syncs: SYNC periods without a sign of life after which drive and master take each other for dead.
         grouped: two targets share an RPDO through dummy mapping.
         torque: the drives send their torque where they can; the plan gives it up where the bus has no room for it.
+        warnings: what its URDF says and hardly means.
     """
 
     model: ArmModel
@@ -151,6 +152,7 @@ class Arm:
     missed_syncs: int
     grouped: bool | Auto
     torque: bool = True
+    warnings: tuple[str, ...] = ()
 
     @property
     def node_ids(self) -> tuple[int, ...]:

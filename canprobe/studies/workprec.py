@@ -55,7 +55,7 @@ def _arm() -> tuple[ArmModel, Bodies]:
     """The packaged PUMA 260, and the bodies of its links."""
     cell = read_cell("puma260")
     assert cell.arm is not None
-    return arm_model(cell.cell.name, cell.arm, cell.joints)
+    return arm_model(cell.cell.name, cell.arm, cell.joints)[:2]
 
 
 @cache

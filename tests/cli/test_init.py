@@ -197,6 +197,23 @@ def test_a_failed_init_leaves_nothing_behind(tmp_path, urdf, capsys):
     assert [path.name for path in folder.iterdir()] == ["mine.txt"]
 
 
+def test_limits_in_degrees_are_warned_of_once_until_the_joint_has_its_own(tmp_path, urdf, capsys):
+    urdf.write_text(URDF.replace('lower="-2.5" upper="2.5"', 'lower="-143" upper="143"'))
+    folder, words = tmp_path / "cell", "j3: <limit> from -143 to 143 rad looks like degrees; correct it, or set min_deg"
+    assert main(["init", str(folder), "--urdf", str(urdf)]) == 0
+    assert capsys.readouterr().err.count(words) == 1
+    assert main(["plan", str(folder / "cell.toml")]) == 0
+    assert capsys.readouterr().out.count(f"lab.urdf: {words}") == 1
+    cell = str(folder / "cell.toml")
+    assert main(["run", cell, "--duration", "0.1", "--out", str(tmp_path / "run")]) == 0
+    assert capsys.readouterr().err.count(words) == 1
+    assert str(json.loads((tmp_path / "run" / "summary.json").read_text())["warnings"]).count(words) == 1
+    own = (folder / "cell.toml").read_text().replace("[joints.j3]", "[joints.j3]\nmin_deg = -143\nmax_deg = 143")
+    (folder / "cell.toml").write_text(own)
+    assert main(["plan", cell]) == 0
+    assert words not in capsys.readouterr().out
+
+
 def test_a_joint_without_range_gets_a_placeholder_and_a_tilt_is_explained(tmp_path, urdf, capsys):
     fixed = 'lower="0.3" upper="0.3"'
     urdf.write_text(URDF.replace('lower="-2.5" upper="2.5"', 'effort="1"', 1).replace('effort="1" effort', "effort"))
