@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import logging
+import warnings
 from functools import lru_cache
+from io import BytesIO
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.errors import UsageError, install_line, regular_file
 from canprobe.scene.model import ObjectSettings
+from canprobe.scene.stl_files import stl_damage
 from canprobe.touch.heights import Heights
 from canprobe.touch.mesh_fit import Fit, fit_mesh
 from canprobe.touch.objects import make_object
@@ -30,7 +33,7 @@ _HUGE, _FAR = 1e30, 10.0
 _FLATTEST, _STEEP = 5e-4, 20.0
 """Rise of a surface by the width of its grid, outside of which one of the two is in another unit."""
 _NARROWEST_MM = 1.0
-_STL_HEADER = 84
+_AGAIN = "get the file again, or export it again"
 
 
 def object_of_file(settings: ObjectSettings, T_base_object: Array) -> PlacedShape:
@@ -43,7 +46,11 @@ def object_of_file(settings: ObjectSettings, T_base_object: Array) -> PlacedShap
     assert settings.file is not None
     path = Path(settings.file)
     if settings.kind == "heights":
-        return make_object("heights", T_base_object=T_base_object, **_heights(settings, path))
+        grid = _heights(settings, path)
+        try:
+            return make_object("heights", T_base_object=T_base_object, **grid)
+        except ValueError as error:
+            raise ValueError(f"file: {path.name}: {error}; correct the file, or origin_mm") from error
     if path.suffix.lower() not in MESHES:
         raise ValueError(f"file: expected a mesh in a file of {', '.join(MESHES)}, got {path.name}")
     try:
@@ -80,14 +87,22 @@ def _mesh(path: Path, changed_ns: int, unit: float, spacing: float, origin_mm: t
     except ImportError as error:
         raise UsageError(f"object.file: a mesh needs trimesh: {install_line('mesh')}") from error
     _refuse_other_content(path)
+    if path.suffix.lower() == ".stl" and (why := stl_damage(path.read_bytes())) is not None:
+        raise ValueError(f"file: {path.name} is a damaged STL: {why}; {_AGAIN}")
+    logging.getLogger("trimesh").addHandler(logging.NullHandler())  # it logs tracebacks of what it does without
     try:
-        read = trimesh.load_mesh(path, process=False)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("error", message="string or file could not be read to its end")  # numpy goes on
+            read = trimesh.load_mesh(path, process=False)
     except Exception as error:  # each of its readers has its own
-        raise ValueError(f"file: {path.name} is no mesh that can be read: {error}") from error
+        why = str(error) or type(error).__name__
+        raise ValueError(f"file: {path.name} is no mesh that can be read: {why}; {_AGAIN}") from error
+    if not len(getattr(read, "faces", ())):
+        raise ValueError(f"file: {path.name} holds no facets: export the body as a mesh of triangles")
     origin = None if origin_mm is None else np.array(origin_mm) * _MM
     try:
         return fit_mesh(read.vertices * unit, read.faces, spacing, origin)
-    except (ValueError, AttributeError) as error:
+    except ValueError as error:
         units = f"; is unit_mm = {1e3 * unit:g} the unit of the file?" if "narrower" in str(error) else ""
         raise ValueError(f"file: {path.name}: {error}{units}") from error
 
@@ -100,17 +115,13 @@ def _refuse_other_content(path: Path) -> None:
     except OSError:  # which its reader names
         return
     if not start.strip():
-        raise ValueError(f"file: {path.name} is empty")
+        raise ValueError(f"file: {path.name} is empty: {_AGAIN}")
     if start.startswith(b"version https://git-lfs"):
         raise ValueError(
             f"file: {path.name} is a pointer of Git LFS, not the file: type `git lfs pull` where it is from"
         )
     if start.lstrip().lower().startswith((b"<!doctype html", b"<html")):
         raise ValueError(f"file: {path.name} is an HTML page: download the file itself (raw)")
-    if path.suffix.lower() == ".stl" and not start.lstrip().startswith(b"solid"):
-        whole, size = _STL_HEADER + 50 * int.from_bytes(start[80:84], "little"), path.stat().st_size
-        if len(start) < _STL_HEADER or size != whole:
-            raise ValueError(f"file: {path.name} is a damaged STL: {size} bytes, by its header {whole}; get it again")
 
 
 def _heights(settings: ObjectSettings, path: Path) -> dict[str, Any]:
@@ -120,12 +131,19 @@ def _heights(settings: ObjectSettings, path: Path) -> dict[str, Any]:
     if spacing is None:
         raise ValueError("spacing_mm: missing: the file holds heights only; give the spacing of their grid")
     if z.ndim != 2:
-        raise ValueError(f"file: expected a grid of heights (rows × columns), got shape {z.shape} in {path.name}")
-    if (gaps := z[np.isin(z, NO_DATA) | (np.abs(z) > _HUGE)]).size and np.ptp(z) > _FAR * np.ptp(_without(z, gaps[0])):
+        raise ValueError(f"file: {path.name}: expected a grid of heights (rows × columns), got shape {z.shape}")
+    if not np.isfinite(z).all():
+        row, column = np.argwhere(~np.isfinite(z))[0].tolist()
+        raise ValueError(
+            f"file: {path.name}: height {z[row, column]} in row {row + 1}, column {column + 1}: fill gaps first"
+        )
+    huge = np.abs(z) > _HUGE
+    gaps = z[np.isin(z, NO_DATA) | huge]
+    if huge.any() or (gaps.size and np.ptp(z) > _FAR * np.ptp(_without(z, gaps[0]))):
         raise ValueError(
             f"file: {path.name}: {gaps.size} of {z.size} heights are {gaps[0]:g}: no data; fill gaps first"
         )
-    _refuse_other_unit(z, spacing, settings.unit_mm)
+    _refuse_other_unit(path, z, spacing, settings.unit_mm)
     unit = settings.unit_mm * _MM
     middle = 0.5 * spacing * unit * (np.array(z.shape) - 1)
     origin = np.zeros(2) if settings.origin_mm is None else np.array(settings.origin_mm) * _MM - middle
@@ -137,13 +155,13 @@ def _without(z: Array, value: float) -> Array:
     return rest if rest.size else np.zeros(1)
 
 
-def _refuse_other_unit(z: Array, spacing: float, unit_mm: float) -> None:
+def _refuse_other_unit(path: Path, z: Array, spacing: float, unit_mm: float) -> None:
     """Heights and spacing of one unit give a surface: neither a wall nor, unless it is a plane, a flat."""
     rise, width = float(np.ptp(z)), spacing * min(z.shape)
-    if unit_mm * width < _NARROWEST_MM or (np.isfinite(rise) and rise > 0.0 and not _FLATTEST < rise / width < _STEEP):
+    if unit_mm * width < _NARROWEST_MM or (rise > 0.0 and not _FLATTEST < rise / width < _STEEP):
         raise ValueError(
-            f"file: its heights rise by {unit_mm * rise:.3g} mm over a grid {unit_mm * width:.3g} mm wide: are heights"
-            f" and spacing in one unit, and is unit_mm = {unit_mm:g} that unit?"
+            f"file: {path.name}: its heights rise by {unit_mm * rise:.3g} mm over a grid {unit_mm * width:.3g} mm wide:"
+            f" are heights and spacing in one unit, and is unit_mm = {unit_mm:g} that unit?"
         )
 
 
@@ -154,22 +172,39 @@ def _grid(path: Path) -> tuple[Array, float | None]:
         raise ValueError(f"file: expected heights in a file of {', '.join(HEIGHTS)}, got {path.name}")
     _refuse_other_content(path)
     try:
-        if kind in (".npy", ".npz"):
-            with regular_file(path).open("rb") as opened:  # numpy leaves a file open that it cannot read
-                read = np.load(opened)
-                if isinstance(read, np.lib.npyio.NpzFile):
-                    return _of_archive({name: read[name] for name in read.files})
-                return np.asarray(read, dtype=np.float64), None
-        text = regular_file(path).read_text(encoding="utf-8-sig").splitlines()
-        rows = [line.partition("#")[0] for line in text]
-        if any(";" in row for row in rows):  # then a comma is a decimal one
-            rows = [row.replace(",", ".").replace(";", " ") for row in rows]
-        lines = [row.replace(",", " ").split() for row in rows]
-        return np.array([[float(word) for word in line] for line in lines if line]), None
+        content = regular_file(path).read_bytes()
     except OSError as error:
-        raise ValueError(f"file: {path}: cannot be read: {error.strerror or error}") from error
-    except (ValueError, TypeError, EOFError, BadZipFile, MemoryError) as error:  # a header may claim terabytes
-        raise ValueError(f"file: {path.name} is no grid of numbers: {error}") from error
+        raise ValueError(f"file: {path}: cannot be read: {error.strerror}") from error
+    try:
+        if kind in (".csv", ".txt"):
+            return _of_text(content.decode("utf-8-sig")), None
+        read = np.load(BytesIO(content))
+        if isinstance(read, np.lib.npyio.NpzFile):
+            return _of_archive({name: read[name] for name in read.files})
+        return np.asarray(read, dtype=np.float64), None
+    except UnicodeDecodeError as error:
+        why = f"byte {error.start} is {error.object[error.start]:#04x}, which is no text"
+        raise ValueError(f"file: {path.name} is no grid of numbers: {why}; {_AGAIN}") from error
+    except Exception as error:  # numpy raises what zip, its decompression and the parser of headers raise
+        why = "it is damaged, or holds Python objects" if "pickle" in str(error) else str(error) or type(error).__name__
+        raise ValueError(f"file: {path.name} is no grid of numbers: {why}; {_AGAIN}") from error
+
+
+def _of_text(text: str) -> Array:
+    """The numbers of a text, a row on each line."""
+    rows = [line.partition("#")[0] for line in text.splitlines()]
+    if any(";" in row for row in rows):  # then a comma is a decimal one
+        rows = [row.replace(",", ".").replace(";", " ") for row in rows]
+    grid: list[list[float]] = []
+    for number, row in enumerate(rows, start=1):
+        try:
+            values = [float(word) for word in row.replace(",", " ").split()]
+        except ValueError as error:
+            raise ValueError(f"line {number}: expected numbers, got {str(error).rpartition(': ')[2]}") from error
+        if values and grid and len(values) != len(grid[0]):
+            raise ValueError(f"line {number}: expected {len(grid[0])} numbers as above, got {len(values)}")
+        grid += [values] if values else []
+    return np.array(grid)
 
 
 def _of_archive(arrays: dict[str, Any]) -> tuple[Array, float | None]:

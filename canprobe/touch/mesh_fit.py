@@ -32,6 +32,8 @@ LAYER = 6.0
 """Spacings below the highest sample of a cell from which on a sample is taken as hidden."""
 EMPTY = 0.1
 """Share of a mesh's grid that has a surface, below which single vertices far away make the grid."""
+FARTHEST_M = 1e6
+"""Coordinates from which on a mesh is no part."""
 MOST_NODES = 1_000_000
 MOST_SAMPLES = 8_000_000
 RINGING, EDGE_NODES = 0.02, 3
@@ -120,10 +122,13 @@ def _merged(points: Array, corners: Index) -> tuple[Array, Index]:
     """Vertices at one place are one vertex, which STL files do not say."""
     if points.ndim != 2 or points.shape[1] != 3 or corners.ndim != 2 or corners.shape[1] != 3 or not len(corners):
         raise ValueError(f"a mesh needs vertices (k, 3) and faces (f, 3), got {points.shape} and {corners.shape}")
-    if not np.isfinite(points).all():
-        raise ValueError("vertices of a mesh must be finite")
+    if not (np.abs(points) < FARTHEST_M).all():
+        odd = points[~(np.abs(points) < FARTHEST_M).all(axis=1)][0].tolist()
+        raise ValueError(f"vertices of a mesh must be finite and below {FARTHEST_M:g} m, got {odd}: export it again")
     if corners.min() < 0 or corners.max() >= len(points):
-        raise ValueError(f"faces name vertices 0 to {len(points) - 1}, got {corners.min()} to {corners.max()}")
+        raise ValueError(
+            f"faces name vertices 0 to {len(points) - 1}, got {corners.min()} to {corners.max()}: export it again"
+        )
     unique, places = np.unique(points, axis=0, return_inverse=True)
     return unique, places.reshape(-1)[corners]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from canprobe.scene.geometry import true_object
 from canprobe.scene.load import load_scene, scenes_folder
 from canprobe.scene.model import ObjectSettings
 from canprobe.scene.resolve import resolve
+from canprobe.scene.stl_files import stl_damage
 from canprobe.session.session import write_scene
 
 X, Y = np.meshgrid(np.arange(-20, 20.1), np.arange(-15, 15.1), indexing="ij")
@@ -54,12 +56,25 @@ def test_heights_of_every_kind_of_file_are_the_same_surface(name, tmp_path):
     [
         ("gone.npy", None, "gone.npy: cannot be read: No such file"),
         ("bump.png", b"", "expected heights in a file of .npy, .npz, .csv, .txt, got bump.png"),
-        ("bump.csv", b"1, 2\n3, four\n", "bump.csv is no grid of numbers: could not convert string to float: 'four'"),
-        ("bump.csv", b"1, 2\n3\n", "no grid of numbers"),
+        (
+            "bump.csv",
+            b"1, 2\n3, four\n",
+            "bump.csv is no grid of numbers: line 2: expected numbers, got 'four'; get the file",
+        ),
+        (
+            "bump.csv",
+            b"1, 2\n# beside\n3\n",
+            "no grid of numbers: line 3: expected 2 numbers as above, got 1; get the file",
+        ),
+        ("bump.csv", b"1, 2\n3, \xff\n", "bump.csv is no grid of numbers: byte 8 is 0xff, which is no text"),
+        ("bump.csv", b"1, 2\n3, nan\n", "bump.csv: height nan in row 2, column 2: fill gaps first"),
+        ("bump.csv", b"1, 2\n1e308, -1e308\n", "bump.csv: 2 of 4 heights are 1e[+]308: no data"),
+        ("bump.npy", b"text", "bump.npy is no grid of numbers: it is damaged, or holds Python objects; get the file"),
         ("bump.txt", b"", "bump.txt is empty"),
         ("bump.txt", b"# nothing but this", "grid of heights"),
         ("bump.csv", b"version https://git-lfs.github.com/spec/v1\noid", "bump.csv is a pointer of Git LFS"),
         ("bump.csv", b"<!DOCTYPE html>\n<html>", "bump.csv is an HTML page"),
+        ("bump.csv", b"0, 0\n0, 1", "bump.csv: heights must be a grid of 8 × 8 or more, got shape .2, 2.; correct the"),
         ("bump.csv", b"0;0,5\n0;-9999\n0;0", "1 of 6 heights are -9999: no data"),
         ("bump.csv", b"0;0,5\n0;500\n0;0", "heights rise by 500 mm over a grid 2 mm wide: .* unit_mm = 1 "),
         ("bump.csv", b"0;0,0005\n0;0\n0;0", "heights rise by 0.0005 mm over a grid 2 mm wide"),
@@ -74,6 +89,98 @@ def test_a_file_without_a_surface_is_refused_with_its_reason(name, content, mess
     scene = dataclasses.replace(load_scene("relief"), object=settings)
     with pytest.raises(PlanError, match=message.replace("(", "\\(")):
         resolve(scene)
+
+
+FACET = b"""facet normal 0 0 1
+  outer loop
+    vertex 0 0 0
+    vertex 1e0 0 0.
+    vertex 0 +1 -.0
+  endloop
+endfacet
+"""
+BINARY = b"solid of a program that begins so".ljust(80) + b"\x02\0\0\0" + 2 * (48 * b"\0" + b"\x01\0")
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (b"solid a part\n" + 2 * FACET + b"endsolid a part\n", None),
+        (b"solid\r\n" + FACET.replace(b"\n", b"\r\n") + b"endsolid\nsolid b\n" + FACET + b"endsolid", None),
+        (b" SOLID a\n" + FACET.upper().replace(b"0 0 1", b"nan nan nan", 1) + b"ENDSOLID", None),
+        (BINARY, None),
+        (b"solid a\n" + FACET + FACET[:40], "line 11: expected vertex and three numbers, got 'vert'"),
+        (b"solid a\n" + FACET + FACET[:33], "line 10: the file ends before vertex and three numbers"),
+        (b"solid a\n" + FACET, "line 8: the file ends before facet normal and three numbers, or endsolid"),
+        (
+            b"solid a\n" + FACET.replace(b"1e0 0 0.", b"1e0 O 0."),
+            "line 5: expected a second vertex and three numbers, got 'v",
+        ),
+        (
+            b"solid a\n" + FACET.replace(b"+1", b"inf") + b"endsolid",
+            "line 6: expected a third vertex and three numbers, g",
+        ),
+        (b"solid a\n" + FACET.replace(b"  endloop\n", b"") + b"endsolid", "line 7: expected endloop, got 'endfacet'"),
+        (b"solid a\n" + FACET + b"endsolid\nsol", "line 10: expected the end of the file, got 'sol'"),
+        (b"solid a\nendsolid a\n", "it holds no facet"),
+        (bytes(84), "it holds no facet"),
+        (bytes(50), "it ends at byte 50, within the 84 bytes of its head"),
+        (BINARY[:-1], "183 bytes, by the 2 facets of its head 184"),
+        (BINARY + b"\0", "185 bytes, by the 2 facets of its head 184"),
+    ],
+)
+def test_a_damaged_stl_is_named_with_its_line_or_its_bytes(content, why, tmp_path):
+    found = stl_damage(content)
+    assert found is None if why is None else found.startswith(why)
+    if why is not None:
+        (tmp_path / "part.stl").write_bytes(content)
+        with pytest.raises(ValueError, match=re.escape(f"file: part.stl is a damaged STL: {why}")):
+            true_object(ObjectSettings("mesh", file=str(tmp_path / "part.stl")))
+
+
+def damaged(content, rng):
+    """A content with one of the faults that files get on their way."""
+    whole, at = bytearray(content), int(rng.integers(len(content)))
+    match int(rng.integers(6)):
+        case 0:
+            del whole[at:]
+        case 1:
+            whole[at] = int(rng.integers(256))
+        case 2:
+            del whole[at : at + int(rng.integers(1, 200))]
+        case 3:
+            whole[at:at] = rng.bytes(20)
+        case 4:
+            del whole[:at]
+        case 5:
+            words = content.split(b" ")
+            words[int(rng.integers(len(words)))] = (b"nan", b"1e400", b"abc", b"-1", b"9999999")[at % 5]
+            whole = bytearray(b" ".join(words))
+    return bytes(whole)
+
+
+@pytest.mark.parametrize("name", ["a.stl", "b.stl", "a.obj", "a.ply", "b.ply", "a.npy", "a.npz", "a.csv", "a.txt"])
+def test_of_a_hundred_damaged_files_each_is_read_or_named(name, tmp_path):
+    if name.startswith("b") or not name.endswith(("npy", "npz", "csv", "txt")):
+        trimesh = pytest.importorskip("trimesh")
+        whole = trimesh.load_mesh(cap(tmp_path, name).file, process=False)
+        kind = {"a.stl": {"file_type": "stl_ascii"}, "a.ply": {"file_type": "ply", "encoding": "ascii"}}
+        content = whole.export(**kind.get(name, {"file_type": name[2:]}))
+        content = content.encode() if isinstance(content, str) else content
+        settings = ObjectSettings("mesh", unit_mm=1000, spacing_mm=2)
+    else:
+        content = Path(write(tmp_path, name, BUMP_MM, spacing=1.0)).read_bytes()
+        settings = ObjectSettings("heights", spacing_mm=1.0)
+    rng, named = np.random.default_rng(0), 0
+    for number in range(100):
+        path = tmp_path / f"odd{number}.{name[2:]}"
+        path.write_bytes(damaged(content, rng))
+        try:
+            true_object(dataclasses.replace(settings, file=str(path)))
+        except ValueError as error:
+            assert str(error).startswith(f"file: {path.name}"), error
+            named += 1
+    assert named > 40
 
 
 def test_a_decimal_comma_between_semicolons(tmp_path):
