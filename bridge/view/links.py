@@ -6,6 +6,7 @@ meshes is missing or cannot be read, the simple link of `canprobe.bridge.view.bo
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -86,11 +87,15 @@ def _solids(urdf: Path, visual: Visual) -> list[tuple[Mesh, tuple[int, int, int]
         raise _LostError("not found beside the URDF")
     if path.suffix.lower() not in _FORMATS:
         raise _LostError(f"expected {', '.join(_FORMATS)}")
+    logging.getLogger("trimesh").addHandler(logging.NullHandler())  # it logs tracebacks of what it does without
     try:
         bodies = trimesh.load_scene(path).dump()
     except Exception as error:  # whatever a reader of foreign files raises, the view goes on
         raise _LostError(f"cannot be read: {error or type(error).__name__}") from error
-    return [(_scaled(_mesh(body), np.array(size)), _colour(body)) for body in bodies if hasattr(body, "faces")]
+    solid = [body for body in bodies if len(getattr(body, "faces", ()))]
+    if not solid:  # of a damaged STL, trimesh makes a body of nothing
+        raise _LostError("cannot be read: it holds no facet")
+    return [(_scaled(_mesh(body), np.array(size)), _colour(body)) for body in solid]
 
 
 def _mesh(body: Any) -> Mesh:
