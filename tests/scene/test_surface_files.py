@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 import canprobe
+from canprobe.bus.disk import read_npz
 from canprobe.cli import main
 from canprobe.errors import PlanError, UsageError
 from canprobe.scene.geometry import true_object
-from canprobe.scene.load import load_scene, scenes_folder
+from canprobe.scene.load import load_scene, packaged_files, scenes_folder
 from canprobe.scene.model import ObjectSettings
 from canprobe.scene.resolve import resolve
 from canprobe.scene.stl_files import stl_damage
@@ -271,25 +272,44 @@ def test_heights_narrower_than_the_pad_are_refused_and_without_an_array_nothing_
     assert resolve(dataclasses.replace(scene, object=dataclasses.replace(heights, spacing_mm=0.9))).truth.object
 
 
-def disc(folder):
-    """A shallow dome of 24 mm radius as a scene for the relief's path."""
+def dome(folder, whole):
+    """A shallow dome of 48 mm by 48 mm, or the disc in it, as a scene for the relief's path."""
     trimesh = pytest.importorskip("trimesh")
     x, y = (one.ravel() for one in np.meshgrid(*[np.linspace(-24, 24, 49)] * 2, indexing="ij"))
     corner = np.array([49 * i + j for i in range(48) for j in range(48)])[:, None]
     faces = np.concatenate((corner + np.array((0, 49, 1)), corner + np.array((1, 49, 50))))
-    faces = faces[(np.hypot(x, y) <= 24)[faces].all(axis=1)]
-    trimesh.Trimesh(np.column_stack((x, y, -(x * x + y * y) / 400)), faces, process=False).export(folder / "disc.stl")
+    faces = faces[(whole | (np.hypot(x, y) <= 24))[faces].all(axis=1)]
+    trimesh.Trimesh(np.column_stack((x, y, -(x * x + y * y) / 400)), faces, process=False).export(folder / "dome.stl")
     text = (scenes_folder() / "relief.toml").read_text().replace("width_mm = 6", "width_mm = 2")
-    text = text.replace('"heights"', '"mesh"').replace("relief.npz", "disc.stl")
-    (folder / "disc.toml").write_text(text)
-    return str(folder / "disc.toml")
+    text = text.replace('"heights"', '"mesh"').replace("relief.npz", "dome.stl")
+    (folder / "dome.toml").write_text(text)
+    return str(folder / "dome.toml")
 
 
 def test_a_path_beyond_the_border_of_a_mesh_is_refused(tmp_path, capsys):
-    scene = disc(tmp_path)
+    scene = dome(tmp_path, False)
     assert main(["plan", scene, "--set", "task.length_mm=42"]) == 0
     assert main(["plan", scene, "--set", "task.length_mm=49"]) == 2  # inside of the square round the disc
     assert re.search(r"at \(-1\d\d\.\d, .* mm the path leaves the object .* shorten task", capsys.readouterr().err)
+
+
+def test_a_probe_that_leaves_a_mesh_is_stopped_and_touches_nothing_beyond(tmp_path):
+    """The true arm is a third longer than the plan knows, so that its path is too."""
+    longer = re.sub(
+        r"(?m)^([ad]_mm = )(.*)$",
+        lambda m: f"{m[1]}{1.3 * float(m[2])}",
+        packaged_files("cells")["puma260"].read_text(),
+    )
+    (tmp_path / "longer.toml").write_text(longer)
+    changes = {"object.origin_mm": "[0, 18.4]", "plant.true_cell": '"longer.toml"', "scene.figures": "false"}
+    changes |= {"task.heading_deg": 90, "task.length_mm": 10, "object.rotation_deg": "[0, 0, 0]"}
+    words = [word for key, value in changes.items() for word in ("--set", f"{key}={value}")]
+    scene, out = Path(dome(tmp_path, True)), tmp_path / "run"
+    scene.write_text(scene.read_text().replace("width_mm = 2", 'strategy = "straight"'))
+    assert main(["run", str(scene), "--bus", "direct", "--duration", "3", "--out", str(out), *words]) == 1
+    truth = read_npz(out / "truth.npz")
+    points = truth["contact_point"][truth["in_contact"]]
+    assert points[:, 1].max() == pytest.approx(-0.1225 + 0.024 - 0.0184, abs=1e-6)  # the border
 
 
 def test_a_path_that_leaves_the_surface_is_refused():
