@@ -100,7 +100,7 @@ ROUNDED_KG_M2 = 1e-12
 
 
 def negative_inertia(tensor: Array) -> str | None:
-    """Why a (3, 3) tensor cannot be moved: a principal moment is negative, which needs no torque; None where it can."""
+    """Why no dynamics follow from a (3, 3) tensor: a principal moment is negative; None where none is."""
     low, _, high = np.linalg.eigvalsh(tensor).tolist()
     if low >= -max(INERTIA_TOLERANCE * high, ROUNDED_KG_M2):
         return None

@@ -87,8 +87,12 @@ def _mesh(path: Path, changed_ns: int, unit: float, spacing: float, origin_mm: t
     except ImportError as error:
         raise UsageError(f"object.file: a mesh needs trimesh: {install_line('mesh')}") from error
     _refuse_other_content(path)
-    if path.suffix.lower() == ".stl" and (why := stl_damage(path.read_bytes())) is not None:
-        raise ValueError(f"file: {path.name} is a damaged STL: {why}; {_AGAIN}")
+    try:
+        damage = stl_damage(path.read_bytes()) if path.suffix.lower() == ".stl" else None
+    except OSError as error:
+        raise ValueError(f"file: {path}: cannot be read: {error.strerror}") from error
+    if damage is not None:
+        raise ValueError(f"file: {path.name} is a damaged STL: {damage}; {_AGAIN}")
     logging.getLogger("trimesh").addHandler(logging.NullHandler())  # it logs tracebacks of what it does without
     try:
         with warnings.catch_warnings():

@@ -252,6 +252,8 @@ def _covered(triangles: Array, shape: tuple[int, ...]) -> npt.NDArray[np.bool_]:
     np.add.at(begun, (row, low), 1)
     np.add.at(begun, (row, np.maximum(high + 1, low)), -1)
     covered: npt.NDArray[np.bool_] = np.cumsum(begun, axis=1)[:, :-1] > 0
+    # A node between four covered ones lies in a gap of less than two spacings, where a facet is missing: it is bridged.
+    covered[1:-1, 1:-1] |= covered[:-2, 1:-1] & covered[2:, 1:-1] & covered[1:-1, :-2] & covered[1:-1, 2:]
     return covered
 
 
@@ -267,7 +269,10 @@ def _fitted(samples: Array, weights: Array, facing: Array, spacing: float, at: A
         least = f"narrower than {LEAST_NODES - 1} spacings of {1e3 * spacing:.3g} mm"
         raise ValueError(f"what is seen of the mesh from +z is {x:.3g} mm by {y:.3g} mm, {least}")
     if np.prod(cells + 1.0) > MOST_NODES:
-        raise ValueError(f"the mesh is {high - low} m wide: more than {MOST_NODES:.0g} nodes; widen the spacing")
+        raise ValueError(
+            f"the mesh is {x:.3g} mm by {y:.3g} mm: more than {MOST_NODES:.0g} nodes at {1e3 * spacing:.3g} mm; widen"
+            " the spacing, or remove vertices far away"
+        )
     corner = 0.5 * (low + high) - 0.5 * cells * spacing
     m, n = (int(one) + 3 for one in cells)  # coefficients along x and y
     place = (samples[:, :2] - corner) / spacing

@@ -175,6 +175,13 @@ def test_the_surface_ends_with_the_facets_and_so_does_the_closest_point(hole_m):
     assert len(there) / len(seen) > 0.8 * math.pi * (0.02**2 - hole_m**2) / 0.042**2  # cells at the border are lost
 
 
+def test_missing_facets_round_a_node_are_bridged():
+    vertices, faces = ring_of(0.0, 0.02, (0.0, 0.0), n=81)
+    torn = faces[(faces != 40 * 81 + 40).all(axis=1)]
+    assert len(torn) == len(faces) - 6
+    assert (fit_mesh(vertices, torn, SPACING).there == fit_mesh(vertices, faces, SPACING).there).all()
+
+
 def test_a_body_that_is_narrow_where_it_is_seen_is_refused():
     """A steep truncated pyramid: 30 mm wide at its foot and 4 mm at its top."""
     top, foot = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * 2e-3, np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
