@@ -315,8 +315,8 @@ class _Stops:
         """Needed speeds (n,), rad/s or m/s, beside what is allowed."""
         joints, limit = self.arm.model.joints, self.arm.model.qd_max * self.limits.speed_share
         return JointSpeeds(
-            tuple(round(joint.shown(rate), 3) for joint, rate in zip(joints, needed.tolist(), strict=True)),
-            tuple(round(joint.shown(rate), 3) for joint, rate in zip(joints, limit.tolist(), strict=True)),
+            tuple(joint.shown(rate) for joint, rate in zip(joints, needed.tolist(), strict=True)),
+            tuple(joint.shown(rate) for joint, rate in zip(joints, limit.tolist(), strict=True)),
             tuple(f"{joint.unit}/s" for joint in joints),
         )
 
@@ -325,7 +325,7 @@ def _too_fast(arm: Arm, speeds: JointSpeeds, way_out: str) -> list[str]:
     """One line for every joint that the task asks to be too fast."""
     each = zip(speeds.needed, speeds.limit, speeds.units, strict=True)
     return [
-        f"task: joint {i} would need {need:.0f} {unit}, allowed {limit:.0f}; {way_out}"
+        f"task: joint {i} would need {need:.4g} {unit}, allowed {limit:.4g}; {way_out}"
         for i, (need, limit, unit) in enumerate(each, start=1)
         if need > limit
     ]

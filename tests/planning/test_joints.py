@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +12,7 @@ from scenes import with_joints
 
 import canprobe
 from canprobe.eds.packaged import eds_path
+from canprobe.emulator.plant.ideal_arm import natural_frequency
 from canprobe.errors import PlanError
 from canprobe.scene.load import load_scene, parse_scene
 
@@ -105,3 +108,39 @@ def test_two_joints_cannot_press():
 def test_a_full_arm_is_warned_of_nothing():
     for cell in ("puma260", "puma560"):
         assert canprobe.plan(load_scene("cylinder", {"cell": cell})).warnings == ()
+
+
+def with_following_window(tmp_path, window, access):
+    """The free scene with drives whose 6065h is as given."""
+    text = eds_path("puma260_joint").read_text()
+    head, mark, rest = text.partition("[6065]")
+    section, end, tail = rest.partition("\n[")
+    section = re.sub("DefaultValue=.*", f"DefaultValue={window}", section)
+    section = re.sub("AccessType=.*", f"AccessType={access}", section)
+    (tmp_path / "window.eds").write_text(head + mark + section + end + tail)
+    scene = load_scene("free", {"bus": {"interface": "direct"}})
+    scene = replace(scene, task=replace(scene.task, duration_s=1.2))
+    return replace(scene, arm=replace(scene.arm, eds=str(tmp_path / "window.eds")))
+
+
+def test_joints_keep_within_the_speed_at_which_their_drives_lag_by_a_fixed_window(tmp_path):
+    lag_s = 2.0 / natural_frequency(30.0, 1.0)
+    plan = canprobe.plan(with_following_window(tmp_path, 200, "ro"))
+    model = plan.setup.arm.model
+    fastest = np.abs(model.units_per_q) @ model.qd_max
+    assert fastest.max() * lag_s == pytest.approx(200 - 2), "two counts are rounding"
+    assert "6065h: drives that fault below the speeds" in plan.warnings[0]
+    assert "servo.drive_lag_ms" in plan.warnings[0]
+    assert canprobe.plan(with_following_window(tmp_path, 200, "rw")).warnings == ()
+    assert canprobe.plan(with_following_window(tmp_path, 0xFFFFFFFF, "ro")).warnings == ()
+
+
+def test_a_swing_that_a_following_window_allows_is_done_and_a_faster_one_refused(tmp_path):
+    free = canprobe.plan(with_following_window(tmp_path, 0xFFFFFFFF, "ro"))
+    speeds = np.abs(free.setup.arm.model.units_per_q) @ np.radians(free.joint_speeds.needed)
+    lag = max(speeds) * 2.0 / natural_frequency(30.0, 1.0)
+    narrow = with_following_window(tmp_path, math.ceil(1.5 * lag) + 2, "ro")
+    assert "6065h" in canprobe.plan(narrow).warnings[0]
+    assert canprobe.run(narrow, files=False).summary["completed"]
+    said = refusal(with_following_window(tmp_path, math.floor(0.5 * lag), "ro"))
+    assert "6065h" in said and "swing slower" in said
