@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from makes import MAKES, Entry, write_eds
 from scenes import with_joints
 
 import canprobe
@@ -144,3 +145,28 @@ def test_a_swing_that_a_following_window_allows_is_done_and_a_faster_one_refused
     assert canprobe.run(narrow, files=False).summary["completed"]
     said = refusal(with_following_window(tmp_path, math.floor(0.5 * lag), "ro"))
     assert "6065h" in said and "swing slower" in said
+
+
+@pytest.mark.parametrize(
+    ("index", "name", "access", "held", "warned"),
+    [
+        (0x200E, "SYNC time-out factor", "ro", 2, True),
+        (0x200E, "SYNC time-out factor", "rw", 2, True),
+        (0x200E, "SYNC time-out factor", "ro", 5, False),
+        (0x200E, "SYNC time-out factor", "ro", 0, False),
+        (0x2000, "Missed SYNCs tolerated", "ro", 2, True),
+        (0x2000, "Missed SYNCs tolerated", "rw", 2, False),
+        (0x200E, "Something else", "ro", 2, False),
+    ],
+)
+def test_drives_that_stop_sooner_than_their_master_thinks_are_named(tmp_path, index, name, access, held, warned):  # noqa: PLR0917
+    make = MAKES["bare"]()
+    make.objects[index, 0] = Entry(name, "U16", access, held)
+    scene = load_scene("free")
+    plan = canprobe.plan(replace(scene, arm=replace(scene.arm, eds=str(write_eds(make, tmp_path)))))
+    said = [warning for warning in plan.warnings if warning.startswith("arm.missed_syncs = 5: ")]
+    assert len(said) == warned
+    if warned:
+        assert f"by {index:04X}h of" in said[0] and "nodes 1, 2, 3, 4, 5, 6 stop by themselves after 2" in said[0]
+        quick = replace(scene.arm, eds=plan.nodes[0].eds, missed_syncs=held)
+        assert not any("arm.missed_syncs" in one for one in canprobe.plan(replace(scene, arm=quick)).warnings)
