@@ -43,7 +43,8 @@ _BESIDE_M = 1e-6  # of a foot that does not lie under its point along the normal
 _TOUCH_TO_TOUCH_RAD = 1.0  # between the touches of a calibration, and from the approach to the first contact
 DEVIATION_RAD = math.radians(1.0)
 """By which the joints of a touch may go beyond its planned way, which knows neither the depth nor the servo; for a
-prismatic one see `ArmModel.radian`."""
+prismatic one see `ArmModel.radian`. Without the last retreat, which no stop ends; near a singular posture there is no
+such bound."""
 PARKED_ABOVE = 5e-3
 """How far above the approach's first point an emulated arm stands at power on, m."""
 
