@@ -69,6 +69,12 @@ def has_missed_syncs(od: canopen.ObjectDictionary) -> bool:
     return MISSED_SYNCS in od and od[MISSED_SYNCS].name == MISSED_SYNCS_NAME
 
 
+def sync_patience(od: canopen.ObjectDictionary) -> int | None:
+    """Index of the object that says how many SYNCs a drive misses before it stops by itself; None without one."""
+    named = ((MISSED_SYNCS, MISSED_SYNCS_NAME), (SYNC_FACTOR, SYNC_FACTOR_NAME))
+    return next((index for index, name in named if index in od and od[index].name == name), None)
+
+
 def has_long_pdos(od: canopen.ObjectDictionary) -> bool:
     """Whether 2007h is that object here: the device can send PDOs in CAN FD frames."""
     return LONG_PDOS in od and od[LONG_PDOS].name == LONG_PDOS_NAME

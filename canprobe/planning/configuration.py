@@ -16,7 +16,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from canopen import ObjectDictionary
 
 from canprobe.eds.description import Description, Entry
@@ -44,10 +43,12 @@ from canprobe.planning.model import (
 from canprobe.planning.operation import INTERPOLATION_TIME, SYNC_PERIOD, follows_sync_period, homing_problems
 from canprobe.planning.traffic import CLASSIC_BYTES
 from canprobe.planning.units import (
+    FOLLOWING_WINDOW,
     POLARITY,
     POSITION_LIMITS,
     PROFILE_SPEED_LIMIT,
     TurnUnits,
+    following_window,
     motor_speed_limit,
     software_limits,
     speed_unit,
@@ -66,7 +67,6 @@ HOME_OFFSET = 0x607C
 HOMES_HERE = frozenset({35, 37})
 """Homing methods that take the present position."""
 TARE = 0x65726174  # "tare", as 1010h has "save"
-FOLLOWING_WINDOW_DEG = 5.0
 FOLLOWING_TIMEOUT_MS = 50
 QUICK_STOP_AND_DISABLE = 2  # 605Ah: slow down on the quick stop ramp, then switch on disabled
 GO_PRE_OPERATIONAL = 0  # 1029h:01
@@ -340,7 +340,6 @@ def _drive_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Writ
     assert arm is not None and node.mode is not None
     model, axis = arm.model, arm.node_ids.index(node.node_id)
     low, high = software_limits(model)
-    window = round(abs(float(model.units_per_q[axis, axis] * model.radian[axis])) * np.radians(FOLLOWING_WINDOW_DEG))
     limit = motor_speed_limit(model, axis, setup.limits.speed_share, plan.sync.period_ns)
     unit = speed_unit(device, arm.drives[axis], VELOCITY)
     fastest = "highest speed of the motor"
@@ -356,7 +355,7 @@ def _drive_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Writ
         Write(MODE, 0, node.mode, "mode of operation"),
         *([Write(0x60C0, 0, 0, "linear interpolation", "the device interpolates in its way")] if interpolated else []),
         *(_interpolation_writes(device, node.interpolation[0]) if node.interpolation else []),
-        Write(0x6065, 0, window, "following error window", following),
+        Write(FOLLOWING_WINDOW, 0, following_window(model, axis), "following error window", following),
         Write(0x6066, 0, FOLLOWING_TIMEOUT_MS, "following error time-out", lag),
         *speed,
         Write(POSITION_LIMITS, 1, int(low[axis]), "lowest position", stops),

@@ -32,7 +32,7 @@ from canprobe.planning.model import (
     Traffic,
 )
 from canprobe.planning.motion import check_motion
-from canprobe.planning.operation import choose_mode, interpolations, operation_problems, period_problem
+from canprobe.planning.operation import choose_mode, early_stops, interpolations, operation_problems, period_problem
 from canprobe.planning.pdos import PdoPlanning, plan_drive_pdos, plan_tactile_pdos
 from canprobe.planning.traffic import plan_ratio, plan_sync, plan_traffic
 from canprobe.planning.units import range_problems, speed_problems, within_drives
@@ -99,7 +99,7 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
         outputs=outputs(setup, dict(absent)),
         left_out=(*absent, *_unused_axes(setup, devices)),
         not_available=(*bus.not_available, *unavailable_bridges(setup)),
-        warnings=(*narrowed, *warnings(setup, bus.pdos)),
+        warnings=(*narrowed, *early_stops(setup, devices), *warnings(setup, bus.pdos)),
     )
     return _with_configuration(plan)
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,17 @@ from canprobe.planning.model import JointSpeeds
 from canprobe.robot.chain import forward, forward_jacobian
 from canprobe.robot.inverse import FIXED_POLE, LENGTH_M, in_rows, inverse_near, probe_pose, start_posture, task_rows
 from canprobe.scene.setup import Approach, Arm, Calibrate, Free, Probe, SafetyLimits, Setup, Touch
+from canprobe.touch.probe_motion import (
+    MOVE_SPEED,
+    OFF_M,
+    RETREAT_SPEED,
+    ROUND_SPEED,
+    SETTLE_S,
+    ArcMotion,
+    LineMotion,
+    PoseSteps,
+)
+from canprobe.touch.servo import ProbePose
 from canprobe.touch.shapes import PlacedShape
 
 Array = NDArray[np.float64]
@@ -29,6 +41,10 @@ _BALL_STEPS = 6  # halves what is left of the way from under the centre to the c
 _PATCH_M = 2e-3  # half of the width of a patch
 _BESIDE_M = 1e-6  # of a foot that does not lie under its point along the normal: on the surface's border
 _TOUCH_TO_TOUCH_RAD = 1.0  # between the touches of a calibration, and from the approach to the first contact
+DEVIATION_RAD = math.radians(1.0)
+"""By which the joints of a touch may go beyond its planned way, which knows neither the depth nor the servo; for a
+prismatic one see `ArmModel.radian`. Without the last retreat, which no stop ends; near a singular posture there is no
+such bound."""
 PARKED_ABOVE = 5e-3
 """How far above the approach's first point an emulated arm stands at power on, m."""
 
@@ -71,12 +87,24 @@ def surface_path(task: Touch, shape: PlacedShape | None) -> SurfacePath:
     # A ball bridges what a point would fall into.
     radius = task.probe.radius if shape.by_gaps and not task.array.pad.is_flat else 0.0
     _check_approach(approach, _along(shape, approach.start, down, radius))
+    if not task.array.pad.is_flat:
+        plane = plane + _first_contact(shape, approach, task.probe.radius)
     path = _contacts(shape, plane, down, radius)
     if shape.by_gaps:
         path = _under_ball(shape, path, plane, down, radius)
     if path.hollow_radius > task.probe.radius:  # a tighter hollow is refused as that
         _check_first_touch(task, shape)
     return path
+
+
+def _first_contact(shape: PlacedShape, approach: Approach, radius: float) -> Array:
+    """Where a ball first touches, (3,) m across the approach from its end: the path begins there."""
+    height = _along(shape, approach.start, approach.normal, radius)
+    if height is None or shape.tightest_concave_radius(approach.start[None]) <= radius:
+        return np.zeros(3)  # in a hollow that is tighter it touches in two places, which is refused as that
+    beside = shape.closest(approach.start + (height + radius) * approach.normal).point - approach.start
+    across: Array = beside - float(beside @ approach.normal) * approach.normal
+    return across
 
 
 def _contacts(shape: PlacedShape, plane: Array, up: Array, radius: float) -> SurfacePath:
@@ -192,8 +220,10 @@ def check_motion(setup: Setup) -> tuple[JointSpeeds | None, list[str]]:
             case Free() as task:
                 speeds, found = _check_swing(task, stops, starts=not problems)
             case Calibrate() as task:
-                joints = _follow(task.arm, task.probe, _over_ball(task), _beginning(setup, task, _over_ball(task)))
-                speeds, found = stops.speeds(np.zeros_like(task.arm.q_start)), stops.problems(joints)
+                ball, q_start = task, _beginning(setup, task, _over_ball(task))
+                _follow(task.arm, task.probe, _over_ball(task), q_start)
+                joints = _gone(task.arm, task.probe, q_start, lambda pose: _round_ball(ball, pose))
+                speeds, found = stops.speeds(np.zeros_like(task.arm.q_start)), stops.problems(joints, touching=True)
             case Touch() as task:
                 path = surface_path(task, setup.truth.object)
                 problems += _hollow_problems(path, task.probe)
@@ -302,21 +332,24 @@ class _Stops:
             for i in np.flatnonzero(~self.inside(q, q)).tolist()
         ]
 
-    def problems(self, joints: Array) -> list[str]:
-        """Joints that would leave their range, of positions (m, n) rad or m."""
-        low, high, its = joints.min(axis=0), joints.max(axis=0), self.arm.model.joints
+    def problems(self, joints: Array, *, touching: bool = False) -> list[str]:
+        """Joints that would leave their range, of positions (m, n) rad or m; a touch may lead them somewhat farther."""
+        its, farther = self.arm.model.joints, DEVIATION_RAD * touching * self.arm.model.radian
+        low, high = joints.min(axis=0), joints.max(axis=0)
+        near = "and {} less, by which a touch may lead it farther; "
         return [
             f"task: joint {i + 1} would move from {its[i].shown(low[i]):.1f} to {its[i].text(high[i])}, "
-            f"allowed {self.allowed(i)}; move the object, shorten the path, or raise task.rolling_share"
-            for i in np.flatnonzero(~self.inside(low, high)).tolist()
+            f"allowed {self.allowed(i)}; {near.format(its[i].text(farther[i])) * touching}"
+            "move the object, shorten the path, or raise task.rolling_share"
+            for i in np.flatnonzero(~self.inside(low - farther, high + farther)).tolist()
         ]
 
     def speeds(self, needed: Array) -> JointSpeeds:
         """Needed speeds (n,), rad/s or m/s, beside what is allowed."""
         joints, limit = self.arm.model.joints, self.arm.model.qd_max * self.limits.speed_share
         return JointSpeeds(
-            tuple(round(joint.shown(rate), 3) for joint, rate in zip(joints, needed.tolist(), strict=True)),
-            tuple(round(joint.shown(rate), 3) for joint, rate in zip(joints, limit.tolist(), strict=True)),
+            tuple(joint.shown(rate) for joint, rate in zip(joints, needed.tolist(), strict=True)),
+            tuple(joint.shown(rate) for joint, rate in zip(joints, limit.tolist(), strict=True)),
             tuple(f"{joint.unit}/s" for joint in joints),
         )
 
@@ -325,7 +358,7 @@ def _too_fast(arm: Arm, speeds: JointSpeeds, way_out: str) -> list[str]:
     """One line for every joint that the task asks to be too fast."""
     each = zip(speeds.needed, speeds.limit, speeds.units, strict=True)
     return [
-        f"task: joint {i} would need {need:.0f} {unit}, allowed {limit:.0f}; {way_out}"
+        f"task: joint {i} would need {need:.4g} {unit}, allowed {limit:.4g}; {way_out}"
         for i, (need, limit, unit) in enumerate(each, start=1)
         if need > limit
     ]
@@ -351,7 +384,8 @@ def _check_touch(task: Touch, path: SurfacePath, stops: _Stops, q_start: Array) 
     if problems:
         return None, problems
     joints = _follow(task.arm, task.probe, _along_path(task, path), q_start)
-    problems = stops.problems(np.vstack((q_start, joints)))
+    gone = _gone(task.arm, task.probe, q_start, lambda pose: _over_path(task, path, pose))
+    problems = stops.problems(gone, touching=True)
     approach = task.approach
     down = stops.speeds(np.abs(joints[_BEFORE_CONTACT] - joints[1]) / approach.clearance * approach.speed)
     slowly = 1e3 * approach.speed / max(down.worst_share, 1.0) * 0.99
@@ -383,8 +417,10 @@ def _off_array(task: Touch, path: SurfacePath) -> list[str]:
 
 def _poles(task: Touch, path: SurfacePath) -> Array:
     """(n, 3) pole of the probe, away from the object, at each contact."""
-    share = task.scan.rolling_share if task.scan is not None else float(task_rows(task.arm.model) == FIXED_POLE)
-    poles = (1 - share) * path.normals + share * task.approach.normal
+    fixed = task_rows(task.arm.model) == FIXED_POLE
+    share = task.scan.rolling_share if task.scan is not None else float(fixed)
+    kept = task.approach.normal if fixed else path.normals[0]  # the probe keeps the pole of its first contact
+    poles = (1 - share) * path.normals + share * kept
     unit: Array = poles / np.linalg.norm(poles, axis=1)[:, None]
     return unit
 
@@ -474,3 +510,72 @@ def _follow(arm: Arm, probe: Probe, poses: Iterable[_Pose], q_start: Array) -> A
             raise PlanError([pose.out_of_reach.format(why=error)]) from error
         found.append(q)
     return np.array(found)
+
+
+# The way that the task will take, in time, and the joints on it: the same steps as the task's, though longer ones.
+
+# longest step: for the null space, the linear and the angular rows
+_LONGEST_S, _LONGEST_M, _LONGEST_RAD = 0.05, 1e-3, 0.02
+_AT_LEAST = 4  # steps between two poses
+_Timed = tuple[ProbePose, float]
+
+
+def _gone(arm: Arm, probe: Probe, q_start: Array, way: Callable[[ProbePose], Iterable[_Timed]]) -> Array:
+    """Joint positions (m, n), rad or m, on the way of a task.
+
+    Args:
+        arm, probe: what moves.
+        q_start: (n,) where it begins.
+        way: from the pose of the beginning, the poses of the task, each with the time to it from the one before, s.
+    """
+    steps = PoseSteps(arm.model, probe.T_flange_probe, q_start)
+    before = ProbePose(np.array(steps.at.flange), np.array(steps.at.z))
+    q, found = q_start.tolist(), [q_start.tolist()]
+    for pose, seconds in way(before):
+        moved = float(np.linalg.norm(pose.centre - before.centre)) / _LONGEST_M
+        turned = float(np.linalg.norm(pose.pole - before.pole)) / _LONGEST_RAD
+        count = max(_AT_LEAST, math.ceil(max(moved, turned, seconds / _LONGEST_S)))
+        for share in (np.arange(count) + 1) / count:
+            pole = before.pole + share * (pose.pole - before.pole)
+            between = ProbePose(before.centre + share * (pose.centre - before.centre), pole / np.linalg.norm(pole))
+            q = [a + step for a, step in zip(q, steps.step(q, between, seconds / count), strict=True)]
+            found.append(q)
+        before = pose
+    return np.array(found)
+
+
+def _over_path(task: Touch, path: SurfacePath, pose: ProbePose) -> Iterator[_Timed]:
+    """To the approach, down, at rest, and once round the path."""
+    approach, radius = task.approach, task.probe.radius
+    above = ProbePose(approach.start + (approach.clearance + radius) * approach.normal, -approach.normal)
+    yield from _moving(LineMotion(pose, above, MOVE_SPEED))
+    poses = [
+        ProbePose(point + radius * normal, -pole)
+        for point, normal, pole in zip(path.points, path.normals, _poles(task, path), strict=True)
+    ]
+    yield ProbePose(poses[0].centre, above.pole), approach.clearance / approach.speed
+    yield poses[0], SETTLE_S
+    if task.scan is not None:
+        for last, here in itertools.pairwise(poses):
+            yield here, float(np.linalg.norm(here.centre - last.centre)) / task.scan.speed
+
+
+def _round_ball(task: Calibrate, pose: ProbePose) -> Iterator[_Timed]:
+    """To each touch, down, and off again."""
+    radii, down_s = task.ball_radius + task.probe.radius, task.approach.clearance / task.approach.speed
+    for touch in task.approaches:
+        above, on, off = (
+            ProbePose(task.ball_centre + (radii + gap) * touch.n_base, touch.pole_base)
+            for gap in (task.approach.clearance, 0.0, task.approach.clearance + OFF_M)
+        )
+        yield from _moving(ArcMotion(task.ball_centre, pose, above, ROUND_SPEED))
+        yield on, down_s
+        yield from _moving(LineMotion(on, off, RETREAT_SPEED))
+        pose = off
+
+
+def _moving(motion: LineMotion | ArcMotion) -> Iterator[_Timed]:
+    """The poses of a move."""
+    count = max(_AT_LEAST, math.ceil(motion.duration / _LONGEST_S))
+    for k in range(1, count + 1):
+        yield motion.at(motion.duration * k / count), motion.duration / count

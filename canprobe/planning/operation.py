@@ -9,13 +9,15 @@ Source: CiA 402-2, objects 6060h, 60C1h, 60C2h, 6502h; CiA 301, object 1006h.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from canprobe.eds.description import Entry
+from canprobe.eds.packaged import MISSED_SYNCS, sync_patience
 from canprobe.planning.devices import Abilities
 from canprobe.planning.model import Interpolation
 from canprobe.protocol.cia402 import OperationMode
+from canprobe.scene.setup import Setup
 
 Place = tuple[int, int]
 
@@ -69,6 +71,32 @@ def operation_problems(device: Abilities) -> list[str]:
 def follows_sync_period(device: Abilities) -> bool:
     """Whether a drive knows the period of its targets only by 1006h."""
     return not device.has(INTERPOLATION_TIME, 1) and device.has(SYNC_PERIOD)
+
+
+def early_stops(setup: Setup, devices: Mapping[int, Abilities]) -> Iterator[str]:
+    """Drives that take their master for dead sooner than the plan says, as their EDS has it."""
+    arm = setup.arm
+    early: dict[tuple[str, int, int], list[int]] = {}
+    for node_id in arm.node_ids if arm is not None else ():
+        assert arm is not None
+        device, index = devices[node_id], sync_patience(devices[node_id].od)
+        entry = device.description.entry(index) if index is not None else None
+        if (
+            index is None
+            or entry is None
+            or (index == MISSED_SYNCS and entry.writable and entry.allows(arm.missed_syncs))
+        ):
+            continue
+        if 0 < (held := device.number(index) or 0) < arm.missed_syncs:
+            early.setdefault((device.eds, index, held), []).append(node_id)
+    for (eds, index, held), node_ids in early.items():
+        assert arm is not None
+        nodes, syncs = ", ".join(map(str, node_ids)), f"{held} missed SYNC{'s' * (held > 1)}"
+        yield (
+            f"arm.missed_syncs = {arm.missed_syncs}: by {index:04X}h of {eds} nodes {nodes} stop by themselves after"
+            f" {syncs}, before their master takes them for lost; set arm.missed_syncs = {held}, or raise {index:04X}h"
+            " in the drives and in their EDS"
+        )
 
 
 def homing_problems(device: Abilities) -> list[str]:

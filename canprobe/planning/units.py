@@ -5,8 +5,8 @@ device is changed for them. Where a device has the factor group of CiA 402, its 
 cell's at bring-up, and 607Eh, which turns positions round, must be as its EDS has it. Speeds and accelerations are
 written in the units of 60A9h and 60AAh, which must be as the EDS has them, too.
 
-Source: CiA 402-2, "Factor group": 607Eh, 608Fh, 6091h, 6092h, 60A9h, 60AAh; "Software position limit": 607Dh; 607Fh,
-6080h; 6064h and 607Ah are INTEGER32.
+Source: CiA 402-2, "Factor group": 607Eh, 608Fh, 6091h, 6092h, 60A9h, 60AAh; "Software position limit": 607Dh; 6065h,
+607Fh, 6080h; 6064h and 607Ah are INTEGER32.
 """
 
 from __future__ import annotations
@@ -21,10 +21,15 @@ from canprobe.planning.devices import Abilities
 from canprobe.protocol.si_unit import VELOCITY, rate_unit
 from canprobe.robot.chain import Array
 from canprobe.robot.model import ArmModel
-from canprobe.scene.setup import Arm, Drive, Setup
+from canprobe.scene.setup import Arm, Calibrate, Drive, Setup, Touch
 
 POSITION_LIMITS, POLARITY, RESOLUTION, GEAR_RATIO, FEED = 0x607D, 0x607E, 0x608F, 0x6091, 0x6092
-PROFILE_SPEED_LIMIT, MOTOR_SPEED_LIMIT = 0x607F, 0x6080
+PROFILE_SPEED_LIMIT, MOTOR_SPEED_LIMIT, FOLLOWING_WINDOW = 0x607F, 0x6080, 0x6065
+FOLLOWING_WINDOW_DEG = 5.0
+NO_WINDOW = 0xFFFFFFFF
+"""6065h of a drive that watches no following error."""
+LAG_BANDWIDTH = math.sqrt(math.sqrt(2.0) - 1.0) / math.pi
+"""Lag behind a ramp, times the -3 dB frequency, of a critically damped loop of second order: 2/w."""
 ROUNDING_COUNTS = 2
 """By which two targets may be rounded apart."""
 _LOWEST, _HIGHEST = -(1 << 31), (1 << 31) - 1
@@ -124,16 +129,38 @@ def range_problems(setup: Setup) -> Iterator[str]:
             )
 
 
+@dataclass(frozen=True, slots=True)
+class _SpeedLimit:
+    """A speed that an object of a drive holds the cell to, whether it limits speed or the following error.
+
+    Attributes:
+        index: of the object.
+        most: position units/s, infinite for none.
+        rounding: what of it whole targets use up, position units/s.
+    """
+
+    index: int
+    most: float
+    rounding: float
+
+    @property
+    def left(self) -> float:
+        """What the joints may ask for, position units/s."""
+        return self.most - self.rounding
+
+
 def speed_problems(setup: Setup, devices: Mapping[int, Abilities]) -> Iterator[str]:
     """Drives whose limit of speed is no more than what whole targets differ by from cycle to cycle."""
-    arm, rounding = setup.arm, ROUNDING_COUNTS * setup.rate_hz
-    for joint, drive in zip(arm.model.joints, arm.drives, strict=True) if arm is not None else ():
-        most, index = _allowed_speed(devices[drive.node_id], drive, math.inf)
-        if most <= rounding:
+    arm = setup.arm
+    for axis, joint in enumerate(arm.model.joints) if arm is not None else ():
+        lowest = _lowest_limit(setup, axis, devices, math.inf)
+        if lowest.left <= 0.0:
+            assert arm is not None
             yield (
-                f"joints.{joint.name}: drive {drive.node_id} allows {most:.4g} units/s by its {index:04X}h, and whole"
-                f" targets differ by as much as {rounding:g} units/s at cycle.rate_hz = {setup.rate_hz:g}: check 60A9h"
-                " in the EDS, then counts_per_turn and gear; if they are right, lower cycle.rate_hz"
+                f"joints.{joint.name}: drive {arm.drives[axis].node_id} allows {lowest.most:.4g} units/s by its"
+                f" {lowest.index:04X}h, and whole targets differ by as much as {lowest.rounding:.4g} units/s at"
+                f" cycle.rate_hz = {setup.rate_hz:g}: check 60A9h in the EDS, then counts_per_turn and gear; if they"
+                " are right, lower cycle.rate_hz"
             )
 
 
@@ -167,18 +194,18 @@ def within_drives(setup: Setup, devices: Mapping[int, Abilities]) -> tuple[Setup
 
 
 def _within_speeds(setup: Setup, arm: Arm, devices: Mapping[int, Abilities]) -> tuple[Setup, tuple[str, ...]]:
-    """Joints no faster than the 607Fh and 6080h that stand in their drives: beyond them a drive faults."""
+    """Joints no faster than what stands in their drives as 607Fh, 6080h and 6065h: beyond it a drive faults."""
     model, share = arm.model, setup.limits.speed_share
-    rounding, slowest, slower = ROUNDING_COUNTS * setup.rate_hz, np.ones(model.n), []
-    for axis, drive in enumerate(arm.drives):
+    slowest, objects = np.ones(model.n), set()
+    for axis in range(model.n):
         wanted = float(np.abs(model.units_per_q[axis]) @ model.qd_max) * share
-        most, index = _allowed_speed(devices[drive.node_id], drive, wanted + rounding)
-        if wanted + rounding <= most:
+        lowest = _lowest_limit(setup, axis, devices, wanted)
+        if wanted <= lowest.left:
             continue
         moved = np.flatnonzero(model.units_per_q[axis])
-        slowest[moved] = np.minimum(slowest[moved], (most - rounding) / wanted)
-        slower.append((model.joints[axis].name, index))
-    if not slower:
+        slowest[moved] = np.minimum(slowest[moved], lowest.left / wanted)
+        objects.add(lowest.index)
+    if not objects:
         return setup, ()
     limits = [replace(joint, qd_max=joint.qd_max * factor) for joint, factor in zip(model.joints, slowest, strict=True)]
     told = ", ".join(
@@ -186,29 +213,57 @@ def _within_speeds(setup: Setup, arm: Arm, devices: Mapping[int, Abilities]) -> 
         for joint, factor in zip(limits, slowest.tolist(), strict=True)
         if factor < 1.0
     )
-    objects = " and ".join(sorted({f"{index:04X}h" for _, index in slower}))
+    lag = f"their lag of {1e3 * _lag_s(setup):.3g} ms (servo.drive_lag_ms, plant.drive_bandwidth_hz), "
     warning = (
-        f"{objects}: drives that fault below the speeds of their joints; the plan keeps within {told}. If that is"
-        " wrong, check 60A9h in the EDS, then counts_per_turn and gear"
+        f"{' and '.join(f'{index:04X}h' for index in sorted(objects))}: drives that fault below the speeds of their"
+        f" joints; the plan keeps within {told}. If that is wrong, check {lag * (FOLLOWING_WINDOW in objects)}60A9h in"
+        " the EDS, then counts_per_turn and gear"
     )
     return setup.changed("arm", model=replace(model, joints=tuple(limits))), (warning,)
 
 
-def _allowed_speed(device: Abilities, drive: Drive, wanted: float) -> tuple[float, int]:
-    """The lowest of the limits that stand in a drive, position units/s, and its object; infinite without any."""
-    limits = [(math.inf, PROFILE_SPEED_LIMIT)]
+def _lowest_limit(setup: Setup, axis: int, devices: Mapping[int, Abilities], wanted: float) -> _SpeedLimit:
+    """The lowest of the limits that stand in the drive of an axis, where so many position units/s are wanted."""
+    arm, rounding = setup.arm, ROUNDING_COUNTS * setup.rate_hz
+    assert arm is not None
+    device, drive = devices[arm.node_ids[axis]], arm.drives[axis]
+    limits = [_SpeedLimit(PROFILE_SPEED_LIMIT, math.inf, 0.0)]
     entry, unit = device.description.entry(PROFILE_SPEED_LIMIT), speed_unit(device, drive, VELOCITY)
     if (
         entry is not None
         and unit is not None
-        and not (entry.writable and (wanted == math.inf or entry.allows(math.ceil(wanted / unit))))
+        and not (entry.writable and (wanted == math.inf or entry.allows(math.ceil((wanted + rounding) / unit))))
     ):
         held = device.number(PROFILE_SPEED_LIMIT)
-        limits += [(held * unit, PROFILE_SPEED_LIMIT)] if held else []
+        limits += [_SpeedLimit(PROFILE_SPEED_LIMIT, held * unit, rounding)] if held else []
     turn, _ = _motor_turn(device, drive)
     if (rpm := device.number(MOTOR_SPEED_LIMIT)) and turn is not None:
-        limits.append((rpm / 60.0 * turn, MOTOR_SPEED_LIMIT))
-    return min(limits)
+        limits.append(_SpeedLimit(MOTOR_SPEED_LIMIT, rpm / 60.0 * turn, rounding))
+    window, lag = _fixed_window(device, following_window(arm.model, axis)), _lag_s(setup)
+    if window is not None and lag > 0.0:
+        limits.append(_SpeedLimit(FOLLOWING_WINDOW, window / lag, ROUNDING_COUNTS / lag))
+    return min(limits, key=lambda limit: limit.left)
+
+
+def following_window(model: ArmModel, axis: int) -> int:
+    """6065h as the cell would have it, units: so many degrees of the joint."""
+    return round(abs(float(model.units_per_q[axis, axis] * model.radian[axis])) * math.radians(FOLLOWING_WINDOW_DEG))
+
+
+def _fixed_window(device: Abilities, wanted: int) -> int | None:
+    """The 6065h with which a drive runs, units, where it is another than wanted; None where it watches no error."""
+    entry = device.description.entry(FOLLOWING_WINDOW)
+    if entry is None or (entry.writable and entry.allows(wanted)):
+        return None
+    window = device.number(FOLLOWING_WINDOW)
+    return None if window == NO_WINDOW else window
+
+
+def _lag_s(setup: Setup) -> float:
+    """How far the drives are behind a ramp, s: as the scene says, or as the emulated ones are, whichever is more."""
+    believed = setup.task.lag_s if isinstance(setup.task, Touch | Calibrate) else 0.0
+    emulated = setup.arm is not None and any(drive.emulated for drive in setup.arm.drives)
+    return max(believed, LAG_BANDWIDTH / setup.truth.bandwidth_hz if emulated else 0.0)
 
 
 def _within_ranges(setup: Setup, arm: Arm, devices: Mapping[int, Abilities]) -> tuple[Setup, tuple[str, ...]]:

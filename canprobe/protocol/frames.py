@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -135,6 +136,21 @@ class SyncCounter:
     def reset(self) -> None:
         """Start again at 1, as a producer does when it enters operation."""
         self._value = 0
+
+
+def is_sync(can_id: int, data: bytes) -> bool:
+    """Whether a frame is a SYNC: 080h without data, or with its counter."""
+    return can_id == SYNC_ID and len(data) <= 1
+
+
+def long_syncs_text(lengths: Mapping[int, int]) -> str:
+    """What is said of 080h with more data than a SYNC has; empty without any.
+
+    Args:
+        lengths: how many such frames there are of each length, bytes.
+    """
+    each = ", ".join(f"{count} frames 080h of {length} bytes" for length, count in sorted(lengths.items()))
+    return each and f"{each}, which CiA 301 does not know"
 
 
 def pack_sync(counter: int | None = None) -> Frame:

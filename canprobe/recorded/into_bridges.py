@@ -17,7 +17,7 @@ from canprobe.cell.cycle import Observation
 from canprobe.planning.bridges import BRIDGES, check_bridges
 from canprobe.planning.make import make_plan
 from canprobe.planning.model import Plan
-from canprobe.protocol.frames import SYNC_ID
+from canprobe.protocol.frames import is_sync
 from canprobe.recorded.cycles import LogCycles
 from canprobe.recorded.recording import read_recording
 from canprobe.recorded.reestimate import ReplayResult, find_log, replay, scene_of
@@ -145,7 +145,7 @@ def frames_by_sync(path: Path, first: str, plan: Plan) -> Iterator[list[TimedFra
     for t_ns, channel, can_id, data in RecordedBus(path):
         if channel != first and channel not in others:
             continue
-        if can_id == SYNC_ID and len(data) <= 1 and channel not in others:
+        if is_sync(can_id, data) and channel not in others:
             yield frames
             frames = []
         frames.append((can_id, data, t_ns))

@@ -14,7 +14,7 @@ from canprobe.bus.clock_steps import RecordedBus
 from canprobe.bus.port import TimedFrame, is_bus_error
 from canprobe.errors import UsageError
 from canprobe.planning.model import Plan
-from canprobe.protocol.frames import SYNC_ID
+from canprobe.protocol.frames import SYNC_ID, is_sync, long_syncs_text
 
 RATE_TOLERANCE = 0.2
 """Share by which the recorded SYNC period may differ from the scene's."""
@@ -114,7 +114,7 @@ def _read(bus: RecordedBus, plan: Plan) -> tuple[dict[str, _Channel], int]:
         channel = channels.get(name)
         if channel is None:
             channel = channels[name] = _Channel()
-        if (can_id == SYNC_ID and len(data) <= 1) or (on if on in others else main, can_id) in raw:
+        if is_sync(can_id, data) or (on if on in others else main, can_id) in raw:
             channel.frames.append((can_id, data, t_ns))
         elif (length := lengths.get(can_id)) is None:
             channel.other += 1
@@ -159,8 +159,8 @@ def _check_heard(path: Path, plan: Plan, name: str, channel: _Channel) -> None:
 def _check_syncs(recording: Recording, plan: Plan, long_syncs: Counter[int]) -> None:
     where = f"{recording.path}: on {recording.channel}"
     if len(recording.syncs) < 2:
-        longer = [f"{count} frames 080h of {length} bytes" for length, count in sorted(long_syncs.items())]
-        but = f" of 0 or 1 byte, but {', '.join(longer)}, which CiA 301 does not know" if longer else ""
+        longer = long_syncs_text(long_syncs)
+        but = f" of 0 or 1 byte, but {longer}" if longer else ""
         raise UsageError(f"{where} {len(recording.syncs)} SYNC (080h){but}; a replay goes from SYNC to SYNC")
     steps = np.diff(recording.sync_stamps)
     if 3 * (twice := np.count_nonzero(steps < STAMP_JITTER_NS)) > len(steps):

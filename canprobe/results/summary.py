@@ -25,6 +25,7 @@ from canprobe.errors import ResultsError, UsageError, install_line
 from canprobe.planning.make import make_plan
 from canprobe.planning.measured import MeasuredTraffic, TrafficMeter
 from canprobe.planning.model import Plan
+from canprobe.protocol.frames import SYNC_ID, is_sync, long_syncs_text
 from canprobe.results.files import save_surface_map
 from canprobe.results.run_files import SCHEMA
 from canprobe.results.scores import ShapeScore, bound_of_scan, score_contact, score_shape
@@ -77,6 +78,7 @@ def measure_traffic(
     plan = scene if isinstance(scene, Plan) else make_plan(resolve(load_scene(scene)))
     meters: dict[str, TrafficMeter] = {}
     syncs: Counter[str] = Counter()
+    long_syncs: Counter[int] = Counter()
     bus = RecordedBus(path)
     for t_ns, name, can_id, data in bus:
         meter = meters.get(name)
@@ -86,17 +88,21 @@ def measure_traffic(
             meter.error_frames += is_bus_error(can_id)
         else:
             meter.write(can_id, data, t_ns)
-            syncs[name] += can_id == 0x080
-    name = _chosen(path, syncs, plan, channel)
+            syncs[name] += is_sync(can_id, data)
+            long_syncs[len(data)] += can_id == SYNC_ID and not is_sync(can_id, data)
+    longer = long_syncs_text(+long_syncs)
+    name = _chosen(path, syncs, longer, plan, channel)
+    measured = meters[name].report()
     return replace(
-        meters[name].report(),
-        notes=tuple(bus.notes()),
+        measured,
+        unlisted=measured.unlisted | ({SYNC_ID: long_syncs.total()} if longer else {}),
+        notes=(*([longer] if longer else []), *bus.notes()),
         xl_frames=bus.xl.get(name, 0),
         lost_by_candump=bus.lost.get(name, 0),
     )
 
 
-def _chosen(path: Path, syncs: Counter[str], plan: Plan, channel: str | None) -> str:
+def _chosen(path: Path, syncs: Counter[str], longer: str, plan: Plan, channel: str | None) -> str:
     with_sync = [name for name in syncs if syncs[name]]
     wanted = plan.buses[0].channel if channel is None else channel
     if wanted in with_sync:
@@ -104,7 +110,8 @@ def _chosen(path: Path, syncs: Counter[str], plan: Plan, channel: str | None) ->
     if channel is None and len(with_sync) == 1:
         return with_sync[0]
     if not with_sync:
-        raise UsageError(f"{path}: no SYNC (080h) on any channel; expected the log of a cell that ran")
+        but = f" of 0 or 1 byte, but {longer}" if longer else " on any channel"
+        raise UsageError(f"{path}: no SYNC (080h){but}; expected the log of a cell that ran")
     raise UsageError(
         f"{path}: no SYNC (080h) on channel {wanted}; name one that has it: {', '.join(sorted(with_sync))}"
     )

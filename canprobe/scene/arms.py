@@ -6,7 +6,7 @@ The chain is read from a URDF or from Denavit-Hartenberg rows. What a joint's se
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -21,6 +21,8 @@ from canprobe.scene.hardware import ArmSettings, JointSettings
 from canprobe.scene.setup import Homing
 
 Bodies = tuple[Body | None, ...] | None
+SLOWEST_RAD_S, SLOWEST_M_S = math.radians(0.01), 1e-5
+"""Speed limits below which a joint of a URDF practically stands: a degree takes it longer than a minute and a half."""
 
 _MM = 1e-3
 _OF_REVOLUTE = {
@@ -64,6 +66,7 @@ def arm_model(
         _refuse_other_names(found, sections, arm)
         chain = _moved(found.chain, mount, flange)
         joints = [_joint(section, joint) for section, joint in zip(sections.values(), found.joints, strict=True)]
+        _refuse_standstill(arm.urdf, found.joints, sections)
         bodies: Bodies = found.bodies if any(found.bodies) else None
         settled = {
             limit_warning(arm.urdf, joint)
@@ -107,6 +110,19 @@ def _refuse_other_names(found: UrdfArm, sections: Mapping[str, JointSettings], a
         kind = "prismatic" if joint.prismatic else "revolute"
         if section.kind != kind:
             raise PlanError([f'joints.{joint.name}.kind: expected "{kind}" as in {arm.urdf}, got "{section.kind}"'])
+
+
+def _refuse_standstill(urdf: str, joints: Sequence[Joint], sections: Mapping[str, JointSettings]) -> None:
+    """The file's speed limit counts where the section has none; a missing or tiny one was hardly meant."""
+    problems = [
+        f"{urdf}: joint {joint.name}: expected a velocity in its <limit> of at least {slowest:.3g} {unit}/s, got"
+        f" {joint.qd_max:g}; put it right there, or set joints.{joint.name}.speed_{joint.unit}_s"
+        for joint, section in zip(joints, sections.values(), strict=True)
+        for slowest, unit in [(SLOWEST_M_S, "m") if joint.prismatic else (SLOWEST_RAD_S, "rad")]
+        if (section.speed_mm_s if joint.prismatic else section.speed_deg_s) is None and not joint.qd_max >= slowest
+    ]
+    if problems:
+        raise PlanError(problems)
 
 
 def _moved(chain: Chain, mount: Array, flange: Array) -> Chain:

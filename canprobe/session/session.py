@@ -532,7 +532,7 @@ def run_beginning(plan: Plan) -> Session:
     Raises:
         CanprobeError: what goes wrong in it.
     """
-    with Session(replace(plan, setup=resolve(shortened(plan.scene)), choices=())) as session:
+    with Session(shortened(plan.scene)) as session:
         session.run(make_task(session.plan))
     return session
 

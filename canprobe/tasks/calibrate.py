@@ -14,11 +14,12 @@ from canprobe.cell.supervision import TOUCH_FORCE
 from canprobe.planning.model import Plan
 from canprobe.robot.tool_calibration import BallModel, BallTouch, ToolEstimate, calibrate_tool
 from canprobe.scene.setup import Calibrate
-from canprobe.tasks.probing import ArcMotion, Phase, ProbingTask
+from canprobe.tasks.probing import Phase, ProbingTask
 from canprobe.tasks.sensing import ContactSensing
 from canprobe.tasks.task import TaskRecord
 from canprobe.touch.contact import ContactSample, PushFit
 from canprobe.touch.patch.image import Patch
+from canprobe.touch.probe_motion import OFF_M, ROUND_SPEED, ArcMotion
 from canprobe.touch.servo import ProbePose
 
 Vector = NDArray[np.float64]
@@ -29,7 +30,6 @@ CERTAIN = 0.06
 SETTLE_S = 0.15
 LISTEN_S = 0.25
 """At rest before samples count, and while they do."""
-MOVE_SPEED = 40e-3
 
 
 class CalibrateTask(ProbingTask):
@@ -106,7 +106,7 @@ class CalibrateTask(ProbingTask):
                 self.estimate = calibrate_tool(self._corrected(), self._ball)
             return self._enter(Phase.DONE)
         self._push = PushFit()
-        self._line = ArcMotion(self._ball.c_base, pose, self._at(self._task.approach.clearance), MOVE_SPEED)
+        self._line = ArcMotion(self._ball.c_base, pose, self._at(self._task.approach.clearance), ROUND_SPEED)
         self._enter(Phase.MOVE)
 
     def _off(self) -> None:
@@ -172,4 +172,4 @@ class CalibrateTask(ProbingTask):
 
     def _let_go(self) -> None:
         n = self._stay().centre - self._ball.c_base
-        self._draw_back(n / np.linalg.norm(n) * (self._task.approach.clearance + 2e-3))
+        self._draw_back(n / np.linalg.norm(n) * (self._task.approach.clearance + OFF_M))

@@ -14,9 +14,10 @@ from canprobe.cell.controller import TactileSample
 from canprobe.cell.supervision import TOUCH_FORCE
 from canprobe.planning.model import Plan
 from canprobe.scene.setup import Touch
-from canprobe.tasks.probing import LineMotion, Phase, ProbingTask
+from canprobe.tasks.probing import Phase, ProbingTask
 from canprobe.tasks.sensing import ContactSensing
 from canprobe.touch.patch.image import Patch
+from canprobe.touch.probe_motion import LineMotion
 from canprobe.touch.servo import ProbePose
 
 Vector = NDArray[np.float64]

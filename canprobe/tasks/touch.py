@@ -15,12 +15,13 @@ from canprobe.cell.controller import Command, Measurement, TactileSample
 from canprobe.cell.supervision import TOUCH_FORCE, Reaction
 from canprobe.planning.model import Plan
 from canprobe.scene.setup import Touch
-from canprobe.tasks.probing import LineMotion, Phase, ProbingTask, smooth_step
+from canprobe.tasks.probing import Phase, ProbingTask
 from canprobe.tasks.sensing import ContactSensing, is_too_hollow
 from canprobe.tasks.shape import ShapeTracker
 from canprobe.tasks.task import Loss, TaskRecord
 from canprobe.touch.contact import AtRest, ContactSample, PushFit, Slope
 from canprobe.touch.patch.image import Patch
+from canprobe.touch.probe_motion import MOVE_SPEED, SETTLE_S, LineMotion, smooth_step
 from canprobe.touch.servo import LocalSurface, PathFollower, ProbePose, TactileServo
 
 if TYPE_CHECKING:
@@ -90,8 +91,6 @@ LOST = 0.1
 """Share of the wanted force below which a scan or a hold has lost its contact: the hysteresis of the array."""
 RETREAT = 6e-3
 """Way off the object, m."""
-SETTLE_S = 0.5
-"""At rest in contact before the scan."""
 RAMP_S = 0.05
 """To reach the scan's speed."""
 _LEAVING = (Phase.RETREAT, Phase.DONE)
@@ -285,7 +284,7 @@ class TouchTask(ProbingTask):
         return ProbePose(self._task.approach.start + up * (self.sensing.radius + distance), -up)
 
     def _begin(self, pose: ProbePose) -> None:
-        self._line = LineMotion(pose, self._above(self._task.approach.clearance), 30e-3)
+        self._line = LineMotion(pose, self._above(self._task.approach.clearance), MOVE_SPEED)
 
     def _approach(self) -> ProbePose:
         distance = self._task.approach.clearance - self._task.approach.speed * self._t

@@ -16,9 +16,9 @@ from canprobe.cell.controller import Command, Controller, Measurement
 from canprobe.cell.drives import rest_counts
 from canprobe.cell.supervisor import JointGuard
 from canprobe.planning.model import Plan
-from canprobe.tasks.probing import smooth_step
 from canprobe.tasks.task import Task, TaskRecord
 from canprobe.touch.patch.image import PatchCalibration
+from canprobe.touch.probe_motion import smooth_step
 
 # The tasks without touch: swing the joints, or only listen to the sensor.
 

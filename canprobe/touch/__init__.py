@@ -8,6 +8,7 @@
 - `contact` places a touch: from the centroid on the wrapped pad to the object's point and normal in base, through the
   squeezed layer; it finds the layer's stiffness from a push.
 - `estimate/` finds the local shape from contacts, online and in batches, with what was not observed.
+- `probe_motion` has the ways between poses of the probe, and the joint steps that follow them.
 - `servo` follows the surface: a local surface that the samples correct, strategies that lead over it, the next pose.
 - `surface_map` keeps a scan as local patches, `blend` makes one surface of them, `meshing` triangles of that;
   `consistency` compares passes where they cross.

@@ -228,3 +228,34 @@ def test_a_joint_without_range_gets_a_placeholder_and_a_tilt_is_explained(tmp_pa
     urdf.write_text(few)
     main(["init", str(tmp_path / "stiff"), "--urdf", str(urdf)])
     assert "from straight down: of 400 tried postures" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("velocity", "what"),
+    [
+        ("3", "joint j4: expected a velocity in its <limit> of at least 0.000175 rad/s, got 1e-09; put it right there,"
+         " or set joints.j4.speed_deg_s"),
+        ("0.5", "joint rail: expected a velocity in its <limit> of at least 1e-05 m/s, got 1e-09; put it right there,"
+         " or set joints.rail.speed_mm_s"),
+    ],
+)  # fmt: skip
+def test_a_speed_limit_of_nearly_nothing_is_refused_with_file_and_joint(tmp_path, urdf, capsys, velocity, what):
+    assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf)]) == 0
+    (copied,) = (tmp_path / "cell").glob("*.urdf")
+    copied.write_text(URDF.replace(f'velocity="{velocity}"', 'velocity="1e-9"'))
+    capsys.readouterr()
+    assert main(["plan", str(tmp_path / "cell" / "first.toml")]) == 2
+    assert f"{copied}: {what}" in capsys.readouterr().err
+
+
+def test_a_speed_limit_of_the_section_replaces_that_of_the_urdf_however_low(tmp_path, urdf, capsys):
+    assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf)]) == 0
+    (copied,) = (tmp_path / "cell").glob("*.urdf")
+    copied.write_text(URDF.replace('velocity="2"', 'velocity="1e-9"'))
+    slow = [f"joints.{joint}.speed_deg_s={speed}" for joint, speed in (("j1", 1e-7), ("j2", 1), ("j3", 1))]
+    words = [word for value in slow for word in ("--set", value)]
+    capsys.readouterr()
+    assert main(["plan", str(tmp_path / "cell" / "first.toml"), *words]) == 2
+    assert "joint 2 would need" in (said := capsys.readouterr().err) and "allowed 5e-08" in said, (
+        "half of it by limits.joint_speed_share"
+    )

@@ -51,7 +51,7 @@ def test_the_log_has_metres(tmp_path):
         ),
         (
             "[joints.z]\nswing_mm = 145\nspeed_mm_s = 1\n",
-            r"joint 3 would need 228 mm/s, allowed 1; .*swing_mm of the joints",
+            r"joint 3 would need 227.8 mm/s, allowed 1; .*swing_mm of the joints",
         ),
     ],
 )

@@ -11,7 +11,7 @@ import pytest
 import canprobe
 from canprobe.errors import PlanError, SafetyStop, SceneError
 from canprobe.scene.geometry import with_tool
-from canprobe.tasks.probing import ArcMotion
+from canprobe.touch.probe_motion import ArcMotion
 from canprobe.touch.servo import ProbePose
 
 ERROR_MM = (0.4, -0.3, 0.5)

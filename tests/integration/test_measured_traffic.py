@@ -95,6 +95,23 @@ def test_logs_that_cannot_be_measured(press, tmp_path):
         canprobe.measure_traffic(two, result.plan)
 
 
+def test_syncs_that_are_too_long_are_named_as_a_replay_names_them(press, tmp_path):
+    result, folder = press
+    text, log = (folder / "bus.log").read_text(), tmp_path / "long.log"
+    log.write_text(re.sub(r" 080#(..)$", r" 080#\g<1>00000000000000", text, flags=re.MULTILINE))
+    said = r"SYNC \(080h\) of 0 or 1 byte, but \d+ frames 080h of 8 bytes, which CiA 301 does not know; "
+    with pytest.raises(UsageError, match="no " + said):
+        canprobe.measure_traffic(log, result.plan)
+    with pytest.raises(UsageError, match="0 " + said):
+        read_recording(log, result.plan)
+    log.write_text(re.sub(r" 080#(..)$", r" 080#\g<1>00", text, count=1, flags=re.MULTILINE))
+    once = canprobe.measure_traffic(log, result.plan)
+    assert once.unlisted == {0x080: 1} and not once.as_planned
+    assert "  1 frames 080h of 2 bytes, which CiA 301 does not know" in once.text()
+    log.write_text(re.sub(r" 080#(..)$", " 080#", text, flags=re.MULTILINE))
+    assert canprobe.measure_traffic(log, result.plan).unlisted == {}, "a SYNC without a counter"
+
+
 def carry_out(scene, out=None):
     session = Session(canprobe.load_scene(scene, {"task.duration_s": 0.3}), out)
     with session:

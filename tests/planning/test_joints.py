@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from makes import MAKES, Entry, write_eds
 from scenes import with_joints
 
 import canprobe
 from canprobe.eds.packaged import eds_path
+from canprobe.emulator.plant.ideal_arm import natural_frequency
 from canprobe.errors import PlanError
 from canprobe.scene.load import load_scene, parse_scene
 
@@ -105,3 +109,64 @@ def test_two_joints_cannot_press():
 def test_a_full_arm_is_warned_of_nothing():
     for cell in ("puma260", "puma560"):
         assert canprobe.plan(load_scene("cylinder", {"cell": cell})).warnings == ()
+
+
+def with_following_window(tmp_path, window, access):
+    """The free scene with drives whose 6065h is as given."""
+    text = eds_path("puma260_joint").read_text()
+    head, mark, rest = text.partition("[6065]")
+    section, end, tail = rest.partition("\n[")
+    section = re.sub("DefaultValue=.*", f"DefaultValue={window}", section)
+    section = re.sub("AccessType=.*", f"AccessType={access}", section)
+    (tmp_path / "window.eds").write_text(head + mark + section + end + tail)
+    scene = load_scene("free", {"bus": {"interface": "direct"}})
+    scene = replace(scene, task=replace(scene.task, duration_s=1.2))
+    return replace(scene, arm=replace(scene.arm, eds=str(tmp_path / "window.eds")))
+
+
+def test_joints_keep_within_the_speed_at_which_their_drives_lag_by_a_fixed_window(tmp_path):
+    lag_s = 2.0 / natural_frequency(30.0, 1.0)
+    plan = canprobe.plan(with_following_window(tmp_path, 200, "ro"))
+    model = plan.setup.arm.model
+    fastest = np.abs(model.units_per_q) @ model.qd_max
+    assert fastest.max() * lag_s == pytest.approx(200 - 2), "two counts are rounding"
+    assert "6065h: drives that fault below the speeds" in plan.warnings[0]
+    assert "servo.drive_lag_ms" in plan.warnings[0]
+    assert canprobe.plan(with_following_window(tmp_path, 200, "rw")).warnings == ()
+    assert canprobe.plan(with_following_window(tmp_path, 0xFFFFFFFF, "ro")).warnings == ()
+
+
+def test_a_swing_that_a_following_window_allows_is_done_and_a_faster_one_refused(tmp_path):
+    free = canprobe.plan(with_following_window(tmp_path, 0xFFFFFFFF, "ro"))
+    speeds = np.abs(free.setup.arm.model.units_per_q) @ np.radians(free.joint_speeds.needed)
+    lag = max(speeds) * 2.0 / natural_frequency(30.0, 1.0)
+    narrow = with_following_window(tmp_path, math.ceil(1.5 * lag) + 2, "ro")
+    assert "6065h" in canprobe.plan(narrow).warnings[0]
+    assert canprobe.run(narrow, files=False).summary["completed"]
+    said = refusal(with_following_window(tmp_path, math.floor(0.5 * lag), "ro"))
+    assert "6065h" in said and "swing slower" in said
+
+
+@pytest.mark.parametrize(
+    ("index", "name", "access", "held", "warned"),
+    [
+        (0x200E, "SYNC time-out factor", "ro", 2, True),
+        (0x200E, "SYNC time-out factor", "rw", 2, True),
+        (0x200E, "SYNC time-out factor", "ro", 5, False),
+        (0x200E, "SYNC time-out factor", "ro", 0, False),
+        (0x2000, "Missed SYNCs tolerated", "ro", 2, True),
+        (0x2000, "Missed SYNCs tolerated", "rw", 2, False),
+        (0x200E, "Something else", "ro", 2, False),
+    ],
+)
+def test_drives_that_stop_sooner_than_their_master_thinks_are_named(tmp_path, index, name, access, held, warned):  # noqa: PLR0917
+    make = MAKES["bare"]()
+    make.objects[index, 0] = Entry(name, "U16", access, held)
+    scene = load_scene("free")
+    plan = canprobe.plan(replace(scene, arm=replace(scene.arm, eds=str(write_eds(make, tmp_path)))))
+    said = [warning for warning in plan.warnings if warning.startswith("arm.missed_syncs = 5: ")]
+    assert len(said) == warned
+    if warned:
+        assert f"by {index:04X}h of" in said[0] and "nodes 1, 2, 3, 4, 5, 6 stop by themselves after 2" in said[0]
+        quick = replace(scene.arm, eds=plan.nodes[0].eds, missed_syncs=held)
+        assert not any("arm.missed_syncs" in one for one in canprobe.plan(replace(scene, arm=quick)).warnings)

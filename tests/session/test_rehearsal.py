@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import pytest
 
 import canprobe
+from canprobe.eds.packaged import eds_path
 from canprobe.scene.load import load_scene
 from canprobe.scene.resolve import resolve
-from canprobe.session.session import Session, rehearse, shortened
+from canprobe.session.session import Session, rehearse, run_beginning, shortened
 from canprobe.tasks.from_plan import make_task
 from canprobe.tasks.probing import Phase
 
@@ -58,3 +60,17 @@ def test_real_nodes_are_emulated_in_it():
     with Session(replace(plan, setup=resolve(shortened(plan.scene)))) as session:
         session.run(make_task(session.plan))
     assert session.opened and not session.cell.faults
+
+
+def test_joints_keep_within_their_drives_in_it_as_in_the_plan(tmp_path):
+    text = eds_path("puma260_joint").read_text()
+    head, mark, rest = text.partition("[607F]")
+    section, end, tail = rest.partition("\n[")
+    section = re.sub("AccessType=.*", "AccessType=ro", re.sub("DefaultValue=.*", "DefaultValue=2000", section))
+    (tmp_path / "slow.eds").write_text(head + mark + section + end + tail)
+    scene = load_scene("press")
+    plan = canprobe.plan(replace(scene, arm=replace(scene.arm, eds=str(tmp_path / "slow.eds"))))
+    assert "607Fh: drives that fault below the speeds of their joints" in plan.warnings[0]
+    session = run_beginning(plan)
+    assert session.plan.setup.arm.model.qd_max.tolist() == plan.setup.arm.model.qd_max.tolist()
+    assert not session.cell.faults
