@@ -90,7 +90,8 @@ def convert(value: object, annotation: Any) -> Any:
     try:
         return _converted(value, annotation)
     except (ValueError, OverflowError):  # the latter for an integer that no float holds
-        beyond = f", at most {LARGEST:g} in size" if _beyond(value) else ""
+        unsaid = _beyond(value) and not conditions_of(annotation, Check)  # no range says it
+        beyond = f", at most {LARGEST:g} in size" if unsaid else ""
         raise MismatchError(f"{expected(annotation)}{beyond}") from None
 
 
