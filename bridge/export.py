@@ -184,6 +184,7 @@ _DRIVER_KEYS = frozenset({
     "switching_state", "position_mode", "velocity_mode", "torque_mode", "scale_pos_to_dev", "scale_pos_from_dev",
     "scale_vel_to_dev", "scale_vel_from_dev", "scale_eff_to_dev", "scale_eff_from_dev", "offset_pos_to_dev",
     "offset_pos_from_dev", "homing_timeout_seconds", "num_channels", "joint_name", "vendor_id", "product_code",
+    "boot_timeout", "boot_timeout_ms", "channels", "channel_names", "effort_mode", "non_transmit_timeout", "remappings",
 })  # fmt: skip
 _EDS_KEYS = ("dcf", "eds")
 _SLAVE_KEYS = _DCFGEN_KEYS | _DRIVER_KEYS | frozenset(_EDS_KEYS)
@@ -338,7 +339,9 @@ def read_bus_yml(path: Path | str, say: Callable[[str], None] = lambda _: None) 
     yaml = need("yaml", "can", _PURPOSE)
     path = Path(path)
     try:
-        document = yaml.safe_load(regular_file(path, MOST_BYTES).read_text(encoding="utf-8"))
+        text = regular_file(path, MOST_BYTES).read_text(encoding="utf-8")
+        document = yaml.safe_load(text)
+        _refuse_twice(path, yaml.compose(text, Loader=yaml.SafeLoader))
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}") from error
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
@@ -368,6 +371,23 @@ def read_bus_yml(path: Path | str, say: Callable[[str], None] = lambda _: None) 
         if node.node_id == following.node_id:
             raise UsageError(f"{path}: {following.name}: node_id: {node.node_id} is that of {node.name} too")
     return nodes
+
+
+def _refuse_twice(path: Path, root: Any) -> None:
+    """Refuse a key that stands twice in a table of a YAML tree: of two nodes of one name only the last would count."""
+    left, known = [root], set[int]()
+    while left:
+        node = left.pop()
+        if node is None or isinstance(node.value, str) or id(node) in known:
+            continue
+        known.add(id(node))
+        pairs = [item if isinstance(item, tuple) else (None, item) for item in node.value]
+        keys = [key for key, _ in pairs if key is not None and isinstance(key.value, str)]
+        for key in keys:
+            if [other.value for other in keys].count(key.value) > 1:
+                line = max(other.start_mark.line for other in keys if other.value == key.value) + 1
+                raise UsageError(f"{path}:{line}: {key.value}: stands twice; which one counts?")
+        left += [value for _, value in pairs]
 
 
 def _mapping(path: Path, document: Mapping[Any, Any], name: str) -> Mapping[str, Any]:

@@ -133,7 +133,10 @@ def regular_file(path: Path, most_bytes: int | None = None) -> Path:
     Raises:
         OSError: there is none, it is something else, or it is larger.
     """
-    found = path.stat()
+    try:
+        found = path.stat()
+    except ValueError as error:  # no system takes such a path
+        raise FileNotFoundError(errno.ENOENT, "No such file or directory", str(path)) from error
     if stat.S_ISDIR(found.st_mode):
         raise IsADirectoryError(errno.EISDIR, "Is a directory", str(path))
     if not stat.S_ISREG(found.st_mode):

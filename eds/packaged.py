@@ -97,7 +97,7 @@ def eds_file(source: str | os.PathLike[str]) -> Path:
         EdsError: no such file.
     """
     path = Path(source)
-    if path.is_file():
+    if os.path.isfile(path):  # False, too, for what no system takes as a path
         return path
     if isinstance(source, str) and path.name == source:
         return eds_path(source)

@@ -251,8 +251,9 @@ def _record(run: RecordedRun, times: Array) -> tuple[str, list[str]]:
         path = LoadedPath(server.scene, trail_of(run))
         surface = LoadedSurface(server.scene, answers_of(run), errors)
         recorder = server.get_scene_serializer()
-        before = float(times[0])
+        before = 0.0  # the page's time is that of the run: the first picture stands until its first cycle
         with server.atomic():  # nobody listens: nothing is sent
+            stage.show(run.at(0.0))
             for t in times.tolist():
                 recorder.insert_sleep(t - before)
                 before = t
@@ -276,7 +277,6 @@ def _panel_data(run: RecordedRun, times: Array, notes: list[str]) -> dict[str, A
         "title": run.title,
         "notes": notes,
         "scene": run.scene.name,
-        "start": float(times[0]),
         "curves": {name: [_short(x) for x in curves[name].tolist()] for name in NAMES},
         "phases": [m.phase for m in moments],
         "target": task.force_n if task.kind in ("scan", "press") else None,

@@ -45,8 +45,8 @@ from canprobe.touch.shapes import PlacedShape
 
 OBJECT, PROBE, FORCE = (126, 150, 176), (78, 88, 104), (214, 40, 30)
 FORCE_M_PER_N = 0.012
-"""Length of the force arrow."""
-LEAST_FORCE_N = 0.05
+"""Length of the shaft of the force arrow; its head is added, so that the smallest force has an arrow, too."""
+FORCE_HEAD_M = 0.007
 LOOK_ASIDE = math.radians(55.0)
 """Of the camera, from the line that leads from base to contact, seen from above: the arm hides nothing there."""
 FOLLOW_M = 4e-3
@@ -154,8 +154,8 @@ class Stage:
             blank = np.zeros(len(places), np.uint8)
             self._taxels = self._api.add_batched_meshes_simple(
                 "/probe/taxels", vertices.astype(np.float32), faces.astype(np.uint32), turns, places,
-                batched_colors=linear_light(taxel_colours(blank)), batched_opacities=_opacities(blank), side="double",
-                cast_shadow=False, lod="off",
+                batched_colors=linear_light(taxel_colours(blank)), batched_scales=_taxel_scales(blank),
+                opacity=0.85, side="double", cast_shadow=False, lod="off",
             )  # fmt: skip
         else:
             self._taxels = None
@@ -167,7 +167,7 @@ class Stage:
         )
         self._force = api.add_arrows(
             "/force", np.zeros((1, 2, 3), np.float32), FORCE, shaft_radius=0.0012, head_radius=0.003,
-            head_length=0.007, visible=False,
+            head_length=FORCE_HEAD_M, visible=False,
         )  # fmt: skip
         self._label = api.add_label("/force/label", "", anchor="bottom-center", visible=False)
 
@@ -207,7 +207,7 @@ class Stage:
         if moment.taxels is not None and self._taxels is not None:
             counts = moment.taxels.reshape(-1)
             self._taxels.batched_colors = linear_light(taxel_colours(counts))
-            self._taxels.batched_opacities = _opacities(counts)
+            self._taxels.batched_scales = _taxel_scales(counts)
         self._show_contact(moment)
         if moment.contact is not None and self._follows is not None and self._follows.value:
             self._follow(moment.contact.point - self._place)
@@ -234,20 +234,22 @@ class Stage:
 
     def _show_contact(self, moment: Moment) -> None:
         contact = moment.contact
-        pressed = contact is not None and moment.force > LEAST_FORCE_N
-        self._contact.visible = self._force.visible = self._label.visible = pressed
-        if not pressed or contact is None:
+        self._contact.visible = self._force.visible = self._label.visible = contact is not None
+        if contact is None:
             return
         _place(self._contact, contact.T_base_contact)
-        tip = contact.point + FORCE_M_PER_N * moment.force * contact.normal
+        tip = contact.point + (FORCE_M_PER_N * moment.force + FORCE_HEAD_M) * contact.normal
         self._force.points = np.array([[contact.point, tip]], np.float32)
         self._label.position = tuple(tip)
         self._label.text = f"{moment.force:.2f} N"
 
 
-def _opacities(counts: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Taxels without pressure are almost transparent."""
-    return np.where(counts > 0, 0.85, 0.04).astype(np.float32)
+def _taxel_scales(counts: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Taxels without pressure are dots.
+
+    Not by their opacity: a browser builds all taxels anew when one opacity changes, and draws none of them meanwhile.
+    """
+    return np.where(counts > 0, 1.0, 0.12).astype(np.float32)
 
 
 def _place(handle: Any, T: Array) -> None:

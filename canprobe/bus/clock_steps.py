@@ -2,8 +2,10 @@
 
 The cell sends SYNC in one period, so the SYNCs of a channel show a clock that was set: their stamps go back, or leap
 over a pause in which nothing else was sent either, and go on from there for good. The lines keep their order, and all
-later stamps of that channel are shifted until SYNC goes on in its period. What stands before the first SYNC is as it
-is. Frames whose lines are in another order than their stamps stay so: whoever needs their order sorts them.
+later stamps of that channel are shifted until SYNC goes on in its period. A clock that was set back by less than lines
+may be out of order shows by the SYNCs on both sides, counted in periods. Before the first SYNC a step back is mended,
+too, without the time that passed. Frames whose lines are in another order than their stamps stay so: whoever needs
+their order sorts them.
 """
 
 from __future__ import annotations
@@ -28,6 +30,8 @@ _SYNCS_AFTER = 3
 """SYNCs after a step that show that it is for good."""
 _PERIODS_LEFT = 20
 """SYNC periods that a pause may leave to the SYNCs beside it; the bring-up of a cell takes longer."""
+_SYNCS_COUNTED = 12
+"""SYNCs on each side of a small step that say by how much."""
 _TIMELESS_NS = 100_000
 """SYNCs that are nearer to each other, by the middle half of their stamps, have no stamps of a clock."""
 _MOST_TOLD = 5
@@ -95,6 +99,18 @@ class _Channel:
             self.back, self.forward = _Leap(), _Leap()
 
 
+def _are_early(syncs: list[_Sync], i: int, period: int) -> bool:
+    """Whether the SYNCs from the i-th on are early for good, against those before, by more than half a period."""
+    sides = []
+    for side in (range(max(i - _SYNCS_COUNTED, 0), i), range(i, min(i + _SYNCS_COUNTED, len(syncs)))):
+        offsets = [syncs[k].t_ns - k * period for k in side]
+        middle = round(median(offsets))
+        if 4 * sum(abs(offset - middle) <= period // 4 for offset in offsets) < 3 * _SYNCS_COUNTED:
+            return False  # too few that go on in their period: lines in another order, or the SYNCs of two masters
+        sides.append(middle)
+    return 2 * (sides[0] - sides[1]) > period
+
+
 class RecordedBus:
     """The frames of a candump log, in the order of its lines, with stamps on one clock. It is read twice.
 
@@ -146,9 +162,20 @@ class RecordedBus:
             return
         self._refuse_no_times(channel, [sync.t_ns for sync in syncs])
         period = round(median(b.t_ns - a.t_ns for a, b in pairwise(syncs)))
-        shift, last_ns = 0, syncs[0].t_ns
+        shift, first = 0, syncs[0]
+        if first.back.ns < -DISORDER_NS and first.back.ns + first.forward.ns < -DISORDER_NS:  # no stray frame
+            shift = self._shifts[channel, first.back.line] = -first.back.ns
+            yield ClockStep(first.back.line, channel, first.back.ns)
+        last_ns = first.t_ns + shift
         for i, sync in enumerate(syncs[1:], 1):
             at_ns = sync.t_ns + shift
+            if last_ns - DISORDER_NS <= at_ns < last_ns + period // 2 and _are_early(syncs, i, period):
+                step, line = last_ns + period - at_ns, sync.back.line or sync.line
+                shift += step
+                last_ns = at_ns + step
+                self._shifts[channel, line] = shift
+                yield ClockStep(line, channel, -step)
+                continue
             pause = sync.forward.ns >= PAUSE_NS and at_ns - last_ns - sync.forward.ns <= _PERIODS_LEFT * period
             if at_ns >= last_ns - DISORDER_NS and not pause:
                 last_ns = max(last_ns, at_ns)

@@ -17,7 +17,7 @@ from canprobe.bus.port import Port, PortCounters, TimedFrame, VirtualClock, send
 from canprobe.bus.scheduling import Interrupts
 from canprobe.cell.array import RawReceiver, make_tactile, patch_from
 from canprobe.cell.bringup import BringUp
-from canprobe.cell.controller import Command, Controller, Measurement, as_controller
+from canprobe.cell.controller import Command, Controller, Measurement, as_controller, check_command
 from canprobe.cell.cycle import Cycle, Observers
 from canprobe.cell.drives import make_drives
 from canprobe.cell.homing import Homing
@@ -341,10 +341,9 @@ class Cell:
         """
         interrupts.take()
         command = step(measurement)
-        if not isinstance(command, Command) or not isinstance(command.columns, dict):
+        if not isinstance(command, Command):
             raise UsageError(f"controller: expected its step to return a Command, got {command!r}")
-        if not isinstance(command.done, bool | np.bool_):
-            raise UsageError(f"controller: expected done to be True or False, got {command.done!r}")
+        check_command(command, arm=self.drives is not None)
         if not OWN_COLUMNS.isdisjoint(command.columns):
             taken = ", ".join(sorted(OWN_COLUMNS.intersection(command.columns)))
             raise UsageError(f"controller: expected other columns than the cell's, got {taken}")

@@ -84,6 +84,37 @@ class Command:
     estimate: SurfaceEstimate | None = None
 
 
+def check_command(command: Command, *, arm: bool) -> None:
+    """Check what a controller returned, but for the joint target of an arm: the supervision checks that.
+
+    Args:
+        command: of this cycle.
+        arm: the scene has one.
+
+    Raises:
+        UsageError: a field is of another kind than `Command` says.
+    """
+    if not isinstance(command.done, bool | np.bool_):
+        raise UsageError(f"controller: expected done to be True or False, got {command.done!r}")
+    if command.stop_reason is not None and not (isinstance(command.stop_reason, str) and command.stop_reason.strip()):
+        raise UsageError(f"controller: expected stop_reason to be a text or None, got {command.stop_reason!r}")
+    if not isinstance(command.columns, dict):
+        raise UsageError(f"controller: expected columns to be a dict of numbers by name, got {command.columns!r}")
+    try:  # at once for all names: this is done in every cycle
+        printable = "".join(command.columns).isprintable() and "" not in command.columns
+    except TypeError:
+        printable = False
+    if not printable:
+        raise UsageError(f"controller: expected the names of columns to be printable texts, got {[*command.columns]}")
+    if command.q_target is not None and not arm:
+        raise UsageError(f"controller: expected no q_target in a scene without an arm, got {command.q_target!r}")
+    if command.estimate is not None:
+        from canprobe.touch.estimate.answer import SurfaceEstimate
+
+        if not isinstance(command.estimate, SurfaceEstimate):
+            raise UsageError(f"controller: expected estimate to be a SurfaceEstimate, got {command.estimate!r}")
+
+
 class Controller:
     """Base of everything that a cell can run: `step` decides a cycle, the other methods do nothing by default.
 

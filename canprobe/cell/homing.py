@@ -17,6 +17,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import shlex
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -137,6 +138,7 @@ class Homing:
     ) -> None:
         assert plan.setup.arm is not None
         self._arm, self._times, self._bus = plan.setup.arm, plan.setup.bring_up, plan.setup.bus
+        self._scene = shlex.quote(plan.setup.name)
         self._model, self._drives = self._arm.model, self._arm.drives
         by_id = {setup.node_id: setup for setup in setups}
         self._setups = [by_id[drive.node_id] for drive in self._drives]
@@ -170,11 +172,11 @@ class Homing:
         lacking = [axis for axis in self.order if axis not in self.known]
         if lacking:
             others = ", ".join(f"{self._drives[axis].node_id} ({self._setups[axis].name})" for axis in lacking[1:])
+            too = f"; nor are {others}" if others else ""
             raise NodeError(
                 self._drives[lacking[0]].node_id,
-                f"({self._setups[lacking[0]].name}) is not homed, or was switched off or moved since"
-                f"{f'; nor are {others}' if others else ''}; type: canprobe up SCENE --home --bus {self._bus.interface}"
-                f" --channel {self._bus.channel}",
+                f"({self._setups[lacking[0]].name}) is not homed, or was switched off or moved since{too}; type:"
+                f" canprobe up {self._scene} --home --bus {self._bus.interface} --channel {self._bus.channel}",
             )
 
     def keep(self) -> None:

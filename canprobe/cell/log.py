@@ -36,9 +36,9 @@ class _RowKind:
 
     def packed(self, values: Iterable[Any]) -> bytes | tuple[Any, ...]:
         """A copy of a row's values: one block, or a tuple where one of them is no number or has another shape."""
-        if not self._views:
-            self._lay_out([np.asarray(value) for value in values])
         try:
+            if not self._views:
+                self._lay_out([np.asarray(value) for value in values])
             for view, value in zip(self._views, values, strict=True):
                 view[...] = value
         except _NO_NUMBERS:
@@ -119,7 +119,10 @@ class RunLog:
     def _column(self, name: str, parts: list[_Part]) -> NDArray[np.float64]:
         """A column of its parts; the first value of all decides the shape."""
         parts = sorted(parts, key=lambda part: part[0][0])
-        shape = np.shape(parts[0][1][0]) if parts else ()
+        try:
+            shape = np.shape(parts[0][1][0]) if parts else ()
+        except ValueError:  # rows of unequal length
+            shape = ()
         out = np.full((len(self._rows), *shape), np.nan)
         misfits = 0
         for rows, values in parts:

@@ -115,7 +115,7 @@ class JointGuard:
             except (TypeError, ValueError):
                 given = np.array(None)
             if given.dtype.kind not in _NUMBERS or isinstance(given, np.ma.MaskedArray):
-                return GuardedTarget(None, f"the controller's joint target is {q_target!r}: expected {n} {self._si}")
+                return GuardedTarget(None, f"the controller's q_target is {q_target!r}: expected {n} {self._si}")
             target = np.asarray(given, dtype=np.float64)
         else:
             target = q_target
@@ -123,7 +123,8 @@ class JointGuard:
         inside = [low <= q <= high for q, (low, high) in zip(wanted, self._range, strict=True)]
         if not all(inside):
             if not all(map(math.isfinite, wanted)):
-                return GuardedTarget(None, f"the controller's joint target is {target}: expected {n} finite {self._si}")
+                got = f"is {target}" if target.shape == (n,) else f"has shape {target.shape}"
+                return GuardedTarget(None, f"the controller's q_target {got}: expected {n} finite {self._si}")
             joint = inside.index(False)
             where = self._model.joints[joint].text(wanted[joint])
             return GuardedTarget(None, f"joint {joint + 1} at {where}, its stop")

@@ -160,11 +160,11 @@ def parser_of(arguments: Sequence[str]) -> Parser:
 
 
 def _with_scene(text: str, args: argparse.Namespace) -> str:
-    """A message whose line to type has the scene that was given; only the command line knows its name or path."""
+    """A message whose line to type has the scene as it was given: the command line knows its path, a cell its name."""
     if getattr(args, "scene", None) is None:
         return text
     cell = f" --cell {shlex.quote(args.cell)}" if getattr(args, "cell", None) else ""
-    return re.sub(r"(?<=type: canprobe up )SCENE\b", lambda _: shlex.quote(str(args.scene)) + cell, text)
+    return re.sub(r"(?<=type: canprobe up ).+?(?= --home)", lambda _: shlex.quote(str(args.scene)) + cell, text)
 
 
 def _complain(report: Report, text: str, status: int) -> int:

@@ -429,17 +429,27 @@ ON_THIS_MACHINE = "ff11::ca"
 
 def _open_to_others(setup: Setup) -> Iterator[str]:
     """What lets other machines reach the cell, and what to write to keep it on this one."""
-    bus, bridge = setup.bus, setup.bridge
-    if bus.interface == "udp_multicast" and not _is_interface_local(bus.channel):
-        yield (
-            f"bus.channel = {bus.channel}: every machine on this network segment hears this bus and can command its"
-            f" nodes; --channel {ON_THIS_MACHINE} keeps it on this machine"
-        )
+    bridge = setup.bridge
+    yield from bus_open_to_others(setup.bus.interface, setup.bus.channel)
     if "ros2" in bridge.use and not bridge.ros2_loopback:
         may = "can start, stop and move the cell" if bridge.ros2_commands else "sees the cell"
         yield (
             f"bridge.ros2_loopback = false: every machine on this network segment {may};"
             " bridge.ros2_loopback = true keeps its topics on this machine, CYCLONEDDS_URI on some interfaces"
+        )
+
+
+def bus_open_to_others(interface: str, channel: str) -> Iterator[str]:
+    """A warning, where other machines reach a bus.
+
+    Args:
+        interface: of python-can.
+        channel: of it.
+    """
+    if interface == "udp_multicast" and not _is_interface_local(channel):
+        yield (
+            f"bus.channel = {channel}: every machine on this network segment hears this bus and can command its"
+            f" nodes; --channel {ON_THIS_MACHINE} keeps it on this machine"
         )
 
 

@@ -274,7 +274,7 @@ def _devices(setup: Setup) -> tuple[dict[int, Abilities], list[str]]:
         try:
             device = devices[node.node_id] = Abilities.of(node.eds, node.node_id)
         except EdsError as error:
-            problems += [str(error)] if first else []
+            problems += [f"{'arm' if kind == 'drive' else 'sensor'}.eds: {error}"] if first else []
             continue
         if first:
             problems += missing_objects(device, kind, setup) + missing_bitrate(device, kind, setup)

@@ -390,19 +390,27 @@ def parse_toml(text: str, file: str) -> dict[str, Any]:
     return document
 
 
+_NAMED_LEVELS = 3
+"""Of the key that is too deep: as many as a scene has, such as joints.joint_1.gear."""
+
+
 def _refuse_deep(document: Mapping[str, Any], file: str) -> None:
     """Raise SceneError for tables and lists in each other that no scene has; others go through them by recursion."""
-    values: list[Any] = [document]
-    for _ in range(MOST_DEPTH):
-        inner = [value.values() if isinstance(value, Mapping) else value for value in values]
-        values = [value for part in inner for value in part if isinstance(value, Mapping | list | tuple)]
+    values: list[tuple[str, Any]] = [("", document)]
+    for level in range(MOST_DEPTH):
+        inner = [
+            (f"{path}{key}." if isinstance(value, Mapping) and level < _NAMED_LEVELS else path, item)
+            for path, value in values
+            for key, item in (value.items() if isinstance(value, Mapping) else enumerate(value))
+        ]
+        values = [(path, item) for path, item in inner if isinstance(item, Mapping | list | tuple)]
         if not values:
             return
-    raise _too_deep(file)
+    raise _too_deep(f"{file}: {values[0][0].removesuffix('.')}")
 
 
-def _too_deep(file: str) -> SceneError:
-    return SceneError([f"{file}: expected tables and lists of at most {MOST_DEPTH} levels, got more of them"])
+def _too_deep(where: str) -> SceneError:
+    return SceneError([f"{where}: expected tables and lists of at most {MOST_DEPTH} levels, got more of them"])
 
 
 def _scene(own: Mapping[str, Any], file: str, folder: Path | None) -> Scene:

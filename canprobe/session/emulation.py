@@ -175,8 +175,11 @@ def _free_port(
     from canprobe.bus.interfaces import open_port
     from canprobe.bus.network import PumpedNetwork, answering_nodes
     from canprobe.bus.port import Reports
+    from canprobe.planning.choices import bus_open_to_others
 
     check_links(target.interface, {target.channel: wanted}, say)
+    for warning in bus_open_to_others(target.interface, target.channel):
+        say(f"warning: {warning}")
     port = open_port(
         target.interface,
         target.channel,

@@ -114,6 +114,12 @@ def real(name: str, values: Any, form: str = "") -> Array:
         raise UsageError(f"{name}: expected real numbers{form}, got {values!r}") from error
 
 
+MAX_MAGNITUDE = 1e60
+"""Of numbers, in any unit: products of five of them are still numbers."""
+MAX_LENGTH = 1e12
+"""Of points and standard deviations, in any unit: beyond, an estimate would be rounding."""
+
+
 def checked(name: str, values: Any, shape: Sequence[int | None]) -> Array:
     """Values as floats of a shape (None: any length), all finite; else a UsageError that names the field."""
     if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
@@ -121,9 +127,11 @@ def checked(name: str, values: Any, shape: Sequence[int | None]) -> Array:
     array = real(name, values, f" of shape {_spell(shape)}")
     if len(array.shape) != len(shape) or any(e is not None and e != g for e, g in zip(shape, array.shape, strict=True)):
         raise UsageError(f"{name}: expected shape {_spell(shape)}, got {array.shape}")
-    if not np.isfinite(array).all():
-        first = np.argwhere(~np.isfinite(array))[0].tolist()
-        raise UsageError(f"{name}: expected finite numbers, got {array[tuple(first)]} at index {first}")
+    within = np.abs(array) <= MAX_MAGNITUDE
+    if not within.all():
+        first = np.argwhere(~within)[0].tolist()
+        wanted = f"finite numbers, at most {MAX_MAGNITUDE:g} in size"
+        raise UsageError(f"{name}: expected {wanted}, got {array[tuple(first)]} at index {first}")
     return array
 
 

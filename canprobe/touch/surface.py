@@ -17,7 +17,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from canprobe.errors import UsageError
-from canprobe.touch.linear_algebra import Array, checked, homogeneous, instance, read_only, real, tangent_rotation
+from canprobe.touch.linear_algebra import (
+    MAX_MAGNITUDE,
+    Array,
+    checked,
+    homogeneous,
+    instance,
+    read_only,
+    real,
+    tangent_rotation,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,6 +46,8 @@ class SurfaceMatrix:
         S = checked("S", self.S, (4, 4))
         if np.abs(S - S.T).max() > 1e-9 * max(float(np.abs(S).max()), 1e-300):
             raise UsageError(f"S: expected a symmetric matrix, got one with |S - Sᵀ| up to {np.abs(S - S.T).max():.3g}")
+        if 0.0 < (size := float(np.abs(S).max())) < 1.0 / MAX_MAGNITUDE:
+            raise UsageError(f"S: expected entries of at least {1.0 / MAX_MAGNITUDE:g} in size, got at most {size:g}")
         object.__setattr__(self, "S", read_only(0.5 * (S + S.T)))
 
     @classmethod

@@ -177,6 +177,20 @@ def test_slaves_under_nodes_with_common_keys_and_folders_are_read(tmp_path):
     ]
 
 
+def test_keys_of_drivers_of_today_are_understood(tmp_path):
+    """Of several channels, of the time to boot, and of topics by other names; anchors are no keys that stand twice."""
+    (tmp_path / "x.eds").write_text("")
+    (tmp_path / "bus.yml").write_text(
+        "defaults: {dcf: x.eds, boot_timeout_ms: 2000}\n"
+        "nodes:\n"
+        "  two: {node_id: 2, channels: &c {1: {joint_name: a}, 2: {joint_name: b}}, channel_names: [a, b]}\n"
+        "  three: {node_id: 3, channels: *c, remappings: {~/nmt_state: /state}, non_transmit_timeout: 100}\n"
+    )
+    said = []
+    assert [node.name for node in read_bus_yml(tmp_path / "bus.yml", said.append)] == ["two", "three"]
+    assert said == []
+
+
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
@@ -190,6 +204,8 @@ def test_slaves_under_nodes_with_common_keys_and_folders_are_read(tmp_path):
         ("nodes: [a]", "nodes: expected keys and values"),
         ("nodes: {a: {dcf: x.eds}}", "a: node_id: expected an integer, got None"),
         ("a: 3", "a: expected keys and values"),
+        ("nodes:\n  a: {node_id: 2, dcf: x.eds}\n  a: {node_id: 3, dcf: x.eds}", r"bus\.yml:3: a: stands twice"),
+        ("a: {node_id: 2, node_id: 3, dcf: x.eds}", r"bus\.yml:1: node_id: stands twice"),
         ("a: {node_id: 200, dcf: x.eds}", "a: node_id: expected 1 to 127, got 200"),
         ("a: {node_id: two, dcf: x.eds}", "a: node_id: expected an integer, got 'two'"),
         ("a: {node_id: .inf, dcf: x.eds}", "a: node_id: expected an integer, got inf"),

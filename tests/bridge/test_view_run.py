@@ -28,6 +28,7 @@ from canprobe.bridge.view.instants import (
 )
 from canprobe.bridge.view.path import GAP_M, LIFT_M, Trail, deviation_scale
 from canprobe.bridge.view.recorded import read_run
+from canprobe.bridge.view.stage import FORCE_HEAD_M, FORCE_M_PER_N
 from canprobe.bridge.worker import SampleSource
 from canprobe.errors import CanprobeError
 from canprobe.scene.geometry import true_object
@@ -214,11 +215,22 @@ def test_the_true_curvature_is_that_under_the_contact():
 # the page
 
 
-def embedded(page):
-    """The recording in a page, decoded by its published layout: sizes, zstd, msgpack."""
+def inside(page):
+    """The recording in a page and its arrays, by the published layout: msgpack behind its size, then aligned bytes."""
     data = base64.b64decode(re.search(r'__VISER_EMBED_DATA__="([^"]+)"', page)[1])
     inner = ZstdDecompressor().decompress(data[8:], max_output_size=int.from_bytes(data[:8], "little"))
-    return msgpack.decode(inner[8 : 8 + int.from_bytes(inner[:8], "little")])
+    end = 8 + int.from_bytes(inner[:8], "little")
+    recording, arrays = msgpack.decode(inner[8:end]), []
+    for length in recording["binaryBufferLengths"]:
+        end += -end % 8
+        arrays.append(inner[end : end + length])
+        end += length
+    return recording, arrays
+
+
+def embedded(page):
+    """The recording in a page."""
+    return inside(page)[0]
 
 
 def panel_data(page):
@@ -241,7 +253,7 @@ def test_a_run_leaves_a_page_that_loads_nothing(page, recorded):
 def test_the_page_holds_the_whole_run(page, run):
     scene = embedded(page)
     names = {message.get("name") for _, message in scene["messages"]}
-    assert scene["durationSeconds"] == pytest.approx(run.duration_s - float(run.log["t_s"][0]))
+    assert scene["durationSeconds"] == pytest.approx(run.duration_s)
     assert {f"/arm/{i}" for i in range(7)} | {"/object/ghost", "/probe/dome", "/contact", "/force"} <= names
     assert {"/probe/taxels", "/path/000"} <= names and any(str(name).startswith("/surface/") for name in names)
     data = panel_data(page)
@@ -263,6 +275,58 @@ def test_the_last_pose_in_the_page_is_the_last_pose_of_the_run(page, run):
     ]
     flange = forward(UPENN.chain, run.at(run.duration_s).q)
     assert places[-1] == pytest.approx(flange[:3, 3].tolist(), abs=1e-6)
+
+
+def test_scene_and_panel_of_the_page_have_one_clock(page, run):
+    """What viser plays at an instant of its slider is what the panel shows there: the run at that instant."""
+    from puma_arm import UPENN
+
+    from canprobe.robot.chain import forward
+
+    placed = {
+        round(t, 6): m["position"]
+        for t, m in embedded(page)["messages"]
+        if m["type"] == "SetPositionMessage" and m["name"] == "/arm/6"
+    }
+    assert min(placed) == 0.0
+    for t in panel_data(page)["curves"]["t_s"][1::10]:
+        shown = placed[max(known for known in placed if known <= t + 1e-4)]
+        assert shown == pytest.approx(forward(UPENN.chain, run.at(t + 1e-4).q)[:3, 3].tolist(), abs=1e-4)
+
+
+def test_the_arrow_is_seen_wherever_a_contact_is_known(page, run):
+    """As long as the force says, and never shorter than its head."""
+    recording, arrays = inside(page)
+    seen, length = {}, math.nan
+    shown = False
+    for t, message in recording["messages"]:
+        if message.get("name") == "/force" and message["type"] == "SetSceneNodeVisibilityMessage":
+            shown = message["visible"]
+        elif message.get("name") == "/force" and message["type"] == "SceneNodeUpdateMessage":
+            foot, tip = np.frombuffer(arrays[message["updates"]["points"]["__binary_index"]], "<f4").reshape(2, 3)
+            length = np.linalg.norm(tip - foot)
+        seen[t] = length if shown else math.nan
+    touched = 0
+    for t in panel_data(page)["curves"]["t_s"][1:]:
+        moment = run.at(t + 1e-4)
+        arrow = seen[max(known for known in seen if known <= t + 1e-4)]
+        if moment.contact is None:
+            assert math.isnan(arrow)
+        else:
+            touched += 1
+            assert arrow == pytest.approx(FORCE_HEAD_M + FORCE_M_PER_N * moment.force, rel=1e-3)
+    assert touched > 20
+
+
+def test_taxels_are_never_built_anew(page):
+    """A new opacity would make viser's client build all taxels anew, with GL errors and pictures without them."""
+    changed = {
+        name
+        for _, m in embedded(page)["messages"]
+        if m["type"] == "SceneNodeUpdateMessage" and m["name"] == "/probe/taxels"
+        for name in m["updates"]
+    }
+    assert changed == {"batched_colors", "batched_scales"}
 
 
 @pytest.mark.parametrize("scene", ["free", "press"])

@@ -253,9 +253,10 @@ def test_brackets_without_an_end(tmp_path, monkeypatch, capsys):
         (tmp_path / "deep.toml").write_text(f"x = {text}")
         assert main(["plan", "./deep.toml"]) == 2
         (line,) = capsys.readouterr().err.splitlines()
-        assert line == "canprobe: ./deep.toml: expected tables and lists of at most 32 levels, got more of them"
+        where = "" if text.startswith("[" * 500) else "x" + ".a" * 2 * text.startswith("{") + ": "
+        assert line == f"canprobe: ./deep.toml: {where}expected tables and lists of at most 32 levels, got more of them"
     assert main(["plan", "press", "--set", f"{'.'.join('a' * 100)}=1"]) == 2
-    assert "press.toml as changed: expected tables and lists of at most 32" in capsys.readouterr().err
+    assert "press.toml as changed: a.a.a: expected tables and lists of at most 32" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

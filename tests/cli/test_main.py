@@ -450,7 +450,7 @@ def test_a_reader_that_goes_away_is_quiet():
 
 def test_a_line_to_type_names_the_scene_that_was_given(monkeypatch, capsys):
     def refuse(args):
-        raise NodeError(1, "is not homed; type: canprobe up SCENE --home --bus socketcan")
+        raise NodeError(1, "is not homed; type: canprobe up 'a cell' --home --bus socketcan")
 
     monkeypatch.setattr("canprobe.cli.plan.run", refuse)
     assert main(["plan", "my cell.toml", "--cell", "puma560"]) == 3

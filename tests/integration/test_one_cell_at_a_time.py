@@ -170,6 +170,53 @@ def test_done_is_true_or_false(free, done):
         cell.run(lambda _: Command(done=done))
 
 
+@pytest.mark.parametrize(
+    ("field", "value", "says"),
+    [
+        ("stop_reason", 3, "expected stop_reason to be a text or None, got 3"),
+        ("stop_reason", " ", "expected stop_reason to be a text or None, got ' '"),
+        ("columns", None, "expected columns to be a dict of numbers by name, got None"),
+        ("columns", {3: 1.0}, r"expected the names of columns to be printable texts, got \[3\]"),
+        ("columns", {"": 1.0}, r"expected the names of columns to be printable texts, got \[''\]"),
+        ("columns", {"a\0b": 1.0}, "expected the names of columns to be printable texts"),
+        ("estimate", "flat", "expected estimate to be a SurfaceEstimate, got 'flat'"),
+    ],
+)
+def test_a_field_of_a_command_that_is_something_else_is_named(free, field, value, says):
+    with canprobe.open_cell(free) as cell, pytest.raises(UsageError, match=f"^controller: {says}"):
+        cell.run(lambda _: Command(**{field: value}))
+
+
+def test_a_joint_target_needs_an_arm():
+    with canprobe.open_cell("listen") as cell, pytest.raises(UsageError, match="no q_target in a scene without an arm"):
+        cell.run(lambda _: Command(q_target=np.zeros(6)))
+
+
+@pytest.mark.parametrize(
+    ("q_target", "says"),
+    [
+        (np.zeros((6, 1)), r"the controller's q_target has shape \(6, 1\): expected 6 finite angles, rad"),
+        ([0.0] * 5, r"the controller's q_target has shape \(5,\): expected 6 finite angles, rad"),
+        ([1j] * 6, r"the controller's q_target is .*1j.*: expected 6 angles, rad"),
+        ("home", r"the controller's q_target is 'home': expected 6 angles, rad"),
+        ([np.inf] * 6, r"the controller's q_target is \[inf .*: expected 6 finite angles, rad"),
+    ],
+)
+def test_a_joint_target_of_another_kind_stops_the_cell_and_is_named(free, q_target, says):
+    with canprobe.open_cell(free) as cell, pytest.raises(SafetyStop, match=says):
+        cell.run(lambda _: Command(q_target=q_target))
+
+
+@pytest.mark.filterwarnings("ignore:log. 3 values of column 'odd'")
+@pytest.mark.parametrize("odd", [[1.0, [2.0, 3.0]], "text", 1j])
+def test_a_column_that_is_no_number_costs_only_itself(free, tmp_path, odd):
+    commands = iter([Command(columns={"odd": odd})] * 3 + [Command(columns={"even": 7.0}, done=True)])
+    with canprobe.open_cell(undrawn(free), out=tmp_path) as cell:
+        cell.run(lambda _: next(commands))
+    log = read_npz(tmp_path / "log.npz")
+    assert np.isnan(log["odd"]).all() and np.nanmax(log["even"]) == 7.0
+
+
 @pytest.mark.parametrize("ended", [True, False])
 def test_a_session_is_opened_once(free, tmp_path, ended):
     with canprobe.open_cell(undrawn(free), out=tmp_path) as cell:

@@ -56,7 +56,16 @@ def stepped(lines, *steps_us):
 
 @pytest.mark.parametrize(
     "steps_us",
-    [(-20_000,), (-1_000_000,), (-3_600_000_000,), (1_000_000,), (86_400_000_000,), (-2_000_000, -7_000_000)],
+    [
+        (-5_000,),
+        (-9_000,),
+        (-20_000,),
+        (-1_000_000,),
+        (-3_600_000_000,),
+        (1_000_000,),
+        (86_400_000_000,),
+        (-2_000_000, -7_000_000),
+    ],
     ids=lambda steps: "_".join(map(str, steps)),
 )
 def test_a_clock_that_was_set_changes_no_estimate_and_no_load(lockstep_run, tmp_path, steps_us):
@@ -78,6 +87,33 @@ def test_a_clock_that_was_set_changes_no_estimate_and_no_load(lockstep_run, tmp_
     measured, before = (canprobe.measure_traffic(one, lockstep_run.plan, exact=False) for one in (log, plain))
     assert measured.load == pytest.approx(before.load, rel=1e-3)
     assert measured.as_planned and f"line {first}: the stamps of can0 step" in measured.text()
+
+
+@pytest.mark.parametrize("step_us", [-5_000_000, -3_600_000_000])
+def test_a_clock_that_was_set_back_before_the_first_sync_changes_no_estimate(lockstep_run, tmp_path, step_us):
+    plain = lockstep_run.out / "bus.log"
+    log = tmp_path / "stepped.log"
+    lines = plain.read_text().splitlines()
+    at = next(n for n, line in enumerate(lines) if can_id_of(line) == "080") // 2
+    log.write_text(
+        "".join(f"{restamped(x, 10**15 + stamp_us(x) + step_us * (n >= at))}\n" for n, x in enumerate(lines))
+    )
+    bus = RecordedBus(log)
+    (step,) = bus.steps
+    assert step.line == at + 1 and step.step_ns == pytest.approx(step_us * 1000, abs=5e6)
+    stamps = [line[0] for line in bus]
+    assert stamps == sorted(stamps)
+    found, expected = (canprobe.replay(one, scene=lockstep_run.plan.scene) for one in (log, plain))
+    assert found.summary["cycle"] == expected.summary["cycle"]
+    assert f"log        line {at + 1}: the stamps of can0 step back" in found.text()
+
+
+def test_one_stray_stamp_before_the_first_sync_is_no_step_of_the_clock(lockstep_run, tmp_path):
+    log = tmp_path / "stray.log"
+    lines = (lockstep_run.out / "bus.log").read_text().splitlines()
+    lines[5] = restamped(lines[5], stamp_us(lines[5]) + 3_600_000_000)
+    log.write_text("\n".join(lines) + "\n")
+    assert RecordedBus(log).steps == ()
 
 
 def test_lines_in_another_order_are_no_step_of_the_clock(lockstep_run, tmp_path):

@@ -1,7 +1,9 @@
 """The strict loader: what loads, what is refused and with which words, and the way back to TOML."""
 
 import dataclasses
+import functools
 import math
+import random
 import tomllib
 import typing
 
@@ -9,7 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from canprobe.errors import SceneError
+import canprobe
+from canprobe.errors import CanprobeError, SceneError
 from canprobe.scene.hardware import ArmSettings, JointSettings
 from canprobe.scene.load import dump_scene, load_scene, packaged_scenes, parse_scene
 from canprobe.scene.model import (
@@ -274,6 +277,60 @@ def test_a_byte_order_mark_and_windows_line_ends_are_read(tmp_path):
 def test_integers_that_no_float_holds(number, told):
     (problem,) = problems_of(with_line("task", f"duration_s = {number}"))
     assert problem.startswith(f"file.toml: {told}")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "told"),
+    [
+        ("joints.joint_3.a_mm", 1e308, "expected a number, at most 1e+20 in size, got 1e+308"),
+        ("joints.joint_6.zero_counts", -(10**30), f"expected an integer, at most 1e+20 in size, got {-(10**30)}"),
+        ("joints.joint_4.gear", 5e-324, "expected a number above 0 up to 100000, got 5e-324"),
+        ("object.position_mm", [0.0, 1e308, 0.0], "expected a list of 3 numbers, at most 1e+20 in size, got"),
+        ("joints.joint_5.alpha_deg", functools.reduce(lambda inner, _: [inner], range(40), []), "expected tables and"),
+    ],
+)
+def test_numbers_and_depths_that_no_scene_has(key, value, told):
+    with pytest.raises(SceneError) as caught:
+        load_scene("cylinder", {key: value})
+    assert caught.value.problems[0].startswith(f"cylinder.toml as changed: {key}: {told}")
+
+
+ODD = (
+    math.nan, math.inf, -1, 0, -0.0, 1e308, -1e308, 1e-308, 5e-324, "", "x", [], {}, True, 10**30, 10**400, -(2**63),
+    "ü" * 300, "\0", "a\nb", "nan", "/dev/zero", "/tmp", [0, 0, 0], [math.nan] * 3, [1e308] * 3, ["x"] * 6, [[]],
+    {"a": 1}, {"x": {"y": {}}}, None,
+)  # fmt: skip
+
+
+def keys_of(scene):
+    """Every key of a scene, those of the tables within tables too, and some that it does not have."""
+    for section, hint in typing.get_type_hints(Scene).items():
+        value = getattr(scene, section)
+        tables = {f"{section}.{name}": one for name, one in value.items()} if section == "joints" else {section: value}
+        for path, table in tables.items():
+            kind = type(table) if table is not None else _class_of(hint)
+            yield from (path, f"{path}.new", *(f"{path}.{field.name}" for field in dataclasses.fields(kind)))
+
+
+@pytest.mark.parametrize("name", ["cylinder", "listen"])
+def test_odd_values_of_any_key_are_a_plan_or_an_error_that_names_the_key(name):
+    pairs = [(key, value) for key in keys_of(load_scene(name)) for value in ODD]
+    for key, value in random.Random(0).sample(pairs, 12):
+        try:
+            canprobe.plan(load_scene(name, {key: value}))
+        except CanprobeError as error:
+            named = f"{value}: cannot be read" in str(error) or any(word in str(error) for word in key.split("."))
+            assert named, (key, value, str(error))
+
+
+@pytest.mark.parametrize("path", ["\0", "ü" * 300, "/tmp"])
+@pytest.mark.parametrize(
+    "key", ["arm.urdf", "arm.eds", "joints.joint_2.eds", "sensor.eds", "sensor.array", "sensor.calibration"]
+)
+def test_a_path_that_no_file_has_is_named_or_its_key_is(key, path):
+    with pytest.raises(CanprobeError) as caught:
+        canprobe.plan(load_scene("cylinder", {key: path}))
+    assert path in str(caught.value) or key.rpartition(".")[2] in str(caught.value)
 
 
 def test_lists_nested_beyond_the_parser():

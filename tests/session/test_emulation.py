@@ -8,6 +8,7 @@ from canprobe.bus.lockstep import LockstepBus
 from canprobe.bus.port import VirtualClock
 from canprobe.cli import main
 from canprobe.eds.packaged import load_eds
+from canprobe.planning.choices import ON_THIS_MACHINE
 
 SAVE_ALL = bytes.fromhex("2310100173617665")
 
@@ -16,7 +17,7 @@ SAVE_ALL = bytes.fromhex("2310100173617665")
 def served(monkeypatch):
     """Runs `canprobe emulate free` up to its serving, with a function that gets the nodes instead; the exit status."""
 
-    def emulate(act, *options):
+    def emulate(act, *options, what=("free", "--channel", "vcan0", "--nodes", "1,2")):
         bus = LockstepBus(VirtualClock())
         monkeypatch.setattr("canprobe.bus.interfaces.open_port", lambda *_, **__: bus.port())
         monkeypatch.setattr("canprobe.session.emulation.rehearse", lambda plan: None)
@@ -24,7 +25,7 @@ def served(monkeypatch):
             "canprobe.bus.scheduling.ask_for_processor", lambda: False
         )  # not for the tests' own process
         monkeypatch.setattr("canprobe.emulator.serve.serve", lambda buses, stop: act(buses[0][0]))
-        return main(["emulate", "free", "--channel", "vcan0", "--nodes", "1,2", *options])
+        return main(["emulate", *what, *options])
 
     return emulate
 
@@ -55,6 +56,19 @@ def test_stored_values_are_there_again_each_with_its_node(served, tmp_path):
     assert served(look) == 0
     default = load_eds("puma260_joint", 1)[0x6067].default
     assert found[2:] == [default.to_bytes(4, "little").hex()] * 2 != found[:2]
+
+
+@pytest.mark.parametrize(
+    ("channel", "wide"), [("239.74.163.2", True), ("ff15::1", True), (ON_THIS_MACHINE, False), ("ff01::2", False)]
+)
+@pytest.mark.parametrize("what", [("free", "--nodes", "1"), ("--eds", "puma260_joint", "--node-id", "1")])
+def test_nodes_that_other_machines_reach_are_served_with_the_warning_of_a_run(served, capsys, what, channel, wide):
+    assert served(lambda _: None, "--bus", "udp_multicast", "--channel", channel, what=what) == 0
+    warned = (
+        f"warning: bus.channel = {channel}: every machine on this network segment hears this bus and can command its"
+        f" nodes; --channel {ON_THIS_MACHINE} keeps it on this machine"
+    )
+    assert (warned in capsys.readouterr().err) is wide
 
 
 def test_a_file_that_cannot_be_used_is_told_in_one_line(served, tmp_path, capsys):

@@ -32,6 +32,7 @@ from canprobe.touch.estimate.quadric import (
     turned,
 )
 from canprobe.touch.linear_algebra import (
+    MAX_LENGTH,
     Array,
     checked,
     homogeneous,
@@ -98,6 +99,8 @@ def checked_arrays(points: ArrayLike, normals: ArrayLike, least: int) -> tuple[A
     p, n = checked("points", points, (None, 3)), checked("normals", normals, (None, 3))
     if len(p) < least:
         raise UsageError(f"points: expected at least {least} samples, got {len(p)}")
+    if float(np.abs(p).max()) > MAX_LENGTH:
+        raise UsageError(f"points: expected coordinates up to {MAX_LENGTH:g}, got {np.abs(p).max():g}")
     if len(n) != len(p):
         raise UsageError(f"normals: expected one per point, shape ({len(p)}, 3), got {n.shape}")
     size = np.sqrt(np.einsum("ij,ij->i", n, n))

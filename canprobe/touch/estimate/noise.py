@@ -10,7 +10,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from canprobe.errors import UsageError
-from canprobe.touch.linear_algebra import Array, checked, inverted_upper, lower_root, positive, real_numbers
+from canprobe.touch.linear_algebra import (
+    MAX_LENGTH,
+    MAX_MAGNITUDE,
+    Array,
+    checked,
+    inverted_upper,
+    lower_root,
+    positive,
+    real_numbers,
+)
 
 CHI2_MEDIAN, CHI2_95, CHI2_99, CHI2_999 = 2.366, 7.815, 11.34, 16.27
 """Median, 95 %, 99 % and 99.9 % points of χ² with three degrees of freedom, which a sample has."""
@@ -130,12 +139,25 @@ def _one(n: int, name: str, value: ArrayLike) -> Array:
     if sigma.shape in ((), (n,)):
         if not (sigma > 0.0).all():
             raise UsageError(f"{wanted}, got {sigma.min()}")
+        _refuse_extremes(name, sigma)
         return np.ascontiguousarray(np.broadcast_to(sigma, (n,)))
     if sigma.shape in ((3, 3), (n, 3, 3)):
-        if not (np.linalg.eigvalsh(sigma) > 0.0).all() or np.abs(sigma - sigma.mT).max() > 1e-9 * np.abs(sigma).max():
+        if not np.abs(sigma).max() <= MAX_MAGNITUDE**2:
+            raise UsageError(f"{wanted}, got a variance of {np.abs(sigma).max():g}")
+        variances = np.linalg.eigvalsh(sigma)
+        if not (variances > 0.0).all() or np.abs(sigma - sigma.mT).max() > 1e-9 * np.abs(sigma).max():
             raise UsageError(f"{wanted}, got one that is not symmetric and definite")
+        _refuse_extremes(name, np.sqrt(variances))
         return np.ascontiguousarray(np.broadcast_to(sigma, (n, 3, 3)))
     raise UsageError(f"{wanted}, got shape {sigma.shape}")
+
+
+def _refuse_extremes(name: str, deviations: Array) -> None:
+    """Refuse deviations that leave an estimate nothing but rounding, or whose information is no number."""
+    for one in (float(deviations.min()), float(deviations.max())):
+        if not 1.0 / MAX_MAGNITUDE <= one <= MAX_LENGTH:
+            limits = f"from {1.0 / MAX_MAGNITUDE:g} to {MAX_LENGTH:g}"
+            raise UsageError(f"{name}: expected a standard deviation {limits}, got {one:g}")
 
 
 def _mean_variance(sigma: Array) -> Array:

@@ -478,3 +478,55 @@ def test_fillet(row, sigma, truth):
         assert any("changed" in note for note in e.notes)
     assert math.sqrt(np.mean(squares)) < max(0.05 * abs(k2), 1.0)
     assert np.mean(seen) > (0.99 if sigma is SIGMA else 0.75)
+
+
+class TestMagnitudes:
+    """Numbers at the ends of what a float holds: refused by name, or right; never a warning of numpy."""
+
+    @staticmethod
+    def cap():
+        """(n, 3) points of a sphere of radius 1, and their normals."""
+        away = np.random.default_rng(0).normal(size=(40, 3)) * 0.2 + (0.0, 0.0, 1.0)
+        normals = away / np.linalg.norm(away, axis=1, keepdims=True)
+        return normals, np.diag([1.0, 1.0, 1.0, -1.0])
+
+    @pytest.mark.parametrize("field", ["sigma_point", "sigma_normal"])
+    @pytest.mark.parametrize("sigma", [1e308, 1e200, 1e-200, 1e-308, 5e-324, math.inf, math.nan, 0.0, 10**400])
+    @pytest.mark.parametrize("as_covariance", [False, True])
+    def test_a_deviation_is_refused_by_name(self, field, sigma, as_covariance):
+        n, S = self.cap()
+        value = np.where(np.eye(3) > 0, sigma, 0.0) if as_covariance and isinstance(sigma, float) else sigma
+        sigmas = {"sigma_point": 2e-5, "sigma_normal": 1e-3, field: value}
+        for compute in (lambda: canprobe.cramer_rao(n, n, S, **sigmas), lambda: fit_surface(n, n, **sigmas)):
+            with pytest.raises(UsageError, match=f"^{field}: expected"):
+                compute()
+
+    @pytest.mark.parametrize("unit", [1e-50, 1e-20, 1e9])
+    def test_a_bound_and_a_fit_have_the_unit_of_their_points(self, unit):
+        n, S = self.cap()
+        scaled = np.diag([1.0, 1.0, 1.0, -(unit**2)]) / unit
+        bound = canprobe.cramer_rao(n, n, S, sigma_point=2e-5, sigma_normal=1e-3)
+        again = canprobe.cramer_rao(unit * n, n, scaled, sigma_point=2e-5 * unit, sigma_normal=1e-3)
+        assert again * unit**2 == pytest.approx(bound, rel=1e-6)
+        estimate = fit_surface(unit * n, n, sigma_point=2e-5 * unit, sigma_normal=1e-3)
+        assert estimate.kappa * unit == pytest.approx([1.0, 1.0], rel=1e-4)
+
+    def test_a_bound_is_that_of_the_surface_however_its_matrix_is_scaled(self):
+        n, S = self.cap()
+        bound = canprobe.cramer_rao(n, n, S, sigma_point=2e-5, sigma_normal=1e-3)
+        for factor in (1e-55, 1e55):
+            again = canprobe.cramer_rao(n, n, factor * S, sigma_point=2e-5, sigma_normal=1e-3)
+            assert again == pytest.approx(bound, rel=1e-9)
+
+    @pytest.mark.parametrize("factor", [1e308, 1e160, 1e-160, 1e-300])
+    def test_a_matrix_is_refused(self, factor):
+        with pytest.raises(UsageError, match=r"^S: expected"):
+            SurfaceMatrix(factor * self.cap()[1])
+
+    @pytest.mark.parametrize("factor", [1e308, 1e160, 1e20])
+    def test_points_are_refused(self, factor):
+        n, S = self.cap()
+        with pytest.raises(UsageError, match=r"^points: expected"):
+            fit_surface(factor * n, n, sigma_point=2e-5, sigma_normal=1e-3)
+        with pytest.raises(UsageError, match=r"^points: expected"):
+            canprobe.cramer_rao(factor * n, n, S, sigma_point=2e-5, sigma_normal=1e-3)
