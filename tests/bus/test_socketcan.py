@@ -202,9 +202,9 @@ def test_can_utils_see_the_same(vcan0: str) -> None:
     if candump is None or cansend is None:
         pytest.skip("type: apt-get install -y can-utils")
     port = SocketCanPort(vcan0, MonotonicClock())
-    command = [candump, "-L", "-n", "3", vcan0]
+    command, before = [candump, "-L", "-n", "3", vcan0], _raw_sockets()
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as listener:
-        while _raw_sockets() < 2:
+        while _raw_sockets() == before:
             pass
         port.send_batch([(0x181, b"\x37\x06\0\0"), (0x9FFFFFFF, b"")])
         subprocess.run([cansend, vcan0, "705#7F"], check=True)
