@@ -21,6 +21,8 @@ SLOW_SAMPLE, FAST_SAMPLE = (0.85, 0.875, 0.90), (0.75, 0.80, 0.90)  # lowest, re
 RESTART_MS, TX_QUEUE = 100, 1000
 _FD_MTU = 72
 _TIMEOUT_S = 5.0
+_SYSTEM_FOLDERS = ("/usr/sbin", "/sbin")
+"""Where `tc` is on Debian, and where the PATH of a user does not lead."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,14 +137,14 @@ def drop_queued(name: str) -> bool:
     A queue that another one replaces lets go of its frames; then the default one comes back. The link stays up, and the
     frame that the controller itself holds stays in it.
     """
+    program = shutil.which("tc", path=os.pathsep.join([os.environ.get("PATH", ""), *_SYSTEM_FOLDERS]))
+    if program is None:
+        return False
     queue = ["dev", name, "root"]
     steps = (["replace", *queue, "handle", "1:", "pfifo"], ["del", *queue])
-    try:
-        return not any(
-            subprocess.run(["tc", "qdisc", *step], capture_output=True, check=False).returncode for step in steps
-        )
-    except OSError:
-        return False
+    return not any(
+        subprocess.run([program, "qdisc", *step], capture_output=True, check=False).returncode for step in steps
+    )
 
 
 def ip_line(*settings: str) -> str:

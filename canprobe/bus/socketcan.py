@@ -1,7 +1,8 @@
 """A `Port` on a SocketCAN interface, with a raw socket of its own: bursts of frames a system call, kernel time stamps.
 
 Time stamps are those of the kernel at reception (CLOCK_REALTIME), brought to CLOCK_MONOTONIC by the difference between
-the two clocks, which is looked at in every cycle (`StampClock`): a wall clock that is set is noticed and counted.
+the two clocks, which is looked at again after each sending (`StampClock`): a wall clock that is set is noticed and
+counted.
 29-bit identifiers and remote requests are passed with `EFF_FLAG` and `RTR_FLAG`. With a data bit rate frames of more
 than 8 bytes are CAN FD frames with bit-rate switch; without it none are received.
 
@@ -85,16 +86,22 @@ class StampClock:
         self._compared_ns = 0
         self.offset_ns, _ = self._measure()
 
-    def follow(self, stamp_ns: int) -> int:
-        """Compare the clocks, unless they were compared up to a millisecond before this stamp.
+    def doubt(self) -> None:
+        """Compare the clocks for the next frames, however soon they come."""
+        self._compared_ns = 0
+
+    def follow(self, oldest_ns: int, newest_ns: int) -> int:
+        """Compare the clocks, unless all of these stamps are of the millisecond after the last comparison.
+
+        A stamp of a frame that came after it and is older shows by itself that the wall clock was set back.
 
         Returns:
             By how much the wall clock was set since the last comparison, ns, negative for back; 0 where it was not.
         """
-        if 0 <= stamp_ns - self._compared_ns < _COMPARE_NS:
+        if self._compared_ns <= oldest_ns and newest_ns < self._compared_ns + _COMPARE_NS:
             return 0
-        self._compared_ns = stamp_ns
-        if abs(self._realtime_ns() - self._monotonic_ns() - self.offset_ns) <= _ALIKE_NS:
+        self._compared_ns = self._realtime_ns()
+        if abs(self._compared_ns - self._monotonic_ns() - self.offset_ns) <= _ALIKE_NS:
             return 0
         offset_ns, doubt_ns = self._measure()  # this process may only have waited between the two readings
         step_ns = offset_ns - self.offset_ns
@@ -181,6 +188,7 @@ class SocketCanPort:
             InterfaceError: the queue stays full, the interface is down or gone, or a frame is none.
         """
         self._check_open()
+        self._stamps.doubt()  # no answer may seem to be older than what it answers
         for can_id, data in frames:
             long = len(data) > CLASSIC_BYTES and not (self._fd and len(data) in FD_LENGTHS)
             if long or (can_id > 0x7FF and can_id < ERR_FLAG):
@@ -213,9 +221,10 @@ class SocketCanPort:
             rows = patient + rows
         if not rows:
             return []
-        if step_ns := self._stamps.follow(rows[-1][2]):
-            rows = self._stamped_now(rows, step_ns)
-        elif self._patient_frames is not None:
+        stamps = [row[2] for row in rows]
+        if step_ns := self._stamps.follow(min(stamps), max(stamps)):
+            rows = self._stamped_anew(rows, step_ns)
+        if self._patient_frames is not None:
             rows = sorted(rows, key=_stamp)
         offset_ns = self._stamps.offset_ns
         frames = [(can_id, data, t_ns - offset_ns) for can_id, data, t_ns, _ in rows if not can_id & ERR_FLAG]
@@ -349,15 +358,22 @@ class SocketCanPort:
         self._dropped[which] += dropped
         self.counters.overruns += dropped
 
-    def _stamped_now(self, rows: Sequence[Row], step_ns: int) -> list[Row]:
-        """The wall clock was set: some of these frames came before that and some after it, all of them until now."""
+    def _stamped_anew(self, rows: Sequence[Row], step_ns: int) -> list[Row]:
+        """The wall clock was set: some of these frames came before that and some after it, all of them until now.
+
+        Of both times that a stamp may mean the later one that is no future is taken: it is right, or late by less than
+        the step, and no frame is older than it is.
+        """
         self.counters.clock_steps += 1
         if self.counters.clock_steps == 1:
             way = "back" if step_ns < 0 else "forward"
             what = f"the wall clock was set {way} by {abs(step_ns) * 1e-6:.1f} ms"
             self._reports.say(f"{self.channel}: {what}; frames keep their time, further times are only counted")
-        stamp_ns = self.clock.now_ns() + self._stamps.offset_ns
-        return [(can_id, data, stamp_ns, drops) for can_id, data, _, drops in rows]
+        now_ns = self.clock.now_ns() + self._stamps.offset_ns
+        return [
+            (can_id, data, max((t for t in (t_ns, t_ns + step_ns) if t <= now_ns), default=now_ns), drops)
+            for can_id, data, t_ns, drops in rows
+        ]
 
     def _note_errors(self, rows: Sequence[Row], offset_ns: int) -> None:
         for can_id, data, t_ns, _ in rows:

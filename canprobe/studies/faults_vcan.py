@@ -97,6 +97,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     check_interface(CHANNEL)
     if (missing := missing_ip()) is not None:
         raise InterfaceError(f"{CHANNEL}: the study takes it down and up: {missing}")
+    link("up")  # whoever may not do that is told before anything moves
     rows = []
     total = len(ProcessFault) if quick else RUNS
     for seed in range(total):
@@ -312,5 +313,13 @@ def _signed(value: int) -> int:
 
 
 def link(state: str) -> None:
-    """Take the interface down or up."""
-    subprocess.run(["ip", "link", "set", CHANNEL, state], check=True, capture_output=True)
+    """Take the interface down or up.
+
+    Raises:
+        InterfaceError: the right to do so is missing.
+    """
+    done = subprocess.run(["ip", "link", "set", CHANNEL, state], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise InterfaceError(
+            f"{CHANNEL}: the study takes it down and up, and `ip` says: {done.stderr.strip()}; run the study as root"
+        )

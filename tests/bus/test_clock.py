@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 
 import pytest
@@ -13,6 +13,8 @@ import pytest
 from canprobe.bus.mmsg import Row
 from canprobe.bus.port import JoinedPort, MonotonicClock, Reports, VirtualClock
 from canprobe.bus.socketcan import SocketCanPort, StampClock
+from canprobe.protocol.frames import Frame, pack_sync
+from canprobe.protocol.raw_image import FramePattern, ImageAssembler, ImageFormat
 
 
 def test_virtual_time_stands_still_and_jumps() -> None:
@@ -112,11 +114,17 @@ class Machine:
     def set_wall(self, ms: float) -> None:
         self.offset += round(ms * MS)
 
-    def arrive(self, can_id: int = 0x181) -> int:
+    def go_on_to(self, t_ns: int) -> None:
+        self.pass_ns(max(0, t_ns - self.monotonic.now_ns()))
+
+    def arrive(self, can_id: int = 0x181, data: bytes = b"") -> int:
         """A frame; when it came, on the monotonic clock."""
         t_ns = self.monotonic.now_ns()
-        self.waiting.append((can_id, b"", t_ns + self.offset, 0))
+        self.waiting.append((can_id, data, t_ns + self.offset, 0))
         return t_ns
+
+    def send(self, frames: Sequence[Frame]) -> int:
+        return len(frames)
 
     def receive(self, wait: bool = False) -> list[Row]:
         rows, self.waiting = self.waiting, []
@@ -159,8 +167,9 @@ def test_a_wall_clock_that_is_set_misplaces_no_frame_by_a_cycle(ms: float, readi
         came_ns = machine.arrive()
         machine.pass_ns(20_000)
         ((_, _, read_ns),) = port.drain()
+        assert before_ns - reading_ns <= read_ns
         if abs(ms) >= 1 or number not in (30, 31):  # of a smaller step two may be read before it is looked for
-            assert before_ns - reading_ns <= read_ns <= machine.monotonic.now_ns() + reading_ns
+            assert read_ns <= machine.monotonic.now_ns() + reading_ns
             assert abs(read_ns - came_ns) < 500_000
         before_ns = machine.monotonic.now_ns()
     way = "back" if ms < 0 else "forward"
@@ -173,16 +182,75 @@ def test_a_wall_clock_that_is_set_misplaces_no_frame_by_a_cycle(ms: float, readi
     assert (port.counters.clock_steps, len(said)) == (2, 1), "a clock that is set again and again does not fill a log"
 
 
-def test_frames_from_before_and_after_the_step_keep_their_order(opened: Open) -> None:
+@pytest.mark.parametrize("ms", STEPS_MS)
+def test_frames_from_before_and_after_the_step_keep_their_times(ms: float, opened: Open) -> None:
     machine = Machine()
     port, _ = opened(machine)
+    came = []
     for can_id in (0x181, 0x182, 0x183, 0x184):
         machine.pass_ns(100_000)
-        machine.arrive(can_id)
+        came.append((can_id, b"", machine.arrive(can_id)))
         if can_id == 0x182:
-            machine.set_wall(-200)
-    now_ns = machine.monotonic.now_ns()
-    assert port.drain() == [(can_id, b"", now_ns) for can_id in (0x181, 0x182, 0x183, 0x184)]
+            machine.set_wall(ms)
+    machine.pass_ns(100_000)
+    read = port.drain()
+    if abs(ms) >= 1:
+        assert read == came
+    for (can_id, _, read_ns), (expected, _, came_ns) in zip(read, came, strict=True):  # never as older than it is
+        assert can_id == expected and came_ns <= read_ns <= machine.monotonic.now_ns()
+
+
+@pytest.mark.parametrize("ms", [-300, -20, -0.9, -0.3, -0.1, 0.3, 300])
+@pytest.mark.parametrize("period_us", [1000, 2500])
+def test_no_step_makes_an_answer_older_than_its_sync(ms: float, period_us: int, opened: Open) -> None:
+    """The clock is set at each moment of a cycle; answers come one by one, other frames come before the SYNC."""
+    steps = {100: "send", 110: "drain", 200: "arrive", 230: "look", 330: "arrive", 350: "look"}
+    steps |= {period_us - 60: "arrive", period_us - 1: "drain"}
+    for moment_us in range(0, period_us, 50):
+        machine, sync_ns = Machine(60), 0
+        port, _ = opened(machine)
+        for cycle in range(6):
+            start_ns = 5 * MS + 1000 * period_us * cycle
+            at_us = steps if cycle != 3 else {**steps, moment_us + 5: "set"}
+            for us in sorted(at_us):
+                machine.go_on_to(start_ns + 1000 * us)
+                match at_us[us]:
+                    case "set":
+                        machine.set_wall(ms)
+                    case "arrive":
+                        machine.arrive()
+                    case "send":
+                        sync_ns = machine.now_ns()
+                        port.send_batch([pack_sync(None)])
+                    case "drain":
+                        port.drain()
+                    case "look":
+                        assert [read_ns >= sync_ns for _, _, read_ns in port.drain()] == [True], moment_us
+        assert port.counters.clock_steps == 1
+
+
+@pytest.mark.parametrize("ms", STEPS_MS)
+def test_a_step_tears_no_image_of_an_array_that_runs_on_its_own_time(ms: float, opened: Open) -> None:
+    """An image of 16 frames takes half of its 4 ms, the cell reads every 2.5 ms: most are read in two parts."""
+    image = ImageFormat(tuple(range(0x710, 0x720)), (FramePattern.parse("aa"),), 4, 4)
+    arrivals = [(10 * MS + 4 * MS * n + 125_000 * k, 0x710 + k, bytes([n])) for n in range(20) for k in range(16)]
+    for moment_us in range(0, 10_000, 250):
+        machine, assembler = Machine(), ImageAssembler(image, 3 * MS)
+        port, _ = opened(machine)
+        images, left, when_ns = [], list(arrivals), 40 * MS + 1000 * moment_us
+        for read_ns in range(5 * MS, 95 * MS, 2 * MS + MS // 2):
+            while left and left[0][0] <= read_ns:
+                t_ns, can_id, data = left.pop(0)
+                if when_ns <= t_ns:
+                    machine.set_wall(ms)
+                    when_ns = 1 << 62
+                machine.go_on_to(t_ns)
+                machine.arrive(can_id, data)
+            machine.go_on_to(read_ns)
+            images += [one for frame in port.drain() if (one := assembler.push(*frame)) is not None]
+        assert assembler.torn == 0 and [int(one.counts.max()) for one in images] == list(range(20))
+        if abs(ms) >= 1:
+            assert [one.t_ns for one in images] == [10 * MS + 4 * MS * n for n in range(20)]
 
 
 def test_a_clock_that_nobody_sets_costs_two_readings_a_millisecond_and_no_step(opened: Open) -> None:

@@ -15,7 +15,7 @@ import pytest
 
 from canprobe.bus.interfaces import PythonCanPort
 from canprobe.bus.mmsg import Row
-from canprobe.bus.port import ERR_FLAG, ControllerState, MonotonicClock, Reports, TimedFrame
+from canprobe.bus.port import ERR_FLAG, ControllerState, MonotonicClock, Reports, TimedFrame, VirtualClock
 from canprobe.bus.socketcan import SocketCanPort
 from canprobe.errors import InterfaceError
 from canprobe.protocol.frames import EFF_FLAG, Frame
@@ -153,7 +153,7 @@ class FullQueue:
 def test_a_full_queue_is_waited_for_then_an_error(vcan0: str, monkeypatch: pytest.MonkeyPatch) -> None:
     queue = FullQueue(3)
     monkeypatch.setattr("canprobe.bus.socketcan.FrameSocket", lambda *_: queue)
-    port = SocketCanPort(vcan0, MonotonicClock())
+    port = SocketCanPort(vcan0, VirtualClock())  # a machine that stands still is no full queue
     batch = [(0x100 + k, b"") for k in range(5)]
     port.send_batch(batch)
     assert (queue.taken, port.counters.transmit_full, port.counters.sent) == (batch, 3, 5)
@@ -202,9 +202,9 @@ def test_can_utils_see_the_same(vcan0: str) -> None:
     if candump is None or cansend is None:
         pytest.skip("type: apt-get install -y can-utils")
     port = SocketCanPort(vcan0, MonotonicClock())
-    command = [candump, "-L", "-n", "3", vcan0]
+    command, before = [candump, "-L", "-n", "3", vcan0], _raw_sockets()
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as listener:
-        while _raw_sockets() < 2:
+        while _raw_sockets() == before:
             pass
         port.send_batch([(0x181, b"\x37\x06\0\0"), (0x9FFFFFFF, b"")])
         subprocess.run([cansend, vcan0, "705#7F"], check=True)

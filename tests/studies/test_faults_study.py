@@ -1,6 +1,7 @@
 """Study `faults`: runs follow from their seeds, the score sees what it must, and a few runs are without failure."""
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -240,6 +241,16 @@ def test_without_ip_the_study_on_vcan_names_the_package(monkeypatch, capsys, tmp
     monkeypatch.setattr("shutil.which", lambda _: None)
     assert main(["study", "faults", "--vcan"]) == 3
     assert "apt-get install -y iproute2" in capsys.readouterr().err
+
+
+def test_without_the_right_to_set_the_interface_the_study_says_so_before_anything_runs(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("canprobe.studies.faults_vcan.check_interface", lambda _: None)
+    (tmp_path / "ip").write_text("#!/bin/sh\necho 'RTNETLINK answers: Operation not permitted' >&2\nexit 2\n")
+    (tmp_path / "ip").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    assert main(["study", "faults", "--vcan"]) == 3
+    assert "takes it down and up, and `ip` says: RTNETLINK answers: Operation not permitted" in capsys.readouterr().err
 
 
 def test_vcan_belongs_to_faults_and_knows_no_seed(capsys):

@@ -6,17 +6,17 @@ import contextlib
 import json
 import os
 import signal
-import subprocess
 from typing import Any
 
 import pytest
+from rights import type_as_root
 
 pytestmark = pytest.mark.vcan
 ON_VCAN0 = ("--bus", "socketcan", "--channel", "vcan0")
 
 
-def link(*words: str) -> None:
-    subprocess.run(["ip", "link", "set", "vcan0", *words], check=True, capture_output=True)
+def link(state: str) -> None:
+    type_as_root("ip", "link", "set", "vcan0", state)
 
 
 def test_the_interface_goes_down_in_mid_run(bench: Any) -> None:
@@ -60,7 +60,7 @@ def test_the_emulator_stands_still_and_the_drives_are_lost(bench: Any) -> None:
 def test_the_disk_is_full(bench: Any) -> None:
     small = bench.folder / "small"
     small.mkdir()
-    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(small)], check=True, capture_output=True)
+    type_as_root("mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(small))
     try:
         command = bench.start("run", bench.scene("free"), *ON_VCAN0, "--out", "small/results")
         lines = command.end(3)
@@ -70,7 +70,7 @@ def test_the_disk_is_full(bench: Any) -> None:
         bench.bus.hear()
         bench.assert_left_safe(bench.bus.last, *range(1, 7))
     finally:
-        subprocess.run(["umount", str(small)], check=True, capture_output=True)
+        type_as_root("umount", str(small))
 
 
 def test_monitor_sees_the_cell_and_sends_nothing(bench: Any) -> None:

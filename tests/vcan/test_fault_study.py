@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
+from rights import type_as_root
 
 from canprobe.cli import main
 from canprobe.protocol.frames import FOLLOWING_ERROR, REFERENCE_LIMIT
@@ -15,6 +16,7 @@ pytestmark = pytest.mark.vcan
 
 @pytest.mark.timeout(300)
 def test_the_quick_campaign_kills_each_process_once(tmp_path, capsys):
+    type_as_root("ip", "link", "set", "vcan0", "up")  # the study takes it down, too
     assert main(["study", "faults", "--vcan", "--quick", "--json", "--out", str(tmp_path)]) == 0
     rows = {row["fault"]: row for row in json.loads(capsys.readouterr().out)["rows"]}
     assert set(rows) == {fault.value for fault in ProcessFault}

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rights import type_as_root
 
 from canprobe.bus.port import MonotonicClock
 from canprobe.bus.socketcan import SocketCanPort
@@ -19,20 +20,18 @@ FAST = 5_000_000
 LONG = bytes(range(64))
 
 
-def ip(*words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(["ip", "link", *words], capture_output=True, text=True, check=False)
+def delete(link: str) -> None:
+    subprocess.run(["ip", "link", "del", link], capture_output=True, check=False)
 
 
 @pytest.fixture(scope="module")
 def fd_channel() -> Iterator[str]:
     """A vcan that carries CAN FD: ip link set … mtu 72, while it is down."""
-    ip("del", CHANNEL)  # of a test that was killed
+    delete(CHANNEL)  # of a test that was killed
     for words in (("add", "dev", CHANNEL, "type", "vcan"), ("set", CHANNEL, "mtu", "72"), ("set", CHANNEL, "up")):
-        done = ip(*words)
-        if done.returncode:
-            pytest.skip(f"ip link {' '.join(words)}: {done.stderr.strip()}")
+        type_as_root("ip", "link", *words)
     yield CHANNEL
-    ip("del", CHANNEL)
+    delete(CHANNEL)
 
 
 def heard(port: SocketCanPort, count: int) -> list[tuple[int, bytes]]:

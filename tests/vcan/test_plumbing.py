@@ -128,6 +128,28 @@ def test_what_the_inner_session_never_reported_is_an_error(project: Path) -> Non
     assert "not reported where the vcan is; that session ended with 3" in output
 
 
+HANGS = """
+import threading
+import pytest
+
+pytestmark = pytest.mark.vcan
+
+@pytest.mark.timeout(0.2)
+def test_hangs(vcan0):
+    threading.Event().wait()
+
+def test_goes_on(vcan0):
+    pass
+"""
+
+
+def test_one_that_hangs_fails_by_the_timer_where_the_vcan_is_and_the_next_goes_on(project: Path) -> None:
+    (project / "test_hangs.py").write_text(HANGS)
+    status, output = run(project, "test_hangs.py", STAND_IN="runs")
+    assert (status, counts(output)) == (1, {"passed": 1, "failed": 1}), output
+    assert "threading.Event().wait()" in output and "Timeout (>0.2s)" in output
+
+
 @pytest.mark.parametrize(
     ("required", "expected"), [("", {"passed": 1, "skipped": 9}), ("1", {"passed": 1, "error": 9})]
 )

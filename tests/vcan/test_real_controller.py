@@ -22,6 +22,8 @@ pytestmark = pytest.mark.vcan
 MakeAdapter = Callable[..., SerialAdapter]
 FRAMES = [(0x100 + k, bytes(8)) for k in range(400)]
 """More than a socket's send buffer holds."""
+USERS_PATH = "/usr/local/bin:/usr/bin:/bin"
+"""As Debian gives it to who is not root."""
 
 
 @pytest.fixture
@@ -72,6 +74,7 @@ def test_what_is_full_while_nobody_acknowledges(
     make_adapter: MakeAdapter, monkeypatch: pytest.MonkeyPatch, queue: int, what: str, permitted: bool
 ) -> None:
     adapter = make_adapter(queue=queue)
+    monkeypatch.setenv("PATH", USERS_PATH)
     told: list[str] = []
     port = SocketCanPort(adapter.name, MonotonicClock(), reports=Reports(say=told.append))
     adapter.acknowledge(False)

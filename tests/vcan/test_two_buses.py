@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from rights import type_as_root
 
 from canprobe.bus.port import MonotonicClock
 from canprobe.bus.socketcan import SocketCanPort
@@ -35,22 +36,20 @@ kind = "press"
 """
 
 
-def ip(*words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(["ip", "link", *words], capture_output=True, text=True, check=False)
+def delete(link: str) -> None:
+    subprocess.run(["ip", "link", "del", link], capture_output=True, check=False)
 
 
 @pytest.fixture
 def second_bus() -> Iterator[SocketCanPort]:
     """An ear on a second virtual interface."""
-    ip("del", SECOND)  # of a test that was killed
+    delete(SECOND)  # of a test that was killed
     for words in (("add", "dev", SECOND, "type", "vcan"), ("set", SECOND, "up")):
-        done = ip(*words)
-        if done.returncode:
-            pytest.skip(f"ip link {' '.join(words)}: {done.stderr.strip()}")
+        type_as_root("ip", "link", *words)
     port = SocketCanPort(SECOND, MonotonicClock())
     yield port
     port.close()
-    ip("del", SECOND)
+    delete(SECOND)
 
 
 def test_an_arm_of_another_process_and_an_emulated_sensor_on_its_own_bus(bench: Any, second_bus: Any) -> None:
