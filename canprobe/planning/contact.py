@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.planning.window import measured_share
 from canprobe.robot.chain import forward
 from canprobe.robot.inverse import FIXED_POLE, task_rows
 from canprobe.robot.model import position_per_unit
@@ -28,6 +29,8 @@ Floats = NDArray[np.float64]
 GAIN_SPREAD = 0.05
 """By which one taxel shows more than another: at the edge it may seem to be pressed harder by as much."""
 
+BLUR_TAXELS = 0.72
+"""Standard deviation of the blur, in taxels, that the packaged calibration has: a finer array blurs over less way."""
 _EVERY = 8
 """Of the contacts along a path, for what changes little from one to the next."""
 
@@ -58,8 +61,12 @@ def pressed(force_n: float, probe: Probe, array: Array, kappa: Sequence[float]) 
     """
     a, b = (0.5 * (1.0 / probe.radius + one) for one in kappa)
     depth = math.sqrt(2.0 * force_n * math.sqrt(a * b) / (math.pi * probe.stiffness))
-    shown = probe.stiffness * (depth - (a + b) * array.calibration.image.blur**2)
+    shown = probe.stiffness * (depth - (a + b) * _blur_m(array) ** 2)
     return Pressed(depth, math.sqrt(depth / min(a, b)), shown)
+
+
+def _blur_m(array: Array) -> float:
+    return min(array.calibration.image.blur, BLUR_TAXELS * array.pad.pitch_m)
 
 
 def contact_problems(task: Touch, joints: Floats, normals: Floats, kappas: Floats, force_max_n: float) -> list[str]:
@@ -118,21 +125,25 @@ def settling_problem(task: Touch, joints: Floats, normals: Floats, force_max_n: 
 def saturation_problem(task: Touch | Calibrate, kappas: Floats) -> str | None:
     """That the array cannot show the wanted force, because its taxels saturate; None where it can.
 
+    Where a window cuts the patch, more than that force presses until the window measures it.
+
     Args:
         task: that touches.
         kappas: (m, 2) principal curvatures of the object at its contacts, 1/m.
     """
-    probe, array = task.probe, task.array
+    probe, array, pitch = task.probe, task.array, task.array.pad.pitch_m
     full_pa = array.pad.full_scale_pa
     if array.pad.is_flat:
         return None  # a calibration with one is refused as that
-    kappa = max(kappas.tolist(), key=lambda one: pressed(task.force, probe, array, one).shown_pa)
-    shown_pa = pressed(task.force, probe, array, kappa).shown_pa
-    if shown_pa <= full_pa:
+    windowed = array.mode == "window" and array.window != "auto"
+    inside = measured_share(task.force, probe, int(array.window), pitch) if windowed else 1.0
+    at_most = max(
+        (pressed(task.force / inside, probe, array, one) for one in kappas.tolist()), key=lambda one: one.shown_pa
+    )
+    if at_most.shown_pa <= full_pa:
         return None
-    share = full_pa / probe.stiffness / pressed(task.force, probe, array, kappa).depth
-    blurred = 1.0 - shown_pa / probe.stiffness / pressed(task.force, probe, array, kappa).depth
-    lower = 0.99 * task.force * (share + blurred) ** 2
+    fits = at_most.depth - (at_most.shown_pa - full_pa) / probe.stiffness
+    lower, shown_pa = 0.99 * task.force * (fits / at_most.depth) ** 2, at_most.shown_pa
     return (
         f"sensor.full_scale_kpa = {1e-3 * full_pa:g}: at task.force_n = {task.force:g} the taxels under the middle of "
         f"the contact have up to {1e-3 * shown_pa:.3g} kPa and saturate, so that the force is not measured; lower "
@@ -152,7 +163,7 @@ def edge_margin(task: Touch, kappa: Sequence[float] = (0.0, 0.0)) -> float:
         return 0.0
     half_axis = pressed(task.force, task.probe, array, kappa).half_axis
     if array.mode == "features":
-        return OFF_PAD_SIGMAS * math.sqrt(half_axis**2 / 6.0 + array.calibration.image.blur**2)
+        return OFF_PAD_SIGMAS * math.sqrt(half_axis**2 / 6.0 + _blur_m(array) ** 2)
     return 0.5 * array.pad.pitch_m + half_axis * math.sqrt(1.0 - OFF_PAD + GAIN_SPREAD)
 
 

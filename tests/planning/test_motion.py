@@ -213,7 +213,7 @@ def test_counts_too_coarse_to_hold_the_force_are_refused():
 
 def test_a_force_that_saturates_the_array_is_refused():
     """The peak of the layer's pressure on a plane, blurred by the Gaussian of the array, against its full scale."""
-    plane = change(load_scene("press"), task={"force_n": 3.0})
+    plane = change(load_scene("press"), task={"force_n": 3.0}, sensor={"window": 10})
     plane = dataclasses.replace(plane, object=dataclasses.replace(plane.object, kind="plane", radius_mm=None))
     setup = resolve(plane)
     k, radius, blur = setup.probe.stiffness, setup.probe.radius, setup.array.calibration.image.blur
