@@ -28,7 +28,6 @@ from canprobe.touch.stops import MOST_SPREAD, OFF_PAD, OFF_PAD_SIGMAS
 Floats = NDArray[np.float64]
 GAIN_SPREAD = 0.05
 """By which one taxel shows more than another: at the edge it may seem to be pressed harder by as much."""
-
 BLUR_TAXELS = 0.72
 """Standard deviation of the blur, in taxels, that the packaged calibration has: a finer array blurs over less way."""
 _EVERY = 8
