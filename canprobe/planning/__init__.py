@@ -11,7 +11,8 @@ changes that would fit. Nothing is opened or sent here.
    make it fit; what is left out; warnings. For each candidate `make` plans PDOs and identifiers, and `traffic` checks
    SYNC, load, the peak behind one SYNC and the worst-case response time of every message. `window` compares the window
    of the array with the contact patch.
-3. `motion` follows the task's path with the arm: reach, stops, speeds, the shape under the probe.
+3. `motion` follows the task's path with the arm: reach, stops, speeds, the shape under the probe. `contact` reckons
+   there with the layer: whether the joints' counts hold the force, and whether the array shows it.
 4. `make.make_plan` puts the answer together: `model.Plan` carries the closed setup, nodes, PDOs, buses, choices, what
    is left out, warnings. Bring-up, cycle, emulator and command line work from it alone.
 

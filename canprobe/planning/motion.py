@@ -5,12 +5,13 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.errors import PlanError
+from canprobe.planning.contact import contact_problems, edge_margin, saturation_problem
 from canprobe.planning.model import JointSpeeds
 from canprobe.robot.chain import forward, forward_jacobian
 from canprobe.robot.inverse import FIXED_POLE, LENGTH_M, in_rows, inverse_near, probe_pose, start_posture, task_rows
@@ -59,11 +60,13 @@ class SurfacePath:
     Attributes:
         points: (n, 3) m, base frame; the first is where the approach ends.
         normals: (n, 3) outward unit normals there.
+        kappas: (n, 2) principal curvatures there, 1/m; 0 where a ball bridges what a formula does not describe.
         hollow_radius: smallest concave radius met, m; inf without one.
     """
 
     points: Array
     normals: Array
+    kappas: Array
     hollow_radius: float
 
 
@@ -83,7 +86,7 @@ def surface_path(task: Touch, shape: PlacedShape | None) -> SurfacePath:
         flat = [task.scan.strategy.point(phase) for phase in np.linspace(0, 2 * math.pi, SAMPLES, endpoint=False)]
         plane = approach.start + np.array(flat) @ approach.axes[:2]
     if shape is None:
-        return SurfacePath(plane, np.tile(down, (len(plane), 1)), math.inf)
+        return SurfacePath(plane, np.tile(down, (len(plane), 1)), np.zeros((len(plane), 2)), math.inf)
     # A ball bridges what a point would fall into.
     radius = task.probe.radius if shape.by_gaps and not task.array.pad.is_flat else 0.0
     _check_approach(approach, _along(shape, approach.start, down, radius))
@@ -122,7 +125,8 @@ def _contacts(shape: PlacedShape, plane: Array, up: Array, radius: float) -> Sur
             )
         contacts.append(shape.closest(point + (height + radius) * up))
     points, normals = np.array([c.point for c in contacts]), np.array([c.normal for c in contacts])
-    return SurfacePath(points, normals, shape.tightest_concave_radius(points))
+    kappas = np.zeros((len(contacts), 2)) if shape.by_gaps else np.array([c.kappa for c in contacts])
+    return SurfacePath(points, normals, kappas, shape.tightest_concave_radius(points))
 
 
 def _under_ball(shape: PlacedShape, path: SurfacePath, plane: Array, up: Array, radius: float) -> SurfacePath:
@@ -145,7 +149,7 @@ def _over_patches(path: SurfacePath, plane: Array, radius: float) -> SurfacePath
     moments = weighted @ terms + 1e-6 * np.eye(4)  # along a line, nothing is known beside it
     normals = np.linalg.solve(moments, weighted @ path.normals)[:, 0]
     normals /= np.linalg.norm(normals, axis=1)[:, None]
-    return SurfacePath(path.points + radius * (path.normals - normals), normals, path.hollow_radius)
+    return replace(path, points=path.points + radius * (path.normals - normals), normals=normals)
 
 
 def _mm(point: Array) -> str:
@@ -196,11 +200,11 @@ def _check_first_touch(task: Touch, shape: PlacedShape) -> None:
         deep = 1e3 * (radius - nearest.distance)
         what = f"{deep:.1f} mm in the object before its approach, {math.degrees(tilt):.0f} deg beside it"
         raise PlanError([f"task.clearance_mm = {1e3 * approach.clearance:g}: the probe would be {what}; {mend}"])
-    reaches = task.array.pad.reach_m
-    if radius * tilt > reaches:
+    reaches, margin = task.array.pad.reach_m, edge_margin(task)
+    if margin < reaches < radius * tilt + margin:
         beside = f"the first touch would be {1e3 * radius * tilt:.1f} mm beside the middle of the array"
-        reach = f"which reaches {1e3 * reaches:.1f} mm and would not measure it"
-        raise PlanError([f"task.approach_normal: {beside}, {reach}; {mend}"])
+        reach = f"which reaches {1e3 * reaches:.1f} mm, and the patch at {task.force:g} N needs {1e3 * margin:.1f} mm"
+        raise PlanError([f"task.approach_normal: {beside}, {reach} of it; {mend}"])
 
 
 # Can the arm do it: reach, joint stops and joint speeds along the whole path.
@@ -224,6 +228,8 @@ def check_motion(setup: Setup) -> tuple[JointSpeeds | None, list[str]]:
                 _follow(task.arm, task.probe, _over_ball(task), q_start)
                 joints = _gone(task.arm, task.probe, q_start, lambda pose: _round_ball(ball, pose))
                 speeds, found = stops.speeds(np.zeros_like(task.arm.q_start)), stops.problems(joints, touching=True)
+                kappas = np.full((1, 2), 1.0 / task.ball_radius)
+                found += [problem] if (problem := saturation_problem(task, kappas)) is not None else []
             case Touch() as task:
                 path = surface_path(task, setup.truth.object)
                 problems += _hollow_problems(path, task.probe)
@@ -380,12 +386,12 @@ def _beginning(setup: Setup, task: Touch | Calibrate, contacts: Iterable[_Pose])
 
 
 def _check_touch(task: Touch, path: SurfacePath, stops: _Stops, q_start: Array) -> tuple[JointSpeeds | None, list[str]]:
-    problems = _off_array(task, path)
-    if problems:
-        return None, problems
     joints = _follow(task.arm, task.probe, _along_path(task, path), q_start)
     gone = _gone(task.arm, task.probe, q_start, lambda pose: _over_path(task, path, pose))
     problems = stops.problems(gone, touching=True)
+    if path.hollow_radius > task.probe.radius:  # a tighter hollow is refused as that
+        at_contacts = joints[_BEFORE_CONTACT:]
+        problems += contact_problems(task, at_contacts, path.normals, path.kappas, stops.limits.force_max)
     approach = task.approach
     down = stops.speeds(np.abs(joints[_BEFORE_CONTACT] - joints[1]) / approach.clearance * approach.speed)
     slowly = 1e3 * approach.speed / max(down.worst_share, 1.0) * 0.99
@@ -398,21 +404,6 @@ def _check_touch(task: Touch, path: SurfacePath, stops: _Stops, q_start: Array) 
     possible = 1e3 * task.scan.speed / max(speeds.worst_share, 1.0) * 0.99
     way_out = f"lower task.speed_mm_s to {possible:.3g}, turn task.heading_deg, or raise task.rolling_share"
     return speeds, problems + _too_fast(task.arm, speeds, way_out)
-
-
-def _off_array(task: Touch, path: SurfacePath) -> list[str]:
-    """That the contact leaves the array of a probe whose pole does not follow the normal."""
-    if task_rows(task.arm.model) != FIXED_POLE:
-        return []  # the servo turns the probe, as far as task.rolling_share lets it
-    along = np.clip(np.sum(path.normals * _poles(task, path), axis=1), -1.0, 1.0)
-    most, reach = float(np.arccos(along).max()), task.array.pad.reach_m / task.probe.radius
-    if most <= reach:
-        return []
-    return [
-        f"task: the contact would leave the array: the normal of the object is up to {math.degrees(most):.1f} deg from "
-        f"the probe's pole, and the array reaches {math.degrees(reach):.1f} deg; shorten the path, or use an arm that "
-        "tilts the probe"
-    ]
 
 
 def _poles(task: Touch, path: SurfacePath) -> Array:

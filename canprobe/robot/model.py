@@ -282,6 +282,11 @@ def position_sigma(model: ArmModel, q: npt.ArrayLike, T_flange_tool: Array, dire
 
     Source: a rounding error is uniform over one unit, of variance 1/12, and independent from drive to drive.
     """
+    return float(np.linalg.norm(position_per_unit(model, q, T_flange_tool, direction))) / math.sqrt(12.0)
+
+
+def position_per_unit(model: ArmModel, q: npt.ArrayLike, T_flange_tool: Array, direction: npt.ArrayLike) -> Array:
+    """(n,) by how much a unit of each drive moves the tool along a direction, m; arguments as of `position_sigma`."""
     _, J = forward_jacobian(model.chain, q, T_flange_tool)
-    per_unit = np.asarray(direction, dtype=float) @ J[:3] @ model.q_per_unit
-    return float(np.linalg.norm(per_unit)) / math.sqrt(12.0)
+    per_unit: Array = np.asarray(direction, dtype=float) @ J[:3] @ model.q_per_unit
+    return per_unit

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from canprobe.errors import UsageError
 from canprobe.touch.linear_algebra import Array, positive
+from canprobe.touch.stops import MOST_SPREAD
 
 
 class Doubt(Enum):
@@ -251,8 +252,6 @@ def stiffness_from_slope(slope: float, radius: float, kappa: ArrayLike) -> float
 
 # What the samples of a touch at rest say against going on: a force that swings, an array that cannot show it.
 
-MOST_SPREAD = 0.2
-"""Standard deviation of the force over the target above which it has not settled: twice that of a 40 kN/m contact."""
 MOST_SATURATED = 0.75
 """Share of saturated samples above which the measured force is only a lower bound of the true one.
 

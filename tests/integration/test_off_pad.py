@@ -9,6 +9,8 @@ import canprobe
 from canprobe.cell.conditions import BY_KEY
 from canprobe.cell.supervision import Reaction, limits_of
 from canprobe.errors import SafetyStop
+from canprobe.scene.geometry import true_object
+from canprobe.scene.model import ObjectSettings
 from canprobe.session.session import Session
 from canprobe.tasks.from_plan import make_task
 
@@ -17,7 +19,10 @@ EDGE_M = 8 * 1.5875e-3
 
 @pytest.mark.parametrize("mode", ["window", "features"])
 def test_the_probe_lets_go_before_the_force_has_grown(mode):
-    """A probe of 135 mm has a pad of 11 degrees, and the edge of the fillet turns by more than that within a second."""
+    """A probe of 135 mm has a pad of 11 degrees, and the edge of the fillet turns by more than that within a second.
+
+    The scene says a plane, as the plan would refuse the fillet.
+    """
     scene = canprobe.load_scene("fillet", {"task.duration_s": 3.0})
     scene = replace(
         scene,
@@ -26,7 +31,10 @@ def test_the_probe_lets_go_before_the_force_has_grown(mode):
         sensor=replace(scene.sensor, mode=mode),
         shape=replace(scene.shape, also=()),
     )
-    with pytest.raises(SafetyStop) as stopped, Session(scene) as session:
+    flat = replace(scene, object=ObjectSettings("plane", scene.object.position_mm, scene.object.rotation_deg))
+    with pytest.raises(SafetyStop) as stopped, Session(flat) as session:
+        plant = session.world.plant
+        plant.config = replace(plant.config, object=true_object(scene.object))
         session.run(make_task(session.plan))
     assert "the contact runs off the edge of the array" in stopped.value.reason
     truth = session.truth

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from scenes import change, reasons, with_joints
 
 import canprobe
 from canprobe.planning.motion import surface_path
+from canprobe.robot.chain import forward
 from canprobe.scene.geometry import true_object
 from canprobe.scene.load import load_scene, packaged_scenes
 from canprobe.scene.model import ObjectSettings
@@ -154,11 +156,78 @@ def tilted(scene, degrees, clearance_mm=3.0):
 
 
 def test_a_first_touch_beside_the_array_is_refused(cylinder):
-    """A probe of 40 mm meets a tilted plane 40 mm · tilt beside its pole; the array ends at 12.7 mm, 18.2 degrees."""
-    assert canprobe.plan(tilted(cylinder, 17.9))
+    """A probe of 40 mm meets a tilted plane 40 mm · tilt beside its pole; the array ends at 12.7 mm, 18.2 degrees.
+
+    At 14.3 degrees the touch stays on the array, from 16 degrees on a run stops it.
+    """
+    assert canprobe.plan(tilted(cylinder, 14.3))
+    assert "would be 11.2 mm beside the middle" in reasons(tilted(cylinder, 16.0))[0]
     (problem,) = reasons(tilted(cylinder, 18.5))
     assert "would be 12.9 mm beside the middle of the array, which reaches 12.7 mm" in problem
     assert "turn task.approach_normal by 18 deg" in problem or "turn task.approach_normal by 19 deg" in problem
+
+
+def test_a_contact_that_runs_off_an_array_that_does_not_turn_is_refused(cylinder):
+    """Along 36 mm of a cylinder of 36 mm the normal turns by 30 degrees to each side."""
+    for share, stays in ((0.05, True), (0.4, True), (0.6, False), (1.0, False)):
+        scene = change(cylinder, task={"rolling_share": share, "speed_mm_s": 5.0})
+        if stays:
+            canprobe.plan(scene)
+        else:
+            (problem,) = reasons(scene)
+            assert "the contact would run off the array" in problem and "lower task.rolling_share" in problem
+
+
+def test_an_array_that_is_smaller_than_the_patch_is_refused(cylinder):
+    press = change(load_scene("press"), sensor={"mode": "image", "rows": 16, "columns": 2})
+    (problem,) = [problem for problem in reasons(press) if "sensor.columns" in problem]
+    assert "sensor.columns = 2: the array is 3.175 mm wide" in problem
+
+
+def rounded_spread(scene, coarser):
+    """Spread of the force over itself, as the joints' counts round at the first contact; by drawing."""
+    setup = resolve(scene)
+    model, T_flange_probe = setup.arm.model, setup.probe.T_flange_probe
+    rng = np.random.default_rng(5)
+    rounding = coarser * rng.uniform(-0.5, 0.5, (400, model.n)) @ model.q_per_unit.T
+    path = surface_path(setup.task, setup.truth.object)
+    places = np.array([(forward(model.chain, setup.arm.q_start + dq) @ T_flange_probe)[:3, 3] for dq in rounding])
+    depth = math.sqrt(setup.touch.force / (math.pi * setup.probe.stiffness * setup.probe.radius))
+    forces = (1.0 + (places - places.mean(axis=0)) @ path.normals[0] / depth) ** 2
+    return float(np.std(forces))
+
+
+def test_counts_too_coarse_to_hold_the_force_are_refused():
+    """A press at the start posture: by drawn roundings, the force may swing by 20 % and no more."""
+    press = load_scene("press")
+    counts = np.array([joint.counts_per_turn for joint in press.joints.values()])
+    limit = 0.2 / rounded_spread(press, 1.0)
+    assert rounded_spread(press, limit) == pytest.approx(0.2, rel=0.05)
+    canprobe.plan(with_joints(press, counts_per_turn=counts / (0.85 * limit)))
+    (problem,) = reasons(with_joints(press, counts_per_turn=counts / (1.2 * limit)))
+    assert problem.startswith("joints.joint_") and "the force would swing by 2" in problem
+    assert "does not settle" in problem and "task.force_n" in problem
+    softer = float(re.search(r"probe.stiffness_n_m3 = ([\d.e+]+)", problem)[1])
+    canprobe.plan(change(with_joints(press, counts_per_turn=counts / (1.2 * limit)), probe={"stiffness_n_m3": softer}))
+
+
+def test_a_force_that_saturates_the_array_is_refused():
+    """The peak of the layer's pressure on a plane, blurred by the Gaussian of the array, against its full scale."""
+    plane = change(load_scene("press"), task={"force_n": 3.0}, sensor={"window": 10})
+    plane = dataclasses.replace(plane, object=dataclasses.replace(plane.object, kind="plane", radius_mm=None))
+    setup = resolve(plane)
+    k, radius, blur = setup.probe.stiffness, setup.probe.radius, setup.array.calibration.image.blur
+    depth = math.sqrt(3.0 / (math.pi * k * radius))
+    x, y = np.meshgrid(*2 * [np.linspace(-0.01, 0.01, 801)])
+    weights = np.exp(-0.5 * (x * x + y * y) / blur**2)
+    pressure = k * np.maximum(depth - (x * x + y * y) / (2.0 * radius), 0.0)
+    peak_kpa = 1e-3 * float(np.sum(weights * pressure) / np.sum(weights))
+    canprobe.plan(change(plane, sensor={"full_scale_kpa": 1.02 * peak_kpa}))
+    (problem,) = reasons(change(plane, sensor={"full_scale_kpa": 0.9 * peak_kpa}))
+    assert f"up to {peak_kpa:.1f} kPa" in problem and problem.startswith("sensor.full_scale_kpa")
+    lower = float(re.search(r"lower task.force_n to ([\d.]+)", problem)[1])
+    assert 2.0 < lower < 3.0
+    canprobe.plan(change(plane, sensor={"full_scale_kpa": 0.9 * peak_kpa}, task={"force_n": lower}))
 
 
 def test_a_probe_that_would_be_in_the_object_before_its_approach_is_refused(cylinder):

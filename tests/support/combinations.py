@@ -396,18 +396,8 @@ class Outcome:
 
     @property
     def keeps(self) -> bool:
-        """Accepted means done; refused means with a key of the scene, or an object of a file.
-
-        What a contact does (a small probe that saturates the array, an edge that is run over) no plan foresees: the
-        touch stops for safety, which `canprobe plan --rehearse` shows, and is counted apart.
-        """
-        broken = self.run is not None and not self.stopped
-        return not broken and (self.plan is None or key_of(self.plan) is not None)
-
-    @property
-    def stopped(self) -> bool:
-        """The touch was stopped for safety."""
-        return self.run is not None and self.run.startswith("SafetyStop: ") and not self.run.endswith("its stop")
+        """Accepted means done; refused means with a key of the scene, or an object of a file."""
+        return self.run is None and (self.plan is None or key_of(self.plan) is not None)
 
 
 KEY = re.compile(r"(?<![\w./-])(?:task|sensor|array|arm|joints?|cycle|bus|limits|object|probe|wire|shape|plant)[.:]?"
@@ -443,7 +433,7 @@ def main() -> int:
     parser.add_argument("--keep", metavar="DIR", type=Path, help="keep the files of each combination there")
     args = parser.parse_args()
     refused: Counter[str | None] = Counter()
-    broken = accepted = stopped = 0
+    broken = accepted = 0
     with tempfile.TemporaryDirectory() as scratch:
         for seed in range(args.seed, args.seed + args.count):
             combination = draw(seed, (args.keep or Path(scratch)) / str(seed))
@@ -452,14 +442,12 @@ def main() -> int:
             spent = time.process_time() - began
             accepted += outcome.plan is None
             broken += not outcome.keeps
-            stopped += outcome.stopped
             refused.update([] if outcome.plan is None else [key_of(outcome.plan)])
-            word = "refused" if outcome.plan is not None else "stopped for safety" if outcome.stopped else "done"
+            word = "refused" if outcome.plan is not None else "done"
             print(f"{seed}: {word if outcome.keeps else 'BROKEN'} ({spent:.1f} s): {combination.what}")
             for line in filter(None, (outcome.plan, outcome.run)):
                 print(f"    {line}", flush=True)
-    print(f"{args.count} combinations: {accepted} accepted, {args.count - accepted} refused, "
-          f"{stopped} stopped for safety, {broken} broken")  # fmt: skip
+    print(f"{args.count} combinations: {accepted} accepted, {args.count - accepted} refused, {broken} broken")
     print("refused by: " + ", ".join(f"{key} {count}" for key, count in refused.most_common()))
     return 1 if broken else 0
 

@@ -21,6 +21,7 @@ from canprobe.errors import UsageError
 from canprobe.touch.contact import Doubt
 from canprobe.touch.linear_algebra import Array, checked, positive, read_only
 from canprobe.touch.pad import COUNTS_MAX, Pad
+from canprobe.touch.stops import OFF_PAD, OFF_PAD_SIGMAS, OFF_PAD_TAXELS
 
 # Dead taxels: found where a taxel reads nothing in the midst of a patch, and bridged by their neighbours.
 #
@@ -132,11 +133,6 @@ class Continuation:
 
 # The patch.
 
-OFF_PAD = 0.95
-"""Pressure at the pad's edge over the highest from which the contact runs off: a paraboloid has lost a sixth."""
-OFF_PAD_SIGMAS, OFF_PAD_TAXELS = 1.55, 1.0
-"""The same where only moments are known: from the centroid to the edge, a taxel's own width included in σ. A paraboloid
-has lost a fourth by then, and one of which only a rim is left lies in the last row of taxels."""
 _TOO_FEW = 4
 _COUNTS = bytes(range(COUNTS_MAX + 1))
 
