@@ -8,6 +8,6 @@ into a sink:
     view/                                 three dimensions in a browser
     export, database                      a plan as DCF, DBC, KCD and bus.yml, without any run
 
-What there is, what each needs and how it is installed stands in `canprobe.planning.bridges`. To add one: a module
+What there is, what each needs and how it is installed stands in `canprobe.cell.planning.bridges`. To add one: a module
 with `open_sink(context)`, a line in that table, an extra.
 """

@@ -12,12 +12,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from canprobe.bus.disk import write_text
+from canprobe.cell.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan, PlannedPdo
+from canprobe.cell.planning.traffic import CLASSIC_BYTES, SYNCHRONOUS
 from canprobe.errors import UsageError, install_line
-from canprobe.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan, PlannedPdo
-from canprobe.planning.traffic import CLASSIC_BYTES, SYNCHRONOUS
-from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, NmtState
-from canprobe.protocol.pdo import PdoEntry
+from canprobe.fieldbus.bus.candump import write_text
+from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, NmtState
+from canprobe.fieldbus.protocol.pdo import PdoEntry
 
 FORMATS = ("dbc", "kcd")
 _MASTER = "master"

@@ -12,14 +12,14 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.bridge.sample import BASE, FLANGE, PROBE
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.scene.geometry import transform
+from canprobe.cell.scene.setup import Probe
 from canprobe.errors import PlanError
-from canprobe.planning.model import Plan
-from canprobe.robot.chain import Chain
-from canprobe.robot.urdf import Visual, find_mesh, visuals_of
-from canprobe.scene.geometry import transform
-from canprobe.scene.setup import Probe
-from canprobe.touch.linear_algebra import homogeneous, tangent_rotation
+from canprobe.lab.bridge.sample import BASE, FLANGE, PROBE
+from canprobe.mechanics.robot.chain import Chain
+from canprobe.mechanics.robot.urdf import Visual, find_mesh, visuals_of
+from canprobe.mechanics.touch.linear_algebra import homogeneous, tangent_rotation
 
 Array = NDArray[np.float64]
 WHITE, DARK = (236, 233, 224), (76, 84, 94)

@@ -11,15 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from canprobe.bridge.database import need, write_database
-from canprobe.bus.disk import make_folder, whole_file, write_text
-from canprobe.eds.packaged import eds_file
-from canprobe.eds.sections import LINE_END, Faults, Section, Sections, decode, split_sections
-from canprobe.eds.structure import commissioned_node
-from canprobe.errors import UsageError, regular_file
-from canprobe.planning.configuration import SYNC_START_VALUE, NodeSetup, Write, make_setups
-from canprobe.planning.devices import INVALID, MAPPING
-from canprobe.planning.model import (
+from canprobe.cell.planning.configuration import SYNC_START_VALUE, NodeSetup, Write, make_setups
+from canprobe.cell.planning.devices import INVALID, MAPPING
+from canprobe.cell.planning.model import (
     HEARTBEAT_CONSUMED_MS,
     HEARTBEAT_PRODUCED_MS,
     MASTER_NODE_ID,
@@ -28,8 +22,14 @@ from canprobe.planning.model import (
     PlannedNode,
     PlannedPdo,
 )
-from canprobe.planning.traffic import CLASSIC_BYTES
-from canprobe.scene.load import MOST_BYTES
+from canprobe.cell.planning.traffic import CLASSIC_BYTES
+from canprobe.cell.scene.load import MOST_BYTES
+from canprobe.errors import UsageError, regular_file
+from canprobe.fieldbus.bus.candump import make_folder, whole_file, write_text
+from canprobe.fieldbus.eds.packaged import eds_file
+from canprobe.fieldbus.eds.sections import LINE_END, Faults, Section, Sections, decode, split_sections
+from canprobe.fieldbus.eds.structure import commissioned_node
+from canprobe.lab.bridge.database import need, write_database
 
 
 def export_plan(plan: Plan, folder: Path, formats: Iterable[str]) -> list[Path]:

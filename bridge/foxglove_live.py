@@ -10,9 +10,9 @@ from importlib import resources
 
 import foxglove
 
-from canprobe.bridge.messages import TOPICS, Encoder, Messages, Topic
-from canprobe.bridge.sample import Context, Sample
 from canprobe.errors import UsageError
+from canprobe.lab.bridge.messages import TOPICS, Encoder, Messages, Topic
+from canprobe.lab.bridge.sample import Context, Sample
 
 LAYOUT = "foxglove_layout.json"
 STATIC_EVERY_NS = 1_000_000_000

@@ -16,15 +16,15 @@ from pathlib import Path
 from mcap.writer import Writer
 
 from canprobe import __version__
-from canprobe.bridge.database import plan_database
-from canprobe.bridge.messages import CLOCK, TOPICS, Encoder, Messages, Topic
-from canprobe.bridge.sample import Context, Sample
-from canprobe.bus.disk import make_folder
-from canprobe.eds.packaged import eds_file
+from canprobe.cell.planning.bridges import BRIDGES
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.scene.load import SAVED_AS
 from canprobe.errors import ResultsError, UsageError
-from canprobe.planning.bridges import BRIDGES
-from canprobe.planning.model import Plan
-from canprobe.scene.load import SAVED_AS
+from canprobe.fieldbus.bus.candump import make_folder
+from canprobe.fieldbus.eds.packaged import eds_file
+from canprobe.lab.bridge.database import plan_database
+from canprobe.lab.bridge.messages import CLOCK, TOPICS, Encoder, Messages, Topic
+from canprobe.lab.bridge.sample import Context, Sample
 
 
 class McapSink:

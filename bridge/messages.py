@@ -15,8 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from canprobe.bridge.description import axis_transforms, robot_description
-from canprobe.bridge.sample import (
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.planning.traffic import CLASSIC_BYTES
+from canprobe.cell.scene.geometry import T_flange_probe
+from canprobe.cell.session.target import VIRTUAL
+from canprobe.fieldbus.bus.port import TimedFrame
+from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG
+from canprobe.lab.bridge.description import axis_transforms, robot_description
+from canprobe.lab.bridge.sample import (
     BASE,
     CONTACT,
     FLANGE,
@@ -28,13 +34,7 @@ from canprobe.bridge.sample import (
     link_transforms,
     quaternion_of,
 )
-from canprobe.bus.port import TimedFrame
-from canprobe.planning.model import Plan
-from canprobe.planning.traffic import CLASSIC_BYTES
-from canprobe.protocol.frames import EFF_FLAG, RTR_FLAG
-from canprobe.robot.chain import Chain
-from canprobe.scene.geometry import T_flange_probe
-from canprobe.session.target import VIRTUAL
+from canprobe.mechanics.robot.chain import Chain
 
 CAN_FRAME = "can_msgs/msg/Frame"
 CAN_FD_FRAME = "ros2_socketcan_msgs/msg/FdFrame"

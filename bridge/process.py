@@ -24,20 +24,20 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from canprobe.bridge.sample import SurfacePatch
-from canprobe.bus.port import TimedFrame, elapsed_ns, epoch_now_ns
-from canprobe.cell.controller import Measurement, TactileSample
-from canprobe.cell.cycle import Observation
+from canprobe.cell.master.controller import Measurement, TactileSample
+from canprobe.cell.master.cycle import Observation
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.scene.load import SAVED_AS
+from canprobe.cell.session.children import with_our_imports
+from canprobe.cell.session.session import write_scene
+from canprobe.cell.tasks.from_plan import Request
 from canprobe.errors import ResultsError, UsageError
-from canprobe.planning.model import Plan
-from canprobe.protocol.tactile import Features, TactileFrame, TactileHeader
-from canprobe.scene.load import SAVED_AS
-from canprobe.session.children import with_our_imports
-from canprobe.session.session import write_scene
-from canprobe.tasks.from_plan import Request
+from canprobe.fieldbus.bus.port import TimedFrame, elapsed_ns, epoch_now_ns
+from canprobe.fieldbus.protocol.tactile import Features, TactileFrame, TactileHeader
+from canprobe.lab.bridge.sample import SurfacePatch
 
 if TYPE_CHECKING:
-    from canprobe.touch.estimate.answer import SurfaceEstimate
+    from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 
 
 # One observation ↔ bytes, for the way into a bridge's process: 3 µs where pickle takes 35.
@@ -300,7 +300,7 @@ class BridgeProcess:
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed by end
         reader, writer = os.pipe()
         self._process = subprocess.Popen(  # a new session: Ctrl-C is for the cell
-            [sys.executable, "-P", "-m", "canprobe.bridge.worker", name],
+            [sys.executable, "-P", "-m", "canprobe.lab.bridge.worker", name],
             env=with_our_imports(),
             stdin=reader,
             stdout=subprocess.PIPE,

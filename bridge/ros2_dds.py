@@ -31,14 +31,14 @@ from cyclonedds.topic import Topic as DdsTopic
 from cyclonedds.util import duration
 from numpy.typing import NDArray
 
-from canprobe.bridge.messages import TOPICS, Encoder, Messages, Topic
-from canprobe.bridge.sample import Context, Sample
+from canprobe.cell.planning.make import make_plan
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.scene.load import dump_scene, parse_scene
+from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.tasks import Trajectory
 from canprobe.errors import UsageError
-from canprobe.planning.make import make_plan
-from canprobe.planning.model import Plan
-from canprobe.scene.load import dump_scene, parse_scene
-from canprobe.scene.resolve import resolve
-from canprobe.tasks import Trajectory
+from canprobe.lab.bridge.messages import TOPICS, Encoder, Messages, Topic
+from canprobe.lab.bridge.sample import Context, Sample
 
 Array = NDArray[np.float64]
 
@@ -81,7 +81,7 @@ def trajectory_of(plan: Plan, message: Any, q: Array | None) -> dict[str, Any]:
         q: (n,) joint positions now, rad or m; None as long as they are not known.
 
     Returns:
-        `points` and `velocities` of a `canprobe.tasks.Trajectory`.
+        `points` and `velocities` of a `canprobe.cell.tasks.Trajectory`.
 
     Raises:
         UsageError: the cell cannot or must not follow it.

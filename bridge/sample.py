@@ -15,11 +15,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.bus.port import TimedFrame
-from canprobe.planning.model import Plan
-from canprobe.robot import chain as serial
-from canprobe.robot.chain import Chain
-from canprobe.scene.model import BridgeSettings
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.scene.model import BridgeSettings
+from canprobe.fieldbus.bus.port import TimedFrame
+from canprobe.mechanics.robot import chain as serial
+from canprobe.mechanics.robot.chain import Chain
 
 Array = NDArray[np.float64]
 
@@ -229,7 +229,7 @@ class Context:
         plan: of the run.
         settings: section `[bridge]`.
         out: folder of the run; None where no files are written.
-        send: hands a request (see `canprobe.tasks.from_plan.RequestedTask`) back to the cell.
+        send: hands a request (see `canprobe.cell.tasks.from_plan.RequestedTask`) back to the cell.
     """
 
     plan: Plan

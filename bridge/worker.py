@@ -22,8 +22,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.bridge.process import END, Received, read_records, unpack_observation
-from canprobe.bridge.sample import (
+from canprobe.cell.master.array import patch_of
+from canprobe.cell.master.controller import Measurement
+from canprobe.cell.master.supervision import TOUCH_FORCE
+from canprobe.cell.master.watch import NodeWatch
+from canprobe.cell.planning.bridges import BRIDGES
+from canprobe.cell.planning.make import make_plan
+from canprobe.cell.planning.model import HEARTBEAT_CONSUMED_MS, Plan, PlannedNode
+from canprobe.cell.scene.load import load_scene
+from canprobe.cell.scene.model import BridgeSettings
+from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.scene.setup import Setup, Touch
+from canprobe.cell.tasks.probing import Phase
+from canprobe.cell.tasks.sensing import ContactSensing
+from canprobe.errors import CanprobeError, ResultsError
+from canprobe.fieldbus.bus.port import TimedFrame
+from canprobe.fieldbus.protocol.cia402 import DriveState, known_state
+from canprobe.fieldbus.protocol.frames import NO_ERROR, NmtState, describe
+from canprobe.lab.bridge.process import END, Received, read_records, unpack_observation
+from canprobe.lab.bridge.sample import (
     ContactFrame,
     Context,
     Diagnostic,
@@ -32,26 +49,9 @@ from canprobe.bridge.sample import (
     SurfacePatch,
     TouchFrame,
 )
-from canprobe.bus.port import TimedFrame
-from canprobe.cell.array import patch_of
-from canprobe.cell.controller import Measurement
-from canprobe.cell.supervision import TOUCH_FORCE
-from canprobe.cell.watch import NodeWatch
-from canprobe.errors import CanprobeError, ResultsError
-from canprobe.planning.bridges import BRIDGES
-from canprobe.planning.make import make_plan
-from canprobe.planning.model import HEARTBEAT_CONSUMED_MS, Plan, PlannedNode
-from canprobe.protocol.cia402 import DriveState, known_state
-from canprobe.protocol.frames import NO_ERROR, NmtState, describe
-from canprobe.scene.load import load_scene
-from canprobe.scene.model import BridgeSettings
-from canprobe.scene.resolve import resolve
-from canprobe.scene.setup import Setup, Touch
-from canprobe.tasks.probing import Phase
-from canprobe.tasks.sensing import ContactSensing
-from canprobe.touch.contact import ContactSample, pad_to_direction
-from canprobe.touch.linear_algebra import homogeneous, tangent_rotation
-from canprobe.touch.patch.image_model import make_patch_calibration
+from canprobe.mechanics.touch.contact import ContactSample, pad_to_direction
+from canprobe.mechanics.touch.linear_algebra import homogeneous, tangent_rotation
+from canprobe.mechanics.touch.patch.image_model import make_patch_calibration
 
 # The state of the nodes, about once a second: from heartbeats, emergencies and statuswords.
 
@@ -201,7 +201,7 @@ class SampleSource:
 
 def _sensing(setup: Setup) -> ContactSensing | None:
     """Contacts, where there is an arm to place them; second moments are the estimator's business."""
-    from canprobe.tasks.from_plan import make_sensing
+    from canprobe.cell.tasks.from_plan import make_sensing
 
     touch = setup.touch
     if touch is None:
@@ -236,7 +236,7 @@ def run(name: str, records: Iterator[bytes], fd: int) -> int:
 
     try:
         context = _context(marshal.loads(next(records)), send)
-        sink: Sink = importlib.import_module(f"canprobe.bridge.{BRIDGES[name].module}").open_sink(context)
+        sink: Sink = importlib.import_module(f"canprobe.lab.bridge.{BRIDGES[name].module}").open_sink(context)
         send({"ready": sink.where})
         received, summary = _serve(sink, SampleSource(context.plan), records)
         done: dict[str, object] = {"done": {"received": received, "where": sink.where}}

@@ -10,7 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from canprobe.api import open_cell, plan, run
-    from canprobe.cell.controller import Command, Controller, Measurement
+    from canprobe.cell.master.controller import Command, Controller, Measurement
+    from canprobe.cell.recorded.reestimate import ReplayResult, replay
+    from canprobe.cell.results.contacts import Contacts
+    from canprobe.cell.results.files import load_surface_map, load_table
+    from canprobe.cell.results.summary import RunResult, measure_traffic
+    from canprobe.cell.scene.load import load_scene
     from canprobe.errors import (
         BusError,
         CanprobeError,
@@ -25,40 +30,35 @@ if TYPE_CHECKING:
         StudyError,
         UsageError,
     )
-    from canprobe.recorded.reestimate import ReplayResult, replay
-    from canprobe.results.contacts import Contacts
-    from canprobe.results.files import load_surface_map, load_table
-    from canprobe.results.summary import RunResult, measure_traffic
-    from canprobe.scene.load import load_scene
-    from canprobe.studies.many import Runs, run_many
-    from canprobe.touch.contact import ContactSample
-    from canprobe.touch.estimate.answer import SurfaceEstimate
-    from canprobe.touch.estimate.fit import fit_surface
-    from canprobe.touch.estimate.likelihood import cramer_rao
-    from canprobe.touch.surface import SurfaceMatrix
-    from canprobe.touch.surface_map import SurfaceMap
+    from canprobe.lab.studies.many import Runs, run_many
+    from canprobe.mechanics.touch.contact import ContactSample
+    from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
+    from canprobe.mechanics.touch.estimate.fit import fit_surface
+    from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
+    from canprobe.mechanics.touch.surface import SurfaceMatrix
+    from canprobe.mechanics.touch.surface_map import SurfaceMap
 
 __version__ = "0.1.0"
 
 _MODULES = {
     "canprobe.api": ("open_cell", "plan", "run"),
-    "canprobe.cell.controller": ("Command", "Controller", "Measurement"),
+    "canprobe.cell.master.controller": ("Command", "Controller", "Measurement"),
     "canprobe.errors": (
         *("BusError", "CanprobeError", "EdsError", "InterfaceError", "NodeError", "PlanError", "ProtocolError"),
         *("ResultsError", "SafetyStop", "SceneError", "StudyError", "UsageError"),
     ),
-    "canprobe.recorded.reestimate": ("ReplayResult", "replay"),
-    "canprobe.scene.load": ("load_scene",),
-    "canprobe.studies.many": ("Runs", "run_many"),
-    "canprobe.results.contacts": ("Contacts",),
-    "canprobe.results.files": ("load_surface_map", "load_table"),
-    "canprobe.touch.contact": ("ContactSample",),
-    "canprobe.touch.estimate.likelihood": ("cramer_rao",),
-    "canprobe.touch.estimate.answer": ("SurfaceEstimate",),
-    "canprobe.touch.estimate.fit": ("fit_surface",),
-    "canprobe.touch.surface": ("SurfaceMatrix",),
-    "canprobe.touch.surface_map": ("SurfaceMap",),
-    "canprobe.results.summary": ("RunResult", "measure_traffic"),
+    "canprobe.cell.recorded.reestimate": ("ReplayResult", "replay"),
+    "canprobe.cell.scene.load": ("load_scene",),
+    "canprobe.lab.studies.many": ("Runs", "run_many"),
+    "canprobe.cell.results.contacts": ("Contacts",),
+    "canprobe.cell.results.files": ("load_surface_map", "load_table"),
+    "canprobe.mechanics.touch.contact": ("ContactSample",),
+    "canprobe.mechanics.touch.estimate.likelihood": ("cramer_rao",),
+    "canprobe.mechanics.touch.estimate.answer": ("SurfaceEstimate",),
+    "canprobe.mechanics.touch.estimate.fit": ("fit_surface",),
+    "canprobe.mechanics.touch.surface": ("SurfaceMatrix",),
+    "canprobe.mechanics.touch.surface_map": ("SurfaceMap",),
+    "canprobe.cell.results.summary": ("RunResult", "measure_traffic"),
 }
 _EXPORTS = {name: (module, name) for module, names in _MODULES.items() for name in names}
 

@@ -10,37 +10,37 @@ from pathlib import Path
 from types import NoneType, TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-from canprobe.bus.scheduling import interrupts_held, interrupts_repeated
-from canprobe.cell.array import patch_from
-from canprobe.cell.controller import Command, Controller, Measurement, TactileSample, as_controller
-from canprobe.cell.cycle import Observation, Observer, Observers
+from canprobe.cell.master.array import patch_from
+from canprobe.cell.master.controller import Command, Controller, Measurement, TactileSample, as_controller
+from canprobe.cell.master.cycle import Observation, Observer, Observers
+from canprobe.cell.planning.make import make_plan
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.results.summary import RunResult, log_columns, summarise, tactile_columns, write_columns, write_files
+from canprobe.cell.scene.load import load_scene
+from canprobe.cell.scene.model import Scene
+from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.scene.setup import Setup, Touch
+from canprobe.cell.session.children import Bridges
+from canprobe.cell.session.emulation import emulate, emulate_eds
+from canprobe.cell.session.looking import commission, monitor, scan
+from canprobe.cell.session.session import Say, Session, quiet, with_bridges
+from canprobe.cell.session.target import VIRTUAL, Target
+from canprobe.cell.session.terminal import Progress
+from canprobe.cell.session.up import check_joints, home, up
+from canprobe.cell.tasks.from_plan import make_task
+from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
+from canprobe.cell.tasks.task import TaskRecord, record_of
 from canprobe.errors import CanprobeError, ResultsError, UsageError
-from canprobe.planning.make import make_plan
-from canprobe.planning.model import Plan
-from canprobe.results.summary import RunResult, log_columns, summarise, tactile_columns, write_columns, write_files
-from canprobe.robot.chain import Array, forward_jacobian
-from canprobe.scene.load import load_scene
-from canprobe.scene.model import Scene
-from canprobe.scene.resolve import resolve
-from canprobe.scene.setup import Setup, Touch
-from canprobe.session.children import Bridges
-from canprobe.session.emulation import emulate, emulate_eds
-from canprobe.session.looking import commission, monitor, scan
-from canprobe.session.session import Say, Session, quiet, with_bridges
-from canprobe.session.target import VIRTUAL, Target
-from canprobe.session.terminal import Progress
-from canprobe.session.up import check_joints, home, up
-from canprobe.tasks.from_plan import make_task
-from canprobe.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
-from canprobe.tasks.task import TaskRecord, record_of
+from canprobe.fieldbus.bus.real.processor import interrupts_held, interrupts_repeated
+from canprobe.mechanics.robot.chain import Array, forward_jacobian
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-    from canprobe.results.contacts import Contacts
-    from canprobe.touch.consistency import Consistency
-    from canprobe.touch.patch.image import Patch
-    from canprobe.touch.surface_map import SurfaceMap
+    from canprobe.cell.results.contacts import Contacts
+    from canprobe.mechanics.touch.consistency import Consistency
+    from canprobe.mechanics.touch.patch.image import Patch
+    from canprobe.mechanics.touch.surface_map import SurfaceMap
 
 __all__ = [
     "Command",
@@ -96,7 +96,7 @@ def run(
         files: False writes nothing.
         force: let the files replace those of an earlier run in ``out``; without, a folder that is not empty is refused.
         observers: called after each cycle with its measurement, command and frames (`Observation`).
-        bridge: names of bridges to other tools, besides those of the scene; see `canprobe.planning.bridges`.
+        bridge: names of bridges to other tools, besides those of the scene; see `canprobe.cell.planning.bridges`.
 
     Returns:
         The finished run.
@@ -148,7 +148,7 @@ def timed_folder(name: str) -> Path:
 
 
 def plan(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = None) -> Plan:
-    """Everything that follows from a scene before anything is started; see `canprobe.planning.make.make_plan`.
+    """Everything that follows from a scene before anything is started; see `canprobe.cell.planning.make.make_plan`.
 
     Args:
         scene, overrides: as for `run`.
@@ -187,7 +187,7 @@ def _estimates(setup: Setup, tracker: ShapeTracker | None) -> dict[str, list[Sha
     """The answers of the estimator in the loop, and of the others on the same contacts."""
     if tracker is None or setup.shape is None:
         return {}
-    from canprobe.tasks.from_plan import estimates_of
+    from canprobe.cell.tasks.from_plan import estimates_of
 
     return estimates_of(setup, tracker, (setup.shape.method, *setup.shape.also))
 
@@ -198,7 +198,7 @@ def _mapped(
     """The surface map of a scan, the tests at its crossings (they take a second), and both for the summary."""
     if tracker is None or setup.shape is None:
         return None, None, None
-    from canprobe.results.scores import map_of_scan
+    from canprobe.cell.results.scores import map_of_scan
 
     return map_of_scan(tracker, setup.shape.method, start_s)
 
@@ -207,17 +207,17 @@ def _drawings(result: RunResult, out: Path, say: Say) -> dict[str, Callable[[], 
     """What draws each picture of a run of at least one cycle; the page of its scene comes last, it takes longest."""
 
     def report() -> None:
-        from canprobe.results.figures import draw_run
+        from canprobe.cell.results.figures import draw_run
 
         draw_run(result, out / "report.png")
 
     def surface() -> None:
-        from canprobe.results.surface_figure import draw_surface
+        from canprobe.cell.results.surface_figure import draw_surface
 
         draw_surface(result, out / "surface.png")
 
     def page() -> None:
-        from canprobe.results.page import write_page_of
+        from canprobe.cell.results.page import write_page_of
 
         try:
             write_page_of(out, say)
@@ -443,7 +443,7 @@ class OpenCell(Session):
         task = self.plan.setup.task
         if record.shape is None or not isinstance(task, Touch):
             return None
-        from canprobe.results.contacts import contacts_of
+        from canprobe.cell.results.contacts import contacts_of
 
         return contacts_of(record.shape.samples, task, start_s)
 

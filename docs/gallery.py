@@ -12,7 +12,7 @@ from matplotlib.transforms import Bbox
 from PIL import Image, ImageOps
 
 import canprobe
-from canprobe.scene.load import packaged_scenes
+from canprobe.cell.scene.load import packaged_scenes
 
 FOLDER = Path(__file__).parent / "img" / "scenes"
 DPI = 100

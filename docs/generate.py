@@ -19,11 +19,11 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from canprobe.results.expected import FIGURES, expected_text, range_text, seeds_text
-from canprobe.scene.checks import Only, conditions_of, expected
-from canprobe.scene.load import packaged_scenes, toml_value
-from canprobe.scene.model import Scene
-from canprobe.scene.rules import SECTIONS_OF_TASK
+from canprobe.cell.results.expected import FIGURES, expected_text, range_text, seeds_text
+from canprobe.cell.scene.checks import Only, conditions_of, expected
+from canprobe.cell.scene.load import packaged_scenes, toml_value
+from canprobe.cell.scene.model import Scene
+from canprobe.cell.scene.rules import SECTIONS_OF_TASK
 
 DOCS = Path(__file__).parent
 EXPECTED = DOCS.parent / "canprobe" / "scenes" / "expected.json"

@@ -23,10 +23,10 @@ from typing import Any
 from PIL import Image
 
 import canprobe
-from canprobe.results.expected import figures_of
-from canprobe.scene.load import packaged_scenes
-from canprobe.studies.harness import processor
-from canprobe.studies.sweep import STUDIES
+from canprobe.cell.results.expected import figures_of
+from canprobe.cell.scene.load import packaged_scenes
+from canprobe.lab.studies.harness import processor
+from canprobe.lab.studies.sweep import STUDIES
 
 DOCS = Path(__file__).resolve().parent
 FILE = DOCS / "measured.json"
@@ -238,7 +238,7 @@ def gym() -> Entry:
 
 def learning() -> Entry:
     """What the example of a policy learns."""
-    command = "python -m canprobe.examples.learn_touch_scan"
+    command = "python -m canprobe.lab.examples.learn_touch_scan"
     return {
         "command": command,
         "findings": [line for line in printed(command).splitlines() if line.startswith(("train", "held_out"))],

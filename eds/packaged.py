@@ -20,7 +20,7 @@ from canprobe.errors import EdsError
 if TYPE_CHECKING:
     import canopen
 
-    from canprobe.eds.reading import Reading
+    from canprobe.fieldbus.eds.reading import Reading
 
 
 MISSED_SYNCS = 0x2000
@@ -140,13 +140,13 @@ def check_eds(name_or_path: str | os.PathLike[str], node_id: int | None = None) 
     """
     if node_id is not None:
         _check_node_id(name_or_path, node_id)
-    from canprobe.eds.reading import read_eds  # late, as it imports canopen: --help must not pay for it
+    from canprobe.fieldbus.eds.reading import read_eds  # late, as it imports canopen: --help must not pay for it
 
     return read_eds(eds_file(name_or_path), node_id)
 
 
 @lru_cache(maxsize=64)
 def _parse(path: Path, _mtime_ns: int, node_id: int) -> canopen.ObjectDictionary:
-    from canprobe.eds.reading import read_eds
+    from canprobe.fieldbus.eds.reading import read_eds
 
     return read_eds(path, node_id, serving=False).usable()

@@ -16,10 +16,16 @@ from pathlib import Path
 
 from canopen.objectdictionary import ObjectDictionary, ODRecord, ODVariable, datatypes
 
-from canprobe.eds.description import variable_at
-from canprobe.eds.sections import Fault, Faults, Section, Source, decode, parse_sum, split_sections
-from canprobe.eds.structure import build_objects, check_lists, commissioned_node, find_objects, read_information
 from canprobe.errors import EdsError
+from canprobe.fieldbus.eds.description import variable_at
+from canprobe.fieldbus.eds.sections import Fault, Faults, Section, Source, decode, parse_sum, split_sections
+from canprobe.fieldbus.eds.structure import (
+    build_objects,
+    check_lists,
+    commissioned_node,
+    find_objects,
+    read_information,
+)
 
 _INVALID = 1 << 31
 _CAN_ID = 0x1FFFFFFF

@@ -10,8 +10,8 @@ import re
 
 from canopen.objectdictionary import ObjectDictionary, ODArray, ODRecord, ODVariable, datatypes
 
-from canprobe.eds.sections import Section, Sections, Source, parse_integer
-from canprobe.eds.variables import COUNTING, build_variable, is_variable, set_value
+from canprobe.fieldbus.eds.sections import Section, Sections, Source, parse_integer
+from canprobe.fieldbus.eds.variables import COUNTING, build_variable, is_variable, set_value
 
 # Sections → arrays and records, also in the compact form, with their counts checked.
 #

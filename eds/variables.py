@@ -11,7 +11,7 @@ from contextlib import suppress
 
 from canopen.objectdictionary import ODVariable, datatypes
 
-from canprobe.eds.sections import Remark, Section, Source, parse_flag, parse_integer, parse_sum
+from canprobe.fieldbus.eds.sections import Remark, Section, Source, parse_flag, parse_integer, parse_sum
 
 # What the standards themselves fix about objects that a node cannot do without.
 #

@@ -31,8 +31,8 @@ import sharing
 import standstill
 import system_packages
 
-from canprobe.bus.socketcan import check_interface
 from canprobe.errors import InterfaceError
+from canprobe.fieldbus.bus.real.socketcan import check_interface
 
 hypothesis.settings.register_profile(
     "canprobe",

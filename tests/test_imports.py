@@ -157,7 +157,7 @@ def test_nothing_imports_the_bridges_but_a_command_that_is_asked_for_one():
         if layer_of(relative.with_suffix("").parts) == "cli":
             tree = ast.parse(path.read_text(encoding="utf-8"))
             at_the_top = [node.module for node in tree.body if isinstance(node, ast.ImportFrom)]
-            assert not [name for name in at_the_top if name.startswith("canprobe.bridge")], relative
+            assert not [name for name in at_the_top if name.startswith("canprobe.lab.bridge")], relative
 
 
 def test_cell_and_emulator_never_see_each_other():
@@ -214,11 +214,11 @@ def test_only_declared_packages_are_imported():
 @pytest.mark.parametrize(
     ("source", "names"),
     [
-        ("from . import port", ["canprobe.bus.port"]),
-        ("from .port import Port", ["canprobe.bus.port"]),
-        ("from ..protocol.frames import Frame", ["canprobe.protocol.frames"]),
-        ("from canprobe import scene", ["canprobe.scene"]),
-        ("import canprobe.cell.cell", ["canprobe.cell.cell"]),
+        ("from . import port", ["canprobe.fieldbus.bus.port"]),
+        ("from .port import Port", ["canprobe.fieldbus.bus.port"]),
+        ("from ..protocol.frames import Frame", ["canprobe.fieldbus.protocol.frames"]),
+        ("from canprobe import scene", ["canprobe.cell.scene"]),
+        ("import canprobe.cell.master.cell", ["canprobe.cell.master.cell"]),
         ("def f():\n    import time", ["time"]),
         ("from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import can", ["typing"]),
     ],

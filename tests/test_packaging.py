@@ -26,7 +26,7 @@ def test_every_file_of_the_package_is_packaged():
         for name in names
         if "__pycache__" not in folder and not name.endswith(".py")
     ]
-    assert "eds/puma260_joint.eds" in files, "links are followed"
+    assert "fieldbus/eds/puma260_joint.eds" in files, "links are followed"
     assert [file for file in files if not any(fnmatch.fnmatch(file, pattern) for pattern in patterns)] == []
 
 

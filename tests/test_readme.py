@@ -12,15 +12,15 @@ import system_packages
 from command_lines import command_lines, parse
 from undrawn import undrawn_run
 
+import canprobe.cell.tasks
 import canprobe.errors
-import canprobe.tasks
+from canprobe.cell.planning.bridges import BRIDGES
+from canprobe.cell.scene.checks import convert
+from canprobe.cell.scene.load import load_scene, scenes_folder
+from canprobe.cell.scene.model import ArrayFile, Scene
 from canprobe.cli import COMMANDS, main
-from canprobe.eds.packaged import eds_path
-from canprobe.planning.bridges import BRIDGES
-from canprobe.scene.checks import convert
-from canprobe.scene.load import load_scene, scenes_folder
-from canprobe.scene.model import ArrayFile, Scene
-from canprobe.studies.sweep import STUDIES
+from canprobe.fieldbus.eds.packaged import eds_path
+from canprobe.lab.studies.sweep import STUDIES
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -124,7 +124,7 @@ def test_the_api_reference_has_every_public_name():
     rendered = set(re.findall(r"^::: ([\w.]+)$", TEXTS["docs/api.md"], re.M))
     errors = {name for name, kind in vars(canprobe.errors).items() if isinstance(kind, type)}
     public = set(canprobe.__all__) - errors - {"__version__"}
-    modules = {"canprobe.errors", *(f"canprobe.tasks.{name}" for name in canprobe.tasks.__all__)}
+    modules = {"canprobe.errors", *(f"canprobe.cell.tasks.{name}" for name in canprobe.cell.tasks.__all__)}
     assert rendered >= {*modules, *(f"canprobe.{name}" for name in public)}
 
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from canprobe.bridge.sample import link_transforms
-from canprobe.bridge.view.meshes import (
+from canprobe.lab.bridge.sample import link_transforms
+from canprobe.lab.bridge.view.meshes import (
     MAGMA,
     Array,
     Colours,
@@ -26,13 +26,13 @@ from canprobe.bridge.view.meshes import (
     revolved,
     scale,
 )
-from canprobe.robot.chain import Chain, dh_step
-from canprobe.touch.contact import pad_to_direction
-from canprobe.touch.heights import Heights
-from canprobe.touch.linear_algebra import tangent_rotation
-from canprobe.touch.objects import Cylinder, Sphere
-from canprobe.touch.pad import Pad
-from canprobe.touch.shapes import Bowl, PlacedShape, Torus, Wave
+from canprobe.mechanics.robot.chain import Chain, dh_step
+from canprobe.mechanics.touch.contact import pad_to_direction
+from canprobe.mechanics.touch.heights import Heights
+from canprobe.mechanics.touch.linear_algebra import tangent_rotation
+from canprobe.mechanics.touch.objects import Cylinder, Sphere
+from canprobe.mechanics.touch.pad import Pad
+from canprobe.mechanics.touch.shapes import Bowl, PlacedShape, Torus, Wave
 
 # The PUMA 260 as solid links, by the lengths of its chain; any other arm as plain joints and bars.
 

@@ -15,17 +15,17 @@ from typing import Any
 
 import numpy as np
 
-from canprobe.bridge.sample import Context, Sample
-from canprobe.bridge.view.instants import NAMES, Answer, Follower, Moment, curves_of, row_of
-from canprobe.bridge.view.meshes import MAGMA, Array, scale
-from canprobe.bridge.view.path import OFF_PATH, GrowingPath, LoadedPath, Trail, deviation_scale
-from canprobe.bridge.view.recorded import RecordedRun
-from canprobe.bridge.view.stage import Panel, Stage, address, legend_of, open_server, place_of
-from canprobe.bridge.view.surface import GrowingSurface, LoadedSurface
-from canprobe.bus.disk import write_text
-from canprobe.bus.port import MonotonicClock
-from canprobe.scene.geometry import true_object
-from canprobe.touch.shapes import PlacedShape
+from canprobe.cell.scene.geometry import true_object
+from canprobe.fieldbus.bus.candump import write_text
+from canprobe.fieldbus.bus.port import MonotonicClock
+from canprobe.lab.bridge.sample import Context, Sample
+from canprobe.lab.bridge.view.instants import NAMES, Answer, Follower, Moment, curves_of, row_of
+from canprobe.lab.bridge.view.meshes import MAGMA, Array, scale
+from canprobe.lab.bridge.view.path import OFF_PATH, GrowingPath, LoadedPath, Trail, deviation_scale
+from canprobe.lab.bridge.view.recorded import RecordedRun
+from canprobe.lab.bridge.view.stage import Panel, Stage, address, legend_of, open_server, place_of
+from canprobe.lab.bridge.view.surface import GrowingSurface, LoadedSurface
+from canprobe.mechanics.touch.shapes import PlacedShape
 
 # The bridge `view`: the cell in a browser while it runs.
 

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.bridge.sample import ContactFrame, Sample, SurfacePatch
-from canprobe.bridge.view.meshes import Array
-from canprobe.touch.shapes import PlacedShape
+from canprobe.lab.bridge.sample import ContactFrame, Sample, SurfacePatch
+from canprobe.lab.bridge.view.meshes import Array
+from canprobe.mechanics.touch.shapes import PlacedShape
 
 SILENT_NS = 250_000_000
 """A contact is shown no longer than this after the tactile frame that showed it."""

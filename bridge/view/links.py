@@ -1,7 +1,7 @@
 """The links of an arm as its URDF shows them: meshes that are found beside it, and plain solids.
 
 Meshes (STL, DAE, OBJ) are read by trimesh (extra `view`). Where a link has nothing to show, or one of its
-meshes is missing or cannot be read, the simple link of `canprobe.bridge.view.bodies` is drawn, and a line says so.
+meshes is missing or cannot be read, the simple link of `canprobe.lab.bridge.view.bodies` is drawn, and a line says so.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from canprobe.bridge.database import need
-from canprobe.bridge.view.bodies import WHITE, Part, arm_parts
-from canprobe.bridge.view.meshes import Array, Mesh
+from canprobe.cell.scene.geometry import transform
+from canprobe.cell.scene.hardware import ArmSettings
 from canprobe.errors import PlanError
-from canprobe.robot.chain import Chain
-from canprobe.robot.urdf import Visual, find_mesh, visuals_of
-from canprobe.scene.geometry import transform
-from canprobe.scene.hardware import ArmSettings
+from canprobe.lab.bridge.database import need
+from canprobe.lab.bridge.view.bodies import WHITE, Part, arm_parts
+from canprobe.lab.bridge.view.meshes import Array, Mesh
+from canprobe.mechanics.robot.chain import Chain
+from canprobe.mechanics.robot.urdf import Visual, find_mesh, visuals_of
 
 _NAMED = 3
 """Missing meshes that a line names."""

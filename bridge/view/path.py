@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from canprobe.bridge.view.meshes import Array, Colours, scale
-from canprobe.tasks.probing import Phase
-from canprobe.touch.shapes import PlacedShape
+from canprobe.cell.tasks.probing import Phase
+from canprobe.lab.bridge.view.meshes import Array, Colours, scale
+from canprobe.mechanics.touch.shapes import PlacedShape
 
 # The contact's path as coloured segments: thinned, lifted off the surface, and cut into chunks by time.
 

@@ -12,18 +12,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.bridge.sample import ContactFrame, SurfacePatch
-from canprobe.bridge.view.instants import Answer, Moment, judge
-from canprobe.bridge.view.meshes import Array
-from canprobe.cell.log import joint_positions
+from canprobe.cell.master.log import joint_positions
+from canprobe.cell.results.run_files import LOG, TACTILE, read_log, read_scene, read_summary, read_tactile
+from canprobe.cell.scene.load import SAVED_AS
+from canprobe.cell.scene.model import Scene
+from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.scene.setup import Setup
+from canprobe.cell.tasks.probing import Phase
 from canprobe.errors import UsageError
-from canprobe.results.run_files import LOG, TACTILE, read_log, read_scene, read_summary, read_tactile
-from canprobe.scene.load import SAVED_AS
-from canprobe.scene.model import Scene
-from canprobe.scene.resolve import resolve
-from canprobe.scene.setup import Setup
-from canprobe.tasks.probing import Phase
-from canprobe.touch.linear_algebra import tangent_rotation
+from canprobe.lab.bridge.sample import ContactFrame, SurfacePatch
+from canprobe.lab.bridge.view.instants import Answer, Moment, judge
+from canprobe.lab.bridge.view.meshes import Array
+from canprobe.mechanics.touch.linear_algebra import tangent_rotation
 
 
 @dataclass(frozen=True, eq=False)  # without slots: `cached_property`

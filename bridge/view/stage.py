@@ -15,9 +15,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.bridge.database import need
-from canprobe.bridge.sample import quaternion_of
-from canprobe.bridge.view.bodies import (
+from canprobe.cell.scene.geometry import T_flange_probe, true_object
+from canprobe.cell.scene.model import Scene
+from canprobe.cell.scene.resolve import resolve
+from canprobe.errors import InterfaceError
+from canprobe.fieldbus.bus.port import MonotonicClock
+from canprobe.lab.bridge.database import need
+from canprobe.lab.bridge.sample import quaternion_of
+from canprobe.lab.bridge.view.bodies import (
     link_frames,
     object_lines,
     object_mesh,
@@ -27,19 +32,14 @@ from canprobe.bridge.view.bodies import (
     taxel_poses,
     tile,
 )
-from canprobe.bridge.view.instants import Curves, Moment
-from canprobe.bridge.view.links import arm_links
-from canprobe.bridge.view.meshes import Array, Mesh, linear_light
-from canprobe.bridge.view.path import PATH, DeviationScale
-from canprobe.bus.port import MonotonicClock
-from canprobe.errors import InterfaceError
-from canprobe.robot.model import ArmModel
-from canprobe.scene.geometry import T_flange_probe, true_object
-from canprobe.scene.model import Scene
-from canprobe.scene.resolve import resolve
-from canprobe.touch.pad import Pad
-from canprobe.touch.patch.array_calibration import NOMINAL
-from canprobe.touch.shapes import PlacedShape
+from canprobe.lab.bridge.view.instants import Curves, Moment
+from canprobe.lab.bridge.view.links import arm_links
+from canprobe.lab.bridge.view.meshes import Array, Mesh, linear_light
+from canprobe.lab.bridge.view.path import PATH, DeviationScale
+from canprobe.mechanics.robot.model import ArmModel
+from canprobe.mechanics.touch.pad import Pad
+from canprobe.mechanics.touch.patch.array_calibration import NOMINAL
+from canprobe.mechanics.touch.shapes import PlacedShape
 
 # The scene in the browser: arm, probe, object, contact, force, patch and path as viser's nodes.
 

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from canprobe.bridge.view.instants import Answer
-from canprobe.bridge.view.meshes import Array
-from canprobe.bridge.view.path import DeviationScale, Parts
-from canprobe.touch.blend import REACH_M
-from canprobe.touch.meshing import Mesh
-from canprobe.touch.surface_map import SPACING_M, LocalPatch, SurfaceMap
+from canprobe.lab.bridge.view.instants import Answer
+from canprobe.lab.bridge.view.meshes import Array
+from canprobe.lab.bridge.view.path import DeviationScale, Parts
+from canprobe.mechanics.touch.blend import REACH_M
+from canprobe.mechanics.touch.meshing import Mesh
+from canprobe.mechanics.touch.surface_map import SPACING_M, LocalPatch, SurfaceMap
 
 CELL_M = 1e-3
 """Size of its triangles."""

@@ -19,12 +19,12 @@ import traceback
 from collections.abc import Sequence
 
 import canprobe
-from canprobe.bus.scheduling import BLAS_THREADS, Terminated
+from canprobe.cell.session.terminal import Report
 from canprobe.cli.completion import complete
 from canprobe.cli.output import termination_interrupts
 from canprobe.cli.parser import Parser, did_you_mean
 from canprobe.errors import EXTRA_OF, CanprobeError, install_line
-from canprobe.session.terminal import Report
+from canprobe.fieldbus.bus.real.processor import BLAS_THREADS, Terminated
 
 COMMANDS = (
     "scenes",

@@ -13,10 +13,10 @@ import sys
 from collections.abc import Callable
 from datetime import date
 
+from canprobe.cell.session.terminal import Report
 from canprobe.cli.output import print_json
 from canprobe.cli.parser import BUS, Parser, add_options, add_verbosity, folder_path, seed, target_of, word
 from canprobe.errors import install_line
-from canprobe.session.terminal import Report
 
 HELP = "calibrate a tactile array by touching known things"
 EXAMPLE = """\
@@ -72,11 +72,11 @@ def add_arguments(parser: Parser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Touch, fit, print, and write calibration.toml, calibration.png and the recorded buses."""
     from canprobe import api
-    from canprobe.bus.disk import write_text
-    from canprobe.results.array_report import as_document, calibration_text, draw_calibration
-    from canprobe.scene.calibrations import dump_calibration
-    from canprobe.scene.load import load_scene, read_cell
-    from canprobe.session.array_calibration import Request, calibrate
+    from canprobe.cell.results.array_report import as_document, calibration_text, draw_calibration
+    from canprobe.cell.scene.calibrations import dump_calibration
+    from canprobe.cell.scene.load import load_scene, read_cell
+    from canprobe.cell.session.array_calibration import Request, calibrate
+    from canprobe.fieldbus.bus.candump import write_text
 
     today = date.today().isoformat()
     out = args.out or api.timed_folder(f"calibrate-array-{read_cell(args.cell).cell.name}")

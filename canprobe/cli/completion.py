@@ -52,7 +52,7 @@ class _Completer:
 
 def _packaged(kind: str) -> Callable[[], Iterable[str]]:
     def names() -> Iterable[str]:
-        from canprobe.scene.load import packaged_files
+        from canprobe.cell.scene.load import packaged_files
 
         return packaged_files(kind)
 
@@ -60,25 +60,25 @@ def _packaged(kind: str) -> Callable[[], Iterable[str]]:
 
 
 def _buses() -> Iterable[str]:
-    from canprobe.bus.interfaces import interface_names
+    from canprobe.fieldbus.bus.real.python_can import interface_names
 
     return ("lockstep", "direct", "config", *interface_names())
 
 
 def _bridges() -> Iterable[str]:
-    from canprobe.planning.bridges import BRIDGES
+    from canprobe.cell.planning.bridges import BRIDGES
 
     return BRIDGES
 
 
 def _studies() -> Iterable[str]:
-    from canprobe.studies.sweep import STUDIES
+    from canprobe.lab.studies.sweep import STUDIES
 
     return STUDIES
 
 
 def _eds() -> Iterable[str]:
-    from canprobe.eds.packaged import eds_names
+    from canprobe.fieldbus.eds.packaged import eds_names
 
     return eds_names()
 

@@ -9,8 +9,8 @@ from canprobe.cli.output import print_json
 from canprobe.cli.parser import Parser, add_options, whole
 
 if TYPE_CHECKING:
-    from canprobe.eds.reading import Reading
-    from canprobe.eds.sections import Fault
+    from canprobe.fieldbus.eds.reading import Reading
+    from canprobe.fieldbus.eds.sections import Fault
 
 HELP = "list, locate or check EDS files"
 EXAMPLE = """\
@@ -66,7 +66,7 @@ def add_arguments(parser: Parser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the names of the files, or the path of one."""
-    from canprobe.eds.packaged import eds_names, eds_path
+    from canprobe.fieldbus.eds.packaged import eds_names, eds_path
 
     if args.action == "path":
         print(eds_path(args.eds))
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
 
 def run_check(args: argparse.Namespace) -> int:
     """Print what is wrong with a file; status 2 when it cannot be served."""
-    from canprobe.eds.packaged import check_eds
+    from canprobe.fieldbus.eds.packaged import check_eds
 
     reading = check_eds(args.file, args.node_id)
     if args.json:

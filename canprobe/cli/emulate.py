@@ -30,8 +30,8 @@ from canprobe.cli.parser import (
 from canprobe.errors import UsageError
 
 if TYPE_CHECKING:
-    from canprobe.scene.model import Scene
-    from canprobe.session.target import Target
+    from canprobe.cell.scene.model import Scene
+    from canprobe.cell.session.target import Target
 
 HELP = "serve emulated nodes on a bus"
 EXAMPLE = """\
@@ -106,7 +106,7 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("emulate: name a SCENE, or else --eds FILE --node-id N, or --bus-yml FILE")
     serve = _scene_server(args) if args.scene is not None else _eds_server(args)
 
-    from canprobe.session.children import end_with_parent
+    from canprobe.cell.session.children import end_with_parent
 
     with left_by_ctrl_c():
         if args.parent is not None:
@@ -168,7 +168,7 @@ def _eds_server(args: argparse.Namespace) -> Callable[[], None]:
 def _eds_files(args: argparse.Namespace) -> list[tuple[str | Path, int]]:
     """(file, node id) of each node without a scene."""
     if args.bus_yml is not None:
-        from canprobe.bridge.export import read_bus_yml
+        from canprobe.lab.bridge.export import read_bus_yml
 
         if args.node_id or args.serial:
             raise UsageError("emulate: --node-id and --serial belong to --eds; a bus.yml has its own")

@@ -21,8 +21,8 @@ from canprobe.errors import PlanError, UsageError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from canprobe.robot.model import ArmModel, Joint
-    from canprobe.robot.urdf import UrdfArm
+    from canprobe.mechanics.robot.model import ArmModel, Joint
+    from canprobe.mechanics.robot.urdf import UrdfArm
 
 HELP = "write a cell file and a first scene for your own arm"
 EXAMPLE = """\
@@ -56,9 +56,9 @@ def add_arguments(parser: Parser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write cell.toml and first.toml, with the files that they name."""
-    from canprobe.bus.disk import write_text, writing
-    from canprobe.robot.urdf import with_meshes_found
-    from canprobe.scene.load import written_by_line
+    from canprobe.cell.scene.load import written_by_line
+    from canprobe.fieldbus.bus.candump import write_text, writing
+    from canprobe.mechanics.robot.urdf import with_meshes_found
 
     folder: Path = args.folder
     for name in ("cell.toml", "first.toml"):
@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
 @contextlib.contextmanager
 def _folder_or_nothing(folder: Path) -> Iterator[None]:
     """The folder for the files that the block writes; where the block fails, neither it nor they are left."""
-    from canprobe.bus.disk import make_folder
+    from canprobe.fieldbus.bus.candump import make_folder
 
     new = [path for path in (folder, *folder.parents) if not path.exists()]
     make_folder(folder)
@@ -143,7 +143,7 @@ sdo_s = 0.5
 
 
 def _urdf_cell(args: argparse.Namespace) -> str:
-    from canprobe.robot.urdf import from_urdf
+    from canprobe.mechanics.robot.urdf import from_urdf
 
     found = from_urdf(args.urdf, args.base, args.tip)
     for warning in found.warnings:
@@ -171,8 +171,8 @@ def _common_bitrate(eds: Sequence[Path]) -> int:
     Raises:
         UsageError: they have none in common.
     """
-    from canprobe.eds.description import Description
-    from canprobe.eds.packaged import check_eds
+    from canprobe.fieldbus.eds.description import Description
+    from canprobe.fieldbus.eds.packaged import check_eds
 
     rates = {str(path): set(Description(check_eds(path).dictionary).bitrates) for path in dict.fromkeys(eds)}
     rates[_ARRAY_EDS] = set(Description(check_eds(_ARRAY_EDS).dictionary).bitrates)
@@ -194,7 +194,7 @@ def _common_eds(eds: Sequence[Path], joints: int) -> str:
 
 def _joint_section(number: int, joint: Joint, start: float, eds: Sequence[Path]) -> str:
     """One joint; its range and speed stand in the URDF."""
-    from canprobe.scene.load import toml_key
+    from canprobe.cell.scene.load import toml_key
 
     lines = [f"[joints.{toml_key(joint.name)}]"]
     if joint.prismatic:
@@ -227,7 +227,7 @@ def _range(joint: Joint) -> tuple[float, float]:
 
 def _dh_cell(args: argparse.Namespace) -> str:
     """The packaged PUMA 560 as a template."""
-    from canprobe.scene.load import packaged_files
+    from canprobe.cell.scene.load import packaged_files
 
     text = packaged_files("cells")["puma560"].read_text(encoding="utf-8")
     name = _cell_name(args.folder)
@@ -256,7 +256,7 @@ def _rounded(found: UrdfArm) -> tuple[list[float], float]:
     """A posture from which the probe points down as far as the arm can, in deg and mm; its tilt from there, rad."""
     import numpy as np
 
-    from canprobe.robot.chain import forward_jacobian, tool_z_offset
+    from canprobe.mechanics.robot.chain import forward_jacobian, tool_z_offset
 
     tool, rng = tool_z_offset(80.0), np.random.default_rng(0)
     low, high = np.array([_range(joint) for joint in found.joints]).T
@@ -276,10 +276,10 @@ def _rounded(found: UrdfArm) -> tuple[list[float], float]:
 
 def _first_scene(folder: Path, cell: str) -> tuple[str, str | None]:
     """Write the cell at the fastest rate at which it can do a scan, else free motion; the scene, and why no scan."""
-    from canprobe.bus.disk import write_text
-    from canprobe.planning.make import make_plan
-    from canprobe.scene.load import parse_scene
-    from canprobe.scene.resolve import resolve
+    from canprobe.cell.planning.make import make_plan
+    from canprobe.cell.scene.load import parse_scene
+    from canprobe.cell.scene.resolve import resolve
+    from canprobe.fieldbus.bus.candump import write_text
 
     write_text(folder / "cell.toml", _at_rate(cell, _RATES_HZ[0]))
     refused: dict[float, str] = {}
@@ -318,8 +318,8 @@ _FREE = _FIRST + '\n[task]\nkind = "free"\nduration_s = 5\n'
 
 def _scans(folder: Path) -> tuple[str, ...]:
     """Scans of the cell in a folder, from demanding to plain: the same at every rate."""
-    from canprobe.scene.load import parse_scene
-    from canprobe.scene.resolve import resolve
+    from canprobe.cell.scene.load import parse_scene
+    from canprobe.cell.scene.resolve import resolve
 
     setup = resolve(parse_scene(_FREE, folder=folder))
     assert setup.arm is not None
@@ -331,7 +331,7 @@ def _touch(model: ArmModel, q: NDArray[Any], T_flange_probe: NDArray[Any], speed
     """A straight scan over a plane that faces the pole of the probe in the start posture."""
     import numpy as np
 
-    from canprobe.robot.chain import forward
+    from canprobe.mechanics.robot.chain import forward
 
     T = forward(model.chain, q) @ T_flange_probe
     pole, place = T[:3, 2], 1e3 * T[:3, 3]

@@ -12,8 +12,8 @@ import sys
 import textwrap
 from collections.abc import Iterator, Sequence
 
-from canprobe.bus.scheduling import TERMINATIONS, Terminated, raise_terminated
-from canprobe.session.terminal import MARKS, NARROW, columns, painted
+from canprobe.cell.session.terminal import MARKS, NARROW, columns, painted
+from canprobe.fieldbus.bus.real.processor import TERMINATIONS, Terminated, raise_terminated
 
 # Results, on stdout.
 

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from canprobe.errors import UsageError
 
 if TYPE_CHECKING:
-    from canprobe.bus.interfaces import ConfiguredBus
-    from canprobe.scene.model import Scene
-    from canprobe.session.target import Target
+    from canprobe.cell.scene.model import Scene
+    from canprobe.cell.session.target import Target
+    from canprobe.fieldbus.bus.real.python_can import ConfiguredBus
 
 
 # One clear line for a wrong command line.
@@ -259,8 +259,8 @@ def scene_of(args: argparse.Namespace) -> Scene:
     Raises:
         UsageError: --patient is given and a node is real, or as `target_of`.
     """
-    from canprobe.scene.load import load_scene
-    from canprobe.session.target import VIRTUAL
+    from canprobe.cell.scene.load import load_scene
+    from canprobe.cell.session.target import VIRTUAL
 
     scene = loaded(args)
     if args.patient:
@@ -279,7 +279,7 @@ def scene_of(args: argparse.Namespace) -> Scene:
 
 def loaded(args: argparse.Namespace) -> Scene:
     """The scene of a command with `add_scene`, as --cell, --set and --realtime change it."""
-    from canprobe.scene.load import load_scene
+    from canprobe.cell.scene.load import load_scene
 
     overrides = dict(args.set)
     if args.cell is not None:
@@ -297,7 +297,7 @@ def target_of(args: argparse.Namespace, scene: Scene) -> Target:
     Raises:
         UsageError: when `--channel NAME=CH` names no channel of the scene, or nothing is configured.
     """
-    from canprobe.session.target import LOCKSTEP, Target
+    from canprobe.cell.session.target import LOCKSTEP, Target
 
     (main, *_), bitrate = scene.channels, args.bitrate
     channels = _channels(args.channel or [], scene.channels)
@@ -325,7 +325,7 @@ def real_target(
     Raises:
         UsageError: nothing names a channel, or nothing is configured and the command line asks for what is.
     """
-    from canprobe.session.target import Target
+    from canprobe.cell.session.target import Target
 
     interface = bus or "socketcan"
     if bus in (None, CONFIG) and (found := _configured(bus)) is not None:
@@ -336,7 +336,7 @@ def real_target(
 
 
 def _configured(bus: str | None) -> ConfiguredBus | None:
-    from canprobe.bus.interfaces import configured_bus
+    from canprobe.fieldbus.bus.real.python_can import configured_bus
 
     found = configured_bus()
     if found is None and bus == CONFIG:

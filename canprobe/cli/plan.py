@@ -11,13 +11,13 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from canprobe.cell.session.terminal import columns
 from canprobe.cli.output import print_json, say
 from canprobe.cli.parser import Parser, add_options, add_scene, loaded
 from canprobe.errors import CanprobeError, PlanError, UsageError, install_line
-from canprobe.session.terminal import columns
 
 if TYPE_CHECKING:
-    from canprobe.planning.model import Plan
+    from canprobe.cell.planning.model import Plan
 
 HELP = "show what a scene sends, needs and leaves out"
 EXAMPLE = """\
@@ -72,7 +72,7 @@ def add_arguments(parser: Parser) -> None:
 
 def _draw(plan: Plan, path: Path) -> Path:
     try:
-        from canprobe.results.figures import draw_plan
+        from canprobe.cell.results.figures import draw_plan
     except ImportError as error:
         raise UsageError(f"--figure needs matplotlib: {install_line('study')}") from error
     if not path.suffix:
@@ -86,10 +86,10 @@ def _draw(plan: Plan, path: Path) -> Path:
 
 def run(args: argparse.Namespace) -> int:
     """Print the plan, or the files that were exported; a scene that does not fit raises PlanError with every reason."""
-    from canprobe.planning.choices import opened
-    from canprobe.planning.make import make_plan
-    from canprobe.planning.report import plan_dict, plan_text, refused_dict
-    from canprobe.scene.resolve import resolve
+    from canprobe.cell.planning.choices import opened
+    from canprobe.cell.planning.make import make_plan
+    from canprobe.cell.planning.report import plan_dict, plan_text, refused_dict
+    from canprobe.cell.scene.resolve import resolve
 
     if args.measured is not None and (args.export or args.figure is not None):
         raise UsageError("plan: --measured sets a log beside the plan and writes no --export or --figure")
@@ -108,7 +108,7 @@ def run(args: argparse.Namespace) -> int:
         return _compare(plan, args.measured, args.json)
     files = [] if args.figure is None else [_draw(plan, args.figure)]
     if args.export:
-        from canprobe.bridge.export import export_plan
+        from canprobe.lab.bridge.export import export_plan
 
         files += export_plan(plan, args.out, args.export)
     if args.json:
@@ -129,7 +129,7 @@ def _rehearse(plan: Plan) -> str:
     Raises:
         PlanError: it did not come to its end.
     """
-    from canprobe.session.session import run_beginning
+    from canprobe.cell.session.session import run_beginning
 
     what = f'{len(plan.nodes)} nodes brought up, then {{time:.2f}} s of task.kind = "{plan.setup.kind}"'
     try:
@@ -143,7 +143,7 @@ def _rehearse(plan: Plan) -> str:
 
 def _scene_beside(log: Path) -> str | None:
     """Name of the scene that ran, where the log is a run's."""
-    from canprobe.recorded.reestimate import scene_of
+    from canprobe.cell.recorded.reestimate import scene_of
 
     try:
         return scene_of(log, log if log.is_dir() else log.parent, None).name
@@ -153,7 +153,7 @@ def _scene_beside(log: Path) -> str | None:
 
 def _compare(plan: Plan, log: Path, as_json: bool) -> int:
     """Print what was measured on each bus; 3 where it is not what was planned."""
-    from canprobe.results.summary import measure_traffic
+    from canprobe.cell.results.summary import measure_traffic
 
     if (ran := _scene_beside(log)) not in (None, plan.scene.name):
         say(f"canprobe: {log} is a run of scene {ran}, set beside the plan of {plan.scene.name}")

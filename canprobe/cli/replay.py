@@ -41,7 +41,7 @@ def add_arguments(parser: Parser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Replay the log and print the estimates."""
-    from canprobe.recorded import reestimate as recorded
+    from canprobe.cell.recorded import reestimate as recorded
 
     if args.bridge:
         return _run_into(args)
@@ -57,8 +57,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _run_into(args: argparse.Namespace) -> int:
     """Feed the log to bridges; print the estimates and the state of the bridges."""
-    from canprobe.recorded.into_bridges import replay_into
-    from canprobe.results.summary import bridge_lines
+    from canprobe.cell.recorded.into_bridges import replay_into
+    from canprobe.cell.results.summary import bridge_lines
 
     replayed = replay_into(args.log, args.bridge, scene=args.scene, method=args.method, say=args.report.say)
     if replayed.result is not None and args.out is not None:

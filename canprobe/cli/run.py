@@ -40,12 +40,12 @@ def run(args: argparse.Namespace) -> int:
     """Run the scene; the summary goes to stdout, the progress to stderr. A run that was stopped raises."""
     scene = scene_of(args)
     if args.tool is not None:
-        from canprobe.scene.geometry import with_tool
+        from canprobe.cell.scene.geometry import with_tool
 
         scene = with_tool(scene, args.tool)
 
     from canprobe import api
-    from canprobe.planning.bridges import BRIDGES
+    from canprobe.cell.planning.bridges import BRIDGES
 
     folder = api.results_folder(scene, args.out)
     try:
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _expected(args: argparse.Namespace) -> str:
     """A line with the figures to expect, where a packaged scene ran as it is."""
-    from canprobe.results.expected import expected_text, read_expected, seeds_text
+    from canprobe.cell.results.expected import expected_text, read_expected, seeds_text
 
     read = read_expected()
     figures = read["scenes"].get(args.scene)

@@ -30,7 +30,7 @@ from canprobe.cli.parser import (
 from canprobe.errors import UsageError
 
 if TYPE_CHECKING:
-    from canprobe.cell.commission import Commissioned
+    from canprobe.cell.master.commission import Commissioned
 
 HELP = "list the nodes on a bus"
 EXAMPLE = """\
@@ -92,7 +92,7 @@ def assignment(text: str) -> Assignment:
 
 def run(args: argparse.Namespace) -> int:
     """Print one row a node."""
-    from canprobe.session.target import refuse_virtual
+    from canprobe.cell.session.target import refuse_virtual
 
     refuse_virtual(args.bus, "scan")
     _check(args)

@@ -28,7 +28,7 @@ def add_arguments(parser: Parser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print name, title and figures of every packaged scene, and the folder of their files."""
-    from canprobe.results.expected import read_expected
+    from canprobe.cell.results.expected import read_expected
 
     return print_packaged({"scene": "copy one to change it"}, args, read_expected())
 
@@ -43,8 +43,8 @@ def print_packaged(
         args: of the command.
         expected: their figures, as `read_expected` has them.
     """
-    from canprobe.results.expected import SHORT, expected_text, seeds_text
-    from canprobe.scene.load import packaged_arrays, packaged_cells, packaged_files, packaged_scenes
+    from canprobe.cell.results.expected import SHORT, expected_text, seeds_text
+    from canprobe.cell.scene.load import packaged_arrays, packaged_cells, packaged_files, packaged_scenes
 
     titles = {"scene": packaged_scenes, "cell": packaged_cells, "array": packaged_arrays}
     document: list[dict[str, Any]] = []

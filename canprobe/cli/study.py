@@ -9,9 +9,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from canprobe.bus.scheduling import interrupts_repeated
 from canprobe.cli.output import print_json, print_table
 from canprobe.cli.parser import Parser, add_options, add_verbosity, did_you_mean, whole
+from canprobe.fieldbus.bus.real.processor import interrupts_repeated
 
 HELP = "measure accuracy, limits, faults and timing"
 EXAMPLE = """\
@@ -46,7 +46,7 @@ def add_arguments(parser: Parser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run a study, print its table, write its files."""
-    from canprobe.studies.sweep import STUDIES, run_study
+    from canprobe.lab.studies.sweep import STUDIES, run_study
 
     if args.list:
         if args.json:
@@ -64,8 +64,8 @@ def run(args: argparse.Namespace) -> int:
         args.complain("--seed: the runs on vcan0 depend on the machine's timing and cannot be repeated from a seed")
     if args.seed is not None:
         return _replay(args)
-    from canprobe.studies.harness import as_document, text_of, write_study
-    from canprobe.studies.sweep import open_sweep
+    from canprobe.lab.studies.harness import as_document, text_of, write_study
+    from canprobe.lab.studies.sweep import open_sweep
 
     out = args.out or Path("runs") / f"study-{args.name}"
     options = {"workers": args.workers, "dask": args.dask, "fresh": args.fresh}
@@ -91,7 +91,7 @@ def _replay(args: argparse.Namespace) -> int:
     """Carry out one numbered run of a study again; status 1 where it fails."""
     if args.name != "faults":
         args.complain(f"--seed: expected study faults, got {args.name}")
-    from canprobe.studies.faults import replay
+    from canprobe.lab.studies.faults import replay
 
     outcome = replay(args.seed, args.report.say)
     if args.json:

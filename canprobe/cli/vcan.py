@@ -45,6 +45,6 @@ def run(args: argparse.Namespace) -> int:
     """Run the command; return its exit status."""
     command = args.command[1:] if args.command[:1] == ["--"] else args.command
 
-    from canprobe.vcan.launch import run_with_vcan
+    from canprobe.fieldbus.vcan.launch import run_with_vcan
 
     return run_with_vcan(command, timeout_s=args.timeout, install=args.install, realtime=args.realtime)

@@ -14,9 +14,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from canprobe.bus.scheduling import interrupts_held, interrupts_repeated
 from canprobe.cli.output import left_by_ctrl_c
 from canprobe.cli.parser import BUS, Parser, add_options, add_verbosity, target_of, whole
+from canprobe.fieldbus.bus.real.processor import interrupts_held, interrupts_repeated
 
 if TYPE_CHECKING:
     from canprobe.api import AnyObserver
@@ -51,7 +51,7 @@ def add_arguments(parser: Parser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Show it until Ctrl-C, or write the file."""
-    from canprobe.planning.bridges import check_bridges
+    from canprobe.cell.planning.bridges import check_bridges
 
     check_bridges(["view"], "")
     folder, browser = Path(args.what), _Browser(args.port, args.report.say, quiet=args.no_open)
@@ -59,8 +59,8 @@ def run(args: argparse.Namespace) -> int:
     with leave:
         if _is_scene(args.what):
             folder = _run_scene(args, browser)
-        from canprobe.bridge.view.browser import serve_run, write_page
-        from canprobe.bridge.view.recorded import read_run
+        from canprobe.lab.bridge.view.browser import serve_run, write_page
+        from canprobe.lab.bridge.view.recorded import read_run
 
         recorded = read_run(folder)
         if args.html is not None:
@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _is_scene(what: str) -> bool:
     """A packaged scene's name goes before a folder that is called like it; `./cylinder` is the folder."""
-    from canprobe.scene.load import packaged_files
+    from canprobe.cell.scene.load import packaged_files
 
     return not Path(what).is_dir() or what in packaged_files("scenes")
 
@@ -91,10 +91,10 @@ def _run_scene(args: argparse.Namespace, browser: _Browser) -> Path:
     from dataclasses import replace
 
     from canprobe import api
+    from canprobe.cell.scene.load import load_scene, packaged_files
+    from canprobe.cell.scene.model import BridgeSettings
+    from canprobe.cell.session.target import VIRTUAL
     from canprobe.errors import SceneError
-    from canprobe.scene.load import load_scene, packaged_files
-    from canprobe.scene.model import BridgeSettings
-    from canprobe.session.target import VIRTUAL
 
     try:
         scene = load_scene(args.what, dict(args.set))
@@ -155,8 +155,8 @@ class _Browser:
 
 def _paced() -> AnyObserver:
     """An observer that lets virtual time pass no faster than the clock on the wall."""
-    from canprobe.bus.port import MonotonicClock
-    from canprobe.cell.cycle import Observation
+    from canprobe.cell.master.cycle import Observation
+    from canprobe.fieldbus.bus.port import MonotonicClock
 
     clock = MonotonicClock()
     offset_ns: int | None = None

@@ -7,9 +7,9 @@ import gymnasium
 import numpy as np
 import pytest
 
-import canprobe.gym  # noqa: F401 - it registers the environment
+import canprobe.lab.gym  # noqa: F401 - it registers the environment
 
-NAME = "canprobe.gym:canprobe/TouchScan-v0"
+NAME = "canprobe.lab.gym:canprobe/TouchScan-v0"
 LONG = {"objects": None, "task.duration_s": 600.0, "object.radius_mm": 60}
 """An episode that does not end meanwhile."""
 TURN = np.array([[0.4 * np.cos(0.3 * step), 0.4 * np.sin(0.3 * step), 0.0] for step in range(600)], dtype=np.float32)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from canprobe.touch.contact import ContactSample
-from canprobe.touch.estimate.fit import make_estimator
-from canprobe.touch.surface import SurfaceMatrix
+from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.touch.estimate.fit import make_estimator
+from canprobe.mechanics.touch.surface import SurfaceMatrix
 
 SIGMA_POINT, SIGMA_NORMAL = 2e-5, 1e-3
 T, POLE = np.eye(4), np.array([0.0, 0.0, 0.04])

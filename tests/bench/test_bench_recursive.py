@@ -10,10 +10,10 @@ import itertools
 import numpy as np
 import pytest
 
-from canprobe.touch.contact import ContactSample
-from canprobe.touch.estimate.fit import make_estimator
-from canprobe.touch.estimate.noise import Correlation
-from canprobe.touch.surface import SurfaceMatrix
+from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.touch.estimate.fit import make_estimator
+from canprobe.mechanics.touch.estimate.noise import Correlation
+from canprobe.mechanics.touch.surface import SurfaceMatrix
 
 SIGMA_POINT, SIGMA_NORMAL = 2e-5, 1e-3
 CORRELATION = {"ml": None, "recursive": Correlation(1e-3, 0.8)}

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 from waiting import wait_for_size
 
-from canprobe.bus.disk import read_candump
-from canprobe.bus.socketcan import has_socketcan
 from canprobe.cli import main
-from canprobe.protocol.cia402 import POWERED_STATES, state_of
+from canprobe.fieldbus.bus.candump import read_candump
+from canprobe.fieldbus.bus.real.socketcan import has_socketcan
+from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
 
 ROOT = Path(__file__).parents[2]
 SCENES = ROOT / "canprobe" / "scenes"

@@ -8,7 +8,7 @@ import pytest
 from canprobe import api
 from canprobe.cli import main
 
-MESSY = Path(__file__).parents[1] / "eds" / "messy"
+MESSY = Path(__file__).parents[1] / "fieldbus" / "eds" / "messy"
 
 
 @pytest.mark.parametrize("name", ["puma260_joint", "tactile_array"])

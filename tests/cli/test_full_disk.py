@@ -13,10 +13,10 @@ from full_disk import room_for
 from undrawn import undrawn_run
 
 import canprobe
-from canprobe.bus.disk import read_candump, read_npz
 from canprobe.cli import main
 from canprobe.errors import ResultsError
-from canprobe.studies.harness import CellStore, Column, StudyResult, write_study
+from canprobe.fieldbus.bus.candump import read_candump, read_npz
+from canprobe.lab.studies.harness import CellStore, Column, StudyResult, write_study
 
 ROOM = 2000
 
@@ -67,7 +67,7 @@ def test_a_run_whose_frames_cannot_be_written_lets_go_and_ends_with_the_same_sta
 
 
 def test_a_table_leaves_no_part_of_a_file(scan, tmp_path):
-    table = pytest.importorskip("canprobe.results.files")
+    table = pytest.importorskip("canprobe.cell.results.files")
     pytest.importorskip("pyarrow")
     with room_for(ROOM), pytest.raises(ResultsError, match=r"log\.parquet: cannot be written"):
         table.write_parquet(read_npz(scan / "log.npz"), tmp_path / "log.parquet")

@@ -10,10 +10,10 @@ import tomllib
 import numpy as np
 import pytest
 
+from canprobe.cell.scene.load import load_scene
+from canprobe.cell.scene.resolve import resolve
 from canprobe.cli import main
-from canprobe.eds.packaged import eds_path
-from canprobe.scene.load import load_scene
-from canprobe.scene.resolve import resolve
+from canprobe.fieldbus.eds.packaged import eds_path
 
 URDF = """<robot name="lab">
   <link name="floor"/><link name="carriage"/><link name="l1"/><link name="l2"/><link name="l3"/><link name="l4"/>

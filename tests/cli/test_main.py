@@ -13,14 +13,14 @@ from command_lines import command_lines, parse
 
 import canprobe
 from canprobe import api
-from canprobe.bus.scheduling import Terminated
-from canprobe.cell.monitor import Monitor
+from canprobe.cell.master.monitor import Monitor
+from canprobe.cell.scene.load import load_scene, packaged_scenes
 from canprobe.cli import COMMANDS, main
 from canprobe.cli.output import print_json, termination_interrupts
 from canprobe.cli.parser import channel, node_ids
-from canprobe.eds.packaged import eds_path
 from canprobe.errors import InterfaceError, NodeError, PlanError, SafetyStop, SceneError, UsageError
-from canprobe.scene.load import load_scene, packaged_scenes
+from canprobe.fieldbus.bus.real.processor import Terminated
+from canprobe.fieldbus.eds.packaged import eds_path
 
 SUMMARY = {"scene": "free", "completed": True, "shape": {"method": None}}
 
@@ -168,7 +168,7 @@ def test_a_run_hears_sigterm_from_its_beginning(monkeypatch, tmp_path):
     def load(*_):
         signal.raise_signal(signal.SIGTERM)
 
-    monkeypatch.setattr("canprobe.scene.load.load_scene", load)
+    monkeypatch.setattr("canprobe.cell.scene.load.load_scene", load)
     assert main(["run", "free"]) == 143
 
 

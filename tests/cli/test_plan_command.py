@@ -7,9 +7,9 @@ import json
 import pytest
 
 import canprobe
+from canprobe.cell.planning.report import plan_text
+from canprobe.cell.scene.load import packaged_scenes
 from canprobe.cli import main
-from canprobe.planning.report import plan_text
-from canprobe.scene.load import packaged_scenes
 
 
 def test_a_rehearsal_says_what_was_done(capsys):

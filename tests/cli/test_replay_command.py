@@ -2,8 +2,8 @@
 
 import pytest
 
+from canprobe.cell.recorded import reestimate as recorded
 from canprobe.cli import main
-from canprobe.recorded import reestimate as recorded
 
 SYNCS = "".join(f"({k // 400:010d}.{k % 400 * 2500:06d}) can0 080#\n" for k in range(10))
 

@@ -7,11 +7,11 @@ import json
 import pytest
 
 import canprobe
-from canprobe.bus.lockstep import LockstepBus, Participant
-from canprobe.bus.port import VirtualClock
+from canprobe.cell.emulated.world import make_world
+from canprobe.cell.scene.load import scenes_folder
 from canprobe.cli import main
-from canprobe.emulator.world import make_world
-from canprobe.scene.load import scenes_folder
+from canprobe.fieldbus.bus.port import VirtualClock
+from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus, Participant
 
 CHANNEL = ("--bus", "socketcan", "--channel", "can0")
 DRIVE = "0xca5e:0x260:0x10000"
@@ -21,15 +21,15 @@ DRIVE = "0xca5e:0x260:0x10000"
 def bus(monkeypatch):
     """A bus that every command of the test opens."""
     bus = LockstepBus(VirtualClock())
-    monkeypatch.setattr("canprobe.bus.interfaces.open_port", lambda *_, **__: bus.port())
+    monkeypatch.setattr("canprobe.fieldbus.bus.real.python_can.open_port", lambda *_, **__: bus.port())
     return bus
 
 
 @pytest.fixture
 def serve(bus, monkeypatch):
     """Runs `canprobe emulate`; its nodes live on the bus afterwards."""
-    monkeypatch.setattr("canprobe.session.emulation.rehearse", lambda plan: None)
-    monkeypatch.setattr("canprobe.bus.scheduling.ask_for_processor", lambda: False)
+    monkeypatch.setattr("canprobe.cell.session.emulation.rehearse", lambda plan: None)
+    monkeypatch.setattr("canprobe.fieldbus.bus.real.processor.ask_for_processor", lambda: False)
     nodes = []
 
     def attach(buses, stop):
@@ -38,7 +38,7 @@ def serve(bus, monkeypatch):
         for node in nodes:
             bus.attach(node)
 
-    monkeypatch.setattr("canprobe.emulator.serve.serve", attach)
+    monkeypatch.setattr("canprobe.fieldbus.node.serve.serve", attach)
 
     def emulate(*words):
         assert main(["emulate", *words, "--channel", "can0"]) == 0
@@ -215,7 +215,7 @@ def test_what_is_stored_is_there_when_the_nodes_are_started_again(serve, tmp_pat
     assert stored["node_id"] == 9
     plan = canprobe.plan(canprobe.load_scene("free"))
     again = make_world(plan, (2,), without_id=(2,)).nodes[0]
-    from canprobe.emulator.serve import keep_in_file
+    from canprobe.fieldbus.node.serve import keep_in_file
 
     keep_in_file(again, tmp_path / "serial00000002.json")
     assert again.start(0) == [(0x709, b"\0")]

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import canprobe
+from canprobe.cell.scene.load import load_scene, parse_scene
 from canprobe.cli import main
 from canprobe.errors import PlanError
-from canprobe.scene.load import load_scene, parse_scene
 
 FREE = 'cell = "gantry"\n[scene]\nname = "s"\n[task]\nkind = "free"\n'
 

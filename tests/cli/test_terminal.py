@@ -10,11 +10,11 @@ import sys
 import pytest
 
 from canprobe import api
+from canprobe.cell.results.expected import expected_text, figures_of, read_expected
+from canprobe.cell.scene.load import packaged_scenes
+from canprobe.cell.session.terminal import Report, painted
 from canprobe.cli import COMMANDS, main
 from canprobe.cli.output import print_summary, print_table
-from canprobe.results.expected import expected_text, figures_of, read_expected
-from canprobe.scene.load import packaged_scenes
-from canprobe.session.terminal import Report, painted
 
 
 class Terminal(io.StringIO):

@@ -21,7 +21,7 @@ def watch_foxglove(address: str) -> None:
 
 def watch_ros2(domain: str) -> None:
     """Read every topic of a ROS 2 domain on this machine."""
-    dds = importlib.import_module("canprobe.bridge.ros2_dds")
+    dds = importlib.import_module("canprobe.lab.bridge.ros2_dds")
     node = dds.Ros2Node(int(domain), True, dds.Encoder())
     readers = [node.reader(topic) for topic in dds.TOPICS]
     print("there", flush=True)

@@ -23,17 +23,17 @@ from typing import Any
 
 import numpy as np
 
-from canprobe.bus.port import MonotonicClock
-from canprobe.bus.scheduling import garbage_collection_paused
-from canprobe.cell.cycle import Observation, Observers
-from canprobe.planning.bridges import BRIDGES
-from canprobe.planning.make import make_plan
-from canprobe.scene.load import load_scene
-from canprobe.scene.resolve import resolve
-from canprobe.session.children import Bridges
-from canprobe.session.session import Session, with_bridges
-from canprobe.studies.harness import Column, Row, StudyResult, as_document, measuring_facts, text_of
-from canprobe.tasks.from_plan import make_task
+from canprobe.cell.master.cycle import Observation, Observers
+from canprobe.cell.planning.bridges import BRIDGES
+from canprobe.cell.planning.make import make_plan
+from canprobe.cell.scene.load import load_scene
+from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.session.children import Bridges
+from canprobe.cell.session.session import Session, with_bridges
+from canprobe.cell.tasks.from_plan import make_task
+from canprobe.fieldbus.bus.port import MonotonicClock
+from canprobe.fieldbus.bus.real.processor import garbage_collection_paused
+from canprobe.lab.studies.harness import Column, Row, StudyResult, as_document, measuring_facts, text_of
 
 # What packages take on disk, with everything that they need and canprobe itself does not.
 
@@ -218,7 +218,7 @@ def _viewer(case: Case, bridges: Bridges) -> Iterator[None]:
 
 
 def _draw(rows: Sequence[Row], path: Path) -> None:
-    from canprobe.results.picture import BLUE, SKY, legend, picture
+    from canprobe.cell.results.picture import BLUE, SKY, legend, picture
 
     title = "Time that bridges add to a cycle of 2500 µs; watched: while a process takes every topic"
     with picture(path, title, 3.6) as figure:

@@ -27,13 +27,13 @@ import numpy as np
 from makes import MAKES, Entry, Make, changed, write_eds
 
 import canprobe
-from canprobe.eds.packaged import eds_path
+from canprobe.cell.scene.load import toml_key
+from canprobe.cell.scene.resolve import resolve
 from canprobe.errors import CanprobeError, PlanError
-from canprobe.robot.chain import Chain, forward, forward_jacobian, tool_z_offset
-from canprobe.robot.model import Joint
-from canprobe.robot.urdf import from_urdf
-from canprobe.scene.load import toml_key
-from canprobe.scene.resolve import resolve
+from canprobe.fieldbus.eds.packaged import eds_path
+from canprobe.mechanics.robot.chain import Chain, forward, forward_jacobian, tool_z_offset
+from canprobe.mechanics.robot.model import Joint
+from canprobe.mechanics.robot.urdf import from_urdf
 
 ARMS = (
     ("ur_description/urdf/ur3_robot.urdf", "base_link", "tool0"),

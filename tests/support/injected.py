@@ -7,16 +7,16 @@ from dataclasses import replace
 from wrapped import Wrapped
 
 import canprobe
-from canprobe.bus.port import ControllerState
-from canprobe.cell.conditions import BY_KEY
-from canprobe.cell.controller import Command, Controller
-from canprobe.cell.supervision import limits_of
-from canprobe.emulator.faults import Fault, FaultyNode
+from canprobe.cell.master.conditions import BY_KEY
+from canprobe.cell.master.controller import Command, Controller
+from canprobe.cell.master.supervision import limits_of
+from canprobe.cell.session.session import Session
+from canprobe.cell.tasks.from_plan import make_task
+from canprobe.cell.tasks.probing import Phase
 from canprobe.errors import CanprobeError
-from canprobe.protocol.cia402 import POWERED_STATES, state_of
-from canprobe.session.session import Session
-from canprobe.tasks.from_plan import make_task
-from canprobe.tasks.probing import Phase
+from canprobe.fieldbus.bus.port import ControllerState
+from canprobe.fieldbus.node.faults import Fault, FaultyNode
+from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
 
 LONG_NS = 10_000_000_000
 FREE_CYCLE = 80

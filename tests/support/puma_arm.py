@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from canprobe.scene.load import load_scene
-from canprobe.scene.resolve import resolve
+from canprobe.cell.scene.load import load_scene
+from canprobe.cell.scene.resolve import resolve
 
 
 def packaged_arm(cell):

@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 import canprobe
-from canprobe.eds.packaged import eds_path
+from canprobe.cell.scene.model import Scene
 from canprobe.errors import PlanError
-from canprobe.scene.model import Scene
+from canprobe.fieldbus.eds.packaged import eds_path
 
 
 def change(scene: Scene, /, **sections: dict[str, Any]) -> Scene:

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from canprobe.robot.chain import Chain, from_dh
-from canprobe.robot.model import ArmModel, Joint
+from canprobe.mechanics.robot.chain import Chain, from_dh
+from canprobe.mechanics.robot.model import ArmModel, Joint
 
 RIGHT = math.pi / 2
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from canprobe.scene.load import scenes_folder
+from canprobe.cell.scene.load import scenes_folder
 
 
 def write_slow_scene(

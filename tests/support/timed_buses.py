@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from canprobe.bus.lockstep import Participant
-from canprobe.bus.port import VirtualClock
-from canprobe.bus.timed import TimedBus
-from canprobe.protocol.frames import Frame
+from canprobe.fieldbus.bus.port import VirtualClock
+from canprobe.fieldbus.bus.virtual.lockstep import Participant
+from canprobe.fieldbus.bus.virtual.timed import TimedBus
+from canprobe.fieldbus.protocol.frames import Frame
 
 BIT = 1000  # ns, at 1 Mbit/s
 INTERMISSION = 3 * BIT

@@ -6,8 +6,8 @@ from dataclasses import replace
 from typing import Any
 
 import canprobe
-from canprobe.results.summary import RunResult
-from canprobe.scene.model import Scene
+from canprobe.cell.results.summary import RunResult
+from canprobe.cell.scene.model import Scene
 
 
 def undrawn(scene: Scene) -> Scene:

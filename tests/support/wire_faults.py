@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from canprobe.bus.lockstep import Participant
-from canprobe.protocol.frames import Frame
+from canprobe.fieldbus.bus.virtual.lockstep import Participant
+from canprobe.fieldbus.protocol.frames import Frame
 
 # A babbling idiot: a node that talks without being asked, as a broken controller does.
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from canprobe.cell.controller import Command, Controller, Measurement
-from canprobe.tasks.task import Task, TaskRecord, record_of
+from canprobe.cell.master.controller import Command, Controller, Measurement
+from canprobe.cell.tasks.task import Task, TaskRecord, record_of
 
 
 class Wrapped(Task):

@@ -15,10 +15,10 @@ import pytest
 from slow_scene import write_slow_scene
 from waiting import wait_until
 
-from canprobe.bus.disk import read_candump
-from canprobe.bus.port import MonotonicClock, TimedFrame
-from canprobe.bus.socketcan import SocketCanPort
-from canprobe.protocol.cia402 import POWERED_STATES, DriveState, state_of
+from canprobe.fieldbus.bus.candump import read_candump
+from canprobe.fieldbus.bus.port import MonotonicClock, TimedFrame
+from canprobe.fieldbus.bus.real.socketcan import SocketCanPort
+from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, DriveState, state_of
 
 ROOT = Path(__file__).parents[2]
 CHANNEL = "vcan0"

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import canprobe
-from canprobe.planning.measured import expected_messages
+from canprobe.cell.planning.measured import expected_messages
 
 pytestmark = pytest.mark.vcan
 NODES = (1, 2, 3, 4, 5, 6, 16)

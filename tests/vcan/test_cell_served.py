@@ -10,8 +10,8 @@ from typing import Any
 import canopen
 import pytest
 
-from canprobe.eds.packaged import eds_path
-from canprobe.protocol.cia402 import POWERED_STATES, state_of
+from canprobe.fieldbus.eds.packaged import eds_path
+from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
 
 pytestmark = pytest.mark.vcan
 NODES = (1, 2, 3, 4, 5, 6, 16)

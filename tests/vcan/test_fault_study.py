@@ -8,8 +8,8 @@ import pytest
 from rights import type_as_root
 
 from canprobe.cli import main
-from canprobe.protocol.frames import FOLLOWING_ERROR, REFERENCE_LIMIT
-from canprobe.studies.faults_vcan import ProcessFault
+from canprobe.fieldbus.protocol.frames import FOLLOWING_ERROR, REFERENCE_LIMIT
+from canprobe.lab.studies.faults_vcan import ProcessFault
 
 pytestmark = pytest.mark.vcan
 

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 from rights import type_as_root
 
-from canprobe.bus.port import MonotonicClock
-from canprobe.bus.socketcan import SocketCanPort
 from canprobe.errors import InterfaceError
+from canprobe.fieldbus.bus.port import MonotonicClock
+from canprobe.fieldbus.bus.real.socketcan import SocketCanPort
 
 pytestmark = pytest.mark.vcan
 CHANNEL = "vcanfd0"

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 import canprobe
-from canprobe.eds.packaged import eds_path
-from canprobe.robot.model import joints_to_units
+from canprobe.fieldbus.eds.packaged import eds_path
+from canprobe.mechanics.robot.model import joints_to_units
 
 pytestmark = pytest.mark.vcan
 ON_VCAN0 = ("--bus", "socketcan", "--channel", "vcan0")

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from canprobe.bus.socketcan import has_socketcan
-from canprobe.vcan.guest import PROGRAM, GuestError, GuestJob, missing_packages
-from canprobe.vcan.launch import supervise
+from canprobe.fieldbus.bus.real.socketcan import has_socketcan
+from canprobe.fieldbus.vcan.guest import PROGRAM, GuestError, GuestJob, missing_packages
+from canprobe.fieldbus.vcan.launch import supervise
 
 CANPROBE = (sys.executable, "-c", "import sys; from canprobe.cli import main; sys.exit(main())")
 ROOT = Path(__file__).parents[2]

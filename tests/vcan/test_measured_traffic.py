@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 import canprobe
-from canprobe.bus.disk import CandumpWriter
-from canprobe.bus.port import ERR_FLAG
+from canprobe.fieldbus.bus.candump import CandumpWriter
+from canprobe.fieldbus.bus.port import ERR_FLAG
 
 pytestmark = pytest.mark.vcan
 SECONDS = 4

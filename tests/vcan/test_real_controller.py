@@ -10,13 +10,13 @@ import pytest
 from serial_adapter import SerialAdapter
 from waiting import wait_until
 
-from canprobe.bus.interfaces import open_port
-from canprobe.bus.link import LinkState, read_link, setting_line
-from canprobe.bus.port import MonotonicClock, Reports
-from canprobe.bus.socketcan import SocketCanPort
+from canprobe.cell.session.terminal import Report
 from canprobe.cli import main
 from canprobe.errors import InterfaceError
-from canprobe.session.terminal import Report
+from canprobe.fieldbus.bus.port import MonotonicClock, Reports
+from canprobe.fieldbus.bus.real.link import LinkState, read_link, setting_line
+from canprobe.fieldbus.bus.real.python_can import open_port
+from canprobe.fieldbus.bus.real.socketcan import SocketCanPort
 
 pytestmark = pytest.mark.vcan
 MakeAdapter = Callable[..., SerialAdapter]
@@ -82,7 +82,7 @@ def test_what_is_full_while_nobody_acknowledges(
         port.send_batch(FRAMES)
     assert ("type: ip link set" in str(caught.value)) is (queue == 10)
     if not permitted:
-        monkeypatch.setattr("canprobe.bus.socketcan.drop_queued", lambda _: False)
+        monkeypatch.setattr("canprobe.fieldbus.bus.real.socketcan.drop_queued", lambda _: False)
     port.close()
     (line,) = told
     if not permitted:

@@ -14,9 +14,9 @@ from types import SimpleNamespace
 import pytest
 
 from canprobe.cli import main
-from canprobe.vcan import launch as vcan
-from canprobe.vcan.guest import GuestError, memory_folder
-from canprobe.vcan.launch import LocalJob, caught_signals, supervise
+from canprobe.fieldbus.vcan import launch as vcan
+from canprobe.fieldbus.vcan.guest import GuestError, memory_folder
+from canprobe.fieldbus.vcan.launch import LocalJob, caught_signals, supervise
 
 
 class Scripted:
@@ -54,7 +54,7 @@ def test_time_out_terminates_then_kills(monkeypatch: pytest.MonkeyPatch) -> None
     job = Scripted(dies_of=signal.SIGTERM)
     assert supervise(job, [], 0.0) == (124, True)
     assert job.told == [signal.SIGTERM]
-    monkeypatch.setattr("canprobe.vcan.launch._GRACE_S", 0.0)
+    monkeypatch.setattr("canprobe.fieldbus.vcan.launch._GRACE_S", 0.0)
     job = Scripted()
     assert supervise(job, [], 0.0) == (124, True)
     assert job.told == [signal.SIGTERM, "kill"]
@@ -107,7 +107,7 @@ def test_without_a_command_a_shell_takes_the_lines_of_standard_input() -> None:
     script = """if True:
         import contextlib, sys
         from canprobe.cli import main
-        from canprobe.vcan import launch
+        from canprobe.fieldbus.vcan import launch
         launch.has_socketcan = lambda: True
         launch._local_way = lambda: contextlib.nullcontext(("here", []))
         sys.exit(main(["vcan"]))"""
@@ -138,7 +138,7 @@ def test_the_guests_memory_is_where_it_can_be_written_or_it_says_why_not(
         free, flags = (300 if folder == str(small) else 800), (os.ST_NOEXEC if folder == str(barred) else 0)
         return SimpleNamespace(f_bavail=free, f_frsize=1 << 20, f_flag=flags)
 
-    monkeypatch.setattr("canprobe.vcan.guest.os.statvfs", statvfs)
+    monkeypatch.setattr("canprobe.fieldbus.vcan.guest.os.statvfs", statvfs)
     bad = [str(tmp_path / "absent"), str(taken), str(small), str(barred)]
     assert memory_folder([*bad, str(good)]) == (str(good), 800 << 20)
     with pytest.raises(GuestError) as caught:

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from rights import type_as_root
 
-from canprobe.bus.port import MonotonicClock
-from canprobe.bus.socketcan import SocketCanPort
+from canprobe.fieldbus.bus.port import MonotonicClock
+from canprobe.fieldbus.bus.real.socketcan import SocketCanPort
 
 pytestmark = pytest.mark.vcan
 SECOND = "vcan7"

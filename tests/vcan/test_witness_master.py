@@ -10,10 +10,10 @@ from typing import Any
 import canopen
 import pytest
 
-from canprobe.eds.packaged import eds_path, load_eds
+from canprobe.fieldbus.eds.packaged import eds_path, load_eds
 
 pytestmark = pytest.mark.vcan
-MESSY = Path(__file__).parents[1] / "eds" / "messy"
+MESSY = Path(__file__).parents[1] / "fieldbus" / "eds" / "messy"
 PACKAGED, VENDORS, DATA = 5, 20, 30
 PERIOD_S = 0.05
 BLOCK = bytes(random.Random(402).randbytes(3001))

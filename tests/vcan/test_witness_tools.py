@@ -14,8 +14,8 @@ from typing import Any, Self
 import pytest
 from slow_scene import write_slow_scene
 
-from canprobe.bus.disk import read_candump
-from canprobe.protocol.frame_bits import best_case_bits, worst_case_bits
+from canprobe.fieldbus.bus.candump import read_candump
+from canprobe.fieldbus.protocol.frame_bits import best_case_bits, worst_case_bits
 
 pytestmark = pytest.mark.vcan
 ON_VCAN0 = ("--bus", "socketcan", "--channel", "vcan0")

@@ -1,0 +1,255 @@
+"""Plan → the emulated side: one plant, its nodes, and the recorder of what is true; or a node from an EDS alone."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from canopen.objectdictionary import ObjectDictionary
+from numpy.typing import NDArray
+
+from canprobe.cell.emulated.array import make_tactile_node
+from canprobe.cell.emulated.raw_array import RawArray
+from canprobe.cell.planning.model import Plan, PlannedNode
+from canprobe.cell.planning.motion import parked_posture
+from canprobe.cell.planning.units import FEED, GEAR_RATIO, RESOLUTION
+from canprobe.cell.plant.config import PlantConfig, PressMotion
+from canprobe.cell.plant.plant import Plant
+from canprobe.cell.plant.taxels import TaxelConfig
+from canprobe.cell.scene.setup import Setup
+from canprobe.fieldbus.bus.virtual.lockstep import Participant
+from canprobe.fieldbus.drive.drive import make_drive_node
+from canprobe.fieldbus.drive.parameters import Delivery
+from canprobe.fieldbus.drive.reference import IdealAxis
+from canprobe.fieldbus.eds.packaged import FULL_SCALE, has_full_scale, load_eds
+from canprobe.fieldbus.eds.reading import is_drive
+from canprobe.fieldbus.node.dictionary import key_of
+from canprobe.fieldbus.node.slave_node import SlaveNode
+from canprobe.fieldbus.protocol.frames import SYNC_ID, UNCONFIGURED, Frame
+from canprobe.mechanics.robot.chain import Array, Chain, forward
+from canprobe.mechanics.touch.pad import Pad
+
+
+class TruthRecorder(Participant):
+    """A silent participant of the bus that notes the plant's state at every SYNC, beside what the nodes measure.
+
+    What is true in that state is computed afterwards: in real time it would make the nodes' next answers late.
+
+    Args:
+        plant: whose truth.
+
+    Attributes:
+        origin_ns: time on the bus's clock that is 0 in the column ``t_s``.
+    """
+
+    name = "truth recorder"
+    hears_every_sync = True
+    listens = frozenset((SYNC_ID,))
+
+    def __init__(self, plant: Plant) -> None:
+        self._plant = plant
+        self.origin_ns = 0
+        self._rows: list[tuple[int, int, Any]] = []
+
+    def receive(self, can_id: int, data: bytes, t_ns: int) -> list[Frame]:
+        """On a SYNC, take the state."""
+        if can_id == SYNC_ID:
+            self._plant.advance(t_ns)
+            self._rows.append((t_ns, data[0] if data else 0, self._plant.state()))
+        return []
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Columns, one row a SYNC: t_s (s), sync_count (0, 1, …), sync_counter (of the frame, 0 without), the truth."""
+        columns: dict[str, NDArray[Any]] = {
+            "t_s": np.array([t_ns - self.origin_ns for t_ns, _, _ in self._rows], dtype=np.float64) * 1e-9,
+            "sync_count": np.arange(len(self._rows), dtype=np.int64),
+            "sync_counter": np.array([counter for _, counter, _ in self._rows], dtype=np.int64),
+        }
+        return columns | self._plant.truths([state for _, _, state in self._rows])
+
+
+def _set_turn_units(node: SlaveNode, units: float | None) -> None:
+    """The factor group of a device that was delivered for this cell, where its EDS has one: units of a motor turn."""
+    delivered = node.dictionary.delivered
+    ratio = (delivered(GEAR_RATIO, 1) or 1) / (delivered(GEAR_RATIO, 2) or 1)
+    for index, value in ((RESOLUTION, units), (FEED, None if units is None else units * ratio)):
+        if value is not None and value.is_integer() and delivered(index, 1) and delivered(index, 2) in (0, 1):
+            node.dictionary.set_default(index, 1, int(value))
+
+
+def set_serial_number(node: SlaveNode, serial: int) -> None:
+    """Give a device its serial number, by which two of one EDS differ; a device without 1018h:04 has none."""
+    if key_of(0x1018, 4) in node.dictionary:
+        node.dictionary.set_default(0x1018, 4, serial)
+
+
+# Plan → the emulated side: one plant, its nodes, and the recorder of what is true.
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """The emulated nodes and what they share.
+
+    Attributes:
+        nodes: the slaves, ascending by node id.
+        plant: arm, probe, object and array.
+        recorder: notes the truth at every SYNC; None where nobody wants it, as it grows with time.
+        raw_array: an array that is no node; None without one.
+        participants: what is put on the bus: the nodes, or what stands between them and it (`FaultyNode`), and the
+            recorder, which listens only.
+    """
+
+    nodes: tuple[SlaveNode, ...]
+    plant: Plant
+    recorder: TruthRecorder | None
+    raw_array: RawArray | None = None
+    participants: list[Any] = field(init=False)
+
+    def __post_init__(self) -> None:
+        others = [one for one in (self.raw_array, self.recorder) if one is not None]
+        object.__setattr__(self, "participants", [*self.nodes, *others])
+
+
+def make_world(
+    plan: Plan,
+    node_ids: Collection[int],
+    *,
+    truth: bool = True,
+    without_id: Collection[int] = (),
+    homed: bool = True,
+) -> World:
+    """The emulated nodes of a plan, behind one plant.
+
+    Where the scene gives a node no serial number, its node id in the scene is one.
+
+    Args:
+        plan: of the scene.
+        node_ids: which of its nodes to emulate.
+        truth: whether what is true is recorded.
+        without_id: which of them start without a node id and wait for LSS to give them one.
+        homed: drives that have to be homed start with their zeros, and keep them.
+    """
+    plant = Plant(_plant_config(plan.setup), waits=True)
+    nodes = []
+    for node in plan.nodes:
+        if node.node_id not in node_ids:
+            continue
+        node_id = UNCONFIGURED if node.node_id in without_id else node.node_id
+        nodes.append(_node(plan.setup, node, node_id, plant, homed))
+    return World(tuple(nodes), plant, TruthRecorder(plant) if truth else None, _raw_array(plan.setup, plant))
+
+
+def _raw_array(setup: Setup, plant: Plant) -> RawArray | None:
+    """The emulated array of a setup where it is no node."""
+    array = setup.array
+    if array is None or array.raw is None or not array.emulated:
+        return None
+    return RawArray(array, plant, sync_ratio=max(1, round(setup.rate_hz / array.rate_hz)), seed=setup.seed)
+
+
+def _node(setup: Setup, planned: PlannedNode, node_id: int, plant: Plant, homed: bool) -> SlaveNode:
+    dictionary = planned.dictionary
+    speaks_lss = node_id == UNCONFIGURED or dictionary.device_information.LSS_supported
+    od_of = partial(load_eds, planned.eds) if speaks_lss else None
+    if planned.kind == "drive":
+        assert setup.arm is not None
+        axis = setup.arm.node_ids.index(planned.node_id)
+        drive = setup.arm.drives[axis]
+        node = make_drive_node(
+            dictionary,
+            node_id,
+            axis,
+            plant,
+            od_of,
+            delivery=Delivery(drive.turn_units, drive.metre_units, setup.arm.missed_syncs),
+            quirks=drive.quirks,
+            incremental=drive.zero is not None and not homed,
+            seed=setup.seed,
+        )
+        _set_turn_units(node, drive.turn_units)
+    else:
+        assert setup.array is not None
+        node = make_tactile_node(dictionary, node_id, plant, od_of=od_of, pad=setup.array.pad)
+        if has_full_scale(dictionary):
+            node.dictionary.set_default(FULL_SCALE, 0, round(setup.array.full_scale))
+    serial = planned.identity.serial_number
+    set_serial_number(node, planned.node_id if serial is None else serial)
+    if node.lss is not None:
+        node.lss.bitrate = setup.bus.bitrate
+    return node
+
+
+def _plant_config(setup: Setup) -> PlantConfig:
+    truth, array = setup.truth, setup.array
+    config = PlantConfig(
+        model=truth.model,
+        T_flange_probe_centre=truth.T_flange_probe,
+        radius_m=setup.probe.radius,
+        stiffness_n_m3=truth.stiffness,
+        damping_s_m=truth.damping,
+        object=truth.object,
+        taxels=None
+        if array is None
+        else TaxelConfig(full_scale_pa=array.full_scale, adc_bits=truth.adc_bits).without(*truth.without),
+        pad=array.pad if array is not None else Pad(),
+        bandwidth_hz=truth.bandwidth_hz,
+        press=PressMotion(after_s=_tared_s(setup)),
+        seed=setup.seed,
+    )
+    if setup.arm is None or truth.model is None:
+        return config
+    q0 = parked_posture(setup, setup.arm)
+    return replace(
+        config,
+        q0=q0,
+        fidelity=truth.fidelity,
+        dynamics=truth.dynamics,
+        bodies=truth.bodies,
+        compliance=truth.compliance,
+        base_offset_m=_base_offset(setup.arm.model.chain, truth.model.chain, q0, setup.probe.T_flange_probe),
+    )
+
+
+def _base_offset(believed: Chain, real: Chain, q: Array, T_flange_probe: Array) -> Array:
+    """Where the real arm's base stands in the controller's base frame, (3,), m.
+
+    An experimenter moves the arm to the object and takes that place for what the encoders show: both arms hold the
+    probe at one place in the first posture.
+    """
+    offset: Array = ((forward(believed, q) - forward(real, q)) @ T_flange_probe)[:3, 3]
+    return offset
+
+
+def _tared_s(setup: Setup) -> float:
+    """How long an array that takes its tare at the beginning takes for it, with some to spare, s; 0 for others."""
+    raw = setup.array.raw if setup.array is not None else None
+    if raw is None or not raw.tare_images:
+        return 0.0
+    assert setup.array is not None
+    return 1.5 * raw.tare_images / setup.array.rate_hz
+
+
+# A node from an EDS alone, of any make: the values of the file, and a drive where the file describes one.
+
+
+def make_eds_node(
+    od: ObjectDictionary, node_id: int, *, eds: str | Path | None = None, serial: int | None = None
+) -> SlaveNode:
+    """A conforming CiA 301 node with the values of its EDS; a CiA 402 drive moves an ideal axis.
+
+    Args:
+        od: of any EDS, for this node id.
+        node_id: 1–127; or 255: it waits for LSS to give it one.
+        eds: the file, for a node that speaks LSS; None for one that does not.
+        serial: number for 1018h:04, in the place of the file's.
+    """
+    od_of = None if eds is None else partial(load_eds, eds)
+    drive = is_drive(od)
+    node = make_drive_node(od, node_id, 0, IdealAxis(), od_of) if drive else SlaveNode(od, node_id, od_of=od_of)
+    if serial is not None:
+        set_serial_number(node, serial)
+    return node

@@ -1,0 +1,314 @@
+"""The array as the cell receives it: whole images placed in time, and the patch that they show."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.master.controller import TactileSample
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.scene.setup import Array, RawWire, Setup
+from canprobe.fieldbus.protocol.frames import Frame
+from canprobe.fieldbus.protocol.period import PeriodFit
+from canprobe.fieldbus.protocol.raw_image import ImageAssembler, RawImage
+from canprobe.fieldbus.protocol.tactile import FrameAssembler, TactileFrame, TactileHeader, TactileMode
+from canprobe.mechanics.touch.pad import COUNTS_MAX
+from canprobe.mechanics.touch.patch.image import Patch, PatchCalibration, compute_patch, patch_from_features
+
+DEADLINE_CYCLES = 2
+"""From the first PDO of a frame to its last."""
+JITTER_NS = 300_000
+"""By how much the stamps of a SYNC and a header may contradict each other: other loggers do not keep order."""
+LATEST_CYCLES = 4
+"""SYNCs after its trigger up to which a header is believed; the bus is planned for two."""
+WITHIN = 0.75
+"""Share of the period of raw images within which the frames of one come; so the next ones are not mixed with it."""
+
+
+class ArrayReceiver(ABC):
+    """Collects the frames of an array into images and hands each out with its place in time.
+
+    Args:
+        cob_ids: of its frames.
+        channel: of their bus.
+
+    Attributes:
+        newest_cycle: trigger of the newest sample.
+        stale: images dropped because they name no SYNC that they can have followed.
+    """
+
+    def __init__(self, cob_ids: Sequence[int], channel: str) -> None:
+        self.cob_ids = tuple(cob_ids)
+        self.channel = channel
+        self.newest_cycle: int | None = None
+        self.stale = 0
+
+    @abstractmethod
+    def assemble(self, can_id: int, data: bytes, t_ns: int) -> TactileFrame | None:
+        """Take one frame; the image that it completes."""
+
+    @abstractmethod
+    def push(self, can_id: int, data: bytes, t_ns: int) -> None:
+        """Take one frame, for `take`."""
+
+    @abstractmethod
+    def take(
+        self, cycle: int, sync_counter: int, sync_times: Sequence[int], sync_stamps: Sequence[int] = ()
+    ) -> TactileSample | None:
+        """The image that becomes usable in ``cycle``, or None.
+
+        Args:
+            cycle: the present cycle; its SYNC has not been answered by this image.
+            sync_counter: counter of the present cycle's SYNC; 0 where it has none.
+            sync_times: times of the last SYNCs (ns), the present one last.
+            sync_stamps: when they went out, on the clock of the frames.
+        """
+
+    def requests(self, cycle: int) -> tuple[Frame, ...]:
+        """What has to be sent in a cycle so that an image comes."""
+        return ()
+
+    @property
+    @abstractmethod
+    def torn(self) -> int:
+        """Images that were not whole."""
+
+    @property
+    @abstractmethod
+    def unusable(self) -> int:
+        """Images and frames of images that could not be used."""
+
+    @property
+    def lost(self) -> int:
+        """Images that were sent and did not come, as far as the array counts them."""
+        return 0
+
+
+class TactileReceiver(ArrayReceiver):
+    """Collects the PDOs of a CANopen node; each frame is handed out one cycle after its trigger.
+
+    Args:
+        assembler: puts the frames together.
+        cob_ids: of its PDOs.
+        sync_overflow: at which the SYNC counter starts again.
+        channel: of their bus.
+    """
+
+    def __init__(
+        self, assembler: FrameAssembler, cob_ids: Sequence[int], sync_overflow: int, channel: str = ""
+    ) -> None:
+        super().__init__(cob_ids, channel)
+        self.assembler = assembler
+        self._overflow = sync_overflow
+        self._complete: list[TactileFrame] = []
+
+    def assemble(self, can_id: int, data: bytes, t_ns: int) -> TactileFrame | None:
+        """Take one tactile PDO; the frame that it completes."""
+        return self.assembler.push(can_id, data, t_ns)
+
+    def push(self, can_id: int, data: bytes, t_ns: int) -> None:
+        """Take one tactile PDO."""
+        frame = self.assembler.push(can_id, data, t_ns)
+        if frame is not None:
+            self.put(frame)
+
+    def put(self, frame: TactileFrame) -> None:
+        """Take a whole frame."""
+        self._complete.append(frame)
+
+    def take(
+        self, cycle: int, sync_counter: int, sync_times: Sequence[int], sync_stamps: Sequence[int] = ()
+    ) -> TactileSample | None:
+        """The frame that becomes usable in ``cycle``.
+
+        Without a SYNC counter a frame belongs to the last SYNC before its header.
+        """
+        if not self._complete:
+            return None
+        sample, early = None, []
+        for frame in self._complete:
+            cycles_ago = self._cycles_ago(frame, sync_counter, sync_stamps)
+            if cycles_ago == 0 and not self._misplaced(frame, 0, sync_stamps):
+                early.append(frame)
+            elif cycles_ago >= len(sync_times) or self._misplaced(frame, cycles_ago, sync_stamps):
+                self.stale += 1
+            else:
+                t_sample = sync_times[-1 - cycles_ago] - frame.header.sample_age_us * 1000
+                sample = TactileSample(frame, t_sample, cycle - cycles_ago)
+                self.newest_cycle = sample.cycle
+        self._complete = early
+        return sample
+
+    @property
+    def torn(self) -> int:
+        """Torn, corrupt or mixed frames."""
+        return self.assembler.torn + self.assembler.crc_errors + self.assembler.orphans
+
+    @property
+    def unusable(self) -> int:
+        """Those, and what means nothing or came twice."""
+        return self.torn + self.assembler.malformed + self.assembler.duplicates
+
+    @property
+    def lost(self) -> int:
+        """From gaps of the frame counter."""
+        return self.assembler.lost
+
+    def _misplaced(self, frame: TactileFrame, cycles_ago: int, sync_stamps: Sequence[int]) -> bool:
+        """The frame names a SYNC that it did not follow: one after its header, or one too long before it."""
+        if not sync_stamps:
+            return False
+        if frame.t_ns + JITTER_NS < sync_stamps[-1 - cycles_ago]:
+            return True
+        later = cycles_ago - LATEST_CYCLES
+        return later > 0 and sync_stamps[-later] <= frame.t_ns
+
+    def _cycles_ago(self, frame: TactileFrame, sync_counter: int, sync_stamps: Sequence[int]) -> int:
+        if sync_counter and frame.header.sync_counter:
+            return (sync_counter - frame.header.sync_counter) % self._overflow
+        return next((i for i, stamp in enumerate(reversed(sync_stamps)) if stamp <= frame.t_ns), len(sync_stamps))
+
+
+class RawReceiver(ArrayReceiver):
+    """Collects the raw frames of a device that knows no CANopen.
+
+    The normal pressure of each taxel becomes a count as a CANopen array sends it: 0 without load, 255 at full scale.
+    An image was sampled at the arrival of its first frame less the latency, as stated and as calibrated; the arrivals
+    of a free-running device are fitted (`PeriodFit`).
+
+    Args:
+        array: with a raw wire.
+        ratio: cycles between two images of a polled device.
+
+    Attributes:
+        wire: of the array.
+        rate_hz: of its images.
+    """
+
+    def __init__(self, array: Array, ratio: int) -> None:
+        assert array.raw is not None
+        super().__init__(array.raw.image.ids, array.channel)
+        self.wire: RawWire = array.raw
+        self.rate_hz = array.rate_hz
+        period_ns = 1e9 / array.rate_hz
+        self.assembler = ImageAssembler(self.wire.image, round(WITHIN * period_ns))
+        self._fit = PeriodFit(period_ns) if self.wire.sampling == "free" else None
+        self._ratio = ratio
+        self._unloaded: NDArray[np.float64] | None = None
+        if not self.wire.tare_images:
+            self._unloaded = np.full(array.pad.shape, float(self.wire.unloaded))
+        self._taring: list[NDArray[np.float64]] = []
+        self._complete: list[tuple[TactileFrame, int, float]] = []
+
+    @property
+    def images(self) -> int:
+        """Whole images so far."""
+        return self.assembler.frames
+
+    def has(self, images: int) -> bool:
+        """Whether so many whole images have come."""
+        return self.images >= images
+
+    def assemble(self, can_id: int, data: bytes, t_ns: int) -> TactileFrame | None:
+        """Take one frame; the image that it completes, once the array is tared."""
+        image = self.assembler.push(can_id, data, t_ns)
+        return self._frame(image) if image is not None else None
+
+    def push(self, can_id: int, data: bytes, t_ns: int) -> None:
+        """Take one frame."""
+        image = self.assembler.push(can_id, data, t_ns)
+        if image is None:
+            return
+        instant, sigma = self._fit.step(image.t_ns) if self._fit is not None else (image.t_ns, 0.0)
+        frame = self._frame(image)
+        if frame is not None:
+            wire = self.wire
+            spread = math.hypot(sigma, wire.latency_sigma_s, wire.found_sigma_s)
+            self._complete.append((frame, instant - round(1e9 * (wire.latency_s + wire.found_s)), spread))
+
+    def take(
+        self, cycle: int, sync_counter: int, sync_times: Sequence[int], sync_stamps: Sequence[int] = ()
+    ) -> TactileSample | None:
+        """The newest image that was sampled before the present SYNC."""
+        sample, early = None, []
+        for frame, instant, sigma in self._complete:
+            if instant > sync_stamps[-1]:
+                early.append((frame, instant, sigma))
+                continue
+            ago = next((i for i, stamp in enumerate(reversed(sync_stamps)) if stamp <= instant), len(sync_stamps) - 1)
+            sample = TactileSample(frame, sync_times[-1] + instant - sync_stamps[-1], cycle - ago, sigma)
+            self.newest_cycle = sample.cycle
+        self._complete = early
+        return sample
+
+    def requests(self, cycle: int) -> tuple[Frame, ...]:
+        """The poll of a polled device."""
+        return self.wire.poll if self.wire.poll and cycle % self._ratio == 0 else ()
+
+    @property
+    def torn(self) -> int:
+        """Images that were dropped incomplete."""
+        return self.assembler.torn
+
+    @property
+    def unusable(self) -> int:
+        """The same."""
+        return self.assembler.torn
+
+    def _frame(self, image: RawImage) -> TactileFrame | None:
+        """The image as a CANopen array would send it; None while it is taken for the tare."""
+        wire = self.wire
+        values = image.counts[:, :, wire.normal].astype(np.float64)
+        if self._unloaded is None:
+            self._taring.append(values)
+            if len(self._taring) == wire.tare_images:
+                self._unloaded = np.mean(self._taring, axis=0)
+            return None
+        loads = (values - self._unloaded) * (COUNTS_MAX / (wire.full_scale - wire.unloaded))
+        taxels = np.clip(np.rint(loads), 0, COUNTS_MAX).astype(np.uint8)
+        taxels.flags.writeable = False
+        overload = bool(taxels.max() == COUNTS_MAX)
+        header = TactileHeader(image.number % 256, 0, 0, 0, TactileMode.IMAGE, overload, 0)
+        return TactileFrame(header, taxels, (0, 0, *taxels.shape), None, image.t_ns, image.counts)
+
+
+def make_tactile(plan: Plan, sync_overflow: int | None = None) -> ArrayReceiver | None:
+    """The receiver of the plan's array, None without one; `sync_overflow` where it is not the plan's."""
+    array = plan.setup.array
+    if array is None:
+        return None
+    if array.raw is not None:
+        return RawReceiver(array, max(1, round(plan.setup.rate_hz / array.rate_hz)))
+    pdos = plan.pdos_of(array.node_id, "tpdo")
+    cob_ids = [pdo.cob_id for pdo in pdos]
+    assembler = FrameAssembler(
+        cob_ids,
+        TactileMode[array.mode.upper()],
+        DEADLINE_CYCLES * plan.sync.period_ns,
+        [pdo.layout.length for pdo in pdos],
+        window=int(array.window),
+        shape=array.pad.shape,
+    )
+    return TactileReceiver(assembler, cob_ids, sync_overflow or plan.sync.overflow, array.channel)
+
+
+def patch_of(sample: TactileSample, calibration: PatchCalibration) -> Patch:
+    """Patch of a tactile sample, in every mode of the array."""
+    frame = sample.frame
+    if frame.features is not None:
+        return patch_from_features(frame.features, calibration)
+    return compute_patch(frame.taxels, calibration, window=frame.window)
+
+
+def patch_from(setup: Setup) -> Callable[[TactileSample], Patch] | None:
+    """The patch of a sample of the setup's array; None without one."""
+    if setup.array is None:
+        return None
+    from canprobe.mechanics.touch.patch.image_model import make_patch_calibration
+
+    calibration = make_patch_calibration(setup.array.calibration, setup.array.pad)
+    return lambda sample: patch_of(sample, calibration)

@@ -1,0 +1,583 @@
+"""The cell: brought up, run cycle by cycle under supervision, and left with the drives disabled on every way out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from itertools import repeat
+from pathlib import Path
+from types import TracebackType
+from typing import Any, TypeVar
+
+import numpy as np
+
+from canprobe.cell.master.array import RawReceiver, make_tactile, patch_from
+from canprobe.cell.master.bringup import BringUp
+from canprobe.cell.master.controller import Command, Controller, Measurement, as_controller, check_command
+from canprobe.cell.master.cycle import Cycle, Observers
+from canprobe.cell.master.drives import make_drives
+from canprobe.cell.master.homing import Homing
+from canprobe.cell.master.log import Notes, RunLog, TactileLog, joint_columns
+from canprobe.cell.master.supervision import Finding, Reaction, Seen, limits_of
+from canprobe.cell.master.supervisor import JointGuard, Supervisor
+from canprobe.cell.master.watch import NodeWatch
+from canprobe.cell.planning.configuration import make_setups
+from canprobe.cell.planning.model import Plan
+from canprobe.errors import BusError, CanprobeError, NodeError, SafetyStop, UsageError
+from canprobe.fieldbus.bus.port import Port, PortCounters, TimedFrame, VirtualClock, send_on
+from canprobe.fieldbus.bus.real.processor import Interrupts
+from canprobe.fieldbus.bus.sdo import PumpedNetwork
+from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, DriveState
+from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE
+
+Result = TypeVar("Result")
+
+WARM_UP_S = 0.1
+"""Cycling before the drives are enabled, until both sides are up to speed."""
+REST_TIMEOUT_S = 2.0
+FREE_IT = "free it; a run does not begin while the array measures a force"
+OWN_COLUMNS = frozenset({"t_s", "q_rad", "q_m", "statusword", "torque_permille", "q_target_rad", "q_target_m"})
+"""Of the log; a controller's `Command.columns` have other names."""
+STUCK_NS = 1_000_000_000
+"""Time in a cycle after which an interrupt does not wait for its end."""
+
+
+def _hold(_: Measurement) -> Command:
+    """Stay where the drives are."""
+    return Command()
+
+
+class Cell:
+    """One cell on one bus. A context manager: entering brings the nodes up, leaving stops them safely.
+
+    Args:
+        plan: of the scene.
+        port: the bus; it is closed on leaving.
+        say: called with each step of bring-up and stop.
+        log_failure: says why frames are no longer written down, None while they are.
+        observers: called after each cycle.
+        rows_kept: cycles whose row of the log is kept; None for all.
+        direct: makes the cycle of nodes that are reached without a bus, as `Cycle` is made, and starts them; None: they
+            are brought up and reached over the port.
+        origin_ns: time on the port's clock from which the run counts, as ``bus.log`` does.
+        zeros: file that records the zeros of real drives that are homed.
+        to_home: the drives are about to be homed; else bring-up refuses one that is not.
+
+    Attributes:
+        drives, tactile: of the arm and the array; None in a scene without one.
+        log: one row a cycle, with times since the first SYNC, so that nothing that is computed from them depends on
+            how long bring-up took; `start_ns` brings them onto the run's clock.
+        tactile_log: one row a tactile frame, on the same clock.
+        notes: what went wrong and was lived with.
+        watch: what the nodes report of themselves.
+        supervisor: the checks, from bring-up on.
+        cycle: None before bring-up is done.
+        homing: of the drives without an absolute encoder; None where there are none.
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        port: Port,
+        *,
+        say: Callable[[str], None] = lambda _: None,
+        log_failure: Callable[[], str | None] = lambda: None,
+        observers: Observers | None = None,
+        rows_kept: int | None = None,
+        direct: Callable[..., Cycle] | None = None,
+        origin_ns: int = 0,
+        zeros: Path | None = None,
+        to_home: bool = False,
+    ) -> None:
+        setup = plan.setup
+        self.log = RunLog(rows_kept)
+        self.tactile_log = TactileLog(rows_kept)
+        self.drives = make_drives(plan)
+        self.tactile = make_tactile(plan)
+        self.notes = Notes()
+        self.watch = NodeWatch(plan.node_ids)
+        self.cycle: Cycle | None = None
+        guard = JointGuard(plan) if setup.arm is not None else None
+        seen = Seen(limits_of(plan), self.watch, self.drives, self.tactile, port.counters)
+        self.supervisor = Supervisor(seen, guard, patch_from(setup) if setup.arm is not None else None)
+        slides = setup.arm.model.chain.prismatic if setup.arm is not None else ()
+        self._slides = np.array(slides, dtype=bool) if any(slides) else None
+        self._plan = plan
+        self._port = port
+        self._to_say = say
+        self._log_failure = log_failure
+        self._observers = observers
+        self._rows_kept = rows_kept
+        self._origin_ns = origin_ns
+        self._network = PumpedNetwork(port, other=self._other)
+        self._make_cycle = direct or Cycle
+        setups = make_setups(plan) if direct is None else ()  # of none only its time passes
+        self._bring_up = BringUp(self._network, self.watch, setups, setup.bring_up, self._say)
+        homed = any(one.homing for one in setups)
+        besides: dict[str, Any] = {"supervise": self._supervise_homing, "record": zeros, "say": self._say}
+        self.homing = Homing(plan, setups, self._network, self.watch, **besides) if homed else None
+        self._to_home = to_home
+        self._array_started = False
+        self._holding = False
+        self._running = False
+        self._retreats_for: CanprobeError | None = None
+        self._controller = Controller()
+        for node_id in self.watch.node_ids:
+            for base in (HEARTBEAT_BASE, EMCY_BASE):
+                self._network.subscribe(base + node_id, self.watch.push)
+
+    @property
+    def start_ns(self) -> int:
+        """When the first cycle was due, on the run's clock; 0 where it came to none."""
+        return self.cycle.t_first_ns - self._origin_ns if self.cycle is not None else 0
+
+    @property
+    def faults(self) -> list[str]:
+        """What went wrong, a line for each kind of it."""
+        return self.notes.lines()
+
+    @property
+    def counters(self) -> PortCounters:
+        """What has passed through the cell's port."""
+        return self._port.counters
+
+    def _say(self, text: str) -> None:
+        """Report a step to the user; a failure of that must not decide what becomes of the drives."""
+        try:
+            self._to_say(text)
+        except Exception as error:
+            self.notes.add(f"steps could not be reported: {type(error).__name__}")
+
+    def _other(self, can_id: int, data: bytes, t_ns: int) -> None:
+        """A frame that arrived during bring-up and that nobody subscribed to."""
+        if self.tactile is not None and can_id in self.tactile.cob_ids:
+            self.tactile.push(can_id, data, t_ns)
+        else:
+            self.watch.push(can_id, data, t_ns)
+
+    def listen(self) -> None:
+        """Listen for another master, before anything is started for this cell; nothing is sent.
+
+        Raises:
+            BusError: there is one.
+        """
+        self._bring_up.listen()
+
+    def hear(self, frames: Iterable[TimedFrame]) -> None:
+        """Take what arrived before bring-up, while another reader waited on the port."""
+        for frame in frames:
+            self.watch.push(*frame)
+
+    def __enter__(self) -> Cell:
+        try:
+            self._bring_up.run()
+            self._start_array()
+            self.cycle = self._make_cycle(
+                self._port,
+                self._plan,
+                drives=self.drives,
+                tactile=self.tactile,
+                watch=self.watch,
+                other=self._network.feed,
+                on_arrival=not isinstance(self._port.clock, VirtualClock),
+                kept=self._rows_kept,
+            )
+            self.watch.start(self._port.clock.now_ns())
+            if self.homing is not None:
+                self.homing.look()
+                if not self._to_home:
+                    self.homing.refuse_unhomed()
+        except BaseException as error:
+            self.close()
+            self._name_another_master(error)
+            raise
+        return self
+
+    def _start_array(self) -> None:
+        """Start an array of raw frames, and wait for as many images as its tare takes, at least one.
+
+        Raises:
+            BusError: they do not come.
+        """
+        array = self.tactile
+        if not isinstance(array, RawReceiver):
+            return
+        wire, clock = array.wire, self._port.clock
+        self._say(f"start the array on {array.channel}")
+        self._array_started = True
+        send_on(self._port, array.channel, wire.start)
+        if wire.sampling == "sync":
+            return  # its images begin with the cycle
+        if wire.tare_images:
+            self._say(f"tare the array: {wire.tare_images} images, with nothing on it")
+        needed, period_s = max(1, wire.tare_images), 1.0 / array.rate_hz
+        end_ns = clock.now_ns() + round(1e9 * (self._plan.setup.bring_up.boot_up_s + 2.0 * needed * period_s))
+        while array.images < needed:
+            if clock.now_ns() >= end_ns:
+                first, last = min(array.cob_ids), max(array.cob_ids)
+                ids = f"{first:03X}h" if first == last else f"{first:03X}h-{last:03X}h"
+                raise BusError(
+                    f"{array.channel}: the array sent {array.images} of {needed} images of its frames {ids} in time"
+                    f" ({array.torn} were not whole); check its power, its channel (sensor.channel), and wire.ids,"
+                    " wire.frames and wire.start of its array file"
+                )
+            if wire.poll:
+                send_on(self._port, array.channel, wire.poll)
+            self._network.pump_until(partial(array.has, array.images + 1), 1.5 * period_s)
+
+    def _stop_array(self) -> None:
+        if isinstance(self.tactile, RawReceiver) and self._array_started:
+            send_on(self._port, self.tactile.channel, self.tactile.wire.stop)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+        if error is not None:
+            self._name_another_master(error)
+
+    def run(
+        self,
+        controller: Controller | Callable[[Measurement], Command],
+        progress: Callable[[Measurement], None] = lambda _: None,
+    ) -> None:
+        """Enable the drives, then run ``controller`` until it says done.
+
+        Args:
+            controller: a `Controller`, or a function of the measurement that returns a command.
+            progress: called after each cycle.
+
+        Raises:
+            UsageError: this is no controller, it returned no `Command`, or another one is running.
+            SafetyStop: the controller or the supervision stopped the cell.
+            ResultsError: frames can no longer be written down.
+            NodeError: a node was lost or failed.
+            InterfaceError: the bus was lost.
+        """
+        self.start(controller)
+        self.advance(None, progress)
+
+    def start(self, controller: Controller | Callable[[Measurement], Command]) -> None:
+        """The first half of `run`: enable the drives for a controller, which `advance` then runs."""
+        runs = as_controller(controller)
+        with self._one_at_a_time(), self._naming_another_master():
+            self._controller, self._retreats_for = runs, None
+            self._enable()
+
+    def advance(self, cycles: int | None, progress: Callable[[Measurement], None] = lambda _: None) -> bool:
+        """The second half of `run`, in pieces: nothing happens between two calls, and virtual time stands still.
+
+        On a real bus the drives stop by themselves where the next call does not come within a cycle.
+
+        Args:
+            cycles: at most so many; None until the controller is done.
+            progress: called after each cycle.
+
+        Returns:
+            Whether the controller is done.
+        """
+        with self._one_at_a_time(), self._naming_another_master(), Interrupts(self._stuck) as interrupts:
+            for _ in repeat(None) if cycles is None else range(cycles):
+                if self._run_cycle(interrupts, progress):
+                    return True
+        return False
+
+    @contextmanager
+    def _one_at_a_time(self) -> Iterator[None]:
+        """Refuse a controller that runs another one in its step."""
+        if self._running:
+            raise UsageError("the cell runs a controller already, which must not run another one in its step")
+        self._running = True
+        try:
+            yield
+        finally:
+            self._running = False
+
+    @contextmanager
+    def _naming_another_master(self) -> Iterator[None]:
+        """Whatever ends the cell names another master that was heard: it may be the cause."""
+        try:
+            yield
+        except BaseException as error:
+            self._name_another_master(error)
+            raise
+
+    def _name_another_master(self, error: BaseException) -> None:
+        words = self.watch.another_master
+        if words is None or str(self.watch.foreign) in str(error):
+            return
+        if isinstance(error, CanprobeError):
+            error.args = (f"{error}; {words}",)
+        elif words not in self.faults:
+            self.notes.add(words)
+
+    def _run_cycle(self, interrupts: Interrupts, progress: Callable[[Measurement], None]) -> bool:
+        """One cycle of the controller; True where it is done."""
+        assert self.cycle is not None
+        measurement = self.cycle.begin()
+        held = self._supervise(measurement)
+        step = _hold if held else self._controller.step
+        command = self._or_lift_off(self._ask, step, measurement, interrupts)
+        command, finding = self.supervisor.guard_target(command)
+        if finding is not None:
+            self._react(finding)
+        self.cycle.end(command)
+        self._or_lift_off(self._controller.update)
+        self.cycle.count_work()
+        self._record(measurement, command)
+        progress(measurement)
+        if command.stop_reason is not None:
+            found = self._retreats_for
+            raise found if found and str(found) == command.stop_reason else SafetyStop(command.stop_reason)
+        return bool(command.done)
+
+    def _ask(self, step: Callable[[Measurement], Command], measurement: Measurement, interrupts: Interrupts) -> Command:
+        """What the controller wants.
+
+        Raises:
+            KeyboardInterrupt: an interrupt came.
+            UsageError: the controller gives something else.
+        """
+        interrupts.take()
+        command = step(measurement)
+        if not isinstance(command, Command):
+            raise UsageError(f"controller: expected its step to return a Command, got {command!r}")
+        check_command(command, arm=self.drives is not None)
+        if not OWN_COLUMNS.isdisjoint(command.columns):
+            taken = ", ".join(sorted(OWN_COLUMNS.intersection(command.columns)))
+            raise UsageError(f"controller: expected other columns than the cell's, got {taken}")
+        return command
+
+    def _or_lift_off(self, work: Callable[..., Result], *arguments: object) -> Result:
+        """What the controller's work returns; what it raises ends the run off the object."""
+        try:
+            return work(*arguments)
+        except BaseException as error:
+            self._lift_off(error)
+            raise
+
+    def _stuck(self) -> bool:
+        """The controller, or what is called after it, has not returned for long."""
+        assert self.cycle is not None
+        return self._port.clock.now_ns() - self.cycle.sync_ns > STUCK_NS
+
+    # enabling and supervision
+
+    def _enable(self) -> None:
+        if self.drives is None:
+            return
+        self._say("enable the drives")
+        self.drives.goal = DriveState.SWITCH_ON_DISABLED
+        times = self._plan.setup.bring_up
+        with self._bring_up.confirm_modes(times.enable_s) as modes:
+            self._cycle_until((), WARM_UP_S, check=modes.serve)
+            while modes.waiting:
+                self._cycle_until((), self._one_cycle_s, check=modes.serve)
+        self._await_rest()
+        if (reason := self._controller.inspect(self.drives.joints())) is not None:
+            raise SafetyStop(reason)
+        self.drives.goal = DriveState.OPERATION_ENABLED
+        if not self._cycle_until((DriveState.OPERATION_ENABLED,), times.enable_s, check=self._supervise_enabling):
+            i, instead = self.drives.first_not_in(DriveState.OPERATION_ENABLED)
+            node_id = self.drives.axes[i].node_id
+            raise NodeError(
+                node_id,
+                f"(joint {i + 1}) is {instead} {times.enable_s:g} s after the command to enable operation"
+                " (bring_up.enable_s)" + self.watch.last_words(node_id),
+            )
+
+    def _await_rest(self) -> None:
+        """Enable nothing that is not known to stand still: the first target of a drive is its reported position."""
+        assert self.drives is not None
+        for _ in range(int(REST_TIMEOUT_S * 1e9 / self._plan.sync.period_ns)):
+            if all(self.drives.rests):
+                return
+            self._cycle_until((), self._one_cycle_s)
+        i = self.drives.rests.index(False)
+        node_id, last_ns = self.drives.axes[i].node_id, self._plan.traffic.budget.looks_ns[-1]
+        if (came_ns := self.drives.lateness_ns[i]) > last_ns:
+            why = (
+                f"its TPDO comes {came_ns * 1e-6:.2f} ms behind the SYNC, and the cell waits for it until"
+                f" {last_ns * 1e-6:.2f} ms: lower cycle.rate_hz"
+            )
+        else:
+            why = f"reports no position that stays for {REST_TIMEOUT_S:g} s: moving, or a wrong TPDO"
+        raise NodeError(node_id, why + self.watch.last_words(node_id))
+
+    @property
+    def _one_cycle_s(self) -> float:
+        """A time in which `_cycle_until` makes one cycle."""
+        return 1.5e-9 * self._plan.sync.period_ns
+
+    def _cycle_until(
+        self,
+        states: tuple[DriveState, ...],
+        timeout_s: float,
+        check: Callable[[], None] = lambda: None,
+    ) -> bool:
+        """Cycle with held targets until every drive is in one of the states; False after the time-out."""
+        assert self.cycle is not None and self.drives is not None
+        for _ in range(int(timeout_s * 1e9 / self._plan.sync.period_ns)):
+            measurement = self.cycle.begin()
+            self._look(measurement)
+            check()
+            reached = bool(states) and measurement.q is not None and self.drives.all_in(*states)
+            self.cycle.end(None)
+            self._record(measurement, None)
+            if reached:
+                return True
+        return False
+
+    def _look(self, measurement: Measurement) -> None:
+        assert self.cycle is not None
+        self._note_alarms()
+        self.supervisor.seen.restarts = self._controller.restarts
+        self.supervisor.step(
+            measurement,
+            sync_ns=self.cycle.sync_ns,
+            overruns=self.cycle.statistics.overruns,
+            counters=self._port.counters,
+            controller_state=self._port.state,
+            log_failure=self._log_failure(),
+        )
+
+    def _supervise_enabling(self) -> None:
+        finding = self.supervisor.finding(enabling=True)
+        if finding is not None and finding.condition.reaction is not Reaction.HOLD:
+            raise finding.error
+
+    def _supervise_homing(self) -> None:
+        self._note_alarms()
+        seen = self.supervisor.seen
+        seen.sync_ns, seen.controller_state = self._port.clock.now_ns(), self._port.state
+        self._supervise_enabling()
+
+    def _supervise(self, measurement: Measurement) -> bool:
+        """Check the table's conditions; True: hold in this cycle."""
+        self._look(measurement)
+        finding = self.supervisor.finding()
+        if finding is None and not self._controller.lets_go:
+            finding = self.supervisor.guard_contact(measurement)
+        if finding is None or finding.condition.reaction is not Reaction.HOLD:
+            self._holding = False
+            if finding is not None:
+                self._react(finding)
+        elif not self._holding:
+            self._holding = True
+            self.notes.add_error(finding.error, "hold", (self.start_ns + measurement.t_ns) * 1e-9)
+        return self._holding
+
+    def _react(self, finding: Finding) -> None:
+        reaction = finding.condition.reaction
+        if reaction is Reaction.RETREAT and self._controller.lets_go:
+            self._retreats_for = self._retreats_for or finding.error
+            self._controller.retreat(str(finding.error))
+            return
+        if reaction in (Reaction.RETREAT, Reaction.LIFT):
+            self._lift_off(finding.error)
+        raise finding.error
+
+    def _lift_off(self, error: BaseException) -> None:
+        """Take the probe off what it presses on, as far as that goes, before the cell is stopped for ``error``."""
+        supervisor = self.supervisor
+        if self.drives is None or self.tactile is None or not supervisor.pressing() or supervisor.must_stop():
+            return
+        from canprobe.cell.master.lift_off import LiftOff
+
+        lift = LiftOff(self._plan, self.drives, self.watch, error)
+        t_s = (self.start_ns + supervisor.seen.measurement.t_ns) * 1e-9
+        if not lift.possible:
+            self.notes.add("no lift-off: a drive may be moving, or none obeys", t_s=t_s)
+            return
+        self._say("lift off with the drives that obey")
+        self.notes.add("lift off", t_s=t_s)
+        lift.begin()
+        assert self.cycle is not None
+        try:
+            while (command := lift.command(supervisor)) is not None:
+                self.cycle.end(command)
+                self._record(supervisor.seen.measurement, command)
+                self._look(self.cycle.begin())
+        except CanprobeError as failure:
+            self.notes.add(f"while lifting off: {failure}")
+
+    def _note_alarms(self) -> None:
+        for event in self.watch.news():
+            self.notes.add(event.what, node_id=event.node_id, t_s=(event.t_ns - self._origin_ns) * 1e-9)
+
+    def _record(self, measurement: Measurement, command: Command | None) -> None:
+        assert self.cycle is not None
+        row: dict[str, object] = {"t_s": measurement.t_ns * 1e-9, "sync_late_us": self.cycle.late_ns * 1e-3}
+        if self.drives is not None:
+            if measurement.q is not None:
+                row.update(joint_columns("q", measurement.q, self._slides))
+            row["q_age"] = measurement.q_age
+            row["statusword"] = measurement.statuswords
+            if measurement.torque_permille:
+                row["torque_permille"] = measurement.torque_permille
+        if command is not None:
+            if command.q_target is not None:
+                row.update(joint_columns("q_target", command.q_target, self._slides))
+            row.update(command.columns)
+        if self.tactile is not None:
+            row["tactile_age"] = measurement.tactile_age
+            if measurement.tactile is not None:
+                self.tactile_log.add(measurement.t_ns, measurement.tactile)
+        self.log.add(row)
+        if self._observers is not None:
+            self._observers.cycle(self.start_ns, measurement, command)
+
+    # the way out
+
+    def close(self) -> None:
+        """Stop safely and close the bus: quick stop, disable, pre-operational. Never raises; failures are faults."""
+        self._try(self._stop_drives)
+        if force := self.supervisor.pressing():
+            self.notes.add(f"the probe is left pressing with {force:.1f} N: {FREE_IT}")
+        self._try(self._stop_array)
+        if self.homing is not None:
+            self._try(self.homing.keep)
+        self._try(self._bring_up.release)
+        self._try(self._port.close)
+        for line in self.supervisor.notes():
+            self.notes.add(line)
+
+    def _try(self, action: Callable[[], None]) -> None:
+        """Run one step of the way out to its end: an interrupt repeats it once, a failure is noted."""
+        for _ in range(2):
+            try:
+                action()
+            except KeyboardInterrupt:
+                continue
+            except CanprobeError as error:
+                self.notes.add(f"while stopping: {error}")
+            return
+
+    def _stop_drives(self) -> None:
+        if self.drives is None or self.cycle is None or not self.drives.heard_all:
+            return
+        self._say("stop and disable the drives")
+        off = tuple(state for state in DriveState if state not in POWERED_STATES)
+        self.drives.goal = DriveState.QUICK_STOP_ACTIVE
+        self._stop_until(off)  # with 605Ah = 2 a drive at rest leaves quick stop by itself
+        self.drives.goal = DriveState.SWITCH_ON_DISABLED
+        disabled = (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT, DriveState.NOT_READY_TO_SWITCH_ON)
+        if not self._stop_until(disabled):
+            stuck = [a.node_id for a, s in zip(self.drives.axes, self.drives.states, strict=True) if s not in disabled]
+            self.notes.add(f"while stopping: node {stuck[0] if stuck else '?'} did not confirm that it is disabled")
+
+    def _stop_until(self, states: tuple[DriveState, ...]) -> bool:
+        """As `_cycle_until`, for a bus that may come and go: what fails is tried again in the next cycle."""
+        assert self.cycle is not None
+        end_ns = self._port.clock.now_ns() + int(self._plan.setup.bring_up.stop_s * 1e9)
+        failure: CanprobeError | None = None
+        while (left_ns := end_ns - self._port.clock.now_ns()) > 0:
+            try:
+                return self._cycle_until(states, left_ns * 1e-9)
+            except CanprobeError as error:
+                failure = error
+                self.cycle.skip()
+        if failure is not None:
+            self.notes.add(f"while stopping: {failure}")
+        return False

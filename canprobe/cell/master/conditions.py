@@ -1,0 +1,384 @@
+"""The table of conditions: what can go wrong, how it is seen, how fast, and what the cell does about it.
+
+Each row stands on its check. A check looks at the cell (`Seen`) or at a touch (`Contact`) and returns the error that
+names what is wrong, or None; what the cell lives with is counted. Pure: no clock, no port. The order is the order of
+precedence. docs/supervision.md has the same table for users, with what they can do about each condition; a test
+compares the two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from canprobe.cell.master.supervision import (
+    HIDDEN_NS,
+    HOLD_CYCLES,
+    HOLD_NS,
+    LOST_NS,
+    Condition,
+    Contact,
+    Finding,
+    Limits,
+    Reaction,
+    Seen,
+)
+from canprobe.cell.planning.model import HEARTBEAT_CONSUMED_MS, HEARTBEAT_PRODUCED_MS
+from canprobe.errors import InterfaceError, NodeError, ResultsError, SafetyStop
+from canprobe.fieldbus.bus.port import ControllerState
+from canprobe.fieldbus.protocol.cia402 import DriveState
+from canprobe.fieldbus.protocol.frames import NmtState
+
+MS = 1_000_000
+ARRAY_RECOVERY_NS = 30 * MS
+"""For so long after the touch the array's creep and hysteresis may still show half of the touch force."""
+Check = TypeVar("Check", bound=Callable[..., Any])
+_TABLE: list[Condition] = []
+
+
+def _unchecked(*row: Any, **more: Any) -> None:
+    """A row that shows by itself."""
+    _TABLE.append(Condition(*row, **more))
+
+
+def _checked(*row: Any, **more: Any) -> Callable[[Check], Check]:
+    """A row whose check looks at the cell in every cycle."""
+    return lambda check: _add(check, *row, check=check, **more)
+
+
+def _touch(*row: Any, **more: Any) -> Callable[[Check], Check]:
+    """A row whose check looks at a touch."""
+    return lambda check: _add(check, *row, check=check, touch=True, **more)
+
+
+def _counted(key: str, what: str, within: Callable[[Limits], int]) -> Callable[[Check], Check]:
+    """A row of what the cell lives with."""
+    return lambda count: _add(count, key, what, Reaction.DEGRADE, within, count=count)
+
+
+def _add(function: Check, *row: Any, **more: Any) -> Check:
+    _TABLE.append(Condition(*row, **more))
+    return function
+
+
+def _cycles(number: int) -> Callable[[Limits], int]:
+    return lambda limits: number * limits.period_ns
+
+
+def _after(time_ns: int, cycles: int = 1) -> Callable[[Limits], int]:
+    """A time, and some cycles until it is looked at."""
+    return lambda limits: time_ns + cycles * limits.period_ns
+
+
+def _frame(limits: Limits) -> int:
+    """From a tactile frame to the reaction on it."""
+    return (limits.tactile_cycles + 2) * limits.period_ns
+
+
+def _sample(limits: Limits) -> int:
+    """From an instant to the reaction on the tactile sample that shows it: sampled, sent one frame later, taken in."""
+    return limits.cycles_to_feel * limits.period_ns
+
+
+def _hidden(limits: Limits) -> int:
+    return HIDDEN_NS + _sample(limits)
+
+
+def _lost(limits: Limits) -> int:
+    return LOST_NS + _sample(limits) + ARRAY_RECOVERY_NS
+
+
+# nodes; another master first: what the nodes then report is what it made of them
+
+
+@_checked("foreign_master", "another master on the bus", Reaction.STOP, _cycles(2), enabling=True)
+def _foreign_master(seen: Seen) -> SafetyStop | None:
+    words = seen.watch.another_master
+    return SafetyStop(words) if words is not None else None
+
+
+@_checked("heartbeat", "heartbeat of a node lost", Reaction.LIFT, _after(HEARTBEAT_CONSUMED_MS * MS), enabling=True)
+def _heartbeat(seen: Seen) -> NodeError | None:
+    node_id = seen.watch.silent(seen.sync_ns)
+    if node_id is None:
+        return None
+    return NodeError(node_id, "lost: no heartbeat within its time-out" + seen.watch.last_words(node_id))
+
+
+@_checked(
+    "nmt_state",
+    "node not operational, or booted again",
+    Reaction.LIFT,
+    _after(HEARTBEAT_PRODUCED_MS * MS),
+    enabling=True,
+)
+def _nmt_state(seen: Seen) -> NodeError | None:
+    node_id = seen.watch.not_in(NmtState.OPERATIONAL)
+    if node_id is None:
+        return None
+    state = seen.watch.states[node_id].name
+    return NodeError(node_id, f"left operation: NMT state {state}{seen.watch.last_words(node_id)}")
+
+
+@_checked("drive_fault", "drive leaves operation enabled (fault, quick stop)", Reaction.LIFT, _cycles(2))
+def _drive_fault(seen: Seen) -> NodeError | None:
+    drives = seen.drives
+    if drives is None or seen.measurement.enabled:
+        return None
+    i, instead = drives.first_not_in(DriveState.OPERATION_ENABLED)
+    node_id = drives.axes[i].node_id
+    words = seen.watch.last_words(node_id)
+    return NodeError(node_id, f"(joint {i + 1}) left operation enabled: {instead}{words}{_held_up(seen)}")
+
+
+def _held_up(seen: Seen) -> str:
+    """Why the drives stopped by themselves, where that is known: the master was late in its cycle for too long."""
+    patience_ns = seen.limits.missed_cycles * seen.limits.period_ns
+    if seen.gap_ns <= patience_ns:
+        return ""
+    return (
+        f"; the last SYNC was sent {seen.gap_ns * 1e-6:.0f} ms after the one before, and the drives stop by themselves"
+        f" {patience_ns * 1e-6:g} ms after one (arm.missed_syncs = {seen.limits.missed_cycles}): the machine held the"
+        " master up; leave it more of the processor, see --realtime, or for emulated nodes --patient"
+    )
+
+
+@_checked("emcy", "EMCY of a device error", Reaction.LIFT, _cycles(2), enabling=True)
+def _emcy(seen: Seen) -> NodeError | None:
+    event = seen.watch.device_alarm
+    return NodeError(event.node_id, event.what) if event is not None else None
+
+
+@_counted("emcy_communication", "EMCY of communication (81xxh, 82xxh)", _cycles(2))
+def _emcy_communication(seen: Seen) -> int:
+    return seen.watch.communication
+
+
+# PDOs
+
+
+@_counted("pdo_missed", "TPDO of a drive missed, late, twice, malformed or impossible", _cycles(1))
+def _pdo_missed(seen: Seen) -> int:
+    return seen.drives.missed + seen.drives.implausible if seen.drives is not None else 0
+
+
+@_checked("drive_late", "drive late", Reaction.HOLD, lambda limits: (HOLD_CYCLES + 1) * limits.period_ns)
+def _drive_late(seen: Seen) -> NodeError | None:
+    return _not_heard(seen, HOLD_CYCLES, "")
+
+
+@_checked("drive_silent", "drive silent", Reaction.LIFT, lambda limits: (limits.missed_cycles + 2) * limits.period_ns)
+def _drive_silent(seen: Seen) -> NodeError | None:
+    return _not_heard(seen, seen.limits.missed_cycles + 1, "lost: ")
+
+
+def _not_heard(seen: Seen, cycles: int, word: str) -> NodeError | None:
+    """The first drive without a usable TPDO for so many cycles."""
+    ages = seen.measurement.q_age
+    if not any(ages) or max(ages) < cycles:
+        return None
+    assert seen.drives is not None
+    i = next(i for i, age in enumerate(ages) if age >= cycles)
+    return NodeError(seen.drives.axes[i].node_id, f"{word}no usable TPDO for {ages[i]} cycles")
+
+
+@_counted("torn_frame", "tactile frame torn, corrupt or mixed", _frame)
+def _torn_frame(seen: Seen) -> int:
+    return seen.tactile.unusable if seen.tactile is not None else 0
+
+
+@_counted("sync_mismatch", "tactile frame names another SYNC than it followed", _frame)
+def _sync_mismatch(seen: Seen) -> int:
+    return seen.tactile.stale if seen.tactile is not None else 0
+
+
+@_touch(
+    "sensor_stale",
+    "no usable tactile frame",
+    Reaction.RETREAT,
+    lambda limits: (limits.tactile_timeout + limits.tactile_cycles + 1) * limits.period_ns,
+)
+def _sensor_stale(contact: Contact) -> SafetyStop | None:
+    age = contact.tactile_age
+    if age is None or age <= contact.limits.tactile_timeout:
+        return None
+    return SafetyStop(f"no tactile frame for {age} cycles")
+
+
+# the bus
+
+
+@_counted("error_frames", "bus error frames", _cycles(2))
+def _error_frames(seen: Seen) -> int:
+    return seen.counters.error_frames
+
+
+@_counted("frames_dropped", "frames dropped by the kernel or the controller", _cycles(2))
+def _frames_dropped(seen: Seen) -> int:
+    return seen.counters.overruns
+
+
+@_checked("error_passive", "CAN controller error-passive", Reaction.HOLD, _cycles(2), enabling=True)
+def _error_passive(seen: Seen) -> SafetyStop | None:
+    if seen.controller_state is not ControllerState.PASSIVE or seen.passive_ns > HOLD_NS:
+        return None
+    return SafetyStop("CAN controller error-passive")
+
+
+@_checked("error_passive_long", "CAN controller error-passive for 1 s", Reaction.RETREAT, _after(HOLD_NS, 2))
+def _error_passive_long(seen: Seen) -> SafetyStop | None:
+    if seen.passive_ns <= HOLD_NS:
+        return None
+    return SafetyStop(f"CAN controller error-passive for {seen.passive_ns * 1e-9:.1f} s: check termination and cabling")
+
+
+@_checked("bus_off", "CAN controller bus-off", Reaction.STOP, _cycles(2), enabling=True)
+def _bus_off(seen: Seen) -> InterfaceError | None:
+    if seen.controller_state is not ControllerState.BUS_OFF:
+        return None
+    return InterfaceError("CAN controller bus-off: check bit rate, termination and cabling, then restart the interface")
+
+
+_unchecked("interface", "interface removed or down", Reaction.STOP, _cycles(1))
+
+
+# time
+
+
+@_counted("clock_step", "wall clock set", _cycles(2))
+def _clock_step(seen: Seen) -> int:
+    return seen.counters.clock_steps
+
+
+@_checked("overruns", "overrun budget used up", Reaction.RETREAT, _after(HOLD_NS, 2))
+def _overruns(seen: Seen) -> SafetyStop | None:
+    if seen.late_share <= seen.limits.safety.late_share:
+        return None
+    return SafetyStop(
+        f"{100 * seen.late_share:.1f} % of the last second's cycles came more than half a period late,"
+        f" limit {100 * seen.limits.safety.late_share:.0f} %"
+    )
+
+
+# the touch and the arm
+
+
+@_checked("preload", "probe pressed before the run", Reaction.STOP, None, enabling=True)
+def _preload(seen: Seen) -> SafetyStop | None:
+    limits = seen.limits
+    if not limits.tares or seen.preload <= limits.safety.preload_max:
+        return None
+    return SafetyStop(
+        f"the array measures {seen.preload:.2f} N before the run, more than limits.preload_max_n ="
+        f" {limits.safety.preload_max:g}, and its tare takes that for zero: free the probe; if it is free, it was"
+        " pressed until just now, which its array forgets in a minute, or the array's offsets are larger than that"
+    )
+
+
+@_touch("force", "measured force above `limits.force_max_n`", Reaction.RETREAT, _sample)
+def _force(contact: Contact) -> SafetyStop | None:
+    limit = contact.limits.safety.force_max
+    if contact.force <= limit:
+        return None
+    return SafetyStop(f"measured force {contact.force:.2f} N above the limit of {limit:.2f} N")
+
+
+@_touch("force_hidden", "force hidden by a saturated array", Reaction.RETREAT, _hidden)
+def _force_hidden(contact: Contact) -> SafetyStop | None:
+    if contact.hidden_s * 1e9 <= HIDDEN_NS:
+        return None
+    return SafetyStop(
+        f"the array is saturated and no stiffness was felt: the true force is above the {contact.force:.1f} N "
+        "measured; raise sensor.full_scale_kpa or lower task.force_n"
+    )
+
+
+@_touch("off_pad", "contact that runs off the array", Reaction.RETREAT, _hidden)
+def _off_pad(contact: Contact) -> SafetyStop | None:
+    if contact.off_pad_s * 1e9 <= HIDDEN_NS:
+        return None
+    return SafetyStop(
+        f"the contact runs off the edge of the array: the true force is above the {contact.force:.1f} N measured; let"
+        " the pad follow the surface (a smaller task.rolling_share or task.speed_mm_s), or take a smaller probe"
+    )
+
+
+@_touch("contact_lost", "contact lost in a hold", Reaction.RETREAT, _lost)
+def _contact_lost(contact: Contact) -> SafetyStop | None:
+    if contact.path and contact.limits.regain > 0.0:
+        return None
+    return SafetyStop("contact lost") if contact.lost_s * 1e9 > LOST_NS else None
+
+
+@_touch("contact_to_regain", "contact lost in a scan", Reaction.SEARCH, _lost)
+def _contact_to_regain(contact: Contact) -> SafetyStop | None:
+    if not contact.path or contact.lost_s * 1e9 <= LOST_NS:
+        return None
+    return SafetyStop("contact lost")
+
+
+@_touch("contact_not_regained", "lost contact not found again", Reaction.RETREAT, _cycles(1))
+def _contact_not_regained(contact: Contact) -> SafetyStop | None:
+    if contact.searched <= contact.limits.regain:
+        return None
+    return SafetyStop(f"contact lost, and not found again within {contact.limits.regain * 1e3:.1f} mm")
+
+
+@_touch("joint_stop", "joint or workspace limit", Reaction.RETREAT, _cycles(1))
+def _joint_stop(contact: Contact) -> SafetyStop | None:
+    return SafetyStop(contact.limit) if contact.limit is not None else None
+
+
+@_counted("target_speed", "target too far for one cycle", _cycles(1))
+def _target_speed(seen: Seen) -> int:
+    return seen.slowed
+
+
+@_checked("joint_speed", "measured joint motion that no joint can make", Reaction.STOP, _cycles(2), enabling=True)
+def _joint_speed(seen: Seen) -> SafetyStop | None:
+    return SafetyStop(seen.speeding) if seen.speeding is not None else None
+
+
+@_counted("estimator", "shape estimator diverges", _cycles(2))
+def _estimator(seen: Seen) -> int:
+    return seen.restarts
+
+
+# outside
+
+
+_unchecked(
+    "interrupt",
+    "Ctrl-C, SIGTERM, a closed terminal (SIGHUP), an exception in your controller",
+    Reaction.LIFT,
+    _cycles(2),
+)
+
+
+_unchecked(
+    "master_dead",
+    "master dead or killed",
+    Reaction.STOP,
+    lambda limits: limits.missed_cycles * limits.period_ns + limits.period_ns // 2,
+)
+
+
+@_checked("log", "frames cannot be written down (full disk)", Reaction.RETREAT, _cycles(2), enabling=True)
+def _log(seen: Seen) -> ResultsError | None:
+    return ResultsError(seen.log_failure) if seen.log_failure is not None else None
+
+
+CONDITIONS = tuple(_TABLE)
+BY_KEY = {condition.key: condition for condition in CONDITIONS}
+CYCLE_CHECKS = tuple(c for c in CONDITIONS if c.check is not None and not c.touch)
+TOUCH_CHECKS = tuple(c for c in CONDITIONS if c.check is not None and c.touch)
+COUNTERS = tuple((c.key, c.count) for c in CONDITIONS if c.count is not None)
+
+
+def touch_finding(contact: Contact) -> Finding | None:
+    """The first condition of a touch that holds."""
+    for condition in TOUCH_CHECKS:
+        error = condition.check(contact)  # type: ignore[misc]  # TOUCH_CHECKS have one
+        if error is not None:
+            return Finding(condition, error)
+    return None

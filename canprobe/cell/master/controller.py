@@ -1,0 +1,192 @@
+"""What a controller gets and returns in one cycle."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.errors import UsageError
+from canprobe.fieldbus.protocol.tactile import TactileFrame
+
+if TYPE_CHECKING:
+    from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
+
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class TactileSample:
+    """A whole tactile frame with its place in time.
+
+    Attributes:
+        frame: the frame, complete and with the right CRC.
+        t_sample_ns: when the array was sampled, in the time of the cycle.
+        cycle: the cycle whose SYNC triggered it, or the last one before it was sampled.
+        t_sigma_s: standard deviation of that instant, s; 0 where a SYNC triggers the sample.
+    """
+
+    frame: TactileFrame
+    t_sample_ns: int
+    cycle: int
+    t_sigma_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """The state of the cell at one SYNC.
+
+    Attributes:
+        cycle: number of the cycle, from 0.
+        t_ns: time of its SYNC, ns since the first one.
+        q: joint positions at this SYNC (n,), rad or m; None in a scene without an arm.
+        q_age: cycles since the last position report of each joint (n,); 0 everywhere when all TPDOs came.
+        torque_permille: motor torque as reported (n,), NaN for a drive that does not report it; empty where none does.
+        statuswords: CiA 402 statuswords (n,).
+        enabled: every drive is in operation enabled.
+        tactile: a tactile sample that became usable in this cycle, else None. A frame triggered at SYNC k comes in
+            cycle k + 1 at the earliest, on every bus.
+        tactile_age: cycles since the trigger of the newest tactile sample, or since the first SYNC where none has come;
+            None without a sensor.
+    """
+
+    cycle: int
+    t_ns: int
+    q: Vector | None = None
+    q_age: tuple[int, ...] = ()
+    torque_permille: tuple[float, ...] = ()
+    statuswords: tuple[int, ...] = ()
+    enabled: bool = False
+    tactile: TactileSample | None = None
+    tactile_age: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """What a controller returns for one cycle.
+
+    Attributes:
+        q_target: joint positions to reach two cycles later (n,), rad or m; None leaves the drives where they are.
+        done: the controller has finished; the cell is stopped in an orderly way.
+        stop_reason: set to stop the cell for safety, with the reason.
+        columns: named numbers for the log; a controller uses the same names in every cycle.
+        estimate: a new answer of its surface estimator, for observers; None in cycles without one.
+    """
+
+    q_target: Vector | None = None
+    done: bool = False
+    stop_reason: str | None = None
+    columns: dict[str, float | Vector] = field(default_factory=dict)
+    estimate: SurfaceEstimate | None = None
+
+
+def check_command(command: Command, *, arm: bool) -> None:
+    """Check what a controller returned, but for the joint target of an arm: the supervision checks that.
+
+    Args:
+        command: of this cycle.
+        arm: the scene has one.
+
+    Raises:
+        UsageError: a field is of another kind than `Command` says.
+    """
+    if not isinstance(command.done, bool | np.bool_):
+        raise UsageError(f"controller: expected done to be True or False, got {command.done!r}")
+    if command.stop_reason is not None and not (isinstance(command.stop_reason, str) and command.stop_reason.strip()):
+        raise UsageError(f"controller: expected stop_reason to be a text or None, got {command.stop_reason!r}")
+    if not isinstance(command.columns, dict):
+        raise UsageError(f"controller: expected columns to be a dict of numbers by name, got {command.columns!r}")
+    try:  # at once for all names: this is done in every cycle
+        printable = "".join(command.columns).isprintable() and "" not in command.columns
+    except TypeError:
+        printable = False
+    if not printable:
+        raise UsageError(f"controller: expected the names of columns to be printable texts, got {[*command.columns]}")
+    if command.q_target is not None and not arm:
+        raise UsageError(f"controller: expected no q_target in a scene without an arm, got {command.q_target!r}")
+    if command.estimate is not None:
+        from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
+
+        if not isinstance(command.estimate, SurfaceEstimate):
+            raise UsageError(f"controller: expected estimate to be a SurfaceEstimate, got {command.estimate!r}")
+
+
+class Controller:
+    """Base of everything that a cell can run: `step` decides a cycle, the other methods do nothing by default.
+
+    Attributes:
+        lets_go: True: the controller supervises its contact and takes the probe off the object when `retreat` is
+            called. False, the default: the cell does both.
+    """
+
+    lets_go: bool = False
+
+    def step(self, measurement: Measurement) -> Command:
+        """Decide one cycle. Called when its TPDOs are in; the command is sent at once.
+
+        Args:
+            measurement: the state of the cell at the SYNC of this cycle.
+
+        Returns:
+            The joint targets of this cycle, or the end of the run.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no step(measurement)")
+
+    def inspect(self, q: Vector) -> str | None:
+        """Check the joint positions before the drives are enabled.
+
+        Args:
+            q: (n,) positions, rad or m.
+
+        Returns:
+            Why the drives must not be enabled here; None where they may.
+        """
+        return None
+
+    def update(self) -> None:
+        """Do work that the next step needs. Called once a cycle, after the commands of the cycle were sent."""
+
+    def retreat(self, reason: str) -> None:
+        """Take the probe off the object in the next steps, then end with this reason.
+
+        Called once, and only where `lets_go` is True and the condition leaves time for it.
+
+        Args:
+            reason: for `Command.stop_reason`.
+        """
+
+    @property
+    def restarts(self) -> int:
+        """How often the estimator of this controller diverged and started again."""
+        return 0
+
+
+class _Function(Controller):
+    """A plain function as a controller."""
+
+    def __init__(self, step: Callable[[Measurement], Command]) -> None:
+        self._step = step
+
+    def step(self, measurement: Measurement) -> Command:
+        """One cycle."""
+        return self._step(measurement)
+
+
+def as_controller(controller: object) -> Controller:
+    """A controller as it is, or of a function.
+
+    Raises:
+        UsageError: it is neither.
+    """
+    if isinstance(controller, Controller):
+        return controller
+    if callable(controller) and not isinstance(controller, type):
+        return _Function(controller)
+    raise UsageError(
+        f"controller: expected a function of the measurement or a canprobe.Controller, got {controller!r}; derive its"
+        " class: class Mine(canprobe.Controller)"
+    )

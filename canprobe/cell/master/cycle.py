@@ -1,0 +1,351 @@
+"""The cycle: SYNC → collect TPDOs → Measurement → controller → RPDOs → observers."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, MutableSequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from canprobe.cell.master.array import ArrayReceiver
+from canprobe.cell.master.controller import Command, Measurement
+from canprobe.cell.master.drives import DriveGroup
+from canprobe.cell.master.watch import NodeWatch
+from canprobe.cell.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan
+from canprobe.fieldbus.bus.port import Port, TimedFrame, elapsed_ns, send_on
+from canprobe.fieldbus.protocol.frames import NmtState, SyncCounter, pack_heartbeat, pack_sync
+
+# What arrives within one cycle → Measurement. The same for a bus and for a recorded log: no clock, no port.
+
+SYNCS_REMEMBERED = 240
+"""Where the SYNC has no counter."""
+
+
+class Intake:
+    """Routes the PDOs of one cycle to the drives and the sensor, and says what they know together.
+
+    Args:
+        drives, tactile: of the arm and the array; None in a scene without one.
+        sync_overflow: of the SYNC counter (1019h); so many SYNCs are remembered.
+    """
+
+    def __init__(self, drives: DriveGroup | None, tactile: ArrayReceiver | None, sync_overflow: int) -> None:
+        self.drives = drives
+        self.tactile = tactile
+        self.number = -1
+        self._feedback = drives.feedback_ids if drives is not None else frozenset()
+        self._taxels = frozenset(tactile.cob_ids) if tactile is not None else frozenset()
+        self._sync_times: deque[int] = deque(maxlen=sync_overflow)
+        self._sync_stamps: deque[int] = deque(maxlen=sync_overflow)
+
+    def begin(self, number: int, t_ns: int, sync_ns: int) -> None:
+        """A SYNC is out.
+
+        Args:
+            number: of its cycle.
+            t_ns: its deadline, ns since the first one.
+            sync_ns: when it went out, on the clock of the frames.
+        """
+        self.number = number
+        self._sync_times.append(t_ns)
+        self._sync_stamps.append(sync_ns)
+        if self.drives is not None:
+            self.drives.begin(number, sync_ns, t_ns)
+
+    def route(self, frames: list[TimedFrame]) -> list[TimedFrame]:
+        """Take the PDOs among ``frames``; the others are returned."""
+        rest: list[TimedFrame] = []
+        feedback, taxels = self._feedback, self._taxels
+        for frame in frames:
+            can_id, data, t_ns = frame
+            if can_id in feedback:
+                self.drives.push(can_id, data, t_ns)  # type: ignore[union-attr]
+            elif can_id in taxels:
+                self.tactile.push(can_id, data, t_ns)  # type: ignore[union-attr]
+            else:
+                rest.append(frame)
+        return rest
+
+    @property
+    def complete(self) -> bool:
+        """No drive's TPDO of this cycle is outstanding."""
+        return self.drives is None or self.drives.complete
+
+    def end(self) -> None:
+        """The collection window is over: what comes now is late."""
+        if self.drives is not None:
+            self.drives.end_collect()
+
+    def measure(self, counter: int) -> Measurement:
+        """The cell at this SYNC.
+
+        Args:
+            counter: of the SYNC; 0 where it has none.
+        """
+        drives, tactile, times = self.drives, self.tactile, self._sync_times
+        sample = tactile.take(self.number, counter, times, self._sync_stamps) if tactile is not None else None
+        age = self.number - (tactile.newest_cycle or 0) if tactile is not None else None
+        if drives is None:
+            return Measurement(self.number, times[-1], enabled=True, tactile=sample, tactile_age=age)
+        return Measurement(
+            cycle=self.number,
+            t_ns=times[-1],
+            q=drives.joints() if drives.heard_all else None,
+            q_age=drives.ages(),
+            torque_permille=tuple(drives.torque_permille),
+            statuswords=tuple(drives.statuswords),
+            enabled=drives.enabled,
+            tactile=sample,
+            tactile_age=age,
+        )
+
+
+TIMED_CYCLES = 5
+"""The computing time of every fifth cycle is taken: in a virtual machine reading a clock costs as much as sending. What
+comes back every 2, 4 or 16 cycles, as images and answers do, then has its share in the sample."""
+
+
+@dataclass(slots=True)
+class CycleStatistics:
+    """What the cycle counted and timed.
+
+    Attributes:
+        overruns: SYNCs that went out more than half a period late.
+        period_error_ns: of every SYNC behind its deadline.
+        response_ns: from the last TPDO in to the RPDOs out, of every cycle of `TIMED_CYCLES`.
+        compute_ns: the same with what the controller does once the RPDOs are out.
+    """
+
+    overruns: int = 0
+    period_error_ns: MutableSequence[int] = field(default_factory=list)
+    response_ns: MutableSequence[int] = field(default_factory=list)
+    compute_ns: MutableSequence[int] = field(default_factory=list)
+
+    @classmethod
+    def of_last(cls, cycles: int | None) -> CycleStatistics:
+        """With the times of the last cycles only; None for all."""
+        if cycles is None:
+            return cls()
+        return cls(0, deque(maxlen=cycles), deque(maxlen=cycles), deque(maxlen=cycles))
+
+
+class Cycle:
+    """One cycle at a time, on absolute deadlines.
+
+    Args:
+        port: the bus.
+        plan: its times: SYNC, and when TPDOs are looked for until all are in; then they are late.
+        drives, tactile: of the arm and the array; None in a scene without one.
+        watch: sees heartbeats and EMCYs.
+        other: takes all other frames, such as SDO answers.
+        on_arrival: on a clock that goes on by itself: do not wait for the next look once all are in. Before the first
+            look they wake nobody: a real bus brings one after the other, and most are in by then.
+        kept: cycles whose times are kept; None for all.
+    """
+
+    def __init__(
+        self,
+        port: Port,
+        plan: Plan,
+        *,
+        drives: DriveGroup | None,
+        tactile: ArrayReceiver | None,
+        watch: NodeWatch,
+        other: Callable[[list[TimedFrame]], None],
+        on_arrival: bool,
+        kept: int | None = None,
+    ) -> None:
+        self.number = -1
+        self.statistics = CycleStatistics.of_last(kept)
+        self.t_first_ns = port.clock.now_ns() + plan.sync.period_ns
+        self.t_ns = 0
+        self.sync_ns = 0
+        self.late_ns = 0
+        self._heartbeat_ns = 0
+        self._port = port
+        self._period_ns = plan.sync.period_ns
+        self._looks_ns = plan.traffic.budget.looks_ns
+        self._on_arrival = on_arrival
+        self._drives, self._tactile = drives, tactile
+        self._intake = Intake(drives, tactile, plan.sync.overflow or SYNCS_REMEMBERED)
+        self._watch = watch
+        self._other = other
+        self._sync = SyncCounter(plan.sync.overflow)
+        self._deadline = self.t_first_ns
+        self._started_ns = self._sent_ns = 0
+
+    def begin(self) -> Measurement:
+        """Sleep to the deadline, send SYNC, collect the answers."""
+        self._port.clock.sleep_until_ns(self._deadline)
+        counter = self._sync.next()
+        self._send_sync(counter)
+        self.late_ns = late_ns = self.sync_ns - self._deadline
+        self.statistics.period_error_ns.append(late_ns)
+        if late_ns > self._period_ns // 2:
+            self.statistics.overruns += 1
+            self._deadline += late_ns // self._period_ns * self._period_ns
+        self.number += 1
+        self.t_ns = self._deadline - self.t_first_ns
+        self._intake.begin(self.number, self.t_ns, self.sync_ns)
+        self._collect()
+        self._intake.end()
+        self._started_ns = elapsed_ns() if self.number % TIMED_CYCLES == 0 else 0
+        return self._intake.measure(counter or 0)
+
+    def _send_sync(self, counter: int | None) -> None:
+        port = self._port
+        if not port.stamps_arrival:  # the only way to separate what came before the SYNC from what came after it
+            self._route(port.drain())
+        self.sync_ns = port.clock.now_ns()
+        port.send_batch([pack_sync(counter)], self.sync_ns)
+
+    def _collect(self) -> None:
+        port, clock, intake, looks_ns = self._port, self._port.clock, self._intake, self._looks_ns
+        if self._on_arrival and self._drives is not None:
+            self._route(port.drain())  # nodes that go first on this processor have answered by now
+            if not intake.complete:
+                self._collect_on_arrival(self.sync_ns + looks_ns[0], self.sync_ns + looks_ns[-1])
+        else:
+            for look_ns in looks_ns:
+                clock.sleep_until_ns(self.sync_ns + look_ns)
+                self._route(port.drain())
+                if intake.complete:
+                    break
+
+    def _collect_on_arrival(self, first_ns: int, last_ns: int) -> None:
+        """Look at a time, then whenever something comes, until all TPDOs are in or another time is over."""
+        port, clock, intake = self._port, self._port.clock, self._intake
+        clock.sleep_until_ns(first_ns)
+        self._route(port.drain())
+        while not intake.complete and clock.now_ns() < last_ns:
+            port.wait(last_ns)
+            self._route(port.drain())
+
+    def _route(self, frames: list[TimedFrame]) -> None:
+        watch = self._watch
+        rest = [frame for frame in self._intake.route(frames) if not watch.push(*frame)]
+        if rest:
+            self._other(rest)
+
+    def skip(self) -> None:
+        """Let this cycle be: wait for the end of its period."""
+        self._deadline += self._period_ns
+        self._port.clock.sleep_until_ns(self._deadline)
+
+    def end(self, command: Command | None) -> None:
+        """Send the commands of this cycle and set the next deadline."""
+        if self._drives is not None and command is not None:
+            self._drives.set_target(command.q_target)
+        self._send_commands()
+        self._sent_ns = elapsed_ns() if self._started_ns else 0
+        self._deadline += self._period_ns
+
+    def _send_commands(self) -> None:
+        frames = self._drives.frames() if self._drives is not None else []
+        if self.sync_ns >= self._heartbeat_ns:
+            self._heartbeat_ns = self._deadline + HEARTBEAT_PRODUCED_MS * 1_000_000
+            frames.append(pack_heartbeat(MASTER_NODE_ID, NmtState.OPERATIONAL))
+        if frames:
+            self._port.send_batch(frames)
+        if self._tactile is not None and (requests := self._tactile.requests(self.number)):
+            send_on(self._port, self._tactile.channel, requests)
+
+    def count_work(self) -> None:
+        """The controller has done all that it does in this cycle."""
+        if self._started_ns:
+            self.statistics.response_ns.append(self._sent_ns - self._started_ns)
+            self.statistics.compute_ns.append(elapsed_ns() - self._started_ns)
+
+
+# Observers of a cell: what they see of every cycle after its work is done, and why they cannot harm it.
+
+MOST_FRAMES = 100_000
+"""Frames that are kept for the next observation: bring-up has a few thousand and no cycle."""
+COSTS_KEPT = 100_000
+"""Costs that are kept: a cell may stay up for days."""
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """One cycle as an observer sees it, once its commands are on the bus.
+
+    Attributes:
+        t_ns: deadline of its SYNC on the run's clock, ns, as in `bus.log`. A time of the cycle's own, such as
+            `measurement.t_ns` or a tactile sample's, is on this clock with `t_ns - measurement.t_ns` added.
+        measurement: what the controller got; None where there are frames alone, at bring-up and after the last cycle.
+        command: what the controller returned; None while the drives are enabled and stopped.
+        frames: what was on the bus since the last observation, (can_id, data, t_ns).
+    """
+
+    t_ns: int
+    measurement: Measurement | None
+    command: Command | None
+    frames: list[TimedFrame]
+
+
+class Observer(Protocol):
+    """Anything with ``observe(observation)``; a plain function will do as well."""
+
+    def observe(self, observation: Observation) -> None:
+        """Take one observation, quickly: the next SYNC is waiting."""
+
+
+class Observers:
+    """Calls every observer after each cycle. One that raises is not called again; the cell goes on.
+
+    Args:
+        observers: whom to call.
+
+    Attributes:
+        origin_ns: where the run's clock is 0, on the clock of the frames.
+        cost_ns: what all of them took together, every ``TIMED_CYCLES`` cycles.
+        faults: those that failed, one line each.
+    """
+
+    def __init__(self, observers: Iterable[Observer | Callable[[Observation], None]]) -> None:
+        self.origin_ns = 0
+        self.cost_ns: deque[int] = deque(maxlen=COSTS_KEPT)
+        self.faults: list[str] = []
+        self._calls = [one.observe if hasattr(one, "observe") else one for one in observers]
+        self._frames: list[TimedFrame] = []
+
+    def tap(self, write: Callable[[int, bytes, int], None]) -> Callable[[int, bytes, int], None]:
+        """A recorder of frames that passes them on to ``write``."""
+
+        def both(can_id: int, data: bytes, t_ns: int) -> None:
+            write(can_id, data, t_ns)
+            frames = self._frames
+            if len(frames) < MOST_FRAMES:
+                frames.append((can_id, data, t_ns - self.origin_ns))
+
+        return both
+
+    def cycle(self, start_ns: int, measurement: Measurement, command: Command | None) -> None:
+        """A cycle is over.
+
+        Args:
+            start_ns: deadline of the first SYNC, on the run's clock.
+            measurement: of the cycle.
+            command: of the cycle; None without a controller.
+        """
+        timed = measurement.cycle % TIMED_CYCLES == 0
+        started_ns = elapsed_ns() if timed else 0
+        frames, self._frames = self._frames, []
+        self._call(Observation(start_ns + measurement.t_ns, measurement, command, frames))
+        if timed:
+            self.cost_ns.append(elapsed_ns() - started_ns)
+
+    def frames_alone(self, t_ns: int) -> None:
+        """Hand over what was on the bus where there is no cycle, at ``t_ns`` on the clock of the frames."""
+        frames, self._frames = self._frames, []
+        if frames:
+            self._call(Observation(t_ns - self.origin_ns, None, None, frames))
+
+    def _call(self, observation: Observation) -> None:
+        for call in tuple(self._calls):
+            try:
+                call(observation)
+            except Exception as error:  # whoever only watches must not stop the cell; the fault is in the summary
+                self._calls.remove(call)
+                name = getattr(call, "__qualname__", type(call).__name__)
+                self.faults.append(f"observer {name} failed and is not called any more: {error!r}")

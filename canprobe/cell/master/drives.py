@@ -1,0 +1,581 @@
+"""The drives as one: TPDOs in and joint positions out, targets in and RPDOs out.
+
+The drives hold *motor* positions; gears and couplings are undone here and nowhere else.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from math import copysign
+from operator import itemgetter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.planning.operation import TARGETS, Place
+from canprobe.errors import ProtocolError
+from canprobe.fieldbus.protocol.cia402 import (
+    ENABLE_INTERPOLATION,
+    DriveState,
+    OperationMode,
+    controlword_toward,
+    describe_state,
+    known_state,
+)
+from canprobe.fieldbus.protocol.frames import Frame
+from canprobe.fieldbus.protocol.pdo import PdoEntry, PdoLayout
+from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_per_motor, units_to_joints
+
+# The position of one motor as its TPDOs report it: what it can have reached, and where it is when one is missing.
+
+REST_NS = 12_500_000
+"""Time without a motion after which a drive is at rest."""
+REST_RAD = 1e-3
+"""Of a joint: what a report may be off by, whatever the motion, and within which a drive at rest stays."""
+REST_COUNTS_LEAST = 8
+"""The same of a coarse encoder, which has a count or two a milliradian: it dithers, and its drive starts in steps."""
+CARRIED_CYCLES = 3
+"""Periods for which a motion is carried on without a report. After a late cycle too: a drive that gets no new target
+stops at its last one, however long the cycle lasts."""
+FOLLOWED_CYCLES = 20
+"""Periods within which a drive has followed its target."""
+_FORGET = 0.9
+"""Share of the largest step of the target that still counts one period later: an eighth after `FOLLOWED_CYCLES`."""
+PERIOD_NS = 2_500_000
+"""Of a cycle at 400 Hz."""
+
+
+class PositionTrack:
+    """Positions of one motor, counts, and its rate.
+
+    A drive cannot change its speed within a cycle by more than its own speed and what its target asks for together, and
+    an enabled one is no faster than its target. Without the second, wrong reports, each believed for the last, would
+    make up a motion that grows from nothing.
+
+    Args:
+        base: what a report may be off by, whatever the motion, counts: see `rest_counts`.
+        period_ns: of the cycle. A late cycle lasts many periods: all bounds are times.
+
+    Attributes:
+        counts: the last position that was believed.
+        cycle: of that position; −1 before the first.
+        rested_ns: how long the reports have stayed within ``base`` of the first of them.
+    """
+
+    __slots__ = (
+        "_asked",
+        "_base",
+        "_heard",
+        "_period_ns",
+        "_periods",
+        "_rate",
+        "_still",
+        "_still_ns",
+        "_t_ns",
+        "_way",
+        "counts",
+        "cycle",
+        "rested_ns",
+    )
+
+    def __init__(self, base: float, period_ns: int = PERIOD_NS) -> None:
+        self.counts = 0
+        self.cycle = -1
+        self.rested_ns = 0
+        self._base = base
+        self._period_ns = period_ns
+        self._still: int | None = None
+        self._still_ns = 0
+        self._t_ns = 0
+        self._rate = 0.0  # counts per ns
+        self._asked = 0.0  # counts per period
+        self._heard = False  # since the target moved on
+        self._way, self._periods = 0.0, 0.0  # what was asked since the last report, up to the last target; counts
+
+    def aim(self, step_counts: float, periods: float = 1.0) -> None:
+        """The target moves on by this much, so many periods after it did so last."""
+        if not self._heard:
+            self._way += self._followed(periods)
+            self._periods += periods
+        self._heard = False
+        faded = _FORGET**periods * self._asked
+        self._asked = step_counts if step_counts > faded else faded
+
+    def take(self, counts: int, cycle: int, t_ns: int, *, guarded: bool) -> bool:
+        """Take a report.
+
+        Args:
+            counts: the position.
+            cycle: of the SYNC at which it was sampled.
+            t_ns: that SYNC's deadline.
+            guarded: the drive is enabled, so that it can only be where it can have gone.
+
+        Returns:
+            Whether it is believed.
+        """
+        if self._still is None or abs(counts - self._still) > self._base:
+            self._still, self._still_ns = counts, t_ns
+        self.rested_ns = t_ns - self._still_ns
+        if self.cycle >= 0:
+            step, passed_ns = counts - self.counts, t_ns - self._t_ns
+            moved: float = step
+            if guarded:
+                carried = self._carried(passed_ns)
+                asked = self._way + self._followed(passed_ns / self._period_ns - self._periods)
+                if abs(step - carried) > self._base + abs(carried) + asked:
+                    return False
+                moved = step if abs(step) <= asked else copysign(asked, step)
+            if passed_ns > 0:
+                self._rate = moved / passed_ns
+        self.counts, self.cycle, self._t_ns = counts, cycle, t_ns
+        self._heard, self._way, self._periods = True, 0.0, 0.0
+        return True
+
+    def position(self, cycle: int, t_ns: int) -> float:
+        """Where the motor is at a SYNC: as reported, or carried on by its rate for a bounded time."""
+        if cycle <= self.cycle or self.cycle < 0:
+            return float(self.counts)
+        return self.counts + self._carried(t_ns - self._t_ns)
+
+    def _followed(self, periods: float) -> float:
+        """How far a drive can have followed its last targets after so many periods, counts."""
+        return min(periods, FOLLOWED_CYCLES) * self._asked
+
+    def _carried(self, passed_ns: int) -> float:
+        """How far the motion has gone on since the last report, counts, as far as that can be said."""
+        return self._rate * min(passed_ns, CARRIED_CYCLES * self._period_ns)
+
+
+def rest_counts(model: ArmModel) -> list[float]:
+    """A milliradian (0.2 mm) of each drive's joint in its units: more than encoders are noisy, less than a motion."""
+    counts = np.abs(units_per_motor(model)) * model.radian * REST_RAD
+    return np.maximum(counts, REST_COUNTS_LEAST).tolist()  # type: ignore[no-any-return]
+
+
+# The drives as one thing: TPDOs in, joint positions out; joint targets in, RPDOs out.
+
+Vector = NDArray[np.float64]
+SYNCHRONOUS_MAX = 240
+"""Highest transmission type that follows SYNC; above it an RPDO is sent on change and again every so often."""
+COMMAND_REPEAT_NS = 100_000_000
+_FEEDBACK: tuple[Place, ...] = ((0x6041, 0), (0x6064, 0), (0x6077, 0))
+_TARGETS = frozenset(TARGETS.values())
+CONTROLWORD, TARGET, CONSTANT = range(3)
+"""What a value of a command is."""
+_QUICK_STOP, _DISABLE_VOLTAGE = 0x0002, 0x0000
+_STATE_BITS, _ENABLED = 0x6F, DriveState.OPERATION_ENABLED.value
+"""Of a statusword of operation enabled; see `known_state` for the other states."""
+
+
+@dataclass(frozen=True, slots=True)
+class DriveAxis:
+    """One drive's place on the bus.
+
+    Attributes:
+        node_id: the node.
+        feedback: layouts of its TPDOs, which between them have statusword, position (counts) and, where the drive can
+            send it, torque (permille). What else they have is not read.
+        commands: layouts of its RPDOs, which between them map controlword and target position (counts). Drives whose
+            RPDOs share a COB-ID (the foreign half a dummy) get one frame together.
+        mode: of operation.
+        constants: what entries of the RPDOs hold that are neither, by (index, sub-index).
+    """
+
+    node_id: int
+    feedback: tuple[PdoLayout, ...]
+    commands: tuple[PdoLayout, ...]
+    mode: int = OperationMode.CYCLIC_SYNC_POSITION
+    constants: Mapping[Place, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class FeedbackFrame:
+    """One TPDO frame of a drive.
+
+    Attributes:
+        axis: of the drive, from 0.
+        layout: of the frame; longer ones are taken too.
+        word, counts, torque: which of its values statusword, position and torque are; None: another TPDO has them.
+    """
+
+    axis: int
+    layout: PdoLayout
+    word: int | None
+    counts: int | None
+    torque: int | None
+
+    def unpack(self, data: bytes) -> tuple[int, ...]:
+        """Its values; what is beyond the mapping is not read.
+
+        Raises:
+            ProtocolError: it is too short.
+        """
+        layout = self.layout
+        if len(data) == layout.length:
+            return layout.raw_unpack(data)
+        return layout.unpack(data[: layout.length])
+
+
+def feedback_frames(axes: Sequence[DriveAxis]) -> tuple[FeedbackFrame, ...]:
+    """The TPDO frames that the drives send between them."""
+    frames = []
+    for i, axis in enumerate(axes):
+        taken: set[Place] = set()
+        for layout in axis.feedback:
+            places = [(entry.index, entry.subindex) for entry in layout.signals]
+            own = [None if p in taken or p not in places else places.index(p) for p in _FEEDBACK]
+            taken.update(places)
+            frames.append(FeedbackFrame(i, layout, *own))
+    return tuple(frames)
+
+
+DriveCommand = tuple[int, list[Callable[..., bytes]], list[tuple[int, ...]]]
+"""One RPDO: COB-ID, what packs each part of it, and the values of each part; see `CommandFrame`."""
+
+
+@dataclass(frozen=True, slots=True)
+class CommandFrame:
+    """One RPDO frame.
+
+    Attributes:
+        cob_id: of the frame.
+        every_cycle: it goes in every cycle; False: on change.
+        parts: who has a part in it: axis, layout, and what each of its values is: `CONTROLWORD`, `TARGET`, `CONSTANT`.
+    """
+
+    cob_id: int
+    every_cycle: bool
+    parts: tuple[tuple[int, PdoLayout, tuple[int, ...]], ...]
+
+
+def command_frames(axes: tuple[DriveAxis, ...]) -> tuple[CommandFrame, ...]:
+    """The RPDO frames that the drives take between them, by COB-ID."""
+    parts: dict[int, list[tuple[int, PdoLayout, tuple[int, ...]]]] = {}
+    for i, axis in enumerate(axes):
+        for layout in axis.commands:
+            picks = tuple(map(_pick, layout.signals))
+            parts.setdefault(layout.cob_id, []).append((i, layout, picks))
+    return tuple(
+        CommandFrame(cob_id, group[0][1].transmission_type <= SYNCHRONOUS_MAX, tuple(group))
+        for cob_id, group in sorted(parts.items())
+    )
+
+
+def _pick(entry: PdoEntry) -> int:
+    place = entry.index, entry.subindex
+    return CONTROLWORD if place == (0x6040, 0) else TARGET if place in _TARGETS else CONSTANT
+
+
+class DriveGroup:
+    """State of the arm's CiA 402 drives in cyclic synchronous or interpolated position mode.
+
+    No RPDO goes to a drive before its position is known: the first target is where it is.
+
+    Args:
+        axes: the drives, joint 1 first.
+        model: the arm, for drive units ↔ joint positions.
+        repeat_cycles: after how many cycles an event-driven RPDO is sent again without a change.
+        period_ns: of the cycle.
+
+    Attributes:
+        torque_permille: of each drive, NaN for one whose TPDO has no torque; empty where none has.
+        late, missed, malformed: TPDOs that were not used, or not there.
+        lateness_ns: time of the last late TPDO of each drive behind its SYNC, ns.
+        answer_ns: from the SYNC to the last TPDO that was used.
+        stopped: node ids of drives that stop while the others go on.
+    """
+
+    def __init__(
+        self, axes: tuple[DriveAxis, ...], model: ArmModel, repeat_cycles: int = 40, period_ns: int = PERIOD_NS
+    ) -> None:
+        self.axes = axes
+        self.goal = DriveState.OPERATION_ENABLED
+        self.statuswords = [0] * len(axes)
+        sources = feedback_frames(axes)
+        with_torque = [any(one.torque is not None for one in sources if one.axis == i) for i in range(len(axes))]
+        self.torque_permille = [0 if sent else math.nan for sent in with_torque] if any(with_torque) else []
+        self.late = 0
+        self.lateness_ns = dict.fromkeys(range(len(axes)), 0)
+        self.missed = 0
+        self.malformed = 0
+        self.answer_ns = 0
+        self.implausible = 0
+        self.stopped: frozenset[int] = frozenset()
+        self._model = model
+        self._sources = {one.layout.cob_id: (k, one) for k, one in enumerate(sources)}
+        self._tracks = tuple([PositionTrack(base, period_ns) for base in rest_counts(model)])
+        self._period_ns = period_ns
+        self._deadline_ns = self._aimed_ns = 0
+        self._heard = [-1] * len(sources)
+        self._all_heard = False
+        self._targets: list[int] | None = None
+        self._aimed: tuple[int, ...] | None = None
+        self._words = [0] * len(axes)
+        self._constants: list[int] = []
+        self._interpolated = [axis.mode == OperationMode.INTERPOLATED_POSITION for axis in axes]
+        self._steady: tuple[object, ...] | None = None
+        self._plan = [
+            (
+                frame.cob_id,
+                frame.every_cycle,
+                [layout.pack for _, layout, _ in frame.parts],
+                [_fetcher(self._places_of(axis, layout, picks)) for axis, layout, picks in frame.parts],
+                tuple(axis for axis, _, _ in frame.parts),
+            )
+            for frame in command_frames(axes)
+        ]
+        self._sent: dict[int, tuple[list[tuple[int, ...]], int]] = {}
+        self._repeat = repeat_cycles
+        self._pending = 0
+        self._open = False
+        self._cycle = -1
+        self._sync_ns = self._sync_before_ns = 0
+
+    def _places_of(self, axis: int, layout: PdoLayout, picks: tuple[int, ...]) -> list[int]:
+        """Where each value of a part stands in controlwords, targets and constants, one after another."""
+        places, n = [], len(self.axes)
+        for entry, pick in zip(layout.signals, picks, strict=True):
+            if pick == CONSTANT:
+                places.append(2 * n + len(self._constants))
+                self._constants.append(self.axes[axis].constants[entry.index, entry.subindex])
+            else:
+                places.append(axis + pick * n)
+        return places
+
+    @property
+    def feedback_ids(self) -> frozenset[int]:
+        """COB-IDs of the TPDOs that belong to the group."""
+        return frozenset(self._sources)
+
+    def begin(self, cycle: int, t_ns: int = 0, deadline_ns: int | None = None) -> None:
+        """A new SYNC is out, at ``t_ns``, meant for ``deadline_ns``: every TPDO is expected once more."""
+        self._cycle = cycle
+        self._deadline_ns = t_ns if deadline_ns is None else deadline_ns
+        self._sync_before_ns, self._sync_ns = self._sync_ns, t_ns
+        self._pending = len(self._heard)
+        self._open = True
+
+    @property
+    def complete(self) -> bool:
+        """Every TPDO of this cycle is in."""
+        return self._pending == 0
+
+    def push(self, can_id: int, data: bytes, t_ns: int = 0) -> None:
+        """Take one TPDO that arrived at ``t_ns``.
+
+        One from before the SYNC or after the collection window, or a second one for a SYNC, is late and not used; nor
+        is a shorter one. The position of one that an enabled drive cannot have reached is not used.
+        """
+        k, source = self._sources[can_id]
+        if not self._open or t_ns < self._sync_ns or self._heard[k] == self._cycle:
+            self.late += 1
+            self.lateness_ns[source.axis] = t_ns - (self._sync_ns if t_ns >= self._sync_ns else self._sync_before_ns)
+            return
+        try:
+            values = source.unpack(data)
+        except ProtocolError:
+            self.malformed += 1  # and missed, unless another one comes
+            return
+        self.take(can_id, values, t_ns)
+
+    def take(self, cob_id: int, values: tuple[int, ...], t_ns: int) -> None:
+        """The values of one TPDO at `t_ns`, the first of it for its SYNC; TPDOs of others are not read."""
+        if (found := self._sources.get(cob_id)) is None:
+            return
+        k, source = found
+        i = source.axis
+        self._heard[k] = self._cycle
+        self._pending -= 1
+        self.answer_ns = t_ns - self._sync_ns
+        if source.torque is not None:
+            self.torque_permille[i] = values[source.torque]
+        enabled = self.statuswords[i] & _STATE_BITS == _ENABLED
+        if source.word is not None:
+            word = self.statuswords[i] = values[source.word]
+            enabled = enabled and word & _STATE_BITS == _ENABLED
+        if source.counts is None:
+            return
+        counts = values[source.counts]
+        guarded = enabled and self._aimed is not None  # a log without targets does not say where it was to go
+        if not self._tracks[i].take(counts, self._cycle, self._deadline_ns, guarded=guarded):
+            self.implausible += 1
+
+    def end_collect(self) -> None:
+        """The collection window of this cycle is over: what is not in is missed."""
+        self.missed += self._pending
+        self._open = False
+
+    @property
+    def heard_all(self) -> bool:
+        """Every drive was heard at least once."""
+        self._all_heard = self._all_heard or min(self._heard) >= 0
+        return self._all_heard
+
+    def ages(self) -> tuple[int, ...]:
+        """Cycles since each drive last reported a position that can be believed."""
+        return tuple([self._cycle - track.cycle for track in self._tracks])
+
+    @property
+    def rests(self) -> tuple[bool, ...]:
+        """Whether each drive has reported the same position for a while."""
+        return tuple([track.rested_ns >= REST_NS for track in self._tracks])
+
+    def joints(self) -> Vector:
+        """Joint positions (n,), rad or m, at this SYNC; where a report is missing, carried on for a short time."""
+        now, now_ns = self._cycle, self._deadline_ns
+        counts = [t.counts if t.cycle == now else t.position(now, now_ns) for t in self._tracks]
+        q = units_to_joints(self._model, counts)
+        q.flags.writeable = False  # it goes into the log as it was measured, whatever a controller does with it
+        return q
+
+    @property
+    def states(self) -> tuple[DriveState | None, ...]:
+        """CiA 402 state of each drive, from its last statusword; None where that is a word of no state."""
+        return tuple([known_state(word) for word in self.statuswords])
+
+    def first_not_in(self, state: DriveState) -> tuple[int, str]:
+        """The first drive that is not in a state: which one, from 0, and what it is instead."""
+        i = next(i for i, other in enumerate(self.states) if other is not state)
+        return i, describe_state(self.statuswords[i])
+
+    @property
+    def enabled(self) -> bool:
+        """Every drive reports operation enabled."""
+        if all([word & _STATE_BITS == _ENABLED for word in self.statuswords]):
+            return True  # as in every cycle of operation
+        return self.all_in(DriveState.OPERATION_ENABLED)
+
+    def enabled_ones(self) -> tuple[bool, ...]:
+        """Whether each drive reported operation enabled last."""
+        return tuple([word & _STATE_BITS == _ENABLED for word in self.statuswords])
+
+    @property
+    def disbelieved(self) -> bool:
+        """A drive reported last a position that it cannot have reached."""
+        positions = [(k, source.axis) for k, source in self._sources.values() if source.counts is not None]
+        return any(self._heard[k] > self._tracks[axis].cycle for k, axis in positions)
+
+    def all_in(self, *states: DriveState) -> bool:
+        """Every drive is in one of ``states``."""
+        return all(state in states for state in self.states)
+
+    def set_target(self, q: Vector | None) -> None:
+        """Joint target (n,), rad or m, of the next RPDOs; None holds the last one."""
+        if q is not None:
+            self._targets = [round(c) for c in joints_to_units(self._model, q).tolist()]
+
+    def targets(self) -> Vector:
+        """Where the motors were sent last (n,), counts; where they are, before they were sent anywhere."""
+        targets = self._targets if self._targets is not None else [track.counts for track in self._tracks]
+        return np.array(targets, dtype=float)
+
+    def aim(self, targets: Sequence[int]) -> None:
+        """The drives get `targets` (counts) in this cycle, which bound what they may do next."""
+        before, periods = self._aimed, max((self._deadline_ns - self._aimed_ns) / self._period_ns, 1.0)
+        if before is None:
+            before, periods = tuple([track.counts for track in self._tracks]), 1.0
+        for track, target, last in zip(self._tracks, targets, before, strict=True):
+            track.aim(abs(target - last), periods)
+        self._aimed, self._aimed_ns = tuple(targets), self._deadline_ns
+
+    def frames(self) -> list[Frame]:
+        """The RPDOs of this cycle, as `commands`, packed."""
+        frames = []
+        for cob_id, packs, parts in self.commands():
+            data = packs[0](*parts[0])
+            if len(parts) > 1:
+                for pack, values in zip(packs[1:], parts[1:], strict=True):
+                    data = _overlaid(data, pack(*values))
+            frames.append((cob_id, data))
+        return frames
+
+    def commands(self) -> list[DriveCommand]:
+        """The RPDOs of this cycle.
+
+        Until a target is set, the target of a drive is its reported position. A drive that was never heard gets none.
+        """
+        targets = self._targets if self._targets is not None else [track.counts for track in self._tracks]
+        self.aim(targets)
+        key = (self.goal, self.stopped, *self.statuswords)
+        if key != self._steady:  # in operation neither goal nor statuswords change, so neither do the controlwords
+            goals = [self._goal_of(axis.node_id) for axis in self.axes]
+            words = list(map(_controlword, self.states, goals, self._words, self._interpolated))
+            self._steady = key if words == self._words else None
+            self._words = words
+        values = [*self._words, *targets, *self._constants]  # an axis and its pick name the place
+        heard_all = self.heard_all
+        commands = []
+        for cob_id, every_cycle, packs, fetches, axes in self._plan:
+            if not heard_all and any(self._tracks[axis].cycle < 0 for axis in axes):
+                continue
+            parts = [fetch(values) for fetch in fetches]
+            if every_cycle or self._due(cob_id, parts):
+                commands.append((cob_id, packs, parts))
+        return commands
+
+    def _goal_of(self, node_id: int) -> DriveState:
+        held_back = node_id in self.stopped and self.goal is DriveState.OPERATION_ENABLED
+        return DriveState.QUICK_STOP_ACTIVE if held_back else self.goal
+
+    def _due(self, cob_id: int, parts: list[tuple[int, ...]]) -> bool:
+        """An event-driven frame goes on a change, and again before its receiver's event timer runs out."""
+        sent, cycle = self._sent.get(cob_id, ([], 0))
+        if parts == sent and self._cycle - cycle < self._repeat:
+            return False
+        self._sent[cob_id] = (parts, self._cycle)
+        return True
+
+
+def _controlword(state: DriveState | None, goal: DriveState, previous: int, interpolated: bool) -> int:
+    """The controlword for a drive; one in an unknown state is stopped, which is right in every state.
+
+    In interpolated position bit 4 lets an enabled drive follow its targets.
+    """
+    if state is None:
+        return _QUICK_STOP if goal is not DriveState.SWITCH_ON_DISABLED else _DISABLE_VOLTAGE
+    word = controlword_toward(state, goal, previous)
+    follows = interpolated and state is goal is DriveState.OPERATION_ENABLED
+    return word | 1 << ENABLE_INTERPOLATION if follows else word
+
+
+def _fetcher(places: Sequence[int]) -> Callable[[Sequence[int]], tuple[int, ...]]:
+    """All of these places at once, by one call into C."""
+    if len(places) == 1:
+        return lambda values, place=places[0]: (values[place],)  # type: ignore[misc]
+    return itemgetter(*places)
+
+
+def _overlaid(data: bytes, part: bytes) -> bytes:
+    """One frame for two drives: each leaves zeros where the other's values are."""
+    return (int.from_bytes(data, "little") | int.from_bytes(part, "little")).to_bytes(len(data), "little")
+
+
+def make_drives(plan: Plan) -> DriveGroup | None:
+    """The plan's drives as one; None without an arm."""
+    arm = plan.setup.arm
+    if arm is None:
+        return None
+    period_ns = plan.sync.period_ns
+    return DriveGroup(drive_axes(plan), arm.model, max(1, COMMAND_REPEAT_NS // period_ns), period_ns)
+
+
+def drive_axes(plan: Plan) -> tuple[DriveAxis, ...]:
+    """The places of the plan's drives on the bus, joint by joint; none without an arm."""
+    modes = {node.node_id: node.mode for node in plan.nodes}
+    axes = []
+    for node_id in plan.setup.arm.node_ids if plan.setup.arm is not None else ():
+        rpdos, mode = plan.pdos_of(node_id, "rpdo"), modes[node_id]
+        assert mode is not None
+        axes.append(
+            DriveAxis(
+                node_id,
+                feedback=tuple(pdo.layout for pdo in plan.pdos_of(node_id, "tpdo")),
+                commands=tuple(pdo.layout for pdo in rpdos),
+                mode=mode,
+                constants={place: value for pdo in rpdos for place, value in pdo.constants},
+            )
+        )
+    return tuple(axes)

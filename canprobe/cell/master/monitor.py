@@ -1,0 +1,262 @@
+"""What a bus says about a cell, from listening alone: nodes, joints, touch, load and the steadiness of SYNC. Pure."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.master.array import make_tactile, patch_from
+from canprobe.cell.master.controller import TactileSample
+from canprobe.cell.master.drives import drive_axes, feedback_frames
+from canprobe.cell.planning.model import MASTER_NODE_ID, Plan
+from canprobe.errors import ProtocolError
+from canprobe.fieldbus.bus.port import TimedFrame
+from canprobe.fieldbus.protocol.cia402 import describe_state
+from canprobe.fieldbus.protocol.frame_bits import best_case_bits, best_case_fd_bits
+from canprobe.fieldbus.protocol.frames import (
+    EMCY_BASE,
+    HEARTBEAT_BASE,
+    SYNC_ID,
+    Emcy,
+    describe,
+    is_no_error,
+    unpack_heartbeat,
+)
+from canprobe.mechanics.robot.model import units_to_joints
+
+SECOND_NS = 1_000_000_000
+CLASSIC_BYTES = 8
+
+
+@dataclass(slots=True)
+class NodeView:
+    """One node as its frames show it.
+
+    Attributes:
+        node_id, role: which.
+        state: NMT state of its last heartbeat; None before the first.
+        heard_s: time since that heartbeat, s; None before the first.
+        drive: CiA 402 state of its last statusword; None of a sensor or before the first.
+        emcy: its last emergency in words; None without one or after its end.
+    """
+
+    node_id: int
+    role: str
+    state: str | None = None
+    heard_s: float | None = None
+    drive: str | None = None
+    emcy: str | None = None
+
+
+@dataclass(slots=True, eq=False)
+class CellView:
+    """The cell at one instant; what was not received is None.
+
+    Attributes:
+        channel: of the bus, or buses.
+        t_s: since the first frame, s.
+        nodes: ascending node ids, the master's heartbeat last.
+        q: joint positions (n,), deg or mm.
+        units: of each of them.
+        force_n: of the last whole tactile frame, N.
+        taxels: (rows, columns) counts of that frame.
+        frames_per_s: of the last second, on all buses.
+        load: of the last second, by channel; without stuff bits, as a share of the bit rate.
+        sync_hz: of the last second.
+        sync_jitter_us: 99th percentile and largest distance of a SYNC interval from the planned one, µs.
+        torn_frames: tactile frames that were not whole.
+    """
+
+    channel: str
+    t_s: float = 0.0
+    nodes: list[NodeView] = field(default_factory=list)
+    q: list[float] | None = None
+    units: tuple[str, ...] = ()
+    force_n: float | None = None
+    taxels: NDArray[np.uint8] | None = None
+    frames_per_s: float = 0.0
+    load: dict[str, float] = field(default_factory=dict)
+    sync_hz: float = 0.0
+    sync_jitter_us: tuple[float, float] | None = None
+    torn_frames: int = 0
+
+    def as_document(self) -> dict[str, Any]:
+        """For `--json`."""
+        document = asdict(self)
+        document["taxels"] = self.taxels.tolist() if self.taxels is not None else None
+        return document
+
+
+class Monitor:
+    """Listens to the frames of a plan's nodes.
+
+    Args:
+        plan: what is on the bus.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        self._plan = plan
+        channels = [bus.channel for bus in plan.buses]
+        self._view = CellView("+".join(channels))
+        self._speed_up = plan.setup.bus.data_bitrate / plan.setup.bus.bitrate
+        roles = {node.node_id: node.role for node in plan.nodes} | {MASTER_NODE_ID: "master"}
+        self._nodes = {node_id: NodeView(node_id, role) for node_id, role in roles.items()}
+        arm = plan.setup.arm
+        self._model = arm.model if arm is not None else None
+        axes = drive_axes(plan)
+        self._feedback = {one.layout.cob_id: (axes[one.axis].node_id, one) for one in feedback_frames(axes)}
+        self._counts: list[int | None] = [None] * len(axes)
+        self._tactile = make_tactile(plan)
+        self._patch_from = patch_from(plan.setup)
+        self._heard: dict[int, int] = {}
+        self._first_ns: int | None = None
+        self._recent: dict[str, deque[tuple[int, float]]] = {channel: deque() for channel in channels}
+        self._syncs: deque[int] = deque()
+
+    def push(self, frames: Iterable[TimedFrame], channel: str | None = None) -> None:
+        """Take what was on one bus; by default the first, whose SYNC is the one that is timed: all of them have it."""
+        first = next(iter(self._recent))
+        recent = self._recent[first if channel is None else channel]
+        timed = recent is self._recent[first]
+        for can_id, data, t_ns in frames:
+            if self._first_ns is None:
+                self._first_ns = t_ns
+            recent.append((t_ns, self._bits(len(data))))
+            if can_id != SYNC_ID:
+                self._take(can_id, data, t_ns)
+            elif timed:
+                self._syncs.append(t_ns)
+
+    def _bits(self, length: int) -> float:
+        """Of a frame, those of a data phase as bits of the nominal rate."""
+        if length <= CLASSIC_BYTES:
+            return best_case_bits(length)
+        bits = best_case_fd_bits(length)
+        return bits.nominal + bits.data / self._speed_up
+
+    def _take(self, can_id: int, data: bytes, t_ns: int) -> None:
+        node = self._nodes.get(can_id & 0x7F)
+        if can_id in self._feedback:
+            self._take_feedback(can_id, data)
+        elif self._tactile is not None and can_id in self._tactile.cob_ids:
+            self._take_taxels(can_id, data, t_ns)
+        elif node is not None and can_id == HEARTBEAT_BASE + node.node_id:
+            self._take_heartbeat(node, data, t_ns)
+        elif node is not None and can_id == EMCY_BASE + node.node_id and len(data) == CLASSIC_BYTES:
+            emcy = Emcy.unpack(data)
+            node.emcy = None if is_no_error(emcy.code) else f"{emcy.code:04X}h, {describe(emcy.code)}"
+
+    def _take_feedback(self, can_id: int, data: bytes) -> None:
+        node_id, frame = self._feedback[can_id]
+        try:
+            values = frame.unpack(data)
+        except ProtocolError:
+            return
+        if frame.word is not None:
+            self._nodes[node_id].drive = describe_state(values[frame.word])
+        if frame.counts is not None:
+            self._counts[frame.axis] = values[frame.counts]
+
+    def _take_taxels(self, can_id: int, data: bytes, t_ns: int) -> None:
+        assert self._tactile is not None
+        frame = self._tactile.assemble(can_id, data, t_ns)
+        if frame is not None:
+            self._view.taxels = frame.taxels
+            patch = self._patch_from(TactileSample(frame, t_ns, 0)) if self._patch_from is not None else None
+            self._view.force_n = patch.force if patch is not None else None
+
+    def _take_heartbeat(self, node: NodeView, data: bytes, t_ns: int) -> None:
+        try:
+            node.state = unpack_heartbeat(data).name
+        except ProtocolError:
+            return
+        self._heard[node.node_id] = t_ns
+
+    def view(self, now_ns: int) -> CellView:
+        """What is known at an instant."""
+        view = self._view
+        view.t_s = (now_ns - self._first_ns) * 1e-9 if self._first_ns is not None else 0.0
+        for node_id, node in self._nodes.items():
+            node.heard_s = (now_ns - self._heard[node_id]) * 1e-9 if node_id in self._heard else None
+        view.nodes = list(self._nodes.values())
+        counts = [c for c in self._counts if c is not None]
+        if self._model is not None and len(counts) == len(self._counts):
+            q, joints = units_to_joints(self._model, np.array(counts, dtype=float)).tolist(), self._model.joints
+            view.q = [joint.shown(value) for joint, value in zip(joints, q, strict=True)]
+            view.units = tuple(joint.unit for joint in joints)
+        self._measure_bus(view, now_ns)
+        return view
+
+    def _measure_bus(self, view: CellView, now_ns: int) -> None:
+        for recent in self._recent.values():
+            while recent and recent[0][0] < now_ns - SECOND_NS:
+                recent.popleft()
+        while self._syncs and self._syncs[0] < now_ns - SECOND_NS:
+            self._syncs.popleft()
+        span_s = min(1.0, max(view.t_s, 1e-3))
+        view.frames_per_s = sum(map(len, self._recent.values())) / span_s
+        whole = self._plan.setup.bus.bitrate * span_s
+        view.load = {channel: sum(bits for _, bits in recent) / whole for channel, recent in self._recent.items()}
+        view.sync_hz = len(self._syncs) / span_s
+        if len(self._syncs) > 2:
+            errors = np.abs(np.diff(np.array(self._syncs)) - self._plan.sync.period_ns) * 1e-3
+            view.sync_jitter_us = (float(np.percentile(errors, 99)), float(errors.max()))
+        if self._tactile is not None:
+            view.torn_frames = self._tactile.torn
+
+
+# A monitored cell as lines for a terminal, in plain ANSI.
+
+HOME, CLEAR_LINE, CLEAR_BELOW = "\x1b[H", "\x1b[K", "\x1b[J"
+SHADES = " ·░▒▓█"
+LATE_S = 0.25
+"""A heartbeat older than that is late."""
+
+
+def screen(view: CellView) -> str:
+    """The view in the place of the one before, on a terminal."""
+    return HOME + "".join(f"{line}{CLEAR_LINE}\r\n" for line in lines(view)) + CLEAR_BELOW
+
+
+def lines(view: CellView) -> Iterator[str]:
+    """The view, line by line."""
+    jitter = (
+        "–"
+        if view.sync_jitter_us is None
+        else f"p99 {view.sync_jitter_us[0]:.0f} µs, max {view.sync_jitter_us[1]:.0f} µs"
+    )
+    names = len(view.load) > 1
+    load = ", ".join(f"{name + ' ' if names else ''}{100 * share:4.1f} %" for name, share in view.load.items())
+    yield f"{view.channel}  {view.t_s:8.1f} s   load {load}   {view.frames_per_s:6.0f} frames/s"
+    yield f"SYNC {view.sync_hz:6.1f} Hz   jitter {jitter}"
+    yield ""
+    for node in view.nodes:
+        yield _node_line(node)
+    if view.q is not None:
+        yield ""
+        yield "joints  " + "  ".join(f"{q:8.2f} {unit}" for q, unit in zip(view.q, view.units, strict=True))
+    if view.taxels is not None:
+        force = "–" if view.force_n is None else f"{view.force_n:.2f} N"
+        yield ""
+        yield f"force   {force}   torn frames {view.torn_frames}"
+        yield from image_lines(view.taxels)
+
+
+def _node_line(node: NodeView) -> str:
+    late = "" if node.heard_s is None or node.heard_s <= LATE_S else f"  SILENT for {node.heard_s:.1f} s"
+    drive = node.drive or ""
+    emcy = f"  EMCY {node.emcy}" if node.emcy else ""
+    return f"node {node.node_id:3d}  {node.role:<14} {node.state or 'not heard':<16} {drive:<20}{late}{emcy}".rstrip()
+
+
+def image_lines(taxels: NDArray[np.uint8]) -> Iterator[str]:
+    """A taxel image, two characters a taxel, the highest count in the darkest shade."""
+    top = max(int(taxels.max()), 1)
+    steps = np.ceil(taxels.astype(float) * (len(SHADES) - 1) / top).astype(int)
+    for row in steps:
+        yield "  " + "".join(SHADES[step] * 2 for step in row)

@@ -1,0 +1,222 @@
+"""What the supervision works with: the numbers of a plan, the cell and the touch as checks see them, and a condition.
+
+The table of conditions with its checks is in `canprobe.cell.master.conditions`; `canprobe.cell.master.supervisor` runs
+it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+
+from canprobe.cell.master.array import ArrayReceiver
+from canprobe.cell.master.controller import Measurement
+from canprobe.cell.master.drives import DriveGroup
+from canprobe.cell.master.watch import NodeWatch
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.scene.setup import SafetyLimits, Touch
+from canprobe.errors import CanprobeError
+from canprobe.fieldbus.bus.port import ControllerState, PortCounters
+from canprobe.mechanics.touch.patch.image import Patch
+
+TOUCH_FORCE = 0.15
+"""N; contact is made above it, and gone below half of it: an image of less says nothing about its place."""
+HOLD_CYCLES = 3
+"""Cycles without a TPDO of one drive after which all of them hold."""
+HOLD_NS = 1_000_000_000
+"""Longest hold."""
+LOST_NS = 30_000_000
+"""Without contact force in a touch, after which the contact is lost."""
+HIDDEN_NS = 20_000_000
+"""With a force that the array shows only in part, after which it may be above the limit."""
+TACTILE_TIMEOUT_PERIODS = 6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Limits:
+    """The numbers of a plan behind the checks.
+
+    Attributes:
+        safety: the limits of the setup.
+        period_ns: of the cycle.
+        missed_cycles: without a TPDO after which a drive is lost, and SYNCs after which it takes its master for dead.
+        tactile_cycles: between two tactile frames.
+        tactile_timeout: cycles without a tactile sample.
+        regain: way towards the object on which a scan searches for a lost contact, m; 0: it does not.
+        tares: the array is tared in bring-up, so that nothing may press on it then.
+    """
+
+    safety: SafetyLimits
+    period_ns: int
+    missed_cycles: int = 5
+    tactile_cycles: int = 2
+    tactile_timeout: int = 12
+    regain: float = 0.0
+    tares: bool = False
+
+    @property
+    def cycles_to_feel(self) -> int:
+        """From a motion to the cycle that has taken in a tactile sample of it."""
+        return 2 * self.tactile_cycles + 2
+
+
+def limits_of(plan: Plan) -> Limits:
+    """What the cell of a plan must not go beyond, and how fast it notices."""
+    setup = plan.setup
+    ratio = setup.rate_hz / setup.array.rate_hz if setup.array is not None else 1.0
+    scan = setup.task.scan if isinstance(setup.task, Touch) else None
+    return Limits(
+        setup.limits,
+        plan.sync.period_ns,
+        missed_cycles=setup.arm.missed_syncs if setup.arm is not None else 5,
+        tactile_cycles=round(ratio),
+        tactile_timeout=math.ceil(TACTILE_TIMEOUT_PERIODS * ratio),
+        regain=scan.regain if scan is not None else 0.0,
+        tares=setup.touch is not None,
+    )
+
+
+@dataclass(slots=True)
+class Seen:
+    """The cell in one cycle, as the checks see it.
+
+    Attributes:
+        limits: of the plan.
+        watch: heartbeats and emergencies.
+        drives, tactile: the arm and the sensor, None where there is none.
+        counters: of the port.
+        controller_state: of the CAN controller.
+        measurement: of this cycle.
+        sync_ns: when its SYNC went out, on the port's clock.
+        gap_ns: from the SYNC before to it; 0 for the first.
+        overruns: cycles late so far.
+        late_share: share of the last second's cycles that were late.
+        passive_ns: how long the controller has been error-passive.
+        speeding: a measured motion that no joint can make; None without one.
+        slowed: targets so far that were too far away for one cycle.
+        restarts: of a diverging estimator so far.
+        preload: highest force in the images before the drives are enabled, N.
+        log_failure: why frames are no longer written down; None while they are.
+    """
+
+    limits: Limits
+    watch: NodeWatch
+    drives: DriveGroup | None
+    tactile: ArrayReceiver | None
+    counters: PortCounters
+    controller_state: ControllerState = ControllerState.ACTIVE
+    measurement: Measurement = field(default_factory=lambda: Measurement(0, 0))
+    sync_ns: int = 0
+    gap_ns: int = 0
+    overruns: int = 0
+    late_share: float = 0.0
+    passive_ns: int = 0
+    speeding: str | None = None
+    slowed: int = 0
+    restarts: int = 0
+    preload: float = 0.0
+    log_failure: str | None = None
+
+
+@dataclass(slots=True, eq=False)
+class Contact:
+    """A touch as its checks see it: one object, kept up to date from sample to sample.
+
+    Attributes:
+        limits: of the plan.
+        force: as measured last, N.
+        tactile_age: cycles since the trigger of the newest sample, or since the first SYNC where none has come; None
+            without a sensor.
+        lost_s: how long the force has been below that of a contact, where there must be one.
+        hidden_s: how long the array has been saturated without other knowledge of the force.
+        off_pad_s: how long a good part of the contact has been beyond the array's edge.
+        path: the touch is a scan, which may search for a contact that it has lost.
+        searched: way towards the object since, m.
+        limit: what a joint or the workspace forbids; None where nothing does.
+    """
+
+    limits: Limits
+    force: float = 0.0
+    tactile_age: int | None = None
+    lost_s: float = 0.0
+    hidden_s: float = 0.0
+    off_pad_s: float = 0.0
+    path: bool = False
+    searched: float = 0.0
+    limit: str | None = None
+    _hidden_since_ns: int | None = None
+    _off_pad_since_ns: int | None = None
+
+    def feel(self, patch: Patch, t_ns: int, *, known: bool = False) -> None:
+        """Take the patch of a tactile sample.
+
+        Args:
+            patch: of the sample.
+            t_ns: when it was taken.
+            known: the force is known where the array is saturated, too.
+        """
+        self.force = patch.force
+        self._hidden_since_ns = _since(self._hidden_since_ns, patch.saturated and not known, t_ns)
+        self.hidden_s = _passed_s(self._hidden_since_ns, t_ns)
+        off_pad = patch.off_pad and patch.force > TOUCH_FORCE / 2
+        self._off_pad_since_ns = _since(self._off_pad_since_ns, off_pad, t_ns)
+        self.off_pad_s = _passed_s(self._off_pad_since_ns, t_ns)
+
+
+def _since(since_ns: int | None, holds: bool, t_ns: int) -> int | None:
+    """Beginning of an unbroken run of samples for which something holds."""
+    if not holds:
+        return None
+    return t_ns if since_ns is None else since_ns
+
+
+def _passed_s(since_ns: int | None, t_ns: int) -> float:
+    return 0.0 if since_ns is None else (t_ns - since_ns) * 1e-9
+
+
+class Reaction(Enum):
+    """What the cell does about a condition, the mildest first."""
+
+    DEGRADE = "degrade"
+    HOLD = "hold"
+    SEARCH = "search"
+    RETREAT = "retreat"
+    LIFT = "lift off, quick stop"
+    STOP = "quick stop"
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """One row of the table.
+
+    Attributes:
+        key: its name in code, tests and studies.
+        what: for people.
+        reaction: what the cell does.
+        within: longest time from the fault to the reaction, ns; None where no such time applies.
+        check: of a `Seen` in every cycle, or of a `Contact` in a touch: the error that names what is wrong, or None.
+            A condition without check and count shows by itself: an exception, or a node that stops.
+        count: for what the cell lives with: how often it has happened.
+        touch: the check takes a `Contact`.
+        enabling: the check holds already while the drives are enabled.
+    """
+
+    key: str
+    what: str
+    reaction: Reaction
+    within: Callable[[Limits], int] | None
+    check: Callable[[Any], CanprobeError | None] | None = None
+    count: Callable[[Seen], int] | None = None
+    touch: bool = False
+    enabling: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """A condition that holds, and the error that names what is wrong."""
+
+    condition: Condition
+    error: CanprobeError

@@ -1,0 +1,329 @@
+"""Runs the table of conditions over a cell and guards its joints. Pure: no clock, no port."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.master.conditions import BY_KEY, COUNTERS, CYCLE_CHECKS, touch_finding
+from canprobe.cell.master.controller import Command, Measurement, TactileSample
+from canprobe.cell.master.supervision import TOUCH_FORCE, Contact, Finding, Reaction, Seen
+from canprobe.cell.planning.model import Plan
+from canprobe.fieldbus.bus.port import ControllerState, PortCounters
+from canprobe.mechanics.robot.chain import forward
+
+if TYPE_CHECKING:
+    from canprobe.mechanics.touch.patch.image import Patch
+
+Vector = NDArray[np.float64]
+MEASURED_SHARE = 1.5
+"""Measured motion above this share of the speed limit is no motion of the arm; SYNCs may be late by a period."""
+COUNTS = 2
+"""Encoder counts by which two readings may differ at rest."""
+_ROUNDING = 1e-9
+_NUMBERS = "fiu"
+"""Kinds of arrays that can be angles."""
+
+
+@dataclass(frozen=True, slots=True)
+class GuardedTarget:
+    """A joint target as it may be sent (n,), rad or m; or why it may not."""
+
+    q: Vector | None
+    limit: str | None = None
+
+
+def outside_workspace(tip: Vector, workspace: Vector) -> str | None:
+    """What is wrong with the tip's position (3,), m, in a box (2, 3), m; None where it is inside."""
+    below, above = tip < workspace[0], tip > workspace[1]
+    if not (below | above).any():
+        return None
+    axis = int(np.flatnonzero(below | above)[0])
+    border = workspace[int(above[axis]), axis]
+    return f"the probe's tip at {'xyz'[axis]} = {1e3 * tip[axis]:.1f} mm, workspace ends at {1e3 * border:.1f} mm"
+
+
+class JointGuard:
+    """Range, speed and workspace of the joint targets; speed of the measured joints.
+
+    Args:
+        plan: of a cell with an arm.
+
+    Attributes:
+        low, high: range of the joint targets (n,), rad or m.
+        count: joint motion of one drive unit (n,), rad or m.
+        slowed: targets that were too far away for one cycle.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        arm, probe, safety = plan.setup.arm, plan.setup.probe, plan.setup.limits
+        assert arm is not None
+        model, margin = arm.model, safety.joint_margin - _ROUNDING * arm.model.radian
+        self.low, self.high = model.q_min + margin, model.q_max - margin
+        self.count = np.abs(model.q_per_unit).sum(axis=1)
+        slides = set(model.chain.prismatic)
+        self._si = "angles, rad" if slides == {False} else "positions, m" if slides == {True} else "positions, rad or m"
+        self.slowed = 0
+        self._model, self._workspace, self._period_ns = model, safety.workspace, plan.sync.period_ns
+        self._T_flange_tip = probe.T_flange_probe.copy()
+        self._T_flange_tip[:3, 3] += probe.radius * self._T_flange_tip[:3, 2]
+        # plain floats: a handful is compared before numpy has begun
+        self._speed: list[float] = (model.qd_max * safety.speed_share).tolist()
+        self._counts: list[float] = self.count.tolist()
+        self._range: list[tuple[float, float]] = list(zip(self.low.tolist(), self.high.tolist(), strict=True))
+        self._target: list[float] | None = None
+        self._q: list[float] | None = None
+        self._t_ns = 0
+
+    def T_base_tip(self, q: Vector) -> Vector:
+        """Transform (4, 4) from the probe's tip (z = pole, towards the object) to base at joints (n,), rad or m."""
+        return forward(self._model.chain, q) @ self._T_flange_tip
+
+    def outside(self, q: Vector) -> str | None:
+        """How the probe's tip leaves the workspace at joint positions (n,), rad or m; None where it does not."""
+        return None if self._workspace is None else outside_workspace(self.T_base_tip(q)[:3, 3], self._workspace)
+
+    def measure(self, measurement: Measurement) -> str | None:
+        """A motion since the last cycle that no joint can make; None without one, or where nothing new is known."""
+        if measurement.q is None or any(measurement.q_age):
+            return None
+        before, self._q = self._q, measurement.q.tolist()
+        share = MEASURED_SHARE * (measurement.t_ns - self._t_ns + self._period_ns) * 1e-9
+        self._t_ns = measurement.t_ns
+        if before is None:
+            return None
+        joints = zip(self._q, before, self._speed, self._counts, strict=True)
+        beyond = [abs(q - was) - share * speed - COUNTS * count for q, was, speed, count in joints]
+        if max(beyond) <= 0.0:
+            return None
+        joint = beyond.index(max(beyond))
+        way = self._model.joints[joint].text(abs(self._q[joint] - before[joint]))
+        return f"joint {joint + 1} reports a motion of {way} in one cycle, more than it can make"
+
+    def command(self, q_target: Vector, measurement: Measurement) -> GuardedTarget:
+        """The target that may be sent for `q_target` (n,), rad or m."""
+        n = len(self._range)
+        if type(q_target) is not np.ndarray or q_target.dtype != np.float64:
+            try:
+                given = np.asanyarray(q_target)
+            except (TypeError, ValueError):
+                given = np.array(None)
+            if given.dtype.kind not in _NUMBERS or isinstance(given, np.ma.MaskedArray):
+                return GuardedTarget(None, f"the controller's q_target is {q_target!r}: expected {n} {self._si}")
+            target = np.asarray(given, dtype=np.float64)
+        else:
+            target = q_target
+        wanted: list[float] = target.tolist() if target.shape == (n,) else [math.nan] * n
+        inside = [low <= q <= high for q, (low, high) in zip(wanted, self._range, strict=True)]
+        if not all(inside):
+            if not all(map(math.isfinite, wanted)):
+                got = f"is {target}" if target.shape == (n,) else f"has shape {target.shape}"
+                return GuardedTarget(None, f"the controller's q_target {got}: expected {n} finite {self._si}")
+            joint = inside.index(False)
+            where = self._model.joints[joint].text(wanted[joint])
+            return GuardedTarget(None, f"joint {joint + 1} at {where}, its stop")
+        if self._workspace is not None and (left := self.outside(target)) is not None:
+            return GuardedTarget(None, left)
+        last = self._target
+        if last is None and measurement.q is not None:
+            last = measurement.q.tolist()
+        if last is not None:
+            joints = zip(wanted, last, self._speed, strict=True)
+            share = max([abs(q - was) / speed for q, was, speed in joints]) / (self._period_ns * 1e-9)
+            if share > 1.0 + _ROUNDING:
+                self.slowed += 1
+                self._target = [was + (q - was) / share for q, was in zip(wanted, last, strict=True)]
+                return GuardedTarget(np.array(self._target))
+        self._target = wanted
+        return GuardedTarget(q_target)
+
+
+NOTED_ONCE = ("error_frames", "frames_dropped", "clock_step", "estimator")
+"""Conditions that the cell lives with and notes once; the others are figures of the summary."""
+SECOND_NS = 1_000_000_000
+LOOK_NS = 20_000_000
+"""Between two looks at where the probe presses: less than a millimetre of a retreat."""
+MEMORY = 0.25
+"""Share of a force that the array may show when it is gone: creep, 5 % a decade, of a press of a quarter of an hour."""
+CLEAR = 3e-3
+"""m, straight back along the pole: half a retreat, and more than `MEMORY` of 50 N presses the softest pad in."""
+
+
+class Press:
+    """Whether what the array shows is a press, or what it remembers of one.
+
+    After a long press the array creeps back for as long as it was pressed. By its size alone that is a light touch. But
+    a press needs the probe to be there: once it has gone straight back from where it pressed last, further than any pad
+    is pressed in, the rest is memory, and only what comes on top of it is a new press.
+    """
+
+    def __init__(self) -> None:
+        self._T_base_tip: Vector | None = None
+        self._highest = 0.0
+        self._remembered = 0.0
+
+    def look(self, force: float, T_base_tip: Vector) -> None:
+        """Take the array's force, N, and where the probe's tip is (4, 4)."""
+        if self.holds(force) and force >= MEMORY * self._highest:
+            self._T_base_tip, self._highest = T_base_tip, max(force, self._highest)
+        elif self._T_base_tip is None:
+            self._remembered = min(force, self._remembered)
+        elif self._is_clear(T_base_tip[:3, 3] - self._T_base_tip[:3, 3]):
+            self._T_base_tip, self._highest, self._remembered = None, 0.0, force
+
+    def holds(self, force: float) -> bool:
+        """Whether a force that the array shows, N, is a press."""
+        return force >= TOUCH_FORCE + (self._remembered if self._T_base_tip is None else 0.0)
+
+    def _is_clear(self, way: Vector) -> bool:
+        assert self._T_base_tip is not None
+        pole = self._T_base_tip[:3, 2]
+        back = -float(way @ pole)
+        return back > CLEAR and float(np.linalg.norm(way + back * pole)) < back
+
+
+class Supervisor:
+    """The checks of the table and what they have to remember.
+
+    Args:
+        seen: the cell; brought up to date by :meth:`step`.
+        guard: of the joints; None without an arm.
+        patch_from: the patch of a tactile sample, for controllers that do not guard their contact; None without touch.
+
+    Attributes:
+        counts: how often each condition that the cell lives with has happened.
+        first: cycle in which each condition was seen first.
+    """
+
+    def __init__(
+        self, seen: Seen, guard: JointGuard | None, patch_from: Callable[[TactileSample], Patch] | None
+    ) -> None:
+        self.seen = seen
+        self.counts: dict[str, int] = dict.fromkeys((key for key, _ in COUNTERS), 0)
+        self.first: dict[str, int] = {}
+        self._patch_from = patch_from
+        self._guard = guard
+        self._contact = Contact(seen.limits)
+        self._sample: TactileSample | None = None
+        self._press = Press()
+        self._look_ns = 0
+        self._untouched = seen.limits.tares
+        self._late: deque[tuple[int, int]] = deque()  # while one of them is late, the last second's cycles
+        self._late_sum = 0
+        self._active_ns = 0
+        self._enabling = tuple(condition for condition in CYCLE_CHECKS if condition.enabling)
+
+    def step(
+        self,
+        measurement: Measurement,
+        *,
+        sync_ns: int,
+        overruns: int,
+        counters: PortCounters,
+        controller_state: ControllerState,
+        log_failure: str | None = None,
+    ) -> None:
+        """Take in one cycle."""
+        seen = self.seen
+        self._count_late(overruns - seen.overruns, measurement.t_ns)
+        seen.overruns = overruns
+        seen.gap_ns = sync_ns - seen.sync_ns if seen.sync_ns else 0
+        seen.measurement, seen.sync_ns, seen.counters = measurement, sync_ns, counters
+        if controller_state is not ControllerState.PASSIVE:
+            self._active_ns = measurement.t_ns
+        seen.passive_ns = measurement.t_ns - self._active_ns
+        seen.controller_state, seen.log_failure = controller_state, log_failure
+        seen.speeding = self._guard.measure(measurement) if self._guard is not None else None
+        self._sample = measurement.tactile or self._sample
+        if self._untouched:
+            self._untouched = not measurement.enabled
+            if measurement.tactile is not None:
+                seen.preload = max(seen.preload, self.felt())
+        if measurement.t_ns >= self._look_ns:
+            self._look_ns = measurement.t_ns + LOOK_NS
+            self._look()
+        for key, count in COUNTERS:
+            if (number := count(seen)) != self.counts[key]:
+                self.counts[key] = number
+                self.first.setdefault(key, measurement.cycle)
+
+    def _count_late(self, late: int, t_ns: int) -> None:
+        """Late cycles are longer than others: the last second has fewer of them."""
+        cycles = self._late
+        if not self._late_sum:
+            cycles.clear()
+            if not late:
+                self.seen.late_share = 0.0
+                return
+            in_time = range(self.seen.measurement.t_ns, t_ns - SECOND_NS, -self.seen.limits.period_ns)
+            cycles.extend((before_ns, 0) for before_ns in reversed(in_time))
+        cycles.append((t_ns, late))
+        self._late_sum += late
+        while cycles[0][0] <= t_ns - SECOND_NS:
+            self._late_sum -= cycles.popleft()[1]
+        self.seen.late_share = self._late_sum / len(cycles)
+
+    def finding(self, *, enabling: bool = False) -> Finding | None:
+        """The first condition of the table that holds now; a hold only where nothing worse is found."""
+        hold: Finding | None = None
+        for condition in self._enabling if enabling else CYCLE_CHECKS:
+            error = condition.check(self.seen)  # type: ignore[misc]  # CYCLE_CHECKS have one
+            if error is None:
+                continue
+            self.first.setdefault(condition.key, self.seen.measurement.cycle)
+            if condition.reaction is not Reaction.HOLD:
+                return Finding(condition, error)
+            hold = hold or Finding(condition, error)
+        return hold
+
+    def must_stop(self) -> bool:
+        """Something holds for which nothing may move any more."""
+        return any(c.reaction is Reaction.STOP and c.check(self.seen) is not None for c in CYCLE_CHECKS)  # type: ignore[misc]
+
+    def felt(self) -> float:
+        """The force of the last tactile sample, N; 0 where nothing can press."""
+        if self._sample is None or self._patch_from is None:
+            return 0.0
+        return self._patch_from(self._sample).force
+
+    def pressing(self) -> float:
+        """The force with which the probe presses on something, N; 0 where the array only remembers that it did."""
+        self._look()
+        force = self.felt()
+        return force if self._press.holds(force) else 0.0
+
+    def _look(self) -> None:
+        q = self.seen.measurement.q
+        if self._sample is not None and q is not None and self._guard is not None:
+            self._press.look(self.felt(), self._guard.T_base_tip(q))
+
+    def guard_contact(self, measurement: Measurement) -> Finding | None:
+        """What must not go on in a touch, for a controller that does not guard its contact itself."""
+        if self._patch_from is not None and measurement.tactile is not None:
+            self._contact.feel(self._patch_from(measurement.tactile), measurement.tactile.t_sample_ns)
+        self._contact.tactile_age = measurement.tactile_age
+        return touch_finding(self._contact)
+
+    def guard_target(self, command: Command) -> tuple[Command, Finding | None]:
+        """The command that may be sent: a target too far away is approached, one out of bounds is left out."""
+        if command.q_target is None or self._guard is None:
+            return command, None
+        guarded = self._guard.command(command.q_target, self.seen.measurement)
+        self.seen.slowed = self._guard.slowed
+        if guarded.limit is not None:
+            return replace(command, q_target=None), touch_finding(Contact(self.seen.limits, limit=guarded.limit))
+        return (command if guarded.q is command.q_target else replace(command, q_target=guarded.q)), None
+
+    def notes(self) -> list[str]:
+        """What happened and was lived with, a line each."""
+        return [
+            f"{BY_KEY[key].what}: {self.counts[key]}, the first in cycle {self.first[key]}"
+            for key in NOTED_ONCE
+            if self.counts[key]
+        ]

@@ -1,0 +1,160 @@
+"""What the nodes say about themselves: boot-ups, heartbeats and emergencies."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+from canprobe.cell.planning.model import HEARTBEAT_CONSUMED_MS, MASTER_NODE_ID
+from canprobe.errors import ProtocolError
+from canprobe.fieldbus.protocol.frames import (
+    EMCY_BASE,
+    HEARTBEAT_BASE,
+    NMT_ID,
+    SYNC_ID,
+    Emcy,
+    NmtState,
+    describe,
+    is_no_error,
+    unpack_heartbeat,
+)
+
+UNTOLD = 64
+"""Alarms that are kept until `NodeWatch.news` is called."""
+
+
+@dataclass(frozen=True, slots=True)
+class EmcyEvent:
+    """An emergency message with its sender and time."""
+
+    node_id: int
+    emcy: Emcy
+    t_ns: int
+
+    @property
+    def is_communication(self) -> bool:
+        """Whether it is about frames rather than the device. Source: CiA 301, error codes 81xxh and 82xxh."""
+        return self.emcy.code >> 8 in (0x81, 0x82)
+
+    @property
+    def what(self) -> str:
+        """The message in words."""
+        return f"EMCY {self.emcy.code:04X}h, {describe(self.emcy.code)}"
+
+    def __str__(self) -> str:
+        return f"node {self.node_id}: {self.what}"
+
+
+class NodeWatch:
+    """Follows the error control and emergency messages of the planned nodes.
+
+    Args:
+        node_ids: the nodes that are watched.
+
+    Attributes:
+        states: NMT state in each node's last heartbeat.
+        boot_ups: boot-up messages of each node.
+        last_emcy: the last EMCY of each node, the end of an error too.
+        last_alarm: the last EMCY of each node that reports an error, not its end.
+        device_alarm: the first one since the start that is about a device rather than frames; None without one.
+        alarmed: nodes that have sent one since the start.
+        communication: how many were about frames.
+        foreign: what another master sent first.
+    """
+
+    def __init__(self, node_ids: tuple[int, ...]) -> None:
+        self.node_ids = node_ids
+        self.states: dict[int, NmtState] = {}
+        self.boot_ups: dict[int, int] = dict.fromkeys(node_ids, 0)
+        self.last_emcy: dict[int, EmcyEvent] = {}
+        self.last_alarm: dict[int, EmcyEvent] = {}
+        self.device_alarm: EmcyEvent | None = None
+        self.alarmed: set[int] = set()
+        self.communication = 0
+        self.foreign: str | None = None
+        self._untold: deque[EmcyEvent] = deque(maxlen=UNTOLD)
+        self._heard: dict[int, int] = {}
+
+    def push(self, can_id: int, data: bytes, t_ns: int) -> bool:
+        """Take a frame that is no PDO; True where it was one of those watched."""
+        node_id = can_id & 0x7F
+        if can_id == HEARTBEAT_BASE + MASTER_NODE_ID:
+            self.foreign = self.foreign or f"a heartbeat of node {MASTER_NODE_ID}, our own id"
+        elif can_id in (SYNC_ID, NMT_ID):
+            what = "SYNC" if can_id == SYNC_ID else "an NMT command"
+            self.foreign = self.foreign or f"{what} from another master"
+        elif can_id == HEARTBEAT_BASE + node_id and node_id in self.boot_ups:
+            self._push_heartbeat(node_id, data, t_ns)
+        elif can_id == EMCY_BASE + node_id and node_id in self.boot_ups:
+            self._push_emcy(node_id, data, t_ns)
+        else:
+            return False
+        return True
+
+    def _push_heartbeat(self, node_id: int, data: bytes, t_ns: int) -> None:
+        try:
+            state = unpack_heartbeat(data)
+        except ProtocolError:
+            return
+        self._heard[node_id] = t_ns
+        self.states[node_id] = state
+        if state is NmtState.INITIALISING:
+            self.boot_ups[node_id] += 1
+
+    def _push_emcy(self, node_id: int, data: bytes, t_ns: int) -> None:
+        try:
+            event = EmcyEvent(node_id, Emcy.unpack(data), t_ns)
+        except ProtocolError:
+            return
+        self.last_emcy[node_id] = event
+        if is_no_error(event.emcy.code):
+            return
+        self.last_alarm[node_id] = event
+        self._untold.append(event)
+        if event.is_communication:
+            self.communication += 1
+        else:
+            self.device_alarm = self.device_alarm or event
+            self.alarmed.add(node_id)
+
+    def news(self) -> list[EmcyEvent]:
+        """Alarms since the last call, the last `UNTOLD` of them."""
+        if not self._untold:
+            return []
+        news = list(self._untold)
+        self._untold.clear()
+        return news
+
+    @property
+    def another_master(self) -> str | None:
+        """That another master was heard, and by what; None where none was."""
+        return None if self.foreign is None else f"another master is on the bus: {self.foreign}"
+
+    def last_words(self, node_id: int) -> str:
+        """The node's last alarm, to be put behind an error; empty without one."""
+        event = self.last_alarm.get(node_id)
+        return "" if event is None else f"; {event}"
+
+    def forget(self) -> None:
+        """Start the heartbeat supervision afresh: no heartbeat has been received yet."""
+        self._heard.clear()
+        self.states.clear()
+
+    def start(self, t_ns: int) -> None:
+        """Expect every node's heartbeat from now on; what a device reported until now is over."""
+        self.device_alarm = None
+        self.alarmed.clear()
+        self._heard = dict.fromkeys(self.node_ids, t_ns)
+
+    def silent(self, t_ns: int) -> int | None:
+        """A node that has been silent for longer than the time-out, or None."""
+        limit = t_ns - HEARTBEAT_CONSUMED_MS * 1_000_000
+        if min(self._heard.values(), default=limit) >= limit:
+            return None  # as in every cycle
+        return next((node_id for node_id, heard in self._heard.items() if heard < limit), None)
+
+    def not_in(self, state: NmtState) -> int | None:
+        """A node whose last heartbeat has another state than `state`, or None."""
+        if list(self.states.values()).count(state) == len(self.states):
+            return None  # as in every cycle
+        return next((node_id for node_id, seen in self.states.items() if seen is not state), None)

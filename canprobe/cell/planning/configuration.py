@@ -1,0 +1,452 @@
+"""Plan → what each node must be, and the list of writes that configure it.
+
+The configuration of a node is an explicit list: one `Write` is an object, its value and the purpose. The order matters:
+PDOs first, then what all nodes have, then what a drive or the array needs.
+
+A write is *required*, or it is *wished* and says what its absence means. What the EDS excludes (no such object,
+read-only with another value, limits) is left out where it is wished, `NodeSetup.left_out`, and makes the plan
+impossible where it is required, `NodeSetup.problems`. What only the device refuses is bring-up's.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from canopen import ObjectDictionary
+
+from canprobe.cell.planning.devices import COMMUNICATION, INVALID, MAPPING, OWN_BITS, Abilities
+from canprobe.cell.planning.model import (
+    HEARTBEAT_CONSUMED_MS,
+    HEARTBEAT_PRODUCED_MS,
+    MASTER_NODE_ID,
+    Interpolation,
+    Plan,
+    PlannedNode,
+    PlannedPdo,
+)
+from canprobe.cell.planning.operation import INTERPOLATION_TIME, SYNC_PERIOD, follows_sync_period, homing_problems
+from canprobe.cell.planning.traffic import CLASSIC_BYTES
+from canprobe.cell.planning.units import (
+    FOLLOWING_WINDOW,
+    POLARITY,
+    POSITION_LIMITS,
+    PROFILE_SPEED_LIMIT,
+    TurnUnits,
+    following_window,
+    motor_speed_limit,
+    software_limits,
+    speed_unit,
+    turn_units,
+)
+from canprobe.fieldbus.eds.description import Description, Entry
+from canprobe.fieldbus.eds.packaged import (
+    FULL_SCALE,
+    LONG_PDOS,
+    MISSED_SYNCS,
+    WINDOW_SIZE,
+    has_full_scale,
+    has_long_pdos,
+    has_missed_syncs,
+    has_window_size,
+)
+from canprobe.fieldbus.eds.variables import name_of
+from canprobe.fieldbus.protocol.cia402 import OperationMode
+from canprobe.fieldbus.protocol.si_unit import ACCELERATION, VELOCITY
+from canprobe.fieldbus.protocol.tactile import TactileMode
+from canprobe.mechanics.robot.model import coupled_joints, drive_position_at, joints_to_units
+
+SYNC_START_VALUE = 1
+EMCY_INHIBIT_100US = 1000
+"""At most ten emergencies a second from a node: one for every late SYNC would make the next SYNC late too."""
+MODE = 0x6060
+HOME_OFFSET = 0x607C
+HOMES_HERE = frozenset({35, 37})
+"""Homing methods that take the present position."""
+TARE = 0x65726174  # "tare", as 1010h has "save"
+FOLLOWING_TIMEOUT_MS = 50
+QUICK_STOP_AND_DISABLE = 2  # 605Ah: slow down on the quick stop ramp, then switch on disabled
+GO_PRE_OPERATIONAL = 0  # 1029h:01
+STARTUP, NOT_BY_ITSELF = 0x1F80, 1 << 2  # CiA 302-2: the device does not become operational without its master
+ABORT_QUICK_STOP = 3  # 6007h: quick stop when the connection is lost
+MOST_DAYS, DAY_MS = 0xFFFF, 86_400_000
+
+
+@dataclass(frozen=True, slots=True)
+class Write:
+    """One entry that bring-up writes and reads back.
+
+    Attributes:
+        index, subindex: the entry.
+        value: integer value.
+        purpose: what the device needs it for.
+        absence: of a wished one, what it means that the device does not have it; None: it is required.
+        read_back: False for commands, whose entry answers another value than the written one.
+        own_bits: bits that are the device's: it may refuse other ones, or hold them whatever is written.
+    """
+
+    index: int
+    subindex: int
+    value: int
+    purpose: str
+    absence: str | None = None
+    read_back: bool = True
+    own_bits: int = 0
+
+    @property
+    def place(self) -> str:
+        """The entry for messages, such as ``60C2h:01``."""
+        return f"{self.index:04X}h:{self.subindex:02X}"
+
+
+@dataclass(frozen=True, slots=True)
+class LeftOut:
+    """A wished write that the EDS excludes.
+
+    Attributes:
+        write: that is not made.
+        why: what the EDS offers instead.
+    """
+
+    write: Write
+    why: str
+
+    @property
+    def what(self) -> str:
+        """Purpose and entry, for people."""
+        return f"{self.write.purpose} ({self.write.place})"
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """One entry that the device cannot change and the scene relies on.
+
+    Attributes:
+        index, subindex: the entry.
+        value: that it must hold.
+        says: who states the value.
+        otherwise: what would be wrong, and what puts it right.
+    """
+
+    index: int
+    subindex: int
+    value: int
+    says: str
+    otherwise: str
+
+
+@dataclass(frozen=True, slots=True)
+class NodeSetup:
+    """What one node must be and become.
+
+    Attributes:
+        node_id: the node.
+        name: for messages, such as ``joint 3``.
+        channel: of the bus that it is on.
+        eds: name of its EDS file, for messages.
+        dictionary: its object dictionary, from the EDS.
+        identity: expected values of 1018h by sub-index; an absent sub-index is not checked.
+        writes: its configuration, in order.
+        given: what it must hold by itself.
+        otherwise: writes that mean the same as those of 60C2h, tried in this order where the device refuses them.
+        left_out: what the EDS excludes of what the cell would have set.
+        problems: what the EDS excludes of what must be set; empty in a plan.
+        mode: of operation, which 6061h must confirm; None: no drive.
+        homing: what a drive needs for homing, in order; empty: it is not homed. Where the drive is coupled to other
+            joints, the home offset depends on where they are; here they are in the start posture.
+        turn: units of a motor turn, with which the device's own statement is compared; None: there is none.
+        speed_unit: position units/s of what the drive has for a velocity.
+    """
+
+    node_id: int
+    name: str
+    channel: str
+    eds: str
+    dictionary: ObjectDictionary
+    identity: dict[int, int]
+    writes: tuple[Write, ...]
+    given: tuple[Given, ...] = ()
+    otherwise: tuple[tuple[Write, ...], ...] = ()
+    left_out: tuple[LeftOut, ...] = ()
+    problems: tuple[str, ...] = ()
+    mode: int | None = None
+    homing: tuple[Write, ...] = ()
+    turn: TurnUnits | None = None
+    speed_unit: float = 1.0
+
+    @property
+    def configuration_date(self) -> dict[int, int]:
+        """What 1020h holds where the node has this configuration: days since 1984, milliseconds after midnight.
+
+        They follow from the values, so that any change of them, of the EDS or of the scene, gives another date.
+        """
+        values = [(write.index, write.subindex, write.value) for write in self.writes if write.read_back]
+        text = repr((self.eds, self.identity, values)).encode()
+        return {1: 1 + zlib.crc32(text) % MOST_DAYS, 2: 1 + zlib.adler32(text) % DAY_MS}
+
+
+def make_setups(plan: Plan) -> tuple[NodeSetup, ...]:
+    """What every planned node must be and become, drives first."""
+    return tuple(_setup(plan, node) for node in plan.nodes)
+
+
+def _setup(plan: Plan, node: PlannedNode) -> NodeSetup:
+    device = Abilities(node.eds, Description(node.dictionary))
+    of_kind = _drive_writes if node.kind == "drive" else _array_writes
+    writes, left_out, problems = _possible(
+        device, [*_pdo_writes(plan, node, device), *_common_writes(plan, device), *of_kind(plan, node, device)]
+    )
+    arm = plan.setup.arm
+    drive = arm.drives[arm.node_ids.index(node.node_id)] if arm is not None and node.kind == "drive" else None
+    times = [_interpolation_writes(device, time) for time in node.interpolation[1:]]
+    homing, not_homing, no_homing = _possible(device, _homing_writes(plan, node, device))
+    no_homing += [*homing_problems(device), *_coupling_problems(plan, node)] if homing else []
+    return NodeSetup(
+        node_id=node.node_id,
+        name=node.role,
+        channel=node.channel,
+        eds=node.eds,
+        dictionary=device.od,
+        identity={sub: value for sub, value in enumerate(node.identity.numbers, start=1) if value is not None},
+        writes=tuple(writes),
+        given=_array_given(plan, device.od) if node.kind == "tactile" else _drive_given(device),
+        otherwise=tuple(tuple(_possible(device, other)[0]) for other in times),
+        left_out=(*left_out, *not_homing),
+        problems=(*problems, *no_homing),
+        mode=node.mode,
+        homing=tuple(homing),
+        turn=None if drive is None else turn_units(device, drive.turn_units, drive.gear),
+        speed_unit=1.0 if drive is None else speed_unit(device, drive, VELOCITY) or 1.0,
+    )
+
+
+def _possible(device: Abilities, writes: Iterable[Write]) -> tuple[list[Write], list[LeftOut], list[str]]:
+    """The writes that a device can take by its EDS, the wished ones that it cannot, and why not a required one."""
+    possible: list[Write] = []
+    left_out: dict[tuple[int, int], LeftOut] = {}
+    problems: list[str] = []
+    for write in writes:
+        why = _excluded(device, write)
+        if why is None:
+            possible.append(write)
+        elif write.absence is not None:
+            left_out.setdefault((write.index, write.subindex), LeftOut(write, why))
+        elif why:
+            problems.append(f"{device.eds}: {write.place} = {write.value} ({write.purpose}) is needed: {why}")
+    return possible, [one for one in left_out.values() if one.why], problems
+
+
+def _excluded(device: Abilities, write: Write) -> str | None:
+    """Why a device cannot take a write; empty where it need not, as the entry always holds the value."""
+    entry = device.description.entry(write.index, write.subindex)
+    if entry is None or (write.purpose == _MISSED_SYNCS and not has_missed_syncs(device.od)):
+        return "no such object"
+    if not entry.is_integer:
+        return f"its data type is {name_of(entry.data_type)}, not an integer"
+    if not entry.writable:
+        same = entry.initial == write.value
+        return "" if same else f"it is {entry.access}{'' if entry.initial is None else f', {entry.initial!r}'}"
+    if not entry.allows(write.value):
+        return f"it takes {_ends(entry)}"
+    return None
+
+
+def _ends(entry: Entry) -> str:
+    if entry.low is None:
+        return f"values of {entry.bits} bits" if entry.high is None else f"at most {entry.high}"
+    return f"at least {entry.low}" if entry.high is None else f"{entry.low} to {entry.high}"
+
+
+def _pdo_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Write]:
+    writes = []
+    if has_long_pdos(device.od):
+        long = any(pdo.layout.length > CLASSIC_BYTES for pdo in plan.pdos_of(node.node_id, "tpdo"))
+        writes.append(Write(LONG_PDOS, 0, int(long), "PDOs of up to 64 bytes"))
+    for direction, number in node.switched_off:
+        index, name = COMMUNICATION[direction] + number - 1, f"{direction.upper()} {number}"
+        cob_id = (device.number(index, 1) or 0) | INVALID
+        absence = "it is sent besides" if direction == "tpdo" else "it listens besides"
+        writes.append(Write(index, 1, cob_id, f"{name} is not used", absence, own_bits=OWN_BITS))
+    for direction in COMMUNICATION:
+        for pdo in plan.pdos_of(node.node_id, direction):
+            writes += _one_pdo(pdo, device)
+    return writes
+
+
+def _one_pdo(pdo: PlannedPdo, device: Abilities) -> list[Write]:
+    communication = COMMUNICATION[pdo.direction] + pdo.number - 1
+    mapping = MAPPING[pdo.direction] + pdo.number - 1
+    name, cob_id = f"{pdo.direction.upper()} {pdo.number}", pdo.cob_id | pdo.own_bits
+    writes = []
+    if not pdo.fixed_id:
+        off = f"{name} off while it is changed"
+        writes.append(Write(communication, 1, cob_id | INVALID, off, "it stays on", own_bits=OWN_BITS))
+    writes.append(Write(communication, 2, pdo.transmission_type, f"transmission type of {name}"))
+    if pdo.event_timer_ms:
+        absence = "the device does not notice that its controlword stays away"
+        writes.append(Write(communication, 5, pdo.event_timer_ms, f"event timer of {name}", absence))
+    if pdo.direction == "tpdo" and 1 < pdo.transmission_type <= 240 and device.has(communication, 6):
+        writes.append(Write(communication, 6, SYNC_START_VALUE, f"first SYNC of {name}"))
+    if device.capacity(pdo.direction, pdo.number):
+        entries = enumerate(pdo.entries, start=1)
+        writes.append(Write(mapping, 0, 0, f"mapping of {name} off while it is changed", "it stays on"))
+        writes += [Write(mapping, sub, entry.word, f"mapping of {name}") for sub, entry in entries]
+        writes.append(Write(mapping, 0, len(pdo.entries), f"mapping of {name} on"))
+    return (
+        writes if pdo.fixed_id else [*writes, Write(communication, 1, cob_id, f"COB-ID of {name}", own_bits=OWN_BITS)]
+    )
+
+
+_UNTIMED = "the device does not know how long a cycle is"
+
+
+def _common_writes(plan: Plan, device: Abilities) -> list[Write]:
+    counter = [
+        Write(SYNC_PERIOD, 0, 0, "1019h may only change while this is 0", _UNTIMED),
+        Write(0x1019, 0, plan.sync.overflow, "overflow of the SYNC counter"),
+    ]
+    return [
+        *(counter if plan.sync.overflow else []),
+        Write(SYNC_PERIOD, 0, plan.sync.period_us, "period of SYNC", None if follows_sync_period(device) else _UNTIMED),
+        Write(0x1015, 0, EMCY_INHIBIT_100US, "shortest time between two emergencies", _EMERGENCIES),
+        Write(0x1017, 0, HEARTBEAT_PRODUCED_MS, "period of the node's heartbeat"),
+        Write(0x1016, 1, MASTER_NODE_ID << 16 | HEARTBEAT_CONSUMED_MS, "the node notices a dead master", _DEAF),
+        Write(0x1029, 1, GO_PRE_OPERATIONAL, "NMT state of a node that has lost its master", _BY_DEFAULT),
+        *_startup_writes(device),
+    ]
+
+
+def _startup_writes(device: Abilities) -> list[Write]:
+    """A device that does not start by itself sends no PDOs before it is configured; one without 1F80h is not asked."""
+    if not device.has(STARTUP):
+        return []
+    value, others = (device.number(STARTUP) or 0) | NOT_BY_ITSELF, 0xFFFFFFFF & ~NOT_BY_ITSELF
+    return [Write(STARTUP, 0, value, "the node waits for its start", _SELF_STARTING, own_bits=others)]
+
+
+_EMERGENCIES = "a faulty device may fill the bus with emergencies"
+_DEAF = "the device will not notice a dead master"
+_BY_DEFAULT = "it goes pre-operational, which is the default of CiA 301, or does what the device has"
+_SELF_STARTING = "the device may become operational before it is configured"
+_MISSED_SYNCS = "SYNCs after which the drive stops by itself"
+_FAST = "the drive itself limits its speed as the device has it, or not at all"
+
+
+def _drive_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Write]:
+    setup, arm = plan.setup, plan.setup.arm
+    assert arm is not None and node.mode is not None
+    model, axis = arm.model, arm.node_ids.index(node.node_id)
+    low, high = software_limits(model)
+    limit = motor_speed_limit(model, axis, setup.limits.speed_share, plan.sync.period_ns)
+    unit = speed_unit(device, arm.drives[axis], VELOCITY)
+    fastest = "highest speed of the motor"
+    speed = [Write(PROFILE_SPEED_LIMIT, 0, math.ceil(limit / unit), fastest, _FAST)] if unit else []
+    interpolated = node.mode is OperationMode.INTERPOLATED_POSITION
+    following = "a drive that does not follow is noticed as the device has it"
+    lag = "a drive that lags is given as long as the device has it"
+    stops = "the drive guards the ends of the joint as the device has it, or not at all"
+    quick = "a quick stop goes and ends as the device has it"
+    lost = "a drive that loses its master does what the device has"
+    return [
+        Write(MISSED_SYNCS, 0, arm.missed_syncs, _MISSED_SYNCS, "a drive may go on without SYNC"),
+        Write(MODE, 0, node.mode, "mode of operation"),
+        *([Write(0x60C0, 0, 0, "linear interpolation", "the device interpolates in its way")] if interpolated else []),
+        *(_interpolation_writes(device, node.interpolation[0]) if node.interpolation else []),
+        Write(FOLLOWING_WINDOW, 0, following_window(model, axis), "following error window", following),
+        Write(0x6066, 0, FOLLOWING_TIMEOUT_MS, "following error time-out", lag),
+        *speed,
+        Write(POSITION_LIMITS, 1, int(low[axis]), "lowest position", stops),
+        Write(POSITION_LIMITS, 2, int(high[axis]), "highest position", stops),
+        Write(0x605A, 0, QUICK_STOP_AND_DISABLE, "what a quick stop does", quick),
+        Write(0x6007, 0, ABORT_QUICK_STOP, "what a lost connection does", lost),
+    ]
+
+
+def _homing_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Write]:
+    """607Ch is from the home position to the zero: at home the drive is at -607Ch. Source: CiA 402-2, "Homing mode"."""
+    arm = plan.setup.arm
+    axis = arm.node_ids.index(node.node_id) if arm is not None and node.kind == "drive" else None
+    zero = arm.drives[axis].zero if arm is not None and axis is not None else None
+    if arm is None or axis is None or zero is None:
+        return []
+    home = drive_position_at(arm.model, axis, zero.home, joints_to_units(arm.model, arm.q_start))
+    units = abs(float(arm.model.units_per_q[axis, axis]))
+    speed, acceleration = (
+        units / (speed_unit(device, arm.drives[axis], index) or 1.0) for index in (VELOCITY, ACCELERATION)
+    )
+    ramp = "homing accelerates as the device has it"
+    still = f"method {zero.method} does without" if zero.method in HOMES_HERE else None
+    return [
+        Write(0x6098, 0, zero.method, "homing method"),
+        Write(0x6099, 1, max(1, round(zero.speed * speed)), "speed of the search for the switch", still),
+        Write(0x6099, 2, max(1, round(zero.zero_speed * speed)), "speed of the search for the zero", still),
+        Write(0x609A, 0, max(1, round(zero.acceleration * acceleration)), "acceleration in homing", ramp),
+        Write(HOME_OFFSET, 0, -round(home), "home offset"),
+    ]
+
+
+def _coupling_problems(plan: Plan, node: PlannedNode) -> list[str]:
+    """Where the zero of a drive depends on other joints, they have to be known when it is homed."""
+    arm = plan.setup.arm
+    assert arm is not None
+    axis = arm.node_ids.index(node.node_id)
+    own, joints, problems = arm.drives[axis].zero, arm.model.joints, []
+    for other in sorted(coupled_joints(arm.model, axis)):
+        zero, name = arm.drives[other].zero, joints[other].name
+        if own is None or zero is None or (zero.order, other) < (own.order, axis):
+            continue
+        way = (
+            "each depends on the other: one of them needs an absolute encoder"
+            if axis in coupled_joints(arm.model, other)
+            else f"joints.{name}.homing_order must be lower than {own.order}"
+        )
+        problems.append(f"the zero of {joints[axis].name} depends on {name}, which is homed later: {way}")
+    return problems
+
+
+def _interpolation_writes(device: Abilities, time: Interpolation) -> list[Write]:
+    """A device without 60C2h:02 counts in milliseconds."""
+    unit = [Write(INTERPOLATION_TIME, 2, time.index, "unit of the interpolation time")]
+    value = Write(INTERPOLATION_TIME, 1, time.value, "interpolation time")
+    return [value, *(unit if device.has(INTERPOLATION_TIME, 2) else [])]
+
+
+def _array_writes(plan: Plan, _: PlannedNode, device: Abilities) -> list[Write]:
+    array = plan.setup.array
+    assert array is not None
+    writes = [Write(0x2000, 0, TactileMode[array.mode.upper()], "what the array sends")]
+    if array.mode == "window" and has_window_size(device.od):
+        writes.append(Write(WINDOW_SIZE, 0, int(array.window), "taxels along the window"))
+    # nothing touches the array yet; a listening cell knows no such moment
+    if plan.setup.touch is not None:
+        writes.append(Write(0x2003, 0, TARE, "tare", read_back=False))
+    return writes
+
+
+def _drive_given(device: Abilities) -> tuple[Given, ...]:
+    """The cell states in `sign` how a drive counts; 607Eh would turn that round. Speeds are written in unit 60A9h."""
+    otherwise = {
+        POLARITY: "it would count the other way round than the cell's sign says; set 607Eh back in the drive",
+        VELOCITY: "limits of speed would be wrong by the ratio of the units; set 60A9h back in the drive, or take the"
+        " drive's value into the EDS",
+    }
+    return tuple(
+        Given(index, 0, device.number(index) or 0, "as its EDS says", text)
+        for index, text in otherwise.items()
+        if device.has(index)
+    )
+
+
+def _array_given(plan: Plan, dictionary: Any) -> tuple[Given, ...]:
+    """With another full scale the force would be wrong by the ratio of the two."""
+    array = plan.setup.array
+    assert array is not None
+    if not has_full_scale(dictionary):
+        return ()
+    pascals = round(array.full_scale)
+    key = "sensor.full_scale_kpa"
+    otherwise = f"force would be read wrong by their ratio; put right {key}"
+    return (Given(FULL_SCALE, 0, pascals, f"as the scene's {key} says", otherwise),)

@@ -1,0 +1,206 @@
+"""The contact of a plan: whether counts of the joints hold its force, and whether the array shows all of it.
+
+The layer on the probe is a bed of springs of stiffness k a volume. On an object of principal curvatures κ, with A and B
+= ½ (1/R + κ), a force F presses it in by δ = √(2 F √(AB) / (π k)), with the pressure k (δ - A x² - B y²) inside a patch
+of half axes √(δ/A) and √(δ/B). The array shows that pressure blurred: a Gaussian of standard deviation σ takes
+k (A + B) σ² off its peak. Stops being true where the blur is as wide as the patch, which then has a higher peak, and
+on a flat array, which has no such layer.
+
+Source: Johnson, Contact Mechanics (1985), 4.3, the elastic foundation.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.planning.window import measured_share
+from canprobe.cell.scene.setup import Array, Calibrate, Probe, Touch
+from canprobe.mechanics.robot.chain import forward
+from canprobe.mechanics.robot.inverse import FIXED_POLE, task_rows
+from canprobe.mechanics.robot.model import position_per_unit
+from canprobe.mechanics.touch.stops import MOST_SPREAD, OFF_PAD, OFF_PAD_SIGMAS
+
+Floats = NDArray[np.float64]
+GAIN_SPREAD = 0.05
+"""By which one taxel shows more than another: at the edge it may seem to be pressed harder by as much."""
+BLUR_TAXELS = 0.72
+"""Standard deviation of the blur, in taxels, that the packaged calibration has: a finer array blurs over less way."""
+_EVERY = 8
+"""Of the contacts along a path, for what changes little from one to the next."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pressed:
+    """The layer under a force on an object.
+
+    Attributes:
+        depth: δ, m.
+        half_axis: the longer one of the patch, m.
+        shown_pa: peak of the pressure as the array shows it.
+    """
+
+    depth: float
+    half_axis: float
+    shown_pa: float
+
+
+def pressed(force_n: float, probe: Probe, array: Array, kappa: Sequence[float]) -> Pressed:
+    """The layer under a force.
+
+    Args:
+        force_n: of the touch.
+        probe: with the layer.
+        array: under the layer.
+        kappa: (2,) principal curvatures of the object, above -1/R, 1/m.
+    """
+    a, b = (0.5 * (1.0 / probe.radius + one) for one in kappa)
+    depth = math.sqrt(2.0 * force_n * math.sqrt(a * b) / (math.pi * probe.stiffness))
+    shown = probe.stiffness * (depth - (a + b) * _blur_m(array) ** 2)
+    return Pressed(depth, math.sqrt(depth / min(a, b)), shown)
+
+
+def _blur_m(array: Array) -> float:
+    return min(array.calibration.image.blur, BLUR_TAXELS * array.pad.pitch_m)
+
+
+def contact_problems(task: Touch, joints: Floats, normals: Floats, kappas: Floats, force_max_n: float) -> list[str]:
+    """Why a touch cannot hold its force along its path; nothing is known of a flat array, which has no layer.
+
+    Args:
+        task: a scan or a press.
+        joints: (m, n) positions at its contacts, rad or m.
+        normals: (m, 3) outward unit normals there.
+        kappas: (m, 2) principal curvatures there, above -1/R, 1/m.
+        force_max_n: highest force that is allowed.
+    """
+    if task.array.pad.is_flat:
+        return []
+    found = (
+        saturation_problem(task, kappas),
+        settling_problem(task, joints[::_EVERY], normals[::_EVERY], force_max_n),
+        edge_problem(task, joints, normals, kappas),
+    )
+    return [problem for problem in found if problem is not None]
+
+
+def settling_problem(task: Touch, joints: Floats, normals: Floats, force_max_n: float) -> str | None:
+    """That the force cannot settle, because the drives count too coarsely for the layer; None where it can.
+
+    Rounding to whole counts displaces the probe by σ along the normal, and with F ~ δ² the force by 2 σ/δ of itself.
+
+    Args:
+        task: a scan or a press.
+        joints: (m, n) positions at its contacts, rad or m.
+        normals: (m, 3) outward unit normals there.
+        force_max_n: highest force that is allowed.
+    """
+    model, tool = task.arm.model, task.probe.T_flange_probe
+    each = np.abs([position_per_unit(model, q, tool, normal) for q, normal in zip(joints, normals, strict=True)])
+    sigmas = np.linalg.norm(each, axis=1) / math.sqrt(12.0)
+    depth = pressed(task.force, task.probe, task.array, (0.0, 0.0)).depth
+    worst = int(np.argmax(sigmas))
+    spread = 2.0 * float(sigmas[worst]) / depth
+    if spread <= MOST_SPREAD:
+        return None
+    coarsest = int(np.argmax(each[worst]))
+    joint, beyond = model.joints[coarsest], spread / MOST_SPREAD
+    ways = [f"let the drive of {joint.name} count finer"]
+    if task.force * beyond**2 <= force_max_n:
+        ways.append(f"raise task.force_n to {1.01 * task.force * beyond**2:.3g}")
+    ways.append(f"take a softer layer (probe.stiffness_n_m3 = {task.probe.stiffness / beyond**2:.3g})")
+    return (
+        f"joints.{joint.name}: one count moves the probe by {1e3 * each[worst, coarsest]:.2g} mm along the normal, and "
+        f"all joints together by {1e3 * sigmas[worst]:.2g} mm (1σ), where {task.force:g} N press the layer in by "
+        f"{1e3 * depth:.2g} mm: the force would swing by {100 * spread:.0f} %, and above {100 * MOST_SPREAD:.0f} % it "
+        f"does not settle; {' or '.join(ways)}"
+    )
+
+
+def saturation_problem(task: Touch | Calibrate, kappas: Floats) -> str | None:
+    """That the array cannot show the wanted force, because its taxels saturate; None where it can.
+
+    Where a window cuts the patch, more than that force presses until the window measures it.
+
+    Args:
+        task: that touches.
+        kappas: (m, 2) principal curvatures of the object at its contacts, 1/m.
+    """
+    probe, array, pitch = task.probe, task.array, task.array.pad.pitch_m
+    full_pa = array.pad.full_scale_pa
+    if array.pad.is_flat:
+        return None  # a calibration with one is refused as that
+    windowed = array.mode == "window" and array.window != "auto"
+    inside = measured_share(task.force, probe, int(array.window), pitch) if windowed else 1.0
+    at_most = max(
+        (pressed(task.force / inside, probe, array, one) for one in kappas.tolist()), key=lambda one: one.shown_pa
+    )
+    if at_most.shown_pa <= full_pa:
+        return None
+    fits = at_most.depth - (at_most.shown_pa - full_pa) / probe.stiffness
+    lower, shown_pa = 0.99 * task.force * (fits / at_most.depth) ** 2, at_most.shown_pa
+    return (
+        f"sensor.full_scale_kpa = {1e-3 * full_pa:g}: at task.force_n = {task.force:g} the taxels under the middle of "
+        f"the contact have up to {1e-3 * shown_pa:.3g} kPa and saturate, so that the force is not measured; lower "
+        f"task.force_n to {lower:.3g}, or take an array with {1.01e-3 * shown_pa:.3g} kPa"
+    )
+
+
+def edge_margin(task: Touch, kappa: Sequence[float] = (0.0, 0.0)) -> float:
+    """How far from the array's edge the middle of the contact must stay, m; else the cell takes it for run off.
+
+    Args:
+        task: a scan or a press with an array that is wrapped on the probe.
+        kappa: (2,) principal curvatures of the object there, 1/m.
+    """
+    array = task.array
+    if array.pad.is_flat or not array.pad.is_grid:
+        return 0.0
+    half_axis = pressed(task.force, task.probe, array, kappa).half_axis
+    if array.mode == "features":
+        return OFF_PAD_SIGMAS * math.sqrt(half_axis**2 / 6.0 + _blur_m(array) ** 2)
+    return 0.5 * array.pad.pitch_m + half_axis * math.sqrt(1.0 - OFF_PAD + GAIN_SPREAD)
+
+
+def edge_problem(task: Touch, joints: Floats, normals: Floats, kappas: Floats) -> str | None:
+    """That the contact would run off the array; None where it stays.
+
+    Args:
+        task: a scan or a press.
+        joints: (m, n) positions at its contacts, rad or m.
+        normals: (m, 3) outward unit normals there.
+        kappas: (m, 2) principal curvatures there, 1/m.
+    """
+    pad, probe, chain = task.array.pad, task.probe, task.arm.model.chain
+    if pad.is_flat or not pad.is_grid:
+        return None
+    axes = np.array([(forward(chain, q) @ probe.T_flange_probe)[:3, :3] for q in joints])
+    x, y, z = -np.einsum("mij,mi->jm", axes, normals)  # from the probe's centre to the contact
+    sine = np.hypot(x, y)
+    angle = np.arctan2(sine, z)
+    uv = np.abs(np.stack((x, y), axis=1)) * (probe.radius * angle / np.maximum(sine, 1e-300))[:, None]
+    margins = np.array([edge_margin(task, kappa) for kappa in kappas.tolist()])
+    beyond = uv + margins[:, None] - 0.5 * pad.pitch_m * np.array((pad.columns, pad.rows))
+    worst = int(np.argmax(beyond.max(axis=1)))
+    if beyond[worst].max() <= 0.0:
+        return None
+    axis = int(np.argmax(beyond[worst]))
+    count, needs = (pad.columns, pad.rows)[axis], f"the patch at {task.force:g} N needs {1e3 * margins[worst]:.1f} mm"
+    half = 0.5 * pad.pitch_m * count
+    if margins[worst] > half:
+        return (
+            f"sensor.{('columns', 'rows')[axis]} = {count}: the array is {2e3 * half:g} mm wide, and {needs} on each "
+            "side of the middle of the contact; take a larger array, or lower task.force_n"
+        )
+    turns = task_rows(task.arm.model) != FIXED_POLE
+    first = "lower task.rolling_share" if turns else "use an arm that tilts the probe"
+    ways = [first, "shorten task.length_mm"] if task.scan is not None else [first]
+    return (
+        f"task: the contact would run off the array: the normal of the object is up to "
+        f"{math.degrees(angle[worst]):.1f} deg from the probe's pole, and the contact {1e3 * uv[worst, axis]:.1f} mm "
+        f"beside the middle of the array, which reaches {1e3 * half:.1f} mm, and {needs} of it; {' or '.join(ways)}"
+    )

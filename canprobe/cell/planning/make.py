@@ -1,0 +1,318 @@
+"""`make_plan`: everything that follows from a setup, or every reason why it cannot be carried out."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from canprobe.cell.planning.array import array_problems, as_supported, plan_raw_frames, raw_frame_problems
+from canprobe.cell.planning.bridges import unavailable_bridges
+from canprobe.cell.planning.choices import candidates, left_out, outputs, warnings, ways_out
+from canprobe.cell.planning.configuration import make_setups
+from canprobe.cell.planning.devices import (
+    Abilities,
+    identifier_problems,
+    missing_bitrate,
+    missing_objects,
+    order_by_deadline,
+)
+from canprobe.cell.planning.model import (
+    SYNC_OVERFLOW,
+    Choice,
+    Direction,
+    NodeKind,
+    Plan,
+    PlannedBus,
+    PlannedFrames,
+    PlannedNode,
+    PlannedPdo,
+    SyncPlan,
+    Traffic,
+)
+from canprobe.cell.planning.motion import check_motion
+from canprobe.cell.planning.operation import (
+    choose_mode,
+    early_stops,
+    interpolations,
+    operation_problems,
+    period_problem,
+)
+from canprobe.cell.planning.pdos import PdoPlanning, plan_drive_pdos, plan_tactile_pdos
+from canprobe.cell.planning.traffic import plan_ratio, plan_sync, plan_traffic
+from canprobe.cell.planning.units import range_problems, speed_problems, within_drives
+from canprobe.cell.planning.window import cut_patch
+from canprobe.cell.scene.setup import Node, Setup
+from canprobe.errors import EdsError, PlanError
+from canprobe.mechanics.robot.dynamics import dynamics_problem
+
+SYNC_COUNTER = 0x1019
+
+
+def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
+    """Derive the plan of a setup; what it leaves open ("auto") is chosen so that it fits.
+
+    Args:
+        setup: of a scene; see `canprobe.cell.scene.resolve.resolve`.
+        find_ways: look for ways out where the bus is overloaded, which takes far longer than the plan.
+
+    Returns:
+        Nodes, PDOs, bus load, what is left out and why. Its setup has nothing open any more.
+
+    Raises:
+        PlanError: with every reason why the setup does not fit, its numbers and the ways out.
+    """
+    setup = as_supported(setup)
+    devices, problems = _devices(setup)
+    beyond = [*range_problems(setup), *(speed_problems(setup, devices) if not problems else ())]
+    setup, narrowed = within_drives(setup, devices) if not problems and not beyond else (setup, ())
+    unsuited = [*array_problems(setup)]
+    problems += unsuited
+    bus = _choose(setup, devices, problems) if not problems else None
+    ways: list[str] = []
+    if bus is not None:
+        setup = bus.setup
+        if bus.overload and find_ways:
+            known = frozenset(bus.problems)
+            ways += ways_out(setup, lambda changed: _fits(changed, known))
+        cut = cut_patch(setup)
+        if cut is not None and not cut.safe:
+            problems.append(cut.text)
+            ways = ways or [*cut.ways]
+    problems += beyond
+    if setup.bus.direct and setup.bus.bit_error_rate > 0:
+        problems.append('bus.interface = "direct" has no wire: bus.bit_error_rate needs a bus, such as lockstep')
+    if setup.bus.direct and setup.array is not None and setup.array.raw is not None:
+        problems.append('bus.interface = "direct" has no frames: an array of raw frames needs a bus, such as lockstep')
+    joint_speeds, unreachable = check_motion(setup) if not unsuited else (None, [])
+    problems += [*narrowed, *unreachable] if unreachable else []
+    truth, arm = setup.truth, setup.arm
+    if arm is not None and truth.fidelity == "dynamic" and any(drive.emulated for drive in arm.drives):
+        problem = dynamics_problem(arm.model.name, truth.bodies)
+        problems += [problem] if problem is not None else []
+    if problems or bus is None:
+        raise PlanError(_shared(problems), ways)
+    absent = left_out(setup)
+    plan = Plan(
+        setup=setup,
+        nodes=_nodes(setup, devices, bus.pdos, bus.sync),
+        pdos=bus.pdos,
+        raw=bus.raw,
+        sync=bus.sync,
+        buses=bus.buses,
+        choices=bus.choices,
+        joint_speeds=joint_speeds,
+        outputs=outputs(setup, dict(absent)),
+        left_out=(*absent, *_unused_axes(setup, devices)),
+        not_available=(*bus.not_available, *unavailable_bridges(setup)),
+        warnings=(*narrowed, *early_stops(setup, devices), *warnings(setup, bus.pdos)),
+    )
+    return _with_configuration(plan)
+
+
+def _shared(problems: Sequence[str]) -> list[str]:
+    """The problems; what several nodes have alike is one, with their numbers."""
+    nodes: dict[str, list[str]] = {}
+    for problem in problems:
+        node, text = re.fullmatch(r"(?:node (\d+): )?(.*)", problem, re.DOTALL).groups()  # type: ignore[union-attr]
+        nodes.setdefault(text, []).extend([node] if node is not None else [])
+    lists = {text: ", ".join(dict.fromkeys(numbers)) for text, numbers in nodes.items()}
+    return [f"node{'s' * (',' in its)} {its}: {text}" if its else text for text, its in lists.items()]
+
+
+def _with_configuration(plan: Plan) -> Plan:
+    """The plan with what its devices cannot take of their configuration.
+
+    Raises:
+        PlanError: a device cannot take what it must.
+    """
+    setups = make_setups(plan)
+    if problems := [problem for setup in setups for problem in setup.problems]:
+        raise PlanError(_shared(problems))
+    lacks = [(one.what, f"{setup.eds}: {one.why}: {one.write.absence}") for setup in setups for one in setup.left_out]
+    return replace(plan, not_available=tuple(dict.fromkeys((*plan.not_available, *lacks))))
+
+
+@dataclass(frozen=True, slots=True)
+class _BusPlan:
+    """The bus part of a plan.
+
+    Attributes:
+        setup: with nothing open any more.
+        choices: what was open.
+        problems: what is wrong whatever the bit rate.
+        overload: what does not fit it.
+    """
+
+    setup: Setup
+    choices: tuple[Choice, ...]
+    sync: SyncPlan
+    pdos: tuple[PlannedPdo, ...]
+    raw: tuple[PlannedFrames, ...]
+    buses: tuple[PlannedBus, ...]
+    problems: list[str]
+    overload: list[str]
+    not_available: tuple[tuple[str, str], ...]
+
+    @property
+    def misfit(self) -> tuple[int, float]:
+        """How far it is from fitting: problems, then the largest share of a bus, or of a trigger's time, in demand."""
+        shares = [bus.traffic.load for bus in self.buses]
+        shares += [demand.used_ns / demand.available_ns for bus in self.buses for demand in bus.traffic.demands]
+        return len(self.problems), max(shares)
+
+
+def _choose(setup: Setup, devices: Mapping[int, Abilities], problems: list[str]) -> _BusPlan:
+    """The first candidate that fits, or else the nearest to it, and then why it does not."""
+    found: list[_BusPlan] = []
+    for candidate, choices in candidates(setup):
+        bus = _plan_bus(candidate, devices, choices)
+        if not bus.overload and not bus.problems:
+            return bus
+        found.append(bus)
+    wanted = setup.arm is None or setup.arm.torque
+    found = [bus for bus in found if bus.setup.arm is None or bus.setup.arm.torque == wanted]
+    nearest = min(found, key=lambda bus: bus.misfit)
+    if len(found) > 1:
+        chosen = ", ".join(f"{choice.key} = {choice.value}" for choice in nearest.choices)
+        problems.append(f"none of {len(found)} ways to fill what is left open fits; the nearest: {chosen}")
+    problems += [*nearest.problems, *nearest.overload]
+    return nearest
+
+
+def _plan_bus(setup: Setup, devices: Mapping[int, Abilities], choices: tuple[Choice, ...] = ()) -> _BusPlan:
+    sync, exact = plan_sync(setup)
+    drives = [devices[node_id] for node_id in setup.arm.node_ids] if setup.arm is not None else []
+    problem = period_problem(setup.rate_hz, sync.period_us, exact, drives)
+    ratio, found = plan_ratio(setup)
+    not_available = []
+    if uncounted := [f"node {node_id}" for node_id, device in sorted(devices.items()) if not _counts_syncs(device)]:
+        sync = replace(sync, overflow=0)
+        not_available.append(("SYNC counter", f"{', '.join(uncounted)} cannot take one: no 1019h"))
+    problems = [*([problem] if problem is not None else []), *found]
+    channels = _channels(setup)
+    channel_of = {node_id: channel for channel, node_ids in channels.items() for node_id in node_ids}
+    planning = PdoPlanning(setup, sync, devices, channel_of, problems=problems, not_available=not_available)
+    plan_drive_pdos(planning)
+    plan_tactile_pdos(planning, ratio)
+    by_deadline = setup.bus.cob_ids == "by_deadline"
+    planned = order_by_deadline(planning.pdos, devices.values()) if by_deadline else planning.pdos
+    planning.problems += identifier_problems(planned)
+    frames = plan_raw_frames(setup)
+    if setup.array is not None:
+        planning.problems += raw_frame_problems(frames, planned, channels, setup.array.name)
+    traffic = plan_traffic(planned, sync, channels, setup.bus, setup.compute_ns, raw=frames)
+    return _BusPlan(
+        setup=setup,
+        choices=choices,
+        sync=sync,
+        pdos=traffic.pdos,
+        raw=traffic.raw,
+        buses=traffic.buses,
+        problems=planning.problems,
+        overload=traffic.problems,
+        not_available=tuple(dict.fromkeys(planning.not_available)),
+    )
+
+
+def _counts_syncs(device: Abilities) -> bool:
+    """Whether a device can take a SYNC with our counter."""
+    entry = device.description.entry(SYNC_COUNTER)
+    return entry is not None and (entry.initial == SYNC_OVERFLOW or (entry.writable and entry.allows(SYNC_OVERFLOW)))
+
+
+def _unused_axes(setup: Setup, devices: Mapping[int, Abilities]) -> list[tuple[str, str]]:
+    """The axes of drives of several axes that the cell does not drive, as (what, why)."""
+    unused = []
+    for kind, role, node in _roles(setup):
+        if kind == "drive" and (others := [axis for axis in devices[node.node_id].axes if axis > 1]):
+            objects = ", ".join(f"{0x6000 + 0x800 * (axis - 1):04X}h" for axis in others)
+            what = (
+                f"ax{'es' if len(others) > 1 else 'is'} {', '.join(map(str, others))} of node {node.node_id} ({role})"
+            )
+            unused.append(
+                (what, f"{node.eds} has objects of more axes, from {objects}: a joint has the first of its node")
+            )
+    return unused
+
+
+def _channels(setup: Setup) -> dict[str, tuple[int, ...]]:
+    """Which nodes are on which bus, in the order of `_roles`; an array of raw frames is on one without being a node."""
+    nodes = [node for _, _, node in _roles(setup)]
+    others = [setup.array.channel] if setup.array is not None and setup.array.raw is not None else []
+    names = dict.fromkeys([*(node.channel for node in nodes), *others])
+    return {name: tuple(sorted(node.node_id for node in nodes if node.channel == name)) for name in names}
+
+
+def _fits(setup: Setup, known: frozenset[str]) -> tuple[Setup, Traffic] | None:
+    """A changed setup as it is closed, and its fullest bus, if it fits and brings no problem that is not known already.
+
+    The plan would give up the motor torque for it too.
+    """
+    devices, problems = _devices(setup)
+    if problems:
+        return None
+    for candidate, _ in candidates(setup):
+        bus = _plan_bus(candidate, devices)
+        if not bus.overload and known.issuperset(bus.problems):
+            return candidate, max((one.traffic for one in bus.buses), key=lambda traffic: traffic.load)
+    return None
+
+
+def _roles(setup: Setup) -> list[tuple[NodeKind, str, Node]]:
+    """Every node with its kind and its role, the drives from the base, the array last."""
+    drives = setup.arm.drives if setup.arm is not None else ()
+    roles: list[tuple[NodeKind, str, Node]] = [
+        ("drive", f"joint {axis}", drive) for axis, drive in enumerate(drives, start=1)
+    ]
+    array = setup.array
+    return roles if array is None or array.raw is not None else [*roles, ("tactile", "tactile array", array)]
+
+
+def _devices(setup: Setup) -> tuple[dict[int, Abilities], list[str]]:
+    """What each node can by its own EDS, and what is missing there, said once of a file that several nodes have."""
+    seen: set[tuple[NodeKind, str]] = set()
+    devices: dict[int, Abilities] = {}
+    problems: list[str] = []
+    for kind, _, node in _roles(setup):
+        first = (kind, node.eds) not in seen
+        seen.add((kind, node.eds))
+        try:
+            device = devices[node.node_id] = Abilities.of(node.eds, node.node_id)
+        except EdsError as error:
+            problems += [f"{'arm' if kind == 'drive' else 'sensor'}.eds: {error}"] if first else []
+            continue
+        if first:
+            problems += missing_objects(device, kind, setup) + missing_bitrate(device, kind, setup)
+            problems += operation_problems(device) if kind == "drive" else []
+    return devices, problems
+
+
+def _nodes(
+    setup: Setup, devices: Mapping[int, Abilities], pdos: tuple[PlannedPdo, ...], sync: SyncPlan
+) -> tuple[PlannedNode, ...]:
+    nodes = [
+        PlannedNode(
+            node_id=node.node_id,
+            kind=kind,
+            role=role,
+            eds=node.eds,
+            dictionary=devices[node.node_id].od,
+            identity=replace(devices[node.node_id].identity, serial_number=node.serial),
+            emulated=node.emulated,
+            channel=node.channel,
+            switched_off=_switched_off(node.node_id, devices[node.node_id], pdos),
+            mode=choose_mode(devices[node.node_id]) if kind == "drive" else None,
+            interpolation=interpolations(devices[node.node_id], sync.period_us) if kind == "drive" else (),
+        )
+        for kind, role, node in _roles(setup)
+    ]
+    return tuple(sorted(nodes, key=lambda node: node.node_id))
+
+
+def _switched_off(node_id: int, device: Abilities, pdos: tuple[PlannedPdo, ...]) -> tuple[tuple[Direction, int], ...]:
+    """PDOs that the device has, that the scene does not need and that can be switched off."""
+    used = {(pdo.direction, pdo.number) for pdo in pdos if pdo.node_id == node_id}
+    directions: tuple[Direction, ...] = ("rpdo", "tpdo")
+    has = [(direction, number) for direction in directions for number in device.pdo_numbers(direction)]
+    return tuple(one for one in has if one not in used and device.fixed_cob_id(*one) is None)

@@ -1,0 +1,391 @@
+"""The plan: frozen data that bring-up, cycle, emulator and command line all work from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+from canprobe.cell.scene.load import SAVED_AS, dump_scene, written_by_line
+from canprobe.cell.scene.model import Scene
+from canprobe.cell.scene.rules import with_choices
+from canprobe.cell.scene.setup import Setup
+from canprobe.fieldbus.protocol.cia402 import OperationMode
+from canprobe.fieldbus.protocol.pdo import PdoEntry, PdoLayout
+
+if TYPE_CHECKING:
+    from canopen import ObjectDictionary
+
+MASTER_NODE_ID = 127
+HEARTBEAT_PRODUCED_MS = 100
+HEARTBEAT_CONSUMED_MS = 250
+SYNC_OVERFLOW = 240
+AROUND_S = 3.0
+"""What a task takes besides its phase, about: enabling, the way to the object, settling, letting go."""
+
+EVERY_SYNC = 1
+"""Transmission type of what goes in every cycle."""
+
+NodeKind = Literal["drive", "tactile"]
+Direction = Literal["tpdo", "rpdo"]
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Object 1018h as the EDS gives it, and its serial number as the scene does; None where it may be any."""
+
+    vendor_id: int | None
+    product_code: int | None
+    revision_number: int | None
+    serial_number: int | None = None
+
+    @property
+    def numbers(self) -> tuple[int | None, int | None, int | None, int | None]:
+        """1018h:01 to :04."""
+        return self.vendor_id, self.product_code, self.revision_number, self.serial_number
+
+
+@dataclass(frozen=True, slots=True)
+class Interpolation:
+    """A time as 60C2h expresses it: value · 10^index s.
+
+    Attributes:
+        value: 60C2h:01.
+        index: 60C2h:02.
+    """
+
+    value: int
+    index: int
+
+    def __str__(self) -> str:
+        return f"{self.value}·10{str(self.index).translate(_SUPERSCRIPT)} s"
+
+
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedNode:
+    """A node that is brought up.
+
+    Attributes:
+        node_id: 1–126.
+        kind: `drive` or `tactile`.
+        role: for people: `joint 1`, `tactile array`.
+        eds: name or path of its EDS.
+        identity: what 1018h must answer.
+        emulated: served by the emulator.
+        channel: of the bus that it is on.
+        switched_off: PDOs of the EDS that the scene does not need, (direction, number).
+        mode: of operation, 6060h; None: no drive.
+        interpolation: the period as 60C2h may express it, the first as it is written; empty: no drive.
+        dictionary: canopen's object dictionary, as the EDS was read for this plan. Treat it as read-only.
+    """
+
+    node_id: int
+    kind: NodeKind
+    role: str
+    eds: str
+    dictionary: ObjectDictionary = field(repr=False, compare=False)
+    identity: Identity
+    emulated: bool
+    channel: str
+    switched_off: tuple[tuple[Direction, int], ...]
+    mode: OperationMode | None = None
+    interpolation: tuple[Interpolation, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedPdo:
+    """One PDO of one node.
+
+    Attributes:
+        node_id: the node.
+        direction: from the device's view.
+        number: 1 for 1400h/1600h or 1800h/1A00h.
+        channel: of the bus that it is on.
+        layout: COB-ID, mapping entries and transmission type.
+        rate_hz: how often it is on the bus; for an event-driven one the slowest rate.
+        bits_worst: length on the wire with worst-case stuffing.
+        deadline_ns: after the SYNC, or after its own queueing where event-driven.
+        response_ns: worst case of its end after the SYNC, or after its own queueing where event-driven; None where
+            the bus is overloaded.
+        event_timer_ms: 14xxh:05, 0 without.
+        kind: of the node.
+        used: False for a TPDO that nobody needs and that cannot be switched off.
+        fixed_id: its COB-ID cannot be changed.
+        own_bits: bits 29 and 30 of its COB-ID, as the device has them.
+        constants: what entries hold that the cycle does not command, by (index, sub-index).
+    """
+
+    node_id: int
+    direction: Direction
+    number: int
+    channel: str
+    layout: PdoLayout
+    rate_hz: float
+    bits_worst: int
+    deadline_ns: int
+    response_ns: int | None = None
+    event_timer_ms: int = 0
+    kind: NodeKind = "drive"
+    used: bool = True
+    fixed_id: bool = False
+    own_bits: int = 0
+    constants: tuple[tuple[tuple[int, int], int], ...] = ()
+
+    @property
+    def cob_id(self) -> int:
+        """11-bit identifier."""
+        return self.layout.cob_id
+
+    @property
+    def slack_ns(self) -> int | None:
+        """What its deadline leaves after the worst case; None where that has no bound."""
+        return None if self.response_ns is None else self.deadline_ns - self.response_ns
+
+    @property
+    def entries(self) -> tuple[PdoEntry, ...]:
+        """Mapped objects, dummies included."""
+        return self.layout.entries
+
+    @property
+    def transmission_type(self) -> int:
+        """18xxh:02 or 14xxh:02."""
+        return self.layout.transmission_type
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedFrames:
+    """Raw frames of one identifier, of an array that is no CANopen node.
+
+    Attributes:
+        can_id: 11-bit identifier.
+        channel: of the bus that they are on.
+        what: `image`, `start`, `stop` or `poll`.
+        sent: by the master; else by the device.
+        count: of one image, or of one command.
+        length: bytes of the longest.
+        rate_hz: of the images; 0 for what is sent at the beginning and the end.
+        bits_worst: of all of them with worst-case stuffing.
+        response_ns: worst case from the first one's queueing to the last one's end; None where the bus is overloaded,
+            or where they have no rate.
+    """
+
+    can_id: int
+    channel: str
+    what: Literal["image", "start", "stop", "poll"]
+    sent: bool
+    count: int
+    length: int
+    rate_hz: float
+    bits_worst: int
+    response_ns: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class SyncPlan:
+    """SYNC as 1005h, 1006h and 1019h express it.
+
+    Attributes:
+        rate_hz: as the scene asks.
+        period_ns: integer.
+        period_us: 1006h.
+        overflow: 1019h.
+    """
+
+    rate_hz: float
+    period_ns: int
+    period_us: int
+    overflow: int
+
+
+@dataclass(frozen=True, slots=True)
+class Demand:
+    """What the frames that one trigger releases ask of the bus, worst case.
+
+    Attributes:
+        what: which frames.
+        cycles: within how many cycles they must be through.
+        used_ns: wire time they and everything of higher priority take meanwhile.
+        available_ns: the cycles' length.
+    """
+
+    what: str
+    cycles: int
+    used_ns: int
+    available_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class CycleBudget:
+    """The worst course of one cycle, ns after its SYNC is due; None without such a part, or without a bound.
+
+    Of several buses each time is that of the last: the controller waits for the feedback of all of them.
+
+    Attributes:
+        period_ns: of SYNC.
+        looks_ns: when the cell looks for TPDOs.
+        sync_ns: the SYNC is through.
+        feedback_ns: the last TPDO of a drive is in.
+        start_ns: the controller starts, at the first look that finds them all.
+        compute_ns: what it takes at most, as the scene says.
+        commands_ns: the last RPDO is through.
+        tactile_ns: the last PDO of a tactile frame is in.
+        slack_ns: what is left of the period; negative: the next SYNC comes too early.
+    """
+
+    period_ns: int
+    looks_ns: tuple[int, ...]
+    sync_ns: int | None
+    feedback_ns: int | None
+    start_ns: int | None
+    compute_ns: int
+    commands_ns: int | None
+    tactile_ns: int | None
+    slack_ns: int | None
+
+    @property
+    def bus_ns(self) -> int | None:
+        """The period's share of the bus: until the controller starts, and from its end to the last RPDO."""
+        if self.start_ns is None or self.slack_ns is None:
+            return None
+        return self.period_ns - self.compute_ns - self.slack_ns
+
+
+@dataclass(frozen=True, slots=True)
+class Traffic:
+    """The bus, worst case.
+
+    Attributes:
+        load: share of the bit rate, everything that repeats.
+        parts: the same by (what, share).
+        demands: peaks behind one SYNC.
+        sync_response_ns: worst-case response time of SYNC.
+        budget: of one cycle of the cell, with all its buses.
+    """
+
+    load: float
+    parts: tuple[tuple[str, float], ...]
+    demands: tuple[Demand, ...]
+    sync_response_ns: int | None
+    budget: CycleBudget
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedBus:
+    """One bus of the cell.
+
+    Attributes:
+        channel: its name in the scene.
+        node_ids: who is on it.
+        traffic: whether it fits, with numbers.
+    """
+
+    channel: str
+    node_ids: tuple[int, ...]
+    traffic: Traffic
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """Something that the scene left to the plan.
+
+    Attributes:
+        key: of the scene file.
+        value: what was chosen, as the scene file writes it.
+        why: for people.
+    """
+
+    key: str
+    value: str
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class JointSpeeds:
+    """Fastest joint motion of the task, and what is allowed, one value a joint, each in its unit: deg/s or mm/s."""
+
+    needed: tuple[float, ...]
+    limit: tuple[float, ...]
+    units: tuple[str, ...]
+
+    @property
+    def worst_share(self) -> float:
+        """Largest share of its limit that a joint is asked for; above 1 it cannot."""
+        return max(need / limit for need, limit in zip(self.needed, self.limit, strict=True))
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Everything that follows from a scene before anything is started.
+
+    Attributes:
+        setup: the resolved scene in SI units, with every choice of the plan.
+        nodes: that are brought up, by node id.
+        pdos: of all nodes, by priority on the bus.
+        raw: frames of an array that is no CANopen node.
+        sync: the cycle.
+        buses: that of the first joint first, then the others in the order of the joints, the array's last.
+        choices: values that the scene left to the plan, with reasons.
+        joint_speeds: needed and allowed; None without an arm.
+        outputs: files that a run writes.
+        left_out: what this scene does not bring up, and why.
+        not_available: what the EDS files could not give.
+        warnings: what is carried out although a number of the plan does not hold for it.
+    """
+
+    setup: Setup
+    nodes: tuple[PlannedNode, ...]
+    pdos: tuple[PlannedPdo, ...]
+    raw: tuple[PlannedFrames, ...]
+    sync: SyncPlan
+    buses: tuple[PlannedBus, ...]
+    choices: tuple[Choice, ...]
+    joint_speeds: JointSpeeds | None
+    outputs: tuple[str, ...]
+    left_out: tuple[tuple[str, str], ...]
+    not_available: tuple[tuple[str, str], ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def scene(self) -> Scene:
+        """The scene with every choice of the plan filled in."""
+        return self._chosen(self.setup.scene)
+
+    @property
+    def files(self) -> dict[str, bytes]:
+        """The files of the scene by name, `SAVED_AS` and those that it names, as they were read for this plan."""
+        text = f"{written_by_line()}\n{dump_scene(self._chosen(self.setup.saved))}"
+        return {SAVED_AS: text.encode(), **self.setup.files}
+
+    def _chosen(self, scene: Scene) -> Scene:
+        return with_choices(scene, {choice.key: choice.value for choice in self.choices})
+
+    @property
+    def traffic(self) -> Traffic:
+        """Traffic of the first bus, which is that of the first joint."""
+        return self.buses[0].traffic
+
+    @property
+    def cycles(self) -> int:
+        """About how many the whole task takes, with the ways to the object and back."""
+        return round((self.setup.task.duration_s + AROUND_S) * self.sync.rate_hz)
+
+    @property
+    def emulated_channels(self) -> tuple[str, ...]:
+        """Of the buses on which something is emulated."""
+        channels = dict.fromkeys(node.channel for node in self.nodes if node.emulated)
+        array = self.setup.array
+        if array is not None and array.raw is not None and array.emulated:
+            channels[array.channel] = None
+        return tuple(channels)
+
+    @property
+    def node_ids(self) -> tuple[int, ...]:
+        """Ids of the nodes that are brought up."""
+        return tuple(node.node_id for node in self.nodes)
+
+    def pdos_of(self, node_id: int, direction: Direction) -> tuple[PlannedPdo, ...]:
+        """The PDOs of one node in one direction that the scene uses, by number."""
+        found = [pdo for pdo in self.pdos if pdo.node_id == node_id and pdo.direction == direction and pdo.used]
+        return tuple(sorted(found, key=lambda pdo: pdo.number))

@@ -1,0 +1,580 @@
+"""Can the arm do it: reach, joint stops and joint speeds along the whole path."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.planning.contact import contact_problems, edge_margin, saturation_problem
+from canprobe.cell.planning.model import JointSpeeds
+from canprobe.cell.scene.setup import Approach, Arm, Calibrate, Free, Probe, SafetyLimits, Setup, Touch
+from canprobe.errors import PlanError
+from canprobe.mechanics.robot.chain import forward, forward_jacobian
+from canprobe.mechanics.robot.inverse import (
+    FIXED_POLE,
+    LENGTH_M,
+    in_rows,
+    inverse_near,
+    probe_pose,
+    start_posture,
+    task_rows,
+)
+from canprobe.mechanics.touch.probe_motion import (
+    MOVE_SPEED,
+    OFF_M,
+    RETREAT_SPEED,
+    ROUND_SPEED,
+    SETTLE_S,
+    ArcMotion,
+    LineMotion,
+    PoseSteps,
+)
+from canprobe.mechanics.touch.servo import ProbePose
+from canprobe.mechanics.touch.shapes import PlacedShape
+
+Array = NDArray[np.float64]
+
+SAMPLES = 240
+"""Points of a path."""
+_STEEPEST = math.radians(70.0)  # the servo steers in the scan plane: steeper than this it cannot follow
+_METRES = 6e-3  # a place so near the origin of the base was hardly meant in mm; the lifted start may add some mm
+_BRANCH_RAD = 0.3  # between two points of a path; farther away lies another branch
+_SINGULAR = 1e-3  # of the Jacobian in rows of a posture from which an arm cannot go on
+_RESTS_M = 5e-6  # of a ball, which may stand on two places that differ by so much
+_BALL_STEPS = 6  # halves what is left of the way from under the centre to the contact
+_PATCH_M = 2e-3  # half of the width of a patch
+_BESIDE_M = 1e-6  # of a foot that does not lie under its point along the normal: on the surface's border
+_TOUCH_TO_TOUCH_RAD = 1.0  # between the touches of a calibration, and from the approach to the first contact
+DEVIATION_RAD = math.radians(1.0)
+"""By which the joints of a touch may go beyond its planned way, which knows neither the depth nor the servo; for a
+prismatic one see `ArmModel.radian`. Without the last retreat, which no stop ends; near a singular posture there is no
+such bound."""
+PARKED_ABOVE = 5e-3
+"""How far above the approach's first point an emulated arm stands at power on, m."""
+
+
+# The path that a task will take over the object as the scene describes it: points, normals, curvature.
+
+
+@dataclass(frozen=True, slots=True)
+class SurfacePath:
+    """Contacts that the task will make.
+
+    Attributes:
+        points: (n, 3) m, base frame; the first is where the approach ends.
+        normals: (n, 3) outward unit normals there.
+        kappas: (n, 2) principal curvatures there, 1/m; 0 where a ball bridges what a formula does not describe.
+        hollow_radius: smallest concave radius met, m; inf without one.
+    """
+
+    points: Array
+    normals: Array
+    kappas: Array
+    hollow_radius: float
+
+
+def surface_path(task: Touch, shape: PlacedShape | None) -> SurfacePath:
+    """Points of the object under the task's path; without a described object the plane that the approach expects.
+
+    Args:
+        task: a scan or a press.
+        shape: the object.
+
+    Raises:
+        PlanError: the approach or the path misses the object, or the probe first meets it beside the array.
+    """
+    approach, down = task.approach, task.approach.normal
+    plane = approach.start[None, :]  # points in the scan plane; one for a press
+    if task.scan is not None:
+        flat = [task.scan.strategy.point(phase) for phase in np.linspace(0, 2 * math.pi, SAMPLES, endpoint=False)]
+        plane = approach.start + np.array(flat) @ approach.axes[:2]
+    if shape is None:
+        return SurfacePath(plane, np.tile(down, (len(plane), 1)), np.zeros((len(plane), 2)), math.inf)
+    # A ball bridges what a point would fall into.
+    radius = task.probe.radius if shape.by_gaps and not task.array.pad.is_flat else 0.0
+    _check_approach(approach, _along(shape, approach.start, down, radius))
+    if not task.array.pad.is_flat:
+        plane = plane + _first_contact(shape, approach, task.probe.radius)
+    path = _contacts(shape, plane, down, radius)
+    if shape.by_gaps:
+        path = _under_ball(shape, path, plane, down, radius)
+    if path.hollow_radius > task.probe.radius:  # a tighter hollow is refused as that
+        _check_first_touch(task, shape)
+    return path
+
+
+def _first_contact(shape: PlacedShape, approach: Approach, radius: float) -> Array:
+    """Where a ball first touches, (3,) m across the approach from its end: the path begins there."""
+    height = _along(shape, approach.start, approach.normal, radius)
+    if height is None or shape.tightest_concave_radius(approach.start[None]) <= radius:
+        return np.zeros(3)  # in a hollow that is tighter it touches in two places, which is refused as that
+    beside = shape.closest(approach.start + (height + radius) * approach.normal).point - approach.start
+    across: Array = beside - float(beside @ approach.normal) * approach.normal
+    return across
+
+
+def _contacts(shape: PlacedShape, plane: Array, up: Array, radius: float) -> SurfacePath:
+    """Where a ball of `radius` over each point (n, 3) rests, or the surface itself with 0."""
+    contacts = []
+    for point in plane:
+        height = _along(shape, point, up, radius)
+        if height is None:
+            raise PlanError(
+                [
+                    f"task: at {_mm(point)} mm the path leaves the object or meets it steeper than "
+                    f"{math.degrees(_STEEPEST):.0f} deg; shorten task.length_mm or task.width_mm, or turn "
+                    "task.heading_deg"
+                ]
+            )
+        contacts.append(shape.closest(point + (height + radius) * up))
+    points, normals = np.array([c.point for c in contacts]), np.array([c.normal for c in contacts])
+    kappas = np.zeros((len(contacts), 2)) if shape.by_gaps else np.array([c.kappa for c in contacts])
+    return SurfacePath(points, normals, kappas, shape.tightest_concave_radius(points))
+
+
+def _under_ball(shape: PlacedShape, path: SurfacePath, plane: Array, up: Array, radius: float) -> SurfacePath:
+    """The path of a ball whose contacts, not whose centre, lie over the points of the plane."""
+    over = plane
+    for _ in range(_BALL_STEPS):
+        path = _over_patches(path, plane, radius)
+        beside = plane - path.points
+        over = over + beside - np.outer(beside @ up, up)
+        path = _contacts(shape, over, up, radius)
+    return _over_patches(path, plane, radius)
+
+
+def _over_patches(path: SurfacePath, plane: Array, radius: float) -> SurfacePath:
+    """A ball's path with the normals as its pad shows them: of each point from a linear fit to those near it."""
+    beside = plane[None] - plane[:, None]
+    weights = np.exp(-0.5 * np.sum((beside / _PATCH_M) ** 2, axis=2))
+    terms = np.concatenate((np.ones((*weights.shape, 1)), beside / _PATCH_M), axis=2)
+    weighted = (weights[..., None] * terms).transpose(0, 2, 1)
+    moments = weighted @ terms + 1e-6 * np.eye(4)  # along a line, nothing is known beside it
+    normals = np.linalg.solve(moments, weighted @ path.normals)[:, 0]
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    return replace(path, points=path.points + radius * (path.normals - normals), normals=normals)
+
+
+def _mm(point: Array) -> str:
+    x, y, z = (1e3 * point).tolist()
+    return f"({x:.1f}, {y:.1f}, {z:.1f})"
+
+
+def _along(shape: PlacedShape, point: Array, up: Array, radius: float = 0.0) -> float | None:
+    """Height along `up` over `point` at which the foot of a ball of `radius` rests on the surface, m, by Newton.
+
+    None where the line misses or grazes the surface, or the ball rests on its border.
+    """
+    height = 0.0
+    for _ in range(50):
+        at = point + (height + radius) * up
+        foot = shape.closest(at)
+        steepness = float(foot.normal @ up)
+        if steepness < math.cos(_STEEPEST) or np.abs(at - foot.point - foot.distance * foot.normal).max() > _BESIDE_M:
+            return None
+        if abs(foot.distance - radius) < (_RESTS_M if radius else 1e-9):
+            return height
+        height -= (foot.distance - radius) / steepness
+    return None
+
+
+def _check_approach(approach: Approach, miss: float | None) -> None:
+    """The approach finds the object, whose surface is `miss` above its end."""
+    x, y, z = (1e3 * approach.start).tolist()
+    where = f"task.start_mm = ({x:g}, {y:g}, {z:g})"
+    if miss is None:
+        raise PlanError(
+            [f"{where}: the approach does not meet the object; move start_mm over it or the object under it"]
+        )
+    if not -approach.search <= miss <= approach.clearance:
+        side = "above" if miss > 0 else "below"
+        searched = f"{1e3 * approach.clearance:g} mm above to {1e3 * approach.search:g} mm below"
+        lies = f"the object lies {abs(1e3 * miss):.1f} mm {side} along the approach"
+        raise PlanError([f"{where}: {lies}, searched from {searched}; move one of them"])
+
+
+def _check_first_touch(task: Touch, shape: PlacedShape) -> None:
+    """The probe is not in the object before its approach, and first meets it where the array is."""
+    approach, radius, up = task.approach, task.probe.radius, task.approach.normal
+    nearest = shape.closest(approach.start + (approach.clearance + radius) * up)
+    tilt = math.acos(min(max(float(nearest.normal @ up), -1.0), 1.0))
+    mend = f"turn task.approach_normal by {math.degrees(tilt):.0f} deg to the object's normal, or move one of them"
+    if nearest.distance <= radius:
+        deep = 1e3 * (radius - nearest.distance)
+        what = f"{deep:.1f} mm in the object before its approach, {math.degrees(tilt):.0f} deg beside it"
+        raise PlanError([f"task.clearance_mm = {1e3 * approach.clearance:g}: the probe would be {what}; {mend}"])
+    reaches, margin = task.array.pad.reach_m, edge_margin(task)
+    if margin < reaches < radius * tilt + margin:
+        beside = f"the first touch would be {1e3 * radius * tilt:.1f} mm beside the middle of the array"
+        reach = f"which reaches {1e3 * reaches:.1f} mm, and the patch at {task.force:g} N needs {1e3 * margin:.1f} mm"
+        raise PlanError([f"task.approach_normal: {beside}, {reach} of it; {mend}"])
+
+
+# Can the arm do it: reach, joint stops and joint speeds along the whole path.
+
+
+def check_motion(setup: Setup) -> tuple[JointSpeeds | None, list[str]]:
+    """What the task asks of the arm, and what the arm cannot do."""
+    if setup.arm is None:
+        return None, []
+    stops = _Stops(setup.arm, setup.limits)
+    problems = stops.start_problems()
+    if (lacking := _lacking_rows(setup)) is not None:
+        return None, [*problems, lacking]
+    speeds: JointSpeeds | None
+    try:
+        match setup.task:
+            case Free() as task:
+                speeds, found = _check_swing(task, stops, starts=not problems)
+            case Calibrate() as task:
+                ball, q_start = task, _beginning(setup, task, _over_ball(task))
+                _follow(task.arm, task.probe, _over_ball(task), q_start)
+                joints = _gone(task.arm, task.probe, q_start, lambda pose: _round_ball(ball, pose))
+                speeds, found = stops.speeds(np.zeros_like(task.arm.q_start)), stops.problems(joints, touching=True)
+                kappas = np.full((1, 2), 1.0 / task.ball_radius)
+                found += [problem] if (problem := saturation_problem(task, kappas)) is not None else []
+            case Touch() as task:
+                path = surface_path(task, setup.truth.object)
+                problems += _hollow_problems(path, task.probe)
+                contacts = [*_along_path(task, path)][_BEFORE_CONTACT:]
+                speeds, found = _check_touch(task, path, stops, _beginning(setup, task, contacts))
+            case _:
+                return None, problems
+    except PlanError as error:
+        return None, [*problems, *error.problems]
+    return speeds, problems + found
+
+
+def parked_posture(setup: Setup, arm: Arm) -> Array:
+    """Where an emulated arm stands at power on, (n,) rad or m: above the start of a touch, else as in the scene.
+
+    Raises:
+        PlanError: it cannot stand there.
+    """
+    touch = setup.touch
+    if touch is None:
+        return arm.q_start
+    clearance = touch.approach.clearance
+    try:
+        return start_posture(
+            arm.model,
+            touch.approach.start,
+            touch.approach.normal,
+            arm.q_start,
+            radius_m=touch.probe.radius,
+            T_flange_probe=touch.probe.T_flange_probe,
+            clearance_m=clearance + PARKED_ABOVE,
+        )
+    except (PlanError, ValueError) as error:
+        raise PlanError(
+            [
+                f"task.clearance_mm = {1e3 * clearance:g}: an emulated arm begins {1e3 * PARKED_ABOVE:g} mm above it,"
+                f" and cannot: {error}; lower it, move the object, or set start_deg of the joints to another branch"
+            ]
+        ) from error
+
+
+def reach_problems(setup: Setup, task: Touch, poses: Iterable[tuple[Array, Array]]) -> list[str]:
+    """Why the arm of a touch cannot go through poses of its probe.
+
+    Args:
+        setup: whole.
+        task: of it.
+        poses: centre (3,), m, and pole (3,) away from the object, base frame.
+    """
+    targets = [_Pose(centre, pole, _TOUCH_TO_TOUCH_RAD, "out of reach: {why}") for centre, pole in poses]
+    try:
+        return _Stops(task.arm, setup.limits).problems(_follow(task.arm, task.probe, targets, task.arm.q_start))
+    except PlanError as error:
+        return list(error.problems)
+
+
+def _lacking_rows(setup: Setup) -> str | None:
+    """What the task needs of the probe's pose and the arm cannot do, whatever the path; None where nothing."""
+    arm, task = setup.arm, setup.task
+    if arm is None or not isinstance(task, Touch | Calibrate):
+        return None
+    rows, name = task_rows(arm.model), arm.model.name
+    if isinstance(task, Calibrate) and rows < 5:
+        return (
+            f"task.kind: a calibration tilts the probe, and the {name} arm of {arm.model.n} joints holds its tilt fixed"
+        )
+    T, J = forward_jacobian(arm.model.chain, arm.q_start, task.probe.T_flange_probe)
+    held = in_rows(rows, T[:3, :3], J) * arm.model.radian
+    held[:3] /= LENGTH_M
+    weakest = float(np.linalg.svd(held, compute_uv=False)[-1]) if len(held) <= arm.model.n else 0.0
+    if weakest > _SINGULAR:
+        return None
+    what = {3: "its position", 5: "its position and pole", 6: "its pose"}[rows]
+    return (
+        f"joints: in its start posture the {name} arm of {arm.model.n} joints cannot move the probe's centre and pole "
+        f"in every direction that a touch needs ({what}; smallest singular value {weakest:.2g}, needed {_SINGULAR:g}): "
+        "start from another posture, or use an arm that can"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Stops:
+    """The joints' stops and speeds, less what the limits keep from them."""
+
+    arm: Arm
+    limits: SafetyLimits
+
+    def inside(self, low: Array, high: Array) -> NDArray[np.bool_]:
+        """For each joint whether a range of positions, (n,) rad or m each, is allowed."""
+        model = self.arm.model
+        margin = self.limits.joint_margin
+        inside: NDArray[np.bool_] = (low >= model.q_min + margin) & (high <= model.q_max - margin)
+        return inside
+
+    def allowed(self, joint: int) -> str:
+        """A joint's range, for people."""
+        a, kept = self.arm.model.joints[joint], float(self.limits.joint_margin[joint])
+        low, high, margin = a.shown(a.q_min), a.shown(a.q_max), a.shown(kept)
+        return f"{low + margin:g} to {high - margin:g} {a.unit} ({margin:g} {a.unit} from its stops)"
+
+    def start_problems(self) -> list[str]:
+        """Joints that would start outside."""
+        q, joints = self.arm.q_start, self.arm.model.joints
+        return [
+            f"joints.{joints[i].name}.start_{joints[i].unit}: at {joints[i].text(q[i], 'g')}, allowed {self.allowed(i)}"
+            for i in np.flatnonzero(~self.inside(q, q)).tolist()
+        ]
+
+    def problems(self, joints: Array, *, touching: bool = False) -> list[str]:
+        """Joints that would leave their range, of positions (m, n) rad or m; a touch may lead them somewhat farther."""
+        its, farther = self.arm.model.joints, DEVIATION_RAD * touching * self.arm.model.radian
+        low, high = joints.min(axis=0), joints.max(axis=0)
+        near = "and {} less, by which a touch may lead it farther; "
+        return [
+            f"task: joint {i + 1} would move from {its[i].shown(low[i]):.1f} to {its[i].text(high[i])}, "
+            f"allowed {self.allowed(i)}; {near.format(its[i].text(farther[i])) * touching}"
+            "move the object, shorten the path, or raise task.rolling_share"
+            for i in np.flatnonzero(~self.inside(low - farther, high + farther)).tolist()
+        ]
+
+    def speeds(self, needed: Array) -> JointSpeeds:
+        """Needed speeds (n,), rad/s or m/s, beside what is allowed."""
+        joints, limit = self.arm.model.joints, self.arm.model.qd_max * self.limits.speed_share
+        return JointSpeeds(
+            tuple(joint.shown(rate) for joint, rate in zip(joints, needed.tolist(), strict=True)),
+            tuple(joint.shown(rate) for joint, rate in zip(joints, limit.tolist(), strict=True)),
+            tuple(f"{joint.unit}/s" for joint in joints),
+        )
+
+
+def _too_fast(arm: Arm, speeds: JointSpeeds, way_out: str) -> list[str]:
+    """One line for every joint that the task asks to be too fast."""
+    each = zip(speeds.needed, speeds.limit, speeds.units, strict=True)
+    return [
+        f"task: joint {i} would need {need:.4g} {unit}, allowed {limit:.4g}; {way_out}"
+        for i, (need, limit, unit) in enumerate(each, start=1)
+        if need > limit
+    ]
+
+
+def _beginning(setup: Setup, task: Touch | Calibrate, contacts: Iterable[_Pose]) -> Array:
+    """Where the arm moves from, (n,) rad or m, as far as it is known.
+
+    Raises:
+        PlanError: an emulated arm cannot be parked; or the contacts are out of reach, which matters more.
+    """
+    if not setup.emulates:
+        return task.arm.q_start
+    try:
+        return parked_posture(setup, task.arm)
+    except PlanError:
+        _follow(task.arm, task.probe, contacts, task.arm.q_start)
+        raise
+
+
+def _check_touch(task: Touch, path: SurfacePath, stops: _Stops, q_start: Array) -> tuple[JointSpeeds | None, list[str]]:
+    joints = _follow(task.arm, task.probe, _along_path(task, path), q_start)
+    gone = _gone(task.arm, task.probe, q_start, lambda pose: _over_path(task, path, pose))
+    problems = stops.problems(gone, touching=True)
+    if path.hollow_radius > task.probe.radius:  # a tighter hollow is refused as that
+        at_contacts = joints[_BEFORE_CONTACT:]
+        problems += contact_problems(task, at_contacts, path.normals, path.kappas, stops.limits.force_max)
+    approach = task.approach
+    down = stops.speeds(np.abs(joints[_BEFORE_CONTACT] - joints[1]) / approach.clearance * approach.speed)
+    slowly = 1e3 * approach.speed / max(down.worst_share, 1.0) * 0.99
+    problems += _too_fast(task.arm, down, f"lower task.approach_mm_s to {slowly:.3g}")
+    if task.scan is None:
+        return stops.speeds(np.zeros_like(task.arm.q_start)), problems
+    steps = np.linalg.norm(np.diff(path.points, axis=0), axis=1)
+    rates = np.abs(np.diff(joints[_BEFORE_CONTACT:], axis=0)) / steps[:, None] * task.scan.speed
+    speeds = stops.speeds(rates.max(axis=0))
+    possible = 1e3 * task.scan.speed / max(speeds.worst_share, 1.0) * 0.99
+    way_out = f"lower task.speed_mm_s to {possible:.3g}, turn task.heading_deg, or raise task.rolling_share"
+    return speeds, problems + _too_fast(task.arm, speeds, way_out)
+
+
+def _poles(task: Touch, path: SurfacePath) -> Array:
+    """(n, 3) pole of the probe, away from the object, at each contact."""
+    fixed = task_rows(task.arm.model) == FIXED_POLE
+    share = task.scan.rolling_share if task.scan is not None else float(fixed)
+    kept = task.approach.normal if fixed else path.normals[0]  # the probe keeps the pole of its first contact
+    poles = (1 - share) * path.normals + share * kept
+    unit: Array = poles / np.linalg.norm(poles, axis=1)[:, None]
+    return unit
+
+
+def _check_swing(task: Free, stops: _Stops, *, starts: bool) -> tuple[JointSpeeds, list[str]]:
+    start, swing = task.arm.q_start, np.abs(task.swing)
+    speeds = stops.speeds(swing * 2 * math.pi / task.period_s)
+    problems = stops.problems(np.array((start - swing, start + swing))) if starts else []
+    slower = task.period_s * max(speeds.worst_share, 1.0) * 1.01
+    keys = " and ".join(dict.fromkeys(f"swing_{joint.unit}" for joint in task.arm.model.joints))
+    way_out = f"swing slower (task.swing_period_s = {slower:.3g}) or less ({keys} of the joints)"
+    return speeds, problems + _too_fast(task.arm, speeds, way_out)
+
+
+def _hollow_problems(path: SurfacePath, probe: Probe) -> list[str]:
+    if path.hollow_radius > probe.radius:
+        return []
+    return [
+        f"object: a hollow of radius {1e3 * path.hollow_radius:.3g} mm is tighter than the probe of radius "
+        f"{1e3 * probe.radius:g} mm, which touches it in more than one place; use a smaller probe or another object"
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class _Pose:
+    """Where the probe's centre is, with its pole; how far the joints may move to it, and what is said if they cannot.
+
+    Attributes:
+        centre: (3,), m, base frame.
+        pole: (3,) from the centre away from the object, base frame.
+        most_rad: largest move of a joint from the pose before, see `inverse_near`; farther away lies another branch.
+        out_of_reach: message, to be filled with why.
+    """
+
+    centre: Array
+    pole: Array
+    most_rad: float
+    out_of_reach: str
+
+
+_BEFORE_CONTACT = 2
+
+
+def _along_path(task: Touch, path: SurfacePath) -> Iterator[_Pose]:
+    """The beginning of the approach and the lifted start, then the contacts."""
+    radius, poles, approach = task.probe.radius, _poles(task, path), task.approach
+    above = approach.start + approach.normal * approach.clearance
+    lifted = path.points[0] + path.normals[0] * approach.clearance
+    points, normals = (above, lifted, *path.points), (approach.normal, path.normals[0], *path.normals)
+    turns = (math.inf, _TOUCH_TO_TOUCH_RAD, _TOUCH_TO_TOUCH_RAD, *(_BRANCH_RAD for _ in path.points[1:]))
+    for point, normal, pole, most_rad in zip(points, normals, (approach.normal, poles[0], *poles), turns, strict=True):
+        metres = " (are these metres?)" if np.abs(point).max() < _METRES else ""
+        out_of_reach = (
+            f"task: contact at {_mm(point)} mm{metres} out of reach: {{why}}; move the object, shorten the probe "
+            "or the path, or set start_deg of the joints to another branch"
+        )
+        yield _Pose(point + radius * normal, pole, most_rad, out_of_reach)
+
+
+def _over_ball(task: Calibrate) -> Iterator[_Pose]:
+    """Above and at each touch."""
+    for number, touch in enumerate(task.approaches, start=1):
+        out_of_reach = (
+            f"task: touch {number} of {len(task.approaches)} is out of reach: {{why}}; move the ball, or lower "
+            "task.tilt_deg or task.beside_deg"
+        )
+        for gap in (task.approach.clearance, 0.0):
+            centre = task.ball_centre + (task.ball_radius + task.probe.radius + gap) * touch.n_base
+            yield _Pose(centre, -touch.pole_base, _TOUCH_TO_TOUCH_RAD, out_of_reach)
+
+
+def _follow(arm: Arm, probe: Probe, poses: Iterable[_Pose], q_start: Array) -> Array:
+    """Joint positions at the poses (m, n), rad or m, each near the one before, from those at the beginning (n,) on.
+
+    Raises:
+        PlanError: the first pose that is out of reach.
+    """
+    q = q_start
+    x_hint = (forward(arm.model.chain, q) @ probe.T_flange_probe)[:3, 0]
+    found: list[Array] = []
+    for pose in poses:
+        try:
+            T_base_probe = probe_pose(pose.centre, pose.pole, 0.0, x_hint)
+            most_rad = pose.most_rad if found else math.inf
+            q = inverse_near(arm.model, T_base_probe, probe.T_flange_probe, q, max_move_rad=most_rad, q_rest=q_start)
+        except (PlanError, ValueError) as error:
+            raise PlanError([pose.out_of_reach.format(why=error)]) from error
+        found.append(q)
+    return np.array(found)
+
+
+# The way that the task will take, in time, and the joints on it: the same steps as the task's, though longer ones.
+
+# longest step: for the null space, the linear and the angular rows
+_LONGEST_S, _LONGEST_M, _LONGEST_RAD = 0.05, 1e-3, 0.02
+_AT_LEAST = 4  # steps between two poses
+_Timed = tuple[ProbePose, float]
+
+
+def _gone(arm: Arm, probe: Probe, q_start: Array, way: Callable[[ProbePose], Iterable[_Timed]]) -> Array:
+    """Joint positions (m, n), rad or m, on the way of a task.
+
+    Args:
+        arm, probe: what moves.
+        q_start: (n,) where it begins.
+        way: from the pose of the beginning, the poses of the task, each with the time to it from the one before, s.
+    """
+    steps = PoseSteps(arm.model, probe.T_flange_probe, q_start)
+    before = ProbePose(np.array(steps.at.flange), np.array(steps.at.z))
+    q, found = q_start.tolist(), [q_start.tolist()]
+    for pose, seconds in way(before):
+        moved = float(np.linalg.norm(pose.centre - before.centre)) / _LONGEST_M
+        turned = float(np.linalg.norm(pose.pole - before.pole)) / _LONGEST_RAD
+        count = max(_AT_LEAST, math.ceil(max(moved, turned, seconds / _LONGEST_S)))
+        for share in (np.arange(count) + 1) / count:
+            pole = before.pole + share * (pose.pole - before.pole)
+            between = ProbePose(before.centre + share * (pose.centre - before.centre), pole / np.linalg.norm(pole))
+            q = [a + step for a, step in zip(q, steps.step(q, between, seconds / count), strict=True)]
+            found.append(q)
+        before = pose
+    return np.array(found)
+
+
+def _over_path(task: Touch, path: SurfacePath, pose: ProbePose) -> Iterator[_Timed]:
+    """To the approach, down, at rest, and once round the path."""
+    approach, radius = task.approach, task.probe.radius
+    above = ProbePose(approach.start + (approach.clearance + radius) * approach.normal, -approach.normal)
+    yield from _moving(LineMotion(pose, above, MOVE_SPEED))
+    poses = [
+        ProbePose(point + radius * normal, -pole)
+        for point, normal, pole in zip(path.points, path.normals, _poles(task, path), strict=True)
+    ]
+    yield ProbePose(poses[0].centre, above.pole), approach.clearance / approach.speed
+    yield poses[0], SETTLE_S
+    if task.scan is not None:
+        for last, here in itertools.pairwise(poses):
+            yield here, float(np.linalg.norm(here.centre - last.centre)) / task.scan.speed
+
+
+def _round_ball(task: Calibrate, pose: ProbePose) -> Iterator[_Timed]:
+    """To each touch, down, and off again."""
+    radii, down_s = task.ball_radius + task.probe.radius, task.approach.clearance / task.approach.speed
+    for touch in task.approaches:
+        above, on, off = (
+            ProbePose(task.ball_centre + (radii + gap) * touch.n_base, touch.pole_base)
+            for gap in (task.approach.clearance, 0.0, task.approach.clearance + OFF_M)
+        )
+        yield from _moving(ArcMotion(task.ball_centre, pose, above, ROUND_SPEED))
+        yield on, down_s
+        yield from _moving(LineMotion(on, off, RETREAT_SPEED))
+        pose = off
+
+
+def _moving(motion: LineMotion | ArcMotion) -> Iterator[_Timed]:
+    """The poses of a move."""
+    count = max(_AT_LEAST, math.ceil(motion.duration / _LONGEST_S))
+    for k in range(1, count + 1):
+        yield motion.at(motion.duration * k / count), motion.duration / count

@@ -1,0 +1,416 @@
+"""Which PDOs a scene needs, as far as the devices' EDS files allow, with the default identifiers of the cell.
+
+A PDO whose mapping can be changed is mapped; else the one, or the several, whose fixed mapping has what is needed. What
+else a fixed RPDO carries gets a safe value; what else a fixed TPDO carries is not read. A TPDO that nobody needs and
+that cannot be switched off is planned as what it is: traffic.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from canprobe.cell.planning.devices import COMMUNICATION, INVALID, Abilities
+from canprobe.cell.planning.model import EVERY_SYNC, Direction, NodeKind, PlannedPdo, SyncPlan
+from canprobe.cell.planning.operation import TARGETS, Place, choose_mode
+from canprobe.cell.planning.traffic import SYNCHRONOUS, frame_bits
+from canprobe.cell.scene.setup import Array, Setup
+from canprobe.fieldbus.eds.packaged import has_long_pdos, has_window_size
+from canprobe.fieldbus.protocol.frames import is_restricted
+from canprobe.fieldbus.protocol.pdo import MAX_BITS, PdoEntry, PdoLayout
+from canprobe.fieldbus.protocol.tactile import WINDOW, image_words, window_words
+
+STATUSWORD, CONTROLWORD = (0x6041, 0), (0x6040, 0)
+POSITION = (0x6064, 0)
+TORQUE = (0x6077, 0)
+MODE = (0x6060, 0)
+STATES = frozenset((0x1001, 0x603F, 0x6041, 0x6061))
+"""Objects that change with the state of a drive and not with its motion."""
+DUMMY_INTEGER32 = 0x0004
+
+DRIVE_TPDOS, DRIVE_RPDOS = (0x180, 0x280, 0x380, 0x480), (0x200, 0x300, 0x400, 0x500)
+"""By use: the first PDO of a drive that is used has the first, whatever its number."""
+TACTILE_TPDO1 = 0x511
+"""Of the array, and those that follow it: 180h + 16 would beat every RPDO; behind them all it delays no drive's frame.
+RPDO4 of nodes 17 to 49 have them by default: where there are such nodes, the array has others."""
+_LAST_COB_ID, _FIRST_COB_ID = 0x57F, 0x481
+TACTILE_DEADLINE_CYCLES = 2
+RESENT_MS, LOST_MS = 100, 250
+"""How often a PDO that is sent on a change comes at the slowest, and when its receiver takes it for lost."""
+ON_EVENT = 255
+
+HEADER, WINDOW_TAXELS, IMAGE_TAXELS, FEATURES = (0x2120, 0), 0x2110, 0x2100, 0x2130
+FD_WORDS = (8, 6, 4, 3, 2, 1)
+"""Objects of 8 bytes that fill a CAN FD frame without a byte left over."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChosenPdo:
+    """A PDO of a device for what has to be carried.
+
+    Attributes:
+        number: 1 for 1400h or 1800h.
+        entries: what it maps then.
+    """
+
+    number: int
+    entries: tuple[PdoEntry, ...]
+
+
+@dataclass(slots=True)
+class PdoPlanning:
+    """PDOs found so far, with what was wrong and what a device could not give.
+
+    Attributes:
+        setup: of the scene.
+        sync: the cycle.
+        devices: what each node can.
+        channels: of the bus that each node is on.
+    """
+
+    setup: Setup
+    sync: SyncPlan
+    devices: Mapping[int, Abilities]
+    channels: Mapping[int, str]
+    pdos: list[PlannedPdo] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+    not_available: list[tuple[str, str]] = field(default_factory=list)
+
+    def entries(self, node_id: int, direction: Direction, *objects: tuple[int, int]) -> list[PdoEntry]:
+        """The objects as entries; what the device cannot map becomes a problem."""
+        device, found = self.devices[node_id], []
+        for index, subindex in objects:
+            entry = device.entry(index, subindex, direction)
+            if entry is None:
+                why = f"is not mappable to a {direction.upper()}" if device.has(index, subindex) else "is missing"
+                self.problems.append(f"node {node_id}: {device.eds}: object {index:04X}h:{subindex:02X} {why}")
+            else:
+                found.append(entry)
+        return found
+
+    def add(
+        self,
+        node_id: int,
+        direction: Direction,
+        number: int,
+        layout: PdoLayout,
+        *,
+        kind: NodeKind = "drive",
+        cycles: int = 1,
+        constants: tuple[tuple[Place, int], ...] = (),
+    ) -> None:
+        """Plan a PDO; one that SYNC triggers has `cycles` cycles to get through."""
+        device = self.devices[node_id]
+        on_event = layout.transmission_type == ON_EVENT
+        fixed = device.fixed_cob_id(direction, number)
+        if fixed is not None:
+            layout = PdoLayout(fixed, layout.entries, layout.transmission_type, fd=layout.fd)
+        self.pdos.append(
+            PlannedPdo(
+                node_id=node_id,
+                direction=direction,
+                number=number,
+                channel=self.channels[node_id],
+                layout=layout,
+                rate_hz=1000 / RESENT_MS if on_event else self.sync.rate_hz / layout.transmission_type,
+                bits_worst=frame_bits(layout.length, self.setup.bus),
+                deadline_ns=RESENT_MS * 1_000_000 if on_event else cycles * self.sync.period_ns,
+                event_timer_ms=LOST_MS if on_event else 0,
+                kind=kind,
+                fixed_id=fixed is not None,
+                own_bits=device.own_bits(direction, number),
+                constants=constants,
+            )
+        )
+
+    def choose(self, node_id: int, direction: Direction, needed: Sequence[Place]) -> list[ChosenPdo]:
+        """PDOs of a device that carry these objects between them; none, and a problem, where there are none.
+
+        One that carries nothing else comes first, by number; then one that carries more; then several.
+        """
+        device = self.devices[node_id]
+        numbers = [number for number in device.pdo_numbers(direction) if device.can_cycle(direction, number)]
+        entries = [device.entry(index, subindex, direction) for index, subindex in needed]
+        mapped = tuple(entry for entry in entries if entry is not None)
+        alone: list[tuple[bool, ChosenPdo]] = []
+        fixed: list[ChosenPdo] = []
+        for number in numbers:
+            if device.capacity(direction, number) >= len(needed):
+                if len(mapped) == len(needed):
+                    alone.append((False, ChosenPdo(number, mapped)))
+            elif not device.capacity(direction, number):
+                one = ChosenPdo(number, tuple(map(device.mapped_entry, device.fixed_mapping(direction, number))))
+                sends = all(entry.bits and _exists(device, entry) for entry in one.entries)
+                if sends and 0 < sum(entry.bits for entry in one.entries) <= MAX_BITS:
+                    fixed.append(one)
+                    if set(needed) <= _places(one):
+                        alone.append((len(one.entries) > len(needed), one))
+        if alone:
+            return [min(alone, key=lambda option: (option[0], option[1].number))[1]]
+        several = {place: next((one for one in fixed if place in _places(one)), None) for place in needed}
+        if None not in several.values():
+            return sorted({one.number: one for one in several.values() if one}.values(), key=lambda one: one.number)
+        missing = [place for place, entry in zip(needed, entries, strict=True) if entry is None]
+        for index, subindex in missing:
+            why = f"is not mappable to a {direction.upper()}" if device.has(index, subindex) else "is missing"
+            self.problems.append(f"node {node_id}: {device.eds}: object {index:04X}h:{subindex:02X} {why}")
+        if not missing:
+            wanted = ", ".join(f"{index:04X}h:{subindex:02X}" for index, subindex in needed)
+            offered = "; ".join(_offered(device, direction, n, len(needed)) for n in device.pdo_numbers(direction))
+            self.problems.append(
+                f"node {node_id}: {device.eds} {offered or f'has no {direction.upper()}'}; needed: {wanted};"
+                " use a device or an EDS that can map it"
+            )
+        return []
+
+    def cob_id(self, node_id: int, direction: Direction, number: int, wanted: int) -> int:
+        """An identifier for a PDO: not the wanted one where an RPDO that cannot be switched off listens to that."""
+        device = self.devices[node_id]
+        others = [n for n in device.pdo_numbers(direction) if n != number]
+        if direction == "tpdo" or wanted not in [device.fixed_cob_id(direction, n) for n in others]:
+            return wanted
+        return (device.number(COMMUNICATION[direction] + number - 1, 1) or wanted) & 0x7FF
+
+
+def _exists(device: Abilities, entry: PdoEntry) -> bool:
+    """Whether the object of a mapping is in the EDS, or is a dummy."""
+    return entry.is_dummy or device.has(entry.index, entry.subindex)
+
+
+def _places(chosen: ChosenPdo) -> set[Place]:
+    return {(entry.index, entry.subindex) for entry in chosen.entries}
+
+
+def _offered(device: Abilities, direction: Direction, number: int, count: int) -> str:
+    """Why a PDO does not carry what is needed."""
+    name = f"{direction.upper()}{number}"
+    if not device.can_cycle(direction, number):
+        return f"{name} cannot follow every SYNC"
+    if capacity := device.capacity(direction, number):
+        return f"{name} maps at most {capacity} objects"
+    words = device.fixed_mapping(direction, number)
+    fixed = ", ".join(f"{word:08X}h" for word in words) or "none"
+    lost = [f"{entry.index:04X}h" for entry in map(device.mapped_entry, words) if not _exists(device, entry)]
+    return f"{name} has the fixed mapping {fixed}" + (f", and the EDS has no {' or '.join(lost)}" if lost else "")
+
+
+def plan_drive_pdos(planning: PdoPlanning) -> None:
+    """Feedback and targets of the drives: one PDO each way where the device has it, or two targets sharing one RPDO."""
+    arm = planning.setup.arm
+    if arm is None:
+        return
+    for node_id in arm.node_ids:
+        _plan_feedback(planning, node_id)
+    without = {node_id: why for node_id in arm.node_ids if (why := _ungrouped(planning.devices[node_id]))}
+    for node_id, why in without.items() if arm.grouped else ():
+        text = f"{planning.devices[node_id].eds}: {why}, so each drive keeps its own target RPDO"
+        planning.not_available.append(("two targets in one RPDO", text))
+    beside: dict[str, list[int]] = {}  # two drives share an RPDO on one bus only
+    for node_id in arm.node_ids:
+        mine = beside.setdefault(planning.channels[node_id], [])
+        mine.append(node_id)
+        if not arm.grouped or without:
+            _plan_commands(planning, node_id)
+        else:
+            _plan_grouped(planning, node_id, mine[(len(mine) - 1) // 2 * 2])
+    for node_id in arm.node_ids:
+        _plan_tolerated(planning, node_id)
+
+
+def _plan_feedback(planning: PdoPlanning, node_id: int) -> None:
+    """Statusword and position, and the torque where the device can send it too."""
+    device, arm = planning.devices[node_id], planning.setup.arm
+    assert arm is not None
+    chosen = planning.choose(node_id, "tpdo", (STATUSWORD, POSITION))
+    if chosen and not any(TORQUE in _places(one) for one in chosen) and arm.torque:
+        first, torque = chosen[0], device.entry(*TORQUE, "tpdo")
+        capacity = device.capacity("tpdo", first.number)
+        if torque is not None and len(chosen) == 1 and capacity > len(first.entries):
+            chosen = [ChosenPdo(first.number, (*first.entries, torque))]
+        else:
+            problem = f"6077h is {'not mappable to a TPDO' if device.has(*TORQUE) else 'missing'}"
+            if torque is not None:
+                problem = _offered(device, "tpdo", first.number, len(first.entries) + 1)
+            planning.not_available.append(("motor torque (torque_permille of log.npz)", f"{device.eds}: {problem}"))
+    for base, one in zip(DRIVE_TPDOS, chosen, strict=False):
+        planning.add(node_id, "tpdo", one.number, PdoLayout(base + node_id, one.entries, EVERY_SYNC))
+
+
+def _plan_commands(planning: PdoPlanning, node_id: int) -> None:
+    """Controlword and target, in one RPDO or several."""
+    device = planning.devices[node_id]
+    mode = choose_mode(device)
+    assert mode is not None  # else the plan has said no
+    targets = set(TARGETS.values())
+    for base, one in zip(DRIVE_RPDOS, planning.choose(node_id, "rpdo", (CONTROLWORD, TARGETS[mode])), strict=False):
+        constants: list[tuple[Place, int]] = []
+        for entry in one.entries:
+            place = entry.index, entry.subindex
+            if entry.is_dummy or place == CONTROLWORD or place in targets:
+                continue
+            value = mode if place == MODE else device.number(*place)
+            if value is None:
+                planning.problems.append(
+                    f"node {node_id}: {device.eds}: RPDO{one.number} also writes {place[0]:04X}h:{place[1]:02X}, whose"
+                    " EDS entry has no default: state a safe DefaultValue there"
+                )
+            else:
+                constants.append((place, int(value)))
+        cob_id = planning.cob_id(node_id, "rpdo", one.number, base + node_id)
+        layout = PdoLayout(cob_id, one.entries, EVERY_SYNC)
+        planning.add(node_id, "rpdo", one.number, layout, constants=tuple(constants))
+
+
+def _ungrouped(device: Abilities) -> str | None:
+    """Why a drive cannot share a target RPDO with another; None where it can."""
+    if device.dummy(DUMMY_INTEGER32, 32) is None:
+        return f"DummyUsage excludes {DUMMY_INTEGER32:04X}h"
+    for number, count in ((1, 1), (2, 2)):
+        free = number in device.pdo_numbers("rpdo") and device.fixed_cob_id("rpdo", number) is None
+        if not free or device.capacity("rpdo", number) < count:
+            return f"RPDO{number} cannot be mapped with {count} object{'s' * (count > 1)}"
+    return None
+
+
+def _plan_grouped(planning: PdoPlanning, node_id: int, first: int) -> None:
+    """The controlword alone on change and again every 100 ms; the target in this drive's half of its pair's RPDO.
+
+    The half of the other drive is a dummy. The identifier is that of the pair's first drive.
+    """
+    device = planning.devices[node_id]
+    mode = choose_mode(device)
+    assert mode is not None  # else the plan has said no
+    entries = planning.entries(node_id, "rpdo", CONTROLWORD)
+    planning.add(node_id, "rpdo", 1, PdoLayout(DRIVE_RPDOS[0] + node_id, tuple(entries), ON_EVENT))
+    entries, dummy = planning.entries(node_id, "rpdo", TARGETS[mode]), device.dummy(DUMMY_INTEGER32, 32)
+    if entries and dummy is not None:
+        halves = (*entries, dummy) if node_id == first else (dummy, *entries)
+        planning.add(node_id, "rpdo", 2, PdoLayout(DRIVE_RPDOS[1] + first, halves, EVERY_SYNC))
+
+
+def _plan_tolerated(planning: PdoPlanning, node_id: int) -> None:
+    """TPDOs that nobody needs and that cannot be switched off.
+
+    No EDS states how often one is sent on events. What only has a state is counted ten times a second; anything else,
+    such as a position, changes in every cycle, unless the inhibit time allows less.
+    """
+    device, sync = planning.devices[node_id], planning.sync
+    used = {pdo.number for pdo in planning.pdos if pdo.node_id == node_id and pdo.direction == "tpdo"}
+    for number in device.pdo_numbers("tpdo"):
+        cob_id = device.fixed_cob_id("tpdo", number)
+        communication = COMMUNICATION["tpdo"] + number - 1
+        kind = device.number(communication, 2) or EVERY_SYNC
+        if cob_id is None or number in used or SYNCHRONOUS < kind < ON_EVENT - 1:
+            continue
+        entries = tuple(map(device.mapped_entry, device.fixed_mapping("tpdo", number)))
+        inhibit_100us = device.number(communication, 3) or 0
+        on_event = kind > SYNCHRONOUS
+        rate = sync.rate_hz / kind
+        if on_event:
+            seldom = all(entry.index in STATES for entry in entries)
+            rate = min(1000 / RESENT_MS if seldom else sync.rate_hz, 10_000 / (inhibit_100us or 1))
+        layout = PdoLayout(cob_id, entries, kind)
+        planning.not_available.append(
+            (
+                f"TPDO{number} switched off",
+                f"{device.eds}: its COB-ID is read-only, so it is sent besides, counted with {rate:g} Hz",
+            )
+        )
+        planning.pdos.append(
+            PlannedPdo(
+                node_id=node_id,
+                direction="tpdo",
+                number=number,
+                channel=planning.channels[node_id],
+                layout=layout,
+                rate_hz=rate,
+                bits_worst=frame_bits(layout.length, planning.setup.bus),
+                deadline_ns=round(1e9 / rate),
+                used=False,
+                fixed_id=True,
+                own_bits=device.own_bits("tpdo", number),
+            )
+        )
+
+
+def plan_tactile_pdos(planning: PdoPlanning, ratio: int) -> None:
+    """Header and payload of a tactile frame, all triggered by every `ratio`-th SYNC."""
+    array, fd = planning.setup.array, planning.setup.bus.fd
+    if array is None or array.raw is not None:
+        return
+    device = planning.devices[array.node_id]
+    long = fd and has_long_pdos(device.od)
+    if fd and not long:
+        why = f"{device.eds} has no PDOs of up to 64 bytes (2007h); tactile_array_fd.eds is of an array that has"
+        planning.not_available.append(("CAN FD frames from the sensor", why))
+    if array.mode == "window" and not has_window_size(device.od):
+        why = f"{device.eds} has no window size (2008h), so the window keeps {WINDOW}×{WINDOW} taxels"
+        planning.not_available.append(("another window", why))
+        if array.window != WINDOW:
+            planning.problems.append(f"node {array.node_id}: {why}: sensor.window = {WINDOW}, not {array.window}")
+    if (lacking := _lacking_words(device, array)) is not None:
+        planning.problems.append(f"node {array.node_id}: {lacking}")
+        return
+    header, *rest = tactile_objects(array)
+    parcels = [[header]]  # the header alone, then an object each, or as many as 64 bytes hold
+    while rest:
+        size = next(words for words in FD_WORDS if words <= len(rest)) if long else 1
+        parcels.append(rest[:size])
+        rest = rest[size:]
+    cob_ids = _tactile_cob_ids(planning, len(parcels))
+    for number, objects in enumerate(parcels, start=1):
+        entries = planning.entries(array.node_id, "tpdo", *objects)
+        if entries and _maps(planning, array.node_id, number, entries):
+            layout = PdoLayout(cob_ids[number - 1], tuple(entries), ratio, fd=long)
+            cycles = min(TACTILE_DEADLINE_CYCLES, ratio)
+            planning.add(array.node_id, "tpdo", number, layout, kind="tactile", cycles=cycles)
+
+
+def _lacking_words(device: Abilities, array: Array) -> str | None:
+    """That the node has another array than the file says; None where it has objects for all its taxels."""
+    words, needed = device.number(IMAGE_TAXELS), image_words(array.pad.taxels)
+    if words is None or words >= needed:  # one without the object cannot send images, which is said of each of them
+        return None
+    taxels = f"{array.pad.rows} × {array.pad.columns} taxels"
+    return (
+        f"{device.eds} has {words} objects of 8 taxels (2100h), and the {taxels} of the array {array.name} need"
+        f" {needed}: it is the EDS of another array, or sensor.rows and sensor.columns are wrong"
+    )
+
+
+def _tactile_cob_ids(planning: PdoPlanning, count: int) -> list[int]:
+    """The lowest free identifiers from `TACTILE_TPDO1` on, ascending; lower ones where those are not enough."""
+    taken = {pdo.cob_id for pdo in planning.pdos}
+    for device in planning.devices.values():
+        words = [device.number(COMMUNICATION["rpdo"] + number - 1, 1) for number in device.pdo_numbers("rpdo")]
+        taken |= {word & 0x7FF for word in words if word is not None and not word & INVALID}
+    places = (*range(TACTILE_TPDO1, _LAST_COB_ID + 1), *range(TACTILE_TPDO1 - 1, _FIRST_COB_ID - 1, -1))
+    free = (cob_id for cob_id in places if cob_id not in taken and not is_restricted(cob_id))
+    return sorted(itertools.islice(free, count))
+
+
+def _maps(planning: PdoPlanning, node_id: int, number: int, entries: Sequence[PdoEntry]) -> bool:
+    """Whether a TPDO of the array carries these entries; a problem where it does not."""
+    device = planning.devices[node_id]
+    words = tuple(entry.word for entry in entries)
+    if number not in device.pdo_numbers("tpdo"):
+        problem = f"has no TPDO{number}"
+    elif device.capacity("tpdo", number) >= len(words) or device.fixed_mapping("tpdo", number) == words:
+        return True
+    else:
+        problem = _offered(device, "tpdo", number, len(words))
+    wanted = ", ".join(f"{entry.index:04X}h:{entry.subindex:02X}" for entry in entries)
+    planning.problems.append(
+        f"node {node_id}: {device.eds} {problem}; needed: {wanted}; use a device or an EDS that can map it"
+    )
+    return False
+
+
+def tactile_objects(array: Array) -> tuple[tuple[int, int], ...]:
+    """The objects of a tactile frame, its header first."""
+    if array.mode == "features":
+        return (FEATURES, 1), (FEATURES, 2)
+    if array.mode == "image":
+        return HEADER, *((IMAGE_TAXELS, word) for word in range(1, image_words(array.pad.taxels) + 1))
+    return HEADER, *((WINDOW_TAXELS, word) for word in range(1, window_words(int(array.window)) + 1))

@@ -1,0 +1,303 @@
+"""Units of the drives: what the cell states, whether its counts fit 32 bits, and what a device says of them.
+
+A cell states the units of a drive (`counts_per_turn`, `gear`, `sign`, `zero_counts`), and they count: nothing in a
+device is changed for them. Where a device has the factor group of CiA 402, its own statement is compared with the
+cell's at bring-up, and 607Eh, which turns positions round, must be as its EDS has it. Speeds and accelerations are
+written in the units of 60A9h and 60AAh, which must be as the EDS has them, too.
+
+Source: CiA 402-2, "Factor group": 607Eh, 608Fh, 6091h, 6092h, 60A9h, 60AAh; "Software position limit": 607Dh; 6065h,
+607Fh, 6080h; 6064h and 607Ah are INTEGER32.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from canprobe.cell.planning.devices import Abilities
+from canprobe.cell.scene.setup import Arm, Calibrate, Drive, Setup, Touch
+from canprobe.fieldbus.protocol.si_unit import VELOCITY, rate_unit
+from canprobe.mechanics.robot.chain import Array
+from canprobe.mechanics.robot.model import ArmModel
+
+POSITION_LIMITS, POLARITY, RESOLUTION, GEAR_RATIO, FEED = 0x607D, 0x607E, 0x608F, 0x6091, 0x6092
+PROFILE_SPEED_LIMIT, MOTOR_SPEED_LIMIT, FOLLOWING_WINDOW = 0x607F, 0x6080, 0x6065
+FOLLOWING_WINDOW_DEG = 5.0
+NO_WINDOW = 0xFFFFFFFF
+"""6065h of a drive that watches no following error."""
+LAG_BANDWIDTH = math.sqrt(math.sqrt(2.0) - 1.0) / math.pi
+"""Lag behind a ramp, times the -3 dB frequency, of a critically damped loop of second order: 2/w."""
+ROUNDING_COUNTS = 2
+"""By which two targets may be rounded apart."""
+_LOWEST, _HIGHEST = -(1 << 31), (1 << 31) - 1
+_TOLERANCE = 1e-3
+"""Share by which units may differ: a factor of the device is a quotient of integers."""
+
+
+@dataclass(frozen=True, slots=True)
+class TurnUnits:
+    """Position units of a motor turn as the cell states them, and the objects in which the device does.
+
+    Attributes:
+        units: the cell's, per turn of the motor.
+        gear: turns of the motor per turn of the joint.
+        feed: 6092h, or 608Fh where the device has no 6092h; the quotient of :01 and :02.
+        ratio: 6091h, motor turns per shaft turn; None where the device has none, or no 6092h.
+    """
+
+    units: float
+    gear: float
+    feed: int
+    ratio: int | None
+
+    def mismatch(self, feed: float, ratio: float) -> str | None:
+        """How the quotients that a device holds differ from the cell; None where they fit.
+
+        A device may take the motor for its shaft, or the joint.
+
+        Args:
+            feed: quotient of `feed`.
+            ratio: quotient of `ratio`; 1 without.
+        """
+        by_motor, by_joint = feed / ratio / self.units, feed / (self.units * self.gear)
+        if min(abs(by_motor - 1), abs(by_joint - 1)) <= _TOLERANCE:
+            return None
+        objects = f"{self.feed:04X}h" + (f" and {self.ratio:04X}h" if self.ratio is not None else "")
+        return (
+            f"counts {feed / ratio:g} units a motor turn by its {objects}, the cell {self.units:g} (counts_per_turn):"
+            " check which is right before it moves"
+        )
+
+
+def turn_units(device: Abilities, units: float | None, gear: float) -> TurnUnits | None:
+    """What to compare with a device; None where it states nothing, or the cell counts no turns.
+
+    Args:
+        device: by its EDS.
+        units: per motor turn, of the cell; None: of a prismatic joint.
+        gear: turns of the motor per turn of the joint.
+    """
+    whole = {index: device.has(index, 1) and device.has(index, 2) for index in (FEED, GEAR_RATIO, RESOLUTION)}
+    if units is None or not (whole[FEED] or whole[RESOLUTION]):
+        return None
+    if not whole[FEED]:
+        return TurnUnits(units, gear, RESOLUTION, None)
+    return TurnUnits(units, gear, FEED, GEAR_RATIO if whole[GEAR_RATIO] else None)
+
+
+def speed_unit(device: Abilities, drive: Drive, index: int) -> float | None:
+    """Position units/s, or /s², of what the device has for a velocity (60A9h) or an acceleration (60AAh).
+
+    None where its EDS names a unit that cannot be expressed in what the cell states.
+    """
+    turn, ratio = _motor_turn(device, drive)
+    return rate_unit(device.number(index) or 0, turn=turn and turn * ratio, metre=drive.metre_units)
+
+
+def _motor_turn(device: Abilities, drive: Drive) -> tuple[float | None, float]:
+    """Position units of a motor turn, None where nobody states them; and motor turns of a turn of the shaft."""
+    feed = _quotient(device, FEED)
+    ratio = (_quotient(device, GEAR_RATIO) or 1.0) if feed else 1.0
+    if drive.turn_units is not None:
+        return drive.turn_units, ratio
+    lines = _quotient(device, RESOLUTION)
+    return (feed / ratio if feed and lines else lines), ratio
+
+
+def _quotient(device: Abilities, index: int) -> float | None:
+    """Of :01 and :02 as delivered; None where the device has none."""
+    over, under = device.number(index, 1), device.number(index, 2)
+    return over / (under or 1) if over else None
+
+
+def range_problems(setup: Setup) -> Iterator[str]:
+    """Joints whose positions leave the 32 bits of 6064h and 607Ah, where they would wrap round."""
+    arm = setup.arm
+    if arm is None:
+        return
+    low, high = software_limits(arm.model)
+    for joint, drive, least, most in zip(arm.model.joints, arm.drives, low.tolist(), high.tolist(), strict=True):
+        if least < _LOWEST or most > _HIGHEST:
+            yield (
+                f"joints.{joint.name}: drive {drive.node_id} would count from {least:.0f} to {most:.0f} over the range"
+                f" of the joint, {joint.text(joint.q_min)} to {joint.text(joint.q_max)}, and 6064h and 607Ah hold"
+                f" {_LOWEST} to {_HIGHEST}: check counts_per_turn and gear, then zero_counts; if they are right, home"
+                " the drive elsewhere, or let it count in coarser units"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class _SpeedLimit:
+    """A speed that an object of a drive holds the cell to, whether it limits speed or the following error.
+
+    Attributes:
+        index: of the object.
+        most: position units/s, infinite for none.
+        rounding: what of it whole targets use up, position units/s.
+    """
+
+    index: int
+    most: float
+    rounding: float
+
+    @property
+    def left(self) -> float:
+        """What the joints may ask for, position units/s."""
+        return self.most - self.rounding
+
+
+def speed_problems(setup: Setup, devices: Mapping[int, Abilities]) -> Iterator[str]:
+    """Drives whose limit of speed is no more than what whole targets differ by from cycle to cycle."""
+    arm = setup.arm
+    for axis, joint in enumerate(arm.model.joints) if arm is not None else ():
+        lowest = _lowest_limit(setup, axis, devices, math.inf)
+        if lowest.left <= 0.0:
+            assert arm is not None
+            yield (
+                f"joints.{joint.name}: drive {arm.drives[axis].node_id} allows {lowest.most:.4g} units/s by its"
+                f" {lowest.index:04X}h, and whole targets differ by as much as {lowest.rounding:.4g} units/s at"
+                f" cycle.rate_hz = {setup.rate_hz:g}: check 60A9h in the EDS, then counts_per_turn and gear; if they"
+                " are right, lower cycle.rate_hz"
+            )
+
+
+def motor_speed_limit(model: ArmModel, axis: int, share: float, period_ns: int) -> int:
+    """Drive units/s beyond which it must not follow a target: all joints that move the motor, at their limits.
+
+    Args:
+        model: the arm.
+        axis: of the motor, 0-based.
+        share: of the joints' speed limits.
+        period_ns: of the cycle; a target is a whole number of drive units.
+    """
+    fastest = float(np.abs(model.units_per_q[axis]) @ model.qd_max) * share
+    return math.ceil(fastest + ROUNDING_COUNTS * 1e9 / period_ns)
+
+
+def software_limits(model: ArmModel) -> tuple[Array, Array]:
+    """Extremes of each drive (n,) and (n,), units, over the joints' ranges; the coupled ones span both joints'."""
+    a, b, zero = model.units_per_q * model.q_min, model.units_per_q * model.q_max, model.zero_units
+    return np.floor(np.minimum(a, b).sum(axis=1) + zero), np.ceil(np.maximum(a, b).sum(axis=1) + zero)
+
+
+def within_drives(setup: Setup, devices: Mapping[int, Abilities]) -> tuple[Setup, tuple[str, ...]]:
+    """The setup whose joints keep within the positions and speeds that their drives can allow, and what is less."""
+    if setup.arm is None:
+        return setup, ()
+    setup, ranges = _within_ranges(setup, setup.arm, devices)
+    assert setup.arm is not None
+    setup, speeds = _within_speeds(setup, setup.arm, devices)
+    return setup, (*ranges, *speeds)
+
+
+def _within_speeds(setup: Setup, arm: Arm, devices: Mapping[int, Abilities]) -> tuple[Setup, tuple[str, ...]]:
+    """Joints no faster than what stands in their drives as 607Fh, 6080h and 6065h: beyond it a drive faults."""
+    model, share = arm.model, setup.limits.speed_share
+    slowest, objects = np.ones(model.n), set()
+    for axis in range(model.n):
+        wanted = float(np.abs(model.units_per_q[axis]) @ model.qd_max) * share
+        lowest = _lowest_limit(setup, axis, devices, wanted)
+        if wanted <= lowest.left:
+            continue
+        moved = np.flatnonzero(model.units_per_q[axis])
+        slowest[moved] = np.minimum(slowest[moved], lowest.left / wanted)
+        objects.add(lowest.index)
+    if not objects:
+        return setup, ()
+    limits = [replace(joint, qd_max=joint.qd_max * factor) for joint, factor in zip(model.joints, slowest, strict=True)]
+    told = ", ".join(
+        f"{joint.name} {joint.text(joint.qd_max * share, '.3g')}/s"
+        for joint, factor in zip(limits, slowest.tolist(), strict=True)
+        if factor < 1.0
+    )
+    lag = f"their lag of {1e3 * _lag_s(setup):.3g} ms (servo.drive_lag_ms, plant.drive_bandwidth_hz), "
+    warning = (
+        f"{' and '.join(f'{index:04X}h' for index in sorted(objects))}: drives that fault below the speeds of their"
+        f" joints; the plan keeps within {told}. If that is wrong, check {lag * (FOLLOWING_WINDOW in objects)}60A9h in"
+        " the EDS, then counts_per_turn and gear"
+    )
+    return setup.changed("arm", model=replace(model, joints=tuple(limits))), (warning,)
+
+
+def _lowest_limit(setup: Setup, axis: int, devices: Mapping[int, Abilities], wanted: float) -> _SpeedLimit:
+    """The lowest of the limits that stand in the drive of an axis, where so many position units/s are wanted."""
+    arm, rounding = setup.arm, ROUNDING_COUNTS * setup.rate_hz
+    assert arm is not None
+    device, drive = devices[arm.node_ids[axis]], arm.drives[axis]
+    limits = [_SpeedLimit(PROFILE_SPEED_LIMIT, math.inf, 0.0)]
+    entry, unit = device.description.entry(PROFILE_SPEED_LIMIT), speed_unit(device, drive, VELOCITY)
+    if (
+        entry is not None
+        and unit is not None
+        and not (entry.writable and (wanted == math.inf or entry.allows(math.ceil((wanted + rounding) / unit))))
+    ):
+        held = device.number(PROFILE_SPEED_LIMIT)
+        limits += [_SpeedLimit(PROFILE_SPEED_LIMIT, held * unit, rounding)] if held else []
+    turn, _ = _motor_turn(device, drive)
+    if (rpm := device.number(MOTOR_SPEED_LIMIT)) and turn is not None:
+        limits.append(_SpeedLimit(MOTOR_SPEED_LIMIT, rpm / 60.0 * turn, rounding))
+    window, lag = _fixed_window(device, following_window(arm.model, axis)), _lag_s(setup)
+    if window is not None and lag > 0.0:
+        limits.append(_SpeedLimit(FOLLOWING_WINDOW, window / lag, ROUNDING_COUNTS / lag))
+    return min(limits, key=lambda limit: limit.left)
+
+
+def following_window(model: ArmModel, axis: int) -> int:
+    """6065h as the cell would have it, units: so many degrees of the joint."""
+    return round(abs(float(model.units_per_q[axis, axis] * model.radian[axis])) * math.radians(FOLLOWING_WINDOW_DEG))
+
+
+def _fixed_window(device: Abilities, wanted: int) -> int | None:
+    """The 6065h with which a drive runs, units, where it is another than wanted; None where it watches no error."""
+    entry = device.description.entry(FOLLOWING_WINDOW)
+    if entry is None or (entry.writable and entry.allows(wanted)):
+        return None
+    window = device.number(FOLLOWING_WINDOW)
+    return None if window == NO_WINDOW else window
+
+
+def _lag_s(setup: Setup) -> float:
+    """How far the drives are behind a ramp, s: as the scene says, or as the emulated ones are, whichever is more."""
+    believed = setup.task.lag_s if isinstance(setup.task, Touch | Calibrate) else 0.0
+    emulated = setup.arm is not None and any(drive.emulated for drive in setup.arm.drives)
+    return max(believed, LAG_BANDWIDTH / setup.truth.bandwidth_hz if emulated else 0.0)
+
+
+def _within_ranges(setup: Setup, arm: Arm, devices: Mapping[int, Abilities]) -> tuple[Setup, tuple[str, ...]]:
+    """Joints within what the 607Dh of their drives can allow: beyond it a drive faults.
+
+    One that moves with several joints is left as it is.
+    """
+    narrower = []
+    joints = list(arm.model.joints)
+    low, high = software_limits(arm.model)
+    for axis, (joint, drive) in enumerate(zip(arm.model.joints, arm.drives, strict=True)):
+        least, most = _guarded(devices[drive.node_id], low[axis], high[axis])
+        if (least, most) == (low[axis], high[axis]) or np.count_nonzero(arm.model.units_per_q[axis]) > 1:
+            continue
+        # a unit inside, so that rounding stays within
+        ends = (np.array((least + 1, most - 1)) - arm.model.zero_units[axis]) / arm.model.units_per_q[axis, axis]
+        joints[axis] = replace(joint, q_min=max(joint.q_min, min(ends)), q_max=min(joint.q_max, max(ends)))
+        narrower.append(f"{joint.name} {joint.shown(min(ends)):.1f} to {joint.text(max(ends))}")
+    if not narrower:
+        return setup, ()
+    warning = (
+        f"607Dh: drives that fault before the ends of their joints; the plan keeps within {', '.join(narrower)}. If"
+        " that is wrong, check counts_per_turn and gear, then zero_counts"
+    )
+    return setup.changed("arm", model=replace(arm.model, joints=tuple(joints))), (warning,)
+
+
+def _guarded(device: Abilities, low: float, high: float) -> tuple[float, float]:
+    """How much of a range of positions a drive's 607Dh can allow."""
+    lowest, highest = (device.description.entry(POSITION_LIMITS, subindex) for subindex in (1, 2))
+    if lowest is None or highest is None:
+        return low, high
+    ends = (lowest.low if lowest.writable else lowest.initial, highest.high if highest.writable else highest.initial)
+    least, most = (end if isinstance(end, int) else None for end in ends)
+    if least is not None and most is not None and least >= most:  # no limits
+        return low, high
+    return low if least is None else max(low, least), high if most is None else min(high, most)

@@ -1,0 +1,306 @@
+"""Dynamic arm: rigid links, friction, drive cascade and the object's push, in the ideal arm's place.
+
+Time goes in steps from the last change of a reference on; a step ends where a reference bends. What is asked between
+two steps is answered by a shorter step that is then forgotten, so that asking changes nothing. Mass matrix, bias and
+contact geometry are held over ``hold_ns``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from canprobe.cell.plant.config import PlantConfig
+from canprobe.cell.plant.equations import STEPS, ArmEquations, DriveLoops, Effects
+from canprobe.cell.plant.ideal_arm import PEAK_PERMILLE, IdealArm, MotorDynamics
+from canprobe.cell.plant.pushing import Neighbourhood, Rubbing
+from canprobe.errors import PlanError
+from canprobe.mechanics.robot.chain import Array
+from canprobe.mechanics.robot.dynamics import GRAVITY_M_S2, RigidBody, ball, dynamics_problem, joined
+from canprobe.mechanics.robot.model import ArmModel, joints_per_motor, joints_to_units, units_per_motor, units_to_joints
+
+# What a drive is asked for: straight ramps of counts, one after the other, each holding its end.
+
+NEVER = 1 << 62
+Ramp = tuple[int, int, float, float]
+"""Start and end time (ns), start and end (counts)."""
+
+
+class Reference:
+    """Reference of one motor.
+
+    Args:
+        counts: where it stands until the first ramp.
+    """
+
+    __slots__ = ("_ramps",)
+
+    def __init__(self, counts: float) -> None:
+        self._ramps: list[Ramp] = [(-1, -1, counts, counts)]
+
+    def add(self, ramp: Ramp, now_ns: int) -> None:
+        """Follow a ramp from its start on, or from now on where it began in the past; drops what was to come later.
+
+        Args:
+            ramp: not before the ramps that act already.
+            now_ns: the present time.
+        """
+        last = self._ramps[-1]
+        if last[0] <= now_ns and last[0] < ramp[0]:
+            self._ramps = [last, ramp]
+            return
+        start = max(ramp[0], now_ns)
+        kept: Sequence[Ramp] = [r for r in self._ramps if r[0] < start or r[0] < 0]
+        past = [r for r in kept if r[0] <= now_ns]
+        self._ramps = [*past[-1:], *(r for r in kept if r[0] > now_ns), ramp]
+
+    def at(self, t_ns: int) -> tuple[float, float]:
+        """Reference (counts) and its slope (counts/s) from t on.
+
+        Args:
+            t_ns: not before the last ramp that began.
+        """
+        t0, t1, start, end = self._ramps[-1]
+        if t0 > t_ns:
+            t0, t1, start, end = next(r for r in reversed(self._ramps) if r[0] <= t_ns)
+        if t_ns >= t1:
+            return end, 0.0
+        slope = (end - start) / (t1 - t0)
+        return start + slope * (t_ns - t0), 1e9 * slope
+
+    def next_bend(self, t_ns: int) -> int:
+        """First time after t at which the slope may change, ns.
+
+        Args:
+            t_ns: ns.
+        """
+        bend = NEVER
+        for t0, t1, _, _ in self._ramps:
+            if t_ns < t0 < bend:
+                bend = t0
+            if t_ns < t1 < bend:
+                bend = t1
+        return bend
+
+
+# Dynamic arm: rigid links, friction, drive cascade and the object's push, in the ideal arm's place.
+
+
+@dataclass(frozen=True, slots=True)
+class Stepping:
+    """How the arm is integrated.
+
+    Args:
+        method: a key of ``equations.STEPS``.
+        step_ns: longest step.
+        hold_ns: how long mass matrix, bias and contact geometry are held.
+    """
+
+    method: str = "rosenbrock"
+    step_ns: int = 625_000
+    hold_ns: int = 2_500_000
+
+
+class DynamicArm:
+    """The n motors that drive the arm's links.
+
+    Args:
+        model: the arm's geometry.
+        q0: (n,) joint positions at time 0, at rest, rad or m.
+        equations: of motion.
+        stepping: how they are integrated.
+    """
+
+    def __init__(self, model: ArmModel, q0: npt.ArrayLike, equations: ArmEquations, stepping: Stepping) -> None:
+        self.model = model
+        self.equations = equations
+        self.t_ns = 0
+        self._stepping, self._step = stepping, STEPS[stepping.method]
+        units = joints_to_units(model, q0)
+        self._scales = units_per_motor(model)
+        # of a drive that counts backwards negative: its torques are in its own sense
+        self._rated = np.sign(self._scales) * [joint.rated_torque for joint in model.joints]
+        self._references = [Reference(c) for c in units.tolist()]
+        self._y = equations.resting((units - model.zero_units) / self._scales)
+        self._y_ns = 0
+        self._hold_ns = -stepping.hold_ns
+        self._bend_ns = 0
+        self._now: tuple[int, Array] | None = None
+        self._torques: tuple[Array, Array] | None = None
+        self._bend()
+
+    def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
+        """Give one motor a ramp, see ``IdealArm.set_ramp``."""
+        if self._y_ns < self.t_ns:
+            self._advance_to(self.t_ns)
+        self._references[axis].add((t0_ns, t1_ns, start_counts, end_counts), self.t_ns)
+        self._bend_ns = self._y_ns
+        self._torques = None  # the state now is what it is, whatever the reference does from now on
+
+    def advance(self, t_ns: int) -> None:
+        """Move the present time on; earlier times and repeats change nothing.
+
+        Args:
+            t_ns: ns.
+        """
+        self.t_ns = max(self.t_ns, t_ns)
+
+    def motors(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Positions (counts) and rates (counts/s) of the motors now."""
+        x, v, _ = self._state().reshape(3, -1)
+        return tuple((x * self._scales + self.model.zero_units).tolist()), tuple((v * self._scales).tolist())
+
+    @property
+    def q(self) -> Array:
+        """(n,) joint positions now, rad or m."""
+        return units_to_joints(self.model, self.motors()[0])
+
+    @property
+    def qd(self) -> Array:
+        """(n,) joint rates now, rad/s or m/s."""
+        rates: Array = self.model.q_per_unit @ np.array(self.motors()[1])
+        return rates
+
+    def motor_counts(self, axis: int) -> float:
+        """Position of one motor now, counts, continuous.
+
+        Args:
+            axis: from 0.
+        """
+        return float(self._state()[axis] * self._scales[axis] + self.model.zero_units[axis])
+
+    def torque_permille(self, axis: int) -> int:
+        """Torque of one motor over its continuous limit, as a drive reports it (6077h).
+
+        Args:
+            axis: from 0.
+        """
+        y = self._state()
+        if self._torques is None or self._torques[0] is not y:
+            self._torques = y, self.equations.loops.drives(1e-9 * self.t_ns, y).given
+        permille = round(1000.0 * float(self._torques[1][axis]) / float(self._rated[axis]))
+        return max(-PEAK_PERMILLE, min(PEAK_PERMILLE, permille))
+
+    def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
+        """Torque limit and feed-forwards of one drive from now on.
+
+        Args:
+            axis: from 0.
+            limit_permille: largest torque, of the continuous torque; the configured limit if that is less.
+            speed: counts/s added behind the position loop.
+            torque_permille: added behind the velocity loop.
+        """
+        self._advance_to(self.t_ns)
+        rated = 1e-3 * float(self._rated[axis])
+        self.equations.loops.set_loop(
+            axis, abs(rated) * limit_permille, speed / self._scales[axis], rated * torque_permille
+        )
+        self._torques = None
+
+    def motor_dynamics(self, axis: int) -> MotorDynamics:
+        """How one motor would answer to torque alone: its own inertia and friction, without the links.
+
+        Args:
+            axis: from 0.
+        """
+        joint = self.model.joints[axis]
+        return MotorDynamics(
+            gain=1e-3 * joint.rated_torque * abs(float(self._scales[axis])) / joint.rotor_inertia,
+            coulomb=1000.0 * joint.coulomb / joint.rated_torque,
+            damping=joint.viscous / joint.rotor_inertia,
+        )
+
+    def _state(self) -> Array:
+        """State now."""
+        if self._now is None or self._now[0] != self.t_ns:
+            self._advance_to(self.t_ns, keep=False)
+        assert self._now is not None
+        return self._now[1]
+
+    def _advance_to(self, t_ns: int, *, keep: bool = True) -> None:
+        """Take all whole steps up to t and one to t itself, which is kept or only noted."""
+        while self._y_ns < t_ns:
+            if self._y_ns >= self._bend_ns:
+                self._bend()
+            end_ns = min(self._y_ns + self._stepping.step_ns, self._bend_ns)
+            if end_ns > t_ns:
+                break
+            self._y, self._y_ns = self._stepped(end_ns), end_ns
+        y = self._stepped(t_ns) if t_ns > self._y_ns else self._y
+        if keep:
+            self._y, self._y_ns = y, t_ns
+        self._now = (t_ns, y)
+
+    def _bend(self) -> None:
+        """Some reference changes its slope here."""
+        now_ns = self._y_ns
+        x, v = np.array([reference.at(now_ns) for reference in self._references]).T
+        theta = (x - self.model.zero_units) / self._scales
+        self.equations.loops.set_reference(1e-9 * now_ns, theta, v / self._scales)
+        self._bend_ns = min(reference.next_bend(now_ns) for reference in self._references)
+
+    def _stepped(self, end_ns: int) -> Array:
+        if self._y_ns >= self._hold_ns + self._stepping.hold_ns:
+            self.equations.hold(self._y)
+            self._hold_ns = self._y_ns
+        return self._step(self.equations, 1e-9 * self._y_ns, self._y, 1e-9 * (end_ns - self._y_ns))
+
+
+# The arm that a plant's configuration asks for.
+
+
+def make_arm(config: PlantConfig) -> IdealArm | DynamicArm:
+    """An ideal or a dynamic arm.
+
+    Args:
+        config: with a model.
+
+    Raises:
+        PlanError: a dynamic arm without bodies, or without the extra `dynamics`.
+    """
+    assert config.model is not None
+    if config.fidelity == "ideal":
+        return IdealArm(config.model, config.q0, config.bandwidth_hz, config.damping_ratio)
+    d = config.dynamics
+    return DynamicArm(config.model, config.q0, make_equations(config), Stepping(d.integrator, d.step_ns, d.hold_ns))
+
+
+def make_equations(config: PlantConfig, effects: Effects | None = None, *, held: bool = True) -> ArmEquations:
+    """Equations of motion of a dynamic arm.
+
+    Args:
+        config: with a model and its bodies.
+        effects: what acts; everything by default.
+        held: see ``ArmEquations``.
+
+    Raises:
+        PlanError: see ``make_arm``.
+    """
+    assert config.model is not None
+    model, d, T_probe, effects = config.model, config.dynamics, config.T_flange_probe_centre, effects or Effects()
+    if config.bodies is None:
+        raise PlanError([dynamics_problem(model.name, None) or ""])
+    centre = (model.chain.T_last_flange @ T_probe)[:3, 3]
+    bodies = *config.bodies[:-1], joined(config.bodies[-1], ball(d.payload, config.radius_m, centre))
+    body = RigidBody(model.chain, bodies, GRAVITY_M_S2 if effects.gravity else 0.0)
+    back = joints_per_motor(model)
+    inertia = np.array([joint.rotor_inertia for joint in model.joints])
+    if effects.links:  # a drive is tuned to what its motor moves in the first posture
+        inertia = inertia + np.diag(back.T @ body.terms(config.q0, np.zeros(model.n))[0] @ back)
+    loops = DriveLoops(model, inertia, config.bandwidth_hz, config.damping_ratio, d, friction=effects.friction)
+    if config.object is None:
+        return ArmEquations(model, body, loops, effects=effects, held=held)
+    touching = Neighbourhood(
+        model.chain,
+        back,
+        T_probe,
+        config.base_offset_m,
+        config.object,
+        radius=config.radius_m,
+        stiffness_n_m3=config.stiffness_n_m3,
+        rubbing=Rubbing(config.damping_s_m, d.friction),
+    )
+    return ArmEquations(model, body, loops, touching, effects, held=held)

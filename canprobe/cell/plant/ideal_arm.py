@@ -1,0 +1,310 @@
+"""Ideal arm: decoupled second-order position loops, one per motor, solved exactly.
+
+Each motor position q (counts) follows its reference r: ``q'' = w^2 (r - q) - 2 z w q'``. References are ramps, for
+which the solution is closed: behind a steady ramp by the lag 2z/w, plus a decaying transient. The state is a function
+of time alone: calling ``advance`` more or less often changes nothing. Not modelled: gravity, coupling of the links,
+friction, contact force on the joints, saturation.
+"""
+
+from __future__ import annotations
+
+from math import cos, exp, pi, sin, sqrt, tanh
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from canprobe.mechanics.robot.chain import Array
+from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_to_joints
+
+PEAK_PERMILLE = 2000
+"""Of the rated torque: what a drive can give for a while (assumed)."""
+STICTION_RATE = 0.01
+"""rad/s over which the Coulomb torque turns its sign; of a prismatic joint m/s."""
+
+# How a motor answers to torque: what a plant tells a drive that controls torque.
+
+
+class MotorDynamics(NamedTuple):
+    """``v' = gain (torque - coulomb sign v) - damping v``, v in counts/s and torques in 1/1000 of the rated torque.
+
+    Attributes:
+        gain: acceleration per permille of torque, counts/s²; positive.
+        coulomb: friction torque, permille; what is below it does not move a motor at rest.
+        damping: viscous friction over inertia, 1/s; positive.
+    """
+
+    gain: float
+    coulomb: float
+    damping: float
+
+
+# Ideal arm: decoupled second-order position loops, one per motor, solved exactly.
+
+Transition = tuple[float, float, float, float]
+State = tuple[float, float, float]
+"""Position, rate and reference of one motor: counts, counts/s, counts."""
+_NEVER = 1 << 62
+
+
+def natural_frequency(bandwidth_hz: float, damping_ratio: float) -> float:
+    """Undamped frequency w in rad/s of the loop whose response falls by 3 dB at ``bandwidth_hz``.
+
+    Args:
+        bandwidth_hz: -3 dB frequency.
+        damping_ratio: z; 1 is critical.
+    """
+    c = 1.0 - 2.0 * damping_ratio**2
+    return 2 * pi * bandwidth_hz / sqrt(c + sqrt(c * c + 1.0))
+
+
+def transition(w: float, z: float, t: float) -> Transition:
+    """Transition matrix (rows of position and rate) of ``e'' = -w^2 e - 2 z w e'`` over t seconds.
+
+    Args:
+        w: undamped frequency, rad/s.
+        z: damping ratio.
+        t: s.
+    """
+    s = z * w
+    if abs(z - 1.0) < 1e-9:
+        decay = exp(-w * t)
+        even, odd = decay, decay * t
+    elif z < 1.0:
+        v, decay = w * sqrt(1.0 - z * z), exp(-s * t)
+        even, odd = decay * cos(v * t), decay * sin(v * t) / v
+    else:
+        v = w * sqrt(z * z - 1.0)
+        slow, fast = exp((v - s) * t), exp(-(v + s) * t)
+        even, odd = 0.5 * (slow + fast), 0.5 * (slow - fast) / v
+    return even + s * odd, odd, -w * w * odd, even - s * odd
+
+
+class _Axis:
+    """One loop: its state at an anchor time, the ramp that acts from there, and ramps to come."""
+
+    __slots__ = ("coming", "end", "end_ns", "event_ns", "lag", "q", "r", "slope", "t_ns", "v")
+
+    def __init__(self, q: float, lag: float) -> None:
+        self.t_ns, self.q, self.v, self.r, self.slope = 0, q, 0.0, q, 0.0
+        self.end, self.end_ns, self.event_ns, self.lag = q, _NEVER, _NEVER, lag
+        self.coming: list[tuple[int, int, float, float]] = []
+
+    def at(self, phi: Transition, tau: float) -> tuple[float, float, float]:
+        """Position, rate and reference at a time before the next event."""
+        p11, p12, p21, p22 = phi
+        e, de = self.q - self.r + self.lag * self.slope, self.v - self.slope
+        r = self.r + self.slope * tau
+        return r - self.lag * self.slope + p11 * e + p12 * de, self.slope + p21 * e + p22 * de, r
+
+    def begin(self, ramp: tuple[int, int, float, float]) -> None:
+        """Follow a ramp from the anchor on (the anchor is at or after the ramp's start)."""
+        t0, t1, start, end = ramp
+        if self.t_ns >= t1:
+            self.r, self.slope, self.end_ns = end, 0.0, _NEVER
+        else:
+            self.slope = (end - start) / (1e-9 * (t1 - t0))
+            self.r, self.end, self.end_ns = start + self.slope * 1e-9 * (self.t_ns - t0), end, t1
+        if self.coming:
+            self.plan_event()
+        else:
+            self.event_ns = self.end_ns
+
+    def plan_event(self) -> None:
+        self.event_ns = min(self.end_ns, self.coming[0][0]) if self.coming else self.end_ns
+
+    def pass_event(self) -> None:
+        """The anchor stands at the next event: end of the ramp or start of a coming one."""
+        if self.coming and self.coming[0][0] <= self.t_ns:
+            self.begin(self.coming.pop(0))
+        else:
+            self.r, self.slope, self.end_ns = self.end, 0.0, _NEVER
+            self.event_ns = self.coming[0][0] if self.coming else _NEVER
+
+
+class IdealArm:
+    """Motors that track ramps of counts with equal bandwidth.
+
+    Args:
+        model: the arm.
+        q0: (n,) joint positions at time 0, at rest, rad or m.
+        bandwidth_hz: -3 dB frequency of every loop.
+        damping_ratio: 1 is critical.
+    """
+
+    def __init__(
+        self, model: ArmModel, q0: npt.ArrayLike, bandwidth_hz: float = 30.0, damping_ratio: float = 1.0
+    ) -> None:
+        self.model = model
+        self.w, self.z = natural_frequency(bandwidth_hz, damping_ratio), damping_ratio
+        self.lag_s = 2.0 * damping_ratio / self.w
+        """How far the motors stay behind a steady ramp, s."""
+        self._stiffness, self._damping = self.w * self.w, 2 * damping_ratio * self.w
+        self.t_ns = 0
+        self._axes = [_Axis(c, self.lag_s) for c in joints_to_units(model, q0).tolist()]
+        self._phi: dict[int, Transition] = {}
+        rows = [[(motor, share) for motor, share in enumerate(row) if share] for row in model.q_per_unit.tolist()]
+        own = np.diag(model.units_per_q).tolist()
+        self._loads = [  # a drive reports torque in its own sense
+            (row, j.rotor_inertia, j.viscous, j.coulomb, j.rated_torque if units > 0.0 else -j.rated_torque)
+            for row, j, units in zip(rows, model.joints, own, strict=True)
+        ]
+        self._evaluated: list[State] | None = None
+
+    def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
+        """Give one motor a ramp; it holds the end afterwards. Replaces whatever was to come from t0 on.
+
+        A ramp that began in the past acts from the present time on.
+
+        Args:
+            axis: from 0.
+            start_counts: reference at t0.
+            end_counts: reference at t1 and after.
+            t0_ns: start.
+            t1_ns: end; not after t0 for a step.
+        """
+        a = self._axes[axis]
+        ramp = (t0_ns, t1_ns, start_counts, end_counts)
+        if t0_ns > self.t_ns:
+            a.coming = [*(r for r in a.coming if r[0] < t0_ns), ramp]
+            a.plan_event()
+            return
+        states = self._evaluated or self._states()
+        a.t_ns, (a.q, a.v, a.r) = self.t_ns, states[axis]
+        if a.coming:
+            a.coming.clear()
+        a.begin(ramp)
+        states[axis] = (a.q, a.v, a.r)  # the other motors know nothing of this ramp
+
+    def advance(self, t_ns: int) -> None:
+        """Move the present time on; earlier times and repeats change nothing.
+
+        Args:
+            t_ns: ns.
+        """
+        if t_ns > self.t_ns:
+            self.t_ns = t_ns
+            self._evaluated = None
+
+    def motors(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Positions (counts) and rates (counts/s) of the motors now."""
+        positions, rates, _ = zip(*(self._evaluated or self._states()), strict=True)
+        return positions, rates
+
+    @property
+    def counts(self) -> Array:
+        """(n,) motor positions now, counts."""
+        return np.array(self.motors()[0])
+
+    @property
+    def count_rates(self) -> Array:
+        """(n,) motor rates now, counts/s."""
+        return np.array(self.motors()[1])
+
+    @property
+    def q(self) -> Array:
+        """(n,) joint positions now, rad or m."""
+        return units_to_joints(self.model, self.counts)
+
+    @property
+    def qd(self) -> Array:
+        """(n,) joint rates now, rad/s or m/s."""
+        rates: Array = self.model.q_per_unit @ self.count_rates
+        return rates
+
+    def motor_counts(self, axis: int) -> float:
+        """Position of one motor now, counts, continuous.
+
+        Args:
+            axis: from 0.
+        """
+        return (self._evaluated or self._states())[axis][0]
+
+    def torque_permille(self, axis: int) -> int:
+        """Torque of one joint over its continuous limit, as a drive reports it (6077h).
+
+        Model: reflected motor inertia, viscous and Coulomb friction; no gravity, no link inertia, no contact.
+
+        Args:
+            axis: from 0.
+
+        Returns:
+            Permille, within the peak of +-2000.
+        """
+        stiffness, damping = self._stiffness, self._damping
+        row, inertia, viscous, coulomb, rated = self._loads[axis]
+        states = self._evaluated or self._states()
+        rate = acceleration = 0.0
+        for motor, share in row:
+            q, v, r = states[motor]
+            rate += share * v
+            acceleration += share * (stiffness * (r - q) - damping * v)
+        torque = inertia * acceleration + viscous * rate
+        torque += coulomb * tanh(rate / STICTION_RATE)
+        permille = round(1000.0 * torque / rated)
+        if -PEAK_PERMILLE <= permille <= PEAK_PERMILLE:
+            return permille
+        return max(-PEAK_PERMILLE, min(PEAK_PERMILLE, permille))
+
+    def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
+        """Nothing: these motors track as they do, whatever torque that takes.
+
+        Args:
+            axis: from 0.
+            limit_permille, speed, torque_permille: see ``DynamicArm.set_loop``.
+        """
+
+    def motor_dynamics(self, axis: int) -> MotorDynamics:
+        """How one motor would answer to torque: inertia, viscous and Coulomb friction of its own joint alone.
+
+        The wrist's coupling is left out here: it acts on positions only.
+
+        Args:
+            axis: from 0.
+        """
+        joint, units = self.model.joints[axis], abs(float(self.model.units_per_q[axis, axis]))
+        return MotorDynamics(
+            gain=1e-3 * joint.rated_torque * units / joint.rotor_inertia,
+            coulomb=1000.0 * joint.coulomb / joint.rated_torque,
+            damping=joint.viscous / joint.rotor_inertia,
+        )
+
+    def _states(self) -> list[State]:
+        if self._evaluated is None:
+            self._evaluated = self._evaluate(self.t_ns)
+        return self._evaluated
+
+    def _evaluate(self, t_ns: int) -> list[State]:
+        """All states at once. At the very end of a ramp its own formula still holds."""
+        states: list[State] = []
+        lag, last_ns, tau = self.lag_s, -1, 0.0
+        p11 = p12 = p21 = p22 = 0.0
+        for a in self._axes:
+            if t_ns > a.event_ns or a.coming:
+                states.append(self._state(a, t_ns))
+                continue
+            dt_ns = t_ns - a.t_ns
+            if dt_ns != last_ns:
+                (p11, p12, p21, p22), tau, last_ns = self._transition(dt_ns), 1e-9 * dt_ns, dt_ns
+            slope = a.slope
+            behind = lag * slope
+            e, de = a.q - a.r + behind, a.v - slope
+            r = a.r + slope * tau
+            states.append((r - behind + p11 * e + p12 * de, slope + p21 * e + p22 * de, r))
+        return states
+
+    def _state(self, a: _Axis, t_ns: int) -> State:
+        while t_ns >= a.event_ns:
+            span_ns = a.event_ns - a.t_ns
+            a.q, a.v, a.r = a.at(self._transition(span_ns), 1e-9 * span_ns)
+            a.t_ns = a.event_ns
+            a.pass_event()
+        return a.at(self._transition(t_ns - a.t_ns), 1e-9 * (t_ns - a.t_ns))
+
+    def _transition(self, dt_ns: int) -> Transition:
+        phi = self._phi.get(dt_ns)
+        if phi is None:
+            if len(self._phi) > 256:
+                self._phi.clear()
+            phi = self._phi[dt_ns] = transition(self.w, self.z, 1e-9 * dt_ns)
+        return phi

@@ -1,0 +1,229 @@
+"""Contact forces on the arm near one posture: the geometry held, the force law exact.
+
+Near the posture the depth of a touch is taken as linear in the motors and its curvature as constant: over one 2.5 ms
+cycle at 25 mm/s the probe moves 0.06 mm, which bends the surface by 0.05 um. The elastic force, its damping and the
+friction follow from depth and velocities as in ``probe``. Motor coordinates are in rad, of prismatic joints in m.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from canprobe.mechanics.robot.chain import Array, Chain, Vec, ending_in, jacobian, posture
+from canprobe.mechanics.touch.shapes import PlacedShape, Touches
+
+SLIP_M_S = 1e-3
+"""Sliding speed over which friction grows to its full size."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rubbing:
+    """What acts besides the layer's elasticity.
+
+    Args:
+        damping_s_m: Hunt-Crossley alpha.
+        friction: Coulomb coefficient; 0 for none.
+    """
+
+    damping_s_m: float = 0.3
+    friction: float = 0.3
+
+
+class Contact:
+    """The object's push on the n motors near a posture, in k places.
+
+    Args:
+        theta: (n,) posture in motor coordinates.
+        depth: (k,) indentations there, m; negative for gaps.
+        rows: (3, k, n) velocity of each touched point of the probe per motor rate: along the object's outward normal
+            and along two tangents.
+        coefficient, exponent: (k,) of the force laws ``force = coefficient depth^exponent``, N and m.
+        rubbing: damping and friction.
+    """
+
+    def __init__(
+        self, theta: Array, depth: Array, rows: Array, *, coefficient: Array, exponent: Array, rubbing: Rubbing
+    ) -> None:
+        self.rows, self._flat = rows, rows.reshape(-1, len(theta))
+        self._normal, self._s, self._t = rows
+        self._offset = depth + self._normal @ theta
+        self._coefficient, self._exponent = coefficient, exponent
+        self._damping, self._friction = 1.5 * rubbing.damping_s_m, rubbing.friction
+
+    def push(self, theta: Array, rate: Array) -> Array | None:
+        """(n,) torque (of prismatic joints force) on the motors, N m or N; None where nothing touches.
+
+        Args:
+            theta: (n,) motor positions.
+            rate: (n,) per second.
+        """
+        depth = self._offset - self._normal @ theta
+        if depth.max() <= 0.0:
+            return None
+        velocity, _, force, drag, _ = self._moving(depth, rate)
+        return self._pushed(velocity, force, drag)
+
+    def linearised(self, theta: Array, rate: Array) -> tuple[Array, Array, Array] | None:
+        """The push, and the slopes (n, n) of ``-push`` by position and by rate; None where nothing touches.
+
+        What friction owes to the depth is left out.
+        """
+        depth = self._offset - self._normal @ theta
+        if depth.max() <= 0.0:
+            return None
+        velocity, elastic, force, drag, square = self._moving(depth, rate)
+        stiffness = self._exponent * force / np.maximum(depth, 1e-12)
+        weights = np.concatenate((self._damping * elastic * (force > 0.0), drag, drag))
+        slip = velocity[1, :, None] * self._s + velocity[2, :, None] * self._t
+        by_rate = (self._flat.T * weights) @ self._flat - (slip.T * (drag / square)) @ slip
+        return self._pushed(velocity, force, drag), (self._normal.T * stiffness) @ self._normal, by_rate
+
+    def _pushed(self, velocity: Array, force: Array, drag: Array) -> Array:
+        loads = velocity * -drag
+        loads[0] = force
+        torque: Array = loads.ravel() @ self._flat
+        return torque
+
+    def _moving(self, depth: Array, rate: Array) -> tuple[Array, Array, Array, Array, Array]:
+        """Velocities (3, k); of each place elastic force, damped force, friction per slip, and the slip's square."""
+        velocity = (self._flat @ rate).reshape(3, -1)
+        elastic = self._coefficient * np.maximum(depth, 0.0) ** self._exponent
+        force = elastic * np.maximum(0.0, 1.0 - self._damping * velocity[0])
+        square = velocity[1] ** 2 + velocity[2] ** 2 + SLIP_M_S**2
+        return velocity, elastic, force, self._friction * force / np.sqrt(square), square
+
+
+# A ball that touches in several places at once: the force of each, and their sum.
+#
+# A point of a smooth surface presses as in ``contact``. A piece of an edge of radius r presses as a long cylinder:
+# ``(4/3) k depth^1.5 / sqrt(A)`` a metre, A = (1/R + 1/r) / 2; summed along an edge that is shorter than the ball is
+# wide it gives the law of the point again.
+
+LEAST_CURVATURE = 1e-2
+"""Of the gap, in curvatures of the ball: a hollow nearer to the ball's own radius counts as this much wider."""
+NEAR_M = 2e-3
+"""Gaps wider than this cannot close within a cycle of the cell."""
+
+
+def widened(kappa: Array, radius: float) -> Array:
+    """Curvatures of a surface, hollows as tight as the ball replaced by the least that the laws can take.
+
+    Args:
+        kappa: (..., 2) 1/m.
+        radius: of the ball, m.
+    """
+    return np.maximum(kappa, (LEAST_CURVATURE - 1.0) / radius)
+
+
+def force_laws(touches: Touches, radius: float, stiffness_n_m3: float) -> tuple[Array, Array]:
+    """Coefficient and exponent of ``force = coefficient depth^exponent`` of every place.
+
+    Args:
+        touches: n places.
+        radius: of the ball, m.
+        stiffness_n_m3: of its layer.
+
+    Returns:
+        (n,) in N and m, and (n,).
+    """
+    A, B = (0.5 * (1.0 / radius + widened(touches.kappa, radius))).T
+    edge = touches.edge_m > 0.0
+    point = 0.5 * np.pi * stiffness_n_m3 / np.sqrt(A * B)
+    line = 4.0 / 3.0 * stiffness_n_m3 * touches.edge_m / np.sqrt(A)
+    return np.where(edge, line, point), np.where(edge, 1.5, 2.0)
+
+
+def total_force(touches: Touches, radius: float, stiffness_n_m3: float, rates: Array, damping: float) -> Array:
+    """(3,) sum of the forces on the ball, N.
+
+    Args:
+        touches: n places.
+        radius: of the ball, m.
+        stiffness_n_m3: of its layer.
+        rates: (n,) of indentation, m/s.
+        damping: Hunt-Crossley alpha, s/m.
+    """
+    coefficient, exponent = force_laws(touches, radius, stiffness_n_m3)
+    depth = np.maximum(radius - touches.distances, 0.0)
+    force = coefficient * depth**exponent * np.maximum(0.0, 1.0 + 1.5 * damping * rates)
+    total: Array = force @ touches.normals
+    return total
+
+
+# Contact of the probe near a posture: from the object's closest points to forces on the motors.
+
+
+class Neighbourhood:
+    """What ``ArmEquations`` asks for the contact.
+
+    Args:
+        chain: the arm.
+        joints_per_motor: (n, n) joint positions per motor coordinate.
+        T_flange_probe: (4, 4) probe centre on the flange, m.
+        base_offset: (3,) of the arm's base, m.
+        shape: the object.
+        radius: of the probe, m.
+        stiffness_n_m3: of the layer.
+        rubbing: damping and friction.
+    """
+
+    def __init__(
+        self,
+        chain: Chain,
+        joints_per_motor: Array,
+        T_flange_probe: Array,
+        base_offset: Array,
+        shape: PlacedShape,
+        *,
+        radius: float,
+        stiffness_n_m3: float,
+        rubbing: Rubbing,
+    ) -> None:
+        self.chain, self.shape, self.radius = ending_in(chain, T_flange_probe), shape, radius
+        self.stiffness_n_m3, self.rubbing = stiffness_n_m3, rubbing
+        self._joints_per_motor, self._base = joints_per_motor, base_offset
+
+    def __call__(self, theta: Array) -> Contact | None:
+        """Contact held at a posture of the motors; None where the object is farther than a cycle's way.
+
+        Args:
+            theta: (n,) motor coordinates.
+        """
+        at = posture(self.chain, self._joints_per_motor @ theta)
+        own = np.array(at.flange)  # in the arm's own base
+        centre: Vec = tuple((own + self._base).tolist())
+        foot = self.shape.nearest(centre)
+        if foot.distance - self.radius > NEAR_M:
+            return None
+        touches = self.shape.touches(centre, self.radius + NEAR_M)
+        if touches is None:
+            places = (foot.point,), (foot.normal,), (foot.distance,), (foot.kappa,), (0.0,)
+            touches = Touches(*map(np.array, places))
+        depth, normals = self.radius - touches.distances, touches.normals
+        frames = np.array((normals, *_tangents(normals)))
+        # The probe's point that touches lies inside the undeformed ball where it is indented.
+        touched = own + np.minimum(touches.distances, self.radius)[:, None] * -normals
+        J = np.array([jacobian(at, tuple(point))[:3] for point in touched.tolist()])
+        coefficient, exponent = force_laws(touches, self.radius, self.stiffness_n_m3)
+        return Contact(
+            theta,
+            depth,
+            (frames[:, :, None] @ J)[:, :, 0] @ self._joints_per_motor,
+            coefficient=coefficient,
+            exponent=exponent,
+            rubbing=self.rubbing,
+        )
+
+
+def _tangents(normals: Array) -> tuple[Array, Array]:
+    """Two unit vectors (k, 3) each at right angles to each normal and to each other.
+
+    Source: Duff et al., Building an Orthonormal Basis, Revisited, JCGT 6, 2017.
+    """
+    x, y, z = normals.T
+    sign = np.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    return np.array((1.0 + sign * x * x * a, sign * b, -sign * x)).T, np.array((b, sign + y * y * a, -y)).T

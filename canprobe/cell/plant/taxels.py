@@ -1,0 +1,520 @@
+"""The tactile array: from pressure on the pad to the counts that the sensor node sends.
+
+Pipeline of one image (after ``PressureField``): gain per taxel, soft saturation, hysteresis, creep, crosstalk, noise,
+ADC, threshold, dead taxels. Every effect has a number in ``TaxelConfig``; 0 switches it off.
+
+Source: figures after FSR data sheets and Sensors 2014, 14, 12816; the forms are stated at each step.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import atan2, ceil, cos, exp, floor, hypot, sin, sqrt
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from canprobe.mechanics.touch.pad import Pad
+
+# Pressure on the pad: fine sampling on the exact sphere, averaged over each taxel and blurred by the cover.
+#
+# Finer than the estimators' paraboloid on purpose: the probe's height is the sphere's, taxels lie on the wrapped sphere
+# with their true area, and nine samples make one taxel.
+#
+# Pad frame: x = u = columns, y = v = rows, z = pole of the probe, origin at the centre of the sphere. Taxel (i, j) of a
+# grid of m rows and n columns is centred at u = (j - (n - 1)/2) pitch, v = (i - (m - 1)/2) pitch; (u, v) lies in the
+# direction of the exponential map of (u, v) / R at the pole. A flat pad is a sphere of `FLAT_RADIUS_M`.
+
+Array = npt.NDArray[np.float64]
+Vec = tuple[float, float, float]
+Directions = tuple[tuple[float, float], tuple[float, float]] | Array
+"""(2, 2) rows: principal directions in the basis ``pad_basis`` of the contact direction."""
+
+_MARGIN = 2
+"""Taxels of pressure beyond the array's edge that still blur into it."""
+_NOTHING = np.array(0.0)
+
+
+def pad_direction(u: float, v: float, radius: float) -> Vec:
+    """Unit direction of a pad point from the sphere's centre (exponential map), pad frame.
+
+    Args:
+        u: m along the pad's x.
+        v: m along the pad's y.
+        radius: m.
+    """
+    arc = hypot(u, v)
+    scale = sin(arc / radius) / arc if arc > 0.0 else 1.0 / radius
+    return scale * u, scale * v, cos(arc / radius)
+
+
+def pad_coordinates(direction: Vec, radius: float) -> tuple[float, float]:
+    """Pad point of a direction (logarithmic map), the inverse of ``pad_direction``.
+
+    Args:
+        direction: unit vector, pad frame.
+        radius: m.
+
+    Returns:
+        (u, v), m.
+    """
+    x, y, z = direction
+    side = hypot(x, y)
+    scale = radius * atan2(side, z) / side if side > 0.0 else radius
+    return scale * x, scale * y
+
+
+def pad_basis(direction: Vec) -> tuple[Vec, Vec]:
+    """Tangent vectors at a direction: the pad's x and y axes turned there the shortest way (parallel transport).
+
+    Args:
+        direction: unit vector, pad frame, not opposite the pole.
+
+    Returns:
+        Unit vectors e_u, e_v.
+    """
+    x, y, z = direction
+    c = 1.0 / (1.0 + z)
+    return (1.0 - c * x * x, -c * x * y, -x), (-c * x * y, 1.0 - c * y * y, -y)
+
+
+def _averaging_matrix(taxels: int, samples: int, blur_pitch: float) -> Array:
+    """(taxels, n) weights along one axis: mean over each taxel of the blurred samples."""
+    count = (taxels + 2 * _MARGIN) * samples
+    mean = np.zeros((taxels, count))
+    for i in range(taxels):
+        start = (i + _MARGIN) * samples
+        mean[i, start : start + samples] = 1.0 / samples
+    if blur_pitch <= 0.0:
+        return mean
+    offsets = np.subtract.outer(np.arange(count), np.arange(count)) / samples
+    kernel = np.exp(-0.5 * (offsets / blur_pitch) ** 2)
+    reach = np.arange(-10 * samples, 10 * samples + 1) / samples
+    weights: Array = mean @ kernel / np.exp(-0.5 * (reach / blur_pitch) ** 2).sum()
+    weights[weights < 1e-12] = 0.0  # products of far tails would be denormal numbers, and slow
+    return weights
+
+
+def _half_axis(depth: float, kappa: float, radius: float) -> float:
+    """Half-axis of the patch along a principal direction, m; large where the hollow fits the probe."""
+    relative = 0.5 * (1.0 / radius + kappa)
+    return sqrt(depth / relative) if relative > depth else 1.0
+
+
+class PressureField:
+    """Mean pressure of every taxel of a grid under one contact.
+
+    Args:
+        radius_m: probe radius.
+        pad: its taxels.
+        blur_pitch: standard deviation of the cover's Gaussian blur, in taxel pitches; 0 for none.
+        samples: samples per taxel and axis.
+    """
+
+    def __init__(self, radius_m: float, pad: Pad | None = None, *, blur_pitch: float = 0.65, samples: int = 3) -> None:
+        pad = pad or Pad()
+        self.radius = radius_m
+        self.shape = pad.shape
+        self._step = pad.pitch_m / samples
+        self._counts = (pad.rows + 2 * _MARGIN) * samples, (pad.columns + 2 * _MARGIN) * samples
+        v, u = (
+            (np.arange(count) + 0.5) * self._step - (taxels / 2 + _MARGIN) * pad.pitch_m
+            for count, taxels in zip(self._counts, pad.shape, strict=True)
+        )
+        u, v = np.meshgrid(u, v)
+        self._samples = _sample_rows(u, v, radius_m)
+        self._directions, self._area = self._samples[:3], self._samples[4]
+        self._rows = _averaging_matrix(pad.rows, samples, blur_pitch)
+        self._columns = np.ascontiguousarray(_averaging_matrix(pad.columns, samples, blur_pitch).T)
+
+    def _span(self, centre: float, half: float, count: int) -> tuple[int, int]:
+        """Sample indices along one axis that cover centre +- half, clipped to the grid."""
+        middle = centre / self._step + 0.5 * count - 0.5
+        reach = 1.08 * half / self._step + 1.0  # the flat pad stretches arcs across the pole by up to 4 %
+        low, high = floor(max(middle - reach, 0.0)), ceil(min(middle + reach, count - 1.0)) + 1
+        return low, high
+
+    def points(self, centre: Array, axes: Array) -> Array:
+        """(n, 3) places of all samples on the undeformed probe, base frame.
+
+        Args:
+            centre: (3,) of the probe, m.
+            axes: (3, 3) rows: its x, y and z axes.
+        """
+        places: Array = centre + self.radius * self._directions.reshape(3, -1).T @ axes
+        return places
+
+    def mean_of(self, compression: Array) -> Array:
+        """Taxel means of a compression given at all samples, as ``mean_pressure`` gives them.
+
+        Args:
+            compression: (n,) m, in the order of ``points``; negative for gaps.
+        """
+        grid = np.maximum(compression, 0.0).reshape(self._counts) * self._area
+        means: Array = self._rows @ grid @ self._columns
+        return means
+
+    def mean_pressure(
+        self, uv: tuple[float, float], depth: float, kappa: tuple[float, float], directions_pad: Directions
+    ) -> Array:
+        """Taxel means of ``depth - probe height - object height`` where positive.
+
+        Args:
+            uv: contact point on the pad, m.
+            depth: indentation, m.
+            kappa: principal curvatures of the object, 1/m, larger first.
+            directions_pad: of the contact on the pad.
+
+        Returns:
+            (rows, columns) layer compression, m, times taxel area over pitch^2; times k it is force over pitch^2, Pa.
+        """
+        if depth <= 0.0:
+            return np.zeros(self.shape)
+        radius = self.radius
+        given = directions_pad.tolist() if isinstance(directions_pad, np.ndarray) else directions_pad
+        (m11, m12), (m21, m22) = given
+        a, b = _half_axis(depth, kappa[0], radius), _half_axis(depth, kappa[1], radius)
+        r0, r1 = self._span(uv[1], hypot(a * m12, b * m22), self._counts[0])
+        c0, c1 = self._span(uv[0], hypot(a * m11, b * m21), self._counts[1])
+        if r0 >= r1 or c0 >= c1:
+            return np.zeros(self.shape)
+        samples = self._samples[:, r0:r1, c0:c1].reshape(5, -1)
+        squeeze = _compression(samples, uv, depth, kappa, directions=given, radius=radius)
+        means: Array = self._rows[:, r0:r1].dot(squeeze.reshape(r1 - r0, -1)).dot(self._columns[c0:c1])
+        return means
+
+
+class ListField:
+    """As `PressureField`, of taxels at given places: each is a square of its own, without blur.
+
+    Args:
+        radius_m: probe radius.
+        pad: its taxels.
+        samples: samples per taxel and axis.
+    """
+
+    def __init__(self, radius_m: float, pad: Pad, *, samples: int = 3) -> None:
+        self.radius = radius_m
+        self.shape = pad.shape
+        inside = ((np.arange(samples) + 0.5) / samples - 0.5) * pad.pitch_m
+        du, dv = np.meshgrid(inside, inside)
+        u, v = (pad.uv[:, axis, None] + d.reshape(-1) for axis, d in ((0, du), (1, dv)))
+        self._samples = _sample_rows(u, v, radius_m).reshape(5, -1)
+        self._each = samples**2
+
+    def points(self, centre: Array, axes: Array) -> Array:
+        """(n, 3) places of all samples on the undeformed probe, base frame."""
+        places: Array = centre + self.radius * self._samples[:3].T @ axes
+        return places
+
+    def mean_of(self, compression: Array) -> Array:
+        """Taxel means of a compression given at all samples."""
+        means: Array = (np.maximum(compression, 0.0) * self._samples[4]).reshape(-1, self._each).mean(axis=1)
+        return means.reshape(self.shape)
+
+    def mean_pressure(
+        self, uv: tuple[float, float], depth: float, kappa: tuple[float, float], directions_pad: Directions
+    ) -> Array:
+        """Taxel means of the compression under one contact."""
+        if depth <= 0.0:
+            return np.zeros(self.shape)
+        given = directions_pad.tolist() if isinstance(directions_pad, np.ndarray) else directions_pad
+        squeeze = _compression(self._samples, uv, depth, kappa, directions=given, radius=self.radius)
+        means: Array = squeeze.reshape(-1, self._each).mean(axis=1)
+        return means.reshape(self.shape)
+
+
+def _sample_rows(u: Array, v: Array, radius: float) -> Array:
+    """(5, …) of samples at pad points: their directions; 1; and the area of a pad cell on the sphere over du dv."""
+    arc = np.hypot(u, v) / radius
+    sinc = np.sinc(arc / np.pi)
+    return np.stack((sinc * u / radius, sinc * v / radius, np.cos(arc), np.ones_like(arc), sinc))
+
+
+def _compression(
+    samples: Array,
+    uv: tuple[float, float],
+    depth: float,
+    kappa: tuple[float, float],
+    *,
+    directions: Any,
+    radius: float,
+) -> Array:
+    """Compression of the layer at samples (5, n), times the area of their cells.
+
+    Depth less the probe's height above its lowest point, R (1 - s.d), which is exact, less the object's heights along
+    its principal directions.
+    """
+    (m11, m12), (m21, m22) = directions
+    d = pad_direction(uv[0], uv[1], radius)
+    (x0, x1, x2), (y0, y1, y2) = pad_basis(d)
+    rows = [(radius * d[0], radius * d[1], radius * d[2], depth - radius)]  # and the roots of the object's heights
+    for curvature, mx, my in ((kappa[0], m11, m12), (kappa[1], m21, m22)):
+        if curvature:
+            root = radius * sqrt(0.5 * abs(curvature))
+            a, b = root * mx, root * my
+            rows.append((a * x0 + b * y0, a * x1 + b * y1, a * x2 + b * y2, 0.0))
+    squeeze: Array
+    squeeze, *across = np.array(rows).dot(samples[:4])
+    for curvature, height in zip(filter(None, kappa), across, strict=True):
+        np.square(height, out=height)
+        if curvature > 0.0:
+            squeeze -= height
+        else:
+            squeeze += height
+    np.maximum(squeeze, _NOTHING, out=squeeze)
+    squeeze *= samples[4]
+    return squeeze
+
+
+# The tactile array: from pressure on the pad to the counts that the sensor node sends.
+
+Image = npt.NDArray[np.uint8] | npt.NDArray[np.float64]
+
+_CREEP_TIMES_S = (0.3, 3.0, 30.0, 300.0)
+_SATURATION_KNEE = 1.25
+_FULL_SCALE = 255
+"""Counts of full scale, whatever the ADC resolves."""
+_NOISE_IMAGES = 8
+"""How many images' noise is drawn at once."""
+_ONE = np.array(1.0)  # a number that is an array already costs a ufunc less
+
+
+@dataclass(frozen=True, slots=True)
+class TaxelConfig:
+    """The imperfections of one array.
+
+    Args:
+        full_scale_pa: pressure of the largest count.
+        blur_pitch: standard deviation of the cover's blur in taxel pitches.
+        gain_error: half-width of the uniform spread of taxel gains, fixed for the life of the array.
+        saturation: whether the response bends off: ``x (1 + (x / 1.25)^4)^(-1/4)``, x in full scales.
+        hysteresis: width of the loop relative to the signal.
+        creep_per_decade: growth of the reading under constant load per decade of time, from 0.1 s to 180 s.
+        crosstalk: share of a taxel's signal that spreads evenly over its row, and again over its column.
+        noise: standard deviation per sample, in full scales.
+        threshold: readings below this share of full scale become 0.
+        dead: (row, column) of taxels that read 0.
+        adc_bits: of the ADC; 8 gives whole counts, more give parts of counts.
+        samples: samples per taxel and axis of the pressure field.
+    """
+
+    full_scale_pa: float = 100e3
+    blur_pitch: float = 0.65
+    gain_error: float = 0.05
+    saturation: bool = True
+    hysteresis: float = 0.10
+    creep_per_decade: float = 0.05
+    crosstalk: float = 0.02
+    noise: float = 0.005
+    threshold: float = 0.02
+    dead: tuple[tuple[int, int], ...] = ()
+    adc_bits: int = 8
+    samples: int = 3
+
+    @property
+    def adc_max(self) -> int:
+        """What the ADC says at full scale."""
+        return (1 << self.adc_bits) - 1
+
+    @property
+    def adc_threshold(self) -> int:
+        """Least that the ADC says above the threshold."""
+        return int(np.ceil(self.threshold * self.adc_max))
+
+    def without(self, *effects: str) -> TaxelConfig:
+        """The same array with some effects switched off.
+
+        Args:
+            *effects: of "noise", "gain_error", "blur", "hysteresis", "creep", "crosstalk", "saturation", "threshold".
+
+        Raises:
+            ValueError: for an effect that does not exist.
+        """
+        fields = {"blur": "blur_pitch", "creep": "creep_per_decade"}
+        known = ("noise", "gain_error", "blur", "hysteresis", "creep", "crosstalk", "saturation", "threshold")
+        unknown = [e for e in effects if e not in known]
+        if unknown:
+            raise ValueError(f"unknown effects {', '.join(unknown)}; one of {', '.join(known)}")
+        off: dict[str, float] = {fields.get(e, e): False if e == "saturation" else 0.0 for e in effects}
+        return replace(self, **off)  # type: ignore[arg-type]
+
+
+IDEAL_TAXELS = TaxelConfig().without("noise", "gain_error", "blur", "hysteresis", "creep", "crosstalk", "saturation")
+"""Only averaging, ADC and threshold."""
+
+
+class TaxelArray:
+    """One array with its memory (hysteresis, creep) and its fixed gains.
+
+    Args:
+        config: the imperfections.
+        rng: source of gains and noise.
+        radius_m: radius of the sphere it is wrapped on.
+        stiffness_n_m3: of the elastic layer.
+        pad: its taxels; None: 16×16 over one inch.
+    """
+
+    def __init__(
+        self,
+        config: TaxelConfig,
+        rng: np.random.Generator,
+        *,
+        radius_m: float = 0.040,
+        stiffness_n_m3: float = 1.27e8,
+        pad: Pad | None = None,
+    ) -> None:
+        self.config = config
+        self.pad = pad = pad or Pad()
+        self._rng = rng
+        self.field: PressureField | ListField
+        if pad.is_grid:
+            self.field = PressureField(radius_m, pad, blur_pitch=config.blur_pitch, samples=config.samples)
+        else:
+            self.field = ListField(radius_m, pad, samples=config.samples)
+        self.gains = 1.0 + config.gain_error * rng.uniform(-1.0, 1.0, pad.shape)
+        self._scale = self.gains * (stiffness_n_m3 / config.full_scale_pa)
+        half = 0.5 * config.hysteresis
+        self._edges = np.array([[[1.0 + half]], [[1.0 - half]]])
+        self._loop = np.zeros(pad.shape)
+        # Rows: the relaxations, and the image that drives them; and where the next ones are put.
+        self._creep, self._next = np.zeros((2, len(_CREEP_TIMES_S) + 1, pad.taxels))
+        self._relaxed: dict[int, Array] = {}
+        self._t_s: float | None = None
+        self._columns = _leaks(pad.columns, config.crosstalk)
+        self._rows = _leaks(pad.rows, config.crosstalk) * float(config.adc_max)
+        self._noise: list[Array] = []
+        self._readings = _readings(config)
+        self._has_dead = bool(config.dead)
+        self._dead = tuple(np.array(config.dead, dtype=np.intp).reshape(-1, 2).T)
+
+    def take_gains(self, other: TaxelArray) -> None:
+        """Be the same array as another one of this configuration, with memories of its own."""
+        self.gains, self._scale = other.gains, other._scale
+
+    def image(
+        self,
+        uv: tuple[float, float],
+        depth: float,
+        kappa: tuple[float, float],
+        directions_pad: Directions,
+        t_s: float,
+        *,
+        pressure_factor: float = 1.0,
+    ) -> Image:
+        """Sample the array once; memory and noise move on with every call.
+
+        Args:
+            uv: contact point on the pad, m.
+            depth: indentation, m; <= 0 is no contact.
+            kappa: principal curvatures of the object, 1/m, larger first.
+            directions_pad: of the contact on the pad.
+            t_s: time of the sample, s, not before the previous one.
+            pressure_factor: of the layer's damping.
+
+        Returns:
+            (rows, columns) counts of 255 at full scale; whole numbers (uint8) of an ADC of 8 bits, else float.
+        """
+        return self.image_of(self.field.mean_pressure(uv, depth, kappa, directions_pad), t_s, pressure_factor)
+
+    def image_of(self, compression: Array, t_s: float, pressure_factor: float = 1.0) -> Image:
+        """The rest of the pipeline: sample the array once under a known compression of the layer.
+
+        Args:
+            compression: (rows, columns) taxel means as ``PressureField`` gives them, m; used up.
+            t_s: time of the sample, s, not before the previous one.
+            pressure_factor: of the layer's damping.
+
+        Returns:
+            (rows, columns) counts.
+        """
+        y = compression
+        y *= self._scale
+        if pressure_factor != 1.0:
+            y *= pressure_factor
+        y = self._remember(_saturate(y) if self.config.saturation else y, t_s)
+        if self.config.crosstalk > 0.0:
+            return self._convert(self._rows.dot(y).dot(self._columns))
+        return self._convert(y * float(self.config.adc_max))
+
+    def _remember(self, y: Array, t_s: float) -> Array:
+        """Hysteresis, then creep."""
+        if self.config.hysteresis > 0.0:
+            # Play with proportional edges (generalised Prandtl-Ishlinskii): the output rests until the input has
+            # crossed the loop; loading reads x (1 - h/2), unloading x (1 + h/2), whatever the rate.
+            high, low = self._edges * y
+            y = self._loop = np.maximum(np.minimum(self._loop, high, out=high), low, out=low)
+        dt = 0.0 if self._t_s is None else t_s - self._t_s
+        self._t_s = t_s
+        if self.config.creep_per_decade > 0.0:
+            self._creep[-1] = y.reshape(-1)
+            self._creep, self._next = np.dot(self._relaxed_by(dt), self._creep, out=self._next), self._creep
+            crept: Array = self._creep[-1].reshape(self.pad.shape)
+            return crept
+        return y
+
+    def _relaxed_by(self, dt: float) -> Array:
+        """(5, 5) what becomes of relaxations and image in a time: the relaxations then, and the crept image.
+
+        Sum of relaxations a decade apart: c per decade for a step, linear, superposes under moving loads.
+        """
+        dt_ns = round(1e9 * dt)
+        matrix = self._relaxed.get(dt_ns)
+        if matrix is None:
+            if len(self._relaxed) > 64:
+                self._relaxed.clear()
+            matrix = np.zeros((len(_CREEP_TIMES_S) + 1,) * 2)
+            for i, tau in enumerate(_CREEP_TIMES_S):
+                matrix[i, i] = exp(-1e-9 * dt_ns / tau)
+                matrix[i, -1] = 1.0 - matrix[i, i]
+            matrix[-1] = self.config.creep_per_decade * matrix[:-1].sum(axis=0)
+            matrix[-1, -1] += 1.0
+            self._relaxed[dt_ns] = matrix
+        return matrix
+
+    def _convert(self, counts: Array) -> Image:
+        """Noise, ADC, threshold, dead taxels."""
+        if self.config.noise > 0.0:
+            counts += self._drawn()
+        else:
+            counts += 0.5
+        read = self._readings.take(counts.astype(np.intp), mode="clip")
+        if self._has_dead:
+            read[self._dead] = 0
+        return read
+
+    def _drawn(self) -> Array:
+        """(rows, columns) noise of one image in counts, and the half count that makes cutting off rounding."""
+        if not self._noise:
+            noise = self._rng.standard_normal((_NOISE_IMAGES, *self.pad.shape))
+            noise *= self.config.noise * self.config.adc_max
+            noise += 0.5
+            self._noise = [*noise[::-1]]
+        return self._noise.pop()
+
+
+def _leaks(taxels: int, crosstalk: float) -> Array:
+    """(n, n) what becomes of the signals along a row or column: a share of each spreads over the others."""
+    if taxels == 1:
+        return np.ones((1, 1))
+    others = (np.ones((taxels, taxels)) - np.eye(taxels)) / (taxels - 1)
+    return (1.0 - crosstalk) * np.eye(taxels) + crosstalk * others
+
+
+def _readings(config: TaxelConfig) -> npt.NDArray[Any]:
+    """What is read at each count of the ADC, in counts of 255 at full scale; 0 below the threshold."""
+    counts = np.arange(config.adc_max + 1)
+    counts[counts < config.adc_threshold] = 0
+    return counts.astype(np.uint8) if config.adc_max == _FULL_SCALE else counts * float(_FULL_SCALE) / config.adc_max
+
+
+def _saturate(x: Array) -> Array:
+    """Power-law knee, exponent 4: 0.2 % low at half of full scale, 8 % at full scale, then flat; in place."""
+    fourth = x * (1.0 / _SATURATION_KNEE)
+    np.square(fourth, out=fourth)
+    np.square(fourth, out=fourth)
+    fourth += _ONE
+    np.sqrt(fourth, out=fourth)
+    x /= np.sqrt(fourth, out=fourth)
+    return x

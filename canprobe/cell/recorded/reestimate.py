@@ -1,0 +1,302 @@
+"""A run, or a recorded bus, estimated again: measurements in, shape and summary out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.planning.make import make_plan
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.recorded.cycles import LogCycles, replay_contacts
+from canprobe.cell.recorded.recording import read_recording
+from canprobe.cell.recorded.run_folder import RunFolder, read_run, replay_task
+from canprobe.cell.results.run_files import LOG, TACTILE, TRUTH, needed, read_log, read_scene, read_truth
+from canprobe.cell.results.scores import estimate_columns, map_of_scan
+from canprobe.cell.results.summary import curvature_text, finite_or_none, shape_lines, summarise_shape
+from canprobe.cell.scene.load import load_scene
+from canprobe.cell.scene.model import Scene
+from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.scene.setup import Setup
+from canprobe.cell.tasks.from_plan import estimates_of
+from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
+from canprobe.errors import ProtocolError, UsageError
+from canprobe.fieldbus.bus.candump import write_npz
+from canprobe.fieldbus.bus.clock_steps import RecordedBus
+from canprobe.mechanics.touch.estimate.fit import METHODS, unknown_method
+
+Array = NDArray[np.float64]
+SCHEMA = 2
+_SCORED = ("kappa", "direction1", "direction2", "contact_normal", "contact_point")
+"""Columns of the truth that estimates are scored against."""
+
+
+@dataclass(frozen=True, slots=True)
+class Contacts:
+    """What a record says of the contacts, for estimates and the summary.
+
+    Attributes:
+        tracker: the contacts, and the answers of the scene's estimator.
+        driven_by: ``task``: the scene's task made its scan, and was stepped again; ``other``: every contact was used.
+        start_s: time of the first cycle, s, on the record's clock.
+        times_s: time of each cycle (n,), s, since the first.
+        counts: what was counted, by name.
+        channel: of the log; None for the folder of a run.
+        bus: the log; None for the folder of a run.
+    """
+
+    tracker: ShapeTracker
+    driven_by: str
+    start_s: float
+    times_s: Array
+    counts: dict[str, int]
+    channel: str | None
+    bus: RecordedBus | None = None
+
+
+def _from_run(plan: Plan, run: RunFolder) -> Contacts:
+    """The contacts of a run, as its master measured them."""
+    task = replay_task(plan, run)
+    if task is not None and task.shape is not None and task.shape.samples:
+        tracker, unplaced, driven_by = task.shape, task.record().unplaced, "task"
+    else:
+        tracker, unplaced = replay_contacts(plan, run.measurements())
+        driven_by = "other"
+    counts = {"cycles": len(run.times_ns), "unplaced_contacts": unplaced}
+    return Contacts(tracker, driven_by, run.start_s, run.times_s, counts, None)
+
+
+def _from_log(plan: Plan, path: Path) -> Contacts:
+    """The contacts in a recorded bus."""
+    recording = read_recording(path, plan)
+    cycles = LogCycles(plan, recording)
+    try:
+        tracker, unplaced = replay_contacts(plan, cycles)
+    except ProtocolError as error:
+        raise UsageError(f"{path}: on {recording.channel}: {error}") from error
+    assert cycles.drives is not None and cycles.tactile is not None
+    counts = {
+        "cycles": len(cycles.sync_times_s),
+        "lost_syncs": cycles.lost_syncs,
+        "missed_pdos": cycles.drives.missed,
+        "malformed_pdos": recording.malformed,
+        "torn_frames": cycles.tactile.torn,
+        "lost_frames": cycles.tactile.lost,
+        "stale_frames": cycles.tactile.stale,
+        "unplaced_contacts": unplaced,
+        "error_frames": recording.error_frames,
+        "other_frames": recording.other,
+        "frames_lost_by_candump": sum(recording.bus.lost.values()),
+    }
+    times_s = np.array(cycles.sync_times_s)
+    return Contacts(tracker, "other", cycles.start_ns * 1e-9, times_s, counts, recording.channel, recording.bus)
+
+
+def _summarise(
+    plan: Plan, source: Path, contacts: Contacts, estimates: dict[str, list[ShapeRecord]], folder: Path | None
+) -> dict[str, Any]:
+    """The summary of a `ReplayResult`; what does not apply is None. `folder` of the run, for its truth and its log."""
+    truth = _truth(folder / TRUTH, plan.setup) if folder is not None else {}
+    tracker = contacts.tracker
+    map_summary = None if plan.scene.shape is None else map_of_scan(tracker, plan.scene.shape.method)[2]
+    return {
+        "schema": SCHEMA,
+        "scene": plan.scene.name,
+        "log": str(source),
+        "channel": contacts.channel,
+        "notes": [] if contacts.bus is None else contacts.bus.notes(),
+        "driven_by": contacts.driven_by,
+        "cycle": contacts.counts,
+        "contacts": len(tracker.samples),
+        "estimates": {name: _last(records, contacts.start_s) for name, records in estimates.items()},
+        "shape": summarise_shape(plan.setup, tracker, estimates, truth, contacts.times_s, map_summary=map_summary),
+        "online": _online(folder, plan.setup, tracker.records)
+        if folder is not None and contacts.driven_by == "task"
+        else None,
+    }
+
+
+def _truth(file: Path, setup: Setup) -> dict[str, Array]:
+    """The plant's truth, one row per SYNC; empty without the file, or where nothing happened."""
+    columns = read_truth(file, setup) if file.exists() else {}
+    if not columns or not len(next(iter(columns.values()))):
+        return {}
+    needed(columns, _SCORED, file)
+    return columns
+
+
+def _last(records: Sequence[ShapeRecord], start_s: float) -> dict[str, Any]:
+    """Number of answers of an estimator, and the last one."""
+    if not records:
+        return {"count": 0, "t_s": None, "kappa_per_m": None, "observed": None}
+    record = records[-1]
+    return {
+        "count": len(records),
+        "t_s": start_s + record.t_s,
+        "kappa_per_m": finite_or_none(record.estimate.kappa),
+        "observed": [bool(o) for o in record.estimate.observed],
+    }
+
+
+def _online(folder: Path, setup: Setup, records: Sequence[ShapeRecord]) -> dict[str, Any] | None:
+    """Difference of the replayed curvature of the estimator in the loop and the logged one, number by number."""
+    path = folder / LOG
+    logged = read_log(path, setup).get("K_per_m") if path.exists() else None
+    if logged is None:
+        return None
+    online = _changes(logged[np.isfinite(logged).all(axis=(1, 2))])
+    replayed = _changes(np.array([r.estimate.K for r in records if np.isfinite(r.estimate.K).all()]).reshape(-1, 2, 2))
+    same = len(online) == len(replayed) > 0
+    return {
+        "estimates": len(online),
+        "replayed": len(replayed),
+        "K_max_difference_per_m": float(np.abs(online - replayed).max()) if same else None,
+    }
+
+
+def _changes(K: Array) -> Array:
+    """The rows (m, 2, 2) of (n, 2, 2) that differ from the row before."""
+    new = np.ones(len(K), bool)
+    new[1:] = (K[1:] != K[:-1]).any(axis=(1, 2))
+    return K[new]
+
+
+def replay_text(summary: dict[str, Any]) -> str:
+    """A summary as text."""
+    online = summary["online"]
+    how = (
+        "the scene's task drove: its scan is replayed"
+        if summary["driven_by"] == "task"
+        else "whoever drove: every contact is fed to the estimators"
+    )
+    counts = ", ".join(
+        f"{count} {name.replace('_', ' ').replace('pdos', 'PDOs').replace('syncs', 'SYNCs')}"
+        for name, count in summary["cycle"].items()
+        if count or name == "cycles"
+    )
+    where = summary["log"] if summary["channel"] is None else f"{summary['log']}, {summary['channel']}"
+    lines = [
+        f"{where}: scene {summary['scene']}",
+        f"  replay     {how}",
+        f"  record     {counts}; {summary['contacts']} contacts",
+        *(f"  log        {note}" for note in summary["notes"]),
+        *_estimate_lines(summary),
+    ]
+    if online is not None:
+        difference = online["K_max_difference_per_m"]
+        lines.append(
+            f"  online     {online['replayed']} of {online['estimates']} estimates"
+            + (f", largest difference {difference:.3g} 1/m" if difference is not None else "")
+        )
+    return "\n".join(lines)
+
+
+def _estimate_lines(summary: dict[str, Any]) -> list[str]:
+    if summary["shape"]["kappa_true_per_m"] is not None:
+        return shape_lines(summary["shape"])
+    return [
+        f"  curvature  {name}: {curvature_text(last['kappa_per_m'])}, the last of {last['count']} estimates"
+        for name, last in summary["estimates"].items()
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayResult:
+    """One replayed log.
+
+    Attributes:
+        plan: of the scene.
+        summary: ``schema, scene, log, channel``; ``driven_by`` (``task``: the scene's task made the scan and was
+            stepped again; ``other``: every contact was used); ``cycle`` (number of cycles, counts of what is missing);
+            ``contacts``; ``estimates`` (the last of each estimator); ``shape`` as in ``summary.json``; ``online`` (the
+            difference to the run's log, None without one).
+        estimates: the answers of each estimator, by name; all times are on the log's clock, as in the summary.
+        tracker: the contacts, and the answers of the scene's estimator, with times since the first SYNC.
+    """
+
+    plan: Plan
+    summary: dict[str, Any]
+    estimates: dict[str, list[ShapeRecord]]
+    tracker: ShapeTracker
+
+    def text(self) -> str:
+        """The summary as text."""
+        return replay_text(self.summary)
+
+    def save(self, path: Path | str) -> None:
+        """Write the estimates as columns, ``<method>_<column>``, into a compressed npz file, exactly that file."""
+        columns: dict[str, Array] = {}
+        for method, records in self.estimates.items():
+            columns |= {f"{method}_{name}": values for name, values in estimate_columns(records).items()}
+        write_npz(Path(path), columns)
+
+
+def replay(
+    log: Path | str, *, scene: Scene | str | Path | None = None, method: str | Sequence[str] | None = None
+) -> ReplayResult:
+    """Estimate the shape again from the folder of a run, or from a recorded bus.
+
+    The folder of a run holds what its master measured, and gives the online result again. From a candump log of the
+    same nodes, whoever drove them, every contact is used. The summary states which of the two was done.
+
+    Args:
+        log: folder of a run, or a candump file.
+        scene: describes nodes and estimators; by default the ``scene.toml`` beside the log.
+        method: the estimators, one or several; by default the scene's.
+
+    Returns:
+        The estimates, and a summary.
+
+    Raises:
+        UsageError: no log or scene, an unknown method, a line that is not in candump format, a node without any TPDO,
+            no SYNC, or no contact.
+    """
+    path, folder = find_log(Path(log))
+    plan = make_plan(resolve(scene_of(path, folder, scene)))
+    methods = _methods(plan.scene, method)
+    run = read_run(folder, plan.setup) if folder is not None else None
+    contacts = _from_run(plan, run) if run is not None else _from_log(plan, path)
+    source = path if folder is None or run is None else folder
+    if not contacts.tracker.samples:
+        raise UsageError(f"{source}: nothing was touched in it: no contact to estimate from")
+    estimates = estimates_of(plan.setup, contacts.tracker, methods)
+    summary = _summarise(plan, source, contacts, estimates, folder)
+    on_clock = {name: on_run_clock(records, contacts.start_s) for name, records in estimates.items()}
+    return ReplayResult(plan, summary, on_clock, contacts.tracker)
+
+
+def find_log(log: Path) -> tuple[Path, Path | None]:
+    """The candump file, and the run's folder if `log` is one; UsageError where either is missing."""
+    if not log.exists():
+        raise UsageError(f"{log}: no such folder or file; expected the folder of a run, or a candump file")
+    if not log.is_dir():
+        return log, None
+    path = log / "bus.log"
+    if not path.exists() and not (log / TACTILE).exists():
+        raise UsageError(f"{log}: no bus.log in this folder; expected the folder of a run, or a candump file")
+    return path, log
+
+
+def scene_of(path: Path, folder: Path | None, scene: Scene | str | Path | None) -> Scene:
+    """The given scene, or the one beside the log; UsageError without either."""
+    if scene is not None:
+        return load_scene(scene)
+    if folder is None:
+        raise UsageError(f"{path}: a log alone does not describe its nodes: name the scene (--scene)")
+    return read_scene(folder)
+
+
+def _methods(scene: Scene, method: str | Sequence[str] | None) -> tuple[str, ...]:
+    if scene.shape is None or scene.task.kind != "scan":
+        raise UsageError(f"scene {scene.name}: task {scene.task.kind} estimates no shape; there is nothing to replay")
+    if method is None:
+        return (scene.shape.method, *scene.shape.also)
+    names = (method,) if isinstance(method, str) else tuple(method)
+    for name in names:
+        if name not in METHODS:
+            raise unknown_method(name)
+    return names or (scene.shape.method,)

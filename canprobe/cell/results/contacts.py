@@ -1,0 +1,161 @@
+"""The contacts of a scan as arrays, and estimators of anybody scored on them, beside ours."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.results.scores import ShapeScore, score_shape
+from canprobe.cell.scene.setup import Touch
+from canprobe.cell.tasks.from_plan import SIGMA_NORMAL_RAD, centroid_coupling, make_shape_estimator
+from canprobe.cell.tasks.shape import replay_samples
+from canprobe.fieldbus.bus.port import MonotonicClock
+from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
+from canprobe.mechanics.touch.estimate.online import Dropped, Estimator, Gate
+
+Array = NDArray[np.float64]
+ASKED_EVERY_S = 0.1
+"""Time between two answers of an estimator that is scored afterwards."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Contacts:
+    """What the master measured of the contact during a scan, one row a tactile frame; base frame, SI.
+
+    Point and normal of a contact come from one centroid, so their errors are coupled: an error e of the point along
+    the surface comes with an error of −e · coupling of the normal. With that, `canprobe.fit_surface` takes them as
+    ``fit_surface(c.points, c.normals, sigma_point=c.covariances, sigma_normal=c.sigma_normal, coupling=c.coupling)``.
+
+    Attributes:
+        t_s: (n,) instants, s, on the clock of the log.
+        points: (n, 3) contact points on the object, m.
+        normals: (n, 3) outward unit normals of the object there.
+        forces: (n,) contact forces, N.
+        covariances: (n, 3, 3) of the points, m².
+        normal_covariances: (n, 3, 3) of the normals, rad²; the part that is coupled to the point is included.
+        sigma_normal: standard deviation of a normal per tangent axis without the coupled part, rad.
+        coupling: 1/m; 0 where the errors are independent.
+        samples: as the estimators took them, with times since the first SYNC, s.
+    """
+
+    t_s: Array
+    points: Array
+    normals: Array
+    forces: Array
+    covariances: Array
+    normal_covariances: Array
+    sigma_normal: float
+    coupling: float
+    samples: tuple[ContactSample, ...]
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    def __repr__(self) -> str:
+        path = float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
+        mean = f", {self.forces.mean():.2f} N in the mean" if len(self) else ""
+        return f"{len(self)} contacts over {1e3 * path:.1f} mm{mean}"
+
+
+def contacts_of(samples: Sequence[ContactSample], task: Touch, start_s: float) -> Contacts:
+    """The contacts of a scan whose first SYNC was due at `start_s` on the run's clock."""
+    n = len(samples)
+    normals = np.array([s.n_base for s in samples]).reshape(n, 3)
+    gate, coupling = Gate(1.0, SIGMA_NORMAL_RAD), centroid_coupling(task.probe)
+    sigmas = np.array([gate.sigmas(sample) for sample in samples]).reshape(n, 2)
+    across = np.eye(3) - normals[:, :, None] * normals[:, None, :]
+    variances = sigmas**2 @ np.array([[1.0, coupling**2], [0.0, 1.0]])
+    return Contacts(
+        t_s=np.array([start_s + s.t_s for s in samples]),
+        points=np.array([s.p_base for s in samples]).reshape(n, 3),
+        normals=normals,
+        forces=np.array([s.force_n for s in samples]),
+        covariances=variances[:, 0, None, None] * np.eye(3),
+        normal_covariances=variances[:, 1, None, None] * across,
+        sigma_normal=SIGMA_NORMAL_RAD,
+        coupling=coupling,
+        samples=tuple(samples),
+    )
+
+
+class OwnEstimator(Protocol):
+    """What an estimator of your own needs."""
+
+    def add(self, sample: ContactSample) -> None:
+        """Take one contact."""
+
+    def estimate(self) -> SurfaceEstimate | None:
+        """The shape at the last contact; None before there is an answer."""
+
+
+class _Renewed:
+    """An own estimator as the loop drives one: a new one after each loss of contact. It drops nothing that we count."""
+
+    def __init__(self, make: Callable[[], OwnEstimator]) -> None:
+        self._make = make
+        self.dropped = Dropped()
+        self.reset()
+
+    def reset(self) -> None:
+        inner = self._make()
+        self.add, self.estimate = inner.add, inner.estimate
+
+
+class Scores(dict[str, dict[str, Any]]):
+    """The errors of estimators on the same contacts, by name; those of `ShapeScore`, and ``us_per_contact``."""
+
+    def __repr__(self) -> str:
+        return "\n".join("  ".join(cell.rjust(12) for cell in row) for row in self._cells())
+
+    def _repr_html_(self) -> str:
+        rows = "".join(f"<tr><td>{'<td>'.join(map(html.escape, row))}" for row in self._cells())
+        return f"<table>{rows}</table>"
+
+    def _cells(self) -> list[list[str]]:
+        columns = {
+            "K (1/m)": ("kappa_rms_error_per_m", ".2f"),
+            "K (%)": ("kappa_rms_error_percent", ".2f"),
+            "normal (deg)": ("normal_rms_deg", ".3f"),
+            "place (mm)": ("position_rms_mm", ".3f"),
+            "answers": ("estimates", "d"),
+            "µs/contact": ("us_per_contact", ".0f"),
+        }
+        cells = [["RMS error", *columns]]
+        for name, score in self.items():
+            values = [(score[key], form) for key, form in columns.values()]
+            cells.append([name, *("–" if value is None else format(value, form) for value, form in values)])
+        return cells
+
+
+def score_estimators(
+    samples: Sequence[ContactSample],
+    task: Touch,
+    estimators: Mapping[str, str | Callable[[], OwnEstimator]],
+    *,
+    truth: Mapping[str, Array],
+    sync_times: Array,
+) -> Scores:
+    """Feed the contacts of a scan to each estimator, as the loop would have, and score its answers.
+
+    Args:
+        samples: of the scan.
+        task: as it was planned.
+        estimators: by the name in the table: one of our methods, or what makes another.
+        truth: columns of the plant's truth, one row a SYNC.
+        sync_times: time of each SYNC on the clock of the samples (n,), s.
+    """
+    every, clock, scores = max(1, round(ASKED_EVERY_S * task.array.rate_hz)), MonotonicClock(), Scores()
+    for name, what in estimators.items():
+        estimator: Estimator = make_shape_estimator(task, what) if isinstance(what, str) else _Renewed(what)
+        before_ns = clock.now_ns()
+        records = replay_samples(estimator, samples, every)
+        cost_us = 1e-3 * (clock.now_ns() - before_ns) / max(len(samples), 1)
+        score: ShapeScore = score_shape(records, truth, sync_times)
+        scores[name] = {**asdict(score), "us_per_contact": cost_us}
+    return scores

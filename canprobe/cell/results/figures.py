@@ -1,0 +1,309 @@
+"""The figure of a run, contact trajectory like the paper's, force, curvature with its band, taxel image; and of a
+plan.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
+from matplotlib.patches import Patch
+
+from canprobe.cell.master.log import joint_positions
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.planning.report import Part, timeline
+from canprobe.cell.planning.traffic import on_the_wire
+from canprobe.cell.results.picture import (
+    AMBER,
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    ORANGE,
+    SHADE,
+    SKY,
+    box,
+    legend,
+    parts,
+    picture,
+    sheet,
+)
+from canprobe.cell.results.summary import RunResult
+from canprobe.cell.results.surface_figure import Array, Plane, add_sheet, map_surface, true_surface
+from canprobe.cell.tasks.probing import Phase
+from canprobe.cell.tasks.shape import ShapeRecord
+from canprobe.errors import UsageError
+from canprobe.mechanics.touch.patch.array_calibration import NOMINAL
+
+# The figure of a run: contact trajectory like the paper's, force, curvature with its band, taxel image.
+
+Panel = Callable[[SubFigure, RunResult], None]
+TWO_SIGMA = 1.96
+LEAST_SPAN = 1.0
+"""Least height of the panel of curvatures, 1/m: a plane's estimates are not blown up."""
+
+
+def draw_run(result: RunResult, path: Path) -> None:
+    """Draw what the run has and write a PNG; panels without data are left out."""
+    rows = _rows(result)
+    if not rows:
+        return
+    with picture(path, _title(result), 0.6 + 2.9 * len(rows)) as figure:
+        _fill(figure, rows, result)
+
+
+def run_figure(result: RunResult) -> Figure:
+    """The same figure, not written.
+
+    Raises:
+        UsageError: the run has nothing to draw.
+    """
+    rows = _rows(result)
+    if not rows:
+        raise UsageError("plot: nothing was measured in this run that a panel shows")
+    with sheet(_title(result), 0.6 + 2.9 * len(rows)) as figure:
+        _fill(figure, rows, result)
+    return figure
+
+
+def _fill(figure: Figure, rows: list[list[tuple[Panel, float]]], result: RunResult) -> None:
+    for strip, row in zip(parts(figure, len(rows), 1), rows, strict=True):
+        places = parts(strip, 1, len(row), width_ratios=[width for _, width in row])
+        for part, (draw, _) in zip(places, row, strict=True):
+            draw(part, result)
+
+
+def _rows(result: RunResult) -> list[list[tuple[Panel, float]]]:
+    """Rows of panels, each with its share of the width."""
+    rows: list[list[tuple[Panel, float]]]
+    log, scanning = result.log, any(result.estimates.values())
+    force = [(_draw_force, 3.0)] if "force_n" in log else []
+    taxels = [(_draw_taxels, 2.0)] if result.taxels is not None else []
+    if scanning:
+        path = [(_draw_trajectory, 3.0)] if "contact_mm" in log else []
+        rows = [[*path, *force], [(_draw_curvature, 3.0), *taxels]]
+    else:
+        rows = [[*force, *taxels]]
+        if result.summary.get("calibration") is not None:
+            rows.append([(_draw_tool, 1.0)])
+        elif joint_positions(log) is not None:  # of a failed bring-up nothing may be known
+            rows.append([(_draw_joints, 1.0)])
+    return [row for row in rows if row]
+
+
+def _title(result: RunResult) -> str:
+    summary = result.summary
+    truth = "black and grey: true, of the emulated plant, unknown to the cell" if result.truth else "no truth is known"
+    newtons = f" · {NOMINAL}" if summary["newtons"] == NOMINAL else ""
+    end = "" if summary["completed"] else f"\nstopped: {summary['stop_reason']}"
+    scene = result.plan.scene.title or summary["scene"]
+    return f"{scene}\n{summary['bus']}, seed {summary['seed']} · colour: measured and estimated; {truth}{newtons}{end}"
+
+
+def _draw_tool(part: SubFigure, result: RunResult) -> None:
+    """Each coordinate of the tool centre beside what was believed, with its 95 % band, and the truth."""
+    axes, found = part.subplots(), result.summary["calibration"]
+    rows = list(range(3))
+    for row in rows:
+        value, sigma = found["tool_centre_mm"][row], found["sigma_mm"][row]
+        if value is None:
+            axes.annotate("not observed", (0.0, row), (4, 4), textcoords="offset points", color=ORANGE)
+            continue
+        moved = value - found["believed_mm"][row]
+        axes.errorbar(moved, row, xerr=TWO_SIGMA * sigma, fmt="o", color=ORANGE, capsize=4, label="found, 95 %")
+        axes.annotate(f"{value:.3f} mm", (moved, row), (0, 16), textcoords="offset points", ha="center")
+    if found["true_mm"] is not None:
+        true = np.subtract(found["true_mm"], found["believed_mm"])
+        axes.plot(true, rows, "|", color=INK, markersize=20, markeredgewidth=1.6, label="truth")
+    axes.axvline(0.0, color=GREY, linewidth=1.0, label="believed")
+    axes.set_yticks(rows, ["x", "y", "z"])
+    axes.set_ylim(-0.5, 2.7)
+    axes.set(title=f"tool centre in the flange frame, {found['touches']} touches", xlabel="found − believed (mm)")
+    legend(part)
+
+
+def _draw_trajectory(part: SubFigure, result: RunResult) -> None:
+    """The path of the contact and the surface that was recovered from it, over the true one."""
+    axes = part.add_subplot(projection="3d", computed_zorder=False)
+    points, normals = result.log["contact_mm"] * 1e-3, result.log["normal"]
+    touched = (result.log["phase"] == Phase.SCAN) & np.isfinite(points).all(axis=1)
+    points, normals = points[touched], normals[touched]
+    axes.plot(*1e3 * points.T, color=ORANGE, linewidth=0.9, zorder=3)
+    shown, azimuth = ["orange: measured path"], -60.0
+    if len(points):
+        plane = Plane.of(points, normals)
+        azimuth = math.degrees(math.atan2(plane.axes[0, 1], plane.axes[0, 0])) - 68.0  # the long side across the page
+        if result.surface_map is not None and len(result.surface_map):
+            shown.append("blue: recovered surface")
+            add_sheet(axes, 1e3 * map_surface(result.surface_map, plane)[0], SKY, alpha=0.8, zorder=2)
+        if (shape := result.plan.setup.truth.object) is not None and result.truth:
+            shown.append("grey: true one")
+            near = 1e3 * true_surface(shape, points, plane)
+            axes.plot_surface(*np.moveaxis(near, 2, 0), color=GREY, alpha=0.3, linewidth=0, shade=True, zorder=1)
+    title = f"contact in the base frame\n{' · '.join(shown)}"
+    box(part, axes, title, ("x (mm)", "y (mm)", "z (mm)"), elev=40, azim=azimuth)
+
+
+def _draw_force(part: SubFigure, result: RunResult) -> None:
+    axes, t = part.subplots(), result.log["t_s"]
+    if "force" in result.truth and np.any(result.truth["force"] > 0):
+        n = min(len(t), len(result.truth["force"]))
+        axes.plot(t[:n], result.truth["force"][:n], color=INK, linewidth=0.9, label="true (plant)")
+    axes.plot(t, result.log["force_n"], color=BLUE, linewidth=0.9, label="measured (array)")
+    target = result.summary["contact"]["force_target_n"]
+    if target is not None:
+        axes.axhline(target, color=GREEN, linestyle="--", label=f"target {target:g} N")
+    axes.set_ylim(bottom=0)
+    axes.set(title="contact force", xlabel="time (s)", ylabel="force (N)")
+    legend(part)
+
+
+def _draw_curvature(part: SubFigure, result: RunResult) -> None:
+    axes = part.subplots()
+    method, records = next((name, found) for name, found in result.estimates.items() if found)
+    travelled = np.array([r.travelled_m for r in records]) * 1e3
+    kappa = np.array([np.where(r.estimate.observed, r.estimate.kappa, np.nan) for r in records])
+    half = TWO_SIGMA * np.array([_kappa_sigma(r) for r in records])
+    lower, upper = kappa - half, kappa + half
+    for i, (colour, name) in enumerate(((ORANGE, "κ₁"), (BLUE, "κ₂"))):
+        axes.fill_between(travelled, lower[:, i], upper[:, i], color=colour, alpha=0.22, linewidth=0)
+        axes.plot(travelled, kappa[:, i], color=colour, label=f"{name}, {method}, 95 % band")
+    known = [band[np.isfinite(band)] for band in (lower, upper)]
+    limits = [np.percentile(band, (20, 80)) for band in known if len(band)]  # how it begins does not set the scale
+    if result.truth:
+        true = result.truth["kappa"][np.searchsorted(result.log["t_s"], [r.t_s - 1e-6 for r in records])]
+        axes.plot(travelled, true, color=INK, linestyle="--", label="true")
+        seen = kappa[np.isfinite(kappa)]
+        if len(seen):  # nor does an edge that is far sharper than all that was estimated
+            span = max(np.ptp(seen), LEAST_SPAN)
+            limits.append(np.clip(true, seen.min() - span, seen.max() + span))
+    if limits:
+        low, high = min(map(np.min, limits)), max(map(np.max, limits))
+        spare = max(0.12 * (high - low), 0.5 * (LEAST_SPAN - (high - low)))
+        axes.set_ylim(low - spare, high + spare)
+    axes.set(title="principal curvatures", xlabel="path of the contact (mm)", ylabel="curvature (1/m)")
+    legend(part)
+
+
+def _kappa_sigma(record: ShapeRecord) -> Array:
+    """Standard deviations (2,) of the principal curvatures, from the covariance of K along its directions."""
+    estimate = record.estimate
+    axes = estimate.T_frame_contact[:3, :2]
+    sigmas = []
+    for direction in estimate.directions:
+        d = np.asarray(direction, dtype=float)
+        u, v = (axes.T @ d) if d.size == 3 else d
+        gradient = np.array((u * u, 2 * u * v, v * v))
+        with np.errstate(invalid="ignore"):  # infinite where nothing was observed
+            sigmas.append(float(np.sqrt(max(gradient @ estimate.covariance @ gradient, 0.0))))
+    return np.array(sigmas)
+
+
+def _draw_taxels(part: SubFigure, result: RunResult) -> None:
+    assert result.taxels is not None
+    axes = part.subplots()
+    image = axes.imshow(result.taxels, cmap="magma", origin="lower", vmin=0)
+    axes.grid(visible=False)
+    axes.set(title="last taxel image of the task", xlabel="column, u", ylabel="row, v")
+    part.colorbar(image, ax=axes, label="counts")
+
+
+def _draw_joints(part: SubFigure, result: RunResult) -> None:
+    """A panel a joint: joints that move alike would hide each other in one."""
+    arm = result.plan.setup.arm
+    q = joint_positions(result.log)
+    assert arm is not None and q is not None
+    t, joints = result.log["t_s"], arm.model.joints
+    columns = min(3, len(joints))
+    turns = len({joint.prismatic for joint in joints}) == 1
+    grid = part.subplots(-(-len(joints) // columns), columns, squeeze=False, sharex=True, sharey=turns)
+    for axes in grid.flat[len(joints) :]:
+        axes.set_visible(False)
+    for i, (axes, joint) in enumerate(zip(grid.flat, joints, strict=False)):
+        axes.plot(t, [joint.shown(value) for value in q[:, i] - q[0, i]], color=BLUE)
+        axes.set_title(f"joint {i + 1} ({joint.unit})")
+    part.supxlabel("time (s)", fontsize="medium")
+    part.supylabel("way from the start", fontsize="medium")
+
+
+# The picture of a plan: its cycles on every bus, and how much of its deadline each message may take.
+
+COLOURS: dict[Part, str] = {
+    "SYNC": INK, "feedback": BLUE, "controller": GREY, "command": AMBER, "tactile": SKY,
+}  # fmt: skip
+NAMES: dict[Part, str] = {
+    "SYNC": "SYNC", "feedback": "feedback (TPDO)", "controller": "controller", "command": "commands (RPDO)",
+    "tactile": "tactile frame",
+}  # fmt: skip
+_ROW_INCHES = 0.21
+
+
+def draw_plan(plan: Plan, path: Path | str) -> None:
+    """Draw the timeline and the response times.
+
+    Args:
+        plan: that fits.
+        path: of the picture; its suffix names the form.
+    """
+    messages = on_the_wire(plan.pdos)
+    heights = [0.45 * (len(plan.buses) + 1) + 0.5, _ROW_INCHES * len(messages) + 0.6]
+    loads = ", ".join(f"{bus.channel} {100 * bus.traffic.load:.0f} %" for bus in plan.buses)
+    title = f"{plan.scene.name} at {plan.sync.rate_hz:g} Hz, {plan.scene.bus.bitrate / 1e6:g} Mbit/s"
+    with picture(path, f"{title}: worst-case load {loads}", sum(heights) + 1.1) as figure:
+        upper, lower = figure.subplots(2, 1, height_ratios=heights)
+        _draw_cycles(upper, plan)
+        _draw_responses(lower, plan)
+        legend(figure, [Patch(color=COLOURS[part], label=NAMES[part]) for part in _parts(plan)])
+
+
+def _parts(plan: Plan) -> list[Part]:
+    used = {slot.part for slot in timeline(plan)}
+    return [part for part in COLOURS if part in used]
+
+
+def _draw_cycles(axes: Axes, plan: Plan) -> None:
+    rows = [*(bus.channel for bus in plan.buses), ""]
+    slots, period_us = timeline(plan), plan.sync.period_ns / 1000
+    for slot in slots:
+        y, start, length = rows.index(slot.channel), slot.start_ns / 1000, (slot.end_ns - slot.start_ns) / 1000
+        axes.barh(y, length, left=start, height=0.62, color=COLOURS[slot.part], edgecolor="white", linewidth=0.5)
+    cycles = 1 + max(slot.cycle for slot in slots)
+    for cycle in range(cycles + 1):
+        axes.axvline(cycle * period_us, color=INK, linewidth=1.0)
+    axes.set_yticks(range(len(rows)), [row or "controller" for row in rows])
+    axes.set_ylim(len(rows) - 0.5, -0.5)
+    axes.set_xlim(-0.01 * cycles * period_us, 1.01 * cycles * period_us)
+    axes.set(title="As it goes, every frame of its worst-case length; line: SYNC", xlabel="time after SYNC (µs)")
+    _bare(axes)
+
+
+def _draw_responses(axes: Axes, plan: Plan) -> None:
+    messages = on_the_wire(plan.pdos)
+    for y, pdo in enumerate(messages):
+        part: Part = "tactile" if pdo.kind == "tactile" else "command" if pdo.direction == "rpdo" else "feedback"
+        share = None if pdo.response_ns is None else 100 * pdo.response_ns / pdo.deadline_ns
+        axes.barh(y, 100, height=0.72, color=SHADE)
+        if share is None:
+            axes.text(1, y, "no bound", va="center", fontsize=8, color=ORANGE)
+            continue
+        axes.barh(y, share, height=0.72, color=COLOURS[part] if share <= 100 else ORANGE)
+        text = f"{pdo.response_ns / 1000:.0f} of {pdo.deadline_ns / 1000:.0f} µs" if pdo.response_ns is not None else ""
+        axes.text(101, y, text, va="center", fontsize=8)
+    labels = [f"{pdo.cob_id:03X}h  node {pdo.node_id:2} {pdo.direction.upper()}{pdo.number}" for pdo in messages]
+    axes.set_yticks(range(len(messages)), labels, fontsize=8, family="monospace")
+    axes.set_ylim(len(messages) - 0.4, -0.6)
+    axes.set_xlim(0, 115)
+    axes.set_xticks(range(0, 101, 20))
+    axes.set(
+        title="At the latest, with everything else on the bus", xlabel="worst-case response time, % of the deadline"
+    )
+    _bare(axes)
+
+
+def _bare(axes: Axes) -> None:
+    axes.grid(visible=False)
+    axes.spines["left"].set_visible(False)

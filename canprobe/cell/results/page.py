@@ -1,0 +1,57 @@
+"""A run in three dimensions, from Python: its page in a notebook or a browser."""
+
+from __future__ import annotations
+
+import html
+import importlib
+import os
+import sys
+import webbrowser
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from canprobe.cell.planning.bridges import check_bridges
+from canprobe.cell.session.session import quiet
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """One HTML file; a notebook shows it, and it can be kept and mailed.
+
+    Attributes:
+        path: of the file.
+    """
+
+    path: Path
+
+    def _repr_html_(self) -> str:
+        text = html.escape(self.path.read_text(encoding="utf-8"))
+        return f'<iframe srcdoc="{text}" style="width: 100%; height: 640px; border: 0"></iframe>'
+
+
+def write_page_of(folder: Path, say: Callable[[str], None]) -> None:
+    """Write ``report.html`` into a run's folder; `say` is called with each line about what cannot be drawn.
+
+    Raises:
+        UsageError: a controller's column has the name of one of ours.
+    """
+    browser, recorded = (
+        importlib.import_module(f"canprobe.lab.bridge.view.{name}") for name in ("browser", "recorded")
+    )
+    browser.write_page(recorded.read_run(folder), folder / "report.html", say)
+
+
+def page_of(folder: Path) -> Page:
+    """The page of a run's folder, written where it is missing; opened in a browser if there is one and no notebook.
+
+    Raises:
+        UsageError: the extra `view` is missing, or a controller's column has the name of one of ours.
+    """
+    page = Page(folder / "report.html")
+    if not page.path.is_file():
+        check_bridges(["view"], "")
+        write_page_of(folder, quiet)
+    if "ipykernel" not in sys.modules and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        webbrowser.open(page.path.resolve().as_uri())
+    return page

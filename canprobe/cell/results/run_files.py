@@ -1,0 +1,225 @@
+"""The files of a run's folder, checked before anything is made of them: names, shapes and sizes of their columns.
+
+Whoever reads a run comes by here: replay and its methods, the view, tables, measured traffic. A folder may be cut off,
+edited, or of another version of canprobe; the message then names file and column, and the version that wrote it.
+
+    summary.json   one object with `schema`; `written_by` says by which canprobe
+    scene.toml     read by `canprobe.cell.scene.load`
+    log.npz        a row a cycle: floats, `t_s` rises; columns of own controllers have any shape behind that
+    tactile.npz    a row a tactile frame
+    truth.npz      a row a SYNC
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.scene.load import SAVED_AS, load_scene, written_by_other
+from canprobe.cell.scene.model import Scene
+from canprobe.cell.scene.setup import Setup
+from canprobe.cell.tasks.probing import Phase
+from canprobe.errors import SceneError, UsageError, regular_file
+from canprobe.fieldbus.bus.candump import read_npz
+
+SCHEMA = 1
+"""Of ``summary.json``."""
+SUMMARY, LOG, TACTILE, TRUTH = "summary.json", "log.npz", "tactile.npz", "truth.npz"
+_MOST_SUMMARY_BYTES = 16 << 20
+_LATEST_S = 1e9
+_WHOLE_NUMBERS = {"q_age": 1 << 31, "statusword": 0xFFFF, "tactile_age": 1 << 31, "phase": max(Phase)}
+"""Columns of ``log.npz`` and their largest value."""
+
+Columns = dict[str, NDArray[Any]]
+_Shapes = Mapping[str, tuple[str, tuple[int | str, ...]]]
+"""Column → kinds of its numbers, as numpy's `dtype.kind` names them, and the shape of a row, by name where it is that
+of the cell."""
+
+_OF_LOG: _Shapes = {
+    "t_s": ("f", ()),
+    "q_rad": ("f", ("joints",)),
+    "q_m": ("f", ("joints",)),
+    "q_age": ("f", ("joints",)),
+    "statusword": ("f", ("joints",)),
+    "torque_permille": ("f", ("joints",)),
+    "tactile_age": ("f", ()),
+    "phase": ("f", ()),
+    "force_n": ("f", ()),
+    "contact_mm": ("f", (3,)),
+    "normal": ("f", (3,)),
+    "kappa_per_m": ("f", (2,)),
+    "T_base_contact_m": ("f", (4, 4)),
+    "K_per_m": ("f", (2, 2)),
+    "K_covariance_per_m2": ("f", (3, 3)),
+}
+_OF_TACTILE: _Shapes = {
+    "t_s": ("f", ()),
+    "t_sample_s": ("f", ()),
+    "t_sigma_s": ("f", ()),
+    "taxels": ("u", ("rows", "columns")),
+    "window": ("i", (4,)),
+    "features": ("f", (7,)),
+}
+_OF_TRUTH: _Shapes = {
+    "t_s": ("f", ()),
+    "force": ("f", ()),
+    "kappa": ("f", (2,)),
+    "direction1": ("f", (3,)),
+    "direction2": ("f", (3,)),
+    "contact_normal": ("f", (3,)),
+    "contact_point": ("f", (3,)),
+}
+
+
+def read_summary(folder: Path) -> dict[str, Any] | None:
+    """The summary of a run; None where it left none, as one that was killed.
+
+    Raises:
+        UsageError: it is something else, or of another schema.
+    """
+    file = folder / SUMMARY
+    if not file.exists():
+        return None
+    try:
+        summary = json.loads(regular_file(file, _MOST_SUMMARY_BYTES).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise UsageError(f"{file}: expected the summary of a run; cannot be read: {error}") from error
+    if not isinstance(summary, dict):
+        raise UsageError(f"{file}: expected the summary of a run, got {type(summary).__name__}")
+    if (found := summary.get("schema")) != SCHEMA:
+        where = f"{file}{written_by_other(summary.get('written_by'))}"
+        raise UsageError(f"{where}: expected schema {SCHEMA}, got {found!r}; run the scene again with this canprobe")
+    return summary
+
+
+def read_scene(folder: Path) -> Scene:
+    """The scene of a run.
+
+    Raises:
+        UsageError: the folder has none.
+        SceneError: it cannot be loaded; with who wrote it, where that is another canprobe.
+    """
+    file = folder / SAVED_AS
+    if not file.exists():
+        raise UsageError(f"{folder}: no {SAVED_AS} in this folder: name the scene (--scene)")
+    try:
+        return load_scene(file)
+    except SceneError as error:
+        if (named := _named(file)) == str(file) or any(line.startswith(named) for line in error.problems):
+            raise
+        raise SceneError([f"{named}{problem.removeprefix(str(file))}" for problem in error.problems]) from error
+
+
+def read_log(file: Path, setup: Setup | None = None) -> Columns:
+    """The columns of ``log.npz``.
+
+    Args:
+        file: its path.
+        setup: of the run, for who makes something of its columns; without one, they may have any shape, as those of
+            own controllers do.
+
+    Raises:
+        UsageError: it cannot be read, or a column is not as a run writes it.
+    """
+    columns = _read(file, "the log of a run", _OF_LOG, setup)
+    times = _times(columns, "t_s", file)
+    if len(times) and times[0] == 0.0:
+        raise UsageError(
+            f"{file}: expected t_s on the clock of bus.log, got times since the first SYNC, as an earlier canprobe"
+            " wrote them; run the scene again"
+        )
+    if (np.diff(times) <= 0.0).any():
+        raise UsageError(f"{_named(file)}: t_s: expected times that rise from cycle to cycle, got others")
+    for name, most in _WHOLE_NUMBERS.items() if setup is not None else ():
+        known = columns[name][np.isfinite(columns[name])] if name in columns else np.empty(0)
+        if ((known < 0.0) | (known > most)).any():
+            raise UsageError(f"{_named(file)}: {name}: expected numbers from 0 to {most}, got others")
+    return columns
+
+
+def read_tactile(file: Path, setup: Setup | None = None) -> Columns:
+    """The columns of ``tactile.npz``; as `read_log`."""
+    columns = _read(file, "the tactile frames of a run", _OF_TACTILE, setup)
+    if not columns:
+        return columns
+    for name in ("t_s", "t_sample_s"):
+        _times(columns, name, file)
+    if setup is not None:
+        needed(columns, _OF_TACTILE, file)
+        first, size = columns["window"][:, :2], columns["window"][:, 2:]
+        if ((first < 0) | (size < 0) | (first + size > columns["taxels"].shape[1:])).any():
+            raise UsageError(f"{_named(file)}: window: expected windows within the array, got others")
+    return columns
+
+
+def read_truth(file: Path, setup: Setup | None = None) -> Columns:
+    """The columns of ``truth.npz``; as `read_log`."""
+    return _read(file, "the true values of a run", _OF_TRUTH, setup)
+
+
+def needed(columns: Columns, names: Iterable[str], file: Path) -> None:
+    """Raise UsageError for columns that a file lacks."""
+    if missing := [name for name in names if name not in columns]:
+        raise UsageError(
+            f"{_named(file)}: expected the columns of a run, got none called {', '.join(missing)}; run it again"
+        )
+
+
+READERS = {LOG: read_log, TACTILE: read_tactile, TRUTH: read_truth}
+"""Reader of each file of columns, by its name."""
+
+
+def _read(file: Path, what: str, shapes: _Shapes, setup: Setup | None) -> Columns:
+    """The columns of a file, all numbers and of one length; of a setup, those that are known in their shapes."""
+    columns = read_npz(file, what)
+    sizes = _sizes(setup)
+    rows = next((len(column) for column in columns.values() if column.ndim), 0)
+    for name, column in columns.items():
+        kinds, row = shapes[name] if setup is not None and rows and name in shapes else ("biuf", column.shape[1:])
+        wanted = (rows, *(sizes.get(size) if isinstance(size, str) else size for size in row))
+        fits = len(column.shape) == len(wanted) and all(
+            size in (None, got) for size, got in zip(wanted, column.shape, strict=True)
+        )
+        if not fits or column.dtype.kind not in kinds:
+            shape = ", ".join("any" if size is None else str(size) for size in wanted) + "," * (len(wanted) == 1)
+            raise UsageError(
+                f"{_named(file)}: {name}: expected {_KINDS[kinds]} of shape ({shape}), got {column.dtype} of shape"
+                f" {column.shape}"
+            )
+    return columns
+
+
+_KINDS = {"f": "floats", "u": "counts (uint8)", "i": "integers", "biuf": "numbers"}
+
+
+def _sizes(setup: Setup | None) -> dict[str, int]:
+    """The sizes of a cell's rows, by the names of `_Shapes`; none of a part that it does not have."""
+    if setup is None:
+        return {}
+    arm, array = setup.arm, setup.array
+    return ({} if arm is None else {"joints": arm.model.n}) | (
+        {} if array is None else {"rows": array.pad.rows, "columns": array.pad.columns}
+    )
+
+
+def _times(columns: Columns, name: str, file: Path) -> NDArray[Any]:
+    """A column of times, s."""
+    needed(columns, (name,), file)
+    times = columns[name]
+    if times.ndim != 1 or times.dtype.kind != "f" or not (np.abs(times) < _LATEST_S).all():
+        raise UsageError(f"{_named(file)}: {name}: expected a time in seconds in each row, got others")
+    return times
+
+
+def _named(file: Path) -> str:
+    """What messages call a file of a folder: with who wrote it, where that is another canprobe."""
+    try:
+        summary = read_summary(file.parent)
+    except UsageError:
+        summary = None
+    return str(file) if summary is None else f"{file}{written_by_other(summary.get('written_by'))}"

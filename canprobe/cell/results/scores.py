@@ -1,0 +1,243 @@
+"""Scores of a run against the plant's truth: contact over the scan, shape after the first 20 mm; map and estimates."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
+from canprobe.errors import UsageError
+from canprobe.mechanics.touch.consistency import PARTS, Consistency, check_consistency
+from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.touch.surface_map import LocalPatch, SurfaceMap, merge_patches
+
+if TYPE_CHECKING:
+    from canprobe.mechanics.touch.estimate.noise import Correlation
+
+Array = NDArray[np.float64]
+RUN_IN_M = 0.020
+"""Path after which the answers of an estimator count."""
+CHECKPOINTS = 12
+
+
+def curvature_tensor(kappa: Array, direction1: Array, direction2: Array) -> Array:
+    """Curvature tensor (3, 3), 1/m, from principal curvatures (2,) and unit directions (3,)."""
+    tensor: Array = kappa[0] * np.outer(direction1, direction1) + kappa[1] * np.outer(direction2, direction2)
+    return tensor
+
+
+def score_contact(truth: Mapping[str, Array], first: int, last: int, target_n: float) -> dict[str, float | None]:
+    """Force, contact and speed over cycles ``first`` ≤ k < ``last``.
+
+    Args:
+        truth: columns of the plant's truth, one row a SYNC.
+        first, last: the scan, as SYNC numbers.
+        target_n: wanted force.
+    """
+    force = truth["force"][first:last]
+    points = truth["contact_point"][first:last]
+    times = truth["t_s"][first:last]
+    if len(force) < 2:
+        return dict.fromkeys(("force_rms_error_n", "force_max_n", "contact_fraction", "speed_mean_m_s"))
+    travelled = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+    return {
+        "force_rms_error_n": float(np.sqrt(np.mean((force - target_n) ** 2))),
+        "force_max_n": float(truth["force"].max()),
+        "contact_fraction": float(np.mean(force > 0)),
+        "speed_mean_m_s": travelled / float(times[-1] - times[0]),
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class ShapeScore:
+    """Errors of one estimator over a run; None where nothing could be scored.
+
+    Attributes:
+        kappa_true_per_m: mean true principal curvatures (1/m) over the scored estimates; where none could be scored, as
+            part of the curvature was not observed, over all after the run-in, or else over all.
+        kappa_est_per_m: mean estimated ones (1/m).
+        kappa_rms_error_per_m: RMS Frobenius norm of K_est − K_true (1/m).
+        kappa_rms_error_percent: the same relative to the RMS of ‖K_true‖; None on a plane.
+        normal_rms_deg, position_rms_mm: of the estimated contact frame.
+        estimates: how many were scored.
+        observed_fraction: share of the answers after the run-in that observed all curvature.
+        patch_fraction: share of the scored answers to which the contact patch contributed a tenth or more.
+    """
+
+    kappa_true_per_m: tuple[float, float] | None
+    kappa_est_per_m: tuple[float, float] | None
+    kappa_rms_error_per_m: float | None
+    kappa_rms_error_percent: float | None
+    normal_rms_deg: float | None
+    position_rms_mm: float | None
+    estimates: int
+    observed_fraction: float | None
+    patch_fraction: float | None = None
+
+
+def score_shape(records: Sequence[ShapeRecord], truth: Mapping[str, Array], sync_times: Array) -> ShapeScore:
+    """Score estimates against the truth at the instants of their last samples.
+
+    Args:
+        records: the estimates.
+        truth: columns of the plant's truth, one row a SYNC.
+        sync_times: time of each SYNC on the master's clock (n,), s.
+    """
+    late = [r for r in records if r.travelled_m >= RUN_IN_M]
+    seen = [r for r in late if bool(np.all(r.estimate.observed))]
+    rows = np.searchsorted(sync_times, [r.t_s - 1e-6 for r in seen or late or records])
+    if rows.max(initial=0) >= len(truth["kappa"]):
+        raise UsageError(
+            f"truth: expected one row per SYNC, at least {rows.max() + 1}, got {len(truth['kappa'])}: of another run?"
+        )
+    kappa_true = _pair(truth["kappa"][rows].mean(axis=0)) if len(rows) else None
+    if not seen:
+        return ShapeScore(kappa_true, None, None, None, None, None, 0, 0.0 if late else None)
+    errors, norms, tilts, offsets = [], [], [], []
+    for record, row in zip(seen, rows, strict=True):
+        T = record.estimate.T_frame_contact
+        tensor = curvature_tensor(truth["kappa"][row], truth["direction1"][row], truth["direction2"][row])
+        K_true = T[:3, :2].T @ tensor @ T[:3, :2]
+        errors.append(float(np.sum((record.estimate.K - K_true) ** 2)))
+        norms.append(float(np.sum(K_true**2)))
+        cosine = float(-T[:3, 2] @ truth["contact_normal"][row])
+        sine = float(np.linalg.norm(T[:3, 2] + truth["contact_normal"][row] * cosine))
+        tilts.append(np.arctan2(sine, cosine) ** 2)
+        offsets.append(float(np.sum((T[:3, 3] - truth["contact_point"][row]) ** 2)))
+    rms, scale = float(np.sqrt(np.mean(errors))), float(np.sqrt(np.mean(norms)))
+    return ShapeScore(
+        kappa_true_per_m=kappa_true,
+        kappa_est_per_m=_pair(np.mean([r.estimate.kappa for r in seen], axis=0)),
+        kappa_rms_error_per_m=rms,
+        kappa_rms_error_percent=100 * rms / scale if scale > 1e-9 else None,
+        normal_rms_deg=float(np.degrees(np.sqrt(np.mean(tilts)))),
+        position_rms_mm=float(np.sqrt(np.mean(offsets)) * 1e3),
+        estimates=len(seen),
+        observed_fraction=len(seen) / len(late),
+        patch_fraction=sum(r.estimate.method.endswith("patch") for r in seen) / len(seen),
+    )
+
+
+def bound_of_scan(
+    samples: Sequence[ContactSample],
+    truth: Mapping[str, Array],
+    sync_times: Array,
+    *,
+    memory_m: float,
+    sigma_normal: float,
+    correlation: Correlation,
+    coupling: float = 0.0,
+) -> float | None:
+    """Cramér–Rao bound on the RMS Frobenius error of K (1/m), over the run; None where a window leaves K open.
+
+    The limit of unbiased estimates from the last ``memory_m`` of path with noise of the stated size, the
+    mean over ``CHECKPOINTS`` places after the run-in. An estimator with a longer memory may be better.
+
+    Args:
+        samples: the contacts of the scan.
+        truth: columns of the plant's truth, one row a SYNC.
+        sync_times: time of each SYNC on the master's clock (n,), s.
+        memory_m: path that counts, m.
+        sigma_normal: of the normals, rad; that of the points is in the samples.
+        correlation: of the noise along the path.
+        coupling: of the errors of point and normal (`Noise`), 1/m.
+    """
+    from canprobe.mechanics.touch.estimate.likelihood import make_touches, osculating_bound
+    from canprobe.mechanics.touch.estimate.noise import make_noise
+    from canprobe.mechanics.touch.surface import SurfaceMatrix
+
+    points = np.array([s.p_base for s in samples])
+    normals = np.array([s.n_base for s in samples])
+    sigmas = np.array([s.sigma_point for s in samples], dtype=np.float64)
+    path = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
+    if len(path) < 3 or path[-1] < max(RUN_IN_M, memory_m):
+        return None
+    squares = []
+    for place in np.linspace(max(RUN_IN_M, memory_m), path[-1], CHECKPOINTS):
+        last = int(np.searchsorted(path, place - 1e-12))
+        first = int(np.searchsorted(path, path[last] - memory_m))
+        row = int(np.searchsorted(sync_times, samples[last].t_s - 1e-6))
+        T = np.eye(4)
+        T[:3, 2], T[:3, 3] = -truth["contact_normal"][row], truth["contact_point"][row]
+        T[:3, 0] = truth["direction1"][row]
+        T[:3, 1] = np.cross(T[:3, 2], T[:3, 0])
+        surface = SurfaceMatrix.from_curvature(np.diag(truth["kappa"][row])).transformed(np.linalg.inv(T))
+        recent = slice(first, last + 1)
+        noise = make_noise(last + 1 - first, sigmas[recent], sigma_normal, coupling)
+        C = osculating_bound(make_touches(points[recent], normals[recent], noise, correlation), surface)
+        squares.append(C[0, 0] + 2 * C[1, 1] + C[2, 2])
+    mean = float(np.mean(squares))
+    return float(np.sqrt(mean)) if np.isfinite(mean) else None
+
+
+def _pair(values: Array) -> tuple[float, float]:
+    return float(values[0]), float(values[1])
+
+
+# The surface map of a scan, and its section of the summary.
+
+SAME_DIRECTION_RAD = math.radians(30.0)
+"""Passes whose directions differ by less have the same hysteresis of the array."""
+
+
+def map_of_scan(
+    tracker: ShapeTracker, method: str, start_s: float = 0.0
+) -> tuple[SurfaceMap, Consistency, dict[str, Any]]:
+    """Merge the answers of the estimator in the loop along a scan.
+
+    Args:
+        tracker: with the answers and the contacts of the scan.
+        method: name of the estimator.
+        start_s: deadline of the first SYNC on the run's clock.
+
+    Returns:
+        The map, the tests at its crossings, and its section of ``summary.json``: None without a test.
+    """
+    patches = [LocalPatch.of(r.estimate, t_s=start_s + r.t_s, travelled_m=r.travelled_m) for r in tracker.records]
+    path = np.array([sample.p_base for sample in tracker.samples]).reshape(-1, 3)
+    surface_map = merge_patches(patches, path[np.isfinite(path).all(axis=1)], method=method)
+    consistency = check_consistency(surface_map)
+    return (
+        surface_map,
+        consistency,
+        {
+            "patches": len(surface_map),
+            "crossings": len(consistency.crossings),
+            "independent_crossings": len(consistency.independent),
+            "consistent": consistency.consistent,
+            **{part: _verdict(consistency, part) for part in PARTS},
+        },
+    )
+
+
+def _verdict(consistency: Consistency, part: str) -> dict[str, float | None]:
+    whole = consistency.verdict(part)
+    same = consistency.verdict(part, (0.0, SAME_DIRECTION_RAD))
+    other = consistency.verdict(part, (SAME_DIRECTION_RAD, math.inf))
+    figures = {
+        "chi2_per_dof": whole.chi2_per_dof,
+        "share_p_below_0.05": whole.share_below,
+        "share_p_below_0.05_same_direction": same.share_below,
+        "share_p_below_0.05_other_direction": other.share_below,
+        "pooled_p": whole.pooled.p,
+    }
+    return {name: value if math.isfinite(value) else None for name, value in figures.items()}
+
+
+def estimate_columns(records: Sequence[ShapeRecord]) -> dict[str, Array]:
+    """Estimates as columns, one row each; the suffix of a name is its unit."""
+    answers = [r.estimate for r in records]
+    return {
+        "t_s": np.array([r.t_s for r in records]),
+        "travelled_m": np.array([r.travelled_m for r in records]),
+        "K_per_m": np.array([a.K for a in answers]).reshape(-1, 2, 2),
+        "K_covariance_per_m2": np.array([a.covariance for a in answers]).reshape(-1, 3, 3),
+        "kappa_per_m": np.array([a.kappa for a in answers]).reshape(-1, 2),
+        "observed": np.array([a.observed for a in answers], bool).reshape(-1, 2),
+        "T_base_contact_m": np.array([a.T_frame_contact for a in answers]).reshape(-1, 4, 4),
+    }

@@ -1,0 +1,656 @@
+"""What a run leaves behind: the summary, the log, the scene as resolved, its traffic beside the plan."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.util
+import json
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe import __version__
+from canprobe.cell.master.cell import Cell
+from canprobe.cell.planning.make import make_plan
+from canprobe.cell.planning.measured import MeasuredTraffic, TrafficMeter
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.results.files import save_surface_map
+from canprobe.cell.results.run_files import SCHEMA
+from canprobe.cell.results.scores import ShapeScore, bound_of_scan, score_contact, score_shape
+from canprobe.cell.scene.geometry import FILE, calibration_lines, summarise_calibration, tool_text
+from canprobe.cell.scene.load import load_scene
+from canprobe.cell.scene.model import Scene
+from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.scene.setup import Setup, Touch
+from canprobe.cell.session.session import Session, write_scene
+from canprobe.cell.session.target import VIRTUAL
+from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
+from canprobe.cell.tasks.task import TaskRecord
+from canprobe.cell.tasks.touch import losses_text, summarise_losses
+from canprobe.errors import ResultsError, UsageError, install_line
+from canprobe.fieldbus.bus.candump import write_npz, write_text
+from canprobe.fieldbus.bus.clock_steps import RecordedBus
+from canprobe.fieldbus.bus.port import ERR_FLAG, is_bus_error
+from canprobe.fieldbus.protocol.frames import SYNC_ID, is_sync, long_syncs_text
+from canprobe.mechanics.touch.consistency import Consistency
+from canprobe.mechanics.touch.surface_map import SurfaceMap
+
+if TYPE_CHECKING:
+    import pandas
+    from matplotlib.figure import Figure
+
+    from canprobe.cell.results.contacts import Contacts, OwnEstimator, Scores
+    from canprobe.cell.results.page import Page
+
+
+# A recorded bus beside the plan of its scene.
+
+LOG = "bus.log"
+
+
+def measure_traffic(
+    log: Path | str, scene: Scene | Plan | str | Path, *, channel: str | None = None, exact: bool = True
+) -> MeasuredTraffic:
+    """Count the frames of a bus and compare them with the plan, message by message.
+
+    Args:
+        log: a candump log, or the folder of a run.
+        scene: that ran, as for `canprobe.run`, or its plan.
+        channel: of the log; by default that of the scene's first bus, or the only one in the log.
+        exact: count stuff bits too, which takes a few µs per frame.
+
+    Returns:
+        Frames and bits (stuff bits included) of every class of messages, their times behind SYNC, and the identifiers
+        that the plan does not list.
+
+    Raises:
+        UsageError: the log cannot be read, has no SYNC on this channel, or several channels and none was named.
+        PlanError: the scene does not fit its bus.
+    """
+    path = Path(log) / LOG if Path(log).is_dir() else Path(log)
+    plan = scene if isinstance(scene, Plan) else make_plan(resolve(load_scene(scene)))
+    meters: dict[str, TrafficMeter] = {}
+    syncs: Counter[str] = Counter()
+    long_syncs: Counter[int] = Counter()
+    bus = RecordedBus(path)
+    for t_ns, name, can_id, data in bus:
+        meter = meters.get(name)
+        if meter is None:
+            meter = meters[name] = TrafficMeter(plan, name, exact)
+        if can_id & ERR_FLAG:
+            meter.error_frames += is_bus_error(can_id)
+        else:
+            meter.write(can_id, data, t_ns)
+            syncs[name] += is_sync(can_id, data)
+            long_syncs[len(data)] += can_id == SYNC_ID and not is_sync(can_id, data)
+    longer = long_syncs_text(+long_syncs)
+    name = _chosen(path, syncs, longer, plan, channel)
+    measured = meters[name].report()
+    return replace(
+        measured,
+        unlisted=measured.unlisted | ({SYNC_ID: long_syncs.total()} if longer else {}),
+        notes=(*([longer] if longer else []), *bus.notes()),
+        xl_frames=bus.xl.get(name, 0),
+        lost_by_candump=bus.lost.get(name, 0),
+    )
+
+
+def _chosen(path: Path, syncs: Counter[str], longer: str, plan: Plan, channel: str | None) -> str:
+    with_sync = [name for name in syncs if syncs[name]]
+    wanted = plan.buses[0].channel if channel is None else channel
+    if wanted in with_sync:
+        return wanted
+    if channel is None and len(with_sync) == 1:
+        return with_sync[0]
+    if not with_sync:
+        but = f" of 0 or 1 byte, but {longer}" if longer else " on any channel"
+        raise UsageError(f"{path}: no SYNC (080h){but}; expected the log of a cell that ran")
+    raise UsageError(
+        f"{path}: no SYNC (080h) on channel {wanted}; name one that has it: {', '.join(sorted(with_sync))}"
+    )
+
+
+# The result of a run, its summary and its files.
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class RunResult:
+    """One finished run; printed, it is its summary.
+
+    That of `canprobe.open_cell` is complete when its block is left: until then the drives are not disabled, the
+    bus is not closed, and reading an attribute raises.
+
+    Attributes:
+        plan: what was planned.
+        summary: the content of ``summary.json``.
+        log: the columns of ``log.npz``, one row per cycle; the suffix of a name is its unit. ``t_s`` here, in the truth
+            and in the estimates counts from the instant that is 0 in ``bus.log``.
+        truth: the plant's true values, one row per SYNC; empty where nothing was emulated.
+        estimates: the answers of each estimator, by name; the online one first.
+        taxels: (rows, columns) counts of the task's last tactile frame, or None.
+        tactile: the columns of ``tactile.npz``, one row per tactile frame that the cell used: ``t_s`` of the cycle,
+            ``t_sample_s``, ``taxels`` (m, rows, columns), their ``window``, ``features``; empty where there was none.
+        surface_map: the local patches of the online estimator, or None without a shape.
+        consistency: the tests at its crossings, or None.
+        out: the folder with the files, or None.
+        contacts: of the scan, as the master measured them; None without a shape.
+    """
+
+    plan: Plan
+    summary: dict[str, Any]
+    log: dict[str, Array]
+    truth: dict[str, Array]
+    estimates: dict[str, list[ShapeRecord]] = field(default_factory=dict)
+    taxels: NDArray[np.uint8] | None = None
+    tactile: dict[str, NDArray[Any]] = field(default_factory=dict)
+    surface_map: SurfaceMap | None = None
+    consistency: Consistency | None = None
+    out: Path | None = None
+    contacts: Contacts | None = None
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            """Called for missing attributes: all of them before the run is finished."""
+            if name not in RunResult.__slots__:
+                raise AttributeError(f"RunResult has no attribute {name!r}")
+            raise UsageError(f"result.{name}: complete when the block of open_cell is left; read it after the block")
+
+    def text(self) -> str:
+        """The summary as text."""
+        return summary_text(self.summary, self.out)
+
+    def __repr__(self) -> str:
+        try:
+            return self.text()
+        except UsageError:
+            return "a run that is under way; complete when the block of open_cell is left"
+
+    def plot(self) -> Figure:
+        """The figure of ``report.png``; a notebook shows it.
+
+        Raises:
+            UsageError: matplotlib is missing, or nothing was measured.
+        """
+        if importlib.util.find_spec("matplotlib") is None:
+            raise UsageError(f"plot needs matplotlib: {install_line('study')}")
+        figures = importlib.import_module("canprobe.cell.results.figures")  # it draws results, and imports this module
+        figure: Figure = figures.run_figure(self)
+        return figure
+
+    def view(self) -> Page:
+        """The run in three dimensions, as one page that replays it: in a notebook, else in a browser.
+
+        It is ``report.html`` of the run's folder, or of a temporary one.
+
+        Raises:
+            UsageError: the extra `view` is missing.
+        """
+        from canprobe.cell.results.page import page_of
+
+        folder = self.out
+        if folder is None:
+            folder = Path(tempfile.mkdtemp(prefix="canprobe-view-"))
+            write_scene(self.plan, folder)
+            write_files(self, folder)
+        return page_of(folder)
+
+    def score(self, *methods: str, **own: Callable[[], OwnEstimator]) -> Scores:
+        """The errors of estimators on the contacts of this scan, all asked every 0.1 s, against the plant's truth.
+
+        Example::
+
+            result.score("recursive", "ml", mine=MyEstimator)
+
+        Args:
+            methods: ours, by name; without any, those of the scene.
+            own: makes an estimator of yours, such as its class, by the name that it has in the table. It has
+                ``add(sample)``, which takes a `canprobe.ContactSample`, and ``estimate()``, which returns a
+                `canprobe.SurfaceEstimate` or None. After a loss of contact a new one is made.
+
+        Raises:
+            UsageError: nothing was scanned, no truth is known, or an unknown method.
+        """
+        from canprobe.cell.results.contacts import score_estimators
+
+        task, scene = self.plan.setup.task, self.plan.scene
+        if self.contacts is None or not len(self.contacts) or scene.shape is None or not isinstance(task, Touch):
+            raise UsageError("score: expected a scan that touched its object, got no contacts")
+        if "kappa" not in self.truth:
+            raise UsageError("score: expected an emulated object; nothing is known of the truth")
+        start_s = float(self.contacts.t_s[0] - self.contacts.samples[0].t_s)
+        ours = {name: name for name in methods or (scene.shape.method, *scene.shape.also)}
+        return score_estimators(
+            self.contacts.samples, task, {**ours, **own}, truth=self.truth, sync_times=self.log["t_s"] - start_s
+        )
+
+    def to_pandas(self, what: Literal["log", "truth", "estimates"] = "log") -> pandas.DataFrame:
+        """A table of the run, by time; vectors are spread over columns, and `attrs["units"]` has every unit.
+
+        Args:
+            what: `log` (one row per cycle), `truth` (per SYNC), or `estimates` (per answer of the estimator in the
+                loop; the attribute `estimates` has the others).
+
+        Raises:
+            UsageError: the extra `data` is missing.
+        """
+        from canprobe.cell.results.files import to_frame
+
+        return to_frame(self._columns(what), self._attrs)
+
+    def to_parquet(self, path: Path | str, what: Literal["log", "truth", "estimates"] = "log") -> None:
+        """Write the same table as Parquet; `canprobe.load_table` reads it.
+
+        Raises:
+            UsageError: the extra `data` is missing.
+        """
+        from canprobe.cell.results.files import write_parquet
+
+        write_parquet(self._columns(what), path, self._attrs)
+
+    @property
+    def _attrs(self) -> dict[str, Any]:
+        return {name: self.summary[name] for name in ("scene", "bus", "seed")}
+
+    def _columns(self, what: str) -> dict[str, Array]:
+        if what == "estimates":
+            from canprobe.cell.results.scores import estimate_columns
+
+            return estimate_columns(next(iter(self.estimates.values()), []))
+        if what not in ("log", "truth"):
+            raise UsageError(f"to_pandas: expected log, truth or estimates, got {what!r}")
+        return self.log if what == "log" else self.truth
+
+
+def summarise(
+    session: Session,
+    record: TaskRecord,
+    estimates: dict[str, list[ShapeRecord]],
+    stop_reason: str | None,
+    *,
+    map_summary: dict[str, Any] | None = None,
+    bridges: dict[str, dict[str, Any]] | None = None,
+) -> dict[str, Any]:
+    """The content of ``summary.json``; what does not apply is None."""
+    scene, cell = session.scene, session.cell
+    cycle, direct = cell.cycle, scene.bus.direct
+    sim_time = cycle.t_ns * 1e-9 if cycle is not None else 0.0
+    wall = session.wall_ns * 1e-9
+    log = cell.log.arrays()
+    contact = _contact(session, record, log)
+    summary = {
+        "schema": SCHEMA,
+        "written_by": f"canprobe {__version__}",
+        "scene": scene.name,
+        "bus": scene.bus.interface,
+        "seed": scene.seed,
+        "completed": stop_reason is None,
+        "stop_reason": stop_reason,
+        "sim_time_s": sim_time,
+        "wall_time_s": wall,
+        "realtime_factor": sim_time / wall if wall > 0 else None,
+        "newtons": None if session.plan.setup.array is None else session.plan.setup.array.newtons,
+        "contact": contact,
+        "shape": summarise_shape(
+            session.plan.setup,
+            record.shape,
+            estimates,
+            _truth(session),
+            log.get("t_s", np.empty(0)),
+            map_summary=map_summary,
+        ),
+        "calibration": summarise_calibration(scene, record.tool),
+        "choices": [f"{choice.key} = {choice.value}: {choice.why}" for choice in session.plan.choices],
+        "cycle": _cycle(cell, record) | {"observe_us": _observed(session)},
+        "bus_load": None if direct else _bus_load(session),
+        "traffic": None if direct else _traffic(session),
+        "left_out": [f"{what}: {why}" for what, why in (*session.plan.left_out, *session.plan.not_available)],
+        "warnings": [*session.plan.warnings, *_hidden_force(session, contact["force_max_n"], log)],
+        "bridges": bridges,
+        "faults": [*cell.faults, *(session.observers.faults if session.observers is not None else ())],
+    }
+    return {name: _without_nan(value) for name, value in summary.items()}
+
+
+def log_columns(cell: Cell) -> dict[str, Array]:
+    """The columns of ``log.npz``, on the run's clock; a run that was stopped before its first cycle has no row."""
+    return _on_run_clock({"t_s": np.empty(0), **cell.log.arrays()}, cell)
+
+
+def tactile_columns(cell: Cell) -> dict[str, NDArray[Any]]:
+    """The columns of ``tactile.npz``, on the run's clock; none where no frame was used."""
+    return _on_run_clock(cell.tactile_log.arrays(), cell)
+
+
+def _on_run_clock(columns: dict[str, NDArray[Any]], cell: Cell) -> dict[str, NDArray[Any]]:
+    start_s = cell.start_ns * 1e-9
+    return {name: column + start_s if name in ("t_s", "t_sample_s") else column for name, column in columns.items()}
+
+
+def _without_nan(value: Any) -> Any:
+    """The value for JSON, null for numbers that are not finite."""
+    if isinstance(value, dict):
+        return {name: _without_nan(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(part) for part in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def _bus_load(session: Session) -> dict[str, Any]:
+    return {
+        bus.channel: {"planned_worst": bus.traffic.load, "measured": session.bus_load(bus.channel)}
+        for bus in session.plan.buses
+    }
+
+
+def _traffic(session: Session) -> dict[str, Any]:
+    """The traffic of each bus beside the plan; that of a real one is counted afterwards, from the log.
+
+    Without a log, or where it ends before the first SYNC, only the bus errors are known.
+    """
+    if session.meters:
+        return {channel: meter.report().as_dict() for channel, meter in session.meters.items()}
+    plan = session.plan
+    with contextlib.suppress(UsageError):
+        if session.out is not None:
+            log = session.out / LOG
+            return {b.channel: measure_traffic(log, plan, channel=b.channel, exact=False).as_dict() for b in plan.buses}
+    errors = {channel: counter.error_frames for channel, counter in session.traffic.items()}
+    return {channel: {"as_planned": None if n == 0 else False, "error_frames": n} for channel, n in errors.items()}
+
+
+def _truth(session: Session) -> dict[str, Array]:
+    """The plant's truth; empty where nothing was emulated, or nothing happened."""
+    return session.truth if "force" in session.truth else {}
+
+
+def _contact(session: Session, record: TaskRecord, log: dict[str, Array]) -> dict[str, Any]:
+    task, scan = session.scene.task, record.scan_cycles if session.keeps_all else None
+    names = ("force_rms_error_n", "force_max_n", "contact_fraction", "speed_mean_m_s")
+    target = task.force_n if task.kind in ("scan", "press") else None
+    figures: dict[str, float | None] = dict.fromkeys(names)
+    measured: float | None = None
+    if scan is not None and scan[1] > scan[0]:
+        measured = _rms_error(log["force_n"][scan[0] : scan[1]], task.force_n)
+        if truth := _truth(session):
+            figures = score_contact(truth, *scan, task.force_n)
+            if task.kind != "scan":
+                figures["speed_mean_m_s"] = None
+        else:
+            figures |= {"force_rms_error_n": measured, "force_max_n": float(np.nanmax(log["force_n"], initial=0.0))}
+    return {"force_target_n": target, **figures, "force_measured_rms_error_n": measured} | {
+        "losses": summarise_losses(record.losses)
+    }
+
+
+def _hidden_force(session: Session, highest: float | None, log: dict[str, Array]) -> list[str]:
+    """That the true force was above the limit, which acts on what the array measures."""
+    limit = session.scene.limits.force_max_n
+    if not _truth(session) or highest is None or highest <= limit:
+        return []
+    return [
+        f"the true force rose to {highest:.2f} N, above limits.force_max_n = {limit:g}: the array measured at most"
+        f" {np.nanmax(log['force_n'], initial=0.0):.2f} N"
+    ]
+
+
+def _rms_error(values: Array, target: float) -> float | None:
+    """RMS error over the cycles that have a value: a cycle in which the cell held has none."""
+    known = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean((known - target) ** 2))) if len(known) else None
+
+
+def summarise_shape(
+    setup: Setup,
+    tracker: ShapeTracker | None,
+    estimates: dict[str, list[ShapeRecord]],
+    truth: Mapping[str, Array],
+    sync_times: Array,
+    *,
+    map_summary: dict[str, Any] | None = None,
+) -> dict[str, Any]:
+    """The section ``shape`` of ``summary.json``, of the first estimator and a table of all.
+
+    Args:
+        setup: of the run.
+        tracker: its contacts; None without a shape.
+        estimates: the answers of each estimator, by name.
+        truth: columns of the plant's truth, one row per SYNC; empty without a truth.
+        sync_times: time of each SYNC (n,), s, on the clock of the estimates.
+        map_summary: of the scan's surface map.
+    """
+    names = (
+        *("method", "kappa_true_per_m", "kappa_est_per_m", "kappa_rms_error_per_m", "kappa_rms_error_percent"),
+        *("normal_rms_deg", "position_rms_mm", "observed", "patch_fraction", "cramer_rao_ratio"),
+    )
+    shape: dict[str, Any] = dict.fromkeys(names)
+    if not estimates:
+        return shape
+    method = next(iter(estimates))
+    records = estimates[method]
+    shape["method"] = method
+    if map_summary is not None:
+        shape["map"] = map_summary
+    if records:
+        shape["observed"] = [bool(o) for o in records[-1].estimate.observed]
+        shape["kappa_est_per_m"] = finite_or_none(records[-1].estimate.kappa)
+    if not truth:
+        return shape
+    scores = {name: score_shape(records, truth, sync_times) for name, records in estimates.items()}
+    score = asdict(scores[method])
+    score["kappa_est_per_m"] = score["kappa_est_per_m"] or shape["kappa_est_per_m"]
+    shape |= {name: value for name, value in score.items() if name in names}
+    shape["cramer_rao_ratio"] = _bound_ratio(setup, tracker, scores[method], truth, sync_times)
+    of_run = ("kappa_true_per_m", "kappa_est_per_m")
+    shape["methods"] = {
+        method: {name: value for name, value in asdict(one).items() if name not in of_run}
+        for method, one in scores.items()
+    }
+    return shape
+
+
+def _bound_ratio(
+    setup: Setup, tracker: ShapeTracker | None, score: ShapeScore, truth: Mapping[str, Array], sync_times: Array
+) -> float | None:
+    """Error of the online estimator over the Cramér–Rao bound of one memory at the stated noise.
+
+    None where the contact patch contributed to most answers: the bound is that of points and normals.
+    """
+    from canprobe.cell.tasks.from_plan import SIGMA_NORMAL_RAD, centroid_correlation, centroid_coupling
+
+    shape = setup.shape
+    if tracker is None or shape is None or score.kappa_rms_error_per_m is None or (score.patch_fraction or 0.0) > 0.5:
+        return None
+    bound = bound_of_scan(
+        tracker.samples,
+        truth,
+        sync_times,
+        memory_m=shape.memory,
+        correlation=centroid_correlation(),
+        sigma_normal=SIGMA_NORMAL_RAD,
+        coupling=centroid_coupling(setup.probe),
+    )
+    return None if bound is None else score.kappa_rms_error_per_m / bound
+
+
+def finite_or_none(values: Sequence[float] | Array) -> list[float | None]:
+    """Floats for JSON; None for what was not observed, which is not finite."""
+    return [float(v) if np.isfinite(v) else None for v in values]
+
+
+def _cycle(cell: Cell, record: TaskRecord) -> dict[str, Any]:
+    cycle, drives, tactile = cell.cycle, cell.drives, cell.tactile
+    statistics = cycle.statistics if cycle is not None else None
+    return {
+        "rate_hz": cycle.number / (cycle.t_ns * 1e-9) if cycle is not None and cycle.t_ns > 0 else None,
+        "cycles": cycle.number + 1 if cycle is not None else 0,
+        "overruns": statistics.overruns if statistics is not None else 0,
+        "missed_pdos": drives.missed if drives is not None else 0,
+        "late_pdos": drives.late if drives is not None else 0,
+        "torn_frames": tactile.torn if tactile is not None else 0,
+        "stale_frames": tactile.stale if tactile is not None else 0,
+        "unplaced_contacts": record.unplaced,
+        "slowed_cycles": record.slowed,
+        "dropped_frames": cell.counters.overruns,
+        "clock_steps": cell.counters.clock_steps,
+        "period_error_us": _percentiles(statistics.period_error_ns if statistics is not None else []),
+        "response_us": _percentiles(statistics.response_ns if statistics is not None else []),
+        "compute_us": _percentiles(statistics.compute_ns if statistics is not None else []),
+    }
+
+
+def _observed(session: Session) -> dict[str, float | None] | None:
+    """Time that observers and bridges added to a cycle, after its work; None without any."""
+    return _percentiles(list(session.observers.cost_ns)) if session.observers is not None else None
+
+
+def _percentiles(values_ns: Sequence[int]) -> dict[str, float | None]:
+    if not values_ns:
+        return dict.fromkeys(("p50", "p99", "p999", "max"))
+    us = np.asarray(values_ns) / 1000
+    p50, p99, p999 = np.percentile(us, (50, 99, 99.9)).tolist()
+    return {"p50": p50, "p99": p99, "p999": p999, "max": float(us.max())}
+
+
+def write_columns(log: Mapping[str, Array], tactile: Mapping[str, NDArray[Any]], out: Path) -> None:
+    """Write what a run measured, ``log.npz`` and ``tactile.npz``; as `write_files`."""
+    _write_each(
+        lambda: write_npz(out / "log.npz", log),
+        lambda: write_npz(out / "tactile.npz", tactile) if tactile else None,
+    )
+
+
+def write_files(result: RunResult, out: Path) -> None:
+    """Write the files of a run into ``out`` that the session has not written, without the figures.
+
+    Raises:
+        ResultsError: a file cannot be written; no part of it is left, and the others are written all the same.
+    """
+    text = json.dumps(result.summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    found, surface_map = result.summary["calibration"], result.surface_map
+    tool = None if found is None else tool_text(found, result.plan.scene.name)
+    _write_each(
+        lambda: write_text(out / "summary.json", text),
+        lambda: write_columns(result.log, result.tactile, out),
+        lambda: write_text(out / FILE, tool) if tool is not None else None,
+        lambda: save_surface_map(surface_map, out / "surface.npz") if surface_map is not None else None,
+    )
+
+
+def _write_each(*writers: Callable[[], None]) -> None:
+    """Write file by file; one that cannot be written does not cost the others."""
+    failed = []
+    for write in writers:
+        try:
+            write()
+        except ResultsError as error:
+            failed.append(str(error))
+    if failed:
+        raise ResultsError("\n".join(failed))
+
+
+def _figure(value: float | None, unit: str, digits: int = 2) -> str:
+    return "not observed" if value is None else f"{value:.{digits}f} {unit}".rstrip()
+
+
+def summary_text(summary: dict[str, Any], out: Path | None) -> str:
+    """A summary as text."""
+    contact, shape, cycle = summary["contact"], summary["shape"], summary["cycle"]
+    pace = f"{summary['realtime_factor']:.1f} × real time" if summary["bus"] in VIRTUAL else "real time"
+    rate = "no cycle" if cycle["rate_hz"] is None else f"{cycle['cycles']} at {cycle['rate_hz']:.4g} Hz"
+    lines = [
+        f"{summary['scene']} on {summary['bus']}, seed {summary['seed']}: "
+        + ("done" if summary["completed"] else f"stopped: {summary['stop_reason']}"),
+        f"  time       {summary['sim_time_s']:.2f} s in {summary['wall_time_s']:.2f} s ({pace})",
+        f"  cycle      {rate}, {cycle['overruns']} overruns,"
+        f" {cycle['missed_pdos']} missed PDOs, {cycle['torn_frames']} torn frames",
+    ]
+    lines += [f"  plan       {choice}" for choice in summary.get("choices", ())]
+    if (summary.get("newtons") or "").startswith("nominal"):
+        lines.append(
+            f"  newtons    {summary['newtons']} of the array; forces and stiffness are as good as its full scale"
+        )
+    if contact["force_rms_error_n"] is not None:
+        target = contact["force_target_n"]
+        lines.append(
+            f"  force      target {target:g} N, RMS error {contact['force_rms_error_n']:.3f} N"
+            f" ({100 * contact['force_rms_error_n'] / target:.1f} %), highest {contact['force_max_n']:.2f} N"
+        )
+    if contact["speed_mean_m_s"] is not None:
+        lines.append(
+            f"  contact    {100 * contact['contact_fraction']:.1f} % of the scan at"
+            f" {contact['speed_mean_m_s'] * 1e3:.2f} mm/s"
+        )
+    if contact["losses"]:
+        lines.append(f"  {losses_text(contact['losses'])}")
+    if shape["method"] is not None:
+        lines += shape_lines(shape)
+    if summary.get("calibration") is not None:
+        lines += calibration_lines(summary["calibration"])
+    lines += bridge_lines(summary.get("bridges") or {})
+    lines += [f"  noted      {fault}" for fault in summary["faults"]]
+    lines += [f"  warning    {warning}" for warning in summary.get("warnings", ())]
+    if out is not None:
+        lines.append(f"  files      {out}")
+    return "\n".join(lines)
+
+
+def bridge_lines(bridges: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Samples, drops and errors of each bridge, as text."""
+    return [
+        f"  bridge     {name}: {status['samples']} samples, {status['dropped']} dropped; "
+        + (f"failed: {status['error']}" if status["error"] is not None else f"{status['where']}")
+        for name, status in bridges.items()
+    ]
+
+
+def curvature_text(values: Sequence[float | None] | None) -> str:
+    """Principal curvatures as text, with their unit."""
+    if values is None:
+        return "–"
+    observed = ", ".join(f"{v:.2f}" for v in values if v is not None)
+    if not observed:
+        return "not observed"
+    return f"{observed} 1/m" + (", the other one not observed" if None in values else "")
+
+
+def shape_lines(shape: dict[str, Any]) -> list[str]:
+    """The section ``shape`` of a summary as text."""
+    estimated, true = curvature_text(shape["kappa_est_per_m"]), curvature_text(shape["kappa_true_per_m"])
+    lines = [f"  curvature  {estimated}; true {true}"]
+    for name, score in shape.get("methods", {}).items():
+        if score["estimates"] == 0:
+            lines.append(f"    {name:<10} not scored: no estimate of both curvatures after the first 20 mm")
+            continue
+        percent = score["kappa_rms_error_percent"]
+        lines.append(
+            f"    {name:<10} RMS error {_figure(score['kappa_rms_error_per_m'], '1/m')}"
+            + (f" ({percent:.1f} %)" if percent is not None else "")
+            + f", normal {_figure(score['normal_rms_deg'], 'deg', 3)},"
+            f" position {_figure(score['position_rms_mm'], 'mm', 3)}"
+            + (f", with the patch in {100 * score['patch_fraction']:.0f} %" if score["patch_fraction"] else "")
+        )
+    if (surface := shape.get("map")) is not None:
+        lines.append(
+            f"  map        {surface['patches']} patches, {surface['crossings']} crossings" + _crossings(surface)
+        )
+    return lines
+
+
+def _crossings(surface: dict[str, Any]) -> str:
+    shares = (
+        f"{part} {100 * surface[part]['share_p_below_0.05']:.0f} %"
+        for part in ("curvature", "normal", "height")
+        if surface[part]["share_p_below_0.05"] is not None
+    )
+    text = ", ".join(shares)
+    return f"; p below 0.05 of {text}" if text else ""

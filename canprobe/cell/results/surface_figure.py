@@ -1,0 +1,252 @@
+"""The figure of a surface map: its surface over the true object, where passes cross, and their p-values."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Colormap, Normalize
+from matplotlib.figure import SubFigure
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from canprobe.cell.results.picture import BLUE, FAINT, GREEN, GREY, INK, ORANGE, Part, box, legend, parts, picture
+from canprobe.cell.results.scores import SAME_DIRECTION_RAD
+from canprobe.cell.results.summary import RunResult
+from canprobe.mechanics.touch.blend import REACH_M
+from canprobe.mechanics.touch.consistency import LEVEL, Consistency, check_consistency
+from canprobe.mechanics.touch.linear_algebra import tangent_rotation
+from canprobe.mechanics.touch.shapes import PlacedShape
+from canprobe.mechanics.touch.surface_map import SurfaceMap
+
+# What the panels of a surface figure share: the map, its tests, the true object, the plane of the scan.
+
+Array = NDArray[np.float64]
+MARGIN_M, GRID = 5e-3, 34
+"""How far a true surface is drawn beyond a path, and its points a side."""
+LONG = 64
+"""Points of a map's surface along its longer side."""
+
+
+class MapView(NamedTuple):
+    """A map, its tests, and the plane in which both are seen; `shape` is the true object or None."""
+
+    map: SurfaceMap
+    consistency: Consistency
+    shape: PlacedShape | None
+    plane: Plane
+
+
+class Plane(NamedTuple):
+    """The plane of a scan: `axes` (3, 3), rows along, across, outward, and `origin` (3,), the middle of the path, m."""
+
+    axes: Array
+    origin: Array
+
+    @classmethod
+    def of(cls, path: Array, normals: Array) -> Plane:
+        """Of points of a path (n, 3), m, and outward normals (m, 3) along it."""
+        middle = 0.5 * (path.min(axis=0) + path.max(axis=0))
+        outward = normals.mean(axis=0)
+        R = tangent_rotation(outward / np.linalg.norm(outward))
+        flat = (path - middle) @ R[:, :2]
+        _, _, main = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)
+        along = R[:, :2] @ main[0]
+        return cls(np.array([along, np.cross(R[:, 2], along), R[:, 2]]), middle)
+
+    def mm(self, points: Array) -> Array:
+        """Points (..., 3) of base, m, as mm along, across, outward."""
+        result: Array = (points - self.origin) @ self.axes.T * 1e3
+        return result
+
+    def base(self, mm: Array) -> Array:
+        """The way back."""
+        result: Array = 1e-3 * mm @ self.axes + self.origin
+        return result
+
+
+def rejected(consistency: Consistency) -> NDArray[np.bool_]:
+    """(n,) whether the joint test of each crossing rejects one surface."""
+    return np.array([c.joint.p < LEVEL for c in consistency.crossings], dtype=bool)
+
+
+def true_surface(shape: PlacedShape, path: Array, plane: Plane) -> Array:
+    """An object's surface below a path (n, 3): (GRID, GRID, 3) points of base, m."""
+    flat = plane.mm(path)
+    low, high = flat.min(axis=0) - 1e3 * MARGIN_M, flat.max(axis=0) + 1e3 * MARGIN_M
+    us, vs = np.meshgrid(np.linspace(low[0], high[0], GRID), np.linspace(low[1], high[1], GRID))
+    above = plane.base(np.stack((us, vs, np.full_like(us, high[2])), axis=-1))
+    return np.array([shape.closest(point).point for point in above.reshape(-1, 3)]).reshape(GRID, GRID, 3)
+
+
+def map_surface(surface_map: SurfaceMap, plane: Plane) -> tuple[Array, Array]:
+    """The one surface of a map: points (rows, columns, 3) of base, m, and its σ there, m; NaN beyond its patches.
+
+    A grid over the plane of the scan, in a tenth of the time of the triangles that `SurfaceMap.mesh` finds.
+    """
+    contacts = plane.mm(surface_map.points)
+    low, high = contacts.min(axis=0)[:2] - 1e3 * REACH_M, contacts.max(axis=0)[:2] + 1e3 * REACH_M
+    counts = np.ceil(LONG * (high - low) / (high - low).max()).astype(int)
+    us, vs = np.meshgrid(*(np.linspace(*ends) for ends in zip(low, high, counts, strict=True)))
+    nearest = cKDTree(contacts[:, :2]).query(np.stack((us, vs), axis=-1))[1]
+    feet = surface_map.closest(plane.base(np.stack((us, vs, contacts[nearest, 2]), axis=-1)).reshape(-1, 3))
+    return feet.point.reshape(*us.shape, 3), feet.sigma.reshape(us.shape)
+
+
+def add_sheet(axes: Any, corners: Array, colours: Array | str, **style: Any) -> None:
+    """Draw the cells of a grid (rows, columns, 3) that are known at all corners; a colour, or (rows, columns, 4)."""
+    cells = np.stack([corners[:-1, :-1], corners[:-1, 1:], corners[1:, 1:], corners[1:, :-1]], axis=2).reshape(-1, 4, 3)
+    known = np.isfinite(cells).all(axis=(1, 2))
+    faces = colours if isinstance(colours, str) else colours[:-1, :-1].reshape(-1, 4)[known]
+    axes.add_collection3d(
+        Poly3DCollection(cells[known], facecolors=faces, linewidths=0, antialiased=False, **style), autolim=False
+    )
+    axes.auto_scale_xyz(*cells[known].reshape(-1, 3).T)
+
+
+# The surface of the map over the true object.
+
+
+def _draw_map_surface(part: Part, view: MapView) -> None:
+    """The map's one surface, coloured by its distance from the truth or by its own σ, in three dimensions."""
+    part, scale = parts(part, 1, 2, width_ratios=(8, 1))
+    axes = part.add_subplot(projection="3d", computed_zorder=False)
+    plane = view.plane
+    shown = ["surface: recovered, as far as its patches reach", "line: path of the contact"]
+    if view.shape is not None:
+        shown.append("light grey: true surface")
+        near = plane.mm(true_surface(view.shape, view.map.path, plane))
+        axes.plot_surface(*np.moveaxis(near, 2, 0), color=GREY, alpha=0.25, linewidth=0, shade=True, zorder=1)
+    points, sigma = map_surface(view.map, plane)
+    values, what, colours = _values(points, sigma, view.shape)
+    norm = _scale(values, signed=view.shape is not None)
+    add_sheet(axes, plane.mm(points), colours.with_extremes(bad=GREY)(norm(np.ma.masked_invalid(values))), zorder=2)
+    axes.plot(*plane.mm(view.map.path).T, color=INK, linewidth=0.5, alpha=0.55, zorder=3)
+    differ = rejected(view.consistency)
+    if differ.any():
+        shown.append("orange dots: passes differ, p < 0.05")
+        places = np.array([c.T_base_common[:3, 3] for c in view.consistency.crossings])[differ]
+        axes.plot(*plane.mm(places).T, "o", color=ORANGE, markersize=3.5, zorder=4)
+    labels = ("along the scan (mm)", "across (mm)", "outward (mm)")
+    box(part, axes, " · ".join(shown[:3]) + "\n" + " · ".join(shown[3:]), labels, elev=42, azim=-68)
+    scale.colorbar(ScalarMappable(norm, colours), cax=scale.subplots(), label=what)
+
+
+def _values(points: Array, sigma: Array, shape: PlacedShape | None) -> tuple[Array, str, Colormap]:
+    """Values (rows, columns) of a surface, µm, what they are, and their colours."""
+    if shape is None:
+        return 1e6 * sigma, "σ of the surface's height (µm)", colormaps["viridis"]
+    above = np.full(sigma.shape, np.nan)
+    for place in zip(*np.nonzero(np.isfinite(points[:, :, 0])), strict=True):
+        above[place] = shape.nearest(tuple(points[place].tolist())).distance
+    return 1e6 * above, "above the true surface (µm)", colormaps["RdBu_r"]
+
+
+def _scale(values: Array, *, signed: bool) -> Normalize:
+    known = np.abs(values[np.isfinite(values)])
+    most = max(float(np.percentile(known, 98)), 1.0) if len(known) else 1.0
+    return Normalize(-most if signed else 0.0, most)
+
+
+# The figure of a surface map: its surface over the true object, where passes cross, and their p-values.
+
+PARTS = (("curvature", ORANGE), ("normal", BLUE), ("height", GREEN))
+
+
+def draw_surface(result: RunResult, path: Path) -> None:
+    """Draw a run's surface map and write a PNG; nothing where there is none."""
+    if result.surface_map is None or result.consistency is None or not len(result.surface_map):
+        return
+    draw_map(
+        result.surface_map,
+        path,
+        consistency=result.consistency,
+        shape=result.plan.setup.truth.object,
+        title=result.plan.scene.title or result.plan.scene.name,
+    )
+
+
+def draw_map(
+    surface_map: SurfaceMap,
+    path: Path,
+    *,
+    consistency: Consistency | None = None,
+    shape: PlacedShape | None = None,
+    title: str = "",
+) -> None:
+    """Draw a map: its surface over the true object, crossings in the plane of the scan, their p-values.
+
+    Args:
+        surface_map: with at least one patch.
+        path: of the PNG.
+        consistency: the tests at its crossings; None for `check_consistency`, which takes a second.
+        shape: the true object, for the ghost below the surface and for errors; None colours by σ.
+        title: first line.
+    """
+    walked = surface_map.path if len(surface_map.path) else surface_map.points
+    plane = Plane.of(walked, surface_map.normals)
+    view = MapView(surface_map, consistency or check_consistency(surface_map), shape, plane)
+    crossings = len(view.consistency.crossings)
+    told = (
+        f"{title}\n{len(surface_map)} patches over {1e3 * surface_map.travelled[-1]:.0f} mm of path by"
+        f" {surface_map.method or 'an estimator'}, {crossings} crossings"
+    )
+    with picture(path, told, 7.8) as figure:
+        upper, lower = parts(figure, 2, 1, height_ratios=(4, 3))
+        _draw_map_surface(upper, view)
+        left, *right = parts(lower, 1, 2 if crossings else 1)
+        _draw_crossings(left, view)
+        for part in right:
+            _draw_p_values(part, view.consistency)
+
+
+def _draw_crossings(part: SubFigure, view: MapView) -> None:
+    axes = part.subplots()
+    path = view.plane.mm(view.map.path)
+    axes.plot(path[:, 0], path[:, 1], color=FAINT, linewidth=0.9, zorder=1)
+    crossings = view.consistency.crossings
+    if crossings:
+        places = view.plane.mm(np.array([c.T_base_common[:3, 3] for c in crossings]))
+        differ = rejected(view.consistency)
+        same = np.array([not c.angle >= SAME_DIRECTION_RAD for c in crossings])
+        for is_same, marker, where in ((True, "o", "same direction"), (False, "X", "other direction")):
+            for is_bad, colour, what in ((False, BLUE, "agree"), (True, ORANGE, "differ")):
+                chosen = (same == is_same) & (differ == is_bad)
+                if chosen.any():
+                    axes.scatter(
+                        places[chosen, 0], places[chosen, 1], s=26, marker=marker, color=colour, linewidths=0.4,
+                        edgecolors="white", zorder=3 if is_bad else 2, label=f"{where}: {chosen.sum()} {what}",
+                    )  # fmt: skip
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set(
+        title="path and crossings; differ: p < 0.05 in the joint test",
+        xlabel="along the scan (mm)",
+        ylabel="across (mm)",
+    )
+    legend(part)
+
+
+def _draw_p_values(part: SubFigure, consistency: Consistency) -> None:
+    axes = part.subplots()
+    axes.plot([0, 1], [0, 1], color=INK, linewidth=0.9, linestyle=":", label="one surface, exact covariances")
+    for name, colour in PARTS:
+        for style, way, low, high in (
+            ("-", "same direction", 0.0, SAME_DIRECTION_RAD),
+            ("--", "other", SAME_DIRECTION_RAD, math.inf),
+        ):
+            tests = [getattr(c, name) for c in consistency.crossings if low <= c.angle < high]
+            p = np.sort([test.p for test in tests if test.dof])
+            if len(p):
+                share = np.arange(1, len(p) + 1) / len(p)
+                axes.step(
+                    [0.0, *p, 1.0], [0.0, *share, 1.0], where="post", color=colour, linestyle=style,
+                    label=f"{name}, {way}",
+                )  # fmt: skip
+    axes.set(xlim=(0, 1), ylim=(0, 1.02), xlabel="p", ylabel="share of crossings below")
+    axes.set_title("p-values of the tests at the crossings\nbelow the dotted line: errors are smaller than stated")
+    legend(part)

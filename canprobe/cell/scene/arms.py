@@ -1,0 +1,215 @@
+"""From the sections `[arm]` and `[joints.*]` to the arm: chain, joints, drive units, bodies, drives.
+
+The chain is read from a URDF or from Denavit-Hartenberg rows. What a joint's section gives replaces what the URDF says.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+
+from canprobe.cell.scene.geometry import transform
+from canprobe.cell.scene.hardware import ArmSettings, JointSettings
+from canprobe.cell.scene.setup import Homing
+from canprobe.errors import PlanError
+from canprobe.mechanics.robot.chain import Array, Chain, dh_step, from_dh
+from canprobe.mechanics.robot.model import ArmModel, Body, Joint, lopsided_inertia, negative_inertia
+from canprobe.mechanics.robot.urdf import UrdfArm, from_urdf, limit_warning
+
+Bodies = tuple[Body | None, ...] | None
+SLOWEST_RAD_S, SLOWEST_M_S = math.radians(0.01), 1e-5
+"""Speed limits below which a joint of a URDF practically stands: a degree takes it longer than a minute and a half."""
+
+_MM = 1e-3
+_OF_REVOLUTE = {
+    "q_min": ("min_deg", math.radians(1)),
+    "q_max": ("max_deg", math.radians(1)),
+    "qd_max": ("speed_deg_s", math.radians(1)),
+    "rated_torque": ("rated_torque_nm", 1.0),
+    "rotor_inertia": ("rotor_inertia_kg_m2", 1.0),
+    "coulomb": ("coulomb_nm", 1.0),
+    "viscous": ("viscous_nm_s", 1.0),
+}
+_OF_PRISMATIC = {
+    "q_min": ("min_mm", _MM),
+    "q_max": ("max_mm", _MM),
+    "qd_max": ("speed_mm_s", _MM),
+    "rated_torque": ("rated_force_n", 1.0),
+    "rotor_inertia": ("rotor_mass_kg", 1.0),
+    "coulomb": ("coulomb_n", 1.0),
+    "viscous": ("viscous_n_s_m", 1.0),
+}
+"""Field of a `Joint` → key of a section, and what its unit is in SI."""
+_PRISMATIC_DEFAULTS = {"rated_torque": 200.0, "rotor_inertia": 5.0, "coulomb": 20.0, "viscous": 20.0}
+
+
+def arm_model(
+    name: str, arm: ArmSettings, sections: Mapping[str, JointSettings]
+) -> tuple[ArmModel, Bodies, tuple[str, ...]]:
+    """The arm of a cell, the bodies of its links, None where masses are not known, and what its URDF hardly means.
+
+    Args:
+        name: of the cell.
+        arm: its section.
+        sections: those of its joints, from the base.
+
+    Raises:
+        PlanError: the URDF cannot be used, or joints and sections contradict each other.
+    """
+    mount, flange = transform(arm.mount_mm, arm.mount_deg), transform(arm.flange_mm, arm.flange_deg)
+    if arm.urdf is not None:
+        found = from_urdf(arm.urdf, arm.base, arm.tip, name=name)
+        _refuse_other_names(found, sections, arm)
+        chain = _moved(found.chain, mount, flange)
+        joints = [_joint(section, joint) for section, joint in zip(sections.values(), found.joints, strict=True)]
+        _refuse_standstill(arm.urdf, found.joints, sections)
+        bodies: Bodies = found.bodies if any(found.bodies) else None
+        settled = {
+            limit_warning(arm.urdf, joint)
+            for joint, section in zip(found.joints, sections.values(), strict=True)
+            if section.min_deg is not None or section.max_deg is not None
+        }
+        warnings = tuple(warning for warning in found.warnings if warning not in settled)
+    else:
+        rows = [
+            (s.a_mm * _MM, math.radians(s.alpha_deg), s.d_mm * _MM, math.radians(s.theta_deg))
+            for s in sections.values()
+        ]
+        slides = [section.kind == "prismatic" for section in sections.values()]
+        chain = from_dh(
+            rows,
+            arm.convention,
+            name=name,
+            joints=list(sections),
+            prismatic=slides,
+            T_base_mount=mount,
+            T_last_flange=flange,
+        )
+        joints = [_joint(section, _bare(joint, section)) for joint, section in sections.items()]
+        known = all(section.mass_kg is not None for section in sections.values())
+        each = zip(sections.values(), rows, strict=True)
+        _refuse_impossible_inertia(sections)
+        bodies = tuple(_body(section, row, arm) for section, row in each) if known else None
+        warnings = ()
+    model = ArmModel(chain, tuple(joints), _units_per_q(sections), np.array([s.zero_counts for s in sections.values()]))
+    return model, bodies, warnings
+
+
+def _refuse_other_names(found: UrdfArm, sections: Mapping[str, JointSettings], arm: ArmSettings) -> None:
+    names = found.chain.joints
+    if tuple(sections) != names:
+        listed = ", ".join(sections) or "none"
+        raise PlanError(
+            [f"joints: expected the joints of {arm.urdf} in their order ({', '.join(names)}), got {listed}"]
+        )
+    for joint, section in zip(found.joints, sections.values(), strict=True):
+        kind = "prismatic" if joint.prismatic else "revolute"
+        if section.kind != kind:
+            raise PlanError([f'joints.{joint.name}.kind: expected "{kind}" as in {arm.urdf}, got "{section.kind}"'])
+
+
+def _refuse_standstill(urdf: str, joints: Sequence[Joint], sections: Mapping[str, JointSettings]) -> None:
+    """The file's speed limit counts where the section has none; a missing or tiny one was hardly meant."""
+    problems = [
+        f"{urdf}: joint {joint.name}: expected a velocity in its <limit> of at least {slowest:.3g} {unit}/s, got"
+        f" {joint.qd_max:g}; put it right there, or set joints.{joint.name}.speed_{joint.unit}_s"
+        for joint, section in zip(joints, sections.values(), strict=True)
+        for slowest, unit in [(SLOWEST_M_S, "m") if joint.prismatic else (SLOWEST_RAD_S, "rad")]
+        if (section.speed_mm_s if joint.prismatic else section.speed_deg_s) is None and not joint.qd_max >= slowest
+    ]
+    if problems:
+        raise PlanError(problems)
+
+
+def _moved(chain: Chain, mount: Array, flange: Array) -> Chain:
+    fixed = chain.fixed.copy()
+    fixed[0] = mount @ fixed[0]
+    return replace(chain, fixed=fixed, T_last_flange=chain.T_last_flange @ flange)
+
+
+def _bare(name: str, section: JointSettings) -> Joint:
+    prismatic = section.kind == "prismatic"
+    return Joint(name, prismatic, 0.0, 0.0, 0.0, **(_PRISMATIC_DEFAULTS if prismatic else {}))
+
+
+def _joint(section: JointSettings, joint: Joint) -> Joint:
+    keys = _OF_PRISMATIC if joint.prismatic else _OF_REVOLUTE
+    given = {field: (getattr(section, key), unit) for field, (key, unit) in keys.items()}
+    return replace(joint, **{field: value * unit for field, (value, unit) in given.items() if value is not None})
+
+
+def _units_per_q(sections: Mapping[str, JointSettings]) -> Array:
+    """(n, n) drive units per rad or m of each joint."""
+    names = list(sections)
+    turns = np.diag([section.gear for section in sections.values()])
+    for i, section in enumerate(sections.values()):
+        for other, share in (section.coupling or {}).items():
+            turns[i, names.index(other)] = share
+    units = [s.sign * (s.counts_per_turn or s.counts_per_m or 0.0) for s in sections.values()]
+    radians = [1.0 if section.kind == "prismatic" else 2 * math.pi for section in sections.values()]
+    scaled: Array = np.diag(units) @ turns / np.array(radians)
+    return scaled
+
+
+def _tensor(section: JointSettings) -> Array:
+    xx, yy, zz, xy, xz, yz = section.inertia_kg_m2
+    return np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
+
+
+def _refuse_impossible_inertia(sections: Mapping[str, JointSettings]) -> None:
+    """Moments of 0 beside others are not known, as of a link that only turns about one axis: they are not compared."""
+    given = {name: section for name, section in sections.items() if min(section.inertia_kg_m2[:3]) != 0.0}
+    tensors = {name: _tensor(section) for name, section in given.items()}
+    found = {name: negative_inertia(tensor) or lopsided_inertia(tensor) for name, tensor in tensors.items()}
+    problems = [
+        f"joints.{name}.inertia_kg_m2: expected xx, yy, zz, xy, xz, yz that a body can have, got {why}"
+        for name, why in found.items()
+        if why is not None
+    ]
+    if problems:
+        raise PlanError(problems)
+
+
+def _body(section: JointSettings, row: tuple[float, float, float, float], arm: ArmSettings) -> Body:
+    """The link behind a joint, in the frame of the joint; a row gives it in the frame that the row leads to."""
+    T = np.eye(4) if arm.convention == "modified" else dh_step(*row)
+    return Body(section.mass_kg or 0.0, np.array(section.com_mm) * _MM, _tensor(section)).moved(T)
+
+
+def joint_compliance(sections: Mapping[str, JointSettings]) -> Array | None:
+    """(n,) compliance of the joints, rad/(N m) or m/N; None where all are rigid."""
+    stiffness = [s.stiffness_n_m if s.kind == "prismatic" else s.stiffness_nm_rad for s in sections.values()]
+    return np.array([0.0 if k is None else 1.0 / k for k in stiffness]) if any(stiffness) else None
+
+
+def per_joint(sections: Mapping[str, JointSettings], key: Literal["start", "swing"]) -> Array:
+    """(n,) rad or m of a key that is in degrees or in millimetres, as the joint turns or slides."""
+    return np.array(
+        [
+            getattr(s, f"{key}_mm") * _MM if s.kind == "prismatic" else math.radians(getattr(s, f"{key}_deg"))
+            for s in sections.values()
+        ]
+    )
+
+
+def homing_of(section: JointSettings, number: int) -> Homing | None:
+    """How the drive of a joint, by its number from 1, is homed; None where its encoder is absolute."""
+    if section.zero == "absolute":
+        return None
+    slides = section.kind == "prismatic"
+    assert section.homing_method is not None
+    return Homing(
+        section.homing_method,
+        section.homing_order or number,
+        home=(section.home_mm or 0.0) * _MM if slides else math.radians(section.home_deg or 0.0),
+        speed=section.homing_speed_mm_s * _MM if slides else math.radians(section.homing_speed_deg_s),
+        zero_speed=section.homing_zero_speed_mm_s * _MM if slides else math.radians(section.homing_zero_speed_deg_s),
+        acceleration=section.homing_acceleration_mm_s2 * _MM
+        if slides
+        else math.radians(section.homing_acceleration_deg_s2),
+        timeout_s=section.homing_timeout_s,
+    )

@@ -1,0 +1,328 @@
+"""Calibration files of tactile arrays: TOML ↔ `ArrayCalibration`, with units in the names of the keys.
+
+`canprobe calibrate array` writes them; the key `sensor.calibration` names one. As in `canprobe.cell.scene.model`, a
+field says everything about its key.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from canprobe.cell.scene.checks import OneOf, Range
+from canprobe.cell.scene.load import (
+    Reader,
+    find_file,
+    packaged_files,
+    read_toml,
+    toml_value,
+    with_writer,
+    written_by_line,
+)
+from canprobe.mechanics.touch.patch.array_calibration import (
+    ArrayCalibration,
+    CentroidErrors,
+    ForceReference,
+    ImageParameters,
+    Lag,
+    MomentErrors,
+    Residuals,
+    StiffnessSources,
+)
+
+SCHEMA = 1
+Share = Annotated[float, Range(0, 1)]
+Percent = Annotated[float, Range(0, 1000)]
+Stiffness = Annotated[float, Range(1e5, 1e12)]
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """`[calibration]`: what the file is of."""
+
+    schema: Annotated[int, OneOf((SCHEMA,))]
+    """Version of the file's form."""
+    array: str
+    """Which array, or which make."""
+    date: str
+    """Date of the touches."""
+    made_on: str
+    """Cell and objects."""
+    force_reference: ForceReference
+    """What newtons rest on: `scale`, `weights`, `unit` (the stated full scale), or `none`: nominal newtons."""
+    full_scale_kpa: Annotated[float, Range(10, 1000)]
+    """`sensor.full_scale_kpa` of the touches."""
+    force_sigma_percent: Percent | None = None
+    """Standard deviation of the reference. Left out with `none`."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImageKeys:
+    """`[image]`: the parameters of the image model."""
+
+    stiffness_n_m3: Stiffness
+    """K/h of the layer, from the moments of the images."""
+    scale: Annotated[float, Range(0.01, 100)]
+    """Pressure that is shown over the true one."""
+    blur_mm: Annotated[float, Range(0.01, 50)]
+    """Standard deviation of the blur by cover and taxel."""
+    crosstalk: Annotated[float, Range(-0.5, 0.5)]
+    """Share of a signal that spreads over its row, and again over its column."""
+    memory: Annotated[float, Range(-1, 1)]
+    """Share of the pad's memory of earlier places in the moments."""
+
+
+@dataclass(frozen=True, slots=True)
+class MomentKeys:
+    """`[moments]`: errors of second moments, relative."""
+
+    sigma_percent: Percent
+    """Along an axis of the patch: what no averaging removes."""
+    both: Annotated[float, Range(-1, 1)]
+    """Correlation of the errors along the two axes."""
+    shear_percent: Percent
+    """Of the mixed moment."""
+    frame_percent: Percent
+    """From one image to the next."""
+
+
+@dataclass(frozen=True, slots=True)
+class CentroidKeys:
+    """`[centroid]`: errors of the place of a contact: `sigma_um · t^power`, t the level over the peak pressure."""
+
+    sigma_um: Annotated[float, Range(0, 100_000)]
+    """Standard deviation at t = 1."""
+    power: Annotated[float, Range(-10, 10)]
+    """Exponent of t."""
+    correlation_mm: Annotated[float, Range(0, 1000)]
+    """Way over the pad along which a part of the errors is alike."""
+    correlated: Share
+    """Share of the variance that this part has."""
+    latency_ms: Annotated[float, Range(-1000, 1000)]
+    """By which images are older than their time stamps."""
+    latency_sigma_ms: Annotated[float, Range(0, 1e6)]
+    """Standard deviation of `latency_ms`."""
+    lag_um: Annotated[float, Range(0, 100_000)]
+    """By which the centroid trails the contact at most."""
+    lag_way_um: Annotated[float, Range(0, 1e9, open_low=True)]
+    """Way at which it trails by half of that."""
+
+
+@dataclass(frozen=True, slots=True)
+class StiffnessKeys:
+    """`[stiffness]`: K/h of the layer from both sources. Their difference is the compliance of the arm."""
+
+    moments_sigma_percent: Percent
+    """Standard deviation of `image.stiffness_n_m3`."""
+    depth_n_m3: Stiffness | None = None
+    """From the way of the arm into the object."""
+    depth_sigma_percent: Percent | None = None
+    """Its standard deviation."""
+    arm_compliance_um_n: float | None = None
+    """Compliance of what carries the probe."""
+    arm_compliance_sigma_um_n: float | None = None
+    """Its standard deviation."""
+
+
+@dataclass(frozen=True, slots=True)
+class ResidualKeys:
+    """`[residuals]`: RMS errors of touches that the fit has not seen; of curvatures relative to (K + 1/R)."""
+
+    touches: Annotated[int, Range(0, 1000)]
+    """Touches of plane and ball."""
+    moments_percent: Percent
+    """Of second moments."""
+    curvature_percent: Percent
+    """Of curvatures from one touch."""
+    force_percent: Percent | None = None
+    """Of reference forces."""
+    rod_curvature_percent: Percent | None = None
+    """Of the curvature of the rod, which no fit has used."""
+
+
+@dataclass(frozen=True, slots=True)
+class TaxelKeys:
+    """`[taxels]`: of this one array. A file of a make has no such section."""
+
+    dead: tuple[tuple[int, int], ...] = ()
+    """Row and column of taxels that read nothing."""
+    gains: tuple[tuple[float, ...], ...] = ()
+    """Gain of each taxel over the mean, row by row."""
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationFile:
+    """The sections of a calibration file."""
+
+    calibration: About
+    image: ImageKeys
+    moments: MomentKeys
+    centroid: CentroidKeys
+    stiffness: StiffnessKeys
+    residuals: ResidualKeys
+    taxels: TaxelKeys
+
+
+def load_calibration(name_or_path: str | Path) -> ArrayCalibration:
+    """Read a calibration.
+
+    Args:
+        name_or_path: a packaged calibration's name, such as `inch16`, or the path of a TOML file.
+
+    Raises:
+        SceneError: with every problem found.
+    """
+    name = str(name_or_path)
+    packaged = packaged_files("calibrations")
+    path = find_file(name, packaged, "calibration")
+    file = path.name if name in packaged else name
+    document, file = with_writer(read_toml(path, file), file)
+    reader = Reader(path.parent)
+    needed = [field.name for field in dataclasses.fields(CalibrationFile)]
+    found = CalibrationFile(**reader.read(CalibrationFile, document, needed))
+    if not reader.problems:
+        rows = found.taxels.gains
+        if rows and (len({len(row) for row in rows}) > 1 or min(map(min, rows)) <= 0.0):
+            reader.complain("taxels.gains", "expected rows of one length with gains above 0")
+        if (found.calibration.force_reference == "none") != (found.calibration.force_sigma_percent is None):
+            reader.complain("calibration.force_sigma_percent", 'expected with any force_reference but "none"')
+    reader.refuse(file)
+    return _calibration(found)
+
+
+def _calibration(file: CalibrationFile) -> ArrayCalibration:
+    """In SI units."""
+    about, image, moments, centroid = file.calibration, file.image, file.moments, file.centroid
+    variance = (1e-2 * moments.sigma_percent) ** 2
+    k = image.stiffness_n_m3
+    return ArrayCalibration(
+        array=about.array,
+        date=about.date,
+        made_on=about.made_on,
+        force_reference=about.force_reference,
+        force_sigma=_share(about.force_sigma_percent),
+        full_scale=1e3 * about.full_scale_kpa,
+        image=ImageParameters(k, image.scale, 1e-3 * image.blur_mm, image.crosstalk, image.memory),
+        moments=MomentErrors(
+            variance, moments.both * variance, (1e-2 * moments.shear_percent) ** 2, 1e-2 * moments.frame_percent
+        ),
+        centroid=CentroidErrors(
+            1e-6 * centroid.sigma_um,
+            centroid.power,
+            1e-3 * centroid.correlation_mm,
+            centroid.correlated,
+            1e-3 * centroid.latency_ms,
+            1e-3 * centroid.latency_sigma_ms,
+            Lag(1e-6 * centroid.lag_um, 1e-6 * centroid.lag_way_um),
+        ),
+        stiffness=StiffnessSources(
+            k,
+            k * 1e-2 * file.stiffness.moments_sigma_percent,
+            _or_nan(file.stiffness.depth_n_m3),
+            _or_nan(file.stiffness.depth_n_m3) * _share(file.stiffness.depth_sigma_percent),
+            1e-6 * _or_nan(file.stiffness.arm_compliance_um_n),
+            1e-6 * _or_nan(file.stiffness.arm_compliance_sigma_um_n),
+        ),
+        residuals=Residuals(
+            file.residuals.touches,
+            _share(file.residuals.force_percent),
+            1e-2 * file.residuals.moments_percent,
+            1e-2 * file.residuals.curvature_percent,
+            _share(file.residuals.rod_curvature_percent),
+        ),
+        gains=file.taxels.gains,
+        dead=file.taxels.dead,
+    )
+
+
+def _or_nan(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def _share(percent: float | None) -> float:
+    return 1e-2 * _or_nan(percent)
+
+
+def dump_calibration(calibration: ArrayCalibration) -> str:
+    """The calibration as a TOML document; `load_calibration` reads it back, to the digits that it shows."""
+    c = calibration
+    sigma = math.sqrt(c.moments.moment)
+    values = CalibrationFile(
+        About(
+            SCHEMA,
+            c.array,
+            c.date,
+            c.made_on,
+            c.force_reference,
+            _rounded(1e-3 * c.full_scale),
+            None if c.nominal else _rounded(1e2 * c.force_sigma),
+        ),
+        ImageKeys(
+            _rounded(c.image.stiffness),
+            _rounded(c.image.scale),
+            _rounded(1e3 * c.image.blur),
+            _rounded(c.image.crosstalk),
+            _rounded(c.image.memory),
+        ),
+        MomentKeys(
+            _rounded(1e2 * sigma),
+            _rounded(c.moments.both / c.moments.moment),
+            _rounded(1e2 * math.sqrt(c.moments.shear)),
+            _rounded(1e2 * c.moments.frame_sigma),
+        ),
+        CentroidKeys(
+            _rounded(1e6 * c.centroid.scale),
+            _rounded(c.centroid.power),
+            _rounded(1e3 * c.centroid.correlation),
+            _rounded(c.centroid.share),
+            _rounded(1e3 * c.centroid.latency_s),
+            _rounded(min(1e3 * c.centroid.latency_sigma_s, 1e6)),
+            _rounded(1e6 * c.centroid.lag.most),
+            _rounded(1e6 * c.centroid.lag.reach),
+        ),
+        StiffnessKeys(
+            _rounded(1e2 * c.stiffness.moments_sigma / c.stiffness.moments),
+            _known(c.stiffness.depth),
+            _known(1e2 * c.stiffness.depth_sigma / c.stiffness.depth),
+            _known(1e6 * c.stiffness.arm_compliance),
+            _known(1e6 * c.stiffness.arm_compliance_sigma),
+        ),
+        ResidualKeys(
+            c.residuals.touches,
+            _rounded(1e2 * c.residuals.moments),
+            _rounded(1e2 * c.residuals.curvature),
+            _known(1e2 * c.residuals.force),
+            _known(1e2 * c.residuals.rod_curvature),
+        ),
+        TaxelKeys(c.dead, c.gains),
+    )
+    sections = []
+    for section in dataclasses.fields(values):
+        part = getattr(values, section.name)
+        given = {key.name: getattr(part, key.name) for key in dataclasses.fields(part)}
+        lines = [f"{key} = {_value(value)}" for key, value in given.items() if value not in (None, ())]
+        if lines:
+            sections.append("\n".join([f"[{section.name}]", *lines]) + "\n")
+    newtons = "# Forces and stiffness are in nominal newtons: there was no force reference.\n" if c.nominal else ""
+    head = written_by_line()
+    return f"# Made by `canprobe calibrate array`; see docs/calibration.md.\n{newtons}{head}\n" + "\n".join(sections)
+
+
+def _value(value: object) -> str:
+    rows = isinstance(value, tuple) and value and isinstance(value[0], tuple) and len(value) > 4
+    if not rows:
+        return toml_value(value)
+    assert isinstance(value, tuple)
+    return "[\n" + "".join(f"    {toml_value(row)},\n" for row in value) + "]"
+
+
+def _rounded(value: float) -> float:
+    """Five digits: more than any calibration is worth."""
+    return float(f"{value:.5g}")
+
+
+def _known(value: float) -> float | None:
+    return _rounded(value) if math.isfinite(value) else None

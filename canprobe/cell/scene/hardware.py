@@ -1,0 +1,214 @@
+"""The hardware of a cell: the arm, its joints with their drives, and how the emulator may make drives difficult.
+
+These sections stand in cell files (`canprobe.cell.scene.cells`); a scene may change single keys of them. As in
+`canprobe.cell.scene.model`, a field says everything about its key.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from canprobe.cell.scene.checks import DISTINCT, Check, OneOf, Only, Pattern, Range, ScenePath
+
+Auto = Literal["auto"]  # the plan chooses
+JointKind = Literal["revolute", "prismatic"]
+Convention = Literal["standard", "modified"]
+Vec3 = tuple[float, float, float]
+Vec6 = tuple[float, float, float, float, float, float]
+Channel = Annotated[str, Pattern(r"[!-~]+", "without spaces, in ASCII")]  # as it stands in a candump log
+NodeId = Annotated[int, Range(1, 126)]  # 127 is the master
+SerialNumber = Annotated[int, Range(0, 0xFFFFFFFF)]
+
+TURNS = Only("kind", ("revolute",))
+SLIDES = Only("kind", ("prismatic",))
+HOMES = Only("zero", ("homing",))
+METHOD = Check("from -128 to 127, but not 0", lambda value: -128 <= value <= 127 and value != 0)
+
+
+@dataclass(frozen=True, slots=True)
+class CellInfo:
+    """`[cell]`: the name of the cell. A scene file with this section is whole: it takes nothing from another cell."""
+
+    name: Annotated[str, Pattern(r"[A-Za-z0-9][A-Za-z0-9_.-]*", "of letters, digits, '_', '.' and '-'")] = "cell"
+    """Name of the cell."""
+    title: str = ""
+    """One line about the cell, which `canprobe cells` prints."""
+
+
+@dataclass(frozen=True, slots=True)
+class ArmSettings:
+    """`[arm]`: the chain of the arm, and what holds for all its drives.
+
+    The chain is either a URDF with its base and tip link, or the Denavit-Hartenberg rows of the joints.
+    """
+
+    urdf: Annotated[str | None, ScenePath()] = None
+    """URDF file of the arm, relative to the cell file. Left out: the rows in `[joints.*]` count."""
+    base: str | None = None
+    """Link of the URDF that is the base. Left out: its root."""
+    tip: str | None = None
+    """Link of the URDF that is the flange. Left out: the only link without children."""
+    convention: Convention = "standard"
+    """Denavit-Hartenberg convention of the rows."""
+    mount_mm: Vec3 = (0.0, 0.0, 0.0)
+    """Where the chain begins in the base frame."""
+    mount_deg: Vec3 = (0.0, 0.0, 0.0)
+    """Roll, pitch and yaw of the beginning of the chain about the fixed axes x, y and z."""
+    flange_mm: Vec3 = (0.0, 0.0, 0.0)
+    """Position of the flange in the last frame of the chain."""
+    flange_deg: Vec3 = (0.0, 0.0, 0.0)
+    """Roll, pitch and yaw of the flange in the last frame of the chain."""
+    eds: Annotated[str, ScenePath()] = "puma260_joint.eds"
+    """EDS of the drives that name none: a packaged name, or a path relative to the file."""
+    emulated: bool = True
+    """canprobe serves the drives. false: the drives are real."""
+    missed_syncs: Annotated[int, Range(1, 250)] = 5
+    """SYNC periods of silence after which master and drives treat each other as lost."""
+    grouped_rpdo: bool | Auto = False
+    """Put two targets into one RPDO by dummy mapping."""
+    torque: bool = True
+    """Map the motor torque (6077h) into the TPDO of each drive, where the drive has it and the bus has room for it."""
+
+
+@dataclass(frozen=True, slots=True)
+class JointSettings:
+    """`[joints.NAME]`: one joint and its drive. The sections stand in the order of the joints, from the base.
+
+    A revolute joint has its lengths in degrees, a prismatic joint in millimetres. With a URDF, names are those of its
+    joints, and what a section leaves out is taken from the URDF. Positions of the drive are
+    `zero_counts + sign * counts_per_turn * (gear * turns of the joint + coupling)`, or counts_per_m times metres.
+    """
+
+    kind: JointKind = "revolute"
+    """Turns about its axis, or slides along it."""
+    a_mm: float = 0.0
+    """Denavit-Hartenberg row: length a of the link."""
+    alpha_deg: float = 0.0
+    """Denavit-Hartenberg row: twist of the link."""
+    d_mm: float = 0.0
+    """Denavit-Hartenberg row: offset d along the axis; of a prismatic joint, what its position is added to."""
+    theta_deg: float = 0.0
+    """Denavit-Hartenberg row: angle about the axis; of a revolute joint, what its position is added to."""
+    min_deg: Annotated[float | None, Range(-3600, 3600), TURNS] = None
+    """Lowest position."""
+    max_deg: Annotated[float | None, Range(-3600, 3600), TURNS] = None
+    """Highest position."""
+    speed_deg_s: Annotated[float | None, Range(0, 36_000, open_low=True), TURNS] = None
+    """Highest speed."""
+    start_deg: Annotated[float, Range(-3600, 3600), TURNS] = 0.0
+    """Start posture. It selects the branch of the inverse kinematics. An emulated arm starts here in `free`, and
+    above the start point in other tasks."""
+    swing_deg: Annotated[float, Range(0, 360), TURNS] = 5.0
+    """Amplitude of the swing in `free`."""
+    min_mm: Annotated[float | None, Range(-100_000, 100_000), SLIDES] = None
+    """Lowest position."""
+    max_mm: Annotated[float | None, Range(-100_000, 100_000), SLIDES] = None
+    """Highest position."""
+    speed_mm_s: Annotated[float | None, Range(0, 100_000, open_low=True), SLIDES] = None
+    """Highest speed."""
+    start_mm: Annotated[float, Range(-100_000, 100_000), SLIDES] = 0.0
+    """Start posture."""
+    swing_mm: Annotated[float, Range(0, 10_000), SLIDES] = 10.0
+    """Amplitude of the swing in `free`."""
+    node_id: NodeId | None = None
+    """Node id of the drive. Left out: the number of the joint, from 1."""
+    channel: Channel | None = None
+    """Channel of the bus that the drive is on. Left out: `bus.channel`. Node ids differ on all buses together."""
+    eds: Annotated[str | None, ScenePath()] = None
+    """EDS of the drive. Left out: `arm.eds`."""
+    emulated: bool | None = None
+    """canprobe serves the drive. Left out: `arm.emulated`."""
+    serial_number: SerialNumber | None = None
+    """Serial number (1018h:04) that the drive must have. Left out: any."""
+    counts_per_turn: Annotated[float | None, Range(1, 1e9), TURNS] = None
+    """Position units of the drive per turn of its motor."""
+    counts_per_m: Annotated[float | None, Range(1, 1e12), SLIDES] = None
+    """Position units of the drive per metre of its carriage, where `gear` is 1."""
+    gear: Annotated[float, Range(0, 100_000, open_low=True)] = 1.0
+    """Turns of the motor per turn of the joint."""
+    sign: Annotated[int, OneOf((1, -1))] = 1
+    """-1: the drive counts down where the joint moves up."""
+    zero_counts: int = 0
+    """Position of the drive where the joint is at 0."""
+    coupling: Mapping[str, float] | None = None
+    """Turns of this motor per turn of other joints, by their names: a wrist whose motors stand in the forearm."""
+    zero: Literal["absolute", "homing"] = "absolute"
+    """absolute: the drive knows its position after power on. homing: it has to be homed, by `canprobe up --home`."""
+    homing_method: Annotated[int | None, METHOD, Only("zero", ("homing",), required=True)] = None
+    """Homing method (6098h), such as 17 for the negative limit switch, 35 or 37 for where the joint stands."""
+    homing_order: Annotated[int | None, Range(1, 1000), HOMES] = None
+    """Joints of lower numbers are homed first. Left out: the number of the joint, from 1."""
+    home_deg: Annotated[float | None, Range(-3600, 3600), TURNS, HOMES] = None
+    """Position of the joint at its home position. The home offset (607Ch) follows from it."""
+    homing_speed_deg_s: Annotated[float, Range(0, 36_000, open_low=True), TURNS, HOMES] = 5.0
+    """Speed of the search for the switch (6099h:01)."""
+    homing_zero_speed_deg_s: Annotated[float, Range(0, 36_000, open_low=True), TURNS, HOMES] = 1.0
+    """Speed of the search for the edge of the switch or the index pulse (6099h:02)."""
+    homing_acceleration_deg_s2: Annotated[float, Range(0, 360_000, open_low=True), TURNS, HOMES] = 20.0
+    """Acceleration in homing (609Ah)."""
+    home_mm: Annotated[float | None, Range(-100_000, 100_000), SLIDES, HOMES] = None
+    """Position of the joint at its home position. The home offset (607Ch) follows from it."""
+    homing_speed_mm_s: Annotated[float, Range(0, 100_000, open_low=True), SLIDES, HOMES] = 10.0
+    """Speed of the search for the switch (6099h:01)."""
+    homing_zero_speed_mm_s: Annotated[float, Range(0, 100_000, open_low=True), SLIDES, HOMES] = 2.0
+    """Speed of the search for the edge of the switch or the index pulse (6099h:02)."""
+    homing_acceleration_mm_s2: Annotated[float, Range(0, 1e6, open_low=True), SLIDES, HOMES] = 50.0
+    """Acceleration in homing (609Ah)."""
+    homing_timeout_s: Annotated[float, Range(1, 3600), HOMES] = 180.0
+    """Longest time of one homing run."""
+    noise_counts: Annotated[float, Range(0, 10_000)] = 0.0
+    """Standard deviation of the emulated encoder, besides `emulate.noise_counts`."""
+    rated_torque_nm: Annotated[float | None, Range(0, 1e6, open_low=True), TURNS] = None
+    """Continuous torque of the drive at the joint; 6071h and 6077h are thousandths of it. Left out: that of the URDF,
+    or 10."""
+    rotor_inertia_kg_m2: Annotated[float | None, Range(0, 1e6, open_low=True), TURNS] = None
+    """Inertia of the motor at the joint. Left out: 0.05."""
+    coulomb_nm: Annotated[float | None, Range(0, 1e6), TURNS] = None
+    """Coulomb friction at the joint. Left out: that of the URDF, or 0.5."""
+    viscous_nm_s: Annotated[float | None, Range(0, 1e6), TURNS] = None
+    """Viscous friction at the joint. Left out: that of the URDF, or 0.3."""
+    rated_force_n: Annotated[float | None, Range(0, 1e6, open_low=True), SLIDES] = None
+    """Continuous force of the drive. Left out: 200."""
+    rotor_mass_kg: Annotated[float | None, Range(0, 1e6, open_low=True), SLIDES] = None
+    """Inertia of the motor, seen at the carriage. Left out: 5."""
+    coulomb_n: Annotated[float | None, Range(0, 1e6), SLIDES] = None
+    """Coulomb friction. Left out: 20."""
+    viscous_n_s_m: Annotated[float | None, Range(0, 1e6), SLIDES] = None
+    """Viscous friction. Left out: 20."""
+    stiffness_nm_rad: Annotated[float | None, Range(1, 1e9), TURNS] = None
+    """Stiffness of the emulated joint between its motor, which the encoder is on, and its link. Left out: rigid. Of an
+    ideal arm, that of its own cell."""
+    stiffness_n_m: Annotated[float | None, Range(1, 1e12), SLIDES] = None
+    """The same of a prismatic joint."""
+    mass_kg: Annotated[float | None, Range(0, 1e5)] = None
+    """Mass of the link behind the joint. Without the masses of all links an arm of rows cannot be `dynamic`."""
+    com_mm: Vec3 = (0.0, 0.0, 0.0)
+    """Centre of mass of the link, in the frame of its Denavit-Hartenberg row."""
+    inertia_kg_m2: Vec6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    """Inertia of the link about its centre of mass: xx, yy, zz, xy, xz, yz."""
+
+
+@dataclass(frozen=True, slots=True)
+class EmulateSettings:
+    """`[emulate]`: what makes the emulated drives difficult, to rehearse a drive that is."""
+
+    nodes: Annotated[tuple[NodeId, ...], DISTINCT] = ()
+    """Node ids of the drives concerned. Empty: all emulated drives."""
+    refuse: Annotated[tuple[Annotated[str, Pattern(r"[0-9A-Fa-f]{4}h", "such as 60C2h")], ...], DISTINCT] = ()
+    """Objects that refuse every write (SDO abort 06010000h)."""
+    boot_s: Annotated[float, Range(0, 60)] = 0.0
+    """Time from reset to the boot-up message."""
+    sdo_ms: Annotated[float, Range(0, 60_000)] = 0.0
+    """Time to each SDO answer."""
+    fixed_mapping: bool = False
+    """Mappings and COB-IDs of PDOs cannot be changed."""
+    tpdo_delay_us: Annotated[float, Range(0, 1_000_000)] = 0.0
+    """Time from SYNC to the TPDOs."""
+    cob_id_bit30: Literal["free", "keep"] = "free"
+    """keep: a write that changes bit 30 of a COB-ID of a TPDO is refused."""
+    brake_early_ms: Annotated[float, Range(0, 10_000)] = 0.0
+    """Time from the opening of the brakes to torque in the motors: a vertical axis of a dynamic arm falls."""
+    noise_counts: Annotated[float, Range(0, 10_000)] = 0.0
+    """Standard deviation of the encoders."""

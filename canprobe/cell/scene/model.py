@@ -1,0 +1,601 @@
+"""A scene: what one experiment consists of, as frozen dataclasses that mirror the TOML file.
+
+Field names are the TOML keys and carry their unit. A section that is None is absent and left out of the plan. A field
+says everything about its key: type and checks, default, and below it the meaning. `canprobe.cell.scene.load` needs no
+more than that, and `docs/generate.py` makes the reference of all keys from it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+
+from canprobe.cell.scene.checks import DIRECTION, DISTINCT, SYMMETRIC, OneOf, Only, Pattern, Range, ScenePath
+from canprobe.cell.scene.hardware import (
+    ArmSettings,
+    Auto,
+    CellInfo,
+    Channel,
+    EmulateSettings,
+    JointSettings,
+    NodeId,
+    SerialNumber,
+    Vec3,
+)
+from canprobe.fieldbus.protocol.tactile import WINDOWS
+
+TaskKind = Literal["scan", "press", "calibrate", "listen", "free"]
+Strategy = Literal["weave", "straight", "circle"]
+TactileModeName = Literal["window", "image", "features", "auto"]
+CobIds = Literal["default", "by_deadline", "auto"]
+ShapeMethod = Literal["recursive", "ml", "chord", "chen1996"]
+ObjectKind = Literal[
+    "plane",
+    "sphere",
+    "cylinder",
+    "ellipsoid",
+    "saddle",
+    "bowl",
+    "torus",
+    "wave",
+    "fillet",
+    "quadric",
+    "heights",
+    "mesh",
+]
+Fidelity = Literal["ideal", "dynamic"]
+Integrator = Literal["semi-implicit", "rk4", "implicit", "rosenbrock", "exponential", "adaptive"]
+TransmitQueue = Literal["priority", "fifo"]
+BridgeName = Literal["mcap", "foxglove", "ros2", "view"]
+
+Vec2 = tuple[float, float]
+Row4 = tuple[float, float, float, float]
+
+TOUCH_KINDS: tuple[TaskKind, ...] = ("scan", "press", "calibrate")
+"""Tasks that touch an object."""
+TOUCHING = Only("kind", TOUCH_KINDS)
+SCANNING = Only("kind", ("scan",))
+CALIBRATING = Only("kind", ("calibrate",))
+FREE = Only("kind", ("free",))
+DYNAMIC = Only("fidelity", ("dynamic",))
+RAW = Only("kind", ("frames",))
+RAW_NEEDED = Only("kind", ("frames",), required=True)
+IDENTIFIERS = Pattern(r"[0-7]?[0-9A-F]{1,2}h(-[0-7]?[0-9A-F]{1,2}h)?", 'such as "710h" or "710h-71Fh"')
+COMMAND = Pattern(r"[0-7]?[0-9A-F]{1,2}#([0-9A-F]{2}){0,8}", 'such as "201#0700"')
+DEFAULT_ARRAY = "inch16"
+"""Array file of a sensor that names none."""
+TWO_RADII = Only("kind", ("saddle", "ellipsoid"), required=True)
+WAVE = Only("kind", ("wave",), required=True)
+OF_A_FILE = Only("kind", ("heights", "mesh"))
+
+
+@dataclass(frozen=True, slots=True)
+class SceneInfo:
+    """`[scene]`: the name of the scene, its seed, and whether its runs are drawn."""
+
+    name: Annotated[str, Pattern(r"[A-Za-z0-9][A-Za-z0-9_.-]*", "of letters, digits, '_', '.' and '-'")]
+    """Name of the scene. It is part of the name of the results folder."""
+    title: str = ""
+    """One line about the scene, which `canprobe scenes` and `canprobe plan` print."""
+    seed: Annotated[int, Range(0, 2**63 - 1)] = 0
+    """Seed of all random numbers. In lockstep the same seed gives the same `bus.log`."""
+    figures: bool = True
+    """Draw `report.png`, `surface.png` and `report.html` after a run. false saves seconds."""
+
+
+DIRECT = "direct"
+"""The interface that is no bus."""
+
+
+@dataclass(frozen=True, slots=True)
+class BusSettings:
+    """`[bus]`: the bus that connects the nodes."""
+
+    interface: Annotated[str, Pattern(r"[a-z0-9_-]+", "such as lockstep, socketcan, pcan")] = "lockstep"
+    """`lockstep` (in this process, in virtual time), `direct` (the same without a bus: counts and images in the place
+    of frames), `socketcan`, or any other python-can interface."""
+    channel: Channel = "can0"
+    """Channel of the interface. On a lockstep bus it is only a name in the log."""
+    bitrate: Annotated[int, Range(10_000, 1_000_000)] = 1_000_000
+    """Bit rate of the bus."""
+    timed: bool = True
+    """Lockstep: a frame takes its time on the wire, and frames wait for each other. false: no time."""
+    transmit_queue: TransmitQueue = "priority"
+    """Which frame a node sends first: the lowest identifier, or the oldest (`fifo`)."""
+    bit_error_rate: Annotated[float, Range(0, 0.01)] = 0.0
+    """Timed lockstep: share of bits that the wire corrupts."""
+    fd: bool | Auto = False
+    """Send PDOs of up to 64 bytes in CAN FD frames where a device has them. Other frames stay classical."""
+    data_bitrate: Annotated[int, Range(10_000, 8_000_000)] = 5_000_000
+    """Bit rate of the data phase of CAN FD frames."""
+    cob_ids: CobIds = "default"
+    """COB-IDs of the PDOs: the defaults of the cell, or priorities in the order of the deadlines."""
+
+    @property
+    def direct(self) -> bool:
+        """There is no bus."""
+        return self.interface == DIRECT
+
+
+@dataclass(frozen=True, slots=True)
+class CycleSettings:
+    """`[cycle]`: the control cycle."""
+
+    rate_hz: Annotated[float, Range(1, 2000)] = 400.0
+    """Rate of SYNC and of the servo."""
+    realtime: bool = False
+    """On a real interface: request SCHED_FIFO, a processor for the cycle and locked memory."""
+    compute_us: Annotated[float, Range(0, 1_000_000)] = 200.0
+    """Computing time that the plan reserves for the controller in each cycle."""
+
+
+@dataclass(frozen=True, slots=True)
+class SensorSettings:
+    """`[sensor]`: the tactile array.
+
+    A key that neither the scene nor its cell gives has the value of the array file that `array` names.
+    """
+
+    array: Annotated[str, ScenePath()] = DEFAULT_ARRAY
+    """Array file: a packaged name, or a path relative to the file."""
+    rows: Annotated[int, Range(1, 64)] = 16
+    """Rows of taxels."""
+    columns: Annotated[int, Range(1, 64)] = 16
+    """Columns of taxels."""
+    pitch_mm: Annotated[float, Range(0.1, 100)] = 1.5875
+    """Distance of neighbouring taxels. Its square is the area that one taxel stands for."""
+    positions_mm: tuple[Vec3, ...] | None = None
+    """Position of each taxel on the array, row by row; z points out of it. Left out: a grid of `pitch_mm`."""
+    normals: tuple[Vec3, ...] | None = None
+    """Outward normal of each taxel, of any length, with `positions_mm`. Left out: z."""
+    mount: Literal["sphere", "flat"] = "sphere"
+    """sphere: wrapped on the sphere of `[probe]`. flat: a flat array listens and presses; it cannot scan."""
+    node_id: NodeId = 16
+    """Node id of an array with `wire.kind = "canopen"`."""
+    eds: Annotated[str, ScenePath()] = "tactile_array.eds"
+    """EDS of an array with `wire.kind = "canopen"`: a packaged name, or a path relative to the file."""
+    emulated: bool = True
+    """canprobe serves the array. false: the array is real."""
+    channel: Channel | None = None
+    """Channel of a separate bus for the array. Left out: `bus.channel`. "auto": the plan chooses."""
+    mode: TactileModeName = "window"
+    """What the array sends: the taxels round the contact, all taxels, or force, centroid and moments that it
+    computes from them."""
+    window: Annotated[Annotated[int, OneOf(WINDOWS)] | Auto, Only("mode", ("window", "auto"))] = 8
+    """Side of the window that follows the contact, in taxels."""
+    rate_hz: Annotated[float, Range(1, 1000)] = 200.0
+    """Rate of the images. A SYNC triggers each, or what `wire.sampling` names."""
+    full_scale_kpa: Annotated[float, Range(10, 1000)] = 100.0
+    """Pressure at the largest count of a taxel."""
+    serial_number: SerialNumber | None = None
+    """Serial number (1018h:04) that the array must have. Left out: any."""
+    calibration: Annotated[str | None, ScenePath()] = None
+    """Calibration file of the array, by `canprobe calibrate array`: a packaged name, or a path relative to the file.
+    Left out: that of the emulated array; a real array then measures in nominal newtons."""
+
+
+@dataclass(frozen=True, slots=True)
+class WireSettings:
+    """`[wire]`: what the array sends. It stands in the array file.
+
+    `canopen` is a node that maps its images to PDOs. `frames` is a device that knows no CANopen: each image is every
+    frame of `frames` from every identifier of `ids`, once each. The values of an image come in the order of
+    identifiers, frames and letters.
+    """
+
+    kind: Literal["canopen", "frames"] = "canopen"
+    """Kind of device."""
+    ids: Annotated[tuple[Annotated[str, IDENTIFIERS], ...], RAW_NEEDED] = ()
+    """Identifiers of its frames: each a number or a range in hexadecimal, such as "710h-71Fh"."""
+    frames: Annotated[tuple[str, ...], RAW_NEEDED] = ()
+    """Frames of one image from each identifier, two characters a byte: 0-9 and A-F are a tag that must stand there,
+    "." is not read, a small letter is 4 bits of a value, whose values are in the order of the alphabet."""
+    byte_order: Annotated[Literal["big", "little"], RAW] = "big"
+    """Byte order of a value of several bytes."""
+    axes: Annotated[int, Range(1, 3), RAW] = 1
+    """Values of a taxel."""
+    normal_axis: Annotated[int, Range(1, 3), RAW] = 1
+    """Which of them is the normal pressure, from 1."""
+    order: Annotated[Literal["rows", "columns"], RAW] = "rows"
+    """Taxels come row by row, or column by column."""
+    unloaded_counts: Annotated[int, Range(0, 0xFFFFFFFF), RAW] = 0
+    """Value of a taxel without load."""
+    full_scale_counts: Annotated[int, Range(0, 0xFFFFFFFF), RAW] = 255
+    """Value of a taxel at `sensor.full_scale_kpa`: below `unloaded_counts` where values fall with pressure."""
+    tare_images: Annotated[int, Range(0, 10_000), RAW] = 0
+    """Images at the beginning of which the mean is the unloaded value of each taxel. 0: `unloaded_counts` is."""
+    sampling: Annotated[Literal["free", "polled", "sync"], RAW] = "free"
+    """What an image begins with: the time of the device, a poll of the master, or a SYNC."""
+    start: Annotated[tuple[Annotated[str, COMMAND], ...], RAW] = ()
+    """Frames that start the device, as cansend writes them: "201#0700"."""
+    stop: Annotated[tuple[Annotated[str, COMMAND], ...], RAW] = ()
+    """Frames that stop it."""
+    poll: Annotated[tuple[Annotated[str, COMMAND], ...], RAW] = ()
+    """Frames that ask a polled device for one image."""
+    latency_ms: Annotated[float, Range(0, 1000), RAW] = 0.0
+    """From the sample of an image to its first frame on the bus."""
+    latency_sigma_ms: Annotated[float, Range(0, 1000), RAW] = 0.0
+    """Standard deviation of `latency_ms`."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProbeSettings:
+    """`[probe]`: the sphere that carries the array and its elastic layer."""
+
+    radius_mm: Annotated[float, Range(5, 200)] = 40.0
+    """Radius of the sphere."""
+    centre_offset_mm: Annotated[float, Range(0, 300)] = 80.0
+    """Distance of the centre of the sphere from the flange along tool z. `canprobe run calibrate` finds it."""
+    centre_lateral_mm: Vec2 = (0.0, 0.0)
+    """Offset of the centre along tool x and y. `canprobe run calibrate` finds it."""
+    mass_kg: Annotated[float, Range(0, 5)] = 0.3
+    """Mass of the probe; the dynamic arm carries it."""
+    stiffness_n_m3: Annotated[float, Range(1e5, 1e12)] | None = None
+    """Stiffness of the elastic layer: its modulus over its thickness (K/h). Left out: that of the calibration of the
+    array."""
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectSettings:
+    """`[object]`: the true object, for the emulated plant and for scoring. The controller never reads it.
+
+    The origin of the object frame lies on the surface, and its z axis points outward. A cylinder, a wave and a fillet
+    are straight along x. A wave is z = amplitude (cos(2π y/wavelength) − 1). A fillet is an arc between two planes;
+    it turns the normal by the angle. A saddle is z = −x²/(2 radius_x) − y²/(2 radius_y) with radii of opposite sign
+    (positive: convex). An ellipsoid has three positive semi-axes. A torus lies flat; the origin is on its crown, and x
+    points away from its axis. A bowl is the inside of a sphere with the origin at its bottom. A quadric is XᵀSX = 0
+    with S = matrix, in metres, negative inside. Heights are a grid of z over x and y; a mesh is what is
+    seen of it from +z. Both are read from a file and taken as one smooth surface (docs/scenes.md).
+    """
+
+    kind: ObjectKind
+    """Shape of the object."""
+    radius_mm: Annotated[
+        float | None,
+        Range(1, 100_000),
+        Only("kind", ("sphere", "cylinder", "bowl", "torus", "fillet"), required=True),
+    ] = None
+    """Radius; of a torus, the radius of its tube."""
+    radius_x_mm: Annotated[float | None, Range(-100_000, 100_000), TWO_RADII] = None
+    """Radius or semi-axis along x of the object frame."""
+    radius_y_mm: Annotated[float | None, Range(-100_000, 100_000), TWO_RADII] = None
+    """Radius or semi-axis along y of the object frame."""
+    radius_z_mm: Annotated[float | None, Range(1, 100_000), Only("kind", ("ellipsoid",), required=True)] = None
+    """Semi-axis along z of the object frame."""
+    ring_radius_mm: Annotated[float | None, Range(1, 100_000), Only("kind", ("torus",), required=True)] = None
+    """Radius of the circle on which the centre of the tube lies; above `radius_mm`."""
+    amplitude_mm: Annotated[float | None, Range(0, 1000, open_low=True), WAVE] = None
+    """Half of the height from trough to crest."""
+    wavelength_mm: Annotated[float | None, Range(1, 100_000), WAVE] = None
+    """Distance from crest to crest."""
+    angle_deg: Annotated[float | None, Range(1, 179), Only("kind", ("fillet",), required=True)] = None
+    """Angle between the two normals."""
+    matrix: Annotated[tuple[Row4, Row4, Row4, Row4] | None, SYMMETRIC, Only("kind", ("quadric",), required=True)] = None
+    """Matrix S of the quadric XᵀSX = 0, with lengths in metres."""
+    file: Annotated[str | None, ScenePath(), Only("kind", ("heights", "mesh"), required=True)] = None
+    """Heights: a .npy, .npz, .csv or .txt file, a row of which is a line along y. Mesh: an STL, OBJ or PLY file."""
+    unit_mm: Annotated[float, Range(1e-6, 1e6), OF_A_FILE] = 1.0
+    """Unit of the lengths in the file: 1000 for metres, 25.4 for inches."""
+    spacing_mm: Annotated[float | None, Range(1e-3, 1000), OF_A_FILE] = None
+    """Spacing of the grid of heights; left out: the `spacing` in a .npz file, in its unit. Of a mesh: that of the grid
+    that is fitted to it, best twice the length of the mesh's edges; left out: 1 mm."""
+    origin_mm: Annotated[Vec2 | None, OF_A_FILE] = None
+    """Point x, y of the file that is the origin of the object frame; left out: the middle. x and y of heights are
+    counted from the grid's first corner, those of a mesh are its own."""
+    position_mm: Vec3 = (-120.0, -122.5, 374.0)
+    """Origin of the object frame in the base frame: a point of the surface."""
+    rotation_deg: Vec3 = (0.0, 0.0, 0.0)
+    """Roll, pitch and yaw of the object about the fixed axes x, y and z."""
+
+
+@dataclass(frozen=True, slots=True)
+class TaskSettings:
+    """`[task]`: what the cell does.
+
+    `scan` approaches, touches and follows a path over the surface. `press` approaches and holds the force. `calibrate`
+    touches a ball of known radius from several sides and finds the centre of the probe on the flange; it expects the
+    top of the ball at `start_mm`. `listen` only reads the array. `free` swings the joints about their
+    start posture and needs no array.
+    """
+
+    kind: TaskKind
+    """Kind of task."""
+    duration_s: Annotated[float, Range(0, 86_400, open_low=True)] = 20.0
+    """Length of the scan, press, listen or free phase."""
+    force_n: Annotated[float, Range(0, 20, open_low=True), TOUCHING] = 2.0
+    """Target of the contact force."""
+    approach_mm_s: Annotated[float, Range(0, 4, open_low=True), TOUCHING] = 4.0
+    """Speed of the approach."""
+    start_mm: Annotated[Vec3, TOUCHING] = (-120.0, -122.5, 374.0)
+    """Expected contact point, in the base frame."""
+    approach_normal: Annotated[Vec3, DIRECTION, TOUCHING] = (0.0, 0.0, 1.0)
+    """Expected outward normal at `start_mm`, of any length. The probe approaches against it."""
+    clearance_mm: Annotated[float, Range(0, 50, open_low=True), TOUCHING] = 3.0
+    """Distance from `start_mm` at which the approach begins."""
+    search_mm: Annotated[float, Range(0, 50, open_low=True), TOUCHING] = 8.0
+    """Distance beyond `start_mm` at which the approach gives up."""
+    strategy: Annotated[Strategy, SCANNING] = "weave"
+    """Path of the scan."""
+    speed_mm_s: Annotated[float, Range(0, 200, open_low=True), SCANNING] = 25.0
+    """Speed of the contact over the surface."""
+    heading_deg: Annotated[float, Range(-360, 360), SCANNING] = 0.0
+    """Heading of the path in the xy plane of the base frame, from x."""
+    regain_mm: Annotated[float, Range(0, 20), SCANNING] = 2.0
+    """Distance over which a scan searches towards the object for a lost contact. 0: it retreats at once."""
+    length_mm: Annotated[float, Range(0.1, 500), SCANNING] = 36.0
+    """Full length of the path along the heading; diameter of a circle."""
+    width_mm: Annotated[float, Range(0, 500, open_low=True), SCANNING, Only("strategy", ("weave",))] = 9.0
+    """Full width of the path across the heading."""
+    wavelength_mm: Annotated[float, Range(1, 500), SCANNING, Only("strategy", ("weave",))] = 12.0
+    """Length of one weave along the heading."""
+    rolling_share: Annotated[float, Range(0, 1), SCANNING] = 0.05
+    """How the probe turns: 0 follows the normal of the surface, 1 keeps its orientation."""
+    ball_radius_mm: Annotated[float, Range(5, 500), CALIBRATING] = 25.0
+    """Radius of the ball."""
+    ball_sigma_mm: Annotated[float, Range(0, 20, open_low=True), CALIBRATING] = 3.0
+    """Standard deviation of the expected centre of the ball, per axis."""
+    touches: Annotated[int, Range(2, 200), CALIBRATING] = 13
+    """Number of touches."""
+    tilt_deg: Annotated[float, Range(0, 60), CALIBRATING] = 22.0
+    """Angle of the outer touches from the top of the ball."""
+    beside_deg: Annotated[float, Range(0, 15), CALIBRATING] = 9.0
+    """Angle of each touch from the pole of the probe."""
+    swing_period_s: Annotated[float, Range(0.1, 3600), FREE] = 4.0
+    """Period of the swing."""
+
+
+@dataclass(frozen=True, slots=True)
+class ShapeSettings:
+    """`[shape]`: the surface estimator."""
+
+    method: ShapeMethod = "recursive"
+    """Estimator in the control loop."""
+    memory_mm: Annotated[float, Range(0, 1000, open_low=True)] = 20.0
+    """Length of path on which an estimate rests, at any speed."""
+    also: Annotated[tuple[ShapeMethod, ...], DISTINCT] = ("ml", "chen1996")
+    """Other estimators that compute on the same contacts after the run, for the report."""
+    patch: bool = True
+    """Use the second moments of the tactile images where the path leaves a curvature open."""
+    every_ms: Annotated[float, Range(0, 10_000, open_low=True)] = 40.0
+    """Time between two estimates. Every contact is used."""
+
+
+@dataclass(frozen=True, slots=True)
+class LimitSettings:
+    """`[limits]`: where the cell stops for safety."""
+
+    force_max_n: Annotated[float, Range(0, 50, open_low=True)] = 5.0
+    """Highest measured force."""
+    preload_max_n: Annotated[float, Range(0, 50)] = 0.15
+    """Highest force before the run. The tare of the array would take it for zero."""
+    joint_margin_deg: Annotated[float, Range(0, 45)] = 1.0
+    """Angle that is kept from the stops of revolute joints."""
+    joint_margin_mm: Annotated[float, Range(0, 1000)] = 3.5
+    """Travel that is kept from the stops of prismatic joints."""
+    joint_speed_share: Annotated[float, Range(0.001, 1)] = 1.0
+    """Share of the speed limits of the arm."""
+    late_cycles_max_percent: Annotated[float, Range(0, 100)] = 10.0
+    """Share of the cycles of the last second that may be late by half a period. 100: no limit."""
+    workspace_min_mm: Vec3 | None = None
+    """Lowest coordinates of the tip of the probe in the base frame. Left out: no limit."""
+    workspace_max_mm: Vec3 | None = None
+    """Highest coordinates of the tip of the probe in the base frame. Left out: no limit."""
+
+
+@dataclass(frozen=True, slots=True)
+class BringUpSettings:
+    """`[bring_up]`: the time of each step of bring-up, and what happens when a step takes longer."""
+
+    listen_s: Annotated[float, Range(0, 60)] = 0.25
+    """Time in which bring-up only listens for another master."""
+    boot_up_s: Annotated[float, Range(0, 600, open_low=True)] = 2.0
+    """Longest time from the reset of a node to its boot-up message."""
+    sdo_s: Annotated[float, Range(0, 60, open_low=True)] = 0.5
+    """Longest time to one SDO answer."""
+    start_s: Annotated[float, Range(0, 60, open_low=True)] = 1.0
+    """Longest time from NMT start to the heartbeat that confirms it."""
+    enable_s: Annotated[float, Range(0, 600, open_low=True)] = 2.0
+    """Longest time in which the drives change to their mode, and from the command to enable operation to their
+    confirmation. Brakes and a search for the commutation take longer."""
+    stop_s: Annotated[float, Range(0, 600, open_low=True)] = 0.5
+    """Longest time of a quick stop, and of disabling the drives after it."""
+    emulated_s: Annotated[float, Range(0, 3600, open_low=True)] = 120.0
+    """Longest time in which the process of the emulated nodes starts."""
+    retries: Annotated[int, Range(0, 100)] = 2
+    """How often a reset, request or start without an answer is repeated."""
+    store: bool = False
+    """Store the configuration in the nodes (1010h). The next bring-up finds it by 1020h and does not write it."""
+
+
+@dataclass(frozen=True, slots=True)
+class ServoSettings:
+    """`[servo]`: the gains of the tactile servo."""
+
+    surface_height_hz: Annotated[float, Range(0, 50, open_low=True)] = 8.0
+    """Bandwidth with which the servo corrects the height of its surface."""
+    surface_tilt_hz: Annotated[float, Range(0, 50, open_low=True)] = 6.0
+    """Bandwidth with which the servo corrects the normal of its surface."""
+    drive_lag_ms: Annotated[float, Range(0, 100)] = 6.8
+    """Lag of the drives behind a ramp: 2 ζ/ω for second-order drives."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlantSettings:
+    """`[plant]`: how the emulated arm, contact and array behave.
+
+    With fidelity `ideal` each drive tracks as a second-order system, whatever pushes against it. `dynamic` adds rigid
+    links, friction, the cascade of the drives and the push of the object; it needs the extra `dynamics`.
+    """
+
+    fidelity: Fidelity = "ideal"
+    """Model of the arm."""
+    true_cell: Annotated[str | None, ScenePath()] = None
+    """Cell whose chain the emulated arm has where it differs from the one that the controller uses: a packaged name, or
+    a path relative to the file. Its base is placed so that the start point stays where it is."""
+    integrator: Annotated[Integrator, DYNAMIC] = "rosenbrock"
+    """Integrator of the equations of motion."""
+    step_us: Annotated[float, Range(10, 2500), DYNAMIC] = 625.0
+    """Step of the integrator."""
+    friction: Annotated[float, Range(0, 2), DYNAMIC] = 0.3
+    """Coefficient of Coulomb friction between probe and object."""
+    integral_ms: Annotated[float, Range(0, 10_000), DYNAMIC] = 20.0
+    """Reset time of the velocity loops. 0: no integral part."""
+    velocity_feed_forward: Annotated[float, Range(0, 1), DYNAMIC] = 0.0
+    """Share of velocity feed-forward in the drives. 1 removes their lag."""
+    torque_limit_permille: Annotated[int, Range(1, 2000), DYNAMIC] = 2000
+    """Torque limit of the drives, relative to their continuous torque."""
+    drive_bandwidth_hz: Annotated[float, Range(1, 1000)] = 30.0
+    """Bandwidth of the drives (−3 dB)."""
+    tool_error_mm: Vec3 = (0.0, 0.0, 0.0)
+    """Error of the centre of the probe: where it is, less where `[probe]` has it, in the flange frame."""
+    stiffness_n_m3: Annotated[float, Range(1e5, 1e12)] | None = None
+    """Stiffness K/h of the emulated layer. Left out: that of `[probe]`, or 1.27e8."""
+    contact_damping_s_m: Annotated[float, Range(0, 100)] = 0.3
+    """Damping of the contact: α of Hunt and Crossley (assumed)."""
+    noise: bool = True
+    """Noise of the taxels."""
+    gain_error: bool = True
+    """Spread of the gains of the taxels."""
+    blur: bool = True
+    """Blur of the pressure by the cover."""
+    hysteresis: bool = True
+    """Hysteresis of the taxels."""
+    creep: bool = True
+    """Creep of the taxels under constant load."""
+    crosstalk: bool = True
+    """Crosstalk between taxels of a row or column."""
+    saturation: bool = True
+    """Saturation of the taxels."""
+    threshold: bool = True
+    """Threshold of the array, below which a taxel reads 0."""
+    adc_bits: Annotated[int, Range(8, 16)] = 8
+    """Resolution of the ADC. Taxels are sent in 8 bits; only the features that the array computes gain."""
+
+
+@dataclass(frozen=True, slots=True)
+class BridgeSettings:
+    """`[bridge]`: other tools that receive the data of this cell, each from a separate process."""
+
+    use: Annotated[tuple[BridgeName, ...], DISTINCT] = ()
+    """Bridges to start."""
+    foxglove_port: Annotated[int, Range(0, 65_535)] = 8765
+    """Port of the Foxglove server. 0: the system chooses."""
+    foxglove_host: Annotated[str, Pattern(r"\S+", "without spaces")] = "127.0.0.1"
+    """Address of the Foxglove server. 0.0.0.0 serves other machines."""
+    ros2_domain: Annotated[int, Range(0, 232)] | None = None
+    """ROS 2 domain; without it that of the environment variable ROS_DOMAIN_ID, or 0."""
+    ros2_loopback: bool = True
+    """Keep the topics on this machine. false: other machines see them, and may send commands if allowed."""
+    view_port: Annotated[int, Range(0, 65_535)] = 8080
+    """Port of the 3-D view; the next free one if it is taken. 0: the system chooses."""
+    view_host: Annotated[str, Pattern(r"\S+", "without spaces")] = "127.0.0.1"
+    """Address of the 3-D view. 0.0.0.0 serves other machines."""
+    ros2_commands: bool = False
+    """Accept start, stop, target force, speed and trajectories of a free arm from ROS 2, within the scene's limits."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """What a cell file may hold: the sections of a scene that describe hardware. Those that are None are absent."""
+
+    cell: CellInfo
+    bus: BusSettings | None = None
+    cycle: CycleSettings | None = None
+    limits: LimitSettings | None = None
+    bring_up: BringUpSettings | None = None
+    arm: ArmSettings | None = None
+    joints: Mapping[str, JointSettings] = field(default_factory=dict)
+    sensor: SensorSettings | None = None
+    wire: WireSettings | None = None
+    probe: ProbeSettings | None = None
+    servo: ServoSettings | None = None
+    plant: PlantSettings | None = None
+    emulate: EmulateSettings | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ArrayInfo:
+    """`[array]`: about an array file."""
+
+    title: str = ""
+    """One line about the array."""
+
+
+@dataclass(frozen=True, slots=True)
+class ArrayFile:
+    """What an array file may hold. Those that are None are absent."""
+
+    array: ArrayInfo
+    sensor: SensorSettings
+    wire: WireSettings | None = None
+    probe: ProbeSettings | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """One experiment. Sections that are None are absent."""
+
+    scene: SceneInfo
+    task: TaskSettings
+    bus: BusSettings = BusSettings()
+    cycle: CycleSettings = CycleSettings()
+    limits: LimitSettings = LimitSettings()
+    bring_up: BringUpSettings = BringUpSettings()
+    cell: CellInfo = CellInfo()  # noqa: RUF009 - frozen
+    arm: ArmSettings | None = None
+    joints: Mapping[str, JointSettings] = field(default_factory=dict)
+    sensor: SensorSettings | None = None
+    wire: WireSettings | None = None
+    probe: ProbeSettings | None = None
+    object: ObjectSettings | None = None
+    shape: ShapeSettings | None = None
+    servo: ServoSettings | None = None
+    plant: PlantSettings | None = None
+    bridge: BridgeSettings | None = None
+    emulate: EmulateSettings | None = None
+
+    @property
+    def name(self) -> str:
+        """The scene's name."""
+        return self.scene.name
+
+    @property
+    def title(self) -> str:
+        """One line about the scene."""
+        return self.scene.title
+
+    @property
+    def seed(self) -> int:
+        """The seed of everything random."""
+        return self.scene.seed
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Channels that the scene names, that of `[bus]` first; not one that is left to the plan."""
+        named = [joint.channel for joint in self.joints.values()]
+        named += [self.sensor.channel] if self.sensor is not None and self.sensor.channel != "auto" else []
+        return tuple(dict.fromkeys((self.bus.channel, *(name for name in named if name is not None))))
+
+    @property
+    def emulated_node_ids(self) -> tuple[int, ...]:
+        """The nodes that the scene wants emulated, ascending."""
+        drives = [node_id for node_id, emulated in self.drives.items() if emulated]
+        sensor = (self.sensor.node_id,) if self.sensor is not None and self.sensor.emulated else ()
+        return tuple(sorted((*drives, *(sensor if self.array_is_node else ()))))
+
+    @property
+    def array_is_node(self) -> bool:
+        """The array is a CANopen node."""
+        return self.sensor is not None and (self.wire is None or self.wire.kind == "canopen")
+
+    @property
+    def drives(self) -> dict[int, bool]:
+        """Node ids of the drives in the order of the joints, and whether each is emulated; empty without an arm."""
+        if self.arm is None:
+            return {}
+        joints = enumerate(self.joints.values(), start=1)
+        return {
+            joint.node_id or number: self.arm.emulated if joint.emulated is None else joint.emulated
+            for number, joint in joints
+        }

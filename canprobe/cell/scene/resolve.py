@@ -1,0 +1,345 @@
+"""Scene → setup: the only place where a scene's millimetres, degrees and defaults become SI."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from canprobe.cell.scene.arms import Bodies, arm_model, homing_of, joint_compliance, per_joint
+from canprobe.cell.scene.calibrations import load_calibration
+from canprobe.cell.scene.geometry import T_flange_probe, expected_ball, scan_axes, true_object
+from canprobe.cell.scene.hardware import EmulateSettings
+from canprobe.cell.scene.load import gathered, read_cell
+from canprobe.cell.scene.model import (
+    BridgeSettings,
+    LimitSettings,
+    PlantSettings,
+    ProbeSettings,
+    Scene,
+    SensorSettings,
+    ServoSettings,
+    ShapeSettings,
+    TaskSettings,
+    WireSettings,
+)
+from canprobe.cell.scene.rules import image_format
+from canprobe.cell.scene.setup import (
+    Approach,
+    Arm,
+    Array,
+    Calibrate,
+    Drive,
+    Dynamics,
+    Free,
+    Listen,
+    Probe,
+    Quirks,
+    RawWire,
+    SafetyLimits,
+    Scan,
+    Setup,
+    Shape,
+    Task,
+    Touch,
+    Truth,
+)
+from canprobe.cell.scene.surface_files import refuse_narrow
+from canprobe.errors import PlanError
+from canprobe.fieldbus.protocol.frames import Frame
+from canprobe.mechanics.robot.inverse import FIXED_POLE, task_rows
+from canprobe.mechanics.robot.model import ArmModel
+from canprobe.mechanics.robot.tool_calibration import ball_approaches
+from canprobe.mechanics.touch.heights import Heights
+from canprobe.mechanics.touch.pad import FLAT_RADIUS_M, Pad
+from canprobe.mechanics.touch.patch.array_calibration import ArrayCalibration
+from canprobe.mechanics.touch.servo import SurfaceGains, make_strategy
+
+MM = 1e-3
+LAYER_N_M3 = 1.27e8
+"""Stiffness of the emulated layer where nothing else is stated."""
+EMULATED_ARRAY = "inch16"
+"""Calibration of the emulated array."""
+SURE = 3.0
+"""Standard deviations of a calibrated latency from which on it is told from none."""
+EFFECTS = ("noise", "gain_error", "blur", "hysteresis", "creep", "crosstalk", "saturation", "threshold")
+
+
+def resolve(scene: Scene) -> Setup:
+    """The setup of a scene.
+
+    Args:
+        scene: as `load_scene` gave it, or changed since.
+
+    Raises:
+        PlanError: the scene describes an object without a surface.
+        SceneError: a file that it names cannot be read.
+    """
+    saved, files = gathered(scene)
+    arm, bodies = _arm(scene)
+    settings = scene.probe or ProbeSettings()
+    array = _array(scene, settings.radius_mm * MM, settings.stiffness_n_m3)
+    flat = array is not None and array.pad.is_flat
+    T, radius = T_flange_probe(settings), settings.radius_mm * MM
+    if flat:  # as a sphere so large that it is one: the point of its pole stays
+        T[:3, 3] += (radius - FLAT_RADIUS_M) * T[:3, 2]
+        radius = FLAT_RADIUS_M
+    stiffness = array.calibration.image.stiffness if array is not None else LAYER_N_M3
+    probe = Probe(T, radius, stiffness, settings.mass_kg)
+    return Setup(
+        scene=scene,
+        saved=saved,
+        files=files,
+        name=scene.name,
+        title=scene.title,
+        seed=scene.seed,
+        figures=scene.scene.figures,
+        bus=scene.bus,
+        rate_hz=scene.cycle.rate_hz,
+        realtime=scene.cycle.realtime,
+        compute_ns=round(scene.cycle.compute_us * 1000),
+        limits=_limits(scene.limits, arm),
+        bring_up=scene.bring_up,
+        bridge=scene.bridge or BridgeSettings(),
+        arm=arm,
+        array=array,
+        probe=probe,
+        kind=scene.task.kind,
+        task=_task(scene, arm, array, probe),
+        truth=_truth(scene, arm, array, bodies, probe),
+    )
+
+
+def _arm(scene: Scene) -> tuple[Arm | None, Bodies]:
+    """The arm, and the bodies of its links."""
+    if scene.arm is None:
+        return None, None
+    settings, joints = scene.arm, scene.joints
+    model, bodies, warnings = arm_model(scene.cell.name, settings, joints)
+    drives = [
+        Drive(
+            node_id=node_id,
+            channel=joint.channel or scene.bus.channel,
+            eds=joint.eds or settings.eds,
+            emulated=emulated,
+            serial=joint.serial_number,
+            zero=homing_of(joint, number),
+            turn_units=joint.counts_per_turn if joint.kind == "revolute" else None,
+            metre_units=joint.counts_per_m if joint.kind == "prismatic" else None,
+            gear=joint.gear,
+            quirks=_quirks(scene.emulate, node_id, joint.noise_counts),
+        )
+        for number, ((node_id, emulated), joint) in enumerate(
+            zip(scene.drives.items(), joints.values(), strict=True), start=1
+        )
+    ]
+    q_start = per_joint(joints, "start")
+    arm = Arm(model, tuple(drives), q_start, settings.missed_syncs, settings.grouped_rpdo, settings.torque, warnings)
+    return arm, bodies
+
+
+def _quirks(settings: EmulateSettings | None, node_id: int, noise: float) -> Quirks | None:
+    """What makes one emulated drive difficult; None where nothing does."""
+    if settings is None or (settings.nodes and node_id not in settings.nodes):
+        settings = EmulateSettings()
+    quirks = Quirks(
+        refuse=tuple(int(index[:4], 16) for index in settings.refuse),
+        boot_ns=round(settings.boot_s * 1e9),
+        sdo_ns=round(settings.sdo_ms * 1e6),
+        fixed_mapping=settings.fixed_mapping,
+        tpdo_delay_ns=round(settings.tpdo_delay_us * 1e3),
+        noise_counts=math.hypot(settings.noise_counts, noise),
+        keep_bit30=settings.cob_id_bit30 == "keep",
+        brake_early_ns=round(settings.brake_early_ms * 1e6),
+    )
+    return None if quirks == Quirks() else quirks
+
+
+def _array(scene: Scene, radius: float, stiffness: float | None) -> Array | None:
+    """The array with its calibration, and the wire of one that is no CANopen node.
+
+    Args:
+        scene: with or without an array.
+        radius: of the sphere that it may be wrapped on, m.
+        stiffness: of the layer, N/m³, in the place of the calibrated one; None: that.
+    """
+    settings = scene.sensor
+    if settings is None:
+        return None
+    calibration = load_calibration(settings.calibration or EMULATED_ARRAY)
+    positions, normals = (
+        np.array(one) if one is not None else None for one in (settings.positions_mm, settings.normals)
+    )
+    pad = Pad(
+        rows=settings.rows,
+        columns=settings.columns,
+        pitch_m=settings.pitch_mm * MM,
+        full_scale_pa=settings.full_scale_kpa * 1e3,
+        mount_radius_m=None if settings.mount == "flat" else radius,
+        positions=positions * MM if positions is not None else None,
+        normals=normals / np.linalg.norm(normals, axis=1, keepdims=True) if normals is not None else None,
+    )
+    return Array(
+        node_id=settings.node_id,
+        channel=settings.channel or scene.bus.channel,
+        eds=settings.eds,
+        emulated=settings.emulated,
+        serial=settings.serial_number,
+        name=settings.array,
+        mode=settings.mode,
+        window=settings.window,
+        rate_hz=settings.rate_hz,
+        pad=pad,
+        calibration=calibration if stiffness is None else calibration.with_stiffness(stiffness),
+        calibrated=settings.calibration is not None or settings.emulated,
+        raw=None if scene.array_is_node or scene.wire is None else _raw_wire(scene.wire, settings, calibration),
+    )
+
+
+def _raw_wire(wire: WireSettings, settings: SensorSettings, calibration: ArrayCalibration) -> RawWire:
+    found = calibration.centroid
+    sure = settings.calibration is not None and abs(found.latency_s) > SURE * found.latency_sigma_s
+    return RawWire(
+        image=image_format(wire, settings.rows, settings.columns),
+        normal=wire.normal_axis - 1,
+        unloaded=wire.unloaded_counts,
+        full_scale=wire.full_scale_counts,
+        tare_images=wire.tare_images,
+        sampling=wire.sampling,
+        start=tuple(map(_frame, wire.start)),
+        stop=tuple(map(_frame, wire.stop)),
+        poll=tuple(map(_frame, wire.poll)),
+        latency_s=wire.latency_ms * 1e-3,
+        latency_sigma_s=wire.latency_sigma_ms * 1e-3,
+        found_s=found.latency_s if sure else 0.0,
+        found_sigma_s=found.latency_sigma_s if sure else 0.0,
+    )
+
+
+def _frame(text: str) -> Frame:
+    """A frame as cansend writes it."""
+    can_id, _, data = text.partition("#")
+    return int(can_id, 16), bytes.fromhex(data)
+
+
+def _limits(settings: LimitSettings, arm: Arm | None) -> SafetyLimits:
+    low, high = settings.workspace_min_mm, settings.workspace_max_mm
+    slides = [] if arm is None else [joint.prismatic for joint in arm.model.joints]
+    bounded = low is not None or high is not None
+    return SafetyLimits(
+        force_max=settings.force_max_n,
+        preload_max=settings.preload_max_n,
+        joint_margin=np.where(slides, settings.joint_margin_mm * MM, math.radians(settings.joint_margin_deg)),
+        speed_share=settings.joint_speed_share,
+        late_share=settings.late_cycles_max_percent / 100,
+        workspace=np.array([low or (-math.inf,) * 3, high or (math.inf,) * 3]) * MM if bounded else None,
+    )
+
+
+def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> Task:
+    """The task's setup; `canprobe.cell.scene.rules` has seen to it that a scene has what its task needs."""
+    settings = scene.task
+    if settings.kind == "free":
+        assert arm is not None
+        return Free(arm, per_joint(scene.joints, "swing"), settings.swing_period_s, settings.duration_s)
+    assert array is not None
+    if settings.kind == "listen":
+        return Listen(array, probe, settings.duration_s)
+    assert arm is not None
+    servo = scene.servo or ServoSettings()
+    touching: dict[str, Any] = {
+        "arm": arm,
+        "array": array,
+        "probe": probe,
+        "approach": Approach(
+            start=np.array(settings.start_mm) * MM,
+            axes=scan_axes(settings),
+            speed=settings.approach_mm_s * MM,
+            clearance=settings.clearance_mm * MM,
+            search=settings.search_mm * MM,
+        ),
+        "force": settings.force_n,
+        "duration_s": settings.duration_s,
+        "lag_s": servo.drive_lag_ms * 1e-3,
+    }
+    if settings.kind == "calibrate":
+        centre, radius = expected_ball(settings)
+        tilt, beside = math.radians(settings.tilt_deg), math.radians(settings.beside_deg)
+        return Calibrate(
+            **touching,
+            ball_centre=centre,
+            ball_radius=radius,
+            ball_sigma=settings.ball_sigma_mm * MM,
+            approaches=ball_approaches(settings.touches, tilt, beside, touching["approach"].normal),
+        )
+    scanning = settings.kind == "scan"
+    return Touch(
+        **touching,
+        gains=SurfaceGains(servo.surface_height_hz, servo.surface_tilt_hz),
+        scan=_scan(settings, arm) if scanning else None,
+        shape=_shape(scene.shape) if scanning and scene.shape is not None else None,
+    )
+
+
+def _scan(settings: TaskSettings, arm: Arm) -> Scan:
+    sizes = (settings.length_mm * MM, settings.width_mm * MM, settings.wavelength_mm * MM)
+    return Scan(
+        strategy=make_strategy(settings.strategy, *sizes),
+        name=settings.strategy,
+        speed=settings.speed_mm_s * MM,
+        rolling_share=1.0 if task_rows(arm.model) == FIXED_POLE else settings.rolling_share,
+        regain=settings.regain_mm * MM,
+    )
+
+
+def _shape(settings: ShapeSettings) -> Shape:
+    return Shape(settings.method, settings.also, settings.memory_mm * MM, settings.every_ms * 1e-3, settings.patch)
+
+
+def _true_arm(scene: Scene, arm: Arm | None, bodies: Bodies) -> tuple[ArmModel | None, Bodies]:
+    """The arm that is emulated, and the bodies of its links."""
+    if arm is None:
+        return None, None
+    other = scene.plant.true_cell if scene.plant is not None else None
+    if other is None:
+        return arm.model, bodies
+    cell = read_cell(other)
+    if cell.arm is None or len(cell.joints) != arm.model.n:
+        raise PlanError([f"plant.true_cell: expected a cell with an arm of {arm.model.n} joints, got {other}"])
+    return arm_model(cell.cell.name, cell.arm, cell.joints)[:2]
+
+
+def _truth(scene: Scene, arm: Arm | None, array: Array | None, bodies: Bodies, probe: Probe) -> Truth:
+    plant = scene.plant or PlantSettings()
+    try:
+        shape = true_object(scene.object) if scene.object is not None else None
+        if scene.object is not None and isinstance(shape, Heights) and array is not None:
+            refuse_narrow(scene.object, shape, array.pad)
+    except ValueError as error:
+        raise PlanError([f"object: {error}"]) from error
+    T_flange_there = probe.T_flange_probe.copy()
+    T_flange_there[:3, 3] += np.array(plant.tool_error_mm) * MM
+    model, bodies = _true_arm(scene, arm, bodies)
+    return Truth(
+        object=shape,
+        model=model,
+        bodies=bodies,
+        compliance=joint_compliance(scene.joints),
+        T_flange_probe=T_flange_there,
+        stiffness=plant.stiffness_n_m3 or (scene.probe.stiffness_n_m3 if scene.probe else None) or LAYER_N_M3,
+        damping=plant.contact_damping_s_m,
+        bandwidth_hz=plant.drive_bandwidth_hz,
+        fidelity=plant.fidelity,
+        dynamics=Dynamics(
+            payload=probe.mass,
+            friction=plant.friction,
+            integral_s=plant.integral_ms * 1e-3,
+            velocity_feed_forward=plant.velocity_feed_forward,
+            torque_limit_permille=plant.torque_limit_permille,
+            integrator=plant.integrator,
+            step_ns=round(plant.step_us * 1000),
+        ),
+        without=tuple(effect for effect in EFFECTS if not getattr(plant, effect)),
+        adc_bits=plant.adc_bits,
+    )

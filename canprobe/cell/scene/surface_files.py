@@ -1,0 +1,219 @@
+"""Objects whose surface is read from a file: a grid of heights, or a mesh."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from functools import lru_cache
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.scene.model import ObjectSettings
+from canprobe.cell.scene.stl_files import stl_damage
+from canprobe.errors import UsageError, install_line, regular_file
+from canprobe.mechanics.touch.heights import Heights
+from canprobe.mechanics.touch.mesh_fit import Fit, fit_mesh
+from canprobe.mechanics.touch.objects import make_object
+from canprobe.mechanics.touch.pad import Pad
+from canprobe.mechanics.touch.shapes import PlacedShape
+
+Array = NDArray[np.float64]
+
+HEIGHTS = (".npy", ".npz", ".csv", ".txt")
+MESHES = (".stl", ".obj", ".ply")
+_MM = 1e-3
+_SPACING_MM = 1.0
+NO_DATA = (-9999.0, -99999.0, -32768.0, -32767.0, 65535.0)
+"""What programs of measuring machines and maps write where they saw nothing; a far outlier only then."""
+_HUGE, _FAR = 1e30, 10.0
+_FLATTEST, _STEEP = 5e-4, 20.0
+"""Rise of a surface by the width of its grid, outside of which one of the two is in another unit."""
+_NARROWEST_MM = 1.0
+_AGAIN = "get the file again, or export it again"
+
+
+def object_of_file(settings: ObjectSettings, T_base_object: Array) -> PlacedShape:
+    """The object whose surface is read from a file.
+
+    Raises:
+        ValueError: the file cannot be read, or holds no surface; with what was expected and found.
+        UsageError: a mesh, and no trimesh is installed.
+    """
+    assert settings.file is not None
+    path = Path(settings.file)
+    if settings.kind == "heights":
+        grid = _heights(settings, path)
+        try:
+            return make_object("heights", T_base_object=T_base_object, **grid)
+        except ValueError as error:
+            raise ValueError(f"file: {path.name}: {error}; correct the file, or origin_mm") from error
+    if path.suffix.lower() not in MESHES:
+        raise ValueError(f"file: expected a mesh in a file of {', '.join(MESHES)}, got {path.name}")
+    try:
+        changed_ns = regular_file(path).stat().st_mtime_ns
+    except OSError as error:
+        raise ValueError(f"file: {path}: cannot be read: {error.strerror}") from error
+    spacing = (settings.spacing_mm or _SPACING_MM) * _MM
+    fit = _mesh(path, changed_ns, settings.unit_mm * _MM, spacing, settings.origin_mm)
+    try:
+        return Heights(T_base_object, fit.heights, fit.spacing, fit.origin, fit.there)
+    except ValueError as error:
+        x, y = (1e3 * fit.spacing * (nodes - 1) for nodes in fit.heights.shape)
+        way_out = "remove vertices far away, or give origin_mm"
+        raise ValueError(f"file: {path.name}: the mesh is {x:.3g} mm by {y:.3g} mm; {error}: {way_out}") from error
+
+
+def refuse_narrow(settings: ObjectSettings, shape: Heights, pad: Pad) -> None:
+    """Raise ValueError for a surface of a file that ends within the pad which is to touch it."""
+    x, y = (1e3 * (far - near) for near, far in zip(shape.spline.corner, shape.spline.far, strict=True))
+    pad_mm = 2e3 * pad.reach_m
+    if settings.file is not None and min(x, y) < pad_mm:
+        raise ValueError(
+            f"file: {Path(settings.file).name}: its surface is {x:.3g} mm by {y:.3g} mm, narrower than the pad of"
+            f" {pad_mm:.3g} mm that touches it; is unit_mm = {settings.unit_mm:g} the unit of the file? If it is, touch"
+            " a wider surface"
+        )
+
+
+@lru_cache(maxsize=4)
+def _mesh(path: Path, changed_ns: int, unit: float, spacing: float, origin_mm: tuple[float, float] | None) -> Fit:
+    """The surface of a mesh; of a file that has not changed it is fitted once."""
+    try:
+        import trimesh
+    except ImportError as error:
+        raise UsageError(f"object.file: a mesh needs trimesh: {install_line('mesh')}") from error
+    _refuse_other_content(path)
+    try:
+        damage = stl_damage(path.read_bytes()) if path.suffix.lower() == ".stl" else None
+    except OSError as error:
+        raise ValueError(f"file: {path}: cannot be read: {error.strerror}") from error
+    if damage is not None:
+        raise ValueError(f"file: {path.name} is a damaged STL: {damage}; {_AGAIN}")
+    logging.getLogger("trimesh").addHandler(logging.NullHandler())  # it logs tracebacks of what it does without
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("error", message="string or file could not be read to its end")  # numpy goes on
+            read = trimesh.load_mesh(path, process=False)
+    except Exception as error:  # each of its readers has its own
+        why = str(error) or type(error).__name__
+        raise ValueError(f"file: {path.name} is no mesh that can be read: {why}; {_AGAIN}") from error
+    if not len(getattr(read, "faces", ())):
+        raise ValueError(f"file: {path.name} holds no facets: export the body as a mesh of triangles")
+    origin = None if origin_mm is None else np.array(origin_mm) * _MM
+    try:
+        return fit_mesh(read.vertices * unit, read.faces, spacing, origin)
+    except ValueError as error:
+        units = f"; is unit_mm = {1e3 * unit:g} the unit of the file?" if "narrower" in str(error) else ""
+        raise ValueError(f"file: {path.name}: {error}{units}") from error
+
+
+def _refuse_other_content(path: Path) -> None:
+    """Name what stands in the place of a file that was not downloaded, or not whole."""
+    try:
+        with regular_file(path).open("rb") as file:
+            start = file.read(200)
+    except OSError:  # which its reader names
+        return
+    if not start.strip():
+        raise ValueError(f"file: {path.name} is empty: {_AGAIN}")
+    if start.startswith(b"version https://git-lfs"):
+        raise ValueError(
+            f"file: {path.name} is a pointer of Git LFS, not the file: type `git lfs pull` where it is from"
+        )
+    if start.lstrip().lower().startswith((b"<!doctype html", b"<html")):
+        raise ValueError(f"file: {path.name} is an HTML page: download the file itself (raw)")
+
+
+def _heights(settings: ObjectSettings, path: Path) -> dict[str, Any]:
+    z, spacing = _grid(path)
+    if settings.spacing_mm is not None:
+        spacing = settings.spacing_mm / settings.unit_mm
+    if spacing is None:
+        raise ValueError("spacing_mm: missing: the file holds heights only; give the spacing of their grid")
+    if z.ndim != 2:
+        raise ValueError(f"file: {path.name}: expected a grid of heights (rows × columns), got shape {z.shape}")
+    if not np.isfinite(z).all():
+        row, column = np.argwhere(~np.isfinite(z))[0].tolist()
+        raise ValueError(
+            f"file: {path.name}: height {z[row, column]} in row {row + 1}, column {column + 1}: fill gaps first"
+        )
+    huge = np.abs(z) > _HUGE
+    gaps = z[np.isin(z, NO_DATA) | huge]
+    if huge.any() or (gaps.size and np.ptp(z) > _FAR * np.ptp(_without(z, gaps[0]))):
+        raise ValueError(
+            f"file: {path.name}: {gaps.size} of {z.size} heights are {gaps[0]:g}: no data; fill gaps first"
+        )
+    _refuse_other_unit(path, z, spacing, settings.unit_mm)
+    unit = settings.unit_mm * _MM
+    middle = 0.5 * spacing * unit * (np.array(z.shape) - 1)
+    origin = np.zeros(2) if settings.origin_mm is None else np.array(settings.origin_mm) * _MM - middle
+    return {"heights": z * unit, "spacing": spacing * unit, "origin": origin}
+
+
+def _without(z: Array, value: float) -> Array:
+    rest: Array = z[z != value]
+    return rest if rest.size else np.zeros(1)
+
+
+def _refuse_other_unit(path: Path, z: Array, spacing: float, unit_mm: float) -> None:
+    """Heights and spacing of one unit give a surface: neither a wall nor, unless it is a plane, a flat."""
+    rise, width = float(np.ptp(z)), spacing * min(z.shape)
+    if unit_mm * width < _NARROWEST_MM or (rise > 0.0 and not _FLATTEST < rise / width < _STEEP):
+        raise ValueError(
+            f"file: {path.name}: its heights rise by {unit_mm * rise:.3g} mm over a grid {unit_mm * width:.3g} mm wide:"
+            f" are heights and spacing in one unit, and is unit_mm = {unit_mm:g} that unit?"
+        )
+
+
+def _grid(path: Path) -> tuple[Array, float | None]:
+    """Heights in the file's unit, and their spacing where the file holds it."""
+    kind = path.suffix.lower()
+    if kind not in HEIGHTS:
+        raise ValueError(f"file: expected heights in a file of {', '.join(HEIGHTS)}, got {path.name}")
+    _refuse_other_content(path)
+    try:
+        content = regular_file(path).read_bytes()
+    except OSError as error:
+        raise ValueError(f"file: {path}: cannot be read: {error.strerror}") from error
+    try:
+        if kind in (".csv", ".txt"):
+            return _of_text(content.decode("utf-8-sig")), None
+        read = np.load(BytesIO(content))
+        if isinstance(read, np.lib.npyio.NpzFile):
+            return _of_archive({name: read[name] for name in read.files})
+        return np.asarray(read, dtype=np.float64), None
+    except UnicodeDecodeError as error:
+        why = f"byte {error.start} is {error.object[error.start]:#04x}, which is no text"
+        raise ValueError(f"file: {path.name} is no grid of numbers: {why}; {_AGAIN}") from error
+    except Exception as error:  # numpy raises what zip, its decompression and the parser of headers raise
+        why = "it is damaged, or holds Python objects" if "pickle" in str(error) else str(error) or type(error).__name__
+        raise ValueError(f"file: {path.name} is no grid of numbers: {why}; {_AGAIN}") from error
+
+
+def _of_text(text: str) -> Array:
+    """The numbers of a text, a row on each line."""
+    rows = [line.partition("#")[0] for line in text.splitlines()]
+    if any(";" in row for row in rows):  # then a comma is a decimal one
+        rows = [row.replace(",", ".").replace(";", " ") for row in rows]
+    grid: list[list[float]] = []
+    for number, row in enumerate(rows, start=1):
+        try:
+            values = [float(word) for word in row.replace(",", " ").split()]
+        except ValueError as error:
+            raise ValueError(f"line {number}: expected numbers, got {str(error).rpartition(': ')[2]}") from error
+        if values and grid and len(values) != len(grid[0]):
+            raise ValueError(f"line {number}: expected {len(grid[0])} numbers as above, got {len(values)}")
+        grid += [values] if values else []
+    return np.array(grid)
+
+
+def _of_archive(arrays: dict[str, Any]) -> tuple[Array, float | None]:
+    heights = arrays.get("heights", next(iter(arrays.values())) if len(arrays) == 1 else None)
+    if heights is None:
+        raise ValueError(f'expected an array "heights", got {", ".join(arrays) or "none"}')
+    spacing = float(arrays["spacing"]) if "spacing" in arrays else None
+    return np.asarray(heights, dtype=np.float64), spacing

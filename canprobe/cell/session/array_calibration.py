@@ -1,0 +1,424 @@
+"""Touch a plane, a ball and a rod with the arm of a cell, and calibrate its array by what it shows of them.
+
+Thirty-nine touches: the plane at 4 places of the pad with 3 forces, three reference loads, two short rolls to and fro
+at two speeds along both axes of the pad; the ball at 9 places with 2 forces; plane and ball once more with the probe
+turned about its pole by half a turn; the rod at two angles, only to verify. Each is a press of `tasks.roll` on a cell
+that is brought up for one object and stopped again. An emulated cell has the objects; at a real one a person is asked
+for them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.planning.make import make_plan
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.planning.motion import reach_problems
+from canprobe.cell.scene.hardware import Vec3
+from canprobe.cell.scene.load import load_scene, packaged_files
+from canprobe.cell.scene.model import ObjectSettings, Scene
+from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.scene.setup import Touch
+from canprobe.cell.session.session import Say, Session, quiet
+from canprobe.cell.session.target import LOCKSTEP, Target
+from canprobe.cell.tasks.from_plan import make_sensing
+from canprobe.cell.tasks.probing import Phase
+from canprobe.cell.tasks.roll import Press, Pressed, RollTask
+from canprobe.errors import PlanError, UsageError
+from canprobe.mechanics.robot.chain import forward
+from canprobe.mechanics.robot.inverse import task_rows
+from canprobe.mechanics.touch.contact import direction_to_pad
+from canprobe.mechanics.touch.patch.array_calibration import ForceReference
+from canprobe.mechanics.touch.patch.calibrate import ArrayFit, calibrate_array
+from canprobe.mechanics.touch.patch.image_fit import Dwell
+
+Floats = NDArray[np.float64]
+Ask = Callable[[str], str]
+"""Asks a person: takes the text, gives the answer."""
+
+PACKAGED_AT: Vec3 = (-120.0, -122.5, 374.0)
+"""The point of a packaged cell, mm."""
+BELOW_M = 5e-3
+"""From the probe in the start posture down to the point that is touched."""
+REST_S = 30.0
+PLANE_FORCES_N, BALL_FORCES_N, LOADS_N = (0.7, 1.5, 3.0), (0.8, 2.0), (1.0, 2.0, 3.0)
+CORNERS_M = tuple((u, v) for u in (-2e-3, 2e-3) for v in (-2e-3, 2e-3))
+GRID_M = tuple((u, v) for u in (-2e-3, 0.0, 2e-3) for v in (-2e-3, 0.0, 2e-3))
+LOAD_S = 9.0
+"""Reference loads rest longer: what creeps has then crept, and a scale has come to rest."""
+STROKE_M, STROKE_HZ, STROKE_S = (0.5e-3, 0.0), (0.5, 1.5), 8.0
+ROD_ANGLES_DEG = (0.0, 45.0)
+EFFECTIVE_REST_S = 0.5
+"""From the moment in which the force is reached to the first image whose force counts."""
+
+
+@dataclass(frozen=True, slots=True)
+class KnownObject:
+    """An object of known size under the probe, touched first at one point.
+
+    Attributes:
+        name: "plane", "ball" or "rod".
+        radius: m; infinite for a plane.
+        angle: of a rod's axis from base x, rad.
+    """
+
+    name: str
+    radius: float
+    angle: float = 0.0
+
+    def asked_for(self, at: Sequence[float]) -> str:
+        """What a person has to do."""
+        where = "({:g}, {:g}, {:g}) mm of the base frame".format(*at)
+        if self.name == "plane":
+            return f"Place the plane level, its surface at {where}."
+        if self.name == "ball":
+            return f"Place the ball of radius {1e3 * self.radius:g} mm with its top at {where}."
+        return (
+            f"Place the rod of radius {1e3 * self.radius:g} mm level with its crown at {where}, its axis"
+            f" {math.degrees(self.angle):g} deg from x of the base frame."
+        )
+
+    def settings(self, at: Vec3) -> ObjectSettings:
+        """The same for an emulated cell."""
+        if self.name == "plane":
+            return ObjectSettings("plane", position_mm=at)
+        kind = "sphere" if self.name == "ball" else "cylinder"
+        turned = (0.0, 0.0, math.degrees(self.angle))
+        return ObjectSettings(kind, radius_mm=1e3 * self.radius, position_mm=at, rotation_deg=turned)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True, slots=True)
+class Visit:
+    """One bring-up of the cell over one object.
+
+    Attributes:
+        known: the object.
+        presses: on it.
+        first: number of the first place.
+        turned: the probe is turned about its pole by half a turn.
+        rest_s: listened to before the first touch.
+        load: each press is a reference load.
+    """
+
+    known: KnownObject
+    presses: tuple[Press, ...]
+    first: int = 0
+    turned: bool = False
+    rest_s: float = 0.0
+    load: bool = False
+
+
+def visits(ball_radius: float, rod_radius: float, *, loads: bool, one_by_one: bool) -> Iterator[Visit]:
+    """All touches, in their order.
+
+    Args:
+        ball_radius, rod_radius: m.
+        loads: reference loads are among them.
+        one_by_one: a person reads each reference load, so that the probe lets go after it.
+    """
+    plane, ball = KnownObject("plane", math.inf), KnownObject("ball", ball_radius)
+    # a light touch after a heavy one reads too much by what the array remembers: forces only grow
+    light, middle, heavy = (
+        [Press(force, at, heading=0.8 * i) for i, at in enumerate(CORNERS_M)] for force in PLANE_FORCES_N
+    )
+    strokes = [Press(2.0, (0.0, 0.0), STROKE_M, heading, STROKE_HZ, STROKE_S) for heading in (0.0, 0.5 * math.pi)]
+    yield Visit(plane, (*light, *middle, *strokes, *heavy), rest_s=REST_S)
+    held = [Press(force, seconds=LOAD_S) for force in LOADS_N] if loads else []
+    for i, some in enumerate([[one] for one in held] if one_by_one else [held] if held else []):
+        yield Visit(plane, tuple(some), first=100 + i, load=True)
+    round_ = [Press(force, at, heading=0.7 * i) for force in BALL_FORCES_N for i, at in enumerate(GRID_M)]
+    yield Visit(ball, tuple(round_))
+    for known, force in ((ball, BALL_FORCES_N[0]), (plane, PLANE_FORCES_N[1])):
+        yield Visit(known, (Press(force, CORNERS_M[0] if known is plane else GRID_M[4]),), first=200, turned=True)
+    for i, angle in enumerate(ROD_ANGLES_DEG):
+        rod = KnownObject("rod", rod_radius, math.radians(angle))
+        yield Visit(rod, (Press(2.0, roll=(1.5e-3, 0.0), heading=math.nan),), first=300 + i)
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What is calibrated, and how.
+
+    Attributes:
+        cell: name or path.
+        target: interface and channels; None: the cell's.
+        at: point that is touched first, mm, base frame; None: the point under the probe in the start posture, or
+            `PACKAGED_AT` of a packaged cell.
+        ball_radius, rod_radius: m.
+        reference: what newtons rest on.
+        sigma: its relative standard deviation.
+        own_gains: the file is of this array; False: of its make.
+        seed: of the emulation.
+    """
+
+    cell: str | Path
+    target: Target | None = None
+    at: Vec3 | None = None
+    ball_radius: float = 0.025
+    rod_radius: float = 0.025
+    reference: ForceReference = "none"
+    sigma: float = 0.01
+    own_gains: bool = True
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibrated:
+    """What a calibration found.
+
+    Attributes:
+        fit: with the calibration.
+        restless: taxels that show counts without load, (row, column).
+        drift_counts: RMS change of the images from the first to the last second without load.
+        notes: what was not done, and why.
+    """
+
+    fit: ArrayFit
+    restless: tuple[tuple[int, int], ...]
+    drift_counts: float
+    notes: tuple[str, ...]
+
+
+def calibrate(
+    request: Request, *, date: str, ask: Ask | None = None, say: Say = quiet, out: Path | None = None
+) -> Calibrated:
+    """Touch everything, and fit.
+
+    Args:
+        request: what and how.
+        date: for the file, ISO 8601.
+        ask: a person at a real cell; None: nobody is asked, which an emulated cell does not need.
+        say: called with each step.
+        out: folder for the recorded buses, one folder a visit; None keeps none.
+
+    Raises:
+        UsageError: the cell cannot do it, or a person is needed and nobody is asked.
+        PlanError: the point is out of reach.
+        SafetyStop, BusError: as of a run.
+    """
+    scene = _scene(request)
+    at = scene.task.start_mm
+    assert scene.sensor is not None and scene.arm is not None
+    emulated = scene.sensor.emulated
+    if not emulated and ask is None:
+        raise UsageError("a real array: somebody has to place the objects; leave --yes out")
+    loads = request.reference in ("scale", "weights")
+    every = list(visits(request.ball_radius, request.rod_radius, loads=loads, one_by_one=not emulated))
+    notes: list[str] = []
+    planned: list[tuple[int, Visit, Plan]] = []
+    for number, visit in enumerate(every, start=1):
+        there = _turned(scene) if visit.turned else scene
+        if there is None:
+            notes.append(f"the {visit.known.name} with the probe turned: the last joint cannot turn by half a turn")
+            continue
+        planned.append((number, visit, _plan(replace(there, object=visit.known.settings(at)), visit)))
+    array = resolve(scene).array  # as it is now: its files may change while it is touched
+    assert array is not None
+    dwells: list[Dwell] = []
+    unloaded: list[NDArray[np.uint8]] = []
+    placed: KnownObject | None = None
+    for number, visit, plan in planned:
+        if ask is not None and not emulated and visit.known != placed:
+            ask(f"{visit.known.asked_for(at)} Then press Enter: ")
+        placed = visit.known
+        touches = f"{len(visit.presses)} touch{'es' * (len(visit.presses) != 1)}"
+        say(f"visit {number} of {len(every)}: {touches} of the {visit.known.name}")
+        folder = None if out is None else out / f"visit-{number:02d}"
+        found, rest = touch_object(plan, visit, folder, say, ask if not emulated else None)
+        dwells += found
+        unloaded += rest
+    who = f"{scene.sensor.eds.rsplit('/', 1)[-1]}, node {array.node_id}"
+    serial = f", serial number {scene.sensor.serial_number}" if scene.sensor.serial_number is not None else ""
+    moved = f"{'emulated ' if scene.arm.emulated else ''}cell {Path(request.cell).stem}"
+    fit = calibrate_array(
+        dwells,
+        pad=array.pad,
+        reference=request.reference,
+        reference_sigma=request.sigma,
+        array=f"{'emulated ' if emulated else ''}{who}{serial}" + (f", seed {request.seed}" if emulated else ""),
+        date=date,
+        made_on=f"{moved}; plane, ball of {1e3 * request.ball_radius:g} mm, rod of {1e3 * request.rod_radius:g} mm",
+        own_gains=request.own_gains,
+    )
+    return Calibrated(fit, *_without_load(unloaded, array.rate_hz), tuple(notes))
+
+
+def _scene(request: Request) -> Scene:
+    """A press on the cell; without a time on the wire where it is emulated in lockstep."""
+    scene = load_scene("press", {"cell": request.cell})
+    if request.target is not None:
+        scene = request.target.applied_to(scene)
+    bus = replace(scene.bus, timed=False) if scene.bus.interface == LOCKSTEP else scene.bus
+    info = replace(scene.scene, name="calibrate-array", seed=request.seed, figures=False)
+    at = request.at or (PACKAGED_AT if str(request.cell) in packaged_files("cells") else _under_probe(scene))
+    task = replace(scene.task, start_mm=at, approach_normal=(0.0, 0.0, 1.0), force_n=max(PLANE_FORCES_N))
+    scene = replace(scene, scene=info, bus=bus, task=task, object=ObjectSettings("plane", position_mm=at))
+    setup = resolve(scene)
+    if setup.array is not None and setup.array.mode == "features":
+        raise UsageError("sensor.mode: a calibration needs images, and this array sends features")
+    if setup.arm is not None and task_rows(setup.arm.model) < 5:
+        raise UsageError(f"{request.cell}: a calibration tilts the probe, and this arm holds its orientation")
+    return scene
+
+
+def _under_probe(scene: Scene) -> Vec3:
+    """The point under the probe in the start posture, mm."""
+    setup = resolve(scene)
+    assert setup.arm is not None
+    centre = (forward(setup.arm.model.chain, setup.arm.q_start) @ setup.probe.T_flange_probe)[:3, 3]
+    x, y, z = (1e3 * (centre - (0.0, 0.0, setup.probe.radius + BELOW_M))).round(1).tolist()
+    return x, y, z
+
+
+def _plan(scene: Scene, visit: Visit) -> Plan:
+    """The plan of a visit, whose touches and rolls the arm reaches.
+
+    Raises:
+        PlanError: it does not; with the option to type.
+    """
+    where = f"{visit.known.name} at ({', '.join(f'{value:g}' for value in scene.task.start_mm)}) mm"
+    try:
+        plan = make_plan(resolve(scene))
+        arm, task = plan.setup.arm, plan.setup.task
+        assert arm is not None and isinstance(task, Touch)
+        x = (forward(arm.model.chain, arm.q_start) @ task.probe.T_flange_probe)[:3, 0]
+        poses = _roll_task(plan, visit).poses(x)
+        if problems := reach_problems(plan.setup, task, [(pose.centre, -pose.pole) for pose in poses]):
+            raise PlanError(problems)
+    except PlanError as error:
+        way = "if the arm does not reach it, give another point with --at X Y Z, or another start posture in the cell"
+        raise PlanError([*(f"{where}: {problem}" for problem in error.problems), way], error.ways_out) from error
+    return plan
+
+
+def _turned(scene: Scene) -> Scene | None:
+    """The scene with the last joint half a turn further; None where it cannot go there."""
+    setup = resolve(scene)
+    assert setup.arm is not None
+    last = setup.arm.model.joints[-1]
+    name, joint = list(scene.joints.items())[-1]
+    for turn in (180.0, -180.0):
+        q = math.radians(joint.start_deg + turn)
+        if not last.prismatic and last.q_min + 0.3 < q < last.q_max - 0.3:
+            joints = {**scene.joints, name: replace(joint, start_deg=joint.start_deg + turn)}
+            return replace(scene, joints=joints)
+    return None
+
+
+def touch_object(
+    plan: Plan, visit: Visit, out: Path | None, say: Say, ask: Ask | None
+) -> tuple[list[Dwell], list[NDArray[np.uint8]]]:
+    """Bring the cell up, touch, stop; the touches, and what the array showed before. `ask` reads reference loads."""
+    task, roll = plan.setup.task, _roll_task(plan, visit)
+    assert isinstance(task, Touch)
+    with Session(plan, out, say) as session:
+        session.run(roll)
+    log, truth = session.cell.log.arrays(), session.truth
+    presses = roll.presses
+    places = list(dict.fromkeys(p.at if not p.hz[1:] else (p.at, p.heading) for p in presses))
+    dwells = []
+    for i, pressed in enumerate(roll.pressed):
+        press = pressed.press
+        force = None
+        if visit.load and "force" in truth:
+            rows = (log["touch"] == i + 1) & (log["phase"] == Phase.SCAN)
+            rows[: int(np.argmax(rows)) + round(EFFECTIVE_REST_S * plan.setup.rate_hz)] = False
+            force = float(truth["force"][: len(rows)][rows].mean())
+        elif visit.load:
+            force = _read(ask, press.force)
+        place = visit.first + places.index(press.at if not press.hz[1:] else (press.at, press.heading))
+        place += 50 * bool(press.hz[1:])
+        dwells.append(as_dwell(pressed, visit, task.approach.start, task.probe.radius, place, force))
+    return dwells, roll.unloaded
+
+
+def _roll_task(plan: Plan, visit: Visit) -> RollTask:
+    task = plan.setup.task
+    assert isinstance(task, Touch)
+    presses = [replace(p, heading=_along_rod(plan, visit.known)) if math.isnan(p.heading) else p for p in visit.presses]
+    radius = math.inf if visit.known.name == "rod" else visit.known.radius
+    return RollTask(plan, task, make_sensing(task), presses, radius, visit.rest_s)
+
+
+def _read(ask: Ask | None, force: float) -> float:
+    """A force (N) that a person reads."""
+    if ask is None:
+        raise UsageError("reference loads: somebody has to read them; leave --yes out")
+    while True:
+        answer = ask(f"Reading of the reference during the load of about {force:g} N, in N: ")
+        try:
+            found = float(answer)
+        except ValueError:
+            continue
+        if 0.05 < found < 50.0:
+            return found
+
+
+def _along_rod(plan: Plan, known: KnownObject) -> float:
+    """Heading on the pad, rad, of a rod's axis."""
+    arm, probe = plan.setup.arm, plan.setup.probe
+    assert arm is not None
+    x, y = (forward(arm.model.chain, arm.q_start) @ probe.T_flange_probe)[:2, 0].tolist()
+    # seen from outside the pad looks down: its v axis is on the other side
+    return math.atan2(y, x) - known.angle
+
+
+def as_dwell(  # noqa: PLR0917
+    pressed: Pressed, visit: Visit, start: Floats, probe_radius: float, place: int, force: float | None
+) -> Dwell:
+    """A touch as the fit takes it: where its contacts should lie by joints and object.
+
+    Args:
+        pressed: what was recorded.
+        visit: of the object, level under the probe.
+        start: its highest point (3,), m.
+        probe_radius: m.
+        place: its number.
+        force: by the reference, N.
+    """
+    known, up = visit.known, np.array([0.0, 0.0, 1.0])
+    axis = np.array([math.cos(known.angle), math.sin(known.angle), 0.0])
+    expected, push, angles = [], [], []
+    for T in pressed.T_base_probe:
+        centre = T[:3, 3]
+        inward, depth = -up, float(up @ (start - centre)) + probe_radius
+        if known.name != "plane":
+            way = start - known.radius * up - centre
+            way = way - axis * float(axis @ way) if known.name == "rod" else way
+            distance = float(np.linalg.norm(way))
+            inward, depth = way / distance, known.radius + probe_radius - distance
+        expected.append(direction_to_pad(T[:3, :3].T @ inward, probe_radius))
+        push.append(depth)
+        across = np.cross(axis, up)
+        angles.append(math.atan2(float(across @ T[:3, 1]), float(across @ T[:3, 0])))
+    k = 0.0 if math.isinf(known.radius) else 1.0 / known.radius
+    return Dwell(
+        name=known.name,
+        kappa=(k, 0.0 if known.name == "rod" else k),
+        angle=angles[0] if known.name == "rod" else 0.0,
+        place=place,
+        t_s=np.array(pressed.t_s),
+        images=pressed.images,
+        windows=[w or (0, 0, 16, 16) for w in pressed.windows],
+        expected=np.array(expected),
+        push=np.array(push),
+        turn=math.pi if visit.turned else 0.0,
+        force=force,
+        to_and_fro=len(pressed.press.hz) > 1,
+    )
+
+
+def _without_load(images: Sequence[NDArray[np.uint8]], rate_hz: float) -> tuple[tuple[tuple[int, int], ...], float]:
+    """Taxels that show counts in more than a tenth of the images without load, and the drift of the mean image."""
+    if not images:
+        return (), 0.0
+    every = np.array(images, dtype=np.float64)
+    restless = tuple((int(i), int(j)) for i, j in np.argwhere((every > 0.0).mean(axis=0) > 0.1))
+    n = min(max(1, round(rate_hz)), len(every))
+    return restless, float(np.sqrt(np.mean((every[-n:].mean(axis=0) - every[:n].mean(axis=0)) ** 2)))

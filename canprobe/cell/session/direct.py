@@ -1,0 +1,232 @@
+"""No bus: a cycle that exchanges counts and images with emulated nodes, in the place of frames.
+
+The nodes are those of a lockstep bus, with their drives, array, plant and PDO parameters, and everything happens in the
+order and at the instants of a lockstep bus whose frames take no time: at a SYNC targets are latched, then positions and
+images are sampled; controlwords that go on change act when the commands are sent. So log and truth are the same to the
+last bit. What is left out is what lies between: packing, frames and their arbitration, SDO, the log of the bus.
+
+What a node sends by itself, its heartbeat and its emergencies, is handed over as it is: the supervision is that of a
+bus.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.emulated.array import TactileApplication
+from canprobe.cell.emulated.world import World
+from canprobe.cell.master.array import TactileReceiver
+from canprobe.cell.master.cycle import Cycle
+from canprobe.cell.master.drives import DriveCommand, DriveGroup
+from canprobe.cell.planning.configuration import NodeSetup, Write, make_setups
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.planning.operation import INTERPOLATION_TIME
+from canprobe.errors import NodeError
+from canprobe.fieldbus.bus.port import Port
+from canprobe.fieldbus.bus.sdo import SECOND_S
+from canprobe.fieldbus.drive.drive import DriveApplication
+from canprobe.fieldbus.node.core import NodeCore
+from canprobe.fieldbus.node.dictionary import Dictionary, SdoAbort, nothing
+from canprobe.fieldbus.node.slave_node import SlaveNode
+from canprobe.fieldbus.node.tpdo import Rpdo
+from canprobe.fieldbus.protocol.frames import SYNC_ID, Frame, NmtCommand, pack_nmt
+from canprobe.fieldbus.protocol.tactile import Features, TactileFrame, TactileHeader, TactileMode
+
+HEARTBEAT_CONSUMER = 0x1016
+Hear = Callable[[int, bytes, int], object]
+"""Called with (can_id, data, t_ns)."""
+
+
+class DirectNodes:
+    """The emulated nodes of a world as their master reaches them without a bus.
+
+    Args:
+        world: all nodes of the plan.
+        plan: their configuration.
+        hear: takes what a node sends by itself.
+        see: takes the array's frames.
+    """
+
+    def __init__(self, world: World, plan: Plan, hear: Hear, see: Callable[[TactileFrame], None]) -> None:
+        self._nodes = world.nodes
+        self._recorder = world.recorder
+        self._setups = {setup.node_id: setup for setup in make_setups(plan)}
+        self._hear = hear
+        self._see = see
+        self._rpdos: dict[int, list[tuple[NodeCore, Rpdo]]] = {}
+        self._drives = plan.setup.arm.node_ids if plan.setup.arm is not None else ()
+        self._stations = [(node.core, node.pdos.exchange, node.node_id in self._drives) for node in world.nodes]
+        self._shape = plan.setup.array.pad.shape if plan.setup.array is not None else (0, 0)
+        self._plan = plan
+
+    def start(self, t_ns: int) -> None:
+        """Power on, configure and start all nodes, so that they are operational at `t_ns`.
+
+        Raises:
+            NodeError: one refuses what its scene requires.
+        """
+        power_on_ns = t_ns - max(node.core.quirks.boot_ns for node in self._nodes)
+        for node in self._nodes:
+            node.start(power_on_ns)
+            node.advance(t_ns)
+            configure(node, self._setups[node.node_id])
+            if isinstance(node.application, TactileApplication):
+                node.application.publish = partial(self._publish, node)
+        for node in self._nodes:
+            self._pass_on(node.receive(*pack_nmt(NmtCommand.START, node.node_id), t_ns), t_ns)
+        by_id = {node.node_id: node for node in self._nodes}
+        for node_id in self._drives:
+            for pdo in self._plan.pdos_of(node_id, "rpdo"):
+                rpdo = by_id[node_id].pdos.rpdo(pdo.cob_id)
+                self._rpdos.setdefault(pdo.cob_id, []).append((by_id[node_id].core, rpdo))
+
+    def advance(self, t_ns: int) -> None:
+        """Let every node do what is due up to and at `t_ns`, in the order of time."""
+        nodes = self._nodes
+        while True:
+            first = min([due for node in nodes if (due := node.next_deadline_ns) is not None], default=t_ns + 1)
+            if first > t_ns:
+                return
+            for node in nodes:
+                if node.next_deadline_ns == first:
+                    self._pass_on(node.advance(first), first)
+
+    def sync(self, t_ns: int, counter: int, take: Callable[[int, tuple[int, ...], int], None]) -> None:
+        """A SYNC: every node latches its targets and samples.
+
+        Args:
+            t_ns: when.
+            counter: of the SYNC; 0 where it has none.
+            take: called with the COB-ID of each TPDO of a drive, its values, and when.
+        """
+        for core, exchange, of_drive in self._stations:
+            core.now_ns = t_ns
+            filled = exchange(t_ns, counter)
+            if of_drive:
+                for cob_id, values in filled:
+                    take(cob_id, values, t_ns)
+            if core.out:
+                frames, core.out = core.out, []
+                self._pass_on(frames, t_ns)
+        if self._recorder is not None:
+            self._recorder.receive(SYNC_ID, bytes((counter,)), t_ns)
+
+    def command(self, commands: Sequence[DriveCommand], t_ns: int) -> None:
+        """RPDOs, whose parts go to one drive each."""
+        for cob_id, _, parts in commands:
+            for (core, rpdo), values in zip(self._rpdos[cob_id], parts, strict=True):
+                core.now_ns = t_ns
+                rpdo.take(values)
+
+    def _pass_on(self, frames: Sequence[Frame], t_ns: int) -> None:
+        for can_id, data in frames:
+            self._hear(can_id, data, t_ns)
+
+    def _publish(self, node: SlaveNode, header: TactileHeader, content: NDArray[np.uint8] | Features) -> None:
+        self._see(tactile_frame(header, content, self._shape, node.core.now_ns))
+
+
+def tactile_frame(
+    header: TactileHeader, content: NDArray[np.uint8] | Features, shape: tuple[int, int], t_ns: int
+) -> TactileFrame:
+    """What arrives of a frame: the taxels that it carries, or the features as they are rounded on the wire.
+
+    Args:
+        header: of the frame.
+        content: of the sensor: the full pad, or features.
+        shape: rows and columns of the pad.
+        t_ns: when.
+    """
+    taxels = np.zeros(shape, np.uint8)
+    window, features = (0, 0, 0, 0), None
+    if isinstance(content, Features):
+        features = Features.unpack(content.pack(), content.peak)
+    else:
+        rows, columns = (header.window, header.window) if header.mode is TactileMode.WINDOW else shape
+        row, col = header.origin_row, header.origin_col
+        window, inside = (row, col, rows, columns), np.s_[row : row + rows, col : col + columns]
+        taxels[inside] = content[inside]
+    taxels.flags.writeable = False
+    return TactileFrame(header, taxels, window, features, t_ns)
+
+
+def configure(node: SlaveNode, setup: NodeSetup) -> None:
+    """Write a node's configuration into its dictionary, as bring-up does by SDO.
+
+    A node does not watch for its master, which is in the same process and cannot fall silent.
+
+    Raises:
+        NodeError: the node refuses a value that is required.
+    """
+    times = [[write for write in setup.writes if write.index == INTERPOLATION_TIME], *setup.otherwise]
+    for write in setup.writes:
+        if write.index == HEARTBEAT_CONSUMER:
+            continue
+        if write.index != INTERPOLATION_TIME:
+            taken = _takes(node.dictionary, write) or write.absence is not None
+        else:
+            taken = write is not times[0][0] or any(all(_takes(node.dictionary, w) for w in time) for time in times)
+        if not taken:
+            raise NodeError(node.node_id, f"({setup.name}) refuses {write.place} = {write.value:#x} ({write.purpose})")
+    if isinstance(node.application, DriveApplication):
+        node.application.parts.parameters.patience_ns = 0
+
+
+def _takes(dictionary: Dictionary, write: Write) -> bool:
+    """Whether a node takes a value, with the bits that are its own as it holds them, or holds it already."""
+    held = dictionary.number(write.index, write.subindex)
+    for value in (write.value, write.value & ~write.own_bits | held & write.own_bits):
+        try:
+            dictionary.write_value(dictionary.find_writable(write.index, write.subindex), value)
+        except SdoAbort:
+            if held == value and write.read_back:
+                return True
+        else:
+            return True
+    return False
+
+
+class DirectCycle(Cycle):
+    """A cycle whose SYNC, TPDOs and RPDOs are calls; for its arguments see `Cycle`.
+
+    Args:
+        world: the emulated nodes; they become operational here.
+    """
+
+    def __init__(
+        self,
+        port: Port,
+        plan: Plan,
+        *,
+        world: World,
+        drives: DriveGroup | None,
+        tactile: TactileReceiver | None,
+        **more: Any,
+    ) -> None:
+        port.clock.sleep_until_ns(port.clock.now_ns() + round(SECOND_S * 1e9))  # as bring-up for second boot-ups
+        super().__init__(port, plan, drives=drives, tactile=tactile, **more)
+        self._clock, self._first_look_ns = port.clock, self._looks_ns[0]
+        self._counter = 0
+        self._take = drives.take if drives is not None else nothing
+        self._nodes = DirectNodes(world, plan, self._watch.push, tactile.put if tactile is not None else nothing)
+        self._nodes.start(self._clock.now_ns())
+
+    def _send_sync(self, counter: int | None) -> None:
+        self.sync_ns = self._clock.now_ns()
+        self._nodes.advance(self.sync_ns)
+        self._counter = counter or 0
+
+    def _collect(self) -> None:
+        self._nodes.sync(self.sync_ns, self._counter, self._take)
+        look_ns = self.sync_ns + self._first_look_ns
+        self._clock.sleep_until_ns(look_ns)
+        self._nodes.advance(look_ns)
+
+    def _send_commands(self) -> None:
+        if self._drives is not None:
+            self._nodes.command(self._drives.commands(), self.sync_ns + self._first_look_ns)

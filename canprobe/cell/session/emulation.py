@@ -1,0 +1,251 @@
+"""Emulated nodes on a real interface: those of a scene, or one from each EDS file."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from itertools import zip_longest
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from canprobe.cell.scene.model import Scene
+from canprobe.cell.session.links import Expected, check_links, data_bitrate
+from canprobe.cell.session.session import Say, quiet, rehearse
+from canprobe.cell.session.target import Target
+from canprobe.errors import NodeError, ResultsError, UsageError
+from canprobe.fieldbus.bus.candump import make_folder, write_npz
+from canprobe.fieldbus.bus.port import MonotonicClock
+from canprobe.fieldbus.protocol.frames import UNCONFIGURED
+
+if TYPE_CHECKING:
+    from canprobe.fieldbus.bus.port import Port
+    from canprobe.fieldbus.bus.virtual.lockstep import Participant
+    from canprobe.fieldbus.node.slave_node import SlaveNode
+
+
+def emulate(
+    scene: Scene,
+    target: Target,
+    *,
+    node_ids: tuple[int, ...],
+    seed: int | None = None,
+    truth_path: Path | None = None,
+    origin_ns: int | None = None,
+    store_folder: Path | None = None,
+    without_id: tuple[int, ...] = (),
+    homed: bool = False,
+    say: Say = quiet,
+) -> None:
+    """Serve emulated nodes on a real interface until interrupted, for any master.
+
+    Args:
+        scene: whose nodes.
+        target: the bus, and what stands for the scene's other channels; a channel that it does not name is the bus.
+        node_ids: which nodes.
+        seed: in the place of the scene's.
+        truth_path: file for the plant's true values, written at the end.
+        origin_ns: time on CLOCK_MONOTONIC that is 0 in that file; by default when the nodes begin to be served.
+        store_folder: folder with a file for each node, where its 1010h and LSS store; None forgets at the end.
+        without_id: which of the nodes start without a node id, for LSS to give them one.
+        homed: drives that have to be homed start with their zeros, and keep them.
+        say: called when the nodes are about to be served.
+
+    Raises:
+        UsageError: the scene does not fit, or a file of `store_folder` is not of its node.
+        InterfaceError: no such interface.
+        NodeError: somebody on the bus has one of the node ids already.
+        ResultsError: `truth_path` or `store_folder` cannot be written; raised before anything is served.
+    """
+    from canprobe.cell.emulated.world import make_world
+    from canprobe.cell.planning.make import make_plan
+    from canprobe.cell.scene.load import load_scene
+    from canprobe.cell.scene.resolve import resolve
+
+    scene = load_scene(scene, {} if seed is None else {"scene.seed": seed})
+    of_scene = replace(target, channel=scene.bus.channel, others={})  # who is on which bus is the scene's
+    plan = make_plan(resolve(of_scene.applied_to(scene)))
+    names = {scene.bus.channel: target.channel, **target.others}
+    placed = {n.node_id: names.get(n.channel, target.channel) for n in plan.nodes if n.node_id in node_ids}
+    array = plan.setup.array
+    raw_at = names.get(array.channel, target.channel) if array is not None and array.raw and array.emulated else None
+    wanted = Expected(target.bitrate, data_bitrate(plan.setup.bus))
+    way_out = "end that node, or name others with --nodes"
+    _make_places(truth_path, store_folder)
+    with contextlib.ExitStack() as stack:
+        ports: dict[str, Port] = {}
+        for channel in dict.fromkeys((*placed.values(), *([raw_at] if raw_at is not None else []))):
+            busy = tuple(i for i, place in placed.items() if place == channel and i not in without_id)
+            one = replace(target, channel=channel)
+            ports[channel] = stack.enter_context(_free_port(one, wanted, busy, way_out=way_out, say=say))
+        rehearse(plan)
+        world = make_world(plan, node_ids, truth=truth_path is not None, without_id=without_id, homed=homed)
+        on: dict[str, list[Participant]] = {channel: [] for channel in ports}
+        for node, channel in zip(world.nodes, placed.values(), strict=True):
+            on[channel].append(node)
+        if world.raw_array is not None and raw_at is not None:
+            on[raw_at].append(world.raw_array)
+        if world.recorder is not None:
+            world.recorder.origin_ns = MonotonicClock().now_ns() if origin_ns is None else origin_ns
+            next(iter(on.values())).append(world.recorder)
+        _keep(world.nodes, store_folder)
+        try:
+            _serve(
+                [(on[channel], port) for channel, port in ports.items()],
+                world.nodes,
+                say=say,
+                in_realtime=plan.setup.realtime,
+                cycles_kept=plan.cycles if truth_path is not None else 0,
+            )
+        finally:
+            if truth_path is not None and world.recorder is not None:
+                write_npz(truth_path, world.recorder.arrays())
+
+
+def emulate_eds(
+    files: Sequence[tuple[str | Path, int]],
+    target: Target,
+    *,
+    store_folder: Path | None = None,
+    serial_numbers: Sequence[int | None] = (),
+    in_realtime: bool = False,
+    say: Say = quiet,
+) -> None:
+    """Serve a node from each EDS file on a real interface until interrupted, for any master.
+
+    Args:
+        files: (name or path of an EDS or DCF file, node id) of each node; 255: it waits for LSS to give it one.
+        target: the bus.
+        store_folder: as for :func:`emulate`.
+        serial_numbers: 1018h:04 of each node; None or left out: as its file has it.
+        in_realtime: SCHED_FIFO, a processor and locked memory, as far as permitted.
+        say: called with the number of warnings of each file, and when the nodes are served.
+
+    Raises:
+        EdsError: a file cannot be served; one line a fault.
+        UsageError: a node id is given twice, two nodes without one are the same device, or a file of `store_folder` is
+            not of its node.
+        InterfaceError: no such interface.
+        NodeError: somebody on the bus has one of the node ids already.
+        ResultsError: `store_folder` cannot be written.
+    """
+    from canprobe.cell.emulated.world import make_eds_node
+    from canprobe.fieldbus.eds.packaged import check_eds
+
+    node_ids = tuple(node_id for _, node_id in files if node_id != UNCONFIGURED)
+    if twice := sorted({node_id for node_id in node_ids if node_ids.count(node_id) > 1}):
+        raise UsageError(f"node id {twice[0]} is given to more than one EDS file")
+    nodes: list[SlaveNode] = []
+    for (name, node_id), serial in zip_longest(files, serial_numbers):
+        reading = check_eds(name, 1 if node_id == UNCONFIGURED else node_id)
+        od = reading.usable()
+        speaks_lss = node_id == UNCONFIGURED or od.device_information.LSS_supported
+        nodes.append(make_eds_node(od, node_id, eds=name if speaks_lss else None, serial=serial))
+        if warnings := len(reading.warnings):
+            check = f"canprobe eds check {name} --node-id {od.node_id}"
+            say(f"{name}: {warnings} warning{'s' * (warnings > 1)}; `{check}` lists them")
+    _check_addresses(nodes)
+    _make_places(None, store_folder)
+    wanted, way_out = Expected(target.bitrate, of_scene=False), "end that node, or give another --node-id"
+    with _free_port(target, wanted, node_ids, way_out=way_out, say=say) as port:
+        for node in nodes:
+            if node.lss is not None:
+                node.lss.bitrate = target.bitrate
+        _keep(nodes, store_folder)
+        _serve([(nodes, port)], nodes, say=say, in_realtime=in_realtime)
+
+
+def _make_places(truth_path: Path | None, store_folder: Path | None) -> None:
+    """Make the folders of the files, so that a place that cannot be written fails at the beginning."""
+    if store_folder is not None:
+        make_folder(store_folder)
+    if truth_path is not None:
+        make_folder(truth_path.parent)
+        if truth_path.is_dir():
+            raise ResultsError(f"{truth_path}: cannot be written: {os.strerror(errno.EISDIR)}")
+
+
+@contextlib.contextmanager
+def _free_port(
+    target: Target, wanted: Expected, node_ids: tuple[int, ...], *, way_out: str, say: Say
+) -> Iterator[Port]:
+    """A port on a bus where nobody has these node ids; it waits for the bus as a device does."""
+    from canprobe.cell.planning.choices import bus_open_to_others
+    from canprobe.fieldbus.bus.port import Reports
+    from canprobe.fieldbus.bus.real.python_can import open_port
+    from canprobe.fieldbus.bus.sdo import PumpedNetwork, answering_nodes
+
+    check_links(target.interface, {target.channel: wanted}, say)
+    for warning in bus_open_to_others(target.interface, target.channel):
+        say(f"warning: {warning}")
+    port = open_port(
+        target.interface,
+        target.channel,
+        target.bitrate,
+        MonotonicClock(),
+        data_bitrate=wanted.data_bitrate,
+        waits=True,
+        reports=Reports(say=say),
+    )
+    try:
+        if busy := answering_nodes(PumpedNetwork(port), node_ids, 0.1):
+            raise NodeError(busy[0], f"is on {target.channel} already; its id is busy: {way_out}")
+        yield port
+    finally:
+        port.close()
+
+
+def _check_addresses(nodes: Sequence[SlaveNode]) -> None:
+    """Nodes without an id differ only by their LSS addresses."""
+    addresses = [node.lss.address for node in nodes if node.lss is not None and node.lss.unconfigured]
+    for address in addresses:
+        if addresses.count(address) > 1:
+            raise UsageError(f"two nodes without an id are the device {address}: give each its --serial")
+
+
+def _serve(
+    buses: Sequence[tuple[Sequence[Participant], Port]],
+    nodes: Sequence[SlaveNode],
+    *,
+    say: Say,
+    in_realtime: bool,
+    cycles_kept: int = 0,
+) -> None:
+    from canprobe.fieldbus.bus.real.processor import DEVICE_PRIORITY, ask_for_processor, realtime, reserve_memory
+    from canprobe.fieldbus.node.serve import serve
+
+    reserve_memory(cycles_kept)
+    for _, port in buses:
+        port.drain()  # what passed meanwhile
+    ask_for_processor()
+    favour = realtime(DEVICE_PRIORITY, say, processor_from_last=1) if in_realtime else contextlib.nullcontext()
+    where = " and ".join(port.channel for _, port in buses)
+    say(f"serving {_named(nodes) or 'the array'} on {where}; Ctrl-C stops them")
+    with favour:
+        serve(buses, lambda: False)
+
+
+def _named(nodes: Sequence[SlaveNode]) -> str:
+    """Nodes by their ids, those without one by their LSS addresses."""
+    ids = sorted(node.node_id for node in nodes if node.node_id != UNCONFIGURED)
+    blank = [str(node.lss.address) for node in nodes if node.lss is not None and node.lss.unconfigured]
+    with_ids = [f"nodes {', '.join(map(str, ids))}"] if ids else []
+    return ", and ".join(with_ids + ([f"without an id {', '.join(blank)}"] if blank else []))
+
+
+def _keep(nodes: Iterable[SlaveNode], folder: Path | None) -> None:
+    """Let each node keep what a master stores by 1010h in its file."""
+    from canprobe.fieldbus.node.serve import keep_in_file
+
+    if folder is not None:
+        for node in nodes:
+            keep_in_file(node, folder / _file_name(node))
+
+
+def _file_name(node: SlaveNode) -> str:
+    """By node id, or by serial number where the node has no id yet."""
+    if node.node_id != UNCONFIGURED:
+        return f"node{node.node_id:03}.json"
+    return f"serial{node.dictionary.number(0x1018, 4):08x}.json"

@@ -1,0 +1,133 @@
+"""Look at a bus without a cell: list its nodes, give ids to those that have none, watch a running cell."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+from canprobe.cell.master.commission import Commissioned, Wanted, scan_nodes, wanted_by
+from canprobe.cell.master.commission import commission as commission_nodes
+from canprobe.cell.master.monitor import CellView, Monitor
+from canprobe.cell.planning.make import make_plan
+from canprobe.cell.scene.model import BringUpSettings, Scene
+from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.session.links import Expected, check_links, expected_of, need_controllers
+from canprobe.cell.session.session import Say, open_ports, quiet
+from canprobe.cell.session.target import Target, need_real_bus
+from canprobe.errors import BusError
+from canprobe.fieldbus.bus.port import MonotonicClock, Port
+
+MONITOR_PERIOD_NS = 100_000_000
+SILENCE_NS = 1_000_000_000
+"""After so long without a frame on a bus the state of its controller is read."""
+
+
+def scan(target: Target, *, timeout_s: float | None = None, say: Say = quiet) -> list[dict[str, Any]]:
+    """List the nodes that answer or send heartbeats on a bus, with the identity that 1018h gives.
+
+    Args:
+        target: the bus.
+        timeout_s: longest time to one SDO answer; that of a bring-up by default.
+        say: called with each warning about the interface's setting.
+
+    Raises:
+        InterfaceError: no such interface, or no node answers and the CAN controller's state is why.
+    """
+    with _open(target, say) as port:
+        nodes = scan_nodes(port, timeout_s or BringUpSettings().sdo_s)
+    if not nodes:
+        need_controllers(target.interface, {target.channel: port})
+    return nodes
+
+
+def commission(
+    target: Target,
+    *,
+    scene: Scene | None = None,
+    assign: Sequence[tuple[tuple[int | None, int | None, int | None, int | None], int]] = (),
+    store: bool = True,
+    timeout_s: float | None = None,
+    say: Say = quiet,
+) -> Commissioned:
+    """Find the nodes that have no id and give them theirs by LSS (CiA 305).
+
+    Args:
+        target: the bus.
+        scene: whose nodes get their ids, as far as EDS files and serial numbers show which device is which.
+        assign: or else ((vendor, product, revision, serial number), node id), None for a number that may be any.
+        store: let the devices keep their ids when their power goes.
+        timeout_s: longest time to one SDO answer; by default that of the scene, or else of a bring-up.
+        say: called with each warning about the interface's setting.
+
+    Raises:
+        UsageError: the scene does not fit.
+        BusError: see `canprobe.cell.master.commission.commission`.
+        InterfaceError: no such interface, or no node answers and the CAN controller's state is why.
+    """
+    wanted = [Wanted(node_id, "--assign", numbers) for numbers, node_id in assign]
+    if scene is not None:
+        on_interface = replace(Target.over(scene), interface=target.interface)
+        wanted = wanted_by(make_plan(resolve(on_interface.applied_to(scene))))
+    answer_s = timeout_s or (BringUpSettings() if scene is None else scene.bring_up).sdo_s
+    with _open(target, say) as port:
+        done = commission_nodes(port, wanted, must=scene is None, store=store, timeout_s=answer_s)
+    if not done.nodes and not done.unconfigured:
+        need_controllers(target.interface, {target.channel: port})
+    return done
+
+
+@contextlib.contextmanager
+def _open(target: Target, say: Say) -> Iterator[Port]:
+    """A port of a bus without a scene; a wrong setting is only a warning."""
+    from canprobe.fieldbus.bus.real.python_can import open_port
+
+    interface, channel = target.interface, target.channel
+    check_links(interface, {channel: Expected(target.bitrate, of_scene=False)}, say, must=False)
+    port = open_port(interface, channel, target.bitrate, MonotonicClock())
+    try:
+        yield port
+    except BusError as error:
+        need_controllers(interface, {channel: port}, error)
+        raise
+    finally:
+        port.close()
+
+
+def monitor(scene: Scene, *, duration_s: float | None = None, say: Say = quiet) -> Iterator[CellView]:
+    """Look at a running cell ten times a second, sending nothing.
+
+    Args:
+        scene: what is on the bus.
+        duration_s: how long; for ever by default.
+        say: called with each warning about the interface's setting.
+
+    Yields:
+        What is known by then; the same object each time.
+
+    Raises:
+        UsageError: the scene does not fit, or its bus is a lockstep bus, which lives inside one run.
+        InterfaceError: no such interface, or it was lost; or a bus is silent and its CAN controller's state is why.
+    """
+    need_real_bus(scene, "monitor")
+    plan, clock, interface = make_plan(resolve(scene)), MonotonicClock(), scene.bus.interface
+    wanted = {name: replace(expected, frames_at_once=0) for name, expected in expected_of(plan).items()}
+    check_links(interface, wanted, say, must=False)
+    with open_ports(plan, clock) as ports:
+        listener = Monitor(plan)
+        start_ns = next_ns = clock.now_ns()
+        duration_ns = None if duration_s is None else duration_s * 1e9
+        patience_ns = SILENCE_NS if duration_ns is None else min(SILENCE_NS, duration_ns)
+        heard_ns = dict.fromkeys(ports, start_ns)
+        while duration_ns is None or next_ns < start_ns + duration_ns:
+            next_ns += MONITOR_PERIOD_NS
+            clock.sleep_until_ns(next_ns)
+            for name, port in ports.items():
+                if frames := port.drain():
+                    listener.push(frames, name)
+                    heard_ns[name] = next_ns
+                elif next_ns - heard_ns[name] >= patience_ns:
+                    need_controllers(interface, {name: port})
+                    heard_ns[name] = next_ns  # the state is asked for once a second at most
+            yield listener.view(clock.now_ns())

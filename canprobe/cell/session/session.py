@@ -1,0 +1,555 @@
+"""A cell with everything round it: buses, recording, emulated nodes, and the way out of all of them.
+
+The composition root: the only place, besides studies and tests, that sees both sides of the bus.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from functools import cached_property, partial
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.master.cell import Cell
+from canprobe.cell.master.controller import Command, Controller, Measurement
+from canprobe.cell.master.cycle import Cycle, Observation, Observer, Observers
+from canprobe.cell.planning.bridges import check_bridges
+from canprobe.cell.planning.make import make_plan
+from canprobe.cell.planning.measured import TrafficMeter
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.planning.traffic import exact_frame_bits
+from canprobe.cell.scene.model import BridgeSettings, Scene
+from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.session.links import check_links, data_bitrate, expected_of, need_controllers
+from canprobe.cell.session.target import LOCKSTEP, VIRTUAL
+from canprobe.cell.tasks.from_plan import make_task
+from canprobe.errors import CanprobeError, UsageError
+from canprobe.fieldbus.bus.candump import CandumpWriter, RecordingPort, make_folder, whole_file, write_npz, writing
+from canprobe.fieldbus.bus.port import (
+    Clock,
+    JoinedPort,
+    MonotonicClock,
+    Port,
+    Reports,
+    TimedFrame,
+    VirtualClock,
+    elapsed_ns,
+    is_bus_error,
+)
+from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, garbage_collection_paused, realtime, reserve_memory
+from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
+from canprobe.fieldbus.protocol.frame_bits import best_case_bits, best_case_fd_bits, exact_bits
+from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE
+
+if TYPE_CHECKING:
+    from canprobe.cell.emulated.world import World
+
+
+# What a session opens: buses in virtual time, the routes between several of them, and what counts their frames.
+
+
+class TrafficCounter:
+    """Counts frames and bits of a bus in real time; bits without stuffing, as `canbusload -i` counts.
+
+    Args:
+        speed_up: data bit rate of CAN FD over the nominal one.
+
+    Attributes:
+        error_frames: bus errors, to be counted by who hears of them.
+    """
+
+    def __init__(self, speed_up: float) -> None:
+        self._by_length = [0] * 65
+        self._speed_up = speed_up
+        self.error_frames = 0
+
+    @property
+    def frames(self) -> int:
+        """Frames so far."""
+        return sum(self._by_length)
+
+    @property
+    def bits(self) -> int:
+        """Bits so far, those of a data phase as bits of the nominal rate."""
+        classic = sum(count * best_case_bits(n) for n, count in enumerate(self._by_length[:9]))
+        long = [(count, best_case_fd_bits(n)) for n, count in enumerate(self._by_length[9:], start=9) if count]
+        return classic + round(sum(count * (bits.nominal + bits.data / self._speed_up) for count, bits in long))
+
+    def write(self, can_id: int, data: bytes, t_ns: int) -> None:
+        """Count one frame."""
+        self._by_length[len(data)] += 1
+
+    def take(self, frames: Sequence[TimedFrame]) -> None:
+        """Count some."""
+        for _, data, _ in frames:
+            self._by_length[len(data)] += 1
+
+
+@contextmanager
+def open_ports(
+    plan: Plan, clock: Clock, reports: Callable[[str], Reports] = lambda _: Reports()
+) -> Iterator[dict[str, Port]]:
+    """The ports of a plan's buses, by channel; closed at the end.
+
+    Args:
+        plan: whose buses.
+        clock: in real time.
+        reports: makes, of a channel, who hears what its port has to report.
+
+    Raises:
+        InterfaceError: one is missing, down, or cannot be opened.
+    """
+    from canprobe.fieldbus.bus.real.python_can import open_port
+
+    bus = plan.scene.bus
+    with ExitStack() as stack:
+        ports: dict[str, Port] = {}
+        for planned in plan.buses:
+            name = planned.channel
+            port = open_port(
+                bus.interface, name, bus.bitrate, clock, data_bitrate=data_bitrate(bus), reports=reports(name)
+            )
+            stack.callback(port.close)
+            ports[name] = port
+        yield ports
+
+
+def channel_routes(plan: Plan) -> dict[int, str]:
+    """Which bus each identifier belongs to, of those that one node alone sends or reads."""
+    routes = {frames.can_id: frames.channel for frames in plan.raw}
+    routes |= {pdo.cob_id: pdo.channel for pdo in plan.pdos}
+    for node in plan.nodes:
+        for base in (SDO_RX_BASE, SDO_TX_BASE, EMCY_BASE, HEARTBEAT_BASE):
+            routes[base + node.node_id] = node.channel
+    return routes
+
+
+def lockstep_bus(scene: Scene, clock: VirtualClock, channel: str) -> LockstepBus:
+    """A bus in virtual time, with the bit rate of the scene or without one."""
+    if not scene.bus.timed:
+        return LockstepBus(clock, channel, fd=scene.bus.fd is True)
+    from canprobe.fieldbus.bus.virtual.timed import BitErrors, TimedBus
+
+    rate = scene.bus.bit_error_rate
+    errors = BitErrors(rate, scene.seed) if rate > 0 else None
+    bus = scene.bus
+    length = partial(exact_frame_bits, bus=bus) if bus.fd is True else exact_bits
+    timed = TimedBus(clock, channel, bitrate=bus.bitrate, queue=bus.transmit_queue, errors=errors, length=length)
+    timed.fd = bus.fd is True
+    return timed
+
+
+# A cell with everything round it: bus, recording, emulated nodes, and the way out of all of them.
+
+Array = NDArray[np.float64]
+LEFT_BY_RUNS = (
+    *("log.npz", "report.html", "report.png", "run.mcap", "scene.toml", "summary.json", "surface.npz"),
+    *("surface.png", "tactile.npz", "tool.toml", "truth.npz"),
+)
+"""Files of a run's folder besides ``bus.log``."""
+Write = Callable[[int, bytes, int], None]
+Say = Callable[[str], None]
+"""Called with a line of text for each step."""
+
+
+def quiet(_: str) -> None:
+    """Report nothing."""
+
+
+def with_bridges(scene: Scene, names: Sequence[str]) -> Scene:
+    """The scene with more bridges in use; an unknown one is a `UsageError`."""
+    if not names:
+        return scene
+    names = (names,) if isinstance(names, str) else names
+    check_bridges(names)
+    known = scene.bridge or BridgeSettings()
+    use: Any = tuple(dict.fromkeys((*known.use, *names)))
+    return replace(scene, bridge=replace(known, use=use))
+
+
+def write_scene(plan: Plan, folder: Path) -> None:
+    """Write `scene.toml` into a folder, with the files that it names beside it, as they were read for the plan.
+
+    Raises:
+        ResultsError: a file cannot be written; no part of it is left.
+    """
+    for name, content in reversed(plan.files.items()):
+        with whole_file(folder / name) as part:
+            part.write_bytes(content)
+
+
+def zeros_file(plan: Plan) -> Path | None:
+    """Where the zeros of a cell's real drives are recorded, in the user's state folder; None where none is homed."""
+    arm = plan.setup.arm
+    if arm is None or all(drive.zero is None or drive.emulated for drive in arm.drives):
+        return None
+    folder = os.environ.get("XDG_STATE_HOME") or "~/.local/state"
+    return Path(folder).expanduser() / "canprobe" / f"zeros-{arm.model.name}.json"
+
+
+class Session:
+    """One cell from bring-up to safe stop. A context manager; :meth:`run` may be called more than once inside.
+
+    Args:
+        scene: what to bring up, resolved; or the plan of it.
+        out: folder for ``bus.log``, ``scene.toml`` and ``truth.npz``; None keeps no files.
+        say: called with each step.
+        observers: called after each cycle with its measurement, command and frames.
+        rows_kept: cycles whose row of the log is kept, and no truth; None for all.
+        to_home: the drives are about to be homed.
+
+    Attributes:
+        origin_ns: where the run's clock is 0, on the clock of its bus: every time in its files counts from there.
+        unwritten: files that could not be written, each with the reason; they are among the cell's faults too.
+    """
+
+    def __init__(
+        self,
+        scene: Scene | Plan,
+        out: Path | None = None,
+        say: Say = quiet,
+        observers: Sequence[Observer | Callable[[Observation], None]] = (),
+        rows_kept: int | None = None,
+        *,
+        to_home: bool = False,
+    ) -> None:
+        self._rows_kept = rows_kept
+        self._to_home = to_home
+        self.plan = scene if isinstance(scene, Plan) else make_plan(resolve(scene))
+        self.scene = self.plan.scene
+        self.out = out
+        self.started_ns = 0
+        self.wall_ns = 0
+        self.origin_ns = 0
+        self._bus_start_ns = 0
+        self._bus_time_ns = 0
+        self.traffic: dict[str, TrafficCounter | TrafficMeter] = {}
+        self.meters: dict[str, TrafficMeter] = {}
+        self.truth: dict[str, Array] = {}
+        self.lockstep: LockstepBus | None = None
+        self._ports: dict[str, Port] = {}
+        self.unwritten: list[str] = []
+        self._candump: CandumpWriter | None = None
+        self.observers = Observers(observers) if observers else None
+        self._say = say
+        self._stack = ExitStack()
+        self._entered = self._left = False
+        self._cell: Cell | None = None
+        self._direct: Callable[..., Cycle] | None = None
+
+    @cached_property
+    def world(self) -> World:
+        """The emulated nodes and their plant on a lockstep bus; their participants may be replaced until it opens."""
+        from canprobe.cell.emulated.world import make_world
+
+        return make_world(self.plan, self.scene.emulated_node_ids, truth=self.keeps_all)
+
+    @property
+    def cell(self) -> Cell:
+        """The cell, while the session is open or afterwards."""
+        if self._cell is None:
+            raise UsageError("the cell is not open: use `with canprobe.open_cell(scene) as cell:`")
+        return self._cell
+
+    @property
+    def started(self) -> bool:
+        """The buses were opened and the cell was made: there is something to report, if only how bring-up failed."""
+        return self._cell is not None
+
+    @property
+    def opened(self) -> bool:
+        """The nodes were brought up."""
+        return self._cell is not None and self._cell.cycle is not None
+
+    @property
+    def virtual(self) -> bool:
+        """It runs in this process, in virtual time."""
+        return self.scene.bus.interface in VIRTUAL
+
+    @property
+    def keeps_all(self) -> bool:
+        """Every cycle has its row in the log, and every SYNC one in the truth."""
+        return self._rows_kept is None
+
+    def bus_load(self, channel: str) -> float | None:
+        """Measured share of a bus's bit rate, from the first frame to the last."""
+        if channel not in self.traffic or self._bus_time_ns <= 0:
+            return None
+        return self.traffic[channel].bits / (self.scene.bus.bitrate * self._bus_time_ns * 1e-9)
+
+    def __enter__(self) -> Self:
+        if self._entered:
+            raise UsageError("a session is opened once: open another cell with open_cell(scene)")
+        self._entered = True
+        self.started_ns = elapsed_ns()
+        for warning in self.plan.warnings:
+            self._say(f"warning: {warning}")
+        try:
+            port = self._open()
+            self._cell = Cell(
+                self.plan,
+                port,
+                say=self._say,
+                log_failure=self._log_failure,
+                observers=self.observers,
+                rows_kept=self._rows_kept,
+                direct=self._direct,
+                origin_ns=self.origin_ns,
+                zeros=zeros_file(self.plan),
+                to_home=self._to_home,
+            )
+            if not self.virtual:
+                self._get_ready(port)
+            self._bus_start_ns = port.clock.now_ns()
+            self._stack.callback(self._stop_watch, port)
+            self._stack.enter_context(garbage_collection_paused(collect=not self.virtual))
+            self._stack.callback(self._observe_frames, port)
+            self._stack.enter_context(self._cell)
+            self._observe_frames(port)
+        except BaseException as error:
+            self._close()
+            need_controllers(self.scene.bus.interface, self._ports, error)
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._close()
+
+    def run(
+        self,
+        controller: Controller | Callable[[Measurement], Command],
+        progress: Callable[[Measurement], None] = lambda _: None,
+    ) -> None:
+        """Run a controller until it is done; see :meth:`canprobe.cell.master.cell.Cell.run`."""
+        if self._left:
+            raise UsageError("the cell is closed: open another one with `with canprobe.open_cell(scene) as cell:`")
+        self.cell.run(controller, progress)
+
+    def _close(self) -> None:
+        try:
+            self._stack.close()
+        finally:
+            self._left = True
+            self.wall_ns = elapsed_ns() - self.started_ns
+            self._note_unwritten(self._log_failure())
+
+    def _note_unwritten(self, failure: str | None) -> None:
+        if failure is not None and self._cell is not None:
+            self.unwritten.append(failure)
+            self._note(failure)
+
+    def _note(self, fault: str) -> None:
+        if self._cell is not None:
+            self._cell.notes.add(fault)
+
+    def _log_failure(self) -> str | None:
+        return self._candump.failure if self._candump is not None else None
+
+    def _stop_watch(self, port: Port) -> None:
+        self._bus_time_ns = port.clock.now_ns() - self._bus_start_ns
+
+    # the three kinds of bus
+
+    def _open(self) -> Port:
+        if self.scene.bus.direct:
+            return self._open_direct()
+        return self._open_lockstep() if self.scene.bus.interface == LOCKSTEP else self._open_real()
+
+    def _make_folder(self, out: Path) -> None:
+        """The run's folder, with its scene and without what an earlier run left there."""
+        make_folder(out)  # only now: where no bus opens nothing is left behind
+        for name in LEFT_BY_RUNS:
+            with writing(out / name):
+                (out / name).unlink(missing_ok=True)
+        write_scene(self.plan, out)
+
+    def _writer(self, channel: str) -> Write:
+        """What a bus is recorded with: its traffic is counted, written to the log and shown to the observers."""
+        if self.scene.bus.interface == LOCKSTEP:
+            self.meters[channel] = TrafficMeter(self.plan, channel, exact=False)
+            self.traffic[channel] = self.meters[channel]
+        else:  # set beside the plan afterwards, from the log
+            self.traffic[channel] = TrafficCounter(self.scene.bus.data_bitrate / self.scene.bus.bitrate)
+        write: Write = self.traffic[channel].write
+        if self.out is not None:
+            if self._candump is None:
+                make_folder(self.out)
+                self._candump = self._stack.enter_context(CandumpWriter(self.out / "bus.log", channel, self.origin_ns))
+                self._make_folder(self.out)
+            write = self._candump.on(channel, self.traffic[channel].take)
+        if self.observers is not None:
+            self.observers.origin_ns = self.origin_ns
+            write = self.observers.tap(write)
+        return write
+
+    def _error_writer(self, channel: str) -> Write:
+        """Error frames go into the log, and beside the plan."""
+
+        def note(can_id: int, data: bytes, t_ns: int) -> None:
+            self.traffic[channel].error_frames += is_bus_error(can_id)
+            if self._candump is not None:
+                self._candump.on(channel)(can_id, data, t_ns)
+
+        return note
+
+    def _join(self, ports: dict[str, Port]) -> Port:
+        """One port for the cell, whatever the number of buses."""
+        return ports.popitem()[1] if len(ports) == 1 else JoinedPort(ports, channel_routes(self.plan))
+
+    def _observe_frames(self, port: Port) -> None:
+        """What was on the bus at bring-up, and after the last cycle."""
+        if self.observers is not None:
+            self.observers.frames_alone(port.clock.now_ns())
+
+    def _need_emulated(self, what: str) -> None:
+        if missing := set(self.plan.node_ids) - set(self.scene.emulated_node_ids):
+            raise UsageError(f"{what} emulated nodes only: node {min(missing)} is marked emulated = false")
+
+    def _open_direct(self) -> Port:
+        """Counts and images in the place of frames: the port's bus has nobody on it, its clock is what is used."""
+        from canprobe.cell.session.direct import DirectCycle
+
+        self._need_emulated("without a bus there are")
+        if self.out is not None:
+            self._make_folder(self.out)
+            with writing(self.out / "bus.log"):
+                (self.out / "bus.log").unlink(missing_ok=True)
+        self._stack.callback(self._keep_truth)
+        self._direct = partial(DirectCycle, world=self.world)
+        clock = VirtualClock()
+        nobody = LockstepBus(clock, self.plan.buses[0].channel)
+        clock.detach(nobody)
+        return nobody.port()
+
+    def _open_lockstep(self) -> Port:
+        self._need_emulated("a lockstep bus has")
+        if self.plan.setup.array is not None and not self.plan.setup.array.emulated:
+            raise UsageError("a lockstep bus has emulated devices only: sensor.emulated = false")
+        clock = VirtualClock()
+        buses = {bus.channel: lockstep_bus(self.scene, clock, bus.channel) for bus in self.plan.buses}
+        for channel, bus in buses.items():
+            bus.recorder = self._writer(channel)
+            bus.error_recorder = self._error_writer(channel)
+        self.lockstep = buses[self.plan.buses[0].channel]
+        participants = self.world.participants
+        self._stack.callback(self._keep_truth)
+        bus_of = {node.node_id: buses[node.channel] for node in self.plan.nodes}
+        array = self.plan.setup.array
+        for participant in participants:
+            bus = bus_of.get(getattr(participant, "node_id", 0), self.lockstep)
+            if participant is self.world.raw_array and array is not None:
+                bus = buses[array.channel]
+            bus.attach(participant)
+        return self._join({channel: bus.port() for channel, bus in buses.items()})
+
+    def _keep_truth(self) -> None:
+        if self.world.recorder is not None:
+            self.truth = self.world.recorder.arrays()
+            if self.out is not None:
+                try:
+                    write_npz(self.out / "truth.npz", self.truth)
+                except CanprobeError as error:
+                    self._note_unwritten(str(error))
+
+    def _open_real(self) -> Port:
+        bus = self.scene.bus
+        if bus.interface == "virtual" and self.plan.setup.emulates:
+            raise UsageError(
+                "python-can's virtual bus ends at the process, and emulated nodes have one of their own; use --bus"
+                " lockstep, or --bus socketcan --channel vcan0 by: canprobe vcan -- COMMAND"
+            )
+        check_links(bus.interface, expected_of(self.plan), self._say)
+        clock = MonotonicClock()
+        self.origin_ns = clock.now_ns()
+        real = self._ports = self._stack.enter_context(
+            open_ports(self.plan, clock, lambda channel: Reports(self._error_writer(channel), self._note))
+        )
+        return self._join({name: RecordingPort(port, self._writer(name)) for name, port in real.items()})
+
+    def _get_ready(self, port: Port) -> None:
+        """For real time: the emulated nodes in their process, everything done once before, the processor's favour."""
+        from canprobe.cell.session.children import EmulatorChild
+
+        child = None
+        if self.plan.setup.emulates:
+            self.cell.listen()  # they would boot beside those of another master
+            self._say("start the emulated nodes")
+            channels = list(self.plan.emulated_channels)
+            child = EmulatorChild(self.plan, self.out, channels, truth=self.keeps_all, origin_ns=self.origin_ns)
+            self._stack.callback(self._end_child, child)
+            child.start()
+        self._say("rehearse in lockstep")
+        rehearse(self.plan)
+        reserve_memory(self.plan.cycles if self._rows_kept is None else self._rows_kept)
+        if child is not None:
+            child.await_boot_ups(port, self._say, self.cell.hear)
+        if self.scene.cycle.realtime:
+            self._stack.enter_context(realtime(MASTER_PRIORITY, self._say))
+
+    def _end_child(self, child: Any) -> None:
+        self.truth = child.end()
+        self._note_unwritten(child.unwritten)
+
+
+# A short run on the lockstep bus before a real one, so that nothing happens for the first time in a 2.5 ms cycle.
+#
+# The first call of everything is slow: libraries are paged in, tables filled, the interpreter specialises its code.
+# On one slow processor first cycles took 3 to 10 ms each, and the drives stopped by themselves for want of SYNC.
+
+REHEARSED_S = 0.3
+"""Length of the scene's phase in a rehearsal: time for some answers of an estimator."""
+CLEARANCE_MM = 0.5
+"""The way to the object is the same in every cycle."""
+TOUCHES = 2
+
+
+def rehearse(plan: Plan) -> None:
+    """Run the beginning of a plan with every node emulated; what goes wrong in it is of no interest here.
+
+    Args:
+        plan: what is about to run on a real bus.
+    """
+    with contextlib.suppress(CanprobeError):
+        run_beginning(plan)
+
+
+def run_beginning(plan: Plan) -> Session:
+    """Bring the cell of a plan up in lockstep with every node emulated, and carry out the beginning of its task.
+
+    Returns:
+        The session, closed.
+
+    Raises:
+        CanprobeError: what goes wrong in it.
+    """
+    with Session(shortened(plan.scene)) as session:
+        session.run(make_task(session.plan))
+    return session
+
+
+def shortened(scene: Scene) -> Scene:
+    """The scene on a lockstep bus that takes no time, with all that its cycles do in as few of them as will do."""
+    task = replace(
+        scene.task,
+        duration_s=min(scene.task.duration_s, REHEARSED_S),
+        clearance_mm=min(scene.task.clearance_mm, CLEARANCE_MM),
+        touches=min(scene.task.touches, TOUCHES),
+    )
+    return replace(
+        scene,
+        bus=replace(scene.bus, interface=LOCKSTEP, timed=False, bit_error_rate=0.0),
+        task=task,
+        arm=replace(scene.arm, emulated=True) if scene.arm is not None else None,
+        joints={name: replace(joint, emulated=None) for name, joint in scene.joints.items()},
+        sensor=replace(scene.sensor, emulated=True) if scene.sensor is not None else None,
+    )

@@ -1,0 +1,91 @@
+"""Where a scene or a command goes: interface, channels and bit rate as one object, put into a scene by one function."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+from canprobe.cell.scene.load import load_scene
+from canprobe.cell.scene.model import DIRECT, Scene
+from canprobe.errors import UsageError
+
+LOCKSTEP = "lockstep"
+VIRTUAL = frozenset({LOCKSTEP, DIRECT})
+"""Interfaces in this process, in virtual time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """A bus.
+
+    Attributes:
+        interface: `lockstep`, `direct` (no bus), `socketcan` or another interface of python-can.
+        channel: of the interface, in the place of the scene's `bus.channel`.
+        bitrate: bit/s.
+        others: what stands for the other channels that the scene names; one that is not here stays as it is.
+    """
+
+    interface: str
+    channel: str
+    bitrate: int
+    others: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def over(
+        cls,
+        scene: Scene,
+        bus: str | None = None,
+        channel: str | Mapping[str, str] | None = None,
+        bitrate: int | None = None,
+    ) -> Target:
+        """The bus of a scene, with what is given in the place of its values.
+
+        Args:
+            scene: whose.
+            bus, bitrate: in the place of the scene's interface and bit rate.
+            channel: in the place of `bus.channel`; or what stands for each channel that the scene names.
+
+        Raises:
+            UsageError: the scene names no such channel, or a value is none that its file could have.
+        """
+        others = dict(channel) if isinstance(channel, Mapping) else {}
+        if unknown := sorted(str(name) for name in others if name not in scene.channels):
+            raise UsageError(f"channel: the scene has no channel {unknown[0]}, only {', '.join(scene.channels)}")
+        others = {name: load_scene(scene, {"bus.channel": new}).bus.channel for name, new in others.items()}
+        main = others.pop(scene.bus.channel, None) if isinstance(channel, Mapping) else channel
+        given = {"bus.interface": bus, "bus.channel": main, "bus.bitrate": bitrate}
+        settings = load_scene(scene, {key: value for key, value in given.items() if value is not None}).bus
+        return cls(settings.interface, settings.channel, settings.bitrate, others)
+
+    def applied_to(self, scene: Scene) -> Scene:
+        """The scene on this bus."""
+        bus = replace(scene.bus, interface=self.interface, channel=self.channel, bitrate=self.bitrate)
+        names: dict[str | None, str] = {scene.bus.channel: self.channel}
+        names.update(self.others.items())
+        joints = {
+            name: replace(joint, channel=names.get(joint.channel, joint.channel))
+            for name, joint in scene.joints.items()
+        }
+        sensor = scene.sensor and replace(scene.sensor, channel=names.get(scene.sensor.channel, scene.sensor.channel))
+        return replace(scene, bus=bus, joints=joints, sensor=sensor)
+
+
+def need_real_bus(scene: Scene, command: str) -> None:
+    """Refuse a command that needs a bus which other processes can reach.
+
+    Raises:
+        UsageError: the scene's bus lives inside one run, or it has none.
+    """
+    refuse_virtual(scene.bus.interface, command)
+
+
+def refuse_virtual(interface: str, command: str) -> None:
+    """Refuse an interface that ends with its run.
+
+    Raises:
+        UsageError: it is one.
+    """
+    if interface == LOCKSTEP:
+        raise UsageError(f"{command}: a lockstep bus lives inside one run; name a real interface with --bus")
+    if interface == DIRECT:
+        raise UsageError(f"{command}: there is no bus in --bus direct; name a real interface with --bus")

@@ -1,0 +1,35 @@
+"""Controllers: what a cell does in each cycle, from a measurement to a command.
+
+`from_plan.make_task` gives the controller of a plan's task; nothing is imported that the task does not need.
+
+- `touch` approaches, settles, scans or holds, searches for a lost contact, and retreats; `calibrate` touches a ball
+  from several sides; `roll` presses and rolls on a known object. All derive from `probing.ProbingTask`: the order of a
+  cycle, phases, and the probe's motion.
+- `sensing` makes a contact of a measurement: joints at the instant of the image, the patch, the squeezed layer.
+- `shape` is the estimator in the loop: contacts go in when they are felt, answers are computed in `update` when the
+  commands are out, and are used from the next cycle on.
+- `untouched` has the tasks without touch: hold, swing, listen, and the check of each joint's first motion.
+- `trajectory` follows points, for own scripts and for ROS 2: `canprobe.cell.tasks.Trajectory`.
+- `task` is what a task leaves for the summary.
+
+A task guards its own contact (`lets_go`): it decides by the same table of conditions as the cell when to let go. A
+task reads its setup (`canprobe.cell.scene.setup`) and nothing of a scene.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from canprobe.cell.tasks.trajectory import Trajectory
+
+__all__ = ["Trajectory"]
+
+
+def __getattr__(name: str) -> Any:
+    """Import the public name on first use (PEP 562): no task imports another one."""
+    if name != "Trajectory":
+        raise AttributeError(f"module 'canprobe.cell.tasks' has no attribute {name!r}")
+    from canprobe.cell.tasks.trajectory import Trajectory
+
+    return Trajectory

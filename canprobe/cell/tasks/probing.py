@@ -1,0 +1,279 @@
+"""What every task that touches with the probe has: the probe's motion, the phases, and the order of a cycle."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import IntEnum
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.master.controller import Command, Measurement, TactileSample
+from canprobe.cell.master.supervision import Contact, limits_of
+from canprobe.cell.master.supervisor import outside_workspace
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.scene.setup import Arm, Probe, SafetyLimits
+from canprobe.cell.tasks.sensing import ContactSensing
+from canprobe.cell.tasks.task import MotionTime, Task, TaskRecord
+from canprobe.mechanics.robot.chain import pose_of
+from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.touch.patch.image import Patch
+from canprobe.mechanics.touch.probe_motion import RETREAT_SPEED, ArcMotion, LineMotion, PoseSteps
+from canprobe.mechanics.touch.servo import ProbePose
+
+if TYPE_CHECKING:
+    from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
+
+
+# The probe's pose → joint targets within what the cell allows, one step a cycle.
+
+Vector = NDArray[np.float64]
+
+
+class ProbeMotion:
+    """Keeps the commanded joint positions of a probe whose pose is asked for cycle by cycle.
+
+    Each cycle one damped step from the *commanded* joints, never from the measured ones: encoder noise stays out of the
+    command, and the step is small enough that its second-order error is gone in the next cycle.
+
+    Args:
+        arm, probe: what moves.
+        safety: what joints and probe must keep to.
+        period_s: of the cycle.
+        q: joint positions to start from (n,), rad or m; more than six joints stay near them.
+
+    Attributes:
+        limit: what a joint or the workspace forbids; None where nothing does.
+        slowed: cycles in which a joint could not keep up.
+    """
+
+    def __init__(self, arm: Arm, probe: Probe, safety: SafetyLimits, period_s: float, q: Vector) -> None:
+        self.q = np.array(q, dtype=float)
+        self._model = model = arm.model
+        self._steps = PoseSteps(model, probe.T_flange_probe, self.q)
+        self._workspace, self._radius = safety.workspace, probe.radius
+        self._step_max: list[float] = (model.qd_max * safety.speed_share * period_s).tolist()
+        self._period_s = period_s
+        margin = safety.joint_margin
+        self._low, self._high = model.q_min + margin, model.q_max - margin
+        self._range: list[tuple[float, float]] = list(zip(self._low.tolist(), self._high.tolist(), strict=True))
+        self.limit: str | None = None
+        self.slowed = 0
+
+    @property
+    def pose(self) -> ProbePose:
+        """The commanded pose."""
+        at = self._steps.at
+        return ProbePose(np.array(at.flange), np.array(at.z))
+
+    @property
+    def pose_matrix(self) -> Vector:
+        """The same with the turn about the pole, (4, 4), m."""
+        return pose_of(self._steps.at)
+
+    def step(self, pose: ProbePose) -> Vector:
+        """Joint targets (n,), rad or m, one step nearer to ``pose``."""
+        before = self.q.tolist()
+        dq = self._steps.step(before, pose, self._period_s)
+        at = self._steps.at
+        if self._workspace is not None:
+            self.limit = outside_workspace(np.array(at.flange) + self._radius * np.array(at.z), self._workspace)
+        share = max([abs(step) / most for step, most in zip(dq, self._step_max, strict=True)])
+        if share > 1.0:
+            dq = [step / share for step in dq]
+            self.slowed += 1
+        targets = [q + step for q, step in zip(before, dq, strict=True)]
+        self.q = np.array(targets)
+        if not all([low <= q <= high for q, (low, high) in zip(targets, self._range, strict=True)]):
+            self._stop_at_limit()
+        return self.q
+
+    def _stop_at_limit(self) -> None:
+        joint = int(np.flatnonzero((self.q < self._low) | (self.q > self._high))[0])
+        self.limit = f"joint {joint + 1} at {self._model.joints[joint].text(self.q[joint])}, its stop"
+        self.q = np.clip(self.q, self._low, self._high)
+
+
+# What every task that touches with the probe has: phases, and the order of a cycle.
+
+CYCLES_TO_EFFECT = 2
+"""From a SYNC to the moment its command begins to take effect, behind which the drives lag."""
+
+
+class Phase(IntEnum):
+    """Phases of a touch task, in their order; a scan that loses its contact goes to and fro between it and REGAIN."""
+
+    MOVE = 0
+    APPROACH = 1
+    SETTLE = 2
+    SCAN = 3
+    RETREAT = 4
+    DONE = 5
+    REGAIN = 6
+
+
+class ProbingTask(Task):
+    """Base of the tasks that touch: the order of a cycle, and the phases that all of them have.
+
+    Args:
+        plan: of a cell with an arm; beyond its limits the probe retreats and the cell stops.
+        lag_s: of the drives behind a ramp.
+        sensing: contacts from measurements.
+
+    Attributes:
+        phase: what it does now.
+        sensing: as given.
+        reason: why it stopped; None as long as it goes on.
+        taxels: last image of the touch itself.
+    """
+
+    lets_go = True
+
+    def __init__(self, plan: Plan, lag_s: float, sensing: ContactSensing) -> None:
+        self.phase = Phase.MOVE
+        self.sensing = sensing
+        self.reason: str | None = None
+        self.taxels: NDArray[np.uint8] | None = None
+        self._setup = plan.setup
+        self._touch = Contact(limits_of(plan))
+        self._period_s = self._dt = plan.sync.period_ns * 1e-9
+        self._time = MotionTime(plan.sync.period_ns)
+        self._lead_s = CYCLES_TO_EFFECT * self._period_s + lag_s
+        self._motion: ProbeMotion | None = None
+        self._line: LineMotion | ArcMotion | None = None
+        self._cycle = 0
+        self._t = 0.0
+        self._floor = 0.0
+        self._columns: dict[str, float | Vector] = {}
+        self._estimate: SurfaceEstimate | None = None
+        self._phases: dict[Phase, Callable[[], ProbePose]] = {
+            Phase.MOVE: self._move,
+            Phase.APPROACH: self._approach,
+            Phase.SETTLE: self._settle,
+            Phase.SCAN: self._scan,
+            Phase.RETREAT: self._retreat,
+            Phase.DONE: self._stay,
+            Phase.REGAIN: self._regain,
+        }
+
+    def record(self) -> TaskRecord:
+        """What it knows so far."""
+        slowed = self._motion.slowed if self._motion is not None else 0
+        return TaskRecord(taxels=self.taxels, unplaced=self.sensing.dropped, slowed=slowed)
+
+    def step(self, measurement: Measurement) -> Command:
+        """One cycle."""
+        self._cycle = measurement.cycle
+        self._dt = self._time.step(measurement.t_ns) * 1e-9
+        if self._motion is None:
+            setup = self._setup
+            assert measurement.q is not None and setup.arm is not None
+            self._motion = ProbeMotion(setup.arm, setup.probe, setup.limits, self._period_s, measurement.q)
+            self._begin(self._motion.pose)
+        patch = self.sensing.step(measurement)
+        if patch is not None and measurement.tactile is not None:
+            self._feel(measurement.tactile, patch)
+        self._touch.tactile_age = measurement.tactile_age
+        self._watch()
+        pose = self._phases[self.phase]()
+        self._t += self._dt
+        return self._command(pose)
+
+    def retreat(self, reason: str) -> None:
+        """Let go and end for a reason that the cell has."""
+        raise NotImplementedError
+
+    def stop(self) -> None:
+        """Let go and be done, from whatever phase."""
+        raise NotImplementedError
+
+    def _begin(self, pose: ProbePose) -> None:
+        """Start the first move, from where the probe is."""
+        raise NotImplementedError
+
+    def _feel(self, sample: TactileSample, patch: Patch) -> None:
+        """Take a tactile sample."""
+        raise NotImplementedError
+
+    def _watch(self) -> None:
+        """Check the touch by the table of conditions."""
+        raise NotImplementedError
+
+    def _command(self, pose: ProbePose) -> Command:
+        """One step of the probe to a pose, as the cell takes it; a joint's limit on the way makes the task let go."""
+        assert self._motion is not None
+        target = self._motion.step(pose)
+        if self._motion.limit is not None:
+            self.retreat(self._motion.limit)
+        self._columns["phase"] = float(self.phase)
+        done = self.phase is Phase.DONE
+        return Command(
+            q_target=target,
+            done=done and self.reason is None,
+            stop_reason=self.reason if done else None,
+            columns=self._columns,
+            estimate=self._estimate,
+        )
+
+    def _felt_columns(
+        self, sample: TactileSample, patch: Patch, contact: ContactSample | None
+    ) -> dict[str, float | Vector]:
+        """What an image says, for the log."""
+        return {
+            "phase": float(self.phase),
+            "sample_cycle": float(sample.cycle),
+            "force_n": patch.force,
+            "pad_u_mm": patch.u * 1e3,
+            "pad_v_mm": patch.v * 1e3,
+            "contact_mm": contact.p_base * 1e3 if contact is not None else np.full(3, np.nan),
+            "normal": contact.n_base if contact is not None else np.full(3, np.nan),
+        }
+
+    # phases: each returns the pose for this cycle
+
+    def _enter(self, phase: Phase) -> None:
+        self.phase = phase
+        self._t = 0.0
+
+    def _move(self) -> ProbePose:
+        assert self._line is not None
+        pose = self._line.at(self._t)
+        if self._t >= self._line.duration + self._lead_s + 0.1:
+            self._floor = self._touch.force  # an array that was pressed for long shows some of it for a while
+            self._enter(Phase.APPROACH)
+        return pose
+
+    def _approach(self) -> ProbePose:
+        raise NotImplementedError
+
+    def _settle(self) -> ProbePose:
+        raise NotImplementedError
+
+    def _scan(self) -> ProbePose:
+        raise NotImplementedError
+
+    def _regain(self) -> ProbePose:
+        raise NotImplementedError
+
+    def _draw_back(self, way: Vector) -> None:
+        """Begin the retreat by a way (3,), m, off the object."""
+        assert self._motion is not None
+        pose = self._motion.pose
+        self._line = LineMotion(pose, ProbePose(pose.centre + way, pose.pole), RETREAT_SPEED, at_once=True)
+        self._enter(Phase.RETREAT)
+
+    def _retreat(self) -> ProbePose:
+        assert self._line is not None
+        pose = self._line.at(self._t)
+        if self._t >= self._line.duration + self._lead_s:
+            self._off()
+        return pose
+
+    def _off(self) -> None:
+        """The probe is off the object."""
+        self._enter(Phase.DONE)
+
+    def _stay(self) -> ProbePose:
+        assert self._motion is not None
+        return self._motion.pose

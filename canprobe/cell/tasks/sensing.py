@@ -1,0 +1,221 @@
+"""From a measurement to a contact: joints at the sample's instant, patch, and the squeezed layer."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.master.array import patch_of
+from canprobe.cell.master.controller import Measurement, TactileSample
+from canprobe.mechanics.robot.chain import ending_in, forward
+from canprobe.mechanics.robot.model import ArmModel, position_sigma
+from canprobe.mechanics.touch.contact import (
+    ContactSample,
+    Slope,
+    contact_sample,
+    indentation_from_force,
+    stiffness_from_slope,
+)
+from canprobe.mechanics.touch.patch.array_calibration import CentroidErrors, Lag
+from canprobe.mechanics.touch.patch.image import Patch, PatchCalibration, mended
+from canprobe.mechanics.touch.patch.moments import MomentImage, Moments, PadLag
+
+if TYPE_CHECKING:
+    from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
+
+
+Vector = NDArray[np.float64]
+MOST_RATIO = 6.0
+"""Between the slope that is felt and the one of the stated stiffness on a plane; further apart it is not believed."""
+HOLLOWEST = 0.9
+"""Least curvature over −1/radius of the probe at which a patch still makes sense."""
+
+
+HISTORY = 64
+"""Cycles whose joints are kept."""
+SPEED_OVER_NS = 10_000_000
+"""Time over which the speed of the probe is taken."""
+
+
+class JointHistory:
+    """The last joint positions with their times, to be interpolated at a tactile sample's instant."""
+
+    def __init__(self) -> None:
+        self._times: deque[int] = deque(maxlen=HISTORY)
+        self._joints: deque[Vector] = deque(maxlen=HISTORY)
+
+    def add(self, t_ns: int, q: Vector) -> None:
+        """Remember joint positions (n,), rad or m, at ``t_ns``; times must increase."""
+        self._times.append(t_ns)
+        self._joints.append(q)
+
+    @property
+    def newest(self) -> Vector:
+        """Joint positions (n,), rad or m, that were added last."""
+        return self._joints[-1]
+
+    def at(self, t_ns: int) -> Vector | None:
+        """Joint positions (n,), rad or m, at ``t_ns``, linear between SYNCs; None outside the history."""
+        if not self._times or not self._times[0] <= t_ns <= self._times[-1]:
+            return None
+        for i in range(len(self._times) - 1, -1, -1):
+            t = self._times[i]
+            if t <= t_ns:
+                if t == t_ns:
+                    return self._joints[i]
+                share = (t_ns - t) / (self._times[i + 1] - t)
+                return self._joints[i] + share * (self._joints[i + 1] - self._joints[i])
+        return None
+
+
+def is_too_hollow(estimate: SurfaceEstimate, radius: float) -> bool:
+    """Whether the object is, beyond doubt (3σ), as hollow as a probe of ``radius`` (m): no contact of one patch."""
+    if not estimate.observed.all():
+        return False
+    x, y = (estimate.T_frame_contact[:3, :2].T @ estimate.directions[1]).tolist()
+    weight = np.array([x * x, 2.0 * x * y, y * y])
+    sigma = math.sqrt(max(float(weight @ estimate.covariance @ weight), 0.0))
+    return float(estimate.kappa[1]) + 3.0 * sigma < -HOLLOWEST / radius
+
+
+class ContactSensing:
+    """Turns tactile samples into contacts in the base frame.
+
+    Args:
+        model: the arm.
+        flange_probe: transform (4, 4) from the probe's centre frame (z = pole) to the flange.
+        calibration: of the array.
+        radius: of the probe, m.
+        stiffness: K/h of the layer, N/m³.
+        moment_image: gives the contacts the second moments of their images; None leaves them out.
+        noise: of the centroids; None: the contacts do not state theirs.
+        lag: how far the array's centroids trail the contact; None: they do not.
+    """
+
+    def __init__(
+        self,
+        model: ArmModel,
+        flange_probe: Vector,
+        calibration: PatchCalibration,
+        radius: float,
+        stiffness: float,
+        *,
+        noise: CentroidErrors | None = None,
+        moment_image: MomentImage | None = None,
+        lag: Lag | None = None,
+    ) -> None:
+        self.model = model
+        self.flange_probe = flange_probe
+        self._chain = ending_in(model.chain, flange_probe)
+        self.radius = radius
+        self.stiffness = stiffness
+        self._slope: Slope | None = None
+        self._settled = True
+        self.set_kappa(np.zeros(2))
+        self.patch: Patch | None = None
+        self.dropped = 0
+        self._calibration = calibration
+        self._noise = noise
+        self._level_pa = MomentImage(calibration).level_pa
+        self._moment_image = moment_image
+        self._lag = None if lag is None else PadLag(lag)
+        self._history = JointHistory()
+
+    def step(self, measurement: Measurement) -> Patch | None:
+        """Take one measurement; the patch of a new tactile sample, or None without one."""
+        if measurement.q is not None:
+            self._history.add(measurement.t_ns, measurement.q)
+        if measurement.tactile is None:
+            return None
+        self.patch = patch_of(measurement.tactile, self._calibration)
+        return self.patch
+
+    def position_sigma(self, direction: Vector) -> float:
+        """Standard deviation of the probe's position along a unit vector (3,), m: joints come in whole counts."""
+        return position_sigma(self.model, self._history.newest, self.flange_probe, direction)
+
+    def set_kappa(self, kappa: Vector, stiffness: float | None = None) -> None:
+        """Take the object's principal curvatures (2,), 1/m, and the layer's stiffness as the estimator knows them.
+
+        An estimate that is no contact of one patch any more (a hollow as tight as the probe) is taken at the limit.
+
+        Args:
+            kappa: 1/m.
+            stiffness: K/h, N/m³; None from an estimator that has none: what the last touch showed, or else as before.
+        """
+        possible = np.maximum(kappa, -HOLLOWEST / self.radius)
+        if stiffness is not None:
+            self.stiffness = stiffness
+        elif self._slope is not None and not self._settled:
+            self.stiffness = stiffness_from_slope(self._slope.value, self.radius, possible)
+        self._settled = True
+        self._depth_at_1_n = float(indentation_from_force(1.0, self.stiffness, self.radius, possible))
+
+    def set_depth_at_1_n(self, depth: float) -> None:
+        """Place contacts as another sensing did that had this depth at 1 N, m."""
+        self._depth_at_1_n = depth
+
+    def set_slope(self, slope: Slope) -> None:
+        """Take what a touch showed; the depth goes by it until the object's curvature is known."""
+        flat = 1.0 / float(indentation_from_force(1.0, self.stiffness, self.radius, np.zeros(2)))
+        self._slope = slope._replace(value=min(max(slope.value, flat / MOST_RATIO), flat * MOST_RATIO))
+        self._settled = False
+        self._depth_at_1_n = 1.0 / self._slope.value
+
+    def depth(self, force: float) -> float:
+        """Indentation (m) of the layer at ``force`` (N) on the curvature known so far: the root of the force."""
+        return self._depth_at_1_n * math.sqrt(force) if force > 0 else 0.0
+
+    def probe_at(self, t_ns: int) -> Vector | None:
+        """The probe (4, 4) in base at a time of the last cycles; None where the joints of that time are unknown."""
+        q = self._history.at(t_ns)
+        return None if q is None else forward(self._chain, q)
+
+    def contact(self, sample: TactileSample, patch: Patch) -> ContactSample | None:
+        """The contact at the sample's instant, or None (counted) where the joints of that instant are unknown."""
+        T_base_probe = self.probe_at(sample.t_sample_ns)
+        if T_base_probe is None:
+            self.dropped += 1
+            return None
+        t_s, uv = sample.t_sample_ns * 1e-9, (patch.u, patch.v)
+        depth = self.depth(patch.force)
+        found = contact_sample(
+            t_s=t_s,
+            T_base_probe=T_base_probe,
+            uv=uv if self._lag is None else self._lag.step(t_s, *uv),
+            depth=depth,
+            radius=self.radius,
+            force_n=patch.force,
+            sigma_point=None if self._noise is None else self._noise.sigma(self._lightness(depth)),
+            moments=self._moments(sample, patch),
+            doubts=patch.doubts,
+            slope=self._slope,
+        )
+        if not sample.t_sigma_s:
+            return found
+        return replace(found, sigma_motion=sample.t_sigma_s * self._speed(sample.t_sample_ns, found))
+
+    def _lightness(self, depth: float) -> float:
+        """Level that is taken off the image over the peak pressure of a contact that sinks in by a depth (m)."""
+        return self._level_pa / (self.stiffness * depth) if depth > 0.0 else 1.0
+
+    def _speed(self, t_ns: int, contact: ContactSample) -> float:
+        """Of the probe at the contact, m/s: what an error of the instant displaces the contact by; 0 without a past."""
+        before = self._history.at(t_ns - SPEED_OVER_NS)
+        if before is None:
+            return 0.0
+        earlier = forward(self._chain, before)
+        point = np.append(contact.r_probe, 1.0)
+        way = ((contact.T_base_probe - earlier) @ point)[:3]
+        return float(np.linalg.norm(way)) / (1e-9 * SPEED_OVER_NS)
+
+    def _moments(self, sample: TactileSample, patch: Patch) -> Moments | None:
+        """Second moments of the image; None where they are not wanted, or not those of the whole patch."""
+        if self._moment_image is None or patch.saturated or patch.cut_by_pad or patch.too_few:
+            return None
+        return self._moment_image.moments(mended(sample.frame.taxels)[0] if patch.dead else sample.frame.taxels)

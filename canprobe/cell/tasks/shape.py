@@ -1,0 +1,135 @@
+"""The estimator in the loop: what it is fed, and how its answer reaches the servo and the log."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from canprobe.mechanics.touch.contact import ContactSample
+    from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
+    from canprobe.mechanics.touch.estimate.online import Estimator
+
+
+GAP_S = 0.1
+"""Time without contact after which an estimator starts afresh: a contact that is regained may be of another surface."""
+SHARPEST = 1e3
+"""1/m; no pad measures a ball of 1 mm, so an answer beyond it has diverged."""
+
+
+@dataclass(frozen=True, slots=True)
+class ShapeRecord:
+    """One estimate with its place in the run.
+
+    Attributes:
+        t_s: instant of its last sample, s, since the first SYNC; in results on the run's clock.
+        travelled_m: path of the contact since the start of the scan, m.
+        estimate: the answer, in the base frame's terms.
+        told_s: instant of the cycle in which it was reported, s, on the same clock.
+    """
+
+    t_s: float
+    travelled_m: float
+    estimate: SurfaceEstimate
+    told_s: float
+
+
+def on_run_clock(records: Sequence[ShapeRecord], start_s: float) -> list[ShapeRecord]:
+    """Estimates of a run in which the first SYNC was due at ``start_s``."""
+    return [replace(record, t_s=start_s + record.t_s, told_s=start_s + record.told_s) for record in records]
+
+
+class ShapeTracker:
+    """Feeds an estimator with the contacts of a scan and keeps what it said.
+
+    Args:
+        estimator: the online estimator.
+        every: samples between two answers.
+
+    Attributes:
+        records: every answer.
+        samples: every contact.
+        travelled_m: path of the contact, m.
+        restarts: how often the estimator diverged and started afresh.
+    """
+
+    def __init__(self, estimator: Estimator, every: int) -> None:
+        self.records: list[ShapeRecord] = []
+        self.samples: list[ContactSample] = []
+        self.travelled_m = 0.0
+        self.restarts = 0
+        self._estimator = estimator
+        self._every = max(1, every)
+        self._waiting: list[ContactSample] = []
+        self._taken = 0
+        self._found: tuple[SurfaceEstimate, float] | None = None
+
+    def add(self, sample: ContactSample) -> None:
+        """Note one contact; `work` takes it."""
+        if self.samples:
+            last = self.samples[-1]
+            if sample.t_s - last.t_s > GAP_S:
+                self._estimator.reset()
+                self._waiting.clear()
+                self._taken, self._found = len(self.samples), None
+            else:
+                self.travelled_m += math.dist(sample.p_base.tolist(), last.p_base.tolist())
+        self.samples.append(sample)
+        self._waiting.append(sample)
+
+    def work(self) -> SurfaceEstimate | None:
+        """Take the contacts that wait, and answer where one is due; the estimate that `answer` has yet to report."""
+        for sample in self._waiting:
+            self._estimator.add(sample)
+            self._taken += 1
+            if self._taken % self._every == 0:
+                self._keep(self._estimator.estimate(), sample.t_s)
+        self._waiting.clear()
+        return None if self._found is None else self._found[0]
+
+    def answer(self, t_s: float) -> SurfaceEstimate | None:
+        """The estimate, once, that has been found since it was last asked for.
+
+        Args:
+            t_s: instant of the cycle in which it is reported, s.
+        """
+        if self._found is None:
+            return None
+        (estimate, at_s), self._found = self._found, None
+        self.records.append(ShapeRecord(at_s, self.travelled_m, estimate, t_s))
+        return estimate
+
+    def answer_at_once(self, t_s: float) -> SurfaceEstimate | None:
+        """Take the contacts that wait; the estimate, if one is due, in the cycle at an instant (s)."""
+        self.work()
+        return self.answer(t_s)
+
+    def _keep(self, estimate: SurfaceEstimate | None, at_s: float) -> None:
+        """An estimate to be reported; where it has diverged the estimator starts afresh."""
+        if estimate is None:
+            return
+        if has_diverged(estimate):
+            self.restarts += 1
+            self._estimator.reset()
+            return
+        self._found = estimate, at_s
+
+
+def has_diverged(estimate: SurfaceEstimate) -> bool:
+    """Whether an answer is not finite, or sharper than anything that a pad can measure."""
+    known = np.asarray(estimate.kappa)[np.asarray(estimate.observed)]
+    finite = np.isfinite(known).all() and np.isfinite(estimate.S).all() and np.isfinite(estimate.T_frame_contact).all()
+    return not (finite and bool((np.abs(known) < SHARPEST).all()))
+
+
+def replay_samples(estimator: Estimator, samples: Sequence[ContactSample], every: int) -> list[ShapeRecord]:
+    """Feed recorded contacts to another estimator, as the loop would have."""
+    tracker = ShapeTracker(estimator, every)
+    for sample in samples:
+        tracker.add(sample)
+        tracker.answer_at_once(sample.t_s)
+    return tracker.records

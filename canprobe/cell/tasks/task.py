@@ -1,0 +1,98 @@
+"""What a task leaves for the summary, besides what it did as a controller."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.master.controller import Controller
+
+if TYPE_CHECKING:
+    from canprobe.cell.tasks.shape import ShapeTracker
+    from canprobe.mechanics.robot.tool_calibration import ToolEstimate
+
+
+LONGEST_STEP = 4
+"""Periods by which a motion goes on in one cycle at most, and for which it makes up later; the rest is lost time."""
+QUICKER = 8
+"""Part of a period by which one step of a motion may be longer than the one before."""
+
+
+class MotionTime:
+    """The time of a motion. It follows the cycles, also where all of them take long, but not from one to the next.
+
+    After a late cycle the target goes on with an eighth more in each cycle until the motion has made up for it: at
+    once, the probe would be pushed by the way of four cycles into what it touches.
+
+    Args:
+        period_ns: of the cycle.
+    """
+
+    def __init__(self, period_ns: int) -> None:
+        self._period_ns = period_ns
+        self._last_ns: int | None = None
+        self._step_ns, self._owed_ns = period_ns, 0
+
+    def step(self, t_ns: int) -> int:
+        """By how much the motion goes on in the cycle at ``t_ns``, ns; one period in the first."""
+        passed_ns = self._period_ns if self._last_ns is None else t_ns - self._last_ns
+        self._last_ns = t_ns
+        due_ns, longest_ns = self._owed_ns + passed_ns, LONGEST_STEP * self._period_ns
+        self._step_ns = min(due_ns, self._step_ns + self._period_ns // QUICKER, longest_ns)
+        self._owed_ns = min(due_ns - self._step_ns, longest_ns)
+        return self._step_ns
+
+
+@dataclass(slots=True)
+class Loss:
+    """One time that a scan lost its contact.
+
+    Attributes:
+        cycle: in which it was noticed.
+        searched: how far the probe went towards the object, m.
+        regained_s: time from there to the new touch; None without one.
+    """
+
+    cycle: int
+    searched: float = 0.0
+    regained_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class TaskRecord:
+    """What a task knows at its end; a user's own controller leaves an empty one.
+
+    Attributes:
+        shape: the estimator's contacts and answers; None where no shape was asked for.
+        tool: the probe's centre as a calibration found it.
+        taxels: last image of the touch.
+        losses: lost contacts of a scan.
+        scan_cycles: first cycle of the scan or hold, and the one after its last; None before.
+        unplaced: contacts that were not used because the joints of their instant are unknown.
+        slowed: cycles in which a joint could not keep up with the probe's path.
+    """
+
+    shape: ShapeTracker | None = None
+    tool: ToolEstimate | None = None
+    taxels: NDArray[np.uint8] | None = None
+    losses: Sequence[Loss] = ()
+    scan_cycles: tuple[int, int] | None = None
+    unplaced: int = 0
+    slowed: int = 0
+
+
+class Task(Controller):
+    """A controller that carries out the task of a scene."""
+
+    def record(self) -> TaskRecord:
+        """What it knows so far."""
+        return TaskRecord()
+
+
+def record_of(controller: Controller | None) -> TaskRecord:
+    """What a controller left, whoever wrote it."""
+    return controller.record() if isinstance(controller, Task) else TaskRecord()

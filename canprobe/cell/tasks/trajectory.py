@@ -1,0 +1,215 @@
+"""A controller that follows points of a joint trajectory, as the joint trajectory controller of ros2_control does."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from canprobe.cell.master.controller import Command, Controller, Measurement
+from canprobe.cell.master.supervisor import JointGuard
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.scene.setup import SafetyLimits
+from canprobe.cell.tasks.task import MotionTime
+from canprobe.errors import UsageError
+from canprobe.mechanics.robot.model import ArmModel
+from canprobe.mechanics.touch.linear_algebra import checked, instance, real_numbers
+
+Vector = NDArray[np.float64]
+NEAR_RAD = 0.01
+"""How far a first point at time 0 may be from where the arm stands; of a joint that slides its `ArmModel.radian`."""
+BRAKE_S = 0.5
+"""How long an arm takes to stand still after a stop."""
+LOOKED_AT = 33
+"""Instants of each segment at which range, speed and workspace are checked."""
+
+
+class Trajectory(Controller):
+    """Leads the joints from where they stand through points, and holds the last one.
+
+    Between two points each joint follows a cubic in time. Without velocities of the points it passes each as a monotone
+    cubic does (Fritsch and Butland): it stays between the two points, and has speed 0 in a point that is an extreme.
+    Speeds are continuous, accelerations are not. The motion starts and ends at rest. A motion that leaves the range of
+    a joint or the workspace, or is faster than `limits.joint_speed_share` of a joint's speed, is refused before the
+    drives are enabled. Lag and torque of the drives are not considered. A trajectory is followed once. Of a stall it
+    makes up for four periods, little by little, and ends later by the rest.
+
+    Args:
+        plan: of a cell with an arm.
+        points: (time from the start, s; joint positions (n,), rad or m), in the order of time. A first one at time 0
+            must be where the arm stands, within 0.01 rad (3.5 mm).
+        velocities: (n,) of each point, rad/s or m/s; by default they follow from the points.
+        hold_s: how long the last point is held before the controller is done.
+
+    Raises:
+        UsageError: no arm, no point, times that do not ascend, wrong numbers of joints, or a point out of range.
+
+    Source: Fritsch and Butland, A method for constructing local monotone piecewise cubic interpolants, 1984.
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        points: Iterable[tuple[float, ArrayLike]],
+        velocities: Sequence[ArrayLike] | None = None,
+        *,
+        hold_s: float = 0.5,
+    ) -> None:
+        arm = instance("trajectory: plan", plan, Plan).setup.arm
+        if arm is None:
+            raise UsageError("trajectory: expected a scene with an arm; got one without")
+        self._model: ArmModel = arm.model
+        self._limits: SafetyLimits = plan.setup.limits
+        self._guard = JointGuard(plan)
+        self._times, self._q = _table(points, arm.model.n)
+        self._given = None if velocities is None else _velocities(velocities, self._q.shape)
+        self._hold_s = float(checked("trajectory: hold_s", hold_s, ()))
+        self._time = MotionTime(plan.sync.period_ns)
+        self._gone_ns: int | None = None
+        self._qd = np.empty(0)
+        if reason := self._outside_range():
+            raise UsageError(f"trajectory: {reason}")
+
+    @property
+    def duration_s(self) -> float:
+        """Time of the last point, s from the start."""
+        return float(self._times[-1])
+
+    def inspect(self, q: Vector) -> str | None:
+        """Why the motion from the joint positions q (n,), rad or m, is refused; None where it is allowed."""
+        if self._times[0] == 0.0:
+            away = np.abs(self._q[0] - q) / self._model.radian
+            if away.max() > NEAR_RAD:
+                joint = int(away.argmax())
+                its = self._model.joints[joint]
+                stands, first = (its.text(float(one[joint]), ".2f") for one in (q, self._q[0]))
+                return f"trajectory: joint {joint + 1} stands at {stands}; the first point, at time 0, is at {first}"
+        self.lead(q)
+        reason = self._outside_way()
+        return None if reason is None else f"trajectory: {reason}"
+
+    def lead(self, q: Vector, qd: Vector | None = None) -> None:
+        """Start the motion at the joint positions q, without a check.
+
+        Args:
+            q: (n,) rad or m.
+            qd: (n,) speeds there, rad/s or m/s; 0 by default.
+        """
+        if self._times[0] == 0.0:
+            self._q[0] = q
+        else:
+            self._times = np.concatenate([[0.0], self._times])
+            self._q = np.vstack([q, self._q])
+            if self._given is not None:
+                self._given = np.vstack([np.zeros_like(q), self._given])
+        if len(self._times) == 1:  # nothing but where it stands
+            self._times, self._q, self._given = np.array([0.0, 1e-3]), np.vstack([q, q]), None
+        self._qd = _slopes(self._times, self._q) if self._given is None else self._given
+        self._qd[0], self._qd[-1] = (0.0 if qd is None else qd), 0.0
+
+    @classmethod
+    def braking(cls, plan: Plan, q: Vector, qd: Vector) -> Trajectory:
+        """From a motion at q with speed qd (n,) to rest, evenly in `BRAKE_S`; within the joints' range."""
+        guard = JointGuard(plan)
+        end = np.clip(q + 0.5 * BRAKE_S * qd, guard.low, guard.high)
+        way = cls(plan, [(BRAKE_S, end)], hold_s=0.0)
+        way.lead(q, qd)
+        return way
+
+    def at(self, t_s: float) -> Vector:
+        """Joint positions (n,), rad or m, at a time from the start, s; after the last point those at it."""
+        t = min(max(t_s, 0.0), self.duration_s)
+        k = min(int(np.searchsorted(self._times, t, side="right")) - 1, len(self._times) - 2)
+        h = self._times[k + 1] - self._times[k]
+        q, _ = _cubic((t - self._times[k]) / h, h, self._q[k : k + 2], self._qd[k : k + 2])
+        return q
+
+    def step(self, measurement: Measurement) -> Command:
+        """One cycle."""
+        passed_ns = self._time.step(measurement.t_ns)
+        if self._gone_ns is None:
+            assert measurement.q is not None
+            if not self._qd.size and (reason := self.inspect(measurement.q)):
+                raise UsageError(reason)
+            passed_ns = self._gone_ns = 0
+        self._gone_ns += passed_ns
+        t = self._gone_ns * 1e-9
+        return Command(q_target=self.at(t), done=t >= self.duration_s + self._hold_s)
+
+    def _outside_range(self) -> str | None:
+        for (point, joint), q in np.ndenumerate(self._q):
+            low, high = float(self._guard.low[joint]), float(self._guard.high[joint])
+            if not low <= q <= high:
+                its = self._model.joints[joint]
+                where = f"point {point + 1}: joint {joint + 1} at {its.text(q, '.2f')}"
+                return f"{where}, outside {its.shown(low):.1f} to {its.text(high)}"
+        return None
+
+    def _outside_way(self) -> str | None:
+        """What is wrong between two points, with the time that would be enough for a speed."""
+        highest = self._model.qd_max * self._limits.speed_share
+        s = np.linspace(0.0, 1.0, LOOKED_AT)[:, None]
+        for k, h in enumerate(np.diff(self._times)):
+            q, qd = _cubic(s, h, self._q[k : k + 2], self._qd[k : k + 2])
+            where = f"at {self._times[k]:g} to {self._times[k + 1]:g} s: joint"
+            share = np.abs(qd).max(axis=0) / highest
+            if share.max() > 1.0:
+                joint = int(share.argmax())
+                its = self._model.joints[joint]
+                asked, limit = (its.text(float(v), ".1f") for v in (share[joint] * highest[joint], highest[joint]))
+                return f"{where} {joint + 1} at {asked}/s, limit {limit}/s; give it {share[joint]:.2f} times the time"
+            beyond = np.maximum(self._guard.low - q, q - self._guard.high).max(axis=0)
+            if beyond.max() > 0.0:
+                return f"{where} {int(beyond.argmax()) + 1} leaves its range between the points"
+            if self._limits.workspace is not None and (found := next(filter(None, map(self._guard.outside, q)), None)):
+                return f"at {self._times[k]:g} to {self._times[k + 1]:g} s: {found}"
+        return None
+
+
+def _table(points: Iterable[tuple[float, ArrayLike]], n: int) -> tuple[Vector, Vector]:
+    """Times (m,) s and positions (m, n) of the points, finite and in the order of time."""
+    try:
+        rows = list(points)
+    except TypeError as error:
+        raise UsageError(f"trajectory: expected (time, positions) of each point, got {points!r}") from error
+    if not rows:
+        raise UsageError("trajectory: expected (time, positions) of each point, got no point")
+    try:
+        times = real_numbers([time for time, _ in rows])
+        q = real_numbers([positions for _, positions in rows])
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"trajectory: expected (time, positions) of each point: {error}") from error
+    if times.shape != (len(rows),):
+        raise UsageError(f"trajectory: expected one time in each point, got shape {times.shape[1:]}")
+    if q.shape != (len(rows), n):
+        raise UsageError(f"trajectory: expected {n} positions in each point, got {q.shape[1:]}")
+    if not (np.isfinite(times).all() and np.isfinite(q).all()):
+        raise UsageError("trajectory: times and positions must be finite")
+    if times[0] < 0.0 or (np.diff(times) <= 0.0).any():
+        raise UsageError("trajectory: expected times from 0 on, each later than the one before")
+    return times, q
+
+
+def _velocities(velocities: Sequence[ArrayLike], shape: tuple[int, ...]) -> Vector:
+    return checked("trajectory: velocities", velocities, shape).copy()
+
+
+def _slopes(times: Vector, q: Vector) -> Vector:
+    """Speed (m, n) in each point: a weighted harmonic mean of the means beside it; 0 at the ends and in extremes."""
+    h = np.diff(times)[:, None]
+    mean = np.diff(q, axis=0) / h
+    before, after = mean[:-1], mean[1:]
+    a, b = h[:-1] + 2.0 * h[1:], 2.0 * h[:-1] + h[1:]
+    same = before * after > 0.0
+    slopes = np.zeros_like(q)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slopes[1:-1] = np.where(same, (a + b) / (a / before + b / after), 0.0)
+    return slopes
+
+
+def _cubic(s: Vector | float, h: float, q: Vector, qd: Vector) -> tuple[Vector, Vector]:
+    """Position and speed at the share s of a segment of h seconds, from those at its ends, (2, n) each."""
+    way = q[1] - q[0]
+    c2, c3 = 3.0 * way - h * (2.0 * qd[0] + qd[1]), -2.0 * way + h * (qd[0] + qd[1])
+    return q[0] + s * (h * qd[0] + s * (c2 + s * c3)), qd[0] + s * (2.0 * c2 + 3.0 * s * c3) / h

@@ -1,0 +1,458 @@
+"""Files at the edge: whole or not there, columns as `.npz`, and logs of a bus in candump's format.
+
+CAN FD frames, which here are those of more than 8 bytes, stand as `521##1<data>`: 1 is the bit rate switch.
+
+Source: can-utils, `candump -l` and `lib.c` (parse_canframe).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import math
+import re
+import zipfile
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from io import BufferedReader, BytesIO, FileIO, TextIOWrapper
+from itertools import starmap
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.errors import ResultsError, UsageError, regular_file
+from canprobe.fieldbus.bus.port import ControllerState, PlainPort, Port, TimedFrame
+from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG, Frame
+
+# candump log files: `(0000000000.002500) can0 181#37060000`, time with six digits, from 0 in a recording of ours.
+# candump pads the channel on the left (several interfaces), writes nine digits with -N, the DLC of a frame of 8 bytes
+# behind "_" with -8, and a line of its own for lost frames with -d.
+
+_LINE = re.compile(
+    r"\((?P<s>\d+)\.(?P<fraction>\d{6}(?:\d{3})?)\) +(?P<channel>\S+) (?:(?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#"
+    r"(?:R(?:[0-7]?|8(?:_[9A-Fa-f])?)|#[0-9A-Fa-f](?P<fd>(?:[0-9A-Fa-f]{2}){0,64})|"
+    r"(?P<data>(?:[0-9A-Fa-f]{2}){0,7}|(?:[0-9A-Fa-f]{2}){8}(?:_[9A-Fa-f])?))|"
+    r"(?P<xl>[0-9A-Fa-f]{5}#[0-9A-Fa-f]{2}:[0-9A-Fa-f]{2}:[0-9A-Fa-f]{8}#(?:[0-9A-Fa-f]{2})*))(?: [RT])?|"
+    r"DROPCOUNT: dropped (?P<dropped>\d+) CAN frames? on '(?P<socket>[^']+)' socket \(total drops \d+\)"
+)
+_ON_SCREEN = re.compile(r" *(?P<stamp>\([-0-9: .]+\))? *\S+ +(?:TX|RX)?[ \-BE]*[0-9A-Fa-f]{3,8} +\[ *\d+\].*")
+"""What candump prints without -l and -L: `(000.002500)  can0  181   [4]  37 06 00 00`."""
+_ENCODINGS = {
+    b"\xff\xfe": "utf-16",
+    b"\xfe\xff": "utf-16",
+    b"(\0": "utf-16-le",
+    b"\0(": "utf-16-be",
+    b"\xef\xbb": "utf-8-sig",
+}
+"""By the first two bytes; anything else is ASCII."""
+
+
+CLASSIC_BYTES = 8
+_BIT_RATE_SWITCH = 1
+_FRAMES = 32
+"""Frames that are kept as they are before they become lines, which is quicker for many at once."""
+_LINES = 256
+"""Lines that are joined before they go to the file."""
+
+
+Take = Callable[[Sequence[TimedFrame]], None]
+"""Takes frames, some at a time."""
+
+
+def _nobody(_: Sequence[TimedFrame]) -> None:
+    """Takes nothing."""
+
+
+class CandumpWriter:
+    """Writes frames as candump does; a context manager. Its `write` is a recorder for a `LockstepBus`.
+
+    A file that fails (full disk) ends the log after a whole line and raises nothing: whoever records a moving machine
+    looks at `failure`.
+
+    Args:
+        path: the file to write; an existing one is replaced.
+        channel: the name in each line.
+        t0_ns: the time on the frames' clock that is written as 0.
+
+    Raises:
+        ResultsError: the file cannot be opened.
+        UsageError: somebody else writes this file just now.
+
+    Attributes:
+        failure: why nothing is written any more; None while all is well.
+    """
+
+    def __init__(self, path: str | Path, channel: str, t0_ns: int = 0) -> None:
+        self._t0_ns = t0_ns
+        self.failure: str | None = None
+        self._path = path
+        with writing(Path(path)):
+            self._file = _opened_alone(path)
+        self._size = 0
+        self._frames: list[TimedFrame] = []  # of the channel that takes them
+        self._take: Take = _nobody
+        self._lines: list[str] = []
+        self.write = self.on(channel)
+
+    def on(self, channel: str, also: Take = _nobody) -> Callable[[int, bytes, int], None]:
+        """A recorder of the frames of one channel: called with (can_id, data, t_ns), it adds a line to this file.
+
+        Args:
+            channel: the name in its lines.
+            also: takes the same frames.
+        """
+        form = _ChannelLines(channel, self._t0_ns).line
+
+        def take(frames: Sequence[TimedFrame]) -> None:
+            self._lines += starmap(form, frames)
+            also(frames)
+
+        def write(can_id: int, data: bytes, t_ns: int) -> None:
+            if self._take is not take:
+                self._form_lines()
+                self._take = take
+            frames = self._frames
+            frames.append((can_id, data, t_ns))
+            if len(frames) >= _FRAMES:
+                self._form_lines()
+                if len(self._lines) >= _LINES:
+                    self.flush()
+
+        return write
+
+    def _form_lines(self) -> None:
+        frames, self._frames = self._frames, []
+        self._take(frames)
+
+    def flush(self) -> None:
+        """Hand what was written to the file."""
+        self._form_lines()
+        data = "".join(self._lines).encode("ascii")
+        self._lines.clear()
+        if self.failure is not None:
+            return
+        written = 0
+        try:
+            while written < len(data):
+                written += self._file.write(data[written:])
+        except OSError as error:
+            self.failure = f"{self._path}: cannot be written: {error.strerror or error}"
+            with contextlib.suppress(OSError):
+                self._file.truncate(self._size + data.rfind(b"\n", 0, written) + 1)
+        self._size += written
+
+    def close(self) -> None:
+        """Flush and close the file; twice is allowed."""
+        if not self._file.closed:
+            self.flush()
+        self._file.close()
+
+    def __enter__(self) -> CandumpWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.close()
+
+
+class _ChannelLines:
+    """Lines of one channel."""
+
+    __slots__ = ("_channel", "_names", "_prefix", "_second", "_t0_ns")
+
+    def __init__(self, channel: str, t0_ns: int) -> None:
+        self._channel, self._t0_ns = channel, t0_ns
+        self._second = -1
+        self._prefix = ""
+        self._names: dict[int, str] = {}
+
+    def line(self, can_id: int, data: bytes, t_ns: int) -> str:
+        """The line of one frame, newline included; ns below the microsecond are cut off."""
+        second, us = divmod((t_ns - self._t0_ns) // 1000, 1_000_000)
+        if second != self._second:
+            self._second, self._prefix = second, f"({second:010d}."
+        name = self._names.get(can_id)
+        if name is None:
+            name = self._names[can_id] = f") {self._channel} {_format_id(can_id)}#"
+        if len(data) > CLASSIC_BYTES:
+            payload = f"#{_BIT_RATE_SWITCH}{data.hex().upper()}"
+        else:
+            payload = "R" if can_id & RTR_FLAG else data.hex().upper()
+        return f"{self._prefix}{us:06d}{name}{payload}\n"
+
+
+def _format_id(can_id: int) -> str:
+    if can_id <= 0x7FF:
+        return f"{can_id:03X}"
+    plain = can_id & ~RTR_FLAG
+    return f"{plain & ~EFF_FLAG:08X}" if plain & EFF_FLAG else f"{plain:03X}"
+
+
+def _opened_alone(path: str | Path) -> FileIO:
+    """An empty file to write to, locked against other runs until it is closed."""
+    file = open(path, "ab", buffering=0)  # noqa: SIM115 - the caller's
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        file.close()
+        raise UsageError(f"{path}: another run writes this file; choose another folder") from None
+    except OSError:
+        pass  # a file system without locks
+    with contextlib.suppress(OSError):  # no file but a device
+        file.truncate(0)
+    return file
+
+
+CandumpLine = tuple[int, str, int, bytes]
+"""A frame of a log: t_ns, channel, can_id with the flags of `canprobe.fieldbus.bus.port`, data."""
+
+
+class CandumpReader:
+    """Reads a candump log, line by line: an iterable of `CandumpLine`. What is no CAN or CAN FD frame is counted.
+
+    Args:
+        path: the log, in ASCII, UTF-8 or UTF-16.
+        whole: a torn last line is an error like any other; else it is passed over, as a logger that is killed leaves
+            one.
+
+    Attributes:
+        number: of the line that was read last, from 1.
+        lost: frames of each channel that candump did not receive (its option -d).
+        xl: CAN XL frames of each channel.
+    """
+
+    def __init__(self, path: str | Path, *, whole: bool = False) -> None:
+        self.number = 0
+        self.lost: Counter[str] = Counter()
+        self.xl: Counter[str] = Counter()
+        self._path, self._whole = path, whole
+        self._piped: bytes | None = None
+
+    def __iter__(self) -> Iterator[CandumpLine]:
+        """Yield the frames.
+
+        Raises:
+            UsageError: the file cannot be read, or a line is not one of candump's; with file and line number.
+        """
+        try:
+            file = self._opened()
+            encoding = _ENCODINGS.get(file.peek(2)[:2], "ascii")
+            with TextIOWrapper(file, encoding, errors="replace") as lines:
+                for self.number, line in enumerate(lines, 1):
+                    text = line.rstrip("\r\n")
+                    match = _LINE.fullmatch(text)
+                    if match is None:
+                        if text and (self._whole or line.endswith("\n")):
+                            raise self._no_line(text)
+                    elif match["dropped"]:
+                        self.lost[match["socket"]] += int(match["dropped"])
+                    elif match["xl"]:
+                        self.xl[match["channel"]] += 1
+                    else:
+                        yield _frame_of(match)
+        except OSError as error:
+            raise UsageError(f"{self._path}: {error.strerror}") from error
+
+    def _opened(self) -> BufferedReader:
+        """The file from its start; what comes through a pipe is kept, as it comes once."""
+        self.lost.clear()
+        self.xl.clear()
+        path = Path(self._path)
+        if self._piped is None and path.is_fifo():
+            self._piped = path.read_bytes()
+        if self._piped is None:
+            return regular_file(path).open("rb")
+        return BufferedReader(BytesIO(self._piped))
+
+    def _no_line(self, text: str) -> UsageError:
+        where = f"{self._path}:{self.number}: no candump line: {text[:60]!r}"
+        if (shown := _ON_SCREEN.fullmatch(text)) is not None:
+            short = re.fullmatch(r"\(\d{3}\.\d+\)", shown["stamp"] or "")
+            stamps = " with stamps that are differences (-td) or count from its first frame (-tz)" if short else ""
+            return UsageError(f"{where}; it is what candump prints on a screen{stamps}; record with `candump -l` or -L")
+        form = "(seconds.microseconds) channel ID#DATA, or ID##fDATA for CAN FD"
+        return UsageError(f"{where}; expected '{form}'; python-can's can_logconvert converts other logs")
+
+
+def read_candump(path: str | Path, *, whole: bool = False) -> Iterator[CandumpLine]:
+    """Read the frames of a candump log as they stand there: see `CandumpReader`."""
+    return iter(CandumpReader(path, whole=whole))
+
+
+def _frame_of(match: re.Match[str]) -> CandumpLine:
+    t_ns = int(match["s"]) * 1_000_000_000 + int(match["fraction"].ljust(9, "0"))
+    return t_ns, match["channel"], _parse_id(match), bytes.fromhex(match["fd"] or (match["data"] or "")[:16])
+
+
+def _parse_id(match: re.Match[str]) -> int:
+    can_id = int(match["id"], 16)
+    if len(match["id"]) == 8:  # 29 bits, or an error frame, which carries its own flag in the text
+        can_id = can_id | EFF_FLAG if can_id <= 0x1FFFFFFF else can_id
+    return can_id | RTR_FLAG if match["data"] is None and match["fd"] is None else can_id
+
+
+class RecordingPort(PlainPort):
+    """A `Port` that writes down what passes through it, sent frames with the time of sending.
+
+    In real time a received frame is written when it is drained, with the time of its reception, so a line may be older
+    than the line above it.
+
+    Args:
+        port: the port to use.
+        write: called with (can_id, data, t_ns), such as `CandumpWriter.write`.
+    """
+
+    def __init__(self, port: Port, write: Callable[[int, bytes, int], None]) -> None:
+        self._port = port
+        self._write = write
+        self.clock, self.channel, self.counters = port.clock, port.channel, port.counters
+        self.stamps_arrival, self.wait, self.close = port.stamps_arrival, port.wait, port.close
+
+    @property
+    def state(self) -> ControllerState:
+        """That of the port."""
+        return self._port.state
+
+    @property
+    def descriptor(self) -> int | None:
+        """That of the port."""
+        return self._port.descriptor
+
+    def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
+        """Send `frames` and write them down, with `t_ns` where it is given."""
+        sent_ns = self.clock.now_ns() if t_ns is None else t_ns
+        self._port.send_batch(frames)
+        for can_id, data in frames:
+            self._write(can_id, data, sent_ns)
+
+    def drain(self) -> list[TimedFrame]:
+        """Return what arrived, written down."""
+        frames = self._port.drain()
+        for can_id, data, t_ns in frames:
+            self._write(can_id, data, t_ns)
+        return frames
+
+
+# Files that are whole or not there, whatever stops the writing.
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """A block that writes a file, or makes or removes one.
+
+    Raises:
+        ResultsError: the system refuses that: a full disk, no permission, no such folder, another file in the way.
+    """
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise ResultsError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder for files, and those above it, where they are missing.
+
+    Raises:
+        ResultsError: it cannot be made, or is no folder.
+    """
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+
+
+@contextlib.contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """A file that is written whole, under the name that is given to the block, or not at all.
+
+    That name is of the same folder and has the same suffix, by which libraries choose what to write. A block that
+    writes nothing there leaves everything as it was.
+
+    Args:
+        path: what it is called afterwards; an older one is replaced, a link followed, a device or a pipe written to.
+
+    Raises:
+        ResultsError: it cannot be written, for example on a full disk or without permission; an older one is as it
+            was.
+    """
+    whole = path.resolve()
+    part = whole if path.exists() and not path.is_file() else whole.with_name(f".part-{whole.name}")
+    try:
+        yield part
+        if part != whole and part.exists():
+            part.replace(whole)
+    except BaseException as error:
+        if part != whole:
+            with contextlib.suppress(OSError):
+                part.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename in (None, str(part)):  # else of something else
+            with writing(path):
+                raise
+        raise
+
+
+def write_text(path: Path, text: str, *, encoding: str = "utf-8", newline: str | None = None) -> None:
+    """Write a text file whole: see `whole_file`; encoding and line ends as for `open`."""
+    with whole_file(path) as part:
+        part.write_text(text, encoding=encoding, newline=newline)
+
+
+# Columns in an ``.npz`` file.
+
+
+def write_npz(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
+    """Write arrays into exactly this file, compressed, whole: numpy would append ``.npz`` to a name.
+
+    The lowest level of compression takes half the time of numpy's; the files are up to 13 % larger.
+    """
+    with (
+        whole_file(path) as part,
+        part.open("wb") as file,
+        zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as saved,
+    ):
+        for name, column in columns.items():
+            with saved.open(f"{name}.npy", "w", force_zip64=True) as entry:
+                np.lib.format.write_array(entry, np.asanyarray(column), allow_pickle=False)
+
+
+def read_npz(path: Path, expected: str = "an .npz of a run") -> dict[str, NDArray[Any]]:
+    """Every array of an ``.npz`` file.
+
+    Args:
+        path: of the file.
+        expected: what it should be, in words.
+
+    Raises:
+        UsageError: no such file, or it is cut off, empty or something else; memory is asked for what is in the file,
+            whatever its headers say.
+    """
+    try:
+        with regular_file(path).open("rb") as opened:
+            if opened.read(len(np.lib.format.MAGIC_PREFIX)) == np.lib.format.MAGIC_PREFIX:
+                raise ValueError("a single array")
+            with zipfile.ZipFile(opened) as saved:
+                return {entry.filename.removesuffix(".npy"): _read_array(saved, entry) for entry in saved.infolist()}
+    except Exception as error:  # zip files, their compression and numpy's headers each have their own
+        raise UsageError(f"{path}: expected {expected}; cannot be read: {_why(error)}") from error
+
+
+def _why(error: Exception) -> str:
+    """What a reader of files says, in a line."""
+    text = error.strerror if isinstance(error, OSError) else None
+    return (text or str(error) or type(error).__name__).partition("\n")[0]
+
+
+def _read_array(saved: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any]:
+    """One array of plain values, whose header and size agree."""
+    with saved.open(entry) as file:
+        version = np.lib.format.read_magic(file)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, fortran, dtype = read(file)
+        if dtype.hasobject:
+            raise ValueError(f"{entry.filename} holds Python objects")
+        if math.prod(shape) * dtype.itemsize != entry.file_size - file.tell():
+            raise ValueError(f"{entry.filename} is no array of shape {shape}, as its header says")
+        flat = np.frombuffer(bytearray(file.read()), dtype)
+    return flat.reshape(shape, order="F" if fortran else "C")

@@ -1,0 +1,211 @@
+"""A recorded bus whose clock was set while it was recorded (NTP, suspend): its frames with stamps that go on.
+
+The cell sends SYNC in one period, so the SYNCs of a channel show a clock that was set: their stamps go back, or leap
+over a pause in which nothing else was sent either, and go on from there for good. The lines keep their order, and all
+later stamps of that channel are shifted until SYNC goes on in its period. A clock that was set back by less than lines
+may be out of order shows by the SYNCs on both sides, counted in periods. Before the first SYNC a step back is mended,
+too, without the time that passed. Frames whose lines are in another order than their stamps stay so: whoever needs
+their order sorts them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from statistics import median
+
+from canprobe.errors import UsageError
+from canprobe.fieldbus.bus.candump import CandumpLine, CandumpReader
+from canprobe.fieldbus.protocol.frames import SYNC_ID
+
+DISORDER_NS = 10_000_000
+"""Lines may be in another order than their stamps by so much; the stamp of a SYNC that is older was set back."""
+STRAY_NS = 1_000_000_000
+"""A single SYNC that is older by more belongs nowhere."""
+PAUSE_NS = 500_000_000
+"""No frame of a running cell for so long: the recorder slept, or its clock was set forward."""
+_SYNCS_AFTER = 3
+"""SYNCs after a step that show that it is for good."""
+_PERIODS_LEFT = 20
+"""SYNC periods that a pause may leave to the SYNCs beside it; the bring-up of a cell takes longer."""
+_SYNCS_COUNTED = 12
+"""SYNCs on each side of a small step that say by how much."""
+_TIMELESS_NS = 100_000
+"""SYNCs that are nearer to each other, by the middle half of their stamps, have no stamps of a clock."""
+_MOST_TOLD = 5
+
+
+@dataclass(frozen=True, slots=True)
+class ClockStep:
+    """A step of the clock in a log.
+
+    Attributes:
+        line: of the first frame behind it.
+        channel: whose stamps step.
+        step_ns: by how much the clock was set, without the time that passed; negative: back.
+    """
+
+    line: int
+    channel: str
+    step_ns: int
+
+    def text(self) -> str:
+        """One line of a report."""
+        way = "forward" if self.step_ns > 0 else "back"
+        return (
+            f"line {self.line}: the stamps of {self.channel} step {way} by {abs(self.step_ns) * 1e-9:.3f} s for good:"
+            " the clock was set, or slept; the lines keep their order and later stamps are shifted"
+        )
+
+
+@dataclass(slots=True)
+class _Leap:
+    """Between two lines of a channel: the second line's number, and its stamp less the latest before it."""
+
+    line: int = 0
+    ns: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class _Sync:
+    """A SYNC in a log: its line, its stamp, and the farthest leaps back and forward since the SYNC before."""
+
+    line: int
+    t_ns: int
+    back: _Leap
+    forward: _Leap
+
+
+@dataclass(slots=True)
+class _Channel:
+    """What the first pass keeps of a channel."""
+
+    latest_ns: int | None = None
+    back: _Leap = field(default_factory=_Leap)
+    forward: _Leap = field(default_factory=_Leap)
+    syncs: list[_Sync] = field(default_factory=list)
+
+    def take(self, line: int, t_ns: int, can_id: int) -> None:
+        leap = 0 if self.latest_ns is None else t_ns - self.latest_ns
+        if leap < self.back.ns:
+            self.back = _Leap(line, leap)
+        elif leap > self.forward.ns:
+            self.forward = _Leap(line, leap)
+        self.latest_ns = t_ns
+        if can_id == SYNC_ID:
+            self.syncs.append(_Sync(line, t_ns, self.back, self.forward))
+            self.back, self.forward = _Leap(), _Leap()
+
+
+def _are_early(syncs: list[_Sync], i: int, period: int) -> bool:
+    """Whether the SYNCs from the i-th on are early for good, against those before, by more than half a period."""
+    sides = []
+    for side in (range(max(i - _SYNCS_COUNTED, 0), i), range(i, min(i + _SYNCS_COUNTED, len(syncs)))):
+        offsets = [syncs[k].t_ns - k * period for k in side]
+        middle = round(median(offsets))
+        if 4 * sum(abs(offset - middle) <= period // 4 for offset in offsets) < 3 * _SYNCS_COUNTED:
+            return False  # too few that go on in their period: lines in another order, or the SYNCs of two masters
+        sides.append(middle)
+    return 2 * (sides[0] - sides[1]) > period
+
+
+class RecordedBus:
+    """The frames of a candump log, in the order of its lines, with stamps on one clock. It is read twice.
+
+    Args:
+        path: the log, as for `CandumpReader`.
+
+    Attributes:
+        steps: where the clock was set, by line.
+        lost: frames of each channel that candump did not receive.
+        xl: CAN XL frames of each channel.
+
+    Raises:
+        UsageError: as `CandumpReader`; the stamps are no times, or stand still where they step and step back.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._reader = CandumpReader(path)
+        channels: dict[str, _Channel] = {}
+        for t_ns, name, can_id, _ in self._reader:
+            channel = channels.get(name)
+            if channel is None:
+                channel = channels[name] = _Channel()
+            channel.take(self._reader.number, t_ns, can_id)
+        self.lost, self.xl = dict(self._reader.lost), dict(self._reader.xl)
+        self._shifts: dict[tuple[str, int], int] = {}
+        found = (step for name, channel in channels.items() for step in self._steps_of(name, channel.syncs))
+        self.steps = tuple(sorted(found, key=lambda step: step.line))
+
+    def __iter__(self) -> Iterator[CandumpLine]:
+        if not self._shifts:
+            yield from self._reader
+            return
+        shift_of: dict[str, int] = {}
+        for t_ns, channel, can_id, data in self._reader:
+            if (shift := self._shifts.get((channel, self._reader.number))) is not None:
+                shift_of[channel] = shift
+            yield t_ns + shift_of.get(channel, 0), channel, can_id, data
+
+    def notes(self) -> list[str]:
+        """What was mended, as lines of a report."""
+        told = [step.text() for step in self.steps[:_MOST_TOLD]]
+        more = len(self.steps) - _MOST_TOLD
+        return [*told, f"and {more} more steps of the clock"] if more > 0 else told
+
+    def _steps_of(self, channel: str, syncs: list[_Sync]) -> Iterator[ClockStep]:
+        """The steps of one channel; what shifts its stamps from which line on is kept."""
+        if len(syncs) <= _SYNCS_AFTER:
+            return
+        self._refuse_no_times(channel, [sync.t_ns for sync in syncs])
+        period = round(median(b.t_ns - a.t_ns for a, b in pairwise(syncs)))
+        shift, first = 0, syncs[0]
+        if first.back.ns < -DISORDER_NS and first.back.ns + first.forward.ns < -DISORDER_NS:  # no stray frame
+            shift = self._shifts[channel, first.back.line] = -first.back.ns
+            yield ClockStep(first.back.line, channel, first.back.ns)
+        last_ns = first.t_ns + shift
+        for i, sync in enumerate(syncs[1:], 1):
+            at_ns = sync.t_ns + shift
+            if last_ns - DISORDER_NS <= at_ns < last_ns + period // 2 and _are_early(syncs, i, period):
+                step, line = last_ns + period - at_ns, sync.back.line or sync.line
+                shift += step
+                last_ns = at_ns + step
+                self._shifts[channel, line] = shift
+                yield ClockStep(line, channel, -step)
+                continue
+            pause = sync.forward.ns >= PAUSE_NS and at_ns - last_ns - sync.forward.ns <= _PERIODS_LEFT * period
+            if at_ns >= last_ns - DISORDER_NS and not pause:
+                last_ns = max(last_ns, at_ns)
+                continue
+            leap = sync.forward if pause else sync.back
+            after = [later.t_ns + shift - k * period for k, later in enumerate(syncs[i : i + 1 + _SYNCS_AFTER])]
+            for_good = all((2 * t_ns > at_ns + last_ns) == pause for t_ns in after)
+            if not for_good and (pause or at_ns < last_ns - STRAY_NS):
+                raise UsageError(
+                    f"{self._path}:{sync.line}: the SYNC of {channel} is {abs(at_ns - last_ns) * 1e-9:.3f} s"
+                    f" {'after' if pause else 'before'} the one above, and later ones are not: its clock was set to"
+                    " and fro, or lines of two logs are mixed; cut the log there"
+                )
+            if not for_good:  # a stray frame: its stamp says where it belongs
+                continue
+            step = max(last_ns + period - at_ns, -leap.ns)
+            shift += step
+            last_ns = at_ns + step
+            self._shifts[channel, leap.line] = shift
+            yield ClockStep(leap.line, channel, -step)
+
+    def _refuse_no_times(self, channel: str, stamps: list[int]) -> None:
+        quarter = len(stamps) // 4
+        middle = sorted(stamps)[quarter : len(stamps) - quarter]
+        if middle[-1] - middle[0] >= _TIMELESS_NS * (len(middle) // 2):
+            return
+        if stamps[0] == stamps[-1] == min(stamps) == max(stamps):
+            what = "all the same, as candump -H writes them without stamps of the hardware"
+        else:
+            what = "differences from line to line (delta stamps, as of candump -td), no times"
+        raise UsageError(
+            f"{self._path}: the stamps of {channel} are {what}; record with `candump -l`, or -L with -ta or -tz"
+        )

@@ -1,0 +1,329 @@
+"""Open a CAN interface by name; a `Port` over any of python-can's, for adapters that SocketCAN does not drive."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import can
+
+from canprobe.errors import InterfaceError, UsageError, install_line
+from canprobe.fieldbus.bus.port import (
+    ERR_BUS,
+    ERR_FLAG,
+    Clock,
+    ControllerState,
+    PlainPort,
+    Port,
+    PortCounters,
+    Reports,
+    TimedFrame,
+    state_after,
+)
+from canprobe.fieldbus.bus.real.mmsg import HAS_BATCHES
+from canprobe.fieldbus.protocol.frame_bits import FD_LENGTHS
+from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG, Frame
+
+# Open a CAN interface by name.
+
+
+def open_port(
+    interface: str,
+    channel: str,
+    bitrate: int,
+    clock: Clock,
+    *,
+    data_bitrate: int | None = None,
+    waits: bool = False,
+    reports: Reports | None = None,
+) -> Port:
+    """Open `channel` of `interface`.
+
+    Args:
+        interface: `socketcan` for a raw socket of our own, or any of python-can's interfaces.
+        channel: the channel as that interface names it, such as `can0`.
+        bitrate: in bit/s; a SocketCAN interface has its own, set with `ip link`.
+        clock: a clock in real time.
+        data_bitrate: of the data phase of CAN FD frames; None: classical frames only.
+        waits: wait for a full transmit queue as long as it takes; only SocketCAN can.
+        reports: who hears of error frames, and of what the user has to know.
+
+    Raises:
+        UsageError: there is no interface of that name.
+        InterfaceError: it is missing, down, or cannot be opened; with what to do.
+    """
+    if interface == "socketcan" and HAS_BATCHES:  # else python-can's
+        from canprobe.fieldbus.bus.real.socketcan import SocketCanPort
+
+        return SocketCanPort(channel, clock, bitrate=bitrate, data_bitrate=data_bitrate, waits=waits, reports=reports)
+    if interface in ("lockstep", "direct"):
+        what = "a lockstep bus lives inside one run" if interface == "lockstep" else "--bus direct has no bus"
+        raise UsageError(f"{channel}: {what}; there is nothing to open")
+    return PythonCanPort(interface, channel, bitrate, clock, data_bitrate=data_bitrate, reports=reports)
+
+
+# Which received frames are our own, on a bus that gives a sender back what it sent.
+
+_LIFE_NS = 1_000_000_000
+
+
+class Echoes:
+    """The first frame that equals one we sent is taken for its echo, once.
+
+    Somebody else's frame with the same identifier and data comes besides the echo, so one of the two is kept. An echo
+    that does not come within a second is waited for no longer.
+    """
+
+    def __init__(self) -> None:
+        self._waiting: dict[Frame, deque[int]] = {}
+
+    def sent(self, frame: Frame, t_ns: int) -> None:
+        """Note a frame of ours."""
+        self._waiting.setdefault(frame, deque()).append(t_ns)
+
+    def is_one(self, frame: Frame, t_ns: int) -> bool:
+        """Whether a received frame is the echo of one that was sent, which it then answers for."""
+        waiting = self._waiting.get(frame)
+        while waiting and t_ns - waiting[0] > _LIFE_NS:
+            waiting.popleft()
+        if not waiting:
+            self._waiting.pop(frame, None)
+            return False
+        waiting.popleft()
+        if not waiting:
+            del self._waiting[frame]
+        return True
+
+
+# A `Port` over any python-can interface: the portable way, for adapters that SocketCAN does not drive.
+#
+# Frames are stamped with the time at which they are taken from python-can, whose own stamps differ between interfaces.
+# It costs some 10 µs a frame; for SocketCAN use `canprobe.fieldbus.bus.real.socketcan`.
+
+_EXTENDED_MASK = 0x1FFFFFFF
+CLASSIC_BYTES = 8
+_STATES = {
+    can.BusState.ACTIVE: ControllerState.ACTIVE,
+    can.BusState.PASSIVE: ControllerState.PASSIVE,
+    can.BusState.ERROR: ControllerState.BUS_OFF,
+}
+_HEARS_ITSELF = ("udp_multicast",)
+"""Interfaces on which python-can gives a sender its own frames back, without a mark on them."""
+_HAS_CLASSES = ("socketcan", "socketcand")
+"""Interfaces whose error frames have SocketCAN's class bits; those of others are bus errors."""
+
+
+class PythonCanPort(PlainPort):
+    """One python-can bus.
+
+    Args:
+        interface: python-can's name of the interface, such as `virtual`, `pcan`, `slcan`.
+        channel: the channel as that interface names it.
+        bitrate: in bit/s, for interfaces that set it themselves.
+        clock: the clock for waits and stamps.
+        data_bitrate: of the data phase of CAN FD frames; None: classical frames only.
+        reports: who hears of error frames.
+
+    Attributes:
+        counters: what has passed; `ignored` are CAN FD frames where they are not wanted.
+        state: the controller's state as of the last error frame.
+
+    Raises:
+        UsageError: python-can has no such interface.
+        InterfaceError: python-can cannot open it, with its reason.
+    """
+
+    def __init__(
+        self,
+        interface: str,
+        channel: str,
+        bitrate: int,
+        clock: Clock,
+        *,
+        data_bitrate: int | None = None,
+        reports: Reports | None = None,
+    ) -> None:
+        self._fd = data_bitrate is not None
+        self._reports = reports or Reports()
+        self._has_classes = interface in _HAS_CLASSES
+        self.clock = clock
+        self.channel = channel
+        self.counters = PortCounters()
+        self.state = ControllerState.ACTIVE
+        self._arrived: deque[can.Message] = deque()
+        self._echoes = Echoes() if interface in _HEARS_ITSELF else None
+        self._bus: can.BusABC | None = _open(interface, channel, bitrate, data_bitrate)
+
+    stamps_arrival = False
+
+    def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
+        """Send `frames` in order, one call of python-can each."""
+        bus = self._open_bus()
+        for can_id, data in frames:
+            message = _message(self.channel, can_id, data, self._fd)
+            try:
+                bus.send(message)
+            except can.CanError as error:
+                self.counters.transmit_full += 1
+                raise InterfaceError(f"{self.channel}: sending {can_id:03X} failed: {error}") from error
+            self.counters.sent += 1
+            if self._echoes is not None:
+                self._echoes.sent((can_id, data), self.clock.now_ns())
+
+    def drain(self) -> list[TimedFrame]:
+        """Return everything that has arrived, stamped now."""
+        bus = self._open_bus()
+        arrived = self._arrived
+        while (message := self._receive(bus, 0.0)) is not None:
+            arrived.append(message)
+        t_ns = self.clock.now_ns()
+        frames = [frame for message in arrived if (frame := self._frame(message, t_ns)) is not None]
+        arrived.clear()
+        if self._echoes is not None:
+            frames = [frame for frame in frames if not self._echoes.is_one(frame[:2], t_ns)]
+        self.counters.received += len(frames)
+        return frames
+
+    def wait(self, until_ns: int) -> None:
+        """Wait for a frame, until `until_ns` at the latest."""
+        bus = self._open_bus()
+        while not self._arrived and (left_ns := until_ns - self.clock.now_ns()) > 0:
+            message = self._receive(bus, left_ns * 1e-9)
+            if message is not None:
+                self._arrived.append(message)
+
+    def close(self) -> None:
+        """Shut the python-can bus down."""
+        bus, self._bus = self._bus, None
+        if bus is not None:
+            bus.shutdown()
+
+    def _open_bus(self) -> can.BusABC:
+        if self._bus is None:
+            raise InterfaceError(f"{self.channel}: this port is closed")
+        return self._bus
+
+    def _receive(self, bus: can.BusABC, timeout_s: float) -> can.Message | None:
+        try:
+            return bus.recv(timeout_s)
+        except can.CanError as error:
+            raise InterfaceError(f"{self.channel}: receiving failed: {error}") from error
+
+    def _frame(self, message: can.Message, t_ns: int) -> TimedFrame | None:
+        if message.is_error_frame:
+            self._note_error(message, t_ns)
+            return None
+        if message.is_fd and not self._fd:
+            self.counters.ignored += 1
+            return None
+        can_id = message.arbitration_id
+        if message.is_extended_id:
+            can_id |= EFF_FLAG
+        if message.is_remote_frame:
+            return can_id | RTR_FLAG, b"", t_ns
+        return can_id, bytes(message.data), t_ns
+
+    def _note_error(self, message: can.Message, t_ns: int) -> None:
+        data = bytes(message.data)
+        if self._has_classes:
+            can_id = ERR_FLAG | message.arbitration_id
+            self.state = state_after(self.state, can_id, data)
+        else:
+            can_id = ERR_FLAG | ERR_BUS
+            self.state = _STATES.get(self._open_bus().state, self.state)
+        self.counters.note_error(can_id, data)
+        self._reports.error_frame(can_id, data, t_ns)
+
+
+def interface_names() -> list[str]:
+    """The interfaces that python-can knows."""
+    return sorted(can.VALID_INTERFACES)
+
+
+def _open(interface: str, channel: str, bitrate: int, data_bitrate: int | None) -> can.BusABC:
+    logging.getLogger("can").setLevel(logging.CRITICAL)
+    if interface not in (names := interface_names()):
+        raise UsageError(f"{channel}: no interface {interface!r}; python-can has: {', '.join(names)}")
+    options: dict[str, Any] = {"interface": interface, "channel": channel, "bitrate": bitrate}
+    if data_bitrate is not None:
+        options |= {"fd": True, "data_bitrate": data_bitrate}
+        if interface == "virtual":
+            options = {**options, "protocol": can.CanProtocol.CAN_FD}
+    try:
+        return can.Bus(**options)
+    except (can.CanError, OSError, ValueError, TypeError, ImportError) as error:
+        missing = interface == "udp_multicast" and importlib.util.find_spec("msgpack") is None
+        way = f": {install_line('can')}" if missing else ""
+        raise InterfaceError(f"{channel}: {interface} cannot be opened: {error}{way}") from error
+    except Exception as error:  # where a driver's library is missing, python-can trips over anything
+        why = f"is its driver installed? python-can says {type(error).__name__}: {error}"
+        raise InterfaceError(f"{channel}: {interface} cannot be opened; {why}") from error
+
+
+def _message(channel: str, can_id: int, data: bytes, fd: bool) -> can.Message:
+    extended = bool(can_id & EFF_FLAG)
+    long = len(data) > CLASSIC_BYTES
+    try:
+        if long and fd and len(data) not in FD_LENGTHS:
+            raise ValueError(f"CAN FD has {', '.join(map(str, FD_LENGTHS))}")
+        return can.Message(
+            arbitration_id=can_id & (_EXTENDED_MASK if extended else ~RTR_FLAG),
+            data=data,
+            is_extended_id=extended,
+            is_remote_frame=bool(can_id & RTR_FLAG),
+            is_fd=fd and long,
+            bitrate_switch=fd and long,
+            check=True,
+        )
+    except ValueError as error:
+        what = f"{can_id:X} with {len(data)} bytes is no {'CAN or CAN FD' if fd else 'classic CAN'} frame"
+        raise InterfaceError(f"{channel}: {what}: {error}") from error
+
+
+# The bus that python-can's own configuration names: CAN_INTERFACE and its kin, CAN_CONFIG, can.conf, ~/.canrc.
+#
+# Source: python-can manual, "Configuration".
+
+
+@dataclass(frozen=True, slots=True)
+class ConfiguredBus:
+    """What the configuration says; None where it says nothing."""
+
+    interface: str
+    channel: str | None
+    bitrate: int | None
+
+
+def configured_bus() -> ConfiguredBus | None:
+    """Read python-can's configuration; None where no interface is configured.
+
+    Raises:
+        UsageError: it cannot be read, or names an interface that python-can does not know.
+    """
+    import json
+
+    import can.util
+
+    named: dict[str, Any] = {}
+    try:
+        named = {**can.util.load_file_config(), **can.util.load_environment_config(), **can.rc}
+        if not (named.get("interface") or named.get("bustype")):
+            return None
+        found = can.util.load_config()
+        channel, bitrate = found.get("channel"), found.get("bitrate")
+        return ConfiguredBus(
+            interface=str(found["interface"]),
+            channel=None if channel is None else str(channel),
+            bitrate=None if bitrate is None else int(bitrate),
+        )
+    except can.CanInterfaceNotImplementedError as error:
+        names = ", ".join(sorted(can.VALID_INTERFACES))
+        raise UsageError(f"python-can's configuration: {error}; python-can has: {names}") from error
+    except json.JSONDecodeError as error:
+        raise UsageError(f"CAN_CONFIG is no JSON: {error}") from error
+    except (ValueError, TypeError) as error:
+        raise UsageError(f"python-can's configuration: {error}") from error

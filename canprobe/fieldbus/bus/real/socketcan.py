@@ -1,0 +1,502 @@
+"""A `Port` on a SocketCAN interface, with a raw socket of its own: bursts of frames a system call, kernel time stamps.
+
+Time stamps are those of the kernel at reception (CLOCK_REALTIME), brought to CLOCK_MONOTONIC by the difference between
+the two clocks, which is looked at again after each sending (`StampClock`): a wall clock that is set is noticed and
+counted.
+29-bit identifiers and remote requests are passed with `EFF_FLAG` and `RTR_FLAG`. With a data bit rate frames of more
+than 8 bytes are CAN FD frames with bit-rate switch; without it none are received.
+
+What the controller cannot send waits in two places: the interface's transmit queue (`txqueuelen`; ENOBUFS when it is
+full) and, counted in bytes, the socket's send buffer (about 277 frames; EAGAIN). Closing the socket empties neither.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import fcntl
+import os
+import select
+import socket
+import struct
+import time
+from collections.abc import Callable, Collection, Sequence
+
+from canprobe.errors import InterfaceError
+from canprobe.fieldbus.bus.port import (
+    ERR_FLAG,
+    Clock,
+    ControllerState,
+    PortCounters,
+    Reports,
+    TimedFrame,
+    Timespec,
+    state_after,
+)
+from canprobe.fieldbus.bus.real.link import TX_QUEUE, drop_queued, emptying_line, ip_line, setting_line, sudo
+from canprobe.fieldbus.bus.real.mmsg import CLASSIC_BYTES, SO_RXQ_OVFL, SO_TIMESTAMPNS, FrameSocket, Row
+from canprobe.fieldbus.protocol.frame_bits import FD_LENGTHS
+from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG, Frame
+
+_SOL_CAN_RAW = 101
+_CAN_RAW_FILTER = 1
+_CAN_RAW_ERR_FILTER = 2
+_CAN_RAW_FD_FRAMES = 5
+_CAN_RAW_JOIN_FILTERS = 6
+_CAN_INV_FILTER = 0x20000000
+_SINGLE_WAIT_US = 2000  # how late a deadline may be served on an idle bus
+_CAN_ERR_MASK = 0x1FFFFFFF
+_SO_RCVBUFFORCE = 33
+_SO_MEMINFO, _MEMINFO, _WMEM_ALLOC = 55, struct.Struct("=9I"), 2
+_SIOCGIFFLAGS = 0x8913
+_SIOCGIFMTU = 0x8921
+_SIOCGIFTXQLEN = 0x8942
+_CANFD_MTU = 72
+_IFF_UP = 0x1
+_RECEIVE_BUFFER = 4 << 20
+_RETRY_S, _LATER_RETRY_S = 200e-6, 2e-3
+_PATIENCE_NS = 10_000_000
+_TELL_NS = 1_000_000_000
+"""A port that waits reports a queue that has been full for so long."""
+_STUCK_NS, _LINGER_NS = 100_000_000, 1_000_000_000
+"""How long a port that closes waits for the next queued frame to leave, and for all of them."""
+_COMPARE_NS = 1_000_000
+"""Time of stamps after which the two clocks are compared again: less than a cycle."""
+_ALIKE_NS = 50_000
+"""Difference that is none: reading both clocks takes as long in a virtual machine. No TPDO follows its SYNC sooner."""
+
+
+class StampClock:
+    """Brings stamps of CLOCK_REALTIME to CLOCK_MONOTONIC, and notices when the wall clock was set.
+
+    NTP slows down and speeds up both clocks alike, so their difference stays the same until somebody sets the wall
+    clock: chrony or ntpd after a long absence, `date`, a leap second. Two readings tell whether it is the same.
+
+    Args:
+        realtime_ns, monotonic_ns: read the clocks.
+
+    Attributes:
+        offset_ns: realtime minus monotonic.
+    """
+
+    def __init__(
+        self, realtime_ns: Callable[[], int] = time.time_ns, monotonic_ns: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        self._realtime_ns, self._monotonic_ns = realtime_ns, monotonic_ns
+        self._compared_ns = 0
+        self.offset_ns, _ = self._measure()
+
+    def doubt(self) -> None:
+        """Compare the clocks for the next frames, however soon they come."""
+        self._compared_ns = 0
+
+    def follow(self, oldest_ns: int, newest_ns: int) -> int:
+        """Compare the clocks, unless all of these stamps are of the millisecond after the last comparison.
+
+        A stamp of a frame that came after it and is older shows by itself that the wall clock was set back.
+
+        Returns:
+            By how much the wall clock was set since the last comparison, ns, negative for back; 0 where it was not.
+        """
+        if self._compared_ns <= oldest_ns and newest_ns < self._compared_ns + _COMPARE_NS:
+            return 0
+        self._compared_ns = self._realtime_ns()
+        if abs(self._compared_ns - self._monotonic_ns() - self.offset_ns) <= _ALIKE_NS:
+            return 0
+        offset_ns, doubt_ns = self._measure()  # this process may only have waited between the two readings
+        step_ns = offset_ns - self.offset_ns
+        if abs(step_ns) <= _ALIKE_NS + doubt_ns:
+            return 0
+        self.offset_ns = offset_ns
+        return step_ns
+
+    def _measure(self) -> tuple[int, int]:
+        """The difference of the clocks and what it may be off by, ns, from the quickest of three readings."""
+        readings = []
+        for _ in range(3):
+            before = self._monotonic_ns()
+            realtime = self._realtime_ns()
+            after = self._monotonic_ns()
+            readings.append((after - before, realtime - (before + after) // 2))
+        doubt_ns, offset_ns = min(readings)
+        return offset_ns, doubt_ns
+
+
+class SocketCanPort:
+    """One raw socket on one interface; it does not hear itself, but it hears every other socket of this machine.
+
+    Args:
+        channel: the interface, such as `can0`.
+        clock: a clock that shows CLOCK_MONOTONIC.
+        bitrate: that the interface is to have, bit/s: for the lines to type; it is not looked at.
+        data_bitrate: send and receive CAN FD frames too; None: classical frames only.
+        waits: wait for a full queue as long as it takes, as a device does for its bus; else up to 10 ms.
+        reports: who hears of error frames, of a queue that is waited for and of frames that are left in it.
+
+    Attributes:
+        counters: what has passed.
+        state: the controller's state as of the last error frame; ACTIVE before the first.
+
+    Raises:
+        InterfaceError: the interface is missing, down, no CAN interface, or not set up for CAN FD; with the line to
+            type.
+    """
+
+    def __init__(
+        self,
+        channel: str,
+        clock: Clock,
+        *,
+        bitrate: int = 1_000_000,
+        data_bitrate: int | None = None,
+        waits: bool = False,
+        reports: Reports | None = None,
+    ) -> None:
+        self._fd = fd = data_bitrate is not None
+        self._setting = setting_line(channel, bitrate, data_bitrate)
+        self._waits = waits
+        self._reports = reports or Reports()
+        check_interface(channel, self._setting)
+        if fd:
+            _check_fd(channel, self._setting)
+        self.clock = clock
+        self.channel = channel
+        self.counters = PortCounters()
+        self.state = ControllerState.ACTIVE
+        self._socket = _open(channel, fd=fd)
+        self._frames = FrameSocket(self._socket, fd)
+        self._patient: socket.socket | None = None
+        self._patient_frames: FrameSocket | None = None
+        self._dropped = [0, 0]
+        self._poll = _Poll(self._socket.fileno())
+        self._blocks = False
+        self._stamps = StampClock(monotonic_ns=clock.now_ns)
+        self._told_ns = 0
+
+    stamps_arrival = True
+
+    @property
+    def descriptor(self) -> int:
+        """The socket; it is not readable for frames that wake nobody (`defer`)."""
+        self._check_open()
+        return self._socket.fileno()
+
+    def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
+        """Send `frames` in order; a full queue is waited for.
+
+        Raises:
+            InterfaceError: the queue stays full, the interface is down or gone, or a frame is none.
+        """
+        self._check_open()
+        self._stamps.doubt()  # no answer may seem to be older than what it answers
+        for can_id, data in frames:
+            long = len(data) > CLASSIC_BYTES and not (self._fd and len(data) in FD_LENGTHS)
+            if long or (can_id > 0x7FF and can_id < ERR_FLAG):
+                kind = "CAN or CAN FD" if self._fd else "classic CAN"
+                raise InterfaceError(f"{self.channel}: {can_id:X} with {len(data)} bytes is no {kind} frame")
+        sent = 0
+        full_ns: int | None = None
+        while sent < len(frames):
+            try:
+                sent += self._frames.send(frames[sent:] if sent else frames)
+            except OSError as error:
+                full_ns = self.clock.now_ns() if full_ns is None else full_ns
+                self._await_room(error, full_ns, len(frames) - sent)
+        self.counters.sent += sent
+
+    def drain(self) -> list[TimedFrame]:
+        """Return every frame that has arrived, with the kernel's time of its arrival."""
+        self._check_open()
+        return self._take(wait=False)
+
+    def _take(self, wait: bool) -> list[TimedFrame]:
+        try:
+            rows = self._frames.receive(wait)
+        except OSError as error:
+            raise self._failed(error) from error
+        if rows:
+            self._count_drops(0, rows)
+        if self._patient_frames is not None and (patient := self._patient_frames.receive()):
+            self._count_drops(1, patient)
+            rows = patient + rows
+        if not rows:
+            return []
+        stamps = [row[2] for row in rows]
+        if step_ns := self._stamps.follow(min(stamps), max(stamps)):
+            rows = self._stamped_anew(rows, step_ns)
+        if self._patient_frames is not None:
+            rows = sorted(rows, key=_stamp)
+        offset_ns = self._stamps.offset_ns
+        frames = [(can_id, data, t_ns - offset_ns) for can_id, data, t_ns, _ in rows if not can_id & ERR_FLAG]
+        if len(frames) < len(rows):
+            self._note_errors(rows, offset_ns)
+        self.counters.received += len(frames)
+        return frames
+
+    def wait(self, until_ns: int) -> None:
+        """Sleep until a frame is there, at `until_ns` at the latest."""
+        self._check_open()
+        while (left_ns := until_ns - self.clock.now_ns()) > 0:
+            if self._poll(left_ns):
+                return
+
+    def wait_and_drain(self, until_ns: int) -> list[TimedFrame]:
+        """As `wait` and `drain`, with one system call where they take three. It waits 2 ms, whatever `until_ns` is."""
+        self._check_open()
+        if not self._blocks:
+            self._socket.setblocking(True)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@ll", 0, _SINGLE_WAIT_US))
+            self._blocks = True
+        return self._take(wait=True)
+
+    def defer(self, can_ids: Collection[int]) -> None:
+        """Let frames with these 11-bit identifiers wake nobody: `drain` and `wait_and_drain` return them with the next
+        other, `wait_and_drain` also at its time-out.
+
+        Whoever has to do nothing about them before that frame (synchronous PDOs: before the SYNC) is spared a wake-up
+        for each. They keep their place by their time of arrival. At a change of the identifiers a frame may come twice.
+
+        Raises:
+            InterfaceError: the interface is lost.
+        """
+        self._check_open()
+        mask = 0x7FF | EFF_FLAG | RTR_FLAG
+        if self._patient is not None:
+            self._patient.close()
+            self._patient = self._patient_frames = None
+        if can_ids:
+            self._patient = _open(self.channel, [(can_id, mask) for can_id in can_ids], fd=self._fd)
+            self._patient_frames = FrameSocket(self._patient, self._fd)
+        try:
+            self._socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_JOIN_FILTERS, struct.pack("=I", 1))
+            others = [(can_id | _CAN_INV_FILTER, mask) for can_id in can_ids] or [(0, 0)]
+            self._socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, _packed(others))
+        except OSError as error:
+            raise self._failed(error) from error
+
+    def close(self) -> None:
+        """Close the socket once its frames have left; where none leaves any more, they are dropped.
+
+        Sent minutes later they would be old news to nodes that come back. Without the right to drop them, the user
+        hears what to type.
+        """
+        if self._socket.fileno() < 0:
+            return
+        try:
+            if self._await_empty():
+                return
+            if drop_queued(self.channel):
+                self._reports.say(
+                    f"{self.channel}: frames that nobody acknowledged were dropped from its transmit queue"
+                )
+            else:
+                self._reports.say(
+                    f"{self.channel}: frames wait in its transmit queue that nobody acknowledges, and are sent when"
+                    f" somebody does; to drop them type: {emptying_line(self.channel)}"
+                )
+        finally:
+            self._socket.close()
+            if self._patient is not None:
+                self._patient.close()
+
+    def _await_empty(self) -> bool:
+        """Wait while the queue empties; whether it is empty."""
+        now_ns = self.clock.now_ns()
+        end_ns, moved_ns, left = now_ns + _LINGER_NS, now_ns, self._queued_bytes()
+        while left and self.clock.now_ns() < min(end_ns, moved_ns + _STUCK_NS):
+            time.sleep(_LATER_RETRY_S)
+            if (still := self._queued_bytes()) != left:
+                left, moved_ns = still, self.clock.now_ns()
+        return not left
+
+    def _queued_bytes(self) -> int:
+        """Memory of this socket's frames that the driver has not taken yet."""
+        numbers = self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)
+        return int(_MEMINFO.unpack(numbers)[_WMEM_ALLOC])
+
+    def _check_open(self) -> None:
+        if self._socket.fileno() < 0:
+            raise InterfaceError(f"{self.channel}: this port is closed")
+
+    def _await_room(self, error: OSError, full_ns: int, left: int) -> None:
+        """Sleep a little where the queue is full, since `full_ns`; raise anything else."""
+        if error.errno not in (errno.ENOBUFS, errno.EAGAIN):
+            raise self._failed(error) from error
+        self.counters.transmit_full += 1
+        full_for_ns = self.clock.now_ns() - full_ns
+        if full_for_ns >= _PATIENCE_NS and not self._waits:
+            why = f"{self._full_queue(error)}, {left} frames not sent{self._longer_queue(error)}"
+            raise InterfaceError(why) from error
+        if full_for_ns >= _TELL_NS and full_ns != self._told_ns:
+            self._told_ns = full_ns
+            self._reports.say(f"{self._full_queue(error)}: waiting for the bus{self._longer_queue(error)}")
+        time.sleep(_RETRY_S if full_for_ns < _PATIENCE_NS else _LATER_RETRY_S)
+
+    def _full_queue(self, error: OSError) -> str:
+        what = "the transmit queue" if error.errno == errno.ENOBUFS else "the socket's send buffer"
+        return f"{self.channel}: {what} stays full, as nobody acknowledges or the bus is overloaded"
+
+    def _longer_queue(self, error: OSError) -> str:
+        """What to type where it is the interface's queue that is full, and short."""
+        if error.errno != errno.ENOBUFS:
+            return ""
+        try:
+            length = struct.unpack("=16si12x", fcntl.ioctl(self._socket, _SIOCGIFTXQLEN, _ifreq(self.channel)))[1]
+        except OSError:  # the interface has gone meanwhile
+            return ""
+        if length >= TX_QUEUE:
+            return ""
+        return f"; it holds {length} frames; type: {ip_line(f'{self.channel} txqueuelen {TX_QUEUE}')}"
+
+    def _failed(self, error: OSError) -> InterfaceError:
+        if error.errno == errno.ENETDOWN:
+            return _down(self.channel, self._setting)
+        return InterfaceError(f"{self.channel}: interface lost: {error.strerror}")
+
+    def _count_drops(self, which: int, rows: Sequence[Row]) -> None:
+        dropped = max(0, rows[-1][3] - self._dropped[which])
+        self._dropped[which] += dropped
+        self.counters.overruns += dropped
+
+    def _stamped_anew(self, rows: Sequence[Row], step_ns: int) -> list[Row]:
+        """The wall clock was set: some of these frames came before that and some after it, all of them until now.
+
+        Of both times that a stamp may mean the later one that is no future is taken: it is right, or late by less than
+        the step, and no frame is older than it is.
+        """
+        self.counters.clock_steps += 1
+        if self.counters.clock_steps == 1:
+            way = "back" if step_ns < 0 else "forward"
+            what = f"the wall clock was set {way} by {abs(step_ns) * 1e-6:.1f} ms"
+            self._reports.say(f"{self.channel}: {what}; frames keep their time, further times are only counted")
+        now_ns = self.clock.now_ns() + self._stamps.offset_ns
+        return [
+            (can_id, data, max((t for t in (t_ns, t_ns + step_ns) if t <= now_ns), default=now_ns), drops)
+            for can_id, data, t_ns, drops in rows
+        ]
+
+    def _note_errors(self, rows: Sequence[Row], offset_ns: int) -> None:
+        for can_id, data, t_ns, _ in rows:
+            if can_id & ERR_FLAG:
+                self.counters.note_error(can_id, data)
+                self.state = state_after(self.state, can_id, data)
+                self._reports.error_frame(can_id, data, t_ns - offset_ns)
+
+
+def has_socketcan() -> bool:
+    """Return whether this kernel (and this Python) has SocketCAN; loads the module if it is allowed to."""
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except (AttributeError, OSError):
+        return False
+    return True
+
+
+def check_interface(channel: str, setting: str | None = None) -> None:
+    """Return if `channel` is a CAN interface that is up.
+
+    Args:
+        channel: its name.
+        setting: the line that sets it up; None where it needs no setting.
+
+    Raises:
+        InterfaceError: it is not, with the line to type.
+    """
+    if not has_socketcan():
+        raise InterfaceError(
+            f"{channel}: this kernel has no SocketCAN (AF_CAN); without it run on --bus lockstep (virtual time) or"
+            " --bus udp_multicast --channel 239.74.163.2 --patient (real time), or run COMMAND with a real vcan0 in a"
+            " virtual machine: canprobe vcan -- COMMAND"
+        )
+    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as probe:
+        try:
+            flags = struct.unpack("=16sH14x", fcntl.ioctl(probe, _SIOCGIFFLAGS, _ifreq(channel)))[1]
+        except OSError as error:
+            raise InterfaceError(f"{channel}: no such interface; {_how_to_make(channel)}") from error
+        try:
+            probe.bind((channel,))
+        except OSError as error:
+            raise InterfaceError(f"{channel}: not a CAN interface: {error.strerror}") from error
+        if not flags & _IFF_UP:
+            raise _down(channel, setting or ip_line(f"{channel} up"))
+
+
+def _check_fd(channel: str, setting: str) -> None:
+    """Return if the interface carries CAN FD frames."""
+    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as probe:
+        try:
+            mtu = struct.unpack("=16si12x", fcntl.ioctl(probe, _SIOCGIFMTU, _ifreq(channel)))[1]
+        except OSError as error:
+            raise InterfaceError(f"{channel}: no such interface; {_how_to_make(channel)}") from error
+    if mtu < _CANFD_MTU:
+        raise InterfaceError(f"{channel}: not set up for CAN FD; type: {setting}")
+
+
+def _ifreq(channel: str) -> bytes:
+    name = os.fsencode(channel)
+    if not 0 < len(name) < 16:
+        raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
+    return struct.pack("=16sH14x", name, 0)
+
+
+def _down(channel: str, setting: str) -> InterfaceError:
+    return InterfaceError(f"{channel}: interface is down; type: {setting}")
+
+
+def _how_to_make(channel: str) -> str:
+    if channel.startswith("vcan"):
+        return f"type: {sudo()}ip link add dev {channel} type vcan && {setting_line(channel, 1_000_000)}"
+    return "is the adapter plugged in? The interfaces there are: ip -br link show type can"
+
+
+def _open(channel: str, only: Sequence[tuple[int, int]] | None = None, *, fd: bool) -> socket.socket:
+    """A raw socket for all frames and error frames, or only for those with `can_id & mask == id & mask`: (id, mask)."""
+    sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+    try:
+        sock.setblocking(False)
+        if fd:
+            sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FD_FRAMES, struct.pack("=i", 1))
+        if only is not None:
+            sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, _packed(only))
+        sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, struct.pack("=I", _CAN_ERR_MASK if only is None else 0))
+        sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        sock.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
+        _enlarge_buffer(sock)
+        sock.bind((channel,))
+    except OSError as error:
+        sock.close()
+        raise InterfaceError(f"{channel}: cannot be opened: {error.strerror}") from error
+    return sock
+
+
+def _packed(filters: Sequence[tuple[int, int]]) -> bytes:
+    return b"".join(struct.pack("=II", can_id, mask) for can_id, mask in filters)
+
+
+def _stamp(row: Row) -> int:
+    return row[2]
+
+
+def _enlarge_buffer(sock: socket.socket) -> None:
+    try:
+        sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _RECEIVE_BUFFER)
+    except PermissionError:  # needs CAP_NET_ADMIN; without it the kernel caps the size at net.core.rmem_max
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+
+
+class _PollFd(ctypes.Structure):
+    _fields_ = (("fd", ctypes.c_int), ("events", ctypes.c_short), ("revents", ctypes.c_short))
+
+
+class _Poll:
+    """ppoll on one descriptor: a wait in ns with one system call."""
+
+    def __init__(self, fd: int) -> None:
+        self._ppoll = ctypes.CDLL(None, use_errno=True).ppoll
+        self._pollfd = _PollFd(fd, select.POLLIN, 0)
+        self._timeout = Timespec()
+
+    def __call__(self, timeout_ns: int) -> bool:
+        """Return whether something is there; a signal ends the wait early with False."""
+        self._timeout.tv_sec, self._timeout.tv_nsec = divmod(timeout_ns, 1_000_000_000)
+        return bool(self._ppoll(ctypes.byref(self._pollfd), 1, ctypes.byref(self._timeout), None) > 0)

@@ -1,0 +1,544 @@
+"""Requests and answers over any `Port` without threads: SDO transfers, LSS, and who answers at all.
+
+Whoever waits for an answer pumps the port: it receives the frames itself, gives each to those that subscribed to its
+identifier and everything else to a callback, so that nothing is lost. Time-outs run on the port's clock; on a
+`LockstepBus` they cost no real time. Not for the cycle, which has its own way to the port.
+
+SDO. A *dialogue* is a generator: it yields the 8 bytes of a request, or None to wait on, and is sent the 8 bytes of
+each answer; an abort that it yields is sent, and nobody answers it. `upload` and `download` are parts of such dialogues
+(`yield from`). What a node needs is written as a plain sequence, and `hold_dialogues` waits for all nodes together: the
+accesses of one node come one after another, those of different nodes side by side. canopen's client is not used,
+because it waits for a thread and for one node at a time.
+
+Source: CiA 301, SDO protocols (expedited download, expedited and segmented upload, abort); CiA 305 (LSS).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterable, Mapping
+from typing import Any, NoReturn
+
+from canopen.objectdictionary import ODVariable
+from canopen.objectdictionary.datatypes import SIGNED_TYPES
+from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
+
+from canprobe.errors import BusError
+from canprobe.fieldbus.bus.port import Port, TimedFrame
+from canprobe.fieldbus.protocol.frames import (
+    LSS_ANSWER_ID,
+    LSS_LENGTH,
+    LSS_REQUEST_ID,
+    NOTHING_ASKED,
+    SDO_RX_BASE,
+    SDO_TX_BASE,
+    LssAddress,
+    LssCommand,
+    LssError,
+    LssState,
+    pack_fastscan,
+    pack_lss,
+    pack_number,
+)
+
+# A port that is pumped by whoever waits.
+
+Taker = Callable[[int, bytes, int], object]
+"""Called with (can_id, data, t_ns) of a frame."""
+
+
+class PumpedNetwork:
+    """A port with subscribers, which receives only while somebody waits, or what it is fed.
+
+    Args:
+        port: the connection to the bus; it is not closed with the network.
+        other: called with each frame that arrives during a wait and that nobody subscribed to.
+    """
+
+    def __init__(self, port: Port, other: Taker = lambda *_: None) -> None:
+        self.port = port
+        self._other = other
+        self._takers: dict[int, list[Taker]] = {}
+
+    def subscribe(self, can_id: int, take: Taker) -> None:
+        """Let `take` have the frames of an identifier."""
+        self._takers.setdefault(can_id, []).append(take)
+
+    def unsubscribe(self, can_id: int, take: Taker) -> None:
+        """Undo one `subscribe`."""
+        takers = self._takers[can_id]
+        takers.remove(take)
+        if not takers:
+            del self._takers[can_id]
+
+    def send_message(self, can_id: int, data: bytes) -> None:
+        """Send one frame through the port."""
+        self.port.send_batch(((can_id, data),))
+
+    def feed(self, frames: Iterable[TimedFrame]) -> None:
+        """Give subscribers frames that were drained elsewhere; the others are ignored."""
+        for can_id, data, t_ns in frames:
+            for take in self._takers.get(can_id, ()):
+                take(can_id, data, t_ns)
+
+    def pump_until(self, done: Callable[[], bool], timeout_s: float) -> bool:
+        """Receive until `done()`, at most `timeout_s` on the port's clock.
+
+        Returns:
+            The last answer of `done`.
+        """
+        port = self.port
+        deadline_ns = port.clock.now_ns() + round(timeout_s * 1e9)
+        self._pump()
+        while not done():
+            if port.clock.now_ns() >= deadline_ns:
+                return False
+            port.wait(deadline_ns)
+            self._pump()
+        return True
+
+    def _pump(self) -> None:
+        for frame in self.port.drain():
+            for take in self._takers.get(frame[0], (self._other,)):
+                take(*frame)
+
+
+# SDO transfers to many nodes at once.
+
+Dialogue = Generator[bytes | None, bytes, Any]
+"""The transfers with one node."""
+
+_LENGTH = 8
+_ABORT, _DOWNLOADED, _UPLOADED, _SEGMENT, _EXPEDITED, _SIZED = 0x80, 0x60, 0x40, 0x00, 0x02, 0x01
+_MOST_EXPEDITED = 4
+_NOT_TOGGLED, _TIMED_OUT, _OUT_OF_MEMORY = 0x05030000, 0x05040000, 0x05040005
+_TOO_LONG, _TOO_SHORT, _GENERAL = 0x06070012, 0x06070013, 0x08000000
+MAX_UPLOAD_BYTES = 4096
+"""Longest value that is read: names and numbers are far shorter. A node that sends more is not asked for the rest."""
+TRANSFER_TIMEOUTS = 10
+"""Longest time of one transfer of several segments, in time-outs of one answer."""
+ROUND_S = 0.02
+"""How long the others wait for the slowest answer: asking again at once, low node ids would take the whole bus."""
+
+
+class SdoTimeoutError(SdoCommunicationError):
+    """A request got no answer in time, however often it was sent."""
+
+
+def download(index: int, subindex: int, data: bytes) -> Generator[bytes | None, bytes, None]:
+    """Write up to four bytes.
+
+    Raises:
+        SdoAbortedError: the node refused.
+        SdoCommunicationError: no answer, or more than four bytes.
+    """
+    if not 0 < len(data) <= _MOST_EXPEDITED:
+        raise SdoCommunicationError(f"{index:04X}h:{subindex:02X} takes {len(data)} bytes; a concise write has 1 to 4")
+    command = 0x23 | (_MOST_EXPEDITED - len(data)) << 2
+    yield from _answered(bytes((command,)), index, subindex, data.ljust(4, b"\0"), _DOWNLOADED)
+
+
+def read_value(variable: ODVariable) -> Generator[bytes | None, bytes, Any]:
+    """Read an entry by its data type, in the entry's own length whatever the length of the answer.
+
+    Many nodes answer with four bytes where the entry has one or two. The bytes beyond its length must be padding.
+
+    Raises:
+        SdoAbortedError: the node refused.
+        SdoCommunicationError: no answer, or one that does not fit the entry.
+    """
+    size = len(variable) // 8
+    data = yield from upload(variable.index, variable.subindex, size)
+    own, beyond = data[:size], data[size:]
+    negative = variable.data_type in SIGNED_TYPES and own[-1:] >= b"\x80"
+    if len(own) < size or (any(beyond) and not (negative and min(beyond) == 0xFF)):
+        got = f"{len(data)}: {data.hex(' ')}" if data else "none"
+        raise SdoCommunicationError(f"expected {size} byte{'s' * (size > 1)}, got {got}")
+    return variable.decode_raw(own)
+
+
+def upload(index: int, subindex: int, size: int = _MOST_EXPEDITED) -> Generator[bytes | None, bytes, bytes]:
+    """Read an entry of any length.
+
+    Args:
+        index, subindex: of the entry.
+        size: bytes to take of an expedited answer that does not state how many of its four bytes are the value.
+
+    Raises:
+        SdoAbortedError: the node refused.
+        SdoCommunicationError: no answer, one segment twice, more or fewer bytes than the node announced, or more than
+            `MAX_UPLOAD_BYTES`. The node got an abort.
+    """
+    answer = yield from _answered(b"\x40", index, subindex, bytes(4), _UPLOADED)
+    if answer[0] & _EXPEDITED:
+        return answer[4 : 8 - (answer[0] >> 2 & 3)] if answer[0] & _SIZED else answer[4 : 4 + size]
+    announced = int.from_bytes(answer[4:], "little") if answer[0] & _SIZED else None
+    return (yield from _segments(answer[1:4], announced))
+
+
+def decode_text(data: bytes) -> str:
+    """A VISIBLE_STRING as devices send it: UTF-8 or else Latin-1, up to the first zero byte."""
+    text = data.partition(b"\0")[0]
+    try:
+        return text.decode()
+    except UnicodeDecodeError:
+        return text.decode("latin-1")
+
+
+def _answered(
+    command: bytes, index: int, subindex: int, data: bytes, expected: int
+) -> Generator[bytes | None, bytes, bytes]:
+    multiplexer = index.to_bytes(2, "little") + bytes((subindex,))
+    answer = yield command + multiplexer + data
+    while answer[1:4] != multiplexer or not (answer[0] == _ABORT or answer[0] & 0xE0 == expected):
+        answer = yield None  # a late one, to an earlier request: of this entry too, which is read after it was written
+    _check_abort(answer)
+    return answer
+
+
+def _segments(multiplexer: bytes, announced: int | None) -> Generator[bytes | None, bytes, bytes]:
+    if announced is not None and announced > MAX_UPLOAD_BYTES:
+        yield from _give_up(multiplexer, _OUT_OF_MEMORY, f"{announced} bytes announced, {MAX_UPLOAD_BYTES} at most")
+    data, toggle, last = b"", 0, False
+    while not last:
+        answer = yield bytes((0x60 | toggle,)) + bytes(7)
+        while not (answer[0] == _ABORT or answer[0] & 0xE0 == _SEGMENT):  # a late one, to the request that began this
+            answer = yield None
+        _check_abort(answer)
+        if answer[0] & 0xF0 != toggle:
+            yield from _give_up(multiplexer, _NOT_TOGGLED, "Toggle bit mismatch")
+        piece = answer[1 : 8 - (answer[0] >> 1 & 7)]
+        data += piece
+        toggle ^= 0x10
+        last = bool(answer[0] & 1)
+        if announced is not None and len(data) > announced:
+            yield from _give_up(multiplexer, _TOO_LONG, f"{announced} bytes announced, more sent")
+        if len(data) > MAX_UPLOAD_BYTES:
+            yield from _give_up(multiplexer, _OUT_OF_MEMORY, f"no end after {MAX_UPLOAD_BYTES} bytes")
+        if not piece and not last:
+            yield from _give_up(multiplexer, _GENERAL, "a segment without a byte that is not the last")
+    if announced is not None and len(data) < announced:
+        yield from _give_up(multiplexer, _TOO_SHORT, f"{announced} bytes announced, {len(data)} sent")
+    return data
+
+
+def _give_up(multiplexer: bytes, code: int, why: str) -> Generator[bytes | None, bytes, NoReturn]:
+    """Tell the node that its transfer is over."""
+    yield _abort(multiplexer, code)
+    raise SdoCommunicationError(f"transfer aborted: {why}")
+
+
+def _abort(multiplexer: bytes, code: int) -> bytes:
+    return bytes((_ABORT,)) + multiplexer + code.to_bytes(4, "little")
+
+
+def _check_abort(answer: bytes) -> None:
+    if answer[0] == _ABORT:
+        raise SdoAbortedError(int.from_bytes(answer[4:], "little"))
+
+
+class _Talk:
+    """One dialogue under way."""
+
+    def __init__(self, network: PumpedNetwork, node_id: int, dialogue: Dialogue, timeout_ns: int, retries: int) -> None:
+        self.node_id = node_id
+        self.inbox: list[bytes] = []
+        self.over = False
+        self.due_ns = 0
+        self.repeated = 0
+        self._network = network
+        self._dialogue = dialogue
+        self._timeout_ns = timeout_ns
+        self._retries = retries
+        self._request = b""
+        self._multiplexer = b""  # of the transfer: a request for a segment has none
+        self._end_ns = 0  # of the transfer
+        self._tries = 0
+        self._go_on(lambda: next(dialogue))
+
+    def take(self, _id: int, data: bytes, _t_ns: int) -> None:
+        """Keep an answer; anything but 8 bytes is no SDO (CiA 301, 7.2.4.3)."""
+        if len(data) == _LENGTH and not self.over:
+            self.inbox.append(data)
+
+    def serve(self) -> None:
+        """Hand the dialogue its answers; where none came in time, ask again or give up."""
+        while self.inbox and not self.over:
+            answer = self.inbox.pop(0)
+            self._go_on(lambda answer=answer: self._dialogue.send(answer))  # type: ignore[misc]
+        if self.over or self.due_ns > self._network.port.clock.now_ns():
+            return
+        self._transmit(_abort(self._multiplexer, _TIMED_OUT))
+        if self._tries <= self._retries and not self._asks_for_segment:  # which cannot be asked for twice
+            self.repeated += 1
+            self._ask()
+        else:
+            late = SdoTimeoutError(self._lateness())
+            self._go_on(lambda: self._dialogue.throw(late))
+
+    @property
+    def _asks_for_segment(self) -> bool:
+        return self._request[0] >> 5 == 3
+
+    def _lateness(self) -> str:
+        timeout_s = self._timeout_ns * 1e-9
+        if self._asks_for_segment and self._network.port.clock.now_ns() >= self._end_ns:
+            return f"SDO transfer not complete after {TRANSFER_TIMEOUTS * timeout_s:g} s"
+        tries = f", {self._tries} times" if self._tries > 1 else ""
+        return f"No SDO response received within {timeout_s:g} s{tries}"
+
+    def _go_on(self, step: Callable[[], bytes | None]) -> None:
+        try:
+            request = step()
+            while request is not None and request[0] == _ABORT:
+                self._transmit(request)
+                request = next(self._dialogue)
+        except StopIteration:
+            self.over = True
+            return
+        if request is not None:
+            self._request, self._tries = request, 0
+            self.inbox.clear()
+            self._ask()
+
+    def _ask(self) -> None:
+        self._tries += 1
+        self.due_ns = self._network.port.clock.now_ns() + self._timeout_ns
+        if self._asks_for_segment:
+            self.due_ns = min(self.due_ns, self._end_ns)
+        else:
+            self._multiplexer = self._request[1:4]
+            self._end_ns = self.due_ns + (TRANSFER_TIMEOUTS - 1) * self._timeout_ns
+        self._transmit(self._request)
+
+    def _transmit(self, data: bytes) -> None:
+        self._network.send_message(SDO_RX_BASE + self.node_id, data)
+
+
+class Dialogues:
+    """Dialogues with several nodes at once, served by whoever receives the frames meanwhile: see `hold_dialogues`.
+
+    A context manager: the first requests go out on entering.
+
+    Args:
+        network: it is pumped, or fed, by the caller.
+        dialogues: by node id; each catches the errors that it can go on after, any other ends them all.
+        timeout_s: for an answer.
+        retries: how often a request without an answer is sent again.
+    """
+
+    def __init__(
+        self, network: PumpedNetwork, dialogues: Mapping[int, Dialogue], *, timeout_s: float, retries: int = 0
+    ) -> None:
+        self._network = network
+        self._dialogues = dialogues
+        self._settings = round(timeout_s * 1e9), retries
+        self._talks: list[_Talk] = []
+
+    def __enter__(self) -> Dialogues:
+        try:
+            for node_id, dialogue in self._dialogues.items():
+                self._talks.append(_Talk(self._network, node_id, dialogue, *self._settings))
+                self._network.subscribe(SDO_TX_BASE + node_id, self._talks[-1].take)
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for talk in self._talks:
+            self._network.unsubscribe(SDO_TX_BASE + talk.node_id, talk.take)
+
+    @property
+    def waiting(self) -> list[_Talk]:
+        """Those that are not over."""
+        return [talk for talk in self._talks if not talk.over]
+
+    def serve(self) -> None:
+        """Hand each dialogue the answers that have come; where none came in time, ask again or give up."""
+        for talk in self.waiting:
+            talk.serve()
+
+    @property
+    def repeated(self) -> dict[int, int]:
+        """Requests that were sent again, by node id."""
+        return {talk.node_id: talk.repeated for talk in self._talks}
+
+
+def hold_dialogues(
+    network: PumpedNetwork, dialogues: Mapping[int, Dialogue], *, timeout_s: float, retries: int = 0
+) -> dict[int, int]:
+    """Carry out dialogues with several nodes at once, on the predefined SDO channel.
+
+    Args:
+        network: pumped meanwhile.
+        dialogues: by node id; each catches the errors that it can go on after, any other ends them all.
+        timeout_s: for an answer.
+        retries: how often a request without an answer is sent again.
+
+    Returns:
+        Requests that were sent again, by node id.
+    """
+    with Dialogues(network, dialogues, timeout_s=timeout_s, retries=retries) as held:
+        while waiting := held.waiting:
+            left_s = max(0, min(talk.due_ns for talk in waiting) - network.port.clock.now_ns()) * 1e-9
+            network.pump_until(lambda: all(talk.inbox for talk in waiting), min(left_s, ROUND_S))
+            held.serve()
+    return held.repeated
+
+
+# LSS: finds nodes without an id, one after another, and gives them one.
+
+SETTLE_S = 0.005
+"""Wait after the first answer: several nodes may give the same answer to one question, one after another."""
+ANSWER_S = 0.5
+SEARCH_S = 0.05
+"""Time without an answer after which a question of fastscan counts as answered with no."""
+
+
+class LssAnswerError(BusError):
+    """An LSS slave gives no answer, an error code, or answers that do not agree."""
+
+
+class Lss:
+    """The LSS master on a network. All slaves answer with one identifier, so it asks one question at a time."""
+
+    def __init__(self, network: PumpedNetwork) -> None:
+        self._network = network
+
+    def release(self) -> None:
+        """Put all nodes into the waiting state; a node that got an id boots with it."""
+        self._send(pack_lss(LssCommand.SWITCH_GLOBAL, bytes((LssState.WAITING,))))
+
+    def select(self, address: LssAddress) -> bool:
+        """Put the node of this address into configuration; whether it answered."""
+        *first, last = [
+            pack_number(LssCommand(LssCommand.SELECT_VENDOR + i), number) for i, number in enumerate(address.numbers)
+        ]
+        for message in first:
+            self._send(message)
+        return bool(self._ask(last, ANSWER_S, LssCommand.SELECTED))
+
+    def inquire_node_ids(self) -> list[int]:
+        """What all the nodes in configuration answer: one node id, unless several devices have one address."""
+        command = LssCommand.INQUIRE_NODE_ID
+        return [answer[1] for answer in self._ask(pack_lss(command), ANSWER_S, command)]
+
+    def configure_node_id(self, node_id: int) -> None:
+        """Give the node in configuration its id.
+
+        Raises:
+            LssAnswerError: it does not answer or refuses.
+        """
+        if code := self._configure(LssCommand.CONFIGURE_NODE_ID, node_id):
+            raise LssAnswerError(f"LSS error {code}")
+
+    def store(self) -> bool:
+        """Let the node in configuration keep its id when its power goes; False where it does not support that.
+
+        Raises:
+            LssAnswerError: it does not answer or could not store it.
+        """
+        if (code := self._configure(LssCommand.STORE)) > LssError.REFUSED:
+            raise LssAnswerError(f"it could not store it: LSS error {code}")
+        return code == LssError.NONE
+
+    def fast_scan(self) -> LssAddress | None:
+        """Find the unconfigured node with the lowest address; it is in configuration afterwards.
+
+        Returns:
+            Its address; None where nobody answers.
+
+        Raises:
+            LssAnswerError: somebody answers, but to no address: answers were lost or came late.
+        """
+        for timeout_s in (SEARCH_S, 5 * SEARCH_S):
+            if not self._identified(0, NOTHING_ASKED, 0, 0, ANSWER_S):
+                return None
+            if (address := self._search(timeout_s)) is not None:
+                return address
+        raise LssAnswerError(
+            f"{self._network.port.channel}: nodes without an id answer, but not to the end of a search; connect them"
+            " one at a time"
+        )
+
+    def _search(self, timeout_s: float) -> LssAddress | None:
+        found: list[int] = []
+        for position in range(4):
+            number = 0
+            for bit in range(31, -1, -1):
+                if not self._identified(number, bit, position, position, timeout_s):
+                    number |= 1 << bit
+            if not self._identified(number, 0, position, (position + 1) % 4, ANSWER_S):
+                return None
+            found.append(number)
+        return LssAddress(*found)
+
+    def _identified(self, number: int, bit: int, position: int, following: int, timeout_s: float) -> bool:
+        return bool(self._ask(pack_fastscan(number, bit, position, following), timeout_s, LssCommand.IDENTIFIED))
+
+    def _configure(self, command: LssCommand, value: int = 0) -> int:
+        answers = self._ask(pack_lss(command, bytes((value,))), ANSWER_S, command)
+        if not answers:
+            raise LssAnswerError(f"no answer to {command.name.lower().replace('_', ' ')}")
+        return answers[0][1]
+
+    def _send(self, message: bytes) -> None:
+        self._network.send_message(LSS_REQUEST_ID, message)
+
+    def _ask(self, message: bytes, timeout_s: float, command: LssCommand) -> list[bytes]:
+        """Send a question; the answers with this command that come."""
+        network = self._network
+        answers: list[bytes] = []
+
+        def take(_id: int, data: bytes, _t_ns: int) -> None:
+            if len(data) == LSS_LENGTH:
+                answers.append(data)
+
+        network.pump_until(lambda: True, 0.0)  # late answers to earlier questions
+        network.subscribe(LSS_ANSWER_ID, take)
+        try:
+            self._send(message)
+            if network.pump_until(lambda: bool(answers), timeout_s):
+                network.pump_until(lambda: False, SETTLE_S)
+        finally:
+            network.unsubscribe(LSS_ANSWER_ID, take)
+        return [answer for answer in answers if answer[0] == command]
+
+
+# Who is there? One SDO read of 1000h to each node id, all at once; any answer counts, an abort too.
+
+SECOND_S = 0.05
+"""In which a second answer to one request is waited for: two devices have one node id."""
+UPLOAD_DEVICE_TYPE = bytes((0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0))
+BURST = 8
+BURST_PAUSE_S = 0.002
+
+
+def answering_nodes(network: PumpedNetwork, node_ids: Iterable[int], timeout_s: float) -> tuple[int, ...]:
+    """Node ids, ascending, whose SDO server answers within the time-out.
+
+    Args:
+        network: pumped meanwhile.
+        node_ids: whom to ask, 1–127.
+        timeout_s: after the last question.
+
+    Raises:
+        InterfaceError: the interface failed.
+    """
+    asked = sorted(set(node_ids))
+    found: set[int] = set()
+
+    def take(can_id: int, _data: bytes, _t_ns: int) -> None:
+        found.add(can_id - SDO_TX_BASE)
+
+    for node_id in asked:
+        network.subscribe(SDO_TX_BASE + node_id, take)
+    try:
+        for first in range(0, len(asked), BURST):
+            network.port.send_batch([(SDO_RX_BASE + n, UPLOAD_DEVICE_TYPE) for n in asked[first : first + BURST]])
+            network.pump_until(lambda: len(found) == len(asked), BURST_PAUSE_S)
+        network.pump_until(lambda: len(found) == len(asked), timeout_s)
+    finally:
+        for node_id in asked:
+            network.unsubscribe(SDO_TX_BASE + node_id, take)
+    return tuple(sorted(found))

@@ -1,0 +1,194 @@
+"""The CAN controllers on one timed bus: which have to wait, which are bus off, and when they come back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from canprobe.fieldbus.bus.port import ControllerState
+from canprobe.fieldbus.bus.virtual.lockstep import BusNode, LockstepPort
+from canprobe.fieldbus.protocol.frame_bits import INTERMISSION_BITS, SUSPEND_BITS
+
+# Error counters of one controller: error active, error passive, bus off, and the way back.
+#
+# Source: ISO 11898-1:2015, fault confinement: rules for the transmit and the receive error counter.
+
+PASSIVE_FROM = 128
+WARNING_FROM = 96
+BUS_OFF_FROM = 256
+RECOVERIES = 128
+"""Sequences of eleven recessive bits that a controller has to hear while it is bus off."""
+
+
+@dataclass(slots=True)
+class ErrorCounters:
+    """Counters of one controller.
+
+    Attributes:
+        transmit: TEC.
+        receive: REC.
+        bus_offs: how often it went bus off.
+        outstanding: sequences of eleven recessive bits until it comes back; 0 where it is not bus off.
+    """
+
+    transmit: int = 0
+    receive: int = 0
+    bus_offs: int = 0
+    outstanding: int = 0
+
+    @property
+    def state(self) -> ControllerState:
+        """What the counters make of the controller."""
+        if self.outstanding:
+            return ControllerState.BUS_OFF
+        worst = max(self.transmit, self.receive)
+        if worst >= PASSIVE_FROM:
+            return ControllerState.PASSIVE
+        return ControllerState.WARNING if worst >= WARNING_FROM else ControllerState.ACTIVE
+
+    def transmit_error(self, *, acknowledge: bool = False) -> None:
+        """It sent an error flag as the transmitter.
+
+        Args:
+            acknowledge: the acknowledgement was missing and no other node sent an error flag. An error-passive node
+                does not count that, so that a node alone on its bus never goes bus off.
+        """
+        if acknowledge and self.state is ControllerState.PASSIVE:
+            return
+        self.transmit += 8
+        if self.transmit >= BUS_OFF_FROM:
+            self.bus_offs += 1
+            self.outstanding = RECOVERIES
+
+    def receive_error(self) -> None:
+        """It saw an error as a receiver."""
+        if not self.outstanding:
+            self.receive += 1
+
+    def transmitted(self) -> None:
+        """It sent a frame without an error."""
+        self.transmit = max(0, self.transmit - 1)
+
+    def received(self) -> None:
+        """It received a frame without an error."""
+        if self.receive >= PASSIVE_FROM:
+            self.receive = PASSIVE_FROM - 1  # the standard leaves 119 to 127
+        elif self.receive:
+            self.receive -= 1
+
+    def heard_recessive(self, sequences: int) -> bool:
+        """It heard so many sequences of eleven recessive bits; whether it is active again, with both counters at 0."""
+        if not self.outstanding:
+            return False
+        self.outstanding = max(0, self.outstanding - sequences)
+        if self.outstanding:
+            return False
+        self.transmit = self.receive = 0
+        return True
+
+
+# All controllers of a bus.
+
+_RECESSIVE_BITS = 11
+_AFTER_ACK_BITS = (
+    8  # recessive bits before a frame's or an error frame's end: ACK delimiter and end of frame, delimiter
+)
+
+
+class Controllers:
+    """Error counters of every node, and what follows from them. They matter only once a bit has failed.
+
+    Args:
+        bits_ns: time of so many bits.
+
+    Attributes:
+        troubled: a controller's counters are not 0.
+        suspended: error-passive nodes that must not start before this time after a frame of their own.
+    """
+
+    def __init__(self, bits_ns: Callable[[int], int]) -> None:
+        self.troubled = False
+        self.suspended: dict[BusNode, int] = {}
+        self._bits_ns = bits_ns
+        self._counters: dict[BusNode, ErrorCounters] = {}
+        self._quiet_ns = 0  # since when the wire has been recessive, less what was counted of it
+
+    def add(self, node: BusNode) -> None:
+        """A new node."""
+        self._counters[node] = ErrorCounters()
+
+    def remove(self, node: BusNode) -> None:
+        """A node that leaves."""
+        self.suspended.pop(node, None)
+        del self._counters[node]
+
+    def of(self, owner: object) -> ErrorCounters:
+        """Counters of a participant or a port.
+
+        Raises:
+            KeyError: it is not on the bus.
+        """
+        for node, counters in self._counters.items():
+            if node.owner is owner:
+                return counters
+        raise KeyError(owner)
+
+    def is_off(self, node: BusNode) -> bool:
+        """It is bus off: it neither sends nor hears."""
+        return self.troubled and bool(self._counters[node].outstanding)
+
+    def off(self) -> list[BusNode]:
+        """The nodes that are bus off."""
+        return [node for node, counters in self._counters.items() if counters.outstanding]
+
+    def fail(self, sender: BusNode, end_ns: int) -> None:
+        """An error frame has ended at `end_ns`; everybody saw it."""
+        self.troubled = True
+        self._quiet_ns = end_ns - self._bits_ns(_AFTER_ACK_BITS)
+        for node, counters in self._counters.items():
+            if node is sender:
+                counters.transmit_error(acknowledge=len(self._counters) < 2)
+            else:
+                counters.receive_error()
+            if isinstance(node.owner, LockstepPort):
+                node.owner.counters.error_frames += 1
+        self._suspend(sender, end_ns)
+        self._show_states()
+
+    def succeed(self, sender: BusNode, end_ns: int) -> None:
+        """A frame has ended at `end_ns`; only of interest while a controller is troubled."""
+        self._quiet_ns = end_ns - self._bits_ns(_AFTER_ACK_BITS)
+        for node, counters in self._counters.items():
+            if node is sender:
+                counters.transmitted()
+            elif not counters.outstanding:
+                counters.received()
+        self._suspend(sender, end_ns)
+        self._show_states()
+        self.troubled = any(c.transmit or c.receive or c.outstanding for c in self._counters.values())
+
+    def hear_silence(self, until_ns: int) -> None:
+        """The wire has been recessive until now: nodes that are bus off count sequences of eleven such bits."""
+        sequence = self._bits_ns(_RECESSIVE_BITS)
+        count = (until_ns - self._quiet_ns) // sequence
+        self._quiet_ns += count * sequence
+        if any([counters.heard_recessive(count) for counters in self._counters.values()]):
+            self._show_states()
+
+    def next_return_ns(self) -> int | None:
+        """When the next node that is bus off comes back, if the wire stays silent."""
+        least = min((c.outstanding for c in self._counters.values() if c.outstanding), default=None)
+        return None if least is None else self._quiet_ns + least * self._bits_ns(_RECESSIVE_BITS)
+
+    def _suspend(self, sender: BusNode, end_ns: int) -> None:
+        """After its own frame an error-passive node waits for eight bits more."""
+        if self._counters[sender].state is ControllerState.PASSIVE:
+            self.suspended[sender] = end_ns + self._bits_ns(INTERMISSION_BITS + SUSPEND_BITS)
+        else:
+            self.suspended.pop(sender, None)
+
+    def _show_states(self) -> None:
+        """Ports show the state of their controller."""
+        for node, counters in self._counters.items():
+            if isinstance(node.owner, LockstepPort):
+                node.owner.state = counters.state

@@ -1,0 +1,411 @@
+"""A lockstep bus with a bit rate: one frame at a time, each as long as its bits, the lowest identifier first.
+
+A frame that was queued while another is on the wire waits for its end; whoever has the lowest identifier when the bus
+is free again sends, to the end. Receivers get a frame with the last bit of its end-of-frame field; the next may follow
+after three bits of intermission. A frame that the wire corrupts ends in an error frame and is sent again; every
+controller counts errors as ISO 11898-1 has it, waits as an error-passive transmitter, and is cut off when it is bus off
+until it has heard 128 times eleven recessive bits.
+
+All of it in virtual time and deterministic, like the `LockstepBus`. Which of its frames a node sends first is its
+controller's: with `queue="priority"` the lowest identifier, as from mailboxes; with "fifo" the oldest.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable, Sequence
+from heapq import heapify, heappop, heappush
+from typing import Literal
+
+from canprobe.fieldbus.bus.port import ERR_BUS, ERR_FLAG, ERR_PROTOCOL, VirtualClock
+from canprobe.fieldbus.bus.virtual.controllers import Controllers, ErrorCounters
+from canprobe.fieldbus.bus.virtual.lockstep import (
+    CLASSIC_BYTES,
+    BusNode,
+    LockstepBus,
+    LockstepPort,
+    Participant,
+    arbitration_key,
+)
+from canprobe.fieldbus.protocol.frame_bits import ERROR_DELIMITER_BITS, ERROR_FLAG_BITS, INTERMISSION_BITS, exact_bits
+from canprobe.fieldbus.protocol.frames import Frame
+
+# Where the wire of a timed bus fails. A model is asked once for every transmission; one seed, always the same bits.
+
+WireErrors = Callable[[int, bytes, int], int | None]
+"""Called with (can_id, data, bits) of a frame that starts: which of its bits is hit, from 0, or None."""
+
+
+class BitErrors:
+    """Bits fail independently of each other, every one with the same probability.
+
+    Args:
+        rate: bit error rate, 0..1; 1e-7 in an industrial hall, 3e-5 next to a welder (Ferreira et al. 2004).
+        seed: of the sequence.
+    """
+
+    def __init__(self, rate: float, seed: int) -> None:
+        if not 0 <= rate < 1:
+            raise ValueError(f"a bit error rate lies in 0..1, not {rate}")
+        self._log = math.log1p(-rate)
+        self._random = random.Random(seed)
+        self._left = self._gap()
+
+    def __call__(self, can_id: int, data: bytes, bits: int) -> int | None:
+        """The first bit of this frame that is hit."""
+        if self._left >= bits:
+            self._left -= bits
+            return None
+        hit, self._left = int(self._left), self._gap()
+        return hit
+
+    def _gap(self) -> float:
+        """Good bits before the next bad one."""
+        return math.floor(math.log(1.0 - self._random.random()) / self._log) if self._log else math.inf
+
+
+# A lockstep bus with a bit rate: one frame at a time, each as long as its bits, the lowest identifier first.
+
+Queue = Literal["priority", "fifo"]
+LINGER_NS = 50_000_000
+"""How long a port that closes lets the bus carry what is queued, at most."""
+_NS = 1_000_000_000
+_ERROR_BITS = 2 * ERROR_FLAG_BITS + ERROR_DELIMITER_BITS  # the others answer the flag of the first with theirs
+
+_Entry = tuple[int, int, BusNode, Frame]
+"""A frame that takes part in the arbitration: what the wire compares, order of queueing, sender, frame."""
+
+
+class TimedBus(LockstepBus):
+    """The bus itself; attach participants and take ports as of a `LockstepBus`.
+
+    Args:
+        clock: virtual time, possibly shared with other buses.
+        channel: the bus's name in messages and logs.
+        bitrate: bit/s.
+        queue: what a node with several frames sends first.
+        errors: where the wire fails; None: nowhere.
+        length: bits of a frame with its intermission, exact by default.
+        max_frames: frames that may wait at once before somebody is taken to send for ever.
+
+    Attributes:
+        errors: as above; another model may take its place while the bus runs.
+        frames, error_frames, busy_ns: so far; the time includes intermissions.
+    """
+
+    def __init__(
+        self,
+        clock: VirtualClock,
+        channel: str = "can0",
+        *,
+        bitrate: int = 1_000_000,
+        queue: Queue = "priority",
+        errors: WireErrors | None = None,
+        length: Callable[[int, bytes], int] = exact_bits,
+        max_frames: int = 20_000,
+    ) -> None:
+        super().__init__(clock, channel, max_frames=max_frames)
+        self.bitrate = bitrate
+        self._bit_ns = 0 if _NS % bitrate else _NS // bitrate  # 0: no whole number
+        self._gap_ns = self._bits_ns(INTERMISSION_BITS)
+        self.frames = self.error_frames = self.busy_ns = 0
+        self._fifo = queue == "fifo"
+        self.errors = errors
+        self._length = length
+        self._ready: list[_Entry] = []  # a heap
+        self._order = 0
+        self._flying: _Entry | None = None
+        self._hit = False
+        self._end_ns = self._free_ns = 0
+        self._since_ns = 0  # when the first of those who are ready queued its frame
+        self._controllers = Controllers(self._bits_ns)
+        self._stale = True  # the participants' deadlines have to be read again
+        self._first_due: int | None = None
+
+    # what is to be seen
+
+    def counters(self, owner: Participant) -> ErrorCounters:
+        """Error counters of a participant or a port.
+
+        Raises:
+            KeyError: it is not on the bus.
+        """
+        if self._flying is None:
+            self._controllers.hear_silence(self.clock.now_ns())
+        return self._controllers.of(owner)
+
+    # time
+
+    def next_deadline_ns(self) -> int | None:
+        """Return when the wire or a participant next has something to do."""
+        if self._stale or (self._flying is None and not self._ready):
+            self._first_due = super().next_deadline_ns()
+            self._stale = False
+        first = self._first_due
+        if self._flying is not None:
+            wire: int | None = self._end_ns
+        else:
+            wire = self._next_start() if self._ready else None
+        if wire is not None and (first is None or wire < first):
+            first = wire
+        if self._controllers.troubled and self._flying is None:
+            back = self._controllers.next_return_ns()
+            if back is not None and (first is None or back < first):
+                first = back
+        return first
+
+    def settle(self) -> None:
+        """Do what is due at the present instant: end of a frame, deadlines of participants, start of the next frame."""
+        if self._settling:
+            return
+        t_ns = self.clock.now_ns()
+        self._settling = True
+        if self._stale:
+            self.next_deadline_ns()
+        rounds_left = self._max_frames
+        try:
+            while True:
+                if self._flying is not None and self._end_ns <= t_ns:
+                    self._finish()
+                    continue
+                due = self._first_due is not None and self._first_due <= t_ns
+                if not due and self._flying is None and self._ready and self._free_ns <= t_ns and self._start(t_ns):
+                    continue
+                if not due or not self._advance_due(t_ns):
+                    break
+                self._first_due = self._earliest()
+                rounds_left -= 1
+                if rounds_left < 0:
+                    raise self._endless(t_ns, "deadlines that never move on, of " + self._names_due(t_ns))
+            if self._controllers.troubled and self._flying is None:
+                self._controllers.hear_silence(t_ns)
+        finally:
+            self._settling = False
+
+    def run_until_ns(self, until_ns: int) -> None:
+        """Do everything due up to and including `until_ns`: in one pass while no bit can fail, else instant by instant.
+
+        Raises:
+            BusError: a participant's deadline never moves on, or more frames wait than may.
+        """
+        if len(self._nodes) < 2 or self._settling or self._controllers.troubled or not self._glide(until_ns):
+            super().run_until_ns(until_ns)
+
+    def _glide(self, until_ns: int) -> bool:
+        """Frame after frame without errors, in the order of `settle`; False where errors came up before the end."""
+        self._first_due = super().next_deadline_ns()
+        self._stale, self._settling = False, True
+        move_ns, controllers, length = self.clock.move_ns, self._controllers, self._length
+        bit_ns, gap_ns = self._bit_ns, self._gap_ns
+        try:
+            while self.errors is None and not controllers.troubled:
+                due, entry = self._first_due, self._flying
+                if entry is None and self._ready:
+                    start = self._free_ns if self._free_ns > self._since_ns else self._since_ns
+                    if start <= until_ns and (due is None or start < due):
+                        entry, self._hit = heappop(self._ready), False  # as `_fly`, of every frame
+                        bits = length(*entry[3]) - INTERMISSION_BITS
+                        self._end_ns = end_ns = start + (bits * bit_ns or self._bits_ns(bits))
+                        self._free_ns = end_ns + gap_ns
+                        self.busy_ns += end_ns + gap_ns - start
+                        self._flying = entry
+                if entry is not None and (due is None or self._end_ns <= due):
+                    if self._end_ns > until_ns:
+                        return True
+                    move_ns(self._end_ns)
+                    if self._hit:
+                        return False
+                    self._flying = None
+                    self._deliver_frame(entry[2], entry[3], self._end_ns)
+                elif due is None or due > until_ns:
+                    return True
+                else:
+                    self._serve(due)
+            return False
+        finally:
+            self._settling = False
+
+    def _serve(self, due_ns: int) -> None:
+        """Let everybody speak whose deadline has come."""
+        self.clock.move_ns(due_ns)
+        t_ns = self.clock.now_ns()
+        for _ in range(self._max_frames):
+            self._advance_due(t_ns)
+            self._first_due = self._earliest()
+            if self._first_due is None or self._first_due > t_ns:
+                return
+        raise self._endless(t_ns, "deadlines that never move on, of " + self._names_due(t_ns))
+
+    def send(self, node: BusNode, frames: Sequence[Frame]) -> None:
+        """Queue the frames of a port; they go when the bus is free and theirs is the lowest identifier."""
+        self._stale = True
+        self._queue(node, frames)
+        self.settle()
+
+    def _earliest(self) -> int | None:
+        dues = [node.due for node in self._nodes if node.due is not None]
+        return min(dues) if dues else None
+
+    def _bits_ns(self, bits: int) -> int:
+        return bits * self._bit_ns if self._bit_ns else -(-bits * _NS // self.bitrate)
+
+    # queues and arbitration
+
+    def _queue(self, node: BusNode, frames: Sequence[Frame]) -> None:
+        if not frames or (self._controllers.troubled and self._controllers.is_off(node)):
+            return  # a controller that is bus off takes no part
+        for frame in frames:
+            if len(frame[1]) > CLASSIC_BYTES:
+                self._check(node, frame)
+        if self._fifo:
+            node.outbox.extend(frames)
+            if not self._is_ready(node):
+                self._compete(node, (node.outbox.popleft(),))
+        else:
+            self._compete(node, frames)
+        if len(self._ready) + len(node.outbox) > self._max_frames:
+            self._ready.clear()
+            raise self._endless(self.clock.now_ns(), f"more than {self._max_frames} frames wait, of {node.owner.name}")
+
+    def _is_ready(self, node: BusNode) -> bool:
+        flying = self._flying
+        return (flying is not None and flying[2] is node) or any(entry[2] is node for entry in self._ready)
+
+    def _compete(self, node: BusNode, frames: Sequence[Frame]) -> None:
+        ready, order = self._ready, self._order
+        if not ready:
+            self._since_ns = self.clock.now_ns()
+        for frame in frames:
+            order += 1
+            can_id = frame[0]
+            heappush(ready, (can_id << 21 if can_id <= 0x7FF else arbitration_key(can_id), order, node, frame))
+        self._order = order
+
+    def _start(self, t_ns: int) -> bool:
+        """Let the winner of the arbitration send; False where all who want to have to wait."""
+        entry = self._winner(t_ns) if self._controllers.suspended else heappop(self._ready)
+        if entry is None:
+            return False
+        can_id, data = entry[3]
+        bits = self._length(can_id, data) - INTERMISSION_BITS
+        if self._controllers.troubled:
+            self._controllers.hear_silence(t_ns)
+        hit = None if self.errors is None else self.errors(can_id, data, bits)
+        if len(self._nodes) < 2:
+            hit = bits - 9  # the slot in which nobody acknowledges it
+        if hit is not None:
+            bits = hit + 1 + _ERROR_BITS
+        self._fly(entry, t_ns, t_ns + self._bits_ns(bits))
+        self._hit = hit is not None
+        return True
+
+    def _fly(self, entry: _Entry, start_ns: int, end_ns: int) -> None:
+        """Put a frame on the wire."""
+        self._flying, self._hit = entry, False
+        self._end_ns = end_ns
+        self._free_ns = end_ns + self._gap_ns
+        self.busy_ns += self._free_ns - start_ns
+
+    def _winner(self, t_ns: int) -> _Entry | None:
+        """The winner among those who do not have to wait after a frame of their own."""
+        waiting = []
+        found = None
+        while self._ready and found is None:
+            entry = heappop(self._ready)
+            if self._controllers.suspended.get(entry[2], 0) > t_ns:
+                waiting.append(entry)
+            else:
+                found = entry
+        for entry in waiting:
+            heappush(self._ready, entry)
+        return found
+
+    def _next_start(self) -> int:
+        """When the next frame can start."""
+        start = self._free_ns if self._free_ns > self._since_ns else self._since_ns
+        if self._controllers.suspended:
+            start = max(start, min(self._controllers.suspended.get(entry[2], 0) for entry in self._ready))
+        return start
+
+    # the end of a frame
+
+    def _finish(self) -> None:
+        """End what is on the wire: deliver it, or count its error and let it compete again."""
+        entry = self._flying
+        assert entry is not None
+        _, _, sender, frame = entry
+        t_ns, self._flying = self._end_ns, None
+        if self._hit:
+            self._fail(entry, t_ns)
+            return
+        off: Sequence[BusNode] = ()
+        if self._controllers.troubled:
+            self._controllers.succeed(sender, t_ns)
+            off = self._controllers.off()
+        self._deliver_frame(sender, frame, t_ns, off)
+
+    def _deliver_frame(self, sender: BusNode, frame: Frame, t_ns: int, off: Sequence[BusNode] = ()) -> None:
+        """Everybody but its sender hears a frame, and those that are bus off; the answers are queued."""
+        self.frames += 1
+        if self._fifo and sender.outbox:
+            self._compete(sender, (sender.outbox.popleft(),))
+        can_id, data = frame
+        if self.recorder is not None:
+            self.recorder(can_id, data, t_ns)
+        moved = False
+        for receive, receiver in sender.listeners.get(can_id) or self._listeners_of(sender, can_id):
+            if off and receiver in off:
+                continue
+            answers = receive(can_id, data, t_ns)
+            due = receiver.owner.next_deadline_ns
+            if due != receiver.due:
+                receiver.due, moved = due, True
+            if answers:
+                self._queue(receiver, answers)
+        if moved:
+            self._first_due = self._earliest()
+
+    # errors
+
+    def _fail(self, entry: _Entry, t_ns: int) -> None:
+        """What was on the wire is lost: its sender tries again, unless that was once too often."""
+        self.error_frames += 1
+        if self.error_recorder is not None:
+            self.error_recorder(ERR_FLAG | ERR_PROTOCOL | ERR_BUS, bytes(CLASSIC_BYTES), t_ns)
+        sender = entry[2]
+        self._controllers.fail(sender, t_ns)
+        if self._controllers.is_off(sender):
+            self._silence(sender)
+        else:
+            heappush(self._ready, entry)
+
+    def _silence(self, node: BusNode) -> None:
+        """A node that is bus off loses what it wanted to send."""
+        node.outbox.clear()
+        self._ready = [entry for entry in self._ready if entry[2] is not node]
+        heapify(self._ready)
+
+    # who is there
+
+    def remove_port(self, port: LockstepPort) -> None:
+        """Take a closed port off the bus, after what it has sent is through, and what is answered at once."""
+        limit_ns = self.clock.now_ns() + LINGER_NS
+        while (self._flying is not None or self._ready) and self.clock.step(limit_ns):
+            pass
+        super().remove_port(port)
+
+    def _add(self, owner: Participant) -> BusNode:
+        node = super()._add(owner)
+        self._controllers.add(node)
+        self._stale = True
+        return node
+
+    def _remove(self, owner: Participant) -> None:
+        for node in [node for node in self._nodes if node.owner is owner]:
+            self._silence(node)
+            self._controllers.remove(node)
+            if self._flying is not None and self._flying[2] is node:
+                self._flying = None  # it falls silent in the middle of a frame
+        super()._remove(owner)
+        self._stale = True

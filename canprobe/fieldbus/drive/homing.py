@@ -1,0 +1,209 @@
+"""Homing: limit switches, index pulses, or the present position.
+
+    method  home
+    1, 2    first index pulse behind the edge of the negative or positive limit switch
+    17, 18  the edge of the negative or positive limit switch
+    33, 34  first index pulse in negative or positive direction
+    35, 37  the present position
+
+The switch is searched at 6099h:01; its edge and the pulses are passed at 6099h:02, all with 609Ah. Edge and pulse are
+caught by hardware, at their exact place, and then driven back to. The encoder gives one pulse a motor turn. There is no
+home switch: other methods are refused with 06090030h. Bits 13, 12, 10 of the statusword:
+000 under way, 001 not started or interrupted, 011 done, 100 error and moving, 101 error and at rest.
+Zero is the home position *plus* the home offset, by the clause: at home the actual position is then -607Ch.
+An error is: no such method, a speed of 0, no switch within `SEARCH_S`, no pulse within two turns. Software limits do
+not act meanwhile.
+Source: CiA 402-2, "Homing mode", objects 607Ch, 6098h, 6099h, 609Ah.
+"""
+
+from __future__ import annotations
+
+from enum import Enum, auto
+from math import ceil, floor
+
+from canprobe.fieldbus.drive.mode import NEGATIVE_SWITCH, POSITIVE_SWITCH, REACHED, DriveParts, ProfiledMode
+from canprobe.fieldbus.drive.reference import STEP_NS, Rates
+from canprobe.fieldbus.node.dictionary import Abort, SdoAbort, Value, key_of
+from canprobe.fieldbus.protocol.cia402 import HOMING_ATTAINED, HOMING_ERROR, HOMING_START, OperationMode
+
+HERE = frozenset({35, 37})
+INDEX_DIRECTIONS = {33: -1, 34: 1}
+SWITCH_DIRECTIONS = {1: -1, 2: 1, 17: -1, 18: 1}
+SWITCH_AND_INDEX = frozenset({1, 2})
+METHODS = frozenset({0, *HERE, *INDEX_DIRECTIONS, *SWITCH_DIRECTIONS})
+SEARCH_TURNS = 2.0
+SEARCH_S = 180.0
+"""Time at full speed in which a limit switch has to be found, or left."""
+_METHOD = key_of(0x6098)
+_TO_SWITCH, _TO_ZERO = 1, 2  # sub-indices of 6099h
+
+
+class Phase(Enum):
+    """Where a homing run is."""
+
+    IDLE = auto()
+    TO_SWITCH = auto()
+    OFF_SWITCH = auto()
+    TO_PULSE = auto()
+    RETURNING = auto()
+    DONE = auto()
+    FAILED = auto()
+
+
+_BITS = {Phase.DONE: REACHED | 1 << HOMING_ATTAINED, Phase.FAILED: 1 << HOMING_ERROR}
+_UNDER_WAY = frozenset({Phase.TO_SWITCH, Phase.OFF_SWITCH, Phase.TO_PULSE, Phase.RETURNING})
+
+
+class Homing(ProfiledMode):
+    """Mode 6."""
+
+    number = OperationMode.HOMING
+    needs = (_METHOD,)
+
+    def __init__(self, parts: DriveParts) -> None:
+        super().__init__(parts)
+        self._phase = Phase.IDLE
+        self._method = 0
+        self._direction = 1  # in which the edge or the pulse is passed, of the motor
+        self._passed = self._home = 0.0  # counts: behind which the pulse comes; the home position
+        parts.node.dictionary.on_check(0x6098, _check_method)
+
+    def reset(self) -> None:
+        """Power on: not homed."""
+        self._phase = Phase.IDLE
+
+    def start(self, word: int, t_ns: int) -> None:
+        """A drive that was homed stays so."""
+        if self._phase is not Phase.DONE:
+            self._phase = Phase.IDLE
+        super().start(word, t_ns)
+        if not self.halted:
+            self._motion.decelerate(t_ns, self._parameters.deceleration, self._at_standstill)
+
+    def leave(self, t_ns: int) -> None:
+        """A run under way is given up."""
+        self._give_up()
+
+    def status(self) -> int:
+        """Homing attained, error, and target reached (when at rest)."""
+        rests = self._standstill and self._phase in (Phase.IDLE, Phase.FAILED)
+        return _BITS.get(self._phase, 0) | REACHED * rests
+
+    def bits(self, word: int, changed: int, t_ns: int) -> None:
+        """Bit 4 starts, and interrupts when it is taken away."""
+        starts = word >> HOMING_START & 1
+        if changed >> HOMING_START & 1 and not self.halted:
+            if starts:
+                self._begin(t_ns)
+            elif self._phase in _UNDER_WAY:
+                self._stop(Phase.IDLE, t_ns)
+
+    def resume(self, t_ns: int) -> None:
+        """With bit 4 still set, homing starts again."""
+        if self._word >> HOMING_START & 1:
+            self._begin(t_ns)
+
+    def _halt(self, t_ns: int) -> None:
+        self._give_up()
+        super()._halt(t_ns)
+
+    def _give_up(self) -> None:
+        self._timer.cancel()
+        if self._phase in _UNDER_WAY:
+            self._phase = Phase.IDLE
+
+    # ------------------------------------------------------------------ a run
+
+    def _begin(self, t_ns: int) -> None:
+        self._method, self._standstill = int(self._values.get(_METHOD, 0)), False
+        positive = 1 if self._units.scale > 0.0 else -1
+        here = self.parts.feedback.measure(t_ns)
+        if self._method in HERE:
+            self._motion.decelerate(t_ns, self._parameters.homing_acceleration)
+            self._home = here
+            self._attain(t_ns)
+        elif self._method in INDEX_DIRECTIONS and self._speed(_TO_ZERO) > 0.0:
+            self._direction = INDEX_DIRECTIONS[self._method] * positive
+            self._seek_pulse(here, t_ns)
+        elif self._method in SWITCH_DIRECTIONS and min(self._speed(_TO_SWITCH), self._speed(_TO_ZERO)) > 0.0:
+            self._direction = -SWITCH_DIRECTIONS[self._method] * positive  # away from the switch
+            if self._on_switch():
+                self._leave_switch(here, t_ns)
+            else:
+                self._phase = Phase.TO_SWITCH
+                reach = SEARCH_S * self._speed(_TO_SWITCH)
+                self._drive_to(here - self._direction * reach, t_ns, _TO_SWITCH)
+        else:
+            self._stop(Phase.FAILED, t_ns)
+        if self._phase in _UNDER_WAY:
+            self._timer.arm(t_ns + STEP_NS)
+
+    def watch(self, t_ns: int, counts: float) -> None:
+        """Catch the switch, its edge, and the index pulse."""
+        if self._phase is Phase.TO_SWITCH and self._on_switch():
+            self._leave_switch(counts, t_ns)
+        elif self._phase is Phase.OFF_SWITCH and not self._on_switch():
+            edge = self.parts.feedback.switch_positions()[SWITCH_DIRECTIONS[self._method] > 0]
+            if self._method in SWITCH_AND_INDEX:
+                self._seek_pulse(edge, t_ns)
+            else:
+                self._return_to(edge, t_ns)
+        if self._phase is Phase.TO_PULSE:
+            pulse = next_pulse(self._passed, self._direction, self._units.turn)
+            if (counts - pulse) * self._direction >= 0.0:
+                self._return_to(pulse, t_ns)
+
+    def _on_switch(self) -> bool:
+        wanted = NEGATIVE_SWITCH if SWITCH_DIRECTIONS[self._method] < 0 else POSITIVE_SWITCH
+        return bool(self.parts.feedback.switches() & wanted)
+
+    def _leave_switch(self, counts: float, t_ns: int) -> None:
+        self._phase = Phase.OFF_SWITCH
+        self._drive_to(counts + self._direction * SEARCH_S * self._speed(_TO_ZERO), t_ns)
+
+    def _seek_pulse(self, passed: float, t_ns: int) -> None:
+        self._phase, self._passed = Phase.TO_PULSE, passed
+        self._drive_to(passed + self._direction * SEARCH_TURNS * self._units.turn, t_ns)
+
+    def _return_to(self, home: float, t_ns: int) -> None:
+        self._phase, self._home = Phase.RETURNING, home
+        self._drive_to(home, t_ns)
+
+    def _drive_to(self, counts: float, t_ns: int, speed: int = _TO_ZERO) -> None:
+        rate = self._parameters.homing_acceleration
+        self._motion.move(counts, t_ns, Rates(self._speed(speed), rate, rate), self._arrived)
+
+    def _speed(self, subindex: int) -> float:
+        wanted = self.parts.node.dictionary.number(0x6099, subindex) * self._units.speed
+        return min(wanted, self._parameters.max_speed)
+
+    def _arrived(self, t_ns: int) -> None:
+        if self._phase is Phase.RETURNING:
+            self._attain(t_ns)
+        else:
+            self._timer.cancel()
+            self._phase, self._standstill = Phase.FAILED, True
+        self.parts.show()
+
+    def _attain(self, t_ns: int) -> None:
+        self._timer.cancel()
+        units, dictionary = self._units, self.parts.node.dictionary
+        units.origin = self._home + dictionary.number(0x607C) * units.scale
+        dictionary.put(0x607A, 0, round(units.position(self._motion.demand(t_ns))))
+        self._phase = Phase.DONE
+
+    def _stop(self, phase: Phase, t_ns: int) -> None:
+        self._timer.cancel()
+        self._phase = phase
+        self._motion.decelerate(t_ns, self._parameters.homing_acceleration, self._at_standstill)
+
+
+def next_pulse(counts: float, direction: int, turn: float) -> float:
+    """The next index pulse behind `counts`, in a direction; one that lies right there has been passed."""
+    turns = counts / turn
+    return (floor(turns) + 1 if direction > 0 else ceil(turns) - 1) * turn
+
+
+def _check_method(subindex: int, value: Value) -> None:
+    if value not in METHODS:
+        raise SdoAbort(Abort.VALUE)

@@ -1,0 +1,225 @@
+"""Parameters of a CiA 402 drive as its application uses them, read from the dictionary whenever one is written.
+
+Source: CiA 402-2, objects 6007h, 605Ah–605Eh, 6065h–6068h, 6072h, 607Dh, 607Fh, 6080h, 6083h–6085h, 609Ah, 60C2h.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from math import inf
+
+from canprobe.fieldbus.eds.packaged import MISSED_SYNCS, MISSED_SYNCS_NAME, SYNC_FACTOR, SYNC_FACTOR_NAME
+from canprobe.fieldbus.node.dictionary import Abort, Dictionary, SdoAbort, Value
+from canprobe.fieldbus.protocol.si_unit import ACCELERATION, VELOCITY, rate_unit
+
+# Factor group: the master's position units ↔ units of the plant's axis, polarity, and where the zero is.
+#
+#     position = (counts - origin) · 6092h / (608Fh · 6091h),   each a quotient :01 / :02
+#
+# A count is the position unit of the drive as delivered, whatever factors its EDS has: a cell states the units of its
+# drives, not the lines of their encoders. An object that the EDS lacks counts as 1. Velocities and accelerations are in
+# the units of 60A9h and 60AAh, whose turns are those of the shaft: 6091h motor turns each.
+# Source: CiA 402-2, "Factor group", objects 607Eh (bit 7 position, bit 6 velocity), 608Fh, 6091h, 6092h, 60A9h, 60AAh.
+
+FACTORS = (0x607E, 0x608F, 0x6091, 0x6092, VELOCITY, ACCELERATION)
+_RESOLUTION, _GEAR, _FEED = FACTORS[1:4]
+_POSITION, _VELOCITY = 7, 6  # bits of 607Eh
+DEFAULT_TURN = 4096.0
+"""Counts of a motor turn, of a drive whose EDS has no 608Fh."""
+DEFAULT_MISSES = 5
+"""Of a drive whose EDS has no object for it."""
+_Number = Callable[[int, int], int]
+
+
+@dataclass(frozen=True, slots=True)
+class Delivery:
+    """What a drive is delivered with for its cell, where its EDS has no object that says so.
+
+    Attributes:
+        turn: position units of a motor turn; None: unknown.
+        metre: position units of a metre; None: unknown.
+        misses: SYNCs missed before the master is taken for dead.
+    """
+
+    turn: float | None = DEFAULT_TURN
+    metre: float | None = None
+    misses: int = DEFAULT_MISSES
+
+
+class Units:
+    """Conversions of one drive.
+
+    Args:
+        dictionary: of the drive; its defaults are the factors as delivered.
+        delivery: a turn and a metre of its axis.
+
+    Attributes:
+        scale: counts per position unit; negative where 607Eh turns positions round.
+        magnitude: the same without sign, for windows.
+        speed: counts/s per unit of velocity, without sign.
+        speed_scale: the same with the polarity of velocities.
+        acceleration: counts/s² per unit of acceleration.
+        turn: counts of one motor turn, 608Fh; also the distance of the index pulses.
+        knows_turn, knows_speed: speeds in turns, and those in the unit of 60A9h, can be converted.
+        origin: counts at position 0; homing sets it.
+    """
+
+    __slots__ = (
+        *("_delivery", "_dictionary", "acceleration", "knows_speed", "knows_turn", "magnitude", "origin", "scale"),
+        *("speed", "speed_scale", "turn"),
+    )
+
+    def __init__(self, dictionary: Dictionary, delivery: Delivery) -> None:
+        self._dictionary = dictionary
+        self._delivery = delivery
+        self.origin = 0.0
+        self.read()
+
+    def read(self) -> None:
+        """Take the present factors."""
+        dictionary, delivery = self._dictionary, self._delivery
+        resolution, delivered = dictionary.number(_RESOLUTION, 1), _encoder_counts(dictionary.delivered)
+        self.turn = delivery.turn or DEFAULT_TURN
+        if resolution:
+            self.turn = _quotient(dictionary.number, _RESOLUTION) / delivered
+        self.knows_turn = bool(resolution) or delivery.turn is not None
+        self.magnitude = magnitude = _encoder_counts(dictionary.number) / delivered
+        shaft = self.turn * (_quotient(dictionary.number, _GEAR) if dictionary.number(_FEED, 1) else 1.0)
+        turn = shaft / magnitude if self.knows_turn else None
+        metre = None if delivery.metre is None else delivery.metre / magnitude
+        speed = rate_unit(dictionary.number(VELOCITY), turn=turn, metre=metre)
+        acceleration = rate_unit(dictionary.number(ACCELERATION), turn=turn, metre=metre)
+        self.knows_speed = speed is not None
+        self.speed = magnitude * (speed or 1.0)
+        self.acceleration = magnitude * (acceleration or 1.0)
+        turned = dictionary.number(0x607E) ^ dictionary.delivered(0x607E)
+        self.scale = -magnitude if turned >> _POSITION & 1 else magnitude
+        self.speed_scale = -self.speed if turned >> _VELOCITY & 1 else self.speed
+
+    def position(self, counts: float) -> float:
+        """Motor counts → position units."""
+        return (counts - self.origin) / self.scale
+
+    def counts(self, position: float) -> float:
+        """Position units → motor counts."""
+        return position * self.scale + self.origin
+
+
+def _encoder_counts(number: _Number) -> float:
+    """Lines of the encoder in one position unit; without 6092h the unit is a line."""
+    if not number(_FEED, 1):
+        return 1.0
+    return _quotient(number, _RESOLUTION) * _quotient(number, _GEAR) / _quotient(number, _FEED)
+
+
+def _quotient(number: _Number, index: int) -> float:
+    return (number(index, 1) or 1) / (number(index, 2) or 1)
+
+
+STAYS_STOPPED = frozenset({5, 6})  # of 605Ah: remain in QUICK_STOP_ACTIVE
+NO_WINDOW = 0xFFFFFFFF
+DEFAULT_ACCELERATION = 100_000
+"""Position units/s², of a drive whose EDS has no profile acceleration."""
+DEFAULT_WINDOW = 10
+"""Position units, of a drive whose EDS has no 6067h."""
+CONTROL_NS = 1_000_000
+"""Of the drive's own position loop: a target is reached after it where 60C2h is 0."""
+PEAK_PERMILLE = 2000
+"""What the plant's motors can do at most."""
+_OPTIONS = {0x605A: frozenset({1, 2, 5, 6}), 0x605D: frozenset({1, 2}), 0x6086: frozenset({0})}
+_INDICES = (
+    *(0x1006, MISSED_SYNCS, SYNC_FACTOR, 0x6007, 0x605A, 0x605B, 0x605C, 0x605D, 0x605E),
+    *(0x6065, 0x6066, 0x6067, 0x6068, 0x6072, 0x607D, 0x607F, 0x6080, 0x6083, 0x6084, 0x6085, 0x609A, 0x60C2),
+    *FACTORS,
+)
+
+
+class DriveParameters:
+    """Plain numbers; `read` refreshes them. Lengths, speeds and accelerations are counts here, whatever the units.
+
+    Attributes:
+        units: the factor group.
+        interpolation_ns: 60C2h, or 1006h of a drive without it: time to reach a latched target; never 0.
+        following_window, following_timeout_ns: 6065h (counts, infinite for none), 6066h.
+        position_window, position_time_ns: 6067h (counts, infinite for none), 6068h.
+        misses: SYNCs missed before the master is taken for dead: 2000h or 200Eh, whichever the make has; 0: any number.
+        patience_ns: time without a SYNC before it is: so many periods of 1006h, or else of 60C2h, and a half; 0: for
+            ever, as where neither is set.
+        low, high: 607Dh, position units; low >= high means no limits.
+        abort_connection, quick_stop, shutdown, disable: option codes.
+        acceleration, deceleration, homing_acceleration: 6083h, 6084h, 609Ah, counts/s².
+        quick_stop_rate, halt_rate, fault_rate: deceleration by 605Ah, 605Dh, 605Eh: the slow-down ramp 6084h or the
+            quick stop ramp 6085h, counts/s²; 0 means the brake at once.
+        max_speed: the lower of 607Fh and 6080h, counts/s; infinite for neither.
+        max_torque: 6072h, permille.
+    """
+
+    def __init__(self, dictionary: Dictionary, delivery: Delivery) -> None:
+        self._dictionary = dictionary
+        self._delivered_misses = delivery.misses
+        named = ((MISSED_SYNCS, MISSED_SYNCS_NAME), (SYNC_FACTOR, SYNC_FACTOR_NAME))
+        self._misses = [index for index, name in named if dictionary.has_named(index, name)]
+        self.units = Units(dictionary, delivery)
+        self.read()
+        dictionary.on_change(self.read, *_INDICES)
+        for index, allowed in _OPTIONS.items():
+            dictionary.on_check(index, partial(_check_among, allowed))
+        dictionary.on_check(0x60C2, _check_interpolation)
+
+    def read(self) -> None:
+        """Take the present values of the dictionary."""
+        number = self._dictionary.number
+        self.units.read()
+        sync_ns, value = number(0x1006) * 1000, number(0x60C2, 1, -1)
+        period_ns = sync_ns if value < 0 else value * 10 ** max(0, 9 + number(0x60C2, 2, -4))
+        self.interpolation_ns = period_ns or CONTROL_NS
+        self.following_window, self.following_timeout_ns = self._window(0x6065), number(0x6066) * 1_000_000
+        self.position_window = self._window(0x6067, DEFAULT_WINDOW)
+        self.position_time_ns = number(0x6068) * 1_000_000
+        self.misses = number(self._misses[0]) if self._misses else self._delivered_misses
+        cycle_ns = sync_ns or period_ns
+        self.patience_ns = self.misses * cycle_ns + cycle_ns // 2 if self.misses else 0
+        self.low, self.high = number(0x607D, 1), number(0x607D, 2)
+        self.abort_connection, self.quick_stop = number(0x6007, 0, 3), number(0x605A, 0, 2)
+        self.shutdown, self.disable = number(0x605B, 0, 0), number(0x605C, 0, 1)
+        units = self.units
+        slow, quick = number(0x6084) * units.acceleration, number(0x6085) * units.acceleration
+        self.acceleration = number(0x6083) * units.acceleration or DEFAULT_ACCELERATION * units.magnitude
+        self.homing_acceleration = number(0x609A) * units.acceleration or DEFAULT_ACCELERATION * units.magnitude
+        self.deceleration = slow
+        self.quick_stop_rate = slow if self.quick_stop in (1, 5) else quick
+        self.halt_rate = quick if number(0x605D, 0, 1) == 2 else slow
+        self.fault_rate = {1: slow, 2: quick}.get(number(0x605E, 0, 2), 0)
+        profile = number(0x607F) * units.speed if units.knows_speed else 0.0
+        motor = number(0x6080) / 60.0 * units.turn if units.knows_turn else 0.0
+        self.max_speed = min(profile or inf, motor or inf)
+        self.max_torque = min(number(0x6072, 0, PEAK_PERMILLE), PEAK_PERMILLE)
+
+    def _window(self, index: int, absent: int = NO_WINDOW) -> float:
+        value = self._dictionary.number(index, 0, absent)
+        return inf if value == NO_WINDOW else value * self.units.magnitude
+
+    @property
+    def fence(self) -> tuple[float, float]:
+        """The software limits, counts, lower first; infinite for none."""
+        if self.low >= self.high:
+            return -inf, inf
+        ends = self.units.counts(self.low), self.units.counts(self.high)
+        return min(ends), max(ends)
+
+    def clamp(self, target: int) -> int:
+        """The target within the software limits."""
+        low, high = self.low, self.high
+        return target if low <= target <= high or low >= high else min(max(target, low), high)
+
+
+def _check_among(allowed: frozenset[int], subindex: int, value: Value) -> None:
+    if value not in allowed:
+        raise SdoAbort(Abort.VALUE)
+
+
+def _check_interpolation(subindex: int, value: Value) -> None:
+    if (subindex == 1 and not value) or (subindex == 2 and not -9 <= int(value) <= 0):
+        raise SdoAbort(Abort.VALUE)

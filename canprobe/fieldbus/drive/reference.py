@@ -1,0 +1,379 @@
+"""The reference that one drive gives to its axis of the plant: ramps, trajectories, hold, slowing to standstill."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import copysign, exp, inf, log, sqrt
+from typing import NamedTuple, Protocol
+
+from canprobe.cell.plant.ideal_arm import MotorDynamics
+from canprobe.fieldbus.node.core import Timers
+
+# Trapezoidal motion to a target, constant velocity, and what a constant torque does to the motor, as pieces one after
+# the other, from any position and speed.
+#
+# A motor that moves the wrong way, or too fast to stop in time, is braked to rest first and turned round. One that is
+# faster than allowed is braked to the profile velocity.
+# Source: CiA 402-2, profile position mode, objects 6081h, 6083h, 6084h, motion profile type 6086h = 0; cyclic
+# synchronous velocity and torque modes; software position limits 607Dh.
+
+
+class Piece(NamedTuple):
+    """Constant acceleration over some time: s, counts, counts/s, counts/s²."""
+
+    duration_s: float
+    position: float
+    velocity: float
+    acceleration: float
+
+    def at(self, t_s: float) -> tuple[float, float]:
+        """Position and velocity `t_s` after the piece began."""
+        return (
+            self.position + t_s * (self.velocity + 0.5 * t_s * self.acceleration),
+            self.velocity + t_s * self.acceleration,
+        )
+
+
+class Decay(NamedTuple):
+    """Velocity that tends exponentially towards `final`: s, counts, counts/s, counts/s, 1/s."""
+
+    duration_s: float
+    position: float
+    velocity: float
+    final: float
+    damping: float
+
+    def at(self, t_s: float) -> tuple[float, float]:
+        """As of `Piece`."""
+        decay = exp(-self.damping * t_s)
+        excess = self.velocity - self.final
+        return self.position + self.final * t_s + excess * (1.0 - decay) / self.damping, self.final + excess * decay
+
+
+class Rates(NamedTuple):
+    """Limits of a move: counts/s and counts/s², all positive."""
+
+    speed: float
+    acceleration: float
+    deceleration: float
+
+
+class Profile:
+    """A reference as a function of the time since its start: pieces one after the other, at rest at `end` after them.
+
+    Attributes:
+        duration_s: s; infinite for a motion without an end.
+        end: position at rest, counts.
+    """
+
+    def __init__(self, pieces: tuple[Piece | Decay, ...], end: float) -> None:
+        self._pieces = pieces
+        self.end = end
+        self.duration_s = sum(piece.duration_s for piece in pieces)
+        self._low, self._high = -inf, inf
+
+    def fenced(self, low: float, high: float) -> Profile:
+        """The same cut off at the software limits, counts: the motor waits there. One outside may only come in."""
+        start, _ = self.at(0.0)
+        self._low, self._high = min(low, start), max(high, start)
+        return self
+
+    def at(self, t_s: float) -> tuple[float, float]:
+        """Position (counts) and velocity (counts/s) `t_s` after the start."""
+        position, velocity, over = self.end, 0.0, t_s >= self.duration_s
+        for piece in () if over else self._pieces:
+            if t_s < piece.duration_s:
+                position, velocity = piece.at(t_s)
+                break
+            t_s -= piece.duration_s
+        if self._low <= position <= self._high:
+            return position, velocity
+        return min(max(position, self._low), self._high), 0.0
+
+
+def braking(position: float, velocity: float, deceleration: float) -> Profile:
+    """To rest, as soon as the deceleration (counts/s², positive) allows."""
+    piece = Piece(abs(velocity) / deceleration, position, velocity, -copysign(deceleration, velocity))
+    return Profile((piece,), piece.at(piece.duration_s)[0])
+
+
+def trapezoid(position: float, velocity: float, target: float, rates: Rates) -> Profile:
+    """From a position (counts) and velocity (counts/s) to rest at a target (counts)."""
+    speed, acceleration, deceleration = rates
+    pieces: list[Piece] = []
+    stop = position + 0.5 * velocity * abs(velocity) / deceleration
+    sign = copysign(1.0, target - stop) if target != stop else copysign(1.0, velocity)
+    if velocity * sign < 0.0:
+        pieces.append(Piece(abs(velocity) / deceleration, position, velocity, sign * deceleration))
+        position, velocity = stop, 0.0
+    way, v0 = sign * (target - position), abs(velocity)
+    peak = min(
+        speed, sqrt((2 * acceleration * deceleration * way + deceleration * v0**2) / (acceleration + deceleration))
+    )
+    change = acceleration if peak >= v0 else -deceleration
+    lengths = ((peak - v0) / change, 0.0, peak / deceleration)
+    used = 0.5 * (v0 + peak) * lengths[0] + 0.5 * peak * lengths[2]
+    cruise = max(0.0, (way - used) / peak) if peak > 0.0 else 0.0
+    for seconds, rate in zip((lengths[0], cruise, lengths[2]), (change, 0.0, -deceleration), strict=True):
+        piece = Piece(seconds, position, velocity, sign * rate)
+        pieces.append(piece)
+        position, velocity = piece.at(seconds)
+    return Profile(tuple(pieces), target)
+
+
+def uniform(position: float, velocity: float) -> Profile:
+    """Constant velocity without an end."""
+    return Profile((Piece(inf, position, velocity, 0.0),), position)
+
+
+def torque_run(
+    position: float, velocity: float, permille: float, dynamics: MotorDynamics, speed_limit: float
+) -> Profile:
+    """Motion under a constant torque, solved exactly; it has no end, and velocity stays within a limit.
+
+    Friction first brings a motor to rest that moves against the torque, then keeps it there unless the torque is
+    above the Coulomb torque. Gravity, contact and the other joints do not act, as in the ideal arm.
+
+    Args:
+        position: at the start, counts.
+        velocity: at the start, counts/s; cut to the limit.
+        permille: torque, 1/1000 of the rated torque.
+        dynamics: of the motor.
+        speed_limit: counts/s, may be infinite.
+    """
+    gain, coulomb, damping = dynamics
+    velocity = min(max(velocity, -speed_limit), speed_limit)
+    pieces: list[Piece | Decay] = []
+    if velocity:
+        final = gain * (permille - copysign(coulomb, velocity)) / damping
+        if final * velocity < 0.0:
+            pieces.append(Decay(log(1.0 - velocity / final) / damping, position, velocity, final, damping))
+            (position, _), velocity = pieces[0].at(pieces[0].duration_s), 0.0
+    if not velocity:
+        if abs(permille) <= coulomb:
+            return Profile((*pieces, Piece(inf, position, 0.0, 0.0)), position)
+        final = gain * (permille - copysign(coulomb, permille)) / damping
+    driven = Decay(inf, position, velocity, final, damping)
+    if abs(final) > speed_limit:
+        limit = copysign(speed_limit, final)
+        driven = driven._replace(duration_s=log((velocity - final) / (limit - final)) / damping)
+        pieces.append(driven)
+        return Profile((*pieces, Piece(inf, driven.at(driven.duration_s)[0], limit, 0.0)), position)
+    return Profile((*pieces, driven), position)
+
+
+# The reference that one drive gives to its axis of the plant: ramps, trajectories, hold, slowing to standstill.
+
+STEP_NS = 2_500_000
+STANDSTILL_COUNTS = 0.1
+"""Motion in one step below which the motor is at rest."""
+PATIENCE_STEPS = 400
+NOTHING_S = 1e-9
+"""Rest of a trajectory below which it has ended."""
+
+Done = Callable[[int], None] | None
+"""Called with the time, ns, when a motion is over."""
+
+
+class AxisPlant(Protocol):
+    """What a drive needs of the plant. Positions are motor counts, calls at one instant are idempotent."""
+
+    def begin(self, t_ns: int) -> None:
+        """Time goes on from `t_ns`, unless it does already: a SYNC came, or a drive was enabled without one."""
+
+    def advance(self, t_ns: int) -> None:
+        """Bring the plant to `t_ns`."""
+
+    def motor_counts(self, axis: int) -> float:
+        """True motor position, counts."""
+
+    def torque_permille(self, axis: int) -> int:
+        """Motor torque, 1/1000 of the rated torque."""
+
+    def limit_switches(self, axis: int) -> tuple[float, float]:
+        """Motor positions (counts) at and beyond which the limit switches are active, lower first; infinite for none.
+
+        Where motors are coupled they follow from where the other motors are now.
+        """
+
+    def motor_dynamics(self, axis: int) -> MotorDynamics:
+        """How the motor answers to torque."""
+
+    def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
+        """What the position loop may do: called when a drive's limit or feed-forward changes.
+
+        Args:
+            axis: 0-based.
+            limit_permille: largest torque, 1/1000 of the rated torque.
+            speed: counts/s added behind the position loop.
+            torque_permille: added behind the velocity loop.
+        """
+
+    def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
+        """Follow a straight reference from `t0_ns` to `t1_ns`, then hold its end."""
+
+
+class Motion:
+    """Reference of one axis; remembers the ramp it gave last.
+
+    A trajectory goes to the plant as straight ramps of one step each, whose ends lie on it.
+    """
+
+    def __init__(self, axis: int, plant: AxisPlant, timers: Timers) -> None:
+        self._axis, self._plant = axis, plant
+        self._timer = timers.new(self._step)
+        self._start = self._end = 0.0
+        self._t0 = self._t1 = 0
+        self._trajectory: Profile | None = None
+        self._begin_ns = 0
+        self._patience = 0
+        self._was = 0.0
+        self._done: Done = None
+
+    @property
+    def busy(self) -> bool:
+        """A trajectory or a deceleration is under way."""
+        return self._timer.due_ns is not None
+
+    def hold(self, t_ns: int) -> float:
+        """Stay where the motor is; returns that position, counts."""
+        self._stop()
+        self._plant.advance(t_ns)
+        here = self._plant.motor_counts(self._axis)
+        self._ramp(here, here, t_ns, t_ns + STEP_NS)
+        return here
+
+    def onset(self, t_ns: int) -> float:
+        """Where a new ramp begins, counts: at the target before it, whenever the SYNC comes, or on a trajectory."""
+        return self._end if self._timer.due_ns is None else self.demand(t_ns)
+
+    def reach(self, onset: float, counts: float, t_ns: int, end_ns: int) -> None:
+        """From `onset` to `counts`, from now to `end_ns`."""
+        if self._timer.due_ns is not None:
+            self._stop()
+        self._start, self._end, self._t0, self._t1 = onset, counts, t_ns, end_ns  # as `_ramp`, in every cycle
+        self._plant.set_ramp(self._axis, onset, counts, t_ns, end_ns)
+
+    def demand(self, t_ns: int) -> float:
+        """The reference at `t_ns`, counts."""
+        if t_ns >= self._t1:
+            return self._end
+        return self._start + (self._end - self._start) * max(0, t_ns - self._t0) / (self._t1 - self._t0)
+
+    def speed(self, t_ns: int) -> float:
+        """Speed of the reference, counts/s; a ramp that has just ended still counts, as SYNC comes when it ends."""
+        if self._trajectory is not None:
+            return self._trajectory.at((t_ns - self._begin_ns) * 1e-9)[1]
+        moving = self._t0 <= t_ns <= self._t1 + STEP_NS // 2
+        return (self._end - self._start) / (self._t1 - self._t0) * 1e9 if moving else 0.0
+
+    def move(self, target: float, t_ns: int, rates: Rates, done: Done = None) -> None:
+        """Move to `target`, counts, from the present position and speed; as `follow`."""
+        self.follow(trapezoid(self.demand(t_ns), self.speed(t_ns), target, rates), t_ns, done)
+
+    def follow(self, trajectory: Profile, t_ns: int, done: Done = None) -> None:
+        """Follow a trajectory from now on; `done(t_ns)` when the motor is at rest behind its end."""
+        self._trajectory, self._begin_ns, self._done = trajectory, t_ns, done
+        self._patience, self._was = PATIENCE_STEPS, inf
+        if trajectory.duration_s < NOTHING_S:
+            here = self.demand(t_ns)
+            self._ramp(here, here, t_ns, t_ns + STEP_NS)
+        self._step(t_ns)
+
+    def decelerate(self, t_ns: int, rate: float, done: Done = None) -> None:
+        """Slow the reference down by `rate` counts/s² and call `done(t_ns)` at standstill, one step from now or later.
+
+        Standstill is the motor's, not the reference's: it is waited for, a second at most. A rate of 0 stops the
+        reference at once.
+        """
+        here, speed = self.demand(t_ns), self.speed(t_ns) if rate > 0 else 0.0
+        if speed:
+            self.follow(braking(here, speed, rate), t_ns, done)
+            return
+        self._stop()
+        self._plant.advance(t_ns)
+        self._was = self._plant.motor_counts(self._axis)
+        self._patience, self._done = PATIENCE_STEPS, done
+        self._ramp(here, here, t_ns, t_ns + STEP_NS)
+        self._timer.arm(t_ns + STEP_NS)
+
+    def _step(self, due_ns: int) -> None:
+        trajectory = self._trajectory
+        if trajectory is None:
+            self._await_standstill(due_ns)
+            return
+        begun_s = (due_ns - self._begin_ns) * 1e-9
+        left_s = trajectory.duration_s - begun_s
+        if left_s < NOTHING_S:
+            self._trajectory, self._start = None, self._end  # the ramp that has just ended no longer counts as motion
+            self._await_standstill(due_ns)
+            return
+        step_s = STEP_NS * 1e-9
+        last = left_s <= step_s
+        step_ns = max(1, round(left_s * 1e9)) if last else STEP_NS
+        end = trajectory.at(trajectory.duration_s if last else begun_s + step_s)[0]
+        self._ramp(self.demand(due_ns), end, due_ns, due_ns + step_ns)
+        self._timer.arm(due_ns + STEP_NS)
+
+    def _await_standstill(self, due_ns: int) -> None:
+        if self._done is None:
+            return
+        self._plant.advance(due_ns)
+        here = self._plant.motor_counts(self._axis)
+        moved, self._was = abs(here - self._was), here
+        self._patience -= 1
+        if moved > STANDSTILL_COUNTS and self._patience > 0:
+            self._timer.arm(due_ns + STEP_NS)
+        else:
+            self._done(due_ns)
+
+    def _stop(self) -> None:
+        self._timer.cancel()
+        self._trajectory = None
+
+    def _ramp(self, start: float, end: float, t0_ns: int, t1_ns: int) -> None:
+        self._start, self._end, self._t0, self._t1 = start, end, t0_ns, t1_ns
+        self._plant.set_ramp(self._axis, start, end, t0_ns, t1_ns)
+
+
+# An axis for a drive that has no plant: the motor is exactly where its reference is.
+#
+# Nothing loads it: there is no torque, and a following error never arises. To the torque of a drive it answers as an
+# inertia with viscous damping, without Coulomb friction.
+
+
+class IdealAxis(AxisPlant):
+    """Follows straight references without a lag. The axis number that calls carry means nothing here."""
+
+    def __init__(self) -> None:
+        self._start = self._end = 0.0
+        self._t0 = self._t1 = self._now = 0
+
+    def begin(self, t_ns: int) -> None:
+        """Nothing: it rests until it gets a reference."""
+
+    def advance(self, t_ns: int) -> None:
+        self._now = max(self._now, t_ns)
+
+    def motor_counts(self, axis: int) -> float:
+        if self._now >= self._t1:
+            return self._end
+        return self._start + (self._end - self._start) * max(0, self._now - self._t0) / (self._t1 - self._t0)
+
+    def torque_permille(self, axis: int) -> int:
+        """Always 0."""
+        return 0
+
+    def limit_switches(self, axis: int) -> tuple[float, float]:
+        """None."""
+        return -inf, inf
+
+    def motor_dynamics(self, axis: int) -> MotorDynamics:
+        """From rest 100 permille give 10⁵ counts/s², in the end 10⁵ counts/s."""
+        return MotorDynamics(gain=1000.0, coulomb=0.0, damping=1.0)
+
+    def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
+        """Nothing: there is no loop and no torque."""
+
+    def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
+        self._start, self._end, self._t0, self._t1 = start_counts, end_counts, t0_ns, t1_ns

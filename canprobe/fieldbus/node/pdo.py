@@ -1,0 +1,339 @@
+"""All PDOs of a node: which frame goes where, and what a SYNC does.
+
+At a SYNC in operational: waiting synchronous RPDOs are applied, the application moves on, then every TPDO whose turn
+it is is sampled and packed. TPDOs of equal type and start value share one group, so they always go together.
+Source: CiA 301, "Process data object (PDO)", objects 1007h, 1019h, 18xxh:06.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+
+from canprobe.fieldbus.node.core import NO_ROUTES, NodeCore, Route, Service
+from canprobe.fieldbus.node.dictionary import Abort, SdoAbort, Value, key_of
+from canprobe.fieldbus.node.emcy import Emergency
+from canprobe.fieldbus.node.tpdo import BUFFERED, Packing, PdoRules, Rpdo, Sampler, Tpdo
+from canprobe.fieldbus.protocol.frames import SYNC_ID, SYNC_LENGTH, SYNC_LOST, Frame, NmtState, is_restricted
+
+
+class _Group:
+    """TPDOs that a SYNC triggers together: every `every`-th, counted from the SYNC with counter `start`.
+
+    Attributes:
+        samplers: bring their values up to date.
+        packing: how each is then packed.
+    """
+
+    def __init__(self, every: int, start: int) -> None:
+        self.every, self.start = every, start
+        self.first: int | None = None
+        self.tpdos: list[Tpdo] = []
+        self.samplers: list[Sampler] = []
+        self.packing: list[Packing] = []
+
+
+class PdoEngine(Service):
+    """The PDOs of one node.
+
+    Args:
+        core: of the node.
+        emcy: reports what is wrong with an RPDO.
+        on_sync: `on_sync(t_ns, counter)` at a SYNC in operational, before the TPDOs are packed.
+    """
+
+    def __init__(self, core: NodeCore, emcy: Emergency, on_sync: Callable[[int, int], None]) -> None:
+        self._core, self._on_sync = core, on_sync
+        self._samplers: dict[int, Sampler] = {}
+        self._rpdos: list[Rpdo] = []
+        self._tpdos: list[Tpdo] = []
+        self._all: list[Rpdo | Tpdo] = []
+        self._waiting: list[Rpdo] = []
+        self._groups: list[_Group] = []
+        self._on_event: list[Tpdo] = []
+        self._buffered: list[Tpdo] = []
+        self._late: deque[tuple[int, list[Frame]]] = deque()  # when, and what
+        self._late_timer = core.timers.new(self._send_late)
+        self._count = self._sync_ns = self._window_ns = 0
+        for rules in _discover(core, 0x1400, transmits=False):
+            self._rpdos.append(rpdo := Rpdo(core, emcy, rules))
+            self._watch(rules, rpdo)
+        for rules in _discover(core, 0x1800, transmits=True):
+            self._tpdos.append(tpdo := Tpdo(core, rules))
+            self._watch(rules, tpdo)
+        core.dictionary.written = self._written
+        core.dictionary.on_change(self._rebuild, 0x1007)
+
+    def _watch(self, rules: PdoRules, pdo: Rpdo | Tpdo) -> None:
+        def reconfigure(subindex: int, value: Value) -> None:
+            pdo.configure()
+            if isinstance(pdo, Tpdo) and self._core.state is NmtState.OPERATIONAL:
+                pdo.reconfigured(self._core.now_ns)
+            self._rebuild()
+            self._core.reroute()
+
+        self._all.append(pdo)
+        dictionary = self._core.dictionary
+        dictionary.on_check(rules.communication, rules.check_communication)
+        dictionary.on_check(rules.mapping, rules.check_mapping)
+        dictionary.on_write(rules.communication, reconfigure)
+        dictionary.on_write(rules.mapping, reconfigure)
+
+    def on_trigger(self, index: int, sampler: Sampler) -> None:
+        """`sampler(t_ns)` is called once before TPDOs that map `index` are packed."""
+        self._samplers[index] = sampler
+
+    def reset(self, t_ns: int) -> None:
+        """Read all parameters."""
+        for pdo in self._all:
+            pdo.configure()
+        self._rebuild()
+
+    def entered(self, t_ns: int) -> None:
+        """Count SYNCs anew in operational; be silent elsewhere."""
+        for pdo in self._all:
+            pdo.stop()
+        self._late.clear()
+        self._late_timer.cancel()
+        if self._core.state is NmtState.OPERATIONAL:
+            self._groups = []
+            self._rebuild()
+            for tpdo in self._on_event:
+                tpdo.started(t_ns)
+
+    def routes(self) -> Mapping[int, Route]:
+        """RPDOs and remote requests for TPDOs, in operational only; PDOs that share an identifier are all served."""
+        if self._core.state is not NmtState.OPERATIONAL:
+            return NO_ROUTES
+        routes: dict[int, Route] = {}
+        for rpdo in self._rpdos:
+            if rpdo.cob_id is not None:
+                routes[rpdo.cob_id] = _both(routes.get(rpdo.cob_id), self._route(rpdo))
+        for tpdo in self._tpdos:
+            if tpdo.remote_id is not None:
+                routes[tpdo.remote_id] = _both(routes.get(tpdo.remote_id), tpdo.remote)
+        return routes
+
+    @property
+    def patient(self) -> frozenset[int]:
+        """Identifiers of RPDOs whose frames can wait for the next SYNC, in operational."""
+        if self._core.state is not NmtState.OPERATIONAL:
+            return frozenset()
+        used = [rpdo for rpdo in self._rpdos if rpdo.cob_id is not None]
+        hasty = {rpdo.cob_id for rpdo in used if not rpdo.patient}
+        return frozenset(rpdo.cob_id for rpdo in used if rpdo.cob_id is not None and rpdo.cob_id not in hasty)
+
+    def _route(self, rpdo: Rpdo) -> Route:
+        if not (self._window_ns and rpdo.synchronous):
+            return rpdo.receive
+
+        def inside_window(data: bytes, t_ns: int) -> None:
+            if t_ns - self._sync_ns <= self._window_ns:
+                rpdo.receive(data, t_ns)
+
+        return inside_window
+
+    def rpdo(self, cob_id: int) -> Rpdo:
+        """The RPDO with this identifier. StopIteration: none."""
+        return next(rpdo for rpdo in self._rpdos if rpdo.cob_id == cob_id)
+
+    def receives(self, index: int) -> bool:
+        """Whether an RPDO that is in use carries an object of `index`."""
+        return any(key >> 8 == index for rpdo in self._rpdos if rpdo.cob_id is not None for key in rpdo.keys)
+
+    def event(self, index: int, subindex: int = 0) -> None:
+        """A value of the device changed: TPDOs of type 0, 254 and 255 that carry it are due."""
+        self._written((key_of(index, subindex),))
+
+    def _written(self, keys: Sequence[int]) -> None:
+        """As `event`, of values that changed together: one event for each TPDO."""
+        if self._core.state is NmtState.OPERATIONAL:
+            for tpdo in self._on_event:
+                if any(key in tpdo.keys for key in keys):
+                    tpdo.event(self._core.now_ns)
+
+    def sync(self, t_ns: int, counter: int, elapsed: int) -> None:
+        """A SYNC in operational.
+
+        Args:
+            t_ns: its time.
+            counter: its counter, 0 without one.
+            elapsed: SYNCs since the last one heard; the counter shows the lost ones, which are included.
+        """
+        core = self._core
+        for group in self._triggered(t_ns, counter, elapsed):
+            frames = self._packed(group, t_ns)
+            if core.quirks.tpdo_delay_ns:
+                self._late.append((t_ns + core.quirks.tpdo_delay_ns, frames))
+                self._late_timer.arm(self._late[0][0])
+            else:
+                core.out += frames
+        for tpdo in self._buffered:
+            tpdo.sample(t_ns)
+        for tpdo in self._on_event:
+            if tpdo.requested:
+                tpdo.send(t_ns)
+
+    def exchange(self, t_ns: int, counter: int) -> list[tuple[int, tuple[int, ...]]]:
+        """As `sync`, for a master that takes values: the TPDOs whose turn it is, each (COB-ID, its values)."""
+        groups, values = self._triggered(t_ns, counter, 1), self._core.dictionary.values
+        return [(cob_id, fetch(values)) for group in groups for cob_id, _, fetch in group.packing]
+
+    def _triggered(self, t_ns: int, counter: int, elapsed: int) -> list[_Group]:
+        """What a SYNC does before anything is packed: the TPDOs whose turn it is, their values up to date."""
+        self._sync_ns = t_ns
+        count = self._count = self._count + elapsed
+        for rpdo in self._waiting:
+            if rpdo.pending is not None:
+                rpdo.apply(rpdo.pending)
+        self._on_sync(t_ns, counter)
+        groups = []
+        for group in self._groups:
+            first = group.first
+            if first is None:
+                if counter != group.start:
+                    continue
+                first = group.first = count
+            if (count - first) % group.every == 0:
+                groups.append(group)
+                for sampler in group.samplers:
+                    sampler(t_ns)
+        return groups
+
+    def _packed(self, group: _Group, t_ns: int) -> list[Frame]:
+        values = self._core.dictionary.values
+        try:
+            return [(cob_id, pack(*fetch(values))) for cob_id, pack, fetch in group.packing]
+        except (struct.error, TypeError):
+            for tpdo in group.tpdos:
+                tpdo.send(t_ns)  # the one with the value that does not fit raises, with its name
+            raise
+
+    def _send_late(self, due_ns: int) -> None:
+        """Frames of a node that is slow after SYNC: what they carry is as old as the SYNC."""
+        while self._late and self._late[0][0] <= due_ns:
+            self._core.out += self._late.popleft()[1]
+        if self._late:
+            self._late_timer.arm(self._late[0][0])
+
+    def _rebuild(self) -> None:
+        dictionary = self._core.dictionary
+        self._window_ns = dictionary.number(0x1007) * 1000
+        self._waiting = [rpdo for rpdo in self._rpdos if rpdo.cob_id is not None and rpdo.synchronous]
+        active = [tpdo for tpdo in self._tpdos if tpdo.active]
+        self._on_event = [tpdo for tpdo in active if tpdo.type == 0 or tpdo.by_event]
+        self._buffered = [tpdo for tpdo in active if tpdo.type == BUFFERED]
+        dictionary.watched = frozenset(key for tpdo in self._on_event for key in tpdo.keys)
+        counted = bool(dictionary.number(0x1019))
+        groups: dict[tuple[int, int], _Group] = {}
+        for tpdo in active:
+            if 1 <= tpdo.type <= 240:
+                key = tpdo.type, tpdo.start if counted else 0
+                groups.setdefault(key, _Group(*key)).tpdos.append(tpdo)
+            else:
+                tpdo.samplers = self._samplers_of([tpdo])
+        phases = {(group.every, group.start): group.first for group in self._groups}
+        self._groups = list(groups.values())
+        for group in self._groups:  # a PDO that is written to in operational does not shift the phase of the others
+            group.samplers = self._samplers_of(group.tpdos)
+            group.packing = [tpdo.packing for tpdo in group.tpdos]
+            group.first = phases.get((group.every, group.start), None if group.start else self._count)
+
+    def _samplers_of(self, tpdos: list[Tpdo]) -> list[Sampler]:
+        indices = dict.fromkeys(key >> 8 for tpdo in tpdos for key in tpdo.keys)
+        return list(dict.fromkeys(self._samplers[index] for index in indices if index in self._samplers))
+
+
+def _discover(core: NodeCore, first: int, transmits: bool) -> list[PdoRules]:
+    indices = range(first, first + 0x200)
+    return [PdoRules(core.dictionary, i, i + 0x200, transmits) for i in indices if core.dictionary.has_index(i)]
+
+
+def _both(first: Route | None, second: Route) -> Route:
+    if first is None:
+        return second
+
+    def route(data: bytes, t_ns: int) -> None:
+        first(data, t_ns)
+        second(data, t_ns)
+
+    return route
+
+
+# SYNC consumer: length, counter, lost SYNCs, and the time-out of the communication cycle period.
+#
+# Source: CiA 301, "Synchronization object (SYNC)", objects 1005h, 1006h, 1019h; errors 8100h, 8240h.
+
+_PRODUCER = 1 << 30
+_HEARD = frozenset({NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL})
+
+
+class SyncConsumer(Service):
+    """Hears SYNC and passes it to the PDOs as `on_sync(t_ns, counter, elapsed)` in operational."""
+
+    def __init__(self, core: NodeCore, emcy: Emergency, on_sync: Callable[[int, int, int], None]) -> None:
+        self._core, self._emcy, self._on_sync = core, emcy, on_sync
+        self._timer = core.timers.new(self._timed_out)
+        self._overflow = self._timeout_ns = self._last = 0
+        self._operational = False
+        dictionary = core.dictionary
+        dictionary.on_check(0x1005, self._check_cob_id)
+        dictionary.on_check(0x1019, self._check_overflow)
+        dictionary.on_write(0x1005, lambda _sub, _value: core.reroute())
+        dictionary.on_change(self._configure, 0x1006, 0x1019)
+
+    def reset(self, t_ns: int) -> None:
+        """Read the parameters."""
+        self._configure()
+
+    def _configure(self) -> None:
+        number = self._core.dictionary.number
+        self._overflow = number(0x1019)
+        self._timeout_ns = number(0x1006) * 1500  # 1.5 periods
+        self._last = 0
+        self._timer.cancel()
+
+    def entered(self, t_ns: int) -> None:
+        """The time-out runs in operational, from the first SYNC there."""
+        self._operational = self._core.state is NmtState.OPERATIONAL
+        self._timer.cancel()
+
+    def routes(self) -> Mapping[int, Route]:
+        """The SYNC identifier, in pre-operational and operational."""
+        if self._core.state not in _HEARD:
+            return NO_ROUTES
+        return {self._core.dictionary.number(0x1005, 0, SYNC_ID) & 0x7FF: self._receive}
+
+    def _receive(self, data: bytes, t_ns: int) -> None:
+        overflow = self._overflow
+        if len(data) != (1 if overflow else 0):
+            self._emcy.report(SYNC_LENGTH)
+            return
+        if self._emcy.any:
+            self._emcy.clear(SYNC_LENGTH)
+            self._emcy.clear(SYNC_LOST)
+        counter, elapsed = 0, 1
+        if overflow:
+            counter, last = data[0], self._last
+            self._last = counter
+            if last:
+                elapsed = (counter - last) % overflow or overflow
+        if self._operational:
+            if self._timeout_ns:
+                self._timer.arm(t_ns + self._timeout_ns)
+            self._on_sync(t_ns, counter, elapsed)
+
+    def _timed_out(self, due_ns: int) -> None:
+        self._emcy.report(SYNC_LOST)
+
+    def _check_cob_id(self, subindex: int, value: Value) -> None:
+        new = int(value)
+        if new & _PRODUCER or new & 0x3FFFF800 or is_restricted(new & 0x7FF):
+            raise SdoAbort(Abort.VALUE)
+
+    def _check_overflow(self, subindex: int, value: Value) -> None:
+        if int(value) == 1 or int(value) > 240:
+            raise SdoAbort(Abort.VALUE)
+        if self._core.dictionary.number(0x1006):
+            raise SdoAbort(Abort.DEVICE_STATE)

@@ -1,0 +1,281 @@
+"""Serves emulated nodes on real buses, in real time, for any master, and keeps what they store in files."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+from canprobe.errors import CanprobeError, UsageError
+from canprobe.fieldbus.bus.candump import write_text
+from canprobe.fieldbus.bus.port import Port, TimedFrame, VirtualClock, wait_for_any
+from canprobe.fieldbus.bus.real.processor import garbage_collection_paused
+from canprobe.fieldbus.bus.virtual.lockstep import BusNode, LockstepBus, Participant
+from canprobe.fieldbus.node.dictionary import Abort, SdoAbort, Value
+from canprobe.fieldbus.node.slave_node import SlaveNode
+from canprobe.fieldbus.protocol.frames import SYNC_ID, UNCONFIGURED, Frame
+
+_MAX_WAIT_NS = 100_000_000
+
+
+class Exchange(LockstepBus):
+    """The nodes of one process behind one bus: a lockstep bus whose time is that of the real one.
+
+    A SYNC goes to one kind of device after the other, in the order of `nodes`, and what one kind answers leaves before
+    the next kind starts to work: the drives' quick feedback does not wait for the sensor's image.
+
+    Attributes:
+        skipped: SYNCs that were left unanswered because the next one had come already.
+        rerouted: set when a node has changed what it listens to; whoever acts on that clears it.
+    """
+
+    def __init__(self, nodes: Sequence[Participant]) -> None:
+        super().__init__(VirtualClock(), "served nodes", fd=True)
+        self._served = nodes
+        self._outside = self._add(_Outside())
+        self._sent: list[Frame] = []
+        self.recorder = lambda can_id, data, _t_ns: self._sent.append((can_id, data))
+        self.skipped = 0
+        self._heard_ns = 0
+        self.rerouted = True
+
+    def _forget_listeners(self) -> None:
+        super()._forget_listeners()
+        self.rerouted = True
+
+    @property
+    def patient(self) -> frozenset[int]:
+        """Identifiers that can wait for the next SYNC, whoever listens to them."""
+        wanted = {can_id for node in self._served for can_id in node.patient}
+        return frozenset(i for i in wanted if all(i in node.patient or i not in node.listens for node in self._served))
+
+    def start(self, t_ns: int) -> list[Frame]:
+        """Power on all nodes; returns what goes on the bus."""
+        self.clock.move_ns(t_ns)
+        for node in self._served:
+            self.attach(node)
+        return self._carry(t_ns)
+
+    def step(self, frames: Sequence[TimedFrame], t_ns: int) -> list[Frame]:
+        """Feed what came from the bus, then do what is due by `t_ns`; returns what goes on the bus.
+
+        Args:
+            frames: (can_id, data, time of reception in ns), in order.
+            t_ns: now; receptions in the future count as now, and none is earlier than the one before it.
+        """
+        return [frame for batch in self.batches(frames, t_ns) for frame in batch]
+
+    def batches(self, frames: Sequence[TimedFrame], t_ns: int) -> Iterator[list[Frame]]:
+        """As `step`, but each batch is computed only when the one before it has been sent.
+
+        Of several SYNCs only the last is answered: nodes that are behind miss SYNCs, as busy devices do, instead of
+        answering old ones ever later.
+        """
+        self.clock.move_ns(t_ns)
+        syncs = [can_id for can_id, _, _ in frames].count(SYNC_ID)
+        for can_id, data, received_ns in frames:
+            heard_ns = self._heard_ns = max(self._heard_ns, min(received_ns, t_ns))
+            if can_id != SYNC_ID:
+                self._hand_over(self._outside, can_id, data, heard_ns)
+                continue
+            syncs -= 1
+            if not syncs:
+                yield from self._synchronise(data, heard_ns)
+                continue
+            self.skipped += 1
+            for node in self._served:
+                if node.hears_every_sync:
+                    node.receive(SYNC_ID, data, heard_ns)
+        for one in self._nodes:
+            one.due = one.owner.next_deadline_ns
+        self._advance_due(t_ns)
+        if rest := self._carry(t_ns):
+            yield rest
+
+    def _synchronise(self, data: bytes, t_ns: int) -> Iterator[list[Frame]]:
+        """Pass a SYNC on. The nodes hear each other's answers to it only once they have all heard the SYNC itself."""
+        if before := self._carry(t_ns):
+            yield before
+        spoken: list[tuple[BusNode, Frame]] = []
+        listeners = self._listeners_of(self._outside, SYNC_ID)
+        for _, kind in groupby(listeners, key=lambda listener: listener[1].owner.kind):
+            for receive, node in kind:
+                self._queue(node, receive(SYNC_ID, data, t_ns))
+            said = []
+            while self._heads:
+                said.append(self._take_next())
+            if said:
+                spoken += said
+                yield [frame for _, frame in said]
+        for sender, frame in spoken:
+            self._hand_over(sender, *frame, t_ns)
+
+    def _carry(self, t_ns: int) -> list[Frame]:
+        """Let the nodes hear what is queued and what they answer each other; returns it for the bus."""
+        self._deliver(t_ns, self._max_frames)
+        sent, self._sent = self._sent, []
+        return sent
+
+
+class _Outside(Participant):
+    """Stands for everybody on the real bus, whose frames the nodes hear; what the nodes send leaves by the port."""
+
+    listens = ()
+
+
+class _Served:
+    """The nodes of one bus behind its port."""
+
+    def __init__(self, nodes: Sequence[Participant], port: Port, now_ns: int) -> None:
+        self.port = port
+        self.exchange = Exchange(nodes)
+        self._deferred: frozenset[int] = frozenset()
+        if boot_ups := self.exchange.start(now_ns):
+            port.send_batch(boot_ups)
+
+    def get_ready(self) -> int | None:
+        """Before a wait: when a node is due, None without any; the port wakes for what the nodes listen to now."""
+        if self.exchange.rerouted:
+            # Being woken for each RPDO, in the middle of its sender's burst, costs both sides more than all else.
+            self.exchange.rerouted = False
+            if (patient := self.exchange.patient) != self._deferred:
+                self._deferred = patient
+                self.port.defer(patient)
+        return self.exchange.next_deadline_ns()
+
+    def step(self, received: list[TimedFrame], now_ns: int) -> None:
+        """Let the nodes answer what came, and do what is due."""
+        for frames in self.exchange.batches(received, now_ns):
+            self.port.send_batch(frames)
+
+
+def serve(buses: Sequence[tuple[Sequence[Participant], Port]], stop: Callable[[], bool]) -> None:
+    """Power on the nodes and serve them until `stop()`; it is called after every wait, of 100 ms at most.
+
+    Nodes hear what is on their own bus. All of them may share one plant: they work one after the other.
+
+    Args:
+        buses: of each bus its participants, for example `SlaveNode`s, and the port; the clock of the ports is theirs.
+        stop: ends the loop when it returns True.
+    """
+    ports = [port for _, port in buses]
+    clock = ports[0].clock
+    with garbage_collection_paused():
+        now_ns = clock.now_ns()
+        served = [_Served(nodes, port, now_ns) for nodes, port in buses]
+        while not stop():
+            until_ns = min([now_ns + _MAX_WAIT_NS, *(due for one in served if (due := one.get_ready()) is not None)])
+            if len(ports) == 1:
+                received = [ports[0].wait_and_drain(until_ns)]
+            else:
+                wait_for_any(ports, until_ns)
+                received = [port.drain() for port in ports]
+            # The last arrival is the time to work at: one reading of the clock less before the answers leave.
+            arrivals_ns = [frames[-1][2] for frames in received if frames]
+            now_ns = max(now_ns, *arrivals_ns) if arrivals_ns else clock.now_ns()
+            for one, frames in zip(served, received, strict=True):
+                one.step(frames, now_ns)
+
+
+# A node's stored parameters (1010h, 1011h, LSS) in a JSON file, so that they survive a restart of the process.
+
+_SCHEMA = 1
+
+
+def keep_in_file(node: SlaveNode, path: Path) -> None:
+    """Take over what the file holds, if there is one; from now on write it at every "save" and "load" and when
+    LSS stores a node id.
+
+    Call it before the node is started. A write that fails aborts the SDO with 06060000h, or LSS with error 2.
+
+    Args:
+        node: the node, not yet started.
+        path: of the file; its folder is made.
+
+    Raises:
+        UsageError: the file cannot be read, or is another device's.
+    """
+    if path.exists():
+        _read(node, path)
+
+    def write() -> None:
+        try:
+            _write(node, path)
+        except (OSError, CanprobeError) as error:
+            raise SdoAbort(Abort.HARDWARE) from error
+
+    node.store.changed = write
+
+
+def _identity(node: SlaveNode) -> list[int]:
+    return [node.dictionary.number(0x1018, subindex) for subindex in (1, 2, 3)]
+
+
+def _write(node: SlaveNode, path: Path) -> None:
+    content = {
+        "schema": _SCHEMA,
+        "identity": _identity(node),
+        "device": node.store.kept.hex(),
+        **({} if node.store.node_id is None else {"node_id": node.store.node_id}),
+        "values": {
+            f"{key >> 8:04X}:{key & 0xFF:02X}": _plain(value) for key, value in sorted(node.store.saved.items())
+        },
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_text(path, json.dumps(content, indent=1))
+
+
+def _plain(value: Value) -> Any:
+    return {"hex": value.hex()} if isinstance(value, bytes) else value
+
+
+def _read(node: SlaveNode, path: Path) -> None:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        identity, texts, device = content["identity"], content["values"], bytes.fromhex(content["device"])
+        values = {_key(text): _value(plain) for text, plain in texts.items()}
+        node_id = _node_id(content.get("node_id"))
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise UsageError(f"{path}: no stored parameters of a node can be read from it: {error!r}") from error
+    if identity != _identity(node):
+        raise UsageError(f"{path}: stored by the device {identity}, {node.name} is {_identity(node)} (1018h:01 to 03)")
+    for key, value in values.items():
+        _check(node, path, key, value)
+    node.store.saved, node.store.kept, node.store.node_id = values, device, node_id
+
+
+def _node_id(value: Any) -> int | None:
+    if value is None or value == UNCONFIGURED or (type(value) is int and 1 <= value <= 127):
+        return value  # type: ignore[no-any-return]
+    raise ValueError(f"expected a node id from 1 to 127, or 255, got {value!r}")
+
+
+def _key(text: str) -> int:
+    index, subindex = text.split(":")
+    return int(index, 16) << 8 | int(subindex, 16)
+
+
+def _value(plain: Any) -> Value:
+    if isinstance(plain, dict):
+        return bytes.fromhex(plain["hex"])
+    if isinstance(plain, bool) or not isinstance(plain, (int, float)):
+        raise TypeError(f"expected a number or hex, got {plain!r}")
+    return plain
+
+
+def _check(node: SlaveNode, path: Path, key: int, value: Value) -> None:
+    """What the file puts into the dictionary must be a value of that entry: the cyclic code packs it unchecked."""
+    where = f"{path}: {key >> 8:04X}h:{key & 0xFF:02X}"
+    entry = node.dictionary.entries.get(key)
+    if entry is None:
+        raise UsageError(f"{where}: the EDS of {node.name} has no such object")
+    try:
+        entry.from_bytes(entry.to_bytes(value))
+        entry.check_limits(value)
+        fits = isinstance(value, bytes) is not bool(entry.bits) and (bool(entry.real) or not isinstance(value, float))
+    except (SdoAbort, OverflowError, ValueError) as error:
+        raise UsageError(f"{where}: {value!r} is no value of it: {error}") from error
+    if not fits:
+        raise UsageError(f"{where}: {value!r} is no value of it: another data type")

@@ -1,0 +1,271 @@
+"""Images in raw CAN frames, of arrays that know no CANopen: one description for both ways, and reassembly.
+
+A frame of such a device is described as a text of two characters a byte, spaces between them ignored: `0`–`9` and
+`A`–`F` must stand there (the tag that names the frame), `.` is not read, and a small letter is part of a value.
+All places with one letter are one value of 4 bits each, in the byte order of the format; the values of a frame are in
+the order of the alphabet. So `"..xxxxyyyyzzzz"` has three words behind an unused byte, `"B130uuvvwwxxyyzz"` six bytes
+behind a tag of two, and `"ttuuvvut.v"`, little-endian, three values of 12 bits whose high nibbles come last.
+
+An image is every frame of `frames` from every identifier, once each. The values are in the order identifier, frame,
+letter; `axes` values in a row are those of one taxel.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.errors import ProtocolError
+from canprobe.fieldbus.protocol.frames import Frame
+
+Counts = NDArray[np.int64]
+"""(rows, columns, axes) counts as the device sends them."""
+_TAG = "0123456789ABCDEF"
+_CLASSIC_BYTES = 8
+
+
+@dataclass(frozen=True, slots=True)
+class FramePattern:
+    """One frame of an image.
+
+    Attributes:
+        length: bytes that it has at least; what follows is not read.
+        mask, tag: of these bytes as one big-endian number: the bits that name the frame, and what they are.
+        values: of each value, the shifts of its nibbles in that number, the most significant first.
+    """
+
+    length: int
+    mask: int
+    tag: int
+    values: tuple[tuple[int, ...], ...]
+
+    @classmethod
+    def parse(cls, text: str, byte_order: str = "big") -> FramePattern:
+        """The pattern in a text (see the module).
+
+        Raises:
+            ProtocolError: it is none, or longer than 8 bytes.
+        """
+        characters = text.replace(" ", "")
+        if not re.fullmatch(r"([0-9A-Za-z.]{2}){1,8}", characters) or re.search(r"[G-Z]", characters):
+            raise ProtocolError(
+                f'frame "{text}": expected 1 to {_CLASSIC_BYTES} bytes of two characters each: 0-9 and A-F for a tag,'
+                " small letters for values, '.' for what is not read"
+            )
+        length, mask, tag = len(characters) // 2, 0, 0
+        places: dict[str, list[int]] = {}
+        for place, character in enumerate(characters):
+            shift = 4 * (2 * length - 1 - place)
+            if character in _TAG:
+                mask |= 0xF << shift
+                tag |= int(character, 16) << shift
+            elif character != ".":
+                places.setdefault(character, []).append(place)
+        values = []
+        for letter in sorted(places):
+            ordered = places[letter]  # big-endian: from the left to the right
+            if byte_order == "little":
+                ordered = sorted(ordered, key=lambda place: (-(place // 2), place % 2))
+            values.append(tuple(4 * (2 * length - 1 - place) for place in ordered))
+        return cls(length, mask, tag, tuple(values))
+
+    def matches(self, data: bytes) -> bool:
+        """Whether bytes are this frame."""
+        return len(data) >= self.length and self._number(data) & self.mask == self.tag
+
+    def resembles(self, other: FramePattern) -> bool:
+        """Whether there are bytes that are both frames."""
+        length = max(self.length, other.length)
+        mine, its = 8 * (length - self.length), 8 * (length - other.length)
+        common = (self.mask << mine) & (other.mask << its)
+        return (self.tag << mine) & common == (other.tag << its) & common
+
+    def unpack(self, data: bytes) -> list[int]:
+        """The values in a frame that matches."""
+        number, values = self._number(data), []
+        for shifts in self.values:
+            value = 0
+            for shift in shifts:
+                value = value << 4 | number >> shift & 0xF
+            values.append(value)
+        return values
+
+    def pack(self, values: Sequence[int]) -> bytes:
+        """The frame with these values; what is not read is 0.
+
+        Raises:
+            ProtocolError: a value that does not fit.
+        """
+        number = self.tag
+        for value, shifts in zip(values, self.values, strict=True):
+            if not 0 <= value < 1 << 4 * len(shifts):
+                raise ProtocolError(f"value {value} has more than {4 * len(shifts)} bits")
+            for place, shift in enumerate(reversed(shifts)):
+                number |= (value >> 4 * place & 0xF) << shift
+        return number.to_bytes(self.length, "big")
+
+    def _number(self, data: bytes) -> int:
+        return int.from_bytes(data[: self.length], "big")
+
+
+@dataclass(frozen=True)
+class ImageFormat:
+    """How a device puts an image into frames.
+
+    Attributes:
+        ids: 11-bit identifiers of its frames.
+        frames: what each identifier sends for one image.
+        rows, columns: of the image.
+        axes: values of a taxel.
+        by_columns: taxels come column by column; else row by row.
+    """
+
+    ids: tuple[int, ...]
+    frames: tuple[FramePattern, ...]
+    rows: int
+    columns: int
+    axes: int = 1
+    by_columns: bool = False
+
+    def __post_init__(self) -> None:
+        """Check it.
+
+        Raises:
+            ProtocolError: an identifier twice, frames that cannot be told apart, or another number of values.
+        """
+        if len(set(self.ids)) != len(self.ids):
+            raise ProtocolError("an identifier is there twice")
+        for number, frame in enumerate(self.frames):
+            if any(frame.resembles(other) for other in self.frames[:number]):
+                raise ProtocolError(f"frame {number + 1} cannot be told from one before it: give each its own tag")
+        carried, taxels = len(self.ids) * sum(len(frame.values) for frame in self.frames), self.rows * self.columns
+        if carried != taxels * self.axes:
+            each = f" of {self.axes} values" if self.axes > 1 else ""
+            raise ProtocolError(
+                f"{len(self.ids)} identifiers with {len(self.frames)} frames each carry {carried} values, and"
+                f" {self.rows} × {self.columns} taxels{each} have {taxels * self.axes}"
+            )
+
+    @property
+    def parts(self) -> int:
+        """Frames of an image."""
+        return len(self.ids) * len(self.frames)
+
+    @property
+    def longest(self) -> int:
+        """Bytes of its longest frame."""
+        return max(frame.length for frame in self.frames)
+
+    @property
+    def bits(self) -> int:
+        """Of its narrowest value."""
+        return min(4 * len(shifts) for frame in self.frames for shifts in frame.values)
+
+    @cached_property
+    def _id_numbers(self) -> dict[int, int]:
+        return {can_id: number for number, can_id in enumerate(self.ids)}
+
+    def part_of(self, can_id: int, data: bytes) -> int | None:
+        """Which frame of the image this is, from 0; None where it is none."""
+        number = self._id_numbers.get(can_id)
+        if number is None:
+            return None
+        for place, frame in enumerate(self.frames):
+            if frame.matches(data):
+                return number * len(self.frames) + place
+        return None
+
+    def values_of(self, part: int, data: bytes) -> list[int]:
+        """The values in a frame of the image."""
+        return self.frames[part % len(self.frames)].unpack(data)
+
+    def decode(self, parts: Sequence[bytes]) -> Counts:
+        """The image in all its frames, in the order of identifiers and frames."""
+        values = [value for part, data in enumerate(parts) for value in self.values_of(part, data)]
+        if self.by_columns:
+            return np.array(values).reshape(self.columns, self.rows, self.axes).transpose(1, 0, 2)
+        return np.array(values).reshape(self.rows, self.columns, self.axes)
+
+    def encode(self, counts: Counts) -> list[Frame]:
+        """The frames of an image, in the order of identifiers and frames.
+
+        Raises:
+            ProtocolError: another shape, or a count that does not fit.
+        """
+        if counts.shape != (self.rows, self.columns, self.axes):
+            raise ProtocolError(f"image: expected {(self.rows, self.columns, self.axes)} counts, got {counts.shape}")
+        values = (counts.transpose(1, 0, 2) if self.by_columns else counts).reshape(-1).tolist()
+        sent, start = [], 0
+        for can_id in self.ids:
+            for frame in self.frames:
+                end = start + len(frame.values)
+                sent.append((can_id, frame.pack(values[start:end])))
+                start = end
+        return sent
+
+
+@dataclass(frozen=True, slots=True)
+class RawImage:
+    """One complete image.
+
+    Attributes:
+        counts: (rows, columns, axes) as sent.
+        t_ns: arrival of its first frame.
+        number: of the complete images so far, from 0.
+    """
+
+    counts: Counts
+    t_ns: int
+    number: int
+
+
+class ImageAssembler:
+    """Collects the frames of images; `push` returns an image when the last of its distinct frames arrives.
+
+    An image opens at any of its frames. A frame that it has already begins the next one: the open image was torn. So a
+    lost frame costs its image and no other. The formats have no counter and no checksum: a changed bit is not noticed,
+    nor is a lost image, and two images are mixed without notice where the first frames of one and the last ones of the
+    other are lost and the rest comes within the deadline.
+
+    Args:
+        image: what is expected.
+        deadline_ns: longest time from the first frame to the last.
+
+    Attributes:
+        frames: images published.
+        torn: opened and dropped incomplete.
+    """
+
+    def __init__(self, image: ImageFormat, deadline_ns: int) -> None:
+        self.image = image
+        self.frames = self.torn = 0
+        self._deadline_ns = deadline_ns
+        self._parts: dict[int, bytes] = {}
+        self._opened_ns = 0
+
+    def push(self, can_id: int, data: bytes, t_ns: int) -> RawImage | None:
+        """Take one received frame; what is no part of an image is ignored. Never raises on bytes."""
+        part = self.image.part_of(can_id, data)
+        if part is None:
+            return None
+        if self._parts and (part in self._parts or t_ns - self._opened_ns > self._deadline_ns):
+            self.torn += 1
+            self._parts.clear()
+        if not self._parts:
+            self._opened_ns = t_ns
+        self._parts[part] = data
+        if len(self._parts) < self.image.parts:
+            return None
+        counts = self.image.decode([self._parts[one] for one in range(self.image.parts)])
+        self._parts.clear()
+        self.frames += 1
+        return RawImage(counts, self._opened_ns, self.frames - 1)
+
+    def reset(self) -> None:
+        """Forget the open image; counters stay."""
+        self._parts.clear()

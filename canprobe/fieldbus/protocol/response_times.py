@@ -1,0 +1,344 @@
+"""How late each message on a CAN bus can be in the worst case.
+
+Holds for a bus whose nodes send their highest-priority message first. Messages are independent of each other, or part
+of one transaction: released at fixed offsets after an event that they share, such as SYNC. `worst_case_response_fifo`
+holds for a bus on which nodes send their oldest frame first. Errors on the wire are not allowed for.
+
+Source: Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis: refuted, revisited and
+revised", Real-Time Systems 35 (2007). Offsets: Palencia and González Harbour, "Schedulability analysis for tasks with
+static and dynamic offsets", RTSS 1998.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.errors import ProtocolError
+from canprobe.fieldbus.protocol.frame_bits import worst_case_bits
+
+_NS = 1_000_000_000
+_Integers = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One periodic or sporadic message.
+
+    Attributes:
+        name: for people.
+        cob_id: identifier, which is its priority: lower wins.
+        n_data: data bytes, 0..8.
+        period_ns: shortest time between two of its events.
+        jitter_ns: largest delay from its earliest to its latest queueing.
+        deadline_ns: latest end of its transmission after the event; None: the period. May exceed the period.
+        frame_ns: time of one frame, where it is not the worst case of a classical frame at the bit rate.
+        offset_ns: earliest queueing after the event that all messages with an offset share, up to multiples of their
+            periods; None for a message that keeps its own time, queued at its event at the earliest.
+    """
+
+    name: str
+    cob_id: int
+    n_data: int
+    period_ns: int
+    jitter_ns: int = 0
+    deadline_ns: int | None = None
+    frame_ns: int | None = None
+    offset_ns: int | None = None
+
+    @property
+    def due_ns(self) -> int:
+        """The deadline, or the period where none is set."""
+        return self.period_ns if self.deadline_ns is None else self.deadline_ns
+
+
+@dataclass(frozen=True, slots=True)
+class Response:
+    """What the analysis says of one message.
+
+    Attributes:
+        message: of which.
+        frame_ns: longest time of one frame.
+        response_ns: worst case from the event to the end of the transmission; None: no bound, the bus cannot carry it.
+        instances: releases in the longest busy period; with more than one the first need not be the worst.
+    """
+
+    message: Message
+    frame_ns: int
+    response_ns: int | None
+    instances: int
+
+    @property
+    def fits(self) -> bool:
+        """Whether the deadline always holds."""
+        return self.response_ns is not None and self.response_ns <= self.message.due_ns
+
+
+@dataclass(frozen=True, slots=True)
+class BusAnalysis:
+    """Worst case of a whole bus.
+
+    Attributes:
+        responses: one per message, highest priority first.
+        load: share of the bus that all messages take with worst-case stuffing, 1.0 = full.
+    """
+
+    responses: tuple[Response, ...]
+    load: float
+
+
+def frame_time_ns(n_data: int, bitrate: int) -> int:
+    """Longest time of a frame with n data bytes, ns, rounded up."""
+    return -(-worst_case_bits(n_data) * _NS // bitrate)
+
+
+def worst_case_response(messages: Sequence[Message], bitrate: int = 1_000_000) -> BusAnalysis:
+    """Worst-case response time of every message on one bus.
+
+    Args:
+        messages: everything that is sent on this bus, in any order; identifiers are unique.
+        bitrate: bit/s.
+
+    Raises:
+        ProtocolError: an identifier twice, or a message with no period, a bad identifier, length, offset or jitter.
+    """
+    timed = _timed(messages, bitrate)
+    responses = _respond_all(timed, [None] * len(timed), bitrate)
+    if any(m.offset_ns is not None for m in messages):  # now it is known who can be on the bus when
+        responses = _respond_all(timed, [response.response_ns for response in responses], bitrate)
+    return _analysis(responses)
+
+
+_Timed = tuple[Message, int]
+"""A message and the time of its frame, ns."""
+
+
+def _timed(messages: Sequence[Message], bitrate: int) -> list[_Timed]:
+    """The messages by rising identifier."""
+    ordered = sorted(messages, key=lambda message: message.cob_id)
+    for first, second in itertools.pairwise(ordered):
+        if first.cob_id == second.cob_id:
+            raise ProtocolError(f"{first.name} and {second.name} both use COB-ID {first.cob_id:03X}h")
+    for message in ordered:
+        bad = message.period_ns <= 0 or min(message.jitter_ns, message.offset_ns or 0) < 0
+        if bad or not 0 <= message.cob_id <= 0x7FF:
+            raise ProtocolError(
+                f"{message.name}: expected a period > 0, jitter and offset >= 0, an 11-bit COB-ID, got {message}"
+            )
+    return [(m, frame_time_ns(m.n_data, bitrate) if m.frame_ns is None else m.frame_ns) for m in ordered]
+
+
+def _analysis(responses: Sequence[Response]) -> BusAnalysis:
+    return BusAnalysis(tuple(responses), sum(one.frame_ns / one.message.period_ns for one in responses))
+
+
+def _respond_all(timed: Sequence[_Timed], bounds: Sequence[int | None], bitrate: int) -> list[Response]:
+    """Every response; `bounds` are upper bounds of them, where known."""
+    known = list(zip(timed, bounds, strict=True))
+    return [_respond(timed[: rank + 1], known[rank + 1 :], bitrate) for rank in range(len(timed))]
+
+
+def _respond(level: Sequence[_Timed], below: Sequence[tuple[_Timed, int | None]], bitrate: int) -> Response:
+    """The response of the last message of a level, which is the message and all of higher priority."""
+    message, frame_ns = level[-1]
+    if _overloaded(level):
+        return Response(message, frame_ns, None, 0)
+    starts, blocking = _starts(level, below)
+    rows = [
+        (c, m.period_ns, m.jitter_ns, *((0, -m.jitter_ns) if m.offset_ns is None else (1, m.offset_ns)))
+        for m, c in level
+    ]
+    cost, period, jitter, moves, phase = np.array(rows, dtype=np.int64).T
+    first = (phase - starts[:, None] * moves) % period
+    worst, instances = _Level(cost, period, (jitter + first) // period, first, blocking, -(-_NS // bitrate)).worst()
+    return Response(message, frame_ns, max(0, (message.offset_ns or 0) + worst), instances)
+
+
+def _overloaded(level: Sequence[_Timed]) -> bool:
+    """Whether a level asks for the whole bus or more; exact, in integers."""
+    cycle = math.lcm(*(m.period_ns for m, _ in level))
+    return sum(cycle // m.period_ns * c for m, c in level) >= cycle
+
+
+class _Level(NamedTuple):
+    """One message, the last of m, and all above it, queued in n busy periods that begin at 0. Integers, ns.
+
+    Attributes:
+        cost: (m,) time of one frame.
+        period: (m,) between two releases.
+        early: (n, m) releases before 0 that jitter has held back until then.
+        first: (n, m) the first release after those, 0 ≤ first < period.
+        blocking: (n,) of the longest frame of lower priority.
+        bit: a bit time: a frame queued so late can still win the arbitration.
+    """
+
+    cost: _Integers
+    period: _Integers
+    early: _Integers
+    first: _Integers
+    blocking: _Integers
+    bit: int
+
+    def before(self, t: _Integers) -> _Integers:
+        """Frames (n, m) queued in [0, t) (n,), at most."""
+        queued: _Integers = np.maximum(-((self.first - t[:, None]) // self.period), 0) + self.early
+        return queued
+
+    def worst(self) -> tuple[int, int]:
+        """From a release of the message to its last bit, at most, and the most instances in one busy period."""
+        length = np.ones_like(self.blocking)
+        while ((longer := self.blocking + self.before(length) @ self.cost) > length).any():
+            length = np.maximum(length, longer)
+        instances = self.before(length)[:, -1]
+        cost, worst, delay = int(self.cost[-1]), 0, np.zeros_like(self.blocking)
+        for instance in range(int(instances.max())):
+            delay = self._started(np.maximum(delay, self.blocking + instance * cost), instance * cost)
+            release = self.first[:, -1] + (instance - self.early[:, -1]) * self.period[-1]
+            found = int((delay + cost - release)[instances > instance].max())
+            worst = found if instance == 0 else max(worst, found)
+        return worst, int(instances.max())
+
+    def _started(self, delay: _Integers, own: int) -> _Integers:
+        """Smallest w (n,) at which nothing is before the message, searched upward. Source: Davis et al. 2007."""
+        while ((longer := self.blocking + own + self._above(delay + self.bit)) > delay).any():
+            delay = np.maximum(delay, longer)
+        return delay
+
+    def _above(self, t: _Integers) -> _Integers:
+        """Time (n,) that the frames of higher priority queued in [0, t) (n,) take."""
+        above: _Integers = self.before(t)[:, :-1] @ self.cost[:-1]
+        return above
+
+
+def _starts(level: Sequence[_Timed], below: Sequence[tuple[_Timed, int | None]]) -> tuple[_Integers, _Integers]:
+    """Where (n,) a busy period has to begin in the transaction, and how long (n,) a frame from below can block it.
+
+    It begins where one of the transaction's messages is at its latest. If nothing of the level keeps its own time, then
+    really with that message, so that what blocks it is on the bus between its earliest and its latest queueing.
+    """
+    longest = max((c for (_, c), _ in below), default=0)
+    members = [(m, m.offset_ns) for m, _ in level if m.offset_ns is not None]
+    if not members:
+        return np.zeros(1, dtype=np.int64), np.full(1, longest)
+    cycle = math.lcm(*(m.period_ns for m, _ in members))
+    unknown = len(members) < len(level) or any(end is None for _, end in below)
+    if not unknown:
+        cycle = math.lcm(cycle, *(m.period_ns for (m, _), _ in below if m.offset_ns is not None))
+    releases = [np.arange(offset, offset + cycle, m.period_ns) for m, offset in members]
+    first = np.concatenate(releases)
+    jitter = np.repeat([m.jitter_ns for m, _ in members], [len(one) for one in releases])
+    starts, index = np.unique((first + jitter) % cycle, return_inverse=True)
+    blocking = np.zeros_like(starts)
+    np.maximum.at(blocking, index, longest if unknown else _blocking(below, first, jitter))
+    return starts, blocking
+
+
+def _blocking(below: Sequence[tuple[_Timed, int | None]], first: _Integers, jitter: _Integers) -> _Integers:
+    """Longest frame that can be on the bus at `first` (n,) or within `jitter` (n,) after it."""
+    always = max((c for (m, c), end in below if m.offset_ns is None or end is None), default=0)
+    # a message with an offset is through `end` after its event at the latest
+    table = [(c, m.period_ns, m.offset_ns, end) for (m, c), end in below if None not in (m.offset_ns, end)]
+    if not table:
+        return np.full_like(first, always)
+    cost, period, offset, end = np.array(table, dtype=np.int64).T
+    into = (first[:, None] - offset) % period  # since it was last released
+    on_the_bus = (into < end - offset) | (into + jitter[:, None] >= period)
+    return np.asarray(np.where(on_the_bus, cost, 0).max(axis=1, initial=always), dtype=np.int64)
+
+
+# How late a message can be where nodes send their oldest frame first, as SocketCAN's queue and many controllers do.
+#
+# A frame then waits for everything that its own node has queued before it, and each of those competes with its own
+# identifier: the one of lowest priority holds up all behind it. Messages are independent of each other; an offset
+# counts as jitter. It stops being a bound where a message's response time exceeds its period: its own last frame could
+# then still be in the queue. Such messages have no response time here, nor have those that they could disturb.
+#
+# Source: Davis, Kollmann, Pollex, Slomka, "Controller Area Network (CAN) schedulability analysis with FIFO queues",
+# ECRTS 2011.
+
+
+@dataclass(frozen=True, slots=True)
+class _Sent:
+    """A message, its frame's time, the messages of its queue (itself alone with a priority queue), ns."""
+
+    message: Message
+    frame_ns: int
+    queue: tuple[int, ...]
+
+
+def worst_case_response_fifo(
+    messages: Sequence[Message], fifo_nodes: Mapping[str, object], bitrate: int = 1_000_000
+) -> BusAnalysis:
+    """Worst-case response time of every message on a bus on which some nodes have FIFO queues.
+
+    Args:
+        messages: everything that is sent on this bus; identifiers are unique.
+        fifo_nodes: of every message that goes through a FIFO queue: its name → whose queue; the others' nodes send
+            their message of highest priority first.
+        bitrate: bit/s.
+
+    Raises:
+        ProtocolError: an identifier twice, or a name that no message has.
+    """
+    timed = _timed(messages, bitrate)
+    if unknown := set(fifo_nodes) - {message.name for message in messages}:
+        raise ProtocolError(f"no message is called {min(unknown)}")
+    owners = [fifo_nodes.get(message.name) for message, _ in timed]
+    sent = []
+    for rank, ((message, frame_ns), owner) in enumerate(zip(timed, owners, strict=True)):
+        queue = (rank,) if owner is None else tuple(r for r, other in enumerate(owners) if other == owner)
+        # queued at any time from the event to the latest that its offset and jitter allow
+        at_any_time = replace(message, jitter_ns=message.jitter_ns + (message.offset_ns or 0), offset_ns=None)
+        sent.append(_Sent(at_any_time, frame_ns, queue))
+    found = _settled(sent, -(-_NS // bitrate))
+    return _analysis(
+        [
+            Response(message, frame_ns, total, 0 if total is None else 1)
+            for (message, frame_ns), total in zip(timed, found, strict=True)
+        ]
+    )
+
+
+def _settled(sent: Sequence[_Sent], bit: int) -> list[int | None]:
+    """Responses from the events, repeated until the delays in the queues, which they hang on, move no more."""
+    delays: list[int | None] = [0] * len(sent)
+    while True:
+        found = [_response(sent, rank, delays, bit) for rank in range(len(sent))]
+        following = [None if total is None else _in_the_queue(sent, rank, total) for rank, total in enumerate(found)]
+        if following == delays:
+            return found
+        delays = following
+
+
+def _in_the_queue(sent: Sequence[_Sent], rank: int, total: int) -> int:
+    """How long after its queueing a frame can begin to compete."""
+    one = sent[rank]
+    return total - one.message.jitter_ns - one.frame_ns if len(one.queue) > 1 else 0
+
+
+def _response(sent: Sequence[_Sent], rank: int, delays: Sequence[int | None], bit: int) -> int | None:
+    """From the event to the end of the frame; None where that is no bound."""
+    one = sent[rank]
+    lowest, frames = max(one.queue), [sent[other].frame_ns for other in one.queue]
+    above = [other for other in range(lowest) if other not in one.queue]
+    if any(delays[other] is None for other in above):
+        return None
+    blocking = max([*frames, *(other.frame_ns for other in sent[lowest + 1 :])])
+    ahead = blocking + sum(frames) - one.frame_ns
+    disturbing = [
+        (sent[k].frame_ns, sent[k].message.period_ns, sent[k].message.jitter_ns + (delays[k] or 0)) for k in above
+    ]
+    limit = one.message.period_ns - one.message.jitter_ns - one.frame_ns
+    delay = ahead
+    while delay <= limit:
+        longer = ahead + sum(-(-(delay + bit + late) // period) * cost for cost, period, late in disturbing)
+        if longer <= delay:
+            return one.message.jitter_ns + delay + one.frame_ns
+        delay = longer
+    return None

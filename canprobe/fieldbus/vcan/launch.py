@@ -1,0 +1,326 @@
+"""Run a command where a real vcan0 exists: here if there is one or one can be made, else in a guest.
+
+In this order: a vcan0 that is up; one in a network namespace of its own; one made by root and removed afterwards; a
+user-mode Linux guest (`canprobe.fieldbus.vcan.guest`). Where a vcan0 is made, a vcan1 is made beside it. The command
+finds the
+way taken in the environment: CANPROBE_VCAN is `here`, `namespace`, `link` or `guest`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Protocol
+
+from canprobe.errors import InterfaceError
+from canprobe.fieldbus.bus.real.link import missing_ip, sudo
+from canprobe.fieldbus.bus.real.socketcan import check_interface, has_socketcan
+from canprobe.fieldbus.vcan.guest import GuestError, GuestJob, missing_packages
+
+# Run one command to its end: signals passed on to it, a time-out, and its exit status as a shell would see it.
+
+TIMED_OUT = 124
+_GRACE_S = 5.0
+_POLL_S = 0.02
+_PATIENCE = 3
+_FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+
+
+@contextlib.contextmanager
+def caught_signals(*, keyboard: bool = True) -> Iterator[list[int]]:
+    """Yield a list to which SIGINT, SIGTERM, SIGHUP and SIGQUIT are appended within the block; ignored ones stay so.
+
+    Args:
+        keyboard: False drops SIGINT and SIGQUIT, which the terminal sends to a shell in this group as well.
+    """
+    signals: list[int] = []
+    before = {number: signal.getsignal(number) for number in _FORWARDED}
+    try:
+        for number, handler in before.items():
+            if handler != signal.SIG_IGN:
+                kept = keyboard or number not in (signal.SIGINT, signal.SIGQUIT)
+                signal.signal(number, (lambda n, _: signals.append(n)) if kept else lambda *_: None)
+        yield signals
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+class Job(Protocol):
+    """A command that runs somewhere."""
+
+    def poll(self) -> int | None:
+        """Pass its output on; return its exit status once it has ended."""
+        ...
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal to the command and what it started in its group."""
+        ...
+
+    def kill(self) -> None:
+        """End it at once, whatever it does."""
+        ...
+
+
+def supervise(job: Job, signals: list[int], timeout_s: float | None) -> tuple[int, bool]:
+    """Run `job` to its end.
+
+    Every signal is passed on; the third one kills. On the time-out the job gets SIGTERM and 5 s, then it is killed.
+
+    Args:
+        job: what runs already.
+        signals: where signals of this process arrive; those that were passed on are taken out.
+        timeout_s: how long it may run, from now; `None` for ever.
+
+    Returns:
+        Its exit status, and whether it ran into the time-out (the status is then 124).
+    """
+    deadline = None if timeout_s is None else time.monotonic() + timeout_s
+    timed_out = False
+    received = 0
+    while (status := job.poll()) is None:
+        while signals:
+            number = signals.pop(0)
+            received += 1
+            if received >= _PATIENCE:
+                job.kill()
+                return 128 + number, timed_out
+            job.send_signal(number)
+        if deadline is not None and time.monotonic() >= deadline:
+            if timed_out:
+                job.kill()
+                break
+            timed_out = True
+            job.send_signal(signal.SIGTERM)
+            deadline += _GRACE_S
+        time.sleep(_POLL_S)
+    return (TIMED_OUT if timed_out or status is None else status), timed_out
+
+
+class LocalJob:
+    """A command that runs on this machine in a session of its own, without standard input.
+
+    It is started by a shell, which says so and ends with 127 or 126 if there is no such program.
+
+    Args:
+        command: program and arguments.
+        environment: the command's whole environment.
+        shell: it is one for the user, with this process's standard input and terminal.
+    """
+
+    def __init__(self, command: Sequence[str], environment: Mapping[str, str], shell: bool = False) -> None:
+        self._send = os.kill if shell else os.killpg
+        self._process = subprocess.Popen(
+            ["/bin/sh", "-c", 'exec "$@"', "sh", *command],
+            stdin=None if shell else subprocess.DEVNULL,
+            env=dict(environment),
+            start_new_session=not shell,
+        )
+
+    def poll(self) -> int | None:
+        """Return the exit status, 128 + n after signal n, once it has ended."""
+        status = self._process.poll()
+        return 128 - status if status is not None and status < 0 else status
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal to its process group, or to the shell."""
+        with contextlib.suppress(ProcessLookupError):
+            self._send(self._process.pid, number)
+
+    def kill(self) -> None:
+        """Kill its process group, or the shell."""
+        self.send_signal(signal.SIGKILL)
+        self._process.wait()
+
+
+# Run a command where a real vcan0 exists: here if there is one or one can be made, else in a guest.
+
+CHANNEL, SECOND = "vcan0", "vcan1"
+NO_VCAN = 125
+GUEST_LOST = 123
+WAY = "CANPROBE_VCAN"
+
+_MAPPINGS = Path("/proc/sys/vm/max_map_count")
+_ENOUGH_MAPPINGS = 1 << 20  # of 4 KiB: more than the guest's memory
+
+_MAKE_LINK, _MAKE_SECOND = (f"ip link add dev {name} type vcan && ip link set {name} up" for name in (CHANNEL, SECOND))
+_IN_NAMESPACE = f'ip link set lo up; {_MAKE_LINK} && {_MAKE_SECOND} && exec "$@"'
+
+
+def run_with_vcan(
+    command: Sequence[str], *, timeout_s: float | None = None, install: bool = False, realtime: bool = False
+) -> int:
+    """Run `command` on a machine that has a vcan0, with the same working folder and environment, without stdin.
+
+    Args:
+        command: program and arguments; none for the user's shell, which has standard input.
+        timeout_s: how long the command may run; booting a guest does not count.
+        install: install the guest's Debian package if a guest is needed, and iproute2 where `ip` is missing.
+        realtime: steady the guest's timing; see `GuestJob`.
+
+    Returns:
+        The command's exit status (128 + n after signal n); 124 after the time-out; 125 if no vcan can be had; 123 if
+        the guest died under the command. Messages go to stderr.
+    """
+    shell = not command
+    if shell:
+        command = [os.environ.get("SHELL") or "/bin/sh"]
+    with caught_signals(keyboard=not (shell and has_socketcan())) as signals:
+        if has_socketcan():
+            with _local_way() as way:
+                if way is not None:
+                    job = LocalJob([*way[1], *command], {**os.environ, WAY: way[0]}, shell)
+                    status, timed_out = supervise(job, signals, timeout_s)
+                    _report_time_out(timed_out, timeout_s)
+                    return status
+        if (status := _check_guest(install)) != 0:
+            return status
+        boot = functools.partial(GuestJob, command, {**os.environ, WAY: "guest"}, realtime, shell)
+        return _run_in_guest(boot, signals, timeout_s)
+
+
+def _check_guest(install: bool) -> int:
+    """0 where a guest can be started; else 125, with the line to type."""
+    missing = missing_packages()
+    if install and missing_ip() is not None:
+        missing.append("iproute2")  # for commands in the guest
+    if missing:
+        line = f"{sudo()}apt-get install -y {' '.join(missing)}"
+        if not install:
+            return _no_vcan(
+                f"this kernel has no vcan, and what the guest that would needs is missing; on Debian type:  {line}"
+                f"  elsewhere take a kernel with vcan ({sudo()}modprobe vcan; Ubuntu has it in the package"
+                " linux-modules-extra-$(uname -r)), or --bus udp_multicast --patient"
+            )
+        if not _install(line):
+            return _no_vcan(f"this failed:  {line}")
+    return 0
+
+
+def _run_in_guest(boot: Callable[[], GuestJob], signals: list[int], timeout_s: float | None) -> int:
+    try:
+        with boot() as job:
+            return _supervise_guest(job, signals, timeout_s)
+    except GuestError as error:
+        if not error.started:
+            return _no_vcan(str(error))
+        _say(str(error))
+        return GUEST_LOST
+
+
+def _supervise_guest(job: GuestJob, signals: list[int], timeout_s: float | None) -> int:
+    """Wait for the boot, which may be interrupted but does not count as running time, then for the command."""
+    interrupted, _ = supervise(_Boot(job), signals, None)
+    if interrupted:
+        return interrupted
+    status, timed_out = supervise(job, signals, timeout_s)
+    _report_time_out(timed_out, timeout_s)
+    if status == 128 + signal.SIGKILL:
+        _report_killed()
+    job.halt()
+    return status
+
+
+class _Boot:
+    """The boot of a guest as a job of its own: ends with 0 when the command starts, with 128 + n at a signal."""
+
+    def __init__(self, job: GuestJob) -> None:
+        self._job = job
+        self._signal = 0
+
+    def poll(self) -> int | None:
+        if self._signal:
+            return 128 + self._signal
+        self._job.poll()
+        return 0 if self._job.started else None
+
+    def send_signal(self, number: int) -> None:
+        self._signal = number
+        self._job.kill()
+
+    def kill(self) -> None:
+        self._job.kill()
+
+
+@contextlib.contextmanager
+def _local_way() -> Iterator[tuple[str, list[str]] | None]:
+    """Yield (name of the way, prefix of the command) of the first way that works on this kernel, or None."""
+    namespace = ["unshare", "--net" if os.geteuid() == 0 else "-rn", "--", "sh", "-c", _IN_NAMESPACE, "sh"]
+    if _has_vcan():
+        yield "here", []
+    elif shutil.which("unshare") and _succeeds([*namespace, "true"]):
+        yield "namespace", namespace
+    elif os.geteuid() == 0 and _succeeds(["sh", "-c", _MAKE_LINK]):
+        made = [CHANNEL, *([SECOND] if _succeeds(["sh", "-c", _MAKE_SECOND]) else [])]  # unless it is there already
+        try:
+            yield "link", []
+        finally:
+            for name in made:
+                _succeeds(["ip", "link", "delete", name])
+    else:
+        yield None
+
+
+def _has_vcan() -> bool:
+    try:
+        check_interface(CHANNEL)
+    except InterfaceError:
+        return False
+    return True
+
+
+def _succeeds(command: Sequence[str]) -> bool:
+    try:
+        return subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL, check=False).returncode == 0
+    except OSError:
+        return False
+
+
+def _install(line: str) -> bool:
+    """Run the apt line, after an update if it fails at first; its output goes to stderr."""
+    environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
+    update = line.partition("install")[0] + "update"
+    for attempt in (line, f"{update} && {line}"):
+        _say(attempt)
+        done = subprocess.run(
+            ["/bin/sh", "-c", attempt], stdin=subprocess.DEVNULL, stdout=2, env=environment, check=False
+        )
+        if done.returncode == 0:
+            return not missing_packages()
+    return False
+
+
+def _report_time_out(timed_out: bool, timeout_s: float | None) -> None:
+    if timed_out:
+        _say(f"the command was stopped after {timeout_s:g} s")
+
+
+def _report_killed() -> None:
+    """The guest maps the pages of its processes one by one, and its kernel kills a process that cannot map another."""
+    try:
+        mappings = int(_MAPPINGS.read_text())
+    except (OSError, ValueError):
+        return
+    if mappings < _ENOUGH_MAPPINGS:
+        _say(
+            f"the command was killed; a process that holds more than about {mappings // 256} MiB is, as "
+            f"vm.max_map_count is {mappings} on this machine; type:  {'' if os.geteuid() == 0 else 'sudo '}"
+            f"sysctl vm.max_map_count={_ENOUGH_MAPPINGS}"
+        )
+
+
+def _no_vcan(why: str) -> int:
+    _say(why)
+    return NO_VCAN
+
+
+def _say(text: str) -> None:
+    print(f"canprobe: vcan: {text}", file=sys.stderr, flush=True)

@@ -1,0 +1,33 @@
+"""A Gymnasium environment: an agent leads the probe over an unknown surface, and the cell does the rest.
+
+    import gymnasium, canprobe.lab.gym
+    env = gymnasium.make("canprobe/TouchScan-v0")
+
+Comes in: an action, 25 times a second: the velocity of the contact in its tangent plane and the set-point of the force.
+Goes out: an observation, the reward of the step, and what is true in `info`.
+
+Between two actions the whole cell runs as ever: drives, array, supervision and the tactile servo, 16 cycles at 400 Hz,
+in virtual time without a bus. `led` is the touch task whose path and force are set from outside; `randomise` draws
+what differs from one episode to the next, with the keys of a scene file; `observations` says what an agent sees and
+which part of the surface it has touched; `env` is the environment. Start reading there.
+
+An episode begins in contact: approach, touch-down and settling are part of `reset`. It ends by itself (`terminated`)
+where the supervision of the cell ends a scan: contact lost, force too high, a joint at its stop. It is cut off
+(`truncated`) after `task.duration_s`.
+"""
+
+from __future__ import annotations
+
+from canprobe.errors import UsageError, install_line
+
+try:
+    import gymnasium
+except ImportError as error:
+    raise UsageError(f"canprobe.lab.gym needs the package gymnasium: {install_line('gym')}") from error
+
+from canprobe.lab.gym.env import TouchScan
+from canprobe.lab.gym.randomise import OBJECTS, Choice, Uniform
+
+__all__ = ["OBJECTS", "Choice", "TouchScan", "Uniform"]
+
+gymnasium.register(id="canprobe/TouchScan-v0", entry_point="canprobe.lab.gym.env:TouchScan")

@@ -1,0 +1,119 @@
+"""One episode: a cell whose probe is in contact, led step by step, with its reward and its end."""
+
+from __future__ import annotations
+
+import gc
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.api import OpenCell
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.session.session import Session, quiet
+from canprobe.errors import BusError, SafetyStop
+from canprobe.lab.gym.led import LedTask
+from canprobe.lab.gym.observations import Coverage
+
+Vector = NDArray[np.float64]
+FORCE_SHARE = 0.5
+"""Share of the wanted force by which an action moves the set-point up or down."""
+TOLERANCE = 0.05
+"""Error of the force, of the wanted force, at which a touch counts exp(−½) of one without error."""
+PENALTY_MM2 = 20.0
+"""What it costs when the supervision ends an episode: the area of a few steps."""
+
+
+class Episode:
+    """Brings a cell up and touches the object; then `step` leads the probe.
+
+    Args:
+        plan: of a scan in virtual time.
+        cycles: in a step.
+        record: folder for the files of the run; None writes nothing.
+
+    Attributes:
+        session: the open cell.
+        task: what the cell runs.
+        origin: first contact (3,), base frame, m.
+        coverage: what was touched.
+        forces: as measured in each cycle of the last step, N.
+        truth: of the plant after the last step.
+        over: no further step; `reason` says why, None where the time is over.
+
+    Raises:
+        SafetyStop, BusError: nothing was touched. The cell is closed.
+    """
+
+    def __init__(self, plan: Plan, cycles: int, record: Path | None) -> None:
+        task = self.task = LedTask(plan)
+        self._cycles, self._period_s = cycles, plan.sync.period_ns * 1e-9
+        self.session = Session(plan, rows_kept=1) if record is None else OpenCell(plan, record, quiet, task=task)
+        collecting = gc.isenabled()
+        self.session.__enter__()
+        if collecting:
+            gc.enable()  # a session pauses the collection, which what learns beside it may need
+        try:
+            self.session.cell.start(task)
+            while not task.touching and not task.ended:
+                self.session.cell.advance(1)
+            if task.reason is not None:
+                raise SafetyStop(task.reason)
+        except BaseException:
+            self.close()
+            raise
+        scan = plan.scene.task
+        self.origin = task.last_contact.p_base
+        self.coverage = Coverage(1e-3 * scan.length_mm, 1e-3 * scan.width_mm)
+        self.coverage.touch(np.zeros(2))
+        self.forces = [task.force]
+        self.truth = self.session.world.plant.truth()
+        self.over = False
+        self.reason: str | None = None
+        self.well_mm2 = 0.0
+        self._steps, self._most_steps = 0, max(1, round(scan.duration_s / (cycles * self._period_s)))
+
+    def step(self, action: Vector) -> float:
+        """Lead the probe by an action (3,) in [−1, 1] for one step; its reward, mm²."""
+        task, forces = self.task, []
+        velocity = action[:2] * task.top_speed / max(1.0, math.hypot(*action[:2]))
+        task.lead(velocity, task.wanted_force * (1.0 + FORCE_SHARE * float(action[2])), self._cycles)
+        try:
+            self.session.cell.advance(self._cycles, lambda _: forces.append(task.force))
+        except (SafetyStop, BusError) as error:
+            self.reason = str(error)
+        if task.ended and self.reason is None:
+            self.reason = task.reason
+        self._steps += 1
+        self.over = self.reason is not None or self._steps == self._most_steps
+        self.forces = forces or [task.force]
+        self.truth = self.session.world.plant.truth()
+        place = task.axes[:2] @ (task.last_contact.p_base - self.origin)
+        new_mm2 = 1e6 * self.coverage.touch(place) if task.touching else 0.0
+        well_mm2 = new_mm2 * math.exp(-0.5 * (self._force_error() / (TOLERANCE * task.wanted_force)) ** 2)
+        self.well_mm2 += well_mm2
+        return well_mm2 - PENALTY_MM2 * (self.reason is not None)
+
+    def _force_error(self) -> float:
+        return float(self.truth["force"]) - self.task.wanted_force
+
+    def info(self) -> dict[str, Any]:
+        """What is true, with units; `reason` where the supervision has ended the episode."""
+        truth = self.truth
+        told = {
+            "t_s": self._steps * self._cycles * self._period_s,
+            "force_n": float(truth["force"]),
+            "force_error_n": self._force_error(),
+            "contact_mm": 1e3 * truth["contact_point"],
+            "normal": truth["contact_normal"],
+            "kappa_per_m": truth["kappa"],
+            "touched_mm2": 1e6 * self.coverage.area,
+            "touched_well_mm2": self.well_mm2,
+        }
+        return told if self.reason is None else told | {"reason": self.reason}
+
+    def close(self) -> None:
+        """Disable the drives and end the cell."""
+        self.session.__exit__(None, None, None)

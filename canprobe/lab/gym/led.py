@@ -1,0 +1,146 @@
+"""A touch task whose path and force are set from outside, while the servo and the supervision go on as ever."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.master.controller import TactileSample
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.scene.setup import Touch
+from canprobe.cell.tasks.from_plan import make_sensing, make_shape_tracker
+from canprobe.cell.tasks.probing import Phase
+from canprobe.cell.tasks.touch import TouchTask
+from canprobe.mechanics.touch.contact import ContactSample, direction_to_pad
+from canprobe.mechanics.touch.patch.image import Patch
+from canprobe.mechanics.touch.servo import PathFollower, ProbePose
+
+if TYPE_CHECKING:
+    from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
+
+
+Vector = NDArray[np.float64]
+
+
+class _Heading(PathFollower):
+    """A follower of no curve: it goes where it is told."""
+
+    def __init__(self) -> None:
+        self.direction = (1.0, 0.0)
+
+    @property
+    def heading(self) -> tuple[float, float]:
+        return self.direction
+
+    def step(self, x: float, y: float, distance_m: float) -> tuple[float, float]:
+        return self.direction
+
+
+class LedTask(TouchTask):
+    """Approach and touch as a scan does; then go on as `lead` says, until the cell is closed or the probe lets go.
+
+    The contact frame stands on the surface as the servo knows it: z is the outward normal, x the heading of the scan
+    laid into the tangent plane, y = z × x.
+
+    Args:
+        plan: of a scan.
+
+    Attributes:
+        axes: (3, 3) rows of the scan plane: heading, across, approach normal; base frame.
+        wanted_force: of the scene, N.
+        top_speed: of the scene's scan, m/s.
+        velocity: of the contact now (2,), in the contact frame, m/s.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        task = plan.setup.task
+        assert isinstance(task, Touch) and task.scan is not None
+        super().__init__(plan, replace(task, duration_s=math.inf), make_sensing(task), make_shape_tracker(plan.setup))
+        self.axes: Vector = np.asarray(task.approach.axes, dtype=float)
+        self.start: Vector = np.asarray(task.approach.start, dtype=float)
+        self.wanted_force = task.force
+        self.top_speed = task.scan.speed
+        self.velocity = 0.0, 0.0
+        self._heading = _Heading()
+        self._change = 0.0, 0.0, 0.0
+        self._left = 0
+        self._speed = 0.0
+        self._newest: ContactSample | None = None
+
+    @property
+    def touching(self) -> bool:
+        """It is in contact and can be led."""
+        return self.phase is Phase.SCAN
+
+    @property
+    def ended(self) -> bool:
+        """It lets go, or has."""
+        return self.phase in (Phase.RETREAT, Phase.DONE)
+
+    @property
+    def last_contact(self) -> ContactSample:
+        """The newest that there is; there is one from the touch-down on."""
+        assert self._newest is not None
+        return self._newest
+
+    @property
+    def pad_uv(self) -> tuple[float, float]:
+        """Where on the pad it is, m."""
+        u, v = direction_to_pad(self.last_contact.r_probe, self.sensing.radius)
+        return u, v
+
+    @property
+    def estimate(self) -> SurfaceEstimate | None:
+        """The newest answer of the estimator; None before the first, or without one."""
+        return self.shape.records[-1].estimate if self.shape is not None and self.shape.records else None
+
+    @property
+    def force(self) -> float:
+        """As measured last, N."""
+        return self._touch.force
+
+    @property
+    def force_set_point(self) -> float:
+        """What the servo aims at, N."""
+        return self._target_force
+
+    def frame(self, normal: Vector) -> Vector:
+        """(3, 3) rows x, y, z of the contact frame in base, for an outward unit normal (3,)."""
+        x = self.axes[0] - (normal @ self.axes[0]) * normal
+        x /= np.linalg.norm(x)
+        return np.array((x, np.cross(normal, x), normal))
+
+    def lead(self, velocity: Vector, force: float, cycles: int) -> None:
+        """Go over to a velocity of the contact (2,), m/s, and a force, N, evenly within so many cycles."""
+        vx, vy = self.velocity
+        dx, dy, more = float(velocity[0]) - vx, float(velocity[1]) - vy, force - self._target_force
+        self._change, self._left = (dx / cycles, dy / cycles, more / cycles), cycles
+
+    def _feel(self, sample: TactileSample, patch: Patch) -> None:
+        super()._feel(sample, patch)
+        self._newest = self._contact or self._newest
+
+    def _follower(self) -> PathFollower:
+        return self._heading
+
+    def _scan(self) -> ProbePose:
+        assert self._servo is not None
+        vx, vy = self.velocity
+        if self._left:
+            self._left -= 1
+            dx, dy, more = self._change
+            self.velocity = vx, vy = vx + dx, vy + dy
+            self._target_force += more
+        self._speed = math.hypot(vx, vy)
+        if self._speed > 0.0:
+            # x = (h − (n·h) n)/s with s its length and y = n × x, seen from above the scan plane of h, c = u × h and u
+            nh, nc, nu = (self.axes @ self._servo.surface.normal).tolist()
+            s = math.sqrt(1.0 - nh * nh)
+            along, across = vx * s, (vy * nu - vx * nh * nc) / s
+            in_plane = math.hypot(along, across)
+            self._heading.direction = (along / in_plane, across / in_plane)
+        return super()._scan()

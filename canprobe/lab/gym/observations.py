@@ -1,0 +1,218 @@
+"""What an agent sees, with the bounds of its spaces, and which part of the surface it has touched."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.scene.setup import Touch
+from canprobe.lab.gym.led import LedTask
+from canprobe.mechanics.touch.pad import COUNTS_MAX
+
+Vector = NDArray[np.float64]
+Kind = Literal["features", "tactile", "oracle"]
+KINDS: tuple[Kind, ...] = ("features", "tactile", "oracle")
+
+# The region of a scan and what of it has been touched.
+
+CELL = 0.5e-3
+"""Side of a cell of the grid, m."""
+BRUSH = 1.5e-3
+"""Radius round a contact within which the surface counts as touched, m: a third of the patch at 2 N on a plane."""
+SECTORS = 8
+"""Directions in which an agent sees what is left to be touched."""
+SIGHT = 6e-3
+"""How far it sees, m."""
+
+
+class Coverage:
+    """A grid over the scan plane: a rectangle round the first contact, and the cells that were touched.
+
+    Args:
+        length, width: of the rectangle along the heading and across it, m.
+    """
+
+    def __init__(self, length: float, width: float) -> None:
+        self._half = np.array((length, width)) / 2
+        self._shape = math.ceil(length / CELL), math.ceil(width / CELL)
+        # A border as wide as the sight, which counts as touched: nothing outside of the rectangle is worth a touch.
+        reach = round(SIGHT / CELL)
+        self._touched = np.pad(np.zeros(self._shape, dtype=bool), reach, constant_values=True)
+        self._side = 2 * reach + 1
+        i, j = np.indices((self._side, self._side)) - reach
+        away = CELL * np.hypot(i, j)
+        self._brush, self._sight = away <= BRUSH, (away > BRUSH) & (away <= SIGHT)
+        angle = np.arctan2(j, i)[self._sight]
+        self._sector = np.rint(angle * (SECTORS / (2 * math.pi))).astype(int) % SECTORS
+        self._in_sector = np.bincount(self._sector, minlength=SECTORS)
+        self._cells = 0
+
+    @property
+    def area(self) -> float:
+        """Touched so far, m²."""
+        return self._cells * CELL**2
+
+    @property
+    def share(self) -> float:
+        """Touched so far, of the rectangle."""
+        return self._cells / (self._shape[0] * self._shape[1])
+
+    def touch(self, place: Vector) -> float:
+        """Touch the surface at a place (2,) along the heading and across it, m; the area that is new, m²."""
+        window = self._window(place)
+        if window is None:
+            return 0.0
+        new = int(np.count_nonzero(self._brush & ~window))
+        window |= self._brush
+        self._cells += new
+        return new * CELL**2
+
+    def left(self, place: Vector) -> Vector:
+        """Share within sight of a place (2,), m, that is left to be touched, by direction (`SECTORS`,).
+
+        The first is round the heading; the others follow towards the side across.
+        """
+        window = self._window(place)
+        if window is None:
+            return np.zeros(SECTORS)
+        left: Vector = np.bincount(self._sector, weights=~window[self._sight], minlength=SECTORS) / self._in_sector
+        return left
+
+    def _window(self, place: Vector) -> NDArray[np.bool_] | None:
+        """The part of the grid within sight of a place, as a view; None outside of the rectangle."""
+        i, j = np.floor((place + self._half) / CELL).astype(int).tolist()
+        if not (0 <= i < self._shape[0] and 0 <= j < self._shape[1]):
+            return None
+        return self._touched[i : i + self._side, j : j + self._side]
+
+
+# Observations.
+
+FARTHEST_MM = 50.0
+"""From the first contact: bound of an observation."""
+
+
+class Observations:
+    """The observations of one kind.
+
+    Args:
+        kind: `features`, which the master measures; `tactile`, the same and the last image; `oracle`, the features and
+            what is true.
+        plan: of the scene; another scene of the same cell has the same spaces.
+        shape: there is a surface estimator.
+
+    Attributes:
+        names: of the entries of the vector, in order, with their units.
+        space: bounds in these units.
+    """
+
+    def __init__(self, kind: Kind, plan: Plan, *, shape: bool) -> None:
+        setup, task = plan.setup, plan.setup.task
+        assert isinstance(task, Touch) and task.scan is not None
+        force, speed, near = setup.limits.force_max, 1e3 * task.scan.speed, FARTHEST_MM
+        pad, bend = 1e3 * task.array.pad.reach_m, 2.0 / task.probe.radius
+        bounds = {
+            "wanted_force_n": (0.0, force),
+            "force_set_point_n": (0.0, force),
+            "force_n": (0.0, force),
+            "force_spread_n": (0.0, force),
+            "pad_u_mm": (-pad, pad),
+            "pad_v_mm": (-pad, pad),
+            "velocity_x_mm_s": (-speed, speed),
+            "velocity_y_mm_s": (-speed, speed),
+            **_where("", near),
+            "touched_share": (0.0, 1.0),
+            **{f"left_{360 * sector // SECTORS}_deg": (0.0, 1.0) for sector in range(SECTORS)},
+        }
+        if shape:
+            bounds |= {**_curvature("estimated_", bend), "estimated": (0.0, 1.0)}
+        if kind == "oracle":
+            bounds |= {"true_force_n": (0.0, force), **_where("true_", near), **_curvature("true_", bend)}
+        low, high = np.array(list(bounds.values()), dtype=np.float32).T
+        self._kind, self._shape = kind, shape
+        self._low, self._high = low, high
+        self.names = tuple(bounds)
+        vector = spaces.Box(low, high, dtype=np.float32)
+        taxels = spaces.Box(0.0, 1.0, task.array.pad.shape, np.float32)
+        self._pad = task.array.pad.shape
+        self.space: spaces.Space[Any] = (
+            spaces.Dict({"features": vector, "taxels": taxels}) if kind == "tactile" else vector
+        )
+
+    def observe(
+        self,
+        task: LedTask,
+        origin: Vector,
+        coverage: Coverage,
+        forces: Sequence[float],
+        truth: Mapping[str, Any],
+    ) -> Any:
+        """An element of the space.
+
+        Args:
+            task: in contact, or as it was last.
+            origin: first contact (3,), base frame, m.
+            coverage: so far.
+            forces: as measured since the last observation, N.
+            truth: of the plant.
+        """
+        contact = task.last_contact
+        along, across, up = (task.axes @ (contact.p_base - origin)).tolist()
+        values: list[float] = [
+            task.wanted_force,
+            task.force_set_point,
+            float(np.mean(forces)),
+            float(np.std(forces)),
+            *(1e3 * uv for uv in task.pad_uv),
+            *(1e3 * v for v in task.velocity),
+            *(1e3 * along, 1e3 * across, 1e3 * up),
+            *(task.axes[:2] @ contact.n_base).tolist(),
+            coverage.share,
+            *coverage.left(np.array((along, across))).tolist(),
+        ]
+        if self._shape:
+            values += self._estimated(task)
+        if self._kind == "oracle":
+            tensor = truth["kappa"][0] * np.outer(truth["direction1"], truth["direction1"])
+            tensor += truth["kappa"][1] * np.outer(truth["direction2"], truth["direction2"])
+            values += [
+                truth["force"],
+                *(1e3 * task.axes @ (truth["contact_point"] - origin)).tolist(),
+                *(task.axes[:2] @ truth["contact_normal"]).tolist(),
+                *_in_frame(tensor, task.frame(truth["contact_normal"])),
+            ]
+        vector = np.clip(np.array(values, dtype=np.float32), self._low, self._high)
+        if self._kind != "tactile":
+            return vector
+        taxels = np.zeros(self._pad) if task.taxels is None else task.taxels
+        return {"features": vector, "taxels": (taxels / COUNTS_MAX).astype(np.float32)}
+
+    def _estimated(self, task: LedTask) -> list[float]:
+        """Curvature as the estimator has it, and the share of it that was observed."""
+        estimate = task.estimate
+        if estimate is None:
+            return [0.0] * 4
+        frame = task.frame(task.last_contact.n_base)
+        return [*_in_frame(estimate.curvature_tensor_base(), frame), float(np.mean(estimate.observed))]
+
+
+def _where(which: str, near: float) -> dict[str, tuple[float, float]]:
+    """A contact's place and normal in the scan plane and across it."""
+    places = {f"{which}{axis}_mm": (-near, near) for axis in ("along", "across", "up")}
+    return places | {f"{which}normal_{axis}": (-1.0, 1.0) for axis in ("along", "across")}
+
+
+def _curvature(which: str, bend: float) -> dict[str, tuple[float, float]]:
+    return {f"{which}k_{axes}_per_m": (-bend, bend) for axes in ("xx", "xy", "yy")}
+
+
+def _in_frame(tensor: Vector, frame: Vector) -> list[float]:
+    """A tensor (3, 3) of base as xx, xy, yy in the frame of rows x, y, z."""
+    x, y, _ = frame
+    return [float(x @ tensor @ x), float(x @ tensor @ y), float(y @ tensor @ y)]

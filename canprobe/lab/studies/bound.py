@@ -1,0 +1,480 @@
+"""Study `bound`: errors of `ml` and `recursive` over the Cramér–Rao bound, and the coverage of their 95 % regions.
+
+A case is a surface, a size, a path, its length and a noise. A seed draws the noise on the path once; the answer is
+scored on (K11, K12, K22) at its end. Both estimators and the bound have the same prior, weak over the extent of the
+path; the memory of `recursive` is the length of the path.
+
+The bound is the limit of unbiased estimators. Where the true c13, c23, c33 equal the mean of the prior (planes, large
+radii) an estimate with that prior is better, and its ratio is below 1.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import product
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from canprobe.cell.results.picture import BLUE, INK, ORANGE, SHADE, legend, picture
+from canprobe.errors import UsageError
+from canprobe.lab.studies.harness import (
+    CHI2_95_OF_3,
+    FROBENIUS,
+    SIGMA_COLUMNS,
+    Array,
+    Column,
+    Row,
+    StudyResult,
+    as_json,
+    measuring_facts,
+    sigma_values,
+)
+from canprobe.lab.studies.sweep import Sweep
+from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
+from canprobe.mechanics.touch.estimate.fit import fit_surface
+from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
+from canprobe.mechanics.touch.estimate.noise import Prior
+from canprobe.mechanics.touch.surface import SurfaceMatrix
+
+RATIOS, COVERAGES = (0.0, 2.0), (0.85, 1.0)
+"""Scales of the picture; a case beyond is drawn at the edge."""
+
+
+def draw_bound(rows: Sequence[Row], path: Path) -> None:
+    """Error over bound, and coverage, of every case: two panels for each method."""
+    methods = list(dict.fromkeys(r["method"] for r in rows))
+    surfaces = list(dict.fromkeys(r["surface"] for r in rows))
+    title = (
+        "Error of curvature over the least that any estimator can have (Cramér–Rao bound; below 1 the prior helps),\n"
+        "and how often the stated 95 % regions hold the true curvature; a mark: one surface, size, noise and path\n"
+        "filled: a local quadric describes what was felt (inside), so the bound means something; open: it does not\n"
+        "on each surface from left to right: 5 mm, 40 mm, 1 m in size, each with more and more noise\n"
+        "shade: target; values beyond the scale are drawn at its edge"
+    )
+    with picture(path, title, 1.3 + 3.3 * len(methods)) as figure:
+        grid = figure.subplots(2 * len(methods), 1, squeeze=False, sharex=True)[:, 0]
+        for method, upper, lower in zip(methods, grid[::2], grid[1::2], strict=True):
+            mine = [r for r in rows if r["method"] == method and r["ratio"] is not None]
+            _draw(upper, mine, surfaces, "ratio", RATIOS)
+            upper.axhline(1.0, color=INK)
+            upper.axhspan(0.0, 1.1 if method == "ml" else 1.25, color=SHADE, linewidth=0, zorder=0)
+            upper.set(title=f"{method}: error", ylabel="error / bound")
+            _draw(lower, mine, surfaces, "coverage", COVERAGES)
+            lower.axhline(0.95, color=INK)
+            lower.axhspan(0.90, 0.99, color=SHADE, linewidth=0, zorder=0)
+            lower.set(title=f"{method}: coverage of 95 % regions", ylabel="coverage")
+        legend(figure)
+
+
+def _draw(axes: Axes, rows: Sequence[Row], surfaces: Sequence[str], key: str, limits: tuple[float, float]) -> None:
+    for inside, colour in ((False, ORANGE), (True, BLUE)):
+        for path, marker in (("weave", "o"), ("circle", "s")):
+            mine = [r for r in rows if r["inside"] == inside and r["path"] == path]
+            axes.scatter(
+                [_place(r, surfaces) for r in mine], np.clip([r[key] for r in mine], *limits), s=22, marker=marker,
+                linewidths=1.0, edgecolors=colour, facecolors=colour if inside else "none", clip_on=False, zorder=3,
+                label=f"{path}, {'inside' if inside else 'outside'}",
+            )  # fmt: skip
+    axes.set_xticks(range(len(surfaces)), surfaces)
+    axes.set_xlim(-0.6, len(surfaces) - 0.4)
+    axes.set_ylim(limits[0], limits[1] + 0.07 * (limits[1] - limits[0]))
+    axes.grid(visible=False, axis="x")
+
+
+def _place(row: Row, surfaces: Sequence[str]) -> float:
+    """Smaller sizes to the left, more noise to the right."""
+    size = 0.11 * (np.log10(row["size_mm"]) - 1.85)
+    return surfaces.index(row["surface"]) + 2.2 * float(size) + 0.04 * float(np.log2(row["sigma_point_um"] / 20.0))
+
+
+# Exact ground for the estimators: surfaces of any size, paths over them, noise on the contacts.
+#
+# Every path ends at the origin of a contact frame (z = inward normal), where the answer is scored.
+
+SURFACES = ("plane", "cylinder", "sphere", "ellipsoid", "saddle", "hyperboloid", "torus")
+PATHS = ("weave", "circle")
+_AXES = {"ellipsoid": (1.6, 1.2, 0.93), "hyperboloid": (1.6, 1.2, 0.93)}
+"""Half-axes over the size."""
+_START = {"ellipsoid": (1.04, 0.53, 0.59), "hyperboloid": (1.44, 0.72, 0.37)}
+_TORUS_RING, _TORUS_ANGLE = 2.5, 0.5
+"""Radius of a torus's ring over that of its tube, and where on the tube it is touched (rad from the equator)."""
+WAVES, _AMPLITUDE = 1.6, 5.0 / 12.0
+"""Waves of a weave, and its amplitude over the length of a wave."""
+_OFF_AXIS = 0.4
+"""Turn of the principal directions against the path, rad, so that no entry of K is special."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ground:
+    """A path over an exact surface.
+
+    Attributes:
+        points, normals: (n, 3) in the contact frame of the last point, m; outward unit normals.
+        surface: the quadric of the surface's second order there (the surface itself but for a torus).
+        length: along the path, m.
+        tensor: the true curvature tensor (3, 3) at the foot of a point (3,) near the contact, 1/m.
+    """
+
+    points: Array
+    normals: Array
+    surface: SurfaceMatrix
+    length: float
+    tensor: Callable[[Array], Array]
+
+    @property
+    def K(self) -> Array:
+        """(2, 2) shape operator at the last point, in its contact frame, 1/m."""
+        return self.surface.curvature_at(np.zeros(3))[0]
+
+    def felt(self, sigma_point: float, sigma_normal: float, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Points and unit normals with independent noise: m per axis, rad per tangent axis."""
+        points = self.points + sigma_point * rng.normal(size=self.points.shape)
+        normals = self.normals + sigma_normal * rng.normal(size=self.normals.shape)
+        return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+    def error(self, T_frame_contact: Array, K: Array) -> Array:
+        """(3,) K11, K12, K22 of an estimate less the truth at its contact point, in its contact frame, 1/m.
+
+        An estimate holds at the foot of the last *measured* point, which is off by that point's noise; on a tight
+        surface the true curvature differs there by as much as the bound.
+        """
+        axes = T_frame_contact[:3, :2]
+        delta = K - axes.T @ self.tensor(T_frame_contact[:3, 3]) @ axes
+        return np.array([delta[0, 0], delta[0, 1], delta[1, 1]])
+
+
+def make_ground(surface: str, size: float, path: str, length: float, samples: int, *, waves: float = WAVES) -> Ground:
+    """A path over a surface.
+
+    Args:
+        surface: one of `SURFACES`.
+        size: radius, or the length that its radii follow, m; without effect on a plane.
+        path: one of `PATHS`.
+        length: along the path as seen from above, m.
+        samples: equally spaced points.
+        waves: of a weave; it is as wide as such a wave is long, times 5/6.
+
+    Raises:
+        UsageError: for an unknown name.
+    """
+    if path not in PATHS:
+        raise UsageError(f"path: expected one of {', '.join(PATHS)}, got {path!r}")
+    x, y = _weave(length, samples, waves) if path == "weave" else _circle(length, samples)
+    if surface == "torus":
+        return _on_torus(size, x, y, length)
+    if surface not in SURFACES:
+        raise UsageError(f"surface: expected one of {', '.join(SURFACES)}, got {surface!r}")
+    matrix = _turned(_quadric(surface, size))
+    points = np.stack([x, y, matrix.height(x, y)], axis=1)
+    return Ground(points, matrix.normal(points), matrix, length, partial(_tensor_of_quadric, matrix))
+
+
+def _tensor_of_quadric(surface: SurfaceMatrix, near: Array) -> Array:
+    K, basis = surface.curvature_at(surface.project(near))
+    return np.asarray(basis @ K @ basis.T, dtype=np.float64)
+
+
+def _weave(length: float, samples: int, waves: float) -> tuple[Array, Array]:
+    """A sine whose amplitude is 5/12 of its wave length, cut to the wanted length; it ends at the origin."""
+    t = np.linspace(-waves, 0.0, 8001)
+    y = _AMPLITUDE * np.sin(2.0 * np.pi * t)
+    arc = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(t), np.diff(y)))])
+    at = np.linspace(0.0, arc[-1], samples)
+    scale = length / arc[-1]
+    return scale * np.interp(at, arc, t), scale * np.interp(at, arc, y)
+
+
+def _circle(length: float, samples: int) -> tuple[Array, Array]:
+    """One turn that ends at the origin."""
+    a = np.linspace(0.0, 2.0 * np.pi, samples)
+    radius = length / (2.0 * np.pi)
+    return radius * np.sin(a), radius * (1.0 - np.cos(a))
+
+
+def _quadric(surface: str, size: float) -> SurfaceMatrix:
+    simple: dict[str, Callable[[], SurfaceMatrix]] = {
+        "plane": SurfaceMatrix.plane,
+        "cylinder": lambda: SurfaceMatrix.cylinder(size),
+        "sphere": lambda: SurfaceMatrix.sphere(size),
+        "saddle": lambda: SurfaceMatrix.from_curvature(np.diag([1.0, -0.75]) / size),
+    }
+    if surface in simple:
+        return simple[surface]()
+    signs = (1.0, 1.0, 1.0 if surface == "ellipsoid" else -1.0)
+    axes = np.multiply(_AXES[surface], size)
+    whole = SurfaceMatrix(np.diag([*(np.array(signs) / axes**2), -1.0]))
+    point = whole.project(np.multiply(_START[surface], size))
+    return whole.normalised_at(point).transformed(whole.contact_frame(point))
+
+
+def _turned(surface: SurfaceMatrix) -> SurfaceMatrix:
+    c, s = np.cos(_OFF_AXIS), np.sin(_OFF_AXIS)
+    T = np.eye(4)
+    T[:2, :2] = [[c, -s], [s, c]]
+    return surface.transformed(T)
+
+
+def _on_torus(tube: float, x: Array, y: Array, length: float) -> Ground:
+    """Outside of a torus; the path is laid on its two angles, which keeps points and normals exact."""
+    ring, a = _TORUS_RING * tube, _TORUS_ANGLE
+    c, s = np.cos(_OFF_AXIS), np.sin(_OFF_AXIS)
+    round_ring = (c * x - s * y) / (ring + tube * np.cos(a))
+    round_tube = a + (s * x + c * y) / tube
+    out = np.stack([np.cos(round_ring), np.sin(round_ring), np.zeros_like(x)], axis=1)
+    normals = np.cos(round_tube)[:, None] * out
+    normals[:, 2] = np.sin(round_tube)
+    points = ring * out + tube * normals
+    contact = np.array([ring + tube * np.cos(a), 0.0, tube * np.sin(a)])
+    points -= contact
+    # contact frame: u along the ring, v along the tube, w = inward normal; x, y turned off both as the path is
+    u, v = np.array([0.0, 1.0, 0.0]), np.array([-np.sin(a), 0.0, np.cos(a)])
+    w = -np.array([np.cos(a), 0.0, np.sin(a)])
+    axes = np.stack([c * u + s * v, -s * u + c * v, w], axis=1)
+
+    def tensor(near: Array) -> Array:
+        x, y, z = axes @ near + contact
+        about, height = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y) - ring)
+        along = np.array([-np.sin(about), np.cos(about), 0.0])
+        up = np.array([-np.sin(height) * np.cos(about), -np.sin(height) * np.sin(about), np.cos(height)])
+        k = np.cos(height) / (ring + tube * np.cos(height))
+        return np.asarray(axes.T @ (k * np.outer(along, along) + np.outer(up, up) / tube) @ axes, dtype=np.float64)
+
+    K = tensor(np.zeros(3))[:2, :2]
+    return Ground(points @ axes, normals @ axes, SurfaceMatrix.from_curvature(K), length, tensor)
+
+
+# The cases, and the region in which a local quadratic bound has a meaning.
+
+SIZES_M, LONGEST_M, SAMPLES = (0.005, 0.04, 1.0), 0.02, 160
+NOISES = ((5e-6, 2e-4), (20e-6, 1e-3), (100e-6, 5e-3))
+LEAST_SIZE = 50.0
+"""A ‖K‖ below this counts as this, 1/m."""
+REGION: Mapping[str, float] = MappingProxyType(
+    {"path": 1.0, "bound": 0.2, "κσ": 5e-3, "cubic": 1.0 / 3.0, "spread": 0.25}
+)
+"""Largest path over the radius, bound on an entry of K over its size, κσ_p (turn of the normal over the noise of a
+point, rad), error of the quadric without noise (its prior, and cubic terms of the surface) over the bound, and noise of
+a point over the spread of the points where that is narrowest: beyond, a path is not well excited.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One row of the study, m and rad."""
+
+    surface: str
+    path: str
+    size: float
+    length: float
+    sigma_point: float
+    sigma_normal: float
+
+    @property
+    def ground(self) -> Ground:
+        """The path over the exact surface."""
+        return make_ground(self.surface, self.size, self.path, self.length, SAMPLES)
+
+
+def all_cases() -> Iterator[Case]:
+    """Weaves and circles over every surface and size with every noise, and weaves of 1.5 radii."""
+    for surface in SURFACES:
+        for size in SIZES_M[:2] if surface == "plane" else SIZES_M:
+            for path, noise in product(PATHS, NOISES):
+                yield Case(surface, path, size, min(size, LONGEST_M), *noise)
+        if surface != "plane":
+            for noise in NOISES[1:]:
+                yield Case(surface, "weave", SIZES_M[0], 1.5 * SIZES_M[0], *noise)
+
+
+def quick_cases() -> Iterator[Case]:
+    """Every surface once, and sizes, paths and noises in turn."""
+    for i, surface in enumerate(SURFACES):
+        size = SIZES_M[i % 2]
+        yield Case(surface, PATHS[i % 2], size, min(size, LONGEST_M), *NOISES[i % 3])
+
+
+def criteria(case: Case, ground: Ground, C: Array, model_bias: float) -> dict[str, float]:
+    """The values of a case that `REGION` limits."""
+    size = float(np.linalg.norm(ground.K))
+    return {
+        "path": 0.0 if case.surface == "plane" else case.length / case.size,
+        "bound": math.sqrt(float(np.diag(C).max())) / max(size, LEAST_SIZE),
+        "κσ": float(np.abs(np.linalg.eigvalsh(ground.K)).max()) * case.sigma_point,
+        "cubic": model_bias,
+        "spread": case.sigma_point / math.sqrt(float(np.linalg.eigvalsh(np.cov(ground.points[:, :2].T))[0])),
+    }
+
+
+# From answers to rows: error, bias and coverage over the bound, and the verdict.
+
+METHODS = ("ml", "recursive")
+POOLED_RATIO, CASE_RATIO = {"ml": 1.1, "recursive": 1.25}, {"ml": 1.25, "recursive": 1.4}
+LARGEST_BIAS = 1.0 / 3.0
+"""Of K over the bound."""
+Answer = list[float] | None
+"""Error of K11, K12, K22, its squared length in standard deviations, and the stated ‖·‖²; None where not observed."""
+
+
+def answer_of(ground: Ground, estimate: SurfaceEstimate) -> Answer:
+    """The scored figures of an estimate."""
+    if estimate.rank < 3:
+        return None
+    e, C = ground.error(estimate.T_frame_contact, estimate.K), estimate.covariance
+    return [*e.tolist(), float(e @ np.linalg.solve(C, e)), float(FROBENIUS @ np.diag(C))]
+
+
+def score(answers: Sequence[Answer], bound: float) -> dict[str, Any]:
+    """Error, stated error and bias over the bound on ‖K‖ (1/m), coverage, and the share observed."""
+    seen = np.array([a for a in answers if a is not None])
+    if not len(seen):
+        return dict.fromkeys(("ratio", "claimed", "bias", "coverage")) | {"observed": 0.0}
+    errors = seen[:, :3]
+    mean, scatter = errors.mean(axis=0), float(errors.var(axis=0) @ FROBENIUS) / len(errors)  # the mean's own scatter
+    return {
+        "ratio": math.sqrt(float(np.mean(errors**2 @ FROBENIUS))) / bound,
+        "claimed": math.sqrt(float(np.median(seen[:, 4]))) / bound,
+        "bias": math.sqrt(max(length(mean) ** 2 - scatter, 0.0)) / bound,
+        "coverage": float(np.mean(seen[:, 3] < CHI2_95_OF_3)),
+        "observed": len(seen) / len(answers),
+    }
+
+
+def length(error: Array) -> float:
+    """‖·‖ of (K11, K12, K22)."""
+    return math.sqrt(float(FROBENIUS @ error**2))
+
+
+def verdict(row: Row, seeds: int) -> str:
+    """`good`, or the figures of a row that are out of line.
+
+    With few seeds the limits are wider: by three standard deviations of the coverage (where that is more than 5 %), one
+    of the mean error and two of its size (1/√(6n): three entries, sum of squares).
+    """
+    if row["ratio"] is None:
+        return "not observed" if row["inside"] else "good"
+    open_cover = max(0.05, 3.0 * math.sqrt(0.95 * 0.05 / seeds))
+    wrong = []
+    if row["inside"]:
+        if row["ratio"] > CASE_RATIO[row["method"]] * (1.0 + (0.0 if seeds >= 200 else 2.0 / math.sqrt(6.0 * seeds))):
+            wrong.append("error")
+        if row["bias"] > LARGEST_BIAS + row["ratio"] / math.sqrt(seeds):
+            wrong.append("bias")
+        if row["observed"] < 1.0:
+            wrong.append("not observed")
+    if row["coverage"] < 0.95 - open_cover:
+        wrong.append("overconfident")
+    elif row["inside"] and row["coverage"] > min(0.99, 0.95 + open_cover) and seeds >= 200:
+        wrong.append("covers too much")
+    return ", ".join(wrong) or "good"
+
+
+def findings(rows: Sequence[Row]) -> list[str]:
+    """Pooled figures inside the region, the cases out of line there, and the count outside."""
+    said = []
+    for method in METHODS:
+        mine = [r for r in rows if r["method"] == method]
+        inside = [r for r in mine if r["inside"] and r["ratio"] is not None]
+        outside = [r for r in mine if not r["inside"]]
+        pooled = math.sqrt(float(np.mean([r["ratio"] ** 2 for r in inside])))
+        cover = float(np.mean([r["coverage"] for r in inside]))
+        bad = [r for r in inside if r["verdict"] != "good"]
+        honest = [r for r in outside if r["verdict"] == "good"]
+        said.append(
+            f"{method}: inside the region {len(inside)} cases, error pooled {pooled:.3f} × bound (asked for: at most "
+            f"{POOLED_RATIO[method]}), 95 % regions cover {100 * cover:.1f} % pooled (asked for: 94–96 %), "
+            f"{len(bad)} cases out of line; outside {len(outside)} cases, {len(honest)} with honest covariance."
+        )
+        said += [f"  out of line: {_named(r)}: {r['verdict']}" for r in bad]
+    return said
+
+
+def _named(row: Row) -> str:
+    return (
+        f"{row['surface']} {row['size_mm']:.0f} mm, {row['path']}, {row['sigma_point_um']:.0f} µm "
+        f"(error {row['ratio']:.2f}, bias {row['bias']:.2f}, cover {row['coverage']:.3f})"
+    )
+
+
+SEEDS, BLOCK = 200, 20
+"""Seeds of a case, and how many of them make a cell of the sweep."""
+MODEL = ("touch", "studies/bound.py")
+AT = "at_"
+"""Before the names of `criteria` in a row."""
+COLUMNS = (
+    Column("surface", "surface"),
+    Column("path", "path"),
+    Column("size_mm", "size mm", ".0f"),
+    Column("length_mm", "path mm", ".1f"),
+    *SIGMA_COLUMNS,
+    Column("method", "method"),
+    Column("bound_per_m", "bound 1/m", ".3g"),
+    Column("ratio", "error/bound", ".2f"),
+    Column("claimed", "claimed/bound", ".2f"),
+    Column("bias", "bias/bound", ".2f"),
+    Column("coverage", "cover", ".3f"),
+    Column("observed", "observed", ".2f"),
+    Column("inside", "inside"),
+    Column("outside_for", "why not"),
+    Column("verdict", "verdict"),
+)
+
+
+def run(*, quick: bool, sweep: Sweep) -> StudyResult:
+    """Measure all cases."""
+    return measure_all(list(quick_cases() if quick else all_cases()), 10 if quick else SEEDS, sweep, quick=quick)
+
+
+def measure_all(cases: list[Case], seeds: int, sweep: Sweep, *, quick: bool = False) -> StudyResult:
+    """The study of some cases with so many seeds each."""
+    sweep.say(f"{len(cases)} cases, {seeds} seeds each")
+    blocks = [(first, min(BLOCK, seeds - first)) for first in range(0, seeds, BLOCK)]
+    cells = [(case, method, *block) for block in blocks for case in cases for method in METHODS]
+    answers: dict[tuple[Case, str], list[Answer]] = {(case, method): [] for case in cases for method in METHODS}
+    for (case, method, *_), found in zip(cells, sweep.map(measure, cells, model=MODEL), strict=True):
+        answers[case, method] += found
+    rows = [row for case in cases for row in _rows(case, {m: answers[case, m] for m in METHODS})]
+    facts = measuring_facts(quick, seeds, MODEL)
+    return StudyResult("bound", COLUMNS, rows, findings(rows), facts, partial(draw_bound, rows))
+
+
+def measure(cell: tuple[Case, str, int, int]) -> list[Answer]:
+    """Answers of a method to a case, with so many seeds from the first one on."""
+    case, method, first, count = cell
+    ground, fit, own = case.ground, _fitter(case), zlib.crc32(as_json(case).encode())
+    generators = [np.random.default_rng([own, seed]) for seed in range(first, first + count)]
+    felt = [ground.felt(case.sigma_point, case.sigma_normal, rng) for rng in generators]
+    return [answer_of(ground, fit(points, normals, method=method)) for points, normals in felt]
+
+
+def _fitter(case: Case) -> partial[Any]:
+    points = case.ground.points
+    prior = Prior.weak(float(np.linalg.norm(points - points[-1], axis=1).max()))
+    return partial(fit_surface, prior=prior, sigma_point=case.sigma_point, sigma_normal=case.sigma_normal)
+
+
+def _rows(case: Case, answers: dict[str, list[Answer]]) -> Iterator[Row]:
+    """One row for each method."""
+    ground, fit = case.ground, _fitter(case)
+    C = cramer_rao(ground.points, ground.normals, ground.surface, **fit.keywords)
+    bound = math.sqrt(float(FROBENIUS @ np.diag(C)))
+    exact = fit(ground.points, ground.normals, quadric=True)
+    model_bias = length(ground.error(exact.T_frame_contact, exact.K)) / bound
+    values = criteria(case, ground, C, model_bias)
+    why = [name for name, limit in REGION.items() if not values[name] <= limit * (1.0 + 1e-9)]
+    shared = {
+        "surface": case.surface, "path": case.path, "size_mm": case.size * 1e3, "length_mm": case.length * 1e3,
+        **sigma_values(case.sigma_point, case.sigma_normal),
+        "bound_per_m": bound, "size_of_K_per_m": float(np.linalg.norm(ground.K)),
+        **{AT + name: value for name, value in values.items()}, "inside": not why, "outside_for": ", ".join(why) or "–",
+    }  # fmt: skip
+    for method, mine in answers.items():
+        row = shared | {"method": method} | score(mine, bound)
+        yield row | {"verdict": verdict(row, len(mine))}

@@ -1,0 +1,306 @@
+"""Study `estimators`: error against run time for every estimator, window, lag and noise.
+
+A probe moves along a weave at 25 mm/s, 200 tactile frames a second; after 60 mm the answer is scored at the last
+contact. Costs are measured apart from errors: all estimators take turns at eight frames and an answer (40 ms of the
+loop), garbage collector off, medians over the turns without the first. They are processor times: other work of the
+machine has little influence.
+"""
+
+from __future__ import annotations
+
+import gc
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from statistics import median
+from time import process_time
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from canprobe.cell.results.picture import INK, METHOD_COLOURS, SHADE, legend, log_scale, picture
+from canprobe.lab.studies.bound import Ground, make_ground
+from canprobe.lab.studies.harness import (
+    FROBENIUS,
+    SIGMA_COLUMNS,
+    Array,
+    Column,
+    Row,
+    StudyResult,
+    measuring_facts,
+    sigma_values,
+)
+from canprobe.lab.studies.sweep import Sweep
+from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.touch.estimate.fit import make_estimator
+from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
+from canprobe.mechanics.touch.estimate.online import Estimator
+from canprobe.mechanics.touch.linear_algebra import homogeneous, tangent_rotation
+
+STEP_M, FRAME_US, SHARE = 0.125e-3, 5000.0, 8
+"""Path between two frames, time between them, frames between two answers of the loop."""
+SAMPLES, PROBE_M = 480, 0.040
+WINDOWS, LAGS = (40, 80, 160, 320), (1, 5, 10, 20)
+NOISES = ((5e-6, 2e-4), (20e-6, 1e-3), (50e-6, 3e-3))
+GROUNDS = (("ellipsoid", 0.05), ("cylinder", 0.036))
+WAVES = 5
+"""Waves of the weave on the whole path: one on 12 mm of it."""
+Noise = tuple[float, float]
+Place = tuple[str, float]
+REFERENCE = ("chen1996", 160, 10)
+MODEL = ("touch", "studies/estimators.py", "studies/bound.py")
+COLUMNS = (
+    Column("surface", "surface"),
+    Column("method", "method"),
+    Column("window_samples", "window"),
+    Column("lag_samples", "lag"),
+    *SIGMA_COLUMNS,
+    Column("error_percent", "error %", ".2f"),
+    Column("bound_percent", "bound %", ".2f"),
+    Column("observed", "observed", ".2f"),
+    Column("add_us", "add µs", ".0f"),
+    Column("answer_us", "answer µs", ".0f"),
+    Column("sample_us", "add + ⅛ answer µs", ".0f"),
+    Column("ratio_to_chen1996", "× chen1996", ".3f"),
+    Column("in_budget", "frame in 5 ms"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One estimator of the study; the window of `recursive` is its memory."""
+
+    method: str
+    window: int
+    lag: int | None = None
+
+    def make(self, sigma_point: float, sigma_normal: float) -> Estimator:
+        """The estimator."""
+        return make_estimator(
+            self.method,
+            sigma_point=sigma_point,
+            sigma_normal=sigma_normal,
+            memory_m=self.window * STEP_M,
+            window=self.window,
+            lag=self.lag or 10,
+        )
+
+
+def settings(quick: bool = False) -> list[Setting]:
+    """Every method and window; the lags below half a window."""
+    windows, lags = ((40, 160), (10,)) if quick else (WINDOWS, LAGS)
+    found = [Setting(m, w) for m in ("chord", "ml", "recursive") for w in windows]
+    return [Setting("chen1996", w, lag) for w in windows for lag in lags if 2 * lag < w] + found
+
+
+def run(*, quick: bool, sweep: Sweep) -> StudyResult:
+    """Measure costs, then errors."""
+    seeds, turns = (3, 4) if quick else (24, 20)
+    grounds = GROUNDS[:1] if quick else GROUNDS
+    sweep.say(f"costs of {len(settings(quick))} settings at {len(NOISES)} noises, one after another")
+    costs = sweep.time(measure_costs, [(noise, quick, turns) for noise in NOISES], model=MODEL)
+    sweep.say(f"errors on {len(grounds)} surface{'s' * (len(grounds) != 1)}, {seeds} seeds each")
+    cells = [(place, noise, quick, seed) for noise in NOISES for place in grounds for seed in range(seeds)]
+    errors = iter(sweep.map(measure_errors, cells, model=MODEL))
+    rows = []
+    for noise, times in zip(NOISES, costs, strict=True):
+        for name, size in grounds:
+            ground, by_seed = on_the_move(name, size), [next(errors) for _ in range(seeds)]
+            found = zip(settings(quick), times, zip(*by_seed, strict=True), strict=True)
+            rows += [_row(name, ground, noise, *one) for one in found]
+    facts = measuring_facts(quick, seeds, MODEL) | {"turns": turns}
+    return StudyResult("estimators", COLUMNS, rows, findings(rows), facts, partial(draw_estimators, rows))
+
+
+def on_the_move(surface: str, size: float) -> Ground:
+    """The weave of the study over a surface."""
+    return make_ground(surface, size, "weave", SAMPLES * STEP_M, SAMPLES, waves=WAVES)
+
+
+def contacts(points: Array, normals: Array, first: int = 0) -> list[ContactSample]:
+    """Contacts of a probe whose pole follows the normal."""
+    pole = np.array([0.0, 0.0, PROBE_M])
+    return [
+        ContactSample(0.005 * i, p, n, homogeneous(tangent_rotation(-n), p + PROBE_M * n), pole, 1.0)
+        for i, (p, n) in enumerate(zip(points, normals, strict=True), first)
+    ]
+
+
+def measure_errors(cell: tuple[Place, Noise, bool, int]) -> list[Array | None]:
+    """Error (3,) of K of each setting, of one seed; None where not all of K was observed."""
+    (name, size), noise, quick, seed = cell
+    ground = on_the_move(name, size)
+    samples = contacts(*ground.felt(*noise, np.random.default_rng([seed, round(noise[0] * 1e9)])))
+    errors: list[Array | None] = []
+    for setting in settings(quick):
+        estimator = setting.make(*noise)
+        for sample in samples if setting.method == "recursive" else samples[-setting.window :]:
+            estimator.add(sample)
+        answer = estimator.estimate()
+        seen = answer is not None and answer.rank == 3
+        errors.append(ground.error(answer.T_frame_contact, answer.K) if answer is not None and seen else None)
+    return errors
+
+
+def measure_costs(cell: tuple[Noise, bool, int]) -> list[list[tuple[float, float]]]:
+    """Times of one `add` and of one answer by setting and turn, µs; the settings take turns."""
+    noise, quick, turns = cell
+    ground = on_the_move(*GROUNDS[0])
+    estimators = [s.make(*noise) for s in settings(quick)]
+    samples = contacts(*ground.felt(*noise, np.random.default_rng(99)))
+    for estimator in estimators:
+        for sample in samples:
+            estimator.add(sample)
+    times: list[list[tuple[float, float]]] = [[] for _ in estimators]
+    points, normals = ground.felt(*noise, np.random.default_rng(100))  # the path again, back from its end
+    back = -2 - np.arange(SHARE * (turns + 1)) % (SAMPLES - 2)
+    more = contacts(points[back], normals[back], first=SAMPLES)
+    gc.collect()
+    gc.disable()
+    try:
+        for turn in range(turns + 1):
+            block = more[SHARE * turn : SHARE * (turn + 1)]
+            for mine, estimator in zip(times, estimators, strict=True):
+                mine.append(_timed(estimator, block))
+    finally:
+        gc.enable()
+    return [mine[1:] for mine in times]
+
+
+def _timed(estimator: Estimator, block: Sequence[ContactSample]) -> tuple[float, float]:
+    start = process_time()
+    for sample in block:
+        estimator.add(sample)
+    added = process_time()
+    estimator.estimate()
+    return (added - start) / len(block) * 1e6, (process_time() - added) * 1e6
+
+
+def _row(  # noqa: PLR0917 - one row of a table
+    surface: str,
+    ground: Ground,
+    noise: Noise,
+    setting: Setting,
+    times: Sequence[tuple[float, float]],
+    errors: Sequence[Array | None],
+) -> Row:
+    size = float(np.linalg.norm(ground.K))
+    # the filter's memory fades, it has no window: its bound is that of all samples
+    last = slice(None if setting.method == "recursive" else -setting.window, None)
+    C = cramer_rao(
+        ground.points[last], ground.normals[last], ground.surface, sigma_point=noise[0], sigma_normal=noise[1]
+    )
+    seen = [e for e in errors if e is not None]
+    rms = math.sqrt(float(np.mean(np.square(seen) @ FROBENIUS))) if seen else math.nan
+    add, answer = (median(column) for column in zip(*times, strict=True))
+    per_sample = [t[0] + t[1] / SHARE for t in times]
+    return {
+        "surface": surface,
+        "method": setting.method,
+        "window_samples": setting.window,
+        "lag_samples": setting.lag,
+        **sigma_values(*noise),
+        "error_percent": 100.0 * rms / size,
+        "bound_percent": 100.0 * math.sqrt(float(FROBENIUS @ np.diag(C))) / size,
+        "observed": len(seen) / len(errors),
+        "add_us": add,
+        "answer_us": answer,
+        "sample_us": median(per_sample),
+        "spread_us": float(np.subtract(*np.percentile(per_sample, [75, 25]))),
+        "in_budget": add + answer <= FRAME_US,
+    }
+
+
+def findings(rows: Sequence[Row]) -> list[str]:
+    """Ratios to `chen1996`, written into the rows, and the sentences that follow from the table."""
+    by = {(r["surface"], r["sigma_point_um"], r["method"], r["window_samples"], r["lag_samples"]): r for r in rows}
+    for r in rows:
+        reference = by[r["surface"], r["sigma_point_um"], *REFERENCE]
+        r["ratio_to_chen1996"] = r["sample_us"] / reference["sample_us"]
+    said = [
+        "the bound is that of the nine-parameter model and the window; of recursive, whose memory fades, of all 480 "
+        "samples. chord and chen1996 take |∇f| for constant: on a cylinder that is true and worth information.",
+        "chen1996 of the ratios: 160 samples, lag 10; error: RMS of ‖K − K_true‖ over ‖K_true‖.",
+    ]
+    for sigma_point, sigma_normal in NOISES:
+        key = (GROUNDS[0][0], sigma_point * 1e6)
+        ml, filtered = by[*key, "ml", 160, None], by[*key, "recursive", 160, None]
+        said.append(
+            f"at {sigma_point * 1e6:.0f} µm, {sigma_normal * 1e3:.1f} mrad: recursive {filtered['sample_us']:.0f} µs a "
+            f"sample = 1/{ml['answer_us'] / filtered['sample_us']:.0f} of an answer of ml over 160 samples "
+            f"({ml['answer_us']:.0f} µs), its error {filtered['error_percent'] / ml['error_percent']:.2f} × that of ml."
+        )
+    return said
+
+
+BUDGET_MS = 5.0
+
+
+def draw_estimators(rows: Sequence[Row], path: Path) -> None:
+    """Error over the time of a frame with an answer: a row of panels for each surface, a column for each noise."""
+    surfaces = list(dict.fromkeys(r["surface"] for r in rows))
+    noises = list(dict.fromkeys((r["sigma_point_um"], r["sigma_normal_mrad"]) for r in rows))
+    title = (
+        "Error of local curvature against the time of one tactile frame with an answer; lower left is better\n"
+        "marker size: window of 40, 80, 160, 320 samples (5–40 mm of path); no marker: not observed\n"
+        "dotted: Cramér–Rao bound of each window, and of all 480 samples (the memory of recursive fades)\n"
+        "lag: samples between the two of a difference"
+    )
+    with picture(path, title, 1.1 + 2.7 * len(surfaces)) as figure:
+        grid = figure.subplots(len(surfaces), len(noises), squeeze=False, sharex=True, sharey=True)
+        for surface, line in zip(surfaces, grid, strict=True):
+            of_surface = [r for r in rows if r["surface"] == surface]
+            for (point, normal), axes in zip(noises, line, strict=True):
+                _draw_panel(axes, [r for r in of_surface if r["sigma_point_um"] == point])
+                axes.set_title(f"{surface}, σ {point:.0f} µm, {normal:.1f} mrad")
+            line[0].set_ylabel("RMS error of K (%)")
+        for axes in grid[-1]:
+            axes.set_xlabel("time of a frame with an answer (ms)")
+        legend(figure)
+
+
+def _draw_panel(axes: Axes, rows: Sequence[Row]) -> None:
+    ends: list[tuple[float, float, str]] = []
+    for method, lag in dict.fromkeys((r["method"], r["lag_samples"]) for r in rows):
+        line = [r for r in rows if r["method"] == method and r["lag_samples"] == lag]
+        x = [(r["add_us"] + r["answer_us"]) * 1e-3 for r in line]
+        y = [r["error_percent"] for r in line]
+        axes.plot(x, y, color=METHOD_COLOURS[method], alpha=0.8)
+        sizes = [12.0 * r["window_samples"] / 40 for r in line]
+        axes.scatter(x, y, s=sizes, color=METHOD_COLOURS[method], label=method, zorder=3, linewidths=0)
+        if lag is not None and x and math.isfinite(y[-1]):
+            ends.append((y[-1], x[-1], str(lag)))
+    _name_lags(axes, sorted(ends))
+    for r in rows:
+        if r["method"] == "ml":
+            _draw_bound(axes, r["bound_percent"], str(r["window_samples"]))
+    _draw_bound(axes, next(r["bound_percent"] for r in rows if r["method"] == "recursive"), "all 480")
+    axes.axvspan(BUDGET_MS, 1e3, color=SHADE, linewidth=0, zorder=0)
+    axes.axvline(BUDGET_MS, color=INK, label="budget of a tactile frame, 5 ms")
+    log_scale(axes, "xy")
+    axes.set_xlim(0.2, 200.0)
+
+
+def _name_lags(axes: Axes, ends: Sequence[tuple[float, float, str]]) -> None:
+    """A name at the end of each line; one for those that end together."""
+    together: list[list[tuple[float, float, str]]] = []
+    for end in ends:
+        if together and end[0] < 1.25 * together[-1][-1][0]:
+            together[-1].append(end)
+        else:
+            together.append([end])
+    for lines in together:
+        y = math.sqrt(lines[0][0] * lines[-1][0])
+        text = "lag " + ", ".join(sorted((lag for *_, lag in lines), key=int))
+        at = (max(x for _, x, _ in lines), y)
+        axes.annotate(text, at, textcoords="offset points", xytext=(7, -2), fontsize="small")
+
+
+def _draw_bound(axes: Axes, percent: float, text: str) -> None:
+    axes.axhline(percent, color=INK, linewidth=0.8, linestyle=":", label="Cramér–Rao bound")
+    axes.annotate(
+        text, (0.0, percent), xycoords=("axes fraction", "data"), textcoords="offset points", xytext=(3, 2),
+        fontsize="small",
+    )  # fmt: skip

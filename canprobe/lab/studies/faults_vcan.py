@@ -1,0 +1,325 @@
+"""Study `faults` on a real vcan0: processes are killed or stalled, the interface goes down and comes back.
+
+`canprobe vcan -- canprobe study faults --vcan`. A run fails where a drive has power or moves two seconds after the
+fault, where the master does not end, or where it leaves no readable log. The nodes are a separate process, which
+outlives the master: they must stop by themselves. Nodes whose interface goes down end with it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+from functools import cache, partial
+from pathlib import Path
+from random import Random
+
+from canprobe.cell.planning.make import make_plan
+from canprobe.cell.scene.load import dump_scene, load_scene
+from canprobe.cell.scene.model import Scene
+from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.session.children import EmulatorChild, with_our_imports
+from canprobe.errors import CanprobeError, InterfaceError
+from canprobe.fieldbus.bus.candump import read_candump
+from canprobe.fieldbus.bus.port import MonotonicClock, Port
+from canprobe.fieldbus.bus.real.link import missing_ip
+from canprobe.fieldbus.bus.real.python_can import open_port
+from canprobe.fieldbus.bus.real.socketcan import check_interface
+from canprobe.fieldbus.bus.sdo import PumpedNetwork, hold_dialogues, upload
+from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, DriveState, state_of
+from canprobe.lab.studies.faults import draw_ends, scenario_scene
+from canprobe.lab.studies.harness import CHANNEL, Column, Row, StudyResult, measuring_facts
+from canprobe.lab.studies.realtime_cases import LATE_PERCENT, patient, with_real_nodes
+from canprobe.lab.studies.sweep import Sweep
+
+RUNS = 40
+SCENARIO, HOLD_S = "press, features", 3.0
+MISSED_SYNCS = 20
+"""Of the drives: a guest stands still for tens of milliseconds, which is no fault of the cell."""
+PATIENCE_S = 60.0
+REACTION_S = 2.0
+"""After the fault, until drives without a master must have stopped: theirs are 0.2 s, the rest is for a slow guest."""
+STALL_S = 1.0
+APART_S = 0.3
+"""Between two looks at the positions."""
+MOST_COUNTS = 8
+_TPDO1 = 0x181
+COLUMNS = (
+    Column("seed", "seed", "d"),
+    Column("fault", "fault"),
+    Column("after_s", "after s", ".2f"),
+    Column("status", "master's status"),
+    Column("ended_s", "ended within s", ".2f"),
+    Column("drives", "drives afterwards"),
+    Column("failures", "failures"),
+)
+
+
+class ProcessFault(Enum):
+    """What happens."""
+
+    MASTER_KILLED = "master killed"
+    MASTER_STALLED = "master stalled"
+    NODES_KILLED = "nodes killed"
+    LINK_DOWN = "link down"
+    LINK_DOWN_UP = "link down and up"
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessCase:
+    """One run.
+
+    Attributes:
+        seed: its number.
+        fault: what happens.
+        after_s: from the enabling of the drives to the fault.
+    """
+
+    seed: int
+    fault: ProcessFault
+    after_s: float
+
+
+def draw_process_case(seed: int) -> ProcessCase:
+    """The case of a seed: the kinds take turns, the time is random, from the enabling to beyond the retreat."""
+    kinds = tuple(ProcessFault)
+    return ProcessCase(seed, kinds[seed % len(kinds)], Random(f"vcan {seed}").uniform(0.0, HOLD_S + 1.0))
+
+
+def run(*, quick: bool, sweep: Sweep) -> StudyResult:
+    """Carry out the campaign: forty runs, or one of each kind with `quick`."""
+    check_interface(CHANNEL)
+    if (missing := missing_ip()) is not None:
+        raise InterfaceError(f"{CHANNEL}: the study takes it down and up: {missing}")
+    link("up")  # whoever may not do that is told before anything moves
+    rows = []
+    total = len(ProcessFault) if quick else RUNS
+    for seed in range(total):
+        rows.append(row_of(draw_process_case(seed)))
+        sweep.say(f"{seed + 1} of {total}: {rows[-1]['fault']}: {rows[-1]['failures'] or 'no failure'}")
+    patience = {"missed_syncs": MISSED_SYNCS, "late_cycles_max_percent": LATE_PERCENT}
+    facts = measuring_facts(quick, total) | {"interface": CHANNEL, **patience}
+    return StudyResult("faults", COLUMNS, rows, findings(rows), facts, partial(draw_ends, rows))
+
+
+def findings(rows: Sequence[Mapping[str, object]]) -> list[str]:
+    """The number of failures, and each of them."""
+    failed = [row for row in rows if row["failures"]]
+    return [
+        f"{len(rows)} runs on {CHANNEL}, {len(failed)} failed.",
+        *(f"seed {row['seed']}, {row['fault']}: {row['failures']}" for row in failed),
+    ]
+
+
+# One run: master and emulated nodes are processes, and one of them is killed.
+
+
+@cache
+def served_scene() -> Scene:
+    """A press whose nodes are a separate process, which outlives the master."""
+    scene = scenario_scene(SCENARIO, True)
+    on_bus = {"bus.interface": "socketcan", "bus.channel": CHANNEL, "task.duration_s": HOLD_S}
+    return patient(load_scene(scene, on_bus), MISSED_SYNCS)
+
+
+def row_of(case: ProcessCase) -> Row:
+    """Bring the cell up, let the fault happen, and look at what is left: the row of the case."""
+    with tempfile.TemporaryDirectory(prefix="canprobe-faults-") as folder:
+        run = _Run(case, EmulatorChild(make_plan(resolve(served_scene())), None, (CHANNEL,)), Path(folder))
+        try:
+            status, ended_s, drives = run.carry_out()
+        finally:
+            link("up")
+            run.close()
+    return {
+        "seed": case.seed,
+        "fault": case.fault.value,
+        "after_s": case.after_s,
+        "status": status,
+        "ended_s": ended_s,
+        "drives": drives,
+        "failures": "; ".join(run.failures),
+    }
+
+
+class _Run:
+    """One case being carried out."""
+
+    def __init__(self, case: ProcessCase, child: EmulatorChild, folder: Path) -> None:
+        self.case, self.child, self.folder = case, child, folder
+        self.clock = MonotonicClock()
+        self.master: subprocess.Popen[bytes] | None = None
+        self.failures: list[str] = []
+
+    def carry_out(self) -> tuple[int | None, float, str]:
+        """Status of the master (None: killed after a hang), seconds from the fault to its end, states of the drives."""
+        port = self._open()
+        try:
+            self.child.start()
+            self.child.await_boot_ups(port)
+            self.master = self._start_master()
+            if not self._await_enabled(port, self.master):
+                self.failures.append("the drives were never enabled")
+                return self.master.poll(), 0.0, ""
+            self._sleep(self.case.after_s)
+        finally:
+            port.close()
+        fault_ns = self.clock.now_ns()
+        self._let_happen(self.master)
+        status = None
+        try:
+            status = self.master.wait(PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            self.failures.append(f"hang: the master still runs {PATIENCE_S:g} s after the fault")
+        ended_s = (self.clock.now_ns() - fault_ns) * 1e-9
+        self._sleep(REACTION_S - ended_s)
+        link("up")
+        drives = self._look()
+        self.failures += score_end(self.case.fault, status, self.folder)
+        return status, ended_s, drives
+
+    def close(self) -> None:
+        """Leave no process behind."""
+        if self.master is not None and self.master.poll() is None:
+            self.master.kill()
+            self.master.wait()
+        self.child.end()
+
+    def _open(self) -> Port:
+        return open_port("socketcan", CHANNEL, 1_000_000, self.clock)
+
+    def _sleep(self, seconds: float) -> None:
+        self.clock.sleep_until_ns(self.clock.now_ns() + max(0, round(seconds * 1e9)))
+
+    def _start_master(self) -> subprocess.Popen[bytes]:
+        scene = with_real_nodes(served_scene())
+        path = self.folder / "scene.toml"
+        path.write_text(dump_scene(replace(scene, scene=replace(scene.scene, figures=False))), encoding="utf-8")
+        command = [sys.executable, "-P", "-m", "canprobe", "run", str(path), "--out", str(self.folder / "run")]
+        with (self.folder / "stderr").open("wb") as errors:
+            return subprocess.Popen(
+                command,
+                env=with_our_imports(),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=errors,
+            )
+
+    def _await_enabled(self, port: Port, master: subprocess.Popen[bytes]) -> bool:
+        """Wait until the first drive reports operation enabled."""
+        deadline_ns = self.clock.now_ns() + round(PATIENCE_S * 1e9)
+        while self.clock.now_ns() < deadline_ns and master.poll() is None:
+            port.wait(self.clock.now_ns() + 50_000_000)
+            for can_id, data, _ in port.drain():
+                word = int.from_bytes(data[:2], "little")
+                if can_id == _TPDO1 and state_of(word) is DriveState.OPERATION_ENABLED:
+                    return True
+        return False
+
+    def _let_happen(self, master: subprocess.Popen[bytes]) -> None:
+        match self.case.fault:
+            case ProcessFault.MASTER_KILLED:
+                master.kill()
+            case ProcessFault.MASTER_STALLED:
+                master.send_signal(signal.SIGSTOP)
+                self._sleep(STALL_S)
+                master.send_signal(signal.SIGCONT)
+            case ProcessFault.NODES_KILLED:
+                os.kill(self.child.pid, signal.SIGKILL)
+            case ProcessFault.LINK_DOWN:
+                link("down")
+            case ProcessFault.LINK_DOWN_UP:
+                link("down")
+                link("up")
+
+    def _look(self) -> str:
+        """The states of the drives, where their process still answers."""
+        if not Path(f"/proc/{self.child.pid}").exists() or not self._answers():
+            if self.case.fault in (ProcessFault.MASTER_KILLED, ProcessFault.MASTER_STALLED):
+                self.failures.append("the nodes ended with a master that is not their parent")
+            return "gone"
+        before, first = self._ask(0x6064), self._ask(0x6041)
+        self._sleep(APART_S)
+        after = self._ask(0x6064)
+        states = {node_id: state_of(word) for node_id, word in first.items()}
+        for node_id, state in states.items():
+            if state in POWERED_STATES:
+                self.failures.append(f"node {node_id} is {state.name} after the stop")
+            if abs(_signed(after[node_id]) - _signed(before[node_id])) > MOST_COUNTS:
+                self.failures.append(f"node {node_id} moves after the stop")
+        codes = self._ask(0x603F) if DriveState.FAULT in states.values() else {}
+        return ", ".join(sorted({_text_of(state, codes.get(node_id)) for node_id, state in states.items()}))
+
+    def _answers(self) -> bool:
+        try:
+            return bool(self._ask(0x6041))
+        except CanprobeError:
+            return False
+
+    def _ask(self, index: int) -> dict[int, int]:
+        """An object of each drive; empty where one does not answer."""
+        drives = served_scene().drives
+        port = self._open()
+        answers: dict[int, int] = {}
+        try:
+            dialogues = {node_id: _read(index, node_id, answers.__setitem__) for node_id in drives}
+            hold_dialogues(PumpedNetwork(port), dialogues, timeout_s=1.0, retries=1)
+        finally:
+            port.close()
+        return answers if len(answers) == len(drives) else {}
+
+
+def score_end(fault: ProcessFault, status: int | None, folder: Path) -> list[str]:
+    """Failures in what a master left: its status, `stderr`, and `run/bus.log` and `run/summary.json` in `folder`."""
+    failures = []
+    killed = fault is ProcessFault.MASTER_KILLED
+    if status is not None and not killed and status not in (1, 3):
+        failures.append(f"the master ended with status {status}, expected 1 or 3")
+    errors = (folder / "stderr").read_text(encoding="utf-8", errors="replace")
+    if "Traceback" in errors:
+        failures.append(f"crash: {errors.strip().splitlines()[-1]}")
+    try:
+        if not sum(1 for _ in read_candump(folder / "run" / "bus.log", whole=True)):
+            failures.append("log: bus.log is empty")
+        summary = folder / "run" / "summary.json"
+        if not killed and json.loads(summary.read_text(encoding="utf-8"))["completed"]:
+            failures.append("the summary says that the run was completed")
+    except (CanprobeError, OSError, ValueError) as error:
+        failures.append(f"log: {error}")
+    return failures
+
+
+def _read(index: int, node_id: int, keep: Callable[[int, int], None]) -> Generator[bytes | None, bytes, None]:
+    from canopen.sdo.exceptions import SdoCommunicationError
+
+    try:
+        keep(node_id, int.from_bytes((yield from upload(index, 0)), "little"))
+    except SdoCommunicationError:
+        return
+
+
+def _text_of(state: DriveState, code: int | None) -> str:
+    return f"{state.name} {code:04X}h" if state is DriveState.FAULT and code is not None else state.name
+
+
+def _signed(value: int) -> int:
+    return value - (1 << 32) if value >> 31 else value
+
+
+def link(state: str) -> None:
+    """Take the interface down or up.
+
+    Raises:
+        InterfaceError: the right to do so is missing.
+    """
+    done = subprocess.run(["ip", "link", "set", CHANNEL, state], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise InterfaceError(
+            f"{CHANNEL}: the study takes it down and up, and `ip` says: {done.stderr.strip()}; run the study as root"
+        )

@@ -1,0 +1,244 @@
+"""The methods that the benchmark compares: a class each, and a line in `METHODS`.
+
+A method makes a surface of the contacts of a shape within a budget: the path that a local estimate remembers, the
+radius of a local fit, the number of contacts. All get the same contacts and the same stated noise. What a method
+wants to set it sets on the development shapes (`develop`), before it sees a test shape.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.spatial import cKDTree
+
+from canprobe.cell.tasks.from_plan import make_shape_estimator
+from canprobe.cell.tasks.shape import replay_samples
+from canprobe.lab.studies.harness import Array
+from canprobe.lab.studies.shapes.implicit import ImplicitSurface, Kernel, fit_quadric, rbf, thin_plate
+from canprobe.lab.studies.shapes.scans import Contacts
+from canprobe.mechanics.touch.blend import REACH_M, Feet
+from canprobe.mechanics.touch.surface import SurfaceMatrix
+from canprobe.mechanics.touch.surface_map import SPACING_M, LocalPatch, SurfaceMap, merge_patches
+
+Settings = Mapping[str, float]
+
+
+class Surface(Protocol):
+    """What a method answers with; NaN where it has no surface, farther than `REACH_M` from every contact."""
+
+    def closest(self, points: Array) -> Feet:
+        """Closest points of the surface to points (n, 3) near it; its σ may be left NaN."""
+
+    def sigma(self, points: Array) -> Array:
+        """(n,) standard deviation of the surface's height at points, m."""
+
+    def curvature(self, points: Array) -> Array:
+        """(n, 3, 3) curvature tensors at points, base frame, 1/m."""
+
+
+class Method(Protocol):
+    """A method.
+
+    Attributes:
+        name: in the table.
+        budgets: what it may spend, the least first; `unit` of them.
+    """
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def budgets(self) -> Sequence[float]: ...
+
+    @property
+    def unit(self) -> str: ...
+
+    def develop(self, shapes: Sequence[Contacts]) -> Settings:
+        """Settings from the contacts of the development shapes."""
+
+    def fit(self, contacts: Contacts, budget: float, settings: Settings) -> Surface:
+        """The surface of a shape."""
+
+
+class MapSurface:
+    """The surface of a map of patches; its curvature is that of the nearest patch."""
+
+    def __init__(self, surface_map: SurfaceMap) -> None:
+        self.map = surface_map
+
+    def closest(self, points: Array) -> Feet:
+        """See `Surface`."""
+        return self.map.closest(points)
+
+    def sigma(self, points: Array) -> Array:
+        """See `Surface`."""
+        return self.map.distance(points)[1]
+
+    def curvature(self, points: Array) -> Array:
+        """See `Surface`."""
+        if not len(self.map):
+            return np.full((len(points), 3, 3), math.nan)
+        apart, nearest = cKDTree(self.map.points).query(points)
+        P = np.array([patch.T_base_contact[:3, :2] for patch in self.map])
+        K = np.array([2.0 * patch.S[:2, :2] for patch in self.map])
+        tensors = P @ K @ P.transpose(0, 2, 1)
+        return np.where(np.less(apart, REACH_M)[:, None, None], tensors[nearest], math.nan)
+
+
+@dataclass(frozen=True, slots=True)
+class Online:
+    """An estimator of the package along the path, as it runs in the loop; its answers every 2 mm make a map."""
+
+    method: str
+    patch: bool = False
+    budgets: Sequence[float] = (5.0, 10.0, 20.0, 40.0)
+    unit: str = "mm of path"
+
+    @property
+    def name(self) -> str:
+        """In the table."""
+        return f"{self.method} + patch" if self.patch else self.method
+
+    def develop(self, shapes: Sequence[Contacts]) -> Settings:
+        """Nothing: as packaged."""
+        return {}
+
+    def fit(self, contacts: Contacts, budget: float, settings: Settings) -> MapSurface:
+        """See `Method`."""
+        task = contacts.task
+        assert task.shape is not None
+        task = replace(task, shape=replace(task.shape, memory=1e-3 * budget, patch=self.patch))
+        assert task.scan is not None
+        every = max(1, round(SPACING_M / task.scan.speed * task.array.rate_hz))
+        records = replay_samples(make_shape_estimator(task, self.method), contacts.samples, every)
+        patches = [LocalPatch.of(r.estimate, t_s=r.t_s, travelled_m=r.travelled_m) for r in records]
+        return MapSurface(merge_patches(patches, contacts.touched.points, method=self.name))
+
+
+@dataclass(frozen=True, slots=True)
+class LocalFits:
+    """Least-squares quadrics of all contacts within a radius, whenever they were felt, every 2 mm of path."""
+
+    name: str = "quadrics"
+    budgets: Sequence[float] = (3.0, 4.0, 6.0, 9.0)
+    unit: str = "mm radius"
+
+    def develop(self, shapes: Sequence[Contacts]) -> Settings:
+        """Nothing to set."""
+        return {}
+
+    def fit(self, contacts: Contacts, budget: float, settings: Settings) -> MapSurface:
+        """See `Method`."""
+        p, n, _, _ = contacts.touched
+        travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
+        places = np.unique(np.searchsorted(travelled, np.arange(0.0, travelled[-1], SPACING_M)))
+        patches = []
+        for i, near in zip(places, cKDTree(p).query_ball_point(p[places], 1e-3 * budget), strict=True):
+            j = np.array(near)[n[near] @ n[i] > 0.5]
+            found = fit_quadric(p[i], n[i], contacts.touched.some(j))
+            if found is not None:
+                patches.append(_patch(*found, t_s=contacts.samples[i].t_s, travelled_m=float(travelled[i])))
+        return MapSurface(SurfaceMap(patches=tuple(patches), path=p, method=self.name))
+
+
+def _patch(T: Array, K: Array, covariance: Array, *, t_s: float, travelled_m: float) -> LocalPatch:
+    """A patch of a fitted quadric; c13, c23, c33 are 0 and taken as known."""
+    of = [2, 0, 1, 6, 7, 8]  # height, slopes and K among the entries of S
+    to_S = np.array([1.0, 0.5, 0.5, 0.5, 0.5, 0.5])
+    P = np.zeros((9, 9))
+    P[np.ix_(of, of)] = covariance * np.outer(to_S, to_S)
+    return LocalPatch(
+        T_base_contact=T, S=SurfaceMatrix.from_curvature(K).S, K_covariance=covariance[3:, 3:], S_covariance=P,
+        pose_known=True, observed=np.ones(2), combinations=np.eye(3), t_s=t_s, travelled_m=travelled_m,
+        distance_m=0.0, innovation=1.0,
+    )  # fmt: skip
+
+
+class ProcessSurface:
+    """The zero of a Gaussian process within reach of the contacts."""
+
+    def __init__(self, process: ImplicitSurface, contacts: Array) -> None:
+        self._process = process
+        self._tree = cKDTree(contacts)
+
+    def closest(self, points: Array) -> Feet:
+        """See `Surface`."""
+        f, g = self._process.value(points)
+        size = np.linalg.norm(g, axis=1)
+        height, normal = f / size, g / size[:, None]
+        foot = points - height[:, None] * normal
+        near = np.less(self._tree.query(foot)[0], REACH_M)
+        nowhere = np.where(near, 0.0, math.nan)
+        return Feet(
+            foot + nowhere[:, None],
+            normal + nowhere[:, None],
+            height + nowhere,
+            np.full(len(points), math.nan),
+            near.astype(int),
+        )
+
+    def sigma(self, points: Array) -> Array:
+        """See `Surface`."""
+        sigma: Array = self._process.sigma(points) / np.linalg.norm(self._process.value(points)[1], axis=1)
+        return sigma
+
+    def curvature(self, points: Array) -> Array:
+        """See `Surface`."""
+        return self._process.curvature(points)
+
+
+@dataclass(frozen=True, slots=True)
+class Process:
+    """A Gaussian-process implicit surface with normals, of contacts at equal steps along the path.
+
+    Its parameters have the greatest marginal likelihood on the development shapes, together.
+    """
+
+    name: str
+    kernel: Kernel
+    length: float | None
+    """Held, m; None: found with the scale."""
+    budgets: Sequence[float] = (50, 100, 200, 400)
+    unit: str = "contacts"
+
+    def develop(self, shapes: Sequence[Contacts]) -> Settings:
+        """Scale and length."""
+
+        def cost(x: Array) -> float:
+            settings = dict(zip(("scale", "length"), np.exp(x).tolist(), strict=False))
+            try:
+                return -sum(self._process(shape, 80, settings).log_likelihood for shape in shapes)
+            except np.linalg.LinAlgError:
+                return math.inf
+
+        start = np.log([3e-3, 30e-3][: 2 if self.length is None else 1])
+        found = minimize(cost, start, method="Nelder-Mead", options={"xatol": 0.02, "fatol": 0.5, "maxfev": 80})
+        return dict(zip(("scale", "length"), np.exp(found.x).tolist(), strict=False))
+
+    def fit(self, contacts: Contacts, budget: float, settings: Settings) -> ProcessSurface:
+        """See `Method`."""
+        return ProcessSurface(self._process(contacts, int(budget), settings), contacts.touched.points)
+
+    def _process(self, contacts: Contacts, count: int, settings: Settings) -> ImplicitSurface:
+        i = np.unique(np.linspace(0, len(contacts.samples) - 1, count).round().astype(int))
+        length = settings["length"] if self.length is None else self.length
+        return ImplicitSurface(self.kernel, settings["scale"], length, contacts.touched.some(i))
+
+
+METHODS: tuple[Method, ...] = (
+    Online("chen1996"),
+    Online("chord"),
+    Online("ml"),
+    Online("ml", patch=True),
+    Online("recursive"),
+    Online("recursive", patch=True),
+    LocalFits(),
+    Process("process, RBF", rbf, None),
+    Process("process, thin plate", thin_plate, 0.1),
+)
+"""Every method. `chen1996` and `chord` state no information that could be fused with the patch: they stand alone."""

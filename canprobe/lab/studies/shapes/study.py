@@ -1,0 +1,261 @@
+"""Scores of the methods on the test shapes, each over its budget; table, findings and picture."""
+
+from __future__ import annotations
+
+import math
+import statistics
+import tracemalloc
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from time import process_time
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from canprobe.cell.results.picture import GREEN, INK, METHOD_COLOURS, PINK, SKY, legend, log_scale, picture
+from canprobe.lab.studies.harness import Array, Column, Row, StudyResult, measuring_facts
+from canprobe.lab.studies.shapes.methods import METHODS, Method, Surface
+from canprobe.lab.studies.shapes.scans import (
+    DEVELOPMENT,
+    SECONDS,
+    TEST,
+    Case,
+    Contacts,
+    read_columns,
+    read_contacts,
+    scan,
+    write_contacts,
+)
+from canprobe.lab.studies.sweep import Sweep
+from canprobe.mechanics.touch.meshing import Mesh, mesh_of
+
+FILE = "contacts.npz"
+CELL_M = 1e-3
+"""Of the meshes that are scored."""
+LIMITS_MM = (0.05, 0.1, 0.2, 0.5)
+WORST_M = 1e-3
+"""A larger error counts as this much, and so does truth where a method has no surface."""
+TRUTH_STEP = 2
+"""Every so manyth point of the truth is looked for in the map."""
+TIMED = "free-2"
+"""Shape on which time and memory are measured; a contact costs the same on all."""
+REPEATS, DRAWS = 3, 2000
+_ROOMS = ("touch", "robot", "protocol", "planning", "cell", "session", "tasks", "emulator", "scenes")
+_SCANS = (*_ROOMS, "studies/shapes/scans.py")
+_FITS = ("touch", "tasks", "studies/shapes")
+COLUMNS = (
+    Column("method", "method"),
+    Column("budget", "budget", "g"),
+    Column("unit", "of"),
+    Column("accuracy_um", "acc µm", ".0f"),
+    Column("completeness_um", "compl µm", ".0f"),
+    *(Column(f"f_{limit:g}mm", f"F {limit:g}", ".3f") for limit in LIMITS_MM),
+    Column("normal_mrad", "normal mrad", ".1f"),
+    Column("curvature_per_m", "K 1/m", ".2f"),
+    Column("nll", "NLL", ".2f"),
+    Column("coverage", "cover", ".2f"),
+    Column("cpu_s", "CPU s", ".2f"),
+    Column("memory_mb", "MB", ".1f"),
+)
+
+
+class Fit(NamedTuple):
+    """A method (index in `METHODS`) with settings on a shape of a file of contacts; repeats where it is timed."""
+
+    method: int
+    budget: float
+    settings: Mapping[str, float]
+    shape: str
+    path: str
+    sha256: str
+    repeats: int
+
+
+def run(*, quick: bool, sweep: Sweep) -> StudyResult:
+    """Scan the shapes, fit every method within every budget, and score."""
+    develop, test = (DEVELOPMENT[:1], TEST[:1]) if quick else (DEVELOPMENT, TEST)
+    cases = [Case(name, 1.2 if quick else SECONDS) for name in (*develop, *test)]
+    sweep.say(f"{len(cases)} scans of {cases[0].seconds:g} s")
+    found = sweep.map(scan, cases, model=_SCANS)
+    path = sweep.folder / FILE
+    digest = write_contacts(path, {case.shape: columns for case, columns in zip(cases, found, strict=True)})
+    sweep.say(f"{path}: SHA-256 {digest}")
+    shapes = [read_contacts(path, name) for name in develop]
+    settings = [method.develop(shapes) for method in METHODS]
+
+    def fits(shapes: Sequence[str]) -> list[Fit]:
+        return [
+            Fit(m, budget, settings[m], shape, str(path), digest, 1 if quick else REPEATS)
+            for m, method in enumerate(METHODS)
+            for budget in (method.budgets[1:2] if quick else method.budgets)
+            for shape in shapes
+        ]
+
+    scores = sweep.map(score, fits(test), model=_FITS)
+    timed = fits([TIMED if TIMED in test else test[0]])
+    costs = sweep.time(cost, timed, model=_FITS)
+    each = [scores[k * len(test) : (k + 1) * len(test)] for k in range(len(timed))]
+    rows = [row_of(METHODS[f.method], f.budget, mine) | c for f, mine, c in zip(timed, each, costs, strict=True)]
+    facts = measuring_facts(quick, len(test), _FITS) | {"contacts": digest[:16]}
+    return StudyResult("shapes", COLUMNS, rows, findings(rows, each), facts, partial(draw_shapes, rows))
+
+
+def surface_of(fit: Fit, contacts: Contacts) -> tuple[Surface, Mesh]:
+    """A method's answer and its mesh; the cost of both is what a method costs."""
+    surface = METHODS[fit.method].fit(contacts, fit.budget, fit.settings)
+    return surface, mesh_of(surface.closest, contacts.touched.points[::20], CELL_M)
+
+
+def cost(fit: Fit) -> dict[str, float]:
+    """Processor time from contacts to mesh, median of the repeats, and the most memory that it takes at once."""
+    contacts = read_contacts(Path(fit.path), fit.shape)
+    times = []
+    for _ in range(fit.repeats):
+        begun = process_time()
+        surface_of(fit, contacts)
+        times.append(process_time() - begun)
+    tracemalloc.start()
+    surface_of(fit, contacts)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return {"cpu_s": statistics.median(times), "memory_mb": most / 1e6}
+
+
+def score(fit: Fit) -> dict[str, Any]:
+    """Scores of a method on one shape."""
+    surface, mesh = surface_of(fit, read_contacts(Path(fit.path), fit.shape))
+    return scored(surface, mesh, read_columns(Path(fit.path), fit.shape))
+
+
+def scored(surface: Surface, mesh: Mesh, truth: Mapping[str, Array]) -> dict[str, Any]:
+    """Scores of a surface and its mesh against the columns of the truth; None where there is nothing to score."""
+    points, normals = truth["truth_point"], truth["truth_normal"]
+    tensors = truth["truth_tensor"].reshape(-1, 3, 3)
+    off = np.abs(distance_from(points, normals, tensors, mesh.vertices))
+    use = np.flatnonzero(truth["truth_counts"] > 0.0)[::TRUTH_STEP]
+    feet = surface.closest(points[use])
+    missed = ~np.isfinite(feet.height)
+    away = np.where(missed, math.inf, np.abs(feet.height))
+    hit, found = [[float((e < 1e-3 * limit).mean()) if len(e) else 0.0 for limit in LIMITS_MM] for e in (off, away)]
+    smooth = ~missed & (truth["truth_edge"][use] == 0.0)
+    turned = np.linalg.norm(np.cross(feet.normal[smooth], normals[use][smooth]), axis=1)
+    bent = np.linalg.norm(surface.curvature(points[use][smooth]) - tensors[use][smooth], axis=(1, 2))
+    sigma = surface.sigma(points[use][~missed])
+    known = sigma > 0.0
+    z, sigma_mm = feet.height[~missed][known] / sigma[known], 1e3 * sigma[known]
+    density = 0.5 * z**2 + np.log(sigma_mm) + 0.5 * math.log(2.0 * math.pi)
+    return {
+        "accuracy_um": 1e6 * float(np.minimum(off, WORST_M).mean()) if len(off) else 1e6 * WORST_M,
+        "completeness_um": 1e6 * float(np.minimum(away, WORST_M).mean()),
+        "missed": float(missed.mean()),
+        **{f"f_{limit:g}mm": _harmonic(p, r) for limit, p, r in zip(LIMITS_MM, hit, found, strict=True)},
+        "normal_mrad": 1e3 * _rms(turned),
+        "curvature_per_m": _rms(bent[np.isfinite(bent)]),
+        "nll": float(np.mean(density)) if len(z) else None,
+        "coverage": float(np.mean(np.abs(z) < 1.96)) if len(z) else None,
+    }  # fmt: skip
+
+
+def distance_from(points: Array, normals: Array, tensors: Array, at: Array) -> Array:
+    """(n,) signed distances of places from a surface known at close points: the quadric of the nearest one, m."""
+    nearest = cKDTree(points).query(at)[1] if len(at) else np.zeros(0, np.intp)
+    d = at - points[nearest]
+    up = np.einsum("ij,ij->i", d, normals[nearest])
+    flat = d - up[:, None] * normals[nearest]
+    result: Array = up + 0.5 * np.einsum("ij,ijk,ik->i", flat, tensors[nearest], flat)
+    return result
+
+
+def _harmonic(a: float, b: float) -> float:
+    return 2.0 * a * b / (a + b) if a + b else 0.0
+
+
+def _rms(values: Array) -> float:
+    return math.sqrt(float(np.mean(values**2))) if len(values) else math.nan
+
+
+def row_of(method: Method, budget: float, scores: Sequence[Mapping[str, Any]]) -> Row:
+    """Means over the shapes, each with the interval of 95 % of the draws of shapes."""
+    row: Row = {"method": method.name, "budget": budget, "unit": method.unit}
+    draws = _draws(len(scores))
+    for key in scores[0]:
+        values = np.array([math.nan if one[key] is None else one[key] for one in scores])
+        known = bool(np.isfinite(values).all())
+        low, high = np.quantile(values[draws].mean(axis=1), [0.025, 0.975]) if known else (math.nan, math.nan)
+        row |= {key: float(values.mean()), f"{key}_low": float(low), f"{key}_high": float(high)}
+    return row
+
+
+def _draws(count: int) -> Any:
+    """(DRAWS, count) indices: shapes drawn anew."""
+    return np.random.default_rng(0).integers(count, size=(DRAWS, count))
+
+
+def findings(rows: Sequence[Row], each: Sequence[Sequence[Mapping[str, Any]]]) -> list[str]:
+    """The best of the package against the best of the others, score by score; `each` has the scores of every row."""
+    said = [
+        f"Means over {len(each[0])} test shapes. accuracy: map to truth; completeness: truth in the footprint to map;"
+        f" both mean distances, at most {1e3 * WORST_M:g} mm; NLL: of the height in mm; time and memory on {TIMED}."
+        " Differences with 95 % of the draws of shapes."
+    ]
+    ours = [k for k, row in enumerate(rows) if row["method"].startswith(("ml", "recursive"))]
+    others = [k for k in range(len(rows)) if k not in ours]
+    for key, heading, best in (
+        ("accuracy_um", "accuracy", min), ("completeness_um", "completeness", min), ("f_0.05mm", "F at 0.05 mm", max),
+        ("f_0.1mm", "F at 0.1 mm", max), ("normal_mrad", "normals", min),
+        ("curvature_per_m", "curvature", min), ("nll", "NLL", min),
+    ):  # fmt: skip
+        known = [[k for k in group if not math.isnan(rows[k][key])] for group in (ours, others)]
+        if not all(known):
+            continue
+        i, j = (best(group, key=lambda k: rows[k][key]) for group in known)
+        less = np.array([a[key] - b[key] for a, b in zip(each[i], each[j], strict=True)])
+        low, high = np.quantile(less[_draws(len(less))].mean(axis=1), [0.025, 0.975])
+        who = "baseline" if (less.mean() > 0.0) == (best is min) else "ours"
+        mine, theirs = (
+            f"{r['method']} ({r['budget']:g} {r['unit']}) {r[key]:.3g} in {r['cpu_s']:.2f} s"
+            for r in (rows[i], rows[j])
+        )
+        said.append(
+            f"  {heading}: {who} better: {mine}; {theirs}; difference {less.mean():.2g} ({low:.2g} to {high:.2g})."
+        )
+    return said
+
+
+COLOURS = {**METHOD_COLOURS, "quadrics": GREEN, "process, RBF": PINK, "process, thin plate": INK}
+MARKERS = {"quadrics": "D", "process, RBF": "^", "process, thin plate": "v"}
+PANELS = (
+    ("f_0.1mm", "F-score at 0.1 mm (1 is best)", False),
+    ("accuracy_um", "accuracy: map to truth (µm)", True),
+    ("completeness_um", "completeness: truth to map (µm)", True),
+    ("normal_mrad", "normals, away from edges (mrad)", True),
+    ("curvature_per_m", "curvature, away from edges (1/m)", True),
+    ("coverage", "share of 95 % bands that hold the truth", False),
+)
+
+
+def draw_shapes(rows: Sequence[Row], path: Path) -> None:
+    """Every score over processor time, a curve for each method."""
+    title = (
+        "Surfaces of the same contacts by every method, over the processor time from contacts to mesh: a curve joins\n"
+        "the budgets of a method (5–40 mm of path, 3–9 mm of radius, 50–400 contacts); means over the test shapes"
+    )
+    with picture(path, title, 6.6) as figure:
+        panels = figure.subplots(2, 3, sharex=True)
+        for axes, (key, heading, logarithmic) in zip(panels.flat, PANELS, strict=True):
+            for name in dict.fromkeys(row["method"] for row in rows):
+                mine = [row for row in rows if row["method"] == name and not math.isnan(row[key])]
+                if not mine:
+                    continue
+                x, y = (np.array([row[k] for row in mine]) for k in ("cpu_s", key))
+                own, _, patched = name.partition(" + ")
+                marker = MARKERS.get(own, "s" if patched else "o")
+                style = "--" if patched else "-"
+                axes.plot(x, y, label=name, color=COLOURS.get(own, SKY), marker=marker, markersize=4, linestyle=style)
+            axes.set_title(heading)
+            log_scale(axes, "xy" if logarithmic else "x")
+        for axes in panels[1]:
+            axes.set_xlabel("processor time (s)")
+        legend(figure)

@@ -1,0 +1,167 @@
+"""Study `soak`: memory, clocks and counters of a cell over an hour on a real SocketCAN interface.
+
+The cell is held as `canprobe up` holds it, emulated nodes in a child process, all PDOs on the bus. For a nightly run:
+`canprobe vcan --realtime -- canprobe study soak`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from canprobe.cell.master.controller import Command, Controller, Measurement
+from canprobe.cell.planning.make import make_plan
+from canprobe.cell.results.picture import BLUE, ORANGE, legend, parts, picture
+from canprobe.cell.scene.load import load_scene
+from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.session.children import EmulatorChild
+from canprobe.cell.session.session import Session
+from canprobe.cell.session.target import Target
+from canprobe.cell.session.up import ROWS_OF_UP
+from canprobe.fieldbus.bus.real.socketcan import check_interface
+from canprobe.lab.studies.harness import CHANNEL, Column, Row, StudyResult, measuring_facts
+from canprobe.lab.studies.realtime_cases import PATIENCE, patient, served, with_real_nodes
+from canprobe.lab.studies.sweep import Sweep
+
+HOUR_S = 3600.0
+SAMPLES = 60
+SETTLED = 0.25
+"""Share of the run after which memory should be constant."""
+COLUMNS = (
+    Column("t_s", "t s", ".0f"),
+    Column("master_mib", "master MiB", ".2f"),
+    Column("nodes_mib", "nodes MiB", ".2f"),
+    Column("cycles", "cycles", ".0f"),
+    Column("overruns", "overruns", ".0f"),
+    Column("missed_pdos", "missed", ".0f"),
+    Column("dropped_frames", "dropped", ".0f"),
+    Column("latency_us", "SYNC→last TPDO µs", ".0f"),
+    Column("frames_counted", "frames counted", ".0f"),
+    Column("frames_on_bus", "on the bus", ".0f"),
+)
+
+
+class Soaker(Controller):
+    """Holds the joints, and takes a sample periodically."""
+
+    def __init__(self, session: Session, nodes_pid: int, seconds: float) -> None:
+        self.samples: list[Row] = []
+        self._session, self._nodes_pid, self._seconds = session, nodes_pid, seconds
+        self._next_s = 0.0
+        self._q: Any = None
+        self._first_packets = self._first_counted = 0
+
+    def step(self, measurement: Measurement) -> Command:
+        """One cycle."""
+        if self._q is None:
+            self._q = measurement.q
+        t_s = measurement.t_ns * 1e-9
+        if t_s >= self._next_s:
+            self._next_s += self._seconds / SAMPLES
+            self._look(t_s)
+        return Command(q_target=self._q, done=t_s >= self._seconds)
+
+    def _look(self, t_s: float) -> None:
+        cell = self._session.cell
+        cycle, drives, counters = cell.cycle, cell.drives, cell.counters
+        assert cycle is not None and drives is not None
+        counted, packets = counters.sent + counters.received, packets_on(CHANNEL)
+        if not self.samples:
+            self._first_counted, self._first_packets = counted, packets
+        self.samples.append({
+            "t_s": t_s,
+            "master_mib": resident_mib(os.getpid()),
+            "nodes_mib": resident_mib(self._nodes_pid),
+            "cycles": cycle.number,
+            "overruns": cycle.statistics.overruns,
+            "missed_pdos": drives.missed,
+            "dropped_frames": counters.overruns,
+            "latency_us": drives.answer_ns * 1e-3,
+            "frames_counted": counted - self._first_counted,
+            "frames_on_bus": packets - self._first_packets,
+        })  # fmt: skip
+
+
+def run(*, quick: bool, sweep: Sweep) -> StudyResult:
+    """Hold the cell for an hour, or for ten seconds with `quick`."""
+    check_interface(CHANNEL)
+    seconds = 10.0 if quick else HOUR_S
+    sweep.say(f"hold the cell for {seconds:g} s")
+    rows = soak(seconds)
+    facts = measuring_facts(quick, 1) | {"interface": CHANNEL, "seconds": seconds, **PATIENCE}
+    return StudyResult("soak", COLUMNS, rows, findings(rows), facts, partial(draw_soak, rows))
+
+
+def soak(seconds: float) -> list[Row]:
+    """Hold the cell; a sample every sixtieth of the time."""
+    scene = load_scene("cylinder")
+    scene = Target.over(scene, "socketcan", CHANNEL).applied_to(scene)
+    child = EmulatorChild(make_plan(resolve(scene)), None, (CHANNEL,), truth=False)
+    with served(child):
+        session = Session(with_real_nodes(patient(scene)), rows_kept=ROWS_OF_UP)
+        soaker = Soaker(session, child.pid, seconds)
+        with session:
+            session.run(soaker)
+    return soaker.samples
+
+
+def resident_mib(pid: int) -> float:
+    """Resident memory of a process, MiB."""
+    pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def packets_on(channel: str) -> int:
+    """Frames that the kernel has counted on an interface."""
+    return int(Path(f"/sys/class/net/{channel}/statistics/tx_packets").read_text(encoding="ascii"))
+
+
+def findings(samples: Sequence[Row]) -> list[str]:
+    """Growth of memory, change of latency, frames and cycles."""
+    first, last = samples[0], samples[-1]
+    settled = [s for s in samples if s["t_s"] >= SETTLED * last["t_s"]]
+    tenth = max(1, len(samples) // 10)
+    begin, end = (float(np.median([s["latency_us"] for s in part])) for part in (samples[:tenth], samples[-tenth:]))
+    counted, seen = last["frames_counted"], last["frames_on_bus"]
+    since = {name: last[name] - first[name] for name in ("dropped_frames", "cycles", "overruns", "missed_pdos")}
+    return [
+        f"memory of the master grew by {_growth(settled, 'master_mib'):+.2f} MiB/h, of the nodes by"
+        f" {_growth(settled, 'nodes_mib'):+.2f} MiB/h, after the first quarter",
+        f"SYNC → last TPDO by the kernel's stamps: {begin:.0f} µs in the first tenth, {end:.0f} µs in the last",
+        f"{counted} frames counted by the master, {seen} by the interface in the same time:"
+        f" {seen - counted:+d} under way or lost, {since['dropped_frames']} dropped by the kernel",
+        f"{since['cycles']} cycles, {since['overruns']} overruns, {since['missed_pdos']} PDOs missed",
+    ]
+
+
+def _growth(samples: Sequence[Row], name: str) -> float:
+    """Slope, MiB/h."""
+    if len(samples) < 2:
+        return 0.0
+    t_h = np.array([s["t_s"] for s in samples]) / 3600
+    slope = np.polyfit(t_h, [s[name] for s in samples], 1)[0]
+    return round(float(slope), 2) + 0.0  # no minus zero
+
+
+def draw_soak(samples: Sequence[Row], path: Path) -> None:
+    """Memory, answer latency and overruns over time."""
+    title = f"The cell held for {samples[-1]['t_s']:.0f} s on vcan0: memory, answer time, losses"
+    with picture(path, title, 6.6) as figure:
+        panels = parts(figure, 3, 1)
+        memory, latency, lost = (part.subplots() for part in panels)
+        minutes = [s["t_s"] / 60 for s in samples]
+        memory.plot(minutes, [s["master_mib"] for s in samples], color=BLUE, label="master")
+        memory.plot(minutes, [s["nodes_mib"] for s in samples], "--", color=ORANGE, label="emulated nodes")
+        latency.plot(minutes, [s["latency_us"] for s in samples], ".-", color=BLUE)
+        lost.plot(minutes, [s["overruns"] for s in samples], color=BLUE, label="overruns")
+        lost.plot(minutes, [s["missed_pdos"] for s in samples], "--", color=ORANGE, label="PDOs missed")
+        labels = ("resident\nmemory (MiB)", "SYNC →\nlast TPDO (µs)", "number so far")
+        for axes, part, label in zip((memory, latency, lost), panels, labels, strict=True):
+            axes.set_ylim(bottom=-0.04 * axes.get_ylim()[1])
+            axes.set(xlabel="time (min)", ylabel=label)
+            legend(part)

@@ -1,0 +1,428 @@
+"""One cell of the stability map: the prediction of the linear loop, a short touch in lockstep, and how it ended.
+
+`stable`: it ran to its end. `stopped`: released and stopped, with the reason. `refused`: by the plan, with the reason.
+`hunting`: it ran to its end, but the force did not settle. `failed`: a hang, a NaN, an exception of ours, or a force
+above the limit for longer than the stated reaction time and the retreat.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Container, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from scipy.linalg import expm
+
+from canprobe.cell.master.supervision import Limits, limits_of
+from canprobe.cell.plant.ideal_arm import natural_frequency
+from canprobe.cell.scene.geometry import T_flange_probe, true_object
+from canprobe.cell.scene.load import load_scene
+from canprobe.cell.scene.model import ObjectSettings, PlantSettings, ProbeSettings, Scene, ServoSettings
+from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.session.session import Session
+from canprobe.cell.tasks.from_plan import make_task
+from canprobe.cell.tasks.sensing import ContactSensing
+from canprobe.cell.tasks.touch import TouchTask
+from canprobe.errors import PlanError, SafetyStop
+from canprobe.fieldbus.node.faults import WrappedNode
+from canprobe.fieldbus.node.slave_node import SlaveNode
+from canprobe.fieldbus.protocol.frames import Frame
+from canprobe.lab.studies.fault_scores import RELEASE_NS, Witness, longest_above, reaction_ns, run_to_end
+from canprobe.lab.studies.harness import Array, Row
+from canprobe.mechanics.robot.chain import forward
+from canprobe.mechanics.robot.inverse import inverse_near
+from canprobe.mechanics.robot.model import ArmModel
+from canprobe.mechanics.touch.contact import Slope, indentation_from_force
+from canprobe.mechanics.touch.patch.image_model import make_patch_calibration
+
+
+class LateNode(WrappedNode):
+    """Delays some frames to and from a node, as a bus or a gateway does, in their order; all others pass at once.
+
+    Args:
+        node: the node.
+        late_ids: COB-IDs that come late, both ways.
+        late_ns: by how much.
+    """
+
+    def __init__(self, node: SlaveNode, late_ids: Container[int], late_ns: int) -> None:
+        super().__init__(node)
+        self._late_ids, self._late_ns = late_ids, late_ns
+        self._in: deque[tuple[int, Frame]] = deque()
+        self._out: deque[tuple[int, Frame]] = deque()
+
+    @property
+    def next_deadline_ns(self) -> int | None:
+        """The node's, or that of the next late frame."""
+        due = [queue[0][0] for queue in (self._in, self._out) if queue]
+        own = self.node.next_deadline_ns
+        return min(due if own is None else [*due, own], default=None)
+
+    def start(self, t_ns: int) -> Sequence[Frame]:
+        """Power on."""
+        return self._sent(self.node.start(t_ns), t_ns)
+
+    def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
+        """A frame from the bus, now or later."""
+        if can_id in self._late_ids:
+            self._in.append((t_ns + self._late_ns, (can_id, data)))
+            return ()
+        return self._sent(self.node.receive(can_id, data, t_ns), t_ns)
+
+    def advance(self, t_ns: int) -> Sequence[Frame]:
+        """What is due."""
+        ready: list[Frame] = []
+        while self._out and self._out[0][0] <= t_ns:
+            ready.append(self._out.popleft()[1])
+        while self._in and self._in[0][0] <= t_ns:
+            _, frame = self._in.popleft()
+            ready += self._sent(self.node.receive(*frame, t_ns), t_ns)
+        own = self.node.next_deadline_ns
+        if own is not None and own <= t_ns:
+            ready += self._sent(self.node.advance(t_ns), t_ns)
+        return ready
+
+    def _sent(self, frames: Sequence[Frame], t_ns: int) -> list[Frame]:
+        now: list[Frame] = []
+        for frame in frames:
+            if frame[0] in self._late_ids:
+                self._out.append((t_ns + self._late_ns, frame))
+            else:
+                now.append(frame)
+        return now
+
+
+# The force loop as a linear sampled system.
+#
+# Along the contact's normal, about the wanted indentation, the loop is linear: measured force and wanted force become
+# depths by the same law, so the measured depth is the true one times `g`, the true slope of √F over the depth divided
+# by the slope that the controller assumes. With heights outward, 0 on the object, `a` of the servo's surface model and
+# `p` of the probe's tip less the wanted indentation:
+#
+#     a ← (1 − H) a + H (1 − g) p of the sample's instant,   H = 1 − exp(−2π height_hz dt)
+#
+# `p` follows `a` as in the cycle: a target is latched at the SYNC after the cycle that made it and reached by a ramp at
+# the next, with the second-order drive behind; an image is sampled at a trigger, sent at the next one and received a
+# cycle later. Frames that are late by more than a period delay both by whole cycles. The state's map over one period of
+# the sensor is one matrix. The model ends where contact is lost, at encoder counts and joint limits, where the array is
+# saturated, and while the stiffness is being estimated. Damping of the layer (Hunt–Crossley) is left out.
+
+
+@dataclass(frozen=True, slots=True)
+class ForceLoop:
+    """Parameters of the linear force loop.
+
+    Attributes:
+        depth_ratio: g, measured over true depth.
+        period_s: of the cycle.
+        sample_cycles: cycles between two tactile images.
+        height_hz: bandwidth of the surface's height correction, the force gain.
+        late_s: delay of targets and tactile frames on the bus.
+        omega: undamped frequency of the drives, rad/s.
+        damping: their damping ratio.
+    """
+
+    depth_ratio: float
+    period_s: float
+    sample_cycles: int
+    height_hz: float
+    late_s: float
+    omega: float
+    damping: float = 1.0
+
+    @property
+    def late_cycles(self) -> int:
+        """Whole cycles of the delay."""
+        return math.floor(self.late_s / self.period_s + 1e-9)
+
+
+@lru_cache(maxsize=64)
+def drive_step(period_s: float, omega: float, damping: float) -> Array:
+    """Map (3, 4) of position, rate, reference and the target that is latched to the first three a cycle later."""
+    rates = np.zeros((4, 4))  # of position, rate, reference, slope
+    rates[0, 1] = 1.0
+    rates[1, :3] = -omega * omega, -2.0 * damping * omega, omega * omega
+    rates[2, 3] = 1.0
+    ramp = np.eye(4)
+    ramp[3] = 0.0, 0.0, -1.0 / period_s, 1.0 / period_s
+    step: Array = (expm(rates * period_s) @ ramp)[:3]
+    step.flags.writeable = False
+    return step
+
+
+def sample_map(loop: ForceLoop) -> Array:
+    """Map of the whole state over one period of the sensor.
+
+    The state at a SYNC: position, rate, reference, a, the last targets, newest first, and the positions at the SYNCs
+    before, newest first.
+    """
+    drive = drive_step(loop.period_s, loop.omega, loop.damping)
+    delay = 1 + loop.late_cycles
+    oldest = delay + loop.sample_cycles
+    size = 4 + delay + oldest
+    share = 1.0 - math.exp(-2.0 * math.pi * loop.height_hz * loop.sample_cycles * loop.period_s)
+    whole = np.eye(size)
+    for cycle in range(loop.sample_cycles):
+        sense = np.eye(size)
+        if (cycle - delay) % loop.sample_cycles == 0:
+            sense[3, 3] = 1.0 - share
+            sense[3, 4 + delay + oldest - 1] = share * (1.0 - loop.depth_ratio)
+        move = np.zeros((size, size))
+        move[:3, :3] = drive[:, :3]
+        move[:3, 4 + delay - 1] = drive[:, 3]  # the target that is latched now
+        move[3, 3] = move[4, 3] = 1.0  # this cycle's target is a
+        for i in range(1, delay):
+            move[4 + i, 4 + i - 1] = 1.0
+        move[4 + delay, 0] = 1.0
+        for i in range(1, oldest):
+            move[4 + delay + i, 4 + delay + i - 1] = 1.0
+        whole = move @ sense @ whole
+    return whole
+
+
+def spectral_radius(loop: ForceLoop) -> float:
+    """Largest modulus of the eigenvalues over one period of the sensor; below 1 the force settles."""
+    return float(np.abs(np.linalg.eigvals(sample_map(loop))).max())
+
+
+# A short touch in lockstep, watched by a witness.
+
+LOOK_NS = 1_250_000
+HUNTING = 0.2
+"""Standard deviation of the force over the second half of the hold, over the target, above which it did not settle."""
+SENSOR_HZ = 200.0
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """A cell of the map.
+
+    Attributes:
+        view: part of the map.
+        contact_n_m: stiffness dF/dδ of the contact at the wanted force, N/m.
+        rate_hz: of the servo.
+        late_ms: delay of targets and tactile frames.
+        height_hz: the force gain.
+        feels: the servo estimates the stiffness from the touch; else it uses that of the default pad.
+        bandwidth_hz: of the drives.
+        fidelity: of the plant.
+        probe_mm: radius of the probe.
+        kind, radius_mm: of the object.
+        speed_mm_s: of a scan; 0 presses.
+        at_mm: where the object is touched, base frame.
+        normal: outward normal there.
+        posture_deg: selects the branch of the inverse kinematics.
+        force_n: target.
+        hold_s: of the press or scan.
+    """
+
+    view: str
+    contact_n_m: float
+    rate_hz: float = 400.0
+    late_ms: float = 0.0
+    height_hz: float = 8.0
+    feels: bool = True
+    bandwidth_hz: float = 30.0
+    fidelity: str = "ideal"
+    probe_mm: float = 40.0
+    kind: str = "cylinder"
+    radius_mm: float = 36.0
+    speed_mm_s: float = 0.0
+    at_mm: tuple[float, float, float] = (-120.0, -122.5, 374.0)
+    normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    posture_deg: tuple[float, ...] = (90.0, 65.0, 15.0, 0.0, 100.0, 0.0)
+    force_n: float = 2.0
+    hold_s: float = 0.4
+
+
+class StatedSensing(ContactSensing):
+    """Uses the stiffness of the scene, not the one estimated from the touch."""
+
+    def set_slope(self, slope: Slope) -> None:
+        """Ignore it."""
+
+
+def layer_stiffness(case: Case) -> float:
+    """K/h (N/m³) that gives the contact its stiffness at the wanted force: `dF/dδ = 2F/δ`."""
+    depth = 2.0 * case.force_n / case.contact_n_m
+    return float(indentation_from_force(case.force_n, 1.0, case.probe_mm * 1e-3, _kappa(case)) / depth) ** 2
+
+
+def _kappa(case: Case) -> Array:
+    place = true_object(_object(case))
+    return np.maximum(place.closest(np.array(case.at_mm) * 1e-3).kappa, -0.9e3 / case.probe_mm)
+
+
+def _object(case: Case) -> ObjectSettings:
+    radius = None if case.kind == "plane" else case.radius_mm
+    return ObjectSettings(kind=case.kind, radius_mm=radius, position_mm=case.at_mm, rotation_deg=upright(case.normal))  # type: ignore[arg-type]
+
+
+def arm_of(scene: Scene) -> ArmModel:
+    """The arm of a scene that has one."""
+    arm = resolve(scene).arm
+    assert arm is not None
+    return arm.model
+
+
+def touch_in_posture(
+    posture_deg: tuple[float, ...], above_mm: float = 10.0
+) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, ...]]:
+    """A touch with the pole of the default probe and these joint angles, deg.
+
+    Returns:
+        Where it is, mm; the outward normal there; joint angles (n,) so far above it, deg.
+    """
+    model, probe = arm_of(load_scene("press")), ProbeSettings()
+    q = np.radians(posture_deg)
+    T_flange_centre = T_flange_probe(probe)
+    T = forward(model.chain, q) @ T_flange_centre
+    pole = T[:3, 2]
+    above = T.copy()
+    above[:3, 3] -= above_mm * 1e-3 * pole
+    away = np.degrees(inverse_near(model, above, T_flange_centre, q))
+    at = 1e3 * T[:3, 3] + probe.radius_mm * pole
+    x, y, z = (float(value) for value in at)
+    nx, ny, nz = (-float(value) for value in pole)
+    return (x, y, z), (nx, ny, nz), tuple(float(angle) for angle in away)
+
+
+def upright(normal: tuple[float, float, float], yaw_deg: float = 20.0) -> tuple[float, float, float]:
+    """Roll, pitch and yaw, deg, of an object whose z is a unit normal."""
+    yaw = math.radians(yaw_deg)
+    x = math.cos(yaw) * normal[0] + math.sin(yaw) * normal[1]
+    y = math.cos(yaw) * normal[1] - math.sin(yaw) * normal[0]
+    return math.degrees(-math.asin(y)), math.degrees(math.atan2(x, normal[2])), yaw_deg
+
+
+def full_scale_kpa(case: Case, stiffness: float) -> float:
+    """Full scale of the array, kPa: the larger one where the wanted force would saturate the other, as in `steel`."""
+    peak_pa = stiffness * 2.0 * case.force_n / case.contact_n_m
+    return 100.0 if peak_pa < 80e3 else 300.0
+
+
+def scene_of(case: Case) -> Scene:
+    """The scene of a case; its layer may be harder and its radii larger than a scene file allows."""
+    scene = load_scene("press" if case.speed_mm_s == 0.0 else "cylinder", {"task.duration_s": case.hold_s})
+    assert scene.arm is not None and scene.sensor is not None and scene.probe is not None
+    stiffness = layer_stiffness(case)
+    task = replace(scene.task, clearance_mm=0.5, force_n=case.force_n, start_mm=case.at_mm, approach_normal=case.normal)
+    if case.speed_mm_s > 0.0:
+        task = replace(task, speed_mm_s=case.speed_mm_s, regain_mm=0.0)
+    return replace(
+        scene,
+        bus=replace(scene.bus, timed=False),
+        cycle=replace(scene.cycle, rate_hz=case.rate_hz),
+        limits=replace(scene.limits, joint_margin_deg=0.5),
+        joints={
+            name: replace(joint, start_deg=start)
+            for (name, joint), start in zip(scene.joints.items(), case.posture_deg, strict=True)
+        },
+        sensor=replace(
+            scene.sensor,
+            rate_hz=min(SENSOR_HZ, case.rate_hz),
+            mode="features",
+            full_scale_kpa=full_scale_kpa(case, stiffness),
+        ),
+        probe=replace(scene.probe, radius_mm=case.probe_mm),
+        object=_object(case),
+        servo=replace(scene.servo or ServoSettings(), surface_height_hz=case.height_hz),
+        plant=replace(
+            scene.plant or PlantSettings(),
+            stiffness_n_m3=stiffness,
+            drive_bandwidth_hz=case.bandwidth_hz,
+            fidelity=case.fidelity,  # type: ignore[arg-type]
+        ),
+        shape=replace(scene.shape, also=(), patch=False) if scene.shape is not None and case.speed_mm_s > 0 else None,
+        task=task,
+    )
+
+
+def loop_of(case: Case) -> ForceLoop:
+    """The linear loop of a case, with the servo's final stiffness."""
+    scene = scene_of(case)
+    assert scene.probe is not None
+    radius, kappa = case.probe_mm * 1e-3, _kappa(case)
+    slope = 1.0 / float(indentation_from_force(1.0, layer_stiffness(case), radius, kappa))
+    told = 1.0 / stated_sensing(scene, ContactSensing).depth(1.0)
+    if case.feels:
+        sensing = stated_sensing(scene, ContactSensing)
+        sensing.set_slope(Slope(slope, 0.0))
+        told = 1.0 / sensing.depth(1.0)
+    return ForceLoop(
+        depth_ratio=slope / told,
+        period_s=1.0 / case.rate_hz,
+        sample_cycles=max(1, round(case.rate_hz / SENSOR_HZ)),
+        height_hz=case.height_hz,
+        late_s=case.late_ms * 1e-3,
+        omega=natural_frequency(case.bandwidth_hz, 1.0),
+    )
+
+
+def stated_sensing(scene: Scene, kind: type[ContactSensing] = StatedSensing) -> ContactSensing:
+    """The scene's sensing, of another kind."""
+    setup = resolve(scene)
+    assert setup.arm is not None and setup.array is not None
+    array, probe = setup.array, setup.probe
+    patch = make_patch_calibration(array.calibration, array.pad)
+    return kind(setup.arm.model, probe.T_flange_probe, patch, probe.radius, probe.stiffness)
+
+
+def carry_out(case: Case) -> Row:
+    """Run a case to its end: `ended`, `reason` and figures of the force; None where there are none."""
+    names = ("force_max_n", "above_ms", "allowed_ms", "error_percent", "spread_percent")
+    try:
+        session = Session(scene_of(case))
+        world = session.world
+    except PlanError as refusal:
+        return {"ended": "refused", "reason": str(refusal).splitlines()[0], **dict.fromkeys(names)}
+    task, limits = make_task(session.plan), limits_of(session.plan)
+    assert isinstance(task, TouchTask)
+    if not case.feels:
+        task.sensing = stated_sensing(session.plan.scene)
+    witness = Witness(world.plant, LOOK_NS)
+    if case.late_ms > 0.0:
+        assert session.scene.sensor is not None
+        late_ids = {pdo.cob_id for pdo in session.plan.pdos if pdo.direction == "rpdo"}
+        late_ids |= {pdo.cob_id for pdo in session.plan.pdos_of(session.scene.sensor.node_id, "tpdo")}
+        late = [LateNode(node, late_ids, round(case.late_ms * 1e6)) for node in world.nodes]
+        world.participants[: len(late)] = late
+    world.participants.insert(0, witness)
+    outcome, error = run_to_end(session, task)
+    ended = {"completed": "stable", "hang": "failed", "crash": "failed"}.get(outcome, "stopped")
+    plain = error is None or isinstance(error, SafetyStop)
+    reason = str(error or "") if plain else f"{type(error).__name__}: {error}"
+    force_error, spread = error_and_spread(session, task, case.force_n)
+    forces = np.array([force for _, force in witness.rows])
+    above_ns, allowed_ns = longest_above(witness.rows, limits.safety.force_max), allowed_above(limits, case.late_ms)
+    if not np.isfinite(forces).all():
+        ended, reason = "failed", "the force is not finite"
+    elif above_ns > allowed_ns:
+        ended, reason = "failed", f"force above the limit for {above_ns * 1e-6:.0f} ms; ended: {reason}"
+    elif ended == "stable" and not (spread is not None and spread <= 100.0 * HUNTING):
+        ended = "hunting"
+    figures = (float(forces.max()), above_ns * 1e-6, allowed_ns * 1e-6, force_error, spread)
+    return {"ended": ended, "reason": reason, **dict(zip(names, figures, strict=True))}
+
+
+def error_and_spread(session: Session, task: TouchTask, force_n: float) -> tuple[float | None, float | None]:
+    """RMS error and standard deviation of the true force, second half of the hold, percent of the target."""
+    cycles, truth = task.scan_cycles, session.truth
+    if cycles is None or "force" not in truth:
+        return None, None
+    half = truth["force"][(cycles[0] + cycles[1]) // 2 : cycles[1]] / force_n
+    if not half.size:
+        return None, None
+    return 100.0 * float(np.sqrt(np.mean((half - 1.0) ** 2))), 100.0 * float(np.std(half))
+
+
+def allowed_above(limits: Limits, late_ms: float) -> int:
+    """Longest time that a force may be above the limit, ns.
+
+    The stated reaction, by the force or by an array that hides it, the delay on the bus both ways, and the retreat.
+    """
+    late = 2 * math.ceil(late_ms * 1e6 / limits.period_ns) * limits.period_ns
+    return max(reaction_ns("force", limits), reaction_ns("force_hidden", limits)) + late + RELEASE_NS

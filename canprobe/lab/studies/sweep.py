@@ -1,0 +1,326 @@
+"""Sweeps: many independent cells on all cores or on a cluster; finished cells are kept, a new start computes the rest.
+
+A study is a module with `run(*, quick, sweep) -> StudyResult`. It names a function of the module that measures one cell
+and the cells; the sweep does the rest:
+
+    @dataclass(frozen=True, slots=True)
+    class Case:
+        stiffness: float
+        rate_hz: int
+        seeds: int
+
+    def measure(case: Case) -> dict[str, Any]:
+        return {"error": ...}                                  # plain numbers, text, lists, mappings, arrays
+
+    def run(*, quick: bool, sweep: Sweep) -> StudyResult:
+        cases = [Case(k, 400, 4 if quick else 40) for k in STIFFNESSES]
+        answers = sweep.map(measure, cases, model=("touch", "emulator", "studies/my_study.py"))
+        costs = sweep.time(measure_cost, settings)             # one at a time, alone, on this machine
+        ...
+        return StudyResult("my_study", COLUMNS, rows, findings(rows), measuring_facts(quick, 40), partial(draw, rows))
+
+Answers come back in the order of the cells and as JSON gives them, whether they were computed now or earlier: tuples
+and arrays are lists, keys of mappings are text. The cell holds all that decides an answer (parameters, seeds). `model`
+names the files and folders of the package that it rests on (all of it by default): when one of them changes, its cells
+are computed again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import json
+import multiprocessing
+import os
+import platform
+import re
+import signal
+import sys
+import traceback
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import AbstractContextManager, contextmanager
+from functools import partial
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from time import perf_counter
+from types import MappingProxyType, ModuleType
+from typing import Any
+
+from canprobe.cell.session.children import end_with_parent
+from canprobe.cell.session.terminal import Progress
+from canprobe.errors import StudyError, UsageError, install_line
+from canprobe.fieldbus.bus.real.processor import BLAS_THREADS
+from canprobe.lab.studies.harness import CellStore, Say, StudyResult, as_json, cell_key, model_digest
+
+# Where cells are computed: a pool of processes on this machine, or the workers of a Dask cluster.
+
+_DASK_WAIT = "10s"
+_GRACE_S = 1.0
+"""For workers to end by themselves: a run catches SIGTERM, stops, and its worker continues."""
+
+
+@contextlib.contextmanager
+def process_pool(workers: int | None = None) -> Iterator[Executor]:
+    """A pool of processes with one BLAS thread each, ended with the block; an exception ends it at once.
+
+    Workers ignore Ctrl-C: this process decides. They end when this process is killed.
+
+    Args:
+        workers: number of processes; one for each core that this process may use by default.
+    """
+    before = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(
+        workers or len(os.sched_getaffinity(0)),
+        multiprocessing.get_context("spawn"),
+        initializer=end_with_parent,
+        initargs=(os.getpid(), signal.SIGKILL),  # nothing in a worker moves, and whatever it does cannot ignore that
+    )
+    try:
+        with _one_blas_thread():  # workers start when cells are submitted
+            yield _Deaf(pool)
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        _end(set(multiprocessing.active_children()) - before)
+        raise
+    finally:
+        pool.shutdown()
+
+
+@contextlib.contextmanager
+def dask_executor(address: str) -> Iterator[Executor]:
+    """The workers of a Dask cluster; they need the same canprobe.
+
+    Args:
+        address: of the scheduler, such as "tcp://10.0.0.1:8786".
+
+    Raises:
+        UsageError: package `distributed` is missing.
+        StudyError: not an address, or no scheduler answers.
+    """
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise UsageError(f"a Dask cluster needs the package distributed: {install_line('dask')}") from error
+    if not re.search(r":[0-9]+$", address):  # a Client that fails at once takes twenty seconds to end
+        raise StudyError(f"Dask scheduler {address}: expected its address and port, as tcp://10.0.0.1:8786")
+    try:
+        client = Client(address, timeout=_DASK_WAIT, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise StudyError(f"Dask scheduler {address}: expected it there, got: {error}") from error
+    executor = client.get_executor(pure=False)
+    try:
+        yield executor
+        executor.shutdown()
+    finally:
+        client.close()  # cancels what is under way
+
+
+class _Deaf(Executor):
+    """Submits with SIGINT blocked: workers inherit that from their first instruction on.
+
+    A worker that is started then does not import the script that starts it, which would start its sweep again; cells
+    are measured by functions of modules.
+    """
+
+    def __init__(self, pool: ProcessPoolExecutor) -> None:
+        self._pool = pool
+
+    def submit(self, fn, /, *args, **kwargs):  # type: ignore[no-untyped-def]  # as its base has it
+        """See `Executor.submit`."""
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        script, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
+        try:
+            return self._pool.submit(fn, *args, **kwargs)
+        finally:
+            sys.modules["__main__"] = script
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _end(workers: Collection[BaseProcess]) -> None:
+    for worker in workers:
+        worker.terminate()
+    until = perf_counter() + _GRACE_S
+    for worker in workers:
+        worker.join(max(until - perf_counter(), 0.0))
+        worker.kill()
+        worker.join()
+
+
+@contextlib.contextmanager
+def _one_blas_thread() -> Iterator[None]:
+    before = {name: os.environ[name] for name in BLAS_THREADS if name in os.environ}
+    os.environ.update(dict.fromkeys(BLAS_THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name in BLAS_THREADS:
+            del os.environ[name]
+        os.environ.update(before)
+
+
+Opener = Callable[[], AbstractContextManager[Executor]]
+
+
+class Sweep:
+    """How a study's cells are computed, and where they are kept.
+
+    Args:
+        executor: opens any `concurrent.futures` executor; called when there is something to compute.
+        store: finished cells.
+        say: called with each step.
+        progress: called after each cell.
+
+    Attributes:
+        folder: of the store, for what a study publishes besides its table.
+    """
+
+    def __init__(self, executor: Opener, store: CellStore, *, say: Say, progress: Progress | None = None) -> None:
+        self.say = say
+        self.folder = store.path.parent
+        self._executor, self._store, self._progress = executor, store, progress
+        if store.damaged:
+            say(f"{store.path}: {store.damaged} damaged lines left out; their cells are computed again")
+
+    def map(self, measure: Callable[[Any], object], cells: Sequence[Any], *, model: Sequence[str] = ()) -> list[Any]:
+        """Answers of `measure` to cells, in their order.
+
+        Args:
+            measure: a function of a module, of one cell; its answer has a JSON form.
+            cells: dataclasses or whatever else has a JSON form.
+            model: files and folders of the package that the answers rest on; all by default.
+
+        Raises:
+            StudyError: a cell or a worker failed; the cells that are finished by then are kept.
+        """
+        return self._all(measure, cells, tuple(model), None)
+
+    def time(self, measure: Callable[[Any], object], cells: Sequence[Any], *, model: Sequence[str] = ()) -> list[Any]:
+        """The same for cells that measure run time: one after another, alone, in one process of this machine.
+
+        A kept answer counts on the machine that measured it only.
+        """
+        return self._all(measure, cells, tuple(model), f"{platform.node()} {platform.processor()}")
+
+    def _all(
+        self, measure: Callable[[Any], object], cells: Sequence[Any], parts: tuple[str, ...], machine: str | None
+    ) -> list[Any]:
+        name, model = f"{measure.__module__}:{measure.__qualname__}", model_digest(parts)
+        keys = [cell_key(name, [cell, machine] if machine else cell, model) for cell in cells]
+        todo = {key: cell for key, cell in zip(keys, cells, strict=True) if self._store.get(key) is None}
+        total = len(set(keys))
+        done = total - len(todo)
+        if done:
+            self.say(f"{done} of {total} cells are kept in {self._store.path}")
+
+        def keep(key: str, answer: str) -> None:
+            self._store.put(key, {"measure": name, "cell": todo[key], "model": model, "machine": machine}, answer)
+            if self._progress is not None:
+                self._progress(total - len(todo.keys() - self._store.keys()), total)
+
+        if todo:
+            with self._executor() if machine is None else process_pool(1) as executor:
+                for batch in [todo] if machine is None else [{key: cell} for key, cell in todo.items()]:
+                    _collect(executor, partial(_compute, measure, parts, model), batch, keep)
+        return [json.loads(self._store.get(key) or "null") for key in keys]
+
+
+@contextmanager
+def open_sweep(
+    folder: Path, *, workers: int | None = None, dask: str | None = None, fresh: bool = False, **watched: Any
+) -> Iterator[Sweep]:
+    """A sweep over the processes of this machine, or a Dask cluster, that keeps its cells in a folder.
+
+    Args:
+        folder: for `cells.jsonl`; what it holds is not computed again.
+        workers: number of processes, one for each core by default.
+        dask: address of a Dask scheduler to use instead.
+        fresh: forget what the folder holds.
+        watched: `say` and `progress` of the sweep.
+
+    Raises:
+        StudyError: another process uses the folder.
+    """
+    store = CellStore(folder, fresh=fresh)
+    try:
+        yield Sweep(partial(dask_executor, dask) if dask else partial(process_pool, workers), store, **watched)
+    finally:
+        store.close()
+
+
+def _compute(measure: Callable[[Any], object], parts: tuple[str, ...], model: str, cell: Any) -> tuple[bool, str]:
+    """In the worker: success, and the answer or the error as text. Not every exception can be pickled."""
+    try:
+        if (here := model_digest(parts)) != model:
+            return False, f"the worker on {platform.node()} has another canprobe or numpy (model {here}, not {model})"
+        return True, as_json(measure(cell))
+    except Exception as error:  # raised again in the main process
+        return False, error_text(error)
+
+
+def error_text(error: Exception) -> str:
+    """What was raised, and where, in a line."""
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__}: {error} ({Path(frame.filename).name}:{frame.lineno})"
+
+
+def _collect(
+    executor: Executor,
+    task: Callable[[Any], tuple[bool, str]],
+    cells: Mapping[str, Any],
+    keep: Callable[[str, str], None],
+) -> None:
+    """Compute cells and keep the answers as they come, also those that are ready when an exception ends it."""
+    futures = {executor.submit(task, cell): key for key, cell in cells.items()}
+    left = set(futures)
+    try:
+        for future in as_completed(futures):
+            keep(futures[future], _answer(future, cells[futures[future]]))
+            left.discard(future)
+    except BaseException:
+        for future in left:
+            if future.done() and not future.cancelled() and future.exception() is None and future.result()[0]:
+                keep(futures[future], future.result()[1])
+        raise
+
+
+def _answer(future: Future[tuple[bool, str]], cell: Any) -> str:
+    try:
+        well, text = future.result()
+    except BrokenProcessPool as error:
+        raise StudyError("a worker was killed; start the study again to compute what is left") from error
+    if not well:
+        raise StudyError(f"cell {as_json(cell)}: {text}")
+    return text
+
+
+STUDIES: Mapping[str, str] = MappingProxyType(
+    {
+        "estimators": "error of the shape estimators against their run time, with the Cramér–Rao bound",
+        "bound": "error and coverage of the estimators over the Cramér–Rao bound: surfaces, sizes, paths and noise",
+        "arrays": "how well forty touches calibrate an emulated array that nobody has seen",
+        "regions": "whether the online estimator's 95 % regions hold the truth, over packaged and random scenes",
+        "shapes": "surfaces of unknown shapes by every estimator, by local fits and by Gaussian processes",
+        "workprec": "error of the dynamic plant against its run time, and of the whole cell against its computing time",
+        "stability": "where the force loop settles, predicted and carried out, and how every other touch ends",
+        "realtime": "how well the cycle keeps time on a real vcan0, against plain canopen-python; needs that interface",
+        "soak": "an hour on a real vcan0: memory, clocks and counters; needs that interface",
+        "faults": "how the cell reacts to thousands of random faults of its nodes and their links",
+    }
+)
+"""Name → what it measures. The module of that name in this package has `run(*, quick, sweep) -> StudyResult`."""
+
+
+def run_study(name: str, *, quick: bool, sweep: Sweep, vcan: bool = False) -> StudyResult:
+    """Run a study.
+
+    Args:
+        name: one of `STUDIES`.
+        quick: fewer repeats and cases.
+        sweep: computes its cells.
+        vcan: its form with processes on a real vcan0, which `faults` has.
+    """
+    module = importlib.import_module(f"canprobe.lab.studies.{name}_vcan" if vcan else f"canprobe.lab.studies.{name}")
+    result: StudyResult = module.run(quick=quick, sweep=sweep)
+    return result

@@ -1,0 +1,368 @@
+"""The other half of study `workprec`: error of the whole cell against its computing time.
+
+Each cell of the sweep is a scan of scene `cylinder` in lockstep: master, bus, emulated nodes and plant in one process.
+Its cost is processor time per second of the scan; its errors are those of the estimated surface (curvature, normal) and
+of the true force. What the plan refuses is a row with its reason, and is tried again with CAN FD for the taxels. The
+drives use classical frames all the same: rates beyond a bus of 1 Mbit/s are scanned on a bus of 8 Mbit/s, which no CAN
+has, for the effect of the rate alone.
+
+The knee is the cheapest combination on a classical bus whose errors are all small enough (`ENOUGH`) and whose servo
+holds the stiffest contact of the cell, 40 kN/m, in a scan of its own. There is one scan for each combination: two with
+different noise differ by some tenths of their errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+from pathlib import Path
+from time import process_time
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+
+from canprobe.api import run as run_scene
+from canprobe.cell.planning.make import make_plan
+from canprobe.cell.results.picture import FAINT, INK, METHOD_COLOURS, legend, log_scale, picture
+from canprobe.cell.scene.load import load_scene
+from canprobe.cell.scene.model import PlantSettings, Scene
+from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.tasks.probing import Phase
+from canprobe.errors import PlanError, SafetyStop
+from canprobe.lab.studies.harness import Column, Row, StudyResult, measuring_facts, on_any_bitrate
+from canprobe.lab.studies.sweep import Sweep
+from canprobe.mechanics.touch.estimate.fit import METHODS
+
+RATES_HZ = (100.0, 200.0, 400.0, 500.0, 1000.0, 2000.0)
+MODES = ("features", "window", "image")
+FIDELITIES = ("ideal", "dynamic")
+SENSOR_HZ = {500.0: 250.0}
+"""Rate of the tactile frames where 200 Hz does not divide the servo's."""
+ENOUGH = {"curvature_percent": 2.0, "normal_deg": 0.2, "force_percent": 6.0}
+"""Small enough errors: the goal of the servo's force at 25 mm/s; shape and normal assumed."""
+MEASURES = tuple(ENOUGH)
+CLASSICAL, FD, FASTER = "classical", "FD", "8 Mbit/s"
+REAL = (CLASSICAL, FD)
+FASTER_BITRATE = 8_000_000
+STIFF_N_M3, STIFF_FORCE_PERCENT = 1.27e8 * (40.0 / 9.4) ** 2, 20.0
+"""Layer of a contact of 40 kN/m at 2 N, and the force error that is small enough there."""
+COLUMNS = (
+    Column("rate_hz", "servo Hz", ".0f"),
+    Column("mode", "sensor"),
+    Column("bus", "bus"),
+    Column("method", "estimator"),
+    Column("fidelity", "plant"),
+    Column("cost_ms_per_s", "ms a second", ".0f"),
+    Column("curvature_percent", "curvature %", ".1f"),
+    Column("normal_deg", "normal deg", ".2f"),
+    Column("force_percent", "force %", ".1f"),
+    Column("stiff", "40 kN/m"),
+    Column("ended", "ended"),
+    Column("reason", "why"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """Rate, mode of the sensor and bus."""
+
+    rate_hz: float
+    mode: str
+    bus: str
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One scan."""
+
+    setting: Setting
+    method: str
+    fidelity: str
+    duration_s: float
+    seed: int
+    stiffness_n_m3: float | None = None
+
+
+def run_cell(*, quick: bool, sweep: Sweep) -> StudyResult:
+    """Plan every setting, and scan with those that fit, one scan at a time."""
+    rates, modes = ((200.0, 500.0), MODES[1:2]) if quick else (RATES_HZ, MODES)
+    methods = ("recursive",) if quick else METHODS
+    why: dict[Setting, str | None] = {}
+    for bus in (*REAL, FASTER):
+        asked = [
+            Setting(rate, mode, bus)
+            for rate, mode in product(rates, modes)
+            if all(why.get(Setting(rate, mode, other), "not asked") is not None for other in REAL)
+            and (bus in REAL or mode != "image")
+        ]
+        why |= dict(zip(asked, sweep.map(refusal, asked), strict=True))
+    fits = [s for s, reason in why.items() if reason is None]
+    duration = 1.0 if quick else 2.0
+    todo = [
+        Case(s, method, fidelity, duration, 1)
+        for s, method, fidelity in product(fits, methods, FIDELITIES)
+        if s.bus in REAL or method == "recursive"
+    ]
+    sweep.say(f"{len(todo)} scans, timed one after another; {len(why) - len(fits)} settings are refused by the plan")
+    answers = dict(zip(todo, sweep.time(measure, todo), strict=True))
+    stiff = [Case(s, "recursive", "ideal", duration, 1, STIFF_N_M3) for s in fits]
+    held = {case.setting: holds(answer) for case, answer in zip(stiff, sweep.map(measure, stiff), strict=True)}
+    rows = [_row(case, answer) | {"stiff": held[case.setting]} for case, answer in answers.items()]
+    rows += [
+        {**_named(s), "method": "any", "fidelity": "any", "ended": "refused", "reason": reason}
+        for s, reason in why.items()
+        if reason is not None
+    ]
+
+    return StudyResult(
+        "workprec_cell", COLUMNS, rows, findings(rows), measuring_facts(quick, 1), partial(draw_cell, rows)
+    )
+
+
+def scene_of(setting: Setting) -> Scene:
+    """The scene with the default estimator and plant."""
+    scene = load_scene("cylinder")
+    assert scene.sensor is not None and scene.shape is not None
+    rate = setting.rate_hz
+    eds = "tactile_array_fd.eds" if setting.bus == FD else scene.sensor.eds
+    sensor = replace(scene.sensor, mode=setting.mode, rate_hz=SENSOR_HZ.get(rate, min(rate, 200.0)), eds=eds)  # type: ignore[arg-type]
+    scene = replace(
+        scene,
+        cycle=replace(scene.cycle, rate_hz=rate),
+        sensor=sensor,
+        bus=replace(scene.bus, fd=setting.bus == FD),
+        shape=replace(scene.shape, also=()),
+        task=replace(scene.task, clearance_mm=0.5),
+    )
+    return on_any_bitrate(scene, FASTER_BITRATE) if setting.bus == FASTER else scene
+
+
+def refusal(setting: Setting) -> str | None:
+    """The plan's reason to refuse a setting; None where it fits."""
+    try:
+        make_plan(resolve(scene_of(setting)))
+    except PlanError as error:
+        return str(error).splitlines()[0]
+    return None
+
+
+def measure(case: Case) -> dict[str, Any]:
+    """Errors of a scan, and its cost in ms of processor time per second."""
+    scene = scene_of(case.setting)
+    assert scene.shape is not None
+    scene = replace(
+        scene,
+        scene=replace(scene.scene, seed=case.seed),
+        task=replace(scene.task, duration_s=case.duration_s),
+        shape=replace(scene.shape, method=case.method),  # type: ignore[arg-type]
+        plant=replace(
+            scene.plant or PlantSettings(),
+            fidelity=case.fidelity,  # type: ignore[arg-type]
+            stiffness_n_m3=case.stiffness_n_m3,
+        ),
+    )
+    spent: list[float] = []
+    try:
+        result = run_scene(
+            scene, files=False,
+            observers=[lambda seen: spent.append(process_time()) if seen.measurement is not None else None],
+        )  # fmt: skip
+    except SafetyStop as stop:
+        return {"ended": "stopped", "reason": stop.reason}
+    scan = np.flatnonzero(result.log["phase"] == Phase.SCAN)
+    seconds = float(result.log["t_s"][scan[-1]] - result.log["t_s"][scan[0]])
+    shape, contact = result.summary["shape"], result.summary["contact"]
+    return {
+        "ended": "done",
+        "cost_ms_per_s": 1e3 * (spent[scan[-1]] - spent[scan[0]]) / seconds,
+        "curvature_percent": shape["kappa_rms_error_percent"],
+        "normal_deg": shape["normal_rms_deg"],
+        "force_percent": 100.0 * contact["force_rms_error_n"] / contact["force_target_n"],
+    }
+
+
+def holds(answer: Row) -> str:
+    """Whether a scan of the stiffest contact keeps its force, in words."""
+    if answer["ended"] != "done":
+        return "stopped"
+    error = answer["force_percent"]
+    return "holds" if error <= STIFF_FORCE_PERCENT else f"force {error:.0f} %"
+
+
+def _named(setting: Setting) -> Row:
+    return {"rate_hz": setting.rate_hz, "mode": setting.mode, "bus": setting.bus}
+
+
+def _row(case: Case, answer: Row) -> Row:
+    return {**_named(case.setting), "method": case.method, "fidelity": case.fidelity, "reason": "", **answer}
+
+
+def good(rows: Iterable[Row], fidelity: str) -> list[Row]:
+    """The rows of a fidelity on a classical bus that are good enough, the cheapest first."""
+    mine = [r for r in rows if r["fidelity"] == fidelity and all(r.get(m) is not None for m in MEASURES)]
+    mine = [r for r in mine if r["bus"] == CLASSICAL and r["stiff"] == "holds"]
+    found = [r for r in mine if all(r[m] <= most for m, most in ENOUGH.items())]
+    return sorted(found, key=lambda r: float(r["cost_ms_per_s"]))
+
+
+def default_of(rows: Iterable[Row], fidelity: str) -> Row | None:
+    """The row of the defaults of scene `cylinder`, on a plant of a fidelity."""
+    scene = load_scene("cylinder")
+    assert scene.sensor is not None and scene.shape is not None
+    mine = scene.cycle.rate_hz, scene.sensor.mode, scene.shape.method, fidelity
+    return next((r for r in rows if (r["rate_hz"], r["mode"], r["method"], r["fidelity"]) == mine), None)
+
+
+def findings(rows: Sequence[Row]) -> list[str]:
+    """The knee of each fidelity and the default beside it, the effect of rate and fidelity, stopped and refused."""
+    said: list[str] = []
+    for fidelity in FIDELITIES:
+        best, mine = next(iter(good(rows, fidelity)), None), default_of(rows, fidelity)
+        said.append(f"Plant {fidelity}: {_knee(best)}.")
+        if mine is not None and mine is best:
+            said.append("  It is the default.")
+        elif mine is not None:
+            times = f": {mine['cost_ms_per_s'] / best['cost_ms_per_s']:.1f} × that cost" if best else ""
+            said.append(f"  It is not the default, {_text_of(mine)}{times if mine['ended'] == 'done' else ''}.")
+    return [*said, *_of_the_rate(rows), *_of_the_plant(rows), *_not_done(rows)]
+
+
+def _knee(best: Row | None) -> str:
+    limits = f"{ENOUGH['curvature_percent']:g} %, {ENOUGH['normal_deg']:g}° and {ENOUGH['force_percent']:g} %"
+    if best is None:
+        return f"no combination is within {limits} of curvature, normal and force and holds 40 kN/m"
+    return (
+        f"the knee, the cheapest on classical CAN within {limits} of curvature, normal and force whose servo also "
+        f"holds a contact of 40 kN/m, is {_text_of(best)}"
+    )
+
+
+def _of_the_rate(rows: Sequence[Row]) -> list[str]:
+    """Cost and errors over the servo's rate, for window and recursive on the ideal plant, on any bus."""
+    told = []
+    for rate in RATES_HZ:
+        mine = [r for r in rows if (r["rate_hz"], r["mode"], r["method"], r["fidelity"])
+                == (rate, "window", "recursive", "ideal") and r["ended"] == "done"]  # fmt: skip
+        told += [
+            f"{rate:.0f} Hz{'' if r['bus'] in REAL else ' (8 Mbit/s)'} {r['cost_ms_per_s']:.0f} ms a second, force "
+            f"{r['force_percent']:.1f} %, curvature {r['curvature_percent']:.1f} %, 40 kN/m: {r['stiff']}"
+            for r in mine
+        ]
+    if not told:
+        return []
+    return [f"Servo rate, window and recursive, ideal plant: {'; '.join(told)}."]
+
+
+def _of_the_plant(rows: Sequence[Row]) -> list[str]:
+    """Cost and errors with the dynamic plant over those with the ideal one."""
+    key: Callable[[Row], tuple[Any, ...]] = lambda r: (r["rate_hz"], r["mode"], r["method"])  # noqa: E731
+    done = {(*key(r), r["fidelity"]): r for r in rows if r["ended"] == "done"}
+    pairs = [(r, done[*k[:3], "ideal"]) for k, r in done.items() if k[3] == "dynamic" and (*k[:3], "ideal") in done]
+    if not pairs:
+        return []
+    shares = {m: [a[m] / b[m] for a, b in pairs if a[m] is not None and b[m]] for m in ("cost_ms_per_s", *MEASURES)}
+    middle = {m: float(np.median(values)) for m, values in shares.items() if values}
+    names = dict(zip(("cost_ms_per_s", *MEASURES), ("cost", "curvature", "normal", "force"), strict=True))
+    told = ", ".join(f"{names[m]} {value:.2f} ×" for m, value in middle.items())
+    return [f"The dynamic plant over the ideal one, median of {len(pairs)} pairs: {told}."]
+
+
+def _not_done(rows: Sequence[Row]) -> list[str]:
+    """The scans that were stopped and the settings that were refused; the reasons are in the table."""
+    said = []
+    stopped = [r for r in rows if r["ended"] == "stopped"]
+    for fidelity in FIDELITIES:
+        mine = sorted({(r["mode"], r["method"]) for r in stopped if r["fidelity"] == fidelity})
+        count = sum(r["fidelity"] == fidelity for r in stopped)
+        if mine:
+            said.append(f"Stopped for safety, plant {fidelity}, {count} scans: {', '.join(map(' '.join, mine))}.")
+    for bus in (*REAL, FASTER):
+        refused = [f"{r['rate_hz']:.0f} Hz {r['mode']}" for r in rows if r["ended"] == "refused" and r["bus"] == bus]
+        if refused:
+            said.append(f"Refused by the plan, bus {bus}: {', '.join(refused)}.")
+    return said
+
+
+def _text_of(row: Row) -> str:
+    what = f"{row['rate_hz']:.0f} Hz, {row['mode']}, {row['bus']}, {row['method']}"
+    if row["ended"] != "done":
+        return f"{what}, {row['ended']}: {row['reason']}"
+    if any(row[m] is None for m in MEASURES):
+        return f"{what}, {row['cost_ms_per_s']:.0f} ms a second, without an answer on the shape"
+    return (
+        f"{what}: {row['cost_ms_per_s']:.0f} ms a second for {row['curvature_percent']:.1f} % of curvature, "
+        f"{row['normal_deg']:.2f}° of normal, {row['force_percent']:.1f} % of force"
+    )
+
+
+MARKS = {"features": "^", "window": "o", "image": "s"}
+SIZES = {100.0: 14.0, 200.0: 34.0, 400.0: 72.0, 500.0: 90.0, 1000.0: 140.0, 2000.0: 210.0}
+PANELS = (
+    ("curvature_percent", "curvature error (%)"),
+    ("normal_deg", "normal error (deg)"),
+    ("force_percent", "force error (%)"),
+)
+
+
+def draw_cell(rows: Sequence[Row], path: Path) -> None:
+    """Error against cost: a row of panels for each measure, a column for each fidelity."""
+    refused, stopped = (sum(r["ended"] == how for r in rows) for how in ("refused", "stopped"))
+    title = (
+        "Whole cell, all in one process: error over the processor time that a second of a scan takes; best lower left\n"
+        "a mark: rate, what the array sends, estimator and bus; ring: the default; star: cheapest that is good enough\n"
+        f"not drawn: {refused} settings that the plan refuses, {stopped} scans that were stopped for safety"
+    )
+    with picture(path, title, 9.6) as figure:
+        grid = figure.subplots(len(PANELS), len(FIDELITIES), squeeze=False, sharex=True, sharey="row")
+        for (key, label), line in zip(PANELS, grid, strict=True):
+            for fidelity, axes in zip(FIDELITIES, line, strict=True):
+                _draw(axes, rows, key, fidelity)
+            line[0].set_ylabel(label)
+        for fidelity, top, bottom in zip(FIDELITIES, grid[0], grid[-1], strict=True):
+            top.set_title(f"{fidelity} plant")
+            bottom.set_xlabel("processor time a second (ms)")
+        legend(figure, _keys(rows))
+
+
+def _draw(axes: Axes, rows: Sequence[Row], key: str, fidelity: str) -> None:
+    mine = [r for r in rows if r["fidelity"] == fidelity and r.get(key) is not None]
+    for r in mine:
+        filled = {CLASSICAL: METHOD_COLOURS[r["method"]], FASTER: FAINT}.get(r["bus"], "none")
+        axes.scatter(
+            r["cost_ms_per_s"], r[key], s=SIZES.get(r["rate_hz"], 110.0), marker=MARKS[r["mode"]],
+            facecolor=filled, edgecolor=METHOD_COLOURS[r["method"]], linewidth=1.2,
+        )  # fmt: skip
+    knee, default = next(iter(good(rows, fidelity)), None), default_of(rows, fidelity)
+    for chosen, mark, size in ((default, "o", 260.0), (knee, "*", 420.0)):
+        if chosen is not None and chosen.get(key) is not None:
+            axes.scatter(
+                chosen["cost_ms_per_s"], chosen[key], s=size, marker=mark, facecolor="none", edgecolor=INK,
+                linewidth=1.4,
+            )  # fmt: skip
+    axes.margins(0.12)
+    log_scale(axes, "xy")
+
+
+def _keys(rows: Sequence[Row]) -> list[Line2D]:
+    """Colours, marks and sizes that occur."""
+
+    def dot(label: str, colour: str, mark: str, size: float, fill: str | None = None) -> Line2D:
+        face = colour if fill is None else fill
+        return Line2D(
+            [], [], linestyle="none", marker=mark, color=colour, markerfacecolor=face, markersize=size, label=label
+        )
+
+    done = [r for r in rows if r["ended"] == "done"]
+    found = [dot(m, c, "o", 7.0) for m, c in METHOD_COLOURS.items() if any(r["method"] == m for r in done)]
+    found += [dot(m, INK, mark, 7.0) for m, mark in MARKS.items() if any(r["mode"] == m for r in done)]
+    rates = sorted({r["rate_hz"] for r in done})
+    found += [dot(f"{rate:.0f} Hz", INK, "o", SIZES.get(rate, 110.0) ** 0.5) for rate in rates]
+    if any(r["bus"] == FD for r in done):
+        found.append(dot("CAN FD", INK, "o", 7.0, "white"))
+    if any(r["bus"] == FASTER for r in done):
+        found.append(dot("8 Mbit/s, no CAN", INK, "o", 7.0, FAINT))
+    return found

@@ -1,0 +1,145 @@
+"""Rigid-body dynamics of any arm: mass matrix, Coriolis and centrifugal torques, gravity; computed by MuJoCo.
+
+Equation of motion: ``M(q) q'' + b(q, q') = tau``, all at the joints; b holds gravity. Motors, gears and friction are
+not in it (``canprobe.mechanics.robot.model``). MuJoCo is in the extra `dynamics` and is imported where a `RigidBody` is
+made.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from canprobe.errors import PlanError, install_line
+from canprobe.mechanics.robot.chain import Array, Chain
+from canprobe.mechanics.robot.model import Body
+
+GRAVITY_M_S2 = 9.81
+_PLACEHOLDER = '<inertial pos="1 2 3" quat="1 2 3 4" mass="1" diaginertia="1 1.1 1.2"/>'
+"""A body that MuJoCo's compiler neither refuses nor simplifies; the real one, which it may refuse, follows after."""
+
+
+def dynamics_problem(name: str, bodies: Sequence[Body | None] | None) -> str | None:
+    """Why an arm cannot be emulated with its dynamics, and what mends it; None where it can.
+
+    Args:
+        name: of the arm.
+        bodies: (n,) of its joints; None where nobody knows them.
+    """
+    lead = 'plant.fidelity = "dynamic"'
+    if bodies is None:
+        return (
+            f"{lead}: the masses of arm {name!r} are not known; give its joints mass_kg, com_mm and inertia_kg_m2 "
+            '(in a URDF <inertial>), or set plant.fidelity = "ideal"'
+        )
+    if importlib.util.find_spec("mujoco") is None:
+        return f"{lead} needs the package mujoco: {install_line('dynamics')}"
+    return None
+
+
+def ball(mass: float, radius: float, centre: Array) -> Body:
+    """A homogeneous ball.
+
+    Args:
+        mass: kg.
+        radius: m.
+        centre: (3,) m.
+    """
+    return Body(mass, centre, 0.4 * mass * radius**2 * np.eye(3))
+
+
+def joined(a: Body | None, b: Body) -> Body:
+    """Two bodies of one frame as one.
+
+    Args:
+        a: None for nothing.
+        b: the other.
+
+    Source: parallel axes (Steiner).
+    """
+    if a is None or a.mass + b.mass == 0.0:
+        return b
+    mass = a.mass + b.mass
+    com = (a.mass * a.com + b.mass * b.com) / mass
+    tensor = np.zeros((3, 3))
+    for body in (a, b):
+        d = body.com - com
+        tensor += body.tensor + body.mass * (float(d @ d) * np.eye(3) - np.outer(d, d))
+    return Body(mass, com, tensor)
+
+
+class RigidBody:
+    """Dynamics of one arm with what it carries.
+
+    Args:
+        chain: its geometry.
+        bodies: (n,) of its joints; None for a joint that carries nothing itself. Numbers that no solid could have are
+            taken as they are, as published tables leave out what does not matter.
+        gravity: acceleration of free fall along base -z, m/s^2.
+
+    Raises:
+        PlanError: the extra `dynamics` is not installed.
+    """
+
+    def __init__(self, chain: Chain, bodies: Sequence[Body | None], gravity: float = GRAVITY_M_S2) -> None:
+        problem = dynamics_problem(chain.name, bodies)
+        if problem is not None:
+            raise PlanError([problem])
+        import mujoco
+
+        self._mujoco: Any = mujoco
+        text = "".join(_opened(mujoco, T, slides) for T, slides in zip(chain.fixed, chain.prismatic, strict=True))
+        text = f"<worldbody>{text}{'</body>' * chain.n}</worldbody>"
+        made = mujoco.MjModel.from_xml_string(f'<mujoco><option gravity="0 0 {-gravity!r}"/>{text}</mujoco>')
+        for i, body in enumerate(bodies, start=1):  # 0 is the world
+            moments, axes = np.linalg.eigh(np.zeros((3, 3)) if body is None else body.tensor)
+            made.body_mass[i] = 0.0 if body is None else body.mass
+            made.body_ipos[i] = np.zeros(3) if body is None else body.com
+            made.body_inertia[i] = moments
+            made.body_iquat[i] = _quaternion(mujoco, axes * np.linalg.det(axes))
+        self._model, self._data = made, mujoco.MjData(made)
+        mujoco.mj_setConst(made, self._data)
+        self._armature = np.eye(chain.n)
+
+    def terms(self, q: npt.ArrayLike, qd: npt.ArrayLike) -> tuple[Array, Array]:
+        """Mass matrix and bias.
+
+        Args:
+            q: (n,) rad or m.
+            qd: (n,) rad/s or m/s.
+
+        Returns:
+            (n, n) M, kg m^2 (kg m and kg where joints slide), and (n,) bias: torque or force that holds the joint rates
+            constant against gravity, Coriolis and centrifugal effects, N m or N.
+        """
+        made, data, mass = self._model, self._data, np.empty_like(self._armature)
+        data.qpos[:], data.qvel[:] = q, qd
+        self._mujoco.mj_fwdPosition(made, data)
+        self._mujoco.mj_fwdVelocity(made, data)
+        self._mujoco.mj_fullM(made, data, mass)
+        return mass - self._armature, data.qfrc_bias.copy()
+
+    def gravity(self, q: npt.ArrayLike) -> Array:
+        """(n,) torque that carries the arm's weight at rest, N m or N.
+
+        Args:
+            q: (n,) rad or m.
+        """
+        return self.terms(q, np.zeros(len(self._armature)))[1]
+
+
+def _opened(mujoco: Any, T: Array, slides: bool) -> str:
+    """A joint's frame with its joint. The armature of 1 keeps MuJoCo's matrix regular where nothing has a mass."""
+    pos, quat = (" ".join(map(repr, values.tolist())) for values in (T[:3, 3], _quaternion(mujoco, T[:3, :3])))
+    joint = f'<joint type="{"slide" if slides else "hinge"}" axis="0 0 1" armature="1"/>'
+    return f'<body pos="{pos}" quat="{quat}">{joint}{_PLACEHOLDER}'
+
+
+def _quaternion(mujoco: Any, R: Array) -> Array:
+    quat = np.empty(4)
+    mujoco.mju_mat2Quat(quat, np.ascontiguousarray(R).ravel())
+    return quat

@@ -1,0 +1,392 @@
+"""From poses and velocities of the tool to the joints of any arm, numerically.
+
+What n joints can hold of a tool's pose is a number of rows, in this order: position (3), the direction of the pole, the
+tool's z axis (2), and the turn about the pole (1). Six or more joints hold all six rows, with more than six they stay
+near a posture besides. Five joints hold position and pole. Fewer hold the position; the pole comes out as it does.
+`task_rows` says so for a model, `in_rows` takes those rows out of a Jacobian or a twist; tasks and planning use both.
+
+- `inverse_near` finds the joints for a pose from a known posture on, within the joint limits (Levenberg-Marquardt). It
+  stays on the branch of that posture, as an arm that moves there does.
+- `damped_step` is one step of the Jacobian, damped near singular poses; `lifting_step` one with some drives at rest.
+- `probe_pose` and `start_posture` put a probe on a surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import atan2, degrees, inf, pi
+
+import numpy as np
+import numpy.typing as npt
+from numpy.typing import NDArray
+
+from canprobe.errors import PlanError
+from canprobe.mechanics.robot.chain import Array, forward, forward_jacobian
+from canprobe.mechanics.robot.model import ArmModel
+
+LENGTH_M = 0.2
+"""Makes linear rows comparable to angular ones: about the length of a link."""
+
+
+FULL_POSE, FIXED_POLE = 6, 3
+"""Rows of an arm that holds a whole pose, and of one that holds the position alone."""
+
+
+def task_rows(model: ArmModel) -> int:
+    """How many rows of a tool's pose an arm can hold, by its number of joints.
+
+    It stops being true where the geometry wastes a joint: five joints of which the last one rolls about the pole cannot
+    lean it sideways. Such poses are out of reach to `inverse_near`, and the step is damped as near singular poses.
+
+    Args:
+        model: the arm.
+
+    Returns:
+        6 from six joints on: position, pole and the turn about it; 5 of five: position and pole; 3 of fewer: position.
+    """
+    return 6 if model.n >= 6 else 5 if model.n == 5 else 3
+
+
+def in_rows(rows: int, R_base_tool: Array, six: Array) -> Array:
+    """The rows that an arm can hold, of a Jacobian (6, n) or a twist (6,).
+
+    Args:
+        rows: of `task_rows`.
+        R_base_tool: (3, 3) axes of the tool; the turns about its x and y are those of the pole.
+        six: linear rows, then angular ones, base frame.
+
+    Returns:
+        (rows, n) or (rows,): linear rows in the base frame, then angular ones, of five rows in the frame of the tool.
+    """
+    if rows == 5:
+        return np.concatenate((six[:3], R_base_tool[:, :2].T @ six[3:]))
+    return six[:rows]
+
+
+# A pose from a known posture on.
+
+_REACHED = 1e-9
+"""Error of a pose, rad or m over `LENGTH_M`, that is rounding."""
+_STEPS = 200
+_LONGEST_STEP = 0.3
+"""Of a joint in one step, rad: farther the Jacobian is another one."""
+_LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e8
+
+
+def inverse_near(
+    model: ArmModel,
+    T_base_tool: Array,
+    T_flange_tool: Array,
+    q_near: npt.ArrayLike,
+    *,
+    max_move_rad: float = inf,
+    q_rest: npt.ArrayLike | None = None,
+) -> Array:
+    """Joints within their limits that hold a tool at a pose, reached from a known posture on.
+
+    Args:
+        model: the arm; `task_rows` says what of the pose it can hold.
+        T_base_tool: (4, 4) pose of the tool, m.
+        T_flange_tool: (4, 4) tool in the flange frame, m.
+        q_near: (n,) rad or m; the answer is on its branch.
+        max_move_rad: farthest that a joint may be from `q_near`, rad; for a prismatic one see `ArmModel.radian`.
+        q_rest: (n,) posture near which more than six joints stay; `q_near` by default.
+
+    Returns:
+        (n,) joint positions, rad or m.
+
+    Raises:
+        PlanError: out of reach from there, with the nearest pose that can be reached; or too far, with the joint.
+
+    Source: Nocedal & Wright, Numerical Optimization, 10.3 (Levenberg-Marquardt), 16.7 (projected to bounds).
+    """
+    near = np.asarray(q_near, dtype=float)
+    pose = _Pose(model, np.asarray(T_base_tool, dtype=float), np.asarray(T_flange_tool, dtype=float))
+    q = _reach(pose, near)
+    if pose.rows < model.n:
+        q = _rest(pose, q, near if q_rest is None else np.asarray(q_rest, dtype=float))
+    if float(np.linalg.norm(pose.error(q)[0])) > _REACHED:
+        raise PlanError([_out_of_reach(pose, q)])
+    moves = np.abs(q - near) / model.radian
+    if float(moves.max()) > max_move_rad:
+        i = int(np.argmax(moves))
+        joint = model.joints[i]
+        raise PlanError(
+            [
+                f"{_place(T_base_tool)}: not near the posture before: joint {i + 1} would have to move by "
+                f"{joint.text(abs(float(q[i] - near[i])))}"
+            ]
+        )
+    return q
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pose:
+    """A pose to be reached by an arm."""
+
+    model: ArmModel
+    T_base_tool: Array
+    T_flange_tool: Array
+
+    @property
+    def rows(self) -> int:
+        return task_rows(self.model)
+
+    def error(self, q: Array) -> tuple[Array, Array]:
+        """What is left (rows,) and its Jacobian (rows, n), in rad: lengths are divided by `LENGTH_M`.
+
+        The Jacobian is per radian of a joint, see `ArmModel.radian`.
+        """
+        T, J = forward_jacobian(self.model.chain, q, self.T_flange_tool)
+        R, aim, rows = T[:3, :3], self.T_base_tool, self.rows
+        turn = _turn(R, aim[:3, :3]) if rows == 6 else _turn_of_pole(R, aim[:3, 2])
+        left = np.concatenate(((aim[:3, 3] - T[:3, 3]) / LENGTH_M, turn))
+        J[:3] /= LENGTH_M
+        return in_rows(rows, R, left), in_rows(rows, R, J) * self.model.radian
+
+
+def _turn(R: Array, R_aim: Array) -> Array:
+    """(3,) rotation vector from one orientation to another, base frame."""
+    E = R_aim @ R.T
+    axis = 0.5 * np.array((E[2, 1] - E[1, 2], E[0, 2] - E[2, 0], E[1, 0] - E[0, 1]))
+    sine, cosine = float(np.linalg.norm(axis)), 0.5 * (float(np.trace(E)) - 1.0)
+    if sine > 1e-8:
+        return np.array(axis * (atan2(sine, cosine) / sine))
+    if cosine > 0.0:
+        return axis
+    column = (E + np.eye(3))[:, int(np.argmax(np.diag(E)))]  # half a turn: any sign of its axis
+    return np.array(column * (pi / float(np.linalg.norm(column))))
+
+
+def _turn_of_pole(R: Array, pole: Array) -> Array:
+    """(3,) shortest rotation vector that brings z to a direction, base frame."""
+    axis = np.cross(R[:, 2], pole)
+    sine, cosine = float(np.linalg.norm(axis)), float(R[:, 2] @ pole)
+    if sine > 1e-8:
+        return np.array(axis * (atan2(sine, cosine) / sine))
+    return axis if cosine > 0.0 else np.array(pi * R[:, 0])
+
+
+def _reach(pose: _Pose, near: Array) -> Array:
+    """The joints where the error of a pose is least, from a posture on: Levenberg-Marquardt, joints held at stops."""
+    model = pose.model
+    q = np.clip(near, model.q_min, model.q_max)
+    left, J = pose.error(q)
+    damping = 1e-3
+    for _ in range(_STEPS):
+        cost = float(left @ left)
+        uphill = J.T @ left
+        free = ~(((q <= model.q_min) & (uphill < 0.0)) | ((q >= model.q_max) & (uphill > 0.0)))
+        if cost < 1e-3 * _REACHED**2 or not np.abs(uphill[free]).max(initial=0.0) > 1e-14 or damping > _MOST_DAMPING:
+            break
+        tried = np.clip(q + _step(J, left, free, damping) * model.radian, model.q_min, model.q_max)
+        new_left, new_J = pose.error(tried)
+        if float(new_left @ new_left) < cost:
+            q, left, J, damping = tried, new_left, new_J, max(damping * 0.1, _LEAST_DAMPING)
+        else:
+            damping = max(10.0 * damping, 1e-6)
+    return q
+
+
+def _step(J: Array, left: Array, free: NDArray[np.bool_], damping: float) -> Array:
+    """A damped step of the free joints, no longer than the Jacobian holds, rad."""
+    A = J[:, free]
+    step = np.zeros(len(free))
+    step[free] = A.T @ np.linalg.solve(A @ A.T + damping * np.eye(len(left)), left)
+    step /= max(1.0, float(np.abs(step).max()) / _LONGEST_STEP)
+    return step
+
+
+def _rest(pose: _Pose, reached: Array, rest: Array) -> Array:
+    """Of the joints that hold a pose the ones nearest to a posture: Newton's steps towards the pose, and along the
+    null space towards the posture. What was reached, where that does not settle."""
+    model, q = pose.model, reached
+    for _ in range(_STEPS):
+        left, J = pose.error(q)
+        wish = (rest - q) / model.radian
+        free = ~(((q <= model.q_min) & (wish < 0.0)) | ((q >= model.q_max) & (wish > 0.0)))
+        A = J[:, free]
+        step = np.zeros(model.n)
+        # wish + A'(AA')^-1 (left - A wish): the nearest to the wish that makes up for what is left
+        damped = A @ A.T + 1e-12 * np.eye(pose.rows)
+        step[free] = wish[free] + A.T @ np.linalg.solve(damped, left - A @ wish[free])
+        step /= max(1.0, float(np.abs(step).max()) / _LONGEST_STEP)
+        moved = np.clip(q + step * model.radian, model.q_min, model.q_max)
+        settled, q = float(np.abs(moved - q).max()) < _REACHED, moved
+        if settled:
+            break
+    back = _reach(pose, q)
+    still = float(np.linalg.norm(pose.error(back)[0])) <= _REACHED
+    return back if still else reached
+
+
+def _out_of_reach(pose: _Pose, q: Array) -> str:
+    """What is nearest, and what holds it there."""
+    model, T = pose.model, forward(pose.model.chain, q) @ pose.T_flange_tool
+    away = 1e3 * float(np.linalg.norm(T[:3, 3] - pose.T_base_tool[:3, 3]))
+    turned = degrees(float(np.linalg.norm(pose.error(q)[0][3:])))
+    stops = [
+        f"joint {i + 1} at its stop, {joint.text(float(value))}"
+        for i, (joint, value) in enumerate(zip(model.joints, q, strict=True))
+        if not joint.q_min + 1e-9 < value < joint.q_max - 1e-9
+    ]
+    nearest = f"nearest reachable: {_place(T)}, {away:.1f} mm and {turned:.1f} deg away"
+    because = f" with {', '.join(stops)}" if stops else ""
+    return f"{_place(pose.T_base_tool)}: out of reach of the {model.name} arm; {nearest}{because}"
+
+
+def _place(T_base_tool: Array) -> str:
+    x, y, z = (1e3 * T_base_tool[:3, 3]).tolist()
+    return f"tool at ({x:.1f}, {y:.1f}, {z:.1f}) mm"
+
+
+# Poses that put a spherical probe on a surface point, and the joints for them: start poses of a scene.
+
+
+def probe_pose(point: npt.ArrayLike, normal: npt.ArrayLike, centre_height_m: float, x_hint: npt.ArrayLike) -> Array:
+    """Probe frame above a surface point, pole (z) against the outward normal.
+
+    Args:
+        point: (3,) surface point, base frame, m.
+        normal: (3,) outward normal of the surface, any length.
+        centre_height_m: distance of the probe's centre from the point along the normal, m
+            (probe radius + clearance, or radius - depth).
+        x_hint: (3,) direction that the frame's x axis follows as far as the pole allows.
+
+    Returns:
+        (4, 4) T_base_probe, m.
+
+    Raises:
+        ValueError: for a hint parallel to the normal.
+    """
+    n = np.asarray(normal, dtype=float) / np.linalg.norm(normal)
+    hint = np.asarray(x_hint, dtype=float)
+    x = hint - (hint @ n) * n
+    size = float(np.linalg.norm(x))
+    if size < 1e-9 * float(np.linalg.norm(hint)) or size == 0.0:
+        raise ValueError(f"x_hint {hint.tolist()} is parallel to the normal {n.tolist()}")
+    T_base_probe = np.eye(4)
+    T_base_probe[:3, 0] = x / size
+    T_base_probe[:3, 1] = np.cross(-n, x / size)
+    T_base_probe[:3, 2] = -n
+    T_base_probe[:3, 3] = np.asarray(point, dtype=float) + centre_height_m * n
+    return T_base_probe
+
+
+def start_posture(
+    model: ArmModel,
+    point: npt.ArrayLike,
+    normal: npt.ArrayLike,
+    q_near: npt.ArrayLike,
+    *,
+    radius_m: float,
+    T_flange_probe: Array,
+    clearance_m: float = 0.0,
+) -> Array:
+    """Joints that hold the probe over a surface point, pole against the normal, from a known posture on.
+
+    The turn about the normal is free: it is what `q_near` has.
+
+    Args:
+        model: the arm.
+        point: (3,) surface point, base frame, m.
+        normal: (3,) outward normal there.
+        q_near: (n,) rad or m.
+        radius_m: probe radius, m.
+        T_flange_probe: (4, 4) probe centre in the flange frame, m.
+        clearance_m: gap between probe and surface, m; negative presses.
+
+    Returns:
+        (n,) joint positions, rad or m, within the limits.
+
+    Raises:
+        PlanError: the pose cannot be reached from there within the limits.
+    """
+    x_hint = (forward(model.chain, q_near) @ T_flange_probe)[:3, 0]
+    T_base_probe = probe_pose(point, normal, radius_m + clearance_m, x_hint)
+    return inverse_near(model, T_base_probe, T_flange_probe, q_near)
+
+
+# Damped least-squares inverse of the Jacobian, damped only near singular poses.
+
+
+_DAMPING, _THRESHOLD = 0.05, 0.08
+"""Largest damping, and the singular value below which it starts; linear rows are divided by `LENGTH_M`."""
+
+
+def damped_step(J: Array, twist: Array, wish: Array | None = None) -> Array:
+    """Joint rates for a tool twist.
+
+    Away from singular poses this is the exact inverse, of least norm where there are more joints than rows. Where the
+    smallest singular value s falls below the threshold the squared damping rises as
+    0.05^2 (1 - (s / 0.08)^2), on all directions alike, so that rates stay bounded and continuous.
+
+    Args:
+        J: (m, n) rows of the geometric Jacobian that the arm can hold, linear rows first, see `task_rows`.
+        twist: (m,) linear m/s then angular rad/s, or a displacement: the map is linear.
+        wish: (n,) rates that the joints have as far as the tool does not notice; none by default.
+
+    Returns:
+        (n,) joint rates, rad/s or m/s.
+
+    Source: Nakamura & Hanafusa 1986; Maciejewski & Klein 1988 (variable damping factor); Liegeois 1977 (null space).
+    """
+    rows, joints = J.shape
+    scale = np.array((1 / LENGTH_M,) * 3 + (1.0,) * (rows - 3))
+    scaled, aim = J * scale[:, None], scale * twist
+    regular = _regular_step(scaled, aim) if rows == joints else None
+    if regular is not None:
+        return regular
+    U, s, Vt = np.linalg.svd(scaled, full_matrices=False)
+    ratio = float(s[-1]) / _THRESHOLD
+    lambda2 = _DAMPING**2 * (1.0 - ratio**2) if ratio < 1.0 else 0.0
+    step: Array = Vt.T @ ((U.T @ aim) * (s / (s * s + lambda2)))
+    return step if wish is None else step + wish - Vt.T @ (Vt @ wish)
+
+
+def _regular_step(J: Array, twist: Array) -> Array | None:
+    """The exact inverse where it is cheap to see that no damping is due (1/‖J⁻¹‖ is below every singular value)."""
+    try:
+        inverse = np.linalg.inv(J)
+    except np.linalg.LinAlgError:
+        return None
+    if float(np.vdot(inverse, inverse)) * _THRESHOLD**2 >= 1.0:
+        return None
+    step: Array = inverse @ twist
+    return step
+
+
+# Moving the tool with the drives that are left: what the others would have done is shared among them.
+
+WORST_GAIN = 30.0
+"""Joint motion per motion of the tool, rad/m, beyond which the drives that are left are badly placed for it."""
+_EXACT = 1e-6
+
+
+def lifting_step(model: ArmModel, J: Array, move: Array, free: NDArray[np.bool_]) -> Array | None:
+    """Drive steps that move the tool's point, its orientation left open, while some drives stand still.
+
+    Of all steps the one with the least joint motion. Couplings between the joints are in it: a drive that stands still
+    is not a joint that stands still.
+
+    Args:
+        model: the arm.
+        J: (3, n) velocity of the point per joint rate, base frame.
+        move: (3,) of the point, m, base frame.
+        free: (n,) drives that may move.
+
+    Returns:
+        (n,) drive units; None where the free drives cannot make this move, or only by moving far.
+
+    Source: least-norm solution of an underdetermined system (Golub and Van Loan, Matrix Computations, 5.6).
+    """
+    turns = (model.q_per_unit / model.radian[:, None])[:, free]
+    scale = 1.0 / np.linalg.norm(turns, axis=0)  # units of a drive for one rad of joints
+    shares, *_ = np.linalg.lstsq(J @ model.q_per_unit[:, free] * scale, move, rcond=None)
+    units = np.zeros(len(free))
+    units[free] = scale * shares
+    dq = model.q_per_unit @ units
+    size = float(np.linalg.norm(move))
+    if np.linalg.norm(J @ dq - move) > _EXACT * size or np.linalg.norm(dq / model.radian) > WORST_GAIN * size:
+        return None
+    return units

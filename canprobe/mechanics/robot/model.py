@@ -1,0 +1,292 @@
+"""An arm as its controller knows it: a chain, what its joints can do, and how the units of its drives follow from them.
+
+A drive counts in units of its own: encoder counts, 1/1000 of a degree. Gears, signs and couplings between the joints
+are one matrix, the drives' zeros one vector: `units = units_per_q @ q + zero_units`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from canprobe.errors import PlanError
+from canprobe.mechanics.robot.chain import Array, Chain, forward_jacobian
+
+METRES_PER_RADIAN = 0.2
+"""Travel of a prismatic joint that counts as much as a radian of a revolute one: about the length of a link."""
+
+
+@dataclass(frozen=True, slots=True)
+class Joint:
+    """What one joint can do. Units are rad, N m and kg m^2; of a prismatic joint m, N and kg.
+
+    Attributes:
+        name: as in the chain.
+        prismatic: it slides; otherwise it turns.
+        q_min, q_max: its stops.
+        qd_max: speed limit, per second.
+        rated_torque: continuous torque of its drive, at the joint.
+        rotor_inertia: of its motor, at the joint; emulation only, as friction is.
+        coulomb: friction torque whatever the speed.
+        viscous: friction torque per speed.
+
+    The defaults of drive and friction are assumed: a geared motor of a small arm.
+    """
+
+    name: str
+    prismatic: bool
+    q_min: float
+    q_max: float
+    qd_max: float
+    rated_torque: float = 10.0
+    rotor_inertia: float = 0.05
+    coulomb: float = 0.5
+    viscous: float = 0.3
+
+    @property
+    def unit(self) -> str:
+        """Unit for people: deg or mm."""
+        return "mm" if self.prismatic else "deg"
+
+    def shown(self, q: float) -> float:
+        """A position or speed in the unit for people.
+
+        Args:
+            q: rad or m, or per second.
+        """
+        return 1e3 * q if self.prismatic else math.degrees(q)
+
+    def text(self, q: float, places: str = ".1f") -> str:
+        """A position with its unit, for people.
+
+        Args:
+            q: rad or m.
+            places: format of the number.
+        """
+        return f"{self.shown(q):{places}} {self.unit}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Body:
+    """What a joint carries up to the next one, in the frame of the joint.
+
+    Attributes:
+        mass: kg.
+        com: (3,) centre of mass, m.
+        tensor: (3, 3) inertia about it, kg m^2.
+    """
+
+    mass: float
+    com: Array
+    tensor: Array
+
+    def moved(self, T: Array) -> Body:
+        """The same body in another frame.
+
+        Args:
+            T: (4, 4) this frame in the other one, m.
+        """
+        R = T[:3, :3]
+        return Body(self.mass, R @ self.com + T[:3, 3], R @ self.tensor @ R.T)
+
+
+INERTIA_TOLERANCE = 0.1
+"""Share of the largest moment by which the others may miss the rules of a body: published numbers are measured."""
+ROUNDED_KG_M2 = 1e-12
+"""A moment of inertia that is 0 but for rounding."""
+
+
+def negative_inertia(tensor: Array) -> str | None:
+    """Why no dynamics follow from a (3, 3) tensor: a principal moment is negative; None where none is."""
+    low, _, high = np.linalg.eigvalsh(tensor).tolist()
+    if low >= -max(INERTIA_TOLERANCE * high, ROUNDED_KG_M2):
+        return None
+    return f"{_principal_moments(tensor)}, of which one is negative"
+
+
+def lopsided_inertia(tensor: Array) -> str | None:
+    """Why a (3, 3) tensor is the inertia of no body: one moment exceeds the sum of the others; None where none does."""
+    low, middle, high = np.linalg.eigvalsh(tensor).tolist()
+    if low + middle >= high * (1.0 - INERTIA_TOLERANCE) - ROUNDED_KG_M2:
+        return None
+    return f"{_principal_moments(tensor)}, of which one is larger than the sum of the others"
+
+
+def _principal_moments(tensor: Array) -> str:
+    return f"principal moments of inertia of {', '.join(f'{one:.4g}' for one in np.linalg.eigvalsh(tensor))} kg m^2"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArmModel:
+    """Geometry, joints and drive units of one arm; compared by identity.
+
+    Args:
+        chain: the geometry.
+        joints: the n joints of the chain, from the base.
+        units_per_q: (n, n) drive units per rad or m of each joint: gear, sign and coupling. A drive's own joint is on
+            the diagonal.
+        zero_units: (n,) drive units at q = 0.
+
+    Attributes:
+        q_min, q_max, qd_max: (n,) of the joints.
+        q_per_unit: (n, n) inverse of `units_per_q`.
+        radian: (n,) what counts as a radian of each joint: 1, of a prismatic one `METRES_PER_RADIAN`.
+
+    Raises:
+        PlanError: joints that are not the chain's, stops or speeds that leave no motion, units that do not follow from
+            the joints.
+    """
+
+    chain: Chain
+    joints: tuple[Joint, ...]
+    units_per_q: Array
+    zero_units: Array
+    q_min: Array = field(init=False)
+    q_max: Array = field(init=False)
+    qd_max: Array = field(init=False)
+    q_per_unit: Array = field(init=False)
+    radian: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        units, zero = np.array(self.units_per_q, dtype=float), np.array(self.zero_units, dtype=float)
+        problems = self._problems(units, zero)
+        if problems:
+            raise PlanError([f"arm {self.chain.name!r}: {problem}" for problem in problems])
+        arrays = {
+            "units_per_q": units,
+            "zero_units": zero,
+            "q_per_unit": np.linalg.inv(units),
+            "radian": np.where([joint.prismatic for joint in self.joints], METRES_PER_RADIAN, 1.0),
+        }
+        for name in ("q_min", "q_max", "qd_max"):
+            arrays[name] = np.array([getattr(joint, name) for joint in self.joints])
+        for name, array in arrays.items():
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    @property
+    def name(self) -> str:
+        """Of the chain."""
+        return self.chain.name
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return len(self.joints)
+
+    def _problems(self, units: Array, zero: Array) -> list[str]:
+        n = self.chain.n
+        names = [(joint.name, joint.prismatic) for joint in self.joints]
+        if names != list(zip(self.chain.joints, self.chain.prismatic, strict=True)):
+            return [f"expected the joints {', '.join(self.chain.joints)}, got {', '.join(name for name, _ in names)}"]
+        if units.shape != (n, n) or zero.shape != (n,):
+            return [f"expected units_per_q ({n}, {n}) and zero_units ({n},), got {units.shape} and {zero.shape}"]
+        problems = []
+        for joint, row in zip(self.joints, units.tolist(), strict=True):
+            if not joint.q_min < joint.q_max:
+                problems.append(f"{joint.name}: expected q_min below q_max, got {joint.q_min:g} and {joint.q_max:g}")
+            if not joint.qd_max > 0.0:
+                problems.append(f"{joint.name}: expected a speed limit above 0, got {joint.qd_max:g}; give it one")
+            if row[self.joints.index(joint)] == 0.0:
+                problems.append(f"{joint.name}: its drive does not move it (0 in units_per_q); give it its gear")
+        if not problems and not np.linalg.cond(units / np.abs(units).max(axis=1)[:, None]) < 1e6:
+            problems.append("units_per_q cannot be inverted: two drives move the same joints alike")
+        return problems
+
+
+def joints_to_units(model: ArmModel, q: npt.ArrayLike) -> Array:
+    """Drive positions of joint positions.
+
+    Args:
+        model: the arm.
+        q: (n,) joint positions, rad or m.
+
+    Returns:
+        (n,) drive positions in drive units, not rounded.
+    """
+    units: Array = model.units_per_q.dot(np.asarray(q, dtype=float)) + model.zero_units
+    return units
+
+
+def units_to_joints(model: ArmModel, units: npt.ArrayLike) -> Array:
+    """Joint positions of drive positions, the inverse of `joints_to_units`.
+
+    Args:
+        model: the arm.
+        units: (n,) drive positions in drive units.
+
+    Returns:
+        (n,) joint positions, rad or m.
+    """
+    q: Array = model.q_per_unit.dot(np.asarray(units, dtype=float) - model.zero_units)
+    return q
+
+
+def coupled_joints(model: ArmModel, axis: int) -> frozenset[int]:
+    """The other joints on which the position of a drive depends, directly or by way of their own drives, from 0."""
+    found: set[int] = set()
+    new = {axis}
+    while new:
+        found |= new
+        new = {int(k) for i in new for k in np.flatnonzero(model.units_per_q[i])} - found
+    return frozenset(found - {axis})
+
+
+def drive_position_at(model: ArmModel, axis: int, q: float, units: npt.ArrayLike) -> float:
+    """Position of one drive, drive units, where its joint is at `q` and the other drives stand still.
+
+    Args:
+        model: the arm.
+        axis: of the drive, from 0.
+        q: position of its joint, rad or m.
+        units: (n,) positions of the drives; that of `axis`, and of drives that it is not coupled to, may be anything.
+    """
+    rows, right = model.units_per_q.copy(), np.asarray(units, dtype=float) - model.zero_units
+    rows[axis], right[axis] = np.eye(model.n)[axis], q
+    return float(model.units_per_q[axis] @ np.linalg.solve(rows, right) + model.zero_units[axis])
+
+
+# Motor coordinates: the position of a drive divided by its units per own joint, so that without coupling they are the
+# joint positions. Rotor inertia, friction and drive torque act there, one motor each; rigid bodies move at the joints.
+
+
+def units_per_motor(model: ArmModel) -> Array:
+    """(n,) drive units per motor coordinate, negative where a drive counts backwards.
+
+    Args:
+        model: the arm.
+    """
+    return np.diag(model.units_per_q).copy()
+
+
+def joints_per_motor(model: ArmModel) -> Array:
+    """(n, n) joint positions per motor coordinate.
+
+    Args:
+        model: the arm.
+    """
+    return np.array(model.q_per_unit * units_per_motor(model), dtype=np.float64)
+
+
+def position_sigma(model: ArmModel, q: npt.ArrayLike, T_flange_tool: Array, direction: npt.ArrayLike) -> float:
+    """Standard deviation of the tool's position along a direction, m, as drives round to whole units.
+
+    Args:
+        model: the arm.
+        q: (n,) joint positions, rad or m.
+        T_flange_tool: (4, 4) tool in the flange frame, m.
+        direction: (3,) unit vector, base frame.
+
+    Source: a rounding error is uniform over one unit, of variance 1/12, and independent from drive to drive.
+    """
+    return float(np.linalg.norm(position_per_unit(model, q, T_flange_tool, direction))) / math.sqrt(12.0)
+
+
+def position_per_unit(model: ArmModel, q: npt.ArrayLike, T_flange_tool: Array, direction: npt.ArrayLike) -> Array:
+    """(n,) by how much a unit of each drive moves the tool along a direction, m; arguments as of `position_sigma`."""
+    _, J = forward_jacobian(model.chain, q, T_flange_tool)
+    per_unit: Array = np.asarray(direction, dtype=float) @ J[:3] @ model.q_per_unit
+    return per_unit

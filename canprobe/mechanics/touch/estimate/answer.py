@@ -1,0 +1,446 @@
+"""The answer of an estimator: local shape at the last contact, with what is known about it and what is not."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from canprobe.mechanics.touch.estimate.noise import CHI2_99
+from canprobe.mechanics.touch.estimate.quadric import (
+    TO_Q,
+    UNIT,
+    Decision,
+    curvature_jacobian,
+    excited,
+    matrix_of,
+    outside,
+    tensor,
+    transport,
+)
+from canprobe.mechanics.touch.linear_algebra import (
+    Array,
+    Vec,
+    checked,
+    homogeneous,
+    inverted,
+    principal,
+    read_only,
+    solved,
+    tangent_rotation,
+)
+from canprobe.mechanics.touch.surface import SurfaceMatrix
+
+_ENTRY_LIMIT = 0.02
+"""Largest unobserved part of an entry of K that still has a number."""
+_DIRECTION_LIMIT = 0.05
+"""The same for the normal curvature along a direction."""
+_UMBILIC_CHI2 = 5.99
+_TO_Q_SQUARED = np.outer(TO_Q, TO_Q)
+_ARRAYS = (
+    *("S", "T_frame_contact", "K", "kappa", "directions", "covariance"),
+    *("observed", "combinations", "information"),
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class SurfaceEstimate:
+    """Local shape in the estimated contact frame of the last sample (z = inward normal); lengths in m.
+
+    What the data did not observe is NaN in `K`, `kappa`, infinite in `covariance`, and False in `observed`. `S` alone
+    is always finite: it holds unobserved combinations at the value nearest to flat, good for predicting along the
+    path that was travelled and for nothing else.
+
+    Attributes:
+        S: (4, 4) in the contact frame, c14 = c24 = c44 = 0, c34 = −½.
+        T_frame_contact: (4, 4) contact frame to the frame of the points; its origin is on the estimated surface.
+        K: (2, 2) shape operator in the contact frame, 1/m.
+        kappa: (2,) principal curvatures, κ1 ≥ κ2, 1/m. With one observed it stands first, whatever its size, and is the
+            normal curvature along `directions[0]`.
+        directions: (2, 3) rows: unit vectors of `kappa` in the frame of the points.
+        covariance: (3, 3) of (K11, K12, K22), 1/m².
+        observed: (2,) bool, for each of `kappa`.
+        rank: how many independent combinations of (K11, K12, K22) were observed, 0–3 (thresholds: `quadric`).
+        combinations: (rank, 3) rows: the observed ones as weights of (K11, √2 K12, K22).
+        information: (3, 3) information of the data about (K11, √2 K12, K22), m²; finite also where nothing is observed.
+        umbilic: κ1 and κ2 do not differ significantly (95 %): the directions mean nothing.
+        innovation: mean squared whitened residual per degree of freedom; about 1 when the model and the σ's are right.
+        distance: path that the estimate rests on, m.
+        samples: number of samples it rests on (effective, with forgetting).
+        method: name of the estimator.
+        prior: name of what was assumed.
+        notes: what a reader should know.
+        stiffness: K/h of the probe's layer, N/m³, from an estimator that knows it; else None.
+        problem_root: root of the information (`rootᵀ root`) of the whitened dimensionless least-squares problem.
+        model_root: (n, 9) root of the information (`rootᵀ root`, prior included) about the entries of `S` in the
+            contact frame, in the order c14, c24, c44, c13, c23, c33, c11, c12, c22; SI units. It holds also what is
+            known of place and normal. None from the methods of differences, which do not know it.
+        evidence: what the data (and a prior on curvature) say about K before the rank decision, to be fused with
+            another source. None from the methods of differences.
+    """
+
+    S: Array
+    T_frame_contact: Array
+    K: Array
+    kappa: Array
+    directions: Array
+    covariance: Array
+    observed: Array
+    rank: int
+    combinations: Array
+    information: Array
+    umbilic: bool
+    innovation: float
+    distance: float
+    samples: float
+    method: str
+    prior: str
+    problem_root: Array
+    notes: tuple[str, ...] = ()
+    model_root: Array | None = None
+    evidence: CurvatureInformation | None = None
+    stiffness: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in _ARRAYS:
+            getattr(self, name).setflags(write=False)
+        if self.model_root is not None:
+            self.model_root.setflags(write=False)
+
+    @classmethod
+    def of(cls, T_frame_contact: Array, K: Array, *, method: str = "own") -> SurfaceEstimate:
+        """An estimate of which only frame and curvature are known, from an estimator of your own.
+
+        Args:
+            T_frame_contact: (4, 4) contact frame to that of the points: its origin on the surface, z the inward normal.
+            K: (2, 2) shape operator along its x and y, 1/m; positive where the object is convex.
+            method: name of the estimator.
+        """
+        K = checked("K", K, (2, 2)).copy()
+        T_frame_contact = checked("T_frame_contact", T_frame_contact, (4, 4))
+        T, (kappa, local) = read_only(T_frame_contact), _principal(K)
+        return cls(
+            S=SurfaceMatrix.from_curvature(K).S.copy(),
+            T_frame_contact=T,
+            K=K,
+            kappa=kappa,
+            directions=local @ T[:3, :2].T,
+            covariance=np.full((3, 3), math.inf),
+            observed=np.array([True, True]),
+            rank=3,
+            combinations=np.eye(3),
+            information=np.zeros((3, 3)),
+            umbilic=False,
+            innovation=math.nan,
+            distance=math.nan,
+            samples=math.nan,
+            method=method,
+            prior="none",
+            problem_root=np.eye(3),
+        )
+
+    @property
+    def condition_number(self) -> float:
+        """Of the whitened dimensionless least-squares problem; infinite where it is singular."""
+        singular = np.linalg.svd(self.problem_root, compute_uv=False)
+        return float(singular[0] / singular[-1]) if singular[-1] > 0.0 else math.inf
+
+    @property
+    def T_base_contact(self) -> Array:
+        """`T_frame_contact` where the frame of the points is the base, as online."""
+        return self.T_frame_contact
+
+    @property
+    def surface(self) -> SurfaceMatrix:
+        """`S` with its operations."""
+        return SurfaceMatrix(self.S)
+
+    @property
+    def point(self) -> Array:
+        """(3,) the contact point on the estimated surface, m."""
+        return self.T_frame_contact[:3, 3]
+
+    @property
+    def normal(self) -> Array:
+        """(3,) the outward unit normal there."""
+        return -self.T_frame_contact[:3, 2]
+
+    def curvature_tensor_base(self) -> Array:
+        """(3, 3) shape operator as a tensor in the frame of the points, `P K Pᵀ`, 1/m.
+
+        From `S`, so always finite; it means nothing where `observed` is False.
+        """
+        P = self.T_frame_contact[:3, :2]
+        result: Array = P.dot(2.0 * self.S[:2, :2]).dot(P.T)
+        return result
+
+    def predict(self, point: Array) -> tuple[Array, Array]:
+        """Surface point and outward unit normal over (along the contact normal) a place near the contact.
+
+        Args:
+            point: (3,) in the frame of the points, m.
+
+        Returns:
+            Point (3,), m, and normal (3,), in the frame of the points; NaN where the quadric has no point there.
+        """
+        R, origin = self.T_frame_contact[:3, :3], self.T_frame_contact[:3, 3]
+        local = R.T @ (point - origin)
+        surface = self.surface
+        local[2] = float(surface.height(local[0], local[1]))
+        return origin + R @ local, R @ surface.normal(local)
+
+
+class Solution(NamedTuple):
+    """A solved local model, dimensionless, before it becomes an estimate.
+
+    Attributes:
+        c: (9,) in the contact frame (c14 = c24 = c44 = 0).
+        covariance: (3, 3) of (K11, K12, K22); used as it is where all is observed.
+        decision: on the data's information.
+        has_prior: a prior makes every combination finite.
+        root: (9, 9) root of the information about c with c14, c24, c44, prior included; None where it is not known.
+    """
+
+    c: Array
+    covariance: Array
+    decision: Decision
+    has_prior: bool
+    root: Array | None = None
+
+
+def build_estimate(
+    solution: Solution,
+    *,
+    length: float,
+    T_frame_contact: Array,
+    problem_root: Array,
+    innovation: float,
+    distance: float,
+    samples: float,
+    method: str,
+    prior: str,
+    notes: tuple[str, ...] = (),
+    evidence: CurvatureInformation | None = None,
+    stiffness: float | None = None,
+) -> SurfaceEstimate:
+    """An estimate from a solution in units of `length` (m)."""
+    S = matrix_of(solution.c)
+    S[:3, :3] /= length
+    k = 2.0 * S[:2, :2]
+    decision = solution.decision
+    covariance = solution.covariance / length**2
+    T = read_only(T_frame_contact)
+    if decision.rank == 3:
+        kappa, local = _principal(k)
+        observed = np.array([True, True])
+        umbilic = is_umbilic(k, covariance)
+    else:
+        k, covariance, kappa, local, observed = _partly(k, covariance, decision, solution.has_prior, length)
+        umbilic = False
+    V = decision.vectors
+    return SurfaceEstimate(
+        S=S,
+        T_frame_contact=T,
+        K=k,
+        kappa=kappa,
+        directions=local.dot(T[:3, :2].T),
+        covariance=covariance,
+        observed=observed,
+        rank=decision.rank,
+        combinations=V[:, decision.passed].T.copy(),
+        information=(V * decision.information).dot(V.T) * length**2,
+        umbilic=umbilic,
+        problem_root=problem_root,
+        innovation=innovation,
+        distance=distance,
+        samples=samples,
+        method=method,
+        prior=prior,
+        notes=notes,
+        model_root=None if solution.root is None else solution.root * [1.0, 1.0, 1.0 / length, *6 * [length]],
+        evidence=evidence,
+        stiffness=stiffness,
+    )
+
+
+def _principal(K: Array) -> tuple[Array, Array]:
+    """κ1 ≥ κ2 and their directions as rows (2, 2)."""
+    mean, radius, angle = principal(K)
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([mean + radius, mean - radius]), np.array([[c, s], [-s, c]])
+
+
+def is_umbilic(K: Array, covariance: Array) -> bool:
+    """The deviator (K11 − K22, 2 K12) is within its 95 % region of 0."""
+    (k11, k12), (_, k22) = K.tolist()
+    (c11, c12, c13), (_, c22, c23), (_, _, c33) = covariance.tolist()
+    x, y = k11 - k22, 2.0 * k12
+    a, b, d = c11 - 2.0 * c13 + c33, 2.0 * (c12 - c23), 4.0 * c22
+    determinant = a * d - b * b
+    return bool(determinant > 0.0 and (d * x * x - 2.0 * b * x * y + a * y * y) < _UMBILIC_CHI2 * determinant)
+
+
+def _partly(
+    K: Array, covariance: Array, decision: Decision, has_prior: bool, length: float
+) -> tuple[Array, Array, Array, Array, Array]:
+    """K, covariance, kappa, directions and flags where the data left something open."""
+    if has_prior:
+        kappa, local = _principal(K)
+        flags = [outside(decision, _projector(d)) < _DIRECTION_LIMIT for d in local]
+        return K, covariance, kappa, local, np.array(flags)
+    t = _observed_direction(decision)
+    local = np.array([t, [-t[1], t[0]]])
+    seen = decision.rank > 0 and outside(decision, _projector(t)) < _DIRECTION_LIMIT
+    kappa = np.array([float(t @ K @ t) if seen else math.nan, math.nan])
+    hidden = np.array([outside(decision, e) >= _ENTRY_LIMIT for e in np.eye(3)])
+    K = np.where(hidden[[[0, 1], [1, 2]]], math.nan, K)
+    V, passed = decision.vectors, decision.passed
+    covariance = partial_covariance(V[:, passed], decision.information[passed], hidden) / length**2
+    return K, covariance, kappa, local, np.array([seen, False])
+
+
+def partial_covariance(V: Array, information: Array, hidden: Array) -> Array:
+    """Covariance (3, 3) of (K11, K12, K22), NaN and infinite in the hidden (3,) entries.
+
+    Args:
+        V: (3, k) columns: observed combinations of q, and
+        information: (k,) about each.
+        hidden: (3,) bool.
+    """
+    C: Array = (V / information) @ V.T / np.outer(TO_Q, TO_Q)
+    C[hidden] = C[:, hidden] = math.nan
+    C[hidden, hidden] = math.inf
+    return C
+
+
+def _projector(t: Array) -> Array:
+    """q of t tᵀ, the normal curvature along the tangent direction t (2,)."""
+    x, y = t.tolist()
+    result: Array = TO_Q * [x * x, x * y, y * y]
+    return result
+
+
+def _observed_direction(decision: Decision) -> Array:
+    """The tangent direction whose normal curvature the data know best.
+
+    With one combination open it is the null direction of that combination; with two, the main direction of the
+    observed one.
+    """
+    if decision.rank == 0:
+        return np.array([1.0, 0.0])
+    open_one = decision.rank == 2
+    wanted = np.logical_not(decision.passed) if open_one else decision.passed
+    q = decision.vectors[:, int(np.argmax(wanted))]
+    values, vectors = np.linalg.eigh(tensor(q))
+    order = np.argsort(np.abs(values))
+    result: Array = vectors[:, order[0 if open_one else 1]]
+    return result if result[np.argmax(np.abs(result))] > 0.0 else -result
+
+
+# What a source says about curvature: value and information, before any decision on what is observed.
+
+
+class CurvatureInformation(NamedTuple):
+    """What a source says about q = (K11, √2 K12, K22) in some contact frame.
+
+    Attributes:
+        q: (3,) its own value, 1/m; counts only where there is information.
+        information: (3, 3) inverse covariance, m².
+    """
+
+    q: Array
+    information: Array
+
+
+def evidence_of(c: Array, covariance: Array, spread: Array | None, length: float) -> CurvatureInformation:
+    """The evidence of a solution with all its parameters free.
+
+    Args:
+        c: (9,) parameters in the contact frame, in units of `length` (m).
+        covariance: (3, 3) of (K11, K12, K22) (`curvature_covariance`).
+        spread: (2, 2) covariance of the points in the tangent plane over the variance of their noise. What they were
+            not spread for is marginalised: noise alone answers it, with −1/R_p where it is that of centroids on a
+            probe. None where a prior answers it.
+    """
+    covariance = _TO_Q_SQUARED * covariance / length**2
+    q = c[6:] / (UNIT * length)
+    axes, wide = (np.eye(3), np.ones(3, dtype=bool)) if spread is None else excited(spread)
+    if wide.all():
+        return CurvatureInformation(q, inverted(covariance))
+    seen = axes[:, wide]
+    known = inverted(seen.T.dot(covariance).dot(seen)) if wide.any() else np.zeros((0, 0))
+    return CurvatureInformation(q, seen.dot(known).dot(seen.T))
+
+
+def curvature_covariance(c: Array, deviation: Array) -> Array:
+    """Covariance (3, 3) of (K11, K12, K22) by the delta method, dimensionless.
+
+    What c13, c23, c33 put K off by is proportional to K. Where the K found is its own noise so is that part, and it is
+    largest where the noise is: a region round a plane would grow with its own error and hold K = 0 always. So it
+    counts only where K = 0 is refuted, by 1 − (q/χ²)², χ² that of K = 0 with c13, c23, c33 known, q its 99 % point.
+
+    Args:
+        c: (9,) parameters in the contact frame.
+        deviation: (9, k) root of their covariance: `deviation @ deviationᵀ`.
+
+    Source: Judge and Bock, "The statistical implications of pre-test and Stein-rule estimators in econometrics", 1978.
+    """
+    D, others = curvature_jacobian(c).dot(deviation), deviation[3:6]
+    cross = D.dot(others.T)
+    by_others = cross.dot(solved(others.dot(others.T), cross.T))
+    own = D.dot(D.T) - by_others
+    chi2 = 4.0 * float(c[6:].dot(solved(own, c[6:])))
+    refuted = 1.0 - (CHI2_99 / max(chi2, CHI2_99)) ** 2
+    return np.asarray(own + refuted * by_others, dtype=np.float64)
+
+
+# From a fit in a working frame to the estimated contact frame.
+
+
+class Anchor(NamedTuple):
+    """A solution in its own contact frame.
+
+    Attributes:
+        c: (9,) dimensionless, c14 = c24 = c44 = 0.
+        M: (9, 9) d(c)/d(c of the working frame).
+        T_frame_contact: (4, 4), m.
+        turn: angle of the contact frame's x axis from the working frame's, rad.
+    """
+
+    c: Array
+    M: Array
+    T_frame_contact: Array
+    turn: float
+
+
+def foot(c: Array, start: Vec) -> tuple[Vec, Vec]:
+    """Foot of a nearby point on the model's surface and the inward unit normal there, dimensionless."""
+    half0, half1, constant, *entries = c.tolist()
+    b02, b12, b22, b00, b01, b11 = [2.0 * entry for entry in entries]
+    h0, h1, h2 = 2.0 * half0, 2.0 * half1, -1.0
+    p, q, r = x, y, z = start
+    u, v, w = b00 * x + b01 * y + b02 * z + h0, b01 * x + b11 * y + b12 * z + h1, b02 * x + b12 * y + b22 * z + h2
+    for _ in range(4):
+        # along the gradient to the surface, and back over the start along the tangent plane
+        f = 0.5 * (x * (u + h0) + y * (v + h1) + z * (w + h2)) + constant
+        share = ((x - p) * u + (y - q) * v + (z - r) * w - f) / (u * u + v * v + w * w)
+        x, y, z = p + share * u, q + share * v, r + share * w
+        u, v, w = b00 * x + b01 * y + b02 * z + h0, b01 * x + b11 * y + b12 * z + h1, b02 * x + b12 * y + b22 * z + h2
+    size = math.sqrt(u * u + v * v + w * w)
+    return (x, y, z), (-u / size, -v / size, -w / size)
+
+
+def anchor(c: Array, T_frame_work: Array, point: Vec, length: float) -> Anchor:
+    """A model at the foot of a point; c (9,) and the point in the working frame, in units of `length` (m)."""
+    x, z = foot(c, point)
+    R_work = T_frame_work[:3, :3]
+    R = tangent_rotation(R_work.dot(z).tolist())
+    R_work_contact = R_work.T.dot(R)
+    c_new, M = transport(c, homogeneous(R_work_contact, x))
+    c_new[:3] = 0.0
+    origin = T_frame_work[:3, 3] + length * R_work.dot(x)
+    (xx, xy, _), (yx, yy, _), _ = R_work_contact.tolist()
+    turn = math.atan2(yx - xy, xx + yy)
+    return Anchor(c_new, M, homogeneous(R, origin), turn)

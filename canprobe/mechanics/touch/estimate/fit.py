@@ -1,0 +1,202 @@
+"""`fit_surface`: local shape from points and normals of one stretch of contact; and the online estimators by name."""
+
+from __future__ import annotations
+
+import difflib
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from canprobe.errors import UsageError
+from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
+from canprobe.mechanics.touch.estimate.likelihood import Touches, checked_arrays, fit_ml, make_touches
+from canprobe.mechanics.touch.estimate.noise import Correlation, Prior, make_noise
+from canprobe.mechanics.touch.estimate.online import Estimator
+from canprobe.mechanics.touch.estimate.recursive import RecursiveEstimator
+from canprobe.mechanics.touch.estimate.window import (
+    Chen1996Estimator,
+    ChordEstimator,
+    MlEstimator,
+    chord_pairs,
+    lag_pairs,
+    solve_pairs,
+    usable_lag,
+)
+from canprobe.mechanics.touch.linear_algebra import whole
+
+METHODS = ("chen1996", "chord", "ml", "recursive")
+
+
+def make_estimator(
+    method: str,
+    *,
+    sigma_point: float,
+    sigma_normal: float,
+    memory_m: float = 0.02,
+    window: int = 160,
+    prior: Prior | None = None,
+    lag: int = 10,
+    correlation: Correlation | None = None,
+    coupling: float = 0.0,
+) -> Estimator:
+    """An online estimator.
+
+    Args:
+        method: one of `METHODS`.
+        sigma_point: effective standard deviation of a contact point per axis, m.
+        sigma_normal: of a normal per tangent axis, rad.
+        memory_m: path that `recursive` remembers (e-folding), m.
+        window: samples that the batch methods keep; for `recursive` the samples on one memory at the nominal pace.
+        prior, lag, correlation, coupling: as for `fit_surface`.
+
+    Raises:
+        UsageError: on an unknown method or a value out of range.
+    """
+    if method == "recursive":
+        return RecursiveEstimator(
+            sigma_point=sigma_point,
+            sigma_normal=sigma_normal,
+            memory_m=memory_m,
+            window=window,
+            prior=prior,
+            correlation=correlation,
+            coupling=coupling,
+        )
+    if method == "ml":
+        return MlEstimator(
+            sigma_point=sigma_point,
+            sigma_normal=sigma_normal,
+            window=window,
+            prior=prior,
+            coupling=coupling,
+            correlation=correlation,
+        )
+    if method == "chord":
+        return ChordEstimator(sigma_point=sigma_point, sigma_normal=sigma_normal, window=window)
+    if method == "chen1996":
+        return Chen1996Estimator(sigma_point=sigma_point, sigma_normal=sigma_normal, window=window, lag=lag)
+    raise unknown_method(method)
+
+
+def unknown_method(method: str) -> UsageError:
+    """The error for a name that is no method, with the nearest one."""
+    near = difflib.get_close_matches(str(method), METHODS, n=1)
+    hint = f'; did you mean "{near[0]}"?' if near else ""
+    return UsageError(f"method: expected one of {', '.join(METHODS)}, got {method!r}{hint}")
+
+
+def fit_surface(
+    points: ArrayLike,
+    normals: ArrayLike,
+    *,
+    sigma_point: ArrayLike,
+    sigma_normal: ArrayLike,
+    method: str = "ml",
+    prior: Prior | None = None,
+    lag: int = 10,
+    correlation: Correlation | None = None,
+    coupling: float = 0.0,
+    quadric: bool = False,
+) -> SurfaceEstimate:
+    """Local shape at the last of a series of contact points.
+
+    Lengths may be in any unit as long as it is one: the answer scales with it.
+
+    Args:
+        points: (n, 3) contact points on the object in one frame, in the order of time; the last row is now.
+        normals: (n, 3) outward unit normals of the object there.
+        sigma_point: standard deviation of a point per axis: a number, (n,), or covariances (3, 3) or (n, 3, 3).
+        sigma_normal: the same of a normal, rad (of a covariance only the tangential part counts).
+        method: "ml" (reaches the Cramér–Rao bound), "recursive" (the online filter run over the points; it remembers
+            all of a short path, of a longer one at most twice the points' extent and the surface's radius), "chord",
+            or "chen1996". The last has no robot here: its rates are differences of points and normals `lag` apart,
+            (16) with the object at rest.
+        prior: for "ml" and "recursive"; None for `Prior.weak` over the path, nothing on curvature itself.
+        lag: for "chen1996".
+        correlation: of the noise along the path, for "ml", which weighs the samples by it, and "recursive", whose
+            covariance grows by it; None for independent samples.
+        coupling: for "ml" and "recursive": 1/R_p where point and normal come from one centroid on a spherical probe, so
+            that their errors are coupled (`Noise`); 0 for independent ones.
+        quadric: for "ml" and "recursive": the surface is known to be one. Otherwise its cubic and quartic terms are
+            corrected for where they show and allowed for in the covariance where they could hide (`nonlinear`).
+
+    Returns:
+        The estimate; what the points did not observe is marked, not guessed.
+
+    Raises:
+        UsageError: naming the field, what was expected and what was got.
+
+    Example:
+        >>> import numpy as np
+        >>> from canprobe import fit_surface
+        >>> a = np.linspace(-0.2, 0.0, 40)
+        >>> n = np.stack([np.sin(a), 0.3 * np.sin(20 * a), -np.cos(a)], axis=1)
+        >>> n /= np.linalg.norm(n, axis=1, keepdims=True)
+        >>> estimate = fit_surface(0.05 * n, n, sigma_point=2e-5, sigma_normal=1e-3)
+        >>> estimate.kappa.round(1).tolist()
+        [20.0, 20.0]
+    """
+    p, n = checked_arrays(points, normals, 3 if method == "chen1996" else 2)
+    touches = make_touches(p, n, make_noise(len(p), sigma_point, sigma_normal, coupling), correlation)
+    if method in ("ml", "recursive"):
+        fitted = fit_ml if method == "ml" else _run_filter
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):  # what is not finite has no root
+                return fitted(touches, prior, quadric)
+        except (np.linalg.LinAlgError, OverflowError) as error:
+            raise UsageError(
+                f"sigma_point, sigma_normal: expected those of real noise, got {sigma_point!r} and {sigma_normal!r}, "
+                f"with which the equations cannot be solved in double precision: {error}"
+            ) from error
+    if correlation is not None:
+        raise UsageError(f"correlation: expected none for {method!r}, which has no noise model, got {correlation}")
+    if method == "chord":
+        return solve_pairs(touches, chord_pairs(touches), "chord")
+    if method == "chen1996":
+        apart = usable_lag(len(p), whole("lag", lag, 1, "sample"))
+        return solve_pairs(touches, lag_pairs(touches, apart), "chen1996")
+    raise unknown_method(method)
+
+
+def _run_filter(touches: Touches, prior: Prior | None, quadric: bool) -> SurfaceEstimate:
+    """The answer of `recursive` after samples of which only place and normal are known."""
+    memory = _memory_of(touches)
+    point, normal = np.sqrt(touches.noise.point_variance), np.sqrt(touches.noise.normal_variance)
+    estimator = RecursiveEstimator(
+        sigma_point=math.sqrt(float(np.mean(point**2))),
+        sigma_normal=math.sqrt(float(np.mean(normal**2))),
+        memory_m=memory,
+        window=max(1, round(len(point) * memory / max(touches.distance, touches.extent))),
+        prior=prior,
+        correlation=touches.correlation,
+        coupling=touches.noise.coupling,
+        quadric=quadric,
+    )
+    nowhere = np.eye(4)
+    for i, (p, n) in enumerate(zip(touches.points, touches.normals, strict=True)):
+        estimator.add(ContactSample(float(i), p, n, nowhere, nowhere[:3, 2], 0.0, float(point[i]), float(normal[i])))
+    answer = estimator.estimate()
+    if answer is None:
+        raise UsageError(
+            f"points: expected a path that moves beyond its noise for 'recursive', got {touches.distance:.3g} in all "
+            f"with sigma_point {math.sqrt(float(np.mean(point**2))):.3g}"
+        )
+    return answer
+
+
+EXTENTS = 2.0
+"""Longest memory over the extent of the points: a weave or a circle has seen all directions by then."""
+
+
+def _memory_of(touches: Touches) -> float:
+    """Path that `recursive` remembers, m: all of a short one; of a longer one as much as extent and radius allow.
+
+    The filter's unit of length, its steps and its prior are shares of the memory. On a long path over a small patch the
+    length of the path would make steps larger than the patch.
+    """
+    off, turned = touches.points - touches.points[-1], touches.normals - touches.normals[-1]
+    square = float(np.square(turned).sum())
+    radius = math.sqrt(float(np.square(off).sum()) / square) if square > 0.0 else math.inf  # exact on a sphere
+    return min(max(touches.distance, touches.extent), EXTENTS * touches.extent, max(radius, 0.5 * touches.extent))

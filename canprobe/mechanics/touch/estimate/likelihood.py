@@ -1,0 +1,252 @@
+"""Maximum likelihood from points and normals: the checked arrays, the `ml` fit, and the Cramér–Rao bound."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from canprobe.errors import UsageError
+from canprobe.mechanics.touch.estimate.answer import (
+    Solution,
+    SurfaceEstimate,
+    anchor,
+    build_estimate,
+    curvature_covariance,
+    evidence_of,
+    partial_covariance,
+)
+from canprobe.mechanics.touch.estimate.noise import Correlation, Noise, Prior, make_noise, mixed
+from canprobe.mechanics.touch.estimate.nonlinear import CERTAIN, DIFFUSE, correct, fit, misfit_notes
+from canprobe.mechanics.touch.estimate.quadric import (
+    UNIT,
+    curvature_jacobian,
+    decide,
+    design,
+    linearise,
+    nothing_observed,
+    parameters_of,
+    spread_of,
+    turned,
+)
+from canprobe.mechanics.touch.linear_algebra import (
+    MAX_LENGTH,
+    Array,
+    checked,
+    homogeneous,
+    instance,
+    inverted,
+    solved,
+    tangent_rotation,
+    upper_root,
+)
+from canprobe.mechanics.touch.surface import SurfaceMatrix
+
+_FLOOR = 20.0
+"""Least extent in standard deviations of a point: shorter paths are noise, and no length to measure curvature by."""
+
+_MEAN_OF = 8
+
+
+class Touches(NamedTuple):
+    """Checked input of a batch fit.
+
+    Attributes:
+        points, normals: (n, 3); the last row is now.
+        noise: of the n samples.
+        extent: largest distance from the last point, never below noise, m: the unit of length.
+        distance: length along the path, m.
+        correlation: of the noise along the path; None for independent samples.
+    """
+
+    points: Array
+    normals: Array
+    noise: Noise
+    extent: float
+    distance: float
+    correlation: Correlation | None = None
+
+    def whitener(self) -> Array | None:
+        """(3, n, n) that makes the whitened samples independent; None where they are."""
+        if self.correlation is None:
+            return None
+        return self.correlation.whitener(np.linspace(0.0, self.distance, len(self.points)))
+
+
+def make_touches(points: Array, normals: Array, noise: Noise, correlation: Correlation | None = None) -> Touches:
+    """Extent and length of arrays that are already checked."""
+    if correlation is not None:
+        instance("correlation", correlation, Correlation)
+    floor = _FLOOR * math.sqrt(float(np.median(noise.point_variance)))
+    offset = points - points[-1]
+    extent = max(math.sqrt(float(np.einsum("ij,ij->i", offset, offset).max())), floor)
+    return Touches(points, normals, noise, extent, _travelled(points), correlation)
+
+
+def _travelled(points: Array) -> float:
+    """Length along noisy points (n, 3): of means over up to eight, or their noise alone would add up to a path."""
+    each = min(_MEAN_OF, max(1, len(points) // 20))
+    means = points[len(points) % each :].reshape(-1, each, 3).mean(axis=1)
+    steps = np.diff(means, axis=0)
+    share = (len(points) - 1) / max(len(points) - each, 1)  # the ends that the means cut off
+    return share * float(np.sqrt(np.einsum("ij,ij->i", steps, steps)).sum())
+
+
+def checked_arrays(points: ArrayLike, normals: ArrayLike, least: int) -> tuple[Array, Array]:
+    """Points and unit normals (n, 3), n ≥ least; else a UsageError that names the field."""
+    p, n = checked("points", points, (None, 3)), checked("normals", normals, (None, 3))
+    if len(p) < least:
+        raise UsageError(f"points: expected at least {least} samples, got {len(p)}")
+    if float(np.abs(p).max()) > MAX_LENGTH:
+        raise UsageError(f"points: expected coordinates up to {MAX_LENGTH:g}, got {np.abs(p).max():g}")
+    if len(n) != len(p):
+        raise UsageError(f"normals: expected one per point, shape ({len(p)}, 3), got {n.shape}")
+    size = np.sqrt(np.einsum("ij,ij->i", n, n))
+    worst = int(np.argmax(np.abs(size - 1.0)))
+    if abs(size[worst] - 1.0) > 1e-6:
+        raise UsageError(f"normals: expected unit vectors, got length {size[worst]:.9g} at index {worst}")
+    if float((n @ n[-1]).min()) <= 0.0:
+        raise UsageError("normals: expected all within 90° of the last (one side of a surface), got some beyond")
+    return p, n
+
+
+def working_frame(touches: Touches) -> Array:
+    """T (4, 4) from the frame at the last measured point, z against its measured normal, to the frame of the points."""
+    return homogeneous(tangent_rotation(-touches.normals[-1]), touches.points[-1])
+
+
+def fit_ml(touches: Touches, prior: Prior | None, quadric: bool = False) -> SurfaceEstimate:
+    """The `ml` estimate (`nonlinear`), in the estimated contact frame of the last point; prior, quadric: as for
+    `fit_surface`.
+    """
+    length = touches.extent
+    stated = Prior.weak(length) if prior is None else instance("prior", prior, Prior)
+    T = working_frame(touches)
+    R = T[:3, :3]
+    d = design((touches.points - T[:3, 3]) @ R / length, touches.normals @ R, touches.noise.scaled(length, R))
+    independent = touches.whitener()
+    result = fit(d, stated.rows(length), independent)
+    problem_root = result.root
+    notes: tuple[str, ...] = () if result.converged else ("the iteration did not settle",)
+    if result.decision.rank == 3 and not quadric:
+        corrected = correct(result.c, result.root, d, independent)
+        trusted = corrected.trusted and (result.converged or corrected.misfit <= CERTAIN)
+        notes += misfit_notes(corrected.misfit, trusted=trusted)
+        if trusted:
+            c, root = corrected.c, corrected.root
+            result = result._replace(c=c, root=root, free=c, free_root=root)
+        else:
+            result = result._replace(decision=nothing_observed(), free_root=DIFFUSE * np.eye(9))
+    has_prior = math.isfinite(stated.sigma_curvature)
+    a = anchor(result.c, T, (0.0, 0.0, 0.0), length)
+    decision = result.decision._replace(vectors=turned(a.turn) @ result.decision.vectors)
+    if decision.rank == 3 or has_prior:
+        covariance = curvature_covariance(a.c, a.M @ inverted(result.root))
+    else:
+        covariance = np.full((3, 3), math.nan)
+    free = anchor(result.free, T, (0.0, 0.0, 0.0), length)
+    spread = None if has_prior else _turned_spread(spread_of(d.X, d.point_variance), free.turn)
+    deviation = solved(result.free_root.T, free.M.T).T
+    if result.outliers:
+        notes += (f"{result.outliers} samples with reduced weight",)
+    return build_estimate(
+        Solution(a.c, covariance, decision, has_prior, root=solved(a.M.T, result.root.T).T),
+        length=length,
+        T_frame_contact=a.T_frame_contact,
+        problem_root=problem_root,
+        innovation=result.innovation,
+        distance=touches.distance,
+        samples=float(len(touches.points)),
+        method="ml",
+        prior=stated.name,
+        notes=notes,
+        evidence=evidence_of(free.c, curvature_covariance(free.c, deviation), spread, length),
+    )
+
+
+def _turned_spread(spread: Array, angle: float) -> Array:
+    """A covariance (2, 2) in axes turned by an angle (rad)."""
+    c, s = math.cos(angle), math.sin(angle)
+    R = np.array([[c, -s], [s, c]])
+    result: Array = R.T @ spread @ R
+    return result
+
+
+OFF_SURFACE = 10.0
+"""Distance of a point from the surface over its standard deviation, beyond which the point is taken to be off it."""
+
+
+def cramer_rao(
+    points: ArrayLike,
+    normals: ArrayLike,
+    S: SurfaceMatrix | ArrayLike,
+    *,
+    sigma_point: ArrayLike,
+    sigma_normal: ArrayLike,
+    prior: Prior | None = None,
+    correlation: Correlation | None = None,
+    coupling: float = 0.0,
+) -> Array:
+    """Least covariance that an unbiased estimate of local curvature can have.
+
+    Information `Σ JᵀJ` of the whitened residual rows at the true surface, plus the prior's, reduced to K by the delta
+    method. Sorted principal curvatures are not differentiable at umbilics, so the bound is on the entries of K.
+
+    Args:
+        points: (n, 3) m, on the true surface, or measured: not further off than `OFF_SURFACE` times their noise; the
+            last row is now.
+        normals: (n, 3) outward unit normals.
+        S: (4, 4) the true surface in the frame of the points.
+        sigma_point, sigma_normal, prior, correlation, coupling: as for `fit_surface`; the prior that the estimator has.
+
+    Returns:
+        (3, 3) covariance of (K11, K12, K22), 1/m², in the contact frame of the last point,
+        `SurfaceMatrix(S).contact_frame(foot of the last point)`; infinite where nothing is known.
+
+    Raises:
+        UsageError: naming the field, what was expected and what was got.
+
+    Source: Kay, "Fundamentals of statistical signal processing: estimation theory", ch. 3.
+    """
+    p, n = checked_arrays(points, normals, 1)
+    touches = make_touches(p, n, make_noise(len(p), sigma_point, sigma_normal, coupling), correlation)
+    surface = S if isinstance(S, SurfaceMatrix) else SurfaceMatrix(checked("S", S, (4, 4)))
+    gradient = surface.gradient(p)
+    off = np.abs(surface.value(p)) / np.maximum(np.sqrt(np.einsum("ij,ij->i", gradient, gradient)), 1e-300)
+    limit = OFF_SURFACE * np.sqrt(touches.noise.point_variance) + 1e-9 * np.abs(p).max()  # and rounding
+    worst = int(np.argmax(off / limit))
+    if off[worst] > limit[worst]:
+        raise UsageError(
+            f"points: expected all on S, up to {limit[worst]:.3g} off ({OFF_SURFACE:g} sigma_point), got one "
+            f"{off[worst]:.3g} off at index {worst}; S is expected in the frame and unit of the points"
+        )
+    return osculating_bound(touches, surface, prior)
+
+
+def osculating_bound(touches: Touches, surface: SurfaceMatrix, prior: Prior | None = None) -> Array:
+    """As `cramer_rao`, for a quadric that need only osculate the surface at the last point."""
+    p, n = touches.points, touches.normals
+    origin = surface.project(p[-1])
+    T = surface.contact_frame(origin)
+    length, R = touches.extent, T[:3, :3]
+    in_contact = surface.normalised_at(origin).transformed(T).S.copy()
+    in_contact[:3, :3] *= length
+    c = parameters_of(in_contact)
+    d = design((p - origin) @ R / length, n @ R, touches.noise.scaled(length, R))
+    J = linearise(c, d).jacobian()
+    independent = touches.whitener()
+    J = (J if independent is None else mixed(independent, J)).reshape(-1, 9)
+    stated = Prior.weak(length) if prior is None else instance("prior", prior, Prior)
+    root = upper_root(np.concatenate([J, stated.rows(length)[0]]))
+    wide = 1e30 * np.eye(2)
+    decision = decide(root[6:, 6:] * UNIT, wide, math.inf)
+    known = decision.passed & (decision.information > 0.0)  # points in one place know nothing
+    if not known.all():
+        V = decision.vectors[:, known]
+        hidden = 1.0 - np.einsum("ij,ij->i", V, V) > 1e-9
+        return partial_covariance(V, decision.information[known], hidden) / length**2
+    X = np.linalg.solve(root.T, curvature_jacobian(c).T)
+    result: Array = X.T @ X / length**2
+    return result

@@ -1,0 +1,231 @@
+"""What is assumed before an estimate: the noise of measured points and normals, and the prior on a surface."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from numbers import Real
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from canprobe.errors import UsageError
+from canprobe.mechanics.touch.linear_algebra import (
+    MAX_LENGTH,
+    MAX_MAGNITUDE,
+    Array,
+    checked,
+    inverted_upper,
+    lower_root,
+    positive,
+    real_numbers,
+)
+
+CHI2_MEDIAN, CHI2_95, CHI2_99, CHI2_999 = 2.366, 7.815, 11.34, 16.27
+"""Median, 95 %, 99 % and 99.9 % points of χ² with three degrees of freedom, which a sample has."""
+
+
+@dataclass(frozen=True, slots=True)
+class Correlation:
+    """Noise that is alike from sample to sample: hysteresis, aliasing of a moving centroid, an arm that bends.
+
+    Between samples a path of s apart the noise of points and normals, whitened to unit variance, has the correlation
+    `share · exp(−s / length)`; the rest of the variance, 1 − share, is independent (a first-order autoregression over
+    the path plus white noise). Where the contact comes back to the same place its error is taken for a new one.
+
+    Attributes:
+        length: correlation length, m (the unit of the points).
+        share: of the variance, 0 to 1.
+        point_share: that of the points along the normal, where it is another than that of the normals.
+    """
+
+    length: float
+    share: float = 1.0
+    point_share: float | None = None
+
+    def __post_init__(self) -> None:
+        positive("correlation.length", self.length)
+        others = {} if self.point_share is None else {"point_share": self.point_share}
+        for name, value in {"share": self.share, **others}.items():
+            share = float(checked(f"correlation.{name}", value, ()))
+            if not 0.0 <= share <= 1.0:
+                raise UsageError(f"correlation.{name}: expected a number from 0 to 1, got {share}")
+
+    @property
+    def shares(self) -> Array:
+        """(3,) of a sample's three rows: height, and the two parts of the normal."""
+        return np.array([self.share if self.point_share is None else self.point_share, self.share, self.share])
+
+    def matrix(self, path: Array) -> Array:
+        """Correlations (3, n, n) of the rows of samples at places (n,) along the path, m."""
+        R: Array = self.shares[:, None, None] * np.exp(-np.abs(path[:, None] - path) / self.length)
+        here = np.arange(len(path))
+        R[:, here, here] = 1.0
+        return R
+
+    def whitener(self, path: Array) -> Array:
+        """(3, n, n): inverse lower Cholesky factors of `matrix`; samples at one place are told apart by 1e-9."""
+        of = {share: R + 1e-9 * np.eye(len(path)) for share, R in zip(self.shares, self.matrix(path), strict=True)}
+        found = {share: inverted_upper(lower_root(R).T).T for share, R in of.items()}  # once for rows that are alike
+        return np.array([found[share] for share in self.shares])
+
+
+def mixed(matrices: Array, rows: Array) -> Array:
+    """Rows (n, 3, k) mixed among the samples by the matrices (3, n, n) of their kinds."""
+    result: Array = (matrices @ rows.transpose(1, 0, 2)).transpose(1, 0, 2)
+    return result
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Noise:
+    """Noise of n samples.
+
+    Attributes:
+        point: (n,) standard deviation per axis, m, or (n, 3, 3) covariances, m².
+        normal: (n,) standard deviation per tangent axis, rad, or (n, 3, 3) covariances.
+        coupling: 1/m; an error e of a point along the surface comes with one of `−coupling · e` of its outward normal.
+            0 for independent errors; 1/R_p where both come from one centroid on a probe of that radius, which is felt
+            as a turn of `(K + coupling) e` against the surface.
+    """
+
+    point: Array
+    normal: Array
+    coupling: float = 0.0
+
+    @property
+    def isotropic(self) -> bool:
+        """Both are plain standard deviations."""
+        return self.point.ndim == 1 and self.normal.ndim == 1
+
+    @property
+    def point_variance(self) -> Array:
+        """(n,) variance per axis, the mean one where axes differ, m²."""
+        return _mean_variance(self.point)
+
+    @property
+    def normal_variance(self) -> Array:
+        """The same of the normals, rad²."""
+        return _mean_variance(self.normal)
+
+    def scaled(self, length: float, R: Array) -> Noise:
+        """The same noise in units of a length and in the frame whose axes are the columns of R (3, 3)."""
+        point = self.point / length if self.point.ndim == 1 else R.T @ self.point @ R / length**2
+        normal = self.normal if self.normal.ndim == 1 else R.T @ self.normal @ R
+        return Noise(point, normal, self.coupling * length)
+
+    def covariances(self) -> tuple[Array, Array]:
+        """Both as (n, 3, 3)."""
+        return _as_covariance(self.point), _as_covariance(self.normal)
+
+
+def make_noise(n: int, sigma_point: ArrayLike, sigma_normal: ArrayLike, coupling: float = 0.0) -> Noise:
+    """Checked noise of n samples, each sigma a number, (n,), or covariances (3, 3) or (n, 3, 3).
+
+    Raises:
+        UsageError: naming the field, when it has another shape, or is not finite and above 0 (definite).
+    """
+    alike = float(checked("coupling", coupling, ()))
+    return Noise(_one(n, "sigma_point", sigma_point), _one(n, "sigma_normal", sigma_normal), alike)
+
+
+def _one(n: int, name: str, value: ArrayLike) -> Array:
+    wanted = f"{name}: expected a number above 0, ({n},) of them, or definite covariances (3, 3) or ({n}, 3, 3)"
+    try:
+        sigma = real_numbers(value)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"{wanted}, got {value!r}") from error
+    if not np.isfinite(sigma).all():
+        raise UsageError(f"{wanted}, got a value that is not finite")
+    if sigma.shape in ((), (n,)):
+        if not (sigma > 0.0).all():
+            raise UsageError(f"{wanted}, got {sigma.min()}")
+        _refuse_extremes(name, sigma)
+        return np.ascontiguousarray(np.broadcast_to(sigma, (n,)))
+    if sigma.shape in ((3, 3), (n, 3, 3)):
+        if not np.abs(sigma).max() <= MAX_MAGNITUDE**2:
+            raise UsageError(f"{wanted}, got a variance of {np.abs(sigma).max():g}")
+        variances = np.linalg.eigvalsh(sigma)
+        if not (variances > 0.0).all() or np.abs(sigma - sigma.mT).max() > 1e-9 * np.abs(sigma).max():
+            raise UsageError(f"{wanted}, got one that is not symmetric and definite")
+        _refuse_extremes(name, np.sqrt(variances))
+        return np.ascontiguousarray(np.broadcast_to(sigma, (n, 3, 3)))
+    raise UsageError(f"{wanted}, got shape {sigma.shape}")
+
+
+def _refuse_extremes(name: str, deviations: Array) -> None:
+    """Refuse deviations that leave an estimate nothing but rounding, or whose information is no number."""
+    for one in (float(deviations.min()), float(deviations.max())):
+        if not 1.0 / MAX_MAGNITUDE <= one <= MAX_LENGTH:
+            limits = f"from {1.0 / MAX_MAGNITUDE:g} to {MAX_LENGTH:g}"
+            raise UsageError(f"{name}: expected a standard deviation {limits}, got {one:g}")
+
+
+def _mean_variance(sigma: Array) -> Array:
+    result: Array = sigma**2 if sigma.ndim == 1 else np.trace(sigma, axis1=1, axis2=2) / 3.0
+    return result
+
+
+def _as_covariance(sigma: Array) -> Array:
+    return sigma if sigma.ndim == 3 else (sigma**2)[:, None, None] * np.eye(3)
+
+
+# What is assumed of a surface before it is touched, always stated and named in the estimate.
+
+NUISANCE = (0.15, 0.15, 0.5)
+"""Standard deviations of c13, c23, c33 times the length of the path: 7.5, 7.5, 25 per m on a path of 20 mm.
+
+On a short path these three are nearly unobservable (on a plane exactly so). They are of the order of a surface's
+curvature; stated relative to the path they stay weak at every size, and the answer does not depend on the unit of
+length.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """Independent normal priors on entries of the normalised surface matrix in its contact frame.
+
+    Attributes:
+        name: appears in the estimate.
+        sigma_c13, sigma_c23, sigma_c33: 1/m, mean 0.
+        curvature: mean of the shape operator, `curvature · I`, 1/m.
+        sigma_curvature: standard deviation of K11 and K22 (of K12 its √½), 1/m; infinite for none, the default.
+            With it every combination has a finite answer; `observed` still says what the data alone observed.
+    """
+
+    name: str
+    sigma_c13: float
+    sigma_c23: float
+    sigma_c33: float
+    curvature: float = 0.0
+    sigma_curvature: float = math.inf
+
+    def __post_init__(self) -> None:
+        checked("curvature", self.curvature, ())
+        for field in ("sigma_c13", "sigma_c23", "sigma_c33", "sigma_curvature"):
+            value = getattr(self, field)
+            if not (isinstance(value, Real) and float(value) > 0.0):  # infinite: none
+                raise UsageError(f"prior.{field}: expected a number above 0, got {value!r}")
+
+    @classmethod
+    def weak(cls, length: float) -> Prior:
+        """The default: nothing on curvature, `NUISANCE / length` on c13, c23, c33."""
+        s13, s23, s33 = (s / positive("length", length) for s in NUISANCE)
+        return cls("weak on c13, c23, c33", s13, s23, s33)
+
+    @classmethod
+    def flat(cls, length: float, sigma_curvature: float) -> Prior:
+        """Weak on c13, c23, c33, and curvature 0 ± sigma_curvature (1/m) in every direction."""
+        s13, s23, s33 = (s / positive("length", length) for s in NUISANCE)
+        sigma_curvature = positive("sigma_curvature", sigma_curvature)
+        return cls(f"curvature 0 ± {sigma_curvature:.4g} per unit length", s13, s23, s33, 0.0, sigma_curvature)
+
+    def rows(self, length: float) -> tuple[Array, Array]:
+        """Whitened rows (6, 9) and right-hand side (6,) on the parameters of `quadric`, in units of `length`."""
+        A, b = np.zeros((6, 9)), np.zeros(6)
+        for row, (column, sigma) in enumerate(((3, self.sigma_c13), (4, self.sigma_c23), (5, self.sigma_c33))):
+            A[row, column] = 1.0 / (sigma * length)
+        inverse = 1.0 / (self.sigma_curvature * length)
+        for row, factor in ((3, 2.0), (4, 2.0 * math.sqrt(2.0)), (5, 2.0)):
+            A[row, 3 + row] = factor * inverse
+        b[3] = b[5] = self.curvature * length * inverse
+        return A, b

@@ -1,0 +1,374 @@
+"""`recursive`: the nine-parameter model as a square-root information filter; what runs in the 200 Hz loop.
+
+Constant work per sample whatever the memory, and no sample much dearer than another. Samples are collected until the
+contact has moved on by a step, then taken in together (`information`). Forgetting is per millimetre travelled, never
+per second; a contact that does not move adds nothing and forgets nothing. The first stretch, also after a change of
+the surface, is solved as a whole (`start`). The covariance is the sandwich of `Score`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+from canprobe.errors import UsageError
+from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.touch.estimate.answer import (
+    Solution,
+    SurfaceEstimate,
+    anchor,
+    build_estimate,
+    curvature_covariance,
+    evidence_of,
+)
+from canprobe.mechanics.touch.estimate.information import Expected, InformationFilter, Touch
+from canprobe.mechanics.touch.estimate.noise import CHI2_99, CHI2_999, Correlation, Prior
+from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE, misfit_notes
+from canprobe.mechanics.touch.estimate.online import ChangeTest, Dropped, Gate
+from canprobe.mechanics.touch.estimate.quadric import UNIT, decide, nothing_observed, size_of
+from canprobe.mechanics.touch.estimate.start import Start
+from canprobe.mechanics.touch.linear_algebra import (
+    Array,
+    homogeneous,
+    instance,
+    inverted,
+    inverted_upper,
+    lower_root,
+    positive,
+    tangent_rotation,
+    upper_root,
+)
+
+# How far a contact has moved, beyond its noise, and how its places spread.
+
+_MEDIAN_OF, _MEAN_OF = 5, 8
+_FAR2, _SLOWLY = 16.0, 0.05
+"""Squared distance from the median, over the usual, that is no jump; and the share of one point in the usual."""
+
+
+class Travel:
+    """Path of a noisy point: its running mean over some samples, taken in steps well above the noise.
+
+    A point that stands still never makes a step, however long it stands; nor do single wrong points among the right
+    ones, for the mean is one of medians.
+
+    Args:
+        step: least distance that counts, m; some standard deviations of the point.
+
+    Attributes:
+        total: path so far, m.
+        weight: of the last point: below 1 where it lies several times further from the median than points usually do.
+        measured: points over which the path was measured so far; the first ones, before there is a mean, are not.
+    """
+
+    def __init__(self, step: float) -> None:
+        self.total = 0.0
+        self.weight = 1.0
+        self.measured = 0
+        self._usual2 = 0.0
+        self._step2 = step * step
+        self._last: deque[list[float]] = deque(maxlen=_MEDIAN_OF)
+        self._mean = self._mark = (0.0, 0.0, 0.0)
+        self._count = 0
+
+    def add(self, point: Array) -> float:
+        """Take a point (3,), m; the length of the step that it completes, or 0."""
+        px, py, pz = here = point.tolist()
+        self._last.append(here)
+        middle = len(self._last) // 2
+        a, b, c = [sorted(axis)[middle] for axis in zip(*self._last, strict=True)]
+        self._weigh((px - a) ** 2 + (py - b) ** 2 + (pz - c) ** 2)
+        self._count = min(self._count + 1, _MEAN_OF)
+        share = 1.0 / self._count
+        x, y, z = self._mean
+        self._mean = x, y, z = x + share * (a - x), y + share * (b - y), z + share * (c - z)
+        if self._count < _MEAN_OF:
+            self._mark = self._mean
+            return 0.0
+        self.measured += 1
+        u, v, w = self._mark
+        square = (x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2
+        if square < self._step2:
+            return 0.0
+        self._mark = self._mean
+        length = math.sqrt(square)
+        self.total += length
+        return length
+
+    def _weigh(self, square: float) -> None:
+        """A contact does not jump from frame to frame; one that does is not believed, however little is known there."""
+        limit = max(_FAR2 * self._usual2, self._step2)
+        ratio = limit / max(square, limit)
+        self.weight = ratio * ratio
+        self._usual2 += _SLOWLY * (min(square, limit) - self._usual2)
+
+
+class Spread:
+    """Weighted covariance of points, with forgetting: second moments about the first point."""
+
+    def __init__(self) -> None:
+        self._origin: Array | None = None
+        self._moments = np.zeros((4, 4))
+
+    @property
+    def weight(self) -> float:
+        """Sum of weights."""
+        return float(self._moments[3, 3])
+
+    @property
+    def covariance(self) -> Array:
+        """(3, 3), m²."""
+        M = self._moments / max(self.weight, 1e-300)
+        mean = M[:3, 3]
+        result: Array = M[:3, :3] - mean[:, None] * mean
+        return result
+
+    def fade(self, kept: float) -> None:
+        """Weigh everything so far by a factor."""
+        self._moments *= kept
+
+    def add(self, points: Array, weights: Array) -> None:
+        """Take points (n, 3) with weights (n,)."""
+        if self._origin is None:
+            self._origin = points[0].copy()
+        X = np.ones((len(points), 4))
+        X[:, :3] = points - self._origin
+        self._moments += (X.T * weights).dot(X)
+
+
+STEP = 0.025
+"""Travel between two updates over the memory."""
+CROWD = 2.0
+"""Most samples per metre that count in full, over the nominal `window / memory`."""
+MOST_PENDING = 16
+"""Samples of one step that are kept; of a slower motion the last ones."""
+STARTING = 1.6
+"""How much higher the alarm's thresholds are during a start: the first answers are soon put right by themselves."""
+ALIKE = 1.4
+"""The same where the errors of neighbours are alike: running means vary more."""
+GENEROUS = 0.5
+"""Usual innovation below which the stated noise is not believed where a misfit is looked for."""
+
+
+class _Pending(NamedTuple):
+    """A contact that waits for the end of its step, and its weight by its place alone (`Travel`)."""
+
+    touch: Touch
+    weight: float
+
+
+class _Compared(NamedTuple):
+    """Contacts against what the filter says: their equations, squared innovations (n,) and weights (n,)."""
+
+    rows: Array
+    residuals: Array
+    squares: Array
+    weights: Array
+
+
+class RecursiveEstimator:
+    """Square-root information filter over the contact's path.
+
+    Args:
+        sigma_point, sigma_normal: effective noise, m and rad.
+        memory_m: path after which a sample's information has fallen to 1/e, m.
+        window: samples per memory at the nominal pace; slower motion is not believed more than twice that.
+        prior: None for `Prior.weak` over the memory; none on curvature itself, which forgetting would wear away.
+        coupling: of the errors of point and normal (`Noise`), 1/m.
+        correlation: of the noise along the path. The samples are weighed as if they were independent, the covariance
+            is what such an answer has under correlated noise.
+        quadric: the surface is known to be one; else its cubic and quartic terms are allowed for (`LeftOut`).
+    """
+
+    def __init__(
+        self,
+        *,
+        sigma_point: float,
+        sigma_normal: float,
+        memory_m: float = 0.02,
+        window: int = 160,
+        prior: Prior | None = None,
+        coupling: float = 0.0,
+        correlation: Correlation | None = None,
+        quadric: bool = False,
+    ) -> None:
+        self._coupling = coupling
+        self.dropped = Dropped()
+        self._gate = Gate(sigma_point, sigma_normal)
+        self._memory = positive("memory_m", memory_m)
+        self._quadric = quadric
+        self._crowd = CROWD * positive("window", window) / self._memory
+        self._prior = Prior.weak(self._memory) if prior is None else instance("prior", prior, Prior)
+        if math.isfinite(self._prior.sigma_curvature):
+            raise UsageError("prior: expected none on curvature itself for 'recursive', got " + self._prior.name)
+        self._caution = 1.0 if correlation is None else ALIKE
+        self._filter = InformationFilter(self._memory, self._prior, correlation)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything but the settings."""
+        self._gate.reset()
+        self._last: Touch | None = None
+        self._pending: deque[_Pending] = deque(maxlen=MOST_PENDING)
+        self._travel = Travel(max(STEP * self._memory, 3.0 * self._gate.sigma_point))
+        self._spread = Spread()
+        self._change = ChangeTest()
+        self._start: Start | None = Start(self._memory, self._prior)
+        self._settled = False
+        self._doubtful = 0.0
+
+    def add(self, sample: ContactSample) -> None:
+        """Take one contact."""
+        if not self._gate.passes(sample, self.dropped):
+            return
+        touch = Touch(sample.p_base, sample.n_base, *self._gate.sigmas(sample), self._coupling)
+        moved = self._travel.add(sample.p_base)
+        self._pending.append(_Pending(touch, self._travel.weight))
+        if self._last is None or self._travel.weight == 1.0:
+            self._last = touch
+        if moved > 0.0:
+            self._step(moved)
+            self._pending.clear()
+
+    def estimate(self) -> SurfaceEstimate | None:
+        """The answer at the foot of the last contact that is no outlier; None before the contact has moved."""
+        if self._last is None or self._spread.weight == 0.0:
+            return None
+        state, notes = self._filter, self._notes()
+        place = state.place(self._last.point)
+        a = anchor(state.c, state.T, place, state.length)
+        # what has not settled is not called observed
+        certain = float(self._settled) / self._gate.sigma_point**2
+        P = a.T_frame_contact[:3, :2]
+        flat = P.T.dot(self._spread.covariance * certain).dot(P)
+        q = a.M[6:].dot(state.inverse) / UNIT[:, None]
+        decision = decide(inverted_upper(upper_root(q.T)).T, flat, size_of(a.c))
+        # the sandwich: A⁻¹ = inverse inverseᵀ, the score between
+        noise = state.inverse.T.dot(state.left_out.score.matrix[:9, :9]).dot(state.inverse)
+        believed = True
+        if decision.rank == 3 and not self._quadric:
+            amended = state.left_out.amend(state.c, state.inverse.dot(state.inverse.T), place, self._expected())
+            notes += misfit_notes(amended.misfit, trusted=amended.trusted)
+            believed = amended.trusted
+            if believed:
+                a = anchor(amended.c, state.T, place, state.length)
+                noise += state.root.dot(amended.covariance).dot(state.root.T)
+            else:
+                decision = nothing_observed()
+        deviation = a.M.dot(state.inverse.dot(lower_root(noise)) if believed else np.eye(9) / DIFFUSE)
+        covariance = curvature_covariance(a.c, deviation)
+        evidence = evidence_of(a.c, covariance, flat, state.length)
+        if decision.rank < 3:
+            known = decision.vectors[:, decision.passed]
+            a.c[6:] = UNIT * (known @ (known.T @ (a.c[6:] / UNIT)))
+            covariance = np.full((3, 3), math.nan)
+        return build_estimate(
+            Solution(a.c, covariance, decision, has_prior=False, root=inverted(deviation)),
+            length=state.length,
+            T_frame_contact=a.T_frame_contact,
+            problem_root=state.root,
+            innovation=self._change.innovation,
+            distance=min(self._travel.total, self._memory),
+            samples=self._spread.weight,
+            method="recursive",
+            prior=self._prior.name,
+            notes=notes,
+            evidence=evidence,
+        )
+
+    def _expected(self) -> Expected:
+        """Stated noise counts unless it is twice the usual; a probe feels surfaces about as curved as itself."""
+        usual = self._change.usual
+        noise = usual if usual < GENEROUS else 1.0
+        return Expected(noise, self._coupling * self._memory, self._gate.sigma_point / self._memory)
+
+    def _notes(self) -> tuple[str, ...]:
+        changes, doubtful = self._change.alarms, round(self._doubtful)
+        notes = [f"the surface changed {changes} times: memory shortened"] if changes else []
+        notes += [f"{doubtful} samples with reduced weight"] if doubtful else []
+        return (*notes, *self._gate.notes())
+
+    def _step(self, moved: float) -> None:
+        """Take what is pending into the filter or its start; after a change of the surface into a new start."""
+        compared = self._compared() if self._settled else None
+        caution = self._caution if self._start is None else STARTING * self._caution
+        if compared and any([self._change.take(square, caution) for square in compared.squares.tolist()]):
+            explained = self._explained(compared)
+            if explained is None:
+                self._change.alarm()
+                self._drop_agreeing(compared.squares)
+                self._spread.fade(0.0)
+                self._start = Start(self._memory, self._prior)
+            else:
+                compared = explained
+        if self._start is not None:
+            self._beginning(self._start, moved)
+        elif compared:
+            self._absorb(compared, moved)
+            if self._last is not None:
+                self._filter.follow(self._last.point)
+
+    def _compared(self) -> _Compared:
+        rows, residuals = self._filter.equations([p.touch for p in self._pending])
+        return self._judged(rows, residuals, residuals)
+
+    def _explained(self, found: _Compared) -> _Compared | None:
+        """As `_compared`, where the contacts are as the terms that a quadric leaves out had them expected."""
+        if self._quadric:
+            return None
+        f = self._filter
+        terms = f.left_out.explanation(f.c, f.inverse.dot(f.inverse.T), self._expected())
+        left = self._judged(found.rows, found.residuals, found.residuals - found.rows @ terms)
+        return left if self._change.usual_again(left.squares) else None
+
+    def _judged(self, rows: Array, residuals: Array, unexplained: Array) -> _Compared:
+        """Weighted by their places, and from a limit on by the square of `limit / d²`.
+
+        It is the 99.9 % point of χ², times the running innovation: where all disagree none is wrong.
+        """
+        squares = self._filter.squared_innovations(rows, unexplained)
+        limit = CHI2_999 * max(1.0, self._change.innovation)
+        weights = np.array([p.weight for p in self._pending]) * np.square(limit / np.maximum(squares, limit))
+        return _Compared(rows, residuals, squares, weights)
+
+    def _absorb(self, compared: _Compared, moved: float) -> None:
+        """Take a step (m) into the filter."""
+        root = np.sqrt(self._weigh(moved, compared.weights) * compared.weights)[:, None]
+        self._filter.take(compared.rows * root[:, :, None], compared.residuals * root, moved)
+
+    def _beginning(self, start: Start, moved: float) -> None:
+        """Take a step (m) into the solution of the first stretch; the filter is given what that is by now."""
+        crowd = self._weigh(moved, np.ones(len(self._pending)))
+        wider = 1.0 / math.sqrt(crowd)
+        touches = [p.touch for p in self._pending]
+        start.add(
+            [t._replace(sigma_point=wider * t.sigma_point, sigma_normal=wider * t.sigma_normal) for t in touches], moved
+        )
+        self._settled = start.settled
+        found = start.solution
+        if found is None:
+            self._filter.begin(homogeneous(tangent_rotation(-touches[-1].normal), touches[-1].point))
+            return
+        c = found.target if start.settled else found.c
+        self._filter.adopt(start.T, c, found.root, found.rows, found.residuals_at(c), start.travelled)
+        self._doubtful = float(np.count_nonzero(found.weight < 1.0))
+        if start.over:
+            self._start, self._settled = None, True
+
+    def _weigh(self, moved: float, weight: Array) -> float:
+        """Count a step; the weight of each sample where they are crowded, else 1."""
+        crowd = min(1.0, self._crowd * moved / min(len(weight), self._travel.measured))
+        kept = math.exp(-moved / self._memory)
+        self._doubtful = kept * self._doubtful + np.count_nonzero(weight < 1.0)
+        self._spread.fade(kept)
+        self._spread.add(np.array([p.touch.point for p in self._pending]), crowd * weight)
+        return crowd
+
+    def _drop_agreeing(self, squares: Array) -> None:
+        """Forget the pending samples up to the last that still agrees with the surface before a change."""
+        agree = np.flatnonzero(squares[:-1] <= CHI2_99 * self._change.usual)
+        for _ in range(int(agree[-1]) + 1 if len(agree) else 0):
+            self._pending.popleft()

@@ -1,0 +1,186 @@
+"""The first stretch of a filter: all its contacts at once, by one Gauss–Newton step whenever some more have come.
+
+A filter that is linearised on a plane would be off by the tilt of a curved surface along the first stretch, and would
+keep it. So the contacts of the first stretch are kept and solved together. The solution is never iterated to the end:
+each call takes one step from the last answer on the data that are there by now, which bounds the work of every call
+(the real-time iteration of model predictive control); by the end of the stretch it has settled.
+
+Source: Diehl, Bock and Schlöder, "A real-time iteration scheme for nonlinear optimization in optimal feedback
+control", 2005.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from canprobe.mechanics.touch.estimate.information import Touch, batch_design
+from canprobe.mechanics.touch.estimate.noise import Prior
+from canprobe.mechanics.touch.estimate.nonlinear import linear_start, robust, solve_rows
+from canprobe.mechanics.touch.estimate.quadric import SPREAD, Decision, Design, linearise, size_of, spread_of
+from canprobe.mechanics.touch.linear_algebra import Array, homogeneous, tangent_rotation
+
+# One Gauss–Newton step of the robust fit: what `nonlinear.fit` iterates, for those who cannot wait.
+
+_SHORTER = (1.0, 0.25)
+"""Shares of a step that are tried."""
+SETTLED = 0.1
+"""Squared length of a step, in standard deviations, below which an answer has settled."""
+
+
+class Solved(NamedTuple):
+    """The problem at some parameters, solved once.
+
+    Attributes:
+        c: (9,) parameters.
+        cost: robust, with the prior's part and the log-determinant of the noise.
+        rows: (n, 3, 18) whitened, weighted: of the parameters and of the terms that a quadric leaves out.
+        r: (n, 3) their residuals.
+        weight: (n,) of the samples.
+        target: (9,) solution of the linearised problem.
+        root: (9, 9) of its information.
+        decision: on the data.
+    """
+
+    c: Array
+    cost: float
+    rows: Array
+    r: Array
+    weight: Array
+    target: Array
+    root: Array
+    decision: Decision
+
+    @property
+    def step(self) -> float:
+        """Squared length of the way to the target, in standard deviations."""
+        way = self.root @ (self.target - self.c)
+        return float(way @ way)
+
+    def residuals_at(self, c: Array) -> Array:
+        """Minus the residuals (n, 3) at other parameters (9,) nearby."""
+        result: Array = -self.r - self.rows[:, :, :9] @ (c - self.c)
+        return result
+
+
+def solved_once(c: Array, d: Design, prior: tuple[Array, Array]) -> Solved:
+    """The problem at parameters (9,); prior: rows (6, 9) and right-hand side (6,)."""
+    at = linearise(c, d)
+    weight, cost = robust(np.einsum("ij,ij->i", at.r, at.r))
+    assumed = prior[0] @ c - prior[1]
+    cost += at.log_det + float(assumed @ assumed)
+    w = np.sqrt(weight)[:, None]
+    r, rows = at.r * w, at.jacobian(18) * w[:, :, None]
+    A = rows[:, :, :9].reshape(-1, 9)
+    target, root, decision = solve_rows(A, A @ c - r.reshape(-1), prior, spread_of(d.X, d.point_variance), size_of(c))
+    return Solved(c, cost, rows, r, weight, target, root, decision)
+
+
+def gauss_newton(now: Solved, d: Design, prior: tuple[Array, Array]) -> Solved:
+    """The next one at the target, or nearer where the step from there is longer; `now` where that is no better either.
+
+    The length of the next step says whether a step was good, not the cost: the whitening changes with K, so the place
+    where the steps end is not quite where the cost is least.
+
+    Source: Deuflhard, "Newton methods for nonlinear problems", 2004 (the natural monotonicity test).
+    """
+    for share in _SHORTER:
+        there = solved_once(now.c + share * (now.target - now.c), d, prior)
+        if there.step <= max(now.step, SETTLED):
+            return there
+    return now
+
+
+# The stretch.
+
+FIRST = 0.1
+"""Travel over the memory at the first solution."""
+LAST = 0.4
+"""Travel over the memory at which the filter takes over, once the solution has settled."""
+LATEST = 0.8
+"""Travel over the memory at which it takes over even where the solution still moves."""
+MOST = 128
+"""Contacts that are kept; of more every second one goes."""
+_FRAME_OF = 5
+"""Contacts whose median place and normal make the working frame."""
+
+
+class Start:
+    """Contacts of the first stretch and their solution so far, for a filter with a memory of `length` (m).
+
+    Attributes:
+        T: (4, 4) working frame of the solution to base, m.
+        solution: None before there is one.
+        settled: the solution is one: its last step was small, and all of K was observed or the stretch is over.
+        travelled: path so far, m.
+    """
+
+    def __init__(self, length: float, prior: Prior) -> None:
+        self.T = np.eye(4)
+        self.solution: Solved | None = None
+        self.settled = False
+        self.travelled = 0.0
+        self._length = length
+        self._prior = prior.rows(length)
+        self._touches: list[Touch] = []
+
+    @property
+    def over(self) -> bool:
+        """Whether the filter should take over."""
+        share = self.travelled / self._length
+        return self.solution is not None and (share >= LATEST or (share >= LAST and self.settled))
+
+    def add(self, touches: Sequence[Touch], moved: float) -> None:
+        """Take in the contacts of a step of the path (m), and improve the solution by a Gauss–Newton step."""
+        self._touches += touches
+        if len(self._touches) > MOST:
+            self._touches = self._touches[::2]
+        self.travelled += moved
+        share = self.travelled / self._length
+        if share < FIRST:
+            return
+        if self.solution is None:
+            self.T = _frame(self._touches[-_FRAME_OF:])
+        d = batch_design(self.T, self._length, self._touches)
+        if share < LAST and float(np.linalg.eigvalsh(spread_of(d.X, d.point_variance))[0]) < SPREAD:
+            return
+        self._improve(d, share >= LAST)
+
+    def _improve(self, d: Design, stretch_over: bool) -> None:
+        """From the better of the last solution and, until that has settled, a linear one."""
+        now = None if self.solution is None else solved_once(self.solution.target, d, self._prior)
+        if now is None or not self.settled:
+            spread = spread_of(d.X, d.point_variance)
+            plain = linear_start(d, self._prior, spread, isolation(d.X, d.point_variance))[0]
+            fresh = solved_once(plain, d, self._prior)
+            now = fresh if now is None or fresh.cost < now.cost else now
+        better = gauss_newton(now, d, self._prior)
+        self.solution = better
+        known = self.settled or better.decision.rank == 3 or stretch_over
+        self.settled = known and better.step < SETTLED
+
+
+def isolation(points: Array, variance: Array) -> Array:
+    """Weights (n,) of points (n, 3) along a path: far below 1 for single ones that lie off between their neighbours.
+
+    A point is compared with the median of the five about it. What is usual is the median of these distances, and never
+    less than the variance (n,) of the points' noise per axis.
+    """
+    if len(points) < 5:
+        return np.ones(len(points))
+    padded = np.concatenate([points[1:3][::-1], points, points[-3:-1][::-1]])
+    windows = np.stack([padded[k : k + len(points)] for k in range(5)])
+    off = points - np.median(windows, axis=0)
+    square = np.einsum("ij,ij->i", off, off)
+    usual = 9.0 * np.maximum(float(np.median(square)), variance)
+    result: Array = usual / np.maximum(square, usual)
+    return result
+
+
+def _frame(touches: Sequence[Touch]) -> Array:
+    """A frame (4, 4) at the median place of contacts, z against their median normal."""
+    normal = np.median([t.normal for t in touches], axis=0)
+    normal = normal / np.sqrt(normal @ normal)
+    return homogeneous(tangent_rotation(-normal), np.median([t.point for t in touches], axis=0))

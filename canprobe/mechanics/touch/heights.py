@@ -1,0 +1,384 @@
+"""A surface that is no formula: heights over a grid, as one C² bicubic spline.
+
+Closest point, normal, curvature, gaps and force all come from that spline. A spline through heights at a spacing d is
+true for features of several d: a sharp edge becomes a rounded one, of a radius of about d. Only what is seen from +z
+is a surface; there are no undercuts.
+
+The closest point is the best of all local minima over the spline's nodes, each polished by Newton. Nothing depends on
+what was asked before: the window that is kept from query to query holds every node that can matter.
+
+Source: de Boor, A Practical Guide to Splines (cubic B-splines on equal knots, not-a-knot ends).
+"""
+
+from __future__ import annotations
+
+from math import atan2, ceil, cos, hypot, inf, sin, sqrt
+
+import numpy as np
+import numpy.typing as npt
+
+from canprobe.mechanics.touch.shapes import Array, Foot, PlacedShape, Touches, Vec, require_positive
+
+LEAST_NODES = 8
+"""Along each side of a grid."""
+WIDEST_M, RISE_M = 5e-4, 4e-6
+"""Of the nodes over which minima are searched and pressure is summed: their widest spacing, and how much a node may be
+farther than the foot beside it; on a sharp edge half of the grid's spacing stands for that."""
+RADIUS_M = 0.03
+"""Of the ball that touches, as far as the spacing of the nodes depends on it."""
+_MARGIN_M = 1.5e-4
+"""How far a query may move before the window of nodes is taken anew."""
+_DEEPEST_M = 3e-4
+"""Indentation up to which that window holds all that a ball presses on."""
+_BLOCK = 4
+_OVER_NODES_M = 5e-5
+"""How far the surface may rise between its nodes, on the safe side."""
+_NEWTON = 40
+_LAST_M = 1e-8
+"""A Newton step after which the rest, its square over a radius of curvature, is below 1e-12 m."""
+_SAME_M = 1e-6
+_NOWHERE_M = -1e3
+_SIDE = 1e-6
+"""Spacings to the cells on both sides of a node."""
+
+_Bends = tuple[float, float, float, float, float, float]
+_Place = tuple[float, float, float, _Bends]
+"""Distance squared of a point to a place of the surface, its x and y, and the spline there."""
+
+
+class Spline:
+    """C² bicubic spline through heights on a grid of equal spacing.
+
+    Args:
+        heights: (m, n) m, at x rising along the rows' index, y along the columns'.
+        spacing: m, of both.
+        corner: (2,) x and y of the first height, m.
+    """
+
+    def __init__(self, heights: Array, spacing: float, corner: tuple[float, float]) -> None:
+        self.shape, self.spacing, self.corner = heights.shape, spacing, corner
+        coefficients = _coefficients(_coefficients(heights).T).T
+        self._flat = np.ascontiguousarray(coefficients).ravel()
+        self._rows: list[list[float]] = coefficients.tolist()
+        self.far = tuple(c + (n - 1) * spacing for c, n in zip(corner, heights.shape, strict=True))
+
+    def at(self, x: float, y: float) -> _Bends:
+        """Height, its slopes along x and y, and its second derivatives xx, xy, yy at a point of the grid's area."""
+        scale, (m, n) = 1.0 / self.spacing, self.shape
+        s, t = (x - self.corner[0]) * scale, (y - self.corner[1]) * scale
+        i, j = min(max(int(s), 0), m - 2), min(max(int(t), 0), n - 2)
+        s, t = s - i, t - j
+        r, p = 1.0 - s, 1.0 - t
+        b0, b3 = p * p * p / 6.0, t * t * t / 6.0
+        b1, b2 = 2.0 / 3.0 - t * t * (1.0 - 0.5 * t), 2.0 / 3.0 - p * p * (1.0 - 0.5 * p)
+        d0, d1, d2, d3 = -0.5 * p * p, t * (1.5 * t - 2.0), p * (2.0 - 1.5 * p), 0.5 * t * t
+        e1, e2 = 3.0 * t - 2.0, 3.0 * p - 2.0
+        z = zx = zy = zxx = zxy = zyy = 0.0
+        weights = (
+            (r * r * r / 6.0, -0.5 * r * r, r),
+            (2.0 / 3.0 - s * s * (1.0 - 0.5 * s), s * (1.5 * s - 2.0), 3.0 * s - 2.0),
+            (2.0 / 3.0 - r * r * (1.0 - 0.5 * r), r * (2.0 - 1.5 * r), 3.0 * r - 2.0),
+            (s * s * s / 6.0, 0.5 * s * s, s),
+        )
+        for row, (b, d, e) in zip(self._rows[i : i + 4], weights, strict=True):
+            c0, c1, c2, c3 = row[j : j + 4]
+            value, slope = b0 * c0 + b1 * c1 + b2 * c2 + b3 * c3, d0 * c0 + d1 * c1 + d2 * c2 + d3 * c3
+            z += b * value
+            zx += d * value
+            zxx += e * value
+            zy += b * slope
+            zxy += d * slope
+            zyy += b * (p * c0 + e1 * c1 + e2 * c2 + t * c3)
+        square = scale * scale
+        return z, zx * scale, zy * scale, zxx * square, zxy * square, zyy * square
+
+    def many(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
+        """Heights and slopes along x and y of points, each (k,), of the grid's area."""
+        m, n = self.shape
+        s, t = (x - self.corner[0]) / self.spacing, (y - self.corner[1]) / self.spacing
+        i, j = np.clip(s.astype(np.intp), 0, m - 2), np.clip(t.astype(np.intp), 0, n - 2)
+        (b, d), (bt, dt) = _weights(s - i), _weights(t - j)
+        first = i * (n + 2) + j
+        z, zx, zy = np.zeros((3, len(s)))
+        for k in range(4):
+            rows = [self._flat.take(first + (k * (n + 2) + q)) for q in range(4)]
+            value = rows[0] * bt[0] + rows[1] * bt[1] + rows[2] * bt[2] + rows[3] * bt[3]
+            z += b[k] * value
+            zx += d[k] * value
+            zy += b[k] * (rows[0] * dt[0] + rows[1] * dt[1] + rows[2] * dt[2] + rows[3] * dt[3])
+        return z, zx / self.spacing, zy / self.spacing
+
+
+def _weights(t: Array) -> tuple[list[Array], list[Array]]:
+    """The four cubic B-splines over a cell at t in 0 … 1, and their slopes."""
+    p = 1.0 - t
+    inner = (2.0 / 3.0 - one * one * (1.0 - 0.5 * one) for one in (t, p))
+    return [p * p * p / 6.0, *inner, t * t * t / 6.0], [
+        -0.5 * p * p,
+        t * (1.5 * t - 2.0),
+        p * (2.0 - 1.5 * p),
+        0.5 * t * t,
+    ]
+
+
+def _coefficients(f: Array) -> Array:
+    """(n + 2, …) B-spline coefficients of the cubic spline through (n, …) values, along the first axis.
+
+    With not-a-knot ends the second coefficient from each end follows from three values, and the rest from
+    ``c[i-1] + 4 c[i] + c[i+1] = 6 f[i]``, by elimination without pivots, as the diagonal dominates.
+    """
+    n = len(f)
+    c = np.zeros((n + 2, *f.shape[1:]))
+    c[2] = (8.0 * f[1] - f[0] - f[2]) / 6.0
+    c[n - 1] = (8.0 * f[n - 2] - f[n - 1] - f[n - 3]) / 6.0
+    pivots = np.zeros(n + 2)
+    for i in range(3, n - 1):  # forwards: c[i] = right side − pivot c[i+1]
+        pivots[i] = 1.0 / (4.0 - pivots[i - 1])
+        c[i] = (6.0 * f[i - 1] - c[i - 1]) * pivots[i]
+    for i in range(n - 2, 2, -1):
+        c[i] -= pivots[i] * c[i + 1]
+    c[1] = 6.0 * f[1] - 4.0 * c[2] - c[3]
+    c[0] = 6.0 * f[0] - 4.0 * c[1] - c[2]
+    c[n] = 6.0 * f[n - 2] - 4.0 * c[n - 1] - c[n - 2]
+    c[n + 1] = 6.0 * f[n - 1] - 4.0 * c[n] - c[n - 1]
+    return c
+
+
+class Heights(PlacedShape):
+    """Surface over a grid of heights, solid below, ending at the grid's border. z of its frame is that of the heights.
+
+    A ball may bridge a groove or stand on an edge: what presses on it follows from the gaps all over the pad, not from
+    one curvature (`by_gaps`).
+
+    Args:
+        T_base_object: (4, 4) pose, m.
+        heights: (m, n) m, 8 or more along each side; x rises with the first index, y with the second.
+        spacing: of the grid, m.
+        origin: (2,) point of the grid that is the object's origin, from the grid's middle, m; the surface there gets
+            the height 0.
+        there: (m, n) whether the surface exists at a node; between nodes it does where it exists at all four round the
+            place. None: everywhere.
+
+    Raises:
+        ValueError: for heights that are no finite grid, or an origin beside the surface.
+    """
+
+    by_gaps = True
+
+    def __init__(
+        self,
+        T_base_object: npt.ArrayLike,
+        heights: npt.ArrayLike,
+        spacing: float,
+        origin: npt.ArrayLike = (0.0, 0.0),
+        there: npt.NDArray[np.bool_] | None = None,
+    ) -> None:
+        super().__init__(T_base_object)
+        require_positive(spacing=spacing)
+        z = np.array(heights, dtype=float)
+        if z.ndim != 2 or min(z.shape) < LEAST_NODES:
+            raise ValueError(f"heights must be a grid of {LEAST_NODES} × {LEAST_NODES} or more, got shape {z.shape}")
+        if not np.isfinite(z).all():
+            i, j = np.argwhere(~np.isfinite(z))[0].tolist()
+            raise ValueError(f"heights must be finite, got {z[i, j]} at row {i}, column {j}: fill gaps first")
+        ox, oy = np.array(origin, dtype=float).tolist()
+        corner = -0.5 * (z.shape[0] - 1) * spacing - ox, -0.5 * (z.shape[1] - 1) * spacing - oy
+        i, j = (round(-c / spacing) for c in corner)
+        if not (0 <= i < z.shape[0] and 0 <= j < z.shape[1] and (there is None or there[i, j])):
+            raise ValueError(f"origin ({ox:g}, {oy:g}) m lies beside the surface")
+        spline = Spline(z, spacing, corner)
+        z -= spline.at(0.0, 0.0)[0]
+        self.spline = Spline(z, spacing, corner)
+        self._fill_nodes(z, there)
+
+    def _fill_nodes(self, heights: Array, there: npt.NDArray[np.bool_] | None) -> None:
+        """Nodes of the search: positions, heights and slopes."""
+        spline = self.spline
+        bend = max(float(np.abs(np.diff(heights, 2, axis=axis)).max()) for axis in (0, 1)) / spline.spacing**2
+        widest = min(max(sqrt(4.0 * RISE_M / (bend + 1.0 / RADIUS_M)), 0.5 * spline.spacing), WIDEST_M)
+        self._x, self._y = (
+            np.linspace(low, high, ceil((high - low) / widest - 1e-6) + 1)
+            for low, high in zip(spline.corner, spline.far, strict=True)
+        )
+        self._cell = float(self._x[1] - self._x[0]), float(self._y[1] - self._y[0])
+        self._step = max(self._cell)
+        shape = len(self._x), len(self._y)
+        x, y = (one.ravel() for one in np.meshgrid(self._x, self._y, indexing="ij"))
+        self._z, self._zx, self._zy = (one.reshape(shape) for one in spline.many(x, y))
+        self._cells: npt.NDArray[np.bool_] | None = None
+        if there is not None and not there.all():
+            self._cells = there[:-1, :-1] & there[1:, :-1] & there[:-1, 1:] & there[1:, 1:]
+            self._z[~self.exists(x, y).reshape(shape)] = _NOWHERE_M
+        starts = [np.arange(0, n, _BLOCK) for n in shape]
+        self._tops = np.maximum.reduceat(np.maximum.reduceat(self._z, starts[0], axis=0), starts[1], axis=1)
+        lids = np.pad(self._tops, 1, mode="edge") + _OVER_NODES_M
+        lids = np.maximum(np.maximum(lids[:-2], lids[1:-1]), lids[2:])
+        self._lids = np.maximum(np.maximum(lids[:, :-2], lids[:, 1:-1]), lids[:, 2:])
+        self._boxes = [
+            (at[start], at[np.minimum(start + _BLOCK, len(at)) - 1])
+            for at, start in zip((self._x, self._y), starts, strict=True)
+        ]
+        self._kept: tuple[Vec, float, float, tuple[slice, slice]] | None = None
+
+    def _window(self, x: float, y: float, z: float, reach: float) -> tuple[slice, slice]:
+        """The nodes that hold all within `reach` of a point, and its nearest with all that compete with it."""
+        kept = self._kept
+        if kept is not None:
+            (kx, ky, kz), nearest, widest, window = kept
+            moved = sqrt((x - kx) ** 2 + (y - ky) ** 2 + (z - kz) ** 2)
+            if nearest + 2.0 * moved + 0.5 * self._step <= widest and reach + moved <= widest:
+                return window
+        # No node of a block is nearer than the box that holds it; the nodes of the nearest box bound the nearest.
+        dx, dy = (at - np.clip(at, low, high) for at, (low, high) in zip((x, y), self._boxes, strict=True))
+        boxes = np.maximum(z - self._tops, 0.0) ** 2 + (dx * dx)[:, None] + dy * dy
+        i, j = (_BLOCK * int(k) for k in divmod(int(boxes.argmin()), boxes.shape[1]))
+        block = slice(i, i + _BLOCK), slice(j, j + _BLOCK)
+        squares = (self._z[block] - z) ** 2 + ((self._x[block[0]] - x) ** 2)[:, None] + (self._y[block[1]] - y) ** 2
+        nearest = sqrt(float(squares.min()))
+        widest = max(nearest + _DEEPEST_M, reach) + 2.0 * _MARGIN_M + 0.5 * self._step
+        inside = boxes <= widest * widest
+        rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
+        first, last = (slice(_BLOCK * int(k[0]), _BLOCK * int(k[-1] + 1)) for k in (rows, columns))
+        window = first, last
+        self._kept = (x, y, z), nearest, widest, window
+        return window
+
+    def _minima(self, x: float, y: float, z: float, reach: float | None) -> list[_Place]:
+        """Feet, nearest first: all within `reach`, or those that compete for the nearest."""
+        rows, columns = self._window(x, y, z, reach or 0.0)
+        heights = self._z[rows, columns]
+        width = heights.shape[1] + 2
+        padded = np.full((len(heights) + 2, width), inf)
+        square = padded[1:-1, 1:-1]
+        np.subtract(heights, z, out=square)
+        square *= square
+        square += ((self._x[rows] - x) ** 2)[:, None] + (self._y[columns] - y) ** 2
+        flat = padded.ravel()
+        lowest = sqrt(float(flat.min()))
+        near = np.flatnonzero(flat <= ((lowest if reach is None else max(reach, lowest)) + 0.25 * self._step) ** 2)
+        value = flat[near]
+        low = (value <= flat[near - width]) & (value < flat[near + width])
+        low &= (value <= flat[near - 1]) & (value < flat[near + 1])
+        feet: list[_Place] = []
+        for index in near[low].tolist():
+            i, j = divmod(index, width)
+            place = self._polished(float(self._x[rows.start + i - 1]), float(self._y[columns.start + j - 1]), x, y, z)
+            if all(abs(place[1] - a) + abs(place[2] - b) > _SAME_M for _, a, b, _ in feet):
+                feet.append(place)
+        return feet if len(feet) == 1 else sorted(feet)
+
+    def _polished(self, u: float, v: float, x: float, y: float, z: float) -> _Place:
+        """The stationary point of the distance near (u, v), by Newton of at most a node's spacing a step."""
+        at, most, node = self.spline.at, self._step, (u, v)
+        (u0, v0), (u1, v1) = self.spline.corner, self.spline.far
+        for _ in range(_NEWTON):
+            h, hx, hy, hxx, hxy, hyy = at(u, v)
+            up = h - z
+            gx, gy = u - x + up * hx, v - y + up * hy
+            a, b, c = 1.0 + hx * hx + up * hxx, hx * hy + up * hxy, 1.0 + hy * hy + up * hyy
+            det = a * c - b * b
+            if det <= 0.0 or a <= 0.0:  # no minimum here: descend without the bend of the surface
+                a, b, c = 1.0 + hx * hx, hx * hy, 1.0 + hy * hy
+                det = a * c - b * b
+            du, dv = (b * gy - c * gx) / det, (b * gx - a * gy) / det
+            size = hypot(du, dv)
+            if size > most:
+                du, dv = du * most / size, dv * most / size
+            new_u, new_v = min(max(u + du, u0), u1), min(max(v + dv, v0), v1)
+            moved = abs(new_u - u) + abs(new_v - v)
+            u, v = new_u, new_v
+            if moved < _LAST_M:
+                break
+        if self._cells is not None:
+            i, j = int((u - u0) / self.spline.spacing), int((v - v0) / self.spline.spacing)
+            within = self._cells[min(i, self._cells.shape[0] - 1), min(j, self._cells.shape[1] - 1)]
+            if not within and not self.exists(np.array((u,)), np.array((v,)))[0]:
+                u, v = node  # beyond the surface: its nearest node is on the border
+        here = at(u, v)
+        return (u - x) ** 2 + (v - y) ** 2 + (here[0] - z) ** 2, u, v, here
+
+    def _foot(self, x: float, y: float, z: float) -> Foot:
+        return self._foot_at(self._minima(x, y, z, None)[0], x, y, z)
+
+    def _foot_at(self, place: _Place, x: float, y: float, z: float) -> Foot:
+        _, u, v, (h, hx, hy, hxx, hxy, hyy) = place
+        square = 1.0 + hx * hx
+        a, w = sqrt(square), sqrt(square + hy * hy)
+        nx, ny, nz = -hx / w, -hy / w, 1.0 / w
+        # Tangents t = (1, 0, hx) / a and s = n × t, and the surface's bend along them.
+        sx, sy, sz = -hx * hy / (w * a), square / (w * a), hy / (w * a)
+        k_tt = -hxx / (square * w)
+        k_ts = -(hxx * sx + hxy * sy) / (a * w)
+        k_ss = -(hxx * sx * sx + 2.0 * hxy * sx * sy + hyy * sy * sy) / w
+        mean, spread = 0.5 * (k_tt + k_ss), hypot(0.5 * (k_tt - k_ss), k_ts)
+        angle = 0.5 * atan2(2.0 * k_ts, k_tt - k_ss)
+        along, across = cos(angle) / a, sin(angle)
+        dx, dy, dz = x - u, y - v, z - h
+        distance = sqrt(dx * dx + dy * dy + dz * dz)  # beyond the border the foot is not under the point
+        if dx * nx + dy * ny + dz * nz < 0.0:
+            distance = -distance
+        return (
+            *(u, v, h, nx, ny, nz, distance, mean + spread, mean - spread),
+            *(along + across * sx, across * sy, along * hx + across * sz),
+        )
+
+    def _tightest_anywhere(self) -> float:
+        """At the origin: elsewhere a ball bridges what is tighter."""
+        tightest = self._foot_at((0.0, 0.0, 0.0, self.spline.at(0.0, 0.0)), 0.0, 0.0, 0.0)[8]
+        return -1.0 / tightest if tightest < -1e-12 else inf
+
+    def touches(self, point_base: npt.ArrayLike, reach: float) -> Touches | None:
+        """Every local minimum of the distance within reach, where there are several: edges of a groove, say."""
+        x, y, z = self._to_object(np.asarray(point_base, dtype=float)[None])[0].tolist()
+        near = [place for place in self._minima(x, y, z, reach) if place[0] < reach * reach]
+        if len(near) < 2:
+            return None
+        feet = np.array([self._foot_at(place, x, y, z) for place in near])
+        return self._placed(feet[:, :3], feet[:, 3:6], feet[:, 6], feet[:, 7:9], np.zeros(len(feet)))
+
+    def gaps(self, points_base: Array) -> Array:
+        """Distances of (n, 3) points to the tangent over or under them, (n,) m: first order near the surface.
+
+        Of points higher than all of the surface near them it is only known that they do not touch; 1 m stands for that.
+        """
+        x, y, z = self._to_object(points_base).T
+        gaps, near = np.ones(len(x)), self.exists(x, y)
+        i = ((x[near] - self._x[0]) * (1.0 / (_BLOCK * self._cell[0]))).astype(np.intp)
+        j = ((y[near] - self._y[0]) * (1.0 / (_BLOCK * self._cell[1]))).astype(np.intp)
+        near[near] = z[near] < self._lids[i, j]
+        height, along, across = self.spline.many(x[near], y[near])
+        gaps[near] = (z[near] - height) / np.sqrt(1.0 + along * along + across * across)
+        return gaps
+
+    def exists(self, x: Array, y: Array) -> npt.NDArray[np.bool_]:
+        """(k,) whether there is a surface over (k,) points x and y of the object's frame, m."""
+        inside: npt.NDArray[np.bool_] = (x >= self._x[0]) & (x <= self._x[-1]) & (y >= self._y[0]) & (y <= self._y[-1])
+        if self._cells is not None:
+            (x0, y0), (m, n) = self.spline.corner, self._cells.shape
+            s, t = (x[inside] - x0) / self.spline.spacing, (y[inside] - y0) / self.spline.spacing
+            rows = [(s + side).astype(np.intp).clip(0, m - 1) for side in (-_SIDE, _SIDE)]  # of both cells on a border
+            columns = [(t + side).astype(np.intp).clip(0, n - 1) for side in (-_SIDE, _SIDE)]
+            inside[inside] = np.any([self._cells[i, j] for i in rows for j in columns], axis=0)
+        return inside
+
+    def squeezed(self, centre_base: Vec, radius: float) -> float:
+        """Volume by which the layer of a ball is squeezed, m³; times its stiffness that is the force.
+
+        Each column of the layer is pressed along its own radius: the sum over the nodes inside the ball of
+        ``(R − |r|) R² dΩ``.
+        """
+        ox, oy, oz = self._origin
+        bx, by, bz = centre_base[0] - ox, centre_base[1] - oy, centre_base[2] - oz
+        x0, x1, x2, y0, y1, y2, z0, z1, z2 = self._columns
+        x, y = bx * x0 + by * x1 + bz * x2, bx * y0 + by * y1 + bz * y2
+        z = bx * z0 + by * z1 + bz * z2
+        rows, columns = self._window(x, y, z, radius)
+        rx, ry, rz = (x - self._x[rows])[:, None], y - self._y[columns], z - self._z[rows, columns]
+        far = np.sqrt(rx * rx + ry * ry + rz * rz)
+        depth = radius - far
+        pressed = depth > 0.0
+        if not pressed.any():
+            return 0.0
+        facing = rz - self._zx[rows, columns] * rx - self._zy[rows, columns] * ry
+        far, depth, facing = far[pressed], depth[pressed], facing[pressed]
+        return float(np.sum(depth * np.maximum(facing, 0.0) / far**3)) * radius**2 * self._cell[0] * self._cell[1]

@@ -1,0 +1,324 @@
+"""A mesh as one smooth surface: what is seen of it from +z, as heights over a grid.
+
+The vertices of a mesh of a smooth body lie on the body, its facets do not. A bicubic spline is fitted by least squares
+to the vertices; where facets are larger than the grid's spacing, points of curved triangles (PN triangles, from the
+vertices and their normals) fill them. Edges that turn by more than 30 degrees stay edges, others are taken as curved.
+The surface ends with the facets: a node beyond their border, or over a hole that they leave, is none of it.
+
+It stops being true at sharp edges, which become round over two spacings to each side; on walls steeper than 70
+degrees, which are bridged; and under overhangs, which are not seen.
+
+Source: Vlachos et al., Curved PN triangles, I3D 2001; Max, Weights for computing vertex normals, JGT 4, 1999.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from canprobe.mechanics.touch.heights import LEAST_NODES, Heights
+from canprobe.mechanics.touch.shapes import Array, require_positive
+
+Index = npt.NDArray[np.intp]
+
+EDGE_RAD = np.radians(30.0)
+"""Facets that meet at a larger angle have an edge between them."""
+COARSE_RAD = np.radians(15.0)
+"""A median angle between the facets of a curved surface from which on they show no curvature."""
+STEEPEST = np.cos(np.radians(70.0))
+LAYER = 6.0
+"""Spacings below the highest sample of a cell from which on a sample is taken as hidden."""
+EMPTY = 0.1
+"""Share of a mesh's grid that has a surface, below which single vertices far away make the grid."""
+FARTHEST_M = 1e6
+"""Coordinates from which on a mesh is no part."""
+MOST_NODES = 1_000_000
+MOST_SAMPLES = 8_000_000
+RINGING, EDGE_NODES = 0.02, 3
+"""Distance of a sample from the fit, in spacings, that tells a wall; and how many nodes round it are rounded off."""
+FILL_WEIGHT = 0.01
+"""Of a point of a curved triangle in the fit: a vertex is exact, and only where there are none these count."""
+ON_BORDER = 1e-3
+"""Spacings beyond the border up to which a node lies on it: files have single precision."""
+_STIFFNESS = 1e-7
+"""Of the fit against second differences, per sample of a cell: it only matters where there are no samples."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """Heights of a mesh over a grid, as `Heights` takes them.
+
+    Attributes:
+        heights: (m, n) m.
+        spacing: m.
+        origin: (2,) m, from the grid's middle.
+        there: (m, n) whether the mesh has a surface at a node.
+    """
+
+    heights: Array
+    spacing: float
+    origin: tuple[float, float]
+    there: npt.NDArray[np.bool_]
+
+
+class Mesh(Heights):
+    """A mesh, seen from +z of its frame.
+
+    Args:
+        T_base_object: (4, 4) pose, m.
+        vertices, faces, spacing, origin: as `fit_mesh` takes them.
+
+    Raises:
+        ValueError: the mesh shows no smooth surface, or none over the origin.
+    """
+
+    def __init__(
+        self,
+        T_base_object: npt.ArrayLike,
+        vertices: npt.ArrayLike,
+        faces: npt.ArrayLike,
+        spacing: float,
+        origin: npt.ArrayLike | None = None,
+    ) -> None:
+        fit = fit_mesh(vertices, faces, spacing, origin)
+        super().__init__(T_base_object, fit.heights, fit.spacing, fit.origin, fit.there)
+
+
+def fit_mesh(vertices: npt.ArrayLike, faces: npt.ArrayLike, spacing: float, origin: npt.ArrayLike | None = None) -> Fit:
+    """Heights of a mesh over x and y.
+
+    Args:
+        vertices: (k, 3) m.
+        faces: (f, 3) indices, counter-clockwise as seen from outside.
+        spacing: of the grid, m; about twice the length of the mesh's edges where it is fine.
+        origin: (2,) x and y of the point that becomes the object's origin, m; None: the middle of the mesh.
+
+    Raises:
+        ValueError: no mesh, none that is seen from +z, one inside out, or one too coarse or too large.
+    """
+    require_positive(spacing=spacing)
+    points, corners = _merged(np.asarray(vertices, dtype=float), np.asarray(faces, dtype=np.intp))
+    turned = np.cross(points[corners[:, 1]] - points[corners[:, 0]], points[corners[:, 2]] - points[corners[:, 0]])
+    area = np.linalg.norm(turned, axis=1)
+    corners, normals = corners[area > 0.0], turned[area > 0.0] / area[area > 0.0, None]
+    _refuse_inside_out(points, corners)
+    up = normals[:, 2] > STEEPEST
+    if not up.any():
+        raise ValueError("no facet of the mesh faces +z: its faces are inside out, or it must be turned")
+    _refuse_coarse(points, corners[up], normals[up])
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))[:2]
+    at = middle if origin is None else np.asarray(origin, dtype=float)
+    exact, filled = points[np.unique(corners[up])], _samples(points, corners, normals, up, spacing)
+    weights = np.repeat((1.0, FILL_WEIGHT), (len(exact), len(filled)))
+    samples = np.concatenate((exact, filled))
+    seen = _seen(samples, spacing)
+    facing = points[corners[normals[:, 2] > 0.0]]  # walls too, as they are bridged
+    return _fitted(samples[seen], weights[seen], facing[:, :, :2], spacing, at)
+
+
+def _merged(points: Array, corners: Index) -> tuple[Array, Index]:
+    """Vertices at one place are one vertex, which STL files do not say."""
+    if points.ndim != 2 or points.shape[1] != 3 or corners.ndim != 2 or corners.shape[1] != 3 or not len(corners):
+        raise ValueError(f"a mesh needs vertices (k, 3) and faces (f, 3), got {points.shape} and {corners.shape}")
+    if not (np.abs(points) < FARTHEST_M).all():
+        odd = points[~(np.abs(points) < FARTHEST_M).all(axis=1)][0].tolist()
+        raise ValueError(f"vertices of a mesh must be finite and below {FARTHEST_M:g} m, got {odd}: export it again")
+    if corners.min() < 0 or corners.max() >= len(points):
+        raise ValueError(
+            f"faces name vertices 0 to {len(points) - 1}, got {corners.min()} to {corners.max()}: export it again"
+        )
+    unique, places = np.unique(points, axis=0, return_inverse=True)
+    return unique, places.reshape(-1)[corners]
+
+
+def _refuse_inside_out(points: Array, corners: Index) -> None:
+    """Only a closed mesh has a volume, whose sign tells."""
+    ends = np.concatenate((corners[:, (0, 1)], corners[:, (1, 2)], corners[:, (2, 0)]))
+    there = np.unique(ends[:, 0] * len(points) + ends[:, 1])
+    back = np.unique(ends[:, 1] * len(points) + ends[:, 0])
+    if np.array_equal(there, back):
+        a, b, c = (points[corners[:, i]] for i in range(3))
+        if np.einsum("ij,ij->", a, np.cross(b, c)) < 0.0:
+            raise ValueError("the mesh is inside out (its volume is negative): turn its faces round")
+
+
+def _refuse_coarse(points: Array, corners: Index, normals: Array) -> None:
+    ends = np.sort(np.concatenate((corners[:, (0, 1)], corners[:, (1, 2)], corners[:, (2, 0)])), axis=1)
+    faces = np.tile(np.arange(len(corners)), 3)
+    order = np.lexsort(ends.T)
+    ends, faces = ends[order], faces[order]
+    shared = np.flatnonzero((ends[1:] == ends[:-1]).all(axis=1))
+    angles = np.arccos(np.clip(np.sum(normals[faces[shared]] * normals[faces[shared + 1]], axis=1), -1.0, 1.0))
+    curved = (angles > 1e-3) & (angles < EDGE_RAD)
+    if curved.any() and np.median(angles[curved]) > COARSE_RAD:
+        long = np.linalg.norm(points[ends[shared, 0]] - points[ends[shared, 1]], axis=1)[curved]
+        raise ValueError(
+            f"the mesh is too coarse: facets of about {1e3 * np.median(long):.3g} mm turn the normal by "
+            f"{np.degrees(np.median(angles[curved])):.0f} deg from one to the next, at most "
+            f"{np.degrees(COARSE_RAD):.0f} deg; export it finer"
+        )
+
+
+def _samples(points: Array, corners: Index, normals: Array, up: npt.NDArray[np.bool_], apart: float) -> Array:
+    """(k, 3) points of curved triangles where the vertices are farther apart than `apart`, m."""
+    edges = _corner_normals(points, corners, normals)[up]
+    triangles = points[corners[up]]
+    longest = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
+    parts = np.ceil(longest / apart - 1e-9).astype(np.intp).clip(1)
+    if (count := float(np.sum((parts + 1.0) * (parts + 2.0) / 2.0))) > MOST_SAMPLES:
+        raise ValueError(f"the mesh gives {count:.2g} samples at this spacing, at most {MOST_SAMPLES:.0g}: widen it")
+    found = [np.empty((0, 3))]
+    for n in np.unique(parts[parts > 1]).tolist():
+        chosen = parts == n
+        found.append(_curved(triangles[chosen], edges[chosen], n))
+    return np.concatenate(found)
+
+
+def _corner_normals(points: Array, corners: Index, normals: Array) -> Array:
+    """(f, 3, 3) normal of the body at each corner of each facet, from the facets there that no edge parts from it.
+
+    The weights are exact on a ball.
+    """
+    weighted = np.empty((len(corners), 3, 3))
+    for k in range(3):
+        a, b = (points[corners[:, (k + j) % 3]] - points[corners[:, k]] for j in (1, 2))
+        weighted[:, k] = np.cross(a, b) / (np.sum(a * a, axis=1) * np.sum(b * b, axis=1))[:, None]
+    flat = corners.ravel()
+    order = np.argsort(flat, kind="stable")
+    vertex, face, weight = flat[order], order // 3, weighted.reshape(-1, 3)[order]
+    first = np.searchsorted(vertex, vertex, side="left")
+    beyond = np.searchsorted(vertex, vertex, side="right")
+    total, still, step = np.zeros_like(weight), np.arange(len(vertex)), 0
+    while len(still):
+        other = first[still] + step
+        near = np.sum(normals[face[still]] * normals[face[other]], axis=1) > np.cos(EDGE_RAD)
+        total[still] += weight[other] * near[:, None]
+        step += 1
+        still = still[first[still] + step < beyond[still]]
+    corner = np.empty_like(total)
+    corner[order] = total / np.linalg.norm(total, axis=1)[:, None]
+    return corner.reshape(-1, 3, 3)
+
+
+def _curved(triangles: Array, normals: Array, parts: int) -> Array:
+    """(k, 3) points of PN triangles (f, 3, 3) with normals (f, 3, 3) at their corners, `parts` along each side."""
+    i, j = (axis.ravel() for axis in np.meshgrid(np.arange(parts + 1), np.arange(parts + 1), indexing="ij"))
+    inside = i + j <= parts
+    share = np.stack((parts - i - j, i, j))[:, inside] / parts  # barycentric
+    on_sides = np.zeros((len(triangles), 3))
+    points = np.zeros((len(triangles), share.shape[1], 3))
+    for a in range(3):
+        points += share[a][None, :, None] ** 3 * triangles[:, a, None]
+        for b in ((a + 1) % 3, (a + 2) % 3):
+            rise = np.sum((triangles[:, b] - triangles[:, a]) * normals[:, a], axis=1)
+            control = (2.0 * triangles[:, a] + triangles[:, b] - rise[:, None] * normals[:, a]) / 3.0
+            points += 3.0 * (share[a] ** 2 * share[b])[None, :, None] * control[:, None]
+            on_sides += control / 6.0
+    middle = 1.5 * on_sides - 0.5 * triangles.mean(axis=1)
+    points += 6.0 * (share[0] * share[1] * share[2])[None, :, None] * middle[:, None]
+    flat: Array = points.reshape(-1, 3)
+    return flat
+
+
+def _seen(samples: Array, spacing: float) -> npt.NDArray[np.bool_]:
+    """(k,) the samples that no others hide from +z."""
+    cells = np.floor(samples[:, :2] / spacing).astype(np.int64)
+    _, cell = np.unique(cells, axis=0, return_inverse=True)
+    cell = cell.reshape(-1)
+    top = np.full(cell.max() + 1, -np.inf)
+    np.maximum.at(top, cell, samples[:, 2])
+    seen: npt.NDArray[np.bool_] = samples[:, 2] >= top[cell] - LAYER * spacing
+    return seen
+
+
+def _covered(triangles: Array, shape: tuple[int, ...]) -> npt.NDArray[np.bool_]:
+    """Which nodes of a grid lie in triangles (f, 3, 2) over it, in spacings from its corner."""
+    first = np.ceil(triangles[:, :, 0].min(axis=1) - ON_BORDER).astype(np.intp).clip(0)
+    last = np.floor(triangles[:, :, 0].max(axis=1) + ON_BORDER).astype(np.intp).clip(max=shape[0] - 1)
+    rows = (last - first + 1).clip(0)
+    row = np.arange(rows.sum()) + np.repeat(first - np.cumsum(rows) + rows, rows)
+    a = np.repeat(triangles, rows, axis=0)
+    b = np.roll(a, 1, axis=1)
+    ends = np.sort(np.stack((a[:, :, 0], b[:, :, 0])), axis=0)
+    crossed = (ends[0] <= row[:, None] + ON_BORDER) & (row[:, None] - ON_BORDER <= ends[1])
+    along = np.where(ends[1] > ends[0], b[:, :, 0] - a[:, :, 0], 1.0)
+    share = ((row[:, None] - a[:, :, 0]) / along).clip(0.0, 1.0)
+    y = a[:, :, 1] + share * (b[:, :, 1] - a[:, :, 1])  # where the row crosses each side
+    low = np.ceil(np.where(crossed, y, np.inf).min(axis=1) - ON_BORDER).clip(0, shape[1]).astype(np.intp)
+    high = np.floor(np.where(crossed, y, -np.inf).max(axis=1) + ON_BORDER).clip(-1, shape[1] - 1).astype(np.intp)
+    begun = np.zeros((shape[0], shape[1] + 1), dtype=np.intp)
+    np.add.at(begun, (row, low), 1)
+    np.add.at(begun, (row, np.maximum(high + 1, low)), -1)
+    covered: npt.NDArray[np.bool_] = np.cumsum(begun, axis=1)[:, :-1] > 0
+    # A node between four covered ones lies in a gap of less than two spacings, where a facet is missing: it is bridged.
+    covered[1:-1, 1:-1] |= covered[:-2, 1:-1] & covered[2:, 1:-1] & covered[1:-1, :-2] & covered[1:-1, 2:]
+    return covered
+
+
+def _fitted(samples: Array, weights: Array, facing: Array, spacing: float, at: Array) -> Fit:
+    """The least-squares spline, at the grid's nodes; `facing` (f, 3, 2) are all facets that face upwards."""
+    from scipy import ndimage, sparse  # only where a mesh is read
+    from scipy.sparse.linalg import splu
+
+    low, high = samples[:, :2].min(axis=0), samples[:, :2].max(axis=0)
+    cells = np.floor((high - low) / spacing + ON_BORDER).astype(int)  # the grid ends within the samples
+    x, y = 1e3 * (high - low)
+    if cells.min() < LEAST_NODES - 1:
+        least = f"narrower than {LEAST_NODES - 1} spacings of {1e3 * spacing:.3g} mm"
+        raise ValueError(f"what is seen of the mesh from +z is {x:.3g} mm by {y:.3g} mm, {least}")
+    if np.prod(cells + 1.0) > MOST_NODES:
+        raise ValueError(
+            f"the mesh is {x:.3g} mm by {y:.3g} mm: more than {MOST_NODES:.0g} nodes at {1e3 * spacing:.3g} mm; widen"
+            " the spacing, or remove vertices far away"
+        )
+    corner = 0.5 * (low + high) - 0.5 * cells * spacing
+    m, n = (int(one) + 3 for one in cells)  # coefficients along x and y
+    place = (samples[:, :2] - corner) / spacing
+    cell = np.clip(place.astype(np.intp), 0, cells - 1)  # those beyond the grid belong to the cubics of its border
+    (bx, by) = (_basis((place - cell)[:, axis]) for axis in (0, 1))
+    columns = (cell[:, 0, None] + np.arange(4))[:, :, None] * n + (cell[:, 1, None] + np.arange(4))[:, None, :]
+    filled = np.zeros((m - 1, n - 1), dtype=bool)
+    filled[cell[:, 0] + 1, cell[:, 1] + 1] = True
+    there = filled[:-1, :-1] | filled[1:, :-1] | filled[:-1, 1:] | filled[1:, 1:]
+    there &= _covered((facing - corner) / spacing, there.shape)
+    nearly_empty = f"the mesh is {x:.3g} mm by {y:.3g} mm and nearly empty: remove vertices far away"
+    if there.mean() < EMPTY:
+        raise ValueError(nearly_empty)
+    values = bx[:, :, None] * by[:, None, :]
+    count = len(samples)
+    A = sparse.csr_array((values.ravel(), (np.repeat(np.arange(count), 16), columns.ravel())), shape=(count, m * n))
+    bends = [sparse.diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(k - 2, k)) for k in (m, n)]
+    along, across = sparse.kron(bends[0], sparse.identity(n)), sparse.kron(sparse.identity(m), bends[1])
+    weighted = A.T @ sparse.diags_array(weights)
+    weak = _STIFFNESS * max(count / (m * n), 1.0)
+    normal = weighted @ A + weak * (along.T @ along + across.T @ across)
+    try:
+        factors = splu(
+            normal.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        )
+    except RuntimeError as error:  # singular
+        raise ValueError(nearly_empty) from error
+    found = factors.solve(weighted @ samples[:, 2])
+    c = found.reshape(m, n)
+    c = (c[:-2] + 4.0 * c[1:-1] + c[2:]) / 6.0
+    heights = (c[:, :-2] + 4.0 * c[:, 1:-1] + c[:, 2:]) / 6.0
+    off = np.abs(A @ found - samples[:, 2]) > RINGING * spacing
+    if off.any():  # beside a wall the fit rings: there the mean of what is near rounds the edges
+        edges = np.zeros(heights.shape, dtype=bool)
+        for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            edges[cell[off, 0] + i, cell[off, 1] + j] = True
+        edges = ndimage.binary_dilation(edges, iterations=EDGE_NODES)
+        near = (A.T @ np.ones(count)).reshape(m, n)[1:-1, 1:-1]
+        edges &= near > 0.0
+        heights[edges] = (A.T @ samples[:, 2]).reshape(m, n)[1:-1, 1:-1][edges] / near[edges]
+    ox, oy = (at - 0.5 * (low + high)).tolist()
+    return Fit(heights, spacing, (ox, oy), there)
+
+
+def _basis(t: Array) -> Array:
+    """(k, 4) cubic B-splines over a cell at t in 0 … 1."""
+    p = 1.0 - t
+    inner = (2.0 / 3.0 - one * one * (1.0 - 0.5 * one) for one in (t, p))
+    return np.stack((p**3 / 6.0, *inner, t**3 / 6.0), axis=1)

@@ -1,0 +1,278 @@
+"""Calibrate an array by touches of a plane and a ball that were rolled to and fro; a rod verifies.
+
+`image_fit` finds the parameters of the image model, `pad_fit` how centroids err, gains of taxels, and the stiffness by
+the arm's way into the object. Errors are held out: each fifth of the touches is predicted by a fit to the others.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from canprobe.errors import UsageError
+from canprobe.mechanics.touch.linear_algebra import Array
+from canprobe.mechanics.touch.pad import Pad
+from canprobe.mechanics.touch.patch.array_calibration import (
+    ArrayCalibration,
+    CentroidErrors,
+    ForceReference,
+    ImageParameters,
+    Lag,
+    MomentErrors,
+    Residuals,
+    StiffnessSources,
+)
+from canprobe.mechanics.touch.patch.image import PatchCalibration
+from canprobe.mechanics.touch.patch.image_fit import (
+    AGE_S,
+    NO_ERRORS,
+    Dwell,
+    Fit,
+    Pairs,
+    Shown,
+    curvature_errors,
+    fit_parameters,
+    moment_errors,
+    what_is_shown,
+)
+from canprobe.mechanics.touch.patch.image_model import USUAL_LIGHTNESS, make_image_model, make_patch_calibration
+from canprobe.mechanics.touch.patch.pad_fit import fit_centroids, stiffness_by_depth, taxel_gains
+
+FORM_SIGMA = 0.01
+"""Relative error of a moment that planes and balls do not show: of cylinders and saddles, by the model's form."""
+FOLDS = 5
+LEAST_TOUCHES = 10
+HELPFUL = 0.9
+"""Share of the moments' error that may be left with gains of the taxels, for these to be used."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArrayFit:
+    """A calibration, and what people want to see of it.
+
+    Attributes:
+        calibration: the result.
+        dwells, shown, forces: the touches that were used, and their forces by it, N.
+        errors: (n, 3) relative errors of moments of each touch by a fit that has not seen it.
+        curvature_errors: (n, 2) the same of the curvatures, relative to (κ + 1/R_p).
+        scatter: (n,) of the centroids of each touch, m.
+        left_out: touches that saturated or ran off the pad.
+        gains: (16, 16) of the taxels; with them moments err by `gained`, without by `plain` (RMS, relative).
+        offset, object_offset: (2,) of centroids that turns with the probe, and that stays with the object, m; NaN
+            without turned touches.
+    """
+
+    calibration: ArrayCalibration
+    dwells: Sequence[Dwell]
+    shown: Sequence[Shown]
+    forces: Array
+    errors: Array
+    curvature_errors: Array
+    scatter: Array
+    left_out: int
+    gains: Array
+    gained: float
+    plain: float
+    offset: Array
+    object_offset: Array
+
+
+def calibrate_array(
+    dwells: Sequence[Dwell],
+    *,
+    pad: Pad,
+    reference: ForceReference,
+    reference_sigma: float,
+    array: str,
+    date: str,
+    made_on: str,
+    own_gains: bool = True,
+) -> ArrayFit:
+    """Everything that touches of known things say about an array.
+
+    Args:
+        dwells: touches of plane and ball, at more than one force and place; those of a rod only verify.
+        pad: its taxels, and the stated pressure of a full count.
+        reference: what newtons rest on. "scale" and "weights" need touches with a force; "unit" trusts the full scale.
+        reference_sigma: its relative standard deviation.
+        array, date, made_on: for the file.
+        own_gains: use taxel gains where they help: the file is of this array, not of its make.
+
+    Raises:
+        UsageError: too few touches, or no force where the reference is one.
+    """
+    by_force = reference in ("scale", "weights")
+    dwells = dwells if by_force else [replace(d, force=None) for d in dwells]
+    plain = PatchCalibration(pad)
+    every = [(d, what_is_shown(d, plain, AGE_S)) for d in dwells]
+    used = {id(d) for d, s in every if s.usable}
+    count = sum(s.usable and d.name != "rod" for d, s in every)
+    if count < LEAST_TOUCHES or len({d.name for d, s in every if s.usable and d.name != "rod"}) < 2:
+        raise UsageError(
+            f"expected at least {LEAST_TOUCHES} touches of a plane and a ball that neither saturate nor leave the pad,"
+            f" got {count}"
+        )
+    if by_force and not any(d.force is not None and id(d) in used for d in dwells):
+        raise UsageError(f'force reference "{reference}": expected touches with a known force, got none')
+    scale_sigma = None if by_force else max(reference_sigma, 1e-4) if reference == "unit" else 1e-4
+    seen = max(pad.shape) if dwells[0].windows is None else max(w[2] for w in dwells[0].windows)
+    blank = _blank(array, date, made_on, reference, reference_sigma, pad.full_scale_pa)
+
+    def fit(pairs: Pairs, own: PatchCalibration) -> tuple[ArrayCalibration, Fit]:
+        sigma = reference_sigma if by_force else 1.0
+        found = fit_parameters([d for d, _ in pairs], [s for _, s in pairs], own, scale_sigma, sigma, seen)
+        crept = [s.crept for d, s in pairs if d.force is not None]
+        scale = found.parameters.scale * (float(np.mean(crept)) if crept else 1.0)
+        return replace(blank, image=replace(found.parameters, scale=scale), gains=own.gains), found
+
+    good = [(d, s) for d, s in every if s.usable]
+    fitted = [(d, s) for d, s in good if d.name != "rod"]
+    first, found = fit(fitted, plain)
+    gained, alike = _by_gains(fitted, first, plain, seen)
+    gains, dead = _gains(fitted, first, plain)
+    own = plain
+    if own_gains and gained < HELPFUL * alike:
+        own = replace(plain, gains=tuple(tuple(row) for row in np.round(gains, 4).tolist()))
+        good = [(d, what_is_shown(d, own, AGE_S)) for d, _ in good]
+        fitted = [(d, s) for d, s in good if d.name != "rod"]
+        first, found = fit(fitted, own)
+    errors, curvatures, force_errors = _held_out(fitted, lambda pairs: fit(pairs, own)[0], own, seen)
+    ds, ss = [d for d, _ in fitted], [s for _, s in fitted]
+    stiffness = found.parameters.stiffness
+    by_images = stiffness, stiffness * math.sqrt(float(found.covariance[0, 0]))
+    by_depth = stiffness_by_depth(ds, ss, found.forces.tolist(), pad.radius_m, by_images)
+    rods = [(d, s) for d, s in good if d.name == "rod"]
+    across = _rms(_checked(first, rods, own, seen)[1][:, 0]) if rods else math.nan
+    centroid, scatter = fit_centroids(ds, ss)
+    calibration = replace(
+        first,
+        moments=_moment_errors(errors, ss),
+        centroid=centroid,
+        stiffness=StiffnessSources(*by_images, *by_depth),
+        residuals=Residuals(len(fitted), _rms(force_errors), _rms(errors[:, :2]), _rms(curvatures), across),
+        dead=dead if own_gains else (),
+    )
+    offset, of_object = _offsets(good)
+    patch = make_patch_calibration(calibration, pad)
+    forces = np.array([_force(patch, s) for s in ss])
+    return ArrayFit(
+        calibration=calibration,
+        dwells=ds,
+        shown=ss,
+        forces=forces,
+        errors=errors,
+        curvature_errors=curvatures,
+        scatter=scatter,
+        left_out=len(every) - len(good),
+        gains=gains,
+        gained=gained,
+        plain=alike,
+        offset=offset,
+        object_offset=of_object,
+    )
+
+
+def _rms(values: Array) -> float:
+    return math.sqrt(float(np.mean(np.square(values)))) if len(values) else math.nan
+
+
+def _blank(  # noqa: PLR0917
+    array: str, date: str, made_on: str, reference: ForceReference, sigma: float, full_scale: float
+) -> ArrayCalibration:
+    nan = math.nan
+    return ArrayCalibration(
+        array,
+        date,
+        made_on,
+        reference,
+        nan if reference == "none" else sigma,
+        full_scale,
+        ImageParameters(1.0, 1.0, 1.0, 0.0, 0.0),
+        NO_ERRORS,
+        CentroidErrors(nan, nan, nan, nan, nan, nan, Lag(0.0, 1.0)),
+        StiffnessSources(nan, nan, nan, nan, nan, nan),
+        Residuals(0, nan, nan, nan, nan),
+    )
+
+
+def _force(patch: PatchCalibration, s: Shown) -> float:
+    return patch.force_gain * s.total + patch.edge_gain * math.sqrt(s.total)
+
+
+def _checked(
+    calibration: ArrayCalibration, pairs: Pairs, plain: PatchCalibration, seen: int
+) -> tuple[Array, Array, Array]:
+    """Errors (n, 3) of moments, (n, 2) of curvatures and (m,) of reference forces of touches by a calibration."""
+    patch = make_patch_calibration(calibration, plain.pad)
+    model = make_image_model(calibration, patch, seen=seen)
+    measured = [_force(patch, s) for _, s in pairs]
+    parts = [d for d, _ in pairs], [s for _, s in pairs], measured
+    forces = [f / d.force - 1.0 for f, (d, _) in zip(measured, pairs, strict=True) if d.force is not None]
+    return moment_errors(model, *parts), curvature_errors(model, *parts), np.array(forces)
+
+
+def _held_out(
+    pairs: Pairs, fit: Callable[[Pairs], ArrayCalibration], plain: PatchCalibration, seen: int
+) -> tuple[Array, Array, Array]:
+    """As `_checked`, each fifth of the touches by a calibration that was fitted to the others."""
+    errors, curvatures, forces = np.zeros((len(pairs), 3)), np.zeros((len(pairs), 2)), []
+    for fold in range(FOLDS):
+        out = list(range(fold, len(pairs), FOLDS))
+        found = _checked(fit([p for i, p in enumerate(pairs) if i not in out]), [pairs[i] for i in out], plain, seen)
+        errors[out], curvatures[out] = found[:2]
+        forces.append(found[2])
+    return errors, curvatures, np.concatenate(forces)
+
+
+def _moment_errors(errors: Array, shown: Sequence[Shown]) -> MomentErrors:
+    """What is left of touches that the fit had not seen, and of shapes that nobody touched."""
+    scaled = errors * np.sqrt(USUAL_LIGHTNESS / np.array([s.lightness for s in shown]))[:, None]
+    moment = float(np.mean(scaled[:, :2] ** 2)) + FORM_SIGMA**2
+    return MomentErrors(
+        moment=moment,
+        both=float(np.clip(np.mean(scaled[:, 0] * scaled[:, 1]), 0.0, 0.5 * moment)),
+        shear=float(np.mean(scaled[:, 2] ** 2)) + 0.25 * FORM_SIGMA**2,
+        frame_sigma=float(np.median([s.frame_sigma for s in shown])),
+    )
+
+
+def _gains(
+    pairs: Pairs, calibration: ArrayCalibration, plain: PatchCalibration
+) -> tuple[Array, tuple[tuple[int, int], ...]]:
+    """(16, 16) gains of the taxels by these touches, and dead ones."""
+    patch = make_patch_calibration(calibration, plain.pad)
+    model = make_image_model(calibration, patch, seen=None)
+    forces = [_force(patch, s) for _, s in pairs]
+    return taxel_gains(plain.pad, model, [d for d, _ in pairs], [s for _, s in pairs], forces)
+
+
+def _by_gains(pairs: Pairs, calibration: ArrayCalibration, plain: PatchCalibration, seen: int) -> tuple[float, float]:
+    """RMS error of the moments of each half of the touches, with gains of the taxels from the other, and without."""
+    gained, alike = [], []
+    for half in (0, 1):
+        gains = _gains(pairs[half::2], calibration, plain)[0]
+        own = replace(plain, gains=tuple(tuple(row) for row in gains.tolist()))
+        check = [(d, what_is_shown(d, own, AGE_S)) for d, _ in pairs[1 - half :: 2]]
+        gained.append(_checked(calibration, check, plain, seen)[0][:, :2])
+        alike.append(_checked(calibration, pairs[1 - half :: 2], plain, seen)[0][:, :2])
+    return _rms(np.concatenate(gained)), _rms(np.concatenate(alike))
+
+
+def _offsets(pairs: Pairs) -> tuple[Array, Array]:
+    """(2,) offset of centroids that turns with the probe, and (2,) that stays with the object, m.
+
+    A gradient of the taxels' gains and an error of the tool turn with the probe; an object that does not stand where it
+    should be does not.
+    """
+    unknown = np.full(2, math.nan)
+    mine, its = [], []
+    for name in sorted({d.name for d, _ in pairs if abs(d.turn) > 0.5 and d.name != "rod"}):
+        straight = [s.off.mean(axis=0) for d, s in pairs if d.name == name and d.turn == 0.0]
+        turned = [s.off.mean(axis=0) for d, s in pairs if d.name == name and abs(d.turn) > 0.5]
+        if straight:
+            mine.append(0.5 * (np.mean(straight, axis=0) + np.mean(turned, axis=0)))
+            its.append(0.5 * (np.mean(straight, axis=0) - np.mean(turned, axis=0)))
+    return (np.mean(mine, axis=0), np.mean(its, axis=0)) if mine else (unknown, unknown)

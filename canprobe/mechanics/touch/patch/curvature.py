@@ -1,0 +1,489 @@
+"""The contact patch as a second sensor: curvature from the second moments of tactile images, fused with the motion's.
+
+The moments are averaged over the last frames, in axes that follow the contact normal, and compared with a calibrated
+model of the sensor (`image_model`). What gains, hysteresis and blur do to them is common to all images of a contact:
+however many are averaged, the patch never knows more than the calibration's floor.
+
+The fusion is that of measurements: the informations of motion and patch are added, each with its whole covariance, so
+the patch fades where a path excites all of K and speaks where it does not. The stiffness of the layer is a fourth
+unknown beside q: known from the scene to begin with, then from the slope of a touch together with the first images, and
+in every answer from what the motion adds. Outside the calibrated range the patch counts less and less. Where patch and
+motion contradict each other both count less, by χ² over its 95 % point; where they go on doing so nothing is
+called observed.
+
+Where the surface bends along the path a mean over some millimetres is that of an earlier place. A second, shorter mean
+shows it: how far the two are apart, carried on to now, is an error of the longer one, and counts as such.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from canprobe.mechanics.touch.contact import ContactSample, Slope, direction_to_pad, stiffness_from_slope
+from canprobe.mechanics.touch.estimate.answer import CurvatureInformation, Solution, SurfaceEstimate, build_estimate
+from canprobe.mechanics.touch.estimate.noise import CHI2_95, CHI2_999
+from canprobe.mechanics.touch.estimate.online import Dropped, Estimator
+from canprobe.mechanics.touch.estimate.quadric import (
+    SIGMA_LIMIT,
+    TO_Q,
+    UNIT,
+    Decision,
+    matrix_of,
+    nothing_observed,
+    parameters_of,
+    turned,
+)
+from canprobe.mechanics.touch.linear_algebra import (
+    Array,
+    Vec,
+    eigen,
+    homogeneous,
+    inverted,
+    positive,
+    principal_of,
+    solved,
+    tangent_rotation,
+    transported,
+)
+from canprobe.mechanics.touch.patch.image_model import ImageModel
+from canprobe.mechanics.touch.patch.moments import Moments, PadMemory
+
+LEAST_FRAMES = 8
+"""Fewer frames make no estimate."""
+MOST_FRAMES = 32
+"""Frames that the running mean reaches back: 0.16 s at 200 Hz, 4 mm at 25 mm/s."""
+FEW_FRAMES = 8
+"""The same of the shorter mean."""
+FINE = 0.05
+"""`GROSS` of the shorter mean, in which one image weighs more: four times the noise of a frame."""
+YOUNGER = 4.0
+"""Frames by which the shorter mean must be the younger one to tell a drift."""
+GROSS = 0.2
+"""Departure from the mean, over its trace, beyond which one image counts less: ten times the noise of a frame."""
+MOST_ROUNDS = 6
+"""Gauss–Newton steps; from the last answer one or two do."""
+SLOPE_SIGMA = 0.08
+"""Error of a touch's slope in the logarithm of the stiffness that its own deviation leaves out: that of the force."""
+_STIFFER = 0.01
+_ROOT2 = math.sqrt(2.0)
+SETTLED, UNSETTLED = 0.002, 0.05
+"""Step, in units of the probe's curvature, that ends the iteration, and the largest that a last step may have."""
+
+
+class Fused(NamedTuple):
+    """What patch and motion say together about q in a contact frame.
+
+    Attributes:
+        q: (3,) 1/m.
+        patch: (3, 3) the patch's part of the information, the layer's stiffness unknown, m².
+        cost: of all that disagrees with the answer, χ².
+        stiffness: K/h of the layer, N/m³.
+    """
+
+    q: Array
+    patch: Array
+    cost: float
+    stiffness: float
+
+    @property
+    def contradicted(self) -> bool:
+        """Patch and motion do not go together."""
+        return self.cost > CHI2_999
+
+
+class LayerStiffness(NamedTuple):
+    """Logarithm of the layer's stiffness over the stated one, and its standard deviation."""
+
+    mean: float
+    sigma: float
+
+
+class _Seen(NamedTuple):
+    """Moments in their principal axes, and how far they are off by what changed along the path."""
+
+    moments: Moments
+    drift: Moments
+
+
+class _Mean:
+    """Running mean of moments over so many frames at most, for how many it stands, and its age; `gross`: as `GROSS`."""
+
+    def __init__(self, most: int, gross: float) -> None:
+        self.moments: Moments = (0.0, 0.0, 0.0)
+        self.age = 0.0
+        self._most, self._gross = most, gross
+        self.frames = 0
+        self._apart = 0
+
+    def add(self, xx: float, xy: float, yy: float) -> float:
+        """Take the moments of a frame; its share in the mean, small where it is far from it."""
+        self.frames = min(self.frames + 1, self._most)
+        share = 1.0 / self.frames
+        mxx, mxy, myy = self.moments
+        dxx, dxy, dyy = xx - mxx, xy - mxy, yy - myy
+        if self.frames >= LEAST_FRAMES:
+            nearness = self._gross * (mxx + myy) / max(abs(dxx) + 2.0 * abs(dxy) + abs(dyy), 1e-300)
+            self._apart = self._apart + 1 if nearness < 1.0 else 0
+            if self._apart == LEAST_FRAMES:
+                # so many in a row are no outliers: what was before them is not what is felt now
+                self.moments, self.age, self.frames, self._apart = (xx, xy, yy), 0.0, 1, 0
+                return 1.0
+            share *= min(1.0, nearness)
+        self.moments = mxx + share * dxx, mxy + share * dxy, myy + share * dyy
+        self.age = (1.0 - share) * (self.age + 1.0)
+        return share
+
+    def drift_from(self, younger: _Mean) -> Moments:
+        """How far this is off by what changed since, if it went on as a younger mean says."""
+        apart = self.age - younger.age
+        if apart < YOUNGER:
+            return 0.0, 0.0, 0.0
+        times = self.age / apart
+        xx, xy, yy = (times * (now - then) for now, then in zip(younger.moments, self.moments, strict=True))
+        return xx, xy, yy
+
+
+class PatchCurvature:
+    """Running mean of second moments in axes that are carried along with the contact normal.
+
+    Args:
+        model: of the sensor.
+        sigma_stiffness: standard deviation of the logarithm of the model's stiffness, before any touch.
+
+    Attributes:
+        frames: how many the mean stands for, at most `MOST_FRAMES`.
+        refused: contacts without moments (saturated, at the pad's edge, hardly any taxel, or a sensor that sends none).
+    """
+
+    def __init__(self, model: ImageModel, sigma_stiffness: float = 1e-3) -> None:
+        self.model = model
+        self._stiffness = LayerStiffness(0.0, positive("sigma_stiffness", sigma_stiffness))
+        self.refused = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all images: contact was lost."""
+        self.frames = 0
+        self.force = 0.0
+        self._memory = PadMemory()
+        self._axes: tuple[Vec, Vec] = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
+        self._last: Array | None = None
+        self._slope: Slope | None = None
+        self._touched = False
+        self._mean, self._recent = _Mean(MOST_FRAMES, GROSS), _Mean(FEW_FRAMES, FINE)
+
+    def add(self, sample: ContactSample) -> None:
+        """Take the image of one contact."""
+        if not self._touched:
+            self._slope, self._touched = sample.slope, True
+        x, y, z = sample.r_probe.tolist()
+        k = 1.0 / math.sqrt(x * x + y * y + z * z)
+        direction = k * x, k * y, k * z
+        was = self._memory.add(sample.t_s, *direction_to_pad(direction, self.model.radius))
+        if sample.moments is None:
+            self.refused += 1
+            return
+        nx, ny, nz = sample.n_base.tolist()
+        inward = -nx, -ny, -nz
+        x_axis = self._axes[0] if self.frames else tangent_rotation(inward)[:, 0].tolist()
+        self._axes = transported(x_axis, inward)
+        (uu, uv, vv), memory = sample.moments, self.model.memory
+        uu, uv, vv = uu - memory * was[0], uv - memory * was[1], vv - memory * was[2]
+        xx, xy, yy = _turned(uu, uv, vv, *self._pad_axis(direction, sample.T_base_probe))
+        self._recent.add(xx, xy, yy)
+        share = self._mean.add(xx, xy, yy)
+        self.frames = self._mean.frames
+        self.force += share * (sample.force_n - self.force)
+
+    def _pad_axis(self, direction: Moments, T_base_probe: Array) -> tuple[float, float]:
+        """Cosine and sine of the angle from x of the carried axes to u of the pad, both about the inward normal."""
+        x, y, z = direction
+        bend = x / (1.0 + z)  # the pad's u axis, turned from the pole to the contact the shortest way
+        u, v, w = 1.0 - bend * x, -bend * y, -x
+        (a, b, c, _), (d, e, f, _), (g, h, i, _), _ = T_base_probe.tolist()
+        return self._in_axes((a * u + b * v + c * w, d * u + e * v + f * w, g * u + h * v + i * w))
+
+    def _in_axes(self, u: Vec) -> tuple[float, float]:
+        """Direction of a vector of base in the carried tangent plane: cosine, sine."""
+        (a, b, c), ((x0, x1, x2), (y0, y1, y2)) = u, self._axes
+        x, y = a * x0 + b * x1 + c * x2, a * y0 + b * y1 + c * y2
+        size = 1.0 / math.hypot(x, y)
+        return x * size, y * size
+
+    def fuse(self, T_base_contact: Array, motion: CurvatureInformation | None = None) -> Fused | None:
+        """The patch, with what the motion knows about q, in a contact frame (4, 4); None where it knows nothing."""
+        if self.frames < LEAST_FRAMES:
+            return None
+        c, s = self._in_axes(T_base_contact[:3, 0].tolist())
+        xx, xy, yy = _turned(*self._mean.moments, c, -s)
+        mean, half, angle = principal_of(xx, xy, yy)
+        drift = _turned(*_turned(*self._mean.drift_from(self._recent), c, -s), math.cos(angle), -math.sin(angle))
+        turn = turned(angle)  # q in the contact frame to q in the patch's principal axes
+        known = CurvatureInformation(np.zeros(3), np.zeros((3, 3))) if motion is None else motion
+        known = CurvatureInformation(turn.dot(known.q), turn.dot(known.information).dot(turn.T))
+        found = self._solve(_Seen((mean + half, 0.0, mean - half), drift), known)
+        if found is None:
+            return None
+        q, patch = turn.T.dot(found.q), turn.T.dot(found.patch).dot(turn)
+        return Fused(q, patch, found.cost, found.stiffness)
+
+    def _solve(self, seen: _Seen, motion: CurvatureInformation) -> Fused | None:
+        """From the last answer, and where that fails from the ideal layer."""
+        last, self._last = self._last, None
+        found = None if last is None else self._iterated(last, seen, motion)
+        for guess in self._guesses():
+            start = None if found is not None else self._model(guess).start(seen.moments, self.force)
+            if start is not None:
+                found = self._iterated(np.array([*(TO_Q * start), guess]), seen, motion)
+        if found is None:
+            return None
+        self._last, fused, stiffness = found
+        if self._slope is not None:
+            # the layer stays what it is; where the touch was is left behind
+            self._slope, self._stiffness = None, stiffness
+        return fused
+
+    def _iterated(
+        self, x: Array, seen: _Seen, motion: CurvatureInformation
+    ) -> tuple[Array, Fused, LayerStiffness] | None:
+        """Gauss–Newton from x = (q, ln of the stiffness over the stated one): where it ends, the answer, and what is
+        known of the stiffness then; None where it does not settle.
+        """
+        known, mean = np.zeros((4, 4)), np.array([*motion.q, self._stiffness.mean])
+        known[:3, :3], known[3, 3] = motion.information, self._stiffness.sigma**-2
+        J = np.empty((3, 4))
+        xx, _, yy = seen.moments
+        scale = np.array([xx, math.sqrt(xx * yy), yy])
+        step = math.inf
+        try:
+            for round_ in range(MOST_ROUNDS):
+                q1, q2, q3, stiffer = x.tolist()
+                k: Moments = q1, q2 / _ROOT2, q3
+                model = self._model(stiffer)
+                J[:, :3], r, W = model.linearised(seen.moments, self.force, self.frames, k)
+                if round_ == 0:  # it hardly changes from step to step
+                    here = np.array(seen.moments) - scale * r
+                    there = self._model(stiffer + _STIFFER).moments(k, self.force)
+                    J[:, 3] = (there - here) / scale / _STIFFER
+                W = _less_certain(W, seen)
+                W *= model.trust(k, self.force)
+                JW = J.T.dot(W)
+                felt, pull, cost = JW.dot(J), JW.dot(r), float(r.dot(W).dot(r))
+                if not felt.any():
+                    return None
+                if self._slope is not None:
+                    row, off, weight = self._push(x, k, self._slope)
+                    felt += weight * np.outer(row, row)
+                    pull += weight * off * row
+                    cost += weight * off**2
+                apart = mean - x
+                drawn = known.dot(apart)
+                way = solved(felt + known, pull + drawn)
+                cost += float(apart.dot(drawn))
+                x = x + way
+                *of_q, of_stiffness = map(abs, way.tolist())
+                step = max(*of_q, of_stiffness / self.model.radius)
+                if step < SETTLED / self.model.radius:
+                    break
+        except (ValueError, np.linalg.LinAlgError):
+            return None
+        if step > UNSETTLED / self.model.radius:
+            return None
+        stiffness = LayerStiffness(float(x[3]), math.sqrt(float(inverted(felt + known)[3, 3])))
+        patch = felt[:3, :3] - felt[:3, 3, None] * felt[3, :3] / (felt[3, 3] + known[3, 3])
+        return x, Fused(x[:3], patch, cost, self.model.stiffness * math.exp(x[3])), stiffness
+
+    def _guesses(self) -> tuple[float, ...]:
+        """What is known of the stiffness, and what the touch would show on a plane."""
+        known, slope = self._stiffness.mean, self._slope
+        if slope is None:
+            return (known,)
+        return known, math.log(stiffness_from_slope(slope.value, self.model.radius, (0.0, 0.0)) / self.model.stiffness)
+
+    def _model(self, stiffer: float) -> ImageModel:
+        return self.model.with_stiffness(self.model.stiffness * math.exp(stiffer))
+
+    def _push(self, x: Array, k: Moments, slope: Slope) -> tuple[Array, float, float]:
+        """Row (4,) of the slope of a touch at x, its residual and its information."""
+        K = np.array([[k[0], k[1]], [k[1], k[2]]])
+        half = 0.5 * inverted(np.eye(2) / self.model.radius + K)
+        kappa = np.linalg.eigvalsh(K)
+        off = math.log(stiffness_from_slope(slope.value, self.model.radius, kappa) / self.model.stiffness) - x[3]
+        row = np.array([-half[0, 0], -2.0 * half[0, 1] / TO_Q[1], -half[1, 1], 1.0])
+        return row, off, 1.0 / ((2.0 * slope.sigma / slope.value) ** 2 + SLOPE_SIGMA**2)
+
+
+def _less_certain(W: Array, seen: _Seen) -> Array:
+    """Information (3, 3) of relative moments that are also off by a drift of unknown sign."""
+    (v1, _, v2), (xx, xy, yy) = seen.moments, seen.drift
+    relative = np.array([xx / v1, xy / math.sqrt(v1 * v2), yy / v2])
+    b = W.dot(relative)
+    result: Array = W - b[:, None] * b / (1.0 + float(b.dot(relative)))
+    return result
+
+
+def _turned(xx: float, xy: float, yy: float, c: float, s: float) -> tuple[float, float, float]:
+    """A symmetric tensor in other axes, in which the old x axis has the components c, s."""
+    cc, cs, ss = c * c, c * s, s * s
+    return cc * xx - 2.0 * cs * xy + ss * yy, cs * (xx - yy) + (cc - ss) * xy, ss * xx + 2.0 * cs * xy + cc * yy
+
+
+# The answer of patch and motion together, and of the patch alone.
+
+NAMED = 0.1
+"""Share of the information about K that the patch gives from which on the estimate's method names it."""
+CONTRADICTED = "the patch contradicts the motion"
+WITHDRAWN = 0.25
+"""Path over the memory after which a contradiction that lasts withdraws that anything was observed."""
+_TO_K = 1.0 / np.outer(TO_Q, TO_Q)
+
+
+def with_patch(motion: SurfaceEstimate, found: Fused, length: float, *, withdrawn: bool = False) -> SurfaceEstimate:
+    """A motion estimate with its `evidence`, and what was found of that and the patch.
+
+    Place, normal and c13, c23, c33 stay the motion's; the patch says nothing about them. Curvatures below 1/length (the
+    memory, m) count as flat; `withdrawn`: nothing is called observed. The `method` ends in "+patch" where the patch
+    gave at least `NAMED`; a note says how much.
+    """
+    assert motion.evidence is not None
+    weight = CHI2_95 / max(found.cost, CHI2_95)
+    evidence, patch = weight * motion.evidence.information, weight * found.patch
+    has_prior = motion.rank < 3 and bool(np.isfinite(motion.covariance).all())
+    data = weight * motion.information if has_prior else evidence
+    decision = nothing_observed() if withdrawn else _decide(data + patch, found.q, length)
+    root = None if motion.model_root is None else _joined(math.sqrt(weight) * motion.model_root, patch)
+    inverse = inverted(evidence + patch)
+    share = float((inverse * patch).sum()) / 3.0
+    return build_estimate(
+        _solution(motion.S, found.q, inverse, decision, has_prior=has_prior, root=root),
+        length=1.0,
+        T_frame_contact=motion.T_frame_contact,
+        problem_root=motion.problem_root,
+        innovation=motion.innovation,
+        distance=motion.distance,
+        samples=motion.samples,
+        method=motion.method + "+patch" if share >= NAMED else motion.method,
+        prior=motion.prior,
+        notes=(*motion.notes, *_notes(found, share)),
+        stiffness=found.stiffness,
+    )
+
+
+def patch_estimate(contact: ContactSample, patch: PatchCurvature, length: float) -> SurfaceEstimate | None:
+    """Shape from the patch alone, at the last contact, as of a touch that stands still; None where it knows nothing."""
+    T = homogeneous(tangent_rotation(-contact.n_base), contact.p_base)
+    found = patch.fuse(T)
+    if found is None:
+        return None
+    return build_estimate(
+        _solution(matrix_of(np.zeros(9)), found.q, inverted(found.patch), _decide(found.patch, found.q, length)),
+        length=1.0,
+        T_frame_contact=T,
+        problem_root=_root(found.patch),
+        innovation=1.0,
+        distance=0.0,
+        samples=float(patch.frames),
+        method="patch",
+        prior="none",
+        stiffness=found.stiffness,
+    )
+
+
+def _notes(found: Fused, share: float) -> tuple[str, ...]:
+    said = (f"{100.0 * share:.0f} % of the curvature from the patch",)
+    return (*said, CONTRADICTED) if found.contradicted else said
+
+
+def _joined(model_root: Array, patch: Array) -> Array:
+    """(n + 3, 9) root of the information about the entries of S with the patch's part about K."""
+    rows = np.zeros((3, 9))
+    rows[:, 6:] = _root(patch) / UNIT
+    return np.concatenate([model_root, rows])
+
+
+def _root(information: Array) -> Array:
+    """(3, 3) root of the patch's information, which may be singular."""
+    values, vectors = eigen(information)
+    result: Array = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+    return result
+
+
+def _decide(information: Array, q: Array, length: float) -> Decision:
+    """The rank decision's second rule on what patch and motion together know; the first is about motion alone."""
+    values, vectors = eigen(information)
+    size = max(math.sqrt(float(q @ q)), 1.0 / length)
+    return Decision(np.maximum(values, 0.0), vectors, values >= 1.0 / (SIGMA_LIMIT * size) ** 2)
+
+
+def _solution(
+    S: Array, q: Array, covariance: Array, decision: Decision, *, has_prior: bool = False, root: Array | None = None
+) -> Solution:
+    """From q and its covariance (3, 3)."""
+    c = parameters_of(S)
+    if has_prior or decision.rank == 3:
+        c[6:] = UNIT * q
+        return Solution(c, covariance * _TO_K, decision, has_prior, root)
+    V = decision.vectors[:, decision.passed]
+    c[6:] = UNIT * (V @ (V.T @ q))
+    return Solution(c, np.full((3, 3), math.nan), decision, has_prior, root)
+
+
+# An estimator of motion with the contact patch as its second sensor.
+
+
+class PatchedEstimator:
+    """Any estimator, its answers completed by the patch (`with_patch`); before the contact moves, the patch alone.
+
+    Args:
+        motion: the estimator of points and normals.
+        patch: the images.
+        length: memory of `motion`, m.
+    """
+
+    def __init__(self, motion: Estimator, patch: PatchCurvature, length: float) -> None:
+        self.patch = patch
+        self._motion = motion
+        self._length = length
+        self._last: ContactSample | None = None
+        self._place: Array | None = None
+        self._contradicted = 0.0
+
+    @property
+    def dropped(self) -> Dropped:
+        """Samples that were not used, by neither sensor."""
+        return self._motion.dropped
+
+    def add(self, sample: ContactSample) -> None:
+        """Take one contact with its moments."""
+        before = self._motion.dropped.total
+        self._motion.add(sample)
+        if self._motion.dropped.total == before:
+            self._last = sample
+            self.patch.add(sample)
+
+    def estimate(self) -> SurfaceEstimate | None:
+        """The answer at the last contact, or None before there is any."""
+        motion = self._motion.estimate()
+        if motion is None:
+            return None if self._last is None else patch_estimate(self._last, self.patch, self._length)
+        if motion.evidence is None:
+            return motion
+        found = self.patch.fuse(motion.T_frame_contact, motion.evidence)
+        if found is None or not found.contradicted:
+            self._contradicted = 0.0
+        elif self._place is not None:
+            self._contradicted += float(np.linalg.norm(motion.point - self._place))
+        self._place = motion.point
+        if found is None:
+            return motion
+        return with_patch(motion, found, self._length, withdrawn=self._contradicted > WITHDRAWN * self._length)
+
+    def reset(self) -> None:
+        """Forget everything but the settings."""
+        self._motion.reset()
+        self.patch.reset()
+        self._last = self._place = None
+        self._contradicted = 0.0

@@ -1,0 +1,319 @@
+"""What an array shows of a contact: force and second moments of its image, from the curvature under the probe.
+
+On a Winkler layer of stiffness k a probe of radius R_p leaves an elliptic patch on a surface with shape operator K:
+with `A = ½ (I/R_p + K)` and `F = π k δ² / (2 √det A)` the pressure is `k (δ − xᵀ A x)₊`, and its second moments are
+`(δ/6) A⁻¹`. The array blurs that pressure, spreads some of it over rows and columns, scales it, and shows what is
+above a level. Five numbers say how much: stiffness, scale, blur, crosstalk, and what the image remembers of earlier
+places (`moments.PadMemory`). The level and the pitch are those of the device.
+
+The blurred patch has no closed form: the pressure is taken on a grid of thirds of a pitch over one quadrant, in the
+principal axes, and blurred by a folded Gaussian matrix. Stops being true where taxels saturate, where the patch is no
+paraboloid (an edge, a hollow nearly as tight as the probe), and where only some taxels are above the level.
+
+Source: Johnson, Contact Mechanics (1985), 4.3, the elastic foundation.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from canprobe.mechanics.touch.linear_algebra import Array, positive, read_only
+from canprobe.mechanics.touch.pad import COUNTS_MAX, Pad
+from canprobe.mechanics.touch.patch.array_calibration import ArrayCalibration, ImageParameters, MomentErrors
+from canprobe.mechanics.touch.patch.image import PatchCalibration
+from canprobe.mechanics.touch.patch.moments import LEVEL_COUNTS, Moments
+
+STEPS = 3
+"""Grid points in a pitch: with more of them a moment changes by 0.1 %."""
+SMALLEST = 0.4
+"""Least moment of the ideal layer over the squared pitch, a patch three pitches wide; smaller ones blur away."""
+LARGEST = 0.2
+"""Largest such moment over the squared half-width, in pitches, of what is seen: the patch just fits."""
+LIGHTEST = 0.3
+"""Level over peak pressure from which too little of a patch is above the level."""
+TAPER = 0.1
+"""How far beyond these limits a patch still counts, as a share of the limit."""
+USUAL_LIGHTNESS = 0.05
+"""Level over peak pressure at which the floor holds; it grows in proportion, as light touches cover few taxels."""
+GAIN_FORCES_N = (0.5, 1.0, 2.0, 4.0)
+GAIN_LIGHTNESS = 0.25
+GAIN_CURVATURES = ((0.0, 0.0), (0.8, 0.8), (1.6, 1.6), (1.2, 0.0), (0.6, -0.5))
+"""Forces, level over peak pressure, and principal curvatures (over that of the probe) between which the force gains
+hold: plane, balls, cylinder, saddle."""
+_STEP = 1e-3
+"""Relative step of the difference quotients, of the curvature relative to the probe and of the force."""
+_ROOT = math.sqrt(2.0)
+_ROUND = 1e-4
+"""Least difference of the principal curvatures, relative, at which the shear of the image is a quotient."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageModel:
+    """The images of one array on one probe.
+
+    Attributes:
+        parameters: of the array.
+        radius: R_p, m.
+        pitch: m.
+        level: taken off the pressure of every taxel before moments are taken (`MomentImage`), Pa: the first count above
+            the array's threshold.
+        count: pressure of one count, Pa.
+        side: taxels along a side of the array.
+        seen: taxels along the side that moments are taken of: the window's.
+        errors: of the moments.
+    """
+
+    parameters: ImageParameters
+    radius: float
+    pitch: float
+    level: float
+    count: float
+    side: int
+    seen: int
+    errors: MomentErrors
+    _squares: Array = field(init=False, repr=False)
+    _blur: Array = field(init=False, repr=False)
+    _turned_blur: Array = field(init=False, repr=False)
+    _moments: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        for name in ("radius", "pitch", "level"):
+            positive(name, getattr(self, name))
+        half = 0.5 * self.seen
+        source = (np.arange(math.ceil(math.sqrt(6.0 * LARGEST) * half * STEPS) + 1) + 0.5) / STEPS
+        x = (np.arange(math.ceil(half * STEPS)) + 0.5) / STEPS
+        width = self.parameters.blur / self.pitch
+        far = np.arange(-20 * STEPS, 20 * STEPS + 1) / STEPS
+        folded = [np.exp(-0.5 * ((x[:, None] - sign * source) / width) ** 2) for sign in (1.0, -1.0)]
+        blur = (folded[0] + folded[1]) / np.exp(-0.5 * (far / width) ** 2).sum()
+        # crosstalk is linear in rows and columns as the blur is: a row spreads its sum, which the blur leaves as it is
+        share = self.parameters.crosstalk / (self.side - 1)
+        blur = (1.0 - self.side * share) * blur + share * 2.0 / STEPS
+        weight = np.ones((len(x), len(x)))
+        sums = np.stack([weight, weight * (x * x)[:, None], weight * x * x], axis=-1).reshape(-1, 3)
+        object.__setattr__(self, "_squares", read_only(source * source))
+        object.__setattr__(self, "_blur", read_only(blur))
+        object.__setattr__(self, "_turned_blur", read_only(np.ascontiguousarray(blur.T)))
+        object.__setattr__(self, "_moments", read_only(sums))
+
+    @property
+    def memory(self) -> float:
+        """As `ImageParameters.memory`."""
+        return self.parameters.memory
+
+    @property
+    def stiffness(self) -> float:
+        """Of the layer (K/h), N/m³."""
+        return self.parameters.stiffness
+
+    def with_stiffness(self, stiffness: float) -> ImageModel:
+        """The same array on another layer (N/m³): its blur stays."""
+        other, p = object.__new__(ImageModel), self.parameters
+        for name in self.__slots__:
+            object.__setattr__(other, name, getattr(self, name))
+        object.__setattr__(other, "parameters", ImageParameters(stiffness, p.scale, p.blur, p.crosstalk, p.memory))
+        return other
+
+    # the forward model
+
+    def depth(self, force: float, det: float) -> float:
+        """Indentation, m, under a force, N, with det A, 1/m²."""
+        return math.sqrt(2.0 * force * math.sqrt(det) / (math.pi * self.parameters.stiffness))
+
+    def shown(self, depth: Array, a: Array, b: Array) -> Array:
+        """Pressure that is shown in a quadrant of the patch.
+
+        Args:
+            depth: (n,) indentation, m.
+            a, b: (n,) eigenvalues of A, 1/m.
+
+        Returns:
+            (n, m, m) Pa, the first of the last two axes along that of a, a third of a pitch apart.
+        """
+        p, square = self.parameters, self.pitch**2
+        peak = p.scale * p.stiffness * depth
+        per_square = peak * (square / depth)
+        fall, drop = per_square * a, per_square * b
+        field = (peak[:, None] - fall[:, None] * self._squares)[:, :, None] - (drop[:, None] * self._squares)[:, None]
+        np.maximum(field, 0.0, out=field)
+        shown: Array = self._blur @ field @ self._turned_blur
+        return shown
+
+    def moments_of(self, shown: Array) -> list[tuple[float, float]]:
+        """Second moments above the level along both axes, m², of each of the n that `shown` gives.
+
+        Raises:
+            ValueError: where nothing is above the level.
+        """
+        above = np.maximum(shown - self.level, 0.0).reshape(len(shown), -1)
+        square = self.pitch**2
+        sums = above.dot(self._moments).tolist()
+        if not all(total > 0.0 for total, _, _ in sums):
+            raise ValueError("no patch: nothing above the level")
+        return [(square * xx / total, square * yy / total) for total, xx, yy in sums]
+
+    def sum_of(self, shown: Array) -> Array:
+        """(n,) pressure times area of the taxels at or above the level, N, of what `shown` gives.
+
+        Noise lets some taxels below it through and cuts some above it: the edge is one count wide.
+        """
+        share = np.clip((shown - self.level) / self.count + 1.0, 0.0, 1.0)
+        sums: Array = (shown * share).sum(axis=(1, 2)) * (2.0 * self.pitch / STEPS) ** 2
+        return sums
+
+    def moments(self, k: Moments, force: float) -> Moments:
+        """Second moments of the image (m²) for a shape operator (K11, K12, K22; 1/m) and a force (N).
+
+        Raises:
+            ValueError: where the surface is as hollow as the probe, or nothing is above the level.
+        """
+        (a, b), axes, det = self._principal(k)
+        depth = self.depth(force, det)
+        v1, v2 = self.moments_of(self.shown(np.array([depth]), np.array([a]), np.array([b])))[0]
+        return _in_axes(v1, v2, axes)
+
+    def _principal(self, k: Moments) -> tuple[tuple[float, float], tuple[float, float], float]:
+        """Eigenvalues of A, cosine and sine of the direction of the first, det A."""
+        mean, off = 0.5 * (k[0] + k[2]), 0.5 * (k[0] - k[2])
+        half = math.hypot(off, k[1])
+        a, b = 0.5 * (1.0 / self.radius + mean + half), 0.5 * (1.0 / self.radius + mean - half)
+        if b <= 0.0:
+            raise ValueError("no patch: hollower than the probe")
+        angle = 0.5 * math.atan2(k[1], off)
+        return (a, b), (math.cos(angle), math.sin(angle)), a * b
+
+    # its inverse: what an image says about force and K
+
+    def force_gains(self, forces: Sequence[float], curvatures: Sequence[tuple[float, float]]) -> tuple[float, float]:
+        """Gains g, e (√N) with which the force is `g S + e √S`, S the sum of pressure times area.
+
+        The second term stands for what the patch loses at its rim. Least squares of relative errors, within 1 %.
+
+        Args:
+            forces: N; larger ones where the second of them would hardly show on a plane.
+            curvatures: principal ones over that of the probe; each is pressed with each force.
+        """
+        light = self._lightness(self.depth(forces[1], 0.25 / self.radius**2))
+        forces = [force * max(1.0, light / GAIN_LIGHTNESS) ** 2 for force in forces]
+        F, K = np.repeat(forces, len(curvatures)), np.tile(curvatures, (len(forces), 1))
+        ab = 0.5 / self.radius * (1.0 + K)
+        depths = np.array([self.depth(*pair) for pair in zip(F.tolist(), ab.prod(axis=1).tolist(), strict=True)])
+        S = self.sum_of(self.shown(depths, ab[:, 0], ab[:, 1]))
+        gains, *_ = np.linalg.lstsq(np.stack([S, np.sqrt(S)], axis=1) / F[:, None], np.ones(len(F)), rcond=None)
+        return float(gains[0]), float(gains[1])
+
+    def trust(self, k: Moments, force: float) -> float:
+        """1 where the model holds (K in 1/m, force in N), falling to 0 beyond `SMALLEST`, `LARGEST` and `LIGHTEST`.
+
+        A peak beyond full scale contradicts an image that is not saturated: the layer is another one.
+        """
+        (a, b), _, det = self._principal(k)
+        depth = self.depth(force, det)
+        least, most = (depth / (6.0 * x * self.pitch**2) for x in (a, b))
+        light = self._lightness(depth)
+        brightest = self.level / (COUNTS_MAX * self.count)
+        ends = SMALLEST / least, most / (LARGEST * (0.5 * self.seen) ** 2), light / LIGHTEST, brightest / light
+        return min(max(1.0 - (max(ends) - 1.0) / TAPER, 0.0), 1.0)
+
+    def _lightness(self, depth: float) -> float:
+        """Level over the peak pressure that is shown."""
+        return self.level / (self.parameters.scale * self.parameters.stiffness * depth)
+
+    def start(self, v: Moments, force: float) -> Moments | None:
+        """K (1/m) to begin with, from moments (m²) in their principal axes and force (N); None where blur is all.
+
+        The ideal layer, blurred: the level takes off about what the blur adds to a small patch.
+        """
+        blur = 0.5 * self.parameters.blur**2
+        x, y = v[0] - blur, v[2] - blur
+        if x <= 0.0 or y <= 0.0:
+            return None
+        root_det = 2.0 * force / (36.0 * math.pi * self.parameters.stiffness * x * y)
+        depth = self.depth(force, root_det * root_det)
+        return depth / (3.0 * x) - 1.0 / self.radius, 0.0, depth / (3.0 * y) - 1.0 / self.radius
+
+    def linearised(self, v: Moments, force: float, frames: float, k: Moments) -> tuple[Array, Array, Array]:
+        """Relative residual at K, its Jacobian, and the information of the residual.
+
+        Args:
+            v: measured moments (m²) in their principal axes, so that the second is 0.
+            force: measured, N.
+            frames: how many were averaged.
+            k: K11, K12, K22 in the same axes, 1/m.
+
+        Returns:
+            J (3, 3) on q = (K11, √2 K12, K22), m; residual (3,); its inverse covariance (3, 3).
+
+        Raises:
+            ValueError: where the surface is as hollow as the probe, or nothing is above the level.
+        """
+        (a, b), (c, s), det = self._principal(k)
+        h = _STEP * a
+        depth = self.depth(force, det)
+        bent = depth * (1.0 + h / a) ** 0.25, depth * (1.0 + h / b) ** 0.25
+        shown = self.shown(np.array((depth, *bent)), np.array((a, a + h, a)), np.array((b, b, b + h)))
+        (v1, v2), (a1, a2), (b1, b2) = self.moments_of(shown)
+        # by the entries of K in its own axes, K = 2 A − I/R_p; an isotropic function turns with its argument
+        d11, d21, d12, d22 = (0.5 * d / h for d in (a1 - v1, a2 - v2, b1 - v1, b2 - v2))
+        apart = 2.0 * (a - b)
+        shear = (v1 - v2) / apart if apart > _ROUND * a else d11 - d12
+        scale = 1.0 / v[0], 1.0 / math.sqrt(v[0] * v[2]), 1.0 / v[2]
+        cc, cs, ss = c * c, c * s, s * s
+        rows = []
+        for weight, (x, y, z) in zip(scale, ((cc, -2.0 * cs, ss), (cs, cc - ss, -cs), (ss, 2.0 * cs, cc)), strict=True):
+            by1, by2, by12 = x * d11 + z * d21, x * d12 + z * d22, y * shear
+            k11 = weight * (by1 * cc + by2 * ss - by12 * cs)
+            k22 = weight * (by1 * ss + by2 * cc + by12 * cs)
+            rows.append((k11, weight * _ROOT * ((by1 - by2) * cs + 0.5 * by12 * (cc - ss)), k22))
+        here = _in_axes(v1, v2, (c, s))
+        residual = np.array([weight * (m - m0) for weight, m, m0 in zip(scale, v, here, strict=True)])
+        return np.array(rows), residual, self._information(frames, self._lightness(depth))
+
+    def _information(self, frames: float, lightness: float) -> Array:
+        """(3, 3) inverse covariance of the relative residuals of V11, V12, V22."""
+        e = self.errors
+        noise, more = e.frame_sigma**2 / max(frames, 1.0), lightness / USUAL_LIGHTNESS
+        moment, both = more * e.moment + noise, more * e.both
+        det, shear = moment * moment - both * both, 1.0 / (more * e.shear + noise)
+        return np.array(((moment / det, 0.0, -both / det), (0.0, shear, 0.0), (-both / det, 0.0, moment / det)))
+
+
+def _in_axes(v1: float, v2: float, axes: tuple[float, float]) -> Moments:
+    """xx, xy, yy of a tensor with principal values v1, v2, the direction of the first given by cosine and sine."""
+    c, s = axes
+    return c * c * v1 + s * s * v2, c * s * (v1 - v2), s * s * v1 + c * c * v2
+
+
+# From a calibration to the models of its array.
+
+
+def make_patch_calibration(calibration: ArrayCalibration, pad: Pad) -> PatchCalibration:
+    """From counts to force, for an array of these taxels; without a sphere or a grid the force is that of the pressure.
+
+    At another full scale than that of the calibration level, threshold and noise are the same counts of another
+    pressure, and layer, blur, crosstalk and scale stay.
+    """
+    if pad.is_flat or not pad.is_grid:
+        return PatchCalibration(pad, force_gain=1.0 / calibration.image.scale)
+    plain = PatchCalibration(pad, gains=calibration.gains)
+    gain, edge = make_image_model(calibration, plain, seen=None).force_gains(GAIN_FORCES_N, GAIN_CURVATURES)
+    return replace(plain, force_gain=gain, edge_gain=edge)
+
+
+def make_image_model(calibration: ArrayCalibration, patch: PatchCalibration, *, seen: int | None) -> ImageModel:
+    """What an array shows; `seen`: taxels along the side of the window, None for all."""
+    count, side = patch.full_scale_pa / COUNTS_MAX, max(patch.pad.shape)
+    return ImageModel(
+        calibration.image,
+        patch.radius_m,
+        patch.pitch_m,
+        level=LEVEL_COUNTS * count,
+        count=count,
+        side=side,
+        seen=side if seen is None else seen,
+        errors=calibration.moments,
+    )

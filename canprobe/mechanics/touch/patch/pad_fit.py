@@ -1,0 +1,221 @@
+"""What touches of known objects say about centroids, taxels, and the layer by the arm's way."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from canprobe.mechanics.touch.contact import indentation_from_force
+from canprobe.mechanics.touch.linear_algebra import Array
+from canprobe.mechanics.touch.pad import Pad
+from canprobe.mechanics.touch.patch.array_calibration import CentroidErrors, Lag
+from canprobe.mechanics.touch.patch.image_fit import Dwell, Shown
+from canprobe.mechanics.touch.patch.image_model import STEPS, ImageModel
+
+REACH = 200e-6, 0.2
+"""Expected `Lag.reach`, m, and how far its logarithm may be off: rolls of one length hardly tell it from `Lag.most`."""
+SCATTER_WAY_M = 1e-3
+"""Way over the pad within which centroids scatter as their noise: 20 mm of a scan whose pad follows the normal."""
+FRAMES_ALIKE = 20
+"""Images in a row whose centroids err alike, about."""
+LAGS, LAG_STEP_M = 16, 1e-4
+"""Of the autocorrelation along the way over the pad."""
+TAU_S = 0.02, 0.3
+"""Time constants of `Lag`."""
+
+
+# Centroids: how they trail, how they scatter, and over which way an error lasts.
+
+
+def _means(t: Array, at: Array) -> Array:
+    """(n, 2) from the slow to the quick exponential mean of places (n, 2), as `PadLag` has them."""
+    quick = slow = at[0]
+    ways = np.zeros_like(at)
+    for i in range(1, len(t)):
+        dt = t[i] - t[i - 1]
+        quick = quick + (1.0 - math.exp(-dt / TAU_S[0])) * (at[i] - quick)
+        slow = slow + (1.0 - math.exp(-dt / TAU_S[1])) * (at[i] - slow)
+        ways[i] = quick - slow
+    return ways
+
+
+def fit_centroids(dwells: Sequence[Dwell], shown: Sequence[Shown]) -> tuple[CentroidErrors, Array]:
+    """How centroids err, and the (n,) scatter of those of each touch, m.
+
+    Latency and lag from the rolls to and fro, then what is left of all by load, and how long it lasts.
+
+    Hysteresis trails by a way and latency by a time: in the middle of a stroke the ways are alike at any speed. The
+    rolls are as short as a scan's: over longer ways the centroid trails further.
+    """
+    rolls = [s for d, s in zip(dwells, shown, strict=True) if d.to_and_fro]
+    latency, latency_sigma = _latency(rolls)
+
+    def left(z: Array, s: Shown, way: Array) -> Array:
+        rest: Array = s.off + 1e-4 * z[0] * way / (np.hypot(*way.T)[:, None] + 1e-4 * abs(z[1]))
+        return rest
+
+    taught = [(s, _means(s.t_s, s.raw)) for s in rolls or shown]
+
+    def residuals(z: Array) -> Array:
+        each = [left(z, *pair) for pair in taught]
+        centred = [1e5 * (r - r.mean(axis=0)).reshape(-1) / math.sqrt(len(r)) for r in each]
+        return np.concatenate([*centred, [math.log(abs(z[1]) / (1e4 * REACH[0])) / REACH[1]]])
+
+    z = least_squares(residuals, np.array([1.0, 1e4 * REACH[0]])).x
+    most, reach = (1e-4 * z).tolist()
+    rest = [left(z, s, _means(s.t_s, s.raw)) for s in shown]
+    sigma = [_scatter(r, s.way) for r, s in zip(rest, shown, strict=True)]
+    power, log_scale = np.polyfit(np.log([s.lightness for s in shown]), np.log(sigma), 1)
+    share, length = _lasting(rest, [s.way for s in shown])
+    found = CentroidErrors(
+        scale=math.exp(float(log_scale)),
+        power=float(power),
+        correlation=length,
+        share=share,
+        latency_s=latency,
+        latency_sigma_s=latency_sigma,
+        lag=Lag(most=max(most, 0.0), reach=abs(reach)),
+    )
+    return found, np.array(sigma)
+
+
+def _along(way: Array) -> Array:
+    """(n,) path over the pad, m, up to each of its places (n, 2)."""
+    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))])
+
+
+def _scatter(r: Array, way: Array) -> float:
+    """Standard deviation of errors (n, 2) within `SCATTER_WAY_M`: what lasts longer bends no surface."""
+    part = (_along(way) / SCATTER_WAY_M).astype(int)
+    variances = [r[part == i].var(axis=0, ddof=1).mean() for i in range(part[-1] + 1) if np.sum(part == i) > 4]
+    return math.sqrt(float(np.mean(variances))) if variances else float(r.std())
+
+
+def _latency(rolls: Sequence[Shown]) -> tuple[float, float]:
+    """By which images are older than their stamps, s, and its σ: by the middle of strokes at several speeds."""
+    rows = []
+    for s in rolls:
+        along = s.way - s.way.mean(axis=0)
+        way = along[:, int(np.ptp(along[:, 1]) > np.ptp(along[:, 0]))]
+        axis = int(np.ptp(along[:, 1]) > np.ptp(along[:, 0]))
+        speed, off = np.gradient(way, s.t_s), s.off[:, axis] - s.off[:, axis].mean()
+        middle = np.abs(way) < 0.5 * np.abs(way).max()
+        rows += list(zip(np.sign(speed[middle]), speed[middle], off[middle], strict=True))
+    if not rows or np.ptp(np.abs([r[1] for r in rows])) == 0.0:
+        return 0.0, math.inf
+    A, y = np.array(rows)[:, :2], np.array(rows)[:, 2]
+    found, *_ = np.linalg.lstsq(A, y, rcond=None)
+    scatter = float(np.mean((y - A @ found) ** 2)) * np.linalg.inv(A.T @ A)[1, 1]
+    return -float(found[1]), math.sqrt(scatter * FRAMES_ALIKE)
+
+
+def _lasting(errors: Sequence[Array], ways: Sequence[Array]) -> tuple[float, float]:
+    """Share of the variance of errors (n, 2) that lasts along the way over the pad, and over which length, m."""
+    lags = np.zeros(LAGS)
+    for r, way in zip(errors, ways, strict=True):
+        s = _along(way)
+        grid = np.arange(0.0, s[-1], LAG_STEP_M)
+        if len(grid) < 2 * LAGS:
+            continue
+        on_grid = np.stack([np.interp(grid, s, r[:, i]) for i in (0, 1)])
+        on_grid -= on_grid.mean(axis=1, keepdims=True)
+        lags += [float((on_grid[:, : len(grid) - k] * on_grid[:, k:]).mean()) for k in range(LAGS)]
+    if lags[0] <= 0.0:
+        return 0.0, LAG_STEP_M
+    # that each error has its mean taken off shifts all of them down
+    at = LAG_STEP_M * np.arange(1, LAGS)
+
+    def residuals(z: Array) -> Array:
+        rest: Array = z[0] * np.exp(-at / abs(z[1]) / 1e-3) - z[2] - lags[1:] / lags[0]
+        return rest
+
+    share, length, shift = least_squares(residuals, np.array([0.5, 1.0, 0.1])).x.tolist()
+    return min(max(share / (1.0 + max(shift, 0.0)), 0.0), 1.0), abs(length) * 1e-3
+
+
+# Taxels.
+
+
+def taxel_gains(
+    pad: Pad, model: ImageModel, dwells: Sequence[Dwell], shown: Sequence[Shown], forces: Sequence[float]
+) -> tuple[Array, tuple[tuple[int, int], ...]]:
+    """Gain of each taxel over the mean, and those that are dead.
+
+    The image of the model is laid on the centroid of each image; taxels above a fifth of the peak count.
+
+    Returns:
+        (rows, columns) gains, 1 where nothing is known; (row, column) of dead taxels.
+    """
+    from scipy.ndimage import map_coordinates
+
+    seen, wanted, dead = np.zeros((3, *pad.shape))
+    u, v = (pad.uv.T / pad.pitch_m).reshape(2, *pad.shape)
+    for dwell, s, force in zip(dwells, shown, forces, strict=True):
+        a, b = (0.5 * (1.0 / model.radius + x) for x in dwell.kappa)
+        quadrant = model.shown(np.array([model.depth(force, a * b)]), np.array([a]), np.array([b]))[0]
+        c, si = math.cos(dwell.angle), math.sin(dwell.angle)
+        mine = quadrant / model.count
+        stamps = dict(zip(s.t_s.tolist(), s.raw / model.pitch, strict=True))
+        for t, image in list(zip(dwell.t_s.tolist(), dwell.images, strict=True))[::4]:
+            if t not in stamps:
+                continue
+            x, y = u - stamps[t][0], v - stamps[t][1]
+            along, across = np.abs(c * x + si * y), np.abs(-si * x + c * y)
+            expected = map_coordinates(mine, [along * STEPS - 0.5, across * STEPS - 0.5], order=1, mode="nearest")
+            inside = (expected > 0.25 * mine.max()) & (np.maximum(along, across) < len(mine) / STEPS)
+            share = expected[inside].sum() / max(float(image[inside].sum()), 1.0)
+            seen[inside] += image[inside] * share
+            wanted[inside] += expected[inside]
+            dead[inside] += np.where(image[inside] == 0, 1.0, -1.0)
+    known = wanted > 10.0 * mine.max()
+    gains = np.where(known, seen / np.maximum(wanted, 1.0), 1.0)
+    broken = tuple((int(i), int(j)) for i, j in np.argwhere(dead > 0))
+    for place in broken:
+        gains[place] = 1.0
+    return gains, broken
+
+
+# The layer, by the arm's way into the object.
+
+
+def stiffness_by_depth(
+    dwells: Sequence[Dwell],
+    shown: Sequence[Shown],
+    forces: Sequence[float],
+    radius: float,
+    by_images: tuple[float, float],
+) -> tuple[float, float, float, float]:
+    """K/h (N/m³) by how far the arm went in between touches of one place; the arm's compliance (m/N); each with its σ.
+
+    On a stiff arm the way between two forces at one place is that of the layer, `δ = √(2 F √det A / (π k))`. What the
+    way has more than the stiffness that the images show (with its σ) grows with the force: the arm's compliance. Its
+    σ is that of the ways' scatter and of that stiffness.
+
+    Returns:
+        NaN where no place was touched with two forces.
+    """
+    stiffness, stiffness_sigma = by_images
+    rows = []
+    for name, place, turn in sorted({(d.name, d.place, d.turn) for d in dwells}):
+        group = [i for i, d in enumerate(dwells) if (d.name, d.place, d.turn) == (name, place, turn)]
+        if len(group) < 2:
+            continue
+        unit = np.array([indentation_from_force(forces[i], 1.0, radius, dwells[i].kappa) for i in group])
+        push, force = np.array([shown[i].push for i in group]), np.array([forces[i] for i in group])
+        rows += list(zip(unit - unit.mean(), force - force.mean(), push - push.mean(), strict=True))
+    if not rows:
+        return (math.nan,) * 4
+    unit, force, push = np.array(rows).T
+    root = float(unit @ push / (unit @ unit))
+    sigma = math.sqrt(float(np.mean((push - root * unit) ** 2)) / float(unit @ unit))
+    more = push - unit / math.sqrt(stiffness)
+    compliance = float(force @ more / (force @ force))
+    scatter = math.sqrt(float(np.mean((more - compliance * force) ** 2)) / float(force @ force))
+    of_stiffness = 0.5 * stiffness_sigma * stiffness**-1.5 * abs(float(force @ unit)) / float(force @ force)
+    compliance_sigma = math.hypot(scatter, of_stiffness)
+    if root <= 0.0:
+        return math.nan, math.nan, compliance, compliance_sigma
+    return root**-2, 2.0 * sigma / root**3, compliance, compliance_sigma

@@ -1,0 +1,167 @@
+"""How a probe moves: lines and arcs between its poses, and the joint steps that follow its poses, in `plan` and `run`.
+
+A line or an arc gives the pose at a time. `PoseSteps` turns pose after pose into joints by one damped Newton step of
+the inverse kinematics each: a task takes one a cycle, the plan takes longer ones along the path that the task will go.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dgesv
+
+from canprobe.mechanics.robot.chain import Posture, Vec, ending_in, jacobian, pose_of, posture
+from canprobe.mechanics.robot.inverse import damped_step, in_rows, task_rows
+from canprobe.mechanics.robot.model import ArmModel
+from canprobe.mechanics.touch.servo import ProbePose
+
+Vector = NDArray[np.float64]
+MOVE_SPEED, ROUND_SPEED, RETREAT_SPEED = 30e-3, 40e-3, 20e-3
+"""Mean speeds of the way to an object, round a ball, and off an object, m/s."""
+OFF_M = 2e-3
+"""By which a probe draws back farther from a ball than the clearance from which it came."""
+SETTLE_S = 0.5
+"""At rest in contact before a scan."""
+SMALL_STEP = 0.01
+"""Joint step (rad) below which the exact inverse is taken: in a cycle of 400 Hz 230 deg/s."""
+REST_HZ = 1.0
+"""How fast more joints than a pose needs go back to the posture they began with."""
+
+
+class PoseSteps:
+    """Joint steps that follow the poses of a probe.
+
+    An arm follows the rows of the pose that it can hold (`task_rows`). With six of them the turn about the pole is as
+    near to that of the beginning as the pole allows. More joints than rows stay near the posture that they began with.
+
+    Args:
+        model: the arm.
+        T_flange_probe: (4, 4) of the probe's centre, m.
+        q: (n,) joint positions of the beginning, rad or m.
+
+    Attributes:
+        at: chain and probe in the joints of the last step.
+    """
+
+    def __init__(self, model: ArmModel, T_flange_probe: Vector, q: Vector) -> None:
+        self._rows = task_rows(model)
+        self._chain = ending_in(model.chain, T_flange_probe)
+        self._rest = np.array(q, dtype=float)
+        self.at = posture(self._chain, self._rest)
+        self._x_reference = self.at.x
+
+    def step(self, q: list[float], pose: ProbePose, dt: float) -> list[float]:
+        """The step (n,), rad or m, by which joints come nearer to a pose.
+
+        Args:
+            q: (n,) joint positions before it.
+            pose: the pose.
+            dt: how long the step takes, s.
+        """
+        self.at = at = posture(self._chain, q)
+        J = jacobian(at, at.flange)
+        twist: tuple[float, ...] | Vector
+        if self._rows == 6:
+            twist = _pose_error(at, pose.centre.tolist(), pose.pole.tolist(), self._x_reference)
+        else:
+            six = np.concatenate((pose.centre - at.flange, np.cross(at.z, pose.pole)))
+            R = pose_of(at)[:3, :3]
+            J, twist = in_rows(self._rows, R, J), in_rows(self._rows, R, six)
+        if J.shape[0] == J.shape[1]:
+            _, _, dq, info = dgesv(J, twist)  # LAPACK itself: numpy's wrapper costs four times as much
+            exact: list[float] = dq.tolist()
+            if info == 0 and max(map(abs, exact)) < SMALL_STEP:
+                return exact
+        # the exact step would be no small one, as near a singular pose
+        wish = 2.0 * math.pi * REST_HZ * dt * (self._rest - q)
+        damped: list[float] = damped_step(J, np.asarray(twist), wish).tolist()
+        return damped
+
+
+def _pose_error(at: Posture, centre: list[float], pole: list[float], x_reference: Vec) -> tuple[float, ...]:
+    """Twist (6) from a probe's pose to a centre and a pole, x as near to the reference as the pole allows.
+
+    Unrolled floats: on 3-vectors numpy costs ten times as much.
+    """
+    (r00, r10, r20), (r01, r11, r21), (r02, r12, r22), (t0, t1, t2) = at.x, at.y, at.z, at.flange
+    p0, p1, p2 = pole
+    x0, x1, x2 = x_reference
+    along = x0 * p0 + x1 * p1 + x2 * p2
+    x0, x1, x2 = x0 - along * p0, x1 - along * p1, x2 - along * p2
+    size = math.sqrt(x0 * x0 + x1 * x1 + x2 * x2)
+    x0, x1, x2 = x0 / size, x1 / size, x2 / size
+    y0, y1, y2 = p1 * x2 - p2 * x1, p2 * x0 - p0 * x2, p0 * x1 - p1 * x0
+    return (
+        centre[0] - t0,
+        centre[1] - t1,
+        centre[2] - t2,
+        0.5 * (r10 * x2 - r20 * x1 + r11 * y2 - r21 * y1 + r12 * p2 - r22 * p1),
+        0.5 * (r20 * x0 - r00 * x2 + r21 * y0 - r01 * y2 + r22 * p0 - r02 * p2),
+        0.5 * (r00 * x1 - r10 * x0 + r01 * y1 - r11 * y0 + r02 * p1 - r12 * p0),
+    )
+
+
+def smooth_step(u: float) -> float:
+    """Quintic from 0 to 1 over ``u`` in 0…1, with zero slope and bend at both ends; constant outside."""
+    u = min(max(u, 0.0), 1.0)
+    return u * u * u * (10 - 15 * u + 6 * u * u)
+
+
+class LineMotion:
+    """A straight move of the probe with a quintic time law (zero speed and acceleration at both ends).
+
+    Args:
+        start: pose to leave.
+        end: pose to reach.
+        speed: mean speed, m/s.
+        at_once: leave with twice the mean speed, which then falls to zero: to let go of what is pressed.
+    """
+
+    def __init__(self, start: ProbePose, end: ProbePose, speed: float, *, at_once: bool = False) -> None:
+        self._start, self._end, self._at_once = start, end, at_once
+        distance = float(np.linalg.norm(end.centre - start.centre))
+        angle = math.acos(max(-1.0, min(1.0, float(start.pole @ end.pole))))
+        self.duration = max(distance / speed, angle / 0.5, 0.05)  # the pole turns at 0.5 rad/s on average
+
+    def at(self, t: float) -> ProbePose:
+        """Pose ``t`` seconds after the start; the end pose afterwards."""
+        share = smooth_step(t / self.duration) if not self._at_once else 1.0 - max(1.0 - t / self.duration, 0.0) ** 2
+        pole = self._start.pole + share * (self._end.pole - self._start.pole)
+        return ProbePose(
+            self._start.centre + share * (self._end.centre - self._start.centre), pole / math.sqrt(float(pole @ pole))
+        )
+
+
+class ArcMotion:
+    """Round a centre: direction along a great circle, distance and pole by a quintic time law.
+
+    Args:
+        centre: of the ball (3,), m.
+        start: pose to leave, not at the centre.
+        end: pose to reach; not opposite to the first.
+        speed: mean speed, m/s.
+    """
+
+    def __init__(self, centre: Vector, start: ProbePose, end: ProbePose, speed: float) -> None:
+        self._centre, self._poles = centre, (start.pole, end.pole)
+        a, b = start.centre - centre, end.centre - centre
+        self._radii = float(np.linalg.norm(a)), float(np.linalg.norm(b))
+        self._a, self._b = a / self._radii[0], b / self._radii[1]
+        self._angle = math.acos(max(-1.0, min(1.0, float(self._a @ self._b))))
+        pole_angle = math.acos(max(-1.0, min(1.0, float(start.pole @ end.pole))))
+        way = math.hypot(self._angle * max(self._radii), self._radii[1] - self._radii[0])
+        self.duration = max(way / speed, pole_angle / 0.7, 0.05)
+
+    def at(self, t: float) -> ProbePose:
+        """Pose ``t`` seconds after the start; the end pose afterwards."""
+        s = smooth_step(t / self.duration)
+        if self._angle > 1e-6:
+            direction = math.sin((1 - s) * self._angle) * self._a + math.sin(s * self._angle) * self._b
+            direction = direction / math.sin(self._angle)
+        else:
+            direction = self._b
+        radius = self._radii[0] + s * (self._radii[1] - self._radii[0])
+        pole = self._poles[0] + s * (self._poles[1] - self._poles[0])
+        return ProbePose(self._centre + radius * direction, pole / math.sqrt(float(pole @ pole)))

@@ -1,0 +1,351 @@
+"""The tactile node: whole frames, one sampling instant, latency, window, tare, gain, overload; points 61–65."""
+
+import numpy as np
+import pytest
+
+from canprobe.cell.emulated.array import TactileApplication, make_tactile_node
+from canprobe.fieldbus.eds.packaged import load_eds
+from canprobe.fieldbus.node.slave_node import SlaveNode
+from canprobe.fieldbus.protocol.frames import NmtState
+from canprobe.fieldbus.protocol.tactile import WINDOWS, FrameAssembler, TactileMode, window_words
+
+MS = 1_000_000
+CYCLE = 2_500_000
+OFF = 0x80000000
+TARE = 0x65726174
+
+
+class Sensor:
+    """The node, a SYNC source and an assembler."""
+
+    def __init__(self, bench_class, plant, *, mode=TactileMode.WINDOW, start=0, latency=1, tare_images=4):
+        node = SlaveNode(load_eds("tactile_array", 16), 16, TactileApplication(plant, latency, tare_images))
+        self.bench = bench_class(node)
+        self.plant = plant
+        self.k = 0
+        node.start(0)
+        for order in [(0x1019, 0, 240, 1), (0x2000, 0, int(mode), 1), (0x2001, 0, 0, 1)]:
+            assert self.bench.write(*order) == 0
+        self.configure(mode, start)
+        self.assembler = FrameAssembler(self.cob_ids, mode, 2 * CYCLE)
+
+    def configure(self, mode, start):
+        content = {
+            TactileMode.WINDOW: [0x21100040 | sub << 8 for sub in range(1, 9)],
+            TactileMode.IMAGE: [0x21000040 | sub << 8 for sub in range(1, 33)],
+            TactileMode.FEATURES: [0x21300240],
+        }[mode]
+        words = [0x21300140 if mode is TactileMode.FEATURES else 0x21200040, *content]
+        self.cob_ids = list(range(0x511, 0x511 + len(words)))
+        for number in range(33):
+            assert self.bench.write(0x1800 + number, 1, OFF | 0x511 + number, 4) == 0
+        for number, word in enumerate(words):
+            index = 0x1800 + number
+            for order in [
+                (index + 0x200, 0, 0, 1),
+                (index + 0x200, 1, word, 4),
+                (index + 0x200, 0, 1, 1),
+                (index, 2, 2, 1),
+                (index, 6, start, 1),
+                (index, 1, 0x511 + number, 4),
+            ]:
+                assert self.bench.write(*order) == 0, order
+
+    def go(self, t_ns=0):
+        self.bench.nmt(0x01, t_ns)
+        assert self.bench.node.state is NmtState.OPERATIONAL
+        return self
+
+    def sync(self):
+        """One SYNC; the frame that came with it, if any."""
+        self.k += 1
+        frames = self.bench.send(0x80, f"{(self.k - 1) % 240 + 1:02x}", self.k * CYCLE)
+        done = [self.assembler.push(can_id, bytes.fromhex(data), self.k * CYCLE) for can_id, data in frames]
+        whole = [frame for frame in done if frame is not None]
+        assert len(whole) == bool(frames)  # all or nothing
+        return whole[0] if whole else None
+
+    def frames(self, count):
+        found = []
+        while len(found) < count:
+            frame = self.sync()
+            if frame is not None:
+                found.append(frame)
+        return found
+
+
+@pytest.fixture
+def make(bench, plant):
+    return lambda **options: Sensor(type(bench), plant, **options)
+
+
+def spot(row, column, value=100):
+    image = np.zeros((16, 16), np.uint8)
+    image[row, column] = value
+    return image
+
+
+def test_sensor_61_whole_frame_at_every_second_sync_header_first(make):
+    sensor = make().go()
+    assert [sensor.sync() is not None for _ in range(6)] == [False, True] * 3
+    ids = [can_id for can_id, _ in sensor.bench.send(0x80, "07", 7 * CYCLE) + sensor.bench.send(0x80, "08", 8 * CYCLE)]
+    assert ids == list(range(0x511, 0x51A))
+
+
+@pytest.mark.parametrize("mode", list(TactileMode))
+def test_sensor_61_every_mode_comes_whole(make, plant, mode):
+    plant.image = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    sensor = make(mode=mode).go()
+    first = sensor.frames(2)[0]
+    assert (first.header.mode, sensor.assembler.torn, sensor.assembler.crc_errors) == (mode, 0, 0)
+    if mode is TactileMode.IMAGE:
+        assert np.array_equal(first.taxels, plant.image)
+    elif mode is TactileMode.WINDOW:
+        r, c, rows, columns = first.window
+        assert np.array_equal(first.taxels[r : r + rows, c : c + columns], plant.image[r : r + rows, c : c + columns])
+
+
+def test_sensor_61_one_sampling_instant_a_frame(make, plant):
+    sensor = make(mode=TactileMode.IMAGE).go(t_ns=100)
+    sensor.frames(2)
+    assert plant.sampled == [100, 2 * CYCLE, 4 * CYCLE]
+
+
+def test_sensor_the_frame_shows_the_trigger_before_and_its_age(make, plant):
+    plant.image = spot(4, 4, 10)
+    sensor = make(mode=TactileMode.IMAGE).go(t_ns=1 * MS)
+    plant.image = spot(4, 4, 20)
+    frames = []
+    for value in (30, 40):
+        frames += sensor.frames(1)
+        plant.image = spot(4, 4, value)
+    frames += sensor.frames(1)
+    assert [int(frame.taxels[4, 4]) for frame in frames] == [10, 20, 30]
+    assert [frame.header.sample_age_us for frame in frames] == [4000, 5000, 5000]
+    assert [frame.header.sync_counter for frame in frames] == [2, 4, 6]
+
+
+@pytest.mark.parametrize(("latency", "ages"), [(0, [0, 0, 0, 0]), (1, [5000] * 4), (2, [5000, 10000, 10000, 10000])])
+def test_sensor_latency_in_frames(make, latency, ages):
+    sensor = make(latency=latency).go()
+    assert [frame.header.sample_age_us for frame in sensor.frames(4)] == ages
+
+
+def test_sensor_age_saturates(make):
+    sensor = make().go()
+    sensor.k = 39
+    assert sensor.frames(1)[0].header.sample_age_us == 0xFFFF
+
+
+def test_sensor_a_trigger_that_is_stamped_before_its_sample_has_age_0(make):
+    """As by a receiver whose clock was set back; the header has no negative age."""
+    sensor = make().go(t_ns=100 * MS)
+    assert [frame.header.sample_age_us for frame in sensor.frames(2)] == [0, 5000]
+
+
+@pytest.mark.parametrize(("start", "counters"), [(1, [1, 3, 5]), (2, [2, 4, 6]), (0, [2, 4, 6])])
+def test_sensor_start_value_sets_the_phase(make, start, counters):
+    sensor = make(start=start).go()
+    assert [frame.header.sync_counter for frame in sensor.frames(3)] == counters
+
+
+def test_sensor_62_counter_counts_frames_mod_256(make):
+    sensor = make(mode=TactileMode.FEATURES).go()
+    counters = [frame.header.frame_counter for frame in sensor.frames(260)]
+    assert counters == [n % 256 for n in range(260)]
+    assert sensor.assembler.lost == 0
+
+
+@pytest.mark.parametrize(
+    ("row", "column", "origin"),
+    [(7, 8, (4, 4)), (0, 0, (0, 0)), (15, 15, (8, 8)), (3, 12, (0, 8)), (10, 5, (6, 2)), (12, 2, (8, 0))],
+)
+def test_sensor_63_window_follows_the_contact(make, plant, row, column, origin):
+    plant.image = spot(row, column)
+    frame = make().go().frames(1)[0]
+    assert (frame.header.origin_row, frame.header.origin_col) == origin
+    assert frame.taxels[row, column] == 100
+
+
+def test_sensor_63_window_stays_without_contact_and_does_not_flicker(make, plant):
+    plant.image = spot(12, 12)
+    sensor = make().go()
+    assert sensor.frames(1)[0].window[:2] == (8, 8)
+    plant.image = np.zeros((16, 16), np.uint8)
+    assert {frame.window[:2] for frame in sensor.frames(4)} == {(8, 8)}
+    origins = set()
+    for turn in range(12):  # centroid between 7.9 and 8.1: half way between two origins
+        plant.image = spot(8, 8)
+        plant.image[8, 7 if turn % 2 else 9] = 10
+        origins.add(sensor.frames(1)[0].window[:2])
+    assert len(origins) <= 2  # the way there, and then one place
+
+
+def test_sensor_rows_are_rows(make, plant):
+    plant.image = spot(9, 6, 77)
+    sensor = make().go()
+    sensor.frames(1)
+    frames = dict(sensor.bench.send(0x80, "03", 3 * CYCLE) + sensor.bench.send(0x80, "04", 4 * CYCLE))
+    r, c = sensor.bench.read(0x2006) >> 4, sensor.bench.read(0x2006) & 15
+    assert bytes.fromhex(frames[0x512 + 9 - r])[6 - c] == 77
+
+
+def test_sensor_64_threshold_and_gain(make, plant):
+    plant.image = spot(5, 5, 40) + spot(6, 6, 39) + spot(7, 7, 200)
+    sensor = make(mode=TactileMode.IMAGE)
+    for order in [(0x2001, 0, 60, 1), (0x2002, 0, 1500, 2)]:
+        assert sensor.bench.write(*order) == 0
+    frame = sensor.go().frames(1)[0]
+    assert [int(frame.taxels[i, i]) for i in (5, 6, 7)] == [60, 0, 255]
+    assert frame.header.overload
+
+
+def test_sensor_64_what_tare_and_gain_leave_is_rounded_to_whole_counts(make, plant):
+    plant.image = spot(5, 5, 101) + spot(6, 6, 103) + spot(7, 7, 2)
+    sensor = make(mode=TactileMode.IMAGE).go()
+    assert sensor.bench.write(0x2002, 0, 1250, 2) == 0
+    taxels = sensor.frames(1)[0].taxels
+    assert [int(taxels[i, i]) for i in (5, 6, 7)] == [126, 129, 2]  # 126.25, 128.75, 2.5: to the even one
+
+
+def test_sensor_64_tare_takes_the_mean_of_the_next_images(make, plant):
+    sensor = make(mode=TactileMode.IMAGE, tare_images=2).go()
+    assert sensor.bench.write(0x2003, 0, 1, 4) == 0x08000020
+    assert sensor.bench.write(0x2003, 0, TARE, 4) == 0
+    for value in (30, 34):
+        plant.image = spot(3, 3, value) + spot(4, 4, 5)
+        sensor.frames(1)
+    plant.image = spot(3, 3, 50)
+    sensor.frames(1)
+    frame = sensor.frames(1)[0]
+    assert (frame.taxels[3, 3], frame.taxels[4, 4], frame.taxels.sum()) == (18, 0, 18)
+
+
+@pytest.mark.parametrize("stored", [True, False])
+def test_sensor_64_tare_and_gain_survive_a_restart_when_stored(make, plant, stored):
+    plant.image = spot(3, 3, 30)
+    sensor = make(mode=TactileMode.IMAGE, tare_images=1).go()
+    sensor.bench.write(0x2002, 0, 2000, 2)
+    sensor.bench.write(0x2003, 0, TARE, 4)
+    sensor.frames(1)
+    if stored:
+        assert sensor.bench.write(0x1010, 1, 0x65766173, 4) == 0
+    sensor.bench.nmt(0x81)
+    assert sensor.bench.read(0x2002) == (2000 if stored else 1000)
+    for order in [(0x1019, 0, 240, 1), (0x2000, 0, 2, 1), (0x2001, 0, 0, 1)]:
+        sensor.bench.write(*order)
+    sensor.configure(TactileMode.IMAGE, 0)
+    plant.image = spot(3, 3, 50)
+    sensor.assembler.reset()
+    frame = sensor.go(t_ns=sensor.k * CYCLE).frames(1)[0]
+    assert frame.taxels[3, 3] == (40 if stored else 50)
+
+
+@pytest.mark.parametrize(("value", "flag"), [(254, 0), (255, 1)])
+def test_sensor_65_overload_is_flagged(make, plant, value, flag):
+    plant.image = spot(8, 8, value)
+    sensor = make().go()
+    assert sensor.frames(1)[0].header.overload == bool(flag)
+    assert sensor.bench.read(0x2005) == flag
+
+
+def test_sensor_features_by_hand(make, plant):
+    plant.image = spot(4, 6, 100) + spot(6, 10, 100)
+    features = make(mode=TactileMode.FEATURES).go().frames(1)[0].features
+    assert (features.row, features.col, features.peak) == (5.0, 8.0, 100)
+    assert (features.var_rr, features.var_rc, features.var_cc) == (1.0, 2.0, 4.0)
+    force_n = 200 / 255 * 100_000 * (1.5875e-3) ** 2
+    assert features.force_n == pytest.approx(force_n, abs=1 / 800)
+
+
+def test_sensor_a_finer_adc_sharpens_the_force_and_leaves_taxels_whole(make, plant):
+    plant.image = np.zeros((16, 16))
+    plant.image[4:10, 4:10] = 50.4
+    taxels = make(mode=TactileMode.IMAGE).go().frames(1)[0].taxels
+    assert (taxels.max(), taxels.sum()) == (50, 36 * 50)
+    features = make(mode=TactileMode.FEATURES).go().frames(1)[0].features
+    assert features.force_n == pytest.approx(36 * 50.4 / 255 * 100_000 * 1.5875e-3**2, abs=1 / 800)
+    assert (features.row, features.col, features.peak) == (6.5, 6.5, 50)
+
+
+def test_sensor_features_without_contact(make):
+    features = make(mode=TactileMode.FEATURES).go().frames(1)[0].features
+    assert (features.force_n, features.row, features.col, features.peak) == (0.0, 7.5, 7.5, 0)
+
+
+def test_sensor_is_silent_out_of_operational_and_starts_afresh(make, plant):
+    sensor = make(mode=TactileMode.IMAGE).go()
+    plant.image = spot(1, 1)
+    sensor.frames(2)
+    sensor.bench.nmt(0x80)
+    assert [sensor.sync() for _ in range(4)] == [None] * 4
+    plant.image = spot(2, 2)
+    sensor.go(t_ns=sensor.k * CYCLE + 1)
+    frame = sensor.frames(1)[0]
+    assert (frame.taxels[2, 2], frame.taxels[1, 1]) == (100, 0)
+
+
+def test_make_tactile_node(plant):
+    node = make_tactile_node(load_eds("tactile_array", 16), 16, plant)
+    assert node.start(0) == [(0x710, b"\0")]
+
+
+# Object 2008h of the tactile node: which windows it takes, when, and what it then sends.
+
+SIZE = 0x2008
+
+
+@pytest.fixture
+def sensor(bench, plant):
+    node = SlaveNode(load_eds("tactile_array", 16), 16, TactileApplication(plant, 0))
+    node.start(0)
+    found = type(bench)(node)
+    for order in ((0x1019, 0, 240, 1), (0x2001, 0, 0, 1)):
+        assert found.write(*order) == 0
+    return found
+
+
+def map_window(sensor, words):
+    """Header and window PDOs on every SYNC."""
+    for number in range(33):
+        assert sensor.write(0x1800 + number, 1, OFF | 0x511 + number, 4) == 0
+    for number, word in enumerate([0x21200040, *(0x21100040 | sub << 8 for sub in range(1, words + 1))]):
+        index = 0x1800 + number
+        orders = [(index + 0x200, 0, 0, 1), (index + 0x200, 1, word, 4), (index + 0x200, 0, 1, 1), (index, 2, 1, 1)]
+        for order in (*orders, (index, 1, 0x511 + number, 4)):
+            assert sensor.write(*order) == 0, order
+
+
+@pytest.mark.parametrize("value, abort", [(3, 0x06090032), (13, 0x06090031), (5, 0x06090030), (11, 0x06090030)])
+def test_sizes_that_it_does_not_have(sensor, value, abort):
+    assert sensor.write(SIZE, 0, value, 1) == abort
+    assert sensor.node.dictionary.number(SIZE) == 8
+
+
+@pytest.mark.parametrize("value", WINDOWS)
+def test_sizes_that_it_has_until_it_is_operational(sensor, value):
+    assert sensor.write(SIZE, 0, value, 1) == 0
+    sensor.nmt(0x01)
+    assert sensor.write(SIZE, 0, value, 1) == 0, "the same value changes nothing"
+    assert sensor.write(SIZE, 0, 4 if value != 4 else 6, 1) == 0x08000022
+    sensor.nmt(0x80)
+    assert sensor.write(SIZE, 0, 4 if value != 4 else 6, 1) == 0
+
+
+@pytest.mark.parametrize("side", WINDOWS)
+@pytest.mark.parametrize("spot", [(0, 15), (8, 3), (15, 0)])
+def test_the_window_holds_the_contact_wherever_it_is(sensor, plant, side, spot):
+    plant.image = np.zeros((16, 16), np.uint8)
+    plant.image[spot] = 99
+    assert sensor.write(SIZE, 0, side, 1) == 0
+    map_window(sensor, window_words(side))
+    sensor.nmt(0x01)
+    assembler = FrameAssembler(range(0x511, 0x512 + window_words(side)), TactileMode.WINDOW, CYCLE, window=side)
+    frames = sensor.send(0x80, "01", CYCLE)
+    found = [assembler.push(can_id, bytes.fromhex(data), CYCLE) for can_id, data in frames]
+    assert found[-1] is not None and found[-1].header.window == side
+    assert np.array_equal(found[-1].taxels, plant.image)
+    row, column, rows, columns = found[-1].window
+    assert (rows, columns) == (side, side)
+    ideal = [min(max(at - (side - 1) / 2, 0), 16 - side) for at in spot]
+    assert abs(row - ideal[0]) <= 0.75 and abs(column - ideal[1]) <= 0.75

@@ -1,0 +1,129 @@
+"""`canprobe run calibrate`: what it finds of the tool, what it writes, and what a scan with a wrong tool gains."""
+
+import itertools
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import canprobe
+from canprobe.cell.scene.geometry import with_tool
+from canprobe.errors import PlanError, SafetyStop, SceneError
+from canprobe.mechanics.touch.probe_motion import ArcMotion
+from canprobe.mechanics.touch.servo import ProbePose
+
+ERROR_MM = (0.4, -0.3, 0.5)
+
+
+def fast(scene, **sections):
+    scene = replace(scene, bus=replace(scene.bus, timed=False))
+    return replace(scene, **{name: replace(getattr(scene, name), **values) for name, values in sections.items()})
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory):
+    out = tmp_path_factory.mktemp("calibrate")
+    return canprobe.run(fast(canprobe.load_scene("calibrate"), task={"touches": 7}), out=out)
+
+
+def test_the_tool_is_found_within_its_bounds(calibrated):
+    found = calibrated.summary["calibration"]
+    assert calibrated.summary["completed"]
+    assert found["touches"] == 7 and found["observed"] == [True] * 3
+    assert found["true_mm"] == pytest.approx([0.4, -0.3, 80.5])
+    error, sigma = np.array(found["error_mm"]), np.array(found["sigma_mm"])
+    np.testing.assert_allclose(np.array(found["tool_centre_mm"]) - found["true_mm"], error)
+    assert (np.abs(error) < 2.6 * sigma).all() and (sigma < 0.2).all()
+    assert (np.abs(error) < 0.1).all(), "of 0.3 to 0.5 mm that it was off"
+    np.testing.assert_allclose(found["ball_moved_mm"], (0.8, -0.6, 0.5), atol=0.15)
+    assert 1 < found["condition_number"] < 1000
+
+
+def test_it_presses_gently_and_lets_go_between_the_touches(calibrated):
+    force = calibrated.truth["force"]
+    touches = np.flatnonzero(np.diff((force > 0.5).astype(int)) == 1)
+    assert len(touches) == 7
+    assert force.max() < 1.5
+    assert all(force[a:b].min() == 0.0 for a, b in itertools.pairwise(touches))
+
+
+def test_its_frames_are_those_the_plan_lists(calibrated):
+    measured = canprobe.measure_traffic(calibrated.out, calibrated.plan)
+    assert measured.as_planned and measured.unlisted == {} and measured.missing == ()
+
+
+def test_a_layer_of_another_stiffness_does_not_move_the_tool():
+    """Three times as stiff as stated: the force alone would say 0.18 mm too deep, and the tool would follow."""
+    scene = fast(canprobe.load_scene("calibrate"), task={"touches": 5}, plant={"stiffness_n_m3": 3 * 1.27e8})
+    found = canprobe.run(scene, files=False).summary["calibration"]
+    assert (np.abs(found["error_mm"]) < 0.1).all()
+
+
+def test_terminal_and_files_say_it(calibrated):
+    text = calibrated.text()
+    assert "7 touches, condition number" in text
+    assert "true 0.400, error" in text
+    assert json.loads((calibrated.out / "summary.json").read_text())["calibration"] == calibrated.summary["calibration"]
+    assert "centre_lateral_mm = [0." in (calibrated.out / "tool.toml").read_text()
+
+
+def test_a_scan_with_a_wrong_tool_gets_better_by_it(calibrated):
+    scene = fast(canprobe.load_scene("cylinder"), plant={"tool_error_mm": ERROR_MM}, shape={"also": ()})
+    better = with_tool(scene, calibrated.out / "tool.toml")
+    real = np.add(scene.plant.tool_error_mm, (0.0, 0.0, 80.0))
+    believed = np.array([*better.probe.centre_lateral_mm, better.probe.centre_offset_mm])
+    np.testing.assert_allclose(believed + better.plant.tool_error_mm, real, atol=1e-9)  # the real tool stays
+    wrong, right = (canprobe.run(s, files=False, duration_s=3.0).summary["shape"] for s in (scene, better))
+    assert wrong["position_rms_mm"] > 0.4
+    assert right["position_rms_mm"] < 0.2
+    assert right["position_rms_mm"] < 0.4 * wrong["position_rms_mm"]
+    # half a millimetre along the pole is 1.4 % of the radius, about what three seconds of scan err by anyway
+    assert max(right["kappa_rms_error_percent"], wrong["kappa_rms_error_percent"]) < 3.0
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("[probe]\ncentre_offset_mm = 80.0\n", "expected the section"),
+        ("[probe]\ncentre_offset_mm = -1\ncentre_lateral_mm = [0, 0]\n", "probe.centre_offset_mm: expected"),
+        ("[probe]\ncentre_offset_mm = 80\ncentre_lateral_mm = [0, nan]\n", "probe.centre_lateral_mm: expected"),
+        ("[probe\n", "not valid TOML"),
+        (f"x = {'9' * 5000}", "not valid TOML"),
+    ],
+)
+def test_a_file_that_is_no_calibration_is_refused(tmp_path, text, what):
+    (tmp_path / "tool.toml").write_text(text)
+    with pytest.raises(SceneError, match=what):
+        with_tool(canprobe.load_scene("cylinder"), tmp_path / "tool.toml")
+    with pytest.raises(SceneError, match="has no probe"):
+        (tmp_path / "good.toml").write_text("[probe]\ncentre_offset_mm = 80\ncentre_lateral_mm = [0, 0]\n")
+        with_tool(replace(canprobe.load_scene("free"), probe=None), tmp_path / "good.toml")
+
+
+def test_a_ball_that_is_not_there_is_told():
+    scene = fast(canprobe.load_scene("calibrate"), task={"touches": 3, "search_mm": 1.0, "clearance_mm": 1.0})
+    x, y, z = scene.object.position_mm
+    scene = replace(scene, object=replace(scene.object, position_mm=(x, y, z - 4.0)))
+    with pytest.raises(SafetyStop, match="touch 1: no ball found up to 1 mm beyond the expected place"):
+        canprobe.run(scene, files=False)
+
+
+def test_the_plan_refuses_a_side_that_the_arm_cannot_reach():
+    scene = canprobe.load_scene("calibrate")
+    with pytest.raises(PlanError, match=r"touch \d+ of 13 is out of reach|joint \d would move"):
+        canprobe.plan(replace(scene, task=replace(scene.task, tilt_deg=55.0)))
+
+
+def test_the_way_round_the_ball_keeps_its_distance():
+    centre = np.array([0.1, 0.2, 0.3])
+    a, b = (np.array([math.sin(angle), 0.0, math.cos(angle)]) for angle in (-0.5, 0.6))
+    arc = ArcMotion(centre, ProbePose(centre + 0.07 * a, -a), ProbePose(centre + 0.068 * b, -b), 0.04)
+    poses = [arc.at(t) for t in np.linspace(0, arc.duration, 50)]
+    distances = [np.linalg.norm(pose.centre - centre) for pose in poses]
+    assert min(distances) >= 0.068 - 1e-12 and max(distances) <= 0.07 + 1e-12
+    np.testing.assert_allclose(poses[-1].centre, centre + 0.068 * b, atol=1e-12)
+    np.testing.assert_allclose(poses[-1].pole, -b, atol=1e-12)
+    speeds = np.linalg.norm(np.diff([pose.centre for pose in poses], axis=0), axis=1)
+    assert speeds.max() / (arc.duration / 49) < 2 * 0.04

@@ -1,0 +1,284 @@
+"""The whole cell on the lockstep bus: bring-up, run, and every way out leaves the drives disabled."""
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from undrawn import undrawn_run
+
+import canprobe
+from canprobe.cell.master.controller import Command
+from canprobe.cell.planning.measured import expected_messages
+from canprobe.cell.session.session import Session
+from canprobe.cell.tasks.from_plan import make_task
+from canprobe.errors import BusError, NodeError, SafetyStop, UsageError
+from canprobe.fieldbus.bus.candump import read_candump
+from canprobe.fieldbus.bus.virtual.lockstep import Participant
+from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
+from canprobe.fieldbus.protocol.frames import NmtState
+
+SHORT = {"free": 1.0, "listen": 0.5, "press": 0.5}
+
+
+def session_of(name, duration_s=1.0, **changes):
+    scene = canprobe.load_scene(name, {"task.duration_s": duration_s})
+    return Session(replace(scene, **changes))
+
+
+def node(session, node_id):
+    return next(n for n in session.world.nodes if n.node_id == node_id)
+
+
+def assert_safe(session, but=()):
+    """Every node is pre-operational and every drive without power; ``but`` were lost."""
+    for slave in session.world.nodes:
+        if slave.node_id in but:
+            continue
+        assert slave.state is NmtState.PRE_OPERATIONAL, slave.name
+        if slave.node_id <= 6:
+            assert state_of(statusword_of(slave)) not in POWERED_STATES, slave.name
+
+
+def statusword_of(slave):
+    """6041h as the node answers an SDO upload."""
+    answer = slave.receive(0x600 + slave.node_id, bytes((0x40, 0x41, 0x60, 0, 0, 0, 0, 0)), slave.core.now_ns)
+    return int.from_bytes(dict(answer)[0x580 + slave.node_id][4:6], "little")
+
+
+@pytest.mark.parametrize("name", SHORT)
+def test_scene_runs_to_its_end_and_leaves_the_cell_safe(name):
+    session = session_of(name, SHORT[name])
+    controller = make_task(session.plan)
+    with session:
+        session.run(controller)
+    assert session.cell.faults == []
+    assert session.cell.cycle.statistics.overruns == 0
+    assert_safe(session)
+
+
+@pytest.mark.parametrize("name", SHORT)
+def test_frames_on_the_bus_and_files_are_exactly_those_planned(name, tmp_path):
+    result = canprobe.run(canprobe.load_scene(name), out=tmp_path, duration_s=SHORT[name])
+    seen = {can_id for _, _, can_id, _ in read_candump(tmp_path / "bus.log")}
+    assert seen <= {can_id for bus in result.plan.buses for can_id in expected_messages(result.plan, bus)}
+    assert {pdo.cob_id for pdo in result.plan.pdos} <= seen
+    assert {path.name for path in tmp_path.iterdir()} == set(result.plan.outputs)
+
+
+def test_same_seed_same_log_other_seed_other_log(tmp_path):
+    scene = canprobe.load_scene("press")
+    logs = []
+    for i, seed in enumerate((3, 3, 4)):
+        undrawn_run(scene, out=tmp_path / str(i), seed=seed, duration_s=0.3)
+        logs.append((tmp_path / str(i) / "bus.log").read_bytes())
+    assert logs[0] == logs[1]
+    assert logs[0] != logs[2]
+    assert logs[0].startswith(b"(0000000000.000056) can0 701#00")
+
+
+def test_press_reaches_and_holds_the_force(tmp_path):
+    result = undrawn_run(canprobe.load_scene("press"), out=tmp_path, duration_s=1.0)
+    contact = result.summary["contact"]
+    assert contact["contact_fraction"] == 1.0
+    assert contact["force_rms_error_n"] < 0.2
+    assert contact["force_max_n"] < 3.0
+    assert result.summary["shape"]["method"] is None
+
+
+def test_a_lost_drive_stops_the_cell():
+    session = session_of("free")
+
+    def cut(_):
+        session.lockstep.detach(node(session, 3))
+        return Command()
+
+    with pytest.raises(NodeError, match="node 3: lost"), session:
+        session.run(_once(cut))
+    assert_safe(session, but=(3,))
+
+
+def _once(action, at=60):
+    done = []
+
+    def step(measurement):
+        if measurement.cycle >= at and not done:
+            done.append(True)
+            return action(measurement)
+        return Command()
+
+    return step
+
+
+def test_a_lost_sensor_stops_the_scan_with_a_retreat():
+    session = session_of("press", 3.0)
+    controller = make_task(session.plan)
+
+    def step(measurement):
+        if measurement.cycle == 900:
+            session.lockstep.detach(node(session, 16))
+        return controller.step(measurement)
+
+    with pytest.raises((SafetyStop, NodeError), match=r"no tactile frame|node 16: lost"), session:
+        session.run(step)
+    assert_safe(session, but=(16,))
+
+
+def test_a_drive_fault_stops_the_cell_and_names_it():
+    session = session_of("free")
+
+    def fault(_):
+        node(session, 2).application.inject_fault(0x4210)
+        return Command()
+
+    with pytest.raises(NodeError, match=r"node 2: .*(4210|temperature)"), session:
+        session.run(_once(fault))
+    assert any("4210h" in fault for fault in session.cell.faults)
+    assert_safe(session)
+
+
+def test_an_exception_in_the_controller_leaves_the_cell_safe():
+    session = session_of("free")
+
+    def fail(_):
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError), session:
+        session.run(_once(fail))
+    assert_safe(session)
+
+
+def test_an_interrupt_leaves_the_cell_safe():
+    session = session_of("free")
+
+    def interrupt(_):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), session:
+        session.run(_once(interrupt))
+    assert_safe(session)
+
+
+def test_the_drives_are_moving_until_quick_stop_brings_them_to_rest():
+    session = session_of("free", 4.0)
+    controller = make_task(session.plan)
+
+    def step(measurement):
+        if measurement.cycle == 800:
+            raise KeyboardInterrupt
+        return controller.step(measurement)
+
+    with pytest.raises(KeyboardInterrupt), session:
+        session.run(step)
+    q = session.truth["q"]
+    assert np.abs(q[795] - q[790]).max() > 1e-4  # it was moving
+    assert np.abs(q[-1] - q[-2]).max() < 5e-5  # a tenth of a count of the coarsest joint, each cycle
+    assert_safe(session)
+
+
+def test_another_master_stops_bring_up():
+    session = session_of("free")
+    session.plan  # noqa: B018
+    original = session._open_lockstep
+
+    def opened():
+        port = original()
+
+        class Foreign(Participant):
+            next_deadline_ns = 100_000_000
+
+            def advance(self, t_ns):
+                self.next_deadline_ns = t_ns + 100_000_000
+                return [(0x77F, b"\x05")]
+
+        session.lockstep.attach(Foreign())
+        return port
+
+    session._open_lockstep = opened
+    with pytest.raises(BusError, match="another master"), session:
+        pass
+
+
+@pytest.mark.parametrize("name", ["free", "press"])
+def test_a_missing_node_is_named(name):
+    session = session_of(name)
+    original = session._open_lockstep
+
+    def opened():
+        port = original()
+        session.lockstep.detach(node(session, 4))
+        return port
+
+    session._open_lockstep = opened
+    with pytest.raises(NodeError, match=r"node 4: \(joint 4\) sent no boot-up"), session:
+        pass
+
+
+def test_a_node_of_another_make_is_named():
+    session = session_of("free")
+    nodes = list(session.plan.nodes)
+    nodes[4] = replace(nodes[4], identity=replace(nodes[4].identity, product_code=0x999))
+    session.plan = replace(session.plan, nodes=tuple(nodes))
+    with pytest.raises(NodeError, match=r"node 5: .*product code expected 0x999, got 0x260"), session:
+        pass
+
+
+def test_own_controller_in_ten_lines():
+    with canprobe.open_cell(canprobe.load_scene("free")) as cell:
+        q0 = None
+
+        def nod(measurement):
+            nonlocal q0
+            q0 = measurement.q if q0 is None else q0
+            target = q0.copy()
+            target[5] += 0.1 * np.sin(measurement.cycle / 100)
+            return Command(q_target=target, done=measurement.cycle > 600)
+
+        cell.run(nod)
+    assert np.ptp(cell.truth["q"][:, 5]) == pytest.approx(0.2, abs=0.01)
+    assert np.ptp(cell.truth["q"][:, 0]) < 1e-3
+
+
+def test_what_is_no_controller_is_told_before_a_drive_is_enabled():
+    session = session_of("free")
+    with pytest.raises(UsageError, match=r"measurement or a canprobe\.Controller, got 3"), session:
+        session.run(3)
+    assert len(session.cell.log) == 0
+    assert_safe(session)
+
+
+def test_a_controller_cannot_write_the_cells_own_columns():
+    session = session_of("free")
+    with pytest.raises(UsageError, match="expected other columns than the cell's, got t_s"), session:
+        session.run(lambda _: Command(columns={"t_s": 0.0}))
+    assert_safe(session)
+
+
+def test_the_log_has_what_was_commanded_whatever_becomes_of_the_controllers_arrays():
+    """A controller that writes each target into the same array, and one that writes into the measurement."""
+    session = session_of("free")
+    target, twice, sent = np.zeros(6), np.zeros(2), []
+
+    def step(measurement):
+        target[:] = measurement.q + 1e-4 * np.sin(measurement.cycle)
+        twice[:] = measurement.cycle
+        sent.append(target.copy())
+        with pytest.raises(ValueError, match="read-only"):
+            measurement.q[0] = 1.0
+        return Command(q_target=target, columns={"twice": twice}, done=len(sent) == 30)
+
+    with session:
+        session.run(step)
+        log = session.cell.log.arrays()
+    rows = np.isfinite(log["twice"][:, 0])
+    assert np.array_equal(log["q_target_rad"][rows], sent)
+    assert np.ptp(log["twice"][rows][:, 0]) == 29
+
+
+def test_the_result_of_a_run_can_come_from_another_process():
+    """As `multiprocessing` sends it, which is how many seeds are run side by side."""
+    result = canprobe.run(canprobe.load_scene("press"), files=False, duration_s=0.1)
+    other = pickle.loads(pickle.dumps(result))
+    assert other.summary == result.summary and other.plan.scene == result.plan.scene
+    assert other.plan.pdos == result.plan.pdos
+    assert np.array_equal(other.log["force_n"], result.log["force_n"], equal_nan=True)

@@ -1,0 +1,450 @@
+"""Drives of other makes in one cell, each as its EDS describes it: planned, brought up, enabled, moved, left.
+
+The EDS files are of `makes`. All of them can have a period of 3 ms: whole milliseconds, and tenths of them.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from makes import MAKES, Entry, changed, pdo, without, word, write_eds
+from scenes import change, reasons
+
+import canprobe
+from canprobe.cell.master.controller import Command
+from canprobe.cell.planning.configuration import make_setups
+from canprobe.cell.planning.make import make_plan
+from canprobe.cell.planning.model import Interpolation
+from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.session.session import Session
+from canprobe.errors import NodeError
+from canprobe.fieldbus.protocol.cia402 import DriveState, OperationMode
+
+RATE_HZ = 333.333
+SWING = np.radians((3, -3, 3, 3, -3, 3))
+IP, CSP = OperationMode.INTERPOLATED_POSITION, OperationMode.CYCLIC_SYNC_POSITION
+MOVING = {name: IP if name == "interpolated" else CSP for name in MAKES if name != "no_cyclic_mode"}
+
+
+def scene_of(make, folder):
+    eds = {"eds": str(write_eds(make, folder))}
+    return change(canprobe.load_scene("free"), arm=eds, cycle={"rate_hz": RATE_HZ}, scene={"figures": False})
+
+
+def mixed_plan(makes, folder):
+    """Six drives of several makes."""
+    setup = resolve(scene_of(makes[0], folder))
+    drives = [
+        replace(drive, eds=str(write_eds(makes[i % len(makes)], folder))) for i, drive in enumerate(setup.arm.drives)
+    ]
+    return make_plan(setup.changed("arm", drives=tuple(drives)))
+
+
+def moved(plan, folder, *, at_cycles=200):
+    """Bring a cell up and move its joints: what was said, how far each joint came (rad), the frames on the bus."""
+    said, q = [], []
+
+    def controller(measurement):
+        q.append(measurement.q)
+        k = len(q)
+        return Command(q[0] + SWING * min(1.0, k / 100), done=k > at_cycles)
+
+    with Session(plan, folder, said.append) as session:
+        session.run(controller)
+        faults = session.cell.faults
+    from canprobe.fieldbus.bus.candump import read_candump
+
+    assert faults == []
+    return said, q[-1] - q[0], [(can_id, data) for _, _, can_id, data in read_candump(folder / "bus.log")]
+
+
+@pytest.mark.parametrize("make", MOVING)
+def test_a_cell_of_one_make_moves(tmp_path, make):
+    plan = canprobe.plan(scene_of(make, tmp_path))
+    assert {node.mode for node in plan.nodes} == {MOVING[make]}
+    said, way, frames = moved(plan, tmp_path / "run")
+    assert way == pytest.approx(SWING, abs=np.radians(0.2))
+    assert not any("left as the device has it" in line and "by its EDS" not in line for line in said), (
+        "all was foreseen"
+    )
+    assert_first_targets_are_positions(plan, frames)
+
+
+def assert_first_targets_are_positions(plan, frames):
+    """Of each drive: its first RPDO has the position of its first TPDO, whatever 607Ah holds as delivered."""
+    for node in plan.nodes:
+        (feedback,), (commands,) = plan.pdos_of(node.node_id, "tpdo"), plan.pdos_of(node.node_id, "rpdo")
+        reports = next(data for can_id, data in frames if can_id == feedback.cob_id)
+        orders = [commands.layout.unpack(data) for can_id, data in frames if can_id == commands.cob_id]
+        assert orders[0][:2] == (0, feedback.layout.unpack(reports)[1])
+        enabling = next(order for order in orders if order[0] & 0x0F == 0x0F)
+        assert enabling[1] == orders[0][1]
+        bits = {order[0] & 0x10 for order in orders if order[0] & 0x0F == 0x0F}
+        assert (0x10 in bits) == (node.mode is IP)
+
+
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [
+        ("milliseconds_only", [Interpolation(3, -3)]),
+        ("microsecond_index", [Interpolation(3, -3), Interpolation(30, -4)]),
+        ("late_target", [Interpolation(3, -3)]),
+        ("bare", [Interpolation(3, -3), Interpolation(30, -4)]),
+        ("fixed_mapping", [Interpolation(30, -4)]),
+        ("tpdo_without_rtr", [Interpolation(3, -3)]),
+    ],
+)
+def test_the_period_as_each_make_expresses_it(tmp_path, make, expected):
+    assert list(canprobe.plan(scene_of(make, tmp_path)).nodes[0].interpolation) == expected
+
+
+def test_a_rate_that_a_make_cannot_express_is_refused_with_the_nearest_that_all_can(tmp_path):
+    scene = change(scene_of("milliseconds_only", tmp_path), cycle={"rate_hz": 400.0})
+    (problem,) = reasons(scene)
+    assert problem.startswith("cycle.rate_hz = 400: a SYNC period of 2500 µs cannot be set (")
+    assert problem.endswith("60C2h takes 1 to 100 · 10^-3 s); take 333.333 or 500 Hz")
+    assert canprobe.plan(change(scene, cycle={"rate_hz": 333.333})).sync.period_ns == 3_000_000
+
+
+def test_a_make_without_a_mode_for_targets_is_refused_with_the_modes_that_it_has(tmp_path):
+    modes = next(problem for problem in reasons(scene_of("no_cyclic_mode", tmp_path)) if "6502h" in problem)
+    assert "profile position (1), profile velocity (3), homing (6); needed: cyclic synchronous position (8)" in modes
+
+
+def test_what_a_bare_drive_lacks_is_listed_with_the_consequence(tmp_path):
+    rows = {what: why.partition(": ")[2] for what, why in canprobe.plan(scene_of("bare", tmp_path)).not_available}
+    assert rows["the node notices a dead master (1016h:01)"] == (
+        "no such object: the device will not notice a dead master"
+    )
+    assert {what[-9:-1] for what in rows} == {
+        "1016h:01", "1029h:01", "2000h:00", "6065h:00", "6066h:00", "607Fh:00", "607Dh:01", "607Dh:02", "605Ah:00",
+        "6007h:00",
+    }  # fmt: skip
+
+
+def wished(plan, index):
+    """What is written there to the first drive, and how the plan says that it is not."""
+    written = [write.value for write in make_setups(plan)[0].writes if write.index == index]
+    return written, [why for what, why in plan.not_available if f"{index:04X}h" in what]
+
+
+def test_a_lost_master_and_a_start_by_itself_are_settled_where_the_device_can(tmp_path):
+    """1029h:01 = 0, pre-operational; bit 2 of 1F80h, the other bits as the device has them."""
+    make = MAKES["milliseconds_only"]()
+    make.objects[0x1F80, 0] = Entry("NMT startup", "U32", "rw", 8)
+    make.objects[0x1029, 0] = Entry("Highest sub-index supported", "U8", "ro", 1)
+    make.objects[0x1029, 1] = Entry("Communication error", "U8", "rw", 1)
+    plan = canprobe.plan(scene_of(make, tmp_path))
+    assert (wished(plan, 0x1029), wished(plan, 0x1F80)) == (([0], []), ([12], []))
+    said, way, _ = moved(plan, tmp_path / "run")
+    assert way == pytest.approx(SWING, abs=np.radians(0.2)) and not any("1F80h" in line for line in said)
+    changed(make.objects, 0x1F80, access="ro")
+    changed(make.objects, 0x1029, 1, low=1, high=2)
+    plan = canprobe.plan(scene_of(make, tmp_path))
+    assert "it is ro, 8: the device may become operational before it is configured" in wished(plan, 0x1F80)[1][0]
+    assert "it takes 1 to 2: it goes pre-operational" in wished(plan, 0x1029)[1][0]
+
+
+def with_factors(make, **factors):
+    """608Fh, 6091h, 6092h as quotients, and 607Eh."""
+    for name, value in factors.items():
+        index = int(name[1:], 16)
+        if index == 0x607E:
+            make.objects[index, 0] = Entry("Polarity", "U8", "rw", value)
+        else:
+            make.objects[index, 0] = Entry("Highest sub-index supported", "U8", "ro", 2)
+            for subindex in (1, 2):
+                make.objects[index, subindex] = Entry(f"Part {subindex}", "U32", "rw", value[subindex - 1])
+    return make
+
+
+def told_by(scene, change_device):
+    """What bring-up says of the second drive after its device was changed."""
+    said = []
+    session = Session(canprobe.plan(scene), say=said.append)
+    change_device(session.world.nodes[1].dictionary)
+    with session:
+        pass
+    return [line for line in said if "node 2: (joint 2)" in line and "units a motor turn" in line]
+
+
+@pytest.mark.parametrize(
+    ("factors", "place", "value", "counts"),
+    [
+        ({"x6092": (1000, 1), "x6091": (1, 1)}, (0x6092, 1), 4096, "4096 units a motor turn by its 6092h and 6091h"),
+        ({"x6092": (1000, 1), "x6091": (1, 1)}, (0x6091, 1), 8, "125 units a motor turn by its 6092h and 6091h"),
+        ({"x608F": (1000, 1)}, (0x608F, 2), 2, "500 units a motor turn by its 608Fh"),
+    ],
+)
+def test_a_device_that_counts_otherwise_than_the_cell_says_is_told(tmp_path, factors, place, value, counts):
+    scene = scene_of(with_factors(MAKES["milliseconds_only"](), **factors), tmp_path)
+    assert told_by(scene, lambda dictionary: None) == []
+    (line,) = told_by(scene, lambda dictionary: dictionary.set_default(*place, value))
+    assert f"counts {counts}, the cell 1000 (counts_per_turn)" in line
+
+
+def test_a_device_that_takes_the_joint_for_its_shaft_counts_as_the_cell(tmp_path):
+    """6091h is the gear of the joint, and 6092h its turn."""
+    scene = scene_of(with_factors(MAKES["milliseconds_only"](), x6092=(1000, 1), x6091=(1, 1)), tmp_path)
+    gear = list(scene.joints.values())[1].gear
+
+    def by_joint(dictionary):
+        dictionary.set_default(0x6091, 1, round(gear * 1000))
+        dictionary.set_default(0x6091, 2, 1000)
+        dictionary.set_default(0x6092, 1, round(1000 * gear))
+
+    assert told_by(scene, by_joint) == []
+
+
+def test_a_device_whose_polarity_was_turned_is_refused(tmp_path):
+    scene = scene_of(with_factors(MAKES["milliseconds_only"](), x607E=0), tmp_path)
+    said = r"\(joint 2\) 607Eh:00 expected 0, as its EDS says, got 128: it would count the other way round"
+    with pytest.raises(NodeError, match=said):
+        told_by(scene, lambda dictionary: dictionary.set_default(0x607E, 0, 0x80))
+
+
+@pytest.mark.parametrize(
+    ("make", "entry"),
+    [
+        ("milliseconds_only", "605A"),  # 0 to 6, 2 is among them
+        ("microsecond_index", "605A"),  # read-only, but it is 2
+        ("late_target", "6065"),
+    ],
+)
+def test_what_limits_and_access_allow_is_no_lack(tmp_path, make, entry):
+    rows = [row for row in canprobe.plan(scene_of(make, tmp_path)).not_available if f"{entry}h" in row[0]]
+    assert rows == []
+
+
+def test_fixed_mappings_are_used_as_they_are(tmp_path):
+    plan = canprobe.plan(scene_of("fixed_mapping", tmp_path))
+    feedback, commands = plan.pdos_of(2, "tpdo"), plan.pdos_of(2, "rpdo")
+    assert [(pdo.number, pdo.cob_id, pdo.transmission_type) for pdo in feedback] == [(3, 0x382, 1)]
+    assert [(pdo.number, pdo.cob_id) for pdo in commands] == [(3, 0x402)]
+    (besides,) = [pdo for pdo in plan.pdos if pdo.node_id == 2 and not pdo.used]
+    assert (besides.number, besides.cob_id, besides.rate_hz) == (1, 0x182, 10)
+    assert "TPDO1 switched off" in dict(plan.not_available)
+
+
+def test_six_makes_in_one_cell_move(tmp_path):
+    makes = [name for name, mode in MOVING.items() if mode is CSP]
+    assert len(makes) == 6
+    said, way, _ = moved(mixed_plan(makes, tmp_path), tmp_path / "run")
+    assert way == pytest.approx(SWING, abs=np.radians(0.2))
+    assert sum("configured" in line for line in said) == 6
+
+
+@pytest.mark.parametrize("make", ["bare", "fixed_mapping"])
+def test_the_drives_are_disabled_on_the_way_out(tmp_path, make):
+    plan = canprobe.plan(scene_of(make, tmp_path))
+    _, _, frames = moved(plan, tmp_path / "run", at_cycles=5)
+    for node_id in plan.node_ids:
+        (feedback,) = plan.pdos_of(node_id, "tpdo")
+        last = [data for can_id, data in frames if can_id == feedback.cob_id][-1]
+        assert feedback.layout.unpack(last)[0] & 0x6F == DriveState.SWITCH_ON_DISABLED.value
+
+
+@pytest.mark.parametrize(
+    ("cell", "quirk", "told"),
+    [
+        (
+            "puma260",
+            {"tpdo_delay_us": 1000.0},
+            r"node \d: its TPDO comes [12]\.\d\d ms behind the SYNC, .* until 1\.\d\d ms",
+        ),
+        (
+            "seven-axis",
+            {"fixed_mapping": True},
+            r"node 1: .*1A00h:00 = 0x2 failed: .*; it holds 0x3: if it is fixed, say so",
+        ),
+    ],
+)
+def test_what_only_the_device_tells_is_said_with_what_there_is(tmp_path, cell, quirk, told):
+    scene = change(canprobe.load_scene("cylinder", {"cell": cell}), emulate=quirk, scene={"figures": False})
+    with pytest.raises(NodeError, match=told), Session(scene, tmp_path) as session:
+        session.run(lambda _: Command(done=True))
+
+
+# What a make may have besides: values that the drives do not take, PDOs with more in them, or with less.
+
+
+def variant(change_objects, base="late_target"):
+    """A make with other objects."""
+    make = MAKES[base]()
+    change_objects(make.objects)
+    return replace(make, name="variant")
+
+
+def rows_of(plan):
+    return {what: why.partition(": ")[2] for what, why in plan.not_available}
+
+
+@pytest.mark.parametrize(
+    ("place", "values", "why"),
+    [
+        ((0x605A, 0), {"access": "ro", "default": 6}, "it is ro, 6"),
+        ((0x605A, 0), {"low": 5, "high": 6}, "it takes 5 to 6"),
+        ((0x605A, 0), {"access": "ro", "default": 2}, None),
+        ((0x6066, 0), {"access": "const", "default": 10}, "it is const, 10"),
+        ((0x607F, 0), {"high": 100}, "it takes at most 100"),
+        ((0x1016, 1), {"access": "ro"}, "it is ro, 0"),
+    ],
+)
+def test_a_wished_value_that_the_eds_excludes_is_left_out(tmp_path, place, values, why):
+    make = variant(lambda objects: changed(objects, *place, **values))
+    plan = canprobe.plan(scene_of(make, tmp_path))
+    rows = {what: text for what, text in rows_of(plan).items() if f"{place[0]:04X}h" in what}
+    assert [text.partition(":")[0] for text in rows.values()] == ([why] if why else [])
+
+
+@pytest.mark.parametrize(
+    ("place", "values", "told"),
+    [
+        ((0x1017, 0), {"access": "const", "default": 0}, "1017h:00 = 100 .* is needed: it is const, 0"),
+        ((0x1017, 0), {"high": 50}, "1017h:00 = 100 .* is needed: it takes at most 50"),
+        ((0x6060, 0), {"access": "ro", "default": 1}, "6060h:00 = 8 .* is needed: it is ro, 1"),
+    ],
+)
+def test_a_required_value_that_the_eds_excludes_is_refused_with_what_there_is(tmp_path, place, values, told):
+    make = variant(lambda objects: changed(objects, *place, **values))
+    (problem,) = reasons(scene_of(make, tmp_path))
+    assert re.search(told, problem)
+
+
+def fixed_pdos(*layouts):
+    """Exactly these PDOs, with fixed mappings."""
+
+    def change_objects(objects):
+        for number in range(1, 9):
+            without(objects, *(base + number - 1 for base in (0x1400, 0x1600, 0x1800, 0x1A00)))
+        for direction, number, words, options in layouts:
+            objects |= pdo(direction, number, words, fixed=True, **options)
+
+    return variant(change_objects)
+
+
+W, T, S, P = word(0x6040, 0, 16), word(0x607A, 0, 32), word(0x6041, 0, 16), word(0x6064, 0, 32)
+SPEED, MODE, ACTUAL_SPEED = word(0x6081, 0, 32), word(0x6060, 0, 8), word(0x606C, 0, 32)
+
+
+def test_controlword_and_target_in_different_fixed_pdos_and_more_in_them(tmp_path):
+    make = fixed_pdos(
+        ("rpdo", 1, (W, MODE), {}),
+        ("rpdo", 2, (SPEED, T), {}),
+        ("tpdo", 1, (S,), {}),
+        ("tpdo", 2, (ACTUAL_SPEED, P), {}),
+    )
+    plan = canprobe.plan(change(scene_of(make, tmp_path), cycle={"rate_hz": 200.0}))
+    assert [pdo.number for pdo in plan.pdos_of(1, "tpdo")] == [1, 2]
+    assert {pdo.number: pdo.constants for pdo in plan.pdos_of(1, "rpdo")} == {
+        1: (((0x6060, 0), 8),),
+        2: (((0x6081, 0), 100_000),),
+    }
+    _, way, frames = moved(plan, tmp_path / "run")
+    assert way == pytest.approx(SWING, abs=np.radians(0.2))
+    assert {data[2] for can_id, data in frames if can_id == 0x201} == {8}
+    assert {data[:4] for can_id, data in frames if can_id == 0x301} == {(100_000).to_bytes(4, "little")}
+
+
+def test_the_pdo_that_carries_nothing_else_is_preferred(tmp_path):
+    make = fixed_pdos(
+        ("rpdo", 1, (W, T, MODE), {}), ("rpdo", 2, (W, T), {}), ("tpdo", 1, (S, P), {}), ("tpdo", 2, (S, P), {})
+    )
+    plan = canprobe.plan(scene_of(make, tmp_path))
+    assert [pdo.number for pdo in (*plan.pdos_of(1, "rpdo"), *plan.pdos_of(1, "tpdo"))] == [2, 1]
+    assert [(pdo.number, pdo.rate_hz) for pdo in plan.pdos if pdo.node_id == 1 and not pdo.used] == [
+        (2, pytest.approx(1000 / 3))
+    ]
+
+
+def test_a_fixed_pdo_whose_other_values_have_no_safe_default_is_refused(tmp_path):
+    make = fixed_pdos(("tpdo", 1, (S, P), {}))
+    make.objects[0x60FF, 0] = Entry("Target velocity", "I32", "rw", "", mappable=True)
+    make.objects.update(pdo("rpdo", 1, (W, word(0x60FF, 0, 32)), fixed=True) | pdo("rpdo", 2, (T,), fixed=True))
+    (problem,) = reasons(scene_of(make, tmp_path))
+    assert problem.startswith("nodes 1, 2, 3, 4, 5, 6: ")
+    assert "RPDO1 also writes 60FFh:00, whose EDS entry has no default" in problem
+
+
+def test_no_pdo_with_what_is_needed_is_refused_with_what_they_carry(tmp_path):
+    make = fixed_pdos(("rpdo", 1, (W,), {}), ("tpdo", 1, (S, P), {}))
+    assert "RPDO1 has the fixed mapping 60400010h; needed: 6040h:00, 607Ah:00" in reasons(scene_of(make, tmp_path))[0]
+
+
+def test_a_pdo_that_follows_no_sync_is_not_used(tmp_path):
+    def change_objects(objects):
+        changed(objects, 0x1800, 2, access="ro", default=255)
+
+    plan = canprobe.plan(scene_of(variant(change_objects), tmp_path))
+    assert {pdo.number for pdo in plan.pdos_of(3, "tpdo")} == {2}
+    assert [(pdo.number, pdo.cob_id) for pdo in plan.pdos_of(3, "tpdo")] == [(2, 0x183)]
+
+
+def test_bits_29_and_30_are_written_as_the_eds_has_them(tmp_path):
+    plan = canprobe.plan(scene_of("tpdo_without_rtr", tmp_path))
+    writes = {(w.index, w.subindex): w.value for w in make_setups(plan)[2].writes}
+    assert writes[0x1800, 1] == 0x4000_0183 and writes[0x1801, 1] == 0xC000_0283 and writes[0x1400, 1] == 0x203
+
+
+def test_targets_of_interpolated_position_go_to_60c1h(tmp_path):
+    """The master alone: what is written, what is mapped."""
+    plan = canprobe.plan(scene_of("interpolated", tmp_path))
+    writes = {(w.index, w.subindex): w.value for w in make_setups(plan)[0].writes}
+    assert writes[0x6060, 0] == 7 and writes[0x60C0, 0] == 0 and (writes[0x60C2, 1], writes[0x60C2, 2]) == (3, -3)
+    assert [writes[0x1600, sub] for sub in (0, 1, 2)] == [2, 0x60400010, 0x60C10120]
+
+
+def test_the_packaged_prbt_joint_is_planned_at_100_hz():
+    scene = canprobe.load_scene("free", {"cell": "prbt"})
+    plan = canprobe.plan(scene)
+    assert {(node.mode, node.interpolation) for node in plan.nodes} == {(IP, (Interpolation(10, -3),))}
+    assert [pdo.number for pdo in (*plan.pdos_of(3, "rpdo"), *plan.pdos_of(3, "tpdo"))] == [1, 1]
+    assert "what a quick stop does (605Ah:00)" in dict(plan.not_available)
+
+
+RPM = 0x00B44700
+
+
+def speed_limited(most, unit=RPM, **values):
+    """607Fh in the unit of 60A9h."""
+
+    def change_objects(objects):
+        objects[0x60A9, 0] = Entry("SI unit velocity", "U32", "ro", unit)
+        changed(objects, 0x607F, default=most, **values)
+
+    return variant(change_objects)
+
+
+def test_a_limit_of_speed_is_written_in_the_unit_of_the_drive(tmp_path):
+    """Joint 1 of the PUMA 260: all its speed in counts a second, and 60 / 1000 of that in turns a minute."""
+    folders = [tmp_path / "turns", tmp_path / "counts"]
+    for folder in folders:
+        folder.mkdir()
+    limited = zip((RPM, 0), folders, strict=True)
+    plans = [canprobe.plan(scene_of(speed_limited(1300, unit), folder)) for unit, folder in limited]
+    rpm, counts = (next(w.value for w in make_setups(plan)[0].writes if w.index == 0x607F) for plan in plans)
+    assert 0.0 <= rpm - counts * 60 / 1000 <= 1.0
+
+
+def test_joints_keep_within_a_limit_of_speed_that_stands_in_the_drive(tmp_path):
+    plan = canprobe.plan(scene_of(speed_limited(1300, access="ro"), tmp_path))
+    model = plan.setup.arm.model
+    fastest = np.abs(model.units_per_q[:4]) @ model.qd_max
+    assert fastest.max() == pytest.approx(1300 * 1000 / 60 - 2 * plan.sync.rate_hz)
+    assert "607Fh: drives that fault below the speeds of their joints" in plan.warnings[0]
+    _, way, _ = moved(plan, tmp_path / "run")
+    assert way == pytest.approx(SWING, abs=np.radians(0.2))
+
+
+def test_a_limit_of_speed_below_the_rounding_of_targets_is_refused(tmp_path):
+    problems = reasons(scene_of(speed_limited(10, access="ro"), tmp_path))
+    assert re.match(r"joints\.joint_1: drive 1 allows 166\.7 units/s by its 607Fh", problems[0])
+
+
+def test_a_drive_without_an_object_for_it_waits_for_arm_missed_syncs(tmp_path):
+    scene = change(scene_of("milliseconds_only", tmp_path), arm={"missed_syncs": 40})
+    drive = Session(canprobe.plan(scene)).world.nodes[0].application
+    assert drive.parts.parameters.misses == 40

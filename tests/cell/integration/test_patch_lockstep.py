@@ -1,0 +1,101 @@
+"""The patch as a second sensor in the whole cell: a path along the axis of a cylinder, full sensor pipeline."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import canprobe
+from canprobe.cell.results.scores import score_shape
+from canprobe.cell.results.summary import shape_lines, summarise_shape
+from canprobe.cell.session.session import Session
+from canprobe.cell.tasks.from_plan import make_shape_estimator, make_task
+from canprobe.cell.tasks.shape import replay_samples
+
+
+@pytest.fixture(scope="module")
+def axial():
+    """The session and its controller after 2 s (50 mm) on the axial scene."""
+    session = Session(canprobe.load_scene("axial", {"task.duration_s": 2.0}))
+    controller = make_task(session.plan)
+    with session:
+        session.run(controller)
+    return session, controller
+
+
+def score(session, records):
+    return score_shape(records, session.truth, session.cell.log.arrays()["t_s"])
+
+
+def test_curvature_across_an_axial_path_is_observed_within_ten_percent(axial):
+    session, controller = axial
+    found = score(session, controller.shape.records)
+    assert found.estimates >= 20
+    assert found.observed_fraction == 1.0
+    assert found.patch_fraction == 1.0
+    assert found.kappa_true_per_m == pytest.approx((1 / 0.036, 0.0), abs=1e-6)
+    assert found.kappa_rms_error_percent < 10.0
+    last = controller.shape.records[-1].estimate
+    assert last.method == "recursive+patch"
+    truth = session.truth["direction1"][-1]
+    assert abs(last.directions[0] @ truth) > 0.99
+
+
+def test_the_first_answer_gives_the_force_no_knock(axial):
+    """The patch tells the curvature, and with it the depth for 2 N, in one instant."""
+    session, controller = axial
+    first, last = controller.scan_cycles
+    assert session.truth["force"][first:last].max() < 2.35
+
+
+def test_without_the_patch_the_same_contacts_leave_it_unobserved(axial):
+    session, controller = axial
+    task = session.plan.setup.task
+    off = replace(task, shape=replace(task.shape, patch=False))
+    records = replay_samples(make_shape_estimator(off, "recursive"), controller.shape.samples, 8)
+    found = score(session, records)
+    assert found.observed_fraction == 0.0
+    assert list(records[-1].estimate.observed) == [True, False]
+    assert records[-1].estimate.kappa[0] == pytest.approx(0.0, abs=1.0)
+    assert np.isnan(records[-1].estimate.kappa[1])
+    times = session.cell.log.arrays()["t_s"]
+    shape = summarise_shape(off, None, {"recursive": records}, session.truth, times)
+    assert shape["kappa_true_per_m"] == pytest.approx((1 / 0.036, 0.0), abs=1e-6)  # it is known all the same
+    assert shape_lines(shape) == [
+        f"  curvature  {records[-1].estimate.kappa[0]:.2f} 1/m, the other one not observed; true 27.78, 0.00 1/m",
+        "    recursive  not scored: no estimate of both curvatures after the first 20 mm",
+    ]
+
+
+def test_ml_takes_the_same_help_and_the_paper_s_method_takes_none(axial):
+    session, controller = axial
+    samples = controller.shape.samples
+    ml = replay_samples(make_shape_estimator(session.plan.setup.task, "ml"), samples, 40)[-1].estimate
+    assert ml.method == "ml+patch"
+    assert ml.kappa == pytest.approx([1 / 0.036, 0.0], abs=2.8)
+    paper = replay_samples(make_shape_estimator(session.plan.setup.task, "chen1996"), samples, 40)[-1].estimate
+    assert paper.method == "chen1996"
+    assert not paper.observed.all()
+
+
+def test_across_a_circumferential_path_the_curvature_is_0_within_2_per_m():
+    """Scored absolutely: there is nothing to divide by."""
+    scene = canprobe.load_scene("axial", {"task.duration_s": 2.4})
+    scene = replace(scene, task=replace(scene.task, heading_deg=110.0, length_mm=20.0))
+    session = Session(scene)
+    controller = make_task(session.plan)
+    with session:
+        session.run(controller)
+    late = [r.estimate for r in controller.shape.records if r.travelled_m > 0.02]
+    axis = np.array([np.cos(np.radians(20.0)), np.sin(np.radians(20.0)), 0.0])
+    along_axis, around = [], []
+    for e in late:
+        assert e.observed.all()
+        a = e.T_frame_contact[:3, :2].T @ axis
+        a /= np.linalg.norm(a)
+        b = np.array([-a[1], a[0]])
+        along_axis.append(a @ e.K @ a)
+        around.append(b @ e.K @ b)
+    assert len(late) >= 10
+    assert np.sqrt(np.mean(np.square(along_axis))) < 2.0
+    assert np.sqrt(np.mean(np.square(np.array(around) - 1 / 0.036))) < 1.0

@@ -1,0 +1,57 @@
+"""A run begun with the probe on an object: its tare would take the press for zero, so that nothing is enabled."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import canprobe
+from canprobe.cell.master.conditions import BY_KEY
+from canprobe.cell.master.supervision import Reaction
+from canprobe.cell.scene.geometry import true_object
+from canprobe.cell.session.session import Session
+from canprobe.cell.tasks.from_plan import make_task
+from canprobe.errors import SafetyStop
+from canprobe.fieldbus.protocol.cia402 import DriveState, state_of
+from canprobe.fieldbus.protocol.frames import NmtState
+
+
+def press_begun_pressed(**limits):
+    """Reason of the stop, and the session: of a press where the object stands 0.3 mm in the way of the arm at rest."""
+    scene = canprobe.load_scene("press", {"task.duration_s": 3.0})
+    session = Session(replace(scene, limits=replace(scene.limits, **limits)))
+    x, y, z = scene.object.position_mm
+    raised = true_object(replace(scene.object, position_mm=(x, y, z + 8.3)))
+
+    plant = session.world.plant
+    plant.config = replace(plant.config, object=raised)
+    with pytest.raises(SafetyStop) as stopped, session:
+        session.run(make_task(session.plan))
+    return stopped.value.reason, session
+
+
+def test_no_drive_is_enabled():
+    reason, session = press_begun_pressed()
+    assert BY_KEY["preload"].reaction is Reaction.STOP and "preload" in session.cell.supervisor.first
+    force = float(reason.removeprefix("the array measures ").split(" N before the run")[0])
+    assert force == pytest.approx(session.truth["force"].max(), rel=0.15) and force > 0.5
+    assert "limits.preload_max_n = 0.15" in reason and "free the probe" in reason
+    assert np.ptp(session.truth["q"], axis=0).max() == 0.0
+    words = session.cell.log.arrays()["statusword"]
+    assert {state_of(int(word)) for word in words[np.isfinite(words)]} == {DriveState.SWITCH_ON_DISABLED}
+    assert {node.state for node in session.world.nodes} == {NmtState.PRE_OPERATIONAL}
+
+
+def test_a_larger_limit_lets_an_array_with_offsets_begin():
+    reason, session = press_begun_pressed(preload_max_n=3.0)
+    assert "before the run" not in reason
+    assert np.ptp(session.truth["q"], axis=0).max() > 0.01
+
+
+def test_a_force_during_the_run_is_no_preload():
+    """Nor while its drives are off afterwards, which must not keep the probe from being taken off the object."""
+    scene = canprobe.load_scene("press", {"task.duration_s": 0.5})
+    with Session(scene) as session:
+        session.run(make_task(session.plan))
+    assert session.cell.supervisor.seen.preload < 0.15 and "preload" not in session.cell.supervisor.first
+    assert session.truth["force"].max() > 1.5

@@ -1,0 +1,84 @@
+"""A scan that loses its contact stops along the path, looks for the object, and goes on without overshoot."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from wrapped import Wrapped
+
+import canprobe
+from canprobe.cell.scene.model import PlantSettings
+from canprobe.cell.session.session import Session
+from canprobe.cell.tasks.from_plan import make_task
+from canprobe.cell.tasks.probing import Phase
+from canprobe.lab.studies.fault_scores import Witness
+
+TARGET = 2.0
+AT_CYCLE = 900
+NOMINAL = 1.27e8
+
+
+class Disturbed(Wrapped):
+    """A scan over the cylinder; in one cycle the object is put somewhere else, or taken away."""
+
+    def __init__(self, move_mm, *, share=1.0, duration_s=3.0, **task):
+        scene = canprobe.load_scene("cylinder", {"task.duration_s": duration_s})
+        self.session = Session(
+            replace(
+                scene,
+                bus=replace(scene.bus, timed=False),
+                task=replace(scene.task, **task),
+                plant=replace(scene.plant or PlantSettings(), stiffness_n_m3=share * NOMINAL),
+                shape=replace(scene.shape, also=()),
+            )
+        )
+        super().__init__(make_task(self.session.plan))
+        self.move_mm = move_mm
+        self.witness = Witness(self.session.world.plant, 1_250_000)
+        self.positions = []
+        self.session.world.participants.insert(0, self.witness)
+
+    def step(self, measurement):
+        if measurement.cycle == AT_CYCLE:
+            plant = self.session.world.plant
+            there = None
+            if self.move_mm is not None:
+                there = canprobe.cell.scene.geometry.true_object(
+                    replace(
+                        self.session.scene.object,
+                        position_mm=tuple(np.add(self.session.scene.object.position_mm, self.move_mm)),
+                    )
+                )
+            plant.config = replace(plant.config, object=there)
+            plant._solved = None
+        command = self.task.step(measurement)
+        self.positions.append((int(self.task.phase), *self.task._motion.pose.centre))
+        return command
+
+    def run(self):
+        with self.session:
+            self.session.run(self)
+        times, forces = (np.array(column) for column in zip(*self.witness.rows, strict=True))
+        return times * 1e-9, forces
+
+
+@pytest.mark.parametrize("share", [1.0, 4.5], ids=["9 kN/m", "20 kN/m"])
+def test_an_object_that_gives_way_is_found_again_without_overshoot(share):
+    run = Disturbed((0.0, 0.0, -1.2), share=share)
+    times, forces = run.run()
+    (loss,) = run.task.losses
+    gap = times[(forces == 0) & (times > times[0] + 3.0)]
+    assert loss.searched == pytest.approx(1.2e-3, abs=0.6e-3)
+    assert 0.2 < loss.regained_s < 0.9
+    assert gap.size > 0, "contact was truly lost"
+    lost_at = AT_CYCLE * 2.5e-3
+    after = forces[times - times[0] > lost_at]
+    assert after.max() < 1.5 * TARGET
+    phases = np.array([row[0] for row in run.positions])
+    assert (np.diff(phases[phases >= Phase.SCAN]) != 0).sum() >= 3, "scan, regain, scan, retreat"
+    resumed = np.flatnonzero(phases == Phase.SCAN)[-1]
+    assert resumed > AT_CYCLE + 200
+    path = np.array([row[1:] for row in run.positions])
+    searching = (phases == Phase.REGAIN) & (np.arange(len(phases)) < loss.cycle + loss.regained_s / 2.5e-3)
+    sideways = path[searching][:, :2] - path[loss.cycle, :2]
+    assert np.linalg.norm(sideways, axis=1).max() < 1.2e-3, "no further along the path"

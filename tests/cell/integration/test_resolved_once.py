@@ -1,0 +1,192 @@
+"""A run is resolved once: what ran is what is written and scored, whatever becomes of the scene's files."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from undrawn import undrawn, undrawn_run
+
+import canprobe
+from canprobe.cell.master.cycle import Observation
+from canprobe.cell.results.summary import RunResult
+from canprobe.cell.scene.load import packaged_files
+from canprobe.cell.scene.model import Scene
+from canprobe.cell.tasks.from_plan import make_task
+from canprobe.cli import main
+from canprobe.errors import ResultsError
+from canprobe.fieldbus.bus.candump import read_npz
+from canprobe.fieldbus.eds.packaged import eds_path
+
+SECONDS = 0.6
+COPIES = {"calibration.toml", "joint.eds", "taxels.eds", "relief.npz", "real.toml"}
+"""Files that stand beside the scene of a run."""
+
+
+def make_inputs(folder: Path) -> Path:
+    """A folder with a scene that names files of its own only: cell, array, calibration, EDS, heights, true cell."""
+    folder.mkdir()
+    scene = packaged_files("scenes")["relief"]
+    shutil.copy(scene.with_suffix(".npz"), folder)
+    shutil.copy(eds_path("puma260_joint"), folder / "joint.eds")
+    shutil.copy(eds_path("tactile_array"), folder / "taxels.eds")
+    shutil.copy(packaged_files("calibrations")["inch16"], folder / "calibration.toml")
+    shutil.copy(packaged_files("arrays")["inch16"], folder / "array.toml")
+    cell = packaged_files("cells")["puma260"].read_text()
+    (folder / "real.toml").write_text(cell)
+    (folder / "cell.toml").write_text(
+        cell.replace("puma260_joint.eds", "joint.eds").replace('array = "inch16"', 'array = "array.toml"')
+    )
+    sensor = '[sensor]\neds = "taxels.eds"\ncalibration = "calibration.toml"\n[plant]\ntrue_cell = "real.toml"\n'
+    (folder / "scene.toml").write_text('cell = "cell.toml"\n' + scene.read_text().replace("[sensor]\n", sensor))
+    return folder
+
+
+@pytest.fixture
+def inputs(tmp_path: Path) -> Path:
+    return make_inputs(tmp_path / "inputs")
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
+    """A run whose files stay as they are."""
+    folder = tmp_path_factory.mktemp("undisturbed")
+    return canprobe.run(scene_of(make_inputs(folder / "inputs")), bus="direct", out=folder / "run")
+
+
+def scene_of(folder: Path) -> Scene:
+    short = {"task.duration_s": SECONDS, "task.clearance_mm": 0.5, "shape.memory_mm": 3, "shape.also": ["ml"]}
+    return undrawn(canprobe.load_scene(folder / "scene.toml", short))
+
+
+def remove(folder: Path) -> None:
+    shutil.rmtree(folder)
+
+
+def spoil(folder: Path) -> None:
+    for path in folder.iterdir():
+        path.write_bytes(b"nothing that can be read\n")
+
+
+def recalibrate(folder: Path) -> None:
+    """Another array: its layer is twice as stiff, and the drives and the surface are others too."""
+    for name, old, new in (
+        ("calibration.toml", "stiffness_n_m3 = ", "stiffness_n_m3 = 2"),
+        ("joint.eds", "DefaultValue=0x00000260", "DefaultValue=0x00000261"),
+        ("real.toml", "d_mm = 330.2", "d_mm = 331.2"),
+    ):
+        text = (folder / name).read_text()
+        assert old in text
+        (folder / name).write_text(text.replace(old, new))
+    with np.load(folder / "relief.npz") as saved:
+        columns = dict(saved)
+    np.savez(folder / "relief.npz", **{**columns, "heights": 2.0 * columns["heights"]})
+
+
+def without_times(summary: dict[str, Any]) -> dict[str, Any]:
+    cycle = {name: value for name, value in summary["cycle"].items() if not name.endswith("_us")}
+    without_folder = [line.rpartition("/")[2] for line in summary["left_out"]]
+    return summary | {
+        "left_out": without_folder,
+        "wall_time_s": None,
+        "realtime_factor": None,
+        "cycle": cycle,
+        "bridges": None,
+    }
+
+
+def score_lines(result: RunResult) -> list[list[str]]:
+    """The table of scores without the time that they took."""
+    return [line.split()[:-1] for line in repr(result.score("ml")).splitlines()]
+
+
+@pytest.mark.parametrize(
+    ("when", "change"),
+    [("planned", recalibrate), ("running", recalibrate), ("running", spoil), ("running", remove)],
+)
+def test_files_that_change_meanwhile_change_nothing(
+    undisturbed: RunResult, inputs: Path, tmp_path: Path, change: Callable[[Path], None], when: str
+) -> None:
+    assert undisturbed.out is not None
+    scene, out = scene_of(inputs), tmp_path / "run"
+
+    def change_amid(observation: Observation) -> None:
+        if when == "running" and observation.measurement is not None and observation.measurement.cycle == 100:
+            change(inputs)
+
+    cell = canprobe.open_cell(scene, bus="direct", out=out, observers=[change_amid])
+    if when == "planned":
+        change(inputs)
+    with cell:
+        result = cell.run(make_task(cell.plan))
+    assert {path.name for path in out.iterdir()} >= COPIES
+    for name in COPIES | {"scene.toml"}:
+        assert (out / name).read_bytes() == (undisturbed.out / name).read_bytes(), name
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["shape"]["methods"].keys() == {"recursive", "ml"}
+    assert without_times(summary) == without_times(undisturbed.summary)
+    for name, columns in (("log.npz", undisturbed.log), ("tactile.npz", undisturbed.tactile)):
+        for column, values in read_npz(out / name).items():
+            if column != "sync_late_us":
+                np.testing.assert_array_equal(values, columns[column], err_msg=f"{name}: {column}")
+    assert score_lines(result) == score_lines(undisturbed)
+    assert result.plot().axes
+    again = canprobe.replay(out)
+    assert again.summary["online"]["K_max_difference_per_m"] == 0.0
+    assert json.loads(json.dumps(again.summary["shape"])) == summary["shape"]
+
+
+def test_other_processes_of_a_run_have_its_files_too(inputs: Path, tmp_path: Path) -> None:
+    """A recording carries the EDS files; its process reads them when it ends."""
+    out = tmp_path / "run"
+    cell = canprobe.open_cell(scene_of(inputs), out=out, bridge=["mcap"])
+    remove(inputs)
+    with cell:
+        cell.run(make_task(cell.plan))
+    assert json.loads((out / "summary.json").read_text())["bridges"]["mcap"]["error"] is None
+    recording = (out / "run.mcap").read_bytes()
+    assert b"joint.eds" in recording and b"taxels.eds" in recording
+
+
+def test_scores_that_fail_do_not_cost_what_was_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise np.linalg.LinAlgError("singular")
+
+    monkeypatch.setattr("canprobe.api.summarise", broken)
+    with pytest.raises(np.linalg.LinAlgError):
+        undrawn_run(canprobe.load_scene("listen"), bus="direct", duration_s=0.1, out=tmp_path)
+    assert len(read_npz(tmp_path / "log.npz")["t_s"]) > 30
+    assert len(read_npz(tmp_path / "tactile.npz")["t_s"]) > 10
+
+
+def test_a_picture_that_fails_costs_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken(*_: object) -> None:
+        raise ValueError("'foo' is not a valid backend")
+
+    monkeypatch.setattr("canprobe.cell.results.figures.draw_run", broken)
+    told = "canprobe: report.png: cannot be drawn: ValueError: 'foo' is not a valid backend\n"
+    assert main(["run", "listen", "--bus", "direct", "--duration", "0.1", "--out", str(tmp_path)]) == 3
+    assert capsys.readouterr().err == told
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {"summary.json", "log.npz", "tactile.npz", "truth.npz", "scene.toml"}
+
+
+@pytest.mark.parametrize("name", ["summary.json", "log.npz", "tactile.npz"])
+def test_one_file_that_cannot_be_written_does_not_cost_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    def in_the_way(observation: Observation) -> None:
+        (tmp_path / name).mkdir(exist_ok=True)
+
+    with pytest.raises(ResultsError, match=rf"{name}: cannot be written: Is a directory") as failed:
+        undrawn_run(canprobe.load_scene("listen"), bus="direct", duration_s=0.1, out=tmp_path, observers=[in_the_way])
+    assert failed.value.summary is not None and failed.value.summary["faults"] == [str(failed.value)]
+    others = {"summary.json", "log.npz", "tactile.npz"} - {name}
+    assert all((tmp_path / other).is_file() for other in others)

@@ -1,0 +1,720 @@
+"""Every row of the table of conditions: injected in lockstep, seen within its time, and answered as the table says."""
+
+from __future__ import annotations
+
+import re
+import signal
+from dataclasses import replace
+from itertools import chain, count, repeat
+from pathlib import Path
+from struct import pack, unpack
+
+import numpy as np
+import pytest
+from injected import FREE_CYCLE, HOLD_CYCLE, Injected, altered, send
+
+import canprobe
+from canprobe.cell.master.conditions import BY_KEY, CONDITIONS
+from canprobe.cell.master.controller import Command
+from canprobe.cell.master.supervision import Reaction
+from canprobe.cell.master.supervisor import JointGuard
+from canprobe.cell.session.session import Session
+from canprobe.cell.tasks.probing import Phase
+from canprobe.errors import CanprobeError, InterfaceError, NodeError, ResultsError, SafetyStop
+from canprobe.fieldbus.bus.port import ControllerState
+from canprobe.fieldbus.node.faults import FaultKind, FaultyNode
+from canprobe.fieldbus.protocol.cia402 import DriveState, state_of
+from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, Emcy, NmtCommand, NmtState, pack_nmt
+
+# nodes
+
+
+def test_heartbeat_lost():
+    run = Injected("free", FREE_CYCLE, lambda r: altered(r.nodes[3], HEARTBEAT_BASE + 3, lambda _: None))
+    run.assert_within("heartbeat").assert_drives_off()
+    assert isinstance(run.error, NodeError) and run.error.node_id == 3 and "heartbeat" in str(run.error)
+
+
+@pytest.mark.parametrize("node_id", [2, 6])
+def test_a_node_that_boots_again(node_id):
+    run = Injected("free", FREE_CYCLE, lambda r: r.fault(FaultKind.REBOOT, node_id, duration_ns=1_000_000))
+    run.assert_within("nmt_state").assert_drives_off()
+    assert isinstance(run.error, NodeError) and run.error.node_id == node_id
+    assert "INITIALISING" in str(run.error) or "PRE_OPERATIONAL" in str(run.error)
+
+
+def test_a_sensor_that_leaves_operation_in_contact():
+    run = Injected("press", HOLD_CYCLE, lambda r: r.nodes[16].node._enter(NmtState.STOPPED, r.now()))
+    run.assert_within("nmt_state").assert_drives_off()
+    assert "node 16: left operation: NMT state STOPPED" in str(run.error)
+
+
+def test_a_drive_fault():
+    run = Injected("free", FREE_CYCLE, lambda r: r.nodes[2].node.application.inject_fault(0x4310))
+    run.assert_within("drive_fault").assert_drives_off()
+    assert run.error.node_id == 2 and "4310h" in str(run.error)
+
+
+def test_an_emcy_of_the_sensor():
+    def alarm(run):
+        run.nodes[16].node.emcy.report(0x5000)
+        send(run, (0x7A0, b""))  # a frame wakes the bus, which then carries the EMCY
+        run.session.lockstep._queue(run.session.lockstep._nodes[6], run.nodes[16].node._taken())
+
+    run = Injected("press", HOLD_CYCLE, alarm)
+    run.assert_within("emcy").assert_drives_off()
+    assert str(run.error) == "node 16: EMCY 5000h, device hardware"
+
+
+def test_an_emcy_about_communication_is_noted():
+    run = Injected("free", FREE_CYCLE, lambda r: send(r, (EMCY_BASE + 4, Emcy(0x8210, 0x11).pack())), until=10)
+    run.assert_counted("emcy_communication")
+    at_s = run.session.cell.start_ns * 1e-9 + FREE_CYCLE * 0.0025
+    told = f"node 4: EMCY 8210h, PDO not processed due to length error, at {at_s:.2f} s"
+    assert run.session.cell.faults == [told]
+
+
+def test_another_master():
+    run = Injected("free", FREE_CYCLE, lambda r: send(r, (SYNC_ID, b"")))
+    run.assert_within("foreign_master")
+    assert isinstance(run.error, SafetyStop) and "another master" in str(run.error)
+
+
+@pytest.mark.parametrize("command", [NmtCommand.STOP, NmtCommand.PRE_OPERATIONAL, NmtCommand.RESET_NODE])
+@pytest.mark.parametrize("node_id", [0, 3])
+def test_another_master_is_named_by_what_it_sent_and_not_by_what_the_nodes_made_of_it(command, node_id):
+    run = Injected("free", FREE_CYCLE, lambda r: send(r, pack_nmt(command, node_id)))
+    run.assert_within("foreign_master")
+    assert str(run.error) == "another master is on the bus: an NMT command from another master"
+
+
+@pytest.mark.parametrize("step", ["identify", "start all", "enable"])
+def test_another_master_that_interferes_before_the_run_is_named_and_nothing_is_enabled(step):
+    said = []
+
+    def say(text):
+        said.append(text)
+        if text.startswith(step):
+            session.lockstep.port().send_batch([pack_nmt(NmtCommand.STOP, 4)])
+
+    session = Session(canprobe.load_scene("free"), say=say)
+    with pytest.raises(CanprobeError, match="an NMT command from another master"), session:
+        session.run(lambda _: Command())
+    assert said[-1] != "enable the drives" or session.cell.log.arrays()["statusword"].size
+    for row in session.cell.log.arrays().get("statusword", ()):
+        assert DriveState.OPERATION_ENABLED not in map(state_of, map(int, row))
+
+
+@pytest.mark.parametrize("what", ["bus-off", "EMCY 4210h"])
+def test_what_comes_while_the_drives_are_being_enabled_ends_that(what):
+    def say(text):
+        if text != "enable the drives":
+            return
+        if what == "bus-off":
+            session.cell._port.state = ControllerState.BUS_OFF
+        else:
+            session.lockstep.port().send_batch([(EMCY_BASE + 4, Emcy(0x4210, 1).pack())])
+
+    session = Session(canprobe.load_scene("free"), say=say)
+    with pytest.raises(CanprobeError, match=what), session:
+        session.run(lambda _: Command(done=True))
+    words = session.cell.log.arrays()["statusword"]
+    assert DriveState.OPERATION_ENABLED not in {state_of(int(word)) for word in words.ravel()}
+
+
+def not_enabled(told, *changes):
+    """Ends so where nodes send other data from `enable the drives` on, by (node id, COB-ID, change)."""
+
+    def say(text):
+        if text == "enable the drives":
+            for node_id, cob_id, change in changes:
+                altered(participants[node_id - 1], cob_id, change)
+
+    session = Session(canprobe.load_scene("free"), say=say)
+    participants = session.world.participants
+    participants[:6] = map(FaultyNode, participants[:6])
+    with pytest.raises(CanprobeError, match=told), session:
+        session.run(lambda _: Command(done=True))
+    words = session.cell.log.arrays()["statusword"]
+    assert DriveState.OPERATION_ENABLED not in {state_of(int(word)) for word in words.ravel()}
+
+
+def moved(data, counts):
+    return data[:2] + pack("<i", unpack("<i", data[2:6])[0] + counts) + data[6:]
+
+
+def test_an_arm_that_does_not_stand_still_is_not_enabled():
+    way = count(0, 20)
+    not_enabled("node 2: reports no position that stays for 2 s", (2, 0x182, lambda d: moved(d, next(way))))
+
+
+def test_a_jump_while_the_drives_are_being_enabled_ends_that():
+    ready = DriveState.READY_TO_SWITCH_ON
+    change = lambda d: moved(d, 20_000) if state_of(unpack("<H", d[:2])[0]) is ready else d  # noqa: E731
+    not_enabled("joint 2 reports a motion of", (2, 0x182, change))
+
+
+def test_a_heartbeat_that_is_lost_before_the_drives_are_enabled_ends_that():
+    """They are enabled only once joint 2 stands still, which here takes longer than the time-out."""
+    way = chain(range(0, 3000, 20), repeat(3000))
+    not_enabled(
+        "node 3: lost: no heartbeat",
+        (2, 0x182, lambda d: moved(d, next(way))),
+        (3, HEARTBEAT_BASE + 3, lambda _: None),
+    )
+
+
+def test_a_moving_arm_is_stopped_before_it_is_disabled():
+    """A drive that loses its power while it moves coasts."""
+    sent = []
+
+    def interrupt(run):
+        inner = run.session.lockstep.recorder
+
+        def recorder(can_id, data, t_ns):
+            sent.append((can_id, data[:2]))
+            inner(can_id, data, t_ns)
+
+        run.session.lockstep.recorder = recorder
+        raise KeyboardInterrupt
+
+    Injected("free", FREE_CYCLE, interrupt).assert_drives_off()
+    for cob_id in range(0x201, 0x207):
+        words = [int.from_bytes(word, "little") for can_id, word in sent if can_id == cob_id]
+        assert list(dict.fromkeys(words))[:2] == [0x02, 0x00]
+
+
+class NeverHeard(Injected):
+    """An array that lives and sends no frame."""
+
+    def _join(self, node):
+        joined = super()._join(node)
+        for pdo in self.session.plan.pdos_of(16, "tpdo") if node.node_id == 16 else ():
+            altered(joined, pdo.cob_id, lambda _: None)
+        return joined
+
+
+def test_an_own_controller_does_not_go_on_with_an_array_that_was_never_heard():
+    run = NeverHeard("press", FREE_CYCLE, lambda _: None, own=True)
+    assert "no tactile frame for" in str(run.error)
+    assert run.injected_ns is None, "it came to no cycle of a touch"
+
+
+# PDOs
+
+
+@pytest.mark.parametrize("kind", [FaultKind.DROP, FaultKind.DELAY, FaultKind.CORRUPT])
+def test_missed_pdos_are_lived_with(kind):
+    def lose(run):
+        if kind is FaultKind.CORRUPT:
+            twice = iter((5, 5))
+            altered(run.nodes[5], 0x185, lambda data: data[: next(twice, 8)])
+            return
+        run.fault(kind, 5, duration_ns=8_000_000, amount_ns=2_000_000)
+
+    run = Injected("free", FREE_CYCLE, lose, until=20)
+    run.assert_counted("pdo_missed")
+    if kind is FaultKind.CORRUPT:
+        assert run.session.cell.drives.malformed > 0
+
+
+def test_a_silent_drive():
+    run = Injected("free", FREE_CYCLE, lambda r: altered(r.nodes[5], 0x185, lambda _: None))
+    run.assert_within("drive_silent").assert_drives_off()
+    assert "node 5: lost: no usable TPDO for 6 cycles" in str(run.error)
+
+
+def test_torn_frames_are_dropped():
+    def lose(run):
+        node = run.nodes[16]
+        inner = node._sent
+        until = run.now() + 15_000_000
+        node._sent = lambda frames, t: inner([f for f in frames if f[0] != 0x515 or t > until], t)
+
+    Injected("press", HOLD_CYCLE, lose, until=40).assert_counted("torn_frame")
+
+
+def test_corrupt_frames_are_dropped():
+    def corrupt(run):
+        run.fault(FaultKind.CORRUPT, 16, duration_ns=15_000_000)
+
+    Injected("press", HOLD_CYCLE, corrupt, until=40).assert_counted("torn_frame")
+
+
+def test_a_frame_that_names_another_sync():
+    def shift(run):
+        run.fault(FaultKind.WRONG_DATA, 16, duration_ns=15_000_000, seed=4)
+
+    run = Injected("press", HOLD_CYCLE, shift, until=40)
+    run.assert_counted("sync_mismatch")
+    assert run.session.truth["force"].max() < 3.0
+
+
+def test_a_stale_sensor_makes_the_probe_retreat():
+    run = Injected("press", HOLD_CYCLE, lambda r: altered(r.nodes[16], 0x511, lambda _: None))
+    run.assert_within("sensor_stale").assert_drives_off()
+    assert "no tactile frame for 13 cycles" in str(run.error)
+    assert run.session.truth["force"][-1] == 0.0
+
+
+def test_a_drive_that_is_late_makes_all_of_them_hold():
+    """Four cycles without node 5: the others stand still meanwhile, then all go on."""
+    run = Injected("free", FREE_CYCLE, lambda r: r.fault(FaultKind.MUTE, 5, duration_ns=9_000_000), until=40)
+    assert run.error is None
+    targets = np.isfinite(run.session.cell.log.arrays()["q_target_rad"][:, 0])
+    held = np.flatnonzero(~targets[run.at : run.until]) + run.at
+    assert len(held) in (1, 2)
+    assert (held[0] - run.at) * run.limits.period_ns <= BY_KEY["drive_late"].within(run.limits)
+    assert any("node 5: no usable TPDO for 3 cycles: hold" in fault for fault in run.session.cell.faults)
+
+
+def test_a_wrong_position_is_not_believed():
+    def lie(run):
+        altered(run.nodes[2], 0x182, lambda d: d[:2] + pack("<i", unpack("<i", d[2:6])[0] + 60) + d[6:])
+
+    class Liar(Injected):
+        def after(self, measurement):
+            if measurement.cycle == self.at + 2:
+                self.nodes[2]._sent = type(self.nodes[2])._sent.__get__(self.nodes[2])
+
+    run = Liar("free", FREE_CYCLE, lie, until=40)
+    run.assert_counted("pdo_missed")
+    assert 2 <= run.session.cell.drives.implausible <= 3
+    q = run.session.cell.log.arrays()["q_rad"][run.at - 5 : run.at + 10, 1]
+    truth = run.session.truth["q"][run.at - 5 : run.at + 10, 1]
+    assert np.abs(q - truth).max() < 1e-3 < 60 / 7000, "sixty counts are 5 mrad"
+
+
+# the bus
+
+
+def test_error_frames_dropped_frames_and_a_wall_clock_that_is_set_are_noted():
+    def count(run):
+        run.session.cell._port.counters.error_frames += 3
+        run.session.cell._port.counters.overruns += 2
+        run.session.cell._port.counters.clock_steps += 1
+
+    run = Injected("free", FREE_CYCLE, count, until=10)
+    run.assert_counted("error_frames").assert_counted("frames_dropped").assert_counted("clock_step")
+    assert f"wall clock set: 1, the first in cycle {FREE_CYCLE + 1}" in run.session.cell.faults
+    assert any("bus error frames: 3" in fault for fault in run.session.cell.faults)
+    assert any("dropped by the kernel or the controller: 2" in fault for fault in run.session.cell.faults)
+
+
+class Passive(Injected):
+    """Error-passive for a while."""
+
+    for_cycles = 40
+
+    def after(self, measurement):
+        if measurement.cycle == self.at + self.for_cycles:
+            self.session.cell._port.state = ControllerState.ACTIVE
+
+
+def passive(run):
+    run.session.cell._port.state = ControllerState.PASSIVE
+
+
+def test_error_passive_holds_until_it_is_over():
+    run = Passive("free", FREE_CYCLE, passive, until=100)
+    assert run.error is None
+    targets = run.session.cell.log.arrays()["q_target_rad"]
+    moved = np.isfinite(targets[:, 0])
+    held = ~moved[run.at + 1 : run.at + run.for_cycles + 1]
+    assert held.all() and moved[run.at] and moved[run.at + run.for_cycles + 1 : run.until].all()
+    assert any("error-passive: hold" in fault for fault in run.session.cell.faults)
+
+
+def test_error_passive_for_long_makes_the_probe_retreat():
+    run = Injected("press", HOLD_CYCLE, passive, until=1500)
+    assert "error-passive for 1.0 s" in str(run.error)
+    run.assert_within("error_passive_long")
+    assert run.session.truth["force"][-1] == 0.0
+
+
+def test_bus_off():
+    def off(run):
+        run.session.cell._port.state = ControllerState.BUS_OFF
+
+    run = Injected("free", FREE_CYCLE, off)
+    run.assert_within("bus_off").assert_drives_off()
+    assert isinstance(run.error, InterfaceError) and "bus-off" in str(run.error)
+
+
+@pytest.mark.parametrize("back_after_ns", [None, 100_000_000])
+def test_the_interface_is_removed_and_the_drives_stop_by_themselves(back_after_ns):
+    def remove(run):
+        port = run.session.cell._port
+        bus, counters = run.session.lockstep, port.counters
+        gone_ns = run.now()
+
+        class Gone:
+            stamps_arrival, clock, channel, state = True, bus.clock, bus.channel, ControllerState.ACTIVE
+
+            def __init__(self):
+                self.counters = counters
+
+            def check(self):
+                if back_after_ns is None or bus.clock.now_ns() < gone_ns + back_after_ns:
+                    raise InterfaceError("can0: interface lost: Network is down")
+
+            def send_batch(self, frames, t_ns=None):
+                self.check()
+                port.send_batch(frames)
+
+            def drain(self):
+                self.check()
+                return port.drain()
+
+            def wait(self, until_ns):
+                self.check()
+                port.wait(until_ns)
+
+            def close(self):
+                port.close()
+
+        cell = run.session.cell
+        cell._port = cell.cycle._port = cell._network.port = Gone()
+
+    run = Injected("free", FREE_CYCLE, remove)
+    run.assert_within("interface").assert_drives_off()
+    assert isinstance(run.error, InterfaceError) and "interface lost" in str(run.error)
+    assert any("while stopping" in fault for fault in run.session.cell.faults) is (back_after_ns is None)
+
+
+# time
+
+
+class Late(Injected):
+    """Every cycle comes late from one on."""
+
+    def command(self, measurement, command):
+        if measurement.cycle >= self.at:
+            clock = self.session.lockstep.clock
+            clock.sleep_until_ns(clock.now_ns() + 8 * self.limits.period_ns // 5)
+        return command
+
+
+def test_the_overrun_budget_makes_the_probe_retreat():
+    run = Late("press", HOLD_CYCLE, lambda _: None, until=1000)
+    assert "of the last second's cycles came more than half a period late" in str(run.error)
+    run.assert_within("overruns")
+    assert run.session.truth["force"][-1] == 0.0
+
+
+# the touch and the arm
+
+
+def test_force_above_the_limit_makes_the_probe_retreat():
+    def squeeze(run):
+        run.task.set_target("target_force_n", 4.0)
+
+    run = Injected("press", HOLD_CYCLE, squeeze, limits={"force_max_n": 3.0})
+    assert "above the limit of 3.00 N" in str(run.error)
+    above = np.flatnonzero(run.session.truth["force"] > 1.03 * 3.0)[0]
+    retreat = np.flatnonzero(run.session.cell.log.arrays()["phase"] == Phase.RETREAT)[0]
+    assert 0 < (retreat - above) * run.limits.period_ns <= BY_KEY["force"].within(run.limits)
+    run.assert_drives_off()
+
+
+def vanish(run):
+    plant = run.session.world.plant
+    plant.config = replace(plant.config, object=None)
+    plant._solved = None
+
+
+def test_contact_lost_makes_the_probe_retreat():
+    run = Injected("press", HOLD_CYCLE, vanish)
+    run.assert_within("contact_lost")
+    assert str(run.error) == "contact lost"
+
+
+def test_contact_lost_in_a_scan_makes_it_search_and_then_retreat():
+    """The answer to the loss is the phase; the object is gone, so it retreats when it has searched as far as it may."""
+
+    class Searching(Injected):
+        noticed_ns = gone_ns = None
+
+        def command(self, measurement, command):
+            if self.noticed_ns is None and self.task.phase is Phase.REGAIN:
+                self.noticed_ns = self.now()
+            if self.gone_ns is None and self.task.losses and self.task.losses[0].searched > self.limits.regain:
+                self.gone_ns = self.now()
+            return command
+
+    run = Searching("cylinder", HOLD_CYCLE, vanish, until=1000, task={"clearance_mm": 0.8, "regain_mm": 1.0})
+    limit = BY_KEY["contact_to_regain"].within(run.limits)
+    assert 0 < run.noticed_ns - run.injected_ns <= limit
+    limit = BY_KEY["contact_not_regained"].within(run.limits)
+    assert 0 <= run.answered_ns - run.gone_ns <= limit
+    assert str(run.error) == "contact lost, and not found again within 1.0 mm"
+    run.assert_drives_off()
+
+
+def test_contact_lost_in_a_scan_that_must_not_search():
+    run = Injected("cylinder", HOLD_CYCLE, vanish, task={"clearance_mm": 0.8, "regain_mm": 0.0})
+    run.assert_within("contact_lost")
+    assert str(run.error) == "contact lost"
+
+
+def test_a_saturated_array_makes_the_probe_retreat():
+    class Saturated(Injected):
+        saturated_ns = None  # since when without a break
+
+        def command(self, measurement, command):
+            if measurement.tactile is not None and self.answered_ns is None:
+                first = self.saturated_ns or self.now()
+                self.saturated_ns = first if self.task.sensing.patch.saturated else None
+            return command
+
+    stiff = {"stiffness_n_m3": 1.4e10}  # 0.1 MN/m: a few taxels carry all of it
+    run = Saturated("press", FREE_CYCLE, lambda _: None, until=1000, plant=stiff, servo={"surface_height_hz": 2.0})
+    assert "the array is saturated and no stiffness was felt" in str(run.error)
+    assert 0 < run.answered_ns - run.saturated_ns <= BY_KEY["force_hidden"].within(run.limits)
+    assert run.session.truth["force"][-1] == 0.0
+
+
+def own_target(change):
+    class Own(Injected):
+        def command(self, measurement, command):
+            if measurement.cycle < self.at:
+                return command
+            return Command(q_target=change(measurement.q))
+
+    return Own
+
+
+def test_an_own_controller_cannot_leave_the_joints_range():
+    run = own_target(lambda q: q + np.array([0, 0, 0, 0, 3.0, 0]))("free", FREE_CYCLE, lambda _: None, own=True)
+    run.assert_within("joint_stop").assert_drives_off()
+    assert "joint 5 at" in str(run.error) and "its stop" in str(run.error)
+    q = run.session.truth["q"]
+    assert np.abs(q[-1] - q[FREE_CYCLE - 20]).max() < 1e-3
+
+
+@pytest.mark.parametrize("target", [np.full(6, np.nan), np.zeros(5), "home"])
+def test_an_own_controllers_target_that_is_none(target):
+    run = own_target(lambda q: target)("free", FREE_CYCLE, lambda _: None, own=True)
+    run.assert_within("joint_stop").assert_drives_off()
+    assert re.search("expected 6 (finite )?angles", str(run.error))
+
+
+def test_an_own_controllers_jump_is_made_at_the_joints_speed():
+    run = own_target(lambda q: np.radians([90, 65, 15, 20, 100, 0.0]))("free", FREE_CYCLE, lambda _: None, own=True)
+    run.assert_counted("target_speed")
+    q = run.session.truth["q"]
+    speeds = np.abs(np.diff(q[:, 3])) / 2.5e-3
+    assert np.degrees(speeds.max()) < 1.2 * 675
+    assert np.degrees(q[-1, 3]) == pytest.approx(20, abs=1.0)
+
+
+def test_the_workspace_ends_a_press():
+    run = Injected("press", 5000, lambda _: None, limits={"workspace_min_mm": (-500.0, -500.0, 375.0)})
+    assert "the probe's tip at z =" in str(run.error) and "workspace ends at 375.0 mm" in str(run.error)
+    assert run.session.truth["force"].max() == 0.0
+
+
+def test_the_workspace_ends_an_own_controllers_motion():
+    scene = canprobe.load_scene("free")
+    T_base_tip_of = JointGuard(canprobe.plan(scene)).T_base_tip
+    start = 1e3 * T_base_tip_of(canprobe.plan(scene).setup.arm.q_start)[:3, 3]
+    up = own_target(lambda q: q + np.array([0, 0.02, 0, 0, 0, 0]))
+    run = up("free", FREE_CYCLE, lambda _: None, own=True, limits={"workspace_max_mm": tuple(start + 15.0)})
+    assert isinstance(run.error, SafetyStop) and "workspace ends at" in str(run.error)
+    tips = np.array([T_base_tip_of(q)[:3, 3] for q in run.session.truth["q"][::5]])
+    assert (1e3 * tips < start + 15.0 + 3.0).all()
+    run.assert_drives_off()
+
+
+def test_a_statusword_of_no_state_is_told_with_its_drive_and_the_others_are_stopped_in_order():
+    run = Injected("free", FREE_CYCLE, lambda r: altered(r.nodes[3], 0x183, lambda d: b"\x01\x06" + d[2:]))
+    run.assert_within("drive_fault").assert_drives_off()
+    told = "node 3: (joint 3) left operation enabled: in no CiA 402 state (statusword 0x0601)"
+    assert str(run.error) == told
+    assert run.session.cell.faults == ["while stopping: node 3 did not confirm that it is disabled"]
+
+
+def test_a_drive_that_is_never_in_a_state_is_not_enabled():
+    session = Session(canprobe.load_scene("free"))
+
+    participants = session.world.participants
+    participants[2] = FaultyNode(participants[2])
+    altered(participants[2], 0x183, lambda d: b"\x01\x06" + d[2:])
+    told = r"node 3: \(joint 3\) is in no CiA 402 state \(statusword 0x0601\) 2 s after the command to enable operation"
+    with pytest.raises(NodeError, match=told), session:
+        session.run(lambda _: Command())
+    assert {node.state for node in session.world.nodes} == {NmtState.PRE_OPERATIONAL}
+
+
+def test_a_drive_that_keeps_telling_a_wrong_position_is_lost():
+    change = lambda d: d[:2] + pack("<i", unpack("<i", d[2:6])[0] + 2000) + d[6:]  # noqa: E731
+    run = Injected("free", FREE_CYCLE, lambda r: altered(r.nodes[2], 0x182, change))
+    run.assert_within("drive_silent").assert_drives_off()
+    assert "node 2: lost: no usable TPDO for 6 cycles" in str(run.error)
+    assert np.abs(np.diff(run.session.truth["q"], axis=0)).max() < 0.01
+
+
+def test_a_measured_jump_that_no_joint_can_make():
+    """Where the guard of the positions is off, as it is until the drives are enabled."""
+
+    class Unguarded(Injected):
+        def after(self, measurement):
+            for track in self.session.cell.drives._tracks:
+                track._asked = 1e9
+
+    change = lambda d: d[:2] + pack("<i", unpack("<i", d[2:6])[0] + 2000) + d[6:]  # noqa: E731
+    run = Unguarded("free", FREE_CYCLE, lambda r: altered(r.nodes[2], 0x182, change))
+    run.assert_within("joint_speed").assert_drives_off()
+    assert "joint 2 reports a motion of" in str(run.error)
+
+
+def test_an_estimator_that_diverges_starts_afresh():
+    def diverge(run):
+        estimator = run.task.shape._estimator
+        original, done = estimator.estimate, []
+
+        def once():
+            estimate = original()
+            if not done and estimate is not None and estimate.observed.all():
+                done.append(True)
+                return replace(estimate, kappa=np.array([5e3, 0.0]))
+            return estimate
+
+        estimator.estimate = once
+
+    run = Injected("cylinder", 620, diverge, until=200, shape={"also": ()})
+    assert run.error is None
+    assert run.session.cell.supervisor.counts["estimator"] == run.task.shape.restarts == 1
+    assert any("estimator diverges: 1" in fault for fault in run.session.cell.faults)
+    assert max(float(np.abs(r.estimate.kappa[0])) for r in run.task.shape.records if r.estimate.observed[0]) < 100
+
+
+def test_an_own_controller_is_stopped_at_the_force_limit():
+    class Pressing(Injected):
+        def command(self, measurement, command):
+            return self.task.step(measurement) if measurement.cycle < self.at else Command()
+
+    run = Pressing("press", 5000, lambda _: None, own=True, limits={"force_max_n": 1.0})
+    assert "above the limit of 1.00 N" in str(run.error)
+    run.assert_drives_off()
+
+
+# outside
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ZeroDivisionError])
+def test_an_interrupt_or_an_exception(error):
+    def raise_it(run):
+        raise error
+
+    run = Injected("free", FREE_CYCLE, raise_it)
+    run.assert_within("interrupt").assert_drives_off()
+    assert isinstance(run.error, error)
+
+
+@pytest.mark.parametrize(("hung_ns", "waits"), [(20_000_000, True), (1_100_000_000, False)])
+def test_an_interrupt_does_not_wait_for_a_controller_that_hangs(hung_ns, waits):
+    reached = []
+
+    def hang(run):
+        clock = run.session.lockstep.clock
+        clock.sleep_until_ns(clock.now_ns() + hung_ns)
+        signal.raise_signal(signal.SIGINT)
+        reached.append(True)
+
+    run = Injected("free", FREE_CYCLE, hang, arm={"missed_syncs": 40})
+    run.assert_drives_off()
+    assert isinstance(run.error, KeyboardInterrupt) and bool(reached) is waits
+
+
+def test_the_drives_of_a_dead_master_stop_by_themselves():
+    seen = {}
+
+    def die(run):
+        clock, start = run.session.lockstep.clock, run.now()
+        limit = BY_KEY["master_dead"].within(run.limits)
+        clock.sleep_until_ns(start + limit - run.limits.period_ns)
+        seen["before"] = [state_of(run.nodes[i].node.dictionary.number(0x6041)) for i in range(1, 7)]
+        clock.sleep_until_ns(start + limit + 1)
+        seen["after"] = [state_of(run.nodes[i].node.dictionary.number(0x6041)) for i in range(1, 7)]
+
+    run = Injected("free", FREE_CYCLE, die)
+    assert seen["before"] == [DriveState.OPERATION_ENABLED] * 6
+    assert DriveState.OPERATION_ENABLED not in seen["after"]
+    assert isinstance(run.error, NodeError)
+
+
+def test_a_full_disk(tmp_path):
+    class OnDisk(Injected):
+        def _run(self):
+            self.session.out = tmp_path
+            super()._run()
+
+    def fill(run):
+        log = run.session._candump
+
+        class Full:
+            closed = False
+
+            def __init__(self, file):
+                self.file, self.room = file, 3000
+
+            def write(self, data):
+                import errno
+
+                if self.room <= 0:
+                    raise OSError(errno.ENOSPC, "No space left on device")
+                part = data[: self.room]
+                self.room -= len(part)
+                return self.file.write(part)
+
+            def truncate(self, size):
+                return self.file.truncate(size)
+
+            def close(self):
+                self.file.close()
+
+        log.flush()
+        log._file = Full(log._file)
+
+        def flushed_each_time(write=log.write):
+            def written(can_id, data, t_ns):
+                write(can_id, data, t_ns)
+                log.flush()
+
+            return written
+
+        run.session.lockstep.recorder = flushed_each_time()
+
+    run = OnDisk("press", HOLD_CYCLE, fill)
+    assert str(run.error) == f"{tmp_path}/bus.log: cannot be written: No space left on device"
+    assert isinstance(run.error, ResultsError)  # after the task has let go
+    run.assert_drives_off()
+    assert run.session.truth["force"][-1] == 0.0
+    text = (tmp_path / "bus.log").read_text()
+    assert text.endswith("\n") and len(list(canprobe_lines(tmp_path / "bus.log"))) > 1000
+
+
+def canprobe_lines(path):
+    from canprobe.fieldbus.bus.candump import read_candump
+
+    return read_candump(path)
+
+
+def test_every_row_is_tested_here():
+    source = Path(__file__).read_text(encoding="utf-8")
+    for name in ("test_preload.py", "test_off_pad.py"):
+        source += Path(__file__).with_name(name).read_text(encoding="utf-8")
+    special = {"error_passive": "error-passive: hold", "error_passive_long": "error-passive for 1.0 s"}
+    special |= {"overruns": "overrun_budget", "estimator": 'counts["estimator"]', "force": 'BY_KEY["force"]'}
+    special |= {key: f'BY_KEY["{key}"]' for key in ("contact_to_regain", "contact_not_regained", "force_hidden")}
+    special |= {
+        "master_dead": 'BY_KEY["master_dead"]',
+        "log": "test_a_full_disk",
+        "preload": 'BY_KEY["preload"]',
+        "off_pad": 'BY_KEY["off_pad"]',
+        "drive_late": 'BY_KEY["drive_late"]',
+    }
+    for condition in CONDITIONS:
+        assert special.get(condition.key, f'("{condition.key}")') in source, condition.key
+    assert {c.reaction for c in CONDITIONS} == set(Reaction)

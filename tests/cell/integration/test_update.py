@@ -1,0 +1,83 @@
+"""A controller's `update`: called when the commands of its step are out, and guarded as the step is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from injected import HOLD_CYCLE, Injected
+from wrapped import Wrapped
+
+import canprobe
+from canprobe.cell.master.controller import Command, Controller
+from canprobe.cell.session.session import Session
+from canprobe.cell.tasks.from_plan import make_task
+
+
+class Working(Controller):
+    """Holds the joints; notes when it is called, and how many frames had been sent by then."""
+
+    def __init__(self, session):
+        self._session, self.calls = session, []
+
+    def _note(self, what):
+        cell = self._session.cell
+        self.calls.append((what, cell.cycle.number, cell._port.counters.sent))
+
+    def step(self, measurement):
+        self._note("step")
+        return Command(done=len(self.calls) >= 40)
+
+    def update(self):
+        self._note("update")
+
+
+def test_it_is_called_once_a_step_when_the_rpdos_are_out():
+    session = Session(canprobe.load_scene("free"))
+    controller = Working(session)
+    with session:
+        session.run(controller)
+    calls = controller.calls
+    assert [what for what, _, _ in calls] == ["step", "update"] * (len(calls) // 2)
+    for (_, asked, before), (_, worked, after) in zip(calls[::2], calls[1::2], strict=True):
+        assert worked == asked
+        assert after - before in (6, 7), "six RPDOs, and now and then the master's heartbeat"
+
+
+def test_what_it_raises_ends_the_run_off_the_object():
+    class Failing(Injected):
+        def _run(self):
+            task, failing = self.task, self
+
+            class Late(Wrapped):
+                def step(self, measurement):
+                    return failing.step(measurement)
+
+                def update(self):
+                    if failing.session.cell.cycle.number == failing.at + 1:
+                        raise ZeroDivisionError("in update")
+
+            with self.session, pytest.raises(ZeroDivisionError, match="in update"):
+                self.session.run(Late(task), progress=self._progress)
+
+    run = Failing("press", HOLD_CYCLE, lambda _: None)
+    run.assert_drives_off()
+    assert run.session.truth["force"][run.at] == pytest.approx(2.0, abs=0.2)
+    assert run.session.truth["force"][-1] == 0.0
+
+
+def scanned(wrap):
+    """Its answers and targets, in a short scan."""
+    session = Session(canprobe.load_scene("cylinder", {"task.duration_s": 0.8}))
+    with session:
+        task = make_task(session.plan)
+        session.run(wrap(task))
+    return task.shape.records, session.cell.log.arrays()["q_target_rad"]
+
+
+def test_a_task_in_a_controller_that_never_updates_it_moves_and_answers_alike():
+    """Whoever wraps a task's `step` alone has its estimates none the less, and the same."""
+    (answers, targets), (wrapped, wrapped_targets) = scanned(lambda task: task), scanned(lambda task: task.step)
+    assert len(answers) > 5
+    assert [a.told_s for a in answers] == [w.told_s for w in wrapped]
+    np.testing.assert_array_equal([a.estimate.K for a in answers], [w.estimate.K for w in wrapped])
+    np.testing.assert_array_equal(targets, wrapped_targets)

@@ -1,0 +1,660 @@
+"""Bring-up in lockstep: side by side, with retries, kept configurations, and a report of what failed where."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scenes import with_joints, without_torque
+from undrawn import undrawn_run
+
+import canprobe
+from canprobe.cell.emulated.world import make_world
+from canprobe.cell.master.controller import Command
+from canprobe.cell.planning.configuration import make_setups
+from canprobe.cell.session.session import Session
+from canprobe.errors import BusError, InterfaceError, NodeError
+from canprobe.fieldbus.bus.sdo import upload
+from canprobe.fieldbus.bus.virtual.lockstep import Participant
+from canprobe.fieldbus.eds.packaged import eds_path
+from canprobe.fieldbus.node.dictionary import Abort, SdoAbort
+from canprobe.fieldbus.node.faults import Fault, FaultKind, FaultyNode
+
+MS = 1_000_000
+
+
+def open_session(tmp_path, *, faults=(), change=None, nodes=None, beside=(), scene="free", rate_hz=400.0, **bring_up):
+    """A session in lockstep; `beside` are participants besides its nodes."""
+    loaded = canprobe.load_scene(scene)
+    loaded = replace(loaded, cycle=replace(loaded.cycle, rate_hz=rate_hz))
+    said = []
+    session = Session(replace(loaded, bring_up=replace(loaded.bring_up, **bring_up)), tmp_path, say=said.append)
+    session.said = said
+    world = session.world
+    for node in world.nodes:
+        if nodes is not None:
+            if node.node_id in nodes:
+                node.store.saved = nodes[node.node_id]
+            nodes[node.node_id] = node
+        if change is not None:
+            change(node)
+    world.participants[:] = [*beside, *(FaultyNode(node, faults) for node in world.nodes), world.recorder]
+    return session
+
+
+def done_to(session):
+    """What bring-up says of each node, in their order."""
+    return [line.split(") ", 1)[1] for line in session.said if re.match(r"node \d+: \(.*\) configur", line)]
+
+
+def frames(tmp_path):
+    from canprobe.fieldbus.bus.candump import read_candump
+
+    return [(t, can_id, data) for t, _, can_id, data in read_candump(tmp_path / "bus.log")]
+
+
+def writes_to(log, node_id):
+    return [(d[1] | d[2] << 8, d[3]) for _, i, d in log if i == 0x600 + node_id and d[0] >> 5 == 1]
+
+
+class Somebody(Participant):
+    """Does something 100 ms after the cell's port was opened, while it listens; or at a frame of the cell's."""
+
+    next_deadline_ns = None
+
+    def __init__(self, act, at=None):
+        self.next_deadline_ns = 100 * MS if at is None else None
+        self._act, self._at = act, at
+
+    def receive(self, can_id, data, t_ns):
+        if self._at is not None and self._at(can_id, data):
+            self._at = None
+            return self._act()
+        return []
+
+    def advance(self, t_ns):
+        self.next_deadline_ns = None
+        return self._act()
+
+
+def sending(can_id, data):
+    return lambda: [(can_id, bytes.fromhex(data))]
+
+
+def raising(error):
+    def act():
+        raise error
+
+    return act
+
+
+def is_reset(can_id, data):
+    return can_id == 0 and data[0] == 0x81
+
+
+def is_write(can_id, data):
+    return can_id == 0x603 and data[0] >> 5 == 1
+
+
+REFUSED = {
+    "a heartbeat of our own id": (sending(0x77F, "05"), BusError),
+    "SYNC": (sending(0x080, ""), BusError),
+    "an NMT command": (sending(0x000, "0103"), BusError),
+    "Ctrl-C": (raising(KeyboardInterrupt()), KeyboardInterrupt),
+    "the interface is lost": (raising(InterfaceError("can0: lost")), InterfaceError),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_did_not_take_over_the_nodes_sends_nothing(tmp_path, what):
+    act, kind = REFUSED[what]
+    with pytest.raises(kind) as refused:
+        open_session(tmp_path, beside=[Somebody(act)]).__enter__()
+    assert kind is not BusError or str(refused.value).endswith("another master is at work here; stop it first")
+    sent = [frame for frame in frames(tmp_path) if frame[0] < 100 * MS or frame[1] not in (0x77F, 0x080, 0x000)]
+    assert sorted(i for _, i, _ in sent) == [0x700 + n for n in range(1, 7)], "the nodes' boot-ups and nothing else"
+    assert len(frames(tmp_path)) - len(sent) == (kind is BusError)
+
+
+def refuse_a_write(node):
+    if node.node_id == 3:
+        node.dictionary.entries.pop(0x606000)
+
+
+FAILED = {
+    "Ctrl-C at the reset": ({"beside": [Somebody(raising(KeyboardInterrupt()), is_reset)]}, KeyboardInterrupt),
+    "Ctrl-C while they are configured": ({"beside": [Somebody(raising(KeyboardInterrupt()), is_write)]}, BaseException),
+    "SYNC after the reset": ({"beside": [Somebody(sending(0x080, ""), is_write)]}, BusError),
+    "a value is refused": ({"change": refuse_a_write}, NodeError),
+}
+
+
+@pytest.mark.parametrize("what", FAILED)
+def test_what_took_over_the_nodes_leaves_them_pre_operational(tmp_path, what):
+    """Another device, a drive that does not start and a pressed probe: see below, and `test_preload`."""
+    options, kind = FAILED[what]
+    with pytest.raises(kind):
+        open_session(tmp_path, **options).__enter__()
+    assert_left_pre_operational(tmp_path)
+
+
+def assert_left_pre_operational(tmp_path, before=(0x81,)):
+    """The last that each node was told; and what they were told before."""
+    commands = [d for _, i, d in frames(tmp_path) if i == 0]
+    assert commands[-6:] == [bytes((0x80, n)) for n in range(1, 7)]
+    assert {d[0] for d in commands[:-6]} == set(before)
+
+
+def test_the_nodes_are_configured_side_by_side(tmp_path):
+    with open_session(tmp_path) as session:
+        assert done_to(session) == ["configured, software 1.0"] * 6
+    asked = [i - 0x600 for _, i, _ in frames(tmp_path) if 0x600 < i < 0x680]
+    for part in range(1, 6):
+        so_far = asked[: len(asked) * part // 6]
+        counts = [so_far.count(node_id) for node_id in range(1, 7)]
+        assert max(counts) - min(counts) <= 2
+
+
+def test_a_lost_answer_is_asked_for_again(tmp_path):
+    lost = Fault(FaultKind.DROP, 3, 300 * MS, 300 * MS)
+    with open_session(tmp_path, faults=[lost]) as session:
+        done = done_to(session)
+    assert done.pop(2) == "configured, software 1.0, 1 requests repeated"
+    assert done == ["configured, software 1.0"] * 5
+
+
+def test_a_node_that_does_not_answer_is_named_with_the_entry(tmp_path):
+    mute = Fault(FaultKind.DROP, 3, 300 * MS, 9000 * MS)
+    with pytest.raises(NodeError, match=r"node 3: \(joint 3\) read of 1018h:01 failed: No SDO response") as failed:
+        open_session(tmp_path, faults=[replace(mute, incoming=True)]).__enter__()
+    assert failed.value.node_id == 3
+    times = [t for t, i, d in frames(tmp_path) if i == 0x603 and d[0] == 0x40]
+    assert [b - a for a, b in pairwise(times)] == [pytest.approx(500 * MS, rel=0.01)] * 2, "two retries"
+    others = [t for t, i, _ in frames(tmp_path) if i == 0x601]
+    assert len([t for t in others if t < times[1]]) > 20, "the others did not wait for node 3"
+
+
+def test_all_that_failed_is_told(tmp_path):
+    def refuse(node):
+        if node.node_id in (2, 5):
+            node.dictionary.entries.pop(0x606000)
+
+    with pytest.raises(NodeError) as failed:
+        open_session(tmp_path, change=refuse).__enter__()
+    text = str(failed.value)
+    assert text.startswith("node 2: (joint 2) write of 6060h:00 = ")
+    assert "; node 5: (joint 5) write of 6060h:00 = " in text and text.count("failed: Code 0x06090011") == 2
+
+
+def forgetting(index, value):
+    """For `change`: node 4 holds another value than is written to an object."""
+
+    def forget(node):
+        if node.node_id == 4:
+            node.dictionary.on_write(index, lambda sub, _: node.dictionary.put(index, sub, value))
+
+    return forget
+
+
+def test_a_required_value_that_does_not_stay_is_told(tmp_path):
+    with pytest.raises(NodeError, match=r"node 4: \(joint 4\) 1017h:00 reads back 0x7 after 0x64 was written"):
+        open_session(tmp_path, change=forgetting(0x1017, 7)).__enter__()
+
+
+def test_a_wished_value_that_the_device_refuses_or_changes_is_reported_and_left(tmp_path):
+    def change(node):
+        forgetting(0x6066, 7)(node)
+        if node.node_id == 2:
+            node.dictionary.entries.pop(0x101601)
+
+    with open_session(tmp_path, change=change) as session:
+        assert done_to(session) == ["configured, software 1.0"] * 6
+    assert session.cell.faults == []
+    remarks = [line for line in session.said if "left as the device has it" in line]
+    assert remarks == [
+        "node 2: (joint 2) write of 1016h:01 = 0x7f00fa failed: Code 0x06090011, Subindex does not exist: left as"
+        " the device has it (the node notices a dead master): the device will not notice a dead master",
+        "node 4: (joint 4) 6066h:00 reads back 0x7 after 0x32 was written: left as the device has it (following error"
+        " time-out): a drive that lags is given as long as the device has it",
+    ]
+
+
+def test_another_expression_of_the_interpolation_time_is_tried(tmp_path):
+    def refuse_tenths(node):
+        if node.node_id == 5:
+            node.dictionary.set_default(0x60C2, 2, -3)
+            node.dictionary.on_check(0x60C2, refuse)
+
+    def refuse(subindex, value):
+        if subindex == 2 and value == -4:
+            raise SdoAbort(Abort.VALUE)
+
+    nodes = {}
+    with open_session(tmp_path, change=refuse_tenths, nodes=nodes) as session:
+        held = {n: tuple(node.dictionary.number(0x60C2, sub) for sub in (1, 2)) for n, node in nodes.items()}
+    assert held == {n: (25, -4) if n != 5 else (250, -5) for n in range(1, 7)}
+    (remark,) = [line for line in session.said if "means the same" in line]
+    assert remark.startswith("node 5: (joint 5) takes 60C2h:01 = 250, 60C2h:02 = -5")
+
+
+@pytest.mark.parametrize("refuses", [True, False])
+def test_bits_29_and_30_of_a_cob_id_stay_as_the_device_has_them(tmp_path, refuses):
+    """It refuses to clear bit 30, or holds it whatever is written."""
+    rtr_off = 1 << 30
+
+    def keep(node):
+        if node.node_id != 3:
+            return
+        for index in range(0x1800, 0x1804):
+            node.dictionary.set_default(index, 1, node.dictionary.number(index, 1) | rtr_off)
+            if refuses:
+                node.dictionary.on_check(index, refuse)
+            else:
+                node.dictionary.on_write(index, lambda s, v, i=index: node.dictionary.put(i, s, v | rtr_off * (s == 1)))
+
+    def refuse(subindex, value):
+        if subindex == 1 and not value & rtr_off:
+            raise SdoAbort(Abort.VALUE)
+
+    nodes = {}
+    with open_session(tmp_path, change=keep, nodes=nodes) as session:
+        assert done_to(session) == ["configured, software 1.0"] * 6
+        assert nodes[3].dictionary.number(0x1800, 1) == 0x4000_0183
+
+
+@pytest.mark.parametrize(("revision", "taken"), [(0x1_0004, True), (0x2_0000, False), (0xFFFF, False)])
+def test_a_revision_of_the_same_major_number_is_taken(tmp_path, revision, taken):
+    def newer(node):
+        if node.node_id == 3:
+            node.dictionary.set_default(0x1018, 3, revision)
+
+    session = open_session(tmp_path, change=newer)
+    if taken:
+        with session:
+            (remark,) = [line for line in session.said if "revision" in line]
+        assert remark == (
+            "node 3: (joint 3) has revision 00010004h, puma260_joint.eds describes 00010000h: the same major revision,"
+            " taken"
+        )
+    else:
+        with pytest.raises(NodeError, match=rf"1018h:03 revision number expected 0x10000, got {revision:#x}"):
+            session.__enter__()
+
+
+def test_a_drive_in_another_mode_is_not_enabled(tmp_path):
+    def stay(node):
+        if node.node_id == 2:
+            node.dictionary.on_read(0x6061, lambda sub: node.dictionary.put(0x6061, 0, 1))
+
+    told = r"^node 2: \(joint 2\) is in mode 1 \(6061h\) after 6060h = 8 was written"
+    with open_session(tmp_path, change=stay, enable_s=0.3) as session, pytest.raises(NodeError, match=told):
+        session.cell.run(lambda _: Command())
+    words = {d[:2] for _, i, d in frames(tmp_path) if 0x201 <= i <= 0x206}
+    assert words == {bytes(2)}, "no drive was switched on"
+
+
+def test_a_kept_configuration_is_not_written_again(tmp_path):
+    nodes = {}
+    logs, kept = [], []
+    for run in range(2):
+        with open_session(tmp_path, nodes=nodes, scene="press", store=True) as session:
+            kept.append(["kept" in done for done in done_to(session)])
+        nodes = {node_id: node.store.saved for node_id, node in nodes.items()}
+        logs.append(frames(tmp_path))
+        assert session.cell.faults == [], run
+    assert kept == [[False] * 7, [True] * 7]
+    assert len(writes_to(logs[0], 2)) > 25 and writes_to(logs[1], 2) == [(0x1016, 1)]  # the heartbeat consumer's end
+    assert writes_to(logs[1], 16) == [(0x2003, 0), (0x1016, 1)]  # and the tare, which is a command
+
+
+def test_another_scene_is_configured_anew_and_so_is_a_node_that_somebody_changed(tmp_path):
+    nodes = {}
+    with open_session(tmp_path, nodes=nodes, store=True):
+        pass
+    saved = {node_id: node.store.saved for node_id, node in nodes.items()}
+    nodes = dict(saved)
+    with open_session(tmp_path, nodes=nodes, rate_hz=200.0, store=True) as session:
+        assert not any("kept" in done for done in done_to(session))
+    saved[3] = {**saved[3], 0x102001: 0}
+    with open_session(tmp_path, nodes=dict(saved), store=True) as session:
+        assert ["kept" in done for done in done_to(session)] == [True, True, False, True, True, True]
+
+
+def test_any_write_over_sdo_takes_the_date_back():
+    nodes = {}
+    session = open_session(None, nodes=nodes, store=True)
+    with session:
+        drive = nodes[1]
+        date = make_setups(session.plan)[0].configuration_date
+        assert {sub: drive.dictionary.number(0x1020, sub) for sub in (1, 2)} == date and min(date.values()) > 0
+        drive.receive(0x601, bytes.fromhex("2b6660001e000000"), drive.core.now_ns)
+        assert [drive.dictionary.number(0x1020, sub) for sub in (1, 2)] == [0, 0]
+
+
+def test_a_node_that_boots_late_is_reset_again(tmp_path):
+    dark = Fault(FaultKind.FREEZE, 2, 200 * MS, 400 * MS)
+    with open_session(tmp_path, faults=[dark], boot_up_s=0.2, retries=3):
+        pass
+    resets = [d for _, i, d in frames(tmp_path) if i == 0 and d[0] == 0x81]
+    assert [d[1] for d in resets].count(2) >= 2 and [d[1] for d in resets].count(1) == 1
+
+
+def deaf_to_starts(number):
+    """For `change`: node 3 does not hear its first NMT starts."""
+
+    def deafen(node):
+        if node.node_id != 3:
+            return
+        hear, left = node.receive, [number]
+
+        def receive(can_id, data, t_ns):
+            if can_id == 0 and data == b"\x01\x03" and left[0]:
+                left[0] -= 1
+                return []
+            return hear(can_id, data, t_ns)
+
+        node.receive = receive
+
+    return deafen
+
+
+def test_a_lost_start_is_sent_again(tmp_path):
+    with open_session(tmp_path, change=deaf_to_starts(2)):
+        pass
+    starts = [d[1] for _, i, d in frames(tmp_path) if i == 0 and d[0] == 0x01]
+    assert starts == [1, 2, 3, 4, 5, 6, 3, 3]
+
+
+def test_a_node_that_does_not_start_is_named(tmp_path):
+    told = r"node 3: \(joint 3\) is not operational 1 s after NMT start, 3 times: PRE_OPERATIONAL$"
+    with pytest.raises(NodeError, match=told):
+        open_session(tmp_path, change=deaf_to_starts(9)).__enter__()
+
+
+def answering_in_other_lengths(node):
+    """For `change`: each node answers SDO uploads in its own way, all of them legal or common."""
+    hear, rest = node.receive, []
+    ways = {1: "unsized", 2: "zeros", 3: "sign", 4: "segments"}
+
+    def receive(can_id, data, t_ns):
+        frames = [(i, changed(d) if i == 0x580 + node.node_id else d) for i, d in hear(can_id, data, t_ns)]
+        if can_id == 0x600 + node.node_id and data[0] == 0x60 and rest:
+            frames[:] = [(0x580 + node.node_id, bytes([7]) + rest.pop() + bytes(3))]  # the last one, 4 of 7 bytes
+        return frames
+
+    def changed(answer):
+        if answer[0] & 0xE3 != 0x43:  # expedited, with its size
+            return answer
+        value, way = answer[4 : 8 - (answer[0] >> 2 & 3)], ways.get(node.node_id)
+        if way == "unsized":
+            return b"\x42" + answer[1:4] + value.ljust(4, b"\x55")
+        longer = value.ljust(4, b"\xff" if way == "sign" and answer[1:4] == b"\xc2\x60\x02" else b"\0")
+        if way == "segments":
+            rest[:] = [longer]
+            return b"\x41" + answer[1:4] + bytes((4, 0, 0, 0))
+        return b"\x43" + answer[1:4] + longer if way else answer
+
+    node.receive = receive
+
+
+def test_an_answer_of_another_length_is_read_in_the_objects_own(tmp_path):
+    """CiA 301, SDO upload initiate: an expedited answer need not tell its size. 60C2h:02 is -4, an INTEGER8."""
+    with open_session(tmp_path, change=answering_in_other_lengths):
+        pass
+    answers = {d[0] for _, i, d in frames(tmp_path) if 0x581 <= i <= 0x584 and d[1:4] == b"\xc2\x60\x02"}
+    assert answers == {0x60, 0x42, 0x43, 0x41}
+
+
+@pytest.mark.parametrize(
+    ("answer", "got"),
+    [
+        ("43 c2 60 01 19 01 00 00", "expected 1 byte, got 4: 19 01 00 00"),
+        ("4b c2 60 01 19 ff 00 00", "expected 1 byte, got 2: 19 ff"),
+        ("43 66 60 00 32 00 01 00", "expected 2 bytes, got 4: 32 00 01 00"),
+        ("4f 66 60 00 32 00 00 00", "expected 2 bytes, got 1: 32"),
+    ],
+)
+def test_a_value_that_does_not_fit_its_object_is_named(tmp_path, answer, got):
+    answer = bytes.fromhex(answer)
+
+    def change(node):
+        hear = node.receive
+        node.receive = lambda can_id, data, t_ns: [
+            (i, answer if i == 0x583 and d[1:4] == answer[1:4] and d[0] & 0xE0 == 0x40 else d)
+            for i, d in hear(can_id, data, t_ns)
+        ]
+
+    entry = f"{answer[2]:02X}{answer[1]:02X}h:{answer[3]:02X}"
+    with pytest.raises(NodeError, match=rf"^node 3: \(joint 3\) read of {entry} failed: {got}$"):
+        open_session(tmp_path, change=change).__enter__()
+
+
+def silent(node):
+    if node.node_id == 3:
+        node.receive = lambda can_id, data, t_ns: []
+
+
+def other_device(node):
+    if node.node_id == 3:
+        node.dictionary.set_default(0x1018, 2, 7)
+
+
+@pytest.mark.parametrize("change", [deaf_to_starts(9), silent, other_device, refuse_a_write])
+def test_a_failure_ends_with_the_last_emcy_of_the_node(tmp_path, change):
+    """Whatever it fails in; the EMCY came before anybody had spoken to it."""
+    reports = Somebody(sending(0x083, "0050810000000000"))
+    with pytest.raises(NodeError, match=r"^node 3: .*; node 3: EMCY 5000h, device hardware$"):
+        open_session(tmp_path, beside=[reports], change=change, boot_up_s=0.2).__enter__()
+
+
+def test_what_a_node_sent_before_we_listened_is_in_its_error_history(tmp_path):
+    def remember(node):
+        deaf_to_starts(9)(node)
+        if node.node_id == 3:
+            node.dictionary.on_read(0x1003, lambda _: node.dictionary.put(0x1003, 1, 0x12345000))
+
+    told = r"PRE_OPERATIONAL; its error history \(1003h\) begins with 5000h, device hardware$"
+    with pytest.raises(NodeError, match=told):
+        open_session(tmp_path, change=remember).__enter__()
+
+
+def late(by_s, **bring_up):
+    """Each answer of node 3 comes late."""
+    fault = Fault(FaultKind.DELAY, 3, 0, 9000 * MS, amount_ns=round(by_s * 1e9))
+    return {"faults": [fault], "sdo_s": 0.05, "retries": 2, **bring_up}
+
+
+def test_late_answers_are_taken_for_what_they_answer(tmp_path):
+    """A write is read back from the same entry: a late answer to the one is none to the other."""
+    with open_session(tmp_path, **late(0.06)) as session:
+        done = done_to(session)
+    assert int(re.fullmatch(r"configured, software 1.0, (\d+) requests repeated", done[2])[1]) > 20
+    assert "repeated" not in done[1]
+
+
+def test_a_late_answer_is_no_segment():
+    talk = upload(0x100A, 0)
+    begin, text = bytes.fromhex("410a100006000000"), b"9.8.76"
+    assert next(talk) == bytes.fromhex("400a100000000000")
+    assert talk.send(begin) == bytes.fromhex("6000000000000000")
+    assert talk.send(begin) is None, "asked twice, answered twice"
+    with pytest.raises(StopIteration) as ended:
+        talk.send(b"\x03" + text + b"\0")
+    assert ended.value.value == text
+
+
+def test_answers_that_come_far_too_late_are_told_with_the_way_out(tmp_path):
+    told = r"failed: No SDO response received within 0.05 s, 3 times; .* a larger bring_up.sdo_s$"
+    with pytest.raises(NodeError, match=told):
+        open_session(tmp_path, **late(1.0)).__enter__()
+
+
+def boots_twice(node):
+    if node.node_id != 3:
+        return
+    hear = node.receive
+
+    def receive(can_id, data, t_ns):
+        answers = list(hear(can_id, data, t_ns))
+        return answers * 2 if answers == [(0x703, b"\0")] else answers
+
+    node.receive = receive
+
+
+def test_a_node_that_boots_twice_is_brought_up(tmp_path):
+    with open_session(tmp_path, change=boots_twice) as session:
+        assert "node 3: (joint 3) sent 2 boot-ups after its reset" in session.said
+
+
+def test_two_nodes_with_one_id_are_told_from_one_that_boots_twice(tmp_path):
+    plan = canprobe.plan(canprobe.load_scene("free"))
+    (twin,) = make_world(plan, (3,)).nodes
+    told = r"node 3: \(joint 3\) answered .* 2 boot-ups and a request with 2 answers: the node id is in use twice"
+    with pytest.raises(NodeError, match=told):
+        open_session(tmp_path, beside=[twin]).__enter__()
+    assert_left_pre_operational(tmp_path)
+
+
+def test_a_node_that_boots_again_ends_bring_up(tmp_path):
+    """It would run with its defaults. On this bus, full of SDOs, its boot-up comes through after them."""
+    booting = Somebody(sending(0x703, "00"), is_write)
+    with pytest.raises(NodeError, match=r"node 3: \(joint 3\) booted again after it was configured: check its power"):
+        open_session(tmp_path, beside=[booting]).__enter__()
+    assert_left_pre_operational(tmp_path, before=(0x81, 0x01))
+
+
+def other_make(tmp_path):
+    """The EDS of a drive of another make: other names and numbers, one RPDO and TPDO with mappings that are fixed, and
+    nothing that only our drive has."""
+    text = eds_path("puma260_joint").read_text(encoding="ascii")
+    text = text.replace("0x0000CA5E", "0x000000AB").replace("0x00000260", "0x00001234")
+    sections = re.split(r"(?m)^(?=\[)", text)
+    optional = "1015|1019|1016|6007|605A|6065|6066|607D|1020|1010|1011|100A|(14|16|18|1A)0[123]|2[0-9A-F]{3}"
+    gone = re.compile(rf"\[({optional})(sub\w+)?\]", re.IGNORECASE)
+    kept = [section for section in sections if not gone.match(section)]
+    objects = {m[1].upper() for s in sections if (m := re.match(r"\[([0-9A-F]{4})\]", s)) and gone.match(s)}
+    lists = "".join(kept)
+    for index in objects:
+        lists = re.sub(rf"(?mi)^\d+=0x{index}\n", "", lists)
+    path = tmp_path / "other_make.eds"
+    path.write_text(renumbered(lists), encoding="ascii")
+    return path
+
+
+def renumbered(text):
+    """The lists of objects counted from 1 again."""
+
+    def again(match):
+        indices = re.findall(r"(?m)^\d+=(0x[0-9A-Fa-f]{4})$", match[2])
+        rows = "".join(f"{n}={index}\n" for n, index in enumerate(indices, start=1))
+        return f"[{match[1]}]\nSupportedObjects={len(indices)}\n{rows}\n"
+
+    return re.sub(r"\[(\w+Objects)\]\nSupportedObjects=\d+\n((?:\d+=0x[0-9A-Fa-f]{4}\n)+)\n?", again, text)
+
+
+def test_drives_of_another_make_are_brought_up_and_moved(tmp_path):
+    scene = canprobe.load_scene("free")
+    scene = replace(scene, arm=replace(scene.arm, eds=str(other_make(tmp_path))))
+    result = undrawn_run(scene, out=tmp_path / "out", duration_s=1.0)
+    assert result.summary["completed"] and result.summary["faults"] == []
+    assert np.ptp(result.truth["q"][:, 5]) > 0.01
+    assert undrawn_run(scene, out=tmp_path / "again", duration_s=0.2).plan.nodes[0].identity.vendor_id == 0xAB
+
+
+def test_drives_whose_file_has_oddities_that_nobody_uses_are_planned_and_run(tmp_path):
+    """Values and types that other tools read or that mean nothing, limits and a revision that nobody filled in."""
+    odd = [("0x7", "0.0"), ("0x15", "0x1234LL"), ("0x7", "0x00 00 01 00"), ("UDINT", "1"), ("", "1"), ("0x5", "off")]
+    text = eds_path("puma260_joint").read_text(encoding="ascii")
+    text = re.sub(r"(\[1018sub3\][^\[]*DefaultValue=)\w+", r"\g<1>0", text)
+    text = re.sub(r"\[607A\]", "[607A]\nLowLimit=0x7FFFFFFF\nHighLimit=0x80000000", text)
+    text = re.sub(r"\[(1017|60C2sub1)\]", r"[\1]\nLowLimit=0\nHighLimit=0", text)
+    for number, (kind, value) in enumerate(odd):
+        text += (
+            f"\n[5FF{number}]\nParameterName=X\nObjectType=7\nDataType={kind}\nAccessType=rw\nDefaultValue={value}\n"
+        )
+    (tmp_path / "odd.eds").write_text(text)
+    scene = canprobe.load_scene("free")
+    scene = replace(scene, arm=replace(scene.arm, eds=str(tmp_path / "odd.eds")))
+    assert canprobe.plan(scene).nodes[0].identity.revision_number is None
+    result = undrawn_run(scene, out=tmp_path / "out", duration_s=0.2)
+    assert result.summary["completed"] and result.summary["faults"] == []
+
+
+@pytest.mark.parametrize("fixed", [True, False])
+def test_drives_that_send_no_torque_are_run_and_logged_without(tmp_path, fixed):
+    scene = without_torque(canprobe.load_scene("free"), tmp_path, fixed=fixed)
+    result = undrawn_run(scene, out=tmp_path / "out", duration_s=0.5)
+    assert result.summary["completed"] and result.summary["faults"] == []
+    assert {"q_rad", "statusword"} <= set(result.log) and "torque_permille" not in result.log
+    assert any(line.startswith("motor torque (torque_permille of log.npz): ") for line in result.summary["left_out"])
+
+
+def test_swapped_drives_are_told_by_their_serial_numbers(tmp_path):
+    """The scene names each drive's serial number; the nodes have others."""
+    session = open_session(tmp_path, change=lambda node: node.dictionary.set_default(0x1018, 4, 1000 + node.node_id))
+    swapped = Session(with_joints(session.scene, serial_number=(1001, 1002, 1004, 1003, 1005, 1006)))
+    swapped.world.participants[:] = session.world.participants
+    with (
+        pytest.raises(NodeError, match=r"1018h:04 serial number expected 0x3ec, got 0x3eb; node 4: ") as failed,
+        swapped,
+    ):
+        pass
+    assert failed.value.node_id == 3
+
+
+@pytest.mark.parametrize(("rate_hz", "taken"), [(400.0, True), (200.0, False)])
+def test_an_interpolation_time_that_cannot_be_written_must_be_the_right_one(tmp_path, rate_hz, taken):
+    """25·10⁻⁴ s as delivered."""
+
+    def refuse(subindex, value):
+        raise SdoAbort(Abort.READ_ONLY)
+
+    def fix(node):
+        if node.node_id == 5:
+            node.dictionary.on_check(0x60C2, refuse)
+
+    session = open_session(tmp_path, change=fix, rate_hz=rate_hz)
+    if taken:
+        with session:
+            assert done_to(session) == ["configured, software 1.0"] * 6
+    else:
+        with pytest.raises(
+            NodeError,
+            match=r"^node 5: \(joint 5\) write of 60C2h:01 = 0x32 failed.* keeps 25 · 10\^-4 s: cycle.rate_hz = 400 ",
+        ):
+            session.__enter__()
+
+
+def test_a_drive_whose_unit_is_fixed_is_given_the_rates_that_fit(tmp_path):
+    """60C2h:01 is taken and :02 stays at milliseconds: 2.5 ms lie between 3 ms and 2 ms."""
+
+    def fix(node):
+        if node.node_id == 5:
+            node.dictionary.set_default(0x60C2, 2, -3)
+            node.dictionary.on_check(0x60C2, refuse_units)
+
+    def refuse_units(subindex, value):
+        if subindex == 2 and value != -3:
+            raise SdoAbort(Abort.VALUE)
+
+    with pytest.raises(NodeError, match=r"counts in 10\^-3 s: cycle.rate_hz = 333.333 or cycle.rate_hz = 500 fits"):
+        open_session(tmp_path, change=fix).__enter__()
+
+
+def test_a_drive_without_60c2h_follows_the_period_of_sync(tmp_path):
+    """1006h alone tells it the period, so the write of it is required, and the emulated drive takes it."""
+    eds = tmp_path / "follower.eds"
+    eds.write_text(re.sub(r"(?s)\[60C2(sub\d)?\].*?(?=\n\[)", "", eds_path("puma260_joint").read_text()))
+    scene = canprobe.load_scene("free")
+    scene = replace(scene, arm=replace(scene.arm, eds=str(eds)))
+    plan = canprobe.plan(scene)
+    (write,) = [one for one in make_setups(plan)[0].writes if one.index == 0x1006 and one.value]
+    assert (write.value, write.absence, plan.nodes[0].interpolation) == (2500, None, ())
+    told = undrawn_run(canprobe.load_scene("free"), out=tmp_path / "told", duration_s=0.5)
+    result = undrawn_run(scene, out=tmp_path / "out", duration_s=0.5)
+    assert result.summary["completed"] and result.summary["faults"] == []
+    assert np.ptp(result.truth["q"][:, 5]) > 0.01
+    assert np.array_equal(result.truth["q"], told.truth["q"]), "as the drive that is given 60C2h"

@@ -1,0 +1,477 @@
+"""The drive group: bytes in, joint angles out; joint targets in, bytes out; late is late."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from puma_arm import MODELS
+
+from canprobe.cell.master.array import TactileReceiver
+from canprobe.cell.master.drives import (
+    REST_COUNTS_LEAST,
+    REST_NS,
+    DriveAxis,
+    DriveGroup,
+    PositionTrack,
+    rest_counts,
+)
+from canprobe.fieldbus.protocol.cia402 import DriveState, OperationMode
+from canprobe.fieldbus.protocol.pdo import PdoEntry, PdoLayout
+from canprobe.fieldbus.protocol.tactile import FrameAssembler, TactileHeader, TactileMode, pack_whole
+from canprobe.mechanics.robot.model import joints_to_units, units_to_joints
+
+STATUS, POSITION, TORQUE = PdoEntry(0x6041, 0, 16), PdoEntry(0x6064, 0, 32, True), PdoEntry(0x6077, 0, 16, True)
+WORD, TARGET, DUMMY = PdoEntry(0x6040, 0, 16), PdoEntry(0x607A, 0, 32, True), PdoEntry(0x0004, 0, 32)
+MODEL = MODELS["puma260"]
+BASE = 8
+"""Counts: a milliradian of a joint of the PUMA, about."""
+ENABLED = DriveState.OPERATION_ENABLED.value
+NAN = float("nan")
+
+
+def make_group(grouped=False, repeat=40, torque=range(1, 7)):
+    axes = []
+    for i in range(1, 7):
+        feedback = PdoLayout(0x180 + i, (STATUS, POSITION, TORQUE) if i in torque else (STATUS, POSITION))
+        if grouped:
+            entries = (TARGET, DUMMY) if i % 2 else (DUMMY, TARGET)
+            commands = (PdoLayout(0x200 + i, (WORD,), 255), PdoLayout(0x301 + (i - 1) // 2 * 2, entries))
+        else:
+            commands = (PdoLayout(0x200 + i, (WORD, TARGET)),)
+        axes.append(DriveAxis(i, (feedback,), commands))
+    return DriveGroup(tuple(axes), MODEL, repeat)
+
+
+def hear(group, counts, status=ENABLED, skip=()):
+    for i, axis in enumerate(group.axes):
+        if i not in skip:
+            (feedback,) = axis.feedback
+            torque = [-7] * (len(feedback.entries) - 2)
+            group.push(feedback.cob_id, feedback.pack(status, round(counts[i]), *torque))
+
+
+def test_joint_angles_come_back_through_the_coupled_wrist():
+    q = np.array((0.3, -0.2, 0.1, 0.5, -0.4, 1.0))
+    group = make_group()
+    group.begin(0)
+    hear(group, joints_to_units(MODEL, q))
+    assert group.complete
+    assert group.joints() == pytest.approx(q, abs=2e-4)
+    assert group.torque_permille == [-7] * 6
+
+
+@pytest.mark.parametrize(("torque", "told"), [((1, 4), [-7, NAN, NAN, -7, NAN, NAN]), ((), [])])
+def test_a_drive_without_torque_in_its_tpdo_is_heard_like_the_others(torque, told):
+    group = make_group(torque=torque)
+    group.begin(0)
+    hear(group, [10.0] * 6)
+    assert group.complete and group.ages() == (0,) * 6
+    assert group.torque_permille == pytest.approx(told, nan_ok=True)
+
+
+def test_wrist_motors_turn_with_joint_4():
+    counts = joints_to_units(MODEL, np.array((0, 0, 0, 2 * np.pi, 0, 0)))
+    assert counts[4] == pytest.approx(-9.8462 * 800, rel=1e-6)
+    assert counts[5] == pytest.approx(1.0 * 800, rel=1e-6)
+
+
+def test_a_tpdo_twice_or_after_the_window_is_late_and_not_used():
+    group = make_group()
+    group.begin(0)
+    hear(group, [10.0] * 6)
+    hear(group, [99.0] * 6)
+    assert group.late == 6
+    group.end_collect()
+    hear(group, [98.0] * 6)
+    assert group.late == 12
+    group.begin(1)
+    hear(group, [15.0] * 6, skip=(2,))
+    group.end_collect()
+    assert group.missed == 1
+    assert group.ages() == (0, 0, 1, 0, 0, 0)
+    counts = joints_to_units(MODEL, group.joints())
+    assert counts == pytest.approx([15, 15, 10, 15, 15, 15], abs=1e-6)
+
+
+def test_a_tpdo_from_before_the_sync_is_late_though_it_is_read_afterwards():
+    group = make_group()
+    group.begin(0, 1000)
+    group.push(0x181, group.axes[0].feedback[0].pack(ENABLED, 5, 0), 999)
+    assert (group.late, group.ages()[0]) == (1, 1)
+    group.push(0x181, group.axes[0].feedback[0].pack(ENABLED, 7, 0), 1000)
+    assert (group.late, group.ages()[0]) == (1, 0)
+
+
+def test_without_a_target_each_drive_is_told_to_stay():
+    group = make_group()
+    group.begin(0)
+    hear(group, [11, 22, 33, 44, 55, -66])
+    assert group.frames()[5] == (0x206, (15).to_bytes(2, "little") + (-66).to_bytes(4, "little", signed=True))
+
+
+def test_a_drive_that_is_stopped_among_others_that_go_on_is_commanded_so_at_once():
+    """As in a lift-off, where nothing else changes: neither the goal nor a statusword."""
+    group, words = make_group(), []
+    for cycle in range(4):
+        if cycle == 3:
+            group.stopped = frozenset({2})
+        group.begin(cycle)
+        hear(group, [0] * 6)
+        words.append([int.from_bytes(data[:2], "little") for _, data in group.frames()])
+    assert words == [[0x0F] * 6] * 3 + [[0x0F, 0x02, 0x0F, 0x0F, 0x0F, 0x0F]]
+
+
+def test_grouped_targets_share_a_frame_and_the_controlword_goes_on_change():
+    group = make_group(grouped=True, repeat=3)
+    group.begin(0)
+    hear(group, [1, 2, 3, 4, 5, -6])
+    frames = dict(group.frames())
+    assert sorted(frames) == [0x201, 0x202, 0x203, 0x204, 0x205, 0x206, 0x301, 0x303, 0x305]
+    assert frames[0x305] == (5).to_bytes(4, "little") + (-6).to_bytes(4, "little", signed=True)
+    seen = []
+    for cycle in range(1, 5):
+        group.begin(cycle)
+        seen.append(sum(1 for can_id, _ in group.frames() if can_id < 0x300))
+    assert seen == [0, 0, 6, 0]
+
+
+def test_a_fault_reset_that_did_not_take_gets_a_new_edge():
+    group = make_group()
+    words = []
+    for cycle in range(4):
+        group.begin(cycle)
+        hear(group, [0] * 6, status=DriveState.FAULT.value)
+        words.append(group.frames()[0][1][0] >> 7)
+    assert words == [1, 0, 1, 0]
+
+
+# Drives of other makes: several PDOs each way, more in them than is needed, interpolated position.
+
+SPEED, MODE = PdoEntry(0x6081, 0, 32), PdoEntry(0x6061, 0, 8, True)
+RECORD = PdoEntry(0x60C1, 1, 32, True)
+
+
+def one_kind(feedback, commands, **options):
+    """Six drives whose TPDOs and RPDOs map these entries each."""
+    axes = [
+        DriveAxis(
+            i,
+            tuple(PdoLayout(0x180 + 0x100 * k + i, entries) for k, entries in enumerate(feedback)),
+            tuple(PdoLayout(0x200 + 0x100 * k + i, entries) for k, entries in enumerate(commands)),
+            **options,
+        )
+        for i in range(1, 7)
+    ]
+    return DriveGroup(tuple(axes), MODEL)
+
+
+def send(group, k, *values):
+    for axis in group.axes:
+        group.push(axis.feedback[k].cob_id, axis.feedback[k].pack(*values))
+
+
+def test_feedback_in_two_tpdos_and_values_that_nobody_reads():
+    group = one_kind([(STATUS, MODE), (MODE, POSITION, TORQUE)], [(WORD,), (TARGET, SPEED)], constants={(0x6081, 0): 9})
+    group.begin(0)
+    send(group, 0, ENABLED, 8)
+    assert not group.complete and not group.heard_all and group.frames() == []
+    send(group, 1, 8, -55, 7)
+    assert group.complete and group.enabled and group.torque_permille == [7] * 6
+    assert dict(group.frames())[0x301] == (-55).to_bytes(4, "little", signed=True) + (9).to_bytes(4, "little")
+    group.begin(1)
+    send(group, 1, 8, -55, 7)
+    group.end_collect()
+    assert group.missed == 6 and group.ages() == (0,) * 6
+
+
+@pytest.mark.parametrize("beyond", [b"", b"\x01", b"\xff\xff"])
+def test_what_a_frame_has_beyond_its_mapping_is_not_read(beyond):
+    group = make_group(torque=())
+    group.begin(0)
+    group.push(0x181, group.axes[0].feedback[0].pack(ENABLED, 77) + beyond)
+    assert group.malformed == 0 and group.statuswords[0] == ENABLED and group.targets()[0] == 77
+    group.push(0x182, group.axes[1].feedback[0].pack(ENABLED, 77)[:-1])
+    assert group.malformed == 1
+
+
+def test_no_rpdo_goes_to_a_drive_that_was_never_heard():
+    """Its target would be 0 and not where it is."""
+    group = make_group()
+    group.begin(0)
+    hear(group, [4000] * 6, skip=(2,))
+    assert sorted(can_id for can_id, _ in group.frames()) == [0x201, 0x202, 0x204, 0x205, 0x206]
+    group.begin(1)
+    hear(group, [4000] * 6)
+    frames = dict(group.frames())
+    assert len(frames) == 6 and {data[2:] for data in frames.values()} == {(4000).to_bytes(4, "little")}
+
+
+def test_interpolated_position_sets_bit_4_while_operation_is_enabled():
+    group = one_kind([(STATUS, POSITION)], [(WORD, RECORD)], mode=OperationMode.INTERPOLATED_POSITION)
+    words = []
+    states = [0x40, 0x21, 0x23, 0x27, 0x27]
+    for cycle, status in enumerate(states):
+        group.begin(cycle)
+        send(group, 0, status, 5)
+        frame = group.frames()[0][1]
+        words.append(int.from_bytes(frame[:2], "little"))
+        assert frame[2:] == (5).to_bytes(4, "little")
+    assert words == [0x06, 0x07, 0x0F, 0x1F, 0x1F]
+    group.goal = DriveState.QUICK_STOP_ACTIVE
+    assert int.from_bytes(group.frames()[0][1][:2], "little") == 0x02
+    group.goal = DriveState.SWITCH_ON_DISABLED
+    assert int.from_bytes(group.frames()[0][1][:2], "little") & 0x10 == 0
+
+
+# Positions that a motor can and cannot have reached, and where it is when nobody says.
+
+PERIOD = 2_500_000
+
+
+def moving(rate=10, cycles=20, track=None, period_ns=PERIOD):
+    track = track or PositionTrack(BASE)
+    for k in range(cycles):
+        track.aim(abs(rate))
+        assert track.take(rate * k, k, k * period_ns, guarded=True) or k == 0
+    return track
+
+
+@pytest.mark.parametrize("rate", [0, 10, -300])
+def test_a_steady_motion_is_believed_and_carried_on(rate):
+    track = moving(rate)
+    for age in range(1, 8):
+        assert track.position(19 + age, (19 + age) * PERIOD) == pytest.approx(rate * (19 + min(age, 3)))
+    assert track.position(19, 19 * PERIOD) == rate * 19
+
+
+@pytest.mark.parametrize("period_ns", [1_000_000, PERIOD, 20_000_000])
+@pytest.mark.parametrize(("periods", "carried"), [(1, 1), (2.5, 2.5), (3, 3), (4, 3), (34, 3), (250, 3)])
+def test_after_a_late_cycle_a_motion_is_carried_on_for_three_periods_of_time(period_ns, periods, carried):
+    """One cycle, one missed TPDO, and a SYNC that comes many periods late."""
+    track = moving(-10, track=PositionTrack(BASE, period_ns), period_ns=period_ns)
+    assert track.position(20, round((19 + periods) * period_ns)) == pytest.approx(-10 * (19 + carried))
+
+
+@pytest.mark.parametrize("rate", [10, -10])
+@pytest.mark.parametrize(("periods", "followed"), [(1, 1), (2, 2), (12, 12), (20, 20), (34, 20)], ids=str)
+def test_a_report_after_a_late_cycle_is_believed_as_far_as_the_drive_can_have_come(rate, periods, followed):
+    """It goes on as before for three periods at most, and follows within twenty what its targets asked of it."""
+    carried = min(periods, 3)
+    most = carried * 10 + BASE + carried * 10 + followed * 10
+    for way, believed in (
+        (most, True),
+        (most + 1, False),
+        (-BASE - followed * 10, True),
+        (-BASE - followed * 10 - 1, False),
+    ):
+        track = moving(rate)
+        report = rate * 19 + way * (1 if rate > 0 else -1)
+        assert track.take(report, 20, (19 + periods) * PERIOD, guarded=True) is believed, way
+
+
+def test_what_a_target_asked_fades_with_the_time_and_not_with_the_cycles():
+    """Twenty periods later an eighth of it counts, whether they are one cycle or twenty."""
+    for cycles in (1, 20):
+        track = moving(0)
+        track.aim(1000)
+        for _ in range(cycles):
+            track.aim(0, 20 / cycles)
+        track.take(0, 20, 40 * PERIOD, guarded=True)
+        left = 1000 * 0.9**20
+        assert track.take(round(left) + BASE - 1, 21, 41 * PERIOD, guarded=True)
+        track.take(0, 22, 42 * PERIOD, guarded=False)
+        assert not track.take(round(left) + BASE + 5, 23, 43 * PERIOD, guarded=True)
+
+
+@pytest.mark.parametrize("turned", [1, -1])
+def test_a_drive_that_was_not_heard_while_it_moved_is_believed_when_all_hold(turned):
+    """Its way since the last report does not fade, however long nobody hears it: it went there."""
+    track = moving(20)
+    position = 20 * 19
+    for _ in range(20, 24):
+        position += turned * 40
+        track.aim(40)
+    for _ in range(24, 60):
+        track.aim(0)
+    assert track.take(position, 60, 60 * PERIOD, guarded=True)
+
+
+def test_the_group_takes_the_time_from_its_syncs():
+    group = make_group()
+    for cycle in range(20):
+        group.begin(cycle, 0, cycle * PERIOD)
+        hear(group, [10 * cycle] * 6)
+        group.set_target(units_to_joints(MODEL, np.full(6, 10.0 * (cycle + 1))))
+        group.frames()
+    group.begin(20, 0, (19 + 34) * PERIOD)
+    hear(group, [190] * 6, skip=(2,))
+    group.end_collect()
+    assert joints_to_units(MODEL, group.joints()) == pytest.approx([190, 190, 220, 190, 190, 190])
+
+
+def test_drives_that_are_stopped_get_a_quick_stop_and_the_others_go_on():
+    group = make_group()
+    group.begin(0)
+    hear(group, [0] * 6)
+    group.stopped = frozenset({2, 5})
+    words = {can_id - 0x200: int.from_bytes(data[:2], "little") for can_id, data in group.frames()}
+    assert words == {1: 0x0F, 2: 0x02, 3: 0x0F, 4: 0x0F, 5: 0x02, 6: 0x0F}
+    group.goal = DriveState.SWITCH_ON_DISABLED
+    assert {int.from_bytes(data[:2], "little") for _, data in group.frames()} == {0x00}, "the way out is for all"
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_jump_is_not_believed_and_the_next_right_one_is(sign):
+    track = moving(10)
+    assert not track.take(200 + sign * 60, 20, 20 * PERIOD, guarded=True)
+    assert (track.counts, track.cycle) == (190, 19)
+    assert track.take(210, 21, 21 * PERIOD, guarded=True)
+    assert track.position(22, 22 * PERIOD) == pytest.approx(220)
+
+
+def test_before_the_drive_is_enabled_everything_is_believed_but_nothing_at_rest():
+    track = PositionTrack(BASE)
+    for k in range(6):
+        assert track.rested_ns < REST_NS
+        track.take(1000, k, k * PERIOD, guarded=False)
+    assert track.rested_ns == REST_NS
+    assert track.take(5000, 9, 9 * PERIOD, guarded=False)
+    assert track.rested_ns == 0
+    track.take(1000, 10, 10 * PERIOD, guarded=False)
+    assert track.rested_ns == 0
+
+
+@pytest.mark.parametrize("period_ns", [1_000_000, PERIOD, 10_000_000])
+def test_rest_is_a_time_within_a_milliradian(period_ns):
+    """Noise of 12 counts on a fine encoder is rest; a slow motion on it is not, though each of its steps is small."""
+    base = 100_000 * 1e-3
+    still, slow = PositionTrack(base), PositionTrack(base)
+    for k in range(1 + -(-REST_NS // period_ns)):
+        still.take((12, -12, 3)[k % 3], k, k * period_ns, guarded=False)
+        slow.take(round(20e-3 * 1e-6 * period_ns * k * base), k, k * period_ns, guarded=False)
+    assert still.rested_ns >= REST_NS or k * period_ns < REST_NS
+    assert still.rested_ns == k * period_ns
+
+
+def test_a_slow_motion_is_no_rest():
+    """A tenth of a radian a second: a quarter of a milliradian in each cycle."""
+    track = PositionTrack(100.0)
+    for k in range(200):
+        track.take(25 * k, k, k * PERIOD, guarded=False)
+        assert track.rested_ns <= REST_NS
+
+
+def test_a_milliradian_in_the_counts_of_each_drive():
+    milliradians = np.abs(np.diag(MODEL.units_per_q)) / 1000
+    assert milliradians.min() < REST_COUNTS_LEAST < milliradians.max(), "the PUMA's encoders are coarse at the wrist"
+    assert rest_counts(MODEL) == pytest.approx(np.maximum(milliradians, REST_COUNTS_LEAST))
+    fine = dataclasses.replace(MODEL, units_per_q=100 * MODEL.units_per_q)
+    assert rest_counts(fine) == pytest.approx(100 * milliradians)
+
+
+def test_a_start_and_a_stop_are_believed():
+    """A drive of 30 Hz behind a ramp that begins and ends at once: x'' = ω²(r − x) − 2 ζ ω x'."""
+    omega, dt, x, v = 188.0, 2.5e-3, 0.0, 0.0
+    track, reference = PositionTrack(BASE), 0.0
+    for k in range(200):
+        step = 40.0 if 50 <= k < 120 else 0.0
+        track.aim(step)
+        for _ in range(50):
+            reference += step / 50
+            a = omega**2 * (reference - x) - 2 * 0.9 * omega * v
+            v += a * dt / 50
+            x += v * dt / 50
+        assert track.take(round(x), k, k * PERIOD, guarded=True), k
+    assert track.counts == pytest.approx(40 * 70, abs=1)
+
+
+def test_noise_of_some_counts_is_believed():
+    track = PositionTrack(BASE)
+    for k in range(50):
+        assert track.take((k % 2) * (BASE // 3), k, k * PERIOD, guarded=True)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_wrong_reports_at_rest_do_not_grow_into_a_motion(sign):
+    """Each of them is near to where the one before would lead, and the target asks for nothing of the kind."""
+    track = moving(0)
+    assert track.take(sign * BASE, 20, 20 * PERIOD, guarded=True)
+    assert track.position(23, 23 * PERIOD) == sign * BASE
+    assert not track.take(sign * 3 * BASE, 21, 21 * PERIOD, guarded=True)
+    assert track.take(0, 22, 22 * PERIOD, guarded=True)
+
+
+# The delay contract of tactile frames: never in the cycle of their trigger, and placed when they were sampled.
+
+IDS = [0x511, *range(0x512, 0x51A)]
+
+
+def payloads(counter, sync_counter, age_us=5000):
+    header = TactileHeader(
+        frame_counter=counter,
+        sync_counter=sync_counter,
+        origin_row=4,
+        origin_col=5,
+        mode=TactileMode.WINDOW,
+        overload=False,
+        sample_age_us=age_us,
+        crc=0,
+    )
+    whole = pack_whole(header, np.full((16, 16), counter, np.uint8))
+    return [whole[i : i + 8] for i in range(0, len(whole), 8)]
+
+
+def make_receiver():
+    return TactileReceiver(FrameAssembler(IDS, TactileMode.WINDOW, 2 * PERIOD), IDS, sync_overflow=240)
+
+
+def push(receiver, frame, t_ns=0):
+    for can_id, data in zip(IDS, frame, strict=True):
+        receiver.push(can_id, data, t_ns)
+
+
+def times(cycle):
+    return [k * PERIOD for k in range(cycle + 1)]
+
+
+def test_a_frame_is_not_usable_in_the_cycle_that_triggered_it():
+    receiver = make_receiver()
+    push(receiver, payloads(1, sync_counter=5))
+    assert receiver.take(4, 5, times(4)) is None
+    sample = receiver.take(5, 6, times(5))
+    assert sample is not None and sample.cycle == 4
+    assert sample.t_sample_ns == 4 * PERIOD - 5_000_000
+    assert receiver.take(6, 7, times(6)) is None
+
+
+def test_the_sync_counter_wraps():
+    receiver = make_receiver()
+    push(receiver, payloads(1, sync_counter=240))
+    sample = receiver.take(240, 1, times(240)[-240:])
+    assert sample is not None and sample.cycle == 239
+
+
+def test_sample_times_follow_the_real_syncs_not_the_period():
+    receiver = make_receiver()
+    push(receiver, payloads(1, sync_counter=3, age_us=0))
+    sample = receiver.take(3, 4, [0, PERIOD, 9 * PERIOD, 10 * PERIOD])  # an overrun before SYNC 3
+    assert sample is not None and sample.t_sample_ns == 9 * PERIOD
+
+
+def test_a_frame_older_than_every_known_sync_is_stale():
+    receiver = make_receiver()
+    push(receiver, payloads(1, sync_counter=200))
+    assert receiver.take(2, 3, times(2)) is None
+    assert receiver.stale == 1
+
+
+@pytest.mark.parametrize("lost", range(9))
+def test_a_frame_with_a_lost_pdo_is_never_handed_out(lost):
+    receiver = make_receiver()
+    for i, (can_id, data) in enumerate(zip(IDS, payloads(1, 1), strict=True)):
+        if i != lost:
+            receiver.push(can_id, data, 0)
+    push(receiver, payloads(2, sync_counter=3))
+    sample = receiver.take(3, 4, times(3))
+    assert sample is not None and sample.frame.header.frame_counter == 2
+    assert receiver.assembler.torn + receiver.assembler.orphans > 0

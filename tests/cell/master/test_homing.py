@@ -1,0 +1,400 @@
+"""Homing by the master, on emulated drives that forget their zeros with the power: found, recorded, asked for."""
+
+from __future__ import annotations
+
+import json
+import re
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from makes import MAKES, changed, without, write_eds
+from scenes import change, reasons, with_joints
+
+import canprobe
+from canprobe.cell.emulated.world import make_world
+from canprobe.cell.master.cell import Cell
+from canprobe.cell.master.controller import Command
+from canprobe.cell.plant.plant import Plant
+from canprobe.cell.session.session import Session
+from canprobe.cell.tasks.free_and_listen import Answer
+from canprobe.errors import CanprobeError, NodeError, UsageError
+from canprobe.fieldbus.bus.port import VirtualClock
+from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus, Participant
+from canprobe.fieldbus.node.faults import Fault, FaultKind, FaultyNode
+from canprobe.fieldbus.protocol.cia402 import DriveState
+from canprobe.fieldbus.protocol.frames import NmtCommand, pack_nmt
+
+HOMED = {"zero": "homing", "homing_acceleration_deg_s2": 1000.0, "homing_speed_deg_s": 100.0}
+BEYOND = 0.01
+"""Of its range, how far behind the end of a joint the limit switches of the plant are."""
+
+
+def switch(joint, method):
+    """Where the switch of a method is, deg."""
+    beyond = BEYOND * (joint.max_deg - joint.min_deg)
+    return joint.min_deg - beyond if method in (1, 17) else joint.max_deg + beyond
+
+
+def scene_of(methods, *, emulated=False, **keys):
+    """A PUMA 260 whose joints are homed by the methods, from the base; 0: it has an absolute encoder."""
+    scene = canprobe.load_scene("free")
+    joints = dict(scene.joints)
+    for (name, joint), method in zip(scene.joints.items(), methods, strict=False):
+        if method:
+            home = joint.start_deg if method in (35, 37) else switch(joint, method)
+            joints[name] = replace(joint, homing_method=method, home_deg=home, **{**HOMED, **keys})
+    return change(replace(scene, joints=joints), arm={"emulated": emulated}, scene={"figures": False})
+
+
+class Bench:
+    """Real drives, as far as the cell can see: on a bus that outlives the cells."""
+
+    def __init__(self, scene, folder, *, faults=(), around=lambda node: node):
+        self.plan = canprobe.plan(scene)
+        self.bus = LockstepBus(VirtualClock(), "can0")
+        self.world = make_world(self.plan, self.plan.node_ids, truth=False, homed=False)
+        self.record = folder / "state" / "zeros.json"
+        self.frames, self.said = [], []
+        self.bus.recorder = lambda can_id, data, t_ns: self.frames.append((can_id, data))
+        for node in self.world.nodes:
+            self.bus.attach(FaultyNode(node, faults) if faults else around(node))
+
+    def cell(self, *, to_home=False):
+        return Cell(self.plan, self.bus.port(), zeros=self.record, to_home=to_home, say=self.said.append)
+
+    def home(self, *axes):
+        with self.cell(to_home=True) as cell:
+            return [cell.homing.home(axis) for axis in axes or cell.homing.order]
+
+    def run(self):
+        """The joints as the cell has them and as they are."""
+        seen = []
+
+        def controller(measurement):
+            seen.append(measurement.q)
+            return Command(done=True)
+
+        with self.cell() as cell:
+            cell.run(controller)
+        return seen[-1], self.world.plant.truth()["q"]
+
+    def words(self, node_id):
+        """Controlwords that a drive got by SDO."""
+        return [data[4] for i, data in self.frames if i == 0x600 + node_id and data[:4].hex() == "2b406000"]
+
+    def states(self):
+        return {node.application.state for node in self.world.nodes}
+
+
+@pytest.mark.parametrize("method", [17, 18, 35, 37])
+def test_a_homed_joint_is_where_the_cell_has_it_and_stays_known(tmp_path, method):
+    bench = Bench(scene_of([method]), tmp_path)
+    (told,) = bench.home()
+    assert "is homed" in told
+    for _ in range(2):
+        q, truth = bench.run()
+        assert q == pytest.approx(truth, abs=2e-4)
+    assert bench.states() == {DriveState.SWITCH_ON_DISABLED}
+    resets = {data for can_id, data in bench.frames if can_id == 0}
+    assert {pack_nmt(NmtCommand.RESET_COMMUNICATION, 1)[1], pack_nmt(NmtCommand.RESET_NODE, 2)[1]} <= resets
+    assert pack_nmt(NmtCommand.RESET_NODE, 1)[1] not in resets
+
+
+def test_the_index_pulse_behind_the_positive_switch(tmp_path):
+    """A joint whose motor turns once in 7.7 deg, and whose pulses count from the position at power on."""
+    bench = Bench(scene_of([2]), tmp_path)
+    bench.home()
+    q, truth = bench.run()
+    turn = np.radians(360 / 46.72) * 4096 / 1000
+    assert 0 <= q[0] - truth[0] <= turn
+    assert q[1:] == pytest.approx(truth[1:], abs=2e-4)
+
+
+def test_a_slide_whose_drive_counts_backwards_finds_its_negative_switch_at_its_upper_end(tmp_path):
+    scene = canprobe.load_scene("free", {"cell": "gantry"})
+    x = replace(scene.joints["x"], sign=-1, zero="homing", homing_method=17, home_mm=404.0, homing_speed_mm_s=100.0)
+    scene = replace(scene, joints={**scene.joints, "x": x})
+    bench = Bench(change(scene, arm={"emulated": False}, scene={"figures": False}), tmp_path)
+    with bench.cell(to_home=True) as cell:
+        assert "move in positive direction to the negative limit switch, at 100 and 2 mm/s" in cell.homing.question(0)
+        told = cell.homing.home(0)
+    assert told.startswith("joint 1 (x) is homed: home is at 404.00 mm; it stands at 39")
+    q, truth = bench.run()
+    assert q == pytest.approx(truth, abs=1e-5)
+    assert 0.39 < q[0] < 0.4
+
+
+def test_joints_in_their_order_each_alone_with_heartbeats_and_without_sync(tmp_path):
+    bench = Bench(scene_of([35, 18, 35], homing_speed_deg_s=20.0), tmp_path)
+    bench.home()
+    enabled = [i - 0x600 for i, data in bench.frames if data[:5].hex() == "2b4060001f"]
+    assert enabled == [1, 2, 3]
+    assert 0x80 not in {can_id for can_id, _ in bench.frames}
+    assert sum(can_id == 0x77F for can_id, _ in bench.frames) > 50
+    modes = [data[4] for i, data in bench.frames if i == 0x602 and data[:4].hex() == "2f606000"]
+    assert modes == [8, 6, 8, 1, 8], "homing, and back inside its range"
+
+
+def test_a_coupled_wrist(tmp_path):
+    """The motors of joints 5 and 6 stand in the forearm: what they count at home depends on the joints before them."""
+    scene = scene_of([0, 0, 0, 18, 17, 18])
+    bench = Bench(scene, tmp_path)
+    bench.home()
+    q, truth = bench.run()
+    assert q == pytest.approx(truth, abs=1e-3)
+    assert abs(truth[3]) > 0.5, "joint 4 is elsewhere than in the start posture"
+
+
+def test_a_wrist_joint_waits_for_those_that_it_depends_on(tmp_path):
+    bench = Bench(scene_of([0, 0, 0, 18, 17]), tmp_path)
+    with pytest.raises(NodeError, match=r"node 5: \(joint 5\) cannot be homed: its zero depends on joint 4: home it"):
+        bench.home(4)
+    names = list(scene_of([]).joints)
+    scene = scene_of([0, 0, 0, 18, 17])
+    late = {name: replace(joint, homing_order=9 if name == names[3] else None) for name, joint in scene.joints.items()}
+    late = {name: joint if joint.zero == "homing" else scene.joints[name] for name, joint in late.items()}
+    (problem,) = reasons(replace(scene, joints=late))
+    assert problem == (
+        "the zero of joint_5 depends on joint_4, which is homed later: joints.joint_4.homing_order must be lower than 5"
+    )
+
+
+# Which drives are homed.
+
+
+def refusal(bench):
+    with pytest.raises(NodeError) as caught, bench.cell():
+        pass
+    return str(caught.value)
+
+
+def test_a_run_with_drives_that_are_not_homed_is_refused_with_the_command(tmp_path):
+    bench = Bench(scene_of([35, 0, 35]), tmp_path)
+    assert refusal(bench) == (
+        "node 1: (joint 1) is not homed, or was switched off or moved since; nor are 3 (joint 3); type: canprobe up"
+        " free --home --bus lockstep --channel can0"
+    )
+    bench.home(0)
+    assert refusal(bench).startswith("node 3: (joint 3) is not homed")
+    assert not bench.words(3)
+    bench.home(2)
+    assert bench.run()
+
+
+def power_cycle(bench, scene):
+    node = bench.world.nodes[0]
+    node.receive(0, pack_nmt(NmtCommand.RESET_NODE, 1)[1], bench.bus.clock.now_ns())
+
+
+def move_by_hand(bench, scene):
+    bench.world.plant.set_ramp(0, 0.0, 5000.0, bench.bus.clock.now_ns(), bench.bus.clock.now_ns() + 1)
+
+
+def lose_the_record(bench, scene):
+    bench.record.write_text("{")
+
+
+def state_another_home(bench, scene):
+    bench.plan = canprobe.plan(with_joints(scene, home_deg=[11.0] + [None] * 5))
+
+
+def exchange_the_drive(bench, scene):
+    bench.world.nodes[0].dictionary.set_default(0x1018, 4, 4711)
+
+
+@pytest.mark.parametrize("act", [power_cycle, move_by_hand, lose_the_record, state_another_home, exchange_the_drive])
+def test_what_makes_a_record_worthless(tmp_path, act):
+    scene = scene_of([35])
+    bench = Bench(scene, tmp_path)
+    bench.home()
+    assert bench.run()
+    act(bench, scene)
+    assert "is not homed" in refusal(bench)
+
+
+def test_the_record_names_what_homing_wrote(tmp_path):
+    bench = Bench(scene_of([35]), tmp_path)
+    bench.home()
+    ((node_id, entry),) = json.loads(bench.record.read_text())["nodes"].items()
+    assert (node_id, entry["objects"]["6098h:00"]) == ("1", 35)
+    assert entry["position"] == -entry["objects"]["607Ch:00"]
+
+
+def test_emulated_drives_of_a_run_start_homed_and_can_be_homed(capsys):
+    scene = scene_of([0, 0, 0, 18, 17, 35], emulated=True)
+    asked, said = [], []
+
+    class Operator:
+        def ask(self, question):
+            asked.append(question)
+
+        def answer(self):
+            return [Answer.YES, Answer.NO, Answer.QUIT][len(asked) - 1]
+
+    with Session(scene) as session:
+        session.run(lambda _: Command(done=True))
+    canprobe.api.home(scene, operator=Operator(), say=said.append)
+    assert asked[:2] == [
+        "joint 4 (joint_4, node 4): home it by method 18: move in positive direction to the positive limit switch, at"
+        " 100 and 1 deg/s?",
+        "joint 5 (joint_5, node 5): home it by method 17: move in negative direction to the negative limit switch, at"
+        " 100 and 1 deg/s?",
+    ]
+    assert sum("is homed" in line for line in said) == 1
+    assert "joint 5 is left as it is" in said
+    with pytest.raises(UsageError, match='no joint of scene free has zero = "homing"'):
+        canprobe.api.home(canprobe.load_scene("free"))
+
+
+# What goes wrong: the drive is stopped and disabled, and is not homed.
+
+
+def failure(bench):
+    with pytest.raises(NodeError) as caught:
+        bench.home()
+    assert bench.states() == {DriveState.SWITCH_ON_DISABLED}
+    assert "is not homed" in refusal(bench)
+    return str(caught.value)
+
+
+def test_a_switch_that_is_never_found(tmp_path, monkeypatch):
+    monkeypatch.setattr(Plant, "limit_switches", lambda *_: (-np.inf, np.inf))
+    bench = Bench(scene_of([17], homing_timeout_s=5.0), tmp_path)
+    assert failure(bench) == ("node 1: (joint 1) did not find its home position by method 17 in 5 s (homing_timeout_s)")
+    assert bench.words(1)[-1] == 0x02
+    assert "joint 1 is stopped and disabled; it is not homed" in bench.said
+
+
+def test_a_homing_error_of_the_drive(tmp_path, monkeypatch):
+    monkeypatch.setattr("canprobe.fieldbus.drive.homing.SEARCH_S", 0.5)
+    bench = Bench(scene_of([17]), tmp_path)
+    assert failure(bench) == (
+        "node 1: (joint 1) could not find its home position by method 17: its statusword (6041h) has bit 13"
+    )
+
+
+class Turned:
+    """A drive that takes the home offset with the other sign."""
+
+    def __init__(self, node):
+        self._node = node
+
+    def __getattr__(self, name):
+        return getattr(self._node, name)
+
+    def receive(self, can_id, data, t_ns):
+        written = data[:4].hex() == "237c6000"
+        data = data[:4] + struct.pack("<i", -struct.unpack("<i", data[4:])[0]) if written else data
+        answers = self._node.receive(can_id, data, t_ns)
+        read = [(i, d) for i, d in answers if d[1:4].hex() == "7c6000" and d[0] >> 5 == 2]
+        turned = [(i, d[:4] + struct.pack("<i", -struct.unpack("<i", d[4:])[0])) for i, d in read]
+        return turned or answers
+
+
+def test_a_drive_that_takes_the_home_offset_the_other_way_round(tmp_path):
+    bench = Bench(scene_of([35]), tmp_path, around=Turned)
+    assert re.fullmatch(
+        r"node 1: \(joint 1\) homed, but is at -(\d+) \(6064h\) where \1 was expected with 607Ch = -\1: the drive may"
+        " count the home offset the other way round",
+        failure(bench),
+    )
+
+
+def test_without_profile_position_the_joint_is_left_at_its_switch(tmp_path):
+    make = MAKES["late_target"]()
+    changed(make.objects, 0x6502, 0, default=1 << 7 | 1 << 5)
+    eds = {"eds": str(write_eds(make, tmp_path)), "emulated": False}
+    bench = Bench(change(scene_of([18], homing_speed_deg_s=20.0), arm=eds, cycle={"rate_hz": 333.333}), tmp_path)
+    (told,) = bench.home()
+    assert told.endswith("it stands there, outside its range: move it inside by hand before a run")
+
+
+class Once(Participant):
+    """Does something when a drive starts to home."""
+
+    listens = (0x601,)
+
+    def __init__(self, act):
+        self._act = act
+
+    def receive(self, can_id, data, t_ns):
+        if data[:5].hex() == "2b4060001f":
+            self._act()
+        return []
+
+
+def test_ctrl_c_stops_and_disables_the_drive(tmp_path):
+    bench = Bench(scene_of([17], homing_speed_deg_s=10.0), tmp_path)
+
+    def interrupt():
+        raise KeyboardInterrupt
+
+    bench.bus.attach(Once(interrupt))
+    with pytest.raises(KeyboardInterrupt):
+        bench.home()
+    assert bench.states() == {DriveState.SWITCH_ON_DISABLED}
+    before = bench.world.plant.truth()["q"]
+    assert "is not homed" in refusal(bench)
+    assert bench.world.plant.truth()["q"] == pytest.approx(before, abs=1e-6)
+
+
+@pytest.mark.parametrize("state", [DriveState.SWITCH_ON_DISABLED, DriveState.QUICK_STOP_ACTIVE, DriveState.SWITCHED_ON])
+def test_a_drive_that_leaves_operation_while_homing_is_noticed(tmp_path, state):
+    """As by its enable input: no EMCY, no homing error, and a heartbeat as always."""
+    bench = Bench(scene_of([17], homing_speed_deg_s=10.0), tmp_path)
+    drive = bench.world.nodes[0].application
+    bench.bus.attach(Once(lambda: drive._go(state, bench.bus.clock.now_ns())))
+    told = failure(bench)
+    assert told == f"node 1: (joint 1) could not find its home position by method 17: it is {state.name}"
+
+
+def test_a_record_is_gone_before_the_drive_moves(tmp_path):
+    """Whatever happens then, up to a power cut of the master: the zero that it had is not taken for the new one."""
+    bench = Bench(scene_of([17]), tmp_path)
+    bench.home()
+    kept = []
+    bench.bus.attach(Once(lambda: kept.append(json.loads(bench.record.read_text())["nodes"])))
+    bench.home()
+    assert kept == [{}] and json.loads(bench.record.read_text())["nodes"].keys() == {"1"}
+
+
+def test_another_master_that_comes_while_homing_is_named(tmp_path):
+    bench = Bench(scene_of([17], homing_speed_deg_s=10.0), tmp_path)
+    bench.bus.attach(Once(lambda: bench.bus.port().send_batch([pack_nmt(NmtCommand.STOP, 1)])))
+    with pytest.raises(CanprobeError, match="an NMT command from another master"):
+        bench.home()
+
+
+def test_a_node_that_is_lost_stops_the_joint_that_is_homed(tmp_path):
+    fault = Fault(FaultKind.MUTE, 3, 3_000_000_000, 10_000_000_000)
+    bench = Bench(scene_of([17], homing_speed_deg_s=10.0), tmp_path, faults=(fault,))
+    with pytest.raises(NodeError, match="node 3: lost: no heartbeat within its time-out"):
+        bench.home()
+    assert bench.world.nodes[0].application.state is DriveState.SWITCH_ON_DISABLED
+
+
+# What the plan refuses.
+
+
+@pytest.mark.parametrize(
+    ("change_objects", "told"),
+    [
+        (
+            lambda o: changed(o, 0x6098, 0, low=-4, high=14),
+            "6098h:00 = 17 (homing method) is needed: it takes -4 to 14",
+        ),
+        (lambda o: without(o, 0x6098), "6098h:00 = 17 (homing method) is needed: no such object"),
+        (lambda o: without(o, 0x6099), "(speed of the search for the switch) is needed: no such object"),
+        (lambda o: changed(o, 0x607C, 0, access="ro"), "(home offset) is needed: it is ro"),
+        (lambda o: changed(o, 0x6502, 0, default=1 << 7), "needed: homing (6)"),
+    ],
+)
+def test_a_drive_that_cannot_be_homed_is_refused_with_what_it_has(tmp_path, change_objects, told):
+    make = MAKES["late_target"]()
+    changed(make.objects, 0x6502, 0, default=1 << 7 | 1 << 5)
+    change_objects(make.objects)
+    eds = write_eds(make, tmp_path)
+    scene = change(scene_of([17]), arm={"eds": str(eds)}, cycle={"rate_hz": 333.333})
+    assert any(told in problem for problem in reasons(scene))

@@ -1,0 +1,257 @@
+"""Each check of the table of conditions at its limit and just beyond it: the runs that inject faults go far beyond."""
+
+from copy import copy
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from puma_arm import UPENN
+
+import canprobe
+from canprobe.cell.master.conditions import BY_KEY, CONDITIONS
+from canprobe.cell.master.controller import Measurement
+from canprobe.cell.master.supervision import Contact, Limits, Reaction, Seen
+from canprobe.cell.master.supervisor import JointGuard, Supervisor
+from canprobe.cell.master.watch import NodeWatch
+from canprobe.cell.scene.setup import SafetyLimits
+from canprobe.fieldbus.bus.port import ControllerState, PortCounters
+from canprobe.fieldbus.protocol.cia402 import DriveState
+from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, NmtState
+
+LIMITS = Limits(SafetyLimits(5.0, 0.15, 0.0, 1.0, 0.8, None), period_ns=2_500_000)
+PASSIVE = {"controller_state": ControllerState.PASSIVE}
+
+
+def seen(**fields):
+    return Seen(LIMITS, NodeWatch((1, 2)), None, None, PortCounters(), **fields)
+
+
+def with_ages(*ages):
+    """Two drives that were heard last so many cycles ago."""
+    found = seen(measurement=Measurement(100, 0, q_age=ages))
+    found.drives = SimpleNamespace(axes=[SimpleNamespace(node_id=1), SimpleNamespace(node_id=2)])
+    return found
+
+
+def check(key):
+    return BY_KEY[key].check
+
+
+def touch(force=2.0, age=2, lost_s=0.0):
+    return Contact(LIMITS, force, age, lost_s)
+
+
+@pytest.mark.parametrize(
+    ("key", "within", "beyond", "told"),
+    [
+        ("force", touch(5.0), touch(5.001), "5.00 N above the limit of 5.00 N"),
+        ("sensor_stale", touch(age=12), touch(age=13), "no tactile frame for 13 cycles"),
+        ("contact_lost", touch(lost_s=0.0299), touch(lost_s=0.0301), "contact lost"),
+        ("drive_late", with_ages(0, 2), with_ages(0, 3), "node 2: no usable TPDO for 3 cycles"),
+        ("drive_silent", with_ages(5, 0), with_ages(6, 0), "node 1: lost: no usable TPDO for 6 cycles"),
+        ("overruns", seen(late_share=0.8), seen(late_share=0.81), "81.0 % of the last second's cycles"),
+        (
+            "error_passive_long",
+            seen(passive_ns=1_000_000_000, **PASSIVE),
+            seen(passive_ns=1_002_500_000, **PASSIVE),
+            "error-passive for 1.0 s",
+        ),
+        ("error_passive", seen(), seen(passive_ns=1_000_000_000, **PASSIVE), "error-passive"),
+        ("bus_off", seen(**PASSIVE), seen(controller_state=ControllerState.BUS_OFF), "bus-off"),
+    ],
+)
+def test_a_limit_itself_is_kept_and_what_is_beyond_is_named(key, within, beyond, told):
+    assert check(key)(within) is None
+    assert told in str(check(key)(beyond))
+
+
+def test_a_hold_that_took_too_long_is_a_retreat_and_no_longer_a_hold():
+    assert check("error_passive")(seen(passive_ns=1_000_000_001, **PASSIVE)) is None
+
+
+def test_a_heartbeat_is_lost_after_its_time_and_not_in_it():
+    found = seen()
+    for node_id in (1, 2):
+        found.watch.push(HEARTBEAT_BASE + node_id, bytes((NmtState.OPERATIONAL,)), 1_000_000)
+    found.sync_ns = 251_000_000
+    assert check("heartbeat")(found) is None
+    found.watch.push(HEARTBEAT_BASE + 1, bytes((NmtState.OPERATIONAL,)), 251_000_000)
+    found.sync_ns += 1
+    assert "node 2: lost: no heartbeat" in str(check("heartbeat")(found))
+
+
+@pytest.mark.parametrize(("gap_ms", "told"), [(12.5, False), (42.0, True)])
+def test_a_drive_that_stopped_because_the_master_was_held_up_says_so(gap_ms, told):
+    found = seen(measurement=Measurement(100, 0, enabled=False), gap_ns=round(gap_ms * 1e6))
+    first = (0, DriveState.QUICK_STOP_ACTIVE.name)
+    found.drives = SimpleNamespace(axes=[SimpleNamespace(node_id=4)], first_not_in=lambda _: first)
+    text = str(check("drive_fault")(found))
+    assert text.startswith("node 4: (joint 1) left operation enabled: QUICK_STOP_ACTIVE")
+    cause = "; the last SYNC was sent 42 ms after the one before, and the drives stop by themselves 12.5 ms after one"
+    assert (cause in text) is told
+    assert told or text.endswith("QUICK_STOP_ACTIVE")
+
+
+def test_the_documented_table_is_the_one_that_supervises():
+    """Condition, time (of 400 Hz, tactile frames at 200 Hz) and reaction of each row, in the order of precedence."""
+    page = (Path(__file__).parents[3] / "docs" / "supervision.md").read_text(encoding="utf-8")
+    rows = [
+        line.strip("| ").split(" | ") for line in page.partition("| what |")[2].partition("\n\n")[0].splitlines()[2:]
+    ]
+    documented = [(what, within, does.split(":")[0]) for what, _, within, does, _ in rows]
+    assert documented == [
+        (c.what, f"{c.within(LIMITS) / 1e6:g} ms" if c.within is not None else "–", c.reaction.value)
+        for c in CONDITIONS
+    ]
+
+
+# A saturated array tells only a lower bound: what the supervision makes of it for controllers of the user's own.
+
+PERIOD_NS = 5_000_000
+
+
+def test_only_an_unbroken_run_of_saturated_samples_counts():
+    contact = Contact(LIMITS)
+    told = []
+    for k, saturated in enumerate((True, True, True, False, True, True)):
+        contact.feel(SimpleNamespace(force=2.0, saturated=saturated, off_pad=False), k * PERIOD_NS)
+        told.append(contact.hidden_s)
+    assert told == pytest.approx([0.0, 0.005, 0.01, 0.0, 0.0, 0.005])
+
+
+def supervisor(patches):
+    seen = Seen(LIMITS, NodeWatch(()), None, None, PortCounters())
+    return Supervisor(seen, None, lambda sample: patches[sample.cycle])
+
+
+def findings(saturated):
+    patches = [SimpleNamespace(force=2.0, saturated=one, off_pad=False) for one in saturated]
+    return guarded(patches)
+
+
+def guarded(patches):
+    guard = supervisor(patches)
+    samples = [SimpleNamespace(cycle=k, t_sample_ns=k * PERIOD_NS) for k in range(len(patches))]
+    return [guard.guard_contact(Measurement(2 * k, 0, tactile=s, tactile_age=2)) for k, s in enumerate(samples)]
+
+
+def test_an_own_controller_is_guarded_against_it():
+    found = findings([False, True, True, True, True, True, True])
+    assert found[:6] == [None] * 6
+    assert found[6].condition.key == "force_hidden"
+    assert found[6].condition.reaction is Reaction.RETREAT
+    assert "above the 2.0 N measured" in str(found[6].error)
+
+
+def test_a_touch_that_saturates_now_and_then_goes_on():
+    assert findings([True, True, True, True, False] * 6) == [None] * 30
+
+
+def test_nor_may_its_contact_run_off_the_array():
+    running_off = [SimpleNamespace(force=1.0, saturated=False, off_pad=k > 1) for k in range(8)]
+    found = guarded(running_off)
+    assert found[:7] == [None] * 7
+    assert found[7].condition.key == "off_pad" and found[7].condition.reaction is Reaction.RETREAT
+    assert "the true force is above the 1.0 N measured" in str(found[7].error)
+    assert guarded([SimpleNamespace(force=0.05, saturated=False, off_pad=True)] * 20) == [None] * 20, (
+        "no contact at all"
+    )
+
+
+def test_a_press_between_two_retreats_is_not_forgotten():
+    """4 N for 30 ms, then 4 mm straight back within 200 ms: what the array still shows is its memory, and no press."""
+    force, back = [0.0], [0.0]
+
+    class Guard:
+        measure = staticmethod(lambda _: None)
+
+        def T_base_tip(self, _):
+            T = np.eye(4)
+            T[2, 3] = -back[0]
+            return T
+
+    watched = Supervisor(
+        Seen(LIMITS, NodeWatch(()), None, None, PortCounters()), Guard(), lambda _: SimpleNamespace(force=force[0])
+    )
+    for cycle in range(80):
+        force[0] = 4.0 if 4 <= cycle < 16 else 0.3 * (cycle >= 16)
+        back[0] = max(cycle - 16, 0) / 64 * 4e-3
+        sample = SimpleNamespace(cycle=cycle, t_sample_ns=0)
+        measurement = Measurement(cycle, cycle * 2_500_000, q=np.zeros(6), q_age=(0,) * 6, tactile=sample)
+        more = {"counters": PortCounters(), "controller_state": ControllerState.ACTIVE}
+        watched.step(measurement, sync_ns=0, overruns=0, **more)
+        if cycle == 20:
+            assert watched.pressing() == 0.3, "not yet clear of it"
+    assert watched.pressing() == 0.0
+
+
+# The joint guard at its borders: range, speed, and what a measured joint can have done.
+
+GUARD_PERIOD_NS = 2_500_000
+TINY = 1e-6
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return canprobe.load_scene("cylinder")
+
+
+@pytest.fixture
+def guard(scene):
+    return JointGuard(canprobe.plan(scene))
+
+
+def at(q, cycle):
+    return Measurement(cycle, cycle * GUARD_PERIOD_NS, q=np.array(q), q_age=(0,) * 6)
+
+
+@pytest.mark.parametrize("axis", range(6))
+def test_a_target_may_come_as_near_to_a_stop_as_the_margin(scene, guard, axis):
+    model = UPENN
+    margin = np.radians(scene.limits.joint_margin_deg)
+    assert margin > 0
+    for border, inward in ((model.q_min, 1.0), (model.q_max, -1.0)):
+        q = (model.q_min + model.q_max) / 2
+        q[axis] = border[axis] + inward * (margin + TINY)
+        assert guard.command(q, at(q, 0)).q is not None
+        q[axis] -= 2 * inward * TINY
+        answer = guard.command(q, at(q, 1))
+        assert answer.q is None and answer.limit.startswith(f"joint {axis + 1} at ")
+
+
+@pytest.mark.parametrize("axis", range(6))
+def test_a_measured_motion_of_three_halves_of_the_speed_in_two_periods_is_the_most(scene, guard, axis):
+    """A cycle's SYNC may come a period late, so two periods may have passed; two counts are the encoder's own."""
+    model = UPENN
+    speed = model.qd_max[axis] * scene.limits.joint_speed_share
+    most = 1.5 * speed * 2 * GUARD_PERIOD_NS * 1e-9 + 2 * guard.count[axis]
+    for share, believed in ((0.999, True), (-0.999, True), (1.001, False), (-1.001, False)):
+        fresh = copy(guard)
+        assert fresh.measure(at(np.zeros(6), 0)) is None
+        moved = np.zeros(6)
+        moved[axis] = share * most
+        told = fresh.measure(at(moved, 1))
+        assert (told is None) is believed
+        assert believed or told.startswith(f"joint {axis + 1} reports a motion of {np.degrees(most):.1f} deg")
+
+
+def test_a_target_too_far_is_approached_at_the_joints_speed(scene, guard):
+    model = UPENN
+    q = (model.q_min + model.q_max) / 2
+    step = model.qd_max * scene.limits.joint_speed_share * GUARD_PERIOD_NS * 1e-9
+    fresh = copy(guard)
+    np.testing.assert_array_equal(guard.command(q + 0.999 * step, at(q, 0)).q, q + 0.999 * step)
+    assert guard.slowed == 0
+    third = np.eye(6)[2] * step
+    assert fresh.command(q + 3 * third, at(q, 0)).q == pytest.approx(q + third, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [np.ma.masked_all(6), np.zeros(6) + 0j, np.zeros(6, dtype=bool), ["0"] * 6, [None] * 6, [[0.0], [0.0, 0.0]], None],
+    ids=["masked", "complex", "bool", "text", "nothing", "ragged", "None"],
+)
+def test_what_is_no_angle_is_never_sent(scene, guard, given):
+    found = guard.command(given, at(np.zeros(6), 1))
+    assert found.q is None and "expected 6" in found.limit

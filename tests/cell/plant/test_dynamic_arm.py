@@ -1,0 +1,348 @@
+"""The dynamic arm: known systems in its limits, derivatives as stated, asking changes nothing."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from puma_arm import BODIES, ELBOW_FORM, MODELS, UPENN
+from scipy.integrate import solve_ivp
+
+from canprobe.cell.plant.config import PlantConfig
+from canprobe.cell.plant.dynamic_arm import NEVER, DynamicArm, Reference, Stepping, make_arm, make_equations
+from canprobe.cell.plant.equations import Effects
+from canprobe.cell.plant.ideal_arm import IdealArm
+from canprobe.cell.plant.plant import Plant
+from canprobe.cell.scene.setup import Dynamics
+from canprobe.errors import PlanError
+from canprobe.mechanics.robot.chain import Chain, forward, forward_jacobian, from_dh, tool_z_offset
+from canprobe.mechanics.robot.inverse import start_posture
+from canprobe.mechanics.robot.model import ArmModel, Body, Joint, joints_per_motor, joints_to_units, units_per_motor
+from canprobe.mechanics.touch.objects import make_object
+
+CYCLE = 2_500_000
+POINT, TOOL = np.array((-0.120, -0.1225, 0.374)), tool_z_offset(80.0)
+POSE = np.eye(4)
+POSE[:3, 3] = POINT
+CYLINDER = make_object("cylinder", T_base_object=POSE, radius=0.036)
+STRETCHED = np.radians((90.0, 10.0, -60.0, 0.0, 60.0, 0.0))
+NOTHING = Effects(gravity=False, coriolis=False, friction=False, links=False, contact=False)
+
+
+def config(depth=0.43e-3, shape=CYLINDER, **dynamics):
+    q0 = start_posture(UPENN, POINT, (0, 0, 1), ELBOW_FORM, radius_m=0.04, T_flange_probe=TOOL, clearance_m=-depth)
+    settings = Dynamics(**dynamics)
+    return PlantConfig(UPENN, q0, object=shape, fidelity="dynamic", dynamics=settings, bodies=BODIES["puma260"])
+
+
+def state(arm):
+    return arm._y.copy()
+
+
+def ramps(arm, cycles=60, counts=0.5, extra=lambda t: None):
+    """Every motor on a ramp of its own for a while, then at rest: positions in the middle of each cycle."""
+    start, seen = arm.motors()[0], []
+    for k in range(cycles + 20):
+        arm.advance(k * CYCLE)
+        if k < cycles:
+            for i, c in enumerate(start):
+                step = counts * (i + 1)
+                arm.set_ramp(i, c + k * step, c + (k + 1) * step, k * CYCLE, (k + 1) * CYCLE)
+        extra(k * CYCLE)
+        arm.advance(k * CYCLE + 1_000_000)
+        seen.append(arm.motors()[0])
+    return np.array(seen)
+
+
+def test_motors_alone_are_the_ideal_arm():
+    c = config(integral_s=0.0)
+    ideal = ramps(IdealArm(UPENN, c.q0))
+    exact = ramps(DynamicArm(UPENN, c.q0, make_equations(c, NOTHING), Stepping("exponential")))
+    assert exact == pytest.approx(ideal, abs=1e-9)
+    close = ramps(DynamicArm(UPENN, c.q0, make_equations(c, NOTHING), Stepping()))
+    assert 1e-6 < np.abs(close - ideal).max() < 0.01
+
+
+def test_asking_changes_nothing():
+    quiet, curious = make_arm(config()), make_arm(config())
+
+    def ask(t):
+        for dt in (100_000, 370_001, 700_000):
+            curious.advance(t + dt)
+            curious.motors()
+            curious.torque_permille(2)
+
+    assert np.array_equal(ramps(quiet), ramps(curious, extra=ask))
+
+
+@pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
+def test_at_rest_the_motors_carry_the_weight_and_nothing_moves(model):
+    arm = make_arm(replace(config(shape=None), model=model, q0=STRETCHED, bodies=BODIES[model.name]))
+    start = arm.motors()[0]
+    torques = [arm.torque_permille(i) for i in range(6)]
+    arm.advance(500_000_000)
+    assert arm.motors()[0] == pytest.approx(start, abs=1e-6)
+    body = arm.equations.body
+    share = joints_per_motor(UPENN).T @ body.gravity(STRETCHED)
+    assert torques == pytest.approx(1e3 * share / np.array((6.4, 6.4, 6.4, 1.4, 0.7, 0.7)), abs=0.51)
+    assert abs(torques[1]) > 100
+
+
+def test_the_push_of_the_object_is_the_force_through_the_jacobian():
+    c = config(friction=0.0)
+    arm, truth = make_arm(c), Plant(c).truth()
+    free = make_arm(replace(c, object=None))
+    for a in (arm, free):
+        a.equations.hold(state(a))
+    pushed = arm.equations.rate(0.0, state(arm)) - free.equations.rate(0.0, state(free))
+    mass = arm.equations.mass
+    J = forward_jacobian(UPENN.chain, c.q0, TOOL)[1][:3]
+    expected = joints_per_motor(UPENN).T @ J.T @ (truth["force"] * truth["contact_normal"])
+    assert mass @ pushed[6:12] == pytest.approx(expected, rel=1e-9, abs=1e-12)
+    assert truth["force"] > 1.9
+
+
+@pytest.mark.parametrize("rate", [0.3, -0.3, 0.004])
+def test_motors_and_gears_rub_as_published(rate):
+    """Viscous and Coulomb friction of each axis, scaled from the PUMA 560's; tanh turns the sign over 0.01 rad/s."""
+    viscous, coulomb = (0.32, 0.52, 0.22, 0.023, 0.023, 0.012), (2.2, 1.1, 0.57, 0.10, 0.083, 0.064)
+    c = config(shape=None)
+    y = state(make_arm(c)) + np.repeat((0.0, rate, 0.0), 6)
+    rough, smooth = make_equations(c), make_equations(c, Effects(friction=False))
+    for e in (rough, smooth):
+        e.hold(y)
+    drag = rough.mass @ (rough.rate(0.0, y) - smooth.rate(0.0, y))[6:12]
+    expected = np.array(viscous) * rate + np.array(coulomb) * np.tanh(rate / 0.01)
+    assert drag == pytest.approx(-expected, rel=1e-9)
+
+
+def test_friction_drags_against_the_sliding_and_never_feeds_it():
+    c = config()
+    arm, smooth = make_arm(c), make_arm(replace(c, dynamics=replace(c.dynamics, friction=0.0)))
+    y = state(arm)
+    y[6:9] = 0.02, -0.03, 0.05
+    for a in (arm, smooth):
+        a.equations.hold(y)
+    mass = arm.equations.mass
+    drag = mass @ (arm.equations.rate(0.0, y) - smooth.equations.rate(0.0, y))[6:12]
+    power = float(drag @ y[6:12])
+    sliding = np.linalg.norm(arm.equations.contact.rows[1:, 0] @ y[6:12])
+    normal_force = Plant(c).truth()["force"]
+    assert sliding > 5e-3
+    assert power == pytest.approx(-0.3 * normal_force * sliding, rel=0.05)
+
+
+def test_jacobian_is_the_slope_and_the_shifted_solver_solves():
+    c = config()
+    arm = make_arm(c)
+    e, y = arm.equations, state(arm)
+    y[6:12] = 0.004, -0.006, 0.01, 0.02, -0.03, 0.01
+    y[14] += 20.0  # one motor at its torque limit
+    e.hold(y)
+    e.loops.set_reference(0.0, y[:6] + 1e-4, np.full(6, 0.1))
+    slope = np.array([(e.rate(0.0, y + d) - e.rate(0.0, y - d)) / 2e-7 for d in 1e-7 * np.eye(18)]).T
+    J = e.jacobian(0.0, y)
+    left_out = np.zeros((18, 18))
+    assert J[:, 6:] == pytest.approx((slope + left_out)[:, 6:], rel=1e-4, abs=1e-3 * np.abs(J).max() * 1e-3)
+    drift = (e.rate(1e-6, y) - e.rate(-1e-6, y)) / 2e-6
+    assert e.drift(0.0, y) == pytest.approx(drift, rel=1e-5, abs=1e-5)
+    r = np.random.default_rng(0).normal(size=18)
+    assert e.linearised(0.0, y, 7e-4).solve(r) == pytest.approx(
+        np.linalg.solve(np.eye(18) - 7e-4 * J, r), rel=1e-9, abs=1e-12
+    )
+
+
+def test_torque_ends_at_its_limit_and_the_motor_arrives_all_the_same():
+    weak = make_arm(replace(config(shape=None, torque_limit_permille=1000), q0=ELBOW_FORM))
+    start = weak.motor_counts(0)
+    weak.set_ramp(0, start, start + 2000.0, 0, 10_000_000)
+    most = 0
+    for k in range(400):
+        weak.advance(k * CYCLE)
+        most = max(most, abs(weak.torque_permille(0)))
+    assert most == 1000
+    assert weak.motor_counts(0) == pytest.approx(start + 2000.0, abs=2.0)
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_velocity_feed_forward_removes_the_lag(share):
+    arm = make_arm(replace(config(shape=None, velocity_feed_forward=share), q0=ELBOW_FORM))
+    start, speed = arm.motor_counts(0), 4000.0
+    arm.set_ramp(0, start, start + speed, 0, 1_000_000_000)
+    arm.advance(900_000_000)
+    behind = (start + 0.9 * speed - arm.motor_counts(0)) / speed
+    assert behind == pytest.approx((1.0 - share) * IdealArm(UPENN, ELBOW_FORM).lag_s, abs=2e-5)
+
+
+def test_the_wrists_coupling_moves_the_motors_of_joints_5_and_6():
+    """Motor coordinates of a turn of joint 4 alone: what the master's decoupling matrix says, in counts."""
+    turn = np.array((0, 0, 0, 0.1, 0, 0))
+    counts = joints_to_units(UPENN, turn)
+    assert np.linalg.inv(joints_per_motor(UPENN)) @ turn * units_per_motor(UPENN) == pytest.approx(counts, abs=1e-9)
+    assert counts[4] == pytest.approx(-9.8462 * 800 * 0.1 / (2 * np.pi))
+
+
+def test_held_dynamics_cost_little_in_a_cycle():
+    """Mass matrix, bias and geometry held over 2.5 ms against evaluated in every call, over a moving contact."""
+    c = config()
+    held = ramps(DynamicArm(UPENN, c.q0, make_equations(c), Stepping(step_ns=625_000)), cycles=20)
+    free = ramps(DynamicArm(UPENN, c.q0, make_equations(c, held=False), Stepping(step_ns=625_000)), cycles=20)
+    assert 0.0 < np.abs(held - free).max() < 0.05
+
+
+def test_references_bend_where_they_should():
+    r = Reference(10.0)
+    assert r.at(0) == (10.0, 0.0)
+    assert r.next_bend(0) == NEVER
+    r.add((100, 200, 10.0, 30.0), 0)
+    r.add((300, 300, 30.0, 5.0), 0)
+    assert [r.next_bend(t) for t in (0, 100, 200, 300)] == [100, 200, 300, NEVER]
+    assert r.at(150) == (20.0, pytest.approx(2e8))
+    assert r.at(250) == (30.0, 0.0)
+    assert r.at(300) == (5.0, 0.0)
+    r.add((120, 220, 14.0, 0.0), 160)
+    assert r.at(170) == (pytest.approx(7.0), pytest.approx(-1.4e8))
+    assert r.at(400) == (0.0, 0.0)
+
+
+# Arms of other kinds: seven joints, and a gantry of three slides that carries the probe downwards.
+
+
+def solids(n):
+    return tuple(Body(2.0 - 0.2 * i, np.array((0.0, 0.02, 0.05)), 4e-3 * np.eye(3)) for i in range(n))
+
+
+def seven():
+    """Spherical shoulder, elbow, spherical wrist; drives geared one to one hundred, one counting backwards."""
+    right, rows = math.pi / 2, []
+    for i, d in enumerate((0.34, 0.0, 0.4, 0.0, 0.4, 0.0, 0.126)):
+        rows.append((0.0, 0.0 if i == 6 else right if i % 2 else -right, d, 0.0))
+    chain = from_dh(rows, name="seven")
+    joints = tuple(Joint(name, False, -3.0, 3.0, 2.0, rated_torque=40.0, rotor_inertia=0.2) for name in chain.joints)
+    units = np.diag((1.0, -1.0, 1.0, 1.0, 1.0, 1.0, 1.0)) * 1e5 / (2 * math.pi)
+    q0 = np.radians((10.0, 30.0, -15.0, -80.0, 20.0, 70.0, 5.0))
+    return ArmModel(chain, joints, units, np.arange(7) * 1000.0), q0
+
+
+def gantry():
+    """Slides along base x, y and z; the flange looks down."""
+    fixed, flange = np.array([np.eye(4)] * 3), np.eye(4)
+    x_up = np.array(((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))  # z along base x
+    y_up = x_up @ x_up  # z along base y
+    fixed[0, :3, :3], fixed[1, :3, :3], fixed[2, :3, :3] = x_up, x_up.T @ y_up, y_up.T
+    flange[:3, :3] = np.diag((1.0, -1.0, -1.0))
+    chain = Chain("gantry", ("x", "y", "z"), (True,) * 3, fixed, flange)
+    slide = {"rated_torque": 100.0, "rotor_inertia": 5.0, "coulomb": 3.0, "viscous": 20.0}
+    joints = tuple(Joint(name, True, -0.5, 0.5, 0.5, **slide) for name in chain.joints)
+    return ArmModel(chain, joints, 1e6 * np.eye(3), np.zeros(3)), np.array((0.1, -0.05, 0.2))
+
+
+def on_a_plane(model, q0, depth=2e-4):
+    """The arm with its probe pressed into a plane under it."""
+    centre = (forward(model.chain, q0) @ TOOL)[:3, 3]
+    pose = np.eye(4)
+    pose[:3, 3] = centre - (0.0, 0.0, 0.04 - depth)
+    shape = make_object("plane", T_base_object=pose)
+    return PlantConfig(model, q0, object=shape, fidelity="dynamic", bodies=solids(model.n))
+
+
+OTHERS = pytest.mark.parametrize("made", [seven, gantry])
+
+
+@OTHERS
+def test_any_arm_carries_its_weight_and_stands_off_the_object(made):
+    model, q0 = made()
+    c = on_a_plane(model, q0)
+    free = make_arm(replace(c, object=None))
+    rest = free.motors()[0]
+    torques = [free.torque_permille(i) for i in range(model.n)]
+    free.advance(200_000_000)
+    assert free.motors()[0] == pytest.approx(rest, abs=1e-3)
+    assert free.q == pytest.approx(q0, abs=1e-8)
+    weight = joints_per_motor(model).T @ free.equations.body.gravity(q0)
+    rated = np.sign(units_per_motor(model)) * [joint.rated_torque for joint in model.joints]  # in the drive's own sense
+    assert torques == pytest.approx(1e3 * weight / rated, abs=0.51)
+    if made is gantry:  # masses of z and the probe
+        assert weight == pytest.approx((0.0, 0.0, 9.81 * (1.6 + 0.3)), abs=1e-9)
+        assert np.diag(free.equations.mass) == pytest.approx(5.0 + np.array((5.7, 3.7, 1.9)))  # with rotors
+    pressed = Plant(c)
+    before = pressed.truth()["force"]
+    pressed.advance(500_000_000)
+    after = pressed.truth()["force"]
+    assert before > 0.4
+    assert after == pytest.approx(before, rel=0.02)  # friction holds the rest
+
+
+@OTHERS
+def test_the_push_on_any_arm_is_the_force_through_its_jacobian(made):
+    model, q0 = made()
+    c = replace(on_a_plane(model, q0), dynamics=Dynamics(friction=0.0))
+    truth = Plant(c).truth()
+    equations = make_equations(c)
+    theta = np.linalg.solve(joints_per_motor(model), q0)
+    equations.hold(equations.resting(theta))
+    J = forward_jacobian(model.chain, q0, TOOL)[1][:3] @ joints_per_motor(model)
+    push = equations.contact.push(theta, np.zeros(model.n))
+    assert push == pytest.approx(J.T @ (truth["force"] * truth["contact_normal"]), rel=1e-9, abs=1e-12)
+
+
+@OTHERS
+def test_any_arm_follows_its_drives_as_scipys_radau_integrates_it(made):
+    """Every motor on a ramp of its own, sliding over the plane, nothing held in the reference."""
+    model, q0 = made()
+    c = on_a_plane(model, q0)
+    arm, exact, cycles = make_arm(c), make_equations(c, held=False), 8
+    scale = units_per_motor(model)
+    start, step = np.array(arm.motors()[0]), 4e-5 * scale * (1.0 + np.arange(model.n)) / model.n
+    y = exact.resting((start - model.zero_units) / scale)
+    for k in range(cycles):
+        t = k * CYCLE
+        for i in range(model.n):
+            arm.set_ramp(i, start[i] + k * step[i], start[i] + (k + 1) * step[i], t, t + CYCLE)
+        arm.advance(t + CYCLE)
+        at = (start + k * step - model.zero_units) / scale
+        exact.loops.set_reference(1e-9 * t, at, step / scale / (1e-9 * CYCLE))
+        span = 1e-9 * t, 1e-9 * (t + CYCLE)
+        y = solve_ivp(exact.rate, span, y, "Radau", rtol=1e-8, atol=1e-11, jac=exact.jacobian).y[:, -1]
+    n = model.n
+    moved = np.array(arm.motors()[0]) - start
+    assert moved == pytest.approx(y[:n] * scale + model.zero_units - start, abs=2e-3 * np.abs(moved).max())
+    assert np.array(arm.motors()[1]) == pytest.approx(y[n : 2 * n] * scale, abs=1e-2 * np.abs(arm.motors()[1]).max())
+    assert np.abs(moved).max() > 3.0
+
+
+@OTHERS
+def test_slopes_of_any_arm_are_those_of_its_equations(made):
+    model, q0 = made()
+    n, e = model.n, make_equations(on_a_plane(model, q0))
+    y = e.resting(np.linalg.solve(joints_per_motor(model), q0))
+    y[n : 2 * n] = 1e-3 * (1.0 + np.arange(n))
+    y[2 * n] += 1e4  # one motor at its limit
+    e.hold(y)
+    e.loops.set_reference(0.0, y[:n] + 1e-4, np.full(n, 0.1))
+    J = e.jacobian(0.0, y)
+    slope = np.array([(e.rate(0.0, y + d) - e.rate(0.0, y - d)) / 2e-7 for d in 1e-7 * np.eye(3 * n)]).T
+    assert J[:, n:] == pytest.approx(slope[:, n:], rel=1e-4, abs=1e-5 * np.abs(J).max())
+    r = np.random.default_rng(0).normal(size=3 * n)
+    solved = e.linearised(0.0, y, 7e-4).solve(r)
+    assert solved == pytest.approx(np.linalg.solve(np.eye(3 * n) - 7e-4 * J, r), rel=1e-8, abs=1e-9)
+
+
+@OTHERS
+def test_an_ideal_arm_of_any_kind_follows_too(made):
+    model, q0 = made()
+    plant = Plant(replace(on_a_plane(model, q0), fidelity="ideal", bodies=None))
+    goal = joints_to_units(model, q0 + 0.01)
+    for i in range(model.n):
+        plant.set_ramp(i, plant.motor_counts(i), float(goal[i]), 0, 50_000_000)
+    plant.advance(10_000_000)
+    senses = np.sign(goal - joints_to_units(model, q0))
+    assert [np.sign(plant.torque_permille(i)) for i in range(model.n)] == senses.tolist()
+    plant.advance(500_000_000)
+    assert plant.truth()["q"] == pytest.approx(q0 + 0.01, abs=1e-9)
+    assert plant.truth()["probe_centre"] == pytest.approx((forward(model.chain, q0 + 0.01) @ TOOL)[:3, 3], abs=1e-9)
+
+
+def test_an_arm_without_bodies_has_no_dynamics():
+    with pytest.raises(PlanError, match="the masses of arm 'puma260' are not known"):
+        make_arm(replace(config(), bodies=None))

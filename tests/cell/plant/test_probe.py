@@ -1,0 +1,88 @@
+"""Elastic contact: published values, the integral of the pressure, damping that never pulls."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from canprobe.cell.plant.probe import NO_CONTACT, depth_for_force, elastic_contact
+
+K, R = 1.27e8, 0.040
+PLANE, CYLINDER, SADDLE = (0.0, 0.0), (1 / 0.036, 0.0), (1 / 0.06, -1 / 0.08)
+SURFACES = pytest.mark.parametrize("kappa", [PLANE, CYLINDER, SADDLE], ids=["plane", "cylinder", "saddle"])
+
+
+def test_published_values_on_a_plane():
+    depth = depth_for_force(1.0, PLANE, R, K)
+    c = elastic_contact(depth, PLANE, R, K)
+    assert depth == pytest.approx(0.25e-3, rel=0.01)
+    assert (c.force, c.a, c.b) == pytest.approx((1.0, 4.47e-3, 4.47e-3), rel=2e-3)
+    assert c.stiffness == pytest.approx(8e3, rel=0.01)
+
+
+def test_published_values_on_the_cylinder():
+    depth = depth_for_force(2.0, CYLINDER, R, K)
+    c = elastic_contact(depth, CYLINDER, R, K)
+    assert depth == pytest.approx(0.426e-3, rel=2e-3)
+    assert (c.a, c.b) == pytest.approx((4.02e-3, 5.84e-3), rel=2e-3)
+    assert c.stiffness == pytest.approx(9.4e3, rel=5e-3)
+    assert 45e3 < c.peak_pressure < 64e3
+
+
+@SURFACES
+def test_force_and_area_are_the_integrals_over_the_patch(kappa):
+    depth = 0.4e-3
+    c = elastic_contact(depth, kappa, R, K)
+    axis = np.linspace(-12e-3, 12e-3, 1201)
+    x, y = np.meshgrid(axis, axis)
+    gap = 0.5 * (1 / R + kappa[0]) * x**2 + 0.5 * (1 / R + kappa[1]) * y**2
+    pressure = K * np.maximum(depth - gap, 0.0)
+    cell = (axis[1] - axis[0]) ** 2
+    assert c.force == pytest.approx(pressure.sum() * cell, rel=1e-4)
+    assert c.area == pytest.approx(np.count_nonzero(pressure) * cell, rel=2e-3)
+    assert c.peak_pressure == pytest.approx(pressure.max(), rel=1e-9)
+
+
+@SURFACES
+def test_stiffness_is_the_slope_of_the_force(kappa):
+    h = 1e-8
+    slope = (elastic_contact(3e-4 + h, kappa, R, K).force - elastic_contact(3e-4 - h, kappa, R, K).force) / (2 * h)
+    assert elastic_contact(3e-4, kappa, R, K).stiffness == pytest.approx(slope, rel=1e-6)
+
+
+@given(force=st.floats(1e-3, 50.0), k1=st.floats(-20.0, 200.0), k2=st.floats(-20.0, 200.0))
+def test_depth_for_force_is_the_inverse(force, k1, k2):
+    kappa = (max(k1, k2), min(k1, k2))
+    assert elastic_contact(depth_for_force(force, kappa, R, K), kappa, R, K).force == pytest.approx(force, rel=1e-12)
+
+
+def test_damping_adds_while_loading_and_never_pulls():
+    still = elastic_contact(3e-4, PLANE, R, K)
+    loading = elastic_contact(3e-4, PLANE, R, K, depth_rate=0.01, damping=0.3)
+    leaving = elastic_contact(3e-4, PLANE, R, K, depth_rate=-0.01, damping=0.3)
+    torn_off = elastic_contact(3e-4, PLANE, R, K, depth_rate=-5.0, damping=0.3)
+    assert loading.force == pytest.approx(still.force * (1 + 1.5 * 0.3 * 0.01))
+    assert leaving.force == pytest.approx(still.force * (1 - 1.5 * 0.3 * 0.01))
+    assert loading.peak_pressure / still.peak_pressure == pytest.approx(loading.damping_factor)
+    assert torn_off.force == 0.0
+
+
+def test_a_closed_cycle_takes_energy_out():
+    t = np.linspace(0.0, 1.0, 20001)
+    depth, rate = 3e-4 * np.sin(math.pi * t) ** 2, 3e-4 * math.pi * np.sin(2 * math.pi * t)
+    force = [elastic_contact(d, PLANE, R, K, depth_rate=v, damping=0.3).force for d, v in zip(depth, rate, strict=True)]
+    elastic = [elastic_contact(d, PLANE, R, K).force for d in depth]
+    assert np.trapezoid(np.array(force) * rate, t) > 0.0
+    assert np.trapezoid(np.array(elastic) * rate, t) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_no_contact_without_depth():
+    assert elastic_contact(0.0, PLANE, R, K) is NO_CONTACT
+    assert elastic_contact(-1e-3, PLANE, R, K, depth_rate=1.0, damping=1.0).force == 0.0
+
+
+def test_a_hollow_as_tight_as_the_probe_is_refused_with_its_radius():
+    with pytest.raises(ValueError, match=r"radius 39\.00 mm is not wider than the probe \(40\.00 mm\)"):
+        elastic_contact(1e-4, (0.0, -1 / 0.039), R, K)

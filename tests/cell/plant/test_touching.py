@@ -1,0 +1,284 @@
+"""Forces of every object as the slope of one energy; several touches; energy in closed cycles."""
+
+import math
+from functools import partial
+
+import numpy as np
+import pytest
+from puma_arm import BODIES, ELBOW_FORM, UPENN
+
+from canprobe.cell.plant.config import PlantConfig
+from canprobe.cell.plant.dynamic_arm import make_equations
+from canprobe.cell.plant.equations import Effects, rosenbrock2
+from canprobe.cell.plant.plant import Plant
+from canprobe.cell.plant.probe import elastic_contact
+from canprobe.cell.plant.pushing import force_laws, total_force
+from canprobe.cell.plant.taxels import IDEAL_TAXELS
+from canprobe.cell.scene.setup import Dynamics
+from canprobe.fieldbus.protocol.tactile import SIDE
+from canprobe.mechanics.robot.chain import forward, forward_jacobian, tool_z_offset
+from canprobe.mechanics.robot.inverse import start_posture
+from canprobe.mechanics.robot.model import joints_per_motor, joints_to_units
+from canprobe.mechanics.touch.objects import make_object
+from canprobe.mechanics.touch.shapes import LIP_M
+
+K, R = 1.27e8, 0.040
+POINT, TOOL = np.array((-0.120, -0.1225, 0.374)), tool_z_offset(80.0)
+POSE = np.eye(4)
+POSE[:3, 3] = POINT
+TILTED = np.array(((0.8, 0.0, 0.6), (0.0, 1.0, 0.0), (-0.6, 0.0, 0.8)))
+QUADRIC = np.array([[6.0, 2.0, 0.5, 0.0], [2.0, -3.0, 1.0, 0.0], [0.5, 1.0, 4.0, 0.5], [0.0, 0.0, 0.5, 0.0]])
+OBJECTS = {
+    "plane": {},
+    "sphere": {"radius": 0.05},
+    "cylinder": {"radius": 0.036},
+    "ellipsoid": {"radius_x": 0.06, "radius_y": 0.045, "radius_z": 0.035},
+    "saddle": {"radius_x": 0.06, "radius_y": -0.08},
+    "quadric": {"matrix": QUADRIC},
+    "torus": {"ring_radius": 0.09, "radius": 0.03},
+    "wave": {"amplitude": 0.002, "wavelength": 0.09},
+    "fillet": {"radius": 0.03, "angle": 1.0},
+    "bowl": {"radius": 0.08},
+}
+EACH = pytest.mark.parametrize("kind", OBJECTS)
+
+
+def tilted(kind):
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = TILTED, POINT
+    return make_object(kind, T_base_object=T, **OBJECTS[kind])
+
+
+@EACH
+def test_force_is_the_slope_of_the_energy(kind):
+    """Elastic energy coefficient depth^3 / 3. Where the curvature varies the law holds it: the slope is then that of
+    the energy at the curvature of the touched point."""
+    shape = tilted(kind)
+    centre = POINT + TILTED @ (0.001, 0.002, R - 3e-4)
+    foot = shape.closest(centre)
+    kappa = (float(foot.kappa[0]), float(foot.kappa[1]))
+
+    def energy(p):
+        depth = R - shape.closest(p).distance
+        return elastic_contact(depth, kappa, R, K).force * depth / 3.0
+
+    h = 1e-7
+    slope = [(energy(centre + d) - energy(centre - d)) / (2 * h) for d in h * np.eye(3)]
+    force = elastic_contact(R - foot.distance, kappa, R, K).force * foot.normal
+    assert force == pytest.approx(-np.array(slope), abs=1e-5 * np.linalg.norm(force))
+    assert np.linalg.norm(force) > 0.5
+
+
+def ring_energy(shape, p):
+    found = shape.touches(p, R)
+    coefficient, exponent = force_laws(found, R, K)
+    return float(np.sum(coefficient * (R - found.distances) ** (exponent + 1) / (exponent + 1)))
+
+
+TIGHT_BOWL = make_object("bowl", T_base_object=POSE, radius=0.03)
+RESTS_AT = 0.03 + math.sqrt((R + LIP_M) ** 2 - (0.03 + LIP_M) ** 2)
+
+
+@pytest.mark.parametrize("aside", [(0.0, 0.0), (1e-4, -5e-5), (4e-4, 2e-4)])
+def test_the_lips_force_is_the_slope_of_its_energy(aside):
+    centre = POINT + np.array((*aside, RESTS_AT - 3e-4))
+    zero = np.zeros(360)
+    found = TIGHT_BOWL.touches(centre, R)
+    force = total_force(found, R, K, zero[: len(found.points)], 0.0)
+    h = 1e-8
+    slope = [
+        (ring_energy(TIGHT_BOWL, centre + d) - ring_energy(TIGHT_BOWL, centre - d)) / (2 * h) for d in h * np.eye(3)
+    ]
+    assert force == pytest.approx(-np.array(slope), abs=1e-4 * np.linalg.norm(force))
+    if aside == (0.0, 0.0):
+        assert force[:2] == pytest.approx((0.0, 0.0), abs=1e-9)
+        assert force[2] > 1.0
+    else:
+        assert force[:2] @ aside < 0.0  # it centres the ball
+
+
+def test_pieces_of_a_lip_add_up_to_the_law_of_a_point():
+    """A small ball on the lip of a wide bowl touches it over a short stretch: one elliptic patch."""
+    wide, ball, depth = make_object("bowl", T_base_object=np.eye(4), radius=0.06), 0.03, 2e-4
+    ring, lean = 0.06 + LIP_M, math.radians(70.0)
+    reach = ball + LIP_M - depth
+    centre = np.array((ring - reach * math.cos(lean), 0.0, 0.06 + reach * math.sin(lean)))
+    found, one = wide.touches(centre, ball), wide.closest(centre)
+    assert one.distance == pytest.approx(ball - depth, abs=1e-12)
+    total = total_force(found, ball, K, np.zeros(len(found.points)), 0.0)
+    expected = elastic_contact(depth, (float(one.kappa[0]), float(one.kappa[1])), ball, K).force
+    assert np.linalg.norm(total) == pytest.approx(expected, rel=0.04)
+    assert total / np.linalg.norm(total) == pytest.approx(one.normal, abs=0.02)
+
+
+def arm_over(shape, depth=2e-4, *, friction=0.0, point=POINT, **config):
+    q0 = start_posture(UPENN, point, (0, 0, 1), ELBOW_FORM, radius_m=R, T_flange_probe=TOOL, clearance_m=-depth)
+    settings, bodies = Dynamics(friction=friction), BODIES["puma260"]
+    return PlantConfig(UPENN, q0, object=shape, fidelity="dynamic", dynamics=settings, bodies=bodies, **config)
+
+
+def equations_of(config, held=False):
+    found = make_equations(config, Effects(gravity=False, coriolis=True, friction=False), held=held)
+    found.loops.gain, found.loops.integral, found.loops.unwind = np.zeros(6), np.zeros(6), 0.0
+    return found
+
+
+def bounced(config, steps=700, h=4e-4, speed=0.05):
+    """A free arm thrown at the object: kinetic energy before, and after it has left again."""
+    e = equations_of(config)
+    theta = joints_to_units(UPENN, config.q0) / np.diag(UPENN.units_per_q)
+    e.hold(e.resting(theta))
+    away = e.contact.rows[0].mean(axis=0)
+    v = -e.inverse @ away
+    v *= speed / abs(float(away @ v))
+    y = np.concatenate((theta, v, np.zeros(6)))
+
+    def kinetic(y):
+        e.hold(y)
+        return 0.5 * float(y[6:12] @ e.mass @ y[6:12])
+
+    before, deepest = kinetic(y), 0.0
+    for i in range(steps):
+        y = rosenbrock2(e, i * h, y, h)
+        e.hold(y)
+        push = e.contact.push(y[:6], y[6:12]) if e.contact is not None else None
+        deepest = max(deepest, 0.0 if push is None else float(np.abs(push).max()))
+        if push is None and i > 20:
+            break
+    assert deepest > 0.0
+    assert push is None, "it has not left the object again"
+    return before, kinetic(y)
+
+
+@pytest.mark.parametrize("kind", [*OBJECTS, "tight bowl"])
+def test_a_bounce_creates_no_energy_and_without_damping_loses_none(kind):
+    shape, point = TIGHT_BOWL, POINT + np.array((0.0, 0.0, RESTS_AT - R))
+    if kind in OBJECTS:
+        shape, point = make_object(kind, T_base_object=POSE, **OBJECTS[kind]), POINT
+    before, after = bounced(arm_over(shape, depth=0.0, point=point, damping_s_m=0.0))
+    assert after == pytest.approx(before, rel=5e-3)
+    before, after = bounced(arm_over(shape, depth=0.0, point=point, damping_s_m=5.0))
+    assert 0.5 * before < after < 0.97 * before
+
+
+def test_a_bounce_with_rubbing_loses_energy():
+    before, after = bounced(arm_over(make_object("cylinder", T_base_object=POSE, radius=0.036), depth=0.0, friction=0.3,
+                                     damping_s_m=0.0))  # fmt: skip
+    assert after < before
+
+
+def places(shape, centre):
+    """Normals, and elastic forces of all touches of the probe."""
+    found = shape.touches(centre, R)
+    if found is None:
+        foot = shape.closest(centre)
+        kappa = float(foot.kappa[0]), float(foot.kappa[1])
+        return [(foot.normal, elastic_contact(R - foot.distance, kappa, R, K).force, R - foot.distance)]
+    coefficient, exponent = force_laws(found, R, K)
+    depth = np.maximum(R - found.distances, 0.0)
+    return list(zip(found.normals, coefficient * depth**exponent, depth, strict=True))
+
+
+@pytest.mark.parametrize(("kind", "height"), [("cylinder", 0.0), ("saddle", 0.0), ("tight bowl", RESTS_AT - R)])
+def test_push_is_that_of_points_of_the_probe_moved_by_finite_differences(kind, height):
+    """Each touch: elastic force, its damping against the speed there, friction against the slip there."""
+    shape = TIGHT_BOWL if kind == "tight bowl" else make_object(kind, T_base_object=POSE, **OBJECTS[kind])
+    config = arm_over(shape, 3e-4, friction=0.3, point=POINT + np.array((2e-4, 1e-4, height)), damping_s_m=5.0)
+    e, back = make_equations(config), joints_per_motor(UPENN)
+    theta = np.linalg.solve(back, config.q0)
+    rate = np.array((0.05, -0.04, 0.06, 0.2, -0.3, 0.1))
+    e.hold(e.resting(theta))
+    centre = (forward(UPENN.chain, config.q0) @ TOOL)[:3, 3]
+    expected = np.zeros(6)
+    for normal, elastic, depth in places(shape, centre):
+        on_flange = np.linalg.solve(forward(UPENN.chain, config.q0), (*(centre - (R - depth) * normal), 1.0))
+        step, flange = 1e-6 * np.eye(6), partial(forward, UPENN.chain)
+        J = np.array([
+            (flange(back @ (theta + d)) @ on_flange - flange(back @ (theta - d)) @ on_flange)[:3] / 2e-6
+            for d in step
+        ]).T  # fmt: skip
+        v = J @ rate
+        force = elastic * max(0.0, 1.0 - 1.5 * 5.0 * (normal @ v))
+        slip = v - (normal @ v) * normal
+        expected += J.T @ (force * normal - 0.3 * force * slip / math.sqrt(slip @ slip + 1e-6))
+    push = e.contact.push(theta, rate)
+    assert push == pytest.approx(expected, rel=2e-5, abs=2e-5 * np.abs(expected).max())
+    assert np.abs(expected).max() > 0.1
+
+
+@pytest.mark.parametrize(("kind", "height"), [("cylinder", 0.0), ("tight bowl", RESTS_AT - R)])
+def test_a_touch_that_is_left_quickly_does_not_pull(kind, height):
+    shape = TIGHT_BOWL if kind == "tight bowl" else make_object(kind, T_base_object=POSE, **OBJECTS[kind])
+    config = arm_over(shape, 3e-4, friction=0.3, point=POINT + np.array((0.0, 0.0, height)), damping_s_m=5.0)
+    e, back = make_equations(config), joints_per_motor(UPENN)
+    theta = np.linalg.solve(back, config.q0)
+    e.hold(e.resting(theta))
+    up = np.linalg.solve(forward_jacobian(UPENN.chain, config.q0, TOOL)[1] @ back, (0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
+    assert not e.contact.push(theta, up).any()
+    assert np.abs(e.contact.push(theta, 0.01 * up)).max() > 0.1
+
+
+def test_slopes_of_several_touches_are_those_of_their_push():
+    top = POINT + np.array((2e-4, 1e-4, RESTS_AT - R))
+    e = make_equations(arm_over(TIGHT_BOWL, 3e-4, point=top, damping_s_m=5.0))
+    theta = joints_to_units(UPENN, arm_over(TIGHT_BOWL, 3e-4, point=top).q0) / np.diag(UPENN.units_per_q)
+    rate = np.array((0.05, -0.04, 0.06, 0.2, -0.3, 0.1))
+    e.hold(e.resting(theta))
+
+    push, (pushed, by_theta, by_rate) = e.contact.push, e.contact.linearised(theta, rate)
+    assert pushed == pytest.approx(push(theta, rate))
+    for given, at in (
+        (by_theta, lambda d: push(theta + d, rate)),
+        (by_rate, lambda d: push(theta, rate + d)),
+    ):
+        slope = np.array([(at(d) - at(-d)) / 2e-6 for d in 1e-6 * np.eye(6)]).T
+        assert -given == pytest.approx(slope, abs=1e-4 * np.abs(slope).max())
+
+
+@pytest.mark.parametrize("speed", [-0.05, 0.05])
+def test_a_plant_on_a_lip_presses_harder_while_it_sinks(speed):
+    config = arm_over(TIGHT_BOWL, 3e-4, point=POINT + np.array((0.0, 0.0, RESTS_AT - R)), damping_s_m=2.0)
+    plant = Plant(config)
+    still = plant.state()
+    J = forward_jacobian(UPENN.chain, config.q0, TOOL)[1]
+    rates = joints_to_units(UPENN, np.linalg.solve(J, (0.0, 0.0, speed, 0.0, 0.0, 0.0)))
+    force = plant.truth(still._replace(rates=tuple(rates.tolist())))["force"]
+    upward = TIGHT_BOWL.touches(plant.truth(still)["probe_centre"], R).normals[0, 2]
+    assert force == pytest.approx(plant.truth(still)["force"] * (1.0 - 1.5 * 2.0 * upward * speed), rel=1e-9)
+
+
+def test_the_plant_rests_a_large_probe_on_a_bowl():
+    top = POINT + np.array((0.0, 0.0, RESTS_AT - R))
+    config = arm_over(TIGHT_BOWL, 3e-4, point=top, taxels=IDEAL_TAXELS)
+    plant = Plant(config)
+    truth, image = plant.truth(), plant.sample_image(5_000_000)
+    expected = total_force(TIGHT_BOWL.touches(truth["probe_centre"], R), R, K, np.zeros(360), 0.0)
+    assert truth["force"] == pytest.approx(np.linalg.norm(expected), rel=1e-9)
+    assert truth["in_contact"]
+    plant.advance(200_000_000)
+    assert plant.truth()["force"] == pytest.approx(truth["force"], rel=0.2)
+    assert image.shape == (SIDE, SIDE)  # the lip lies off the pad: 29 mm from its pole
+    assert not image.any()
+
+
+def test_an_image_of_two_walls_shows_two_patches():
+    trough = make_object("wave", T_base_object=POSE, amplitude=0.0045, wavelength=0.07)
+    bottom = POINT + np.array((0.0, 0.035, -0.009))
+    ball, probe = 0.045, tool_z_offset(80.0)
+    q0 = start_posture(UPENN, bottom, (0, 0, 1), ELBOW_FORM, radius_m=ball, T_flange_probe=probe, clearance_m=1e-5)
+    for lift in np.arange(0.0, 3e-3, 2e-5):
+        centre = bottom + np.array((0.0, 0.0, ball + lift))
+        if trough.closest(centre).distance > ball - 4e-4:
+            break
+    q0 = start_posture(
+        UPENN, bottom, (0, 0, 1), ELBOW_FORM, radius_m=ball, T_flange_probe=probe, clearance_m=float(lift)
+    )
+    plant = Plant(PlantConfig(UPENN, q0, object=trough, radius_m=ball, taxels=IDEAL_TAXELS))
+    assert len(trough.touches(plant.truth()["probe_centre"], ball).points) == 2
+    image = plant.sample_image(5_000_000).astype(float)
+    profiles = [image.sum(axis=0), image.sum(axis=1)]
+    across = max(profiles, key=lambda p: p.std())
+    assert image.any()
+    middle = across[SIDE // 2 - 2 : SIDE // 2 + 2].max()
+    assert across[: SIDE // 2 - 2].max() > 1.5 * middle
+    assert across[SIDE // 2 + 2 :].max() > 1.5 * middle

@@ -1,0 +1,97 @@
+"""A scene becomes a setup in SI units in one place, and nobody behind it reads the scene."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scenes import change
+
+import canprobe
+from canprobe.cell.scene.load import load_scene, packaged_scenes
+from canprobe.cell.scene.model import ObjectSettings
+from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.scene.setup import Calibrate, Free, Listen, Touch
+from canprobe.errors import PlanError
+
+PACKAGE = Path(canprobe.__file__).parent
+
+
+def test_millimetres_degrees_and_kilopascals_become_si():
+    scene = change(
+        load_scene("cylinder"),
+        task={"start_mm": (-121.0, -122.0, 374.0), "clearance_mm": 2.5, "speed_mm_s": 20.0, "heading_deg": 90.0},
+        sensor={"full_scale_kpa": 300.0},
+        probe={"centre_offset_mm": 70.0, "centre_lateral_mm": (1.0, -2.0)},
+        limits={"joint_margin_deg": 2.0, "workspace_min_mm": (-200.0, -200.0, 300.0)},
+        shape={"memory_mm": 15.0, "every_ms": 50.0},
+        cycle={"compute_us": 150.0},
+    )
+    setup = resolve(scene)
+    task = setup.task
+    assert isinstance(task, Touch) and task.scan is not None and task.shape is not None
+    np.testing.assert_allclose(task.approach.start, (-0.121, -0.122, 0.374))
+    np.testing.assert_allclose(task.approach.axes, ((0, 1, 0), (-1, 0, 0), (0, 0, 1)), atol=1e-15)
+    assert (task.approach.clearance, task.scan.speed) == pytest.approx((2.5e-3, 0.020))
+    assert (task.shape.memory, task.shape.every_s) == pytest.approx((0.015, 0.05))
+    assert setup.arm.q_start[0] == pytest.approx(math.pi / 2)
+    assert setup.array.full_scale == pytest.approx(300e3)
+    np.testing.assert_allclose(setup.probe.T_flange_probe[:3, 3], (1e-3, -2e-3, 0.070))
+    assert setup.limits.joint_margin == pytest.approx(math.radians(2.0))
+    np.testing.assert_allclose(setup.limits.workspace, ((-0.2, -0.2, 0.3), (math.inf,) * 3))
+    assert setup.compute_ns == 150_000
+
+
+@pytest.mark.parametrize("name", [name for name, _ in packaged_scenes()])
+def test_a_task_holds_the_hardware_of_its_setup(name):
+    setup = resolve(load_scene(name))
+    for part in ("arm", "array", "probe"):
+        if hasattr(setup.task, part):
+            assert getattr(setup.task, part) is getattr(setup, part)
+    kinds = {"scan": Touch, "press": Touch, "calibrate": Calibrate, "listen": Listen, "free": Free}
+    assert type(setup.task) is kinds[setup.kind]
+    assert setup.emulated_node_ids == setup.scene.emulated_node_ids
+
+
+def test_other_hardware_reaches_the_task():
+    setup = resolve(load_scene("cylinder")).changed("array", mode="features").changed("arm", grouped=True)
+    assert setup.task.array is setup.array and setup.array.mode == "features"
+    assert setup.task.arm is setup.arm and setup.arm.grouped is True
+
+
+def test_what_the_plan_chose_stands_in_the_scene_that_a_run_writes():
+    scene = change(load_scene("cylinder"), sensor={"mode": "auto"}, bus={"fd": "auto"}, arm={"grouped_rpdo": "auto"})
+    plan = canprobe.plan(scene)
+    assert (plan.setup.array.mode, plan.setup.bus.fd, plan.setup.arm.grouped) == ("window", False, False)
+    closed = plan.scene
+    assert (closed.sensor.mode, closed.bus.fd, closed.arm.grouped_rpdo) == ("window", False, False)
+    assert canprobe.plan(closed).pdos == plan.pdos
+
+
+def test_what_is_no_object():
+    rows = ((1.0, 0, 0, 0), (0, 1.0, 0, 0), (0, 0, 1.0, 0), (0, 0, 0, -1.0))
+    wrong = dataclasses.replace(load_scene("cylinder"), object=ObjectSettings("quadric", matrix=rows))
+    with pytest.raises(PlanError, match="object: matrix must pass through the origin"):
+        resolve(wrong)
+
+
+def test_nobody_behind_it_reads_the_scene():
+    """`Plan.scene` is there for who writes or sends it: sessions, results, bridges, studies, the command line."""
+    wrong = []
+    for room in ("planning", "cell", "tasks", "emulator", "robot", "touch"):
+        for path in sorted((PACKAGE / room).rglob("*.py")):
+            if path.relative_to(PACKAGE) == Path("planning/model.py"):
+                continue
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.ImportFrom) and node.module in (
+                    "canprobe.cell.scene.model",
+                    "canprobe.cell.scene.load",
+                ):
+                    wrong.append(f"{path}:{node.lineno} imports {node.module}")
+                if isinstance(node, ast.Attribute) and node.attr == "scene":
+                    wrong.append(f"{path}:{node.lineno} reads .scene")
+    assert not wrong, "; ".join(wrong)

@@ -1,0 +1,46 @@
+"""What `docs/generate.py` writes: the reference of all scene keys, whole, and all that was measured; up to date."""
+
+import dataclasses
+import importlib.util
+import typing
+from pathlib import Path
+
+import pytest
+
+from canprobe.cell.scene.model import Scene
+
+DOCS = Path(__file__).parents[3] / "docs"
+_spec = importlib.util.spec_from_file_location("generate", DOCS / "generate.py")
+generate = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(generate)
+
+SECTIONS = {name: generate.section_class(hint) for name, hint in typing.get_type_hints(Scene).items()}
+
+
+@pytest.mark.parametrize("section", SECTIONS)
+def test_every_key_has_a_meaning(section):
+    texts = generate.meanings(SECTIONS[section])
+    keys = [field.name for field in dataclasses.fields(SECTIONS[section])]
+    assert list(texts) == keys
+    assert all(text.endswith(".") for text in texts.values())
+
+
+def test_all_files_are_what_the_script_writes():
+    files = dict(generate.pages())
+    assert {path.name for path in files} >= {"expected.json", "README.md", "scene-keys.md", "gallery.md", "accuracy.md"}
+    for path, text in files.items():
+        assert path.read_text(encoding="utf-8") == text, "type: python docs/generate.py"
+
+
+def test_all_that_was_measured_is_on_a_page():
+    """So that no figure is measured for nothing, and no page names what was not measured."""
+    named = [found[2] for page in DOCS.glob("*.md") for found in generate.MARKED.finditer(page.read_text("utf-8"))]
+    assert sorted(named) == sorted(set(named)) == sorted(generate.read_measured())
+
+
+def test_a_key_has_its_value_unit_default_condition_and_meaning():
+    row = next(line for line in generate.scene_keys().splitlines() if line.startswith("| `speed_mm_s`"))
+    assert row == (
+        "| `speed_mm_s` | a number above 0 up to 200 | mm/s | `25.0` | Speed of the contact over the surface."
+        ' *Only with `kind` = `"scan"`.* |'
+    )

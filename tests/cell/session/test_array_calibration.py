@@ -1,0 +1,129 @@
+"""`canprobe calibrate array`: what a touch of a known object records, and what is refused.
+
+The fit is tested on simulated touches (`tests/mechanics/touch/patch/test_array_calibration.py`): the whole command
+takes a minute.
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from canprobe.cell.planning.make import make_plan
+from canprobe.cell.scene.load import load_scene, packaged_files
+from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.session import array_calibration
+from canprobe.cell.session.array_calibration import KnownObject, Visit, touch_object, visits
+from canprobe.cell.tasks.roll import Press
+from canprobe.cli import main
+
+AT = (-120.0, -122.5, 374.0)
+
+
+def plan_of(known):
+    scene = load_scene("press")
+    return make_plan(
+        resolve(
+            replace(
+                scene,
+                bus=replace(scene.bus, timed=False),
+                object=known.settings(AT),
+                task=replace(scene.task, start_mm=AT),
+            )
+        )
+    )
+
+
+@pytest.mark.parametrize("known", [KnownObject("ball", 0.025), KnownObject("plane", math.inf)])
+def test_a_touch_rolls_over_the_pad_and_is_recorded_with_its_reference_force(known):
+    presses = (Press(1.0, (1.5e-3, -1e-3), seconds=1.5, hz=(1.0,)), Press(2.0, seconds=1.0, hz=(1.0,)))
+    dwells, unloaded = touch_object(
+        plan_of(known), Visit(known, presses, rest_s=0.5, load=True), None, lambda _: None, None
+    )
+    assert len(unloaded) > 80 and not np.any(unloaded)
+    assert [d.place for d in dwells] == [0, 1]
+    for dwell, press in zip(dwells, presses, strict=True):
+        assert dwell.force == pytest.approx(press.force, rel=0.08)  # just pressed, it reads 5 % low
+        np.testing.assert_allclose(dwell.expected[0], press.at, atol=0.15e-3)
+        np.testing.assert_allclose(np.ptp(dwell.expected, axis=0), [3.0e-3, 1.2e-3], rtol=0.25)
+        v, u = np.indices((16, 16)) - 7.5
+        for image, place in list(zip(dwell.images, dwell.expected, strict=True))[50::40]:
+            centroid = 1.5875e-3 * np.array([(image * u).sum(), (image * v).sum()]) / image.sum()
+            np.testing.assert_allclose(centroid, place, atol=0.25e-3)
+        A = 0.5 * (25.0 + dwell.kappa[0])
+        depth = math.sqrt(2.0 * dwell.force * A / (math.pi * 1.27e8))
+        assert dwell.push.mean() == pytest.approx(depth, rel=0.05)
+
+
+def test_there_are_at_most_forty_touches_and_forces_only_grow_on_an_object():
+    every = list(visits(0.025, 0.025, loads=True, one_by_one=True))
+    assert sum(len(v.presses) for v in every) <= 40
+    for visit in every:
+        forces = [p.force for p in visit.presses]
+        assert forces == sorted(forces)
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        (["gantry"], "this arm holds its orientation"),
+        (["pumma"], "no such cell"),
+        (["puma260", "--force-reference", "guess"], "invalid choice"),
+        (["puma260", "--at", "2000", "0", "0"], "out of reach"),
+    ],
+)
+def test_what_cannot_be_calibrated_is_said(argv, said, tmp_path, capsys):
+    assert main(["calibrate", "array", *argv, "--out", str(tmp_path / "out")]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_the_reach_of_every_roll_is_checked_before_anything_moves(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["calibrate", "array", "puma260", "--at", "-104", "-122.5", "374"]) == 2
+    said = capsys.readouterr().err
+    assert "give another point with --at" in said and "visit" not in said
+    assert "contact at" not in said, "the plan of a press alone accepts it"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_a_point_a_cell_file_has_the_one_under_its_probe(tmp_path, monkeypatch):
+    cell = tmp_path / "mine.toml"
+    cell.write_text(packaged_files("cells")["puma260"].read_text())
+    asked = []
+    monkeypatch.setattr(array_calibration, "touch_object", lambda plan, *_: asked.append(plan.scene) or 1 / 0)
+    for name in ("puma260", cell):
+        with pytest.raises(ZeroDivisionError):
+            array_calibration.calibrate(array_calibration.Request(name), date="2026-01-01")
+        at = asked[-1].task.start_mm
+        assert asked[-1].object.position_mm == at
+        assert (at == AT) == (name == "puma260")
+        assert at == pytest.approx(AT, abs=15)
+
+
+def test_a_real_array_needs_somebody_to_place_things(tmp_path, capsys):
+    cell = tmp_path / "mine.toml"
+    text = packaged_files("cells")["puma260"].read_text().replace("[sensor]", "[sensor]\nemulated = false", 1)
+    text = text.replace('eds = "puma260_joint.eds"', 'eds = "puma260_joint.eds"\nemulated = false', 1)
+    cell.write_text(text)
+    args = [
+        "calibrate",
+        "array",
+        str(cell),
+        "--yes",
+        "--bus",
+        "socketcan",
+        "--channel",
+        "can9",
+        "--out",
+        str(tmp_path / "o"),
+    ]
+    assert main(args) == 2
+    assert "somebody has to place the objects" in capsys.readouterr().err
+
+
+def test_a_real_array_without_a_calibration_measures_nominal_newtons(tmp_path):
+    scene = load_scene("listen")
+    real = replace(scene, sensor=replace(scene.sensor, emulated=False), bus=replace(scene.bus, interface="socketcan"))
+    assert any("nominal newtons" in warning for warning in make_plan(resolve(real)).warnings)
+    assert not any("nominal" in warning for warning in make_plan(resolve(scene)).warnings)

@@ -1,0 +1,195 @@
+"""The first motion against motors that do something else: a controller and a few matrices, no bus."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from puma_arm import UPENN
+
+import canprobe
+from canprobe.cell.master.controller import Measurement
+from canprobe.cell.master.supervisor import JointGuard
+from canprobe.cell.tasks.free_and_listen import Answer, JointCheck
+from canprobe.cli.operator import TerminalOperator
+from canprobe.mechanics.robot.model import joints_to_units, units_to_joints
+
+PERIOD_S = 0.02
+START = np.radians((90.0, 65.0, 15.0, 0.0, 100.0, 0.0))
+
+
+@pytest.fixture(scope="module")
+def plan():
+    scene = canprobe.load_scene("free")
+    return canprobe.plan(replace(scene, cycle=replace(scene.cycle, rate_hz=1 / PERIOD_S)))
+
+
+@pytest.fixture(scope="module")
+def guard(plan):
+    return JointGuard(plan)
+
+
+class Scripted:
+    """An operator who says these words, each after some cycles."""
+
+    def __init__(self, *words):
+        self.questions, self._words, self._wait = [], list(words), 0
+
+    def ask(self, question):
+        self.questions.append(question)
+        self._wait = 5
+
+    def answer(self):
+        self._wait -= 1
+        if self._wait > 0:
+            return None
+        return self._words.pop(0) if self._words else Answer.YES
+
+
+def run(check, motors=None, start=START):
+    """Motors that make `motors` (6, 6) of what they are told; the targets (n, 6), rad, and the last command."""
+    motors = np.eye(6) if motors is None else motors
+    zero = joints_to_units(UPENN, start)
+    q, targets = start, []
+    for cycle in range(20_000):
+        command = check.step(Measurement(cycle, round(cycle * PERIOD_S * 1e9), q))
+        if command.done or command.stop_reason is not None:
+            return np.array(targets), command
+        if command.q_target is not None:
+            targets.append(command.q_target)
+            told = joints_to_units(UPENN, command.q_target) - zero
+            q = units_to_joints(UPENN, np.round(zero + motors @ told))
+    raise AssertionError("no end")
+
+
+def test_each_joint_turns_alone_slowly_and_comes_back(plan):
+    check = JointCheck(plan, None)
+    targets, last = run(check)
+    away = targets - START
+    assert last.done and [f.joint for f in check.findings] == list(range(6))
+    assert np.all((np.abs(away) > 1e-9).sum(axis=1) <= 1)
+    assert np.degrees(away.max(axis=0)) == pytest.approx(np.ones(6)) and away.min() > -1e-12
+    assert away[-1] == pytest.approx(np.zeros(6))
+    speed = np.degrees(np.abs(np.diff(targets, axis=0)).max()) / PERIOD_S
+    assert speed == pytest.approx(2.0, rel=0.01)
+    for finding in check.findings:
+        assert finding.fault is None and finding.moved == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize("joint", range(6))
+@pytest.mark.parametrize(
+    ("factor", "fault"),
+    [(-1.0, "it turned the wrong way"), (0.0, "it did not turn"), (0.5, "it turned 0.50 times as far")],
+)
+def test_a_motor_that_does_something_else_is_named(plan, joint, factor, fault):
+    motors = np.eye(6)
+    motors[joint, joint] = factor
+    check = JointCheck(plan, None)
+    run(check, motors)
+    findings = {f.joint: f.fault for f in check.findings}
+    assert findings[joint].startswith(fault)
+    for other, text in findings.items():
+        if other != joint:  # joints 4 and 5 drag the motors behind them along, which shows there too
+            assert text is None or f"the motor of joint {joint + 1} turned by" in text
+    left_out = np.abs((1 - factor) * UPENN.units_per_q[joint]) * math.radians(1.0)
+    dragged = {other for other in range(6) if other != joint and left_out[other] > 4}
+    assert {other for other, text in findings.items() if text is not None and other != joint} == dragged
+
+
+def test_swapped_drives_are_told(plan):
+    motors = np.eye(6)[[1, 0, 2, 3, 4, 5]]
+    check = JointCheck(plan, None)
+    run(check, motors)
+    faults = [finding.fault for finding in check.findings]
+    assert faults[0] == faults[1] == "it did not turn" and faults[2:] == [None] * 4
+
+
+def test_a_motor_that_runs_along_is_told(plan):
+    motors = np.eye(6)
+    motors[2, 1] = 0.3
+    check = JointCheck(plan, None)
+    run(check, motors)
+    assert check.findings[1].fault.startswith("the motor of joint 3 turned by")
+
+
+def test_at_a_stop_a_joint_turns_the_other_way(plan, guard):
+    start = START.copy()
+    start[1] = guard.high[1] - math.radians(0.5)
+    check = JointCheck(plan, None)
+    targets, _ = run(check, start=start)
+    assert check.findings[1].asked == pytest.approx(-1.0)
+    assert np.all(targets <= guard.high + 1e-12) and np.all(targets >= guard.low - 1e-12)
+
+
+def test_beyond_a_stop_nothing_moves(plan, guard):
+    start = START.copy()
+    start[4] = guard.low[4] - math.radians(2.0)
+    check = JointCheck(plan, None)
+    assert check.inspect(START) is None
+    assert check.inspect(
+        start
+    ) == "joint 5 stands at -31.0 deg, outside -29.0 to 199.0 deg: check counts_per_turn and" + (
+        " gear, then sign and zero_counts; if they are right, move it there by hand"
+    )
+
+
+def test_a_workspace_without_room_is_left_alone(plan, guard):
+    tip = guard.T_base_tip(START)[:3, 3]
+    limits = replace(plan.setup.limits, workspace=np.array([tip - 1e-5, tip + 1e-5]))
+    check = JointCheck(replace(plan, setup=replace(plan.setup, limits=limits)), None)
+    targets, last = run(check)
+    assert last.done
+    skipped = [finding.skipped for finding in check.findings]
+    assert skipped[:5] == ["either way it would leave its limits or the workspace"] * 5
+    assert skipped[5] is None  # joint 6 turns the probe about its own axis
+    assert np.ptp(targets[:, :5]) == pytest.approx(np.ptp(START[:5]))
+
+
+def test_nothing_moves_before_the_operator_says_so(plan):
+    operator = Scripted(Answer.NO, Answer.YES, Answer.YES, Answer.YES, Answer.NO, Answer.QUIT)
+    check = JointCheck(plan, operator)
+    targets, last = run(check)
+    assert last.done
+    assert [(f.joint, f.skipped, f.fault) for f in check.findings] == [
+        (0, "as the operator wished", None),
+        (1, None, None),
+        (2, None, "the operator did not see it turn that way: polarity, gear or another joint's drive"),
+    ]
+    assert operator.questions[0] == "joint 1 at 90.00 deg: turn it by +1.00 deg?"
+    assert operator.questions[2].startswith("did joint 2 turn by about +1.0 deg, positive by the right hand")
+    assert targets[-1] == pytest.approx(START) and np.all(targets[:, 3:] == START[3:])
+
+
+def test_an_operator_who_ends_while_a_joint_is_away_gets_it_back_first(plan):
+    check = JointCheck(plan, Scripted(Answer.YES, Answer.QUIT))
+    targets, last = run(check)
+    assert last.done and targets[-1] == pytest.approx(START)
+    assert [(f.joint, f.fault) for f in check.findings] == [(0, None)]
+
+
+def test_the_terminal_is_never_waited_for(capsys):
+    reader, writer = os.pipe()
+    operator = TerminalOperator(reader)
+
+    def ask(*typed):
+        operator.ask("move?")
+        answers = [operator.answer()]
+        for text in typed:
+            os.write(writer, text)
+            answers += [operator.answer() for _ in range(20)]
+        return [answer for answer in answers if answer is not None]
+
+    os.write(writer, b"typed too early\n")
+    assert ask() == []
+    assert ask(b"\n") == [Answer.YES]
+    assert ask(b"n", b"o\n") == [Answer.NO]
+    assert ask(b"perhaps\n", b" Y \n") == [Answer.YES]
+    assert ask(b"q\n") == [Answer.QUIT]
+    operator.ask("move?")
+    os.close(writer)
+    assert operator.answer() is Answer.QUIT
+    os.close(reader)
+    assert "move? [Enter or y: yes, n: no, q: end]" in capsys.readouterr().err

@@ -1,0 +1,86 @@
+"""When the estimator in the loop works, and when its answer is there."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from canprobe.cell.tasks.shape import SHARPEST, ShapeTracker, replay_samples
+
+
+def contact(t_s, x=0.0):
+    return SimpleNamespace(t_s=t_s, p_base=np.array([x, 0.0, 0.0]))
+
+
+class Counting:
+    """Answers; remembers of how many contacts it knew."""
+
+    def __init__(self, curvature=10.0):
+        self.n, self.resets, self.knew, self._curvature = 0, 0, [], curvature
+
+    def add(self, _):
+        self.n += 1
+
+    def reset(self):
+        self.n, self.resets = 0, self.resets + 1
+
+    def estimate(self):
+        self.knew.append(self.n)
+        return SimpleNamespace(
+            kappa=np.array([self._curvature, 0.0]),
+            observed=np.array([True, True]),
+            S=np.eye(4),
+            T_frame_contact=np.eye(4),
+        )
+
+
+def cycle(tracker, t_s, *, contacts=()):
+    """One cycle of a loop: ask, add what was felt, work once the commands are out; whether an answer was there."""
+    reported = tracker.answer(t_s) is not None
+    for t in contacts:
+        tracker.add(contact(t, 25e-3 * t))
+    tracker.work()
+    return reported
+
+
+def test_an_answer_is_there_in_the_cycle_after_the_contact_that_it_stands_at():
+    estimator = Counting()
+    tracker = ShapeTracker(estimator, every=2)
+    reported = [cycle(tracker, 2.5e-3 * k, contacts=[2.5e-3 * k] if k % 2 == 0 else ()) for k in range(8)]
+    assert reported == [False, False, False, True, False, False, False, True]
+    assert estimator.knew == [2, 4]
+    first, second = tracker.records
+    assert (first.t_s, first.told_s, first.travelled_m) == pytest.approx((5e-3, 7.5e-3, 25e-3 * 5e-3))
+    assert (second.t_s, second.told_s) == pytest.approx((15e-3, 17.5e-3))
+
+
+def test_contacts_faster_than_cycles_are_all_taken():
+    estimator = Counting()
+    tracker = ShapeTracker(estimator, every=3)
+    cycle(tracker, 0.0, contacts=[1e-3 * k for k in range(7)])
+    assert estimator.n == 7 and estimator.knew == [3, 6]
+    assert cycle(tracker, 2.5e-3), "the newest of them is reported"
+
+
+def test_a_new_contact_after_a_gap_makes_an_answer_void():
+    estimator = Counting()
+    tracker = ShapeTracker(estimator, every=2)
+    cycle(tracker, 0.0, contacts=[0.0, 2.5e-3])
+    tracker.add(contact(1.0))
+    assert not any(cycle(tracker, 1.0 + 2.5e-3 * k) for k in range(4))
+    assert estimator.resets == 1 and estimator.n == 1 and not tracker.records
+
+
+def test_a_diverged_answer_starts_the_estimator_afresh():
+    estimator = Counting(curvature=2.0 * SHARPEST)
+    tracker = ShapeTracker(estimator, every=2)
+    assert not any(cycle(tracker, 2.5e-3 * k, contacts=[2.5e-3 * k]) for k in range(5))
+    assert tracker.restarts == 2 and estimator.resets == 2 and not tracker.records
+    assert estimator.n == 1, "it goes on with the contacts that come"
+
+
+def test_recorded_contacts_are_answered_one_by_one():
+    samples = [contact(0.005 * k) for k in range(10)]
+    assert [r.t_s for r in replay_samples(Counting(), samples, 3)] == [s.t_s for s in samples[2::3]]

@@ -1,0 +1,299 @@
+"""candump logs: written and read back, against lines that candump itself writes."""
+
+import contextlib
+import io
+import os
+import re
+import threading
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import canprobe
+from canprobe.errors import ResultsError, UsageError
+from canprobe.fieldbus.bus.candump import (
+    CandumpReader,
+    CandumpWriter,
+    RecordingPort,
+    make_folder,
+    read_candump,
+    read_npz,
+    whole_file,
+    write_text,
+)
+from canprobe.fieldbus.bus.clock_steps import RecordedBus
+from canprobe.fieldbus.bus.port import ERR_FLAG, VirtualClock
+from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
+from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG
+
+LINES = [
+    ("(0000000000.002500) can0 181#37060000", (2_500_000, "can0", 0x181, b"\x37\x06\0\0")),
+    ("(0000000000.000000) vcan0 080#", (0, "vcan0", 0x080, b"")),
+    ("(1436509052.249713) vcan0 044#2A366C2BBA", (1436509052249713000, "vcan0", 0x044, b"\x2a\x36\x6c\x2b\xba")),
+    ("(0000000001.000001) can0 00000001#01", (1_000_001_000, "can0", 1 | EFF_FLAG, b"\1")),
+    ("(0000000001.000001) can0 1FFFFFFF#0102030405060708", (1_000_001_000, "can0", 0x9FFFFFFF, bytes(range(1, 9)))),
+    ("(0000000001.000001) can0 701#R", (1_000_001_000, "can0", 0x701 | RTR_FLAG, b"")),
+]
+
+
+@pytest.mark.parametrize(("line", "frame"), LINES, ids=[line[20:] for line, _ in LINES])
+def test_lines_both_ways(tmp_path: Path, line: str, frame: tuple[int, str, int, bytes]) -> None:
+    t_ns, channel, can_id, data = frame
+    log = tmp_path / "bus.log"
+    with CandumpWriter(log, channel) as writer:
+        writer.write(can_id, data, t_ns)
+    assert log.read_bytes() == line.encode() + b"\n"
+    assert list(read_candump(log)) == [frame]
+
+
+@pytest.mark.parametrize(
+    ("line", "frame"),
+    [
+        ("(0000000000.000001) can0 181#0a T", (1000, "can0", 0x181, b"\x0a")),
+        ("(0000000000.000001) can0 701#R1", (1000, "can0", 0x701 | RTR_FLAG, b"")),
+        ("(0000000000.000001234) can0 181#0A", (1234, "can0", 0x181, b"\x0a")),
+        ("(000.000001)  can0 181#0A", (1000, "can0", 0x181, b"\x0a")),
+        ("(0000000000.000001) can0 181#0102030405060708_F", (1000, "can0", 0x181, bytes(range(1, 9)))),
+        ("(0000000000.000001) can0 701#R8_9", (1000, "can0", 0x701 | RTR_FLAG, b"")),
+        ("(0000000000.000001) can0 20000004#0000000000000000", (1000, "can0", ERR_FLAG | 4, bytes(8))),
+    ],
+)
+def test_lines_of_other_writers_are_read(tmp_path: Path, line: str, frame: tuple[int, str, int, bytes]) -> None:
+    log = tmp_path / "bus.log"
+    log.write_text(line + "\r\n\n")
+    assert list(read_candump(log)) == [frame]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "(0000000000.0025) can0 181#00",
+        "(0000000000.002500) can0 1811#00",
+        "(0000000000.002500) can0 181#001",
+        "(0000000000.002500) can0 181#" + "00" * 9,
+        "(0000000000.002500) can0 181##1" + "00" * 65,
+        "(0000000000.002500) can0 181##0011",
+        "(0000000000.002500) can0 181#00 X",
+        "(0000000000.0025001) can0 181#00",
+        "(0000000000.002500) can0 181#00_F",
+        "(0000000000.002500) can0 181#0102030405060708_8",
+        "(0000000000.002500) can0 45123#81:00:1234567#11",
+        "DROPCOUNT: dropped some CAN frames",
+        " (0000000000.002500) can0 181#00",
+        "0.002500 can0 181#00",
+        "can0  181   [1]  00",
+    ],
+)
+def test_anything_else_is_refused_with_its_line_number(tmp_path: Path, line: str) -> None:
+    log = tmp_path / "bus.log"
+    log.write_text(f"{LINES[0][0]}\n{line}\n")
+    with pytest.raises(UsageError, match=r"bus\.log:2: "):
+        list(read_candump(log))
+
+
+def test_lines_for_lost_frames_and_of_can_xl_are_counted_and_no_frames(tmp_path: Path) -> None:
+    log = tmp_path / "bus.log"
+    log.write_text(
+        f"{LINES[0][0]}\n"
+        "DROPCOUNT: dropped 1 CAN frame on 'can0' socket (total drops 1)\n"
+        "DROPCOUNT: dropped 3 CAN frames on 'can0' socket (total drops 4)\n"
+        "(0000000000.002600) vcan0 45123#81:00:12345678#11223344\n"
+    )
+    reader = CandumpReader(log)
+    for _ in range(2):
+        assert list(reader) == [LINES[0][1]]
+        assert (reader.lost, reader.xl) == ({"can0": 4}, {"vcan0": 1})
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "utf-16-be"])
+def test_a_log_that_another_system_wrote_again_is_read(tmp_path: Path, encoding: str) -> None:
+    log = tmp_path / "bus.log"
+    log.write_text("".join(f"{line}\r\n" for line, _ in LINES), encoding=encoding)
+    assert list(read_candump(log)) == [frame for _, frame in LINES]
+
+
+@pytest.mark.parametrize(
+    ("line", "differences"),
+    [
+        (" (000.002500)  can0  181   [4]  37 06 00 00", True),
+        (" (1763000000.002500)  vcan0  00000001   [0]", False),
+        ("  can0  181   [1]  00   '.'", False),
+    ],
+)
+def test_what_candump_prints_on_a_screen_is_named(tmp_path: Path, line: str, differences: bool) -> None:
+    log = tmp_path / "bus.log"
+    log.write_text(f"{line}\n")
+    with pytest.raises(UsageError, match=r"on a screen.*; record with `candump -l` or -L") as caught:
+        list(read_candump(log))
+    assert ("differences (-td)" in str(caught.value)) == differences
+
+
+def test_a_log_that_comes_through_a_pipe_is_read_twice(tmp_path: Path) -> None:
+    os.mkfifo(pipe := tmp_path / "pipe")
+    writer = threading.Thread(target=pipe.write_text, args=(LINES[0][0] + "\n",))
+    writer.start()
+    assert list(RecordedBus(pipe)) == [LINES[0][1]]
+    writer.join()
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"none\.log: No such file"):
+        list(read_candump(tmp_path / "none.log"))
+
+
+@given(st.text(max_size=60))
+def test_random_text_raises_only_its_own_error(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
+    log = tmp_path_factory.getbasetemp() / "random.log"
+    log.write_text(text, encoding="utf-8")
+    with contextlib.suppress(UsageError):
+        list(read_candump(log))
+
+
+def test_time_starts_at_t0_and_ns_are_cut(tmp_path: Path) -> None:
+    with CandumpWriter(tmp_path / "x", "can0", t0_ns=5_000_000_000) as writer:
+        writer.write(0x80, b"", 5_000_001_999)
+    assert (tmp_path / "x").read_text() == "(0000000000.000001) can0 080#\n"
+
+
+def test_recording_port_writes_both_directions(tmp_path: Path) -> None:
+    bus = LockstepBus(VirtualClock(), "can0")
+    one, two = bus.port(), bus.port()
+    with CandumpWriter(tmp_path / "x", "can0") as writer:
+        port = RecordingPort(one, writer.write)
+        port.send_batch([(0x080, b"\1"), (0x201, b"\2")])
+        port.clock.sleep_until_ns(2_500_000)
+        two.send_batch([(0x181, b"\3")])
+        port.wait(3_000_000)
+        assert port.drain() == [(0x181, b"\3", 2_500_000)]
+        port.close()
+    assert (port.channel, two.drain()) == ("can0", [(0x080, b"\1", 0), (0x201, b"\2", 0)])
+    assert [(t, i, d) for t, _, i, d in read_candump(tmp_path / "x")] == [
+        (0, 0x080, b"\1"),
+        (0, 0x201, b"\2"),
+        (2_500_000, 0x181, b"\3"),
+    ]
+
+
+def test_a_torn_last_line_is_passed_over_unless_the_log_should_be_whole(tmp_path):
+    path, line = tmp_path / "bus.log", "(0000000000.002500) vcan0 080#01\n"
+    path.write_text(line + line[:20])
+    assert len(list(read_candump(path))) == 1
+    with pytest.raises(UsageError, match=r"bus\.log:2: no candump line"):
+        list(read_candump(path, whole=True))
+    path.write_text(line + line.rstrip())  # an editor's last line: not torn
+    assert len(list(read_candump(path))) == len(list(read_candump(path, whole=True))) == 2
+    path.write_text(line[:20] + "\n" + line)
+    with pytest.raises(UsageError, match=r"bus\.log:1: no candump line"):
+        list(read_candump(path))
+
+
+FRAMES = [
+    (0, "can0", 0x080, b"\x01"),
+    (2_500_000, "can0", 0x181, bytes(range(8))),
+    (2_501_000, "can0", 0x201 | RTR_FLAG, b""),
+    (5_000_000, "can1", 0x18FF0102 | EFF_FLAG, b"\xaa\xbb"),
+    (7_500_000, "can0", 0x531, bytes(range(64))),
+]
+
+
+def test_python_can_reads_a_log_of_ours_with_its_fd_frames(tmp_path):
+    path = tmp_path / "bus.log"
+    with CandumpWriter(path, "can0") as writer:
+        for t_ns, channel, can_id, data in FRAMES:
+            writer.on(channel)(can_id, data, t_ns)
+    assert list(read_candump(path)) == FRAMES
+    assert path.read_text().splitlines()[-1] == f"(0000000000.007500) can0 531##1{bytes(range(64)).hex().upper()}"
+    messages = list(can.CanutilsLogReader(path))
+    assert [message.arbitration_id for message in messages] == [0x080, 0x181, 0x201, 0x18FF0102, 0x531]
+    assert [bytes(message.data) for message in messages] == [data for *_, data in FRAMES]
+    assert [message.is_fd and message.bitrate_switch for message in messages] == [False] * 4 + [True]
+    assert [message.is_remote_frame for message in messages] == [False, False, True, False, False]
+    assert [message.channel for message in messages] == [channel for _, channel, _, _ in FRAMES]
+    assert [message.timestamp for message in messages] == pytest.approx([0, 2.5e-3, 2.501e-3, 5e-3, 7.5e-3], abs=1e-9)
+
+
+# Files of a run that are cut off, empty or something else: one line that names the file, from every reader.
+
+
+def npz(**columns):
+    held = io.BytesIO()
+    np.savez_compressed(held, **columns)
+    return held.getvalue()
+
+
+def npy(values):
+    held = io.BytesIO()
+    np.save(held, values)
+    return held.getvalue()
+
+
+WHOLE = npz(t_s=np.arange(3.0))
+DAMAGED = {"empty": b"", "cut off": WHOLE[:-9], "torn": b"PK", "text": b"t_s\n0\n", "single array": npy(np.arange(3.0))}
+
+
+@pytest.mark.parametrize("content", DAMAGED.values(), ids=DAMAGED)
+@pytest.mark.parametrize(("read", "what"), [(read_npz, "an .npz of a run"), (canprobe.load_table, "the log of a run")])
+def test_a_damaged_file_is_named(content, read, what, tmp_path):
+    (tmp_path / "log.npz").write_bytes(content)
+    with pytest.raises(UsageError, match=rf"log\.npz: expected {re.escape(what)}; cannot be read: "):
+        read(tmp_path / "log.npz")
+
+
+def test_a_whole_one_is_read(tmp_path):
+    (tmp_path / "log.npz").write_bytes(WHOLE)
+    assert read_npz(tmp_path / "log.npz")["t_s"].tolist() == [0.0, 1.0, 2.0]
+
+
+# Files that are whole or not there.
+
+WHOLE_TEXT = b"what was there before"
+
+
+@pytest.mark.parametrize("older", [True, False])
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError(28, "No space left on device")])
+def test_a_file_is_written_whole_or_not_at_all(error, older, tmp_path):
+    path = tmp_path / "log.npz"
+    if older:
+        path.write_bytes(WHOLE_TEXT)
+    with pytest.raises((KeyboardInterrupt, ResultsError)) as raised, whole_file(path) as part:
+        assert part.suffix == ".npz"  # by which libraries choose what they write
+        part.write_bytes(b"PK")
+        raise error
+    if isinstance(error, OSError):
+        assert str(raised.value) == f"{path}: cannot be written: No space left on device"
+    assert [(file, file.read_bytes()) for file in tmp_path.iterdir()] == [(path, WHOLE_TEXT)] * older
+
+
+def test_where_no_file_can_be_it_is_named(tmp_path):
+    with pytest.raises(ResultsError, match=r"none/a\.txt: cannot be written: No such file or directory"):
+        write_text(tmp_path / "none" / "a.txt", "")
+    (tmp_path / "way").write_text("")
+    with pytest.raises(ResultsError, match=r"way/in/it: cannot be written: Not a directory"):
+        make_folder(tmp_path / "way" / "in" / "it")
+    with pytest.raises(ResultsError, match=r"way: cannot be written: File exists"):
+        make_folder(tmp_path / "way")
+    with pytest.raises(ResultsError, match=r": cannot be written: Is a directory"):
+        CandumpWriter(tmp_path, "can0")
+
+
+def test_a_block_that_writes_nothing_changes_nothing(tmp_path):
+    with whole_file(tmp_path / "surface.png"):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_link_stays_a_link_and_a_device_a_device(tmp_path):
+    link, file = tmp_path / "link", tmp_path / "file"
+    file.write_bytes(WHOLE_TEXT)
+    link.symlink_to(file)
+    write_text(link, "new")
+    assert link.is_symlink() and file.read_text() == "new"
+    os.mkfifo(pipe := tmp_path / "pipe")
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    write_text(pipe, "told")
+    assert os.read(reader, 10) == b"told" and pipe.is_fifo()
+    os.close(reader)

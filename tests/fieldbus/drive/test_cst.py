@@ -1,0 +1,182 @@
+"""Cyclic synchronous torque, CiA 402-2: torque against inertia and friction, limits, what the drive tells of it."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import pytest
+from puma_arm import ELBOW_FORM, UPENN
+
+from canprobe.cell.plant.config import PlantConfig
+from canprobe.cell.plant.ideal_arm import MotorDynamics
+from canprobe.cell.plant.plant import Plant
+from canprobe.fieldbus.drive.drive import make_drive_node
+from canprobe.fieldbus.drive.reference import torque_run
+from canprobe.fieldbus.eds.packaged import load_eds
+
+GAIN, COULOMB, DAMPING = 100.0, 50.0, 4.0  # of the plant of numbers
+
+
+def integrate(torques, step_s=2.5e-3, parts=100):
+    """Positions at the end of every step, by small explicit steps that stop at a change of sign."""
+    position = velocity = 0.0
+    places = []
+    for torque in torques:
+        for _ in range(parts):
+            dt = step_s / parts
+            if velocity == 0.0:
+                push = math.copysign(max(0.0, abs(torque) - COULOMB), torque)
+            else:
+                push = torque - math.copysign(COULOMB, velocity)
+            middle = velocity + dt / 2 * (GAIN * push - DAMPING * velocity)
+            after = velocity + dt * (GAIN * push - DAMPING * middle)
+            if after * velocity < 0:
+                after = 0.0
+            position += dt * (velocity + after) / 2
+            velocity = after
+        places.append(position)
+    return places
+
+
+@pytest.fixture
+def cst(rig):
+    """Operational, RPDO1 = controlword + target torque."""
+    for name, value in (("_1400_1", 0x80000201), ("_1600_0", 0), ("_1600_2", 0x60710010), ("_1600_0", 2)):
+        rig.put(**{name: value})
+    rig.put(_1400_1=0x201).enable(10)
+    rig.drive.nmt(0x01)
+    return rig
+
+
+def order(torque, word=0x0F):
+    return (word.to_bytes(2, "little") + torque.to_bytes(2, "little", signed=True)).hex()
+
+
+def push(cst, torques):
+    """Positions at the SYNC that ends each torque's cycle."""
+    cst.trace.clear()
+    for torque in (*torques, torques[-1], torques[-1]):
+        cst.cycles(1, rpdo=order(torque))
+    return [counts for _, counts in cst.trace[2:]]
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(
+    "torques",
+    [
+        [250] * 60,
+        [49] * 10,
+        [400] * 20 + [0] * 60,
+        [400] * 20 + [-400] * 50,
+        [300, -300, 200, -60, 60, 500, 20] * 6,
+    ],
+)
+def test_cia402_cst_motion_under_torque(cst, torques, sign):
+    torques = [sign * torque for torque in torques]
+    assert push(cst, torques) == pytest.approx(integrate(torques), rel=1e-3, abs=0.01)
+
+
+def test_cia402_cst_the_motor_comes_to_rest_by_friction(cst):
+    places = push(cst, [400] * 20 + [0] * 150)
+    assert places[-1] == places[-10] > 10
+    assert cst.signed(0x606C) == 0
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_cia402_58_torque_limit(cst, sign):
+    cst.put(_6072=200)
+    assert push(cst, [sign * 500] * 30) == pytest.approx(integrate([sign * 200] * 30), rel=1e-3, abs=0.01)
+    assert (cst.bits(11), cst.signed(0x6074), cst.signed(0x6077)) == ((1,), sign * 200, sign * 200)
+    cst.cycles(2, rpdo=order(sign * 150))
+    assert (cst.bits(11), cst.signed(0x6077)) == ((0,), sign * 150)
+
+
+def test_cia402_58_the_limit_holds_for_target_and_offset_together(cst):
+    cst.put(_6072=200, _60B2=-100).cycles(3, rpdo=order(250))
+    assert (cst.bits(11), cst.signed(0x6077)) == ((0,), 150)
+    cst.put(_60B2=100).cycles(3, rpdo=order(250))
+    assert (cst.bits(11), cst.signed(0x6077)) == ((1,), 200)
+
+
+def test_cia402_cst_6077_is_the_plants_again_afterwards(cst, plant):
+    plant.torque = -77
+    cst.cycles(5, rpdo=order(100))
+    assert cst.signed(0x6077) == 100
+    cst.put(_6060=8)
+    assert cst.signed(0x6077) == -77
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_cia402_cst_607f_limits_the_speed_and_bit_11_says_so(cst, sign):
+    cst.put(_607F=1000)
+    push(cst, [sign * 250] * 40)
+    assert (cst.signed(0x606C), cst.bits(11)) == (sign * 1000, (1,))
+    cst.cycles(100, rpdo=order(sign * 60))
+    assert cst.signed(0x606C) == pytest.approx(sign * GAIN * 10 / DAMPING + sign * 750 * math.exp(-1), abs=10)
+    assert cst.bits(11) == (0,)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_cia402_57_the_motor_waits_at_a_software_limit(cst, sign):
+    cst.put(_607D_1=-20, _607D_2=20)
+    places = push(cst, [sign * 300] * 60)
+    assert (places[-1], max(map(abs, places)), cst.bits(11)) == (sign * 20, 20, (1,))
+    cst.cycles(10, rpdo=order(sign * -300))
+    assert cst.bits(11) == (0,)
+    assert abs(cst.counts) < 20
+
+
+def test_cia402_60_halt_in_cst(cst):
+    cst.put(_605D=1, _6084=50_000)
+    push(cst, [250] * 60)
+    cst.drive.send(0x201, order(250, 0x10F))
+    cst.cycles(1)
+    speed, start = 5000 * (1 - math.exp(-4 * 61 * 2.5e-3)), cst.counts
+    cst.cycles(60, rpdo=order(250, 0x10F))
+    assert cst.counts - start == pytest.approx(speed**2 / (2 * 50_000))
+    assert cst.bits(10, 12) == (1, 0)
+    cst.cycles(3, rpdo=order(250))
+    assert cst.bits(10, 12) == (0, 1)
+    assert cst.signed(0x606C) > 0
+
+
+def test_cia402_59_missing_targets_stop_it(cst):
+    cst.cycles(20, rpdo=order(250))
+    cst.cycles(7)
+    cst.run(200)
+    assert cst.drive.read(0x6041) & 0x4F == 0x40
+    still = cst.counts
+    assert cst.run(50).counts == still
+
+
+@pytest.mark.parametrize("axis", [0, 3, 5])
+def test_cia402_cst_the_ideal_arm_needs_the_torque_that_it_is_given(drive, axis):
+    """Steady motion of a real plant: 600 permille in, and its own torque model says 600 permille."""
+    plant = Plant(PlantConfig(UPENN, ELBOW_FORM, taxels=None))
+    drive.node = make_drive_node(load_eds("puma260_joint", axis + 1), axis + 1, axis, plant)
+    drive.node.start(0)
+    for index, value, size in ((0x6060, 10, 1), (0x1006, 2500, 4), (0x607F, 10**7, 4)):
+        assert drive.write(index, 0, value, size) == 0
+    for word in (0x06, 0x07, 0x0F):
+        drive.write(0x6040, 0, word, 2)
+    drive.nmt(0x01)
+    for k in range(1, 800):
+        drive.send(0x80, "", k * 2_500_000)
+        drive.write(0x6071, 0, -600, 2)
+    assert plant.torque_permille(axis) == pytest.approx(-600, abs=2)
+    assert plant.arm.qd[axis] < -0.5
+
+
+@pytest.mark.parametrize("torque", [0.0, 30.0, 51.0, -300.0, 300.0])
+@pytest.mark.parametrize("velocity", [0.0, 2000.0, -2000.0])
+@pytest.mark.parametrize("limit", [math.inf, 2500.0, 500.0])
+def test_torque_run_is_continuous_and_its_velocity_is_the_slope(torque, velocity, limit):
+    run = torque_run(10.0, velocity, torque, MotorDynamics(GAIN, COULOMB, DAMPING), limit)
+    times = [k * 1e-3 for k in range(700)]
+    samples = [run.at(t) for t in times]
+    assert samples[0] == pytest.approx((10.0, min(max(velocity, -limit), limit)))
+    for (p, v), (q, w) in pairwise(samples):
+        assert (q - p) * 1e3 == pytest.approx((v + w) / 2, abs=10.0)
+        assert abs(w - v) <= GAIN * 350 * 1e-3 + DAMPING * 2500 * 1e-3 + 1e-6
+        assert abs(w) <= limit + 1e-9

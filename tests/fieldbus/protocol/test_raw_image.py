@@ -1,0 +1,125 @@
+"""Images in raw CAN frames: the test frames of four makers' drivers, both ways; loss, mixtures, and what is refused."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from canprobe.cell.scene.load import load_array, packaged_arrays
+from canprobe.cell.scene.model import WireSettings
+from canprobe.cell.scene.rules import image_format
+from canprobe.errors import ProtocolError
+from canprobe.fieldbus.protocol.raw_image import FramePattern, ImageAssembler, ImageFormat
+
+MS = 1_000_000
+
+
+def format_of(name):
+    """The format of a packaged array."""
+    file = load_array(name)
+    wire = WireSettings(**{key: tuple(v) if isinstance(v, list) else v for key, v in file["wire"].items()})
+    return image_format(wire, file["sensor"]["rows"], file["sensor"]["columns"])
+
+
+RAW = [name for name, _ in packaged_arrays() if load_array(name)["wire"]["kind"] == "frames"]
+FORMATS = {name: format_of(name) for name in RAW}
+
+# (array, frame, {(row, column, axis): value}): values decoded by hand from the makers' drivers
+FRAMES = [
+    ("uskin4x4", "712#007E31800546A000", {(2, 0, 0): 32305, (2, 0, 1): 32773, (2, 0, 2): 18080}),
+    ("uskin4x4", "710#000102FFFE800000", {(0, 0, 0): 258, (0, 0, 1): 65534, (0, 0, 2): 32768}),
+    ("uskin4x4", "71F#0000FF00000100", {(3, 3, 0): 255, (3, 3, 1): 0, (3, 3, 2): 256}),
+    ("uskin4x6", "727#0000FF00000100", {(3, 5, 0): 255, (3, 5, 1): 0, (3, 5, 2): 256}),
+    ("linker12x6", "027#B130000005122A00", {(3, column, 0): v for column, v in enumerate((0, 0, 5, 18, 42, 0))}),
+    ("poweron6x6", "300#9601E25504", {(0, column, 0): v for column, v in enumerate((1430, 1281, 1250))}),
+    ("poweron6x6", "302#B2DCF34504", {(1, column, 0): v for column, v in enumerate((1458, 1244, 1267))}),
+    ("poweron6x6", "30B#B1CFC15505", {(5, 3 + column, 0): v for column, v in enumerate((1457, 1487, 1473))}),
+    # the triangle on row 1; the pads t6 = 110 and t10 = 106 are not read
+    ("icub-triangles", "4D1#40F0EFD280F0F06E", {(1, c, 0): v for c, v in enumerate((240, 239, 210, 128, 240, 240))}),
+    ("icub-triangles", "4D1#C0F0F1F06AF00000", {(1, 6 + c, 0): v for c, v in enumerate((240, 241, 240, 240))}),
+    ("icub-triangles", "4D1#C0F0F1F06AF00081", {(1, 6 + c, 0): v for c, v in enumerate((240, 241, 240, 240))}),
+]
+
+
+@pytest.mark.parametrize(("name", "frame", "values"), FRAMES)
+def test_frames_of_the_makers_are_read_exactly(name, frame, values):
+    image = FORMATS[name]
+    can_id, data = int(frame[:3], 16), bytes.fromhex(frame[4:])
+    part = image.part_of(can_id, data)
+    blank = np.zeros((image.rows, image.columns, image.axes), np.int64)
+    parts = [one for _, one in image.encode(blank)]
+    parts[part] = data
+    counts = image.decode(parts)
+    assert {place: int(counts[place]) for place in values} == values
+    assert np.count_nonzero(counts) == sum(v != 0 for v in values.values())  # and nowhere else
+    sent_id, sent = image.encode(counts)[part]
+    read = image.values_of(part, data)
+    assert sent_id == can_id and image.values_of(part, sent) == read
+
+
+def test_frames_of_others_on_the_same_identifier_are_no_part():
+    thumb, triangles = FORMATS["linker12x6"], FORMATS["icub-triangles"]
+    assert thumb.part_of(0x027, bytes.fromhex("B2B0FF0100000000")) is None  # index row 11
+    assert thumb.part_of(0x027, bytes.fromhex("B10102")) is None  # an answer of 3 bytes
+    assert triangles.part_of(0x4D0, bytes.fromhex("40F0F0F0")) is None
+    other = ImageFormat((0x27,), tuple(FramePattern.parse(f"B1{r:X}0 ww xx yy zz") for r in range(10)), 10, 4)
+    assert other.values_of(9, bytes.fromhex("B19001020304")) == [1, 2, 3, 4]  # the O6 hand, thumb row 9
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.sampled_from(RAW), st.integers(0, 2**32), st.randoms(use_true_random=False))
+def test_an_image_comes_back_from_its_frames_in_any_order(name, seed, order):
+    image = FORMATS[name]
+    counts = np.random.default_rng(seed).integers(0, 1 << image.bits, (image.rows, image.columns, image.axes))
+    frames = image.encode(counts)
+    order.shuffle(frames)
+    assembler = ImageAssembler(image, 8 * MS)
+    found = [assembler.push(can_id, data, i) for i, (can_id, data) in enumerate(frames)]
+    assert found[:-1] == [None] * (image.parts - 1)
+    assert np.array_equal(found[-1].counts, counts) and found[-1].t_ns == 0
+    assert (assembler.frames, assembler.torn) == (1, 0)
+
+
+@pytest.mark.parametrize("name", RAW)
+@pytest.mark.parametrize("lost", [0, 1, -1])
+def test_a_lost_frame_costs_its_image_and_no_other(name, lost):
+    image = FORMATS[name]
+    assembler = ImageAssembler(image, 8 * MS)
+    numbers = []
+    for k in range(5):
+        frames = image.encode(np.full((image.rows, image.columns, image.axes), k))
+        if k == 2:
+            del frames[lost]
+        for i, (can_id, data) in enumerate(frames):
+            whole = assembler.push(can_id, data, k * 10 * MS + i * 100_000)
+            if whole is not None:
+                assert len(np.unique(whole.counts)) == 1  # never a mixture
+                numbers.append(int(whole.counts.flat[0]))
+    assert numbers == [0, 1, 3, 4] and assembler.torn == 1
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.sampled_from(RAW), st.lists(st.tuples(st.integers(0, 0x7FF), st.binary(max_size=8)), max_size=60))
+def test_no_bytes_make_it_fail(name, frames):
+    assembler = ImageAssembler(FORMATS[name], 8 * MS)
+    for t_ns, (can_id, data) in enumerate(frames):
+        assembler.push(can_id, data, t_ns)
+
+
+@pytest.mark.parametrize(
+    ("build", "words"),
+    [
+        (lambda: FramePattern.parse("40 tt u"), "two characters"),
+        (lambda: FramePattern.parse("tt" * 9), "1 to 8 bytes"),
+        (lambda: FramePattern.parse("G0 tt"), "two characters"),
+        (lambda: ImageFormat((1, 1), (FramePattern.parse("tt"),), 1, 2), "twice"),
+        (lambda: ImageFormat((1,), (FramePattern.parse("B1 tt"), FramePattern.parse(".. tt")), 1, 2), "own tag"),
+        (lambda: ImageFormat((1,), (FramePattern.parse("tt uu"),), 1, 3), "carry 2 values"),
+        (lambda: FramePattern.parse("t").pack([16]), "two characters"),
+        (lambda: FramePattern.parse(".t").pack([16]), "more than 4 bits"),
+        (lambda: FORMATS["uskin4x4"].encode(np.zeros((4, 4, 1), np.int64)), "expected"),
+    ],
+)
+def test_what_contradicts_itself_is_refused(build, words):
+    with pytest.raises(ProtocolError, match=words):
+        build()

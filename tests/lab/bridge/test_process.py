@@ -1,0 +1,144 @@
+"""A bridge's process that crashes, stands still or never begins: the cell runs on, and ends in time."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+from mcap.reader import make_reader
+from waiting import wait_for_size
+
+import canprobe
+from canprobe.cell.master.cycle import Observation
+from canprobe.cell.scene.load import dump_scene, parse_scene
+from canprobe.cell.session.session import Session
+from canprobe.cell.tasks.from_plan import Request
+from canprobe.errors import ResultsError
+from canprobe.lab.bridge import process as process_module
+from canprobe.lab.bridge.process import BridgeProcess
+
+
+@pytest.fixture
+def plan():
+    return canprobe.plan(canprobe.load_scene("free", {"task.duration_s": 0.1}))
+
+
+@pytest.fixture
+def bridge(plan, tmp_path):
+    one = BridgeProcess("mcap", plan, tmp_path, virtual=False)
+    one.await_ready()
+    yield one
+    one.kill()
+
+
+def pid_of(bridge):
+    return bridge._process.pid
+
+
+def run_cell(plan, *observers):
+    from canprobe.cell.tasks.from_plan import make_task
+
+    session = Session(plan.scene, None, observers=observers)
+    with session:
+        session.run(make_task(plan))
+    return session
+
+
+def test_a_crash_in_the_middle_of_a_run_costs_samples_only(plan, bridge):
+    seen = []
+
+    def crash(observation):
+        seen.append(observation)
+        if len(seen) == 50:
+            os.kill(pid_of(bridge), signal.SIGKILL)
+            os.waitpid(pid_of(bridge), 0)
+
+    session = run_cell(plan, crash, bridge)
+    status = bridge.end("{}")
+    assert session.cell.faults == [] and session.observers.faults == []
+    assert status["samples"] == len(seen) and status["dropped"] >= len(seen) - 50 - bridge._batch
+    assert "ended with status" in status["error"]
+
+
+@pytest.mark.parametrize(("commands", "taken"), [("true", 1), ("false", 0)])
+def test_what_comes_back_counts_as_a_command_only_if_it_is_one_and_only_where_commands_are_allowed(commands, taken):
+    scene = parse_scene(dump_scene(canprobe.load_scene("free")) + f"[bridge]\nros2_commands = {commands}\n")
+    bridge = BridgeProcess("ros2", canprobe.plan(scene), None, virtual=True)
+    try:
+        bridge._back, back = os.pipe()
+        asked = ['{"kind": "start", "value": 0}', '{"value": null}', '{"kind": ["stop"]}', "7", '{"kind": "stop"}']
+        os.write(back, "".join(f'{{"request": {one}}}\n' for one in asked).encode())
+        assert bridge._listen(0.0)
+        assert list(bridge.requests) == [Request("stop")] * taken
+    finally:
+        bridge.kill()
+        os.close(bridge._back)
+        os.close(back)
+
+
+def test_one_that_stands_still_is_left_behind(plan, bridge, monkeypatch):
+    """The queue fills, samples are dropped and counted, and the end comes when it was said to come."""
+    monkeypatch.setattr(process_module, "END_TIMEOUT_S", 0.1)
+    os.kill(pid_of(bridge), signal.SIGSTOP)
+    frames = [(0x181, bytes(8), i) for i in range(2000)]
+    for i in range(200):  # 12 MB
+        bridge.observe(Observation(i, None, None, frames))
+    assert bridge.status()["dropped"] > 50
+    status = bridge.end("{}")
+    assert (status["samples"], status["error"]) == (200, "did not end within 0.1 s")
+    assert bridge._process.returncode == -signal.SIGKILL
+
+
+def test_ctrl_c_on_the_terminal_does_not_reach_it(bridge):
+    assert os.getpgid(pid_of(bridge)) != os.getpgid(0)
+    os.kill(pid_of(bridge), signal.SIGINT)
+    bridge.observe(Observation(0, None, None, [(0x80, b"", 0)]))
+    status = bridge.end("{}")
+    assert status["error"] is None and (status["samples"], status["dropped"]) == (1, 0)
+
+
+def test_a_cell_that_vanishes_leaves_a_whole_file(bridge, tmp_path):
+    """The writing end closes without a word, as when the master is killed."""
+    bridge.observe(Observation(0, None, None, [(0x80, b"", 0)]))
+    bridge._feed.flush()
+    bridge._feed.close()
+    bridge._wait(1 << 62)
+    assert (tmp_path / "run.mcap").exists() and bridge.status()["error"] is None
+
+
+def test_one_that_cannot_begin_stops_the_run_before_anything_is_sent(tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    with pytest.raises(ResultsError, match=r"bridge mcap: .*(Not a directory|File exists)"):
+        canprobe.run(canprobe.load_scene("free"), out=blocked / "run", bridge=("mcap",), duration_s=0.1)
+
+
+def test_samples_count_what_was_dropped_before_them(plan):
+    """What the viewer is shown of losses: the number travels with the next sample."""
+    from canprobe.lab.bridge.process import pack_observation, unpack_observation
+    from canprobe.lab.bridge.worker import SampleSource
+
+    sample = SampleSource(plan).sample(unpack_observation(pack_observation(Observation(0, None, None, []), 17)))
+    assert sample.dropped == 17
+
+
+def test_an_interrupt_ends_run_and_bridge_with_a_whole_file(tmp_path):
+    """Ctrl-C at a terminal goes to the whole group; the run ends as always, and the file is closed properly."""
+    command = [sys.executable, "-m", "canprobe", "run", "free", "--duration", "600", "--bridge", "mcap"]
+    run = subprocess.Popen([*command, "--out", tmp_path], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    try:
+        wait_for_size(tmp_path / "bus.log", 500_000, run)
+        run.send_signal(signal.SIGINT)
+        _, error = run.communicate(timeout=60)
+    finally:
+        run.kill()
+    assert run.returncode == 130 and b"interrupted" in error
+    with (tmp_path / "run.mcap").open("rb") as file:
+        reader = make_reader(file)
+        assert reader.get_summary().statistics.message_count > 1000
+        summary = json.loads(next(a.data for a in reader.iter_attachments() if a.name == "summary.json"))
+    assert summary["stop_reason"] == "interrupted" and summary["bridges"]["mcap"]["dropped"] == 0

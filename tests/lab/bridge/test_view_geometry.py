@@ -1,0 +1,280 @@
+"""The shapes of the 3-D view: links against forward kinematics, ghosts and patches against exact surfaces."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from puma_arm import MODELS
+
+from canprobe.cell.plant.taxels import pad_coordinates
+from canprobe.cell.scene.load import read_cell
+from canprobe.lab.bridge.sample import SurfacePatch
+from canprobe.lab.bridge.view import bodies as arm
+from canprobe.lab.bridge.view import bodies as objects
+from canprobe.lab.bridge.view import bodies as taxels
+from canprobe.lab.bridge.view import meshes
+from canprobe.lab.bridge.view import meshes as colours
+from canprobe.lab.bridge.view.instants import judge
+from canprobe.lab.bridge.view.path import deviation_scale
+from canprobe.lab.bridge.view.surface import Surface
+from canprobe.mechanics.robot.chain import forward, posture, tool_z_offset
+from canprobe.mechanics.touch.linear_algebra import homogeneous, tangent_rotation
+from canprobe.mechanics.touch.objects import OBJECT_PARAMETERS, make_object
+from canprobe.mechanics.touch.pad import Pad
+
+MODEL = pytest.mark.parametrize("model", MODELS.values(), ids=MODELS.keys())
+QS = np.random.default_rng(2).uniform(-2.5, 2.5, (20, 6))
+
+
+def winding(mesh, point):
+    """How often a closed mesh goes round a point: 1 inside, 0 outside (van Oosterom and Strackee, 1983)."""
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] - point for i in range(3))
+    la, lb, lc = (np.linalg.norm(x, axis=1) for x in (a, b, c))
+    dot = lambda x, y: np.einsum("ij,ij->i", x, y)  # noqa: E731
+    over = dot(a, np.cross(b, c))
+    under = la * lb * lc + dot(a, b) * lc + dot(b, c) * la + dot(c, a) * lb
+    return float(np.sum(2.0 * np.arctan2(over, under)) / (4.0 * math.pi))
+
+
+def normals(mesh):
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
+    return np.cross(b - a, c - a)
+
+
+def volume(mesh):
+    """Enclosed by a closed mesh; negative where it is inside out."""
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
+    return np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0
+
+
+def face_middles(mesh):
+    return mesh.vertices[mesh.faces].mean(axis=1)
+
+
+# meshes
+
+
+def test_volumes_are_those_of_the_solids():
+    polygon = 0.5 * meshes.SECTORS * 0.05**2 * math.sin(2 * math.pi / meshes.SECTORS)
+    assert volume(meshes.cylinder(0.05, (-0.1, 0.2))) == pytest.approx(0.3 * polygon, rel=1e-12)
+    stadium = math.pi * 0.02**2 + 0.04 * 0.1
+    link = meshes.link(((0.0, 0.0), 0.02), ((0.06, 0.08), 0.02), (0.0, 0.03))
+    assert volume(link) == pytest.approx(0.03 * stadium, rel=2e-3)
+    assert volume(meshes.dome(0.04, math.pi, rings=200)) == pytest.approx(4 / 3 * math.pi * 0.04**3, rel=4e-3)
+    rounded = meshes.link(((0.0, 0.0), 0.02), ((0.06, 0.08), 0.02), (0.0, 0.03), 4e-3)
+    assert 0.9 * volume(link) < volume(rounded) < volume(link)
+
+
+def test_a_link_between_unequal_circles_has_their_tangents():
+    outline = meshes.link_outline(((0.0, 0.0), 0.03), ((0.1, 0.0), 0.01), 400)
+    apart = np.minimum(np.hypot(*outline.T) - 0.03, np.hypot(outline[:, 0] - 0.1, outline[:, 1]) - 0.01)
+    assert np.abs(apart).max() < 1e-12
+    edges = np.roll(outline, -1, axis=0) - outline
+    assert (
+        edges[:, 0] * np.roll(edges, -1, axis=0)[:, 1] - edges[:, 1] * np.roll(edges, -1, axis=0)[:, 0] > -1e-15
+    ).all()
+
+
+def test_a_circle_inside_the_other_leaves_the_larger():
+    outline = meshes.link_outline(((0.0, 0.0), 0.03), ((0.01, 0.0), 0.005))
+    assert np.hypot(*outline.T) == pytest.approx(0.03)
+
+
+def test_moving_keeps_faces_outside():
+    T = homogeneous(tangent_rotation(np.array([0.6, 0.0, 0.8])), np.array([0.1, 0.2, 0.3]))
+    mesh = meshes.cylinder(0.02, (0.0, 0.1), 2e-3)
+    assert volume(mesh.moved(T)) == pytest.approx(volume(mesh))
+    assert winding(mesh.moved(T), T[:3, 3] + 0.05 * T[:3, 2]) == pytest.approx(1.0)
+
+
+# the arm
+
+
+@MODEL
+@pytest.mark.parametrize("q", QS[:6])
+def test_link_frames_end_at_the_flange_and_pass_the_wrist(model, q):
+    frames = arm.link_frames(model.chain, q)
+    assert frames[6] == pytest.approx(forward(model.chain, q), abs=1e-14)
+    c = posture(model.chain, q)
+    wrist = c.origins[4]
+    assert frames[4][:3, 3] == pytest.approx(wrist, abs=1e-14) and frames[5][:3, 3] == pytest.approx(wrist, abs=1e-14)
+    assert frames[1][:3, 2] == pytest.approx(c.axes[1], abs=1e-14)
+    assert frames[3][:3, 2] == pytest.approx(c.axes[3], abs=1e-14)
+
+
+@MODEL
+def test_every_link_is_a_closed_body_the_right_way_out(model):
+    parts = arm.arm_parts(model.chain)
+    assert len({part.name for part in parts}) == len(parts) and {part.frame for part in parts} == set(range(7))
+    assert all(volume(part.mesh) > 0 for part in parts)
+    for part in parts:
+        edges = np.sort(part.mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        places = np.unique(part.mesh.vertices.round(9), axis=0, return_inverse=True)[1].ravel()
+        at = np.sort(places[edges], axis=1)
+        at = at[at[:, 0] != at[:, 1]]  # triangles at a pole have an edge without length
+        _, uses = np.unique(at, axis=0, return_counts=True)
+        assert (uses % 2 == 0).all(), part.name
+
+
+@MODEL
+def test_joints_lie_in_the_bodies_that_they_join(model):
+    """Each joint's place by the closed form, looked for in the solids on both of its sides, in many postures."""
+    parts = {part.name: part for part in arm.arm_parts(model.chain)}
+    d = [1e-3 * joint.d_mm for joint in read_cell(model.name).joints.values()]
+
+    def inside(name, frames, point):
+        part = parts[name]
+        return winding(part.mesh.moved(frames[part.frame]), point) > 0.5
+
+    for q in QS:
+        frames, c = arm.link_frames(model.chain, q), posture(model.chain, q)
+        axis, offset = np.array(c.axes[1]), d[1] + d[2]
+        shoulder, wrist = np.array([0.0, 0.0, d[0]]), np.array(c.origins[4])
+        elbow = np.array(c.origins[2]) - d[1] * axis  # in the plane of joint 1's axis
+        side = math.copysign(1.0, offset)
+        beam = side * (abs(offset) - 0.5 * arm.FOREARM - 0.004 - 0.5 * arm.UPPER_ARM)
+        assert inside("shoulder", frames, shoulder)
+        assert inside("upper_arm", frames, shoulder + beam * axis)  # round joint 2
+        assert inside("upper_arm", frames, elbow + beam * axis)  # round joint 3
+        assert inside("forearm", frames, elbow + offset * axis)
+        assert inside("wrist", frames, wrist) and inside("hub", frames, wrist)
+        assert not inside("forearm", frames, wrist + 0.04 * np.array(c.axes[3]))
+
+
+def test_the_two_published_arms_differ_where_their_numbers_do():
+    upenn, unimate = ({p.name: p.mesh for p in arm.arm_parts(model.chain)} for model in MODELS.values())
+    length = lambda mesh: float(np.ptp(mesh.vertices[:, 0]))  # noqa: E731
+    assert length(upenn["upper_arm"]) - length(unimate["upper_arm"]) == pytest.approx(0.2 * 0.0254, abs=1e-6)
+
+
+def test_the_probe_is_a_ball_with_a_holder_from_the_flange():
+    tool = tool_z_offset(80.0)
+    holder, elastic = arm.probe_parts(0.04, tool)
+    assert np.linalg.norm(elastic.vertices, axis=1) == pytest.approx(0.04)
+    assert elastic.vertices[:, 2].max() == pytest.approx(0.04)
+    assert volume(holder) > 0 and holder.vertices[:, 2].min() == pytest.approx(-0.08)
+    assert np.linalg.norm(holder.vertices[holder.vertices[:, 2] > -0.02], axis=1).max() < 0.04
+    assert np.einsum("ij,ij->i", normals(elastic), face_middles(elastic)).min() > -1e-15
+
+
+# the array
+
+
+def test_taxels_lie_where_the_plant_has_them():
+    radius, pitch = 0.04, 0.0254 / 16
+    places, turns = taxels.taxel_poses(Pad(), radius)
+    for k, (place, (w, x, y, z)) in enumerate(zip(places, turns, strict=True)):
+        direction = place / np.linalg.norm(place)
+        u, v = pad_coordinates(tuple(direction), radius)
+        assert (u / pitch + 7.5, v / pitch + 7.5) == pytest.approx((k % 16, k // 16), abs=1e-9)
+        up = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))  # where the quaternion takes z
+        assert up == pytest.approx(direction, abs=1e-12)
+    assert np.linalg.norm(places, axis=1) == pytest.approx(radius + taxels.TAXEL_LIFT_M)
+
+
+def test_the_image_has_u_to_the_right_and_v_upward():
+    counts = np.zeros((16, 16), np.uint8)
+    counts[0, 15] = 255  # lowest v, highest u
+    image = taxels.taxel_image(counts, pixels=2)
+    bright = np.argwhere(image.sum(axis=2) > 300)
+    assert bright.min(axis=0).tolist() == [30, 30] and bright.max(axis=0).tolist() == [31, 31]
+
+
+# objects
+
+POSE = homogeneous(tangent_rotation(np.array([0.36, -0.48, 0.8])), np.array([-0.12, 0.1, 0.37]))
+HEIGHTS = -np.add.outer(np.linspace(-0.05, 0.05, 51) ** 2, 2 * np.linspace(-0.04, 0.04, 41) ** 2)
+BALL = meshes.revolved([(0.03 * math.sin(a), 0.03 * math.cos(a)) for a in np.linspace(math.pi, 0, 100)], 200)
+KINDS = {
+    "heights": {"heights": HEIGHTS, "spacing": 2e-3, "origin": (0, 0)},
+    "mesh": {"vertices": BALL.vertices, "faces": BALL.faces, "spacing": 2e-3, "origin": (0, 0)},
+    "plane": {},
+    "sphere": {"radius": 0.03},
+    "large sphere": {"radius": 0.5},
+    "cylinder": {"radius": 0.036},
+    "large cylinder": {"radius": 0.4},
+    "ellipsoid": {"radius_x": 0.08, "radius_y": 0.06, "radius_z": 0.05},
+    "torus": {"ring_radius": 0.06, "radius": 0.02},
+    "large torus": {"ring_radius": 0.4, "radius": 0.1},
+    "wave": {"amplitude": 4e-3, "wavelength": 0.04},
+    "fillet": {"radius": 0.02, "angle": 1.0},
+    "saddle": {"radius_x": 0.05, "radius_y": -0.12},
+    "bowl": {"radius": 0.08},
+    "large bowl": {"radius": 0.6},
+    "quadric": {"matrix": np.array([[6, 2, 0, 0], [2, 9, 0, 0], [0, 0, 3, 0.5], [0, 0, 0.5, 0]], float)},
+}
+
+
+def test_every_kind_of_object_has_a_ghost_here():
+    assert {name.split()[-1] for name in KINDS} == set(OBJECT_PARAMETERS)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_ghosts_lie_on_the_exact_surface_with_their_front_outside(name):
+    shape = make_object(name.split()[-1], T_base_object=POSE, **KINDS[name])
+    mesh = objects.object_mesh(shape)
+    some = 9 if name in ("heights", "mesh") else 1  # whose feet take longer
+    feet = [shape.closest(vertex) for vertex in mesh.vertices[::some]]
+    assert max(abs(foot.distance) for foot in feet) < 1e-9
+    flat = np.linalg.norm(normals(mesh), axis=1) < 1e-12
+    outward = np.array([shape.closest(p).normal for p in face_middles(mesh)[~flat][::some]])
+    n = normals(mesh)[~flat][::some]
+    assert np.einsum("ij,ij->i", n / np.linalg.norm(n, axis=1, keepdims=True), outward).min() > 0.9
+    assert np.linalg.norm(mesh.vertices - POSE[:3, 3], axis=1).min() < 0.006  # it is there where it is touched
+    lines = objects.object_lines(shape)
+    assert max(abs(shape.closest(p).distance) for p in lines.reshape(-1, 3)[::7]) < 1e-9
+
+
+# the recovered surface
+
+
+def answer(direction, sigma, radius=0.05):
+    """What is stated of a ball in a direction from its centre."""
+    T = homogeneous(tangent_rotation(-np.array(direction)), radius * np.array(direction))
+    covariance = (
+        np.diag(sigma**2 * np.array([1 / 3, 1 / 6, 1 / 3])) if math.isfinite(sigma) else np.full((3, 3), math.inf)
+    )
+    return judge(SurfacePatch(0, T, np.eye(2) / radius, covariance, (True, True)), None)
+
+
+def ring(angles, sigma):
+    return [answer((math.sin(a), 0.0, math.cos(a)), sigma) for a in angles]
+
+
+def test_the_recovered_surface_lies_on_the_ball_and_has_the_colours_of_what_is_known():
+    scale = deviation_scale(None)
+    surface = Surface(scale)
+    for one in ring(np.arange(-0.5, 0.5, 0.05), sigma=1.0):
+        assert surface.add(one)
+    mesh, rgb = surface.mesh()
+    assert np.linalg.norm(mesh.vertices, axis=1) == pytest.approx(0.05, abs=2e-6)
+    assert np.ptp(np.arctan2(mesh.vertices[:, 0], mesh.vertices[:, 2])) == pytest.approx(1.08, abs=0.06)
+    assert (rgb == scale.colours(np.ones(1))).all()
+
+
+def test_of_two_answers_at_one_place_the_better_known_one_is_drawn():
+    surface = Surface(deviation_scale(None))
+    answers = (*ring([0.0], 1.0), *ring([0.01], 1.5), *ring([0.01], 0.5))
+    assert [surface.add(one) for one in answers] == [True, False, True]
+    assert not surface.add(answer((0.0, 0.0, 1.0), math.inf))
+
+
+# colours
+
+
+def test_colours_rise_in_lightness_and_tell_what_is_unknown():
+    scale = colours.scale(np.linspace(-1.0, 3.0, 200), 0.0, 2.0).astype(float)
+    lightness = scale @ (0.2126, 0.7152, 0.0722)
+    assert (np.diff(lightness) >= -1.0).all() and lightness[-1] - lightness[0] > 150
+    assert (scale[:50] == scale[0]).all() and scale[0].tolist() == [68, 1, 84]
+    assert colours.scale([math.nan, math.inf], 0.0, 1.0).tolist() == [list(colours.UNKNOWN)] * 2
+
+
+def test_linear_light_is_undone_by_the_screen():
+    """Encoded as a screen does it (IEC 61966-2-1), within what eight bits of light leave of dark colours."""
+    rgb = np.arange(0, 256, 5, dtype=np.uint8)
+    light = colours.linear_light(rgb) / 255.0
+    shown = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055) * 255.0
+    assert shown == pytest.approx(rgb, abs=7.0) and shown[20:] == pytest.approx(rgb[20:], abs=1.0)

@@ -1,0 +1,116 @@
+"""Study `bound`: its ground is exact, and a fixed subset of its cases is inside the bands that its seeds allow."""
+
+from __future__ import annotations
+
+import json
+import math
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from canprobe.cli import main
+from canprobe.errors import UsageError
+from canprobe.lab.studies import bound
+from canprobe.lab.studies.bound import PATHS, SURFACES, Case, all_cases, findings, make_ground
+from canprobe.lab.studies.harness import CellStore
+from canprobe.lab.studies.sweep import Sweep
+
+SEEDS = 24
+SUBSET = (
+    Case("cylinder", "weave", 0.04, 0.02, 20e-6, 1e-3),
+    Case("hyperboloid", "circle", 0.005, 0.005, 20e-6, 1e-3),
+    Case("torus", "weave", 1.0, 0.02, 100e-6, 5e-3),
+    Case("plane", "circle", 0.005, 0.005, 100e-6, 5e-3),
+)
+
+
+OUTSIDE = (
+    Case("torus", "weave", 0.005, 0.005, 5e-6, 2e-4),
+    Case("sphere", "weave", 0.005, 0.005, 100e-6, 5e-3),
+)
+
+
+@pytest.fixture(scope="module")
+def rows(tmp_path_factory):
+    store = CellStore(tmp_path_factory.mktemp("cells"))
+    sweep = Sweep(lambda: ThreadPoolExecutor(1), store, say=lambda line: None)
+    yield bound.measure_all([*SUBSET, *OUTSIDE], SEEDS, sweep).rows
+    store.close()
+
+
+@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize("surface", SURFACES)
+def test_the_ground_is_exact(surface, path):
+    g = make_ground(surface, 0.03, path, 0.02, 400)
+    steps, along = np.diff(g.points, axis=0), g.normals[1:] + g.normals[:-1]
+    assert np.abs(np.einsum("ij,ij->i", steps, along)).max() < 1e-9  # normals stand on the path
+    assert np.linalg.norm(steps, axis=1).sum() == pytest.approx(0.02, rel=0.1)
+    assert np.allclose(g.points[-1], 0.0, atol=1e-15)
+    assert np.allclose(g.normals[-1], [0.0, 0.0, -1.0], atol=1e-12)
+    # K by differences of normals over a path that is short against the radii, also at a place off the contact
+    small = make_ground(surface, 0.03, path, 3e-6, 400)
+    K = np.linalg.lstsq(small.points[:, :2], small.normals[:, :2], rcond=None)[0]
+    assert np.allclose(K, g.K, atol=0.01)
+    assert np.allclose(g.tensor(np.zeros(3))[:2, :2], g.K, atol=1e-9)
+    # along the path: dn = K dp, the tensor taken half-way
+    for i in (50, 200):
+        half = 0.5 * (g.points[i] + g.points[i + 1])
+        assert np.allclose(g.tensor(half) @ steps[i], g.normals[i + 1] - g.normals[i], atol=2e-5)
+
+
+def test_an_unknown_surface_is_named():
+    with pytest.raises(UsageError, match="surface"):
+        make_ground("cube", 0.1, "weave", 0.02, 10)
+    with pytest.raises(UsageError, match="path"):
+        make_ground("plane", 0.1, "spiral", 0.02, 10)
+
+
+def test_inside_the_region_the_estimators_are_at_the_bound(rows):
+    inside = [r for r in rows if r["inside"]]
+    assert len(inside) == 2 * len(SUBSET)
+    for row in inside:
+        # an RMS of three entries over 24 seeds scatters by 1/√(6·24) = 8 %: three of them
+        assert row["ratio"] < (1.25 if row["method"] == "ml" else 1.4) * 1.25, row
+        assert row["observed"] == 1.0
+        # 95 % of 24: three standard deviations are 13 %
+        assert row["coverage"] >= 0.82, row
+        assert 0.75 < row["claimed"] / row["ratio"] < 1.35, row  # what is said is what is so
+    pooled = math.sqrt(np.mean([r["ratio"] ** 2 for r in inside if r["method"] == "ml"]))
+    assert 0.6 < pooled < 1.1 * 1.13
+
+
+def test_outside_the_region_ml_is_honest(rows):
+    """A torus's cubic terms are ten times the bound; on the sphere the points' noise turns normals by 20 mrad."""
+    torus, sphere = (r for r in rows if not r["inside"] and r["method"] == "ml")
+    assert torus["at_cubic"] > 5.0
+    assert torus["ratio"] < 2.5
+    for row in (torus, sphere):
+        assert row["coverage"] >= 0.82, row
+
+
+def test_the_quick_study_runs_from_the_command_line(tmp_path, capsys):
+    assert main(["study", "bound", "--quick", "--out", str(tmp_path), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert {r["surface"] for r in document["rows"]} == set(SURFACES)
+    assert {"commit", "machine", "model", "seeds"} <= set(document["facts"])
+    assert {p.suffix for p in tmp_path.iterdir()} == {".jsonl", ".csv", ".txt", ".json", ".png"}
+    assert main(["study", "bound", "--quick", "--out", str(tmp_path), "--json"]) == 0
+    again = capsys.readouterr()
+    assert json.loads(again.out) == document
+    assert f"{2 * len(SURFACES)} of {2 * len(SURFACES)} cells are kept" in again.err
+
+
+def test_the_table_says_what_is_wrong(rows):
+    bad = dict(rows[0], ratio=3.0, coverage=0.5, inside=True, verdict="error, overconfident")
+    said = findings([*rows, bad])
+    assert any("out of line: cylinder" in line and "overconfident" in line for line in said)
+
+
+def test_cases_are_what_was_promised():
+    cases = list(all_cases())
+    assert len(cases) == len(set(cases))
+    assert {c.surface for c in cases} == set(SURFACES)
+    assert min(c.size for c in cases) == 0.005
+    assert max(c.size for c in cases) == 1.0
+    assert {(c.sigma_point, c.sigma_normal) for c in cases} >= {(5e-6, 2e-4), (100e-6, 5e-3)}

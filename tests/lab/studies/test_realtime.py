@@ -1,0 +1,133 @@
+"""The arithmetic of study `realtime`; the study itself runs on vcan0 only."""
+
+import mmap
+import os
+
+import numpy as np
+import pytest
+
+from canprobe.cli import main
+from canprobe.fieldbus.bus.real.socketcan import has_socketcan
+from canprobe.lab.studies.realtime import findings
+from canprobe.lab.studies.realtime_cases import CycleTimes, Measured, answer_latencies, holding_scene, woken
+from canprobe.lab.studies.soak import COLUMNS, resident_mib
+from canprobe.lab.studies.soak import findings as findings_of_soak
+
+
+def log_of(tmp_path, *lines):
+    path = tmp_path / "bus.log"
+    path.write_text("".join(f"(0000000000.{us:06d}) vcan0 {text}\n" for us, text in lines))
+    return path
+
+
+def test_latency_is_that_of_the_last_answer_and_only_where_all_answered(tmp_path):
+    path = log_of(
+        tmp_path,
+        (0, "080#01"), (300, "182#00"), (410, "181#00"),
+        (2500, "080#02"), (2600, "181#00"),  # 182h of this cycle never came
+        (5000, "080#03"), (5900, "182#00"), (5100, "181#00"), (5000, "201#00"),
+    )  # fmt: skip
+    assert answer_latencies(path, frozenset({0x181, 0x182}), 2_500_000).tolist() == [410_000, 900_000]
+
+
+def test_no_sync_no_latency(tmp_path):
+    assert len(answer_latencies(log_of(tmp_path, (0, "181#00")), frozenset({0x181}), 2_500_000)) == 0
+
+
+def times(cycles, overruns, seconds, response_us=(), compute_us=()):
+    late = np.where(np.arange(cycles) < overruns, 2_000_000, 0)
+    response, compute = (1000 * np.array(us, np.int64) for us in (response_us, compute_us))
+    return CycleTimes(2_500_000, late, seconds, response, compute)
+
+
+def test_findings_tell_rates_and_shares():
+    measured = [
+        Measured("whole controller", "window", 400.0, times(4001, 2, 10.0, [500], [750])),
+        Measured("plain canopen", "window", 400.0, times(1001, 900, 10.0)),
+        Measured("bare clock", "none", 400.0, times(4000, 1, 10.0)),
+        Measured("hold", "features", 400.0, times(4001, 0, 10.0)),
+        Measured("hold", "features", 500.0, times(4001, 40, 10.0)),
+        Measured("hold", "image", 400.0, times(401, 0, 1.0), ended="node 1: lost"),
+    ]
+    text = "\n".join(findings(measured))
+    assert "whole controller at 400 Hz for 10 s: 5.0 overruns in 10 000 cycles (goal 1), 400.0 cycles" in text
+    assert "100.0 cycles a second held" in text
+    assert "does nothing: 2.5 overruns in 10 000 cycles" in text
+    assert "p99 is 20 % of the period until the commands are out, 30 % with" in text
+    assert "features: 400 Hz held without overruns of 400, 500 Hz" in text
+    assert "image: no rate held" in text
+
+
+@pytest.mark.skipif(has_socketcan(), reason="this kernel has SocketCAN")
+def test_without_socketcan_the_way_is_told(capsys, tmp_path):
+    assert main(["study", "realtime", "--quick", "--out", str(tmp_path)]) == 3
+    assert "canprobe vcan -- COMMAND" in capsys.readouterr().err
+
+
+def test_the_studies_scenes_leave_every_node_to_a_process_of_its_own():
+    scene = holding_scene("features", 800.0)
+    assert scene.emulated_node_ids == ()
+    assert (scene.arm.missed_syncs, scene.limits.late_cycles_max_percent) == (250, 100), "measured, never ended"
+    assert (scene.cycle.rate_hz, scene.sensor.rate_hz, scene.sensor.mode) == (800.0, 400.0, "features")
+
+
+def test_a_loop_that_is_late_passes_over_the_deadlines_that_are_past():
+    class Clock:
+        now = 0
+        naps = iter((0, 100, 2600, 0))
+
+        def now_ns(self):
+            return self.now
+
+        def sleep_until_ns(self, t_ns):
+            self.now = max(self.now, t_ns) + next(self.naps)
+
+    lateness: list[int] = []
+    assert list(woken(Clock(), 1000, 4, lateness)) == [1000, 2000, 5000, 6000]
+    assert lateness == [0, 100, 2600, 0]
+    times = CycleTimes(1000, np.array(lateness), 5e-6)
+    assert (times.overruns, times.cycles, times.missed) == (1, 4, 0)
+
+
+# The arithmetic of study `soak`; the study itself runs on vcan0 only.
+
+ZERO = {column.key: 0 for column in COLUMNS} | {"master_mib": 90.0, "nodes_mib": 80.0, "latency_us": 400.0}
+
+
+def hour(leak_mib_h=0.0, drift_us=0.0, lost=0):
+    return [
+        ZERO
+        | {
+            "t_s": 60.0 * k,
+            "master_mib": 90.0 + leak_mib_h * k / 60,
+            "cycles": 24_000 * k,
+            "latency_us": 400.0 + drift_us * k / 60,
+            "frames_counted": 1000 * k,
+            "frames_on_bus": 1000 * k + (lost if k == 60 else 0),
+        }
+        for k in range(61)
+    ]
+
+
+def test_a_sound_hour_shows_nothing():
+    memory, latency, frames, cycles = findings_of_soak(hour())
+    assert "master grew by +0.00 MiB/h" in memory
+    assert "400 µs in the first tenth, 400 µs in the last" in latency
+    assert "60000 frames counted by the master, 60000 by the interface" in frames and "+0 under way" in frames
+    assert cycles.startswith("1440000 cycles, 0 overruns")
+
+
+def test_a_leak_a_drift_and_a_loss_are_told():
+    memory, latency, frames, _ = findings_of_soak(hour(leak_mib_h=3.0, drift_us=120.0, lost=7))
+    assert "master grew by +3.00 MiB/h" in memory
+    assert "405 µs in the first tenth, 515 µs in the last" in latency
+    assert "+7 under way or lost" in frames
+
+
+def test_resident_memory_is_that_of_the_process():
+    before = resident_mib(os.getpid())
+    with mmap.mmap(-1, 32 << 20) as ballast:  # pages of its own: what the allocator keeps or gives back has no say
+        for page in range(0, len(ballast), mmap.PAGESIZE):
+            ballast[page] = 1
+        assert resident_mib(os.getpid()) - before == pytest.approx(32, abs=8)
+    assert resident_mib(os.getpid()) - before == pytest.approx(0, abs=8)

@@ -1,0 +1,102 @@
+"""Study `workprec` in its quick form, and what its words rest on."""
+
+import numpy as np
+import pytest
+
+from canprobe.cell.plant.dynamic_arm import Stepping
+from canprobe.lab.studies import workprec
+from canprobe.lab.studies.workprec import (
+    ENOUGH,
+    Case,
+    cases,
+    errors,
+    findings,
+    integrated,
+    knee,
+    observed,
+    reference,
+    stands,
+    verdict,
+)
+
+CYCLES = 3
+PAD = 1.27e8
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return observed(PAD, CYCLES, reference(PAD, CYCLES, 1e-10))
+
+
+def errors_of(truth, method, step_us, held):
+    stepping = Stepping(method, round(1000 * step_us))
+    return errors(truth, observed(PAD, CYCLES, integrated(PAD, CYCLES, stepping, held)))
+
+
+def test_the_whole_plant_converges_with_the_order_of_its_step(truth):
+    coarse, fine = (errors_of(truth, "rosenbrock", step, False)["position_um"] for step in (312.5, 78.125))
+    assert np.log2(coarse / fine) / 2 == pytest.approx(2, abs=0.4)
+    assert fine < 0.1
+
+
+def test_holding_dynamics_over_a_cycle_is_an_error_of_its_own(truth):
+    held, free = (errors_of(truth, "rk4", 78.125, held) for held in (True, False))
+    assert free["force_percent"] < held["force_percent"] < 0.5
+    assert free["position_um"] < 1e-3
+
+
+def row(method, cost, force, *, held=True, step=625.0, stiffness=PAD, stands=True):
+    found = {"stiffness_n_m3": stiffness, "held": held, "method": method, "step_us": step, "cost_us": cost}
+    found |= {"force_percent": force, "position_um": None if force is None else 0.1 * force, "taxel_counts": 0.0}
+    return found | {"stands": stands, "verdict": verdict(found)}
+
+
+def test_the_knee_is_the_cheapest_that_is_accurate_enough():
+    rows = [row("a", 5.0, 1.01 * ENOUGH["force_percent"]), row("b", 7.0, 0.9), row("c", 6.0, None), row("d", 9.0, 1e-5)]
+    assert [r["verdict"] for r in rows] == ["coarse", "enough", "broke down", "enough"]
+    assert knee(rows, PAD)["method"] == "b"
+    assert knee(rows[:1], PAD) is None
+
+
+def test_the_choice_is_linearly_implicit_accurate_over_the_span_and_stands():
+    def over_the_span(method, cost, step, **changes):
+        return [row(method, cost, 0.5, step=step, stiffness=k, **changes) for k in workprec.SPAN]
+
+    good = over_the_span("rosenbrock", 9.0, 625.0)
+    rows = [*good, *over_the_span("rk4", 2.0, 625.0), *over_the_span("implicit", 3.0, 625.0, stands=False)]
+    rows += [row("rosenbrock", 1.0, 0.5, step=1250.0), row("rosenbrock", 1.0, 3.0, step=1250.0, stiffness=1.27e9)]
+    assert workprec.choice(rows) == (("rosenbrock", 625.0), 27.0)
+    assert workprec.choice(rows, workprec.METHODS) == (("rk4", 625.0), 6.0)
+    assert "rk4 at 625 µs costs least, 0.22 × as much" in findings(rows, {})[0]
+    assert workprec.choice(rows[3:]) is None
+
+
+def test_quick_cells_cover_every_method_and_free_dynamics_too():
+    quick = cases(True)
+    assert {c.method for c in quick if c.held} == set(workprec.METHODS)
+    assert any(not c.held for c in quick)
+    assert len(quick) < len(cases(False)) / 4
+
+
+def test_a_cell_measures_states_and_cost():
+    answer = workprec.measure(Case(PAD, "rosenbrock", 1250.0, True, CYCLES, 1))
+    assert np.shape(answer["states"]) == (CYCLES, 12)
+    assert answer["cost_us"] > 10.0
+
+
+@pytest.mark.parametrize(("method", "step_us", "quiet"), [("rosenbrock", 625.0, True), ("rk4", 1250.0, False)])
+def test_explicit_steps_rattle_at_rest_and_linearly_implicit_ones_do_not(method, step_us, quiet):
+    assert stands(workprec.STIFFEST, 40, Stepping(method, round(1000 * step_us))) is quiet
+    assert stands(PAD, 40, Stepping(method, round(1000 * step_us))) is quiet
+
+
+def test_findings_say_whether_the_default_is_the_knee():
+    floor = {PAD: {"force_percent": 1e-9, "position_um": 1e-9, "taxel_counts": 1e-9}}
+    mine = workprec.default_choice()
+    rows = [row("rosenbrock", 7.0, 0.5, step=mine["step_us"], stiffness=k) for k in workprec.SPAN]
+    rows.append(row("rosenbrock", 20.0, 0.1, held=False, step=mine["step_us"]))
+    said = "\n".join(findings(rows, floor))
+    assert "the knee, and the default" in said
+    assert "2.9 × the cost" in said
+    others = [r | {"method": "implicit", "step_us": 78.0} for r in rows]
+    assert "not the default" in "\n".join(findings(others, floor))

@@ -1,0 +1,417 @@
+"""fit_surface and cramer_rao: exact without noise, at the bound with it, honest where nothing was observed."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from canprobe.errors import UsageError
+from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
+from canprobe.mechanics.touch.estimate.fit import METHODS, fit_surface, make_estimator
+from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
+from canprobe.mechanics.touch.estimate.noise import Correlation, Prior
+from canprobe.mechanics.touch.surface import SurfaceMatrix
+from canprobe.mechanics.touch.surface_map import SurfaceMap
+
+TINY = {"sigma_point": 1e-9, "sigma_normal": 1e-9}
+WEIGHT = np.array([1.0, 2.0, 1.0])
+"""K12 stands twice in the Frobenius norm."""
+
+
+def frobenius(error):
+    return math.sqrt(float(WEIGHT @ np.square(error)))
+
+
+@pytest.mark.parametrize("name", ["plane", "sphere", "small sphere", "cylinder"])
+@pytest.mark.parametrize("method", ["ml", "chord", "chen1996"])
+def test_constant_gradient_surfaces_are_exact_for_all(method, name, truth):
+    path = truth.path(name, T=truth.any_pose(4))
+    estimate = fit_surface(path.points, path.normals, method=method, **TINY)
+    assert frobenius(path.error(estimate)) < 1e-6
+    assert estimate.observed.all()
+
+
+@pytest.mark.parametrize("name", ["saddle", "bowl", "ellipsoid", "hyperboloid"])
+def test_ml_is_exact_on_any_quadric(name, truth):
+    path = truth.path(name, T=truth.any_pose(5))
+    estimate = fit_surface(path.points, path.normals, **TINY)
+    assert frobenius(path.error(estimate)) < 1e-6
+    S = path.surface.normalised_at(path.points[-1]).transformed(estimate.T_frame_contact).S
+    assert np.allclose(estimate.S, S, atol=1e-4)
+    assert np.allclose(estimate.T_frame_contact[:3, 3], path.points[-1], atol=1e-12)
+    assert np.allclose(estimate.normal, path.normals[-1], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "kappa"),
+    [
+        ("plane", (0, 0)),
+        ("sphere", (20, 20)),
+        ("cylinder", (1 / 0.036, 0)),
+        ("saddle", (20, -15)),
+        ("bowl", (-12.5,) * 2),
+    ],
+)
+def test_signs_and_order_of_principal_curvatures(name, kappa, truth):
+    path = truth.path(name, T=truth.any_pose(6))
+    p, n = path.noisy(2e-5, 1e-3, 1)
+    estimate = fit_surface(p, n, sigma_point=2e-5, sigma_normal=1e-3)
+    assert estimate.kappa == pytest.approx(kappa, abs=1.5)
+    assert estimate.kappa[0] >= estimate.kappa[1]
+    assert estimate.umbilic == (name in ("plane", "sphere", "bowl"))
+    for k, d in zip(estimate.kappa, estimate.directions, strict=True):
+        assert d @ estimate.curvature_tensor_base() @ d == pytest.approx(k)
+        assert abs(d @ estimate.normal) < 1e-12
+
+
+# The table of the method comparison: ml against the bound.
+@pytest.mark.parametrize(("sigma_point", "sigma_normal"), [(2e-5, 1e-3), (5e-5, 3e-3)])
+@pytest.mark.parametrize("name", ["cylinder", "sphere", "ellipsoid", "hyperboloid", "saddle"])
+def test_ml_reaches_the_bound_and_covers(name, sigma_point, sigma_normal, truth):
+    path = truth.path(name)
+    noise = {"sigma_point": sigma_point, "sigma_normal": sigma_normal}
+    bound = math.sqrt(float(WEIGHT @ np.diag(cramer_rao(path.points, path.normals, path.surface, **noise))))
+    errors, inside, innovation = [], 0, []
+    for seed in range(40):
+        estimate = fit_surface(*path.noisy(sigma_point, sigma_normal, seed), **noise)
+        error = path.error(estimate)
+        errors.append(error)
+        innovation.append(estimate.innovation)
+        inside += error @ np.linalg.solve(estimate.covariance, error) < 7.815
+    rms = math.sqrt(np.mean([frobenius(e) ** 2 for e in errors]))
+    assert 0.6 * bound < rms < 1.25 * bound
+    assert frobenius(np.mean(errors, axis=0)) < 0.5 * bound  # 40 runs leave 0.16 by chance
+    assert inside >= 33
+    assert np.mean(innovation) == pytest.approx(1.0, abs=0.06)
+    relative = bound / np.linalg.norm(path.surface.curvature_at(path.points[-1])[0])
+    assert relative < 0.05
+
+
+def test_tight_curvature_needs_the_points_noise_in_the_normals(truth):
+    """R = 5 mm: κ σ_p is 4 mrad against 1 mrad of σ_n."""
+    path = truth.path("small sphere")
+    noise = {"sigma_point": 2e-5, "sigma_normal": 1e-3}
+    bound = math.sqrt(float(WEIGHT @ np.diag(cramer_rao(path.points, path.normals, path.surface, **noise))))
+    errors = [path.error(fit_surface(*path.noisy(2e-5, 1e-3, seed), **noise)) for seed in range(40)]
+    assert math.sqrt(np.mean([frobenius(e) ** 2 for e in errors])) < 1.25 * bound
+    assert frobenius(np.mean(errors, axis=0)) < 0.4 * bound
+
+
+@pytest.mark.parametrize("method", ["chord", "chen1996"])
+@pytest.mark.parametrize(("count", "rank"), [(3, 2), (4, 3), (40, 3)])
+def test_differences_of_three_points_leave_one_combination_open(count, rank, method):
+    """S y is known of two y: S may have any multiple of m mᵀ more, m across both; on a curve m is not the normal."""
+    surface = SurfaceMatrix.sphere(0.05)
+    x, y = np.random.default_rng(0).uniform(-0.01, 0.01, size=(2, count))
+    points = np.stack([x, y, surface.height(x, y)], axis=1)
+    e = fit_surface(points, surface.normal(points), sigma_point=1e-6, sigma_normal=1e-5, method=method, lag=1)
+    assert e.rank == rank
+    assert e.observed.tolist() == [True, rank == 3]
+    if rank == 3:
+        assert e.kappa == pytest.approx([20.0, 20.0], rel=1e-6)
+        return
+    first, second = (points[-1] - points[:-1]) @ e.T_frame_contact[:3, :3]
+    m = np.cross(first, second)
+    hidden = m[[0, 0, 1]] * m[[0, 1, 1]] * [1.0, math.sqrt(2.0), 1.0]
+    assert np.allclose(e.combinations @ hidden, 0.0, atol=1e-9 * np.linalg.norm(hidden))
+    assert np.isnan(e.kappa[1])
+
+
+class TestUnobserved:
+    NOISE = ((5e-5, 3e-3), (2e-5, 1e-3))
+
+    @pytest.mark.parametrize("noise", NOISE)
+    @pytest.mark.parametrize("angle", [0.0, 0.5 * math.pi, 0.6])
+    @pytest.mark.parametrize("name", ["cylinder", "sphere", "plane"])
+    def test_a_straight_path_leaves_one_combination_open(self, name, angle, noise, truth):
+        path = truth.straight(name, angle)
+        K = path.surface.curvature_at([0, 0, 0])[0]
+        t = np.array([math.cos(angle), math.sin(angle)])
+        for seed in range(5):
+            e = fit_surface(*path.noisy(*noise, seed), sigma_point=noise[0], sigma_normal=noise[1])
+            assert e.rank == 2
+            assert e.observed.tolist() == [True, False]
+            assert e.kappa[0] == pytest.approx(t @ K @ t, abs=2.0)
+            assert abs(e.directions[0, :2] @ t) > 0.999
+            assert np.isnan(e.kappa[1])
+            assert np.isnan(e.K[1, 1]) or angle == 0.5 * math.pi
+            assert np.isinf(np.diag(e.covariance)).any()
+            assert np.isfinite(e.S).all()
+
+    @pytest.mark.parametrize("noise", NOISE)
+    def test_standing_still_and_pure_spin_say_nothing(self, noise, truth):
+        path = truth.placed(truth.surface("cylinder"), np.zeros(160), np.zeros(160))
+        for seed in range(10):
+            e = fit_surface(*path.noisy(*noise, seed), sigma_point=noise[0], sigma_normal=noise[1])
+            assert e.rank == 0
+            assert not e.observed.any()
+            assert np.isnan(e.kappa).all()
+            assert np.isnan(e.K).all()
+            assert np.isinf(np.diag(e.covariance)).all()
+
+    def test_a_prior_on_curvature_fills_in_but_is_named_and_not_called_observed(self, truth):
+        path = truth.straight("cylinder")
+        p, n = path.noisy(5e-5, 3e-3, 0)
+        prior = Prior.flat(0.02, 30.0)
+        e = fit_surface(p, n, sigma_point=5e-5, sigma_normal=3e-3, prior=prior)
+        assert np.isfinite(e.K).all()
+        assert e.prior == prior.name
+        assert e.observed.tolist() == [True, False]
+        assert math.sqrt(e.covariance[1, 1]) < 1.0
+        assert math.sqrt(e.covariance[2, 2]) == pytest.approx(30.0, rel=0.2)
+
+    def test_the_bound_of_a_straight_path_is_infinite_across(self, truth):
+        path = truth.straight("cylinder")
+        C = cramer_rao(path.points, path.normals, path.surface, sigma_point=2e-5, sigma_normal=1e-3)
+        assert np.isfinite(C[:2, :2]).all()
+        assert np.isinf(C[2, 2])
+
+
+def long_path(kind, size):
+    """x, y of a long path over a patch of a size (m) that ends inside it, 1/80 of the size a sample."""
+    t = np.linspace(0.0, 1.0, 20_001)
+    if kind == "spiral":
+        x, y = (0.5 * (1.0 - t) * f(24.0 * np.pi * t) for f in (np.cos, np.sin))
+    elif kind == "circles":
+        x, y = (0.5 * f(20.0 * np.pi * t) for f in (np.cos, np.sin))
+    else:  # lines there and back, each a little further on
+        lines = 4 if kind == "dwell" else 20
+        x, y = np.abs(lines * t % 2.0 - 1.0) - 0.5, t - 0.5
+    s = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
+    at = np.arange(0.0, s[-1], 1 / 80)
+    if kind == "dwell":
+        at = np.sort(np.concatenate([at, np.full(1000, 0.6 * s[-1])]))
+    return size * np.interp(at, s, x), size * np.interp(at, s, y)
+
+
+@pytest.mark.parametrize("kind", ["zigzag", "spiral", "circles", "dwell"])
+@pytest.mark.parametrize(
+    ("radius", "K"), [(5e-3, [[1, 0], [0, 1]]), (0.05, [[1, 0], [0, 0]]), (10.0, [[1, 0], [0, -0.5]])]
+)
+def test_recursive_on_a_long_path_over_a_small_patch(radius, K, kind, truth):
+    """Up to 31 times the patch's size of path: its memory goes by the patch and by the surface's radius."""
+    size = min(0.4 * radius, 0.02)
+    path = truth.placed(SurfaceMatrix.from_curvature(np.array(K) / radius), *long_path(kind, size))
+    noise = {"sigma_point": size / 600, "sigma_normal": 1e-3}
+    for seed in range(2):
+        e = fit_surface(*path.noisy(*noise.values(), seed), **noise, method="recursive")
+        error = path.error(e)
+        assert e.rank == 3
+        assert error @ np.linalg.solve(e.covariance, error) < 16.27  # 99.9 %
+        assert frobenius(error) * size < 0.02
+        assert e.distance <= 3.0 * size
+
+
+def test_recursive_refuses_only_what_does_not_move(truth):
+    rest = truth.placed(truth.surface("cylinder"), np.zeros(400), np.zeros(400))
+    with pytest.raises(UsageError, match="beyond its noise"):
+        fit_surface(*rest.noisy(2e-5, 1e-3, 0), sigma_point=2e-5, sigma_normal=1e-3, method="recursive")
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("unit", [1e3, 1e-3, 39.37])
+def test_the_unit_of_length_does_not_matter(method, unit, truth):
+    path = truth.path("ellipsoid")
+    p, n = path.noisy(2e-5, 1e-3, 2)
+    one = fit_surface(p, n, sigma_point=2e-5, sigma_normal=1e-3, method=method)
+    other = fit_surface(p * unit, n, sigma_point=2e-5 * unit, sigma_normal=1e-3, method=method)
+    assert np.allclose(other.K * unit, one.K, rtol=1e-6, atol=1e-6 * np.abs(one.K).max())
+    assert np.allclose(other.covariance * unit**2, one.covariance, rtol=1e-5, atol=1e-9)
+    assert other.condition_number == pytest.approx(one.condition_number, rel=1e-5)
+
+
+@pytest.mark.parametrize("radius", [1e-3, 1.0, 100.0])
+def test_radius_from_a_millimetre_to_a_hundred_metres(radius, truth):
+    path = truth.path("sphere", size=20 * radius if radius < 0.01 else 1.0)
+    scale = radius / 0.05
+    p, n = path.points * scale, path.normals
+    e = fit_surface(p, n, sigma_point=1e-6 * radius, sigma_normal=1e-5)
+    assert e.kappa * radius == pytest.approx([1, 1], rel=1e-2)
+
+
+def test_the_answer_turns_with_the_frame(truth):
+    path = truth.path("ellipsoid")
+    p, n = path.noisy(2e-5, 1e-3, 3)
+    T = truth.any_pose(9)
+    R = T[:3, :3]
+    one = fit_surface(p, n, sigma_point=2e-5, sigma_normal=1e-3)
+    other = fit_surface(p @ R.T + T[:3, 3], n @ R.T, sigma_point=2e-5, sigma_normal=1e-3)
+    assert np.allclose(R @ one.curvature_tensor_base() @ R.T, other.curvature_tensor_base(), atol=1e-5)
+    assert np.allclose(one.kappa, other.kappa, atol=1e-6)
+
+
+def test_noise_per_sample_and_as_covariance(truth):
+    path = truth.path("saddle")
+    p, n = path.noisy(2e-5, 1e-3, 4)
+    fits = [
+        fit_surface(p, n, sigma_point=sp, sigma_normal=sn)
+        for sp, sn in (
+            (2e-5, 1e-3),
+            (np.full(160, 2e-5), np.full(160, 1e-3)),
+            (4e-10 * np.eye(3), 1e-6 * np.eye(3)),
+            (np.tile(4e-10 * np.eye(3), (160, 1, 1)), 1e-3),
+        )
+    ]
+    for other in fits[1:]:
+        assert np.allclose(other.K, fits[0].K, atol=1e-4)
+        assert np.allclose(other.covariance, fits[0].covariance, rtol=1e-3)
+    bad = np.where(np.arange(160) < 40, 1e-3, 2e-5)
+    p[:40] += np.random.default_rng(0).normal(size=(40, 3)) * 1e-3
+    weighted = fit_surface(p, n, sigma_point=bad, sigma_normal=1e-3)
+    assert frobenius(path.error(weighted)) < 2.0
+
+
+def test_outliers_have_bounded_influence(truth):
+    path = truth.path("cylinder")
+    p, n = path.noisy(2e-5, 1e-3, 5)
+    clean = frobenius(path.error(fit_surface(p, n, sigma_point=2e-5, sigma_normal=1e-3)))
+    rng = np.random.default_rng(6)
+    wrong = rng.choice(150, 8, replace=False)
+    p[wrong] += rng.normal(size=(8, 3)) * 2e-3
+    e = fit_surface(p, n, sigma_point=2e-5, sigma_normal=1e-3)
+    assert frobenius(path.error(e)) < clean + 1.0
+    assert any("reduced weight" in note for note in e.notes)
+
+
+def test_prediction_follows_the_surface(truth):
+    path = truth.path("ellipsoid", T=truth.any_pose(7))
+    e = fit_surface(path.points, path.normals, **TINY)
+    point, normal = e.predict(path.points[-1] + 2e-3 * e.directions[0] + 1e-3 * e.normal)
+    assert abs(path.surface.value(point)) < 1e-9 * np.linalg.norm(path.surface.gradient(point))
+    assert np.allclose(normal, path.surface.normal(point), atol=1e-8)
+
+
+def test_the_bound_scales_with_noise_and_samples(truth):
+    path = truth.path("ellipsoid")
+    free = Prior("none to speak of", 1e9, 1e9, 1e9)
+    arguments = (path.points, path.normals, path.surface)
+    one = cramer_rao(*arguments, sigma_point=2e-5, sigma_normal=1e-3, prior=free)
+    double = cramer_rao(*arguments, sigma_point=4e-5, sigma_normal=2e-3, prior=free)
+    assert np.allclose(double, 4 * one, rtol=1e-6)
+    twice = (np.repeat(path.points, 2, axis=0), np.repeat(path.normals, 2, axis=0), path.surface)
+    assert np.allclose(cramer_rao(*twice, sigma_point=2e-5, sigma_normal=1e-3, prior=free), one / 2, rtol=1e-9)
+
+
+def test_the_bound_against_numerical_information():
+    """One unknown at a time cannot be checked in closed form, a plane can: slopes of normals over places."""
+    rng = np.random.default_rng(0)
+    p = np.zeros((50, 3))
+    p[:, :2] = rng.uniform(-0.01, 0.01, size=(50, 2))
+    p[-1] = 0
+    n = np.tile([0.0, 0.0, -1.0], (50, 1))
+    C = cramer_rao(p, n, SurfaceMatrix.plane(), sigma_point=1e3, sigma_normal=1e-3)
+    x = p[:, :2] - p[:, :2].mean(axis=0)
+    xx, xy, yy = x[:, 0] @ x[:, 0], x[:, 0] @ x[:, 1], x[:, 1] @ x[:, 1]
+    information = np.array([[xx, xy, 0], [xy, xx + yy, xy], [0, xy, yy]]) / 1e-6
+    assert np.allclose(C, np.linalg.inv(information), rtol=1e-6)
+
+
+@pytest.mark.parametrize("off", [3e-4, 1e-2, 50.0])
+@pytest.mark.parametrize("index", [0, -1])
+def test_the_bound_refuses_points_off_the_surface(index, off, truth):
+    path = truth.path("ellipsoid")
+    noise = {"sigma_point": 2e-5, "sigma_normal": 1e-3}
+    assert np.isfinite(cramer_rao(*path.noisy(2e-5, 1e-3, 0), path.surface, **noise)).all()
+    points = path.points.copy()
+    points[index] += off * path.normals[index]
+    with pytest.raises(UsageError, match=rf"^points: expected all on S, .*at index {index % 160};"):
+        cramer_rao(points, path.normals, path.surface, **noise)
+    with pytest.raises(UsageError, match=r"^points: expected all on S"):
+        cramer_rao(1e3 * path.points, path.normals, path.surface, **noise)
+
+
+def bad(points=None, normals=None, **kw):
+    p = np.zeros((5, 3)) if points is None else points
+    n = np.tile([0.0, 0.0, 1.0], (len(p), 1)) if normals is None else normals
+    return lambda: fit_surface(p, n, **{"sigma_point": 1e-5, "sigma_normal": 1e-3, **kw})
+
+
+@pytest.mark.parametrize(
+    ("call", "field"),
+    [
+        (bad(points=np.zeros((5, 2))), "points"),
+        (bad(points=np.full((5, 3), np.nan)), "points"),
+        (bad(points=[["a", "b", "c"]] * 3), "points"),
+        (bad(points=np.zeros((1, 3))), "points"),
+        (bad(normals=np.ones((5, 3))), "normals"),
+        (bad(normals=np.tile([0.0, 0.0, 1.0], (4, 1))), "normals"),
+        (bad(normals=np.vstack([np.tile([0.0, 0, 1], (4, 1)), [[0.0, 0, -1]]])), "normals"),
+        (bad(sigma_point=0.0), "sigma_point"),
+        (bad(sigma_point=np.inf), "sigma_point"),
+        (bad(sigma_normal=-1e-3), "sigma_normal"),
+        (bad(sigma_normal=np.ones(4)), "sigma_normal"),
+        (bad(sigma_point=np.diag([1e-10, 1e-10, 0.0])), "sigma_point"),
+        (bad(method="m1"), "method"),
+        (bad(method="chen1996", lag=0), "lag"),
+        (bad(method="chen1996", lag=2.5), "lag"),
+        (bad(points=np.ma.masked_equal(np.eye(5, 3), 1.0)), "points"),
+        (bad(sigma_point="fine"), "sigma_point"),
+        (bad(coupling=np.nan), "coupling"),
+        (bad(coupling="no"), "coupling"),
+        (bad(points=[]), "points"),
+        (bad(points=np.zeros((5, 3)) + 1j), "points"),
+        (bad(points=np.full((5, 3), "1")), "points"),
+        (bad(points=[[0, 0, 10**400]] * 5), "points"),
+        (bad(sigma_point="1e-5"), "sigma_point"),
+        (bad(sigma_normal=1e-3 + 0j), "sigma_normal"),
+        (bad(method="chen1996", lag="10"), "lag"),
+        (bad(prior="flat"), "prior"),
+        (bad(method="recursive", prior=0.1), "prior"),
+        (bad(correlation=0.002), "correlation"),
+        (lambda: Correlation("2 mm"), "correlation.length"),
+        (lambda: Correlation(2e-3, 0.5, "all"), "correlation.point_share"),
+        (lambda: Prior("x", "1", 1.0, 1.0), "prior.sigma_c13"),
+        (lambda: Prior.weak("20 mm"), "length"),
+        (lambda: SurfaceMatrix([]), "S"),
+        (lambda: SurfaceMatrix.cylinder(0.1, axis=[1, 0, 0]), "axis"),
+        (lambda: SurfaceMatrix.from_curvature(np.eye(2), c13="1"), "c13, c23, c33"),
+        (lambda: SurfaceMatrix.plane() + 1.0, "sum"),
+        (lambda: "2" * SurfaceMatrix.plane(), "factor"),
+        (lambda: SurfaceMatrix.plane().value([1j, 0, 0]), "points"),
+        (lambda: SurfaceMatrix.plane().normal([0, 0]), "points"),
+        (lambda: SurfaceMatrix.plane().height("0", 0.0), "x"),
+        (lambda: SurfaceMap(patches=None, path=np.zeros((1, 3))), "patches"),
+        (lambda: SurfaceMap(patches=(), path=[]), "path"),
+        (lambda: SurfaceEstimate.of(np.eye(4), "K"), "K"),
+        (lambda: make_estimator("ml", sigma_point=1e-5, sigma_normal=1e-3, window="many"), "window"),
+        (lambda: make_estimator("recursive", sigma_point=1e-5, sigma_normal=1e-3, memory_m="20 mm"), "memory_m"),
+        (lambda: cramer_rao(np.zeros((5, 3)), np.eye(3)[[2] * 5], "S", sigma_point=1, sigma_normal=1), "S"),
+        (lambda: Prior("x", 0.0, 1.0, 1.0), "prior.sigma_c13"),
+    ],
+)
+def test_errors_name_the_field(call, field):
+    with pytest.raises(UsageError, match=f"^{field}: expected"):
+        call()
+
+
+def test_a_wrong_method_gets_a_suggestion():
+    with pytest.raises(UsageError, match='did you mean "chen1996"'):
+        bad(method="chen96")()
+
+
+def test_a_length_that_is_hardly_wrong_is_told_with_the_digits_that_are():
+    with pytest.raises(UsageError, match=r"got length 1\.000002"):
+        bad(normals=np.tile([0.0, 0.0, 1.000002], (5, 1)))()
+
+
+@pytest.mark.parametrize("rows", [1, 4])
+def test_the_bound_of_one_place_is_infinite(rows):
+    C = cramer_rao(
+        np.tile([0.0, 0.0, 0.05], (rows, 1)),
+        np.tile([0.0, 0.0, 1.0], (rows, 1)),
+        np.diag([1, 1, 1, -(0.05**2)]),
+        sigma_point=2e-5,
+        sigma_normal=1e-3,
+    )
+    assert np.isposinf(np.diag(C)).all()
+    assert np.isnan(C[~np.eye(3, dtype=bool)]).all()
+
+
+def test_deviations_that_no_arithmetic_can_bear_are_told():
+    a = np.linspace(-0.2, 0.0, 60)
+    normals = np.stack([np.sin(a), 0.3 * np.sin(20 * a), -np.cos(a)], axis=1)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    with pytest.raises(UsageError, match="expected those of real noise, got 1e-05 and 1e-30"):
+        fit_surface(0.05 * normals, normals, sigma_point=1e-5, sigma_normal=1e-30)

@@ -1,0 +1,99 @@
+"""What the pad remembers, against the sum over all past places."""
+
+import math
+
+import numpy as np
+import pytest
+
+from canprobe.mechanics.touch.patch.array_calibration import Lag
+from canprobe.mechanics.touch.patch.moments import GAP_S, TIMES_S, PadLag, PadMemory
+
+
+def remembered(t, uv):
+    """(3,) uu, uv, vv of the way back, each past place with the share of the memory that it filled, all memories."""
+    total = np.zeros(3)
+    back = uv - uv[-1]
+    for tau in TIMES_S:
+        filled = np.exp(-(t[-1] - t[1:]) / tau) - np.exp(-(t[-1] - t[:-1]) / tau)
+        total += filled @ np.stack([back[1:, 0] ** 2, back[1:, 0] * back[1:, 1], back[1:, 1] ** 2], axis=1)
+    return total
+
+
+def test_it_is_the_sum_over_past_places():
+    rng = np.random.default_rng(0)
+    t = np.cumsum(rng.uniform(0.004, 0.05, 300))
+    uv = 1e-3 * np.cumsum(rng.normal(size=(300, 2)), axis=0)
+    memory = PadMemory()
+    for i in range(300):
+        found = memory.add(t[i], *uv[i])
+        if i % 60 == 59:
+            assert found == pytest.approx(remembered(t[: i + 1], uv[: i + 1]), rel=1e-9, abs=1e-18)
+
+
+def test_a_patch_that_rests_leaves_nothing_and_one_that_has_moved_is_forgotten():
+    memory = PadMemory()
+    for i in range(200):
+        assert memory.add(0.05 * i, 1e-3, -2e-3) == pytest.approx((0.0, 0.0, 0.0), abs=1e-17)
+    moved = [memory.add(10.0 + 0.05 * i, 3e-3, -2e-3)[0] for i in range(4000)]
+    full = 1.0 - np.exp(-10.0 / np.array(TIMES_S))
+    assert moved[0] == pytest.approx(4e-6 * full.sum(), rel=0.1)
+    assert np.all(np.diff(moved) < 0.0)
+    assert moved[-1] < 0.005 * moved[0]
+
+
+def test_a_reset_forgets():
+    memory = PadMemory()
+    memory.add(0.0, 0.0, 0.0)
+    memory.add(1.0, 0.0, 0.0)
+    memory.reset()
+    assert memory.add(1.1, 5e-3, 0.0) == (0.0, 0.0, 0.0)
+
+
+# The centroid's lag on the pad.
+
+LAG = Lag(most=120e-6, reach=200e-6)
+
+
+def moved(speed, seconds, rate=200.0):
+    """What is added to the centroid of a contact that goes along u at a speed (m/s), at the end."""
+    pad = PadLag(LAG)
+    for k in range(round(seconds * rate)):
+        u = speed * k / rate
+        out = pad.step(k / rate, u, 1e-3)
+    return out[0] - u, out[1] - 1e-3
+
+
+@pytest.mark.parametrize("speed", [1e-3, -1e-3])
+def test_a_contact_is_ahead_of_its_centroid(speed):
+    """Means of time constants T trail a steady motion by speed · T."""
+    u, v = moved(speed, 3.0)
+    way = 1e-3 * (LAG.slow_s - LAG.quick_s)
+    assert v == 0.0
+    assert u == pytest.approx(math.copysign(LAG.most * way / (way + LAG.reach), speed), rel=0.01)
+
+
+def test_at_rest_nothing_is_added_and_never_more_than_the_most():
+    assert moved(0.0, 1.0) == (0.0, 0.0)
+    assert abs(moved(1.0, 2.0)[0]) < LAG.most
+
+
+def test_it_comes_close_to_a_pad_with_play():
+    """A centroid that a loop of 60 µm drags behind on a weave: most of the lag is gone, whatever the phase."""
+    t = np.arange(0.0, 6.0, 0.005)
+    true = 0.45e-3 * np.stack([np.sin(1.6 * t), np.cos(1.0 * t)], axis=1)
+    pad, centre, left, before = PadLag(LAG), true[0].copy(), [], []
+    for k, place in enumerate(true):
+        way = place - centre
+        size = float(np.hypot(*way))
+        centre = centre + way * max(0.0, 1.0 - 60e-6 / max(size, 1e-12))
+        out = pad.step(float(t[k]), *centre.tolist())
+        left.append(out - place)
+        before.append(centre - place)
+    assert np.std(left[200:]) < 0.65 * np.std(before[200:])
+
+
+def test_a_new_contact_starts_without_a_past():
+    pad = PadLag(LAG)
+    pad.step(0.0, 0.0, 0.0)
+    pad.step(0.005, 1e-3, 0.0)
+    assert pad.step(0.01 + GAP_S, 5e-3, 2e-3) == (5e-3, 2e-3)

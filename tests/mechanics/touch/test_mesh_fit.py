@@ -1,0 +1,204 @@
+"""Meshes as smooth surfaces: against the bodies that they are meshes of, edges, and meshes that show no surface."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial import Delaunay
+
+from canprobe.mechanics.touch.mesh_fit import fit_mesh
+from canprobe.mechanics.touch.objects import make_object
+
+EDGE, SPACING = 5e-4, 1e-3
+BODIES = {
+    "cylinder": ({"radius": 0.036}, lambda x, y: np.sqrt(0.036**2 - y**2) - 0.036),
+    "sphere": ({"radius": 0.05}, lambda x, y: np.sqrt(0.05**2 - x**2 - y**2) - 0.05),
+    "saddle": ({"radius_x": 0.06, "radius_y": -0.08}, lambda x, y: -(x**2) / 0.12 + y**2 / 0.16),
+    "torus": (
+        {"ring_radius": 0.06, "radius": 0.03},
+        lambda x, y: np.sqrt(0.03**2 - (np.hypot(x + 0.06, y) - 0.06) ** 2) - 0.03,
+    ),
+    "wave": ({"amplitude": 2e-3, "wavelength": 0.09}, lambda x, y: 2e-3 * (np.cos(2 * math.pi * y / 0.09) - 1)),
+}
+
+
+def patch_of(height, edge=EDGE, half=0.016, seed=1):
+    """An irregular mesh: a grid of points, each moved by up to 0.3 of the edge's length, in single precision."""
+    x, y = np.meshgrid(*[np.linspace(-half, half, round(2 * half / edge) + 1)] * 2, indexing="ij")
+    inner = (slice(1, -1), slice(1, -1))
+    for axis, moved in zip((x, y), np.random.default_rng(seed).uniform(-0.3, 0.3, (2, *x.shape)), strict=True):
+        axis[inner] += edge * moved[inner]
+    vertices = np.column_stack((x.ravel(), y.ravel(), height(x, y).ravel()))
+    faces = Delaunay(vertices[:, :2]).simplices
+    a, b, c = (vertices[faces[:, k], :2] for k in range(3))
+    down = (b - a)[:, 0] * (c - a)[:, 1] < (b - a)[:, 1] * (c - a)[:, 0]
+    faces[down] = faces[down][:, ::-1]
+    return vertices.astype(np.float32), faces
+
+
+def mesh(vertices, faces, spacing=SPACING, origin=(0, 0)):
+    pose = np.eye(4)
+    return make_object("mesh", T_base_object=pose, vertices=vertices, faces=faces, spacing=spacing, origin=origin)
+
+
+def worst(exact, read, seed=2):
+    """Errors of point (m), normal (rad) and curvature (relative) over feet of a ball of about 30 mm."""
+    errors = []
+    for at in np.random.default_rng(seed).uniform((-0.009, -0.009, 0.029), (0.009, 0.009, 0.031), (40, 3)):
+        a, b = exact.closest(at), read.closest(at)
+        A, B = ((c.directions.T * c.kappa) @ c.directions for c in (a, b))
+        bend = np.linalg.norm(A - B) / np.linalg.norm(A)
+        errors.append((np.linalg.norm(a.point - b.point), np.linalg.norm(a.normal - b.normal), bend))
+    return np.max(errors, axis=0)
+
+
+@pytest.mark.parametrize("kind", BODIES)
+def test_an_irregular_mesh_of_a_body_is_the_body(kind):
+    """Edges of 0.5 mm; fifty times nearer than the 5 µm, 0.5 mrad and 1 % that are asked for."""
+    params, height = BODIES[kind]
+    exact = make_object(kind, T_base_object=np.eye(4), **params)
+    point, normal, bend = worst(exact, mesh(*patch_of(height)))
+    assert point < 1e-7 and normal < 1e-5 and bend < 1e-3
+
+
+def test_long_facets_of_a_cad_program_are_curved_across_and_straight_along():
+    """A cylinder in strips of 2 mm: only their ends are vertices, and their normals turn by 56 mrad."""
+    angles = np.linspace(-0.7, 0.7, 26)
+    ends = [np.column_stack((np.full(26, x), 0.036 * np.sin(angles), 0.036 * np.cos(angles))) for x in (-0.03, 0.03)]
+    a, b, c, d = np.arange(25), np.arange(1, 26), np.arange(26, 51), np.arange(27, 52)
+    faces = np.concatenate((np.column_stack((a, c, b)), np.column_stack((b, c, d))))
+    exact = make_object("cylinder", T_base_object=np.eye(4), radius=0.036)
+    point, normal, bend = worst(exact, mesh(np.concatenate(ends), faces))
+    assert point < 2e-7 and normal < 1e-5 and bend < 2e-3
+
+
+def ball(radius=0.02, rings=60, sectors=120):
+    """A closed ball with two poles, its centre at the origin."""
+    polar, turn = np.linspace(0, math.pi, rings + 1)[1:-1], np.arange(sectors) * (2 * math.pi / sectors)
+    p, t = (one.ravel() for one in np.meshgrid(polar, turn, indexing="ij"))
+    body = radius * np.column_stack((np.sin(p) * np.cos(t), np.sin(p) * np.sin(t), np.cos(p)))
+    vertices = np.vstack((body, (0, 0, radius), (0, 0, -radius)))
+    index = np.arange(len(body)).reshape(-1, sectors)
+    beside = np.roll(index, -1, axis=1)
+    a, b, c, d = (one.ravel() for one in (index[:-1], beside[:-1], index[1:], beside[1:]))
+    top, bottom = np.full(sectors, len(body)), np.full(sectors, len(body) + 1)
+    faces = [(a, c, b), (b, c, d), (top, index[0], beside[0]), (bottom, beside[-1], index[-1])]
+    return vertices, np.concatenate([np.column_stack(one) for one in faces])
+
+
+def test_of_a_closed_body_the_upper_side_is_the_surface():
+    vertices, faces = ball()
+    read, exact = mesh(vertices, faces), make_object("sphere", T_base_object=np.eye(4), radius=0.02)
+    point, normal, bend = worst(exact, read)
+    assert point < 1e-6 and normal < 1e-4 and bend < 1e-2
+    beyond = np.array([(0.0195, 0.0, 0.0), (0.1, 0.0, 0.0), (0.0, 0.0, -1e-5)])
+    assert (read.gaps(beyond) > 0).tolist() == [True, True, False]  # the steep side is no surface, nor what is beside
+
+
+def test_a_plate_of_few_facets_is_flat_between_its_edges():
+    profile = np.array([(-30, 0), (-1, 0), (-1, -0.5), (1, -0.5), (1, 0), (30, 0)]) * 1e-3  # a groove 2 mm wide
+    sides = [np.column_stack((profile[:, 0], np.full(6, y), profile[:, 1])) for y in (-0.02, 0.02)]
+    i = np.arange(5)
+    faces = np.concatenate((np.column_stack((i, i + 1, i + 6)), np.column_stack((i + 1, i + 7, i + 6))))
+    plate = mesh(np.concatenate(sides), faces, spacing=5e-4, origin=(0.015, 0.0))
+    flat = plate.closest((0.0, 0.0, 0.03))
+    assert flat.point == pytest.approx((0, 0, 0), abs=1e-7) and np.abs(flat.kappa).max() < 0.05
+    assert plate.spline.at(-0.015, 0.0)[0] == pytest.approx(-5e-4, abs=1e-4)
+    over = plate.touches((-0.015, 0.0, 0.03), 0.0302)
+    assert over is not None and len(over.points) == 2  # on its edges, which are round over two spacings to each side
+    assert 2e-3 < np.ptp(over.points[:, 0]) < 4.5e-3
+    along = np.linspace(-0.04, 0.01, 2001)
+    assert plate.spline.many(along, np.zeros(2001))[0].max() < 1e-5  # it does not overshoot beside the walls
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda v, f: (v, f[:, ::-1]), "inside out"),
+        (lambda v, f: (v * np.nan, f), "finite"),
+        (lambda v, f: (v[:5], f), "faces name vertices 0 to 4"),
+        (lambda v, f: (v, f[:0]), "needs vertices"),
+        (lambda v, f: (v * 1000, f), "widen"),
+        (lambda v, f: ball(0.02, 8, 16), "too coarse: facets of about 7.8 mm turn the normal by 19 deg"),
+    ],
+)
+def test_what_shows_no_surface_is_refused_with_the_reason(change, message):
+    with pytest.raises(ValueError, match=message):
+        mesh(*change(*ball()))
+
+
+def test_an_open_mesh_that_faces_down_and_an_origin_beside_it():
+    vertices, faces = patch_of(BODIES["sphere"][1], edge=2e-3)
+    with pytest.raises(ValueError, match=r"no facet of the mesh faces \+z"):
+        mesh(vertices, faces[:, ::-1])
+    with pytest.raises(ValueError, match="beside the surface"):
+        mesh(vertices, faces, origin=(0.1, 0.0))
+
+
+def grid_faces(n):
+    """Facets of a grid of n by n vertices, row by row."""
+    corner = np.array([n * i + j for i in range(n - 1) for j in range(n - 1)])[:, None]
+    return np.concatenate((corner + np.array((0, n, 1)), corner + np.array((1, n, n + 1))))
+
+
+def ring_of(low_m, high_m, at_m, n=61):
+    """A shallow dome, the facets of which lie between two distances from its middle at (x, y), in single precision."""
+    x, y = (axis.ravel() for axis in np.meshgrid(*[np.linspace(-high_m, high_m, n)] * 2, indexing="ij"))
+    faces = grid_faces(n)
+    far = np.hypot(x, y)[faces]
+    faces = faces[(far >= low_m).all(axis=1) & (far <= high_m).all(axis=1)]
+    return np.column_stack((x + at_m[0], y + at_m[1], -2.0 * (x * x + y * y))).astype(np.float32), faces
+
+
+@pytest.mark.parametrize(("width_mm", "nodes"), [(8.0, 9), (8.00002, 9), (8.3, 9), (8.99, 9), (20.45, 21)])
+@pytest.mark.parametrize("at_mm", [0.0, 100.0, -1000.0])
+def test_no_node_lies_beyond_the_border(width_mm, nodes, at_mm):
+    x, y = (axis.ravel() for axis in np.meshgrid(*[np.linspace(-0.5, 0.5, 21) * width_mm] * 2, indexing="ij"))
+    points = 1e-3 * np.column_stack((x + at_mm, y, -0.01 * (x * x + y * y))).astype(np.float32).astype(float)
+    fit = fit_mesh(points, grid_faces(21), 1e-3, (1e-3 * at_mm, 0.0))
+    assert fit.heights.shape == (nodes, nodes) and fit.there.all()
+    assert fit.origin == pytest.approx((0.0, 0.0), abs=1e-7)  # the grid stands in the middle of the mesh
+    assert 0.5 * (nodes - 1) * 1e-3 <= 0.5e-3 * width_mm + 1e-6
+
+
+@pytest.mark.parametrize("hole_m", [0.0, 0.006])
+def test_the_surface_ends_with_the_facets_and_so_does_the_closest_point(hole_m):
+    vertices, faces = ring_of(hole_m, 0.02, (0.3, -0.2))
+    read = mesh(vertices, faces, origin=(0.3, -0.188))
+    at = np.random.default_rng(3).uniform((-0.035, -0.047, 0.005), (0.035, 0.023, 0.075), (400, 3))
+    feet = np.array([read.closest(one).point for one in at])[:, :2] + (0.0, 0.012)
+    seen = np.random.default_rng(4).uniform(-0.021, 0.021, (20_000, 2))
+    there = seen[read.exists(seen[:, 0], seen[:, 1] - 0.012)]
+    for points in (feet, there):
+        far = np.hypot(*points.T)
+        assert far.min() >= hole_m - 1e-6 * (hole_m > 0.0) and far.max() <= 0.02 + 2e-6
+    assert len(there) / len(seen) > 0.8 * math.pi * (0.02**2 - hole_m**2) / 0.042**2  # cells at the border are lost
+
+
+def test_missing_facets_round_a_node_are_bridged():
+    vertices, faces = ring_of(0.0, 0.02, (0.0, 0.0), n=81)
+    torn = faces[(faces != 40 * 81 + 40).all(axis=1)]
+    assert len(torn) == len(faces) - 6
+    assert (fit_mesh(vertices, torn, SPACING).there == fit_mesh(vertices, faces, SPACING).there).all()
+
+
+def test_a_body_that_is_narrow_where_it_is_seen_is_refused():
+    """A steep truncated pyramid: 30 mm wide at its foot and 4 mm at its top."""
+    top, foot = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * 2e-3, np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+    vertices = np.vstack((np.column_stack((top, np.zeros(4))), np.column_stack((15e-3 * foot, np.full(4, -0.1)))))
+    sides = [(k, 4 + k, 4 + (k + 1) % 4) for k in range(4)] + [(k, 4 + (k + 1) % 4, (k + 1) % 4) for k in range(4)]
+    with pytest.raises(ValueError, match=r"mesh from \+z is 4 mm by 4 mm, narrower than 7 spacings"):
+        mesh(vertices, [(0, 1, 2), (0, 2, 3), *sides])
+
+
+def test_a_mesh_narrower_than_seven_spacings_or_with_a_far_vertex_is_refused():
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-4.0, 4.1), np.arange(-4.0, 4.1), indexing="ij"))
+    points = 1e-3 * np.column_stack((x, y, -0.01 * (x * x + y * y)))
+    faces = grid_faces(9)
+    assert fit_mesh(points, faces, 1e-3).heights.shape == (9, 9)
+    with pytest.raises(ValueError, match=r"8 mm by 8 mm, narrower than 7 spacings of 1.5 mm"):
+        fit_mesh(points, faces, 1.5e-3)
+    for far in (0.1, 0.2):
+        odd = np.concatenate((points, [[far, far, 0.0]])), np.concatenate((faces, [[0, len(points), 1]]))
+        with pytest.raises(ValueError, match=r"mm and nearly empty: remove vertices far away"):
+            fit_mesh(*odd, 1e-3)

@@ -1,0 +1,301 @@
+"""Object geometry: closest points, normals and curvatures against the quadric, scipy and finite differences."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from canprobe.mechanics.touch.objects import OBJECT_PARAMETERS, make_object
+
+POSE = np.eye(4)
+POSE[:3, :3] = Rotation.from_euler("xyz", (12, -25, 70), degrees=True).as_matrix()
+POSE[:3, 3] = (-0.120, -0.1225, 0.374)
+
+# Ellipsoid of half-axes 60, 45, 35 mm, origin at its top: (x/60)^2 + (y/45)^2 + ((z + 35)/35)^2 = 1.
+ELLIPSOID = np.diag((1 / 0.06**2, 1 / 0.045**2, 1 / 0.035**2, 0.0))
+ELLIPSOID[2, 3] = ELLIPSOID[3, 2] = 1 / 0.035
+TWISTED = np.array([[6.0, 2.0, 0.5, 0.0], [2.0, -3.0, 1.0, 0.0], [0.5, 1.0, 4.0, 0.5], [0.0, 0.0, 0.5, 0.0]])
+
+# kind, parameters (m), curvatures at the origin (1/m), direction of the larger one in the object's frame
+SHAPES = {
+    "plane": ("plane", {}, (0.0, 0.0), None),
+    "sphere": ("sphere", {"radius": 0.05}, (20.0, 20.0), None),
+    "cylinder": ("cylinder", {"radius": 0.036}, (1 / 0.036, 0.0), (0, 1, 0)),
+    "saddle": ("saddle", {"radius_x": 0.06, "radius_y": -0.08}, (1 / 0.06, -12.5), (1, 0, 0)),
+    "saddle turned": ("saddle", {"radius_x": -0.08, "radius_y": 0.06}, (1 / 0.06, -12.5), (0, 1, 0)),
+    "bowl": ("bowl", {"radius": 0.1}, (-10.0, -10.0), None),
+    "ellipsoid": ("quadric", {"matrix": ELLIPSOID}, (0.035 / 0.045**2, 0.035 / 0.06**2), (0, 1, 0)),
+    "twisted": ("quadric", {"matrix": TWISTED}, (3.0 + math.sqrt(97.0), 3.0 - math.sqrt(97.0)), None),
+}
+DIAGONALS = {
+    "plane": (0.0, 0.0, 0.0),
+    "sphere": (10.0, 10.0, 10.0),
+    "cylinder": (0.0, 0.5 / 0.036, 0.5 / 0.036),
+    "saddle": (0.5 / 0.06, -0.5 / 0.08, 0.0),
+    "saddle turned": (-0.5 / 0.08, 0.5 / 0.06, 0.0),
+    "bowl": (-5.0, -5.0, -5.0),
+}
+"""Of the surfaces x'Dx + z = 0 in the object's frame."""
+EACH = pytest.mark.parametrize("name", SHAPES)
+CURVED = [name for name in SHAPES if name != "plane"]
+
+
+def build(name, pose=POSE):
+    kind, params, _, _ = SHAPES[name]
+    return make_object(kind, T_base_object=pose, **params)
+
+
+def quadric_of(name):
+    """S of the surface in base, f < 0 inside, |∇f| = 1 at the object's origin."""
+    if name in DIAGONALS:
+        S = np.diag((*DIAGONALS[name], 0.0))
+        S[2, 3] = S[3, 2] = 0.5
+    else:
+        S = SHAPES[name][1]["matrix"]
+    T = np.linalg.inv(POSE)
+    return T.T @ (S * 0.5 / S[2, 3]) @ T
+
+
+def above(local):
+    """Base coordinates of a point of the object's frame."""
+    return POSE[:3, :3] @ local + POSE[:3, 3]
+
+
+QUERY = st.tuples(st.floats(-0.015, 0.015), st.floats(-0.015, 0.015), st.floats(-0.004, 0.06)).map(np.array)
+
+
+@EACH
+def test_origin_is_on_the_surface_with_z_outward(name):
+    _, _, kappa, direction1 = SHAPES[name]
+    for height in (0.04, 1e-4, -1e-4):
+        c = build(name).closest(above((0, 0, height)))
+        assert c.point == pytest.approx(POSE[:3, 3], abs=1e-15)
+        assert c.normal == pytest.approx(POSE[:3, 2], abs=1e-15)
+        assert c.distance == pytest.approx(height, abs=1e-15)
+        assert c.kappa == pytest.approx(kappa, abs=1e-9)
+        if direction1 is not None:
+            assert abs(c.directions[0] @ POSE[:3, :3] @ direction1) == pytest.approx(1.0)
+
+
+@EACH
+@settings(max_examples=40)
+@given(local=QUERY)
+def test_foot_lies_on_the_surface_and_normal_is_its_gradient(name, local):
+    shape, query = build(name), above(local)
+    c, S = shape.closest(query), quadric_of(name)
+    X = np.append(c.point, 1.0)
+    gradient = 2 * (S @ X)[:3]
+    assert abs(X @ S @ X) < 1e-12
+    assert c.normal == pytest.approx(gradient / np.linalg.norm(gradient), abs=1e-9)
+    assert query - c.point == pytest.approx(c.distance * c.normal, abs=1e-12)
+
+
+@EACH
+@settings(max_examples=40)
+@given(local=QUERY)
+def test_curvature_is_the_one_of_the_surface_matrix(name, local):
+    shape = build(name)
+    c = shape.closest(above(local))
+    d1, d2 = c.directions
+    assert np.cross(d1, d2) == pytest.approx(c.normal, abs=1e-12)
+    assert (d1 @ d1, d1 @ c.normal) == pytest.approx((1.0, 0.0), abs=1e-12)
+    S = quadric_of(name)
+    K = c.directions @ (2 * S[:3, :3]) @ c.directions.T / np.linalg.norm(2 * (S @ np.append(c.point, 1.0))[:3])
+    assert pytest.approx(np.diag(c.kappa), abs=1e-8) == K
+    assert c.kappa[0] >= c.kappa[1]
+
+
+@EACH
+@settings(max_examples=25)
+@given(local=QUERY)
+def test_finite_differences_of_the_normal_confirm_the_curvature(name, local):
+    """dn = K dp on the surface: positive where the normals spread, that is on a convex body."""
+    shape = build(name)
+    c, h = shape.closest(above(local)), 1e-5
+    for k, d in zip(c.kappa, c.directions, strict=True):
+        plus, minus = shape.closest(c.point + h * d), shape.closest(c.point - h * d)
+        moved = plus.point - minus.point
+        assert plus.normal - minus.normal == pytest.approx(k * moved, abs=2e-8)
+
+
+@pytest.mark.parametrize("name", ["ellipsoid", "saddle", "twisted", "cylinder"])
+@pytest.mark.parametrize("seed", range(4))
+def test_distance_is_the_minimum_found_by_scipy(name, seed):
+    rng = np.random.default_rng(seed)
+    shape, S = build(name), quadric_of(name)
+    query = above(rng.uniform((-0.015, -0.015, 0.001), (0.015, 0.015, 0.05)))
+    surface = {
+        "type": "eq",
+        "fun": lambda p: 1e3 * np.append(p, 1.0) @ S @ np.append(p, 1.0),
+        "jac": lambda p: 2e3 * (S @ np.append(p, 1.0))[:3],
+    }
+    best = min(
+        minimize(
+            lambda p: 1e4 * np.sum((p - query) ** 2),
+            query + rng.normal(0, 0.01, 3),
+            jac=lambda p: 2e4 * (p - query),
+            constraints=[surface],
+            method="SLSQP",
+            options={"ftol": 1e-14, "maxiter": 400},
+        ).fun
+        for _ in range(5)
+    )
+    assert shape.closest(query).distance == pytest.approx(math.sqrt(best / 1e4), abs=1e-7)
+
+
+@pytest.mark.parametrize("name", CURVED)
+@settings(max_examples=20)
+@given(local=QUERY)
+def test_distance_never_beats_a_sampled_surface(name, local):
+    """Global minimum: no surface point on a grid over the neighbourhood is nearer."""
+    shape = build(name)
+    grid = np.linspace(-0.03, 0.03, 13)
+    feet = np.array([shape.closest(above((x, y, 0.0))).point for x in grid[::3] for y in grid[::3]])
+    query = above(local)
+    assert abs(shape.closest(query).distance) <= np.linalg.norm(feet - query, axis=1).min() + 1e-12
+
+
+def test_sign_of_the_distance():
+    for name in SHAPES:
+        assert build(name).closest(above((0.001, 0.002, -0.003))).distance < 0
+        assert build(name).closest(above((0.001, 0.002, 0.003))).distance > 0
+
+
+@given(
+    radius=st.floats(0.001, 100.0),
+    local=st.tuples(st.floats(-0.01, 0.01), st.floats(-0.01, 0.01), st.floats(0.0, 0.06)).map(np.array),
+)
+def test_a_quadric_of_a_sphere_is_the_sphere(radius, local):
+    matrix = np.diag((1.0, 1.0, 1.0, 0.0))
+    matrix[2, 3] = matrix[3, 2] = radius
+    quadric = make_object("quadric", T_base_object=POSE, matrix=matrix).closest(above(local))
+    sphere = make_object("sphere", T_base_object=POSE, radius=radius).closest(above(local))
+    assert quadric.distance == pytest.approx(sphere.distance, abs=1e-12)
+    assert quadric.point == pytest.approx(sphere.point, abs=1e-12)
+    assert quadric.kappa == pytest.approx(sphere.kappa, rel=1e-9)
+
+
+def test_cylinder_axis_is_the_object_x_axis():
+    along, across = above((0.5, 0.0, 0.01)), above((0.0, 0.036, 0.0))
+    cylinder = build("cylinder")
+    assert cylinder.closest(along).distance == pytest.approx(0.01)
+    assert cylinder.closest(across).distance == pytest.approx(0.036 * (math.sqrt(2) - 1))
+
+
+def test_bowl_is_hollow_above_its_origin_and_has_a_rim():
+    bowl = build("bowl")
+    side = bowl.closest(above((0.09, 0.0, 0.1)))
+    assert side.distance == pytest.approx(0.01)
+    assert side.normal == pytest.approx(-POSE[:3, 0], abs=1e-12)
+    over = bowl.closest(above((0.1, 0.0, 0.15)))  # the lip is rounded by 1 mm about (0.101, 0.1)
+    assert over.distance == pytest.approx(math.hypot(0.001, 0.05) - 0.001)
+    assert over.normal == pytest.approx(POSE[:3, :3] @ (-0.001, 0.0, 0.05) / math.hypot(0.001, 0.05))
+    assert bowl.closest(above((0.15, 0.0, 0.11))).distance == pytest.approx(0.009)
+
+
+@pytest.mark.parametrize(
+    ("name", "radius"),
+    [
+        ("plane", math.inf),
+        ("sphere", math.inf),
+        ("cylinder", math.inf),
+        ("ellipsoid", math.inf),
+        ("bowl", 0.1),
+        ("saddle", 0.08),
+        ("saddle turned", 0.08),
+        ("twisted", 1 / (math.sqrt(97.0) - 3.0)),
+    ],
+)
+def test_tightest_hollow(name, radius):
+    tightest = build(name).tightest_concave_radius()
+    if name == "twisted":  # sampled round the origin, where it is known
+        assert build(name).tightest_concave_radius(POSE[:3, 3]) == pytest.approx(radius)
+        assert tightest <= radius
+    else:
+        assert tightest == pytest.approx(radius)
+
+
+def test_tightest_hollow_of_a_region_is_milder_than_at_the_origin():
+    far = [above((x, 0.05, 0.02)) for x in (-0.01, 0.0, 0.01)]
+    assert build("saddle").tightest_concave_radius(far) > 0.1
+
+
+def test_saddle_is_nowhere_tighter_than_at_its_origin():
+    saddle = build("saddle")
+    grid = np.linspace(-0.1, 0.1, 15)
+    assert saddle.tightest_concave_radius([above((x, y, 0.0)) for x in grid for y in grid]) == pytest.approx(0.08)
+
+
+@pytest.mark.parametrize("local", [(0.0, 0.0, -0.035), (0.0, 0.0, -0.0349), (1e-9, 0.0, -0.03)])
+def test_from_the_middle_of_an_ellipsoid(local):
+    """Two feet are equally near on the plane of symmetry; one of them is returned, at the right distance."""
+    c, S = build("ellipsoid").closest(above(local)), quadric_of("ellipsoid")
+    X = np.append(c.point, 1.0)
+    assert abs(X @ S @ X) < 1e-9
+    assert abs(c.distance) <= 0.035 + local[2] + 0.035 + 1e-12
+    assert abs(c.distance) == pytest.approx(np.linalg.norm(c.point - above(local)), abs=1e-9)
+    assert np.all(np.isfinite(c.kappa))
+
+
+def test_on_the_axis_of_a_hollow_beyond_its_centre():
+    """Above the centre of curvature the foot leaves the bottom; the two nearest feet lie on the hollow section."""
+    c = build("saddle").closest(above((0.0, 0.0, 0.2)))
+    assert c.distance < 0.2
+    z = 0.2 - 0.08  # foot of a parabola y^2 = 2 R z seen from height h: z = h - R
+    feet = [above((0.0, side * math.sqrt(2 * 0.08 * z), z)) for side in (1, -1)]
+    assert min(np.abs(c.point - foot).max() for foot in feet) < 1e-9
+
+
+@pytest.mark.parametrize("name", ["sphere", "cylinder", "bowl"])
+def test_centre_of_a_round_body_gives_a_finite_answer(name):
+    centre = {"sphere": (0, 0, -0.05), "cylinder": (0, 0, -0.036), "bowl": (0, 0, 0.1)}[name]
+    c = build(name).closest(above(centre))
+    assert np.all(np.isfinite(np.concatenate((c.point, c.normal, c.kappa, c.directions.ravel()))))
+
+
+@settings(max_examples=25)
+@given(local=QUERY)
+def test_the_pose_only_moves_the_answer(local):
+    assume(np.linalg.norm(local) > 1e-3)
+    for name in SHAPES:
+        here, there = build(name, np.eye(4)).closest(local), build(name).closest(above(local))
+        assert there.point == pytest.approx(above(here.point), abs=1e-13)
+        assert there.normal == pytest.approx(POSE[:3, :3] @ here.normal, abs=1e-12)
+        if here.kappa[0] - here.kappa[1] > 1e-3:
+            along = there.directions @ POSE[:3, :3] @ here.directions.T
+            assert np.abs(along) == pytest.approx(np.eye(2), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("kind", "params", "message"),
+    [
+        ("cone", {}, "unknown object kind 'cone'; one of plane, sphere"),
+        ("sphere", {}, "takes radius; got none"),
+        ("plane", {"radius": 1.0}, "takes no parameters; got radius"),
+        ("sphere", {"radius": -0.05}, "radius must be a positive length"),
+        ("saddle", {"radius_x": 0.06, "radius_y": 0.08}, "opposite sign"),
+        ("quadric", {"matrix": np.triu(TWISTED)}, "symmetric"),
+        ("quadric", {"matrix": np.diag((1.0, 1.0, 1.0, -1.0))}, "through the origin"),
+        ("quadric", {"matrix": -ELLIPSOID}, "gradient along"),
+    ],
+)
+def test_wrong_objects_are_refused_with_what_was_expected(kind, params, message):
+    with pytest.raises(ValueError, match=message):
+        make_object(kind, T_base_object=POSE, **params)
+
+
+@pytest.mark.parametrize("bad", [2.0 * np.eye(4), np.diag((1.0, 1.0, -1.0, 1.0)), np.full((4, 4), np.nan), np.eye(3)])
+def test_a_pose_that_is_not_rigid_is_refused(bad):
+    with pytest.raises(ValueError, match="T_base_object"):
+        make_object("plane", T_base_object=bad)
+
+
+def test_every_kind_lists_its_parameters():
+    assert OBJECT_PARAMETERS["cylinder"] == ("radius",)
+    assert set(OBJECT_PARAMETERS) == {"plane", "sphere", "cylinder", "saddle", "bowl", "quadric"} | {
+        "ellipsoid", "torus", "wave", "fillet", "heights", "mesh",
+    }  # fmt: skip
