@@ -15,7 +15,7 @@ from typing import Any
 from canprobe.cell.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan, PlannedPdo
 from canprobe.cell.planning.traffic import CLASSIC_BYTES, SYNCHRONOUS
 from canprobe.errors import UsageError, install_line
-from canprobe.fieldbus.bus.candump import write_text
+from canprobe.fieldbus.bus.files import write_text
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, NmtState
 from canprobe.fieldbus.protocol.pdo import PdoEntry
 

@@ -25,7 +25,7 @@ from canprobe.cell.planning.model import (
 from canprobe.cell.planning.traffic import CLASSIC_BYTES
 from canprobe.cell.scene.load import MOST_BYTES
 from canprobe.errors import UsageError, regular_file
-from canprobe.fieldbus.bus.candump import make_folder, whole_file, write_text
+from canprobe.fieldbus.bus.files import make_folder, whole_file, write_text
 from canprobe.fieldbus.eds.packaged import eds_file
 from canprobe.fieldbus.eds.sections import LINE_END, Faults, Section, Sections, decode, split_sections
 from canprobe.fieldbus.eds.structure import commissioned_node

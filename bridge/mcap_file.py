@@ -20,7 +20,7 @@ from canprobe.cell.planning.bridges import BRIDGES
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.load import SAVED_AS
 from canprobe.errors import ResultsError, UsageError
-from canprobe.fieldbus.bus.candump import make_folder
+from canprobe.fieldbus.bus.files import make_folder
 from canprobe.fieldbus.eds.packaged import eds_file
 from canprobe.lab.bridge.database import plan_database
 from canprobe.lab.bridge.messages import CLOCK, TOPICS, Encoder, Messages, Topic

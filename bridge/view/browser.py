@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from canprobe.cell.scene.geometry import true_object
-from canprobe.fieldbus.bus.candump import write_text
+from canprobe.fieldbus.bus.files import write_text
 from canprobe.fieldbus.bus.port import MonotonicClock
 from canprobe.lab.bridge.sample import Context, Sample
 from canprobe.lab.bridge.view.instants import NAMES, Answer, Follower, Moment, curves_of, row_of

@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
     from canprobe.cell.scene.calibrations import dump_calibration
     from canprobe.cell.scene.load import load_scene, read_cell
     from canprobe.cell.session.array_calibration import Request, calibrate
-    from canprobe.fieldbus.bus.candump import write_text
+    from canprobe.fieldbus.bus.files import write_text
 
     today = date.today().isoformat()
     out = args.out or api.timed_folder(f"calibrate-array-{read_cell(args.cell).cell.name}")

@@ -57,7 +57,7 @@ def add_arguments(parser: Parser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Write cell.toml and first.toml, with the files that they name."""
     from canprobe.cell.scene.load import written_by_line
-    from canprobe.fieldbus.bus.candump import write_text, writing
+    from canprobe.fieldbus.bus.files import write_text, writing
     from canprobe.mechanics.robot.urdf import with_meshes_found
 
     folder: Path = args.folder
@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
 @contextlib.contextmanager
 def _folder_or_nothing(folder: Path) -> Iterator[None]:
     """The folder for the files that the block writes; where the block fails, neither it nor they are left."""
-    from canprobe.fieldbus.bus.candump import make_folder
+    from canprobe.fieldbus.bus.files import make_folder
 
     new = [path for path in (folder, *folder.parents) if not path.exists()]
     make_folder(folder)
@@ -279,7 +279,7 @@ def _first_scene(folder: Path, cell: str) -> tuple[str, str | None]:
     from canprobe.cell.planning.make import make_plan
     from canprobe.cell.scene.load import parse_scene
     from canprobe.cell.scene.resolve import resolve
-    from canprobe.fieldbus.bus.candump import write_text
+    from canprobe.fieldbus.bus.files import write_text
 
     write_text(folder / "cell.toml", _at_rate(cell, _RATES_HZ[0]))
     refused: dict[float, str] = {}

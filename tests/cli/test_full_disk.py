@@ -13,9 +13,10 @@ from full_disk import room_for
 from undrawn import undrawn_run
 
 import canprobe
+from canprobe.cell.npz import read_npz
 from canprobe.cli import main
 from canprobe.errors import ResultsError
-from canprobe.fieldbus.bus.candump import read_candump, read_npz
+from canprobe.fieldbus.bus.candump import read_candump
 from canprobe.lab.studies.harness import CellStore, Column, StudyResult, write_study
 
 ROOM = 2000

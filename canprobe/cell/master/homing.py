@@ -32,7 +32,7 @@ from canprobe.cell.planning.configuration import HOME_OFFSET, HOMES_HERE, MODE, 
 from canprobe.cell.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan
 from canprobe.cell.scene.setup import Homing as Settings
 from canprobe.errors import CanprobeError, NodeError, UsageError
-from canprobe.fieldbus.bus.candump import write_text
+from canprobe.fieldbus.bus.files import write_text
 from canprobe.fieldbus.bus.sdo import Dialogue, Dialogues, PumpedNetwork
 from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.protocol.cia402 import (

@@ -15,9 +15,10 @@ import numpy.typing as npt
 
 from canprobe.cell.plant.config import PlantConfig
 from canprobe.cell.plant.equations import STEPS, ArmEquations, DriveLoops, Effects
-from canprobe.cell.plant.ideal_arm import PEAK_PERMILLE, IdealArm, MotorDynamics
+from canprobe.cell.plant.ideal_arm import PEAK_PERMILLE, IdealArm
 from canprobe.cell.plant.pushing import Neighbourhood, Rubbing
 from canprobe.errors import PlanError
+from canprobe.fieldbus.drive.motor import MotorDynamics
 from canprobe.mechanics.robot.chain import Array
 from canprobe.mechanics.robot.dynamics import GRAVITY_M_S2, RigidBody, ball, dynamics_problem, joined
 from canprobe.mechanics.robot.model import ArmModel, joints_per_motor, joints_to_units, units_per_motor, units_to_joints

@@ -9,11 +9,11 @@ friction, contact force on the joints, saturation.
 from __future__ import annotations
 
 from math import cos, exp, pi, sin, sqrt, tanh
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from canprobe.fieldbus.drive.motor import MotorDynamics
 from canprobe.mechanics.robot.chain import Array
 from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_to_joints
 
@@ -21,25 +21,6 @@ PEAK_PERMILLE = 2000
 """Of the rated torque: what a drive can give for a while (assumed)."""
 STICTION_RATE = 0.01
 """rad/s over which the Coulomb torque turns its sign; of a prismatic joint m/s."""
-
-# How a motor answers to torque: what a plant tells a drive that controls torque.
-
-
-class MotorDynamics(NamedTuple):
-    """``v' = gain (torque - coulomb sign v) - damping v``, v in counts/s and torques in 1/1000 of the rated torque.
-
-    Attributes:
-        gain: acceleration per permille of torque, counts/s²; positive.
-        coulomb: friction torque, permille; what is below it does not move a motor at rest.
-        damping: viscous friction over inertia, 1/s; positive.
-    """
-
-    gain: float
-    coulomb: float
-    damping: float
-
-
-# Ideal arm: decoupled second-order position loops, one per motor, solved exactly.
 
 Transition = tuple[float, float, float, float]
 State = tuple[float, float, float]

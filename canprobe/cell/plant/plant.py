@@ -19,11 +19,12 @@ import numpy as np
 
 from canprobe.cell.plant.config import PlantConfig
 from canprobe.cell.plant.dynamic_arm import DynamicArm, make_arm
-from canprobe.cell.plant.ideal_arm import IdealArm, MotorDynamics
+from canprobe.cell.plant.ideal_arm import IdealArm
 from canprobe.cell.plant.probe import NO_CONTACT, Contact, PressedProbe, Probe, elastic_contact, in_pad
 from canprobe.cell.plant.pushing import LEAST_CURVATURE, total_force
 from canprobe.cell.plant.taxels import Image, TaxelArray, Vec, pad_coordinates
 from canprobe.errors import PlanError
+from canprobe.fieldbus.drive.motor import MotorDynamics
 from canprobe.mechanics.robot.chain import Array, Chain, ending_in, jacobian, point_velocity, posture
 from canprobe.mechanics.robot.model import ArmModel, units_to_joints
 from canprobe.mechanics.touch.shapes import Nearest, PlacedShape, Touches

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.cell.npz import write_npz
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.recorded.cycles import LogCycles, replay_contacts
@@ -25,7 +26,6 @@ from canprobe.cell.scene.setup import Setup
 from canprobe.cell.tasks.from_plan import estimates_of
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
 from canprobe.errors import ProtocolError, UsageError
-from canprobe.fieldbus.bus.candump import write_npz
 from canprobe.fieldbus.bus.clock_steps import RecordedBus
 from canprobe.mechanics.touch.estimate.fit import METHODS, unknown_method
 

@@ -18,9 +18,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.cell.npz import read_npz, write_npz
 from canprobe.cell.results.run_files import READERS
 from canprobe.errors import UsageError, install_line, regular_file
-from canprobe.fieldbus.bus.candump import read_npz, whole_file, write_npz
+from canprobe.fieldbus.bus.files import whole_file
 from canprobe.mechanics.touch.surface_map import LocalPatch, SurfaceMap
 
 if TYPE_CHECKING:

@@ -25,7 +25,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
-from canprobe.fieldbus.bus.candump import whole_file
+from canprobe.fieldbus.bus.files import whole_file
 
 Part = Figure | SubFigure
 WIDTH_IN, DPI = 9.0, 150

@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.cell.npz import read_npz
 from canprobe.cell.scene.load import SAVED_AS, load_scene, written_by_other
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.setup import Setup
 from canprobe.cell.tasks.probing import Phase
 from canprobe.errors import SceneError, UsageError, regular_file
-from canprobe.fieldbus.bus.candump import read_npz
 
 SCHEMA = 1
 """Of ``summary.json``."""

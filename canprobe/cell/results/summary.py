@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from canprobe import __version__
 from canprobe.cell.master.cell import Cell
+from canprobe.cell.npz import write_npz
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.measured import MeasuredTraffic, TrafficMeter
 from canprobe.cell.planning.model import Plan
@@ -35,8 +36,8 @@ from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.cell.tasks.task import TaskRecord
 from canprobe.cell.tasks.touch import losses_text, summarise_losses
 from canprobe.errors import ResultsError, UsageError, install_line
-from canprobe.fieldbus.bus.candump import write_npz, write_text
 from canprobe.fieldbus.bus.clock_steps import RecordedBus
+from canprobe.fieldbus.bus.files import write_text
 from canprobe.fieldbus.bus.port import ERR_FLAG, is_bus_error
 from canprobe.fieldbus.protocol.frames import SYNC_ID, is_sync, long_syncs_text
 from canprobe.mechanics.touch.consistency import Consistency

@@ -35,7 +35,6 @@ from canprobe.cell.scene.setup import (
     Free,
     Listen,
     Probe,
-    Quirks,
     RawWire,
     SafetyLimits,
     Scan,
@@ -47,6 +46,7 @@ from canprobe.cell.scene.setup import (
 )
 from canprobe.cell.scene.surface_files import refuse_narrow
 from canprobe.errors import PlanError
+from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.mechanics.robot.inverse import FIXED_POLE, task_rows
 from canprobe.mechanics.robot.model import ArmModel

@@ -11,12 +11,13 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from canprobe.cell.npz import write_npz
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.session.links import Expected, check_links, data_bitrate
 from canprobe.cell.session.session import Say, quiet, rehearse
 from canprobe.cell.session.target import Target
 from canprobe.errors import NodeError, ResultsError, UsageError
-from canprobe.fieldbus.bus.candump import make_folder, write_npz
+from canprobe.fieldbus.bus.files import make_folder
 from canprobe.fieldbus.bus.port import MonotonicClock
 from canprobe.fieldbus.protocol.frames import UNCONFIGURED
 

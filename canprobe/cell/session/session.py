@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from canprobe.cell.master.cell import Cell
 from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.master.cycle import Cycle, Observation, Observer, Observers
+from canprobe.cell.npz import write_npz
 from canprobe.cell.planning.bridges import check_bridges
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.measured import TrafficMeter
@@ -32,7 +33,8 @@ from canprobe.cell.session.links import check_links, data_bitrate, expected_of, 
 from canprobe.cell.session.target import LOCKSTEP, VIRTUAL
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.errors import CanprobeError, UsageError
-from canprobe.fieldbus.bus.candump import CandumpWriter, RecordingPort, make_folder, whole_file, write_npz, writing
+from canprobe.fieldbus.bus.candump import CandumpWriter, RecordingPort
+from canprobe.fieldbus.bus.files import make_folder, whole_file, writing
 from canprobe.fieldbus.bus.port import (
     Clock,
     JoinedPort,

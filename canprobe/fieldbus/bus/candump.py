@@ -1,4 +1,4 @@
-"""Files at the edge: whole or not there, columns as `.npz`, and logs of a bus in candump's format.
+"""Logs of a bus in candump's format.
 
 CAN FD frames, which here are those of more than 8 bytes, stand as `521##1<data>`: 1 is the bit rate switch.
 
@@ -9,21 +9,16 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import math
 import re
-import zipfile
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from io import BufferedReader, BytesIO, FileIO, TextIOWrapper
 from itertools import starmap
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from canprobe.errors import ResultsError, UsageError, regular_file
+from canprobe.errors import UsageError, regular_file
+from canprobe.fieldbus.bus.files import writing
 from canprobe.fieldbus.bus.port import ControllerState, PlainPort, Port, TimedFrame
 from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG, Frame
 
@@ -333,126 +328,3 @@ class RecordingPort(PlainPort):
         for can_id, data, t_ns in frames:
             self._write(can_id, data, t_ns)
         return frames
-
-
-# Files that are whole or not there, whatever stops the writing.
-
-
-@contextlib.contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """A block that writes a file, or makes or removes one.
-
-    Raises:
-        ResultsError: the system refuses that: a full disk, no permission, no such folder, another file in the way.
-    """
-    try:
-        yield
-    except BrokenPipeError:
-        raise
-    except OSError as error:
-        raise ResultsError(f"{path}: cannot be written: {error.strerror or error}") from error
-
-
-def make_folder(folder: Path) -> None:
-    """Make a folder for files, and those above it, where they are missing.
-
-    Raises:
-        ResultsError: it cannot be made, or is no folder.
-    """
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-
-
-@contextlib.contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
-    """A file that is written whole, under the name that is given to the block, or not at all.
-
-    That name is of the same folder and has the same suffix, by which libraries choose what to write. A block that
-    writes nothing there leaves everything as it was.
-
-    Args:
-        path: what it is called afterwards; an older one is replaced, a link followed, a device or a pipe written to.
-
-    Raises:
-        ResultsError: it cannot be written, for example on a full disk or without permission; an older one is as it
-            was.
-    """
-    whole = path.resolve()
-    part = whole if path.exists() and not path.is_file() else whole.with_name(f".part-{whole.name}")
-    try:
-        yield part
-        if part != whole and part.exists():
-            part.replace(whole)
-    except BaseException as error:
-        if part != whole:
-            with contextlib.suppress(OSError):
-                part.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.filename in (None, str(part)):  # else of something else
-            with writing(path):
-                raise
-        raise
-
-
-def write_text(path: Path, text: str, *, encoding: str = "utf-8", newline: str | None = None) -> None:
-    """Write a text file whole: see `whole_file`; encoding and line ends as for `open`."""
-    with whole_file(path) as part:
-        part.write_text(text, encoding=encoding, newline=newline)
-
-
-# Columns in an ``.npz`` file.
-
-
-def write_npz(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays into exactly this file, compressed, whole: numpy would append ``.npz`` to a name.
-
-    The lowest level of compression takes half the time of numpy's; the files are up to 13 % larger.
-    """
-    with (
-        whole_file(path) as part,
-        part.open("wb") as file,
-        zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as saved,
-    ):
-        for name, column in columns.items():
-            with saved.open(f"{name}.npy", "w", force_zip64=True) as entry:
-                np.lib.format.write_array(entry, np.asanyarray(column), allow_pickle=False)
-
-
-def read_npz(path: Path, expected: str = "an .npz of a run") -> dict[str, NDArray[Any]]:
-    """Every array of an ``.npz`` file.
-
-    Args:
-        path: of the file.
-        expected: what it should be, in words.
-
-    Raises:
-        UsageError: no such file, or it is cut off, empty or something else; memory is asked for what is in the file,
-            whatever its headers say.
-    """
-    try:
-        with regular_file(path).open("rb") as opened:
-            if opened.read(len(np.lib.format.MAGIC_PREFIX)) == np.lib.format.MAGIC_PREFIX:
-                raise ValueError("a single array")
-            with zipfile.ZipFile(opened) as saved:
-                return {entry.filename.removesuffix(".npy"): _read_array(saved, entry) for entry in saved.infolist()}
-    except Exception as error:  # zip files, their compression and numpy's headers each have their own
-        raise UsageError(f"{path}: expected {expected}; cannot be read: {_why(error)}") from error
-
-
-def _why(error: Exception) -> str:
-    """What a reader of files says, in a line."""
-    text = error.strerror if isinstance(error, OSError) else None
-    return (text or str(error) or type(error).__name__).partition("\n")[0]
-
-
-def _read_array(saved: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any]:
-    """One array of plain values, whose header and size agree."""
-    with saved.open(entry) as file:
-        version = np.lib.format.read_magic(file)
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, fortran, dtype = read(file)
-        if dtype.hasobject:
-            raise ValueError(f"{entry.filename} holds Python objects")
-        if math.prod(shape) * dtype.itemsize != entry.file_size - file.tell():
-            raise ValueError(f"{entry.filename} is no array of shape {shape}, as its header says")
-        flat = np.frombuffer(bytearray(file.read()), dtype)
-    return flat.reshape(shape, order="F" if fortran else "C")

@@ -14,12 +14,12 @@ from functools import partial
 
 from canopen.objectdictionary import ObjectDictionary
 
-from canprobe.cell.scene.setup import Quirks
 from canprobe.fieldbus.drive.mode import DriveParts
 from canprobe.fieldbus.drive.modes import make_modes
 from canprobe.fieldbus.drive.parameters import FACTORS, STAYS_STOPPED, Delivery
 from canprobe.fieldbus.drive.reference import STEP_NS, AxisPlant
 from canprobe.fieldbus.node.dictionary import Abort, SdoAbort, Value, key_of
+from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.node.slave_node import Application, OdOf, SlaveNode
 from canprobe.fieldbus.protocol import cia402
 from canprobe.fieldbus.protocol.cia402 import (

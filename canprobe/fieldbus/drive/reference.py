@@ -6,7 +6,7 @@ from collections.abc import Callable
 from math import copysign, exp, inf, log, sqrt
 from typing import NamedTuple, Protocol
 
-from canprobe.cell.plant.ideal_arm import MotorDynamics
+from canprobe.fieldbus.drive.motor import MotorDynamics
 from canprobe.fieldbus.node.core import Timers
 
 # Trapezoidal motion to a target, constant velocity, and what a constant torque does to the motor, as pieces one after

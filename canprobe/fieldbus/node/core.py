@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Protocol
 
-from canprobe.cell.scene.setup import Quirks
 from canprobe.fieldbus.node.dictionary import Abort, Dictionary, SdoAbort, Value, nothing
+from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.protocol.frames import Frame, NmtCommand, NmtState, is_restricted
 
 # Deadlines of one node. Few of them are armed at once, and most are armed again before they fire, at every SYNC: the

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from canprobe.errors import CanprobeError, UsageError
-from canprobe.fieldbus.bus.candump import write_text
+from canprobe.fieldbus.bus.files import write_text
 from canprobe.fieldbus.bus.port import Port, TimedFrame, VirtualClock, wait_for_any
 from canprobe.fieldbus.bus.real.processor import garbage_collection_paused
 from canprobe.fieldbus.bus.virtual.lockstep import BusNode, LockstepBus, Participant

@@ -15,13 +15,13 @@ from collections.abc import Callable, Container
 
 from canopen.objectdictionary import ObjectDictionary
 
-from canprobe.cell.scene.setup import Quirks
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.node.core import NMT_GOALS, NodeCore, Route, Service
 from canprobe.fieldbus.node.dictionary import Dictionary, nothing
 from canprobe.fieldbus.node.emcy import Emergency, HeartbeatConsumer, HeartbeatProducer, NodeGuarding
 from canprobe.fieldbus.node.lss import LssSlave, Store
 from canprobe.fieldbus.node.pdo import PdoEngine, SyncConsumer
+from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.node.sdo_server import SdoServer
 from canprobe.fieldbus.protocol.frames import NMT_ID, UNCONFIGURED, Frame, NmtCommand, NmtState
 

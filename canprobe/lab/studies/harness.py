@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 import canprobe
 from canprobe.cell.scene.model import Scene
 from canprobe.errors import ResultsError, StudyError
-from canprobe.fieldbus.bus.candump import make_folder, whole_file, write_text, writing
+from canprobe.fieldbus.bus.files import make_folder, whole_file, write_text, writing
 from canprobe.fieldbus.eds.packaged import eds_file
 
 Say = Callable[[str], None]

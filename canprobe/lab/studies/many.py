@@ -25,7 +25,7 @@ from canprobe.cell.session.session import Say, quiet
 from canprobe.cell.session.target import VIRTUAL, Target
 from canprobe.cell.session.terminal import Report
 from canprobe.errors import CanprobeError, SafetyStop, UsageError, install_line
-from canprobe.fieldbus.bus.candump import make_folder, whole_file
+from canprobe.fieldbus.bus.files import make_folder, whole_file
 from canprobe.lab.studies.harness import Array, Row, model_digest
 from canprobe.lab.studies.sweep import error_text, open_sweep
 

@@ -12,12 +12,13 @@ from canprobe.cell.emulated import world as build
 from canprobe.cell.emulated.array import make_tactile_node
 from canprobe.cell.emulated.world import TruthRecorder
 from canprobe.cell.scene.load import load_scene
-from canprobe.cell.scene.setup import Homing, Quirks
+from canprobe.cell.scene.setup import Homing
 from canprobe.errors import BusError
 from canprobe.fieldbus.bus.port import PlainPort, VirtualClock
 from canprobe.fieldbus.bus.virtual.lockstep import EVERY_ID, LockstepBus, Participant
 from canprobe.fieldbus.drive.drive import make_drive_node
 from canprobe.fieldbus.eds.packaged import load_eds
+from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.node.serve import Exchange, serve
 
 MS = 1_000_000

@@ -13,10 +13,11 @@ from undrawn import undrawn, undrawn_run
 import canprobe
 from canprobe.api import results_folder
 from canprobe.cell.master.controller import Command
+from canprobe.cell.npz import read_npz
 from canprobe.cell.results import summary as results
 from canprobe.cli import main
 from canprobe.errors import InterfaceError, SafetyStop, UsageError
-from canprobe.fieldbus.bus.candump import CandumpWriter, read_candump, read_npz
+from canprobe.fieldbus.bus.candump import CandumpWriter, read_candump
 
 
 @pytest.fixture

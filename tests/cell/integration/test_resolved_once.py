@@ -14,13 +14,13 @@ from undrawn import undrawn, undrawn_run
 
 import canprobe
 from canprobe.cell.master.cycle import Observation
+from canprobe.cell.npz import read_npz
 from canprobe.cell.results.summary import RunResult
 from canprobe.cell.scene.load import packaged_files
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cli import main
 from canprobe.errors import ResultsError
-from canprobe.fieldbus.bus.candump import read_npz
 from canprobe.fieldbus.eds.packaged import eds_path
 
 SECONDS = 0.6

@@ -14,10 +14,11 @@ from wrapped import Wrapped
 import canprobe
 from canprobe.cell.emulated.world import make_world
 from canprobe.cell.master.cell import Cell
+from canprobe.cell.npz import write_npz
 from canprobe.cell.results.summary import log_columns, tactile_columns
 from canprobe.cell.scene.load import dump_scene
 from canprobe.cell.tasks.from_plan import make_task
-from canprobe.fieldbus.bus.candump import CandumpWriter, RecordingPort, write_npz
+from canprobe.fieldbus.bus.candump import CandumpWriter, RecordingPort
 from canprobe.fieldbus.bus.port import VirtualClock
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 

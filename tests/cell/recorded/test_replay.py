@@ -12,9 +12,10 @@ from scenes import without_torque
 from undrawn import undrawn_run
 
 import canprobe
+from canprobe.cell.npz import read_npz
 from canprobe.cell.recorded.run_folder import RunFolder
 from canprobe.cli import main
-from canprobe.fieldbus.bus.candump import read_candump, read_npz
+from canprobe.fieldbus.bus.candump import read_candump
 
 DRIVES = tuple(f"{0x180 + node:03X}" for node in range(1, 7))
 TRUE_KAPPA = np.array([1 / 0.036, 0.0])

@@ -15,9 +15,9 @@ import pytest
 from undrawn import undrawn_run
 
 import canprobe
+from canprobe.cell.npz import read_npz
 from canprobe.cli import main
 from canprobe.errors import UsageError
-from canprobe.fieldbus.bus.candump import read_npz
 
 TERABYTES = (10**12, 8)
 

@@ -14,18 +14,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import canprobe
+from canprobe.cell.npz import read_npz
 from canprobe.errors import ResultsError, UsageError
-from canprobe.fieldbus.bus.candump import (
-    CandumpReader,
-    CandumpWriter,
-    RecordingPort,
-    make_folder,
-    read_candump,
-    read_npz,
-    whole_file,
-    write_text,
-)
+from canprobe.fieldbus.bus.candump import CandumpReader, CandumpWriter, RecordingPort, read_candump
 from canprobe.fieldbus.bus.clock_steps import RecordedBus
+from canprobe.fieldbus.bus.files import make_folder, whole_file, write_text
 from canprobe.fieldbus.bus.port import ERR_FLAG, VirtualClock
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from canprobe.cell.scene.setup import Quirks
+from canprobe.fieldbus.node.quirks import Quirks
 
 PRE, OP, STOPPED = 0x7F, 0x05, 0x04
 TO = {PRE: 0x80, OP: 0x01, STOPPED: 0x02}

@@ -9,9 +9,9 @@ import pytest
 from puma_arm import ELBOW_FORM, UPENN
 
 from canprobe.cell.plant.config import PlantConfig
-from canprobe.cell.plant.ideal_arm import MotorDynamics
 from canprobe.cell.plant.plant import Plant
 from canprobe.fieldbus.drive.drive import make_drive_node
+from canprobe.fieldbus.drive.motor import MotorDynamics
 from canprobe.fieldbus.drive.reference import torque_run
 from canprobe.fieldbus.eds.packaged import load_eds
 

@@ -6,9 +6,9 @@ from puma_arm import BODIES, ELBOW_FORM, UPENN
 
 from canprobe.cell.plant.config import PlantConfig
 from canprobe.cell.plant.plant import Plant
-from canprobe.cell.scene.setup import Quirks
 from canprobe.fieldbus.drive.drive import make_drive_node
 from canprobe.fieldbus.eds.packaged import load_eds
+from canprobe.fieldbus.node.quirks import Quirks
 
 CSP, CSV, CST = 8, 9, 10
 HOLD = "0f0000000000"

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
+from canprobe.cell.npz import read_npz, write_npz
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.results.scores import curvature_tensor
 from canprobe.cell.scene.geometry import true_object
@@ -28,7 +29,6 @@ from canprobe.cell.scene.resolve import LAYER_N_M3, resolve
 from canprobe.cell.scene.setup import Touch
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import SIGMA_NORMAL_RAD, centroid_coupling, make_task
-from canprobe.fieldbus.bus.candump import read_npz, write_npz
 from canprobe.lab.studies.harness import Array
 from canprobe.lab.studies.shapes.implicit import Touched
 from canprobe.mechanics.touch.contact import ContactSample, Doubt, Slope
