@@ -11,8 +11,6 @@ from __future__ import annotations
 import math
 from collections import deque
 
-import numpy as np
-
 KEPT = 64
 """Arrivals in the fit."""
 LEAST = 4
@@ -55,18 +53,18 @@ class PeriodFit:
         arrivals.append((number, t_ns))
         if len(arrivals) < LEAST:
             return t_ns, 1e-9 * self._stated_ns / math.sqrt(12.0)
-        numbers, times = np.array(arrivals, dtype=np.int64).T
-        n, t = numbers - numbers.mean(), (times - t_ns).astype(np.float64)
-        squares = float(n @ n)
-        period = float(n @ t) / squares
-        fitted = t.mean() + period * n
-        rest = t - fitted
-        if max(abs(rest[-1]), abs(period - self._stated_ns)) > OFF * self._stated_ns:
+        count = len(arrivals)
+        numbers, times = [n - number for n, _ in arrivals], [t - t_ns for _, t in arrivals]  # from this one: small
+        mean_n, mean_t = sum(numbers) / count, sum(times) / count
+        squares = sum((n - mean_n) ** 2 for n in numbers)
+        period = sum((n - mean_n) * t for n, t in zip(numbers, times, strict=True)) / squares
+        rests = [t - mean_t - period * (n - mean_n) for n, t in zip(numbers, times, strict=True)]
+        if max(abs(rests[-1]), abs(period - self._stated_ns)) > OFF * self._stated_ns:
             self._arrivals.clear()
             self._arrivals.append((0, t_ns))
             self.period_ns = self._stated_ns
             self.restarts += 1
             return t_ns, 1e-9 * self._stated_ns / math.sqrt(12.0)
         self.period_ns = period
-        variance = float(rest @ rest) / (len(n) - 2) * (1.0 / len(n) + float(n[-1]) ** 2 / squares)
-        return t_ns + round(float(fitted[-1])), 1e-9 * math.sqrt(variance)
+        variance = sum(rest * rest for rest in rests) / (count - 2) * (1.0 / count + mean_n**2 / squares)
+        return t_ns + round(mean_t - period * mean_n), 1e-9 * math.sqrt(variance)

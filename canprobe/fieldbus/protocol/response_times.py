@@ -17,14 +17,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.frame_bits import worst_case_bits
 
 _NS = 1_000_000_000
-_Integers = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,15 +145,10 @@ def _respond(level: Sequence[_Timed], below: Sequence[tuple[_Timed, int | None]]
     message, frame_ns = level[-1]
     if _overloaded(level):
         return Response(message, frame_ns, None, 0)
-    starts, blocking = _starts(level, below)
-    rows = [
-        (c, m.period_ns, m.jitter_ns, *((0, -m.jitter_ns) if m.offset_ns is None else (1, m.offset_ns)))
-        for m, c in level
-    ]
-    cost, period, jitter, moves, phase = np.array(rows, dtype=np.int64).T
-    first = (phase - starts[:, None] * moves) % period
-    worst, instances = _Level(cost, period, (jitter + first) // period, first, blocking, -(-_NS // bitrate)).worst()
-    return Response(message, frame_ns, max(0, (message.offset_ns or 0) + worst), instances)
+    bit = -(-_NS // bitrate)
+    found = [_busy_period(level, start, block, bit).delays() for start, block in _starts(level, below).items()]
+    worst = max((delay for delays in found for delay in delays), default=0)
+    return Response(message, frame_ns, max(0, (message.offset_ns or 0) + worst), max(map(len, found)))
 
 
 def _overloaded(level: Sequence[_Timed]) -> bool:
@@ -166,58 +157,74 @@ def _overloaded(level: Sequence[_Timed]) -> bool:
     return sum(cycle // m.period_ns * c for m, c in level) >= cycle
 
 
-class _Level(NamedTuple):
-    """One message, the last of m, and all above it, queued in n busy periods that begin at 0. Integers, ns.
+class _Queued(NamedTuple):
+    """A message as a busy period that begins at 0 meets it. Integers, ns.
 
     Attributes:
-        cost: (m,) time of one frame.
-        period: (m,) between two releases.
-        early: (n, m) releases before 0 that jitter has held back until then.
-        first: (n, m) the first release after those, 0 ≤ first < period.
-        blocking: (n,) of the longest frame of lower priority.
+        cost: time of one frame.
+        period: between two releases.
+        first: of the releases after the beginning, 0 ≤ first < period.
+        early: releases before the beginning that jitter has held back until then.
+    """
+
+    cost: int
+    period: int
+    first: int
+    early: int
+
+    def before(self, t: int) -> int:
+        """Frames queued in [0, t), at most."""
+        return max(-((self.first - t) // self.period), 0) + self.early
+
+
+class _BusyPeriod(NamedTuple):
+    """One message and all above it, queued in a busy period that begins at 0. Integers, ns.
+
+    Attributes:
+        above: the messages of higher priority.
+        own: the message.
+        blocking: of the longest frame of lower priority.
         bit: a bit time: a frame queued so late can still win the arbitration.
     """
 
-    cost: _Integers
-    period: _Integers
-    early: _Integers
-    first: _Integers
-    blocking: _Integers
+    above: tuple[_Queued, ...]
+    own: _Queued
+    blocking: int
     bit: int
 
-    def before(self, t: _Integers) -> _Integers:
-        """Frames (n, m) queued in [0, t) (n,), at most."""
-        queued: _Integers = np.maximum(-((self.first - t[:, None]) // self.period), 0) + self.early
-        return queued
+    def delays(self) -> list[int]:
+        """From each release of the message in the busy period to its last bit, at most."""
+        own, length = self.own, 1
+        while (longer := self.blocking + self._ahead(length) + own.before(length) * own.cost) > length:
+            length = longer
+        found, delay = [], 0
+        for instance in range(own.before(length)):
+            delay = self._started(max(delay, self.blocking + instance * own.cost), instance * own.cost)
+            found.append(delay + own.cost - own.first - (instance - own.early) * own.period)
+        return found
 
-    def worst(self) -> tuple[int, int]:
-        """From a release of the message to its last bit, at most, and the most instances in one busy period."""
-        length = np.ones_like(self.blocking)
-        while ((longer := self.blocking + self.before(length) @ self.cost) > length).any():
-            length = np.maximum(length, longer)
-        instances = self.before(length)[:, -1]
-        cost, worst, delay = int(self.cost[-1]), 0, np.zeros_like(self.blocking)
-        for instance in range(int(instances.max())):
-            delay = self._started(np.maximum(delay, self.blocking + instance * cost), instance * cost)
-            release = self.first[:, -1] + (instance - self.early[:, -1]) * self.period[-1]
-            found = int((delay + cost - release)[instances > instance].max())
-            worst = found if instance == 0 else max(worst, found)
-        return worst, int(instances.max())
-
-    def _started(self, delay: _Integers, own: int) -> _Integers:
-        """Smallest w (n,) at which nothing is before the message, searched upward. Source: Davis et al. 2007."""
-        while ((longer := self.blocking + own + self._above(delay + self.bit)) > delay).any():
-            delay = np.maximum(delay, longer)
+    def _started(self, delay: int, before: int) -> int:
+        """Smallest time at which nothing is before the message, searched upward. Source: Davis et al. 2007."""
+        while (longer := self.blocking + before + self._ahead(delay + self.bit)) > delay:
+            delay = longer
         return delay
 
-    def _above(self, t: _Integers) -> _Integers:
-        """Time (n,) that the frames of higher priority queued in [0, t) (n,) take."""
-        above: _Integers = self.before(t)[:, :-1] @ self.cost[:-1]
-        return above
+    def _ahead(self, t: int) -> int:
+        """Time that the frames of higher priority queued in [0, t) take."""
+        return sum(one.before(t) * one.cost for one in self.above)
 
 
-def _starts(level: Sequence[_Timed], below: Sequence[tuple[_Timed, int | None]]) -> tuple[_Integers, _Integers]:
-    """Where (n,) a busy period has to begin in the transaction, and how long (n,) a frame from below can block it.
+def _busy_period(level: Sequence[_Timed], start: int, blocking: int, bit: int) -> _BusyPeriod:
+    """The busy period of a level that begins `start` after the event of its transaction."""
+    queued = []
+    for m, cost in level:
+        first = (-m.jitter_ns if m.offset_ns is None else m.offset_ns - start) % m.period_ns
+        queued.append(_Queued(cost, m.period_ns, first, (m.jitter_ns + first) // m.period_ns))
+    return _BusyPeriod(tuple(queued[:-1]), queued[-1], blocking, bit)
+
+
+def _starts(level: Sequence[_Timed], below: Sequence[tuple[_Timed, int | None]]) -> dict[int, int]:
+    """Where a busy period has to begin in the transaction → how long a frame from below can block it.
 
     It begins where one of the transaction's messages is at its latest. If nothing of the level keeps its own time, then
     really with that message, so that what blocks it is on the bus between its earliest and its latest queueing.
@@ -225,31 +232,30 @@ def _starts(level: Sequence[_Timed], below: Sequence[tuple[_Timed, int | None]])
     longest = max((c for (_, c), _ in below), default=0)
     members = [(m, m.offset_ns) for m, _ in level if m.offset_ns is not None]
     if not members:
-        return np.zeros(1, dtype=np.int64), np.full(1, longest)
+        return {0: longest}
     cycle = math.lcm(*(m.period_ns for m, _ in members))
     unknown = len(members) < len(level) or any(end is None for _, end in below)
     if not unknown:
         cycle = math.lcm(cycle, *(m.period_ns for (m, _), _ in below if m.offset_ns is not None))
-    releases = [np.arange(offset, offset + cycle, m.period_ns) for m, offset in members]
-    first = np.concatenate(releases)
-    jitter = np.repeat([m.jitter_ns for m, _ in members], [len(one) for one in releases])
-    starts, index = np.unique((first + jitter) % cycle, return_inverse=True)
-    blocking = np.zeros_like(starts)
-    np.maximum.at(blocking, index, longest if unknown else _blocking(below, first, jitter))
-    return starts, blocking
+    starts: dict[int, int] = {}
+    for m, offset in members:
+        for first in range(offset, offset + cycle, m.period_ns):
+            start = (first + m.jitter_ns) % cycle
+            blocking = longest if unknown else _blocking(below, first, m.jitter_ns)
+            starts[start] = max(starts.get(start, 0), blocking)
+    return starts
 
 
-def _blocking(below: Sequence[tuple[_Timed, int | None]], first: _Integers, jitter: _Integers) -> _Integers:
-    """Longest frame that can be on the bus at `first` (n,) or within `jitter` (n,) after it."""
-    always = max((c for (m, c), end in below if m.offset_ns is None or end is None), default=0)
-    # a message with an offset is through `end` after its event at the latest
-    table = [(c, m.period_ns, m.offset_ns, end) for (m, c), end in below if None not in (m.offset_ns, end)]
-    if not table:
-        return np.full_like(first, always)
-    cost, period, offset, end = np.array(table, dtype=np.int64).T
-    into = (first[:, None] - offset) % period  # since it was last released
-    on_the_bus = (into < end - offset) | (into + jitter[:, None] >= period)
-    return np.asarray(np.where(on_the_bus, cost, 0).max(axis=1, initial=always), dtype=np.int64)
+def _blocking(below: Sequence[tuple[_Timed, int | None]], first: int, jitter: int) -> int:
+    """Longest frame that can be on the bus at `first` or within `jitter` after it."""
+
+    def can_be_on_the_bus(m: Message, end: int | None) -> bool:
+        if m.offset_ns is None or end is None:
+            return True
+        into = (first - m.offset_ns) % m.period_ns  # since it was last released
+        return into < end - m.offset_ns or into + jitter >= m.period_ns  # it is through `end` after its event
+
+    return max((c for (m, c), end in below if can_be_on_the_bus(m, end)), default=0)
 
 
 # How late a message can be where nodes send their oldest frame first, as SocketCAN's queue and many controllers do.

@@ -1,6 +1,9 @@
 """Instants of a free-running device from late, jittered and lost arrivals."""
 
-import numpy as np
+import math
+from random import Random
+from statistics import fmean
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -13,7 +16,7 @@ STATED_NS = 10_000_000
 
 def errors_of(jitter_ns, lost=0.0, images=600, seed=1):
     """Errors (s) of the fitted instants and their stated deviations, once the fit is full."""
-    rng = np.random.default_rng(seed)
+    rng = Random(seed)
     fit, errors, stated = PeriodFit(STATED_NS), [], []
     for k in range(images):
         late = rng.uniform(-jitter_ns, jitter_ns)
@@ -23,24 +26,28 @@ def errors_of(jitter_ns, lost=0.0, images=600, seed=1):
         errors.append(1e-9 * (t - k * PERIOD_NS))
         stated.append(sigma)
     assert fit.restarts == 0
-    return np.array(errors[KEPT:]), np.array(stated[KEPT:]), fit
+    return errors[KEPT:], stated[KEPT:], fit
+
+
+def rms(values):
+    return math.sqrt(fmean(value * value for value in values))
 
 
 @pytest.mark.parametrize("lost", [0.0, 0.2])
 def test_jitter_is_averaged_out_and_stated(lost):
     jitter_ns = 500_000
     errors, stated, fit = errors_of(jitter_ns, lost)
-    arrivals = 1e-9 * jitter_ns / np.sqrt(3.0)
-    assert np.sqrt(np.mean(errors**2)) < arrivals / 3
+    arrivals = 1e-9 * jitter_ns / math.sqrt(3.0)
+    assert rms(errors) < arrivals / 3
     # the end of a line through m points has a variance of about 4/m of a point's
-    assert np.mean(stated) == pytest.approx(arrivals * 2 / np.sqrt(KEPT), rel=0.1)
-    assert 0.7 < np.sqrt(np.mean(errors**2)) / np.mean(stated) < 1.4
+    assert fmean(stated) == pytest.approx(arrivals * 2 / math.sqrt(KEPT), rel=0.1)
+    assert 0.7 < rms(errors) / fmean(stated) < 1.4
     assert fit.period_ns == pytest.approx(PERIOD_NS, rel=1e-3)
 
 
 def test_a_steady_device_is_known_to_the_rounding():
     errors, stated, _ = errors_of(0)
-    assert np.abs(errors).max() < 2e-9 and stated.max() < 2e-9
+    assert max(map(abs, errors)) < 2e-9 and max(stated) < 2e-9
 
 
 def test_a_restarted_device_is_fitted_anew():
@@ -49,7 +56,7 @@ def test_a_restarted_device_is_fitted_anew():
         fit.step(k * STATED_NS)
     shifted = 100 * STATED_NS + STATED_NS // 2
     t, sigma = fit.step(shifted)
-    assert (t, fit.restarts) == (shifted, 1) and sigma == pytest.approx(1e-9 * STATED_NS / np.sqrt(12))
+    assert (t, fit.restarts) == (shifted, 1) and sigma == pytest.approx(1e-9 * STATED_NS / math.sqrt(12))
     for k in range(1, 10):
         t, sigma = fit.step(shifted + k * STATED_NS)
     assert t == shifted + 9 * STATED_NS and sigma < 1e-9
