@@ -26,6 +26,7 @@ import numpy as np
 
 from canprobe.cell.master.controller import Measurement, TactileSample
 from canprobe.cell.master.cycle import Observation
+from canprobe.cell.master.tactile_frame import TactileFrame
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.load import SAVED_AS
 from canprobe.cell.session.children import with_our_imports
@@ -33,7 +34,7 @@ from canprobe.cell.session.session import write_scene
 from canprobe.cell.tasks.from_plan import Request
 from canprobe.errors import ResultsError, UsageError
 from canprobe.fieldbus.bus.port import TimedFrame, elapsed_ns, epoch_now_ns
-from canprobe.fieldbus.protocol.tactile import Features, TactileFrame, TactileHeader
+from canprobe.fieldbus.protocol.tactile import Features, TactileHeader
 from canprobe.lab.bridge.sample import SurfacePatch
 
 if TYPE_CHECKING:

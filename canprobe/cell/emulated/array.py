@@ -302,7 +302,7 @@ class TactileApplication(Application):
     def _put(self, header: TactileHeader, content: Image | Features) -> None:
         """Put one frame into the objects that the TPDOs carry."""
         dictionary, mode = self._node.dictionary, self._mode
-        whole = pack_whole(header, content)
+        whole = pack_whole(header, content if isinstance(content, Features) else _sent(header, content))
         words = struct.unpack(f"<{len(whole) // 8}Q", whole)
         dictionary.put(OVERLOAD, 0, int(header.overload))
         dictionary.put(ORIGIN, 0, self._origin[0] << 4 | self._origin[1])
@@ -322,6 +322,14 @@ class TactileApplication(Application):
 
     def _begin_tare(self, subindex: int, value: Value) -> None:
         self._tare, self._taring = None, []
+
+
+def _sent(header: TactileHeader, image: Image) -> bytes:
+    """The taxels that a frame carries: those of its window, or all."""
+    if header.mode is TactileMode.WINDOW:
+        row, column = header.origin_row, header.origin_col
+        image = image[row : row + header.window, column : column + header.window]
+    return image.tobytes()
 
 
 def _members(dictionary: Dictionary, index: int) -> tuple[int, ...]:

@@ -99,7 +99,9 @@ class RawArray(Participant):
         counts = np.empty((image.rows, image.columns, image.axes), dtype=np.int64)
         counts[:] = self._unloaded[:, :, None]
         counts[:, :, self._wire.normal] = np.rint(self._unloaded + self._span * loads)
-        self._waiting.append((t_ns + self._latency_ns, image.encode(np.clip(counts, 0, self._largest))))
+        self._waiting.append(
+            (t_ns + self._latency_ns, image.encode(np.clip(counts, 0, self._largest).reshape(-1).tolist()))
+        )
 
     def _ready(self, t_ns: int) -> list[Frame]:
         """The frames of the images that have waited for the latency."""

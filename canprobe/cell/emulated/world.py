@@ -1,15 +1,13 @@
-"""Plan → the emulated side: one plant, its nodes, and the recorder of what is true; or a node from an EDS alone."""
+"""Plan → the emulated side: one plant, its nodes, and the recorder of what is true."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from canopen.objectdictionary import ObjectDictionary
 from numpy.typing import NDArray
 
 from canprobe.cell.emulated.array import make_tactile_node
@@ -23,11 +21,9 @@ from canprobe.cell.plant.taxels import TaxelConfig
 from canprobe.cell.scene.setup import Setup
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.drive.drive import make_drive_node
+from canprobe.fieldbus.drive.from_eds import set_serial_number
 from canprobe.fieldbus.drive.parameters import Delivery
-from canprobe.fieldbus.drive.reference import IdealAxis
 from canprobe.fieldbus.eds.packaged import FULL_SCALE, has_full_scale, load_eds
-from canprobe.fieldbus.eds.reading import is_drive
-from canprobe.fieldbus.node.dictionary import key_of
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol.frames import SYNC_ID, UNCONFIGURED, Frame
 from canprobe.mechanics.robot.chain import Array, Chain, forward
@@ -79,15 +75,6 @@ def _set_turn_units(node: SlaveNode, units: float | None) -> None:
     for index, value in ((RESOLUTION, units), (FEED, None if units is None else units * ratio)):
         if value is not None and value.is_integer() and delivered(index, 1) and delivered(index, 2) in (0, 1):
             node.dictionary.set_default(index, 1, int(value))
-
-
-def set_serial_number(node: SlaveNode, serial: int) -> None:
-    """Give a device its serial number, by which two of one EDS differ; a device without 1018h:04 has none."""
-    if key_of(0x1018, 4) in node.dictionary:
-        node.dictionary.set_default(0x1018, 4, serial)
-
-
-# Plan → the emulated side: one plant, its nodes, and the recorder of what is true.
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,25 +218,3 @@ def _tared_s(setup: Setup) -> float:
         return 0.0
     assert setup.array is not None
     return 1.5 * raw.tare_images / setup.array.rate_hz
-
-
-# A node from an EDS alone, of any make: the values of the file, and a drive where the file describes one.
-
-
-def make_eds_node(
-    od: ObjectDictionary, node_id: int, *, eds: str | Path | None = None, serial: int | None = None
-) -> SlaveNode:
-    """A conforming CiA 301 node with the values of its EDS; a CiA 402 drive moves an ideal axis.
-
-    Args:
-        od: of any EDS, for this node id.
-        node_id: 1–127; or 255: it waits for LSS to give it one.
-        eds: the file, for a node that speaks LSS; None for one that does not.
-        serial: number for 1018h:04, in the place of the file's.
-    """
-    od_of = None if eds is None else partial(load_eds, eds)
-    drive = is_drive(od)
-    node = make_drive_node(od, node_id, 0, IdealAxis(), od_of) if drive else SlaveNode(od, node_id, od_of=od_of)
-    if serial is not None:
-        set_serial_number(node, serial)
-    return node

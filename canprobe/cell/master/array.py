@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.master.controller import TactileSample
+from canprobe.cell.master.tactile_frame import TactileFrame, decode
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Array, RawWire, Setup
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.protocol.period import PeriodFit
 from canprobe.fieldbus.protocol.raw_image import ImageAssembler, RawImage
-from canprobe.fieldbus.protocol.tactile import FrameAssembler, TactileFrame, TactileHeader, TactileMode
+from canprobe.fieldbus.protocol.tactile import FrameAssembler, TactileHeader, TactileMode
 from canprobe.mechanics.touch.pad import COUNTS_MAX
 from canprobe.mechanics.touch.patch.image import Patch, PatchCalibration, compute_patch, patch_from_features
 
@@ -108,11 +109,12 @@ class TactileReceiver(ArrayReceiver):
 
     def assemble(self, can_id: int, data: bytes, t_ns: int) -> TactileFrame | None:
         """Take one tactile PDO; the frame that it completes."""
-        return self.assembler.push(can_id, data, t_ns)
+        message = self.assembler.push(can_id, data, t_ns)
+        return decode(message, self.assembler.shape) if message is not None else None
 
     def push(self, can_id: int, data: bytes, t_ns: int) -> None:
         """Take one tactile PDO."""
-        frame = self.assembler.push(can_id, data, t_ns)
+        frame = self.assemble(can_id, data, t_ns)
         if frame is not None:
             self.put(frame)
 
@@ -262,7 +264,8 @@ class RawReceiver(ArrayReceiver):
     def _frame(self, image: RawImage) -> TactileFrame | None:
         """The image as a CANopen array would send it; None while it is taken for the tare."""
         wire = self.wire
-        values = image.counts[:, :, wire.normal].astype(np.float64)
+        raw = np.array(image.counts).reshape(wire.image.rows, wire.image.columns, wire.image.axes)
+        values = raw[:, :, wire.normal].astype(np.float64)
         if self._unloaded is None:
             self._taring.append(values)
             if len(self._taring) == wire.tare_images:
@@ -273,7 +276,7 @@ class RawReceiver(ArrayReceiver):
         taxels.flags.writeable = False
         overload = bool(taxels.max() == COUNTS_MAX)
         header = TactileHeader(image.number % 256, 0, 0, 0, TactileMode.IMAGE, overload, 0)
-        return TactileFrame(header, taxels, (0, 0, *taxels.shape), None, image.t_ns, image.counts)
+        return TactileFrame(header, taxels, (0, 0, *taxels.shape), None, image.t_ns, raw)
 
 
 def make_tactile(plan: Plan, sync_overflow: int | None = None) -> ArrayReceiver | None:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.cell.master.tactile_frame import TactileFrame
 from canprobe.errors import UsageError
-from canprobe.fieldbus.protocol.tactile import TactileFrame
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate

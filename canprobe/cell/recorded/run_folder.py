@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from canprobe.cell.master.controller import Measurement, TactileSample
 from canprobe.cell.master.log import joint_positions
+from canprobe.cell.master.tactile_frame import TactileFrame
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.run_files import LOG, TACTILE, needed, read_log, read_summary, read_tactile
 from canprobe.cell.scene.setup import Setup
@@ -20,7 +21,7 @@ from canprobe.cell.tasks.probing import Phase
 from canprobe.cell.tasks.touch import TouchTask
 from canprobe.errors import UsageError
 from canprobe.fieldbus.protocol.cia402 import DriveState, known_state
-from canprobe.fieldbus.protocol.tactile import Features, TactileFrame, TactileHeader, TactileMode
+from canprobe.fieldbus.protocol.tactile import Features, TactileHeader, TactileMode
 
 LEAVING = (Phase.RETREAT, Phase.DONE)
 

@@ -23,6 +23,7 @@ from canprobe.cell.emulated.world import World
 from canprobe.cell.master.array import TactileReceiver
 from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.drives import DriveCommand, DriveGroup
+from canprobe.cell.master.tactile_frame import TactileFrame
 from canprobe.cell.planning.configuration import NodeSetup, Write, make_setups
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.operation import INTERPOLATION_TIME
@@ -35,7 +36,7 @@ from canprobe.fieldbus.node.dictionary import Dictionary, SdoAbort, nothing
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.node.tpdo import Rpdo
 from canprobe.fieldbus.protocol.frames import SYNC_ID, Frame, NmtCommand, pack_nmt
-from canprobe.fieldbus.protocol.tactile import Features, TactileFrame, TactileHeader, TactileMode
+from canprobe.fieldbus.protocol.tactile import Features, TactileHeader, TactileMode
 
 HEARTBEAT_CONSUMER = 0x1016
 Hear = Callable[[int, bytes, int], object]

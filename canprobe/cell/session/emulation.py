@@ -132,7 +132,7 @@ def emulate_eds(
         NodeError: somebody on the bus has one of the node ids already.
         ResultsError: `store_folder` cannot be written.
     """
-    from canprobe.cell.emulated.world import make_eds_node
+    from canprobe.fieldbus.drive.from_eds import make_eds_node
     from canprobe.fieldbus.eds.packaged import check_eds
 
     node_ids = tuple(node_id for _, node_id in files if node_id != UNCONFIGURED)

@@ -17,14 +17,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
-from numpy.typing import NDArray
-
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.frames import Frame
 
-Counts = NDArray[np.int64]
-"""(rows, columns, axes) counts as the device sends them."""
+Counts = tuple[int, ...]
+"""Counts as the device sends them: row by row, in a row column by column, of a taxel axis by axis."""
 _TAG = "0123456789ABCDEF"
 _CLASSIC_BYTES = 8
 
@@ -167,6 +164,19 @@ class ImageFormat:
         return min(4 * len(shifts) for frame in self.frames for shifts in frame.values)
 
     @cached_property
+    def _places(self) -> tuple[int, ...]:
+        """Of each count, in the order of `Counts`, its place among the values of the frames."""
+        by_row = self.columns * self.axes, self.axes
+        by_column = self.axes, self.rows * self.axes
+        row_step, column_step = by_column if self.by_columns else by_row
+        return tuple(
+            row * row_step + column * column_step + axis
+            for row in range(self.rows)
+            for column in range(self.columns)
+            for axis in range(self.axes)
+        )
+
+    @cached_property
     def _id_numbers(self) -> dict[int, int]:
         return {can_id: number for number, can_id in enumerate(self.ids)}
 
@@ -187,19 +197,19 @@ class ImageFormat:
     def decode(self, parts: Sequence[bytes]) -> Counts:
         """The image in all its frames, in the order of identifiers and frames."""
         values = [value for part, data in enumerate(parts) for value in self.values_of(part, data)]
-        if self.by_columns:
-            return np.array(values).reshape(self.columns, self.rows, self.axes).transpose(1, 0, 2)
-        return np.array(values).reshape(self.rows, self.columns, self.axes)
+        return tuple(values[place] for place in self._places)
 
-    def encode(self, counts: Counts) -> list[Frame]:
+    def encode(self, counts: Sequence[int]) -> list[Frame]:
         """The frames of an image, in the order of identifiers and frames.
 
         Raises:
-            ProtocolError: another shape, or a count that does not fit.
+            ProtocolError: another number of counts, or a count that does not fit.
         """
-        if counts.shape != (self.rows, self.columns, self.axes):
-            raise ProtocolError(f"image: expected {(self.rows, self.columns, self.axes)} counts, got {counts.shape}")
-        values = (counts.transpose(1, 0, 2) if self.by_columns else counts).reshape(-1).tolist()
+        if len(counts) != len(self._places):
+            raise ProtocolError(f"image: expected {len(self._places)} counts, got {len(counts)}")
+        values = [0] * len(counts)
+        for count, place in zip(counts, self._places, strict=True):
+            values[place] = count
         sent, start = [], 0
         for can_id in self.ids:
             for frame in self.frames:
@@ -214,7 +224,7 @@ class RawImage:
     """One complete image.
 
     Attributes:
-        counts: (rows, columns, axes) as sent.
+        counts: as sent.
         t_ns: arrival of its first frame.
         number: of the complete images so far, from 0.
     """

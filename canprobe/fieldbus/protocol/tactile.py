@@ -29,12 +29,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 
-import numpy as np
-from numpy.typing import NDArray
-
 from canprobe.errors import ProtocolError
-
-# Tactile frames on the wire: header, contact features, checksum, payloads in PDO order.
 
 SIDE = 16
 """Most rows and columns of an array: the header names a taxel in 8 bits."""
@@ -236,69 +231,55 @@ class Features:
         return cls(force_n, row, col, var_rr, var_rc, var_cc, peak)
 
 
-def _payload_bytes(header: TactileHeader, content: NDArray[np.uint8] | Features) -> bytes:
-    if isinstance(content, Features):
-        if header.mode is not TactileMode.FEATURES:
-            raise ProtocolError(f"features given to a frame of mode {header.mode.name}")
-        return content.pack()
-    side = header.window
-    if header.mode is TactileMode.WINDOW and content.shape != (side, side):
-        row, col = header.origin_row, header.origin_col
-        content = content[row : row + side, col : col + side]
-    whole = header.mode is TactileMode.IMAGE and content.ndim == 2
-    if content.dtype != np.uint8 or not (whole or content.shape == (side, side)):
-        raise ProtocolError(
-            f"taxels: expected uint8 that hold the window of {side} × {side} at {header.origin_row, header.origin_col},"
-            f" or a whole image, got {content.dtype} {content.shape} for a frame of mode {header.mode.name}"
-        )
-    data = content.tobytes()
-    return data + bytes(-len(data) % 8)
-
-
-def pack_whole(header: TactileHeader, content: NDArray[np.uint8] | Features) -> bytes:
+def pack_whole(header: TactileHeader, content: bytes | Features) -> bytes:
     """Pack a whole tactile frame into one string: its payloads of 8 bytes, in PDO order, with the CRC set.
 
     Args:
         header: its crc is ignored; in features mode its origin too (the peak of the features takes that byte).
-        content: taxels uint8, the full pad (rows, columns), of which window mode sends its window, or that window; or
-            features.
+        content: a byte for each taxel of the window or the whole image, row by row; or features.
 
     Raises:
         ProtocolError: content and mode do not match, or a field does not fit.
     """
+    if isinstance(content, Features) is not (header.mode is TactileMode.FEATURES):
+        what = "features" if isinstance(content, Features) else "taxels"
+        raise ProtocolError(f"{what} given to a frame of mode {header.mode.name}")
     if isinstance(content, Features):
         if not 0 <= content.peak <= 255:
             raise ProtocolError(f"features: peak {content.peak} is not 0..255")
         header = replace(header, origin_row=content.peak >> 4, origin_col=content.peak & 0x0F)
-    whole_pad = not isinstance(content, Features) and content.shape != (header.window, header.window)
-    _check_origin(header, content.shape if whole_pad else (SIDE, SIDE))  # type: ignore[union-attr]
-    body, start = _payload_bytes(header, content), header.start()
-    crc = crc16_ccitt(body, crc16_ccitt(start))
-    return start + crc.to_bytes(2, "little") + body
+        body = content.pack()
+    else:
+        expected = header.window**2 if header.mode is TactileMode.WINDOW else len(content)
+        if len(content) != expected or not content:
+            raise ProtocolError(f"taxels: expected {expected or 'those of an image'}, got {len(content)}")
+        body = content + bytes(-len(content) % 8)
+    _check_origin(header, (SIDE, SIDE))
+    start = header.start()
+    return start + crc16_ccitt(body, crc16_ccitt(start)).to_bytes(2, "little") + body
 
 
 # Puts the PDOs of a tactile frame together again, or drops them: never half of one frame and half of another.
 
 
 @dataclass(frozen=True, slots=True)
-class TactileFrame:
-    """One complete, checked tactile frame.
+class TactileMessage:
+    """One complete, checked tactile frame as it stood on the wire.
 
     Attributes:
         header: as received.
-        taxels: uint8 (rows, columns), full pad, counts; zero outside the window, all zero in features mode; read-only.
-        window: (first row, first column, rows, columns) that the taxels cover; (0, 0, 0, 0) in features mode.
-        features: contact features, in features mode only.
+        body: what follows it: taxels row by row, filled up with zeros to a multiple of 8 bytes; or features.
         t_ns: arrival of the header.
-        raw: (rows, columns, axes) values as they came, of a device of raw frames, whose header is made up; else None.
     """
 
     header: TactileHeader
-    taxels: NDArray[np.uint8]
-    window: tuple[int, int, int, int]
-    features: Features | None
+    body: bytes
     t_ns: int
-    raw: NDArray[np.int64] | None = None
+
+    @property
+    def features(self) -> Features | None:
+        """Contact features, in features mode only."""
+        return Features.unpack(self.body, self.header.peak) if self.header.mode is TactileMode.FEATURES else None
 
 
 class FrameAssembler:
@@ -308,6 +289,7 @@ class FrameAssembler:
     the deadline before it is complete: torn, dropped.
 
     Attributes:
+        shape: rows and columns of the array.
         frames: published.
         torn: opened and dropped incomplete.
         crc_errors: complete with a wrong CRC (corrupted, or mixed from two triggers where a header was lost).
@@ -318,8 +300,8 @@ class FrameAssembler:
     """
 
     __slots__ = (
-        "_deadline_ns", "_last", "_missing", "_mode", "_opened_ns", "_parts", "_shape", "_sizes", "_slots", "_window",
-        "crc_errors", "duplicates", "frames", "lost", "malformed", "orphans", "torn",
+        "_deadline_ns", "_last", "_missing", "_mode", "_opened_ns", "_parts", "_sizes", "_slots", "_window",
+        "crc_errors", "duplicates", "frames", "lost", "malformed", "orphans", "shape", "torn",
     )  # fmt: skip
 
     def __init__(
@@ -355,7 +337,7 @@ class FrameAssembler:
                 f"{mode.name.lower()} frames need different COB-IDs, a header of 8 bytes first, {needed} bytes in all; "
                 f"got {cob_ids} with {self._sizes} bytes"
             )
-        self._mode, self._window, self._shape = mode, window, shape
+        self._mode, self._window, self.shape = mode, window, shape
         self._deadline_ns = deadline_ns
         self._parts: list[bytes | None] = []
         self._missing = 0  # 0: no frame is open
@@ -363,7 +345,7 @@ class FrameAssembler:
         self._last: int | None = None
         self.frames = self.torn = self.crc_errors = self.duplicates = self.lost = self.orphans = self.malformed = 0
 
-    def push(self, can_id: int, data: bytes, t_ns: int) -> TactileFrame | None:
+    def push(self, can_id: int, data: bytes, t_ns: int) -> TactileMessage | None:
         """Take one received frame; identifiers of others are ignored. Never raises on bytes."""
         slot = self._slots.get(can_id)
         if slot is None:
@@ -408,13 +390,13 @@ class FrameAssembler:
         self._missing = len(self._slots) - 1
         self._opened_ns = t_ns
 
-    def _close(self) -> TactileFrame | None:
+    def _close(self) -> TactileMessage | None:
         start, *rest = self._parts
         assert start is not None
         body = b"".join(rest)  # type: ignore[arg-type]  # complete: no None is left
         try:
             header = TactileHeader.unpack(start)
-            _check_origin(header, self._shape)
+            _check_origin(header, self.shape)
         except ProtocolError:
             self.malformed += 1
             return None
@@ -431,19 +413,4 @@ class FrameAssembler:
             self.lost += (header.frame_counter - self._last - 1) % 256
         self._last = header.frame_counter
         self.frames += 1
-        return _build(header, body, self._opened_ns, self._shape)
-
-
-def _build(header: TactileHeader, body: bytes, t_ns: int, shape: Shape) -> TactileFrame:
-    taxels = np.zeros(shape, np.uint8)
-    window, features = (0, 0, 0, 0), None
-    if header.mode is TactileMode.FEATURES:
-        features = Features.unpack(body, header.peak)
-    else:
-        rows, columns = (header.window, header.window) if header.mode is TactileMode.WINDOW else shape
-        row, col = header.origin_row, header.origin_col
-        counts = np.frombuffer(body, np.uint8, rows * columns).reshape(rows, columns)
-        taxels[row : row + rows, col : col + columns] = counts
-        window = (row, col, rows, columns)
-    taxels.flags.writeable = False
-    return TactileFrame(header, taxels, window, features, t_ns)
+        return TactileMessage(header, body, self._opened_ns)

@@ -2,9 +2,12 @@
 
 import numpy as np
 import pytest
+from node_fuzz import Watched, rage
 
 from canprobe.cell.emulated.array import TactileApplication, make_tactile_node
+from canprobe.cell.master.tactile_frame import decode
 from canprobe.fieldbus.eds.packaged import load_eds
+from canprobe.fieldbus.node.serve import keep_in_file
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol.frames import NmtState
 from canprobe.fieldbus.protocol.tactile import WINDOWS, FrameAssembler, TactileMode, window_words
@@ -60,7 +63,8 @@ class Sensor:
         """One SYNC; the frame that came with it, if any."""
         self.k += 1
         frames = self.bench.send(0x80, f"{(self.k - 1) % 240 + 1:02x}", self.k * CYCLE)
-        done = [self.assembler.push(can_id, bytes.fromhex(data), self.k * CYCLE) for can_id, data in frames]
+        messages = [self.assembler.push(can_id, bytes.fromhex(data), self.k * CYCLE) for can_id, data in frames]
+        done = [message and decode(message, (16, 16)) for message in messages]
         whole = [frame for frame in done if frame is not None]
         assert len(whole) == bool(frames)  # all or nothing
         return whole[0] if whole else None
@@ -344,8 +348,38 @@ def test_the_window_holds_the_contact_wherever_it_is(sensor, plant, side, spot):
     frames = sensor.send(0x80, "01", CYCLE)
     found = [assembler.push(can_id, bytes.fromhex(data), CYCLE) for can_id, data in frames]
     assert found[-1] is not None and found[-1].header.window == side
-    assert np.array_equal(found[-1].taxels, plant.image)
-    row, column, rows, columns = found[-1].window
-    assert (rows, columns) == (side, side)
+    assert np.array_equal(decode(found[-1], (16, 16)).taxels, plant.image)
+    row, column = found[-1].header.origin_row, found[-1].header.origin_col
     ideal = [min(max(at - (side - 1) / 2, 0), 16 - side) for at in spot]
     assert abs(row - ideal[0]) <= 0.75 and abs(column - ideal[1]) <= 0.75
+
+
+def test_random_and_mutated_frames(plant):
+    rage(Watched(make_tactile_node(load_eds("tactile_array", 5), 5, plant)), 30_000, seed=20260)
+
+
+SAVE = 0x65766173
+
+
+def test_the_tare_of_the_sensor_comes_back_and_only_with_its_group(connect_sensor, plant):
+    plant.image[3, 3] = 30
+    first = connect_sensor()
+    first.write(0x2003, 0, 0x65726174, 4)
+    first.nmt(0x01)
+    assert first.write(0x1010, 2, SAVE, 4) == 0  # communication parameters only
+    assert connect_sensor().node.store.kept == b""
+    assert first.write(0x1010, 3, SAVE, 4) == 0
+    assert connect_sensor().node.application._tare[3, 3] == 30
+    assert first.write(0x1011, 1, 0x64616F6C, 4) == 0
+    assert connect_sensor().node.application._tare is None
+
+
+@pytest.fixture
+def connect_sensor(bench, plant, tmp_path):
+    def make():
+        node = SlaveNode(load_eds("tactile_array", 16), 16, TactileApplication(plant, tare_images=1))
+        keep_in_file(node, tmp_path / "node016.json")
+        node.start(0)
+        return type(bench)(node)
+
+    return make

@@ -7,7 +7,6 @@ from functools import partial
 import numpy as np
 import pytest
 
-from canprobe.cell.emulated.world import set_serial_number
 from canprobe.cell.master.commission import (
     Assignment,
     Wanted,
@@ -21,6 +20,7 @@ from canprobe.fieldbus.bus.port import VirtualClock
 from canprobe.fieldbus.bus.sdo import Lss, PumpedNetwork
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 from canprobe.fieldbus.bus.virtual.timed import TimedBus
+from canprobe.fieldbus.drive.from_eds import set_serial_number
 from canprobe.fieldbus.eds.packaged import load_eds
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol.frames import LssAddress, LssState

@@ -4,11 +4,13 @@ import json
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from scenes import change
 
 import canprobe
+from canprobe.cell.planning.devices import Abilities
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.report import plan_dict, plan_text
 from canprobe.cell.scene.load import load_scene, packaged_scenes
@@ -151,3 +153,13 @@ def test_a_dynamic_arm_that_cannot_be_emulated_is_refused(monkeypatch, changes, 
     monkeypatch.setattr("canprobe.mechanics.robot.dynamics.importlib.util.find_spec", lambda name: None)
     with pytest.raises(canprobe.PlanError, match=match):
         make_plan(setup)
+
+
+def test_a_plan_knows_about_how_many_cycles_it_takes():
+    assert canprobe.plan(load_scene("cylinder")).cycles == 23 * 400
+
+
+def test_the_identity_that_1018h_leaves_open_is_that_of_device_info():
+    """The plan compares it in bring-up; a revision of 0 there is an empty field."""
+    path = Path(__file__).parents[2] / "fieldbus" / "eds" / "messy" / "untold_drive.eds"
+    assert Abilities.of(str(path), 5).identity.numbers == (0xFB, 0x62100000, None, None)

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from canprobe.cell.master.controller import Measurement, TactileSample
+from canprobe.cell.master.tactile_frame import TactileFrame
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.tasks.from_plan import make_sensing
 from canprobe.cell.tasks.sensing import JointHistory, is_too_hollow
-from canprobe.fieldbus.protocol.tactile import TactileFrame, TactileHeader, TactileMode
+from canprobe.fieldbus.protocol.tactile import TactileHeader, TactileMode
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.touch.estimate.fit import fit_surface
 from canprobe.mechanics.touch.estimate.online import Gate

@@ -2,38 +2,21 @@
 
 from __future__ import annotations
 
-import json
-import os
 import re
 import signal
 import socket
 import subprocess
 import sys
 import threading
-import uuid
 
 import pytest
+from network_buses import bare, group  # noqa: F401
 
-from canprobe.cli import main
 from canprobe.errors import InterfaceError, UsageError
 from canprobe.fieldbus.bus.port import MonotonicClock
 from canprobe.fieldbus.bus.real.python_can import Echoes, configured_bus, open_port
 
 SECOND = 1_000_000_000
-
-
-@pytest.fixture
-def group(monkeypatch, tmp_path):
-    """An IPv6 group that never leaves this machine, with a port of its own, as python-can's configuration has it."""
-    with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as free:
-        free.bind(("::1", 0))
-        port = free.getsockname()[1]
-    name = f"ff11::{uuid.uuid4().hex[:4]}"
-    monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.setenv("CAN_INTERFACE", "udp_multicast")
-    monkeypatch.setenv("CAN_CHANNEL", name)
-    monkeypatch.setenv("CAN_CONFIG", json.dumps({"port": port, "hop_limit": 0}))
-    return name
 
 
 def frames_of(port, count, clock):
@@ -66,25 +49,6 @@ def test_an_echo_is_taken_once_and_not_for_ever():
     echoes.sent((1, b"a"), 0)
     assert not echoes.is_one((1, b"b"), 1)
     assert not echoes.is_one((1, b"a"), 2 * SECOND)
-
-
-def test_nodes_of_a_bus_yml_are_scanned_over_multicast(group, tmp_path, capsys):
-    """Emulator and scan both find their bus in python-can's environment."""
-    assert main(["plan", "listen", "--export", "bus.yml", "--out", str(tmp_path)]) == 0
-    emulator = subprocess.Popen(
-        [sys.executable, "-m", "canprobe", "emulate", "--bus-yml", str(tmp_path / "bus.yml")],
-        stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    try:
-        assert emulator.stderr is not None and f"serving nodes 16 on {group}" in emulator.stderr.readline()
-        capsys.readouterr()
-        assert main(["scan", "--json"]) == 0
-        (node,) = json.loads(capsys.readouterr().out)
-        assert (node["node_id"], node["vendor_id"], node["product_code"]) == (16, 0xCA5E, 0x1616)
-    finally:
-        emulator.send_signal(signal.SIGINT)
-        assert emulator.wait(20) == 0
-        emulator.stderr.close()
 
 
 class Socketcand(threading.Thread):
@@ -137,18 +101,8 @@ def test_socketcand_with_its_host_from_python_cans_file(monkeypatch, tmp_path):
     assert ["open", "can0"] in server.said
 
 
-@pytest.fixture
-def bare(monkeypatch, tmp_path):
-    """An environment in which nothing is configured."""
-    monkeypatch.setenv("HOME", str(tmp_path))
-    for name in [name for name in os.environ if name.startswith("CAN_")]:
-        monkeypatch.delenv(name)
-
-
-def test_without_a_configuration_there_is_none(bare, capsys):
+def test_without_a_configuration_there_is_none(bare):
     assert configured_bus() is None
-    assert main(["run", "free", "--bus", "config", "--duration", "0.01"]) == 2
-    assert "names no interface; set CAN_INTERFACE" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -163,60 +117,6 @@ def test_a_wrong_configuration_is_said(bare, monkeypatch, name, value, complaint
     monkeypatch.setenv(name, value)
     with pytest.raises(UsageError, match=complaint):
         configured_bus()
-
-
-def test_the_command_line_and_the_scene_come_before_the_configuration(bare, monkeypatch):
-    """A scene whose nodes are all emulated stays in lockstep; one with real nodes takes what is configured."""
-    from argparse import Namespace
-    from dataclasses import replace
-
-    from canprobe.cell.scene.load import load_scene
-    from canprobe.cell.session.target import Target
-    from canprobe.cli.parser import target_of
-
-    monkeypatch.setenv("CAN_INTERFACE", "pcan")
-    monkeypatch.setenv("CAN_CHANNEL", "PCAN_USBBUS1")
-    monkeypatch.setenv("CAN_BITRATE", "500000")
-    silent = Namespace(bus=None, channel=None, bitrate=None)
-    scene = load_scene("free")
-    real = replace(scene, arm=replace(scene.arm, emulated=False))
-    named = replace(real, bus=replace(real.bus, interface="kvaser"))
-    configured = Target("pcan", "PCAN_USBBUS1", 500_000)
-    assert target_of(silent, scene) == Target("lockstep", "can0", 1_000_000)
-    assert target_of(silent, real) == configured
-    assert target_of(silent, named) == Target("kvaser", "can0", 1_000_000)
-    assert target_of(Namespace(bus="config", channel=None, bitrate=None), scene) == configured
-    assert target_of(Namespace(bus="config", channel=[(None, "X")], bitrate=250_000), scene) == Target(
-        "pcan", "X", 250_000
-    )
-    assert target_of(Namespace(bus="slcan", channel=None, bitrate=None), real) == Target("slcan", "can0", 1_000_000)
-
-
-def test_channels_of_a_scene_with_two_buses(bare):
-    from argparse import Namespace
-    from dataclasses import replace
-
-    from canprobe.cell.scene.load import load_scene
-    from canprobe.cell.session.target import Target
-    from canprobe.cli.parser import target_of
-
-    scene = load_scene("press")
-    scene = replace(scene, sensor=replace(scene.sensor, channel="can1"))
-
-    def target(*channels):
-        return target_of(Namespace(bus="socketcan", channel=list(channels), bitrate=None), scene)
-
-    assert target() == Target("socketcan", "can0", 1_000_000)
-    assert target((None, "vcan0")) == Target("socketcan", "vcan0", 1_000_000)
-    both = target(("can0", "a"), ("can1", "b"))
-    assert both == Target("socketcan", "a", 1_000_000, {"can1": "b"})
-    joint = replace(next(iter(scene.joints.values())), channel="can1")
-    placed = both.applied_to(replace(scene, joints={**scene.joints, "shoulder": joint}))
-    assert (placed.channels, placed.joints["shoulder"].channel) == (("a", "b"), "b")
-    with pytest.raises(UsageError, match="no channel can2, only can0, can1; did you mean can1"):
-        target(("can2", "x"))
-    with pytest.raises(UsageError, match="given 2 times, but the scene has the channels can0 and can1"):
-        target(("can0", "x"), (None, "y"))
 
 
 class Speaking(Socketcand):

@@ -6,8 +6,6 @@ import sys
 
 import pytest
 
-import canprobe
-from canprobe.cell.scene.load import load_scene
 from canprobe.fieldbus.bus.real.processor import LARGEST_RESERVE, LEAST_RESERVE, realtime, reserve_memory
 
 SCRIPT = """
@@ -84,7 +82,3 @@ def held(cycles):
 )
 def test_as_much_as_the_cycles_will_keep(cycles, size):
     assert held(cycles) == pytest.approx(size / 2, rel=0.05)
-
-
-def test_a_plan_knows_about_how_many_cycles_it_takes():
-    assert canprobe.plan(load_scene("cylinder")).cycles == 23 * 400

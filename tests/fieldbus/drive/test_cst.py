@@ -6,14 +6,9 @@ import math
 from itertools import pairwise
 
 import pytest
-from puma_arm import ELBOW_FORM, UPENN
 
-from canprobe.cell.plant.config import PlantConfig
-from canprobe.cell.plant.plant import Plant
-from canprobe.fieldbus.drive.drive import make_drive_node
 from canprobe.fieldbus.drive.motor import MotorDynamics
 from canprobe.fieldbus.drive.reference import torque_run
-from canprobe.fieldbus.eds.packaged import load_eds
 
 GAIN, COULOMB, DAMPING = 100.0, 50.0, 4.0  # of the plant of numbers
 
@@ -148,24 +143,6 @@ def test_cia402_59_missing_targets_stop_it(cst):
     assert cst.drive.read(0x6041) & 0x4F == 0x40
     still = cst.counts
     assert cst.run(50).counts == still
-
-
-@pytest.mark.parametrize("axis", [0, 3, 5])
-def test_cia402_cst_the_ideal_arm_needs_the_torque_that_it_is_given(drive, axis):
-    """Steady motion of a real plant: 600 permille in, and its own torque model says 600 permille."""
-    plant = Plant(PlantConfig(UPENN, ELBOW_FORM, taxels=None))
-    drive.node = make_drive_node(load_eds("puma260_joint", axis + 1), axis + 1, axis, plant)
-    drive.node.start(0)
-    for index, value, size in ((0x6060, 10, 1), (0x1006, 2500, 4), (0x607F, 10**7, 4)):
-        assert drive.write(index, 0, value, size) == 0
-    for word in (0x06, 0x07, 0x0F):
-        drive.write(0x6040, 0, word, 2)
-    drive.nmt(0x01)
-    for k in range(1, 800):
-        drive.send(0x80, "", k * 2_500_000)
-        drive.write(0x6071, 0, -600, 2)
-    assert plant.torque_permille(axis) == pytest.approx(-600, abs=2)
-    assert plant.arm.qd[axis] < -0.5
 
 
 @pytest.mark.parametrize("torque", [0.0, 30.0, 51.0, -300.0, 300.0])

@@ -6,10 +6,7 @@ from copy import deepcopy
 
 import pytest
 from canopen.objectdictionary import ODVariable
-from puma_arm import ELBOW_FORM, UPENN
 
-from canprobe.cell.plant.config import PlantConfig
-from canprobe.cell.plant.plant import Plant
 from canprobe.fieldbus.drive.drive import make_drive_node
 from canprobe.fieldbus.eds.packaged import load_eds
 
@@ -229,51 +226,3 @@ def test_cia402_55_leaving_the_mode_gives_the_run_up(homing):
     assert homing.counts < 800
     homing.put(_6060=6).run(10)
     assert bits(homing) == NOT_STARTED
-
-
-def test_cia402_55_a_lagging_wrist_motor_stands_on_its_pulse():
-    """Axis 5 of the ideal arm, 800 counts a turn, 8 ms behind its reference: the pulse is caught where it is."""
-    plant = Plant(PlantConfig(UPENN, ELBOW_FORM, taxels=None))
-    node = make_drive_node(load_eds("puma260_joint", 5), 5, 4, plant)
-    node.start(0)
-    t_ns = 0
-    for text in (
-        "238f600120030000",  # 608Fh:01 = 800
-        "2392600120030000",  # 6092h:01 = 800
-        "2398600022000000",  # wrong length: refused
-        "2f98600022000000",  # method 34
-        "2f60600006000000",
-        *("2b40600006000000", "2b40600007000000", "2b4060000f000000", "2b4060001f000000"),
-    ):
-        t_ns += 1_000_000
-        node.receive(0x605, bytes.fromhex(text), t_ns)
-        node.advance(t_ns)
-    start = plant.motor_counts(4)
-    others = [plant.motor_counts(axis) for axis in (0, 1, 2, 3, 5)]
-    for k in range(1, 500):
-        node.advance(t_ns + k * 2_500_000)
-    pulse = (start // 800 + 1) * 800
-    assert plant.motor_counts(4) == pytest.approx(pulse, abs=0.5)
-    assert node.dictionary.values[0x6041 << 8] >> 10 & 7 == 0b101
-    answer = node.receive(0x605, bytes.fromhex("4064600000000000"), t_ns + 1250 * 10**6)[0][1]
-    assert abs(int.from_bytes(answer[4:], "little", signed=True)) <= 1
-    assert [plant.motor_counts(axis) for axis in (0, 1, 2, 3, 5)] == pytest.approx(others, abs=1e-6)
-
-
-@pytest.mark.parametrize(("method", "end"), [(17, "q_min"), (18, "q_max")])
-def test_cia402_55_a_coupled_wrist_joint_finds_its_switch_where_the_joint_really_is(rig, method, end):
-    """Axis 5 of the ideal arm counts from 0 at power on, and lags 8 ms behind its reference."""
-    rig.plant = plant = Plant(PlantConfig(UPENN, ELBOW_FORM, taxels=None))
-    rig.drive.node = make_drive_node(load_eds("puma260_joint", 1), 1, 4, plant, incremental=True)
-    rig.drive.node.start(0)
-    assert rig.signed(0x6064) == 0
-    rig.put(_6099_1=20_000, _6099_2=500, _609A=200_000, _6098=method).enable(6)
-    rig.drive.advance(rig.drive.t_ns + 10_000_000)
-    rig.word(START)
-    for _ in range(4000):
-        rig.drive.advance(rig.drive.t_ns + 2_500_000)
-    assert bits(rig) == DONE
-    margin = 0.01 * (UPENN.q_max[4] - UPENN.q_min[4])
-    wanted = getattr(UPENN, end)[4] + (margin if method == 18 else -margin)
-    assert plant.truth()["q"][4] == pytest.approx(wanted, abs=1e-4)
-    assert abs(rig.signed(0x6064)) <= 1

@@ -100,31 +100,3 @@ def test_a_write_that_fails_aborts_and_keeps_what_was_stored(stored, path):
     assert path.read_text() == before
     stored.nmt(0x81)
     assert stored.read(0x2000) == 77
-
-
-def test_the_tare_of_the_sensor_comes_back_and_only_with_its_group(connect_sensor, plant):
-    plant.image[3, 3] = 30
-    first = connect_sensor()
-    first.write(0x2003, 0, 0x65726174, 4)
-    first.nmt(0x01)
-    assert first.write(0x1010, 2, SAVE, 4) == 0  # communication parameters only
-    assert connect_sensor().node.store.kept == b""
-    assert first.write(0x1010, 3, SAVE, 4) == 0
-    assert connect_sensor().node.application._tare[3, 3] == 30
-    assert first.write(0x1011, 1, 0x64616F6C, 4) == 0
-    assert connect_sensor().node.application._tare is None
-
-
-@pytest.fixture
-def connect_sensor(bench, plant, path):
-    from canprobe.cell.emulated.array import TactileApplication
-    from canprobe.fieldbus.eds.packaged import load_eds
-    from canprobe.fieldbus.node.slave_node import SlaveNode
-
-    def make():
-        node = SlaveNode(load_eds("tactile_array", 16), 16, TactileApplication(plant, tare_images=1))
-        keep_in_file(node, path)
-        node.start(0)
-        return type(bench)(node)
-
-    return make

@@ -8,7 +8,8 @@ import pytest
 import canprobe
 from canprobe.cell.master.controller import Command, Measurement, TactileSample
 from canprobe.cell.master.cycle import Observation
-from canprobe.fieldbus.protocol.tactile import Features, TactileFrame, TactileHeader, TactileMode
+from canprobe.cell.master.tactile_frame import TactileFrame
+from canprobe.fieldbus.protocol.tactile import Features, TactileHeader, TactileMode
 from canprobe.lab.bridge.process import pack_observation, unpack_observation
 from canprobe.lab.bridge.worker import SampleSource
 

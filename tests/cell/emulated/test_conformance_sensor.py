@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
+from conformance_bench import Bench, connect  # noqa: F401
 
+from canprobe.cell.emulated.array import TactileApplication
+from canprobe.cell.master.tactile_frame import decode
+from canprobe.fieldbus.eds.packaged import load_eds
+from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol.tactile import FrameAssembler, TactileMode
 
 OFF = 0x80000000
@@ -13,6 +20,12 @@ CONTENT = {
     TactileMode.WINDOW: [0x21100040 | sub << 8 for sub in range(1, 9)],
     TactileMode.IMAGE: [0x21000040 | sub << 8 for sub in range(1, 33)],
 }
+
+
+@pytest.fixture
+def sensor(connect: Any, plant: Any) -> Bench:
+    """The tactile node 16, booted; a tare takes two images."""
+    return connect(SlaveNode(load_eds("tactile_array", 16), 16, TactileApplication(plant, tare_images=2))).boot()
 
 
 class Reader:
@@ -46,7 +59,8 @@ class Reader:
         return [self.sensor.next() for _ in range(self.count)]
 
     def push(self, raw):
-        return [self.assembler.push(can_id, bytes.fromhex(text), t_ns) for can_id, text, t_ns in raw]
+        messages = [self.assembler.push(can_id, bytes.fromhex(text), t_ns) for can_id, text, t_ns in raw]
+        return [message and decode(message, (16, 16)) for message in messages]
 
     def frame(self):
         done = self.push(self.raw())

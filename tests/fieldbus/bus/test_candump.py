@@ -1,24 +1,18 @@
 """candump logs: written and read back, against lines that candump itself writes."""
 
 import contextlib
-import io
 import os
-import re
 import threading
 from pathlib import Path
 
 import can
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import canprobe
-from canprobe.cell.npz import read_npz
-from canprobe.errors import ResultsError, UsageError
+from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.candump import CandumpReader, CandumpWriter, RecordingPort, read_candump
 from canprobe.fieldbus.bus.clock_steps import RecordedBus
-from canprobe.fieldbus.bus.files import make_folder, whole_file, write_text
 from canprobe.fieldbus.bus.port import ERR_FLAG, VirtualClock
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG
@@ -207,86 +201,3 @@ def test_python_can_reads_a_log_of_ours_with_its_fd_frames(tmp_path):
     assert [message.is_remote_frame for message in messages] == [False, False, True, False, False]
     assert [message.channel for message in messages] == [channel for _, channel, _, _ in FRAMES]
     assert [message.timestamp for message in messages] == pytest.approx([0, 2.5e-3, 2.501e-3, 5e-3, 7.5e-3], abs=1e-9)
-
-
-# Files of a run that are cut off, empty or something else: one line that names the file, from every reader.
-
-
-def npz(**columns):
-    held = io.BytesIO()
-    np.savez_compressed(held, **columns)
-    return held.getvalue()
-
-
-def npy(values):
-    held = io.BytesIO()
-    np.save(held, values)
-    return held.getvalue()
-
-
-WHOLE = npz(t_s=np.arange(3.0))
-DAMAGED = {"empty": b"", "cut off": WHOLE[:-9], "torn": b"PK", "text": b"t_s\n0\n", "single array": npy(np.arange(3.0))}
-
-
-@pytest.mark.parametrize("content", DAMAGED.values(), ids=DAMAGED)
-@pytest.mark.parametrize(("read", "what"), [(read_npz, "an .npz of a run"), (canprobe.load_table, "the log of a run")])
-def test_a_damaged_file_is_named(content, read, what, tmp_path):
-    (tmp_path / "log.npz").write_bytes(content)
-    with pytest.raises(UsageError, match=rf"log\.npz: expected {re.escape(what)}; cannot be read: "):
-        read(tmp_path / "log.npz")
-
-
-def test_a_whole_one_is_read(tmp_path):
-    (tmp_path / "log.npz").write_bytes(WHOLE)
-    assert read_npz(tmp_path / "log.npz")["t_s"].tolist() == [0.0, 1.0, 2.0]
-
-
-# Files that are whole or not there.
-
-WHOLE_TEXT = b"what was there before"
-
-
-@pytest.mark.parametrize("older", [True, False])
-@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError(28, "No space left on device")])
-def test_a_file_is_written_whole_or_not_at_all(error, older, tmp_path):
-    path = tmp_path / "log.npz"
-    if older:
-        path.write_bytes(WHOLE_TEXT)
-    with pytest.raises((KeyboardInterrupt, ResultsError)) as raised, whole_file(path) as part:
-        assert part.suffix == ".npz"  # by which libraries choose what they write
-        part.write_bytes(b"PK")
-        raise error
-    if isinstance(error, OSError):
-        assert str(raised.value) == f"{path}: cannot be written: No space left on device"
-    assert [(file, file.read_bytes()) for file in tmp_path.iterdir()] == [(path, WHOLE_TEXT)] * older
-
-
-def test_where_no_file_can_be_it_is_named(tmp_path):
-    with pytest.raises(ResultsError, match=r"none/a\.txt: cannot be written: No such file or directory"):
-        write_text(tmp_path / "none" / "a.txt", "")
-    (tmp_path / "way").write_text("")
-    with pytest.raises(ResultsError, match=r"way/in/it: cannot be written: Not a directory"):
-        make_folder(tmp_path / "way" / "in" / "it")
-    with pytest.raises(ResultsError, match=r"way: cannot be written: File exists"):
-        make_folder(tmp_path / "way")
-    with pytest.raises(ResultsError, match=r": cannot be written: Is a directory"):
-        CandumpWriter(tmp_path, "can0")
-
-
-def test_a_block_that_writes_nothing_changes_nothing(tmp_path):
-    with whole_file(tmp_path / "surface.png"):
-        pass
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_link_stays_a_link_and_a_device_a_device(tmp_path):
-    link, file = tmp_path / "link", tmp_path / "file"
-    file.write_bytes(WHOLE_TEXT)
-    link.symlink_to(file)
-    write_text(link, "new")
-    assert link.is_symlink() and file.read_text() == "new"
-    os.mkfifo(pipe := tmp_path / "pipe")
-    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
-    write_text(pipe, "told")
-    assert os.read(reader, 10) == b"told" and pipe.is_fifo()
-    os.close(reader)

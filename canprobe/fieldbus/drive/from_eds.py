@@ -1,0 +1,40 @@
+"""A node from an EDS alone, of any make: the values of the file, and a drive where the file describes one."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+from canopen.objectdictionary import ObjectDictionary
+
+from canprobe.fieldbus.drive.drive import make_drive_node
+from canprobe.fieldbus.drive.reference import IdealAxis
+from canprobe.fieldbus.eds.packaged import load_eds
+from canprobe.fieldbus.eds.reading import is_drive
+from canprobe.fieldbus.node.dictionary import key_of
+from canprobe.fieldbus.node.slave_node import SlaveNode
+
+
+def set_serial_number(node: SlaveNode, serial: int) -> None:
+    """Give a device its serial number, by which two of one EDS differ; a device without 1018h:04 has none."""
+    if key_of(0x1018, 4) in node.dictionary:
+        node.dictionary.set_default(0x1018, 4, serial)
+
+
+def make_eds_node(
+    od: ObjectDictionary, node_id: int, *, eds: str | Path | None = None, serial: int | None = None
+) -> SlaveNode:
+    """A conforming CiA 301 node with the values of its EDS; a CiA 402 drive moves an ideal axis.
+
+    Args:
+        od: of any EDS, for this node id.
+        node_id: 1–127; or 255: it waits for LSS to give it one.
+        eds: the file, for a node that speaks LSS; None for one that does not.
+        serial: number for 1018h:04, in the place of the file's.
+    """
+    od_of = None if eds is None else partial(load_eds, eds)
+    drive = is_drive(od)
+    node = make_drive_node(od, node_id, 0, IdealAxis(), od_of) if drive else SlaveNode(od, node_id, od_of=od_of)
+    if serial is not None:
+        set_serial_number(node, serial)
+    return node
