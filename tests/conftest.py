@@ -30,6 +30,7 @@ import pytest
 import sharing
 import standstill
 import system_packages
+from hangup import hangup_heard  # noqa: F401
 
 from canprobe.errors import InterfaceError
 from canprobe.fieldbus.bus.real.socketcan import check_interface
@@ -62,14 +63,6 @@ def vcan0() -> str:
     """The name of a real SocketCAN interface that is up; the test fails without one."""
     _require_interface()
     return _CHANNEL
-
-
-@pytest.fixture
-def hangup_heard() -> Iterator[None]:
-    """SIGHUP as a terminal has it: a test of what it does passes under `nohup` too, which has it ignored."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
-    yield
-    signal.signal(signal.SIGHUP, before)
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from puma_arm import MODELS
+from published_puma import MODELS
 from serial_arms import five, gantry, random_chain, scara, seven
 
 from canprobe.errors import PlanError

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from puma_arm import ELBOW_FORM, MODELS, UPENN
+from published_puma import ELBOW_FORM, MODELS, UPENN
 from serial_arms import five, gantry, model_of, random_chain, scara, seven
 
 from canprobe.errors import PlanError

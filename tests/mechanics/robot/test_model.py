@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from puma_arm import MODELS, UPENN
+from published_puma import MODELS, UPENN
 from serial_arms import gantry, scara, seven
 
 from canprobe.errors import PlanError

@@ -8,11 +8,7 @@ import math
 import numpy as np
 import pytest
 
-import canprobe
-from canprobe.cell.scene.load import load_scene
-from canprobe.cell.scene.model import ObjectSettings
-from canprobe.errors import PlanError, UsageError
-from canprobe.fieldbus.protocol.tactile import SIDE
+from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import ContactSample, Doubt, indentation_from_force
 from canprobe.mechanics.touch.estimate.fit import METHODS, fit_surface, make_estimator
 from canprobe.mechanics.touch.patch.image import PatchCalibration, compute_patch
@@ -76,13 +72,7 @@ class TestShapes:
             assert e.kappa == pytest.approx(kappa, abs=1.5)
             assert e.umbilic == umbilic
 
-    def test_concave_tighter_than_the_probe_is_refused_when_planned(self):
-        """What happens when it is met: `tests/cell/master/test_sensing.py`."""
-        scene = load_scene("cylinder")
-        short = dataclasses.replace(scene.task, length_mm=10.0, width_mm=4.0)
-        scene = dataclasses.replace(scene, task=short, object=ObjectSettings("bowl", radius_mm=30))
-        with pytest.raises(PlanError, match="tighter than the probe"):
-            canprobe.plan(scene)
+    def test_concave_tighter_than_the_probe_has_no_indentation(self):
         with pytest.raises(UsageError, match="the probe's own curvature"):
             indentation_from_force(1.0, 1.27e8, 0.04, (-1 / 0.03, -1 / 0.03))
 
@@ -401,7 +391,7 @@ class TestOutliers:
 
 def pressed(u=0.0, v=0.0, a=5e-3, peak=180.0):
     """A round patch (16, 16) of counts."""
-    k = (np.arange(SIDE) - 7.5) * PatchCalibration().pitch_m
+    k = (np.arange(16) - 7.5) * PatchCalibration().pitch_m
     return np.clip(peak * (1 - ((k - u) ** 2 + (k[:, None] - v) ** 2) / a**2), 0, 255).astype(np.uint8)
 
 

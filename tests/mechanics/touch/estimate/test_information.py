@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from canprobe.mechanics.touch.estimate.answer import curvature_covariance
-from canprobe.mechanics.touch.estimate.fit import fit_surface
 from canprobe.mechanics.touch.estimate.information import Expected, InformationFilter, LeftOut, Score
 from canprobe.mechanics.touch.estimate.noise import Correlation, Noise, Prior
 from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE
@@ -174,49 +173,6 @@ def test_without_forgetting_an_answer_is_that_of_a_batch():
     spread = np.diag(H + found.covariance) / np.diag(wide)
     assert np.all(spread[:6] > 0.9)
     assert np.all(spread[:6] < 1.2)
-
-
-def on_torus(n, seed):
-    """A weave along a torus (tube 40 mm, ring 100 mm) with the noise of the loop: contacts and its K."""
-    from canprobe.lab.studies.bound import make_ground
-
-    ground = make_ground("torus", 0.04, "weave", 0.06, n, waves=5)
-    return ground, ground.felt(50e-6, 2e-3, RNG(seed))
-
-
-def test_on_a_torus_the_filter_says_how_far_it_is_off():
-    """Half of the regions of a filter that takes it for a quadric miss; of this, nearly none."""
-    hits = {True: [], False: []}
-    for seed in range(8):
-        ground, (points, normals) = on_torus(480, seed)
-        for quadric, found in hits.items():
-            e = fit_surface(
-                points, normals, sigma_point=50e-6, sigma_normal=2e-3, method="recursive",
-                prior=Prior.weak(0.02), quadric=quadric,
-            )  # fmt: skip
-            if e.rank == 3:
-                error = ground.error(e.T_frame_contact, e.K)
-                found.append(error @ np.linalg.solve(e.covariance, error) < 7.815)
-    assert len(hits[False]) >= 6
-    assert np.mean(hits[False]) > 0.75
-    assert np.mean(hits[False]) > np.mean(hits[True])
-
-
-@pytest.mark.parametrize("path", ["weave", "circle"])
-def test_a_torus_felt_finely_is_no_change_of_the_surface(path):
-    """At 5 µm every sample disagrees with a quadric, as those before let expect: the memory is kept, and K is right."""
-    from canprobe.lab.studies.bound import make_ground
-
-    ground = make_ground("torus", 0.04, path, 0.02, 160)
-    found = []
-    for seed in range(8):
-        points, normals = ground.felt(5e-6, 2e-4, RNG(seed))
-        e = fit_surface(points, normals, sigma_point=5e-6, sigma_normal=2e-4, method="recursive")
-        assert e.rank == 3
-        assert not [note for note in e.notes if "changed" in note]
-        error = ground.error(e.T_frame_contact, e.K)
-        found.append(error @ np.linalg.solve(e.covariance, error) < 7.815)
-    assert np.mean(found) > 0.75
 
 
 def test_where_k_is_its_noise_the_others_hardly_count():

@@ -1,10 +1,12 @@
 """The packaged cells of the PUMA 260: published lengths, counts, coupling and poses."""
 
+import dataclasses
 import math
 
 import numpy as np
+import published_puma
 import pytest
-from puma_arm import ELBOW_FORM, UPENN
+from puma_arm import ELBOW_FORM, MODELS, UPENN
 
 from canprobe.cell.scene.load import read_cell
 from canprobe.mechanics.robot.chain import forward, tool_z_offset
@@ -59,3 +61,13 @@ def test_elbow_form_points_down_into_the_scan_region():
     assert -0.140 <= T[0, 3] <= -0.100
     assert -0.140 <= T[1, 3] <= -0.105
     assert T[2, 3] - 0.040 == pytest.approx(0.369, abs=0.010)
+
+
+def test_the_packaged_cells_are_the_published_arms():
+    for name, published in published_puma.MODELS.items():
+        packaged = MODELS[name]
+        assert packaged.chain.fixed == pytest.approx(published.chain.fixed, abs=1e-12)
+        assert packaged.chain.T_last_flange == pytest.approx(published.chain.T_last_flange, abs=1e-12)
+        assert packaged.units_per_q == pytest.approx(published.units_per_q, rel=1e-12)
+        for joint, written in zip(packaged.joints, published.joints, strict=True):
+            assert dataclasses.astuple(joint)[2:] == pytest.approx(dataclasses.astuple(written)[2:])
