@@ -6,7 +6,10 @@ Public names are imported when they are first used, so that `import canprobe` co
 from __future__ import annotations
 
 import importlib
+import sys
 from typing import TYPE_CHECKING, Any
+
+from canprobe.moved import MovedModules
 
 if TYPE_CHECKING:
     from canprobe.api import open_cell, plan, run
@@ -39,6 +42,8 @@ if TYPE_CHECKING:
     from canprobe.mechanics.touch.surface_map import SurfaceMap
 
 __version__ = "0.1.0"
+
+sys.meta_path.insert(0, MovedModules())
 
 _MODULES = {
     "canprobe.api": ("open_cell", "plan", "run"),

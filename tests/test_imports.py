@@ -1,7 +1,11 @@
-"""The rooms of the package: who may import whom, read from the source; no circles, no crowded folder.
+"""The wings and rooms of the package: who may import whom, read from the source; no circles, no crowded folder.
 
-errors < protocol, eds, robot, touch < scene < planning < bus < vcan, cell < tasks | emulator < session < results
-< recorded < bridge, api < gym, studies < cli
+    fieldbus   protocol < eds < bus < node < drive; vcan          neither numpy nor scipy
+    mechanics  robot < touch
+    cell       scene < planning < master < tasks | plant < emulated, then session < results < recorded
+    lab        bridge, studies, gym, examples
+
+`fieldbus` and `mechanics` know nothing of each other nor of what is above; `cell` knows both; `lab` and `cli` know all.
 """
 
 import ast
@@ -17,27 +21,39 @@ PACKAGE = Path(canprobe.__file__).parent
 FILES = glob.glob("**/*.py", root_dir=PACKAGE, recursive=True)  # it follows the links eds and bridge; rglob does not
 MODULES = {PACKAGE / name: Path(name) for name in sorted(FILES)}
 
-# room → rooms of this package that it may import, besides itself and errors
-LOW = {"protocol", "eds"}
-PURE = LOW | {"robot", "touch"}
-SCENE = PURE | {"scene", "planning"}
-EDGE = SCENE | {"bus"}
-MASTER = EDGE | {"cell", "tasks"}
-BOTH = MASTER | {"emulator", "plant", "session"}
+WINGS = {
+    "fieldbus": ("protocol", "eds", "bus", "node", "drive", "vcan"),
+    "mechanics": ("robot", "touch"),
+    "cell": ("npz", "scene", "planning", "master", "tasks", "plant", "emulated", "session", "results", "recorded"),
+    "lab": ("bridge", "studies", "gym", "examples"),
+}
+WING_OF = {room: wing for wing, rooms in WINGS.items() for room in rooms} | {wing: wing for wing in WINGS}
+
+# room → rooms of this package that it may import, besides itself, the doors of their wings and errors
+BUS = {"protocol", "eds", "bus"}
+MECHANICS = {"robot", "touch"}
+SCENE = {"protocol", "eds", "node", *MECHANICS, "scene"}
+PLANNING = SCENE | {"planning", "bus"}
+MASTER = PLANNING | {"master", "tasks", "npz"}
+BOTH = MASTER | {"drive", "plant", "emulated", "session"}
 ALLOWED = {
     "errors": set(),
+    "moved": set(),
     "protocol": set(),
-    "eds": set(),
-    "robot": {"protocol"},
-    "touch": {"protocol", "robot"},
-    "plant": {"protocol", "robot", "touch", "scene"},
-    "scene": PURE,
-    "planning": PURE | {"scene"},
-    "bus": SCENE,
+    "eds": {"protocol"},
+    "bus": {"protocol", "eds"},
+    "node": BUS,
+    "drive": BUS | {"node"},
     "vcan": {"bus"},
-    "cell": EDGE,
-    "tasks": EDGE | {"cell"},
-    "emulator": EDGE | {"plant"},
+    "robot": set(),
+    "touch": {"robot"},
+    "npz": {"bus"},
+    "scene": SCENE,
+    "planning": PLANNING,
+    "master": MASTER - {"tasks"},
+    "tasks": MASTER,
+    "plant": SCENE | {"drive"},
+    "emulated": PLANNING | {"drive", "plant", "npz"},
     "session": BOTH,
     "results": BOTH,
     "recorded": BOTH | {"results"},
@@ -47,35 +63,37 @@ ALLOWED = {
     "studies": BOTH | {"results", "recorded", "api"},
     "cli": BOTH | {"results", "recorded", "api", "studies", "bridge", "vcan"},
     "examples": {"package", "api", "gym"},
-    "package": {*MASTER, "api", "cli", "session", "results", "recorded", "studies"},
+    "package": {*MASTER, "moved", "api", "cli", "session", "results", "recorded", "studies"},
+    **{wing: set() for wing in WINGS},  # the doors
 }
-ROOT = {"__init__", "__main__", "api", "errors"}
+ROOT = {"__init__", "__main__", "api", "errors", "moved"}
 MOST_MODULES = 19
 """In `cli`: a module for each of fifteen commands, and what they share."""
 
 # module → packages of its extra; it is imported only where the extra is asked for
 EXTRAS = {
-    "bridge/messages.py": {"rosbags"},
-    "bridge/mcap_file.py": {"mcap"},
-    "bridge/foxglove_live.py": {"foxglove"},
-    "bridge/ros2_dds.py": {"cyclonedds"},
-    "bridge/view/stage.py": {"viser"},
-    "bridge/view/links.py": {"trimesh"},
+    "lab/bridge/messages.py": {"rosbags"},
+    "lab/bridge/mcap_file.py": {"mcap"},
+    "lab/bridge/foxglove_live.py": {"foxglove"},
+    "lab/bridge/ros2_dds.py": {"cyclonedds"},
+    "lab/bridge/view/stage.py": {"viser"},
+    "lab/bridge/view/links.py": {"trimesh"},
     "cli/completion.py": {"argcomplete"},
-    "results/picture.py": {"matplotlib"},
-    "robot/dynamics.py": {"mujoco"},
-    "scene/surface_files.py": {"trimesh"},
-    "studies/many.py": {"pandas", "xarray"},
-    "results/figures.py": {"matplotlib"},
-    "results/surface_figure.py": {"matplotlib", "mpl_toolkits"},  # of the same distribution
-    "gym/__init__.py": {"gymnasium"},
-    "gym/env.py": {"gymnasium"},
-    "examples/learn_touch_scan.py": {"gymnasium"},
-    "gym/observations.py": {"gymnasium"},
+    "cell/results/picture.py": {"matplotlib"},
+    "mechanics/robot/dynamics.py": {"mujoco"},
+    "cell/scene/surface_files.py": {"trimesh"},
+    "lab/studies/many.py": {"pandas", "xarray"},
+    "cell/results/figures.py": {"matplotlib"},
+    "cell/results/surface_figure.py": {"matplotlib", "mpl_toolkits"},  # of the same distribution
+    "lab/gym/__init__.py": {"gymnasium"},
+    "lab/gym/env.py": {"gymnasium"},
+    "lab/examples/learn_touch_scan.py": {"gymnasium"},
+    "lab/gym/observations.py": {"gymnasium"},
 }
 
 EDGE_ONLY = {"time", "socket", "threading", "can", "selectors", "asyncio", "sched"}
 AT_THE_EDGE = {"bus", "vcan"}
+NUMERIC = {"numpy", "scipy"}
 NEVER_IN_PURE = EDGE_ONLY | {
     "canopen",
     "os",
@@ -92,8 +110,8 @@ PURE_LAYERS = {"protocol", "robot", "touch", "plant"}
 def layer_of(parts):
     """The room of a module, from the parts of its path or dotted name below the package."""
     top = parts[0] if parts else "package"
-    if top == "emulator" and len(parts) > 1 and parts[1] == "plant":
-        return "plant"
+    if top in WINGS and len(parts) > 1 and parts[1] in WINGS[top]:
+        return parts[1]
     return "package" if top in ("__init__", "__main__") else top
 
 
@@ -136,10 +154,14 @@ def test_imports_point_downward(path):
         top, *below = name.split(".")
         if top == "canprobe":
             target = layer_of(below)
-            if target == "package":
+            if target == WING_OF.get(layer):  # its own door
+                fine = True
+            elif target == "package":
                 fine = layer in ("cli", "studies", "bridge", "api", "examples", "package") or what == "__version__"
             else:
                 fine = target in {layer, "errors"} | ALLOWED[layer]
+        elif WING_OF.get(layer) == "fieldbus" and top in NUMERIC:
+            fine = False
         elif layer in PURE_LAYERS:
             fine = top not in NEVER_IN_PURE
         elif layer == "studies" and top == "time":
@@ -160,16 +182,21 @@ def test_nothing_imports_the_bridges_but_a_command_that_is_asked_for_one():
             assert not [name for name in at_the_top if name.startswith("canprobe.lab.bridge")], relative
 
 
-def test_cell_and_emulator_never_see_each_other():
-    assert not {"cell", "tasks"} & (ALLOWED["emulator"] | ALLOWED["plant"])
-    assert not {"emulator", "plant"} & (ALLOWED["cell"] | ALLOWED["tasks"])
+def test_master_and_emulated_nodes_never_see_each_other():
+    assert not {"master", "tasks"} & (ALLOWED["emulated"] | ALLOWED["plant"])
+    assert not {"emulated", "plant"} & (ALLOWED["master"] | ALLOWED["tasks"])
+
+
+@pytest.mark.parametrize("wing", ["fieldbus", "mechanics"])
+def test_a_wing_that_stands_alone_knows_nothing_outside(wing):
+    assert all(ALLOWED[room] <= set(WINGS[wing]) for room in WINGS[wing])
 
 
 def test_every_module_belongs_to_a_room():
     assert {layer_of(relative.with_suffix("").parts) for relative in MODULES.values()} <= set(ALLOWED)
 
 
-def test_the_root_holds_two_modules_and_no_room_has_the_name_of_a_function():
+def test_the_root_holds_three_modules_and_no_room_has_the_name_of_a_function():
     assert {relative.stem for relative in MODULES.values() if relative.parent == Path(".")} == ROOT
     assert not {"plan", "run", "replay"} & {part for relative in MODULES.values() for part in relative.parent.parts}
 
@@ -217,7 +244,7 @@ def test_only_declared_packages_are_imported():
         ("from . import port", ["canprobe.fieldbus.bus.port"]),
         ("from .port import Port", ["canprobe.fieldbus.bus.port"]),
         ("from ..protocol.frames import Frame", ["canprobe.fieldbus.protocol.frames"]),
-        ("from canprobe import scene", ["canprobe.cell.scene"]),
+        ("from canprobe.cell import scene", ["canprobe.cell.scene"]),
         ("import canprobe.cell.master.cell", ["canprobe.cell.master.cell"]),
         ("def f():\n    import time", ["time"]),
         ("from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import can", ["typing"]),
@@ -226,4 +253,4 @@ def test_only_declared_packages_are_imported():
 def test_the_reader_of_imports_sees_every_form(tmp_path, source, names):
     path = tmp_path / "module.py"
     path.write_text(source)
-    assert [name for name, _, _ in imports_of(path, Path("bus/module.py"))] == names
+    assert [name for name, _, _ in imports_of(path, Path("fieldbus/bus/module.py"))] == names

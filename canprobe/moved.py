@@ -1,0 +1,90 @@
+"""Modules under the names that they had before the package had wings; they go with the next version.
+
+An import of an old name gives the module itself and a `DeprecationWarning` with the new one:
+
+    canprobe.tasks.Trajectory  →  canprobe.cell.tasks.Trajectory
+    canprobe.gym               →  canprobe.lab.gym
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+import warnings
+from collections.abc import Sequence
+from importlib.abc import InspectLoader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from types import CodeType, ModuleType
+
+_ROOMS = {
+    "protocol": "fieldbus.protocol",
+    "eds": "fieldbus.eds",
+    "bus": "fieldbus.bus",
+    "vcan": "fieldbus.vcan",
+    "robot": "mechanics.robot",
+    "touch": "mechanics.touch",
+    "scene": "cell.scene",
+    "planning": "cell.planning",
+    "cell.controller": "cell.master.controller",
+    "cell.cycle": "cell.master.cycle",
+    "tasks": "cell.tasks",
+    "session": "cell.session",
+    "results": "cell.results",
+    "recorded": "cell.recorded",
+    "studies": "lab.studies",
+    "bridge": "lab.bridge",
+    "gym": "lab.gym",
+    "examples": "lab.examples",
+}
+"""Old name → new name, both below `canprobe`; what lies in a room moves with it."""
+_TACTILE_FRAME = "canprobe.cell.master.tactile_frame"
+
+
+def new_name(name: str) -> str | None:
+    """The present name of a module that moved; None for any other module."""
+    package, _, below = name.partition(".")
+    if package != "canprobe":
+        return None
+    for old, new in _ROOMS.items():
+        if below == old or below.startswith(f"{old}."):
+            return f"canprobe.{new}{below.removeprefix(old)}"
+    return None
+
+
+class MovedModules(MetaPathFinder, InspectLoader):
+    """Finds a module under its old name."""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """The specification of a module that moved."""
+        new = new_name(fullname)
+        found = importlib.util.find_spec(new) if new is not None else None
+        return None if found is None else ModuleSpec(fullname, self, origin=found.origin)
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Put the module into the place of its old name."""
+        old = module.__name__
+        found = importlib.import_module(self._named(old))
+        if old == "canprobe.protocol.tactile":  # which had the frame as controllers see it, too
+            module.__dict__.update(vars(found), TactileFrame=importlib.import_module(_TACTILE_FRAME).TactileFrame)
+            found = module
+        sys.modules[old] = found
+
+    def get_code(self, fullname: str) -> CodeType | None:
+        """The code of the module, for `python -m`."""
+        spec = importlib.util.find_spec(self._named(fullname))
+        assert spec is not None
+        assert isinstance(spec.loader, InspectLoader)
+        return spec.loader.get_code(spec.name)
+
+    def get_source(self, fullname: str) -> str | None:
+        """The source is found under the new name."""
+        return None
+
+    def _named(self, old: str) -> str:
+        new = new_name(old)
+        assert new is not None
+        warnings.warn(f"{old} is now {new}", DeprecationWarning, stacklevel=3)
+        return new
