@@ -1,11 +1,13 @@
 """A CANopen library that stands alone: bytes, device descriptions, buses, nodes and drives.
 
 Nothing here knows a robot, a cell or a tactile task, and nothing needs numpy or scipy. A device that any EDS file
-describes can be served on a bus, and a master that somebody else wrote can work with it:
+describes is served on a bus whose time the program owns, or on a real one, and a master that somebody else wrote works
+with it:
 
-    bus = LockstepBus(clock)                                   a bus whose time the program owns
-    node = SlaveNode(5, load_eds("drive.eds", 5), ...)         a CiA 301 node
-    serve(...)                                                 the same node on a real interface
+    bus = LockstepBus(VirtualClock())
+    bus.attach(make_eds_node(load_eds("drive.eds", 5), 5))
+    drive = PortNetwork(bus.port()).add_node(5, load_eds("drive.eds", 5))
+    drive.sdo[0x6041].raw
 
 What comes in are bytes and times; what goes out are bytes and deadlines:
 
@@ -20,6 +22,69 @@ What comes in are bytes and times; what goes out are bytes and deadlines:
 Invariants: times are integer nanoseconds; a decoder raises `ProtocolError` and nothing else; a port raises nothing for
 what a bus does; the same seed gives the same frames on a virtual bus.
 
-Imports point downward: protocol ← eds ← bus ← node ← drive. Of the rest of the package only `canprobe.errors` is seen.
+Imports point downward: protocol < eds < bus < node < drive. Of the rest of the package only `canprobe.errors` is seen.
 Start reading at `protocol.frames`, then `bus.port`, then `node.slave_node`.
 """
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from canprobe.fieldbus.bus.candump import CandumpWriter, read_candump
+    from canprobe.fieldbus.bus.canopen_network import PortNetwork
+    from canprobe.fieldbus.bus.port import MonotonicClock, VirtualClock
+    from canprobe.fieldbus.bus.real.python_can import open_port
+    from canprobe.fieldbus.bus.real.socketcan import SocketCanPort
+    from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
+    from canprobe.fieldbus.bus.virtual.timed import TimedBus
+    from canprobe.fieldbus.drive.from_eds import make_eds_node
+    from canprobe.fieldbus.eds.packaged import check_eds, load_eds
+    from canprobe.fieldbus.node.serve import serve
+    from canprobe.fieldbus.node.slave_node import SlaveNode
+
+_MODULES = {
+    "CandumpWriter": "bus.candump",
+    "LockstepBus": "bus.virtual.lockstep",
+    "MonotonicClock": "bus.port",
+    "PortNetwork": "bus.canopen_network",
+    "SlaveNode": "node.slave_node",
+    "SocketCanPort": "bus.real.socketcan",
+    "TimedBus": "bus.virtual.timed",
+    "VirtualClock": "bus.port",
+    "check_eds": "eds.packaged",
+    "load_eds": "eds.packaged",
+    "make_eds_node": "drive.from_eds",
+    "open_port": "bus.real.python_can",
+    "read_candump": "bus.candump",
+    "serve": "node.serve",
+}
+
+__all__ = [
+    "CandumpWriter",
+    "LockstepBus",
+    "MonotonicClock",
+    "PortNetwork",
+    "SlaveNode",
+    "SocketCanPort",
+    "TimedBus",
+    "VirtualClock",
+    "check_eds",
+    "load_eds",
+    "make_eds_node",
+    "open_port",
+    "read_candump",
+    "serve",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name on first use (PEP 562)."""
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_MODULES})

@@ -2,9 +2,8 @@
 
 Nothing here knows a bus, a file of a scene or a clock. A list of contacts is enough for a surface:
 
-    from canprobe.mechanics.touch.estimate.fit import fit_surface
     estimate = fit_surface(points, normals, sigma_point=20e-6, sigma_normal=2e-3)
-    estimate.kappa                                             principal curvatures, 1/m, with their covariance
+    estimate.kappa, estimate.observed, estimate.covariance
 
 - `robot` is any serial arm of 1 to 8 joints: geometry, kinematics and their inverse, dynamics, calibration of the tool.
 - `touch` goes from a tactile image to the local shape of the object, to the map of a whole scan, and to the servo that
@@ -17,3 +16,63 @@ unobserved, never zero.
 Of the rest of the package only `canprobe.errors` is seen. Start reading at `touch`, whose text shows the path of a
 contact.
 """
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from canprobe.mechanics.robot.chain import Chain, forward, from_dh
+    from canprobe.mechanics.robot.model import ArmModel, Joint
+    from canprobe.mechanics.touch.contact import ContactSample
+    from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
+    from canprobe.mechanics.touch.estimate.fit import fit_surface
+    from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
+    from canprobe.mechanics.touch.estimate.noise import Prior
+    from canprobe.mechanics.touch.objects import make_object
+    from canprobe.mechanics.touch.surface import SurfaceMatrix
+    from canprobe.mechanics.touch.surface_map import SurfaceMap
+
+_MODULES = {
+    "ArmModel": "robot.model",
+    "Chain": "robot.chain",
+    "ContactSample": "touch.contact",
+    "Joint": "robot.model",
+    "Prior": "touch.estimate.noise",
+    "SurfaceEstimate": "touch.estimate.answer",
+    "SurfaceMap": "touch.surface_map",
+    "SurfaceMatrix": "touch.surface",
+    "cramer_rao": "touch.estimate.likelihood",
+    "fit_surface": "touch.estimate.fit",
+    "forward": "robot.chain",
+    "from_dh": "robot.chain",
+    "make_object": "touch.objects",
+}
+
+__all__ = [
+    "ArmModel",
+    "Chain",
+    "ContactSample",
+    "Joint",
+    "Prior",
+    "SurfaceEstimate",
+    "SurfaceMap",
+    "SurfaceMatrix",
+    "cramer_rao",
+    "fit_surface",
+    "forward",
+    "from_dh",
+    "make_object",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name on first use (PEP 562)."""
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_MODULES})

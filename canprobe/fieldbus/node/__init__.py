@@ -7,9 +7,11 @@ they share `core`: identity, NMT state, time, timers, dictionary, and the quirks
 - `dictionary` keeps values and makes every check that an access over the bus must pass, with the abort codes of CiA
   301.
 - `sdo_server` does expedited, segmented and block transfers by one table of states, for several clients.
-- `pdo_engine` and `rpdo_tpdo` route PDOs, hold parameters and mapping rules, events, inhibit times and SYNC.
-- `error_control` is heartbeat, guarding and emergencies; `lss_slave` node ids and stored parameters.
+- `pdo` and `tpdo` route PDOs, hold parameters and mapping rules, events, inhibit times and SYNC.
+- `emcy` has emergencies, heartbeat and guarding; `lss` node ids and stored parameters.
+- `faults` injects faults into a node; `serve` serves nodes on a real interface and keeps what a master stores in them.
 
-An application (`canprobe.fieldbus.drive`, `canprobe.cell.emulated.array`) hooks onto entries of the dictionary and gets
-every SYNC.
+An application (`canprobe.fieldbus.drive`) hooks onto entries of the dictionary and gets every SYNC. A node never
+sleeps, opens or waits: the same one runs in virtual time and on a real interface, for any master. Each point of the
+conformance list is a test named after its clause.
 """
