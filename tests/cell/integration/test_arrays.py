@@ -94,7 +94,7 @@ def test_an_array_of_raw_frames_is_started_listened_to_and_recorded(array, tmp_p
     images = [image for t_ns, can_id, data in sent if (image := assembler.push(can_id, data, t_ns)) is not None]
     times = np.array([image.t_ns for image in images])
     assert np.median(np.diff(times)) * 1e-9 == pytest.approx(1 / plan.setup.array.rate_hz, rel=0.01)
-    normal = np.array([image.counts[:, :, raw.normal] for image in images], dtype=float)
+    normal = np.array([image.counts[raw.normal :: raw.image.axes] for image in images], dtype=float)
     falls = raw.full_scale < raw.unloaded
     assert (normal.min() < raw.unloaded - 20) if falls else (normal.max() > raw.unloaded + 20)
     force = np.load(tmp_path / "run" / "log.npz")["force_n"]
