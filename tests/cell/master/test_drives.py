@@ -417,7 +417,7 @@ def payloads(counter, sync_counter, age_us=5000):
         sample_age_us=age_us,
         crc=0,
     )
-    whole = pack_whole(header, np.full((16, 16), counter, np.uint8))
+    whole = pack_whole(header, bytes([counter]) * header.window**2)
     return [whole[i : i + 8] for i in range(0, len(whole), 8)]
 
 
