@@ -1,4 +1,4 @@
-"""What a value of a file may be: small checks that stand in the annotations of `canprobe.cell.scene.model`, and `convert`.
+"""What a value of a file may be: small checks in the annotations of `canprobe.cell.scene.model`, and `convert`.
 
 `convert` turns what `tomllib` read into the annotated type, or says what was expected. Nothing is coerced silently
 except an integer where a number is wanted (TOML's `25` for `25.0`); a boolean is never a number.

@@ -123,7 +123,8 @@ def test_public_name_is_the_function():
 def test_light_commands_import_neither_scipy_nor_matplotlib(argv):
     code = (
         "import sys; from canprobe.cli import main; status = main(sys.argv[1:]); "
-        "heavy = {'scipy', 'matplotlib', 'canprobe.cell.master', 'canprobe.cell.emulated', 'canprobe.api'} & set(sys.modules); "
+        "heavy = {'scipy', 'matplotlib', 'canprobe.api', 'canprobe.cell.master', 'canprobe.cell.emulated'}; "
+        "heavy &= set(sys.modules); "
         "sys.exit(f'imported {heavy}' if heavy else status)"
     )
     done = subprocess.run([sys.executable, "-c", code, *argv], capture_output=True, text=True, check=False)

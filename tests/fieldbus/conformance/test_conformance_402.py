@@ -1,4 +1,4 @@
-"""Points 48–60 and 74: the drive, by raw frames. Source: CiA 402-2. Modes in depth: tests/cell/emulated/test_drive_*.py."""
+"""Points 48–60 and 74: the drive, by raw frames. Source: CiA 402-2. Modes in depth: tests/fieldbus/drive/."""
 
 from __future__ import annotations
 

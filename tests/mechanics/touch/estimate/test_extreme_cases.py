@@ -11,6 +11,7 @@ import pytest
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import ContactSample, Doubt, indentation_from_force
 from canprobe.mechanics.touch.estimate.fit import METHODS, fit_surface, make_estimator
+from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
 from canprobe.mechanics.touch.patch.image import PatchCalibration, compute_patch
 from canprobe.mechanics.touch.surface import SurfaceMatrix
 
@@ -487,7 +488,7 @@ class TestMagnitudes:
         n, S = self.cap()
         value = np.where(np.eye(3) > 0, sigma, 0.0) if as_covariance and isinstance(sigma, float) else sigma
         sigmas = {"sigma_point": 2e-5, "sigma_normal": 1e-3, field: value}
-        for compute in (lambda: canprobe.cramer_rao(n, n, S, **sigmas), lambda: fit_surface(n, n, **sigmas)):
+        for compute in (lambda: cramer_rao(n, n, S, **sigmas), lambda: fit_surface(n, n, **sigmas)):
             with pytest.raises(UsageError, match=f"^{field}: expected"):
                 compute()
 
@@ -495,17 +496,17 @@ class TestMagnitudes:
     def test_a_bound_and_a_fit_have_the_unit_of_their_points(self, unit):
         n, S = self.cap()
         scaled = np.diag([1.0, 1.0, 1.0, -(unit**2)]) / unit
-        bound = canprobe.cramer_rao(n, n, S, sigma_point=2e-5, sigma_normal=1e-3)
-        again = canprobe.cramer_rao(unit * n, n, scaled, sigma_point=2e-5 * unit, sigma_normal=1e-3)
+        bound = cramer_rao(n, n, S, sigma_point=2e-5, sigma_normal=1e-3)
+        again = cramer_rao(unit * n, n, scaled, sigma_point=2e-5 * unit, sigma_normal=1e-3)
         assert again * unit**2 == pytest.approx(bound, rel=1e-6)
         estimate = fit_surface(unit * n, n, sigma_point=2e-5 * unit, sigma_normal=1e-3)
         assert estimate.kappa * unit == pytest.approx([1.0, 1.0], rel=1e-4)
 
     def test_a_bound_is_that_of_the_surface_however_its_matrix_is_scaled(self):
         n, S = self.cap()
-        bound = canprobe.cramer_rao(n, n, S, sigma_point=2e-5, sigma_normal=1e-3)
+        bound = cramer_rao(n, n, S, sigma_point=2e-5, sigma_normal=1e-3)
         for factor in (1e-55, 1e55):
-            again = canprobe.cramer_rao(n, n, factor * S, sigma_point=2e-5, sigma_normal=1e-3)
+            again = cramer_rao(n, n, factor * S, sigma_point=2e-5, sigma_normal=1e-3)
             assert again == pytest.approx(bound, rel=1e-9)
 
     @pytest.mark.parametrize("factor", [1e308, 1e160, 1e-160, 1e-300])
@@ -519,4 +520,4 @@ class TestMagnitudes:
         with pytest.raises(UsageError, match=r"^points: expected"):
             fit_surface(factor * n, n, sigma_point=2e-5, sigma_normal=1e-3)
         with pytest.raises(UsageError, match=r"^points: expected"):
-            canprobe.cramer_rao(factor * n, n, S, sigma_point=2e-5, sigma_normal=1e-3)
+            cramer_rao(factor * n, n, S, sigma_point=2e-5, sigma_normal=1e-3)
