@@ -81,8 +81,19 @@ _HIGHER = [(int(n) - k, k, 0) for n, k in zip(DEGREE, _POWER_Y, strict=True)]
 _QUADRIC = [(1, 0, 0), (0, 1, 0), (0, 0, 0), (1, 0, 1), (0, 1, 1), (0, 0, 2), (2, 0, 0), (1, 1, 0), (0, 2, 0)]
 """Powers of x, y, z in the terms of the nine parameters, in their order."""
 _OWN = [2.0, 2.0, 1.0, 2.0, 2.0, 1.0, 1.0, 2.0, 1.0]
-_POWERS = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (2, 0, 0), (1, 1, 0), (0, 2, 0), (1, 0, 1), (0, 1, 1), (0, 0, 2)]
-_POWERS += _HIGHER
+_POWERS = [
+    (0, 0, 0),
+    (1, 0, 0),
+    (0, 1, 0),
+    (0, 0, 1),
+    (2, 0, 0),
+    (1, 1, 0),
+    (0, 2, 0),
+    (1, 0, 1),
+    (0, 1, 1),
+    (0, 0, 2),
+    *_HIGHER,
+]
 
 
 def _monomials(x: Any, y: Any, z: Any) -> Array:
