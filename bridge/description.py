@@ -19,7 +19,7 @@ from canprobe.errors import PlanError
 from canprobe.lab.bridge.sample import BASE, FLANGE, PROBE
 from canprobe.mechanics.robot.chain import Chain
 from canprobe.mechanics.robot.urdf import Visual, find_mesh, visuals_of
-from canprobe.mechanics.touch.linear_algebra import homogeneous, tangent_rotation
+from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 
 Array = NDArray[np.float64]
 WHITE, DARK = (236, 233, 224), (76, 84, 94)

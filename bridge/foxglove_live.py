@@ -11,8 +11,10 @@ from importlib import resources
 import foxglove
 
 from canprobe.errors import UsageError
-from canprobe.lab.bridge.messages import TOPICS, Encoder, Messages, Topic
-from canprobe.lab.bridge.sample import Context, Sample
+from canprobe.lab.bridge.interface import Context
+from canprobe.lab.bridge.messages import Encoder
+from canprobe.lab.bridge.sample import Sample
+from canprobe.lab.bridge.topics import TOPICS, Messages, Topic
 
 LAYOUT = "foxglove_layout.json"
 STATIC_EVERY_NS = 1_000_000_000

@@ -12,188 +12,23 @@ Source: ROS 2's mapping to DDS names (`rt/` before a topic), REP 2016 (`typehash
 from __future__ import annotations
 
 import contextlib
-import dataclasses
-import math
 import os
-import types as python_types
-from dataclasses import replace
 from typing import Any
 
-import numpy as np
 from cyclonedds.core import DDSException, Policy, Qos
 from cyclonedds.domain import Domain, DomainParticipant
-from cyclonedds.idl import IdlStruct
-from cyclonedds.idl import annotations as annotate
-from cyclonedds.idl import types as idl
 from cyclonedds.pub import DataWriter, Publisher
 from cyclonedds.sub import DataReader, Subscriber
 from cyclonedds.topic import Topic as DdsTopic
 from cyclonedds.util import duration
-from numpy.typing import NDArray
 
-from canprobe.cell.planning.make import make_plan
-from canprobe.cell.planning.model import Plan
-from canprobe.cell.scene.load import dump_scene, parse_scene
-from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.tasks import Trajectory
 from canprobe.errors import UsageError
-from canprobe.lab.bridge.messages import TOPICS, Encoder, Messages, Topic
-from canprobe.lab.bridge.sample import Context, Sample
-
-Array = NDArray[np.float64]
-
-# Whether a command from outside may reach the cell: by the same checks that the scene itself has to pass.
-
-
-def refuse(plan: Plan, kind: str, value: float | None) -> str | None:
-    """Why a command is refused, or None.
-
-    A target force or a speed is put into the scene, which is then checked and planned as if it had been written so:
-    ranges, `limits.force_max_n`, the speeds of the joints.
-
-    Args:
-        plan: of the run.
-        kind: start, stop, target_force_n or speed_m_s.
-        value: N or m/s; None for start and stop.
-    """
-    if kind in ("start", "stop"):
-        return None
-    needs = ("scan", "press") if kind == "target_force_n" else ("scan",)
-    task = plan.scene.task
-    if task.kind not in needs:
-        return f'task.kind = "{task.kind}" has none'
-    if value is None or not math.isfinite(value):
-        return f"expected a number, got {value}"
-    changed = replace(task, force_n=value) if kind == "target_force_n" else replace(task, speed_mm_s=value * 1e3)
-    try:
-        make_plan(resolve(parse_scene(dump_scene(replace(plan.scene, task=changed)))))
-    except UsageError as error:
-        return str(error).splitlines()[0].removeprefix("scene: ")
-    return None
-
-
-def trajectory_of(plan: Plan, message: Any, q: Array | None) -> dict[str, Any]:
-    """The way that a `trajectory_msgs/msg/JointTrajectory` asks for, checked from where the arm stands.
-
-    Args:
-        plan: of the run.
-        message: with names, points, and positions in each; velocities in all of them or in none.
-        q: (n,) joint positions now, rad or m; None as long as they are not known.
-
-    Returns:
-        `points` and `velocities` of a `canprobe.cell.tasks.Trajectory`.
-
-    Raises:
-        UsageError: the cell cannot or must not follow it.
-    """
-    arm = plan.setup.arm
-    if arm is None or plan.scene.task.kind != "free":
-        raise UsageError(f'task.kind = "{plan.scene.task.kind}" follows none: task.kind = "free" does')
-    if q is None:
-        raise UsageError("the joints have not reported yet")
-    names, known = list(message.joint_names), list(arm.model.chain.joints)
-    if sorted(names) != sorted(known):
-        raise UsageError(f"expected the joints {', '.join(known)}, got {', '.join(names) or 'none'}")
-    order = [names.index(name) for name in known]
-
-    def ordered(values: Any) -> list[float]:
-        if len(values) != len(names):
-            raise UsageError(f"expected {len(names)} numbers for {len(names)} joints, got {len(values)}")
-        return [float(values[i]) for i in order]
-
-    times = [point.time_from_start.sec + 1e-9 * point.time_from_start.nanosec for point in message.points]
-    points = [(t, ordered(point.positions)) for t, point in zip(times, message.points, strict=True)]
-    moving = [point.velocities for point in message.points if len(point.velocities)]
-    velocities = [ordered(one) for one in moving] if moving else None
-    if reason := Trajectory(plan, points, velocities).inspect(q):
-        raise UsageError(reason)
-    return {"points": points, "velocities": velocities}
-
-
-# ROS 2 message types as Cyclone DDS knows types, made from rosbags' definitions: one type store for all sinks.
-#
-# A type made here carries messages that are CDR already, byte for byte. Built field by field it is serialised by
-# Cyclone itself, which the tests hold against rosbags.
-#
-# Source: ROS 2's mapping to DDS: `pkg/msg/Name` is `pkg::msg::dds_::Name_`, final, plain CDR (XCDR1).
-
-_BASE: dict[str, Any] = {
-    "bool": bool,
-    "byte": idl.uint8,
-    "char": idl.uint8,
-    "string": str,
-    **{f"{kind}{bits}": getattr(idl, f"{kind}{bits}") for kind in ("int", "uint") for bits in (8, 16, 32, 64)},
-    "float32": idl.float32,
-    "float64": idl.float64,
-}
-_NODE_BASE, _NODE_NAME, _NODE_ARRAY = 1, 2, 3
-
-
-def _serialize(self: Any, buffer: Any = None, endianness: Any = None, use_version_2: Any = None) -> bytes:
-    """What goes onto the wire, encapsulation included: the bytes that a message carries, or its fields."""
-    carried = self.__dict__.get("carried")
-    if carried is not None:
-        return bytes(carried)
-    data: bytes = IdlStruct.serialize(self, buffer, endianness, use_version_2)
-    return data
-
-
-class DdsTypes:
-    """The DDS types of one type store, each made when it is first asked for.
-
-    Args:
-        encoder: with the store.
-    """
-
-    def __init__(self, encoder: Encoder) -> None:
-        self._encoder = encoder
-        self._made: dict[str, Any] = {}
-
-    def of(self, type_name: str) -> Any:
-        """The class of a ROS type, such as `sensor_msgs/msg/JointState`."""
-        if type_name not in self._made:
-            _, fields = self._encoder.store.fielddefs[type_name]
-            self._made[type_name] = self._make(type_name, {name: self._field(node) for name, node in fields})
-        return self._made[type_name]
-
-    def carry(self, type_name: str, cdr: bytes) -> Any:
-        """A message of a type that will be sent as the bytes that it is."""
-        cls = self.of(type_name)
-        message = cls.__new__(cls)
-        message.__dict__["carried"] = cdr
-        return message
-
-    def _make(self, type_name: str, fields: dict[str, Any]) -> Any:
-        name = dds_name(type_name)
-
-        def body(namespace: dict[str, Any]) -> None:
-            namespace["__annotations__"].update(fields)
-            namespace["__module__"] = __name__
-            namespace["serialize"] = _serialize
-
-        typename = {"typename": name.replace("::", ".")}
-        cls = python_types.new_class(name.rpartition(":")[2], (IdlStruct,), typename, body)
-        return annotate.final(dataclasses.dataclass(cls))
-
-    def _field(self, node: tuple[Any, Any]) -> Any:
-        kind, of = int(node[0]), node[1]
-        if kind == _NODE_BASE:
-            return _BASE[of[0]]
-        if kind == _NODE_NAME:
-            return self.of(of)
-        inner, length = self._field(of[0]), of[1]
-        if kind == _NODE_ARRAY:
-            return idl.array[inner, length]  # type: ignore[misc]
-        return idl.sequence[(inner, length) if length else inner]  # type: ignore[misc]
-
-
-def dds_name(type_name: str) -> str:
-    """`sensor_msgs/msg/JointState` → `sensor_msgs::msg::dds_::JointState_`."""
-    package, kind, name = type_name.split("/")
-    return f"{package}::{kind}::dds_::{name}_"
-
-
-# The sink.
+from canprobe.lab.bridge.commands import Array, refuse, trajectory_of
+from canprobe.lab.bridge.dds_types import DdsTypes
+from canprobe.lab.bridge.interface import Context
+from canprobe.lab.bridge.messages import Encoder
+from canprobe.lab.bridge.sample import Sample
+from canprobe.lab.bridge.topics import TOPICS, Messages, Topic
 
 EMPTY, FLOAT64, STRING = "std_msgs/msg/Empty", "std_msgs/msg/Float64", "std_msgs/msg/String"
 START, STOP = Topic("/canprobe/start", EMPTY), Topic("/canprobe/stop", EMPTY)

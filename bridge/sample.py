@@ -6,20 +6,13 @@ message type. Times are in nanoseconds. z of the contact frame is the inward nor
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.planning.model import Plan
-from canprobe.cell.scene.model import BridgeSettings
 from canprobe.fieldbus.bus.port import TimedFrame
-from canprobe.mechanics.robot import chain as serial
-from canprobe.mechanics.robot.chain import Chain
 
 Array = NDArray[np.float64]
 
@@ -171,93 +164,3 @@ class Sample:
     frames: Sequence[TimedFrame] = ()
     diagnostics: tuple[Diagnostic, ...] = ()
     dropped: int = 0
-
-
-# The tree of frames, base to contact, as every viewer with tf wants it.
-
-
-def link_transforms(chain: Chain, q: Array) -> list[tuple[str, str, Array]]:
-    """Frame of every link in that of the one before.
-
-    Args:
-        chain: the arm.
-        q: (n,) joint positions, rad or m.
-
-    Returns:
-        (parent, child, (4, 4) T_parent_child) of the n links, m, base_link first; the last link and the flange are the
-        same.
-    """
-    names = [BASE, *(f"link_{i}" for i in range(1, chain.n + 1))]
-    return [(names[i], names[i + 1], T) for i, T in enumerate(serial.link_transforms(chain, q))]
-
-
-def flange_transform(chain: Chain) -> tuple[str, str, Array]:
-    """The flange lies in the last link's frame."""
-    return (f"link_{chain.n}", FLANGE, np.eye(4))
-
-
-def quaternion_of(R: Array) -> tuple[float, float, float, float]:
-    """Unit quaternion x, y, z, w of a rotation (3, 3), w ≥ 0.
-
-    Source: Shepperd's choice of the largest of the four squares, which divides by no small number.
-    """
-    m = R.tolist()
-    trace = m[0][0] + m[1][1] + m[2][2]
-    squares = (1 - trace + 2 * m[0][0], 1 - trace + 2 * m[1][1], 1 - trace + 2 * m[2][2], 1 + trace)
-    i = squares.index(max(squares))
-    big = math.sqrt(squares[i]) / 2
-    if i == 3:
-        q = [(m[2][1] - m[1][2]), (m[0][2] - m[2][0]), (m[1][0] - m[0][1]), 4 * big * big]
-    else:
-        j, k = (i + 1) % 3, (i + 2) % 3
-        q = [0.0] * 4
-        q[i] = 4 * big * big
-        q[j], q[k] = m[i][j] + m[j][i], m[i][k] + m[k][i]
-        q[3] = m[k][j] - m[j][k]
-    scale = math.copysign(1 / (4 * big), q[3])
-    return (q[0] * scale, q[1] * scale, q[2] * scale, q[3] * scale)
-
-
-# What a bridge's module has to offer, and what it gets at its start.
-
-
-@dataclass(frozen=True, slots=True)
-class Context:
-    """What a sink gets at its start.
-
-    Attributes:
-        plan: of the run.
-        settings: section `[bridge]`.
-        out: folder of the run; None where no files are written.
-        send: hands a request (see `canprobe.cell.tasks.from_plan.RequestedTask`) back to the cell.
-    """
-
-    plan: Plan
-    settings: BridgeSettings
-    out: Path | None
-    send: Callable[[dict[str, object]], None]
-
-
-class Sink(Protocol):
-    """One tool at the other end. Its module has `open_sink(context) -> Sink`."""
-
-    @property
-    def where(self) -> str:
-        """Where it is to be found, for people: a file, an address."""
-        ...
-
-    def start(self, epoch_ns: int) -> None:
-        """The first sample is here; time 0 of the samples is `epoch_ns` after the Unix epoch (0 in virtual time)."""
-        ...
-
-    def write(self, sample: Sample) -> None:
-        """Take one sample."""
-        ...
-
-    def close(self, summary: str | None) -> None:
-        """The end of the run.
-
-        Args:
-            summary: the content of `summary.json`; None where the cell went away without a word.
-        """
-        ...

@@ -16,8 +16,10 @@ if TYPE_CHECKING:
     from canprobe.cell.master.controller import Command, Controller, Measurement
     from canprobe.cell.recorded.reestimate import ReplayResult, replay
     from canprobe.cell.results.contacts import Contacts
-    from canprobe.cell.results.files import load_surface_map, load_table
-    from canprobe.cell.results.summary import RunResult, measure_traffic
+    from canprobe.cell.results.files import load_table
+    from canprobe.cell.results.summary import RunResult
+    from canprobe.cell.results.surface_file import load_surface_map
+    from canprobe.cell.results.traffic import measure_traffic
     from canprobe.cell.scene.load import load_scene
     from canprobe.errors import (
         BusError,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from canprobe.cell.master.array import patch_from
 from canprobe.cell.master.controller import Command, Controller, Measurement, TactileSample, as_controller
-from canprobe.cell.master.cycle import Observation, Observer, Observers
+from canprobe.cell.master.observers import Observation, Observer, Observers
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.summary import RunResult, log_columns, summarise, tactile_columns, write_columns, write_files
@@ -20,18 +20,20 @@ from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.scene.setup import Setup, Touch
+from canprobe.cell.session.check_joints import check_joints
 from canprobe.cell.session.children import Bridges
 from canprobe.cell.session.emulation import emulate, emulate_eds
+from canprobe.cell.session.home import home
 from canprobe.cell.session.looking import commission, monitor, scan
 from canprobe.cell.session.session import Say, Session, quiet, with_bridges
 from canprobe.cell.session.target import VIRTUAL, Target
 from canprobe.cell.session.terminal import Progress
-from canprobe.cell.session.up import check_joints, home, up
+from canprobe.cell.session.up import up
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
 from canprobe.cell.tasks.task import TaskRecord, record_of
 from canprobe.errors import CanprobeError, ResultsError, UsageError
-from canprobe.fieldbus.bus.real.processor import interrupts_held, interrupts_repeated
+from canprobe.fieldbus.bus.real.interrupts import interrupts_held, interrupts_repeated
 from canprobe.mechanics.robot.chain import Array, forward_jacobian
 
 if TYPE_CHECKING:
@@ -198,7 +200,7 @@ def _mapped(
     """The surface map of a scan, the tests at its crossings (they take a second), and both for the summary."""
     if tracker is None or setup.shape is None:
         return None, None, None
-    from canprobe.cell.results.scores import map_of_scan
+    from canprobe.cell.results.map_score import map_of_scan
 
     return map_of_scan(tracker, setup.shape.method, start_s)
 

@@ -25,7 +25,7 @@ from PIL import Image
 import canprobe
 from canprobe.cell.results.expected import figures_of
 from canprobe.cell.scene.load import packaged_scenes
-from canprobe.lab.studies.harness import processor
+from canprobe.lab.studies.result_files import processor
 from canprobe.lab.studies.sweep import STUDIES
 
 DOCS = Path(__file__).resolve().parent

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 from canopen.objectdictionary import ObjectDictionary, ODArray, ODVariable, datatypes
 
-from canprobe.fieldbus.eds.variables import OCTETS, SIGNED, TEXTS, UNSIGNED, Value
+from canprobe.fieldbus.eds.values import OCTETS, SIGNED, TEXTS, UNSIGNED, Value
 
 LAST_DUMMY = 0x0007
 """Indices up to here are data types: DummyUsage says which of them an RPDO may map to fill room."""

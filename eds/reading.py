@@ -18,14 +18,12 @@ from canopen.objectdictionary import ObjectDictionary, ODRecord, ODVariable, dat
 
 from canprobe.errors import EdsError
 from canprobe.fieldbus.eds.description import variable_at
-from canprobe.fieldbus.eds.sections import Fault, Faults, Section, Source, decode, parse_sum, split_sections
-from canprobe.fieldbus.eds.structure import (
-    build_objects,
-    check_lists,
-    commissioned_node,
-    find_objects,
-    read_information,
-)
+from canprobe.fieldbus.eds.device_info import commissioned_node, read_information
+from canprobe.fieldbus.eds.findings import Fault, Faults
+from canprobe.fieldbus.eds.numbers import parse_sum
+from canprobe.fieldbus.eds.object_lists import check_lists
+from canprobe.fieldbus.eds.sections import Section, Source, decode, split_sections
+from canprobe.fieldbus.eds.structure import build_objects, find_objects
 
 _INVALID = 1 << 31
 _CAN_ID = 0x1FFFFFFF

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.master.log import joint_positions
+from canprobe.cell.master.joint_columns import joint_positions
 from canprobe.cell.results.run_files import LOG, TACTILE, read_log, read_scene, read_summary, read_tactile
 from canprobe.cell.scene.load import SAVED_AS
 from canprobe.cell.scene.model import Scene
@@ -23,7 +23,7 @@ from canprobe.errors import UsageError
 from canprobe.lab.bridge.sample import ContactFrame, SurfacePatch
 from canprobe.lab.bridge.view.instants import Answer, Moment, judge
 from canprobe.lab.bridge.view.meshes import Array
-from canprobe.mechanics.touch.linear_algebra import tangent_rotation
+from canprobe.mechanics.touch.tangent_frames import tangent_rotation
 
 
 @dataclass(frozen=True, eq=False)  # without slots: `cached_property`

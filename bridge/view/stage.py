@@ -1,15 +1,8 @@
-"""The scene in the browser: a viser server, its nodes for arm, probe, object, contact and path, and the panel beside
-them.
-"""
+"""The scene in the browser: arm, probe, object, contact, force, patch and path as viser's nodes."""
 
 from __future__ import annotations
 
-import contextlib
-import html
-import importlib
-import io
 import math
-from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,30 +11,20 @@ from numpy.typing import NDArray
 from canprobe.cell.scene.geometry import T_flange_probe, true_object
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
-from canprobe.errors import InterfaceError
-from canprobe.fieldbus.bus.port import MonotonicClock
-from canprobe.lab.bridge.database import need
-from canprobe.lab.bridge.sample import quaternion_of
-from canprobe.lab.bridge.view.bodies import (
-    link_frames,
-    object_lines,
-    object_mesh,
-    probe_parts,
-    taxel_colours,
-    taxel_image,
-    taxel_poses,
-    tile,
-)
-from canprobe.lab.bridge.view.instants import Curves, Moment
+from canprobe.fieldbus.bus.clock import MonotonicClock
+from canprobe.lab.bridge.frames import quaternion_of
+from canprobe.lab.bridge.view.array_dome import taxel_colours, taxel_poses, tile
+from canprobe.lab.bridge.view.bodies import link_frames, probe_parts
+from canprobe.lab.bridge.view.colours import linear_light
+from canprobe.lab.bridge.view.instants import Moment
 from canprobe.lab.bridge.view.links import arm_links
-from canprobe.lab.bridge.view.meshes import Array, Mesh, linear_light
-from canprobe.lab.bridge.view.path import PATH, DeviationScale
+from canprobe.lab.bridge.view.meshes import Array, Mesh
+from canprobe.lab.bridge.view.object_sheet import object_lines, object_mesh
+from canprobe.lab.bridge.view.path_nodes import PATH
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.patch.array_calibration import NOMINAL
 from canprobe.mechanics.touch.shapes import PlacedShape
-
-# The scene in the browser: arm, probe, object, contact, force, patch and path as viser's nodes.
 
 OBJECT, PROBE, FORCE = (126, 150, 176), (78, 88, 104), (214, 40, 30)
 FORCE_M_PER_N = 0.012
@@ -256,153 +239,3 @@ def _place(handle: Any, T: Array) -> None:
     x, y, z, w = quaternion_of(T[:3, :3])
     handle.wxyz = (w, x, y, z)
     handle.position = T[:3, 3]
-
-
-# A viser server that says nothing on stdout and leaves nothing behind.
-
-
-@contextlib.contextmanager
-def open_server(port: int, host: str = "127.0.0.1") -> Iterator[Any]:
-    """A server for browsers, stopped on leaving.
-
-    Args:
-        port: 0 lets the system choose; where it is taken, the next free one.
-        host: 0.0.0.0 for other machines too.
-
-    Raises:
-        UsageError: viser is not installed.
-        InterfaceError: no port can be had.
-    """
-    viser = need("viser", "view", "the view")
-    with contextlib.redirect_stdout(io.StringIO()):  # viser greets and leaves with a box on stdout
-        try:
-            server = viser.ViserServer(host=host, port=port, label="canprobe", verbose=False)
-        except OSError as error:
-            raise InterfaceError(f"{host}:{port}: no port to show the cell on: {error.strerror or error}") from error
-    try:
-        yield server
-    finally:
-        with contextlib.redirect_stdout(io.StringIO()):
-            server.stop()
-
-
-def address(server: Any) -> str:
-    """Where a browser finds a server."""
-    host = server.get_host()
-    return f"http://{'localhost' if host == '0.0.0.0' else host}:{server.get_port()}"
-
-
-# Beside the scene: what the task does in figures, the taxel image, plots over time.
-
-INK, FIRST, SECOND, FAINT = "#1f2933", "#c2410c", "#0f6e84", "#9aa5b1"
-HEIGHT = 96
-PIXELS = 5
-"""Of a taxel in its image."""
-
-
-class Panel:
-    """What a browser shows beside the scene.
-
-    Args:
-        server: a `viser.ViserServer`.
-        scene: that is shown.
-        errors: what the path's colours mean.
-        stage: what is beside, with lines about what cannot be drawn.
-    """
-
-    def __init__(self, server: Any, scene: Scene, errors: DeviationScale, stage: Stage) -> None:
-        gui = server.gui
-        gui.configure_theme(control_layout="fixed", control_width="medium", show_logo=False, brand_color=(15, 110, 132))
-        gui.set_panel_label(f"canprobe · {scene.name}")
-        self._target = scene.task.force_n if scene.task.kind in ("scan", "press") else None
-        self._status = gui.add_html("")
-        gui.add_html(_PHONE + _legend(scene, stage.notes))
-        stage.add_switches(gui)
-        self._plots: list[tuple[Any, tuple[str, ...]]] = []
-        self._taxels = None
-        if scene.shape is not None:
-            bar = np.broadcast_to(errors.colours(np.linspace(0.0, errors.high, 256)), (14, 256, 3))
-            gui.add_image(
-                np.ascontiguousarray(bar), label=f"surface: 0 … {errors.high:.2g}  {errors.text}", format="png"
-            )
-        if scene.sensor is not None:
-            blank = np.zeros((scene.sensor.rows, scene.sensor.columns), np.uint8)
-            self._taxels = gui.add_image(taxel_image(blank, PIXELS), label="taxel image", format="png")
-            self._add_plot(gui, "force (N)", ("force", "target"), (FIRST, FAINT))
-        if scene.shape is not None:
-            names = ("true1", "true2", "low1", "high1", "low2", "high2", "kappa1", "kappa2")
-            colours = (FAINT, FAINT, FIRST, FIRST, SECOND, SECOND, FIRST, SECOND)
-            self._add_plot(gui, "κ1, κ2 with 95 % bands; grey: true (1/m)", names, colours)
-            self._add_plot(gui, "error of K; grey: stated deviation (1/m)", ("error", "sigma"), (INK, FAINT))
-
-    def _add_plot(self, gui: Any, title: str, names: tuple[str, ...], colours: tuple[str, ...]) -> None:
-        uplot = importlib.import_module("viser").uplot
-        series = [uplot.Series(label="t (s)")]
-        for name, colour in zip(names, colours, strict=True):
-            thin = name.startswith(("low", "high", "true")) or name in ("target", "sigma")
-            series.append(uplot.Series(label=name, stroke=colour, width=1.0 if thin else 2.0))
-        empty = tuple(np.array([0.0, 1.0]) if i == 0 else np.full(2, np.nan) for i in range(len(series)))
-        handle = gui.add_uplot(
-            empty, tuple(series), title=title, height=HEIGHT, scales=_scales(empty[0], []),
-            legend=uplot.Legend(show=False),
-        )  # fmt: skip
-        self._plots.append((handle, names))
-
-    def show(self, moment: Moment, curves: Curves | None = None) -> None:
-        """Show a moment, and curves where there are new ones."""
-        self._status.content = _STYLED.format("<br>".join(self._lines(moment)))
-        if self._taxels is not None and moment.taxels is not None:
-            self._taxels.image = taxel_image(moment.taxels, PIXELS)
-        if curves is None or len(curves["t_s"]) < 2:
-            return
-        for handle, names in self._plots:
-            columns = [self._column(curves, name) for name in names]
-            handle.scales = _scales(curves["t_s"], columns)
-            handle.data = (curves["t_s"], *columns)
-
-    def _column(self, curves: Curves, name: str) -> Any:
-        if name == "target":
-            return np.full(len(curves["t_s"]), math.nan if self._target is None else self._target)
-        return curves[name]
-
-    def _lines(self, moment: Moment) -> Iterator[str]:
-        force = f" · <b>{moment.force:.2f} N</b>" if math.isfinite(moment.force) else ""
-        yield f"<b>{moment.t_s:.2f} s</b> {moment.phase or ''}{force}"
-        if (answer := moment.answer) is not None:
-            kappa = ", ".join("not observed" if math.isnan(k) else f"{k:.2f}" for k in answer.patch.kappa)
-            error = "" if math.isnan(answer.error) else f" · error of K <b>{answer.error:.2f}</b>"
-            yield f"κ <b>{kappa} 1/m</b>{error}"
-            if math.isfinite(answer.kappa_true[0]):
-                yield f"true κ {answer.kappa_true[0]:.2f}, {answer.kappa_true[1]:.2f} 1/m"
-        if moment.dropped:
-            yield f"samples dropped: {moment.dropped}"
-
-
-_PHONE = """<style>
-@media (max-width: 36em) { /* viser lays its panel over the picture there: below it, and as wide */
-  #root:has([aria-hidden="false"] .mantine-InputWrapper-root) > div { height: 58vh !important; }
-  .mantine-Paper-root[style*="position: fixed"] { max-height: 42vh !important; width: 100% !important; }
-  .mantine-Paper-root[style*="position: fixed"] .mantine-ScrollArea-content > div { width: 100% !important; }
-}
-</style>"""
-_STYLED = '<div style="padding: 0 0.6em 0.4em; font-size: 0.9em; line-height: 1.5">{}</div>'
-
-
-_KEY = '<span style="white-space: nowrap"><span style="color: rgb{}">&#9632;</span> {}</span>'
-
-
-def _legend(scene: Scene, notes: Sequence[str]) -> str:
-    rows = [_KEY.format(colour, html.escape(text)) for colour, text in legend_of(scene)]
-    return _STYLED.format("<br>".join([" &ensp; ".join(rows), *map(html.escape, notes)]))
-
-
-def _scales(times: Any, columns: list[Any]) -> dict[str, Any]:
-    """Fixed ends of the axes: uPlot cannot find them where a value is missing (NaN)."""
-    scale_of = importlib.import_module("viser").uplot.Scale
-    values = np.concatenate([column[np.isfinite(column)] for column in columns]) if columns else np.empty(0)
-    low, high = np.percentile(values, (1.0, 99.0)).tolist() if len(values) else (0.0, 1.0)
-    low = min(low, 0.0)
-    spare = 0.08 * (high - low) or 1.0
-    ends = (low - spare if low < 0.0 else 0.0, high + spare)
-    span = (float(times[0]), max(float(times[-1]), float(times[0]) + 1e-3))
-    return {"x": scale_of(time=False, auto=False, range=span), "y": scale_of(auto=False, range=ends)}

@@ -13,7 +13,8 @@ from scipy.spatial import cKDTree
 
 from canprobe.lab.bridge.view.instants import Answer
 from canprobe.lab.bridge.view.meshes import Array
-from canprobe.lab.bridge.view.path import DeviationScale, Parts
+from canprobe.lab.bridge.view.path import DeviationScale
+from canprobe.lab.bridge.view.path_nodes import Parts
 from canprobe.mechanics.touch.blend import REACH_M
 from canprobe.mechanics.touch.meshing import Mesh
 from canprobe.mechanics.touch.surface_map import SPACING_M, LocalPatch, SurfaceMap

@@ -14,8 +14,11 @@ from collections.abc import Callable
 from datetime import date
 
 from canprobe.cell.session.terminal import Report
+from canprobe.cli.argument_types import folder_path, word
+from canprobe.cli.common_arguments import BUS, add_options, add_verbosity, seed
 from canprobe.cli.output import print_json
-from canprobe.cli.parser import BUS, Parser, add_options, add_verbosity, folder_path, seed, target_of, word
+from canprobe.cli.parser import Parser
+from canprobe.cli.target import target_of
 from canprobe.errors import install_line
 
 HELP = "calibrate a tactile array by touching known things"

@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
+from canprobe.cli.argument_types import whole
+from canprobe.cli.common_arguments import add_options
 from canprobe.cli.output import print_json
-from canprobe.cli.parser import Parser, add_options, whole
+from canprobe.cli.parser import Parser
 
 if TYPE_CHECKING:
+    from canprobe.fieldbus.eds.findings import Fault
     from canprobe.fieldbus.eds.reading import Reading
-    from canprobe.fieldbus.eds.sections import Fault
 
 HELP = "list, locate or check EDS files"
 EXAMPLE = """\

@@ -12,21 +12,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from canprobe.cli.output import left_by_ctrl_c
-from canprobe.cli.parser import (
-    BUS,
-    Parser,
-    add_options,
-    add_scene,
-    add_verbosity,
-    loaded,
-    node_id,
-    node_ids,
-    number_of_32_bits,
-    real_target,
-    target_of,
-    whole,
-)
+from canprobe.cli.argument_types import node_id, node_ids, number_of_32_bits, whole
+from canprobe.cli.common_arguments import BUS, add_options, add_scene, add_verbosity
+from canprobe.cli.interrupts import left_by_ctrl_c
+from canprobe.cli.parser import Parser
+from canprobe.cli.target import loaded, real_target, target_of
 from canprobe.errors import UsageError
 
 if TYPE_CHECKING:
@@ -106,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("emulate: name a SCENE, or else --eds FILE --node-id N, or --bus-yml FILE")
     serve = _scene_server(args) if args.scene is not None else _eds_server(args)
 
-    from canprobe.cell.session.children import end_with_parent
+    from canprobe.cell.session.emulator_child import end_with_parent
 
     with left_by_ctrl_c():
         if args.parent is not None:
@@ -168,7 +158,7 @@ def _eds_server(args: argparse.Namespace) -> Callable[[], None]:
 def _eds_files(args: argparse.Namespace) -> list[tuple[str | Path, int]]:
     """(file, node id) of each node without a scene."""
     if args.bus_yml is not None:
-        from canprobe.lab.bridge.export import read_bus_yml
+        from canprobe.lab.bridge.bus_yml import read_bus_yml
 
         if args.node_id or args.serial:
             raise UsageError("emulate: --node-id and --serial belong to --eds; a bus.yml has its own")

@@ -14,8 +14,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from canprobe.cli.output import say
-from canprobe.cli.parser import Parser, folder_path
+from canprobe.cli.argument_types import folder_path
+from canprobe.cli.parser import Parser
+from canprobe.cli.progress import say
 from canprobe.errors import PlanError, UsageError
 
 if TYPE_CHECKING:
@@ -256,7 +257,8 @@ def _rounded(found: UrdfArm) -> tuple[list[float], float]:
     """A posture from which the probe points down as far as the arm can, in deg and mm; its tilt from there, rad."""
     import numpy as np
 
-    from canprobe.mechanics.robot.chain import forward_jacobian, tool_z_offset
+    from canprobe.mechanics.robot.chain import forward_jacobian
+    from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
 
     tool, rng = tool_z_offset(80.0), np.random.default_rng(0)
     low, high = np.array([_range(joint) for joint in found.joints]).T

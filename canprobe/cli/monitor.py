@@ -8,9 +8,12 @@ from __future__ import annotations
 import argparse
 import sys
 
+from canprobe.cli.argument_types import seconds
+from canprobe.cli.common_arguments import BUS, add_options, add_scene, add_verbosity
 from canprobe.cli.output import print_json
-from canprobe.cli.parser import BUS, Parser, add_options, add_scene, add_verbosity, loaded, seconds, target_of
-from canprobe.fieldbus.bus.real.processor import Terminated
+from canprobe.cli.parser import Parser
+from canprobe.cli.target import loaded, target_of
+from canprobe.fieldbus.bus.real.interrupts import Terminated
 
 HELP = "watch a running cell"
 EXAMPLE = """\
@@ -38,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
     scene = target_of(args, scene).applied_to(scene)
 
     from canprobe import api
-    from canprobe.cell.master.monitor import lines, screen
+    from canprobe.cell.master.monitor_text import lines, screen
 
     on_terminal = sys.stdout.isatty() and not args.json
     duration_s = args.duration if args.duration is not None or on_terminal else 1.0

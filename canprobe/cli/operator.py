@@ -6,8 +6,8 @@ import os
 import select
 import sys
 
-from canprobe.cell.tasks.free_and_listen import Answer
-from canprobe.cli.output import say
+from canprobe.cell.tasks.joint_finding import Answer
+from canprobe.cli.progress import say
 
 _CHOICES = "Enter or y: yes, n: no, q: end"
 _WORDS = {"": Answer.YES, "y": Answer.YES, "yes": Answer.YES, "n": Answer.NO, "no": Answer.NO, "q": Answer.QUIT}

@@ -1,21 +1,16 @@
-"""What commands print on stdout: JSON documents, tables, summaries; and interrupts that leave a terminal in order."""
+"""What commands print on stdout: JSON documents, tables, summaries."""
 
 from __future__ import annotations
 
 import codecs
-import contextlib
 import itertools
 import json
 import re
-import signal
 import sys
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 from canprobe.cell.session.terminal import MARKS, NARROW, columns, painted
-from canprobe.fieldbus.bus.real.processor import TERMINATIONS, Terminated, raise_terminated
-
-# Results, on stdout.
 
 
 def print_json(document: object) -> None:
@@ -55,43 +50,3 @@ def print_summary(text: str) -> None:
         match = re.match(r"( +)(\S+)(.*)", line)
         colour = "yellow" if match and match[2] in MARKS else "cyan"
         print(f"{match[1]}{painted(match[2], colour, sys.stdout)}{match[3]}" if match else line)
-
-
-# Steps and progress, on stderr.
-
-
-def say(line: str) -> None:
-    """Report one line, on stderr."""
-    print(line, file=sys.stderr, flush=True)
-
-
-# SIGTERM and SIGHUP as interrupts: whatever stops a command, it leaves by the same safe way.
-
-
-@contextlib.contextmanager
-def termination_interrupts() -> Iterator[None]:
-    """Within the block SIGTERM and SIGHUP raise `Terminated`; outside a main thread nothing changes."""
-    before = {number: signal.getsignal(number) for number in TERMINATIONS}
-    try:
-        for number, handler in before.items():
-            if handler != signal.SIG_IGN:  # as nohup has it
-                signal.signal(number, raise_terminated)
-    except ValueError:  # not the main thread: signals are not ours to receive
-        yield
-        return
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-@contextlib.contextmanager
-def left_by_ctrl_c() -> Iterator[None]:
-    """Ctrl-C is the normal way to leave the block; SIGTERM and SIGHUP go on to the caller, for status 143."""
-    try:
-        yield
-    except Terminated:
-        raise
-    except KeyboardInterrupt:
-        pass

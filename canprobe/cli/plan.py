@@ -12,8 +12,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from canprobe.cell.session.terminal import columns
-from canprobe.cli.output import print_json, say
-from canprobe.cli.parser import Parser, add_options, add_scene, loaded
+from canprobe.cli.common_arguments import add_options, add_scene
+from canprobe.cli.output import print_json
+from canprobe.cli.parser import Parser
+from canprobe.cli.progress import say
+from canprobe.cli.target import loaded
 from canprobe.errors import CanprobeError, PlanError, UsageError, install_line
 
 if TYPE_CHECKING:
@@ -72,7 +75,7 @@ def add_arguments(parser: Parser) -> None:
 
 def _draw(plan: Plan, path: Path) -> Path:
     try:
-        from canprobe.cell.results.figures import draw_plan
+        from canprobe.cell.results.plan_figure import draw_plan
     except ImportError as error:
         raise UsageError(f"--figure needs matplotlib: {install_line('study')}") from error
     if not path.suffix:
@@ -86,9 +89,10 @@ def _draw(plan: Plan, path: Path) -> Path:
 
 def run(args: argparse.Namespace) -> int:
     """Print the plan, or the files that were exported; a scene that does not fit raises PlanError with every reason."""
-    from canprobe.cell.planning.choices import opened
     from canprobe.cell.planning.make import make_plan
-    from canprobe.cell.planning.report import plan_dict, plan_text, refused_dict
+    from canprobe.cell.planning.open_keys import opened
+    from canprobe.cell.planning.report import plan_text
+    from canprobe.cell.planning.report_json import plan_dict, refused_dict
     from canprobe.cell.scene.resolve import resolve
 
     if args.measured is not None and (args.export or args.figure is not None):
@@ -153,7 +157,7 @@ def _scene_beside(log: Path) -> str | None:
 
 def _compare(plan: Plan, log: Path, as_json: bool) -> int:
     """Print what was measured on each bus; 3 where it is not what was planned."""
-    from canprobe.cell.results.summary import measure_traffic
+    from canprobe.cell.results.traffic import measure_traffic
 
     if (ran := _scene_beside(log)) not in (None, plan.scene.name):
         say(f"canprobe: {log} is a run of scene {ran}, set beside the plan of {plan.scene.name}")

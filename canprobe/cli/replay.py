@@ -8,8 +8,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from canprobe.cli.common_arguments import add_options, add_verbosity
 from canprobe.cli.output import print_json
-from canprobe.cli.parser import Parser, add_options, add_verbosity
+from canprobe.cli.parser import Parser
 from canprobe.errors import ResultsError
 
 HELP = "estimate the shape again from a recorded bus"

@@ -10,8 +10,10 @@ import argparse
 import shlex
 from pathlib import Path
 
+from canprobe.cli.common_arguments import BUS, add_options, add_scene, add_verbosity
 from canprobe.cli.output import print_json, print_summary
-from canprobe.cli.parser import BUS, Parser, add_options, add_scene, add_verbosity, scene_of
+from canprobe.cli.parser import Parser
+from canprobe.cli.target import scene_of
 from canprobe.errors import CanprobeError
 
 HELP = "run a scene and write the results"
@@ -40,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the scene; the summary goes to stdout, the progress to stderr. A run that was stopped raises."""
     scene = scene_of(args)
     if args.tool is not None:
-        from canprobe.cell.scene.geometry import with_tool
+        from canprobe.cell.results.tool_file import with_tool
 
         scene = with_tool(scene, args.tool)
 

@@ -13,20 +13,11 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
+from canprobe.cli.argument_types import channel, number_of_32_bits, seconds, whole
+from canprobe.cli.common_arguments import OPTIONS, add_options, add_scene, add_verbosity
 from canprobe.cli.output import print_json, print_table
-from canprobe.cli.parser import (
-    OPTIONS,
-    Parser,
-    add_options,
-    add_scene,
-    add_verbosity,
-    channel,
-    loaded,
-    number_of_32_bits,
-    real_target,
-    seconds,
-    whole,
-)
+from canprobe.cli.parser import Parser
+from canprobe.cli.target import loaded, real_target
 from canprobe.errors import UsageError
 
 if TYPE_CHECKING:

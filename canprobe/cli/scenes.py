@@ -10,8 +10,9 @@ import argparse
 from collections.abc import Mapping
 from typing import Any
 
+from canprobe.cli.common_arguments import add_options
 from canprobe.cli.output import print_json, print_table
-from canprobe.cli.parser import Parser, add_options
+from canprobe.cli.parser import Parser
 
 HELP = "list the packaged scenes"
 EXAMPLE = """\

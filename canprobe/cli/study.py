@@ -9,9 +9,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from canprobe.cli.argument_types import whole
+from canprobe.cli.common_arguments import add_options, add_verbosity
 from canprobe.cli.output import print_json, print_table
-from canprobe.cli.parser import Parser, add_options, add_verbosity, did_you_mean, whole
-from canprobe.fieldbus.bus.real.processor import interrupts_repeated
+from canprobe.cli.parser import Parser, did_you_mean
+from canprobe.fieldbus.bus.real.interrupts import interrupts_repeated
 
 HELP = "measure accuracy, limits, faults and timing"
 EXAMPLE = """\
@@ -64,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
         args.complain("--seed: the runs on vcan0 depend on the machine's timing and cannot be repeated from a seed")
     if args.seed is not None:
         return _replay(args)
-    from canprobe.lab.studies.harness import as_document, text_of, write_study
+    from canprobe.lab.studies.result_files import as_document, text_of, write_study
     from canprobe.lab.studies.sweep import open_sweep
 
     out = args.out or Path("runs") / f"study-{args.name}"

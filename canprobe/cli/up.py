@@ -8,8 +8,10 @@ from __future__ import annotations
 import argparse
 import sys
 
-from canprobe.cli.output import left_by_ctrl_c
-from canprobe.cli.parser import BUS, Parser, add_options, add_scene, add_verbosity, scene_of
+from canprobe.cli.common_arguments import BUS, add_options, add_scene, add_verbosity
+from canprobe.cli.interrupts import left_by_ctrl_c
+from canprobe.cli.parser import Parser
+from canprobe.cli.target import scene_of
 from canprobe.errors import UsageError
 
 HELP = "bring the cell up and hold it"

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import argparse
 
-from canprobe.cli.parser import Parser, seconds
+from canprobe.cli.argument_types import seconds
+from canprobe.cli.parser import Parser
 
 HELP = "run a command where a vcan0 exists"
 EXAMPLE = """\

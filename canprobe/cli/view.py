@@ -14,9 +14,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from canprobe.cli.output import left_by_ctrl_c
-from canprobe.cli.parser import BUS, Parser, add_options, add_verbosity, target_of, whole
-from canprobe.fieldbus.bus.real.processor import interrupts_held, interrupts_repeated
+from canprobe.cli.argument_types import whole
+from canprobe.cli.common_arguments import BUS, add_options, add_verbosity
+from canprobe.cli.interrupts import left_by_ctrl_c
+from canprobe.cli.parser import Parser
+from canprobe.cli.target import target_of
+from canprobe.fieldbus.bus.real.interrupts import interrupts_held, interrupts_repeated
 
 if TYPE_CHECKING:
     from canprobe.api import AnyObserver
@@ -59,8 +62,9 @@ def run(args: argparse.Namespace) -> int:
     with leave:
         if _is_scene(args.what):
             folder = _run_scene(args, browser)
-        from canprobe.lab.bridge.view.browser import serve_run, write_page
+        from canprobe.lab.bridge.view.page import write_page
         from canprobe.lab.bridge.view.recorded import read_run
+        from canprobe.lab.bridge.view.replay import serve_run
 
         recorded = read_run(folder)
         if args.html is not None:
@@ -155,8 +159,8 @@ class _Browser:
 
 def _paced() -> AnyObserver:
     """An observer that lets virtual time pass no faster than the clock on the wall."""
-    from canprobe.cell.master.cycle import Observation
-    from canprobe.fieldbus.bus.port import MonotonicClock
+    from canprobe.cell.master.observers import Observation
+    from canprobe.fieldbus.bus.clock import MonotonicClock
 
     clock = MonotonicClock()
     offset_ns: int | None = None

@@ -34,7 +34,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from canprobe.fieldbus.bus.candump import CandumpWriter, read_candump
     from canprobe.fieldbus.bus.canopen_network import PortNetwork
-    from canprobe.fieldbus.bus.port import MonotonicClock, VirtualClock
+    from canprobe.fieldbus.bus.clock import MonotonicClock, VirtualClock
     from canprobe.fieldbus.bus.real.python_can import open_port
     from canprobe.fieldbus.bus.real.socketcan import SocketCanPort
     from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus

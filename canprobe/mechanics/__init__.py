@@ -23,13 +23,14 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from canprobe.mechanics.robot.chain import Chain, forward, from_dh
+    from canprobe.mechanics.robot.chain import Chain, forward
+    from canprobe.mechanics.robot.denavit_hartenberg import from_dh
     from canprobe.mechanics.robot.model import ArmModel, Joint
     from canprobe.mechanics.touch.contact import ContactSample
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
     from canprobe.mechanics.touch.estimate.fit import fit_surface
     from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
-    from canprobe.mechanics.touch.estimate.noise import Prior
+    from canprobe.mechanics.touch.estimate.prior import Prior
     from canprobe.mechanics.touch.objects import make_object
     from canprobe.mechanics.touch.surface import SurfaceMatrix
     from canprobe.mechanics.touch.surface_map import SurfaceMap

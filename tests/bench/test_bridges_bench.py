@@ -7,7 +7,7 @@ import mcap
 import pytest
 from bridges_bench import size_of
 
-from canprobe.lab.studies.harness import text_of
+from canprobe.lab.studies.result_files import text_of
 
 
 def test_a_short_study_has_a_row_a_case(monkeypatch):

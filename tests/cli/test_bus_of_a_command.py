@@ -13,7 +13,7 @@ from network_buses import bare, group  # noqa: F401
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.session.target import Target
 from canprobe.cli import main
-from canprobe.cli.parser import target_of
+from canprobe.cli.target import target_of
 from canprobe.errors import UsageError
 
 

@@ -9,9 +9,9 @@ import sys
 import pytest
 
 from canprobe.cli import main
-from canprobe.cli.output import termination_interrupts
-from canprobe.fieldbus.bus.port import MonotonicClock
-from canprobe.fieldbus.bus.real.processor import Terminated, interrupts_held, interrupts_repeated
+from canprobe.cli.interrupts import termination_interrupts
+from canprobe.fieldbus.bus.clock import MonotonicClock
+from canprobe.fieldbus.bus.real.interrupts import Terminated, interrupts_held, interrupts_repeated
 
 
 @pytest.mark.usefixtures("hangup_heard")
@@ -65,7 +65,7 @@ def draw(number):
 def test_an_interrupt_ends_the_drawing_of_a_run_even_if_a_library_drops_it(
     number, status, monkeypatch, tmp_path, capfd
 ):
-    monkeypatch.setattr("canprobe.lab.bridge.view.browser.write_page", lambda *_: draw(number))
+    monkeypatch.setattr("canprobe.lab.bridge.view.page.write_page", lambda *_: draw(number))
     out = tmp_path / "run"
     assert main(["run", "free", "--duration", "0.05", "--out", str(out)]) == status
     assert (

@@ -16,10 +16,11 @@ from canprobe import api
 from canprobe.cell.master.monitor import Monitor
 from canprobe.cell.scene.load import load_scene, packaged_scenes
 from canprobe.cli import COMMANDS, main
-from canprobe.cli.output import print_json, termination_interrupts
-from canprobe.cli.parser import channel, node_ids
+from canprobe.cli.argument_types import channel, node_ids
+from canprobe.cli.interrupts import termination_interrupts
+from canprobe.cli.output import print_json
 from canprobe.errors import InterfaceError, NodeError, PlanError, SafetyStop, SceneError, UsageError
-from canprobe.fieldbus.bus.real.processor import Terminated
+from canprobe.fieldbus.bus.real.interrupts import Terminated
 from canprobe.fieldbus.eds.packaged import eds_path
 
 SUMMARY = {"scene": "free", "completed": True, "shape": {"method": None}}

@@ -10,7 +10,7 @@ import canprobe
 from canprobe.cell.emulated.world import make_world
 from canprobe.cell.scene.load import scenes_folder
 from canprobe.cli import main
-from canprobe.fieldbus.bus.port import VirtualClock
+from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus, Participant
 
 CHANNEL = ("--bus", "socketcan", "--channel", "can0")
@@ -215,7 +215,7 @@ def test_what_is_stored_is_there_when_the_nodes_are_started_again(serve, tmp_pat
     assert stored["node_id"] == 9
     plan = canprobe.plan(canprobe.load_scene("free"))
     again = make_world(plan, (2,), without_id=(2,)).nodes[0]
-    from canprobe.fieldbus.node.serve import keep_in_file
+    from canprobe.fieldbus.node.stored_file import keep_in_file
 
     keep_in_file(again, tmp_path / "serial00000002.json")
     assert again.start(0) == [(0x709, b"\0")]

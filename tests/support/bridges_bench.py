@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from canprobe.cell.master.cycle import Observation, Observers
+from canprobe.cell.master.observers import Observation, Observers
 from canprobe.cell.planning.bridges import BRIDGES
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.scene.load import load_scene
@@ -31,9 +31,10 @@ from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.children import Bridges
 from canprobe.cell.session.session import Session, with_bridges
 from canprobe.cell.tasks.from_plan import make_task
-from canprobe.fieldbus.bus.port import MonotonicClock
+from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.real.processor import garbage_collection_paused
-from canprobe.lab.studies.harness import Column, Row, StudyResult, as_document, measuring_facts, text_of
+from canprobe.lab.studies.harness import Column, Row, StudyResult
+from canprobe.lab.studies.result_files import as_document, measuring_facts, text_of
 
 # What packages take on disk, with everything that they need and canprobe itself does not.
 

@@ -31,7 +31,8 @@ from canprobe.cell.scene.load import toml_key
 from canprobe.cell.scene.resolve import resolve
 from canprobe.errors import CanprobeError, PlanError
 from canprobe.fieldbus.eds.packaged import eds_path
-from canprobe.mechanics.robot.chain import Chain, forward, forward_jacobian, tool_z_offset
+from canprobe.mechanics.robot.chain import Chain, forward, forward_jacobian
+from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
 from canprobe.mechanics.robot.model import Joint
 from canprobe.mechanics.robot.urdf import from_urdf
 

@@ -17,7 +17,8 @@ from typing import Any, NamedTuple
 import pytest
 from sdo_words import SdoWords
 
-from canprobe.fieldbus.bus.port import MonotonicClock, Port, VirtualClock
+from canprobe.fieldbus.bus.clock import MonotonicClock, VirtualClock
+from canprobe.fieldbus.bus.port import Port
 from canprobe.fieldbus.bus.real.socketcan import SocketCanPort
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 from canprobe.fieldbus.node.serve import serve

@@ -7,7 +7,8 @@ import math
 import numpy as np
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.linear_algebra import Array, homogeneous, inverse_transform, tangent_rotation
+from canprobe.mechanics.touch.linear_algebra import Array
+from canprobe.mechanics.touch.tangent_frames import homogeneous, inverse_transform, tangent_rotation
 
 
 def probe_contact_frame(direction: Array, radius: float) -> Array:

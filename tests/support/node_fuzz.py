@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import random
 
-from canprobe.fieldbus.node.sdo_server import MAX_BYTES, SDO_TRANSITIONS, SdoServer, SdoState, request_of
+from canprobe.fieldbus.node.sdo_server import MAX_BYTES, SdoServer
+from canprobe.fieldbus.node.sdo_states import SDO_TRANSITIONS, SdoState, request_of
 from canprobe.fieldbus.protocol.frames import NmtState
 
 INIT, PRE, OP, STOPPED = NmtState.INITIALISING, NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL, NmtState.STOPPED

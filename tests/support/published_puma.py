@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from canprobe.mechanics.robot.chain import from_dh
+from canprobe.mechanics.robot.denavit_hartenberg import from_dh
 from canprobe.mechanics.robot.model import ArmModel, Joint
 
 RIGHT = math.pi / 2

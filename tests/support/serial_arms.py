@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 
-from canprobe.mechanics.robot.chain import Chain, from_dh
+from canprobe.mechanics.robot.chain import Chain
+from canprobe.mechanics.robot.denavit_hartenberg import from_dh
 from canprobe.mechanics.robot.model import ArmModel, Joint
 
 RIGHT = math.pi / 2

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from canprobe.fieldbus.bus.port import VirtualClock
+from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.bus.virtual.timed import TimedBus
 from canprobe.fieldbus.protocol.frames import Frame

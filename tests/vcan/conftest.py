@@ -16,7 +16,8 @@ from slow_scene import write_slow_scene
 from waiting import wait_until
 
 from canprobe.fieldbus.bus.candump import read_candump
-from canprobe.fieldbus.bus.port import MonotonicClock, TimedFrame
+from canprobe.fieldbus.bus.clock import MonotonicClock
+from canprobe.fieldbus.bus.port import TimedFrame
 from canprobe.fieldbus.bus.real.socketcan import SocketCanPort
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, DriveState, state_of
 

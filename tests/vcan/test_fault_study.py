@@ -8,7 +8,7 @@ import pytest
 from rights import type_as_root
 
 from canprobe.cli import main
-from canprobe.fieldbus.protocol.frames import FOLLOWING_ERROR, REFERENCE_LIMIT
+from canprobe.fieldbus.protocol.emcy import FOLLOWING_ERROR, REFERENCE_LIMIT
 from canprobe.lab.studies.faults_vcan import ProcessFault
 
 pytestmark = pytest.mark.vcan

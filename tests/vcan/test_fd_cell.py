@@ -11,7 +11,7 @@ import pytest
 from rights import type_as_root
 
 from canprobe.errors import InterfaceError
-from canprobe.fieldbus.bus.port import MonotonicClock
+from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.real.socketcan import SocketCanPort
 
 pytestmark = pytest.mark.vcan

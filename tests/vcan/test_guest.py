@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from canprobe.fieldbus.bus.real.socketcan import has_socketcan
+from canprobe.fieldbus.vcan.child import supervise
 from canprobe.fieldbus.vcan.guest import PROGRAM, GuestError, GuestJob, missing_packages
-from canprobe.fieldbus.vcan.launch import supervise
 
 CANPROBE = (sys.executable, "-c", "import sys; from canprobe.cli import main; sys.exit(main())")
 ROOT = Path(__file__).parents[2]

@@ -13,7 +13,8 @@ from waiting import wait_until
 from canprobe.cell.session.terminal import Report
 from canprobe.cli import main
 from canprobe.errors import InterfaceError
-from canprobe.fieldbus.bus.port import MonotonicClock, Reports
+from canprobe.fieldbus.bus.clock import MonotonicClock
+from canprobe.fieldbus.bus.port import Reports
 from canprobe.fieldbus.bus.real.link import LinkState, read_link, setting_line
 from canprobe.fieldbus.bus.real.python_can import open_port
 from canprobe.fieldbus.bus.real.socketcan import SocketCanPort

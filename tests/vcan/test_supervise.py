@@ -15,8 +15,8 @@ import pytest
 
 from canprobe.cli import main
 from canprobe.fieldbus.vcan import launch as vcan
+from canprobe.fieldbus.vcan.child import LocalJob, caught_signals, supervise
 from canprobe.fieldbus.vcan.guest import GuestError, memory_folder
-from canprobe.fieldbus.vcan.launch import LocalJob, caught_signals, supervise
 
 
 class Scripted:
@@ -54,7 +54,7 @@ def test_time_out_terminates_then_kills(monkeypatch: pytest.MonkeyPatch) -> None
     job = Scripted(dies_of=signal.SIGTERM)
     assert supervise(job, [], 0.0) == (124, True)
     assert job.told == [signal.SIGTERM]
-    monkeypatch.setattr("canprobe.fieldbus.vcan.launch._GRACE_S", 0.0)
+    monkeypatch.setattr("canprobe.fieldbus.vcan.child._GRACE_S", 0.0)
     job = Scripted()
     assert supervise(job, [], 0.0) == (124, True)
     assert job.told == [signal.SIGTERM, "kill"]

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from rights import type_as_root
 
-from canprobe.fieldbus.bus.port import MonotonicClock
+from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.real.socketcan import SocketCanPort
 
 pytestmark = pytest.mark.vcan

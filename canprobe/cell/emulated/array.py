@@ -10,7 +10,6 @@ from __future__ import annotations
 import struct
 from collections import deque
 from collections.abc import Callable
-from functools import cache
 from itertools import count, takewhile
 from typing import Protocol
 
@@ -18,138 +17,32 @@ import numpy as np
 from canopen.objectdictionary import ObjectDictionary
 from numpy.typing import NDArray
 
+from canprobe.cell.emulated.image_processing import (
+    Image,
+    Raw,
+    compute_features,
+    correct,
+    correct_finely,
+    follow,
+    is_overloaded,
+    middle,
+)
 from canprobe.errors import UsageError
 from canprobe.fieldbus.eds.packaged import WINDOW_SIZE, WINDOW_SIZE_NAME
-from canprobe.fieldbus.node.dictionary import Abort, Dictionary, SdoAbort, Value, key_of
+from canprobe.fieldbus.node.abort import Abort, SdoAbort
+from canprobe.fieldbus.node.dictionary import Dictionary
+from canprobe.fieldbus.node.entry import Value, key_of
 from canprobe.fieldbus.node.slave_node import Application, OdOf, SlaveNode
 from canprobe.fieldbus.protocol.frames import NmtState
 from canprobe.fieldbus.protocol.tactile import (
-    SIDE,
     WINDOW,
     WINDOWS,
     Features,
-    Shape,
     TactileHeader,
     TactileMode,
     pack_whole,
 )
 from canprobe.mechanics.touch.pad import Pad
-
-# What the sensor makes of a raw image: tare, gain, threshold, the window that follows the contact, features.
-
-Image = NDArray[np.uint8]
-Raw = NDArray[np.uint8] | NDArray[np.float64]
-"""Counts of 255 at full scale: whole ones of an ADC of 8 bits, parts of counts of a finer one."""
-FULL_SCALE = 255
-GAIN_ONE = 1000
-_HYSTERESIS = 0.75  # taxels the ideal origin must be away before the window moves; 0.5 would flicker
-
-
-def is_overloaded(raw: Raw) -> bool:
-    """Whether a taxel has reached full scale."""
-    if raw.dtype == np.uint8:
-        return FULL_SCALE in raw.tobytes()
-    return bool(raw.max() == FULL_SCALE)
-
-
-def correct(raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int, threshold: int) -> Image:
-    """Raw counts → whole counts, tare subtracted, times the gain, saturated, zero below the threshold."""
-    as_sampled = tare is None and gain_permille == GAIN_ONE and raw.dtype == np.uint8
-    counts = raw if as_sampled else np.rint(_scaled(raw, tare, gain_permille))
-    return _kept(threshold).take(counts.astype(np.intp), mode="clip")
-
-
-@cache
-def _kept(threshold: int) -> Image:
-    """(256,) what remains of each count."""
-    counts = np.arange(FULL_SCALE + 1, dtype=np.uint8)
-    counts[: max(threshold, 0)] = 0
-    return counts
-
-
-def correct_finely(
-    raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int, threshold: int
-) -> NDArray[np.float64]:
-    """As ``correct``, with the parts of counts that a finer ADC sees and an image on the bus cannot carry."""
-    counts = np.minimum(_scaled(raw, tare, gain_permille), FULL_SCALE)
-    counts[counts < max(threshold, 0)] = 0.0
-    return counts
-
-
-def _scaled(raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int) -> NDArray[np.float64]:
-    counts = raw.astype(np.float64)
-    if tare is not None:
-        counts -= tare
-    if gain_permille != GAIN_ONE:
-        counts *= gain_permille / GAIN_ONE
-    return counts
-
-
-@cache
-def _sums(rows: int, columns: int) -> NDArray[np.float64]:
-    """(3, rows · columns): 1, row and column of each taxel."""
-    row, column = np.indices((rows, columns), dtype=np.float64)
-    return np.stack((np.ones(rows * columns), row.reshape(-1), column.reshape(-1)))
-
-
-def _moments(image: Raw) -> tuple[float, float, float]:
-    """Sum, centroid row, centroid column; the centre of the pad without a contact."""
-    total, rows, columns = _sums(*image.shape).dot(image.reshape(-1)).tolist()
-    if total == 0.0:
-        return 0.0, (image.shape[0] - 1) / 2, (image.shape[1] - 1) / 2
-    return total, rows / total, columns / total
-
-
-def middle(window: int = WINDOW, shape: Shape = (SIDE, SIDE)) -> tuple[int, int]:
-    """First taxel (row, column) of a window in the middle of the pad."""
-    return max(shape[0] - window, 0) // 2, max(shape[1] - window, 0) // 2
-
-
-def follow(image: Raw, origin: tuple[int, int], window: int = WINDOW) -> tuple[int, int]:
-    """First taxel (row, column) of the window of so many taxels a side round the contact.
-
-    The window stays while the contact's centroid is near its middle, and where it is without a contact.
-    """
-    total, row, column = _moments(image)
-    if total == 0.0:
-        return origin
-    rows, columns = image.shape
-    return _shift(origin[0], row, window, rows), _shift(origin[1], column, window, columns)
-
-
-def _shift(origin: int, centroid: float, window: int, taxels: int) -> int:
-    ideal = centroid - (window - 1) / 2
-    if abs(ideal - origin) <= _HYSTERESIS:
-        return origin
-    return max(min(round(ideal), taxels - window), 0)
-
-
-def compute_features(image: Raw, full_scale_pa: float, pitch_m: float) -> Features:
-    """Force, centroid and central second moments of the whole pad.
-
-    Args:
-        image: corrected counts, (rows, columns), whole or not.
-        full_scale_pa: pressure at 255 counts, Pa.
-        pitch_m: of the taxels.
-    """
-    total, row, column = _moments(image)
-    if total == 0.0:
-        return Features(0.0, row, column, 0.0, 0.0, 0.0, 0)
-    weights = image / total
-    rows, columns = image.shape
-    d_row, d_column = np.arange(rows) - row, np.arange(columns) - column
-    return Features(
-        force_n=total / FULL_SCALE * full_scale_pa * pitch_m**2,
-        row=row,
-        col=column,
-        var_rr=float(d_row**2 @ weights.sum(axis=1)),
-        var_rc=float(d_row @ weights @ d_column),
-        var_cc=float(d_column**2 @ weights.sum(axis=0)),
-        peak=round(float(image.max())),
-    )
-
-
-# The tactile node: 16×16 taxels as window, full image or features, one whole frame a trigger.
 
 TARE = int.from_bytes(b"tare", "little")
 MODE, THRESHOLD, GAIN, TARE_COMMAND, FULL_SCALE_PA, OVERLOAD, ORIGIN = range(0x2000, 0x2007)

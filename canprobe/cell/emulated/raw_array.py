@@ -11,7 +11,8 @@ from collections.abc import Container, Sequence
 
 import numpy as np
 
-from canprobe.cell.emulated.array import FULL_SCALE, TactilePlant
+from canprobe.cell.emulated.array import TactilePlant
+from canprobe.cell.emulated.image_processing import FULL_SCALE
 from canprobe.cell.scene.setup import Array
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.protocol.frames import SYNC_ID, Frame

@@ -22,10 +22,11 @@ from canprobe.cell.scene.setup import Setup
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.drive.drive import make_drive_node
 from canprobe.fieldbus.drive.from_eds import set_serial_number
-from canprobe.fieldbus.drive.parameters import Delivery
+from canprobe.fieldbus.drive.units import Delivery
 from canprobe.fieldbus.eds.packaged import FULL_SCALE, has_full_scale, load_eds
 from canprobe.fieldbus.node.slave_node import SlaveNode
-from canprobe.fieldbus.protocol.frames import SYNC_ID, UNCONFIGURED, Frame
+from canprobe.fieldbus.protocol.frames import SYNC_ID, Frame
+from canprobe.fieldbus.protocol.lss import UNCONFIGURED
 from canprobe.mechanics.robot.chain import Array, Chain, forward
 from canprobe.mechanics.touch.pad import Pad
 

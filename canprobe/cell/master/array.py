@@ -16,7 +16,8 @@ from canprobe.cell.scene.setup import Array, RawWire, Setup
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.protocol.period import PeriodFit
 from canprobe.fieldbus.protocol.raw_image import ImageAssembler, RawImage
-from canprobe.fieldbus.protocol.tactile import FrameAssembler, TactileHeader, TactileMode
+from canprobe.fieldbus.protocol.tactile import TactileHeader, TactileMode
+from canprobe.fieldbus.protocol.tactile_assembler import FrameAssembler
 from canprobe.mechanics.touch.pad import COUNTS_MAX
 from canprobe.mechanics.touch.patch.image import Patch, PatchCalibration, compute_patch, patch_from_features
 

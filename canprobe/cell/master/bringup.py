@@ -27,11 +27,10 @@ from canprobe.cell.planning.configuration import NodeSetup, Write
 from canprobe.cell.planning.operation import INTERPOLATION_TIME
 from canprobe.cell.scene.setup import BringUpTimes as Settings
 from canprobe.errors import BusError, NodeError
+from canprobe.fieldbus.bus.presence import SECOND_S, UPLOAD_DEVICE_TYPE
+from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.sdo import (
-    SECOND_S,
-    UPLOAD_DEVICE_TYPE,
     Dialogues,
-    PumpedNetwork,
     SdoTimeoutError,
     decode_text,
     download,
@@ -39,15 +38,8 @@ from canprobe.fieldbus.bus.sdo import (
     read_value,
     upload,
 )
-from canprobe.fieldbus.protocol.frames import (
-    SDO_RX_BASE,
-    SDO_TX_BASE,
-    NmtCommand,
-    NmtState,
-    describe,
-    is_no_error,
-    pack_nmt,
-)
+from canprobe.fieldbus.protocol.emcy import describe, is_no_error
+from canprobe.fieldbus.protocol.frames import SDO_RX_BASE, SDO_TX_BASE, NmtCommand, NmtState, pack_nmt
 
 ERROR_HISTORY = 0x1003
 SOFTWARE_VERSION, STORE_PARAMETERS, VERIFY_CONFIGURATION = 0x100A, 0x1010, 0x1020

@@ -15,19 +15,24 @@ import numpy as np
 from canprobe.cell.master.array import RawReceiver, make_tactile, patch_from
 from canprobe.cell.master.bringup import BringUp
 from canprobe.cell.master.controller import Command, Controller, Measurement, as_controller, check_command
-from canprobe.cell.master.cycle import Cycle, Observers
+from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.drives import make_drives
 from canprobe.cell.master.homing import Homing
-from canprobe.cell.master.log import Notes, RunLog, TactileLog, joint_columns
+from canprobe.cell.master.joint_columns import TactileLog, joint_columns
+from canprobe.cell.master.log import RunLog
+from canprobe.cell.master.notes import Notes
+from canprobe.cell.master.observers import Observers
 from canprobe.cell.master.supervision import Finding, Reaction, Seen, limits_of
 from canprobe.cell.master.supervisor import JointGuard, Supervisor
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.configuration import make_setups
 from canprobe.cell.planning.model import Plan
 from canprobe.errors import BusError, CanprobeError, NodeError, SafetyStop, UsageError
-from canprobe.fieldbus.bus.port import Port, PortCounters, TimedFrame, VirtualClock, send_on
-from canprobe.fieldbus.bus.real.processor import Interrupts
-from canprobe.fieldbus.bus.sdo import PumpedNetwork
+from canprobe.fieldbus.bus.clock import VirtualClock
+from canprobe.fieldbus.bus.joined import send_on
+from canprobe.fieldbus.bus.port import Port, PortCounters, TimedFrame
+from canprobe.fieldbus.bus.pumped import PumpedNetwork
+from canprobe.fieldbus.bus.real.interrupts import Interrupts
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, DriveState
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE
 

@@ -33,7 +33,8 @@ from canprobe.cell.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, 
 from canprobe.cell.scene.setup import Homing as Settings
 from canprobe.errors import CanprobeError, NodeError, UsageError
 from canprobe.fieldbus.bus.files import write_text
-from canprobe.fieldbus.bus.sdo import Dialogue, Dialogues, PumpedNetwork
+from canprobe.fieldbus.bus.pumped import PumpedNetwork
+from canprobe.fieldbus.bus.sdo import Dialogue, Dialogues
 from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.protocol.cia402 import (
     CHANGE_IMMEDIATELY,

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.fieldbus.protocol.tactile import Features, Shape, TactileHeader, TactileMessage, TactileMode
+from canprobe.fieldbus.protocol.tactile import Features, Shape, TactileHeader, TactileMode
+from canprobe.fieldbus.protocol.tactile_assembler import TactileMessage
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,17 +7,8 @@ from dataclasses import dataclass
 
 from canprobe.cell.planning.model import HEARTBEAT_CONSUMED_MS, MASTER_NODE_ID
 from canprobe.errors import ProtocolError
-from canprobe.fieldbus.protocol.frames import (
-    EMCY_BASE,
-    HEARTBEAT_BASE,
-    NMT_ID,
-    SYNC_ID,
-    Emcy,
-    NmtState,
-    describe,
-    is_no_error,
-    unpack_heartbeat,
-)
+from canprobe.fieldbus.protocol.emcy import Emcy, describe, is_no_error
+from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NMT_ID, SYNC_ID, NmtState, unpack_heartbeat
 
 UNTOLD = 64
 """Alarms that are kept until `NodeWatch.news` is called."""

@@ -18,7 +18,7 @@ from typing import Any
 
 from canopen import ObjectDictionary
 
-from canprobe.cell.planning.devices import COMMUNICATION, INVALID, MAPPING, OWN_BITS, Abilities
+from canprobe.cell.planning.abilities import COMMUNICATION, INVALID, MAPPING, OWN_BITS, Abilities
 from canprobe.cell.planning.model import (
     HEARTBEAT_CONSUMED_MS,
     HEARTBEAT_PRODUCED_MS,
@@ -29,7 +29,6 @@ from canprobe.cell.planning.model import (
     PlannedPdo,
 )
 from canprobe.cell.planning.operation import INTERPOLATION_TIME, SYNC_PERIOD, follows_sync_period, homing_problems
-from canprobe.cell.planning.traffic import CLASSIC_BYTES
 from canprobe.cell.planning.units import (
     FOLLOWING_WINDOW,
     POLARITY,
@@ -42,6 +41,7 @@ from canprobe.cell.planning.units import (
     speed_unit,
     turn_units,
 )
+from canprobe.cell.planning.wire_time import CLASSIC_BYTES
 from canprobe.fieldbus.eds.description import Description, Entry
 from canprobe.fieldbus.eds.packaged import (
     FULL_SCALE,
@@ -53,7 +53,7 @@ from canprobe.fieldbus.eds.packaged import (
     has_missed_syncs,
     has_window_size,
 )
-from canprobe.fieldbus.eds.variables import name_of
+from canprobe.fieldbus.eds.values import name_of
 from canprobe.fieldbus.protocol.cia402 import OperationMode
 from canprobe.fieldbus.protocol.si_unit import ACCELERATION, VELOCITY
 from canprobe.fieldbus.protocol.tactile import TactileMode

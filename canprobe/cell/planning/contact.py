@@ -22,7 +22,7 @@ from canprobe.cell.planning.window import measured_share
 from canprobe.cell.scene.setup import Array, Calibrate, Probe, Touch
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.inverse import FIXED_POLE, task_rows
-from canprobe.mechanics.robot.model import position_per_unit
+from canprobe.mechanics.robot.motors import position_per_unit
 from canprobe.mechanics.touch.stops import MOST_SPREAD, OFF_PAD, OFF_PAD_SIGMAS
 
 Floats = NDArray[np.float64]

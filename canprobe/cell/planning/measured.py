@@ -21,14 +21,8 @@ from canprobe.cell.planning.model import (
     PlannedFrames,
     PlannedPdo,
 )
-from canprobe.cell.planning.traffic import (
-    SYNC_BITS,
-    SYNC_BITS_LEAST,
-    SYNCHRONOUS,
-    exact_frame_bits,
-    on_the_wire,
-    unstuffed_frame_bits,
-)
+from canprobe.cell.planning.traffic import SYNC_BITS, SYNC_BITS_LEAST, SYNCHRONOUS, on_the_wire
+from canprobe.cell.planning.wire_time import exact_frame_bits, unstuffed_frame_bits
 from canprobe.fieldbus.protocol.frame_bits import FD_LENGTHS, worst_case_bits
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NMT_ID, SDO_RX_BASE, SDO_TX_BASE, SYNC_ID
 
@@ -194,8 +188,6 @@ class MeasuredTraffic:
             yield f"  lost by candump: {self.lost_by_candump} frames"
         yield from (f"  {note}" for note in self.notes)
 
-
-# Counts what is on a bus, thousands of frames at a time, which is quicker than cycle by cycle.
 
 Ints = NDArray[np.int64]
 _NEVER = np.iinfo(np.int64).max

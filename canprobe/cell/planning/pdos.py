@@ -11,10 +11,11 @@ import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from canprobe.cell.planning.devices import COMMUNICATION, INVALID, Abilities
+from canprobe.cell.planning.abilities import COMMUNICATION, INVALID, Abilities
 from canprobe.cell.planning.model import EVERY_SYNC, Direction, NodeKind, PlannedPdo, SyncPlan
 from canprobe.cell.planning.operation import TARGETS, Place, choose_mode
-from canprobe.cell.planning.traffic import SYNCHRONOUS, frame_bits
+from canprobe.cell.planning.traffic import SYNCHRONOUS
+from canprobe.cell.planning.wire_time import frame_bits
 from canprobe.cell.scene.setup import Array, Setup
 from canprobe.fieldbus.eds.packaged import has_long_pdos, has_window_size
 from canprobe.fieldbus.protocol.frames import is_restricted

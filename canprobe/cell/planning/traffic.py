@@ -1,5 +1,13 @@
-"""SYNC, and does everything fit the bus: average load, peak demand behind one SYNC, worst-case response time of every
-message.
+"""The cycle as one transaction behind SYNC: TPDOs, controller, RPDOs, and how much of the period they leave.
+
+A node queues its TPDOs when it has received the SYNC. The cell looks for them at fixed shares of the period and once
+at the time by which the last one must be in; in real time, after the first look, at each that comes. So the
+controller starts when the last one comes, but not before the first look, or at the next look; it takes at most the
+scene's `cycle.compute_us`, and its RPDOs follow. Their latest queueing hangs on the TPDOs' response times and those
+on the SYNC's: the analysis is repeated until nothing moves (Palencia and González Harbour 1998, dynamic offsets).
+
+Where nodes send their oldest frame first, what has to wait behind its own node's heartbeat hangs on no phase: the
+bound for FIFO queues, which knows no offsets, takes the place of the one for priority queues.
 """
 
 from __future__ import annotations
@@ -19,97 +27,14 @@ from canprobe.cell.planning.model import (
     SyncPlan,
     Traffic,
 )
-from canprobe.cell.scene.setup import Bus, Setup
+from canprobe.cell.scene.setup import Bus
+from canprobe.fieldbus.protocol.fifo_response_times import worst_case_response_fifo
 from canprobe.fieldbus.protocol.frame_bits import (
-    FrameLength,
     best_case_bits,
-    best_case_fd_bits,
-    exact_bits,
-    exact_fd_bits,
     worst_case_bits,
-    worst_case_fd_bits,
 )
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, SYNC_ID
-from canprobe.fieldbus.protocol.response_times import (
-    BusAnalysis,
-    Message,
-    Response,
-    worst_case_response,
-    worst_case_response_fifo,
-)
-
-# Can the cycle be said in CANopen's objects: SYNC period, tactile trigger.
-
-_TOLERANCE = 1e-5  # of a rate written with six digits
-
-
-def plan_sync(setup: Setup) -> tuple[SyncPlan, bool]:
-    """The SYNC of a scene, in whole µs, and whether that is the rate of the scene.
-
-    Source: CiA 301 object 1006h (period in µs).
-    """
-    period_us = max(1, round(1e6 / setup.rate_hz))
-    exact = abs(period_us * setup.rate_hz / 1e6 - 1) < _TOLERANCE
-    return SyncPlan(1e6 / period_us, period_us * 1000, period_us, SYNC_OVERFLOW), exact
-
-
-def plan_ratio(setup: Setup) -> tuple[int, list[str]]:
-    """How many SYNCs make one tactile frame (18xxh:02), and why the rate is not possible."""
-    array = setup.array
-    if array is None or (array.raw is not None and array.raw.sampling == "free"):
-        return 1, []
-    exact = setup.rate_hz / array.rate_hz
-    ratio = max(1, round(exact))
-    if abs(exact / ratio - 1) < _TOLERANCE and (SYNC_OVERFLOW % ratio == 0 or array.raw is not None):
-        return ratio, []
-    if array.raw is not None:
-        rates = f"{setup.rate_hz / ratio:.6g} or {setup.rate_hz / (ratio + 1):.6g}"
-        what = f"an image every {exact:.4g} cycles cannot be asked for; take {rates} Hz"
-        return ratio, [f"sensor.rate_hz = {array.rate_hz:g}: {what}"]
-    fitting = [count for count in range(1, SYNC_OVERFLOW + 1) if SYNC_OVERFLOW % count == 0]
-    near = sorted(fitting, key=lambda count: abs(count - exact))[:2]
-    rates = " or ".join(f"{setup.rate_hz / count:.6g}" for count in sorted(near))
-    return min(ratio, SYNC_OVERFLOW), [
-        f"sensor.rate_hz = {array.rate_hz:g}: a frame every {exact:.4g} SYNCs cannot be triggered; the SYNC "
-        f"counter runs to {SYNC_OVERFLOW}, so cycle.rate_hz must be 1, 2, 3, 4, 5, 6, 8, … times it; take {rates} Hz"
-    ]
-
-
-# How much of a bus a PDO takes: a classical frame, or above 8 bytes one of CAN FD with bit-rate switch. In bit times of
-# the nominal rate; the data phase of an FD frame is rounded up.
-
-CLASSIC_BYTES = 8
-
-
-def frame_bits(n_data: int, bus: Bus) -> int:
-    """Worst case of one frame with so many data bytes."""
-    return worst_case_bits(n_data) if n_data <= CLASSIC_BYTES else _nominal(worst_case_fd_bits(n_data), bus)
-
-
-def exact_frame_bits(can_id: int, data: bytes, bus: Bus) -> int:
-    """Bits of this very frame."""
-    return exact_bits(can_id, data) if len(data) <= CLASSIC_BYTES else _nominal(exact_fd_bits(can_id, data), bus)
-
-
-def unstuffed_frame_bits(n_data: int, bus: Bus) -> int:
-    """Bits of a frame without stuff bits, as `canbusload -i` counts."""
-    return best_case_bits(n_data) if n_data <= CLASSIC_BYTES else _nominal(best_case_fd_bits(n_data), bus)
-
-
-def _nominal(length: FrameLength, bus: Bus) -> int:
-    return length.nominal - (-length.data * bus.bitrate // bus.data_bitrate)
-
-
-# The cycle as one transaction behind SYNC: TPDOs, controller, RPDOs, and how much of the period they leave.
-#
-# A node queues its TPDOs when it has received the SYNC. The cell looks for them at fixed shares of the period and once
-# at the time by which the last one must be in; in real time, after the first look, at each that comes. So the
-# controller starts when the last one comes, but not before the first look, or at the next look; it takes at most the
-# scene's `cycle.compute_us`, and its RPDOs follow. Their latest queueing hangs on the TPDOs' response times and those
-# on the SYNC's: the analysis is repeated until nothing moves (Palencia and González Harbour 1998, dynamic offsets).
-#
-# Where nodes send their oldest frame first, what has to wait behind its own node's heartbeat hangs on no phase: the
-# bound for FIFO queues, which knows no offsets, takes the place of the one for priority queues.
+from canprobe.fieldbus.protocol.response_times import BusAnalysis, Message, Response, worst_case_response
 
 FIRST_LOOK, LAST_LOOK = 0.25, 0.6
 """Shares of the period at which the cell looks for TPDOs besides the planned time; after the last they are late."""

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from canprobe.cell.planning.devices import Abilities
+from canprobe.cell.planning.abilities import Abilities
 from canprobe.cell.scene.setup import Arm, Calibrate, Drive, Setup, Touch
 from canprobe.fieldbus.protocol.si_unit import VELOCITY, rate_unit
 from canprobe.mechanics.robot.chain import Array

@@ -8,7 +8,8 @@ import numpy as np
 
 from canprobe.cell.plant.taxels import TaxelConfig
 from canprobe.cell.scene.setup import Dynamics, Fidelity
-from canprobe.mechanics.robot.chain import Array, tool_z_offset
+from canprobe.mechanics.robot.chain import Array
+from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
 from canprobe.mechanics.robot.model import ArmModel, Body
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.shapes import PlacedShape

@@ -17,12 +17,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from canprobe.cell.plant.arms import make_arm
 from canprobe.cell.plant.config import PlantConfig
-from canprobe.cell.plant.dynamic_arm import DynamicArm, make_arm
+from canprobe.cell.plant.dynamic_arm import DynamicArm
+from canprobe.cell.plant.elastic_contact import NO_CONTACT, Contact, elastic_contact
 from canprobe.cell.plant.ideal_arm import IdealArm
-from canprobe.cell.plant.probe import NO_CONTACT, Contact, PressedProbe, Probe, elastic_contact, in_pad
-from canprobe.cell.plant.pushing import LEAST_CURVATURE, total_force
-from canprobe.cell.plant.taxels import Image, TaxelArray, Vec, pad_coordinates
+from canprobe.cell.plant.pressure import Vec, pad_coordinates
+from canprobe.cell.plant.probe import PressedProbe, Probe, in_pad
+from canprobe.cell.plant.several_contacts import LEAST_CURVATURE, total_force
+from canprobe.cell.plant.taxels import Image, TaxelArray
 from canprobe.errors import PlanError
 from canprobe.fieldbus.drive.motor import MotorDynamics
 from canprobe.mechanics.robot.chain import Array, Chain, ending_in, jacobian, point_velocity, posture

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from canprobe.cell.master.controller import Command
-from canprobe.cell.master.cycle import Observation
+from canprobe.cell.master.observers import Observation
 from canprobe.cell.planning.bridges import BRIDGES, check_bridges
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import Plan
@@ -23,9 +23,10 @@ from canprobe.cell.scene.model import BridgeSettings, Scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.children import Bridges
 from canprobe.cell.session.session import Say
+from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.clock_steps import RecordedBus
-from canprobe.fieldbus.bus.port import MonotonicClock, TimedFrame
-from canprobe.fieldbus.protocol.frames import is_sync
+from canprobe.fieldbus.bus.port import TimedFrame
+from canprobe.fieldbus.protocol.sync import is_sync
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 
 LOGGED = ("phase", "depth_at_1n_mm")

@@ -14,7 +14,8 @@ from canprobe.cell.planning.model import Plan
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.clock_steps import RecordedBus
 from canprobe.fieldbus.bus.port import TimedFrame, is_bus_error
-from canprobe.fieldbus.protocol.frames import SYNC_ID, is_sync, long_syncs_text
+from canprobe.fieldbus.protocol.frames import SYNC_ID
+from canprobe.fieldbus.protocol.sync import is_sync, long_syncs_text
 
 RATE_TOLERANCE = 0.2
 """Share by which the recorded SYNC period may differ from the scene's."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.master.controller import Measurement, TactileSample
-from canprobe.cell.master.log import joint_positions
+from canprobe.cell.master.joint_columns import joint_positions
 from canprobe.cell.master.tactile_frame import TactileFrame
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.run_files import LOG, TACTILE, needed, read_log, read_summary, read_tactile

@@ -14,7 +14,7 @@ from canprobe.cell.results.scores import ShapeScore, score_shape
 from canprobe.cell.scene.setup import Touch
 from canprobe.cell.tasks.from_plan import SIGMA_NORMAL_RAD, centroid_coupling, make_shape_estimator
 from canprobe.cell.tasks.shape import replay_samples
-from canprobe.fieldbus.bus.port import MonotonicClock
+from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 from canprobe.mechanics.touch.estimate.online import Dropped, Estimator, Gate

@@ -1,4 +1,4 @@
-"""What a run leaves behind: the summary, the log, the scene as resolved, its traffic beside the plan."""
+"""What a run leaves behind: its result, the summary, the log, the scene as resolved."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ import importlib
 import importlib.util
 import json
 import tempfile
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -19,27 +18,20 @@ from numpy.typing import NDArray
 from canprobe import __version__
 from canprobe.cell.master.cell import Cell
 from canprobe.cell.npz import write_npz
-from canprobe.cell.planning.make import make_plan
-from canprobe.cell.planning.measured import MeasuredTraffic, TrafficMeter
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.results.files import save_surface_map
 from canprobe.cell.results.run_files import SCHEMA
 from canprobe.cell.results.scores import ShapeScore, bound_of_scan, score_contact, score_shape
-from canprobe.cell.scene.geometry import FILE, calibration_lines, summarise_calibration, tool_text
-from canprobe.cell.scene.load import load_scene
-from canprobe.cell.scene.model import Scene
-from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.results.surface_file import save_surface_map
+from canprobe.cell.results.tool_file import FILE, calibration_lines, summarise_calibration, tool_text
+from canprobe.cell.results.traffic import LOG, measure_traffic
 from canprobe.cell.scene.setup import Setup, Touch
 from canprobe.cell.session.session import Session, write_scene
 from canprobe.cell.session.target import VIRTUAL
+from canprobe.cell.tasks.regain import losses_text, summarise_losses
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.cell.tasks.task import TaskRecord
-from canprobe.cell.tasks.touch import losses_text, summarise_losses
 from canprobe.errors import ResultsError, UsageError, install_line
-from canprobe.fieldbus.bus.clock_steps import RecordedBus
 from canprobe.fieldbus.bus.files import write_text
-from canprobe.fieldbus.bus.port import ERR_FLAG, is_bus_error
-from canprobe.fieldbus.protocol.frames import SYNC_ID, is_sync, long_syncs_text
 from canprobe.mechanics.touch.consistency import Consistency
 from canprobe.mechanics.touch.surface_map import SurfaceMap
 
@@ -50,75 +42,6 @@ if TYPE_CHECKING:
     from canprobe.cell.results.contacts import Contacts, OwnEstimator, Scores
     from canprobe.cell.results.page import Page
 
-
-# A recorded bus beside the plan of its scene.
-
-LOG = "bus.log"
-
-
-def measure_traffic(
-    log: Path | str, scene: Scene | Plan | str | Path, *, channel: str | None = None, exact: bool = True
-) -> MeasuredTraffic:
-    """Count the frames of a bus and compare them with the plan, message by message.
-
-    Args:
-        log: a candump log, or the folder of a run.
-        scene: that ran, as for `canprobe.run`, or its plan.
-        channel: of the log; by default that of the scene's first bus, or the only one in the log.
-        exact: count stuff bits too, which takes a few µs per frame.
-
-    Returns:
-        Frames and bits (stuff bits included) of every class of messages, their times behind SYNC, and the identifiers
-        that the plan does not list.
-
-    Raises:
-        UsageError: the log cannot be read, has no SYNC on this channel, or several channels and none was named.
-        PlanError: the scene does not fit its bus.
-    """
-    path = Path(log) / LOG if Path(log).is_dir() else Path(log)
-    plan = scene if isinstance(scene, Plan) else make_plan(resolve(load_scene(scene)))
-    meters: dict[str, TrafficMeter] = {}
-    syncs: Counter[str] = Counter()
-    long_syncs: Counter[int] = Counter()
-    bus = RecordedBus(path)
-    for t_ns, name, can_id, data in bus:
-        meter = meters.get(name)
-        if meter is None:
-            meter = meters[name] = TrafficMeter(plan, name, exact)
-        if can_id & ERR_FLAG:
-            meter.error_frames += is_bus_error(can_id)
-        else:
-            meter.write(can_id, data, t_ns)
-            syncs[name] += is_sync(can_id, data)
-            long_syncs[len(data)] += can_id == SYNC_ID and not is_sync(can_id, data)
-    longer = long_syncs_text(+long_syncs)
-    name = _chosen(path, syncs, longer, plan, channel)
-    measured = meters[name].report()
-    return replace(
-        measured,
-        unlisted=measured.unlisted | ({SYNC_ID: long_syncs.total()} if longer else {}),
-        notes=(*([longer] if longer else []), *bus.notes()),
-        xl_frames=bus.xl.get(name, 0),
-        lost_by_candump=bus.lost.get(name, 0),
-    )
-
-
-def _chosen(path: Path, syncs: Counter[str], longer: str, plan: Plan, channel: str | None) -> str:
-    with_sync = [name for name in syncs if syncs[name]]
-    wanted = plan.buses[0].channel if channel is None else channel
-    if wanted in with_sync:
-        return wanted
-    if channel is None and len(with_sync) == 1:
-        return with_sync[0]
-    if not with_sync:
-        but = f" of 0 or 1 byte, but {longer}" if longer else " on any channel"
-        raise UsageError(f"{path}: no SYNC (080h){but}; expected the log of a cell that ran")
-    raise UsageError(
-        f"{path}: no SYNC (080h) on channel {wanted}; name one that has it: {', '.join(sorted(with_sync))}"
-    )
-
-
-# The result of a run, its summary and its files.
 
 Array = NDArray[np.float64]
 
@@ -264,7 +187,7 @@ class RunResult:
 
     def _columns(self, what: str) -> dict[str, Array]:
         if what == "estimates":
-            from canprobe.cell.results.scores import estimate_columns
+            from canprobe.cell.results.map_score import estimate_columns
 
             return estimate_columns(next(iter(self.estimates.values()), []))
         if what not in ("log", "truth"):

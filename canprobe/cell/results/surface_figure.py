@@ -4,110 +4,20 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import SubFigure
-from mpl_toolkits.mplot3d.art3d import Poly3DCollection
-from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
+from canprobe.cell.results.map_score import SAME_DIRECTION_RAD
 from canprobe.cell.results.picture import BLUE, FAINT, GREEN, GREY, INK, ORANGE, Part, box, legend, parts, picture
-from canprobe.cell.results.scores import SAME_DIRECTION_RAD
 from canprobe.cell.results.summary import RunResult
-from canprobe.mechanics.touch.blend import REACH_M
-from canprobe.mechanics.touch.consistency import LEVEL, Consistency, check_consistency
-from canprobe.mechanics.touch.linear_algebra import tangent_rotation
+from canprobe.cell.results.surface_panels import Array, MapView, Plane, add_sheet, map_surface, rejected, true_surface
+from canprobe.mechanics.touch.consistency import Consistency, check_consistency
 from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.touch.surface_map import SurfaceMap
-
-# What the panels of a surface figure share: the map, its tests, the true object, the plane of the scan.
-
-Array = NDArray[np.float64]
-MARGIN_M, GRID = 5e-3, 34
-"""How far a true surface is drawn beyond a path, and its points a side."""
-LONG = 64
-"""Points of a map's surface along its longer side."""
-
-
-class MapView(NamedTuple):
-    """A map, its tests, and the plane in which both are seen; `shape` is the true object or None."""
-
-    map: SurfaceMap
-    consistency: Consistency
-    shape: PlacedShape | None
-    plane: Plane
-
-
-class Plane(NamedTuple):
-    """The plane of a scan: `axes` (3, 3), rows along, across, outward, and `origin` (3,), the middle of the path, m."""
-
-    axes: Array
-    origin: Array
-
-    @classmethod
-    def of(cls, path: Array, normals: Array) -> Plane:
-        """Of points of a path (n, 3), m, and outward normals (m, 3) along it."""
-        middle = 0.5 * (path.min(axis=0) + path.max(axis=0))
-        outward = normals.mean(axis=0)
-        R = tangent_rotation(outward / np.linalg.norm(outward))
-        flat = (path - middle) @ R[:, :2]
-        _, _, main = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)
-        along = R[:, :2] @ main[0]
-        return cls(np.array([along, np.cross(R[:, 2], along), R[:, 2]]), middle)
-
-    def mm(self, points: Array) -> Array:
-        """Points (..., 3) of base, m, as mm along, across, outward."""
-        result: Array = (points - self.origin) @ self.axes.T * 1e3
-        return result
-
-    def base(self, mm: Array) -> Array:
-        """The way back."""
-        result: Array = 1e-3 * mm @ self.axes + self.origin
-        return result
-
-
-def rejected(consistency: Consistency) -> NDArray[np.bool_]:
-    """(n,) whether the joint test of each crossing rejects one surface."""
-    return np.array([c.joint.p < LEVEL for c in consistency.crossings], dtype=bool)
-
-
-def true_surface(shape: PlacedShape, path: Array, plane: Plane) -> Array:
-    """An object's surface below a path (n, 3): (GRID, GRID, 3) points of base, m."""
-    flat = plane.mm(path)
-    low, high = flat.min(axis=0) - 1e3 * MARGIN_M, flat.max(axis=0) + 1e3 * MARGIN_M
-    us, vs = np.meshgrid(np.linspace(low[0], high[0], GRID), np.linspace(low[1], high[1], GRID))
-    above = plane.base(np.stack((us, vs, np.full_like(us, high[2])), axis=-1))
-    return np.array([shape.closest(point).point for point in above.reshape(-1, 3)]).reshape(GRID, GRID, 3)
-
-
-def map_surface(surface_map: SurfaceMap, plane: Plane) -> tuple[Array, Array]:
-    """The one surface of a map: points (rows, columns, 3) of base, m, and its σ there, m; NaN beyond its patches.
-
-    A grid over the plane of the scan, in a tenth of the time of the triangles that `SurfaceMap.mesh` finds.
-    """
-    contacts = plane.mm(surface_map.points)
-    low, high = contacts.min(axis=0)[:2] - 1e3 * REACH_M, contacts.max(axis=0)[:2] + 1e3 * REACH_M
-    counts = np.ceil(LONG * (high - low) / (high - low).max()).astype(int)
-    us, vs = np.meshgrid(*(np.linspace(*ends) for ends in zip(low, high, counts, strict=True)))
-    nearest = cKDTree(contacts[:, :2]).query(np.stack((us, vs), axis=-1))[1]
-    feet = surface_map.closest(plane.base(np.stack((us, vs, contacts[nearest, 2]), axis=-1)).reshape(-1, 3))
-    return feet.point.reshape(*us.shape, 3), feet.sigma.reshape(us.shape)
-
-
-def add_sheet(axes: Any, corners: Array, colours: Array | str, **style: Any) -> None:
-    """Draw the cells of a grid (rows, columns, 3) that are known at all corners; a colour, or (rows, columns, 4)."""
-    cells = np.stack([corners[:-1, :-1], corners[:-1, 1:], corners[1:, 1:], corners[1:, :-1]], axis=2).reshape(-1, 4, 3)
-    known = np.isfinite(cells).all(axis=(1, 2))
-    faces = colours if isinstance(colours, str) else colours[:-1, :-1].reshape(-1, 4)[known]
-    axes.add_collection3d(
-        Poly3DCollection(cells[known], facecolors=faces, linewidths=0, antialiased=False, **style), autolim=False
-    )
-    axes.auto_scale_xyz(*cells[known].reshape(-1, 3).T)
-
 
 # The surface of the map over the true object.
 

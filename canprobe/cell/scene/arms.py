@@ -16,7 +16,8 @@ from canprobe.cell.scene.geometry import transform
 from canprobe.cell.scene.hardware import ArmSettings, JointSettings
 from canprobe.cell.scene.setup import Homing
 from canprobe.errors import PlanError
-from canprobe.mechanics.robot.chain import Array, Chain, dh_step, from_dh
+from canprobe.mechanics.robot.chain import Array, Chain
+from canprobe.mechanics.robot.denavit_hartenberg import dh_step, from_dh
 from canprobe.mechanics.robot.model import ArmModel, Body, Joint, lopsided_inertia, negative_inertia
 from canprobe.mechanics.robot.urdf import UrdfArm, from_urdf, limit_warning
 

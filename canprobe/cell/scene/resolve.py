@@ -54,7 +54,8 @@ from canprobe.mechanics.robot.tool_calibration import ball_approaches
 from canprobe.mechanics.touch.heights import Heights
 from canprobe.mechanics.touch.pad import FLAT_RADIUS_M, Pad
 from canprobe.mechanics.touch.patch.array_calibration import ArrayCalibration
-from canprobe.mechanics.touch.servo import SurfaceGains, make_strategy
+from canprobe.mechanics.touch.servo import SurfaceGains
+from canprobe.mechanics.touch.strategies import make_strategy
 
 MM = 1e-3
 LAYER_N_M3 = 1.27e8

@@ -36,8 +36,9 @@ from canprobe.mechanics.robot.model import ArmModel, Body
 from canprobe.mechanics.robot.tool_calibration import BallApproach
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.patch.array_calibration import NOMINAL, ArrayCalibration
-from canprobe.mechanics.touch.servo import Strategy, SurfaceGains
+from canprobe.mechanics.touch.servo import SurfaceGains
 from canprobe.mechanics.touch.shapes import PlacedShape
+from canprobe.mechanics.touch.strategies import Strategy
 
 Floats = NDArray[np.float64]
 Bus = BusSettings

@@ -29,12 +29,13 @@ from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.operation import INTERPOLATION_TIME
 from canprobe.errors import NodeError
 from canprobe.fieldbus.bus.port import Port
-from canprobe.fieldbus.bus.sdo import SECOND_S
+from canprobe.fieldbus.bus.presence import SECOND_S
 from canprobe.fieldbus.drive.drive import DriveApplication
+from canprobe.fieldbus.node.abort import SdoAbort, nothing
 from canprobe.fieldbus.node.core import NodeCore
-from canprobe.fieldbus.node.dictionary import Dictionary, SdoAbort, nothing
+from canprobe.fieldbus.node.dictionary import Dictionary
+from canprobe.fieldbus.node.rpdo import Rpdo
 from canprobe.fieldbus.node.slave_node import SlaveNode
-from canprobe.fieldbus.node.tpdo import Rpdo
 from canprobe.fieldbus.protocol.frames import SYNC_ID, Frame, NmtCommand, pack_nmt
 from canprobe.fieldbus.protocol.tactile import Features, TactileHeader, TactileMode
 

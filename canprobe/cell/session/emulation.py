@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING
 
 from canprobe.cell.npz import write_npz
 from canprobe.cell.scene.model import Scene
-from canprobe.cell.session.links import Expected, check_links, data_bitrate
+from canprobe.cell.session.link_faults import Expected, data_bitrate
+from canprobe.cell.session.links import check_links
 from canprobe.cell.session.session import Say, quiet, rehearse
 from canprobe.cell.session.target import Target
 from canprobe.errors import NodeError, ResultsError, UsageError
+from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.files import make_folder
-from canprobe.fieldbus.bus.port import MonotonicClock
-from canprobe.fieldbus.protocol.frames import UNCONFIGURED
+from canprobe.fieldbus.protocol.lss import UNCONFIGURED
 
 if TYPE_CHECKING:
     from canprobe.fieldbus.bus.port import Port
@@ -173,10 +174,11 @@ def _free_port(
     target: Target, wanted: Expected, node_ids: tuple[int, ...], *, way_out: str, say: Say
 ) -> Iterator[Port]:
     """A port on a bus where nobody has these node ids; it waits for the bus as a device does."""
-    from canprobe.cell.planning.choices import bus_open_to_others
+    from canprobe.cell.planning.warnings import bus_open_to_others
     from canprobe.fieldbus.bus.port import Reports
+    from canprobe.fieldbus.bus.presence import answering_nodes
+    from canprobe.fieldbus.bus.pumped import PumpedNetwork
     from canprobe.fieldbus.bus.real.python_can import open_port
-    from canprobe.fieldbus.bus.sdo import PumpedNetwork, answering_nodes
 
     check_links(target.interface, {target.channel: wanted}, say)
     for warning in bus_open_to_others(target.interface, target.channel):
@@ -238,7 +240,7 @@ def _named(nodes: Sequence[SlaveNode]) -> str:
 
 def _keep(nodes: Iterable[SlaveNode], folder: Path | None) -> None:
     """Let each node keep what a master stores by 1010h in its file."""
-    from canprobe.fieldbus.node.serve import keep_in_file
+    from canprobe.fieldbus.node.stored_file import keep_in_file
 
     if folder is not None:
         for node in nodes:

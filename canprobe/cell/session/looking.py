@@ -7,17 +7,22 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
-from canprobe.cell.master.commission import Commissioned, Wanted, scan_nodes, wanted_by
+from canprobe.cell.master.commission import Commissioned, wanted_by
 from canprobe.cell.master.commission import commission as commission_nodes
+from canprobe.cell.master.id_assignment import Wanted
 from canprobe.cell.master.monitor import CellView, Monitor
+from canprobe.cell.master.scan import scan_nodes
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.scene.model import BringUpSettings, Scene
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.session.links import Expected, check_links, expected_of, need_controllers
-from canprobe.cell.session.session import Say, open_ports, quiet
+from canprobe.cell.session.buses import open_ports
+from canprobe.cell.session.link_faults import Expected, expected_of
+from canprobe.cell.session.links import check_links, need_controllers
+from canprobe.cell.session.session import Say, quiet
 from canprobe.cell.session.target import Target, need_real_bus
 from canprobe.errors import BusError
-from canprobe.fieldbus.bus.port import MonotonicClock, Port
+from canprobe.fieldbus.bus.clock import MonotonicClock
+from canprobe.fieldbus.bus.port import Port
 
 MONITOR_PERIOD_NS = 100_000_000
 SILENCE_NS = 1_000_000_000

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -20,133 +20,31 @@ from numpy.typing import NDArray
 
 from canprobe.cell.master.cell import Cell
 from canprobe.cell.master.controller import Command, Controller, Measurement
-from canprobe.cell.master.cycle import Cycle, Observation, Observer, Observers
+from canprobe.cell.master.cycle import Cycle
+from canprobe.cell.master.observers import Observation, Observer, Observers
 from canprobe.cell.npz import write_npz
 from canprobe.cell.planning.bridges import check_bridges
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.measured import TrafficMeter
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.planning.traffic import exact_frame_bits
 from canprobe.cell.scene.model import BridgeSettings, Scene
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.session.links import check_links, data_bitrate, expected_of, need_controllers
+from canprobe.cell.session.buses import TrafficCounter, channel_routes, lockstep_bus, open_ports
+from canprobe.cell.session.link_faults import expected_of
+from canprobe.cell.session.links import check_links, need_controllers
 from canprobe.cell.session.target import LOCKSTEP, VIRTUAL
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.errors import CanprobeError, UsageError
 from canprobe.fieldbus.bus.candump import CandumpWriter, RecordingPort
+from canprobe.fieldbus.bus.clock import MonotonicClock, VirtualClock, elapsed_ns
 from canprobe.fieldbus.bus.files import make_folder, whole_file, writing
-from canprobe.fieldbus.bus.port import (
-    Clock,
-    JoinedPort,
-    MonotonicClock,
-    Port,
-    Reports,
-    TimedFrame,
-    VirtualClock,
-    elapsed_ns,
-    is_bus_error,
-)
+from canprobe.fieldbus.bus.joined import JoinedPort
+from canprobe.fieldbus.bus.port import Port, Reports, is_bus_error
 from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, garbage_collection_paused, realtime, reserve_memory
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
-from canprobe.fieldbus.protocol.frame_bits import best_case_bits, best_case_fd_bits, exact_bits
-from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE
 
 if TYPE_CHECKING:
     from canprobe.cell.emulated.world import World
-
-
-# What a session opens: buses in virtual time, the routes between several of them, and what counts their frames.
-
-
-class TrafficCounter:
-    """Counts frames and bits of a bus in real time; bits without stuffing, as `canbusload -i` counts.
-
-    Args:
-        speed_up: data bit rate of CAN FD over the nominal one.
-
-    Attributes:
-        error_frames: bus errors, to be counted by who hears of them.
-    """
-
-    def __init__(self, speed_up: float) -> None:
-        self._by_length = [0] * 65
-        self._speed_up = speed_up
-        self.error_frames = 0
-
-    @property
-    def frames(self) -> int:
-        """Frames so far."""
-        return sum(self._by_length)
-
-    @property
-    def bits(self) -> int:
-        """Bits so far, those of a data phase as bits of the nominal rate."""
-        classic = sum(count * best_case_bits(n) for n, count in enumerate(self._by_length[:9]))
-        long = [(count, best_case_fd_bits(n)) for n, count in enumerate(self._by_length[9:], start=9) if count]
-        return classic + round(sum(count * (bits.nominal + bits.data / self._speed_up) for count, bits in long))
-
-    def write(self, can_id: int, data: bytes, t_ns: int) -> None:
-        """Count one frame."""
-        self._by_length[len(data)] += 1
-
-    def take(self, frames: Sequence[TimedFrame]) -> None:
-        """Count some."""
-        for _, data, _ in frames:
-            self._by_length[len(data)] += 1
-
-
-@contextmanager
-def open_ports(
-    plan: Plan, clock: Clock, reports: Callable[[str], Reports] = lambda _: Reports()
-) -> Iterator[dict[str, Port]]:
-    """The ports of a plan's buses, by channel; closed at the end.
-
-    Args:
-        plan: whose buses.
-        clock: in real time.
-        reports: makes, of a channel, who hears what its port has to report.
-
-    Raises:
-        InterfaceError: one is missing, down, or cannot be opened.
-    """
-    from canprobe.fieldbus.bus.real.python_can import open_port
-
-    bus = plan.scene.bus
-    with ExitStack() as stack:
-        ports: dict[str, Port] = {}
-        for planned in plan.buses:
-            name = planned.channel
-            port = open_port(
-                bus.interface, name, bus.bitrate, clock, data_bitrate=data_bitrate(bus), reports=reports(name)
-            )
-            stack.callback(port.close)
-            ports[name] = port
-        yield ports
-
-
-def channel_routes(plan: Plan) -> dict[int, str]:
-    """Which bus each identifier belongs to, of those that one node alone sends or reads."""
-    routes = {frames.can_id: frames.channel for frames in plan.raw}
-    routes |= {pdo.cob_id: pdo.channel for pdo in plan.pdos}
-    for node in plan.nodes:
-        for base in (SDO_RX_BASE, SDO_TX_BASE, EMCY_BASE, HEARTBEAT_BASE):
-            routes[base + node.node_id] = node.channel
-    return routes
-
-
-def lockstep_bus(scene: Scene, clock: VirtualClock, channel: str) -> LockstepBus:
-    """A bus in virtual time, with the bit rate of the scene or without one."""
-    if not scene.bus.timed:
-        return LockstepBus(clock, channel, fd=scene.bus.fd is True)
-    from canprobe.fieldbus.bus.virtual.timed import BitErrors, TimedBus
-
-    rate = scene.bus.bit_error_rate
-    errors = BitErrors(rate, scene.seed) if rate > 0 else None
-    bus = scene.bus
-    length = partial(exact_frame_bits, bus=bus) if bus.fd is True else exact_bits
-    timed = TimedBus(clock, channel, bitrate=bus.bitrate, queue=bus.transmit_queue, errors=errors, length=length)
-    timed.fd = bus.fd is True
-    return timed
 
 
 # A cell with everything round it: bus, recording, emulated nodes, and the way out of all of them.
@@ -480,7 +378,7 @@ class Session:
 
     def _get_ready(self, port: Port) -> None:
         """For real time: the emulated nodes in their process, everything done once before, the processor's favour."""
-        from canprobe.cell.session.children import EmulatorChild
+        from canprobe.cell.session.emulator_child import EmulatorChild
 
         child = None
         if self.plan.setup.emulates:

@@ -17,7 +17,8 @@ from canprobe.cell.tasks.probing import Phase, ProbingTask
 from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.task import TaskRecord
 from canprobe.mechanics.robot.tool_calibration import BallModel, BallTouch, ToolEstimate, calibrate_tool
-from canprobe.mechanics.touch.contact import ContactSample, PushFit
+from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.touch.layer_stiffness import PushFit
 from canprobe.mechanics.touch.patch.image import Patch
 from canprobe.mechanics.touch.probe_motion import OFF_M, ROUND_SPEED, ArcMotion
 from canprobe.mechanics.touch.servo import ProbePose

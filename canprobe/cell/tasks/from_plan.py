@@ -1,24 +1,18 @@
-"""Plan → the controller of its task, its estimators, and a task that others start, stop and set while it runs."""
+"""Plan → the controller of its task, and its estimators."""
 
 from __future__ import annotations
 
-import math
-from collections import deque
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
-from canprobe.cell.master.controller import Command, Controller, Measurement
+from canprobe.cell.master.controller import Controller
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Calibrate, Free, Probe, Setup, Touch
-from canprobe.cell.tasks.probing import ProbingTask
 from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, replay_samples
-from canprobe.cell.tasks.task import MotionTime
 from canprobe.cell.tasks.touch import TouchTask
-from canprobe.errors import UsageError
 from canprobe.fieldbus.protocol.tactile import WINDOW
-from canprobe.mechanics.robot.chain import Array as Vector
 from canprobe.mechanics.touch.contact import indentation_from_force
 from canprobe.mechanics.touch.patch.array_calibration import CentroidErrors
 from canprobe.mechanics.touch.patch.image_model import make_image_model, make_patch_calibration
@@ -28,8 +22,6 @@ if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.noise import Correlation
     from canprobe.mechanics.touch.estimate.online import Estimator
 
-
-# Plan → the tasks that touch.
 
 ALIKE = (2e-3, 0.3)
 """Path of the contact (m) along which a share of the centroids' variance is alike, over 87 random scenes. That of a
@@ -99,7 +91,7 @@ def make_shape_estimator(task: Touch, method: str) -> Estimator:
     )
     if method not in WITH_PATCH:
         return estimator
-    from canprobe.mechanics.touch.estimate.online import FollowingEstimator
+    from canprobe.mechanics.touch.estimate.following import FollowingEstimator
 
     scale = SCALE + SCALE_ROLLING * task.scan.rolling_share
     return FollowingEstimator(_with_patch(task, estimator, memory) if _uses_patch(task) else estimator, memory, scale)
@@ -115,7 +107,8 @@ def _typical_sigma(task: Touch) -> float:
 
 def _with_patch(task: Touch, estimator: Estimator, memory: float) -> Estimator:
     """The estimator with the contact patch as its second sensor."""
-    from canprobe.mechanics.touch.patch.curvature import PatchCurvature, PatchedEstimator
+    from canprobe.mechanics.touch.patch.curvature import PatchCurvature
+    from canprobe.mechanics.touch.patch.fused_estimator import PatchedEstimator
 
     array = task.array
     patch = make_patch_calibration(array.calibration, array.pad)
@@ -168,170 +161,3 @@ def make_task(plan: Plan) -> Controller:
 
     patch = make_patch_calibration(task.array.calibration, task.array.pad)
     return ListenTask(patch, task.duration_s, period_s)
-
-
-# A task that a bridge starts, stops and sets while it runs; its requests were checked before.
-#
-# A new target force or speed is approached at a bounded rate: no request makes a step.
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _is_way(value: object) -> bool:
-    return isinstance(value, dict) and value.keys() == {"points", "velocities"}
-
-
-_VALUES: dict[str, Callable[[object], bool]] = {
-    "start": lambda value: value is None,
-    "stop": lambda value: value is None,
-    "target_force_n": _is_number,
-    "speed_m_s": _is_number,
-    "trajectory": _is_way,
-}
-"""The kinds of requests, and whether something can be the value of one."""
-
-
-@dataclass(frozen=True, slots=True)
-class Request:
-    """What another tool asks of a running task; it cannot be made of anything else.
-
-    Args:
-        kind: start, stop, target_force_n, speed_m_s or trajectory.
-        value: None for start and stop; N or m/s, finite; the arguments `points` and `velocities` of a `Trajectory`.
-
-    Raises:
-        UsageError: the kind is unknown, or the value has another type.
-    """
-
-    kind: str
-    value: Any = None
-
-    def __post_init__(self) -> None:
-        fits = _VALUES.get(self.kind)
-        if fits is None or not fits(self.value):
-            kinds = ", ".join(_VALUES)
-            got = f"{self.kind!r} with the value {self.value!r}"
-            raise UsageError(f"request: expected one of {kinds}, each with a value of its type, got {got}")
-
-
-FORCE_RATE = 2.0
-"""N/s."""
-SPEED_RATE = 0.1
-"""m/s²."""
-
-
-class RequestedTask(Controller):
-    """Steps a task, and lets requests change it.
-
-    Args:
-        task: the task; None holds still until a `start`.
-        make: makes a new task at every `start`; None where the task runs once, from the beginning.
-        requests: where requests arrive.
-        period_s: of the cycle.
-        plan: of an arm that follows trajectories on request; without, none is asked for.
-    """
-
-    def __init__(
-        self,
-        task: Controller | None,
-        make: Callable[[], Controller] | None,
-        requests: Sequence[deque[Request]],
-        period_s: float,
-        plan: Plan | None = None,
-    ) -> None:
-        self._task = task
-        self._plan = plan
-        self._period_s = period_s
-        self._time = MotionTime(round(1e9 * period_s))
-        self._step_s = period_s
-        self._targets: list[Vector] = []
-        self._make = make
-        self._requests = requests
-        self._steps = {"target_force_n": FORCE_RATE * period_s, "speed_m_s": SPEED_RATE * period_s}
-        self._asked: dict[str, float] = {}
-        self._stopping = False
-
-    def step(self, measurement: Measurement) -> Command:
-        """One cycle."""
-        for queue in self._requests:
-            while queue:
-                request = queue.popleft()
-                if request.kind == "trajectory":
-                    self._follow(measurement, **request.value)
-                else:
-                    self._take(request)
-        self._step_s = 1e-9 * self._time.step(measurement.t_ns)
-        if self._task is None:
-            return Command()
-        columns = self._approach(self._task) if isinstance(self._task, TouchTask) else {}
-        command = self._task.step(measurement)
-        if columns:
-            command = replace(command, columns={**command.columns, **columns})
-        if self._stopping and not isinstance(self._task, ProbingTask):
-            command = replace(command, done=True)
-        if self._plan is not None and command.q_target is not None:
-            self._targets = [*self._targets[-1:], command.q_target]
-        if command.done and self._make is not None:
-            self._task, self._stopping, self._targets = None, False, []
-            return replace(command, done=False)
-        return command
-
-    def update(self) -> None:
-        """What the task does once its commands are out."""
-        if self._task is not None:
-            self._task.update()
-
-    @property
-    def lets_go(self) -> bool:  # type: ignore[override]
-        """As the task does."""
-        return self._task is not None and self._task.lets_go
-
-    def retreat(self, reason: str) -> None:
-        """Ask the task to let go."""
-        if self._task is not None:
-            self._task.retreat(reason)
-
-    @property
-    def restarts(self) -> int:
-        """Of the task's estimator."""
-        return 0 if self._task is None else self._task.restarts
-
-    def _take(self, request: Request) -> None:
-        if request.kind == "stop":
-            if isinstance(self._task, ProbingTask):
-                self._task.stop()
-            elif self._plan is not None and len(self._targets) == 2:
-                from canprobe.cell.tasks.trajectory import Trajectory
-
-                self._task = Trajectory.braking(self._plan, *self._motion())
-                return
-            self._stopping = self._task is not None
-        elif request.kind == "start":
-            if self._task is None and self._make is not None:
-                self._task = self._make()
-        else:
-            self._asked[request.kind] = request.value
-
-    def _follow(self, measurement: Measurement, **way: Any) -> None:
-        """Leave what the arm does for a trajectory, at the speed that it has; the bridge has checked the way."""
-        from canprobe.cell.tasks.trajectory import Trajectory
-
-        assert self._plan is not None and measurement.q is not None
-        trajectory = Trajectory(self._plan, **way)
-        trajectory.lead(*(self._motion() if len(self._targets) == 2 else (measurement.q, None)))
-        self._task, self._stopping = trajectory, False
-
-    def _motion(self) -> tuple[Vector, Vector]:
-        """Where the last two targets lead in this cycle: position and speed (n,)."""
-        before, last = self._targets
-        qd = (last - before) / self._step_s
-        return last + qd * self._period_s, qd
-
-    def _approach(self, task: TouchTask) -> dict[str, float]:
-        """Move the task's targets towards what was asked for; what they are now, once anything was asked for."""
-        for kind, wanted in self._asked.items():
-            now, step = task.targets[kind], self._steps[kind]
-            task.set_target(kind, now + min(max(wanted - now, -step), step))
-        return {f"target_{kind.removeprefix('target_')}": task.targets[kind] for kind in self._asked}

@@ -1,109 +1,28 @@
-"""What every task that touches with the probe has: the probe's motion, the phases, and the order of a cycle."""
+"""What every task that touches with the probe has: phases, and the order of a cycle."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dgesv
 
 from canprobe.cell.master.controller import Command, Measurement, TactileSample
 from canprobe.cell.master.supervision import Contact, limits_of
-from canprobe.cell.master.supervisor import outside_workspace
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.scene.setup import Arm, Probe, SafetyLimits
+from canprobe.cell.tasks.probe_motion import ProbeMotion, Vector
 from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.task import MotionTime, Task, TaskRecord
-from canprobe.mechanics.robot.chain import pose_of
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.patch.image import Patch
-from canprobe.mechanics.touch.probe_motion import RETREAT_SPEED, ArcMotion, LineMotion, PoseSteps
+from canprobe.mechanics.touch.probe_motion import RETREAT_SPEED, ArcMotion, LineMotion
 from canprobe.mechanics.touch.servo import ProbePose
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 
-
-# The probe's pose → joint targets within what the cell allows, one step a cycle.
-
-Vector = NDArray[np.float64]
-
-
-def _solve(J: Vector, twist: Any) -> list[float] | None:
-    """As `probe_motion.solve`, by LAPACK itself: numpy's wrapper costs four times as much in each cycle."""
-    _, _, dq, info = dgesv(J, twist)
-    step: list[float] = dq.tolist()
-    return step if info == 0 else None
-
-
-class ProbeMotion:
-    """Keeps the commanded joint positions of a probe whose pose is asked for cycle by cycle.
-
-    Each cycle one damped step from the *commanded* joints, never from the measured ones: encoder noise stays out of the
-    command, and the step is small enough that its second-order error is gone in the next cycle.
-
-    Args:
-        arm, probe: what moves.
-        safety: what joints and probe must keep to.
-        period_s: of the cycle.
-        q: joint positions to start from (n,), rad or m; more than six joints stay near them.
-
-    Attributes:
-        limit: what a joint or the workspace forbids; None where nothing does.
-        slowed: cycles in which a joint could not keep up.
-    """
-
-    def __init__(self, arm: Arm, probe: Probe, safety: SafetyLimits, period_s: float, q: Vector) -> None:
-        self.q = np.array(q, dtype=float)
-        self._model = model = arm.model
-        self._steps = PoseSteps(model, probe.T_flange_probe, self.q, _solve)
-        self._workspace, self._radius = safety.workspace, probe.radius
-        self._step_max: list[float] = (model.qd_max * safety.speed_share * period_s).tolist()
-        self._period_s = period_s
-        margin = safety.joint_margin
-        self._low, self._high = model.q_min + margin, model.q_max - margin
-        self._range: list[tuple[float, float]] = list(zip(self._low.tolist(), self._high.tolist(), strict=True))
-        self.limit: str | None = None
-        self.slowed = 0
-
-    @property
-    def pose(self) -> ProbePose:
-        """The commanded pose."""
-        at = self._steps.at
-        return ProbePose(np.array(at.flange), np.array(at.z))
-
-    @property
-    def pose_matrix(self) -> Vector:
-        """The same with the turn about the pole, (4, 4), m."""
-        return pose_of(self._steps.at)
-
-    def step(self, pose: ProbePose) -> Vector:
-        """Joint targets (n,), rad or m, one step nearer to ``pose``."""
-        before = self.q.tolist()
-        dq = self._steps.step(before, pose, self._period_s)
-        at = self._steps.at
-        if self._workspace is not None:
-            self.limit = outside_workspace(np.array(at.flange) + self._radius * np.array(at.z), self._workspace)
-        share = max([abs(step) / most for step, most in zip(dq, self._step_max, strict=True)])
-        if share > 1.0:
-            dq = [step / share for step in dq]
-            self.slowed += 1
-        targets = [q + step for q, step in zip(before, dq, strict=True)]
-        self.q = np.array(targets)
-        if not all([low <= q <= high for q, (low, high) in zip(targets, self._range, strict=True)]):
-            self._stop_at_limit()
-        return self.q
-
-    def _stop_at_limit(self) -> None:
-        joint = int(np.flatnonzero((self.q < self._low) | (self.q > self._high))[0])
-        self.limit = f"joint {joint + 1} at {self._model.joints[joint].text(self.q[joint])}, its stop"
-        self.q = np.clip(self.q, self._low, self._high)
-
-
-# What every task that touches with the probe has: phases, and the order of a cycle.
 
 CYCLES_TO_EFFECT = 2
 """From a SYNC to the moment its command begins to take effect, behind which the drives lag."""

@@ -13,17 +13,15 @@ from numpy.typing import NDArray
 from canprobe.cell.master.array import patch_of
 from canprobe.cell.master.controller import Measurement, TactileSample
 from canprobe.mechanics.robot.chain import ending_in, forward
-from canprobe.mechanics.robot.model import ArmModel, position_sigma
-from canprobe.mechanics.touch.contact import (
-    ContactSample,
-    Slope,
-    contact_sample,
-    indentation_from_force,
-    stiffness_from_slope,
-)
+from canprobe.mechanics.robot.model import ArmModel
+from canprobe.mechanics.robot.motors import position_sigma
+from canprobe.mechanics.touch.contact import ContactSample, Slope, contact_sample, indentation_from_force
+from canprobe.mechanics.touch.layer_stiffness import stiffness_from_slope
 from canprobe.mechanics.touch.patch.array_calibration import CentroidErrors, Lag
-from canprobe.mechanics.touch.patch.image import Patch, PatchCalibration, mended
-from canprobe.mechanics.touch.patch.moments import MomentImage, Moments, PadLag
+from canprobe.mechanics.touch.patch.dead_taxels import mended
+from canprobe.mechanics.touch.patch.image import Patch, PatchCalibration
+from canprobe.mechanics.touch.patch.moments import MomentImage, Moments
+from canprobe.mechanics.touch.patch.trailing import PadLag
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate

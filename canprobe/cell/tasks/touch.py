@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.cell.master.conditions import touch_finding
 from canprobe.cell.master.controller import Command, Measurement, TactileSample
@@ -16,70 +13,21 @@ from canprobe.cell.master.supervision import TOUCH_FORCE, Reaction
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Touch
 from canprobe.cell.tasks.probing import Phase, ProbingTask
+from canprobe.cell.tasks.regain import REST_S, SPEED, Search, Vector
 from canprobe.cell.tasks.sensing import ContactSensing, is_too_hollow
 from canprobe.cell.tasks.shape import ShapeTracker
 from canprobe.cell.tasks.task import Loss, TaskRecord
-from canprobe.mechanics.touch.contact import AtRest, ContactSample, PushFit, Slope
+from canprobe.mechanics.touch.at_rest import AtRest
+from canprobe.mechanics.touch.contact import ContactSample, Slope
+from canprobe.mechanics.touch.layer_stiffness import PushFit
 from canprobe.mechanics.touch.patch.image import Patch
 from canprobe.mechanics.touch.probe_motion import MOVE_SPEED, SETTLE_S, LineMotion, smooth_step
-from canprobe.mechanics.touch.servo import LocalSurface, PathFollower, ProbePose, TactileServo
+from canprobe.mechanics.touch.servo import LocalSurface, ProbePose, TactileServo
+from canprobe.mechanics.touch.strategies import PathFollower
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 
-
-# Contact that a scan has lost: the probe stops along its path and goes on towards the object, slowly and not far.
-
-Vector = NDArray[np.float64]
-SPEED = 2e-3
-"""m/s: until the first sample of the new touch has taken effect, 27 ms later, the layer sinks in by 0.05 mm."""
-BRAKE_S = 0.02
-"""Time constant with which the motion along the path ends: 0.5 mm at 25 mm/s."""
-REST_S = 0.25
-"""Time at rest on the surface that was found, until the wanted force is reached and the scan goes on."""
-
-
-class Search:
-    """The probe's motion from a lost contact to the object, along its pole.
-
-    Args:
-        pose: of the probe where the contact was lost.
-        velocity: of its centre then (3,), m/s; what of it runs along the path fades out.
-    """
-
-    def __init__(self, pose: ProbePose, velocity: Vector) -> None:
-        self._start = pose
-        self._sideways = velocity - pose.pole * float(velocity @ pose.pole)
-
-    def pose(self, t: float) -> ProbePose:
-        """Pose ``t`` seconds after the loss."""
-        sideways = self._sideways * (BRAKE_S * (1.0 - math.exp(-t / BRAKE_S)))
-        return ProbePose(self._start.centre + sideways + self._start.pole * (SPEED * t), self._start.pole)
-
-
-def summarise_losses(losses: Sequence[Loss]) -> list[dict[str, float | None]]:
-    """Each loss for `summary.json`: `searched_mm`, and `regained_after_ms`, None where it was not."""
-    return [
-        {
-            "searched_mm": 1e3 * loss.searched,
-            "regained_after_ms": None if loss.regained_s is None else 1e3 * loss.regained_s,
-        }
-        for loss in losses
-    ]
-
-
-def losses_text(losses: Sequence[Mapping[str, float | None]]) -> str:
-    """How often contact was lost in the scan, and what was done about it, in words."""
-    told = ", ".join(
-        f"not regained within {loss['searched_mm']:.1f} mm"
-        if loss["regained_after_ms"] is None
-        else f"regained after {loss['regained_after_ms']:.0f} ms and {loss['searched_mm']:.1f} mm"
-        for loss in losses
-    )
-    return f"contact lost {len(losses)} time{'s' * (len(losses) > 1)}: {told}"
-
-
-# The touch tasks: approach, settle, scan or hold, regain a lost contact, retreat.
 
 CERTAIN = 0.12
 """Share of itself to which the slope of √F over the push must be known (1σ) before it is used."""

@@ -16,9 +16,11 @@ from canopen.objectdictionary import ObjectDictionary
 
 from canprobe.fieldbus.drive.mode import DriveParts
 from canprobe.fieldbus.drive.modes import make_modes
-from canprobe.fieldbus.drive.parameters import FACTORS, STAYS_STOPPED, Delivery
+from canprobe.fieldbus.drive.parameters import STAYS_STOPPED
 from canprobe.fieldbus.drive.reference import STEP_NS, AxisPlant
-from canprobe.fieldbus.node.dictionary import Abort, SdoAbort, Value, key_of
+from canprobe.fieldbus.drive.units import FACTORS, Delivery
+from canprobe.fieldbus.node.abort import Abort, SdoAbort
+from canprobe.fieldbus.node.entry import Value, key_of
 from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.node.slave_node import Application, OdOf, SlaveNode
 from canprobe.fieldbus.protocol import cia402
@@ -32,7 +34,8 @@ from canprobe.fieldbus.protocol.cia402 import (
     Event,
     command_of,
 )
-from canprobe.fieldbus.protocol.frames import FOLLOWING_ERROR, HEARTBEAT_LOST, NmtState
+from canprobe.fieldbus.protocol.emcy import FOLLOWING_ERROR, HEARTBEAT_LOST
+from canprobe.fieldbus.protocol.frames import NmtState
 
 _STATUSWORD = key_of(0x6041)
 _VOLATILE = frozenset({0x6040, 0x6071, 0x607A, 0x60B0, 0x60B1, 0x60B2, 0x60C1, 0x60FF})

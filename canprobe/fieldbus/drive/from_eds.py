@@ -8,10 +8,10 @@ from pathlib import Path
 from canopen.objectdictionary import ObjectDictionary
 
 from canprobe.fieldbus.drive.drive import make_drive_node
-from canprobe.fieldbus.drive.reference import IdealAxis
+from canprobe.fieldbus.drive.ideal_axis import IdealAxis
 from canprobe.fieldbus.eds.packaged import load_eds
 from canprobe.fieldbus.eds.reading import is_drive
-from canprobe.fieldbus.node.dictionary import key_of
+from canprobe.fieldbus.node.entry import key_of
 from canprobe.fieldbus.node.slave_node import SlaveNode
 
 

@@ -21,9 +21,12 @@ from __future__ import annotations
 from enum import Enum, auto
 from math import ceil, floor
 
-from canprobe.fieldbus.drive.mode import NEGATIVE_SWITCH, POSITIVE_SWITCH, REACHED, DriveParts, ProfiledMode
-from canprobe.fieldbus.drive.reference import STEP_NS, Rates
-from canprobe.fieldbus.node.dictionary import Abort, SdoAbort, Value, key_of
+from canprobe.fieldbus.drive.feedback import NEGATIVE_SWITCH, POSITIVE_SWITCH
+from canprobe.fieldbus.drive.mode import REACHED, DriveParts, ProfiledMode
+from canprobe.fieldbus.drive.profile import Rates
+from canprobe.fieldbus.drive.reference import STEP_NS
+from canprobe.fieldbus.node.abort import Abort, SdoAbort
+from canprobe.fieldbus.node.entry import Value, key_of
 from canprobe.fieldbus.protocol.cia402 import HOMING_ATTAINED, HOMING_ERROR, HOMING_START, OperationMode
 
 HERE = frozenset({35, 37})

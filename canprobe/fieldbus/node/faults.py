@@ -1,132 +1,19 @@
-"""Faults of a node or its link: what, when, how often; and the node in which they happen."""
+"""A node with faults, between the node and a lockstep bus: it is attached in the node's place."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable, Sequence
-from dataclasses import dataclass, replace
-from enum import Enum
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from heapq import heappop, heappush
 from random import Random
 
 from canprobe.errors import ProtocolError
-from canprobe.fieldbus.bus.virtual.lockstep import Participant
+from canprobe.fieldbus.node.fault import Fault, FaultKind, flip_bit
 from canprobe.fieldbus.node.slave_node import SlaveNode
-from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, Emcy, Frame
+from canprobe.fieldbus.node.wrapped import WrappedNode
+from canprobe.fieldbus.protocol.emcy import Emcy
+from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, Frame
 from canprobe.fieldbus.protocol.tactile import TactileHeader, crc16_ccitt
-
-# Faults of a node or its link: what, when, how often. `canprobe.fieldbus.node.faults` lets them happen.
-
-
-class FaultKind(Enum):
-    """What goes wrong between a node and the bus, or in the node."""
-
-    DROP = "drop"
-    DELAY = "delay"
-    DUPLICATE = "duplicate"
-    CORRUPT = "corrupt"
-    REORDER = "reorder"
-    MUTE = "mute"
-    DEAF = "deaf"
-    REBOOT = "reboot"
-    FREEZE = "freeze"
-    BABBLE = "babble"
-    WRONG_DATA = "wrong data"
-
-
-@dataclass(frozen=True, slots=True)
-class Fault:
-    """One fault.
-
-    Attributes:
-        kind: what goes wrong.
-        node_id: whose.
-        start_ns, duration_ns: when it begins, on the bus's clock, and how long it lasts.
-        share: of the frames that it hits, 0…1.
-        incoming: it hits what the node receives; else what it sends.
-        amount_ns: delay of a frame, or time between two frames of a babbling node.
-        seed: of its chances.
-    """
-
-    kind: FaultKind
-    node_id: int
-    start_ns: int
-    duration_ns: int
-    share: float = 1.0
-    incoming: bool = False
-    amount_ns: int = 1_000_000
-    seed: int = 0
-
-    @property
-    def end_ns(self) -> int:
-        """When it is over."""
-        return self.start_ns + self.duration_ns
-
-    def holds(self, t_ns: int) -> bool:
-        """Whether it is at work."""
-        return self.start_ns <= t_ns < self.end_ns
-
-    def __str__(self) -> str:
-        way = " incoming" if self.incoming else ""
-        return (
-            f"{self.kind.value}{way} at node {self.node_id}, {self.start_ns * 1e-9:.4f} s for"
-            f" {self.duration_ns * 1e-6:.1f} ms, {100 * self.share:.0f} %"
-        )
-
-
-def flip_bit(data: bytes, rng: Random) -> bytes:
-    """The data with one bit changed, or cut short: what a CRC on the wire lets through once in a lifetime."""
-    if not data:
-        return data
-    if rng.random() < 0.2:
-        return data[: rng.randrange(len(data))]
-    place, bit = rng.randrange(len(data)), 1 << rng.randrange(8)
-    return data[:place] + bytes((data[place] ^ bit,)) + data[place + 1 :]
-
-
-# The base of what stands between a node and a lockstep bus: it is attached in the node's place.
-
-
-class WrappedNode(Participant):
-    """Passes on what the bus asks of a node; what is done to its frames is the derived class's.
-
-    Args:
-        node: the node.
-    """
-
-    def __init__(self, node: SlaveNode) -> None:
-        self.node = node
-
-    @property
-    def node_id(self) -> int:
-        """As the node."""
-        return self.node.node_id
-
-    @property
-    def name(self) -> str:
-        """For messages."""
-        return self.node.name
-
-    @property
-    def listens(self) -> Container[int]:
-        """As the node."""
-        return self.node.listens
-
-    @property
-    def kind(self) -> type:
-        """As the node."""
-        return self.node.kind
-
-    @property
-    def patient(self) -> frozenset[int]:
-        """As the node."""
-        return self.node.patient
-
-    def connect(self, rerouted: Callable[[], None]) -> None:
-        """Of the node."""
-        self.node.connect(rerouted)
-
-
-# A node with faults, between the node and a lockstep bus: it is attached in the node's place.
 
 _GARBAGE_ID = 0x050
 _TPDO1 = 0x180

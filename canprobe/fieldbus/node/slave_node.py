@@ -16,14 +16,21 @@ from collections.abc import Callable, Container
 from canopen.objectdictionary import ObjectDictionary
 
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
-from canprobe.fieldbus.node.core import NMT_GOALS, NodeCore, Route, Service
-from canprobe.fieldbus.node.dictionary import Dictionary, nothing
-from canprobe.fieldbus.node.emcy import Emergency, HeartbeatConsumer, HeartbeatProducer, NodeGuarding
-from canprobe.fieldbus.node.lss import LssSlave, Store
-from canprobe.fieldbus.node.pdo import PdoEngine, SyncConsumer
+from canprobe.fieldbus.node.abort import nothing
+from canprobe.fieldbus.node.core import NodeCore, Route, Service
+from canprobe.fieldbus.node.dictionary import Dictionary
+from canprobe.fieldbus.node.emcy import Emergency
+from canprobe.fieldbus.node.guarding import NodeGuarding
+from canprobe.fieldbus.node.heartbeat import HeartbeatConsumer, HeartbeatProducer
+from canprobe.fieldbus.node.lss import LssSlave
+from canprobe.fieldbus.node.nmt import NMT_GOALS
+from canprobe.fieldbus.node.pdo import PdoEngine
 from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.node.sdo_server import SdoServer
-from canprobe.fieldbus.protocol.frames import NMT_ID, UNCONFIGURED, Frame, NmtCommand, NmtState
+from canprobe.fieldbus.node.store import Store
+from canprobe.fieldbus.node.sync import SyncConsumer
+from canprobe.fieldbus.protocol.frames import NMT_ID, Frame, NmtCommand, NmtState
+from canprobe.fieldbus.protocol.lss import UNCONFIGURED
 
 OdOf = Callable[[int], ObjectDictionary]
 """Parses a node's EDS for a node id."""

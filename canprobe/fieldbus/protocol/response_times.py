@@ -13,14 +13,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.frame_bits import worst_case_bits
 
-_NS = 1_000_000_000
+NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +91,7 @@ class BusAnalysis:
 
 def frame_time_ns(n_data: int, bitrate: int) -> int:
     """Longest time of a frame with n data bytes, ns, rounded up."""
-    return -(-worst_case_bits(n_data) * _NS // bitrate)
+    return -(-worst_case_bits(n_data) * NS // bitrate)
 
 
 def worst_case_response(messages: Sequence[Message], bitrate: int = 1_000_000) -> BusAnalysis:
@@ -145,7 +145,7 @@ def _respond(level: Sequence[_Timed], below: Sequence[tuple[_Timed, int | None]]
     message, frame_ns = level[-1]
     if _overloaded(level):
         return Response(message, frame_ns, None, 0)
-    bit = -(-_NS // bitrate)
+    bit = -(-NS // bitrate)
     found = [_busy_period(level, start, block, bit).delays() for start, block in _starts(level, below).items()]
     worst = max((delay for delays in found for delay in delays), default=0)
     return Response(message, frame_ns, max(0, (message.offset_ns or 0) + worst), max(map(len, found)))
@@ -256,95 +256,3 @@ def _blocking(below: Sequence[tuple[_Timed, int | None]], first: int, jitter: in
         return into < end - m.offset_ns or into + jitter >= m.period_ns  # it is through `end` after its event
 
     return max((c for (m, c), end in below if can_be_on_the_bus(m, end)), default=0)
-
-
-# How late a message can be where nodes send their oldest frame first, as SocketCAN's queue and many controllers do.
-#
-# A frame then waits for everything that its own node has queued before it, and each of those competes with its own
-# identifier: the one of lowest priority holds up all behind it. Messages are independent of each other; an offset
-# counts as jitter. It stops being a bound where a message's response time exceeds its period: its own last frame could
-# then still be in the queue. Such messages have no response time here, nor have those that they could disturb.
-#
-# Source: Davis, Kollmann, Pollex, Slomka, "Controller Area Network (CAN) schedulability analysis with FIFO queues",
-# ECRTS 2011.
-
-
-@dataclass(frozen=True, slots=True)
-class _Sent:
-    """A message, its frame's time, the messages of its queue (itself alone with a priority queue), ns."""
-
-    message: Message
-    frame_ns: int
-    queue: tuple[int, ...]
-
-
-def worst_case_response_fifo(
-    messages: Sequence[Message], fifo_nodes: Mapping[str, object], bitrate: int = 1_000_000
-) -> BusAnalysis:
-    """Worst-case response time of every message on a bus on which some nodes have FIFO queues.
-
-    Args:
-        messages: everything that is sent on this bus; identifiers are unique.
-        fifo_nodes: of every message that goes through a FIFO queue: its name → whose queue; the others' nodes send
-            their message of highest priority first.
-        bitrate: bit/s.
-
-    Raises:
-        ProtocolError: an identifier twice, or a name that no message has.
-    """
-    timed = _timed(messages, bitrate)
-    if unknown := set(fifo_nodes) - {message.name for message in messages}:
-        raise ProtocolError(f"no message is called {min(unknown)}")
-    owners = [fifo_nodes.get(message.name) for message, _ in timed]
-    sent = []
-    for rank, ((message, frame_ns), owner) in enumerate(zip(timed, owners, strict=True)):
-        queue = (rank,) if owner is None else tuple(r for r, other in enumerate(owners) if other == owner)
-        # queued at any time from the event to the latest that its offset and jitter allow
-        at_any_time = replace(message, jitter_ns=message.jitter_ns + (message.offset_ns or 0), offset_ns=None)
-        sent.append(_Sent(at_any_time, frame_ns, queue))
-    found = _settled(sent, -(-_NS // bitrate))
-    return _analysis(
-        [
-            Response(message, frame_ns, total, 0 if total is None else 1)
-            for (message, frame_ns), total in zip(timed, found, strict=True)
-        ]
-    )
-
-
-def _settled(sent: Sequence[_Sent], bit: int) -> list[int | None]:
-    """Responses from the events, repeated until the delays in the queues, which they hang on, move no more."""
-    delays: list[int | None] = [0] * len(sent)
-    while True:
-        found = [_response(sent, rank, delays, bit) for rank in range(len(sent))]
-        following = [None if total is None else _in_the_queue(sent, rank, total) for rank, total in enumerate(found)]
-        if following == delays:
-            return found
-        delays = following
-
-
-def _in_the_queue(sent: Sequence[_Sent], rank: int, total: int) -> int:
-    """How long after its queueing a frame can begin to compete."""
-    one = sent[rank]
-    return total - one.message.jitter_ns - one.frame_ns if len(one.queue) > 1 else 0
-
-
-def _response(sent: Sequence[_Sent], rank: int, delays: Sequence[int | None], bit: int) -> int | None:
-    """From the event to the end of the frame; None where that is no bound."""
-    one = sent[rank]
-    lowest, frames = max(one.queue), [sent[other].frame_ns for other in one.queue]
-    above = [other for other in range(lowest) if other not in one.queue]
-    if any(delays[other] is None for other in above):
-        return None
-    blocking = max([*frames, *(other.frame_ns for other in sent[lowest + 1 :])])
-    ahead = blocking + sum(frames) - one.frame_ns
-    disturbing = [
-        (sent[k].frame_ns, sent[k].message.period_ns, sent[k].message.jitter_ns + (delays[k] or 0)) for k in above
-    ]
-    limit = one.message.period_ns - one.message.jitter_ns - one.frame_ns
-    delay = ahead
-    while delay <= limit:
-        longer = ahead + sum(-(-(delay + bit + late) // period) * cost for cost, period, late in disturbing)
-        if longer <= delay:
-            return one.message.jitter_ns + delay + one.frame_ns
-        delay = longer
-    return None

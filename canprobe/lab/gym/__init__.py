@@ -26,7 +26,8 @@ except ImportError as error:
     raise UsageError(f"canprobe.lab.gym needs the package gymnasium: {install_line('gym')}") from error
 
 from canprobe.lab.gym.env import TouchScan
-from canprobe.lab.gym.randomise import OBJECTS, Choice, Uniform
+from canprobe.lab.gym.objects import OBJECTS
+from canprobe.lab.gym.randomise import Choice, Uniform
 
 __all__ = ["OBJECTS", "Choice", "TouchScan", "Uniform"]
 

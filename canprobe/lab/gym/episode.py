@@ -15,7 +15,7 @@ from canprobe.cell.planning.model import Plan
 from canprobe.cell.session.session import Session, quiet
 from canprobe.errors import BusError, SafetyStop
 from canprobe.lab.gym.led import LedTask
-from canprobe.lab.gym.observations import Coverage
+from canprobe.lab.gym.region import Coverage
 
 Vector = NDArray[np.float64]
 FORCE_SHARE = 0.5

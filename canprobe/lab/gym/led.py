@@ -17,7 +17,8 @@ from canprobe.cell.tasks.probing import Phase
 from canprobe.cell.tasks.touch import TouchTask
 from canprobe.mechanics.touch.contact import ContactSample, direction_to_pad
 from canprobe.mechanics.touch.patch.image import Patch
-from canprobe.mechanics.touch.servo import PathFollower, ProbePose
+from canprobe.mechanics.touch.servo import ProbePose
+from canprobe.mechanics.touch.strategies import PathFollower
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate

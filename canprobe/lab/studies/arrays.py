@@ -20,17 +20,19 @@ from typing import Any
 
 import numpy as np
 
-from canprobe.cell.emulated.array import follow
-from canprobe.cell.plant.probe import depth_for_force
+from canprobe.cell.emulated.image_processing import follow
+from canprobe.cell.plant.elastic_contact import depth_for_force
 from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig
 from canprobe.cell.results.picture import BLUE, INK, picture
-from canprobe.lab.studies.harness import Array, Column, Row, StudyResult, measuring_facts
+from canprobe.lab.studies.harness import Array, Column, Row, StudyResult
+from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.patch.calibrate import calibrate_array
 from canprobe.mechanics.touch.patch.image import PatchCalibration
-from canprobe.mechanics.touch.patch.image_fit import Dwell, curvature_errors, moment_errors, what_is_shown
+from canprobe.mechanics.touch.patch.image_fit import Dwell, what_is_shown
 from canprobe.mechanics.touch.patch.image_model import make_image_model, make_patch_calibration
+from canprobe.mechanics.touch.patch.image_parameters import curvature_errors, moment_errors
 
 RADIUS_M = 0.040
 BALL_PER_M = 40.0

@@ -21,23 +21,15 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from canprobe.cell.results.picture import INK, METHOD_COLOURS, SHADE, legend, log_scale, picture
-from canprobe.lab.studies.bound import Ground, make_ground
-from canprobe.lab.studies.harness import (
-    FROBENIUS,
-    SIGMA_COLUMNS,
-    Array,
-    Column,
-    Row,
-    StudyResult,
-    measuring_facts,
-    sigma_values,
-)
+from canprobe.lab.studies.ground import Ground, make_ground
+from canprobe.lab.studies.harness import FROBENIUS, Array, Column, Row, StudyResult
+from canprobe.lab.studies.result_files import SIGMA_COLUMNS, measuring_facts, sigma_values
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.fit import make_estimator
 from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
 from canprobe.mechanics.touch.estimate.online import Estimator
-from canprobe.mechanics.touch.linear_algebra import homogeneous, tangent_rotation
+from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 
 STEP_M, FRAME_US, SHARE = 0.125e-3, 5000.0, 8
 """Path between two frames, time between them, frames between two answers of the loop."""

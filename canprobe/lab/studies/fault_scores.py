@@ -28,30 +28,27 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.master.conditions import BY_KEY
-from canprobe.cell.master.controller import Controller, Measurement
-from canprobe.cell.master.log import joint_positions
+from canprobe.cell.master.controller import Controller
+from canprobe.cell.master.joint_columns import joint_positions
 from canprobe.cell.master.supervision import Limits, limits_of
 from canprobe.cell.planning.units import motor_speed_limit
-from canprobe.cell.plant.plant import Plant
 from canprobe.cell.results.summary import summarise
 from canprobe.cell.scene.geometry import T_flange_probe
 from canprobe.cell.scene.model import ServoSettings
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.probing import Phase
 from canprobe.cell.tasks.task import record_of
-from canprobe.errors import CanprobeError, SafetyStop
+from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.candump import read_candump
-from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
-from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.mechanics.robot.chain import forward_jacobian
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.touch.contact import indentation_from_force
@@ -218,57 +215,3 @@ def score_log(session: Session, steps: int) -> list[str]:
         return [*failures, f"log: {error}"]
     frames = sum(counter.frames for counter in session.traffic.values())
     return failures if lines == frames else [*failures, f"log: {lines} lines of {frames} frames"]
-
-
-# A run to its end, and the witness of it.
-
-
-class HangError(Exception):
-    """The run did not end."""
-
-
-class Witness(Participant):
-    """A participant of the bus that looks at the plant periodically, also when the master sends no SYNC any more.
-
-    Args:
-        plant: of the run.
-        period_ns: between two looks.
-
-    Attributes:
-        rows: (t_ns, force in N) of each look.
-    """
-
-    listens = frozenset[int]()
-    next_deadline_ns: int | None = None
-
-    def __init__(self, plant: Plant, period_ns: int) -> None:
-        self.rows: list[tuple[int, float]] = []
-        self.next_deadline_ns = period_ns
-        self._plant, self._period_ns = plant, period_ns
-
-    def advance(self, t_ns: int) -> Sequence[Frame]:
-        """Look."""
-        self.next_deadline_ns = t_ns + self._period_ns
-        self._plant.advance(t_ns)
-        self.rows.append((t_ns, float(self._plant.truth()["force"])))
-        if t_ns > LONGEST_S * 1e9:
-            raise HangError(f"no end after {LONGEST_S:g} s")
-        return ()
-
-
-def run_to_end(
-    session: Session, task: Controller, progress: Callable[[Measurement], None] = lambda _: None
-) -> tuple[str, Exception | None]:
-    """Bring the cell up and run its task; the outcome in words, and the exception that ended the run."""
-    try:
-        with session:
-            session.run(task, progress=progress)
-    except SafetyStop as stop:
-        return "stopped for safety", stop
-    except CanprobeError as error:
-        return ("bus or node failure" if session.opened else "bring-up refused"), error
-    except HangError as hang:
-        return "hang", hang
-    except Exception as error:  # of any kind: it is a failure of ours, and the study continues
-        return "crash", error
-    return "completed", None

@@ -24,18 +24,21 @@ from canprobe.cell.planning.make import make_plan
 from canprobe.cell.scene.load import dump_scene, load_scene
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.session.children import EmulatorChild, with_our_imports
+from canprobe.cell.session.emulator_child import EmulatorChild, with_our_imports
 from canprobe.errors import CanprobeError, InterfaceError
 from canprobe.fieldbus.bus.candump import read_candump
-from canprobe.fieldbus.bus.port import MonotonicClock, Port
+from canprobe.fieldbus.bus.clock import MonotonicClock
+from canprobe.fieldbus.bus.port import Port
+from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.real.link import missing_ip
 from canprobe.fieldbus.bus.real.python_can import open_port
 from canprobe.fieldbus.bus.real.socketcan import check_interface
-from canprobe.fieldbus.bus.sdo import PumpedNetwork, hold_dialogues, upload
+from canprobe.fieldbus.bus.sdo import hold_dialogues, upload
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, DriveState, state_of
-from canprobe.lab.studies.faults import draw_ends, scenario_scene
-from canprobe.lab.studies.harness import CHANNEL, Column, Row, StudyResult, measuring_facts
+from canprobe.lab.studies.fault_scenes import draw_ends, scenario_scene
+from canprobe.lab.studies.harness import CHANNEL, Column, Row, StudyResult
 from canprobe.lab.studies.realtime_cases import LATE_PERCENT, patient, with_real_nodes
+from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 
 RUNS = 40
@@ -115,9 +118,6 @@ def findings(rows: Sequence[Mapping[str, object]]) -> list[str]:
         f"{len(rows)} runs on {CHANNEL}, {len(failed)} failed.",
         *(f"seed {row['seed']}, {row['fault']}: {row['failures']}" for row in failed),
     ]
-
-
-# One run: master and emulated nodes are processes, and one of them is killed.
 
 
 @cache

@@ -26,7 +26,8 @@ from canprobe.cell.session.target import VIRTUAL, Target
 from canprobe.cell.session.terminal import Report
 from canprobe.errors import CanprobeError, SafetyStop, UsageError, install_line
 from canprobe.fieldbus.bus.files import make_folder, whole_file
-from canprobe.lab.studies.harness import Array, Row, model_digest
+from canprobe.lab.studies.cell_store import model_digest
+from canprobe.lab.studies.harness import Array, Row
 from canprobe.lab.studies.sweep import error_text, open_sweep
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from matplotlib.figure import SubFigure
 from canprobe.cell.results.picture import BLUE, GREY, INK, ORANGE, SKY, legend, log_scale, parts, picture
 from canprobe.cell.scene.model import TactileModeName
 from canprobe.fieldbus.bus.real.socketcan import check_interface
-from canprobe.lab.studies.harness import CHANNEL, Column, Row, Say, StudyResult, measuring_facts
+from canprobe.lab.studies.harness import CHANNEL, Column, Row, Say, StudyResult
 from canprobe.lab.studies.realtime_cases import (
     PATIENCE,
     CycleTimes,
@@ -31,6 +31,7 @@ from canprobe.lab.studies.realtime_cases import (
     measure_plain,
     measure_scan,
 )
+from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 
 RATES_HZ = (100, 200, 250, 400, 500, 625, 1000)

@@ -22,16 +22,18 @@ from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import Scene, TactileModeName
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.session.children import EmulatorChild
+from canprobe.cell.session.emulator_child import EmulatorChild
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.candump import read_candump
-from canprobe.fieldbus.bus.port import Clock, MonotonicClock
+from canprobe.fieldbus.bus.clock import Clock, MonotonicClock
 from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, realtime
 from canprobe.fieldbus.bus.real.python_can import open_port
-from canprobe.fieldbus.protocol.frames import SYNC_ID, SyncCounter
-from canprobe.lab.studies.harness import CHANNEL, on_any_bitrate
+from canprobe.fieldbus.protocol.frames import SYNC_ID
+from canprobe.fieldbus.protocol.sync import SyncCounter
+from canprobe.lab.studies.harness import CHANNEL
+from canprobe.lab.studies.no_bus import on_any_bitrate
 
 Times = NDArray[np.int64]
 

@@ -19,13 +19,14 @@ from canprobe.cell.planning.make import make_plan
 from canprobe.cell.results.picture import BLUE, ORANGE, legend, parts, picture
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.session.children import EmulatorChild
+from canprobe.cell.session.emulator_child import EmulatorChild
 from canprobe.cell.session.session import Session
 from canprobe.cell.session.target import Target
 from canprobe.cell.session.up import ROWS_OF_UP
 from canprobe.fieldbus.bus.real.socketcan import check_interface
-from canprobe.lab.studies.harness import CHANNEL, Column, Row, StudyResult, measuring_facts
+from canprobe.lab.studies.harness import CHANNEL, Column, Row, StudyResult
 from canprobe.lab.studies.realtime_cases import PATIENCE, patient, served, with_real_nodes
+from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 
 HOUR_S = 3600.0

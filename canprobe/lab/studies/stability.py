@@ -25,16 +25,10 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from canprobe.cell.results.picture import AMBER, BLUE, GREY, INK, ORANGE, PINK, legend, log_scale, parts, picture
-from canprobe.lab.studies.harness import Array, Column, Row, StudyResult, measuring_facts
-from canprobe.lab.studies.stability_runs import (
-    HUNTING,
-    Case,
-    ForceLoop,
-    carry_out,
-    loop_of,
-    spectral_radius,
-    touch_in_posture,
-)
+from canprobe.lab.studies.harness import Array, Column, Row, StudyResult
+from canprobe.lab.studies.linear_loop import ForceLoop, spectral_radius
+from canprobe.lab.studies.result_files import measuring_facts
+from canprobe.lab.studies.stability_runs import HUNTING, Case, carry_out, loop_of, touch_in_posture
 from canprobe.lab.studies.sweep import Sweep
 
 STIFFNESSES = (1e2, 1e3, 1e4, 2e4, 4e4, 6e4, 1e5, 1e6, 1e7)

@@ -24,24 +24,25 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
+from canprobe.cell.plant.arms import make_equations
 from canprobe.cell.plant.config import PlantConfig
-from canprobe.cell.plant.dynamic_arm import DynamicArm, Stepping, make_equations
+from canprobe.cell.plant.dynamic_arm import DynamicArm, Stepping
+from canprobe.cell.plant.elastic_contact import depth_for_force
 from canprobe.cell.plant.plant import Plant, PlantState
-from canprobe.cell.plant.probe import depth_for_force
 from canprobe.cell.results.picture import AMBER, BLUE, GREEN, GREY, INK, ORANGE, PINK, SHADE, legend, log_scale, picture
 from canprobe.cell.scene.arms import Bodies, arm_model
 from canprobe.cell.scene.load import read_cell
 from canprobe.cell.scene.setup import Dynamics
-from canprobe.lab.studies.harness import Array, Column, Row, StudyResult, measuring_facts
+from canprobe.lab.studies.harness import Array, Column, Row, StudyResult
+from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.lab.studies.workprec_cell import run_cell
-from canprobe.mechanics.robot.chain import tool_z_offset
-from canprobe.mechanics.robot.inverse import inverse_near, probe_pose, start_posture
-from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_per_motor, units_to_joints
+from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
+from canprobe.mechanics.robot.inverse import inverse_near
+from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_to_joints
+from canprobe.mechanics.robot.motors import units_per_motor
+from canprobe.mechanics.robot.probe_poses import probe_pose, start_posture
 from canprobe.mechanics.touch.objects import make_object
-
-# The motion: the probe starts at rest in contact and slides over the cylinder at 25 mm/s at the indentation of 2 N, one
-# straight ramp per cycle, as in the cell. Drives, links, friction and contact are on.
 
 CYCLE_NS = 2_500_000
 SPEED_M_S, FORCE_N = 0.025, 2.0

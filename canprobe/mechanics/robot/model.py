@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from canprobe.errors import PlanError
-from canprobe.mechanics.robot.chain import Array, Chain, forward_jacobian
+from canprobe.mechanics.robot.chain import Array, Chain
 
 METRES_PER_RADIAN = 0.2
 """Travel of a prismatic joint that counts as much as a radian of a revolute one: about the length of a link."""
@@ -247,46 +247,3 @@ def drive_position_at(model: ArmModel, axis: int, q: float, units: npt.ArrayLike
     rows, right = model.units_per_q.copy(), np.asarray(units, dtype=float) - model.zero_units
     rows[axis], right[axis] = np.eye(model.n)[axis], q
     return float(model.units_per_q[axis] @ np.linalg.solve(rows, right) + model.zero_units[axis])
-
-
-# Motor coordinates: the position of a drive divided by its units per own joint, so that without coupling they are the
-# joint positions. Rotor inertia, friction and drive torque act there, one motor each; rigid bodies move at the joints.
-
-
-def units_per_motor(model: ArmModel) -> Array:
-    """(n,) drive units per motor coordinate, negative where a drive counts backwards.
-
-    Args:
-        model: the arm.
-    """
-    return np.diag(model.units_per_q).copy()
-
-
-def joints_per_motor(model: ArmModel) -> Array:
-    """(n, n) joint positions per motor coordinate.
-
-    Args:
-        model: the arm.
-    """
-    return np.array(model.q_per_unit * units_per_motor(model), dtype=np.float64)
-
-
-def position_sigma(model: ArmModel, q: npt.ArrayLike, T_flange_tool: Array, direction: npt.ArrayLike) -> float:
-    """Standard deviation of the tool's position along a direction, m, as drives round to whole units.
-
-    Args:
-        model: the arm.
-        q: (n,) joint positions, rad or m.
-        T_flange_tool: (4, 4) tool in the flange frame, m.
-        direction: (3,) unit vector, base frame.
-
-    Source: a rounding error is uniform over one unit, of variance 1/12, and independent from drive to drive.
-    """
-    return float(np.linalg.norm(position_per_unit(model, q, T_flange_tool, direction))) / math.sqrt(12.0)
-
-
-def position_per_unit(model: ArmModel, q: npt.ArrayLike, T_flange_tool: Array, direction: npt.ArrayLike) -> Array:
-    """(n,) by how much a unit of each drive moves the tool along a direction, m; arguments as of `position_sigma`."""
-    _, J = forward_jacobian(model.chain, q, T_flange_tool)
-    per_unit: Array = np.asarray(direction, dtype=float) @ J[:3] @ model.q_per_unit
-    return per_unit

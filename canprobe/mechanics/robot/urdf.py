@@ -22,7 +22,8 @@ from xml.sax.saxutils import unescape
 import numpy as np
 
 from canprobe.errors import PlanError, regular_file
-from canprobe.mechanics.robot.chain import MOST_JOINTS, Array, Chain, rotation_rpy
+from canprobe.mechanics.robot.chain import MOST_JOINTS, Array, Chain
+from canprobe.mechanics.robot.denavit_hartenberg import rotation_rpy
 from canprobe.mechanics.robot.model import Body, Joint, lopsided_inertia, negative_inertia
 
 CONTINUOUS_RAD = 2 * math.pi
@@ -121,9 +122,6 @@ def limit_warning(source: str | Path, joint: Joint) -> str | None:
         f"{_named(source)}: {joint.name}: <limit> from {joint.q_min:g} to {joint.q_max:g} rad looks like degrees;"
         " correct it, or set min_deg and max_deg of the joint"
     )
-
-
-# What links look like, and where the meshes are that a file names.
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,4 +1,9 @@
-"""Small matrices, input checks, and frames on a tangent plane, as all of touch uses them."""
+"""Small matrices and input checks, as all of touch uses them.
+
+LAPACK is called by its own names: on matrices as small as these, numpy's wrappers cost four times the decomposition.
+For the same reason what runs in the loop says `A.dot(B)`, which costs half of `A @ B`, and works on single vectors
+and 2x2 matrices in plain floats.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +21,6 @@ Array = NDArray[np.float64]
 Vec = tuple[float, float, float]
 _T = TypeVar("_T")
 _UPPER, _IDENTITY = np.triu(np.ones((16, 16))), np.eye(16)
-
-# LAPACK is called by its own names: on matrices as small as these, numpy's wrappers cost four times the decomposition.
-# For the same reason what runs in the loop says `A.dot(B)`, which costs half of `A @ B`, and works on single vectors
-# and 2x2 matrices in plain floats.
 
 
 def upper_root(A: Array) -> Array:
@@ -161,63 +162,3 @@ def instance(name: str, value: Any, kind: type[_T]) -> _T:
 def _spell(shape: Sequence[int | None]) -> str:
     sides = ", ".join("n" if side is None else str(side) for side in shape)
     return f"({sides},)" if len(shape) == 1 else f"({sides})"
-
-
-# Frames on a tangent plane, and small rotations.
-
-_AXIS_LIMIT = 0.95
-"""Above this |component| of the normal the frame's own x axis is too close to it, and y is used."""
-
-
-def tangent_rotation(z_axis: Sequence[float] | Array) -> Array:
-    """Right-handed axes (3, 3), columns x, y, z, with a given unit z; x is the parent frame's x on the tangent plane.
-
-    Where z is within 18° of the parent's x axis, the parent's y axis is laid on the plane instead. The choice depends
-    on z alone, so that two nearly equal normals give nearly equal axes.
-    """
-    zx, zy, zz = float(z_axis[0]), float(z_axis[1]), float(z_axis[2])
-    if abs(zx) <= _AXIS_LIMIT:
-        scale = 1.0 / math.sqrt(max(zy * zy + zz * zz, 1e-300))
-        xx, xy, xz = (zy * zy + zz * zz) * scale, -zx * zy * scale, -zx * zz * scale
-    else:
-        scale = 1.0 / math.sqrt(zx * zx + zz * zz)
-        xx, xy, xz = -zy * zx * scale, (zx * zx + zz * zz) * scale, -zy * zz * scale
-    return np.array([[xx, zy * xz - zz * xy, zx], [xy, zz * xx - zx * xz, zy], [xz, zx * xy - zy * xx, zz]])
-
-
-def transported(x_axis: Vec, z_axis: Vec) -> tuple[Vec, Vec]:
-    """Axes x and y, turned the shortest way so that their z becomes a unit vector: parallel transport over a step."""
-    x, y, z = x_axis
-    u, v, w = z_axis
-    along = x * u + y * v + z * w
-    x, y, z = x - along * u, y - along * v, z - along * w
-    size = math.sqrt(x * x + y * y + z * z)
-    if size < 1e-6:
-        first, second, _ = tangent_rotation(z_axis).T.tolist()
-        return first, second
-    x, y, z = x / size, y / size, z / size
-    return (x, y, z), (v * z - w * y, w * x - u * z, u * y - v * x)
-
-
-def homogeneous(R: Array, origin: Sequence[float] | Array) -> Array:
-    """The 4x4 matrix of a rotation and an origin."""
-    T = np.zeros((4, 4))
-    T[:3, :3] = R
-    T[:3, 3] = origin
-    T[3, 3] = 1.0
-    return T
-
-
-def inverse_transform(T: Array) -> Array:
-    """The inverse of a rigid 4x4 transform."""
-    R = T[:3, :3].T
-    return homogeneous(R, -R @ T[:3, 3])
-
-
-def rotation_vectors(R: Array) -> Array:
-    """The rotation vectors (n, 3) (angle times axis, rad) of rotations (n, 3, 3) below a half turn."""
-    w = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
-    sine = 0.5 * np.linalg.norm(w, axis=1)
-    angle = np.arctan2(sine, 0.5 * (np.trace(R, axis1=1, axis2=2) - 1.0))
-    small = sine < 1e-12
-    return np.asarray(w * np.where(small, 0.5, 0.5 * angle / np.where(small, 1.0, sine))[:, None])

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.mechanics.robot.chain import Posture, Vec, ending_in, jacobian, pose_of, posture
-from canprobe.mechanics.robot.inverse import damped_step, in_rows, task_rows
+from canprobe.mechanics.robot.damped_inverse import damped_step
+from canprobe.mechanics.robot.inverse import in_rows, task_rows
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.touch.servo import ProbePose
 

@@ -17,16 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.linear_algebra import (
-    MAX_MAGNITUDE,
-    Array,
-    checked,
-    homogeneous,
-    instance,
-    read_only,
-    real,
-    tangent_rotation,
-)
+from canprobe.mechanics.touch.linear_algebra import MAX_MAGNITUDE, Array, checked, instance, read_only, real
+from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,10 +7,11 @@ from node_fuzz import Watched, rage
 from canprobe.cell.emulated.array import TactileApplication, make_tactile_node
 from canprobe.cell.master.tactile_frame import decode
 from canprobe.fieldbus.eds.packaged import load_eds
-from canprobe.fieldbus.node.serve import keep_in_file
 from canprobe.fieldbus.node.slave_node import SlaveNode
+from canprobe.fieldbus.node.stored_file import keep_in_file
 from canprobe.fieldbus.protocol.frames import NmtState
-from canprobe.fieldbus.protocol.tactile import WINDOWS, FrameAssembler, TactileMode, window_words
+from canprobe.fieldbus.protocol.tactile import WINDOWS, TactileMode, window_words
+from canprobe.fieldbus.protocol.tactile_assembler import FrameAssembler
 
 MS = 1_000_000
 CYCLE = 2_500_000

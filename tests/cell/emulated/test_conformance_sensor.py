@@ -12,7 +12,8 @@ from canprobe.cell.emulated.array import TactileApplication
 from canprobe.cell.master.tactile_frame import decode
 from canprobe.fieldbus.eds.packaged import load_eds
 from canprobe.fieldbus.node.slave_node import SlaveNode
-from canprobe.fieldbus.protocol.tactile import FrameAssembler, TactileMode
+from canprobe.fieldbus.protocol.tactile import TactileMode
+from canprobe.fieldbus.protocol.tactile_assembler import FrameAssembler
 
 OFF = 0x80000000
 SAVE, TARE = 0x65766173, 0x65726174

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from canprobe.fieldbus.bus.port import VirtualClock
+from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus, Participant
-from canprobe.fieldbus.node.faults import Fault, FaultKind, FaultyNode
+from canprobe.fieldbus.node.fault import Fault, FaultKind
+from canprobe.fieldbus.node.faults import FaultyNode
 
 MS = 1_000_000
 ID = 0x185

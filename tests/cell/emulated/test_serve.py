@@ -14,7 +14,8 @@ from canprobe.cell.emulated.world import TruthRecorder
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.setup import Homing
 from canprobe.errors import BusError
-from canprobe.fieldbus.bus.port import PlainPort, VirtualClock
+from canprobe.fieldbus.bus.clock import VirtualClock
+from canprobe.fieldbus.bus.port import PlainPort
 from canprobe.fieldbus.bus.virtual.lockstep import EVERY_ID, LockstepBus, Participant
 from canprobe.fieldbus.drive.drive import make_drive_node
 from canprobe.fieldbus.eds.packaged import load_eds

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import canprobe
-from canprobe.cell.scene.geometry import with_tool
+from canprobe.cell.results.tool_file import with_tool
 from canprobe.errors import PlanError, SafetyStop, SceneError
 from canprobe.mechanics.touch.probe_motion import ArcMotion
 from canprobe.mechanics.touch.servo import ProbePose

@@ -17,7 +17,8 @@ from canprobe.api import OpenCell
 from canprobe.cli import main
 from canprobe.errors import NodeError, SafetyStop
 from canprobe.fieldbus.bus.candump import read_candump
-from canprobe.fieldbus.node.faults import Fault, FaultKind, FaultyNode
+from canprobe.fieldbus.node.fault import Fault, FaultKind
+from canprobe.fieldbus.node.faults import FaultyNode
 
 MS = 1_000_000
 FILES = {"bus.log", "log.npz", "scene.toml", "summary.json", "truth.npz"}

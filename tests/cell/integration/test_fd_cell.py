@@ -10,7 +10,7 @@ import canprobe
 from canprobe.cell.master.array import make_tactile
 from canprobe.errors import BusError, PlanError
 from canprobe.fieldbus.bus.candump import read_candump
-from canprobe.fieldbus.bus.port import VirtualClock
+from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 
 PERIOD_NS = 2_500_000

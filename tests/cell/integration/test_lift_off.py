@@ -20,10 +20,11 @@ from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cell.tasks.probing import Phase
 from canprobe.errors import SafetyStop
 from canprobe.fieldbus.bus.port import ControllerState
-from canprobe.fieldbus.bus.real.processor import Terminated
-from canprobe.fieldbus.node.faults import FaultKind
+from canprobe.fieldbus.bus.real.interrupts import Terminated
+from canprobe.fieldbus.node.fault import FaultKind
 from canprobe.fieldbus.protocol.cia402 import DriveState, state_of
-from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, Emcy, NmtCommand, NmtState, pack_nmt
+from canprobe.fieldbus.protocol.emcy import Emcy
+from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, NmtCommand, NmtState, pack_nmt
 
 
 def lifted(run):

@@ -16,7 +16,7 @@ from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cli import main
 from canprobe.errors import UsageError
-from canprobe.fieldbus.bus.port import VirtualClock
+from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 
 

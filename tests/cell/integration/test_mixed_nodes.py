@@ -13,7 +13,7 @@ from canprobe.cell.master.cell import Cell
 from canprobe.cell.master.controller import Command
 from canprobe.cell.session.session import Session
 from canprobe.errors import UsageError
-from canprobe.fieldbus.bus.port import VirtualClock
+from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
 

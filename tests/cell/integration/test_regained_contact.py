@@ -11,7 +11,7 @@ from canprobe.cell.scene.model import PlantSettings
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cell.tasks.probing import Phase
-from canprobe.lab.studies.fault_scores import Witness
+from canprobe.lab.studies.witnessed_run import Witness
 
 TARGET = 2.0
 AT_CYCLE = 900

@@ -13,7 +13,7 @@ import pytest
 from undrawn import undrawn, undrawn_run
 
 import canprobe
-from canprobe.cell.master.cycle import Observation
+from canprobe.cell.master.observers import Observation
 from canprobe.cell.npz import read_npz
 from canprobe.cell.results.summary import RunResult
 from canprobe.cell.scene.load import packaged_files

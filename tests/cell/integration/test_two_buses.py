@@ -12,7 +12,8 @@ from canprobe.cell.recorded.recording import read_recording
 from canprobe.cell.session.session import Session
 from canprobe.errors import InterfaceError
 from canprobe.fieldbus.bus.candump import read_candump
-from canprobe.fieldbus.bus.port import JoinedPort, VirtualClock
+from canprobe.fieldbus.bus.clock import VirtualClock
+from canprobe.fieldbus.bus.joined import JoinedPort
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus, Participant
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
 from canprobe.fieldbus.protocol.frames import NmtState

@@ -12,7 +12,7 @@ import canprobe.fieldbus.eds.packaged
 from canprobe.cell.planning.configuration import make_setups
 from canprobe.cell.planning.pdos import tactile_objects
 from canprobe.cell.planning.window import patch_across_taxels, patch_radius_m, window_choices
-from canprobe.cell.plant.probe import elastic_contact
+from canprobe.cell.plant.elastic_contact import elastic_contact
 from canprobe.cell.scene.load import dump_scene, parse_scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.scene.setup import Probe

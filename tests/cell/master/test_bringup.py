@@ -20,8 +20,9 @@ from canprobe.errors import BusError, InterfaceError, NodeError
 from canprobe.fieldbus.bus.sdo import upload
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.eds.packaged import eds_path
-from canprobe.fieldbus.node.dictionary import Abort, SdoAbort
-from canprobe.fieldbus.node.faults import Fault, FaultKind, FaultyNode
+from canprobe.fieldbus.node.abort import Abort, SdoAbort
+from canprobe.fieldbus.node.fault import Fault, FaultKind
+from canprobe.fieldbus.node.faults import FaultyNode
 
 MS = 1_000_000
 

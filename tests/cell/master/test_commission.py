@@ -7,23 +7,19 @@ from functools import partial
 import numpy as np
 import pytest
 
-from canprobe.cell.master.commission import (
-    Assignment,
-    Wanted,
-    assign,
-    choose_assignments,
-    commission,
-    find_unconfigured,
-)
+from canprobe.cell.master.commission import commission
+from canprobe.cell.master.id_assignment import Assignment, Wanted, choose_assignments
+from canprobe.cell.master.lss_session import assign, find_unconfigured
 from canprobe.errors import BusError, NodeError
-from canprobe.fieldbus.bus.port import VirtualClock
-from canprobe.fieldbus.bus.sdo import Lss, PumpedNetwork
+from canprobe.fieldbus.bus.clock import VirtualClock
+from canprobe.fieldbus.bus.lss import Lss
+from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 from canprobe.fieldbus.bus.virtual.timed import TimedBus
 from canprobe.fieldbus.drive.from_eds import set_serial_number
 from canprobe.fieldbus.eds.packaged import load_eds
 from canprobe.fieldbus.node.slave_node import SlaveNode
-from canprobe.fieldbus.protocol.frames import LssAddress, LssState
+from canprobe.fieldbus.protocol.lss import LssAddress, LssState
 
 EDS = "puma260_joint"
 ANY = (None, None, None)

@@ -8,7 +8,8 @@ from undrawn import undrawn, undrawn_run
 
 import canprobe
 from canprobe.cell.master.controller import Command
-from canprobe.cell.master.cycle import MOST_FRAMES, SYNCS_REMEMBERED, Cycle, Intake, Observers
+from canprobe.cell.master.cycle import SYNCS_REMEMBERED, Cycle, Intake
+from canprobe.cell.master.observers import MOST_FRAMES, Observers
 from canprobe.fieldbus.bus.candump import read_candump
 from canprobe.fieldbus.protocol.frames import SYNC_ID
 

@@ -7,17 +7,12 @@ import pytest
 from puma_arm import MODELS
 
 from canprobe.cell.master.array import TactileReceiver
-from canprobe.cell.master.drives import (
-    REST_COUNTS_LEAST,
-    REST_NS,
-    DriveAxis,
-    DriveGroup,
-    PositionTrack,
-    rest_counts,
-)
+from canprobe.cell.master.drives import DriveAxis, DriveGroup
+from canprobe.cell.master.position_track import REST_COUNTS_LEAST, REST_NS, PositionTrack, rest_counts
 from canprobe.fieldbus.protocol.cia402 import DriveState, OperationMode
 from canprobe.fieldbus.protocol.pdo import PdoEntry, PdoLayout
-from canprobe.fieldbus.protocol.tactile import FrameAssembler, TactileHeader, TactileMode, pack_whole
+from canprobe.fieldbus.protocol.tactile import TactileHeader, TactileMode, pack_whole
+from canprobe.fieldbus.protocol.tactile_assembler import FrameAssembler
 from canprobe.mechanics.robot.model import joints_to_units, units_to_joints
 
 STATUS, POSITION, TORQUE = PdoEntry(0x6041, 0, 16), PdoEntry(0x6064, 0, 32, True), PdoEntry(0x6077, 0, 16, True)

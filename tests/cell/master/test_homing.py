@@ -18,11 +18,12 @@ from canprobe.cell.master.cell import Cell
 from canprobe.cell.master.controller import Command
 from canprobe.cell.plant.plant import Plant
 from canprobe.cell.session.session import Session
-from canprobe.cell.tasks.free_and_listen import Answer
+from canprobe.cell.tasks.joint_finding import Answer
 from canprobe.errors import CanprobeError, NodeError, UsageError
-from canprobe.fieldbus.bus.port import VirtualClock
+from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus, Participant
-from canprobe.fieldbus.node.faults import Fault, FaultKind, FaultyNode
+from canprobe.fieldbus.node.fault import Fault, FaultKind
+from canprobe.fieldbus.node.faults import FaultyNode
 from canprobe.fieldbus.protocol.cia402 import DriveState
 from canprobe.fieldbus.protocol.frames import NmtCommand, pack_nmt
 

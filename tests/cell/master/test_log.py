@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from canprobe.cell.master.cycle import CycleStatistics
-from canprobe.cell.master.log import KINDS_KEPT, OTHERS, Notes, RunLog, nodes_text
+from canprobe.cell.master.log import RunLog
+from canprobe.cell.master.notes import KINDS_KEPT, OTHERS, Notes, nodes_text
 
 
 def rows(count):

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from canprobe.cell.master.tactile_frame import decode
-from canprobe.fieldbus.protocol.tactile import Features, TactileHeader, TactileMessage, TactileMode
+from canprobe.fieldbus.protocol.tactile import Features, TactileHeader, TactileMode
+from canprobe.fieldbus.protocol.tactile_assembler import TactileMessage
 
 
 @pytest.mark.parametrize("shape", [(16, 16), (12, 9)])

@@ -7,7 +7,8 @@ import sys
 import pytest
 
 from canprobe.cell.master.watch import UNTOLD, NodeWatch
-from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, Emcy
+from canprobe.fieldbus.protocol.emcy import Emcy
+from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE
 
 SYNC_LOST, OVERHEATED, OVERCURRENT = 0x8100, 0x4210, 0x2310
 

@@ -10,9 +10,10 @@ import pytest
 from scenes import change
 
 import canprobe
-from canprobe.cell.planning.devices import Abilities
+from canprobe.cell.planning.abilities import Abilities
 from canprobe.cell.planning.make import make_plan
-from canprobe.cell.planning.report import plan_dict, plan_text
+from canprobe.cell.planning.report import plan_text
+from canprobe.cell.planning.report_json import plan_dict
 from canprobe.cell.scene.load import load_scene, packaged_scenes
 from canprobe.cell.scene.resolve import resolve
 

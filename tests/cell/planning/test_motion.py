@@ -9,7 +9,7 @@ import pytest
 from scenes import change, reasons, with_joints
 
 import canprobe
-from canprobe.cell.planning.motion import surface_path
+from canprobe.cell.planning.surface_path import surface_path
 from canprobe.cell.scene.geometry import true_object
 from canprobe.cell.scene.load import load_scene, packaged_scenes
 from canprobe.cell.scene.model import ObjectSettings

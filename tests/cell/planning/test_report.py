@@ -7,7 +7,7 @@ import pytest
 from scenes import change
 
 import canprobe
-from canprobe.cell.planning.report import timeline, timeline_rows
+from canprobe.cell.planning.timeline import timeline, timeline_rows
 from canprobe.cell.planning.traffic import on_the_wire
 from canprobe.cell.scene.load import load_scene
 from canprobe.cli import main

@@ -10,11 +10,12 @@ from makes import write_eds
 from scenes import change, reasons, refused, ways_out, with_joints, without_torque
 
 import canprobe
-from canprobe.cell.planning.devices import Abilities, identifier_problems
+from canprobe.cell.planning.abilities import Abilities
+from canprobe.cell.planning.devices import identifier_problems
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.measured import expected_messages
 from canprobe.cell.planning.model import Interpolation, PlannedPdo
-from canprobe.cell.planning.report import plan_dict
+from canprobe.cell.planning.report_json import plan_dict
 from canprobe.cell.planning.traffic import controller_starts
 from canprobe.cell.scene.load import dump_scene, load_scene, parse_scene
 from canprobe.cell.scene.resolve import resolve

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from canprobe.cell.plant.probe import depth_for_force
+from canprobe.cell.plant.elastic_contact import depth_for_force
 from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig
 from canprobe.cell.results.array_report import as_document, calibration_text
 from canprobe.cell.scene.calibrations import dump_calibration, load_calibration
@@ -14,9 +14,10 @@ from canprobe.errors import SceneError, UsageError
 from canprobe.lab.studies.arrays import RADIUS_M, Presses, measure, random_array
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.patch.calibrate import calibrate_array
+from canprobe.mechanics.touch.patch.creep import PadMemory
 from canprobe.mechanics.touch.patch.image import compute_patch
 from canprobe.mechanics.touch.patch.image_model import make_patch_calibration
-from canprobe.mechanics.touch.patch.moments import MomentImage, PadMemory
+from canprobe.mechanics.touch.patch.moments import MomentImage
 
 
 @pytest.fixture(scope="module")

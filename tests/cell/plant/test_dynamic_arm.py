@@ -8,16 +8,20 @@ import pytest
 from puma_arm import BODIES, ELBOW_FORM, MODELS, UPENN
 from scipy.integrate import solve_ivp
 
+from canprobe.cell.plant.arms import make_arm, make_equations
 from canprobe.cell.plant.config import PlantConfig
-from canprobe.cell.plant.dynamic_arm import NEVER, DynamicArm, Reference, Stepping, make_arm, make_equations
+from canprobe.cell.plant.dynamic_arm import DynamicArm, Stepping
 from canprobe.cell.plant.equations import Effects
 from canprobe.cell.plant.ideal_arm import IdealArm
 from canprobe.cell.plant.plant import Plant
+from canprobe.cell.plant.ramps import NEVER, Reference
 from canprobe.cell.scene.setup import Dynamics
 from canprobe.errors import PlanError
-from canprobe.mechanics.robot.chain import Chain, forward, forward_jacobian, from_dh, tool_z_offset
-from canprobe.mechanics.robot.inverse import start_posture
-from canprobe.mechanics.robot.model import ArmModel, Body, Joint, joints_per_motor, joints_to_units, units_per_motor
+from canprobe.mechanics.robot.chain import Chain, forward, forward_jacobian
+from canprobe.mechanics.robot.denavit_hartenberg import from_dh, tool_z_offset
+from canprobe.mechanics.robot.model import ArmModel, Body, Joint, joints_to_units
+from canprobe.mechanics.robot.motors import joints_per_motor, units_per_motor
+from canprobe.mechanics.robot.probe_poses import start_posture
 from canprobe.mechanics.touch.objects import make_object
 
 CYCLE = 2_500_000

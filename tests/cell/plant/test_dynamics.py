@@ -10,7 +10,8 @@ from puma_arm import BODIES, MODELS, UPENN
 
 from canprobe.cell.scene.load import read_cell
 from canprobe.errors import PlanError
-from canprobe.mechanics.robot.chain import forward, from_dh, link_transforms, tool_z_offset
+from canprobe.mechanics.robot.chain import forward, link_transforms
+from canprobe.mechanics.robot.denavit_hartenberg import from_dh, tool_z_offset
 from canprobe.mechanics.robot.dynamics import RigidBody, ball, dynamics_problem, joined
 from canprobe.mechanics.robot.model import Body
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from canprobe.cell.plant.equations import STEPS, Linearised, adaptive, exponential
+from canprobe.cell.plant.integrators import STEPS, Linearised, adaptive, exponential
 
 
 class Spring:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from canprobe.cell.emulated.array import follow, middle
+from canprobe.cell.emulated.image_processing import follow, middle
 from canprobe.cell.planning.window import CARRIED_ERROR, CARRIED_SHARE, CARRIED_SIDE, measured_share
-from canprobe.cell.plant.probe import depth_for_force
+from canprobe.cell.plant.elastic_contact import depth_for_force
 from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig
 from canprobe.cell.scene.setup import Probe
 from canprobe.fieldbus.protocol.tactile import SIDE
-from canprobe.mechanics.touch.patch.image import Continuation, PatchCalibration, compute_patch
+from canprobe.mechanics.touch.patch.beyond_window import Continuation
+from canprobe.mechanics.touch.patch.image import PatchCalibration, compute_patch
 
 EXACT = PatchCalibration()
 PITCH = EXACT.pitch_m

@@ -6,18 +6,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from canprobe.cell.plant.probe import depth_for_force
+from canprobe.cell.plant.elastic_contact import depth_for_force
 from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig
 from canprobe.errors import UsageError
 from canprobe.fieldbus.protocol.tactile import SIDE
 from canprobe.mechanics.touch.contact import Doubt
 from canprobe.mechanics.touch.pad import Pad
-from canprobe.mechanics.touch.patch.image import (
-    PatchCalibration,
-    compute_patch,
-    mended,
-    patch_from_features,
-)
+from canprobe.mechanics.touch.patch.dead_taxels import mended
+from canprobe.mechanics.touch.patch.image import PatchCalibration, compute_patch, patch_from_features
 from canprobe.mechanics.touch.patch.moments import MomentImage
 
 PITCH = 1.5875e-3

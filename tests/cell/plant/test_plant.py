@@ -8,13 +8,16 @@ from puma_arm import BODIES, ELBOW_FORM, UPENN
 from scipy.spatial.transform import Rotation
 
 from canprobe.cell.plant.config import PlantConfig, PressMotion
+from canprobe.cell.plant.elastic_contact import depth_for_force
 from canprobe.cell.plant.plant import Plant
-from canprobe.cell.plant.probe import depth_for_force
-from canprobe.cell.plant.taxels import IDEAL_TAXELS, pad_direction
+from canprobe.cell.plant.pressure import pad_direction
+from canprobe.cell.plant.taxels import IDEAL_TAXELS
 from canprobe.errors import PlanError
-from canprobe.mechanics.robot.chain import forward, forward_jacobian, tool_z_offset
-from canprobe.mechanics.robot.inverse import inverse_near, start_posture
+from canprobe.mechanics.robot.chain import forward, forward_jacobian
+from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
+from canprobe.mechanics.robot.inverse import inverse_near
 from canprobe.mechanics.robot.model import joints_to_units, units_to_joints
+from canprobe.mechanics.robot.probe_poses import start_posture
 from canprobe.mechanics.touch.objects import make_object
 
 PITCH_M = 1.5875e-3

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from canprobe.cell.plant.probe import elastic_contact
+from canprobe.cell.plant.elastic_contact import elastic_contact
 from canprobe.mechanics.touch.objects import make_object
 
 SPACING, BALL = 5e-4, 0.03

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from canprobe.cell.plant.probe import NO_CONTACT, depth_for_force, elastic_contact
+from canprobe.cell.plant.elastic_contact import NO_CONTACT, depth_for_force, elastic_contact
 
 K, R = 1.27e8, 0.040
 PLANE, CYLINDER, SADDLE = (0.0, 0.0), (1 / 0.036, 0.0), (1 / 0.06, -1 / 0.08)

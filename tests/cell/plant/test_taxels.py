@@ -8,16 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from canprobe.cell.plant.probe import depth_for_force
-from canprobe.cell.plant.taxels import (
-    IDEAL_TAXELS,
-    PressureField,
-    TaxelArray,
-    TaxelConfig,
-    pad_basis,
-    pad_coordinates,
-    pad_direction,
-)
+from canprobe.cell.plant.elastic_contact import depth_for_force
+from canprobe.cell.plant.pressure import PressureField, pad_basis, pad_coordinates, pad_direction
+from canprobe.cell.plant.taxels import IDEAL_TAXELS, TaxelArray, TaxelConfig
 
 K, R = 1.27e8, 0.040
 PLANE, CYLINDER, SADDLE = (0.0, 0.0), (1 / 0.036, 0.0), (1 / 0.06, -1 / 0.08)

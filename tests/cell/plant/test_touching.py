@@ -7,18 +7,21 @@ import numpy as np
 import pytest
 from puma_arm import BODIES, ELBOW_FORM, UPENN
 
+from canprobe.cell.plant.arms import make_equations
 from canprobe.cell.plant.config import PlantConfig
-from canprobe.cell.plant.dynamic_arm import make_equations
-from canprobe.cell.plant.equations import Effects, rosenbrock2
+from canprobe.cell.plant.elastic_contact import elastic_contact
+from canprobe.cell.plant.equations import Effects
+from canprobe.cell.plant.integrators import rosenbrock2
 from canprobe.cell.plant.plant import Plant
-from canprobe.cell.plant.probe import elastic_contact
-from canprobe.cell.plant.pushing import force_laws, total_force
+from canprobe.cell.plant.several_contacts import force_laws, total_force
 from canprobe.cell.plant.taxels import IDEAL_TAXELS
 from canprobe.cell.scene.setup import Dynamics
 from canprobe.fieldbus.protocol.tactile import SIDE
-from canprobe.mechanics.robot.chain import forward, forward_jacobian, tool_z_offset
-from canprobe.mechanics.robot.inverse import start_posture
-from canprobe.mechanics.robot.model import joints_per_motor, joints_to_units
+from canprobe.mechanics.robot.chain import forward, forward_jacobian
+from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
+from canprobe.mechanics.robot.model import joints_to_units
+from canprobe.mechanics.robot.motors import joints_per_motor
+from canprobe.mechanics.robot.probe_poses import start_posture
 from canprobe.mechanics.touch.objects import make_object
 from canprobe.mechanics.touch.shapes import LIP_M
 

@@ -19,7 +19,7 @@ from canprobe.cell.results.summary import log_columns, tactile_columns
 from canprobe.cell.scene.load import dump_scene
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.fieldbus.bus.candump import CandumpWriter, RecordingPort
-from canprobe.fieldbus.bus.port import VirtualClock
+from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 
 DURATION_S = 1.1

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import canprobe
-from canprobe.cell.results.files import FORMAT_VERSION, load_surface_map, save_surface_map
+from canprobe.cell.results.surface_file import FORMAT_VERSION, load_surface_map, save_surface_map
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.estimate.fit import fit_surface
 from canprobe.mechanics.touch.surface_map import LocalPatch, SurfaceMap

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from canprobe.cell.scene.geometry import T_base_object, T_flange_probe, scan_axes, true_object
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import ObjectSettings, ProbeSettings, TaskSettings
-from canprobe.mechanics.robot.chain import rotation_rpy
+from canprobe.mechanics.robot.denavit_hartenberg import rotation_rpy
 
 
 @pytest.mark.parametrize("angles", [(0.3, 0, 0), (0, 0.4, 0), (0, 0, -0.5), (0.3, -0.4, 2.5), (-3, 1.5, 0.1)])

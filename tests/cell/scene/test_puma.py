@@ -9,7 +9,8 @@ import pytest
 from puma_arm import ELBOW_FORM, MODELS, UPENN
 
 from canprobe.cell.scene.load import read_cell
-from canprobe.mechanics.robot.chain import forward, tool_z_offset
+from canprobe.mechanics.robot.chain import forward
+from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
 from canprobe.mechanics.robot.model import joints_to_units
 
 

@@ -12,9 +12,10 @@ import pytest
 
 import canprobe
 from canprobe.cell.master.cell import Cell
-from canprobe.cell.session.children import END_TIMEOUT_S, EmulatorChild
+from canprobe.cell.session.emulator_child import END_TIMEOUT_S, EmulatorChild
 from canprobe.errors import BusError, NodeError
-from canprobe.fieldbus.bus.port import MonotonicClock, Port, TimedFrame, VirtualClock
+from canprobe.fieldbus.bus.clock import MonotonicClock, VirtualClock
+from canprobe.fieldbus.bus.port import Port, TimedFrame
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus, Participant
 from canprobe.fieldbus.protocol.frames import Frame
 

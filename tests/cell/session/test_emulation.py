@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from canprobe.cell.planning.choices import ON_THIS_MACHINE
+from canprobe.cell.planning.warnings import ON_THIS_MACHINE
 from canprobe.cli import main
-from canprobe.fieldbus.bus.port import VirtualClock
+from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 from canprobe.fieldbus.eds.packaged import load_eds
 

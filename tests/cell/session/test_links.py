@@ -10,9 +10,11 @@ import pytest
 
 import canprobe
 import canprobe.cli
-from canprobe.cell.session.links import Expected, check_link, check_links, expected_of
+from canprobe.cell.session.link_faults import Expected, check_link, expected_of
+from canprobe.cell.session.links import check_links
 from canprobe.errors import InterfaceError
-from canprobe.fieldbus.bus.port import ControllerState, VirtualClock
+from canprobe.fieldbus.bus.clock import VirtualClock
+from canprobe.fieldbus.bus.port import ControllerState
 from canprobe.fieldbus.bus.real.link import LinkState, parse_link, read_link, setting_line, sudo
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 
@@ -263,7 +265,7 @@ def silent_bus(ip, monkeypatch):
     """can0 in the time of its own clock, with nobody on it."""
     bus = LockstepBus(VirtualClock())
     monkeypatch.setattr("canprobe.fieldbus.bus.real.python_can.open_port", lambda *_, **__: bus.port())
-    monkeypatch.setattr("canprobe.fieldbus.bus.port.MonotonicClock", lambda: bus.clock)
+    monkeypatch.setattr("canprobe.fieldbus.bus.clock.MonotonicClock", lambda: bus.clock)
     monkeypatch.setattr("canprobe.cell.session.session.MonotonicClock", lambda: bus.clock)
     return bus
 

@@ -13,12 +13,13 @@ from canprobe.cell.master.controller import Command
 from canprobe.cell.session import up as joint_report
 from canprobe.cell.session.session import Session
 from canprobe.cell.session.up import reporting_notes
-from canprobe.cell.tasks.free_and_listen import Answer
+from canprobe.cell.tasks.joint_finding import Answer
 from canprobe.cli import main
 from canprobe.errors import NodeError, SafetyStop, UsageError
-from canprobe.fieldbus.node.dictionary import key_of
+from canprobe.fieldbus.node.entry import key_of
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
-from canprobe.fieldbus.protocol.frames import EMCY_BASE, Emcy
+from canprobe.fieldbus.protocol.emcy import Emcy
+from canprobe.fieldbus.protocol.frames import EMCY_BASE
 
 REPORTED = "by its encoders the arm stands at"
 

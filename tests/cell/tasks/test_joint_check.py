@@ -13,7 +13,8 @@ from puma_arm import UPENN
 import canprobe
 from canprobe.cell.master.controller import Measurement
 from canprobe.cell.master.supervisor import JointGuard
-from canprobe.cell.tasks.free_and_listen import Answer, JointCheck
+from canprobe.cell.tasks.joint_check import JointCheck
+from canprobe.cell.tasks.joint_finding import Answer
 from canprobe.cli.operator import TerminalOperator
 from canprobe.mechanics.robot.model import joints_to_units, units_to_joints
 

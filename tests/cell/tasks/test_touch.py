@@ -10,9 +10,10 @@ import pytest
 import canprobe
 from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.session.session import Session
-from canprobe.cell.tasks.from_plan import FORCE_RATE, Request, RequestedTask, make_task
+from canprobe.cell.tasks.from_plan import make_task
+from canprobe.cell.tasks.regain import losses_text, summarise_losses
+from canprobe.cell.tasks.requested import FORCE_RATE, Request, RequestedTask
 from canprobe.cell.tasks.task import Loss
-from canprobe.cell.tasks.touch import losses_text, summarise_losses
 from canprobe.errors import UsageError
 
 FOUND = {"searched_mm": 0.93, "regained_after_ms": 465.0}

@@ -10,7 +10,7 @@ import canprobe
 from canprobe.cell.master.controller import Measurement
 from canprobe.cell.scene.load import dump_scene, parse_scene
 from canprobe.cell.tasks import Trajectory
-from canprobe.cell.tasks.from_plan import Request, RequestedTask
+from canprobe.cell.tasks.requested import Request, RequestedTask
 from canprobe.errors import SafetyStop, UsageError
 
 PLAN = canprobe.plan(canprobe.load_scene("free"))

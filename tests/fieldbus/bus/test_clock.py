@@ -10,11 +10,14 @@ from contextlib import ExitStack, contextmanager
 
 import pytest
 
-from canprobe.fieldbus.bus.port import JoinedPort, MonotonicClock, Reports, VirtualClock
+from canprobe.fieldbus.bus.clock import MonotonicClock, VirtualClock
+from canprobe.fieldbus.bus.joined import JoinedPort
+from canprobe.fieldbus.bus.port import Reports
 from canprobe.fieldbus.bus.real.mmsg import Row
 from canprobe.fieldbus.bus.real.socketcan import SocketCanPort, StampClock
-from canprobe.fieldbus.protocol.frames import Frame, pack_sync
+from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.protocol.raw_image import FramePattern, ImageAssembler, ImageFormat
+from canprobe.fieldbus.protocol.sync import pack_sync
 
 
 def test_virtual_time_stands_still_and_jumps() -> None:

@@ -10,7 +10,7 @@ import can
 import pytest
 
 from canprobe.errors import InterfaceError
-from canprobe.fieldbus.bus.port import MonotonicClock
+from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.real.mmsg import FrameSocket
 from canprobe.fieldbus.bus.real.python_can import open_port
 

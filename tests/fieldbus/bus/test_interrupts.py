@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from canprobe.fieldbus.bus.real.processor import Interrupts, Terminated
+from canprobe.fieldbus.bus.real.interrupts import Interrupts, Terminated
 
 BOTH = [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated), (signal.SIGHUP, Terminated)]
 

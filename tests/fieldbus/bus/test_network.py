@@ -10,13 +10,12 @@ import pytest
 from canopen.objectdictionary import ODVariable
 from canopen.sdo import SdoAbortedError, SdoCommunicationError
 
-from canprobe.fieldbus.bus.port import VirtualClock
+from canprobe.fieldbus.bus.clock import VirtualClock
+from canprobe.fieldbus.bus.lss import Lss, LssAnswerError
+from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.sdo import (
     MAX_UPLOAD_BYTES,
     TRANSFER_TIMEOUTS,
-    Lss,
-    LssAnswerError,
-    PumpedNetwork,
     SdoTimeoutError,
     download,
     hold_dialogues,
@@ -24,7 +23,8 @@ from canprobe.fieldbus.bus.sdo import (
     upload,
 )
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus, Participant
-from canprobe.fieldbus.protocol.frames import RTR_FLAG, Frame, LssAddress
+from canprobe.fieldbus.protocol.frames import RTR_FLAG, Frame
+from canprobe.fieldbus.protocol.lss import LssAddress
 
 MS = 1_000_000
 LONG = bytes(range(256)) * 3 + b"end"

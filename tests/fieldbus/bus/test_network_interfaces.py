@@ -13,8 +13,10 @@ import pytest
 from network_buses import bare, group  # noqa: F401
 
 from canprobe.errors import InterfaceError, UsageError
-from canprobe.fieldbus.bus.port import MonotonicClock
-from canprobe.fieldbus.bus.real.python_can import Echoes, configured_bus, open_port
+from canprobe.fieldbus.bus.clock import MonotonicClock
+from canprobe.fieldbus.bus.real.configured import configured_bus
+from canprobe.fieldbus.bus.real.echoes import Echoes
+from canprobe.fieldbus.bus.real.python_can import open_port
 
 SECOND = 1_000_000_000
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from canprobe.fieldbus.node.serve import keep_in_file
+from canprobe.fieldbus.node.stored_file import keep_in_file
 
 OFF = 0x80000000
 PRE, OP, STOPPED = 0x7F, 0x05, 0x04

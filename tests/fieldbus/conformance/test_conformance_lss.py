@@ -7,7 +7,7 @@ from functools import partial
 import pytest
 
 from canprobe.fieldbus.eds.packaged import load_eds
-from canprobe.fieldbus.node.dictionary import Abort, SdoAbort
+from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.slave_node import SlaveNode
 
 EDS = "puma260_joint"

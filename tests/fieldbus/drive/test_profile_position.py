@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from canprobe.fieldbus.drive.reference import Rates, braking, trapezoid
+from canprobe.fieldbus.drive.profile import Rates, braking, trapezoid
 
 CYCLE = 2_500_000
 NEW, NEW_NOW, NEW_RELATIVE, NEW_NOW_RELATIVE, HALT = 0x1F, 0x3F, 0x5F, 0x7F, 0x10F

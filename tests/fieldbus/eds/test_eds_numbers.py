@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from canprobe.fieldbus.eds.sections import parse_integer, parse_sum
-from canprobe.fieldbus.eds.variables import SIGNED, UNSIGNED, convert
+from canprobe.fieldbus.eds.numbers import parse_integer, parse_sum
+from canprobe.fieldbus.eds.values import SIGNED, UNSIGNED, convert
 
 WORDS = st.integers(0, 2**64 - 1)
 

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from canprobe.fieldbus.eds.packaged import load_eds
 from canprobe.fieldbus.node.slave_node import SlaveNode
-from canprobe.fieldbus.protocol.frames import LssCommand, NmtState
+from canprobe.fieldbus.protocol.frames import NmtState
+from canprobe.fieldbus.protocol.lss import LssCommand
 
 EDS = "puma260_joint"
 OD_OF = partial(load_eds, EDS)

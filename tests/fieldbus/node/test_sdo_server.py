@@ -2,7 +2,8 @@
 
 import pytest
 
-from canprobe.fieldbus.node.sdo_server import SDO_TRANSITIONS, SdoRequest, SdoServer, SdoState
+from canprobe.fieldbus.node.sdo_server import SdoServer
+from canprobe.fieldbus.node.sdo_states import SDO_TRANSITIONS, SdoRequest, SdoState
 
 PAD = "00000000"
 

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from canprobe.errors import UsageError
-from canprobe.fieldbus.node.serve import keep_in_file
+from canprobe.fieldbus.node.stored_file import keep_in_file
 
 SAVE = 0x65766173
 

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 from hypothesis import given
 from hypothesis import strategies as st
 
-from canprobe.fieldbus.node.core import Timers
+from canprobe.fieldbus.node.timers import Timers
 
 
 def test_fires_once_at_its_time():

@@ -10,15 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from canprobe.errors import ProtocolError
-from canprobe.fieldbus.protocol.tactile import (
-    WINDOWS,
-    Features,
-    FrameAssembler,
-    TactileHeader,
-    TactileMode,
-    crc16_ccitt,
-    pack_whole,
-)
+from canprobe.fieldbus.protocol.tactile import WINDOWS, Features, TactileHeader, TactileMode, crc16_ccitt, pack_whole
+from canprobe.fieldbus.protocol.tactile_assembler import FrameAssembler
 
 FEATURES, WINDOW, IMAGE = TactileMode
 DEADLINE = 5_000_000

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import canprobe
-from canprobe.cell.master.cycle import Observation
+from canprobe.cell.master.observers import Observation
 from canprobe.cell.results.summary import RunResult
 from canprobe.cell.scene.load import dump_scene, parse_scene
 

@@ -7,11 +7,11 @@ import pytest
 
 import canprobe
 from canprobe.cell.master.controller import Command, Measurement, TactileSample
-from canprobe.cell.master.cycle import Observation
+from canprobe.cell.master.observers import Observation
 from canprobe.cell.master.tactile_frame import TactileFrame
 from canprobe.fieldbus.protocol.tactile import Features, TactileHeader, TactileMode
-from canprobe.lab.bridge.process import pack_observation, unpack_observation
-from canprobe.lab.bridge.worker import SampleSource
+from canprobe.lab.bridge.codec import pack_observation, unpack_observation
+from canprobe.lab.bridge.sampling import SampleSource
 
 WINDOW = TactileFrame(
     TactileHeader(7, 200, 3, 4, TactileMode.WINDOW, True, 5000, 0xBEEF),

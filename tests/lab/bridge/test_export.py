@@ -15,7 +15,8 @@ from canprobe.cell.scene.load import load_scene
 from canprobe.cli import main
 from canprobe.errors import UsageError
 from canprobe.fieldbus.eds.packaged import check_eds
-from canprobe.lab.bridge.export import dcf_text, final_values, read_bus_yml, write_bus_yml, write_dcfs
+from canprobe.lab.bridge.bus_yml import read_bus_yml, write_bus_yml
+from canprobe.lab.bridge.dcf import dcf_text, final_values, write_dcfs
 
 
 @pytest.fixture(scope="module", params=["press", "free"])

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from canprobe.lab.bridge import process as feed_module
-from canprobe.lab.bridge.process import Feed, read_records
+from canprobe.lab.bridge.pipe_queue import Feed, read_records
 
 
 @pytest.fixture

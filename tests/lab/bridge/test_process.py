@@ -13,10 +13,10 @@ from mcap.reader import make_reader
 from waiting import wait_for_size
 
 import canprobe
-from canprobe.cell.master.cycle import Observation
+from canprobe.cell.master.observers import Observation
 from canprobe.cell.scene.load import dump_scene, parse_scene
 from canprobe.cell.session.session import Session
-from canprobe.cell.tasks.from_plan import Request
+from canprobe.cell.tasks.requested import Request
 from canprobe.errors import ResultsError
 from canprobe.lab.bridge import process as process_module
 from canprobe.lab.bridge.process import BridgeProcess
@@ -119,8 +119,8 @@ def test_one_that_cannot_begin_stops_the_run_before_anything_is_sent(tmp_path):
 
 def test_samples_count_what_was_dropped_before_them(plan):
     """What the viewer is shown of losses: the number travels with the next sample."""
-    from canprobe.lab.bridge.process import pack_observation, unpack_observation
-    from canprobe.lab.bridge.worker import SampleSource
+    from canprobe.lab.bridge.codec import pack_observation, unpack_observation
+    from canprobe.lab.bridge.sampling import SampleSource
 
     sample = SampleSource(plan).sample(unpack_observation(pack_observation(Observation(0, None, None, []), 17)))
     assert sample.dropped == 17

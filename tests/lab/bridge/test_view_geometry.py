@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from puma_arm import MODELS
 
-from canprobe.cell.plant.taxels import pad_coordinates
+from canprobe.cell.plant.pressure import pad_coordinates
 from canprobe.cell.scene.load import read_cell
 from canprobe.lab.bridge.sample import SurfacePatch
 from canprobe.lab.bridge.view import bodies as arm
@@ -19,10 +19,11 @@ from canprobe.lab.bridge.view import meshes as colours
 from canprobe.lab.bridge.view.instants import judge
 from canprobe.lab.bridge.view.path import deviation_scale
 from canprobe.lab.bridge.view.surface import Surface
-from canprobe.mechanics.robot.chain import forward, posture, tool_z_offset
-from canprobe.mechanics.touch.linear_algebra import homogeneous, tangent_rotation
+from canprobe.mechanics.robot.chain import forward, posture
+from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
 from canprobe.mechanics.touch.objects import OBJECT_PARAMETERS, make_object
 from canprobe.mechanics.touch.pad import Pad
+from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 
 MODEL = pytest.mark.parametrize("model", MODELS.values(), ids=MODELS.keys())
 QS = np.random.default_rng(2).uniform(-2.5, 2.5, (20, 6))

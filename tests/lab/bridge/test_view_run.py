@@ -16,24 +16,17 @@ from zstandard import ZstdDecompressor
 import canprobe
 from canprobe.cell.scene.geometry import true_object
 from canprobe.errors import CanprobeError
-from canprobe.lab.bridge.process import pack_observation, unpack_observation
+from canprobe.lab.bridge.codec import pack_observation, unpack_observation
 from canprobe.lab.bridge.sample import ContactFrame, Sample, SurfacePatch
-from canprobe.lab.bridge.view.browser import trail_of
-from canprobe.lab.bridge.view.instants import (
-    SILENT_NS,
-    Follower,
-    Moment,
-    curves_of,
-    judge,
-    kappa_sigmas,
-    row_of,
-)
+from canprobe.lab.bridge.sampling import SampleSource
+from canprobe.lab.bridge.view.instants import SILENT_NS, Follower, Moment, judge
 from canprobe.lab.bridge.view.path import GAP_M, LIFT_M, Trail, deviation_scale
+from canprobe.lab.bridge.view.plots import curves_of, kappa_sigmas, row_of
 from canprobe.lab.bridge.view.recorded import read_run
+from canprobe.lab.bridge.view.replay import trail_of
 from canprobe.lab.bridge.view.stage import FORCE_HEAD_M, FORCE_M_PER_N
-from canprobe.lab.bridge.worker import SampleSource
-from canprobe.mechanics.touch.linear_algebra import homogeneous, tangent_rotation
 from canprobe.mechanics.touch.objects import make_object
+from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 
 
 @pytest.fixture(scope="module")

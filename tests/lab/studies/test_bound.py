@@ -12,8 +12,9 @@ import pytest
 from canprobe.cli import main
 from canprobe.errors import UsageError
 from canprobe.lab.studies import bound
-from canprobe.lab.studies.bound import PATHS, SURFACES, Case, all_cases, findings, make_ground
-from canprobe.lab.studies.harness import CellStore
+from canprobe.lab.studies.bound import Case, all_cases, findings
+from canprobe.lab.studies.cell_store import CellStore
+from canprobe.lab.studies.ground import PATHS, SURFACES, make_ground
 from canprobe.lab.studies.sweep import Sweep
 
 SEEDS = 24

@@ -19,7 +19,8 @@ from canprobe.lab.studies.estimators import (
     on_the_move,
     settings,
 )
-from canprobe.lab.studies.harness import Column, StudyResult, as_document, table_lines, write_study
+from canprobe.lab.studies.harness import Column, StudyResult
+from canprobe.lab.studies.result_files import as_document, table_lines, write_study
 from canprobe.lab.studies.sweep import STUDIES
 from canprobe.mechanics.touch.estimate.fit import METHODS
 

@@ -10,23 +10,12 @@ from canprobe.cell.master.supervision import limits_of
 from canprobe.cell.master.supervisor import Supervisor
 from canprobe.cell.tasks import touch
 from canprobe.cli import main
-from canprobe.fieldbus.node.faults import Fault, FaultKind
+from canprobe.fieldbus.node.fault import Fault, FaultKind
 from canprobe.lab.studies import fault_scores as fault_witness
+from canprobe.lab.studies.fault_cases import PHASES, FaultCase
+from canprobe.lab.studies.fault_scenes import FORCE_MAX_N, SCENARIOS, seeded_plan
 from canprobe.lab.studies.fault_scores import Peak, score_force
-from canprobe.lab.studies.faults import (
-    FORCE_MAX_N,
-    PHASES,
-    SCENARIOS,
-    FaultCase,
-    carry_out,
-    draw_case,
-    findings,
-    peak,
-    phase_windows,
-    run_seed,
-    seeded_plan,
-    table_rows,
-)
+from canprobe.lab.studies.faults import carry_out, draw_case, findings, peak, phase_windows, run_seed, table_rows
 from canprobe.lab.studies.faults_vcan import HOLD_S, ProcessFault, draw_process_case, score_end
 from canprobe.lab.studies.faults_vcan import findings as findings_on_vcan
 
@@ -147,7 +136,7 @@ def test_the_score_sees_a_force_above_the_limit(monkeypatch):
 def test_the_score_sees_motion_and_power_after_the_stop(monkeypatch):
     monkeypatch.setattr("canprobe.cell.master.cell.Cell._stop_drives", lambda self: None)
     monkeypatch.setattr("canprobe.cell.master.bringup.BringUp.release", lambda self: None)
-    monkeypatch.setattr("canprobe.fieldbus.drive.mode.Supervision._sync_missing", lambda self, due_ns: None)
+    monkeypatch.setattr("canprobe.fieldbus.drive.self_stop.Supervision._sync_missing", lambda self, due_ns: None)
     monkeypatch.setattr("canprobe.fieldbus.node.slave_node.SlaveNode._communication_error", lambda self, t_ns: None)
     run = carry_out(FaultCase(0, FEATURES, "", ()))
     assert any("OPERATION_ENABLED after the stop" in failure for failure in run["failures"])

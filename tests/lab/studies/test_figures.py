@@ -15,14 +15,16 @@ from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 
 import canprobe
-from canprobe.cell.results.figures import draw_plan, draw_run
+from canprobe.cell.results.figures import draw_run
+from canprobe.cell.results.plan_figure import draw_plan
 from canprobe.cell.results.surface_figure import draw_surface
-from canprobe.fieldbus.node.faults import FaultKind
+from canprobe.fieldbus.node.fault import FaultKind
 from canprobe.lab.studies import estimators, stability, workprec
 from canprobe.lab.studies import stability as stability_figure
-from canprobe.lab.studies.bound import NOISES, SIZES_M, SURFACES, draw_bound
+from canprobe.lab.studies.bound import NOISES, SIZES_M, draw_bound
 from canprobe.lab.studies.estimators import draw_estimators
-from canprobe.lab.studies.faults import draw_ends, draw_faults
+from canprobe.lab.studies.fault_scenes import draw_ends, draw_faults
+from canprobe.lab.studies.ground import SURFACES
 from canprobe.lab.studies.realtime import draw_realtime
 from canprobe.lab.studies.realtime_cases import CycleTimes, Measured
 from canprobe.lab.studies.regions import draw_regions

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from canprobe.lab.studies.bound import make_ground
+from canprobe.lab.studies.ground import make_ground
 from canprobe.mechanics.touch.estimate import nonlinear as misfit
 from canprobe.mechanics.touch.estimate.fit import fit_surface
-from canprobe.mechanics.touch.estimate.noise import Prior
+from canprobe.mechanics.touch.estimate.prior import Prior
 
 CUBIC = np.array([9.0, -14.0, 6.0, 11.0])
 """Of x³, x²y, xy², y³, 1/m²: curvature changes by 2 1/m over the path."""

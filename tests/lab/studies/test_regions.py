@@ -13,7 +13,8 @@ from canprobe.cell.planning.make import make_plan
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cli import main
 from canprobe.errors import PlanError
-from canprobe.lab.studies.regions import NUMBERS, Scan, findings, random_scene, row_of, scored
+from canprobe.lab.studies.random_scenes import random_scene
+from canprobe.lab.studies.regions import NUMBERS, Scan, findings, row_of, scored
 
 TIMES = np.arange(0.0, 5.0, 0.0025)
 TRUTH = {

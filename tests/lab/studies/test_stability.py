@@ -13,18 +13,11 @@ from canprobe.cell.plant.ideal_arm import natural_frequency
 from canprobe.cell.scene.geometry import T_flange_probe
 from canprobe.lab.studies import stability
 from canprobe.lab.studies.fault_scores import longest_above
-from canprobe.lab.studies.harness import write_study
-from canprobe.lab.studies.stability_runs import (
-    Case,
-    ForceLoop,
-    layer_stiffness,
-    loop_of,
-    scene_of,
-    spectral_radius,
-    touch_in_posture,
-    upright,
-)
-from canprobe.mechanics.robot.chain import forward, rotation_rpy
+from canprobe.lab.studies.linear_loop import ForceLoop, spectral_radius
+from canprobe.lab.studies.result_files import write_study
+from canprobe.lab.studies.stability_runs import Case, layer_stiffness, loop_of, scene_of, touch_in_posture, upright
+from canprobe.mechanics.robot.chain import forward
+from canprobe.mechanics.robot.denavit_hartenberg import rotation_rpy
 from canprobe.mechanics.touch.contact import indentation_from_force
 
 LOOP = ForceLoop(1.0, 0.0025, 2, 8.0, 0.0, natural_frequency(30.0, 1.0))

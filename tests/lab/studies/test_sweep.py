@@ -18,8 +18,9 @@ from canprobe.errors import StudyError, UsageError
 from canprobe.fieldbus.bus.real.processor import BLAS_THREADS
 from canprobe.lab.studies import harness as sweep_store
 from canprobe.lab.studies import sweep
-from canprobe.lab.studies.harness import CellStore, as_json, cell_key, model_digest
-from canprobe.lab.studies.sweep import Sweep, dask_executor, open_sweep, process_pool
+from canprobe.lab.studies.cell_store import CellStore, as_json, cell_key, model_digest
+from canprobe.lab.studies.executors import dask_executor, process_pool
+from canprobe.lab.studies.sweep import Sweep, open_sweep
 
 DEMO = '''
 """A study of six cells; what happens in the fourth is set by the environment. Every measurement leaves a line."""

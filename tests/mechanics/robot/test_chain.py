@@ -13,13 +13,13 @@ from canprobe.mechanics.robot.chain import (
     ending_in,
     forward,
     forward_jacobian,
-    from_dh,
     jacobian,
     link_transforms,
     point_velocity,
     pose_of,
     posture,
 )
+from canprobe.mechanics.robot.denavit_hartenberg import from_dh
 
 TOOL = np.array([[0.36, 0.48, -0.8, 0.01], [-0.8, 0.6, 0.0, -0.02], [0.48, 0.64, 0.6, 0.08], [0.0, 0.0, 0.0, 1.0]])
 CHAINS = {model.name: model.chain for model in (*MODELS.values(), gantry(), scara(), five(), seven())}

@@ -8,7 +8,8 @@ import pytest
 from scipy.stats import combine_pvalues, kstest
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.consistency import Consistency, check_consistency, compare, find_crossings, fisher
+from canprobe.mechanics.touch.consistency import Consistency, check_consistency, find_crossings, fisher
+from canprobe.mechanics.touch.crossings import compare
 from canprobe.mechanics.touch.estimate.fit import fit_surface
 from canprobe.mechanics.touch.surface import SurfaceMatrix
 from canprobe.mechanics.touch.surface_map import LocalPatch, SurfaceMap, merge_patches

@@ -11,16 +11,11 @@ from hypothesis import strategies as st
 
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch import contact as c
-from canprobe.mechanics.touch.contact import (
-    SAMPLES_AT_REST,
-    SAMPLES_OF_A_PUSH,
-    AtRest,
-    PushFit,
-    indentation_from_force,
-    stiffness_from_slope,
-)
-from canprobe.mechanics.touch.linear_algebra import homogeneous, rotation_vectors, tangent_rotation
+from canprobe.mechanics.touch.at_rest import SAMPLES_AT_REST, AtRest
+from canprobe.mechanics.touch.contact import indentation_from_force
+from canprobe.mechanics.touch.layer_stiffness import SAMPLES_OF_A_PUSH, PushFit, stiffness_from_slope
 from canprobe.mechanics.touch.surface import SurfaceMatrix
+from canprobe.mechanics.touch.tangent_frames import homogeneous, rotation_vectors, tangent_rotation
 
 H = 1e-3
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.servo import LocalSurface, PathFollower, SurfaceGains, TactileServo, make_strategy
+from canprobe.mechanics.touch.servo import LocalSurface, SurfaceGains, TactileServo
+from canprobe.mechanics.touch.strategies import PathFollower, make_strategy
 
 RADIUS_P = 0.040
 DEPTH = 0.426e-3

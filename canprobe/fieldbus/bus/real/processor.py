@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import _thread
 import contextlib
 import ctypes
 import functools
 import gc
 import os
-import signal
-import sys
-import threading
 from collections.abc import Callable, Iterator
-from types import FrameType, TracebackType
-from typing import Any
 
 # The processor's favour and the memory's, where they can be had.
 
@@ -143,139 +137,3 @@ def garbage_collection_paused(*, collect: bool = True) -> Iterator[None]:
             gc.unfreeze()
         if was_enabled:
             gc.enable()
-
-
-# Ctrl-C, SIGTERM and SIGHUP taken between two cycles, where the cell can still act, instead of anywhere in one.
-
-TERMINATIONS = (signal.SIGTERM, signal.SIGHUP)
-"""What ends a process from outside: a service that is stopped, a terminal that is closed."""
-REPEAT_S = 0.1
-
-
-class Terminated(KeyboardInterrupt):
-    """SIGTERM or SIGHUP, raised like Ctrl-C where the program stands."""
-
-
-def raise_terminated(_number: int, _frame: FrameType | None) -> None:
-    """The handler of both."""
-    raise Terminated
-
-
-@contextlib.contextmanager
-def interrupts_held() -> Iterator[None]:
-    """An interrupt waits for the end of the block: what is begun in it is done whole. In the main thread only.
-
-    Ignored signals stay ignored, as `nohup` has SIGHUP, and a shell without job control SIGINT in the background.
-    """
-    came: list[int] = []
-    before: dict[int, Any] = {}
-    with contextlib.suppress(ValueError):  # not the main thread: signals are not ours to receive
-        for number in (signal.SIGINT, *TERMINATIONS):
-            if signal.getsignal(number) is not signal.SIG_IGN:
-                before[number] = signal.signal(number, lambda n, _: came.append(n))
-    try:
-        yield
-    finally:
-        for held, handler in before.items():
-            signal.signal(held, handler)
-        if came:
-            signal.raise_signal(came[0])
-
-
-@contextlib.contextmanager
-def interrupts_repeated() -> Iterator[None]:
-    """An interrupt is raised every `REPEAT_S` until the block is left. In the main thread only.
-
-    For work with libraries that draw: Python drops what is raised in the callback of a weak reference or in `__del__`,
-    of which they have thousands, so that one Ctrl-C in twenty was lost in them, with a traceback on stderr.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    came: list[signal.Signals] = []
-    left = threading.Event()
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, *TERMINATIONS)}
-    handlers = {number: handler for number, handler in before.items() if callable(handler)}
-    hook = sys.unraisablehook
-
-    def raise_it(number: int, frame: FrameType | None) -> None:
-        came.append(kind := signal.Signals(number))
-        if not left.is_set():
-            handlers[kind](number, frame)
-
-    def repeat() -> None:
-        while not left.wait(REPEAT_S):
-            if came:
-                _thread.interrupt_main(came[0])
-
-    def unraisable(dropped: Any) -> None:
-        if not issubclass(dropped.exc_type, KeyboardInterrupt):
-            hook(dropped)
-
-    repeater = threading.Thread(target=repeat, daemon=True)
-    sys.unraisablehook = unraisable
-    try:
-        for number in handlers:
-            signal.signal(number, raise_it)
-        repeater.start()
-        yield
-    finally:
-        left.set()
-        repeater.join()
-        for number in handlers:
-            signal.signal(number, before[number])
-        sys.unraisablehook = hook
-    if came:
-        signal.raise_signal(came[0])
-
-
-class Interrupts:
-    """Within the block the first interrupt waits until it is taken; a second one is raised where the program stands.
-
-    So is the first where ``stuck`` says that nobody will come to take it. Ignored signals stay ignored (as `nohup` has
-    it), one that would end the process raises `Terminated`, and outside a main thread nothing changes.
-
-    Args:
-        stuck: whether the program is held up somewhere.
-    """
-
-    def __init__(self, stuck: Callable[[], bool] = lambda: False) -> None:
-        self._stuck = stuck
-        self._before: dict[int, Callable[[int, FrameType | None], object]] = {}
-        self._restore: dict[int, object] = {}
-        self._came = False
-        self._waiting: int | None = None
-
-    def __enter__(self) -> Interrupts:
-        for number in (signal.SIGINT, *TERMINATIONS):
-            before = signal.getsignal(number)
-            handler = raise_terminated if before is signal.SIG_DFL and number in TERMINATIONS else before
-            if not callable(handler):
-                continue
-            try:
-                signal.signal(number, self._note)
-            except ValueError:  # not the main thread: signals are not ours to receive
-                break
-            self._before[number], self._restore[number] = handler, before
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        for number, before in self._restore.items():
-            signal.signal(number, before)  # type: ignore[arg-type]  # as getsignal gave it
-        if error is None:
-            self.take()
-
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        first, self._came, self._waiting = not self._came, True, None
-        if first and not self._stuck():
-            self._waiting = number
-        else:
-            self._before[number](number, frame)
-
-    def take(self) -> None:
-        """Give what waits to who would have had it without us, which raises it as a rule; nothing where none waits."""
-        if self._waiting is not None:
-            number, self._waiting = self._waiting, None
-            self._before[number](number, None)

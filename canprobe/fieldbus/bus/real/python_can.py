@@ -6,16 +6,15 @@ import importlib.util
 import logging
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import can
 
 from canprobe.errors import InterfaceError, UsageError, install_line
+from canprobe.fieldbus.bus.clock import Clock
 from canprobe.fieldbus.bus.port import (
     ERR_BUS,
     ERR_FLAG,
-    Clock,
     ControllerState,
     PlainPort,
     Port,
@@ -24,6 +23,7 @@ from canprobe.fieldbus.bus.port import (
     TimedFrame,
     state_after,
 )
+from canprobe.fieldbus.bus.real.echoes import Echoes
 from canprobe.fieldbus.bus.real.mmsg import HAS_BATCHES
 from canprobe.fieldbus.protocol.frame_bits import FD_LENGTHS
 from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG, Frame
@@ -64,39 +64,6 @@ def open_port(
         what = "a lockstep bus lives inside one run" if interface == "lockstep" else "--bus direct has no bus"
         raise UsageError(f"{channel}: {what}; there is nothing to open")
     return PythonCanPort(interface, channel, bitrate, clock, data_bitrate=data_bitrate, reports=reports)
-
-
-# Which received frames are our own, on a bus that gives a sender back what it sent.
-
-_LIFE_NS = 1_000_000_000
-
-
-class Echoes:
-    """The first frame that equals one we sent is taken for its echo, once.
-
-    Somebody else's frame with the same identifier and data comes besides the echo, so one of the two is kept. An echo
-    that does not come within a second is waited for no longer.
-    """
-
-    def __init__(self) -> None:
-        self._waiting: dict[Frame, deque[int]] = {}
-
-    def sent(self, frame: Frame, t_ns: int) -> None:
-        """Note a frame of ours."""
-        self._waiting.setdefault(frame, deque()).append(t_ns)
-
-    def is_one(self, frame: Frame, t_ns: int) -> bool:
-        """Whether a received frame is the echo of one that was sent, which it then answers for."""
-        waiting = self._waiting.get(frame)
-        while waiting and t_ns - waiting[0] > _LIFE_NS:
-            waiting.popleft()
-        if not waiting:
-            self._waiting.pop(frame, None)
-            return False
-        waiting.popleft()
-        if not waiting:
-            del self._waiting[frame]
-        return True
 
 
 # A `Port` over any python-can interface: the portable way, for adapters that SocketCAN does not drive.
@@ -282,48 +249,3 @@ def _message(channel: str, can_id: int, data: bytes, fd: bool) -> can.Message:
     except ValueError as error:
         what = f"{can_id:X} with {len(data)} bytes is no {'CAN or CAN FD' if fd else 'classic CAN'} frame"
         raise InterfaceError(f"{channel}: {what}: {error}") from error
-
-
-# The bus that python-can's own configuration names: CAN_INTERFACE and its kin, CAN_CONFIG, can.conf, ~/.canrc.
-#
-# Source: python-can manual, "Configuration".
-
-
-@dataclass(frozen=True, slots=True)
-class ConfiguredBus:
-    """What the configuration says; None where it says nothing."""
-
-    interface: str
-    channel: str | None
-    bitrate: int | None
-
-
-def configured_bus() -> ConfiguredBus | None:
-    """Read python-can's configuration; None where no interface is configured.
-
-    Raises:
-        UsageError: it cannot be read, or names an interface that python-can does not know.
-    """
-    import json
-
-    import can.util
-
-    named: dict[str, Any] = {}
-    try:
-        named = {**can.util.load_file_config(), **can.util.load_environment_config(), **can.rc}
-        if not (named.get("interface") or named.get("bustype")):
-            return None
-        found = can.util.load_config()
-        channel, bitrate = found.get("channel"), found.get("bitrate")
-        return ConfiguredBus(
-            interface=str(found["interface"]),
-            channel=None if channel is None else str(channel),
-            bitrate=None if bitrate is None else int(bitrate),
-        )
-    except can.CanInterfaceNotImplementedError as error:
-        names = ", ".join(sorted(can.VALID_INTERFACES))
-        raise UsageError(f"python-can's configuration: {error}; python-can has: {names}") from error
-    except json.JSONDecodeError as error:
-        raise UsageError(f"CAN_CONFIG is no JSON: {error}") from error
-    except (ValueError, TypeError) as error:
-        raise UsageError(f"python-can's configuration: {error}") from error

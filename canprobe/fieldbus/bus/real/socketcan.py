@@ -23,16 +23,8 @@ import time
 from collections.abc import Callable, Collection, Sequence
 
 from canprobe.errors import InterfaceError
-from canprobe.fieldbus.bus.port import (
-    ERR_FLAG,
-    Clock,
-    ControllerState,
-    PortCounters,
-    Reports,
-    TimedFrame,
-    Timespec,
-    state_after,
-)
+from canprobe.fieldbus.bus.clock import Clock, Timespec
+from canprobe.fieldbus.bus.port import ERR_FLAG, ControllerState, PortCounters, Reports, TimedFrame, state_after
 from canprobe.fieldbus.bus.real.link import TX_QUEUE, drop_queued, emptying_line, ip_line, setting_line, sudo
 from canprobe.fieldbus.bus.real.mmsg import CLASSIC_BYTES, SO_RXQ_OVFL, SO_TIMESTAMPNS, FrameSocket, Row
 from canprobe.fieldbus.protocol.frame_bits import FD_LENGTHS

@@ -3,91 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from canprobe.fieldbus.bus.port import ControllerState
+from canprobe.fieldbus.bus.virtual.error_counters import ErrorCounters
 from canprobe.fieldbus.bus.virtual.lockstep import BusNode, LockstepPort
 from canprobe.fieldbus.protocol.frame_bits import INTERMISSION_BITS, SUSPEND_BITS
-
-# Error counters of one controller: error active, error passive, bus off, and the way back.
-#
-# Source: ISO 11898-1:2015, fault confinement: rules for the transmit and the receive error counter.
-
-PASSIVE_FROM = 128
-WARNING_FROM = 96
-BUS_OFF_FROM = 256
-RECOVERIES = 128
-"""Sequences of eleven recessive bits that a controller has to hear while it is bus off."""
-
-
-@dataclass(slots=True)
-class ErrorCounters:
-    """Counters of one controller.
-
-    Attributes:
-        transmit: TEC.
-        receive: REC.
-        bus_offs: how often it went bus off.
-        outstanding: sequences of eleven recessive bits until it comes back; 0 where it is not bus off.
-    """
-
-    transmit: int = 0
-    receive: int = 0
-    bus_offs: int = 0
-    outstanding: int = 0
-
-    @property
-    def state(self) -> ControllerState:
-        """What the counters make of the controller."""
-        if self.outstanding:
-            return ControllerState.BUS_OFF
-        worst = max(self.transmit, self.receive)
-        if worst >= PASSIVE_FROM:
-            return ControllerState.PASSIVE
-        return ControllerState.WARNING if worst >= WARNING_FROM else ControllerState.ACTIVE
-
-    def transmit_error(self, *, acknowledge: bool = False) -> None:
-        """It sent an error flag as the transmitter.
-
-        Args:
-            acknowledge: the acknowledgement was missing and no other node sent an error flag. An error-passive node
-                does not count that, so that a node alone on its bus never goes bus off.
-        """
-        if acknowledge and self.state is ControllerState.PASSIVE:
-            return
-        self.transmit += 8
-        if self.transmit >= BUS_OFF_FROM:
-            self.bus_offs += 1
-            self.outstanding = RECOVERIES
-
-    def receive_error(self) -> None:
-        """It saw an error as a receiver."""
-        if not self.outstanding:
-            self.receive += 1
-
-    def transmitted(self) -> None:
-        """It sent a frame without an error."""
-        self.transmit = max(0, self.transmit - 1)
-
-    def received(self) -> None:
-        """It received a frame without an error."""
-        if self.receive >= PASSIVE_FROM:
-            self.receive = PASSIVE_FROM - 1  # the standard leaves 119 to 127
-        elif self.receive:
-            self.receive -= 1
-
-    def heard_recessive(self, sequences: int) -> bool:
-        """It heard so many sequences of eleven recessive bits; whether it is active again, with both counters at 0."""
-        if not self.outstanding:
-            return False
-        self.outstanding = max(0, self.outstanding - sequences)
-        if self.outstanding:
-            return False
-        self.transmit = self.receive = 0
-        return True
-
-
-# All controllers of a bus.
 
 _RECESSIVE_BITS = 11
 _AFTER_ACK_BITS = (

@@ -15,7 +15,8 @@ from collections.abc import Callable, Container, Sequence
 from heapq import heapify, heappop, heappush
 
 from canprobe.errors import BusError, InterfaceError
-from canprobe.fieldbus.bus.port import ControllerState, PlainPort, PortCounters, TimedFrame, VirtualClock
+from canprobe.fieldbus.bus.clock import VirtualClock
+from canprobe.fieldbus.bus.port import ControllerState, PlainPort, PortCounters, TimedFrame
 from canprobe.fieldbus.protocol.frame_bits import FD_LENGTHS
 from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG, Frame
 

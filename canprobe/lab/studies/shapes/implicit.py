@@ -23,7 +23,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from canprobe.lab.studies.harness import Array
-from canprobe.mechanics.touch.linear_algebra import tangent_rotation
+from canprobe.mechanics.touch.tangent_frames import tangent_rotation
 
 Kernel = Callable[[Array, float, float], tuple[Array, Array, Array]]
 """Distances r, scale of f (m) and length (m) → k, a, b."""

@@ -19,8 +19,8 @@ from scipy.spatial import cKDTree
 from canprobe.cell.tasks.from_plan import make_shape_estimator
 from canprobe.cell.tasks.shape import replay_samples
 from canprobe.lab.studies.harness import Array
+from canprobe.lab.studies.shapes.contacts_file import Contacts
 from canprobe.lab.studies.shapes.implicit import ImplicitSurface, Kernel, fit_quadric, rbf, thin_plate
-from canprobe.lab.studies.shapes.scans import Contacts
 from canprobe.mechanics.touch.blend import REACH_M, Feet
 from canprobe.mechanics.touch.surface import SurfaceMatrix
 from canprobe.mechanics.touch.surface_map import SPACING_M, LocalPatch, SurfaceMap, merge_patches

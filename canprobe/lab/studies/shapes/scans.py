@@ -9,7 +9,6 @@ the path: points of the true surface on a grid, with normals and curvature. Meth
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,18 +18,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from canprobe.cell.npz import read_npz, write_npz
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.results.scores import curvature_tensor
 from canprobe.cell.scene.geometry import true_object
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import ObjectSettings, PlantSettings, Scene
 from canprobe.cell.scene.resolve import LAYER_N_M3, resolve
-from canprobe.cell.scene.setup import Touch
 from canprobe.cell.session.session import Session
-from canprobe.cell.tasks.from_plan import SIGMA_NORMAL_RAD, centroid_coupling, make_task
+from canprobe.cell.tasks.from_plan import make_task
 from canprobe.lab.studies.harness import Array
-from canprobe.lab.studies.shapes.implicit import Touched
 from canprobe.mechanics.touch.contact import ContactSample, Doubt, Slope
 from canprobe.mechanics.touch.shapes import PlacedShape
 
@@ -215,43 +211,3 @@ def truth_under(shape: PlacedShape, contacts: Array) -> dict[str, Array]:
         "truth_counts": np.less(away, FOOTPRINT_M).astype(float),
         "truth_edge": edge.astype(float),
     }
-
-
-# The file.
-
-
-class Contacts(NamedTuple):
-    """What a method gets of a shape.
-
-    Attributes:
-        samples: contacts in the order of time, with their stated noise.
-        touched: their places, normals and noise, base.
-        task: the scan's setup: array, calibration, probe, speed; the estimators' model of the sensor.
-    """
-
-    samples: list[ContactSample]
-    touched: Touched
-    task: Touch
-
-
-def write_contacts(path: Path, shapes: Mapping[str, Mapping[str, Any]]) -> str:
-    """Write the file of contacts; its SHA-256."""
-    write_npz(path, {f"{name}/{key}": np.asarray(v) for name, columns in shapes.items() for key, v in columns.items()})
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def read_columns(path: Path, name: str) -> dict[str, Array]:
-    """Columns of a shape."""
-    prefix = f"{name}/"
-    return {k.removeprefix(prefix): v for k, v in read_npz(path, "contacts").items() if k.startswith(prefix)}
-
-
-def read_contacts(path: Path, name: str) -> Contacts:
-    """The contacts of a shape with the setup that was stated for all of them."""
-    columns = read_columns(path, name)
-    samples = samples_of(columns)
-    task = resolve(load_scene("cylinder")).task
-    assert isinstance(task, Touch)
-    sigma = np.hypot(columns["sigma"][:, 0], columns["sigma"][:, 2])
-    normal = np.hypot(SIGMA_NORMAL_RAD, sigma * centroid_coupling(task.probe))
-    return Contacts(samples, Touched(columns["p_base"], columns["n_base"], sigma, normal), task)

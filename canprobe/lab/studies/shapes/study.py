@@ -15,19 +15,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from canprobe.cell.results.picture import GREEN, INK, METHOD_COLOURS, PINK, SKY, legend, log_scale, picture
-from canprobe.lab.studies.harness import Array, Column, Row, StudyResult, measuring_facts
+from canprobe.lab.studies.harness import Array, Column, Row, StudyResult
+from canprobe.lab.studies.result_files import measuring_facts
+from canprobe.lab.studies.shapes.contacts_file import Contacts, read_columns, read_contacts, write_contacts
 from canprobe.lab.studies.shapes.methods import METHODS, Method, Surface
-from canprobe.lab.studies.shapes.scans import (
-    DEVELOPMENT,
-    SECONDS,
-    TEST,
-    Case,
-    Contacts,
-    read_columns,
-    read_contacts,
-    scan,
-    write_contacts,
-)
+from canprobe.lab.studies.shapes.scans import DEVELOPMENT, SECONDS, TEST, Case, scan
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.touch.meshing import Mesh, mesh_of
 

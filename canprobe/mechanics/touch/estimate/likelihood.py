@@ -14,35 +14,19 @@ from canprobe.mechanics.touch.estimate.answer import (
     SurfaceEstimate,
     anchor,
     build_estimate,
-    curvature_covariance,
-    evidence_of,
     partial_covariance,
 )
-from canprobe.mechanics.touch.estimate.noise import Correlation, Noise, Prior, make_noise, mixed
-from canprobe.mechanics.touch.estimate.nonlinear import CERTAIN, DIFFUSE, correct, fit, misfit_notes
-from canprobe.mechanics.touch.estimate.quadric import (
-    UNIT,
-    curvature_jacobian,
-    decide,
-    design,
-    linearise,
-    nothing_observed,
-    parameters_of,
-    spread_of,
-    turned,
-)
-from canprobe.mechanics.touch.linear_algebra import (
-    MAX_LENGTH,
-    Array,
-    checked,
-    homogeneous,
-    instance,
-    inverted,
-    solved,
-    tangent_rotation,
-    upper_root,
-)
+from canprobe.mechanics.touch.estimate.known_curvature import curvature_covariance, evidence_of
+from canprobe.mechanics.touch.estimate.misfit import CERTAIN, correct, misfit_notes
+from canprobe.mechanics.touch.estimate.noise import Correlation, Noise, make_noise, mixed
+from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE, fit
+from canprobe.mechanics.touch.estimate.observed import decide, nothing_observed, spread_of, turned
+from canprobe.mechanics.touch.estimate.prior import Prior
+from canprobe.mechanics.touch.estimate.quadric import UNIT, parameters_of
+from canprobe.mechanics.touch.estimate.residuals import curvature_jacobian, design, linearise
+from canprobe.mechanics.touch.linear_algebra import MAX_LENGTH, Array, checked, instance, inverted, solved, upper_root
 from canprobe.mechanics.touch.surface import SurfaceMatrix
+from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 
 _FLOOR = 20.0
 """Least extent in standard deviations of a point: shorter paths are noise, and no length to measure curvature by."""

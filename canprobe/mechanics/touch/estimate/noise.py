@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -167,65 +165,3 @@ def _mean_variance(sigma: Array) -> Array:
 
 def _as_covariance(sigma: Array) -> Array:
     return sigma if sigma.ndim == 3 else (sigma**2)[:, None, None] * np.eye(3)
-
-
-# What is assumed of a surface before it is touched, always stated and named in the estimate.
-
-NUISANCE = (0.15, 0.15, 0.5)
-"""Standard deviations of c13, c23, c33 times the length of the path: 7.5, 7.5, 25 per m on a path of 20 mm.
-
-On a short path these three are nearly unobservable (on a plane exactly so). They are of the order of a surface's
-curvature; stated relative to the path they stay weak at every size, and the answer does not depend on the unit of
-length.
-"""
-
-
-@dataclass(frozen=True, slots=True)
-class Prior:
-    """Independent normal priors on entries of the normalised surface matrix in its contact frame.
-
-    Attributes:
-        name: appears in the estimate.
-        sigma_c13, sigma_c23, sigma_c33: 1/m, mean 0.
-        curvature: mean of the shape operator, `curvature · I`, 1/m.
-        sigma_curvature: standard deviation of K11 and K22 (of K12 its √½), 1/m; infinite for none, the default.
-            With it every combination has a finite answer; `observed` still says what the data alone observed.
-    """
-
-    name: str
-    sigma_c13: float
-    sigma_c23: float
-    sigma_c33: float
-    curvature: float = 0.0
-    sigma_curvature: float = math.inf
-
-    def __post_init__(self) -> None:
-        checked("curvature", self.curvature, ())
-        for field in ("sigma_c13", "sigma_c23", "sigma_c33", "sigma_curvature"):
-            value = getattr(self, field)
-            if not (isinstance(value, Real) and float(value) > 0.0):  # infinite: none
-                raise UsageError(f"prior.{field}: expected a number above 0, got {value!r}")
-
-    @classmethod
-    def weak(cls, length: float) -> Prior:
-        """The default: nothing on curvature, `NUISANCE / length` on c13, c23, c33."""
-        s13, s23, s33 = (s / positive("length", length) for s in NUISANCE)
-        return cls("weak on c13, c23, c33", s13, s23, s33)
-
-    @classmethod
-    def flat(cls, length: float, sigma_curvature: float) -> Prior:
-        """Weak on c13, c23, c33, and curvature 0 ± sigma_curvature (1/m) in every direction."""
-        s13, s23, s33 = (s / positive("length", length) for s in NUISANCE)
-        sigma_curvature = positive("sigma_curvature", sigma_curvature)
-        return cls(f"curvature 0 ± {sigma_curvature:.4g} per unit length", s13, s23, s33, 0.0, sigma_curvature)
-
-    def rows(self, length: float) -> tuple[Array, Array]:
-        """Whitened rows (6, 9) and right-hand side (6,) on the parameters of `quadric`, in units of `length`."""
-        A, b = np.zeros((6, 9)), np.zeros(6)
-        for row, (column, sigma) in enumerate(((3, self.sigma_c13), (4, self.sigma_c23), (5, self.sigma_c33))):
-            A[row, column] = 1.0 / (sigma * length)
-        inverse = 1.0 / (self.sigma_curvature * length)
-        for row, factor in ((3, 2.0), (4, 2.0 * math.sqrt(2.0)), (5, 2.0)):
-            A[row, 3 + row] = factor * inverse
-        b[3] = b[5] = self.curvature * length * inverse
-        return A, b

@@ -16,128 +16,30 @@ import numpy as np
 
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import ContactSample
-from canprobe.mechanics.touch.estimate.answer import (
-    Solution,
-    SurfaceEstimate,
-    anchor,
-    build_estimate,
-    curvature_covariance,
-    evidence_of,
-)
-from canprobe.mechanics.touch.estimate.information import Expected, InformationFilter, Touch
-from canprobe.mechanics.touch.estimate.noise import CHI2_99, CHI2_999, Correlation, Prior
-from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE, misfit_notes
-from canprobe.mechanics.touch.estimate.online import ChangeTest, Dropped, Gate
-from canprobe.mechanics.touch.estimate.quadric import UNIT, decide, nothing_observed, size_of
+from canprobe.mechanics.touch.estimate.answer import Solution, SurfaceEstimate, anchor, build_estimate
+from canprobe.mechanics.touch.estimate.change import ChangeTest
+from canprobe.mechanics.touch.estimate.information import InformationFilter, Touch
+from canprobe.mechanics.touch.estimate.known_curvature import curvature_covariance, evidence_of
+from canprobe.mechanics.touch.estimate.left_out import Expected
+from canprobe.mechanics.touch.estimate.misfit import misfit_notes
+from canprobe.mechanics.touch.estimate.noise import CHI2_99, CHI2_999, Correlation
+from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE
+from canprobe.mechanics.touch.estimate.observed import decide, nothing_observed
+from canprobe.mechanics.touch.estimate.online import Dropped, Gate
+from canprobe.mechanics.touch.estimate.prior import Prior
+from canprobe.mechanics.touch.estimate.quadric import UNIT, size_of
 from canprobe.mechanics.touch.estimate.start import Start
+from canprobe.mechanics.touch.estimate.travel import Spread, Travel
 from canprobe.mechanics.touch.linear_algebra import (
     Array,
-    homogeneous,
     instance,
     inverted,
     inverted_upper,
     lower_root,
     positive,
-    tangent_rotation,
     upper_root,
 )
-
-# How far a contact has moved, beyond its noise, and how its places spread.
-
-_MEDIAN_OF, _MEAN_OF = 5, 8
-_FAR2, _SLOWLY = 16.0, 0.05
-"""Squared distance from the median, over the usual, that is no jump; and the share of one point in the usual."""
-
-
-class Travel:
-    """Path of a noisy point: its running mean over some samples, taken in steps well above the noise.
-
-    A point that stands still never makes a step, however long it stands; nor do single wrong points among the right
-    ones, for the mean is one of medians.
-
-    Args:
-        step: least distance that counts, m; some standard deviations of the point.
-
-    Attributes:
-        total: path so far, m.
-        weight: of the last point: below 1 where it lies several times further from the median than points usually do.
-        measured: points over which the path was measured so far; the first ones, before there is a mean, are not.
-    """
-
-    def __init__(self, step: float) -> None:
-        self.total = 0.0
-        self.weight = 1.0
-        self.measured = 0
-        self._usual2 = 0.0
-        self._step2 = step * step
-        self._last: deque[list[float]] = deque(maxlen=_MEDIAN_OF)
-        self._mean = self._mark = (0.0, 0.0, 0.0)
-        self._count = 0
-
-    def add(self, point: Array) -> float:
-        """Take a point (3,), m; the length of the step that it completes, or 0."""
-        px, py, pz = here = point.tolist()
-        self._last.append(here)
-        middle = len(self._last) // 2
-        a, b, c = [sorted(axis)[middle] for axis in zip(*self._last, strict=True)]
-        self._weigh((px - a) ** 2 + (py - b) ** 2 + (pz - c) ** 2)
-        self._count = min(self._count + 1, _MEAN_OF)
-        share = 1.0 / self._count
-        x, y, z = self._mean
-        self._mean = x, y, z = x + share * (a - x), y + share * (b - y), z + share * (c - z)
-        if self._count < _MEAN_OF:
-            self._mark = self._mean
-            return 0.0
-        self.measured += 1
-        u, v, w = self._mark
-        square = (x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2
-        if square < self._step2:
-            return 0.0
-        self._mark = self._mean
-        length = math.sqrt(square)
-        self.total += length
-        return length
-
-    def _weigh(self, square: float) -> None:
-        """A contact does not jump from frame to frame; one that does is not believed, however little is known there."""
-        limit = max(_FAR2 * self._usual2, self._step2)
-        ratio = limit / max(square, limit)
-        self.weight = ratio * ratio
-        self._usual2 += _SLOWLY * (min(square, limit) - self._usual2)
-
-
-class Spread:
-    """Weighted covariance of points, with forgetting: second moments about the first point."""
-
-    def __init__(self) -> None:
-        self._origin: Array | None = None
-        self._moments = np.zeros((4, 4))
-
-    @property
-    def weight(self) -> float:
-        """Sum of weights."""
-        return float(self._moments[3, 3])
-
-    @property
-    def covariance(self) -> Array:
-        """(3, 3), m²."""
-        M = self._moments / max(self.weight, 1e-300)
-        mean = M[:3, 3]
-        result: Array = M[:3, :3] - mean[:, None] * mean
-        return result
-
-    def fade(self, kept: float) -> None:
-        """Weigh everything so far by a factor."""
-        self._moments *= kept
-
-    def add(self, points: Array, weights: Array) -> None:
-        """Take points (n, 3) with weights (n,)."""
-        if self._origin is None:
-            self._origin = points[0].copy()
-        X = np.ones((len(points), 4))
-        X[:, :3] = points - self._origin
-        self._moments += (X.T * weights).dot(X)
-
+from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 
 STEP = 0.025
 """Travel between two updates over the memory."""

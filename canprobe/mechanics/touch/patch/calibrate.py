@@ -26,20 +26,12 @@ from canprobe.mechanics.touch.patch.array_calibration import (
     StiffnessSources,
 )
 from canprobe.mechanics.touch.patch.image import PatchCalibration
-from canprobe.mechanics.touch.patch.image_fit import (
-    AGE_S,
-    NO_ERRORS,
-    Dwell,
-    Fit,
-    Pairs,
-    Shown,
-    curvature_errors,
-    fit_parameters,
-    moment_errors,
-    what_is_shown,
-)
+from canprobe.mechanics.touch.patch.image_fit import AGE_S, NO_ERRORS, Dwell, Shown, what_is_shown
 from canprobe.mechanics.touch.patch.image_model import USUAL_LIGHTNESS, make_image_model, make_patch_calibration
-from canprobe.mechanics.touch.patch.pad_fit import fit_centroids, stiffness_by_depth, taxel_gains
+from canprobe.mechanics.touch.patch.image_parameters import Fit, Pairs, curvature_errors, fit_parameters, moment_errors
+from canprobe.mechanics.touch.patch.layer_fit import stiffness_by_depth
+from canprobe.mechanics.touch.patch.pad_fit import fit_centroids
+from canprobe.mechanics.touch.patch.taxel_gains import taxel_gains
 
 FORM_SIGMA = 0.01
 """Relative error of a moment that planes and balls do not show: of cylinders and saddles, by the model's form."""

@@ -22,34 +22,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from canprobe.mechanics.touch.contact import ContactSample, Slope, direction_to_pad, stiffness_from_slope
-from canprobe.mechanics.touch.estimate.answer import CurvatureInformation, Solution, SurfaceEstimate, build_estimate
-from canprobe.mechanics.touch.estimate.noise import CHI2_95, CHI2_999
-from canprobe.mechanics.touch.estimate.online import Dropped, Estimator
-from canprobe.mechanics.touch.estimate.quadric import (
-    SIGMA_LIMIT,
-    TO_Q,
-    UNIT,
-    Decision,
-    matrix_of,
-    nothing_observed,
-    parameters_of,
-    turned,
-)
-from canprobe.mechanics.touch.linear_algebra import (
-    Array,
-    Vec,
-    eigen,
-    homogeneous,
-    inverted,
-    positive,
-    principal_of,
-    solved,
-    tangent_rotation,
-    transported,
-)
+from canprobe.mechanics.touch.contact import ContactSample, Slope, direction_to_pad
+from canprobe.mechanics.touch.estimate.known_curvature import CurvatureInformation
+from canprobe.mechanics.touch.estimate.noise import CHI2_999
+from canprobe.mechanics.touch.estimate.observed import turned
+from canprobe.mechanics.touch.estimate.quadric import TO_Q
+from canprobe.mechanics.touch.layer_stiffness import stiffness_from_slope
+from canprobe.mechanics.touch.linear_algebra import Array, Vec, inverted, positive, principal_of, solved
+from canprobe.mechanics.touch.patch.creep import PadMemory
 from canprobe.mechanics.touch.patch.image_model import ImageModel
-from canprobe.mechanics.touch.patch.moments import Moments, PadMemory
+from canprobe.mechanics.touch.patch.moments import Moments
+from canprobe.mechanics.touch.tangent_frames import tangent_rotation, transported
 
 LEAST_FRAMES = 8
 """Fewer frames make no estimate."""
@@ -329,161 +312,3 @@ def _turned(xx: float, xy: float, yy: float, c: float, s: float) -> tuple[float,
     """A symmetric tensor in other axes, in which the old x axis has the components c, s."""
     cc, cs, ss = c * c, c * s, s * s
     return cc * xx - 2.0 * cs * xy + ss * yy, cs * (xx - yy) + (cc - ss) * xy, ss * xx + 2.0 * cs * xy + cc * yy
-
-
-# The answer of patch and motion together, and of the patch alone.
-
-NAMED = 0.1
-"""Share of the information about K that the patch gives from which on the estimate's method names it."""
-CONTRADICTED = "the patch contradicts the motion"
-WITHDRAWN = 0.25
-"""Path over the memory after which a contradiction that lasts withdraws that anything was observed."""
-_TO_K = 1.0 / np.outer(TO_Q, TO_Q)
-
-
-def with_patch(motion: SurfaceEstimate, found: Fused, length: float, *, withdrawn: bool = False) -> SurfaceEstimate:
-    """A motion estimate with its `evidence`, and what was found of that and the patch.
-
-    Place, normal and c13, c23, c33 stay the motion's; the patch says nothing about them. Curvatures below 1/length (the
-    memory, m) count as flat; `withdrawn`: nothing is called observed. The `method` ends in "+patch" where the patch
-    gave at least `NAMED`; a note says how much.
-    """
-    assert motion.evidence is not None
-    weight = CHI2_95 / max(found.cost, CHI2_95)
-    evidence, patch = weight * motion.evidence.information, weight * found.patch
-    has_prior = motion.rank < 3 and bool(np.isfinite(motion.covariance).all())
-    data = weight * motion.information if has_prior else evidence
-    decision = nothing_observed() if withdrawn else _decide(data + patch, found.q, length)
-    root = None if motion.model_root is None else _joined(math.sqrt(weight) * motion.model_root, patch)
-    inverse = inverted(evidence + patch)
-    share = float((inverse * patch).sum()) / 3.0
-    return build_estimate(
-        _solution(motion.S, found.q, inverse, decision, has_prior=has_prior, root=root),
-        length=1.0,
-        T_frame_contact=motion.T_frame_contact,
-        problem_root=motion.problem_root,
-        innovation=motion.innovation,
-        distance=motion.distance,
-        samples=motion.samples,
-        method=motion.method + "+patch" if share >= NAMED else motion.method,
-        prior=motion.prior,
-        notes=(*motion.notes, *_notes(found, share)),
-        stiffness=found.stiffness,
-    )
-
-
-def patch_estimate(contact: ContactSample, patch: PatchCurvature, length: float) -> SurfaceEstimate | None:
-    """Shape from the patch alone, at the last contact, as of a touch that stands still; None where it knows nothing."""
-    T = homogeneous(tangent_rotation(-contact.n_base), contact.p_base)
-    found = patch.fuse(T)
-    if found is None:
-        return None
-    return build_estimate(
-        _solution(matrix_of(np.zeros(9)), found.q, inverted(found.patch), _decide(found.patch, found.q, length)),
-        length=1.0,
-        T_frame_contact=T,
-        problem_root=_root(found.patch),
-        innovation=1.0,
-        distance=0.0,
-        samples=float(patch.frames),
-        method="patch",
-        prior="none",
-        stiffness=found.stiffness,
-    )
-
-
-def _notes(found: Fused, share: float) -> tuple[str, ...]:
-    said = (f"{100.0 * share:.0f} % of the curvature from the patch",)
-    return (*said, CONTRADICTED) if found.contradicted else said
-
-
-def _joined(model_root: Array, patch: Array) -> Array:
-    """(n + 3, 9) root of the information about the entries of S with the patch's part about K."""
-    rows = np.zeros((3, 9))
-    rows[:, 6:] = _root(patch) / UNIT
-    return np.concatenate([model_root, rows])
-
-
-def _root(information: Array) -> Array:
-    """(3, 3) root of the patch's information, which may be singular."""
-    values, vectors = eigen(information)
-    result: Array = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
-    return result
-
-
-def _decide(information: Array, q: Array, length: float) -> Decision:
-    """The rank decision's second rule on what patch and motion together know; the first is about motion alone."""
-    values, vectors = eigen(information)
-    size = max(math.sqrt(float(q @ q)), 1.0 / length)
-    return Decision(np.maximum(values, 0.0), vectors, values >= 1.0 / (SIGMA_LIMIT * size) ** 2)
-
-
-def _solution(
-    S: Array, q: Array, covariance: Array, decision: Decision, *, has_prior: bool = False, root: Array | None = None
-) -> Solution:
-    """From q and its covariance (3, 3)."""
-    c = parameters_of(S)
-    if has_prior or decision.rank == 3:
-        c[6:] = UNIT * q
-        return Solution(c, covariance * _TO_K, decision, has_prior, root)
-    V = decision.vectors[:, decision.passed]
-    c[6:] = UNIT * (V @ (V.T @ q))
-    return Solution(c, np.full((3, 3), math.nan), decision, has_prior, root)
-
-
-# An estimator of motion with the contact patch as its second sensor.
-
-
-class PatchedEstimator:
-    """Any estimator, its answers completed by the patch (`with_patch`); before the contact moves, the patch alone.
-
-    Args:
-        motion: the estimator of points and normals.
-        patch: the images.
-        length: memory of `motion`, m.
-    """
-
-    def __init__(self, motion: Estimator, patch: PatchCurvature, length: float) -> None:
-        self.patch = patch
-        self._motion = motion
-        self._length = length
-        self._last: ContactSample | None = None
-        self._place: Array | None = None
-        self._contradicted = 0.0
-
-    @property
-    def dropped(self) -> Dropped:
-        """Samples that were not used, by neither sensor."""
-        return self._motion.dropped
-
-    def add(self, sample: ContactSample) -> None:
-        """Take one contact with its moments."""
-        before = self._motion.dropped.total
-        self._motion.add(sample)
-        if self._motion.dropped.total == before:
-            self._last = sample
-            self.patch.add(sample)
-
-    def estimate(self) -> SurfaceEstimate | None:
-        """The answer at the last contact, or None before there is any."""
-        motion = self._motion.estimate()
-        if motion is None:
-            return None if self._last is None else patch_estimate(self._last, self.patch, self._length)
-        if motion.evidence is None:
-            return motion
-        found = self.patch.fuse(motion.T_frame_contact, motion.evidence)
-        if found is None or not found.contradicted:
-            self._contradicted = 0.0
-        elif self._place is not None:
-            self._contradicted += float(np.linalg.norm(motion.point - self._place))
-        self._place = motion.point
-        if found is None:
-            return motion
-        return with_patch(motion, found, self._length, withdrawn=self._contradicted > WITHDRAWN * self._length)
-
-    def reset(self) -> None:
-        """Forget everything but the settings."""
-        self._motion.reset()
-        self.patch.reset()
-        self._last = self._place = None
-        self._contradicted = 0.0

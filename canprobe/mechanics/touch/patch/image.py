@@ -15,123 +15,14 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dposv
 
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import Doubt
 from canprobe.mechanics.touch.linear_algebra import Array, checked, positive, read_only
 from canprobe.mechanics.touch.pad import COUNTS_MAX, Pad
+from canprobe.mechanics.touch.patch.beyond_window import LEAST_PEAK, WORTH_COMPLETING, Continuation
+from canprobe.mechanics.touch.patch.dead_taxels import may_be_dead, mended
 from canprobe.mechanics.touch.stops import OFF_PAD, OFF_PAD_SIGMAS, OFF_PAD_TAXELS
-
-# Dead taxels: found where a taxel reads nothing in the midst of a patch, and bridged by their neighbours.
-#
-# A dead taxel in the midst of a patch at 2 N moves the centroid by up to a tenth of a pitch and takes some percent off
-# the force. At the rim, where it cannot be told from the patch's end, it hardly matters.
-
-LEAST_COUNTS = 20
-"""Counts that each of the four neighbours must show: more than a patch's slope can fall to nothing from."""
-
-_LEVELS = bytes((count > 0) + (count >= LEAST_COUNTS) for count in range(256))
-_GAP = bytes((2, 0, 2))
-"""A dead taxel between its left and its right neighbour, in levels of counts."""
-
-Image = NDArray[np.uint8]
-
-
-def mended(taxels: Image) -> tuple[Image, int]:
-    """The image with its dead taxels bridged, and how many there were.
-
-    The same array (rows, columns) where none is dead; else a copy in which each has the mean of its four neighbours.
-    """
-    if not _may_be_dead(taxels.tobytes()):
-        return taxels, 0
-    inner = taxels[1:-1, 1:-1]
-    sides = (taxels[:-2, 1:-1], taxels[2:, 1:-1], taxels[1:-1, :-2], taxels[1:-1, 2:])
-    least = np.minimum(np.minimum(sides[0], sides[1]), np.minimum(sides[2], sides[3]))
-    dead = least > (LEAST_COUNTS - 1) + 255 * (inner > 0).astype(np.int16)
-    n = int(np.count_nonzero(dead))
-    if n == 0:
-        return taxels, 0
-    mean = np.mean(np.stack([s.astype(np.float64) for s in sides]), axis=0)
-    whole = taxels.copy()
-    whole[1:-1, 1:-1][dead] = np.rint(mean[dead]).astype(np.uint8)
-    return whole, n
-
-
-def _may_be_dead(counts: bytes) -> bool:
-    """Whether a taxel reads nothing between two pressed ones: no as a rule, and in a fraction of the whole search."""
-    return _GAP in counts.translate(_LEVELS)
-
-
-# What a window cuts off the contact patch: carried on from what is in it.
-#
-# A window of 8 × 8 taxels cuts the patch of a soft contact, and force and centroid read wrong by what is outside. On a
-# bed of springs the pressure falls off from its summit as a quadratic does, so that the rest of the patch follows from
-# the part that is seen: a quadratic is fitted to the well pressed taxels and read off outside the window where it is
-# above zero. Of the emulated array the force is then 2 % low at 4 kN/m instead of 3–11 %, and the centroid 0.09 mm off
-# instead of 0.2–0.4 mm. Stops being true where the curvature of the object changes within the patch.
-# Source: Johnson, Contact Mechanics (1985), 4.3, the elastic foundation.
-
-WORTH_COMPLETING = 0.1
-"""Share of the peak at the window's edge up to which a patch ends within the next taxel."""
-LEAST_PEAK = 3
-"""Highest count over the threshold up to which whole counts and noise hide the shape: what creep leaves of a long press
-was carried on to up to five times its force."""
-LEAST_SHARE = 0.2
-"""Share of the peak below which a taxel is left out of the fit: blur and threshold bend the rim."""
-LEAST_TAXELS = 12
-"""Twice the six unknowns."""
-LEAST_FALL = 0.3
-"""Share of the peak by which the pressure must fall over half the pad in every direction: else it is no patch."""
-
-
-class Continuation:
-    """Carries on what a window of one array cuts off.
-
-    Args:
-        weights: (n², 6) area of each taxel × (1, u, v, uu, uv, vv), the place in any unit.
-        saturated_pa: pressure from which on a taxel says no more than that, and is left out of the fit.
-    """
-
-    def __init__(self, weights: Array, saturated_pa: float) -> None:
-        self._saturated_pa = saturated_pa
-        self._weights = weights
-        self._area = weights[:, 0].copy()
-        self._terms = weights / weights[:, :1]
-        self._corner = float(self._terms[-1, 3])
-
-    def completed(self, pressure: Array, window: Sequence[int], peak_pa: float) -> Array:
-        """The pressures of the whole pad, those outside the window carried on from those inside.
-
-        Args:
-            pressure: (n, n) of the taxels, Pa; 0 outside the window.
-            window: first row, first column, rows, columns.
-            peak_pa: the highest of them.
-
-        Returns:
-            A filled copy; the same array where the taxels show no quadratic with a summit.
-        """
-        row, column, rows, columns = window
-        width = pressure.shape[1]
-        strip = slice(width * row, width * (row + rows))  # the rows of the window: all else is 0
-        seen = pressure.reshape(-1)[strip]
-        used = (seen >= LEAST_SHARE * peak_pa) & (seen < self._saturated_pa)
-        if np.count_nonzero(used) < LEAST_TAXELS:
-            return pressure
-        weights = self._weights[strip]
-        used_weights = (weights * used[:, None]).T
-        _, quadratic, singular = dposv(used_weights.dot(weights), used_weights.dot(self._area[strip] * seen))
-        _, _, _, uu, uv, vv = quadratic.tolist()
-        least_fall = -0.5 * (uu + vv + math.hypot(uu - vv, uv)) * self._corner
-        if singular or not least_fall > LEAST_FALL * peak_pa:
-            return pressure
-        whole: Array = np.maximum(self._terms.dot(quadratic), 0.0).reshape(pressure.shape)
-        inside = slice(row, row + rows), slice(column, column + columns)
-        whole[inside] = pressure[inside]
-        return whole
-
-
-# The patch.
 
 _TOO_FEW = 4
 _COUNTS = bytes(range(COUNTS_MAX + 1))
@@ -283,7 +174,7 @@ def compute_patch(
         raise UsageError(f"taxels: expected {pad.shape} uint8, got {taxels.shape} {taxels.dtype}")
     counts, dead, edges = taxels.tobytes(), 0, (0, 0)
     if pad.is_grid:  # a list has neither neighbours nor an edge
-        if _may_be_dead(counts):
+        if may_be_dead(counts):
             taxels, dead = mended(taxels)
             counts = taxels.tobytes()
         edges = _edges(counts, pad.shape, window)

@@ -13,17 +13,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.linear_algebra import Array
-from canprobe.mechanics.touch.patch.array_calibration import ImageParameters, MomentErrors
-from canprobe.mechanics.touch.patch.image import Image, PatchCalibration, compute_patch
-from canprobe.mechanics.touch.patch.image_model import ImageModel
-from canprobe.mechanics.touch.patch.moments import LEVEL_COUNTS, MomentImage, PadMemory
+from canprobe.mechanics.touch.patch.array_calibration import MomentErrors
+from canprobe.mechanics.touch.patch.creep import PadMemory
+from canprobe.mechanics.touch.patch.dead_taxels import Image
+from canprobe.mechanics.touch.patch.image import PatchCalibration, compute_patch
+from canprobe.mechanics.touch.patch.moments import LEVEL_COUNTS, MomentImage
 
 BLUR_PITCH = (0.7, 0.2)
 CROSSTALK = (0.025, 0.01)
@@ -157,117 +157,3 @@ def what_is_shown(dwell: Dwell, plain: PatchCalibration, age_s: float = math.inf
         usable=bad <= 0.2 * len(kept) and peak < MOST_OF_FULL_SCALE * plain.full_scale_pa,
         push=float(dwell.push[kept].mean()),
     )
-
-
-# The image model's parameters.
-
-
-Pairs = Sequence[tuple[Dwell, Shown]]
-
-
-class Fit(NamedTuple):
-    """Parameters, their covariance (5, 5) in the order of `_as_vector`, and the forces (n,) of the touches, N."""
-
-    parameters: ImageParameters
-    covariance: Array
-    forces: Array
-
-
-def _as_parameters(z: Array, pitch: float) -> ImageParameters:
-    k, scale, blur, crosstalk, memory = z.tolist()
-    return ImageParameters(math.exp(k), math.exp(scale), max(blur, 0.1) * pitch, crosstalk, memory)
-
-
-def _model(parameters: ImageParameters, plain: PatchCalibration, seen: int, errors: MomentErrors) -> ImageModel:
-    count = plain.full_scale_pa / 255
-    return ImageModel(
-        parameters,
-        plain.radius_m,
-        plain.pitch_m,
-        LEVEL_COUNTS * count,
-        count,
-        side=max(plain.pad.shape),
-        seen=seen,
-        errors=errors,
-    )
-
-
-def fit_parameters(  # noqa: PLR0917
-    dwells: Sequence[Dwell],
-    shown: Sequence[Shown],
-    plain: PatchCalibration,
-    scale_sigma: float | None,
-    reference_sigma: float,
-    seen: int,
-) -> Fit:
-    """Least squares over sums and moments of touches, reference forces and priors.
-
-    Args:
-        dwells, shown: the touches.
-        plain: full scale, pitch and radius of the probe.
-        scale_sigma: of ln(scale) about 0, where the stated full scale is the reference; None: forces are.
-        reference_sigma: relative, of reference forces.
-        seen: taxels along the side of the window.
-    """
-    n = len(dwells)
-    kappa = np.array([d.kappa for d in dwells])
-    S, V, D = (np.array([getattr(s, name) for s in shown]) for name in ("total", "moments", "remembered"))
-    known = np.array([i for i, d in enumerate(dwells) if d.force is not None], dtype=int)
-    reference = np.array([dwells[i].force for i in known], dtype=float)
-    a, b = (0.5 * (1.0 / plain.radius_m + kappa)).T
-    side = max(plain.pad.shape)
-    prior = np.array([math.log(1e8), 0.0, BLUR_PITCH[0], CROSSTALK[0], MEMORY[0]])
-    widths = np.array([5.0, 5.0 if scale_sigma is None else scale_sigma, BLUR_PITCH[1], CROSSTALK[1], MEMORY[1]])
-
-    def residuals(z: Array) -> Array:
-        parameters = _as_parameters(z[:5], plain.pitch_m)
-        force = np.exp(z[5:])
-        depth = np.sqrt(2.0 * force * np.sqrt(a * b) / (math.pi * parameters.stiffness))
-        whole = _model(parameters, plain, side, NO_ERRORS)
-        image = whole.shown(depth, a, b)
-        part = whole if seen == side else _model(parameters, plain, seen, NO_ERRORS)
-        M = np.array(part.moments_of(image if part is whole else part.shown(depth, a, b)))
-        own = (V - parameters.memory * D)[:, [0, 2]]
-        return np.concatenate(
-            [
-                (own / M - 1.0).reshape(-1) / TOUCH_SIGMA,
-                (S / whole.sum_of(image) - 1.0) / TOUCH_SIGMA,
-                (z[5:][known] - np.log(reference)) / reference_sigma,
-                (z[:5] - prior) / widths,
-            ]
-        )
-
-    start = np.concatenate([prior, np.log(np.maximum(S, 1e-3))])
-    found: Any = least_squares(residuals, start, x_scale=np.array([0.1, 0.1, 0.1, 0.02, 0.03] + n * [0.05]))
-    covariance = np.linalg.inv(found.jac.T @ found.jac)[:5, :5]
-    return Fit(_as_parameters(found.x[:5], plain.pitch_m), covariance, np.exp(found.x[5:]))
-
-
-def moment_errors(model: ImageModel, dwells: Sequence[Dwell], shown: Sequence[Shown], forces: Sequence[float]) -> Array:
-    """(n, 3) relative errors of V_1, V_2 and of V_12 over their root, at measured forces, N."""
-    errors = []
-    for dwell, s, force in zip(dwells, shown, forces, strict=True):
-        k = (dwell.kappa[0], 0.0, dwell.kappa[1])
-        xx, _, yy = model.moments(k, force)
-        v = s.moments - model.memory * s.remembered
-        errors.append((v[0] / xx - 1.0, v[2] / yy - 1.0, v[1] / math.sqrt(v[0] * v[2])))
-    return np.array(errors)
-
-
-def curvature_errors(
-    model: ImageModel, dwells: Sequence[Dwell], shown: Sequence[Shown], forces: Sequence[float]
-) -> Array:
-    """(n, 2) errors of the principal curvatures from each dwell's moments alone, relative to (κ + 1/R_p)."""
-    result = []
-    for dwell, s, force in zip(dwells, shown, forces, strict=True):
-        v = tuple((s.moments - model.memory * s.remembered).tolist())
-        v = (v[0], 0.0, v[2])
-        k = model.start(v, force) or (dwell.kappa[0], 0.0, dwell.kappa[1])
-        for _ in range(20):
-            J, r, _ = model.linearised(v, force, 100.0, k)
-            step = np.clip(np.linalg.solve(J[[0, 2]][:, [0, 2]], r[[0, 2]]), -20.0, 20.0)
-            least = HOLLOWEST / model.radius
-            k = (max(k[0] + float(step[0]), least), 0.0, max(k[2] + float(step[1]), least))
-        relative = np.array([1.0 / model.radius + x for x in dwell.kappa])
-        result.append((np.array([k[0], k[2]]) - dwell.kappa) / relative)
-    return np.array(result)

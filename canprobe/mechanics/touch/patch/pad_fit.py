@@ -1,4 +1,4 @@
-"""What touches of known objects say about centroids, taxels, and the layer by the arm's way."""
+"""Centroids: how they trail, how they scatter, and over which way an error lasts."""
 
 from __future__ import annotations
 
@@ -8,12 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import least_squares
 
-from canprobe.mechanics.touch.contact import indentation_from_force
 from canprobe.mechanics.touch.linear_algebra import Array
-from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.patch.array_calibration import CentroidErrors, Lag
 from canprobe.mechanics.touch.patch.image_fit import Dwell, Shown
-from canprobe.mechanics.touch.patch.image_model import STEPS, ImageModel
 
 REACH = 200e-6, 0.2
 """Expected `Lag.reach`, m, and how far its logarithm may be off: rolls of one length hardly tell it from `Lag.most`."""
@@ -25,9 +22,6 @@ LAGS, LAG_STEP_M = 16, 1e-4
 """Of the autocorrelation along the way over the pad."""
 TAU_S = 0.02, 0.3
 """Time constants of `Lag`."""
-
-
-# Centroids: how they trail, how they scatter, and over which way an error lasts.
 
 
 def _means(t: Array, at: Array) -> Array:
@@ -134,88 +128,3 @@ def _lasting(errors: Sequence[Array], ways: Sequence[Array]) -> tuple[float, flo
 
     share, length, shift = least_squares(residuals, np.array([0.5, 1.0, 0.1])).x.tolist()
     return min(max(share / (1.0 + max(shift, 0.0)), 0.0), 1.0), abs(length) * 1e-3
-
-
-# Taxels.
-
-
-def taxel_gains(
-    pad: Pad, model: ImageModel, dwells: Sequence[Dwell], shown: Sequence[Shown], forces: Sequence[float]
-) -> tuple[Array, tuple[tuple[int, int], ...]]:
-    """Gain of each taxel over the mean, and those that are dead.
-
-    The image of the model is laid on the centroid of each image; taxels above a fifth of the peak count.
-
-    Returns:
-        (rows, columns) gains, 1 where nothing is known; (row, column) of dead taxels.
-    """
-    from scipy.ndimage import map_coordinates
-
-    seen, wanted, dead = np.zeros((3, *pad.shape))
-    u, v = (pad.uv.T / pad.pitch_m).reshape(2, *pad.shape)
-    for dwell, s, force in zip(dwells, shown, forces, strict=True):
-        a, b = (0.5 * (1.0 / model.radius + x) for x in dwell.kappa)
-        quadrant = model.shown(np.array([model.depth(force, a * b)]), np.array([a]), np.array([b]))[0]
-        c, si = math.cos(dwell.angle), math.sin(dwell.angle)
-        mine = quadrant / model.count
-        stamps = dict(zip(s.t_s.tolist(), s.raw / model.pitch, strict=True))
-        for t, image in list(zip(dwell.t_s.tolist(), dwell.images, strict=True))[::4]:
-            if t not in stamps:
-                continue
-            x, y = u - stamps[t][0], v - stamps[t][1]
-            along, across = np.abs(c * x + si * y), np.abs(-si * x + c * y)
-            expected = map_coordinates(mine, [along * STEPS - 0.5, across * STEPS - 0.5], order=1, mode="nearest")
-            inside = (expected > 0.25 * mine.max()) & (np.maximum(along, across) < len(mine) / STEPS)
-            share = expected[inside].sum() / max(float(image[inside].sum()), 1.0)
-            seen[inside] += image[inside] * share
-            wanted[inside] += expected[inside]
-            dead[inside] += np.where(image[inside] == 0, 1.0, -1.0)
-    known = wanted > 10.0 * mine.max()
-    gains = np.where(known, seen / np.maximum(wanted, 1.0), 1.0)
-    broken = tuple((int(i), int(j)) for i, j in np.argwhere(dead > 0))
-    for place in broken:
-        gains[place] = 1.0
-    return gains, broken
-
-
-# The layer, by the arm's way into the object.
-
-
-def stiffness_by_depth(
-    dwells: Sequence[Dwell],
-    shown: Sequence[Shown],
-    forces: Sequence[float],
-    radius: float,
-    by_images: tuple[float, float],
-) -> tuple[float, float, float, float]:
-    """K/h (N/m³) by how far the arm went in between touches of one place; the arm's compliance (m/N); each with its σ.
-
-    On a stiff arm the way between two forces at one place is that of the layer, `δ = √(2 F √det A / (π k))`. What the
-    way has more than the stiffness that the images show (with its σ) grows with the force: the arm's compliance. Its
-    σ is that of the ways' scatter and of that stiffness.
-
-    Returns:
-        NaN where no place was touched with two forces.
-    """
-    stiffness, stiffness_sigma = by_images
-    rows = []
-    for name, place, turn in sorted({(d.name, d.place, d.turn) for d in dwells}):
-        group = [i for i, d in enumerate(dwells) if (d.name, d.place, d.turn) == (name, place, turn)]
-        if len(group) < 2:
-            continue
-        unit = np.array([indentation_from_force(forces[i], 1.0, radius, dwells[i].kappa) for i in group])
-        push, force = np.array([shown[i].push for i in group]), np.array([forces[i] for i in group])
-        rows += list(zip(unit - unit.mean(), force - force.mean(), push - push.mean(), strict=True))
-    if not rows:
-        return (math.nan,) * 4
-    unit, force, push = np.array(rows).T
-    root = float(unit @ push / (unit @ unit))
-    sigma = math.sqrt(float(np.mean((push - root * unit) ** 2)) / float(unit @ unit))
-    more = push - unit / math.sqrt(stiffness)
-    compliance = float(force @ more / (force @ force))
-    scatter = math.sqrt(float(np.mean((more - compliance * force) ** 2)) / float(force @ force))
-    of_stiffness = 0.5 * stiffness_sigma * stiffness**-1.5 * abs(float(force @ unit)) / float(force @ force)
-    compliance_sigma = math.hypot(scatter, of_stiffness)
-    if root <= 0.0:
-        return math.nan, math.nan, compliance, compliance_sigma
-    return root**-2, 2.0 * sigma / root**3, compliance, compliance_sigma

@@ -12,8 +12,9 @@ from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate import quadric
 from canprobe.mechanics.touch.estimate.fit import METHODS, make_estimator
 from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
-from canprobe.mechanics.touch.estimate.noise import Prior, make_noise
-from canprobe.mechanics.touch.estimate.recursive import Spread, Travel
+from canprobe.mechanics.touch.estimate.noise import make_noise
+from canprobe.mechanics.touch.estimate.prior import Prior
+from canprobe.mechanics.touch.estimate.travel import Spread, Travel
 
 NOISE = {"sigma_point": 2e-5, "sigma_normal": 1e-3}
 WEIGHT = np.array([1.0, 2.0, 1.0])

@@ -11,7 +11,8 @@ from canprobe.errors import UsageError
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 from canprobe.mechanics.touch.estimate.fit import METHODS, fit_surface, make_estimator
 from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
-from canprobe.mechanics.touch.estimate.noise import Correlation, Prior
+from canprobe.mechanics.touch.estimate.noise import Correlation
+from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.surface import SurfaceMatrix
 from canprobe.mechanics.touch.surface_map import SurfaceMap
 

@@ -5,12 +5,16 @@ import math
 import numpy as np
 import pytest
 
-from canprobe.mechanics.touch.estimate.answer import curvature_covariance
-from canprobe.mechanics.touch.estimate.information import Expected, InformationFilter, LeftOut, Score
-from canprobe.mechanics.touch.estimate.noise import Correlation, Noise, Prior
+from canprobe.mechanics.touch.estimate.gauss_newton_step import solved_once
+from canprobe.mechanics.touch.estimate.information import InformationFilter
+from canprobe.mechanics.touch.estimate.known_curvature import curvature_covariance
+from canprobe.mechanics.touch.estimate.left_out import Expected, LeftOut
+from canprobe.mechanics.touch.estimate.noise import Correlation, Noise
 from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE
-from canprobe.mechanics.touch.estimate.quadric import curvature_jacobian, design, shifted, terms
-from canprobe.mechanics.touch.estimate.start import solved_once
+from canprobe.mechanics.touch.estimate.prior import Prior
+from canprobe.mechanics.touch.estimate.residuals import curvature_jacobian, design
+from canprobe.mechanics.touch.estimate.sandwich import Score
+from canprobe.mechanics.touch.estimate.terms import shifted, terms
 
 MEMORY = 0.02
 STEP = 0.5e-3

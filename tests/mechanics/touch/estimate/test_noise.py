@@ -8,7 +8,8 @@ import pytest
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.estimate.fit import fit_surface
 from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
-from canprobe.mechanics.touch.estimate.noise import Correlation, Prior
+from canprobe.mechanics.touch.estimate.noise import Correlation
+from canprobe.mechanics.touch.estimate.prior import Prior
 
 SIGMA = {"sigma_point": 5e-5, "sigma_normal": 3e-3}
 LENGTH, SHARE, STEP = 1.5e-3, 0.9, 0.125e-3

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.touch.estimate.change import ChangeTest
 from canprobe.mechanics.touch.estimate.fit import fit_surface, make_estimator
-from canprobe.mechanics.touch.estimate.online import LAG, SPAN, ChangeTest, FollowingEstimator, less_certain
+from canprobe.mechanics.touch.estimate.following import LAG, SPAN, FollowingEstimator, less_certain
 from canprobe.mechanics.touch.patch.curvature import FEW_FRAMES, FINE, LEAST_FRAMES, _Mean
 
 MEMORY = 0.02

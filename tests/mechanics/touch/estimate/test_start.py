@@ -9,8 +9,8 @@ from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate import start as one_step
 from canprobe.mechanics.touch.estimate.fit import make_estimator
 from canprobe.mechanics.touch.estimate.information import Touch, batch_design
-from canprobe.mechanics.touch.estimate.noise import Prior
 from canprobe.mechanics.touch.estimate.nonlinear import fit
+from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.estimate.start import LAST, MOST, Start, isolation
 
 MEMORY, SIGMA = 0.02, (2e-5, 1e-3)

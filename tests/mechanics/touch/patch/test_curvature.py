@@ -10,15 +10,18 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from canprobe.mechanics.touch.contact import ContactSample, Slope, direction_to_pad, indentation_from_force
-from canprobe.mechanics.touch.estimate.answer import CurvatureInformation
 from canprobe.mechanics.touch.estimate.fit import make_estimator
-from canprobe.mechanics.touch.estimate.noise import Prior
-from canprobe.mechanics.touch.linear_algebra import homogeneous, tangent_rotation
+from canprobe.mechanics.touch.estimate.known_curvature import CurvatureInformation
+from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.patch.array_calibration import ImageParameters, MomentErrors
-from canprobe.mechanics.touch.patch.curvature import LEAST_FRAMES, PatchCurvature, PatchedEstimator, patch_estimate
+from canprobe.mechanics.touch.patch.creep import PadMemory
+from canprobe.mechanics.touch.patch.curvature import LEAST_FRAMES, PatchCurvature
+from canprobe.mechanics.touch.patch.fused_answer import patch_estimate
+from canprobe.mechanics.touch.patch.fused_estimator import PatchedEstimator
 from canprobe.mechanics.touch.patch.image import PatchCalibration
 from canprobe.mechanics.touch.patch.image_model import USUAL_LIGHTNESS, ImageModel
-from canprobe.mechanics.touch.patch.moments import LEVEL_COUNTS, MomentImage, PadMemory
+from canprobe.mechanics.touch.patch.moments import LEVEL_COUNTS, MomentImage
+from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 
 RADIUS, STIFFNESS, PITCH, COUNT_PA = 0.040, 1.27e8, 1.5875e-3, 100e3 / 255
 LEVEL_PA = 6 * COUNT_PA

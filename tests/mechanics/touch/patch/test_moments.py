@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from canprobe.mechanics.touch.patch.array_calibration import Lag
-from canprobe.mechanics.touch.patch.moments import GAP_S, TIMES_S, PadLag, PadMemory
+from canprobe.mechanics.touch.patch.creep import TIMES_S, PadMemory
+from canprobe.mechanics.touch.patch.trailing import GAP_S, PadLag
 
 
 def remembered(t, uv):

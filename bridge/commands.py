@@ -1,0 +1,84 @@
+"""Whether a command from outside may reach the cell: by the same checks that the scene itself has to pass."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.planning.make import make_plan
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.scene.load import dump_scene, parse_scene
+from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.tasks import Trajectory
+from canprobe.errors import UsageError
+
+Array = NDArray[np.float64]
+
+
+def refuse(plan: Plan, kind: str, value: float | None) -> str | None:
+    """Why a command is refused, or None.
+
+    A target force or a speed is put into the scene, which is then checked and planned as if it had been written so:
+    ranges, `limits.force_max_n`, the speeds of the joints.
+
+    Args:
+        plan: of the run.
+        kind: start, stop, target_force_n or speed_m_s.
+        value: N or m/s; None for start and stop.
+    """
+    if kind in ("start", "stop"):
+        return None
+    needs = ("scan", "press") if kind == "target_force_n" else ("scan",)
+    task = plan.scene.task
+    if task.kind not in needs:
+        return f'task.kind = "{task.kind}" has none'
+    if value is None or not math.isfinite(value):
+        return f"expected a number, got {value}"
+    changed = replace(task, force_n=value) if kind == "target_force_n" else replace(task, speed_mm_s=value * 1e3)
+    try:
+        make_plan(resolve(parse_scene(dump_scene(replace(plan.scene, task=changed)))))
+    except UsageError as error:
+        return str(error).splitlines()[0].removeprefix("scene: ")
+    return None
+
+
+def trajectory_of(plan: Plan, message: Any, q: Array | None) -> dict[str, Any]:
+    """The way that a `trajectory_msgs/msg/JointTrajectory` asks for, checked from where the arm stands.
+
+    Args:
+        plan: of the run.
+        message: with names, points, and positions in each; velocities in all of them or in none.
+        q: (n,) joint positions now, rad or m; None as long as they are not known.
+
+    Returns:
+        `points` and `velocities` of a `canprobe.cell.tasks.Trajectory`.
+
+    Raises:
+        UsageError: the cell cannot or must not follow it.
+    """
+    arm = plan.setup.arm
+    if arm is None or plan.scene.task.kind != "free":
+        raise UsageError(f'task.kind = "{plan.scene.task.kind}" follows none: task.kind = "free" does')
+    if q is None:
+        raise UsageError("the joints have not reported yet")
+    names, known = list(message.joint_names), list(arm.model.chain.joints)
+    if sorted(names) != sorted(known):
+        raise UsageError(f"expected the joints {', '.join(known)}, got {', '.join(names) or 'none'}")
+    order = [names.index(name) for name in known]
+
+    def ordered(values: Any) -> list[float]:
+        if len(values) != len(names):
+            raise UsageError(f"expected {len(names)} numbers for {len(names)} joints, got {len(values)}")
+        return [float(values[i]) for i in order]
+
+    times = [point.time_from_start.sec + 1e-9 * point.time_from_start.nanosec for point in message.points]
+    points = [(t, ordered(point.positions)) for t, point in zip(times, message.points, strict=True)]
+    moving = [point.velocities for point in message.points if len(point.velocities)]
+    velocities = [ordered(one) for one in moving] if moving else None
+    if reason := Trajectory(plan, points, velocities).inspect(q):
+        raise UsageError(reason)
+    return {"points": points, "velocities": velocities}

@@ -1,0 +1,99 @@
+"""Observations → neutral samples, in the bridge's process: patch, contact, frames and the state of the nodes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.master.array import patch_of
+from canprobe.cell.master.controller import Measurement
+from canprobe.cell.master.supervision import TOUCH_FORCE
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.scene.setup import Setup, Touch
+from canprobe.cell.tasks.probing import Phase
+from canprobe.cell.tasks.sensing import ContactSensing
+from canprobe.lab.bridge.codec import Received
+from canprobe.lab.bridge.node_states import Health
+from canprobe.lab.bridge.sample import ContactFrame, Sample, SurfacePatch, TouchFrame
+from canprobe.mechanics.touch.contact import ContactSample, pad_to_direction
+from canprobe.mechanics.touch.patch.image_model import make_patch_calibration
+from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
+
+Array = NDArray[np.float64]
+_PHASES = {float(phase): phase.name.lower() for phase in Phase}
+
+
+class SampleSource:
+    """Makes the samples of one run, with the scene's own calibration and geometry.
+
+    Args:
+        plan: of the run.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        arm, array, probe = plan.setup.arm, plan.setup.array, plan.setup.probe
+        self._health = Health(plan)
+        self._sensing = _sensing(plan.setup)
+        self._has_arm = arm is not None
+        self._radius = probe.radius
+        self._calibration = make_patch_calibration(array.calibration, array.pad) if array is not None else None
+
+    def sample(self, received: Received) -> Sample:
+        """The sample of one observation."""
+        measurement, t_ns = received.measurement, received.t_ns
+        diagnostics = self._health.step(t_ns, received)
+        sample = Sample(t_ns, frames=received.frames, diagnostics=diagnostics, dropped=received.dropped)
+        if measurement is None:
+            return sample
+        self._place_on(received.patch)  # before the contact, as the task does
+        if received.depth is not None and self._sensing is not None:
+            self._sensing.set_depth_at_1_n(received.depth * 1e-3)
+        return replace(
+            sample,
+            cycle=measurement.cycle,
+            phase=_PHASES.get(received.phase) if received.phase is not None else None,
+            q=measurement.q if self._has_arm else None,
+            touch=self._touch(measurement, t_ns - measurement.t_ns),
+            patch=received.patch,
+        )
+
+    def _touch(self, m: Measurement, shift_ns: int) -> TouchFrame | None:
+        """What the array measured; ``shift_ns`` takes the cycle's clock to that of the samples."""
+        sensing, sample = self._sensing, m.tactile
+        patch = sensing.step(m) if sensing is not None else None
+        if sample is None or self._calibration is None:
+            return None
+        if patch is None:
+            patch = patch_of(sample, self._calibration)
+        contact = sensing.contact(sample, patch) if sensing is not None and patch.force > TOUCH_FORCE / 2 else None
+        force = np.zeros(3)
+        if patch.force > 0.0:  # the object pushes the probe back along the direction of the contact
+            force = -patch.force * pad_to_direction(patch.u, patch.v, self._radius)
+        return TouchFrame(
+            t_ns=sample.t_sample_ns + shift_ns,
+            counts=sample.frame.taxels if sample.frame.features is None else None,
+            force=force,
+            contact=_contact(contact) if contact is not None else None,
+        )
+
+    def _place_on(self, patch: SurfacePatch | None) -> None:
+        """Contacts are placed on the estimated curvature from now on."""
+        if patch is not None and self._sensing is not None and all(patch.observed):
+            low, high = np.linalg.eigvalsh(patch.K).tolist()
+            self._sensing.set_kappa(np.array([high, low]))
+
+
+def _sensing(setup: Setup) -> ContactSensing | None:
+    """Contacts, where there is an arm to place them; second moments are the estimator's business."""
+    from canprobe.cell.tasks.from_plan import make_sensing
+
+    touch = setup.touch
+    if touch is None:
+        return None
+    return make_sensing(replace(touch, shape=None) if isinstance(touch, Touch) else touch)
+
+
+def _contact(contact: ContactSample) -> ContactFrame:
+    return ContactFrame(homogeneous(tangent_rotation(-contact.n_base), contact.p_base))

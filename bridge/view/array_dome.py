@@ -1,0 +1,61 @@
+"""The tactile array on its dome: where each taxel lies, and its image as colours."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.lab.bridge.view.colours import MAGMA, Colours, scale
+from canprobe.lab.bridge.view.meshes import Array
+from canprobe.mechanics.touch.contact import pad_to_direction
+from canprobe.mechanics.touch.pad import Pad
+
+FULL_COUNTS = 255
+SHARE = 0.9
+"""Side of a drawn taxel over the pitch."""
+TAXEL_LIFT_M = 2e-4
+"""How far above the dome taxels are drawn."""
+
+
+def taxel_poses(pad: Pad, radius: float) -> tuple[Array, Array]:
+    """Where the taxels lie on the probe.
+
+    Args:
+        pad: the taxels.
+        radius: from the origin of the probe's frame to its pole, m.
+
+    Returns:
+        (n, 3) positions in the probe frame, m, and (n, 4) unit quaternions w, x, y, z that turn a tile lying in
+        the xy plane to its place; row by row, v and then u rising.
+    """
+    directions = np.array([pad_to_direction(u, v, pad.radius_m) for u, v in pad.uv.tolist()])
+    # the shortest turn from z to d: (1 + d_z, z × d), normalised
+    turns = np.column_stack([1.0 + directions[:, 2], -directions[:, 1], directions[:, 0], np.zeros(len(directions))])
+    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+    pole = np.array([0.0, 0.0, radius - pad.radius_m])
+    return pole + (pad.radius_m + TAXEL_LIFT_M) * directions, turns
+
+
+def tile(pad: Pad) -> tuple[Array, NDArray[np.int64]]:
+    """One taxel: vertices (4, 3), m, and faces (2, 3), front side towards +z."""
+    half = 0.5 * SHARE * pad.pitch_m
+    corners = half * np.array(((-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)), dtype=np.float64)
+    return corners, np.array(((0, 1, 2), (0, 2, 3)))
+
+
+def taxel_colours(taxels: NDArray[np.uint8]) -> Colours:
+    """(..., 3) colours of counts; a square-root scale, so that the rim of a patch is seen."""
+    return scale(np.sqrt(taxels.astype(np.float64)), 0.0, math.sqrt(FULL_COUNTS), MAGMA)
+
+
+def taxel_image(taxels: NDArray[np.uint8], pixels: int) -> Colours:
+    """The image as RGB, each taxel a square of so many pixels; v rises upward.
+
+    Args:
+        taxels: (rows, columns) counts, rows v, columns u.
+        pixels: per taxel.
+    """
+    colours = taxel_colours(taxels[::-1])
+    return np.repeat(np.repeat(colours, pixels, axis=0), pixels, axis=1)

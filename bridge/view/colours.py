@@ -1,0 +1,51 @@
+"""Colours of numbers: a scale that is even to the eye, dark blue to yellow."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from canprobe.lab.bridge.view.meshes import Array
+
+Colours = NDArray[np.uint8]
+VIRIDIS = np.array(
+    (
+        (68, 1, 84), (71, 44, 122), (59, 81, 139), (44, 113, 142), (33, 144, 141),
+        (39, 173, 129), (92, 200, 99), (170, 220, 50), (253, 231, 37),
+    ),
+    dtype=np.float64,
+)  # fmt: skip
+"""At ninths. Source: Smith and van der Walt, matplotlib 2.0, CC0."""
+MAGMA = np.array(((0, 0, 4), (81, 18, 124), (183, 55, 121), (252, 137, 97), (252, 253, 191)), dtype=np.float64)
+"""At quarters, of the same source."""
+UNKNOWN = (138, 148, 160)
+
+
+def scale(values: ArrayLike, low: float, high: float, stops: Array = VIRIDIS) -> Colours:
+    """Colours of values between two ends, those beyond take the end's; what is not finite is grey.
+
+    Args:
+        values: (...,) any unit.
+        low, high: in the same unit, low < high.
+        stops: `VIRIDIS`, dark blue to yellow, or `MAGMA`, black to light yellow.
+
+    Returns:
+        (..., 3) RGB, 0–255.
+    """
+    x = np.asarray(values, dtype=np.float64)
+    known = np.isfinite(x)
+    place = np.clip((np.where(known, x, low) - low) / (high - low), 0.0, 1.0) * (len(stops) - 1)
+    first = np.minimum(place.astype(np.int64), len(stops) - 2)
+    share = (place - first)[..., None]
+    mixed = (1.0 - share) * stops[first] + share * stops[first + 1]
+    return np.where(known[..., None], mixed.round(), UNKNOWN).astype(np.uint8)
+
+
+def linear_light(colours: Colours) -> Colours:
+    """RGB as amounts of light, which viser wants of lines and of batches; anything else would look too bright.
+
+    Source: IEC 61966-2-1 (sRGB), decoding.
+    """
+    x = colours.astype(np.float64) / 255.0
+    light = np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+    return (255.0 * light).round().astype(np.uint8)

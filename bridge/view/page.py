@@ -1,0 +1,114 @@
+"""One HTML file that replays a run: viser's own client with the scene in it, and a panel of plots beside it.
+
+Nothing is loaded when it is opened, so that it can be mailed, and looked at years later, from any disk.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import math
+from collections.abc import Callable
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from canprobe.fieldbus.bus.files import write_text
+from canprobe.lab.bridge.view.colours import MAGMA, scale
+from canprobe.lab.bridge.view.meshes import Array
+from canprobe.lab.bridge.view.path import deviation_scale
+from canprobe.lab.bridge.view.path_nodes import LoadedPath
+from canprobe.lab.bridge.view.plots import NAMES, curves_of, row_of
+from canprobe.lab.bridge.view.recorded import RecordedRun
+from canprobe.lab.bridge.view.replay import FRAME_S, answers_of, shape_of, trail_of
+from canprobe.lab.bridge.view.server import open_server
+from canprobe.lab.bridge.view.stage import Stage, legend_of, place_of
+from canprobe.lab.bridge.view.surface import LoadedSurface
+
+MOST_FRAMES = 900
+"""A longer run is shown in larger steps: the file stays below ten megabytes."""
+
+
+def write_page(run: RecordedRun, file: Path, say: Callable[[str], None]) -> None:
+    """Write the replay of a run into one file.
+
+    Args:
+        run: from `read_run`.
+        file: to write; an older one is replaced.
+        say: called with each line about what cannot be drawn.
+
+    Raises:
+        UsageError: viser is not installed.
+        ResultsError: the file cannot be written.
+    """
+    times = run.times(max(FRAME_S, run.duration_s / MOST_FRAMES))
+    recorded, notes = _record(run, times)
+    for note in notes:
+        say(note)
+    head, middle, tail = recorded.partition("</head>")
+    panel = files(__package__).joinpath("panel.html").read_text(encoding="utf-8")
+    data = json.dumps(_panel_data(run, times, notes), allow_nan=False, separators=(",", ":")).replace("</", "<\\/")
+    title = html.escape(f"canprobe: {run.title}", quote=False)
+    head = head.replace("<title>Viser</title>", f"<title>{title}</title>")
+    write_text(file, f"{head}{panel.replace('/*DATA*/null', data)}{middle}{tail}")
+
+
+def _record(run: RecordedRun, times: Array) -> tuple[str, list[str]]:
+    """Viser's page with every frame in it, and lines about what cannot be drawn."""
+    with open_server(0) as server:
+        stage = Stage(server, run.scene)
+        errors = deviation_scale(shape_of(run))
+        path = LoadedPath(server.scene, trail_of(run))
+        surface = LoadedSurface(server.scene, answers_of(run), errors)
+        recorder = server.get_scene_serializer()
+        before = 0.0  # the page's time is that of the run: the first picture stands until its first cycle
+        with server.atomic():  # nobody listens: nothing is sent
+            stage.show(run.at(0.0))
+            for t in times.tolist():
+                recorder.insert_sleep(t - before)
+                before = t
+                stage.show(run.at(t))
+                path.until(t)
+                surface.until(t)
+        return str(recorder.as_html()), stage.notes
+
+
+def _panel_data(run: RecordedRun, times: Array, notes: list[str]) -> dict[str, Any]:
+    """What the panel plots: columns, taxel images, colours; None for what is not finite."""
+    moments = [run.at(t) for t in times.tolist()]
+    curves = curves_of(map(row_of, moments))
+    shape = shape_of(run)
+    errors = deviation_scale(shape)
+    task = run.scene.task
+    sensor = run.scene.sensor
+    blank = np.zeros((1, 1) if sensor is None else (sensor.rows, sensor.columns), np.uint8)
+    taxels = b"".join((blank if m.taxels is None else m.taxels).tobytes() for m in moments) if run.taxels else b""
+    return {
+        "title": run.title,
+        "notes": notes,
+        "scene": run.scene.name,
+        "curves": {name: [_short(x) for x in curves[name].tolist()] for name in NAMES},
+        "phases": [m.phase for m in moments],
+        "target": task.force_n if task.kind in ("scan", "press") else None,
+        "truth": shape is not None,
+        "shape": run.scene.shape is not None,
+        "sensor": sensor is not None,
+        "rows": blank.shape[0],
+        "columns": blank.shape[1],
+        "taxels": base64.b64encode(taxels).decode("ascii"),
+        "scale": {
+            "high": errors.high,
+            "text": errors.text,
+            "colours": errors.colours(np.linspace(0, errors.high, 64)).tolist(),
+        },
+        "heat": scale(np.sqrt(np.arange(256.0)), 0.0, math.sqrt(255.0), MAGMA).tolist(),
+        "legend": legend_of(run.scene),
+        "centre": place_of(run.scene).tolist(),
+    }
+
+
+def _short(x: float) -> float | None:
+    return float(f"{x:.5g}") if math.isfinite(x) else None

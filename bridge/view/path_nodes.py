@@ -1,0 +1,80 @@
+"""The path in the browser: a node for each stretch of it, so that a growing path is not sent again and again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from canprobe.lab.bridge.view.path import Trail
+
+PATH = (40, 44, 52)
+THICKNESS_M = 4e-4
+STRETCH = 150
+"""Segments of one node of a live path."""
+
+
+class Parts:
+    """Nodes of viser's scene that appear one after the other."""
+
+    def __init__(self) -> None:
+        self._starts: list[float] = []
+        self._nodes: list[Any] = []
+        self._shown = 0
+
+    def add(self, t_s: float, node: Any) -> None:
+        """A hidden node that appears at an instant, s, no earlier than those before."""
+        self._starts.append(t_s)
+        self._nodes.append(node)
+
+    def until(self, t_s: float) -> None:
+        """Show what has appeared by an instant, and hide the rest."""
+        wanted = int(np.searchsorted(self._starts, t_s, side="right"))
+        low, high = sorted((self._shown, wanted))
+        for node in self._nodes[low:high]:
+            node.visible = wanted > self._shown
+        self._shown = wanted
+
+
+class LoadedPath(Parts):
+    """A whole recorded path, shown up to an instant.
+
+    Args:
+        api: of viser's scene.
+        trail: of the run.
+    """
+
+    def __init__(self, api: Any, trail: Trail) -> None:
+        super().__init__()
+        for number, chunk in enumerate(trail.chunks()):
+            self.add(trail.times[chunk.start], _add(api, f"/path/{number:03d}", trail, chunk, visible=False))
+
+
+class GrowingPath:
+    """A path that grows while the cell runs.
+
+    Args:
+        api: of viser's scene.
+        trail: which grows elsewhere.
+    """
+
+    def __init__(self, api: Any, trail: Trail) -> None:
+        self._api, self._trail = api, trail
+        self._done = self._sent = 0
+
+    def refresh(self) -> None:
+        """Send what has come since."""
+        while self._sent < len(self._trail):
+            end = min(self._done + STRETCH, len(self._trail))
+            name = f"/path/{self._done // STRETCH:04d}"
+            _add(self._api, name, self._trail, slice(self._done, end), visible=True)
+            self._sent = end
+            if end - self._done == STRETCH:
+                self._done = end
+
+
+def _add(api: Any, name: str, trail: Trail, chunk: slice, *, visible: bool) -> Any:
+    return api.add_line_segments(
+        name, np.array(trail.segments[chunk], np.float32), PATH, thickness=THICKNESS_M, thickness_units="world",
+        visible=visible,
+    )  # fmt: skip

@@ -1,0 +1,129 @@
+"""A recorded run in a browser, with a time slider, play and pause."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any
+
+import numpy as np
+
+from canprobe.cell.scene.geometry import true_object
+from canprobe.fieldbus.bus.clock import MonotonicClock
+from canprobe.lab.bridge.view.instants import Answer
+from canprobe.lab.bridge.view.panel import Panel
+from canprobe.lab.bridge.view.path import OFF_PATH, Trail, deviation_scale
+from canprobe.lab.bridge.view.path_nodes import LoadedPath
+from canprobe.lab.bridge.view.plots import curves_of, row_of
+from canprobe.lab.bridge.view.recorded import RecordedRun
+from canprobe.lab.bridge.view.server import address, open_server
+from canprobe.lab.bridge.view.stage import Stage
+from canprobe.lab.bridge.view.surface import LoadedSurface
+from canprobe.mechanics.touch.shapes import PlacedShape
+
+FRAME_S = 0.04
+MOST_POINTS = 600
+"""Points of a curve in a plot."""
+
+
+def serve_run(
+    run: RecordedRun,
+    *,
+    port: int,
+    host: str,
+    ready: Callable[[str], None],
+    say: Callable[[str], None],
+    whole: Callable[[], AbstractContextManager[None]] = nullcontext,
+) -> None:
+    """Show a run until it is interrupted.
+
+    Args:
+        run: from `read_run`.
+        port, host: see `open_server`.
+        ready: called with the address.
+        say: called with each line about what cannot be drawn.
+        whole: what is done within it is not to be interrupted; pictures are made by libraries that take it ill.
+    """
+    with open_server(port, host) as server:
+        player = Player(server, run)
+        for note in player.notes:
+            say(note)
+        ready(address(server))
+        clock = MonotonicClock()
+        next_ns = clock.now_ns()
+        while True:
+            with whole():
+                player.step(FRAME_S)
+            next_ns = max(next_ns + round(FRAME_S * 1e9), clock.now_ns())
+            clock.sleep_until_ns(next_ns)
+
+
+class Player:
+    """The slider and what follows it; `step` moves the time on.
+
+    Args:
+        server: a `viser.ViserServer`.
+        run: what is shown.
+
+    Attributes:
+        notes: lines about what cannot be drawn.
+    """
+
+    def __init__(self, server: Any, run: RecordedRun) -> None:
+        self._server = server
+        self._run = run
+        errors = deviation_scale(shape_of(run))
+        self._stage = Stage(server, run.scene)
+        self._path = LoadedPath(server.scene, trail_of(run))
+        self._surface = LoadedSurface(server.scene, answers_of(run), errors)
+        gui = server.gui
+        start = round(float(run.log["t_s"][0]), 2)
+        self._slider = gui.add_slider("time (s)", start, max(round(run.duration_s, 2), start + 0.01), 0.01, start)
+        self._play = gui.add_checkbox("play", True)
+        self._speed = gui.add_dropdown("speed", ("0.25", "0.5", "1", "2", "4"), initial_value="1")
+        self.notes = self._stage.notes
+        self._panel = Panel(server, run.scene, errors, self._stage)
+        times = run.times(max(FRAME_S, run.duration_s / MOST_POINTS))
+        self._panel.show(run.at(start), curves_of(row_of(run.at(t)) for t in times))
+        self._shown = math.nan
+
+    def step(self, dt_s: float) -> None:
+        """Go on by so much of the wall's time, and show where the slider stands."""
+        t = float(self._slider.value)
+        if self._play.value:
+            t = round(t + dt_s * float(self._speed.value), 2)
+            t = t if t <= self._run.duration_s else self._slider.min
+            self._slider.value = t
+        if t == self._shown:
+            return
+        self._shown = t
+        moment = self._run.at(t)
+        with self._server.atomic():
+            self._stage.show(moment)
+            self._path.until(t)
+            self._surface.until(t)
+            self._panel.show(moment)
+
+
+def shape_of(run: RecordedRun) -> PlacedShape | None:
+    """The true object of a run's scene."""
+    return None if run.scene.object is None else true_object(run.scene.object)
+
+
+def answers_of(run: RecordedRun) -> Iterator[tuple[float, Answer]]:
+    """The answers of a run's estimator, each with the instant from which it counted, s."""
+    yield from zip(run.log["t_s"][run.answer_rows].tolist(), run.answers, strict=True)
+
+
+def trail_of(run: RecordedRun) -> Trail:
+    """The path of a run's contact."""
+    trail, log = Trail(), run.log
+    if "contact_mm" not in log:
+        return trail
+    touched = np.isfinite(log["contact_mm"]).all(axis=1) & ~np.isin(log["phase"], OFF_PATH)
+    rows = np.nonzero(touched)[0]
+    times, points = log["t_s"][rows].tolist(), log["contact_mm"][rows] * 1e-3
+    for t_s, point, normal in zip(times, points, log["normal"][rows], strict=True):
+        trail.add(t_s, point, normal)
+    return trail

@@ -1,0 +1,124 @@
+"""What a device can, read from its EDS: objects, PDOs, mapping, dummies, identity."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import Any
+
+from canprobe.cell.planning.model import EVERY_SYNC, Direction, Identity
+from canprobe.fieldbus.eds.description import Description
+from canprobe.fieldbus.eds.packaged import load_eds
+from canprobe.fieldbus.protocol.pdo import PdoEntry
+
+COMMUNICATION: dict[Direction, int] = {"rpdo": 0x1400, "tpdo": 0x1800}
+MAPPING: dict[Direction, int] = {"rpdo": 0x1600, "tpdo": 0x1A00}
+INVALID = 1 << 31
+"""Of a COB-ID: the PDO is off."""
+OWN_BITS = 0x6000_0000
+"""Bits 29 and 30 of a COB-ID, which are the device's: its frame format, and that it sends nothing on request (RTR)."""
+MOST_ENTRIES = 64
+_MOST_AXES = 8
+_IDENTIFIER = 0x7FF
+
+
+@dataclass(frozen=True, slots=True)
+class Abilities:
+    """What one device can as a node of the cell, by its description.
+
+    Attributes:
+        eds: name or path, for messages.
+        description: what its EDS states.
+    """
+
+    eds: str
+    description: Description
+
+    @classmethod
+    def of(cls, eds: str, node_id: int) -> Abilities:
+        """Read an EDS.
+
+        Raises:
+            EdsError: when it is missing or not usable.
+        """
+        return cls(eds, Description(load_eds(eds, node_id)))
+
+    @property
+    def od(self) -> Any:
+        """canopen's object dictionary."""
+        return self.description.od
+
+    @property
+    def identity(self) -> Identity:
+        """Vendor, product and revision of 1018h; None where the file states none, or 0 as nobody filled it in."""
+        return Identity(*(self.number(0x1018, subindex) or None for subindex in (1, 2, 3)))
+
+    def has(self, index: int, subindex: int = 0) -> bool:
+        """Whether the object exists."""
+        return self.description.entry(index, subindex) is not None
+
+    @property
+    def axes(self) -> tuple[int, ...]:
+        """Axes of a drive from 1: those whose controlword is described, 800h apart. Source: CiA 402-1."""
+        return tuple(axis for axis in range(1, _MOST_AXES + 1) if self.has(0x6040 + 0x800 * (axis - 1)))
+
+    def number(self, index: int, subindex: int = 0) -> int | None:
+        """The integer that the entry holds at boot; None where it is missing or not stated."""
+        entry = self.description.entry(index, subindex)
+        return entry.initial if entry is not None and isinstance(entry.initial, int) else None
+
+    def entry(self, index: int, subindex: int, direction: Direction) -> PdoEntry | None:
+        """The object as a mapping entry, None where the device cannot map it in this direction."""
+        entry = self.description.entry(index, subindex)
+        if entry is None or not (entry.in_tpdo if direction == "tpdo" else entry.in_rpdo):
+            return None
+        return PdoEntry(index, subindex, entry.bits, entry.signed, entry.name)
+
+    def dummy(self, data_type: int, bits: int) -> PdoEntry | None:
+        """A dummy entry, None where DummyUsage does not allow it."""
+        return PdoEntry(data_type, 0, bits, name="dummy") if data_type in self.description.dummies else None
+
+    def pdo_numbers(self, direction: Direction) -> tuple[int, ...]:
+        """Numbers of the PDOs that the device has, 1 for 1400h or 1800h."""
+        numbers = self.description.rpdos if direction == "rpdo" else self.description.tpdos
+        return tuple(number for number in numbers if self.has(MAPPING[direction] + number - 1))
+
+    def capacity(self, direction: Direction, number: int) -> int:
+        """How many objects may be mapped to a PDO; 0: its mapping is fixed."""
+        index = MAPPING[direction] + number - 1
+        count = self.description.entry(index)
+        if count is None or not count.writable:
+            return 0
+        entries = (self.description.entry(index, subindex) for subindex in range(1, MOST_ENTRIES + 1))
+        return sum(1 for _ in itertools.takewhile(lambda entry: entry is not None and entry.writable, entries))
+
+    def fixed_mapping(self, direction: Direction, number: int) -> tuple[int, ...]:
+        """The mapping that the EDS gives as default."""
+        index = MAPPING[direction] + number - 1
+        return tuple(self.number(index, sub) or 0 for sub in range(1, (self.number(index) or 0) + 1))
+
+    def mapped_entry(self, word: int) -> PdoEntry:
+        """An object of a fixed mapping, whether the EDS calls it mappable or not."""
+        entry = self.description.entry(word >> 16, word >> 8 & 0xFF)
+        return PdoEntry.from_word(word, entry is not None and entry.signed, entry.name if entry is not None else "")
+
+    def can_cycle(self, direction: Direction, number: int) -> bool:
+        """Whether a PDO exists or can be switched on, and follows every SYNC or can be made to."""
+        index = COMMUNICATION[direction] + number - 1
+        cob_id, kind = self.description.entry(index, 1), self.description.entry(index, 2)
+        off = cob_id is None or (not cob_id.writable and (self.number(index, 1) or INVALID) & INVALID)
+        return (
+            not off and kind is not None and (kind.initial == EVERY_SYNC or (kind.writable and kind.allows(EVERY_SYNC)))
+        )
+
+    def fixed_cob_id(self, direction: Direction, number: int) -> int | None:
+        """The identifier of a PDO that exists and whose COB-ID cannot be changed; None where it can."""
+        index = COMMUNICATION[direction] + number - 1
+        entry, value = self.description.entry(index, 1), self.number(index, 1)
+        if entry is None or entry.writable or value is None or value & INVALID:
+            return None
+        return value & _IDENTIFIER
+
+    def own_bits(self, direction: Direction, number: int) -> int:
+        """Bits 29 and 30 of the COB-ID of a PDO."""
+        return (self.number(COMMUNICATION[direction] + number - 1, 1) or 0) & OWN_BITS

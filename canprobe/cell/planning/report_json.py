@@ -1,0 +1,151 @@
+"""The plan as JSON types, for `canprobe plan --json` and other tools."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, fields
+from typing import Any
+
+from canprobe.cell.planning.array import support_of
+from canprobe.cell.planning.model import (
+    HEARTBEAT_CONSUMED_MS,
+    HEARTBEAT_PRODUCED_MS,
+    MASTER_NODE_ID,
+    Plan,
+    PlannedBus,
+    PlannedNode,
+    PlannedPdo,
+)
+from canprobe.cell.planning.timeline import timeline
+from canprobe.cell.scene.setup import Setup
+
+SCHEMA = 1
+
+
+def plan_dict(plan: Plan) -> dict[str, Any]:
+    """Every field of the plan; what does not apply is None."""
+    setup, bus, shape = plan.setup, plan.setup.bus, plan.setup.shape
+    return {
+        "schema": SCHEMA,
+        "scene": setup.name,
+        "fits": True,
+        "title": setup.title,
+        "bus": {
+            "interface": bus.interface,
+            "channel": bus.channel,
+            "bitrate": bus.bitrate,
+            "transmit_queue": bus.transmit_queue,
+            "fd": bus.fd,
+            "data_bitrate": bus.data_bitrate if bus.fd else None,
+        },
+        "sync": asdict(plan.sync),
+        "heartbeat": {
+            "master_node_id": MASTER_NODE_ID,
+            "produced_ms": HEARTBEAT_PRODUCED_MS,
+            "consumed_ms": HEARTBEAT_CONSUMED_MS,
+        },
+        "nodes": [_node(node) for node in plan.nodes],
+        "pdos": [_pdo(pdo) for pdo in plan.pdos],
+        "raw_frames": [_in_us(asdict(frames)) for frames in plan.raw],
+        "array": _array(setup),
+        "bus_load": {one.channel: _bus(one) for one in plan.buses},
+        "choices": [asdict(choice) for choice in plan.choices],
+        "timeline": [_in_us(asdict(slot)) | {"channel": slot.channel or None} for slot in timeline(plan)],
+        "joint_speeds": asdict(plan.joint_speeds) if plan.joint_speeds is not None else None,
+        "estimator": shape.method if shape is not None else None,
+        "offline_estimators": list(shape.also) if shape is not None else [],
+        "strategy": setup.scan.name if setup.scan is not None else None,
+        "fidelity": setup.truth.fidelity if setup.emulates else None,
+        "bridges": list(setup.bridge.use),
+        "outputs": list(plan.outputs),
+        "left_out": [{"what": what, "why": why} for what, why in plan.left_out],
+        "not_available": [{"what": what, "why": why} for what, why in plan.not_available],
+        "warnings": list(plan.warnings),
+    }
+
+
+def refused_dict(name: str, problems: Sequence[str], ways_out: Sequence[str]) -> dict[str, Any]:
+    """What is said of a scene that does not fit."""
+    return {
+        "schema": SCHEMA,
+        "scene": name,
+        "fits": False,
+        "problems": list(problems),
+        "ways_out": list(ways_out),
+    }
+
+
+def _bus(bus: PlannedBus) -> dict[str, Any]:
+    traffic, budget = bus.traffic, bus.traffic.budget
+    return {
+        "node_ids": list(bus.node_ids),
+        "planned_worst": traffic.load,
+        "parts": dict(traffic.parts),
+        "demands": [_in_us(asdict(demand)) for demand in traffic.demands],
+        "sync_response_us": _microseconds(traffic.sync_response_ns),
+        "budget": _in_us(asdict(budget) | {"bus_ns": budget.bus_ns}),
+    }
+
+
+def _array(setup: Setup) -> dict[str, Any] | None:
+    """The array and what it supports; None without one."""
+    array, support = setup.array, support_of(setup)
+    if array is None or support is None:
+        return None
+    pad, radius = array.pad, array.pad.mount_radius_m
+    return {
+        "name": array.name,
+        "rows": pad.rows,
+        "columns": pad.columns,
+        "pitch_mm": 1e3 * pad.pitch_m,
+        "mount_radius_mm": None if radius is None else 1e3 * radius,
+        "rate_hz": array.rate_hz,
+        "taxels_pressed": support.taxels if setup.touch is not None else None,
+        "supports": {"force": True, "centroid": support.centroid, "curvature": support.curvature},
+    }
+
+
+def _node(node: PlannedNode) -> dict[str, Any]:
+    """A node without its dictionary, which is as large as its EDS."""
+    return {item.name: getattr(node, item.name) for item in fields(node) if item.name != "dictionary"} | {
+        "identity": asdict(node.identity),
+        "switched_off": [{"direction": way, "number": number} for way, number in node.switched_off],
+        "interpolation": [asdict(period) for period in node.interpolation],
+    }
+
+
+def _pdo(pdo: PlannedPdo) -> dict[str, Any]:
+    return {
+        "node_id": pdo.node_id,
+        "channel": pdo.channel,
+        "direction": pdo.direction,
+        "number": pdo.number,
+        "cob_id": pdo.cob_id,
+        "entries": [
+            {"index": entry.index, "subindex": entry.subindex, "bits": entry.bits, "name": entry.name}
+            for entry in pdo.entries
+        ],
+        "transmission_type": pdo.transmission_type,
+        "rate_hz": pdo.rate_hz,
+        "bytes": pdo.layout.length,
+        "bits_worst": pdo.bits_worst,
+        "deadline_us": _microseconds(pdo.deadline_ns),
+        "response_us": _microseconds(pdo.response_ns),
+        "slack_us": _microseconds(pdo.slack_ns),
+        "event_timer_ms": pdo.event_timer_ms or None,
+        "used": pdo.used,
+    }
+
+
+def _in_us(values: dict[str, Any]) -> dict[str, Any]:
+    """The same with its times in µs: `start_ns` becomes `start_us`."""
+    return {
+        f"{name.removesuffix('_ns')}_us" if name.endswith("_ns") else name: (
+            _microseconds(value) if name.endswith("_ns") else value
+        )
+        for name, value in values.items()
+    }
+
+
+def _microseconds(t_ns: Any) -> Any:
+    return None if t_ns is None else [t / 1000 for t in t_ns] if isinstance(t_ns, tuple) else t_ns / 1000

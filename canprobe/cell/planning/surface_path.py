@@ -1,0 +1,177 @@
+"""The path that a task will take over the object as the scene describes it: points, normals, curvature."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.planning.contact import edge_margin
+from canprobe.cell.scene.setup import Approach, Touch
+from canprobe.errors import PlanError
+from canprobe.mechanics.touch.shapes import PlacedShape
+
+Array = NDArray[np.float64]
+SAMPLES = 240
+"""Points of a path."""
+_STEEPEST = math.radians(70.0)  # the servo steers in the scan plane: steeper than this it cannot follow
+_RESTS_M = 5e-6  # of a ball, which may stand on two places that differ by so much
+_BALL_STEPS = 6  # halves what is left of the way from under the centre to the contact
+_PATCH_M = 2e-3  # half of the width of a patch
+_BESIDE_M = 1e-6  # of a foot that does not lie under its point along the normal: on the surface's border
+
+
+@dataclass(frozen=True, slots=True)
+class SurfacePath:
+    """Contacts that the task will make.
+
+    Attributes:
+        points: (n, 3) m, base frame; the first is where the approach ends.
+        normals: (n, 3) outward unit normals there.
+        kappas: (n, 2) principal curvatures there, 1/m; 0 where a ball bridges what a formula does not describe.
+        hollow_radius: smallest concave radius met, m; inf without one.
+    """
+
+    points: Array
+    normals: Array
+    kappas: Array
+    hollow_radius: float
+
+
+def surface_path(task: Touch, shape: PlacedShape | None) -> SurfacePath:
+    """Points of the object under the task's path; without a described object the plane that the approach expects.
+
+    Args:
+        task: a scan or a press.
+        shape: the object.
+
+    Raises:
+        PlanError: the approach or the path misses the object, or the probe first meets it beside the array.
+    """
+    approach, down = task.approach, task.approach.normal
+    plane = approach.start[None, :]  # points in the scan plane; one for a press
+    if task.scan is not None:
+        flat = [task.scan.strategy.point(phase) for phase in np.linspace(0, 2 * math.pi, SAMPLES, endpoint=False)]
+        plane = approach.start + np.array(flat) @ approach.axes[:2]
+    if shape is None:
+        return SurfacePath(plane, np.tile(down, (len(plane), 1)), np.zeros((len(plane), 2)), math.inf)
+    # A ball bridges what a point would fall into.
+    radius = task.probe.radius if shape.by_gaps and not task.array.pad.is_flat else 0.0
+    _check_approach(approach, _along(shape, approach.start, down, radius))
+    if not task.array.pad.is_flat:
+        plane = plane + _first_contact(shape, approach, task.probe.radius)
+    path = _contacts(shape, plane, down, radius)
+    if shape.by_gaps:
+        path = _under_ball(shape, path, plane, down, radius)
+    if path.hollow_radius > task.probe.radius:  # a tighter hollow is refused as that
+        _check_first_touch(task, shape)
+    return path
+
+
+def _first_contact(shape: PlacedShape, approach: Approach, radius: float) -> Array:
+    """Where a ball first touches, (3,) m across the approach from its end: the path begins there."""
+    height = _along(shape, approach.start, approach.normal, radius)
+    if height is None or shape.tightest_concave_radius(approach.start[None]) <= radius:
+        return np.zeros(3)  # in a hollow that is tighter it touches in two places, which is refused as that
+    beside = shape.closest(approach.start + (height + radius) * approach.normal).point - approach.start
+    across: Array = beside - float(beside @ approach.normal) * approach.normal
+    return across
+
+
+def _contacts(shape: PlacedShape, plane: Array, up: Array, radius: float) -> SurfacePath:
+    """Where a ball of `radius` over each point (n, 3) rests, or the surface itself with 0."""
+    contacts = []
+    for point in plane:
+        height = _along(shape, point, up, radius)
+        if height is None:
+            raise PlanError(
+                [
+                    f"task: at {_mm(point)} mm the path leaves the object or meets it steeper than "
+                    f"{math.degrees(_STEEPEST):.0f} deg; shorten task.length_mm or task.width_mm, or turn "
+                    "task.heading_deg"
+                ]
+            )
+        contacts.append(shape.closest(point + (height + radius) * up))
+    points, normals = np.array([c.point for c in contacts]), np.array([c.normal for c in contacts])
+    kappas = np.zeros((len(contacts), 2)) if shape.by_gaps else np.array([c.kappa for c in contacts])
+    return SurfacePath(points, normals, kappas, shape.tightest_concave_radius(points))
+
+
+def _under_ball(shape: PlacedShape, path: SurfacePath, plane: Array, up: Array, radius: float) -> SurfacePath:
+    """The path of a ball whose contacts, not whose centre, lie over the points of the plane."""
+    over = plane
+    for _ in range(_BALL_STEPS):
+        path = _over_patches(path, plane, radius)
+        beside = plane - path.points
+        over = over + beside - np.outer(beside @ up, up)
+        path = _contacts(shape, over, up, radius)
+    return _over_patches(path, plane, radius)
+
+
+def _over_patches(path: SurfacePath, plane: Array, radius: float) -> SurfacePath:
+    """A ball's path with the normals as its pad shows them: of each point from a linear fit to those near it."""
+    beside = plane[None] - plane[:, None]
+    weights = np.exp(-0.5 * np.sum((beside / _PATCH_M) ** 2, axis=2))
+    terms = np.concatenate((np.ones((*weights.shape, 1)), beside / _PATCH_M), axis=2)
+    weighted = (weights[..., None] * terms).transpose(0, 2, 1)
+    moments = weighted @ terms + 1e-6 * np.eye(4)  # along a line, nothing is known beside it
+    normals = np.linalg.solve(moments, weighted @ path.normals)[:, 0]
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    return replace(path, points=path.points + radius * (path.normals - normals), normals=normals)
+
+
+def _mm(point: Array) -> str:
+    x, y, z = (1e3 * point).tolist()
+    return f"({x:.1f}, {y:.1f}, {z:.1f})"
+
+
+def _along(shape: PlacedShape, point: Array, up: Array, radius: float = 0.0) -> float | None:
+    """Height along `up` over `point` at which the foot of a ball of `radius` rests on the surface, m, by Newton.
+
+    None where the line misses or grazes the surface, or the ball rests on its border.
+    """
+    height = 0.0
+    for _ in range(50):
+        at = point + (height + radius) * up
+        foot = shape.closest(at)
+        steepness = float(foot.normal @ up)
+        if steepness < math.cos(_STEEPEST) or np.abs(at - foot.point - foot.distance * foot.normal).max() > _BESIDE_M:
+            return None
+        if abs(foot.distance - radius) < (_RESTS_M if radius else 1e-9):
+            return height
+        height -= (foot.distance - radius) / steepness
+    return None
+
+
+def _check_approach(approach: Approach, miss: float | None) -> None:
+    """The approach finds the object, whose surface is `miss` above its end."""
+    x, y, z = (1e3 * approach.start).tolist()
+    where = f"task.start_mm = ({x:g}, {y:g}, {z:g})"
+    if miss is None:
+        raise PlanError(
+            [f"{where}: the approach does not meet the object; move start_mm over it or the object under it"]
+        )
+    if not -approach.search <= miss <= approach.clearance:
+        side = "above" if miss > 0 else "below"
+        searched = f"{1e3 * approach.clearance:g} mm above to {1e3 * approach.search:g} mm below"
+        lies = f"the object lies {abs(1e3 * miss):.1f} mm {side} along the approach"
+        raise PlanError([f"{where}: {lies}, searched from {searched}; move one of them"])
+
+
+def _check_first_touch(task: Touch, shape: PlacedShape) -> None:
+    """The probe is not in the object before its approach, and first meets it where the array is."""
+    approach, radius, up = task.approach, task.probe.radius, task.approach.normal
+    nearest = shape.closest(approach.start + (approach.clearance + radius) * up)
+    tilt = math.acos(min(max(float(nearest.normal @ up), -1.0), 1.0))
+    mend = f"turn task.approach_normal by {math.degrees(tilt):.0f} deg to the object's normal, or move one of them"
+    if nearest.distance <= radius:
+        deep = 1e3 * (radius - nearest.distance)
+        what = f"{deep:.1f} mm in the object before its approach, {math.degrees(tilt):.0f} deg beside it"
+        raise PlanError([f"task.clearance_mm = {1e3 * approach.clearance:g}: the probe would be {what}; {mend}"])
+    reaches, margin = task.array.pad.reach_m, edge_margin(task)
+    if margin < reaches < radius * tilt + margin:
+        beside = f"the first touch would be {1e3 * radius * tilt:.1f} mm beside the middle of the array"
+        reach = f"which reaches {1e3 * reaches:.1f} mm, and the patch at {task.force:g} N needs {1e3 * margin:.1f} mm"
+        raise PlanError([f"task.approach_normal: {beside}, {reach} of it; {mend}"])

@@ -1,0 +1,153 @@
+"""The cycles of a plan as they go when every frame takes its worst-case length and nobody else speaks.
+
+SYNC opens a cycle, the nodes queue what it triggers, the controller starts at the first look that finds all feedback,
+its commands follow. Heartbeats and what comes on events are left out: the worst case, with all of them, is the
+response time of each message.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from heapq import heappop, heappush
+from typing import Literal
+
+from canprobe.cell.planning.model import (
+    Plan,
+    PlannedBus,
+    PlannedPdo,
+)
+from canprobe.cell.planning.traffic import SYNC_BITS, SYNCHRONOUS, on_the_wire, wire_ns
+from canprobe.fieldbus.protocol.frames import SYNC_ID
+
+Part = Literal["SYNC", "feedback", "controller", "command", "tactile", "other"]
+_ROUNDS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Slot:
+    """Something that takes its time in the cycles.
+
+    Attributes:
+        part: what it is.
+        channel: bus; empty for the controller.
+        cob_id: identifier; None for the controller.
+        cycle: from 0, in which it was released.
+        start_ns, end_ns: after the first SYNC is queued.
+    """
+
+    part: Part
+    channel: str
+    cob_id: int | None
+    cycle: int
+    start_ns: int
+    end_ns: int
+
+
+def timeline(plan: Plan) -> tuple[Slot, ...]:
+    """As many cycles as the slowest frame behind SYNC has, two with a sensor as a rule.
+
+    Args:
+        plan: that fits.
+
+    Returns:
+        Frames and controller by start; those of the last cycles may end behind it.
+    """
+    cyclic = [pdo for pdo in plan.pdos if pdo.transmission_type <= SYNCHRONOUS]
+    cycles = max((pdo.transmission_type for pdo in cyclic), default=1)
+    period, compute = plan.sync.period_ns, plan.traffic.budget.compute_ns
+    starts: list[int | None] = [None] * cycles
+    slots: list[Slot] = []
+    for _ in range(_ROUNDS):  # when the commands go depends on the feedback, which earlier commands may delay
+        slots = [slot for bus in plan.buses for slot in _carried(_released(plan, bus, cyclic, starts))]
+        found: list[int | None] = [_controller_start(plan, slots, cycle) for cycle in range(cycles)]
+        if found == starts:
+            break
+        starts = found
+    thinking = [
+        Slot("controller", "", None, cycle, start, start + compute)
+        for cycle, start in enumerate(starts)
+        if start is not None and start < cycles * period
+    ]
+    return tuple(sorted([*slots, *thinking], key=lambda slot: (slot.start_ns, slot.channel)))
+
+
+def _controller_start(plan: Plan, slots: Sequence[Slot], cycle: int) -> int:
+    """The first look of a cycle that finds all its feedback."""
+    begin = cycle * plan.sync.period_ns
+    last = max((slot.end_ns for slot in slots if slot.part == "feedback" and slot.cycle == cycle), default=begin)
+    looks = [begin + look for look in plan.traffic.budget.looks_ns]
+    return next((look for look in looks if look >= last), looks[-1])
+
+
+def _released(
+    plan: Plan, bus: PlannedBus, cyclic: Sequence[PlannedPdo], starts: Sequence[int | None]
+) -> Iterator[Slot]:
+    """Every frame of one bus as if it were alone on it."""
+    bitrate = plan.setup.bus.bitrate
+    sync_ns = wire_ns(SYNC_BITS, bitrate)
+    mine = on_the_wire([pdo for pdo in cyclic if pdo.channel == bus.channel])
+    for cycle, start in enumerate(starts):
+        begin = cycle * plan.sync.period_ns
+        yield Slot("SYNC", bus.channel, SYNC_ID, cycle, begin, begin + sync_ns)
+        for pdo in mine:
+            length = wire_ns(pdo.bits_worst, bitrate)
+            if pdo.direction == "rpdo":
+                if start is not None:
+                    out = start + plan.traffic.budget.compute_ns
+                    yield Slot("command", bus.channel, pdo.cob_id, cycle, out, out + length)
+            elif cycle % pdo.transmission_type == 0:
+                part: Part = "tactile" if pdo.kind == "tactile" else "feedback" if pdo.used else "other"
+                yield Slot(part, bus.channel, pdo.cob_id, cycle, begin + sync_ns, begin + sync_ns + length)
+
+
+def _carried(released: Iterator[Slot]) -> Iterator[Slot]:
+    """Frames one by one: of those that wait, the lowest identifier."""
+    coming = sorted(released, key=lambda slot: slot.start_ns, reverse=True)
+    waiting: list[tuple[int | None, int, Slot]] = []
+    now = 0
+    while coming or waiting:
+        if not waiting:
+            now = max(now, coming[-1].start_ns)
+        while coming and coming[-1].start_ns <= now:
+            slot = coming.pop()
+            heappush(waiting, (slot.cob_id, slot.start_ns, slot))
+        slot = heappop(waiting)[-1]
+        end = now + slot.end_ns - slot.start_ns
+        yield replace(slot, start_ns=now, end_ns=end)
+        now = end
+
+
+LETTERS: dict[Part, str] = {
+    "SYNC": "S",
+    "feedback": "f",
+    "controller": "C",
+    "command": "r",
+    "tactile": "t",
+    "other": "o",
+}
+"""What stands for each part in `timeline_rows`."""
+
+
+def timeline_rows(plan: Plan, width: int = 80) -> list[list[str]]:
+    """A row for each bus and cycle, and for the controller; one character is a `width`-th of the period.
+
+    Args:
+        plan: that fits.
+        width: characters of a cycle.
+    """
+    slots, period = timeline(plan), plan.sync.period_ns
+    rows = []
+    for cycle in range(1 + max(slot.cycle for slot in slots)):
+        for channel in (*(bus.channel for bus in plan.buses), ""):
+            cells = ["·"] * width
+            for slot in slots:
+                start, end = slot.start_ns - cycle * period, slot.end_ns - cycle * period
+                if slot.channel == channel and end >= 0 and start < period:
+                    # the characters in whose middle it is under way; what is shorter still has one
+                    first, last = ((2 * t_ns * width + period) // (2 * period) for t_ns in (start, end))
+                    for cell in range(max(first, 0), min(max(last, first + 1), width)):
+                        cells[cell] = LETTERS[slot.part]
+            title = f"cycle {cycle + 1}" if channel == plan.buses[0].channel else ""
+            rows.append([title, channel or "controller", "".join(cells)])
+    return rows

@@ -1,0 +1,81 @@
+"""What a plan carries out and yet says first: who else can command it, and where the numbers in it do not hold."""
+
+from __future__ import annotations
+
+import ipaddress
+from collections.abc import Iterator, Sequence
+
+from canprobe.cell.planning.left_out import held_rows, long_waits
+from canprobe.cell.planning.model import PlannedPdo
+from canprobe.cell.planning.window import (
+    TOLERATED,
+    cut_patch,
+)
+from canprobe.cell.scene.setup import Setup
+from canprobe.fieldbus.protocol.frame_bits import WORST_ERROR_BITS
+from canprobe.mechanics.robot.inverse import FULL_POSE, task_rows
+from canprobe.mechanics.touch.patch.array_calibration import NOMINAL
+
+ON_THIS_MACHINE = "ff11::ca"
+"""A multicast group of interface-local scope, which no packet leaves or enters. Source: RFC 4291, 2.7."""
+
+
+def _open_to_others(setup: Setup) -> Iterator[str]:
+    """What lets other machines reach the cell, and what to write to keep it on this one."""
+    bridge = setup.bridge
+    yield from bus_open_to_others(setup.bus.interface, setup.bus.channel)
+    if "ros2" in bridge.use and not bridge.ros2_loopback:
+        may = "can start, stop and move the cell" if bridge.ros2_commands else "sees the cell"
+        yield (
+            f"bridge.ros2_loopback = false: every machine on this network segment {may};"
+            " bridge.ros2_loopback = true keeps its topics on this machine, CYCLONEDDS_URI on some interfaces"
+        )
+
+
+def bus_open_to_others(interface: str, channel: str) -> Iterator[str]:
+    """A warning, where other machines reach a bus.
+
+    Args:
+        interface: of python-can.
+        channel: of it.
+    """
+    if interface == "udp_multicast" and not _is_interface_local(channel):
+        yield (
+            f"bus.channel = {channel}: every machine on this network segment hears this bus and can command its"
+            f" nodes; --channel {ON_THIS_MACHINE} keeps it on this machine"
+        )
+
+
+def _is_interface_local(channel: str) -> bool:
+    try:
+        group = ipaddress.ip_address(channel)
+    except ValueError:
+        return False
+    return group.version == 6 and group.is_multicast and int(group) >> 112 & 0xF == 1
+
+
+def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
+    """What a user has to know before trusting the plan, most important first."""
+    cut, bus = cut_patch(setup), setup.bus
+    yield from _open_to_others(setup)
+    if setup.arm is not None:
+        yield from setup.arm.warnings
+    if setup.arm is not None and not all(drive.emulated for drive in setup.arm.drives):
+        yield from long_waits(setup.arm.missed_syncs, setup.rate_hz)
+    if setup.array is not None and setup.array.newtons == NOMINAL:
+        yield (
+            "sensor.calibration: the array measures in nominal newtons, as good as its stated full scale;"
+            " `canprobe calibrate array CELL --force-reference scale` gives them a reference"
+        )
+    if cut is not None:
+        yield f"{cut.text}; {' or '.join(cut.ways)} leaves less than {100 * TOLERATED:.0f} % outside"
+    if setup.arm is not None and setup.touch is not None and task_rows(setup.arm.model) < FULL_POSE:
+        yield held_rows(setup.arm)
+    if bus.bit_error_rate > 0 and pdos:
+        longest = max(pdo.bits_worst for pdo in pdos)
+        lost = 1.0 - (1.0 - bus.bit_error_rate) ** longest
+        each_us = (WORST_ERROR_BITS + longest) * 1e6 / bus.bitrate
+        yield (
+            f"bus.bit_error_rate = {bus.bit_error_rate:g}: response times hold for a wire without errors; each error "
+            f"adds up to {each_us:.0f} µs, and up to {100 * lost:.2g} % of the frames have one"
+        )

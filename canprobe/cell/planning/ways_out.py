@@ -1,0 +1,121 @@
+"""What to change when a scene does not fit its bus: each way is planned too, and only those that fit are named."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+from canprobe.cell.planning.model import Traffic
+from canprobe.cell.planning.open_keys import KEYS, candidates, free_channel, opened, wants_torque
+from canprobe.cell.planning.window import (
+    windows_of,
+)
+from canprobe.cell.scene.setup import Array, Setup
+from canprobe.fieldbus.protocol.tactile import WINDOW
+
+FD_ARRAY = "tactile_array_fd.eds"
+Fit = Callable[[Setup], tuple[Setup, Traffic] | None]
+"""A changed setup as the plan closes it and the traffic of its fullest bus; None where that does not fit either."""
+
+
+def ways_out(setup: Setup, fit: Fit) -> list[str]:
+    """Changes each of which makes the scene fit, with the load and the longest demand that it leaves."""
+    found = []
+    for text, changed in (*_changes(setup), *_together(setup, fit), *_quicker(setup, fit), *_slower(setup, fit)):
+        if (fitting := fit(changed)) is not None:
+            closed, traffic = fitting
+            peak = max(traffic.demands, key=lambda demand: demand.used_ns / demand.available_ns)
+            share = f"{peak.used_ns / 1000:.0f} of {peak.available_ns / 1000:.0f} µs"
+            less = ", without 6077h" if wants_torque(setup) and not wants_torque(closed) else ""
+            found.append(f"{text}: load {100 * traffic.load:.0f} %, peak {share}{less}")
+    return found or ["fewer nodes or a faster bus"]
+
+
+def _changes(setup: Setup) -> Iterator[tuple[str, Setup]]:
+    """Single changes of what is sent, and of the bus."""
+    bus, array = setup.bus, setup.array
+    if bus.bitrate < 1_000_000:
+        yield "bus.bitrate = 1000000", setup.changed("bus", bitrate=1_000_000)
+    if bus.transmit_queue == "fifo":
+        text = 'controllers that send their most urgent frame first (bus.transmit_queue = "priority")'
+        yield text, setup.changed("bus", transmit_queue="priority")
+    if setup.arm is not None and not setup.arm.grouped:
+        yield "arm.grouped_rpdo = true", setup.changed("arm", grouped=True)
+    yield from _split(setup)
+    if array is None:
+        return
+    if array.raw is not None:
+        yield from _own_bus(setup, array)
+        return
+    if array.mode == "window":
+        for side in reversed([side for side in windows_of(array) if side < int(array.window)]):
+            yield f"sensor.window = {side}", setup.changed("array", window=side)
+    if array.mode == "image":
+        yield 'sensor.mode = "window"', setup.changed("array", mode="window")
+    if array.mode != "features":  # only a window may have another size
+        text = 'sensor.mode = "features"' + " without sensor.window" * (array.mode == "window")
+        yield text, setup.changed("array", mode="features", window=WINDOW)
+    yield from _own_bus(setup, array)
+    if not bus.fd and array.emulated:
+        fd = setup.changed("bus", fd=True)
+        yield "bus.fd = true", fd
+        yield f'CAN FD: bus.fd = true and sensor.eds = "{FD_ARRAY}"', fd.changed("array", eds=FD_ARRAY)
+
+
+def _own_bus(setup: Setup, array: Array) -> Iterator[tuple[str, Setup]]:
+    """The array on a bus of its own, where it shares one with drives."""
+    if setup.arm is not None and any(array.channel == drive.channel for drive in setup.arm.drives):
+        own = free_channel(setup)
+        yield f'a separate bus for the sensor (sensor.channel = "{own}")', setup.changed("array", channel=own)
+
+
+def _split(setup: Setup) -> Iterator[tuple[str, Setup]]:
+    """The second half of the drives on a bus of their own."""
+    arm = setup.arm
+    if arm is None or len(arm.drives) < 2 or len({drive.channel for drive in arm.drives}) > 1:
+        return
+    own, kept = free_channel(setup), len(arm.drives) // 2
+    drives = (*arm.drives[:kept], *(replace(drive, channel=own) for drive in arm.drives[kept:]))
+    keys = " and ".join(f'joints.{joint.name}.channel = "{own}"' for joint in arm.model.joints[kept:])
+    yield f"a second bus for half of the drives ({keys})", setup.changed("arm", drives=drives)
+
+
+def _together(setup: Setup, fit: Fit) -> Iterator[tuple[str, Setup]]:
+    """The cheapest combination of what the plan could choose, where one change is not enough."""
+    now = {key.key: key.written(setup) for key in KEYS}
+    for changed, choices in candidates(opened(setup)):
+        if fit(changed) is not None:
+            differing = [choice for choice in choices if choice.value != now[choice.key]]
+            if len(differing) > 1:
+                yield " and ".join(f"{choice.key} = {choice.value}" for choice in differing), changed
+            return
+
+
+def _quicker(setup: Setup, fit: Fit) -> Iterator[tuple[str, Setup]]:
+    """A controller that takes no longer than the bus leaves it, in whole microseconds."""
+    idle = fit(replace(setup, compute_ns=0))
+    if idle is None or (slack_ns := idle[1].budget.slack_ns) is None:
+        return
+    left_us = slack_ns // 1000
+    if 0 < left_us * 1000 < setup.compute_ns:
+        yield f"cycle.compute_us = {left_us}", replace(setup, compute_ns=left_us * 1000)
+
+
+_SLOWEST_US = 25_500
+_DIVISORS_US = [us for us in range(500, 1_000_000, 100) if 1_000_000 % us == 0]
+
+
+def _slower(setup: Setup, fit: Fit) -> Iterator[tuple[str, Setup]]:
+    """The fastest cycle of whole hertz, or of whole milliseconds, that fits, with images as fast as the scene's."""
+    periods_us = {us for us in range(1000, _SLOWEST_US, 1000)} | {us for us in _DIVISORS_US if us < _SLOWEST_US}
+    rates = sorted((float(f"{1e6 / us:.6g}") for us in periods_us), reverse=True)
+    for rate in (rate for rate in rates if rate < setup.rate_hz):
+        changed, text = replace(setup, rate_hz=rate), f"cycle.rate_hz = {rate:.6g}"
+        if setup.array is not None:
+            tactile = rate / math.ceil(rate / setup.array.rate_hz)  # the cycle is a multiple
+            changed = changed.changed("array", rate_hz=tactile)
+            text += f" with sensor.rate_hz = {tactile:.6g}" * (tactile != setup.array.rate_hz)
+        if fit(changed) is not None:
+            yield text, changed
+            return

@@ -1,0 +1,37 @@
+"""How much of a bus a PDO takes: a classical frame, or above 8 bytes one of CAN FD with bit-rate switch. In bit times of
+the nominal rate; the data phase of an FD frame is rounded up.
+"""
+
+from __future__ import annotations
+
+from canprobe.cell.scene.setup import Bus
+from canprobe.fieldbus.protocol.frame_bits import (
+    FrameLength,
+    best_case_bits,
+    best_case_fd_bits,
+    exact_bits,
+    exact_fd_bits,
+    worst_case_bits,
+    worst_case_fd_bits,
+)
+
+CLASSIC_BYTES = 8
+
+
+def frame_bits(n_data: int, bus: Bus) -> int:
+    """Worst case of one frame with so many data bytes."""
+    return worst_case_bits(n_data) if n_data <= CLASSIC_BYTES else _nominal(worst_case_fd_bits(n_data), bus)
+
+
+def exact_frame_bits(can_id: int, data: bytes, bus: Bus) -> int:
+    """Bits of this very frame."""
+    return exact_bits(can_id, data) if len(data) <= CLASSIC_BYTES else _nominal(exact_fd_bits(can_id, data), bus)
+
+
+def unstuffed_frame_bits(n_data: int, bus: Bus) -> int:
+    """Bits of a frame without stuff bits, as `canbusload -i` counts."""
+    return best_case_bits(n_data) if n_data <= CLASSIC_BYTES else _nominal(best_case_fd_bits(n_data), bus)
+
+
+def _nominal(length: FrameLength, bus: Bus) -> int:
+    return length.nominal - (-length.data * bus.bitrate // bus.data_bitrate)

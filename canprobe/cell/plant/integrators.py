@@ -1,0 +1,152 @@
+"""Steps of ordinary differential equations y' = f(t, y), each one function of (problem, t, y, h).
+
+| step | order | for |
+|---|---|---|
+| ``semi_implicit_euler`` | 1 | mechanics that is not stiff; velocities first, positions with the new ones |
+| ``runge_kutta_4`` | 4 | smooth and not stiff |
+| ``implicit_euler`` | 1 | stiff; linearly implicit, one linear solve |
+| ``rosenbrock2`` | 2 | stiff; two stages, one matrix, L-stable; second order whatever matrix the problem gives |
+| ``exponential`` | 2 | exact where f is linear in y and t; else the exponential Rosenbrock-Euler step |
+| ``adaptive`` | 2 | ``rosenbrock2`` in as many parts as its own error estimate asks for |
+
+Source: Hairer & Wanner, Solving ODEs II, IV.7; Verwer, Spee, Blom & Hundsdorfer, SIAM J. Sci. Comput. 20, 1999
+(ROS2); Hochbruck & Ostermann, Acta Numerica 2010 (exponential).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from math import sqrt
+from types import MappingProxyType
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from canprobe.mechanics.robot.chain import Array
+
+GAMMA = 1.0 - sqrt(0.5)
+"""Of ROS2."""
+_MOST_PARTS = 4096
+
+
+class Linearised(NamedTuple):
+    """The equations near one place.
+
+    Attributes:
+        rate: f.
+        drift: partial derivative of f by t.
+        solve: r -> x of (I - g J) x = r; J may be an approximation of the Jacobian.
+    """
+
+    rate: Array
+    drift: Array
+    solve: Callable[[Array], Array]
+
+
+class Problem(Protocol):
+    """What a step asks of the equations. States begin with n positions, then their n rates, then anything."""
+
+    @property
+    def positions(self) -> int:
+        """n."""
+
+    def rate(self, t: float, y: Array) -> Array:
+        """f(t, y)."""
+
+    def drift(self, t: float, y: Array) -> Array:
+        """Partial derivative of f by t."""
+
+    def jacobian(self, t: float, y: Array) -> Array:
+        """Partial derivative of f by y."""
+
+    def linearised(self, t: float, y: Array, g: float) -> Linearised:
+        """All that a linearly implicit step asks for at one place."""
+
+
+Step = Callable[[Problem, float, Array, float], Array]
+
+
+def semi_implicit_euler(problem: Problem, t: float, y: Array, h: float) -> Array:
+    """Explicit Euler, but positions advance with the new rates."""
+    n = problem.positions
+    new = y + h * problem.rate(t, y)
+    new[:n] = y[:n] + h * new[n : 2 * n]
+    return new
+
+
+def runge_kutta_4(problem: Problem, t: float, y: Array, h: float) -> Array:
+    """The classical explicit step."""
+    k1 = problem.rate(t, y)
+    k2 = problem.rate(t + 0.5 * h, y + 0.5 * h * k1)
+    k3 = problem.rate(t + 0.5 * h, y + 0.5 * h * k2)
+    k4 = problem.rate(t + h, y + h * k3)
+    new: Array = y + (h / 6.0) * (k1 + 2.0 * (k2 + k3) + k4)
+    return new
+
+
+def implicit_euler(problem: Problem, t: float, y: Array, h: float) -> Array:
+    """One Newton iteration of backward Euler."""
+    rate, drift, solve = problem.linearised(t, y, h)
+    new: Array = y + h * solve(rate + h * drift)
+    return new
+
+
+def rosenbrock2(problem: Problem, t: float, y: Array, h: float) -> Array:
+    """ROS2 with gamma = 1 - 1/sqrt(2)."""
+    return _rosenbrock2(problem, t, y, h)[0]
+
+
+def _rosenbrock2(problem: Problem, t: float, y: Array, h: float) -> tuple[Array, Array]:
+    """The step, and how far its own first-order step lies off."""
+    rate, drift, solve = problem.linearised(t, y, GAMMA * h)
+    drift *= GAMMA * h
+    k1 = solve(rate + drift)
+    k2 = solve(problem.rate(t + h, y + h * k1) - 2.0 * k1 - drift)
+    return y + (1.5 * h) * k1 + (0.5 * h) * k2, (0.5 * h) * (k1 + k2)
+
+
+def exponential(problem: Problem, t: float, y: Array, h: float) -> Array:
+    """y + h phi1(hJ) f + h^2 phi2(hJ) f_t, both from one matrix exponential."""
+    from scipy.linalg import expm
+
+    size = len(y)
+    augmented = np.zeros((size + 2, size + 2))
+    augmented[:size, :size] = h * problem.jacobian(t, y)
+    augmented[:size, size] = h * h * problem.drift(t, y)
+    augmented[:size, size + 1] = h * problem.rate(t, y)
+    augmented[size, size + 1] = 1.0
+    new: Array = y + expm(augmented)[:size, size + 1]
+    return new
+
+
+def adaptive(problem: Problem, t: float, y: Array, h: float, *, rtol: float = 1e-3, atol: float = 1e-5) -> Array:
+    """``rosenbrock2`` in parts whose estimated error stays within ``atol + rtol |y|``, component by component.
+
+    Raises:
+        ArithmeticError: when it would take more than 4096 parts.
+    """
+    done, part = 0.0, h
+    for _ in range(_MOST_PARTS):
+        part = min(part, h - done)
+        new, error = _rosenbrock2(problem, t + done, y, part)
+        size = float(np.max(np.abs(error) / (atol + rtol * np.maximum(np.abs(y), np.abs(new)))))
+        if size <= 1.0:
+            y, done = new, done + part
+            if done >= h * (1.0 - 1e-12):
+                return y
+        # NaN counts as an error too large
+        part *= min(4.0, max(0.2, 0.9 / sqrt(size))) if size > 0.0 else 4.0 if size == 0.0 else 0.2
+    raise ArithmeticError(f"a step of {h:g} s at t = {t:g} s needs more than {_MOST_PARTS} parts")
+
+
+STEPS: Mapping[str, Step] = MappingProxyType(
+    {
+        "semi-implicit": semi_implicit_euler,
+        "rk4": runge_kutta_4,
+        "implicit": implicit_euler,
+        "rosenbrock": rosenbrock2,
+        "exponential": exponential,
+        "adaptive": adaptive,
+    }
+)
+"""Name in a scene -> step."""

@@ -1,0 +1,199 @@
+"""The emulated nodes of a run in a process of their own: started, awaited, and ended on every way out."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import zipfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import IO, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.scene.load import SAVED_AS
+from canprobe.errors import BusError, NodeError
+from canprobe.fieldbus.bus.clock import MonotonicClock
+from canprobe.fieldbus.bus.port import Port, TimedFrame
+from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE
+
+REPORT_EVERY_S = 10.0
+END_TIMEOUT_S = 10.0
+SERVING = "serving "
+"""What the process says when it serves."""
+TRUTH_SHARE = 0.2
+"""Time that the nodes may take at their end to work out what was true, over the time that they ran."""
+_PR_SET_PDEATHSIG = 1
+
+
+def with_our_imports() -> dict[str, str]:
+    """The environment in which `python -P -m` imports what this process does, whatever lies in the working folder."""
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(os.path.abspath(path) for path in sys.path)}
+
+
+def end_with_parent(parent: int, number: int = signal.SIGTERM) -> None:
+    """In the child: get a signal when the parent is killed. Linux only, and only a second line of defence.
+
+    Args:
+        parent: its process id; if it has gone already, this process gets the signal at once.
+        number: of the signal.
+    """
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
+        if os.getppid() != parent:
+            os.kill(os.getpid(), number)
+
+
+class EmulatorChild:
+    """``canprobe emulate`` as a child process.
+
+    It runs in another session, so that Ctrl-C reaches only the master, which stops the drives before their process.
+
+    Args:
+        plan: whose nodes; the process reads the files of its scene as they were read for the plan.
+        out: folder for ``truth.npz``; None uses a temporary one.
+        channels: the buses of its nodes.
+        truth: whether what is true is recorded, which grows with time.
+        origin_ns: time that is 0 in ``truth.npz``, on the clock that all processes of a machine share.
+
+    Attributes:
+        unwritten: why there is no ``truth.npz`` at the end; None where nothing was wrong with it.
+    """
+
+    def __init__(
+        self, plan: Plan, out: Path | None, channels: Sequence[str], *, truth: bool = True, origin_ns: int = 0
+    ) -> None:
+        self._plan = plan
+        self._scene = plan.scene
+        self._channels = channels
+        self._folder = Path(tempfile.mkdtemp(prefix="canprobe-"))
+        self._wants_truth = truth
+        self._origin_ns = origin_ns
+        self._truth = (out or self._folder) / "truth.npz"
+        self.unwritten: str | None = None
+        self._errors: IO[bytes] | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._clock = MonotonicClock()
+        self._started_ns = self._clock.now_ns()
+
+    def start(self) -> None:
+        """Start the process."""
+        for name, content in self._plan.files.items():
+            (self._folder / name).write_bytes(content)
+        bus, nodes = self._scene.bus, self._scene.emulated_node_ids
+        command = [
+            *(sys.executable, "-P", "-m", "canprobe", "emulate", str(self._folder / SAVED_AS)),
+            *("--bus", bus.interface, "--bitrate", str(bus.bitrate)),
+            *(word for channel in self._channels for word in ("--channel", f"{channel}={channel}")),
+            *("--parent", str(os.getpid())),
+        ]
+        if nodes:
+            command += ["--nodes", ",".join(str(n) for n in nodes)]
+        if self._wants_truth:
+            command += ["--truth", str(self._truth), "--origin", str(self._origin_ns)]
+        self._errors = (self._folder / "stderr").open("w+b")
+        self._process = subprocess.Popen(  # no preexec_fn: fork would make the master's first cycles copy its pages
+            command,
+            env=with_our_imports(),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=self._errors,
+            start_new_session=True,
+        )
+
+    @property
+    def pid(self) -> int:
+        """Process id, once it is started."""
+        assert self._process is not None
+        return self._process.pid
+
+    def await_boot_ups(
+        self,
+        port: Port,
+        say: Callable[[str], None] = lambda _: None,
+        hear: Callable[[list[TimedFrame]], None] = lambda _: None,
+    ) -> None:
+        """Wait until it serves, and for the boot-up of each of its nodes, as long as the scene allows.
+
+        Args:
+            port: of the nodes' buses.
+            say: called every 10 s with how long it has taken.
+            hear: gets all that arrives meanwhile: another master may begin, or a node report an error.
+
+        Raises:
+            BusError: the process ended; with its own last words.
+            NodeError: a node did not boot in time.
+        """
+        assert self._process is not None
+        waiting = set(self._scene.emulated_node_ids)
+        clock = port.clock
+        start = clock.now_ns()
+        deadline = start + round(self._scene.bring_up.emulated_s * 1e9)
+        report = start + round(REPORT_EVERY_S * 1e9)
+        while waiting or not self._serves():
+            now = clock.now_ns()
+            if self._process.poll() is not None:
+                raise BusError(self._last_words() or f"the emulated nodes ended with status {self._process.returncode}")
+            if now >= deadline:
+                self._raise_late(min(waiting, default=0))
+            if now >= report:
+                say(f"the emulated nodes are still starting, after {(now - start) * 1e-9:.0f} s")
+                report += round(REPORT_EVERY_S * 1e9)
+            port.wait(min(deadline, now + 50_000_000))
+            frames = port.drain()
+            hear(frames)
+            for can_id, data, _ in frames:
+                if data == b"\0":
+                    waiting.discard(can_id - HEARTBEAT_BASE)
+
+    def _serves(self) -> bool:
+        """An array of raw frames sends no boot-up: the process has said that it is served."""
+        if self._scene.sensor is None or self._scene.array_is_node or not self._scene.sensor.emulated:
+            return True
+        assert self._errors is not None
+        return SERVING.encode() in os.pread(self._errors.fileno(), 1 << 16, 0)  # without moving the child's place in it
+
+    def _raise_late(self, node_id: int) -> NoReturn:
+        raise NodeError(
+            node_id,
+            f"the emulated node did not boot within {self._scene.bring_up.emulated_s:g} s, and its process still runs:"
+            " a busier machine needs a larger [bring_up] emulated_s",
+        )
+
+    def _last_words(self) -> str:
+        assert self._errors is not None
+        self._errors.seek(0)
+        lines = self._errors.read().decode(errors="replace").strip().splitlines()
+        return lines[-1].removeprefix("canprobe: ") if lines else ""
+
+    def end(self) -> dict[str, NDArray[np.float64]]:
+        """Stop the process, first politely, harder at an interrupt; the plant's truth where it left any."""
+        if self._process is not None:
+            patience_s = END_TIMEOUT_S + TRUTH_SHARE * (self._clock.now_ns() - self._started_ns) * 1e-9
+            for number in (signal.SIGTERM, signal.SIGINT, signal.SIGKILL):  # SIGINT is ignored in the background
+                self._process.send_signal(number)
+                self._process.send_signal(signal.SIGCONT)  # one that was stopped hears it only then
+                with contextlib.suppress(subprocess.TimeoutExpired, KeyboardInterrupt):
+                    self._process.wait(patience_s)
+                    break
+        truth = {}
+        if self._truth.exists():
+            with (
+                contextlib.suppress(OSError, ValueError, EOFError, zipfile.BadZipFile),  # cut off by a full disk
+                np.load(self._truth, allow_pickle=False) as data,
+            ):
+                truth = {name: np.asarray(data[name]) for name in data.files}
+        if self._errors is not None:
+            words = self._last_words()
+            self.unwritten = words if words.startswith(str(self._truth)) else None
+            self._errors.close()
+        for leftover in (*self._folder.iterdir(), self._folder):
+            leftover.rmdir() if leftover.is_dir() else leftover.unlink()
+        return truth

@@ -1,0 +1,38 @@
+"""SIGTERM and SIGHUP as interrupts: whatever stops a command, it leaves by the same safe way."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+from collections.abc import Iterator
+
+from canprobe.fieldbus.bus.real.interrupts import TERMINATIONS, Terminated, raise_terminated
+
+
+@contextlib.contextmanager
+def termination_interrupts() -> Iterator[None]:
+    """Within the block SIGTERM and SIGHUP raise `Terminated`; outside a main thread nothing changes."""
+    before = {number: signal.getsignal(number) for number in TERMINATIONS}
+    try:
+        for number, handler in before.items():
+            if handler != signal.SIG_IGN:  # as nohup has it
+                signal.signal(number, raise_terminated)
+    except ValueError:  # not the main thread: signals are not ours to receive
+        yield
+        return
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def left_by_ctrl_c() -> Iterator[None]:
+    """Ctrl-C is the normal way to leave the block; SIGTERM and SIGHUP go on to the caller, for status 143."""
+    try:
+        yield
+    except Terminated:
+        raise
+    except KeyboardInterrupt:
+        pass

@@ -1,0 +1,133 @@
+"""Where a command goes: what the command line says, else the scene, else python-can's configuration."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from canprobe.cli.common_arguments import PATIENT_SYNCS
+from canprobe.cli.parser import did_you_mean
+from canprobe.errors import UsageError
+
+if TYPE_CHECKING:
+    from canprobe.cell.scene.model import Scene
+    from canprobe.cell.session.target import Target
+    from canprobe.fieldbus.bus.real.configured import ConfiguredBus
+
+CONFIG = "config"
+"""Stands for the interface where python-can's configuration is to name it."""
+
+
+def scene_of(args: argparse.Namespace) -> Scene:
+    """The scene of `run` and `up`, as their options change it.
+
+    Raises:
+        UsageError: --patient is given and a node is real, or as `target_of`.
+    """
+    from canprobe.cell.scene.load import load_scene
+    from canprobe.cell.session.target import VIRTUAL
+
+    scene = loaded(args)
+    if args.patient:
+        if _has_real_nodes(scene):
+            raise UsageError(
+                "--patient is for emulated nodes: real drives must stop soon after their master; for nodes of `canprobe"
+                f" emulate`: --set arm.missed_syncs={PATIENT_SYNCS} --set limits.late_cycles_max_percent=100"
+            )
+        arm = {} if scene.arm is None else {"arm.missed_syncs": PATIENT_SYNCS}
+        scene = load_scene(scene, {"limits.late_cycles_max_percent": 100.0, **arm})
+    scene = target_of(args, scene).applied_to(scene)
+    if args.realtime and scene.bus.interface in VIRTUAL:
+        args.report.say(f"warning: --realtime has no effect on bus {scene.bus.interface}, whose time is virtual")
+    return scene
+
+
+def loaded(args: argparse.Namespace) -> Scene:
+    """The scene of a command with `add_scene`, as --cell, --set and --realtime change it."""
+    from canprobe.cell.scene.load import load_scene
+
+    overrides = dict(args.set)
+    if args.cell is not None:
+        overrides["cell"] = args.cell
+    if getattr(args, "realtime", False):
+        overrides["cycle.realtime"] = True
+    return load_scene(args.scene, overrides)
+
+
+def target_of(args: argparse.Namespace, scene: Scene) -> Target:
+    """The scene's buses with the command line's changes.
+
+    Where neither names a bus and the scene has real nodes, which no lockstep bus has, python-can's configuration does.
+
+    Raises:
+        UsageError: when `--channel NAME=CH` names no channel of the scene, or nothing is configured.
+    """
+    from canprobe.cell.session.target import LOCKSTEP, Target
+
+    (main, *_), bitrate = scene.channels, args.bitrate
+    channels = _channels(args.channel or [], scene.channels)
+    interface, channel = args.bus, channels.pop(main, None)
+    open_to_configuration = args.bus is None and scene.bus.interface == LOCKSTEP and _has_real_nodes(scene)
+    if (args.bus == CONFIG or open_to_configuration) and (found := _configured(args.bus)) is not None:
+        interface, channel, bitrate = found.interface, channel or found.channel, bitrate or found.bitrate
+    return Target.over(scene, interface, channels | ({} if channel is None else {main: channel}), bitrate)
+
+
+def real_target(
+    bus: str | None,
+    channel: str | None,
+    bitrate: int | None,
+    *,
+    channel_else: str | None = None,
+    bitrate_else: int = 1_000_000,
+) -> Target:
+    """The bus of a command that needs one between processes: the command line's, else python-can's configuration's.
+
+    Args:
+        bus, channel, bitrate: of the command line.
+        channel_else, bitrate_else: where neither says anything.
+
+    Raises:
+        UsageError: nothing names a channel, or nothing is configured and the command line asks for what is.
+    """
+    from canprobe.cell.session.target import Target
+
+    interface = bus or "socketcan"
+    if bus in (None, CONFIG) and (found := _configured(bus)) is not None:
+        interface, channel, bitrate = found.interface, channel or found.channel, bitrate or found.bitrate
+    if (channel := channel or channel_else) is None:
+        raise UsageError("--channel is missing: name the bus, such as --channel vcan0")
+    return Target(interface, channel, bitrate or bitrate_else)
+
+
+def _configured(bus: str | None) -> ConfiguredBus | None:
+    from canprobe.fieldbus.bus.real.configured import configured_bus
+
+    found = configured_bus()
+    if found is None and bus == CONFIG:
+        raise UsageError(
+            "--bus config: python-can's configuration names no interface; set CAN_INTERFACE and CAN_CHANNEL, or write "
+            "them into ~/.canrc"
+        )
+    return found
+
+
+def _has_real_nodes(scene: Scene) -> bool:
+    real_array = scene.sensor is not None and not scene.sensor.emulated
+    return real_array or not all(scene.drives.values())
+
+
+def _channels(given: Sequence[tuple[str | None, str]], names: Sequence[str]) -> dict[str, str]:
+    """What stands for which of the scene's channels; a channel without a name stands for the first."""
+    main = names[0]
+    found: dict[str, str] = {}
+    for name, target in given:
+        if name is not None and name not in names:
+            hint = did_you_mean(name, names)
+            raise UsageError(f"--channel {name}=…: the scene has no channel {name}, only {', '.join(names)}{hint}")
+        if (name or main) in found:
+            have = "one channel, " + main if len(names) == 1 else f"the channels {' and '.join(names)}"
+            raise UsageError(f"--channel given {len(given)} times, but the scene has {have}")
+        found[name or main] = target
+    return found

@@ -1,0 +1,170 @@
+"""Two kinds of time behind one interface: virtual time that jumps, and the monotonic clock of the machine.
+
+All times are integer nanoseconds. The cycle asks only for `now_ns` and `sleep_until_ns`; with a `VirtualClock` a
+sleep is a jump that runs everything due on the way, so a simulated second lasts as long as its computation.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import os
+import time
+from typing import Protocol
+
+_CLOCK_MONOTONIC = 1
+_TIMER_ABSTIME = 1
+
+
+class Clock(Protocol):
+    """A source of time and the only way to wait for it."""
+
+    def now_ns(self) -> int:
+        """Return the present time in ns; it never decreases."""
+        ...
+
+    def sleep_until_ns(self, t_ns: int) -> None:
+        """Return when the clock shows `t_ns` or later; at once if it does already."""
+        ...
+
+
+class Driver(Protocol):
+    """Something that lives in virtual time, such as a `LockstepBus`."""
+
+    def next_deadline_ns(self) -> int | None:
+        """Return when it next has something to do, `None` if it only waits for others."""
+        ...
+
+    def settle(self) -> None:
+        """Do everything due at the present instant; afterwards its next deadline lies in the future."""
+        ...
+
+    def run_until_ns(self, until_ns: int) -> None:
+        """Do everything due up to and including `until_ns`, and move the clock to each instant on the way."""
+        ...
+
+
+class VirtualClock:
+    """A clock that stands still until somebody waits, then jumps from one thing that is due to the next.
+
+    Several drivers (buses) may share one clock: they are settled at each instant in the order of their attachment.
+
+    Args:
+        start_ns: the time at which the clock starts.
+    """
+
+    __slots__ = ("_drivers", "_now_ns")
+
+    def __init__(self, start_ns: int = 0) -> None:
+        self._now_ns = start_ns
+        self._drivers: list[Driver] = []
+
+    def now_ns(self) -> int:
+        """Return the present virtual time in ns."""
+        return self._now_ns
+
+    def attach(self, driver: Driver) -> None:
+        """Let `driver` be run whenever time passes one of its deadlines."""
+        self._drivers.append(driver)
+
+    def detach(self, driver: Driver) -> None:
+        """Stop running `driver`."""
+        self._drivers.remove(driver)
+
+    def step(self, until_ns: int) -> bool:
+        """Go to the next instant at which something is due and do it, or to `until_ns` if nothing is due by then.
+
+        Returns:
+            True if something was done (call again), False if `until_ns` is reached and nothing is due any more.
+        """
+        target = until_ns + 1
+        for driver in self._drivers:
+            due = driver.next_deadline_ns()
+            if due is not None and due < target:
+                target = due
+        if target > until_ns:
+            self._now_ns = max(self._now_ns, until_ns)
+            return False
+        self._now_ns = max(self._now_ns, target)
+        for driver in self._drivers:
+            driver.settle()
+        return True
+
+    def move_ns(self, t_ns: int) -> None:
+        """Show `t_ns`, unless it is past; for a driver that runs."""
+        self._now_ns = t_ns if t_ns > self._now_ns else self._now_ns
+
+    def sleep_until_ns(self, t_ns: int) -> None:
+        """Run every driver up to and including `t_ns`; whoever is first runs alone until the next one is due."""
+        if len(self._drivers) == 1:
+            self._drivers[0].run_until_ns(t_ns)
+            self.move_ns(t_ns)
+            return
+        while True:
+            first, alone_ns, earliest = None, t_ns + 1, t_ns + 1
+            for driver in self._drivers:
+                due = driver.next_deadline_ns()
+                if due is None or due >= alone_ns:
+                    continue
+                if due < earliest:
+                    first, alone_ns, earliest = driver, earliest, due
+                else:
+                    alone_ns = due
+            if first is None:
+                self.move_ns(t_ns)
+                return
+            if alone_ns > earliest:
+                first.run_until_ns(alone_ns - 1)
+            else:
+                self.step(t_ns)
+
+
+class Timespec(ctypes.Structure):
+    """struct timespec of the C library."""
+
+    _fields_ = (("tv_sec", ctypes.c_long), ("tv_nsec", ctypes.c_long))
+
+
+class MonotonicClock:
+    """CLOCK_MONOTONIC, with sleeps on absolute deadlines so that periods do not drift."""
+
+    __slots__ = ("_clock_nanosleep", "_request")
+
+    def __init__(self) -> None:
+        self._request = Timespec()
+        self._clock_nanosleep = getattr(ctypes.CDLL(None), "clock_nanosleep", None)
+
+    def now_ns(self) -> int:
+        """Return CLOCK_MONOTONIC in ns."""
+        return time.monotonic_ns()
+
+    def sleep_until_ns(self, t_ns: int) -> None:
+        """Sleep until CLOCK_MONOTONIC shows `t_ns`; a signal handler that raises ends the sleep.
+
+        A time that is past costs a reading of the clock: the system call alone costs five in a virtual machine.
+        """
+        now_ns = time.monotonic_ns()
+        if now_ns >= t_ns:
+            return
+        clock_nanosleep = self._clock_nanosleep
+        if clock_nanosleep is None:
+            time.sleep((t_ns - now_ns) * 1e-9)
+            return
+        request = self._request
+        request.tv_sec, request.tv_nsec = divmod(t_ns, 1_000_000_000)
+        while status := clock_nanosleep(_CLOCK_MONOTONIC, _TIMER_ABSTIME, ctypes.byref(request), None):
+            if status != errno.EINTR:
+                raise OSError(status, os.strerror(status))
+
+
+def epoch_now_ns() -> int:
+    """The time of day in ns since the Unix epoch, for what leaves this machine; nothing is decided by it."""
+    return time.time_ns()
+
+
+def elapsed_ns() -> int:
+    """A running count of real nanoseconds, to measure what something costs; never to decide anything.
+
+    On a virtual clock too this is real time: the cost of a cycle is the same question in lockstep.
+    """
+    return time.perf_counter_ns()

@@ -1,0 +1,44 @@
+"""Who is there? One SDO read of 1000h to each node id, all at once; any answer counts, an abort too."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from canprobe.fieldbus.bus.pumped import PumpedNetwork
+from canprobe.fieldbus.protocol.frames import SDO_RX_BASE, SDO_TX_BASE
+
+SECOND_S = 0.05
+"""In which a second answer to one request is waited for: two devices have one node id."""
+UPLOAD_DEVICE_TYPE = bytes((0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0))
+BURST = 8
+BURST_PAUSE_S = 0.002
+
+
+def answering_nodes(network: PumpedNetwork, node_ids: Iterable[int], timeout_s: float) -> tuple[int, ...]:
+    """Node ids, ascending, whose SDO server answers within the time-out.
+
+    Args:
+        network: pumped meanwhile.
+        node_ids: whom to ask, 1–127.
+        timeout_s: after the last question.
+
+    Raises:
+        InterfaceError: the interface failed.
+    """
+    asked = sorted(set(node_ids))
+    found: set[int] = set()
+
+    def take(can_id: int, _data: bytes, _t_ns: int) -> None:
+        found.add(can_id - SDO_TX_BASE)
+
+    for node_id in asked:
+        network.subscribe(SDO_TX_BASE + node_id, take)
+    try:
+        for first in range(0, len(asked), BURST):
+            network.port.send_batch([(SDO_RX_BASE + n, UPLOAD_DEVICE_TYPE) for n in asked[first : first + BURST]])
+            network.pump_until(lambda: len(found) == len(asked), BURST_PAUSE_S)
+        network.pump_until(lambda: len(found) == len(asked), timeout_s)
+    finally:
+        for node_id in asked:
+            network.unsubscribe(SDO_TX_BASE + node_id, take)
+    return tuple(sorted(found))

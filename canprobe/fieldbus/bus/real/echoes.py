@@ -1,0 +1,37 @@
+"""Which received frames are our own, on a bus that gives a sender back what it sent."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from canprobe.fieldbus.protocol.frames import Frame
+
+_LIFE_NS = 1_000_000_000
+
+
+class Echoes:
+    """The first frame that equals one we sent is taken for its echo, once.
+
+    Somebody else's frame with the same identifier and data comes besides the echo, so one of the two is kept. An echo
+    that does not come within a second is waited for no longer.
+    """
+
+    def __init__(self) -> None:
+        self._waiting: dict[Frame, deque[int]] = {}
+
+    def sent(self, frame: Frame, t_ns: int) -> None:
+        """Note a frame of ours."""
+        self._waiting.setdefault(frame, deque()).append(t_ns)
+
+    def is_one(self, frame: Frame, t_ns: int) -> bool:
+        """Whether a received frame is the echo of one that was sent, which it then answers for."""
+        waiting = self._waiting.get(frame)
+        while waiting and t_ns - waiting[0] > _LIFE_NS:
+            waiting.popleft()
+        if not waiting:
+            self._waiting.pop(frame, None)
+            return False
+        waiting.popleft()
+        if not waiting:
+            del self._waiting[frame]
+        return True

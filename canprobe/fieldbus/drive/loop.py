@@ -1,0 +1,73 @@
+"""What a drive gives to the plant's position loop: the torque limit 6072h and the feed-forwards 60B1h and 60B2h.
+
+The feed-forwards act in the mode that gives them; leaving it takes them back. In cyclic synchronous velocity 60B1h is
+part of the target already, and in cyclic synchronous torque both are: there the loop gets none. Outside operation
+enabled the loop stands for the closed brake. A brake that opens before the motor has torque (`Quirks`) is a loop
+without torque for that time: a vertical axis of a dynamic arm falls.
+Source: CiA 402-2, objects 6072h, 60B1h, 60B2h.
+"""
+
+from __future__ import annotations
+
+from canprobe.fieldbus.drive.parameters import PEAK_PERMILLE, DriveParameters
+from canprobe.fieldbus.drive.reference import AxisPlant
+from canprobe.fieldbus.node.slave_node import SlaveNode
+
+_LIMIT, _SPEED, _TORQUE = 0x6072, 0x60B1, 0x60B2
+
+
+class DriveLoop:
+    """Torque limit and feed-forwards of one axis; the plant gets changes only.
+
+    Args:
+        axis: of the plant, 0-based.
+        plant: shared with the other drives.
+        parameters: of the drive.
+        node: of the drive.
+
+    Attributes:
+        changed: a position mode has to `feed_forward` in this cycle.
+    """
+
+    def __init__(self, axis: int, plant: AxisPlant, parameters: DriveParameters, node: SlaveNode) -> None:
+        dictionary = node.dictionary
+        self._axis, self._plant, self._parameters, self._number = axis, plant, parameters, dictionary.number
+        self._early_ns = node.core.quirks.brake_early_ns
+        self._torque_comes = node.core.timers.new(lambda _due_ns: self._give(*self._given[1:]))
+        self._given: tuple[int, float, float] = (PEAK_PERMILLE, 0.0, 0.0)
+        self.changed = True
+        for index in (_LIMIT, _SPEED, _TORQUE):
+            dictionary.on_write(index, lambda _sub, _value: self._give(*self._given[1:]))
+
+    def open_brake(self, t_ns: int) -> None:
+        """Operation is enabled."""
+        if self._early_ns:
+            self._torque_comes.arm(t_ns + self._early_ns)
+            self._give(*self._given[1:])
+
+    def close_brake(self) -> None:
+        """Operation is no longer enabled, or is stopping by torque."""
+        if self._torque_comes.due_ns is not None:
+            self._torque_comes.cancel()
+            self._give(*self._given[1:])
+
+    def feed_forward(self) -> None:
+        """Take limit and offsets as they are now."""
+        self._give(self._number(_SPEED) * self._parameters.units.speed_scale, float(self._number(_TORQUE)))
+        self.changed = False
+
+    def feed_torque(self) -> None:
+        """Take limit and torque offset: every cycle of a velocity mode."""
+        self._give(0.0, float(self._number(_TORQUE)))
+
+    def release(self) -> None:
+        """Limit only."""
+        self._give(0.0, 0.0)
+
+    def _give(self, speed: float, torque: float) -> None:
+        self.changed = True
+        limit = self._parameters.max_torque if self._torque_comes.due_ns is None else 0
+        wanted = (limit, speed, torque)
+        if wanted != self._given:
+            self._given = wanted
+            self._plant.set_loop(self._axis, *wanted)

@@ -1,0 +1,120 @@
+"""One entry of the object dictionary: its type, its rights, its limits, and the bytes of a value.
+
+Source: CiA 301, "Data type entry usage" and "Object dictionary", EDS keywords of CiA 306.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from canopen.objectdictionary import ObjectDictionary, datatypes
+
+from canprobe.fieldbus.eds.description import LAST_DUMMY, Description
+from canprobe.fieldbus.eds.description import Entry as Described
+from canprobe.fieldbus.eds.values import REALS, SIGNED, UNSIGNED
+from canprobe.fieldbus.node.abort import Abort, SdoAbort
+
+Value = int | float | bytes
+
+
+def key_of(index: int, subindex: int = 0) -> int:
+    """Index and subindex as one dictionary key."""
+    return index << 8 | subindex
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One addressable value.
+
+    Attributes:
+        key: index << 8 | subindex.
+        bits: length of a fixed-size value; 0 for strings and domains.
+        signed: whether an integer is signed.
+        real: struct format of a REAL32/REAL64, or empty.
+        readable, writable: access over SDO.
+        in_tpdo, in_rpdo: may be mapped there.
+        low, high: limits of the EDS, or None.
+        default: value after a reset.
+    """
+
+    key: int
+    name: str
+    bits: int
+    signed: bool
+    real: str
+    readable: bool
+    writable: bool
+    in_tpdo: bool
+    in_rpdo: bool
+    low: float | None
+    high: float | None
+    default: Value
+
+    def to_bytes(self, value: Value) -> bytes:
+        """Value → bytes on the wire."""
+        if isinstance(value, bytes):
+            return value
+        if self.real:
+            return struct.pack(self.real, value)
+        return int(value).to_bytes(self.bits // 8, "little", signed=self.signed)
+
+    def from_bytes(self, data: bytes) -> Value:
+        """Bytes on the wire → value. Raises SdoAbort when the length is not the object's."""
+        if not self.bits:
+            return bytes(data)
+        self.check_size(len(data))
+        if self.real:
+            number: float = struct.unpack(self.real, data)[0]
+            return number
+        return int.from_bytes(data, "little", signed=self.signed)
+
+    def check_size(self, size: int) -> None:
+        """Raises SdoAbort when a value of a fixed size has another size than `size` bytes."""
+        if self.bits and size * 8 != self.bits:
+            raise SdoAbort(Abort.TOO_LONG if size * 8 > self.bits else Abort.TOO_SHORT)
+
+    def check_limits(self, value: Value) -> None:
+        """Raises SdoAbort when the value is outside the EDS's limits."""
+        if isinstance(value, bytes):
+            return
+        if self.high is not None and value > self.high:
+            raise SdoAbort(Abort.VALUE_HIGH)
+        if self.low is not None and value < self.low:
+            raise SdoAbort(Abort.VALUE_LOW)
+
+
+def read_entries(od: ObjectDictionary) -> Iterator[Entry]:
+    """Every entry of a parsed EDS, the dummy types 0001h–0007h that DummyUsage allows included."""
+    return map(_entry, Description(od).entries())
+
+
+def _entry(described: Described) -> Entry:
+    data_type = described.data_type
+    number = data_type in SIGNED or data_type in UNSIGNED or data_type in REALS
+    bits = 8 if data_type == datatypes.BOOLEAN else described.bits if number else 0
+    return Entry(
+        key=key_of(described.index, described.subindex),
+        name=described.name,
+        bits=bits,
+        signed=described.signed,
+        real=REALS[data_type][0] if data_type in REALS else "",
+        readable=described.readable,
+        writable=described.writable,
+        in_tpdo=described.in_tpdo and described.index > LAST_DUMMY,
+        in_rpdo=described.in_rpdo,
+        low=described.low,
+        high=described.high,
+        default=_default(described, bits),
+    )
+
+
+def _default(described: Described, bits: int) -> Value:
+    value = described.initial
+    if value is None:
+        return 0 if bits else b""
+    if isinstance(value, str):
+        unicode = described.data_type == datatypes.UNICODE_STRING
+        return value.encode("utf-16-le") if unicode else value.encode("latin-1", "replace")
+    return value

@@ -1,0 +1,108 @@
+"""Heartbeat producer and consumer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+
+from canprobe.fieldbus.node.abort import Abort, SdoAbort
+from canprobe.fieldbus.node.core import NO_ROUTES, NodeCore, Route, Service
+from canprobe.fieldbus.node.emcy import Emergency
+from canprobe.fieldbus.node.entry import Value
+from canprobe.fieldbus.node.timers import Timer
+from canprobe.fieldbus.protocol.emcy import HEARTBEAT_LOST
+from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, NmtState, pack_heartbeat
+
+
+class HeartbeatProducer(Service):
+    """Reports the NMT state every 1017h milliseconds, and at once when it changes or 1017h is written."""
+
+    def __init__(self, core: NodeCore) -> None:
+        self._core = core
+        self._timer = core.timers.new(self._due)
+        core.dictionary.on_write(0x1017, lambda _sub, _value: self._begin(core.now_ns))
+
+    def reset(self, t_ns: int) -> None:
+        """Silent until `boot_up`."""
+        self._timer.cancel()
+
+    def entered(self, t_ns: int) -> None:
+        """A heartbeat with the new state."""
+        self._begin(t_ns)
+
+    def boot_up(self, t_ns: int) -> None:
+        """Send the boot-up message, which is the first heartbeat."""
+        self._core.send(*pack_heartbeat(self._core.node_id, NmtState.INITIALISING))
+        if self._period_ns():
+            self._timer.arm(t_ns + self._period_ns())
+
+    def _period_ns(self) -> int:
+        return self._core.dictionary.number(0x1017) * 1_000_000
+
+    def _begin(self, t_ns: int) -> None:
+        self._timer.cancel()
+        if self._period_ns():
+            self._due(t_ns)
+
+    def _due(self, due_ns: int) -> None:
+        self._core.send(*pack_heartbeat(self._core.node_id, self._core.state))
+        self._timer.arm_next(due_ns, self._period_ns())
+
+
+class HeartbeatConsumer(Service):
+    """Watches the producers of 1016h, each from its first heartbeat on."""
+
+    def __init__(self, core: NodeCore, emcy: Emergency, on_loss: Callable[[int], None]) -> None:
+        """`on_loss(t_ns)` is called when a producer is lost."""
+        self._core, self._emcy, self._on_loss = core, emcy, on_loss
+        self._watched: dict[int, tuple[Timer, int]] = {}  # by node id: its timer, its period in ns
+        core.dictionary.on_check(0x1016, self._check)
+        core.dictionary.on_change(self._configure, 0x1016)
+
+    def reset(self, t_ns: int) -> None:
+        """Read 1016h; nobody has been heard."""
+        self._configure()
+
+    def routes(self) -> Mapping[int, Route]:
+        """Heartbeat identifiers of the producers watched."""
+        if self._core.state is NmtState.INITIALISING:
+            return NO_ROUTES
+        return {HEARTBEAT_BASE + node_id: partial(self._heard, node_id) for node_id in self._watched}
+
+    def _entries(self) -> dict[int, tuple[int, int]]:
+        """Subindex → (node id, period in ms) of the entries in use."""
+        number, found = self._core.dictionary.number, {}
+        for subindex in range(1, 128):
+            word = number(0x1016, subindex)
+            if 1 <= word >> 16 & 0xFF <= 127 and word & 0xFFFF:
+                found[subindex] = word >> 16 & 0xFF, word & 0xFFFF
+        return found
+
+    def _configure(self) -> None:
+        for node_id, (timer, _) in self._watched.items():
+            timer.cancel()
+            self._emcy.clear(HEARTBEAT_LOST, node_id)
+        self._watched = {
+            node_id: (self._core.timers.new(partial(self._timed_out, node_id)), period * 1_000_000)
+            for node_id, period in self._entries().values()
+        }
+        self._core.reroute()
+
+    def _heard(self, node_id: int, data: bytes, t_ns: int) -> None:
+        if len(data) == 1:
+            timer, period_ns = self._watched[node_id]
+            timer.arm(t_ns + period_ns)
+            if self._emcy.any:
+                self._emcy.clear(HEARTBEAT_LOST, node_id)
+
+    def _timed_out(self, node_id: int, due_ns: int) -> None:
+        self._emcy.report(HEARTBEAT_LOST, bytes((node_id,)), source=node_id)
+        self._on_loss(due_ns)
+
+    def _check(self, subindex: int, value: Value) -> None:
+        node_id, period = int(value) >> 16 & 0xFF, int(value) & 0xFFFF
+        if subindex == 0 or not (node_id and period):
+            return
+        others = {node for sub, (node, _) in self._entries().items() if sub != subindex}
+        if node_id in others or node_id > 127:
+            raise SdoAbort(Abort.PARAMETER_INCOMPATIBLE)

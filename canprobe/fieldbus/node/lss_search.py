@@ -1,0 +1,74 @@
+"""How an LSS slave is found among others: by its whole address, by bounds, or bit by bit.
+
+Source: CiA 305, switch state selective, identify remote slave, fastscan.
+"""
+
+from __future__ import annotations
+
+from canprobe.fieldbus.protocol.lss import (
+    NOTHING_ASKED,
+    LssAddress,
+    LssCommand,
+)
+
+SELECT = range(LssCommand.SELECT_VENDOR, LssCommand.SELECT_SERIAL + 1)
+IDENTIFY = range(LssCommand.IDENTIFY_VENDOR, LssCommand.IDENTIFY_SERIAL_HIGH + 1)
+_MASK = 0xFFFFFFFF
+
+
+class LssSearch:
+    """What one slave has heard of the questions so far."""
+
+    def __init__(self) -> None:
+        self._heard: list[tuple[int, int]] = []  # command and number, of the sequence under way
+        self._position = 0
+
+    def forget(self) -> None:
+        """Start again."""
+        self._heard.clear()
+        self._position = 0
+
+    def selects(self, data: bytes, mine: LssAddress) -> bool:
+        """Switch state selective: the four numbers one after another, the last one decides."""
+        return tuple(self._complete(data, SELECT)) == mine.numbers
+
+    def identifies(self, data: bytes, mine: LssAddress) -> bool:
+        """Identify remote slave: vendor and product, revision and serial number each from a lowest to a highest."""
+        numbers = self._complete(data, IDENTIFY)
+        if not numbers:
+            return False
+        vendor, product, revision_low, revision_high, serial_low, serial_high = numbers
+        return (
+            (vendor, product) == (mine.vendor_id, mine.product_code)
+            and revision_low <= mine.revision_number <= revision_high
+            and serial_low <= mine.serial_number <= serial_high
+        )
+
+    def fastscan(self, data: bytes, mine: LssAddress) -> tuple[bool, bool]:
+        """The bits of one number from the asked one upwards: whether they are mine, and with them the whole address."""
+        bit, position, following = data[5:]
+        if not (bit < 32 or bit == NOTHING_ASKED) or position > 3 or following > 3:
+            return False, False
+        if bit == NOTHING_ASKED:
+            self._position = 0
+            return True, False
+        asked = _MASK << bit & _MASK
+        if position != self._position or (_number_in(data) ^ mine.numbers[position]) & asked:
+            return False, False
+        self._position = following
+        return True, bit == 0 and following < position
+
+    def _complete(self, data: bytes, sequence: range) -> list[int]:
+        """Take one number of a sequence; all of them where it is the last one and none was left out, else nothing."""
+        if data[0] != sequence[0] and (not self._heard or self._heard[-1][0] != data[0] - 1):
+            self._heard.clear()
+            return []
+        if data[0] == sequence[0]:
+            self._heard.clear()
+        self._heard.append((data[0], _number_in(data)))
+        return [number for _, number in self._heard] if data[0] == sequence[-1] else []
+
+
+def _number_in(data: bytes) -> int:
+    """The 32 bits behind the command specifier."""
+    return int.from_bytes(data[1:5], "little")

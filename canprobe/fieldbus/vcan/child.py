@@ -1,0 +1,124 @@
+"""Run one command to its end: signals passed on to it, a time-out, and its exit status as a shell would see it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Protocol
+
+TIMED_OUT = 124
+_GRACE_S = 5.0
+_POLL_S = 0.02
+_PATIENCE = 3
+_FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+
+
+@contextlib.contextmanager
+def caught_signals(*, keyboard: bool = True) -> Iterator[list[int]]:
+    """Yield a list to which SIGINT, SIGTERM, SIGHUP and SIGQUIT are appended within the block; ignored ones stay so.
+
+    Args:
+        keyboard: False drops SIGINT and SIGQUIT, which the terminal sends to a shell in this group as well.
+    """
+    signals: list[int] = []
+    before = {number: signal.getsignal(number) for number in _FORWARDED}
+    try:
+        for number, handler in before.items():
+            if handler != signal.SIG_IGN:
+                kept = keyboard or number not in (signal.SIGINT, signal.SIGQUIT)
+                signal.signal(number, (lambda n, _: signals.append(n)) if kept else lambda *_: None)
+        yield signals
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+class Job(Protocol):
+    """A command that runs somewhere."""
+
+    def poll(self) -> int | None:
+        """Pass its output on; return its exit status once it has ended."""
+        ...
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal to the command and what it started in its group."""
+        ...
+
+    def kill(self) -> None:
+        """End it at once, whatever it does."""
+        ...
+
+
+def supervise(job: Job, signals: list[int], timeout_s: float | None) -> tuple[int, bool]:
+    """Run `job` to its end.
+
+    Every signal is passed on; the third one kills. On the time-out the job gets SIGTERM and 5 s, then it is killed.
+
+    Args:
+        job: what runs already.
+        signals: where signals of this process arrive; those that were passed on are taken out.
+        timeout_s: how long it may run, from now; `None` for ever.
+
+    Returns:
+        Its exit status, and whether it ran into the time-out (the status is then 124).
+    """
+    deadline = None if timeout_s is None else time.monotonic() + timeout_s
+    timed_out = False
+    received = 0
+    while (status := job.poll()) is None:
+        while signals:
+            number = signals.pop(0)
+            received += 1
+            if received >= _PATIENCE:
+                job.kill()
+                return 128 + number, timed_out
+            job.send_signal(number)
+        if deadline is not None and time.monotonic() >= deadline:
+            if timed_out:
+                job.kill()
+                break
+            timed_out = True
+            job.send_signal(signal.SIGTERM)
+            deadline += _GRACE_S
+        time.sleep(_POLL_S)
+    return (TIMED_OUT if timed_out or status is None else status), timed_out
+
+
+class LocalJob:
+    """A command that runs on this machine in a session of its own, without standard input.
+
+    It is started by a shell, which says so and ends with 127 or 126 if there is no such program.
+
+    Args:
+        command: program and arguments.
+        environment: the command's whole environment.
+        shell: it is one for the user, with this process's standard input and terminal.
+    """
+
+    def __init__(self, command: Sequence[str], environment: Mapping[str, str], shell: bool = False) -> None:
+        self._send = os.kill if shell else os.killpg
+        self._process = subprocess.Popen(
+            ["/bin/sh", "-c", 'exec "$@"', "sh", *command],
+            stdin=None if shell else subprocess.DEVNULL,
+            env=dict(environment),
+            start_new_session=not shell,
+        )
+
+    def poll(self) -> int | None:
+        """Return the exit status, 128 + n after signal n, once it has ended."""
+        status = self._process.poll()
+        return 128 - status if status is not None and status < 0 else status
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal to its process group, or to the shell."""
+        with contextlib.suppress(ProcessLookupError):
+            self._send(self._process.pid, number)
+
+    def kill(self) -> None:
+        """Kill its process group, or the shell."""
+        self.send_signal(signal.SIGKILL)
+        self._process.wait()

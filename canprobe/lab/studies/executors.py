@@ -1,0 +1,126 @@
+"""Where cells are computed: a pool of processes on this machine, or the workers of a Dask cluster."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import re
+import signal
+import sys
+from collections.abc import Callable, Collection, Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import AbstractContextManager
+from multiprocessing.process import BaseProcess
+from time import perf_counter
+from types import ModuleType
+
+from canprobe.cell.session.emulator_child import end_with_parent
+from canprobe.errors import StudyError, UsageError, install_line
+from canprobe.fieldbus.bus.real.processor import BLAS_THREADS
+
+_DASK_WAIT = "10s"
+_GRACE_S = 1.0
+"""For workers to end by themselves: a run catches SIGTERM, stops, and its worker continues."""
+
+
+@contextlib.contextmanager
+def process_pool(workers: int | None = None) -> Iterator[Executor]:
+    """A pool of processes with one BLAS thread each, ended with the block; an exception ends it at once.
+
+    Workers ignore Ctrl-C: this process decides. They end when this process is killed.
+
+    Args:
+        workers: number of processes; one for each core that this process may use by default.
+    """
+    before = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(
+        workers or len(os.sched_getaffinity(0)),
+        multiprocessing.get_context("spawn"),
+        initializer=end_with_parent,
+        initargs=(os.getpid(), signal.SIGKILL),  # nothing in a worker moves, and whatever it does cannot ignore that
+    )
+    try:
+        with _one_blas_thread():  # workers start when cells are submitted
+            yield _Deaf(pool)
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        _end(set(multiprocessing.active_children()) - before)
+        raise
+    finally:
+        pool.shutdown()
+
+
+@contextlib.contextmanager
+def dask_executor(address: str) -> Iterator[Executor]:
+    """The workers of a Dask cluster; they need the same canprobe.
+
+    Args:
+        address: of the scheduler, such as "tcp://10.0.0.1:8786".
+
+    Raises:
+        UsageError: package `distributed` is missing.
+        StudyError: not an address, or no scheduler answers.
+    """
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise UsageError(f"a Dask cluster needs the package distributed: {install_line('dask')}") from error
+    if not re.search(r":[0-9]+$", address):  # a Client that fails at once takes twenty seconds to end
+        raise StudyError(f"Dask scheduler {address}: expected its address and port, as tcp://10.0.0.1:8786")
+    try:
+        client = Client(address, timeout=_DASK_WAIT, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise StudyError(f"Dask scheduler {address}: expected it there, got: {error}") from error
+    executor = client.get_executor(pure=False)
+    try:
+        yield executor
+        executor.shutdown()
+    finally:
+        client.close()  # cancels what is under way
+
+
+class _Deaf(Executor):
+    """Submits with SIGINT blocked: workers inherit that from their first instruction on.
+
+    A worker that is started then does not import the script that starts it, which would start its sweep again; cells
+    are measured by functions of modules.
+    """
+
+    def __init__(self, pool: ProcessPoolExecutor) -> None:
+        self._pool = pool
+
+    def submit(self, fn, /, *args, **kwargs):  # type: ignore[no-untyped-def]  # as its base has it
+        """See `Executor.submit`."""
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        script, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
+        try:
+            return self._pool.submit(fn, *args, **kwargs)
+        finally:
+            sys.modules["__main__"] = script
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _end(workers: Collection[BaseProcess]) -> None:
+    for worker in workers:
+        worker.terminate()
+    until = perf_counter() + _GRACE_S
+    for worker in workers:
+        worker.join(max(until - perf_counter(), 0.0))
+        worker.kill()
+        worker.join()
+
+
+@contextlib.contextmanager
+def _one_blas_thread() -> Iterator[None]:
+    before = {name: os.environ[name] for name in BLAS_THREADS if name in os.environ}
+    os.environ.update(dict.fromkeys(BLAS_THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name in BLAS_THREADS:
+            del os.environ[name]
+        os.environ.update(before)
+
+
+Opener = Callable[[], AbstractContextManager[Executor]]

@@ -1,0 +1,58 @@
+"""The case of a seed: a scenario, and one to three faults at random times in its phases."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from random import Random
+
+from canprobe.fieldbus.node.fault import Fault, FaultKind
+
+PHASES = ("bring-up", "approach", "scan", "retreat", "stop")
+"""`listen` has no approach and no retreat, `free` no retreat; the approach of `free` is the enabling."""
+FILES_EVERY = 8
+"""One run in so many writes its log, and is scored on that."""
+SENSOR_SHARE = 0.3
+Windows = Mapping[str, tuple[int, int]]
+"""Phase → when it begins and ends in a run without faults, ns."""
+KINDS = tuple(FaultKind)
+_BOTH_WAYS = (FaultKind.DROP, FaultKind.DELAY, FaultKind.DUPLICATE, FaultKind.CORRUPT)
+"""A frame that the wire corrupts is dropped for its CRC-15, all but one in 10¹⁰; a frame that is corrupted here stands
+for errors behind it: in a controller's memory, a driver, a gateway."""
+NEED_TIME = (FaultKind.BABBLE, FaultKind.DELAY, FaultKind.REORDER)
+"""Kinds that act by the time that frames take on the bus, or by their order."""
+
+
+@dataclass(frozen=True, slots=True)
+class FaultCase:
+    """One run.
+
+    Attributes:
+        seed: of everything random in the run.
+        scenario: one of `SCENARIOS`.
+        phase: in which the first fault begins.
+        faults: what happens.
+        timed: frames take time on the bus.
+        files: the run writes its log.
+    """
+
+    seed: int
+    scenario: str
+    phase: str
+    faults: tuple[Fault, ...]
+    timed: bool = False
+    files: bool = True
+
+
+def draw_fault(rng: Random, kind: FaultKind, nodes: tuple[int, ...], window: tuple[int, int]) -> Fault:
+    amount = rng.uniform(2e5, 2e6) if kind is FaultKind.BABBLE else 10 ** rng.uniform(5.0, 7.5)
+    return Fault(
+        kind,
+        node_id=nodes[-1] if rng.random() < SENSOR_SHARE else rng.choice(nodes),
+        start_ns=rng.randrange(*window),
+        duration_ns=int(10 ** rng.uniform(6.0, 8.7)),
+        share=rng.choice((1.0, 1.0, 0.5, 0.1)),
+        incoming=kind is FaultKind.DEAF or (kind in _BOTH_WAYS and rng.random() < 0.4),
+        amount_ns=int(amount),
+        seed=rng.randrange(2**32),
+    )

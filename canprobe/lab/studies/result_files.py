@@ -1,0 +1,129 @@
+"""A study's result as text, CSV, JSON and picture, and the facts of every measurement."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import importlib.util
+import json
+import math
+import platform
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import canprobe
+from canprobe.fieldbus.bus.files import make_folder, whole_file, write_text
+from canprobe.lab.studies.cell_store import PACKAGE, model_digest
+from canprobe.lab.studies.harness import Column, StudyResult
+
+SIGMA_COLUMNS = (
+    Column("sigma_point_um", "σp µm", ".0f"),
+    Column("sigma_normal_mrad", "σn mrad", ".1f"),
+)
+"""Noise of a row, filled by `sigma_values`."""
+
+
+def measuring_facts(quick: bool, seeds: int, model: Sequence[str] = ()) -> dict[str, Any]:
+    """Machine, versions and settings of a study; `model` as for `Sweep.map`."""
+    commit = ""
+    with contextlib.suppress(OSError, subprocess.TimeoutExpired):
+        command = ["git", "-C", str(PACKAGE), "describe", "--always", "--dirty"]
+        commit = subprocess.run(command, capture_output=True, text=True, check=False, timeout=5.0).stdout.strip()
+    return {
+        "canprobe": canprobe.__version__,
+        "commit": commit or None,
+        "model": model_digest(tuple(model)),
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "machine": processor(),
+        "quick": quick,
+        "seeds": seeds,
+    }
+
+
+def processor() -> str:
+    """The name of this machine's processor, or else its architecture."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.machine()
+
+
+def sigma_values(sigma_point: float, sigma_normal: float) -> dict[str, float]:
+    """The values of `SIGMA_COLUMNS`, from m and rad."""
+    return {"sigma_point_um": sigma_point * 1e6, "sigma_normal_mrad": sigma_normal * 1e3}
+
+
+def table_lines(result: StudyResult) -> list[str]:
+    """The table, a line for each row, numbers flush right."""
+    cells = [[c.heading for c in result.columns]]
+    cells += [[_shown(row.get(c.key), c.form) for c in result.columns] for row in result.rows]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    words = [bool(result.rows) and isinstance(result.rows[0].get(c.key), str) for c in result.columns]
+    return [
+        "  ".join(
+            t.ljust(w) if is_word else t.rjust(w) for t, w, is_word in zip(line, widths, words, strict=True)
+        ).rstrip()
+        for line in cells
+    ]
+
+
+def text_of(result: StudyResult) -> str:
+    """Facts, table and findings of all its tables."""
+    facts = ", ".join(f"{name} {value}" for name, value in result.facts.items() if value is not None)
+    own = [f"study {result.name}: {facts}", "", *table_lines(result), "", *result.findings, ""]
+    return "\n".join([*own, *(f"\n{text_of(more)}" for more in result.more)])
+
+
+def as_document(result: StudyResult) -> dict[str, Any]:
+    """For `--json`: no NaN, what does not apply is null."""
+    more = {"more": [as_document(part) for part in result.more]} if result.more else {}
+    return {
+        "study": result.name,
+        "facts": dict(result.facts),
+        "findings": list(result.findings),
+        "rows": [{key: _plain(value) for key, value in row.items()} for row in result.rows],
+        **more,
+    }
+
+
+def write_study(result: StudyResult, out: Path) -> list[Path]:
+    """Write `<name>.csv`, `.txt`, `.json` and, where matplotlib is installed, `.png`.
+
+    Returns:
+        The files of each table, its picture last where there is one.
+
+    Raises:
+        ResultsError: one cannot be written.
+    """
+    make_folder(out)
+    paths = [out / f"{result.name}.{end}" for end in ("csv", "txt", "json")]
+    keys = list(dict.fromkeys(key for row in result.rows for key in row))
+    with whole_file(paths[0]) as part, part.open("w", newline="", encoding="utf-8") as file:
+        lines = [["" if (v := _plain(row.get(key))) is None else v for key in keys] for row in result.rows]
+        csv.writer(file).writerows([keys, *lines])
+    write_text(paths[1], text_of(result))
+    document = json.dumps(as_document(result), indent=1, allow_nan=False, ensure_ascii=False)
+    write_text(paths[2], document + "\n")
+    if importlib.util.find_spec("matplotlib") is not None:
+        paths.append(out / f"{result.name}.png")
+        result.draw(paths[-1])
+    return [*paths, *(path for more in result.more for path in write_study(more, out))]
+
+
+def _shown(value: Any, form: str) -> str:
+    value = _plain(value)
+    if value is None:
+        return "–"
+    return "yes" if value is True else "no" if value is False else format(value, form)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value

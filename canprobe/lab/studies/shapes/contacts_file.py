@@ -1,0 +1,57 @@
+"""The file."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from canprobe.cell.npz import read_npz, write_npz
+from canprobe.cell.scene.load import load_scene
+from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.scene.setup import Touch
+from canprobe.cell.tasks.from_plan import SIGMA_NORMAL_RAD, centroid_coupling
+from canprobe.lab.studies.harness import Array
+from canprobe.lab.studies.shapes.implicit import Touched
+from canprobe.lab.studies.shapes.scans import samples_of
+from canprobe.mechanics.touch.contact import ContactSample
+
+
+class Contacts(NamedTuple):
+    """What a method gets of a shape.
+
+    Attributes:
+        samples: contacts in the order of time, with their stated noise.
+        touched: their places, normals and noise, base.
+        task: the scan's setup: array, calibration, probe, speed; the estimators' model of the sensor.
+    """
+
+    samples: list[ContactSample]
+    touched: Touched
+    task: Touch
+
+
+def write_contacts(path: Path, shapes: Mapping[str, Mapping[str, Any]]) -> str:
+    """Write the file of contacts; its SHA-256."""
+    write_npz(path, {f"{name}/{key}": np.asarray(v) for name, columns in shapes.items() for key, v in columns.items()})
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def read_columns(path: Path, name: str) -> dict[str, Array]:
+    """Columns of a shape."""
+    prefix = f"{name}/"
+    return {k.removeprefix(prefix): v for k, v in read_npz(path, "contacts").items() if k.startswith(prefix)}
+
+
+def read_contacts(path: Path, name: str) -> Contacts:
+    """The contacts of a shape with the setup that was stated for all of them."""
+    columns = read_columns(path, name)
+    samples = samples_of(columns)
+    task = resolve(load_scene("cylinder")).task
+    assert isinstance(task, Touch)
+    sigma = np.hypot(columns["sigma"][:, 0], columns["sigma"][:, 2])
+    normal = np.hypot(SIGMA_NORMAL_RAD, sigma * centroid_coupling(task.probe))
+    return Contacts(samples, Touched(columns["p_base"], columns["n_base"], sigma, normal), task)

@@ -1,0 +1,53 @@
+"""Damped least-squares inverse of the Jacobian, damped only near singular poses."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from canprobe.mechanics.robot.chain import Array
+from canprobe.mechanics.robot.inverse import LENGTH_M
+
+_DAMPING, _THRESHOLD = 0.05, 0.08
+"""Largest damping, and the singular value below which it starts; linear rows are divided by `LENGTH_M`."""
+
+
+def damped_step(J: Array, twist: Array, wish: Array | None = None) -> Array:
+    """Joint rates for a tool twist.
+
+    Away from singular poses this is the exact inverse, of least norm where there are more joints than rows. Where the
+    smallest singular value s falls below the threshold the squared damping rises as
+    0.05^2 (1 - (s / 0.08)^2), on all directions alike, so that rates stay bounded and continuous.
+
+    Args:
+        J: (m, n) rows of the geometric Jacobian that the arm can hold, linear rows first, see `task_rows`.
+        twist: (m,) linear m/s then angular rad/s, or a displacement: the map is linear.
+        wish: (n,) rates that the joints have as far as the tool does not notice; none by default.
+
+    Returns:
+        (n,) joint rates, rad/s or m/s.
+
+    Source: Nakamura & Hanafusa 1986; Maciejewski & Klein 1988 (variable damping factor); Liegeois 1977 (null space).
+    """
+    rows, joints = J.shape
+    scale = np.array((1 / LENGTH_M,) * 3 + (1.0,) * (rows - 3))
+    scaled, aim = J * scale[:, None], scale * twist
+    regular = _regular_step(scaled, aim) if rows == joints else None
+    if regular is not None:
+        return regular
+    U, s, Vt = np.linalg.svd(scaled, full_matrices=False)
+    ratio = float(s[-1]) / _THRESHOLD
+    lambda2 = _DAMPING**2 * (1.0 - ratio**2) if ratio < 1.0 else 0.0
+    step: Array = Vt.T @ ((U.T @ aim) * (s / (s * s + lambda2)))
+    return step if wish is None else step + wish - Vt.T @ (Vt @ wish)
+
+
+def _regular_step(J: Array, twist: Array) -> Array | None:
+    """The exact inverse where it is cheap to see that no damping is due (1/‖J⁻¹‖ is below every singular value)."""
+    try:
+        inverse = np.linalg.inv(J)
+    except np.linalg.LinAlgError:
+        return None
+    if float(np.vdot(inverse, inverse)) * _THRESHOLD**2 >= 1.0:
+        return None
+    step: Array = inverse @ twist
+    return step

@@ -1,0 +1,42 @@
+"""Moving the tool with the drives that are left: what the others would have done is shared among them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.mechanics.robot.chain import Array
+from canprobe.mechanics.robot.model import ArmModel
+
+WORST_GAIN = 30.0
+"""Joint motion per motion of the tool, rad/m, beyond which the drives that are left are badly placed for it."""
+_EXACT = 1e-6
+
+
+def lifting_step(model: ArmModel, J: Array, move: Array, free: NDArray[np.bool_]) -> Array | None:
+    """Drive steps that move the tool's point, its orientation left open, while some drives stand still.
+
+    Of all steps the one with the least joint motion. Couplings between the joints are in it: a drive that stands still
+    is not a joint that stands still.
+
+    Args:
+        model: the arm.
+        J: (3, n) velocity of the point per joint rate, base frame.
+        move: (3,) of the point, m, base frame.
+        free: (n,) drives that may move.
+
+    Returns:
+        (n,) drive units; None where the free drives cannot make this move, or only by moving far.
+
+    Source: least-norm solution of an underdetermined system (Golub and Van Loan, Matrix Computations, 5.6).
+    """
+    turns = (model.q_per_unit / model.radian[:, None])[:, free]
+    scale = 1.0 / np.linalg.norm(turns, axis=0)  # units of a drive for one rad of joints
+    shares, *_ = np.linalg.lstsq(J @ model.q_per_unit[:, free] * scale, move, rcond=None)
+    units = np.zeros(len(free))
+    units[free] = scale * shares
+    dq = model.q_per_unit @ units
+    size = float(np.linalg.norm(move))
+    if np.linalg.norm(J @ dq - move) > _EXACT * size or np.linalg.norm(dq / model.radian) > WORST_GAIN * size:
+        return None
+    return units

@@ -1,0 +1,118 @@
+"""Which combinations of curvature the data observed.
+
+The decision is made on K alone, in q = (K11, √2 K12, K22), where a turn of the frame is orthogonal, so that it does
+not depend on the choice of axes. A combination of K counts as observed when
+
+1. the points were spread: their mean square distance from their mean, along the axes that the combination weighs, is
+   at least `SPREAD · σ_p²` (noise alone would give σ_p²). Below, an answer would be drawn towards 0 with a small but
+   false σ. This is decided first, on the places alone, so that no fit can talk itself into it;
+2. its standard deviation, all other parameters unknown, is at most `SIGMA_LIMIT · max(‖K‖, 1/L)`, L the length of the
+   path;
+3. its information is at least `NUMERIC` times the largest: rounding.
+
+A straight path passes two of three: the normal curvature along it and the twist. Combinations that fail are held at
+the value nearest to flat.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.mechanics.touch.estimate.quadric import TO_Q
+from canprobe.mechanics.touch.linear_algebra import Array, eigen, principal
+
+SPREAD = 10.0
+SIGMA_LIMIT = 0.3
+NUMERIC = 1e-12
+
+
+class Decision(NamedTuple):
+    """What is known about q, combination by combination.
+
+    Attributes:
+        information: (3,) information 1/σ² of each; 0 for what the points were not spread for.
+        vectors: (3, 3) columns, orthonormal in q.
+        passed: (3,) bool.
+    """
+
+    information: Array
+    vectors: Array
+    passed: NDArray[np.bool_]
+
+    @property
+    def rank(self) -> int:
+        """Number of observed combinations."""
+        return int(self.passed.tolist().count(True))
+
+
+def nothing_observed() -> Decision:
+    """The decision where a model does not hold."""
+    return Decision(np.zeros(3), np.eye(3), np.zeros(3, dtype=bool))
+
+
+def decide(root_q: Array, spread: Array, curvature: float) -> Decision:
+    """Rank decision.
+
+    Args:
+        root_q: (m, 3) root of the data's information about q, all else unknown, dimensionless.
+        spread: (2, 2) covariance of the points in the tangent plane over the variance of their noise.
+        curvature: ‖K‖, dimensionless.
+    """
+    axes, wide = excited(spread)
+    if wide.all():
+        root = root_q.dot(axes)
+        values, turn = eigen(root.T.dot(root))
+        return Decision(values, axes.dot(turn), values >= _least(curvature, float(values[-1])))
+    seen = axes[:, wide]
+    root = root_q.dot(seen)
+    values, turn = eigen(root.T.dot(root)) if seen.size else (np.zeros(0), np.zeros((0, 0)))
+    least = _least(curvature, float(values.max(initial=0.0)))
+    unseen = int(np.count_nonzero(~wide))
+    return Decision(
+        np.concatenate([np.zeros(unseen), values]),
+        np.concatenate([axes[:, ~wide], seen.dot(turn)], axis=1),
+        np.concatenate([np.zeros(unseen, dtype=bool), values >= least]),
+    )
+
+
+def _least(curvature: float, largest: float) -> float:
+    return max(1.0 / (SIGMA_LIMIT * max(curvature, 1.0)) ** 2, NUMERIC * largest)
+
+
+def excited(spread: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """As columns (3, 3) in q the curvature along the main axis of a spread, the twist, and across; and for which of
+    them (3,) the points were spread.
+    """
+    mean, radius, angle = principal(spread)
+    return turned(angle).T, np.array([mean + radius, mean, mean - radius]) >= SPREAD
+
+
+def turned(angle: float) -> Array:
+    """The (3, 3) orthogonal matrix that takes q = (K11, √2 K12, K22) to axes turned by an angle in rad."""
+    c, s = math.cos(angle), math.sin(angle)
+    cs = math.sqrt(2.0) * c * s
+    return np.array([[c * c, cs, s * s], [-cs, c * c - s * s, cs], [s * s, -cs, c * c]])
+
+
+def spread_of(points: Array, variance: Array) -> Array:
+    """Covariance (2, 2) of points (n, 2 or 3) in the tangent plane, over the variance (n,) of their noise per axis."""
+    weight = 1.0 / variance
+    offset = points[:, :2] - weight @ points[:, :2] / weight.sum()
+    result: Array = (offset * weight[:, None]).T @ offset / len(points)
+    return result
+
+
+def outside(decision: Decision, q: Array) -> float:
+    """Length of the part of q (3,) that the data did not observe, relative to q."""
+    hidden = decision.vectors[:, np.logical_not(decision.passed)].T @ q
+    return math.sqrt(float(hidden @ hidden) / float(q @ q))
+
+
+def tensor(q: Array) -> Array:
+    """The symmetric (2, 2) matrix of q."""
+    k11, k12, k22 = q / TO_Q
+    return np.array([[k11, k12], [k12, k22]])

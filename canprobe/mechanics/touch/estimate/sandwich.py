@@ -1,0 +1,77 @@
+"""What the noise of weighted and forgotten rows does to an answer: the middle of the sandwich covariance.
+
+An answer `c = A⁻¹ Jᵀ W e` has the covariance `A⁻¹ (Jᵀ W R W J) A⁻¹`, not `A⁻¹`: forgetting weighs rows without making
+them noisier, so weights enter squared, and correlated rows add what they share.
+
+Source: Huber, "The behavior of maximum likelihood estimates under nonstandard conditions", 1967; White 1980.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from canprobe.mechanics.touch.estimate.noise import Correlation, mixed
+from canprobe.mechanics.touch.linear_algebra import Array
+
+
+class Score:
+    """Covariance `matrix` (k, k) of the score `Jᵀ W e` of a filter that forgets along the path.
+
+    Args:
+        prior: (k, k) information of what is always known about the k parameters.
+        correlation: of the rows along the path; None for independent samples.
+    """
+
+    def __init__(self, prior: Array, correlation: Correlation | None) -> None:
+        self._prior = prior
+        self._correlation = correlation
+        self._shares = np.zeros((3, 1)) if correlation is None else correlation.shares[:, None]
+        self.reset()
+
+    def reset(self) -> None:
+        """Only the prior is left."""
+        self.matrix = self._prior.copy()
+        self._recent = np.zeros((3, len(self.matrix)))
+
+    def start(self, J: Array, travelled: float) -> None:
+        """Take a batch's whitened rows (n, 3, k), evenly spread over a path (m), which all count in full."""
+        self.reset()
+        k = len(self.matrix)
+        rows = J.reshape(-1, k)
+        if self._correlation is None:
+            self.matrix += rows.T @ rows
+            return
+        places = np.linspace(0.0, travelled, len(J))
+        self.matrix += rows.T @ mixed(self._correlation.matrix(places), J).reshape(-1, k)
+        fades = np.exp((places - travelled) / self._correlation.length)
+        self._recent = self._shares * (fades @ J.reshape(-1, 3 * k)).reshape(3, k)
+
+    def take(self, J: Array, moved: float, kept: float, known: float) -> None:
+        """Take new whitened rows (3n, k) over a step (m) of the path, which leaves `kept` of the information.
+
+        `known` is what of the prior is put back into the matrix, over the whole prior.
+        """
+        self.matrix = kept**2 * self.matrix + known * self._prior + self._added(J, moved, kept)
+
+    def carry(self, back: Array) -> None:
+        """Go over to other parameters; back (k, k) is d(old)/d(new)."""
+        self.matrix = back.T.dot(self.matrix).dot(back)
+        self._recent = self._recent.dot(back)
+
+    def _added(self, J: Array, moved: float, kept: float) -> Array:
+        """What new rows add: with each other, and with earlier ones that they resemble."""
+        if self._correlation is None:
+            return np.asarray(J.T.dot(J), dtype=np.float64)
+        n, k = len(J) // 3, J.shape[1]
+        fade = math.exp(-moved / (n * self._correlation.length))
+        shared = self._shares * J.reshape(n, 3, k)
+        recent, past = kept * self._recent, np.empty((n, 3, k))
+        for i in range(n):
+            recent *= fade
+            past[i] = recent
+            recent += shared[i]
+        self._recent = recent
+        cross = J.T.dot(past.reshape(-1, k))
+        return np.asarray(J.T.dot(J) + cross + cross.T, dtype=np.float64)

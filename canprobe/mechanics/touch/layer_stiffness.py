@@ -1,0 +1,101 @@
+"""The layer's compliance from a touch: how the force grows while the probe is pushed into an object that stands still.
+
+On a Winkler layer `F = π k δ² / (2 √(AB))`, so the root of the force is a straight line over the push, whatever the
+curvatures: its slope b is what the servo needs, `δ = √F / b`; with the curvatures known it gives `k = 2 √(AB) b² /
+π`. Stops being true where the patch is cut by the pad's edge or the object slides away.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+SIGMA_ROOT = 0.03
+"""Noise of √F, √N: a force of 1 N known to 6 %, its slow errors (hysteresis, creep) included."""
+MOST_SCATTER = 3.3
+"""RMS distance from the line over the noise above which it is none."""
+LEAST_FORCE_N = 0.1
+"""Below it threshold and noise of the array bend the line."""
+SAMPLES_OF_A_PUSH = 6
+
+
+class PushFit:
+    """Straight line of √F over the push, from running means (Welford): constant time and memory.
+
+    Both have errors, and on a stiff contact a micrometre of the push is a large force. The line is that of the root on
+    the push as it was measured, which errors make flatter: it predicts the force where the encoders see the probe.
+
+    Example: `fit.add(push, force)` for every tactile frame of a touch; `fit.slope` once `fit.certain(0.1)`.
+
+    Args:
+        push_sigma: standard deviation of a push, m, independent from sample to sample.
+    """
+
+    def __init__(self, push_sigma: float = 0.0) -> None:
+        self._push_variance = push_sigma * push_sigma
+        self._n = 0
+        self._push = self._root = 0.0  # means
+        self._spread = self._joint = self._root_spread = 0.0  # sums of products about them
+
+    def add(self, push: float, force: float) -> None:
+        """Take a push of the probe towards the object (m, from any zero) and the force (N); a small one is left out."""
+        if not (force >= LEAST_FORCE_N and math.isfinite(push)):
+            return
+        root = math.sqrt(force)
+        self._n += 1
+        from_mean = push - self._push
+        self._push += from_mean / self._n
+        root_from_mean = root - self._root
+        self._root += root_from_mean / self._n
+        self._spread += from_mean * (push - self._push)
+        self._joint += from_mean * (root - self._root)
+        self._root_spread += root_from_mean * (root - self._root)
+
+    @property
+    def slope(self) -> float:
+        """b, √N per m; NaN where there is none yet."""
+        return self._joint / self._spread if self._determined else math.nan
+
+    @property
+    def start(self) -> float:
+        """Push at which the line has no force any more, m: where the touch began; NaN where there is no slope yet."""
+        return self._push - self._root / self.slope if self._determined else math.nan
+
+    @property
+    def sigma(self) -> float:
+        """Its standard deviation, √N per m; infinite where there is no slope."""
+        return self._noise / math.sqrt(self._spread) if self._determined else math.inf
+
+    def certain(self, share: float) -> bool:
+        """Whether the slope is positive, known to this share of itself (1σ), and the samples lie on the line.
+
+        A sensor that sends nonsense has a slope too; its samples are off the line.
+        """
+        return self.slope > 0.0 and self.sigma < share * self.slope and self.scatter < MOST_SCATTER * self._noise
+
+    @property
+    def scatter(self) -> float:
+        """RMS distance of √F from the line, √N; infinite where there is no slope."""
+        if not self._determined:
+            return math.inf
+        return math.sqrt(max(self._root_spread - self._joint**2 / self._spread, 0.0) / (self._n - 2))
+
+    @property
+    def _noise(self) -> float:
+        """Of a sample about the line, √N: that of the root and that of the push, seen along the slope."""
+        return math.sqrt(SIGMA_ROOT**2 + self.slope**2 * self._push_variance)
+
+    @property
+    def _determined(self) -> bool:
+        return self._n >= SAMPLES_OF_A_PUSH and self._spread > 0.0
+
+
+def stiffness_from_slope(slope: float, radius: float, kappa: ArrayLike) -> float:
+    """K/h of the layer (N/m³) from the slope b (√N per m) on an object of known curvature (2,) above −1/R_p, 1/m.
+
+    The inverse of `indentation_from_force`.
+    """
+    k1, k2 = (float(k) for k in np.asarray(kappa, dtype=np.float64))
+    return 2.0 * math.sqrt(0.25 * (1.0 / radius + k1) * (1.0 / radius + k2)) * slope * slope / math.pi

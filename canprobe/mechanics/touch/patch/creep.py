@@ -1,0 +1,57 @@
+"""What an array that creeps remembers of where the patch has been.
+
+A taxel's reading goes on growing under a constant load, by some percent a decade of time, and falls as slowly when
+the load is gone. So an image is the patch as it is, with a faint and blurred picture of where it was: the second
+moments of a patch that rolls over the pad are larger than those of one that rests, by a share of how far it has been
+away. The share is calibrated (`ImageParameters.memory`); with it images at rest and on the move say the same of the
+surface.
+
+Model: memories that fade exponentially, a decade apart, all of one strength. It stops being true where the patch has
+been further away than its own size.
+
+Source: logarithmic creep as a sum of exponentials a decade apart: Findley, Lai and Onaran, "Creep and relaxation of
+nonlinear viscoelastic materials", ch. 5.
+"""
+
+from __future__ import annotations
+
+import math
+
+from canprobe.mechanics.touch.patch.moments import Moments
+
+TIMES_S = (0.3, 3.0, 30.0)
+"""Time constants of the memories."""
+
+
+class PadMemory:
+    """Places of the patch on the pad since the contact began, as faded memories."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Contact was lost."""
+        self._t_s: float | None = None
+        self._sums = [(0.0, 0.0, 0.0, 0.0, 0.0, 0.0) for _ in TIMES_S]  # of 1, u, v, uu, uv, vv
+
+    def add(self, t_s: float, u: float, v: float) -> Moments:
+        """Take the centroid (m) of an image at a time (s).
+
+        Returns uu, uv, vv of the way from here to where the patch was, mean over what each memory holds, added up, m².
+        """
+        dt = 0.0 if self._t_s is None else max(t_s - self._t_s, 0.0)
+        self._t_s = t_s
+        mass = su = sv = uu = uv = vv = 0.0
+        for k, tau in enumerate(TIMES_S):
+            kept = math.exp(-dt / tau)
+            new = 1.0 - kept
+            m, a, b, aa, ab, bb = self._sums[k]
+            m, a, b = kept * m + new, kept * a + new * u, kept * b + new * v
+            aa, ab, bb = kept * aa + new * u * u, kept * ab + new * u * v, kept * bb + new * v * v
+            self._sums[k] = m, a, b, aa, ab, bb
+            mass, su, sv, uu, uv, vv = mass + m, su + a, sv + b, uu + aa, uv + ab, vv + bb
+        return (
+            uu - 2.0 * u * su + u * u * mass,
+            uv - u * sv - v * su + u * v * mass,
+            vv - 2.0 * v * sv + v * v * mass,
+        )

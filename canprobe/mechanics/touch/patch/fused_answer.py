@@ -1,0 +1,113 @@
+"""The answer of patch and motion together, and of the patch alone."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.touch.estimate.answer import Solution, SurfaceEstimate, build_estimate
+from canprobe.mechanics.touch.estimate.noise import CHI2_95
+from canprobe.mechanics.touch.estimate.observed import SIGMA_LIMIT, Decision, nothing_observed
+from canprobe.mechanics.touch.estimate.quadric import TO_Q, UNIT, matrix_of, parameters_of
+from canprobe.mechanics.touch.linear_algebra import Array, eigen, inverted
+from canprobe.mechanics.touch.patch.curvature import Fused, PatchCurvature
+from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
+
+NAMED = 0.1
+"""Share of the information about K that the patch gives from which on the estimate's method names it."""
+CONTRADICTED = "the patch contradicts the motion"
+WITHDRAWN = 0.25
+"""Path over the memory after which a contradiction that lasts withdraws that anything was observed."""
+_TO_K = 1.0 / np.outer(TO_Q, TO_Q)
+
+
+def with_patch(motion: SurfaceEstimate, found: Fused, length: float, *, withdrawn: bool = False) -> SurfaceEstimate:
+    """A motion estimate with its `evidence`, and what was found of that and the patch.
+
+    Place, normal and c13, c23, c33 stay the motion's; the patch says nothing about them. Curvatures below 1/length (the
+    memory, m) count as flat; `withdrawn`: nothing is called observed. The `method` ends in "+patch" where the patch
+    gave at least `NAMED`; a note says how much.
+    """
+    assert motion.evidence is not None
+    weight = CHI2_95 / max(found.cost, CHI2_95)
+    evidence, patch = weight * motion.evidence.information, weight * found.patch
+    has_prior = motion.rank < 3 and bool(np.isfinite(motion.covariance).all())
+    data = weight * motion.information if has_prior else evidence
+    decision = nothing_observed() if withdrawn else _decide(data + patch, found.q, length)
+    root = None if motion.model_root is None else _joined(math.sqrt(weight) * motion.model_root, patch)
+    inverse = inverted(evidence + patch)
+    share = float((inverse * patch).sum()) / 3.0
+    return build_estimate(
+        _solution(motion.S, found.q, inverse, decision, has_prior=has_prior, root=root),
+        length=1.0,
+        T_frame_contact=motion.T_frame_contact,
+        problem_root=motion.problem_root,
+        innovation=motion.innovation,
+        distance=motion.distance,
+        samples=motion.samples,
+        method=motion.method + "+patch" if share >= NAMED else motion.method,
+        prior=motion.prior,
+        notes=(*motion.notes, *_notes(found, share)),
+        stiffness=found.stiffness,
+    )
+
+
+def patch_estimate(contact: ContactSample, patch: PatchCurvature, length: float) -> SurfaceEstimate | None:
+    """Shape from the patch alone, at the last contact, as of a touch that stands still; None where it knows nothing."""
+    T = homogeneous(tangent_rotation(-contact.n_base), contact.p_base)
+    found = patch.fuse(T)
+    if found is None:
+        return None
+    return build_estimate(
+        _solution(matrix_of(np.zeros(9)), found.q, inverted(found.patch), _decide(found.patch, found.q, length)),
+        length=1.0,
+        T_frame_contact=T,
+        problem_root=_root(found.patch),
+        innovation=1.0,
+        distance=0.0,
+        samples=float(patch.frames),
+        method="patch",
+        prior="none",
+        stiffness=found.stiffness,
+    )
+
+
+def _notes(found: Fused, share: float) -> tuple[str, ...]:
+    said = (f"{100.0 * share:.0f} % of the curvature from the patch",)
+    return (*said, CONTRADICTED) if found.contradicted else said
+
+
+def _joined(model_root: Array, patch: Array) -> Array:
+    """(n + 3, 9) root of the information about the entries of S with the patch's part about K."""
+    rows = np.zeros((3, 9))
+    rows[:, 6:] = _root(patch) / UNIT
+    return np.concatenate([model_root, rows])
+
+
+def _root(information: Array) -> Array:
+    """(3, 3) root of the patch's information, which may be singular."""
+    values, vectors = eigen(information)
+    result: Array = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+    return result
+
+
+def _decide(information: Array, q: Array, length: float) -> Decision:
+    """The rank decision's second rule on what patch and motion together know; the first is about motion alone."""
+    values, vectors = eigen(information)
+    size = max(math.sqrt(float(q @ q)), 1.0 / length)
+    return Decision(np.maximum(values, 0.0), vectors, values >= 1.0 / (SIGMA_LIMIT * size) ** 2)
+
+
+def _solution(
+    S: Array, q: Array, covariance: Array, decision: Decision, *, has_prior: bool = False, root: Array | None = None
+) -> Solution:
+    """From q and its covariance (3, 3)."""
+    c = parameters_of(S)
+    if has_prior or decision.rank == 3:
+        c[6:] = UNIT * q
+        return Solution(c, covariance * _TO_K, decision, has_prior, root)
+    V = decision.vectors[:, decision.passed]
+    c[6:] = UNIT * (V @ (V.T @ q))
+    return Solution(c, np.full((3, 3), math.nan), decision, has_prior, root)

@@ -1,0 +1,126 @@
+"""Strategies: where the contact goes next, as a heading in the scan plane.
+
+The scan plane is perpendicular to the approach direction. A strategy is a closed curve in it, followed by arc length,
+so that the contact speed is the same everywhere; the servo lifts the heading into the surface's tangent plane.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Protocol
+
+
+class Strategy(Protocol):
+    """A smooth closed curve in the scan plane that starts at the origin."""
+
+    def point(self, phase: float) -> tuple[float, float]:
+        """Point of the curve (m, m: along the heading, across) at ``phase`` (rad)."""
+
+    def tangent(self, phase: float) -> tuple[float, float]:
+        """Derivative of :meth:`point` by the phase (m/rad)."""
+
+
+class Weave:
+    """To and fro along the heading with a sine across it: excites the curvature in both directions everywhere.
+
+    Along the heading it is a triangle wave without its sharp tips (three terms of its series), so that the path does
+    not linger at the ends, where a plain sine would leave the curvature along the heading without excitation.
+
+    Args:
+        length_m: full size along the heading.
+        width_m: full size across it.
+        wavelength_m: mean distance along the heading of one full weave; sets the even ratio ``m``: at
+            the ends the path then turns round smoothly and comes back beside itself, where an odd one would reverse.
+    """
+
+    def __init__(self, length_m: float, width_m: float, wavelength_m: float) -> None:
+        self._a, self._b = length_m / 2 / (1 + 1 / 9 + 1 / 25), width_m / 2
+        self._m = max(2, 2 * round(length_m / wavelength_m))
+
+    def point(self, phase: float) -> tuple[float, float]:
+        along = math.sin(phase) - math.sin(3.0 * phase) / 9.0 + math.sin(5.0 * phase) / 25.0
+        return self._a * along, self._b * math.sin(self._m * phase)
+
+    def tangent(self, phase: float) -> tuple[float, float]:
+        along = math.cos(phase) - math.cos(3.0 * phase) / 3.0 + math.cos(5.0 * phase) / 5.0
+        return self._a * along, self._b * self._m * math.cos(self._m * phase)
+
+
+class Circle:
+    """A circle through the start point, its centre ``diameter/2`` along the heading."""
+
+    def __init__(self, diameter_m: float) -> None:
+        self._r = diameter_m / 2
+
+    def point(self, phase: float) -> tuple[float, float]:
+        return self._r * (1 - math.cos(phase)), self._r * math.sin(phase)
+
+    def tangent(self, phase: float) -> tuple[float, float]:
+        return self._r * math.sin(phase), self._r * math.cos(phase)
+
+
+class Straight:
+    """To and fro along the heading: a triangle wave, one stroke of ``length/2`` per quarter turn of the phase.
+
+    A straight path leaves the curvature across it unobserved; that is what this strategy is for.
+
+    Args:
+        length_m: full size along the heading.
+    """
+
+    def __init__(self, length_m: float) -> None:
+        self._slope = length_m / math.pi
+
+    def point(self, phase: float) -> tuple[float, float]:
+        folded = (phase + math.pi / 2) % (2 * math.pi)
+        return self._slope * (min(folded, 2 * math.pi - folded) - math.pi / 2), 0.0
+
+    def tangent(self, phase: float) -> tuple[float, float]:
+        return (self._slope if (phase + math.pi / 2) % (2 * math.pi) < math.pi else -self._slope), 0.0
+
+
+def make_strategy(name: str, length_m: float, width_m: float, wavelength_m: float = 0.012) -> Strategy:
+    """Strategy by name.
+
+    Raises:
+        KeyError: for a name that is none of ``weave``, ``circle``, ``straight``.
+    """
+    makers: dict[str, Callable[[], Strategy]] = {
+        "weave": lambda: Weave(length_m, width_m, wavelength_m),
+        "circle": lambda: Circle(length_m),
+        "straight": lambda: Straight(length_m),
+    }
+    return makers[name]()
+
+
+class PathFollower:
+    """Follows a curve by arc length; `cross_track_per_m`: how strongly the heading turns back to it."""
+
+    def __init__(self, strategy: Strategy, cross_track_per_m: float = 60.0) -> None:
+        self._strategy = strategy
+        self._gain = cross_track_per_m
+        self._phase = 0.0
+        self._tangent = strategy.tangent(0.0)
+
+    @property
+    def heading(self) -> tuple[float, float]:
+        """Unit tangent (along, across) of the curve where the follower is."""
+        tx, ty = self._tangent
+        norm = max(math.hypot(tx, ty), 1e-9)
+        return tx / norm, ty / norm
+
+    def step(self, x: float, y: float, distance_m: float) -> tuple[float, float]:
+        """Unit heading (along, across) in the scan plane for the next step, from where the contact is (m, m).
+
+        `distance_m`: how far it moves in that plane until the next call.
+        """
+        tx, ty = self._tangent
+        norm = math.hypot(tx, ty)
+        self._phase += distance_m / max(norm, 1e-4)
+        self._tangent = self._strategy.tangent(self._phase)
+        px, py = self._strategy.point(self._phase)
+        hx = tx / max(norm, 1e-9) + self._gain * (px - x)
+        hy = ty / max(norm, 1e-9) + self._gain * (py - y)
+        scale = math.hypot(hx, hy)
+        return (hx / scale, hy / scale) if scale > 1e-9 else (1.0, 0.0)
