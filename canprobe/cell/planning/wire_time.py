@@ -1,5 +1,6 @@
-"""How much of a bus a PDO takes: a classical frame, or above 8 bytes one of CAN FD with bit-rate switch. In bit times of
-the nominal rate; the data phase of an FD frame is rounded up.
+"""How much of a bus a PDO takes, as a classical frame or, above 8 bytes, as one of CAN FD with bit-rate switch.
+
+Times are bit times of the nominal rate; the data phase of an FD frame is rounded up.
 """
 
 from __future__ import annotations

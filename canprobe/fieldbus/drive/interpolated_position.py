@@ -1,4 +1,4 @@
-"""Interpolated position: 60C1h:01 is the target of the next SYNC, as 607Ah is in mode 8, while controlword bit 4 is set.
+"""Interpolated position: 60C1h:01 is the target of the next SYNC while bit 4 of the controlword is set.
 
 With bit 4 the interpolation becomes active and statusword bit 12 set; without it the reference slows down by 6084h
 and stands. The target that stands when bit 4 comes is followed even if it is an old one, as drives do: the master
