@@ -38,7 +38,12 @@ _ROOMS = {
     "examples": "lab.examples",
 }
 """Old name → new name, both below `canprobe`; what lies in a room moves with it."""
-_TACTILE_FRAME = "canprobe.cell.master.tactile_frame"
+_ALSO = {
+    "canprobe.cell.cycle": "canprobe.cell.master.observers",
+    "canprobe.protocol.tactile": "canprobe.cell.master.tactile_frame",
+    "canprobe.touch.estimate.noise": "canprobe.mechanics.touch.estimate.prior",
+}
+"""Old name → where else its contents are now, of documented modules that were taken apart."""
 
 
 def new_name(name: str) -> str | None:
@@ -67,10 +72,11 @@ class MovedModules(MetaPathFinder, InspectLoader):
         """Put the module into the place of its old name."""
         old = module.__name__
         found = importlib.import_module(self._named(old))
-        if old == "canprobe.protocol.tactile":  # which had the frame as controllers see it, too
-            module.__dict__.update(vars(found), TactileFrame=importlib.import_module(_TACTILE_FRAME).TactileFrame)
-            found = module
-        sys.modules[old] = found
+        if old in _ALSO:
+            public = {**vars(importlib.import_module(_ALSO[old])), **vars(found)}
+            module.__dict__.update((name, value) for name, value in public.items() if not name.startswith("__"))
+        else:
+            sys.modules[old] = found
 
     def get_code(self, fullname: str) -> CodeType | None:
         """The code of the module, for `python -m`."""
