@@ -10,6 +10,7 @@
 
 import ast
 import glob
+import importlib
 import sys
 from pathlib import Path
 
@@ -215,6 +216,12 @@ def test_no_modules_import_each_other_in_a_circle(typed):
     while tops := set(graph) - {target for targets in graph.values() for target in targets}:
         graph = {name: targets for name, targets in graph.items() if name not in tops}
     assert not graph, {name: sorted(targets & set(graph)) for name, targets in graph.items()}
+
+
+@pytest.mark.parametrize("door", ["canprobe", "canprobe.fieldbus", "canprobe.mechanics"])
+def test_every_public_name_of_a_door_can_be_had(door):
+    module = importlib.import_module(door)
+    assert [name for name in module.__all__ if not hasattr(module, name)] == []
 
 
 def test_only_declared_packages_are_imported():

@@ -40,14 +40,14 @@ _MODULES = {
     "Chain": "robot.chain",
     "ContactSample": "touch.contact",
     "Joint": "robot.model",
-    "Prior": "touch.estimate.noise",
+    "Prior": "touch.estimate.prior",
     "SurfaceEstimate": "touch.estimate.answer",
     "SurfaceMap": "touch.surface_map",
     "SurfaceMatrix": "touch.surface",
     "cramer_rao": "touch.estimate.likelihood",
     "fit_surface": "touch.estimate.fit",
     "forward": "robot.chain",
-    "from_dh": "robot.chain",
+    "from_dh": "robot.denavit_hartenberg",
     "make_object": "touch.objects",
 }
 

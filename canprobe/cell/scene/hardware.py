@@ -1,6 +1,6 @@
 """The hardware of a cell: the arm, its joints with their drives, and how the emulator may make drives difficult.
 
-These sections stand in cell files (`canprobe.cell.scene.cells`); a scene may change single keys of them. As in
+These sections stand in cell files (`canprobe/cells`); a scene may change single keys of them. As in
 `canprobe.cell.scene.model`, a field says everything about its key.
 """
 
