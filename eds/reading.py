@@ -22,7 +22,8 @@ from canprobe.fieldbus.eds.device_info import commissioned_node, read_informatio
 from canprobe.fieldbus.eds.findings import Fault, Faults
 from canprobe.fieldbus.eds.numbers import parse_sum
 from canprobe.fieldbus.eds.object_lists import check_lists
-from canprobe.fieldbus.eds.sections import Section, Source, decode, split_sections
+from canprobe.fieldbus.eds.sections import Section, decode, split_sections
+from canprobe.fieldbus.eds.source import Source
 from canprobe.fieldbus.eds.structure import build_objects, find_objects
 
 _INVALID = 1 << 31

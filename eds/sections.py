@@ -1,20 +1,16 @@
-"""Bytes of an EDS file → its sections, keys and numbers, each with its line, and what is wrong with them.
+"""Bytes of an EDS file → its sections and keys, each with its line, and what is wrong with them.
 
-Read as Windows reads an INI file, which is what vendors' tools do: names in any case, the first of two counts.
-Source: CiA 306-1, "General structure".
+They are read as Windows reads an INI file, which is what vendors' tools do: names count in any case, and of two equal
+names the first one counts. Source: CiA 306-1, "General structure".
 """
 
 from __future__ import annotations
 
 import codecs
 import re
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from canprobe.fieldbus.eds.findings import Faults
-from canprobe.fieldbus.eds.numbers import parse_integer
-
-# The text of a file → its sections.
 
 LINE_END = re.compile(r"\r\n|\n|\r")
 _INLINE_COMMENT = re.compile(r"\s;.*")
@@ -123,46 +119,3 @@ def _warn_of_repetition(first: Section, again: Section, faults: Faults) -> None:
     old, new = ({key: item.value for key, item in section.items.items()} for section in (first, again))
     how = "the same" if old == new else "but different"
     faults.warn(again.line, again.name, "", f"is in line {first.line} already, {how}; that one counts")
-
-
-# What the builders of a dictionary share.
-
-
-@dataclass(frozen=True, slots=True)
-class Source:
-    """An EDS file in pieces.
-
-    Attributes:
-        sections: of the file.
-        node_id: for $NODEID.
-        faults: collects what is wrong.
-        drive: the device is a drive of CiA 402.
-    """
-
-    sections: Sections
-    node_id: int
-    faults: Faults
-    drive: bool = False
-
-    def warn(self, section: Section, key: str, text: str) -> None:
-        """A warning at a key, or at its section where the key is missing."""
-        self.faults.warn(section.line_of(key), section.name, key, text)
-
-    def fault(self, section: Section, key: str, text: str) -> None:
-        """A fault at a key, or at its section where the key is missing."""
-        self.faults.fault(section.line_of(key), section.name, key, text)
-
-    def remark(self, section: Section, key: str) -> Callable[[str], None]:
-        """What a parser calls with what is odd about a value."""
-        return lambda text: self.warn(section, key, text)
-
-    def number(self, section: Section, key: str, default: int = 0) -> int:
-        """An integer that does no harm when it is wrong; `default` where it is missing, empty or none."""
-        text = section.value(key)
-        if not text:
-            return default
-        try:
-            return parse_integer(text, self.remark(section, key))
-        except ValueError as error:
-            self.warn(section, key, f"{error}; read as {default}")
-            return default

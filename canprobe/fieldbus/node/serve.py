@@ -8,7 +8,7 @@ from itertools import groupby
 from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.joined import wait_for_any
 from canprobe.fieldbus.bus.port import Port, TimedFrame
-from canprobe.fieldbus.bus.real.processor import garbage_collection_paused
+from canprobe.fieldbus.bus.real.memory import garbage_collection_paused
 from canprobe.fieldbus.bus.virtual.lockstep import BusNode, LockstepBus, Participant
 from canprobe.fieldbus.protocol.frames import SYNC_ID, Frame
 

@@ -1,4 +1,4 @@
-"""Damped least-squares inverse of the Jacobian, damped only near singular poses."""
+"""The inverse of the Jacobian by damped least squares, damped only near singular poses."""
 
 from __future__ import annotations
 

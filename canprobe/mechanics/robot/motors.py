@@ -1,5 +1,7 @@
-"""Motor coordinates: the position of a drive divided by its units per own joint, so that without coupling they are the
-joint positions. Rotor inertia, friction and drive torque act there, one motor each; rigid bodies move at the joints.
+"""Motor coordinates: the position of a drive divided by its units per own joint.
+
+Without coupling they are the joint positions. Rotor inertia, friction and drive torque act there, one motor each; rigid
+bodies move at the joints.
 """
 
 from __future__ import annotations

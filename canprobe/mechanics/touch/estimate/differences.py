@@ -1,4 +1,4 @@
-"""Six-unknown linear estimates from differences of points and normals."""
+"""Linear estimates of six unknowns from differences of points and normals."""
 
 from __future__ import annotations
 

@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from canprobe.mechanics.touch.estimate.answer import foot
-from canprobe.mechanics.touch.estimate.left_out import LeftOut
 from canprobe.mechanics.touch.estimate.noise import Correlation, Noise
 from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE
+from canprobe.mechanics.touch.estimate.omitted_terms import LeftOut
 from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.estimate.residuals import Design, design, linearise, transport
 from canprobe.mechanics.touch.linear_algebra import Array, Vec, inverted, inverted_upper, upper_root

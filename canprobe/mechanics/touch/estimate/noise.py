@@ -1,4 +1,4 @@
-"""What is assumed before an estimate: the noise of measured points and normals, and the prior on a surface."""
+"""The stated noise of points and normals: σ or covariances, coupled, and correlated along the path."""
 
 from __future__ import annotations
 

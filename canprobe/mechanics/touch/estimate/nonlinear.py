@@ -1,4 +1,4 @@
-"""Batch Gauss–Newton on the local model, robust, and what a quadric leaves out of its residuals.
+"""Batch Gauss–Newton on the local model, robust.
 
 The points have errors as the normals do, so that the residuals are whitened by `σ_n² I + K² σ_p²`: that keeps the fit
 at the Cramér–Rao bound also on tight curvature. Beyond the 99.9 % point of χ² with three degrees of freedom samples

@@ -1,4 +1,4 @@
-"""What is assumed of a surface before it is touched, always stated and named in the estimate."""
+"""The prior: what is assumed of a surface before it is touched. It is always stated, and named in the estimate."""
 
 from __future__ import annotations
 

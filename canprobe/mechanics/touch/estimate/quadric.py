@@ -1,12 +1,8 @@
-"""The local model, a quadric near the origin of a working frame with c34 = −½, and which of its curvature was observed.
+"""The local model: a quadric near the origin of a working frame, with c34 = −½.
 
-Nine parameters, in this order: `c14, c24, c44` (tilt and height of the working frame), `c13, c23, c33`, and
+Its nine parameters, in this order: `c14, c24, c44` (tilt and height of the working frame), `c13, c23, c33`, and
 `c11, c12, c22`, the half of K, last, so that the trailing 3x3 block of an upper triangular information root is the
-information about K with all else unknown. Beside them stand the nine cubic and quartic terms that a quadric leaves
-out. Lengths are in units of some length L: a dimensionless problem.
-
-Residuals of a sample (x, n): `f/|∇f|` and the two tangential parts of `∇f/|∇f| − n`, whitened by σ_p² and
-`σ_n² I + K² σ_p²`: the point's tangential noise turns the model's normal by K times it.
+information about K with all else unknown. Lengths are in units of some length L: a dimensionless problem.
 """
 
 from __future__ import annotations

@@ -20,11 +20,11 @@ from canprobe.mechanics.touch.estimate.answer import Solution, SurfaceEstimate, 
 from canprobe.mechanics.touch.estimate.change import ChangeTest
 from canprobe.mechanics.touch.estimate.information import InformationFilter, Touch
 from canprobe.mechanics.touch.estimate.known_curvature import curvature_covariance, evidence_of
-from canprobe.mechanics.touch.estimate.left_out import Expected
 from canprobe.mechanics.touch.estimate.misfit import misfit_notes
 from canprobe.mechanics.touch.estimate.noise import CHI2_99, CHI2_999, Correlation
 from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE
 from canprobe.mechanics.touch.estimate.observed import decide, nothing_observed
+from canprobe.mechanics.touch.estimate.omitted_terms import Expected
 from canprobe.mechanics.touch.estimate.online import Dropped, Gate
 from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.estimate.quadric import UNIT, size_of

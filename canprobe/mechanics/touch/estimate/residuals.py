@@ -1,4 +1,8 @@
-"""Residuals of samples and their Jacobian."""
+"""Residuals of samples and their Jacobian.
+
+A sample (x, n) has three residuals: `f/|∇f|` and the two tangential parts of `∇f/|∇f| − n`. They are whitened by σ_p²
+and `σ_n² I + K² σ_p²`: the point's tangential noise turns the model's normal by K times it.
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Estimators over a window of the last samples: `ml`, and the linear ones from differences, `chord` and `chen1996`.
+"""Estimators over a window of the last samples: `ml`, and the linear one from differences, `chord`.
 
-The linear ones rest on `n_a − n_b = 2 S₃ (p_a − p_b)`, exact only where |∇f| is constant along the surface: plane,
-sphere, circular cylinder. Elsewhere they keep a bias without any noise, and noise in the points, on both sides of the
-equation, draws them towards 0. They are baselines and are reported as they are.
+The linear one, and `chen1996`, rest on `n_a − n_b = 2 S₃ (p_a − p_b)`, exact only where |∇f| is constant along the
+surface: plane, sphere, circular cylinder. Elsewhere they keep a bias without any noise, and noise in the points, on
+both sides of the equation, draws them towards 0. They are baselines and are reported as they are.
 """
 
 from __future__ import annotations

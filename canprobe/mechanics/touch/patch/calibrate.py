@@ -25,12 +25,13 @@ from canprobe.mechanics.touch.patch.array_calibration import (
     Residuals,
     StiffnessSources,
 )
+from canprobe.mechanics.touch.patch.array_models import make_image_model, make_patch_calibration
 from canprobe.mechanics.touch.patch.image import PatchCalibration
 from canprobe.mechanics.touch.patch.image_fit import AGE_S, NO_ERRORS, Dwell, Shown, what_is_shown
-from canprobe.mechanics.touch.patch.image_model import USUAL_LIGHTNESS, make_image_model, make_patch_calibration
-from canprobe.mechanics.touch.patch.image_parameters import Fit, Pairs, curvature_errors, fit_parameters, moment_errors
+from canprobe.mechanics.touch.patch.image_model import USUAL_LIGHTNESS
 from canprobe.mechanics.touch.patch.layer_fit import stiffness_by_depth
 from canprobe.mechanics.touch.patch.pad_fit import fit_centroids
+from canprobe.mechanics.touch.patch.parameter_fit import Fit, Pairs, curvature_errors, fit_parameters, moment_errors
 from canprobe.mechanics.touch.patch.taxel_gains import taxel_gains
 
 FORM_SIGMA = 0.01

@@ -4,7 +4,7 @@ On a Winkler layer of stiffness k a probe of radius R_p leaves an elliptic patch
 with `A = ½ (I/R_p + K)` and `F = π k δ² / (2 √det A)` the pressure is `k (δ − xᵀ A x)₊`, and its second moments are
 `(δ/6) A⁻¹`. The array blurs that pressure, spreads some of it over rows and columns, scales it, and shows what is
 above a level. Five numbers say how much: stiffness, scale, blur, crosstalk, and what the image remembers of earlier
-places (`moments.PadMemory`). The level and the pitch are those of the device.
+places (`creep.PadMemory`). The level and the pitch are those of the device.
 
 The blurred patch has no closed form: the pressure is taken on a grid of thirds of a pitch over one quadrant, in the
 principal axes, and blurred by a folded Gaussian matrix. Stops being true where taxels saturate, where the patch is no
@@ -17,15 +17,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from canprobe.mechanics.touch.linear_algebra import Array, positive, read_only
-from canprobe.mechanics.touch.pad import COUNTS_MAX, Pad
-from canprobe.mechanics.touch.patch.array_calibration import ArrayCalibration, ImageParameters, MomentErrors
-from canprobe.mechanics.touch.patch.image import PatchCalibration
-from canprobe.mechanics.touch.patch.moments import LEVEL_COUNTS, Moments
+from canprobe.mechanics.touch.pad import COUNTS_MAX
+from canprobe.mechanics.touch.patch.array_calibration import ImageParameters, MomentErrors
+from canprobe.mechanics.touch.patch.moments import Moments
 
 STEPS = 3
 """Grid points in a pitch: with more of them a moment changes by 0.1 %."""
@@ -39,11 +38,8 @@ TAPER = 0.1
 """How far beyond these limits a patch still counts, as a share of the limit."""
 USUAL_LIGHTNESS = 0.05
 """Level over peak pressure at which the floor holds; it grows in proportion, as light touches cover few taxels."""
-GAIN_FORCES_N = (0.5, 1.0, 2.0, 4.0)
 GAIN_LIGHTNESS = 0.25
-GAIN_CURVATURES = ((0.0, 0.0), (0.8, 0.8), (1.6, 1.6), (1.2, 0.0), (0.6, -0.5))
-"""Forces, level over peak pressure, and principal curvatures (over that of the probe) between which the force gains
-hold: plane, balls, cylinder, saddle."""
+"""Level over peak pressure from which on the forces of `force_gains` are made larger."""
 _STEP = 1e-3
 """Relative step of the difference quotients, of the curvature relative to the probe and of the force."""
 _ROOT = math.sqrt(2.0)
@@ -286,34 +282,3 @@ def _in_axes(v1: float, v2: float, axes: tuple[float, float]) -> Moments:
     """xx, xy, yy of a tensor with principal values v1, v2, the direction of the first given by cosine and sine."""
     c, s = axes
     return c * c * v1 + s * s * v2, c * s * (v1 - v2), s * s * v1 + c * c * v2
-
-
-# From a calibration to the models of its array.
-
-
-def make_patch_calibration(calibration: ArrayCalibration, pad: Pad) -> PatchCalibration:
-    """From counts to force, for an array of these taxels; without a sphere or a grid the force is that of the pressure.
-
-    At another full scale than that of the calibration level, threshold and noise are the same counts of another
-    pressure, and layer, blur, crosstalk and scale stay.
-    """
-    if pad.is_flat or not pad.is_grid:
-        return PatchCalibration(pad, force_gain=1.0 / calibration.image.scale)
-    plain = PatchCalibration(pad, gains=calibration.gains)
-    gain, edge = make_image_model(calibration, plain, seen=None).force_gains(GAIN_FORCES_N, GAIN_CURVATURES)
-    return replace(plain, force_gain=gain, edge_gain=edge)
-
-
-def make_image_model(calibration: ArrayCalibration, patch: PatchCalibration, *, seen: int | None) -> ImageModel:
-    """What an array shows; `seen`: taxels along the side of the window, None for all."""
-    count, side = patch.full_scale_pa / COUNTS_MAX, max(patch.pad.shape)
-    return ImageModel(
-        calibration.image,
-        patch.radius_m,
-        patch.pitch_m,
-        level=LEVEL_COUNTS * count,
-        count=count,
-        side=side,
-        seen=side if seen is None else seen,
-        errors=calibration.moments,
-    )

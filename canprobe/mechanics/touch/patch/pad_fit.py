@@ -1,4 +1,4 @@
-"""Centroids: how they trail, how they scatter, and over which way an error lasts."""
+"""Fits how centroids trail, how they scatter, and over which way an error of theirs lasts."""
 
 from __future__ import annotations
 

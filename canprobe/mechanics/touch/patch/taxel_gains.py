@@ -1,4 +1,4 @@
-"""Taxels."""
+"""Fits the gain of each taxel to images of known touches, and finds dead taxels."""
 
 from __future__ import annotations
 

@@ -8,9 +8,9 @@ import pytest
 from canprobe.mechanics.touch.estimate.gauss_newton_step import solved_once
 from canprobe.mechanics.touch.estimate.information import InformationFilter
 from canprobe.mechanics.touch.estimate.known_curvature import curvature_covariance
-from canprobe.mechanics.touch.estimate.left_out import Expected, LeftOut
 from canprobe.mechanics.touch.estimate.noise import Correlation, Noise
 from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE
+from canprobe.mechanics.touch.estimate.omitted_terms import Expected, LeftOut
 from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.estimate.residuals import curvature_jacobian, design
 from canprobe.mechanics.touch.estimate.sandwich import Score

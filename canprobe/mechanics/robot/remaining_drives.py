@@ -1,4 +1,4 @@
-"""Moving the tool with the drives that are left: what the others would have done is shared among them."""
+"""Moving the tool with the drives that are left: they share the motion of those that are at rest."""
 
 from __future__ import annotations
 

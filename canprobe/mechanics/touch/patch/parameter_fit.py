@@ -1,4 +1,4 @@
-"""The image model's parameters."""
+"""Fits the parameters of the image model to what images show, and the errors that are left."""
 
 from __future__ import annotations
 
