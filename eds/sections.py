@@ -10,7 +10,7 @@ import codecs
 import re
 from dataclasses import dataclass, field
 
-from canprobe.fieldbus.eds.findings import Faults
+from canprobe.fieldbus.eds.findings import EdsFindings
 
 LINE_END = re.compile(r"\r\n|\n|\r")
 _INLINE_COMMENT = re.compile(r"\s;.*")
@@ -55,7 +55,7 @@ Sections = dict[str, Section]
 """By name in lower case, in the order of the file."""
 
 
-def decode(data: bytes, faults: Faults) -> str:
+def decode(data: bytes, faults: EdsFindings) -> str:
     """Text of a file in ASCII, UTF-8, UTF-16 with its mark, or else Latin-1."""
     try:
         text = data.decode("utf-16" if data.startswith(_UTF16) else "utf-8-sig")
@@ -72,7 +72,7 @@ def decode(data: bytes, faults: Faults) -> str:
     return text
 
 
-def split_sections(text: str, faults: Faults) -> Sections:
+def split_sections(text: str, faults: EdsFindings) -> Sections:
     """The sections of a text; what is neither section, key nor comment is left out with a warning."""
     sections: Sections = {}
     repeated: list[tuple[Section, Section]] = []
@@ -96,7 +96,7 @@ def split_sections(text: str, faults: Faults) -> Sections:
     return sections
 
 
-def _head(line: str, number: int, faults: Faults) -> Section:
+def _head(line: str, number: int, faults: EdsFindings) -> Section:
     name, bracket, _ = line[1:].partition("]")
     if not bracket:
         name = _INLINE_COMMENT.sub("", name)
@@ -104,7 +104,7 @@ def _head(line: str, number: int, faults: Faults) -> Section:
     return Section(name.strip(), number)
 
 
-def _add(section: Section, line: str, number: int, faults: Faults) -> None:
+def _add(section: Section, line: str, number: int, faults: EdsFindings) -> None:
     key, _, value = line.partition("=")
     value = _INLINE_COMMENT.sub("", f" {value}").strip()
     if len(value) >= 2 and value[0] == value[-1] and value[0] in "\"'":
@@ -115,7 +115,7 @@ def _add(section: Section, line: str, number: int, faults: Faults) -> None:
         faults.warn(number, section.name, item.key, f"was {first.value!r} in line {first.line} already, which counts")
 
 
-def _warn_of_repetition(first: Section, again: Section, faults: Faults) -> None:
+def _warn_of_repetition(first: Section, again: Section, faults: EdsFindings) -> None:
     old, new = ({key: item.value for key, item in section.items.items()} for section in (first, again))
     how = "the same" if old == new else "but different"
     faults.warn(again.line, again.name, "", f"is in line {first.line} already, {how}; that one counts")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from canprobe.fieldbus.eds.findings import Faults
+from canprobe.fieldbus.eds.findings import EdsFindings
 from canprobe.fieldbus.eds.numbers import parse_integer
 from canprobe.fieldbus.eds.sections import Section, Sections
 
@@ -23,7 +23,7 @@ class Source:
 
     sections: Sections
     node_id: int
-    faults: Faults
+    faults: EdsFindings
     drive: bool = False
 
     def warn(self, section: Section, key: str, text: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from canprobe.fieldbus.drive.cyclic_position import CyclicPosition
 from canprobe.fieldbus.drive.cyclic_torque import CyclicTorque
 from canprobe.fieldbus.drive.cyclic_velocity import CyclicVelocity
-from canprobe.fieldbus.drive.homing import Homing
+from canprobe.fieldbus.drive.homing import HomingMode
 from canprobe.fieldbus.drive.interpolated_position import InterpolatedPosition
 from canprobe.fieldbus.drive.mode import DriveMode, DriveParts
 from canprobe.fieldbus.drive.profile_position import ProfilePosition
@@ -13,7 +13,7 @@ from canprobe.fieldbus.drive.profile_position import ProfilePosition
 MODES: tuple[type[DriveMode], ...] = (
     DriveMode,
     ProfilePosition,
-    Homing,
+    HomingMode,
     InterpolatedPosition,
     CyclicPosition,
     CyclicVelocity,

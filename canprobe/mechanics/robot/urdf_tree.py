@@ -18,9 +18,9 @@ from xml.parsers import expat
 import numpy as np
 
 from canprobe.errors import PlanError, regular_file
-from canprobe.mechanics.robot.chain import Array
 from canprobe.mechanics.robot.denavit_hartenberg import rotation_rpy
 from canprobe.mechanics.robot.model import Body, Joint, negative_inertia
+from canprobe.mechanics.types import Floats
 
 MAX_FILE_BYTES = 64 << 20
 """Largest size of a URDF, bytes."""
@@ -40,7 +40,7 @@ class UrdfEdge:
     kind: str
     parent: str
     child: str
-    T_parent_child: Array
+    T_parent_child: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -188,17 +188,17 @@ class UrdfTree:
             raise self.wrong(edge.name, expected, f"{soft[0]:g} and {soft[1]:g}")
         return inside
 
-    def axis(self, edge: UrdfEdge) -> Array:
+    def axis(self, edge: UrdfEdge) -> Floats:
         """(3,) unit vector in the joint's frame."""
         element = edge.element.find("axis")
         axis = np.array((1.0, 0.0, 0.0) if element is None else self.three_numbers(edge.name, element, "xyz"))
         length = float(np.linalg.norm(axis))
         if length < 1e-6:
             raise self.wrong(edge.name, "an axis that is not zero", str(axis.tolist()))
-        unit: Array = axis / length
+        unit: Floats = axis / length
         return unit
 
-    def body(self, edge: UrdfEdge, path: set[str], turned: Array) -> Body | None:
+    def body(self, edge: UrdfEdge, path: set[str], turned: Floats) -> Body | None:
         """All that a joint of the path carries up to the next one, with what hangs there, in its turned frame."""
         parts = ((link, self.links[link].find("inertial"), T) for link, T in self.carried(edge.child, path, turned.T))
         found = [self._inertial(link, element, T) for link, element, T in parts if element is not None]
@@ -219,7 +219,7 @@ class UrdfTree:
         """RGB of a material, by itself or by its name; None where the file gives none."""
         return None if material is None else _colour(material) or self.colours.get(material.get("name", ""))
 
-    def carried(self, link: str, path: set[str], T: Array) -> Iterator[tuple[str, Array]]:
+    def carried(self, link: str, path: set[str], T: Floats) -> Iterator[tuple[str, Floats]]:
         """A link that stands at T in some frame, and the links that it carries up to the next joint, there too."""
         if link in self.links:
             yield link, T
@@ -227,7 +227,7 @@ class UrdfTree:
             if edge.parent == link and not (edge.name in path and edge.kind != "fixed"):
                 yield from self.carried(edge.child, path, T @ edge.T_parent_child)
 
-    def _inertial(self, link: str, element: ElementTree.Element, T: Array) -> Body:
+    def _inertial(self, link: str, element: ElementTree.Element, T: Floats) -> Body:
         mass, inertia = element.find("mass"), element.find("inertia")
         if mass is None or inertia is None:
             raise self.wrong(f"link {link}", "<mass> and <inertia> in its <inertial>", "one of them is missing")
@@ -238,7 +238,7 @@ class UrdfTree:
             raise self.wrong(f"link {link}", "a value in <mass> that is not negative", f"{body.mass:g}")
         return body.moved(T @ self.origin(f"link {link}", element.find("origin")))
 
-    def origin(self, name: str, element: ElementTree.Element | None) -> Array:
+    def origin(self, name: str, element: ElementTree.Element | None) -> Floats:
         """(4, 4) transform of an <origin>: roll, pitch and yaw about fixed axes, then the translation."""
         T = np.eye(4)
         if element is None:
@@ -311,7 +311,7 @@ def _colour(material: ElementTree.Element) -> tuple[int, int, int] | None:
     return red, green, blue
 
 
-def z_along(axis: Array) -> Array:
+def z_along(axis: Floats) -> Floats:
     """(4, 4) rotation that turns z into a unit vector by a short way; one that points down is turned over before."""
     T = np.eye(4)
     over = np.diag((1.0, -1.0, -1.0)) if axis[2] < 0.0 else np.eye(3)

@@ -17,8 +17,8 @@ from xml.sax.saxutils import unescape
 import numpy as np
 
 from canprobe.errors import regular_file
-from canprobe.mechanics.robot.chain import Array
 from canprobe.mechanics.robot.urdf_tree import MAX_FILE_BYTES, UrdfTree, z_along
+from canprobe.mechanics.types import Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,7 +36,7 @@ class Visual:
     """
 
     joint: int
-    T: Array
+    T: Floats
     kind: str
     size: tuple[float, ...]
     mesh: str
@@ -63,7 +63,7 @@ def visuals_of(source: str | Path, base: str | None = None, tip: str | None = No
     return found
 
 
-def _visuals(tree: UrdfTree, joint: int, link: str, path: set[str], T: Array) -> Iterator[Visual]:
+def _visuals(tree: UrdfTree, joint: int, link: str, path: set[str], T: Floats) -> Iterator[Visual]:
     """Solids of a link and of what it carries, seen from the frame in which the link stands at T."""
     for name, there in tree.carried(link, path, T):
         for element in tree.links[name].iterfind("visual"):

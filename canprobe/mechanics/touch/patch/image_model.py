@@ -21,10 +21,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from canprobe.mechanics.touch.linear_algebra import Array, positive, read_only
+from canprobe.mechanics.touch.linear_algebra import positive, read_only
 from canprobe.mechanics.touch.pad import COUNTS_MAX
 from canprobe.mechanics.touch.patch.array_calibration import ImageParameters, MomentErrors
 from canprobe.mechanics.touch.patch.moments import Moments
+from canprobe.mechanics.types import Floats
 
 STEPS = 3
 """Grid points in a pitch: with more of them a moment changes by 0.1 %."""
@@ -71,10 +72,10 @@ class ImageModel:
     side: int
     seen: int
     errors: MomentErrors
-    _squares: Array = field(init=False, repr=False)
-    _blur: Array = field(init=False, repr=False)
-    _turned_blur: Array = field(init=False, repr=False)
-    _moments: Array = field(init=False, repr=False)
+    _squares: Floats = field(init=False, repr=False)
+    _blur: Floats = field(init=False, repr=False)
+    _turned_blur: Floats = field(init=False, repr=False)
+    _moments: Floats = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         for name in ("radius", "pitch", "level"):
@@ -120,7 +121,7 @@ class ImageModel:
         """Indentation, m, under a force, N, with det A, 1/m²."""
         return math.sqrt(2.0 * force * math.sqrt(det) / (math.pi * self.parameters.stiffness))
 
-    def shown(self, depth: Array, a: Array, b: Array) -> Array:
+    def shown(self, depth: Floats, a: Floats, b: Floats) -> Floats:
         """Pressure that is shown in a quadrant of the patch.
 
         Args:
@@ -136,10 +137,10 @@ class ImageModel:
         fall, drop = per_square * a, per_square * b
         field = (peak[:, None] - fall[:, None] * self._squares)[:, :, None] - (drop[:, None] * self._squares)[:, None]
         np.maximum(field, 0.0, out=field)
-        shown: Array = self._blur @ field @ self._turned_blur
+        shown: Floats = self._blur @ field @ self._turned_blur
         return shown
 
-    def moments_of(self, shown: Array) -> list[tuple[float, float]]:
+    def moments_of(self, shown: Floats) -> list[tuple[float, float]]:
         """Second moments above the level along both axes, m², of each of the n that `shown` gives.
 
         Raises:
@@ -152,13 +153,13 @@ class ImageModel:
             raise ValueError("no patch: nothing above the level")
         return [(square * xx / total, square * yy / total) for total, xx, yy in sums]
 
-    def sum_of(self, shown: Array) -> Array:
+    def sum_of(self, shown: Floats) -> Floats:
         """(n,) pressure times area of the taxels at or above the level, N, of what `shown` gives.
 
         Noise lets some taxels below it through and cuts some above it: the edge is one count wide.
         """
         share = np.clip((shown - self.level) / self.count + 1.0, 0.0, 1.0)
-        sums: Array = (shown * share).sum(axis=(1, 2)) * (2.0 * self.pitch / STEPS) ** 2
+        sums: Floats = (shown * share).sum(axis=(1, 2)) * (2.0 * self.pitch / STEPS) ** 2
         return sums
 
     def moments(self, k: Moments, force: float) -> Moments:
@@ -232,7 +233,7 @@ class ImageModel:
         depth = self.depth(force, root_det * root_det)
         return depth / (3.0 * x) - 1.0 / self.radius, 0.0, depth / (3.0 * y) - 1.0 / self.radius
 
-    def linearised(self, v: Moments, force: float, frames: float, k: Moments) -> tuple[Array, Array, Array]:
+    def linearised(self, v: Moments, force: float, frames: float, k: Moments) -> tuple[Floats, Floats, Floats]:
         """Relative residual at K, its Jacobian, and the information of the residual.
 
         Args:
@@ -269,7 +270,7 @@ class ImageModel:
         residual = np.array([weight * (m - m0) for weight, m, m0 in zip(scale, v, here, strict=True)])
         return np.array(rows), residual, self._information(frames, self._lightness(depth))
 
-    def _information(self, frames: float, lightness: float) -> Array:
+    def _information(self, frames: float, lightness: float) -> Floats:
         """(3, 3) inverse covariance of the relative residuals of V11, V12, V22."""
         e = self.errors
         noise, more = e.frame_sigma**2 / max(frames, 1.0), lightness / USUAL_LIGHTNESS
