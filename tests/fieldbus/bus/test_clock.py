@@ -32,7 +32,7 @@ def test_virtual_time_stands_still_and_jumps() -> None:
 @pytest.mark.parametrize("native", [True, False])
 def test_monotonic_sleep_never_ends_early(native: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if not native:  # a C library without clock_nanosleep
-        monkeypatch.setattr("canprobe.fieldbus.bus.port.ctypes.CDLL", lambda _: object())
+        monkeypatch.setattr("canprobe.fieldbus.bus.clock.ctypes.CDLL", lambda _: object())
     clock = MonotonicClock()
     for ahead_ns in (-5, 0, 1, 300_000):
         target_ns = time.monotonic_ns() + ahead_ns
@@ -76,7 +76,7 @@ def test_a_time_that_is_past_asks_nothing_of_the_kernel(monkeypatch: pytest.Monk
         def clock_nanosleep(self, *request: object) -> int:
             return asked.append(request) or 0  # type: ignore[func-returns-value]
 
-    monkeypatch.setattr("canprobe.fieldbus.bus.port.ctypes.CDLL", lambda _: Library())
+    monkeypatch.setattr("canprobe.fieldbus.bus.clock.ctypes.CDLL", lambda _: Library())
     clock = MonotonicClock()
     clock.sleep_until_ns(clock.now_ns())
     assert not asked
@@ -251,7 +251,7 @@ def test_a_step_tears_no_image_of_an_array_that_runs_on_its_own_time(ms: float, 
                 machine.arrive(can_id, data)
             machine.go_on_to(read_ns)
             images += [one for frame in port.drain() if (one := assembler.push(*frame)) is not None]
-        assert assembler.torn == 0 and [int(one.counts.max()) for one in images] == list(range(20))
+        assert assembler.torn == 0 and [max(one.counts) for one in images] == list(range(20))
         if abs(ms) >= 1:
             assert [one.t_ns for one in images] == [10 * MS + 4 * MS * n for n in range(20)]
 

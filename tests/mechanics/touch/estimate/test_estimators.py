@@ -88,11 +88,13 @@ def test_transport_is_the_congruence_and_its_derivative():
     T[:3, :3], _ = np.linalg.qr(np.eye(3) + 0.1 * rng.normal(size=(3, 3)))
     T[:3, :3] *= np.sign(np.diag(T[:3, :3]))
     T[:3, 3] = 0.1 * rng.normal(size=3)
-    new, M = quadric.transport(c, T)
+    new, M = residuals.transport(c, T)
     S = T.T @ quadric.matrix_of(c) @ T
     assert np.allclose(quadric.matrix_of(new), S * (-0.5 / S[2, 3]))
     h = 1e-6
-    numeric = [(quadric.transport(c + h * e, T)[0] - quadric.transport(c - h * e, T)[0]) / (2 * h) for e in np.eye(9)]
+    numeric = [
+        (residuals.transport(c + h * e, T)[0] - residuals.transport(c - h * e, T)[0]) / (2 * h) for e in np.eye(9)
+    ]
     assert np.allclose(M, np.transpose(numeric), atol=1e-8)
 
 

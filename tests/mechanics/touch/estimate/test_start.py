@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from canprobe.mechanics.touch.contact import ContactSample
-from canprobe.mechanics.touch.estimate import start as one_step
+from canprobe.mechanics.touch.estimate import gauss_newton_step as one_step
 from canprobe.mechanics.touch.estimate.fit import make_estimator
 from canprobe.mechanics.touch.estimate.information import MeasuredContact, batch_design
 from canprobe.mechanics.touch.estimate.nonlinear import fit
