@@ -34,7 +34,7 @@ from canprobe.cell.scene.load import MOST_BYTES
 from canprobe.errors import UsageError, regular_file
 from canprobe.fieldbus.bus.files import whole_file, write_text
 from canprobe.fieldbus.eds.device_info import commissioned_node
-from canprobe.fieldbus.eds.findings import Faults
+from canprobe.fieldbus.eds.findings import EdsFindings
 from canprobe.fieldbus.eds.packaged import eds_file
 from canprobe.fieldbus.eds.sections import decode, split_sections
 from canprobe.lab.bridge.database import need
@@ -291,7 +291,7 @@ def _read_node(path: Path, name: str, keys: Mapping[str, Any], options: Mapping[
         raise UsageError(f"{path}: {name}: {key}: no file {dcf} beside the bus.yml, nor in its dcf_path")
     stated = keys.get("node_id")
     if stated is None:  # that of the DCF
-        stated = commissioned_node(split_sections(decode(eds.read_bytes(), Faults()), Faults()))
+        stated = commissioned_node(split_sections(decode(eds.read_bytes(), EdsFindings()), EdsFindings()))
     node_id = _integer(path, name, stated)
     if not 1 <= node_id <= 127:
         raise UsageError(f"{path}: {name}: node_id: expected 1 to 127, got {node_id}")

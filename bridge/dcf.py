@@ -14,7 +14,7 @@ from canprobe.cell.planning.model import (
     Plan,
 )
 from canprobe.fieldbus.bus.files import write_text
-from canprobe.fieldbus.eds.findings import Faults
+from canprobe.fieldbus.eds.findings import EdsFindings
 from canprobe.fieldbus.eds.packaged import eds_file
 from canprobe.fieldbus.eds.sections import LINE_END, Section, Sections, decode, split_sections
 
@@ -56,7 +56,7 @@ def _dcf_of(plan: Plan, setup: NodeSetup, name: str) -> str:
         "CANopenManager": "0",
     }
     keys = {"fileinfo": {"FileName": name, "LastEDS": source.name}, "devicecomissioning": commissioning}
-    return dcf_text(decode(source.read_bytes(), Faults()), final_values(setup), keys)
+    return dcf_text(decode(source.read_bytes(), EdsFindings()), final_values(setup), keys)
 
 
 def dcf_text(eds: str, values: Values, keys: Mapping[str, Mapping[str, str]]) -> str:
@@ -68,7 +68,7 @@ def dcf_text(eds: str, values: Values, keys: Mapping[str, Mapping[str, str]]) ->
         keys: other keys by section in lower case; a section that is not there is added.
     """
     lines = LINE_END.split(eds.rstrip())
-    sections = split_sections(eds, Faults())
+    sections = split_sections(eds, EdsFindings())
     wanted: dict[str, dict[str, str]] = {name: dict(items) for name, items in keys.items()}
     for (index, subindex), value in values.items():
         section, key = _place(sections, index, subindex)

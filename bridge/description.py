@@ -18,7 +18,7 @@ from canprobe.cell.scene.setup import Probe
 from canprobe.errors import PlanError
 from canprobe.lab.bridge.sample import BASE, FLANGE, PROBE
 from canprobe.mechanics.robot.chain import Chain
-from canprobe.mechanics.robot.urdf import Visual, find_mesh, visuals_of
+from canprobe.mechanics.robot.urdf_visuals import Visual, find_mesh, visuals_of
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 
 Array = NDArray[np.float64]

@@ -18,7 +18,7 @@ from canprobe.lab.bridge.codec import Received
 from canprobe.lab.bridge.node_states import Health
 from canprobe.lab.bridge.sample import ContactFrame, Sample, SurfacePatch, TouchFrame
 from canprobe.mechanics.touch.contact import ContactSample, pad_to_direction
-from canprobe.mechanics.touch.patch.image_model import make_patch_calibration
+from canprobe.mechanics.touch.patch.array_models import make_patch_calibration
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 
 Array = NDArray[np.float64]

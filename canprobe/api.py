@@ -34,7 +34,8 @@ from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
 from canprobe.cell.tasks.task import TaskRecord, record_of
 from canprobe.errors import CanprobeError, ResultsError, UsageError
 from canprobe.fieldbus.bus.real.interrupts import interrupts_held, interrupts_repeated
-from canprobe.mechanics.robot.chain import Array, forward_jacobian
+from canprobe.mechanics.robot.chain import forward_jacobian
+from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -317,7 +318,7 @@ class OpenCell(Session):
     def _patch_from(self) -> Callable[[TactileSample], Patch] | None:
         return patch_from(self.plan.setup)
 
-    def probe(self, q: npt.ArrayLike) -> tuple[Array, Array]:
+    def probe(self, q: npt.ArrayLike) -> tuple[Floats, Floats]:
         """Where joint positions put the probe, and how it moves with them.
 
         Args:
@@ -398,7 +399,7 @@ class OpenCell(Session):
                 failure.add_note(line)
 
     def _score(
-        self, log: dict[str, Array], tactile: dict[str, npt.NDArray[Any]], failure: BaseException | None
+        self, log: dict[str, Floats], tactile: dict[str, npt.NDArray[Any]], failure: BaseException | None
     ) -> None:
         """Make the run's result of what was measured, by the plan that it ran with."""
         record, start_s, setup = record_of(self._last), self.cell.start_ns * 1e-9, self.plan.setup

@@ -1,6 +1,24 @@
-"""The EDS files of the cell's nodes, and a reader for those of any vendor.
+"""Device descriptions: a reader for EDS and DCF files of any vendor, and the packaged files of the cell's nodes.
 
-sections     bytes → sections, keys, numbers         variables   one section → one variable
-structure    variables → objects of a dictionary     reading     the whole file, mended where the standard allows
-description  what a dictionary states, typed         packaged    the files of this package, and how any file is loaded
+The bytes of a file come in; an object dictionary (canopen's) and a list of findings go out. A finding is a warning,
+where the meaning is clear or the standard decides it, or it prevents serving, where nobody can know what the device is.
+The stages, each in its module:
+
+    sections      bytes → sections and keys, each with its line
+    source        one file while it is read: its sections, and the findings so far
+    numbers       texts → numbers, sums with $NODEID, flags
+    structure     sections → objects: the order of everything below
+    data_types    the data type of a variable: as stated, as its editor defined it, or as the standard demands
+    values        default, parameter value and limits by data type
+    variables     one section → one variable
+    records       sections → arrays and records, also in the compact form
+    object_lists  the lists of objects against the objects that the file describes
+    device_info   [DeviceInfo], [Comments], [DeviceComissioning]
+    mandatory     what the standards fix about objects that a node cannot do without
+    findings      what is wrong in a file, and where
+    reading       all of it: the whole file, mended where the standard allows
+    description   what a dictionary states of its device, typed
+    packaged      the files of this package, and `load_eds` for any file
+
+Start reading at `packaged.load_eds`, then `reading`.
 """

@@ -11,7 +11,8 @@ from canopen.objectdictionary import datatypes
 
 from canprobe.fieldbus.eds.mandatory import MISSING, U8, standard_type
 from canprobe.fieldbus.eds.numbers import parse_integer
-from canprobe.fieldbus.eds.sections import Section, Source
+from canprobe.fieldbus.eds.sections import Section
+from canprobe.fieldbus.eds.source import Source
 from canprobe.fieldbus.eds.values import KNOWN, NAMES, WORDS_OF_TYPES, name_of
 
 _OBJECT_DOMAIN = 2

@@ -1,4 +1,4 @@
-"""What an EDS file states of a device, typed: one `Entry` per (index, subindex), and the features of [DeviceInfo].
+"""What an EDS file states of a device: a `DescribedEntry` per (index, subindex), and the features of [DeviceInfo].
 
 `load_eds` gives the dictionary, `Description(od)` reads it; an object or sub-index that the file does not describe is
 None. Source: CiA 306-1, "Object description", "Dummy usage", "Device information"; CiA 402-2, 6502h.
@@ -19,7 +19,7 @@ _MODES = 0x6502
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class DescribedEntry:
     """One value of the object dictionary, as the file describes it for one node.
 
     Attributes:
@@ -98,7 +98,7 @@ class Description:
 
     od: ObjectDictionary
 
-    def entry(self, index: int, subindex: int = 0) -> Entry | None:
+    def entry(self, index: int, subindex: int = 0) -> DescribedEntry | None:
         """What is described there; None where the object or the sub-index is missing."""
         found = variable_at(self.od, index, subindex)
         if found is not None:
@@ -109,7 +109,7 @@ class Description:
         first = _entry(array.subindices[1])  # the first member is described and stands for all
         return replace(first, subindex=subindex, name=f"{first.name}_{subindex:x}")
 
-    def entries(self) -> Iterator[Entry]:
+    def entries(self) -> Iterator[DescribedEntry]:
         """Everything that is described, the dummy types included."""
         for found in self.od.indices.values():
             for variable in (found,) if isinstance(found, ODVariable) else found.subindices.values():
@@ -169,9 +169,9 @@ def _array_length(array: ODArray) -> int:
     return min(count, 254) if isinstance(count, int) else 0
 
 
-def _entry(variable: ODVariable) -> Entry:
+def _entry(variable: ODVariable) -> DescribedEntry:
     data_type = variable.data_type or int(datatypes.DOMAIN)
-    return Entry(
+    return DescribedEntry(
         index=variable.index,
         subindex=variable.subindex,
         name=variable.name,

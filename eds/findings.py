@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
+class EdsFinding:
     """One thing that is wrong.
 
     Attributes:
@@ -30,19 +30,19 @@ class Fault:
 
 
 @dataclass(slots=True)
-class Faults:
-    """Collects faults while a file is read."""
+class EdsFindings:
+    """Collects findings while a file is read."""
 
-    found: list[Fault] = field(default_factory=list)
+    found: list[EdsFinding] = field(default_factory=list)
 
     def fault(self, line: int, section: str, key: str, text: str) -> None:
         """What the device would answer cannot be known."""
-        self.found.append(Fault(line, section, key, text, True))
+        self.found.append(EdsFinding(line, section, key, text, True))
 
     def warn(self, line: int, section: str, key: str, text: str) -> None:
         """Not as it should be, but the meaning is clear or the rest can be served."""
-        self.found.append(Fault(line, section, key, text, False))
+        self.found.append(EdsFinding(line, section, key, text, False))
 
-    def sorted(self) -> tuple[Fault, ...]:
+    def sorted(self) -> tuple[EdsFinding, ...]:
         """By line."""
         return tuple(sorted(self.found, key=lambda fault: fault.line))

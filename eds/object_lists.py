@@ -8,7 +8,8 @@ from __future__ import annotations
 import re
 
 from canprobe.fieldbus.eds.numbers import parse_integer
-from canprobe.fieldbus.eds.sections import Section, Source
+from canprobe.fieldbus.eds.sections import Section
+from canprobe.fieldbus.eds.source import Source
 
 _LISTS = {
     "MandatoryObjects": (range(0x1000, 0x1002), range(0x1018, 0x1019)),

@@ -19,10 +19,11 @@ from canopen.objectdictionary import ObjectDictionary, ODRecord, ODVariable, dat
 from canprobe.errors import EdsError
 from canprobe.fieldbus.eds.description import variable_at
 from canprobe.fieldbus.eds.device_info import commissioned_node, read_information
-from canprobe.fieldbus.eds.findings import Fault, Faults
+from canprobe.fieldbus.eds.findings import EdsFinding, EdsFindings
 from canprobe.fieldbus.eds.numbers import parse_sum
 from canprobe.fieldbus.eds.object_lists import check_lists
-from canprobe.fieldbus.eds.sections import Section, Source, decode, split_sections
+from canprobe.fieldbus.eds.sections import Section, decode, split_sections
+from canprobe.fieldbus.eds.source import Source
 from canprobe.fieldbus.eds.structure import build_objects, find_objects
 
 _INVALID = 1 << 31
@@ -58,15 +59,15 @@ class Reading:
 
     path: Path
     dictionary: ObjectDictionary
-    found: tuple[Fault, ...]
+    found: tuple[EdsFinding, ...]
 
     @property
-    def faults(self) -> tuple[Fault, ...]:
+    def faults(self) -> tuple[EdsFinding, ...]:
         """What prevents serving."""
         return tuple(fault for fault in self.found if fault.prevents)
 
     @property
-    def warnings(self) -> tuple[Fault, ...]:
+    def warnings(self) -> tuple[EdsFinding, ...]:
         """What was put right, or left out."""
         return tuple(fault for fault in self.found if not fault.prevents)
 
@@ -102,7 +103,7 @@ def read_eds(path: Path, node_id: int | None, *, serving: bool = True) -> Readin
         data = path.read_bytes()
     except OSError as error:
         raise EdsError(f"{path}: {error.strerror}") from error
-    faults, od = Faults(), ObjectDictionary()  # type: ignore[no-untyped-call]
+    faults, od = EdsFindings(), ObjectDictionary()  # type: ignore[no-untyped-call]
     sections = split_sections(decode(data, faults), faults)
     source = Source(sections, commissioned_node(sections) or 1 if node_id is None else node_id, faults)
     read_information(source, od)

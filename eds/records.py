@@ -10,7 +10,8 @@ import copy
 from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 
 from canprobe.fieldbus.eds.mandatory import COUNTING, is_variable
-from canprobe.fieldbus.eds.sections import Section, Source
+from canprobe.fieldbus.eds.sections import Section
+from canprobe.fieldbus.eds.source import Source
 from canprobe.fieldbus.eds.variables import build_variable, set_value
 
 ARRAY, RECORD = 8, 9

@@ -1,20 +1,16 @@
-"""Bytes of an EDS file → its sections, keys and numbers, each with its line, and what is wrong with them.
+"""Bytes of an EDS file → its sections and keys, each with its line, and what is wrong with them.
 
-Read as Windows reads an INI file, which is what vendors' tools do: names in any case, the first of two counts.
-Source: CiA 306-1, "General structure".
+They are read as Windows reads an INI file, which is what vendors' tools do: names count in any case, and of two equal
+names the first one counts. Source: CiA 306-1, "General structure".
 """
 
 from __future__ import annotations
 
 import codecs
 import re
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from canprobe.fieldbus.eds.findings import Faults
-from canprobe.fieldbus.eds.numbers import parse_integer
-
-# The text of a file → its sections.
+from canprobe.fieldbus.eds.findings import EdsFindings
 
 LINE_END = re.compile(r"\r\n|\n|\r")
 _INLINE_COMMENT = re.compile(r"\s;.*")
@@ -59,7 +55,7 @@ Sections = dict[str, Section]
 """By name in lower case, in the order of the file."""
 
 
-def decode(data: bytes, faults: Faults) -> str:
+def decode(data: bytes, faults: EdsFindings) -> str:
     """Text of a file in ASCII, UTF-8, UTF-16 with its mark, or else Latin-1."""
     try:
         text = data.decode("utf-16" if data.startswith(_UTF16) else "utf-8-sig")
@@ -76,7 +72,7 @@ def decode(data: bytes, faults: Faults) -> str:
     return text
 
 
-def split_sections(text: str, faults: Faults) -> Sections:
+def split_sections(text: str, faults: EdsFindings) -> Sections:
     """The sections of a text; what is neither section, key nor comment is left out with a warning."""
     sections: Sections = {}
     repeated: list[tuple[Section, Section]] = []
@@ -100,7 +96,7 @@ def split_sections(text: str, faults: Faults) -> Sections:
     return sections
 
 
-def _head(line: str, number: int, faults: Faults) -> Section:
+def _head(line: str, number: int, faults: EdsFindings) -> Section:
     name, bracket, _ = line[1:].partition("]")
     if not bracket:
         name = _INLINE_COMMENT.sub("", name)
@@ -108,7 +104,7 @@ def _head(line: str, number: int, faults: Faults) -> Section:
     return Section(name.strip(), number)
 
 
-def _add(section: Section, line: str, number: int, faults: Faults) -> None:
+def _add(section: Section, line: str, number: int, faults: EdsFindings) -> None:
     key, _, value = line.partition("=")
     value = _INLINE_COMMENT.sub("", f" {value}").strip()
     if len(value) >= 2 and value[0] == value[-1] and value[0] in "\"'":
@@ -119,50 +115,7 @@ def _add(section: Section, line: str, number: int, faults: Faults) -> None:
         faults.warn(number, section.name, item.key, f"was {first.value!r} in line {first.line} already, which counts")
 
 
-def _warn_of_repetition(first: Section, again: Section, faults: Faults) -> None:
+def _warn_of_repetition(first: Section, again: Section, faults: EdsFindings) -> None:
     old, new = ({key: item.value for key, item in section.items.items()} for section in (first, again))
     how = "the same" if old == new else "but different"
     faults.warn(again.line, again.name, "", f"is in line {first.line} already, {how}; that one counts")
-
-
-# What the builders of a dictionary share.
-
-
-@dataclass(frozen=True, slots=True)
-class Source:
-    """An EDS file in pieces.
-
-    Attributes:
-        sections: of the file.
-        node_id: for $NODEID.
-        faults: collects what is wrong.
-        drive: the device is a drive of CiA 402.
-    """
-
-    sections: Sections
-    node_id: int
-    faults: Faults
-    drive: bool = False
-
-    def warn(self, section: Section, key: str, text: str) -> None:
-        """A warning at a key, or at its section where the key is missing."""
-        self.faults.warn(section.line_of(key), section.name, key, text)
-
-    def fault(self, section: Section, key: str, text: str) -> None:
-        """A fault at a key, or at its section where the key is missing."""
-        self.faults.fault(section.line_of(key), section.name, key, text)
-
-    def remark(self, section: Section, key: str) -> Callable[[str], None]:
-        """What a parser calls with what is odd about a value."""
-        return lambda text: self.warn(section, key, text)
-
-    def number(self, section: Section, key: str, default: int = 0) -> int:
-        """An integer that does no harm when it is wrong; `default` where it is missing, empty or none."""
-        text = section.value(key)
-        if not text:
-            return default
-        try:
-            return parse_integer(text, self.remark(section, key))
-        except ValueError as error:
-            self.warn(section, key, f"{error}; read as {default}")
-            return default

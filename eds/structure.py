@@ -11,7 +11,8 @@ from canopen.objectdictionary import ObjectDictionary, ODArray, ODRecord, ODVari
 
 from canprobe.fieldbus.eds.numbers import parse_integer
 from canprobe.fieldbus.eds.records import ARRAY, RECORD, Subs, build_composite
-from canprobe.fieldbus.eds.sections import Section, Source
+from canprobe.fieldbus.eds.sections import Section
+from canprobe.fieldbus.eds.source import Source
 from canprobe.fieldbus.eds.variables import build_variable
 
 _OBJECT = re.compile(r"(?:0x)?([0-9a-f]{4})")

@@ -12,7 +12,8 @@ from canopen.objectdictionary import ODVariable, datatypes
 from canprobe.fieldbus.eds.data_types import data_type_of
 from canprobe.fieldbus.eds.mandatory import CHOICES, decides, standard_access
 from canprobe.fieldbus.eds.numbers import parse_flag, parse_sum
-from canprobe.fieldbus.eds.sections import Section, Source
+from canprobe.fieldbus.eds.sections import Section
+from canprobe.fieldbus.eds.source import Source
 from canprobe.fieldbus.eds.values import TEXTS, convert, convert_limit, name_of
 
 _ACCESS = frozenset({"ro", "wo", "rw", "rwr", "rww", "const"})

@@ -1,7 +1,7 @@
 """The wings and rooms of the package: who may import whom, read from the source; no circles.
 
     fieldbus   protocol < eds < bus < node < drive; vcan          neither numpy nor scipy
-    mechanics  robot < touch
+    mechanics  types < robot < touch
     cell       scene < planning < master < tasks | plant < emulated, then session < results < recorded
     lab        bridge, studies, gym, examples
 
@@ -24,7 +24,7 @@ MODULES = {PACKAGE / name: Path(name) for name in sorted(FILES)}
 
 WINGS = {
     "fieldbus": ("protocol", "eds", "bus", "node", "drive", "vcan"),
-    "mechanics": ("robot", "touch"),
+    "mechanics": ("types", "robot", "touch"),
     "cell": ("npz", "scene", "planning", "master", "tasks", "plant", "emulated", "session", "results", "recorded"),
     "lab": ("bridge", "studies", "gym", "examples"),
 }
@@ -32,7 +32,7 @@ WING_OF = {room: wing for wing, rooms in WINGS.items() for room in rooms} | {win
 
 # room → rooms of this package that it may import, besides itself, the doors of their wings and errors
 BUS = {"protocol", "eds", "bus"}
-MECHANICS = {"robot", "touch"}
+MECHANICS = {"types", "robot", "touch"}
 SCENE = {"protocol", "eds", "node", *MECHANICS, "scene"}
 PLANNING = SCENE | {"planning", "bus"}
 MASTER = PLANNING | {"master", "tasks", "npz"}
@@ -46,8 +46,9 @@ ALLOWED = {
     "node": BUS,
     "drive": BUS | {"node"},
     "vcan": {"bus"},
-    "robot": set(),
-    "touch": {"robot"},
+    "types": set(),
+    "robot": {"types"},
+    "touch": {"types", "robot"},
     "npz": {"bus"},
     "scene": SCENE,
     "planning": PLANNING,
@@ -105,7 +106,7 @@ NEVER_IN_PURE = EDGE_ONLY | {
     "ctypes",
     "datetime",
 }
-PURE_LAYERS = {"protocol", "robot", "touch", "plant"}
+PURE_LAYERS = {"protocol", "types", "robot", "touch", "plant"}
 
 
 def layer_of(parts):

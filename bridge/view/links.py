@@ -20,7 +20,7 @@ from canprobe.lab.bridge.database import need
 from canprobe.lab.bridge.view.bodies import WHITE, Part, arm_parts
 from canprobe.lab.bridge.view.meshes import Array, Mesh
 from canprobe.mechanics.robot.chain import Chain
-from canprobe.mechanics.robot.urdf import Visual, find_mesh, visuals_of
+from canprobe.mechanics.robot.urdf_visuals import Visual, find_mesh, visuals_of
 
 _NAMED = 3
 """Missing meshes that a line names."""

@@ -11,7 +11,7 @@ from canprobe.cli.output import print_json
 from canprobe.cli.parser import Parser
 
 if TYPE_CHECKING:
-    from canprobe.fieldbus.eds.findings import Fault
+    from canprobe.fieldbus.eds.findings import EdsFinding
     from canprobe.fieldbus.eds.reading import Reading
 
 HELP = "list, locate or check EDS files"
@@ -112,7 +112,7 @@ def _document(reading: Reading) -> dict[str, object]:
     }
 
 
-def _row(fault: Fault) -> dict[str, object]:
+def _row(fault: EdsFinding) -> dict[str, object]:
     return {
         "line": fault.line or None,
         "section": fault.section or None,

@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     """Write cell.toml and first.toml, with the files that they name."""
     from canprobe.cell.scene.load import written_by_line
     from canprobe.fieldbus.bus.files import write_text, writing
-    from canprobe.mechanics.robot.urdf import with_meshes_found
+    from canprobe.mechanics.robot.urdf_visuals import with_meshes_found
 
     folder: Path = args.folder
     for name in ("cell.toml", "first.toml"):

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from canprobe.fieldbus.bus.candump import CandumpWriter, read_candump
     from canprobe.fieldbus.bus.canopen_network import PortNetwork
     from canprobe.fieldbus.bus.clock import MonotonicClock, VirtualClock
-    from canprobe.fieldbus.bus.real.python_can import open_port
+    from canprobe.fieldbus.bus.real.opening import open_port
     from canprobe.fieldbus.bus.real.socketcan import SocketCanPort
     from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
     from canprobe.fieldbus.bus.virtual.timed import TimedBus
@@ -56,7 +56,7 @@ _MODULES = {
     "check_eds": "eds.packaged",
     "load_eds": "eds.packaged",
     "make_eds_node": "drive.from_eds",
-    "open_port": "bus.real.python_can",
+    "open_port": "bus.real.opening",
     "read_candump": "bus.candump",
     "serve": "node.serve",
 }

@@ -21,7 +21,7 @@ DRIVE = "0xca5e:0x260:0x10000"
 def bus(monkeypatch):
     """A bus that every command of the test opens."""
     bus = LockstepBus(VirtualClock())
-    monkeypatch.setattr("canprobe.fieldbus.bus.real.python_can.open_port", lambda *_, **__: bus.port())
+    monkeypatch.setattr("canprobe.fieldbus.bus.real.opening.open_port", lambda *_, **__: bus.port())
     return bus
 
 

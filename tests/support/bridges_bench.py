@@ -32,7 +32,7 @@ from canprobe.cell.session.children import Bridges
 from canprobe.cell.session.session import Session, with_bridges
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.fieldbus.bus.clock import MonotonicClock
-from canprobe.fieldbus.bus.real.processor import garbage_collection_paused
+from canprobe.fieldbus.bus.real.memory import garbage_collection_paused
 from canprobe.lab.studies.harness import Column, Row, StudyResult
 from canprobe.lab.studies.result_files import as_document, measuring_facts, text_of
 

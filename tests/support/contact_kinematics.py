@@ -7,49 +7,49 @@ import math
 import numpy as np
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.linear_algebra import Array
 from canprobe.mechanics.touch.tangent_frames import homogeneous, inverse_transform, tangent_rotation
+from canprobe.mechanics.types import Floats
 
 
-def probe_contact_frame(direction: Array, radius: float) -> Array:
+def probe_contact_frame(direction: Floats, radius: float) -> Floats:
     """T (4, 4) from the probe's contact frame (z = inward normal of the probe) to the probe frame."""
     return homogeneous(tangent_rotation(-direction), radius * direction)
 
 
-def point_in_object(T_base_object: Array, p_base: Array) -> Array:
+def point_in_object(T_base_object: Floats, p_base: Floats) -> Floats:
     """The contact point in the object's frame (21), (22)."""
     T = inverse_transform(T_base_object)
-    result: Array = T[:3, :3] @ p_base + T[:3, 3]
+    result: Floats = T[:3, :3] @ p_base + T[:3, 3]
     return result
 
 
 def contact_orientation_in_object(
-    T_base_object: Array, T_base_probe: Array, T_probe_cf: Array, R_cf_co: Array
-) -> Array:
+    T_base_object: Floats, T_base_probe: Floats, T_probe_cf: Floats, R_cf_co: Floats
+) -> Floats:
     """Axes of the object's contact frame in the object's frame, `R_o_c = R_bᵀ R_s R_cf R_cf_co` (23)."""
-    result: Array = T_base_object[:3, :3].T @ T_base_probe[:3, :3] @ T_probe_cf[:3, :3] @ R_cf_co
+    result: Floats = T_base_object[:3, :3].T @ T_base_probe[:3, :3] @ T_probe_cf[:3, :3] @ R_cf_co
     return result
 
 
-def facing_rotation(spin: float = 0.0) -> Array:
+def facing_rotation(spin: float = 0.0) -> Floats:
     """R (3, 3) from the object's to the probe's contact frame: z opposed, x turned by `spin` rad."""
     c, s = math.cos(spin), math.sin(spin)
     return np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])
 
 
-def material_velocity(origin: Array, origin_velocity: Array, omega: Array, point: Array) -> Array:
+def material_velocity(origin: Floats, origin_velocity: Floats, omega: Floats, point: Floats) -> Floats:
     """V: velocity of the point of a rigid body that is now at `point`."""
     return origin_velocity + np.cross(omega, point - origin)
 
 
-def velocity_over_object(v_f: Array, V_f: Array, V_o: Array) -> Array:
+def velocity_over_object(v_f: Floats, V_f: Floats, V_o: Floats) -> Floats:
     """v_o = v_f + V_f − V_o (17)–(19): how the contact point moves over the object."""
     return v_f + V_f - V_o
 
 
 def normal_rate_residual(  # noqa: PLR0917 - the equation's own symbols in its order
-    K_o: Array, v_o: Array, K_f: Array, v_f: Array, omega_f: Array, omega_o: Array, n_o: Array
-) -> Array:
+    K_o: Floats, v_o: Floats, K_f: Floats, v_f: Floats, omega_f: Floats, omega_o: Floats, n_o: Floats
+) -> Floats:
     """`K_o v_o + K_f v_f − (ω_f − ω_o) × n_o` (16): zero in a motion that keeps contact.
 
     Args:
@@ -58,11 +58,13 @@ def normal_rate_residual(  # noqa: PLR0917 - the equation's own symbols in its o
         omega_f, omega_o: (3,) rad/s.
         n_o: (3,) outward unit normal of the object.
     """
-    result: Array = K_o @ v_o + K_f @ v_f - np.cross(omega_f - omega_o, n_o)
+    result: Floats = K_o @ v_o + K_f @ v_f - np.cross(omega_f - omega_o, n_o)
     return result
 
 
-def contact_velocities(K_o: Array, K_f: Array, V_rel: Array, omega_rel: Array, n_o: Array) -> tuple[Array, Array]:
+def contact_velocities(
+    K_o: Floats, K_f: Floats, V_rel: Floats, omega_rel: Floats, n_o: Floats
+) -> tuple[Floats, Floats]:
     """How the contact moves over both bodies when the motion is given: (16) and (19) solved together.
 
     Args:
@@ -86,12 +88,12 @@ def contact_velocities(K_o: Array, K_f: Array, V_rel: Array, omega_rel: Array, n
     return v_f + slide, v_f
 
 
-def sphere_tensor(radius: float, normal: Array) -> Array:
+def sphere_tensor(radius: float, normal: Floats) -> Floats:
     """Shape operator (3, 3) of a sphere at the point with this unit normal, 1/m."""
     return (np.eye(3) - np.outer(normal, normal)) / radius
 
 
-def skew(w: Array) -> Array:
+def skew(w: Floats) -> Floats:
     """The (3, 3) matrix of `w ×`."""
     x, y, z = float(w[0]), float(w[1]), float(w[2])
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

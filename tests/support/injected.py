@@ -16,7 +16,7 @@ from canprobe.cell.tasks.probing import Phase
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.port import ControllerState
 from canprobe.fieldbus.node.fault import Fault
-from canprobe.fieldbus.node.faults import FaultyNode
+from canprobe.fieldbus.node.faulty_node import FaultyNode
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
 
 LONG_NS = 10_000_000_000

@@ -16,7 +16,7 @@ from canprobe.errors import InterfaceError
 from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.port import Reports
 from canprobe.fieldbus.bus.real.link import LinkState, read_link, setting_line
-from canprobe.fieldbus.bus.real.python_can import open_port
+from canprobe.fieldbus.bus.real.opening import open_port
 from canprobe.fieldbus.bus.real.socketcan import SocketCanPort
 
 pytestmark = pytest.mark.vcan

@@ -27,8 +27,9 @@ from canprobe.fieldbus.eds.packaged import FULL_SCALE, has_full_scale, load_eds
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol.frames import SYNC_ID, Frame
 from canprobe.fieldbus.protocol.lss import UNCONFIGURED
-from canprobe.mechanics.robot.chain import Array, Chain, forward
+from canprobe.mechanics.robot.chain import Chain, forward
 from canprobe.mechanics.touch.pad import Pad
+from canprobe.mechanics.types import Floats
 
 
 class TruthRecorder(Participant):
@@ -202,13 +203,13 @@ def _plant_config(setup: Setup) -> PlantConfig:
     )
 
 
-def _base_offset(believed: Chain, real: Chain, q: Array, T_flange_probe: Array) -> Array:
+def _base_offset(believed: Chain, real: Chain, q: Floats, T_flange_probe: Floats) -> Floats:
     """Where the real arm's base stands in the controller's base frame, (3,), m.
 
     An experimenter moves the arm to the object and takes that place for what the encoders show: both arms hold the
     probe at one place in the first posture.
     """
-    offset: Array = ((forward(believed, q) - forward(real, q)) @ T_flange_probe)[:3, 3]
+    offset: Floats = ((forward(believed, q) - forward(real, q)) @ T_flange_probe)[:3, 3]
     return offset
 
 

@@ -312,7 +312,7 @@ def patch_from(setup: Setup) -> Callable[[TactileSample], Patch] | None:
     """The patch of a sample of the setup's array; None without one."""
     if setup.array is None:
         return None
-    from canprobe.mechanics.touch.patch.image_model import make_patch_calibration
+    from canprobe.mechanics.touch.patch.array_models import make_patch_calibration
 
     calibration = make_patch_calibration(setup.array.calibration, setup.array.pad)
     return lambda sample: patch_of(sample, calibration)

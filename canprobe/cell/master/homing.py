@@ -52,8 +52,8 @@ from canprobe.fieldbus.protocol.cia402 import (
     known_state,
 )
 from canprobe.fieldbus.protocol.frames import NmtState, pack_heartbeat
-from canprobe.mechanics.robot.chain import Array
 from canprobe.mechanics.robot.model import coupled_joints, drive_position_at
+from canprobe.mechanics.types import Floats
 
 POLL_S = 0.01
 TOLERANCE = math.radians(1.0)
@@ -283,7 +283,7 @@ class Homing:
         assert zero is not None
         return zero
 
-    def _positions(self, axis: int) -> Array:
+    def _positions(self, axis: int) -> Floats:
         """(n,) positions of the drives on which the zero of one depends, drive units."""
         units = np.zeros(self._model.n)
         for other in sorted(coupled_joints(self._model, axis)):

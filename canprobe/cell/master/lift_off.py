@@ -21,7 +21,7 @@ from canprobe.errors import NodeError
 from canprobe.fieldbus.protocol.frames import NmtState
 from canprobe.mechanics.robot.chain import forward_jacobian
 from canprobe.mechanics.robot.model import ArmModel, units_to_joints
-from canprobe.mechanics.robot.without_drives import lifting_step
+from canprobe.mechanics.robot.remaining_drives import lifting_step
 
 Vector = NDArray[np.float64]
 WAY = 6e-3

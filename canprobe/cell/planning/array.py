@@ -114,7 +114,7 @@ def array_problems(setup: Setup) -> Iterator[str]:
 
 def _unreadable(array: Array) -> Iterator[str]:
     """That no force can be read from the array, because a contact falls between its taxels."""
-    from canprobe.mechanics.touch.patch.image_model import make_patch_calibration  # late, as it imports scipy
+    from canprobe.mechanics.touch.patch.array_models import make_patch_calibration
 
     try:
         make_patch_calibration(array.calibration, array.pad)

@@ -42,7 +42,7 @@ from canprobe.cell.planning.units import (
     turn_units,
 )
 from canprobe.cell.planning.wire_time import CLASSIC_BYTES
-from canprobe.fieldbus.eds.description import Description, Entry
+from canprobe.fieldbus.eds.description import DescribedEntry, Description
 from canprobe.fieldbus.eds.packaged import (
     FULL_SCALE,
     LONG_PDOS,
@@ -254,7 +254,7 @@ def _excluded(device: Abilities, write: Write) -> str | None:
     return None
 
 
-def _ends(entry: Entry) -> str:
+def _ends(entry: DescribedEntry) -> str:
     if entry.low is None:
         return f"values of {entry.bits} bits" if entry.high is None else f"at most {entry.high}"
     return f"at least {entry.low}" if entry.high is None else f"{entry.low} to {entry.high}"

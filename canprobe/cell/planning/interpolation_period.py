@@ -16,7 +16,7 @@ from canprobe.cell.planning.operation import (
     SYNC_PERIOD,
     follows_sync_period,
 )
-from canprobe.fieldbus.eds.description import Entry
+from canprobe.fieldbus.eds.description import DescribedEntry
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ def _offer(device: Abilities) -> _Offer:
     return _Offer(_values(value), tuple(number for number in indices if FINEST <= number <= COARSEST))
 
 
-def _values(entry: Entry | None) -> range:
+def _values(entry: DescribedEntry | None) -> range:
     if entry is None:
         return range(0)
     if not entry.writable:

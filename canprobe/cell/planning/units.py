@@ -20,8 +20,8 @@ import numpy as np
 from canprobe.cell.planning.abilities import Abilities
 from canprobe.cell.scene.setup import Arm, Calibrate, Drive, Setup, Touch
 from canprobe.fieldbus.protocol.si_unit import VELOCITY, rate_unit
-from canprobe.mechanics.robot.chain import Array
 from canprobe.mechanics.robot.model import ArmModel
+from canprobe.mechanics.types import Floats
 
 POSITION_LIMITS, POLARITY, RESOLUTION, GEAR_RATIO, FEED = 0x607D, 0x607E, 0x608F, 0x6091, 0x6092
 PROFILE_SPEED_LIMIT, MOTOR_SPEED_LIMIT, FOLLOWING_WINDOW = 0x607F, 0x6080, 0x6065
@@ -177,7 +177,7 @@ def motor_speed_limit(model: ArmModel, axis: int, share: float, period_ns: int) 
     return math.ceil(fastest + ROUNDING_COUNTS * 1e9 / period_ns)
 
 
-def software_limits(model: ArmModel) -> tuple[Array, Array]:
+def software_limits(model: ArmModel) -> tuple[Floats, Floats]:
     """Extremes of each drive (n,) and (n,), units, over the joints' ranges; the coupled ones span both joints'."""
     a, b, zero = model.units_per_q * model.q_min, model.units_per_q * model.q_max, model.zero_units
     return np.floor(np.minimum(a, b).sum(axis=1) + zero), np.ceil(np.maximum(a, b).sum(axis=1) + zero)

@@ -16,16 +16,16 @@ import numpy as np
 
 from canprobe.cell.plant.ideal_arm import STICTION_RATE, natural_frequency
 from canprobe.cell.scene.setup import Dynamics
-from canprobe.mechanics.robot.chain import Array
 from canprobe.mechanics.robot.model import ArmModel
+from canprobe.mechanics.types import Floats
 
 
 class Drives(NamedTuple):
     """(n,) each: velocity error, torque asked for and torque given."""
 
-    error: Array
-    asked: Array
-    given: Array
+    error: Floats
+    asked: Floats
+    given: Floats
 
 
 class DriveLoops:
@@ -50,7 +50,7 @@ class DriveLoops:
     def __init__(
         self,
         model: ArmModel,
-        inertia: Array,
+        inertia: Floats,
         bandwidth_hz: float,
         damping_ratio: float,
         dynamics: Dynamics,
@@ -59,10 +59,10 @@ class DriveLoops:
     ) -> None:
         w, reset_s = natural_frequency(bandwidth_hz, damping_ratio), dynamics.integral_s
         self.position, self.unwind = w / (2.0 * damping_ratio), 1.0 / reset_s if reset_s > 0.0 else 0.0
-        self.gain: Array = 2.0 * damping_ratio * w * inertia
-        self.integral: Array = self.gain * self.unwind
+        self.gain: Floats = 2.0 * damping_ratio * w * inertia
+        self.integral: Floats = self.gain * self.unwind
         rated = np.array([joint.rated_torque for joint in model.joints])
-        self._most: Array = rated * (1e-3 * dynamics.torque_limit_permille)
+        self._most: Floats = rated * (1e-3 * dynamics.torque_limit_permille)
         self.limit = self._most.copy()
         self.viscous = np.array([friction * joint.viscous for joint in model.joints])
         self.coulomb = np.array([friction * joint.coulomb for joint in model.joints])
@@ -70,7 +70,7 @@ class DriveLoops:
         self.fed, self._speed_fed = np.zeros(model.n), np.zeros(model.n)
         self.set_reference(0.0, np.zeros(model.n), np.zeros(model.n))
 
-    def set_reference(self, t: float, theta: Array, slope: Array) -> None:
+    def set_reference(self, t: float, theta: Floats, slope: Floats) -> None:
         """Straight reference of all motors from now on.
 
         Args:
@@ -79,7 +79,7 @@ class DriveLoops:
             slope: (n,) rad/s.
         """
         self.start, self.slope = theta - slope * t, slope
-        self.ahead: Array = self._share * slope + self._speed_fed
+        self.ahead: Floats = self._share * slope + self._speed_fed
 
     def set_loop(self, axis: int, limit: float, speed: float, torque: float) -> None:
         """Torque limit and feed-forwards of one motor from now on.
@@ -94,7 +94,7 @@ class DriveLoops:
         self._speed_fed[axis], self.fed[axis] = speed, torque
         self.ahead = self._share * self.slope + self._speed_fed
 
-    def drives(self, t: float, y: Array) -> Drives:
+    def drives(self, t: float, y: Floats) -> Drives:
         """What the cascades do.
 
         Args:
@@ -106,7 +106,7 @@ class DriveLoops:
         asked = self.gain * error + s + self.fed
         return Drives(error, asked, np.minimum(np.maximum(asked, -self.limit), self.limit))
 
-    def slopes(self, v: Array, drives: Drives) -> tuple[Array, Array, Array, Array]:
+    def slopes(self, v: Floats, drives: Drives) -> tuple[Floats, Floats, Floats, Floats]:
         """(n,) each: slope of torque by velocity error, of friction by rate; of the integrator's rate by velocity error
         and by the integrator itself. At its limit the torque depends on nothing, and the integrator unwinds.
 

@@ -8,11 +8,11 @@ import numpy as np
 
 from canprobe.cell.plant.taxels import TaxelConfig
 from canprobe.cell.scene.setup import Dynamics, Fidelity
-from canprobe.mechanics.robot.chain import Array
 from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
 from canprobe.mechanics.robot.model import ArmModel, Body
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.shapes import PlacedShape
+from canprobe.mechanics.types import Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,8 +59,8 @@ class PlantConfig:
     """
 
     model: ArmModel | None
-    q0: Array = field(default_factory=lambda: np.zeros(0))
-    T_flange_probe_centre: Array = field(default_factory=lambda: tool_z_offset(80.0))
+    q0: Floats = field(default_factory=lambda: np.zeros(0))
+    T_flange_probe_centre: Floats = field(default_factory=lambda: tool_z_offset(80.0))
     radius_m: float = 0.040
     stiffness_n_m3: float = 1.27e8
     damping_s_m: float = 0.3
@@ -74,5 +74,5 @@ class PlantConfig:
     fidelity: Fidelity = "ideal"
     dynamics: Dynamics = field(default_factory=Dynamics)
     bodies: tuple[Body | None, ...] | None = None
-    compliance: Array | None = None
-    base_offset_m: Array = field(default_factory=lambda: np.zeros(3))
+    compliance: Floats | None = None
+    base_offset_m: Floats = field(default_factory=lambda: np.zeros(3))

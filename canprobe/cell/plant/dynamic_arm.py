@@ -17,9 +17,9 @@ from canprobe.cell.plant.ideal_arm import PEAK_PERMILLE
 from canprobe.cell.plant.integrators import STEPS
 from canprobe.cell.plant.ramps import Reference
 from canprobe.fieldbus.drive.motor import MotorDynamics
-from canprobe.mechanics.robot.chain import Array
 from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_to_joints
 from canprobe.mechanics.robot.motors import units_per_motor
+from canprobe.mechanics.types import Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,8 +61,8 @@ class DynamicArm:
         self._y_ns = 0
         self._hold_ns = -stepping.hold_ns
         self._bend_ns = 0
-        self._now: tuple[int, Array] | None = None
-        self._torques: tuple[Array, Array] | None = None
+        self._now: tuple[int, Floats] | None = None
+        self._torques: tuple[Floats, Floats] | None = None
         self._bend()
 
     def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
@@ -87,14 +87,14 @@ class DynamicArm:
         return tuple((x * self._scales + self.model.zero_units).tolist()), tuple((v * self._scales).tolist())
 
     @property
-    def q(self) -> Array:
+    def q(self) -> Floats:
         """(n,) joint positions now, rad or m."""
         return units_to_joints(self.model, self.motors()[0])
 
     @property
-    def qd(self) -> Array:
+    def qd(self) -> Floats:
         """(n,) joint rates now, rad/s or m/s."""
-        rates: Array = self.model.q_per_unit @ np.array(self.motors()[1])
+        rates: Floats = self.model.q_per_unit @ np.array(self.motors()[1])
         return rates
 
     def motor_counts(self, axis: int) -> float:
@@ -146,7 +146,7 @@ class DynamicArm:
             damping=joint.viscous / joint.rotor_inertia,
         )
 
-    def _state(self) -> Array:
+    def _state(self) -> Floats:
         """State now."""
         if self._now is None or self._now[0] != self.t_ns:
             self._advance_to(self.t_ns, keep=False)
@@ -175,7 +175,7 @@ class DynamicArm:
         self.equations.loops.set_reference(1e-9 * now_ns, theta, v / self._scales)
         self._bend_ns = min(reference.next_bend(now_ns) for reference in self._references)
 
-    def _stepped(self, end_ns: int) -> Array:
+    def _stepped(self, end_ns: int) -> Floats:
         if self._y_ns >= self._hold_ns + self._stepping.hold_ns:
             self.equations.hold(self._y)
             self._hold_ns = self._y_ns

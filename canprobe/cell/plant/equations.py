@@ -17,12 +17,12 @@ from canprobe.cell.plant.cascade import DriveLoops, Drives
 from canprobe.cell.plant.ideal_arm import STICTION_RATE
 from canprobe.cell.plant.integrators import Linearised
 from canprobe.cell.plant.pushing import Contact
-from canprobe.mechanics.robot.chain import Array
 from canprobe.mechanics.robot.dynamics import RigidBody
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.robot.motors import joints_per_motor
+from canprobe.mechanics.types import Floats
 
-Touching = Callable[[Array], Contact | None]
+Touching = Callable[[Floats], Contact | None]
 """Motor positions (n,) -> the contact near there, None where nothing is near."""
 
 
@@ -78,7 +78,7 @@ class ArmEquations:
         self._rotors = np.diag([joint.rotor_inertia for joint in model.joints])
         self._take(self._rotors, np.zeros(model.n))
 
-    def hold(self, y: Array) -> None:
+    def hold(self, y: Floats) -> None:
         """Evaluate mass matrix, bias and contact geometry at a state.
 
         Args:
@@ -92,17 +92,17 @@ class ArmEquations:
         if self.effects.contact:
             self.contact = self._touching(theta)
 
-    def _driven(self, theta: Array, rate: Array) -> tuple[Array, Array]:
+    def _driven(self, theta: Floats, rate: Floats) -> tuple[Floats, Floats]:
         """Mass matrix and bias of links and rotors in motor coordinates."""
         back = self._joints_per_motor
         mass, bias = self.body.terms(back @ theta, back @ rate)
         return back.T @ mass @ back + self._rotors, back.T @ bias
 
-    def _take(self, mass: Array, bias: Array) -> None:
+    def _take(self, mass: Floats, bias: Floats) -> None:
         self.mass, self.bias = mass, bias
-        self.inverse: Array = np.asarray(np.linalg.inv(mass), dtype=np.float64)
+        self.inverse: Floats = np.asarray(np.linalg.inv(mass), dtype=np.float64)
 
-    def resting(self, theta: Array) -> Array:
+    def resting(self, theta: Floats) -> Floats:
         """(3n,) state at rest that the drives hold: the integrators carry the weight.
 
         Args:
@@ -112,14 +112,14 @@ class ArmEquations:
         bias = self._driven(theta, still)[1] if self.effects.links else still
         return np.concatenate((theta, still, bias))
 
-    def rate(self, t: float, y: Array) -> Array:
+    def rate(self, t: float, y: Floats) -> Floats:
         """f(t, y)."""
         if not self.held:
             self.hold(y)
         x, v, _ = y.reshape(3, -1)
         return self._rate(v, self.loops.drives(t, y), self.contact.push(x, v) if self.contact is not None else None)
 
-    def _rate(self, v: Array, drives: Drives, push: Array | None) -> Array:
+    def _rate(self, v: Floats, drives: Drives, push: Floats | None) -> Floats:
         loops = self.loops
         net = drives.given - self.bias - loops.viscous * v - loops.coulomb * np.tanh(v / STICTION_RATE)
         if push is not None:
@@ -127,16 +127,16 @@ class ArmEquations:
         wound = loops.integral * drives.error - loops.unwind * (drives.asked - drives.given)
         return np.concatenate((v, self.inverse @ net, wound))
 
-    def drift(self, t: float, y: Array) -> Array:
+    def drift(self, t: float, y: Floats) -> Floats:
         """Partial derivative of f by t: the reference moves on."""
         by_error, _, sum_by_error, _ = self.loops.slopes(y.reshape(3, -1)[1], self.loops.drives(t, y))
         return self._drift(by_error, sum_by_error)
 
-    def _drift(self, by_error: Array, sum_by_error: Array) -> Array:
+    def _drift(self, by_error: Floats, sum_by_error: Floats) -> Floats:
         pull = self.loops.slope * self.loops.position
         return np.concatenate((np.zeros(self.positions), self.inverse @ (by_error * pull), sum_by_error * pull))
 
-    def jacobian(self, t: float, y: Array) -> Array:
+    def jacobian(self, t: float, y: Floats) -> Floats:
         """(3n, 3n) of f by y; mass matrix, bias and contact geometry held."""
         n, kp = self.positions, self.loops.position
         x, v, _ = y.reshape(3, -1)
@@ -153,7 +153,7 @@ class ArmEquations:
         J[2 * n :] = np.hstack((np.diag(-kp * sum_by_error), np.diag(-sum_by_error), np.diag(sum_by_sum)))
         return J
 
-    def linearised(self, t: float, y: Array, g: float) -> Linearised:
+    def linearised(self, t: float, y: Floats, g: float) -> Linearised:
         """Rate, drift, and the solver of (I - g J) x = r by elimination: one n x n system for the rates."""
         if not self.held:
             self.hold(y)
@@ -173,7 +173,7 @@ class ArmEquations:
             inner += g * (pushed[2] + springs)
         inverse = np.linalg.inv(inner)
 
-        def solve(r: Array) -> Array:
+        def solve(r: Floats) -> Floats:
             first, second, third = r.reshape(3, -1)
             third = third - first_back * first
             torque = fed * third - by_theta * first

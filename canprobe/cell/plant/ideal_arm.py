@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from canprobe.fieldbus.drive.motor import MotorDynamics
-from canprobe.mechanics.robot.chain import Array
 from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_to_joints
+from canprobe.mechanics.types import Floats
 
 PEAK_PERMILLE = 2000
 """Of the rated torque: what a drive can give for a while (assumed)."""
@@ -173,24 +173,24 @@ class IdealArm:
         return positions, rates
 
     @property
-    def counts(self) -> Array:
+    def counts(self) -> Floats:
         """(n,) motor positions now, counts."""
         return np.array(self.motors()[0])
 
     @property
-    def count_rates(self) -> Array:
+    def count_rates(self) -> Floats:
         """(n,) motor rates now, counts/s."""
         return np.array(self.motors()[1])
 
     @property
-    def q(self) -> Array:
+    def q(self) -> Floats:
         """(n,) joint positions now, rad or m."""
         return units_to_joints(self.model, self.counts)
 
     @property
-    def qd(self) -> Array:
+    def qd(self) -> Floats:
         """(n,) joint rates now, rad/s or m/s."""
-        rates: Array = self.model.q_per_unit @ self.count_rates
+        rates: Floats = self.model.q_per_unit @ self.count_rates
         return rates
 
     def motor_counts(self, axis: int) -> float:

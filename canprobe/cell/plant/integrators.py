@@ -22,7 +22,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from canprobe.mechanics.robot.chain import Array
+from canprobe.mechanics.types import Floats
 
 GAMMA = 1.0 - sqrt(0.5)
 """Of ROS2."""
@@ -38,9 +38,9 @@ class Linearised(NamedTuple):
         solve: r -> x of (I - g J) x = r; J may be an approximation of the Jacobian.
     """
 
-    rate: Array
-    drift: Array
-    solve: Callable[[Array], Array]
+    rate: Floats
+    drift: Floats
+    solve: Callable[[Floats], Floats]
 
 
 class Problem(Protocol):
@@ -50,23 +50,23 @@ class Problem(Protocol):
     def positions(self) -> int:
         """n."""
 
-    def rate(self, t: float, y: Array) -> Array:
+    def rate(self, t: float, y: Floats) -> Floats:
         """f(t, y)."""
 
-    def drift(self, t: float, y: Array) -> Array:
+    def drift(self, t: float, y: Floats) -> Floats:
         """Partial derivative of f by t."""
 
-    def jacobian(self, t: float, y: Array) -> Array:
+    def jacobian(self, t: float, y: Floats) -> Floats:
         """Partial derivative of f by y."""
 
-    def linearised(self, t: float, y: Array, g: float) -> Linearised:
+    def linearised(self, t: float, y: Floats, g: float) -> Linearised:
         """All that a linearly implicit step asks for at one place."""
 
 
-Step = Callable[[Problem, float, Array, float], Array]
+Step = Callable[[Problem, float, Floats, float], Floats]
 
 
-def semi_implicit_euler(problem: Problem, t: float, y: Array, h: float) -> Array:
+def semi_implicit_euler(problem: Problem, t: float, y: Floats, h: float) -> Floats:
     """Explicit Euler, but positions advance with the new rates."""
     n = problem.positions
     new = y + h * problem.rate(t, y)
@@ -74,29 +74,29 @@ def semi_implicit_euler(problem: Problem, t: float, y: Array, h: float) -> Array
     return new
 
 
-def runge_kutta_4(problem: Problem, t: float, y: Array, h: float) -> Array:
+def runge_kutta_4(problem: Problem, t: float, y: Floats, h: float) -> Floats:
     """The classical explicit step."""
     k1 = problem.rate(t, y)
     k2 = problem.rate(t + 0.5 * h, y + 0.5 * h * k1)
     k3 = problem.rate(t + 0.5 * h, y + 0.5 * h * k2)
     k4 = problem.rate(t + h, y + h * k3)
-    new: Array = y + (h / 6.0) * (k1 + 2.0 * (k2 + k3) + k4)
+    new: Floats = y + (h / 6.0) * (k1 + 2.0 * (k2 + k3) + k4)
     return new
 
 
-def implicit_euler(problem: Problem, t: float, y: Array, h: float) -> Array:
+def implicit_euler(problem: Problem, t: float, y: Floats, h: float) -> Floats:
     """One Newton iteration of backward Euler."""
     rate, drift, solve = problem.linearised(t, y, h)
-    new: Array = y + h * solve(rate + h * drift)
+    new: Floats = y + h * solve(rate + h * drift)
     return new
 
 
-def rosenbrock2(problem: Problem, t: float, y: Array, h: float) -> Array:
+def rosenbrock2(problem: Problem, t: float, y: Floats, h: float) -> Floats:
     """ROS2 with gamma = 1 - 1/sqrt(2)."""
     return _rosenbrock2(problem, t, y, h)[0]
 
 
-def _rosenbrock2(problem: Problem, t: float, y: Array, h: float) -> tuple[Array, Array]:
+def _rosenbrock2(problem: Problem, t: float, y: Floats, h: float) -> tuple[Floats, Floats]:
     """The step, and how far its own first-order step lies off."""
     rate, drift, solve = problem.linearised(t, y, GAMMA * h)
     drift *= GAMMA * h
@@ -105,7 +105,7 @@ def _rosenbrock2(problem: Problem, t: float, y: Array, h: float) -> tuple[Array,
     return y + (1.5 * h) * k1 + (0.5 * h) * k2, (0.5 * h) * (k1 + k2)
 
 
-def exponential(problem: Problem, t: float, y: Array, h: float) -> Array:
+def exponential(problem: Problem, t: float, y: Floats, h: float) -> Floats:
     """y + h phi1(hJ) f + h^2 phi2(hJ) f_t, both from one matrix exponential."""
     from scipy.linalg import expm
 
@@ -115,11 +115,11 @@ def exponential(problem: Problem, t: float, y: Array, h: float) -> Array:
     augmented[:size, size] = h * h * problem.drift(t, y)
     augmented[:size, size + 1] = h * problem.rate(t, y)
     augmented[size, size + 1] = 1.0
-    new: Array = y + expm(augmented)[:size, size + 1]
+    new: Floats = y + expm(augmented)[:size, size + 1]
     return new
 
 
-def adaptive(problem: Problem, t: float, y: Array, h: float, *, rtol: float = 1e-3, atol: float = 1e-5) -> Array:
+def adaptive(problem: Problem, t: float, y: Floats, h: float, *, rtol: float = 1e-3, atol: float = 1e-5) -> Floats:
     """``rosenbrock2`` in parts whose estimated error stays within ``atol + rtol |y|``, component by component.
 
     Raises:

@@ -28,11 +28,12 @@ from canprobe.cell.plant.several_contacts import LEAST_CURVATURE, total_force
 from canprobe.cell.plant.taxels import Image, TaxelArray
 from canprobe.errors import PlanError
 from canprobe.fieldbus.drive.motor import MotorDynamics
-from canprobe.mechanics.robot.chain import Array, Chain, ending_in, jacobian, point_velocity, posture
+from canprobe.mechanics.robot.chain import Chain, ending_in, jacobian, point_velocity, posture
 from canprobe.mechanics.robot.model import ArmModel, units_to_joints
-from canprobe.mechanics.touch.shapes import Nearest, PlacedShape, Touches
+from canprobe.mechanics.touch.shapes import Nearest, PlacedShape, TouchedPlaces
+from canprobe.mechanics.types import Floats
 
-Truth = dict[str, float | bool | Array]
+Truth = dict[str, float | bool | Floats]
 SWITCH_BEYOND = 0.01
 """How far outside of a joint's range its limit switches are, of the range."""
 
@@ -198,7 +199,7 @@ class Plant:
             self._image = (t_ns, self._sampled(self.array, self._solution()))
         return self._image[1].copy()
 
-    def pressure(self, state: PlantState | None = None) -> Array:
+    def pressure(self, state: PlantState | None = None) -> Floats:
         """(rows, columns) mean pressure of every taxel, Pa, before the array's imperfections; zeros without an array.
 
         Args:
@@ -207,7 +208,7 @@ class Plant:
         s = self._solution() if state is None else self._solve(state)
         if self.array is None or s.depth <= 0.0:
             return np.zeros(self.config.pad.shape)
-        means: Array
+        means: Floats
         if self.config.object is not None and self.config.object.by_gaps:
             means = self._over_gaps(self.array, self.config.object, s)
         else:
@@ -230,7 +231,7 @@ class Plant:
             pressure_factor=s.contact.damping_factor,
         )
 
-    def _over_gaps(self, array: TaxelArray, shape: PlacedShape, s: _Solution) -> Array:
+    def _over_gaps(self, array: TaxelArray, shape: PlacedShape, s: _Solution) -> Floats:
         """(rows, columns) taxel means of the layer's compression, m, from the gaps all over the pad."""
         points = array.field.points(np.array(s.probe.centre), np.array(s.probe.axes))
         return array.field.mean_of(-shape.gaps(points))
@@ -258,7 +259,7 @@ class Plant:
         found = _true(self._solution() if state is None else self._solve(state))
         return {name: np.array(value) if isinstance(value, tuple) else value for name, value in found.items()}
 
-    def truths(self, states: Sequence[PlantState]) -> dict[str, Array]:
+    def truths(self, states: Sequence[PlantState]) -> dict[str, Floats]:
         """The same of many states, one row each; nothing of none."""
         rows = [tuple(_true(self._solve(state)).values()) for state in states]
         names = _true(self._solve(states[0])) if states else ()
@@ -326,7 +327,7 @@ class Plant:
         uv = pad_coordinates(d, config.radius_m)
         return _Solution(q, probe, foot, depth, rate, contact, (k1, k2), uv, d, several)
 
-    def _given_way(self, q: tuple[float, ...], foot: Nearest, compliance: Array) -> tuple[float, ...]:
+    def _given_way(self, q: tuple[float, ...], foot: Nearest, compliance: Floats) -> tuple[float, ...]:
         """Joints (n,) that the contact has pushed back, by torque over stiffness each.
 
         Model: at rest and linear, `q + C Jᵀ F n` with the motors where they are. F is that of the depth that is left,
@@ -355,7 +356,7 @@ class Plant:
         force = factor * config.stiffness_n_m3 * shape.squeezed(probe.centre, config.radius_m)
         return NO_CONTACT._replace(force=force, damping_factor=factor)
 
-    def _resting(self, touches: Touches, probe: Probe) -> Contact:
+    def _resting(self, touches: TouchedPlaces, probe: Probe) -> Contact:
         """Several places at once, as one contact with the resultant force; it has no patch of its own."""
         config = self.config
         rates = -(touches.normals @ np.array(probe.velocity))

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from canprobe.cell.plant.several_contacts import NEAR_M, force_laws
-from canprobe.mechanics.robot.chain import Array, Chain, Vec, ending_in, jacobian, posture
-from canprobe.mechanics.touch.shapes import PlacedShape, Touches
+from canprobe.mechanics.robot.chain import Chain, ending_in, jacobian, posture
+from canprobe.mechanics.touch.shapes import PlacedShape, TouchedPlaces
+from canprobe.mechanics.types import Floats, Vec
 
 SLIP_M_S = 1e-3
 """Sliding speed over which friction grows to its full size."""
@@ -45,7 +46,7 @@ class Contact:
     """
 
     def __init__(
-        self, theta: Array, depth: Array, rows: Array, *, coefficient: Array, exponent: Array, rubbing: Rubbing
+        self, theta: Floats, depth: Floats, rows: Floats, *, coefficient: Floats, exponent: Floats, rubbing: Rubbing
     ) -> None:
         self.rows, self._flat = rows, rows.reshape(-1, len(theta))
         self._normal, self._s, self._t = rows
@@ -53,7 +54,7 @@ class Contact:
         self._coefficient, self._exponent = coefficient, exponent
         self._damping, self._friction = 1.5 * rubbing.damping_s_m, rubbing.friction
 
-    def push(self, theta: Array, rate: Array) -> Array | None:
+    def push(self, theta: Floats, rate: Floats) -> Floats | None:
         """(n,) torque (of prismatic joints force) on the motors, N m or N; None where nothing touches.
 
         Args:
@@ -66,7 +67,7 @@ class Contact:
         velocity, _, force, drag, _ = self._moving(depth, rate)
         return self._pushed(velocity, force, drag)
 
-    def linearised(self, theta: Array, rate: Array) -> tuple[Array, Array, Array] | None:
+    def linearised(self, theta: Floats, rate: Floats) -> tuple[Floats, Floats, Floats] | None:
         """The push, and the slopes (n, n) of ``-push`` by position and by rate; None where nothing touches.
 
         What friction owes to the depth is left out.
@@ -81,13 +82,13 @@ class Contact:
         by_rate = (self._flat.T * weights) @ self._flat - (slip.T * (drag / square)) @ slip
         return self._pushed(velocity, force, drag), (self._normal.T * stiffness) @ self._normal, by_rate
 
-    def _pushed(self, velocity: Array, force: Array, drag: Array) -> Array:
+    def _pushed(self, velocity: Floats, force: Floats, drag: Floats) -> Floats:
         loads = velocity * -drag
         loads[0] = force
-        torque: Array = loads.ravel() @ self._flat
+        torque: Floats = loads.ravel() @ self._flat
         return torque
 
-    def _moving(self, depth: Array, rate: Array) -> tuple[Array, Array, Array, Array, Array]:
+    def _moving(self, depth: Floats, rate: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
         """Velocities (3, k); of each place elastic force, damped force, friction per slip, and the slip's square."""
         velocity = (self._flat @ rate).reshape(3, -1)
         elastic = self._coefficient * np.maximum(depth, 0.0) ** self._exponent
@@ -113,9 +114,9 @@ class Neighbourhood:
     def __init__(
         self,
         chain: Chain,
-        joints_per_motor: Array,
-        T_flange_probe: Array,
-        base_offset: Array,
+        joints_per_motor: Floats,
+        T_flange_probe: Floats,
+        base_offset: Floats,
         shape: PlacedShape,
         *,
         radius: float,
@@ -126,7 +127,7 @@ class Neighbourhood:
         self.stiffness_n_m3, self.rubbing = stiffness_n_m3, rubbing
         self._joints_per_motor, self._base = joints_per_motor, base_offset
 
-    def __call__(self, theta: Array) -> Contact | None:
+    def __call__(self, theta: Floats) -> Contact | None:
         """Contact held at a posture of the motors; None where the object is farther than a cycle's way.
 
         Args:
@@ -141,7 +142,7 @@ class Neighbourhood:
         touches = self.shape.touches(centre, self.radius + NEAR_M)
         if touches is None:
             places = (foot.point,), (foot.normal,), (foot.distance,), (foot.kappa,), (0.0,)
-            touches = Touches(*map(np.array, places))
+            touches = TouchedPlaces(*map(np.array, places))
         depth, normals = self.radius - touches.distances, touches.normals
         frames = np.array((normals, *_tangents(normals)))
         # The probe's point that touches lies inside the undeformed ball where it is indented.
@@ -158,7 +159,7 @@ class Neighbourhood:
         )
 
 
-def _tangents(normals: Array) -> tuple[Array, Array]:
+def _tangents(normals: Floats) -> tuple[Floats, Floats]:
     """Two unit vectors (k, 3) each at right angles to each normal and to each other.
 
     Source: Duff et al., Building an Orthonormal Basis, Revisited, JCGT 6, 2017.

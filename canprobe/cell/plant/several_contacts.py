@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from canprobe.mechanics.robot.chain import Array
-from canprobe.mechanics.touch.shapes import Touches
+from canprobe.mechanics.touch.shapes import TouchedPlaces
+from canprobe.mechanics.types import Floats
 
 LEAST_CURVATURE = 1e-2
 """Of the gap, in curvatures of the ball: a hollow nearer to the ball's own radius counts as this much wider."""
@@ -18,7 +18,7 @@ NEAR_M = 2e-3
 """Gaps wider than this cannot close within a cycle of the cell."""
 
 
-def widened(kappa: Array, radius: float) -> Array:
+def widened(kappa: Floats, radius: float) -> Floats:
     """Curvatures of a surface, hollows as tight as the ball replaced by the least that the laws can take.
 
     Args:
@@ -28,7 +28,7 @@ def widened(kappa: Array, radius: float) -> Array:
     return np.maximum(kappa, (LEAST_CURVATURE - 1.0) / radius)
 
 
-def force_laws(touches: Touches, radius: float, stiffness_n_m3: float) -> tuple[Array, Array]:
+def force_laws(touches: TouchedPlaces, radius: float, stiffness_n_m3: float) -> tuple[Floats, Floats]:
     """Coefficient and exponent of ``force = coefficient depth^exponent`` of every place.
 
     Args:
@@ -46,7 +46,7 @@ def force_laws(touches: Touches, radius: float, stiffness_n_m3: float) -> tuple[
     return np.where(edge, line, point), np.where(edge, 1.5, 2.0)
 
 
-def total_force(touches: Touches, radius: float, stiffness_n_m3: float, rates: Array, damping: float) -> Array:
+def total_force(touches: TouchedPlaces, radius: float, stiffness_n_m3: float, rates: Floats, damping: float) -> Floats:
     """(3,) sum of the forces on the ball, N.
 
     Args:
@@ -59,5 +59,5 @@ def total_force(touches: Touches, radius: float, stiffness_n_m3: float, rates: A
     coefficient, exponent = force_laws(touches, radius, stiffness_n_m3)
     depth = np.maximum(radius - touches.distances, 0.0)
     force = coefficient * depth**exponent * np.maximum(0.0, 1.0 + 1.5 * damping * rates)
-    total: Array = force @ touches.normals
+    total: Floats = force @ touches.normals
     return total

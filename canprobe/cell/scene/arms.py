@@ -16,10 +16,11 @@ from canprobe.cell.scene.geometry import transform
 from canprobe.cell.scene.hardware import ArmSettings, JointSettings
 from canprobe.cell.scene.setup import Homing
 from canprobe.errors import PlanError
-from canprobe.mechanics.robot.chain import Array, Chain
+from canprobe.mechanics.robot.chain import Chain
 from canprobe.mechanics.robot.denavit_hartenberg import dh_step, from_dh
 from canprobe.mechanics.robot.model import ArmModel, Body, Joint, lopsided_inertia, negative_inertia
 from canprobe.mechanics.robot.urdf import UrdfArm, from_urdf, limit_warning
+from canprobe.mechanics.types import Floats
 
 Bodies = tuple[Body | None, ...] | None
 SLOWEST_RAD_S, SLOWEST_M_S = math.radians(0.01), 1e-5
@@ -126,7 +127,7 @@ def _refuse_standstill(urdf: str, joints: Sequence[Joint], sections: Mapping[str
         raise PlanError(problems)
 
 
-def _moved(chain: Chain, mount: Array, flange: Array) -> Chain:
+def _moved(chain: Chain, mount: Floats, flange: Floats) -> Chain:
     fixed = chain.fixed.copy()
     fixed[0] = mount @ fixed[0]
     return replace(chain, fixed=fixed, T_last_flange=chain.T_last_flange @ flange)
@@ -143,7 +144,7 @@ def _joint(section: JointSettings, joint: Joint) -> Joint:
     return replace(joint, **{field: value * unit for field, (value, unit) in given.items() if value is not None})
 
 
-def _units_per_q(sections: Mapping[str, JointSettings]) -> Array:
+def _units_per_q(sections: Mapping[str, JointSettings]) -> Floats:
     """(n, n) drive units per rad or m of each joint."""
     names = list(sections)
     turns = np.diag([section.gear for section in sections.values()])
@@ -152,11 +153,11 @@ def _units_per_q(sections: Mapping[str, JointSettings]) -> Array:
             turns[i, names.index(other)] = share
     units = [s.sign * (s.counts_per_turn or s.counts_per_m or 0.0) for s in sections.values()]
     radians = [1.0 if section.kind == "prismatic" else 2 * math.pi for section in sections.values()]
-    scaled: Array = np.diag(units) @ turns / np.array(radians)
+    scaled: Floats = np.diag(units) @ turns / np.array(radians)
     return scaled
 
 
-def _tensor(section: JointSettings) -> Array:
+def _tensor(section: JointSettings) -> Floats:
     xx, yy, zz, xy, xz, yz = section.inertia_kg_m2
     return np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
 
@@ -181,13 +182,13 @@ def _body(section: JointSettings, row: tuple[float, float, float, float], arm: A
     return Body(section.mass_kg or 0.0, np.array(section.com_mm) * _MM, _tensor(section)).moved(T)
 
 
-def joint_compliance(sections: Mapping[str, JointSettings]) -> Array | None:
+def joint_compliance(sections: Mapping[str, JointSettings]) -> Floats | None:
     """(n,) compliance of the joints, rad/(N m) or m/N; None where all are rigid."""
     stiffness = [s.stiffness_n_m if s.kind == "prismatic" else s.stiffness_nm_rad for s in sections.values()]
     return np.array([0.0 if k is None else 1.0 / k for k in stiffness]) if any(stiffness) else None
 
 
-def per_joint(sections: Mapping[str, JointSettings], key: Literal["start", "swing"]) -> Array:
+def per_joint(sections: Mapping[str, JointSettings], key: Literal["start", "swing"]) -> Floats:
     """(n,) rad or m of a key that is in degrees or in millimetres, as the joint turns or slides."""
     return np.array(
         [

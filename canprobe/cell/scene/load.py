@@ -25,7 +25,8 @@ from canprobe.cell.scene.hardware import ArmSettings, CellInfo
 from canprobe.cell.scene.model import DEFAULT_ARRAY, TOUCH_KINDS, ArrayFile, Cell, Scene
 from canprobe.cell.scene.rules import SECTIONS_OF_TASK, broken_rules
 from canprobe.errors import PlanError, SceneError, UsageError, regular_file
-from canprobe.mechanics.robot.urdf import from_urdf, with_meshes_found
+from canprobe.mechanics.robot.urdf import from_urdf
+from canprobe.mechanics.robot.urdf_visuals import with_meshes_found
 
 DEFAULT_CELL = "puma260"
 """Cell of a scene that names none."""

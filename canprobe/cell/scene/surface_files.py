@@ -16,7 +16,7 @@ from canprobe.cell.scene.model import ObjectSettings
 from canprobe.cell.scene.stl_files import stl_damage
 from canprobe.errors import UsageError, install_line, regular_file
 from canprobe.mechanics.touch.heights import Heights
-from canprobe.mechanics.touch.mesh_fit import Fit, fit_mesh
+from canprobe.mechanics.touch.mesh_fit import HeightGrid, fit_mesh
 from canprobe.mechanics.touch.objects import make_object
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.shapes import PlacedShape
@@ -80,7 +80,9 @@ def refuse_narrow(settings: ObjectSettings, shape: Heights, pad: Pad) -> None:
 
 
 @lru_cache(maxsize=4)
-def _mesh(path: Path, changed_ns: int, unit: float, spacing: float, origin_mm: tuple[float, float] | None) -> Fit:
+def _mesh(
+    path: Path, changed_ns: int, unit: float, spacing: float, origin_mm: tuple[float, float] | None
+) -> HeightGrid:
     """The surface of a mesh; of a file that has not changed it is fitted once."""
     try:
         import trimesh

@@ -72,7 +72,7 @@ def open_ports(
     Raises:
         InterfaceError: one is missing, down, or cannot be opened.
     """
-    from canprobe.fieldbus.bus.real.python_can import open_port
+    from canprobe.fieldbus.bus.real.opening import open_port
 
     bus = plan.scene.bus
     with ExitStack() as stack:

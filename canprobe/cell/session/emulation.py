@@ -178,7 +178,7 @@ def _free_port(
     from canprobe.fieldbus.bus.port import Reports
     from canprobe.fieldbus.bus.presence import answering_nodes
     from canprobe.fieldbus.bus.pumped import PumpedNetwork
-    from canprobe.fieldbus.bus.real.python_can import open_port
+    from canprobe.fieldbus.bus.real.opening import open_port
 
     check_links(target.interface, {target.channel: wanted}, say)
     for warning in bus_open_to_others(target.interface, target.channel):
@@ -216,7 +216,8 @@ def _serve(
     in_realtime: bool,
     cycles_kept: int = 0,
 ) -> None:
-    from canprobe.fieldbus.bus.real.processor import DEVICE_PRIORITY, ask_for_processor, realtime, reserve_memory
+    from canprobe.fieldbus.bus.real.memory import reserve_memory
+    from canprobe.fieldbus.bus.real.processor import DEVICE_PRIORITY, ask_for_processor, realtime
     from canprobe.fieldbus.node.serve import serve
 
     reserve_memory(cycles_kept)

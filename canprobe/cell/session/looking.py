@@ -86,7 +86,7 @@ def commission(
 @contextlib.contextmanager
 def _open(target: Target, say: Say) -> Iterator[Port]:
     """A port of a bus without a scene; a wrong setting is only a warning."""
-    from canprobe.fieldbus.bus.real.python_can import open_port
+    from canprobe.fieldbus.bus.real.opening import open_port
 
     interface, channel = target.interface, target.channel
     check_links(interface, {channel: Expected(target.bitrate, of_scene=False)}, say, must=False)

@@ -40,7 +40,8 @@ from canprobe.fieldbus.bus.clock import MonotonicClock, VirtualClock, elapsed_ns
 from canprobe.fieldbus.bus.files import make_folder, whole_file, writing
 from canprobe.fieldbus.bus.joined import JoinedPort
 from canprobe.fieldbus.bus.port import Port, Reports, is_bus_error
-from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, garbage_collection_paused, realtime, reserve_memory
+from canprobe.fieldbus.bus.real.memory import garbage_collection_paused, reserve_memory
+from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, realtime
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 
 if TYPE_CHECKING:

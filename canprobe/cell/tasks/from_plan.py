@@ -15,7 +15,7 @@ from canprobe.cell.tasks.touch import TouchTask
 from canprobe.fieldbus.protocol.tactile import WINDOW
 from canprobe.mechanics.touch.contact import indentation_from_force
 from canprobe.mechanics.touch.patch.array_calibration import CentroidErrors
-from canprobe.mechanics.touch.patch.image_model import make_image_model, make_patch_calibration
+from canprobe.mechanics.touch.patch.array_models import make_image_model, make_patch_calibration
 from canprobe.mechanics.touch.patch.moments import MomentImage
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from canprobe.cell.tasks.probing import ProbingTask
 from canprobe.cell.tasks.task import MotionTime
 from canprobe.cell.tasks.touch import TouchTask
 from canprobe.errors import UsageError
-from canprobe.mechanics.robot.chain import Array as Vector
+from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     pass
@@ -94,7 +94,7 @@ class RequestedTask(Controller):
         self._period_s = period_s
         self._time = MotionTime(round(1e9 * period_s))
         self._step_s = period_s
-        self._targets: list[Vector] = []
+        self._targets: list[Floats] = []
         self._make = make
         self._requests = requests
         self._steps = {"target_force_n": FORCE_RATE * period_s, "speed_m_s": SPEED_RATE * period_s}
@@ -171,7 +171,7 @@ class RequestedTask(Controller):
         trajectory.lead(*(self._motion() if len(self._targets) == 2 else (measurement.q, None)))
         self._task, self._stopping = trajectory, False
 
-    def _motion(self) -> tuple[Vector, Vector]:
+    def _motion(self) -> tuple[Floats, Floats]:
         """Where the last two targets lead in this cycle: position and speed (n,)."""
         before, last = self._targets
         qd = (last - before) / self._step_s

@@ -21,7 +21,7 @@ from canprobe.mechanics.touch.patch.array_calibration import CentroidErrors, Lag
 from canprobe.mechanics.touch.patch.dead_taxels import mended
 from canprobe.mechanics.touch.patch.image import Patch, PatchCalibration
 from canprobe.mechanics.touch.patch.moments import MomentImage, Moments
-from canprobe.mechanics.touch.patch.trailing import PadLag
+from canprobe.mechanics.touch.patch.pad_lag import PadLag
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate

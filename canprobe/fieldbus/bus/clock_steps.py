@@ -79,7 +79,7 @@ class _Sync:
 
 
 @dataclass(slots=True)
-class _Channel:
+class _ChannelSyncs:
     """What the first pass keeps of a channel."""
 
     latest_ns: int | None = None
@@ -129,11 +129,11 @@ class RecordedBus:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._reader = CandumpReader(path)
-        channels: dict[str, _Channel] = {}
+        channels: dict[str, _ChannelSyncs] = {}
         for t_ns, name, can_id, _ in self._reader:
             channel = channels.get(name)
             if channel is None:
-                channel = channels[name] = _Channel()
+                channel = channels[name] = _ChannelSyncs()
             channel.take(self._reader.number, t_ns, can_id)
         self.lost, self.xl = dict(self._reader.lost), dict(self._reader.xl)
         self._shifts: dict[tuple[str, int], int] = {}

@@ -1,4 +1,7 @@
-"""LSS: finds nodes without an id, one after another, and gives them one."""
+"""LSS requests: find nodes without an id, one after another, and give each an id.
+
+Source: CiA 305, "LSS services".
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""A port that is pumped by whoever waits."""
+"""A port that is read by whoever waits for an answer.
+
+Whoever waits pumps the port: it receives the frames itself, gives each to those that subscribed to its identifier and
+everything else to a callback, so that nothing is lost. Time-outs run on the port's clock; on a `LockstepBus` they cost
+no real time. It is not for the cycle, which has its own way to the port.
+"""
 
 from __future__ import annotations
 

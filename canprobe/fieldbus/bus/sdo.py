@@ -1,16 +1,12 @@
 """SDO transfers to many nodes at once, over any `Port`, without threads.
 
-Whoever waits for an answer pumps the port: it receives the frames itself, gives each to those that subscribed to its
-identifier and everything else to a callback, so that nothing is lost. Time-outs run on the port's clock; on a
-`LockstepBus` they cost no real time. Not for the cycle, which has its own way to the port.
-
-SDO. A *dialogue* is a generator: it yields the 8 bytes of a request, or None to wait on, and is sent the 8 bytes of
-each answer; an abort that it yields is sent, and nobody answers it. `upload` and `download` are parts of such dialogues
+A *dialogue* is a generator: it yields the 8 bytes of a request, or None to wait on, and is sent the 8 bytes of each
+answer; an abort that it yields is sent, and nobody answers it. `upload` and `download` are parts of such dialogues
 (`yield from`). What a node needs is written as a plain sequence, and `hold_dialogues` waits for all nodes together: the
 accesses of one node come one after another, those of different nodes side by side. canopen's client is not used,
-because it waits for a thread and for one node at a time.
+because it waits for a thread and for one node at a time. `pumped` is how the port is read meanwhile.
 
-Source: CiA 301, SDO protocols (expedited download, expedited and segmented upload, abort); CiA 305 (LSS).
+Source: CiA 301, SDO protocols (expedited download, expedited and segmented upload, abort).
 """
 
 from __future__ import annotations

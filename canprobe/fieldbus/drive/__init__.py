@@ -1,9 +1,27 @@
 """A CiA 402 drive: its states and faults, its modes of operation, and the motion that it asks of the plant.
 
-`drive.DriveApplication` is the application of a node: controlword in, statusword out, by the table in
-`canprobe.fieldbus.protocol.cia402`. The active mode (`modes`, `homing`; `mode` has what they share) gives a
-reference, `reference` turns it into ramps, holds and stops of one axis of the plant, and `parameters` reads units,
-limits and options from the dictionary whenever one is written. An object that the EDS lacks has a default here.
+Controlword, mode and targets come in through the dictionary of a node; statusword and actual values go out through it,
+and a reference goes to one axis of the plant. `drive.DriveApplication` is the application of the node. It follows the
+table of states in `protocol.cia402` and runs one mode at a time.
 
-Loss of SYNC, RPDOs or heartbeat quick-stops the drive by itself (6007h, 605Ah): a dead master never leaves it moving.
+    drive                   states, faults, options, and which mode is active
+    from_eds                a node from an EDS alone, and a drive where the file describes one
+    parameters              limits, ramps and options, read from the dictionary whenever one is written
+    units                   position units of the master ↔ counts of the axis
+    feedback                actual and demand values that the drive reports
+    loop                    torque limit and feed-forwards, given to the plant's position loop
+    self_stop               what makes a drive stop by itself
+    mode                    what all modes share
+    modes                   the table of all modes
+    cyclic_position, cyclic_velocity, cyclic_torque   modes with a target for every SYNC
+    interpolated_position   the same by 60C1h
+    profile_position        set-points by handshake, each a trapezoidal move
+    homing                  limit switches, index pulses, or the present position
+    profile                 trapezoids and other motion as pieces of constant acceleration
+    reference               ramps, trajectories, holds and stops of one axis
+    motor                   how a motor answers to torque
+    ideal_axis              an axis for a drive without a plant
+
+Invariants: outside operation enabled the drive holds. Loss of SYNC, RPDOs or heartbeat quick-stops it (6007h, 605Ah): a
+dead master never leaves it moving. An object that the EDS lacks has a default. Start reading at `drive`, then `mode`.
 """

@@ -29,7 +29,7 @@ from canprobe.fieldbus.protocol.cia402 import (
     INITIAL_STATE,
     POWERED_STATES,
     TRANSITIONS,
-    Command,
+    DriveCommand,
     DriveState,
     Event,
     command_of,
@@ -39,7 +39,7 @@ from canprobe.fieldbus.protocol.frames import NmtState
 
 _STATUSWORD = key_of(0x6041)
 _VOLATILE = frozenset({0x6040, 0x6071, 0x607A, 0x60B0, 0x60B1, 0x60B2, 0x60C1, 0x60FF})
-_ABORT_COMMANDS = {2: Command.DISABLE_VOLTAGE, 3: Command.QUICK_STOP}  # of 6007h; 1 is a fault, 0 nothing
+_ABORT_COMMANDS = {2: DriveCommand.DISABLE_VOLTAGE, 3: DriveCommand.QUICK_STOP}  # of 6007h; 1 is a fault, 0 nothing
 _ENABLED = DriveState.OPERATION_ENABLED
 STAND_ALONE = Delivery()
 """Of a drive that belongs to no cell."""
@@ -77,7 +77,7 @@ class DriveApplication(Application):
         self._axis, self._plant, self._incremental, self._noise = axis, plant, incremental, noise
         self._delivery = delivery
         self.state = INITIAL_STATE
-        self._command: Command | None = None  # the one that stands
+        self._command: DriveCommand | None = None  # the one that stands
         self._word = 0  # the last controlword
         self._idle_word: int | None = None  # the same if it did nothing and nothing has happened since
         self._word_waits = False  # the active mode has not seen it yet
@@ -189,7 +189,7 @@ class DriveApplication(Application):
 
     def _pass_on(self, t_ns: int) -> None:
         """Transition 4 after 3, when the controlword that switched on also enables."""
-        if self.state is DriveState.SWITCHED_ON and self._command is Command.ENABLE_OPERATION:
+        if self.state is DriveState.SWITCHED_ON and self._command is DriveCommand.ENABLE_OPERATION:
             self._go(_ENABLED, t_ns)
 
     # ------------------------------------------------------------------ mode of operation

@@ -41,7 +41,7 @@ _METHOD = key_of(0x6098)
 _TO_SWITCH, _TO_ZERO = 1, 2  # sub-indices of 6099h
 
 
-class Phase(Enum):
+class HomingPhase(Enum):
     """Where a homing run is."""
 
     IDLE = auto()
@@ -53,11 +53,11 @@ class Phase(Enum):
     FAILED = auto()
 
 
-_BITS = {Phase.DONE: REACHED | 1 << HOMING_ATTAINED, Phase.FAILED: 1 << HOMING_ERROR}
-_UNDER_WAY = frozenset({Phase.TO_SWITCH, Phase.OFF_SWITCH, Phase.TO_PULSE, Phase.RETURNING})
+_BITS = {HomingPhase.DONE: REACHED | 1 << HOMING_ATTAINED, HomingPhase.FAILED: 1 << HOMING_ERROR}
+_UNDER_WAY = frozenset({HomingPhase.TO_SWITCH, HomingPhase.OFF_SWITCH, HomingPhase.TO_PULSE, HomingPhase.RETURNING})
 
 
-class Homing(ProfiledMode):
+class HomingMode(ProfiledMode):
     """Mode 6."""
 
     number = OperationMode.HOMING
@@ -65,7 +65,7 @@ class Homing(ProfiledMode):
 
     def __init__(self, parts: DriveParts) -> None:
         super().__init__(parts)
-        self._phase = Phase.IDLE
+        self._phase = HomingPhase.IDLE
         self._method = 0
         self._direction = 1  # in which the edge or the pulse is passed, of the motor
         self._passed = self._home = 0.0  # counts: behind which the pulse comes; the home position
@@ -73,12 +73,12 @@ class Homing(ProfiledMode):
 
     def reset(self) -> None:
         """Power on: not homed."""
-        self._phase = Phase.IDLE
+        self._phase = HomingPhase.IDLE
 
     def start(self, word: int, t_ns: int) -> None:
         """A drive that was homed stays so."""
-        if self._phase is not Phase.DONE:
-            self._phase = Phase.IDLE
+        if self._phase is not HomingPhase.DONE:
+            self._phase = HomingPhase.IDLE
         super().start(word, t_ns)
         if not self.halted:
             self._motion.decelerate(t_ns, self._parameters.deceleration, self._at_standstill)
@@ -89,7 +89,7 @@ class Homing(ProfiledMode):
 
     def status(self) -> int:
         """Homing attained, error, and target reached (when at rest)."""
-        rests = self._standstill and self._phase in (Phase.IDLE, Phase.FAILED)
+        rests = self._standstill and self._phase in (HomingPhase.IDLE, HomingPhase.FAILED)
         return _BITS.get(self._phase, 0) | REACHED * rests
 
     def bits(self, word: int, changed: int, t_ns: int) -> None:
@@ -99,7 +99,7 @@ class Homing(ProfiledMode):
             if starts:
                 self._begin(t_ns)
             elif self._phase in _UNDER_WAY:
-                self._stop(Phase.IDLE, t_ns)
+                self._stop(HomingPhase.IDLE, t_ns)
 
     def resume(self, t_ns: int) -> None:
         """With bit 4 still set, homing starts again."""
@@ -113,7 +113,7 @@ class Homing(ProfiledMode):
     def _give_up(self) -> None:
         self._timer.cancel()
         if self._phase in _UNDER_WAY:
-            self._phase = Phase.IDLE
+            self._phase = HomingPhase.IDLE
 
     # ------------------------------------------------------------------ a run
 
@@ -133,25 +133,25 @@ class Homing(ProfiledMode):
             if self._on_switch():
                 self._leave_switch(here, t_ns)
             else:
-                self._phase = Phase.TO_SWITCH
+                self._phase = HomingPhase.TO_SWITCH
                 reach = SEARCH_S * self._speed(_TO_SWITCH)
                 self._drive_to(here - self._direction * reach, t_ns, _TO_SWITCH)
         else:
-            self._stop(Phase.FAILED, t_ns)
+            self._stop(HomingPhase.FAILED, t_ns)
         if self._phase in _UNDER_WAY:
             self._timer.arm(t_ns + STEP_NS)
 
     def watch(self, t_ns: int, counts: float) -> None:
         """Catch the switch, its edge, and the index pulse."""
-        if self._phase is Phase.TO_SWITCH and self._on_switch():
+        if self._phase is HomingPhase.TO_SWITCH and self._on_switch():
             self._leave_switch(counts, t_ns)
-        elif self._phase is Phase.OFF_SWITCH and not self._on_switch():
+        elif self._phase is HomingPhase.OFF_SWITCH and not self._on_switch():
             edge = self.parts.feedback.switch_positions()[SWITCH_DIRECTIONS[self._method] > 0]
             if self._method in SWITCH_AND_INDEX:
                 self._seek_pulse(edge, t_ns)
             else:
                 self._return_to(edge, t_ns)
-        if self._phase is Phase.TO_PULSE:
+        if self._phase is HomingPhase.TO_PULSE:
             pulse = next_pulse(self._passed, self._direction, self._units.turn)
             if (counts - pulse) * self._direction >= 0.0:
                 self._return_to(pulse, t_ns)
@@ -161,15 +161,15 @@ class Homing(ProfiledMode):
         return bool(self.parts.feedback.switches() & wanted)
 
     def _leave_switch(self, counts: float, t_ns: int) -> None:
-        self._phase = Phase.OFF_SWITCH
+        self._phase = HomingPhase.OFF_SWITCH
         self._drive_to(counts + self._direction * SEARCH_S * self._speed(_TO_ZERO), t_ns)
 
     def _seek_pulse(self, passed: float, t_ns: int) -> None:
-        self._phase, self._passed = Phase.TO_PULSE, passed
+        self._phase, self._passed = HomingPhase.TO_PULSE, passed
         self._drive_to(passed + self._direction * SEARCH_TURNS * self._units.turn, t_ns)
 
     def _return_to(self, home: float, t_ns: int) -> None:
-        self._phase, self._home = Phase.RETURNING, home
+        self._phase, self._home = HomingPhase.RETURNING, home
         self._drive_to(home, t_ns)
 
     def _drive_to(self, counts: float, t_ns: int, speed: int = _TO_ZERO) -> None:
@@ -181,11 +181,11 @@ class Homing(ProfiledMode):
         return min(wanted, self._parameters.max_speed)
 
     def _arrived(self, t_ns: int) -> None:
-        if self._phase is Phase.RETURNING:
+        if self._phase is HomingPhase.RETURNING:
             self._attain(t_ns)
         else:
             self._timer.cancel()
-            self._phase, self._standstill = Phase.FAILED, True
+            self._phase, self._standstill = HomingPhase.FAILED, True
         self.parts.show()
 
     def _attain(self, t_ns: int) -> None:
@@ -193,9 +193,9 @@ class Homing(ProfiledMode):
         units, dictionary = self._units, self.parts.node.dictionary
         units.origin = self._home + dictionary.number(0x607C) * units.scale
         dictionary.put(0x607A, 0, round(units.position(self._motion.demand(t_ns))))
-        self._phase = Phase.DONE
+        self._phase = HomingPhase.DONE
 
-    def _stop(self, phase: Phase, t_ns: int) -> None:
+    def _stop(self, phase: HomingPhase, t_ns: int) -> None:
         self._timer.cancel()
         self._phase = phase
         self._motion.decelerate(t_ns, self._parameters.homing_acceleration, self._at_standstill)

@@ -1,4 +1,4 @@
-"""How a motor answers to torque: what a plant tells a drive that controls torque."""
+"""How a motor answers to torque: what a drive that controls torque needs to know of its plant."""
 
 from __future__ import annotations
 

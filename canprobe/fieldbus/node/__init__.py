@@ -1,17 +1,34 @@
 """A CiA 301 node without I/O: object dictionary, SDO, PDO, SYNC, EMCY, error control, LSS and storage.
 
-`slave_node.SlaveNode` has one method for what comes in (`receive(can_id, data, t)`) and one for time (`advance(t)`);
-both return frames to send, and `next_deadline_ns` is when `advance` has to be called. It puts the services together;
-they share `core`: identity, NMT state, time, timers, dictionary, and the quirks that make a node difficult.
+`slave_node.SlaveNode` has one method for what comes in, `receive(can_id, data, t)`, and one for time, `advance(t)`;
+both return frames to send, and `next_deadline_ns` says when `advance` has to be called. It puts the services together.
+Each service of the standard is one module:
 
-- `dictionary` keeps values and makes every check that an access over the bus must pass, with the abort codes of CiA
-  301.
-- `sdo_server` does expedited, segmented and block transfers by one table of states, for several clients.
-- `pdo` and `tpdo` route PDOs, hold parameters and mapping rules, events, inhibit times and SYNC.
-- `emcy` has emergencies, heartbeat and guarding; `lss` node ids and stored parameters.
-- `faults` injects faults into a node; `serve` serves nodes on a real interface and keeps what a master stores in them.
+    core                what all services share: identity, NMT state, time, timers, dictionary, frames to send
+    nmt                 the NMT state machine as a table
+    timers              the deadlines of one node
+    entry               one entry of the dictionary: type, rights, limits, bytes
+    dictionary          all values, with the checks that an access over the bus must pass
+    abort               SDO abort codes
+    sdo_states          the state machine of an SDO server as a table
+    sdo_server          expedited, segmented and block transfers by that table
+    pdo                 all PDOs of a node: which frame goes where, and what a SYNC does
+    rpdo, tpdo          one RPDO, one TPDO
+    pdo_rules           what may be written to their parameters, and when
+    sync                the SYNC consumer
+    emcy                emergencies, error register, error history
+    heartbeat           heartbeat producer and consumer
+    guarding            node guarding and life guarding
+    lss, lss_search     node ids over the bus, and how a node without one is found
+    store, stored_file  stored parameters, in memory and in a file
+    quirks              what makes a node difficult
+    fault               a fault of a node or its link: what, when, how often
+    wrapped             what stands in a node's place on a lockstep bus
+    faulty_node         a node whose faults happen
+    serve               nodes on a real interface, in real time
 
-An application (`canprobe.fieldbus.drive`) hooks onto entries of the dictionary and gets every SYNC. A node never
-sleeps, opens or waits: the same one runs in virtual time and on a real interface, for any master. Each point of the
-conformance list is a test named after its clause.
+An application (`canprobe.fieldbus.drive`) hooks onto entries of the dictionary and gets every SYNC. Invariants: a node
+never sleeps, opens or waits, so that the same node runs in virtual time and on a real interface, for any master;
+`receive` never raises, whatever is on the bus. Each point of the conformance list is a test named after its clause.
+Start reading at `slave_node`, then `core`.
 """

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 from canopen.objectdictionary import ObjectDictionary, datatypes
 
-from canprobe.fieldbus.eds.description import LAST_DUMMY, Description
-from canprobe.fieldbus.eds.description import Entry as Described
+from canprobe.fieldbus.eds.description import LAST_DUMMY, DescribedEntry, Description
 from canprobe.fieldbus.eds.values import REALS, SIGNED, UNSIGNED
 from canprobe.fieldbus.node.abort import Abort, SdoAbort
 
@@ -90,7 +89,7 @@ def read_entries(od: ObjectDictionary) -> Iterator[Entry]:
     return map(_entry, Description(od).entries())
 
 
-def _entry(described: Described) -> Entry:
+def _entry(described: DescribedEntry) -> Entry:
     data_type = described.data_type
     number = data_type in SIGNED or data_type in UNSIGNED or data_type in REALS
     bits = 8 if data_type == datatypes.BOOLEAN else described.bits if number else 0
@@ -110,7 +109,7 @@ def _entry(described: Described) -> Entry:
     )
 
 
-def _default(described: Described, bits: int) -> Value:
+def _default(described: DescribedEntry, bits: int) -> Value:
     value = described.initial
     if value is None:
         return 0 if bits else b""

@@ -1,4 +1,4 @@
-"""Faults of a node or its link: what, when, how often. `canprobe.fieldbus.node.faults` lets them happen."""
+"""A fault of a node or its link: what happens, when, and how often. `faulty_node` makes it happen."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Heartbeat producer and consumer."""
+"""Heartbeat producer and consumer.
+
+Source: CiA 301, "Heartbeat protocol", objects 1016h and 1017h; error 8130h.
+"""
 
 from __future__ import annotations
 

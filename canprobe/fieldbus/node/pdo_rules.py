@@ -1,4 +1,7 @@
-"""What may be written to PDO communication and mapping parameters, and when."""
+"""What may be written to PDO communication and mapping parameters, and when.
+
+Source: CiA 301, "PDO mapping", objects 1400h to 1BFFh.
+"""
 
 from __future__ import annotations
 

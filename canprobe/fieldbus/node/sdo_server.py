@@ -1,5 +1,7 @@
-"""One SDO server on the node's dictionary: each request that the table allows has one method, which returns the answers
-or raises SdoAbort when the client breaks the protocol.
+"""One SDO server on the node's dictionary, by the table of `sdo_states`.
+
+Each request that the table allows has one method. It returns the answers, or raises `SdoAbort` when the client breaks
+the protocol.
 
 Source: CiA 301, "SDO download", "SDO upload", "SDO block download", "SDO block upload"; the CRC is CRC-16/XMODEM
 (polynomial 1021h, start 0).

@@ -8,8 +8,8 @@ from itertools import groupby
 from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.joined import wait_for_any
 from canprobe.fieldbus.bus.port import Port, TimedFrame
-from canprobe.fieldbus.bus.real.processor import garbage_collection_paused
-from canprobe.fieldbus.bus.virtual.lockstep import BusNode, LockstepBus, Participant
+from canprobe.fieldbus.bus.real.memory import garbage_collection_paused
+from canprobe.fieldbus.bus.virtual.lockstep import Attachment, LockstepBus, Participant
 from canprobe.fieldbus.protocol.frames import SYNC_ID, Frame
 
 _MAX_WAIT_NS = 100_000_000
@@ -93,7 +93,7 @@ class Exchange(LockstepBus):
         """Pass a SYNC on. The nodes hear each other's answers to it only once they have all heard the SYNC itself."""
         if before := self._carry(t_ns):
             yield before
-        spoken: list[tuple[BusNode, Frame]] = []
+        spoken: list[tuple[Attachment, Frame]] = []
         listeners = self._listeners_of(self._outside, SYNC_ID)
         for _, kind in groupby(listeners, key=lambda listener: listener[1].owner.kind):
             for receive, node in kind:

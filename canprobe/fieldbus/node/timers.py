@@ -1,5 +1,7 @@
-"""Deadlines of one node. Few of them are armed at once, and most are armed again before they fire, at every SYNC: the
-first is looked for among those that are armed.
+"""The deadlines of one node.
+
+Few timers are armed at once, and most are armed again before they fire, at every SYNC. So the first deadline is looked
+for among the armed timers, without a heap.
 """
 
 from __future__ import annotations

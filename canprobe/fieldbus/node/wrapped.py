@@ -1,4 +1,4 @@
-"""The base of what stands between a node and a lockstep bus: it is attached in the node's place."""
+"""The base of what stands between a node and a lockstep bus, attached in the node's place."""
 
 from __future__ import annotations
 

@@ -1,13 +1,24 @@
 """CANopen bytes and their meaning, pure: no socket, no clock, no side of the bus.
 
-Master and emulated nodes read the same tables, so that neither can be right alone.
+Bytes come in and values go out, or the reverse. Master and emulated nodes read the same tables, so that a mistake in
+one of them shows on both sides of the bus.
 
-frames          identifiers, NMT, heartbeat, SYNC, EMCY, LSS: a few bytes each, packed and parsed
-pdo             PDO mappings, compiled once to struct formats
-cia402          the drive state machine as one table, read by the drive and by its master
-tactile         tactile frames: header, CRC, window and features, and their reassembly with losses noticed
-frame_bits      bits of a frame on the wire: exact for given contents, and the best and worst case
-response_times  how late each message can be in the worst case (Davis, Burns, Bril, Lukkien 2007)
+    frames                identifiers of CiA 301, NMT and heartbeat, flags of long identifiers and remote requests
+    sync                  the SYNC object and its counter
+    pdo                   PDO mappings, compiled once to struct formats
+    emcy                  emergency messages and the words for their codes
+    lss                   layer setting services
+    cia402                the state machine of a drive as one table, which the drive and its master both read
+    si_unit               units of velocity and acceleration (60A9h, 60AAh)
+    tactile               tactile frames in PDOs: header, CRC, window and features
+    tactile_assembler     the PDOs of one tactile frame put together again; losses are noticed
+    raw_image             images in raw CAN frames, of arrays without CANopen
+    period                the sampling instants of a free-running device
+    frame_bits            bits of a frame on the wire: exact for given contents, best case and worst case
+    response_times        how late a message can be where each node sends its highest priority first
+    fifo_response_times   the same where nodes send their oldest frame first
 
-Every decoder raises only `ProtocolError`, whatever the bytes. Sources are cited where a table comes from.
+Invariants: every decoder raises `ProtocolError` and nothing else, whatever the bytes; nothing holds state but the
+assemblers, the SYNC counter and the period fit; the source of each table is cited. Start reading at `frames`, then
+`pdo` and `cia402`.
 """

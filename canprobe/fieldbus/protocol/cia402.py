@@ -61,7 +61,7 @@ class DriveState(Enum):
     FAULT = 0x08
 
 
-class Command(Enum):
+class DriveCommand(Enum):
     """What a controlword commands; switching on and disabling operation are the same pattern."""
 
     SHUTDOWN = auto()
@@ -83,11 +83,11 @@ class Event(Enum):
 
 
 _S = DriveState
-_C = Command
+_C = DriveCommand
 INITIAL_STATE = _S.NOT_READY_TO_SWITCH_ON  # transition 0, at power on
 
 # (mask, pattern, command). With bit 7 clear every controlword matches exactly one line.
-_CONTROLWORD_PATTERNS: tuple[tuple[int, int, Command], ...] = (
+_CONTROLWORD_PATTERNS: tuple[tuple[int, int, DriveCommand], ...] = (
     (0x82, 0x00, _C.DISABLE_VOLTAGE),
     (0x86, 0x02, _C.QUICK_STOP),
     (0x87, 0x06, _C.SHUTDOWN),
@@ -96,7 +96,7 @@ _CONTROLWORD_PATTERNS: tuple[tuple[int, int, Command], ...] = (
 )
 
 # (number in the standard, from, cause, to). 3 is there twice: enabling from READY passes through SWITCHED_ON.
-NUMBERED_TRANSITIONS: tuple[tuple[int, DriveState, Command, DriveState], ...] = (
+NUMBERED_TRANSITIONS: tuple[tuple[int, DriveState, DriveCommand, DriveState], ...] = (
     (2, _S.SWITCH_ON_DISABLED, _C.SHUTDOWN, _S.READY_TO_SWITCH_ON),
     (3, _S.READY_TO_SWITCH_ON, _C.SWITCH_ON, _S.SWITCHED_ON),
     (3, _S.READY_TO_SWITCH_ON, _C.ENABLE_OPERATION, _S.SWITCHED_ON),
@@ -115,7 +115,7 @@ NUMBERED_TRANSITIONS: tuple[tuple[int, DriveState, Command, DriveState], ...] = 
     (16, _S.QUICK_STOP_ACTIVE, _C.ENABLE_OPERATION, _S.OPERATION_ENABLED),
 )
 
-TRANSITIONS: dict[tuple[DriveState, Command], DriveState] = {
+TRANSITIONS: dict[tuple[DriveState, DriveCommand], DriveState] = {
     (source, command): target for _, source, command, target in NUMBERED_TRANSITIONS
 }
 """Where a command leads. What is not in the table changes nothing. Transition 16 is only for 605Ah = 5..8, and
@@ -169,13 +169,13 @@ def statusword_of(state: DriveState) -> int:
     return state.value
 
 
-def command_of(controlword: int, previous: int = 0) -> Command | None:
+def command_of(controlword: int, previous: int = 0) -> DriveCommand | None:
     """The command in a controlword, given the one before it.
 
     Fault reset is the rising edge of bit 7. While bit 7 stays set nothing else is commanded: None.
     """
     if controlword & ~previous & 1 << FAULT_RESET_BIT:
-        return Command.FAULT_RESET
+        return DriveCommand.FAULT_RESET
     return _COMMANDS.get(controlword & 0xFF)
 
 

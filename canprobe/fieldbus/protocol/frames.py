@@ -1,4 +1,4 @@
-"""CAN frames, the identifiers of CiA 301, and the services of a few bytes: NMT, heartbeat, SYNC, EMCY and LSS."""
+"""CAN frames, the identifiers of CiA 301, and the two services of a few bytes: NMT and heartbeat."""
 
 from __future__ import annotations
 

@@ -28,11 +28,11 @@ from canprobe.lab.studies.harness import Array, Column, Row, StudyResult
 from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.touch.pad import Pad
+from canprobe.mechanics.touch.patch.array_models import make_image_model, make_patch_calibration
 from canprobe.mechanics.touch.patch.calibrate import calibrate_array
 from canprobe.mechanics.touch.patch.image import PatchCalibration
 from canprobe.mechanics.touch.patch.image_fit import Dwell, what_is_shown
-from canprobe.mechanics.touch.patch.image_model import make_image_model, make_patch_calibration
-from canprobe.mechanics.touch.patch.image_parameters import curvature_errors, moment_errors
+from canprobe.mechanics.touch.patch.parameter_fit import curvature_errors, moment_errors
 
 RADIUS_M = 0.040
 BALL_PER_M = 40.0

@@ -28,7 +28,7 @@ from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cell.tasks.probing import Phase
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.node.fault import FaultKind
-from canprobe.fieldbus.node.faults import FaultyNode
+from canprobe.fieldbus.node.faulty_node import FaultyNode
 from canprobe.lab.studies.fault_cases import FILES_EVERY, KINDS, NEED_TIME, PHASES, FaultCase, Windows, draw_fault
 from canprobe.lab.studies.fault_scenes import COLOURS, FORCE_MAX_N, SCENARIOS, draw_faults, scenario_plan, seeded_plan
 from canprobe.lab.studies.fault_scores import Peak, peak_of, score_force, score_log, score_rest, score_summary

@@ -31,7 +31,7 @@ from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.port import Port
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.real.link import missing_ip
-from canprobe.fieldbus.bus.real.python_can import open_port
+from canprobe.fieldbus.bus.real.opening import open_port
 from canprobe.fieldbus.bus.real.socketcan import check_interface
 from canprobe.fieldbus.bus.sdo import hold_dialogues, upload
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, DriveState, state_of

@@ -28,8 +28,8 @@ from canprobe.cell.tasks.from_plan import make_task
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.candump import read_candump
 from canprobe.fieldbus.bus.clock import Clock, MonotonicClock
+from canprobe.fieldbus.bus.real.opening import open_port
 from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, realtime
-from canprobe.fieldbus.bus.real.python_can import open_port
 from canprobe.fieldbus.protocol.frames import SYNC_ID
 from canprobe.fieldbus.protocol.sync import SyncCounter
 from canprobe.lab.studies.harness import CHANNEL

@@ -36,7 +36,7 @@ from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.inverse import inverse_near
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.touch.contact import Slope, indentation_from_force
-from canprobe.mechanics.touch.patch.image_model import make_patch_calibration
+from canprobe.mechanics.touch.patch.array_models import make_patch_calibration
 
 
 class LateNode(WrappedNode):

@@ -1,14 +1,20 @@
 """The arm as mathematics: geometry, kinematics, inverse kinematics, dynamics, tool calibration. Pure functions.
 
-- `chain` is the geometry of any serial arm of 1 to 8 joints, revolute or prismatic: poses, Jacobians and velocities
-  from one evaluation on plain floats. Chains come from Denavit-Hartenberg rows, or by `urdf` out of a file.
-- `model` puts the joints to a chain (stops, speeds, motors, friction, bodies) and how drive units follow from them.
-- `inverse` goes from poses to joints numerically: what n joints can hold of a pose, the joints for a pose from a known
-  posture on, damped steps of the Jacobian near singular poses, and postures that put the probe on a surface.
-- `dynamics` has mass matrix and bias torques of an arm with what it carries, computed by MuJoCo.
-- `tool_calibration` finds the probe's centre on the flange from touches of a ball.
+Joint positions come in and poses, Jacobians and torques go out, or poses come in and joint positions go out.
 
-Frames are spelled in names: `T_base_flange` takes flange coordinates to base. Joint vectors are rad, of
-prismatic joints m; lengths are m. What no posture can reach is a `PlanError` that says why. Nothing here knows a scene,
-a bus or a time.
+    chain                any serial arm of 1 to 8 joints: poses, Jacobians and velocities from one evaluation
+    denavit_hartenberg   chains from Denavit-Hartenberg rows
+    urdf, urdf_tree      an arm from a URDF, and the links and joints of that file
+    urdf_visuals         what links look like: only a view needs it
+    model                joints of a chain with stops, speeds, motors, friction, bodies; units of its drives
+    motors               motor coordinates, where rotor inertia, friction and drive torque act
+    inverse              from poses to joints: what n joints can hold of a pose, and the joints near a known posture
+    damped_inverse       one step of the Jacobian, damped near singular poses
+    remaining_drives     the same with some drives at rest
+    probe_poses          poses and postures that put a probe on a surface
+    dynamics             mass matrix and bias torques, computed by MuJoCo
+    tool_calibration     the probe's centre on the flange, from touches of a ball
+
+Invariants: frames are spelled in names (`T_base_flange` takes flange coordinates to base). Joint vectors are in rad, of
+prismatic joints in m. A pose that no posture reaches is a `PlanError` that says why. Start reading at `chain`.
 """

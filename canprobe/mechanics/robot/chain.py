@@ -24,9 +24,8 @@ import numpy as np
 import numpy.typing as npt
 
 from canprobe.errors import PlanError
+from canprobe.mechanics.types import Floats, Vec
 
-Array = npt.NDArray[np.float64]
-Vec = tuple[float, float, float]
 Convention = Literal["standard", "modified"]
 MOST_JOINTS = 8
 _RIGID = 1e-9
@@ -70,8 +69,8 @@ class Chain:
     name: str
     joints: tuple[str, ...]
     prismatic: tuple[bool, ...]
-    fixed: Array
-    T_last_flange: Array
+    fixed: Floats
+    T_last_flange: Floats
     _first: tuple[float, ...] = field(init=False, repr=False)
     _links: tuple[_Link, ...] = field(init=False, repr=False)
     _last: tuple[float, float] = field(init=False, repr=False)
@@ -89,7 +88,7 @@ class Chain:
         """Number of joints."""
         return len(self.joints)
 
-    def _refuse_odd(self, fixed: Array, flange: Array) -> None:
+    def _refuse_odd(self, fixed: Floats, flange: Floats) -> None:
         n, where = len(self.joints), f"chain {self.name!r}"
         if not 1 <= n <= MOST_JOINTS:
             raise PlanError([f"{where}: expected 1 to {MOST_JOINTS} joints, got {n}"])
@@ -126,7 +125,7 @@ class Chain:
         object.__setattr__(self, "_last", (cos(before), sin(before)))
 
 
-def ending_in(chain: Chain, T_flange_tool: Array) -> Chain:
+def ending_in(chain: Chain, T_flange_tool: Floats) -> Chain:
     """The same arm with a tool, (4, 4) in its flange's frame (m), for a flange: its posture is that of the tool.
 
     Raises:
@@ -192,7 +191,7 @@ def posture(chain: Chain, q: npt.ArrayLike) -> Posture:
     )
 
 
-def forward(chain: Chain, q: npt.ArrayLike) -> Array:
+def forward(chain: Chain, q: npt.ArrayLike) -> Floats:
     """Flange pose.
 
     Args:
@@ -205,7 +204,7 @@ def forward(chain: Chain, q: npt.ArrayLike) -> Array:
     return pose_of(posture(chain, q))
 
 
-def forward_jacobian(chain: Chain, q: npt.ArrayLike, T_flange_tool: Array) -> tuple[Array, Array]:
+def forward_jacobian(chain: Chain, q: npt.ArrayLike, T_flange_tool: Floats) -> tuple[Floats, Floats]:
     """Tool pose and geometric Jacobian of the tool origin.
 
     Args:
@@ -222,7 +221,7 @@ def forward_jacobian(chain: Chain, q: npt.ArrayLike, T_flange_tool: Array) -> tu
     return T_base_tool, jacobian(at, tuple(T_base_tool[:3, 3].tolist()))
 
 
-def jacobian(at: Posture, point: Vec) -> Array:
+def jacobian(at: Posture, point: Vec) -> Floats:
     """Geometric Jacobian of a point fixed to the flange.
 
     Args:
@@ -268,7 +267,7 @@ def point_velocity(at: Posture, point: Vec, qd: npt.ArrayLike) -> Vec:
     return vx, vy, vz
 
 
-def link_transforms(chain: Chain, q: npt.ArrayLike) -> list[Array]:
+def link_transforms(chain: Chain, q: npt.ArrayLike) -> list[Floats]:
     """Frame of each link in that of the link before, (4, 4) each, m.
 
     The frame of a link is where the next joint begins, of the last link the flange: that is the frame of a standard
@@ -283,19 +282,19 @@ def link_transforms(chain: Chain, q: npt.ArrayLike) -> list[Array]:
     return [chain.fixed[0] @ links[0], *links[1:]]
 
 
-def pose_of(at: Posture) -> Array:
+def pose_of(at: Posture) -> Floats:
     """(4, 4) T_base_flange, m, of an evaluated chain."""
     (x0, x1, x2), (y0, y1, y2), (z0, z1, z2), (p0, p1, p2) = at.x, at.y, at.z, at.flange
     flat = (x0, y0, z0, p0, x1, y1, z1, p1, x2, y2, z2, p2, 0.0, 0.0, 0.0, 1.0)  # nested ones take numpy longer
     return np.array(flat).reshape(4, 4)
 
 
-def _turn_z(angle: float) -> Array:
+def _turn_z(angle: float) -> Floats:
     c, s = cos(angle), sin(angle)
     return np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
 
 
-def _motion(slides: bool, value: float) -> Array:
+def _motion(slides: bool, value: float) -> Floats:
     T = np.eye(4)
     if slides:
         T[2, 3] = value

@@ -1,17 +1,17 @@
-"""Damped least-squares inverse of the Jacobian, damped only near singular poses."""
+"""The inverse of the Jacobian by damped least squares, damped only near singular poses."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from canprobe.mechanics.robot.chain import Array
 from canprobe.mechanics.robot.inverse import LENGTH_M
+from canprobe.mechanics.types import Floats
 
 _DAMPING, _THRESHOLD = 0.05, 0.08
 """Largest damping, and the singular value below which it starts; linear rows are divided by `LENGTH_M`."""
 
 
-def damped_step(J: Array, twist: Array, wish: Array | None = None) -> Array:
+def damped_step(J: Floats, twist: Floats, wish: Floats | None = None) -> Floats:
     """Joint rates for a tool twist.
 
     Away from singular poses this is the exact inverse, of least norm where there are more joints than rows. Where the
@@ -37,11 +37,11 @@ def damped_step(J: Array, twist: Array, wish: Array | None = None) -> Array:
     U, s, Vt = np.linalg.svd(scaled, full_matrices=False)
     ratio = float(s[-1]) / _THRESHOLD
     lambda2 = _DAMPING**2 * (1.0 - ratio**2) if ratio < 1.0 else 0.0
-    step: Array = Vt.T @ ((U.T @ aim) * (s / (s * s + lambda2)))
+    step: Floats = Vt.T @ ((U.T @ aim) * (s / (s * s + lambda2)))
     return step if wish is None else step + wish - Vt.T @ (Vt @ wish)
 
 
-def _regular_step(J: Array, twist: Array) -> Array | None:
+def _regular_step(J: Floats, twist: Floats) -> Floats | None:
     """The exact inverse where it is cheap to see that no damping is due (1/‖J⁻¹‖ is below every singular value)."""
     try:
         inverse = np.linalg.inv(J)
@@ -49,5 +49,5 @@ def _regular_step(J: Array, twist: Array) -> Array | None:
         return None
     if float(np.vdot(inverse, inverse)) * _THRESHOLD**2 >= 1.0:
         return None
-    step: Array = inverse @ twist
+    step: Floats = inverse @ twist
     return step

@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from canprobe.errors import PlanError
-from canprobe.mechanics.robot.chain import Array, Chain, Convention
+from canprobe.mechanics.robot.chain import Chain, Convention
+from canprobe.mechanics.types import Floats
 
 
 def from_dh(
@@ -19,8 +20,8 @@ def from_dh(
     name: str = "arm",
     joints: Sequence[str] | None = None,
     prismatic: Sequence[bool] | None = None,
-    T_base_mount: Array | None = None,
-    T_last_flange: Array | None = None,
+    T_base_mount: Floats | None = None,
+    T_last_flange: Floats | None = None,
 ) -> Chain:
     """A chain from Denavit-Hartenberg rows.
 
@@ -61,7 +62,7 @@ def from_dh(
     )
 
 
-def dh_step(a: float, alpha: float, d: float, theta: float, *, convention: Convention = "standard") -> Array:
+def dh_step(a: float, alpha: float, d: float, theta: float, *, convention: Convention = "standard") -> Floats:
     """(4, 4) of one Denavit-Hartenberg row, m and rad, see `from_dh`."""
     ct, st, ca, sa = cos(theta), sin(theta), cos(alpha), sin(alpha)
     if convention == "standard":
@@ -71,7 +72,7 @@ def dh_step(a: float, alpha: float, d: float, theta: float, *, convention: Conve
     return np.array((*rows, (0.0, 0.0, 0.0, 1.0)))
 
 
-def rotation_rpy(roll: float, pitch: float, yaw: float) -> Array:
+def rotation_rpy(roll: float, pitch: float, yaw: float) -> Floats:
     """Rotation about the fixed axes x, then y, then z: Rz(yaw) Ry(pitch) Rx(roll), (3, 3).
 
     Args:
@@ -89,7 +90,7 @@ def rotation_rpy(roll: float, pitch: float, yaw: float) -> Array:
     )
 
 
-def tool_z_offset(offset_mm: float) -> Array:
+def tool_z_offset(offset_mm: float) -> Floats:
     """A tool frame along the flange's z axis, axes parallel.
 
     Args:

@@ -15,8 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from canprobe.errors import PlanError, install_line
-from canprobe.mechanics.robot.chain import Array, Chain
+from canprobe.mechanics.robot.chain import Chain
 from canprobe.mechanics.robot.model import Body
+from canprobe.mechanics.types import Floats
 
 GRAVITY_M_S2 = 9.81
 _PLACEHOLDER = '<inertial pos="1 2 3" quat="1 2 3 4" mass="1" diaginertia="1 1.1 1.2"/>'
@@ -41,7 +42,7 @@ def dynamics_problem(name: str, bodies: Sequence[Body | None] | None) -> str | N
     return None
 
 
-def ball(mass: float, radius: float, centre: Array) -> Body:
+def ball(mass: float, radius: float, centre: Floats) -> Body:
     """A homogeneous ball.
 
     Args:
@@ -105,7 +106,7 @@ class RigidBody:
         mujoco.mj_setConst(made, self._data)
         self._armature = np.eye(chain.n)
 
-    def terms(self, q: npt.ArrayLike, qd: npt.ArrayLike) -> tuple[Array, Array]:
+    def terms(self, q: npt.ArrayLike, qd: npt.ArrayLike) -> tuple[Floats, Floats]:
         """Mass matrix and bias.
 
         Args:
@@ -123,7 +124,7 @@ class RigidBody:
         self._mujoco.mj_fullM(made, data, mass)
         return mass - self._armature, data.qfrc_bias.copy()
 
-    def gravity(self, q: npt.ArrayLike) -> Array:
+    def gravity(self, q: npt.ArrayLike) -> Floats:
         """(n,) torque that carries the arm's weight at rest, N m or N.
 
         Args:
@@ -132,14 +133,14 @@ class RigidBody:
         return self.terms(q, np.zeros(len(self._armature)))[1]
 
 
-def _opened(mujoco: Any, T: Array, slides: bool) -> str:
+def _opened(mujoco: Any, T: Floats, slides: bool) -> str:
     """A joint's frame with its joint. The armature of 1 keeps MuJoCo's matrix regular where nothing has a mass."""
     pos, quat = (" ".join(map(repr, values.tolist())) for values in (T[:3, 3], _quaternion(mujoco, T[:3, :3])))
     joint = f'<joint type="{"slide" if slides else "hinge"}" axis="0 0 1" armature="1"/>'
     return f'<body pos="{pos}" quat="{quat}">{joint}{_PLACEHOLDER}'
 
 
-def _quaternion(mujoco: Any, R: Array) -> Array:
+def _quaternion(mujoco: Any, R: Floats) -> Floats:
     quat = np.empty(4)
     mujoco.mju_mat2Quat(quat, np.ascontiguousarray(R).ravel())
     return quat

@@ -21,8 +21,9 @@ import numpy.typing as npt
 from numpy.typing import NDArray
 
 from canprobe.errors import PlanError
-from canprobe.mechanics.robot.chain import Array, forward, forward_jacobian
+from canprobe.mechanics.robot.chain import forward, forward_jacobian
 from canprobe.mechanics.robot.model import ArmModel
+from canprobe.mechanics.types import Floats
 
 LENGTH_M = 0.2
 """Makes linear rows comparable to angular ones: about the length of a link."""
@@ -47,7 +48,7 @@ def task_rows(model: ArmModel) -> int:
     return 6 if model.n >= 6 else 5 if model.n == 5 else 3
 
 
-def in_rows(rows: int, R_base_tool: Array, six: Array) -> Array:
+def in_rows(rows: int, R_base_tool: Floats, six: Floats) -> Floats:
     """The rows that an arm can hold, of a Jacobian (6, n) or a twist (6,).
 
     Args:
@@ -73,13 +74,13 @@ _LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e8
 
 def inverse_near(
     model: ArmModel,
-    T_base_tool: Array,
-    T_flange_tool: Array,
+    T_base_tool: Floats,
+    T_flange_tool: Floats,
     q_near: npt.ArrayLike,
     *,
     max_move_rad: float = inf,
     q_rest: npt.ArrayLike | None = None,
-) -> Array:
+) -> Floats:
     """Joints within their limits that hold a tool at a pose, reached from a known posture on.
 
     Args:
@@ -99,7 +100,7 @@ def inverse_near(
     Source: Nocedal & Wright, Numerical Optimization, 10.3 (Levenberg-Marquardt), 16.7 (projected to bounds).
     """
     near = np.asarray(q_near, dtype=float)
-    pose = _Pose(model, np.asarray(T_base_tool, dtype=float), np.asarray(T_flange_tool, dtype=float))
+    pose = _PosedTool(model, np.asarray(T_base_tool, dtype=float), np.asarray(T_flange_tool, dtype=float))
     q = _reach(pose, near)
     if pose.rows < model.n:
         q = _rest(pose, q, near if q_rest is None else np.asarray(q_rest, dtype=float))
@@ -119,18 +120,18 @@ def inverse_near(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Pose:
+class _PosedTool:
     """A pose to be reached by an arm."""
 
     model: ArmModel
-    T_base_tool: Array
-    T_flange_tool: Array
+    T_base_tool: Floats
+    T_flange_tool: Floats
 
     @property
     def rows(self) -> int:
         return task_rows(self.model)
 
-    def error(self, q: Array) -> tuple[Array, Array]:
+    def error(self, q: Floats) -> tuple[Floats, Floats]:
         """What is left (rows,) and its Jacobian (rows, n), in rad: lengths are divided by `LENGTH_M`.
 
         The Jacobian is per radian of a joint, see `ArmModel.radian`.
@@ -143,7 +144,7 @@ class _Pose:
         return in_rows(rows, R, left), in_rows(rows, R, J) * self.model.radian
 
 
-def _turn(R: Array, R_aim: Array) -> Array:
+def _turn(R: Floats, R_aim: Floats) -> Floats:
     """(3,) rotation vector from one orientation to another, base frame."""
     E = R_aim @ R.T
     axis = 0.5 * np.array((E[2, 1] - E[1, 2], E[0, 2] - E[2, 0], E[1, 0] - E[0, 1]))
@@ -156,7 +157,7 @@ def _turn(R: Array, R_aim: Array) -> Array:
     return np.array(column * (pi / float(np.linalg.norm(column))))
 
 
-def _turn_of_pole(R: Array, pole: Array) -> Array:
+def _turn_of_pole(R: Floats, pole: Floats) -> Floats:
     """(3,) shortest rotation vector that brings z to a direction, base frame."""
     axis = np.cross(R[:, 2], pole)
     sine, cosine = float(np.linalg.norm(axis)), float(R[:, 2] @ pole)
@@ -165,7 +166,7 @@ def _turn_of_pole(R: Array, pole: Array) -> Array:
     return axis if cosine > 0.0 else np.array(pi * R[:, 0])
 
 
-def _reach(pose: _Pose, near: Array) -> Array:
+def _reach(pose: _PosedTool, near: Floats) -> Floats:
     """The joints where the error of a pose is least, from a posture on: Levenberg-Marquardt, joints held at stops."""
     model = pose.model
     q = np.clip(near, model.q_min, model.q_max)
@@ -186,7 +187,7 @@ def _reach(pose: _Pose, near: Array) -> Array:
     return q
 
 
-def _step(J: Array, left: Array, free: NDArray[np.bool_], damping: float) -> Array:
+def _step(J: Floats, left: Floats, free: NDArray[np.bool_], damping: float) -> Floats:
     """A damped step of the free joints, no longer than the Jacobian holds, rad."""
     A = J[:, free]
     step = np.zeros(len(free))
@@ -195,7 +196,7 @@ def _step(J: Array, left: Array, free: NDArray[np.bool_], damping: float) -> Arr
     return step
 
 
-def _rest(pose: _Pose, reached: Array, rest: Array) -> Array:
+def _rest(pose: _PosedTool, reached: Floats, rest: Floats) -> Floats:
     """Of the joints that hold a pose the ones nearest to a posture: Newton's steps towards the pose, and along the
     null space towards the posture. What was reached, where that does not settle."""
     model, q = pose.model, reached
@@ -218,7 +219,7 @@ def _rest(pose: _Pose, reached: Array, rest: Array) -> Array:
     return back if still else reached
 
 
-def _out_of_reach(pose: _Pose, q: Array) -> str:
+def _out_of_reach(pose: _PosedTool, q: Floats) -> str:
     """What is nearest, and what holds it there."""
     model, T = pose.model, forward(pose.model.chain, q) @ pose.T_flange_tool
     away = 1e3 * float(np.linalg.norm(T[:3, 3] - pose.T_base_tool[:3, 3]))
@@ -233,6 +234,6 @@ def _out_of_reach(pose: _Pose, q: Array) -> str:
     return f"{_place(pose.T_base_tool)}: out of reach of the {model.name} arm; {nearest}{because}"
 
 
-def _place(T_base_tool: Array) -> str:
+def _place(T_base_tool: Floats) -> str:
     x, y, z = (1e3 * T_base_tool[:3, 3]).tolist()
     return f"tool at ({x:.1f}, {y:.1f}, {z:.1f}) mm"

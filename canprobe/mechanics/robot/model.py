@@ -13,7 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from canprobe.errors import PlanError
-from canprobe.mechanics.robot.chain import Array, Chain
+from canprobe.mechanics.robot.chain import Chain
+from canprobe.mechanics.types import Floats
 
 METRES_PER_RADIAN = 0.2
 """Travel of a prismatic joint that counts as much as a radian of a revolute one: about the length of a link."""
@@ -80,10 +81,10 @@ class Body:
     """
 
     mass: float
-    com: Array
-    tensor: Array
+    com: Floats
+    tensor: Floats
 
-    def moved(self, T: Array) -> Body:
+    def moved(self, T: Floats) -> Body:
         """The same body in another frame.
 
         Args:
@@ -99,7 +100,7 @@ ROUNDED_KG_M2 = 1e-12
 """A moment of inertia that is 0 but for rounding."""
 
 
-def negative_inertia(tensor: Array) -> str | None:
+def negative_inertia(tensor: Floats) -> str | None:
     """Why no dynamics follow from a (3, 3) tensor: a principal moment is negative; None where none is."""
     low, _, high = np.linalg.eigvalsh(tensor).tolist()
     if low >= -max(INERTIA_TOLERANCE * high, ROUNDED_KG_M2):
@@ -107,7 +108,7 @@ def negative_inertia(tensor: Array) -> str | None:
     return f"{_principal_moments(tensor)}, of which one is negative"
 
 
-def lopsided_inertia(tensor: Array) -> str | None:
+def lopsided_inertia(tensor: Floats) -> str | None:
     """Why a (3, 3) tensor is the inertia of no body: one moment exceeds the sum of the others; None where none does."""
     low, middle, high = np.linalg.eigvalsh(tensor).tolist()
     if low + middle >= high * (1.0 - INERTIA_TOLERANCE) - ROUNDED_KG_M2:
@@ -115,7 +116,7 @@ def lopsided_inertia(tensor: Array) -> str | None:
     return f"{_principal_moments(tensor)}, of which one is larger than the sum of the others"
 
 
-def _principal_moments(tensor: Array) -> str:
+def _principal_moments(tensor: Floats) -> str:
     return f"principal moments of inertia of {', '.join(f'{one:.4g}' for one in np.linalg.eigvalsh(tensor))} kg m^2"
 
 
@@ -142,13 +143,13 @@ class ArmModel:
 
     chain: Chain
     joints: tuple[Joint, ...]
-    units_per_q: Array
-    zero_units: Array
-    q_min: Array = field(init=False)
-    q_max: Array = field(init=False)
-    qd_max: Array = field(init=False)
-    q_per_unit: Array = field(init=False)
-    radian: Array = field(init=False)
+    units_per_q: Floats
+    zero_units: Floats
+    q_min: Floats = field(init=False)
+    q_max: Floats = field(init=False)
+    qd_max: Floats = field(init=False)
+    q_per_unit: Floats = field(init=False)
+    radian: Floats = field(init=False)
 
     def __post_init__(self) -> None:
         units, zero = np.array(self.units_per_q, dtype=float), np.array(self.zero_units, dtype=float)
@@ -177,7 +178,7 @@ class ArmModel:
         """Number of joints."""
         return len(self.joints)
 
-    def _problems(self, units: Array, zero: Array) -> list[str]:
+    def _problems(self, units: Floats, zero: Floats) -> list[str]:
         n = self.chain.n
         names = [(joint.name, joint.prismatic) for joint in self.joints]
         if names != list(zip(self.chain.joints, self.chain.prismatic, strict=True)):
@@ -197,7 +198,7 @@ class ArmModel:
         return problems
 
 
-def joints_to_units(model: ArmModel, q: npt.ArrayLike) -> Array:
+def joints_to_units(model: ArmModel, q: npt.ArrayLike) -> Floats:
     """Drive positions of joint positions.
 
     Args:
@@ -207,11 +208,11 @@ def joints_to_units(model: ArmModel, q: npt.ArrayLike) -> Array:
     Returns:
         (n,) drive positions in drive units, not rounded.
     """
-    units: Array = model.units_per_q.dot(np.asarray(q, dtype=float)) + model.zero_units
+    units: Floats = model.units_per_q.dot(np.asarray(q, dtype=float)) + model.zero_units
     return units
 
 
-def units_to_joints(model: ArmModel, units: npt.ArrayLike) -> Array:
+def units_to_joints(model: ArmModel, units: npt.ArrayLike) -> Floats:
     """Joint positions of drive positions, the inverse of `joints_to_units`.
 
     Args:
@@ -221,7 +222,7 @@ def units_to_joints(model: ArmModel, units: npt.ArrayLike) -> Array:
     Returns:
         (n,) joint positions, rad or m.
     """
-    q: Array = model.q_per_unit.dot(np.asarray(units, dtype=float) - model.zero_units)
+    q: Floats = model.q_per_unit.dot(np.asarray(units, dtype=float) - model.zero_units)
     return q
 
 

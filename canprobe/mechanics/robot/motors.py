@@ -1,5 +1,7 @@
-"""Motor coordinates: the position of a drive divided by its units per own joint, so that without coupling they are the
-joint positions. Rotor inertia, friction and drive torque act there, one motor each; rigid bodies move at the joints.
+"""Motor coordinates: the position of a drive divided by its units per own joint.
+
+Without coupling they are the joint positions. Rotor inertia, friction and drive torque act there, one motor each; rigid
+bodies move at the joints.
 """
 
 from __future__ import annotations
@@ -9,11 +11,12 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from canprobe.mechanics.robot.chain import Array, forward_jacobian
+from canprobe.mechanics.robot.chain import forward_jacobian
 from canprobe.mechanics.robot.model import ArmModel
+from canprobe.mechanics.types import Floats
 
 
-def units_per_motor(model: ArmModel) -> Array:
+def units_per_motor(model: ArmModel) -> Floats:
     """(n,) drive units per motor coordinate, negative where a drive counts backwards.
 
     Args:
@@ -22,7 +25,7 @@ def units_per_motor(model: ArmModel) -> Array:
     return np.diag(model.units_per_q).copy()
 
 
-def joints_per_motor(model: ArmModel) -> Array:
+def joints_per_motor(model: ArmModel) -> Floats:
     """(n, n) joint positions per motor coordinate.
 
     Args:
@@ -31,7 +34,7 @@ def joints_per_motor(model: ArmModel) -> Array:
     return np.array(model.q_per_unit * units_per_motor(model), dtype=np.float64)
 
 
-def position_sigma(model: ArmModel, q: npt.ArrayLike, T_flange_tool: Array, direction: npt.ArrayLike) -> float:
+def position_sigma(model: ArmModel, q: npt.ArrayLike, T_flange_tool: Floats, direction: npt.ArrayLike) -> float:
     """Standard deviation of the tool's position along a direction, m, as drives round to whole units.
 
     Args:
@@ -45,8 +48,8 @@ def position_sigma(model: ArmModel, q: npt.ArrayLike, T_flange_tool: Array, dire
     return float(np.linalg.norm(position_per_unit(model, q, T_flange_tool, direction))) / math.sqrt(12.0)
 
 
-def position_per_unit(model: ArmModel, q: npt.ArrayLike, T_flange_tool: Array, direction: npt.ArrayLike) -> Array:
+def position_per_unit(model: ArmModel, q: npt.ArrayLike, T_flange_tool: Floats, direction: npt.ArrayLike) -> Floats:
     """(n,) by how much a unit of each drive moves the tool along a direction, m; arguments as of `position_sigma`."""
     _, J = forward_jacobian(model.chain, q, T_flange_tool)
-    per_unit: Array = np.asarray(direction, dtype=float) @ J[:3] @ model.q_per_unit
+    per_unit: Floats = np.asarray(direction, dtype=float) @ J[:3] @ model.q_per_unit
     return per_unit

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from canprobe.mechanics.robot.chain import Array, forward
+from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.inverse import inverse_near
 from canprobe.mechanics.robot.model import ArmModel
+from canprobe.mechanics.types import Floats
 
 
-def probe_pose(point: npt.ArrayLike, normal: npt.ArrayLike, centre_height_m: float, x_hint: npt.ArrayLike) -> Array:
+def probe_pose(point: npt.ArrayLike, normal: npt.ArrayLike, centre_height_m: float, x_hint: npt.ArrayLike) -> Floats:
     """Probe frame above a surface point, pole (z) against the outward normal.
 
     Args:
@@ -47,9 +48,9 @@ def start_posture(
     q_near: npt.ArrayLike,
     *,
     radius_m: float,
-    T_flange_probe: Array,
+    T_flange_probe: Floats,
     clearance_m: float = 0.0,
-) -> Array:
+) -> Floats:
     """Joints that hold the probe over a surface point, pole against the normal, from a known posture on.
 
     The turn about the normal is free: it is what `q_near` has.

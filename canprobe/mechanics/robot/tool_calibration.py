@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.errors import UsageError
+from canprobe.mechanics.types import Floats
 
-Array = NDArray[np.float64]
 LENGTH = 1e-3
 ANGLE = 1e-2
 _SCALE = np.array([LENGTH] * 7 + [ANGLE] * 2)
@@ -41,8 +41,8 @@ class BallTouch:
         depth: indentation of the layer, m.
     """
 
-    T_base_flange: Array
-    d_flange: Array
+    T_base_flange: Floats
+    d_flange: Floats
     depth: float
 
 
@@ -62,8 +62,8 @@ class BallModel:
         observed_below: standard deviation of a coordinate of the tool centre below which it counts as observed, m.
     """
 
-    t_flange: Array
-    c_base: Array
+    t_flange: Floats
+    c_base: Floats
     radii: float
     sigma_c: float = 5e-3
     sigma_radii: float = 50e-6
@@ -90,12 +90,12 @@ class ToolEstimate:
         touches: how many.
     """
 
-    t_flange: Array
-    covariance: Array
+    t_flange: Floats
+    covariance: Floats
     observed: NDArray[np.bool_]
-    c_base: Array
+    c_base: Floats
     radii_error: float
-    tilt: Array
+    tilt: Floats
     condition_number: float
     along_rms: float
     across_rms: float
@@ -103,9 +103,9 @@ class ToolEstimate:
     touches: int
 
     @property
-    def sigma(self) -> Array:
+    def sigma(self) -> Floats:
         """Standard deviation of each coordinate (3,), m."""
-        sigma: Array = np.sqrt(np.diag(self.covariance))
+        sigma: Floats = np.sqrt(np.diag(self.covariance))
         return sigma
 
 
@@ -136,7 +136,7 @@ def calibrate_tool(touches: Sequence[BallTouch], model: BallModel) -> ToolEstima
     return _estimate(touches, model, x, r, J)
 
 
-def residual(touch: BallTouch, model: BallModel, x: Array) -> tuple[Array, Array]:
+def residual(touch: BallTouch, model: BallModel, x: Floats) -> tuple[Floats, Floats]:
     """Where a touch puts the ball's centre less where it is, and its derivative by the unknowns.
 
     Args:
@@ -160,7 +160,7 @@ def residual(touch: BallTouch, model: BallModel, x: Array) -> tuple[Array, Array
     return p + R @ (x[_T] + reach * turned) - x[_C], J
 
 
-def _rows(touches: Sequence[BallTouch], model: BallModel, x: Array, x0: Array) -> tuple[Array, Array]:
+def _rows(touches: Sequence[BallTouch], model: BallModel, x: Floats, x0: Floats) -> tuple[Floats, Floats]:
     """Whitened residuals (3n + 6,) and their derivative: the touches, then the priors on all but the tool centre."""
     blocks, slopes = [], []
     for touch in touches:
@@ -176,7 +176,7 @@ def _rows(touches: Sequence[BallTouch], model: BallModel, x: Array, x0: Array) -
     return np.concatenate([*blocks, (x - x0)[3:] / sigma]), np.concatenate([*slopes, prior])
 
 
-def _estimate(touches: Sequence[BallTouch], model: BallModel, x: Array, r: Array, J: Array) -> ToolEstimate:
+def _estimate(touches: Sequence[BallTouch], model: BallModel, x: Floats, r: Floats, J: Floats) -> ToolEstimate:
     _, s, Vt = np.linalg.svd(J * _SCALE, full_matrices=False)
     known = s > s[0] * 1e-12
     condition = float(s[0] / s[-1]) if known.all() else float("inf")
@@ -216,11 +216,11 @@ class BallApproach:
         pole_base: (3,) unit vector of the probe's pole during the touch.
     """
 
-    n_base: Array
-    pole_base: Array
+    n_base: Floats
+    pole_base: Floats
 
 
-def ball_approaches(count: int, tilt: float, beside: float, up: Array) -> list[BallApproach]:
+def ball_approaches(count: int, tilt: float, beside: float, up: Floats) -> list[BallApproach]:
     """Touches all round a ball: on a ring about its top, each beside the pole of the probe in another direction.
 
     Neighbours on the ball are neighbours in the list. From one to the next the direction beside the pole turns by the

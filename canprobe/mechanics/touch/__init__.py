@@ -4,20 +4,34 @@
        patch/image, moments     contact          estimate/    estimate/answer      surface_map            consistency
                                    └──────────────────────────────► servo ◄─ curvature
 
-- `patch/` reads images: force, centroid, moments, and curvature from them.
-- `contact` places a touch: from the centroid on the wrapped pad to the object's point and normal in base, through the
-  squeezed layer; it finds the layer's stiffness from a push.
-- `estimate/` finds the local shape from contacts, online and in batches, with what was not observed.
-- `probe_motion` has the ways between poses of the probe, and the joint steps that follow them.
-- `servo` follows the surface: a local surface that the samples correct, strategies that lead over it, the next pose.
-- `surface_map` keeps a scan as local patches, `blend` makes one surface of them, `meshing` triangles of that;
-  `consistency` compares passes where they cross.
-- `surface` is the gauge in which every second-order surface is written: XᵀSX = 0 with S symmetric (4, 4), f < 0
-  inside, in its own contact frame c14 = c24 = c44 = 0 and c34 = −½, so that K = 2 [[c11, c12], [c12, c22]] is the
-  curvature.
-- `objects` and `shapes` are the true objects of the emulation and of scores: closest point, normal and curvature. No
-  estimator knows them.
+Reading a touch:
 
-SI units, base frame unless a name says otherwise. z of a contact frame is the inward normal; κ > 0 is convex. Source:
-Chen, Rink, Zhang, "Local Object Shape From Tactile Sensing", with the corrections that the docstrings name.
+    pad               where the taxels are, and what their counts mean
+    patch/            images: force, centroid, moments, and curvature from them
+    contact           from the centroid on the wrapped pad to the object's point and normal in base
+    layer_stiffness   the stiffness of the layer from a push
+    at_rest, stops    what a touch at rest shows, and the limits at which a touch ends
+
+Shape:
+
+    surface           second-order surfaces in one gauge: XᵀSX = 0 with S symmetric (4, 4), f < 0 inside
+    estimate/         local shape from contacts, online and in batches, with what was not observed
+    surface_map       a whole scan as local patches
+    blend, meshing    one surface of those patches, and triangles of it
+    crossings         a χ² test where a path crosses itself; `consistency` gives one verdict on all crossings
+    linear_algebra, tangent_frames   small matrices, input checks, frames on a tangent plane
+
+Motion:
+
+    servo             a local surface that the samples correct, and the next pose of the probe
+    strategies        where the contact goes next
+    probe_motion      ways between poses, and the joint steps that follow them
+
+True objects, which no estimator knows: `shapes` (a shape at a pose; bowl, wave, fillet, torus), `objects` (by name, and
+the quadrics), `heights` (a spline over a grid), `mesh_fit` (such a spline from a mesh).
+
+Invariants: SI units, base frame unless a name says otherwise. z of a contact frame is the inward normal; in its own
+contact frame a surface has c14 = c24 = c44 = 0 and c34 = −½, so that K = 2 [[c11, c12], [c12, c22]] is the curvature;
+κ > 0 is convex. Source: Chen, Rink, Zhang, "Local Object Shape From Tactile Sensing", with the corrections that the
+docstrings name. Start reading at `contact`, then `estimate/`.
 """

@@ -1,4 +1,4 @@
-"""What the samples of a touch at rest say against going on: a force that swings, an array that cannot show it."""
+"""What the samples of a touch at rest say against going on: the force swings, or the array cannot show it."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from canprobe.mechanics.touch.linear_algebra import Array
+from canprobe.mechanics.types import Floats
 
 REACH_M = 4e-3
 """Default distance from a contact at which its patch no longer counts, m."""
@@ -49,10 +49,10 @@ class Feet(NamedTuple):
         patches: (n,) how many were blended.
     """
 
-    point: Array
-    normal: Array
-    height: Array
-    sigma: Array
+    point: Floats
+    normal: Floats
+    height: Floats
+    sigma: Floats
     patches: NDArray[np.intp]
 
 
@@ -66,23 +66,23 @@ class Quadrics(NamedTuple):
         known: (m,) whether the patch knows its height.
     """
 
-    R: Array
-    contact: Array
-    normal: Array
-    B: Array
-    h: Array
-    covariance: Array
+    R: Floats
+    contact: Floats
+    normal: Floats
+    B: Floats
+    h: Floats
+    covariance: Floats
     known: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, T: Array, S: Array, covariance: Array, known: NDArray[np.bool_]) -> Quadrics:
+    def of(cls, T: Floats, S: Floats, covariance: Floats, known: NDArray[np.bool_]) -> Quadrics:
         """Of contact frames and matrices (m, 4, 4); covariances (m, 9, 9), of those that know their height."""
         R, covariance = T[:, :3, :3], covariance.copy()
         covariance[~known, 2, 2] = UNKNOWN_M**2
         B = 2.0 * R @ S[:, :3, :3] @ R.transpose(0, 2, 1)
         return cls(R, T[:, :3, 3], -R[:, :, 2], B, 2.0 * _times(R, S[:, :3, 3]), covariance, known)
 
-    def heights(self, i: NDArray[np.intp], p: Array, d: Array) -> tuple[Array, Array, Array, Array]:
+    def heights(self, i: NDArray[np.intp], p: Floats, d: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Where the lines p + t d meet the patches i: t (m), outward normals, variances of t (m²), and `g`."""
         x, B, h = p - self.contact[i], self.B[i], self.h[i]
         Bx, Bd = _times(B, x), _times(B, d)
@@ -102,23 +102,23 @@ class Quadrics(NamedTuple):
         return t, g / np.sqrt(_dot(g, g))[:, None], variance, _eased(limb) * _eased(facing)
 
 
-def _dot(a: Array, b: Array) -> Array:
-    result: Array = np.einsum("ij,ij->i", a, b)
+def _dot(a: Floats, b: Floats) -> Floats:
+    result: Floats = np.einsum("ij,ij->i", a, b)
     return result
 
 
-def _times(A: Array, x: Array) -> Array:
-    result: Array = np.einsum("nij,nj->ni", A, x)
+def _times(A: Floats, x: Floats) -> Floats:
+    result: Floats = np.einsum("nij,nj->ni", A, x)
     return result
 
 
-def _eased(x: Array) -> Array:
+def _eased(x: Floats) -> Floats:
     """0 below 0, 1 above 1, between them with slopes that end at 0."""
     x = np.clip(x, 0.0, 1.0)
     return x * x * (3.0 - 2.0 * x)
 
 
-def feet_on(patches: Quadrics, points: Array, reach: float) -> Feet:
+def feet_on(patches: Quadrics, points: Floats, reach: float) -> Feet:
     """Closest points of the blend of patches to points (n, 3), base frame, m."""
     n = len(points)
     places, numbers = np.full((2, n, 3), math.nan), np.full((2, n), math.nan)
@@ -146,7 +146,7 @@ def feet_on(patches: Quadrics, points: Array, reach: float) -> Feet:
             share = weight / np.bincount(row, weight, len(left))[row]
         known = patches.known[patch]
         columns = (height, known * np.sqrt(variance), known, *outward.T)
-        blend: Array = np.array([np.bincount(row, share * column, len(left)) for column in columns])
+        blend: Floats = np.array([np.bincount(row, share * column, len(left)) for column in columns])
         height, sigma, knowing = blend[:3]
         foot = points[left] + height[:, None] * normal
         before, normal = normal, blend[3:].T

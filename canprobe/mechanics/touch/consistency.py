@@ -11,8 +11,9 @@ import numpy as np
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.blend import FACING
 from canprobe.mechanics.touch.crossings import NOTHING, ChiSquared, Crossing, _tested, compare
-from canprobe.mechanics.touch.linear_algebra import Array, positive
+from canprobe.mechanics.touch.linear_algebra import positive
 from canprobe.mechanics.touch.surface_map import SurfaceMap
+from canprobe.mechanics.types import Floats
 
 RADIUS_M = 2e-3
 """Default largest distance between the contacts of a crossing, m."""
@@ -112,15 +113,15 @@ def find_crossings(surface_map: SurfaceMap, *, radius: float = RADIUS_M, gap: fl
     ]
 
 
-def _headings(surface_map: SurfaceMap) -> Array:
+def _headings(surface_map: SurfaceMap) -> Floats:
     """(n, 3) unit direction of travel at each patch, from the patch before; the first as the second; NaN at rest."""
     steps = np.diff(surface_map.points, axis=0)
     sizes = np.linalg.norm(steps, axis=1, keepdims=True)
-    headings: Array = steps / np.where(sizes > 0.0, sizes, math.nan)
+    headings: Floats = steps / np.where(sizes > 0.0, sizes, math.nan)
     return np.concatenate([headings[:1], headings])
 
 
-def _angle(a: Array, b: Array) -> float:
+def _angle(a: Floats, b: Floats) -> float:
     return math.atan2(float(np.linalg.norm(np.cross(a, b))), float(a @ b))
 
 

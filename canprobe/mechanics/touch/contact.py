@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.linear_algebra import Array, positive
+from canprobe.mechanics.touch.linear_algebra import positive
+from canprobe.mechanics.types import Floats
 
 
 class Doubt(Enum):
@@ -56,10 +57,10 @@ class ContactSample:
     """
 
     t_s: float
-    p_base: Array
-    n_base: Array
-    T_base_probe: Array
-    r_probe: Array
+    p_base: Floats
+    n_base: Floats
+    T_base_probe: Floats
+    r_probe: Floats
     force_n: float
     sigma_point: float | None = None
     sigma_normal: float | None = None
@@ -69,7 +70,7 @@ class ContactSample:
     slope: Slope | None = None
 
 
-def pad_to_direction(u: float, v: float, radius: float) -> Array:
+def pad_to_direction(u: float, v: float, radius: float) -> Floats:
     """Direction (3,) of a pad point (u, v), m, as seen from the sphere's centre, in the probe frame.
 
     The flat array is wrapped azimuthal-equidistantly: the exponential map of (u, v)/R_p at the pole, R_p the radius.
@@ -83,7 +84,7 @@ def _direction(u: float, v: float, radius: float) -> tuple[float, float, float]:
     return u * scale, v * scale, math.cos(angle)
 
 
-def direction_to_pad(direction: Sequence[float] | Array, radius: float) -> tuple[float, float]:
+def direction_to_pad(direction: Sequence[float] | Floats, radius: float) -> tuple[float, float]:
     """Pad coordinates (u, v) in m of a direction (3,) in the probe frame: the logarithmic map at the pole."""
     x, y, z = float(direction[0]), float(direction[1]), float(direction[2])
     sine = math.hypot(x, y)
@@ -92,8 +93,8 @@ def direction_to_pad(direction: Sequence[float] | Array, radius: float) -> tuple
 
 
 def contact_on_object(
-    T_base_probe: Array, direction: Sequence[float], radius: float, depth: float
-) -> tuple[Array, Array]:
+    T_base_probe: Floats, direction: Sequence[float], radius: float, depth: float
+) -> tuple[Floats, Floats]:
     """The object's contact point and outward normal in base, through the squeezed layer (13), (14), (20).
 
     `p = centre + (R_p − δ) n_f` and `n_o = −n_f`, (3,) each, n_f along a direction (3,) of the probe frame (4, 4).
@@ -108,8 +109,8 @@ def contact_on_object(
 def contact_sample(
     *,
     t_s: float,
-    T_base_probe: Array,
-    uv: Sequence[float] | Array,
+    T_base_probe: Floats,
+    uv: Sequence[float] | Floats,
     depth: float,
     radius: float,
     force_n: float,

@@ -30,10 +30,10 @@ import numpy as np
 from canprobe.mechanics.touch.estimate.observed import turned
 from canprobe.mechanics.touch.estimate.quadric import TO_Q
 from canprobe.mechanics.touch.estimate.residuals import curvature_jacobian, transport
-from canprobe.mechanics.touch.linear_algebra import Array
 from canprobe.mechanics.touch.surface import SurfaceMatrix
 from canprobe.mechanics.touch.surface_map import LocalPatch
 from canprobe.mechanics.touch.tangent_frames import homogeneous, inverse_transform, tangent_rotation
+from canprobe.mechanics.types import Floats
 
 _UNSEEN = 0.05
 """Largest part of a unit combination that either pass may have left unobserved."""
@@ -77,9 +77,9 @@ class Crossing:
     gap_m: float
     distance_m: float
     angle: float
-    T_base_common: Array
-    difference: Array
-    covariance: Array
+    T_base_common: Floats
+    difference: Floats
+    covariance: Floats
     curvature: ChiSquared
     normal: ChiSquared
     height: ChiSquared
@@ -89,9 +89,9 @@ class Crossing:
 class _Jet(NamedTuple):
     """Height, slopes and K (6,) over the origin of a frame, their covariance, and what was not observed of q (m, 3)."""
 
-    values: Array
-    covariance: Array
-    hidden: Array
+    values: Floats
+    covariance: Floats
+    hidden: Floats
 
 
 def compare(a: LocalPatch, b: LocalPatch, first: int = 0, second: int = 1, angle: float = math.nan) -> Crossing:
@@ -124,7 +124,7 @@ def compare(a: LocalPatch, b: LocalPatch, first: int = 0, second: int = 1, angle
     )
 
 
-def _jet(patch: LocalPatch, T_base_common: Array) -> _Jet:
+def _jet(patch: LocalPatch, T_base_common: Floats) -> _Jet:
     T = inverse_transform(patch.T_base_contact) @ T_base_common
     c, M = transport(patch.c, T)
     surface = SurfaceMatrix(T.T @ patch.S @ T)
@@ -146,7 +146,7 @@ def _jet(patch: LocalPatch, T_base_common: Array) -> _Jet:
     )
 
 
-def _seen_by_both(hidden_a: Array, hidden_b: Array) -> Array:
+def _seen_by_both(hidden_a: Floats, hidden_b: Floats) -> Floats:
     """(k, 6) rows that pick the combinations of K of which neither pass left more than `_UNSEEN` open."""
     _, size, Vt = np.linalg.svd(np.concatenate([hidden_a, hidden_b]))
     seen = Vt[size < _UNSEEN]
@@ -155,7 +155,7 @@ def _seen_by_both(hidden_a: Array, hidden_b: Array) -> Array:
     return rows
 
 
-def _chi_squared(rows: Array, d: Array, C: Array) -> ChiSquared:
+def _chi_squared(rows: Floats, d: Floats, C: Floats) -> ChiSquared:
     if not len(rows):
         return NOTHING
     e, V = rows @ d, rows @ C @ rows.T

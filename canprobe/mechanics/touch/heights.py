@@ -17,7 +17,8 @@ from math import atan2, ceil, cos, hypot, inf, sin, sqrt
 import numpy as np
 import numpy.typing as npt
 
-from canprobe.mechanics.touch.shapes import Array, Foot, PlacedShape, Touches, Vec, require_positive
+from canprobe.mechanics.touch.shapes import Foot, PlacedShape, TouchedPlaces, require_positive
+from canprobe.mechanics.types import Floats, Vec
 
 LEAST_NODES = 8
 """Along each side of a grid."""
@@ -55,7 +56,7 @@ class Spline:
         corner: (2,) x and y of the first height, m.
     """
 
-    def __init__(self, heights: Array, spacing: float, corner: tuple[float, float]) -> None:
+    def __init__(self, heights: Floats, spacing: float, corner: tuple[float, float]) -> None:
         self.shape, self.spacing, self.corner = heights.shape, spacing, corner
         coefficients = _coefficients(_coefficients(heights).T).T
         self._flat = np.ascontiguousarray(coefficients).ravel()
@@ -92,7 +93,7 @@ class Spline:
         square = scale * scale
         return z, zx * scale, zy * scale, zxx * square, zxy * square, zyy * square
 
-    def many(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
+    def many(self, x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
         """Heights and slopes along x and y of points, each (k,), of the grid's area."""
         m, n = self.shape
         s, t = (x - self.corner[0]) / self.spacing, (y - self.corner[1]) / self.spacing
@@ -109,7 +110,7 @@ class Spline:
         return z, zx / self.spacing, zy / self.spacing
 
 
-def _weights(t: Array) -> tuple[list[Array], list[Array]]:
+def _weights(t: Floats) -> tuple[list[Floats], list[Floats]]:
     """The four cubic B-splines over a cell at t in 0 … 1, and their slopes."""
     p = 1.0 - t
     inner = (2.0 / 3.0 - one * one * (1.0 - 0.5 * one) for one in (t, p))
@@ -121,7 +122,7 @@ def _weights(t: Array) -> tuple[list[Array], list[Array]]:
     ]
 
 
-def _coefficients(f: Array) -> Array:
+def _coefficients(f: Floats) -> Floats:
     """(n + 2, …) B-spline coefficients of the cubic spline through (n, …) values, along the first axis.
 
     With not-a-knot ends the second coefficient from each end follows from three values, and the rest from
@@ -191,7 +192,7 @@ class Heights(PlacedShape):
         self.spline = Spline(z, spacing, corner)
         self._fill_nodes(z, there)
 
-    def _fill_nodes(self, heights: Array, there: npt.NDArray[np.bool_] | None) -> None:
+    def _fill_nodes(self, heights: Floats, there: npt.NDArray[np.bool_] | None) -> None:
         """Nodes of the search: positions, heights and slopes."""
         spline = self.spline
         bend = max(float(np.abs(np.diff(heights, 2, axis=axis)).max()) for axis in (0, 1)) / spline.spacing**2
@@ -327,7 +328,7 @@ class Heights(PlacedShape):
         tightest = self._foot_at((0.0, 0.0, 0.0, self.spline.at(0.0, 0.0)), 0.0, 0.0, 0.0)[8]
         return -1.0 / tightest if tightest < -1e-12 else inf
 
-    def touches(self, point_base: npt.ArrayLike, reach: float) -> Touches | None:
+    def touches(self, point_base: npt.ArrayLike, reach: float) -> TouchedPlaces | None:
         """Every local minimum of the distance within reach, where there are several: edges of a groove, say."""
         x, y, z = self._to_object(np.asarray(point_base, dtype=float)[None])[0].tolist()
         near = [place for place in self._minima(x, y, z, reach) if place[0] < reach * reach]
@@ -336,7 +337,7 @@ class Heights(PlacedShape):
         feet = np.array([self._foot_at(place, x, y, z) for place in near])
         return self._placed(feet[:, :3], feet[:, 3:6], feet[:, 6], feet[:, 7:9], np.zeros(len(feet)))
 
-    def gaps(self, points_base: Array) -> Array:
+    def gaps(self, points_base: Floats) -> Floats:
         """Distances of (n, 3) points to the tangent over or under them, (n,) m: first order near the surface.
 
         Of points higher than all of the surface near them it is only known that they do not touch; 1 m stands for that.
@@ -350,7 +351,7 @@ class Heights(PlacedShape):
         gaps[near] = (z[near] - height) / np.sqrt(1.0 + along * along + across * across)
         return gaps
 
-    def exists(self, x: Array, y: Array) -> npt.NDArray[np.bool_]:
+    def exists(self, x: Floats, y: Floats) -> npt.NDArray[np.bool_]:
         """(k,) whether there is a surface over (k,) points x and y of the object's frame, m."""
         inside: npt.NDArray[np.bool_] = (x >= self._x[0]) & (x <= self._x[-1]) & (y >= self._y[0]) & (y <= self._y[-1])
         if self._cells is not None:

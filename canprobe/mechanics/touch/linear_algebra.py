@@ -12,18 +12,17 @@ from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.linalg.lapack import dgeqrf, dgesv, dpotrf, dsyev, dtrtri
 
 from canprobe.errors import UsageError
+from canprobe.mechanics.types import Floats
 
-Array = NDArray[np.float64]
-Vec = tuple[float, float, float]
 _T = TypeVar("_T")
 _UPPER, _IDENTITY = np.triu(np.ones((16, 16))), np.eye(16)
 
 
-def upper_root(A: Array) -> Array:
+def upper_root(A: Floats) -> Floats:
     """The upper triangular R of a QR decomposition, Rᵀ R = Aᵀ A."""
     qr, _, _, _ = dgeqrf(A)
     R = qr[: min(A.shape)]
@@ -31,31 +30,31 @@ def upper_root(A: Array) -> Array:
     return R * _UPPER[:n, :m] if m <= len(_UPPER) else np.triu(R)
 
 
-def solved(A: Array, B: Array) -> Array:
+def solved(A: Floats, B: Floats) -> Floats:
     """A⁻¹ B; numpy's LinAlgError where A is singular."""
-    X: Array
+    X: Floats
     _, _, X, info = dgesv(A, B)
     if info > 0:
         raise np.linalg.LinAlgError("singular matrix")
     return X
 
 
-def inverted(A: Array) -> Array:
+def inverted(A: Floats) -> Floats:
     """A⁻¹; numpy's LinAlgError where A is singular."""
     n = len(A)
     return solved(A, _IDENTITY[:n, :n] if n <= len(_IDENTITY) else np.eye(n))
 
 
-def inverted_upper(R: Array) -> Array:
+def inverted_upper(R: Floats) -> Floats:
     """R⁻¹ of an upper triangular R; numpy's LinAlgError where it is singular."""
-    result: Array
+    result: Floats
     result, info = dtrtri(R)
     if info > 0:
         raise np.linalg.LinAlgError("singular matrix")
     return result
 
 
-def eigen(A: Array) -> tuple[Array, Array]:
+def eigen(A: Floats) -> tuple[Floats, Floats]:
     """Eigenvalues of a symmetric matrix, the least first, and eigenvectors as columns; LinAlgError if not finite."""
     values, vectors, info = dsyev(A, lower=1)
     if info != 0:
@@ -63,7 +62,7 @@ def eigen(A: Array) -> tuple[Array, Array]:
     return values, vectors
 
 
-def principal(A: Array) -> tuple[float, float, float]:
+def principal(A: Floats) -> tuple[float, float, float]:
     """Mean and half difference of the eigenvalues of a symmetric (2, 2), and the angle (rad) of the larger one."""
     (a, b), (_, d) = A.tolist()
     return principal_of(a, b, d)
@@ -75,23 +74,23 @@ def principal_of(a: float, b: float, d: float) -> tuple[float, float, float]:
     return 0.5 * (a + d), math.hypot(half, b), 0.5 * math.atan2(b, half)
 
 
-def lower_root(A: Array) -> Array:
+def lower_root(A: Floats) -> Floats:
     """The lower triangular L of a Cholesky decomposition, L Lᵀ = A; LinAlgError where A is not positive definite."""
-    L: Array
+    L: Floats
     L, info = dpotrf(A, lower=1)
     if info != 0:
         raise np.linalg.LinAlgError("matrix is not positive definite")
     return L
 
 
-def read_only(values: ArrayLike) -> Array:
+def read_only(values: ArrayLike) -> Floats:
     """A private copy that nobody can write to."""
     array = np.array(values, dtype=np.float64)
     array.flags.writeable = False
     return array
 
 
-def real_numbers(values: Any) -> Array:
+def real_numbers(values: Any) -> Floats:
     """Values as floats.
 
     Raises:
@@ -107,7 +106,7 @@ def real_numbers(values: Any) -> Array:
         raise ValueError(str(error)) from error
 
 
-def real(name: str, values: Any, form: str = "") -> Array:
+def real(name: str, values: Any, form: str = "") -> Floats:
     """Values as floats, of any shape and also NaN; else a UsageError that names the field."""
     try:
         return real_numbers(values)
@@ -121,7 +120,7 @@ MAX_LENGTH = 1e12
 """Of points and standard deviations, in any unit: beyond, an estimate would be rounding."""
 
 
-def checked(name: str, values: Any, shape: Sequence[int | None]) -> Array:
+def checked(name: str, values: Any, shape: Sequence[int | None]) -> Floats:
     """Values as floats of a shape (None: any length), all finite; else a UsageError that names the field."""
     if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
         raise UsageError(f"{name}: expected numbers, got masked ones; leave those rows out")

@@ -19,7 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from canprobe.mechanics.touch.heights import LEAST_NODES, Heights
-from canprobe.mechanics.touch.shapes import Array, require_positive
+from canprobe.mechanics.touch.shapes import require_positive
+from canprobe.mechanics.types import Floats
 
 Index = npt.NDArray[np.intp]
 
@@ -47,7 +48,7 @@ _STIFFNESS = 1e-7
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fit:
+class HeightGrid:
     """Heights of a mesh over a grid, as `Heights` takes them.
 
     Attributes:
@@ -57,13 +58,13 @@ class Fit:
         there: (m, n) whether the mesh has a surface at a node.
     """
 
-    heights: Array
+    heights: Floats
     spacing: float
     origin: tuple[float, float]
     there: npt.NDArray[np.bool_]
 
 
-class Mesh(Heights):
+class MeshHeights(Heights):
     """A mesh, seen from +z of its frame.
 
     Args:
@@ -86,7 +87,9 @@ class Mesh(Heights):
         super().__init__(T_base_object, fit.heights, fit.spacing, fit.origin, fit.there)
 
 
-def fit_mesh(vertices: npt.ArrayLike, faces: npt.ArrayLike, spacing: float, origin: npt.ArrayLike | None = None) -> Fit:
+def fit_mesh(
+    vertices: npt.ArrayLike, faces: npt.ArrayLike, spacing: float, origin: npt.ArrayLike | None = None
+) -> HeightGrid:
     """Heights of a mesh over x and y.
 
     Args:
@@ -118,7 +121,7 @@ def fit_mesh(vertices: npt.ArrayLike, faces: npt.ArrayLike, spacing: float, orig
     return _fitted(samples[seen], weights[seen], facing[:, :, :2], spacing, at)
 
 
-def _merged(points: Array, corners: Index) -> tuple[Array, Index]:
+def _merged(points: Floats, corners: Index) -> tuple[Floats, Index]:
     """Vertices at one place are one vertex, which STL files do not say."""
     if points.ndim != 2 or points.shape[1] != 3 or corners.ndim != 2 or corners.shape[1] != 3 or not len(corners):
         raise ValueError(f"a mesh needs vertices (k, 3) and faces (f, 3), got {points.shape} and {corners.shape}")
@@ -133,7 +136,7 @@ def _merged(points: Array, corners: Index) -> tuple[Array, Index]:
     return unique, places.reshape(-1)[corners]
 
 
-def _refuse_inside_out(points: Array, corners: Index) -> None:
+def _refuse_inside_out(points: Floats, corners: Index) -> None:
     """Only a closed mesh has a volume, whose sign tells."""
     ends = np.concatenate((corners[:, (0, 1)], corners[:, (1, 2)], corners[:, (2, 0)]))
     there = np.unique(ends[:, 0] * len(points) + ends[:, 1])
@@ -144,7 +147,7 @@ def _refuse_inside_out(points: Array, corners: Index) -> None:
             raise ValueError("the mesh is inside out (its volume is negative): turn its faces round")
 
 
-def _refuse_coarse(points: Array, corners: Index, normals: Array) -> None:
+def _refuse_coarse(points: Floats, corners: Index, normals: Floats) -> None:
     ends = np.sort(np.concatenate((corners[:, (0, 1)], corners[:, (1, 2)], corners[:, (2, 0)])), axis=1)
     faces = np.tile(np.arange(len(corners)), 3)
     order = np.lexsort(ends.T)
@@ -161,7 +164,7 @@ def _refuse_coarse(points: Array, corners: Index, normals: Array) -> None:
         )
 
 
-def _samples(points: Array, corners: Index, normals: Array, up: npt.NDArray[np.bool_], apart: float) -> Array:
+def _samples(points: Floats, corners: Index, normals: Floats, up: npt.NDArray[np.bool_], apart: float) -> Floats:
     """(k, 3) points of curved triangles where the vertices are farther apart than `apart`, m."""
     edges = _corner_normals(points, corners, normals)[up]
     triangles = points[corners[up]]
@@ -176,7 +179,7 @@ def _samples(points: Array, corners: Index, normals: Array, up: npt.NDArray[np.b
     return np.concatenate(found)
 
 
-def _corner_normals(points: Array, corners: Index, normals: Array) -> Array:
+def _corner_normals(points: Floats, corners: Index, normals: Floats) -> Floats:
     """(f, 3, 3) normal of the body at each corner of each facet, from the facets there that no edge parts from it.
 
     The weights are exact on a ball.
@@ -202,7 +205,7 @@ def _corner_normals(points: Array, corners: Index, normals: Array) -> Array:
     return corner.reshape(-1, 3, 3)
 
 
-def _curved(triangles: Array, normals: Array, parts: int) -> Array:
+def _curved(triangles: Floats, normals: Floats, parts: int) -> Floats:
     """(k, 3) points of PN triangles (f, 3, 3) with normals (f, 3, 3) at their corners, `parts` along each side."""
     i, j = (axis.ravel() for axis in np.meshgrid(np.arange(parts + 1), np.arange(parts + 1), indexing="ij"))
     inside = i + j <= parts
@@ -218,11 +221,11 @@ def _curved(triangles: Array, normals: Array, parts: int) -> Array:
             on_sides += control / 6.0
     middle = 1.5 * on_sides - 0.5 * triangles.mean(axis=1)
     points += 6.0 * (share[0] * share[1] * share[2])[None, :, None] * middle[:, None]
-    flat: Array = points.reshape(-1, 3)
+    flat: Floats = points.reshape(-1, 3)
     return flat
 
 
-def _seen(samples: Array, spacing: float) -> npt.NDArray[np.bool_]:
+def _seen(samples: Floats, spacing: float) -> npt.NDArray[np.bool_]:
     """(k,) the samples that no others hide from +z."""
     cells = np.floor(samples[:, :2] / spacing).astype(np.int64)
     _, cell = np.unique(cells, axis=0, return_inverse=True)
@@ -233,7 +236,7 @@ def _seen(samples: Array, spacing: float) -> npt.NDArray[np.bool_]:
     return seen
 
 
-def _covered(triangles: Array, shape: tuple[int, ...]) -> npt.NDArray[np.bool_]:
+def _covered(triangles: Floats, shape: tuple[int, ...]) -> npt.NDArray[np.bool_]:
     """Which nodes of a grid lie in triangles (f, 3, 2) over it, in spacings from its corner."""
     first = np.ceil(triangles[:, :, 0].min(axis=1) - ON_BORDER).astype(np.intp).clip(0)
     last = np.floor(triangles[:, :, 0].max(axis=1) + ON_BORDER).astype(np.intp).clip(max=shape[0] - 1)
@@ -257,7 +260,7 @@ def _covered(triangles: Array, shape: tuple[int, ...]) -> npt.NDArray[np.bool_]:
     return covered
 
 
-def _fitted(samples: Array, weights: Array, facing: Array, spacing: float, at: Array) -> Fit:
+def _fitted(samples: Floats, weights: Floats, facing: Floats, spacing: float, at: Floats) -> HeightGrid:
     """The least-squares spline, at the grid's nodes; `facing` (f, 3, 2) are all facets that face upwards."""
     from scipy import ndimage, sparse  # only where a mesh is read
     from scipy.sparse.linalg import splu
@@ -314,10 +317,10 @@ def _fitted(samples: Array, weights: Array, facing: Array, spacing: float, at: A
         edges &= near > 0.0
         heights[edges] = (A.T @ samples[:, 2]).reshape(m, n)[1:-1, 1:-1][edges] / near[edges]
     ox, oy = (at - 0.5 * (low + high)).tolist()
-    return Fit(heights, spacing, (ox, oy), there)
+    return HeightGrid(heights, spacing, (ox, oy), there)
 
 
-def _basis(t: Array) -> Array:
+def _basis(t: Floats) -> Floats:
     """(k, 4) cubic B-splines over a cell at t in 0 … 1."""
     p = 1.0 - t
     inner = (2.0 / 3.0 - one * one * (1.0 - 0.5 * one) for one in (t, p))

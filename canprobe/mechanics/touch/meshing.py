@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from canprobe.errors import ResultsError, UsageError
 from canprobe.mechanics.touch.blend import Feet
-from canprobe.mechanics.touch.linear_algebra import Array
+from canprobe.mechanics.types import Floats
 
-Field = Callable[[Array], Feet]
+Field = Callable[[Floats], Feet]
 """Points (n, 3) → closest points of a surface, NaN where it is not defined."""
 Numbers = NDArray[np.int64]
 """Of cells or corners of the lattice."""
@@ -47,10 +47,10 @@ class Mesh:
         sigma: (n,) standard deviation of the surface's height at the vertices, m; NaN where it is not known.
     """
 
-    vertices: Array
+    vertices: Floats
     triangles: NDArray[np.int32]
-    normals: Array
-    sigma: Array
+    normals: Floats
+    sigma: Floats
 
     def save_ply(self, path: Path | str) -> None:
         """Write a binary PLY file: vertices in m, normals, σ as the property `sigma`, and triangles.
@@ -71,7 +71,7 @@ class Mesh:
             raise ResultsError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-def mesh_of(field: Field, seeds: Array, cell: float) -> Mesh:
+def mesh_of(field: Field, seeds: Floats, cell: float) -> Mesh:
     """Triangles of a surface.
 
     Args:
@@ -112,31 +112,31 @@ def mesh_of(field: Field, seeds: Array, cell: float) -> Mesh:
     return Mesh(vertices[used], renumbered.reshape(-1, 3).astype(np.int32), normals[used], sigma[used])
 
 
-def _place(number: Numbers, cell: float) -> Array:
+def _place(number: Numbers, cell: float) -> Floats:
     """(n, 3) where corners stand, m."""
     mask = (1 << _BITS) - 1
     steps = np.stack([number >> 2 * _BITS, number >> _BITS & mask, number & mask], axis=1)
     return (steps - _BIAS) * cell
 
 
-def _crossing(height: Array) -> Array:
+def _crossing(height: Floats) -> Floats:
     """(n, 3) mean of the places where a cell's edges meet the surface, in cells from its lowest corner."""
     a, b = height[:, _EDGES[:, 0]], height[:, _EDGES[:, 1]]
     met = (a < 0.0) != (b < 0.0)
     share = np.where(met, a / np.where(met, a - b, 1.0), 0.0)
     places = _CORNERS[_EDGES[:, 0]] + share[:, :, None] * (_CORNERS[_EDGES[:, 1]] - _CORNERS[_EDGES[:, 0]])
-    result: Array = (places * met[:, :, None]).sum(axis=1) / met.sum(axis=1)[:, None]
+    result: Floats = (places * met[:, :, None]).sum(axis=1) / met.sum(axis=1)[:, None]
     return result
 
 
-def _laid_on(field: Field, points: Array) -> tuple[Array, Array, Array]:
+def _laid_on(field: Field, points: Floats) -> tuple[Floats, Floats, Floats]:
     """Points moved to their feet, and normals and σ there."""
     feet = field(points)
     feet = field(np.where(np.isfinite(feet.point), feet.point, points))
     return feet.point, feet.normal, feet.sigma
 
 
-def _triangles(cells: Numbers, height: Array, vertices: Array) -> NDArray[np.intp]:
+def _triangles(cells: Numbers, height: Floats, vertices: Floats) -> NDArray[np.intp]:
     """(m, 3) two triangles for each edge of the lattice that meets the surface amid four cells with a vertex."""
     found = [np.zeros((0, 3), np.intp)]
     finite: NDArray[np.bool_] = np.isfinite(vertices[:, 0])

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from canprobe.mechanics.touch.heights import Heights
-from canprobe.mechanics.touch.mesh_fit import Mesh
+from canprobe.mechanics.touch.mesh_fit import MeshHeights
 from canprobe.mechanics.touch.shapes import (
     Bowl,
     Fillet,
@@ -18,11 +18,11 @@ from canprobe.mechanics.touch.shapes import (
     PlacedShape,
     RoundShape,
     Torus,
-    Vec,
     Wave,
     require_positive,
     tangent_of,
 )
+from canprobe.mechanics.types import Vec
 
 
 class Plane(PlacedShape):
@@ -229,7 +229,7 @@ _KINDS: Mapping[str, tuple[type[PlacedShape], tuple[str, ...]]] = MappingProxyTy
         "fillet": (Fillet, ("radius", "angle")),
         "quadric": (Quadric, ("matrix",)),
         "heights": (Heights, ("heights", "spacing", "origin")),
-        "mesh": (Mesh, ("vertices", "faces", "spacing", "origin")),
+        "mesh": (MeshHeights, ("vertices", "faces", "spacing", "origin")),
     }
 )
 

@@ -11,11 +11,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.errors import UsageError
-
-Array = NDArray[np.float64]
+from canprobe.mechanics.types import Floats
 
 COUNTS_MAX = 255
 """Counts of an image at full scale; 0 is no pressure. What a device counts instead its wire converts."""
@@ -45,8 +43,8 @@ class Pad:
     pitch_m: float = 1.5875e-3
     full_scale_pa: float = 100e3
     mount_radius_m: float | None = 0.040
-    positions: Array | None = None
-    normals: Array | None = None
+    positions: Floats | None = None
+    normals: Floats | None = None
 
     def __post_init__(self) -> None:
         for name in ("pitch_m", "full_scale_pa", "radius_m"):
@@ -90,7 +88,7 @@ class Pad:
         return float(np.abs(self.uv).max(axis=0).min()) + 0.5 * self.pitch_m
 
     @cached_property
-    def uv(self) -> Array:
+    def uv(self) -> Floats:
         """(rows · columns, 2) pad coordinates of the taxels, m."""
         if self.positions is not None:
             return _read_only(np.array(self.positions, dtype=np.float64)[:, :2])
@@ -98,7 +96,7 @@ class Pad:
         return _read_only(self.pitch_m * np.stack((u.reshape(-1), v.reshape(-1)), axis=1))
 
     @cached_property
-    def areas(self) -> Array:
+    def areas(self) -> Floats:
         """(rows · columns,) area that each taxel stands for, m².
 
         Of a grid on a sphere `pitch² · sin(ρ)/ρ` with ρ = √(u² + v²)/R; of a list the part across z, so that pressure
@@ -111,11 +109,11 @@ class Pad:
         return _read_only(self.pitch_m**2 * np.sinc(angle / math.pi))
 
 
-def _centred(count: int) -> Array:
+def _centred(count: int) -> Floats:
     """−(count − 1)/2 … (count − 1)/2."""
     return np.arange(count, dtype=np.float64) - (count - 1) / 2
 
 
-def _read_only(values: Array) -> Array:
+def _read_only(values: Floats) -> Floats:
     values.flags.writeable = False
     return values

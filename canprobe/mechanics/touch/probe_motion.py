@@ -11,15 +11,14 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from canprobe.mechanics.robot.chain import Posture, Vec, ending_in, jacobian, pose_of, posture
+from canprobe.mechanics.robot.chain import Posture, ending_in, jacobian, pose_of, posture
 from canprobe.mechanics.robot.damped_inverse import damped_step
 from canprobe.mechanics.robot.inverse import in_rows, task_rows
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.touch.servo import ProbePose
+from canprobe.mechanics.types import Floats, Vec
 
-Vector = NDArray[np.float64]
 MOVE_SPEED, ROUND_SPEED, RETREAT_SPEED = 30e-3, 40e-3, 20e-3
 """Mean speeds of the way to an object, round a ball, and off an object, m/s."""
 OFF_M = 2e-3
@@ -32,7 +31,7 @@ REST_HZ = 1.0
 """How fast more joints than a pose needs go back to the posture they began with."""
 
 
-def solve(J: Vector, twist: Any) -> list[float] | None:
+def solve(J: Floats, twist: Any) -> list[float] | None:
     """The joint step (n,) of a twist (n,) by a square Jacobian; None where it is singular."""
     try:
         step: list[float] = np.linalg.solve(J, twist).tolist()
@@ -60,9 +59,9 @@ class PoseSteps:
     def __init__(
         self,
         model: ArmModel,
-        T_flange_probe: Vector,
-        q: Vector,
-        solve: Callable[[Vector, Any], list[float] | None] = solve,
+        T_flange_probe: Floats,
+        q: Floats,
+        solve: Callable[[Floats, Any], list[float] | None] = solve,
     ) -> None:
         self._solve = solve
         self._rows = task_rows(model)
@@ -81,7 +80,7 @@ class PoseSteps:
         """
         self.at = at = posture(self._chain, q)
         J = jacobian(at, at.flange)
-        twist: tuple[float, ...] | Vector
+        twist: tuple[float, ...] | Floats
         if self._rows == 6:
             twist = _pose_error(at, pose.centre.tolist(), pose.pole.tolist(), self._x_reference)
         else:
@@ -162,7 +161,7 @@ class ArcMotion:
         speed: mean speed, m/s.
     """
 
-    def __init__(self, centre: Vector, start: ProbePose, end: ProbePose, speed: float) -> None:
+    def __init__(self, centre: Floats, start: ProbePose, end: ProbePose, speed: float) -> None:
         self._centre, self._poles = centre, (start.pole, end.pole)
         a, b = start.centre - centre, end.centre - centre
         self._radii = float(np.linalg.norm(a)), float(np.linalg.norm(b))

@@ -17,13 +17,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.strategies import PathFollower
+from canprobe.mechanics.types import Floats
 
-Vector = NDArray[np.float64]
-Floats = Sequence[float]
 STEEPEST = 0.2
 """Least cosine between surface normal and approach direction that is reckoned with: 78 degrees."""
 
@@ -55,24 +53,24 @@ class LocalSurface:
         gains: correction bandwidths.
     """
 
-    def __init__(self, point: Vector, normal: Vector, gains: SurfaceGains) -> None:
-        self._point: Floats
-        self._normal: Floats
+    def __init__(self, point: Floats, normal: Floats, gains: SurfaceGains) -> None:
+        self._point: Sequence[float]
+        self._normal: Sequence[float]
         self.move_to(point, normal)
         self._curvature = self._wanted = [0.0] * 6  # xx, xy, xz, yy, yz, zz
         self._gains = gains
 
     @property
-    def point(self) -> Vector:
+    def point(self) -> Floats:
         """The point (3,), m, that the model stands on."""
         return np.array(self._point)
 
     @property
-    def normal(self) -> Vector:
+    def normal(self) -> Floats:
         """Outward unit normal (3,) there."""
         return np.array(self._normal)
 
-    def foot(self, x: Floats) -> tuple[Floats, Floats]:
+    def foot(self, x: Sequence[float]) -> tuple[Sequence[float], Sequence[float]]:
         """Surface point and outward unit normal over the tangential position of a point, m.
 
         On plain floats: on 3-vectors numpy costs ten times as much.
@@ -94,7 +92,7 @@ class LocalSurface:
             (n0 / size, n1 / size, n2 / size),
         )
 
-    def correct(self, point: Vector, normal: Vector, dt: float) -> float:
+    def correct(self, point: Floats, normal: Floats, dt: float) -> float:
         """Move the model to a measured point (3,), m, and towards it and its outward normal (3,), `dt` (s) later.
 
         Returns the height error before, m, positive where the surface was found higher than modelled.
@@ -118,12 +116,12 @@ class LocalSurface:
         (a0, a1, a2), (m0, m1, m2) = self._point, self._normal
         self._point = a0 + height * m0, a1 + height * m1, a2 + height * m2
 
-    def move_to(self, point: Vector, normal: Vector) -> None:
+    def move_to(self, point: Floats, normal: Floats) -> None:
         """Stand on another point (3,), m, with an outward unit normal (3,)."""
         self._point = tuple(point.tolist())
         self._normal = _unit(normal.tolist())
 
-    def set_curvature(self, tensor: Vector) -> None:
+    def set_curvature(self, tensor: Floats) -> None:
         """Go over, with the next samples, to a curvature tensor (3, 3), symmetric, 1/m, in the same frame."""
         (xx, xy, xz), (_, yy, yz), (_, _, zz) = tensor.tolist()
         self._wanted = [xx, xy, xz, yy, yz, zz]
@@ -133,8 +131,8 @@ class LocalSurface:
 class ProbePose:
     """Where the probe sphere must be: its centre (3,), m, and the direction of its pole (3,), in base."""
 
-    centre: Vector
-    pole: Vector
+    centre: Floats
+    pole: Floats
 
 
 class TactileServo:
@@ -154,8 +152,8 @@ class TactileServo:
         surface: LocalSurface,
         follower: PathFollower | None,
         *,
-        axes: Vector,
-        origin: Vector,
+        axes: Floats,
+        origin: Floats,
         probe_radius: float,
         rolling_share: float,
     ) -> None:
@@ -165,10 +163,10 @@ class TactileServo:
         self._origin = origin.tolist()
         self._radius = probe_radius
         self._share = rolling_share
-        self._reference: Floats = tuple(surface.point.tolist())
+        self._reference: Sequence[float] = tuple(surface.point.tolist())
         self._first_pole = (-surface.normal).tolist()
 
-    def rest_on(self, point: Vector, normal: Vector) -> None:
+    def rest_on(self, point: Floats, normal: Floats) -> None:
         """Go on from another contact: its point (3,), m, and outward unit normal (3,); the curvature is kept."""
         self.surface.move_to(point, normal)
         self._reference = tuple(point.tolist())
@@ -190,7 +188,9 @@ class TactileServo:
         pole = _unit((share * p0 - flat * n0, share * p1 - flat * n1, share * p2 - flat * n2))
         return ProbePose(np.array((f0 + reach * n0, f1 + reach * n1, f2 + reach * n2)), np.array(pole))
 
-    def _march(self, follower: PathFollower, foot: Floats, normal: Floats, distance: float) -> tuple[Floats, Floats]:
+    def _march(
+        self, follower: PathFollower, foot: Sequence[float], normal: Sequence[float], distance: float
+    ) -> tuple[Sequence[float], Sequence[float]]:
         """One step along the heading, lifted out of the scan plane into the tangent plane."""
         (h0, h1, h2), (c0, c1, c2), (u0, u1, u2) = self._heading, self._across, self._up
         (f0, f1, f2), (n0, n1, n2), (o0, o1, o2) = foot, normal, self._origin
@@ -209,7 +209,7 @@ class TactileServo:
         return self.surface.foot((f0 + distance * x, f1 + distance * y, f2 + distance * z))
 
 
-def _unit(v: Floats) -> Floats:
+def _unit(v: Sequence[float]) -> Sequence[float]:
     x, y, z = v
     size = math.sqrt(x * x + y * y + z * z)
     return x / size, y / size, z / size

@@ -14,11 +14,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from canprobe.mechanics.types import Floats, Vec
 
 Foot = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
 """Local closest point: point xyz, outward normal xyz, signed distance, kappa1, kappa2, direction1 xyz."""
-Vec = tuple[float, float, float]
 
 
 class Nearest(NamedTuple):
@@ -44,15 +43,15 @@ class ClosestPoint:
             an umbilic any such pair may stand.
     """
 
-    point: Array
-    normal: Array
+    point: Floats
+    normal: Floats
     distance: float
-    kappa: Array
-    directions: Array
+    kappa: Floats
+    directions: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Touches:
+class TouchedPlaces:
     """All places where a ball touches at once, base frame.
 
     Attributes:
@@ -62,11 +61,11 @@ class Touches:
         edge_m: (n,) length of edge that a place stands for, m; 0 for a point of a smooth surface.
     """
 
-    points: Array
-    normals: Array
-    distances: Array
-    kappa: Array
-    edge_m: Array
+    points: Floats
+    normals: Floats
+    distances: Floats
+    kappa: Floats
+    edge_m: Floats
 
 
 class PlacedShape:
@@ -96,7 +95,7 @@ class PlacedShape:
         self._origin = tuple(pose[:3, 3].tolist())
 
     @property
-    def T_base_object(self) -> Array:
+    def T_base_object(self) -> Floats:
         """(4, 4) frame of the object in the base frame, m."""
         return self._pose
 
@@ -129,11 +128,11 @@ class PlacedShape:
             ((d0, d1, d2), (n1 * d2 - n2 * d1, n2 * d0 - n0 * d2, n0 * d1 - n1 * d0)),
         )
 
-    def touches(self, point_base: npt.ArrayLike, reach: float) -> Touches | None:
+    def touches(self, point_base: npt.ArrayLike, reach: float) -> TouchedPlaces | None:
         """Every place where a ball (centre (3,) in base, radius, m) touches; None where ``closest`` is all there is."""
         return None
 
-    def gaps(self, points_base: Array) -> Array:
+    def gaps(self, points_base: Floats) -> Floats:
         """Signed distances (n,) of points (n, 3) of the base frame, m, positive outside."""
         return np.array([self.closest(p).distance for p in points_base])
 
@@ -141,15 +140,17 @@ class PlacedShape:
         """Volume (m³) by which the layer of a ball is squeezed; of surfaces that press by their gaps only."""
         raise NotImplementedError
 
-    def _to_object(self, points_base: Array) -> Array:
+    def _to_object(self, points_base: Floats) -> Floats:
         """(n, 3) points of the base frame in the object's."""
-        local: Array = (points_base - self._pose[:3, 3]) @ self._pose[:3, :3]
+        local: Floats = (points_base - self._pose[:3, 3]) @ self._pose[:3, :3]
         return local
 
-    def _placed(self, points: Array, normals: Array, distances: Array, kappa: Array, edge_m: Array) -> Touches:
-        """Touches of the object's frame in the base frame."""
+    def _placed(
+        self, points: Floats, normals: Floats, distances: Floats, kappa: Floats, edge_m: Floats
+    ) -> TouchedPlaces:
+        """Places in the object's frame, carried to the base frame."""
         turn = self._rotation_t
-        return Touches(points @ turn + self._pose[:3, 3], normals @ turn, distances, kappa, edge_m)
+        return TouchedPlaces(points @ turn + self._pose[:3, 3], normals @ turn, distances, kappa, edge_m)
 
     def tightest_concave_radius(self, region: npt.ArrayLike | None = None) -> float:
         """Smallest radius of a hollow of the surface; a probe must be smaller to touch in one point.
@@ -249,7 +250,7 @@ class Bowl(RoundShape):
             *(size - LIP_M, 1.0 / LIP_M, nr / rim, -nz * ex, -nz * ey, nr),
         )
 
-    def touches(self, point_base: npt.ArrayLike, reach: float) -> Touches | None:
+    def touches(self, point_base: npt.ArrayLike, reach: float) -> TouchedPlaces | None:
         """Pieces of the lip under a ball whose centre is above it."""
         p = self._to_object(np.asarray(point_base, dtype=float)[None])[0]
         if p[2] <= self.radius or hypot(p[0], p[1]) >= self.radius + LIP_M:
@@ -264,14 +265,14 @@ class Bowl(RoundShape):
         length = np.full(len(points), 2.0 * pi * (self.radius + LIP_M) / _PIECES)
         return self._placed(points, normals, size[near] - LIP_M, kappa, length)
 
-    def gaps(self, points_base: Array) -> Array:
+    def gaps(self, points_base: Floats) -> Floats:
         """Signed distances of (n, 3) points, (n,) m, positive outside the body."""
         p = self._to_object(points_base)
         zc, out = p[:, 2] - self.radius, np.hypot(p[:, 0], p[:, 1])
         inside = self.radius - np.hypot(out, zc)
         lip = np.hypot(out - self.radius - LIP_M, zc) - LIP_M
         above = np.where(out >= self.radius + LIP_M, zc - LIP_M, lip)
-        gaps: Array = np.where(zc > 0.0, above, inside)
+        gaps: Floats = np.where(zc > 0.0, above, inside)
         return gaps
 
     def _tightest_anywhere(self) -> float:
@@ -345,7 +346,7 @@ class Wave(PlacedShape):
             return x, v, h, 0.0, ny, nz, distance, across, 0.0, 0.0, nz, -ny
         return x, v, h, 0.0, ny, nz, distance, 0.0, across, 1.0, 0.0, 0.0
 
-    def touches(self, point_base: npt.ArrayLike, reach: float) -> Touches | None:
+    def touches(self, point_base: npt.ArrayLike, reach: float) -> TouchedPlaces | None:
         """Both walls where a trough is too tight for the ball."""
         x, y, z = self._to_object(np.asarray(point_base, dtype=float)[None])[0].tolist()
         near = [v for square, v in self._minima(y, z) if square < reach * reach]
@@ -354,11 +355,11 @@ class Wave(PlacedShape):
         feet = np.array([self._foot_at(v, x, y, z) for v in near])
         return self._placed(feet[:, :3], feet[:, 3:6], feet[:, 6], feet[:, 7:9], np.zeros(len(feet)))
 
-    def gaps(self, points_base: Array) -> Array:
+    def gaps(self, points_base: Floats) -> Floats:
         """Distances of (n, 3) points to the tangent over or under them, (n,) m: first order near the surface."""
         _, y, z = self._to_object(points_base).T
         slope = self.amplitude * self._k * np.sin(self._k * y)
-        gaps: Array = (z - self.amplitude * (np.cos(self._k * y) - 1.0)) / np.sqrt(1.0 + slope * slope)
+        gaps: Floats = (z - self.amplitude * (np.cos(self._k * y) - 1.0)) / np.sqrt(1.0 + slope * slope)
         return gaps
 
     def _tightest_anywhere(self) -> float:

@@ -1,5 +1,7 @@
-"""Where a touch stops, as images and forces show it. The plan reckons with the same numbers, so that what it accepts
-comes to its end."""
+"""The limits at which a touch ends, as images and forces show it.
+
+The plan reckons with the same numbers, so that what it accepts comes to its end.
+"""
 
 from __future__ import annotations
 

@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.linear_algebra import MAX_MAGNITUDE, Array, checked, instance, read_only, real
+from canprobe.mechanics.touch.linear_algebra import MAX_MAGNITUDE, checked, instance, read_only, real
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
+from canprobe.mechanics.types import Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,7 +33,7 @@ class SurfaceMatrix:
         UsageError: when S is not a finite symmetric 4x4 matrix.
     """
 
-    S: Array
+    S: Floats
 
     def __post_init__(self) -> None:
         S = checked("S", self.S, (4, 4))
@@ -120,21 +121,21 @@ class SurfaceMatrix:
         S = matrix.T @ self.S @ matrix
         return SurfaceMatrix(0.5 * (S + S.T))
 
-    def value(self, points: ArrayLike) -> Array:
+    def value(self, points: ArrayLike) -> Floats:
         """f at points (…, 3); negative inside the body."""
         p = _places(points)
-        result: Array = np.einsum("...i,...i->...", p @ self.S[:3, :3] + 2.0 * self.S[:3, 3], p) + self.S[3, 3]
+        result: Floats = np.einsum("...i,...i->...", p @ self.S[:3, :3] + 2.0 * self.S[:3, 3], p) + self.S[3, 3]
         return result
 
-    def gradient(self, points: ArrayLike) -> Array:
+    def gradient(self, points: ArrayLike) -> Floats:
         """∇f = 2 (S X)₁..₃ at points (…, 3); points outward."""
-        result: Array = 2.0 * (_places(points) @ self.S[:3, :3] + self.S[:3, 3])
+        result: Floats = 2.0 * (_places(points) @ self.S[:3, :3] + self.S[:3, 3])
         return result
 
-    def normal(self, points: ArrayLike) -> Array:
+    def normal(self, points: ArrayLike) -> Floats:
         """Outward unit normal (…, 3) at points (…, 3), of the level set through the point (12)."""
         g = self.gradient(points)
-        result: Array = g / np.sqrt(np.einsum("...i,...i->...", g, g))[..., None]
+        result: Floats = g / np.sqrt(np.einsum("...i,...i->...", g, g))[..., None]
         return result
 
     def normalised_at(self, point: ArrayLike) -> SurfaceMatrix:
@@ -145,7 +146,7 @@ class SurfaceMatrix:
         """
         return SurfaceMatrix(self.S / self._gradient_size(point))
 
-    def curvature_at(self, point: ArrayLike) -> tuple[Array, Array]:
+    def curvature_at(self, point: ArrayLike) -> tuple[Floats, Floats]:
         """Shape operator at a point of the surface.
 
         Args:
@@ -159,7 +160,7 @@ class SurfaceMatrix:
         K = basis.T @ (2.0 * self.S[:3, :3]) @ basis / self._gradient_size(point)
         return 0.5 * (K + K.T), basis
 
-    def contact_frame(self, point: ArrayLike) -> Array:
+    def contact_frame(self, point: ArrayLike) -> Floats:
         """T (4, 4) from the contact frame at a point to this frame: z is the inward normal.
 
         The x axis is this frame's x axis laid on the tangent plane (`linear_algebra.tangent_rotation`).
@@ -167,7 +168,7 @@ class SurfaceMatrix:
         p = checked("point", point, (3,))
         return homogeneous(tangent_rotation(-self.gradient(p) / self._gradient_size(p)), p)
 
-    def height(self, x: ArrayLike, y: ArrayLike) -> Array:
+    def height(self, x: ArrayLike, y: ArrayLike) -> Floats:
         """z of the surface over (x, y), the root that is 0 at the contact; NaN where there is none.
 
         Args:
@@ -183,10 +184,10 @@ class SurfaceMatrix:
         square = b * b - s[2, 2] * c
         root = np.sqrt(np.where(square >= 0.0, square, np.nan))
         # not (-b + root)/c33: that cancels, and divides by zero on a plane
-        result: Array = -c / (b + np.copysign(root, b))
+        result: Floats = -c / (b + np.copysign(root, b))
         return result
 
-    def project(self, point: ArrayLike) -> Array:
+    def project(self, point: ArrayLike) -> Floats:
         """The foot of a point (3,) on the surface: Newton on the Lagrange conditions from a point nearby.
 
         Raises:
@@ -220,7 +221,7 @@ class SurfaceMatrix:
         return size
 
 
-def _places(points: ArrayLike) -> Array:
+def _places(points: ArrayLike) -> Floats:
     """Points (…, 3) as floats."""
     p = real("points", points, " of shape (…, 3)")
     if p.shape[-1:] != (3,):

@@ -17,9 +17,10 @@ from canprobe.errors import UsageError
 from canprobe.mechanics.touch.blend import REACH_M, Feet, Quadrics, feet_on
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 from canprobe.mechanics.touch.estimate.quadric import TO_Q, UNIT, parameters_of
-from canprobe.mechanics.touch.linear_algebra import Array, checked, positive, read_only
+from canprobe.mechanics.touch.linear_algebra import checked, positive, read_only
 from canprobe.mechanics.touch.meshing import CELL_M, Mesh, mesh_of
 from canprobe.mechanics.touch.surface import SurfaceMatrix
+from canprobe.mechanics.types import Floats
 
 WIDE = 10.0
 """Standard deviation of a combination of curvature that was not observed, over the path that the estimate rests on:
@@ -58,13 +59,13 @@ class LocalPatch:
         innovation: mean squared whitened residual per degree of freedom; well below 1 where the σ's are generous.
     """
 
-    T_base_contact: Array
-    S: Array
-    K_covariance: Array
-    S_covariance: Array
+    T_base_contact: Floats
+    S: Floats
+    K_covariance: Floats
+    S_covariance: Floats
     pose_known: bool
-    observed: Array
-    combinations: Array
+    observed: Floats
+    combinations: Floats
     t_s: float
     travelled_m: float
     distance_m: float
@@ -100,12 +101,12 @@ class LocalPatch:
         return len(self.combinations)
 
     @property
-    def point(self) -> Array:
+    def point(self) -> Floats:
         """(3,) contact point, base frame, m."""
         return self.T_base_contact[:3, 3]
 
     @property
-    def normal(self) -> Array:
+    def normal(self) -> Floats:
         """(3,) outward unit normal there, base frame."""
         return -self.T_base_contact[:3, 2]
 
@@ -115,7 +116,7 @@ class LocalPatch:
         return SurfaceMatrix(self.S)
 
     @property
-    def c(self) -> Array:
+    def c(self) -> Floats:
         """(9,) entries of `S` in the order of `S_covariance`, SI units."""
         return parameters_of(self.S)
 
@@ -127,7 +128,7 @@ class LocalPatch:
         )
 
 
-def _covariance(estimate: SurfaceEstimate) -> Array:
+def _covariance(estimate: SurfaceEstimate) -> Floats:
     """(9, 9) finite covariance of the entries of S, SI units."""
     length = max(estimate.distance, LEAST_LENGTH_M)
     weak = WIDE / length
@@ -147,16 +148,16 @@ def _covariance(estimate: SurfaceEstimate) -> Array:
     if len(root) > 9:
         root = np.linalg.qr(root, mode="r")
     inverse = np.linalg.inv(root)
-    result: Array = inverse @ inverse.T / np.outer(units, units)
+    result: Floats = inverse @ inverse.T / np.outer(units, units)
     return 0.5 * (result + result.T)
 
 
-def _curvature_covariance(estimate: SurfaceEstimate, V: Array, weak: float) -> Array:
+def _curvature_covariance(estimate: SurfaceEstimate, V: Floats, weak: float) -> Floats:
     """(3, 3) covariance of q = (K11, √2 K12, K22), what was not observed held wide, 1/m²."""
     if estimate.rank == 3:
         return estimate.covariance * np.outer(TO_Q, TO_Q)
     seen = V @ np.linalg.inv(V.T @ estimate.information @ V) @ V.T
-    result: Array = seen + weak**2 * (np.eye(3) - V @ V.T)
+    result: Floats = seen + weak**2 * (np.eye(3) - V @ V.T)
     return result
 
 
@@ -179,11 +180,11 @@ class SurfaceMap:
     """
 
     patches: tuple[LocalPatch, ...]
-    path: Array
+    path: Floats
     method: str = ""
-    points: Array = field(init=False, repr=False)
-    normals: Array = field(init=False, repr=False)
-    travelled: Array = field(init=False, repr=False)
+    points: Floats = field(init=False, repr=False)
+    normals: Floats = field(init=False, repr=False)
+    travelled: Floats = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         def keep(name: str, values: ArrayLike) -> None:
@@ -231,7 +232,7 @@ class SurfaceMap:
         """
         return feet_on(self._quadrics(), checked("points", points, (None, 3)), positive("reach", reach))
 
-    def distance(self, points: ArrayLike, *, reach: float = REACH_M) -> tuple[Array, Array]:
+    def distance(self, points: ArrayLike, *, reach: float = REACH_M) -> tuple[Floats, Floats]:
         """Signed distances of points from the map's surface, positive outside, and their standard deviations.
 
         Args:

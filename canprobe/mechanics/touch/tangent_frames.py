@@ -7,13 +7,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from canprobe.mechanics.touch.linear_algebra import Array, Vec
+from canprobe.mechanics.types import Floats, Vec
 
 _AXIS_LIMIT = 0.95
 """Above this |component| of the normal the frame's own x axis is too close to it, and y is used."""
 
 
-def tangent_rotation(z_axis: Sequence[float] | Array) -> Array:
+def tangent_rotation(z_axis: Sequence[float] | Floats) -> Floats:
     """Right-handed axes (3, 3), columns x, y, z, with a given unit z; x is the parent frame's x on the tangent plane.
 
     Where z is within 18° of the parent's x axis, the parent's y axis is laid on the plane instead. The choice depends
@@ -43,7 +43,7 @@ def transported(x_axis: Vec, z_axis: Vec) -> tuple[Vec, Vec]:
     return (x, y, z), (v * z - w * y, w * x - u * z, u * y - v * x)
 
 
-def homogeneous(R: Array, origin: Sequence[float] | Array) -> Array:
+def homogeneous(R: Floats, origin: Sequence[float] | Floats) -> Floats:
     """The 4x4 matrix of a rotation and an origin."""
     T = np.zeros((4, 4))
     T[:3, :3] = R
@@ -52,13 +52,13 @@ def homogeneous(R: Array, origin: Sequence[float] | Array) -> Array:
     return T
 
 
-def inverse_transform(T: Array) -> Array:
+def inverse_transform(T: Floats) -> Floats:
     """The inverse of a rigid 4x4 transform."""
     R = T[:3, :3].T
     return homogeneous(R, -R @ T[:3, 3])
 
 
-def rotation_vectors(R: Array) -> Array:
+def rotation_vectors(R: Floats) -> Floats:
     """The rotation vectors (n, 3) (angle times axis, rad) of rotations (n, 3, 3) below a half turn."""
     w = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
     sine = 0.5 * np.linalg.norm(w, axis=1)

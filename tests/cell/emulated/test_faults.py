@@ -7,7 +7,7 @@ import pytest
 from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus, Participant
 from canprobe.fieldbus.node.fault import Fault, FaultKind
-from canprobe.fieldbus.node.faults import FaultyNode
+from canprobe.fieldbus.node.faulty_node import FaultyNode
 
 MS = 1_000_000
 ID = 0x185

@@ -18,7 +18,7 @@ from canprobe.cli import main
 from canprobe.errors import NodeError, SafetyStop
 from canprobe.fieldbus.bus.candump import read_candump
 from canprobe.fieldbus.node.fault import Fault, FaultKind
-from canprobe.fieldbus.node.faults import FaultyNode
+from canprobe.fieldbus.node.faulty_node import FaultyNode
 
 MS = 1_000_000
 FILES = {"bus.log", "log.npz", "scene.toml", "summary.json", "truth.npz"}

@@ -152,7 +152,7 @@ def real_bus(monkeypatch):
         reports.append(options["reports"])
         return bus.port()
 
-    monkeypatch.setattr("canprobe.fieldbus.bus.real.python_can.open_port", open_port)
+    monkeypatch.setattr("canprobe.fieldbus.bus.real.opening.open_port", open_port)
     monkeypatch.setattr("canprobe.cell.session.session.MonotonicClock", lambda: bus.clock)
     monkeypatch.setattr("canprobe.cell.session.session.check_links", lambda *_: None)
     return scene, reports

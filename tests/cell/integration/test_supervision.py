@@ -23,7 +23,7 @@ from canprobe.cell.tasks.probing import Phase
 from canprobe.errors import CanprobeError, InterfaceError, NodeError, ResultsError, SafetyStop
 from canprobe.fieldbus.bus.port import ControllerState
 from canprobe.fieldbus.node.fault import FaultKind
-from canprobe.fieldbus.node.faults import FaultyNode
+from canprobe.fieldbus.node.faulty_node import FaultyNode
 from canprobe.fieldbus.protocol.cia402 import DriveState, state_of
 from canprobe.fieldbus.protocol.emcy import Emcy
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, NmtCommand, NmtState, pack_nmt

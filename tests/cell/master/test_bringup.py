@@ -22,7 +22,7 @@ from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.eds.packaged import eds_path
 from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.fault import Fault, FaultKind
-from canprobe.fieldbus.node.faults import FaultyNode
+from canprobe.fieldbus.node.faulty_node import FaultyNode
 
 MS = 1_000_000
 

@@ -23,7 +23,7 @@ from canprobe.errors import CanprobeError, NodeError, UsageError
 from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus, Participant
 from canprobe.fieldbus.node.fault import Fault, FaultKind
-from canprobe.fieldbus.node.faults import FaultyNode
+from canprobe.fieldbus.node.faulty_node import FaultyNode
 from canprobe.fieldbus.protocol.cia402 import DriveState
 from canprobe.fieldbus.protocol.frames import NmtCommand, pack_nmt
 

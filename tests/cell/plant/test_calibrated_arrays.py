@@ -13,10 +13,10 @@ from canprobe.cell.scene.calibrations import dump_calibration, load_calibration
 from canprobe.errors import SceneError, UsageError
 from canprobe.lab.studies.arrays import RADIUS_M, Presses, measure, random_array
 from canprobe.mechanics.touch.pad import Pad
+from canprobe.mechanics.touch.patch.array_models import make_patch_calibration
 from canprobe.mechanics.touch.patch.calibrate import calibrate_array
 from canprobe.mechanics.touch.patch.creep import PadMemory
 from canprobe.mechanics.touch.patch.image import compute_patch
-from canprobe.mechanics.touch.patch.image_model import make_patch_calibration
 from canprobe.mechanics.touch.patch.moments import MomentImage
 
 

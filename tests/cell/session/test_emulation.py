@@ -19,7 +19,7 @@ def served(monkeypatch):
 
     def emulate(act, *options, what=("free", "--channel", "vcan0", "--nodes", "1,2")):
         bus = LockstepBus(VirtualClock())
-        monkeypatch.setattr("canprobe.fieldbus.bus.real.python_can.open_port", lambda *_, **__: bus.port())
+        monkeypatch.setattr("canprobe.fieldbus.bus.real.opening.open_port", lambda *_, **__: bus.port())
         monkeypatch.setattr("canprobe.cell.session.emulation.rehearse", lambda plan: None)
         monkeypatch.setattr(
             "canprobe.fieldbus.bus.real.processor.ask_for_processor", lambda: False

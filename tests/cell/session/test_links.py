@@ -240,7 +240,7 @@ WAYS_ONTO_A_BUS = {
 def test_whatever_sends_stops_at_a_wrong_bit_rate_before_it_opens_the_bus(ip, words, monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
     opened = []
-    monkeypatch.setattr("canprobe.fieldbus.bus.real.python_can.open_port", lambda *args, **_: opened.append(args))
+    monkeypatch.setattr("canprobe.fieldbus.bus.real.opening.open_port", lambda *args, **_: opened.append(args))
     ip["can0"] = (PASSIVE, "")
     assert canprobe.cli.main(words) == 3
     *_, line = capsys.readouterr().err.splitlines()
@@ -264,7 +264,7 @@ def state(name, transmit=0, receive=0):
 def silent_bus(ip, monkeypatch):
     """can0 in the time of its own clock, with nobody on it."""
     bus = LockstepBus(VirtualClock())
-    monkeypatch.setattr("canprobe.fieldbus.bus.real.python_can.open_port", lambda *_, **__: bus.port())
+    monkeypatch.setattr("canprobe.fieldbus.bus.real.opening.open_port", lambda *_, **__: bus.port())
     monkeypatch.setattr("canprobe.fieldbus.bus.clock.MonotonicClock", lambda: bus.clock)
     monkeypatch.setattr("canprobe.cell.session.session.MonotonicClock", lambda: bus.clock)
     return bus
@@ -325,7 +325,7 @@ def test_where_ip_tells_no_state_the_last_error_frame_does(ip, silent_bus, monke
     ip["can0"] = (None, "")
     port = silent_bus.port()
     port.state = ControllerState.PASSIVE
-    monkeypatch.setattr("canprobe.fieldbus.bus.real.python_can.open_port", lambda *_, **__: port)
+    monkeypatch.setattr("canprobe.fieldbus.bus.real.opening.open_port", lambda *_, **__: port)
     assert canprobe.cli.main(["scan", "--channel", "can0"]) == 3
     *_, line = capsys.readouterr().err.splitlines()
     assert "can0: its CAN controller is error-passive: nobody acknowledges what it sends" in line and EMPTY in line

@@ -6,7 +6,8 @@ import sys
 
 import pytest
 
-from canprobe.fieldbus.bus.real.processor import LARGEST_RESERVE, LEAST_RESERVE, realtime, reserve_memory
+from canprobe.fieldbus.bus.real.memory import LARGEST_RESERVE, LEAST_RESERVE, reserve_memory
+from canprobe.fieldbus.bus.real.processor import realtime
 
 SCRIPT = """
 import os, sys

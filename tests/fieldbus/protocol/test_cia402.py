@@ -5,7 +5,7 @@ import pytest
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol import cia402
 from canprobe.fieldbus.protocol.cia402 import (
-    Command,
+    DriveCommand,
     DriveState,
     Event,
     command_of,
@@ -14,7 +14,7 @@ from canprobe.fieldbus.protocol.cia402 import (
     statusword_of,
 )
 
-S, C = DriveState, Command
+S, C = DriveState, DriveCommand
 ALL_LOW_BYTES = [high | low for high in (0x0000, 0xFF00, 0x1200) for low in range(0x100)]
 
 # CiA 402-2, statusword: bits 15..0, x free.

@@ -7,9 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from canprobe.errors import ProtocolError
-from canprobe.fieldbus.protocol import frames
-from canprobe.fieldbus.protocol import frames as emcy
-from canprobe.fieldbus.protocol import frames as sync
+from canprobe.fieldbus.protocol import emcy, frames, sync
 from canprobe.fieldbus.protocol.frames import NmtCommand, NmtState
 
 NMT = [

@@ -14,7 +14,7 @@ from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
 from canprobe.mechanics.robot.inverse import LENGTH_M, in_rows, inverse_near, task_rows
 from canprobe.mechanics.robot.model import joints_to_units, units_to_joints
 from canprobe.mechanics.robot.probe_poses import probe_pose, start_posture
-from canprobe.mechanics.robot.without_drives import lifting_step
+from canprobe.mechanics.robot.remaining_drives import lifting_step
 
 TOOL = tool_z_offset(80.0)
 POINT = np.array((-0.120, -0.1225, 0.374))

@@ -10,7 +10,8 @@ import pytest
 
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.chain import Chain, forward, forward_jacobian
-from canprobe.mechanics.robot.urdf import find_mesh, from_urdf, visuals_of, with_meshes_found
+from canprobe.mechanics.robot.urdf import from_urdf
+from canprobe.mechanics.robot.urdf_visuals import find_mesh, visuals_of, with_meshes_found
 
 ARMS = {
     "panda": ("panda_description/urdf/panda.urdf", "panda_link0", "panda_hand_tcp", 7),

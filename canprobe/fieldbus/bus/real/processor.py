@@ -1,15 +1,11 @@
-"""What a process in real time needs of its machine: priority, memory, and interrupts between two cycles only."""
+"""What a process in real time asks of its machine: priority, one processor, locked memory."""
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
-import functools
-import gc
 import os
 from collections.abc import Callable, Iterator
-
-# The processor's favour and the memory's, where they can be had.
 
 FAVOURED = -15
 """Nice value asked for."""
@@ -83,57 +79,3 @@ def _locked() -> Callable[[], object]:
         raise OSError(number, os.strerror(number))
     unlock: Callable[[], object] = libc.munlockall
     return unlock
-
-
-# Keeps the garbage collector and page faults out of cycles.
-
-BYTES_PER_CYCLE = 4 << 10
-"""A cycle that keeps its frames, log rows and truth grows by 1 to 3 KiB."""
-LEAST_RESERVE, LARGEST_RESERVE = 4 << 20, 32 << 20
-"""Bytes taken in advance; more than a run of 20 s at 400 Hz grows by."""
-_SMALL = 480  # bytes; objects up to 512 come from Python's own allocator, larger ones from the C library
-_KEEP_EVERY = (256 << 10) // 512
-
-
-@functools.cache
-def reserve_memory(cycles: int) -> tuple[bytes, ...]:
-    """Let both allocators take memory from the system now, and keep it.
-
-    A first touch of a page costs a microsecond, and a hundred in a virtual machine that has to ask its host: there a
-    second for the largest reserve.
-
-    Args:
-        cycles: that are going to keep something; for longer runs the rest is taken on the way.
-
-    Returns:
-        What holds the memory, kept until the process ends; a second call has nothing left to do.
-    """
-    size = min(LEAST_RESERVE + cycles * BYTES_PER_CYCLE, LARGEST_RESERVE)  # half for small objects, half for large ones
-    blocks = [bytes(_SMALL) for _ in range(size // 2 // 512)]
-    for _ in range(2):  # the first raises glibc's limits above this size, the second then comes out of its heap
-        bytearray(size // 2)
-    return tuple(blocks[::_KEEP_EVERY])  # an arena with nothing in it would go back to the system
-
-
-@contextlib.contextmanager
-def garbage_collection_paused(*, collect: bool = True) -> Iterator[None]:
-    """Within the block nothing is collected: a full collection takes 35 ms with these libraries loaded, 14 cycles.
-
-    What exists at its start is set aside for good measure, so that a collection afterwards is short. The cycle makes no
-    reference cycles, so nothing piles up meanwhile.
-
-    Args:
-        collect: collect once before; False where no time is lost by collecting later.
-    """
-    was_enabled = gc.isenabled()
-    if collect:
-        gc.collect()
-        gc.freeze()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if collect:
-            gc.unfreeze()
-        if was_enabled:
-            gc.enable()

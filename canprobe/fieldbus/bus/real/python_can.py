@@ -1,4 +1,8 @@
-"""Open a CAN interface by name; a `Port` over any of python-can's, for adapters that SocketCAN does not drive."""
+"""A `Port` over any interface of python-can: the portable way, for adapters that SocketCAN does not drive.
+
+Frames are stamped with the time at which they are taken from python-can, whose own stamps differ between interfaces.
+It costs some 10 µs a frame; for SocketCAN use `canprobe.fieldbus.bus.real.socketcan`.
+"""
 
 from __future__ import annotations
 
@@ -17,59 +21,14 @@ from canprobe.fieldbus.bus.port import (
     ERR_FLAG,
     ControllerState,
     PlainPort,
-    Port,
     PortCounters,
     Reports,
     TimedFrame,
     state_after,
 )
 from canprobe.fieldbus.bus.real.echoes import Echoes
-from canprobe.fieldbus.bus.real.mmsg import HAS_BATCHES
 from canprobe.fieldbus.protocol.frame_bits import FD_LENGTHS
 from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG, Frame
-
-# Open a CAN interface by name.
-
-
-def open_port(
-    interface: str,
-    channel: str,
-    bitrate: int,
-    clock: Clock,
-    *,
-    data_bitrate: int | None = None,
-    waits: bool = False,
-    reports: Reports | None = None,
-) -> Port:
-    """Open `channel` of `interface`.
-
-    Args:
-        interface: `socketcan` for a raw socket of our own, or any of python-can's interfaces.
-        channel: the channel as that interface names it, such as `can0`.
-        bitrate: in bit/s; a SocketCAN interface has its own, set with `ip link`.
-        clock: a clock in real time.
-        data_bitrate: of the data phase of CAN FD frames; None: classical frames only.
-        waits: wait for a full transmit queue as long as it takes; only SocketCAN can.
-        reports: who hears of error frames, and of what the user has to know.
-
-    Raises:
-        UsageError: there is no interface of that name.
-        InterfaceError: it is missing, down, or cannot be opened; with what to do.
-    """
-    if interface == "socketcan" and HAS_BATCHES:  # else python-can's
-        from canprobe.fieldbus.bus.real.socketcan import SocketCanPort
-
-        return SocketCanPort(channel, clock, bitrate=bitrate, data_bitrate=data_bitrate, waits=waits, reports=reports)
-    if interface in ("lockstep", "direct"):
-        what = "a lockstep bus lives inside one run" if interface == "lockstep" else "--bus direct has no bus"
-        raise UsageError(f"{channel}: {what}; there is nothing to open")
-    return PythonCanPort(interface, channel, bitrate, clock, data_bitrate=data_bitrate, reports=reports)
-
-
-# A `Port` over any python-can interface: the portable way, for adapters that SocketCAN does not drive.
-#
-# Frames are stamped with the time at which they are taken from python-can, whose own stamps differ between interfaces.
-# It costs some 10 µs a frame; for SocketCAN use `canprobe.fieldbus.bus.real.socketcan`.
 
 _EXTENDED_MASK = 0x1FFFFFFF
 CLASSIC_BYTES = 8

@@ -1,5 +1,13 @@
 """Buses in virtual time, in one process and one thread: the same seed gives the same log, byte by byte.
 
-`lockstep` delivers frames at once, in the order of arbitration. `timed` gives each frame its bits at the bit rate, with
-arbitration, queues and error frames; `controllers` are the error counters and states of the nodes on it.
+Nodes attach to a bus as participants: the bus gives them frames and the time, and takes frames and their next deadline.
+Time is a `VirtualClock`. It passes only while somebody waits on it, and then jumps from one deadline to the next.
+
+    lockstep         frames arrive at once, in the order of arbitration, without time on the wire
+    timed            frames take their bits at the bit rate, wait for each other, and fail where the wire fails
+    bit_errors       which transmissions the wire corrupts
+    error_counters   the error counters of one controller: error active, error passive, bus off
+    controllers      all controllers of a timed bus: who has to wait, and who is off the bus
+
+Start reading at `lockstep`; a `TimedBus` is a `LockstepBus` that adds the wire.
 """

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from canprobe.fieldbus.bus.port import ControllerState
 from canprobe.fieldbus.bus.virtual.error_counters import ErrorCounters
-from canprobe.fieldbus.bus.virtual.lockstep import BusNode, LockstepPort
+from canprobe.fieldbus.bus.virtual.lockstep import Attachment, LockstepPort
 from canprobe.fieldbus.protocol.frame_bits import INTERMISSION_BITS, SUSPEND_BITS
 
 _RECESSIVE_BITS = 11
@@ -28,16 +28,16 @@ class Controllers:
 
     def __init__(self, bits_ns: Callable[[int], int]) -> None:
         self.troubled = False
-        self.suspended: dict[BusNode, int] = {}
+        self.suspended: dict[Attachment, int] = {}
         self._bits_ns = bits_ns
-        self._counters: dict[BusNode, ErrorCounters] = {}
+        self._counters: dict[Attachment, ErrorCounters] = {}
         self._quiet_ns = 0  # since when the wire has been recessive, less what was counted of it
 
-    def add(self, node: BusNode) -> None:
+    def add(self, node: Attachment) -> None:
         """A new node."""
         self._counters[node] = ErrorCounters()
 
-    def remove(self, node: BusNode) -> None:
+    def remove(self, node: Attachment) -> None:
         """A node that leaves."""
         self.suspended.pop(node, None)
         del self._counters[node]
@@ -53,15 +53,15 @@ class Controllers:
                 return counters
         raise KeyError(owner)
 
-    def is_off(self, node: BusNode) -> bool:
+    def is_off(self, node: Attachment) -> bool:
         """It is bus off: it neither sends nor hears."""
         return self.troubled and bool(self._counters[node].outstanding)
 
-    def off(self) -> list[BusNode]:
+    def off(self) -> list[Attachment]:
         """The nodes that are bus off."""
         return [node for node, counters in self._counters.items() if counters.outstanding]
 
-    def fail(self, sender: BusNode, end_ns: int) -> None:
+    def fail(self, sender: Attachment, end_ns: int) -> None:
         """An error frame has ended at `end_ns`; everybody saw it."""
         self.troubled = True
         self._quiet_ns = end_ns - self._bits_ns(_AFTER_ACK_BITS)
@@ -75,7 +75,7 @@ class Controllers:
         self._suspend(sender, end_ns)
         self._show_states()
 
-    def succeed(self, sender: BusNode, end_ns: int) -> None:
+    def succeed(self, sender: Attachment, end_ns: int) -> None:
         """A frame has ended at `end_ns`; only of interest while a controller is troubled."""
         self._quiet_ns = end_ns - self._bits_ns(_AFTER_ACK_BITS)
         for node, counters in self._counters.items():
@@ -100,7 +100,7 @@ class Controllers:
         least = min((c.outstanding for c in self._counters.values() if c.outstanding), default=None)
         return None if least is None else self._quiet_ns + least * self._bits_ns(_RECESSIVE_BITS)
 
-    def _suspend(self, sender: BusNode, end_ns: int) -> None:
+    def _suspend(self, sender: Attachment, end_ns: int) -> None:
         """After its own frame an error-passive node waits for eight bits more."""
         if self._counters[sender].state is ControllerState.PASSIVE:
             self.suspended[sender] = end_ns + self._bits_ns(INTERMISSION_BITS + SUSPEND_BITS)

@@ -81,10 +81,10 @@ class Participant:
         return ()
 
 
-Listener = tuple[Callable[[int, bytes, int], Sequence[Frame]], "BusNode"]
+Listener = tuple[Callable[[int, bytes, int], Sequence[Frame]], "Attachment"]
 
 
-class BusNode:
+class Attachment:
     """The bus's view of one sender: its queue, and where its frames go."""
 
     __slots__ = ("due", "listeners", "order", "outbox", "owner")
@@ -117,8 +117,8 @@ class LockstepBus:
         self.error_recorder: Recorder | None = None  # called with each error frame, where bits can fail
         self._max_frames = max_frames
         self._count = 0
-        self._nodes: list[BusNode] = []
-        self._heads: list[tuple[int, int, BusNode]] = []
+        self._nodes: list[Attachment] = []
+        self._heads: list[tuple[int, int, Attachment]] = []
         self._settling = False
         clock.attach(self)
 
@@ -180,7 +180,7 @@ class LockstepBus:
             self.clock.move_ns(due)
             self.settle()
 
-    def send(self, node: BusNode, frames: Sequence[Frame]) -> None:
+    def send(self, node: Attachment, frames: Sequence[Frame]) -> None:
         """Queue the frames of a port and carry everything due."""
         self._queue(node, frames)
         self.settle()
@@ -212,7 +212,7 @@ class LockstepBus:
             self._hand_over(sender, can_id, data, t_ns)
         return limit
 
-    def _take_next(self) -> tuple[BusNode, Frame]:
+    def _take_next(self) -> tuple[Attachment, Frame]:
         """Take the frame that wins the arbitration out of its queue."""
         _, _, sender = heappop(self._heads)
         outbox = sender.outbox
@@ -221,7 +221,7 @@ class LockstepBus:
             heappush(self._heads, (arbitration_key(outbox[0][0]), sender.order, sender))
         return sender, frame
 
-    def _hand_over(self, sender: BusNode, can_id: int, data: bytes, t_ns: int) -> None:
+    def _hand_over(self, sender: Attachment, can_id: int, data: bytes, t_ns: int) -> None:
         """Everybody hears a frame but its sender; the answers are queued."""
         for receive, receiver in self._listeners_of(sender, can_id):
             answers = receive(can_id, data, t_ns)
@@ -229,7 +229,7 @@ class LockstepBus:
             if answers:
                 self._queue(receiver, answers)
 
-    def _queue(self, node: BusNode, frames: Sequence[Frame]) -> None:
+    def _queue(self, node: Attachment, frames: Sequence[Frame]) -> None:
         if not frames:
             return
         for frame in frames:
@@ -238,13 +238,13 @@ class LockstepBus:
             heappush(self._heads, (arbitration_key(frames[0][0]), node.order, node))
         node.outbox.extend(frames)
 
-    def _check(self, node: BusNode, frame: Frame) -> None:
+    def _check(self, node: Attachment, frame: Frame) -> None:
         can_id, data = frame
         if len(data) > CLASSIC_BYTES and not (self.fd and len(data) in FD_LENGTHS):
             has = f"CAN FD has {', '.join(map(str, FD_LENGTHS[9:]))} above 8" if self.fd else "CAN has 8"
             raise BusError(f"{self.channel}: {node.owner.name} sends {len(data)} bytes with {can_id:03X}; {has}")
 
-    def _listeners_of(self, sender: BusNode, can_id: int) -> tuple[Listener, ...]:
+    def _listeners_of(self, sender: Attachment, can_id: int) -> tuple[Listener, ...]:
         listeners = sender.listeners.get(can_id)
         if listeners is None:
             listeners = sender.listeners[can_id] = tuple(
@@ -254,10 +254,10 @@ class LockstepBus:
             )
         return listeners
 
-    def _add(self, owner: Participant) -> BusNode:
+    def _add(self, owner: Participant) -> Attachment:
         if any(node.owner is owner for node in self._nodes):
             raise BusError(f"{self.channel}: {owner.name} is on the bus already")
-        node = BusNode(owner, self._count)
+        node = Attachment(owner, self._count)
         self._count += 1
         self._nodes.append(node)
         self._forget_listeners()
@@ -291,7 +291,7 @@ class LockstepPort(Participant, PlainPort):
         (`canprobe.fieldbus.bus.virtual.controllers`).
     """
 
-    node: BusNode
+    node: Attachment
     next_deadline_ns = None
 
     def __init__(self, bus: LockstepBus) -> None:

@@ -23,7 +23,7 @@ from canprobe.fieldbus.bus.virtual.controllers import Controllers
 from canprobe.fieldbus.bus.virtual.error_counters import ErrorCounters
 from canprobe.fieldbus.bus.virtual.lockstep import (
     CLASSIC_BYTES,
-    BusNode,
+    Attachment,
     LockstepBus,
     LockstepPort,
     Participant,
@@ -38,7 +38,7 @@ LINGER_NS = 50_000_000
 _NS = 1_000_000_000
 _ERROR_BITS = 2 * ERROR_FLAG_BITS + ERROR_DELIMITER_BITS  # the others answer the flag of the first with theirs
 
-_Entry = tuple[int, int, BusNode, Frame]
+_Entry = tuple[int, int, Attachment, Frame]
 """A frame that takes part in the arbitration: what the wire compares, order of queueing, sender, frame."""
 
 
@@ -202,7 +202,7 @@ class TimedBus(LockstepBus):
                 return
         raise self._endless(t_ns, "deadlines that never move on, of " + self._names_due(t_ns))
 
-    def send(self, node: BusNode, frames: Sequence[Frame]) -> None:
+    def send(self, node: Attachment, frames: Sequence[Frame]) -> None:
         """Queue the frames of a port; they go when the bus is free and theirs is the lowest identifier."""
         self._stale = True
         self._queue(node, frames)
@@ -217,7 +217,7 @@ class TimedBus(LockstepBus):
 
     # queues and arbitration
 
-    def _queue(self, node: BusNode, frames: Sequence[Frame]) -> None:
+    def _queue(self, node: Attachment, frames: Sequence[Frame]) -> None:
         if not frames or (self._controllers.troubled and self._controllers.is_off(node)):
             return  # a controller that is bus off takes no part
         for frame in frames:
@@ -233,11 +233,11 @@ class TimedBus(LockstepBus):
             self._ready.clear()
             raise self._endless(self.clock.now_ns(), f"more than {self._max_frames} frames wait, of {node.owner.name}")
 
-    def _is_ready(self, node: BusNode) -> bool:
+    def _is_ready(self, node: Attachment) -> bool:
         flying = self._flying
         return (flying is not None and flying[2] is node) or any(entry[2] is node for entry in self._ready)
 
-    def _compete(self, node: BusNode, frames: Sequence[Frame]) -> None:
+    def _compete(self, node: Attachment, frames: Sequence[Frame]) -> None:
         ready, order = self._ready, self._order
         if not ready:
             self._since_ns = self.clock.now_ns()
@@ -304,13 +304,13 @@ class TimedBus(LockstepBus):
         if self._hit:
             self._fail(entry, t_ns)
             return
-        off: Sequence[BusNode] = ()
+        off: Sequence[Attachment] = ()
         if self._controllers.troubled:
             self._controllers.succeed(sender, t_ns)
             off = self._controllers.off()
         self._deliver_frame(sender, frame, t_ns, off)
 
-    def _deliver_frame(self, sender: BusNode, frame: Frame, t_ns: int, off: Sequence[BusNode] = ()) -> None:
+    def _deliver_frame(self, sender: Attachment, frame: Frame, t_ns: int, off: Sequence[Attachment] = ()) -> None:
         """Everybody but its sender hears a frame, and those that are bus off; the answers are queued."""
         self.frames += 1
         if self._fifo and sender.outbox:
@@ -345,7 +345,7 @@ class TimedBus(LockstepBus):
         else:
             heappush(self._ready, entry)
 
-    def _silence(self, node: BusNode) -> None:
+    def _silence(self, node: Attachment) -> None:
         """A node that is bus off loses what it wanted to send."""
         node.outbox.clear()
         self._ready = [entry for entry in self._ready if entry[2] is not node]
@@ -360,7 +360,7 @@ class TimedBus(LockstepBus):
             pass
         super().remove_port(port)
 
-    def _add(self, owner: Participant) -> BusNode:
+    def _add(self, owner: Participant) -> Attachment:
         node = super()._add(owner)
         self._controllers.add(node)
         self._stale = True

@@ -12,9 +12,10 @@ from canprobe.mechanics.touch.estimate.known_curvature import CurvatureInformati
 from canprobe.mechanics.touch.estimate.observed import Decision, outside, tensor
 from canprobe.mechanics.touch.estimate.quadric import TO_Q, matrix_of
 from canprobe.mechanics.touch.estimate.residuals import transport
-from canprobe.mechanics.touch.linear_algebra import Array, Vec, checked, principal, read_only
+from canprobe.mechanics.touch.linear_algebra import checked, principal, read_only
 from canprobe.mechanics.touch.surface import SurfaceMatrix
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
+from canprobe.mechanics.types import Floats, Vec
 
 _ENTRY_LIMIT = 0.02
 """Largest unobserved part of an entry of K that still has a number."""
@@ -63,25 +64,25 @@ class SurfaceEstimate:
             another source. None from the methods of differences.
     """
 
-    S: Array
-    T_frame_contact: Array
-    K: Array
-    kappa: Array
-    directions: Array
-    covariance: Array
-    observed: Array
+    S: Floats
+    T_frame_contact: Floats
+    K: Floats
+    kappa: Floats
+    directions: Floats
+    covariance: Floats
+    observed: Floats
     rank: int
-    combinations: Array
-    information: Array
+    combinations: Floats
+    information: Floats
     umbilic: bool
     innovation: float
     distance: float
     samples: float
     method: str
     prior: str
-    problem_root: Array
+    problem_root: Floats
     notes: tuple[str, ...] = ()
-    model_root: Array | None = None
+    model_root: Floats | None = None
     evidence: CurvatureInformation | None = None
     stiffness: float | None = None
 
@@ -92,7 +93,7 @@ class SurfaceEstimate:
             self.model_root.setflags(write=False)
 
     @classmethod
-    def of(cls, T_frame_contact: Array, K: Array, *, method: str = "own") -> SurfaceEstimate:
+    def of(cls, T_frame_contact: Floats, K: Floats, *, method: str = "own") -> SurfaceEstimate:
         """An estimate of which only frame and curvature are known, from an estimator of your own.
 
         Args:
@@ -130,7 +131,7 @@ class SurfaceEstimate:
         return float(singular[0] / singular[-1]) if singular[-1] > 0.0 else math.inf
 
     @property
-    def T_base_contact(self) -> Array:
+    def T_base_contact(self) -> Floats:
         """`T_frame_contact` where the frame of the points is the base, as online."""
         return self.T_frame_contact
 
@@ -140,25 +141,25 @@ class SurfaceEstimate:
         return SurfaceMatrix(self.S)
 
     @property
-    def point(self) -> Array:
+    def point(self) -> Floats:
         """(3,) the contact point on the estimated surface, m."""
         return self.T_frame_contact[:3, 3]
 
     @property
-    def normal(self) -> Array:
+    def normal(self) -> Floats:
         """(3,) the outward unit normal there."""
         return -self.T_frame_contact[:3, 2]
 
-    def curvature_tensor_base(self) -> Array:
+    def curvature_tensor_base(self) -> Floats:
         """(3, 3) shape operator as a tensor in the frame of the points, `P K Pᵀ`, 1/m.
 
         From `S`, so always finite; it means nothing where `observed` is False.
         """
         P = self.T_frame_contact[:3, :2]
-        result: Array = P.dot(2.0 * self.S[:2, :2]).dot(P.T)
+        result: Floats = P.dot(2.0 * self.S[:2, :2]).dot(P.T)
         return result
 
-    def predict(self, point: Array) -> tuple[Array, Array]:
+    def predict(self, point: Floats) -> tuple[Floats, Floats]:
         """Surface point and outward unit normal over (along the contact normal) a place near the contact.
 
         Args:
@@ -185,19 +186,19 @@ class Solution(NamedTuple):
         root: (9, 9) root of the information about c with c14, c24, c44, prior included; None where it is not known.
     """
 
-    c: Array
-    covariance: Array
+    c: Floats
+    covariance: Floats
     decision: Decision
     has_prior: bool
-    root: Array | None = None
+    root: Floats | None = None
 
 
 def build_estimate(
     solution: Solution,
     *,
     length: float,
-    T_frame_contact: Array,
-    problem_root: Array,
+    T_frame_contact: Floats,
+    problem_root: Floats,
     innovation: float,
     distance: float,
     samples: float,
@@ -247,14 +248,14 @@ def build_estimate(
     )
 
 
-def _principal(K: Array) -> tuple[Array, Array]:
+def _principal(K: Floats) -> tuple[Floats, Floats]:
     """κ1 ≥ κ2 and their directions as rows (2, 2)."""
     mean, radius, angle = principal(K)
     c, s = math.cos(angle), math.sin(angle)
     return np.array([mean + radius, mean - radius]), np.array([[c, s], [-s, c]])
 
 
-def is_umbilic(K: Array, covariance: Array) -> bool:
+def is_umbilic(K: Floats, covariance: Floats) -> bool:
     """The deviator (K11 − K22, 2 K12) is within its 95 % region of 0."""
     (k11, k12), (_, k22) = K.tolist()
     (c11, c12, c13), (_, c22, c23), (_, _, c33) = covariance.tolist()
@@ -265,8 +266,8 @@ def is_umbilic(K: Array, covariance: Array) -> bool:
 
 
 def _partly(
-    K: Array, covariance: Array, decision: Decision, has_prior: bool, length: float
-) -> tuple[Array, Array, Array, Array, Array]:
+    K: Floats, covariance: Floats, decision: Decision, has_prior: bool, length: float
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """K, covariance, kappa, directions and flags where the data left something open."""
     if has_prior:
         kappa, local = _principal(K)
@@ -283,7 +284,7 @@ def _partly(
     return K, covariance, kappa, local, np.array([seen, False])
 
 
-def partial_covariance(V: Array, information: Array, hidden: Array) -> Array:
+def partial_covariance(V: Floats, information: Floats, hidden: Floats) -> Floats:
     """Covariance (3, 3) of (K11, K12, K22), NaN and infinite in the hidden (3,) entries.
 
     Args:
@@ -291,20 +292,20 @@ def partial_covariance(V: Array, information: Array, hidden: Array) -> Array:
         information: (k,) about each.
         hidden: (3,) bool.
     """
-    C: Array = (V / information) @ V.T / np.outer(TO_Q, TO_Q)
+    C: Floats = (V / information) @ V.T / np.outer(TO_Q, TO_Q)
     C[hidden] = C[:, hidden] = math.nan
     C[hidden, hidden] = math.inf
     return C
 
 
-def _projector(t: Array) -> Array:
+def _projector(t: Floats) -> Floats:
     """q of t tᵀ, the normal curvature along the tangent direction t (2,)."""
     x, y = t.tolist()
-    result: Array = TO_Q * [x * x, x * y, y * y]
+    result: Floats = TO_Q * [x * x, x * y, y * y]
     return result
 
 
-def _observed_direction(decision: Decision) -> Array:
+def _observed_direction(decision: Decision) -> Floats:
     """The tangent direction whose normal curvature the data know best.
 
     With one combination open it is the null direction of that combination; with two, the main direction of the
@@ -317,7 +318,7 @@ def _observed_direction(decision: Decision) -> Array:
     q = decision.vectors[:, int(np.argmax(wanted))]
     values, vectors = np.linalg.eigh(tensor(q))
     order = np.argsort(np.abs(values))
-    result: Array = vectors[:, order[0 if open_one else 1]]
+    result: Floats = vectors[:, order[0 if open_one else 1]]
     return result if result[np.argmax(np.abs(result))] > 0.0 else -result
 
 
@@ -331,13 +332,13 @@ class Anchor(NamedTuple):
         turn: angle of the contact frame's x axis from the working frame's, rad.
     """
 
-    c: Array
-    M: Array
-    T_frame_contact: Array
+    c: Floats
+    M: Floats
+    T_frame_contact: Floats
     turn: float
 
 
-def foot(c: Array, start: Vec) -> tuple[Vec, Vec]:
+def foot(c: Floats, start: Vec) -> tuple[Vec, Vec]:
     """Foot of a nearby point on the model's surface and the inward unit normal there, dimensionless."""
     half0, half1, constant, *entries = c.tolist()
     b02, b12, b22, b00, b01, b11 = [2.0 * entry for entry in entries]
@@ -354,7 +355,7 @@ def foot(c: Array, start: Vec) -> tuple[Vec, Vec]:
     return (x, y, z), (-u / size, -v / size, -w / size)
 
 
-def anchor(c: Array, T_frame_work: Array, point: Vec, length: float) -> Anchor:
+def anchor(c: Floats, T_frame_work: Floats, point: Vec, length: float) -> Anchor:
     """A model at the foot of a point; c (9,) and the point in the working frame, in units of `length` (m)."""
     x, z = foot(c, point)
     R_work = T_frame_work[:3, :3]

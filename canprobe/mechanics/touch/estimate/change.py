@@ -12,7 +12,7 @@ from collections import deque
 import numpy as np
 
 from canprobe.mechanics.touch.estimate.noise import CHI2_999, CHI2_MEDIAN
-from canprobe.mechanics.touch.linear_algebra import Array
+from canprobe.mechanics.types import Floats
 
 LAST_FEW, BEST = 8, 3
 """Of so many last samples so many are the best: they stay right while no more than five of eight are wrong."""
@@ -66,7 +66,7 @@ class ChangeTest:
             self._of_best += LONG_TERM * (best - self._of_best)
         return False
 
-    def usual_again(self, squares: Array) -> bool:
+    def usual_again(self, squares: Floats) -> bool:
         """Whether such squared innovations alone would set off no alarm, once something is taken into account."""
         return float(np.minimum(squares, CHI2_999).mean()) / 3.0 < ALARM * self.usual
 
@@ -81,7 +81,7 @@ def _bounded(usual: float) -> float:
     return min(max(usual, USUAL[0]), USUAL[1])
 
 
-def looks_changed(squares: Array) -> bool:
+def looks_changed(squares: Floats) -> bool:
     """The same test on a batch's squared residuals (n,), in the order of time: whether the last few disagree with the
     fit of all.
     """

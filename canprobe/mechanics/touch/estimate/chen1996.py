@@ -24,10 +24,11 @@ import numpy as np
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 from canprobe.mechanics.touch.estimate.differences import Pairs, solve_pairs, usable_lag
-from canprobe.mechanics.touch.estimate.likelihood import Touches, working_frame
+from canprobe.mechanics.touch.estimate.likelihood import ContactBatch, working_frame
 from canprobe.mechanics.touch.estimate.window import WindowEstimator
-from canprobe.mechanics.touch.linear_algebra import Array, whole
+from canprobe.mechanics.touch.linear_algebra import whole
 from canprobe.mechanics.touch.tangent_frames import rotation_vectors
+from canprobe.mechanics.types import Floats
 
 
 class Chen1996Estimator(WindowEstimator):
@@ -48,7 +49,7 @@ class Chen1996Estimator(WindowEstimator):
         """With the probe's pose, row by row, and the contact in its frame."""
         return (*super()._row(sample), *sample.T_base_probe[:3].ravel().tolist(), *sample.r_probe.tolist())
 
-    def _solve(self, touches: Touches) -> SurfaceEstimate:
+    def _solve(self, touches: ContactBatch) -> SurfaceEstimate:
         rows = np.array(self._rows)
         lag = usable_lag(len(rows), self._lag)
         newer = np.arange(lag, len(rows))
@@ -57,7 +58,7 @@ class Chen1996Estimator(WindowEstimator):
         return solve_pairs(touches, Pairs(newer, newer - lag, y / touches.extent, -x), "chen1996")
 
 
-def paper_rates(T_base_probe: Array, r_probe: Array, n_base: Array, lag: int) -> tuple[Array, Array]:
+def paper_rates(T_base_probe: Floats, r_probe: Floats, n_base: Floats, lag: int) -> tuple[Floats, Floats]:
     """x (28) and y (29) (n − lag, 3) times the time between samples `lag` apart, in base axes; the object stands still.
 
     `x = ω × n_f + K_f v_f`, `y = V_f + v_f`, everything taken half-way; K_f = 1/|r_probe|.

@@ -1,4 +1,4 @@
-"""Six-unknown linear estimates from differences of points and normals."""
+"""Linear estimates of six unknowns from differences of points and normals."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.mechanics.touch.estimate.answer import Solution, SurfaceEstimate, build_estimate
-from canprobe.mechanics.touch.estimate.likelihood import Touches, working_frame
+from canprobe.mechanics.touch.estimate.likelihood import ContactBatch, working_frame
 from canprobe.mechanics.touch.estimate.observed import decide
 from canprobe.mechanics.touch.estimate.quadric import TO_Q, size_of
-from canprobe.mechanics.touch.linear_algebra import Array, upper_root
+from canprobe.mechanics.touch.linear_algebra import upper_root
+from canprobe.mechanics.types import Floats
 
 NO_PRIOR = "none (the method takes none)"
 _COLUMNS = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
@@ -36,23 +37,23 @@ class Pairs(NamedTuple):
 
     newer: NDArray[np.intp]
     older: NDArray[np.intp]
-    points: Array
-    normals: Array
+    points: Floats
+    normals: Floats
 
 
-def chord_pairs(touches: Touches) -> Pairs:
+def chord_pairs(touches: ContactBatch) -> Pairs:
     """Every sample against the last."""
     n = len(touches.points)
     return _pairs(touches, np.full(n - 1, n - 1), np.arange(n - 1))
 
 
-def lag_pairs(touches: Touches, lag: int) -> Pairs:
+def lag_pairs(touches: ContactBatch, lag: int) -> Pairs:
     """Every sample against the one `lag` before it."""
     newer = np.arange(lag, len(touches.points))
     return _pairs(touches, newer, newer - lag)
 
 
-def _pairs(touches: Touches, newer: NDArray[np.intp], older: NDArray[np.intp]) -> Pairs:
+def _pairs(touches: ContactBatch, newer: NDArray[np.intp], older: NDArray[np.intp]) -> Pairs:
     R = working_frame(touches)[:3, :3]
     p, n = touches.points, touches.normals
     return Pairs(newer, older, (p[newer] - p[older]) @ R / touches.extent, (n[newer] - n[older]) @ R)
@@ -63,7 +64,7 @@ def usable_lag(n: int, lag: int) -> int:
     return max(1, min(lag, (n - 1) // 2))
 
 
-def three_rows(y: Array) -> Array:
+def three_rows(y: Floats) -> Floats:
     """A (3m, 6) with `A c = S₃ y` for vectors y (m, 3), (33) without its empty columns."""
     A = np.zeros((len(y), 3, 6))
     for row, columns in enumerate(_COLUMNS):
@@ -71,7 +72,7 @@ def three_rows(y: Array) -> Array:
     return A.reshape(-1, 6)
 
 
-def solve_pairs(touches: Touches, data: Pairs, method: str) -> SurfaceEstimate:
+def solve_pairs(touches: ContactBatch, data: Pairs, method: str) -> SurfaceEstimate:
     """Least squares for 2 S₃, in the contact frame of the last *measured* point and normal.
 
     By SVD; singular values below 1e-10 of the largest are left out, and what of K lies along their vectors is not
@@ -106,17 +107,17 @@ def solve_pairs(touches: Touches, data: Pairs, method: str) -> SurfaceEstimate:
     )
 
 
-def _propagated(data: Pairs, inverse: Array) -> Array:
+def _propagated(data: Pairs, inverse: Floats) -> Floats:
     """Covariance (6, 6) of the six per unit variance of each sample's equation noise."""
     gain = inverse.reshape(6, -1, 3)
     total = np.zeros((int(data.newer.max()) + 1, 6, 3))
     np.add.at(total, data.newer, gain.transpose(1, 0, 2))
     np.subtract.at(total, data.older, gain.transpose(1, 0, 2))
-    result: Array = np.einsum("kia,kja->ij", total, total)
+    result: Floats = np.einsum("kia,kja->ij", total, total)
     return result
 
 
-def _root_of(covariance: Array, open_ways: Array) -> Array:
+def _root_of(covariance: Floats, open_ways: Floats) -> Floats:
     """A root (k, 3) of the inverse of a covariance that may vanish or be singular (then: nothing is known there).
 
     Nothing is known along the columns of `open_ways` (3, m) either.
@@ -125,5 +126,5 @@ def _root_of(covariance: Array, open_ways: Array) -> Array:
     known = ways[:, np.count_nonzero(sizes > _OPEN) :]
     values, vectors = np.linalg.eigh(known.T @ covariance @ known)
     inverse = np.where(values > 1e-14 * values.max(initial=1e-300), 1.0 / np.maximum(values, 1e-300), 0.0)
-    result: Array = np.sqrt(inverse)[:, None] * (known @ vectors).T
+    result: Floats = np.sqrt(inverse)[:, None] * (known @ vectors).T
     return result

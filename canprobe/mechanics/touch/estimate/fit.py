@@ -13,7 +13,7 @@ from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 from canprobe.mechanics.touch.estimate.chen1996 import Chen1996Estimator
 from canprobe.mechanics.touch.estimate.differences import chord_pairs, lag_pairs, solve_pairs, usable_lag
-from canprobe.mechanics.touch.estimate.likelihood import Touches, checked_arrays, fit_ml, make_touches
+from canprobe.mechanics.touch.estimate.likelihood import ContactBatch, checked_arrays, fit_ml, make_touches
 from canprobe.mechanics.touch.estimate.noise import Correlation, make_noise
 from canprobe.mechanics.touch.estimate.online import Estimator
 from canprobe.mechanics.touch.estimate.prior import Prior
@@ -155,7 +155,7 @@ def fit_surface(
     raise unknown_method(method)
 
 
-def _run_filter(touches: Touches, prior: Prior | None, quadric: bool) -> SurfaceEstimate:
+def _run_filter(touches: ContactBatch, prior: Prior | None, quadric: bool) -> SurfaceEstimate:
     """The answer of `recursive` after samples of which only place and normal are known."""
     memory = _memory_of(touches)
     point, normal = np.sqrt(touches.noise.point_variance), np.sqrt(touches.noise.normal_variance)
@@ -185,7 +185,7 @@ EXTENTS = 2.0
 """Longest memory over the extent of the points: a weave or a circle has seen all directions by then."""
 
 
-def _memory_of(touches: Touches) -> float:
+def _memory_of(touches: ContactBatch) -> float:
     """Path that `recursive` remembers, m: all of a short one; of a longer one as much as extent and radius allow.
 
     The filter's unit of length, its steps and its prior are shares of the memory. On a long path over a small patch the

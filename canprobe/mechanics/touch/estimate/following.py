@@ -19,7 +19,7 @@ from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate, is_umbilic
 from canprobe.mechanics.touch.estimate.online import Dropped, Estimator
 from canprobe.mechanics.touch.estimate.quadric import TO_Q
-from canprobe.mechanics.touch.linear_algebra import Array
+from canprobe.mechanics.types import Floats
 
 SPAN = 0.5
 """Path, over the memory, along which a change of the answers is looked for."""
@@ -43,8 +43,8 @@ class FollowingEstimator:
         self._inner = inner
         self._scale = scale
         self._memory = memory_m
-        self._past: deque[tuple[float, Array]] = deque()
-        self._place: Array | None = None
+        self._past: deque[tuple[float, Floats]] = deque()
+        self._place: Floats | None = None
         self._travelled = 0.0
 
     @property
@@ -78,7 +78,7 @@ class FollowingEstimator:
             errors.append(self._scale * tensor)
         return less_certain(answer, *errors)
 
-    def _late(self, tensor: Array) -> Array | None:
+    def _late(self, tensor: Floats) -> Floats | None:
         """(3, 3) change of the curvature tensor over the path that an answer lags behind; None where there is none."""
         past = self._past
         while len(past) > 1 and self._travelled - past[1][0] >= SPAN * self._memory:
@@ -86,11 +86,11 @@ class FollowingEstimator:
         if not past or self._travelled - past[0][0] < LEAST_SPAN * self._memory:
             return None
         then, before = past[0]
-        result: Array = (tensor - before) * (LAG * self._memory / (self._travelled - then))
+        result: Floats = (tensor - before) * (LAG * self._memory / (self._travelled - then))
         return result
 
 
-def less_certain(answer: SurfaceEstimate, *errors: Array) -> SurfaceEstimate:
+def less_certain(answer: SurfaceEstimate, *errors: Floats) -> SurfaceEstimate:
     """An answer, all observed, whose curvature is also off by tensors (3, 3, 1/m), each times a normal variate."""
     P = answer.T_frame_contact[:3, :2]
     covariance, information, root = answer.covariance, answer.information, answer.model_root
@@ -112,12 +112,12 @@ def less_certain(answer: SurfaceEstimate, *errors: Array) -> SurfaceEstimate:
     )
 
 
-def _with_error(root: Array, error: Array) -> Array:
+def _with_error(root: Floats, error: Floats) -> Floats:
     """A root (n, k) of an information once the last parameters have one more error (3,) of random size."""
     u = root[:, -len(error) :].dot(error)
     square = float(u.dot(u))
     if square == 0.0:
         return root
     share = (1.0 - 1.0 / math.sqrt(1.0 + square)) / square
-    result: Array = root - (share * u)[:, None] * u.dot(root)
+    result: Floats = root - (share * u)[:, None] * u.dot(root)
     return result

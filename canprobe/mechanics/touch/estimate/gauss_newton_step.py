@@ -10,7 +10,7 @@ from canprobe.mechanics.touch.estimate.nonlinear import robust, solve_rows
 from canprobe.mechanics.touch.estimate.observed import Decision, spread_of
 from canprobe.mechanics.touch.estimate.quadric import size_of
 from canprobe.mechanics.touch.estimate.residuals import Design, linearise
-from canprobe.mechanics.touch.linear_algebra import Array
+from canprobe.mechanics.types import Floats
 
 _SHORTER = (1.0, 0.25)
 """Shares of a step that are tried."""
@@ -32,13 +32,13 @@ class Solved(NamedTuple):
         decision: on the data.
     """
 
-    c: Array
+    c: Floats
     cost: float
-    rows: Array
-    r: Array
-    weight: Array
-    target: Array
-    root: Array
+    rows: Floats
+    r: Floats
+    weight: Floats
+    target: Floats
+    root: Floats
     decision: Decision
 
     @property
@@ -47,13 +47,13 @@ class Solved(NamedTuple):
         way = self.root @ (self.target - self.c)
         return float(way @ way)
 
-    def residuals_at(self, c: Array) -> Array:
+    def residuals_at(self, c: Floats) -> Floats:
         """Minus the residuals (n, 3) at other parameters (9,) nearby."""
-        result: Array = -self.r - self.rows[:, :, :9] @ (c - self.c)
+        result: Floats = -self.r - self.rows[:, :, :9] @ (c - self.c)
         return result
 
 
-def solved_once(c: Array, d: Design, prior: tuple[Array, Array]) -> Solved:
+def solved_once(c: Floats, d: Design, prior: tuple[Floats, Floats]) -> Solved:
     """The problem at parameters (9,); prior: rows (6, 9) and right-hand side (6,)."""
     at = linearise(c, d)
     weight, cost = robust(np.einsum("ij,ij->i", at.r, at.r))
@@ -66,7 +66,7 @@ def solved_once(c: Array, d: Design, prior: tuple[Array, Array]) -> Solved:
     return Solved(c, cost, rows, r, weight, target, root, decision)
 
 
-def gauss_newton(now: Solved, d: Design, prior: tuple[Array, Array]) -> Solved:
+def gauss_newton(now: Solved, d: Design, prior: tuple[Floats, Floats]) -> Solved:
     """The next one at the target, or nearer where the step from there is longer; `now` where that is no better either.
 
     The length of the next step says whether a step was good, not the cost: the whitening changes with K, so the place

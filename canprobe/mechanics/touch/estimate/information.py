@@ -14,29 +14,30 @@ from typing import NamedTuple
 import numpy as np
 
 from canprobe.mechanics.touch.estimate.answer import foot
-from canprobe.mechanics.touch.estimate.left_out import LeftOut
 from canprobe.mechanics.touch.estimate.noise import Correlation, Noise
 from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE
+from canprobe.mechanics.touch.estimate.omitted_terms import OmittedTerms
 from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.estimate.residuals import Design, design, linearise, transport
-from canprobe.mechanics.touch.linear_algebra import Array, Vec, inverted, inverted_upper, upper_root
+from canprobe.mechanics.touch.linear_algebra import inverted, inverted_upper, upper_root
 from canprobe.mechanics.touch.tangent_frames import homogeneous, transported
+from canprobe.mechanics.types import Floats, Vec
 
 
-class Touch(NamedTuple):
+class MeasuredContact(NamedTuple):
     """What a contact gives the filter: place (3,) m and outward unit normal (3,) in base, and their noise.
 
     The noise is in m, rad and, what couples them (`Noise.coupling`), 1/m.
     """
 
-    point: Array
-    normal: Array
+    point: Floats
+    normal: Floats
     sigma_point: float
     sigma_normal: float
     coupling: float = 0.0
 
 
-def batch_design(T_base_work: Array, length: float, touches: Sequence[Touch]) -> Design:
+def batch_design(T_base_work: Floats, length: float, touches: Sequence[MeasuredContact]) -> Design:
     """Contacts (`quadric.design`) in a working frame (4, 4), in units of a length (m)."""
     R = T_base_work[:3, :3]
     points = (np.array([t.point for t in touches]) - T_base_work[:3, 3]).dot(R) / length
@@ -83,13 +84,13 @@ class InformationFilter:
 
     def __init__(self, length: float, prior: Prior, correlation: Correlation | None) -> None:
         self.length = length
-        self.root: Array
-        self.inverse: Array
+        self.root: Floats
+        self.inverse: Floats
         self._prior_rows = _prior_rows(prior, length)
-        self.left_out = LeftOut(self._prior_rows.T @ self._prior_rows, correlation)
+        self.left_out = OmittedTerms(self._prior_rows.T @ self._prior_rows, correlation)
         self.begin(np.eye(4))
 
-    def begin(self, T: Array) -> None:
+    def begin(self, T: Floats) -> None:
         """Know nothing but the prior: a plane in a frame (4, 4)."""
         self.T = T
         self.c = np.zeros(9)
@@ -98,7 +99,7 @@ class InformationFilter:
         self.left_out.reset()
 
     def adopt(  # noqa: PLR0917 - what a batch solution is
-        self, T: Array, c: Array, root: Array, rows: Array, residuals: Array, travelled: float
+        self, T: Floats, c: Floats, root: Floats, rows: Floats, residuals: Floats, travelled: float
     ) -> None:
         """Take over a batch solution: its working frame (4, 4), parameters (9,), root (9, 9) of their information,
         whitened and weighted rows (n, 3, 18), and minus their residuals (n, 3), evenly spread over the path (m).
@@ -108,7 +109,7 @@ class InformationFilter:
         self._set_root(upper_root(np.concatenate([root, DIFFUSE * np.eye(9)])))
         self.left_out.start(rows, residuals, travelled)
 
-    def take(self, rows: Array, residuals: Array, moved: float) -> None:
+    def take(self, rows: Floats, residuals: Floats, moved: float) -> None:
         """Forget over a step of the path (m), then take in weighted rows (n, 3, 18), minus residuals (n, 3): one QR."""
         rows, residuals = rows.reshape(-1, 18), residuals.reshape(-1)
         kept = math.exp(-moved / self.length)
@@ -126,23 +127,23 @@ class InformationFilter:
         self.c = self.c + step
         self.left_out.take(rows, residuals, step, moved, kept, share**2 - left**2)
 
-    def equations(self, touches: Sequence[Touch]) -> tuple[Array, Array]:
+    def equations(self, touches: Sequence[MeasuredContact]) -> tuple[Floats, Floats]:
         """Whitened rows (n, 3, 18) and minus residuals (n, 3) of new contacts, as `take` wants them."""
         at = linearise(self.c, batch_design(self.T, self.length, touches))
         return at.jacobian(18), -at.r
 
-    def squared_innovations(self, rows: Array, residuals: Array) -> Array:
+    def squared_innovations(self, rows: Floats, residuals: Floats) -> Floats:
         """(n,) squared innovations of such contacts, χ² of 3."""
         variance = 1.0 + np.square(rows[:, :, :9] @ self.inverse).sum(axis=2)
-        result: Array = (np.square(residuals) / variance).sum(axis=1)
+        result: Floats = (np.square(residuals) / variance).sum(axis=1)
         return result
 
-    def place(self, point: Array) -> Vec:
+    def place(self, point: Floats) -> Vec:
         """A point (3,) of base in the working frame, dimensionless."""
         x, y, z = (point - self.T[:3, 3]).dot(self.T[:3, :3]).tolist()
         return x / self.length, y / self.length, z / self.length
 
-    def follow(self, point: Array) -> None:
+    def follow(self, point: Floats) -> None:
         """Carry everything to a contact frame at the foot of a point (3,) of base, once that is far enough away."""
         near = u, v, w = self.place(point)
         if u * u + v * v + w * w < ANCHOR**2:
@@ -157,12 +158,12 @@ class InformationFilter:
         R = self.T[:3, :3]
         self.T = homogeneous(R.dot(turned), self.T[:3, 3] + self.length * R.dot(x))
 
-    def _set_root(self, root: Array) -> None:
+    def _set_root(self, root: Floats) -> None:
         """Take an upper triangular root."""
         self.root, self.inverse = root, inverted_upper(root)
 
 
-def _prior_rows(prior: Prior, length: float) -> Array:
+def _prior_rows(prior: Prior, length: float) -> Floats:
     """(9, 9) root of what is always known."""
     own = DIFFUSE * np.eye(9)
     own[3:6] = prior.rows(length)[0][:3]

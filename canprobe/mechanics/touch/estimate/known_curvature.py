@@ -10,7 +10,8 @@ from canprobe.mechanics.touch.estimate.noise import CHI2_99
 from canprobe.mechanics.touch.estimate.observed import excited
 from canprobe.mechanics.touch.estimate.quadric import TO_Q, UNIT
 from canprobe.mechanics.touch.estimate.residuals import curvature_jacobian
-from canprobe.mechanics.touch.linear_algebra import Array, inverted, solved
+from canprobe.mechanics.touch.linear_algebra import inverted, solved
+from canprobe.mechanics.types import Floats
 
 _TO_Q_SQUARED = np.outer(TO_Q, TO_Q)
 
@@ -23,11 +24,11 @@ class CurvatureInformation(NamedTuple):
         information: (3, 3) inverse covariance, m².
     """
 
-    q: Array
-    information: Array
+    q: Floats
+    information: Floats
 
 
-def evidence_of(c: Array, covariance: Array, spread: Array | None, length: float) -> CurvatureInformation:
+def evidence_of(c: Floats, covariance: Floats, spread: Floats | None, length: float) -> CurvatureInformation:
     """The evidence of a solution with all its parameters free.
 
     Args:
@@ -47,7 +48,7 @@ def evidence_of(c: Array, covariance: Array, spread: Array | None, length: float
     return CurvatureInformation(q, seen.dot(known).dot(seen.T))
 
 
-def curvature_covariance(c: Array, deviation: Array) -> Array:
+def curvature_covariance(c: Floats, deviation: Floats) -> Floats:
     """Covariance (3, 3) of (K11, K12, K22) by the delta method, dimensionless.
 
     What c13, c23, c33 put K off by is proportional to K. Where the K found is its own noise so is that part, and it is

@@ -24,9 +24,10 @@ from canprobe.mechanics.touch.estimate.observed import decide, nothing_observed,
 from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.estimate.quadric import UNIT, parameters_of
 from canprobe.mechanics.touch.estimate.residuals import curvature_jacobian, design, linearise
-from canprobe.mechanics.touch.linear_algebra import MAX_LENGTH, Array, checked, instance, inverted, solved, upper_root
+from canprobe.mechanics.touch.linear_algebra import MAX_LENGTH, checked, instance, inverted, solved, upper_root
 from canprobe.mechanics.touch.surface import SurfaceMatrix
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
+from canprobe.mechanics.types import Floats
 
 _FLOOR = 20.0
 """Least extent in standard deviations of a point: shorter paths are noise, and no length to measure curvature by."""
@@ -34,7 +35,7 @@ _FLOOR = 20.0
 _MEAN_OF = 8
 
 
-class Touches(NamedTuple):
+class ContactBatch(NamedTuple):
     """Checked input of a batch fit.
 
     Attributes:
@@ -45,31 +46,31 @@ class Touches(NamedTuple):
         correlation: of the noise along the path; None for independent samples.
     """
 
-    points: Array
-    normals: Array
+    points: Floats
+    normals: Floats
     noise: Noise
     extent: float
     distance: float
     correlation: Correlation | None = None
 
-    def whitener(self) -> Array | None:
+    def whitener(self) -> Floats | None:
         """(3, n, n) that makes the whitened samples independent; None where they are."""
         if self.correlation is None:
             return None
         return self.correlation.whitener(np.linspace(0.0, self.distance, len(self.points)))
 
 
-def make_touches(points: Array, normals: Array, noise: Noise, correlation: Correlation | None = None) -> Touches:
+def make_touches(points: Floats, normals: Floats, noise: Noise, correlation: Correlation | None = None) -> ContactBatch:
     """Extent and length of arrays that are already checked."""
     if correlation is not None:
         instance("correlation", correlation, Correlation)
     floor = _FLOOR * math.sqrt(float(np.median(noise.point_variance)))
     offset = points - points[-1]
     extent = max(math.sqrt(float(np.einsum("ij,ij->i", offset, offset).max())), floor)
-    return Touches(points, normals, noise, extent, _travelled(points), correlation)
+    return ContactBatch(points, normals, noise, extent, _travelled(points), correlation)
 
 
-def _travelled(points: Array) -> float:
+def _travelled(points: Floats) -> float:
     """Length along noisy points (n, 3): of means over up to eight, or their noise alone would add up to a path."""
     each = min(_MEAN_OF, max(1, len(points) // 20))
     means = points[len(points) % each :].reshape(-1, each, 3).mean(axis=1)
@@ -78,7 +79,7 @@ def _travelled(points: Array) -> float:
     return share * float(np.sqrt(np.einsum("ij,ij->i", steps, steps)).sum())
 
 
-def checked_arrays(points: ArrayLike, normals: ArrayLike, least: int) -> tuple[Array, Array]:
+def checked_arrays(points: ArrayLike, normals: ArrayLike, least: int) -> tuple[Floats, Floats]:
     """Points and unit normals (n, 3), n ≥ least; else a UsageError that names the field."""
     p, n = checked("points", points, (None, 3)), checked("normals", normals, (None, 3))
     if len(p) < least:
@@ -96,12 +97,12 @@ def checked_arrays(points: ArrayLike, normals: ArrayLike, least: int) -> tuple[A
     return p, n
 
 
-def working_frame(touches: Touches) -> Array:
+def working_frame(touches: ContactBatch) -> Floats:
     """T (4, 4) from the frame at the last measured point, z against its measured normal, to the frame of the points."""
     return homogeneous(tangent_rotation(-touches.normals[-1]), touches.points[-1])
 
 
-def fit_ml(touches: Touches, prior: Prior | None, quadric: bool = False) -> SurfaceEstimate:
+def fit_ml(touches: ContactBatch, prior: Prior | None, quadric: bool = False) -> SurfaceEstimate:
     """The `ml` estimate (`nonlinear`), in the estimated contact frame of the last point; prior, quadric: as for
     `fit_surface`.
     """
@@ -150,11 +151,11 @@ def fit_ml(touches: Touches, prior: Prior | None, quadric: bool = False) -> Surf
     )
 
 
-def _turned_spread(spread: Array, angle: float) -> Array:
+def _turned_spread(spread: Floats, angle: float) -> Floats:
     """A covariance (2, 2) in axes turned by an angle (rad)."""
     c, s = math.cos(angle), math.sin(angle)
     R = np.array([[c, -s], [s, c]])
-    result: Array = R.T @ spread @ R
+    result: Floats = R.T @ spread @ R
     return result
 
 
@@ -172,7 +173,7 @@ def cramer_rao(
     prior: Prior | None = None,
     correlation: Correlation | None = None,
     coupling: float = 0.0,
-) -> Array:
+) -> Floats:
     """Least covariance that an unbiased estimate of local curvature can have.
 
     Information `Σ JᵀJ` of the whitened residual rows at the true surface, plus the prior's, reduced to K by the delta
@@ -209,7 +210,7 @@ def cramer_rao(
     return osculating_bound(touches, surface, prior)
 
 
-def osculating_bound(touches: Touches, surface: SurfaceMatrix, prior: Prior | None = None) -> Array:
+def osculating_bound(touches: ContactBatch, surface: SurfaceMatrix, prior: Prior | None = None) -> Floats:
     """As `cramer_rao`, for a quadric that need only osculate the surface at the last point."""
     p, n = touches.points, touches.normals
     origin = surface.project(p[-1])
@@ -232,5 +233,5 @@ def osculating_bound(touches: Touches, surface: SurfaceMatrix, prior: Prior | No
         hidden = 1.0 - np.einsum("ij,ij->i", V, V) > 1e-9
         return partial_covariance(V, decision.information[known], hidden) / length**2
     X = np.linalg.solve(root.T, curvature_jacobian(c).T)
-    result: Array = X.T @ X / length**2
+    result: Floats = X.T @ X / length**2
     return result

@@ -28,7 +28,8 @@ from canprobe.mechanics.touch.estimate.nonlinear import robust
 from canprobe.mechanics.touch.estimate.quadric import UNIT, sharpest
 from canprobe.mechanics.touch.estimate.residuals import Design, linearise
 from canprobe.mechanics.touch.estimate.terms import DEGREE
-from canprobe.mechanics.touch.linear_algebra import Array, inverted, upper_root
+from canprobe.mechanics.touch.linear_algebra import inverted, upper_root
+from canprobe.mechanics.types import Floats
 
 NONE, USUAL, TAIL = 0.88, 0.11, 0.01
 """Prior weights of: no misfit; a usual one; one that is only believed when seen.
@@ -68,8 +69,8 @@ class Corrected(NamedTuple):
     misfit, trusted: as of `Averaged`.
     """
 
-    c: Array
-    root: Array
+    c: Floats
+    root: Floats
     misfit: float
     trusted: bool
 
@@ -87,20 +88,20 @@ class Averaged(NamedTuple):
         trusted: the change of K is small enough for a linear step.
     """
 
-    shift: Array
-    spread: Array
-    share: Array
-    terms: Array
+    shift: Floats
+    spread: Floats
+    share: Floats
+    terms: Floats
     misfit: float
     trusted: bool
 
 
-def scales(curvature: float) -> Array:
+def scales(curvature: float) -> Floats:
     """(9,) usual size of each term over that of the cubic ones, at ‖K‖ · length."""
     return np.where(_CUBIC, 1.0, 0.25 * max(curvature, _NEVER_LESS))
 
 
-def averaged(m: Array, s: Array, carried: Array, curvature: float, blur: float = 0.0) -> Averaged:
+def averaged(m: Floats, s: Floats, carried: Floats, curvature: float, blur: float = 0.0) -> Averaged:
     """Average over the variance of the terms, given in directions in which the data's information is diagonal.
 
     Args:
@@ -131,15 +132,15 @@ def averaged(m: Array, s: Array, carried: Array, curvature: float, blur: float =
     return Averaged(mean, spread, left, weight.dot(share * s), shown, trusted)
 
 
-def _prior(blur: float) -> Array:
+def _prior(blur: float) -> Floats:
     """Prior weights of no misfit, the usual ones and the tail, at κσ_p (rad)."""
     if blur <= BLURRED:
         return _PRIOR
-    result: Array = _PRIOR + min(blur / BLURRED - 1.0, 1.0) * (_CAUTIOUS - _PRIOR)
+    result: Floats = _PRIOR + min(blur / BLURRED - 1.0, 1.0) * (_CAUTIOUS - _PRIOR)
     return result
 
 
-def correct(c: Array, root: Array, d: Design, independent: Array | None) -> Corrected:
+def correct(c: Floats, root: Floats, d: Design, independent: Floats | None) -> Corrected:
     """Average a converged fit (c in the frame at the last sample, its root; else as `fit`) over its misfit."""
     J, E, r, slack = _rows(c, d, independent)
     inverse = inverted(root)
@@ -155,7 +156,7 @@ def correct(c: Array, root: Array, d: Design, independent: Array | None) -> Corr
     return Corrected(c + found.shift, upper_root(inverted(lower)), found.misfit, found.trusted)
 
 
-def _rows(c: Array, d: Design, independent: Array | None) -> tuple[Array, Array, Array, Array]:
+def _rows(c: Floats, d: Design, independent: Floats | None) -> tuple[Floats, Floats, Floats, Floats]:
     """Whitened rows of the parameters (3n, 9) and of the terms (3n, 9), residuals (3n,), what is left of Jᵀ r (9,).
 
     Wrong samples count by the square of their weight: some that still pull at the fit would look like a misfit.

@@ -1,4 +1,4 @@
-"""What is assumed before an estimate: the noise of measured points and normals, and the prior on a surface."""
+"""The stated noise of points and normals: σ or covariances, coupled, and correlated along the path."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from canprobe.errors import UsageError
 from canprobe.mechanics.touch.linear_algebra import (
     MAX_LENGTH,
     MAX_MAGNITUDE,
-    Array,
     checked,
     inverted_upper,
     lower_root,
     positive,
     real_numbers,
 )
+from canprobe.mechanics.types import Floats
 
 CHI2_MEDIAN, CHI2_95, CHI2_99, CHI2_999 = 2.366, 7.815, 11.34, 16.27
 """Median, 95 %, 99 % and 99.9 % points of χ² with three degrees of freedom, which a sample has."""
@@ -50,27 +50,27 @@ class Correlation:
                 raise UsageError(f"correlation.{name}: expected a number from 0 to 1, got {share}")
 
     @property
-    def shares(self) -> Array:
+    def shares(self) -> Floats:
         """(3,) of a sample's three rows: height, and the two parts of the normal."""
         return np.array([self.share if self.point_share is None else self.point_share, self.share, self.share])
 
-    def matrix(self, path: Array) -> Array:
+    def matrix(self, path: Floats) -> Floats:
         """Correlations (3, n, n) of the rows of samples at places (n,) along the path, m."""
-        R: Array = self.shares[:, None, None] * np.exp(-np.abs(path[:, None] - path) / self.length)
+        R: Floats = self.shares[:, None, None] * np.exp(-np.abs(path[:, None] - path) / self.length)
         here = np.arange(len(path))
         R[:, here, here] = 1.0
         return R
 
-    def whitener(self, path: Array) -> Array:
+    def whitener(self, path: Floats) -> Floats:
         """(3, n, n): inverse lower Cholesky factors of `matrix`; samples at one place are told apart by 1e-9."""
         of = {share: R + 1e-9 * np.eye(len(path)) for share, R in zip(self.shares, self.matrix(path), strict=True)}
         found = {share: inverted_upper(lower_root(R).T).T for share, R in of.items()}  # once for rows that are alike
         return np.array([found[share] for share in self.shares])
 
 
-def mixed(matrices: Array, rows: Array) -> Array:
+def mixed(matrices: Floats, rows: Floats) -> Floats:
     """Rows (n, 3, k) mixed among the samples by the matrices (3, n, n) of their kinds."""
-    result: Array = (matrices @ rows.transpose(1, 0, 2)).transpose(1, 0, 2)
+    result: Floats = (matrices @ rows.transpose(1, 0, 2)).transpose(1, 0, 2)
     return result
 
 
@@ -86,8 +86,8 @@ class Noise:
             as a turn of `(K + coupling) e` against the surface.
     """
 
-    point: Array
-    normal: Array
+    point: Floats
+    normal: Floats
     coupling: float = 0.0
 
     @property
@@ -96,22 +96,22 @@ class Noise:
         return self.point.ndim == 1 and self.normal.ndim == 1
 
     @property
-    def point_variance(self) -> Array:
+    def point_variance(self) -> Floats:
         """(n,) variance per axis, the mean one where axes differ, m²."""
         return _mean_variance(self.point)
 
     @property
-    def normal_variance(self) -> Array:
+    def normal_variance(self) -> Floats:
         """The same of the normals, rad²."""
         return _mean_variance(self.normal)
 
-    def scaled(self, length: float, R: Array) -> Noise:
+    def scaled(self, length: float, R: Floats) -> Noise:
         """The same noise in units of a length and in the frame whose axes are the columns of R (3, 3)."""
         point = self.point / length if self.point.ndim == 1 else R.T @ self.point @ R / length**2
         normal = self.normal if self.normal.ndim == 1 else R.T @ self.normal @ R
         return Noise(point, normal, self.coupling * length)
 
-    def covariances(self) -> tuple[Array, Array]:
+    def covariances(self) -> tuple[Floats, Floats]:
         """Both as (n, 3, 3)."""
         return _as_covariance(self.point), _as_covariance(self.normal)
 
@@ -126,7 +126,7 @@ def make_noise(n: int, sigma_point: ArrayLike, sigma_normal: ArrayLike, coupling
     return Noise(_one(n, "sigma_point", sigma_point), _one(n, "sigma_normal", sigma_normal), alike)
 
 
-def _one(n: int, name: str, value: ArrayLike) -> Array:
+def _one(n: int, name: str, value: ArrayLike) -> Floats:
     wanted = f"{name}: expected a number above 0, ({n},) of them, or definite covariances (3, 3) or ({n}, 3, 3)"
     try:
         sigma = real_numbers(value)
@@ -150,7 +150,7 @@ def _one(n: int, name: str, value: ArrayLike) -> Array:
     raise UsageError(f"{wanted}, got shape {sigma.shape}")
 
 
-def _refuse_extremes(name: str, deviations: Array) -> None:
+def _refuse_extremes(name: str, deviations: Floats) -> None:
     """Refuse deviations that leave an estimate nothing but rounding, or whose information is no number."""
     for one in (float(deviations.min()), float(deviations.max())):
         if not 1.0 / MAX_MAGNITUDE <= one <= MAX_LENGTH:
@@ -158,10 +158,10 @@ def _refuse_extremes(name: str, deviations: Array) -> None:
             raise UsageError(f"{name}: expected a standard deviation {limits}, got {one:g}")
 
 
-def _mean_variance(sigma: Array) -> Array:
-    result: Array = sigma**2 if sigma.ndim == 1 else np.trace(sigma, axis1=1, axis2=2) / 3.0
+def _mean_variance(sigma: Floats) -> Floats:
+    result: Floats = sigma**2 if sigma.ndim == 1 else np.trace(sigma, axis1=1, axis2=2) / 3.0
     return result
 
 
-def _as_covariance(sigma: Array) -> Array:
+def _as_covariance(sigma: Floats) -> Floats:
     return sigma if sigma.ndim == 3 else (sigma**2)[:, None, None] * np.eye(3)

@@ -1,4 +1,4 @@
-"""Batch Gauss–Newton on the local model, robust, and what a quadric leaves out of its residuals.
+"""Batch Gauss–Newton on the local model, robust.
 
 The points have errors as the normals do, so that the residuals are whitened by `σ_n² I + K² σ_p²`: that keeps the fit
 at the Cramér–Rao bound also on tight curvature. Beyond the 99.9 % point of χ² with three degrees of freedom samples
@@ -15,7 +15,8 @@ from canprobe.mechanics.touch.estimate.noise import CHI2_999, CHI2_MEDIAN, mixed
 from canprobe.mechanics.touch.estimate.observed import Decision, decide, spread_of
 from canprobe.mechanics.touch.estimate.quadric import UNIT, size_of
 from canprobe.mechanics.touch.estimate.residuals import Design, linear_rows, linearise
-from canprobe.mechanics.touch.linear_algebra import Array, solved, upper_root
+from canprobe.mechanics.touch.linear_algebra import solved, upper_root
+from canprobe.mechanics.types import Floats
 
 DIFFUSE = 1e-2
 """Root of the information, in units of the length, that keeps a root regular: K known to ±200/length."""
@@ -31,7 +32,7 @@ _GROSS = 60.0
 """Squared residual over its scale, of some sample, at which the linear start is made robust."""
 
 
-class Fit(NamedTuple):
+class QuadricFit(NamedTuple):
     """A converged batch fit in its working frame, dimensionless.
 
     Attributes:
@@ -45,17 +46,17 @@ class Fit(NamedTuple):
         converged: the last step was below the tolerance.
     """
 
-    c: Array
-    root: Array
+    c: Floats
+    root: Floats
     decision: Decision
-    free: Array
-    free_root: Array
+    free: Floats
+    free_root: Floats
     innovation: float
     outliers: int
     converged: bool
 
 
-def fit(d: Design, prior: tuple[Array, Array], independent: Array | None = None) -> Fit:
+def fit(d: Design, prior: tuple[Floats, Floats], independent: Floats | None = None) -> QuadricFit:
     """Fit the model to a design with a prior (`Prior.rows`).
 
     `independent` (3, n, n) makes correlated whitened samples independent (`Correlation.whitener`); None: they are.
@@ -100,10 +101,10 @@ def fit(d: Design, prior: tuple[Array, Array], independent: Array | None = None)
     has_prior = bool(prior[0][3:].any())
     free, free_root = (c, root) if has_prior else _freed(best, A, residuals, root, prior)
     freedom = max(3 * len(square) - 6 - decision.rank, 1)
-    return Fit(c, root, decision, free, free_root, chi2 / freedom, int(np.sum(weight < 1.0)), converged)
+    return QuadricFit(c, root, decision, free, free_root, chi2 / freedom, int(np.sum(weight < 1.0)), converged)
 
 
-def _freed(c: Array, J: Array, r: Array, root: Array, prior: tuple[Array, Array]) -> tuple[Array, Array]:
+def _freed(c: Floats, J: Floats, r: Floats, root: Floats, prior: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
     """One more step with nothing held."""
     regular = upper_root(np.concatenate([root, DIFFUSE * np.eye(9)]))
     gradient = J.T @ r + prior[0].T @ (prior[0] @ c - prior[1])
@@ -111,8 +112,8 @@ def _freed(c: Array, J: Array, r: Array, root: Array, prior: tuple[Array, Array]
 
 
 def linear_start(
-    d: Design, prior: tuple[Array, Array], spread: Array, weight: Array | None = None
-) -> tuple[Array, Array, Decision]:
+    d: Design, prior: tuple[Floats, Floats], spread: Floats, weight: Floats | None = None
+) -> tuple[Floats, Floats, Decision]:
     """The linear solution, as of `solve_rows`; where some samples are far off, again with weights that fall with the
     square. `weight` (n,) is that to begin with.
     """
@@ -131,12 +132,12 @@ def linear_start(
     return answer
 
 
-def _median(values: Array) -> float:
+def _median(values: Floats) -> float:
     middle = len(values) // 2
     return float(np.partition(values, middle)[middle])
 
 
-def robust(square: Array) -> tuple[Array, float]:
+def robust(square: Floats) -> tuple[Floats, float]:
     """Weights (n,) and robust cost of squared whitened residuals (n,); far off, a sample costs no more and pulls by
     the inverse cube of its distance: at the end of a long lever even a little would be too much."""
     limit = CHI2_999 * max(1.0, _median(square) / CHI2_MEDIAN)
@@ -146,8 +147,8 @@ def robust(square: Array) -> tuple[Array, float]:
 
 
 def solve_rows(
-    A: Array, b: Array, prior: tuple[Array, Array], spread: Array, size: float, *, known: Decision | None = None
-) -> tuple[Array, Array, Decision]:
+    A: Floats, b: Floats, prior: tuple[Floats, Floats], spread: Floats, size: float, *, known: Decision | None = None
+) -> tuple[Floats, Floats, Decision]:
     """Least squares `A c = b` by QR; combinations of K that were not observed are held at the value nearest to flat.
 
     A `known` decision that found everything observed is not taken again; `spread`: of the points, `size`: ‖K‖. Returns

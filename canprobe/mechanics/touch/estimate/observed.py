@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.mechanics.touch.estimate.quadric import TO_Q
-from canprobe.mechanics.touch.linear_algebra import Array, eigen, principal
+from canprobe.mechanics.touch.linear_algebra import eigen, principal
+from canprobe.mechanics.types import Floats
 
 SPREAD = 10.0
 SIGMA_LIMIT = 0.3
@@ -39,8 +40,8 @@ class Decision(NamedTuple):
         passed: (3,) bool.
     """
 
-    information: Array
-    vectors: Array
+    information: Floats
+    vectors: Floats
     passed: NDArray[np.bool_]
 
     @property
@@ -54,7 +55,7 @@ def nothing_observed() -> Decision:
     return Decision(np.zeros(3), np.eye(3), np.zeros(3, dtype=bool))
 
 
-def decide(root_q: Array, spread: Array, curvature: float) -> Decision:
+def decide(root_q: Floats, spread: Floats, curvature: float) -> Decision:
     """Rank decision.
 
     Args:
@@ -83,7 +84,7 @@ def _least(curvature: float, largest: float) -> float:
     return max(1.0 / (SIGMA_LIMIT * max(curvature, 1.0)) ** 2, NUMERIC * largest)
 
 
-def excited(spread: Array) -> tuple[Array, NDArray[np.bool_]]:
+def excited(spread: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """As columns (3, 3) in q the curvature along the main axis of a spread, the twist, and across; and for which of
     them (3,) the points were spread.
     """
@@ -91,28 +92,28 @@ def excited(spread: Array) -> tuple[Array, NDArray[np.bool_]]:
     return turned(angle).T, np.array([mean + radius, mean, mean - radius]) >= SPREAD
 
 
-def turned(angle: float) -> Array:
+def turned(angle: float) -> Floats:
     """The (3, 3) orthogonal matrix that takes q = (K11, √2 K12, K22) to axes turned by an angle in rad."""
     c, s = math.cos(angle), math.sin(angle)
     cs = math.sqrt(2.0) * c * s
     return np.array([[c * c, cs, s * s], [-cs, c * c - s * s, cs], [s * s, -cs, c * c]])
 
 
-def spread_of(points: Array, variance: Array) -> Array:
+def spread_of(points: Floats, variance: Floats) -> Floats:
     """Covariance (2, 2) of points (n, 2 or 3) in the tangent plane, over the variance (n,) of their noise per axis."""
     weight = 1.0 / variance
     offset = points[:, :2] - weight @ points[:, :2] / weight.sum()
-    result: Array = (offset * weight[:, None]).T @ offset / len(points)
+    result: Floats = (offset * weight[:, None]).T @ offset / len(points)
     return result
 
 
-def outside(decision: Decision, q: Array) -> float:
+def outside(decision: Decision, q: Floats) -> float:
     """Length of the part of q (3,) that the data did not observe, relative to q."""
     hidden = decision.vectors[:, np.logical_not(decision.passed)].T @ q
     return math.sqrt(float(hidden @ hidden) / float(q @ q))
 
 
-def tensor(q: Array) -> Array:
+def tensor(q: Floats) -> Floats:
     """The symmetric (2, 2) matrix of q."""
     k11, k12, k22 = q / TO_Q
     return np.array([[k11, k12], [k12, k22]])

@@ -1,4 +1,4 @@
-"""What an online estimator is, the gate that every sample passes, and how answers follow a changing surface."""
+"""What an online estimator is, and the gate that every sample passes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is assumed of a surface before it is touched, always stated and named in the estimate."""
+"""The prior: what is assumed of a surface before it is touched. It is always stated, and named in the estimate."""
 
 from __future__ import annotations
 
@@ -9,11 +9,8 @@ from numbers import Real
 import numpy as np
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.linear_algebra import (
-    Array,
-    checked,
-    positive,
-)
+from canprobe.mechanics.touch.linear_algebra import checked, positive
+from canprobe.mechanics.types import Floats
 
 NUISANCE = (0.15, 0.15, 0.5)
 """Standard deviations of c13, c23, c33 times the length of the path: 7.5, 7.5, 25 per m on a path of 20 mm.
@@ -63,7 +60,7 @@ class Prior:
         sigma_curvature = positive("sigma_curvature", sigma_curvature)
         return cls(f"curvature 0 ± {sigma_curvature:.4g} per unit length", s13, s23, s33, 0.0, sigma_curvature)
 
-    def rows(self, length: float) -> tuple[Array, Array]:
+    def rows(self, length: float) -> tuple[Floats, Floats]:
         """Whitened rows (6, 9) and right-hand side (6,) on the parameters of `quadric`, in units of `length`."""
         A, b = np.zeros((6, 9)), np.zeros(6)
         for row, (column, sigma) in enumerate(((3, self.sigma_c13), (4, self.sigma_c23), (5, self.sigma_c33))):

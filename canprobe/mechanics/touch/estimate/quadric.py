@@ -1,12 +1,8 @@
-"""The local model, a quadric near the origin of a working frame with c34 = −½, and which of its curvature was observed.
+"""The local model: a quadric near the origin of a working frame, with c34 = −½.
 
-Nine parameters, in this order: `c14, c24, c44` (tilt and height of the working frame), `c13, c23, c33`, and
+Its nine parameters, in this order: `c14, c24, c44` (tilt and height of the working frame), `c13, c23, c33`, and
 `c11, c12, c22`, the half of K, last, so that the trailing 3x3 block of an upper triangular information root is the
-information about K with all else unknown. Beside them stand the nine cubic and quartic terms that a quadric leaves
-out. Lengths are in units of some length L: a dimensionless problem.
-
-Residuals of a sample (x, n): `f/|∇f|` and the two tangential parts of `∇f/|∇f| − n`, whitened by σ_p² and
-`σ_n² I + K² σ_p²`: the point's tangential noise turns the model's normal by K times it.
+information about K with all else unknown. Lengths are in units of some length L: a dimensionless problem.
 """
 
 from __future__ import annotations
@@ -15,7 +11,7 @@ import math
 
 import numpy as np
 
-from canprobe.mechanics.touch.linear_algebra import Array
+from canprobe.mechanics.types import Floats
 
 TO_Q = np.array([1.0, math.sqrt(2.0), 1.0])
 """K11, K12, K22 to q = (K11, √2 K12, K22), in which a rotation of the frame is orthogonal."""
@@ -37,27 +33,27 @@ ENTRIES = np.array([[40 * i + 4 * k + j for k in range(10)] for i, j in (*_INDEX
 """Where the parameters stand in each of them, and c34."""
 
 
-def matrix_of(c: Array) -> Array:
+def matrix_of(c: Floats) -> Floats:
     """S (4, 4) of parameters (9,)."""
-    S: Array = c.dot(_FLAT).reshape(4, 4)
+    S: Floats = c.dot(_FLAT).reshape(4, 4)
     S += _CONSTANT
     return S
 
 
-def parameters_of(S: Array) -> Array:
+def parameters_of(S: Floats) -> Floats:
     """Parameters (9,) of S (4, 4), scaled to c34 = −½."""
-    result: Array = S.take(_PLACES)
+    result: Floats = S.take(_PLACES)
     result *= -0.5 / S[2, 3]
     return result
 
 
-def size_of(c: Array) -> float:
+def size_of(c: Floats) -> float:
     """‖K‖ of parameters (9,), Frobenius."""
     c11, c12, c22 = c[6:].tolist()
     return 2.0 * math.sqrt(c11 * c11 + 2.0 * c12 * c12 + c22 * c22)
 
 
-def sharpest(c: Array) -> float:
+def sharpest(c: Floats) -> float:
     """Largest |κ| of parameters (9,)."""
     c11, c12, c22 = c[6:].tolist()
     return float(abs(c11 + c22) + math.hypot(c11 - c22, 2.0 * c12))

@@ -18,28 +18,21 @@ from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import Solution, SurfaceEstimate, anchor, build_estimate
 from canprobe.mechanics.touch.estimate.change import ChangeTest
-from canprobe.mechanics.touch.estimate.information import InformationFilter, Touch
+from canprobe.mechanics.touch.estimate.information import InformationFilter, MeasuredContact
 from canprobe.mechanics.touch.estimate.known_curvature import curvature_covariance, evidence_of
-from canprobe.mechanics.touch.estimate.left_out import Expected
 from canprobe.mechanics.touch.estimate.misfit import misfit_notes
 from canprobe.mechanics.touch.estimate.noise import CHI2_99, CHI2_999, Correlation
 from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE
 from canprobe.mechanics.touch.estimate.observed import decide, nothing_observed
+from canprobe.mechanics.touch.estimate.omitted_terms import ExpectedMisfit
 from canprobe.mechanics.touch.estimate.online import Dropped, Gate
 from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.estimate.quadric import UNIT, size_of
 from canprobe.mechanics.touch.estimate.start import Start
 from canprobe.mechanics.touch.estimate.travel import Spread, Travel
-from canprobe.mechanics.touch.linear_algebra import (
-    Array,
-    instance,
-    inverted,
-    inverted_upper,
-    lower_root,
-    positive,
-    upper_root,
-)
+from canprobe.mechanics.touch.linear_algebra import instance, inverted, inverted_upper, lower_root, positive, upper_root
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
+from canprobe.mechanics.types import Floats
 
 STEP = 0.025
 """Travel between two updates over the memory."""
@@ -58,17 +51,17 @@ GENEROUS = 0.5
 class _Pending(NamedTuple):
     """A contact that waits for the end of its step, and its weight by its place alone (`Travel`)."""
 
-    touch: Touch
+    touch: MeasuredContact
     weight: float
 
 
 class _Compared(NamedTuple):
     """Contacts against what the filter says: their equations, squared innovations (n,) and weights (n,)."""
 
-    rows: Array
-    residuals: Array
-    squares: Array
-    weights: Array
+    rows: Floats
+    residuals: Floats
+    squares: Floats
+    weights: Floats
 
 
 class RecursiveEstimator:
@@ -113,7 +106,7 @@ class RecursiveEstimator:
     def reset(self) -> None:
         """Forget everything but the settings."""
         self._gate.reset()
-        self._last: Touch | None = None
+        self._last: MeasuredContact | None = None
         self._pending: deque[_Pending] = deque(maxlen=MOST_PENDING)
         self._travel = Travel(max(STEP * self._memory, 3.0 * self._gate.sigma_point))
         self._spread = Spread()
@@ -126,7 +119,7 @@ class RecursiveEstimator:
         """Take one contact."""
         if not self._gate.passes(sample, self.dropped):
             return
-        touch = Touch(sample.p_base, sample.n_base, *self._gate.sigmas(sample), self._coupling)
+        touch = MeasuredContact(sample.p_base, sample.n_base, *self._gate.sigmas(sample), self._coupling)
         moved = self._travel.add(sample.p_base)
         self._pending.append(_Pending(touch, self._travel.weight))
         if self._last is None or self._travel.weight == 1.0:
@@ -181,11 +174,11 @@ class RecursiveEstimator:
             evidence=evidence,
         )
 
-    def _expected(self) -> Expected:
+    def _expected(self) -> ExpectedMisfit:
         """Stated noise counts unless it is twice the usual; a probe feels surfaces about as curved as itself."""
         usual = self._change.usual
         noise = usual if usual < GENEROUS else 1.0
-        return Expected(noise, self._coupling * self._memory, self._gate.sigma_point / self._memory)
+        return ExpectedMisfit(noise, self._coupling * self._memory, self._gate.sigma_point / self._memory)
 
     def _notes(self) -> tuple[str, ...]:
         changes, doubtful = self._change.alarms, round(self._doubtful)
@@ -226,7 +219,7 @@ class RecursiveEstimator:
         left = self._judged(found.rows, found.residuals, found.residuals - found.rows @ terms)
         return left if self._change.usual_again(left.squares) else None
 
-    def _judged(self, rows: Array, residuals: Array, unexplained: Array) -> _Compared:
+    def _judged(self, rows: Floats, residuals: Floats, unexplained: Floats) -> _Compared:
         """Weighted by their places, and from a limit on by the square of `limit / d²`.
 
         It is the 99.9 % point of χ², times the running innovation: where all disagree none is wrong.
@@ -260,7 +253,7 @@ class RecursiveEstimator:
         if start.over:
             self._start, self._settled = None, True
 
-    def _weigh(self, moved: float, weight: Array) -> float:
+    def _weigh(self, moved: float, weight: Floats) -> float:
         """Count a step; the weight of each sample where they are crowded, else 1."""
         crowd = min(1.0, self._crowd * moved / min(len(weight), self._travel.measured))
         kept = math.exp(-moved / self._memory)
@@ -269,7 +262,7 @@ class RecursiveEstimator:
         self._spread.add(np.array([p.touch.point for p in self._pending]), crowd * weight)
         return crowd
 
-    def _drop_agreeing(self, squares: Array) -> None:
+    def _drop_agreeing(self, squares: Floats) -> None:
         """Forget the pending samples up to the last that still agrees with the surface before a change."""
         agree = np.flatnonzero(squares[:-1] <= CHI2_99 * self._change.usual)
         for _ in range(int(agree[-1]) + 1 if len(agree) else 0):

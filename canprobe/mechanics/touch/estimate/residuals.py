@@ -1,4 +1,8 @@
-"""Residuals of samples and their Jacobian."""
+"""Residuals of samples and their Jacobian.
+
+A sample (x, n) has three residuals: `f/|∇f|` and the two tangential parts of `∇f/|∇f| − n`. They are whitened by σ_p²
+and `σ_n² I + K² σ_p²`: the point's tangential noise turns the model's normal by K times it.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,7 @@ import numpy as np
 from canprobe.mechanics.touch.estimate.noise import Noise
 from canprobe.mechanics.touch.estimate.quadric import ENTRIES, WIDE, matrix_of
 from canprobe.mechanics.touch.estimate.terms import terms
-from canprobe.mechanics.touch.linear_algebra import Array
+from canprobe.mechanics.types import Floats
 
 
 class Design(NamedTuple):
@@ -22,19 +26,19 @@ class Design(NamedTuple):
         point_variance, normal_variance: (n,) the noise per axis.
     """
 
-    X: Array
-    T: Array
+    X: Floats
+    T: Floats
     noise: Noise
-    point_variance: Array
-    normal_variance: Array
+    point_variance: Floats
+    normal_variance: Floats
 
 
-def design(points: Array, normals: Array, noise: Noise) -> Design:
+def design(points: Floats, normals: Floats, noise: Noise) -> Design:
     """Constant parts for points and outward normals (n, 3) in the working frame."""
     return Design(points, tangents(normals), noise, noise.point_variance, noise.normal_variance)
 
 
-def tangents(normals: Array) -> Array:
+def tangents(normals: Floats) -> Floats:
     """Two tangent axes (n, 2, 3) of unit normals (n, 3) that lie near the z axis, either way."""
     T = np.empty((len(normals), 2, 3))
     nx, ny, nz = normals.T
@@ -47,7 +51,7 @@ def tangents(normals: Array) -> Array:
     return T
 
 
-def linear_rows(d: Design) -> tuple[Array, Array]:
+def linear_rows(d: Design) -> tuple[Floats, Floats]:
     """Whitened linear equations (3n, 9), (3n,): f = 0 and t·∇f = 0, as if |∇f| were 1 everywhere.
 
     The second multiplies the normals' noise into the regressor and shrinks K by some percent: a start, no answer.
@@ -60,7 +64,7 @@ def linear_rows(d: Design) -> tuple[Array, Array]:
     return A.reshape(-1, 9), b.reshape(-1)
 
 
-class Linearised(NamedTuple):
+class LinearisedResiduals(NamedTuple):
     """The model at the likely places of samples.
 
     The model's normal is compared at the foot of the measured point, and the Jacobian is taken where the sample most
@@ -76,19 +80,19 @@ class Linearised(NamedTuple):
         W: (n, 3, 3) whitener.
     """
 
-    r: Array
-    X: Array
-    V: Array
-    bend: Array
-    inverse: Array
-    W: Array
+    r: Floats
+    X: Floats
+    V: Floats
+    bend: Floats
+    inverse: Floats
+    W: Floats
 
     @property
     def log_det(self) -> float:
         """Log-determinant of the covariances of the residuals."""
         return -2.0 * float(np.log(self.W[:, 1, 1] * self.W[:, 2, 2]).sum())
 
-    def jacobian(self, count: int = 9) -> Array:
+    def jacobian(self, count: int = 9) -> Floats:
         """Whitened Jacobian (n, 3, count): 9 of the parameters, 18 with the terms that a quadric leaves out."""
         F = terms(self.X, count)
         G = self.V @ F[:, 1:]
@@ -96,11 +100,11 @@ class Linearised(NamedTuple):
         G[:, 0] = F[:, 0]
         G *= self.inverse[:, None, None]
         G[:, 1:] -= self.bend[:, 0, :, None] * G[:, :1]  # the foot moves with the model
-        result: Array = self.W @ G
+        result: Floats = self.W @ G
         return result
 
 
-def linearise(c: Array, d: Design) -> Linearised:
+def linearise(c: Floats, d: Design) -> LinearisedResiduals:
     """The model at parameters (9,) with samples."""
     S = matrix_of(c)
     B, h = 2.0 * S[:3, :3], 2.0 * S[:3, 3]
@@ -123,10 +127,10 @@ def linearise(c: Array, d: Design) -> Linearised:
     g = X.dot(B) + h
     inverse = 1.0 / np.sqrt(np.einsum("ij,ij->i", g, g))
     V[:, 0] = g * inverse[:, None]
-    return Linearised(r, X, V, bend, inverse, W)
+    return LinearisedResiduals(r, X, V, bend, inverse, W)
 
 
-def _whitener(K: Array, ghat: Array, d: Design) -> Array:
+def _whitener(K: Floats, ghat: Floats, d: Design) -> Floats:
     """Lower triangular W (n, 3, 3) with Wᵀ W the inverse covariance of the residuals."""
     W = np.zeros((len(K), 3, 3))
     if not d.noise.isotropic:
@@ -145,17 +149,17 @@ def _whitener(K: Array, ghat: Array, d: Design) -> Array:
     return W
 
 
-def _likely_places(d: Design, foot: Array, score: Array, K: Array, ghat: Array) -> Array:
+def _likely_places(d: Design, foot: Floats, score: Floats, K: Floats, ghat: Floats) -> Floats:
     """Most likely true places (n, 3), given residuals times their inverse covariance (n, 3)."""
     if d.noise.isotropic:
         tangential = (score[:, None, 1:] @ K @ d.T)[:, 0]
         return foot - d.point_variance[:, None] * tangential
     A = np.concatenate([ghat[:, None], K @ d.T], axis=1)
-    result: Array = d.X - ((score[:, None] @ A) @ d.noise.covariances()[0])[:, 0]
+    result: Floats = d.X - ((score[:, None] @ A) @ d.noise.covariances()[0])[:, 0]
     return result
 
 
-def transport(c: Array, T: Array) -> tuple[Array, Array]:
+def transport(c: Floats, T: Floats) -> tuple[Floats, Floats]:
     """c' (9,) of the same surface in new coordinates, `S' = Tᵀ S T` scaled to c34 = −½, and dc'/dc (9, 9).
 
     T (4, 4) takes new coordinates to old, lengths in the problem's unit.
@@ -164,11 +168,11 @@ def transport(c: Array, T: Array) -> tuple[Array, Array]:
     entries = moved[:, :9].dot(c) + moved[:, 9]
     scale = -0.5 / float(entries[9])
     c_new = scale * entries[:9]
-    M: Array = scale * (moved[:9, :9] + (2.0 * c_new)[:, None] * moved[9, :9])
+    M: Floats = scale * (moved[:9, :9] + (2.0 * c_new)[:, None] * moved[9, :9])
     return c_new, M
 
 
-def curvature_jacobian(c: Array) -> Array:
+def curvature_jacobian(c: Floats) -> Floats:
     """d(K11, K12, K22)/dc (3, 9) in the *estimated* contact frame, where c14 = c24 = c44 = 0.
 
     The frame tilts with c14, c24, so c13 and c23 leak in; |∇f| changes with c44 through c33.

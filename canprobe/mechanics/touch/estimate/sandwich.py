@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from canprobe.mechanics.touch.estimate.noise import Correlation, mixed
-from canprobe.mechanics.touch.linear_algebra import Array
+from canprobe.mechanics.types import Floats
 
 
 class Score:
@@ -24,7 +24,7 @@ class Score:
         correlation: of the rows along the path; None for independent samples.
     """
 
-    def __init__(self, prior: Array, correlation: Correlation | None) -> None:
+    def __init__(self, prior: Floats, correlation: Correlation | None) -> None:
         self._prior = prior
         self._correlation = correlation
         self._shares = np.zeros((3, 1)) if correlation is None else correlation.shares[:, None]
@@ -35,7 +35,7 @@ class Score:
         self.matrix = self._prior.copy()
         self._recent = np.zeros((3, len(self.matrix)))
 
-    def start(self, J: Array, travelled: float) -> None:
+    def start(self, J: Floats, travelled: float) -> None:
         """Take a batch's whitened rows (n, 3, k), evenly spread over a path (m), which all count in full."""
         self.reset()
         k = len(self.matrix)
@@ -48,19 +48,19 @@ class Score:
         fades = np.exp((places - travelled) / self._correlation.length)
         self._recent = self._shares * (fades @ J.reshape(-1, 3 * k)).reshape(3, k)
 
-    def take(self, J: Array, moved: float, kept: float, known: float) -> None:
+    def take(self, J: Floats, moved: float, kept: float, known: float) -> None:
         """Take new whitened rows (3n, k) over a step (m) of the path, which leaves `kept` of the information.
 
         `known` is what of the prior is put back into the matrix, over the whole prior.
         """
         self.matrix = kept**2 * self.matrix + known * self._prior + self._added(J, moved, kept)
 
-    def carry(self, back: Array) -> None:
+    def carry(self, back: Floats) -> None:
         """Go over to other parameters; back (k, k) is d(old)/d(new)."""
         self.matrix = back.T.dot(self.matrix).dot(back)
         self._recent = self._recent.dot(back)
 
-    def _added(self, J: Array, moved: float, kept: float) -> Array:
+    def _added(self, J: Floats, moved: float, kept: float) -> Floats:
         """What new rows add: with each other, and with earlier ones that they resemble."""
         if self._correlation is None:
             return np.asarray(J.T.dot(J), dtype=np.float64)

@@ -16,13 +16,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from canprobe.mechanics.touch.estimate.gauss_newton_step import SETTLED, Solved, gauss_newton, solved_once
-from canprobe.mechanics.touch.estimate.information import Touch, batch_design
+from canprobe.mechanics.touch.estimate.information import MeasuredContact, batch_design
 from canprobe.mechanics.touch.estimate.nonlinear import linear_start
 from canprobe.mechanics.touch.estimate.observed import SPREAD, spread_of
 from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.estimate.residuals import Design
-from canprobe.mechanics.touch.linear_algebra import Array
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
+from canprobe.mechanics.types import Floats
 
 FIRST = 0.1
 """Travel over the memory at the first solution."""
@@ -53,7 +53,7 @@ class Start:
         self.travelled = 0.0
         self._length = length
         self._prior = prior.rows(length)
-        self._touches: list[Touch] = []
+        self._touches: list[MeasuredContact] = []
 
     @property
     def over(self) -> bool:
@@ -61,7 +61,7 @@ class Start:
         share = self.travelled / self._length
         return self.solution is not None and (share >= LATEST or (share >= LAST and self.settled))
 
-    def add(self, touches: Sequence[Touch], moved: float) -> None:
+    def add(self, touches: Sequence[MeasuredContact], moved: float) -> None:
         """Take in the contacts of a step of the path (m), and improve the solution by a Gauss–Newton step."""
         self._touches += touches
         if len(self._touches) > MOST:
@@ -91,7 +91,7 @@ class Start:
         self.settled = known and better.step < SETTLED
 
 
-def isolation(points: Array, variance: Array) -> Array:
+def isolation(points: Floats, variance: Floats) -> Floats:
     """Weights (n,) of points (n, 3) along a path: far below 1 for single ones that lie off between their neighbours.
 
     A point is compared with the median of the five about it. What is usual is the median of these distances, and never
@@ -104,11 +104,11 @@ def isolation(points: Array, variance: Array) -> Array:
     off = points - np.median(windows, axis=0)
     square = np.einsum("ij,ij->i", off, off)
     usual = 9.0 * np.maximum(float(np.median(square)), variance)
-    result: Array = usual / np.maximum(square, usual)
+    result: Floats = usual / np.maximum(square, usual)
     return result
 
 
-def _frame(touches: Sequence[Touch]) -> Array:
+def _frame(touches: Sequence[MeasuredContact]) -> Floats:
     """A frame (4, 4) at the median place of contacts, z against their median normal."""
     normal = np.median([t.normal for t in touches], axis=0)
     normal = normal / np.sqrt(normal @ normal)

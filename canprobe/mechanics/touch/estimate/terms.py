@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from canprobe.mechanics.touch.linear_algebra import Array
+from canprobe.mechanics.types import Floats
 
 _POWER_Y = (0, 1, 2, 3, 0, 1, 2, 3, 4)
 DEGREE = np.array([3, 3, 3, 3, 4, 4, 4, 4, 4])
@@ -38,14 +38,14 @@ _POWERS = [
 ]
 
 
-def _monomials(x: Any, y: Any, z: Any) -> Array:
+def _monomials(x: Any, y: Any, z: Any) -> Floats:
     """The 19 monomials of `_POWERS` at a place, (19,), or at places given as arrays, (19, n)."""
     xx, xy, yy = x * x, x * y, y * y
     rest = [xx * x, xx * y, x * yy, yy * y, xx * xx, xx * xy, xx * yy, xy * yy, yy * yy]
     return np.array((1.0 + 0.0 * x, x, y, z, xx, xy, yy, x * z, y * z, z * z, *rest))
 
 
-def _derivatives() -> Array:
+def _derivatives() -> Floats:
     """(19, 4, 18): values and derivatives by x, y, z of the 18 terms, per monomial."""
     found = np.zeros((len(_POWERS), 4, 18))
     for column, (powers, factor) in enumerate(zip(_QUADRIC + _HIGHER, _OWN + _FACTOR, strict=True)):
@@ -57,7 +57,7 @@ def _derivatives() -> Array:
     return found
 
 
-def _shift() -> Array:
+def _shift() -> Floats:
     """(19, 162): A and Q of `shifted`, per monomial of the new place."""
     found = np.zeros((len(_POWERS), 18, 9))
     own = {powers: (row, factor) for row, (powers, factor) in enumerate(zip(_HIGHER, _FACTOR, strict=True))}
@@ -75,13 +75,13 @@ _SHIFT = _shift()
 _TABLE = {count: _derivatives()[:, :, :count].reshape(len(_POWERS), -1) for count in (9, 18)}
 
 
-def terms(X: Array, count: int = 18) -> Array:
+def terms(X: Floats, count: int = 18) -> Floats:
     """Values and derivatives by x, y, z (n, 4, count) of the first terms of f, the quadric's nine first, at (n, 3)."""
-    values: Array = _monomials(*X.T).T.dot(_TABLE[count]).reshape(len(X), 4, count)
+    values: Floats = _monomials(*X.T).T.dot(_TABLE[count]).reshape(len(X), 4, count)
     return values
 
 
-def shifted(x: float, y: float) -> tuple[Array, Array]:
+def shifted(x: float, y: float) -> tuple[Floats, Floats]:
     """The terms that a quadric leaves out about another place (x, y).
 
     Returns:

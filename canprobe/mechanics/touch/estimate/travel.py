@@ -7,9 +7,7 @@ from collections import deque
 
 import numpy as np
 
-from canprobe.mechanics.touch.linear_algebra import (
-    Array,
-)
+from canprobe.mechanics.types import Floats
 
 _MEDIAN_OF, _MEAN_OF = 5, 8
 _FAR2, _SLOWLY = 16.0, 0.05
@@ -41,7 +39,7 @@ class Travel:
         self._mean = self._mark = (0.0, 0.0, 0.0)
         self._count = 0
 
-    def add(self, point: Array) -> float:
+    def add(self, point: Floats) -> float:
         """Take a point (3,), m; the length of the step that it completes, or 0."""
         px, py, pz = here = point.tolist()
         self._last.append(here)
@@ -77,7 +75,7 @@ class Spread:
     """Weighted covariance of points, with forgetting: second moments about the first point."""
 
     def __init__(self) -> None:
-        self._origin: Array | None = None
+        self._origin: Floats | None = None
         self._moments = np.zeros((4, 4))
 
     @property
@@ -86,18 +84,18 @@ class Spread:
         return float(self._moments[3, 3])
 
     @property
-    def covariance(self) -> Array:
+    def covariance(self) -> Floats:
         """(3, 3), m²."""
         M = self._moments / max(self.weight, 1e-300)
         mean = M[:3, 3]
-        result: Array = M[:3, :3] - mean[:, None] * mean
+        result: Floats = M[:3, :3] - mean[:, None] * mean
         return result
 
     def fade(self, kept: float) -> None:
         """Weigh everything so far by a factor."""
         self._moments *= kept
 
-    def add(self, points: Array, weights: Array) -> None:
+    def add(self, points: Floats, weights: Floats) -> None:
         """Take points (n, 3) with weights (n,)."""
         if self._origin is None:
             self._origin = points[0].copy()

@@ -1,8 +1,8 @@
-"""Estimators over a window of the last samples: `ml`, and the linear ones from differences, `chord` and `chen1996`.
+"""Estimators over a window of the last samples: `ml`, and the linear one from differences, `chord`.
 
-The linear ones rest on `n_a − n_b = 2 S₃ (p_a − p_b)`, exact only where |∇f| is constant along the surface: plane,
-sphere, circular cylinder. Elsewhere they keep a bias without any noise, and noise in the points, on both sides of the
-equation, draws them towards 0. They are baselines and are reported as they are.
+The linear one, and `chen1996`, rest on `n_a − n_b = 2 S₃ (p_a − p_b)`, exact only where |∇f| is constant along the
+surface: plane, sphere, circular cylinder. Elsewhere they keep a bias without any noise, and noise in the points, on
+both sides of the equation, draws them towards 0. They are baselines and are reported as they are.
 """
 
 from __future__ import annotations
@@ -17,11 +17,12 @@ from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 from canprobe.mechanics.touch.estimate.change import AGREES, LAST_FEW, looks_changed
 from canprobe.mechanics.touch.estimate.differences import chord_pairs, solve_pairs
-from canprobe.mechanics.touch.estimate.likelihood import Touches, fit_ml, make_touches
+from canprobe.mechanics.touch.estimate.likelihood import ContactBatch, fit_ml, make_touches
 from canprobe.mechanics.touch.estimate.noise import Correlation, make_noise
 from canprobe.mechanics.touch.estimate.online import Dropped, Gate
 from canprobe.mechanics.touch.estimate.prior import Prior
-from canprobe.mechanics.touch.linear_algebra import Array, whole
+from canprobe.mechanics.touch.linear_algebra import whole
+from canprobe.mechanics.types import Floats
 
 
 class WindowEstimator:
@@ -76,14 +77,14 @@ class WindowEstimator:
         self._gate.reset()
         self._answer = None
 
-    def _solve(self, touches: Touches) -> SurfaceEstimate:
+    def _solve(self, touches: ContactBatch) -> SurfaceEstimate:
         raise NotImplementedError
 
     def _row(self, sample: ContactSample) -> Sequence[float]:
         """What is kept of a sample: point, normal, their standard deviations; a subclass adds what it needs."""
         return (*sample.p_base.tolist(), *sample.n_base.tolist(), *self._gate.sigmas(sample))
 
-    def _touches(self) -> Touches:
+    def _touches(self) -> ContactBatch:
         rows = np.array(self._rows)
         noise = make_noise(len(rows), rows[:, 6], rows[:, 7], self._coupling)
         return make_touches(rows[:, :3], rows[:, 3:6], noise, self._correlation)
@@ -96,7 +97,7 @@ class MlEstimator(WindowEstimator):
     are held against the fit first; where they disagree as a changed surface does, what was before is forgotten.
     """
 
-    def _solve(self, touches: Touches) -> SurfaceEstimate:
+    def _solve(self, touches: ContactBatch) -> SurfaceEstimate:
         answer = fit_ml(touches, self._prior)
         squares = _squared_residuals(answer, touches)
         if len(squares) < 3 * LAST_FEW or answer.rank < 3 or not looks_changed(squares):
@@ -108,7 +109,7 @@ class MlEstimator(WindowEstimator):
         return replace(answer, notes=(*answer.notes, "the surface changed: memory shortened"))
 
 
-def _squared_residuals(answer: SurfaceEstimate, touches: Touches) -> Array:
+def _squared_residuals(answer: SurfaceEstimate, touches: ContactBatch) -> Floats:
     """(n,) squared distance of contacts from an answer's surface, χ² of 3 where the noise is as stated."""
     places = (touches.points - answer.point) @ answer.T_frame_contact[:3, :3]
     gradient = answer.surface.gradient(places)
@@ -117,12 +118,12 @@ def _squared_residuals(answer: SurfaceEstimate, touches: Touches) -> Array:
     point = touches.noise.point_variance
     felt = np.abs(answer.kappa).max() + touches.noise.coupling
     normal = touches.noise.normal_variance + felt**2 * point
-    result: Array = (answer.surface.value(places) / size) ** 2 / point + np.einsum("ij,ij->i", tilt, tilt) / normal
+    result: Floats = (answer.surface.value(places) / size) ** 2 / point + np.einsum("ij,ij->i", tilt, tilt) / normal
     return result
 
 
 class ChordEstimator(WindowEstimator):
     """`n_i − n_0 = 2 S₃ (p_i − p_0)` over a window, p_0 the last sample."""
 
-    def _solve(self, touches: Touches) -> SurfaceEstimate:
+    def _solve(self, touches: ContactBatch) -> SurfaceEstimate:
         return solve_pairs(touches, chord_pairs(touches), "chord")

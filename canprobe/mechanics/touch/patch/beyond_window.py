@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.linalg.lapack import dposv
 
-from canprobe.mechanics.touch.linear_algebra import Array
+from canprobe.mechanics.types import Floats
 
 WORTH_COMPLETING = 0.1
 """Share of the peak at the window's edge up to which a patch ends within the next taxel."""
@@ -39,14 +39,14 @@ class Continuation:
         saturated_pa: pressure from which on a taxel says no more than that, and is left out of the fit.
     """
 
-    def __init__(self, weights: Array, saturated_pa: float) -> None:
+    def __init__(self, weights: Floats, saturated_pa: float) -> None:
         self._saturated_pa = saturated_pa
         self._weights = weights
         self._area = weights[:, 0].copy()
         self._terms = weights / weights[:, :1]
         self._corner = float(self._terms[-1, 3])
 
-    def completed(self, pressure: Array, window: Sequence[int], peak_pa: float) -> Array:
+    def completed(self, pressure: Floats, window: Sequence[int], peak_pa: float) -> Floats:
         """The pressures of the whole pad, those outside the window carried on from those inside.
 
         Args:
@@ -71,7 +71,7 @@ class Continuation:
         least_fall = -0.5 * (uu + vv + math.hypot(uu - vv, uv)) * self._corner
         if singular or not least_fall > LEAST_FALL * peak_pa:
             return pressure
-        whole: Array = np.maximum(self._terms.dot(quadratic), 0.0).reshape(pressure.shape)
+        whole: Floats = np.maximum(self._terms.dot(quadratic), 0.0).reshape(pressure.shape)
         inside = slice(row, row + rows), slice(column, column + columns)
         whole[inside] = pressure[inside]
         return whole

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.linear_algebra import Array
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.patch.array_calibration import (
     ArrayCalibration,
@@ -25,13 +24,21 @@ from canprobe.mechanics.touch.patch.array_calibration import (
     Residuals,
     StiffnessSources,
 )
+from canprobe.mechanics.touch.patch.array_models import make_image_model, make_patch_calibration
 from canprobe.mechanics.touch.patch.image import PatchCalibration
 from canprobe.mechanics.touch.patch.image_fit import AGE_S, NO_ERRORS, Dwell, Shown, what_is_shown
-from canprobe.mechanics.touch.patch.image_model import USUAL_LIGHTNESS, make_image_model, make_patch_calibration
-from canprobe.mechanics.touch.patch.image_parameters import Fit, Pairs, curvature_errors, fit_parameters, moment_errors
+from canprobe.mechanics.touch.patch.image_model import USUAL_LIGHTNESS
 from canprobe.mechanics.touch.patch.layer_fit import stiffness_by_depth
 from canprobe.mechanics.touch.patch.pad_fit import fit_centroids
+from canprobe.mechanics.touch.patch.parameter_fit import (
+    Pairs,
+    ParameterFit,
+    curvature_errors,
+    fit_parameters,
+    moment_errors,
+)
 from canprobe.mechanics.touch.patch.taxel_gains import taxel_gains
+from canprobe.mechanics.types import Floats
 
 FORM_SIGMA = 0.01
 """Relative error of a moment that planes and balls do not show: of cylinders and saddles, by the model's form."""
@@ -60,16 +67,16 @@ class ArrayFit:
     calibration: ArrayCalibration
     dwells: Sequence[Dwell]
     shown: Sequence[Shown]
-    forces: Array
-    errors: Array
-    curvature_errors: Array
-    scatter: Array
+    forces: Floats
+    errors: Floats
+    curvature_errors: Floats
+    scatter: Floats
     left_out: int
-    gains: Array
+    gains: Floats
     gained: float
     plain: float
-    offset: Array
-    object_offset: Array
+    offset: Floats
+    object_offset: Floats
 
 
 def calibrate_array(
@@ -113,7 +120,7 @@ def calibrate_array(
     seen = max(pad.shape) if dwells[0].windows is None else max(w[2] for w in dwells[0].windows)
     blank = _blank(array, date, made_on, reference, reference_sigma, pad.full_scale_pa)
 
-    def fit(pairs: Pairs, own: PatchCalibration) -> tuple[ArrayCalibration, Fit]:
+    def fit(pairs: Pairs, own: PatchCalibration) -> tuple[ArrayCalibration, ParameterFit]:
         sigma = reference_sigma if by_force else 1.0
         found = fit_parameters([d for d, _ in pairs], [s for _, s in pairs], own, scale_sigma, sigma, seen)
         crept = [s.crept for d, s in pairs if d.force is not None]
@@ -167,7 +174,7 @@ def calibrate_array(
     )
 
 
-def _rms(values: Array) -> float:
+def _rms(values: Floats) -> float:
     return math.sqrt(float(np.mean(np.square(values)))) if len(values) else math.nan
 
 
@@ -196,7 +203,7 @@ def _force(patch: PatchCalibration, s: Shown) -> float:
 
 def _checked(
     calibration: ArrayCalibration, pairs: Pairs, plain: PatchCalibration, seen: int
-) -> tuple[Array, Array, Array]:
+) -> tuple[Floats, Floats, Floats]:
     """Errors (n, 3) of moments, (n, 2) of curvatures and (m,) of reference forces of touches by a calibration."""
     patch = make_patch_calibration(calibration, plain.pad)
     model = make_image_model(calibration, patch, seen=seen)
@@ -208,7 +215,7 @@ def _checked(
 
 def _held_out(
     pairs: Pairs, fit: Callable[[Pairs], ArrayCalibration], plain: PatchCalibration, seen: int
-) -> tuple[Array, Array, Array]:
+) -> tuple[Floats, Floats, Floats]:
     """As `_checked`, each fifth of the touches by a calibration that was fitted to the others."""
     errors, curvatures, forces = np.zeros((len(pairs), 3)), np.zeros((len(pairs), 2)), []
     for fold in range(FOLDS):
@@ -219,7 +226,7 @@ def _held_out(
     return errors, curvatures, np.concatenate(forces)
 
 
-def _moment_errors(errors: Array, shown: Sequence[Shown]) -> MomentErrors:
+def _moment_errors(errors: Floats, shown: Sequence[Shown]) -> MomentErrors:
     """What is left of touches that the fit had not seen, and of shapes that nobody touched."""
     scaled = errors * np.sqrt(USUAL_LIGHTNESS / np.array([s.lightness for s in shown]))[:, None]
     moment = float(np.mean(scaled[:, :2] ** 2)) + FORM_SIGMA**2
@@ -233,7 +240,7 @@ def _moment_errors(errors: Array, shown: Sequence[Shown]) -> MomentErrors:
 
 def _gains(
     pairs: Pairs, calibration: ArrayCalibration, plain: PatchCalibration
-) -> tuple[Array, tuple[tuple[int, int], ...]]:
+) -> tuple[Floats, tuple[tuple[int, int], ...]]:
     """(16, 16) gains of the taxels by these touches, and dead ones."""
     patch = make_patch_calibration(calibration, plain.pad)
     model = make_image_model(calibration, patch, seen=None)
@@ -253,7 +260,7 @@ def _by_gains(pairs: Pairs, calibration: ArrayCalibration, plain: PatchCalibrati
     return _rms(np.concatenate(gained)), _rms(np.concatenate(alike))
 
 
-def _offsets(pairs: Pairs) -> tuple[Array, Array]:
+def _offsets(pairs: Pairs) -> tuple[Floats, Floats]:
     """(2,) offset of centroids that turns with the probe, and (2,) that stays with the object, m.
 
     A gradient of the taxels' gains and an error of the tool turn with the probe; an object that does not stand where it

@@ -28,11 +28,12 @@ from canprobe.mechanics.touch.estimate.noise import CHI2_999
 from canprobe.mechanics.touch.estimate.observed import turned
 from canprobe.mechanics.touch.estimate.quadric import TO_Q
 from canprobe.mechanics.touch.layer_stiffness import stiffness_from_slope
-from canprobe.mechanics.touch.linear_algebra import Array, Vec, inverted, positive, principal_of, solved
+from canprobe.mechanics.touch.linear_algebra import inverted, positive, principal_of, solved
 from canprobe.mechanics.touch.patch.creep import PadMemory
 from canprobe.mechanics.touch.patch.image_model import ImageModel
 from canprobe.mechanics.touch.patch.moments import Moments
 from canprobe.mechanics.touch.tangent_frames import tangent_rotation, transported
+from canprobe.mechanics.types import Floats, Vec
 
 LEAST_FRAMES = 8
 """Fewer frames make no estimate."""
@@ -66,8 +67,8 @@ class Fused(NamedTuple):
         stiffness: K/h of the layer, N/m³.
     """
 
-    q: Array
-    patch: Array
+    q: Floats
+    patch: Floats
     cost: float
     stiffness: float
 
@@ -153,7 +154,7 @@ class PatchCurvature:
         self.force = 0.0
         self._memory = PadMemory()
         self._axes: tuple[Vec, Vec] = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
-        self._last: Array | None = None
+        self._last: Floats | None = None
         self._slope: Slope | None = None
         self._touched = False
         self._mean, self._recent = _Mean(MOST_FRAMES, GROSS), _Mean(FEW_FRAMES, FINE)
@@ -181,7 +182,7 @@ class PatchCurvature:
         self.frames = self._mean.frames
         self.force += share * (sample.force_n - self.force)
 
-    def _pad_axis(self, direction: Moments, T_base_probe: Array) -> tuple[float, float]:
+    def _pad_axis(self, direction: Moments, T_base_probe: Floats) -> tuple[float, float]:
         """Cosine and sine of the angle from x of the carried axes to u of the pad, both about the inward normal."""
         x, y, z = direction
         bend = x / (1.0 + z)  # the pad's u axis, turned from the pole to the contact the shortest way
@@ -196,7 +197,7 @@ class PatchCurvature:
         size = 1.0 / math.hypot(x, y)
         return x * size, y * size
 
-    def fuse(self, T_base_contact: Array, motion: CurvatureInformation | None = None) -> Fused | None:
+    def fuse(self, T_base_contact: Floats, motion: CurvatureInformation | None = None) -> Fused | None:
         """The patch, with what the motion knows about q, in a contact frame (4, 4); None where it knows nothing."""
         if self.frames < LEAST_FRAMES:
             return None
@@ -230,8 +231,8 @@ class PatchCurvature:
         return fused
 
     def _iterated(
-        self, x: Array, seen: _Seen, motion: CurvatureInformation
-    ) -> tuple[Array, Fused, LayerStiffness] | None:
+        self, x: Floats, seen: _Seen, motion: CurvatureInformation
+    ) -> tuple[Floats, Fused, LayerStiffness] | None:
         """Gauss–Newton from x = (q, ln of the stiffness over the stated one): where it ends, the answer, and what is
         known of the stiffness then; None where it does not settle.
         """
@@ -289,7 +290,7 @@ class PatchCurvature:
     def _model(self, stiffer: float) -> ImageModel:
         return self.model.with_stiffness(self.model.stiffness * math.exp(stiffer))
 
-    def _push(self, x: Array, k: Moments, slope: Slope) -> tuple[Array, float, float]:
+    def _push(self, x: Floats, k: Moments, slope: Slope) -> tuple[Floats, float, float]:
         """Row (4,) of the slope of a touch at x, its residual and its information."""
         K = np.array([[k[0], k[1]], [k[1], k[2]]])
         half = 0.5 * inverted(np.eye(2) / self.model.radius + K)
@@ -299,12 +300,12 @@ class PatchCurvature:
         return row, off, 1.0 / ((2.0 * slope.sigma / slope.value) ** 2 + SLOPE_SIGMA**2)
 
 
-def _less_certain(W: Array, seen: _Seen) -> Array:
+def _less_certain(W: Floats, seen: _Seen) -> Floats:
     """Information (3, 3) of relative moments that are also off by a drift of unknown sign."""
     (v1, _, v2), (xx, xy, yy) = seen.moments, seen.drift
     relative = np.array([xx / v1, xy / math.sqrt(v1 * v2), yy / v2])
     b = W.dot(relative)
-    result: Array = W - b[:, None] * b / (1.0 + float(b.dot(relative)))
+    result: Floats = W - b[:, None] * b / (1.0 + float(b.dot(relative)))
     return result
 
 

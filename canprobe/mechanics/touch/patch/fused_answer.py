@@ -11,9 +11,10 @@ from canprobe.mechanics.touch.estimate.answer import Solution, SurfaceEstimate, 
 from canprobe.mechanics.touch.estimate.noise import CHI2_95
 from canprobe.mechanics.touch.estimate.observed import SIGMA_LIMIT, Decision, nothing_observed
 from canprobe.mechanics.touch.estimate.quadric import TO_Q, UNIT, matrix_of, parameters_of
-from canprobe.mechanics.touch.linear_algebra import Array, eigen, inverted
+from canprobe.mechanics.touch.linear_algebra import eigen, inverted
 from canprobe.mechanics.touch.patch.curvature import Fused, PatchCurvature
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
+from canprobe.mechanics.types import Floats
 
 NAMED = 0.1
 """Share of the information about K that the patch gives from which on the estimate's method names it."""
@@ -79,21 +80,21 @@ def _notes(found: Fused, share: float) -> tuple[str, ...]:
     return (*said, CONTRADICTED) if found.contradicted else said
 
 
-def _joined(model_root: Array, patch: Array) -> Array:
+def _joined(model_root: Floats, patch: Floats) -> Floats:
     """(n + 3, 9) root of the information about the entries of S with the patch's part about K."""
     rows = np.zeros((3, 9))
     rows[:, 6:] = _root(patch) / UNIT
     return np.concatenate([model_root, rows])
 
 
-def _root(information: Array) -> Array:
+def _root(information: Floats) -> Floats:
     """(3, 3) root of the patch's information, which may be singular."""
     values, vectors = eigen(information)
-    result: Array = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+    result: Floats = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
     return result
 
 
-def _decide(information: Array, q: Array, length: float) -> Decision:
+def _decide(information: Floats, q: Floats, length: float) -> Decision:
     """The rank decision's second rule on what patch and motion together know; the first is about motion alone."""
     values, vectors = eigen(information)
     size = max(math.sqrt(float(q @ q)), 1.0 / length)
@@ -101,7 +102,7 @@ def _decide(information: Array, q: Array, length: float) -> Decision:
 
 
 def _solution(
-    S: Array, q: Array, covariance: Array, decision: Decision, *, has_prior: bool = False, root: Array | None = None
+    S: Floats, q: Floats, covariance: Floats, decision: Decision, *, has_prior: bool = False, root: Floats | None = None
 ) -> Solution:
     """From q and its covariance (3, 3)."""
     c = parameters_of(S)

@@ -7,9 +7,9 @@ import numpy as np
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 from canprobe.mechanics.touch.estimate.online import Dropped, Estimator
-from canprobe.mechanics.touch.linear_algebra import Array
 from canprobe.mechanics.touch.patch.curvature import PatchCurvature
 from canprobe.mechanics.touch.patch.fused_answer import WITHDRAWN, patch_estimate, with_patch
+from canprobe.mechanics.types import Floats
 
 
 class PatchedEstimator:
@@ -26,7 +26,7 @@ class PatchedEstimator:
         self._motion = motion
         self._length = length
         self._last: ContactSample | None = None
-        self._place: Array | None = None
+        self._place: Floats | None = None
         self._contradicted = 0.0
 
     @property

@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import Doubt
-from canprobe.mechanics.touch.linear_algebra import Array, checked, positive, read_only
+from canprobe.mechanics.touch.linear_algebra import checked, positive, read_only
 from canprobe.mechanics.touch.pad import COUNTS_MAX, Pad
 from canprobe.mechanics.touch.patch.beyond_window import LEAST_PEAK, WORTH_COMPLETING, Continuation
 from canprobe.mechanics.touch.patch.dead_taxels import may_be_dead, mended
 from canprobe.mechanics.touch.stops import OFF_PAD, OFF_PAD_SIGMAS, OFF_PAD_TAXELS
+from canprobe.mechanics.types import Floats
 
 _TOO_FEW = 4
 _COUNTS = bytes(range(COUNTS_MAX + 1))
@@ -113,8 +114,8 @@ class PatchCalibration:
     force_gain: float = 1.0
     edge_gain: float = 0.0
     gains: tuple[tuple[float, ...], ...] = ()
-    pascals: Array = field(init=False, repr=False)
-    weights: Array = field(init=False, repr=False)
+    pascals: Floats = field(init=False, repr=False)
+    weights: Floats = field(init=False, repr=False)
     continuation: Continuation = field(init=False, repr=False)
 
     @property
@@ -145,7 +146,7 @@ class PatchCalibration:
         object.__setattr__(self, "weights", read_only(weights))
 
 
-def _moment_weights(pad: Pad) -> Array:
+def _moment_weights(pad: Pad) -> Floats:
     """(n, 6): columns area × (1, u, v, uu, uv, vv), lengths in pitches but the area in m²."""
     if pad.is_grid:
         k, m = (np.arange(taxels) - (taxels - 1) / 2 for taxels in pad.shape)

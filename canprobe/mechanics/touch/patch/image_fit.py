@@ -18,12 +18,12 @@ from typing import NamedTuple
 import numpy as np
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.linear_algebra import Array
 from canprobe.mechanics.touch.patch.array_calibration import MomentErrors
 from canprobe.mechanics.touch.patch.creep import PadMemory
 from canprobe.mechanics.touch.patch.dead_taxels import Image
 from canprobe.mechanics.touch.patch.image import PatchCalibration, compute_patch
 from canprobe.mechanics.touch.patch.moments import LEVEL_COUNTS, MomentImage
+from canprobe.mechanics.types import Floats
 
 BLUR_PITCH = (0.7, 0.2)
 CROSSTALK = (0.025, 0.01)
@@ -66,11 +66,11 @@ class Dwell:
     kappa: tuple[float, float]
     angle: float
     place: int
-    t_s: Array
+    t_s: Floats
     images: Sequence[Image]
     windows: Sequence[Sequence[int]] | None
-    expected: Array
-    push: Array
+    expected: Floats
+    push: Floats
     turn: float = 0.0
     force: float | None = None
     to_and_fro: bool = False
@@ -95,14 +95,14 @@ class Shown(NamedTuple):
 
     total: float
     crept: float
-    moments: Array
-    remembered: Array
+    moments: Floats
+    remembered: Floats
     frame_sigma: float
     lightness: float
-    off: Array
-    way: Array
-    t_s: Array
-    raw: Array
+    off: Floats
+    way: Floats
+    t_s: Floats
+    raw: Floats
     usable: bool
     push: float
 

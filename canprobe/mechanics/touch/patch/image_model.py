@@ -4,7 +4,7 @@ On a Winkler layer of stiffness k a probe of radius R_p leaves an elliptic patch
 with `A = ½ (I/R_p + K)` and `F = π k δ² / (2 √det A)` the pressure is `k (δ − xᵀ A x)₊`, and its second moments are
 `(δ/6) A⁻¹`. The array blurs that pressure, spreads some of it over rows and columns, scales it, and shows what is
 above a level. Five numbers say how much: stiffness, scale, blur, crosstalk, and what the image remembers of earlier
-places (`moments.PadMemory`). The level and the pitch are those of the device.
+places (`creep.PadMemory`). The level and the pitch are those of the device.
 
 The blurred patch has no closed form: the pressure is taken on a grid of thirds of a pitch over one quadrant, in the
 principal axes, and blurred by a folded Gaussian matrix. Stops being true where taxels saturate, where the patch is no
@@ -17,15 +17,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from canprobe.mechanics.touch.linear_algebra import Array, positive, read_only
-from canprobe.mechanics.touch.pad import COUNTS_MAX, Pad
-from canprobe.mechanics.touch.patch.array_calibration import ArrayCalibration, ImageParameters, MomentErrors
-from canprobe.mechanics.touch.patch.image import PatchCalibration
-from canprobe.mechanics.touch.patch.moments import LEVEL_COUNTS, Moments
+from canprobe.mechanics.touch.linear_algebra import positive, read_only
+from canprobe.mechanics.touch.pad import COUNTS_MAX
+from canprobe.mechanics.touch.patch.array_calibration import ImageParameters, MomentErrors
+from canprobe.mechanics.touch.patch.moments import Moments
+from canprobe.mechanics.types import Floats
 
 STEPS = 3
 """Grid points in a pitch: with more of them a moment changes by 0.1 %."""
@@ -39,11 +39,8 @@ TAPER = 0.1
 """How far beyond these limits a patch still counts, as a share of the limit."""
 USUAL_LIGHTNESS = 0.05
 """Level over peak pressure at which the floor holds; it grows in proportion, as light touches cover few taxels."""
-GAIN_FORCES_N = (0.5, 1.0, 2.0, 4.0)
 GAIN_LIGHTNESS = 0.25
-GAIN_CURVATURES = ((0.0, 0.0), (0.8, 0.8), (1.6, 1.6), (1.2, 0.0), (0.6, -0.5))
-"""Forces, level over peak pressure, and principal curvatures (over that of the probe) between which the force gains
-hold: plane, balls, cylinder, saddle."""
+"""Level over peak pressure from which on the forces of `force_gains` are made larger."""
 _STEP = 1e-3
 """Relative step of the difference quotients, of the curvature relative to the probe and of the force."""
 _ROOT = math.sqrt(2.0)
@@ -75,10 +72,10 @@ class ImageModel:
     side: int
     seen: int
     errors: MomentErrors
-    _squares: Array = field(init=False, repr=False)
-    _blur: Array = field(init=False, repr=False)
-    _turned_blur: Array = field(init=False, repr=False)
-    _moments: Array = field(init=False, repr=False)
+    _squares: Floats = field(init=False, repr=False)
+    _blur: Floats = field(init=False, repr=False)
+    _turned_blur: Floats = field(init=False, repr=False)
+    _moments: Floats = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         for name in ("radius", "pitch", "level"):
@@ -124,7 +121,7 @@ class ImageModel:
         """Indentation, m, under a force, N, with det A, 1/m²."""
         return math.sqrt(2.0 * force * math.sqrt(det) / (math.pi * self.parameters.stiffness))
 
-    def shown(self, depth: Array, a: Array, b: Array) -> Array:
+    def shown(self, depth: Floats, a: Floats, b: Floats) -> Floats:
         """Pressure that is shown in a quadrant of the patch.
 
         Args:
@@ -140,10 +137,10 @@ class ImageModel:
         fall, drop = per_square * a, per_square * b
         field = (peak[:, None] - fall[:, None] * self._squares)[:, :, None] - (drop[:, None] * self._squares)[:, None]
         np.maximum(field, 0.0, out=field)
-        shown: Array = self._blur @ field @ self._turned_blur
+        shown: Floats = self._blur @ field @ self._turned_blur
         return shown
 
-    def moments_of(self, shown: Array) -> list[tuple[float, float]]:
+    def moments_of(self, shown: Floats) -> list[tuple[float, float]]:
         """Second moments above the level along both axes, m², of each of the n that `shown` gives.
 
         Raises:
@@ -156,13 +153,13 @@ class ImageModel:
             raise ValueError("no patch: nothing above the level")
         return [(square * xx / total, square * yy / total) for total, xx, yy in sums]
 
-    def sum_of(self, shown: Array) -> Array:
+    def sum_of(self, shown: Floats) -> Floats:
         """(n,) pressure times area of the taxels at or above the level, N, of what `shown` gives.
 
         Noise lets some taxels below it through and cuts some above it: the edge is one count wide.
         """
         share = np.clip((shown - self.level) / self.count + 1.0, 0.0, 1.0)
-        sums: Array = (shown * share).sum(axis=(1, 2)) * (2.0 * self.pitch / STEPS) ** 2
+        sums: Floats = (shown * share).sum(axis=(1, 2)) * (2.0 * self.pitch / STEPS) ** 2
         return sums
 
     def moments(self, k: Moments, force: float) -> Moments:
@@ -236,7 +233,7 @@ class ImageModel:
         depth = self.depth(force, root_det * root_det)
         return depth / (3.0 * x) - 1.0 / self.radius, 0.0, depth / (3.0 * y) - 1.0 / self.radius
 
-    def linearised(self, v: Moments, force: float, frames: float, k: Moments) -> tuple[Array, Array, Array]:
+    def linearised(self, v: Moments, force: float, frames: float, k: Moments) -> tuple[Floats, Floats, Floats]:
         """Relative residual at K, its Jacobian, and the information of the residual.
 
         Args:
@@ -273,7 +270,7 @@ class ImageModel:
         residual = np.array([weight * (m - m0) for weight, m, m0 in zip(scale, v, here, strict=True)])
         return np.array(rows), residual, self._information(frames, self._lightness(depth))
 
-    def _information(self, frames: float, lightness: float) -> Array:
+    def _information(self, frames: float, lightness: float) -> Floats:
         """(3, 3) inverse covariance of the relative residuals of V11, V12, V22."""
         e = self.errors
         noise, more = e.frame_sigma**2 / max(frames, 1.0), lightness / USUAL_LIGHTNESS
@@ -286,34 +283,3 @@ def _in_axes(v1: float, v2: float, axes: tuple[float, float]) -> Moments:
     """xx, xy, yy of a tensor with principal values v1, v2, the direction of the first given by cosine and sine."""
     c, s = axes
     return c * c * v1 + s * s * v2, c * s * (v1 - v2), s * s * v1 + c * c * v2
-
-
-# From a calibration to the models of its array.
-
-
-def make_patch_calibration(calibration: ArrayCalibration, pad: Pad) -> PatchCalibration:
-    """From counts to force, for an array of these taxels; without a sphere or a grid the force is that of the pressure.
-
-    At another full scale than that of the calibration level, threshold and noise are the same counts of another
-    pressure, and layer, blur, crosstalk and scale stay.
-    """
-    if pad.is_flat or not pad.is_grid:
-        return PatchCalibration(pad, force_gain=1.0 / calibration.image.scale)
-    plain = PatchCalibration(pad, gains=calibration.gains)
-    gain, edge = make_image_model(calibration, plain, seen=None).force_gains(GAIN_FORCES_N, GAIN_CURVATURES)
-    return replace(plain, force_gain=gain, edge_gain=edge)
-
-
-def make_image_model(calibration: ArrayCalibration, patch: PatchCalibration, *, seen: int | None) -> ImageModel:
-    """What an array shows; `seen`: taxels along the side of the window, None for all."""
-    count, side = patch.full_scale_pa / COUNTS_MAX, max(patch.pad.shape)
-    return ImageModel(
-        calibration.image,
-        patch.radius_m,
-        patch.pitch_m,
-        level=LEVEL_COUNTS * count,
-        count=count,
-        side=side,
-        seen=side if seen is None else seen,
-        errors=calibration.moments,
-    )

@@ -1,4 +1,4 @@
-"""The layer, by the arm's way into the object."""
+"""Fits the stiffness of the layer to the arm's way into the object."""
 
 from __future__ import annotations
 

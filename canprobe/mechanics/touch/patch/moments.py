@@ -1,4 +1,4 @@
-"""Second moments and centroids of tactile images, and what an array remembers in them of where the patch has been."""
+"""Second moments of a tactile image, and its centroid."""
 
 from __future__ import annotations
 

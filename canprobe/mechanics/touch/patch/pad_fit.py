@@ -1,4 +1,4 @@
-"""Centroids: how they trail, how they scatter, and over which way an error lasts."""
+"""Fits how centroids trail, how they scatter, and over which way an error of theirs lasts."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import least_squares
 
-from canprobe.mechanics.touch.linear_algebra import Array
 from canprobe.mechanics.touch.patch.array_calibration import CentroidErrors, Lag
 from canprobe.mechanics.touch.patch.image_fit import Dwell, Shown
+from canprobe.mechanics.types import Floats
 
 REACH = 200e-6, 0.2
 """Expected `Lag.reach`, m, and how far its logarithm may be off: rolls of one length hardly tell it from `Lag.most`."""
@@ -24,7 +24,7 @@ TAU_S = 0.02, 0.3
 """Time constants of `Lag`."""
 
 
-def _means(t: Array, at: Array) -> Array:
+def _means(t: Floats, at: Floats) -> Floats:
     """(n, 2) from the slow to the quick exponential mean of places (n, 2), as `PadLag` has them."""
     quick = slow = at[0]
     ways = np.zeros_like(at)
@@ -36,7 +36,7 @@ def _means(t: Array, at: Array) -> Array:
     return ways
 
 
-def fit_centroids(dwells: Sequence[Dwell], shown: Sequence[Shown]) -> tuple[CentroidErrors, Array]:
+def fit_centroids(dwells: Sequence[Dwell], shown: Sequence[Shown]) -> tuple[CentroidErrors, Floats]:
     """How centroids err, and the (n,) scatter of those of each touch, m.
 
     Latency and lag from the rolls to and fro, then what is left of all by load, and how long it lasts.
@@ -47,13 +47,13 @@ def fit_centroids(dwells: Sequence[Dwell], shown: Sequence[Shown]) -> tuple[Cent
     rolls = [s for d, s in zip(dwells, shown, strict=True) if d.to_and_fro]
     latency, latency_sigma = _latency(rolls)
 
-    def left(z: Array, s: Shown, way: Array) -> Array:
-        rest: Array = s.off + 1e-4 * z[0] * way / (np.hypot(*way.T)[:, None] + 1e-4 * abs(z[1]))
+    def left(z: Floats, s: Shown, way: Floats) -> Floats:
+        rest: Floats = s.off + 1e-4 * z[0] * way / (np.hypot(*way.T)[:, None] + 1e-4 * abs(z[1]))
         return rest
 
     taught = [(s, _means(s.t_s, s.raw)) for s in rolls or shown]
 
-    def residuals(z: Array) -> Array:
+    def residuals(z: Floats) -> Floats:
         each = [left(z, *pair) for pair in taught]
         centred = [1e5 * (r - r.mean(axis=0)).reshape(-1) / math.sqrt(len(r)) for r in each]
         return np.concatenate([*centred, [math.log(abs(z[1]) / (1e4 * REACH[0])) / REACH[1]]])
@@ -76,12 +76,12 @@ def fit_centroids(dwells: Sequence[Dwell], shown: Sequence[Shown]) -> tuple[Cent
     return found, np.array(sigma)
 
 
-def _along(way: Array) -> Array:
+def _along(way: Floats) -> Floats:
     """(n,) path over the pad, m, up to each of its places (n, 2)."""
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))])
 
 
-def _scatter(r: Array, way: Array) -> float:
+def _scatter(r: Floats, way: Floats) -> float:
     """Standard deviation of errors (n, 2) within `SCATTER_WAY_M`: what lasts longer bends no surface."""
     part = (_along(way) / SCATTER_WAY_M).astype(int)
     variances = [r[part == i].var(axis=0, ddof=1).mean() for i in range(part[-1] + 1) if np.sum(part == i) > 4]
@@ -106,7 +106,7 @@ def _latency(rolls: Sequence[Shown]) -> tuple[float, float]:
     return -float(found[1]), math.sqrt(scatter * FRAMES_ALIKE)
 
 
-def _lasting(errors: Sequence[Array], ways: Sequence[Array]) -> tuple[float, float]:
+def _lasting(errors: Sequence[Floats], ways: Sequence[Floats]) -> tuple[float, float]:
     """Share of the variance of errors (n, 2) that lasts along the way over the pad, and over which length, m."""
     lags = np.zeros(LAGS)
     for r, way in zip(errors, ways, strict=True):
@@ -122,8 +122,8 @@ def _lasting(errors: Sequence[Array], ways: Sequence[Array]) -> tuple[float, flo
     # that each error has its mean taken off shifts all of them down
     at = LAG_STEP_M * np.arange(1, LAGS)
 
-    def residuals(z: Array) -> Array:
-        rest: Array = z[0] * np.exp(-at / abs(z[1]) / 1e-3) - z[2] - lags[1:] / lags[0]
+    def residuals(z: Floats) -> Floats:
+        rest: Floats = z[0] * np.exp(-at / abs(z[1]) / 1e-3) - z[2] - lags[1:] / lags[0]
         return rest
 
     share, length, shift = least_squares(residuals, np.array([0.5, 1.0, 0.1])).x.tolist()

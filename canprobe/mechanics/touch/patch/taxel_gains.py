@@ -1,4 +1,4 @@
-"""Taxels."""
+"""Fits the gain of each taxel to images of known touches, and finds dead taxels."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from canprobe.mechanics.touch.linear_algebra import Array
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.patch.image_fit import Dwell, Shown
 from canprobe.mechanics.touch.patch.image_model import STEPS, ImageModel
+from canprobe.mechanics.types import Floats
 
 
 def taxel_gains(
     pad: Pad, model: ImageModel, dwells: Sequence[Dwell], shown: Sequence[Shown], forces: Sequence[float]
-) -> tuple[Array, tuple[tuple[int, int], ...]]:
+) -> tuple[Floats, tuple[tuple[int, int], ...]]:
     """Gain of each taxel over the mean, and those that are dead.
 
     The image of the model is laid on the centroid of each image; taxels above a fifth of the peak count.

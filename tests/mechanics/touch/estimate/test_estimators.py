@@ -9,7 +9,7 @@ import pytest
 
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import ContactSample
-from canprobe.mechanics.touch.estimate import quadric
+from canprobe.mechanics.touch.estimate import quadric, residuals
 from canprobe.mechanics.touch.estimate.fit import METHODS, make_estimator
 from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
 from canprobe.mechanics.touch.estimate.noise import make_noise
@@ -74,9 +74,9 @@ def test_rows_are_the_derivative_of_residuals(truth):
     S = path.surface.S.copy()
     S[:3, :3] *= 0.02
     c = quadric.parameters_of(S)
-    d = quadric.design(path.points / 0.02, path.normals, make_noise(160, 1e-9, 1.0))
-    J, h = quadric.linearise(c, d).jacobian(), 1e-6
-    numeric = [(quadric.linearise(c + h * e, d).r - quadric.linearise(c - h * e, d).r) / (2 * h) for e in np.eye(9)]
+    d = residuals.design(path.points / 0.02, path.normals, make_noise(160, 1e-9, 1.0))
+    J, h = residuals.linearise(c, d).jacobian(), 1e-6
+    numeric = [(residuals.linearise(c + h * e, d).r - residuals.linearise(c - h * e, d).r) / (2 * h) for e in np.eye(9)]
     assert np.allclose(J[:, 1:], np.moveaxis(numeric, 0, 2)[:, 1:], atol=1e-8)
     assert np.allclose(J[:, 0] * 1e-9, np.moveaxis(numeric, 0, 2)[:, 0] * 1e-9, atol=1e-8)
 
@@ -88,11 +88,13 @@ def test_transport_is_the_congruence_and_its_derivative():
     T[:3, :3], _ = np.linalg.qr(np.eye(3) + 0.1 * rng.normal(size=(3, 3)))
     T[:3, :3] *= np.sign(np.diag(T[:3, :3]))
     T[:3, 3] = 0.1 * rng.normal(size=3)
-    new, M = quadric.transport(c, T)
+    new, M = residuals.transport(c, T)
     S = T.T @ quadric.matrix_of(c) @ T
     assert np.allclose(quadric.matrix_of(new), S * (-0.5 / S[2, 3]))
     h = 1e-6
-    numeric = [(quadric.transport(c + h * e, T)[0] - quadric.transport(c - h * e, T)[0]) / (2 * h) for e in np.eye(9)]
+    numeric = [
+        (residuals.transport(c + h * e, T)[0] - residuals.transport(c - h * e, T)[0]) / (2 * h) for e in np.eye(9)
+    ]
     assert np.allclose(M, np.transpose(numeric), atol=1e-8)
 
 

@@ -8,9 +8,9 @@ import pytest
 from canprobe.mechanics.touch.estimate.gauss_newton_step import solved_once
 from canprobe.mechanics.touch.estimate.information import InformationFilter
 from canprobe.mechanics.touch.estimate.known_curvature import curvature_covariance
-from canprobe.mechanics.touch.estimate.left_out import Expected, LeftOut
 from canprobe.mechanics.touch.estimate.noise import Correlation, Noise
 from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE
+from canprobe.mechanics.touch.estimate.omitted_terms import ExpectedMisfit, OmittedTerms
 from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.estimate.residuals import curvature_jacobian, design
 from canprobe.mechanics.touch.estimate.sandwich import Score
@@ -161,18 +161,18 @@ def test_without_forgetting_an_answer_is_that_of_a_batch():
     rows = np.concatenate([J, E], axis=2)
     flat = rows.reshape(-1, 18)
     prior = 1e-9 * np.eye(9)
-    sums = LeftOut(prior, None)
+    sums = OmittedTerms(prior, None)
     c = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5, 0.1, 0.3])
     H = np.linalg.inv(flat[:, :9].T @ flat[:, :9])
     a = 0.3 * rng.normal(size=9)
     residuals = flat[:, 9:] @ a + e.reshape(-1)
     residuals -= flat[:, :9] @ (H @ (flat[:, :9].T @ residuals))  # at the quadric that fits best
     sums.start(rows, residuals.reshape(-1, 3), 0.01)
-    found = sums.amend(c, H, np.zeros(3), Expected())
+    found = sums.amend(c, H, np.zeros(3), ExpectedMisfit())
     both = np.linalg.lstsq(flat, residuals, rcond=None)[0]  # terms that show: those that fit best
     assert found.misfit > 0.999
     assert np.allclose(found.c - c, both[:9], atol=0.02)
-    assert np.allclose(sums.explanation(c, H, Expected()), both, atol=0.02)
+    assert np.allclose(sums.explanation(c, H, ExpectedMisfit()), both, atol=0.02)
     wide = np.linalg.inv(flat.T @ flat)[:9, :9]
     spread = np.diag(H + found.covariance) / np.diag(wide)
     assert np.all(spread[:6] > 0.9)
@@ -203,10 +203,10 @@ def test_generous_noise_does_not_hide_a_misfit():
     a = 0.14 * rng.normal(size=9)
     residuals = (flat[:, 9:] @ a + e) / 3.0
     residuals -= flat[:, :9] @ (H @ (flat[:, :9].T @ residuals))
-    sums = LeftOut(1e-9 * np.eye(9), None)
+    sums = OmittedTerms(1e-9 * np.eye(9), None)
     c = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5, 0.1, 0.3])
     sums.start(rows, residuals.reshape(-1, 3), 0.01)
-    stated, known = (sums.amend(c, H, np.zeros(3), Expected(noise)) for noise in (1.0, 1.0 / 9.0))
+    stated, known = (sums.amend(c, H, np.zeros(3), ExpectedMisfit(noise)) for noise in (1.0, 1.0 / 9.0))
     assert stated.misfit < 0.5
     assert known.misfit > 0.99
 

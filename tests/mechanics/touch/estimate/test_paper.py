@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from canprobe.mechanics.touch.estimate import quadric
+from canprobe.mechanics.touch.estimate import residuals
 from canprobe.mechanics.touch.estimate.chen1996 import paper_rates
 from canprobe.mechanics.touch.estimate.differences import three_rows
 from canprobe.mechanics.touch.estimate.fit import fit_surface, make_estimator
@@ -112,8 +112,10 @@ def test_the_linear_step_shrinks_curvature(truth):
         p, n = path.noisy(5e-5, 3e-3, seed)
         touches = make_touches(p, n, make_noise(160, 5e-5, 3e-3))
         T, length = working_frame(touches), touches.extent
-        d = quadric.design((p - T[:3, 3]) @ T[:3, :3] / length, n @ T[:3, :3], touches.noise.scaled(length, T[:3, :3]))
-        c = np.linalg.lstsq(*quadric.linear_rows(d), rcond=None)[0]
+        d = residuals.design(
+            (p - T[:3, 3]) @ T[:3, :3] / length, n @ T[:3, :3], touches.noise.scaled(length, T[:3, :3])
+        )
+        c = np.linalg.lstsq(*residuals.linear_rows(d), rcond=None)[0]
         linear.append(2 * c[6] / length * R - 1)
         best.append(fit_ml(touches, None).K[0, 0] * R - 1)
     assert np.mean(linear) < -0.04
@@ -122,9 +124,9 @@ def test_the_linear_step_shrinks_curvature(truth):
 
 def test_normal_equations_square_the_condition(truth):
     path = truth.path("cylinder")
-    d = quadric.design(path.points, path.normals, make_noise(160, 2e-5, 1e-3))
-    A, _ = quadric.linear_rows(d)
+    d = residuals.design(path.points, path.normals, make_noise(160, 2e-5, 1e-3))
+    A, _ = residuals.linear_rows(d)
     in_metres = np.linalg.cond(A)
-    scaled = quadric.design(path.points / 0.01, path.normals, make_noise(160, 2e-3, 1e-3))
-    assert in_metres > 100 * np.linalg.cond(quadric.linear_rows(scaled)[0])
+    scaled = residuals.design(path.points / 0.01, path.normals, make_noise(160, 2e-3, 1e-3))
+    assert in_metres > 100 * np.linalg.cond(residuals.linear_rows(scaled)[0])
     assert np.linalg.cond(A.T @ A) > 1e3 * in_metres

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from canprobe.mechanics.touch.contact import ContactSample
-from canprobe.mechanics.touch.estimate import start as one_step
+from canprobe.mechanics.touch.estimate import gauss_newton_step as one_step
 from canprobe.mechanics.touch.estimate.fit import make_estimator
-from canprobe.mechanics.touch.estimate.information import Touch, batch_design
+from canprobe.mechanics.touch.estimate.information import MeasuredContact, batch_design
 from canprobe.mechanics.touch.estimate.nonlinear import fit
 from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.estimate.start import LAST, MOST, Start, isolation
@@ -20,7 +20,7 @@ PRIOR = Prior.weak(MEMORY)
 def touches(truth, name, seed, n=72):
     path = truth.path(name, T=truth.any_pose(seed))
     p, normals = path.noisy(*SIGMA, seed)
-    return [Touch(a, b, *SIGMA) for a, b in zip(p[-n:], normals[-n:], strict=True)]
+    return [MeasuredContact(a, b, *SIGMA) for a, b in zip(p[-n:], normals[-n:], strict=True)]
 
 
 def stepwise(found, each=4):

@@ -7,7 +7,7 @@ import pytest
 
 from canprobe.mechanics.touch.patch.array_calibration import Lag
 from canprobe.mechanics.touch.patch.creep import TIMES_S, PadMemory
-from canprobe.mechanics.touch.patch.trailing import GAP_S, PadLag
+from canprobe.mechanics.touch.patch.pad_lag import GAP_S, PadLag
 
 
 def remembered(t, uv):

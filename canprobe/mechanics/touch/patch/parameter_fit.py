@@ -1,4 +1,4 @@
-"""The image model's parameters."""
+"""Fits the parameters of the image model to what images show, and the errors that are left."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
-from canprobe.mechanics.touch.linear_algebra import Array
 from canprobe.mechanics.touch.patch.array_calibration import ImageParameters, MomentErrors
 from canprobe.mechanics.touch.patch.image import PatchCalibration
 from canprobe.mechanics.touch.patch.image_fit import (
@@ -24,19 +23,20 @@ from canprobe.mechanics.touch.patch.image_fit import (
 )
 from canprobe.mechanics.touch.patch.image_model import ImageModel
 from canprobe.mechanics.touch.patch.moments import LEVEL_COUNTS
+from canprobe.mechanics.types import Floats
 
 Pairs = Sequence[tuple[Dwell, Shown]]
 
 
-class Fit(NamedTuple):
+class ParameterFit(NamedTuple):
     """Parameters, their covariance (5, 5) in the order of `_as_vector`, and the forces (n,) of the touches, N."""
 
     parameters: ImageParameters
-    covariance: Array
-    forces: Array
+    covariance: Floats
+    forces: Floats
 
 
-def _as_parameters(z: Array, pitch: float) -> ImageParameters:
+def _as_parameters(z: Floats, pitch: float) -> ImageParameters:
     k, scale, blur, crosstalk, memory = z.tolist()
     return ImageParameters(math.exp(k), math.exp(scale), max(blur, 0.1) * pitch, crosstalk, memory)
 
@@ -62,7 +62,7 @@ def fit_parameters(  # noqa: PLR0917
     scale_sigma: float | None,
     reference_sigma: float,
     seen: int,
-) -> Fit:
+) -> ParameterFit:
     """Least squares over sums and moments of touches, reference forces and priors.
 
     Args:
@@ -82,7 +82,7 @@ def fit_parameters(  # noqa: PLR0917
     prior = np.array([math.log(1e8), 0.0, BLUR_PITCH[0], CROSSTALK[0], MEMORY[0]])
     widths = np.array([5.0, 5.0 if scale_sigma is None else scale_sigma, BLUR_PITCH[1], CROSSTALK[1], MEMORY[1]])
 
-    def residuals(z: Array) -> Array:
+    def residuals(z: Floats) -> Floats:
         parameters = _as_parameters(z[:5], plain.pitch_m)
         force = np.exp(z[5:])
         depth = np.sqrt(2.0 * force * np.sqrt(a * b) / (math.pi * parameters.stiffness))
@@ -103,10 +103,12 @@ def fit_parameters(  # noqa: PLR0917
     start = np.concatenate([prior, np.log(np.maximum(S, 1e-3))])
     found: Any = least_squares(residuals, start, x_scale=np.array([0.1, 0.1, 0.1, 0.02, 0.03] + n * [0.05]))
     covariance = np.linalg.inv(found.jac.T @ found.jac)[:5, :5]
-    return Fit(_as_parameters(found.x[:5], plain.pitch_m), covariance, np.exp(found.x[5:]))
+    return ParameterFit(_as_parameters(found.x[:5], plain.pitch_m), covariance, np.exp(found.x[5:]))
 
 
-def moment_errors(model: ImageModel, dwells: Sequence[Dwell], shown: Sequence[Shown], forces: Sequence[float]) -> Array:
+def moment_errors(
+    model: ImageModel, dwells: Sequence[Dwell], shown: Sequence[Shown], forces: Sequence[float]
+) -> Floats:
     """(n, 3) relative errors of V_1, V_2 and of V_12 over their root, at measured forces, N."""
     errors = []
     for dwell, s, force in zip(dwells, shown, forces, strict=True):
@@ -119,7 +121,7 @@ def moment_errors(model: ImageModel, dwells: Sequence[Dwell], shown: Sequence[Sh
 
 def curvature_errors(
     model: ImageModel, dwells: Sequence[Dwell], shown: Sequence[Shown], forces: Sequence[float]
-) -> Array:
+) -> Floats:
     """(n, 2) errors of the principal curvatures from each dwell's moments alone, relative to (κ + 1/R_p)."""
     result = []
     for dwell, s, force in zip(dwells, shown, forces, strict=True):

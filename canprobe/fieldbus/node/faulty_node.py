@@ -1,4 +1,4 @@
-"""A node with faults, between the node and a lockstep bus: it is attached in the node's place."""
+"""A node whose faults happen: it stands between the node and a lockstep bus, and is attached in the node's place."""
 
 from __future__ import annotations
 

@@ -1,19 +1,19 @@
-"""Moving the tool with the drives that are left: what the others would have done is shared among them."""
+"""Moving the tool with the drives that are left: they share the motion of those that are at rest."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.mechanics.robot.chain import Array
 from canprobe.mechanics.robot.model import ArmModel
+from canprobe.mechanics.types import Floats
 
 WORST_GAIN = 30.0
 """Joint motion per motion of the tool, rad/m, beyond which the drives that are left are badly placed for it."""
 _EXACT = 1e-6
 
 
-def lifting_step(model: ArmModel, J: Array, move: Array, free: NDArray[np.bool_]) -> Array | None:
+def lifting_step(model: ArmModel, J: Floats, move: Floats, free: NDArray[np.bool_]) -> Floats | None:
     """Drive steps that move the tool's point, its orientation left open, while some drives stand still.
 
     Of all steps the one with the least joint motion. Couplings between the joints are in it: a drive that stands still

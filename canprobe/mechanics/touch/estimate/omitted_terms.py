@@ -17,7 +17,8 @@ from canprobe.mechanics.touch.estimate.noise import Correlation
 from canprobe.mechanics.touch.estimate.quadric import sharpest, size_of
 from canprobe.mechanics.touch.estimate.sandwich import Score
 from canprobe.mechanics.touch.estimate.terms import shifted
-from canprobe.mechanics.touch.linear_algebra import Array, Vec, eigen, solved
+from canprobe.mechanics.touch.linear_algebra import eigen, solved
+from canprobe.mechanics.types import Floats, Vec
 
 _REGULAR = 1e-9
 """What keeps the covariance of the terms' score regular, over its mean."""
@@ -29,13 +30,13 @@ class Amended(NamedTuple):
     The covariance (9, 9) is what the terms add to that of the noise; symmetric, not definite by itself.
     """
 
-    c: Array
-    covariance: Array
+    c: Floats
+    covariance: Floats
     misfit: float
     trusted: bool
 
 
-class Expected(NamedTuple):
+class ExpectedMisfit(NamedTuple):
     """What is known beforehand of what a filter is given.
 
     Attributes:
@@ -61,20 +62,20 @@ class _Along(NamedTuple):
     """
 
     found: Averaged
-    off: Array
-    terms: Array
-    shared: Array
-    weighted: Array
+    off: Floats
+    terms: Floats
+    shared: Floats
+    weighted: Floats
 
 
-class LeftOut:
+class OmittedTerms:
     """Sums over the rows of parameters and terms; `score` is that of both.
 
     Args:
         prior, correlation: as of `Score`, for the nine parameters.
     """
 
-    def __init__(self, prior: Array, correlation: Correlation | None) -> None:
+    def __init__(self, prior: Floats, correlation: Correlation | None) -> None:
         wide = np.zeros((18, 18))
         wide[:9, :9] = prior
         self.score = Score(wide, correlation)
@@ -86,7 +87,7 @@ class LeftOut:
         self._information = np.zeros((18, 18))
         self._slope = np.zeros(9)
 
-    def start(self, rows: Array, residuals: Array, travelled: float) -> None:
+    def start(self, rows: Floats, residuals: Floats, travelled: float) -> None:
         """Take a batch's rows (n, 3, 18) and minus residuals (n, 3), evenly spread over a path (m)."""
         self.score.start(rows, travelled)
         flat = rows.reshape(-1, 18)
@@ -94,14 +95,14 @@ class LeftOut:
         self._slope = flat[:, 9:].T @ residuals.reshape(-1)
 
     def take(  # noqa: PLR0917 - as `Score.take`, and what the sums need
-        self, rows: Array, residuals: Array, step: Array, moved: float, kept: float, known: float
+        self, rows: Floats, residuals: Floats, step: Floats, moved: float, kept: float, known: float
     ) -> None:
         """Take new rows (3n, 18), minus their residuals (3n,) before the parameters made a step (9,)."""
         self.score.take(rows, moved, kept, known)
         self._information = kept * self._information + rows.T.dot(rows)
         self._slope = kept * self._slope + rows[:, 9:].T.dot(residuals) - self._information[9:, :9].dot(step)
 
-    def carry(self, back: Array, x: float, y: float) -> None:
+    def carry(self, back: Floats, x: float, y: float) -> None:
         """Go over to a frame at (x, y); back (9, 9) is d(old)/d(new) of the parameters."""
         A, Q = shifted(x, y)
         away = 2.0 * np.eye(9) - A  # its inverse: a quartic term leaves cubic ones behind, a cubic one none
@@ -111,7 +112,7 @@ class LeftOut:
         self._information = wide.T.dot(self._information).dot(wide)
         self._slope = away.T.dot(self._slope)
 
-    def amend(self, c: Array, H: Array, place: Vec, expected: Expected) -> Amended:
+    def amend(self, c: Floats, H: Floats, place: Vec, expected: ExpectedMisfit) -> Amended:
         """Average an answer at a place over the terms; c (9,) of the filter, H (9, 9) the inverse of its
         information.
         """
@@ -119,12 +120,12 @@ class LeftOut:
         both = H.dot(a.shared[:9]).dot(a.weighted * a.found.share).dot(a.off.T)
         return Amended(c + a.found.shift, a.found.spread + both + both.T, a.found.misfit, a.found.trusted)
 
-    def explanation(self, c: Array, H: Array, expected: Expected) -> Array:
+    def explanation(self, c: Floats, H: Floats, expected: ExpectedMisfit) -> Floats:
         """What the terms most likely are: (18,) what they add to the filter's parameters, and the terms."""
         a = self._along(c, H, expected, (0.0, 0.0, 0.0))
         return np.concatenate([a.found.shift, a.terms @ a.found.terms])
 
-    def _along(self, c: Array, H: Array, expected: Expected, place: Vec) -> _Along:
+    def _along(self, c: Floats, H: Floats, expected: ExpectedMisfit, place: Vec) -> _Along:
         curvature = max(size_of(c), expected.curvature)
         D = scales(curvature)
         X = np.zeros((18, 9))  # what a unit of each term does to the parameters, and the term itself

@@ -1,0 +1,46 @@
+"""Opens a port by the name of its interface."""
+
+from __future__ import annotations
+
+from canprobe.errors import UsageError
+from canprobe.fieldbus.bus.clock import Clock
+from canprobe.fieldbus.bus.port import (
+    Port,
+    Reports,
+)
+from canprobe.fieldbus.bus.real.mmsg import HAS_BATCHES
+from canprobe.fieldbus.bus.real.python_can import PythonCanPort
+from canprobe.fieldbus.bus.real.socketcan import SocketCanPort
+
+
+def open_port(
+    interface: str,
+    channel: str,
+    bitrate: int,
+    clock: Clock,
+    *,
+    data_bitrate: int | None = None,
+    waits: bool = False,
+    reports: Reports | None = None,
+) -> Port:
+    """Open `channel` of `interface`.
+
+    Args:
+        interface: `socketcan` for a raw socket of our own, or any of python-can's interfaces.
+        channel: the channel as that interface names it, such as `can0`.
+        bitrate: in bit/s; a SocketCAN interface has its own, set with `ip link`.
+        clock: a clock in real time.
+        data_bitrate: of the data phase of CAN FD frames; None: classical frames only.
+        waits: wait for a full transmit queue as long as it takes; only SocketCAN can.
+        reports: who hears of error frames, and of what the user has to know.
+
+    Raises:
+        UsageError: there is no interface of that name.
+        InterfaceError: it is missing, down, or cannot be opened; with what to do.
+    """
+    if interface == "socketcan" and HAS_BATCHES:  # else python-can's
+        return SocketCanPort(channel, clock, bitrate=bitrate, data_bitrate=data_bitrate, waits=waits, reports=reports)
+    if interface in ("lockstep", "direct"):
+        what = "a lockstep bus lives inside one run" if interface == "lockstep" else "--bus direct has no bus"
+        raise UsageError(f"{channel}: {what}; there is nothing to open")
+    return PythonCanPort(interface, channel, bitrate, clock, data_bitrate=data_bitrate, reports=reports)

@@ -1,0 +1,124 @@
+"""What the links of a URDF look like: their solids in the frames of `from_urdf`, and the files of their meshes.
+
+Source: URDF specification (wiki.ros.org/urdf/XML, link, visual).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import unquote
+from xml.etree import ElementTree
+from xml.sax.saxutils import unescape
+
+import numpy as np
+
+from canprobe.errors import regular_file
+from canprobe.mechanics.robot.urdf_tree import MAX_FILE_BYTES, UrdfTree, z_along
+from canprobe.mechanics.types import Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Visual:
+    """One solid that a URDF shows.
+
+    Attributes:
+        joint: number of the joint that moves it, from 1; 0 where it stands with the base.
+        T: (4, 4) the solid in the frame of that joint in the chain of `from_urdf`, of the base for 0, m.
+        kind: "mesh", "box", "cylinder" along z, or "sphere".
+        size: of a mesh (3,) what its coordinates are multiplied by; of a box its edges, of a cylinder radius and
+            length, of a sphere its radius, m.
+        mesh: name of the mesh file, as it stands in the URDF; "" of another kind.
+        colour: RGB, 0–255; None where the URDF has none.
+    """
+
+    joint: int
+    T: Floats
+    kind: str
+    size: tuple[float, ...]
+    mesh: str
+    colour: tuple[int, int, int] | None
+
+
+def visuals_of(source: str | Path, base: str | None = None, tip: str | None = None) -> list[Visual]:
+    """What the links from base to tip look like, with what hangs on them; as `from_urdf`.
+
+    Args:
+        source: path of the file, or its text.
+        base, tip: links, as of `from_urdf`.
+
+    Raises:
+        PlanError: as `from_urdf`, or a solid without its numbers.
+    """
+    tree = UrdfTree.read(source)
+    start = base or tree.root()
+    path = tree.path(start, tip or tree.only_end())
+    names = {edge.name for edge in path}
+    found = list(_visuals(tree, 0, start, names, np.eye(4)))
+    for number, edge in enumerate((edge for edge in path if edge.kind != "fixed"), start=1):
+        found += _visuals(tree, number, edge.child, names, z_along(tree.axis(edge)).T)
+    return found
+
+
+def _visuals(tree: UrdfTree, joint: int, link: str, path: set[str], T: Floats) -> Iterator[Visual]:
+    """Solids of a link and of what it carries, seen from the frame in which the link stands at T."""
+    for name, there in tree.carried(link, path, T):
+        for element in tree.links[name].iterfind("visual"):
+            place = there @ tree.origin(f"link {name}", element.find("origin"))
+            for solid in element.iterfind("geometry/*"):
+                size = _size(tree, f"link {name}", solid)
+                colour = tree.colour_of(element.find("material"))
+                yield Visual(joint, place, solid.tag, size, solid.get("filename", ""), colour)
+
+
+def _size(tree: UrdfTree, name: str, solid: ElementTree.Element) -> tuple[float, ...]:
+    keys = {"mesh": "scale", "box": "size", "cylinder": "radius length", "sphere": "radius"}.get(solid.tag, "")
+    if solid.tag in ("mesh", "box"):
+        return tuple(tree.three_numbers(name, solid, keys, "1 1 1" if solid.tag == "mesh" else ""))
+    return tuple(tree.number(name, solid, key, math.nan) for key in keys.split())
+
+
+def find_mesh(urdf: Path, name: str) -> Path | None:
+    """The file of a mesh: beside the URDF or in a folder above it; None where it is not there.
+
+    Args:
+        urdf: path of the file that names it.
+        name: a path relative to the URDF, `file://`, or `package://PACKAGE/…`. A package is looked for above the URDF;
+            a folder above it that has the rest of the path will do.
+    """
+    folder, scheme = urdf.absolute().parent, name.partition("://")[0] if "://" in name else ""
+    rest = name.removeprefix(f"{scheme}://")
+    if scheme == "package":
+        inside = rest.partition("/")[2]
+        places = [above / part for above in (folder, *folder.parents) for part in (rest, inside)]
+    else:
+        places = [folder / (unquote(rest) if scheme == "file" else rest)] if scheme in ("", "file") else []
+    return next(filter(_is_file, places), None)
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name that the system refuses
+        return False
+
+
+def with_meshes_found(urdf: Path) -> bytes:
+    """The content of a URDF, with absolute `file://` paths of the meshes that are found: a copy of it finds them too.
+
+    Args:
+        urdf: path of the file.
+    """
+
+    def absolute(match: re.Match[bytes]) -> bytes:
+        found = find_mesh(urdf, unescape(match[2].decode(errors="replace"), {"&quot;": '"', "&apos;": "'"}))
+        return match[0] if found is None else match[1] + found.as_uri().encode() + match[3]
+
+    return re.sub(
+        rb"""(<mesh\b[^>]*?\bfilename\s*=\s*["'])([^"']*)(["'])""",
+        absolute,
+        regular_file(urdf, MAX_FILE_BYTES).read_bytes(),
+    )
