@@ -36,10 +36,8 @@ def write_page_of(folder: Path, say: Callable[[str], None]) -> None:
     Raises:
         UsageError: a controller's column has the name of one of ours.
     """
-    browser, recorded = (
-        importlib.import_module(f"canprobe.lab.bridge.view.{name}") for name in ("browser", "recorded")
-    )
-    browser.write_page(recorded.read_run(folder), folder / "report.html", say)
+    page, recorded = (importlib.import_module(f"canprobe.lab.bridge.view.{name}") for name in ("page", "recorded"))
+    page.write_page(recorded.read_run(folder), folder / "report.html", say)
 
 
 def page_of(folder: Path) -> Page:

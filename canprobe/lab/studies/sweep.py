@@ -14,7 +14,7 @@ and the cells; the sweep does the rest:
 
     def run(*, quick: bool, sweep: Sweep) -> StudyResult:
         cases = [Case(k, 400, 4 if quick else 40) for k in STIFFNESSES]
-        answers = sweep.map(measure, cases, model=("touch", "emulator", "studies/my_study.py"))
+        answers = sweep.map(measure, cases, model=("mechanics/touch", "cell/plant", "lab/studies/my_study.py"))
         costs = sweep.time(measure_cost, settings)             # one at a time, alone, on this machine
         ...
         return StudyResult("my_study", COLUMNS, rows, findings(rows), measuring_facts(quick, 40), partial(draw, rows))
