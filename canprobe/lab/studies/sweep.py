@@ -189,22 +189,21 @@ STUDIES: Mapping[str, str] = MappingProxyType(
         "workprec": "error of the dynamic plant against its run time, and of the whole cell against its computing time",
         "stability": "where the force loop settles, predicted and carried out, and how every other touch ends",
         "realtime": "how well the cycle keeps time on a real vcan0, against plain canopen-python; needs that interface",
-        "soak": "an hour on a real vcan0: memory, clocks and counters; needs that interface",
         "faults": "how the cell reacts to thousands of random faults of its nodes and their links",
     }
 )
 """Name → what it measures. The module of that name in this package has `run(*, quick, sweep) -> StudyResult`."""
 
 
-def run_study(name: str, *, quick: bool, sweep: Sweep, vcan: bool = False) -> StudyResult:
+def run_study(name: str, *, quick: bool, sweep: Sweep, form: str = "") -> StudyResult:
     """Run a study.
 
     Args:
         name: one of `STUDIES`.
         quick: fewer repeats and cases.
         sweep: computes its cells.
-        vcan: its form with processes on a real vcan0, which `faults` has.
+        form: another form of it: ``vcan`` of `faults`, with processes on a real vcan0; ``soak`` of `realtime`, an hour.
     """
-    module = importlib.import_module(f"canprobe.lab.studies.{name}_vcan" if vcan else f"canprobe.lab.studies.{name}")
+    module = importlib.import_module(f"canprobe.lab.studies.{name}_{form}" if form else f"canprobe.lab.studies.{name}")
     result: StudyResult = module.run(quick=quick, sweep=sweep)
     return result
