@@ -1,5 +1,5 @@
-"""What pages do not say by themselves: keys of a scene, from the code; all that was measured, from docs/measured.json;
-with `notebooks`, what these show. The figures of the packaged scenes go into the package too.
+"""What pages do not say by themselves: keys of a scene and imports, from the code; all that was measured, from
+docs/measured.json; with `notebooks`, what these show. The figures of the packaged scenes go into the package too.
 
 `python docs/generate.py [notebooks]`
 """
@@ -18,6 +18,8 @@ import typing
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from room_imports import imports_svg
 
 from canprobe.cell.results.expected import FIGURES, expected_text, range_text, seeds_text
 from canprobe.cell.scene.checks import Only, conditions_of, expected
@@ -259,6 +261,7 @@ def pages() -> Iterator[tuple[Path, str]]:
     yield EXPECTED, expected_figures(measured)
     yield DOCS / "gallery.md", gallery(measured)
     yield DOCS / "scene-keys.md", scene_keys()
+    yield DOCS / "img" / "imports.svg", imports_svg()
     readme = DOCS.parent / "README.md"
     yield readme, with_accuracy(readme.read_text(encoding="utf-8"), measured)
     for page in sorted(DOCS.glob("*.md")):

@@ -179,7 +179,7 @@ def _scan_figures(summary: Row) -> dict[str, float]:
 
 def study(name: str) -> Entry:
     """Findings and table of a study; its pictures, where the pages show them, are drawn anew."""
-    command = f"canprobe study {name}"
+    command = "canprobe study " + ("realtime --soak" if name == "soak" else name)
     if name in ("realtime", "soak"):
         command = IN_GUEST + command
     out = RUNS / name

@@ -1,5 +1,6 @@
 """README, CONTRIBUTING and docs: Python blocks run as they stand, commands are understood, and the cheap ones run."""
 
+import ast
 import re
 import shutil
 import tomllib
@@ -156,3 +157,12 @@ def test_messages_on_the_page_of_troubles_are_those_of_the_code():
     for message in [text for row in rows for text in re.findall(r"`([^`]+)`", row)]:
         for part in filter(None, (part.strip() for part in message.split("…"))):
             assert part in source, message
+
+
+def test_the_stops_of_the_path_through_the_code_are_there():
+    page = TEXTS["docs/architecture.md"]
+    stops = re.findall(r'<a href="\.\./(canprobe/[\w/.]+)">[\w/.]+</a> \| `(\w+)`', page)
+    assert 10 <= len(stops) <= 15
+    for file, name in stops:
+        tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
+        assert name in [node.name for node in tree.body if isinstance(node, ast.FunctionDef | ast.ClassDef)], file

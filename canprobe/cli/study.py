@@ -23,6 +23,7 @@ examples:
   canprobe study bound --dask tcp://10.0.0.1:8786
   canprobe study faults --seed 4711
   canprobe vcan -- canprobe study faults --vcan
+  canprobe vcan --realtime -- canprobe study realtime --soak
 """
 
 
@@ -37,6 +38,9 @@ def add_arguments(parser: Parser) -> None:
     )
     parser.add_argument(
         "--vcan", action="store_true", help="faults: on a real vcan0; processes are killed and the link is taken down"
+    )
+    parser.add_argument(
+        "--soak", action="store_true", help="realtime: hold the cell for an hour, and watch memory, clocks and counters"
     )
     parser.add_argument("--workers", metavar="N", type=whole(1, 1024), help="number of processes [one for each core]")
     parser.add_argument("--dask", metavar="ADDRESS", help="compute on the Dask cluster with this scheduler")
@@ -56,6 +60,8 @@ def run(args: argparse.Namespace) -> int:
         else:
             print_table(list(STUDIES.items()))
         return 0
+    if args.name == "soak":
+        args.complain("study soak is now an option of study realtime: canprobe study realtime --soak")
     if args.name not in STUDIES:
         known = ", ".join(STUDIES)
         wrong = f"unknown study {args.name!r}{did_you_mean(args.name, STUDIES)}" if args.name else "expected NAME"
@@ -64,16 +70,19 @@ def run(args: argparse.Namespace) -> int:
         args.complain(f"--vcan: study {args.name} does not run on vcan0; only faults does")
     if args.vcan and args.seed is not None:
         args.complain("--seed: the runs on vcan0 depend on the machine's timing and cannot be repeated from a seed")
+    if args.soak and args.name != "realtime":
+        args.complain(f"--soak: study {args.name} has no such form; only realtime has")
     if args.seed is not None:
         return _replay(args)
     from canprobe.lab.studies.result_files import as_document, text_of, write_study
     from canprobe.lab.studies.sweep import open_sweep
 
     out = args.out or Path("runs") / f"study-{args.name}"
+    form = "vcan" if args.vcan else "soak" if args.soak else ""
     options = {"workers": args.workers, "dask": args.dask, "fresh": args.fresh}
     try:
         with open_sweep(out, say=args.report.say, progress=args.report.bar(".0f cells"), **options) as sweep:
-            result = run_study(args.name, quick=args.quick, sweep=sweep, vcan=args.vcan)
+            result = run_study(args.name, quick=args.quick, sweep=sweep, form=form)
     except KeyboardInterrupt:
         args.report.complain(
             f"canprobe: interrupted; finished cells are kept in {out}, the same command computes the rest"

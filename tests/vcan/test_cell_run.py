@@ -43,7 +43,7 @@ def test_a_touch_in_two_processes(bench: Any) -> None:
     assert set(results.last) <= {can_id for bus in planned.buses for can_id in expected_messages(planned, bus)}
     assert {pdo.cob_id for pdo in planned.pdos} <= set(results.last)
     with np.load(bench.folder / "results" / "truth.npz") as truth:
-        assert truth["force"].max() == pytest.approx(results.summary["contact"]["force_max_n"])
+        assert truth["force_n"].max() == pytest.approx(results.summary["contact"]["force_max_n"])
         at_nodes = truth["t_s"]
     with np.load(bench.folder / "results" / "log.npz") as log:
         due = log["t_s"]

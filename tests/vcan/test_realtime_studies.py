@@ -1,4 +1,4 @@
-"""Studies `realtime` and `soak` on a real vcan0: the masters cycle, and what is told is what was counted."""
+"""Study `realtime`, and its `--soak`, on a real vcan0: the masters cycle, and what is told is what was counted."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_the_quick_study_measures_every_case(tmp_path, capsys):
 
 @pytest.mark.timeout(200)
 def test_the_soak_counts_what_the_interface_counts(tmp_path, capsys):
-    assert main(["study", "soak", "--quick", "--json", "--out", str(tmp_path)]) == 0
+    assert main(["study", "realtime", "--soak", "--quick", "--json", "--out", str(tmp_path)]) == 0
     rows = json.loads(capsys.readouterr().out)["rows"]
     first, last = rows[0], rows[-1]
     assert last["t_s"] - first["t_s"] > 9

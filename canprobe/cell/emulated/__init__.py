@@ -1,6 +1,7 @@
 """The emulated side of a cell: its drives and its array, made of a plan and put on one plant.
 
 - `world` makes all of it from a plan, with a recorder of what is true.
+- `truth_columns` names what is true as `truth.npz` does.
 - `array` is the tactile node of a CANopen array, `raw_array` an array that knows no CANopen.
 
 The nodes are those of `canprobe.fieldbus`; the model behind them is `canprobe.cell.plant`, which they ask for positions

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from canprobe.cell.emulated.array import make_tactile_node
 from canprobe.cell.emulated.raw_array import RawArray
+from canprobe.cell.emulated.truth_columns import TruthColumns, with_units
 from canprobe.cell.planning.model import Plan, PlannedNode
 from canprobe.cell.planning.motion import parked_posture
 from canprobe.cell.planning.units import FEED, GEAR_RATIO, RESOLUTION
@@ -60,14 +61,16 @@ class TruthRecorder(Participant):
             self._rows.append((t_ns, data[0] if data else 0, self._plant.state()))
         return []
 
-    def arrays(self) -> dict[str, NDArray[Any]]:
+    def arrays(self) -> TruthColumns:
         """Columns, one row a SYNC: t_s (s), sync_count (0, 1, …), sync_counter (of the frame, 0 without), the truth."""
         columns: dict[str, NDArray[Any]] = {
             "t_s": np.array([t_ns - self.origin_ns for t_ns, _, _ in self._rows], dtype=np.float64) * 1e-9,
             "sync_count": np.arange(len(self._rows), dtype=np.int64),
             "sync_counter": np.array([counter for _, counter, _ in self._rows], dtype=np.int64),
         }
-        return columns | self._plant.truths([state for _, _, state in self._rows])
+        model = self._plant.config.model
+        prismatic = () if model is None else model.chain.prismatic
+        return with_units(columns | self._plant.truths([state for _, _, state in self._rows]), prismatic)
 
 
 def _set_turn_units(node: SlaveNode, units: float | None) -> None:

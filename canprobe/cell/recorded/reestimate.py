@@ -31,7 +31,7 @@ from canprobe.mechanics.touch.estimate.fit import METHODS, unknown_method
 
 Array = NDArray[np.float64]
 SCHEMA = 2
-_SCORED = ("kappa", "direction1", "direction2", "contact_normal", "contact_point")
+_SCORED = ("kappa_per_m", "direction1", "direction2", "contact_normal", "contact_point_m")
 """Columns of the truth that estimates are scored against."""
 
 

@@ -139,9 +139,9 @@ def _draw_trajectory(part: SubFigure, result: RunResult) -> None:
 
 def _draw_force(part: SubFigure, result: RunResult) -> None:
     axes, t = part.subplots(), result.log["t_s"]
-    if "force" in result.truth and np.any(result.truth["force"] > 0):
-        n = min(len(t), len(result.truth["force"]))
-        axes.plot(t[:n], result.truth["force"][:n], color=INK, linewidth=0.9, label="true (plant)")
+    if "force_n" in result.truth and np.any(result.truth["force_n"] > 0):
+        n = min(len(t), len(result.truth["force_n"]))
+        axes.plot(t[:n], result.truth["force_n"][:n], color=INK, linewidth=0.9, label="true (plant)")
     axes.plot(t, result.log["force_n"], color=BLUE, linewidth=0.9, label="measured (array)")
     target = result.summary["contact"]["force_target_n"]
     if target is not None:
@@ -164,7 +164,7 @@ def _draw_curvature(part: SubFigure, result: RunResult) -> None:
     known = [band[np.isfinite(band)] for band in (lower, upper)]
     limits = [np.percentile(band, (20, 80)) for band in known if len(band)]  # how it begins does not set the scale
     if result.truth:
-        true = result.truth["kappa"][np.searchsorted(result.log["t_s"], [r.t_s - 1e-6 for r in records])]
+        true = result.truth["kappa_per_m"][np.searchsorted(result.log["t_s"], [r.t_s - 1e-6 for r in records])]
         axes.plot(travelled, true, color=INK, linestyle="--", label="true")
         seen = kappa[np.isfinite(kappa)]
         if len(seen):  # nor does an edge that is far sharper than all that was estimated

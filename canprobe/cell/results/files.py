@@ -29,17 +29,11 @@ _UNITS = {
     "per_m2": "1/m^2", "per_m": "1/m", "permille": "permille", "m_s": "m/s", "rad": "rad", "deg": "deg", "mm": "mm",
     "hz": "Hz", "ns": "ns", "us": "us", "n": "N", "m": "m", "s": "s",
 }  # fmt: skip
-_TRUTH_UNITS = {  # the plant's own columns are SI without a suffix
-    "q": "rad or m", "probe_centre": "m", "force": "N", "depth": "m", "depth_rate": "m/s", "contact_point": "m",
-    "kappa": "1/m", "pad_uv": "m",
-}  # fmt: skip
 _ATTRS = b"PANDAS_ATTRS"  # where pandas itself keeps a frame's attrs in Parquet
 
 
 def unit_of(name: str) -> str:
     """The unit of a column of a log, of a truth file or of estimates; `1` for what has none."""
-    if name in _TRUTH_UNITS:
-        return _TRUTH_UNITS[name]
     return next((unit for suffix, unit in _UNITS.items() if name.endswith(f"_{suffix}")), "1")
 
 

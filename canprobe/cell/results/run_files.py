@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.cell.emulated.truth_columns import with_present_names
 from canprobe.cell.npz import read_npz
 from canprobe.cell.scene.load import SAVED_AS, load_scene, written_by_other
 from canprobe.cell.scene.model import Scene
@@ -67,12 +68,14 @@ _OF_TACTILE: _Shapes = {
 }
 _OF_TRUTH: _Shapes = {
     "t_s": ("f", ()),
-    "force": ("f", ()),
-    "kappa": ("f", (2,)),
+    "q_rad": ("f", ("joints",)),
+    "q_m": ("f", ("joints",)),
+    "force_n": ("f", ()),
+    "kappa_per_m": ("f", (2,)),
     "direction1": ("f", (3,)),
     "direction2": ("f", (3,)),
     "contact_normal": ("f", (3,)),
-    "contact_point": ("f", (3,)),
+    "contact_point_m": ("f", (3,)),
 }
 
 
@@ -158,8 +161,22 @@ def read_tactile(file: Path, setup: Setup | None = None) -> Columns:
 
 
 def read_truth(file: Path, setup: Setup | None = None) -> Columns:
-    """The columns of ``truth.npz``; as `read_log`."""
-    return _read(file, "the true values of a run", _OF_TRUTH, setup)
+    """The columns of ``truth.npz``; as `read_log`. Former names are understood, with one warning."""
+    prismatic = _prismatic(file.parent / LOG) if setup is None or setup.arm is None else setup.arm.model.chain.prismatic
+    columns = with_present_names(read_npz(file, "the true values of a run"), prismatic, file)
+    return _checked(columns, file, _OF_TRUTH, setup)
+
+
+def _prismatic(log: Path) -> tuple[bool, ...] | None:
+    """Which joints slide, by the log beside a truth that names no kind; None where it does not say."""
+    try:
+        columns = read_npz(log)
+    except UsageError:
+        return None
+    turning, sliding = columns.get("q_rad"), columns.get("q_m")
+    if sliding is None:
+        return None if turning is None else (False,) * turning.shape[-1]
+    return (True,) * sliding.shape[-1] if turning is None else tuple(np.isnan(turning).all(axis=0).tolist())
 
 
 def needed(columns: Columns, names: Iterable[str], file: Path) -> None:
@@ -176,7 +193,11 @@ READERS = {LOG: read_log, TACTILE: read_tactile, TRUTH: read_truth}
 
 def _read(file: Path, what: str, shapes: _Shapes, setup: Setup | None) -> Columns:
     """The columns of a file, all numbers and of one length; of a setup, those that are known in their shapes."""
-    columns = read_npz(file, what)
+    return _checked(read_npz(file, what), file, shapes, setup)
+
+
+def _checked(columns: Columns, file: Path, shapes: _Shapes, setup: Setup | None) -> Columns:
+    """Columns as they were read, after a look at their kinds and shapes."""
     sizes = _sizes(setup)
     rows = next((len(column) for column in columns.values() if column.ndim), 0)
     for name, column in columns.items():

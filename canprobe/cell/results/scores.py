@@ -36,15 +36,15 @@ def score_contact(truth: Mapping[str, Array], first: int, last: int, target_n: f
         first, last: the scan, as SYNC numbers.
         target_n: wanted force.
     """
-    force = truth["force"][first:last]
-    points = truth["contact_point"][first:last]
+    force = truth["force_n"][first:last]
+    points = truth["contact_point_m"][first:last]
     times = truth["t_s"][first:last]
     if len(force) < 2:
         return dict.fromkeys(("force_rms_error_n", "force_max_n", "contact_fraction", "speed_mean_m_s"))
     travelled = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
     return {
         "force_rms_error_n": float(np.sqrt(np.mean((force - target_n) ** 2))),
-        "force_max_n": float(truth["force"].max()),
+        "force_max_n": float(truth["force_n"].max()),
         "contact_fraction": float(np.mean(force > 0)),
         "speed_mean_m_s": travelled / float(times[-1] - times[0]),
     }
@@ -88,24 +88,24 @@ def score_shape(records: Sequence[ShapeRecord], truth: Mapping[str, Array], sync
     late = [r for r in records if r.travelled_m >= RUN_IN_M]
     seen = [r for r in late if bool(np.all(r.estimate.observed))]
     rows = np.searchsorted(sync_times, [r.t_s - 1e-6 for r in seen or late or records])
-    if rows.max(initial=0) >= len(truth["kappa"]):
+    if rows.max(initial=0) >= len(truth["kappa_per_m"]):
         raise UsageError(
-            f"truth: expected one row per SYNC, at least {rows.max() + 1}, got {len(truth['kappa'])}: of another run?"
+            f"truth: expected one row per SYNC, at least {rows.max() + 1}, got {len(truth['t_s'])}: of another run?"
         )
-    kappa_true = _pair(truth["kappa"][rows].mean(axis=0)) if len(rows) else None
+    kappa_true = _pair(truth["kappa_per_m"][rows].mean(axis=0)) if len(rows) else None
     if not seen:
         return ShapeScore(kappa_true, None, None, None, None, None, 0, 0.0 if late else None)
     errors, norms, tilts, offsets = [], [], [], []
     for record, row in zip(seen, rows, strict=True):
         T = record.estimate.T_frame_contact
-        tensor = curvature_tensor(truth["kappa"][row], truth["direction1"][row], truth["direction2"][row])
+        tensor = curvature_tensor(truth["kappa_per_m"][row], truth["direction1"][row], truth["direction2"][row])
         K_true = T[:3, :2].T @ tensor @ T[:3, :2]
         errors.append(float(np.sum((record.estimate.K - K_true) ** 2)))
         norms.append(float(np.sum(K_true**2)))
         cosine = float(-T[:3, 2] @ truth["contact_normal"][row])
         sine = float(np.linalg.norm(T[:3, 2] + truth["contact_normal"][row] * cosine))
         tilts.append(np.arctan2(sine, cosine) ** 2)
-        offsets.append(float(np.sum((T[:3, 3] - truth["contact_point"][row]) ** 2)))
+        offsets.append(float(np.sum((T[:3, 3] - truth["contact_point_m"][row]) ** 2)))
     rms, scale = float(np.sqrt(np.mean(errors))), float(np.sqrt(np.mean(norms)))
     return ShapeScore(
         kappa_true_per_m=kappa_true,
@@ -160,10 +160,10 @@ def bound_of_scan(
         first = int(np.searchsorted(path, path[last] - memory_m))
         row = int(np.searchsorted(sync_times, samples[last].t_s - 1e-6))
         T = np.eye(4)
-        T[:3, 2], T[:3, 3] = -truth["contact_normal"][row], truth["contact_point"][row]
+        T[:3, 2], T[:3, 3] = -truth["contact_normal"][row], truth["contact_point_m"][row]
         T[:3, 0] = truth["direction1"][row]
         T[:3, 1] = np.cross(T[:3, 2], T[:3, 0])
-        surface = SurfaceMatrix.from_curvature(np.diag(truth["kappa"][row])).transformed(np.linalg.inv(T))
+        surface = SurfaceMatrix.from_curvature(np.diag(truth["kappa_per_m"][row])).transformed(np.linalg.inv(T))
         recent = slice(first, last + 1)
         noise = make_noise(last + 1 - first, sigmas[recent], sigma_normal, coupling)
         C = osculating_bound(make_touches(points[recent], normals[recent], noise, correlation), surface)

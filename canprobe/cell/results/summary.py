@@ -149,7 +149,7 @@ class RunResult:
         task, scene = self.plan.setup.task, self.plan.scene
         if self.contacts is None or not len(self.contacts) or scene.shape is None or not isinstance(task, Touch):
             raise UsageError("score: expected a scan that touched its object, got no contacts")
-        if "kappa" not in self.truth:
+        if "kappa_per_m" not in self.truth:
             raise UsageError("score: expected an emulated object; nothing is known of the truth")
         start_s = float(self.contacts.t_s[0] - self.contacts.samples[0].t_s)
         ours = {name: name for name in methods or (scene.shape.method, *scene.shape.also)}
@@ -294,7 +294,7 @@ def _traffic(session: Session) -> dict[str, Any]:
 
 def _truth(session: Session) -> dict[str, Array]:
     """The plant's truth; empty where nothing was emulated, or nothing happened."""
-    return session.truth if "force" in session.truth else {}
+    return session.truth if "force_n" in session.truth else {}
 
 
 def _contact(session: Session, record: TaskRecord, log: dict[str, Array]) -> dict[str, Any]:

@@ -326,10 +326,10 @@ def touch_object(
     for i, pressed in enumerate(roll.pressed):
         press = pressed.press
         force = None
-        if visit.load and "force" in truth:
+        if visit.load and "force_n" in truth:
             rows = (log["touch"] == i + 1) & (log["phase"] == Phase.SCAN)
             rows[: int(np.argmax(rows)) + round(EFFECTIVE_REST_S * plan.setup.rate_hz)] = False
-            force = float(truth["force"][: len(rows)][rows].mean())
+            force = float(truth["force_n"][: len(rows)][rows].mean())
         elif visit.load:
             force = _read(ask, press.force)
         place = visit.first + places.index(press.at if not press.hz[1:] else (press.at, press.heading))

@@ -17,6 +17,7 @@ from typing import IO, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.cell.emulated.truth_columns import TruthColumns
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.load import SAVED_AS
 from canprobe.errors import BusError, NodeError
@@ -183,13 +184,13 @@ class EmulatorChild:
                 with contextlib.suppress(subprocess.TimeoutExpired, KeyboardInterrupt):
                     self._process.wait(patience_s)
                     break
-        truth = {}
+        truth = TruthColumns()
         if self._truth.exists():
             with (
                 contextlib.suppress(OSError, ValueError, EOFError, zipfile.BadZipFile),  # cut off by a full disk
                 np.load(self._truth, allow_pickle=False) as data,
             ):
-                truth = {name: np.asarray(data[name]) for name in data.files}
+                truth.update({name: np.asarray(data[name]) for name in data.files})
         if self._errors is not None:
             words = self._last_words()
             self.unwritten = words if words.startswith(str(self._truth)) else None

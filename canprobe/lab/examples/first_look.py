@@ -16,9 +16,9 @@ print({name: log.attrs["units"][name] for name in ("force_n", "contact_mm_2", "q
 scan = log[log.phase == 3]
 truth = result.to_pandas("truth").reindex(scan.index, method="nearest")
 target = result.summary["contact"]["force_target_n"]
-rms = ((truth.force - target) ** 2).mean() ** 0.5
+rms = ((truth.force_n - target) ** 2).mean() ** 0.5
 print(f"force in the scan: measured {scan.force_n.mean():.3f} ± {scan.force_n.std():.3f} N")
-print(f"                   true     {truth.force.mean():.3f} ± {truth.force.std():.3f} N, RMS error {rms:.3f} N")
+print(f"                   true     {truth.force_n.mean():.3f} ± {truth.force_n.std():.3f} N, RMS error {rms:.3f} N")
 
 # %% How the curvature estimate comes in along the path
 estimates = result.to_pandas("estimates")

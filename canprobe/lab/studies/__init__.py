@@ -11,5 +11,5 @@ Estimators: `estimators` (error against run time), `bound` (error and coverage o
 (coverage with the whole sensor, packaged and random scenes), `shapes` (whole surfaces beside those of other methods),
 `arrays` (calibration of unseen arrays). Plant and loop:
 `workprec`, `workprec_cell`, `stability` with `stability_runs`. Robustness: `faults` with `fault_scores`, `faults_vcan`.
-Real time: `realtime` with `realtime_cases`, `soak`.
+Real time: `realtime` with `realtime_cases`, `realtime_soak`.
 """

@@ -49,7 +49,7 @@ UNREST, UNREST_S = 0.03, 0.1
 ENCODER_M = 3e-6
 EIGHT_M, STROKE_M, STROKE_HZ = (1.5e-3, 0.6e-3), (0.5e-3, 0.0), (0.5, 1.5)
 GOALS = {"force_percent": 2.0, "stiffness_percent": 3.0, "curvature_percent": 5.0}
-MODEL = ("touch", "emulator/plant", "studies/arrays.py")
+MODEL = ("mechanics/touch", "cell/plant", "lab/studies/arrays.py")
 COLUMNS = (
     Column("array", "array"),
     Column("full_scale_kpa", "kPa", ".0f"),

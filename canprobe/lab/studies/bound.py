@@ -239,7 +239,7 @@ def _named(row: Row) -> str:
 
 SEEDS, BLOCK = 200, 20
 """Seeds of a case, and how many of them make a cell of the sweep."""
-MODEL = ("touch", "studies/bound.py")
+MODEL = ("mechanics/touch", "lab/studies/bound.py", "lab/studies/ground.py")
 AT = "at_"
 """Before the names of `criteria` in a row."""
 COLUMNS = (

@@ -46,7 +46,8 @@ def model_digest(parts: tuple[str, ...] = ()) -> str:
     """Digest of the code that answers rest on, of Python and of numpy.
 
     Args:
-        parts: files and folders of the package, such as "touch" or "studies/bound.py"; the whole package by default.
+        parts: files and folders of the package, such as "mechanics/touch" or "lab/studies/bound.py"; by default the
+            whole package.
 
     Raises:
         StudyError: a part is not there.

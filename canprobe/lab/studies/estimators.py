@@ -42,7 +42,7 @@ WAVES = 5
 Noise = tuple[float, float]
 Place = tuple[str, float]
 REFERENCE = ("chen1996", 160, 10)
-MODEL = ("touch", "studies/estimators.py", "studies/bound.py")
+MODEL = ("mechanics/touch", "lab/studies/estimators.py", "lab/studies/ground.py")
 COLUMNS = (
     Column("surface", "surface"),
     Column("method", "method"),

@@ -17,6 +17,7 @@ import numpy as np
 
 import canprobe
 from canprobe.api import run
+from canprobe.cell.emulated.truth_columns import present_name
 from canprobe.cell.results.files import unit_of
 from canprobe.cell.results.summary import RunResult
 from canprobe.cell.scene.load import dump_scene, gathered, load_scene, parse_scene
@@ -123,7 +124,7 @@ def run_many(
             ``tcp://10.0.0.1:8786``, whose workers have the same canprobe.
         out: folder of the finished runs; ``runs/many-<scene>`` by default.
         fresh: forget what is in ``out``.
-        series: columns of the log to keep over time for `Runs.to_xarray`; ``truth.force`` is one of the truth.
+        series: columns of the log to keep over time for `Runs.to_xarray`; ``truth.force_n`` is one of the truth.
         every_ms: time between two of their values, ms.
         progress: show a bar on a terminal or in a notebook.
         say: called with each step.
@@ -146,6 +147,7 @@ def run_many(
     changes = [dict(zip(keys, values, strict=True)) for values in combinations]
     scenes = [load_scene(base, change) for change in changes]  # all are checked before anything is written
     folder = Path(out) if out is not None else Path("runs") / f"many-{base.name}"
+    series = [f"{TRUTH}{present_name(s.removeprefix(TRUTH))}" if s.startswith(TRUTH) else s for s in series]
     cases, rows = [], []
     for change, changed in zip(changes, scenes, strict=True):
         text, digest = _with_own_files(changed, folder)

@@ -47,8 +47,7 @@ ASKED = (0.93, 0.97)
 SELDOM, HARDLY = 0.8, 0.4
 """Shares of the answers of a scene."""
 DRAWS = 2000
-_ROOMS = ("touch", "robot", "protocol", "planning", "cell", "session", "tasks", "emulator", "scenes")
-MODEL = (*_ROOMS, "studies/regions.py")
+MODEL = ("fieldbus", "mechanics", "cell", "scenes", "lab/studies/regions.py", "lab/studies/random_scenes.py")
 COLUMNS = (
     Column("group", "group"),
     Column("of", "of"),
@@ -131,7 +130,10 @@ def scored(record: ShapeRecord, truth: dict[str, Array], times: Array) -> list[f
     """One of `Scan.scores`, in the answer's own axes."""
     row = int(np.searchsorted(times, record.t_s - 1e-6))
     P = record.estimate.T_frame_contact[:3, :2]
-    D = record.estimate.K - P.T @ curvature_tensor(*(truth[k][row] for k in ("kappa", "direction1", "direction2"))) @ P
+    D = (
+        record.estimate.K
+        - P.T @ curvature_tensor(*(truth[k][row] for k in ("kappa_per_m", "direction1", "direction2"))) @ P
+    )
     e, C = np.array([D[0, 0], D[0, 1], D[1, 1]]), record.estimate.covariance
     square = float(e @ np.linalg.solve(C, e))
     density = -0.5 * (square + float(np.linalg.slogdet(2.0 * math.pi * C)[1]))

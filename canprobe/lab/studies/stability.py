@@ -48,7 +48,7 @@ SCAN_S = 1.5
 _AT = (-120.0, -122.5, 374.0)
 WIDE_PERCENT = 20.0
 ENDS = ("stable", "stopped", "refused")
-MODEL = ("bus", "cell", "emulator", "planning", "robot", "session", "tasks", "touch", "studies/stability_runs.py")
+MODEL = ("fieldbus", "mechanics", "cell", "lab/studies/stability_runs.py", "lab/studies/linear_loop.py")
 COLUMNS = (
     Column("view", "view"),
     Column("contact_n_m", "contact N/m", ".0e"),

@@ -316,9 +316,9 @@ def carry_out(case: Case) -> Row:
 def error_and_spread(session: Session, task: TouchTask, force_n: float) -> tuple[float | None, float | None]:
     """RMS error and standard deviation of the true force, second half of the hold, percent of the target."""
     cycles, truth = task.scan_cycles, session.truth
-    if cycles is None or "force" not in truth:
+    if cycles is None or "force_n" not in truth:
         return None, None
-    half = truth["force"][(cycles[0] + cycles[1]) // 2 : cycles[1]] / force_n
+    half = truth["force_n"][(cycles[0] + cycles[1]) // 2 : cycles[1]] / force_n
     if not half.size:
         return None, None
     return 100.0 * float(np.sqrt(np.mean((half - 1.0) ** 2))), 100.0 * float(np.std(half))

@@ -14,7 +14,7 @@ and the cells; the sweep does the rest:
 
     def run(*, quick: bool, sweep: Sweep) -> StudyResult:
         cases = [Case(k, 400, 4 if quick else 40) for k in STIFFNESSES]
-        answers = sweep.map(measure, cases, model=("touch", "emulator", "studies/my_study.py"))
+        answers = sweep.map(measure, cases, model=("mechanics/touch", "cell/plant", "lab/studies/my_study.py"))
         costs = sweep.time(measure_cost, settings)             # one at a time, alone, on this machine
         ...
         return StudyResult("my_study", COLUMNS, rows, findings(rows), measuring_facts(quick, 40), partial(draw, rows))
@@ -189,22 +189,21 @@ STUDIES: Mapping[str, str] = MappingProxyType(
         "workprec": "error of the dynamic plant against its run time, and of the whole cell against its computing time",
         "stability": "where the force loop settles, predicted and carried out, and how every other touch ends",
         "realtime": "how well the cycle keeps time on a real vcan0, against plain canopen-python; needs that interface",
-        "soak": "an hour on a real vcan0: memory, clocks and counters; needs that interface",
         "faults": "how the cell reacts to thousands of random faults of its nodes and their links",
     }
 )
 """Name → what it measures. The module of that name in this package has `run(*, quick, sweep) -> StudyResult`."""
 
 
-def run_study(name: str, *, quick: bool, sweep: Sweep, vcan: bool = False) -> StudyResult:
+def run_study(name: str, *, quick: bool, sweep: Sweep, form: str = "") -> StudyResult:
     """Run a study.
 
     Args:
         name: one of `STUDIES`.
         quick: fewer repeats and cases.
         sweep: computes its cells.
-        vcan: its form with processes on a real vcan0, which `faults` has.
+        form: another form of it: ``vcan`` of `faults`, with processes on a real vcan0; ``soak`` of `realtime`, an hour.
     """
-    module = importlib.import_module(f"canprobe.lab.studies.{name}_vcan" if vcan else f"canprobe.lab.studies.{name}")
+    module = importlib.import_module(f"canprobe.lab.studies.{name}_{form}" if form else f"canprobe.lab.studies.{name}")
     result: StudyResult = module.run(quick=quick, sweep=sweep)
     return result

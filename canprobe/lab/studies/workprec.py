@@ -161,7 +161,7 @@ FREE_METHODS, FREE_STEPS_US = ("rk4", "rosenbrock"), (1250.0, 312.5, 78.125)
 """Cells in which the dynamics are not held."""
 ENOUGH = {"force_percent": 1.0, "position_um": 2.9, "taxel_counts": 0.29}
 """Small enough errors: 1 % of the force, and the rounding of encoders (10 µm) and ADC, RMS."""
-MODEL = ("robot", "touch/objects.py", "touch/shapes.py", "emulator/plant", "studies/workprec.py")
+MODEL = ("mechanics", "cell/plant", "lab/studies/workprec.py")
 COLUMNS = (
     Column("stiffness_n_m3", "K/h N/m³", ".3g"),
     Column("held", "held"),

@@ -42,7 +42,7 @@ def test_the_tool_is_found_within_its_bounds(calibrated):
 
 
 def test_it_presses_gently_and_lets_go_between_the_touches(calibrated):
-    force = calibrated.truth["force"]
+    force = calibrated.truth["force_n"]
     touches = np.flatnonzero(np.diff((force > 0.5).astype(int)) == 1)
     assert len(touches) == 7
     assert force.max() < 1.5

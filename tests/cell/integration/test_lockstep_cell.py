@@ -170,7 +170,7 @@ def test_the_drives_are_moving_until_quick_stop_brings_them_to_rest():
 
     with pytest.raises(KeyboardInterrupt), session:
         session.run(step)
-    q = session.truth["q"]
+    q = session.truth["q_rad"]
     assert np.abs(q[795] - q[790]).max() > 1e-4  # it was moving
     assert np.abs(q[-1] - q[-2]).max() < 5e-5  # a tenth of a count of the coarsest joint, each cycle
     assert_safe(session)
@@ -235,8 +235,8 @@ def test_own_controller_in_ten_lines():
             return Command(q_target=target, done=measurement.cycle > 600)
 
         cell.run(nod)
-    assert np.ptp(cell.truth["q"][:, 5]) == pytest.approx(0.2, abs=0.01)
-    assert np.ptp(cell.truth["q"][:, 0]) < 1e-3
+    assert np.ptp(cell.truth["q_rad"][:, 5]) == pytest.approx(0.2, abs=0.01)
+    assert np.ptp(cell.truth["q_rad"][:, 0]) < 1e-3
 
 
 def test_what_is_no_controller_is_told_before_a_drive_is_enabled():

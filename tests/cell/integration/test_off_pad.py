@@ -38,9 +38,9 @@ def test_the_probe_lets_go_before_the_force_has_grown(mode):
         session.run(make_task(session.plan))
     assert "the contact runs off the edge of the array" in stopped.value.reason
     truth = session.truth
-    outside = np.flatnonzero(np.abs(truth["pad_uv"]).max(axis=1) > EDGE_M)
-    pressed = np.count_nonzero(truth["force"][outside] > 0.0) * session.plan.sync.period_ns
+    outside = np.flatnonzero(np.abs(truth["pad_uv_m"]).max(axis=1) > EDGE_M)
+    pressed = np.count_nonzero(truth["force_n"][outside] > 0.0) * session.plan.sync.period_ns
     assert BY_KEY["off_pad"].reaction is Reaction.RETREAT
     assert pressed <= BY_KEY["off_pad"].within(limits_of(session.plan)) + 100e6
-    assert truth["force"].max() < 3.0  # of 5 N allowed; it grew to 160 N
-    assert truth["force"][-1] == 0.0
+    assert truth["force_n"].max() < 3.0  # of 5 N allowed; it grew to 160 N
+    assert truth["force_n"][-1] == 0.0

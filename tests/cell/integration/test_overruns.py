@@ -76,7 +76,7 @@ def test_the_contact_keeps_its_speed_and_the_surface(stalled: tuple[Session, Sta
     contact = summarise(session, controller.record(), {}, None)["contact"]
     assert contact["contact_fraction"] == 1.0
     assert contact["force_max_n"] < 3.0
-    t, points = session.truth["t_s"], session.truth["contact_point"]
+    t, points = session.truth["t_s"], session.truth["contact_point_m"]
     steady = slice(first + 60, last - 60)
     path = np.linalg.norm(np.diff(points[steady], axis=0), axis=1).sum()
     assert path / (t[steady][-1] - t[steady][0]) == pytest.approx(0.025, rel=0.02)
@@ -145,4 +145,4 @@ def test_no_stall_with_lost_tpdos_presses_harder_than_the_limit(patient: Patient
     starts = np.flatnonzero(np.diff(patient.session.truth["t_s"]) > 9e-3)
     first = starts[episode]
     assert len(starts) == len(EPISODES)
-    assert patient.session.truth["force"][first : first + SPACING + 2].max() < limit
+    assert patient.session.truth["force_n"][first : first + SPACING + 2].max() < limit

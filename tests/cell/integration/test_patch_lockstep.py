@@ -45,7 +45,7 @@ def test_the_first_answer_gives_the_force_no_knock(axial):
     """The patch tells the curvature, and with it the depth for 2 N, in one instant."""
     session, controller = axial
     first, last = controller.scan_cycles
-    assert session.truth["force"][first:last].max() < 2.35
+    assert session.truth["force_n"][first:last].max() < 2.35
 
 
 def test_without_the_patch_the_same_contacts_leave_it_unobserved(axial):

@@ -249,14 +249,14 @@ def test_a_frame_that_names_another_sync():
 
     run = Injected("press", HOLD_CYCLE, shift, until=40)
     run.assert_counted("sync_mismatch")
-    assert run.session.truth["force"].max() < 3.0
+    assert run.session.truth["force_n"].max() < 3.0
 
 
 def test_a_stale_sensor_makes_the_probe_retreat():
     run = Injected("press", HOLD_CYCLE, lambda r: altered(r.nodes[16], 0x511, lambda _: None))
     run.assert_within("sensor_stale").assert_drives_off()
     assert "no tactile frame for 13 cycles" in str(run.error)
-    assert run.session.truth["force"][-1] == 0.0
+    assert run.session.truth["force_n"][-1] == 0.0
 
 
 def test_a_drive_that_is_late_makes_all_of_them_hold():
@@ -283,7 +283,7 @@ def test_a_wrong_position_is_not_believed():
     run.assert_counted("pdo_missed")
     assert 2 <= run.session.cell.drives.implausible <= 3
     q = run.session.cell.log.arrays()["q_rad"][run.at - 5 : run.at + 10, 1]
-    truth = run.session.truth["q"][run.at - 5 : run.at + 10, 1]
+    truth = run.session.truth["q_rad"][run.at - 5 : run.at + 10, 1]
     assert np.abs(q - truth).max() < 1e-3 < 60 / 7000, "sixty counts are 5 mrad"
 
 
@@ -331,7 +331,7 @@ def test_error_passive_for_long_makes_the_probe_retreat():
     run = Injected("press", HOLD_CYCLE, passive, until=1500)
     assert "error-passive for 1.0 s" in str(run.error)
     run.assert_within("error_passive_long")
-    assert run.session.truth["force"][-1] == 0.0
+    assert run.session.truth["force_n"][-1] == 0.0
 
 
 def test_bus_off():
@@ -401,7 +401,7 @@ def test_the_overrun_budget_makes_the_probe_retreat():
     run = Late("press", HOLD_CYCLE, lambda _: None, until=1000)
     assert "of the last second's cycles came more than half a period late" in str(run.error)
     run.assert_within("overruns")
-    assert run.session.truth["force"][-1] == 0.0
+    assert run.session.truth["force_n"][-1] == 0.0
 
 
 # the touch and the arm
@@ -413,7 +413,7 @@ def test_force_above_the_limit_makes_the_probe_retreat():
 
     run = Injected("press", HOLD_CYCLE, squeeze, limits={"force_max_n": 3.0})
     assert "above the limit of 3.00 N" in str(run.error)
-    above = np.flatnonzero(run.session.truth["force"] > 1.03 * 3.0)[0]
+    above = np.flatnonzero(run.session.truth["force_n"] > 1.03 * 3.0)[0]
     retreat = np.flatnonzero(run.session.cell.log.arrays()["phase"] == Phase.RETREAT)[0]
     assert 0 < (retreat - above) * run.limits.period_ns <= BY_KEY["force"].within(run.limits)
     run.assert_drives_off()
@@ -473,7 +473,7 @@ def test_a_saturated_array_makes_the_probe_retreat():
     run = Saturated("press", FREE_CYCLE, lambda _: None, until=1000, plant=stiff, servo={"surface_height_hz": 2.0})
     assert "the array is saturated and no stiffness was felt" in str(run.error)
     assert 0 < run.answered_ns - run.saturated_ns <= BY_KEY["force_hidden"].within(run.limits)
-    assert run.session.truth["force"][-1] == 0.0
+    assert run.session.truth["force_n"][-1] == 0.0
 
 
 def own_target(change):
@@ -490,7 +490,7 @@ def test_an_own_controller_cannot_leave_the_joints_range():
     run = own_target(lambda q: q + np.array([0, 0, 0, 0, 3.0, 0]))("free", FREE_CYCLE, lambda _: None, own=True)
     run.assert_within("joint_stop").assert_drives_off()
     assert "joint 5 at" in str(run.error) and "its stop" in str(run.error)
-    q = run.session.truth["q"]
+    q = run.session.truth["q_rad"]
     assert np.abs(q[-1] - q[FREE_CYCLE - 20]).max() < 1e-3
 
 
@@ -504,7 +504,7 @@ def test_an_own_controllers_target_that_is_none(target):
 def test_an_own_controllers_jump_is_made_at_the_joints_speed():
     run = own_target(lambda q: np.radians([90, 65, 15, 20, 100, 0.0]))("free", FREE_CYCLE, lambda _: None, own=True)
     run.assert_counted("target_speed")
-    q = run.session.truth["q"]
+    q = run.session.truth["q_rad"]
     speeds = np.abs(np.diff(q[:, 3])) / 2.5e-3
     assert np.degrees(speeds.max()) < 1.2 * 675
     assert np.degrees(q[-1, 3]) == pytest.approx(20, abs=1.0)
@@ -513,7 +513,7 @@ def test_an_own_controllers_jump_is_made_at_the_joints_speed():
 def test_the_workspace_ends_a_press():
     run = Injected("press", 5000, lambda _: None, limits={"workspace_min_mm": (-500.0, -500.0, 375.0)})
     assert "the probe's tip at z =" in str(run.error) and "workspace ends at 375.0 mm" in str(run.error)
-    assert run.session.truth["force"].max() == 0.0
+    assert run.session.truth["force_n"].max() == 0.0
 
 
 def test_the_workspace_ends_an_own_controllers_motion():
@@ -523,7 +523,7 @@ def test_the_workspace_ends_an_own_controllers_motion():
     up = own_target(lambda q: q + np.array([0, 0.02, 0, 0, 0, 0]))
     run = up("free", FREE_CYCLE, lambda _: None, own=True, limits={"workspace_max_mm": tuple(start + 15.0)})
     assert isinstance(run.error, SafetyStop) and "workspace ends at" in str(run.error)
-    tips = np.array([T_base_tip_of(q)[:3, 3] for q in run.session.truth["q"][::5]])
+    tips = np.array([T_base_tip_of(q)[:3, 3] for q in run.session.truth["q_rad"][::5]])
     assert (1e3 * tips < start + 15.0 + 3.0).all()
     run.assert_drives_off()
 
@@ -553,7 +553,7 @@ def test_a_drive_that_keeps_telling_a_wrong_position_is_lost():
     run = Injected("free", FREE_CYCLE, lambda r: altered(r.nodes[2], 0x182, change))
     run.assert_within("drive_silent").assert_drives_off()
     assert "node 2: lost: no usable TPDO for 6 cycles" in str(run.error)
-    assert np.abs(np.diff(run.session.truth["q"], axis=0)).max() < 0.01
+    assert np.abs(np.diff(run.session.truth["q_rad"], axis=0)).max() < 0.01
 
 
 def test_a_measured_jump_that_no_joint_can_make():
@@ -692,7 +692,7 @@ def test_a_full_disk(tmp_path):
     assert str(run.error) == f"{tmp_path}/bus.log: cannot be written: No space left on device"
     assert isinstance(run.error, ResultsError)  # after the task has let go
     run.assert_drives_off()
-    assert run.session.truth["force"][-1] == 0.0
+    assert run.session.truth["force_n"][-1] == 0.0
     text = (tmp_path / "bus.log").read_text()
     assert text.endswith("\n") and len(list(canprobe_lines(tmp_path / "bus.log"))) > 1000
 

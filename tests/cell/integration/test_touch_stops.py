@@ -35,8 +35,8 @@ def press_session(**changes):
 def test_force_above_the_limit():
     reason, truth = run_until_stopped(press_session(limits={"force_max_n": 1.5}))
     assert "above the limit of 1.50 N" in reason
-    assert np.count_nonzero(truth["force"] > 1.5) < 60  # 150 ms: approach goes on until the sample is in, then retreat
-    assert truth["force"][-1] == 0.0  # it let go
+    assert np.count_nonzero(truth["force_n"] > 1.5) < 60  # 150 ms: approach until the sample is in, then retreat
+    assert truth["force_n"][-1] == 0.0  # it let go
 
 
 def test_no_object_where_it_was_expected():
@@ -52,7 +52,7 @@ def test_no_object_where_it_was_expected():
 
     reason, truth = run_until_stopped(session, at_cycle=60, action=sink)
     assert "no object found up to 8 mm beyond" in reason
-    assert truth["force"].max() == 0.0
+    assert truth["force_n"].max() == 0.0
 
 
 def test_contact_lost_in_the_hold():
@@ -72,7 +72,7 @@ def test_sensor_falls_silent_but_lives():
     sensor.receive = lambda can_id, data, t_ns: [f for f in original(can_id, data, t_ns) if f[0] < 0x511 or not silent]
     reason, truth = run_until_stopped(session, at_cycle=1100, action=silent.append)
     assert "no tactile frame for 13 cycles" in reason
-    assert truth["force"][-1] == 0.0
+    assert truth["force_n"][-1] == 0.0
 
 
 def test_sensor_lives_but_never_sends_a_frame():
@@ -84,7 +84,7 @@ def test_sensor_lives_but_never_sends_a_frame():
     sensor.receive = lambda can_id, data, t_ns: [f for f in original(can_id, data, t_ns) if f[0] not in frames]
     reason, truth = run_until_stopped(session)
     assert "no tactile frame for" in reason
-    assert truth["force"].max() == 0.0
+    assert truth["force_n"].max() == 0.0
 
 
 def test_samples_that_say_they_are_old_do_not_move_the_surface():
@@ -101,7 +101,7 @@ def test_samples_that_say_they_are_old_do_not_move_the_surface():
     with session:
         session.run(step)
     assert controller.record().unplaced > 20
-    assert session.truth["force"].max() < 3.0
+    assert session.truth["force_n"].max() < 3.0
 
 
 def test_joint_at_its_stop():

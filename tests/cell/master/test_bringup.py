@@ -561,7 +561,7 @@ def test_drives_of_another_make_are_brought_up_and_moved(tmp_path):
     scene = replace(scene, arm=replace(scene.arm, eds=str(other_make(tmp_path))))
     result = undrawn_run(scene, out=tmp_path / "out", duration_s=1.0)
     assert result.summary["completed"] and result.summary["faults"] == []
-    assert np.ptp(result.truth["q"][:, 5]) > 0.01
+    assert np.ptp(result.truth["q_rad"][:, 5]) > 0.01
     assert undrawn_run(scene, out=tmp_path / "again", duration_s=0.2).plan.nodes[0].identity.vendor_id == 0xAB
 
 
@@ -657,5 +657,5 @@ def test_a_drive_without_60c2h_follows_the_period_of_sync(tmp_path):
     told = undrawn_run(canprobe.load_scene("free"), out=tmp_path / "told", duration_s=0.5)
     result = undrawn_run(scene, out=tmp_path / "out", duration_s=0.5)
     assert result.summary["completed"] and result.summary["faults"] == []
-    assert np.ptp(result.truth["q"][:, 5]) > 0.01
-    assert np.array_equal(result.truth["q"], told.truth["q"]), "as the drive that is given 60C2h"
+    assert np.ptp(result.truth["q_rad"][:, 5]) > 0.01
+    assert np.array_equal(result.truth["q_rad"], told.truth["q_rad"]), "as the drive that is given 60C2h"

@@ -51,7 +51,7 @@ def in_hold(recorded):
 def test_joints_force_and_image_are_those_of_the_cell(recorded, in_hold):
     result, _ = recorded
     row, _, view = in_hold
-    assert view.q == pytest.approx(np.degrees(result.truth["q"][row]), abs=0.05)
+    assert view.q == pytest.approx(np.degrees(result.truth["q_rad"][row]), abs=0.05)
     assert view.force_n == pytest.approx(result.log["force_n"][row], abs=0.1)
     assert view.taxels.max() > 50 and view.torn_frames == 0
 

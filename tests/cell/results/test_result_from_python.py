@@ -48,7 +48,7 @@ def test_contacts_lie_on_the_true_object_within_their_covariances(result):
     assert shapes == [(n,), (n, 3), (n, 3), (n,)]
     assert contacts.covariances.shape == contacts.normal_covariances.shape == (n, 3, 3)
     rows = np.searchsorted(result.truth["t_s"], contacts.t_s - 1e-6)
-    off = contacts.points - result.truth["contact_point"][rows]
+    off = contacts.points - result.truth["contact_point_m"][rows]
     assert np.mean(np.einsum("ni,nij,nj->n", off, np.linalg.inv(contacts.covariances), off)) < 5.0
     true_normals = result.truth["contact_normal"][rows]
     assert np.degrees(np.arccos(np.sum(contacts.normals * true_normals, axis=1))).max() < 0.5
@@ -149,10 +149,10 @@ def test_a_controller_is_told_the_force_and_the_pose_of_the_probe():
     with canprobe.open_cell("press", bus="direct") as cell:
         result = cell.run(press)
     assert felt[-1].good
-    late = result.truth["force"][-40:]
+    late = result.truth["force_n"][-40:]
     assert late.min() * 0.9 < felt[-1].force < late.max() * 1.1
-    T_base_probe, _ = cell.probe(result.truth["q"][-1])
-    assert T_base_probe[:3, 3] == pytest.approx(result.truth["probe_centre"][-1], abs=1e-9)
+    T_base_probe, _ = cell.probe(result.truth["q_rad"][-1])
+    assert T_base_probe[:3, 3] == pytest.approx(result.truth["probe_centre_m"][-1], abs=1e-9)
 
 
 @pytest.mark.parametrize(("scene", "method", "lacks"), [("free", "patch", "an array"), ("listen", "probe", "an arm")])

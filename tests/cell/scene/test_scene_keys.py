@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.util
+import sys
 import typing
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 from canprobe.cell.scene.model import Scene
 
 DOCS = Path(__file__).parents[3] / "docs"
+sys.path.append(str(DOCS))  # as for `python docs/generate.py`
 _spec = importlib.util.spec_from_file_location("generate", DOCS / "generate.py")
 generate = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(generate)

@@ -308,7 +308,7 @@ def test_a_probe_that_leaves_a_mesh_is_stopped_and_touches_nothing_beyond(tmp_pa
     scene.write_text(scene.read_text().replace("width_mm = 2", 'strategy = "straight"'))
     assert main(["run", str(scene), "--bus", "direct", "--duration", "3", "--out", str(out), *words]) == 1
     truth = read_npz(out / "truth.npz")
-    points = truth["contact_point"][truth["in_contact"]]
+    points = truth["contact_point_m"][truth["in_contact"]]
     assert points[:, 1].max() == pytest.approx(-0.1225 + 0.024 - 0.0184, abs=1e-6)  # the border
 
 

@@ -36,7 +36,7 @@ def test_every_column_has_its_unit(run):
     assert {name: units[name] for name in ("q_rad_3", "contact_mm_1", "force_n", "torque_permille_0", "phase")} == {
         **{"q_rad_3": "rad", "contact_mm_1": "mm", "force_n": "N", "torque_permille_0": "permille", "phase": "1"}
     }
-    assert result.to_pandas("truth").attrs["units"]["contact_point_2"] == "m"
+    assert result.to_pandas("truth").attrs["units"]["contact_point_m_2"] == "m"
     assert result.to_pandas().attrs["scene"] == "cylinder"
 
 

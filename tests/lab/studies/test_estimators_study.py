@@ -90,7 +90,15 @@ def test_list(capsys):
     assert json.loads(capsys.readouterr().out) == dict(STUDIES)
 
 
-@pytest.mark.parametrize(("argv", "said"), [(["study", "bond"], "did you mean bound?"), (["study"], "expected NAME")])
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        (["study", "bond"], "did you mean bound?"),
+        (["study"], "expected NAME"),
+        (["study", "soak"], "canprobe study realtime --soak"),
+        (["study", "bound", "--soak"], "only realtime has"),
+    ],
+)
 def test_a_wrong_name_is_told(argv, said, capsys):
     assert main(argv) == 2
     complaint = capsys.readouterr().err

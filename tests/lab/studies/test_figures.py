@@ -27,8 +27,8 @@ from canprobe.lab.studies.fault_scenes import draw_ends, draw_faults
 from canprobe.lab.studies.ground import SURFACES
 from canprobe.lab.studies.realtime import draw_realtime
 from canprobe.lab.studies.realtime_cases import CycleTimes, Measured
+from canprobe.lab.studies.realtime_soak import draw_soak
 from canprobe.lab.studies.regions import draw_regions
-from canprobe.lab.studies.soak import draw_soak
 from canprobe.lab.studies.workprec import draw_workprec
 from canprobe.lab.studies.workprec_cell import FASTER, FIDELITIES, MODES, RATES_HZ, REAL, draw_cell
 

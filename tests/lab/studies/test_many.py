@@ -16,7 +16,7 @@ from canprobe.lab.studies.sweep import Sweep
 
 QUICK = {"task.clearance_mm": 0.5, "task.duration_s": 0.2}
 VARY = {"limits.force_max_n": [5.0, np.float64(2.01)], "bus.bit_error_rate": [0.0, 1e-5]}
-SERIES = ("force_n", "contact_mm", "truth.force")
+SERIES = ("force_n", "contact_mm", "truth.force_n")
 
 
 @pytest.fixture(scope="module")
@@ -48,14 +48,14 @@ def test_each_is_the_run_that_it_stands_for(runs):
     row = runs.table().iloc[1]
     assert row["contact.force_max_n"] == one.summary["contact"]["force_max_n"]
     data = runs.to_xarray()
-    assert data["force_n"].attrs == data["truth.force"].attrs == {"units": "N"}
+    assert data["force_n"].attrs == data["truth.force_n"].attrs == {"units": "N"}
     assert data["contact_mm"].dims == ("run", "time", "contact_mm_0") and data["contact_mm"].attrs == {"units": "mm"}
     assert data["time"].attrs == {"units": "s"}
     assert data["status"].values.tolist() == runs.table()["status"].tolist()
     of_one, rows = data["force_n"].sel(run=1), len(one.log["force_n"][::4])
     np.testing.assert_allclose(of_one["time"][:3], [0.0, 0.01, 0.02])
     np.testing.assert_array_equal(of_one[:rows], one.log["force_n"][::4])
-    assert np.isnan(data["truth.force"][4]).all()
+    assert np.isnan(data["truth.force_n"][4]).all()
 
 
 def test_what_is_finished_is_found_again_and_the_rest_is_computed(runs, out, monkeypatch):

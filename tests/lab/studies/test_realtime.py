@@ -10,8 +10,8 @@ from canprobe.cli import main
 from canprobe.fieldbus.bus.real.socketcan import has_socketcan
 from canprobe.lab.studies.realtime import findings
 from canprobe.lab.studies.realtime_cases import CycleTimes, Measured, answer_latencies, holding_scene, woken
-from canprobe.lab.studies.soak import COLUMNS, resident_mib
-from canprobe.lab.studies.soak import findings as findings_of_soak
+from canprobe.lab.studies.realtime_soak import COLUMNS, resident_mib
+from canprobe.lab.studies.realtime_soak import findings as findings_of_soak
 
 
 def log_of(tmp_path, *lines):
@@ -89,7 +89,7 @@ def test_a_loop_that_is_late_passes_over_the_deadlines_that_are_past():
     assert (times.overruns, times.cycles, times.missed) == (1, 4, 0)
 
 
-# The arithmetic of study `soak`; the study itself runs on vcan0 only.
+# The arithmetic of `realtime --soak`; it runs on vcan0 only.
 
 ZERO = {column.key: 0 for column in COLUMNS} | {"master_mib": 90.0, "nodes_mib": 80.0, "latency_us": 400.0}
 

@@ -18,7 +18,7 @@ from canprobe.lab.studies.regions import NUMBERS, Scan, findings, row_of, scored
 
 TIMES = np.arange(0.0, 5.0, 0.0025)
 TRUTH = {
-    "kappa": np.tile([30.0, -10.0], (len(TIMES), 1)),
+    "kappa_per_m": np.tile([30.0, -10.0], (len(TIMES), 1)),
     "direction1": np.tile([0.6, 0.8, 0.0], (len(TIMES), 1)),
     "direction2": np.tile([-0.8, 0.6, 0.0], (len(TIMES), 1)),
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import signal
@@ -16,7 +17,7 @@ from waiting import wait_until
 from canprobe.cli import main
 from canprobe.errors import StudyError, UsageError
 from canprobe.fieldbus.bus.real.processor import BLAS_THREADS
-from canprobe.lab.studies import harness as sweep_store
+from canprobe.lab.studies import cell_store as sweep_store
 from canprobe.lab.studies import sweep
 from canprobe.lab.studies.cell_store import CellStore, as_json, cell_key, model_digest
 from canprobe.lab.studies.executors import dask_executor, process_pool
@@ -56,7 +57,7 @@ def deaf():
     return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
 def run(*, quick, sweep):
-    rows = sweep.map(measure, [Case(x) for x in range(6)], model=("studies/sweep.py",))
+    rows = sweep.map(measure, [Case(x) for x in range(6)], model=("lab/studies/sweep.py",))
     return StudyResult("demo", (Column("square", "x²"),), rows, ["done"], {}, lambda path: path.write_bytes(b""))
 
 if __name__ == "__main__":
@@ -114,7 +115,7 @@ def test_cells_run_in_processes_of_one_thread_and_are_found_again(demo, tmp_path
     said, progress = [], []
     before = {name: os.environ.get(name) for name in BLAS_THREADS}
     with open_sweep(tmp_path / "a", say=said.append, progress=lambda *at: progress.append(at), workers=2) as opened:
-        answers = opened.map(demo.measure, cells, model=("touch",))
+        answers = opened.map(demo.measure, cells, model=("mechanics/touch",))
         assert [a["square"] for a in answers] == [4, 0, 1, 4]
         assert all(a["threads"] == 1 and a["deaf"] for a in answers)
         assert answers[0]["pair"] == [2, np.pi]  # as JSON gives it, also when it was not read from a file
@@ -122,11 +123,11 @@ def test_cells_run_in_processes_of_one_thread_and_are_found_again(demo, tmp_path
         assert not any(pid == os.getpid() for _, pid in measured(tmp_path))
     assert {name: os.environ.get(name) for name in BLAS_THREADS} == before
     with open_sweep(tmp_path / "a", say=said.append) as opened:
-        assert opened.map(demo.measure, cells, model=("touch",)) == answers
+        assert opened.map(demo.measure, cells, model=("mechanics/touch",)) == answers
         assert "3 of 3 cells are kept" in said[-1]
         assert len(measured(tmp_path)) == 3
     with open_sweep(tmp_path / "a", say=said.append, fresh=True) as opened:
-        opened.map(demo.measure, cells[:1], model=("touch",))
+        opened.map(demo.measure, cells[:1], model=("mechanics/touch",))
         assert len(measured(tmp_path)) == 4
 
 
@@ -155,6 +156,11 @@ def test_times_are_taken_one_by_one_and_belong_to_a_machine(demo, tmp_path, monk
     other.time(demo.measure, [demo.Case(5)])
     assert len(measured(tmp_path)) == 4
     store.close()
+
+
+@pytest.mark.parametrize("study", [name for name in sweep.STUDIES if name != "shapes"])
+def test_the_code_that_a_study_names_is_there(study):
+    model_digest(getattr(importlib.import_module(f"canprobe.lab.studies.{study}"), "MODEL", ()))
 
 
 def test_answers_of_other_code_are_not_taken(monkeypatch, tmp_path):
@@ -285,7 +291,9 @@ def test_a_killed_process_leaves_no_worker(tmp_path):
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_a_child_whose_parent_is_gone_before_it_asks_ends_at_once(number):
-    command = f"from canprobe.cell.session.children import end_with_parent; end_with_parent(1 << 22, {int(number)})"
+    command = (
+        f"from canprobe.cell.session.emulator_child import end_with_parent; end_with_parent(1 << 22, {int(number)})"
+    )
     assert subprocess.run([sys.executable, "-c", command], check=False, timeout=60).returncode == -number
 
 

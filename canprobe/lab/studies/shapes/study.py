@@ -34,9 +34,8 @@ TRUTH_STEP = 2
 TIMED = "free-2"
 """Shape on which time and memory are measured; a contact costs the same on all."""
 REPEATS, DRAWS = 3, 2000
-_ROOMS = ("touch", "robot", "protocol", "planning", "cell", "session", "tasks", "emulator", "scenes")
-_SCANS = (*_ROOMS, "studies/shapes/scans.py")
-_FITS = ("touch", "tasks", "studies/shapes")
+_SCANS = ("fieldbus", "mechanics", "cell", "scenes", "lab/studies/shapes/scans.py")
+_FITS = ("mechanics/touch", "cell/tasks", "lab/studies/shapes")
 COLUMNS = (
     Column("method", "method"),
     Column("budget", "budget", "g"),

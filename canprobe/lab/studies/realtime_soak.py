@@ -1,7 +1,7 @@
-"""Study `soak`: memory, clocks and counters of a cell over an hour on a real SocketCAN interface.
+"""Study `realtime --soak`: memory, clocks and counters of a cell over an hour on a real SocketCAN interface.
 
 The cell is held as `canprobe up` holds it, emulated nodes in a child process, all PDOs on the bus. For a nightly run:
-`canprobe vcan --realtime -- canprobe study soak`.
+`canprobe vcan --realtime -- canprobe study realtime --soak`.
 """
 
 from __future__ import annotations
