@@ -19,7 +19,7 @@ from canprobe.cell.scene.stl_files import stl_damage
 from canprobe.cell.session.session import write_scene
 from canprobe.cli import main
 from canprobe.errors import PlanError, UsageError
-from canprobe.fieldbus.bus.candump import read_npz
+from canprobe.cell.npz import read_npz
 
 X, Y = np.meshgrid(np.arange(-20, 20.1), np.arange(-15, 15.1), indexing="ij")
 BUMP_MM = 1.5 * np.exp(-((X - 4) ** 2 + 2 * Y**2) / 200)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from canprobe.lab.bridge import process as feed_module
+from canprobe.lab.bridge import pipe_queue as feed_module
 from canprobe.lab.bridge.pipe_queue import Feed, read_records
 
 
