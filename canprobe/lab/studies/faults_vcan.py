@@ -131,7 +131,7 @@ def served_scene() -> Scene:
 def row_of(case: ProcessCase) -> Row:
     """Bring the cell up, let the fault happen, and look at what is left: the row of the case."""
     with tempfile.TemporaryDirectory(prefix="canprobe-faults-") as folder:
-        run = _Run(case, EmulatorChild(make_plan(resolve(served_scene())), None, (CHANNEL,)), Path(folder))
+        run = _ServedRun(case, EmulatorChild(make_plan(resolve(served_scene())), None, (CHANNEL,)), Path(folder))
         try:
             status, ended_s, drives = run.carry_out()
         finally:
@@ -148,7 +148,7 @@ def row_of(case: ProcessCase) -> Row:
     }
 
 
-class _Run:
+class _ServedRun:
     """One case being carried out."""
 
     def __init__(self, case: ProcessCase, child: EmulatorChild, folder: Path) -> None:
