@@ -16,5 +16,5 @@ Estimators: `estimators` (error against run time) and `bound` (error and coverag
 whole surfaces with those of other methods; `arrays` calibrates unseen arrays.
 Plant and loop: `workprec`, with `workprec_cell` on `no_bus`; `stability` with `stability_runs` and `linear_loop`.
 Robustness: `faults` with `fault_cases`, `fault_scenes`, `fault_scores` and `witnessed_run`; `faults_vcan`.
-Real time: `realtime` with `realtime_cases`; `realtime_soak`.
+Real time: `realtime` with `realtime_cases`, `cycle_times` and `plain_canopen`; `realtime_soak`.
 """
