@@ -20,6 +20,8 @@ from functools import cache, partial
 from pathlib import Path
 from random import Random
 
+from canopen.sdo.exceptions import SdoCommunicationError
+
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.scene.load import dump_scene, load_scene
 from canprobe.cell.scene.model import Scene
@@ -296,8 +298,6 @@ def score_end(fault: ProcessFault, status: int | None, folder: Path) -> list[str
 
 
 def _read(index: int, node_id: int, keep: Callable[[int, int], None]) -> Generator[bytes | None, bytes, None]:
-    from canopen.sdo.exceptions import SdoCommunicationError
-
     try:
         keep(node_id, int.from_bytes((yield from upload(index, 0)), "little"))
     except SdoCommunicationError:

@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from scipy.integrate import solve_ivp
 
 from canprobe.cell.plant.arms import make_equations
 from canprobe.cell.plant.config import PlantConfig
@@ -118,8 +119,6 @@ def stands(stiffness_n_m3: float, cycles: int, stepping: Stepping) -> bool:
 
 def reference(stiffness_n_m3: float, cycles: int, rtol: float) -> Array:
     """The same by scipy's Radau, cycle by cycle, nothing held."""
-    from scipy.integrate import solve_ivp
-
     config, targets = trial(stiffness_n_m3, cycles)
     equations, scale = make_equations(config, held=False), units_per_motor(_arm()[0])
     h, seen = CYCLE_NS * 1e-9, []
