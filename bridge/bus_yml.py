@@ -67,7 +67,7 @@ _OWN_KEYS = (0x1016, 0x1017)  # dcfgen writes them from heartbeat_producer and h
 
 
 @dataclass(frozen=True, slots=True)
-class BusNode:
+class ListedNode:
     """A slave of a bus.yml.
 
     Attributes:
@@ -194,7 +194,7 @@ def _pdo(pdo: PlannedPdo, written: set[int]) -> dict[str, Any]:
     return found
 
 
-def read_bus_yml(path: Path | str, say: Callable[[str], None] = lambda _: None) -> list[BusNode]:
+def read_bus_yml(path: Path | str, say: Callable[[str], None] = lambda _: None) -> list[ListedNode]:
     """Read the nodes of a bus.yml, whether they stand under `nodes` or beside `master`.
 
     Args:
@@ -281,7 +281,7 @@ def _name_unknown(
             say(f"{path}: {name}: {key}: not understood, passed over{hint}")
 
 
-def _read_node(path: Path, name: str, keys: Mapping[str, Any], options: Mapping[str, Any]) -> BusNode:
+def _read_node(path: Path, name: str, keys: Mapping[str, Any], options: Mapping[str, Any]) -> ListedNode:
     key = next((key for key in _EDS_KEYS if key in keys), _EDS_KEYS[0])
     dcf = keys.get(key)
     if not isinstance(dcf, str) or not dcf:
@@ -295,7 +295,7 @@ def _read_node(path: Path, name: str, keys: Mapping[str, Any], options: Mapping[
     node_id = _integer(path, name, stated)
     if not 1 <= node_id <= 127:
         raise UsageError(f"{path}: {name}: node_id: expected 1 to 127, got {node_id}")
-    return BusNode(name, node_id, eds)
+    return ListedNode(name, node_id, eds)
 
 
 def _find(path: Path, dcf: str, dcf_path: str) -> Path | None:

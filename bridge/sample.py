@@ -1,4 +1,4 @@
-"""What every bridge is fed: one neutral sample of the cell in SI units; its tree of frames; and what a bridge offers.
+"""The neutral sample of a cell in SI units, which every bridge gets.
 
 A sample belongs to one cycle and holds what was new in it; a part that was not is None. Nothing in it knows a tool or a
 message type. Times are in nanoseconds. z of the contact frame is the inward normal.

@@ -1,5 +1,10 @@
 """A cell in three dimensions: live in a browser, a recorded run with a time slider, one file to share.
 
-Shapes, colours and what is read from a run are plain numpy; only ``stage`` imports viser, and only ``stage``, ``path``
-and ``browser`` speak to it; ``links`` reads the meshes of a URDF with trimesh. The extra ``view`` installs both.
+- What is shown: `instants` from samples, `recorded` from a run's folder, `plots` over time.
+- How it looks, in plain numpy: `meshes`, `bodies`, `object_sheet`, `array_dome`, `path`, `surface`, `colours`. `links`
+  reads the meshes of a URDF with trimesh.
+- Where it is shown, by viser: `stage` is the scene, with `path_nodes` and `panel`, on a `server`; `browser` is the
+  bridge of a live cell, `replay` a recorded run, `page` one HTML file.
+
+The extra `view` installs viser and trimesh.
 """

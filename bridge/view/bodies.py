@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from canprobe.lab.bridge.frames import link_transforms
-from canprobe.lab.bridge.view.meshes import Array, Mesh, cylinder, dome, link, merged, revolved
+from canprobe.lab.bridge.view.meshes import Array, TriangleMesh, cylinder, dome, link, merged, revolved
 from canprobe.mechanics.robot.chain import Chain
 from canprobe.mechanics.robot.denavit_hartenberg import dh_step
 from canprobe.mechanics.touch.tangent_frames import tangent_rotation
@@ -47,7 +47,7 @@ class Part:
 
     name: str
     frame: int
-    mesh: Mesh
+    mesh: TriangleMesh
     colour: tuple[int, int, int]
     flat: bool = False
 
@@ -183,7 +183,7 @@ def _span(a: float, b: float) -> tuple[float, float]:
     return (a, b) if a <= b else (b, a)
 
 
-def probe_parts(radius: float, T_flange_probe: Array) -> tuple[Mesh, Mesh]:
+def probe_parts(radius: float, T_flange_probe: Array) -> tuple[TriangleMesh, TriangleMesh]:
     """The probe in its own frame (origin at the sphere's centre, z the pole): its holder, and its elastic dome.
 
     Args:

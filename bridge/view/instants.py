@@ -17,7 +17,7 @@ SILENT_NS = 250_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Answer:
+class JudgedAnswer:
     """An answer of the estimator, compared with the truth.
 
     Attributes:
@@ -54,19 +54,19 @@ class Moment:
     phase: str | None = None
     q: Array | None = None
     contact: ContactFrame | None = None
-    answer: Answer | None = None
+    answer: JudgedAnswer | None = None
     taxels: NDArray[np.uint8] | None = None
     force: float = math.nan
     dropped: int = 0
 
 
-def judge(patch: SurfacePatch, shape: PlacedShape | None) -> Answer:
+def judge(patch: SurfacePatch, shape: PlacedShape | None) -> JudgedAnswer:
     """An answer beside the true object; None where that is not known."""
     C = patch.covariance
     variance = float(C[0, 0] + 2.0 * C[1, 1] + C[2, 2])
     sigma = math.sqrt(max(variance, 0.0)) if math.isfinite(variance) else math.inf
     if shape is None:
-        return Answer(patch, math.nan, (math.nan, math.nan), sigma)
+        return JudgedAnswer(patch, math.nan, (math.nan, math.nan), sigma)
     true = shape.closest(patch.T_base_contact[:3, 3])
     error = math.nan
     if all(patch.observed) and np.isfinite(patch.K).all():
@@ -74,7 +74,7 @@ def judge(patch: SurfacePatch, shape: PlacedShape | None) -> Answer:
         tensor = (true.directions.T * true.kappa) @ true.directions
         error = float(np.linalg.norm(patch.K - axes.T @ tensor @ axes))
     first, second = true.kappa.tolist()
-    return Answer(patch, error, (first, second), sigma)
+    return JudgedAnswer(patch, error, (first, second), sigma)
 
 
 class Follower:

@@ -18,7 +18,7 @@ from canprobe.cell.scene.hardware import ArmSettings
 from canprobe.errors import PlanError
 from canprobe.lab.bridge.database import need
 from canprobe.lab.bridge.view.bodies import WHITE, Part, arm_parts
-from canprobe.lab.bridge.view.meshes import Array, Mesh
+from canprobe.lab.bridge.view.meshes import Array, TriangleMesh
 from canprobe.mechanics.robot.chain import Chain
 from canprobe.mechanics.robot.urdf_visuals import Visual, find_mesh, visuals_of
 
@@ -70,7 +70,7 @@ class _LostError(Exception):
     """Why a solid cannot be drawn."""
 
 
-def _solids(urdf: Path, visual: Visual) -> list[tuple[Mesh, tuple[int, int, int]]]:
+def _solids(urdf: Path, visual: Visual) -> list[tuple[TriangleMesh, tuple[int, int, int]]]:
     """Triangles and colours of one solid, in its own frame."""
     trimesh = need("trimesh", "view", "the view")
     size: Sequence[float] = visual.size
@@ -98,14 +98,14 @@ def _solids(urdf: Path, visual: Visual) -> list[tuple[Mesh, tuple[int, int, int]
     return [(_scaled(_mesh(body), np.array(size)), _colour(body)) for body in solid]
 
 
-def _mesh(body: Any) -> Mesh:
+def _mesh(body: Any) -> TriangleMesh:
     body.merge_vertices(merge_tex=True, merge_norm=True)
-    return Mesh(np.array(body.vertices, np.float64), np.array(body.faces, np.int64))
+    return TriangleMesh(np.array(body.vertices, np.float64), np.array(body.faces, np.int64))
 
 
-def _scaled(mesh: Mesh, scale: Array) -> Mesh:
+def _scaled(mesh: TriangleMesh, scale: Array) -> TriangleMesh:
     faces = mesh.faces if scale.prod() > 0.0 else mesh.faces[:, ::-1]  # mirrored, it would be inside out
-    return Mesh(mesh.vertices * scale, faces)
+    return TriangleMesh(mesh.vertices * scale, faces)
 
 
 def _colour(body: Any) -> tuple[int, int, int]:

@@ -1,4 +1,4 @@
-"""Triangle meshes as plain arrays: prisms with rounded rims, solids of revolution, grids; and colours of numbers.
+"""Triangle meshes as plain arrays: prisms with rounded rims, solids of revolution, grids.
 
 Faces wind counter-clockwise seen from outside. Vertices are doubled at edges, so that smooth shading stops there.
 """
@@ -22,7 +22,7 @@ Circle = tuple[tuple[float, float], float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Mesh:
+class TriangleMesh:
     """A triangle mesh.
 
     Attributes:
@@ -33,20 +33,20 @@ class Mesh:
     vertices: Array
     faces: Faces
 
-    def moved(self, T: Array) -> Mesh:
+    def moved(self, T: Array) -> TriangleMesh:
         """The mesh carried by a transform (4, 4)."""
-        return Mesh(self.vertices @ T[:3, :3].T + T[:3, 3], self.faces)
+        return TriangleMesh(self.vertices @ T[:3, :3].T + T[:3, 3], self.faces)
 
 
-def merged(meshes: Iterable[Mesh]) -> Mesh:
+def merged(meshes: Iterable[TriangleMesh]) -> TriangleMesh:
     """Several meshes as one."""
     parts = list(meshes)
     starts = accumulate((len(mesh.vertices) for mesh in parts), initial=0)
     faces = [mesh.faces + start for mesh, start in zip(parts, starts, strict=False)]
-    return Mesh(np.concatenate([mesh.vertices for mesh in parts]), np.concatenate(faces))
+    return TriangleMesh(np.concatenate([mesh.vertices for mesh in parts]), np.concatenate(faces))
 
 
-def grid(points: ArrayLike) -> Mesh:
+def grid(points: ArrayLike) -> TriangleMesh:
     """A sheet through a grid of points.
 
     Args:
@@ -57,10 +57,10 @@ def grid(points: ArrayLike) -> Mesh:
     index = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = (x.ravel() for x in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
     faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
-    return Mesh(p.reshape(-1, 3), faces)
+    return TriangleMesh(p.reshape(-1, 3), faces)
 
 
-def _prism(rings: Iterable[tuple[Array, float]]) -> Mesh:
+def _prism(rings: Iterable[tuple[Array, float]]) -> TriangleMesh:
     """A closed body along z: walls between rising (outline (n, 2), counter-clockwise and convex; height), flat ends."""
     outlines = [np.column_stack([outline, np.full(len(outline), z)]) for outline, z in rings]
     closed = [np.vstack([ring, ring[:1]]) for ring in outlines]
@@ -69,12 +69,12 @@ def _prism(rings: Iterable[tuple[Array, float]]) -> Mesh:
     return merged([*walls, _fan(outlines[0][::-1]), _fan(outlines[-1])])
 
 
-def _fan(ring: Array) -> Mesh:
+def _fan(ring: Array) -> TriangleMesh:
     """A convex flat face round its middle."""
     n = len(ring)
     around = np.arange(n)
     faces = np.stack([np.full(n, n), around, (around + 1) % n], axis=1)
-    return Mesh(np.vstack([ring, ring.mean(axis=0)]), faces)
+    return TriangleMesh(np.vstack([ring, ring.mean(axis=0)]), faces)
 
 
 def link_outline(first: Circle, second: Circle, sectors: int = SECTORS) -> Array:
@@ -103,7 +103,7 @@ def _arc(centre: tuple[float, float], radius: float, angles: Array) -> Array:
     return points
 
 
-def link(first: Circle, second: Circle, span: tuple[float, float], rim: float = 0.0) -> Mesh:
+def link(first: Circle, second: Circle, span: tuple[float, float], rim: float = 0.0) -> TriangleMesh:
     """A link between two parallel joint axes along z, its rims rounded off.
 
     Args:
@@ -121,12 +121,12 @@ def link(first: Circle, second: Circle, span: tuple[float, float], rim: float = 
     return _prism([*((ring, low + z) for ring, z in rings), *((ring, high - z) for ring, z in reversed(rings))])
 
 
-def cylinder(radius: float, span: tuple[float, float], rim: float = 0.0) -> Mesh:
+def cylinder(radius: float, span: tuple[float, float], rim: float = 0.0) -> TriangleMesh:
     """A round cylinder along z; see :func:`link`."""
     return link(((0.0, 0.0), radius), ((0.0, 0.0), radius), span, rim)
 
 
-def revolved(profile: ArrayLike, sectors: int = SECTORS) -> Mesh:
+def revolved(profile: ArrayLike, sectors: int = SECTORS) -> TriangleMesh:
     """A surface of revolution about z.
 
     Args:
@@ -139,7 +139,7 @@ def revolved(profile: ArrayLike, sectors: int = SECTORS) -> Mesh:
     return grid(np.stack([x, y, np.broadcast_to(p[:, 1], x.shape)], axis=-1))
 
 
-def dome(radius: float, opening_rad: float, rings: int = 24) -> Mesh:
+def dome(radius: float, opening_rad: float, rings: int = 24) -> TriangleMesh:
     """The part of a sphere round its pole (+z), centre at the origin.
 
     Args:

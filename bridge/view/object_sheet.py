@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.lab.bridge.view.meshes import Array, Mesh, dome, grid, revolved
+from canprobe.lab.bridge.view.meshes import Array, TriangleMesh, dome, grid, revolved
 from canprobe.mechanics.touch.heights import Heights
 from canprobe.mechanics.touch.objects import Cylinder, Sphere
 from canprobe.mechanics.touch.shapes import Bowl, PlacedShape, Torus, Wave
@@ -22,7 +22,7 @@ RELIEF = 161
 """Points along each side of a grid of heights."""
 
 
-def object_mesh(shape: PlacedShape) -> Mesh:
+def object_mesh(shape: PlacedShape) -> TriangleMesh:
     """The surface of an object near its origin, base frame.
 
     Balls, cylinders, bowls and rings of ordinary size are shown whole (a cylinder over `REACH_M` to each side),
@@ -39,7 +39,7 @@ def object_mesh(shape: PlacedShape) -> Mesh:
         points, exists = _relief(shape)
         mesh = grid(points)
         used, faces = np.unique(mesh.faces[exists.ravel()[mesh.faces].all(axis=1)], return_inverse=True)
-        return Mesh(mesh.vertices[used], faces.reshape(-1, 3))
+        return TriangleMesh(mesh.vertices[used], faces.reshape(-1, 3))
     if isinstance(shape, Torus) and shape.ring_radius + radius <= WHOLE_M:
         return _ring(shape)
     return grid(_sheet(shape, REACH_M))
@@ -92,21 +92,21 @@ def _height(shape: PlacedShape, y: float) -> float:
     return 0.0
 
 
-def _ring(shape: Torus) -> Mesh:
+def _ring(shape: Torus) -> TriangleMesh:
     """A whole torus."""
     angle = np.linspace(-math.pi, math.pi, 49)
     profile = np.column_stack([shape.ring_radius + shape.radius * np.cos(angle), shape.radius * np.sin(angle)])
     mesh = revolved(profile, 96)
-    return _placed(shape, Mesh(mesh.vertices - (shape.ring_radius, 0.0, 0.0), mesh.faces), -shape.radius)
+    return _placed(shape, TriangleMesh(mesh.vertices - (shape.ring_radius, 0.0, 0.0), mesh.faces), -shape.radius)
 
 
-def _placed(shape: PlacedShape, mesh: Mesh, height_m: float) -> Mesh:
+def _placed(shape: PlacedShape, mesh: TriangleMesh, height_m: float) -> TriangleMesh:
     T = np.array(shape.T_base_object)
     T[:3, 3] += height_m * T[:3, 2]
     return mesh.moved(T)
 
 
-def _tube(radius: float, half: float) -> Mesh:
+def _tube(radius: float, half: float) -> TriangleMesh:
     """A cylinder along x, open at its ends."""
     angles = np.linspace(0.0, 2.0 * math.pi, 97)
     y, z = radius * np.cos(angles), radius * np.sin(angles)
@@ -114,7 +114,7 @@ def _tube(radius: float, half: float) -> Mesh:
     return grid(np.stack(ends, axis=1))
 
 
-def _hollow(radius: float) -> Mesh:
+def _hollow(radius: float) -> TriangleMesh:
     """The inside of the lower half of a ball."""
     half = dome(radius, math.pi / 2)
-    return Mesh(half.vertices * (1.0, -1.0, -1.0), half.faces[:, ::-1])
+    return TriangleMesh(half.vertices * (1.0, -1.0, -1.0), half.faces[:, ::-1])

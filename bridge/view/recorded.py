@@ -21,7 +21,7 @@ from canprobe.cell.scene.setup import Setup
 from canprobe.cell.tasks.probing import Phase
 from canprobe.errors import UsageError
 from canprobe.lab.bridge.sample import ContactFrame, SurfacePatch
-from canprobe.lab.bridge.view.instants import Answer, Moment, judge
+from canprobe.lab.bridge.view.instants import JudgedAnswer, Moment, judge
 from canprobe.lab.bridge.view.meshes import Array
 from canprobe.mechanics.touch.tangent_frames import tangent_rotation
 
@@ -41,7 +41,7 @@ class RecordedRun:
     scene: Scene
     log: dict[str, Array]
     answer_rows: NDArray[np.int64]
-    answers: tuple[Answer, ...]
+    answers: tuple[JudgedAnswer, ...]
     taxels: tuple[tuple[float, NDArray[np.uint8]], ...]
 
     @property

@@ -11,7 +11,7 @@ import numpy as np
 
 from canprobe.cell.scene.geometry import true_object
 from canprobe.fieldbus.bus.clock import MonotonicClock
-from canprobe.lab.bridge.view.instants import Answer
+from canprobe.lab.bridge.view.instants import JudgedAnswer
 from canprobe.lab.bridge.view.panel import Panel
 from canprobe.lab.bridge.view.path import OFF_PATH, Trail, deviation_scale
 from canprobe.lab.bridge.view.path_nodes import LoadedPath
@@ -111,7 +111,7 @@ def shape_of(run: RecordedRun) -> PlacedShape | None:
     return None if run.scene.object is None else true_object(run.scene.object)
 
 
-def answers_of(run: RecordedRun) -> Iterator[tuple[float, Answer]]:
+def answers_of(run: RecordedRun) -> Iterator[tuple[float, JudgedAnswer]]:
     """The answers of a run's estimator, each with the instant from which it counted, s."""
     yield from zip(run.log["t_s"][run.answer_rows].tolist(), run.answers, strict=True)
 

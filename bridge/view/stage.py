@@ -18,7 +18,7 @@ from canprobe.lab.bridge.view.bodies import link_frames, probe_parts
 from canprobe.lab.bridge.view.colours import linear_light
 from canprobe.lab.bridge.view.instants import Moment
 from canprobe.lab.bridge.view.links import arm_links
-from canprobe.lab.bridge.view.meshes import Array, Mesh
+from canprobe.lab.bridge.view.meshes import Array, TriangleMesh
 from canprobe.lab.bridge.view.object_sheet import object_lines, object_mesh
 from canprobe.lab.bridge.view.path_nodes import PATH
 from canprobe.mechanics.robot.model import ArmModel
@@ -98,7 +98,7 @@ class Stage:
 
     # building
 
-    def _add(self, name: str, mesh: Mesh, colour: tuple[int, int, int], **settings: Any) -> Any:
+    def _add(self, name: str, mesh: TriangleMesh, colour: tuple[int, int, int], **settings: Any) -> Any:
         return self._api.add_mesh_simple(
             name, mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32), color=colour, **settings
         )

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from canprobe.lab.bridge.view.instants import Answer
+from canprobe.lab.bridge.view.instants import JudgedAnswer
 from canprobe.lab.bridge.view.meshes import Array
 from canprobe.lab.bridge.view.path import DeviationScale
 from canprobe.lab.bridge.view.path_nodes import Parts
@@ -25,7 +25,7 @@ LIFT_M = 3e-4
 """Off the true surface, outward, so that the two do not flicker through each other."""
 
 
-class Surface:
+class BlendedSurface:
     """Answers as one surface: of those within `SPACING_M` of each other the best known one.
 
     Args:
@@ -34,12 +34,12 @@ class Surface:
 
     def __init__(self, scale: DeviationScale) -> None:
         self._scale = scale
-        self._answers: list[Answer] = []
+        self._answers: list[JudgedAnswer] = []
 
     def __bool__(self) -> bool:
         return bool(self._answers)
 
-    def add(self, answer: Answer) -> bool:
+    def add(self, answer: JudgedAnswer) -> bool:
         """Take an answer; whether the surface has changed by it."""
         if not (np.isfinite(answer.sigma) and np.isfinite(answer.patch.K).all()):
             return False
@@ -59,17 +59,17 @@ class Surface:
         return mesh, self._scale.colours(np.array(best))
 
 
-def _near(vertices: Array, answers: Sequence[Answer]) -> list[list[int]]:
+def _near(vertices: Array, answers: Sequence[JudgedAnswer]) -> list[list[int]]:
     """For each vertex (n, 3) the indices of the answers within `REACH_M`."""
     tree = cKDTree([_point(answer) for answer in answers])
     return [tree.query_ball_point(vertex, REACH_M) for vertex in vertices]
 
 
-def _point(answer: Answer) -> Array:
+def _point(answer: JudgedAnswer) -> Array:
     return answer.patch.T_base_contact[:3, 3]
 
 
-def _patch(answer: Answer) -> LocalPatch:
+def _patch(answer: JudgedAnswer) -> LocalPatch:
     """An answer as a patch of a map, as far as it is shown: its shape, not where its contact might be instead."""
     patch, S, covariance = answer.patch, np.zeros((4, 4)), np.zeros((9, 9))
     S[:2, :2], S[2, 3], S[3, 2] = 0.5 * patch.K, -0.5, -0.5
@@ -90,9 +90,9 @@ class GrowingSurface:
     """
 
     def __init__(self, api: Any, scale: DeviationScale) -> None:
-        self._api, self._surface, self._grown = api, Surface(scale), False
+        self._api, self._surface, self._grown = api, BlendedSurface(scale), False
 
-    def add(self, answer: Answer) -> None:
+    def add(self, answer: JudgedAnswer) -> None:
         """Take an answer."""
         self._grown |= self._surface.add(answer)
 
@@ -117,8 +117,8 @@ class LoadedSurface(Parts):
         scale: of its colours.
     """
 
-    def __init__(self, api: Any, answers: Iterable[tuple[float, Answer]], scale: DeviationScale) -> None:
-        surface, times, shown = Surface(scale), list[float](), list[Answer]()
+    def __init__(self, api: Any, answers: Iterable[tuple[float, JudgedAnswer]], scale: DeviationScale) -> None:
+        surface, times, shown = BlendedSurface(scale), list[float](), list[JudgedAnswer]()
         for t_s, answer in answers:
             surface.add(answer)
             times.append(t_s)

@@ -3,6 +3,9 @@
 
 A command module has `HELP`, `EXAMPLE`, `add_arguments(parser)` and `run(args) -> int`; its docstring is the description
 in its help. What it needs beyond argparse it imports inside `run`: `canprobe --help` stays quick.
+
+Commands share `common_arguments` with their `argument_types`, `target` (scene and bus of a command), `output` (stdout),
+`interrupts`, `operator` (questions), `parser` and `completion`.
 """
 
 from __future__ import annotations

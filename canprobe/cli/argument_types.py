@@ -1,4 +1,4 @@
-"""Types of arguments."""
+"""Types of arguments: numbers, times, ids, channels and folders, each with a clear line for a wrong value."""
 
 from __future__ import annotations
 

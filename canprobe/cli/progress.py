@@ -1,4 +1,4 @@
-"""Steps and progress, on stderr."""
+"""A line of progress, on stderr."""
 
 from __future__ import annotations
 

@@ -199,7 +199,7 @@ def test_what_a_signal_ends_has_its_status(name, number, monkeypatch, capsys):
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("recorded.reestimate.replay", ("replay", "log")), ("studies.sweep.run_study", ("study", "bound"))],
+    [("cell.recorded.reestimate.replay", ("replay", "log")), ("lab.studies.sweep.run_study", ("study", "bound"))],
 )
 def test_sigterm_ends_what_computes(name, words, monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)

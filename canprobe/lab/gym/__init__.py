@@ -7,9 +7,10 @@ Comes in: an action, 25 times a second: the velocity of the contact in its tange
 Goes out: an observation, the reward of the step, and what is true in `info`.
 
 Between two actions the whole cell runs as ever: drives, array, supervision and the tactile servo, 16 cycles at 400 Hz,
-in virtual time without a bus. `led` is the touch task whose path and force are set from outside; `randomise` draws
-what differs from one episode to the next, with the keys of a scene file; `observations` says what an agent sees and
-which part of the surface it has touched; `env` is the environment. Start reading there.
+in virtual time without a bus. `env` is the environment; start reading there. `episode` is one cell that is led step by
+step, `led` the touch task whose path and force are set from outside. `observations` says what an agent sees, `region`
+which part of the surface it has touched. `randomise` draws what differs from one episode to the next, with the keys of
+a scene file; `objects` are those to train on and those that are held out.
 
 An episode begins in contact: approach, touch-down and settling are part of `reset`. It ends by itself (`terminated`)
 where the supervision of the cell ends a scan: contact lost, force too high, a joint at its stop. It is cut off

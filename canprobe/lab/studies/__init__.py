@@ -4,12 +4,17 @@
 cases; the sweep measures each case once, in any process; the study makes rows and findings of the answers, and a
 function that draws them. `--quick` takes fewer cases and repeats. No other room imports a study.
 
-`harness` has the result of a study, its files, and the store of finished cells. `sweep` computes cells on all cores or
-on a cluster, keeps what is finished, and lists the studies.
+    sweep         lists the studies; computes cells, keeps what is finished
+    executors     where cells are computed: processes of this machine, or a Dask cluster
+    cell_store    finished cells on disk, with a digest of the code that they rest on
+    harness       the result of a study: columns, rows, findings, picture
+    result_files  the result as text, CSV, JSON and picture
+    many          one scene, many runs, for `canprobe.run_many`; no study
 
-Estimators: `estimators` (error against run time), `bound` (error and coverage over the Cramér–Rao bound), `regions`
-(coverage with the whole sensor, packaged and random scenes), `shapes` (whole surfaces beside those of other methods),
-`arrays` (calibration of unseen arrays). Plant and loop:
-`workprec`, `workprec_cell`, `stability` with `stability_runs`. Robustness: `faults` with `fault_scores`, `faults_vcan`.
-Real time: `realtime` with `realtime_cases`, `realtime_soak`.
+Estimators: `estimators` (error against run time) and `bound` (error and coverage over the Cramér–Rao bound) stand on
+`ground`; `regions` measures coverage with the whole sensor on packaged scenes and `random_scenes`; `shapes` compares
+whole surfaces with those of other methods; `arrays` calibrates unseen arrays.
+Plant and loop: `workprec`, with `workprec_cell` on `no_bus`; `stability` with `stability_runs` and `linear_loop`.
+Robustness: `faults` with `fault_cases`, `fault_scenes`, `fault_scores` and `witnessed_run`; `faults_vcan`.
+Real time: `realtime` with `realtime_cases`, `cycle_times` and `plain_canopen`; `realtime_soak`.
 """

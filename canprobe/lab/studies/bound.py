@@ -101,7 +101,7 @@ a point over the spread of the points where that is narrowest: beyond, a path is
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class BoundCase:
     """One row of the study, m and rad."""
 
     surface: str
@@ -117,25 +117,25 @@ class Case:
         return make_ground(self.surface, self.size, self.path, self.length, SAMPLES)
 
 
-def all_cases() -> Iterator[Case]:
+def all_cases() -> Iterator[BoundCase]:
     """Weaves and circles over every surface and size with every noise, and weaves of 1.5 radii."""
     for surface in SURFACES:
         for size in SIZES_M[:2] if surface == "plane" else SIZES_M:
             for path, noise in product(PATHS, NOISES):
-                yield Case(surface, path, size, min(size, LONGEST_M), *noise)
+                yield BoundCase(surface, path, size, min(size, LONGEST_M), *noise)
         if surface != "plane":
             for noise in NOISES[1:]:
-                yield Case(surface, "weave", SIZES_M[0], 1.5 * SIZES_M[0], *noise)
+                yield BoundCase(surface, "weave", SIZES_M[0], 1.5 * SIZES_M[0], *noise)
 
 
-def quick_cases() -> Iterator[Case]:
+def quick_cases() -> Iterator[BoundCase]:
     """Every surface once, and sizes, paths and noises in turn."""
     for i, surface in enumerate(SURFACES):
         size = SIZES_M[i % 2]
-        yield Case(surface, PATHS[i % 2], size, min(size, LONGEST_M), *NOISES[i % 3])
+        yield BoundCase(surface, PATHS[i % 2], size, min(size, LONGEST_M), *NOISES[i % 3])
 
 
-def criteria(case: Case, ground: Ground, C: Array, model_bias: float) -> dict[str, float]:
+def criteria(case: BoundCase, ground: Ground, C: Array, model_bias: float) -> dict[str, float]:
     """The values of a case that `REGION` limits."""
     size = float(np.linalg.norm(ground.K))
     return {
@@ -266,12 +266,12 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     return measure_all(list(quick_cases() if quick else all_cases()), 10 if quick else SEEDS, sweep, quick=quick)
 
 
-def measure_all(cases: list[Case], seeds: int, sweep: Sweep, *, quick: bool = False) -> StudyResult:
+def measure_all(cases: list[BoundCase], seeds: int, sweep: Sweep, *, quick: bool = False) -> StudyResult:
     """The study of some cases with so many seeds each."""
     sweep.say(f"{len(cases)} cases, {seeds} seeds each")
     blocks = [(first, min(BLOCK, seeds - first)) for first in range(0, seeds, BLOCK)]
     cells = [(case, method, *block) for block in blocks for case in cases for method in METHODS]
-    answers: dict[tuple[Case, str], list[Answer]] = {(case, method): [] for case in cases for method in METHODS}
+    answers: dict[tuple[BoundCase, str], list[Answer]] = {(case, method): [] for case in cases for method in METHODS}
     for (case, method, *_), found in zip(cells, sweep.map(measure, cells, model=MODEL), strict=True):
         answers[case, method] += found
     rows = [row for case in cases for row in _rows(case, {m: answers[case, m] for m in METHODS})]
@@ -279,7 +279,7 @@ def measure_all(cases: list[Case], seeds: int, sweep: Sweep, *, quick: bool = Fa
     return StudyResult("bound", COLUMNS, rows, findings(rows), facts, partial(draw_bound, rows))
 
 
-def measure(cell: tuple[Case, str, int, int]) -> list[Answer]:
+def measure(cell: tuple[BoundCase, str, int, int]) -> list[Answer]:
     """Answers of a method to a case, with so many seeds from the first one on."""
     case, method, first, count = cell
     ground, fit, own = case.ground, _fitter(case), zlib.crc32(as_json(case).encode())
@@ -288,13 +288,13 @@ def measure(cell: tuple[Case, str, int, int]) -> list[Answer]:
     return [answer_of(ground, fit(points, normals, method=method)) for points, normals in felt]
 
 
-def _fitter(case: Case) -> partial[Any]:
+def _fitter(case: BoundCase) -> partial[Any]:
     points = case.ground.points
     prior = Prior.weak(float(np.linalg.norm(points - points[-1], axis=1).max()))
     return partial(fit_surface, prior=prior, sigma_point=case.sigma_point, sigma_normal=case.sigma_normal)
 
 
-def _rows(case: Case, answers: dict[str, list[Answer]]) -> Iterator[Row]:
+def _rows(case: BoundCase, answers: dict[str, list[Answer]]) -> Iterator[Row]:
     """One row for each method."""
     ground, fit = case.ground, _fitter(case)
     C = cramer_rao(ground.points, ground.normals, ground.surface, **fit.keywords)

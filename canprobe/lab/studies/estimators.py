@@ -61,7 +61,7 @@ COLUMNS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class EstimatorSetting:
     """One estimator of the study; the window of `recursive` is its memory."""
 
     method: str
@@ -80,11 +80,11 @@ class Setting:
         )
 
 
-def settings(quick: bool = False) -> list[Setting]:
+def settings(quick: bool = False) -> list[EstimatorSetting]:
     """Every method and window; the lags below half a window."""
     windows, lags = ((40, 160), (10,)) if quick else (WINDOWS, LAGS)
-    found = [Setting(m, w) for m in ("chord", "ml", "recursive") for w in windows]
-    return [Setting("chen1996", w, lag) for w in windows for lag in lags if 2 * lag < w] + found
+    found = [EstimatorSetting(m, w) for m in ("chord", "ml", "recursive") for w in windows]
+    return [EstimatorSetting("chen1996", w, lag) for w in windows for lag in lags if 2 * lag < w] + found
 
 
 def run(*, quick: bool, sweep: Sweep) -> StudyResult:
@@ -174,7 +174,7 @@ def _row(  # noqa: PLR0917 - one row of a table
     surface: str,
     ground: Ground,
     noise: Noise,
-    setting: Setting,
+    setting: EstimatorSetting,
     times: Sequence[tuple[float, float]],
     errors: Sequence[Array | None],
 ) -> Row:

@@ -1,4 +1,4 @@
-"""The case of a seed: a scenario, and one to three faults at random times in its phases."""
+"""The case that a seed draws: a scenario, and one to three faults at random times in its phases."""
 
 from __future__ import annotations
 

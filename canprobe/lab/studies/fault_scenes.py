@@ -1,4 +1,4 @@
-"""The scenes: each as short as it can be with all its phases, planned once in a process."""
+"""The scenes of study `faults`: each is as short as it can be with all its phases, planned once in a process."""
 
 from __future__ import annotations
 

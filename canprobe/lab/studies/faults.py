@@ -53,7 +53,7 @@ STOP_NS = 20_000_000
 @cache
 def phase_windows(scenario: str, timed: bool) -> Windows:
     """When each phase of a scenario begins and ends in a run without faults, ns."""
-    run = _Run(FaultCase(0, scenario, "", (), timed, files=False))
+    run = _LockstepRun(FaultCase(0, scenario, "", (), timed, files=False))
     cycle, begun = run.session.cell.cycle, run.begun
     assert cycle is not None
     first, task = cycle.t_first_ns, begun.get(Phase.SETTLE, begun[Phase.SCAN])
@@ -72,7 +72,7 @@ def phase_windows(scenario: str, timed: bool) -> Windows:
 @cache
 def peak(scenario: str) -> Peak | None:
     """How deep the probe of a scenario can sink in until the cell reacts; None where nothing presses."""
-    return peak_of(_Run(FaultCase(0, scenario, "", (), timed=False, files=False)).session)
+    return peak_of(_LockstepRun(FaultCase(0, scenario, "", (), timed=False, files=False)).session)
 
 
 def draw_case(seed: int) -> FaultCase:
@@ -112,12 +112,12 @@ def carry_out(case: FaultCase) -> dict[str, Any]:
     wrong = any(fault.incoming and fault.kind is FaultKind.CORRUPT for fault in case.faults)
     bound = reach.force(len(case.faults), wrong) if reach is not None else None
     if not case.files:
-        return _Run(case).result(bound)
+        return _LockstepRun(case).result(bound)
     with tempfile.TemporaryDirectory(prefix="canprobe-faults-") as folder:
-        return _Run(case, Path(folder)).result(bound)
+        return _LockstepRun(case, Path(folder)).result(bound)
 
 
-class _Run:
+class _LockstepRun:
     """One case, carried out.
 
     Attributes:

@@ -20,6 +20,8 @@ from functools import cache, partial
 from pathlib import Path
 from random import Random
 
+from canopen.sdo.exceptions import SdoCommunicationError
+
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.scene.load import dump_scene, load_scene
 from canprobe.cell.scene.model import Scene
@@ -131,7 +133,7 @@ def served_scene() -> Scene:
 def row_of(case: ProcessCase) -> Row:
     """Bring the cell up, let the fault happen, and look at what is left: the row of the case."""
     with tempfile.TemporaryDirectory(prefix="canprobe-faults-") as folder:
-        run = _Run(case, EmulatorChild(make_plan(resolve(served_scene())), None, (CHANNEL,)), Path(folder))
+        run = _ServedRun(case, EmulatorChild(make_plan(resolve(served_scene())), None, (CHANNEL,)), Path(folder))
         try:
             status, ended_s, drives = run.carry_out()
         finally:
@@ -148,7 +150,7 @@ def row_of(case: ProcessCase) -> Row:
     }
 
 
-class _Run:
+class _ServedRun:
     """One case being carried out."""
 
     def __init__(self, case: ProcessCase, child: EmulatorChild, folder: Path) -> None:
@@ -296,8 +298,6 @@ def score_end(fault: ProcessFault, status: int | None, folder: Path) -> list[str
 
 
 def _read(index: int, node_id: int, keep: Callable[[int, int], None]) -> Generator[bytes | None, bytes, None]:
-    from canopen.sdo.exceptions import SdoCommunicationError
-
     try:
         keep(node_id, int.from_bytes((yield from upload(index, 0)), "little"))
     except SdoCommunicationError:

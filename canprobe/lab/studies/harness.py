@@ -1,4 +1,4 @@
-"""What a study is: a table with its facts and findings, and a picture; its files; the store of its finished cells."""
+"""The result of a study: a table with its facts and findings, and a picture."""
 
 from __future__ import annotations
 

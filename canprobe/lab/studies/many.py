@@ -44,7 +44,7 @@ _FIGURES = ("sim_time_s", "wall_time_s", "contact", "shape", "calibration")
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class RunCase:
     """A run, with all that decides its outcome.
 
     Attributes:
@@ -62,7 +62,7 @@ class Case:
     every_ms: float
 
 
-def measure(case: Case) -> dict[str, Any]:
+def measure(case: RunCase) -> dict[str, Any]:
     """Carry a case out, in a worker; whatever ends it is its outcome."""
     scene = parse_scene(case.scene)
     scene = replace(scene, scene=replace(scene.scene, seed=case.seed))
@@ -151,7 +151,7 @@ def run_many(
     cases, rows = [], []
     for change, changed in zip(changes, scenes, strict=True):
         text, digest = _with_own_files(changed, folder)
-        cases += [Case(text, digest, seed, tuple(series), float(every_ms)) for seed in wanted]
+        cases += [RunCase(text, digest, seed, tuple(series), float(every_ms)) for seed in wanted]
         rows += [{**change, "seed": seed} for seed in wanted]
     where: dict[str, Any] = {"dask": workers} if isinstance(workers, str) else {"workers": workers}
     bar = Report().bar(".0f runs") if progress else None

@@ -1,4 +1,4 @@
-"""A bus that no CAN is: virtual, or faster than a real one, to measure what comes beyond the bus."""
+"""A bus faster than any CAN bus, to measure what limits a cell beyond its bus."""
 
 from __future__ import annotations
 

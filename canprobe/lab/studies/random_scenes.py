@@ -1,4 +1,4 @@
-"""Random scenes."""
+"""Scenes that are drawn at random: object, place, path and what the emulated array does."""
 
 from __future__ import annotations
 

@@ -20,12 +20,11 @@ from matplotlib.figure import SubFigure
 from canprobe.cell.results.picture import BLUE, GREY, INK, ORANGE, SKY, legend, log_scale, parts, picture
 from canprobe.cell.scene.model import TactileModeName
 from canprobe.fieldbus.bus.real.socketcan import check_interface
+from canprobe.lab.studies.cycle_times import CycleTimes, Times
 from canprobe.lab.studies.harness import CHANNEL, Column, Row, Say, StudyResult
 from canprobe.lab.studies.realtime_cases import (
     PATIENCE,
-    CycleTimes,
     Measured,
-    Times,
     measure_bare,
     measure_hold,
     measure_plain,

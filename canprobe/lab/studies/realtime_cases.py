@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import process_time
 from typing import Any
 
-import canopen
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.cell.master.controller import Command, Controller, Measurement
-from canprobe.cell.planning.configuration import NodeSetup, make_setups
 from canprobe.cell.planning.make import make_plan
-from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import Scene, TactileModeName
 from canprobe.cell.scene.resolve import resolve
@@ -26,116 +21,13 @@ from canprobe.cell.session.emulator_child import EmulatorChild
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.errors import CanprobeError
-from canprobe.fieldbus.bus.candump import read_candump
-from canprobe.fieldbus.bus.clock import Clock, MonotonicClock
+from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.real.opening import open_port
 from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, realtime
-from canprobe.fieldbus.protocol.frames import SYNC_ID
-from canprobe.fieldbus.protocol.sync import SyncCounter
+from canprobe.lab.studies.cycle_times import CycleTimes, answer_latencies, processor_share, woken
 from canprobe.lab.studies.harness import CHANNEL
 from canprobe.lab.studies.no_bus import on_any_bitrate
-
-Times = NDArray[np.int64]
-
-
-def _nothing() -> Times:
-    return np.zeros(0, np.int64)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CycleTimes:
-    """Times of the cycles of one run; empty arrays where a time was not measured.
-
-    Attributes:
-        period_ns: of SYNC, as asked.
-        lateness_ns: of each SYNC behind its deadline (n,), ns.
-        seconds: from the first SYNC to the last.
-        response_ns: from the last TPDO to the RPDOs, of every fifth cycle (m,), ns.
-        compute_ns: the same with the controller's work after the RPDOs (m,), ns.
-        latency_ns: from each SYNC to the last of the drives' TPDOs that answer it (k,), ns.
-        missed: TPDOs that a cycle did without.
-        processor_share: processor time of the master's process over `seconds`; None where it cannot be measured.
-    """
-
-    period_ns: int
-    lateness_ns: Times
-    seconds: float
-    response_ns: Times = field(default_factory=_nothing)
-    compute_ns: Times = field(default_factory=_nothing)
-    latency_ns: Times = field(default_factory=_nothing)
-    missed: int = 0
-    processor_share: float | None = None
-
-    @property
-    def overruns(self) -> int:
-        """Cycles woken more than half a period late."""
-        return int(np.count_nonzero(self.lateness_ns > self.period_ns // 2))
-
-    @property
-    def cycles(self) -> int:
-        """Number of cycles."""
-        return len(self.lateness_ns)
-
-    @property
-    def rate_hz(self) -> float:
-        """Cycles per second that were held."""
-        return (self.cycles - 1) / self.seconds if self.seconds > 0 else 0.0
-
-
-def woken(clock: Clock, period_ns: int, cycles: int, lateness: list[int]) -> Iterator[int]:
-    """Wake at so many deadlines, a period apart, and append the lateness of each (ns); missed ones are skipped.
-
-    Yields:
-        The deadline, ns, or the last one that has passed by then.
-    """
-    deadline_ns = clock.now_ns() + period_ns
-    for _ in range(cycles):
-        clock.sleep_until_ns(deadline_ns)
-        lateness.append(clock.now_ns() - deadline_ns)
-        deadline_ns += lateness[-1] // period_ns * period_ns
-        yield deadline_ns
-        deadline_ns += period_ns
-
-
-def answer_latencies(path: Path, feedback_ids: frozenset[int], period_ns: int) -> Times:
-    """From each SYNC of a candump log to the last of the TPDOs that answer it within a period.
-
-    Args:
-        path: of the log.
-        feedback_ids: COB-IDs of the TPDOs.
-        period_ns: of SYNC.
-
-    Returns:
-        One number for each SYNC that all of them answered (k,), ns, in whole microseconds.
-    """
-    syncs: list[int] = []
-    arrivals: dict[int, list[int]] = {can_id: [] for can_id in feedback_ids}
-    for t_ns, _, can_id, _ in read_candump(path):
-        if can_id == SYNC_ID:
-            syncs.append(t_ns)
-        elif can_id in arrivals:
-            arrivals[can_id].append(t_ns)
-    if not syncs or not arrivals:
-        return _nothing()
-    begins = np.array(sorted(syncs), np.int64)
-    last = np.full(len(begins), -1, np.int64)
-    complete = np.ones(len(begins), bool)
-    for times in arrivals.values():
-        stamps = np.array([*sorted(times), np.iinfo(np.int64).max], np.int64)
-        delays = stamps[np.searchsorted(stamps, begins)] - begins
-        complete &= delays < period_ns
-        last = np.maximum(last, delays)
-    return last[complete]
-
-
-def processor_share(used_before_s: float, passed_s: float) -> float | None:
-    """Processor share since `process_time` gave `used_before_s`; None in a guest, which counts whole ticks."""
-    if os.environ.get("CANPROBE_VCAN") == "guest" or passed_s <= 0:
-        return None
-    return (process_time() - used_before_s) / passed_s
-
-
-# The cases, one run each.
+from canprobe.lab.studies.plain_canopen import run_plain
 
 RATE_HZ = 400.0
 MISSED_SYNCS, LATE_PERCENT = 250, 100
@@ -279,102 +171,3 @@ def _times(session: Session, folder: Path, used_s: float) -> CycleTimes:
         missed=cell.drives.missed,
         processor_share=processor_share(used_s, seconds),
     )
-
-
-# The same cycle written with plain canopen-python: its Network, its threads, its PDO objects. A reference only.
-#
-# SYNC, wait for six TPDOs, read statusword, position and torque, write the targets, transmit six RPDOs; read the
-# sensor's PDOs. Nothing is computed: the targets are the first positions.
-
-_ENABLING = (6, 7, 15)
-_CYCLES_A_STEP = 20
-_WAIT_SHARE = 0.6
-"""Longest wait for TPDOs over the period, as in canprobe's cycle."""
-
-
-def run_plain(plan: Plan, seconds: float) -> CycleTimes:
-    """Bring the nodes of a plan with drives 1–6 up, run the cycle for some time, stop them."""
-    network = canopen.Network()
-    network.connect(interface="socketcan", channel=CHANNEL)
-    try:
-        nodes = [_configured(network, setup) for setup in make_setups(plan)]
-        with _operational(network):
-            cycle = _PlainCycle(network, plan, nodes)
-            for word in _ENABLING:
-                cycle.run(word, _CYCLES_A_STEP)
-            return cycle.times(seconds)
-    finally:
-        network.disconnect()
-
-
-def _configured(network: canopen.Network, setup: NodeSetup) -> Any:
-    node: Any = network.add_node(setup.node_id, setup.dictionary)
-    for write in setup.writes:
-        variable = setup.dictionary.get_variable(write.index, write.subindex)
-        assert variable is not None
-        node.sdo.download(write.index, write.subindex, variable.encode_raw(write.value))
-    node.tpdo.read()
-    node.rpdo.read()
-    return node
-
-
-@contextmanager
-def _operational(network: canopen.Network) -> Iterator[None]:
-    network.nmt.send_command(1)
-    try:
-        yield
-    finally:
-        network.nmt.send_command(0x80)
-
-
-class _PlainCycle:
-    def __init__(self, network: canopen.Network, plan: Plan, nodes: Sequence[Any]) -> None:
-        drive_ids = {node.node_id for node in plan.nodes if node.kind == "drive"}
-        self._network, self._plan = network, plan
-        self._drives = [node for node in nodes if node.id in drive_ids]
-        self._maps = [m for node in nodes if node.id not in drive_ids for m in node.tpdo.values() if m.enabled]
-        self._sync = SyncCounter(plan.sync.overflow)
-        self._held: dict[int, int] = {}
-        self.missed = 0
-        self._clock = MonotonicClock()
-
-    def run(self, word: int, cycles: int) -> list[int]:
-        """Run some cycles; returns the lateness of each SYNC, ns."""
-        period_ns = self._plan.sync.period_ns
-        lateness: list[int] = []
-        for deadline_ns in woken(self._clock, period_ns, cycles, lateness):
-            self._once(word, deadline_ns + int(_WAIT_SHARE * period_ns))
-        return lateness
-
-    def _once(self, word: int, until_ns: int) -> None:
-        maps = [drive.tpdo[1] for drive in self._drives]
-        for tpdo in maps:
-            tpdo.is_received = False
-        self._network.sync.transmit(self._sync.next())
-        for tpdo in maps:
-            with tpdo.receive_condition:
-                while not tpdo.is_received and (left_ns := until_ns - self._clock.now_ns()) > 0:
-                    tpdo.receive_condition.wait(left_ns * 1e-9)
-            self.missed += not tpdo.is_received
-        for drive, tpdo in zip(self._drives, maps, strict=True):
-            _, position, *_ = [variable.raw for variable in tpdo]
-            self._held.setdefault(drive.id, position)
-            controlword, target = list(drive.rpdo[1])
-            controlword.raw = word
-            target.raw = self._held[drive.id]
-            drive.rpdo[1].transmit()
-        for tpdo in self._maps:
-            for variable in tpdo:
-                _ = variable.raw
-
-    def times(self, seconds: float) -> CycleTimes:
-        """Run the cycle for some time."""
-        period_ns, clock = self._plan.sync.period_ns, self._clock
-        self.missed = 0
-        begin_ns, used_s = clock.now_ns(), process_time()
-        lateness: list[int] = []
-        while (left_ns := seconds * 1e9 - (clock.now_ns() - begin_ns)) > 0:
-            lateness += self.run(_ENABLING[-1], min(200, int(left_ns / period_ns) + 1))
-        passed_s = (clock.now_ns() - begin_ns) * 1e-9
-        late, share = np.array(lateness, np.int64), processor_share(used_s, passed_s)
-        return CycleTimes(period_ns, late, passed_s, missed=self.missed, processor_share=share)

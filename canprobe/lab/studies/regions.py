@@ -68,7 +68,7 @@ COLUMNS = (
 )
 
 
-class Case(NamedTuple):
+class RegionCase(NamedTuple):
     """One scan: of a packaged scene with a seed, or ("random") of the random scene of that number."""
 
     scene: str
@@ -76,7 +76,7 @@ class Case(NamedTuple):
     duration_s: float
 
 
-class Scan(NamedTuple):
+class ScoredScan(NamedTuple):
     """What a scan gave: its scene in words, answers after the run-in, and the scores (n, 4) of those with all of K.
 
     A score is: squared error and stated variance (Frobenius), squared length of the error in the region's, and the
@@ -94,11 +94,11 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     """Scan the scenes."""
     packaged, seeds, numbers = (PACKAGED[:1], SEEDS[:1], NUMBERS[2:4]) if quick else (PACKAGED, SEEDS, NUMBERS)
     seconds = (1.8, 1.8) if quick else (PACKAGED_S, RANDOM_S)
-    cases = [Case(scene, seed, seconds[0]) for seed in seeds for scene in packaged]
-    cases += [Case("random", number, seconds[1]) for number in numbers]
+    cases = [RegionCase(scene, seed, seconds[0]) for seed in seeds for scene in packaged]
+    cases += [RegionCase("random", number, seconds[1]) for number in numbers]
     sweep.say(f"{len(cases)} scans of {min(seconds):g} to {max(seconds):g} s")
     found = sweep.map(measure, cases, model=MODEL)
-    scans = [Scan(*one)._replace(scores=np.array(one[-1]).reshape(-1, 4)) for one in found]
+    scans = [ScoredScan(*one)._replace(scores=np.array(one[-1]).reshape(-1, 4)) for one in found]
     groups = {"packaged": scans[: len(packaged) * len(seeds)], "random": scans[len(packaged) * len(seeds) :]}
     rows = [row for group, mine in groups.items() for row in rows_of(group, mine)]
     return StudyResult(
@@ -106,7 +106,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     )
 
 
-def measure(case: Case) -> Scan:
+def measure(case: RegionCase) -> ScoredScan:
     """One scan."""
     name, seed, duration = case
     if name == "random":
@@ -118,16 +118,18 @@ def measure(case: Case) -> Scan:
     try:
         task: Any = make_task(make_plan(resolve(scene)))
     except PlanError:
-        return Scan(*words, 0, np.zeros((0, 4)))
+        return ScoredScan(*words, 0, np.zeros((0, 4)))
     with Session(scene) as session:
         session.run(task)
     times = session.cell.log.arrays()["t_s"]
     late = [r for r in task.shape.records if r.travelled_m >= RUN_IN_M]
-    return Scan(*words, len(late), np.array([scored(r, session.truth, times) for r in late if r.estimate.rank == 3]))
+    return ScoredScan(
+        *words, len(late), np.array([scored(r, session.truth, times) for r in late if r.estimate.rank == 3])
+    )
 
 
 def scored(record: ShapeRecord, truth: dict[str, Array], times: Array) -> list[float]:
-    """One of `Scan.scores`, in the answer's own axes."""
+    """One of `ScoredScan.scores`, in the answer's own axes."""
     row = int(np.searchsorted(times, record.t_s - 1e-6))
     P = record.estimate.T_frame_contact[:3, :2]
     D = (
@@ -140,7 +142,7 @@ def scored(record: ShapeRecord, truth: dict[str, Array], times: Array) -> list[f
     return [float(e**2 @ FROBENIUS), float(np.diag(C) @ FROBENIUS), square, density]
 
 
-def rows_of(group: str, scans: Sequence[Scan]) -> list[Row]:
+def rows_of(group: str, scans: Sequence[ScoredScan]) -> list[Row]:
     """Rows of a group: each kind of object, each full scale and path where there are several, and all."""
     rows = []
     for field in ("kind", "full_scale_kpa", "path"):
@@ -152,7 +154,7 @@ def rows_of(group: str, scans: Sequence[Scan]) -> list[Row]:
     return [*rows, row_of(group, "all", scans)]
 
 
-def row_of(group: str, name: str, scans: Sequence[Scan]) -> Row:
+def row_of(group: str, name: str, scans: Sequence[ScoredScan]) -> Row:
     """One row of the table."""
     answering = [scan.scores for scan in scans if len(scan.scores)]
     answers = np.concatenate(answering) if answering else np.full((1, 4), np.nan)

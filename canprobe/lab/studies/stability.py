@@ -28,7 +28,7 @@ from canprobe.cell.results.picture import AMBER, BLUE, GREY, INK, ORANGE, PINK, 
 from canprobe.lab.studies.harness import Array, Column, Row, StudyResult
 from canprobe.lab.studies.linear_loop import ForceLoop, spectral_radius
 from canprobe.lab.studies.result_files import measuring_facts
-from canprobe.lab.studies.stability_runs import HUNTING, Case, carry_out, loop_of, touch_in_posture
+from canprobe.lab.studies.stability_runs import HUNTING, LoopCase, carry_out, loop_of, touch_in_posture
 from canprobe.lab.studies.sweep import Sweep
 
 STIFFNESSES = (1e2, 1e3, 1e4, 2e4, 4e4, 6e4, 1e5, 1e6, 1e7)
@@ -66,57 +66,59 @@ COLUMNS = (
 )
 
 
-def cases(quick: bool) -> list[Case]:
+def cases(quick: bool) -> list[LoopCase]:
     """All cells."""
     if quick:
         return _quick_cases()
     found = [_at(reach, speed) for reach, speed in product(REACHES_MM, (0.0, 25.0))]
     found += [_bent(wrist, speed) for wrist, speed in product(WRISTS_DEG, (0.0, 25.0))]
     found += [_round(probe, radius) for probe, radius in product(RADII_MM, RADII_MM)]
-    found += [Case("speed", k, speed_mm_s=v, hold_s=SCAN_S) for v, k in product(SPEEDS_MM_S, (1e4, 4e4))]
-    found += [Case("drives", k, bandwidth_hz=b, fidelity=f) for b, f, k in product(DRIVES_HZ, FIDELITIES, (1e4, 1e6))]
+    found += [LoopCase("speed", k, speed_mm_s=v, hold_s=SCAN_S) for v, k in product(SPEEDS_MM_S, (1e4, 4e4))]
+    found += [
+        LoopCase("drives", k, bandwidth_hz=b, fidelity=f) for b, f, k in product(DRIVES_HZ, FIDELITIES, (1e4, 1e6))
+    ]
     grid = product(BUSES, GAINS_HZ, STIFFNESSES, (True, False))
     return found + [
-        Case("felt" if feels else "told", k, rate_hz=rate, late_ms=late, height_hz=gain, feels=feels)
+        LoopCase("felt" if feels else "told", k, rate_hz=rate, late_ms=late, height_hz=gain, feels=feels)
         for (rate, late), gain, k, feels in grid
         if rate <= 400.0 or (gain == 8.0 and k == 1e4)
     ]
 
 
-def _quick_cases() -> list[Case]:
+def _quick_cases() -> list[LoopCase]:
     """A case for each way to end."""
     return [
-        Case("told", 1e4, rate_hz=200.0, feels=False, hold_s=0.1),
-        Case("told", 1e7, feels=False),
-        Case("drives", 1e6, bandwidth_hz=3.0, fidelity="dynamic"),
-        Case("felt", 1e4, late_ms=20.0),
-        Case("felt", 1e4, rate_hz=1000.0),
+        LoopCase("told", 1e4, rate_hz=200.0, feels=False, hold_s=0.1),
+        LoopCase("told", 1e7, feels=False),
+        LoopCase("drives", 1e6, bandwidth_hz=3.0, fidelity="dynamic"),
+        LoopCase("felt", 1e4, late_ms=20.0),
+        LoopCase("felt", 1e4, rate_hz=1000.0),
         _round(10_000.0, 1.0),
-        Case("speed", 1e4, speed_mm_s=250.0),
+        LoopCase("speed", 1e4, speed_mm_s=250.0),
     ]
 
 
-def _at(reach_mm: float, speed_mm_s: float) -> Case:
+def _at(reach_mm: float, speed_mm_s: float) -> LoopCase:
     """A touch that far from the first joint's axis, in the default direction."""
     share = reach_mm / math.hypot(*_AT[:2])
     at_mm = (_AT[0] * share, _AT[1] * share, _AT[2])
-    return Case("pose", 1e4, at_mm=at_mm, speed_mm_s=speed_mm_s, hold_s=SCAN_S if speed_mm_s else 0.4)
+    return LoopCase("pose", 1e4, at_mm=at_mm, speed_mm_s=speed_mm_s, hold_s=SCAN_S if speed_mm_s else 0.4)
 
 
-def _bent(wrist_deg: float, speed_mm_s: float) -> Case:
+def _bent(wrist_deg: float, speed_mm_s: float) -> LoopCase:
     """A touch of a gently curved object in front of the arm, with the wrist bent by so much."""
     at_mm, normal, posture_deg = touch_in_posture((90.0, 65.0, 15.0, -360.0, wrist_deg, 0.0))
-    return Case(
+    return LoopCase(
         "pose", 1e4, at_mm=at_mm, normal=normal, posture_deg=posture_deg, kind="sphere", radius_mm=300.0,
         speed_mm_s=speed_mm_s, hold_s=SCAN_S if speed_mm_s else 0.4,
     )  # fmt: skip
 
 
-def _round(probe_mm: float, radius_mm: float) -> Case:
-    return Case("radii", 1e4, probe_mm=probe_mm, kind="sphere", radius_mm=radius_mm)
+def _round(probe_mm: float, radius_mm: float) -> LoopCase:
+    return LoopCase("radii", 1e4, probe_mm=probe_mm, kind="sphere", radius_mm=radius_mm)
 
 
-def what_of(case: Case) -> str:
+def what_of(case: LoopCase) -> str:
     """The special parameters of a case, in words."""
     scan = " scan" if case.speed_mm_s else ""
     pose = f"{math.hypot(*case.at_mm[:2]):.0f} mm from axis 1" + scan
@@ -140,7 +142,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     return StudyResult("stability", COLUMNS, rows, findings(rows), facts, partial(draw_stability, rows))
 
 
-def row_of(case: Case, answer: Row) -> Row:
+def row_of(case: LoopCase, answer: Row) -> Row:
     """The row of a cell: case, prediction, answer."""
     known = asdict(case)
     del known["at_mm"], known["normal"], known["posture_deg"]
@@ -246,13 +248,13 @@ def draw_stability(rows: Sequence[Row], path: Path) -> None:
         stiffness = np.geomspace(70.0, 1.5e7, 40)
         for part, (view, words) in zip(maps, VIEWS.items(), strict=True):
             part.suptitle(words, x=0.01, ha="left", fontsize="medium", fontweight="bold")
-            ratios = [loop_of(Case(view, float(k), feels=view == "felt")).depth_ratio for k in stiffness]
+            ratios = [loop_of(LoopCase(view, float(k), feels=view == "felt")).depth_ratio for k in stiffness]
             grid = part.subplots(lines, min(PANELS_IN_A_ROW, len(buses)), squeeze=False, sharex=True, sharey=True)
             for axes in grid.flat[len(buses) :]:
                 axes.set_visible(False)
             for axes, (rate, late) in zip(grid.flat, buses, strict=False):
                 mine = [r for r in rows if r["view"] == view and (r["rate_hz"], r["late_ms"]) == (rate, late)]
-                _draw_map(axes, stiffness, ratios, loop_of(Case(view, 1e4, rate_hz=rate, late_ms=late)), mine)
+                _draw_map(axes, stiffness, ratios, loop_of(LoopCase(view, 1e4, rate_hz=rate, late_ms=late)), mine)
                 axes.set_title(f"cycle of {rate:g} Hz" + (f", frames {late:g} ms late" if late else ""))
             for axes in grid[-1]:
                 axes.set_xlabel("contact stiffness (N/m)")

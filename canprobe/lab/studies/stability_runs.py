@@ -102,7 +102,7 @@ SENSOR_HZ = 200.0
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class LoopCase:
     """A cell of the map.
 
     Attributes:
@@ -150,18 +150,18 @@ class StatedSensing(ContactSensing):
         """Ignore it."""
 
 
-def layer_stiffness(case: Case) -> float:
+def layer_stiffness(case: LoopCase) -> float:
     """K/h (N/m³) that gives the contact its stiffness at the wanted force: `dF/dδ = 2F/δ`."""
     depth = 2.0 * case.force_n / case.contact_n_m
     return float(indentation_from_force(case.force_n, 1.0, case.probe_mm * 1e-3, _kappa(case)) / depth) ** 2
 
 
-def _kappa(case: Case) -> Array:
+def _kappa(case: LoopCase) -> Array:
     place = true_object(_object(case))
     return np.maximum(place.closest(np.array(case.at_mm) * 1e-3).kappa, -0.9e3 / case.probe_mm)
 
 
-def _object(case: Case) -> ObjectSettings:
+def _object(case: LoopCase) -> ObjectSettings:
     radius = None if case.kind == "plane" else case.radius_mm
     return ObjectSettings(kind=case.kind, radius_mm=radius, position_mm=case.at_mm, rotation_deg=upright(case.normal))  # type: ignore[arg-type]
 
@@ -203,13 +203,13 @@ def upright(normal: tuple[float, float, float], yaw_deg: float = 20.0) -> tuple[
     return math.degrees(-math.asin(y)), math.degrees(math.atan2(x, normal[2])), yaw_deg
 
 
-def full_scale_kpa(case: Case, stiffness: float) -> float:
+def full_scale_kpa(case: LoopCase, stiffness: float) -> float:
     """Full scale of the array, kPa: the larger one where the wanted force would saturate the other, as in `steel`."""
     peak_pa = stiffness * 2.0 * case.force_n / case.contact_n_m
     return 100.0 if peak_pa < 80e3 else 300.0
 
 
-def scene_of(case: Case) -> Scene:
+def scene_of(case: LoopCase) -> Scene:
     """The scene of a case; its layer may be harder and its radii larger than a scene file allows."""
     scene = load_scene("press" if case.speed_mm_s == 0.0 else "cylinder", {"task.duration_s": case.hold_s})
     assert scene.arm is not None and scene.sensor is not None and scene.probe is not None
@@ -246,7 +246,7 @@ def scene_of(case: Case) -> Scene:
     )
 
 
-def loop_of(case: Case) -> ForceLoop:
+def loop_of(case: LoopCase) -> ForceLoop:
     """The linear loop of a case, with the servo's final stiffness."""
     scene = scene_of(case)
     assert scene.probe is not None
@@ -276,7 +276,7 @@ def stated_sensing(scene: Scene, kind: type[ContactSensing] = StatedSensing) -> 
     return kind(setup.arm.model, probe.T_flange_probe, patch, probe.radius, probe.stiffness)
 
 
-def carry_out(case: Case) -> Row:
+def carry_out(case: LoopCase) -> Row:
     """Run a case to its end: `ended`, `reason` and figures of the force; None where there are none."""
     names = ("force_max_n", "above_ms", "allowed_ms", "error_percent", "spread_percent")
     try:

@@ -1,4 +1,4 @@
-"""A run to its end, and the witness of it."""
+"""A run of a session to its end, and a witness that records the true force meanwhile."""
 
 from __future__ import annotations
 

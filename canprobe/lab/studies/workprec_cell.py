@@ -69,7 +69,7 @@ COLUMNS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class BusSetting:
     """Rate, mode of the sensor and bus."""
 
     rate_hz: float
@@ -78,10 +78,10 @@ class Setting:
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class CellCase:
     """One scan."""
 
-    setting: Setting
+    setting: BusSetting
     method: str
     fidelity: str
     duration_s: float
@@ -93,25 +93,25 @@ def run_cell(*, quick: bool, sweep: Sweep) -> StudyResult:
     """Plan every setting, and scan with those that fit, one scan at a time."""
     rates, modes = ((200.0, 500.0), MODES[1:2]) if quick else (RATES_HZ, MODES)
     methods = ("recursive",) if quick else METHODS
-    why: dict[Setting, str | None] = {}
+    why: dict[BusSetting, str | None] = {}
     for bus in (*REAL, FASTER):
         asked = [
-            Setting(rate, mode, bus)
+            BusSetting(rate, mode, bus)
             for rate, mode in product(rates, modes)
-            if all(why.get(Setting(rate, mode, other), "not asked") is not None for other in REAL)
+            if all(why.get(BusSetting(rate, mode, other), "not asked") is not None for other in REAL)
             and (bus in REAL or mode != "image")
         ]
         why |= dict(zip(asked, sweep.map(refusal, asked), strict=True))
     fits = [s for s, reason in why.items() if reason is None]
     duration = 1.0 if quick else 2.0
     todo = [
-        Case(s, method, fidelity, duration, 1)
+        CellCase(s, method, fidelity, duration, 1)
         for s, method, fidelity in product(fits, methods, FIDELITIES)
         if s.bus in REAL or method == "recursive"
     ]
     sweep.say(f"{len(todo)} scans, timed one after another; {len(why) - len(fits)} settings are refused by the plan")
     answers = dict(zip(todo, sweep.time(measure, todo), strict=True))
-    stiff = [Case(s, "recursive", "ideal", duration, 1, STIFF_N_M3) for s in fits]
+    stiff = [CellCase(s, "recursive", "ideal", duration, 1, STIFF_N_M3) for s in fits]
     held = {case.setting: holds(answer) for case, answer in zip(stiff, sweep.map(measure, stiff), strict=True)}
     rows = [_row(case, answer) | {"stiff": held[case.setting]} for case, answer in answers.items()]
     rows += [
@@ -125,7 +125,7 @@ def run_cell(*, quick: bool, sweep: Sweep) -> StudyResult:
     )
 
 
-def scene_of(setting: Setting) -> Scene:
+def scene_of(setting: BusSetting) -> Scene:
     """The scene with the default estimator and plant."""
     scene = load_scene("cylinder")
     assert scene.sensor is not None and scene.shape is not None
@@ -143,7 +143,7 @@ def scene_of(setting: Setting) -> Scene:
     return on_any_bitrate(scene, FASTER_BITRATE) if setting.bus == FASTER else scene
 
 
-def refusal(setting: Setting) -> str | None:
+def refusal(setting: BusSetting) -> str | None:
     """The plan's reason to refuse a setting; None where it fits."""
     try:
         make_plan(resolve(scene_of(setting)))
@@ -152,7 +152,7 @@ def refusal(setting: Setting) -> str | None:
     return None
 
 
-def measure(case: Case) -> dict[str, Any]:
+def measure(case: CellCase) -> dict[str, Any]:
     """Errors of a scan, and its cost in ms of processor time per second."""
     scene = scene_of(case.setting)
     assert scene.shape is not None
@@ -195,11 +195,11 @@ def holds(answer: Row) -> str:
     return "holds" if error <= STIFF_FORCE_PERCENT else f"force {error:.0f} %"
 
 
-def _named(setting: Setting) -> Row:
+def _named(setting: BusSetting) -> Row:
     return {"rate_hz": setting.rate_hz, "mode": setting.mode, "bus": setting.bus}
 
 
-def _row(case: Case, answer: Row) -> Row:
+def _row(case: CellCase, answer: Row) -> Row:
     return {**_named(case.setting), "method": case.method, "fidelity": case.fidelity, "reason": "", **answer}
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import canprobe
+from canprobe.cell.npz import read_npz
 from canprobe.cell.scene.geometry import true_object
 from canprobe.cell.scene.load import load_scene, packaged_files, scenes_folder
 from canprobe.cell.scene.model import ObjectSettings
@@ -19,7 +20,6 @@ from canprobe.cell.scene.stl_files import stl_damage
 from canprobe.cell.session.session import write_scene
 from canprobe.cli import main
 from canprobe.errors import PlanError, UsageError
-from canprobe.cell.npz import read_npz
 
 X, Y = np.meshgrid(np.arange(-20, 20.1), np.arange(-15, 15.1), indexing="ij")
 BUMP_MM = 1.5 * np.exp(-((X - 4) ** 2 + 2 * Y**2) / 200)

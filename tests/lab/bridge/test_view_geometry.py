@@ -11,14 +11,13 @@ from puma_arm import MODELS
 from canprobe.cell.plant.pressure import pad_coordinates
 from canprobe.cell.scene.load import read_cell
 from canprobe.lab.bridge.sample import SurfacePatch
+from canprobe.lab.bridge.view import array_dome as taxels
 from canprobe.lab.bridge.view import bodies as arm
-from canprobe.lab.bridge.view import bodies as objects
-from canprobe.lab.bridge.view import bodies as taxels
-from canprobe.lab.bridge.view import meshes
-from canprobe.lab.bridge.view import meshes as colours
+from canprobe.lab.bridge.view import colours, meshes
+from canprobe.lab.bridge.view import object_sheet as objects
 from canprobe.lab.bridge.view.instants import judge
 from canprobe.lab.bridge.view.path import deviation_scale
-from canprobe.lab.bridge.view.surface import Surface
+from canprobe.lab.bridge.view.surface import BlendedSurface
 from canprobe.mechanics.robot.chain import forward, posture
 from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
 from canprobe.mechanics.touch.objects import OBJECT_PARAMETERS, make_object
@@ -246,7 +245,7 @@ def ring(angles, sigma):
 
 def test_the_recovered_surface_lies_on_the_ball_and_has_the_colours_of_what_is_known():
     scale = deviation_scale(None)
-    surface = Surface(scale)
+    surface = BlendedSurface(scale)
     for one in ring(np.arange(-0.5, 0.5, 0.05), sigma=1.0):
         assert surface.add(one)
     mesh, rgb = surface.mesh()
@@ -256,7 +255,7 @@ def test_the_recovered_surface_lies_on_the_ball_and_has_the_colours_of_what_is_k
 
 
 def test_of_two_answers_at_one_place_the_better_known_one_is_drawn():
-    surface = Surface(deviation_scale(None))
+    surface = BlendedSurface(deviation_scale(None))
     answers = (*ring([0.0], 1.0), *ring([0.01], 1.5), *ring([0.01], 0.5))
     assert [surface.add(one) for one in answers] == [True, False, True]
     assert not surface.add(answer((0.0, 0.0, 1.0), math.inf))

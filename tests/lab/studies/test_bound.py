@@ -12,23 +12,23 @@ import pytest
 from canprobe.cli import main
 from canprobe.errors import UsageError
 from canprobe.lab.studies import bound
-from canprobe.lab.studies.bound import Case, all_cases, findings
+from canprobe.lab.studies.bound import BoundCase, all_cases, findings
 from canprobe.lab.studies.cell_store import CellStore
 from canprobe.lab.studies.ground import PATHS, SURFACES, make_ground
 from canprobe.lab.studies.sweep import Sweep
 
 SEEDS = 24
 SUBSET = (
-    Case("cylinder", "weave", 0.04, 0.02, 20e-6, 1e-3),
-    Case("hyperboloid", "circle", 0.005, 0.005, 20e-6, 1e-3),
-    Case("torus", "weave", 1.0, 0.02, 100e-6, 5e-3),
-    Case("plane", "circle", 0.005, 0.005, 100e-6, 5e-3),
+    BoundCase("cylinder", "weave", 0.04, 0.02, 20e-6, 1e-3),
+    BoundCase("hyperboloid", "circle", 0.005, 0.005, 20e-6, 1e-3),
+    BoundCase("torus", "weave", 1.0, 0.02, 100e-6, 5e-3),
+    BoundCase("plane", "circle", 0.005, 0.005, 100e-6, 5e-3),
 )
 
 
 OUTSIDE = (
-    Case("torus", "weave", 0.005, 0.005, 5e-6, 2e-4),
-    Case("sphere", "weave", 0.005, 0.005, 100e-6, 5e-3),
+    BoundCase("torus", "weave", 0.005, 0.005, 5e-6, 2e-4),
+    BoundCase("sphere", "weave", 0.005, 0.005, 100e-6, 5e-3),
 )
 
 

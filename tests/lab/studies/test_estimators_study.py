@@ -12,7 +12,7 @@ from canprobe.lab.studies import estimators
 from canprobe.lab.studies.estimators import (
     GROUNDS,
     NOISES,
-    Setting,
+    EstimatorSetting,
     findings,
     measure_costs,
     measure_errors,
@@ -24,7 +24,7 @@ from canprobe.lab.studies.result_files import as_document, table_lines, write_st
 from canprobe.lab.studies.sweep import STUDIES
 from canprobe.mechanics.touch.estimate.fit import METHODS
 
-FEW = [Setting("chen1996", 160, 10), Setting("ml", 160), Setting("recursive", 160)]
+FEW = [EstimatorSetting("chen1996", 160, 10), EstimatorSetting("ml", 160), EstimatorSetting("recursive", 160)]
 
 
 @pytest.fixture

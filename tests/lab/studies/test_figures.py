@@ -22,11 +22,12 @@ from canprobe.fieldbus.node.fault import FaultKind
 from canprobe.lab.studies import estimators, stability, workprec
 from canprobe.lab.studies import stability as stability_figure
 from canprobe.lab.studies.bound import NOISES, SIZES_M, draw_bound
+from canprobe.lab.studies.cycle_times import CycleTimes
 from canprobe.lab.studies.estimators import draw_estimators
 from canprobe.lab.studies.fault_scenes import draw_ends, draw_faults
 from canprobe.lab.studies.ground import SURFACES
 from canprobe.lab.studies.realtime import draw_realtime
-from canprobe.lab.studies.realtime_cases import CycleTimes, Measured
+from canprobe.lab.studies.realtime_cases import Measured
 from canprobe.lab.studies.realtime_soak import draw_soak
 from canprobe.lab.studies.regions import draw_regions
 from canprobe.lab.studies.workprec import draw_workprec

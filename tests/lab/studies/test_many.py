@@ -70,7 +70,7 @@ def test_what_is_finished_is_found_again_and_the_rest_is_computed(runs, out, mon
 
 
 def test_a_fault_of_one_run_costs_that_run(monkeypatch, out):
-    case = many.Case(many.dump_scene(canprobe.load_scene("press")), "", 0, (), 50.0)
+    case = many.RunCase(many.dump_scene(canprobe.load_scene("press")), "", 0, (), 50.0)
     monkeypatch.setattr(many, "run", lambda *_, **__: {}["nothing"])
     outcome = many.measure(case)
     assert outcome["status"] == "failed" and outcome["reason"].startswith("KeyError: 'nothing' (test_many.py:")

@@ -8,8 +8,9 @@ import pytest
 
 from canprobe.cli import main
 from canprobe.fieldbus.bus.real.socketcan import has_socketcan
+from canprobe.lab.studies.cycle_times import CycleTimes, answer_latencies, woken
 from canprobe.lab.studies.realtime import findings
-from canprobe.lab.studies.realtime_cases import CycleTimes, Measured, answer_latencies, holding_scene, woken
+from canprobe.lab.studies.realtime_cases import Measured, holding_scene
 from canprobe.lab.studies.realtime_soak import COLUMNS, resident_mib
 from canprobe.lab.studies.realtime_soak import findings as findings_of_soak
 

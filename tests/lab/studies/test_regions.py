@@ -14,7 +14,7 @@ from canprobe.cell.scene.resolve import resolve
 from canprobe.cli import main
 from canprobe.errors import PlanError
 from canprobe.lab.studies.random_scenes import random_scene
-from canprobe.lab.studies.regions import NUMBERS, Scan, findings, row_of, scored
+from canprobe.lab.studies.regions import NUMBERS, ScoredScan, findings, row_of, scored
 
 TIMES = np.arange(0.0, 5.0, 0.0025)
 TRUTH = {
@@ -40,13 +40,13 @@ def test_a_row_tells_overconfidence_and_its_interval_is_over_scenes():
     def scan(size):
         e = size * rng.normal(size=(100, 3))
         square = (e**2).sum(axis=1)
-        return Scan("sphere", "weave", 100.0, 125, np.stack([square, np.full(100, 3.0), square, -square], axis=1))
+        return ScoredScan("sphere", "weave", 100.0, 125, np.stack([square, np.full(100, 3.0), square, -square], axis=1))
 
     # within a scene all answers are held alike: so many answers are no more than so many scenes
     row = row_of(
         "random",
         "sphere",
-        [*(scan(0.5) for _ in range(9)), scan(20.0), Scan("bowl", "weave", 100.0, 0, np.zeros((0, 4)))],
+        [*(scan(0.5) for _ in range(9)), scan(20.0), ScoredScan("bowl", "weave", 100.0, 0, np.zeros((0, 4)))],
     )
     assert row["observed"] == 0.8
     assert (row["scenes"], row["refused"], row["answers"]) == (11, 1, 1000)

@@ -15,7 +15,7 @@ from canprobe.lab.studies import stability
 from canprobe.lab.studies.fault_scores import longest_above
 from canprobe.lab.studies.linear_loop import ForceLoop, spectral_radius
 from canprobe.lab.studies.result_files import write_study
-from canprobe.lab.studies.stability_runs import Case, layer_stiffness, loop_of, scene_of, touch_in_posture, upright
+from canprobe.lab.studies.stability_runs import LoopCase, layer_stiffness, loop_of, scene_of, touch_in_posture, upright
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.denavit_hartenberg import rotation_rpy
 from canprobe.mechanics.touch.contact import indentation_from_force
@@ -85,17 +85,17 @@ def test_twice_the_slope_is_stable_however_late_and_more_delay_takes_away_the_re
 
 
 def test_the_layer_has_the_stiffness_of_the_case():
-    case = Case("told", 3e4)
+    case = LoopCase("told", 3e4)
     kappa = (1e3 / 36.0, 0.0)
     depths = [indentation_from_force(f, layer_stiffness(case), 0.04, kappa) for f in (1.99, 2.01)]
     assert 0.02 / (depths[1] - depths[0]) == pytest.approx(3e4, rel=1e-4)
 
 
 def test_feeling_takes_the_wrong_stiffness_out_of_the_loop_within_its_bound():
-    told, felt = (loop_of(Case("x", 5e4, feels=feels)).depth_ratio for feels in (False, True))
+    told, felt = (loop_of(LoopCase("x", 5e4, feels=feels)).depth_ratio for feels in (False, True))
     assert felt == pytest.approx(1.0)
     assert told > 4.0
-    assert loop_of(Case("x", 1e6)).depth_ratio > 10.0
+    assert loop_of(LoopCase("x", 1e6)).depth_ratio > 10.0
 
 
 def test_a_posture_touches_where_the_arm_would_be():
@@ -117,7 +117,7 @@ def test_an_object_stands_upright_on_its_normal(normal):
 
 
 def test_the_array_is_one_that_the_wanted_force_does_not_saturate():
-    scales = [scene_of(Case("x", k)).sensor.full_scale_kpa for k in (1e3, 1e4, 2e4, 1e7)]
+    scales = [scene_of(LoopCase("x", k)).sensor.full_scale_kpa for k in (1e3, 1e4, 2e4, 1e7)]
     assert scales == [100.0, 100.0, 300.0, 300.0]
 
 
@@ -131,7 +131,7 @@ def test_cells_of_every_view_and_bus():
     whole = stability.cases(False)
     assert {c.view for c in whole} == {"told", "felt", "drives", "pose", "radii", "speed"}
     assert {c.contact_n_m for c in whole} >= {1e2, 1e7}
-    assert scene_of(Case("x", 1e4, probe_mm=1.0)).probe.radius_mm == 1.0
+    assert scene_of(LoopCase("x", 1e4, probe_mm=1.0)).probe.radius_mm == 1.0
 
 
 class InLine:
@@ -166,9 +166,9 @@ def test_quick_touches_end_as_they_may_and_are_drawn(tmp_path):
 
 def test_findings_name_every_touch_that_ends_otherwise(tmp_path):
     force = {"force_max_n": 3.0, "above_ms": 10.0, "allowed_ms": 115.0, "error_percent": 4.0, "spread_percent": 3.0}
-    good = stability.row_of(Case("told", 1e4, feels=False), {"ended": "stable", "reason": "", **force})
+    good = stability.row_of(LoopCase("told", 1e4, feels=False), {"ended": "stable", "reason": "", **force})
     assert "Every touch is stable" in stability.findings([good])[-1]
-    bad = stability.row_of(Case("told", 1e6, feels=False), {"ended": "failed", "reason": "hang", **force})
+    bad = stability.row_of(LoopCase("told", 1e6, feels=False), {"ended": "failed", "reason": "hang", **force})
     said = "\n".join(stability.findings([good, bad]))
     assert "told, 1e+06 N/m" in said
     assert "failed, hang" in said

@@ -7,7 +7,7 @@ from canprobe.cell.plant.dynamic_arm import Stepping
 from canprobe.lab.studies import workprec
 from canprobe.lab.studies.workprec import (
     ENOUGH,
-    Case,
+    IntegrationCase,
     cases,
     errors,
     findings,
@@ -79,7 +79,7 @@ def test_quick_cells_cover_every_method_and_free_dynamics_too():
 
 
 def test_a_cell_measures_states_and_cost():
-    answer = workprec.measure(Case(PAD, "rosenbrock", 1250.0, True, CYCLES, 1))
+    answer = workprec.measure(IntegrationCase(PAD, "rosenbrock", 1250.0, True, CYCLES, 1))
     assert np.shape(answer["states"]) == (CYCLES, 12)
     assert answer["cost_us"] > 10.0
 

@@ -9,7 +9,16 @@ import pytest
 from canprobe.cell.tasks.probing import Phase
 from canprobe.lab.studies import workprec_cell
 from canprobe.lab.studies.result_files import as_document, text_of, write_study
-from canprobe.lab.studies.workprec_cell import MEASURES, Case, Setting, default_of, findings, good, measure, run_cell
+from canprobe.lab.studies.workprec_cell import (
+    MEASURES,
+    BusSetting,
+    CellCase,
+    default_of,
+    findings,
+    good,
+    measure,
+    run_cell,
+)
 
 
 class Here:
@@ -65,7 +74,7 @@ def test_a_scan_that_is_stopped_is_a_row_with_its_reason(monkeypatch):
         raise workprec_cell.SafetyStop("measured force 9 N above the limit of 5 N")
 
     monkeypatch.setattr(workprec_cell, "run_scene", stopped)
-    answer = measure(Case(Setting(100.0, "features", "classical"), "chord", "ideal", 1.0, 1))
+    answer = measure(CellCase(BusSetting(100.0, "features", "classical"), "chord", "ideal", 1.0, 1))
     assert answer == {"ended": "stopped", "reason": "measured force 9 N above the limit of 5 N"}
 
 
@@ -85,7 +94,7 @@ def test_the_cost_is_that_of_the_scan_alone(monkeypatch):
     clock = iter(range(100))
     monkeypatch.setattr(workprec_cell, "run_scene", run)
     monkeypatch.setattr(workprec_cell, "process_time", lambda: float(next(clock)))
-    answer = measure(Case(Setting(100.0, "features", "classical"), "recursive", "ideal", 1.0, 1))
+    answer = measure(CellCase(BusSetting(100.0, "features", "classical"), "recursive", "ideal", 1.0, 1))
     assert answer["cost_ms_per_s"] == pytest.approx(1e3 * 5.0 / 0.05)
     assert answer["force_percent"] == pytest.approx(5.0)
 

@@ -1,4 +1,4 @@
-"""The file."""
+"""The file of contacts: what every method gets, with the truth that it is scored against."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from canprobe.lab.studies.shapes.scans import samples_of
 from canprobe.mechanics.touch.contact import ContactSample
 
 
-class Contacts(NamedTuple):
+class ShapeContacts(NamedTuple):
     """What a method gets of a shape.
 
     Attributes:
@@ -46,7 +46,7 @@ def read_columns(path: Path, name: str) -> dict[str, Array]:
     return {k.removeprefix(prefix): v for k, v in read_npz(path, "contacts").items() if k.startswith(prefix)}
 
 
-def read_contacts(path: Path, name: str) -> Contacts:
+def read_contacts(path: Path, name: str) -> ShapeContacts:
     """The contacts of a shape with the setup that was stated for all of them."""
     columns = read_columns(path, name)
     samples = samples_of(columns)
@@ -54,4 +54,4 @@ def read_contacts(path: Path, name: str) -> Contacts:
     assert isinstance(task, Touch)
     sigma = np.hypot(columns["sigma"][:, 0], columns["sigma"][:, 2])
     normal = np.hypot(SIGMA_NORMAL_RAD, sigma * centroid_coupling(task.probe))
-    return Contacts(samples, Touched(columns["p_base"], columns["n_base"], sigma, normal), task)
+    return ShapeContacts(samples, Touched(columns["p_base"], columns["n_base"], sigma, normal), task)

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from canprobe.cell.tasks.from_plan import make_shape_estimator
 from canprobe.cell.tasks.shape import replay_samples
 from canprobe.lab.studies.harness import Array
-from canprobe.lab.studies.shapes.contacts_file import Contacts
+from canprobe.lab.studies.shapes.contacts_file import ShapeContacts
 from canprobe.lab.studies.shapes.implicit import ImplicitSurface, Kernel, fit_quadric, rbf, thin_plate
 from canprobe.mechanics.touch.blend import REACH_M, Feet
 from canprobe.mechanics.touch.surface import SurfaceMatrix
@@ -28,7 +28,7 @@ from canprobe.mechanics.touch.surface_map import SPACING_M, LocalPatch, SurfaceM
 Settings = Mapping[str, float]
 
 
-class Surface(Protocol):
+class FittedSurface(Protocol):
     """What a method answers with; NaN where it has no surface, farther than `REACH_M` from every contact."""
 
     def closest(self, points: Array) -> Feet:
@@ -58,10 +58,10 @@ class Method(Protocol):
     @property
     def unit(self) -> str: ...
 
-    def develop(self, shapes: Sequence[Contacts]) -> Settings:
+    def develop(self, shapes: Sequence[ShapeContacts]) -> Settings:
         """Settings from the contacts of the development shapes."""
 
-    def fit(self, contacts: Contacts, budget: float, settings: Settings) -> Surface:
+    def fit(self, contacts: ShapeContacts, budget: float, settings: Settings) -> FittedSurface:
         """The surface of a shape."""
 
 
@@ -72,15 +72,15 @@ class MapSurface:
         self.map = surface_map
 
     def closest(self, points: Array) -> Feet:
-        """See `Surface`."""
+        """See `FittedSurface`."""
         return self.map.closest(points)
 
     def sigma(self, points: Array) -> Array:
-        """See `Surface`."""
+        """See `FittedSurface`."""
         return self.map.distance(points)[1]
 
     def curvature(self, points: Array) -> Array:
-        """See `Surface`."""
+        """See `FittedSurface`."""
         if not len(self.map):
             return np.full((len(points), 3, 3), math.nan)
         apart, nearest = cKDTree(self.map.points).query(points)
@@ -104,11 +104,11 @@ class Online:
         """In the table."""
         return f"{self.method} + patch" if self.patch else self.method
 
-    def develop(self, shapes: Sequence[Contacts]) -> Settings:
+    def develop(self, shapes: Sequence[ShapeContacts]) -> Settings:
         """Nothing: as packaged."""
         return {}
 
-    def fit(self, contacts: Contacts, budget: float, settings: Settings) -> MapSurface:
+    def fit(self, contacts: ShapeContacts, budget: float, settings: Settings) -> MapSurface:
         """See `Method`."""
         task = contacts.task
         assert task.shape is not None
@@ -128,11 +128,11 @@ class LocalFits:
     budgets: Sequence[float] = (3.0, 4.0, 6.0, 9.0)
     unit: str = "mm radius"
 
-    def develop(self, shapes: Sequence[Contacts]) -> Settings:
+    def develop(self, shapes: Sequence[ShapeContacts]) -> Settings:
         """Nothing to set."""
         return {}
 
-    def fit(self, contacts: Contacts, budget: float, settings: Settings) -> MapSurface:
+    def fit(self, contacts: ShapeContacts, budget: float, settings: Settings) -> MapSurface:
         """See `Method`."""
         p, n, _, _ = contacts.touched
         travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
@@ -167,7 +167,7 @@ class ProcessSurface:
         self._tree = cKDTree(contacts)
 
     def closest(self, points: Array) -> Feet:
-        """See `Surface`."""
+        """See `FittedSurface`."""
         f, g = self._process.value(points)
         size = np.linalg.norm(g, axis=1)
         height, normal = f / size, g / size[:, None]
@@ -183,12 +183,12 @@ class ProcessSurface:
         )
 
     def sigma(self, points: Array) -> Array:
-        """See `Surface`."""
+        """See `FittedSurface`."""
         sigma: Array = self._process.sigma(points) / np.linalg.norm(self._process.value(points)[1], axis=1)
         return sigma
 
     def curvature(self, points: Array) -> Array:
-        """See `Surface`."""
+        """See `FittedSurface`."""
         return self._process.curvature(points)
 
 
@@ -206,7 +206,7 @@ class Process:
     budgets: Sequence[float] = (50, 100, 200, 400)
     unit: str = "contacts"
 
-    def develop(self, shapes: Sequence[Contacts]) -> Settings:
+    def develop(self, shapes: Sequence[ShapeContacts]) -> Settings:
         """Scale and length."""
 
         def cost(x: Array) -> float:
@@ -220,11 +220,11 @@ class Process:
         found = minimize(cost, start, method="Nelder-Mead", options={"xatol": 0.02, "fatol": 0.5, "maxfev": 80})
         return dict(zip(("scale", "length"), np.exp(found.x).tolist(), strict=False))
 
-    def fit(self, contacts: Contacts, budget: float, settings: Settings) -> ProcessSurface:
+    def fit(self, contacts: ShapeContacts, budget: float, settings: Settings) -> ProcessSurface:
         """See `Method`."""
         return ProcessSurface(self._process(contacts, int(budget), settings), contacts.touched.points)
 
-    def _process(self, contacts: Contacts, count: int, settings: Settings) -> ImplicitSurface:
+    def _process(self, contacts: ShapeContacts, count: int, settings: Settings) -> ImplicitSurface:
         i = np.unique(np.linspace(0, len(contacts.samples) - 1, count).round().astype(int))
         length = settings["length"] if self.length is None else self.length
         return ImplicitSurface(self.kernel, settings["scale"], length, contacts.touched.some(i))

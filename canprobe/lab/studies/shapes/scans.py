@@ -1,4 +1,4 @@
-"""The shapes of the benchmark, their scans through the whole emulated sensor, and the file of contacts.
+"""The shapes of the benchmark, their scans through the whole emulated sensor.
 
 A scan is a weave of 32 by 14 mm at 25 mm/s and 2 N on the direct bus, with everything that an array does to a touch;
 shape, pose, path and array (its seed) are fixed. No seed here was used in a calibration or to look at an estimator.
@@ -120,14 +120,14 @@ def scene_of(name: str, folder: Path, seconds: float = SECONDS) -> Scene:
     )
 
 
-class Case(NamedTuple):
+class ScanCase(NamedTuple):
     """One scan."""
 
     shape: str
     seconds: float
 
 
-def scan(case: Case) -> dict[str, Array]:
+def scan(case: ScanCase) -> dict[str, Array]:
     """Columns of the file for one shape."""
     with TemporaryDirectory() as folder:
         scene = scene_of(case.shape, Path(folder), case.seconds)

@@ -17,9 +17,9 @@ from scipy.spatial import cKDTree
 from canprobe.cell.results.picture import GREEN, INK, METHOD_COLOURS, PINK, SKY, legend, log_scale, picture
 from canprobe.lab.studies.harness import Array, Column, Row, StudyResult
 from canprobe.lab.studies.result_files import measuring_facts
-from canprobe.lab.studies.shapes.contacts_file import Contacts, read_columns, read_contacts, write_contacts
-from canprobe.lab.studies.shapes.methods import METHODS, Method, Surface
-from canprobe.lab.studies.shapes.scans import DEVELOPMENT, SECONDS, TEST, Case, scan
+from canprobe.lab.studies.shapes.contacts_file import ShapeContacts, read_columns, read_contacts, write_contacts
+from canprobe.lab.studies.shapes.methods import METHODS, FittedSurface, Method
+from canprobe.lab.studies.shapes.scans import DEVELOPMENT, SECONDS, TEST, ScanCase, scan
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.touch.meshing import Mesh, mesh_of
 
@@ -52,7 +52,7 @@ COLUMNS = (
 )
 
 
-class Fit(NamedTuple):
+class MethodFit(NamedTuple):
     """A method (index in `METHODS`) with settings on a shape of a file of contacts; repeats where it is timed."""
 
     method: int
@@ -67,7 +67,7 @@ class Fit(NamedTuple):
 def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     """Scan the shapes, fit every method within every budget, and score."""
     develop, test = (DEVELOPMENT[:1], TEST[:1]) if quick else (DEVELOPMENT, TEST)
-    cases = [Case(name, 1.2 if quick else SECONDS) for name in (*develop, *test)]
+    cases = [ScanCase(name, 1.2 if quick else SECONDS) for name in (*develop, *test)]
     sweep.say(f"{len(cases)} scans of {cases[0].seconds:g} s")
     found = sweep.map(scan, cases, model=_SCANS)
     path = sweep.folder / FILE
@@ -76,9 +76,9 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     shapes = [read_contacts(path, name) for name in develop]
     settings = [method.develop(shapes) for method in METHODS]
 
-    def fits(shapes: Sequence[str]) -> list[Fit]:
+    def fits(shapes: Sequence[str]) -> list[MethodFit]:
         return [
-            Fit(m, budget, settings[m], shape, str(path), digest, 1 if quick else REPEATS)
+            MethodFit(m, budget, settings[m], shape, str(path), digest, 1 if quick else REPEATS)
             for m, method in enumerate(METHODS)
             for budget in (method.budgets[1:2] if quick else method.budgets)
             for shape in shapes
@@ -93,13 +93,13 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     return StudyResult("shapes", COLUMNS, rows, findings(rows, each), facts, partial(draw_shapes, rows))
 
 
-def surface_of(fit: Fit, contacts: Contacts) -> tuple[Surface, Mesh]:
+def surface_of(fit: MethodFit, contacts: ShapeContacts) -> tuple[FittedSurface, Mesh]:
     """A method's answer and its mesh; the cost of both is what a method costs."""
     surface = METHODS[fit.method].fit(contacts, fit.budget, fit.settings)
     return surface, mesh_of(surface.closest, contacts.touched.points[::20], CELL_M)
 
 
-def cost(fit: Fit) -> dict[str, float]:
+def cost(fit: MethodFit) -> dict[str, float]:
     """Processor time from contacts to mesh, median of the repeats, and the most memory that it takes at once."""
     contacts = read_contacts(Path(fit.path), fit.shape)
     times = []
@@ -114,13 +114,13 @@ def cost(fit: Fit) -> dict[str, float]:
     return {"cpu_s": statistics.median(times), "memory_mb": most / 1e6}
 
 
-def score(fit: Fit) -> dict[str, Any]:
+def score(fit: MethodFit) -> dict[str, Any]:
     """Scores of a method on one shape."""
     surface, mesh = surface_of(fit, read_contacts(Path(fit.path), fit.shape))
     return scored(surface, mesh, read_columns(Path(fit.path), fit.shape))
 
 
-def scored(surface: Surface, mesh: Mesh, truth: Mapping[str, Array]) -> dict[str, Any]:
+def scored(surface: FittedSurface, mesh: Mesh, truth: Mapping[str, Array]) -> dict[str, Any]:
     """Scores of a surface and its mesh against the columns of the truth; None where there is nothing to score."""
     points, normals = truth["truth_point"], truth["truth_normal"]
     tensors = truth["truth_tensor"].reshape(-1, 3, 3)
