@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 
 from canprobe.errors import PlanError
-from canprobe.mechanics.robot.chain import MOST_JOINTS, Chain
+from canprobe.mechanics.robot.chain import MAX_JOINTS, Chain
 from canprobe.mechanics.robot.model import Body, Joint, lopsided_inertia
 from canprobe.mechanics.robot.urdf_tree import UrdfTree, source_name, z_along
 
-LARGEST_RAD = 4 * math.pi
+MAX_STOP_RAD = 4 * math.pi
 """A stop of a revolute joint beyond it looks like one in degrees."""
 
 
@@ -60,11 +60,11 @@ def from_urdf(
     tree = UrdfTree.read(source)
     path = tree.path(base or tree.root(), tip or tree.only_end())
     moving = [edge for edge in path if edge.kind != "fixed"]
-    if len(moving) > MOST_JOINTS:
+    if len(moving) > MAX_JOINTS:
         raise PlanError(
             [
                 f"{tree.where}: {len(moving)} joints move between {path[0].parent!r} and {path[-1].child!r}, at most"
-                f" {MOST_JOINTS} can; choose a base nearer to the tip, such as --base {moving[-MOST_JOINTS].parent}"
+                f" {MAX_JOINTS} can; choose a base nearer to the tip, such as --base {moving[-MAX_JOINTS].parent}"
                 " (arm.base)"
             ]
         )
@@ -103,7 +103,7 @@ def limit_warning(source: str | Path, joint: Joint) -> str | None:
         source: path of the file, or its text.
         joint: as `from_urdf` read it.
     """
-    if joint.prismatic or max(-joint.q_min, joint.q_max) <= LARGEST_RAD:
+    if joint.prismatic or max(-joint.q_min, joint.q_max) <= MAX_STOP_RAD:
         return None
     return (
         f"{source_name(source)}: {joint.name}: <limit> from {joint.q_min:g} to {joint.q_max:g} rad looks like degrees;"

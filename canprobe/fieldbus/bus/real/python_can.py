@@ -28,10 +28,9 @@ from canprobe.fieldbus.bus.port import (
 )
 from canprobe.fieldbus.bus.real.echoes import Echoes
 from canprobe.fieldbus.protocol.frame_bits import FD_LENGTHS
-from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG, Frame
+from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EFF_FLAG, RTR_FLAG, Frame
 
 _EXTENDED_MASK = 0x1FFFFFFF
-CLASSIC_BYTES = 8
 _STATES = {
     can.BusState.ACTIVE: ControllerState.ACTIVE,
     can.BusState.PASSIVE: ControllerState.PASSIVE,

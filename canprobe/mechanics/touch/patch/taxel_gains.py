@@ -9,7 +9,7 @@ import numpy as np
 
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.patch.image_fit import Dwell, Shown
-from canprobe.mechanics.touch.patch.image_model import STEPS, ImageModel
+from canprobe.mechanics.touch.patch.image_model import STEPS_PER_PITCH, ImageModel
 from canprobe.mechanics.types import Floats
 
 
@@ -38,8 +38,10 @@ def taxel_gains(
                 continue
             x, y = u - stamps[t][0], v - stamps[t][1]
             along, across = np.abs(c * x + si * y), np.abs(-si * x + c * y)
-            expected = map_coordinates(mine, [along * STEPS - 0.5, across * STEPS - 0.5], order=1, mode="nearest")
-            inside = (expected > 0.25 * mine.max()) & (np.maximum(along, across) < len(mine) / STEPS)
+            expected = map_coordinates(
+                mine, [along * STEPS_PER_PITCH - 0.5, across * STEPS_PER_PITCH - 0.5], order=1, mode="nearest"
+            )
+            inside = (expected > 0.25 * mine.max()) & (np.maximum(along, across) < len(mine) / STEPS_PER_PITCH)
             share = expected[inside].sum() / max(float(image[inside].sum()), 1.0)
             seen[inside] += image[inside] * share
             wanted[inside] += expected[inside]
