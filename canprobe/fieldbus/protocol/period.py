@@ -23,11 +23,11 @@ class PeriodFit:
     """Fits a period to arrivals.
 
     Args:
-        period_ns: as stated; it tells how many images were lost until there is a fit.
+        period_ns: stated period; until there is a fit it gives the number of lost images.
 
     Attributes:
-        period_ns: fitted.
-        restarts: of the fit.
+        period_ns: fitted period.
+        restarts: how often the fit began anew.
     """
 
     def __init__(self, period_ns: float) -> None:
@@ -39,7 +39,7 @@ class PeriodFit:
         """Take an arrival.
 
         Args:
-            t_ns: of the first frame of an image, after the one before.
+            t_ns: arrival of the first frame of an image, after that of the image before.
 
         Returns:
             The fitted instant of this image, ns, and its standard deviation, s. Without a fit the arrival, and the

@@ -32,8 +32,8 @@ class UrdfArm:
         chain: from base to tip.
         joints: stops, speeds, friction; the effort limit stands for the rated torque. What the file leaves out has the
             defaults of `Joint`, but a speed limit that is missing is 0, which an `ArmModel` refuses.
-        bodies: (n,) of the joints; None for one without any inertial.
-        warnings: what the file says and hardly means.
+        bodies: (n,) bodies of the joints; None for a joint without any inertial.
+        warnings: statements of the file that look like mistakes.
     """
 
     chain: Chain
@@ -51,7 +51,7 @@ def from_urdf(
         source: path of the file, or its text.
         base: link that is the base frame; the root by default.
         tip: link whose frame is the flange; the only link without children by default.
-        name: of the arm; the robot's by default.
+        name: name of the arm; by default that of the robot.
 
     Raises:
         PlanError: no URDF, no path from base to tip, a joint on the path that a drive cannot move, or what `Chain`

@@ -165,6 +165,6 @@ def _chi_squared(rows: Floats, d: Floats, C: Floats) -> ChiSquared:
 
 
 def _tested(chi2: float, dof: int) -> ChiSquared:
-    from scipy.special import chdtrc
+    from scipy.special import chdtrc  # late: only a test of crossings needs it, and it takes long to load
 
     return ChiSquared(chi2, dof, float(chdtrc(dof, chi2)))

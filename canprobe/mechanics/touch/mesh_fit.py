@@ -52,9 +52,9 @@ class HeightGrid:
     """Heights of a mesh over a grid, as `Heights` takes them.
 
     Attributes:
-        heights: (m, n) m.
-        spacing: m.
-        origin: (2,) m, from the grid's middle.
+        heights: (m, n) heights, m.
+        spacing: spacing of the nodes, m.
+        origin: (2,) reference point, from the grid's middle, m.
         there: (m, n) whether the mesh has a surface at a node.
     """
 

@@ -48,10 +48,10 @@ class PythonCanPort(PlainPort):
     Args:
         interface: python-can's name of the interface, such as `virtual`, `pcan`, `slcan`.
         channel: the channel as that interface names it.
-        bitrate: in bit/s, for interfaces that set it themselves.
+        bitrate: bit rate, bit/s, for interfaces that set it themselves.
         clock: the clock for waits and stamps.
-        data_bitrate: of the data phase of CAN FD frames; None: classical frames only.
-        reports: who hears of error frames.
+        data_bitrate: bit rate of the data phase of CAN FD frames; None: classical frames only.
+        reports: receives error frames.
 
     Attributes:
         counters: what has passed; `ignored` are CAN FD frames where they are not wanted.

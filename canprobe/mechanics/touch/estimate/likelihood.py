@@ -39,11 +39,11 @@ class ContactBatch(NamedTuple):
     """Checked input of a batch fit.
 
     Attributes:
-        points, normals: (n, 3); the last row is now.
-        noise: of the n samples.
+        points, normals: (n, 3) m and unit vectors; the last row is now.
+        noise: noise of the n samples.
         extent: largest distance from the last point, never below noise, m: the unit of length.
         distance: length along the path, m.
-        correlation: of the noise along the path; None for independent samples.
+        correlation: correlation of the noise along the path; None for independent samples.
     """
 
     points: Floats

@@ -23,7 +23,7 @@ def taxel_gains(
     Returns:
         (rows, columns) gains, 1 where nothing is known; (row, column) of dead taxels.
     """
-    from scipy.ndimage import map_coordinates
+    from scipy.ndimage import map_coordinates  # late: only a calibration needs it, and it takes long to load
 
     seen, wanted, dead = np.zeros((3, *pad.shape))
     u, v = (pad.uv.T / pad.pitch_m).reshape(2, *pad.shape)
