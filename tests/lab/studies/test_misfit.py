@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from canprobe.lab.studies.ground import make_ground
-from canprobe.mechanics.touch.estimate import nonlinear as misfit
+from canprobe.mechanics.touch.estimate import misfit
 from canprobe.mechanics.touch.estimate.fit import fit_surface
 from canprobe.mechanics.touch.estimate.prior import Prior
 
