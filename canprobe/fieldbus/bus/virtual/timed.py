@@ -26,7 +26,7 @@ from canprobe.fieldbus.protocol.frame_bits import ERROR_DELIMITER_BITS, ERROR_FL
 from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, Frame
 
 Queue = Literal["priority", "fifo"]
-WAIT_STEP_NS = 50_000_000
+MAX_CLOSING_NS = 50_000_000
 """How long a port that closes lets the bus carry what is queued, at most."""
 _NS = 1_000_000_000
 _ERROR_BITS = 2 * ERROR_FLAG_BITS + ERROR_DELIMITER_BITS  # the others answer the flag of the first with theirs
@@ -348,7 +348,7 @@ class TimedBus(LockstepBus):
 
     def remove_port(self, port: LockstepPort) -> None:
         """Take a closed port off the bus, after what it has sent is through, and what is answered at once."""
-        limit_ns = self.clock.now_ns() + WAIT_STEP_NS
+        limit_ns = self.clock.now_ns() + MAX_CLOSING_NS
         while (self._flying is not None or self._ready) and self.clock.step(limit_ns):
             pass
         super().remove_port(port)
