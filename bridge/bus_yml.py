@@ -29,7 +29,6 @@ from canprobe.cell.planning.model import (
     PlannedNode,
     PlannedPdo,
 )
-from canprobe.cell.planning.wire_time import CLASSIC_BYTES
 from canprobe.cell.scene.load import MOST_BYTES
 from canprobe.errors import UsageError, regular_file
 from canprobe.fieldbus.bus.files import whole_file, write_text
@@ -37,6 +36,7 @@ from canprobe.fieldbus.eds.device_info import commissioned_node
 from canprobe.fieldbus.eds.findings import EdsFindings
 from canprobe.fieldbus.eds.packaged import eds_file
 from canprobe.fieldbus.eds.sections import decode, split_sections
+from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES
 from canprobe.lab.bridge.database import need
 
 _PURPOSE = "a bus.yml"

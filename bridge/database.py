@@ -14,10 +14,9 @@ from typing import Any
 
 from canprobe.cell.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan, PlannedPdo
 from canprobe.cell.planning.traffic import SYNCHRONOUS
-from canprobe.cell.planning.wire_time import CLASSIC_BYTES
 from canprobe.errors import UsageError, install_line
 from canprobe.fieldbus.bus.files import write_text
-from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, NmtState
+from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, NmtState
 from canprobe.fieldbus.protocol.pdo import PdoEntry
 
 FORMATS = ("dbc", "kcd")

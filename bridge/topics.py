@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.planning.wire_time import CLASSIC_BYTES
 from canprobe.cell.scene.geometry import T_flange_probe
 from canprobe.cell.session.target import VIRTUAL
 from canprobe.fieldbus.bus.port import TimedFrame
+from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES
 from canprobe.lab.bridge.description import axis_transforms, robot_description
 from canprobe.lab.bridge.frames import flange_transform, link_transforms, quaternion_of
 from canprobe.lab.bridge.messages import CAN_FD_FRAME, CAN_FRAME, Encoder, _identifier, encode_can_frame

@@ -147,6 +147,6 @@ def check_eds(name_or_path: str | os.PathLike[str], node_id: int | None = None) 
 
 @lru_cache(maxsize=64)
 def _parse(path: Path, _mtime_ns: int, node_id: int) -> canopen.ObjectDictionary:
-    from canprobe.fieldbus.eds.reading import read_eds
+    from canprobe.fieldbus.eds.reading import read_eds  # late, as above
 
     return read_eds(path, node_id, serving=False).usable()

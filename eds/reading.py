@@ -29,7 +29,7 @@ from canprobe.fieldbus.eds.structure import build_objects, find_objects
 _INVALID = 1 << 31
 _CAN_ID = 0x1FFFFFFF
 _MOST = 0xFFFFFFFF
-_MOST_BITS = 64
+_MAX_BITS = 64
 _PROFILE = 0xFFFF
 _DRIVE_PROFILE = 402
 _SERVO_DRIVE = 0x00020192
@@ -257,8 +257,8 @@ class _Repair:
             elif not target.pdo_mappable and target.index > 7:
                 self._warn((target.index, target.subindex), f"is mapped in {index:04X}h, so 1", "PDOMapping")
                 target.pdo_mappable = serving
-        if bits > _MOST_BITS:
-            self._warn((index, 0), f"maps {bits} bits, but a frame has {_MOST_BITS}; the PDO is served empty")
+        if bits > _MAX_BITS:
+            self._warn((index, 0), f"maps {bits} bits, but a frame has {_MAX_BITS}; the PDO is served empty")
 
     def _check_pdo_counts(self) -> None:
         section = self._source.sections.get("deviceinfo")
@@ -296,7 +296,7 @@ def _text(variable: ODVariable) -> tuple[str, str]:
 def _words(od: ObjectDictionary, index: int) -> Iterator[tuple[int, int]]:
     """Sub-index and word of each entry that is mapped."""
     count = _present(variable_at(od, index, 0))
-    for subindex in range(1, min(count, _MOST_BITS) + 1):
+    for subindex in range(1, min(count, _MAX_BITS) + 1):
         if word := _present(variable_at(od, index, subindex)):
             yield subindex, word
 

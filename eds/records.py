@@ -18,7 +18,7 @@ ARRAY, RECORD = 8, 9
 """Object codes."""
 Subs = dict[int, Section]
 """Sections of an object's sub-objects by subindex."""
-_MOST_COMPACT = 254
+_MAX_COMPACT = 254
 
 
 def build_composite(source: Source, index: int, head: Section, subs: Subs, kind: int) -> ODArray | ODRecord | None:
@@ -56,9 +56,9 @@ def build_composite(source: Source, index: int, head: Section, subs: Subs, kind:
 def _compact_members(source: Source, index: int, head: Section) -> dict[int, ODVariable]:
     """Members of an object with CompactSubObj; names and values from [indexName] and [indexValue]."""
     count = source.number(head, "CompactSubObj")
-    if not 0 < count <= _MOST_COMPACT:
+    if not 0 < count <= _MAX_COMPACT:
         if count:
-            source.warn(head, "CompactSubObj", f"{count} is not 1..{_MOST_COMPACT}; ignored")
+            source.warn(head, "CompactSubObj", f"{count} is not 1..{_MAX_COMPACT}; ignored")
         return {}
     template = build_variable(source, head, index, 1, composite=True)
     members = {0: _count_of(index, 0 if index in COUNTING else count)}

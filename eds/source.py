@@ -15,9 +15,9 @@ class Source:
     """An EDS file in pieces.
 
     Attributes:
-        sections: of the file.
-        node_id: for $NODEID.
-        faults: collects what is wrong.
+        sections: sections of the file.
+        node_id: value of $NODEID.
+        faults: findings so far.
         drive: the device is a drive of CiA 402.
     """
 
@@ -39,7 +39,7 @@ class Source:
         return lambda text: self.warn(section, key, text)
 
     def number(self, section: Section, key: str, default: int = 0) -> int:
-        """An integer that does no harm when it is wrong; `default` where it is missing, empty or none."""
+        """An integer that does no harm when it is wrong; `default` where it is missing, empty or not a number."""
         text = section.value(key)
         if not text:
             return default

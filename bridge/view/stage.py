@@ -23,7 +23,7 @@ from canprobe.lab.bridge.view.object_sheet import object_lines, object_mesh
 from canprobe.lab.bridge.view.path_nodes import PATH
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.touch.pad import Pad
-from canprobe.mechanics.touch.patch.array_calibration import NOMINAL
+from canprobe.mechanics.touch.patch.array_calibration import NO_FORCE_REFERENCE
 from canprobe.mechanics.touch.shapes import PlacedShape
 
 OBJECT, PROBE, FORCE = (126, 150, 176), (78, 88, 104), (214, 40, 30)
@@ -76,7 +76,9 @@ class Stage:
         self._shape = None if scene.object is None else true_object(scene.object)
         self._probe = None
         self._tool = np.eye(4) if scene.probe is None else T_flange_probe(scene.probe)
-        self.notes: list[str] = [] if array is None or array.newtons != NOMINAL else [f"force in {NOMINAL}"]
+        self.notes: list[str] = (
+            [] if array is None or array.newtons != NO_FORCE_REFERENCE else [f"force in {NO_FORCE_REFERENCE}"]
+        )
         self._place, self._moved, self._met = place_of(scene), dict[int, Array](), dict[int, float]()
         self._clock = MonotonicClock()
         self._truth: list[Any] = []

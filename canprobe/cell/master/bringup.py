@@ -27,7 +27,7 @@ from canprobe.cell.planning.configuration import NodeSetup, Write
 from canprobe.cell.planning.operation import INTERPOLATION_TIME
 from canprobe.cell.scene.setup import BringUpTimes as Settings
 from canprobe.errors import BusError, NodeError
-from canprobe.fieldbus.bus.presence import SECOND_S, UPLOAD_DEVICE_TYPE
+from canprobe.fieldbus.bus.presence import SECOND_ANSWER_S, UPLOAD_DEVICE_TYPE
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.sdo import (
     Dialogues,
@@ -175,7 +175,7 @@ class BringUp:
                 "; check power, node id, bit rate and termination, or mark it emulated in the scene",
                 *missing,
             )
-        self._network.pump_until(lambda: False, SECOND_S)
+        self._network.pump_until(lambda: False, SECOND_ANSWER_S)
         self._booted = dict(boot_ups)
         for setup in self._setups:
             count = self._booted[setup.node_id] - before[setup.node_id]
@@ -194,7 +194,7 @@ class BringUp:
         try:
             self._network.send_message(SDO_RX_BASE + setup.node_id, UPLOAD_DEVICE_TYPE)
             self._network.pump_until(lambda: bool(answers), self._settings.sdo_s)
-            self._network.pump_until(lambda: len(answers) > 1, SECOND_S)
+            self._network.pump_until(lambda: len(answers) > 1, SECOND_ANSWER_S)
         finally:
             self._network.unsubscribe(cob_id, take)
         if len(answers) > 1:

@@ -19,11 +19,10 @@ from canprobe.fieldbus.bus.port import TimedFrame
 from canprobe.fieldbus.protocol.cia402 import describe_state
 from canprobe.fieldbus.protocol.emcy import Emcy, describe, is_no_error
 from canprobe.fieldbus.protocol.frame_bits import best_case_bits, best_case_fd_bits
-from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, unpack_heartbeat
+from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, unpack_heartbeat
 from canprobe.mechanics.robot.model import units_to_joints
 
 SECOND_NS = 1_000_000_000
-CLASSIC_BYTES = 8
 
 
 @dataclass(slots=True)

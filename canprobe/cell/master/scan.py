@@ -12,7 +12,7 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 from canprobe.cell.master.lss_session import MOST_NODES
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.bus.port import Port
-from canprobe.fieldbus.bus.presence import SECOND_S, answering_nodes
+from canprobe.fieldbus.bus.presence import SECOND_ANSWER_S, answering_nodes
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.sdo import decode_text, hold_dialogues, upload
 from canprobe.fieldbus.protocol.frames import (
@@ -88,7 +88,7 @@ def scan_nodes(port: Port, timeout_s: float) -> list[dict[str, Any]]:
     read = {node_id: dict[str, Any]() for node_id in answering_nodes(network, seen, timeout_s)}
     hold_dialogues(network, {node_id: _identify(node) for node_id, node in read.items()}, timeout_s=timeout_s)
     rest_s = (end_ns - port.clock.now_ns()) * 1e-9
-    network.pump_until(lambda: False, max(rest_s, SECOND_S))
+    network.pump_until(lambda: False, max(rest_s, SECOND_ANSWER_S))
     unread: dict[str, Any] = dict.fromkeys((*NUMBERS, "device_name"))
     return [
         {

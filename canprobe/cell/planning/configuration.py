@@ -41,7 +41,6 @@ from canprobe.cell.planning.units import (
     speed_unit,
     turn_units,
 )
-from canprobe.cell.planning.wire_time import CLASSIC_BYTES
 from canprobe.fieldbus.eds.description import DescribedEntry, Description
 from canprobe.fieldbus.eds.packaged import (
     FULL_SCALE,
@@ -55,6 +54,7 @@ from canprobe.fieldbus.eds.packaged import (
 )
 from canprobe.fieldbus.eds.values import name_of
 from canprobe.fieldbus.protocol.cia402 import OperationMode
+from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES
 from canprobe.fieldbus.protocol.si_unit import ACCELERATION, VELOCITY
 from canprobe.fieldbus.protocol.tactile import TactileMode
 from canprobe.mechanics.robot.model import coupled_joints, drive_position_at, joints_to_units

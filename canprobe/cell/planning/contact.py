@@ -23,7 +23,7 @@ from canprobe.cell.scene.setup import Array, Calibrate, Probe, Touch
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.inverse import FIXED_POLE, task_rows
 from canprobe.mechanics.robot.motors import position_per_unit
-from canprobe.mechanics.touch.stops import MOST_SPREAD, OFF_PAD, OFF_PAD_SIGMAS
+from canprobe.mechanics.touch.stops import MAX_FORCE_SPREAD, OFF_PAD_EDGE_SHARE, OFF_PAD_SIGMAS
 
 Floats = NDArray[np.float64]
 GAIN_SPREAD = 0.05
@@ -105,10 +105,10 @@ def settling_problem(task: Touch, joints: Floats, normals: Floats, force_max_n: 
     depth = pressed(task.force, task.probe, task.array, (0.0, 0.0)).depth
     worst = int(np.argmax(sigmas))
     spread = 2.0 * float(sigmas[worst]) / depth
-    if spread <= MOST_SPREAD:
+    if spread <= MAX_FORCE_SPREAD:
         return None
     coarsest = int(np.argmax(each[worst]))
-    joint, beyond = model.joints[coarsest], spread / MOST_SPREAD
+    joint, beyond = model.joints[coarsest], spread / MAX_FORCE_SPREAD
     ways = [f"let the drive of {joint.name} count finer"]
     if task.force * beyond**2 <= force_max_n:
         ways.append(f"raise task.force_n to {1.01 * task.force * beyond**2:.3g}")
@@ -116,8 +116,8 @@ def settling_problem(task: Touch, joints: Floats, normals: Floats, force_max_n: 
     return (
         f"joints.{joint.name}: one count moves the probe by {1e3 * each[worst, coarsest]:.2g} mm along the normal, and "
         f"all joints together by {1e3 * sigmas[worst]:.2g} mm (1σ), where {task.force:g} N press the layer in by "
-        f"{1e3 * depth:.2g} mm: the force would swing by {100 * spread:.0f} %, and above {100 * MOST_SPREAD:.0f} % it "
-        f"does not settle; {' or '.join(ways)}"
+        f"{1e3 * depth:.2g} mm: the force would swing by {100 * spread:.0f} %, and above "
+        f"{100 * MAX_FORCE_SPREAD:.0f} % it does not settle; {' or '.join(ways)}"
     )
 
 
@@ -163,7 +163,7 @@ def edge_margin(task: Touch, kappa: Sequence[float] = (0.0, 0.0)) -> float:
     half_axis = pressed(task.force, task.probe, array, kappa).half_axis
     if array.mode == "features":
         return OFF_PAD_SIGMAS * math.sqrt(half_axis**2 / 6.0 + _blur_m(array) ** 2)
-    return 0.5 * array.pad.pitch_m + half_axis * math.sqrt(1.0 - OFF_PAD + GAIN_SPREAD)
+    return 0.5 * array.pad.pitch_m + half_axis * math.sqrt(1.0 - OFF_PAD_EDGE_SHARE + GAIN_SPREAD)
 
 
 def edge_problem(task: Touch, joints: Floats, normals: Floats, kappas: Floats) -> str | None:

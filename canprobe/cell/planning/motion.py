@@ -19,8 +19,8 @@ from canprobe.mechanics.robot.chain import forward, forward_jacobian
 from canprobe.mechanics.robot.inverse import FIXED_POLE, LENGTH_M, in_rows, inverse_near, task_rows
 from canprobe.mechanics.robot.probe_poses import probe_pose, start_posture
 from canprobe.mechanics.touch.probe_motion import (
+    EXTRA_CLEARANCE_M,
     MOVE_SPEED,
-    OFF_M,
     RETREAT_SPEED,
     ROUND_SPEED,
     SETTLE_S,
@@ -392,7 +392,7 @@ def _round_ball(task: Calibrate, pose: ProbePose) -> Iterator[_Timed]:
     for touch in task.approaches:
         above, on, off = (
             ProbePose(task.ball_centre + (radii + gap) * touch.n_base, touch.pole_base)
-            for gap in (task.approach.clearance, 0.0, task.approach.clearance + OFF_M)
+            for gap in (task.approach.clearance, 0.0, task.approach.clearance + EXTRA_CLEARANCE_M)
         )
         yield from _moving(ArcMotion(task.ball_centre, pose, above, ROUND_SPEED))
         yield on, down_s

@@ -14,7 +14,7 @@ from canprobe.cell.planning.window import (
 from canprobe.cell.scene.setup import Setup
 from canprobe.fieldbus.protocol.frame_bits import WORST_ERROR_BITS
 from canprobe.mechanics.robot.inverse import FULL_POSE, task_rows
-from canprobe.mechanics.touch.patch.array_calibration import NOMINAL
+from canprobe.mechanics.touch.patch.array_calibration import NO_FORCE_REFERENCE
 
 ON_THIS_MACHINE = "ff11::ca"
 """A multicast group of interface-local scope, which no packet leaves or enters. Source: RFC 4291, 2.7."""
@@ -62,7 +62,7 @@ def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
         yield from setup.arm.warnings
     if setup.arm is not None and not all(drive.emulated for drive in setup.arm.drives):
         yield from long_waits(setup.arm.missed_syncs, setup.rate_hz)
-    if setup.array is not None and setup.array.newtons == NOMINAL:
+    if setup.array is not None and setup.array.newtons == NO_FORCE_REFERENCE:
         yield (
             "sensor.calibration: the array measures in nominal newtons, as good as its stated full scale;"
             " `canprobe calibrate array CELL --force-reference scale` gives them a reference"

@@ -15,8 +15,7 @@ from canprobe.fieldbus.protocol.frame_bits import (
     worst_case_bits,
     worst_case_fd_bits,
 )
-
-CLASSIC_BYTES = 8
+from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES
 
 
 def frame_bits(n_data: int, bus: Bus) -> int:

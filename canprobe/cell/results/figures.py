@@ -28,7 +28,7 @@ from canprobe.cell.results.surface_panels import Array, Plane, add_sheet, map_su
 from canprobe.cell.tasks.probing import Phase
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.patch.array_calibration import NOMINAL
+from canprobe.mechanics.touch.patch.array_calibration import NO_FORCE_REFERENCE
 
 Panel = Callable[[SubFigure, RunResult], None]
 TWO_SIGMA = 1.96
@@ -87,7 +87,7 @@ def _rows(result: RunResult) -> list[list[tuple[Panel, float]]]:
 def _title(result: RunResult) -> str:
     summary = result.summary
     truth = "black and grey: true, of the emulated plant, unknown to the cell" if result.truth else "no truth is known"
-    newtons = f" · {NOMINAL}" if summary["newtons"] == NOMINAL else ""
+    newtons = f" · {NO_FORCE_REFERENCE}" if summary["newtons"] == NO_FORCE_REFERENCE else ""
     end = "" if summary["completed"] else f"\nstopped: {summary['stop_reason']}"
     scene = result.plan.scene.title or summary["scene"]
     return f"{scene}\n{summary['bus']}, seed {summary['seed']} · colour: measured and estimated; {truth}{newtons}{end}"

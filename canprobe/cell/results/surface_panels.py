@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from canprobe.mechanics.touch.blend import REACH_M
-from canprobe.mechanics.touch.consistency import LEVEL, Consistency
+from canprobe.mechanics.touch.consistency import SIGNIFICANCE_LEVEL, Consistency
 from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.touch.surface_map import SurfaceMap
 from canprobe.mechanics.touch.tangent_frames import tangent_rotation
@@ -61,7 +61,7 @@ class Plane(NamedTuple):
 
 def rejected(consistency: Consistency) -> NDArray[np.bool_]:
     """(n,) whether the joint test of each crossing rejects one surface."""
-    return np.array([c.joint.p < LEVEL for c in consistency.crossings], dtype=bool)
+    return np.array([c.joint.p < SIGNIFICANCE_LEVEL for c in consistency.crossings], dtype=bool)
 
 
 def true_surface(shape: PlacedShape, path: Array, plane: Plane) -> Array:

@@ -13,7 +13,7 @@ from canprobe.cell.scene.model import TOUCH_KINDS, Scene, WireSettings
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.raw_image import FramePattern, ImageFormat
 from canprobe.fieldbus.protocol.tactile import SIDE, WINDOWS
-from canprobe.mechanics.robot.chain import MOST_JOINTS
+from canprobe.mechanics.robot.chain import MAX_JOINTS
 
 _USUALLY = {
     "arm": ("may", ""),
@@ -82,8 +82,8 @@ def _across(*keys: str) -> Callable[[Callable[..., _Complaint]], Callable[..., _
 
 @_across("arm", "joints")
 def _joints_missing(arm: object, joints: Mapping[str, JointSettings]) -> _Complaint:
-    if not 1 <= len(joints) <= MOST_JOINTS:
-        yield "joints", f"expected 1 to {MOST_JOINTS} sections [joints.NAME], got {len(joints)}"
+    if not 1 <= len(joints) <= MAX_JOINTS:
+        yield "joints", f"expected 1 to {MAX_JOINTS} sections [joints.NAME], got {len(joints)}"
 
 
 @_across("joints", "arm.urdf?")

@@ -35,7 +35,7 @@ from canprobe.fieldbus.protocol.raw_image import ImageFormat
 from canprobe.mechanics.robot.model import ArmModel, Body
 from canprobe.mechanics.robot.tool_calibration import BallApproach
 from canprobe.mechanics.touch.pad import Pad
-from canprobe.mechanics.touch.patch.array_calibration import NOMINAL, ArrayCalibration
+from canprobe.mechanics.touch.patch.array_calibration import NO_FORCE_REFERENCE, ArrayCalibration
 from canprobe.mechanics.touch.servo import SurfaceGains
 from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.touch.strategies import Strategy
@@ -200,7 +200,7 @@ class Array(Node):
     @property
     def newtons(self) -> str:
         """What the array's newtons are, in words."""
-        return self.calibration.newtons if self.calibrated else NOMINAL
+        return self.calibration.newtons if self.calibrated else NO_FORCE_REFERENCE
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -29,7 +29,7 @@ from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.operation import INTERPOLATION_TIME
 from canprobe.errors import NodeError
 from canprobe.fieldbus.bus.port import Port
-from canprobe.fieldbus.bus.presence import SECOND_S
+from canprobe.fieldbus.bus.presence import SECOND_ANSWER_S
 from canprobe.fieldbus.drive.drive import DriveApplication
 from canprobe.fieldbus.node.abort import SdoAbort, nothing
 from canprobe.fieldbus.node.core import NodeCore
@@ -210,7 +210,7 @@ class DirectCycle(Cycle):
         tactile: TactileReceiver | None,
         **more: Any,
     ) -> None:
-        port.clock.sleep_until_ns(port.clock.now_ns() + round(SECOND_S * 1e9))  # as bring-up for second boot-ups
+        port.clock.sleep_until_ns(port.clock.now_ns() + round(SECOND_ANSWER_S * 1e9))  # as bring-up for second boot-ups
         super().__init__(port, plan, drives=drives, tactile=tactile, **more)
         self._clock, self._first_look_ns = port.clock, self._looks_ns[0]
         self._counter = 0

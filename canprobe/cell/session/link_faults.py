@@ -13,7 +13,7 @@ from canprobe.fieldbus.bus.real.link import (
     SLOW_BIT_S,
     SLOW_SAMPLE,
     TX_QUEUE,
-    VIRTUAL,
+    VIRTUAL_KINDS,
     LinkState,
     emptying_line,
     ip_line,
@@ -74,7 +74,7 @@ def expected_of(plan: Plan) -> dict[str, Expected]:
 
 def check_link(link: LinkState, expected: Expected) -> list[Remark]:
     """Everything that is wrong with an interface; nothing where all is well, and nothing of a virtual one."""
-    if link.kind in VIRTUAL:
+    if link.kind in VIRTUAL_KINDS:
         return []
     checks = (_rates, _modes, _state, _sample_point, _restart, _queue)
     return [remark for check in checks for remark in check(link, expected)]

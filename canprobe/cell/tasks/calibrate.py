@@ -20,7 +20,7 @@ from canprobe.mechanics.robot.tool_calibration import BallModel, BallTouch, Tool
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.layer_stiffness import PushFit
 from canprobe.mechanics.touch.patch.image import Patch
-from canprobe.mechanics.touch.probe_motion import OFF_M, ROUND_SPEED, ArcMotion
+from canprobe.mechanics.touch.probe_motion import EXTRA_CLEARANCE_M, ROUND_SPEED, ArcMotion
 from canprobe.mechanics.touch.servo import ProbePose
 
 Vector = NDArray[np.float64]
@@ -173,4 +173,4 @@ class CalibrateTask(ProbingTask):
 
     def _let_go(self) -> None:
         n = self._stay().centre - self._ball.c_base
-        self._draw_back(n / np.linalg.norm(n) * (self._task.approach.clearance + OFF_M))
+        self._draw_back(n / np.linalg.norm(n) * (self._task.approach.clearance + EXTRA_CLEARANCE_M))

@@ -20,7 +20,7 @@ from types import TracebackType
 from canprobe.errors import UsageError, regular_file
 from canprobe.fieldbus.bus.files import writing
 from canprobe.fieldbus.bus.port import ControllerState, PlainPort, Port, TimedFrame
-from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG, Frame
+from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EFF_FLAG, RTR_FLAG, Frame
 
 # candump log files: `(0000000000.002500) can0 181#37060000`, time with six digits, from 0 in a recording of ours.
 # candump pads the channel on the left (several interfaces), writes nine digits with -N, the DLC of a frame of 8 bytes
@@ -45,7 +45,6 @@ _ENCODINGS = {
 """By the first two bytes; anything else is ASCII."""
 
 
-CLASSIC_BYTES = 8
 _BIT_RATE_SWITCH = 1
 _FRAMES = 32
 """Frames that are kept as they are before they become lines, which is quicker for many at once."""

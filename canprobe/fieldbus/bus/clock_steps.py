@@ -34,7 +34,7 @@ _SYNCS_COUNTED = 12
 """SYNCs on each side of a small step that say by how much."""
 _TIMELESS_NS = 100_000
 """SYNCs that are nearer to each other, by the middle half of their stamps, have no stamps of a clock."""
-_MOST_TOLD = 5
+_MAX_REPORTED = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,8 +152,8 @@ class RecordedBus:
 
     def notes(self) -> list[str]:
         """What was mended, as lines of a report."""
-        told = [step.text() for step in self.steps[:_MOST_TOLD]]
-        more = len(self.steps) - _MOST_TOLD
+        told = [step.text() for step in self.steps[:_MAX_REPORTED]]
+        more = len(self.steps) - _MAX_REPORTED
         return [*told, f"and {more} more steps of the clock"] if more > 0 else told
 
     def _steps_of(self, channel: str, syncs: list[_Sync]) -> Iterator[ClockStep]:

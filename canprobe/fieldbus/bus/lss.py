@@ -11,7 +11,7 @@ from canprobe.fieldbus.protocol.lss import (
     LSS_ANSWER_ID,
     LSS_LENGTH,
     LSS_REQUEST_ID,
-    NOTHING_ASKED,
+    PRESENCE_CHECK,
     LssAddress,
     LssCommand,
     LssError,
@@ -85,7 +85,7 @@ class Lss:
             LssAnswerError: somebody answers, but to no address: answers were lost or came late.
         """
         for timeout_s in (SEARCH_S, 5 * SEARCH_S):
-            if not self._identified(0, NOTHING_ASKED, 0, 0, ANSWER_S):
+            if not self._identified(0, PRESENCE_CHECK, 0, 0, ANSWER_S):
                 return None
             if (address := self._search(timeout_s)) is not None:
                 return address

@@ -7,10 +7,10 @@ from collections.abc import Iterable
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.protocol.frames import SDO_RX_BASE, SDO_TX_BASE
 
-SECOND_S = 0.05
+SECOND_ANSWER_S = 0.05
 """In which a second answer to one request is waited for: two devices have one node id."""
 UPLOAD_DEVICE_TYPE = bytes((0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0))
-BURST = 8
+BURST_FRAMES = 8
 BURST_PAUSE_S = 0.002
 
 
@@ -34,8 +34,10 @@ def answering_nodes(network: PumpedNetwork, node_ids: Iterable[int], timeout_s: 
     for node_id in asked:
         network.subscribe(SDO_TX_BASE + node_id, take)
     try:
-        for first in range(0, len(asked), BURST):
-            network.port.send_batch([(SDO_RX_BASE + n, UPLOAD_DEVICE_TYPE) for n in asked[first : first + BURST]])
+        for first in range(0, len(asked), BURST_FRAMES):
+            network.port.send_batch(
+                [(SDO_RX_BASE + n, UPLOAD_DEVICE_TYPE) for n in asked[first : first + BURST_FRAMES]]
+            )
             network.pump_until(lambda: len(found) == len(asked), BURST_PAUSE_S)
         network.pump_until(lambda: len(found) == len(asked), timeout_s)
     finally:

@@ -26,7 +26,7 @@ Dialogue = Generator[bytes | None, bytes, Any]
 
 _LENGTH = 8
 _ABORT, _DOWNLOADED, _UPLOADED, _SEGMENT, _EXPEDITED, _SIZED = 0x80, 0x60, 0x40, 0x00, 0x02, 0x01
-_MOST_EXPEDITED = 4
+_MAX_EXPEDITED = 4
 _NOT_TOGGLED, _TIMED_OUT, _OUT_OF_MEMORY = 0x05030000, 0x05040000, 0x05040005
 _TOO_LONG, _TOO_SHORT, _GENERAL = 0x06070012, 0x06070013, 0x08000000
 MAX_UPLOAD_BYTES = 4096
@@ -48,9 +48,9 @@ def download(index: int, subindex: int, data: bytes) -> Generator[bytes | None, 
         SdoAbortedError: the node refused.
         SdoCommunicationError: no answer, or more than four bytes.
     """
-    if not 0 < len(data) <= _MOST_EXPEDITED:
+    if not 0 < len(data) <= _MAX_EXPEDITED:
         raise SdoCommunicationError(f"{index:04X}h:{subindex:02X} takes {len(data)} bytes; a concise write has 1 to 4")
-    command = 0x23 | (_MOST_EXPEDITED - len(data)) << 2
+    command = 0x23 | (_MAX_EXPEDITED - len(data)) << 2
     yield from _answered(bytes((command,)), index, subindex, data.ljust(4, b"\0"), _DOWNLOADED)
 
 
@@ -73,7 +73,7 @@ def read_value(variable: ODVariable) -> Generator[bytes | None, bytes, Any]:
     return variable.decode_raw(own)
 
 
-def upload(index: int, subindex: int, size: int = _MOST_EXPEDITED) -> Generator[bytes | None, bytes, bytes]:
+def upload(index: int, subindex: int, size: int = _MAX_EXPEDITED) -> Generator[bytes | None, bytes, bytes]:
     """Read an entry of any length.
 
     Args:

@@ -16,7 +16,7 @@ from canopen.objectdictionary import ObjectDictionary
 
 from canprobe.fieldbus.drive.mode import DriveParts
 from canprobe.fieldbus.drive.modes import make_modes
-from canprobe.fieldbus.drive.parameters import STAYS_STOPPED
+from canprobe.fieldbus.drive.parameters import STAYING_QUICK_STOP_OPTIONS
 from canprobe.fieldbus.drive.reference import STEP_NS, AxisPlant
 from canprobe.fieldbus.drive.units import FACTORS, Delivery
 from canprobe.fieldbus.node.abort import Abort, SdoAbort
@@ -175,7 +175,7 @@ class DriveApplication(Application):
         repeated, self._command = command is self._command, command
         goal = None if command is None else TRANSITIONS.get((self.state, command))
         resumes = self.state is DriveState.QUICK_STOP_ACTIVE and goal is _ENABLED
-        if goal is None or (resumes and (repeated or self._parameters.quick_stop not in STAYS_STOPPED)):
+        if goal is None or (resumes and (repeated or self._parameters.quick_stop not in STAYING_QUICK_STOP_OPTIONS)):
             self._idle_word = word
             return  # a drive that stopped by itself is not restarted by a controlword that merely repeats
         self._go(goal, t_ns)
@@ -271,7 +271,7 @@ class DriveApplication(Application):
             self._motion.hold(t_ns)
 
     def _stopped(self, t_ns: int) -> None:
-        if self._parameters.quick_stop in STAYS_STOPPED:
+        if self._parameters.quick_stop in STAYING_QUICK_STOP_OPTIONS:
             self._standstill = True
             self._show()
         else:

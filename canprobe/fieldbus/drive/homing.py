@@ -29,11 +29,11 @@ from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.entry import Value, key_of
 from canprobe.fieldbus.protocol.cia402 import HOMING_ATTAINED, HOMING_ERROR, HOMING_START, OperationMode
 
-HERE = frozenset({35, 37})
+PRESENT_POSITION_METHODS = frozenset({35, 37})
 INDEX_DIRECTIONS = {33: -1, 34: 1}
 SWITCH_DIRECTIONS = {1: -1, 2: 1, 17: -1, 18: 1}
 SWITCH_AND_INDEX = frozenset({1, 2})
-METHODS = frozenset({0, *HERE, *INDEX_DIRECTIONS, *SWITCH_DIRECTIONS})
+HOMING_METHODS = frozenset({0, *PRESENT_POSITION_METHODS, *INDEX_DIRECTIONS, *SWITCH_DIRECTIONS})
 SEARCH_TURNS = 2.0
 SEARCH_S = 180.0
 """Time at full speed in which a limit switch has to be found, or left."""
@@ -121,7 +121,7 @@ class HomingMode(ProfiledMode):
         self._method, self._standstill = int(self._values.get(_METHOD, 0)), False
         positive = 1 if self._units.scale > 0.0 else -1
         here = self.parts.feedback.measure(t_ns)
-        if self._method in HERE:
+        if self._method in PRESENT_POSITION_METHODS:
             self._motion.decelerate(t_ns, self._parameters.homing_acceleration)
             self._home = here
             self._attain(t_ns)
@@ -208,5 +208,5 @@ def next_pulse(counts: float, direction: int, turn: float) -> float:
 
 
 def _check_method(subindex: int, value: Value) -> None:
-    if value not in METHODS:
+    if value not in HOMING_METHODS:
         raise SdoAbort(Abort.VALUE)

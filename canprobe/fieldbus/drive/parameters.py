@@ -14,13 +14,13 @@ from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.dictionary import Dictionary
 from canprobe.fieldbus.node.entry import Value
 
-STAYS_STOPPED = frozenset({5, 6})  # of 605Ah: remain in QUICK_STOP_ACTIVE
+STAYING_QUICK_STOP_OPTIONS = frozenset({5, 6})  # of 605Ah: remain in QUICK_STOP_ACTIVE
 NO_WINDOW = 0xFFFFFFFF
 DEFAULT_ACCELERATION = 100_000
 """Position units/s², of a drive whose EDS has no profile acceleration."""
 DEFAULT_WINDOW = 10
 """Position units, of a drive whose EDS has no 6067h."""
-CONTROL_NS = 1_000_000
+CONTROL_PERIOD_NS = 1_000_000
 """Of the drive's own position loop: a target is reached after it where 60C2h is 0."""
 PEAK_PERMILLE = 2000
 """What the plant's motors can do at most."""
@@ -70,7 +70,7 @@ class DriveParameters:
         self.units.read()
         sync_ns, value = number(0x1006) * 1000, number(0x60C2, 1, -1)
         period_ns = sync_ns if value < 0 else value * 10 ** max(0, 9 + number(0x60C2, 2, -4))
-        self.interpolation_ns = period_ns or CONTROL_NS
+        self.interpolation_ns = period_ns or CONTROL_PERIOD_NS
         self.following_window, self.following_timeout_ns = self._window(0x6065), number(0x6066) * 1_000_000
         self.position_window = self._window(0x6067, DEFAULT_WINDOW)
         self.position_time_ns = number(0x6068) * 1_000_000

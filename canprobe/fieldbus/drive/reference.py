@@ -13,8 +13,8 @@ from canprobe.fieldbus.node.timers import Timers
 STEP_NS = 2_500_000
 STANDSTILL_COUNTS = 0.1
 """Motion in one step below which the motor is at rest."""
-PATIENCE_STEPS = 400
-NOTHING_S = 1e-9
+MAX_WAIT_STEPS = 400
+END_TOLERANCE_S = 1e-9
 """Rest of a trajectory below which it has ended."""
 
 Done = Callable[[int], None] | None
@@ -120,8 +120,8 @@ class Motion:
     def follow(self, trajectory: Profile, t_ns: int, done: Done = None) -> None:
         """Follow a trajectory from now on; `done(t_ns)` when the motor is at rest behind its end."""
         self._trajectory, self._begin_ns, self._done = trajectory, t_ns, done
-        self._patience, self._was = PATIENCE_STEPS, inf
-        if trajectory.duration_s < NOTHING_S:
+        self._patience, self._was = MAX_WAIT_STEPS, inf
+        if trajectory.duration_s < END_TOLERANCE_S:
             here = self.demand(t_ns)
             self._ramp(here, here, t_ns, t_ns + STEP_NS)
         self._step(t_ns)
@@ -139,7 +139,7 @@ class Motion:
         self._stop()
         self._plant.advance(t_ns)
         self._was = self._plant.motor_counts(self._axis)
-        self._patience, self._done = PATIENCE_STEPS, done
+        self._patience, self._done = MAX_WAIT_STEPS, done
         self._ramp(here, here, t_ns, t_ns + STEP_NS)
         self._timer.arm(t_ns + STEP_NS)
 
@@ -150,7 +150,7 @@ class Motion:
             return
         begun_s = (due_ns - self._begin_ns) * 1e-9
         left_s = trajectory.duration_s - begun_s
-        if left_s < NOTHING_S:
+        if left_s < END_TOLERANCE_S:
             self._trajectory, self._start = None, self._end  # the ramp that has just ended no longer counts as motion
             self._await_standstill(due_ns)
             return

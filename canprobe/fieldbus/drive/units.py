@@ -19,9 +19,9 @@ from canprobe.fieldbus.protocol.si_unit import ACCELERATION, VELOCITY, rate_unit
 FACTORS = (0x607E, 0x608F, 0x6091, 0x6092, VELOCITY, ACCELERATION)
 _RESOLUTION, _GEAR, _FEED = FACTORS[1:4]
 _POSITION, _VELOCITY = 7, 6  # bits of 607Eh
-DEFAULT_TURN = 4096.0
+DEFAULT_COUNTS_PER_TURN = 4096.0
 """Counts of a motor turn, of a drive whose EDS has no 608Fh."""
-DEFAULT_MISSES = 5
+DEFAULT_MISSED_SYNCS = 5
 """Of a drive whose EDS has no object for it."""
 _Number = Callable[[int, int], int]
 
@@ -36,9 +36,9 @@ class Delivery:
         misses: SYNCs missed before the master is taken for dead.
     """
 
-    turn: float | None = DEFAULT_TURN
+    turn: float | None = DEFAULT_COUNTS_PER_TURN
     metre: float | None = None
-    misses: int = DEFAULT_MISSES
+    misses: int = DEFAULT_MISSED_SYNCS
 
 
 class Units:
@@ -74,7 +74,7 @@ class Units:
         """Take the present factors."""
         dictionary, delivery = self._dictionary, self._delivery
         resolution, delivered = dictionary.number(_RESOLUTION, 1), _encoder_counts(dictionary.delivered)
-        self.turn = delivery.turn or DEFAULT_TURN
+        self.turn = delivery.turn or DEFAULT_COUNTS_PER_TURN
         if resolution:
             self.turn = _quotient(dictionary.number, _RESOLUTION) / delivered
         self.knows_turn = bool(resolution) or delivery.turn is not None

@@ -27,7 +27,7 @@ def register_bit(code: int) -> int:
     return _REGISTER_BITS.get(code >> 12, 0)
 
 
-_MOST_WAITING = 16
+_MAX_WAITING = 16
 """Messages kept while the inhibit time runs; of a flood the oldest go."""
 
 
@@ -43,7 +43,7 @@ class Emergency(Service):
         self._active: dict[int, set[Hashable]] = {}
         self.any = False
         self._history: list[int] = []
-        self._waiting: deque[tuple[int, int, bytes]] = deque(maxlen=_MOST_WAITING)
+        self._waiting: deque[tuple[int, int, bytes]] = deque(maxlen=_MAX_WAITING)
         self._room = sum(1 for key in core.dictionary.entries if key >> 8 == 0x1003 and key & 0xFF)
         self._timer = core.timers.new(self._inhibit_over)
         core.dictionary.on_check(0x1003, self._check_history)

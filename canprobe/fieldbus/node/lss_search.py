@@ -6,7 +6,7 @@ Source: CiA 305, switch state selective, identify remote slave, fastscan.
 from __future__ import annotations
 
 from canprobe.fieldbus.protocol.lss import (
-    NOTHING_ASKED,
+    PRESENCE_CHECK,
     LssAddress,
     LssCommand,
 )
@@ -47,9 +47,9 @@ class LssSearch:
     def fastscan(self, data: bytes, mine: LssAddress) -> tuple[bool, bool]:
         """The bits of one number from the asked one upwards: whether they are mine, and with them the whole address."""
         bit, position, following = data[5:]
-        if not (bit < 32 or bit == NOTHING_ASKED) or position > 3 or following > 3:
+        if not (bit < 32 or bit == PRESENCE_CHECK) or position > 3 or following > 3:
             return False, False
-        if bit == NOTHING_ASKED:
+        if bit == PRESENCE_CHECK:
             self._position = 0
             return True, False
         asked = _MASK << bit & _MASK

@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from canprobe.errors import ProtocolError
-from canprobe.fieldbus.protocol.response_times import NS, BusAnalysis, Message, Response, _analysis, _timed
+from canprobe.fieldbus.protocol.response_times import NS_PER_S, BusAnalysis, Message, Response, _analysis, _timed
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ def worst_case_response_fifo(
         # queued at any time from the event to the latest that its offset and jitter allow
         at_any_time = replace(message, jitter_ns=message.jitter_ns + (message.offset_ns or 0), offset_ns=None)
         sent.append(_Sent(at_any_time, frame_ns, queue))
-    found = _settled(sent, -(-NS // bitrate))
+    found = _settled(sent, -(-NS_PER_S // bitrate))
     return _analysis(
         [
             Response(message, frame_ns, total, 0 if total is None else 1)

@@ -9,6 +9,8 @@ from canprobe.errors import ProtocolError
 Frame = tuple[int, bytes]
 """An 11-bit identifier and up to 8 data bytes."""
 
+CLASSIC_BYTES = 8
+"""Longest data of a classic CAN frame; longer ones are CAN FD frames."""
 EFF_FLAG = 0x80000000
 """On a 29-bit identifier, as in Linux's `struct can_frame`."""
 

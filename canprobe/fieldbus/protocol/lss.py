@@ -16,7 +16,7 @@ LSS_ANSWER_ID = 0x7E4
 LSS_LENGTH = 8
 UNCONFIGURED = 255
 """Node-ID FFh: the node has none and waits in initialisation for LSS."""
-NOTHING_ASKED = 0x80
+PRESENCE_CHECK = 0x80
 """Bit check of fastscan that asks who is there at all and starts the search again."""
 BIT_RATES = {0: 1_000_000, 1: 800_000, 2: 500_000, 3: 250_000, 4: 125_000, 6: 50_000, 7: 20_000, 8: 10_000}
 """Table selector 0 of configure bit timing: index → bit/s."""
@@ -100,7 +100,7 @@ def pack_fastscan(number: int, bit: int, position: int, following: int) -> bytes
 
     Args:
         number: bits from `bit` upwards are compared.
-        bit: 31 to 0, or `NOTHING_ASKED`.
+        bit: 31 to 0, or `PRESENCE_CHECK`.
         position: which of the four numbers is asked for, 0 to 3.
         following: which one those that answer expect next; one below `position` ends the search.
     """

@@ -1,8 +1,8 @@
 """The instants of a free-running device from the arrivals of its frames: a line through the last of them.
 
 A device that samples on its own time has a steady period; what it sends waits for the bus, for a driver, for the
-receiver. The instants are `t0 + n·T`, fitted by least squares to the last `KEPT` arrivals, each with its number n,
-which steps over images that were lost. A mean delay of the frames is in t0: it is part of the latency.
+receiver. The instants are `t0 + n·T`, fitted by least squares to the last `MAX_ARRIVALS` arrivals, each with its number
+n, which steps over images that were lost. A mean delay of the frames is in t0: it is part of the latency.
 Stops being true where the device changes its period, or where arrivals scatter by more than a quarter of it.
 """
 
@@ -11,11 +11,11 @@ from __future__ import annotations
 import math
 from collections import deque
 
-KEPT = 64
+MAX_ARRIVALS = 64
 """Arrivals in the fit."""
-LEAST = 4
+MIN_ARRIVALS = 4
 """Arrivals from which there is a fit."""
-OFF = 0.25
+MAX_ERROR_SHARE = 0.25
 """Share of the period by which an arrival, and the fitted period, may be off; beyond it the fit begins anew."""
 
 
@@ -23,23 +23,23 @@ class PeriodFit:
     """Fits a period to arrivals.
 
     Args:
-        period_ns: as stated; it tells how many images were lost until there is a fit.
+        period_ns: stated period; until there is a fit it gives the number of lost images.
 
     Attributes:
-        period_ns: fitted.
-        restarts: of the fit.
+        period_ns: fitted period.
+        restarts: how often the fit began anew.
     """
 
     def __init__(self, period_ns: float) -> None:
         self.period_ns = self._stated_ns = period_ns
         self.restarts = 0
-        self._arrivals: deque[tuple[int, int]] = deque(maxlen=KEPT)
+        self._arrivals: deque[tuple[int, int]] = deque(maxlen=MAX_ARRIVALS)
 
     def step(self, t_ns: int) -> tuple[int, float]:
         """Take an arrival.
 
         Args:
-            t_ns: of the first frame of an image, after the one before.
+            t_ns: arrival of the first frame of an image, after that of the image before.
 
         Returns:
             The fitted instant of this image, ns, and its standard deviation, s. Without a fit the arrival, and the
@@ -51,7 +51,7 @@ class PeriodFit:
             before, last_ns = arrivals[-1]
             number = before + max(1, round((t_ns - last_ns) / self.period_ns))
         arrivals.append((number, t_ns))
-        if len(arrivals) < LEAST:
+        if len(arrivals) < MIN_ARRIVALS:
             return t_ns, 1e-9 * self._stated_ns / math.sqrt(12.0)
         count = len(arrivals)
         numbers, times = [n - number for n, _ in arrivals], [t - t_ns for _, t in arrivals]  # from this one: small
@@ -59,7 +59,7 @@ class PeriodFit:
         squares = sum((n - mean_n) ** 2 for n in numbers)
         period = sum((n - mean_n) * t for n, t in zip(numbers, times, strict=True)) / squares
         rests = [t - mean_t - period * (n - mean_n) for n, t in zip(numbers, times, strict=True)]
-        if max(abs(rests[-1]), abs(period - self._stated_ns)) > OFF * self._stated_ns:
+        if max(abs(rests[-1]), abs(period - self._stated_ns)) > MAX_ERROR_SHARE * self._stated_ns:
             self._arrivals.clear()
             self._arrivals.append((0, t_ns))
             self.period_ns = self._stated_ns

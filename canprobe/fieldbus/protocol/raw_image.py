@@ -18,12 +18,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from canprobe.errors import ProtocolError
-from canprobe.fieldbus.protocol.frames import Frame
+from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, Frame
 
 Counts = tuple[int, ...]
 """Counts as the device sends them: row by row, in a row column by column, of a taxel axis by axis."""
 _TAG = "0123456789ABCDEF"
-_CLASSIC_BYTES = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +50,7 @@ class FramePattern:
         characters = text.replace(" ", "")
         if not re.fullmatch(r"([0-9A-Za-z.]{2}){1,8}", characters) or re.search(r"[G-Z]", characters):
             raise ProtocolError(
-                f'frame "{text}": expected 1 to {_CLASSIC_BYTES} bytes of two characters each: 0-9 and A-F for a tag,'
+                f'frame "{text}": expected 1 to {CLASSIC_BYTES} bytes of two characters each: 0-9 and A-F for a tag,'
                 " small letters for values, '.' for what is not read"
             )
         length, mask, tag = len(characters) // 2, 0, 0

@@ -20,7 +20,7 @@ from typing import NamedTuple
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.frame_bits import worst_case_bits
 
-NS = 1_000_000_000
+NS_PER_S = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +91,7 @@ class BusAnalysis:
 
 def frame_time_ns(n_data: int, bitrate: int) -> int:
     """Longest time of a frame with n data bytes, ns, rounded up."""
-    return -(-worst_case_bits(n_data) * NS // bitrate)
+    return -(-worst_case_bits(n_data) * NS_PER_S // bitrate)
 
 
 def worst_case_response(messages: Sequence[Message], bitrate: int = 1_000_000) -> BusAnalysis:
@@ -145,7 +145,7 @@ def _respond(level: Sequence[_Timed], below: Sequence[tuple[_Timed, int | None]]
     message, frame_ns = level[-1]
     if _overloaded(level):
         return Response(message, frame_ns, None, 0)
-    bit = -(-NS // bitrate)
+    bit = -(-NS_PER_S // bitrate)
     found = [_busy_period(level, start, block, bit).delays() for start, block in _starts(level, below).items()]
     worst = max((delay for delays in found for delay in delays), default=0)
     return Response(message, frame_ns, max(0, (message.offset_ns or 0) + worst), max(map(len, found)))

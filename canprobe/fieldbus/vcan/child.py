@@ -13,7 +13,7 @@ from typing import Protocol
 TIMED_OUT = 124
 _GRACE_S = 5.0
 _POLL_S = 0.02
-_PATIENCE = 3
+_MAX_SIGNALS = 3
 _FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 
 
@@ -73,7 +73,7 @@ def supervise(job: Job, signals: list[int], timeout_s: float | None) -> tuple[in
         while signals:
             number = signals.pop(0)
             received += 1
-            if received >= _PATIENCE:
+            if received >= _MAX_SIGNALS:
                 job.kill()
                 return 128 + number, timed_out
             job.send_signal(number)

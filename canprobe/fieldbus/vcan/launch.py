@@ -27,10 +27,10 @@ from canprobe.fieldbus.vcan.guest import GuestError, GuestJob, missing_packages
 CHANNEL, SECOND = "vcan0", "vcan1"
 NO_VCAN = 125
 GUEST_LOST = 123
-WAY = "CANPROBE_VCAN"
+WAY_VARIABLE = "CANPROBE_VCAN"
 
 _MAPPINGS = Path("/proc/sys/vm/max_map_count")
-_ENOUGH_MAPPINGS = 1 << 20  # of 4 KiB: more than the guest's memory
+_MIN_MAPPINGS = 1 << 20  # of 4 KiB: more than the guest's memory
 
 _MAKE_LINK, _MAKE_SECOND = (f"ip link add dev {name} type vcan && ip link set {name} up" for name in (CHANNEL, SECOND))
 _IN_NAMESPACE = f'ip link set lo up; {_MAKE_LINK} && {_MAKE_SECOND} && exec "$@"'
@@ -58,13 +58,13 @@ def run_with_vcan(
         if has_socketcan():
             with _local_way() as way:
                 if way is not None:
-                    job = LocalJob([*way[1], *command], {**os.environ, WAY: way[0]}, shell)
+                    job = LocalJob([*way[1], *command], {**os.environ, WAY_VARIABLE: way[0]}, shell)
                     status, timed_out = supervise(job, signals, timeout_s)
                     _report_time_out(timed_out, timeout_s)
                     return status
         if (status := _check_guest(install)) != 0:
             return status
-        boot = functools.partial(GuestJob, command, {**os.environ, WAY: "guest"}, realtime, shell)
+        boot = functools.partial(GuestJob, command, {**os.environ, WAY_VARIABLE: "guest"}, realtime, shell)
         return _run_in_guest(boot, signals, timeout_s)
 
 
@@ -190,11 +190,11 @@ def _report_killed() -> None:
         mappings = int(_MAPPINGS.read_text())
     except (OSError, ValueError):
         return
-    if mappings < _ENOUGH_MAPPINGS:
+    if mappings < _MIN_MAPPINGS:
         _say(
             f"the command was killed; a process that holds more than about {mappings // 256} MiB is, as "
             f"vm.max_map_count is {mappings} on this machine; type:  {'' if os.geteuid() == 0 else 'sudo '}"
-            f"sysctl vm.max_map_count={_ENOUGH_MAPPINGS}"
+            f"sysctl vm.max_map_count={_MIN_MAPPINGS}"
         )
 
 

@@ -27,7 +27,7 @@ from canprobe.errors import PlanError
 from canprobe.mechanics.types import Floats, Vec
 
 Convention = Literal["standard", "modified"]
-MOST_JOINTS = 8
+MAX_JOINTS = 8
 _RIGID = 1e-9
 """How far a fixed transform may be from a rotation with a translation."""
 
@@ -90,8 +90,8 @@ class Chain:
 
     def _refuse_odd(self, fixed: Floats, flange: Floats) -> None:
         n, where = len(self.joints), f"chain {self.name!r}"
-        if not 1 <= n <= MOST_JOINTS:
-            raise PlanError([f"{where}: expected 1 to {MOST_JOINTS} joints, got {n}"])
+        if not 1 <= n <= MAX_JOINTS:
+            raise PlanError([f"{where}: expected 1 to {MAX_JOINTS} joints, got {n}"])
         if len(set(self.joints)) < n:
             raise PlanError([f"{where}: expected a name of its own for each joint, got {', '.join(self.joints)}"])
         if len(self.prismatic) != n or fixed.shape != (n, 4, 4) or flange.shape != (4, 4):

@@ -90,7 +90,7 @@ class RigidBody:
         problem = dynamics_problem(chain.name, bodies)
         if problem is not None:
             raise PlanError([problem])
-        import mujoco
+        import mujoco  # late: of the extra `dynamics`
 
         self._mujoco: Any = mujoco
         text = "".join(_opened(mujoco, T, slides) for T, slides in zip(chain.fixed, chain.prismatic, strict=True))

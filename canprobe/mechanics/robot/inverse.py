@@ -64,12 +64,12 @@ def in_rows(rows: int, R_base_tool: Floats, six: Floats) -> Floats:
     return six[:rows]
 
 
-_REACHED = 1e-9
+_ROUNDING_ERROR = 1e-9
 """Error of a pose, rad or m over `LENGTH_M`, that is rounding."""
 _STEPS = 200
-_LONGEST_STEP = 0.3
+_MAX_STEP_RAD = 0.3
 """Of a joint in one step, rad: farther the Jacobian is another one."""
-_LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e8
+_MIN_DAMPING, _MAX_DAMPING = 1e-12, 1e8
 
 
 def inverse_near(
@@ -104,7 +104,7 @@ def inverse_near(
     q = _reach(pose, near)
     if pose.rows < model.n:
         q = _rest(pose, q, near if q_rest is None else np.asarray(q_rest, dtype=float))
-    if float(np.linalg.norm(pose.error(q)[0])) > _REACHED:
+    if float(np.linalg.norm(pose.error(q)[0])) > _ROUNDING_ERROR:
         raise PlanError([_out_of_reach(pose, q)])
     moves = np.abs(q - near) / model.radian
     if float(moves.max()) > max_move_rad:
@@ -176,12 +176,16 @@ def _reach(pose: _PosedTool, near: Floats) -> Floats:
         cost = float(left @ left)
         uphill = J.T @ left
         free = ~(((q <= model.q_min) & (uphill < 0.0)) | ((q >= model.q_max) & (uphill > 0.0)))
-        if cost < 1e-3 * _REACHED**2 or not np.abs(uphill[free]).max(initial=0.0) > 1e-14 or damping > _MOST_DAMPING:
+        if (
+            cost < 1e-3 * _ROUNDING_ERROR**2
+            or not np.abs(uphill[free]).max(initial=0.0) > 1e-14
+            or damping > _MAX_DAMPING
+        ):
             break
         tried = np.clip(q + _step(J, left, free, damping) * model.radian, model.q_min, model.q_max)
         new_left, new_J = pose.error(tried)
         if float(new_left @ new_left) < cost:
-            q, left, J, damping = tried, new_left, new_J, max(damping * 0.1, _LEAST_DAMPING)
+            q, left, J, damping = tried, new_left, new_J, max(damping * 0.1, _MIN_DAMPING)
         else:
             damping = max(10.0 * damping, 1e-6)
     return q
@@ -192,7 +196,7 @@ def _step(J: Floats, left: Floats, free: NDArray[np.bool_], damping: float) -> F
     A = J[:, free]
     step = np.zeros(len(free))
     step[free] = A.T @ np.linalg.solve(A @ A.T + damping * np.eye(len(left)), left)
-    step /= max(1.0, float(np.abs(step).max()) / _LONGEST_STEP)
+    step /= max(1.0, float(np.abs(step).max()) / _MAX_STEP_RAD)
     return step
 
 
@@ -209,13 +213,13 @@ def _rest(pose: _PosedTool, reached: Floats, rest: Floats) -> Floats:
         # wish + A'(AA')^-1 (left - A wish): the nearest to the wish that makes up for what is left
         damped = A @ A.T + 1e-12 * np.eye(pose.rows)
         step[free] = wish[free] + A.T @ np.linalg.solve(damped, left - A @ wish[free])
-        step /= max(1.0, float(np.abs(step).max()) / _LONGEST_STEP)
+        step /= max(1.0, float(np.abs(step).max()) / _MAX_STEP_RAD)
         moved = np.clip(q + step * model.radian, model.q_min, model.q_max)
-        settled, q = float(np.abs(moved - q).max()) < _REACHED, moved
+        settled, q = float(np.abs(moved - q).max()) < _ROUNDING_ERROR, moved
         if settled:
             break
     back = _reach(pose, q)
-    still = float(np.linalg.norm(pose.error(back)[0])) <= _REACHED
+    still = float(np.linalg.norm(pose.error(back)[0])) <= _ROUNDING_ERROR
     return back if still else reached
 
 

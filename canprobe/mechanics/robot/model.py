@@ -96,14 +96,14 @@ class Body:
 
 INERTIA_TOLERANCE = 0.1
 """Share of the largest moment by which the others may miss the rules of a body: published numbers are measured."""
-ROUNDED_KG_M2 = 1e-12
+ROUNDING_KG_M2 = 1e-12
 """A moment of inertia that is 0 but for rounding."""
 
 
 def negative_inertia(tensor: Floats) -> str | None:
     """Why no dynamics follow from a (3, 3) tensor: a principal moment is negative; None where none is."""
     low, _, high = np.linalg.eigvalsh(tensor).tolist()
-    if low >= -max(INERTIA_TOLERANCE * high, ROUNDED_KG_M2):
+    if low >= -max(INERTIA_TOLERANCE * high, ROUNDING_KG_M2):
         return None
     return f"{_principal_moments(tensor)}, of which one is negative"
 
@@ -111,7 +111,7 @@ def negative_inertia(tensor: Floats) -> str | None:
 def lopsided_inertia(tensor: Floats) -> str | None:
     """Why a (3, 3) tensor is the inertia of no body: one moment exceeds the sum of the others; None where none does."""
     low, middle, high = np.linalg.eigvalsh(tensor).tolist()
-    if low + middle >= high * (1.0 - INERTIA_TOLERANCE) - ROUNDED_KG_M2:
+    if low + middle >= high * (1.0 - INERTIA_TOLERANCE) - ROUNDING_KG_M2:
         return None
     return f"{_principal_moments(tensor)}, of which one is larger than the sum of the others"
 

@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 from canprobe.errors import UsageError
 from canprobe.mechanics.types import Floats
 
-LENGTH = 1e-3
-ANGLE = 1e-2
-_SCALE = np.array([LENGTH] * 7 + [ANGLE] * 2)
+LENGTH_UNIT_M = 1e-3
+ANGLE_UNIT_RAD = 1e-2
+_SCALE = np.array([LENGTH_UNIT_M] * 7 + [ANGLE_UNIT_RAD] * 2)
 """Of the unknowns: tool centre, ball centre, radii, tilt. The condition number is of the problem in these units."""
-GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
+GOLDEN_ANGLE_RAD = np.pi * (3.0 - np.sqrt(5.0))
 """rad."""
 _ROUNDS = 20
 _T, _C, _RHO, _TILT = slice(0, 3), slice(3, 6), 6, slice(7, 9)
@@ -84,7 +84,7 @@ class ToolEstimate:
         c_base: (3,) centre of the ball, m.
         radii_error: of the sum of the radii, m.
         tilt: (2,) of the array about the flange's x and y, rad.
-        condition_number: of the whole problem, priors included, in units of `LENGTH` and `ANGLE`.
+        condition_number: of the whole problem, priors included, in units of `LENGTH_UNIT_M` and `ANGLE_UNIT_RAD`.
         along_rms, across_rms: residuals, m.
         chi2_per_dof: sum of squared residuals over their expectation; None without more rows than unknowns.
         touches: how many.
@@ -181,9 +181,9 @@ def _estimate(touches: Sequence[BallTouch], model: BallModel, x: Floats, r: Floa
     known = s > s[0] * 1e-12
     condition = float(s[0] / s[-1]) if known.all() else float("inf")
     weights = np.where(known, 1.0 / np.where(known, s, 1.0), np.inf)
-    V = Vt.T[:3] * LENGTH
+    V = Vt.T[:3] * LENGTH_UNIT_M
     covariance = np.where(np.abs(V) > 0, V, 0.0) * np.where(known, weights, 0.0) ** 2 @ V.T
-    blind = (np.abs(V[:, ~known]) > 1e-9 * LENGTH).any(axis=1)
+    blind = (np.abs(V[:, ~known]) > 1e-9 * LENGTH_UNIT_M).any(axis=1)
     covariance[blind, blind] = np.inf
     observed = np.sqrt(np.diag(covariance)) < model.observed_below
     n = len(touches)
@@ -240,7 +240,7 @@ def ball_approaches(count: int, tilt: float, beside: float, up: Floats) -> list[
         around = 2.0 * np.pi * k / max(count - 1, 1)
         lean = tilt if k else 0.0
         n = np.cos(lean) * up + np.sin(lean) * (np.cos(around) * e1 + np.sin(around) * e2)
-        side = np.cos(k * GOLDEN) * e1 + np.sin(k * GOLDEN) * e2
+        side = np.cos(k * GOLDEN_ANGLE_RAD) * e1 + np.sin(k * GOLDEN_ANGLE_RAD) * e2
         side = side - n * float(n @ side)
         side /= np.linalg.norm(side)
         found.append(BallApproach(n, -np.cos(beside) * n + np.sin(beside) * side))

@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 
 from canprobe.errors import PlanError
-from canprobe.mechanics.robot.chain import MOST_JOINTS, Chain
+from canprobe.mechanics.robot.chain import MAX_JOINTS, Chain
 from canprobe.mechanics.robot.model import Body, Joint, lopsided_inertia
 from canprobe.mechanics.robot.urdf_tree import UrdfTree, source_name, z_along
 
-LARGEST_RAD = 4 * math.pi
+MAX_STOP_RAD = 4 * math.pi
 """A stop of a revolute joint beyond it looks like one in degrees."""
 
 
@@ -32,8 +32,8 @@ class UrdfArm:
         chain: from base to tip.
         joints: stops, speeds, friction; the effort limit stands for the rated torque. What the file leaves out has the
             defaults of `Joint`, but a speed limit that is missing is 0, which an `ArmModel` refuses.
-        bodies: (n,) of the joints; None for one without any inertial.
-        warnings: what the file says and hardly means.
+        bodies: (n,) bodies of the joints; None for a joint without any inertial.
+        warnings: statements of the file that look like mistakes.
     """
 
     chain: Chain
@@ -51,7 +51,7 @@ def from_urdf(
         source: path of the file, or its text.
         base: link that is the base frame; the root by default.
         tip: link whose frame is the flange; the only link without children by default.
-        name: of the arm; the robot's by default.
+        name: name of the arm; by default that of the robot.
 
     Raises:
         PlanError: no URDF, no path from base to tip, a joint on the path that a drive cannot move, or what `Chain`
@@ -60,11 +60,11 @@ def from_urdf(
     tree = UrdfTree.read(source)
     path = tree.path(base or tree.root(), tip or tree.only_end())
     moving = [edge for edge in path if edge.kind != "fixed"]
-    if len(moving) > MOST_JOINTS:
+    if len(moving) > MAX_JOINTS:
         raise PlanError(
             [
                 f"{tree.where}: {len(moving)} joints move between {path[0].parent!r} and {path[-1].child!r}, at most"
-                f" {MOST_JOINTS} can; choose a base nearer to the tip, such as --base {moving[-MOST_JOINTS].parent}"
+                f" {MAX_JOINTS} can; choose a base nearer to the tip, such as --base {moving[-MAX_JOINTS].parent}"
                 " (arm.base)"
             ]
         )
@@ -103,7 +103,7 @@ def limit_warning(source: str | Path, joint: Joint) -> str | None:
         source: path of the file, or its text.
         joint: as `from_urdf` read it.
     """
-    if joint.prismatic or max(-joint.q_min, joint.q_max) <= LARGEST_RAD:
+    if joint.prismatic or max(-joint.q_min, joint.q_max) <= MAX_STOP_RAD:
         return None
     return (
         f"{source_name(source)}: {joint.name}: <limit> from {joint.q_min:g} to {joint.q_max:g} rad looks like degrees;"

@@ -32,7 +32,7 @@ class Visual:
         size: of a mesh (3,) what its coordinates are multiplied by; of a box its edges, of a cylinder radius and
             length, of a sphere its radius, m.
         mesh: name of the mesh file, as it stands in the URDF; "" of another kind.
-        colour: RGB, 0–255; None where the URDF has none.
+        colour: RGB, 0–255; None where the URDF gives no colour.
     """
 
     joint: int

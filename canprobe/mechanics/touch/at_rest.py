@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from canprobe.mechanics.touch.stops import MOST_SPREAD
+from canprobe.mechanics.touch.stops import MAX_FORCE_SPREAD
 
-MOST_SATURATED = 0.75
+MAX_SATURATED_SHARE = 0.75
 """Share of saturated samples above which the measured force is only a lower bound of the true one.
 
 That alone is no reason: up to 40 kN/m the bound is near enough. Where √F did not grow on a line either, it is not.
@@ -36,14 +36,14 @@ class AtRest:
         """
         if self._n < SAMPLES_AT_REST:
             return None
-        if not felt and self._saturated > MOST_SATURATED * self._n:
+        if not felt and self._saturated > MAX_SATURATED_SHARE * self._n:
             return (
                 f"the array is saturated in {100.0 * self._saturated / self._n:.0f} % of the samples and no stiffness "
                 f"was felt: the true force is above the {self._mean:.1f} N measured; raise sensor.full_scale_kpa or "
                 "lower task.force_n"
             )
         sigma = math.sqrt(self._spread / (self._n - 1))
-        if sigma > MOST_SPREAD * target:
+        if sigma > MAX_FORCE_SPREAD * target:
             return (
                 f"the force does not settle: {self._mean:.1f} ± {sigma:.1f} N where {target:.1f} N are wanted; the "
                 "contact is too stiff for the arm's encoder counts, or servo.surface_height_hz too high"

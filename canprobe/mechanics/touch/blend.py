@@ -10,7 +10,7 @@ normals, iterated, so that the answer is the closest point.
 Valid within `reach` of a contact and for a point nearer to the surface than its radius of curvature; with no patch in
 reach the answer is NaN, never an extrapolation. The blend neither averages noise away in `sigma` nor knows of errors
 that all patches share (calibration, indentation): neighbours on one pass rest on the same samples. Across an edge that
-is sharper than `FACING` the patches of one side stand alone.
+is sharper than `MIN_FACING_COSINE` the patches of one side stand alone.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from canprobe.mechanics.types import Floats
 
 REACH_M = 4e-3
 """Default distance from a contact at which its patch no longer counts, m."""
-FACING = 0.5
+MIN_FACING_COSINE = 0.5
 """Least cosine between a patch's normal and the surface's: others are another side of a thin body."""
 _FULL, _LIMB = 0.75, 0.25
 """Cosine from which a patch counts in full, and share of the discriminant of a line that grazes it."""
-UNKNOWN_M = 1e-4
+UNKNOWN_HEIGHT_SIGMA_M = 1e-4
 """Standard deviation of the height of a patch that does not know its own, for its weight: as contacts have at most."""
 _ITERATIONS = 40
 """Most rounds; each shrinks the error of the normal by the height over the radius of curvature."""
@@ -78,7 +78,7 @@ class Quadrics(NamedTuple):
     def of(cls, T: Floats, S: Floats, covariance: Floats, known: NDArray[np.bool_]) -> Quadrics:
         """Of contact frames and matrices (m, 4, 4); covariances (m, 9, 9), of those that know their height."""
         R, covariance = T[:, :3, :3], covariance.copy()
-        covariance[~known, 2, 2] = UNKNOWN_M**2
+        covariance[~known, 2, 2] = UNKNOWN_HEIGHT_SIGMA_M**2
         B = 2.0 * R @ S[:, :3, :3] @ R.transpose(0, 2, 1)
         return cls(R, T[:, :3, 3], -R[:, :, 2], B, 2.0 * _times(R, S[:, :3, 3]), covariance, known)
 
@@ -98,7 +98,7 @@ class Quadrics(NamedTuple):
         F = np.stack([2 * u, 2 * v, np.ones_like(u), 2 * u * w, 2 * v * w, w * w, u * u, 2 * u * v, v * v], 1)  # df/dc
         variance = _dot(_times(self.covariance[i], F), F) / slope**2
         limb = np.where(met, square / np.where(met, b * b * _LIMB, 1.0), 0.0)
-        facing = (_dot(self.normal[i], d) - FACING) / (_FULL - FACING)
+        facing = (_dot(self.normal[i], d) - MIN_FACING_COSINE) / (_FULL - MIN_FACING_COSINE)
         return t, g / np.sqrt(_dot(g, g))[:, None], variance, _eased(limb) * _eased(facing)
 
 

@@ -9,19 +9,19 @@ from typing import NamedTuple
 import numpy as np
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.blend import FACING
-from canprobe.mechanics.touch.crossings import NOTHING, ChiSquared, Crossing, _tested, compare
+from canprobe.mechanics.touch.blend import MIN_FACING_COSINE
+from canprobe.mechanics.touch.crossings import NO_TEST, ChiSquared, Crossing, _tested, compare
 from canprobe.mechanics.touch.linear_algebra import positive
 from canprobe.mechanics.touch.surface_map import SurfaceMap
 from canprobe.mechanics.types import Floats
 
-RADIUS_M = 2e-3
+CROSSING_RADIUS_M = 2e-3
 """Default largest distance between the contacts of a crossing, m."""
-MEMORIES = 3.0
+MEMORY_SCALE = 3.0
 """Default path between the two passes of a crossing over the longest path that a patch rests on.
 
 With forgetting by exp(−s/memory) two answers s apart share exp(−s/memory) of their data: 5 % at three."""
-LEVEL = 0.05
+SIGNIFICANCE_LEVEL = 0.05
 PARTS = ("curvature", "normal", "height", "joint")
 
 
@@ -75,7 +75,7 @@ class Consistency:
             return Verdict(0, math.nan, math.nan, fisher([]))
         return Verdict(
             len(tests),
-            sum(test.p < LEVEL for test in tests.values()) / len(tests),
+            sum(test.p < SIGNIFICANCE_LEVEL for test in tests.values()) / len(tests),
             sum(test.chi2 for test in tests.values()) / dof,
             fisher([tests[i].p for i in self.independent if i in tests]),
         )
@@ -84,22 +84,24 @@ class Consistency:
     def consistent(self) -> bool | None:
         """The pooled joint test does not reject one surface at 5 %; None where there was nothing to test."""
         pooled = self.verdict().pooled
-        return None if pooled.dof == 0 else pooled.p >= LEVEL
+        return None if pooled.dof == 0 else pooled.p >= SIGNIFICANCE_LEVEL
 
 
-def find_crossings(surface_map: SurfaceMap, *, radius: float = RADIUS_M, gap: float | None = None) -> list[Crossing]:
+def find_crossings(
+    surface_map: SurfaceMap, *, radius: float = CROSSING_RADIUS_M, gap: float | None = None
+) -> list[Crossing]:
     """Places where two passes come close, one pair of patches for each; radius, gap: as of `check_consistency`.
 
     Of the pairs within the radius the closest is taken; others whose contacts both lie within two radii of its
     contacts along the path are the same crossing. A path that follows itself gives one every two radii.
     """
     limit = positive("radius", radius)
-    least = positive("gap", gap) if gap is not None else MEMORIES * surface_map.memory
+    least = positive("gap", gap) if gap is not None else MEMORY_SCALE * surface_map.memory
     if not len(surface_map):
         return []
     along = surface_map.travelled
     apart = np.linalg.norm(surface_map.points[:, None] - surface_map.points[None], axis=2)
-    facing = surface_map.normals @ surface_map.normals.T > FACING
+    facing = surface_map.normals @ surface_map.normals.T > MIN_FACING_COSINE
     fits = np.triu((apart <= limit) & (along[None] - along[:, None] >= least) & facing, 1)
     pairs = np.argwhere(fits)[np.argsort(apart[fits], kind="stable")]
     chosen: list[tuple[int, int]] = []
@@ -125,16 +127,18 @@ def _angle(a: Floats, b: Floats) -> float:
     return math.atan2(float(np.linalg.norm(np.cross(a, b))), float(a @ b))
 
 
-def check_consistency(surface_map: SurfaceMap, *, radius: float = RADIUS_M, gap: float | None = None) -> Consistency:
+def check_consistency(
+    surface_map: SurfaceMap, *, radius: float = CROSSING_RADIUS_M, gap: float | None = None
+) -> Consistency:
     """Test every crossing of a map and pool the independent ones; see `compare` for what the test rests on.
 
     Args:
         surface_map: the map.
         radius: largest distance between the contacts of a crossing, m.
-        gap: least path between them, and between the patches of independent crossings, m; None for `MEMORIES` times
+        gap: least path between them, and between the patches of independent crossings, m; None for `MEMORY_SCALE` times
             the longest memory of a patch.
     """
-    least = positive("gap", gap) if gap is not None else MEMORIES * surface_map.memory
+    least = positive("gap", gap) if gap is not None else MEMORY_SCALE * surface_map.memory
     found = find_crossings(surface_map, radius=radius, gap=gap)
     return Consistency(tuple(found), _independent(surface_map, found, least))
 
@@ -158,5 +162,5 @@ def fisher(p_values: list[float]) -> ChiSquared:
     Source: R. A. Fisher, Statistical Methods for Research Workers, 4th ed., 1932, §21.1.
     """
     if not p_values:
-        return NOTHING
+        return NO_TEST
     return _tested(-2.0 * float(np.sum(np.log(np.maximum(p_values, 1e-300)))), 2 * len(p_values))

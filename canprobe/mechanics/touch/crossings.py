@@ -35,7 +35,7 @@ from canprobe.mechanics.touch.surface_map import LocalPatch
 from canprobe.mechanics.touch.tangent_frames import homogeneous, inverse_transform, tangent_rotation
 from canprobe.mechanics.types import Floats
 
-_UNSEEN = 0.05
+_MAX_UNSEEN_SHARE = 0.05
 """Largest part of a unit combination that either pass may have left unobserved."""
 _HEIGHT, _SLOPE, _K = slice(0, 1), slice(1, 3), slice(3, 6)
 
@@ -54,7 +54,7 @@ class ChiSquared(NamedTuple):
     p: float
 
 
-NOTHING = ChiSquared(0.0, 0, math.nan)
+NO_TEST = ChiSquared(0.0, 0, math.nan)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,9 +147,9 @@ def _jet(patch: LocalPatch, T_base_common: Floats) -> _Jet:
 
 
 def _seen_by_both(hidden_a: Floats, hidden_b: Floats) -> Floats:
-    """(k, 6) rows that pick the combinations of K of which neither pass left more than `_UNSEEN` open."""
+    """(k, 6) rows that pick the combinations of K of which neither pass left more than `_MAX_UNSEEN_SHARE` open."""
     _, size, Vt = np.linalg.svd(np.concatenate([hidden_a, hidden_b]))
-    seen = Vt[size < _UNSEEN]
+    seen = Vt[size < _MAX_UNSEEN_SHARE]
     rows = np.zeros((len(seen), 6))
     rows[:, _K] = seen * TO_Q
     return rows
@@ -157,7 +157,7 @@ def _seen_by_both(hidden_a: Floats, hidden_b: Floats) -> Floats:
 
 def _chi_squared(rows: Floats, d: Floats, C: Floats) -> ChiSquared:
     if not len(rows):
-        return NOTHING
+        return NO_TEST
     e, V = rows @ d, rows @ C @ rows.T
     scale = 1.0 / np.sqrt(np.diag(V))  # metres beside 1/m
     e, V = e * scale, V * np.outer(scale, scale)
@@ -165,6 +165,6 @@ def _chi_squared(rows: Floats, d: Floats, C: Floats) -> ChiSquared:
 
 
 def _tested(chi2: float, dof: int) -> ChiSquared:
-    from scipy.special import chdtrc
+    from scipy.special import chdtrc  # late: only a test of crossings needs it, and it takes long to load
 
     return ChiSquared(chi2, dof, float(chdtrc(dof, chi2)))

@@ -20,25 +20,25 @@ import numpy.typing as npt
 from canprobe.mechanics.touch.shapes import Foot, PlacedShape, TouchedPlaces, require_positive
 from canprobe.mechanics.types import Floats, Vec
 
-LEAST_NODES = 8
+MIN_NODES = 8
 """Along each side of a grid."""
-WIDEST_M, RISE_M = 5e-4, 4e-6
+MAX_SPACING_M, MAX_RISE_M = 5e-4, 4e-6
 """Of the nodes over which minima are searched and pressure is summed: their widest spacing, and how much a node may be
 farther than the foot beside it; on a sharp edge half of the grid's spacing stands for that."""
-RADIUS_M = 0.03
+MAX_BALL_RADIUS_M = 0.03
 """Of the ball that touches, as far as the spacing of the nodes depends on it."""
 _MARGIN_M = 1.5e-4
 """How far a query may move before the window of nodes is taken anew."""
-_DEEPEST_M = 3e-4
+_MAX_DEPTH_M = 3e-4
 """Indentation up to which that window holds all that a ball presses on."""
 _BLOCK = 4
 _OVER_NODES_M = 5e-5
 """How far the surface may rise between its nodes, on the safe side."""
 _NEWTON = 40
-_LAST_M = 1e-8
+_LAST_STEP_M = 1e-8
 """A Newton step after which the rest, its square over a radius of curvature, is below 1e-12 m."""
-_SAME_M = 1e-6
-_NOWHERE_M = -1e3
+_SAME_PLACE_M = 1e-6
+_NO_HEIGHT_M = -1e3
 _SIDE = 1e-6
 """Spacings to the cells on both sides of a node."""
 
@@ -177,8 +177,8 @@ class Heights(PlacedShape):
         super().__init__(T_base_object)
         require_positive(spacing=spacing)
         z = np.array(heights, dtype=float)
-        if z.ndim != 2 or min(z.shape) < LEAST_NODES:
-            raise ValueError(f"heights must be a grid of {LEAST_NODES} × {LEAST_NODES} or more, got shape {z.shape}")
+        if z.ndim != 2 or min(z.shape) < MIN_NODES:
+            raise ValueError(f"heights must be a grid of {MIN_NODES} × {MIN_NODES} or more, got shape {z.shape}")
         if not np.isfinite(z).all():
             i, j = np.argwhere(~np.isfinite(z))[0].tolist()
             raise ValueError(f"heights must be finite, got {z[i, j]} at row {i}, column {j}: fill gaps first")
@@ -196,7 +196,9 @@ class Heights(PlacedShape):
         """Nodes of the search: positions, heights and slopes."""
         spline = self.spline
         bend = max(float(np.abs(np.diff(heights, 2, axis=axis)).max()) for axis in (0, 1)) / spline.spacing**2
-        widest = min(max(sqrt(4.0 * RISE_M / (bend + 1.0 / RADIUS_M)), 0.5 * spline.spacing), WIDEST_M)
+        widest = min(
+            max(sqrt(4.0 * MAX_RISE_M / (bend + 1.0 / MAX_BALL_RADIUS_M)), 0.5 * spline.spacing), MAX_SPACING_M
+        )
         self._x, self._y = (
             np.linspace(low, high, ceil((high - low) / widest - 1e-6) + 1)
             for low, high in zip(spline.corner, spline.far, strict=True)
@@ -209,7 +211,7 @@ class Heights(PlacedShape):
         self._cells: npt.NDArray[np.bool_] | None = None
         if there is not None and not there.all():
             self._cells = there[:-1, :-1] & there[1:, :-1] & there[:-1, 1:] & there[1:, 1:]
-            self._z[~self.exists(x, y).reshape(shape)] = _NOWHERE_M
+            self._z[~self.exists(x, y).reshape(shape)] = _NO_HEIGHT_M
         starts = [np.arange(0, n, _BLOCK) for n in shape]
         self._tops = np.maximum.reduceat(np.maximum.reduceat(self._z, starts[0], axis=0), starts[1], axis=1)
         lids = np.pad(self._tops, 1, mode="edge") + _OVER_NODES_M
@@ -236,7 +238,7 @@ class Heights(PlacedShape):
         block = slice(i, i + _BLOCK), slice(j, j + _BLOCK)
         squares = (self._z[block] - z) ** 2 + ((self._x[block[0]] - x) ** 2)[:, None] + (self._y[block[1]] - y) ** 2
         nearest = sqrt(float(squares.min()))
-        widest = max(nearest + _DEEPEST_M, reach) + 2.0 * _MARGIN_M + 0.5 * self._step
+        widest = max(nearest + _MAX_DEPTH_M, reach) + 2.0 * _MARGIN_M + 0.5 * self._step
         inside = boxes <= widest * widest
         rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
         first, last = (slice(_BLOCK * int(k[0]), _BLOCK * int(k[-1] + 1)) for k in (rows, columns))
@@ -264,7 +266,7 @@ class Heights(PlacedShape):
         for index in near[low].tolist():
             i, j = divmod(index, width)
             place = self._polished(float(self._x[rows.start + i - 1]), float(self._y[columns.start + j - 1]), x, y, z)
-            if all(abs(place[1] - a) + abs(place[2] - b) > _SAME_M for _, a, b, _ in feet):
+            if all(abs(place[1] - a) + abs(place[2] - b) > _SAME_PLACE_M for _, a, b, _ in feet):
                 feet.append(place)
         return feet if len(feet) == 1 else sorted(feet)
 
@@ -288,7 +290,7 @@ class Heights(PlacedShape):
             new_u, new_v = min(max(u + du, u0), u1), min(max(v + dv, v0), v1)
             moved = abs(new_u - u) + abs(new_v - v)
             u, v = new_u, new_v
-            if moved < _LAST_M:
+            if moved < _LAST_STEP_M:
                 break
         if self._cells is not None:
             i, j = int((u - u0) / self.spline.spacing), int((v - v0) / self.spline.spacing)

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike
 
 SIGMA_ROOT = 0.03
 """Noise of √F, √N: a force of 1 N known to 6 %, its slow errors (hysteresis, creep) included."""
-MOST_SCATTER = 3.3
+MAX_SCATTER = 3.3
 """RMS distance from the line over the noise above which it is none."""
-LEAST_FORCE_N = 0.1
+MIN_FORCE_N = 0.1
 """Below it threshold and noise of the array bend the line."""
 SAMPLES_OF_A_PUSH = 6
 
@@ -41,7 +41,7 @@ class PushFit:
 
     def add(self, push: float, force: float) -> None:
         """Take a push of the probe towards the object (m, from any zero) and the force (N); a small one is left out."""
-        if not (force >= LEAST_FORCE_N and math.isfinite(push)):
+        if not (force >= MIN_FORCE_N and math.isfinite(push)):
             return
         root = math.sqrt(force)
         self._n += 1
@@ -73,7 +73,7 @@ class PushFit:
 
         A sensor that sends nonsense has a slope too; its samples are off the line.
         """
-        return self.slope > 0.0 and self.sigma < share * self.slope and self.scatter < MOST_SCATTER * self._noise
+        return self.slope > 0.0 and self.sigma < share * self.slope and self.scatter < MAX_SCATTER * self._noise
 
     @property
     def scatter(self) -> float:

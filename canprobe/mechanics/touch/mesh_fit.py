@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from canprobe.mechanics.touch.heights import LEAST_NODES, Heights
+from canprobe.mechanics.touch.heights import MIN_NODES, Heights
 from canprobe.mechanics.touch.shapes import require_positive
 from canprobe.mechanics.types import Floats
 
@@ -28,20 +28,20 @@ EDGE_RAD = np.radians(30.0)
 """Facets that meet at a larger angle have an edge between them."""
 COARSE_RAD = np.radians(15.0)
 """A median angle between the facets of a curved surface from which on they show no curvature."""
-STEEPEST = np.cos(np.radians(70.0))
-LAYER = 6.0
+MIN_WALL_COSINE = np.cos(np.radians(70.0))
+LAYER_SPACINGS = 6.0
 """Spacings below the highest sample of a cell from which on a sample is taken as hidden."""
-EMPTY = 0.1
+MIN_COVERED_SHARE = 0.1
 """Share of a mesh's grid that has a surface, below which single vertices far away make the grid."""
-FARTHEST_M = 1e6
+MAX_COORDINATE_M = 1e6
 """Coordinates from which on a mesh is no part."""
-MOST_NODES = 1_000_000
-MOST_SAMPLES = 8_000_000
-RINGING, EDGE_NODES = 0.02, 3
+MAX_NODES = 1_000_000
+MAX_SAMPLES = 8_000_000
+RINGING_SPACINGS, EDGE_NODES = 0.02, 3
 """Distance of a sample from the fit, in spacings, that tells a wall; and how many nodes round it are rounded off."""
 FILL_WEIGHT = 0.01
 """Of a point of a curved triangle in the fit: a vertex is exact, and only where there are none these count."""
-ON_BORDER = 1e-3
+BORDER_SPACINGS = 1e-3
 """Spacings beyond the border up to which a node lies on it: files have single precision."""
 _STIFFNESS = 1e-7
 """Of the fit against second differences, per sample of a cell: it only matters where there are no samples."""
@@ -52,9 +52,9 @@ class HeightGrid:
     """Heights of a mesh over a grid, as `Heights` takes them.
 
     Attributes:
-        heights: (m, n) m.
-        spacing: m.
-        origin: (2,) m, from the grid's middle.
+        heights: (m, n) heights, m.
+        spacing: spacing of the nodes, m.
+        origin: (2,) reference point, from the grid's middle, m.
         there: (m, n) whether the mesh has a surface at a node.
     """
 
@@ -107,7 +107,7 @@ def fit_mesh(
     area = np.linalg.norm(turned, axis=1)
     corners, normals = corners[area > 0.0], turned[area > 0.0] / area[area > 0.0, None]
     _refuse_inside_out(points, corners)
-    up = normals[:, 2] > STEEPEST
+    up = normals[:, 2] > MIN_WALL_COSINE
     if not up.any():
         raise ValueError("no facet of the mesh faces +z: its faces are inside out, or it must be turned")
     _refuse_coarse(points, corners[up], normals[up])
@@ -125,9 +125,11 @@ def _merged(points: Floats, corners: Index) -> tuple[Floats, Index]:
     """Vertices at one place are one vertex, which STL files do not say."""
     if points.ndim != 2 or points.shape[1] != 3 or corners.ndim != 2 or corners.shape[1] != 3 or not len(corners):
         raise ValueError(f"a mesh needs vertices (k, 3) and faces (f, 3), got {points.shape} and {corners.shape}")
-    if not (np.abs(points) < FARTHEST_M).all():
-        odd = points[~(np.abs(points) < FARTHEST_M).all(axis=1)][0].tolist()
-        raise ValueError(f"vertices of a mesh must be finite and below {FARTHEST_M:g} m, got {odd}: export it again")
+    if not (np.abs(points) < MAX_COORDINATE_M).all():
+        odd = points[~(np.abs(points) < MAX_COORDINATE_M).all(axis=1)][0].tolist()
+        raise ValueError(
+            f"vertices of a mesh must be finite and below {MAX_COORDINATE_M:g} m, got {odd}: export it again"
+        )
     if corners.min() < 0 or corners.max() >= len(points):
         raise ValueError(
             f"faces name vertices 0 to {len(points) - 1}, got {corners.min()} to {corners.max()}: export it again"
@@ -170,8 +172,8 @@ def _samples(points: Floats, corners: Index, normals: Floats, up: npt.NDArray[np
     triangles = points[corners[up]]
     longest = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
     parts = np.ceil(longest / apart - 1e-9).astype(np.intp).clip(1)
-    if (count := float(np.sum((parts + 1.0) * (parts + 2.0) / 2.0))) > MOST_SAMPLES:
-        raise ValueError(f"the mesh gives {count:.2g} samples at this spacing, at most {MOST_SAMPLES:.0g}: widen it")
+    if (count := float(np.sum((parts + 1.0) * (parts + 2.0) / 2.0))) > MAX_SAMPLES:
+        raise ValueError(f"the mesh gives {count:.2g} samples at this spacing, at most {MAX_SAMPLES:.0g}: widen it")
     found = [np.empty((0, 3))]
     for n in np.unique(parts[parts > 1]).tolist():
         chosen = parts == n
@@ -232,25 +234,25 @@ def _seen(samples: Floats, spacing: float) -> npt.NDArray[np.bool_]:
     cell = cell.reshape(-1)
     top = np.full(cell.max() + 1, -np.inf)
     np.maximum.at(top, cell, samples[:, 2])
-    seen: npt.NDArray[np.bool_] = samples[:, 2] >= top[cell] - LAYER * spacing
+    seen: npt.NDArray[np.bool_] = samples[:, 2] >= top[cell] - LAYER_SPACINGS * spacing
     return seen
 
 
 def _covered(triangles: Floats, shape: tuple[int, ...]) -> npt.NDArray[np.bool_]:
     """Which nodes of a grid lie in triangles (f, 3, 2) over it, in spacings from its corner."""
-    first = np.ceil(triangles[:, :, 0].min(axis=1) - ON_BORDER).astype(np.intp).clip(0)
-    last = np.floor(triangles[:, :, 0].max(axis=1) + ON_BORDER).astype(np.intp).clip(max=shape[0] - 1)
+    first = np.ceil(triangles[:, :, 0].min(axis=1) - BORDER_SPACINGS).astype(np.intp).clip(0)
+    last = np.floor(triangles[:, :, 0].max(axis=1) + BORDER_SPACINGS).astype(np.intp).clip(max=shape[0] - 1)
     rows = (last - first + 1).clip(0)
     row = np.arange(rows.sum()) + np.repeat(first - np.cumsum(rows) + rows, rows)
     a = np.repeat(triangles, rows, axis=0)
     b = np.roll(a, 1, axis=1)
     ends = np.sort(np.stack((a[:, :, 0], b[:, :, 0])), axis=0)
-    crossed = (ends[0] <= row[:, None] + ON_BORDER) & (row[:, None] - ON_BORDER <= ends[1])
+    crossed = (ends[0] <= row[:, None] + BORDER_SPACINGS) & (row[:, None] - BORDER_SPACINGS <= ends[1])
     along = np.where(ends[1] > ends[0], b[:, :, 0] - a[:, :, 0], 1.0)
     share = ((row[:, None] - a[:, :, 0]) / along).clip(0.0, 1.0)
     y = a[:, :, 1] + share * (b[:, :, 1] - a[:, :, 1])  # where the row crosses each side
-    low = np.ceil(np.where(crossed, y, np.inf).min(axis=1) - ON_BORDER).clip(0, shape[1]).astype(np.intp)
-    high = np.floor(np.where(crossed, y, -np.inf).max(axis=1) + ON_BORDER).clip(-1, shape[1] - 1).astype(np.intp)
+    low = np.ceil(np.where(crossed, y, np.inf).min(axis=1) - BORDER_SPACINGS).clip(0, shape[1]).astype(np.intp)
+    high = np.floor(np.where(crossed, y, -np.inf).max(axis=1) + BORDER_SPACINGS).clip(-1, shape[1] - 1).astype(np.intp)
     begun = np.zeros((shape[0], shape[1] + 1), dtype=np.intp)
     np.add.at(begun, (row, low), 1)
     np.add.at(begun, (row, np.maximum(high + 1, low)), -1)
@@ -266,14 +268,14 @@ def _fitted(samples: Floats, weights: Floats, facing: Floats, spacing: float, at
     from scipy.sparse.linalg import splu
 
     low, high = samples[:, :2].min(axis=0), samples[:, :2].max(axis=0)
-    cells = np.floor((high - low) / spacing + ON_BORDER).astype(int)  # the grid ends within the samples
+    cells = np.floor((high - low) / spacing + BORDER_SPACINGS).astype(int)  # the grid ends within the samples
     x, y = 1e3 * (high - low)
-    if cells.min() < LEAST_NODES - 1:
-        least = f"narrower than {LEAST_NODES - 1} spacings of {1e3 * spacing:.3g} mm"
+    if cells.min() < MIN_NODES - 1:
+        least = f"narrower than {MIN_NODES - 1} spacings of {1e3 * spacing:.3g} mm"
         raise ValueError(f"what is seen of the mesh from +z is {x:.3g} mm by {y:.3g} mm, {least}")
-    if np.prod(cells + 1.0) > MOST_NODES:
+    if np.prod(cells + 1.0) > MAX_NODES:
         raise ValueError(
-            f"the mesh is {x:.3g} mm by {y:.3g} mm: more than {MOST_NODES:.0g} nodes at {1e3 * spacing:.3g} mm; widen"
+            f"the mesh is {x:.3g} mm by {y:.3g} mm: more than {MAX_NODES:.0g} nodes at {1e3 * spacing:.3g} mm; widen"
             " the spacing, or remove vertices far away"
         )
     corner = 0.5 * (low + high) - 0.5 * cells * spacing
@@ -287,7 +289,7 @@ def _fitted(samples: Floats, weights: Floats, facing: Floats, spacing: float, at
     there = filled[:-1, :-1] | filled[1:, :-1] | filled[:-1, 1:] | filled[1:, 1:]
     there &= _covered((facing - corner) / spacing, there.shape)
     nearly_empty = f"the mesh is {x:.3g} mm by {y:.3g} mm and nearly empty: remove vertices far away"
-    if there.mean() < EMPTY:
+    if there.mean() < MIN_COVERED_SHARE:
         raise ValueError(nearly_empty)
     values = bx[:, :, None] * by[:, None, :]
     count = len(samples)
@@ -307,7 +309,7 @@ def _fitted(samples: Floats, weights: Floats, facing: Floats, spacing: float, at
     c = found.reshape(m, n)
     c = (c[:-2] + 4.0 * c[1:-1] + c[2:]) / 6.0
     heights = (c[:, :-2] + 4.0 * c[:, 1:-1] + c[:, 2:]) / 6.0
-    off = np.abs(A @ found - samples[:, 2]) > RINGING * spacing
+    off = np.abs(A @ found - samples[:, 2]) > RINGING_SPACINGS * spacing
     if off.any():  # beside a wall the fit rings: there the mean of what is near rounds the edges
         edges = np.zeros(heights.shape, dtype=bool)
         for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):

@@ -22,7 +22,7 @@ from canprobe.errors import UsageError
 from canprobe.mechanics.touch.strategies import PathFollower
 from canprobe.mechanics.types import Floats
 
-STEEPEST = 0.2
+MIN_SLOPE_COSINE = 0.2
 """Least cosine between surface normal and approach direction that is reckoned with: 78 degrees."""
 
 
@@ -195,7 +195,7 @@ class TactileServo:
         (h0, h1, h2), (c0, c1, c2), (u0, u1, u2) = self._heading, self._across, self._up
         (f0, f1, f2), (n0, n1, n2), (o0, o1, o2) = foot, normal, self._origin
         d0, d1, d2 = f0 - o0, f1 - o1, f2 - o2
-        steep = max(n0 * u0 + n1 * u1 + n2 * u2, STEEPEST)
+        steep = max(n0 * u0 + n1 * u1 + n2 * u2, MIN_SLOPE_COSINE)
         slope_along = (n0 * h0 + n1 * h1 + n2 * h2) / steep
         slope_across = (n0 * c0 + n1 * c1 + n2 * c2) / steep
         along, across = follower.heading

@@ -16,16 +16,16 @@ from numpy.typing import ArrayLike
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.blend import REACH_M, Feet, Quadrics, feet_on
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-from canprobe.mechanics.touch.estimate.quadric import TO_Q, UNIT, parameters_of
+from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, TO_Q, parameters_of
 from canprobe.mechanics.touch.linear_algebra import checked, positive, read_only
 from canprobe.mechanics.touch.meshing import CELL_M, Mesh, mesh_of
 from canprobe.mechanics.touch.surface import SurfaceMatrix
 from canprobe.mechanics.types import Floats
 
-WIDE = 10.0
+UNSEEN_CURVATURE_SIGMA = 10.0
 """Standard deviation of a combination of curvature that was not observed, over the path that the estimate rests on:
 ±500 1/m for 20 mm, a radius of 2 mm. It only ever widens what is said of heights and normals beside the contact."""
-LEAST_LENGTH_M = 1e-3
+MIN_LENGTH_M = 1e-3
 """A shorter path counts as this long."""
 
 _SHAPES: dict[str, tuple[int | None, ...]] = {
@@ -35,7 +35,7 @@ _SHAPES: dict[str, tuple[int | None, ...]] = {
     "observed": (2,),
     "combinations": (None, 3),
 }
-_Q_TO_C = UNIT[:, None]
+_Q_TO_C = C_PER_Q[:, None]
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -47,8 +47,8 @@ class LocalPatch:
         S: (4, 4) in the contact frame, c14 = c24 = c44 = 0, c34 = −½; unobserved combinations nearest to flat.
         K_covariance: (3, 3) of (K11, K12, K22), 1/m²; NaN or infinite where not observed, as in `SurfaceEstimate`.
         S_covariance: (9, 9) of (c14, c24, c44, c13, c23, c33, c11, c12, c22), SI units, always finite: a combination
-            that the data did not observe has the variance of `WIDE` there, whatever the prior. c44 is the height,
-            2 c14 and 2 c24 are the tilt.
+            that the data did not observe has the variance of `UNSEEN_CURVATURE_SIGMA` there, whatever the prior. c44 is
+            the height, 2 c14 and 2 c24 are the tilt.
         pose_known: the part of `S_covariance` about height and tilt is the estimator's; False from methods that do
             not know it, which leave zeros there.
         observed: (2,) 1 or 0, for each principal curvature.
@@ -130,8 +130,8 @@ class LocalPatch:
 
 def _covariance(estimate: SurfaceEstimate) -> Floats:
     """(9, 9) finite covariance of the entries of S, SI units."""
-    length = max(estimate.distance, LEAST_LENGTH_M)
-    weak = WIDE / length
+    length = max(estimate.distance, MIN_LENGTH_M)
+    weak = UNSEEN_CURVATURE_SIGMA / length
     V = estimate.combinations.T
     if estimate.model_root is None:
         P = np.zeros((9, 9))
@@ -144,7 +144,7 @@ def _covariance(estimate: SurfaceEstimate) -> Floats:
         open_ = np.eye(3) - V @ V.T
         root = np.concatenate([root, np.zeros((3, 9))])
         root[:-3, 6:] = root[:-3, 6:] @ (_Q_TO_C * (V @ V.T) / _Q_TO_C.T)
-        root[-3:, 6:] = open_ / UNIT / WIDE
+        root[-3:, 6:] = open_ / C_PER_Q / UNSEEN_CURVATURE_SIGMA
     if len(root) > 9:
         root = np.linalg.qr(root, mode="r")
     inverse = np.linalg.inv(root)
@@ -163,7 +163,7 @@ def _curvature_covariance(estimate: SurfaceEstimate, V: Floats, weak: float) -> 
 
 SPACING_M = 2e-3
 """Path from one patch to the next, m: well below the radius of what can be felt, so that neighbours overlap."""
-LEAST_RANK = 1
+MIN_RANK = 1
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -297,5 +297,5 @@ def merge_patches(
 
     A patch every `spacing` (m) is kept, of those that observed some curvature.
     """
-    usable = [patch for patch in patches if patch.rank >= LEAST_RANK]
+    usable = [patch for patch in patches if patch.rank >= MIN_RANK]
     return SurfaceMap(patches=tuple(spaced(usable, spacing)), path=np.asarray(path, np.float64), method=method)

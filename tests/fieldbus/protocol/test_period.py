@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from canprobe.fieldbus.protocol.period import KEPT, PeriodFit
+from canprobe.fieldbus.protocol.period import MAX_ARRIVALS, PeriodFit
 
 PERIOD_NS = 10_100_000  # 1 % off the stated 100 Hz
 STATED_NS = 10_000_000
@@ -26,7 +26,7 @@ def errors_of(jitter_ns, lost=0.0, images=600, seed=1):
         errors.append(1e-9 * (t - k * PERIOD_NS))
         stated.append(sigma)
     assert fit.restarts == 0
-    return errors[KEPT:], stated[KEPT:], fit
+    return errors[MAX_ARRIVALS:], stated[MAX_ARRIVALS:], fit
 
 
 def rms(values):
@@ -40,7 +40,7 @@ def test_jitter_is_averaged_out_and_stated(lost):
     arrivals = 1e-9 * jitter_ns / math.sqrt(3.0)
     assert rms(errors) < arrivals / 3
     # the end of a line through m points has a variance of about 4/m of a point's
-    assert fmean(stated) == pytest.approx(arrivals * 2 / math.sqrt(KEPT), rel=0.1)
+    assert fmean(stated) == pytest.approx(arrivals * 2 / math.sqrt(MAX_ARRIVALS), rel=0.1)
     assert 0.7 < rms(errors) / fmean(stated) < 1.4
     assert fit.period_ns == pytest.approx(PERIOD_NS, rel=1e-3)
 

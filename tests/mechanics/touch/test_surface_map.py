@@ -12,7 +12,7 @@ from canprobe.mechanics.touch.blend import REACH_M, Feet
 from canprobe.mechanics.touch.estimate.fit import fit_surface
 from canprobe.mechanics.touch.meshing import mesh_of
 from canprobe.mechanics.touch.surface import SurfaceMatrix
-from canprobe.mechanics.touch.surface_map import WIDE, LocalPatch, SurfaceMap, merge_patches, spaced
+from canprobe.mechanics.touch.surface_map import UNSEEN_CURVATURE_SIGMA, LocalPatch, SurfaceMap, merge_patches, spaced
 
 RADIUS = 0.05
 SIGMA = {"sigma_point": 2e-5, "sigma_normal": 1e-3}
@@ -177,7 +177,7 @@ def test_what_a_straight_path_leaves_open_is_wide(truth, method):
     P = patch.T_base_contact[:3, :2].T[:, :2]  # axes of the frame of the path in the contact frame
     sigma = [_sigma_of_curvature(patch, P @ t) for t in (along, across)]
     assert sigma[0] < 2.0
-    assert sigma[1] == pytest.approx(WIDE / estimate.distance, rel=0.05)
+    assert sigma[1] == pytest.approx(UNSEEN_CURVATURE_SIGMA / estimate.distance, rel=0.05)
     # the height on the path beside the contact is known, across it is not
     surface_map = SurfaceMap(patches=(patch,), path=[patch.point])
     beside = [path.surface.project(patch.point + 2e-3 * np.append(t, 0)) for t in (-along, across)]

@@ -5,6 +5,7 @@ Source: python-can manual, "Configuration".
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,9 +27,7 @@ def configured_bus() -> ConfiguredBus | None:
     Raises:
         UsageError: it cannot be read, or names an interface that python-can does not know.
     """
-    import json
-
-    import can.util
+    import can.util  # late: python-can is loaded only where a bus is opened
 
     named: dict[str, Any] = {}
     try:

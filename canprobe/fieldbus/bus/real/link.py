@@ -15,7 +15,7 @@ import subprocess
 from dataclasses import dataclass
 from typing import Any
 
-VIRTUAL = ("vcan", "vxcan")
+VIRTUAL_KINDS = ("vcan", "vxcan")
 SLOW_BIT_S = 500_000
 SLOW_SAMPLE, FAST_SAMPLE = (0.85, 0.875, 0.90), (0.75, 0.80, 0.90)  # lowest, recommended, highest
 RESTART_MS, TX_QUEUE = 100, 1000
@@ -115,7 +115,7 @@ def setting_line(name: str, bitrate: int, data_bitrate: int | None = None) -> st
         bitrate: bit/s.
         data_bitrate: of CAN FD, bit/s; None: classical frames only.
     """
-    if name.startswith(VIRTUAL):
+    if name.startswith(VIRTUAL_KINDS):
         return ip_line(f"{name} up") if data_bitrate is None else ip_line(f"{name} down", f"{name} mtu {_FD_MTU} up")
     sample = (SLOW_SAMPLE if bitrate <= SLOW_BIT_S else FAST_SAMPLE)[1]
     fast = "" if data_bitrate is None else f" dbitrate {data_bitrate} fd on"

@@ -15,7 +15,7 @@ import socket
 import struct
 from collections.abc import Sequence
 
-from canprobe.fieldbus.protocol.frames import Frame
+from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, Frame
 
 SO_TIMESTAMPNS = 35
 SO_RXQ_OVFL = 40
@@ -23,7 +23,6 @@ SO_RXQ_OVFL = 40
 Row = tuple[int, bytes, int, int]
 """can_id with flags, data, CLOCK_REALTIME of reception in ns (0: unknown), frames dropped so far."""
 
-CLASSIC_BYTES = 8
 _BIT_RATE_SWITCH = 0x01
 _FRAME = struct.Struct("=IBB2x8s")  # struct can_frame; its first 16 bytes are also those of a struct canfd_frame
 _FD_FRAME = struct.Struct("=IBB2x64s")

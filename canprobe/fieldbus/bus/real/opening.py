@@ -28,15 +28,15 @@ def open_port(
     Args:
         interface: `socketcan` for a raw socket of our own, or any of python-can's interfaces.
         channel: the channel as that interface names it, such as `can0`.
-        bitrate: in bit/s; a SocketCAN interface has its own, set with `ip link`.
+        bitrate: bit rate, bit/s; a SocketCAN interface has its own, set with `ip link`.
         clock: a clock in real time.
-        data_bitrate: of the data phase of CAN FD frames; None: classical frames only.
+        data_bitrate: bit rate of the data phase of CAN FD frames; None: classical frames only.
         waits: wait for a full transmit queue as long as it takes; only SocketCAN can.
-        reports: who hears of error frames, and of what the user has to know.
+        reports: receives error frames, and what the user has to know.
 
     Raises:
         UsageError: there is no interface of that name.
-        InterfaceError: it is missing, down, or cannot be opened; with what to do.
+        InterfaceError: the interface is missing, down, or cannot be opened; the message says what to do.
     """
     if interface == "socketcan" and HAS_BATCHES:  # else python-can's
         return SocketCanPort(channel, clock, bitrate=bitrate, data_bitrate=data_bitrate, waits=waits, reports=reports)

@@ -7,7 +7,7 @@ import ctypes
 import os
 from collections.abc import Callable, Iterator
 
-FAVOURED = -15
+NICE_VALUE = -15
 """Nice value asked for."""
 MASTER_PRIORITY = 40
 DEVICE_PRIORITY = 50
@@ -27,7 +27,7 @@ def ask_for_processor() -> bool:
     that takes a favour, else both sides wait for each other.
     """
     with contextlib.suppress(OSError, AttributeError):
-        os.setpriority(os.PRIO_PROCESS, 0, FAVOURED)
+        os.setpriority(os.PRIO_PROCESS, 0, NICE_VALUE)
         return True
     return False
 

@@ -28,10 +28,9 @@ from canprobe.fieldbus.bus.port import (
 )
 from canprobe.fieldbus.bus.real.echoes import Echoes
 from canprobe.fieldbus.protocol.frame_bits import FD_LENGTHS
-from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG, Frame
+from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EFF_FLAG, RTR_FLAG, Frame
 
 _EXTENDED_MASK = 0x1FFFFFFF
-CLASSIC_BYTES = 8
 _STATES = {
     can.BusState.ACTIVE: ControllerState.ACTIVE,
     can.BusState.PASSIVE: ControllerState.PASSIVE,
@@ -49,10 +48,10 @@ class PythonCanPort(PlainPort):
     Args:
         interface: python-can's name of the interface, such as `virtual`, `pcan`, `slcan`.
         channel: the channel as that interface names it.
-        bitrate: in bit/s, for interfaces that set it themselves.
+        bitrate: bit rate, bit/s, for interfaces that set it themselves.
         clock: the clock for waits and stamps.
-        data_bitrate: of the data phase of CAN FD frames; None: classical frames only.
-        reports: who hears of error frames.
+        data_bitrate: bit rate of the data phase of CAN FD frames; None: classical frames only.
+        reports: receives error frames.
 
     Attributes:
         counters: what has passed; `ignored` are CAN FD frames where they are not wanted.

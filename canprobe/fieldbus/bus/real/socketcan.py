@@ -26,9 +26,9 @@ from canprobe.errors import InterfaceError
 from canprobe.fieldbus.bus.clock import Clock, Timespec
 from canprobe.fieldbus.bus.port import ERR_FLAG, ControllerState, PortCounters, Reports, TimedFrame, state_after
 from canprobe.fieldbus.bus.real.link import TX_QUEUE, drop_queued, emptying_line, ip_line, setting_line, sudo
-from canprobe.fieldbus.bus.real.mmsg import CLASSIC_BYTES, SO_RXQ_OVFL, SO_TIMESTAMPNS, FrameSocket, Row
+from canprobe.fieldbus.bus.real.mmsg import SO_RXQ_OVFL, SO_TIMESTAMPNS, FrameSocket, Row
 from canprobe.fieldbus.protocol.frame_bits import FD_LENGTHS
-from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG, Frame
+from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EFF_FLAG, RTR_FLAG, Frame
 
 _SOL_CAN_RAW = 101
 _CAN_RAW_FILTER = 1
@@ -47,14 +47,14 @@ _CANFD_MTU = 72
 _IFF_UP = 0x1
 _RECEIVE_BUFFER = 4 << 20
 _RETRY_S, _LATER_RETRY_S = 200e-6, 2e-3
-_PATIENCE_NS = 10_000_000
-_TELL_NS = 1_000_000_000
+_MAX_QUEUE_WAIT_NS = 10_000_000
+_REPORTED_WAIT_NS = 1_000_000_000
 """A port that waits reports a queue that has been full for so long."""
 _STUCK_NS, _LINGER_NS = 100_000_000, 1_000_000_000
 """How long a port that closes waits for the next queued frame to leave, and for all of them."""
 _COMPARE_NS = 1_000_000
 """Time of stamps after which the two clocks are compared again: less than a cycle."""
-_ALIKE_NS = 50_000
+_CLOCK_READING_ERROR_NS = 50_000
 """Difference that is none: reading both clocks takes as long in a virtual machine. No TPDO follows its SYNC sooner."""
 
 
@@ -93,11 +93,11 @@ class StampClock:
         if self._compared_ns <= oldest_ns and newest_ns < self._compared_ns + _COMPARE_NS:
             return 0
         self._compared_ns = self._realtime_ns()
-        if abs(self._compared_ns - self._monotonic_ns() - self.offset_ns) <= _ALIKE_NS:
+        if abs(self._compared_ns - self._monotonic_ns() - self.offset_ns) <= _CLOCK_READING_ERROR_NS:
             return 0
         offset_ns, doubt_ns = self._measure()  # this process may only have waited between the two readings
         step_ns = offset_ns - self.offset_ns
-        if abs(step_ns) <= _ALIKE_NS + doubt_ns:
+        if abs(step_ns) <= _CLOCK_READING_ERROR_NS + doubt_ns:
             return 0
         self.offset_ns = offset_ns
         return step_ns
@@ -316,13 +316,13 @@ class SocketCanPort:
             raise self._failed(error) from error
         self.counters.transmit_full += 1
         full_for_ns = self.clock.now_ns() - full_ns
-        if full_for_ns >= _PATIENCE_NS and not self._waits:
+        if full_for_ns >= _MAX_QUEUE_WAIT_NS and not self._waits:
             why = f"{self._full_queue(error)}, {left} frames not sent{self._longer_queue(error)}"
             raise InterfaceError(why) from error
-        if full_for_ns >= _TELL_NS and full_ns != self._told_ns:
+        if full_for_ns >= _REPORTED_WAIT_NS and full_ns != self._told_ns:
             self._told_ns = full_ns
             self._reports.say(f"{self._full_queue(error)}: waiting for the bus{self._longer_queue(error)}")
-        time.sleep(_RETRY_S if full_for_ns < _PATIENCE_NS else _LATER_RETRY_S)
+        time.sleep(_RETRY_S if full_for_ns < _MAX_QUEUE_WAIT_NS else _LATER_RETRY_S)
 
     def _full_queue(self, error: OSError) -> str:
         what = "the transmit queue" if error.errno == errno.ENOBUFS else "the socket's send buffer"

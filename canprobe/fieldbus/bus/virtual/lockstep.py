@@ -18,12 +18,10 @@ from canprobe.errors import BusError, InterfaceError
 from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.port import ControllerState, PlainPort, PortCounters, TimedFrame
 from canprobe.fieldbus.protocol.frame_bits import FD_LENGTHS
-from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG, Frame
+from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EFF_FLAG, RTR_FLAG, Frame
 
 Recorder = Callable[[int, bytes, int], None]
 """Called with (can_id, data, t_ns)."""
-
-CLASSIC_BYTES = 8
 
 
 EVERY_ID = range(1 << 32)

@@ -21,19 +21,12 @@ from canprobe.fieldbus.bus.port import ERR_BUS, ERR_FLAG, ERR_PROTOCOL
 from canprobe.fieldbus.bus.virtual.bit_errors import WireErrors
 from canprobe.fieldbus.bus.virtual.controllers import Controllers
 from canprobe.fieldbus.bus.virtual.error_counters import ErrorCounters
-from canprobe.fieldbus.bus.virtual.lockstep import (
-    CLASSIC_BYTES,
-    Attachment,
-    LockstepBus,
-    LockstepPort,
-    Participant,
-    arbitration_key,
-)
+from canprobe.fieldbus.bus.virtual.lockstep import Attachment, LockstepBus, LockstepPort, Participant, arbitration_key
 from canprobe.fieldbus.protocol.frame_bits import ERROR_DELIMITER_BITS, ERROR_FLAG_BITS, INTERMISSION_BITS, exact_bits
-from canprobe.fieldbus.protocol.frames import Frame
+from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, Frame
 
 Queue = Literal["priority", "fifo"]
-LINGER_NS = 50_000_000
+MAX_CLOSING_NS = 50_000_000
 """How long a port that closes lets the bus carry what is queued, at most."""
 _NS = 1_000_000_000
 _ERROR_BITS = 2 * ERROR_FLAG_BITS + ERROR_DELIMITER_BITS  # the others answer the flag of the first with theirs
@@ -355,7 +348,7 @@ class TimedBus(LockstepBus):
 
     def remove_port(self, port: LockstepPort) -> None:
         """Take a closed port off the bus, after what it has sent is through, and what is answered at once."""
-        limit_ns = self.clock.now_ns() + LINGER_NS
+        limit_ns = self.clock.now_ns() + MAX_CLOSING_NS
         while (self._flying is not None or self._ready) and self.clock.step(limit_ns):
             pass
         super().remove_port(port)

@@ -21,10 +21,10 @@ BEST_SHARE = 0.37
 ALARM, ALARM_OF_BEST = 2.2, 3.5
 """Innovations, over what is usual, at which the surface is taken to have changed. By chance, or with three wrong
 samples among the eight, one in a thousand and one in a hundred are above the second."""
-USUAL = (0.3, 2.0)
+USUAL_INNOVATION = (0.3, 2.0)
 """Bounds of the usual innovation that an alarm is measured by. It is small where the stated noise is generous; above
 the upper bound no innovation, capped as it is, could ever set off an alarm."""
-AGREES = 4.8
+MAX_AGREEING_RESIDUAL = 4.8
 """Squared residual over the median one up to which a sample may lie on the surface before a change: 99 % of χ² of 3."""
 RUNNING, LONG_TERM = 0.1, 0.004
 """Weights of one sample in the running and in the long-term innovation."""
@@ -46,7 +46,7 @@ class ChangeTest:
 
     @property
     def usual(self) -> float:
-        """The innovation in the long term, within `USUAL`."""
+        """The innovation in the long term, within `USUAL_INNOVATION`."""
         return _bounded(self._all)
 
     def take(self, square: float, caution: float = 1.0) -> bool:
@@ -78,7 +78,7 @@ class ChangeTest:
 
 
 def _bounded(usual: float) -> float:
-    return min(max(usual, USUAL[0]), USUAL[1])
+    return min(max(usual, USUAL_INNOVATION[0]), USUAL_INNOVATION[1])
 
 
 def looks_changed(squares: Floats) -> bool:

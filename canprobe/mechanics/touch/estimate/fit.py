@@ -181,7 +181,7 @@ def _run_filter(touches: ContactBatch, prior: Prior | None, quadric: bool) -> Su
     return answer
 
 
-EXTENTS = 2.0
+EXTENT_SCALE = 2.0
 """Longest memory over the extent of the points: a weave or a circle has seen all directions by then."""
 
 
@@ -194,4 +194,4 @@ def _memory_of(touches: ContactBatch) -> float:
     off, turned = touches.points - touches.points[-1], touches.normals - touches.normals[-1]
     square = float(np.square(turned).sum())
     radius = math.sqrt(float(np.square(off).sum()) / square) if square > 0.0 else math.inf  # exact on a sphere
-    return min(max(touches.distance, touches.extent), EXTENTS * touches.extent, max(radius, 0.5 * touches.extent))
+    return min(max(touches.distance, touches.extent), EXTENT_SCALE * touches.extent, max(radius, 0.5 * touches.extent))

@@ -21,11 +21,11 @@ from canprobe.mechanics.touch.estimate.online import Dropped, Estimator
 from canprobe.mechanics.touch.estimate.quadric import TO_Q
 from canprobe.mechanics.types import Floats
 
-SPAN = 0.5
+SPAN_SHARE = 0.5
 """Path, over the memory, along which a change of the answers is looked for."""
-LEAST_SPAN = 0.05
+MIN_SPAN_SHARE = 0.05
 """The same just after a start."""
-LAG = 0.075
+LAG_SHARE = 0.075
 """Path, over the memory, that an answer lags behind, one standard deviation: 1.5 mm of 20 mm, half a patch. Set on
 scans of nine packaged scenes."""
 
@@ -81,12 +81,12 @@ class FollowingEstimator:
     def _late(self, tensor: Floats) -> Floats | None:
         """(3, 3) change of the curvature tensor over the path that an answer lags behind; None where there is none."""
         past = self._past
-        while len(past) > 1 and self._travelled - past[1][0] >= SPAN * self._memory:
+        while len(past) > 1 and self._travelled - past[1][0] >= SPAN_SHARE * self._memory:
             past.popleft()
-        if not past or self._travelled - past[0][0] < LEAST_SPAN * self._memory:
+        if not past or self._travelled - past[0][0] < MIN_SPAN_SHARE * self._memory:
             return None
         then, before = past[0]
-        result: Floats = (tensor - before) * (LAG * self._memory / (self._travelled - then))
+        result: Floats = (tensor - before) * (LAG_SHARE * self._memory / (self._travelled - then))
         return result
 
 

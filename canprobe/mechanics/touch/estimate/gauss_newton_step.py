@@ -14,7 +14,7 @@ from canprobe.mechanics.types import Floats
 
 _SHORTER = (1.0, 0.25)
 """Shares of a step that are tried."""
-SETTLED = 0.1
+SETTLED_STEP = 0.1
 """Squared length of a step, in standard deviations, below which an answer has settled."""
 
 
@@ -76,6 +76,6 @@ def gauss_newton(now: Solved, d: Design, prior: tuple[Floats, Floats]) -> Solved
     """
     for share in _SHORTER:
         there = solved_once(now.c + share * (now.target - now.c), d, prior)
-        if there.step <= max(now.step, SETTLED):
+        if there.step <= max(now.step, SETTLED_STEP):
             return there
     return now

@@ -15,7 +15,7 @@ import numpy as np
 
 from canprobe.mechanics.touch.estimate.answer import foot
 from canprobe.mechanics.touch.estimate.noise import Correlation, Noise
-from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE
+from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE_INFORMATION
 from canprobe.mechanics.touch.estimate.omitted_terms import OmittedTerms
 from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.estimate.residuals import Design, design, linearise, transport
@@ -106,7 +106,7 @@ class InformationFilter:
         """
         self.T, self.c = T, c.copy()
         self._path = _Path(travelled, travelled)
-        self._set_root(upper_root(np.concatenate([root, DIFFUSE * np.eye(9)])))
+        self._set_root(upper_root(np.concatenate([root, DIFFUSE_INFORMATION * np.eye(9)])))
         self.left_out.start(rows, residuals, travelled)
 
     def take(self, rows: Floats, residuals: Floats, moved: float) -> None:
@@ -165,6 +165,6 @@ class InformationFilter:
 
 def _prior_rows(prior: Prior, length: float) -> Floats:
     """(9, 9) root of what is always known."""
-    own = DIFFUSE * np.eye(9)
+    own = DIFFUSE_INFORMATION * np.eye(9)
     own[3:6] = prior.rows(length)[0][:3]
     return own

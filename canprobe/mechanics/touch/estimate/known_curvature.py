@@ -8,7 +8,7 @@ import numpy as np
 
 from canprobe.mechanics.touch.estimate.noise import CHI2_99
 from canprobe.mechanics.touch.estimate.observed import excited
-from canprobe.mechanics.touch.estimate.quadric import TO_Q, UNIT
+from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, TO_Q
 from canprobe.mechanics.touch.estimate.residuals import curvature_jacobian
 from canprobe.mechanics.touch.linear_algebra import inverted, solved
 from canprobe.mechanics.types import Floats
@@ -39,7 +39,7 @@ def evidence_of(c: Floats, covariance: Floats, spread: Floats | None, length: fl
             probe. None where a prior answers it.
     """
     covariance = _TO_Q_SQUARED * covariance / length**2
-    q = c[6:] / (UNIT * length)
+    q = c[6:] / (C_PER_Q * length)
     axes, wide = (np.eye(3), np.ones(3, dtype=bool)) if spread is None else excited(spread)
     if wide.all():
         return CurvatureInformation(q, inverted(covariance))

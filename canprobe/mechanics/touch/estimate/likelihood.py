@@ -17,12 +17,12 @@ from canprobe.mechanics.touch.estimate.answer import (
     partial_covariance,
 )
 from canprobe.mechanics.touch.estimate.known_curvature import curvature_covariance, evidence_of
-from canprobe.mechanics.touch.estimate.misfit import CERTAIN, correct, misfit_notes
+from canprobe.mechanics.touch.estimate.misfit import MENTIONED_PROBABILITY, correct, misfit_notes
 from canprobe.mechanics.touch.estimate.noise import Correlation, Noise, make_noise, mixed
-from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE, fit
+from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE_INFORMATION, fit
 from canprobe.mechanics.touch.estimate.observed import decide, nothing_observed, spread_of, turned
 from canprobe.mechanics.touch.estimate.prior import Prior
-from canprobe.mechanics.touch.estimate.quadric import UNIT, parameters_of
+from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, parameters_of
 from canprobe.mechanics.touch.estimate.residuals import curvature_jacobian, design, linearise
 from canprobe.mechanics.touch.linear_algebra import MAX_LENGTH, checked, instance, inverted, solved, upper_root
 from canprobe.mechanics.touch.surface import SurfaceMatrix
@@ -39,11 +39,11 @@ class ContactBatch(NamedTuple):
     """Checked input of a batch fit.
 
     Attributes:
-        points, normals: (n, 3); the last row is now.
-        noise: of the n samples.
+        points, normals: (n, 3) m and unit vectors; the last row is now.
+        noise: noise of the n samples.
         extent: largest distance from the last point, never below noise, m: the unit of length.
         distance: length along the path, m.
-        correlation: of the noise along the path; None for independent samples.
+        correlation: correlation of the noise along the path; None for independent samples.
     """
 
     points: Floats
@@ -117,13 +117,13 @@ def fit_ml(touches: ContactBatch, prior: Prior | None, quadric: bool = False) ->
     notes: tuple[str, ...] = () if result.converged else ("the iteration did not settle",)
     if result.decision.rank == 3 and not quadric:
         corrected = correct(result.c, result.root, d, independent)
-        trusted = corrected.trusted and (result.converged or corrected.misfit <= CERTAIN)
+        trusted = corrected.trusted and (result.converged or corrected.misfit <= MENTIONED_PROBABILITY)
         notes += misfit_notes(corrected.misfit, trusted=trusted)
         if trusted:
             c, root = corrected.c, corrected.root
             result = result._replace(c=c, root=root, free=c, free_root=root)
         else:
-            result = result._replace(decision=nothing_observed(), free_root=DIFFUSE * np.eye(9))
+            result = result._replace(decision=nothing_observed(), free_root=DIFFUSE_INFORMATION * np.eye(9))
     has_prior = math.isfinite(stated.sigma_curvature)
     a = anchor(result.c, T, (0.0, 0.0, 0.0), length)
     decision = result.decision._replace(vectors=turned(a.turn) @ result.decision.vectors)
@@ -159,7 +159,7 @@ def _turned_spread(spread: Floats, angle: float) -> Floats:
     return result
 
 
-OFF_SURFACE = 10.0
+MAX_OFF_SURFACE_SIGMAS = 10.0
 """Distance of a point from the surface over its standard deviation, beyond which the point is taken to be off it."""
 
 
@@ -180,8 +180,8 @@ def cramer_rao(
     method. Sorted principal curvatures are not differentiable at umbilics, so the bound is on the entries of K.
 
     Args:
-        points: (n, 3) m, on the true surface, or measured: not further off than `OFF_SURFACE` times their noise; the
-            last row is now.
+        points: (n, 3) m, on the true surface, or measured: not further off than `MAX_OFF_SURFACE_SIGMAS` times their
+            noise; the last row is now.
         normals: (n, 3) outward unit normals.
         S: (4, 4) the true surface in the frame of the points.
         sigma_point, sigma_normal, prior, correlation, coupling: as for `fit_surface`; the prior that the estimator has.
@@ -200,12 +200,12 @@ def cramer_rao(
     surface = S if isinstance(S, SurfaceMatrix) else SurfaceMatrix(checked("S", S, (4, 4)))
     gradient = surface.gradient(p)
     off = np.abs(surface.value(p)) / np.maximum(np.sqrt(np.einsum("ij,ij->i", gradient, gradient)), 1e-300)
-    limit = OFF_SURFACE * np.sqrt(touches.noise.point_variance) + 1e-9 * np.abs(p).max()  # and rounding
+    limit = MAX_OFF_SURFACE_SIGMAS * np.sqrt(touches.noise.point_variance) + 1e-9 * np.abs(p).max()  # and rounding
     worst = int(np.argmax(off / limit))
     if off[worst] > limit[worst]:
         raise UsageError(
-            f"points: expected all on S, up to {limit[worst]:.3g} off ({OFF_SURFACE:g} sigma_point), got one "
-            f"{off[worst]:.3g} off at index {worst}; S is expected in the frame and unit of the points"
+            f"points: expected all on S, up to {limit[worst]:.3g} off ({MAX_OFF_SURFACE_SIGMAS:g} sigma_point), got "
+            f"one {off[worst]:.3g} off at index {worst}; S is expected in the frame and unit of the points"
         )
     return osculating_bound(touches, surface, prior)
 
@@ -226,7 +226,7 @@ def osculating_bound(touches: ContactBatch, surface: SurfaceMatrix, prior: Prior
     stated = Prior.weak(length) if prior is None else instance("prior", prior, Prior)
     root = upper_root(np.concatenate([J, stated.rows(length)[0]]))
     wide = 1e30 * np.eye(2)
-    decision = decide(root[6:, 6:] * UNIT, wide, math.inf)
+    decision = decide(root[6:, 6:] * C_PER_Q, wide, math.inf)
     known = decision.passed & (decision.information > 0.0)  # points in one place know nothing
     if not known.all():
         V = decision.vectors[:, known]

@@ -3,10 +3,10 @@
 A quadric has two of the four cubic terms of a surface's height over its tangent plane; a torus, a fillet or a wave
 has the others too. They turn into errors of K that no covariance of a quadric knows. Here the height gets terms `Σ
 a_j φ_j(x, y)`, all cubic and quartic monomials about the contact, with `a ~ N(0, τ²)` alike in all directions, and
-the answer is averaged over τ: 0 (a quadric), what is usual for a surface of such curvature (`CHANGES`), and, should
-the residuals insist, anything (`EVIDENCE`). The weights are the prior's times the marginal likelihood of the
-residuals: a quadric stays one, a misfit that shows is corrected, one that could hide in the noise widens the
-covariance.
+the answer is averaged over τ: 0 (a quadric), what is usual for a surface of such curvature (`USUAL_CURVATURE_CHANGES`),
+and, should the residuals insist, anything (`TAIL_VARIANCES`). The weights are the prior's times the marginal
+likelihood of the residuals: a quadric stays one, a misfit that shows is corrected, one that could hide in the noise
+widens the covariance.
 
 The correction is one linear step, and higher terms follow where quartic ones matter: their part is taken to be a
 third of the correction, and goes into the covariance. A correction of more than a tenth of K is
@@ -25,7 +25,7 @@ import numpy as np
 
 from canprobe.mechanics.touch.estimate.noise import mixed
 from canprobe.mechanics.touch.estimate.nonlinear import robust
-from canprobe.mechanics.touch.estimate.quadric import UNIT, sharpest
+from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, sharpest
 from canprobe.mechanics.touch.estimate.residuals import Design, linearise
 from canprobe.mechanics.touch.estimate.terms import DEGREE
 from canprobe.mechanics.touch.linear_algebra import inverted, upper_root
@@ -37,30 +37,36 @@ NONE, USUAL, TAIL = 0.88, 0.11, 0.01
 Some nine in ten places on what is felt are taken to be like a quadric over a path no longer than a radius: flat, round,
 or nearly so. An edge or a seam is one in a hundred; it shows, and then its likelihood outweighs that.
 """
-CHANGES = (0.1, 0.5)
+USUAL_CURVATURE_CHANGES = (0.1, 0.5)
 """A usual change of curvature along a surface, dK/ds over ‖K‖²: a torus 2.5 times as wide as its tube has 0.1 on its
 outer side and 0.4 on top, a fillet more. Slower ones change K by some percent over a path of a radius."""
-BLURRED = 5e-3
+BLUR_RAD = 5e-3
 """κσ_p, rad: a point's noise over the least radius. Up to here `NONE` holds, from twice as much on a usual misfit is
 certain. A path on which points err by so much of the radius says next to nothing about cubic terms, so the prior alone
 answers for them, and it is the cautious one: there a region may hold the truth too often, not too seldom."""
-EVIDENCE = 10.0 ** np.arange(1.0, 9.0)
+TAIL_VARIANCES = 10.0 ** np.arange(1.0, 9.0)
 """Variances of the tail over that of the best known of the terms."""
-LEFT_OUT = 0.35
+HIGHER_TERMS_SHARE = 0.35
 """Higher terms over what cubic and quartic ones changed; on an edge they are no smaller where the surface is flat."""
-TRUST = 0.1
+MAX_CORRECTION_SHARE = 0.1
 """Largest change of K that is believed, over ‖K‖ or 1/length."""
-CERTAIN = 0.99
+MENTIONED_PROBABILITY = 0.99
 """Probability of a misfit from which an estimate mentions it."""
-_PER_SQUARE = UNIT**-2.0
+_PER_SQUARE = C_PER_Q**-2.0
 _CUBIC = DEGREE == 3
-_NEVER_LESS = 0.1
+_MIN_CURVATURE = 0.1
 """‖K‖ · length at which the ratio of quartic to cubic terms stops falling."""
-_USUAL = np.concatenate([[0.0], np.square(CHANGES) / 36.0])
-_VARIANCES = np.concatenate([_USUAL, EVIDENCE])
+_USUAL = np.concatenate([[0.0], np.square(USUAL_CURVATURE_CHANGES) / 36.0])
+_VARIANCES = np.concatenate([_USUAL, TAIL_VARIANCES])
 """No misfit, usual ones per ‖K‖⁴ (the length being 1), and the tail."""
-_PRIOR = np.repeat([NONE, USUAL / len(CHANGES), TAIL / len(EVIDENCE)], [1, len(CHANGES), len(EVIDENCE)])
-_CAUTIOUS = np.repeat([0.0, (NONE + USUAL) / len(CHANGES), TAIL / len(EVIDENCE)], [1, len(CHANGES), len(EVIDENCE)])
+_PRIOR = np.repeat(
+    [NONE, USUAL / len(USUAL_CURVATURE_CHANGES), TAIL / len(TAIL_VARIANCES)],
+    [1, len(USUAL_CURVATURE_CHANGES), len(TAIL_VARIANCES)],
+)
+_CAUTIOUS = np.repeat(
+    [0.0, (NONE + USUAL) / len(USUAL_CURVATURE_CHANGES), TAIL / len(TAIL_VARIANCES)],
+    [1, len(USUAL_CURVATURE_CHANGES), len(TAIL_VARIANCES)],
+)
 
 
 class Corrected(NamedTuple):
@@ -83,7 +89,7 @@ class Averaged(NamedTuple):
         spread: (9, 9) covariance that the terms add to theirs.
         share: (9,) how much of each direction of the terms the data settle: mean variance left.
         terms: (9,) the terms in these directions.
-        misfit: probability of there being one, without the caution of `BLURRED`; `1 − NONE` where the residuals do not
+        misfit: probability of there being one, without the caution of `BLUR_RAD`; `1 − NONE` where the residuals do not
             show it.
         trusted: the change of K is small enough for a linear step.
     """
@@ -98,7 +104,7 @@ class Averaged(NamedTuple):
 
 def scales(curvature: float) -> Floats:
     """(9,) usual size of each term over that of the cubic ones, at ‖K‖ · length."""
-    return np.where(_CUBIC, 1.0, 0.25 * max(curvature, _NEVER_LESS))
+    return np.where(_CUBIC, 1.0, 0.25 * max(curvature, _MIN_CURVATURE))
 
 
 def averaged(m: Floats, s: Floats, carried: Floats, curvature: float, blur: float = 0.0) -> Averaged:
@@ -126,17 +132,17 @@ def averaged(m: Floats, s: Floats, carried: Floats, curvature: float, blur: floa
     left = weight.dot(share)
     spread = (carried * left).dot(carried.T) + (apart.T * weight).dot(apart)
     changed = float(weight.dot(np.square(shifts[:, 6:])).dot(_PER_SQUARE))
-    spread.flat[60::10] += LEFT_OUT**2 * changed / _PER_SQUARE  # of K
-    trusted = changed <= (TRUST * max(curvature, 1.0)) ** 2
+    spread.flat[60::10] += HIGHER_TERMS_SHARE**2 * changed / _PER_SQUARE  # of K
+    trusted = changed <= (MAX_CORRECTION_SHARE * max(curvature, 1.0)) ** 2
     shown = 1.0 - NONE * float(evidence[0] / _PRIOR.dot(evidence))
     return Averaged(mean, spread, left, weight.dot(share * s), shown, trusted)
 
 
 def _prior(blur: float) -> Floats:
     """Prior weights of no misfit, the usual ones and the tail, at κσ_p (rad)."""
-    if blur <= BLURRED:
+    if blur <= BLUR_RAD:
         return _PRIOR
-    result: Floats = _PRIOR + min(blur / BLURRED - 1.0, 1.0) * (_CAUTIOUS - _PRIOR)
+    result: Floats = _PRIOR + min(blur / BLUR_RAD - 1.0, 1.0) * (_CAUTIOUS - _PRIOR)
     return result
 
 
@@ -145,7 +151,7 @@ def correct(c: Floats, root: Floats, d: Design, independent: Floats | None) -> C
     J, E, r, slack = _rows(c, d, independent)
     inverse = inverted(root)
     H = inverse @ inverse.T
-    curvature = float(np.linalg.norm(c[6:] / UNIT))
+    curvature = float(np.linalg.norm(c[6:] / C_PER_Q))
     E *= scales(curvature)
     carried = H @ (J.T @ E)  # terms a put the quadric off by −carried a
     m, U = np.linalg.eigh(E.T @ (E - J @ carried))  # what the nine parameters and their prior cannot explain of them
@@ -176,4 +182,4 @@ def misfit_notes(misfit: float, *, trusted: bool) -> tuple[str, ...]:
     """What a reader should know about a misfit."""
     if not trusted:
         return ("no quadric: K varies too much along the path to be observed",)
-    return ("no quadric: corrected for cubic and quartic terms",) if misfit > CERTAIN else ()
+    return ("no quadric: corrected for cubic and quartic terms",) if misfit > MENTIONED_PROBABILITY else ()

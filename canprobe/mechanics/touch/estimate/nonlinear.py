@@ -13,12 +13,12 @@ import numpy as np
 
 from canprobe.mechanics.touch.estimate.noise import CHI2_999, CHI2_MEDIAN, mixed
 from canprobe.mechanics.touch.estimate.observed import Decision, decide, spread_of
-from canprobe.mechanics.touch.estimate.quadric import UNIT, size_of
+from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, size_of
 from canprobe.mechanics.touch.estimate.residuals import Design, linear_rows, linearise
 from canprobe.mechanics.touch.linear_algebra import solved, upper_root
 from canprobe.mechanics.types import Floats
 
-DIFFUSE = 1e-2
+DIFFUSE_INFORMATION = 1e-2
 """Root of the information, in units of the length, that keeps a root regular: K known to ±200/length."""
 _TOLERANCE = 3e-8
 _ITERATIONS = 40
@@ -40,7 +40,7 @@ class QuadricFit(NamedTuple):
         root: (9, 9) upper triangular information root, prior included.
         decision: rank decision on the data.
         free: (9,) parameters with nothing held, and
-        free_root: (9, 9) root of their information, kept regular by next to nothing (`DIFFUSE`).
+        free_root: (9, 9) root of their information, kept regular by next to nothing (`DIFFUSE_INFORMATION`).
         innovation: weighted χ² per degree of freedom.
         outliers: samples with less than full weight.
         converged: the last step was below the tolerance.
@@ -106,7 +106,7 @@ def fit(d: Design, prior: tuple[Floats, Floats], independent: Floats | None = No
 
 def _freed(c: Floats, J: Floats, r: Floats, root: Floats, prior: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
     """One more step with nothing held."""
-    regular = upper_root(np.concatenate([root, DIFFUSE * np.eye(9)]))
+    regular = upper_root(np.concatenate([root, DIFFUSE_INFORMATION * np.eye(9)]))
     gradient = J.T @ r + prior[0].T @ (prior[0] @ c - prior[1])
     return c - solved(regular, solved(regular.T, gradient)), regular
 
@@ -162,14 +162,14 @@ def solve_rows(
     root, z = full[:9, :9], full[:9, 9]
     if known is not None and known.rank == 3:
         return solved(root, z), root, known
-    root_q, has_prior = root[6:, 6:] * UNIT, bool(P[3:].any())
+    root_q, has_prior = root[6:, 6:] * C_PER_Q, bool(P[3:].any())
     # rank is the data's: a prior on K itself is left out of it
     data = upper_root(np.concatenate([A, P[:3]])) if has_prior else root
-    decision = decide(data[6:, 6:] * UNIT, spread, size)
+    decision = decide(data[6:, 6:] * C_PER_Q, spread, size)
     if has_prior and decision.rank < 3:
         # what only noise says about the open combinations is taken out, the prior alone speaks there
-        V = UNIT[:, None] * decision.vectors[:, decision.passed]
-        seen = V @ (decision.vectors[:, decision.passed].T / UNIT)
+        V = C_PER_Q[:, None] * decision.vectors[:, decision.passed]
+        seen = V @ (decision.vectors[:, decision.passed].T / C_PER_Q)
         hidden = stacked[:-3, 6:9] @ (np.eye(3) - seen)
         mean = p[3:] / np.diag(P[3:, 6:])
         stacked[:-3, 6:9] -= hidden
@@ -180,6 +180,6 @@ def solve_rows(
         return solved(root, z), root, decision
     V = decision.vectors[:, decision.passed]
     c = np.empty(9)
-    c[6:] = UNIT * (V @ np.linalg.lstsq(root_q @ V, z[6:], rcond=None)[0]) if decision.rank else 0.0
+    c[6:] = C_PER_Q * (V @ np.linalg.lstsq(root_q @ V, z[6:], rcond=None)[0]) if decision.rank else 0.0
     c[:6] = solved(root[:6, :6], z[:6] - root[:6, 6:] @ c[6:])
     return c, root, decision

@@ -4,11 +4,11 @@ The decision is made on K alone, in q = (K11, √2 K12, K22), where a turn of th
 not depend on the choice of axes. A combination of K counts as observed when
 
 1. the points were spread: their mean square distance from their mean, along the axes that the combination weighs, is
-   at least `SPREAD · σ_p²` (noise alone would give σ_p²). Below, an answer would be drawn towards 0 with a small but
-   false σ. This is decided first, on the places alone, so that no fit can talk itself into it;
+   at least `MIN_SPREAD · σ_p²` (noise alone would give σ_p²). Below, an answer would be drawn towards 0 with a small
+   but false σ. This is decided first, on the places alone, so that no fit can talk itself into it;
 2. its standard deviation, all other parameters unknown, is at most `SIGMA_LIMIT · max(‖K‖, 1/L)`, L the length of the
    path;
-3. its information is at least `NUMERIC` times the largest: rounding.
+3. its information is at least `NUMERIC_SHARE` times the largest: rounding.
 
 A straight path passes two of three: the normal curvature along it and the twist. Combinations that fail are held at
 the value nearest to flat.
@@ -26,9 +26,9 @@ from canprobe.mechanics.touch.estimate.quadric import TO_Q
 from canprobe.mechanics.touch.linear_algebra import eigen, principal
 from canprobe.mechanics.types import Floats
 
-SPREAD = 10.0
+MIN_SPREAD = 10.0
 SIGMA_LIMIT = 0.3
-NUMERIC = 1e-12
+NUMERIC_SHARE = 1e-12
 
 
 class Decision(NamedTuple):
@@ -81,7 +81,7 @@ def decide(root_q: Floats, spread: Floats, curvature: float) -> Decision:
 
 
 def _least(curvature: float, largest: float) -> float:
-    return max(1.0 / (SIGMA_LIMIT * max(curvature, 1.0)) ** 2, NUMERIC * largest)
+    return max(1.0 / (SIGMA_LIMIT * max(curvature, 1.0)) ** 2, NUMERIC_SHARE * largest)
 
 
 def excited(spread: Floats) -> tuple[Floats, NDArray[np.bool_]]:
@@ -89,7 +89,7 @@ def excited(spread: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     them (3,) the points were spread.
     """
     mean, radius, angle = principal(spread)
-    return turned(angle).T, np.array([mean + radius, mean, mean - radius]) >= SPREAD
+    return turned(angle).T, np.array([mean + radius, mean, mean - radius]) >= MIN_SPREAD
 
 
 def turned(angle: float) -> Floats:

@@ -33,9 +33,9 @@ class Dropped:
         return self.not_finite + self.repeated + self.backwards + self.zero_sigma + self.not_unit
 
 
-WIDER = {Doubt.SATURATED: 3.0, Doubt.CUT: 3.0, Doubt.SMALL: 3.0, Doubt.DEAD: 1.5}
+DOUBT_SIGMA_SCALE = {Doubt.SATURATED: 3.0, Doubt.CUT: 3.0, Doubt.SMALL: 3.0, Doubt.DEAD: 1.5}
 """Factor of both standard deviations of a contact whose image is in doubt."""
-DOUBTS_OF = 160
+DOUBT_WINDOW_SAMPLES = 160
 """Last contacts whose doubts an estimate reports."""
 
 
@@ -63,7 +63,7 @@ class Gate:
         self.sigma_point = positive("sigma_point", sigma_point)
         self.sigma_normal = positive("sigma_normal", sigma_normal)
         self._last_t = -math.inf
-        self._doubts: deque[tuple[Doubt, ...]] = deque(maxlen=DOUBTS_OF)
+        self._doubts: deque[tuple[Doubt, ...]] = deque(maxlen=DOUBT_WINDOW_SAMPLES)
 
     def reset(self) -> None:
         """Accept any time again."""
@@ -102,7 +102,7 @@ class Gate:
 
     def sigmas(self, sample: ContactSample) -> tuple[float, float]:
         """Standard deviations of a sample's point (m) and normal (rad)."""
-        wider = max([WIDER[doubt] for doubt in sample.doubts], default=1.0)
+        wider = max([DOUBT_SIGMA_SCALE[doubt] for doubt in sample.doubts], default=1.0)
         return (
             wider
             * math.hypot(self.sigma_point if sample.sigma_point is None else sample.sigma_point, sample.sigma_motion),

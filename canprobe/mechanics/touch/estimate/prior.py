@@ -12,7 +12,7 @@ from canprobe.errors import UsageError
 from canprobe.mechanics.touch.linear_algebra import checked, positive
 from canprobe.mechanics.types import Floats
 
-NUISANCE = (0.15, 0.15, 0.5)
+NUISANCE_SIGMA = (0.15, 0.15, 0.5)
 """Standard deviations of c13, c23, c33 times the length of the path: 7.5, 7.5, 25 per m on a path of 20 mm.
 
 On a short path these three are nearly unobservable (on a plane exactly so). They are of the order of a surface's
@@ -50,13 +50,13 @@ class Prior:
     @classmethod
     def weak(cls, length: float) -> Prior:
         """The default: nothing on curvature, `NUISANCE / length` on c13, c23, c33."""
-        s13, s23, s33 = (s / positive("length", length) for s in NUISANCE)
+        s13, s23, s33 = (s / positive("length", length) for s in NUISANCE_SIGMA)
         return cls("weak on c13, c23, c33", s13, s23, s33)
 
     @classmethod
     def flat(cls, length: float, sigma_curvature: float) -> Prior:
         """Weak on c13, c23, c33, and curvature 0 ± sigma_curvature (1/m) in every direction."""
-        s13, s23, s33 = (s / positive("length", length) for s in NUISANCE)
+        s13, s23, s33 = (s / positive("length", length) for s in NUISANCE_SIGMA)
         sigma_curvature = positive("sigma_curvature", sigma_curvature)
         return cls(f"curvature 0 ± {sigma_curvature:.4g} per unit length", s13, s23, s33, 0.0, sigma_curvature)
 

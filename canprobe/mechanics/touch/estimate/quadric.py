@@ -15,7 +15,7 @@ from canprobe.mechanics.types import Floats
 
 TO_Q = np.array([1.0, math.sqrt(2.0), 1.0])
 """K11, K12, K22 to q = (K11, √2 K12, K22), in which a rotation of the frame is orthogonal."""
-UNIT = 0.5 / TO_Q
+C_PER_Q = 0.5 / TO_Q
 """c11, c12, c22 per unit of q."""
 
 _INDEX = ((0, 3), (1, 3), (3, 3), (0, 2), (1, 2), (2, 2), (0, 0), (0, 1), (1, 1))
@@ -27,9 +27,9 @@ _FLAT = _BASIS.reshape(9, 16)
 _PLACES = np.array([4 * i + j for i, j in _INDEX])
 _CONSTANT = np.zeros((4, 4))
 _CONSTANT[2, 3] = _CONSTANT[3, 2] = -0.5
-WIDE = np.concatenate([_BASIS, _CONSTANT[None]]).transpose(1, 0, 2).reshape(4, 40)
+STACKED_BASIS = np.concatenate([_BASIS, _CONSTANT[None]]).transpose(1, 0, 2).reshape(4, 40)
 """S as the sum of ten matrices, side by side."""
-ENTRIES = np.array([[40 * i + 4 * k + j for k in range(10)] for i, j in (*_INDEX, (2, 3))])
+STACKED_ENTRIES = np.array([[40 * i + 4 * k + j for k in range(10)] for i, j in (*_INDEX, (2, 3))])
 """Where the parameters stand in each of them, and c34."""
 
 

@@ -22,29 +22,29 @@ from canprobe.mechanics.touch.estimate.information import InformationFilter, Mea
 from canprobe.mechanics.touch.estimate.known_curvature import curvature_covariance, evidence_of
 from canprobe.mechanics.touch.estimate.misfit import misfit_notes
 from canprobe.mechanics.touch.estimate.noise import CHI2_99, CHI2_999, Correlation
-from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE
+from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE_INFORMATION
 from canprobe.mechanics.touch.estimate.observed import decide, nothing_observed
 from canprobe.mechanics.touch.estimate.omitted_terms import ExpectedMisfit
 from canprobe.mechanics.touch.estimate.online import Dropped, Gate
 from canprobe.mechanics.touch.estimate.prior import Prior
-from canprobe.mechanics.touch.estimate.quadric import UNIT, size_of
+from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, size_of
 from canprobe.mechanics.touch.estimate.start import Start
 from canprobe.mechanics.touch.estimate.travel import Spread, Travel
 from canprobe.mechanics.touch.linear_algebra import instance, inverted, inverted_upper, lower_root, positive, upper_root
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 from canprobe.mechanics.types import Floats
 
-STEP = 0.025
+STEP_SHARE = 0.025
 """Travel between two updates over the memory."""
-CROWD = 2.0
+MAX_CROWDING = 2.0
 """Most samples per metre that count in full, over the nominal `window / memory`."""
-MOST_PENDING = 16
+MAX_PENDING = 16
 """Samples of one step that are kept; of a slower motion the last ones."""
-STARTING = 1.6
+START_ALARM_SCALE = 1.6
 """How much higher the alarm's thresholds are during a start: the first answers are soon put right by themselves."""
-ALIKE = 1.4
+CORRELATED_ALARM_SCALE = 1.4
 """The same where the errors of neighbours are alike: running means vary more."""
-GENEROUS = 0.5
+MIN_BELIEVED_INNOVATION = 0.5
 """Usual innovation below which the stated noise is not believed where a misfit is looked for."""
 
 
@@ -95,11 +95,11 @@ class RecursiveEstimator:
         self._gate = Gate(sigma_point, sigma_normal)
         self._memory = positive("memory_m", memory_m)
         self._quadric = quadric
-        self._crowd = CROWD * positive("window", window) / self._memory
+        self._crowd = MAX_CROWDING * positive("window", window) / self._memory
         self._prior = Prior.weak(self._memory) if prior is None else instance("prior", prior, Prior)
         if math.isfinite(self._prior.sigma_curvature):
             raise UsageError("prior: expected none on curvature itself for 'recursive', got " + self._prior.name)
-        self._caution = 1.0 if correlation is None else ALIKE
+        self._caution = 1.0 if correlation is None else CORRELATED_ALARM_SCALE
         self._filter = InformationFilter(self._memory, self._prior, correlation)
         self.reset()
 
@@ -107,8 +107,8 @@ class RecursiveEstimator:
         """Forget everything but the settings."""
         self._gate.reset()
         self._last: MeasuredContact | None = None
-        self._pending: deque[_Pending] = deque(maxlen=MOST_PENDING)
-        self._travel = Travel(max(STEP * self._memory, 3.0 * self._gate.sigma_point))
+        self._pending: deque[_Pending] = deque(maxlen=MAX_PENDING)
+        self._travel = Travel(max(STEP_SHARE * self._memory, 3.0 * self._gate.sigma_point))
         self._spread = Spread()
         self._change = ChangeTest()
         self._start: Start | None = Start(self._memory, self._prior)
@@ -139,7 +139,7 @@ class RecursiveEstimator:
         certain = float(self._settled) / self._gate.sigma_point**2
         P = a.T_frame_contact[:3, :2]
         flat = P.T.dot(self._spread.covariance * certain).dot(P)
-        q = a.M[6:].dot(state.inverse) / UNIT[:, None]
+        q = a.M[6:].dot(state.inverse) / C_PER_Q[:, None]
         decision = decide(inverted_upper(upper_root(q.T)).T, flat, size_of(a.c))
         # the sandwich: A⁻¹ = inverse inverseᵀ, the score between
         noise = state.inverse.T.dot(state.left_out.score.matrix[:9, :9]).dot(state.inverse)
@@ -153,12 +153,12 @@ class RecursiveEstimator:
                 noise += state.root.dot(amended.covariance).dot(state.root.T)
             else:
                 decision = nothing_observed()
-        deviation = a.M.dot(state.inverse.dot(lower_root(noise)) if believed else np.eye(9) / DIFFUSE)
+        deviation = a.M.dot(state.inverse.dot(lower_root(noise)) if believed else np.eye(9) / DIFFUSE_INFORMATION)
         covariance = curvature_covariance(a.c, deviation)
         evidence = evidence_of(a.c, covariance, flat, state.length)
         if decision.rank < 3:
             known = decision.vectors[:, decision.passed]
-            a.c[6:] = UNIT * (known @ (known.T @ (a.c[6:] / UNIT)))
+            a.c[6:] = C_PER_Q * (known @ (known.T @ (a.c[6:] / C_PER_Q)))
             covariance = np.full((3, 3), math.nan)
         return build_estimate(
             Solution(a.c, covariance, decision, has_prior=False, root=inverted(deviation)),
@@ -177,7 +177,7 @@ class RecursiveEstimator:
     def _expected(self) -> ExpectedMisfit:
         """Stated noise counts unless it is twice the usual; a probe feels surfaces about as curved as itself."""
         usual = self._change.usual
-        noise = usual if usual < GENEROUS else 1.0
+        noise = usual if usual < MIN_BELIEVED_INNOVATION else 1.0
         return ExpectedMisfit(noise, self._coupling * self._memory, self._gate.sigma_point / self._memory)
 
     def _notes(self) -> tuple[str, ...]:
@@ -189,7 +189,7 @@ class RecursiveEstimator:
     def _step(self, moved: float) -> None:
         """Take what is pending into the filter or its start; after a change of the surface into a new start."""
         compared = self._compared() if self._settled else None
-        caution = self._caution if self._start is None else STARTING * self._caution
+        caution = self._caution if self._start is None else START_ALARM_SCALE * self._caution
         if compared and any([self._change.take(square, caution) for square in compared.squares.tolist()]):
             explained = self._explained(compared)
             if explained is None:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from canprobe.mechanics.touch.estimate.noise import Noise
-from canprobe.mechanics.touch.estimate.quadric import ENTRIES, WIDE, matrix_of
+from canprobe.mechanics.touch.estimate.quadric import STACKED_BASIS, STACKED_ENTRIES, matrix_of
 from canprobe.mechanics.touch.estimate.terms import terms
 from canprobe.mechanics.types import Floats
 
@@ -164,7 +164,7 @@ def transport(c: Floats, T: Floats) -> tuple[Floats, Floats]:
 
     T (4, 4) takes new coordinates to old, lengths in the problem's unit.
     """
-    moved = T.T.dot(WIDE).reshape(40, 4).dot(T).take(ENTRIES)
+    moved = T.T.dot(STACKED_BASIS).reshape(40, 4).dot(T).take(STACKED_ENTRIES)
     entries = moved[:, :9].dot(c) + moved[:, 9]
     scale = -0.5 / float(entries[9])
     c_new = scale * entries[:9]

@@ -15,22 +15,22 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from canprobe.mechanics.touch.estimate.gauss_newton_step import SETTLED, Solved, gauss_newton, solved_once
+from canprobe.mechanics.touch.estimate.gauss_newton_step import SETTLED_STEP, Solved, gauss_newton, solved_once
 from canprobe.mechanics.touch.estimate.information import MeasuredContact, batch_design
 from canprobe.mechanics.touch.estimate.nonlinear import linear_start
-from canprobe.mechanics.touch.estimate.observed import SPREAD, spread_of
+from canprobe.mechanics.touch.estimate.observed import MIN_SPREAD, spread_of
 from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.estimate.residuals import Design
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 from canprobe.mechanics.types import Floats
 
-FIRST = 0.1
+FIRST_SOLUTION_SHARE = 0.1
 """Travel over the memory at the first solution."""
-LAST = 0.4
+TAKEOVER_SHARE = 0.4
 """Travel over the memory at which the filter takes over, once the solution has settled."""
-LATEST = 0.8
+LATEST_TAKEOVER_SHARE = 0.8
 """Travel over the memory at which it takes over even where the solution still moves."""
-MOST = 128
+MAX_CONTACTS = 128
 """Contacts that are kept; of more every second one goes."""
 _FRAME_OF = 5
 """Contacts whose median place and normal make the working frame."""
@@ -59,23 +59,25 @@ class Start:
     def over(self) -> bool:
         """Whether the filter should take over."""
         share = self.travelled / self._length
-        return self.solution is not None and (share >= LATEST or (share >= LAST and self.settled))
+        return self.solution is not None and (
+            share >= LATEST_TAKEOVER_SHARE or (share >= TAKEOVER_SHARE and self.settled)
+        )
 
     def add(self, touches: Sequence[MeasuredContact], moved: float) -> None:
         """Take in the contacts of a step of the path (m), and improve the solution by a Gauss–Newton step."""
         self._touches += touches
-        if len(self._touches) > MOST:
+        if len(self._touches) > MAX_CONTACTS:
             self._touches = self._touches[::2]
         self.travelled += moved
         share = self.travelled / self._length
-        if share < FIRST:
+        if share < FIRST_SOLUTION_SHARE:
             return
         if self.solution is None:
             self.T = _frame(self._touches[-_FRAME_OF:])
         d = batch_design(self.T, self._length, self._touches)
-        if share < LAST and float(np.linalg.eigvalsh(spread_of(d.X, d.point_variance))[0]) < SPREAD:
+        if share < TAKEOVER_SHARE and float(np.linalg.eigvalsh(spread_of(d.X, d.point_variance))[0]) < MIN_SPREAD:
             return
-        self._improve(d, share >= LAST)
+        self._improve(d, share >= TAKEOVER_SHARE)
 
     def _improve(self, d: Design, stretch_over: bool) -> None:
         """From the better of the last solution and, until that has settled, a linear one."""
@@ -88,7 +90,7 @@ class Start:
         better = gauss_newton(now, d, self._prior)
         self.solution = better
         known = self.settled or better.decision.rank == 3 or stretch_over
-        self.settled = known and better.step < SETTLED
+        self.settled = known and better.step < SETTLED_STEP
 
 
 def isolation(points: Floats, variance: Floats) -> Floats:

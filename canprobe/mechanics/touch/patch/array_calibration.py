@@ -14,7 +14,7 @@ from typing import Literal
 from canprobe.errors import UsageError
 
 ForceReference = Literal["scale", "weights", "unit", "none"]
-NOMINAL = "nominal newtons: no force reference"
+NO_FORCE_REFERENCE = "nominal newtons: no force reference"
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +169,7 @@ class ArrayCalibration:
     def newtons(self) -> str:
         """What a newton of this array is, in words."""
         if self.nominal:
-            return NOMINAL
+            return NO_FORCE_REFERENCE
         return f"newtons by {self.force_reference} (1σ {100.0 * self.force_sigma:.1f} %)"
 
     def with_stiffness(self, stiffness: float) -> ArrayCalibration:

@@ -43,8 +43,8 @@ from canprobe.mechanics.types import Floats
 FORM_SIGMA = 0.01
 """Relative error of a moment that planes and balls do not show: of cylinders and saddles, by the model's form."""
 FOLDS = 5
-LEAST_TOUCHES = 10
-HELPFUL = 0.9
+MIN_TOUCHES = 10
+MAX_ERROR_LEFT_SHARE = 0.9
 """Share of the moments' error that may be left with gains of the taxels, for these to be used."""
 
 
@@ -109,9 +109,9 @@ def calibrate_array(
     every = [(d, what_is_shown(d, plain, AGE_S)) for d in dwells]
     used = {id(d) for d, s in every if s.usable}
     count = sum(s.usable and d.name != "rod" for d, s in every)
-    if count < LEAST_TOUCHES or len({d.name for d, s in every if s.usable and d.name != "rod"}) < 2:
+    if count < MIN_TOUCHES or len({d.name for d, s in every if s.usable and d.name != "rod"}) < 2:
         raise UsageError(
-            f"expected at least {LEAST_TOUCHES} touches of a plane and a ball that neither saturate nor leave the pad,"
+            f"expected at least {MIN_TOUCHES} touches of a plane and a ball that neither saturate nor leave the pad,"
             f" got {count}"
         )
     if by_force and not any(d.force is not None and id(d) in used for d in dwells):
@@ -133,7 +133,7 @@ def calibrate_array(
     gained, alike = _by_gains(fitted, first, plain, seen)
     gains, dead = _gains(fitted, first, plain)
     own = plain
-    if own_gains and gained < HELPFUL * alike:
+    if own_gains and gained < MAX_ERROR_LEFT_SHARE * alike:
         own = replace(plain, gains=tuple(tuple(row) for row in np.round(gains, 4).tolist()))
         good = [(d, what_is_shown(d, own, AGE_S)) for d, _ in good]
         fitted = [(d, s) for d, s in good if d.name != "rod"]

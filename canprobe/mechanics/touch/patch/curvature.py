@@ -35,25 +35,25 @@ from canprobe.mechanics.touch.patch.moments import Moments
 from canprobe.mechanics.touch.tangent_frames import tangent_rotation, transported
 from canprobe.mechanics.types import Floats, Vec
 
-LEAST_FRAMES = 8
+MIN_FRAMES = 8
 """Fewer frames make no estimate."""
-MOST_FRAMES = 32
+MAX_FRAMES = 32
 """Frames that the running mean reaches back: 0.16 s at 200 Hz, 4 mm at 25 mm/s."""
 FEW_FRAMES = 8
 """The same of the shorter mean."""
-FINE = 0.05
-"""`GROSS` of the shorter mean, in which one image weighs more: four times the noise of a frame."""
-YOUNGER = 4.0
+FINE_OUTLIER_SHARE = 0.05
+"""`OUTLIER_SHARE` of the shorter mean, in which one image weighs more: four times the noise of a frame."""
+MIN_AGE_DIFFERENCE_FRAMES = 4.0
 """Frames by which the shorter mean must be the younger one to tell a drift."""
-GROSS = 0.2
+OUTLIER_SHARE = 0.2
 """Departure from the mean, over its trace, beyond which one image counts less: ten times the noise of a frame."""
-MOST_ROUNDS = 6
+MAX_ROUNDS = 6
 """Gauss–Newton steps; from the last answer one or two do."""
 SLOPE_SIGMA = 0.08
 """Error of a touch's slope in the logarithm of the stiffness that its own deviation leaves out: that of the force."""
-_STIFFER = 0.01
+_STIFFNESS_STEP = 0.01
 _ROOT2 = math.sqrt(2.0)
-SETTLED, UNSETTLED = 0.002, 0.05
+SETTLED_STEP, MAX_LAST_STEP = 0.002, 0.05
 """Step, in units of the probe's curvature, that ends the iteration, and the largest that a last step may have."""
 
 
@@ -93,7 +93,7 @@ class _Seen(NamedTuple):
 
 
 class _Mean:
-    """Running mean of moments over so many frames at most, for how many it stands, and its age; `gross`: as `GROSS`."""
+    """Running mean of moments over at most `most` frames, their number, and its age; `gross`: as `OUTLIER_SHARE`."""
 
     def __init__(self, most: int, gross: float) -> None:
         self.moments: Moments = (0.0, 0.0, 0.0)
@@ -108,10 +108,10 @@ class _Mean:
         share = 1.0 / self.frames
         mxx, mxy, myy = self.moments
         dxx, dxy, dyy = xx - mxx, xy - mxy, yy - myy
-        if self.frames >= LEAST_FRAMES:
+        if self.frames >= MIN_FRAMES:
             nearness = self._gross * (mxx + myy) / max(abs(dxx) + 2.0 * abs(dxy) + abs(dyy), 1e-300)
             self._apart = self._apart + 1 if nearness < 1.0 else 0
-            if self._apart == LEAST_FRAMES:
+            if self._apart == MIN_FRAMES:
                 # so many in a row are no outliers: what was before them is not what is felt now
                 self.moments, self.age, self.frames, self._apart = (xx, xy, yy), 0.0, 1, 0
                 return 1.0
@@ -123,7 +123,7 @@ class _Mean:
     def drift_from(self, younger: _Mean) -> Moments:
         """How far this is off by what changed since, if it went on as a younger mean says."""
         apart = self.age - younger.age
-        if apart < YOUNGER:
+        if apart < MIN_AGE_DIFFERENCE_FRAMES:
             return 0.0, 0.0, 0.0
         times = self.age / apart
         xx, xy, yy = (times * (now - then) for now, then in zip(younger.moments, self.moments, strict=True))
@@ -138,7 +138,7 @@ class PatchCurvature:
         sigma_stiffness: standard deviation of the logarithm of the model's stiffness, before any touch.
 
     Attributes:
-        frames: how many the mean stands for, at most `MOST_FRAMES`.
+        frames: how many the mean stands for, at most `MAX_FRAMES`.
         refused: contacts without moments (saturated, at the pad's edge, hardly any taxel, or a sensor that sends none).
     """
 
@@ -157,7 +157,7 @@ class PatchCurvature:
         self._last: Floats | None = None
         self._slope: Slope | None = None
         self._touched = False
-        self._mean, self._recent = _Mean(MOST_FRAMES, GROSS), _Mean(FEW_FRAMES, FINE)
+        self._mean, self._recent = _Mean(MAX_FRAMES, OUTLIER_SHARE), _Mean(FEW_FRAMES, FINE_OUTLIER_SHARE)
 
     def add(self, sample: ContactSample) -> None:
         """Take the image of one contact."""
@@ -199,7 +199,7 @@ class PatchCurvature:
 
     def fuse(self, T_base_contact: Floats, motion: CurvatureInformation | None = None) -> Fused | None:
         """The patch, with what the motion knows about q, in a contact frame (4, 4); None where it knows nothing."""
-        if self.frames < LEAST_FRAMES:
+        if self.frames < MIN_FRAMES:
             return None
         c, s = self._in_axes(T_base_contact[:3, 0].tolist())
         xx, xy, yy = _turned(*self._mean.moments, c, -s)
@@ -243,15 +243,15 @@ class PatchCurvature:
         scale = np.array([xx, math.sqrt(xx * yy), yy])
         step = math.inf
         try:
-            for round_ in range(MOST_ROUNDS):
+            for round_ in range(MAX_ROUNDS):
                 q1, q2, q3, stiffer = x.tolist()
                 k: Moments = q1, q2 / _ROOT2, q3
                 model = self._model(stiffer)
                 J[:, :3], r, W = model.linearised(seen.moments, self.force, self.frames, k)
                 if round_ == 0:  # it hardly changes from step to step
                     here = np.array(seen.moments) - scale * r
-                    there = self._model(stiffer + _STIFFER).moments(k, self.force)
-                    J[:, 3] = (there - here) / scale / _STIFFER
+                    there = self._model(stiffer + _STIFFNESS_STEP).moments(k, self.force)
+                    J[:, 3] = (there - here) / scale / _STIFFNESS_STEP
                 W = _less_certain(W, seen)
                 W *= model.trust(k, self.force)
                 JW = J.T.dot(W)
@@ -270,11 +270,11 @@ class PatchCurvature:
                 x = x + way
                 *of_q, of_stiffness = map(abs, way.tolist())
                 step = max(*of_q, of_stiffness / self.model.radius)
-                if step < SETTLED / self.model.radius:
+                if step < SETTLED_STEP / self.model.radius:
                     break
         except (ValueError, np.linalg.LinAlgError):
             return None
-        if step > UNSETTLED / self.model.radius:
+        if step > MAX_LAST_STEP / self.model.radius:
             return None
         stiffness = LayerStiffness(float(x[3]), math.sqrt(float(inverted(felt + known)[3, 3])))
         patch = felt[:3, :3] - felt[:3, 3, None] * felt[3, :3] / (felt[3, 3] + known[3, 3])

@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-LEAST_COUNTS = 20
+MIN_COUNTS = 20
 """Counts that each of the four neighbours must show: more than a patch's slope can fall to nothing from."""
-_LEVELS = bytes((count > 0) + (count >= LEAST_COUNTS) for count in range(256))
+_LEVELS = bytes((count > 0) + (count >= MIN_COUNTS) for count in range(256))
 _GAP = bytes((2, 0, 2))
 """A dead taxel between its left and its right neighbour, in levels of counts."""
 Image = NDArray[np.uint8]
@@ -27,7 +27,7 @@ def mended(taxels: Image) -> tuple[Image, int]:
     inner = taxels[1:-1, 1:-1]
     sides = (taxels[:-2, 1:-1], taxels[2:, 1:-1], taxels[1:-1, :-2], taxels[1:-1, 2:])
     least = np.minimum(np.minimum(sides[0], sides[1]), np.minimum(sides[2], sides[3]))
-    dead = least > (LEAST_COUNTS - 1) + 255 * (inner > 0).astype(np.int16)
+    dead = least > (MIN_COUNTS - 1) + 255 * (inner > 0).astype(np.int16)
     n = int(np.count_nonzero(dead))
     if n == 0:
         return taxels, 0

@@ -10,16 +10,16 @@ from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import Solution, SurfaceEstimate, build_estimate
 from canprobe.mechanics.touch.estimate.noise import CHI2_95
 from canprobe.mechanics.touch.estimate.observed import SIGMA_LIMIT, Decision, nothing_observed
-from canprobe.mechanics.touch.estimate.quadric import TO_Q, UNIT, matrix_of, parameters_of
+from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, TO_Q, matrix_of, parameters_of
 from canprobe.mechanics.touch.linear_algebra import eigen, inverted
 from canprobe.mechanics.touch.patch.curvature import Fused, PatchCurvature
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 from canprobe.mechanics.types import Floats
 
-NAMED = 0.1
+NAMED_SHARE = 0.1
 """Share of the information about K that the patch gives from which on the estimate's method names it."""
-CONTRADICTED = "the patch contradicts the motion"
-WITHDRAWN = 0.25
+CONTRADICTION_NOTE = "the patch contradicts the motion"
+WITHDRAWAL_SHARE = 0.25
 """Path over the memory after which a contradiction that lasts withdraws that anything was observed."""
 _TO_K = 1.0 / np.outer(TO_Q, TO_Q)
 
@@ -29,7 +29,7 @@ def with_patch(motion: SurfaceEstimate, found: Fused, length: float, *, withdraw
 
     Place, normal and c13, c23, c33 stay the motion's; the patch says nothing about them. Curvatures below 1/length (the
     memory, m) count as flat; `withdrawn`: nothing is called observed. The `method` ends in "+patch" where the patch
-    gave at least `NAMED`; a note says how much.
+    gave at least `NAMED_SHARE`; a note says how much.
     """
     assert motion.evidence is not None
     weight = CHI2_95 / max(found.cost, CHI2_95)
@@ -48,7 +48,7 @@ def with_patch(motion: SurfaceEstimate, found: Fused, length: float, *, withdraw
         innovation=motion.innovation,
         distance=motion.distance,
         samples=motion.samples,
-        method=motion.method + "+patch" if share >= NAMED else motion.method,
+        method=motion.method + "+patch" if share >= NAMED_SHARE else motion.method,
         prior=motion.prior,
         notes=(*motion.notes, *_notes(found, share)),
         stiffness=found.stiffness,
@@ -77,13 +77,13 @@ def patch_estimate(contact: ContactSample, patch: PatchCurvature, length: float)
 
 def _notes(found: Fused, share: float) -> tuple[str, ...]:
     said = (f"{100.0 * share:.0f} % of the curvature from the patch",)
-    return (*said, CONTRADICTED) if found.contradicted else said
+    return (*said, CONTRADICTION_NOTE) if found.contradicted else said
 
 
 def _joined(model_root: Floats, patch: Floats) -> Floats:
     """(n + 3, 9) root of the information about the entries of S with the patch's part about K."""
     rows = np.zeros((3, 9))
-    rows[:, 6:] = _root(patch) / UNIT
+    rows[:, 6:] = _root(patch) / C_PER_Q
     return np.concatenate([model_root, rows])
 
 
@@ -107,8 +107,8 @@ def _solution(
     """From q and its covariance (3, 3)."""
     c = parameters_of(S)
     if has_prior or decision.rank == 3:
-        c[6:] = UNIT * q
+        c[6:] = C_PER_Q * q
         return Solution(c, covariance * _TO_K, decision, has_prior, root)
     V = decision.vectors[:, decision.passed]
-    c[6:] = UNIT * (V @ (V.T @ q))
+    c[6:] = C_PER_Q * (V @ (V.T @ q))
     return Solution(c, np.full((3, 3), math.nan), decision, has_prior, root)

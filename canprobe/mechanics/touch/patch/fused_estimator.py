@@ -8,7 +8,7 @@ from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 from canprobe.mechanics.touch.estimate.online import Dropped, Estimator
 from canprobe.mechanics.touch.patch.curvature import PatchCurvature
-from canprobe.mechanics.touch.patch.fused_answer import WITHDRAWN, patch_estimate, with_patch
+from canprobe.mechanics.touch.patch.fused_answer import WITHDRAWAL_SHARE, patch_estimate, with_patch
 from canprobe.mechanics.types import Floats
 
 
@@ -57,7 +57,7 @@ class PatchedEstimator:
         self._place = motion.point
         if found is None:
             return motion
-        return with_patch(motion, found, self._length, withdrawn=self._contradicted > WITHDRAWN * self._length)
+        return with_patch(motion, found, self._length, withdrawn=self._contradicted > WITHDRAWAL_SHARE * self._length)
 
     def reset(self) -> None:
         """Forget everything but the settings."""

@@ -20,12 +20,12 @@ from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import Doubt
 from canprobe.mechanics.touch.linear_algebra import checked, positive, read_only
 from canprobe.mechanics.touch.pad import COUNTS_MAX, Pad
-from canprobe.mechanics.touch.patch.beyond_window import LEAST_PEAK, WORTH_COMPLETING, Continuation
+from canprobe.mechanics.touch.patch.beyond_window import MAX_EDGE_SHARE, MIN_PEAK, Continuation
 from canprobe.mechanics.touch.patch.dead_taxels import may_be_dead, mended
-from canprobe.mechanics.touch.stops import OFF_PAD, OFF_PAD_SIGMAS, OFF_PAD_TAXELS
+from canprobe.mechanics.touch.stops import OFF_PAD_EDGE_SHARE, OFF_PAD_SIGMAS, OFF_PAD_TAXELS
 from canprobe.mechanics.types import Floats
 
-_TOO_FEW = 4
+_MIN_TAXELS = 4
 _COUNTS = bytes(range(COUNTS_MAX + 1))
 
 
@@ -184,8 +184,8 @@ def compute_patch(
     pascals = calibration.pascals
     peak_pa, at_pad, at_window = [pascals.item(count) for count in (peak, *edges)]
     pressure = pascals.take(taxels)
-    shows_shape = peak > LEAST_PEAK * calibration.threshold_counts
-    if window is not None and at_window > WORTH_COMPLETING * peak_pa and shows_shape:
+    shows_shape = peak > MIN_PEAK * calibration.threshold_counts
+    if window is not None and at_window > MAX_EDGE_SHARE * peak_pa and shows_shape:
         pressure = calibration.continuation.completed(pressure, window, peak_pa)
     total, u, v, *_ = pressure.reshape(-1).dot(calibration.weights).tolist()
     if total <= 0.0:
@@ -197,9 +197,9 @@ def compute_patch(
         saturated=peak >= COUNTS_MAX,
         cut_by_window=at_window > 0.0,
         cut_by_pad=at_pad > 0.0,
-        too_few=n_active < _TOO_FEW,
+        too_few=n_active < _MIN_TAXELS,
         dead=dead,
-        off_pad=at_pad >= OFF_PAD * peak_pa,
+        off_pad=at_pad >= OFF_PAD_EDGE_SHARE * peak_pa,
     )
 
 

@@ -33,12 +33,12 @@ TOUCH_SIGMA = 0.012
 """Relative error of moments and sums of a touch: gains, hysteresis and creep."""
 SETTLED_S, AGE_S = 0.5, 3.5
 """From the touch to the first image that counts, and to the last: all touches are compared after as much creep."""
-MOST_OF_FULL_SCALE = 0.7
+MAX_OF_FULL_SCALE = 0.7
 """Peak over full scale above which a touch is left out: taxels bend off before they saturate."""
-HOLLOWEST = -0.9
+MIN_CURVATURE_SHARE = -0.9
 """Least curvature that is looked for, over that of the probe."""
 
-LEAST_IMAGES = 10
+MIN_IMAGES = 10
 NO_ERRORS = MomentErrors(1.0, 0.0, 1.0, 0.0)
 """Of a model that is only asked forward."""
 
@@ -135,7 +135,7 @@ def what_is_shown(dwell: Dwell, plain: PatchCalibration, age_s: float = math.inf
         at.append((patch.u, patch.v))
         peaks.append(patch.peak_pa)
         kept.append(i)
-    if len(kept) < LEAST_IMAGES:
+    if len(kept) < MIN_IMAGES:
         raise UsageError(
             f"a touch of the {dwell.name}: expected a patch in its images, got {len(kept)} images with one"
         )
@@ -154,6 +154,6 @@ def what_is_shown(dwell: Dwell, plain: PatchCalibration, age_s: float = math.inf
         way=dwell.expected[kept],
         t_s=dwell.t_s[kept],
         raw=raw,
-        usable=bad <= 0.2 * len(kept) and peak < MOST_OF_FULL_SCALE * plain.full_scale_pa,
+        usable=bad <= 0.2 * len(kept) and peak < MAX_OF_FULL_SCALE * plain.full_scale_pa,
         push=float(dwell.push[kept].mean()),
     )

@@ -27,15 +27,15 @@ from canprobe.mechanics.touch.patch.array_calibration import ImageParameters, Mo
 from canprobe.mechanics.touch.patch.moments import Moments
 from canprobe.mechanics.types import Floats
 
-STEPS = 3
+STEPS_PER_PITCH = 3
 """Grid points in a pitch: with more of them a moment changes by 0.1 %."""
-SMALLEST = 0.4
+MIN_MOMENT_PITCH2 = 0.4
 """Least moment of the ideal layer over the squared pitch, a patch three pitches wide; smaller ones blur away."""
-LARGEST = 0.2
+MAX_MOMENT_SHARE = 0.2
 """Largest such moment over the squared half-width, in pitches, of what is seen: the patch just fits."""
-LIGHTEST = 0.3
+MAX_LIGHTNESS = 0.3
 """Level over peak pressure from which too little of a patch is above the level."""
-TAPER = 0.1
+TAPER_SHARE = 0.1
 """How far beyond these limits a patch still counts, as a share of the limit."""
 USUAL_LIGHTNESS = 0.05
 """Level over peak pressure at which the floor holds; it grows in proportion, as light touches cover few taxels."""
@@ -81,15 +81,17 @@ class ImageModel:
         for name in ("radius", "pitch", "level"):
             positive(name, getattr(self, name))
         half = 0.5 * self.seen
-        source = (np.arange(math.ceil(math.sqrt(6.0 * LARGEST) * half * STEPS) + 1) + 0.5) / STEPS
-        x = (np.arange(math.ceil(half * STEPS)) + 0.5) / STEPS
+        source = (
+            np.arange(math.ceil(math.sqrt(6.0 * MAX_MOMENT_SHARE) * half * STEPS_PER_PITCH) + 1) + 0.5
+        ) / STEPS_PER_PITCH
+        x = (np.arange(math.ceil(half * STEPS_PER_PITCH)) + 0.5) / STEPS_PER_PITCH
         width = self.parameters.blur / self.pitch
-        far = np.arange(-20 * STEPS, 20 * STEPS + 1) / STEPS
+        far = np.arange(-20 * STEPS_PER_PITCH, 20 * STEPS_PER_PITCH + 1) / STEPS_PER_PITCH
         folded = [np.exp(-0.5 * ((x[:, None] - sign * source) / width) ** 2) for sign in (1.0, -1.0)]
         blur = (folded[0] + folded[1]) / np.exp(-0.5 * (far / width) ** 2).sum()
         # crosstalk is linear in rows and columns as the blur is: a row spreads its sum, which the blur leaves as it is
         share = self.parameters.crosstalk / (self.side - 1)
-        blur = (1.0 - self.side * share) * blur + share * 2.0 / STEPS
+        blur = (1.0 - self.side * share) * blur + share * 2.0 / STEPS_PER_PITCH
         weight = np.ones((len(x), len(x)))
         sums = np.stack([weight, weight * (x * x)[:, None], weight * x * x], axis=-1).reshape(-1, 3)
         object.__setattr__(self, "_squares", read_only(source * source))
@@ -159,7 +161,7 @@ class ImageModel:
         Noise lets some taxels below it through and cuts some above it: the edge is one count wide.
         """
         share = np.clip((shown - self.level) / self.count + 1.0, 0.0, 1.0)
-        sums: Floats = (shown * share).sum(axis=(1, 2)) * (2.0 * self.pitch / STEPS) ** 2
+        sums: Floats = (shown * share).sum(axis=(1, 2)) * (2.0 * self.pitch / STEPS_PER_PITCH) ** 2
         return sums
 
     def moments(self, k: Moments, force: float) -> Moments:
@@ -204,7 +206,7 @@ class ImageModel:
         return float(gains[0]), float(gains[1])
 
     def trust(self, k: Moments, force: float) -> float:
-        """1 where the model holds (K in 1/m, force in N), falling to 0 beyond `SMALLEST`, `LARGEST` and `LIGHTEST`.
+        """1 where the model holds (K in 1/m, force in N), falling to 0 beyond its limits of moment and lightness.
 
         A peak beyond full scale contradicts an image that is not saturated: the layer is another one.
         """
@@ -213,8 +215,13 @@ class ImageModel:
         least, most = (depth / (6.0 * x * self.pitch**2) for x in (a, b))
         light = self._lightness(depth)
         brightest = self.level / (COUNTS_MAX * self.count)
-        ends = SMALLEST / least, most / (LARGEST * (0.5 * self.seen) ** 2), light / LIGHTEST, brightest / light
-        return min(max(1.0 - (max(ends) - 1.0) / TAPER, 0.0), 1.0)
+        ends = (
+            MIN_MOMENT_PITCH2 / least,
+            most / (MAX_MOMENT_SHARE * (0.5 * self.seen) ** 2),
+            light / MAX_LIGHTNESS,
+            brightest / light,
+        )
+        return min(max(1.0 - (max(ends) - 1.0) / TAPER_SHARE, 0.0), 1.0)
 
     def _lightness(self, depth: float) -> float:
         """Level over the peak pressure that is shown."""

@@ -12,13 +12,13 @@ from canprobe.mechanics.touch.patch.array_calibration import CentroidErrors, Lag
 from canprobe.mechanics.touch.patch.image_fit import Dwell, Shown
 from canprobe.mechanics.types import Floats
 
-REACH = 200e-6, 0.2
+REACH_M = 200e-6, 0.2
 """Expected `Lag.reach`, m, and how far its logarithm may be off: rolls of one length hardly tell it from `Lag.most`."""
 SCATTER_WAY_M = 1e-3
 """Way over the pad within which centroids scatter as their noise: 20 mm of a scan whose pad follows the normal."""
-FRAMES_ALIKE = 20
+CORRELATED_FRAMES = 20
 """Images in a row whose centroids err alike, about."""
-LAGS, LAG_STEP_M = 16, 1e-4
+LAG_STEPS, LAG_STEP_M = 16, 1e-4
 """Of the autocorrelation along the way over the pad."""
 TAU_S = 0.02, 0.3
 """Time constants of `Lag`."""
@@ -56,9 +56,9 @@ def fit_centroids(dwells: Sequence[Dwell], shown: Sequence[Shown]) -> tuple[Cent
     def residuals(z: Floats) -> Floats:
         each = [left(z, *pair) for pair in taught]
         centred = [1e5 * (r - r.mean(axis=0)).reshape(-1) / math.sqrt(len(r)) for r in each]
-        return np.concatenate([*centred, [math.log(abs(z[1]) / (1e4 * REACH[0])) / REACH[1]]])
+        return np.concatenate([*centred, [math.log(abs(z[1]) / (1e4 * REACH_M[0])) / REACH_M[1]]])
 
-    z = least_squares(residuals, np.array([1.0, 1e4 * REACH[0]])).x
+    z = least_squares(residuals, np.array([1.0, 1e4 * REACH_M[0]])).x
     most, reach = (1e-4 * z).tolist()
     rest = [left(z, s, _means(s.t_s, s.raw)) for s in shown]
     sigma = [_scatter(r, s.way) for r, s in zip(rest, shown, strict=True)]
@@ -103,24 +103,24 @@ def _latency(rolls: Sequence[Shown]) -> tuple[float, float]:
     A, y = np.array(rows)[:, :2], np.array(rows)[:, 2]
     found, *_ = np.linalg.lstsq(A, y, rcond=None)
     scatter = float(np.mean((y - A @ found) ** 2)) * np.linalg.inv(A.T @ A)[1, 1]
-    return -float(found[1]), math.sqrt(scatter * FRAMES_ALIKE)
+    return -float(found[1]), math.sqrt(scatter * CORRELATED_FRAMES)
 
 
 def _lasting(errors: Sequence[Floats], ways: Sequence[Floats]) -> tuple[float, float]:
     """Share of the variance of errors (n, 2) that lasts along the way over the pad, and over which length, m."""
-    lags = np.zeros(LAGS)
+    lags = np.zeros(LAG_STEPS)
     for r, way in zip(errors, ways, strict=True):
         s = _along(way)
         grid = np.arange(0.0, s[-1], LAG_STEP_M)
-        if len(grid) < 2 * LAGS:
+        if len(grid) < 2 * LAG_STEPS:
             continue
         on_grid = np.stack([np.interp(grid, s, r[:, i]) for i in (0, 1)])
         on_grid -= on_grid.mean(axis=1, keepdims=True)
-        lags += [float((on_grid[:, : len(grid) - k] * on_grid[:, k:]).mean()) for k in range(LAGS)]
+        lags += [float((on_grid[:, : len(grid) - k] * on_grid[:, k:]).mean()) for k in range(LAG_STEPS)]
     if lags[0] <= 0.0:
         return 0.0, LAG_STEP_M
     # that each error has its mean taken off shifts all of them down
-    at = LAG_STEP_M * np.arange(1, LAGS)
+    at = LAG_STEP_M * np.arange(1, LAG_STEPS)
 
     def residuals(z: Floats) -> Floats:
         rest: Floats = z[0] * np.exp(-at / abs(z[1]) / 1e-3) - z[2] - lags[1:] / lags[0]

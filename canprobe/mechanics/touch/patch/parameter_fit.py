@@ -14,8 +14,8 @@ from canprobe.mechanics.touch.patch.image import PatchCalibration
 from canprobe.mechanics.touch.patch.image_fit import (
     BLUR_PITCH,
     CROSSTALK,
-    HOLLOWEST,
     MEMORY,
+    MIN_CURVATURE_SHARE,
     NO_ERRORS,
     TOUCH_SIGMA,
     Dwell,
@@ -131,7 +131,7 @@ def curvature_errors(
         for _ in range(20):
             J, r, _ = model.linearised(v, force, 100.0, k)
             step = np.clip(np.linalg.solve(J[[0, 2]][:, [0, 2]], r[[0, 2]]), -20.0, 20.0)
-            least = HOLLOWEST / model.radius
+            least = MIN_CURVATURE_SHARE / model.radius
             k = (max(k[0] + float(step[0]), least), 0.0, max(k[2] + float(step[1]), least))
         relative = np.array([1.0 / model.radius + x for x in dwell.kappa])
         result.append((np.array([k[0], k[2]]) - dwell.kappa) / relative)

@@ -9,7 +9,7 @@ import numpy as np
 
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.patch.image_fit import Dwell, Shown
-from canprobe.mechanics.touch.patch.image_model import STEPS, ImageModel
+from canprobe.mechanics.touch.patch.image_model import STEPS_PER_PITCH, ImageModel
 from canprobe.mechanics.types import Floats
 
 
@@ -23,7 +23,7 @@ def taxel_gains(
     Returns:
         (rows, columns) gains, 1 where nothing is known; (row, column) of dead taxels.
     """
-    from scipy.ndimage import map_coordinates
+    from scipy.ndimage import map_coordinates  # late: only a calibration needs it, and it takes long to load
 
     seen, wanted, dead = np.zeros((3, *pad.shape))
     u, v = (pad.uv.T / pad.pitch_m).reshape(2, *pad.shape)
@@ -38,8 +38,10 @@ def taxel_gains(
                 continue
             x, y = u - stamps[t][0], v - stamps[t][1]
             along, across = np.abs(c * x + si * y), np.abs(-si * x + c * y)
-            expected = map_coordinates(mine, [along * STEPS - 0.5, across * STEPS - 0.5], order=1, mode="nearest")
-            inside = (expected > 0.25 * mine.max()) & (np.maximum(along, across) < len(mine) / STEPS)
+            expected = map_coordinates(
+                mine, [along * STEPS_PER_PITCH - 0.5, across * STEPS_PER_PITCH - 0.5], order=1, mode="nearest"
+            )
+            inside = (expected > 0.25 * mine.max()) & (np.maximum(along, across) < len(mine) / STEPS_PER_PITCH)
             share = expected[inside].sum() / max(float(image[inside].sum()), 1.0)
             seen[inside] += image[inside] * share
             wanted[inside] += expected[inside]

@@ -9,7 +9,7 @@ from canprobe.mechanics.touch.estimate.gauss_newton_step import solved_once
 from canprobe.mechanics.touch.estimate.information import InformationFilter
 from canprobe.mechanics.touch.estimate.known_curvature import curvature_covariance
 from canprobe.mechanics.touch.estimate.noise import Correlation, Noise
-from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE
+from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE_INFORMATION
 from canprobe.mechanics.touch.estimate.omitted_terms import ExpectedMisfit, OmittedTerms
 from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.estimate.residuals import curvature_jacobian, design
@@ -18,7 +18,7 @@ from canprobe.mechanics.touch.estimate.terms import shifted, terms
 
 MEMORY = 0.02
 STEP = 0.5e-3
-TINY = 2.0 * DIFFUSE**2
+TINY = 2.0 * DIFFUSE_INFORMATION**2
 """Of information: what keeps roots regular is added once more."""
 
 

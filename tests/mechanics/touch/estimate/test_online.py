@@ -8,8 +8,8 @@ import pytest
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.change import ChangeTest
 from canprobe.mechanics.touch.estimate.fit import fit_surface, make_estimator
-from canprobe.mechanics.touch.estimate.following import LAG, SPAN, FollowingEstimator, less_certain
-from canprobe.mechanics.touch.patch.curvature import FEW_FRAMES, FINE, LEAST_FRAMES, _Mean
+from canprobe.mechanics.touch.estimate.following import LAG_SHARE, SPAN_SHARE, FollowingEstimator, less_certain
+from canprobe.mechanics.touch.patch.curvature import FEW_FRAMES, FINE_OUTLIER_SHARE, MIN_FRAMES, _Mean
 
 MEMORY = 0.02
 SIGMAS = {"sigma_point": 2e-5, "sigma_normal": 1e-3}
@@ -48,7 +48,7 @@ def test_a_region_grows_by_the_change_over_the_lag():
     """Curvature grows by 0.5 1/m a millimetre in both directions: the lag of 1.5 mm is 0.75 1/m of K11 and of K22."""
     found, bare = followed([20.0 + 0.5 * i for i in range(15)], 1e-3)
     added = found.covariance - bare.covariance
-    expected = 0.5e3 * LAG * MEMORY
+    expected = 0.5e3 * LAG_SHARE * MEMORY
     assert np.sqrt(added[0, 0]) == pytest.approx(expected, rel=0.05)
     assert added[0, 2] == pytest.approx(expected**2, rel=0.1)
     assert abs(added[1, 1]) < 0.01 * expected**2
@@ -56,7 +56,7 @@ def test_a_region_grows_by_the_change_over_the_lag():
 
 
 def test_a_jump_is_doubted_for_as_long_as_the_span():
-    n = round(SPAN * MEMORY / 1e-3)
+    n = round(SPAN_SHARE * MEMORY / 1e-3)
     soon, bare = followed([5.0] * 12 + [30.0] * 3, 1e-3)
     later, _ = followed([5.0] * 12 + [30.0] * (n + 2), 1e-3)
     assert soon.covariance[0, 0] > bare.covariance[0, 0] + 3.0**2
@@ -104,13 +104,13 @@ def test_ml_forgets_what_was_before_an_edge():
 
 
 def test_a_mean_of_moments_takes_a_row_of_far_ones_for_a_change_and_a_single_one_for_wrong():
-    mean = _Mean(FEW_FRAMES, FINE)
+    mean = _Mean(FEW_FRAMES, FINE_OUTLIER_SHARE)
     for _ in range(20):
         mean.add(1.0, 0.0, 1.0)
     mean.add(5.0, 0.0, 5.0)
     mean.add(1.0, 0.0, 1.0)
     assert mean.moments[0] == pytest.approx(1.0, abs=0.05)
-    for _ in range(LEAST_FRAMES + 1):
+    for _ in range(MIN_FRAMES + 1):
         mean.add(2.0, 0.1, 1.5)
     assert mean.moments == pytest.approx((2.0, 0.1, 1.5))
 

@@ -11,7 +11,7 @@ from canprobe.mechanics.touch.estimate.fit import make_estimator
 from canprobe.mechanics.touch.estimate.information import MeasuredContact, batch_design
 from canprobe.mechanics.touch.estimate.nonlinear import fit
 from canprobe.mechanics.touch.estimate.prior import Prior
-from canprobe.mechanics.touch.estimate.start import LAST, MOST, Start, isolation
+from canprobe.mechanics.touch.estimate.start import MAX_CONTACTS, TAKEOVER_SHARE, Start, isolation
 
 MEMORY, SIGMA = 0.02, (2e-5, 1e-3)
 PRIOR = Prior.weak(MEMORY)
@@ -103,10 +103,10 @@ class TestWork:
         for i, (point, normal) in enumerate(zip(p, n, strict=True)):
             estimator.add(ContactSample(0.005 * i, point, normal, np.eye(4), np.array([0.0, 0.0, 0.04]), 1.0))
             most, total = max(most, len(evaluations)), total + len(evaluations)
-            assert max(evaluations, default=0) <= MOST
+            assert max(evaluations, default=0) <= MAX_CONTACTS
             evaluations.clear()
         assert 2 <= most <= 4
-        assert total <= 4 * (2 * LAST) / 0.025 + 4
+        assert total <= 4 * (2 * TAKEOVER_SHARE) / 0.025 + 4
 
     def test_once_the_filter_has_taken_over_there_is_no_batch_any_more(self, truth, evaluations):
         path = truth.path("ellipsoid")

@@ -15,7 +15,7 @@ from canprobe.mechanics.touch.estimate.known_curvature import CurvatureInformati
 from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.patch.array_calibration import ImageParameters, MomentErrors
 from canprobe.mechanics.touch.patch.creep import PadMemory
-from canprobe.mechanics.touch.patch.curvature import LEAST_FRAMES, PatchCurvature
+from canprobe.mechanics.touch.patch.curvature import MIN_FRAMES, PatchCurvature
 from canprobe.mechanics.touch.patch.fused_answer import patch_estimate
 from canprobe.mechanics.touch.patch.fused_estimator import PatchedEstimator
 from canprobe.mechanics.touch.patch.image import PatchCalibration
@@ -257,7 +257,7 @@ def test_what_the_pad_remembers_is_taken_off():
 
 def test_fewer_than_eight_frames_say_nothing_and_a_reset_forgets():
     patch = PatchCurvature(model())
-    touches = samples(base_tensor(tensor(20.0, 0.0, 0.0)), NORMAL, FORCE, exact, LEAST_FRAMES)
+    touches = samples(base_tensor(tensor(20.0, 0.0, 0.0)), NORMAL, FORCE, exact, MIN_FRAMES)
     for touch in touches[:-1]:
         patch.add(touch)
     assert patch_estimate(touches[-1], patch, 0.02) is None
@@ -318,7 +318,7 @@ def test_regions_of_95_percent_cover_the_truth_and_the_errors_have_the_stated_si
             return xx * (1 + e1), math.sqrt(xx * yy) * shear, yy * (1 + e2)
 
         normal = np.array([0.0, 0.0, 1.0])
-        touches = samples(base_tensor(K, normal), normal, FORCE, seen, 2 * LEAST_FRAMES)
+        touches = samples(base_tensor(K, normal), normal, FORCE, seen, 2 * MIN_FRAMES)
         patch = PatchCurvature(model())
         for touch in touches:
             patch.add(touch)
@@ -556,7 +556,7 @@ class TestFusion:
 
             patch = PatchCurvature(model())
             for touch in samples(base_tensor(K, np.array([0.0, 0.0, 1.0])), np.array([0.0, 0.0, 1.0]),
-                                 FORCE, seen, 2 * LEAST_FRAMES):  # fmt: skip
+                                 FORCE, seen, 2 * MIN_FRAMES):  # fmt: skip
                 patch.add(touch)
             motion = CurvatureInformation(true + root @ rng.standard_normal(3), information)
             found = patch.fuse(T, motion)
