@@ -3,6 +3,7 @@
 - `world` makes all of it from a plan, with a recorder of what is true.
 - `truth_columns` names what is true as `truth.npz` does.
 - `array` is the tactile node of a CANopen array, `raw_array` an array that knows no CANopen.
+- `image_processing` is what the sensor makes of a raw image before it sends it.
 
 The nodes are those of `canprobe.fieldbus`; the model behind them is `canprobe.cell.plant`, which they ask for positions
 and images by time. The emulated side never imports the master's, nor the reverse: they know each other only by the bus,

@@ -1,4 +1,4 @@
-"""Ask nodes for their ids and tell them new ones over the bus.
+"""An LSS session on a bus: read the ids of nodes, and give them new ones.
 
 Source: CiA 305.
 """

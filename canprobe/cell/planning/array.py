@@ -1,4 +1,4 @@
-"""The array of a plan: what its taxels support, and the raw frames of one that is no CANopen node.
+"""The array of a plan: what its taxels support, and why a task cannot be done with it.
 
 Force is a sum over taxels. A centroid needs a few of them under the patch. The second moments of a patch, and with them
 its curvature, need about sixteen: on fewer they are those of the grid.

@@ -1,4 +1,4 @@
-"""60C2h."""
+"""The cycle's period as object 60C2h (interpolation time period) of each drive can express it."""
 
 from __future__ import annotations
 

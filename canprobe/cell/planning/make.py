@@ -11,7 +11,7 @@ from canprobe.cell.planning.array import array_problems, as_supported
 from canprobe.cell.planning.bridges import unavailable_bridges
 from canprobe.cell.planning.configuration import make_setups
 from canprobe.cell.planning.demands import missing_bitrate, missing_objects
-from canprobe.cell.planning.devices import identifier_problems, order_by_deadline
+from canprobe.cell.planning.identifiers import identifier_problems, order_by_deadline
 from canprobe.cell.planning.interpolation_period import interpolations, period_problem
 from canprobe.cell.planning.left_out import left_out, outputs
 from canprobe.cell.planning.model import (

@@ -1,4 +1,4 @@
-"""Raw frames."""
+"""The frames of an array that is no CANopen node, and identifiers that they share with something else in the cell."""
 
 from __future__ import annotations
 

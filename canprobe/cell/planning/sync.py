@@ -1,4 +1,4 @@
-"""Can the cycle be said in CANopen's objects: SYNC period, tactile trigger."""
+"""The cycle in CANopen's objects: the SYNC period, and the SYNCs of one tactile frame."""
 
 from __future__ import annotations
 

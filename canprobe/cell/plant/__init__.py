@@ -3,10 +3,13 @@
 `plant.Plant` is asked for motor positions, torques and images at an instant, and moves itself there.
 
 - Both arms have 1 to 8 joints that turn or slide. `ideal_arm`: each drive is a second-order system, solved exactly.
-  `dynamic_arm`: rigid links, friction, drive cascade and the object's push, by `equations` and a choice of integrators
-  on dynamics held over a cycle; `pushing` is the contact forces near one posture.
-- `probe` is the elastic layer on an object (Winkler, Hunt–Crossley damping, regularised friction).
-- `taxels` makes counts of pressure: blur, gains, saturation, hysteresis, creep, crosstalk, noise, quantisation.
+  `dynamic_arm`: rigid links, friction, the drive `cascade` and the object's push, by `equations` and one of the
+  `integrators` on dynamics held over a cycle; `pushing` is the contact forces near one posture. `arms` makes the arm
+  that a configuration asks for, `ramps` are the targets of a drive.
+- `probe` is the probe's ball in space, `elastic_contact` its elastic layer on an object (Winkler, Hunt–Crossley
+  damping, regularised friction), `several_contacts` a ball that touches in several places.
+- `pressure` averages the contact over each taxel; `taxels` makes counts of it: blur, gains, saturation, hysteresis,
+  creep, crosstalk, noise, quantisation.
 - `config` says what a plant is made of.
 
 The image model shares no formula with the estimators. Energy is not created in a closed contact cycle without

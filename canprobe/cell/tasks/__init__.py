@@ -2,13 +2,15 @@
 
 `from_plan.make_task` gives the controller of a plan's task; nothing is imported that the task does not need.
 
-- `touch` approaches, settles, scans or holds, searches for a lost contact, and retreats; `calibrate` touches a ball
+- `touch` approaches, settles, scans or holds, and retreats; `regain` searches for a lost contact, `requested` lets a
+  bridge start, stop and set the task. `calibrate` touches a ball
   from several sides; `roll` presses and rolls on a known object. All derive from `probing.ProbingTask`: the order of a
-  cycle, phases, and the probe's motion.
+  cycle and its phases; `probe_motion` turns the probe's pose into joint targets.
 - `sensing` makes a contact of a measurement: joints at the instant of the image, the patch, the squeezed layer.
 - `shape` is the estimator in the loop: contacts go in when they are felt, answers are computed in `update` when the
   commands are out, and are used from the next cycle on.
-- `untouched` has the tasks without touch: hold, swing, listen, and the check of each joint's first motion.
+- `free_and_listen` has the tasks without touch: hold, swing, listen. `joint_check` moves each joint alone for the first
+  time, and `joint_finding` is what that showed.
 - `trajectory` follows points, for own scripts and for ROS 2: `canprobe.cell.tasks.Trajectory`.
 - `task` is what a task leaves for the summary.
 

@@ -11,7 +11,7 @@ from scenes import change, reasons, refused, ways_out, with_joints, without_torq
 
 import canprobe
 from canprobe.cell.planning.abilities import Abilities
-from canprobe.cell.planning.devices import identifier_problems
+from canprobe.cell.planning.identifiers import identifier_problems
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.measured import expected_messages
 from canprobe.cell.planning.model import Interpolation, PlannedPdo
