@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ class FakeCellPlant(FakePlant):
 
     image: np.ndarray = field(default_factory=lambda: np.zeros((16, 16), np.uint8))
     sampled: list[int] = field(default_factory=list)
+    config: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(model=None))
 
     def sample_image(self, t_ns: int) -> np.ndarray:
         self.sampled.append(t_ns)

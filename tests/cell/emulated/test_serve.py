@@ -267,9 +267,9 @@ def test_truth_recorder_columns(plant):
     assert columns["t_s"].tolist() == [0.0, 0.0025, 0.005]
     assert columns["sync_count"].tolist() == [0, 1, 2]
     assert columns["sync_counter"].tolist() == [7, 8, 9]
-    assert columns["q"].shape == (3, 6)
-    assert columns["q"][2, 0] == pytest.approx(0.005)
-    assert columns["force"].tolist() == [2.0] * 3
+    assert columns["q_rad"].shape == (3, 6)
+    assert columns["q_rad"][2, 0] == pytest.approx(0.005)
+    assert columns["force_n"].tolist() == [2.0] * 3
 
 
 def make_world(plant):

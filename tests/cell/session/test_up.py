@@ -10,7 +10,7 @@ import pytest
 import canprobe
 import canprobe.api
 from canprobe.cell.master.controller import Command
-from canprobe.cell.session import up as joint_report
+from canprobe.cell.session import check_joints as joint_report
 from canprobe.cell.session.session import Session
 from canprobe.cell.session.up import reporting_notes
 from canprobe.cell.tasks.joint_finding import Answer

@@ -201,7 +201,7 @@ def test_wrong_arguments_are_refused(arguments, message):
 def test_without_gymnasium_it_says_what_to_install(monkeypatch):
     monkeypatch.delitem(sys.modules, "canprobe.lab.gym")
     monkeypatch.setitem(sys.modules, "gymnasium", None)
-    with pytest.raises(UsageError, match=r"canprobe\.gym needs the package gymnasium: pip install .*\[gym\]"):
+    with pytest.raises(UsageError, match=r"canprobe\.lab\.gym needs the package gymnasium: pip install .*\[gym\]"):
         __import__("canprobe.lab.gym")
 
 
