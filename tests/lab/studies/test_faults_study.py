@@ -11,7 +11,7 @@ from canprobe.cell.master.supervisor import Supervisor
 from canprobe.cell.tasks import touch
 from canprobe.cli import main
 from canprobe.fieldbus.node.fault import Fault, FaultKind
-from canprobe.lab.studies import fault_scores as fault_witness
+from canprobe.lab.studies import witnessed_run
 from canprobe.lab.studies.fault_cases import PHASES, FaultCase
 from canprobe.lab.studies.fault_scenes import FORCE_MAX_N, SCENARIOS, seeded_plan
 from canprobe.lab.studies.fault_scores import Peak, score_force
@@ -143,7 +143,7 @@ def test_the_score_sees_motion_and_power_after_the_stop(monkeypatch):
 
 
 def test_the_score_sees_a_hang_a_crash_a_torn_log_and_no_summary(monkeypatch):
-    monkeypatch.setattr(fault_witness, "LONGEST_S", 0.5)
+    monkeypatch.setattr(witnessed_run, "LONGEST_S", 0.5)
     assert any(f.startswith("hang") for f in carry_out(FaultCase(0, FEATURES, "", ()))["failures"])
     monkeypatch.undo()
 
