@@ -7,10 +7,11 @@ the inverse kinematics each: a task takes one a cycle, the plan takes longer one
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dgesv
 
 from canprobe.robot.chain import Posture, Vec, ending_in, jacobian, pose_of, posture
 from canprobe.robot.inverse import damped_step, in_rows, task_rows
@@ -30,6 +31,15 @@ REST_HZ = 1.0
 """How fast more joints than a pose needs go back to the posture they began with."""
 
 
+def solve(J: Vector, twist: Any) -> list[float] | None:
+    """The joint step (n,) of a twist (n,) by a square Jacobian; None where it is singular."""
+    try:
+        step: list[float] = np.linalg.solve(J, twist).tolist()
+    except np.linalg.LinAlgError:
+        return None
+    return step
+
+
 class PoseSteps:
     """Joint steps that follow the poses of a probe.
 
@@ -40,12 +50,20 @@ class PoseSteps:
         model: the arm.
         T_flange_probe: (4, 4) of the probe's centre, m.
         q: (n,) joint positions of the beginning, rad or m.
+        solve: what solves a square system, as `solve` does; a cycle has a quicker one.
 
     Attributes:
         at: chain and probe in the joints of the last step.
     """
 
-    def __init__(self, model: ArmModel, T_flange_probe: Vector, q: Vector) -> None:
+    def __init__(
+        self,
+        model: ArmModel,
+        T_flange_probe: Vector,
+        q: Vector,
+        solve: Callable[[Vector, Any], list[float] | None] = solve,
+    ) -> None:
+        self._solve = solve
         self._rows = task_rows(model)
         self._chain = ending_in(model.chain, T_flange_probe)
         self._rest = np.array(q, dtype=float)
@@ -70,9 +88,8 @@ class PoseSteps:
             R = pose_of(at)[:3, :3]
             J, twist = in_rows(self._rows, R, J), in_rows(self._rows, R, six)
         if J.shape[0] == J.shape[1]:
-            _, _, dq, info = dgesv(J, twist)  # LAPACK itself: numpy's wrapper costs four times as much
-            exact: list[float] = dq.tolist()
-            if info == 0 and max(map(abs, exact)) < SMALL_STEP:
+            exact = self._solve(J, twist)
+            if exact is not None and max(map(abs, exact)) < SMALL_STEP:
                 return exact
         # the exact step would be no small one, as near a singular pose
         wish = 2.0 * math.pi * REST_HZ * dt * (self._rest - q)

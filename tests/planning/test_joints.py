@@ -40,6 +40,7 @@ a_mm = 300
 kind = "plane"
 [task]
 kind = "press"
+start_mm = [300.0, 100.0, 0.0]
 """
 
 
