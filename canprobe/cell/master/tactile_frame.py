@@ -32,15 +32,36 @@ class TactileFrame:
     raw: NDArray[np.int64] | None = None
 
 
+def covered(header: TactileHeader, shape: Shape) -> tuple[int, int, int, int]:
+    """First row, first column, rows and columns of the taxels that a frame carries; none in features mode."""
+    if header.mode is TactileMode.FEATURES:
+        return 0, 0, 0, 0
+    rows, columns = (header.window, header.window) if header.mode is TactileMode.WINDOW else shape
+    return header.origin_row, header.origin_col, rows, columns
+
+
+def frame_of(header: TactileHeader, content: NDArray[np.uint8] | Features, shape: Shape, t_ns: int) -> TactileFrame:
+    """The frame with a content.
+
+    Args:
+        header: of the frame.
+        content: counts of the taxels that the frame carries (`covered`), or features.
+        shape: rows and columns of the pad.
+        t_ns: arrival.
+    """
+    taxels, window = np.zeros(shape, np.uint8), covered(header, shape)
+    features = content if isinstance(content, Features) else None
+    if not isinstance(content, Features):
+        row, col, rows, columns = window
+        taxels[row : row + rows, col : col + columns] = content
+    taxels.flags.writeable = False
+    return TactileFrame(header, taxels, window, features, t_ns)
+
+
 def decode(message: TactileMessage, shape: Shape) -> TactileFrame:
     """The frame in a message of an array of so many rows and columns."""
-    header, features = message.header, message.features
-    taxels, window = np.zeros(shape, np.uint8), (0, 0, 0, 0)
-    if features is None:
-        rows, columns = (header.window, header.window) if header.mode is TactileMode.WINDOW else shape
-        row, col = header.origin_row, header.origin_col
-        counts = np.frombuffer(message.body, np.uint8, rows * columns).reshape(rows, columns)
-        taxels[row : row + rows, col : col + columns] = counts
-        window = (row, col, rows, columns)
-    taxels.flags.writeable = False
-    return TactileFrame(header, taxels, window, features, message.t_ns)
+    content: NDArray[np.uint8] | Features | None = message.features
+    if content is None:
+        _, _, rows, columns = covered(message.header, shape)
+        content = np.frombuffer(message.body, np.uint8, rows * columns).reshape(rows, columns)
+    return frame_of(message.header, content, shape, message.t_ns)

@@ -23,7 +23,7 @@ from canprobe.cell.emulated.world import World
 from canprobe.cell.master.array import TactileReceiver
 from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.drives import DriveCommand, DriveGroup
-from canprobe.cell.master.tactile_frame import TactileFrame
+from canprobe.cell.master.tactile_frame import TactileFrame, covered, frame_of
 from canprobe.cell.planning.configuration import NodeSetup, Write, make_setups
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.operation import INTERPOLATION_TIME
@@ -37,7 +37,7 @@ from canprobe.fieldbus.node.dictionary import Dictionary
 from canprobe.fieldbus.node.rpdo import Rpdo
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol.frames import SYNC_ID, Frame, NmtCommand, pack_nmt
-from canprobe.fieldbus.protocol.tactile import Features, TactileHeader, TactileMode
+from canprobe.fieldbus.protocol.tactile import Features, TactileHeader
 
 HEARTBEAT_CONSUMER = 0x1016
 Hear = Callable[[int, bytes, int], object]
@@ -144,17 +144,10 @@ def tactile_frame(
         shape: rows and columns of the pad.
         t_ns: when.
     """
-    taxels = np.zeros(shape, np.uint8)
-    window, features = (0, 0, 0, 0), None
     if isinstance(content, Features):
-        features = Features.unpack(content.pack(), content.peak)
-    else:
-        rows, columns = (header.window, header.window) if header.mode is TactileMode.WINDOW else shape
-        row, col = header.origin_row, header.origin_col
-        window, inside = (row, col, rows, columns), np.s_[row : row + rows, col : col + columns]
-        taxels[inside] = content[inside]
-    taxels.flags.writeable = False
-    return TactileFrame(header, taxels, window, features, t_ns)
+        return frame_of(header, Features.unpack(content.pack(), content.peak), shape, t_ns)
+    row, col, rows, columns = covered(header, shape)
+    return frame_of(header, content[row : row + rows, col : col + columns], shape, t_ns)
 
 
 def configure(node: SlaveNode, setup: NodeSetup) -> None:

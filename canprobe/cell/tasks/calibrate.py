@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.master.conditions import touch_finding
 from canprobe.cell.master.controller import TactileSample
 from canprobe.cell.master.supervision import TOUCH_FORCE
 from canprobe.cell.planning.model import Plan
@@ -86,12 +85,6 @@ class CalibrateTask(ProbingTask):
             if contact is not None and self._t > SETTLE_S:
                 self._felt.append(contact)
         self._columns = self._felt_columns(sample, patch, contact) | {"touch": float(self._number + 1)}
-
-    def _watch(self) -> None:
-        if self.reason is None and self.phase is not Phase.DONE:
-            finding = touch_finding(self._touch)
-            if finding is not None:
-                self.retreat(str(finding.error))
 
     # phases: each returns the pose for this cycle
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.cell.master.conditions import touch_finding
 from canprobe.cell.master.controller import Command, Measurement, TactileSample
 from canprobe.cell.master.supervision import Contact, limits_of
 from canprobe.cell.planning.model import Plan
@@ -125,7 +126,10 @@ class ProbingTask(Task):
 
     def _watch(self) -> None:
         """Check the touch by the table of conditions."""
-        raise NotImplementedError
+        if self.reason is None and self.phase is not Phase.DONE:
+            finding = touch_finding(self._touch)
+            if finding is not None:
+                self.retreat(str(finding.error))
 
     def _command(self, pose: ProbePose) -> Command:
         """One step of the probe to a pose, as the cell takes it; a joint's limit on the way makes the task let go."""

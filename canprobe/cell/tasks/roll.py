@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.master.conditions import touch_finding
 from canprobe.cell.master.controller import TactileSample
 from canprobe.cell.master.supervision import TOUCH_FORCE
 from canprobe.cell.planning.model import Plan
@@ -142,12 +141,6 @@ class RollTask(ProbingTask):
             mine.cycles.append(sample.cycle)
         contact = self.sensing.contact(sample, patch) if patch.force > TOUCH_FORCE / 2 else None
         self._columns = self._felt_columns(sample, patch, contact) | {"touch": float(self._number + 1)}
-
-    def _watch(self) -> None:
-        if self.reason is None and self.phase is not Phase.DONE:
-            finding = touch_finding(self._touch)
-            if finding is not None:
-                self.retreat(str(finding.error))
 
     # where the probe is
 

@@ -7,6 +7,7 @@ from typing import Any
 import canopen
 
 from canprobe.fieldbus.bus.port import Port
+from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.protocol.frames import RTR_FLAG
 
 
@@ -24,11 +25,12 @@ class PortNetwork(canopen.Network):
     def __init__(self, port: Port) -> None:
         super().__init__()
         self.port = port
+        self._pumped = PumpedNetwork(port, self._take)
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
         """Send a frame, and receive what comes at once."""
-        self.port.send_batch(((can_id | RTR_FLAG if remote else can_id, bytes(data)),))
-        self._receive()
+        self._pumped.send_message(can_id | RTR_FLAG if remote else can_id, bytes(data))
+        self.pass_time(0.0)
 
     def send_periodic(self, can_id: int, data: bytes, period: float, remote: bool = False) -> Any:
         """Refused: nothing is sent by itself here.
@@ -40,16 +42,12 @@ class PortNetwork(canopen.Network):
 
     def pass_time(self, seconds: float) -> None:
         """Let time pass on the port's clock, and receive what comes."""
-        until_ns = self.port.clock.now_ns() + round(seconds * 1e9)
-        while self.port.clock.now_ns() < until_ns:
-            self.port.wait(until_ns)
-            self._receive()
+        self._pumped.pump_until(lambda: False, seconds)
 
     def disconnect(self) -> None:
         """Close the port."""
         self.port.close()
 
-    def _receive(self) -> None:
-        for can_id, data, t_ns in self.port.drain():
-            if can_id < RTR_FLAG:
-                self.notify(can_id, bytearray(data), 1e-9 * t_ns)
+    def _take(self, can_id: int, data: bytes, t_ns: int) -> None:
+        if can_id < RTR_FLAG:
+            self.notify(can_id, bytearray(data), 1e-9 * t_ns)
