@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from canprobe.cell.master.array import patch_of
 from canprobe.cell.master.controller import Measurement
-from canprobe.cell.master.supervision import TOUCH_FORCE
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Setup, Touch
 from canprobe.cell.tasks.probing import Phase
@@ -19,6 +18,7 @@ from canprobe.lab.bridge.node_states import Health
 from canprobe.lab.bridge.sample import ContactFrame, Sample, SurfacePatch, TouchFrame
 from canprobe.mechanics.touch.contact import ContactSample, pad_to_direction
 from canprobe.mechanics.touch.patch.array_models import make_patch_calibration
+from canprobe.mechanics.touch.stops import TOUCH_FORCE
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 
 Array = NDArray[np.float64]

@@ -21,9 +21,8 @@ from canprobe.cell.scene.setup import SafetyLimits, Touch
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.port import ControllerState, PortCounters
 from canprobe.mechanics.touch.patch.image import Patch
+from canprobe.mechanics.touch.stops import TOUCH_FORCE
 
-TOUCH_FORCE = 0.15
-"""N; contact is made above it, and gone below half of it: an image of less says nothing about its place."""
 HOLD_CYCLES = 3
 """Cycles without a TPDO of one drive after which all of them hold."""
 HOLD_NS = 1_000_000_000

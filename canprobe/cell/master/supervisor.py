@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from canprobe.cell.master.conditions import BY_KEY, COUNTERS, CYCLE_CHECKS, touch_finding
 from canprobe.cell.master.controller import Command, Measurement, TactileSample
-from canprobe.cell.master.supervision import TOUCH_FORCE, Contact, Finding, Reaction, Seen
+from canprobe.cell.master.supervision import Contact, Finding, Reaction, Seen
 from canprobe.cell.planning.model import Plan
 from canprobe.fieldbus.bus.port import ControllerState, PortCounters
 from canprobe.mechanics.robot.chain import forward
+from canprobe.mechanics.touch.stops import TOUCH_FORCE
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.patch.image import Patch

@@ -16,8 +16,8 @@ from canprobe.cell.scene.setup import Array, Calibrate, Setup, Touch
 from canprobe.errors import UsageError
 
 What = Literal["image", "start", "stop", "poll"]
-CENTROID_TAXELS, CURVATURE_TAXELS = 4, 16
-"""Taxels under the patch from which there is a centroid, and second moments."""
+PRESS_TAXELS, CENTROID_TAXELS, CURVATURE_TAXELS = 2, 4, 16
+"""Taxels under the patch from which a press finds the normal of a sphere, there is a centroid, and second moments."""
 COARSE_SHARE = 0.1
 """Share of a sphere's radius: taxels that are nearer to each other than this see the contact of 1 N from all sides."""
 
@@ -101,6 +101,12 @@ def array_problems(setup: Setup) -> Iterator[str]:
             covers = f"the patch covers {support.taxels:.1f} taxels"
             why = f"fewer than {CENTROID_TAXELS} show no place; raise task.force_n, or take a finer array"
             yield f"{what}: {covers} of the array {array.name}, and {why}"
+    elif setup.touch is not None and not array.pad.is_flat and array.pad.is_grid and support.taxels < PRESS_TAXELS:
+        yield (
+            f"sensor.pitch_mm = {1e3 * array.pad.pitch_m:g}: at task.force_n = {setup.touch.force:g} the patch covers "
+            f"{support.taxels:.1f} taxels of the array {array.name}, and fewer than {PRESS_TAXELS} do not show where "
+            "on the probe it presses; raise task.force_n, or take a finer array"
+        )
     if setup.scan is not None and not array.pad.is_flat:
         most = array.pad.pitch_m * array.rate_hz
         if setup.scan.speed > most:

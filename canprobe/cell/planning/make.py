@@ -81,7 +81,7 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
     if setup.bus.direct and setup.array is not None and setup.array.raw is not None:
         problems.append('bus.interface = "direct" has no frames: an array of raw frames needs a bus, such as lockstep')
     joint_speeds, unreachable = check_motion(setup) if not unsuited else (None, [])
-    problems += [*narrowed, *unreachable] if unreachable else []
+    problems += [*unreachable, *narrowed] if unreachable else []
     truth, arm = setup.truth, setup.arm
     if arm is not None and truth.fidelity == "dynamic" and any(drive.emulated for drive in arm.drives):
         problem = dynamics_problem(arm.model.name, truth.bodies)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.planning.contact import contact_problems, saturation_problem
+from canprobe.cell.planning.first_touch import first_touch_problems
 from canprobe.cell.planning.model import JointSpeeds
 from canprobe.cell.planning.surface_path import Array, SurfacePath, _mm, surface_path
 from canprobe.cell.scene.setup import Arm, Calibrate, Free, Probe, SafetyLimits, Setup, Touch
@@ -65,11 +66,14 @@ def check_motion(setup: Setup) -> tuple[JointSpeeds | None, list[str]]:
                 speeds, found = stops.speeds(np.zeros_like(task.arm.q_start)), stops.problems(joints, touching=True)
                 kappas = np.full((1, 2), 1.0 / task.ball_radius)
                 found += [problem] if (problem := saturation_problem(task, kappas)) is not None else []
+                found += first_touch_problems(setup, task, kappas[0].tolist())
             case Touch() as task:
                 path = surface_path(task, setup.truth.object)
                 problems += _hollow_problems(path, task.probe)
                 contacts = [*_along_path(task, path)][_BEFORE_CONTACT:]
                 speeds, found = _check_touch(task, path, stops, _beginning(setup, task, contacts))
+                if path.hollow_radius > task.probe.radius:
+                    found += first_touch_problems(setup, task, path.kappas[0].tolist())
             case _:
                 return None, problems
     except PlanError as error:

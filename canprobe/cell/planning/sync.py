@@ -8,6 +8,8 @@ from canprobe.cell.planning.model import (
 )
 from canprobe.cell.scene.setup import Setup
 
+CYCLES_TO_EFFECT = 2
+"""From a SYNC to the moment its command begins to take effect, behind which the drives lag."""
 _TOLERANCE = 1e-5  # of a rate written with six digits
 
 

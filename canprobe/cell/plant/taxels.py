@@ -9,7 +9,7 @@ Source: figures after FSR data sheets and Sensors 2014, 14, 12816; the forms are
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import exp
+from math import ceil, exp
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,9 @@ _CREEP_TIMES_S = (0.3, 3.0, 30.0, 300.0)
 _SATURATION_KNEE = 1.25
 _FULL_SCALE = 255
 """Counts of full scale, whatever the ADC resolves."""
+MAX_SAMPLE_DISTANCE_M = 1e-3
+"""Distance of the samples of a pressure field: a first touch of 0.1 N on a probe of 10 mm is 3 mm wide, and of a mat
+with taxels 30 mm apart three samples a taxel would miss it."""
 _NOISE_IMAGES = 8
 """How many images' noise is drawn at once."""
 _ONE = np.array(1.0)  # a number that is an array already costs a ufunc less
@@ -45,7 +48,8 @@ class TaxelConfig:
         threshold: readings below this share of full scale become 0.
         dead: (row, column) of taxels that read 0.
         adc_bits: of the ADC; 8 gives whole counts, more give parts of counts.
-        samples: samples per taxel and axis of the pressure field.
+        samples: samples of the pressure field per taxel and axis; more where they would lie more than
+            `MAX_SAMPLE_DISTANCE_M` apart.
     """
 
     full_scale_pa: float = 100e3
@@ -117,10 +121,11 @@ class TaxelArray:
         self.pad = pad = pad or Pad()
         self._rng = rng
         self.field: PressureField | ListField
+        samples = max(config.samples, ceil(pad.pitch_m / MAX_SAMPLE_DISTANCE_M))
         if pad.is_grid:
-            self.field = PressureField(radius_m, pad, blur_pitch=config.blur_pitch, samples=config.samples)
+            self.field = PressureField(radius_m, pad, blur_pitch=config.blur_pitch, samples=samples)
         else:
-            self.field = ListField(radius_m, pad, samples=config.samples)
+            self.field = ListField(radius_m, pad, samples=samples)
         self.gains = 1.0 + config.gain_error * rng.uniform(-1.0, 1.0, pad.shape)
         self._scale = self.gains * (stiffness_n_m3 / config.full_scale_pa)
         half = 0.5 * config.hysteresis

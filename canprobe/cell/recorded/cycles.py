@@ -10,7 +10,6 @@ from canprobe.cell.master.array import make_tactile
 from canprobe.cell.master.controller import Measurement
 from canprobe.cell.master.cycle import SYNCS_REMEMBERED, Intake
 from canprobe.cell.master.drives import DriveGroup, make_drives
-from canprobe.cell.master.supervision import TOUCH_FORCE
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.recorded.recording import Recording
 from canprobe.cell.scene.setup import Touch
@@ -18,6 +17,7 @@ from canprobe.cell.tasks.from_plan import make_sensing, make_shape_tracker
 from canprobe.cell.tasks.shape import ShapeTracker
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.cia402 import known_state
+from canprobe.mechanics.touch.stops import TOUCH_FORCE
 
 MOST_LOST = 5
 """A SYNC counter that jumps by more was restarted."""

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.master.controller import TactileSample
-from canprobe.cell.master.supervision import TOUCH_FORCE
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Calibrate
 from canprobe.cell.tasks.probing import Phase, ProbingTask
@@ -21,6 +20,7 @@ from canprobe.mechanics.touch.layer_stiffness import PushFit
 from canprobe.mechanics.touch.patch.image import Patch
 from canprobe.mechanics.touch.probe_motion import EXTRA_CLEARANCE_M, ROUND_SPEED, ArcMotion
 from canprobe.mechanics.touch.servo import ProbePose
+from canprobe.mechanics.touch.stops import TOUCH_FORCE
 
 Vector = NDArray[np.float64]
 PRESS_SPEED = 0.8e-3

@@ -13,6 +13,7 @@ from canprobe.cell.master.conditions import touch_finding
 from canprobe.cell.master.controller import Command, Measurement, TactileSample
 from canprobe.cell.master.supervision import Contact, limits_of
 from canprobe.cell.planning.model import Plan
+from canprobe.cell.planning.sync import CYCLES_TO_EFFECT
 from canprobe.cell.tasks.probe_motion import ProbeMotion, Vector
 from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.task import MotionTime, Task, TaskRecord
@@ -23,10 +24,6 @@ from canprobe.mechanics.touch.servo import ProbePose
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-
-
-CYCLES_TO_EFFECT = 2
-"""From a SYNC to the moment its command begins to take effect, behind which the drives lag."""
 
 
 class Phase(IntEnum):

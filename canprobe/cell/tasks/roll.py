@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.master.controller import TactileSample
-from canprobe.cell.master.supervision import TOUCH_FORCE
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Touch
 from canprobe.cell.tasks.probing import Phase, ProbingTask
@@ -18,6 +17,7 @@ from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.mechanics.touch.patch.image import Patch
 from canprobe.mechanics.touch.probe_motion import LineMotion
 from canprobe.mechanics.touch.servo import ProbePose
+from canprobe.mechanics.touch.stops import TOUCH_FORCE
 
 Vector = NDArray[np.float64]
 PRESS_SPEED = 0.8e-3

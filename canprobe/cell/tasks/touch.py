@@ -9,7 +9,7 @@ import numpy as np
 
 from canprobe.cell.master.conditions import touch_finding
 from canprobe.cell.master.controller import Command, Measurement, TactileSample
-from canprobe.cell.master.supervision import TOUCH_FORCE, Reaction
+from canprobe.cell.master.supervision import Reaction
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Touch
 from canprobe.cell.tasks.probing import Phase, ProbingTask
@@ -23,6 +23,7 @@ from canprobe.mechanics.touch.layer_stiffness import PushFit
 from canprobe.mechanics.touch.patch.image import Patch
 from canprobe.mechanics.touch.probe_motion import MOVE_SPEED, SETTLE_S, LineMotion, smooth_step
 from canprobe.mechanics.touch.servo import LocalSurface, ProbePose, TactileServo
+from canprobe.mechanics.touch.stops import TOUCH_FORCE
 from canprobe.mechanics.touch.strategies import PathFollower
 
 if TYPE_CHECKING:
@@ -275,11 +276,18 @@ class TouchTask(ProbingTask):
         pole = self._pole0 + share * (pose.pole - self._pole0)
         return ProbePose(pose.centre, pole / np.linalg.norm(pole))
 
+    def _settled_share(self) -> float:
+        """Share of the way to the wanted depth; out of a touch that went too deep as fast as it went in."""
+        too_deep = self._depth0 - self._target_depth()
+        if too_deep <= 0.0:
+            return smooth_step(self._t / (0.6 * SETTLE_S))
+        return min(1.0, self._t * self._task.approach.speed / too_deep)
+
     def _target_depth(self) -> float:
         return self.sensing.depth(self._target_force)
 
     def _settle(self) -> ProbePose:
-        pose = self._sink(smooth_step(self._t / (0.6 * SETTLE_S)))
+        pose = self._sink(self._settled_share())
         if self._t >= SETTLE_S:
             self._enter(Phase.SCAN)
             self._scan_start = self._cycle

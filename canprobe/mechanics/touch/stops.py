@@ -10,5 +10,7 @@ OFF_PAD_EDGE_SHARE = 0.95
 OFF_PAD_SIGMAS, OFF_PAD_TAXELS = 1.55, 1.0
 """The same where only moments are known: from the centroid to the edge, a taxel's own width included in σ. A paraboloid
 has lost a fourth by then, and one of which only a rim is left lies in the last row of taxels."""
+TOUCH_FORCE = 0.15
+"""N; contact is made above it, and gone below half of it: an image of less says nothing about its place."""
 MAX_FORCE_SPREAD = 0.2
 """Standard deviation of the force over the target above which it has not settled: twice that of a 40 kN/m contact."""

@@ -14,7 +14,6 @@ from injected import HOLD_CYCLE, Injected, altered, send
 import canprobe
 from canprobe.cell.master.controller import Command
 from canprobe.cell.master.lift_off import WAY
-from canprobe.cell.master.supervision import TOUCH_FORCE
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cell.tasks.probing import Phase
@@ -25,6 +24,7 @@ from canprobe.fieldbus.node.fault import FaultKind
 from canprobe.fieldbus.protocol.cia402 import DriveState, state_of
 from canprobe.fieldbus.protocol.emcy import Emcy
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, NmtCommand, NmtState, pack_nmt
+from canprobe.mechanics.touch.stops import TOUCH_FORCE
 
 
 def lifted(run):

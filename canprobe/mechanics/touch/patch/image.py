@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import Doubt
 from canprobe.mechanics.touch.linear_algebra import checked, positive, read_only
-from canprobe.mechanics.touch.pad import COUNTS_MAX, Pad
+from canprobe.mechanics.touch.pad import COUNTS_MAX, THRESHOLD_COUNTS, Pad
 from canprobe.mechanics.touch.patch.beyond_window import MAX_EDGE_SHARE, MIN_PEAK, Continuation
 from canprobe.mechanics.touch.patch.dead_taxels import may_be_dead, mended
 from canprobe.mechanics.touch.stops import OFF_PAD_EDGE_SHARE, OFF_PAD_SIGMAS, OFF_PAD_TAXELS
@@ -110,7 +110,7 @@ class PatchCalibration:
     """
 
     pad: Pad = field(default_factory=Pad)
-    threshold_counts: int = 5
+    threshold_counts: int = THRESHOLD_COUNTS
     force_gain: float = 1.0
     edge_gain: float = 0.0
     gains: tuple[tuple[float, ...], ...] = ()
