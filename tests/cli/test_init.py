@@ -248,6 +248,22 @@ def test_a_speed_limit_of_nearly_nothing_is_refused_with_file_and_joint(tmp_path
     assert f"{copied}: {what}" in capsys.readouterr().err
 
 
+def test_a_range_of_nothing_is_refused_with_file_and_joint_until_the_section_has_one(tmp_path, urdf, capsys):
+    assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf)]) == 0
+    (copied,) = (tmp_path / "cell").glob("*.urdf")
+    copied.write_text(URDF.replace('lower="-2" upper="2"', 'lower="0" upper="0"', 1))
+    capsys.readouterr()
+    scene = str(tmp_path / "cell" / "first.toml")
+    assert main(["plan", scene]) == 2
+    said = capsys.readouterr().err
+    name = re.search(
+        f"{re.escape(str(copied))}: joint (\\w+): expected lower below upper in its <limit>, got 0 and 0; ", said
+    )[1]
+    assert f"or set joints.{name}.min_deg and max_deg" in said
+    main(["plan", scene, "--set", f"joints.{name}.min_deg=-114", "--set", f"joints.{name}.max_deg=114"])
+    assert "expected lower below upper" not in capsys.readouterr().err
+
+
 def test_a_speed_limit_of_the_section_replaces_that_of_the_urdf_however_low(tmp_path, urdf, capsys):
     assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf)]) == 0
     (copied,) = (tmp_path / "cell").glob("*.urdf")

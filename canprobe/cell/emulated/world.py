@@ -78,7 +78,7 @@ def _set_turn_units(node: SlaveNode, units: float | None) -> None:
     delivered = node.dictionary.delivered
     ratio = (delivered(GEAR_RATIO, 1) or 1) / (delivered(GEAR_RATIO, 2) or 1)
     for index, value in ((RESOLUTION, units), (FEED, None if units is None else units * ratio)):
-        if value is not None and value.is_integer() and delivered(index, 1) and delivered(index, 2) in (0, 1):
+        if value is not None and float(value).is_integer() and delivered(index, 1) and delivered(index, 2) in (0, 1):
             node.dictionary.set_default(index, 1, int(value))
 
 

@@ -40,7 +40,7 @@ from canprobe.cell.planning.ways_out import ways_out
 from canprobe.cell.planning.window import cut_patch
 from canprobe.cell.scene.setup import Node, Setup
 from canprobe.errors import EdsError, PlanError
-from canprobe.mechanics.robot.dynamics import dynamics_problem
+from canprobe.mechanics.robot.dynamics import dynamics_problem, impossible_bodies
 
 SYNC_COUNTER = 0x1019
 
@@ -85,7 +85,7 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
     truth, arm = setup.truth, setup.arm
     if arm is not None and truth.fidelity == "dynamic" and any(drive.emulated for drive in arm.drives):
         problem = dynamics_problem(arm.model.name, truth.bodies)
-        problems += [problem] if problem is not None else []
+        problems += [problem] if problem is not None else impossible_bodies(arm.model.chain.joints, truth.bodies or ())
     if problems or bus is None:
         raise PlanError(_shared(problems), ways)
     absent = left_out(setup)

@@ -123,8 +123,18 @@ def _refuse_standstill(urdf: str, joints: Sequence[Joint], sections: Mapping[str
         for slowest, unit in [(SLOWEST_M_S, "m") if joint.prismatic else (SLOWEST_RAD_S, "rad")]
         if (section.speed_mm_s if joint.prismatic else section.speed_deg_s) is None and not joint.qd_max >= slowest
     ]
+    problems += [
+        f"{urdf}: joint {joint.name}: expected lower below upper in its <limit>, got {joint.q_min:g} and "
+        f"{joint.q_max:g}; put it right there, or set joints.{joint.name}.min_{joint.unit} and max_{joint.unit}"
+        for joint, section in zip(joints, sections.values(), strict=True)
+        if not joint.q_min < joint.q_max and None in _stops(joint, section)
+    ]
     if problems:
         raise PlanError(problems)
+
+
+def _stops(joint: Joint, section: JointSettings) -> tuple[float | None, float | None]:
+    return (section.min_mm, section.max_mm) if joint.prismatic else (section.min_deg, section.max_deg)
 
 
 def _moved(chain: Chain, mount: Floats, flange: Floats) -> Chain:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from canprobe.errors import PlanError, install_line
 from canprobe.mechanics.robot.chain import Chain
-from canprobe.mechanics.robot.model import Body
+from canprobe.mechanics.robot.model import Body, lopsided_inertia
 from canprobe.mechanics.types import Floats
 
 GRAVITY_M_S2 = 9.81
@@ -40,6 +40,20 @@ def dynamics_problem(name: str, bodies: Sequence[Body | None] | None) -> str | N
     if importlib.util.find_spec("mujoco") is None:
         return f"{lead} needs the package mujoco: {install_line('dynamics')}"
     return None
+
+
+def impossible_bodies(joints: Sequence[str], bodies: Sequence[Body | None]) -> list[str]:
+    """Why no motion follows from the bodies (n,) of joints: moments of inertia that no solid has.
+
+    A body with a moment of 0 beside others is one of which not all is known, and is taken as it is.
+    """
+    tensors = {joint: body.tensor for joint, body in zip(joints, bodies, strict=False) if body is not None}
+    return [
+        f'plant.fidelity = "dynamic": joint {joint} moves a body with {why}, as no solid has; correct its '
+        '<inertia> or inertia_kg_m2, or set plant.fidelity = "ideal"'
+        for joint, tensor in tensors.items()
+        if np.diag(tensor).min() != 0.0 and (why := lopsided_inertia(tensor)) is not None
+    ]
 
 
 def ball(mass: float, radius: float, centre: Floats) -> Body:

@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 from puma_arm import BODIES, MODELS, UPENN
 
+import canprobe
+from canprobe.cell.planning.make import make_plan
 from canprobe.cell.scene.load import read_cell
+from canprobe.cell.scene.resolve import resolve
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.chain import forward, link_transforms
 from canprobe.mechanics.robot.denavit_hartenberg import from_dh, tool_z_offset
-from canprobe.mechanics.robot.dynamics import RigidBody, ball, dynamics_problem, joined
+from canprobe.mechanics.robot.dynamics import RigidBody, ball, dynamics_problem, impossible_bodies, joined
 from canprobe.mechanics.robot.model import Body
 
 TOOL = tool_z_offset(80.0)
@@ -168,3 +171,19 @@ def test_what_is_missing_is_said_with_what_to_type(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(PlanError, match=r"pip install .*\[dynamics\]"):
         RigidBody(UPENN.chain, BODIES["puma260"])
+
+
+def test_dynamics_of_moments_that_no_body_has_are_refused_and_an_ideal_arm_does_not_ask_for_them():
+    bodies = [
+        Body(1.0, np.zeros(3), np.diag(moments)) for moments in ((1.0, 1.0, 1.9), (1.0, 1.0, 9.0), (0.0, 0.0, 9.0))
+    ]
+    (problem,) = impossible_bodies(("a", "b", "c"), bodies)
+    assert (
+        'plant.fidelity = "dynamic": joint b moves a body with principal moments of inertia of 1, 1, 9 kg m^2'
+        in problem
+    )
+    setup = resolve(canprobe.load_scene("free"))
+    chosen = replace(setup, truth=replace(setup.truth, fidelity="dynamic", bodies=(*bodies, None, None, None)))
+    with pytest.raises(PlanError, match="joint joint_2 moves a body with"):
+        make_plan(chosen)
+    make_plan(replace(chosen, truth=replace(chosen.truth, fidelity="ideal")))
