@@ -53,7 +53,7 @@ def refusal(scene):
 def test_a_gantry_keeps_its_pole_and_the_plan_says_so():
     plan = canprobe.plan(load_scene("plane", {"cell": "gantry"}))
     assert plan.setup.task.scan.rolling_share == 1.0
-    assert any("keeps the orientation of the probe" in warning for warning in plan.warnings)
+    assert any("holds the place of the probe, not its tilt" in warning for warning in plan.warnings)
 
 
 def test_a_contact_that_leaves_the_array_is_refused_with_the_angle():
