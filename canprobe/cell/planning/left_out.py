@@ -164,8 +164,8 @@ def held_rows(arm: Arm) -> str:
     name = f"the {arm.model.name} arm of {arm.model.n} joints"
     if task_rows(arm.model) == FIXED_POLE:
         return (
-            f"{name} holds the place of the probe, not its tilt: task.rolling_share is 1, and the contact wanders on the "
-            "array"
+            f"{name} holds the place of the probe, not its tilt: task.rolling_share is 1, and the contact wanders "
+            "on the array"
         )
     return f"{name} holds position and pole of the probe and leaves the turn about the pole free"
 

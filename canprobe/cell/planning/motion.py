@@ -132,9 +132,7 @@ def _lacking_rows(setup: Setup) -> str | None:
         return None
     rows, name = task_rows(arm.model), arm.model.name
     if isinstance(task, Calibrate) and rows < 5:
-        return (
-            f"task.kind: a calibration tilts the probe, and the {name} arm of {arm.model.n} joints cannot choose its tilt"
-        )
+        return f"task.kind: a calibration tilts the probe, and the {name} arm of {arm.model.n} joints cannot choose it"
     T, J = forward_jacobian(arm.model.chain, arm.q_start, task.probe.T_flange_probe)
     held = in_rows(rows, T[:3, :3], J) * arm.model.radian
     held[:3] /= LENGTH_M
