@@ -113,8 +113,9 @@ def run(
         ResultsError: a file could not be written, for example on a full disk. The drives are disabled.
     """
     _refuse_wrong(overrides, out, observers, bridge)
-    scene = load_scene(scene, _over(overrides, {"scene.seed": seed, "task.duration_s": duration_s}))
-    resolved = with_bridges(Target.over(scene, bus, channel, bitrate).applied_to(scene), bridge)
+    given = {"scene.seed": seed, "task.duration_s": duration_s, "bus.interface": bus, "bus.bitrate": bitrate}
+    scene = load_scene(scene, _over(overrides, given))
+    resolved = with_bridges(Target.over(scene, channel=channel).applied_to(scene), bridge)
     folder = results_folder(resolved, out) if files else None
     check_free(folder, force=force)
     plan = make_plan(resolve(resolved))
@@ -223,7 +224,7 @@ def _drawings(result: RunResult, out: Path, say: Say) -> dict[str, Callable[[], 
         from canprobe.cell.results.page import write_page_of
 
         try:
-            write_page_of(out, say)
+            write_page_of(out, result.plan.setup, say)
         except UsageError as error:  # a controller's column that is called like one of ours and is something else
             say(f"report.html is left out: {error}")
 
@@ -503,8 +504,9 @@ def open_cell(
         ResultsError: when the block is left: a file could not be written.
     """
     _refuse_wrong(overrides, out, observers, bridge)
-    scene = load_scene(scene, _over(overrides, {"scene.seed": seed}))
-    resolved = with_bridges(Target.over(scene, bus, channel, bitrate).applied_to(scene), bridge)
+    given = {"scene.seed": seed, "bus.interface": bus, "bus.bitrate": bitrate}
+    scene = load_scene(scene, _over(overrides, given))
+    resolved = with_bridges(Target.over(scene, channel=channel).applied_to(scene), bridge)
     folder = Path(out) if out is not None else None
     check_free(folder, force=force)
     return OpenCell(make_plan(resolve(resolved)), folder, say, observers, rows_kept)

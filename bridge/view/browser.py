@@ -38,7 +38,7 @@ class LiveView:
         errors = deviation_scale(shape)
         self._stack = ExitStack()
         server = self._server = self._stack.enter_context(open_server(settings.view_port, settings.view_host))
-        self._stage = Stage(server, scene)
+        self._stage = Stage(server, context.plan.setup)
         self._panel = Panel(server, scene, errors, self._stage)
         self._trail = Trail()
         self._path = GrowingPath(server.scene, self._trail)

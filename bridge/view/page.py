@@ -59,7 +59,7 @@ def write_page(run: RecordedRun, file: Path, say: Callable[[str], None]) -> None
 def _record(run: RecordedRun, times: Array) -> tuple[str, list[str]]:
     """Viser's page with every frame in it, and lines about what cannot be drawn."""
     with open_server(0) as server:
-        stage = Stage(server, run.scene)
+        stage = Stage(server, run.setup)
         errors = deviation_scale(shape_of(run))
         path = LoadedPath(server.scene, trail_of(run))
         surface = LoadedSurface(server.scene, answers_of(run), errors)

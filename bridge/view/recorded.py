@@ -31,18 +31,23 @@ class RecordedRun:
     """What is shown of a run.
 
     Attributes:
-        scene: as resolved.
+        setup: the scene as resolved.
         log: the columns of ``log.npz``; every row one cycle.
         answer_rows: rows at which the estimator gave a new answer.
         answers: at each of them.
         taxels: (t_s, (rows, columns) uint8 counts) of each tactile frame, by rising time of the cycle that used it.
     """
 
-    scene: Scene
+    setup: Setup
     log: dict[str, Array]
     answer_rows: NDArray[np.int64]
     answers: tuple[JudgedAnswer, ...]
     taxels: tuple[tuple[float, NDArray[np.uint8]], ...]
+
+    @property
+    def scene(self) -> Scene:
+        """The scene in the user's words."""
+        return self.setup.scene
 
     @property
     def title(self) -> str:
@@ -93,11 +98,12 @@ class RecordedRun:
         return ContactFrame(T)
 
 
-def read_run(folder: Path) -> RecordedRun:
+def read_run(folder: Path, setup: Setup | None = None) -> RecordedRun:
     """Read what is shown of a run.
 
     Args:
         folder: that `canprobe run` wrote: ``scene.toml``, ``log.npz`` and, for the taxels, ``tactile.npz``.
+        setup: that the run had; None reads ``scene.toml``.
 
     Raises:
         UsageError: no such folder, a file that is missing or of another canprobe, or a column that is not as it should
@@ -110,15 +116,15 @@ def read_run(folder: Path) -> RecordedRun:
         if not (folder / name).exists():
             raise UsageError(f"{folder}: no {name} in this folder; expected one that `canprobe run --out DIR` wrote")
     read_summary(folder)
-    scene = read_scene(folder)
-    setup = resolve(scene)
+    if setup is None:
+        setup = resolve(read_scene(folder))
     log = read_log(folder / LOG, setup)
     if not len(log["t_s"]):
         raise UsageError(f"{folder / LOG}: expected a row for each cycle, got none")
     rows = _new_answers(log)
     shape = setup.truth.object
     return RecordedRun(
-        scene=scene,
+        setup=setup,
         log=log,
         answer_rows=rows,
         answers=tuple(judge(_patch(log, row), shape) for row in rows.tolist()),

@@ -74,7 +74,7 @@ class Player:
         self._server = server
         self._run = run
         errors = deviation_scale(shape_of(run))
-        self._stage = Stage(server, run.scene)
+        self._stage = Stage(server, run.setup)
         self._path = LoadedPath(server.scene, trail_of(run))
         self._surface = LoadedSurface(server.scene, answers_of(run), errors)
         gui = server.gui

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from canprobe.cell.scene.geometry import T_flange_probe, true_object
 from canprobe.cell.scene.model import Scene
-from canprobe.cell.scene.resolve import resolve
+from canprobe.cell.scene.setup import Setup
 from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.lab.bridge.frames import quaternion_of
 from canprobe.lab.bridge.view.array_dome import taxel_colours, taxel_poses, tile
@@ -62,16 +62,15 @@ class Stage:
 
     Args:
         server: a `viser.ViserServer`, or a client handle; only its `scene` and `initial_camera` are used.
-        scene: which arm, probe and object.
+        setup: which arm, probe and object.
 
     Attributes:
         notes: lines about what cannot be drawn, and what the newtons are.
     """
 
-    def __init__(self, server: Any, scene: Scene) -> None:
+    def __init__(self, server: Any, setup: Setup) -> None:
         self._api = server.scene
-        setup = resolve(scene)
-        arm, array = setup.arm, setup.array
+        scene, arm, array = setup.scene, setup.arm, setup.array
         self._model = None if arm is None else arm.model
         self._shape = None if scene.object is None else true_object(scene.object)
         self._probe = None

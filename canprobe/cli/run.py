@@ -54,8 +54,6 @@ def run(args: argparse.Namespace) -> int:
         result = api.run(
             scene,
             out=folder,
-            seed=args.seed,
-            duration_s=args.duration,
             force=args.force,
             progress=args.report.bar(),
             say=args.report.detail,

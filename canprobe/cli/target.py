@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 from canprobe.cli.common_arguments import PATIENT_SYNCS
 from canprobe.cli.parser import did_you_mean
@@ -28,7 +28,13 @@ def scene_of(args: argparse.Namespace) -> Scene:
     from canprobe.cell.scene.load import load_scene
     from canprobe.cell.session.target import VIRTUAL
 
-    scene = loaded(args)
+    given = {
+        "bus.interface": None if args.bus == CONFIG else args.bus,
+        "bus.bitrate": args.bitrate,
+        "scene.seed": getattr(args, "seed", None),
+        "task.duration_s": getattr(args, "duration", None),
+    }
+    scene = loaded(args, {key: value for key, value in given.items() if value is not None})
     if args.patient:
         if _has_real_nodes(scene):
             raise UsageError(
@@ -43,11 +49,11 @@ def scene_of(args: argparse.Namespace) -> Scene:
     return scene
 
 
-def loaded(args: argparse.Namespace) -> Scene:
-    """The scene of a command with `add_scene`, as --cell, --set and --realtime change it."""
+def loaded(args: argparse.Namespace, more: Mapping[str, Any] | None = None) -> Scene:
+    """The scene of a command with `add_scene`, as --cell, --set, --realtime and more overrides change it."""
     from canprobe.cell.scene.load import load_scene
 
-    overrides = dict(args.set)
+    overrides = {**dict(args.set), **(more or {})}
     if args.cell is not None:
         overrides["cell"] = args.cell
     if getattr(args, "realtime", False):

@@ -38,6 +38,7 @@ from canprobe.cell.planning.units import range_problems, speed_problems, within_
 from canprobe.cell.planning.warnings import warnings
 from canprobe.cell.planning.ways_out import ways_out
 from canprobe.cell.planning.window import cut_patch
+from canprobe.cell.scene.rules import with_choices
 from canprobe.cell.scene.setup import Node, Setup
 from canprobe.errors import EdsError, PlanError
 from canprobe.mechanics.robot.dynamics import dynamics_problem, impossible_bodies
@@ -88,6 +89,8 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
         problems += [problem] if problem is not None else impossible_bodies(arm.model.chain.joints, truth.bodies or ())
     if problems or bus is None:
         raise PlanError(_shared(problems), ways)
+    chosen = {choice.key: choice.value for choice in bus.choices}
+    setup = replace(setup, scene=with_choices(setup.scene, chosen), saved=with_choices(setup.saved, chosen))
     absent = left_out(setup)
     plan = Plan(
         setup=setup,
@@ -170,7 +173,7 @@ def _choose(setup: Setup, devices: Mapping[int, Abilities], problems: list[str])
     found = [bus for bus in found if bus.setup.arm is None or bus.setup.arm.torque == wanted]
     nearest = min(found, key=lambda bus: bus.misfit)
     if len(found) > 1:
-        chosen = ", ".join(f"{choice.key} = {choice.value}" for choice in nearest.choices)
+        chosen = ", ".join(f"{choice.key} = {choice.written}" for choice in nearest.choices)
         problems.append(f"none of {len(found)} ways to fill what is left open fits; the nearest: {chosen}")
     problems += [*nearest.problems, *nearest.overload]
     return nearest

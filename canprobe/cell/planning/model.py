@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from canprobe.cell.scene.load import SAVED_AS, dump_scene, written_by_line
+from canprobe.cell.scene.load import SAVED_AS, dump_scene, toml_value, written_by_line
 from canprobe.cell.scene.model import Scene
-from canprobe.cell.scene.rules import with_choices
 from canprobe.cell.scene.setup import Setup
 from canprobe.fieldbus.protocol.cia402 import OperationMode
 from canprobe.fieldbus.protocol.pdo import PdoEntry, PdoLayout
@@ -292,13 +291,18 @@ class Choice:
 
     Attributes:
         key: of the scene file.
-        value: what was chosen, as the scene file writes it.
+        value: what was chosen.
         why: for people.
     """
 
     key: str
-    value: str
+    value: Any
     why: str
+
+    @property
+    def written(self) -> str:
+        """The value as a scene file writes it."""
+        return toml_value(self.value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -320,7 +324,7 @@ class Plan:
     """Everything that follows from a scene before anything is started.
 
     Attributes:
-        setup: the resolved scene in SI units, with every choice of the plan.
+        setup: the resolved scene in SI units, with every choice of the plan; its `scene` has them too.
         nodes: that are brought up, by node id.
         pdos: of all nodes, by priority on the bus.
         raw: frames of an array that is no CANopen node.
@@ -350,16 +354,13 @@ class Plan:
     @property
     def scene(self) -> Scene:
         """The scene with every choice of the plan filled in."""
-        return self._chosen(self.setup.scene)
+        return self.setup.scene
 
     @property
     def files(self) -> dict[str, bytes]:
         """The files of the scene by name, `SAVED_AS` and those that it names, as they were read for this plan."""
-        text = f"{written_by_line()}\n{dump_scene(self._chosen(self.setup.saved))}"
+        text = f"{written_by_line()}\n{dump_scene(self.setup.saved)}"
         return {SAVED_AS: text.encode(), **self.setup.files}
-
-    def _chosen(self, scene: Scene) -> Scene:
-        return with_choices(scene, {choice.key: choice.value for choice in self.choices})
 
     @property
     def traffic(self) -> Traffic:

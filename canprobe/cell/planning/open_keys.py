@@ -42,14 +42,6 @@ class _OpenKey:
         """What the setup says; None where it has no such part."""
         return getattr(getattr(setup, self.part), self.field, None)
 
-    def written(self, setup: Setup) -> str:
-        """The value as a scene file writes it."""
-        return _written(self.value(setup))
-
-
-def _written(value: Any) -> str:
-    return str(value).lower() if isinstance(value, bool | int) else f'"{value}"'
-
 
 def _modes(setup: Setup) -> list[tuple[ArrayMode, str]]:
     """Of an array that only listens all; of one that is touched those that follow the contact."""
@@ -113,7 +105,7 @@ def candidates(setup: Setup) -> Iterator[tuple[Setup, tuple[Choice, ...]]]:
                 candidate, choices = setup, []
                 for key, (value, why) in zip((*sensing, *wiring), (*chosen, *others), strict=True):
                     candidate = candidate.changed(key.part, **{key.field: value})
-                    choices.append(Choice(key.key, _written(value), why))
+                    choices.append(Choice(key.key, value, why))
                 if not torque:
                     candidate = candidate.changed("arm", torque=False)
                 array = candidate.array

@@ -78,7 +78,7 @@ def _lines(plan: Plan, width: int | None) -> Iterator[str]:
     other = "" if all(pdo.used for pdo in plan.pdos) else ", o not used"
     parts = f"(S SYNC, f feedback, C controller, r commands, t tactile{other})"
     yield from _titled(f"{each} {parts}", timeline_rows(plan, characters), width)
-    yield from _titled("chosen by the plan", ((f"{one.key} = {one.value}", one.why) for one in plan.choices), width)
+    yield from _titled("chosen by the plan", ((f"{one.key} = {one.written}", one.why) for one in plan.choices), width)
     yield from _titled("joint speeds", _speed_rows(plan), width)
     yield from _titled("uses", _use_rows(plan), width)
     yield from _titled("leaves out", plan.left_out, width)

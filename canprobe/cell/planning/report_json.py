@@ -49,7 +49,7 @@ def plan_dict(plan: Plan) -> dict[str, Any]:
         "raw_frames": [_in_us(asdict(frames)) for frames in plan.raw],
         "array": _array(setup),
         "bus_load": {one.channel: _bus(one) for one in plan.buses},
-        "choices": [asdict(choice) for choice in plan.choices],
+        "choices": [{"key": one.key, "value": one.written, "why": one.why} for one in plan.choices],
         "timeline": [_in_us(asdict(slot)) | {"channel": slot.channel or None} for slot in timeline(plan)],
         "joint_speeds": asdict(plan.joint_speeds) if plan.joint_speeds is not None else None,
         "estimator": shape.method if shape is not None else None,

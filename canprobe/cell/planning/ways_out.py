@@ -83,12 +83,12 @@ def _split(setup: Setup) -> Iterator[tuple[str, Setup]]:
 
 def _together(setup: Setup, fit: Fit) -> Iterator[tuple[str, Setup]]:
     """The cheapest combination of what the plan could choose, where one change is not enough."""
-    now = {key.key: key.written(setup) for key in KEYS}
+    now = {key.key: key.value(setup) for key in KEYS}
     for changed, choices in candidates(opened(setup)):
         if fit(changed) is not None:
             differing = [choice for choice in choices if choice.value != now[choice.key]]
             if len(differing) > 1:
-                yield " and ".join(f"{choice.key} = {choice.value}" for choice in differing), changed
+                yield " and ".join(f"{choice.key} = {choice.written}" for choice in differing), changed
             return
 
 

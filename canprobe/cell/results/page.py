@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from canprobe.cell.planning.bridges import check_bridges
+from canprobe.cell.scene.setup import Setup
 from canprobe.cell.session.session import quiet
 
 
@@ -30,17 +31,22 @@ class Page:
         return f'<iframe srcdoc="{text}" style="width: 100%; height: 640px; border: 0"></iframe>'
 
 
-def write_page_of(folder: Path, say: Callable[[str], None]) -> None:
-    """Write ``report.html`` into a run's folder; `say` is called with each line about what cannot be drawn.
+def write_page_of(folder: Path, setup: Setup, say: Callable[[str], None]) -> None:
+    """Write ``report.html`` into a run's folder.
+
+    Args:
+        folder: with the files of the run.
+        setup: that the run had.
+        say: called with each line about what cannot be drawn.
 
     Raises:
         UsageError: a controller's column has the name of one of ours.
     """
     page, recorded = (importlib.import_module(f"canprobe.lab.bridge.view.{name}") for name in ("page", "recorded"))
-    page.write_page(recorded.read_run(folder), folder / "report.html", say)
+    page.write_page(recorded.read_run(folder, setup), folder / "report.html", say)
 
 
-def page_of(folder: Path) -> Page:
+def page_of(folder: Path, setup: Setup) -> Page:
     """The page of a run's folder, written where it is missing; opened in a browser if there is one and no notebook.
 
     Raises:
@@ -49,7 +55,7 @@ def page_of(folder: Path) -> Page:
     page = Page(folder / "report.html")
     if not page.path.is_file():
         check_bridges(["view"], "")
-        write_page_of(folder, quiet)
+        write_page_of(folder, setup, quiet)
     if "ipykernel" not in sys.modules and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         webbrowser.open(page.path.resolve().as_uri())
     return page

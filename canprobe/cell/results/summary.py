@@ -126,7 +126,7 @@ class RunResult:
             folder = Path(tempfile.mkdtemp(prefix="canprobe-view-"))
             write_scene(self.plan, folder)
             write_files(self, folder)
-        return page_of(folder)
+        return page_of(folder, self.plan.setup)
 
     def score(self, *methods: str, **own: Callable[[], OwnEstimator]) -> Scores:
         """The errors of estimators on the contacts of this scan, all asked every 0.1 s, against the plant's truth.
@@ -233,7 +233,7 @@ def summarise(
             map_summary=map_summary,
         ),
         "calibration": summarise_calibration(scene, record.tool),
-        "choices": [f"{choice.key} = {choice.value}: {choice.why}" for choice in session.plan.choices],
+        "choices": [f"{choice.key} = {choice.written}: {choice.why}" for choice in session.plan.choices],
         "cycle": _cycle(cell, record) | {"observe_us": _observed(session)},
         "bus_load": None if direct else _bus_load(session),
         "traffic": None if direct else _traffic(session),

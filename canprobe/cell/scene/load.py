@@ -53,20 +53,34 @@ def dump_scene(scene: Scene | Cell) -> str:
     tables = []
     for name, part in ((field.name, getattr(scene, field.name)) for field in dataclasses.fields(scene)):
         if isinstance(part, Mapping):
-            tables += [f"[{name}.{toml_key(key)}]\n{_keys(section)}" for key, section in part.items()]
+            tables += [(f"{name}.{toml_key(key)}", _values(section)) for key, section in part.items()]
         elif part is not None:
-            tables.append(f"[{name}]\n{_keys(part)}")
-    return "\n".join(tables)
+            tables.append((name, _values(part)))
+    return "\n".join(
+        f"[{name}]\n" + "".join(f"{key} = {toml_value(value)}\n" for key, value in table.items())
+        for name, table in tables
+    )
 
 
-def _keys(section: Any) -> str:
-    annotations, lines = typing.get_type_hints(type(section), include_extras=True), ""
+def _document(scene: Scene) -> dict[str, Any]:
+    """The scene as `tomllib` reads what `dump_scene` writes."""
+    parts = ((field.name, getattr(scene, field.name)) for field in dataclasses.fields(scene))
+    return {
+        name: {key: _values(section) for key, section in part.items()} if isinstance(part, Mapping) else _values(part)
+        for name, part in parts
+        if part is not None and part != {}
+    }
+
+
+def _values(section: Any) -> dict[str, Any]:
+    """The keys of a section that have a value and belong to the others."""
+    annotations, values = typing.get_type_hints(type(section), include_extras=True), {}
     for field in dataclasses.fields(section):
         value = getattr(section, field.name)
         only = conditions_of(annotations[field.name], Only)
         if value is not None and all(getattr(section, one.key) in one.values for one in only):
-            lines += f"{field.name} = {toml_value(value)}\n"
-    return lines
+            values[field.name] = _as_toml(value)
+    return values
 
 
 def written_by_line() -> str:
@@ -175,10 +189,12 @@ def load_scene(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = 
         SceneError: with every problem found, each with file, key path, what was expected and what was got.
         UsageError: there is no such scene, or `overrides` is not a mapping.
     """
+    whole = False
     if isinstance(scene, Scene):
         if not overrides:
             return scene
-        own, file, folder = parse_toml(dump_scene(scene), scene.name), scene.name, None
+        whole = isinstance(overrides, Mapping) and all(path.partition(".")[0] != "sensor" for path in overrides)
+        own, file, folder = _document(scene), scene.name, None
     elif isinstance(scene, str | Path):
         name = str(scene)
         packaged = packaged_files("scenes")
@@ -192,7 +208,7 @@ def load_scene(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = 
     if overrides:
         own, file = _with_overrides(own, overrides, file), f"{file} as changed"
         _refuse_deep(own, file)
-    return _scene(own, file, folder)
+    return _scene(own, file, folder, whole=whole)
 
 
 def _with_overrides(own: Mapping[str, Any], overrides: Mapping[str, Any], file: str) -> dict[str, Any]:
@@ -222,6 +238,8 @@ def _with_overrides(own: Mapping[str, Any], overrides: Mapping[str, Any], file: 
 
 def _key_path(path: str) -> list[str]:
     """The keys of a dotted path, as TOML reads it."""
+    if re.fullmatch(r"[A-Za-z0-9_-]+(\.[A-Za-z0-9_-]+)*", path):
+        return path.split(".")
     try:
         table, keys = tomllib.loads(f"{path} = 0"), []
     except (ValueError, RecursionError):
@@ -236,6 +254,8 @@ def _as_toml(value: Any) -> Any:
     """A value of Python, numpy or pathlib as `tomllib` would have read it."""
     if isinstance(value, Mapping):
         return {key: _as_toml(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_as_toml(item) for item in value]
     if isinstance(value, Path):
         return str(value)
     return value.tolist() if hasattr(value, "tolist") else value
@@ -414,10 +434,10 @@ def _too_deep(where: str) -> SceneError:
     return SceneError([f"{where}: expected tables and lists of at most {MOST_DEPTH} levels, got more of them"])
 
 
-def _scene(own: Mapping[str, Any], file: str, folder: Path | None) -> Scene:
+def _scene(own: Mapping[str, Any], file: str, folder: Path | None, *, whole: bool = False) -> Scene:
     """The scene in a document, with what its cell says and the sections that its task has by default.
 
-    Everything is checked together.
+    Everything is checked together. A whole document has what its array file says: the file is not read again.
     """
     own, file = with_writer(own, file)
     if _are_tables(own.get("cell")) and not {"scene", "task"} & set(own):
@@ -427,7 +447,9 @@ def _scene(own: Mapping[str, Any], file: str, folder: Path | None) -> Scene:
     needs = SECTIONS_OF_TASK.get(kind, {}) if isinstance(kind, str) else {}
     defaults = [section for section, (need, _) in needs.items() if need == "default"]
     unused = [section for section, (need, _) in needs.items() if need in ("never", "may")]
-    document = _with_array(_with_cell(own, file, folder, unused), folder)
+    document = _with_cell(own, file, folder, unused)
+    if not whole:
+        document = _with_array(document, folder)
     reader = Reader(folder)
     values = reader.read(Scene, document, (*_ALWAYS, *defaults))
     for section, (need, why) in needs.items():

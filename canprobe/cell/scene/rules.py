@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -314,15 +313,14 @@ def broken_rules(lookup: Callable[[str], Any]) -> Iterator[tuple[str, str]]:
             yield from rule(*values)
 
 
-def with_choices(scene: Scene, choices: Mapping[str, str]) -> Scene:
+def with_choices(scene: Scene, choices: Mapping[str, object]) -> Scene:
     """A scene with what was chosen in the place of its "auto".
 
     Args:
         scene: with open keys.
-        choices: value by key path, as a scene file writes it: `{"sensor.mode": '"window"'}`.
+        choices: value by key path: `{"sensor.mode": "window"}`.
     """
-    for path, text in choices.items():
+    for path, value in choices.items():
         section, _, key = path.partition(".")
-        value = tomllib.loads(f"value = {text}")["value"]
         scene = replace(scene, **{section: replace(getattr(scene, section), **{key: value})})
     return scene

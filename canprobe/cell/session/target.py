@@ -51,10 +51,11 @@ class Target:
         others = dict(channel) if isinstance(channel, Mapping) else {}
         if unknown := sorted(str(name) for name in others if name not in scene.channels):
             raise UsageError(f"channel: the scene has no channel {unknown[0]}, only {', '.join(scene.channels)}")
-        others = {name: load_scene(scene, {"bus.channel": new}).bus.channel for name, new in others.items()}
+        others = {name: load_scene(scene, {"bus.channel": other}).bus.channel for name, other in others.items()}
         main = others.pop(scene.bus.channel, None) if isinstance(channel, Mapping) else channel
-        given = {"bus.interface": bus, "bus.channel": main, "bus.bitrate": bitrate}
-        settings = load_scene(scene, {key: value for key, value in given.items() if value is not None}).bus
+        given = (("interface", bus), ("channel", main), ("bitrate", bitrate))
+        new = {f"bus.{key}": value for key, value in given if value not in (None, getattr(scene.bus, key))}
+        settings = load_scene(scene, new).bus if new else scene.bus
         return cls(settings.interface, settings.channel, settings.bitrate, others)
 
     def applied_to(self, scene: Scene) -> Scene:

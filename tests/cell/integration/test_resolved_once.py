@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
+import tomllib
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -15,7 +19,9 @@ from undrawn import undrawn, undrawn_run
 import canprobe
 from canprobe.cell.master.observers import Observation
 from canprobe.cell.npz import read_npz
+from canprobe.cell.planning import make as make_module
 from canprobe.cell.results.summary import RunResult
+from canprobe.cell.scene import resolve as resolve_module
 from canprobe.cell.scene.load import packaged_files
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.tasks.from_plan import make_task
@@ -151,6 +157,32 @@ def test_other_processes_of_a_run_have_its_files_too(inputs: Path, tmp_path: Pat
     assert json.loads((out / "summary.json").read_text())["bridges"]["mcap"]["error"] is None
     recording = (out / "run.mcap").read_bytes()
     assert b"joint.eds" in recording and b"taxels.eds" in recording
+
+
+@pytest.mark.parametrize("bus", ["direct", "lockstep"])
+def test_each_file_is_read_once_and_the_scene_resolved_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bus: str
+) -> None:
+    """From the command line to the pictures: scene, cell, array and calibration are four files."""
+    calls: Counter[str] = Counter()
+
+    def count(name: str, module: ModuleType) -> None:
+        original = getattr(module, name)
+
+        def counted(*args: Any, **named: Any) -> Any:
+            calls[name] += 1
+            return original(*args, **named)
+
+        for known in [module, *sys.modules.values()]:
+            if known is module or (known.__name__.startswith("canprobe") and vars(known).get(name) is original):
+                monkeypatch.setattr(known, name, counted)
+
+    count("loads", tomllib)
+    count("resolve", resolve_module)
+    count("make_plan", make_module)
+    command = ["run", "cylinder", "--bus", bus, "--seed", "1", "--duration", "0.1", "--out", str(tmp_path)]
+    assert main(command) == 0
+    assert calls == {"loads": 4, "resolve": 1, "make_plan": 1}
 
 
 def test_scores_that_fail_do_not_cost_what_was_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

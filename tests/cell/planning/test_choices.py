@@ -40,7 +40,7 @@ def opened_plan(scene):
 
 
 def chosen(plan):
-    return {choice.key: choice.value for choice in plan.choices}
+    return {choice.key: choice.written for choice in plan.choices}
 
 
 def test_what_fits_is_left_as_the_contract_has_it(cylinder):

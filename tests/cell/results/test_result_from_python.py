@@ -126,7 +126,8 @@ def test_the_page_is_written_once_and_opened_where_there_is_a_browser(result, mo
     (tmp_path / "report.html").write_text("<p>kept")
     monkeypatch.delenv("DISPLAY")
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    assert page.page_of(tmp_path)._repr_html_().startswith('<iframe srcdoc="&lt;p&gt;kept"') and len(opened) == 1
+    setup = canprobe.plan("listen").setup
+    assert page.page_of(tmp_path, setup)._repr_html_().startswith('<iframe srcdoc="&lt;p&gt;kept"') and len(opened) == 1
 
 
 # What a cell tells a controller of one's own.
