@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from canprobe.cell.recorded.reestimate import ReplayResult, replay
     from canprobe.cell.results.contacts import Contacts
     from canprobe.cell.results.files import load_table
-    from canprobe.cell.results.summary import RunResult
+    from canprobe.cell.results.result import RunResult
     from canprobe.cell.results.surface_file import load_surface_map
     from canprobe.cell.results.traffic import measure_traffic
     from canprobe.cell.scene.load import load_scene
@@ -66,7 +66,8 @@ _MODULES = {
     "canprobe.mechanics.touch.estimate.fit": ("fit_surface",),
     "canprobe.mechanics.touch.surface": ("SurfaceMatrix",),
     "canprobe.mechanics.touch.surface_map": ("SurfaceMap",),
-    "canprobe.cell.results.summary": ("RunResult", "measure_traffic"),
+    "canprobe.cell.results.result": ("RunResult",),
+    "canprobe.cell.results.traffic": ("measure_traffic",),
 }
 _EXPORTS = {name: (module, name) for module, names in _MODULES.items() for name in names}
 

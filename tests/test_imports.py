@@ -139,6 +139,13 @@ def imports_of(path, relative, *, typed=False):
             yield from ((_resolved(module, alias.name), node.lineno, alias.name) for alias in node.names)
 
 
+def imported_by_name(source):
+    """Whole names that `import_module` gets; one that is put together is what a user asks for, such as a command."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+            yield from (arg.value for arg in node.args if isinstance(arg, ast.Constant))
+
+
 def _resolved(module, name):
     """`from canprobe import api` names a module, `from canprobe.api import run` a thing in one."""
     below = module.split(".")[1:]
@@ -208,10 +215,11 @@ def test_no_modules_import_each_other_in_a_circle(typed):
     names = {path: ".".join(("canprobe", *relative.with_suffix("").parts)) for path, relative in MODULES.items()}
     names = {path: name.removesuffix(".__init__") for path, name in names.items()}
     known = set(names.values())
-    graph = {
-        name: {target for target, _, _ in imports_of(path, MODULES[path], typed=typed)} & known - {name, "canprobe"}
-        for path, name in names.items()
-    }
+    graph = {}
+    for path, name in names.items():
+        targets = {target for target, _, _ in imports_of(path, MODULES[path], typed=typed)} & known
+        targets |= {*imported_by_name(path.read_text(encoding="utf-8"))} & known
+        graph[name] = targets - {name, "canprobe"}
     while leaves := {name for name, targets in graph.items() if not targets & set(graph)}:
         graph = {name: targets for name, targets in graph.items() if name not in leaves}
     while tops := set(graph) - {target for targets in graph.values() for target in targets}:
@@ -253,3 +261,15 @@ def test_the_reader_of_imports_sees_every_form(tmp_path, source, names):
     path = tmp_path / "module.py"
     path.write_text(source)
     assert [name for name, _, _ in imports_of(path, Path("fieldbus/bus/module.py"))] == names
+
+
+@pytest.mark.parametrize(
+    ("source", "names"),
+    [
+        ("importlib.import_module('canprobe.api')", ["canprobe.api"]),
+        ("import_module('canprobe.cell.scene').load", ["canprobe.cell.scene"]),
+        ("import_module(f'canprobe.cli.{name}').run", []),
+    ],
+)
+def test_the_reader_of_imports_sees_those_by_name(source, names):
+    assert list(imported_by_name(source)) == names

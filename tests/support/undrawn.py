@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import canprobe
-from canprobe.cell.results.summary import RunResult
+from canprobe.cell.results.result import RunResult
 from canprobe.cell.scene.model import Scene
 
 

@@ -18,7 +18,8 @@ from canprobe.cell.recorded.recording import read_recording
 from canprobe.cell.recorded.run_folder import RunFolder, read_run, replay_task
 from canprobe.cell.results.map_score import estimate_columns, map_of_scan
 from canprobe.cell.results.run_files import LOG, TACTILE, TRUTH, needed, read_log, read_scene, read_truth
-from canprobe.cell.results.summary import curvature_text, finite_or_none, shape_lines, summarise_shape
+from canprobe.cell.results.summary import finite_or_none, summarise_shape
+from canprobe.cell.results.text import curvature_text, shape_lines
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve

@@ -23,20 +23,20 @@ from canprobe.cell.results.picture import (
     picture,
     sheet,
 )
-from canprobe.cell.results.summary import RunResult
+from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.surface_panels import Array, Plane, add_sheet, map_surface, true_surface
 from canprobe.cell.tasks.probing import Phase
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.patch.array_calibration import NO_FORCE_REFERENCE
 
-Panel = Callable[[SubFigure, RunResult], None]
+Panel = Callable[[SubFigure, RunData], None]
 TWO_SIGMA = 1.96
 LEAST_SPAN = 1.0
 """Least height of the panel of curvatures, 1/m: a plane's estimates are not blown up."""
 
 
-def draw_run(result: RunResult, path: Path) -> None:
+def draw_run(result: RunData, path: Path) -> None:
     """Draw what the run has and write a PNG; panels without data are left out."""
     rows = _rows(result)
     if not rows:
@@ -45,7 +45,7 @@ def draw_run(result: RunResult, path: Path) -> None:
         _fill(figure, rows, result)
 
 
-def run_figure(result: RunResult) -> Figure:
+def run_figure(result: RunData) -> Figure:
     """The same figure, not written.
 
     Raises:
@@ -59,14 +59,14 @@ def run_figure(result: RunResult) -> Figure:
     return figure
 
 
-def _fill(figure: Figure, rows: list[list[tuple[Panel, float]]], result: RunResult) -> None:
+def _fill(figure: Figure, rows: list[list[tuple[Panel, float]]], result: RunData) -> None:
     for strip, row in zip(parts(figure, len(rows), 1), rows, strict=True):
         places = parts(strip, 1, len(row), width_ratios=[width for _, width in row])
         for part, (draw, _) in zip(places, row, strict=True):
             draw(part, result)
 
 
-def _rows(result: RunResult) -> list[list[tuple[Panel, float]]]:
+def _rows(result: RunData) -> list[list[tuple[Panel, float]]]:
     """Rows of panels, each with its share of the width."""
     rows: list[list[tuple[Panel, float]]]
     log, scanning = result.log, any(result.estimates.values())
@@ -84,7 +84,7 @@ def _rows(result: RunResult) -> list[list[tuple[Panel, float]]]:
     return [row for row in rows if row]
 
 
-def _title(result: RunResult) -> str:
+def _title(result: RunData) -> str:
     summary = result.summary
     truth = "black and grey: true, of the emulated plant, unknown to the cell" if result.truth else "no truth is known"
     newtons = f" · {NO_FORCE_REFERENCE}" if summary["newtons"] == NO_FORCE_REFERENCE else ""
@@ -93,7 +93,7 @@ def _title(result: RunResult) -> str:
     return f"{scene}\n{summary['bus']}, seed {summary['seed']} · colour: measured and estimated; {truth}{newtons}{end}"
 
 
-def _draw_tool(part: SubFigure, result: RunResult) -> None:
+def _draw_tool(part: SubFigure, result: RunData) -> None:
     """Each coordinate of the tool centre beside what was believed, with its 95 % band, and the truth."""
     axes, found = part.subplots(), result.summary["calibration"]
     rows = list(range(3))
@@ -115,7 +115,7 @@ def _draw_tool(part: SubFigure, result: RunResult) -> None:
     legend(part)
 
 
-def _draw_trajectory(part: SubFigure, result: RunResult) -> None:
+def _draw_trajectory(part: SubFigure, result: RunData) -> None:
     """The path of the contact and the surface that was recovered from it, over the true one."""
     axes = part.add_subplot(projection="3d", computed_zorder=False)
     points, normals = result.log["contact_mm"] * 1e-3, result.log["normal"]
@@ -137,7 +137,7 @@ def _draw_trajectory(part: SubFigure, result: RunResult) -> None:
     box(part, axes, title, ("x (mm)", "y (mm)", "z (mm)"), elev=40, azim=azimuth)
 
 
-def _draw_force(part: SubFigure, result: RunResult) -> None:
+def _draw_force(part: SubFigure, result: RunData) -> None:
     axes, t = part.subplots(), result.log["t_s"]
     if "force_n" in result.truth and np.any(result.truth["force_n"] > 0):
         n = min(len(t), len(result.truth["force_n"]))
@@ -151,7 +151,7 @@ def _draw_force(part: SubFigure, result: RunResult) -> None:
     legend(part)
 
 
-def _draw_curvature(part: SubFigure, result: RunResult) -> None:
+def _draw_curvature(part: SubFigure, result: RunData) -> None:
     axes = part.subplots()
     method, records = next((name, found) for name, found in result.estimates.items() if found)
     travelled = np.array([r.travelled_m for r in records]) * 1e3
@@ -192,7 +192,7 @@ def _kappa_sigma(record: ShapeRecord) -> Array:
     return np.array(sigmas)
 
 
-def _draw_taxels(part: SubFigure, result: RunResult) -> None:
+def _draw_taxels(part: SubFigure, result: RunData) -> None:
     assert result.taxels is not None
     axes = part.subplots()
     image = axes.imshow(result.taxels, cmap="magma", origin="lower", vmin=0)
@@ -201,7 +201,7 @@ def _draw_taxels(part: SubFigure, result: RunResult) -> None:
     part.colorbar(image, ax=axes, label="counts")
 
 
-def _draw_joints(part: SubFigure, result: RunResult) -> None:
+def _draw_joints(part: SubFigure, result: RunData) -> None:
     """A panel a joint: joints that move alike would hide each other in one."""
     arm = result.plan.setup.arm
     q = joint_positions(result.log)

@@ -42,7 +42,8 @@ def write_page_of(folder: Path, setup: Setup, say: Callable[[str], None]) -> Non
     Raises:
         UsageError: a controller's column has the name of one of ours.
     """
-    page, recorded = (importlib.import_module(f"canprobe.lab.bridge.view.{name}") for name in ("page", "recorded"))
+    page = importlib.import_module("canprobe.lab.bridge.view.page")
+    recorded = importlib.import_module("canprobe.lab.bridge.view.recorded")
     page.write_page(recorded.read_run(folder, setup), folder / "report.html", say)
 
 

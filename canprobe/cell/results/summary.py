@@ -1,16 +1,13 @@
-"""What a run leaves behind: its result, the summary, the log, the scene as resolved."""
+"""What a run leaves behind: its summary, and the files of what was measured."""
 
 from __future__ import annotations
 
 import contextlib
-import importlib
-import importlib.util
 import json
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,181 +15,21 @@ from numpy.typing import NDArray
 from canprobe import __version__
 from canprobe.cell.master.cell import Cell
 from canprobe.cell.npz import write_npz
-from canprobe.cell.planning.model import Plan
+from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.run_files import SCHEMA
 from canprobe.cell.results.scores import ShapeScore, bound_of_scan, score_contact, score_shape
 from canprobe.cell.results.surface_file import save_surface_map
-from canprobe.cell.results.tool_file import FILE, calibration_lines, summarise_calibration, tool_text
+from canprobe.cell.results.tool_file import FILE, summarise_calibration, tool_text
 from canprobe.cell.results.traffic import LOG, measure_traffic
-from canprobe.cell.scene.setup import Setup, Touch
-from canprobe.cell.session.session import Session, write_scene
-from canprobe.cell.session.target import VIRTUAL
-from canprobe.cell.tasks.regain import losses_text, summarise_losses
+from canprobe.cell.scene.setup import Setup
+from canprobe.cell.session.session import Session
+from canprobe.cell.tasks.regain import summarise_losses
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.cell.tasks.task import TaskRecord
-from canprobe.errors import ResultsError, UsageError, install_line
+from canprobe.errors import ResultsError, UsageError
 from canprobe.fieldbus.bus.files import write_text
-from canprobe.mechanics.touch.consistency import Consistency
-from canprobe.mechanics.touch.surface_map import SurfaceMap
-
-if TYPE_CHECKING:
-    import pandas
-    from matplotlib.figure import Figure
-
-    from canprobe.cell.results.contacts import Contacts, OwnEstimator, Scores
-    from canprobe.cell.results.page import Page
-
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True, repr=False)
-class RunResult:
-    """One finished run; printed, it is its summary.
-
-    That of `canprobe.open_cell` is complete when its block is left: until then the drives are not disabled, the
-    bus is not closed, and reading an attribute raises.
-
-    Attributes:
-        plan: what was planned.
-        summary: the content of ``summary.json``.
-        log: the columns of ``log.npz``, one row per cycle; the suffix of a name is its unit. ``t_s`` here, in the truth
-            and in the estimates counts from the instant that is 0 in ``bus.log``.
-        truth: the plant's true values, one row per SYNC; empty where nothing was emulated.
-        estimates: the answers of each estimator, by name; the online one first.
-        taxels: (rows, columns) counts of the task's last tactile frame, or None.
-        tactile: the columns of ``tactile.npz``, one row per tactile frame that the cell used: ``t_s`` of the cycle,
-            ``t_sample_s``, ``taxels`` (m, rows, columns), their ``window``, ``features``; empty where there was none.
-        surface_map: the local patches of the online estimator, or None without a shape.
-        consistency: the tests at its crossings, or None.
-        out: the folder with the files, or None.
-        contacts: of the scan, as the master measured them; None without a shape.
-    """
-
-    plan: Plan
-    summary: dict[str, Any]
-    log: dict[str, Array]
-    truth: dict[str, Array]
-    estimates: dict[str, list[ShapeRecord]] = field(default_factory=dict)
-    taxels: NDArray[np.uint8] | None = None
-    tactile: dict[str, NDArray[Any]] = field(default_factory=dict)
-    surface_map: SurfaceMap | None = None
-    consistency: Consistency | None = None
-    out: Path | None = None
-    contacts: Contacts | None = None
-
-    if not TYPE_CHECKING:
-
-        def __getattr__(self, name: str) -> Any:
-            """Called for missing attributes: all of them before the run is finished."""
-            if name not in RunResult.__slots__:
-                raise AttributeError(f"RunResult has no attribute {name!r}")
-            raise UsageError(f"result.{name}: complete when the block of open_cell is left; read it after the block")
-
-    def text(self) -> str:
-        """The summary as text."""
-        return summary_text(self.summary, self.out)
-
-    def __repr__(self) -> str:
-        try:
-            return self.text()
-        except UsageError:
-            return "a run that is under way; complete when the block of open_cell is left"
-
-    def plot(self) -> Figure:
-        """The figure of ``report.png``; a notebook shows it.
-
-        Raises:
-            UsageError: matplotlib is missing, or nothing was measured.
-        """
-        if importlib.util.find_spec("matplotlib") is None:
-            raise UsageError(f"plot needs matplotlib: {install_line('study')}")
-        figures = importlib.import_module("canprobe.cell.results.figures")  # it draws results, and imports this module
-        figure: Figure = figures.run_figure(self)
-        return figure
-
-    def view(self) -> Page:
-        """The run in three dimensions, as one page that replays it: in a notebook, else in a browser.
-
-        It is ``report.html`` of the run's folder, or of a temporary one.
-
-        Raises:
-            UsageError: the extra `view` is missing.
-        """
-        from canprobe.cell.results.page import page_of
-
-        folder = self.out
-        if folder is None:
-            folder = Path(tempfile.mkdtemp(prefix="canprobe-view-"))
-            write_scene(self.plan, folder)
-            write_files(self, folder)
-        return page_of(folder, self.plan.setup)
-
-    def score(self, *methods: str, **own: Callable[[], OwnEstimator]) -> Scores:
-        """The errors of estimators on the contacts of this scan, all asked every 0.1 s, against the plant's truth.
-
-        Example::
-
-            result.score("recursive", "ml", mine=MyEstimator)
-
-        Args:
-            methods: ours, by name; without any, those of the scene.
-            own: makes an estimator of yours, such as its class, by the name that it has in the table. It has
-                ``add(sample)``, which takes a `canprobe.ContactSample`, and ``estimate()``, which returns a
-                `canprobe.SurfaceEstimate` or None. After a loss of contact a new one is made.
-
-        Raises:
-            UsageError: nothing was scanned, no truth is known, or an unknown method.
-        """
-        from canprobe.cell.results.contacts import score_estimators
-
-        task, scene = self.plan.setup.task, self.plan.scene
-        if self.contacts is None or not len(self.contacts) or scene.shape is None or not isinstance(task, Touch):
-            raise UsageError("score: expected a scan that touched its object, got no contacts")
-        if "kappa_per_m" not in self.truth:
-            raise UsageError("score: expected an emulated object; nothing is known of the truth")
-        start_s = float(self.contacts.t_s[0] - self.contacts.samples[0].t_s)
-        ours = {name: name for name in methods or (scene.shape.method, *scene.shape.also)}
-        return score_estimators(
-            self.contacts.samples, task, {**ours, **own}, truth=self.truth, sync_times=self.log["t_s"] - start_s
-        )
-
-    def to_pandas(self, what: Literal["log", "truth", "estimates"] = "log") -> pandas.DataFrame:
-        """A table of the run, by time; vectors are spread over columns, and `attrs["units"]` has every unit.
-
-        Args:
-            what: `log` (one row per cycle), `truth` (per SYNC), or `estimates` (per answer of the estimator in the
-                loop; the attribute `estimates` has the others).
-
-        Raises:
-            UsageError: the extra `data` is missing.
-        """
-        from canprobe.cell.results.files import to_frame
-
-        return to_frame(self._columns(what), self._attrs)
-
-    def to_parquet(self, path: Path | str, what: Literal["log", "truth", "estimates"] = "log") -> None:
-        """Write the same table as Parquet; `canprobe.load_table` reads it.
-
-        Raises:
-            UsageError: the extra `data` is missing.
-        """
-        from canprobe.cell.results.files import write_parquet
-
-        write_parquet(self._columns(what), path, self._attrs)
-
-    @property
-    def _attrs(self) -> dict[str, Any]:
-        return {name: self.summary[name] for name in ("scene", "bus", "seed")}
-
-    def _columns(self, what: str) -> dict[str, Array]:
-        if what == "estimates":
-            from canprobe.cell.results.map_score import estimate_columns
-
-            return estimate_columns(next(iter(self.estimates.values()), []))
-        if what not in ("log", "truth"):
-            raise UsageError(f"to_pandas: expected log, truth or estimates, got {what!r}")
-        return self.log if what == "log" else self.truth
 
 
 def summarise(
@@ -453,7 +290,7 @@ def write_columns(log: Mapping[str, Array], tactile: Mapping[str, NDArray[Any]],
     )
 
 
-def write_files(result: RunResult, out: Path) -> None:
+def write_files(result: RunData, out: Path) -> None:
     """Write the files of a run into ``out`` that the session has not written, without the figures.
 
     Raises:
@@ -480,101 +317,3 @@ def _write_each(*writers: Callable[[], None]) -> None:
             failed.append(str(error))
     if failed:
         raise ResultsError("\n".join(failed))
-
-
-def _figure(value: float | None, unit: str, digits: int = 2) -> str:
-    return "not observed" if value is None else f"{value:.{digits}f} {unit}".rstrip()
-
-
-def summary_text(summary: dict[str, Any], out: Path | None) -> str:
-    """A summary as text."""
-    contact, shape, cycle = summary["contact"], summary["shape"], summary["cycle"]
-    pace = f"{summary['realtime_factor']:.1f} × real time" if summary["bus"] in VIRTUAL else "real time"
-    rate = "no cycle" if cycle["rate_hz"] is None else f"{cycle['cycles']} at {cycle['rate_hz']:.4g} Hz"
-    lines = [
-        f"{summary['scene']} on {summary['bus']}, seed {summary['seed']}: "
-        + ("done" if summary["completed"] else f"stopped: {summary['stop_reason']}"),
-        f"  time       {summary['sim_time_s']:.2f} s in {summary['wall_time_s']:.2f} s ({pace})",
-        f"  cycle      {rate}, {cycle['overruns']} overruns,"
-        f" {cycle['missed_pdos']} missed PDOs, {cycle['torn_frames']} torn frames",
-    ]
-    lines += [f"  plan       {choice}" for choice in summary.get("choices", ())]
-    if (summary.get("newtons") or "").startswith("nominal"):
-        lines.append(
-            f"  newtons    {summary['newtons']} of the array; forces and stiffness are as good as its full scale"
-        )
-    if contact["force_rms_error_n"] is not None:
-        target = contact["force_target_n"]
-        lines.append(
-            f"  force      target {target:g} N, RMS error {contact['force_rms_error_n']:.3f} N"
-            f" ({100 * contact['force_rms_error_n'] / target:.1f} %), highest {contact['force_max_n']:.2f} N"
-        )
-    if contact["speed_mean_m_s"] is not None:
-        lines.append(
-            f"  contact    {100 * contact['contact_fraction']:.1f} % of the scan at"
-            f" {contact['speed_mean_m_s'] * 1e3:.2f} mm/s"
-        )
-    if contact["losses"]:
-        lines.append(f"  {losses_text(contact['losses'])}")
-    if shape["method"] is not None:
-        lines += shape_lines(shape)
-    if summary.get("calibration") is not None:
-        lines += calibration_lines(summary["calibration"])
-    lines += bridge_lines(summary.get("bridges") or {})
-    lines += [f"  noted      {fault}" for fault in summary["faults"]]
-    lines += [f"  warning    {warning}" for warning in summary.get("warnings", ())]
-    if out is not None:
-        lines.append(f"  files      {out}")
-    return "\n".join(lines)
-
-
-def bridge_lines(bridges: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Samples, drops and errors of each bridge, as text."""
-    return [
-        f"  bridge     {name}: {status['samples']} samples, {status['dropped']} dropped; "
-        + (f"failed: {status['error']}" if status["error"] is not None else f"{status['where']}")
-        for name, status in bridges.items()
-    ]
-
-
-def curvature_text(values: Sequence[float | None] | None) -> str:
-    """Principal curvatures as text, with their unit."""
-    if values is None:
-        return "–"
-    observed = ", ".join(f"{v:.2f}" for v in values if v is not None)
-    if not observed:
-        return "not observed"
-    return f"{observed} 1/m" + (", the other one not observed" if None in values else "")
-
-
-def shape_lines(shape: dict[str, Any]) -> list[str]:
-    """The section ``shape`` of a summary as text."""
-    estimated, true = curvature_text(shape["kappa_est_per_m"]), curvature_text(shape["kappa_true_per_m"])
-    lines = [f"  curvature  {estimated}; true {true}"]
-    for name, score in shape.get("methods", {}).items():
-        if score["estimates"] == 0:
-            lines.append(f"    {name:<10} not scored: no estimate of both curvatures after the first 20 mm")
-            continue
-        percent = score["kappa_rms_error_percent"]
-        lines.append(
-            f"    {name:<10} RMS error {_figure(score['kappa_rms_error_per_m'], '1/m')}"
-            + (f" ({percent:.1f} %)" if percent is not None else "")
-            + f", normal {_figure(score['normal_rms_deg'], 'deg', 3)},"
-            f" position {_figure(score['position_rms_mm'], 'mm', 3)}"
-            + (f", with the patch in {100 * score['patch_fraction']:.0f} %" if score["patch_fraction"] else "")
-        )
-    if (surface := shape.get("map")) is not None:
-        lines.append(
-            f"  map        {surface['patches']} patches, {surface['crossings']} crossings" + _crossings(surface)
-        )
-    return lines
-
-
-def _crossings(surface: dict[str, Any]) -> str:
-    shares = (
-        f"{part} {100 * surface[part]['share_p_below_0.05']:.0f} %"
-        for part in ("curvature", "normal", "height")
-        if surface[part]["share_p_below_0.05"] is not None
-    )
-    text = ", ".join(shares)
-    return f"; p below 0.05 of {text}" if text else ""

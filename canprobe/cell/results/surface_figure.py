@@ -13,7 +13,7 @@ from matplotlib.figure import SubFigure
 
 from canprobe.cell.results.map_score import SAME_DIRECTION_RAD
 from canprobe.cell.results.picture import BLUE, FAINT, GREEN, GREY, INK, ORANGE, Part, box, legend, parts, picture
-from canprobe.cell.results.summary import RunResult
+from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.surface_panels import Array, MapView, Plane, add_sheet, map_surface, rejected, true_surface
 from canprobe.mechanics.touch.consistency import Consistency, check_consistency
 from canprobe.mechanics.touch.shapes import PlacedShape
@@ -68,7 +68,7 @@ def _scale(values: Array, *, signed: bool) -> Normalize:
 PARTS = (("curvature", ORANGE), ("normal", BLUE), ("height", GREEN))
 
 
-def draw_surface(result: RunResult, path: Path) -> None:
+def draw_surface(result: RunData, path: Path) -> None:
     """Draw a run's surface map and write a PNG; nothing where there is none."""
     if result.surface_map is None or result.consistency is None or not len(result.surface_map):
         return

@@ -186,9 +186,13 @@ class Session:
             return None
         return self.traffic[channel].bits / (self.scene.bus.bitrate * self._bus_time_ns * 1e-9)
 
-    def __enter__(self) -> Self:
+    def refuse_reentry(self) -> None:
+        """Raise UsageError where the session was opened before."""
         if self._entered:
             raise UsageError("a session is opened once: open another cell with open_cell(scene)")
+
+    def __enter__(self) -> Self:
+        self.refuse_reentry()
         self._entered = True
         self.started_ns = elapsed_ns()
         for warning in self.plan.warnings:
@@ -242,9 +246,10 @@ class Session:
         finally:
             self._left = True
             self.wall_ns = elapsed_ns() - self.started_ns
-            self._note_unwritten(self._log_failure())
+            self.note_unwritten(self._log_failure())
 
-    def _note_unwritten(self, failure: str | None) -> None:
+    def note_unwritten(self, failure: str | None) -> None:
+        """Note that a file could not be written, and why; None notes nothing."""
         if failure is not None and self._cell is not None:
             self.unwritten.append(failure)
             self._note(failure)
@@ -360,7 +365,7 @@ class Session:
                 try:
                     write_npz(self.out / "truth.npz", self.truth)
                 except CanprobeError as error:
-                    self._note_unwritten(str(error))
+                    self.note_unwritten(str(error))
 
     def _open_real(self) -> Port:
         bus = self.scene.bus
@@ -399,7 +404,7 @@ class Session:
 
     def _end_child(self, child: Any) -> None:
         self.truth = child.end()
-        self._note_unwritten(child.unwritten)
+        self.note_unwritten(child.unwritten)
 
 
 # A short run on the lockstep bus before a real one, so that nothing happens for the first time in a 2.5 ms cycle.

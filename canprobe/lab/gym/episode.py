@@ -50,9 +50,10 @@ class Episode:
     def __init__(self, plan: Plan, cycles: int, record: Path | None) -> None:
         task = self.task = LedTask(plan)
         self._cycles, self._period_s = cycles, plan.sync.period_ns * 1e-9
-        self.session = Session(plan, rows_kept=1) if record is None else OpenCell(plan, record, quiet, task=task)
+        self._opened = Session(plan, rows_kept=1) if record is None else OpenCell(plan, record, quiet, task=task)
+        self.session = self._opened.session if isinstance(self._opened, OpenCell) else self._opened
         collecting = gc.isenabled()
-        self.session.__enter__()
+        self._opened.__enter__()
         if collecting:
             gc.enable()  # a session pauses the collection, which what learns beside it may need
         try:
@@ -116,4 +117,4 @@ class Episode:
 
     def close(self) -> None:
         """Disable the drives and end the cell."""
-        self.session.__exit__(None, None, None)
+        self._opened.__exit__(None, None, None)

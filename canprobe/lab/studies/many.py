@@ -19,7 +19,7 @@ import canprobe
 from canprobe.api import run
 from canprobe.cell.emulated.truth_columns import present_name
 from canprobe.cell.results.files import unit_of
-from canprobe.cell.results.summary import RunResult
+from canprobe.cell.results.result import RunResult
 from canprobe.cell.scene.load import dump_scene, gathered, load_scene, parse_scene
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.session.session import Say, quiet

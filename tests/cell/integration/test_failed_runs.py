@@ -28,8 +28,9 @@ def run_with(faults: Sequence[Fault], scene: str, out: Path, monkeypatch: pytest
     class Faulty(OpenCell):
         def __init__(self, *words: Any, **options: Any) -> None:
             super().__init__(*words, **options)
-            nodes = self.world.nodes
-            self.world.participants[: len(nodes)] = [FaultyNode(node, faults) for node in nodes]
+            world = self.session.world
+            nodes = world.nodes
+            world.participants[: len(nodes)] = [FaultyNode(node, faults) for node in nodes]
 
     monkeypatch.setattr("canprobe.api.OpenCell", Faulty)
     canprobe.run(canprobe.load_scene(scene), out=out, duration_s=seconds, force=True)

@@ -7,7 +7,8 @@ import pytest
 
 import canprobe
 from canprobe.cell.results.scores import score_shape
-from canprobe.cell.results.summary import shape_lines, summarise_shape
+from canprobe.cell.results.summary import summarise_shape
+from canprobe.cell.results.text import shape_lines
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_shape_estimator, make_task
 from canprobe.cell.tasks.shape import replay_samples

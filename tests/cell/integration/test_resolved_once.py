@@ -20,7 +20,7 @@ import canprobe
 from canprobe.cell.master.observers import Observation
 from canprobe.cell.npz import read_npz
 from canprobe.cell.planning import make as make_module
-from canprobe.cell.results.summary import RunResult
+from canprobe.cell.results.result import RunResult
 from canprobe.cell.scene import resolve as resolve_module
 from canprobe.cell.scene.load import packaged_files
 from canprobe.cell.scene.model import Scene
@@ -189,7 +189,7 @@ def test_scores_that_fail_do_not_cost_what_was_measured(tmp_path: Path, monkeypa
     def broken(*_: object, **__: object) -> None:
         raise np.linalg.LinAlgError("singular")
 
-    monkeypatch.setattr("canprobe.api.summarise", broken)
+    monkeypatch.setattr("canprobe.cell.results.open_cell.summarise", broken)
     with pytest.raises(np.linalg.LinAlgError):
         undrawn_run(canprobe.load_scene("listen"), bus="direct", duration_s=0.1, out=tmp_path)
     assert len(read_npz(tmp_path / "log.npz")["t_s"]) > 30

@@ -10,7 +10,7 @@ import pytest
 
 import canprobe
 from canprobe.cell.master.observers import Observation
-from canprobe.cell.results.summary import RunResult
+from canprobe.cell.results.result import RunResult
 from canprobe.cell.scene.load import dump_scene, parse_scene
 
 

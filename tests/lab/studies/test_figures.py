@@ -46,7 +46,7 @@ def run_of(scene, seconds):
 def draw_scene(scene, seconds, *, draw=draw_run, **summary):
     def drawing(path):
         result = run_of(scene, seconds)
-        draw(dataclasses.replace(result, summary=result.summary | summary), path)
+        draw(dataclasses.replace(result.data, summary=result.summary | summary), path)
 
     return drawing
 

@@ -1,0 +1,321 @@
+"""A cell for controllers, from its bring-up to its results."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy.typing as npt
+
+from canprobe.cell.master.array import patch_from
+from canprobe.cell.master.cell import Cell
+from canprobe.cell.master.controller import Command, Controller, Measurement, TactileSample, as_controller
+from canprobe.cell.master.observers import Observation, Observer, Observers
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.results.result import RunResult
+from canprobe.cell.results.run_data import RunData
+from canprobe.cell.results.summary import log_columns, summarise, tactile_columns, write_columns, write_files
+from canprobe.cell.scene.setup import Setup, Touch
+from canprobe.cell.session.children import Bridges
+from canprobe.cell.session.session import Say, Session
+from canprobe.cell.session.target import VIRTUAL
+from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
+from canprobe.cell.tasks.task import TaskRecord, record_of
+from canprobe.errors import CanprobeError, ResultsError, UsageError
+from canprobe.fieldbus.bus.real.interrupts import interrupts_held, interrupts_repeated
+from canprobe.mechanics.robot.chain import forward_jacobian
+from canprobe.mechanics.types import Floats
+
+if TYPE_CHECKING:
+    from canprobe.cell.results.contacts import Contacts
+    from canprobe.mechanics.touch.consistency import Consistency
+    from canprobe.mechanics.touch.patch.image import Patch
+    from canprobe.mechanics.touch.surface_map import SurfaceMap
+
+AnyObserver = Observer | Callable[[Observation], None]
+
+
+class OpenCell:
+    """A cell for controllers: brought up where its block is entered, stopped where it is left, with its results then.
+
+    One block is one run, however many controllers it runs one after the other: one log, one summary, one folder. The
+    summary's contact and shape are those of the controller that ran last.
+
+    Args:
+        plan: of the scene.
+        out: folder of the results; None writes nothing.
+        say: called with each step.
+        observers: called after each cycle.
+        rows_kept: cycles whose row of the log is kept, and no truth; None for all.
+        task: whose contact and shape stand in the summary, whatever is run.
+
+    Attributes:
+        plan: of the scene.
+        session: the cell with everything round it.
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        out: Path | None,
+        say: Say,
+        observers: Sequence[AnyObserver] = (),
+        rows_kept: int | None = None,
+        *,
+        task: Controller | None = None,
+    ) -> None:
+        self.plan = plan
+        self.session = Session(plan, out, say, (), rows_kept)
+        self._out = out
+        self._say = say
+        self._bridges = Bridges(plan, out, virtual=plan.scene.bus.interface in VIRTUAL, say=say)
+        self._watchers = tuple(observers)
+        self._task = task
+        self._last: Controller | None = task
+        self._result = RunResult()
+
+    @property
+    def cell(self) -> Cell:
+        """The master's side of the cell, while the block is open or afterwards."""
+        return self.session.cell
+
+    def __enter__(self) -> Self:
+        self.session.refuse_reentry()
+        self._bridges.__enter__()
+        try:
+            if watchers := (*self._watchers, *self._bridges.observers):
+                self.session.observers = Observers(watchers)
+            self.session.__enter__()
+        except BaseException as error:
+            self._finish(error)
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        failure = error
+        try:
+            self.session.__exit__(kind, error, trace)
+        except BaseException as late:
+            failure = late
+            raise
+        finally:
+            self._finish(failure)
+
+    def patch(self, sample: TactileSample) -> Patch:
+        """What the array says of the contact: force, N, and place on the pad, m, with what makes them doubtful.
+
+        Args:
+            sample: of a measurement, `measurement.tactile`.
+
+        Raises:
+            UsageError: the scene has no array.
+        """
+        if self._patch_from is None:
+            raise UsageError(f"{self.plan.setup.name}: expected a scene with an array; got one without")
+        return self._patch_from(sample)
+
+    @cached_property
+    def _patch_from(self) -> Callable[[TactileSample], Patch] | None:
+        return patch_from(self.plan.setup)
+
+    def probe(self, q: npt.ArrayLike) -> tuple[Floats, Floats]:
+        """Where joint positions put the probe, and how it moves with them.
+
+        Args:
+            q: (n,) joint positions, rad or m.
+
+        Returns:
+            (4, 4) pose of the probe's centre in the base frame, m, whose z axis is the pole; and (6, n) its Jacobian:
+            velocity (rows 0-2) and angular velocity (3-5) in the base frame, per rate of each joint.
+
+        Raises:
+            UsageError: the scene has no arm.
+        """
+        setup = self.plan.setup
+        if setup.arm is None:
+            raise UsageError(f"{setup.name}: expected a scene with an arm; got one without")
+        return forward_jacobian(setup.arm.model.chain, q, setup.probe.T_flange_probe)
+
+    def run(
+        self,
+        controller: Controller | Callable[[Measurement], Command],
+        progress: Callable[[Measurement], None] = lambda _: None,
+    ) -> RunResult:
+        """Run a controller until it is done.
+
+        Args:
+            controller: a `Controller`, or a function of the measurement that returns a `Command`.
+            progress: called with the measurement of each cycle.
+
+        Returns:
+            The result of the whole block, the same from every call; it is complete when the block is left.
+
+        Raises:
+            UsageError: this is no controller, or its step returned no command.
+            BusError: the interface or a node failed.
+            SafetyStop: the cell was stopped for safety, or the controller gave a `stop_reason`.
+        """
+        runs = as_controller(controller)
+        if self._task is None:
+            self._last = runs
+        self.session.run(runs, progress)
+        return self._result
+
+    def open_to_requests(self, task: Controller) -> Controller:
+        """The task, which other tools may start, stop and set where the scene allows that."""
+        return self._bridges.open_to_requests(task)
+
+    def _finish(self, failure: BaseException | None) -> None:
+        """What the run was, once the bus is closed; nothing where none was opened."""
+        try:
+            if self.session.started:
+                self._conclude(failure)
+        finally:
+            self._bridges.end(None)
+
+    def _conclude(self, failure: BaseException | None) -> None:
+        log, tactile = log_columns(self.cell), tactile_columns(self.cell)
+        try:
+            data = self._score(log, tactile, failure)
+        except BaseException:  # what was measured is kept all the same
+            self._write(lambda out: write_columns(log, tactile, out))
+            raise
+        self._result.complete(data)
+        summary, lines = data.summary, self.session.unwritten
+        if isinstance(failure, CanprobeError):
+            failure.summary = summary
+        self._write(lambda out: write_files(data, out))
+        if self._out is not None:
+            for name, draw in _drawings(data, self._out, self._say).items():
+                self._say(f"draw {name}")
+                if (why := _draw(name, draw)) is not None:
+                    self.session.note_unwritten(why)
+        summary["faults"] += [line for line in lines if line not in summary["faults"]]
+        if lines and failure is None:
+            unwritten = ResultsError("\n".join(lines))
+            unwritten.summary = summary
+            raise unwritten
+        for line in lines:  # what stopped the run comes first
+            if failure is not None and line != str(failure):
+                failure.add_note(line)
+
+    def _score(
+        self, log: dict[str, Floats], tactile: dict[str, npt.NDArray[Any]], failure: BaseException | None
+    ) -> RunData:
+        """The data of the run, scored by the plan that it ran with."""
+        record, start_s, setup = record_of(self._last), self.cell.start_ns * 1e-9, self.plan.setup
+        if record.shape is not None and setup.shape is not None and setup.shape.also:
+            self._say(f"estimate again with {', '.join(setup.shape.also)}")
+        estimates = _estimates(setup, record.shape)
+        surface_map, consistency, map_summary = _mapped(setup, record.shape, start_s)
+        summary = summarise(
+            self.session,
+            record,
+            estimates,
+            None if failure is None else _reason(failure),
+            map_summary=map_summary,
+            bridges=self._bridges.status(),
+        )
+        summary["bridges"] = self._bridges.end(summary)
+        return RunData(
+            plan=self.plan,
+            summary=summary,
+            log=log,
+            truth=self.session.truth,
+            estimates={name: on_run_clock(records, start_s) for name, records in estimates.items()},
+            taxels=record.taxels,
+            tactile=tactile,
+            surface_map=surface_map,
+            consistency=consistency,
+            out=self._out,
+            contacts=self._contacts(record, start_s),
+        )
+
+    def _write(self, write: Callable[[Path], None]) -> None:
+        """Write files into the run's folder; what cannot be written is noted, and raised at the end."""
+        if self._out is None:
+            return
+        try:
+            with interrupts_held():
+                write(self._out)
+        except ResultsError as error:
+            for line in str(error).splitlines():
+                self.session.note_unwritten(line)
+
+    def _contacts(self, record: TaskRecord, start_s: float) -> Contacts | None:
+        task = self.plan.setup.task
+        if record.shape is None or not isinstance(task, Touch):
+            return None
+        from canprobe.cell.results.contacts import contacts_of
+
+        return contacts_of(record.shape.samples, task, start_s)
+
+
+def _estimates(setup: Setup, tracker: ShapeTracker | None) -> dict[str, list[ShapeRecord]]:
+    """The answers of the estimator in the loop, and of the others on the same contacts."""
+    if tracker is None or setup.shape is None:
+        return {}
+    from canprobe.cell.tasks.from_plan import estimates_of
+
+    return estimates_of(setup, tracker, (setup.shape.method, *setup.shape.also))
+
+
+def _mapped(
+    setup: Setup, tracker: ShapeTracker | None, start_s: float
+) -> tuple[SurfaceMap | None, Consistency | None, dict[str, Any] | None]:
+    """The surface map of a scan, the tests at its crossings (they take a second), and both for the summary."""
+    if tracker is None or setup.shape is None:
+        return None, None, None
+    from canprobe.cell.results.map_score import map_of_scan
+
+    return map_of_scan(tracker, setup.shape.method, start_s)
+
+
+def _drawings(data: RunData, out: Path, say: Say) -> dict[str, Callable[[], None]]:
+    """What draws each picture of a run of at least one cycle; the page of its scene comes last, it takes longest."""
+
+    def report() -> None:
+        from canprobe.cell.results.figures import draw_run
+
+        draw_run(data, out / "report.png")
+
+    def surface() -> None:
+        from canprobe.cell.results.surface_figure import draw_surface
+
+        draw_surface(data, out / "surface.png")
+
+    def page() -> None:
+        from canprobe.cell.results.page import write_page_of
+
+        try:
+            write_page_of(out, data.plan.setup, say)
+        except UsageError as error:  # a controller's column that is called like one of ours and is something else
+            say(f"report.html is left out: {error}")
+
+    outputs = data.plan.outputs if len(data.log["t_s"]) else ()
+    known = {"report.png": report, "surface.png": surface, "report.html": page}
+    return {name: draw for name, draw in known.items() if name in outputs}
+
+
+def _draw(name: str, draw: Callable[[], None]) -> str | None:
+    """Draw one picture; why that failed. Whatever a library of pictures raises, the run's results are written."""
+    try:
+        with interrupts_repeated():
+            draw()
+    except (CanprobeError, OSError) as error:
+        return str(error)
+    except Exception as error:
+        return f"{name}: cannot be drawn: {type(error).__name__}: {error}"
+    return None
+
+
+def _reason(failure: BaseException) -> str:
+    """Why a run ended, in words."""
+    if isinstance(failure, KeyboardInterrupt):
+        return "interrupted"
+    return str(failure) if isinstance(failure, CanprobeError) else f"{type(failure).__name__}: {failure}"

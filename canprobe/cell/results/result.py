@@ -1,0 +1,207 @@
+"""The result of a run, as Python has it: its data, and what is made of them when somebody asks."""
+
+from __future__ import annotations
+
+import importlib.util
+import tempfile
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.results.run_data import RunData
+from canprobe.cell.results.summary import write_files
+from canprobe.cell.results.text import summary_text
+from canprobe.cell.scene.setup import Touch
+from canprobe.cell.session.session import write_scene
+from canprobe.cell.tasks.shape import ShapeRecord
+from canprobe.errors import UsageError, install_line
+from canprobe.mechanics.types import Floats
+
+if TYPE_CHECKING:
+    import pandas
+    from matplotlib.figure import Figure
+
+    from canprobe.cell.results.contacts import Contacts, OwnEstimator, Scores
+    from canprobe.cell.results.page import Page
+    from canprobe.mechanics.touch.consistency import Consistency
+    from canprobe.mechanics.touch.surface_map import SurfaceMap
+
+_FIELDS = frozenset(field.name for field in fields(RunData))
+
+
+class RunResult:
+    """One finished run; printed, it is its summary.
+
+    That of `canprobe.open_cell` is complete when its block is left: until then the drives are not disabled, the
+    bus is not closed, and reading an attribute raises.
+
+    Attributes:
+        plan: what was planned.
+        summary: the content of ``summary.json``.
+        log: the columns of ``log.npz``, one row per cycle; the suffix of a name is its unit. ``t_s`` here, in the truth
+            and in the estimates counts from the instant that is 0 in ``bus.log``.
+        truth: the plant's true values, one row per SYNC; empty where nothing was emulated.
+        estimates: the answers of each estimator, by name; the online one first.
+        taxels: (rows, columns) counts of the task's last tactile frame, or None.
+        tactile: the columns of ``tactile.npz``, one row per tactile frame that the cell used: ``t_s`` of the cycle,
+            ``t_sample_s``, ``taxels`` (m, rows, columns), their ``window``, ``features``; empty where there was none.
+        surface_map: the local patches of the online estimator, or None without a shape.
+        consistency: the tests at its crossings, or None.
+        out: the folder with the files, or None.
+        contacts: of the scan, as the master measured them; None without a shape.
+    """
+
+    __slots__ = ("_data",)
+
+    plan: Plan
+    summary: dict[str, Any]
+    log: dict[str, Floats]
+    truth: dict[str, Floats]
+    estimates: dict[str, list[ShapeRecord]]
+    taxels: NDArray[np.uint8] | None
+    tactile: dict[str, NDArray[Any]]
+    surface_map: SurfaceMap | None
+    consistency: Consistency | None
+    out: Path | None
+    contacts: Contacts | None
+
+    def __init__(self) -> None:
+        self._data: RunData | None = None
+
+    def complete(self, data: RunData) -> None:
+        """Take the data of the run, which is over."""
+        self._data = data
+
+    @property
+    def data(self) -> RunData:
+        """All attributes in one object.
+
+        Raises:
+            UsageError: the run is under way.
+        """
+        return self._known("data")
+
+    def _known(self, name: str) -> RunData:
+        if self._data is None:
+            raise UsageError(f"result.{name}: complete when the block of open_cell is left; read it after the block")
+        return self._data
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            if name not in _FIELDS:
+                raise AttributeError(f"RunResult has no attribute {name!r}")
+            return getattr(self._known(name), name)
+
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), *_FIELDS]
+
+    def text(self) -> str:
+        """The summary as text."""
+        return summary_text(self.summary, self.out)
+
+    def __repr__(self) -> str:
+        try:
+            return self.text()
+        except UsageError:
+            return "a run that is under way; complete when the block of open_cell is left"
+
+    def plot(self) -> Figure:
+        """The figure of ``report.png``; a notebook shows it.
+
+        Raises:
+            UsageError: matplotlib is missing, or nothing was measured.
+        """
+        if importlib.util.find_spec("matplotlib") is None:
+            raise UsageError(f"plot needs matplotlib: {install_line('study')}")
+        from canprobe.cell.results.figures import run_figure
+
+        return run_figure(self.data)
+
+    def view(self) -> Page:
+        """The run in three dimensions, as one page that replays it: in a notebook, else in a browser.
+
+        It is ``report.html`` of the run's folder, or of a temporary one.
+
+        Raises:
+            UsageError: the extra `view` is missing.
+        """
+        from canprobe.cell.results.page import page_of
+
+        folder = self.out
+        if folder is None:
+            folder = Path(tempfile.mkdtemp(prefix="canprobe-view-"))
+            write_scene(self.plan, folder)
+            write_files(self.data, folder)
+        return page_of(folder, self.plan.setup)
+
+    def score(self, *methods: str, **own: Callable[[], OwnEstimator]) -> Scores:
+        """The errors of estimators on the contacts of this scan, all asked every 0.1 s, against the plant's truth.
+
+        Example::
+
+            result.score("recursive", "ml", mine=MyEstimator)
+
+        Args:
+            methods: ours, by name; without any, those of the scene.
+            own: makes an estimator of yours, such as its class, by the name that it has in the table. It has
+                ``add(sample)``, which takes a `canprobe.ContactSample`, and ``estimate()``, which returns a
+                `canprobe.SurfaceEstimate` or None. After a loss of contact a new one is made.
+
+        Raises:
+            UsageError: nothing was scanned, no truth is known, or an unknown method.
+        """
+        from canprobe.cell.results.contacts import score_estimators
+
+        task, scene = self.plan.setup.task, self.plan.scene
+        if self.contacts is None or not len(self.contacts) or scene.shape is None or not isinstance(task, Touch):
+            raise UsageError("score: expected a scan that touched its object, got no contacts")
+        if "kappa_per_m" not in self.truth:
+            raise UsageError("score: expected an emulated object; nothing is known of the truth")
+        start_s = float(self.contacts.t_s[0] - self.contacts.samples[0].t_s)
+        ours = {name: name for name in methods or (scene.shape.method, *scene.shape.also)}
+        return score_estimators(
+            self.contacts.samples, task, {**ours, **own}, truth=self.truth, sync_times=self.log["t_s"] - start_s
+        )
+
+    def to_pandas(self, what: Literal["log", "truth", "estimates"] = "log") -> pandas.DataFrame:
+        """A table of the run, by time; vectors are spread over columns, and `attrs["units"]` has every unit.
+
+        Args:
+            what: `log` (one row per cycle), `truth` (per SYNC), or `estimates` (per answer of the estimator in the
+                loop; the attribute `estimates` has the others).
+
+        Raises:
+            UsageError: the extra `data` is missing.
+        """
+        from canprobe.cell.results.files import to_frame
+
+        return to_frame(self._columns(what), self._attrs)
+
+    def to_parquet(self, path: Path | str, what: Literal["log", "truth", "estimates"] = "log") -> None:
+        """Write the same table as Parquet; `canprobe.load_table` reads it.
+
+        Raises:
+            UsageError: the extra `data` is missing.
+        """
+        from canprobe.cell.results.files import write_parquet
+
+        write_parquet(self._columns(what), path, self._attrs)
+
+    @property
+    def _attrs(self) -> dict[str, Any]:
+        return {name: self.summary[name] for name in ("scene", "bus", "seed")}
+
+    def _columns(self, what: str) -> dict[str, Floats]:
+        if what == "estimates":
+            from canprobe.cell.results.map_score import estimate_columns
+
+            return estimate_columns(next(iter(self.estimates.values()), []))
+        if what not in ("log", "truth"):
+            raise UsageError(f"to_pandas: expected log, truth or estimates, got {what!r}")
+        return self.log if what == "log" else self.truth

@@ -1,0 +1,109 @@
+"""A summary as text, as `canprobe run` and `canprobe replay` print it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from canprobe.cell.results.tool_file import calibration_lines
+from canprobe.cell.session.target import VIRTUAL
+from canprobe.cell.tasks.regain import losses_text
+
+
+def _figure(value: float | None, unit: str, digits: int = 2) -> str:
+    return "not observed" if value is None else f"{value:.{digits}f} {unit}".rstrip()
+
+
+def summary_text(summary: dict[str, Any], out: Path | None) -> str:
+    """A summary as text."""
+    contact, shape, cycle = summary["contact"], summary["shape"], summary["cycle"]
+    pace = f"{summary['realtime_factor']:.1f} × real time" if summary["bus"] in VIRTUAL else "real time"
+    rate = "no cycle" if cycle["rate_hz"] is None else f"{cycle['cycles']} at {cycle['rate_hz']:.4g} Hz"
+    lines = [
+        f"{summary['scene']} on {summary['bus']}, seed {summary['seed']}: "
+        + ("done" if summary["completed"] else f"stopped: {summary['stop_reason']}"),
+        f"  time       {summary['sim_time_s']:.2f} s in {summary['wall_time_s']:.2f} s ({pace})",
+        f"  cycle      {rate}, {cycle['overruns']} overruns,"
+        f" {cycle['missed_pdos']} missed PDOs, {cycle['torn_frames']} torn frames",
+    ]
+    lines += [f"  plan       {choice}" for choice in summary.get("choices", ())]
+    if (summary.get("newtons") or "").startswith("nominal"):
+        lines.append(
+            f"  newtons    {summary['newtons']} of the array; forces and stiffness are as good as its full scale"
+        )
+    if contact["force_rms_error_n"] is not None:
+        target = contact["force_target_n"]
+        lines.append(
+            f"  force      target {target:g} N, RMS error {contact['force_rms_error_n']:.3f} N"
+            f" ({100 * contact['force_rms_error_n'] / target:.1f} %), highest {contact['force_max_n']:.2f} N"
+        )
+    if contact["speed_mean_m_s"] is not None:
+        lines.append(
+            f"  contact    {100 * contact['contact_fraction']:.1f} % of the scan at"
+            f" {contact['speed_mean_m_s'] * 1e3:.2f} mm/s"
+        )
+    if contact["losses"]:
+        lines.append(f"  {losses_text(contact['losses'])}")
+    if shape["method"] is not None:
+        lines += shape_lines(shape)
+    if summary.get("calibration") is not None:
+        lines += calibration_lines(summary["calibration"])
+    lines += bridge_lines(summary.get("bridges") or {})
+    lines += [f"  noted      {fault}" for fault in summary["faults"]]
+    lines += [f"  warning    {warning}" for warning in summary.get("warnings", ())]
+    if out is not None:
+        lines.append(f"  files      {out}")
+    return "\n".join(lines)
+
+
+def bridge_lines(bridges: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Samples, drops and errors of each bridge, as text."""
+    return [
+        f"  bridge     {name}: {status['samples']} samples, {status['dropped']} dropped; "
+        + (f"failed: {status['error']}" if status["error"] is not None else f"{status['where']}")
+        for name, status in bridges.items()
+    ]
+
+
+def curvature_text(values: Sequence[float | None] | None) -> str:
+    """Principal curvatures as text, with their unit."""
+    if values is None:
+        return "–"
+    observed = ", ".join(f"{v:.2f}" for v in values if v is not None)
+    if not observed:
+        return "not observed"
+    return f"{observed} 1/m" + (", the other one not observed" if None in values else "")
+
+
+def shape_lines(shape: dict[str, Any]) -> list[str]:
+    """The section ``shape`` of a summary as text."""
+    estimated, true = curvature_text(shape["kappa_est_per_m"]), curvature_text(shape["kappa_true_per_m"])
+    lines = [f"  curvature  {estimated}; true {true}"]
+    for name, score in shape.get("methods", {}).items():
+        if score["estimates"] == 0:
+            lines.append(f"    {name:<10} not scored: no estimate of both curvatures after the first 20 mm")
+            continue
+        percent = score["kappa_rms_error_percent"]
+        lines.append(
+            f"    {name:<10} RMS error {_figure(score['kappa_rms_error_per_m'], '1/m')}"
+            + (f" ({percent:.1f} %)" if percent is not None else "")
+            + f", normal {_figure(score['normal_rms_deg'], 'deg', 3)},"
+            f" position {_figure(score['position_rms_mm'], 'mm', 3)}"
+            + (f", with the patch in {100 * score['patch_fraction']:.0f} %" if score["patch_fraction"] else "")
+        )
+    if (surface := shape.get("map")) is not None:
+        lines.append(
+            f"  map        {surface['patches']} patches, {surface['crossings']} crossings" + _crossings(surface)
+        )
+    return lines
+
+
+def _crossings(surface: dict[str, Any]) -> str:
+    shares = (
+        f"{part} {100 * surface[part]['share_p_below_0.05']:.0f} %"
+        for part in ("curvature", "normal", "height")
+        if surface[part]["share_p_below_0.05"] is not None
+    )
+    text = ", ".join(shares)
+    return f"; p below 0.05 of {text}" if text else ""
