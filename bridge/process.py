@@ -22,7 +22,7 @@ from canprobe.cell.master.observers import Observation
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.load import SAVED_AS
 from canprobe.cell.session.emulator_child import with_our_imports
-from canprobe.cell.session.session import write_scene
+from canprobe.cell.session.folder import write_scene
 from canprobe.cell.tasks.requested import Request
 from canprobe.errors import ResultsError, UsageError
 from canprobe.fieldbus.bus.clock import elapsed_ns, epoch_now_ns

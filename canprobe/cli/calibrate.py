@@ -78,13 +78,13 @@ def run(args: argparse.Namespace) -> int:
     from canprobe.cell.results.array_report import as_document, calibration_text, draw_calibration
     from canprobe.cell.scene.calibrations import dump_calibration
     from canprobe.cell.scene.load import load_scene, read_cell
-    from canprobe.cell.session.array_calibration import Request, calibrate
+    from canprobe.cell.session.array_calibration import CalibrationRequest, calibrate
     from canprobe.fieldbus.bus.files import write_text
 
     today = date.today().isoformat()
     out = args.out or api.timed_folder(f"calibrate-array-{read_cell(args.cell).cell.name}")
     api.check_free(out, force=args.force)
-    request = Request(
+    request = CalibrationRequest(
         cell=args.cell,
         target=target_of(args, load_scene("press", {"cell": args.cell})),
         at=args.at and tuple(args.at),

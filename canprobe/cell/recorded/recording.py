@@ -63,7 +63,7 @@ class Recording:
 
 
 @dataclass(slots=True)
-class _Channel:
+class _RecordedChannel:
     """What was read of one channel so far."""
 
     frames: list[TimedFrame] = field(default_factory=list)
@@ -88,7 +88,7 @@ def read_recording(path: Path, plan: Plan) -> Recording:
     bus = RecordedBus(path)
     channels, error_frames = _read(bus, plan)
     name = max(channels, key=lambda c: (channels[c].answers, len(channels[c].frames)), default="")
-    chosen = channels.get(name, _Channel())
+    chosen = channels.get(name, _RecordedChannel())
     _check_heard(path, plan, name, chosen)
     frames = _in_bus_order(chosen.frames)
     syncs = [i for i, frame in enumerate(frames) if frame[0] == SYNC_ID]
@@ -100,12 +100,12 @@ def read_recording(path: Path, plan: Plan) -> Recording:
     return recording
 
 
-def _read(bus: RecordedBus, plan: Plan) -> tuple[dict[str, _Channel], int]:
+def _read(bus: RecordedBus, plan: Plan) -> tuple[dict[str, _RecordedChannel], int]:
     lengths: dict[int, int] = {pdo.cob_id: pdo.layout.length for pdo in plan.pdos}
     answers = {pdo.cob_id for pdo in plan.pdos if pdo.direction == "tpdo"}
     may_be_longer = {pdo.cob_id for pdo in plan.pdos if pdo.direction == "tpdo" and pdo.kind == "drive"}
     raw = {(frames.channel, frames.can_id) for frames in plan.raw}  # their formats say what is in them
-    channels: dict[str, _Channel] = {}
+    channels: dict[str, _RecordedChannel] = {}
     error_frames = 0
     main, *others = [bus.channel for bus in plan.buses]
     for t_ns, on, can_id, data in bus:
@@ -114,7 +114,7 @@ def _read(bus: RecordedBus, plan: Plan) -> tuple[dict[str, _Channel], int]:
         name = main if on in others else on
         channel = channels.get(name)
         if channel is None:
-            channel = channels[name] = _Channel()
+            channel = channels[name] = _RecordedChannel()
         if is_sync(can_id, data) or (on if on in others else main, can_id) in raw:
             channel.frames.append((can_id, data, t_ns))
         elif (length := lengths.get(can_id)) is None:
@@ -144,7 +144,7 @@ def _in_bus_order(frames: list[TimedFrame]) -> list[TimedFrame]:
     return [(can_id, data, t_ns) for (can_id, data, _), t_ns in zip(frames, latest.tolist(), strict=True)]
 
 
-def _check_heard(path: Path, plan: Plan, name: str, channel: _Channel) -> None:
+def _check_heard(path: Path, plan: Plan, name: str, channel: _RecordedChannel) -> None:
     silent = []
     for node in plan.nodes:
         missing = [pdo for pdo in plan.pdos_of(node.node_id, "tpdo") if pdo.cob_id not in channel.heard]

@@ -37,7 +37,7 @@ _SCORED = ("kappa_per_m", "direction1", "direction2", "contact_normal", "contact
 
 
 @dataclass(frozen=True, slots=True)
-class Contacts:
+class RecordedContacts:
     """What a record says of the contacts, for estimates and the summary.
 
     Attributes:
@@ -59,7 +59,7 @@ class Contacts:
     bus: RecordedBus | None = None
 
 
-def _from_run(plan: Plan, run: RunFolder) -> Contacts:
+def _from_run(plan: Plan, run: RunFolder) -> RecordedContacts:
     """The contacts of a run, as its master measured them."""
     task = replay_task(plan, run)
     if task is not None and task.shape is not None and task.shape.samples:
@@ -68,10 +68,10 @@ def _from_run(plan: Plan, run: RunFolder) -> Contacts:
         tracker, unplaced = replay_contacts(plan, run.measurements())
         driven_by = "other"
     counts = {"cycles": len(run.times_ns), "unplaced_contacts": unplaced}
-    return Contacts(tracker, driven_by, run.start_s, run.times_s, counts, None)
+    return RecordedContacts(tracker, driven_by, run.start_s, run.times_s, counts, None)
 
 
-def _from_log(plan: Plan, path: Path) -> Contacts:
+def _from_log(plan: Plan, path: Path) -> RecordedContacts:
     """The contacts in a recorded bus."""
     recording = read_recording(path, plan)
     cycles = LogCycles(plan, recording)
@@ -94,11 +94,11 @@ def _from_log(plan: Plan, path: Path) -> Contacts:
         "frames_lost_by_candump": sum(recording.bus.lost.values()),
     }
     times_s = np.array(cycles.sync_times_s)
-    return Contacts(tracker, "other", cycles.start_ns * 1e-9, times_s, counts, recording.channel, recording.bus)
+    return RecordedContacts(tracker, "other", cycles.start_ns * 1e-9, times_s, counts, recording.channel, recording.bus)
 
 
 def _summarise(
-    plan: Plan, source: Path, contacts: Contacts, estimates: dict[str, list[ShapeRecord]], folder: Path | None
+    plan: Plan, source: Path, contacts: RecordedContacts, estimates: dict[str, list[ShapeRecord]], folder: Path | None
 ) -> dict[str, Any]:
     """The summary of a `ReplayResult`; what does not apply is None. `folder` of the run, for its truth and its log."""
     truth = _truth(folder / TRUTH, plan.setup) if folder is not None else {}

@@ -17,7 +17,7 @@ from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.summary import write_files
 from canprobe.cell.results.text import summary_text
 from canprobe.cell.scene.setup import Touch
-from canprobe.cell.session.session import write_scene
+from canprobe.cell.session.folder import write_scene
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.errors import UsageError, install_line
 from canprobe.mechanics.types import Floats

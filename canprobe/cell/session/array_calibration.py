@@ -142,7 +142,7 @@ def visits(ball_radius: float, rod_radius: float, *, loads: bool, one_by_one: bo
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class CalibrationRequest:
     """What is calibrated, and how.
 
     Attributes:
@@ -186,7 +186,7 @@ class Calibrated:
 
 
 def calibrate(
-    request: Request, *, date: str, ask: Ask | None = None, say: Say = quiet, out: Path | None = None
+    request: CalibrationRequest, *, date: str, ask: Ask | None = None, say: Say = quiet, out: Path | None = None
 ) -> Calibrated:
     """Touch everything, and fit.
 
@@ -249,7 +249,7 @@ def calibrate(
     return Calibrated(fit, *_without_load(unloaded, array.rate_hz), tuple(notes))
 
 
-def _scene(request: Request) -> Scene:
+def _scene(request: CalibrationRequest) -> Scene:
     """A press on the cell; without a time on the wire where it is emulated in lockstep."""
     scene = load_scene("press", {"cell": request.cell})
     if request.target is not None:

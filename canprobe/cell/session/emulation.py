@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from canprobe.cell.npz import write_npz
 from canprobe.cell.scene.model import Scene
-from canprobe.cell.session.link_faults import Expected, data_bitrate
+from canprobe.cell.session.link_faults import ExpectedLink, data_bitrate
 from canprobe.cell.session.links import check_links
 from canprobe.cell.session.session import Say, quiet, rehearse
 from canprobe.cell.session.target import Target
@@ -73,7 +73,7 @@ def emulate(
     placed = {n.node_id: names.get(n.channel, target.channel) for n in plan.nodes if n.node_id in node_ids}
     array = plan.setup.array
     raw_at = names.get(array.channel, target.channel) if array is not None and array.raw and array.emulated else None
-    wanted = Expected(target.bitrate, data_bitrate(plan.setup.bus))
+    wanted = ExpectedLink(target.bitrate, data_bitrate(plan.setup.bus))
     way_out = "end that node, or name others with --nodes"
     _make_places(truth_path, store_folder)
     with contextlib.ExitStack() as stack:
@@ -150,7 +150,7 @@ def emulate_eds(
             say(f"{name}: {warnings} warning{'s' * (warnings > 1)}; `{check}` lists them")
     _check_addresses(nodes)
     _make_places(None, store_folder)
-    wanted, way_out = Expected(target.bitrate, of_scene=False), "end that node, or give another --node-id"
+    wanted, way_out = ExpectedLink(target.bitrate, of_scene=False), "end that node, or give another --node-id"
     with _free_port(target, wanted, node_ids, way_out=way_out, say=say) as port:
         for node in nodes:
             if node.lss is not None:
@@ -171,7 +171,7 @@ def _make_places(truth_path: Path | None, store_folder: Path | None) -> None:
 
 @contextlib.contextmanager
 def _free_port(
-    target: Target, wanted: Expected, node_ids: tuple[int, ...], *, way_out: str, say: Say
+    target: Target, wanted: ExpectedLink, node_ids: tuple[int, ...], *, way_out: str, say: Say
 ) -> Iterator[Port]:
     """A port on a bus where nobody has these node ids; it waits for the bus as a device does."""
     from canprobe.cell.planning.warnings import bus_open_to_others

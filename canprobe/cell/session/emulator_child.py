@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from canprobe.cell.emulated.truth_columns import TruthColumns
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.load import SAVED_AS
+from canprobe.cell.session.folder import write_scene
 from canprobe.errors import BusError, NodeError
 from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.port import Port, TimedFrame
@@ -86,8 +87,7 @@ class EmulatorChild:
 
     def start(self) -> None:
         """Start the process."""
-        for name, content in self._plan.files.items():
-            (self._folder / name).write_bytes(content)
+        write_scene(self._plan, self._folder)
         bus, nodes = self._scene.bus, self._scene.emulated_node_ids
         command = [
             *(sys.executable, "-P", "-m", "canprobe", "emulate", str(self._folder / SAVED_AS)),

@@ -41,7 +41,7 @@ class Remark:
 
 
 @dataclass(frozen=True, slots=True)
-class Expected:
+class ExpectedLink:
     """What is wanted of an interface.
 
     Attributes:
@@ -61,7 +61,7 @@ def data_bitrate(bus: BusSettings) -> int | None:
     return bus.data_bitrate if bus.fd is True else None
 
 
-def expected_of(plan: Plan) -> dict[str, Expected]:
+def expected_of(plan: Plan) -> dict[str, ExpectedLink]:
     """What a plan wants of each of its channels.
 
     After a late cycle the frames of two go at once, each SYNC, heartbeat and every RPDO.
@@ -69,10 +69,12 @@ def expected_of(plan: Plan) -> dict[str, Expected]:
     bus = plan.setup.bus
     rpdos = {(pdo.channel, pdo.cob_id) for pdo in plan.pdos if pdo.direction == "rpdo"}
     numbers = {one.channel: sum(channel == one.channel for channel, _ in rpdos) for one in plan.buses}
-    return {channel: Expected(bus.bitrate, data_bitrate(bus), 2 * (number + 2)) for channel, number in numbers.items()}
+    return {
+        channel: ExpectedLink(bus.bitrate, data_bitrate(bus), 2 * (number + 2)) for channel, number in numbers.items()
+    }
 
 
-def check_link(link: LinkState, expected: Expected) -> list[Remark]:
+def check_link(link: LinkState, expected: ExpectedLink) -> list[Remark]:
     """Everything that is wrong with an interface; nothing where all is well, and nothing of a virtual one."""
     if link.kind in VIRTUAL_KINDS:
         return []
@@ -104,7 +106,7 @@ def _restart_line(link: LinkState) -> str:
     return f"then type: {ip_line(f'{link.name} type can restart')}"
 
 
-def _rates(link: LinkState, expected: Expected) -> Iterator[Remark]:
+def _rates(link: LinkState, expected: ExpectedLink) -> Iterator[Remark]:
     pairs = [("bit rate", link.bitrate, expected.bitrate)]
     if expected.data_bitrate is not None:
         pairs.append(("data bit rate", link.data_bitrate, expected.data_bitrate))
@@ -114,11 +116,11 @@ def _rates(link: LinkState, expected: Expected) -> Iterator[Remark]:
             yield Remark(True, f"its {what} is {have} bit/s, {whose} {want}; type: {_line(link, expected)}")
 
 
-def _line(link: LinkState, expected: Expected) -> str:
+def _line(link: LinkState, expected: ExpectedLink) -> str:
     return setting_line(link.name, expected.bitrate, expected.data_bitrate)
 
 
-def _modes(link: LinkState, expected: Expected) -> Iterator[Remark]:
+def _modes(link: LinkState, expected: ExpectedLink) -> Iterator[Remark]:
     name = link.name
     for mode, what in (("LISTEN-ONLY", "cannot send"), ("LOOPBACK", "hears only itself")):
         if mode in link.modes and expected.frames_at_once:
@@ -128,7 +130,7 @@ def _modes(link: LinkState, expected: Expected) -> Iterator[Remark]:
         yield Remark(False, "it is in one-shot mode: a frame that loses the arbitration is not sent again")
 
 
-def _state(link: LinkState, _: Expected) -> Iterator[Remark]:
+def _state(link: LinkState, _: ExpectedLink) -> Iterator[Remark]:
     if (trouble := controller_trouble(link)) is not None:
         yield Remark(link.state == "BUS-OFF", f"it is {trouble}")
     elif link.state == "ERROR-WARNING":
@@ -149,7 +151,7 @@ def _symptom(link: LinkState) -> str:
     return unheard if sent > heard else broken
 
 
-def _sample_point(link: LinkState, expected: Expected) -> Iterator[Remark]:
+def _sample_point(link: LinkState, expected: ExpectedLink) -> Iterator[Remark]:
     low, best, high = SLOW_SAMPLE if expected.bitrate <= SLOW_BIT_S else FAST_SAMPLE
     point = link.sample_point
     if point is not None and not low - 1e-3 <= point <= high + 1e-3:
@@ -160,7 +162,7 @@ def _sample_point(link: LinkState, expected: Expected) -> Iterator[Remark]:
         )
 
 
-def _restart(link: LinkState, expected: Expected) -> Iterator[Remark]:
+def _restart(link: LinkState, expected: ExpectedLink) -> Iterator[Remark]:
     if link.restart_ms == 0 and expected.frames_at_once:
         yield Remark(
             False,
@@ -168,7 +170,7 @@ def _restart(link: LinkState, expected: Expected) -> Iterator[Remark]:
         )
 
 
-def _queue(link: LinkState, expected: Expected) -> Iterator[Remark]:
+def _queue(link: LinkState, expected: ExpectedLink) -> Iterator[Remark]:
     if link.tx_queue is not None and link.tx_queue < expected.frames_at_once:
         yield Remark(
             False,

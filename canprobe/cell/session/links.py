@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from canprobe.cell.session.link_faults import Expected, check_link, controller_trouble
+from canprobe.cell.session.link_faults import ExpectedLink, check_link, controller_trouble
 from canprobe.errors import BusError, InterfaceError
 from canprobe.fieldbus.bus.real.link import (
     LinkState,
@@ -20,7 +20,7 @@ SOCKETCAN = "socketcan"
 
 
 def check_links(
-    interface: str, channels: Mapping[str, Expected], say: Callable[[str], None], *, must: bool = True
+    interface: str, channels: Mapping[str, ExpectedLink], say: Callable[[str], None], *, must: bool = True
 ) -> None:
     """Check SocketCAN interfaces before anything is sent; of others, and of virtual ones, there is nothing to check.
 

@@ -16,7 +16,7 @@ from canprobe.cell.planning.make import make_plan
 from canprobe.cell.scene.model import BringUpSettings, Scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.buses import open_ports
-from canprobe.cell.session.link_faults import Expected, expected_of
+from canprobe.cell.session.link_faults import ExpectedLink, expected_of
 from canprobe.cell.session.links import check_links, need_controllers
 from canprobe.cell.session.session import Say, quiet
 from canprobe.cell.session.target import Target, need_real_bus
@@ -89,7 +89,7 @@ def _open(target: Target, say: Say) -> Iterator[Port]:
     from canprobe.fieldbus.bus.real.opening import open_port
 
     interface, channel = target.interface, target.channel
-    check_links(interface, {channel: Expected(target.bitrate, of_scene=False)}, say, must=False)
+    check_links(interface, {channel: ExpectedLink(target.bitrate, of_scene=False)}, say, must=False)
     port = open_port(interface, channel, target.bitrate, MonotonicClock())
     try:
         yield port

@@ -6,7 +6,6 @@ The composition root: the only place, besides studies and tests, that sees both 
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -30,14 +29,17 @@ from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.model import BridgeSettings, Scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.buses import TrafficCounter, channel_routes, lockstep_bus, open_ports
+from canprobe.cell.session.emulator_child import EmulatorChild
+from canprobe.cell.session.folder import prepare_folder, zeros_file
 from canprobe.cell.session.link_faults import expected_of
 from canprobe.cell.session.links import check_links, need_controllers
+from canprobe.cell.session.rehearsal import shortened
 from canprobe.cell.session.target import LOCKSTEP, VIRTUAL
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.errors import CanprobeError, UsageError
 from canprobe.fieldbus.bus.candump import CandumpWriter, RecordingPort
 from canprobe.fieldbus.bus.clock import MonotonicClock, VirtualClock, elapsed_ns
-from canprobe.fieldbus.bus.files import make_folder, whole_file, writing
+from canprobe.fieldbus.bus.files import make_folder, writing
 from canprobe.fieldbus.bus.joined import JoinedPort
 from canprobe.fieldbus.bus.port import Port, Reports, is_bus_error
 from canprobe.fieldbus.bus.real.memory import garbage_collection_paused, reserve_memory
@@ -47,15 +49,7 @@ from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 if TYPE_CHECKING:
     from canprobe.cell.emulated.world import World
 
-
-# A cell with everything round it: bus, recording, emulated nodes, and the way out of all of them.
-
 Array = NDArray[np.float64]
-LEFT_BY_RUNS = (
-    *("log.npz", "report.html", "report.png", "run.mcap", "scene.toml", "summary.json", "surface.npz"),
-    *("surface.png", "tactile.npz", "tool.toml", "truth.npz"),
-)
-"""Files of a run's folder besides ``bus.log``."""
 Write = Callable[[int, bytes, int], None]
 Say = Callable[[str], None]
 """Called with a line of text for each step."""
@@ -74,26 +68,6 @@ def with_bridges(scene: Scene, names: Sequence[str]) -> Scene:
     known = scene.bridge or BridgeSettings()
     use: Any = tuple(dict.fromkeys((*known.use, *names)))
     return replace(scene, bridge=replace(known, use=use))
-
-
-def write_scene(plan: Plan, folder: Path) -> None:
-    """Write `scene.toml` into a folder, with the files that it names beside it, as they were read for the plan.
-
-    Raises:
-        ResultsError: a file cannot be written; no part of it is left.
-    """
-    for name, content in reversed(plan.files.items()):
-        with whole_file(folder / name) as part:
-            part.write_bytes(content)
-
-
-def zeros_file(plan: Plan) -> Path | None:
-    """Where the zeros of a cell's real drives are recorded, in the user's state folder; None where none is homed."""
-    arm = plan.setup.arm
-    if arm is None or all(drive.zero is None or drive.emulated for drive in arm.drives):
-        return None
-    folder = os.environ.get("XDG_STATE_HOME") or "~/.local/state"
-    return Path(folder).expanduser() / "canprobe" / f"zeros-{arm.model.name}.json"
 
 
 class Session:
@@ -271,14 +245,6 @@ class Session:
             return self._open_direct()
         return self._open_lockstep() if self.scene.bus.interface == LOCKSTEP else self._open_real()
 
-    def _make_folder(self, out: Path) -> None:
-        """The run's folder, with its scene and without what an earlier run left there."""
-        make_folder(out)  # only now: where no bus opens nothing is left behind
-        for name in LEFT_BY_RUNS:
-            with writing(out / name):
-                (out / name).unlink(missing_ok=True)
-        write_scene(self.plan, out)
-
     def _writer(self, channel: str) -> Write:
         """What a bus is recorded with: its traffic is counted, written to the log and shown to the observers."""
         if self.scene.bus.interface == LOCKSTEP:
@@ -291,7 +257,7 @@ class Session:
             if self._candump is None:
                 make_folder(self.out)
                 self._candump = self._stack.enter_context(CandumpWriter(self.out / "bus.log", channel, self.origin_ns))
-                self._make_folder(self.out)
+                prepare_folder(self.plan, self.out)
             write = self._candump.on(channel, self.traffic[channel].take)
         if self.observers is not None:
             self.observers.origin_ns = self.origin_ns
@@ -327,7 +293,7 @@ class Session:
 
         self._need_emulated("without a bus there are")
         if self.out is not None:
-            self._make_folder(self.out)
+            prepare_folder(self.plan, self.out)
             with writing(self.out / "bus.log"):
                 (self.out / "bus.log").unlink(missing_ok=True)
         self._stack.callback(self._keep_truth)
@@ -384,8 +350,6 @@ class Session:
 
     def _get_ready(self, port: Port) -> None:
         """For real time: the emulated nodes in their process, everything done once before, the processor's favour."""
-        from canprobe.cell.session.emulator_child import EmulatorChild
-
         child = None
         if self.plan.setup.emulates:
             self.cell.listen()  # they would boot beside those of another master
@@ -402,21 +366,9 @@ class Session:
         if self.scene.cycle.realtime:
             self._stack.enter_context(realtime(MASTER_PRIORITY, self._say))
 
-    def _end_child(self, child: Any) -> None:
+    def _end_child(self, child: EmulatorChild) -> None:
         self.truth = child.end()
         self.note_unwritten(child.unwritten)
-
-
-# A short run on the lockstep bus before a real one, so that nothing happens for the first time in a 2.5 ms cycle.
-#
-# The first call of everything is slow: libraries are paged in, tables filled, the interpreter specialises its code.
-# On one slow processor first cycles took 3 to 10 ms each, and the drives stopped by themselves for want of SYNC.
-
-REHEARSED_S = 0.3
-"""Length of the scene's phase in a rehearsal: time for some answers of an estimator."""
-CLEARANCE_MM = 0.5
-"""The way to the object is the same in every cycle."""
-TOUCHES = 2
 
 
 def rehearse(plan: Plan) -> None:
@@ -441,21 +393,3 @@ def run_beginning(plan: Plan) -> Session:
     with Session(shortened(plan.scene)) as session:
         session.run(make_task(session.plan))
     return session
-
-
-def shortened(scene: Scene) -> Scene:
-    """The scene on a lockstep bus that takes no time, with all that its cycles do in as few of them as will do."""
-    task = replace(
-        scene.task,
-        duration_s=min(scene.task.duration_s, REHEARSED_S),
-        clearance_mm=min(scene.task.clearance_mm, CLEARANCE_MM),
-        touches=min(scene.task.touches, TOUCHES),
-    )
-    return replace(
-        scene,
-        bus=replace(scene.bus, interface=LOCKSTEP, timed=False, bit_error_rate=0.0),
-        task=task,
-        arm=replace(scene.arm, emulated=True) if scene.arm is not None else None,
-        joints={name: replace(joint, emulated=None) for name, joint in scene.joints.items()},
-        sensor=replace(scene.sensor, emulated=True) if scene.sensor is not None else None,
-    )

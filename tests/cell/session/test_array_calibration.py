@@ -94,7 +94,7 @@ def test_without_a_point_a_cell_file_has_the_one_under_its_probe(tmp_path, monke
     monkeypatch.setattr(array_calibration, "touch_object", lambda plan, *_: asked.append(plan.scene) or 1 / 0)
     for name in ("puma260", cell):
         with pytest.raises(ZeroDivisionError):
-            array_calibration.calibrate(array_calibration.Request(name), date="2026-01-01")
+            array_calibration.calibrate(array_calibration.CalibrationRequest(name), date="2026-01-01")
         at = asked[-1].task.start_mm
         assert asked[-1].object.position_mm == at
         assert (at == AT) == (name == "puma260")

@@ -10,7 +10,7 @@ import pytest
 
 import canprobe
 import canprobe.cli
-from canprobe.cell.session.link_faults import Expected, check_link, expected_of
+from canprobe.cell.session.link_faults import ExpectedLink, check_link, expected_of
 from canprobe.cell.session.links import check_links
 from canprobe.errors import InterfaceError
 from canprobe.fieldbus.bus.clock import VirtualClock
@@ -42,7 +42,7 @@ FIXED = """[{"ifname":"can2","flags":["UP"],"txqlen":10,"linkinfo":{"info_kind":
 {"state":"ERROR-ACTIVE","restart_ms":0,"bittiming_bitrate":500000,"bitrate_const":[125000,500000]}}}]"""
 
 GOOD = LinkState("can0", "can", True, 1000, 1_000_000, None, 0.8, 100, "ERROR-ACTIVE", 0, 0, (), 0, 0)
-EXPECTED = Expected(1_000_000, None, 16)
+EXPECTED = ExpectedLink(1_000_000, None, 16)
 
 
 def test_what_ip_prints_is_read():
@@ -76,7 +76,7 @@ def texts(link, expected=EXPECTED):
 
 def test_a_good_link_and_a_virtual_one_have_no_remarks():
     assert texts(GOOD) == []
-    assert texts(parse_link(VCAN), Expected(125_000, 2_000_000, 5000)) == []
+    assert texts(parse_link(VCAN), ExpectedLink(125_000, 2_000_000, 5000)) == []
     assert texts(replace(GOOD, bitrate=None, sample_point=None, restart_ms=None, tx_queue=None, state=None)) == []
 
 
@@ -109,7 +109,7 @@ def test_each_wrong_setting_is_told_with_what_mends_it(change, is_error, words):
 @pytest.mark.parametrize(("point", "good"), [(0.84, False), (0.85, True), (0.875, True), (0.9, True), (0.91, False)])
 def test_the_sample_point_of_slow_buses_is_that_of_cia_301(bitrate, point, good):
     link = replace(GOOD, bitrate=bitrate, sample_point=point)
-    assert bool(texts(link, Expected(bitrate))) is not good
+    assert bool(texts(link, ExpectedLink(bitrate))) is not good
     assert "sample-point 0.875 " in setting_line("can0", bitrate)
 
 
@@ -119,7 +119,7 @@ def test_what_the_kernel_chooses_by_itself_at_1_mbit_s_is_accepted(point, good):
 
 
 def test_all_that_is_wrong_with_a_fd_link_is_told():
-    remarks = texts(parse_link(FD), Expected(1_000_000, 5_000_000, 16))
+    remarks = texts(parse_link(FD), ExpectedLink(1_000_000, 5_000_000, 16))
     assert [is_error for is_error, _ in remarks] == [True, True, False, False]
     assert "data bit rate is 8000000 bit/s, the scene's 5000000" in remarks[0][1]
     assert "dbitrate 5000000 fd on" in remarks[0][1]
@@ -129,7 +129,7 @@ def test_all_that_is_wrong_with_a_fd_link_is_told():
 def test_a_plan_says_how_many_frames_go_at_once():
     """Twice SYNC, heartbeat and the RPDOs: six, or with grouped targets six controlwords and three targets."""
     plan = canprobe.plan(canprobe.load_scene("free"))
-    assert expected_of(plan) == {"can0": Expected(1_000_000, None, 16)}
+    assert expected_of(plan) == {"can0": ExpectedLink(1_000_000, None, 16)}
     grouped = replace(plan.scene, arm=replace(plan.scene.arm, grouped_rpdo=True))
     assert expected_of(canprobe.plan(grouped))["can0"].frames_at_once == 22
     assert expected_of(canprobe.plan(canprobe.load_scene("listen")))["can0"].frames_at_once == 4

@@ -1,0 +1,48 @@
+"""The folder of a run before its first frame, and the file of a cell's zeros."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from canprobe.cell.planning.model import Plan
+from canprobe.fieldbus.bus.files import make_folder, whole_file, writing
+
+LEFT_BY_RUNS = (
+    *("log.npz", "report.html", "report.png", "run.mcap", "scene.toml", "summary.json", "surface.npz"),
+    *("surface.png", "tactile.npz", "tool.toml", "truth.npz"),
+)
+"""Files of a run's folder besides ``bus.log``."""
+
+
+def prepare_folder(plan: Plan, out: Path) -> None:
+    """Make the folder of a run, with its scene and without what an earlier run left there.
+
+    Raises:
+        ResultsError: a file cannot be written or removed.
+    """
+    make_folder(out)
+    for name in LEFT_BY_RUNS:
+        with writing(out / name):
+            (out / name).unlink(missing_ok=True)
+    write_scene(plan, out)
+
+
+def write_scene(plan: Plan, folder: Path) -> None:
+    """Write `scene.toml` into a folder, with the files that it names beside it, as they were read for the plan.
+
+    Raises:
+        ResultsError: a file cannot be written; no part of it is left.
+    """
+    for name, content in reversed(plan.files.items()):
+        with whole_file(folder / name) as part:
+            part.write_bytes(content)
+
+
+def zeros_file(plan: Plan) -> Path | None:
+    """Where the zeros of a cell's real drives are recorded, in the user's state folder; None where none is homed."""
+    arm = plan.setup.arm
+    if arm is None or all(drive.zero is None or drive.emulated for drive in arm.drives):
+        return None
+    folder = os.environ.get("XDG_STATE_HOME") or "~/.local/state"
+    return Path(folder).expanduser() / "canprobe" / f"zeros-{arm.model.name}.json"
