@@ -132,6 +132,8 @@ class CycleStatistics:
 class Cycle:
     """One cycle at a time, on absolute deadlines.
 
+    `send_sync`, `collect` and `send_commands` are all that it does on the bus; a cycle without a bus overrides them.
+
     Args:
         port: the bus.
         plan: its times: SYNC, and when TPDOs are looked for until all are in; then they are late.
@@ -178,7 +180,7 @@ class Cycle:
         """Sleep to the deadline, send SYNC, collect the answers."""
         self._port.clock.sleep_until_ns(self._deadline)
         counter = self._sync.next()
-        self._send_sync(counter)
+        self.send_sync(counter)
         self.late_ns = late_ns = self.sync_ns - self._deadline
         self.statistics.period_error_ns.append(late_ns)
         if late_ns > self._period_ns // 2:
@@ -187,19 +189,21 @@ class Cycle:
         self.number += 1
         self.t_ns = self._deadline - self.t_first_ns
         self._intake.begin(self.number, self.t_ns, self.sync_ns)
-        self._collect()
+        self.collect()
         self._intake.end()
         self._started_ns = elapsed_ns() if self.number % TIMED_CYCLES == 0 else 0
         return self._intake.measure(counter or 0)
 
-    def _send_sync(self, counter: int | None) -> None:
+    def send_sync(self, counter: int | None) -> None:
+        """Send SYNC; `sync_ns` is when."""
         port = self._port
         if not port.stamps_arrival:  # the only way to separate what came before the SYNC from what came after it
             self._route(port.drain())
         self.sync_ns = port.clock.now_ns()
         port.send_batch([pack_sync(counter)], self.sync_ns)
 
-    def _collect(self) -> None:
+    def collect(self) -> None:
+        """Take the TPDOs of this cycle, until all are in or they are late."""
         port, clock, intake, looks_ns = self._port, self._port.clock, self._intake, self._looks_ns
         if self._on_arrival and self._drives is not None:
             self._route(port.drain())  # nodes that go first on this processor have answered by now
@@ -236,11 +240,12 @@ class Cycle:
         """Send the commands of this cycle and set the next deadline."""
         if self._drives is not None and command is not None:
             self._drives.set_target(command.q_target)
-        self._send_commands()
+        self.send_commands()
         self._sent_ns = elapsed_ns() if self._started_ns else 0
         self._deadline += self._period_ns
 
-    def _send_commands(self) -> None:
+    def send_commands(self) -> None:
+        """Send the RPDOs of this cycle, and the heartbeat when it is due."""
         frames = self._drives.frames() if self._drives is not None else []
         if self.sync_ns >= self._heartbeat_ns:
             self._heartbeat_ns = self._deadline + HEARTBEAT_PRODUCED_MS * 1_000_000

@@ -24,6 +24,7 @@ from canprobe.cell.master.array import TactileReceiver
 from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.drives import DriveCommand, DriveGroup
 from canprobe.cell.master.tactile_frame import TactileFrame, covered, frame_of
+from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.configuration import NodeSetup, Write, make_setups
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.operation import INTERPOLATION_TIME
@@ -201,27 +202,28 @@ class DirectCycle(Cycle):
         world: World,
         drives: DriveGroup | None,
         tactile: TactileReceiver | None,
+        watch: NodeWatch,
         **more: Any,
     ) -> None:
         port.clock.sleep_until_ns(port.clock.now_ns() + round(SECOND_ANSWER_S * 1e9))  # as bring-up for second boot-ups
-        super().__init__(port, plan, drives=drives, tactile=tactile, **more)
-        self._clock, self._first_look_ns = port.clock, self._looks_ns[0]
+        super().__init__(port, plan, drives=drives, tactile=tactile, watch=watch, **more)
+        self._clock, self._first_look_ns = port.clock, plan.traffic.budget.looks_ns[0]
         self._counter = 0
+        self._commands = drives.commands if drives is not None else tuple
         self._take = drives.take if drives is not None else nothing
-        self._nodes = DirectNodes(world, plan, self._watch.push, tactile.put if tactile is not None else nothing)
+        self._nodes = DirectNodes(world, plan, watch.push, tactile.put if tactile is not None else nothing)
         self._nodes.start(self._clock.now_ns())
 
-    def _send_sync(self, counter: int | None) -> None:
+    def send_sync(self, counter: int | None) -> None:
         self.sync_ns = self._clock.now_ns()
         self._nodes.advance(self.sync_ns)
         self._counter = counter or 0
 
-    def _collect(self) -> None:
+    def collect(self) -> None:
         self._nodes.sync(self.sync_ns, self._counter, self._take)
         look_ns = self.sync_ns + self._first_look_ns
         self._clock.sleep_until_ns(look_ns)
         self._nodes.advance(look_ns)
 
-    def _send_commands(self) -> None:
-        if self._drives is not None:
-            self._nodes.command(self._drives.commands(), self.sync_ns + self._first_look_ns)
+    def send_commands(self) -> None:
+        self._nodes.command(self._commands(), self.sync_ns + self._first_look_ns)
