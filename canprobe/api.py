@@ -10,10 +10,11 @@ from types import NoneType
 from typing import Any
 
 from canprobe.cell.master.controller import Command, Measurement
-from canprobe.cell.master.observers import Observation
+from canprobe.cell.master.observers import AnyObserver, Observation
+from canprobe.cell.master.options import RunOptions, Say, quiet
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.results.open_cell import AnyObserver, OpenCell
+from canprobe.cell.results.open_cell import OpenCell
 from canprobe.cell.results.result import RunResult
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import Scene
@@ -22,7 +23,7 @@ from canprobe.cell.session.check_joints import check_joints
 from canprobe.cell.session.emulation import emulate, emulate_eds
 from canprobe.cell.session.home import home
 from canprobe.cell.session.looking import commission, monitor, scan
-from canprobe.cell.session.session import Say, quiet, with_bridges
+from canprobe.cell.session.session import with_bridges
 from canprobe.cell.session.target import Target
 from canprobe.cell.session.terminal import Progress
 from canprobe.cell.session.up import up
@@ -103,7 +104,7 @@ def run(
     check_free(folder, force=force)
     plan = make_plan(resolve(resolved))
     task = make_task(plan)
-    with OpenCell(plan, folder, say, observers, task=task) as cell:
+    with OpenCell(plan, RunOptions(folder, say, observers), task=task) as cell:
         return cell.run(cell.open_to_requests(task), _report(progress, resolved.task.duration_s))
 
 
@@ -220,4 +221,4 @@ def open_cell(
     resolved = with_bridges(Target.over(scene, channel=channel).applied_to(scene), bridge)
     folder = Path(out) if out is not None else None
     check_free(folder, force=force)
-    return OpenCell(make_plan(resolve(resolved)), folder, say, observers, rows_kept)
+    return OpenCell(make_plan(resolve(resolved)), RunOptions(folder, say, observers, rows_kept))

@@ -22,7 +22,7 @@ from canprobe.cli.target import target_of
 from canprobe.fieldbus.bus.real.interrupts import interrupts_held, interrupts_repeated
 
 if TYPE_CHECKING:
-    from canprobe.cell.results.open_cell import AnyObserver
+    from canprobe.cell.master.observers import AnyObserver
 
 HELP = "show a scene or a run in a browser"
 EXAMPLE = """\

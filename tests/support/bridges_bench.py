@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from canprobe.cell.master.observers import Observation, Observers
+from canprobe.cell.master.options import RunOptions
 from canprobe.cell.planning.bridges import BRIDGES
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.scene.load import load_scene
@@ -136,7 +137,7 @@ def run(*, quick: bool, sweep: object) -> StudyResult:
 def _record(seconds: float) -> list[Observation]:
     """Every cycle of a scan, as an observer sees it."""
     seen: list[Observation] = []
-    session = Session(load_scene(SCENE, {"task.duration_s": seconds}), observers=(seen.append,))
+    session = Session(load_scene(SCENE, {"task.duration_s": seconds}), RunOptions(observers=(seen.append,)))
     task = make_task(session.plan)
     with session:
         session.run(task)

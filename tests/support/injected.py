@@ -9,6 +9,7 @@ from wrapped import Wrapped
 import canprobe
 from canprobe.cell.master.conditions import BY_KEY
 from canprobe.cell.master.controller import Command, Controller
+from canprobe.cell.master.options import RunOptions
 from canprobe.cell.master.supervision import limits_of
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
@@ -34,7 +35,7 @@ class Injected:
         if scene.task.kind in ("press", "scan"):
             scene = replace(scene, task=replace(scene.task, clearance_mm=0.8))
         scene = replace(scene, **{k: replace(getattr(scene, k), **v) for k, v in changes.items()})
-        self.session = Session(scene, say=self._say)
+        self.session = Session(scene, RunOptions(say=self._say))
         self.limits = limits_of(self.session.plan)
         self.nodes = {}
         world = self.session.world

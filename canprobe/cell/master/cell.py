@@ -22,6 +22,7 @@ from canprobe.cell.master.joint_columns import TactileLog, joint_columns
 from canprobe.cell.master.log import RunLog
 from canprobe.cell.master.notes import Notes
 from canprobe.cell.master.observers import Observers
+from canprobe.cell.master.options import DEFAULT_OPTIONS, RunOptions
 from canprobe.cell.master.supervision import Finding, Reaction, Seen, limits_of
 from canprobe.cell.master.supervisor import JointGuard, Supervisor
 from canprobe.cell.master.watch import NodeWatch
@@ -59,15 +60,13 @@ class Cell:
     Args:
         plan: of the scene.
         port: the bus; it is closed on leaving.
-        say: called with each step of bring-up and stop.
-        log_failure: says why frames are no longer written down, None while they are.
+        options: of the run.
         observers: called after each cycle.
-        rows_kept: cycles whose row of the log is kept; None for all.
+        log_failure: says why frames are no longer written down, None while they are.
         direct: makes the cycle of nodes that are reached without a bus, as `Cycle` is made, and starts them; None: they
             are brought up and reached over the port.
         origin_ns: time on the port's clock from which the run counts, as ``bus.log`` does.
         zeros: file that records the zeros of real drives that are homed.
-        to_home: the drives are about to be homed; else bring-up refuses one that is not.
 
     Attributes:
         drives, tactile: of the arm and the array; None in a scene without one.
@@ -85,19 +84,17 @@ class Cell:
         self,
         plan: Plan,
         port: Port,
+        options: RunOptions = DEFAULT_OPTIONS,
         *,
-        say: Callable[[str], None] = lambda _: None,
-        log_failure: Callable[[], str | None] = lambda: None,
         observers: Observers | None = None,
-        rows_kept: int | None = None,
+        log_failure: Callable[[], str | None] = lambda: None,
         direct: Callable[..., Cycle] | None = None,
         origin_ns: int = 0,
         zeros: Path | None = None,
-        to_home: bool = False,
     ) -> None:
         setup = plan.setup
-        self.log = RunLog(rows_kept)
-        self.tactile_log = TactileLog(rows_kept)
+        self.log = RunLog(options.rows_kept)
+        self.tactile_log = TactileLog(options.rows_kept)
         self.drives = make_drives(plan)
         self.tactile = make_tactile(plan)
         self.notes = Notes()
@@ -110,10 +107,9 @@ class Cell:
         self._slides = np.array(slides, dtype=bool) if any(slides) else None
         self._plan = plan
         self._port = port
-        self._to_say = say
-        self._log_failure = log_failure
+        self._options = options
         self._observers = observers
-        self._rows_kept = rows_kept
+        self._log_failure = log_failure
         self._origin_ns = origin_ns
         self._network = PumpedNetwork(port, other=self._other)
         self._make_cycle = direct or Cycle
@@ -122,7 +118,6 @@ class Cell:
         homed = any(one.homing for one in setups)
         besides: dict[str, Any] = {"supervise": self._supervise_homing, "record": zeros, "say": self._say}
         self.homing = Homing(plan, setups, self._network, self.watch, **besides) if homed else None
-        self._to_home = to_home
         self._array_started = False
         self._holding = False
         self._running = False
@@ -150,7 +145,7 @@ class Cell:
     def _say(self, text: str) -> None:
         """Report a step to the user; a failure of that must not decide what becomes of the drives."""
         try:
-            self._to_say(text)
+            self._options.say(text)
         except Exception as error:
             self.notes.add(f"steps could not be reported: {type(error).__name__}")
 
@@ -186,12 +181,12 @@ class Cell:
                 watch=self.watch,
                 other=self._network.feed,
                 on_arrival=not isinstance(self._port.clock, VirtualClock),
-                kept=self._rows_kept,
+                kept=self._options.rows_kept,
             )
             self.watch.start(self._port.clock.now_ns())
             if self.homing is not None:
                 self.homing.look()
-                if not self._to_home:
+                if not self._options.to_home:
                     self.homing.refuse_unhomed()
         except BaseException as error:
             self.close()

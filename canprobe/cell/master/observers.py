@@ -43,6 +43,9 @@ class Observer(Protocol):
         """Take one observation, quickly: the next SYNC is waiting."""
 
 
+AnyObserver = Observer | Callable[[Observation], None]
+
+
 class Observers:
     """Calls every observer after each cycle. One that raises is not called again; the cell goes on.
 
@@ -55,7 +58,7 @@ class Observers:
         faults: those that failed, one line each.
     """
 
-    def __init__(self, observers: Iterable[Observer | Callable[[Observation], None]]) -> None:
+    def __init__(self, observers: Iterable[AnyObserver]) -> None:
         self.origin_ns = 0
         self.cost_ns: deque[int] = deque(maxlen=COSTS_KEPT)
         self.faults: list[str] = []

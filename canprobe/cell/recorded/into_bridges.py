@@ -12,6 +12,7 @@ import numpy as np
 
 from canprobe.cell.master.controller import Command
 from canprobe.cell.master.observers import Observation
+from canprobe.cell.master.options import Say
 from canprobe.cell.planning.bridges import BRIDGES, check_bridges
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import Plan
@@ -22,7 +23,6 @@ from canprobe.cell.recorded.run_folder import RunFolder, read_run
 from canprobe.cell.scene.model import BridgeSettings, Scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.children import Bridges
-from canprobe.cell.session.session import Say
 from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.clock_steps import RecordedBus
 from canprobe.fieldbus.bus.port import TimedFrame

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
@@ -13,15 +13,15 @@ import numpy.typing as npt
 from canprobe.cell.master.array import patch_from
 from canprobe.cell.master.cell import Cell
 from canprobe.cell.master.controller import Command, Controller, Measurement, TactileSample, as_controller
-from canprobe.cell.master.observers import Observation, Observer, Observers
+from canprobe.cell.master.observers import Observers
+from canprobe.cell.master.options import RunOptions, Say
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.result import RunResult
 from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.summary import log_columns, summarise, tactile_columns, write_columns, write_files
 from canprobe.cell.scene.setup import Setup, Touch
 from canprobe.cell.session.children import Bridges
-from canprobe.cell.session.session import Say, Session
-from canprobe.cell.session.target import VIRTUAL
+from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
 from canprobe.cell.tasks.task import TaskRecord, record_of
 from canprobe.errors import CanprobeError, ResultsError, UsageError
@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from canprobe.mechanics.touch.patch.image import Patch
     from canprobe.mechanics.touch.surface_map import SurfaceMap
 
-AnyObserver = Observer | Callable[[Observation], None]
-
 
 class OpenCell:
     """A cell for controllers: brought up where its block is entered, stopped where it is left, with its results then.
@@ -46,10 +44,7 @@ class OpenCell:
 
     Args:
         plan: of the scene.
-        out: folder of the results; None writes nothing.
-        say: called with each step.
-        observers: called after each cycle.
-        rows_kept: cycles whose row of the log is kept, and no truth; None for all.
+        options: of the run.
         task: whose contact and shape stand in the summary, whatever is run.
 
     Attributes:
@@ -57,22 +52,11 @@ class OpenCell:
         session: the cell with everything round it.
     """
 
-    def __init__(
-        self,
-        plan: Plan,
-        out: Path | None,
-        say: Say,
-        observers: Sequence[AnyObserver] = (),
-        rows_kept: int | None = None,
-        *,
-        task: Controller | None = None,
-    ) -> None:
+    def __init__(self, plan: Plan, options: RunOptions, *, task: Controller | None = None) -> None:
         self.plan = plan
-        self.session = Session(plan, out, say, (), rows_kept)
-        self._out = out
-        self._say = say
-        self._bridges = Bridges(plan, out, virtual=plan.scene.bus.interface in VIRTUAL, say=say)
-        self._watchers = tuple(observers)
+        self.session = Session(plan, options)
+        self._out, self._say = options.out, options.say
+        self._bridges = Bridges(plan, options.out, virtual=self.session.virtual, say=options.say)
         self._task = task
         self._last: Controller | None = task
         self._result = RunResult()
@@ -86,8 +70,8 @@ class OpenCell:
         self.session.refuse_reentry()
         self._bridges.__enter__()
         try:
-            if watchers := (*self._watchers, *self._bridges.observers):
-                self.session.observers = Observers(watchers)
+            if self._bridges.observers:
+                self.session.observers = Observers((*self.session.options.observers, *self._bridges.observers))
             self.session.__enter__()
         except BaseException as error:
             self._finish(error)

@@ -11,9 +11,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from canprobe.cell.master.options import quiet
 from canprobe.cell.planning.bridges import check_bridges
 from canprobe.cell.scene.setup import Setup
-from canprobe.cell.session.session import quiet
 
 
 @dataclass(frozen=True, slots=True)

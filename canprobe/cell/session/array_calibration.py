@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.cell.master.options import RunOptions, Say, quiet
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.motion import reach_problems
@@ -25,7 +26,7 @@ from canprobe.cell.scene.load import load_scene, packaged_files
 from canprobe.cell.scene.model import ObjectSettings, Scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.scene.setup import Touch
-from canprobe.cell.session.session import Say, Session, quiet
+from canprobe.cell.session.session import Session
 from canprobe.cell.session.target import LOCKSTEP, Target
 from canprobe.cell.tasks.from_plan import make_sensing
 from canprobe.cell.tasks.probing import Phase
@@ -317,7 +318,7 @@ def touch_object(
     """Bring the cell up, touch, stop; the touches, and what the array showed before. `ask` reads reference loads."""
     task, roll = plan.setup.task, _roll_task(plan, visit)
     assert isinstance(task, Touch)
-    with Session(plan, out, say) as session:
+    with Session(plan, RunOptions(out, say)) as session:
         session.run(roll)
     log, truth = session.cell.log.arrays(), session.truth
     presses = roll.presses

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from canprobe.cell.master.options import RunOptions, Say, quiet
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.session.session import Say, Session, quiet
+from canprobe.cell.session.session import Session
 from canprobe.cell.session.up import ROWS_OF_UP
 from canprobe.errors import NodeError, UsageError
 
@@ -41,7 +42,7 @@ def check_joints(scene: Scene, *, operator: Operator | None = None, say: Say = q
     assert plan.setup.arm is not None
     arm, check = plan.setup.arm, JointCheck(plan, operator)
     try:
-        with Session(plan, None, say, (), ROWS_OF_UP) as session:
+        with Session(plan, RunOptions(say=say, rows_kept=ROWS_OF_UP)) as session:
             session.run(check)
     finally:
         for finding in check.findings:

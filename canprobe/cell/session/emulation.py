@@ -11,11 +11,12 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from canprobe.cell.master.options import Say, quiet
 from canprobe.cell.npz import write_npz
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.session.link_faults import ExpectedLink, data_bitrate
 from canprobe.cell.session.links import check_links
-from canprobe.cell.session.session import Say, quiet, rehearse
+from canprobe.cell.session.session import rehearse
 from canprobe.cell.session.target import Target
 from canprobe.errors import NodeError, ResultsError, UsageError
 from canprobe.fieldbus.bus.clock import MonotonicClock

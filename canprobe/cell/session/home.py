@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from canprobe.cell.master.options import RunOptions, Say, quiet
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.session.session import Say, Session, quiet
+from canprobe.cell.session.session import Session
 from canprobe.cell.session.up import ROWS_OF_UP
 from canprobe.cell.tasks.joint_finding import Answer
 from canprobe.errors import UsageError
@@ -32,7 +33,7 @@ def home(scene: Scene, *, operator: Operator | None = None, say: Say = quiet) ->
     plan = make_plan(resolve(scene))
     if plan.setup.arm is None or not any(drive.zero for drive in plan.setup.arm.drives):
         raise UsageError(f'up --home: no joint of scene {scene.name} has zero = "homing"')
-    with Session(plan, None, say, (), ROWS_OF_UP, to_home=True) as session:
+    with Session(plan, RunOptions(say=say, rows_kept=ROWS_OF_UP, to_home=True)) as session:
         homing = session.cell.homing
         assert homing is not None
         for axis in homing.order:

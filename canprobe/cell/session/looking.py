@@ -11,6 +11,7 @@ from canprobe.cell.master.commission import Commissioned, wanted_by
 from canprobe.cell.master.commission import commission as commission_nodes
 from canprobe.cell.master.id_assignment import Wanted
 from canprobe.cell.master.monitor import CellView, Monitor
+from canprobe.cell.master.options import Say, quiet
 from canprobe.cell.master.scan import scan_nodes
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.scene.model import BringUpSettings, Scene
@@ -18,7 +19,6 @@ from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.buses import open_ports
 from canprobe.cell.session.link_faults import ExpectedLink, expected_of
 from canprobe.cell.session.links import check_links, need_controllers
-from canprobe.cell.session.session import Say, quiet
 from canprobe.cell.session.target import Target, need_real_bus
 from canprobe.errors import BusError
 from canprobe.fieldbus.bus.clock import MonotonicClock

@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import cached_property, partial
-from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
@@ -20,7 +19,8 @@ from numpy.typing import NDArray
 from canprobe.cell.master.cell import Cell
 from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.master.cycle import Cycle
-from canprobe.cell.master.observers import Observation, Observer, Observers
+from canprobe.cell.master.observers import Observers
+from canprobe.cell.master.options import DEFAULT_OPTIONS, RunOptions
 from canprobe.cell.npz import write_npz
 from canprobe.cell.planning.bridges import check_bridges
 from canprobe.cell.planning.make import make_plan
@@ -51,12 +51,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Write = Callable[[int, bytes, int], None]
-Say = Callable[[str], None]
-"""Called with a line of text for each step."""
-
-
-def quiet(_: str) -> None:
-    """Report nothing."""
 
 
 def with_bridges(scene: Scene, names: Sequence[str]) -> Scene:
@@ -75,32 +69,18 @@ class Session:
 
     Args:
         scene: what to bring up, resolved; or the plan of it.
-        out: folder for ``bus.log``, ``scene.toml`` and ``truth.npz``; None keeps no files.
-        say: called with each step.
-        observers: called after each cycle with its measurement, command and frames.
-        rows_kept: cycles whose row of the log is kept, and no truth; None for all.
-        to_home: the drives are about to be homed.
+        options: of the run; ``bus.log``, ``scene.toml`` and ``truth.npz`` are written here.
 
     Attributes:
         origin_ns: where the run's clock is 0, on the clock of its bus: every time in its files counts from there.
         unwritten: files that could not be written, each with the reason; they are among the cell's faults too.
     """
 
-    def __init__(
-        self,
-        scene: Scene | Plan,
-        out: Path | None = None,
-        say: Say = quiet,
-        observers: Sequence[Observer | Callable[[Observation], None]] = (),
-        rows_kept: int | None = None,
-        *,
-        to_home: bool = False,
-    ) -> None:
-        self._rows_kept = rows_kept
-        self._to_home = to_home
+    def __init__(self, scene: Scene | Plan, options: RunOptions = DEFAULT_OPTIONS) -> None:
+        self.options = options
         self.plan = scene if isinstance(scene, Plan) else make_plan(resolve(scene))
         self.scene = self.plan.scene
-        self.out = out
+        self.out = options.out
         self.started_ns = 0
         self.wall_ns = 0
         self.origin_ns = 0
@@ -113,8 +93,8 @@ class Session:
         self._ports: dict[str, Port] = {}
         self.unwritten: list[str] = []
         self._candump: CandumpWriter | None = None
-        self.observers = Observers(observers) if observers else None
-        self._say = say
+        self.observers = Observers(options.observers) if options.observers else None
+        self._say = options.say
         self._stack = ExitStack()
         self._entered = self._left = False
         self._cell: Cell | None = None
@@ -152,7 +132,7 @@ class Session:
     @property
     def keeps_all(self) -> bool:
         """Every cycle has its row in the log, and every SYNC one in the truth."""
-        return self._rows_kept is None
+        return self.options.rows_kept is None
 
     def bus_load(self, channel: str) -> float | None:
         """Measured share of a bus's bit rate, from the first frame to the last."""
@@ -176,14 +156,12 @@ class Session:
             self._cell = Cell(
                 self.plan,
                 port,
-                say=self._say,
-                log_failure=self._log_failure,
+                self.options,
                 observers=self.observers,
-                rows_kept=self._rows_kept,
+                log_failure=self._log_failure,
                 direct=self._direct,
                 origin_ns=self.origin_ns,
                 zeros=zeros_file(self.plan),
-                to_home=self._to_home,
             )
             if not self.virtual:
                 self._get_ready(port)
@@ -360,7 +338,7 @@ class Session:
             child.start()
         self._say("rehearse in lockstep")
         rehearse(self.plan)
-        reserve_memory(self.plan.cycles if self._rows_kept is None else self._rows_kept)
+        reserve_memory(self.plan.cycles if self.keeps_all else self.options.rows_kept)
         if child is not None:
             child.await_boot_ups(port, self._say, self.cell.hear)
         if self.scene.cycle.realtime:

@@ -7,11 +7,12 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from canprobe.cell.master.controller import Measurement
+from canprobe.cell.master.options import RunOptions, Say, quiet
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.children import Bridges
-from canprobe.cell.session.session import Say, Session, quiet, with_bridges
+from canprobe.cell.session.session import Session, with_bridges
 from canprobe.cell.session.target import need_real_bus
 from canprobe.cell.tasks.from_plan import make_task
 
@@ -37,7 +38,7 @@ def up(scene: Scene, *, bridge: Sequence[str] = (), say: Say = quiet) -> None:
     need_real_bus(scene, "up")
     plan = make_plan(resolve(with_bridges(scene, bridge)))
     with Bridges(plan, None, virtual=False, say=say) as bridges:
-        session = Session(plan, None, say, bridges.observers, ROWS_OF_UP)
+        session = Session(plan, RunOptions(None, say, bridges.observers, ROWS_OF_UP))
         with reporting_notes(session, say) as report_news:
             say(f"the cell is up: nodes {', '.join(map(str, plan.node_ids))}; Ctrl-C stops it")
             session.run(bridges.open_to_requests(None, lambda: make_task(plan)), report_news)

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.api import OpenCell
+from canprobe.cell.master.options import RunOptions
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.session.session import Session, quiet
+from canprobe.cell.session.session import Session
 from canprobe.errors import BusError, SafetyStop
 from canprobe.lab.gym.led import LedTask
 from canprobe.lab.gym.region import Coverage
@@ -50,7 +51,9 @@ class Episode:
     def __init__(self, plan: Plan, cycles: int, record: Path | None) -> None:
         task = self.task = LedTask(plan)
         self._cycles, self._period_s = cycles, plan.sync.period_ns * 1e-9
-        self._opened = Session(plan, rows_kept=1) if record is None else OpenCell(plan, record, quiet, task=task)
+        self._opened = (
+            OpenCell(plan, RunOptions(record), task=task) if record else Session(plan, RunOptions(rows_kept=1))
+        )
         self.session = self._opened.session if isinstance(self._opened, OpenCell) else self._opened
         collecting = gc.isenabled()
         self._opened.__enter__()

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from canprobe.cell.master.controller import Measurement
+from canprobe.cell.master.options import RunOptions
 from canprobe.cell.master.supervision import limits_of
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
@@ -128,7 +129,7 @@ class _LockstepRun:
     def __init__(self, case: FaultCase, folder: Path | None = None) -> None:
         self.case = case
         self.plan = seeded_plan(case.scenario, case.timed, case.seed)
-        self.session = Session(self.plan, folder)
+        self.session = Session(self.plan, RunOptions(folder))
         self.task = make_task(self.plan)
         self.begun: dict[Phase, int] = {}
         self.steps = self.stepped_ns = 0

@@ -18,11 +18,11 @@ import numpy as np
 import canprobe
 from canprobe.api import run
 from canprobe.cell.emulated.truth_columns import present_name
+from canprobe.cell.master.options import Say, quiet
 from canprobe.cell.results.files import unit_of
 from canprobe.cell.results.result import RunResult
 from canprobe.cell.scene.load import dump_scene, gathered, load_scene, parse_scene
 from canprobe.cell.scene.model import Scene
-from canprobe.cell.session.session import Say, quiet
 from canprobe.cell.session.target import VIRTUAL, Target
 from canprobe.cell.session.terminal import Report
 from canprobe.errors import CanprobeError, SafetyStop, UsageError, install_line

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from canprobe.cell.master.controller import Command, Controller, Measurement
+from canprobe.cell.master.options import RunOptions
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import Scene, TactileModeName
@@ -143,7 +144,7 @@ def _measured(case: str, scene: Scene, make: Callable[[Session], Controller]) ->
     assert scene.sensor is not None
     ended = ""
     with tempfile.TemporaryDirectory() as folder:
-        session = Session(scene, Path(folder))
+        session = Session(scene, RunOptions(Path(folder)))
         used_s = 0.0
         try:
             with session:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from canprobe.cell.master.controller import Command, Controller, Measurement
+from canprobe.cell.master.options import RunOptions
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.results.picture import BLUE, ORANGE, legend, parts, picture
 from canprobe.cell.scene.load import load_scene
@@ -104,7 +105,7 @@ def soak(seconds: float) -> list[Row]:
     scene = Target.over(scene, "socketcan", CHANNEL).applied_to(scene)
     child = EmulatorChild(make_plan(resolve(scene)), None, (CHANNEL,), truth=False)
     with served(child):
-        session = Session(with_real_nodes(patient(scene)), rows_kept=ROWS_OF_UP)
+        session = Session(with_real_nodes(patient(scene)), RunOptions(rows_kept=ROWS_OF_UP))
         soaker = Soaker(session, child.pid, seconds)
         with session:
             session.run(soaker)

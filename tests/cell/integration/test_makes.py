@@ -15,6 +15,7 @@ from scenes import change, reasons
 
 import canprobe
 from canprobe.cell.master.controller import Command
+from canprobe.cell.master.options import RunOptions
 from canprobe.cell.planning.configuration import make_setups
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import Interpolation
@@ -52,7 +53,7 @@ def moved(plan, folder, *, at_cycles=200):
         k = len(q)
         return Command(q[0] + SWING * min(1.0, k / 100), done=k > at_cycles)
 
-    with Session(plan, folder, said.append) as session:
+    with Session(plan, RunOptions(folder, said.append)) as session:
         session.run(controller)
         faults = session.cell.faults
     from canprobe.fieldbus.bus.candump import read_candump
@@ -164,7 +165,7 @@ def with_factors(make, **factors):
 def told_by(scene, change_device):
     """What bring-up says of the second drive after its device was changed."""
     said = []
-    session = Session(canprobe.plan(scene), say=said.append)
+    session = Session(canprobe.plan(scene), RunOptions(say=said.append))
     change_device(session.world.nodes[1].dictionary)
     with session:
         pass
@@ -264,7 +265,7 @@ def test_the_drives_are_disabled_on_the_way_out(tmp_path, make):
 )
 def test_what_only_the_device_tells_is_said_with_what_there_is(tmp_path, cell, quirk, told):
     scene = change(canprobe.load_scene("cylinder", {"cell": cell}), emulate=quirk, scene={"figures": False})
-    with pytest.raises(NodeError, match=told), Session(scene, tmp_path) as session:
+    with pytest.raises(NodeError, match=told), Session(scene, RunOptions(tmp_path)) as session:
         session.run(lambda _: Command(done=True))
 
 

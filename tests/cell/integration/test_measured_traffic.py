@@ -11,6 +11,7 @@ from undrawn import undrawn_run
 
 import canprobe
 from canprobe.cell.emulated.world import make_world
+from canprobe.cell.master.options import RunOptions
 from canprobe.cell.recorded.recording import read_recording
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
@@ -113,7 +114,7 @@ def test_syncs_that_are_too_long_are_named_as_a_replay_names_them(press, tmp_pat
 
 
 def carry_out(scene, out=None):
-    session = Session(canprobe.load_scene(scene, {"task.duration_s": 0.3}), out)
+    session = Session(canprobe.load_scene(scene, {"task.duration_s": 0.3}), RunOptions(out))
     with session:
         session.run(make_task(session.plan))
     return session

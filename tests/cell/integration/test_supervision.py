@@ -16,6 +16,7 @@ from injected import FREE_CYCLE, HOLD_CYCLE, Injected, altered, send
 import canprobe
 from canprobe.cell.master.conditions import BY_KEY, CONDITIONS
 from canprobe.cell.master.controller import Command
+from canprobe.cell.master.options import RunOptions
 from canprobe.cell.master.supervision import Reaction
 from canprobe.cell.master.supervisor import JointGuard
 from canprobe.cell.session.session import Session
@@ -99,7 +100,7 @@ def test_another_master_that_interferes_before_the_run_is_named_and_nothing_is_e
         if text.startswith(step):
             session.lockstep.port().send_batch([pack_nmt(NmtCommand.STOP, 4)])
 
-    session = Session(canprobe.load_scene("free"), say=say)
+    session = Session(canprobe.load_scene("free"), RunOptions(say=say))
     with pytest.raises(CanprobeError, match="an NMT command from another master"), session:
         session.run(lambda _: Command())
     assert said[-1] != "enable the drives" or session.cell.log.arrays()["statusword"].size
@@ -117,7 +118,7 @@ def test_what_comes_while_the_drives_are_being_enabled_ends_that(what):
         else:
             session.lockstep.port().send_batch([(EMCY_BASE + 4, Emcy(0x4210, 1).pack())])
 
-    session = Session(canprobe.load_scene("free"), say=say)
+    session = Session(canprobe.load_scene("free"), RunOptions(say=say))
     with pytest.raises(CanprobeError, match=what), session:
         session.run(lambda _: Command(done=True))
     words = session.cell.log.arrays()["statusword"]
@@ -132,7 +133,7 @@ def not_enabled(told, *changes):
             for node_id, cob_id, change in changes:
                 altered(participants[node_id - 1], cob_id, change)
 
-    session = Session(canprobe.load_scene("free"), say=say)
+    session = Session(canprobe.load_scene("free"), RunOptions(say=say))
     participants = session.world.participants
     participants[:6] = map(FaultyNode, participants[:6])
     with pytest.raises(CanprobeError, match=told), session:

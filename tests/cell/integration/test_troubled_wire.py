@@ -6,6 +6,7 @@ import pytest
 from wire_faults import Babbler, ErrorsAt
 
 import canprobe
+from canprobe.cell.master.options import RunOptions
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.errors import CanprobeError
@@ -21,7 +22,7 @@ def last_statuswords(folder):
 
 def test_a_babbling_idiot_stops_the_cell_and_the_drives_end_without_power(tmp_path):
     """For 150 ms an identifier below SYNC's fills the bus: nobody hears a SYNC, and both sides stop by themselves."""
-    session = Session(canprobe.load_scene("free", {"task.duration_s": 2.0}), tmp_path)
+    session = Session(canprobe.load_scene("free", {"task.duration_s": 2.0}), RunOptions(tmp_path))
     shout = (0x001, bytes(8))
     with pytest.raises(CanprobeError), session:
         bus = session.lockstep
@@ -38,7 +39,7 @@ def test_a_babbling_idiot_stops_the_cell_and_the_drives_end_without_power(tmp_pa
 
 def test_a_drive_whose_controller_goes_bus_off_is_missed(tmp_path):
     """32 of its TPDOs in a row are hit; it comes back after 128 times eleven recessive bits."""
-    session = Session(canprobe.load_scene("free", {"task.duration_s": 1.0}), tmp_path)
+    session = Session(canprobe.load_scene("free", {"task.duration_s": 1.0}), RunOptions(tmp_path))
     with session:
         bus = session.lockstep
         bus.errors = ErrorsAt({200 + k: 40 for k in range(32)}, can_id=0x183)

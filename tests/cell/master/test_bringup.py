@@ -14,6 +14,7 @@ from undrawn import undrawn_run
 import canprobe
 from canprobe.cell.emulated.world import make_world
 from canprobe.cell.master.controller import Command
+from canprobe.cell.master.options import RunOptions
 from canprobe.cell.planning.configuration import make_setups
 from canprobe.cell.session.session import Session
 from canprobe.errors import BusError, InterfaceError, NodeError
@@ -32,7 +33,7 @@ def open_session(tmp_path, *, faults=(), change=None, nodes=None, beside=(), sce
     loaded = canprobe.load_scene(scene)
     loaded = replace(loaded, cycle=replace(loaded.cycle, rate_hz=rate_hz))
     said = []
-    session = Session(replace(loaded, bring_up=replace(loaded.bring_up, **bring_up)), tmp_path, say=said.append)
+    session = Session(replace(loaded, bring_up=replace(loaded.bring_up, **bring_up)), RunOptions(tmp_path, said.append))
     session.said = said
     world = session.world
     for node in world.nodes:

@@ -16,6 +16,7 @@ import canprobe
 from canprobe.cell.emulated.world import make_world
 from canprobe.cell.master.cell import Cell
 from canprobe.cell.master.controller import Command
+from canprobe.cell.master.options import RunOptions
 from canprobe.cell.plant.plant import Plant
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.joint_finding import Answer
@@ -63,7 +64,7 @@ class Bench:
             self.bus.attach(FaultyNode(node, faults) if faults else around(node))
 
     def cell(self, *, to_home=False):
-        return Cell(self.plan, self.bus.port(), zeros=self.record, to_home=to_home, say=self.said.append)
+        return Cell(self.plan, self.bus.port(), RunOptions(say=self.said.append, to_home=to_home), zeros=self.record)
 
     def home(self, *axes):
         with self.cell(to_home=True) as cell:

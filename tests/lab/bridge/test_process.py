@@ -14,6 +14,7 @@ from waiting import wait_for_size
 
 import canprobe
 from canprobe.cell.master.observers import Observation
+from canprobe.cell.master.options import RunOptions
 from canprobe.cell.scene.load import dump_scene, parse_scene
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.requested import Request
@@ -42,7 +43,7 @@ def pid_of(bridge):
 def run_cell(plan, *observers):
     from canprobe.cell.tasks.from_plan import make_task
 
-    session = Session(plan.scene, None, observers=observers)
+    session = Session(plan.scene, RunOptions(observers=observers))
     with session:
         session.run(make_task(plan))
     return session

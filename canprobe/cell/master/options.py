@@ -1,0 +1,38 @@
+"""What the caller of a run sets beside its scene."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from canprobe.cell.master.observers import AnyObserver
+
+Say = Callable[[str], None]
+"""Called with a line of text for each step."""
+
+
+def quiet(_: str) -> None:
+    """Report nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunOptions:
+    """Options of one run, made once by its caller; every layer below takes the same object.
+
+    Attributes:
+        out: folder of the files; None writes none.
+        say: called with each step.
+        observers: called after each cycle with its measurement, command and frames.
+        rows_kept: cycles whose row of the log is kept, and no truth; None for all.
+        to_home: the drives are about to be homed; else bring-up refuses one that is not.
+    """
+
+    out: Path | None = None
+    say: Say = quiet
+    observers: Sequence[AnyObserver] = ()
+    rows_kept: int | None = None
+    to_home: bool = False
+
+
+DEFAULT_OPTIONS = RunOptions()
