@@ -10,28 +10,19 @@ import json
 import marshal
 import os
 import select
-import shutil
 import subprocess
-import sys
-import tempfile
 from collections import deque
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from canprobe.cell.master.observers import Observation
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.scene.load import SAVED_AS
-from canprobe.cell.session.emulator_child import with_our_imports
-from canprobe.cell.session.folder import write_scene
+from canprobe.cell.session.child_process import ChildProcess
 from canprobe.cell.tasks.requested import Request
 from canprobe.errors import ResultsError, UsageError
 from canprobe.fieldbus.bus.clock import elapsed_ns, epoch_now_ns
 from canprobe.lab.bridge.codec import pack_observation
 from canprobe.lab.bridge.pipe_queue import Feed
-
-if TYPE_CHECKING:
-    pass
-
 
 READY_TIMEOUT_S = 60.0
 END_TIMEOUT_S = 30.0
@@ -45,7 +36,7 @@ OBSERVATION, END = b"o", b"e"
 """First byte of a record: what follows."""
 
 
-class BridgeProcess:
+class BridgeProcess(ChildProcess):
     """One bridge in its process.
 
     Args:
@@ -59,12 +50,11 @@ class BridgeProcess:
     """
 
     def __init__(self, name: str, plan: Plan, out: Path | None, *, virtual: bool) -> None:
+        super().__init__()
         self.name = name
         self.requests: deque[Request] = deque(maxlen=100)
-        self._folder = Path(tempfile.mkdtemp(prefix="canprobe-"))
-        write_scene(plan, self._folder)
         self._config = {
-            "scene": str(self._folder / SAVED_AS),
+            "scene": str(self.scene_file),
             "out": str(out.resolve()) if out is not None else None,
         }
         self._virtual = virtual
@@ -77,26 +67,13 @@ class BridgeProcess:
         self._ends_by_ns: int | None = None
         self._text = b""
         self._poll_in = self._batch = max(1, round(LATENCY_S * plan.scene.cycle.rate_hz))
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed by end
         reader, writer = os.pipe()
-        self._process = subprocess.Popen(  # a new session: Ctrl-C is for the cell
-            [sys.executable, "-P", "-m", "canprobe.lab.bridge.worker", name],
-            env=with_our_imports(),
-            stdin=reader,
-            stdout=subprocess.PIPE,
-            stderr=self._errors,
-            start_new_session=True,
-        )
+        self.launch(plan, ["canprobe.lab.bridge.worker", name], stdin=reader, stdout=subprocess.PIPE)
         os.close(reader)
-        assert self._process.stdout is not None
-        self._back = self._process.stdout.fileno()
+        assert self.process.stdout is not None
+        self._back = self.process.stdout.fileno()
         os.set_blocking(self._back, False)
         self._feed = Feed(writer, batch=self._batch, lossless=virtual)
-
-    @property
-    def pid(self) -> int:
-        """Of its process."""
-        return self._process.pid
 
     def await_ready(self) -> str:
         """Wait until the bridge says where it is to be found; at once where it has.
@@ -116,7 +93,7 @@ class BridgeProcess:
             if left <= 0:
                 self._error = f"not ready after {READY_TIMEOUT_S:g} s"
             elif not self._listen(left):
-                self._error = self._last_words() or "ended before it began"
+                self._error = self.last_words() or "ended before it began"
         if self._where is None:
             raise (ResultsError if self._unwritten else UsageError)(f"bridge {self.name}: {self._error}")
         return self._where
@@ -195,30 +172,24 @@ class BridgeProcess:
         while (left := _left_s(min(deadline_ns, self._ends_by_ns or deadline_ns))) > 0:
             if not self._listen(left):
                 with contextlib.suppress(subprocess.TimeoutExpired):
-                    self._process.wait(max(left, 0.1))
+                    self.process.wait(max(left, 0.1))
                 break
         if self._received is None and self._error is None:
-            code = self._process.poll()
-            self._error = self._last_words() or (
+            code = self.process.poll()
+            self._error = self.last_words() or (
                 f"did not end within {END_TIMEOUT_S:g} s" if code is None else f"ended with status {code}"
             )
 
     def kill(self) -> None:
         """Make sure that nothing is left of the process. Twice is allowed."""
         self._feed.close()
-        if self._process.poll() is None:
-            self._process.kill()
+        if self.process.poll() is None:
+            self.process.kill()
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(KILL_TIMEOUT_S)
-        if self._process.stdout is not None:
-            self._process.stdout.close()
-        shutil.rmtree(self._folder, ignore_errors=True)
-        self._errors.close()
-
-    def _last_words(self) -> str:
-        self._errors.seek(0)
-        lines = self._errors.read().decode(errors="replace").strip().splitlines()
-        return lines[-1] if lines else ""
+            self.process.wait(KILL_TIMEOUT_S)
+        if self.process.stdout is not None:
+            self.process.stdout.close()
+        self.remove()
 
 
 def _left_s(deadline_ns: int) -> float:

@@ -96,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("emulate: name a SCENE, or else --eds FILE --node-id N, or --bus-yml FILE")
     serve = _scene_server(args) if args.scene is not None else _eds_server(args)
 
-    from canprobe.cell.session.emulator_child import end_with_parent
+    from canprobe.cell.session.child_process import end_with_parent
 
     with left_by_ctrl_c():
         if args.parent is not None:

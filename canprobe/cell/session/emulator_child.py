@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import signal
 import subprocess
-import sys
-import tempfile
 import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import IO, NoReturn
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.emulated.truth_columns import TruthColumns
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.scene.load import SAVED_AS
-from canprobe.cell.session.folder import write_scene
+from canprobe.cell.session.child_process import ChildProcess
 from canprobe.errors import BusError, NodeError
 from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.port import Port, TimedFrame
@@ -32,34 +28,13 @@ SERVING = "serving "
 """What the process says when it serves."""
 TRUTH_SHARE = 0.2
 """Time that the nodes may take at their end to work out what was true, over the time that they ran."""
-_PR_SET_PDEATHSIG = 1
 
 
-def with_our_imports() -> dict[str, str]:
-    """The environment in which `python -P -m` imports what this process does, whatever lies in the working folder."""
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(os.path.abspath(path) for path in sys.path)}
-
-
-def end_with_parent(parent: int, number: int = signal.SIGTERM) -> None:
-    """In the child: get a signal when the parent is killed. Linux only, and only a second line of defence.
-
-    Args:
-        parent: its process id; if it has gone already, this process gets the signal at once.
-        number: of the signal.
-    """
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
-        if os.getppid() != parent:
-            os.kill(os.getpid(), number)
-
-
-class EmulatorChild:
+class EmulatorChild(ChildProcess):
     """``canprobe emulate`` as a child process.
 
-    It runs in another session, so that Ctrl-C reaches only the master, which stops the drives before their process.
-
     Args:
-        plan: whose nodes; the process reads the files of its scene as they were read for the plan.
+        plan: whose nodes.
         out: folder for ``truth.npz``; None uses a temporary one.
         channels: the buses of its nodes.
         truth: whether what is true is recorded, which grows with time.
@@ -72,48 +47,30 @@ class EmulatorChild:
     def __init__(
         self, plan: Plan, out: Path | None, channels: Sequence[str], *, truth: bool = True, origin_ns: int = 0
     ) -> None:
+        super().__init__()
         self._plan = plan
         self._scene = plan.scene
         self._channels = channels
-        self._folder = Path(tempfile.mkdtemp(prefix="canprobe-"))
         self._wants_truth = truth
         self._origin_ns = origin_ns
-        self._truth = (out or self._folder) / "truth.npz"
+        self._truth = (out or self.folder) / "truth.npz"
         self.unwritten: str | None = None
-        self._errors: IO[bytes] | None = None
-        self._process: subprocess.Popen[bytes] | None = None
         self._clock = MonotonicClock()
         self._started_ns = self._clock.now_ns()
 
     def start(self) -> None:
         """Start the process."""
-        write_scene(self._plan, self._folder)
         bus, nodes = self._scene.bus, self._scene.emulated_node_ids
-        command = [
-            *(sys.executable, "-P", "-m", "canprobe", "emulate", str(self._folder / SAVED_AS)),
-            *("--bus", bus.interface, "--bitrate", str(bus.bitrate)),
+        words = [
+            *("canprobe", "emulate", str(self.scene_file), "--bus", bus.interface, "--bitrate", str(bus.bitrate)),
             *(word for channel in self._channels for word in ("--channel", f"{channel}={channel}")),
             *("--parent", str(os.getpid())),
         ]
         if nodes:
-            command += ["--nodes", ",".join(str(n) for n in nodes)]
+            words += ["--nodes", ",".join(str(n) for n in nodes)]
         if self._wants_truth:
-            command += ["--truth", str(self._truth), "--origin", str(self._origin_ns)]
-        self._errors = (self._folder / "stderr").open("w+b")
-        self._process = subprocess.Popen(  # no preexec_fn: fork would make the master's first cycles copy its pages
-            command,
-            env=with_our_imports(),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=self._errors,
-            start_new_session=True,
-        )
-
-    @property
-    def pid(self) -> int:
-        """Process id, once it is started."""
-        assert self._process is not None
-        return self._process.pid
+            words += ["--truth", str(self._truth), "--origin", str(self._origin_ns)]
+        self.launch(self._plan, words)
 
     def await_boot_ups(
         self,
@@ -132,7 +89,6 @@ class EmulatorChild:
             BusError: the process ended; with its own last words.
             NodeError: a node did not boot in time.
         """
-        assert self._process is not None
         waiting = set(self._scene.emulated_node_ids)
         clock = port.clock
         start = clock.now_ns()
@@ -140,8 +96,8 @@ class EmulatorChild:
         report = start + round(REPORT_EVERY_S * 1e9)
         while waiting or not self._serves():
             now = clock.now_ns()
-            if self._process.poll() is not None:
-                raise BusError(self._last_words() or f"the emulated nodes ended with status {self._process.returncode}")
+            if self.process.poll() is not None:
+                raise BusError(self.last_words() or f"the emulated nodes ended with status {self.process.returncode}")
             if now >= deadline:
                 self._raise_late(min(waiting, default=0))
             if now >= report:
@@ -168,12 +124,6 @@ class EmulatorChild:
             " a busier machine needs a larger [bring_up] emulated_s",
         )
 
-    def _last_words(self) -> str:
-        assert self._errors is not None
-        self._errors.seek(0)
-        lines = self._errors.read().decode(errors="replace").strip().splitlines()
-        return lines[-1].removeprefix("canprobe: ") if lines else ""
-
     def end(self) -> dict[str, NDArray[np.float64]]:
         """Stop the process, first politely, harder at an interrupt; the plant's truth where it left any."""
         if self._process is not None:
@@ -191,10 +141,7 @@ class EmulatorChild:
                 np.load(self._truth, allow_pickle=False) as data,
             ):
                 truth.update({name: np.asarray(data[name]) for name in data.files})
-        if self._errors is not None:
-            words = self._last_words()
-            self.unwritten = words if words.startswith(str(self._truth)) else None
-            self._errors.close()
-        for leftover in (*self._folder.iterdir(), self._folder):
-            leftover.rmdir() if leftover.is_dir() else leftover.unlink()
+        words = self.last_words()
+        self.unwritten = words if words.startswith(str(self._truth)) else None
+        self.remove()
         return truth

@@ -15,7 +15,7 @@ from multiprocessing.process import BaseProcess
 from time import perf_counter
 from types import ModuleType
 
-from canprobe.cell.session.emulator_child import end_with_parent
+from canprobe.cell.session.child_process import end_with_parent
 from canprobe.errors import StudyError, UsageError, install_line
 from canprobe.fieldbus.bus.real.processor import BLAS_THREADS
 

@@ -26,7 +26,8 @@ from canprobe.cell.planning.make import make_plan
 from canprobe.cell.scene.load import dump_scene, load_scene
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.session.emulator_child import EmulatorChild, with_our_imports
+from canprobe.cell.session.child_process import with_our_imports
+from canprobe.cell.session.emulator_child import EmulatorChild
 from canprobe.errors import CanprobeError, InterfaceError
 from canprobe.fieldbus.bus.candump import read_candump
 from canprobe.fieldbus.bus.clock import MonotonicClock
