@@ -108,7 +108,7 @@ def _without_nan(value: Any) -> Any:
 
 def _bus_load(session: Session) -> dict[str, Any]:
     return {
-        bus.channel: {"planned_worst": bus.traffic.load, "measured": session.bus_load(bus.channel)}
+        bus.channel: {"planned_worst": bus.traffic.load, "measured": session.record.load(bus.channel)}
         for bus in session.plan.buses
     }
 
@@ -118,14 +118,14 @@ def _traffic(session: Session) -> dict[str, Any]:
 
     Without a log, or where it ends before the first SYNC, only the bus errors are known.
     """
-    if session.meters:
-        return {channel: meter.report().as_dict() for channel, meter in session.meters.items()}
+    if session.record.meters:
+        return {channel: meter.report().as_dict() for channel, meter in session.record.meters.items()}
     plan = session.plan
     with contextlib.suppress(UsageError):
         if session.out is not None:
             log = session.out / LOG
             return {b.channel: measure_traffic(log, plan, channel=b.channel, exact=False).as_dict() for b in plan.buses}
-    errors = {channel: counter.error_frames for channel, counter in session.traffic.items()}
+    errors = {channel: counter.error_frames for channel, counter in session.record.traffic.items()}
     return {channel: {"as_planned": None if n == 0 else False, "error_frames": n} for channel, n in errors.items()}
 
 

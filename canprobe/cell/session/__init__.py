@@ -13,6 +13,7 @@ it stops everything in the reverse order: drives disabled, logs flushed, bus clo
     folder          the folder of a run before its first frame
     direct          a cell without a bus
     rehearsal       the scene of a short run in lockstep, before a real one
+    bus_record      what is recorded of its buses
     child_process   a process beside the master
     emulator_child  the process of the emulated nodes
     children        the processes of the bridges to other tools

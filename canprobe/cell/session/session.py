@@ -24,11 +24,11 @@ from canprobe.cell.master.options import DEFAULT_OPTIONS, RunOptions
 from canprobe.cell.npz import write_npz
 from canprobe.cell.planning.bridges import check_bridges
 from canprobe.cell.planning.make import make_plan
-from canprobe.cell.planning.measured import TrafficMeter
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.model import BridgeSettings, Scene
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.session.buses import TrafficCounter, channel_routes, lockstep_bus, open_ports
+from canprobe.cell.session.bus_record import BusRecord
+from canprobe.cell.session.buses import channel_routes, lockstep_bus, open_ports
 from canprobe.cell.session.emulator_child import EmulatorChild
 from canprobe.cell.session.folder import prepare_folder, zeros_file
 from canprobe.cell.session.link_faults import expected_of
@@ -37,11 +37,11 @@ from canprobe.cell.session.rehearsal import shortened
 from canprobe.cell.session.target import LOCKSTEP, VIRTUAL
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.errors import CanprobeError, UsageError
-from canprobe.fieldbus.bus.candump import CandumpWriter, RecordingPort
+from canprobe.fieldbus.bus.candump import RecordingPort
 from canprobe.fieldbus.bus.clock import MonotonicClock, VirtualClock, elapsed_ns
-from canprobe.fieldbus.bus.files import make_folder, writing
+from canprobe.fieldbus.bus.files import writing
 from canprobe.fieldbus.bus.joined import JoinedPort
-from canprobe.fieldbus.bus.port import Port, Reports, is_bus_error
+from canprobe.fieldbus.bus.port import Port, Reports
 from canprobe.fieldbus.bus.real.memory import garbage_collection_paused, reserve_memory
 from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, realtime
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
@@ -50,7 +50,6 @@ if TYPE_CHECKING:
     from canprobe.cell.emulated.world import World
 
 Array = NDArray[np.float64]
-Write = Callable[[int, bytes, int], None]
 
 
 def with_bridges(scene: Scene, names: Sequence[str]) -> Scene:
@@ -72,7 +71,7 @@ class Session:
         options: of the run; ``bus.log``, ``scene.toml`` and ``truth.npz`` are written here.
 
     Attributes:
-        origin_ns: where the run's clock is 0, on the clock of its bus: every time in its files counts from there.
+        record: of the buses, from the entry on; every time in the files of the run counts from its `origin_ns`.
         unwritten: files that could not be written, each with the reason; they are among the cell's faults too.
     """
 
@@ -83,16 +82,10 @@ class Session:
         self.out = options.out
         self.started_ns = 0
         self.wall_ns = 0
-        self.origin_ns = 0
-        self._bus_start_ns = 0
-        self._bus_time_ns = 0
-        self.traffic: dict[str, TrafficCounter | TrafficMeter] = {}
-        self.meters: dict[str, TrafficMeter] = {}
         self.truth: dict[str, Array] = {}
         self.lockstep: LockstepBus | None = None
         self._ports: dict[str, Port] = {}
         self.unwritten: list[str] = []
-        self._candump: CandumpWriter | None = None
         self.observers = Observers(options.observers) if options.observers else None
         self._say = options.say
         self._stack = ExitStack()
@@ -134,12 +127,6 @@ class Session:
         """Every cycle has its row in the log, and every SYNC one in the truth."""
         return self.options.rows_kept is None
 
-    def bus_load(self, channel: str) -> float | None:
-        """Measured share of a bus's bit rate, from the first frame to the last."""
-        if channel not in self.traffic or self._bus_time_ns <= 0:
-            return None
-        return self.traffic[channel].bits / (self.scene.bus.bitrate * self._bus_time_ns * 1e-9)
-
     def refuse_reentry(self) -> None:
         """Raise UsageError where the session was opened before."""
         if self._entered:
@@ -151,6 +138,7 @@ class Session:
         self.started_ns = elapsed_ns()
         for warning in self.plan.warnings:
             self._say(f"warning: {warning}")
+        self.record = self._stack.enter_context(BusRecord(self.plan, self.out, self.observers))
         try:
             port = self._open()
             self._cell = Cell(
@@ -158,15 +146,14 @@ class Session:
                 port,
                 self.options,
                 observers=self.observers,
-                log_failure=self._log_failure,
+                log_failure=self.record.failure,
                 direct=self._direct,
-                origin_ns=self.origin_ns,
+                origin_ns=self.record.origin_ns,
                 zeros=zeros_file(self.plan),
             )
             if not self.virtual:
                 self._get_ready(port)
-            self._bus_start_ns = port.clock.now_ns()
-            self._stack.callback(self._stop_watch, port)
+            self._stack.enter_context(self.record.timed(port.clock))
             self._stack.enter_context(garbage_collection_paused(collect=not self.virtual))
             self._stack.callback(self._observe_frames, port)
             self._stack.enter_context(self._cell)
@@ -198,7 +185,7 @@ class Session:
         finally:
             self._left = True
             self.wall_ns = elapsed_ns() - self.started_ns
-            self.note_unwritten(self._log_failure())
+            self.note_unwritten(self.record.failure())
 
     def note_unwritten(self, failure: str | None) -> None:
         """Note that a file could not be written, and why; None notes nothing."""
@@ -210,47 +197,12 @@ class Session:
         if self._cell is not None:
             self._cell.notes.add(fault)
 
-    def _log_failure(self) -> str | None:
-        return self._candump.failure if self._candump is not None else None
-
-    def _stop_watch(self, port: Port) -> None:
-        self._bus_time_ns = port.clock.now_ns() - self._bus_start_ns
-
     # the three kinds of bus
 
     def _open(self) -> Port:
         if self.scene.bus.direct:
             return self._open_direct()
         return self._open_lockstep() if self.scene.bus.interface == LOCKSTEP else self._open_real()
-
-    def _writer(self, channel: str) -> Write:
-        """What a bus is recorded with: its traffic is counted, written to the log and shown to the observers."""
-        if self.scene.bus.interface == LOCKSTEP:
-            self.meters[channel] = TrafficMeter(self.plan, channel, exact=False)
-            self.traffic[channel] = self.meters[channel]
-        else:  # set beside the plan afterwards, from the log
-            self.traffic[channel] = TrafficCounter(self.scene.bus.data_bitrate / self.scene.bus.bitrate)
-        write: Write = self.traffic[channel].write
-        if self.out is not None:
-            if self._candump is None:
-                make_folder(self.out)
-                self._candump = self._stack.enter_context(CandumpWriter(self.out / "bus.log", channel, self.origin_ns))
-                prepare_folder(self.plan, self.out)
-            write = self._candump.on(channel, self.traffic[channel].take)
-        if self.observers is not None:
-            self.observers.origin_ns = self.origin_ns
-            write = self.observers.tap(write)
-        return write
-
-    def _error_writer(self, channel: str) -> Write:
-        """Error frames go into the log, and beside the plan."""
-
-        def note(can_id: int, data: bytes, t_ns: int) -> None:
-            self.traffic[channel].error_frames += is_bus_error(can_id)
-            if self._candump is not None:
-                self._candump.on(channel)(can_id, data, t_ns)
-
-        return note
 
     def _join(self, ports: dict[str, Port]) -> Port:
         """One port for the cell, whatever the number of buses."""
@@ -288,8 +240,8 @@ class Session:
         clock = VirtualClock()
         buses = {bus.channel: lockstep_bus(self.scene, clock, bus.channel) for bus in self.plan.buses}
         for channel, bus in buses.items():
-            bus.recorder = self._writer(channel)
-            bus.error_recorder = self._error_writer(channel)
+            bus.recorder = self.record.writer(channel)
+            bus.error_recorder = self.record.error_writer(channel)
         self.lockstep = buses[self.plan.buses[0].channel]
         participants = self.world.participants
         self._stack.callback(self._keep_truth)
@@ -320,11 +272,11 @@ class Session:
             )
         check_links(bus.interface, expected_of(self.plan), self._say)
         clock = MonotonicClock()
-        self.origin_ns = clock.now_ns()
+        self.record.origin_ns = clock.now_ns()
         real = self._ports = self._stack.enter_context(
-            open_ports(self.plan, clock, lambda channel: Reports(self._error_writer(channel), self._note))
+            open_ports(self.plan, clock, lambda channel: Reports(self.record.error_writer(channel), self._note))
         )
-        return self._join({name: RecordingPort(port, self._writer(name)) for name, port in real.items()})
+        return self._join({name: RecordingPort(port, self.record.writer(name)) for name, port in real.items()})
 
     def _get_ready(self, port: Port) -> None:
         """For real time: the emulated nodes in their process, everything done once before, the processor's favour."""
@@ -333,7 +285,7 @@ class Session:
             self.cell.listen()  # they would boot beside those of another master
             self._say("start the emulated nodes")
             channels = list(self.plan.emulated_channels)
-            child = EmulatorChild(self.plan, self.out, channels, truth=self.keeps_all, origin_ns=self.origin_ns)
+            child = EmulatorChild(self.plan, self.out, channels, truth=self.keeps_all, origin_ns=self.record.origin_ns)
             self._stack.callback(self._end_child, child)
             child.start()
         self._say("rehearse in lockstep")

@@ -213,5 +213,5 @@ def score_log(session: Session, steps: int) -> list[str]:
         lines = sum(1 for _ in read_candump(session.out / "bus.log", whole=True))
     except CanprobeError as error:
         return [*failures, f"log: {error}"]
-    frames = sum(counter.frames for counter in session.traffic.values())
+    frames = sum(counter.frames for counter in session.record.traffic.values())
     return failures if lines == frames else [*failures, f"log: {lines} lines of {frames} frames"]

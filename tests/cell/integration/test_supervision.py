@@ -654,7 +654,7 @@ def test_a_full_disk(tmp_path):
             super()._run()
 
     def fill(run):
-        log = run.session._candump
+        log = run.session.record._candump
 
         class Full:
             closed = False

@@ -1,0 +1,106 @@
+"""Record of a run's buses: their traffic counted, written into ``bus.log`` and shown to the observers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from canprobe.cell.master.observers import Observers
+from canprobe.cell.planning.measured import TrafficMeter
+from canprobe.cell.planning.model import Plan
+from canprobe.cell.session.buses import TrafficCounter
+from canprobe.cell.session.folder import prepare_folder
+from canprobe.cell.session.target import LOCKSTEP
+from canprobe.fieldbus.bus.candump import CandumpWriter
+from canprobe.fieldbus.bus.clock import Clock
+from canprobe.fieldbus.bus.files import make_folder
+from canprobe.fieldbus.bus.port import is_bus_error
+
+Write = Callable[[int, bytes, int], None]
+
+
+class BusRecord:
+    """Record of every bus of a run. A context manager: leaving closes ``bus.log``.
+
+    Args:
+        plan: of the run.
+        out: folder for ``bus.log``, which the first `writer` prepares; None writes nothing.
+        observers: get the frames; None where there are none.
+
+    Attributes:
+        origin_ns: time on the clock of the buses from which the log counts.
+        traffic: counter of each channel.
+        meters: those of a lockstep bus, which compare the traffic with the plan while it is there; on a real bus
+            that is done afterwards, from the log.
+    """
+
+    def __init__(self, plan: Plan, out: Path | None, observers: Observers | None) -> None:
+        self.origin_ns = 0
+        self.traffic: dict[str, TrafficCounter | TrafficMeter] = {}
+        self.meters: dict[str, TrafficMeter] = {}
+        self._plan = plan
+        self._out = out
+        self._observers = observers
+        self._candump: CandumpWriter | None = None
+        self._time_ns = 0
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.close()
+
+    def writer(self, channel: str) -> Write:
+        """What takes each frame of a bus."""
+        bus = self._plan.scene.bus
+        if bus.interface == LOCKSTEP:
+            self.traffic[channel] = self.meters[channel] = TrafficMeter(self._plan, channel, exact=False)
+        else:
+            self.traffic[channel] = TrafficCounter(bus.data_bitrate / bus.bitrate)
+        write: Write = self.traffic[channel].write
+        if self._out is not None:
+            if self._candump is None:
+                make_folder(self._out)
+                log = CandumpWriter(self._out / "bus.log", channel, self.origin_ns)
+                self._candump = self._stack.enter_context(log)
+                prepare_folder(self._plan, self._out)
+            write = self._candump.on(channel, self.traffic[channel].take)
+        if self._observers is not None:
+            self._observers.origin_ns = self.origin_ns
+            write = self._observers.tap(write)
+        return write
+
+    def error_writer(self, channel: str) -> Write:
+        """What takes each error frame of a bus: it is counted and written into the log."""
+
+        def note(can_id: int, data: bytes, t_ns: int) -> None:
+            self.traffic[channel].error_frames += is_bus_error(can_id)
+            if self._candump is not None:
+                self._candump.on(channel)(can_id, data, t_ns)
+
+        return note
+
+    def failure(self) -> str | None:
+        """Why frames are no longer written down; None while they are."""
+        return self._candump.failure if self._candump is not None else None
+
+    @contextmanager
+    def timed(self, clock: Clock) -> Iterator[None]:
+        """Take the time that the loads refer to."""
+        start_ns = clock.now_ns()
+        try:
+            yield
+        finally:
+            self._time_ns = clock.now_ns() - start_ns
+
+    def load(self, channel: str) -> float | None:
+        """Measured share of a bus's bit rate, from the first frame to the last."""
+        if channel not in self.traffic or self._time_ns <= 0:
+            return None
+        return self.traffic[channel].bits / (self._plan.scene.bus.bitrate * self._time_ns * 1e-9)
