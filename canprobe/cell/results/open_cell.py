@@ -22,6 +22,7 @@ from canprobe.cell.results.summary import log_columns, summarise, tactile_column
 from canprobe.cell.scene.setup import Setup, Touch
 from canprobe.cell.session.children import Bridges
 from canprobe.cell.session.session import Session
+from canprobe.cell.tasks.from_plan import estimates_of
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
 from canprobe.cell.tasks.task import TaskRecord, record_of
 from canprobe.errors import CanprobeError, ResultsError, UsageError
@@ -244,7 +245,6 @@ def _estimates(setup: Setup, tracker: ShapeTracker | None) -> dict[str, list[Sha
     """The answers of the estimator in the loop, and of the others on the same contacts."""
     if tracker is None or setup.shape is None:
         return {}
-    from canprobe.cell.tasks.from_plan import estimates_of
 
     return estimates_of(setup, tracker, (setup.shape.method, *setup.shape.also))
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.planning.model import Plan
+from canprobe.cell.results.files import to_frame, write_parquet
 from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.summary import write_files
 from canprobe.cell.results.text import summary_text
@@ -179,8 +180,6 @@ class RunResult:
         Raises:
             UsageError: the extra `data` is missing.
         """
-        from canprobe.cell.results.files import to_frame
-
         return to_frame(self._columns(what), self._attrs)
 
     def to_parquet(self, path: Path | str, what: Literal["log", "truth", "estimates"] = "log") -> None:
@@ -189,8 +188,6 @@ class RunResult:
         Raises:
             UsageError: the extra `data` is missing.
         """
-        from canprobe.cell.results.files import write_parquet
-
         write_parquet(self._columns(what), path, self._attrs)
 
     @property

@@ -11,6 +11,7 @@ from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.session import Session
 from canprobe.cell.session.up import ROWS_OF_UP
 from canprobe.errors import NodeError, UsageError
+from canprobe.mechanics.robot.chain import forward
 
 if TYPE_CHECKING:
     from canprobe.cell.tasks.free_and_listen import Vector
@@ -59,8 +60,6 @@ def check_joints(scene: Scene, *, operator: Operator | None = None, say: Say = q
 
 def _zero_pose(model: ArmModel, start: Vector) -> str:
     """Where the arm has to be if its zeros are right, for a look at its marks."""
-    from canprobe.mechanics.robot.chain import forward
-
     units = [joint.unit for joint in model.joints]
     each = [f"{joint.shown(q):.2f}" for joint, q in zip(model.joints, start, strict=True)]
     positions = f"{', '.join(each)} {units[0]}"

@@ -13,7 +13,11 @@ from typing import TYPE_CHECKING
 
 from canprobe.cell.master.options import Say, quiet
 from canprobe.cell.npz import write_npz
+from canprobe.cell.planning.make import make_plan
+from canprobe.cell.planning.warnings import bus_open_to_others
+from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import Scene
+from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.link_faults import ExpectedLink, data_bitrate
 from canprobe.cell.session.links import check_links
 from canprobe.cell.session.session import rehearse
@@ -21,10 +25,15 @@ from canprobe.cell.session.target import Target
 from canprobe.errors import NodeError, ResultsError, UsageError
 from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.files import make_folder
+from canprobe.fieldbus.bus.port import Port, Reports
+from canprobe.fieldbus.bus.presence import answering_nodes
+from canprobe.fieldbus.bus.pumped import PumpedNetwork
+from canprobe.fieldbus.bus.real.memory import reserve_memory
+from canprobe.fieldbus.bus.real.processor import DEVICE_PRIORITY, ask_for_processor, realtime
+from canprobe.fieldbus.eds.packaged import check_eds
 from canprobe.fieldbus.protocol.lss import UNCONFIGURED
 
 if TYPE_CHECKING:
-    from canprobe.fieldbus.bus.port import Port
     from canprobe.fieldbus.bus.virtual.lockstep import Participant
     from canprobe.fieldbus.node.slave_node import SlaveNode
 
@@ -63,9 +72,6 @@ def emulate(
         ResultsError: `truth_path` or `store_folder` cannot be written; raised before anything is served.
     """
     from canprobe.cell.emulated.world import make_world
-    from canprobe.cell.planning.make import make_plan
-    from canprobe.cell.scene.load import load_scene
-    from canprobe.cell.scene.resolve import resolve
 
     scene = load_scene(scene, {} if seed is None else {"scene.seed": seed})
     of_scene = replace(target, channel=scene.bus.channel, others={})  # who is on which bus is the scene's
@@ -135,7 +141,6 @@ def emulate_eds(
         ResultsError: `store_folder` cannot be written.
     """
     from canprobe.fieldbus.drive.from_eds import make_eds_node
-    from canprobe.fieldbus.eds.packaged import check_eds
 
     node_ids = tuple(node_id for _, node_id in files if node_id != UNCONFIGURED)
     if twice := sorted({node_id for node_id in node_ids if node_ids.count(node_id) > 1}):
@@ -175,10 +180,6 @@ def _free_port(
     target: Target, wanted: ExpectedLink, node_ids: tuple[int, ...], *, way_out: str, say: Say
 ) -> Iterator[Port]:
     """A port on a bus where nobody has these node ids; it waits for the bus as a device does."""
-    from canprobe.cell.planning.warnings import bus_open_to_others
-    from canprobe.fieldbus.bus.port import Reports
-    from canprobe.fieldbus.bus.presence import answering_nodes
-    from canprobe.fieldbus.bus.pumped import PumpedNetwork
     from canprobe.fieldbus.bus.real.opening import open_port
 
     check_links(target.interface, {target.channel: wanted}, say)
@@ -217,8 +218,6 @@ def _serve(
     in_realtime: bool,
     cycles_kept: int = 0,
 ) -> None:
-    from canprobe.fieldbus.bus.real.memory import reserve_memory
-    from canprobe.fieldbus.bus.real.processor import DEVICE_PRIORITY, ask_for_processor, realtime
     from canprobe.fieldbus.node.serve import serve
 
     reserve_memory(cycles_kept)

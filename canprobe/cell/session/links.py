@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from canprobe.cell.session.link_faults import ExpectedLink, check_link, controller_trouble
 from canprobe.errors import BusError, InterfaceError
+from canprobe.fieldbus.bus.port import ControllerState, Port
 from canprobe.fieldbus.bus.real.link import (
     LinkState,
+    missing_ip,
+    read_link,
 )
-
-if TYPE_CHECKING:
-    from canprobe.fieldbus.bus.port import Port
-
 
 SOCKETCAN = "socketcan"
 
@@ -35,7 +33,6 @@ def check_links(
     """
     if interface != SOCKETCAN:
         return
-    from canprobe.fieldbus.bus.real.link import missing_ip, read_link
     from canprobe.fieldbus.bus.real.socketcan import has_socketcan
 
     errors: list[str] = []
@@ -67,8 +64,6 @@ def need_controllers(interface: str, ports: Mapping[str, Port], error: BaseExcep
     """
     if error is not None and not isinstance(error, BusError):
         return
-    from canprobe.fieldbus.bus.port import ControllerState
-    from canprobe.fieldbus.bus.real.link import read_link
 
     troubles: list[str] = []
     for channel, port in ports.items():

@@ -22,7 +22,7 @@ def served(monkeypatch):
         monkeypatch.setattr("canprobe.fieldbus.bus.real.opening.open_port", lambda *_, **__: bus.port())
         monkeypatch.setattr("canprobe.cell.session.emulation.rehearse", lambda plan: None)
         monkeypatch.setattr(
-            "canprobe.fieldbus.bus.real.processor.ask_for_processor", lambda: False
+            "canprobe.cell.session.emulation.ask_for_processor", lambda: False
         )  # not for the tests' own process
         monkeypatch.setattr("canprobe.fieldbus.node.serve.serve", lambda buses, stop: act(buses[0][0]))
         return main(["emulate", *what, *options])
