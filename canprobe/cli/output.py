@@ -10,7 +10,7 @@ import sys
 import textwrap
 from collections.abc import Sequence
 
-from canprobe.cell.session.terminal import MARKS, NARROW, columns, painted
+from canprobe.cell.session.terminal import MARKED_WORDS, MIN_COLUMNS, columns, painted
 
 
 def print_json(document: object) -> None:
@@ -29,7 +29,7 @@ def print_table(rows: Sequence[Sequence[str]]) -> None:
         return
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     if (window := columns(sys.stdout)) is not None:
-        while sum(widths) + 2 * (len(widths) - 1) > window and max(widths) > NARROW:
+        while sum(widths) + 2 * (len(widths) - 1) > window and max(widths) > MIN_COLUMNS:
             widths[widths.index(max(widths))] -= 1
     for row in rows:
         broken = [
@@ -48,5 +48,5 @@ def print_summary(text: str) -> None:
     print(painted(head, "green" if head.endswith(": done") else "red", sys.stdout))
     for line in lines:
         match = re.match(r"( +)(\S+)(.*)", line)
-        colour = "yellow" if match and match[2] in MARKS else "cyan"
+        colour = "yellow" if match and match[2] in MARKED_WORDS else "cyan"
         print(f"{match[1]}{painted(match[2], colour, sys.stdout)}{match[3]}" if match else line)

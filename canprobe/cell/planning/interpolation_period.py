@@ -10,10 +10,10 @@ from canprobe.cell.planning.model import Interpolation
 from canprobe.cell.planning.operation import (
     COARSEST,
     FINEST,
-    INDICES,
     INTERPOLATION_TIME,
-    MOST,
+    MAX_TIME_UNITS,
     SYNC_PERIOD,
+    TIME_INDICES,
     follows_sync_period,
 )
 from canprobe.fieldbus.eds.description import DescribedEntry
@@ -39,10 +39,10 @@ class _Offer:
 
 def _offer(device: Abilities) -> _Offer:
     value, index = (device.description.entry(INTERPOLATION_TIME, sub) for sub in (1, 2))
-    default = index.initial if index is not None and isinstance(index.initial, int) else INDICES[0]
+    default = index.initial if index is not None and isinstance(index.initial, int) else TIME_INDICES[0]
     indices = [default]
     if index is not None and index.writable:
-        indices = [number for number in dict.fromkeys((default, *INDICES)) if index.allows(number)]
+        indices = [number for number in dict.fromkeys((default, *TIME_INDICES)) if index.allows(number)]
     return _Offer(_values(value), tuple(number for number in indices if FINEST <= number <= COARSEST))
 
 
@@ -51,7 +51,7 @@ def _values(entry: DescribedEntry | None) -> range:
         return range(0)
     if not entry.writable:
         return range(entry.initial, entry.initial + 1) if isinstance(entry.initial, int) else range(0)
-    most = min(MOST, (1 << entry.bits) - 1)
+    most = min(MAX_TIME_UNITS, (1 << entry.bits) - 1)
     low, high = 1 if entry.low is None else int(entry.low), most if entry.high is None else int(entry.high)
     return range(max(1, low), min(most, high) + 1)
 

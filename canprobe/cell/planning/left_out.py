@@ -40,10 +40,10 @@ _EFFECTS = {
 }
 _BY_ARRAY = f'sensor.mode = "features": {MODES["features"]}'
 IMAGE, OWN_WINDOW = "full image (32 PDOs)", "window (8 PDOs)"
-RAW_DEVICE = "node of the array, its PDOs and its supervision by heartbeat"
+ARRAY_NODE_PARTS = "node of the array, its PDOs and its supervision by heartbeat"
 ESTIMATOR, FIGURE, PAGE = "surface estimator", "figure", "replay to share (report.html)"
-BUS = "bus, bring-up by SDO and their log (bus.log)"
-TRUTH = "truth and scores against it"
+BUS_PARTS = "bus, bring-up by SDO and their log (bus.log)"
+TRUTH_PARTS = "truth and scores against it"
 
 
 def left_out(setup: Setup) -> tuple[tuple[str, str], ...]:
@@ -54,7 +54,7 @@ def left_out(setup: Setup) -> tuple[tuple[str, str], ...]:
 def _not_sent(setup: Setup) -> Iterator[tuple[str, str]]:
     array, kind = setup.array, setup.kind
     if setup.bus.direct:
-        yield BUS, 'bus.interface = "direct": counts and images pass in the place of frames'
+        yield BUS_PARTS, 'bus.interface = "direct": counts and images pass in the place of frames'
     if setup.arm is None:
         yield "drives, their PDOs, joint limits", f'no [arm]: task.kind = "{kind}" moves nothing'
     elif not setup.arm.torque:
@@ -62,7 +62,7 @@ def _not_sent(setup: Setup) -> Iterator[tuple[str, str]]:
     if array is None:
         yield "tactile node and its PDOs", f'no [sensor]: task.kind = "{kind}" feels nothing'
     elif array.raw is not None:
-        yield RAW_DEVICE, 'wire.kind = "frames": the device knows no CANopen'
+        yield ARRAY_NODE_PARTS, 'wire.kind = "frames": the device knows no CANopen'
     elif array.mode == "window":
         yield IMAGE, _by_window(setup.touch, int(array.window))
     elif array.mode == "image":
@@ -90,9 +90,9 @@ def _not_emulated(setup: Setup) -> Iterator[tuple[str, str]]:
     arm, array, kind = setup.arm, setup.array, setup.kind
     if not setup.emulates:
         yield "emulator", "every node is real"
-        yield TRUTH, "no emulated node"
+        yield TRUTH_PARTS, "no emulated node"
     elif setup.truth.object is None and kind != "free":
-        yield TRUTH, "no [object]: nothing to compare with"
+        yield TRUTH_PARTS, "no [object]: nothing to compare with"
     if arm is not None and setup.truth.fidelity == "ideal" and any(drive.emulated for drive in arm.drives):
         yield "arm dynamics", 'plant.fidelity = "ideal": each drive tracks as a second-order system'
     for effect, what in _EFFECTS.items():
@@ -136,9 +136,9 @@ def outputs(setup: Setup, absent: Container[str]) -> tuple[str, ...]:
         "summary.json": True,
         "log.npz": True,
         "tactile.npz": setup.array is not None,
-        "bus.log": BUS not in absent,
+        "bus.log": BUS_PARTS not in absent,
         "scene.toml": True,
-        "truth.npz": TRUTH not in absent,
+        "truth.npz": TRUTH_PARTS not in absent,
         "tool.toml": setup.kind == "calibrate",
         "surface.npz": ESTIMATOR not in absent,
         "report.png": FIGURE not in absent,

@@ -18,7 +18,7 @@ MASTER_NODE_ID = 127
 HEARTBEAT_PRODUCED_MS = 100
 HEARTBEAT_CONSUMED_MS = 250
 SYNC_OVERFLOW = 240
-AROUND_S = 3.0
+TASK_OVERHEAD_S = 3.0
 """What a task takes besides its phase, about: enabling, the way to the object, settling, letting go."""
 
 EVERY_SYNC = 1
@@ -370,7 +370,7 @@ class Plan:
     @property
     def cycles(self) -> int:
         """About how many the whole task takes, with the ways to the object and back."""
-        return round((self.setup.task.duration_s + AROUND_S) * self.sync.rate_hz)
+        return round((self.setup.task.duration_s + TASK_OVERHEAD_S) * self.sync.rate_hz)
 
     @property
     def emulated_channels(self) -> tuple[str, ...]:

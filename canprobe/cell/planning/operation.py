@@ -36,10 +36,10 @@ _MODE_NAMES: Mapping[int, str] = {
     9: "cyclic synchronous velocity",
     10: "cyclic synchronous torque",
 }
-INDICES = (-3, -4, -5, -6)
+TIME_INDICES = (-3, -4, -5, -6)
 FINEST, COARSEST = -6, 0
 """Indices between which a unit is a whole number of microseconds, and no more than a second."""
-MOST = 0xFFFF
+MAX_TIME_UNITS = 0xFFFF
 
 
 def choose_mode(device: Abilities) -> OperationMode | None:

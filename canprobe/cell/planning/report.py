@@ -22,7 +22,7 @@ from canprobe.fieldbus.protocol.pdo import PdoEntry
 
 TIMELINE_WIDTH = 100
 """Characters of a cycle."""
-NARROWEST = 40
+MIN_CHARACTERS = 40
 """Characters below which no line is broken."""
 _BESIDE_TIMELINE, _NARROW, _LAST = 24, 8, 12
 
@@ -34,7 +34,7 @@ def plan_text(plan: Plan, width: int | None = None) -> str:
         plan: that fits.
         width: characters of a line, which are broken there; None: lines stay whole.
     """
-    room = None if width is None else max(width, NARROWEST)
+    room = None if width is None else max(width, MIN_CHARACTERS)
     lines = (part for line in _lines(plan, room) for part in _broken(line, room))
     return "\n".join(lines) + "\n"
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from canprobe.cell.planning.left_out import held_rows, long_waits
 from canprobe.cell.planning.model import PlannedPdo
 from canprobe.cell.planning.window import (
-    TOLERATED,
+    TOLERATED_LOSS_SHARE,
     cut_patch,
 )
 from canprobe.cell.scene.setup import Setup
@@ -16,7 +16,7 @@ from canprobe.fieldbus.protocol.frame_bits import WORST_ERROR_BITS
 from canprobe.mechanics.robot.inverse import FULL_POSE, task_rows
 from canprobe.mechanics.touch.patch.array_calibration import NO_FORCE_REFERENCE
 
-ON_THIS_MACHINE = "ff11::ca"
+LOCAL_GROUP = "ff11::ca"
 """A multicast group of interface-local scope, which no packet leaves or enters. Source: RFC 4291, 2.7."""
 
 
@@ -42,7 +42,7 @@ def bus_open_to_others(interface: str, channel: str) -> Iterator[str]:
     if interface == "udp_multicast" and not _is_interface_local(channel):
         yield (
             f"bus.channel = {channel}: every machine on this network segment hears this bus and can command its"
-            f" nodes; --channel {ON_THIS_MACHINE} keeps it on this machine"
+            f" nodes; --channel {LOCAL_GROUP} keeps it on this machine"
         )
 
 
@@ -68,7 +68,7 @@ def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
             " `canprobe calibrate array CELL --force-reference scale` gives them a reference"
         )
     if cut is not None:
-        yield f"{cut.text}; {' or '.join(cut.ways)} leaves less than {100 * TOLERATED:.0f} % outside"
+        yield f"{cut.text}; {' or '.join(cut.ways)} leaves less than {100 * TOLERATED_LOSS_SHARE:.0f} % outside"
     if setup.arm is not None and setup.touch is not None and task_rows(setup.arm.model) < FULL_POSE:
         yield held_rows(setup.arm)
     if bus.bit_error_rate > 0 and pdos:

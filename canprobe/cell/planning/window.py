@@ -25,7 +25,7 @@ from canprobe.fieldbus.protocol.tactile import WINDOWS
 
 FOLLOWING_TAXELS = 0.75
 """By how much the contact's centroid may be off the middle of the window before the window moves."""
-TOLERATED = 0.05
+TOLERATED_LOSS_SHARE = 0.05
 """Share of the force that a window may miss without a warning; the array itself errs by as much."""
 CARRIED_SIDE, CARRIED_SHARE = 6, 0.5
 """Smallest window, and share of the force inside, from which the rest of a patch follows."""
@@ -127,10 +127,10 @@ def cut_patch(setup: Setup) -> CutPatch | None:
     force, probe, side, most = touch.force, touch.probe, int(touch.array.window), setup.limits.force_max
     pitch = touch.array.pad.pitch_m
     share = measured_share(force, probe, side, pitch)
-    if share >= 1.0 - TOLERATED:
+    if share >= 1.0 - TOLERATED_LOSS_SHARE:
         return None
     windows = windows_of(touch.array)
-    enough = [wider for wider in windows if measured_share(force, probe, wider, pitch) >= 1.0 - TOLERATED]
+    enough = [wider for wider in windows if measured_share(force, probe, wider, pitch) >= 1.0 - TOLERATED_LOSS_SHARE]
     ways = (f"sensor.window = {enough[0]}" if enough else 'sensor.mode = "image"', "a smaller task.force_n")
     across = patch_across_taxels(force, probe, pitch)
     cuts = (

@@ -19,7 +19,7 @@ from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.cia402 import known_state
 from canprobe.mechanics.touch.stops import TOUCH_FORCE
 
-MOST_LOST = 5
+MAX_LOST_SYNCS = 5
 """A SYNC counter that jumps by more was restarted."""
 
 
@@ -79,7 +79,7 @@ class LogCycles:
     def _lost(self, before: int, counter: int) -> int:
         """How many SYNCs are missing in the log between two counters; they have a number and a time too."""
         lost = (counter - before - 1) % self._overflow if before and counter else 0
-        return lost if lost <= MOST_LOST else 0
+        return lost if lost <= MAX_LOST_SYNCS else 0
 
 
 def _check_states(drives: DriveGroup) -> None:

@@ -29,7 +29,7 @@ from canprobe.fieldbus.bus.port import TimedFrame
 from canprobe.fieldbus.protocol.sync import is_sync
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 
-LOGGED = ("phase", "depth_at_1n_mm")
+TASK_COLUMNS = ("phase", "depth_at_1n_mm")
 """Columns of the task that the bridges use."""
 
 
@@ -122,7 +122,7 @@ def _observations_of(
     start_ns = round(run.start_s * 1e9)
     waiting = next(groups, [])
     deadlines = [*run.times_ns[1:].tolist(), math.inf]
-    names = [name for name in LOGGED if name in run.log]
+    names = [name for name in TASK_COLUMNS if name in run.log]
     for k, m in enumerate(run.measurements()):
         frames: list[TimedFrame] = []
         while waiting and waiting[0][2] - start_ns < deadlines[k]:

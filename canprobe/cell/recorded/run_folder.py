@@ -23,7 +23,7 @@ from canprobe.errors import UsageError
 from canprobe.fieldbus.protocol.cia402 import DriveState, known_state
 from canprobe.fieldbus.protocol.tactile import Features, TactileHeader, TactileMode
 
-LEAVING = (Phase.RETREAT, Phase.DONE)
+LEAVING_PHASES = (Phase.RETREAT, Phase.DONE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +147,7 @@ def replay_task(plan: Plan, run: RunFolder) -> TouchTask | None:
         if not np.isfinite(phase):  # the cell enabled, held, lifted off or stopped: it did not step its controller
             continue
         task.step(measurement)
-        if phase in LEAVING and task.phase not in LEAVING:  # the cell asked it to let go
+        if phase in LEAVING_PHASES and task.phase not in LEAVING_PHASES:  # the cell asked it to let go
             return task
         if phase != task.phase:
             return None

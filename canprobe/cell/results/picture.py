@@ -44,7 +44,7 @@ _STYLE: Any = MappingProxyType(
 )  # fmt: skip
 _LETTER_IN = 0.062
 """Mean width of a letter of a legend."""
-LEAST_DEPTH = 6.0
+MIN_DEPTH_MM = 6.0
 """Least height of a box, mm: a plane's is not flat."""
 
 
@@ -139,7 +139,7 @@ def _number(value: float) -> str:
 def box(part: Part, axes: Any, title: str, labels: Sequence[str], *, elev: float, azim: float) -> None:
     """Axes in three dimensions that fill their part: one scale for all, ticks as each side has room for them."""
     low, high = axes.get_zlim()
-    spare = max(0.0, LEAST_DEPTH - (high - low)) / 2
+    spare = max(0.0, MIN_DEPTH_MM - (high - low)) / 2
     axes.set_zlim(low - spare, high + spare)
     axes.set_aspect("equal")
     axes.view_init(elev=elev, azim=azim)

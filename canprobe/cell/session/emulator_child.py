@@ -24,7 +24,7 @@ from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE
 
 REPORT_EVERY_S = 10.0
 END_TIMEOUT_S = 10.0
-SERVING = "serving "
+SERVING_WORD = "serving "
 """What the process says when it serves."""
 TRUTH_SHARE = 0.2
 """Time that the nodes may take at their end to work out what was true, over the time that they ran."""
@@ -115,7 +115,7 @@ class EmulatorChild(ChildProcess):
         if self._scene.sensor is None or self._scene.array_is_node or not self._scene.sensor.emulated:
             return True
         assert self._errors is not None
-        return SERVING.encode() in os.pread(self._errors.fileno(), 1 << 16, 0)  # without moving the child's place in it
+        return SERVING_WORD.encode() in os.pread(self._errors.fileno(), 1 << 16, 0)  # leaves the child's place in it
 
     def _raise_late(self, node_id: int) -> NoReturn:
         raise NodeError(

@@ -13,9 +13,9 @@ from typing import TextIO
 Progress = Callable[[float, float], None]
 """Called with what is done and the whole, in one unit."""
 COLOURS = {"bold": "1", "red": "31", "green": "32", "yellow": "33", "cyan": "36"}
-NARROW = 16
+MIN_COLUMNS = 16
 """Columns below which no cell of a table is broken, and no bar is drawn."""
-MARKS = ("warning", "noted", "fault")
+MARKED_WORDS = ("warning", "noted", "fault")
 
 
 def columns(stream: TextIO) -> int | None:
@@ -50,7 +50,7 @@ class Report:
 
     def say(self, line: str) -> None:
         """Report one step; a warning comes through however quiet the command is."""
-        mark = next((mark for mark in MARKS if line.startswith(f"{mark}:")), None)
+        mark = next((mark for mark in MARKED_WORDS if line.startswith(f"{mark}:")), None)
         if mark is None and self.verbosity < 0:
             return
         self._write(line if mark is None else painted(mark, "yellow", self._stream) + line.removeprefix(mark))
@@ -88,7 +88,7 @@ class Report:
             share = min(max(done / total, 0.0), 1.0) if total > 0 else 1.0
             text = f" {int(100 * share):3d} %  {done:{form}} of {total:{form}} {name}"
             room = min((columns(self._stream) or 80) - len(text) - 1, 60)
-            drawn = ("█" * round(room * share)).ljust(room, "░") if room >= NARROW else ""
+            drawn = ("█" * round(room * share)).ljust(room, "░") if room >= MIN_COLUMNS else ""
             if (now := f"{drawn} {int(100 * share)}") != shown:
                 shown, self._bar = now, f"{painted(drawn, 'cyan', self._stream)}{text}"
                 self._stream.write(f"\r{self._bar}\x1b[K")

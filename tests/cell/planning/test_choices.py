@@ -14,7 +14,7 @@ from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.open_keys import opened, second_channel
 from canprobe.cell.planning.report import plan_text
 from canprobe.cell.planning.report_json import plan_dict
-from canprobe.cell.planning.warnings import ON_THIS_MACHINE
+from canprobe.cell.planning.warnings import LOCAL_GROUP
 from canprobe.cell.planning.window import (
     cut_patch,
     measured_share,
@@ -251,7 +251,7 @@ def test_features_and_the_whole_image_cut_nothing():
         ("ff15:7079:7468:6f6e:6465:6d6f:6d63:6173", False),
         ("ff02::1", False),
         ("fd00::1", False),
-        (ON_THIS_MACHINE, True),
+        (LOCAL_GROUP, True),
         ("ff01::2", True),
     ],
 )
@@ -260,7 +260,7 @@ def test_a_bus_that_other_machines_hear_is_a_warning_with_the_way_to_restrict_it
     assert len(plan.warnings) == (not local)
     for warning in plan.warnings:
         assert warning.startswith(f"bus.channel = {channel}: every machine on this network segment hears this bus")
-        assert warning.endswith(f"--channel {ON_THIS_MACHINE} keeps it on this machine")
+        assert warning.endswith(f"--channel {LOCAL_GROUP} keeps it on this machine")
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from canprobe.cell.planning.warnings import ON_THIS_MACHINE
+from canprobe.cell.planning.warnings import LOCAL_GROUP
 from canprobe.cli import main
 from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
@@ -59,14 +59,14 @@ def test_stored_values_are_there_again_each_with_its_node(served, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("channel", "wide"), [("239.74.163.2", True), ("ff15::1", True), (ON_THIS_MACHINE, False), ("ff01::2", False)]
+    ("channel", "wide"), [("239.74.163.2", True), ("ff15::1", True), (LOCAL_GROUP, False), ("ff01::2", False)]
 )
 @pytest.mark.parametrize("what", [("free", "--nodes", "1"), ("--eds", "puma260_joint", "--node-id", "1")])
 def test_nodes_that_other_machines_reach_are_served_with_the_warning_of_a_run(served, capsys, what, channel, wide):
     assert served(lambda _: None, "--bus", "udp_multicast", "--channel", channel, what=what) == 0
     warned = (
         f"warning: bus.channel = {channel}: every machine on this network segment hears this bus and can command its"
-        f" nodes; --channel {ON_THIS_MACHINE} keeps it on this machine"
+        f" nodes; --channel {LOCAL_GROUP} keeps it on this machine"
     )
     assert (warned in capsys.readouterr().err) is wide
 
