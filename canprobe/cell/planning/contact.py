@@ -16,7 +16,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.cell.planning.window import measured_share
 from canprobe.cell.scene.setup import Array, Calibrate, Probe, Touch
@@ -24,8 +23,8 @@ from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.inverse import FIXED_POLE, task_rows
 from canprobe.mechanics.robot.motors import position_per_unit
 from canprobe.mechanics.touch.stops import MAX_FORCE_SPREAD, OFF_PAD_EDGE_SHARE, OFF_PAD_SIGMAS
+from canprobe.mechanics.types import Floats
 
-Floats = NDArray[np.float64]
 GAIN_SPREAD = 0.05
 """By which one taxel shows more than another: at the edge it may seem to be pressed harder by as much."""
 BLUR_TAXELS = 0.72

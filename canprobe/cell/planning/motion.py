@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,37 +12,27 @@ from numpy.typing import NDArray
 from canprobe.cell.planning.contact import contact_problems, saturation_problem
 from canprobe.cell.planning.first_touch import first_touch_problems
 from canprobe.cell.planning.model import JointSpeeds
-from canprobe.cell.planning.surface_path import Array, SurfacePath, _mm, surface_path
+from canprobe.cell.planning.surface_path import SurfacePath, in_mm, surface_path
+from canprobe.cell.planning.task_way import joints_on_way, over_path, poles_at_contacts, round_ball
 from canprobe.cell.scene.setup import Arm, Calibrate, Free, Probe, SafetyLimits, Setup, Touch
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.chain import forward, forward_jacobian
-from canprobe.mechanics.robot.inverse import FIXED_POLE, LENGTH_M, in_rows, inverse_near, task_rows
+from canprobe.mechanics.robot.inverse import LENGTH_M, in_rows, inverse_near, task_rows
 from canprobe.mechanics.robot.probe_poses import probe_pose, start_posture
-from canprobe.mechanics.touch.probe_motion import (
-    EXTRA_CLEARANCE_M,
-    MOVE_SPEED,
-    RETREAT_SPEED,
-    ROUND_SPEED,
-    SETTLE_S,
-    ArcMotion,
-    LineMotion,
-    PoseSteps,
-)
-from canprobe.mechanics.touch.servo import ProbePose
+from canprobe.mechanics.types import Floats
 
-_METRES = 6e-3  # a place so near the origin of the base was hardly meant in mm; the lifted start may add some mm
-_BRANCH_RAD = 0.3  # between two points of a path; farther away lies another branch
-_SINGULAR = 1e-3  # of the Jacobian in rows of a posture from which an arm cannot go on
-_TOUCH_TO_TOUCH_RAD = 1.0  # between the touches of a calibration, and from the approach to the first contact
+_METRES_GUESS_M = (
+    6e-3  # a place so near the origin of the base was hardly meant in mm; the lifted start may add some mm
+)
+_PATH_MOVE_RAD = 0.3  # between two points of a path; farther away lies another branch
+_MIN_SINGULAR = 1e-3  # of the Jacobian in rows of a posture from which an arm cannot go on
+_TOUCH_MOVE_RAD = 1.0  # between the touches of a calibration, and from the approach to the first contact
 DEVIATION_RAD = math.radians(1.0)
 """By which the joints of a touch may go beyond its planned way, which knows neither the depth nor the servo; for a
 prismatic one see `ArmModel.radian`. Without the last retreat, which no stop ends; near a singular posture there is no
 such bound."""
-PARKED_ABOVE = 5e-3
+PARKED_ABOVE_M = 5e-3
 """How far above the approach's first point an emulated arm stands at power on, m."""
-
-
-# Can the arm do it: reach, joint stops and joint speeds along the whole path.
 
 
 def check_motion(setup: Setup) -> tuple[JointSpeeds | None, list[str]]:
@@ -62,7 +51,7 @@ def check_motion(setup: Setup) -> tuple[JointSpeeds | None, list[str]]:
             case Calibrate() as task:
                 ball, q_start = task, _beginning(setup, task, _over_ball(task))
                 _follow(task.arm, task.probe, _over_ball(task), q_start)
-                joints = _gone(task.arm, task.probe, q_start, lambda pose: _round_ball(ball, pose))
+                joints = joints_on_way(task.arm, task.probe, q_start, lambda pose: round_ball(ball, pose))
                 speeds, found = stops.speeds(np.zeros_like(task.arm.q_start)), stops.problems(joints, touching=True)
                 kappas = np.full((1, 2), 1.0 / task.ball_radius)
                 found += [problem] if (problem := saturation_problem(task, kappas)) is not None else []
@@ -70,7 +59,7 @@ def check_motion(setup: Setup) -> tuple[JointSpeeds | None, list[str]]:
             case Touch() as task:
                 path = surface_path(task, setup.truth.object)
                 problems += _hollow_problems(path, task.probe)
-                contacts = [*_along_path(task, path)][_BEFORE_CONTACT:]
+                contacts = [*_along_path(task, path)][_POSES_BEFORE_CONTACT:]
                 speeds, found = _check_touch(task, path, stops, _beginning(setup, task, contacts))
                 if path.hollow_radius > task.probe.radius:
                     found += first_touch_problems(setup, task, path.kappas[0].tolist())
@@ -81,7 +70,7 @@ def check_motion(setup: Setup) -> tuple[JointSpeeds | None, list[str]]:
     return speeds, problems + found
 
 
-def parked_posture(setup: Setup, arm: Arm) -> Array:
+def parked_posture(setup: Setup, arm: Arm) -> Floats:
     """Where an emulated arm stands at power on, (n,) rad or m: above the start of a touch, else as in the scene.
 
     Raises:
@@ -99,18 +88,18 @@ def parked_posture(setup: Setup, arm: Arm) -> Array:
             arm.q_start,
             radius_m=touch.probe.radius,
             T_flange_probe=touch.probe.T_flange_probe,
-            clearance_m=clearance + PARKED_ABOVE,
+            clearance_m=clearance + PARKED_ABOVE_M,
         )
     except (PlanError, ValueError) as error:
         raise PlanError(
             [
-                f"task.clearance_mm = {1e3 * clearance:g}: an emulated arm begins {1e3 * PARKED_ABOVE:g} mm above it,"
+                f"task.clearance_mm = {1e3 * clearance:g}: an emulated arm begins {1e3 * PARKED_ABOVE_M:g} mm above it,"
                 f" and cannot: {error}; lower it, move the object, or set start_deg of the joints to another branch"
             ]
         ) from error
 
 
-def reach_problems(setup: Setup, task: Touch, poses: Iterable[tuple[Array, Array]]) -> list[str]:
+def reach_problems(setup: Setup, task: Touch, poses: Iterable[tuple[Floats, Floats]]) -> list[str]:
     """Why the arm of a touch cannot go through poses of its probe.
 
     Args:
@@ -118,7 +107,7 @@ def reach_problems(setup: Setup, task: Touch, poses: Iterable[tuple[Array, Array
         task: of it.
         poses: centre (3,), m, and pole (3,) away from the object, base frame.
     """
-    targets = [_Pose(centre, pole, _TOUCH_TO_TOUCH_RAD, "out of reach: {why}") for centre, pole in poses]
+    targets = [_Pose(centre, pole, _TOUCH_MOVE_RAD, "out of reach: {why}") for centre, pole in poses]
     try:
         return _Stops(task.arm, setup.limits).problems(_follow(task.arm, task.probe, targets, task.arm.q_start))
     except PlanError as error:
@@ -137,13 +126,13 @@ def _lacking_rows(setup: Setup) -> str | None:
     held = in_rows(rows, T[:3, :3], J) * arm.model.radian
     held[:3] /= LENGTH_M
     weakest = float(np.linalg.svd(held, compute_uv=False)[-1]) if len(held) <= arm.model.n else 0.0
-    if weakest > _SINGULAR:
+    if weakest > _MIN_SINGULAR:
         return None
     what = {3: "its position", 5: "its position and pole", 6: "its pose"}[rows]
     return (
         f"joints: in its start posture the {name} arm of {arm.model.n} joints cannot move the probe's centre and pole "
-        f"in every direction that a touch needs ({what}; smallest singular value {weakest:.2g}, needed {_SINGULAR:g}): "
-        "start from another posture, or use an arm that can"
+        f"in every direction that a touch needs ({what}; smallest singular value {weakest:.2g}, needed "
+        f"{_MIN_SINGULAR:g}): start from another posture, or use an arm that can"
     )
 
 
@@ -154,7 +143,7 @@ class _Stops:
     arm: Arm
     limits: SafetyLimits
 
-    def inside(self, low: Array, high: Array) -> NDArray[np.bool_]:
+    def inside(self, low: Floats, high: Floats) -> NDArray[np.bool_]:
         """For each joint whether a range of positions, (n,) rad or m each, is allowed."""
         model = self.arm.model
         margin = self.limits.joint_margin
@@ -175,7 +164,7 @@ class _Stops:
             for i in np.flatnonzero(~self.inside(q, q)).tolist()
         ]
 
-    def problems(self, joints: Array, *, touching: bool = False) -> list[str]:
+    def problems(self, joints: Floats, *, touching: bool = False) -> list[str]:
         """Joints that would leave their range, of positions (m, n) rad or m; a touch may lead them somewhat farther."""
         its, farther = self.arm.model.joints, DEVIATION_RAD * touching * self.arm.model.radian
         low, high = joints.min(axis=0), joints.max(axis=0)
@@ -187,7 +176,7 @@ class _Stops:
             for i in np.flatnonzero(~self.inside(low - farther, high + farther)).tolist()
         ]
 
-    def speeds(self, needed: Array) -> JointSpeeds:
+    def speeds(self, needed: Floats) -> JointSpeeds:
         """Needed speeds (n,), rad/s or m/s, beside what is allowed."""
         joints, limit = self.arm.model.joints, self.arm.model.qd_max * self.limits.speed_share
         return JointSpeeds(
@@ -207,7 +196,7 @@ def _too_fast(arm: Arm, speeds: JointSpeeds, way_out: str) -> list[str]:
     ]
 
 
-def _beginning(setup: Setup, task: Touch | Calibrate, contacts: Iterable[_Pose]) -> Array:
+def _beginning(setup: Setup, task: Touch | Calibrate, contacts: Iterable[_Pose]) -> Floats:
     """Where the arm moves from, (n,) rad or m, as far as it is known.
 
     Raises:
@@ -222,35 +211,27 @@ def _beginning(setup: Setup, task: Touch | Calibrate, contacts: Iterable[_Pose])
         raise
 
 
-def _check_touch(task: Touch, path: SurfacePath, stops: _Stops, q_start: Array) -> tuple[JointSpeeds | None, list[str]]:
+def _check_touch(
+    task: Touch, path: SurfacePath, stops: _Stops, q_start: Floats
+) -> tuple[JointSpeeds | None, list[str]]:
     joints = _follow(task.arm, task.probe, _along_path(task, path), q_start)
-    gone = _gone(task.arm, task.probe, q_start, lambda pose: _over_path(task, path, pose))
+    gone = joints_on_way(task.arm, task.probe, q_start, lambda pose: over_path(task, path, pose))
     problems = stops.problems(gone, touching=True)
     if path.hollow_radius > task.probe.radius:  # a tighter hollow is refused as that
-        at_contacts = joints[_BEFORE_CONTACT:]
+        at_contacts = joints[_POSES_BEFORE_CONTACT:]
         problems += contact_problems(task, at_contacts, path.normals, path.kappas, stops.limits.force_max)
     approach = task.approach
-    down = stops.speeds(np.abs(joints[_BEFORE_CONTACT] - joints[1]) / approach.clearance * approach.speed)
+    down = stops.speeds(np.abs(joints[_POSES_BEFORE_CONTACT] - joints[1]) / approach.clearance * approach.speed)
     slowly = 1e3 * approach.speed / max(down.worst_share, 1.0) * 0.99
     problems += _too_fast(task.arm, down, f"lower task.approach_mm_s to {slowly:.3g}")
     if task.scan is None:
         return stops.speeds(np.zeros_like(task.arm.q_start)), problems
     steps = np.linalg.norm(np.diff(path.points, axis=0), axis=1)
-    rates = np.abs(np.diff(joints[_BEFORE_CONTACT:], axis=0)) / steps[:, None] * task.scan.speed
+    rates = np.abs(np.diff(joints[_POSES_BEFORE_CONTACT:], axis=0)) / steps[:, None] * task.scan.speed
     speeds = stops.speeds(rates.max(axis=0))
     possible = 1e3 * task.scan.speed / max(speeds.worst_share, 1.0) * 0.99
     way_out = f"lower task.speed_mm_s to {possible:.3g}, turn task.heading_deg, or raise task.rolling_share"
     return speeds, problems + _too_fast(task.arm, speeds, way_out)
-
-
-def _poles(task: Touch, path: SurfacePath) -> Array:
-    """(n, 3) pole of the probe, away from the object, at each contact."""
-    fixed = task_rows(task.arm.model) == FIXED_POLE
-    share = task.scan.rolling_share if task.scan is not None else float(fixed)
-    kept = task.approach.normal if fixed else path.normals[0]  # the probe keeps the pole of its first contact
-    poles = (1 - share) * path.normals + share * kept
-    unit: Array = poles / np.linalg.norm(poles, axis=1)[:, None]
-    return unit
 
 
 def _check_swing(task: Free, stops: _Stops, *, starts: bool) -> tuple[JointSpeeds, list[str]]:
@@ -283,26 +264,31 @@ class _Pose:
         out_of_reach: message, to be filled with why.
     """
 
-    centre: Array
-    pole: Array
+    centre: Floats
+    pole: Floats
     most_rad: float
     out_of_reach: str
 
 
-_BEFORE_CONTACT = 2
+_POSES_BEFORE_CONTACT = 2
 
 
 def _along_path(task: Touch, path: SurfacePath) -> Iterator[_Pose]:
     """The beginning of the approach and the lifted start, then the contacts."""
-    radius, poles, approach = task.probe.radius, _poles(task, path), task.approach
+    radius, poles, approach = task.probe.radius, poles_at_contacts(task, path), task.approach
     above = approach.start + approach.normal * approach.clearance
     lifted = path.points[0] + path.normals[0] * approach.clearance
     points, normals = (above, lifted, *path.points), (approach.normal, path.normals[0], *path.normals)
-    turns = (math.inf, _TOUCH_TO_TOUCH_RAD, _TOUCH_TO_TOUCH_RAD, *(_BRANCH_RAD for _ in path.points[1:]))
+    turns = (
+        math.inf,
+        _TOUCH_MOVE_RAD,
+        _TOUCH_MOVE_RAD,
+        *(_PATH_MOVE_RAD for _ in path.points[1:]),
+    )
     for point, normal, pole, most_rad in zip(points, normals, (approach.normal, poles[0], *poles), turns, strict=True):
-        metres = " (are these metres?)" if np.abs(point).max() < _METRES else ""
+        metres = " (are these metres?)" if np.abs(point).max() < _METRES_GUESS_M else ""
         out_of_reach = (
-            f"task: contact at {_mm(point)} mm{metres} out of reach: {{why}}; move the object, shorten the probe "
+            f"task: contact at {in_mm(point)} mm{metres} out of reach: {{why}}; move the object, shorten the probe "
             "or the path, or set start_deg of the joints to another branch"
         )
         yield _Pose(point + radius * normal, pole, most_rad, out_of_reach)
@@ -317,10 +303,10 @@ def _over_ball(task: Calibrate) -> Iterator[_Pose]:
         )
         for gap in (task.approach.clearance, 0.0):
             centre = task.ball_centre + (task.ball_radius + task.probe.radius + gap) * touch.n_base
-            yield _Pose(centre, -touch.pole_base, _TOUCH_TO_TOUCH_RAD, out_of_reach)
+            yield _Pose(centre, -touch.pole_base, _TOUCH_MOVE_RAD, out_of_reach)
 
 
-def _follow(arm: Arm, probe: Probe, poses: Iterable[_Pose], q_start: Array) -> Array:
+def _follow(arm: Arm, probe: Probe, poses: Iterable[_Pose], q_start: Floats) -> Floats:
     """Joint positions at the poses (m, n), rad or m, each near the one before, from those at the beginning (n,) on.
 
     Raises:
@@ -328,7 +314,7 @@ def _follow(arm: Arm, probe: Probe, poses: Iterable[_Pose], q_start: Array) -> A
     """
     q = q_start
     x_hint = (forward(arm.model.chain, q) @ probe.T_flange_probe)[:3, 0]
-    found: list[Array] = []
+    found: list[Floats] = []
     for pose in poses:
         try:
             T_base_probe = probe_pose(pose.centre, pose.pole, 0.0, x_hint)
@@ -338,72 +324,3 @@ def _follow(arm: Arm, probe: Probe, poses: Iterable[_Pose], q_start: Array) -> A
             raise PlanError([pose.out_of_reach.format(why=error)]) from error
         found.append(q)
     return np.array(found)
-
-
-# The way that the task will take, in time, and the joints on it: the same steps as the task's, though longer ones.
-
-# longest step: for the null space, the linear and the angular rows
-_LONGEST_S, _LONGEST_M, _LONGEST_RAD = 0.05, 1e-3, 0.02
-_AT_LEAST = 4  # steps between two poses
-_Timed = tuple[ProbePose, float]
-
-
-def _gone(arm: Arm, probe: Probe, q_start: Array, way: Callable[[ProbePose], Iterable[_Timed]]) -> Array:
-    """Joint positions (m, n), rad or m, on the way of a task.
-
-    Args:
-        arm, probe: what moves.
-        q_start: (n,) where it begins.
-        way: from the pose of the beginning, the poses of the task, each with the time to it from the one before, s.
-    """
-    steps = PoseSteps(arm.model, probe.T_flange_probe, q_start)
-    before = ProbePose(np.array(steps.at.flange), np.array(steps.at.z))
-    q, found = q_start.tolist(), [q_start.tolist()]
-    for pose, seconds in way(before):
-        moved = float(np.linalg.norm(pose.centre - before.centre)) / _LONGEST_M
-        turned = float(np.linalg.norm(pose.pole - before.pole)) / _LONGEST_RAD
-        count = max(_AT_LEAST, math.ceil(max(moved, turned, seconds / _LONGEST_S)))
-        for share in (np.arange(count) + 1) / count:
-            pole = before.pole + share * (pose.pole - before.pole)
-            between = ProbePose(before.centre + share * (pose.centre - before.centre), pole / np.linalg.norm(pole))
-            q = [a + step for a, step in zip(q, steps.step(q, between, seconds / count), strict=True)]
-            found.append(q)
-        before = pose
-    return np.array(found)
-
-
-def _over_path(task: Touch, path: SurfacePath, pose: ProbePose) -> Iterator[_Timed]:
-    """To the approach, down, at rest, and once round the path."""
-    approach, radius = task.approach, task.probe.radius
-    above = ProbePose(approach.start + (approach.clearance + radius) * approach.normal, -approach.normal)
-    yield from _moving(LineMotion(pose, above, MOVE_SPEED))
-    poses = [
-        ProbePose(point + radius * normal, -pole)
-        for point, normal, pole in zip(path.points, path.normals, _poles(task, path), strict=True)
-    ]
-    yield ProbePose(poses[0].centre, above.pole), approach.clearance / approach.speed
-    yield poses[0], SETTLE_S
-    if task.scan is not None:
-        for last, here in itertools.pairwise(poses):
-            yield here, float(np.linalg.norm(here.centre - last.centre)) / task.scan.speed
-
-
-def _round_ball(task: Calibrate, pose: ProbePose) -> Iterator[_Timed]:
-    """To each touch, down, and off again."""
-    radii, down_s = task.ball_radius + task.probe.radius, task.approach.clearance / task.approach.speed
-    for touch in task.approaches:
-        above, on, off = (
-            ProbePose(task.ball_centre + (radii + gap) * touch.n_base, touch.pole_base)
-            for gap in (task.approach.clearance, 0.0, task.approach.clearance + EXTRA_CLEARANCE_M)
-        )
-        yield from _moving(ArcMotion(task.ball_centre, pose, above, ROUND_SPEED))
-        yield on, down_s
-        yield from _moving(LineMotion(on, off, RETREAT_SPEED))
-        pose = off
-
-
-def _moving(motion: LineMotion | ArcMotion) -> Iterator[_Timed]:
-    """The poses of a move."""
-    count = max(_AT_LEAST, math.ceil(motion.duration / _LONGEST_S))
-    for k in range(1, count + 1):
-        yield motion.at(motion.duration * k / count), motion.duration / count

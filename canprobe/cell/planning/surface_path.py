@@ -6,14 +6,13 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.cell.planning.contact import edge_margin
 from canprobe.cell.scene.setup import Approach, Touch
 from canprobe.errors import PlanError
 from canprobe.mechanics.touch.shapes import PlacedShape
+from canprobe.mechanics.types import Floats
 
-Array = NDArray[np.float64]
 SAMPLES = 240
 """Points of a path."""
 _STEEPEST = math.radians(70.0)  # the servo steers in the scan plane: steeper than this it cannot follow
@@ -34,9 +33,9 @@ class SurfacePath:
         hollow_radius: smallest concave radius met, m; inf without one.
     """
 
-    points: Array
-    normals: Array
-    kappas: Array
+    points: Floats
+    normals: Floats
+    kappas: Floats
     hollow_radius: float
 
 
@@ -70,17 +69,17 @@ def surface_path(task: Touch, shape: PlacedShape | None) -> SurfacePath:
     return path
 
 
-def _first_contact(shape: PlacedShape, approach: Approach, radius: float) -> Array:
+def _first_contact(shape: PlacedShape, approach: Approach, radius: float) -> Floats:
     """Where a ball first touches, (3,) m across the approach from its end: the path begins there."""
     height = _along(shape, approach.start, approach.normal, radius)
     if height is None or shape.tightest_concave_radius(approach.start[None]) <= radius:
         return np.zeros(3)  # in a hollow that is tighter it touches in two places, which is refused as that
     beside = shape.closest(approach.start + (height + radius) * approach.normal).point - approach.start
-    across: Array = beside - float(beside @ approach.normal) * approach.normal
+    across: Floats = beside - float(beside @ approach.normal) * approach.normal
     return across
 
 
-def _contacts(shape: PlacedShape, plane: Array, up: Array, radius: float) -> SurfacePath:
+def _contacts(shape: PlacedShape, plane: Floats, up: Floats, radius: float) -> SurfacePath:
     """Where a ball of `radius` over each point (n, 3) rests, or the surface itself with 0."""
     contacts = []
     for point in plane:
@@ -88,7 +87,7 @@ def _contacts(shape: PlacedShape, plane: Array, up: Array, radius: float) -> Sur
         if height is None:
             raise PlanError(
                 [
-                    f"task: at {_mm(point)} mm the path leaves the object or meets it steeper than "
+                    f"task: at {in_mm(point)} mm the path leaves the object or meets it steeper than "
                     f"{math.degrees(_STEEPEST):.0f} deg; shorten task.length_mm or task.width_mm, or turn "
                     "task.heading_deg"
                 ]
@@ -99,7 +98,7 @@ def _contacts(shape: PlacedShape, plane: Array, up: Array, radius: float) -> Sur
     return SurfacePath(points, normals, kappas, shape.tightest_concave_radius(points))
 
 
-def _under_ball(shape: PlacedShape, path: SurfacePath, plane: Array, up: Array, radius: float) -> SurfacePath:
+def _under_ball(shape: PlacedShape, path: SurfacePath, plane: Floats, up: Floats, radius: float) -> SurfacePath:
     """The path of a ball whose contacts, not whose centre, lie over the points of the plane."""
     over = plane
     for _ in range(_BALL_STEPS):
@@ -110,7 +109,7 @@ def _under_ball(shape: PlacedShape, path: SurfacePath, plane: Array, up: Array, 
     return _over_patches(path, plane, radius)
 
 
-def _over_patches(path: SurfacePath, plane: Array, radius: float) -> SurfacePath:
+def _over_patches(path: SurfacePath, plane: Floats, radius: float) -> SurfacePath:
     """A ball's path with the normals as its pad shows them: of each point from a linear fit to those near it."""
     beside = plane[None] - plane[:, None]
     weights = np.exp(-0.5 * np.sum((beside / _PATCH_M) ** 2, axis=2))
@@ -122,12 +121,12 @@ def _over_patches(path: SurfacePath, plane: Array, radius: float) -> SurfacePath
     return replace(path, points=path.points + radius * (path.normals - normals), normals=normals)
 
 
-def _mm(point: Array) -> str:
+def in_mm(point: Floats) -> str:
     x, y, z = (1e3 * point).tolist()
     return f"({x:.1f}, {y:.1f}, {z:.1f})"
 
 
-def _along(shape: PlacedShape, point: Array, up: Array, radius: float = 0.0) -> float | None:
+def _along(shape: PlacedShape, point: Floats, up: Floats, radius: float = 0.0) -> float | None:
     """Height along `up` over `point` at which the foot of a ball of `radius` rests on the surface, m, by Newton.
 
     None where the line misses or grazes the surface, or the ball rests on its border.

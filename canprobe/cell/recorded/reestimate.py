@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.cell.npz import write_npz
 from canprobe.cell.planning.make import make_plan
@@ -29,8 +28,8 @@ from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
 from canprobe.errors import ProtocolError, UsageError
 from canprobe.fieldbus.bus.clock_steps import RecordedBus
 from canprobe.mechanics.touch.estimate.fit import METHODS, unknown_method
+from canprobe.mechanics.types import Floats
 
-Array = NDArray[np.float64]
 SCHEMA = 2
 _SCORED = ("kappa_per_m", "direction1", "direction2", "contact_normal", "contact_point_m")
 """Columns of the truth that estimates are scored against."""
@@ -53,7 +52,7 @@ class RecordedContacts:
     tracker: ShapeTracker
     driven_by: str
     start_s: float
-    times_s: Array
+    times_s: Floats
     counts: dict[str, int]
     channel: str | None
     bus: RecordedBus | None = None
@@ -121,7 +120,7 @@ def _summarise(
     }
 
 
-def _truth(file: Path, setup: Setup) -> dict[str, Array]:
+def _truth(file: Path, setup: Setup) -> dict[str, Floats]:
     """The plant's truth, one row per SYNC; empty without the file, or where nothing happened."""
     columns = read_truth(file, setup) if file.exists() else {}
     if not columns or not len(next(iter(columns.values()))):
@@ -159,7 +158,7 @@ def _online(folder: Path, setup: Setup, records: Sequence[ShapeRecord]) -> dict[
     }
 
 
-def _changes(K: Array) -> Array:
+def _changes(K: Floats) -> Floats:
     """The rows (m, 2, 2) of (n, 2, 2) that differ from the row before."""
     new = np.ones(len(K), bool)
     new[1:] = (K[1:] != K[:-1]).any(axis=(1, 2))
@@ -230,7 +229,7 @@ class ReplayResult:
 
     def save(self, path: Path | str) -> None:
         """Write the estimates as columns, ``<method>_<column>``, into a compressed npz file, exactly that file."""
-        columns: dict[str, Array] = {}
+        columns: dict[str, Floats] = {}
         for method, records in self.estimates.items():
             columns |= {f"{method}_{name}": values for name, values in estimate_columns(records).items()}
         write_npz(Path(path), columns)

@@ -19,7 +19,7 @@ refuses to be read before. All files of a run count time from the 0 of its `bus.
     surface_file   a surface map as a file
     tool_file      a found tool centre as a file
     array_report   what a calibration of an array found
-    figures, plan_figure, surface_figure, surface_panels   pictures, in the one look of `picture`
+    figures, plan_figure, surface_figure, surface_sheet, surface_panels   pictures, in the one look of `picture`
     page           a run as a page that replays it
 
 Matplotlib is imported where pictures are drawn only.

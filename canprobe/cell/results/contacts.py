@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.cell.results.scores import ShapeScore, score_shape
 from canprobe.cell.scene.setup import Touch
@@ -18,9 +17,9 @@ from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 from canprobe.mechanics.touch.estimate.online import Dropped, Estimator, Gate
+from canprobe.mechanics.types import Floats
 
-Array = NDArray[np.float64]
-ASKED_EVERY_S = 0.1
+ESTIMATE_PERIOD_S = 0.1
 """Time between two answers of an estimator that is scored afterwards."""
 
 
@@ -44,12 +43,12 @@ class Contacts:
         samples: as the estimators took them, with times since the first SYNC, s.
     """
 
-    t_s: Array
-    points: Array
-    normals: Array
-    forces: Array
-    covariances: Array
-    normal_covariances: Array
+    t_s: Floats
+    points: Floats
+    normals: Floats
+    forces: Floats
+    covariances: Floats
+    normal_covariances: Floats
     sigma_normal: float
     coupling: float
     samples: tuple[ContactSample, ...]
@@ -138,8 +137,8 @@ def score_estimators(
     task: Touch,
     estimators: Mapping[str, str | Callable[[], OwnEstimator]],
     *,
-    truth: Mapping[str, Array],
-    sync_times: Array,
+    truth: Mapping[str, Floats],
+    sync_times: Floats,
 ) -> Scores:
     """Feed the contacts of a scan to each estimator, as the loop would have, and score its answers.
 
@@ -150,7 +149,7 @@ def score_estimators(
         truth: columns of the plant's truth, one row a SYNC.
         sync_times: time of each SYNC on the clock of the samples (n,), s.
     """
-    every, clock, scores = max(1, round(ASKED_EVERY_S * task.array.rate_hz)), MonotonicClock(), Scores()
+    every, clock, scores = max(1, round(ESTIMATE_PERIOD_S * task.array.rate_hz)), MonotonicClock(), Scores()
     for name, what in estimators.items():
         estimator: Estimator = make_shape_estimator(task, what) if isinstance(what, str) else _Renewed(what)
         before_ns = clock.now_ns()

@@ -24,15 +24,16 @@ from canprobe.cell.results.picture import (
     sheet,
 )
 from canprobe.cell.results.run_data import RunData
-from canprobe.cell.results.surface_panels import Array, MapPlane, add_sheet, map_surface, true_surface
+from canprobe.cell.results.surface_panels import MapPlane, add_sheet, map_surface, true_surface
 from canprobe.cell.tasks.probing import Phase
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.patch.array_calibration import NO_FORCE_REFERENCE
+from canprobe.mechanics.types import Floats
 
 Panel = Callable[[SubFigure, RunData], None]
 TWO_SIGMA = 1.96
-LEAST_SPAN = 1.0
+MIN_SPAN_PER_M = 1.0
 """Least height of the panel of curvatures, 1/m: a plane's estimates are not blown up."""
 
 
@@ -168,17 +169,17 @@ def _draw_curvature(part: SubFigure, result: RunData) -> None:
         axes.plot(travelled, true, color=INK, linestyle="--", label="true")
         seen = kappa[np.isfinite(kappa)]
         if len(seen):  # nor does an edge that is far sharper than all that was estimated
-            span = max(np.ptp(seen), LEAST_SPAN)
+            span = max(np.ptp(seen), MIN_SPAN_PER_M)
             limits.append(np.clip(true, seen.min() - span, seen.max() + span))
     if limits:
         low, high = min(map(np.min, limits)), max(map(np.max, limits))
-        spare = max(0.12 * (high - low), 0.5 * (LEAST_SPAN - (high - low)))
+        spare = max(0.12 * (high - low), 0.5 * (MIN_SPAN_PER_M - (high - low)))
         axes.set_ylim(low - spare, high + spare)
     axes.set(title="principal curvatures", xlabel="path of the contact (mm)", ylabel="curvature (1/m)")
     legend(part)
 
 
-def _kappa_sigma(record: ShapeRecord) -> Array:
+def _kappa_sigma(record: ShapeRecord) -> Floats:
     """Standard deviations (2,) of the principal curvatures, from the covariance of K along its directions."""
     estimate = record.estimate
     axes = estimate.T_frame_contact[:3, :2]

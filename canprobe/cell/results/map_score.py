@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from canprobe.cell.results.scores import Array
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.mechanics.touch.consistency import PARTS, Consistency, check_consistency
 from canprobe.mechanics.touch.surface_map import LocalPatch, SurfaceMap, merge_patches
+from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     pass
@@ -64,7 +64,7 @@ def _verdict(consistency: Consistency, part: str) -> dict[str, float | None]:
     return {name: value if math.isfinite(value) else None for name, value in figures.items()}
 
 
-def estimate_columns(records: Sequence[ShapeRecord]) -> dict[str, Array]:
+def estimate_columns(records: Sequence[ShapeRecord]) -> dict[str, Floats]:
     """Estimates as columns, one row each; the suffix of a name is its unit."""
     answers = [r.estimate for r in records]
     return {

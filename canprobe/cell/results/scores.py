@@ -7,28 +7,27 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.noise import Correlation
 
-Array = NDArray[np.float64]
 RUN_IN_M = 0.020
 """Path after which the answers of an estimator count."""
 CHECKPOINTS = 12
 
 
-def curvature_tensor(kappa: Array, direction1: Array, direction2: Array) -> Array:
+def curvature_tensor(kappa: Floats, direction1: Floats, direction2: Floats) -> Floats:
     """Curvature tensor (3, 3), 1/m, from principal curvatures (2,) and unit directions (3,)."""
-    tensor: Array = kappa[0] * np.outer(direction1, direction1) + kappa[1] * np.outer(direction2, direction2)
+    tensor: Floats = kappa[0] * np.outer(direction1, direction1) + kappa[1] * np.outer(direction2, direction2)
     return tensor
 
 
-def score_contact(truth: Mapping[str, Array], first: int, last: int, target_n: float) -> dict[str, float | None]:
+def score_contact(truth: Mapping[str, Floats], first: int, last: int, target_n: float) -> dict[str, float | None]:
     """Force, contact and speed over cycles ``first`` ≤ k < ``last``.
 
     Args:
@@ -77,7 +76,7 @@ class ShapeScore:
     patch_fraction: float | None = None
 
 
-def score_shape(records: Sequence[ShapeRecord], truth: Mapping[str, Array], sync_times: Array) -> ShapeScore:
+def score_shape(records: Sequence[ShapeRecord], truth: Mapping[str, Floats], sync_times: Floats) -> ShapeScore:
     """Score estimates against the truth at the instants of their last samples.
 
     Args:
@@ -122,8 +121,8 @@ def score_shape(records: Sequence[ShapeRecord], truth: Mapping[str, Array], sync
 
 def bound_of_scan(
     samples: Sequence[ContactSample],
-    truth: Mapping[str, Array],
-    sync_times: Array,
+    truth: Mapping[str, Floats],
+    sync_times: Floats,
     *,
     memory_m: float,
     sigma_normal: float,
@@ -172,5 +171,5 @@ def bound_of_scan(
     return float(np.sqrt(mean)) if np.isfinite(mean) else None
 
 
-def _pair(values: Array) -> tuple[float, float]:
+def _pair(values: Floats) -> tuple[float, float]:
     return float(values[0]), float(values[1])

@@ -29,8 +29,7 @@ from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.cell.tasks.task import TaskRecord
 from canprobe.errors import ResultsError, UsageError
 from canprobe.fieldbus.bus.files import write_text
-
-Array = NDArray[np.float64]
+from canprobe.mechanics.types import Floats
 
 
 def summarise(
@@ -83,7 +82,7 @@ def summarise(
     return {name: _without_nan(value) for name, value in summary.items()}
 
 
-def log_columns(cell: Cell) -> dict[str, Array]:
+def log_columns(cell: Cell) -> dict[str, Floats]:
     """The columns of ``log.npz``, on the run's clock; a run that was stopped before its first cycle has no row."""
     return _on_run_clock({"t_s": np.empty(0), **cell.log.arrays()}, cell)
 
@@ -130,12 +129,12 @@ def _traffic(session: Session) -> dict[str, Any]:
     return {channel: {"as_planned": None if n == 0 else False, "error_frames": n} for channel, n in errors.items()}
 
 
-def _truth(session: Session) -> dict[str, Array]:
+def _truth(session: Session) -> dict[str, Floats]:
     """The plant's truth; empty where nothing was emulated, or nothing happened."""
     return session.truth if "force_n" in session.truth else {}
 
 
-def _contact(session: Session, record: TaskRecord, log: dict[str, Array]) -> dict[str, Any]:
+def _contact(session: Session, record: TaskRecord, log: dict[str, Floats]) -> dict[str, Any]:
     task, scan = session.scene.task, record.scan_cycles if session.keeps_all else None
     names = ("force_rms_error_n", "force_max_n", "contact_fraction", "speed_mean_m_s")
     target = task.force_n if task.kind in ("scan", "press") else None
@@ -154,7 +153,7 @@ def _contact(session: Session, record: TaskRecord, log: dict[str, Array]) -> dic
     }
 
 
-def _hidden_force(session: Session, highest: float | None, log: dict[str, Array]) -> list[str]:
+def _hidden_force(session: Session, highest: float | None, log: dict[str, Floats]) -> list[str]:
     """That the true force was above the limit, which acts on what the array measures."""
     limit = session.scene.limits.force_max_n
     if not _truth(session) or highest is None or highest <= limit:
@@ -165,7 +164,7 @@ def _hidden_force(session: Session, highest: float | None, log: dict[str, Array]
     ]
 
 
-def _rms_error(values: Array, target: float) -> float | None:
+def _rms_error(values: Floats, target: float) -> float | None:
     """RMS error over the cycles that have a value: a cycle in which the cell held has none."""
     known = values[np.isfinite(values)]
     return float(np.sqrt(np.mean((known - target) ** 2))) if len(known) else None
@@ -175,8 +174,8 @@ def summarise_shape(
     setup: Setup,
     tracker: ShapeTracker | None,
     estimates: dict[str, list[ShapeRecord]],
-    truth: Mapping[str, Array],
-    sync_times: Array,
+    truth: Mapping[str, Floats],
+    sync_times: Floats,
     *,
     map_summary: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
@@ -221,7 +220,7 @@ def summarise_shape(
 
 
 def _bound_ratio(
-    setup: Setup, tracker: ShapeTracker | None, score: ShapeScore, truth: Mapping[str, Array], sync_times: Array
+    setup: Setup, tracker: ShapeTracker | None, score: ShapeScore, truth: Mapping[str, Floats], sync_times: Floats
 ) -> float | None:
     """Error of the online estimator over the Cramér–Rao bound of one memory at the stated noise.
 
@@ -242,7 +241,7 @@ def _bound_ratio(
     return None if bound is None else score.kappa_rms_error_per_m / bound
 
 
-def finite_or_none(values: Sequence[float] | Array) -> list[float | None]:
+def finite_or_none(values: Sequence[float] | Floats) -> list[float | None]:
     """Floats for JSON; None for what was not observed, which is not finite."""
     return [float(v) if np.isfinite(v) else None for v in values]
 
@@ -281,7 +280,7 @@ def _percentiles(values_ns: Sequence[int]) -> dict[str, float | None]:
     return {"p50": p50, "p99": p99, "p999": p999, "max": float(us.max())}
 
 
-def write_columns(log: Mapping[str, Array], tactile: Mapping[str, NDArray[Any]], out: Path) -> None:
+def write_columns(log: Mapping[str, Floats], tactile: Mapping[str, NDArray[Any]], out: Path) -> None:
     """Write what a run measured, ``log.npz`` and ``tactile.npz``; as `write_files`."""
     _write_each(
         lambda: write_npz(out / "log.npz", log),

@@ -6,72 +6,20 @@ import math
 from pathlib import Path
 
 import numpy as np
-from matplotlib import colormaps
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import SubFigure
 
 from canprobe.cell.results.map_score import SAME_DIRECTION_RAD
-from canprobe.cell.results.picture import BLUE, FAINT, GREEN, GREY, INK, ORANGE, Part, box, legend, parts, picture
+from canprobe.cell.results.picture import BLUE, FAINT, GREEN, INK, ORANGE, legend, parts, picture
 from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.surface_panels import (
-    Array,
     MapPlane,
     MapView,
-    add_sheet,
-    map_surface,
     rejected,
-    true_surface,
 )
+from canprobe.cell.results.surface_sheet import draw_map_surface
 from canprobe.mechanics.touch.consistency import Consistency, check_consistency
 from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.touch.surface_map import SurfaceMap
-
-# The surface of the map over the true object.
-
-
-def _draw_map_surface(part: Part, view: MapView) -> None:
-    """The map's one surface, coloured by its distance from the truth or by its own σ, in three dimensions."""
-    part, scale = parts(part, 1, 2, width_ratios=(8, 1))
-    axes = part.add_subplot(projection="3d", computed_zorder=False)
-    plane = view.plane
-    shown = ["surface: recovered, as far as its patches reach", "line: path of the contact"]
-    if view.shape is not None:
-        shown.append("light grey: true surface")
-        near = plane.mm(true_surface(view.shape, view.map.path, plane))
-        axes.plot_surface(*np.moveaxis(near, 2, 0), color=GREY, alpha=0.25, linewidth=0, shade=True, zorder=1)
-    points, sigma = map_surface(view.map, plane)
-    values, what, colours = _values(points, sigma, view.shape)
-    norm = _scale(values, signed=view.shape is not None)
-    add_sheet(axes, plane.mm(points), colours.with_extremes(bad=GREY)(norm(np.ma.masked_invalid(values))), zorder=2)
-    axes.plot(*plane.mm(view.map.path).T, color=INK, linewidth=0.5, alpha=0.55, zorder=3)
-    differ = rejected(view.consistency)
-    if differ.any():
-        shown.append("orange dots: passes differ, p < 0.05")
-        places = np.array([c.T_base_common[:3, 3] for c in view.consistency.crossings])[differ]
-        axes.plot(*plane.mm(places).T, "o", color=ORANGE, markersize=3.5, zorder=4)
-    labels = ("along the scan (mm)", "across (mm)", "outward (mm)")
-    box(part, axes, " · ".join(shown[:3]) + "\n" + " · ".join(shown[3:]), labels, elev=42, azim=-68)
-    scale.colorbar(ScalarMappable(norm, colours), cax=scale.subplots(), label=what)
-
-
-def _values(points: Array, sigma: Array, shape: PlacedShape | None) -> tuple[Array, str, Colormap]:
-    """Values (rows, columns) of a surface, µm, what they are, and their colours."""
-    if shape is None:
-        return 1e6 * sigma, "σ of the surface's height (µm)", colormaps["viridis"]
-    above = np.full(sigma.shape, np.nan)
-    for place in zip(*np.nonzero(np.isfinite(points[:, :, 0])), strict=True):
-        above[place] = shape.nearest(tuple(points[place].tolist())).distance
-    return 1e6 * above, "above the true surface (µm)", colormaps["RdBu_r"]
-
-
-def _scale(values: Array, *, signed: bool) -> Normalize:
-    known = np.abs(values[np.isfinite(values)])
-    most = max(float(np.percentile(known, 98)), 1.0) if len(known) else 1.0
-    return Normalize(-most if signed else 0.0, most)
-
-
-# The figure of a surface map: its surface over the true object, where passes cross, and their p-values.
 
 PARTS = (("curvature", ORANGE), ("normal", BLUE), ("height", GREEN))
 
@@ -116,7 +64,7 @@ def draw_map(
     )
     with picture(path, told, 7.8) as figure:
         upper, lower = parts(figure, 2, 1, height_ratios=(4, 3))
-        _draw_map_surface(upper, view)
+        draw_map_surface(upper, view)
         left, *right = parts(lower, 1, 2 if crossings else 1)
         _draw_crossings(left, view)
         for part in right:

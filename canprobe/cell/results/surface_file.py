@@ -32,12 +32,12 @@ from numpy.typing import NDArray
 from canprobe.cell.npz import read_npz, write_npz
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.surface_map import LocalPatch, SurfaceMap
+from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     pass
 
 FORMAT_VERSION = 1
-Array = NDArray[np.float64]
 _PER_PATCH: dict[str, tuple[str, tuple[int, ...]]] = {
     "t_s": ("t_s", ()),
     "travelled_m": ("travelled_m", ()),
@@ -121,7 +121,7 @@ def load_surface_map(path: str | PathLike[str]) -> SurfaceMap:
         raise UsageError(f"{file}: patch {len(patches)}: {error}") from error
 
 
-def _patch(row: dict[str, Array]) -> LocalPatch:
+def _patch(row: dict[str, Floats]) -> LocalPatch:
     combinations = row["combinations"]
     return LocalPatch(
         T_base_contact=row["T_base_contact"],

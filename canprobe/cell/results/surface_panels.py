@@ -14,11 +14,11 @@ from canprobe.mechanics.touch.consistency import SIGNIFICANCE_LEVEL, Consistency
 from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.touch.surface_map import SurfaceMap
 from canprobe.mechanics.touch.tangent_frames import tangent_rotation
+from canprobe.mechanics.types import Floats
 
-Array = NDArray[np.float64]
-MARGIN_M, GRID = 5e-3, 34
+MARGIN_M, TRUE_POINTS = 5e-3, 34
 """How far a true surface is drawn beyond a path, and its points a side."""
-LONG = 64
+MAP_POINTS = 64
 """Points of a map's surface along its longer side."""
 
 
@@ -34,11 +34,11 @@ class MapView(NamedTuple):
 class MapPlane(NamedTuple):
     """The plane of a scan: `axes` (3, 3), rows along, across, outward, and `origin` (3,), the middle of the path, m."""
 
-    axes: Array
-    origin: Array
+    axes: Floats
+    origin: Floats
 
     @classmethod
-    def of(cls, path: Array, normals: Array) -> MapPlane:
+    def of(cls, path: Floats, normals: Floats) -> MapPlane:
         """Of points of a path (n, 3), m, and outward normals (m, 3) along it."""
         middle = 0.5 * (path.min(axis=0) + path.max(axis=0))
         outward = normals.mean(axis=0)
@@ -48,14 +48,14 @@ class MapPlane(NamedTuple):
         along = R[:, :2] @ main[0]
         return cls(np.array([along, np.cross(R[:, 2], along), R[:, 2]]), middle)
 
-    def mm(self, points: Array) -> Array:
+    def mm(self, points: Floats) -> Floats:
         """Points (..., 3) of base, m, as mm along, across, outward."""
-        result: Array = (points - self.origin) @ self.axes.T * 1e3
+        result: Floats = (points - self.origin) @ self.axes.T * 1e3
         return result
 
-    def base(self, mm: Array) -> Array:
+    def base(self, mm: Floats) -> Floats:
         """The way back."""
-        result: Array = 1e-3 * mm @ self.axes + self.origin
+        result: Floats = 1e-3 * mm @ self.axes + self.origin
         return result
 
 
@@ -64,30 +64,30 @@ def rejected(consistency: Consistency) -> NDArray[np.bool_]:
     return np.array([c.joint.p < SIGNIFICANCE_LEVEL for c in consistency.crossings], dtype=bool)
 
 
-def true_surface(shape: PlacedShape, path: Array, plane: MapPlane) -> Array:
-    """An object's surface below a path (n, 3): (GRID, GRID, 3) points of base, m."""
+def true_surface(shape: PlacedShape, path: Floats, plane: MapPlane) -> Floats:
+    """An object's surface below a path (n, 3): (TRUE_POINTS, TRUE_POINTS, 3) points of base, m."""
     flat = plane.mm(path)
     low, high = flat.min(axis=0) - 1e3 * MARGIN_M, flat.max(axis=0) + 1e3 * MARGIN_M
-    us, vs = np.meshgrid(np.linspace(low[0], high[0], GRID), np.linspace(low[1], high[1], GRID))
+    us, vs = np.meshgrid(np.linspace(low[0], high[0], TRUE_POINTS), np.linspace(low[1], high[1], TRUE_POINTS))
     above = plane.base(np.stack((us, vs, np.full_like(us, high[2])), axis=-1))
-    return np.array([shape.closest(point).point for point in above.reshape(-1, 3)]).reshape(GRID, GRID, 3)
+    return np.array([shape.closest(point).point for point in above.reshape(-1, 3)]).reshape(TRUE_POINTS, TRUE_POINTS, 3)
 
 
-def map_surface(surface_map: SurfaceMap, plane: MapPlane) -> tuple[Array, Array]:
+def map_surface(surface_map: SurfaceMap, plane: MapPlane) -> tuple[Floats, Floats]:
     """The one surface of a map: points (rows, columns, 3) of base, m, and its σ there, m; NaN beyond its patches.
 
     A grid over the plane of the scan, in a tenth of the time of the triangles that `SurfaceMap.mesh` finds.
     """
     contacts = plane.mm(surface_map.points)
     low, high = contacts.min(axis=0)[:2] - 1e3 * REACH_M, contacts.max(axis=0)[:2] + 1e3 * REACH_M
-    counts = np.ceil(LONG * (high - low) / (high - low).max()).astype(int)
+    counts = np.ceil(MAP_POINTS * (high - low) / (high - low).max()).astype(int)
     us, vs = np.meshgrid(*(np.linspace(*ends) for ends in zip(low, high, counts, strict=True)))
     nearest = cKDTree(contacts[:, :2]).query(np.stack((us, vs), axis=-1))[1]
     feet = surface_map.closest(plane.base(np.stack((us, vs, contacts[nearest, 2]), axis=-1)).reshape(-1, 3))
     return feet.point.reshape(*us.shape, 3), feet.sigma.reshape(us.shape)
 
 
-def add_sheet(axes: Any, corners: Array, colours: Array | str, **style: Any) -> None:
+def add_sheet(axes: Any, corners: Floats, colours: Floats | str, **style: Any) -> None:
     """Draw the cells of a grid (rows, columns, 3) that are known at all corners; a colour, or (rows, columns, 4)."""
     cells = np.stack([corners[:-1, :-1], corners[:-1, 1:], corners[1:, 1:], corners[1:, :-1]], axis=2).reshape(-1, 4, 3)
     known = np.isfinite(cells).all(axis=(1, 2))

@@ -38,8 +38,8 @@ from canprobe.mechanics.touch.contact import direction_to_pad
 from canprobe.mechanics.touch.patch.array_calibration import ForceReference
 from canprobe.mechanics.touch.patch.calibrate import ArrayFit, calibrate_array
 from canprobe.mechanics.touch.patch.image_fit import Dwell
+from canprobe.mechanics.types import Floats
 
-Floats = NDArray[np.float64]
 Ask = Callable[[str], str]
 """Asks a person: takes the text, gives the answer."""
 

@@ -13,9 +13,6 @@ from functools import cached_property, partial
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-import numpy as np
-from numpy.typing import NDArray
-
 from canprobe.cell.master.cell import Cell
 from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.master.cycle import Cycle
@@ -45,11 +42,10 @@ from canprobe.fieldbus.bus.port import Port, Reports
 from canprobe.fieldbus.bus.real.memory import garbage_collection_paused, reserve_memory
 from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, realtime
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
+from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     from canprobe.cell.emulated.world import World
-
-Array = NDArray[np.float64]
 
 
 def with_bridges(scene: Scene, names: Sequence[str]) -> Scene:
@@ -82,7 +78,7 @@ class Session:
         self.out = options.out
         self.started_ns = 0
         self.wall_ns = 0
-        self.truth: dict[str, Array] = {}
+        self.truth: dict[str, Floats] = {}
         self.lockstep: LockstepBus | None = None
         self._ports: dict[str, Port] = {}
         self.unwritten: list[str] = []

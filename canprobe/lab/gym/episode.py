@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.api import OpenCell
 from canprobe.cell.master.options import RunOptions
@@ -17,8 +16,8 @@ from canprobe.cell.session.session import Session
 from canprobe.errors import BusError, SafetyStop
 from canprobe.lab.gym.led import LedTask
 from canprobe.lab.gym.region import Coverage
+from canprobe.mechanics.types import Floats
 
-Vector = NDArray[np.float64]
 FORCE_SHARE = 0.5
 """Share of the wanted force by which an action moves the set-point up or down."""
 TOLERANCE = 0.05
@@ -79,7 +78,7 @@ class Episode:
         self.well_mm2 = 0.0
         self._steps, self._most_steps = 0, max(1, round(scan.duration_s / (cycles * self._period_s)))
 
-    def step(self, action: Vector) -> float:
+    def step(self, action: Floats) -> float:
         """Lead the probe by an action (3,) in [−1, 1] for one step; its reward, mm²."""
         task, forces = self.task, []
         velocity = action[:2] * task.top_speed / max(1.0, math.hypot(*action[:2]))
