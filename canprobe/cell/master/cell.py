@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from itertools import repeat
 from pathlib import Path
 from types import TracebackType
@@ -23,14 +22,14 @@ from canprobe.cell.master.log import RunLog
 from canprobe.cell.master.notes import Notes
 from canprobe.cell.master.observers import Observers
 from canprobe.cell.master.options import DEFAULT_OPTIONS, RunOptions
+from canprobe.cell.master.raw_array_start import RawArrayStart
 from canprobe.cell.master.supervision import Finding, Reaction, Seen, limits_of
 from canprobe.cell.master.supervisor import JointGuard, Supervisor
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.configuration import make_setups
 from canprobe.cell.planning.model import Plan
-from canprobe.errors import BusError, CanprobeError, NodeError, SafetyStop, UsageError
+from canprobe.errors import CanprobeError, NodeError, SafetyStop, UsageError
 from canprobe.fieldbus.bus.clock import VirtualClock
-from canprobe.fieldbus.bus.joined import send_on
 from canprobe.fieldbus.bus.port import Port, PortCounters, TimedFrame
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.real.interrupts import Interrupts
@@ -115,10 +114,14 @@ class Cell:
         self._make_cycle = direct or Cycle
         setups = make_setups(plan) if direct is None else ()  # of none only its time passes
         self._bring_up = BringUp(self._network, self.watch, setups, setup.bring_up, self._say)
+        self._raw_array = (
+            RawArrayStart(self.tactile, self._network, setup.bring_up.boot_up_s, self._say)
+            if isinstance(self.tactile, RawReceiver)
+            else None
+        )
         homed = any(one.homing for one in setups)
         besides: dict[str, Any] = {"supervise": self._supervise_homing, "record": zeros, "say": self._say}
         self.homing = Homing(plan, setups, self._network, self.watch, **besides) if homed else None
-        self._array_started = False
         self._holding = False
         self._running = False
         self._retreats_for: CanprobeError | None = None
@@ -172,7 +175,8 @@ class Cell:
     def __enter__(self) -> Cell:
         try:
             self._bring_up.run()
-            self._start_array()
+            if self._raw_array is not None:
+                self._raw_array.start()
             self.cycle = self._make_cycle(
                 self._port,
                 self._plan,
@@ -193,42 +197,6 @@ class Cell:
             self._name_another_master(error)
             raise
         return self
-
-    def _start_array(self) -> None:
-        """Start an array of raw frames, and wait for as many images as its tare takes, at least one.
-
-        Raises:
-            BusError: they do not come.
-        """
-        array = self.tactile
-        if not isinstance(array, RawReceiver):
-            return
-        wire, clock = array.wire, self._port.clock
-        self._say(f"start the array on {array.channel}")
-        self._array_started = True
-        send_on(self._port, array.channel, wire.start)
-        if wire.sampling == "sync":
-            return  # its images begin with the cycle
-        if wire.tare_images:
-            self._say(f"tare the array: {wire.tare_images} images, with nothing on it")
-        needed, period_s = max(1, wire.tare_images), 1.0 / array.rate_hz
-        end_ns = clock.now_ns() + round(1e9 * (self._plan.setup.bring_up.boot_up_s + 2.0 * needed * period_s))
-        while array.images < needed:
-            if clock.now_ns() >= end_ns:
-                first, last = min(array.cob_ids), max(array.cob_ids)
-                ids = f"{first:03X}h" if first == last else f"{first:03X}h-{last:03X}h"
-                raise BusError(
-                    f"{array.channel}: the array sent {array.images} of {needed} images of its frames {ids} in time"
-                    f" ({array.torn} were not whole); check its power, its channel (sensor.channel), and wire.ids,"
-                    " wire.frames and wire.start of its array file"
-                )
-            if wire.poll:
-                send_on(self._port, array.channel, wire.poll)
-            self._network.pump_until(partial(array.has, array.images + 1), 1.5 * period_s)
-
-    def _stop_array(self) -> None:
-        if isinstance(self.tactile, RawReceiver) and self._array_started:
-            send_on(self._port, self.tactile.channel, self.tactile.wire.stop)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -535,7 +503,8 @@ class Cell:
         self._try(self._stop_drives)
         if force := self.supervisor.pressing():
             self.notes.add(f"the probe is left pressing with {force:.1f} N: {FREE_IT}")
-        self._try(self._stop_array)
+        if self._raw_array is not None:
+            self._try(self._raw_array.stop)
         if self.homing is not None:
             self._try(self.homing.keep)
         self._try(self._bring_up.release)
