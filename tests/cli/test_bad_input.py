@@ -1,8 +1,10 @@
 """What goes wrong on the command line, as a user sees it: one clear line a problem, the exit status, no traceback.
 
-Each case is a process of its own; nothing here needs a CAN interface.
+A signal, a stream, an encoding and one complaint are tried on processes; nothing here needs a CAN interface.
 """
 
+import contextlib
+import io
 import json
 import os
 import re
@@ -46,12 +48,12 @@ def start_command(command, folder):
 
 def lines_of(folder, status, *words):
     """The lines on stderr of a command that must end with `status` and say nothing on stdout."""
-    process = start(folder, *words)
-    out, err = process.communicate()
-    assert process.returncode == status, err
-    assert out == ""
-    assert "Traceback" not in err
-    return err.splitlines()
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.chdir(folder), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        ended = main([*map(str, words)])
+    assert ended == status, err.getvalue()
+    assert out.getvalue() == ""
+    return err.getvalue().splitlines()
 
 
 def edited(folder, name, *changes):
@@ -70,6 +72,13 @@ def test_a_tool_file_that_is_none(tmp_path):
     (line,) = lines_of(tmp_path, 2, "run", "cylinder", "--tool", "tool.toml")
     assert "tool.toml: expected the section [probe] with centre_offset_mm and centre_lateral_mm" in line
     assert not (tmp_path / "runs").exists()
+
+
+def test_a_complaint_of_a_process_is_one_line_and_a_status(tmp_path):
+    process = start(tmp_path, "run", "cylindre")
+    out, err = process.communicate()
+    assert (process.returncode, out) == (2, "")
+    assert err.startswith("canprobe: cylindre: no such scene or file") and err.count("\n") == 1
 
 
 @pytest.mark.parametrize("command", ["run", "plan", "up", "emulate"])
@@ -302,21 +311,29 @@ ENCODINGS = {
 }
 
 
+def planned(folder, variables, *words):
+    """What `canprobe plan free` prints in this environment."""
+    command = [sys.executable, "-m", "canprobe", "plan", "free", *words]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), **variables}
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, check=False)
+    assert (done.returncode, done.stderr) == (0, b"")
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def in_utf8(tmp_path_factory):
+    """The plan for people, and the document."""
+    return [planned(tmp_path_factory.mktemp("utf8"), {"PYTHONIOENCODING": "utf-8"}, *w) for w in ((), ("--json",))]
+
+
 @pytest.mark.parametrize("name", ENCODINGS)
-def test_what_an_encoding_does_not_have_is_printed_escaped(name, tmp_path):
+def test_what_an_encoding_does_not_have_is_printed_escaped(name, tmp_path, in_utf8):
     encoding = "cp1252" if name == "cp1252" else "ascii"
-
-    def printed(variables, *words):
-        environment = {**os.environ, "PYTHONPATH": str(ROOT), **variables}
-        command = [sys.executable, "-m", "canprobe", "plan", "cylinder", *words]
-        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, check=False)
-        assert (done.returncode, done.stderr) == (0, b"")
-        return done.stdout
-
-    whole = printed({"PYTHONIOENCODING": "utf-8"}).decode()
-    assert printed(ENCODINGS[name]) == whole.encode(encoding, "backslashreplace")
-    documents = [json.loads(printed(v, "--json")) for v in ({"PYTHONIOENCODING": "utf-8"}, ENCODINGS[name])]
-    assert documents[0] == documents[1]
+    whole, document = in_utf8
+    escaped = whole.decode().encode(encoding, "backslashreplace")
+    assert b"\\u" in escaped, "else nothing is tried"
+    assert planned(tmp_path, ENCODINGS[name]) == escaped
+    assert json.loads(planned(tmp_path, ENCODINGS[name], "--json")) == json.loads(document)
 
 
 @pytest.mark.parametrize(
