@@ -15,7 +15,6 @@ from typing import Protocol
 
 import numpy as np
 from canopen.objectdictionary import ObjectDictionary
-from numpy.typing import NDArray
 
 from canprobe.cell.emulated.image_processing import (
     Image,
@@ -43,6 +42,7 @@ from canprobe.fieldbus.protocol.tactile import (
     pack_whole,
 )
 from canprobe.mechanics.touch.pad import Pad
+from canprobe.mechanics.types import Floats
 
 TARE = int.from_bytes(b"tare", "little")
 MODE, THRESHOLD, GAIN, TARE_COMMAND, FULL_SCALE_PA, OVERLOAD, ORIGIN = range(0x2000, 0x2007)
@@ -90,7 +90,7 @@ class TactileApplication(Application):
         self._pad = pad or Pad()
         self._latency, self._tare_images = latency_frames, tare_images
         self._pipeline: deque[tuple[int, Raw]] = deque()
-        self._tare: NDArray[np.float64] | None = None
+        self._tare: Floats | None = None
         self._taring: list[Raw] | None = None
         self._frames = 0
         self._origin = middle(shape=self._pad.shape)

@@ -13,9 +13,10 @@ from canprobe.fieldbus.protocol.tactile import (
     Features,
     Shape,
 )
+from canprobe.mechanics.types import Floats
 
 Image = NDArray[np.uint8]
-Raw = NDArray[np.uint8] | NDArray[np.float64]
+Raw = NDArray[np.uint8] | Floats
 """Counts of 255 at full scale: whole ones of an ADC of 8 bits, parts of counts of a finer one."""
 FULL_SCALE = 255
 GAIN_ONE = 1000
@@ -29,7 +30,7 @@ def is_overloaded(raw: Raw) -> bool:
     return bool(raw.max() == FULL_SCALE)
 
 
-def correct(raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int, threshold: int) -> Image:
+def correct(raw: Raw, tare: Floats | None, gain_permille: int, threshold: int) -> Image:
     """Raw counts → whole counts, tare subtracted, times the gain, saturated, zero below the threshold."""
     as_sampled = tare is None and gain_permille == GAIN_ONE and raw.dtype == np.uint8
     counts = raw if as_sampled else np.rint(_scaled(raw, tare, gain_permille))
@@ -44,16 +45,14 @@ def _kept(threshold: int) -> Image:
     return counts
 
 
-def correct_finely(
-    raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int, threshold: int
-) -> NDArray[np.float64]:
+def correct_finely(raw: Raw, tare: Floats | None, gain_permille: int, threshold: int) -> Floats:
     """As ``correct``, with the parts of counts that a finer ADC sees and an image on the bus cannot carry."""
     counts = np.minimum(_scaled(raw, tare, gain_permille), FULL_SCALE)
     counts[counts < max(threshold, 0)] = 0.0
     return counts
 
 
-def _scaled(raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int) -> NDArray[np.float64]:
+def _scaled(raw: Raw, tare: Floats | None, gain_permille: int) -> Floats:
     counts = raw.astype(np.float64)
     if tare is not None:
         counts -= tare
@@ -63,7 +62,7 @@ def _scaled(raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int) -> N
 
 
 @cache
-def _sums(rows: int, columns: int) -> NDArray[np.float64]:
+def _sums(rows: int, columns: int) -> Floats:
     """(3, rows · columns): 1, row and column of each taxel."""
     row, column = np.indices((rows, columns), dtype=np.float64)
     return np.stack((np.ones(rows * columns), row.reshape(-1), column.reshape(-1)))

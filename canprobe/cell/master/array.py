@@ -7,7 +7,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.cell.master.controller import TactileSample
 from canprobe.cell.master.tactile_frame import TactileFrame, decode
@@ -20,6 +19,7 @@ from canprobe.fieldbus.protocol.tactile import TactileHeader, TactileMode
 from canprobe.fieldbus.protocol.tactile_assembler import FrameAssembler
 from canprobe.mechanics.touch.pad import COUNTS_MAX
 from canprobe.mechanics.touch.patch.image import Patch, PatchCalibration, compute_patch, patch_from_features
+from canprobe.mechanics.types import Floats
 
 DEADLINE_CYCLES = 2
 """From the first PDO of a frame to its last."""
@@ -201,10 +201,10 @@ class RawReceiver(ArrayReceiver):
         self.assembler = ImageAssembler(self.wire.image, round(WITHIN * period_ns))
         self._fit = PeriodFit(period_ns) if self.wire.sampling == "free" else None
         self._ratio = ratio
-        self._unloaded: NDArray[np.float64] | None = None
+        self._unloaded: Floats | None = None
         if not self.wire.tare_images:
             self._unloaded = np.full(array.pad.shape, float(self.wire.unloaded))
-        self._taring: list[NDArray[np.float64]] = []
+        self._taring: list[Floats] = []
         self._complete: list[tuple[TactileFrame, int, float]] = []
 
     @property

@@ -7,16 +7,13 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.cell.master.tactile_frame import TactileFrame
 from canprobe.errors import UsageError
+from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-
-
-Vector = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +53,7 @@ class Measurement:
 
     cycle: int
     t_ns: int
-    q: Vector | None = None
+    q: Floats | None = None
     q_age: tuple[int, ...] = ()
     torque_permille: tuple[float, ...] = ()
     statuswords: tuple[int, ...] = ()
@@ -77,10 +74,10 @@ class Command:
         estimate: a new answer of its surface estimator, for observers; None in cycles without one.
     """
 
-    q_target: Vector | None = None
+    q_target: Floats | None = None
     done: bool = False
     stop_reason: str | None = None
-    columns: dict[str, float | Vector] = field(default_factory=dict)
+    columns: dict[str, float | Floats] = field(default_factory=dict)
     estimate: SurfaceEstimate | None = None
 
 
@@ -136,7 +133,7 @@ class Controller:
         """
         raise NotImplementedError(f"{type(self).__name__} has no step(measurement)")
 
-    def inspect(self, q: Vector) -> str | None:
+    def inspect(self, q: Floats) -> str | None:
         """Check the joint positions before the drives are enabled.
 
         Args:

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from operator import itemgetter
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.cell.master.position_track import PERIOD_NS, REST_NS, PositionTrack, rest_counts
 from canprobe.cell.planning.model import Plan
@@ -28,8 +27,8 @@ from canprobe.fieldbus.protocol.cia402 import (
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.protocol.pdo import PdoEntry, PdoLayout
 from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_to_joints
+from canprobe.mechanics.types import Floats
 
-Vector = NDArray[np.float64]
 SYNCHRONOUS_MAX = 240
 """Highest transmission type that follows SYNC; above it an RPDO is sent on change and again every so often."""
 COMMAND_REPEAT_NS = 100_000_000
@@ -295,7 +294,7 @@ class DriveGroup:
         """Whether each drive has reported the same position for a while."""
         return tuple([track.rested_ns >= REST_NS for track in self._tracks])
 
-    def joints(self) -> Vector:
+    def joints(self) -> Floats:
         """Joint positions (n,), rad or m, at this SYNC; where a report is missing, carried on for a short time."""
         now, now_ns = self._cycle, self._deadline_ns
         counts = [t.counts if t.cycle == now else t.position(now, now_ns) for t in self._tracks]
@@ -334,12 +333,12 @@ class DriveGroup:
         """Every drive is in one of ``states``."""
         return all(state in states for state in self.states)
 
-    def set_target(self, q: Vector | None) -> None:
+    def set_target(self, q: Floats | None) -> None:
         """Joint target (n,), rad or m, of the next RPDOs; None holds the last one."""
         if q is not None:
             self._targets = [round(c) for c in joints_to_units(self._model, q).tolist()]
 
-    def targets(self) -> Vector:
+    def targets(self) -> Floats:
         """Where the motors were sent last (n,), counts; where they are, before they were sent anywhere."""
         targets = self._targets if self._targets is not None else [track.counts for track in self._tracks]
         return np.array(targets, dtype=float)

@@ -22,8 +22,8 @@ from canprobe.fieldbus.protocol.frames import NmtState
 from canprobe.mechanics.robot.chain import forward_jacobian
 from canprobe.mechanics.robot.model import ArmModel, units_to_joints
 from canprobe.mechanics.robot.remaining_drives import lifting_step
+from canprobe.mechanics.types import Floats
 
-Vector = NDArray[np.float64]
 WAY = 6e-3
 """m: as far as a touch retreats, and further than the softest pad is pressed in."""
 SPEED = 20e-3
@@ -44,14 +44,14 @@ class WayBack:
     """
 
     def __init__(
-        self, model: ArmModel, flange_probe: Vector, period_s: float, free: NDArray[np.bool_], targets: Vector
+        self, model: ArmModel, flange_probe: Floats, period_s: float, free: NDArray[np.bool_], targets: Floats
     ) -> None:
         self._model, self._flange_probe, self._period_s = model, flange_probe, period_s
         self._free, self._targets = free, targets
-        self._away: Vector | None = None
+        self._away: Floats | None = None
         self._t = 0.0
 
-    def step(self, measured: Vector) -> Vector | None:
+    def step(self, measured: Floats) -> Floats | None:
         """Joint targets (n,), rad or m, of this cycle; None at the end of the way, or where it cannot go on.
 
         Args:

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.cell.master.conditions import BY_KEY, COUNTERS, CYCLE_CHECKS, touch_finding
 from canprobe.cell.master.controller import Command, Measurement, TactileSample
@@ -18,11 +17,11 @@ from canprobe.cell.planning.model import Plan
 from canprobe.fieldbus.bus.port import ControllerState, PortCounters
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.touch.stops import TOUCH_FORCE
+from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.patch.image import Patch
 
-Vector = NDArray[np.float64]
 MEASURED_SHARE = 1.5
 """Measured motion above this share of the speed limit is no motion of the arm; SYNCs may be late by a period."""
 COUNTS = 2
@@ -36,11 +35,11 @@ _NUMBERS = "fiu"
 class GuardedTarget:
     """A joint target as it may be sent (n,), rad or m; or why it may not."""
 
-    q: Vector | None
+    q: Floats | None
     limit: str | None = None
 
 
-def outside_workspace(tip: Vector, workspace: Vector) -> str | None:
+def outside_workspace(tip: Floats, workspace: Floats) -> str | None:
     """What is wrong with the tip's position (3,), m, in a box (2, 3), m; None where it is inside."""
     below, above = tip < workspace[0], tip > workspace[1]
     if not (below | above).any():
@@ -82,11 +81,11 @@ class JointGuard:
         self._q: list[float] | None = None
         self._t_ns = 0
 
-    def T_base_tip(self, q: Vector) -> Vector:
+    def T_base_tip(self, q: Floats) -> Floats:
         """Transform (4, 4) from the probe's tip (z = pole, towards the object) to base at joints (n,), rad or m."""
         return forward(self._model.chain, q) @ self._T_flange_tip
 
-    def outside(self, q: Vector) -> str | None:
+    def outside(self, q: Floats) -> str | None:
         """How the probe's tip leaves the workspace at joint positions (n,), rad or m; None where it does not."""
         return None if self._workspace is None else outside_workspace(self.T_base_tip(q)[:3, 3], self._workspace)
 
@@ -107,7 +106,7 @@ class JointGuard:
         way = self._model.joints[joint].text(abs(self._q[joint] - before[joint]))
         return f"joint {joint + 1} reports a motion of {way} in one cycle, more than it can make"
 
-    def command(self, q_target: Vector, measurement: Measurement) -> GuardedTarget:
+    def command(self, q_target: Floats, measurement: Measurement) -> GuardedTarget:
         """The target that may be sent for `q_target` (n,), rad or m."""
         n = len(self._range)
         if type(q_target) is not np.ndarray or q_target.dtype != np.float64:
@@ -165,11 +164,11 @@ class Press:
     """
 
     def __init__(self) -> None:
-        self._T_base_tip: Vector | None = None
+        self._T_base_tip: Floats | None = None
         self._highest = 0.0
         self._remembered = 0.0
 
-    def look(self, force: float, T_base_tip: Vector) -> None:
+    def look(self, force: float, T_base_tip: Floats) -> None:
         """Take the array's force, N, and where the probe's tip is (4, 4)."""
         if self.holds(force) and force >= MEMORY * self._highest:
             self._T_base_tip, self._highest = T_base_tip, max(force, self._highest)
@@ -182,7 +181,7 @@ class Press:
         """Whether a force that the array shows, N, is a press."""
         return force >= TOUCH_FORCE + (self._remembered if self._T_base_tip is None else 0.0)
 
-    def _is_clear(self, way: Vector) -> bool:
+    def _is_clear(self, way: Floats) -> bool:
         assert self._T_base_tip is not None
         pole = self._T_base_tip[:3, 2]
         back = -float(way @ pole)

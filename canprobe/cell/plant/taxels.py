@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from canprobe.cell.plant.pressure import Array, Directions, ListField, PressureField
+from canprobe.cell.plant.pressure import Directions, ListField, PressureField
 from canprobe.mechanics.touch.pad import Pad
+from canprobe.mechanics.types import Floats
 
-Image = npt.NDArray[np.uint8] | npt.NDArray[np.float64]
+Image = npt.NDArray[np.uint8] | Floats
 
 _CREEP_TIMES_S = (0.3, 3.0, 30.0, 300.0)
 _SATURATION_KNEE = 1.25
@@ -133,11 +134,11 @@ class TaxelArray:
         self._loop = np.zeros(pad.shape)
         # Rows: the relaxations, and the image that drives them; and where the next ones are put.
         self._creep, self._next = np.zeros((2, len(_CREEP_TIMES_S) + 1, pad.taxels))
-        self._relaxed: dict[int, Array] = {}
+        self._relaxed: dict[int, Floats] = {}
         self._t_s: float | None = None
         self._columns = _leaks(pad.columns, config.crosstalk)
         self._rows = _leaks(pad.rows, config.crosstalk) * float(config.adc_max)
-        self._noise: list[Array] = []
+        self._noise: list[Floats] = []
         self._readings = _readings(config)
         self._has_dead = bool(config.dead)
         self._dead = tuple(np.array(config.dead, dtype=np.intp).reshape(-1, 2).T)
@@ -171,7 +172,7 @@ class TaxelArray:
         """
         return self.image_of(self.field.mean_pressure(uv, depth, kappa, directions_pad), t_s, pressure_factor)
 
-    def image_of(self, compression: Array, t_s: float, pressure_factor: float = 1.0) -> Image:
+    def image_of(self, compression: Floats, t_s: float, pressure_factor: float = 1.0) -> Image:
         """The rest of the pipeline: sample the array once under a known compression of the layer.
 
         Args:
@@ -191,7 +192,7 @@ class TaxelArray:
             return self._convert(self._rows.dot(y).dot(self._columns))
         return self._convert(y * float(self.config.adc_max))
 
-    def _remember(self, y: Array, t_s: float) -> Array:
+    def _remember(self, y: Floats, t_s: float) -> Floats:
         """Hysteresis, then creep."""
         if self.config.hysteresis > 0.0:
             # Play with proportional edges (generalised Prandtl-Ishlinskii): the output rests until the input has
@@ -203,11 +204,11 @@ class TaxelArray:
         if self.config.creep_per_decade > 0.0:
             self._creep[-1] = y.reshape(-1)
             self._creep, self._next = np.dot(self._relaxed_by(dt), self._creep, out=self._next), self._creep
-            crept: Array = self._creep[-1].reshape(self.pad.shape)
+            crept: Floats = self._creep[-1].reshape(self.pad.shape)
             return crept
         return y
 
-    def _relaxed_by(self, dt: float) -> Array:
+    def _relaxed_by(self, dt: float) -> Floats:
         """(5, 5) what becomes of relaxations and image in a time: the relaxations then, and the crept image.
 
         Sum of relaxations a decade apart: c per decade for a step, linear, superposes under moving loads.
@@ -226,7 +227,7 @@ class TaxelArray:
             self._relaxed[dt_ns] = matrix
         return matrix
 
-    def _convert(self, counts: Array) -> Image:
+    def _convert(self, counts: Floats) -> Image:
         """Noise, ADC, threshold, dead taxels."""
         if self.config.noise > 0.0:
             counts += self._drawn()
@@ -237,7 +238,7 @@ class TaxelArray:
             read[self._dead] = 0
         return read
 
-    def _drawn(self) -> Array:
+    def _drawn(self) -> Floats:
         """(rows, columns) noise of one image in counts, and the half count that makes cutting off rounding."""
         if not self._noise:
             noise = self._rng.standard_normal((_NOISE_IMAGES, *self.pad.shape))
@@ -247,7 +248,7 @@ class TaxelArray:
         return self._noise.pop()
 
 
-def _leaks(taxels: int, crosstalk: float) -> Array:
+def _leaks(taxels: int, crosstalk: float) -> Floats:
     """(n, n) what becomes of the signals along a row or column: a share of each spreads over the others."""
     if taxels == 1:
         return np.ones((1, 1))
@@ -262,7 +263,7 @@ def _readings(config: TaxelConfig) -> npt.NDArray[Any]:
     return counts.astype(np.uint8) if config.adc_max == _FULL_SCALE else counts * float(_FULL_SCALE) / config.adc_max
 
 
-def _saturate(x: Array) -> Array:
+def _saturate(x: Floats) -> Floats:
     """Power-law knee, exponent 4: 0.2 % low at half of full scale, 8 % at full scale, then flat; in place."""
     fourth = x * (1.0 / _SATURATION_KNEE)
     np.square(fourth, out=fourth)

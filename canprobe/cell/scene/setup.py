@@ -16,9 +16,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from canprobe.cell.scene.hardware import Auto
 from canprobe.cell.scene.model import (
     BridgeSettings,
@@ -39,8 +36,8 @@ from canprobe.mechanics.touch.patch.array_calibration import NO_FORCE_REFERENCE,
 from canprobe.mechanics.touch.servo import SurfaceGains
 from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.touch.strategies import Strategy
+from canprobe.mechanics.types import Floats
 
-Floats = NDArray[np.float64]
 Bus = BusSettings
 BringUpTimes = BringUpSettings
 Bridges = BridgeSettings

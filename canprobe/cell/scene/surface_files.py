@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.cell.scene.model import ObjectSettings
 from canprobe.cell.scene.stl_files import stl_damage
@@ -20,8 +19,7 @@ from canprobe.mechanics.touch.mesh_fit import HeightGrid, fit_mesh
 from canprobe.mechanics.touch.objects import make_object
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.shapes import PlacedShape
-
-Array = NDArray[np.float64]
+from canprobe.mechanics.types import Floats
 
 HEIGHTS = (".npy", ".npz", ".csv", ".txt")
 MESHES = (".stl", ".obj", ".ply")
@@ -36,7 +34,7 @@ _NARROWEST_MM = 1.0
 _AGAIN = "get the file again, or export it again"
 
 
-def object_of_file(settings: ObjectSettings, T_base_object: Array) -> PlacedShape:
+def object_of_file(settings: ObjectSettings, T_base_object: Floats) -> PlacedShape:
     """The object whose surface is read from a file.
 
     Raises:
@@ -156,12 +154,12 @@ def _heights(settings: ObjectSettings, path: Path) -> dict[str, Any]:
     return {"heights": z * unit, "spacing": spacing * unit, "origin": origin}
 
 
-def _without(z: Array, value: float) -> Array:
-    rest: Array = z[z != value]
+def _without(z: Floats, value: float) -> Floats:
+    rest: Floats = z[z != value]
     return rest if rest.size else np.zeros(1)
 
 
-def _refuse_other_unit(path: Path, z: Array, spacing: float, unit_mm: float) -> None:
+def _refuse_other_unit(path: Path, z: Floats, spacing: float, unit_mm: float) -> None:
     """Heights and spacing of one unit give a surface: neither a wall nor, unless it is a plane, a flat."""
     rise, width = float(np.ptp(z)), spacing * min(z.shape)
     if unit_mm * width < _NARROWEST_MM or (rise > 0.0 and not _FLATTEST < rise / width < _STEEP):
@@ -171,7 +169,7 @@ def _refuse_other_unit(path: Path, z: Array, spacing: float, unit_mm: float) -> 
         )
 
 
-def _grid(path: Path) -> tuple[Array, float | None]:
+def _grid(path: Path) -> tuple[Floats, float | None]:
     """Heights in the file's unit, and their spacing where the file holds it."""
     kind = path.suffix.lower()
     if kind not in HEIGHTS:
@@ -196,7 +194,7 @@ def _grid(path: Path) -> tuple[Array, float | None]:
         raise ValueError(f"file: {path.name} is no grid of numbers: {why}; {_AGAIN}") from error
 
 
-def _of_text(text: str) -> Array:
+def _of_text(text: str) -> Floats:
     """The numbers of a text, a row on each line."""
     rows = [line.partition("#")[0] for line in text.splitlines()]
     if any(";" in row for row in rows):  # then a comma is a decimal one
@@ -213,7 +211,7 @@ def _of_text(text: str) -> Array:
     return np.array(grid)
 
 
-def _of_archive(arrays: dict[str, Any]) -> tuple[Array, float | None]:
+def _of_archive(arrays: dict[str, Any]) -> tuple[Floats, float | None]:
     heights = arrays.get("heights", next(iter(arrays.values())) if len(arrays) == 1 else None)
     if heights is None:
         raise ValueError(f'expected an array "heights", got {", ".join(arrays) or "none"}')

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.cell.master.controller import TactileSample
 from canprobe.cell.planning.model import Plan
@@ -21,8 +20,8 @@ from canprobe.mechanics.touch.patch.image import Patch
 from canprobe.mechanics.touch.probe_motion import EXTRA_CLEARANCE_M, ROUND_SPEED, ArcMotion
 from canprobe.mechanics.touch.servo import ProbePose
 from canprobe.mechanics.touch.stops import TOUCH_FORCE
+from canprobe.mechanics.types import Floats
 
-Vector = NDArray[np.float64]
 PRESS_SPEED = 0.8e-3
 """m/s, from the first touch to the wanted force: what is still under way then sinks in by 0.02 mm."""
 CERTAIN = 0.06
@@ -150,7 +149,7 @@ class CalibrateTask(ProbingTask):
             self._depths.append((depth, self._pushed(T_base_probe[:3, 3]) - self._push.start))
         return BallTouch(T_base_flange, d_flange, depth)
 
-    def _pushed(self, centre: Vector) -> float:
+    def _pushed(self, centre: Floats) -> float:
         """Way of the probe's centre (3,), m, towards the ball along this touch's direction, from the ball's centre."""
         return -float(self._task.approaches[self._number].n_base @ (centre - self._ball.c_base))
 

@@ -12,8 +12,7 @@ from canprobe.cell.master.controller import Command, Measurement
 from canprobe.cell.tasks.task import Task, TaskRecord
 from canprobe.mechanics.touch.patch.image import PatchCalibration
 from canprobe.mechanics.touch.probe_motion import smooth_step
-
-Vector = NDArray[np.float64]
+from canprobe.mechanics.types import Floats
 
 
 class FreeTask(Task):
@@ -26,14 +25,14 @@ class FreeTask(Task):
         period_s: of the cycle.
     """
 
-    def __init__(self, amplitude: Vector, swing_period_s: float, duration_s: float, period_s: float) -> None:
+    def __init__(self, amplitude: Floats, swing_period_s: float, duration_s: float, period_s: float) -> None:
         self._amplitude = amplitude
         self._omega = 2 * math.pi / swing_period_s
         self._duration = duration_s
         self._soft = min(1.0, duration_s / 4)
         self._period = period_s
         self._t = 0.0
-        self._q0: Vector | None = None
+        self._q0: Floats | None = None
 
     def step(self, measurement: Measurement) -> Command:
         """One cycle."""
@@ -61,7 +60,7 @@ class ListenTask(Task):
         self._left = duration_s
         self._period = period_s
         self.taxels: NDArray[np.uint8] | None = None
-        self._columns: dict[str, float | Vector] = {}
+        self._columns: dict[str, float | Floats] = {}
 
     def record(self) -> TaskRecord:
         """What it knows so far."""

@@ -16,9 +16,9 @@ from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.master.position_track import rest_counts
 from canprobe.cell.master.supervisor import JointGuard
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.tasks.free_and_listen import Vector
 from canprobe.cell.tasks.joint_finding import VERBS, Answer, JointFinding, Operator, find_fault
 from canprobe.mechanics.touch.probe_motion import smooth_step
+from canprobe.mechanics.types import Floats
 
 Script = Generator[Command, Measurement, Measurement]
 ANGLE = math.radians(1.0)
@@ -45,7 +45,7 @@ class JointCheck(Controller):
         self._guard, self._model = JointGuard(plan), plan.setup.arm.model
         self._period_s, self._operator = plan.sync.period_ns * 1e-9, operator
         self.findings: list[JointFinding] = []
-        self.start: Vector | None = None
+        self.start: Floats | None = None
         self._quits = False
         self._script: Generator[Command, Measurement, None] = self._all_joints()
         next(self._script)
@@ -57,7 +57,7 @@ class JointCheck(Controller):
         except StopIteration:
             return Command(done=True)
 
-    def inspect(self, q: Vector) -> str | None:
+    def inspect(self, q: Floats) -> str | None:
         """Why an arm that stands at joint positions (n,), rad or m, must not be enabled."""
         self.start = q
         outside = np.flatnonzero((q < self._guard.low) | (q > self._guard.high))
@@ -82,7 +82,7 @@ class JointCheck(Controller):
             if self._quits:
                 return
 
-    def _joint(self, joint: int, start: Vector) -> Generator[Command, Measurement, JointFinding | None]:
+    def _joint(self, joint: int, start: Floats) -> Generator[Command, Measurement, JointFinding | None]:
         """Ask, move, look, ask, move back; None where the operator has enough before it has moved."""
         its, units_per_q = self._model.joints[joint], self._model.units_per_q
         stood, unit = its.shown(start[joint]), its.unit
@@ -109,7 +109,7 @@ class JointCheck(Controller):
         way_made = its.shown(float(moved[joint] / units_per_q[joint, joint]))
         return JointFinding(joint, stood, told, way_made, fault, unit=unit)
 
-    def _way(self, joint: int, start: Vector) -> Vector | None:
+    def _way(self, joint: int, start: Floats) -> Floats | None:
         """The change of the joints (n,), rad or m: forwards, or else backwards; None where there is no room."""
         for angle in (ANGLE, -ANGLE):
             way = np.zeros_like(start)
@@ -121,7 +121,7 @@ class JointCheck(Controller):
 
     # parts of the script
 
-    def _asked(self, question: str, q: Vector) -> Generator[Command, Measurement, Answer]:
+    def _asked(self, question: str, q: Floats) -> Generator[Command, Measurement, Answer]:
         if self._operator is None:
             return Answer.YES
         self._operator.ask(question)
@@ -130,12 +130,12 @@ class JointCheck(Controller):
         self._quits = answer is Answer.QUIT
         return answer
 
-    def _hold(self, q: Vector) -> Script:
+    def _hold(self, q: Floats) -> Script:
         for _ in range(max(1, round(SETTLE_S / self._period_s))):
             measurement = yield Command(q_target=q)
         return measurement
 
-    def _move(self, q_from: Vector, q_to: Vector) -> Script:
+    def _move(self, q_from: Floats, q_to: Floats) -> Script:
         cycles = max(1, round(MOVE_S / self._period_s))
         for k in range(1, cycles + 1):
             yield Command(q_target=q_from + smooth_step(k / cycles) * (q_to - q_from))

@@ -9,7 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
-from canprobe.cell.tasks.free_and_listen import Vector
+from canprobe.mechanics.types import Floats
 
 TOLERANCE, TOLERANCE_RESTS = 0.05, 0.5
 """How far an encoder's way may be from what was asked: this share, but at least this part of `rest_counts`."""
@@ -67,7 +67,7 @@ class JointFinding:
         return where + way + (f": {self.fault}" if self.fault is not None else ": as expected")
 
 
-def find_fault(joint: int, asked: Vector, moved: Vector, rest: Sequence[float], unit: str = "deg") -> str | None:
+def find_fault(joint: int, asked: Floats, moved: Floats, rest: Sequence[float], unit: str = "deg") -> str | None:
     """What is wrong with the motors' ways, the joint's own first; None where nothing is.
 
     Args:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg.lapack import dgesv
 
 from canprobe.cell.master.supervisor import outside_workspace
@@ -13,14 +12,13 @@ from canprobe.cell.scene.setup import Arm, Probe, SafetyLimits
 from canprobe.mechanics.robot.chain import pose_of
 from canprobe.mechanics.touch.probe_motion import PoseSteps
 from canprobe.mechanics.touch.servo import ProbePose
+from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     pass
 
-Vector = NDArray[np.float64]
 
-
-def _solve(J: Vector, twist: Any) -> list[float] | None:
+def _solve(J: Floats, twist: Any) -> list[float] | None:
     """As `probe_motion.solve`, by LAPACK itself: numpy's wrapper costs four times as much in each cycle."""
     _, _, dq, info = dgesv(J, twist)
     step: list[float] = dq.tolist()
@@ -44,7 +42,7 @@ class ProbeMotion:
         slowed: cycles in which a joint could not keep up.
     """
 
-    def __init__(self, arm: Arm, probe: Probe, safety: SafetyLimits, period_s: float, q: Vector) -> None:
+    def __init__(self, arm: Arm, probe: Probe, safety: SafetyLimits, period_s: float, q: Floats) -> None:
         self.q = np.array(q, dtype=float)
         self._model = model = arm.model
         self._steps = PoseSteps(model, probe.T_flange_probe, self.q, _solve)
@@ -64,11 +62,11 @@ class ProbeMotion:
         return ProbePose(np.array(at.flange), np.array(at.z))
 
     @property
-    def pose_matrix(self) -> Vector:
+    def pose_matrix(self) -> Floats:
         """The same with the turn about the pole, (4, 4), m."""
         return pose_of(self._steps.at)
 
-    def step(self, pose: ProbePose) -> Vector:
+    def step(self, pose: ProbePose) -> Floats:
         """Joint targets (n,), rad or m, one step nearer to ``pose``."""
         before = self.q.tolist()
         dq = self._steps.step(before, pose, self._period_s)

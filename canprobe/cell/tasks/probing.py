@@ -14,13 +14,14 @@ from canprobe.cell.master.controller import Command, Measurement, TactileSample
 from canprobe.cell.master.supervision import Contact, limits_of
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.sync import CYCLES_TO_EFFECT
-from canprobe.cell.tasks.probe_motion import ProbeMotion, Vector
+from canprobe.cell.tasks.probe_motion import ProbeMotion
 from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.task import MotionTime, Task, TaskRecord
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.patch.image import Patch
 from canprobe.mechanics.touch.probe_motion import RETREAT_SPEED, ArcMotion, LineMotion
 from canprobe.mechanics.touch.servo import ProbePose
+from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
@@ -70,7 +71,7 @@ class ProbingTask(Task):
         self._cycle = 0
         self._t = 0.0
         self._floor = 0.0
-        self._columns: dict[str, float | Vector] = {}
+        self._columns: dict[str, float | Floats] = {}
         self._estimate: SurfaceEstimate | None = None
         self._phases: dict[Phase, Callable[[], ProbePose]] = {
             Phase.MOVE: self._move,
@@ -146,7 +147,7 @@ class ProbingTask(Task):
 
     def _felt_columns(
         self, sample: TactileSample, patch: Patch, contact: ContactSample | None
-    ) -> dict[str, float | Vector]:
+    ) -> dict[str, float | Floats]:
         """What an image says, for the log."""
         return {
             "phase": float(self.phase),
@@ -184,7 +185,7 @@ class ProbingTask(Task):
     def _regain(self) -> ProbePose:
         raise NotImplementedError
 
-    def _draw_back(self, way: Vector) -> None:
+    def _draw_back(self, way: Floats) -> None:
         """Begin the retreat by a way (3,), m, off the object."""
         assert self._motion is not None
         pose = self._motion.pose

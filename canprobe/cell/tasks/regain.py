@@ -6,16 +6,13 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
 from canprobe.cell.tasks.task import Loss
 from canprobe.mechanics.touch.servo import ProbePose
+from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     pass
 
-Vector = NDArray[np.float64]
 SPEED = 2e-3
 """m/s: until the first sample of the new touch has taken effect, 27 ms later, the layer sinks in by 0.05 mm."""
 BRAKE_S = 0.02
@@ -32,7 +29,7 @@ class Search:
         velocity: of its centre then (3,), m/s; what of it runs along the path fades out.
     """
 
-    def __init__(self, pose: ProbePose, velocity: Vector) -> None:
+    def __init__(self, pose: ProbePose, velocity: Floats) -> None:
         self._start = pose
         self._sideways = velocity - pose.pole * float(velocity @ pose.pole)
 

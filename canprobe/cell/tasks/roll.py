@@ -18,8 +18,8 @@ from canprobe.mechanics.touch.patch.image import Patch
 from canprobe.mechanics.touch.probe_motion import LineMotion
 from canprobe.mechanics.touch.servo import ProbePose
 from canprobe.mechanics.touch.stops import TOUCH_FORCE
+from canprobe.mechanics.types import Floats
 
-Vector = NDArray[np.float64]
 PRESS_SPEED = 0.8e-3
 """m/s, from the first touch to the wanted force."""
 MOVE_SPEED = 30e-3
@@ -77,7 +77,7 @@ class Pressed:
     t_s: list[float] = field(default_factory=list)
     images: list[NDArray[np.uint8]] = field(default_factory=list)
     windows: list[tuple[int, int, int, int] | None] = field(default_factory=list)
-    T_base_probe: list[Vector] = field(default_factory=list)
+    T_base_probe: list[Floats] = field(default_factory=list)
     cycles: list[int] = field(default_factory=list)
 
 
@@ -144,7 +144,7 @@ class RollTask(ProbingTask):
 
     # where the probe is
 
-    def poses(self, x: Vector) -> Iterator[ProbePose]:
+    def poses(self, x: Floats) -> Iterator[ProbePose]:
         """Above each touch, and round its roll, for a probe that begins with its x axis along `x` (3,)."""
         self._set_axes(x)
         for number, press in enumerate(self.presses):
@@ -154,7 +154,7 @@ class RollTask(ProbingTask):
                 yield self._pose(press.way(float(t)), 0.0)
         self._number = 0
 
-    def _set_axes(self, x: Vector) -> None:
+    def _set_axes(self, x: Floats) -> None:
         inward = -self._approach_of.normal
         x = x - inward * float(inward @ x)
         x = x / np.linalg.norm(x)

@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.cell.master.array import patch_of
 from canprobe.cell.master.controller import Measurement, TactileSample
@@ -22,12 +21,12 @@ from canprobe.mechanics.touch.patch.dead_taxels import mended
 from canprobe.mechanics.touch.patch.image import Patch, PatchCalibration
 from canprobe.mechanics.touch.patch.moments import MomentImage, Moments
 from canprobe.mechanics.touch.patch.pad_lag import PadLag
+from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 
 
-Vector = NDArray[np.float64]
 MOST_RATIO = 6.0
 """Between the slope that is felt and the one of the stated stiffness on a plane; further apart it is not believed."""
 HOLLOWEST = 0.9
@@ -45,19 +44,19 @@ class JointHistory:
 
     def __init__(self) -> None:
         self._times: deque[int] = deque(maxlen=HISTORY)
-        self._joints: deque[Vector] = deque(maxlen=HISTORY)
+        self._joints: deque[Floats] = deque(maxlen=HISTORY)
 
-    def add(self, t_ns: int, q: Vector) -> None:
+    def add(self, t_ns: int, q: Floats) -> None:
         """Remember joint positions (n,), rad or m, at ``t_ns``; times must increase."""
         self._times.append(t_ns)
         self._joints.append(q)
 
     @property
-    def newest(self) -> Vector:
+    def newest(self) -> Floats:
         """Joint positions (n,), rad or m, that were added last."""
         return self._joints[-1]
 
-    def at(self, t_ns: int) -> Vector | None:
+    def at(self, t_ns: int) -> Floats | None:
         """Joint positions (n,), rad or m, at ``t_ns``, linear between SYNCs; None outside the history."""
         if not self._times or not self._times[0] <= t_ns <= self._times[-1]:
             return None
@@ -98,7 +97,7 @@ class ContactSensing:
     def __init__(
         self,
         model: ArmModel,
-        flange_probe: Vector,
+        flange_probe: Floats,
         calibration: PatchCalibration,
         radius: float,
         stiffness: float,
@@ -133,11 +132,11 @@ class ContactSensing:
         self.patch = patch_of(measurement.tactile, self._calibration)
         return self.patch
 
-    def position_sigma(self, direction: Vector) -> float:
+    def position_sigma(self, direction: Floats) -> float:
         """Standard deviation of the probe's position along a unit vector (3,), m: joints come in whole counts."""
         return position_sigma(self.model, self._history.newest, self.flange_probe, direction)
 
-    def set_kappa(self, kappa: Vector, stiffness: float | None = None) -> None:
+    def set_kappa(self, kappa: Floats, stiffness: float | None = None) -> None:
         """Take the object's principal curvatures (2,), 1/m, and the layer's stiffness as the estimator knows them.
 
         An estimate that is no contact of one patch any more (a hollow as tight as the probe) is taken at the limit.
@@ -169,7 +168,7 @@ class ContactSensing:
         """Indentation (m) of the layer at ``force`` (N) on the curvature known so far: the root of the force."""
         return self._depth_at_1_n * math.sqrt(force) if force > 0 else 0.0
 
-    def probe_at(self, t_ns: int) -> Vector | None:
+    def probe_at(self, t_ns: int) -> Floats | None:
         """The probe (4, 4) in base at a time of the last cycles; None where the joints of that time are unknown."""
         q = self._history.at(t_ns)
         return None if q is None else forward(self._chain, q)

@@ -13,7 +13,7 @@ from canprobe.cell.master.supervision import Reaction
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Touch
 from canprobe.cell.tasks.probing import Phase, ProbingTask
-from canprobe.cell.tasks.regain import REST_S, SPEED, Search, Vector
+from canprobe.cell.tasks.regain import REST_S, SPEED, Search
 from canprobe.cell.tasks.sensing import ContactSensing, is_too_hollow
 from canprobe.cell.tasks.shape import ShapeTracker
 from canprobe.cell.tasks.task import Loss, TaskRecord
@@ -25,6 +25,7 @@ from canprobe.mechanics.touch.probe_motion import MOVE_SPEED, SETTLE_S, LineMoti
 from canprobe.mechanics.touch.servo import LocalSurface, ProbePose, TactileServo
 from canprobe.mechanics.touch.stops import TOUCH_FORCE
 from canprobe.mechanics.touch.strategies import PathFollower
+from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
@@ -68,15 +69,15 @@ class TouchTask(ProbingTask):
         self.losses: list[Loss] = []
         self._search: Search | None = None
         self._asked: ProbePose | None = None
-        self._velocity: Vector = np.zeros(3)
+        self._velocity: Floats = np.zeros(3)
         self._scan_t = self._searched_before = 0.0
         self._contact: ContactSample | None = None
         self._depth0 = 0.0
         self._push = PushFit()
-        self._push_from: tuple[Vector, Vector] | None = None
+        self._push_from: tuple[Floats, Floats] | None = None
         self._at_rest = AtRest()
-        self._pole0: Vector = np.zeros(3)
-        self._shape_columns: dict[str, float | Vector] = {}
+        self._pole0: Floats = np.zeros(3)
+        self._shape_columns: dict[str, float | Floats] = {}
         self._updated = True
 
     @property

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.master.supervisor import JointGuard
@@ -15,8 +15,8 @@ from canprobe.cell.tasks.task import MotionTime
 from canprobe.errors import UsageError
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.touch.linear_algebra import checked, instance, real_numbers
+from canprobe.mechanics.types import Floats
 
-Vector = NDArray[np.float64]
 NEAR_RAD = 0.01
 """How far a first point at time 0 may be from where the arm stands; of a joint that slides its `ArmModel.radian`."""
 BRAKE_S = 0.5
@@ -76,7 +76,7 @@ class Trajectory(Controller):
         """Time of the last point, s from the start."""
         return float(self._times[-1])
 
-    def inspect(self, q: Vector) -> str | None:
+    def inspect(self, q: Floats) -> str | None:
         """Why the motion from the joint positions q (n,), rad or m, is refused; None where it is allowed."""
         if self._times[0] == 0.0:
             away = np.abs(self._q[0] - q) / self._model.radian
@@ -89,7 +89,7 @@ class Trajectory(Controller):
         reason = self._outside_way()
         return None if reason is None else f"trajectory: {reason}"
 
-    def lead(self, q: Vector, qd: Vector | None = None) -> None:
+    def lead(self, q: Floats, qd: Floats | None = None) -> None:
         """Start the motion at the joint positions q, without a check.
 
         Args:
@@ -109,7 +109,7 @@ class Trajectory(Controller):
         self._qd[0], self._qd[-1] = (0.0 if qd is None else qd), 0.0
 
     @classmethod
-    def braking(cls, plan: Plan, q: Vector, qd: Vector) -> Trajectory:
+    def braking(cls, plan: Plan, q: Floats, qd: Floats) -> Trajectory:
         """From a motion at q with speed qd (n,) to rest, evenly in `BRAKE_S`; within the joints' range."""
         guard = JointGuard(plan)
         end = np.clip(q + 0.5 * BRAKE_S * qd, guard.low, guard.high)
@@ -117,7 +117,7 @@ class Trajectory(Controller):
         way.lead(q, qd)
         return way
 
-    def at(self, t_s: float) -> Vector:
+    def at(self, t_s: float) -> Floats:
         """Joint positions (n,), rad or m, at a time from the start, s; after the last point those at it."""
         t = min(max(t_s, 0.0), self.duration_s)
         k = min(int(np.searchsorted(self._times, t, side="right")) - 1, len(self._times) - 2)
@@ -167,7 +167,7 @@ class Trajectory(Controller):
         return None
 
 
-def _table(points: Iterable[tuple[float, ArrayLike]], n: int) -> tuple[Vector, Vector]:
+def _table(points: Iterable[tuple[float, ArrayLike]], n: int) -> tuple[Floats, Floats]:
     """Times (m,) s and positions (m, n) of the points, finite and in the order of time."""
     try:
         rows = list(points)
@@ -191,11 +191,11 @@ def _table(points: Iterable[tuple[float, ArrayLike]], n: int) -> tuple[Vector, V
     return times, q
 
 
-def _velocities(velocities: Sequence[ArrayLike], shape: tuple[int, ...]) -> Vector:
+def _velocities(velocities: Sequence[ArrayLike], shape: tuple[int, ...]) -> Floats:
     return checked("trajectory: velocities", velocities, shape).copy()
 
 
-def _slopes(times: Vector, q: Vector) -> Vector:
+def _slopes(times: Floats, q: Floats) -> Floats:
     """Speed (m, n) in each point: a weighted harmonic mean of the means beside it; 0 at the ends and in extremes."""
     h = np.diff(times)[:, None]
     mean = np.diff(q, axis=0) / h
@@ -208,7 +208,7 @@ def _slopes(times: Vector, q: Vector) -> Vector:
     return slopes
 
 
-def _cubic(s: Vector | float, h: float, q: Vector, qd: Vector) -> tuple[Vector, Vector]:
+def _cubic(s: Floats | float, h: float, q: Floats, qd: Floats) -> tuple[Floats, Floats]:
     """Position and speed at the share s of a segment of h seconds, from those at its ends, (2, n) each."""
     way = q[1] - q[0]
     c2, c3 = 3.0 * way - h * (2.0 * qd[0] + qd[1]), -2.0 * way + h * (qd[0] + qd[1])
