@@ -12,12 +12,12 @@ from collections.abc import Container, Sequence
 import numpy as np
 
 from canprobe.cell.emulated.array import TactilePlant
-from canprobe.cell.emulated.image_processing import FULL_SCALE
 from canprobe.cell.scene.setup import Array
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.protocol.frames import SYNC_ID, Frame
+from canprobe.mechanics.touch.pad import COUNTS_MAX
 
-OFFSETS = 0.02
+OFFSET_SHARE = 0.02
 """Half-width of the unloaded values' spread, as a share of the full scale."""
 
 
@@ -44,7 +44,7 @@ class RawArray(Participant):
         self.running = not wire.start
         self._due_ns: int | None = None
         self._span = wire.full_scale - wire.unloaded
-        spread = OFFSETS * self._span if wire.tare_images else 0.0
+        spread = OFFSET_SHARE * self._span if wire.tare_images else 0.0
         offsets = np.random.default_rng(seed).uniform(-spread, spread, array.pad.shape) if spread else 0.0
         self._unloaded = np.rint(wire.unloaded + np.zeros(array.pad.shape) + offsets)
         self._largest = (1 << wire.image.bits) - 1
@@ -95,7 +95,7 @@ class RawArray(Participant):
     def _sample(self, t_ns: int) -> None:
         self._plant.begin(t_ns)
         self._plant.advance(t_ns)
-        loads = self._plant.sample_image(t_ns).astype(np.float64) / FULL_SCALE
+        loads = self._plant.sample_image(t_ns).astype(np.float64) / COUNTS_MAX
         image = self._wire.image
         counts = np.empty((image.rows, image.columns, image.axes), dtype=np.int64)
         counts[:] = self._unloaded[:, :, None]

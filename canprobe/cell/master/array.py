@@ -25,9 +25,9 @@ DEADLINE_CYCLES = 2
 """From the first PDO of a frame to its last."""
 JITTER_NS = 300_000
 """By how much the stamps of a SYNC and a header may contradict each other: other loggers do not keep order."""
-LATEST_CYCLES = 4
+MAX_HEADER_AGE_CYCLES = 4
 """SYNCs after its trigger up to which a header is believed; the bus is planned for two."""
-WITHIN = 0.75
+IMAGE_SPREAD_PERIODS = 0.75
 """Share of the period of raw images within which the frames of one come; so the next ones are not mixed with it."""
 
 
@@ -167,7 +167,7 @@ class TactileReceiver(ArrayReceiver):
             return False
         if frame.t_ns + JITTER_NS < sync_stamps[-1 - cycles_ago]:
             return True
-        later = cycles_ago - LATEST_CYCLES
+        later = cycles_ago - MAX_HEADER_AGE_CYCLES
         return later > 0 and sync_stamps[-later] <= frame.t_ns
 
     def _cycles_ago(self, frame: TactileFrame, sync_counter: int, sync_stamps: Sequence[int]) -> int:
@@ -198,7 +198,7 @@ class RawReceiver(ArrayReceiver):
         self.wire: RawWire = array.raw
         self.rate_hz = array.rate_hz
         period_ns = 1e9 / array.rate_hz
-        self.assembler = ImageAssembler(self.wire.image, round(WITHIN * period_ns))
+        self.assembler = ImageAssembler(self.wire.image, round(IMAGE_SPREAD_PERIODS * period_ns))
         self._fit = PeriodFit(period_ns) if self.wire.sampling == "free" else None
         self._ratio = ratio
         self._unloaded: Floats | None = None

@@ -25,11 +25,12 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.configuration import NodeSetup, Write
 from canprobe.cell.planning.operation import INTERPOLATION_TIME
-from canprobe.cell.scene.setup import BringUpTimes as Settings
+from canprobe.cell.scene.model import BringUpSettings
 from canprobe.errors import BusError, NodeError
 from canprobe.fieldbus.bus.presence import SECOND_ANSWER_S, UPLOAD_DEVICE_TYPE
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.sdo import (
+    Dialogue,
     Dialogues,
     SdoTimeoutError,
     decode_text,
@@ -43,15 +44,14 @@ from canprobe.fieldbus.protocol.frames import SDO_RX_BASE, SDO_TX_BASE, NmtComma
 
 ERROR_HISTORY = 0x1003
 SOFTWARE_VERSION, STORE_PARAMETERS, VERIFY_CONFIGURATION = 0x100A, 0x1010, 0x1020
-SAVE = int.from_bytes(b"save", "little")
+SAVE_SIGNATURE = int.from_bytes(b"save", "little")
 HEARTBEAT_CONSUMER = 0x1016
 PDO_PARAMETERS = range(0x1400, 0x1C00)
 MODE_DISPLAY = 0x6061
-REVISION = 3
+REVISION_SUBINDEX = 3
 IDENTITY_NAMES = {1: "vendor id", 2: "product code", 3: "revision number", 4: "serial number"}
 RELEASE_S = 0.1
 """For one answer of a node that is released."""
-Dialogue = Generator[bytes | None, bytes, None]
 
 
 @dataclass(slots=True)
@@ -100,7 +100,7 @@ class BringUp:
         network: PumpedNetwork,
         watch: NodeWatch,
         setups: tuple[NodeSetup, ...],
-        settings: Settings,
+        settings: BringUpSettings,
         say: Callable[[str], None],
     ) -> None:
         self._network = network
@@ -249,7 +249,7 @@ class BringUp:
         setup = report.setup
         for subindex, expected in setup.identity.items():
             got = yield from read_entry(setup, 0x1018, subindex)
-            if subindex == REVISION and got != expected and _same_major(got, expected):
+            if subindex == REVISION_SUBINDEX and got != expected and _same_major(got, expected):
                 report.remarks.append(
                     f"has revision {got:08X}h, {setup.eds} describes {expected:08X}h: the same major revision, taken"
                 )
@@ -311,7 +311,7 @@ class BringUp:
             return
         for subindex, value in setup.configuration_date.items():
             yield from write_entry(setup, Write(VERIFY_CONFIGURATION, subindex, value, "configuration date"))
-        yield from write_entry(setup, Write(STORE_PARAMETERS, 1, SAVE, "store", read_back=False))
+        yield from write_entry(setup, Write(STORE_PARAMETERS, 1, SAVE_SIGNATURE, "store", read_back=False))
 
     # 4. start
 

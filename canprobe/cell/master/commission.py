@@ -12,7 +12,7 @@ from typing import Any
 
 from canprobe.cell.master.id_assignment import Assignment, Wanted, choose_assignments
 from canprobe.cell.master.lss_session import FoundTwiceError, assign, find_unconfigured
-from canprobe.cell.master.scan import NUMBERS, scan_nodes
+from canprobe.cell.master.scan import IDENTITY_SUBINDICES, scan_nodes
 from canprobe.cell.planning.model import Plan
 from canprobe.errors import BusError
 from canprobe.fieldbus.bus.port import Port
@@ -103,9 +103,9 @@ def _check_all_placed(
 
 
 def _address(node: dict[str, Any]) -> LssAddress | None:
-    numbers = [node[name] for name in NUMBERS]
+    numbers = [node[name] for name in IDENTITY_SUBINDICES]
     return None if None in numbers else LssAddress(*numbers)
 
 
 def _numbers(address: LssAddress) -> dict[str, int]:
-    return dict(zip(NUMBERS, address.numbers, strict=True))
+    return dict(zip(IDENTITY_SUBINDICES, address.numbers, strict=True))

@@ -30,7 +30,7 @@ from canprobe.cell.master.supervisor import JointGuard
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.configuration import HOME_OFFSET, HOMES_HERE, MODE, NodeSetup, Write
 from canprobe.cell.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan
-from canprobe.cell.scene.setup import Homing as Settings
+from canprobe.cell.scene.setup import HomingParameters
 from canprobe.errors import CanprobeError, NodeError, UsageError
 from canprobe.fieldbus.bus.files import write_text
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
@@ -56,7 +56,7 @@ from canprobe.mechanics.robot.model import coupled_joints, drive_position_at
 from canprobe.mechanics.types import Floats
 
 POLL_S = 0.01
-TOLERANCE = math.radians(1.0)
+TOLERANCE_RAD = math.radians(1.0)
 """By which a position may differ from the record, and at home from the home offset, rad; a slide's is in proportion."""
 CONTROLWORD, STATUSWORD, POSITION, IDENTITY = 0x6040, 0x6041, 0x6064, 0x1018
 TARGET, PROFILE_SPEED = 0x607A, 0x6081
@@ -146,7 +146,10 @@ class Homing:
         self._network, self._watch, self._supervise = network, watch, supervise
         self._record, self._say = ZeroRecord(record), say
         guard = JointGuard(plan)
-        self._low, self._high = guard.low + TOLERANCE * self._model.radian, guard.high - TOLERANCE * self._model.radian
+        self._low, self._high = (
+            guard.low + TOLERANCE_RAD * self._model.radian,
+            guard.high - TOLERANCE_RAD * self._model.radian,
+        )
         self._beats, self._heartbeat_ns = False, 0
         zeros = {axis: drive.zero for axis, drive in enumerate(self._drives) if drive.zero is not None}
         self.order = tuple(sorted(zeros, key=lambda axis: (zeros[axis].order, axis)))
@@ -211,7 +214,7 @@ class Homing:
 
     def _tolerance(self, axis: int) -> float:
         """Drive units."""
-        return abs(float(self._model.units_per_q[axis, axis] * self._model.radian[axis])) * TOLERANCE
+        return abs(float(self._model.units_per_q[axis, axis] * self._model.radian[axis])) * TOLERANCE_RAD
 
     # homing
 
@@ -278,7 +281,7 @@ class Homing:
         self._pump(lambda: False, POLL_S)
         self._supervise()
 
-    def _zero(self, axis: int) -> Settings:
+    def _zero(self, axis: int) -> HomingParameters:
         zero = self._drives[axis].zero
         assert zero is not None
         return zero
@@ -295,7 +298,7 @@ class Homing:
             units[other] = self._read(self._setups[other], POSITION, 0)
         return units
 
-    def _find_home(self, setup: NodeSetup, zero: Settings, home: int) -> None:
+    def _find_home(self, setup: NodeSetup, zero: HomingParameters, home: int) -> None:
         for write in setup.homing:
             self._write(setup, replace(write, value=-home) if write.index == HOME_OFFSET else write)
         self._enable(setup, OperationMode.HOMING)
@@ -304,7 +307,7 @@ class Homing:
         late = f"did not {what} in {zero.timeout_s:g} s (homing_timeout_s)"
         self._await_bits(setup, (HOMING_ATTAINED, TARGET_REACHED), zero.timeout_s, what, late, error=HOMING_ERROR)
 
-    def _move(self, setup: NodeSetup, zero: Settings, target: int, speed: int) -> None:
+    def _move(self, setup: NodeSetup, zero: HomingParameters, target: int, speed: int) -> None:
         """Profile position."""
         self._write(setup, Write(PROFILE_SPEED, 0, speed, "profile velocity"))
         self._enable(setup, OperationMode.PROFILE_POSITION)

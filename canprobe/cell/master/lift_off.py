@@ -24,11 +24,11 @@ from canprobe.mechanics.robot.model import ArmModel, units_to_joints
 from canprobe.mechanics.robot.remaining_drives import lifting_step
 from canprobe.mechanics.types import Floats
 
-WAY = 6e-3
+LIFT_WAY = 6e-3
 """m: as far as a touch retreats, and further than the softest pad is pressed in."""
-SPEED = 20e-3
+LIFT_SPEED = 20e-3
 """m/s, the mean; it begins with twice as much, which then falls to zero."""
-ARRIVE_S = 0.02
+ARRIVAL_S = 0.02
 """For the drives' lag at the end."""
 
 
@@ -61,7 +61,7 @@ class WayBack:
         if self._away is None:
             self._away = -T[:3, 2]
         before, self._t = self._gone(self._t), self._t + self._period_s
-        if before >= WAY and self._t > WAY / SPEED + ARRIVE_S:
+        if before >= LIFT_WAY and self._t > LIFT_WAY / LIFT_SPEED + ARRIVAL_S:
             return None
         move = self._away * (self._gone(self._t) - before)
         if move.any():
@@ -74,12 +74,12 @@ class WayBack:
     @staticmethod
     def cycles(period_s: float) -> int:
         """How many there are at most."""
-        return math.ceil((WAY / SPEED + ARRIVE_S) / period_s) + 1
+        return math.ceil((LIFT_WAY / LIFT_SPEED + ARRIVAL_S) / period_s) + 1
 
     @staticmethod
     def _gone(t: float) -> float:
         """Way after ``t`` seconds, m."""
-        return WAY * (1.0 - max(1.0 - t * SPEED / WAY, 0.0) ** 2)
+        return LIFT_WAY * (1.0 - max(1.0 - t * LIFT_SPEED / LIFT_WAY, 0.0) ** 2)
 
 
 class LiftOff:

@@ -10,7 +10,7 @@ from canprobe.errors import CanprobeError, NodeError
 
 KINDS_KEPT = 100
 """Kinds that are distinguished; a node that sends another EMCY each time must not fill the memory."""
-OTHERS = "more of other kinds"
+OTHER_KINDS_TEXT = "more of other kinds"
 
 
 @dataclass(slots=True)
@@ -52,7 +52,7 @@ class Notes:
             t_s: on the run's clock.
         """
         if what not in self._kinds and len(self._kinds) >= KINDS_KEPT:
-            what = OTHERS
+            what = OTHER_KINDS_TEXT
         kind = self._kinds.setdefault(what, _NoteKind(what))
         kind.times += 1
         if node_id is not None:

@@ -12,7 +12,7 @@ from canprobe.cell.master.cycle import TIMED_CYCLES
 from canprobe.fieldbus.bus.clock import elapsed_ns
 from canprobe.fieldbus.bus.port import TimedFrame
 
-MOST_FRAMES = 100_000
+MAX_FRAMES = 100_000
 """Frames that are kept for the next observation: bring-up has a few thousand and no cycle."""
 COSTS_KEPT = 100_000
 """Costs that are kept: a cell may stay up for days."""
@@ -68,7 +68,7 @@ class Observers:
         def both(can_id: int, data: bytes, t_ns: int) -> None:
             write(can_id, data, t_ns)
             frames = self._frames
-            if len(frames) < MOST_FRAMES:
+            if len(frames) < MAX_FRAMES:
                 frames.append((can_id, data, t_ns - self.origin_ns))
 
         return both

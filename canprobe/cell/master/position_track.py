@@ -13,14 +13,14 @@ REST_NS = 12_500_000
 """Time without a motion after which a drive is at rest."""
 REST_RAD = 1e-3
 """Of a joint: what a report may be off by, whatever the motion, and within which a drive at rest stays."""
-REST_COUNTS_LEAST = 8
+MIN_REST_COUNTS = 8
 """The same of a coarse encoder, which has a count or two a milliradian: it dithers, and its drive starts in steps."""
 CARRIED_CYCLES = 3
 """Periods for which a motion is carried on without a report. After a late cycle too: a drive that gets no new target
 stops at its last one, however long the cycle lasts."""
 FOLLOWED_CYCLES = 20
 """Periods within which a drive has followed its target."""
-_FORGET = 0.9
+_STEP_DECAY = 0.9
 """Share of the largest step of the target that still counts one period later: an eighth after `FOLLOWED_CYCLES`."""
 PERIOD_NS = 2_500_000
 """Of a cycle at 400 Hz."""
@@ -79,7 +79,7 @@ class PositionTrack:
             self._way += self._followed(periods)
             self._periods += periods
         self._heard = False
-        faded = _FORGET**periods * self._asked
+        faded = _STEP_DECAY**periods * self._asked
         self._asked = step_counts if step_counts > faded else faded
 
     def take(self, counts: int, cycle: int, t_ns: int, *, guarded: bool) -> bool:
@@ -130,4 +130,4 @@ class PositionTrack:
 def rest_counts(model: ArmModel) -> list[float]:
     """A milliradian (0.2 mm) of each drive's joint in its units: more than encoders are noisy, less than a motion."""
     counts = np.abs(units_per_motor(model)) * model.radian * REST_RAD
-    return np.maximum(counts, REST_COUNTS_LEAST).tolist()  # type: ignore[no-any-return]
+    return np.maximum(counts, MIN_REST_COUNTS).tolist()  # type: ignore[no-any-return]

@@ -25,11 +25,11 @@ from canprobe.mechanics.touch.stops import TOUCH_FORCE
 
 HOLD_CYCLES = 3
 """Cycles without a TPDO of one drive after which all of them hold."""
-HOLD_NS = 1_000_000_000
+MAX_HOLD_NS = 1_000_000_000
 """Longest hold."""
-LOST_NS = 30_000_000
+CONTACT_LOST_NS = 30_000_000
 """Without contact force in a touch, after which the contact is lost."""
-HIDDEN_NS = 20_000_000
+FORCE_HIDDEN_NS = 20_000_000
 """With a force that the array shows only in part, after which it may be above the limit."""
 TACTILE_TIMEOUT_PERIODS = 6
 
@@ -121,7 +121,7 @@ class Seen:
 
 
 @dataclass(slots=True, eq=False)
-class Contact:
+class TouchState:
     """A touch as its checks see it: one object, kept up to date from sample to sample.
 
     Attributes:
@@ -196,10 +196,10 @@ class Condition:
         what: for people.
         reaction: what the cell does.
         within: longest time from the fault to the reaction, ns; None where no such time applies.
-        check: of a `Seen` in every cycle, or of a `Contact` in a touch: the error that names what is wrong, or None.
+        check: of a `Seen` in every cycle, or of a `TouchState` in a touch: the error that names what is wrong, or None.
             A condition without check and count shows by itself: an exception, or a node that stops.
         count: for what the cell lives with: how often it has happened.
-        touch: the check takes a `Contact`.
+        touch: the check takes a `TouchState`.
         enabling: the check holds already while the drives are enabled.
     """
 

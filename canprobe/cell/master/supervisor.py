@@ -12,7 +12,7 @@ import numpy as np
 
 from canprobe.cell.master.conditions import BY_KEY, COUNTERS, CYCLE_CHECKS, touch_finding
 from canprobe.cell.master.controller import Command, Measurement, TactileSample
-from canprobe.cell.master.supervision import Contact, Finding, Reaction, Seen
+from canprobe.cell.master.supervision import Finding, Reaction, Seen, TouchState
 from canprobe.cell.planning.model import Plan
 from canprobe.fieldbus.bus.port import ControllerState, PortCounters
 from canprobe.mechanics.robot.chain import forward
@@ -22,12 +22,12 @@ from canprobe.mechanics.types import Floats
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.patch.image import Patch
 
-MEASURED_SHARE = 1.5
+MAX_SPEED_SHARE = 1.5
 """Measured motion above this share of the speed limit is no motion of the arm; SYNCs may be late by a period."""
-COUNTS = 2
+ENCODER_TOLERANCE_COUNTS = 2
 """Encoder counts by which two readings may differ at rest."""
 _ROUNDING = 1e-9
-_NUMBERS = "fiu"
+_NUMBER_KINDS = "fiu"
 """Kinds of arrays that can be angles."""
 
 
@@ -94,12 +94,12 @@ class JointGuard:
         if measurement.q is None or any(measurement.q_age):
             return None
         before, self._q = self._q, measurement.q.tolist()
-        share = MEASURED_SHARE * (measurement.t_ns - self._t_ns + self._period_ns) * 1e-9
+        share = MAX_SPEED_SHARE * (measurement.t_ns - self._t_ns + self._period_ns) * 1e-9
         self._t_ns = measurement.t_ns
         if before is None:
             return None
         joints = zip(self._q, before, self._speed, self._counts, strict=True)
-        beyond = [abs(q - was) - share * speed - COUNTS * count for q, was, speed, count in joints]
+        beyond = [abs(q - was) - share * speed - ENCODER_TOLERANCE_COUNTS * count for q, was, speed, count in joints]
         if max(beyond) <= 0.0:
             return None
         joint = beyond.index(max(beyond))
@@ -114,7 +114,7 @@ class JointGuard:
                 given = np.asanyarray(q_target)
             except (TypeError, ValueError):
                 given = np.array(None)
-            if given.dtype.kind not in _NUMBERS or isinstance(given, np.ma.MaskedArray):
+            if given.dtype.kind not in _NUMBER_KINDS or isinstance(given, np.ma.MaskedArray):
                 return GuardedTarget(None, f"the controller's q_target is {q_target!r}: expected {n} {self._si}")
             target = np.asarray(given, dtype=np.float64)
         else:
@@ -147,15 +147,15 @@ class JointGuard:
 NOTED_ONCE = ("error_frames", "frames_dropped", "clock_step", "estimator")
 """Conditions that the cell lives with and notes once; the others are figures of the summary."""
 SECOND_NS = 1_000_000_000
-LOOK_NS = 20_000_000
+LOOK_PERIOD_NS = 20_000_000
 """Between two looks at where the probe presses: less than a millimetre of a retreat."""
-MEMORY = 0.25
+MEMORY_SHARE = 0.25
 """Share of a force that the array may show when it is gone: creep, 5 % a decade, of a press of a quarter of an hour."""
-CLEAR = 3e-3
-"""m, straight back along the pole: half a retreat, and more than `MEMORY` of 50 N presses the softest pad in."""
+CLEARANCE = 3e-3
+"""m, straight back along the pole: half a retreat, and more than `MEMORY_SHARE` of 50 N presses the softest pad in."""
 
 
-class Press:
+class PressDetector:
     """Whether what the array shows is a press, or what it remembers of one.
 
     After a long press the array creeps back for as long as it was pressed. By its size alone that is a light touch. But
@@ -170,7 +170,7 @@ class Press:
 
     def look(self, force: float, T_base_tip: Floats) -> None:
         """Take the array's force, N, and where the probe's tip is (4, 4)."""
-        if self.holds(force) and force >= MEMORY * self._highest:
+        if self.holds(force) and force >= MEMORY_SHARE * self._highest:
             self._T_base_tip, self._highest = T_base_tip, max(force, self._highest)
         elif self._T_base_tip is None:
             self._remembered = min(force, self._remembered)
@@ -185,7 +185,7 @@ class Press:
         assert self._T_base_tip is not None
         pole = self._T_base_tip[:3, 2]
         back = -float(way @ pole)
-        return back > CLEAR and float(np.linalg.norm(way + back * pole)) < back
+        return back > CLEARANCE and float(np.linalg.norm(way + back * pole)) < back
 
 
 class Supervisor:
@@ -209,9 +209,9 @@ class Supervisor:
         self.first: dict[str, int] = {}
         self._patch_from = patch_from
         self._guard = guard
-        self._contact = Contact(seen.limits)
+        self._contact = TouchState(seen.limits)
         self._sample: TactileSample | None = None
-        self._press = Press()
+        self._press = PressDetector()
         self._look_ns = 0
         self._untouched = seen.limits.tares
         self._late: deque[tuple[int, int]] = deque()  # while one of them is late, the last second's cycles
@@ -246,7 +246,7 @@ class Supervisor:
             if measurement.tactile is not None:
                 seen.preload = max(seen.preload, self.felt())
         if measurement.t_ns >= self._look_ns:
-            self._look_ns = measurement.t_ns + LOOK_NS
+            self._look_ns = measurement.t_ns + LOOK_PERIOD_NS
             self._look()
         for key, count in COUNTERS:
             if (number := count(seen)) != self.counts[key]:
@@ -317,7 +317,7 @@ class Supervisor:
         guarded = self._guard.command(command.q_target, self.seen.measurement)
         self.seen.slowed = self._guard.slowed
         if guarded.limit is not None:
-            return replace(command, q_target=None), touch_finding(Contact(self.seen.limits, limit=guarded.limit))
+            return replace(command, q_target=None), touch_finding(TouchState(self.seen.limits, limit=guarded.limit))
         return (command if guarded.q is command.q_target else replace(command, q_target=guarded.q)), None
 
     def notes(self) -> list[str]:

@@ -10,7 +10,7 @@ from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.emcy import Emcy, describe, is_no_error
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NMT_ID, SYNC_ID, NmtState, unpack_heartbeat
 
-UNTOLD = 64
+MAX_NEW_ALARMS = 64
 """Alarms that are kept until `NodeWatch.news` is called."""
 
 
@@ -63,7 +63,7 @@ class NodeWatch:
         self.alarmed: set[int] = set()
         self.communication = 0
         self.foreign: str | None = None
-        self._untold: deque[EmcyEvent] = deque(maxlen=UNTOLD)
+        self._untold: deque[EmcyEvent] = deque(maxlen=MAX_NEW_ALARMS)
         self._heard: dict[int, int] = {}
 
     def push(self, can_id: int, data: bytes, t_ns: int) -> bool:
@@ -109,7 +109,7 @@ class NodeWatch:
             self.alarmed.add(node_id)
 
     def news(self) -> list[EmcyEvent]:
-        """Alarms since the last call, the last `UNTOLD` of them."""
+        """Alarms since the last call, the last `MAX_NEW_ALARMS` of them."""
         if not self._untold:
             return []
         news = list(self._untold)

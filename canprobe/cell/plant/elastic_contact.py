@@ -11,7 +11,7 @@ from math import pi, sqrt
 from typing import NamedTuple
 
 
-class Contact(NamedTuple):
+class Indentation(NamedTuple):
     """What one indentation gives.
 
     Attributes:
@@ -33,7 +33,7 @@ class Contact(NamedTuple):
     damping_factor: float
 
 
-NO_CONTACT = Contact(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+NO_CONTACT = Indentation(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 def relative_curvatures(kappa: tuple[float, float], radius: float) -> tuple[float, float]:
@@ -65,7 +65,7 @@ def elastic_contact(
     *,
     depth_rate: float = 0.0,
     damping: float = 0.0,
-) -> Contact:
+) -> Indentation:
     """Force and patch of an indentation.
 
     Args:
@@ -90,7 +90,7 @@ def elastic_contact(
     factor = max(0.0, 1.0 + 1.5 * damping * depth_rate)
     elastic = pi * stiffness_n_m3 * depth * depth / (2.0 * sqrt(A * B))
     a, b = sqrt(depth / A), sqrt(depth / B)
-    return Contact(
+    return Indentation(
         force=factor * elastic,
         a=a,
         b=b,

@@ -16,13 +16,13 @@ import numpy as np
 from canprobe.cell.plant.cascade import DriveLoops, Drives
 from canprobe.cell.plant.ideal_arm import STICTION_RATE
 from canprobe.cell.plant.integrators import Linearised
-from canprobe.cell.plant.pushing import Contact
+from canprobe.cell.plant.pushing import HeldContact
 from canprobe.mechanics.robot.dynamics import RigidBody
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.robot.motors import joints_per_motor
 from canprobe.mechanics.types import Floats
 
-Touching = Callable[[Floats], Contact | None]
+Touching = Callable[[Floats], HeldContact | None]
 """Motor positions (n,) -> the contact near there, None where nothing is near."""
 
 
@@ -72,7 +72,7 @@ class ArmEquations:
     ) -> None:
         self.body, self.loops, self.effects, self.held = body, loops, effects, held
         self.positions = model.n
-        self.contact: Contact | None = None
+        self.contact: HeldContact | None = None
         self._touching = touching
         self._joints_per_motor = joints_per_motor(model)
         self._rotors = np.diag([joint.rotor_inertia for joint in model.joints])

@@ -13,6 +13,7 @@ from math import cos, exp, pi, sin, sqrt, tanh
 import numpy as np
 import numpy.typing as npt
 
+from canprobe.cell.plant.ramps import NEVER
 from canprobe.fieldbus.drive.motor import MotorDynamics
 from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_to_joints
 from canprobe.mechanics.types import Floats
@@ -25,7 +26,6 @@ STICTION_RATE = 0.01
 Transition = tuple[float, float, float, float]
 State = tuple[float, float, float]
 """Position, rate and reference of one motor: counts, counts/s, counts."""
-_NEVER = 1 << 62
 
 
 def natural_frequency(bandwidth_hz: float, damping_ratio: float) -> float:
@@ -68,7 +68,7 @@ class _Axis:
 
     def __init__(self, q: float, lag: float) -> None:
         self.t_ns, self.q, self.v, self.r, self.slope = 0, q, 0.0, q, 0.0
-        self.end, self.end_ns, self.event_ns, self.lag = q, _NEVER, _NEVER, lag
+        self.end, self.end_ns, self.event_ns, self.lag = q, NEVER, NEVER, lag
         self.coming: list[tuple[int, int, float, float]] = []
 
     def at(self, phi: Transition, tau: float) -> tuple[float, float, float]:
@@ -82,7 +82,7 @@ class _Axis:
         """Follow a ramp from the anchor on (the anchor is at or after the ramp's start)."""
         t0, t1, start, end = ramp
         if self.t_ns >= t1:
-            self.r, self.slope, self.end_ns = end, 0.0, _NEVER
+            self.r, self.slope, self.end_ns = end, 0.0, NEVER
         else:
             self.slope = (end - start) / (1e-9 * (t1 - t0))
             self.r, self.end, self.end_ns = start + self.slope * 1e-9 * (self.t_ns - t0), end, t1
@@ -99,8 +99,8 @@ class _Axis:
         if self.coming and self.coming[0][0] <= self.t_ns:
             self.begin(self.coming.pop(0))
         else:
-            self.r, self.slope, self.end_ns = self.end, 0.0, _NEVER
-            self.event_ns = self.coming[0][0] if self.coming else _NEVER
+            self.r, self.slope, self.end_ns = self.end, 0.0, NEVER
+            self.event_ns = self.coming[0][0] if self.coming else NEVER
 
 
 class IdealArm:

@@ -26,7 +26,7 @@ from canprobe.mechanics.types import Floats
 
 GAMMA = 1.0 - sqrt(0.5)
 """Of ROS2."""
-_MOST_PARTS = 4096
+_MAX_PARTS = 4096
 
 
 class Linearised(NamedTuple):
@@ -126,7 +126,7 @@ def adaptive(problem: Problem, t: float, y: Floats, h: float, *, rtol: float = 1
         ArithmeticError: when it would take more than 4096 parts.
     """
     done, part = 0.0, h
-    for _ in range(_MOST_PARTS):
+    for _ in range(_MAX_PARTS):
         part = min(part, h - done)
         new, error = _rosenbrock2(problem, t + done, y, part)
         size = float(np.max(np.abs(error) / (atol + rtol * np.maximum(np.abs(y), np.abs(new)))))
@@ -136,7 +136,7 @@ def adaptive(problem: Problem, t: float, y: Floats, h: float, *, rtol: float = 1
                 return y
         # NaN counts as an error too large
         part *= min(4.0, max(0.2, 0.9 / sqrt(size))) if size > 0.0 else 4.0 if size == 0.0 else 0.2
-    raise ArithmeticError(f"a step of {h:g} s at t = {t:g} s needs more than {_MOST_PARTS} parts")
+    raise ArithmeticError(f"a step of {h:g} s at t = {t:g} s needs more than {_MAX_PARTS} parts")
 
 
 STEPS: Mapping[str, Step] = MappingProxyType(

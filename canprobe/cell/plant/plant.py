@@ -20,11 +20,11 @@ import numpy as np
 from canprobe.cell.plant.arms import make_arm
 from canprobe.cell.plant.config import PlantConfig
 from canprobe.cell.plant.dynamic_arm import DynamicArm
-from canprobe.cell.plant.elastic_contact import NO_CONTACT, Contact, elastic_contact
+from canprobe.cell.plant.elastic_contact import NO_CONTACT, Indentation, elastic_contact
 from canprobe.cell.plant.ideal_arm import IdealArm
 from canprobe.cell.plant.pressure import Vec, pad_coordinates
-from canprobe.cell.plant.probe import PressedProbe, Probe, in_pad
-from canprobe.cell.plant.several_contacts import LEAST_CURVATURE, total_force
+from canprobe.cell.plant.probe import PressedProbe, ProbeState, in_pad
+from canprobe.cell.plant.several_contacts import MIN_CURVATURE_SHARE, total_force
 from canprobe.cell.plant.taxels import Image, TaxelArray
 from canprobe.errors import PlanError
 from canprobe.fieldbus.drive.motor import MotorDynamics
@@ -34,7 +34,7 @@ from canprobe.mechanics.touch.shapes import Nearest, PlacedShape, TouchedPlaces
 from canprobe.mechanics.types import Floats
 
 Truth = dict[str, float | bool | Floats]
-SWITCH_BEYOND = 0.01
+SWITCH_DISTANCE_SHARE = 0.01
 """How far outside of a joint's range its limit switches are, of the range."""
 
 
@@ -80,7 +80,7 @@ class Plant:
         if config.object is not None and config.model is None:
             _refuse_tight_hollow(config)
             self._pressed = PressedProbe(config)
-        self._tightest = (LEAST_CURVATURE - 1.0) / config.radius_m
+        self._tightest = (MIN_CURVATURE_SHARE - 1.0) / config.radius_m
         self.array: TaxelArray | None = None
         if config.taxels is not None:
             rng = np.random.default_rng(config.seed)
@@ -171,7 +171,7 @@ class Plant:
         if arm is None:
             return -inf, inf
         model, q, here = arm.model, float(arm.q[axis]), arm.motor_counts(axis)
-        beyond = SWITCH_BEYOND * (model.q_max[axis] - model.q_min[axis])
+        beyond = SWITCH_DISTANCE_SHARE * (model.q_max[axis] - model.q_min[axis])
         per_count = float(model.q_per_unit[axis, axis])
         ends = [here + (end - q) / per_count for end in (model.q_min[axis] - beyond, model.q_max[axis] + beyond)]
         return min(ends), max(ends)
@@ -270,14 +270,14 @@ class Plant:
             self._solved = self._solve(self.state())
         return self._solved
 
-    def _probe(self, t_ns: int, q: tuple[float, ...], qd: tuple[float, ...]) -> Probe:
+    def _probe(self, t_ns: int, q: tuple[float, ...], qd: tuple[float, ...]) -> ProbeState:
         if self._pressed is not None:
             return self._pressed.at(1e-9 * t_ns, self._first_image_s)
         if self._chain is None:
-            return Probe((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 0.0))
+            return ProbeState((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 0.0))
         c = posture(self._chain, q)
         (c0, c1, c2), (b0, b1, b2) = c.flange, self._base
-        return Probe((c0 + b0, c1 + b1, c2 + b2), (c.x, c.y, c.z), point_velocity(c, c.flange, qd))
+        return ProbeState((c0 + b0, c1 + b1, c2 + b2), (c.x, c.y, c.z), point_velocity(c, c.flange, qd))
 
     def _joints(self, motors: Sequence[float]) -> tuple[float, ...]:
         """What the joints do where the motors do something; none without an arm."""
@@ -347,7 +347,7 @@ class Plant:
         given: tuple[float, ...] = tuple((np.array(q) + compliance * lever * (unit * left * left)).tolist())
         return given
 
-    def _squeezed(self, shape: PlacedShape, probe: Probe, depth: float, rate: float) -> Contact:
+    def _squeezed(self, shape: PlacedShape, probe: ProbeState, depth: float, rate: float) -> Indentation:
         """The force of all that is pressed in, whatever its shape; it has no patch of its own."""
         if depth <= 0.0:
             return NO_CONTACT
@@ -356,7 +356,7 @@ class Plant:
         force = factor * config.stiffness_n_m3 * shape.squeezed(probe.centre, config.radius_m)
         return NO_CONTACT._replace(force=force, damping_factor=factor)
 
-    def _resting(self, touches: TouchedPlaces, probe: Probe) -> Contact:
+    def _resting(self, touches: TouchedPlaces, probe: ProbeState) -> Indentation:
         """Several places at once, as one contact with the resultant force; it has no patch of its own."""
         config = self.config
         rates = -(touches.normals @ np.array(probe.velocity))
@@ -377,11 +377,11 @@ class _Solution:
     """Contact at one instant."""
 
     q: tuple[float, ...]
-    probe: Probe
+    probe: ProbeState
     foot: Nearest
     depth: float
     depth_rate: float
-    contact: Contact
+    contact: Indentation
     kappa: tuple[float, float]
     pad_uv: tuple[float, float]
     direction: Vec  # of the contact from the probe's centre, pad frame

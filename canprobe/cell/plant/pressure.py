@@ -21,9 +21,9 @@ from canprobe.mechanics.types import Floats
 Vec = tuple[float, float, float]
 Directions = tuple[tuple[float, float], tuple[float, float]] | Floats
 """(2, 2) rows: principal directions in the basis ``pad_basis`` of the contact direction."""
-_MARGIN = 2
+_BLUR_MARGIN = 2
 """Taxels of pressure beyond the array's edge that still blur into it."""
-_NOTHING = np.array(0.0)
+_NO_PRESSURE = np.array(0.0)
 
 
 def pad_direction(u: float, v: float, radius: float) -> Vec:
@@ -71,10 +71,10 @@ def pad_basis(direction: Vec) -> tuple[Vec, Vec]:
 
 def _averaging_matrix(taxels: int, samples: int, blur_pitch: float) -> Floats:
     """(taxels, n) weights along one axis: mean over each taxel of the blurred samples."""
-    count = (taxels + 2 * _MARGIN) * samples
+    count = (taxels + 2 * _BLUR_MARGIN) * samples
     mean = np.zeros((taxels, count))
     for i in range(taxels):
-        start = (i + _MARGIN) * samples
+        start = (i + _BLUR_MARGIN) * samples
         mean[i, start : start + samples] = 1.0 / samples
     if blur_pitch <= 0.0:
         return mean
@@ -107,9 +107,9 @@ class PressureField:
         self.radius = radius_m
         self.shape = pad.shape
         self._step = pad.pitch_m / samples
-        self._counts = (pad.rows + 2 * _MARGIN) * samples, (pad.columns + 2 * _MARGIN) * samples
+        self._counts = (pad.rows + 2 * _BLUR_MARGIN) * samples, (pad.columns + 2 * _BLUR_MARGIN) * samples
         v, u = (
-            (np.arange(count) + 0.5) * self._step - (taxels / 2 + _MARGIN) * pad.pitch_m
+            (np.arange(count) + 0.5) * self._step - (taxels / 2 + _BLUR_MARGIN) * pad.pitch_m
             for count, taxels in zip(self._counts, pad.shape, strict=True)
         )
         u, v = np.meshgrid(u, v)
@@ -253,6 +253,6 @@ def _compression(
             squeeze -= height
         else:
             squeeze += height
-    np.maximum(squeeze, _NOTHING, out=squeeze)
+    np.maximum(squeeze, _NO_PRESSURE, out=squeeze)
     squeeze *= samples[4]
     return squeeze

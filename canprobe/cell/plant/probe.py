@@ -16,7 +16,7 @@ Axes = tuple[Vec, Vec, Vec]
 
 
 @dataclass(slots=True, eq=False)
-class Probe:
+class ProbeState:
     """Probe sphere now: centre, axes (columns x, y, z = pole) and velocity of the centre, base frame."""
 
     centre: Vec
@@ -24,7 +24,7 @@ class Probe:
     velocity: Vec
 
 
-OFF = 1e-3
+PRESS_GAP = 1e-3
 """How far the probe is off the object before the press begins, m."""
 
 
@@ -47,7 +47,7 @@ class PressedProbe:
         )
         self._radius, self._press = config.radius_m, config.press
 
-    def at(self, t_s: float, first_s: float | None) -> Probe:
+    def at(self, t_s: float, first_s: float | None) -> ProbeState:
         """Where it is.
 
         Args:
@@ -56,16 +56,16 @@ class PressedProbe:
         """
         waits = self._press.after_s
         if waits and (first_s is None or t_s < first_s + waits):
-            centre = self._origin + (self._radius + OFF) * self._normal
-            return Probe(tuple(centre.tolist()), self._axes, (0.0, 0.0, 0.0))
+            centre = self._origin + (self._radius + PRESS_GAP) * self._normal
+            return ProbeState(tuple(centre.tolist()), self._axes, (0.0, 0.0, 0.0))
         rate = 2 * pi * self._press.frequency_hz
         depth = self._mean * (1.0 + self._press.swing * sin(rate * t_s))
         speed = -self._mean * self._press.swing * rate * cos(rate * t_s)
         centre, velocity = self._origin + (self._radius - depth) * self._normal, speed * self._normal
-        return Probe(tuple(centre.tolist()), self._axes, tuple(velocity.tolist()))
+        return ProbeState(tuple(centre.tolist()), self._axes, tuple(velocity.tolist()))
 
 
-def in_pad(foot: Nearest, probe: Probe, d: Vec) -> Directions:
+def in_pad(foot: Nearest, probe: ProbeState, d: Vec) -> Directions:
     """Principal directions in the transported pad basis at the contact direction.
 
     Args:

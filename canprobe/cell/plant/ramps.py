@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 NEVER = 1 << 62
+"""A time, ns, that no run reaches."""
 Ramp = tuple[int, int, float, float]
 """Start and end time (ns), start and end (counts)."""
 

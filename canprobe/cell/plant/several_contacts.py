@@ -12,7 +12,7 @@ import numpy as np
 from canprobe.mechanics.touch.shapes import TouchedPlaces
 from canprobe.mechanics.types import Floats
 
-LEAST_CURVATURE = 1e-2
+MIN_CURVATURE_SHARE = 1e-2
 """Of the gap, in curvatures of the ball: a hollow nearer to the ball's own radius counts as this much wider."""
 NEAR_M = 2e-3
 """Gaps wider than this cannot close within a cycle of the cell."""
@@ -25,7 +25,7 @@ def widened(kappa: Floats, radius: float) -> Floats:
         kappa: (..., 2) 1/m.
         radius: of the ball, m.
     """
-    return np.maximum(kappa, (LEAST_CURVATURE - 1.0) / radius)
+    return np.maximum(kappa, (MIN_CURVATURE_SHARE - 1.0) / radius)
 
 
 def force_laws(touches: TouchedPlaces, radius: float, stiffness_n_m3: float) -> tuple[Floats, Floats]:

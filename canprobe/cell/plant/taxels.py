@@ -16,15 +16,13 @@ import numpy as np
 import numpy.typing as npt
 
 from canprobe.cell.plant.pressure import Directions, ListField, PressureField
-from canprobe.mechanics.touch.pad import Pad
+from canprobe.mechanics.touch.pad import COUNTS_MAX, Pad
 from canprobe.mechanics.types import Floats
 
 Image = npt.NDArray[np.uint8] | Floats
 
 _CREEP_TIMES_S = (0.3, 3.0, 30.0, 300.0)
 _SATURATION_KNEE = 1.25
-_FULL_SCALE = 255
-"""Counts of full scale, whatever the ADC resolves."""
 MAX_SAMPLE_DISTANCE_M = 1e-3
 """Distance of the samples of a pressure field: a first touch of 0.1 N on a probe of 10 mm is 3 mm wide, and of a mat
 with taxels 30 mm apart three samples a taxel would miss it."""
@@ -260,7 +258,7 @@ def _readings(config: TaxelConfig) -> npt.NDArray[Any]:
     """What is read at each count of the ADC, in counts of 255 at full scale; 0 below the threshold."""
     counts = np.arange(config.adc_max + 1)
     counts[counts < config.adc_threshold] = 0
-    return counts.astype(np.uint8) if config.adc_max == _FULL_SCALE else counts * float(_FULL_SCALE) / config.adc_max
+    return counts.astype(np.uint8) if config.adc_max == COUNTS_MAX else counts * float(COUNTS_MAX) / config.adc_max
 
 
 def _saturate(x: Floats) -> Floats:

@@ -13,8 +13,8 @@ from typing import Literal
 import numpy as np
 
 from canprobe.cell.scene.geometry import transform
-from canprobe.cell.scene.hardware import ArmSettings, JointSettings
-from canprobe.cell.scene.setup import Homing
+from canprobe.cell.scene.hardware import MM, ArmSettings, JointSettings
+from canprobe.cell.scene.setup import HomingParameters
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.chain import Chain
 from canprobe.mechanics.robot.denavit_hartenberg import dh_step, from_dh
@@ -23,10 +23,9 @@ from canprobe.mechanics.robot.urdf import UrdfArm, from_urdf, limit_warning
 from canprobe.mechanics.types import Floats
 
 Bodies = tuple[Body | None, ...] | None
-SLOWEST_RAD_S, SLOWEST_M_S = math.radians(0.01), 1e-5
+MIN_SPEED_RAD_S, MIN_SPEED_M_S = math.radians(0.01), 1e-5
 """Speed limits below which a joint of a URDF practically stands: a degree takes it longer than a minute and a half."""
 
-_MM = 1e-3
 _OF_REVOLUTE = {
     "q_min": ("min_deg", math.radians(1)),
     "q_max": ("max_deg", math.radians(1)),
@@ -37,9 +36,9 @@ _OF_REVOLUTE = {
     "viscous": ("viscous_nm_s", 1.0),
 }
 _OF_PRISMATIC = {
-    "q_min": ("min_mm", _MM),
-    "q_max": ("max_mm", _MM),
-    "qd_max": ("speed_mm_s", _MM),
+    "q_min": ("min_mm", MM),
+    "q_max": ("max_mm", MM),
+    "qd_max": ("speed_mm_s", MM),
     "rated_torque": ("rated_force_n", 1.0),
     "rotor_inertia": ("rotor_mass_kg", 1.0),
     "coulomb": ("coulomb_n", 1.0),
@@ -78,8 +77,7 @@ def arm_model(
         warnings = tuple(warning for warning in found.warnings if warning not in settled)
     else:
         rows = [
-            (s.a_mm * _MM, math.radians(s.alpha_deg), s.d_mm * _MM, math.radians(s.theta_deg))
-            for s in sections.values()
+            (s.a_mm * MM, math.radians(s.alpha_deg), s.d_mm * MM, math.radians(s.theta_deg)) for s in sections.values()
         ]
         slides = [section.kind == "prismatic" for section in sections.values()]
         chain = from_dh(
@@ -120,7 +118,7 @@ def _refuse_standstill(urdf: str, joints: Sequence[Joint], sections: Mapping[str
         f"{urdf}: joint {joint.name}: expected a velocity in its <limit> of at least {slowest:.3g} {unit}/s, got"
         f" {joint.qd_max:g}; put it right there, or set joints.{joint.name}.speed_{joint.unit}_s"
         for joint, section in zip(joints, sections.values(), strict=True)
-        for slowest, unit in [(SLOWEST_M_S, "m") if joint.prismatic else (SLOWEST_RAD_S, "rad")]
+        for slowest, unit in [(MIN_SPEED_M_S, "m") if joint.prismatic else (MIN_SPEED_RAD_S, "rad")]
         if (section.speed_mm_s if joint.prismatic else section.speed_deg_s) is None and not joint.qd_max >= slowest
     ]
     problems += [
@@ -189,7 +187,7 @@ def _refuse_impossible_inertia(sections: Mapping[str, JointSettings]) -> None:
 def _body(section: JointSettings, row: tuple[float, float, float, float], arm: ArmSettings) -> Body:
     """The link behind a joint, in the frame of the joint; a row gives it in the frame that the row leads to."""
     T = np.eye(4) if arm.convention == "modified" else dh_step(*row)
-    return Body(section.mass_kg or 0.0, np.array(section.com_mm) * _MM, _tensor(section)).moved(T)
+    return Body(section.mass_kg or 0.0, np.array(section.com_mm) * MM, _tensor(section)).moved(T)
 
 
 def joint_compliance(sections: Mapping[str, JointSettings]) -> Floats | None:
@@ -202,25 +200,25 @@ def per_joint(sections: Mapping[str, JointSettings], key: Literal["start", "swin
     """(n,) rad or m of a key that is in degrees or in millimetres, as the joint turns or slides."""
     return np.array(
         [
-            getattr(s, f"{key}_mm") * _MM if s.kind == "prismatic" else math.radians(getattr(s, f"{key}_deg"))
+            getattr(s, f"{key}_mm") * MM if s.kind == "prismatic" else math.radians(getattr(s, f"{key}_deg"))
             for s in sections.values()
         ]
     )
 
 
-def homing_of(section: JointSettings, number: int) -> Homing | None:
+def homing_of(section: JointSettings, number: int) -> HomingParameters | None:
     """How the drive of a joint, by its number from 1, is homed; None where its encoder is absolute."""
     if section.zero == "absolute":
         return None
     slides = section.kind == "prismatic"
     assert section.homing_method is not None
-    return Homing(
+    return HomingParameters(
         section.homing_method,
         section.homing_order or number,
-        home=(section.home_mm or 0.0) * _MM if slides else math.radians(section.home_deg or 0.0),
-        speed=section.homing_speed_mm_s * _MM if slides else math.radians(section.homing_speed_deg_s),
-        zero_speed=section.homing_zero_speed_mm_s * _MM if slides else math.radians(section.homing_zero_speed_deg_s),
-        acceleration=section.homing_acceleration_mm_s2 * _MM
+        home=(section.home_mm or 0.0) * MM if slides else math.radians(section.home_deg or 0.0),
+        speed=section.homing_speed_mm_s * MM if slides else math.radians(section.homing_speed_deg_s),
+        zero_speed=section.homing_zero_speed_mm_s * MM if slides else math.radians(section.homing_zero_speed_deg_s),
+        acceleration=section.homing_acceleration_mm_s2 * MM
         if slides
         else math.radians(section.homing_acceleration_deg_s2),
         timeout_s=section.homing_timeout_s,

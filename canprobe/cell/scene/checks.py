@@ -32,7 +32,7 @@ def Range(low: float, high: float, *, open_low: bool = False) -> Check:
     """Numbers from `low` to `high`, both included unless `open_low` leaves the lower end out."""
     first, last = (str(end) if isinstance(end, int) else f"{end:g}" for end in (low, high))
     if open_low:
-        return Check(f"above {first} up to {last}", lambda value: value - low >= _LEAST_ABOVE and value <= high)
+        return Check(f"above {first} up to {last}", lambda value: value - low >= _MIN_ABOVE_LIMIT and value <= high)
     return Check(f"from {first} to {last}", lambda value: low <= value <= high)
 
 
@@ -68,9 +68,9 @@ class ScenePath:
     """A packaged file's name, or a path that is looked up beside the file first."""
 
 
-LARGEST = 1e20
+MAX_NUMBER = 1e20
 """Size of a number in any unit of a scene: products of such numbers are numbers."""
-_LEAST_ABOVE = 1e-30
+_MIN_ABOVE_LIMIT = 1e-30
 """What is above a limit is so by this: quotients by it are numbers."""
 
 _UNIONS = (types.UnionType, typing.Union)
@@ -91,7 +91,7 @@ def convert(value: object, annotation: Any) -> Any:
         return _converted(value, annotation)
     except (ValueError, OverflowError):  # the latter for an integer that no float holds
         unsaid = _beyond(value) and not conditions_of(annotation, Check)  # no range says it
-        beyond = f", at most {LARGEST:g} in size" if unsaid else ""
+        beyond = f", at most {MAX_NUMBER:g} in size" if unsaid else ""
         raise MismatchError(f"{expected(annotation)}{beyond}") from None
 
 
@@ -129,7 +129,7 @@ def _beyond(value: object) -> bool:
     """A number, or a list with one, that is not finite, or of a size that no scene has."""
     if isinstance(value, list | tuple):
         return any(map(_beyond, value))
-    return isinstance(value, int | float) and not abs(value) <= LARGEST
+    return isinstance(value, int | float) and not abs(value) <= MAX_NUMBER
 
 
 def _members(annotation: Any) -> list[Any]:

@@ -22,7 +22,7 @@ from typing import Any
 from canprobe import __version__
 from canprobe.cell.scene.checks import MismatchError, Only, ScenePath, choices_of, conditions_of, convert
 from canprobe.cell.scene.hardware import ArmSettings, CellInfo
-from canprobe.cell.scene.model import DEFAULT_ARRAY, TOUCH_KINDS, ArrayFile, Cell, Scene
+from canprobe.cell.scene.model import DEFAULT_ARRAY, TOUCH_KINDS, ArrayFile, CellFile, Scene
 from canprobe.cell.scene.rules import SECTIONS_OF_TASK, broken_rules
 from canprobe.errors import PlanError, SceneError, UsageError, regular_file
 from canprobe.mechanics.robot.urdf import from_urdf
@@ -30,21 +30,21 @@ from canprobe.mechanics.robot.urdf_visuals import with_meshes_found
 
 DEFAULT_CELL = "puma260"
 """Cell of a scene that names none."""
-CHANGED = " (changed)"
+CHANGED_MARK = " (changed)"
 """Behind the title of a scene whose object or task is no longer that of its file."""
-_ALWAYS = ("scene", "task", "bus", "cycle", "limits", "bring_up")
+_ALWAYS_PRESENT = ("scene", "task", "bus", "cycle", "limits", "bring_up")
 FILE_KEYS = {"array", "calibration", "eds", "file", "urdf", "true_cell"}
 """Keys whose files a saved scene takes along."""
 SAVED_AS = "scene.toml"
 """Name of a saved scene."""
-WRITTEN_BY = "written_by"
+WRITTEN_BY_KEY = "written_by"
 """Key above the sections of a file that canprobe wrote: by which version."""
-MOST_BYTES, MOST_DEPTH = 64 << 20, 32
+MAX_BYTES, MAX_DEPTH = 64 << 20, 32
 """Size of a TOML file, and how deep its tables and lists may be nested."""
 _ESCAPES = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\t": "\\t", "\r": "\\r", "\b": "\\b", "\f": "\\f"}
 
 
-def dump_scene(scene: Scene | Cell) -> str:
+def dump_scene(scene: Scene | CellFile) -> str:
     """The scene as a TOML document that loads back equal, with every value that its kind uses.
 
     Args:
@@ -71,13 +71,13 @@ def _keys(section: Any) -> str:
 
 def written_by_line() -> str:
     """The first line of a file that this canprobe writes."""
-    return f"{WRITTEN_BY} = {toml_value(f'canprobe {__version__}')}\n"
+    return f"{WRITTEN_BY_KEY} = {toml_value(f'canprobe {__version__}')}\n"
 
 
 def with_writer(document: Mapping[str, Any], file: str) -> tuple[dict[str, Any], str]:
-    """A document without `WRITTEN_BY`, and what messages call its file: with its writer, where that is another one."""
-    writer = document.get(WRITTEN_BY, f"canprobe {__version__}")
-    rest = {name: value for name, value in document.items() if name != WRITTEN_BY}
+    """A document without `WRITTEN_BY_KEY`, and the name of its file in messages, with a writer of another version."""
+    writer = document.get(WRITTEN_BY_KEY, f"canprobe {__version__}")
+    rest = {name: value for name, value in document.items() if name != WRITTEN_BY_KEY}
     return rest, f"{file}{written_by_other(writer)}"
 
 
@@ -216,7 +216,7 @@ def _with_overrides(own: Mapping[str, Any], overrides: Mapping[str, Any], file: 
             table[key] = _as_toml(value)
     info, touched = changed.get("scene"), {path.partition(".")[0] for path in overrides if path != "task.duration_s"}
     if isinstance(info, dict) and info.get("title") and touched & {"object", "task"} and "scene.title" not in overrides:
-        changed["scene"] = {**info, "title": f"{str(info['title']).removesuffix(CHANGED)}{CHANGED}"}
+        changed["scene"] = {**info, "title": f"{str(info['title']).removesuffix(CHANGED_MARK)}{CHANGED_MARK}"}
     return changed
 
 
@@ -253,14 +253,14 @@ def load_cell(name_or_path: str | Path) -> dict[str, Any]:
     return _read_cell(name_or_path)[1]
 
 
-def read_cell(name_or_path: str | Path) -> Cell:
+def read_cell(name_or_path: str | Path) -> CellFile:
     """A cell file; as `load_cell`."""
     return _read_cell(name_or_path)[0]
 
 
-def _read_cell(name_or_path: str | Path) -> tuple[Cell, dict[str, Any]]:
-    sections, document = _read_hardware(name_or_path, "cell", Cell)
-    return Cell(**sections), document
+def _read_cell(name_or_path: str | Path) -> tuple[CellFile, dict[str, Any]]:
+    sections, document = _read_hardware(name_or_path, "cell", CellFile)
+    return CellFile(**sections), document
 
 
 def _read_hardware(name_or_path: str | Path, what: str, kind: type[Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -368,7 +368,7 @@ def read_toml(path: Path, file: str, else_what: str = "") -> dict[str, Any]:
         SceneError: it cannot be read, or is not TOML.
     """
     try:
-        text = regular_file(path, MOST_BYTES).read_text(
+        text = regular_file(path, MAX_BYTES).read_text(
             encoding="utf-8-sig"
         )  # some editors begin with a byte order mark
     except OSError as error:
@@ -398,7 +398,7 @@ _NAMED_LEVELS = 3
 def _refuse_deep(document: Mapping[str, Any], file: str) -> None:
     """Raise SceneError for tables and lists in each other that no scene has; others go through them by recursion."""
     values: list[tuple[str, Any]] = [("", document)]
-    for level in range(MOST_DEPTH):
+    for level in range(MAX_DEPTH):
         inner = [
             (f"{path}{key}." if isinstance(value, Mapping) and level < _NAMED_LEVELS else path, item)
             for path, value in values
@@ -411,7 +411,7 @@ def _refuse_deep(document: Mapping[str, Any], file: str) -> None:
 
 
 def _too_deep(where: str) -> SceneError:
-    return SceneError([f"{where}: expected tables and lists of at most {MOST_DEPTH} levels, got more of them"])
+    return SceneError([f"{where}: expected tables and lists of at most {MAX_DEPTH} levels, got more of them"])
 
 
 def _scene(own: Mapping[str, Any], file: str, folder: Path | None) -> Scene:
@@ -429,7 +429,7 @@ def _scene(own: Mapping[str, Any], file: str, folder: Path | None) -> Scene:
     unused = [section for section, (need, _) in needs.items() if need in ("never", "may")]
     document = _with_array(_with_cell(own, file, folder, unused), folder)
     reader = Reader(folder)
-    values = reader.read(Scene, document, (*_ALWAYS, *defaults))
+    values = reader.read(Scene, document, (*_ALWAYS_PRESENT, *defaults))
     for section, (need, why) in needs.items():
         if need == "must" and section not in document:
             reader.complain(section, f'missing: task.kind = "{kind}" needs a section [{section}]: {why}')

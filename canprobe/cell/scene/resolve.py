@@ -10,7 +10,7 @@ import numpy as np
 from canprobe.cell.scene.arms import Bodies, arm_model, homing_of, joint_compliance, per_joint
 from canprobe.cell.scene.calibrations import load_calibration
 from canprobe.cell.scene.geometry import T_flange_probe, expected_ball, scan_axes, true_object
-from canprobe.cell.scene.hardware import EmulateSettings
+from canprobe.cell.scene.hardware import MM, EmulateSettings
 from canprobe.cell.scene.load import gathered, read_cell
 from canprobe.cell.scene.model import (
     BridgeSettings,
@@ -57,12 +57,11 @@ from canprobe.mechanics.touch.patch.array_calibration import ArrayCalibration
 from canprobe.mechanics.touch.servo import SurfaceGains
 from canprobe.mechanics.touch.strategies import make_strategy
 
-MM = 1e-3
-LAYER_N_M3 = 1.27e8
+LAYER_STIFFNESS = 1.27e8
 """Stiffness of the emulated layer where nothing else is stated."""
 EMULATED_ARRAY = "inch16"
 """Calibration of the emulated array."""
-SURE = 3.0
+LATENCY_SIGMAS = 3.0
 """Standard deviations of a calibrated latency from which on it is told from none."""
 EFFECTS = ("noise", "gain_error", "blur", "hysteresis", "creep", "crosstalk", "saturation", "threshold")
 
@@ -86,7 +85,7 @@ def resolve(scene: Scene) -> Setup:
     if flat:  # as a sphere so large that it is one: the point of its pole stays
         T[:3, 3] += (radius - FLAT_RADIUS_M) * T[:3, 2]
         radius = FLAT_RADIUS_M
-    stiffness = array.calibration.image.stiffness if array is not None else LAYER_N_M3
+    stiffness = array.calibration.image.stiffness if array is not None else LAYER_STIFFNESS
     probe = Probe(T, radius, stiffness, settings.mass_kg)
     return Setup(
         scene=scene,
@@ -200,7 +199,7 @@ def _array(scene: Scene, radius: float, stiffness: float | None) -> Array | None
 
 def _raw_wire(wire: WireSettings, settings: SensorSettings, calibration: ArrayCalibration) -> RawWire:
     found = calibration.centroid
-    sure = settings.calibration is not None and abs(found.latency_s) > SURE * found.latency_sigma_s
+    sure = settings.calibration is not None and abs(found.latency_s) > LATENCY_SIGMAS * found.latency_sigma_s
     return RawWire(
         image=image_format(wire, settings.rows, settings.columns),
         normal=wire.normal_axis - 1,
@@ -328,7 +327,7 @@ def _truth(scene: Scene, arm: Arm | None, array: Array | None, bodies: Bodies, p
         bodies=bodies,
         compliance=joint_compliance(scene.joints),
         T_flange_probe=T_flange_there,
-        stiffness=plant.stiffness_n_m3 or (scene.probe.stiffness_n_m3 if scene.probe else None) or LAYER_N_M3,
+        stiffness=plant.stiffness_n_m3 or (scene.probe.stiffness_n_m3 if scene.probe else None) or LAYER_STIFFNESS,
         damping=plant.contact_damping_s_m,
         bandwidth_hz=plant.drive_bandwidth_hz,
         fidelity=plant.fidelity,

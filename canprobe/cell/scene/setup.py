@@ -21,6 +21,7 @@ from canprobe.cell.scene.model import (
     BridgeSettings,
     BringUpSettings,
     BusSettings,
+    Fidelity,
     Scene,
     ShapeMethod,
     TactileModeName,
@@ -37,12 +38,6 @@ from canprobe.mechanics.touch.servo import SurfaceGains
 from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.touch.strategies import Strategy
 from canprobe.mechanics.types import Floats
-
-Bus = BusSettings
-BringUpTimes = BringUpSettings
-Bridges = BridgeSettings
-ArrayMode = TactileModeName
-Fidelity = Literal["ideal", "dynamic"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +60,7 @@ class Node:
 
 
 @dataclass(frozen=True, slots=True)
-class Homing:
+class HomingParameters:
     """How a drive that does not know its zero after power on finds it. Units are rad or m, and s.
 
     Attributes:
@@ -99,7 +94,7 @@ class Drive(Node):
         quirks: of an emulated one; None: it has none.
     """
 
-    zero: Homing | None = None
+    zero: HomingParameters | None = None
     turn_units: float | None = None
     metre_units: float | None = None
     gear: float = 1.0
@@ -181,7 +176,7 @@ class Array(Node):
     """
 
     name: str
-    mode: ArrayMode
+    mode: TactileModeName
     window: int | Auto
     rate_hz: float
     pad: Pad
@@ -461,13 +456,13 @@ class Setup:
     title: str
     seed: int
     figures: bool
-    bus: Bus
+    bus: BusSettings
     rate_hz: float
     realtime: bool
     compute_ns: int
     limits: SafetyLimits
-    bring_up: BringUpTimes
-    bridge: Bridges
+    bring_up: BringUpSettings
+    bridge: BridgeSettings
     arm: Arm | None
     array: Array | None
     probe: Probe

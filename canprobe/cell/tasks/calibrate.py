@@ -24,7 +24,7 @@ from canprobe.mechanics.types import Floats
 
 PRESS_SPEED = 0.8e-3
 """m/s, from the first touch to the wanted force: what is still under way then sinks in by 0.02 mm."""
-CERTAIN = 0.06
+MAX_SLOPE_SIGMA_SHARE = 0.06
 """Share of itself to which the slope of √F over the push must be known (1σ) for the depth to be read off it."""
 SETTLE_S = 0.15
 LISTEN_S = 0.25
@@ -145,7 +145,7 @@ class CalibrateTask(ProbingTask):
         T_base_flange = T_base_probe @ np.linalg.inv(self.sensing.flange_probe)
         d_flange = -(T_base_flange[:3, :3].T @ n) / float(np.linalg.norm(n))
         depth = float(np.mean([self.sensing.depth(contact.force_n) for contact in felt]))
-        if self._push.certain(CERTAIN):
+        if self._push.certain(MAX_SLOPE_SIGMA_SHARE):
             self._depths.append((depth, self._pushed(T_base_probe[:3, 3]) - self._push.start))
         return BallTouch(T_base_flange, d_flange, depth)
 

@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.online import Estimator
 
 
-ALIKE = (2e-3, 0.3)
+CENTROID_CORRELATION = (2e-3, 0.3)
 """Path of the contact (m) along which a share of the centroids' variance is alike, over 87 random scenes. That of a
 calibration is a way over the pad, of which a pad that follows the normal goes a twentieth."""
-SCANNING = 1.6
+SCAN_CENTROID_FACTOR = 1.6
 """Error of a centroid in a scan over that of a calibration's touches, which roll over 1 mm. Over 87 random scenes at
 100 kPa it is 1.25 (RMS), but not Gaussian: at 1.35 one scan of the cylinder in ten raises a false alarm of another
 surface, at 1.6 none, and saddle, torus and wave err less."""
@@ -34,10 +34,10 @@ SIGMA_NORMAL_RAD = 0.3e-3
 """Of what turns no centroid: joint counts displace the probe by 11 µm, and the surface bends by 28 1/m of it."""
 SIGMA_STIFFNESS = 0.6
 """Of the logarithm of the layer's stiffness, before any touch."""
-SCALE, SCALE_ROLLING = 4e-3, 0.08
+SCALE_ERROR, ROLLING_SCALE_ERROR = 4e-3, 0.08
 """Relative error of curvature that no path averages, and what a probe that keeps its orientation adds to it: creep
 shows the ways of the contact over the pad too short, and the rolling share is their part of what bends the normal."""
-WITH_PATCH = ("recursive", "ml")
+PATCH_METHODS = ("recursive", "ml")
 """Estimators whose answers the patch completes and whose regions follow changes; the others stay as they were."""
 
 
@@ -58,7 +58,7 @@ def make_sensing(task: Touch | Calibrate) -> ContactSensing:
 
 def _centroid_errors(task: Touch | Calibrate) -> CentroidErrors:
     calibrated = task.array.calibration.centroid
-    return replace(calibrated, scale=SCANNING * calibrated.scale)
+    return replace(calibrated, scale=SCAN_CENTROID_FACTOR * calibrated.scale)
 
 
 def centroid_coupling(probe: Probe) -> float:
@@ -70,7 +70,7 @@ def centroid_correlation() -> Correlation:
     """Of the noise of contacts along their path."""
     from canprobe.mechanics.touch.estimate.noise import Correlation  # only where a shape is asked for
 
-    return Correlation(*ALIKE)
+    return Correlation(*CENTROID_CORRELATION)
 
 
 def make_shape_estimator(task: Touch, method: str) -> Estimator:
@@ -89,11 +89,11 @@ def make_shape_estimator(task: Touch, method: str) -> Estimator:
         correlation=centroid_correlation(),
         coupling=centroid_coupling(task.probe),
     )
-    if method not in WITH_PATCH:
+    if method not in PATCH_METHODS:
         return estimator
     from canprobe.mechanics.touch.estimate.following import FollowingEstimator
 
-    scale = SCALE + SCALE_ROLLING * task.scan.rolling_share
+    scale = SCALE_ERROR + ROLLING_SCALE_ERROR * task.scan.rolling_share
     return FollowingEstimator(_with_patch(task, estimator, memory) if _uses_patch(task) else estimator, memory, scale)
 
 

@@ -21,7 +21,7 @@ from canprobe.mechanics.touch.probe_motion import smooth_step
 from canprobe.mechanics.types import Floats
 
 Script = Generator[Command, Measurement, Measurement]
-ANGLE = math.radians(1.0)
+MOVE_ANGLE = math.radians(1.0)
 """Of a prismatic joint its travel by `ArmModel.radian`: 3.5 mm."""
 MOVE_S = 15 / 8 * 0.5
 """With a highest speed of 2 deg/s (7 mm/s): that of the quintic is 15/8 of its mean."""
@@ -111,7 +111,7 @@ class JointCheck(Controller):
 
     def _way(self, joint: int, start: Floats) -> Floats | None:
         """The change of the joints (n,), rad or m: forwards, or else backwards; None where there is no room."""
-        for angle in (ANGLE, -ANGLE):
+        for angle in (MOVE_ANGLE, -MOVE_ANGLE):
             way = np.zeros_like(start)
             way[joint] = angle * self._model.radian[joint]
             goal = start + way

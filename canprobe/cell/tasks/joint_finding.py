@@ -11,7 +11,7 @@ import numpy as np
 
 from canprobe.mechanics.types import Floats
 
-TOLERANCE, TOLERANCE_RESTS = 0.05, 0.5
+TRAVEL_TOLERANCE_SHARE, TRAVEL_TOLERANCE_RESTS = 0.05, 0.5
 """How far an encoder's way may be from what was asked: this share, but at least this part of `rest_counts`."""
 
 
@@ -76,8 +76,8 @@ def find_fault(joint: int, asked: Floats, moved: Floats, rest: Sequence[float], 
         rest: within which each is at rest (n,), drive units.
         unit: of the joint, deg or mm.
     """
-    least = TOLERANCE_RESTS * np.array(rest)
-    tolerance = np.maximum(TOLERANCE * np.abs(asked), least)
+    least = TRAVEL_TOLERANCE_RESTS * np.array(rest)
+    tolerance = np.maximum(TRAVEL_TOLERANCE_SHARE * np.abs(asked), least)
     wrong = np.abs(moved - asked) > tolerance
     if wrong[joint]:
         share = float(moved[joint] / asked[joint])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.linalg.lapack import dgesv
@@ -13,9 +13,6 @@ from canprobe.mechanics.robot.chain import pose_of
 from canprobe.mechanics.touch.probe_motion import PoseSteps
 from canprobe.mechanics.touch.servo import ProbePose
 from canprobe.mechanics.types import Floats
-
-if TYPE_CHECKING:
-    pass
 
 
 def _solve(J: Floats, twist: Any) -> list[float] | None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from canprobe.cell.master.conditions import touch_finding
 from canprobe.cell.master.controller import Command, Measurement, TactileSample
-from canprobe.cell.master.supervision import Contact, limits_of
+from canprobe.cell.master.supervision import TouchState, limits_of
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.sync import CYCLES_TO_EFFECT
 from canprobe.cell.tasks.probe_motion import ProbeMotion
@@ -62,7 +62,7 @@ class ProbingTask(Task):
         self.reason: str | None = None
         self.taxels: NDArray[np.uint8] | None = None
         self._setup = plan.setup
-        self._touch = Contact(limits_of(plan))
+        self._touch = TouchState(limits_of(plan))
         self._period_s = self._dt = plan.sync.period_ns * 1e-9
         self._time = MotionTime(plan.sync.period_ns)
         self._lead_s = CYCLES_TO_EFFECT * self._period_s + lag_s

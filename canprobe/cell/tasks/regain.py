@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 from canprobe.cell.tasks.task import Loss
 from canprobe.mechanics.touch.servo import ProbePose
 from canprobe.mechanics.types import Floats
 
-if TYPE_CHECKING:
-    pass
-
-SPEED = 2e-3
+SEARCH_SPEED = 2e-3
 """m/s: until the first sample of the new touch has taken effect, 27 ms later, the layer sinks in by 0.05 mm."""
 BRAKE_S = 0.02
 """Time constant with which the motion along the path ends: 0.5 mm at 25 mm/s."""
@@ -36,7 +32,7 @@ class Search:
     def pose(self, t: float) -> ProbePose:
         """Pose ``t`` seconds after the loss."""
         sideways = self._sideways * (BRAKE_S * (1.0 - math.exp(-t / BRAKE_S)))
-        return ProbePose(self._start.centre + sideways + self._start.pole * (SPEED * t), self._start.pole)
+        return ProbePose(self._start.centre + sideways + self._start.pole * (SEARCH_SPEED * t), self._start.pole)
 
 
 def summarise_losses(losses: Sequence[Loss]) -> list[dict[str, float | None]]:

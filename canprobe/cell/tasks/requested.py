@@ -9,7 +9,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.planning.model import Plan
@@ -18,9 +18,6 @@ from canprobe.cell.tasks.task import MotionTime
 from canprobe.cell.tasks.touch import TouchTask
 from canprobe.errors import UsageError
 from canprobe.mechanics.types import Floats
-
-if TYPE_CHECKING:
-    pass
 
 
 def _is_number(value: object) -> bool:

@@ -25,7 +25,7 @@ PRESS_SPEED = 0.8e-3
 MOVE_SPEED = 30e-3
 FORCE_HZ = 0.5
 """Bandwidth with which the force is held; slower than a roll, so that its images have one depth."""
-MOST_DEPTH = 3e-3
+MAX_PRESS_WAY = 3e-3
 """Way beyond the first touch, m, at which the object gives way."""
 ROLL_SAMPLES = 24
 """Poses of a roll whose reach is checked."""
@@ -62,7 +62,7 @@ class Press:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Pressed:
+class RollRecord:
     """What was recorded of a touch, image by image, from the moment in which the force was reached.
 
     Attributes:
@@ -105,7 +105,7 @@ class RollTask(ProbingTask):
         self, plan: Plan, task: Touch, sensing: ContactSensing, presses: Sequence[Press], radius: float, rest_s: float
     ) -> None:
         super().__init__(plan, task.lag_s, sensing)
-        self.pressed: list[Pressed] = []
+        self.pressed: list[RollRecord] = []
         self.unloaded: list[NDArray[np.uint8]] = []
         self._approach_of = task.approach
         self.presses, self._radius, self._rest_s = presses, radius, rest_s
@@ -218,9 +218,9 @@ class RollTask(ProbingTask):
         """On, slowly, until the force is there."""
         press = self.presses[self._number]
         if self._touch.force >= press.force:
-            self.pressed.append(Pressed(press))
+            self.pressed.append(RollRecord(press))
             self._enter(Phase.SCAN)
-        elif self._gone > self._touched_at + MOST_DEPTH:
+        elif self._gone > self._touched_at + MAX_PRESS_WAY:
             self.retreat(f"touch {self._number + 1}: {press.force:g} N are not reached where the object is expected")
         else:
             self._gone += PRESS_SPEED * self._dt

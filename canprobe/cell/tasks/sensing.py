@@ -27,13 +27,13 @@ if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 
 
-MOST_RATIO = 6.0
+MAX_STIFFNESS_RATIO = 6.0
 """Between the slope that is felt and the one of the stated stiffness on a plane; further apart it is not believed."""
-HOLLOWEST = 0.9
+HOLLOW_LIMIT_SHARE = 0.9
 """Least curvature over −1/radius of the probe at which a patch still makes sense."""
 
 
-HISTORY = 64
+HISTORY_CYCLES = 64
 """Cycles whose joints are kept."""
 SPEED_OVER_NS = 10_000_000
 """Time over which the speed of the probe is taken."""
@@ -43,8 +43,8 @@ class JointHistory:
     """The last joint positions with their times, to be interpolated at a tactile sample's instant."""
 
     def __init__(self) -> None:
-        self._times: deque[int] = deque(maxlen=HISTORY)
-        self._joints: deque[Floats] = deque(maxlen=HISTORY)
+        self._times: deque[int] = deque(maxlen=HISTORY_CYCLES)
+        self._joints: deque[Floats] = deque(maxlen=HISTORY_CYCLES)
 
     def add(self, t_ns: int, q: Floats) -> None:
         """Remember joint positions (n,), rad or m, at ``t_ns``; times must increase."""
@@ -77,7 +77,7 @@ def is_too_hollow(estimate: SurfaceEstimate, radius: float) -> bool:
     x, y = (estimate.T_frame_contact[:3, :2].T @ estimate.directions[1]).tolist()
     weight = np.array([x * x, 2.0 * x * y, y * y])
     sigma = math.sqrt(max(float(weight @ estimate.covariance @ weight), 0.0))
-    return float(estimate.kappa[1]) + 3.0 * sigma < -HOLLOWEST / radius
+    return float(estimate.kappa[1]) + 3.0 * sigma < -HOLLOW_LIMIT_SHARE / radius
 
 
 class ContactSensing:
@@ -145,7 +145,7 @@ class ContactSensing:
             kappa: 1/m.
             stiffness: K/h, N/m³; None from an estimator that has none: what the last touch showed, or else as before.
         """
-        possible = np.maximum(kappa, -HOLLOWEST / self.radius)
+        possible = np.maximum(kappa, -HOLLOW_LIMIT_SHARE / self.radius)
         if stiffness is not None:
             self.stiffness = stiffness
         elif self._slope is not None and not self._settled:
@@ -160,7 +160,9 @@ class ContactSensing:
     def set_slope(self, slope: Slope) -> None:
         """Take what a touch showed; the depth goes by it until the object's curvature is known."""
         flat = 1.0 / float(indentation_from_force(1.0, self.stiffness, self.radius, np.zeros(2)))
-        self._slope = slope._replace(value=min(max(slope.value, flat / MOST_RATIO), flat * MOST_RATIO))
+        self._slope = slope._replace(
+            value=min(max(slope.value, flat / MAX_STIFFNESS_RATIO), flat * MAX_STIFFNESS_RATIO)
+        )
         self._settled = False
         self._depth_at_1_n = 1.0 / self._slope.value
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 GAP_S = 0.1
 """Time without contact after which an estimator starts afresh: a contact that is regained may be of another surface."""
-SHARPEST = 1e3
+MAX_CURVATURE = 1e3
 """1/m; no pad measures a ball of 1 mm, so an answer beyond it has diverged."""
 
 
@@ -123,7 +123,7 @@ def has_diverged(estimate: SurfaceEstimate) -> bool:
     """Whether an answer is not finite, or sharper than anything that a pad can measure."""
     known = np.asarray(estimate.kappa)[np.asarray(estimate.observed)]
     finite = np.isfinite(known).all() and np.isfinite(estimate.S).all() and np.isfinite(estimate.T_frame_contact).all()
-    return not (finite and bool((np.abs(known) < SHARPEST).all()))
+    return not (finite and bool((np.abs(known) < MAX_CURVATURE).all()))
 
 
 def replay_samples(estimator: Estimator, samples: Sequence[ContactSample], every: int) -> list[ShapeRecord]:

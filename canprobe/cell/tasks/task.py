@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from canprobe.mechanics.robot.tool_calibration import ToolEstimate
 
 
-LONGEST_STEP = 4
+MAX_STEP_PERIODS = 4
 """Periods by which a motion goes on in one cycle at most, and for which it makes up later; the rest is lost time."""
-QUICKER = 8
+STEP_GROWTH_DIVISOR = 8
 """Part of a period by which one step of a motion may be longer than the one before."""
 
 
@@ -41,8 +41,8 @@ class MotionTime:
         """By how much the motion goes on in the cycle at ``t_ns``, ns; one period in the first."""
         passed_ns = self._period_ns if self._last_ns is None else t_ns - self._last_ns
         self._last_ns = t_ns
-        due_ns, longest_ns = self._owed_ns + passed_ns, LONGEST_STEP * self._period_ns
-        self._step_ns = min(due_ns, self._step_ns + self._period_ns // QUICKER, longest_ns)
+        due_ns, longest_ns = self._owed_ns + passed_ns, MAX_STEP_PERIODS * self._period_ns
+        self._step_ns = min(due_ns, self._step_ns + self._period_ns // STEP_GROWTH_DIVISOR, longest_ns)
         self._owed_ns = min(due_ns - self._step_ns, longest_ns)
         return self._step_ns
 

@@ -17,11 +17,11 @@ from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.touch.linear_algebra import checked, instance, real_numbers
 from canprobe.mechanics.types import Floats
 
-NEAR_RAD = 0.01
+FIRST_POINT_TOLERANCE_RAD = 0.01
 """How far a first point at time 0 may be from where the arm stands; of a joint that slides its `ArmModel.radian`."""
 BRAKE_S = 0.5
 """How long an arm takes to stand still after a stop."""
-LOOKED_AT = 33
+CHECKS_PER_SEGMENT = 33
 """Instants of each segment at which range, speed and workspace are checked."""
 
 
@@ -80,7 +80,7 @@ class Trajectory(Controller):
         """Why the motion from the joint positions q (n,), rad or m, is refused; None where it is allowed."""
         if self._times[0] == 0.0:
             away = np.abs(self._q[0] - q) / self._model.radian
-            if away.max() > NEAR_RAD:
+            if away.max() > FIRST_POINT_TOLERANCE_RAD:
                 joint = int(away.argmax())
                 its = self._model.joints[joint]
                 stands, first = (its.text(float(one[joint]), ".2f") for one in (q, self._q[0]))
@@ -149,7 +149,7 @@ class Trajectory(Controller):
     def _outside_way(self) -> str | None:
         """What is wrong between two points, with the time that would be enough for a speed."""
         highest = self._model.qd_max * self._limits.speed_share
-        s = np.linspace(0.0, 1.0, LOOKED_AT)[:, None]
+        s = np.linspace(0.0, 1.0, CHECKS_PER_SEGMENT)[:, None]
         for k, h in enumerate(np.diff(self._times)):
             q, qd = _cubic(s, h, self._q[k : k + 2], self._qd[k : k + 2])
             where = f"at {self._times[k]:g} to {self._times[k + 1]:g} s: joint"
