@@ -236,7 +236,7 @@ def make_tactile_node(
     """A tactile node on the plant.
 
     Args:
-        od: of `tactile_array.eds`, for this node id.
+        od: object dictionary of `tactile_array.eds`, for this node id.
         node_id: 1–127, or 255 for none.
         plant: shared by all nodes.
         od_of: the EDS for another node id, where LSS may give the node one.

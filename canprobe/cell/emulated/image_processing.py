@@ -1,4 +1,4 @@
-"""What the sensor makes of a raw image: tare, gain, threshold, the window that follows the contact, features."""
+"""The sensor's processing of a raw image: tare, gain, threshold, the window that follows the contact, features."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def compute_features(image: Raw, full_scale_pa: float, pitch_m: float) -> Featur
     Args:
         image: corrected counts, (rows, columns), whole or not.
         full_scale_pa: pressure at 255 counts, Pa.
-        pitch_m: of the taxels.
+        pitch_m: pitch of the taxels.
     """
     total, row, column = _moments(image)
     if total == 0.0:

@@ -22,13 +22,13 @@ OFFSET_SHARE = 0.02
 
 
 class RawArray(Participant):
-    """The device.
+    """The emulated device.
 
     Args:
-        array: with a raw wire.
+        array: an array that sends raw frames.
         plant: shared with the nodes.
         sync_ratio: SYNCs between two images of a device that samples at SYNC.
-        seed: of its unloaded values.
+        seed: seed of its unloaded values.
 
     Attributes:
         running: it was started; a device without a start frame always runs.
@@ -52,13 +52,13 @@ class RawArray(Participant):
 
     @property
     def listens(self) -> Container[int]:
-        """Its commands, and SYNC where that samples."""
+        """Identifiers of its commands, and of SYNC where a SYNC triggers its images."""
         commands = {can_id for can_id, _ in (*self._wire.start, *self._wire.stop, *self._wire.poll)}
         return frozenset(commands | {SYNC_ID} if self._wire.sampling == "sync" else commands)
 
     @property
     def next_deadline_ns(self) -> int | None:
-        """Of the next sample, or of the next image to send."""
+        """Time of the next sample, or of the next image to send, ns."""
         dues = [due for due, _ in self._waiting]
         return min([*dues, self._due_ns]) if self._due_ns is not None else min(dues, default=None)
 

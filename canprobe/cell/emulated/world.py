@@ -55,7 +55,7 @@ class TruthRecorder(Participant):
         self._rows: list[tuple[int, int, Any]] = []
 
     def receive(self, can_id: int, data: bytes, t_ns: int) -> list[Frame]:
-        """On a SYNC, take the state."""
+        """Take the state of the plant at a SYNC."""
         if can_id == SYNC_ID:
             self._plant.advance(t_ns)
             self._rows.append((t_ns, data[0] if data else 0, self._plant.state()))
@@ -119,7 +119,7 @@ def make_world(
     Where the scene gives a node no serial number, its node id in the scene is one.
 
     Args:
-        plan: of the scene.
+        plan: plan of the scene.
         node_ids: which of its nodes to emulate.
         truth: whether what is true is recorded.
         without_id: which of them start without a node id and wait for LSS to give them one.

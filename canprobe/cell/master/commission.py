@@ -35,7 +35,7 @@ class Commissioned:
     assigned: list[tuple[Assignment, bool]]
 
     def as_document(self) -> dict[str, Any]:
-        """For JSON."""
+        """The result as JSON has it."""
         return {
             "nodes": self.nodes,
             "unconfigured": [_numbers(address) for address in self.unconfigured],
@@ -56,7 +56,7 @@ def commission(
         wanted: which ids are to be given to whom; none only looks.
         must: each of them needs its device; False: as far as there is one.
         store: let the devices keep their ids when their power goes.
-        timeout_s: for an SDO answer.
+        timeout_s: longest time to an SDO answer.
 
     Raises:
         BusError: no device without an id answers though ids are wanted, it is not clear which one is meant, or a device

@@ -1,9 +1,9 @@
 """The table of conditions: what can go wrong, how it is seen, how fast, and what the cell does about it.
 
 Each row stands on its check. A check looks at the cell (`Seen`) or at a touch (`TouchState`) and returns the error that
-names what is wrong, or None; what the cell lives with is counted. Pure: no clock, no port. The order is the order of
-precedence. docs/supervision.md has the same table for users, with what they can do about each condition; a test
-compares the two.
+names what is wrong, or None; conditions that do not stop the cell are counted. Pure: no clock, no port. The order is
+the order of precedence. docs/supervision.md has the same table for users, with what they can do about each condition;
+a test compares the two.
 """
 
 from __future__ import annotations
@@ -31,28 +31,28 @@ from canprobe.fieldbus.protocol.frames import NmtState
 
 NS_PER_MS = 1_000_000
 ARRAY_RECOVERY_NS = 30 * NS_PER_MS
-"""For so long after the touch the array's creep and hysteresis may still show half of the touch force."""
+"""Time after a touch in which the array's creep and hysteresis may still show half of the touch force."""
 Check = TypeVar("Check", bound=Callable[..., Any])
 _TABLE: list[Condition] = []
 
 
 def _unchecked(*row: Any, **more: Any) -> None:
-    """A row that shows by itself."""
+    """Add a row without a check: the condition shows by itself."""
     _TABLE.append(Condition(*row, **more))
 
 
 def _checked(*row: Any, **more: Any) -> Callable[[Check], Check]:
-    """A row whose check looks at the cell in every cycle."""
+    """Add a row whose check looks at the cell in every cycle."""
     return lambda check: _add(check, *row, check=check, **more)
 
 
 def _touch(*row: Any, **more: Any) -> Callable[[Check], Check]:
-    """A row whose check looks at a touch."""
+    """Add a row whose check looks at a touch."""
     return lambda check: _add(check, *row, check=check, touch=True, **more)
 
 
 def _counted(key: str, what: str, within: Callable[[Limits], int]) -> Callable[[Check], Check]:
-    """A row of what the cell lives with."""
+    """Add a row of a condition that is counted and does not stop the cell."""
     return lambda count: _add(count, key, what, Reaction.DEGRADE, within, count=count)
 
 
@@ -66,17 +66,17 @@ def _cycles(number: int) -> Callable[[Limits], int]:
 
 
 def _after(time_ns: int, cycles: int = 1) -> Callable[[Limits], int]:
-    """A time, and some cycles until it is looked at."""
+    """A time, and the cycles until the check runs."""
     return lambda limits: time_ns + cycles * limits.period_ns
 
 
 def _frame(limits: Limits) -> int:
-    """From a tactile frame to the reaction on it."""
+    """Time from a tactile frame to the reaction on it."""
     return (limits.tactile_cycles + 2) * limits.period_ns
 
 
 def _sample(limits: Limits) -> int:
-    """From an instant to the reaction on the tactile sample that shows it: sampled, sent one frame later, taken in."""
+    """Time from an instant to the reaction on the tactile sample of it, which is sent a frame later."""
     return limits.cycles_to_feel * limits.period_ns
 
 

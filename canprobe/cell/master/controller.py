@@ -85,7 +85,7 @@ def check_command(command: Command, *, arm: bool) -> None:
     """Check what a controller returned, but for the joint target of an arm: the supervision checks that.
 
     Args:
-        command: of this cycle.
+        command: command of this cycle.
         arm: the scene has one.
 
     Raises:
@@ -153,7 +153,7 @@ class Controller:
         Called once, and only where `lets_go` is True and the condition leaves time for it.
 
         Args:
-            reason: for `Command.stop_reason`.
+            reason: what becomes `Command.stop_reason`.
         """
 
     @property
@@ -169,7 +169,7 @@ class _Function(Controller):
         self._step = step
 
     def step(self, measurement: Measurement) -> Command:
-        """One cycle."""
+        """Call the function for one cycle."""
         return self._step(measurement)
 
 

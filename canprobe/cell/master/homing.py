@@ -57,7 +57,7 @@ from canprobe.mechanics.types import Floats
 
 POLL_S = 0.01
 TOLERANCE_RAD = math.radians(1.0)
-"""By which a position may differ from the record, and at home from the home offset, rad; a slide's is in proportion."""
+"""Largest difference of a position from the record, and at home from the home offset, rad; of a slide in proportion."""
 CONTROLWORD, STATUSWORD, POSITION, IDENTITY = 0x6040, 0x6041, 0x6064, 0x1018
 TARGET, PROFILE_SPEED = 0x607A, 0x6081
 _ENABLE = 0x0F
@@ -72,10 +72,10 @@ _MOVES = {
 
 
 class ZeroRecord:
-    """What is known of the zeros of a cell's drives, by node id, in a file.
+    """The record of the zeros of a cell's drives, by node id, in a file.
 
     Args:
-        path: of a JSON file; None keeps nothing.
+        path: path of a JSON file; None: nothing is kept.
     """
 
     def __init__(self, path: Path | None) -> None:
@@ -88,12 +88,12 @@ class ZeroRecord:
                 self._nodes = {}  # as where it was never written: the drives are homed again
 
     def entry(self, node_id: int) -> dict[str, Any]:
-        """Of one node; empty where nothing is known."""
+        """The entry of a node; empty where nothing is known."""
         found = self._nodes.get(str(node_id))
         return found if isinstance(found, dict) else {}
 
     def put(self, node_id: int, entry: dict[str, Any] | None) -> None:
-        """Write the entry of a node, or that there is none.
+        """Write the entry of a node; None removes it.
 
         Raises:
             CanprobeError: the file cannot be written.
@@ -110,15 +110,15 @@ class ZeroRecord:
 
 
 class Homing:
-    """The drives of a cell that are homed: which of them have their zeros, and how they get them.
+    """Homes the drives of a cell that have no absolute encoder, and knows which of them have their zeros.
 
     Args:
-        plan: of a cell with an arm.
-        setups: of its nodes.
+        plan: plan of a cell with an arm.
+        setups: configurations of its nodes.
         network: pumped; the nodes are operational.
-        watch: of the nodes.
-        supervise: raises the error of what goes wrong besides.
-        record: file of the zeros; None: none is kept.
+        watch: what the nodes report of themselves.
+        supervise: called meanwhile; it raises the error of whatever else goes wrong.
+        record: file of the zeros; None: no record is kept.
         say: called with each step.
 
     Attributes:
@@ -352,7 +352,7 @@ class Homing:
 
     @contextlib.contextmanager
     def _left_disabled(self, setup: NodeSetup) -> Iterator[None]:
-        """On every way out the drive is stopped, disabled, and in its mode of the cycle."""
+        """A context on every way out of which the drive is stopped, disabled, and in its mode of the cycle."""
         try:
             yield
         except BaseException:

@@ -15,7 +15,7 @@ class Wanted:
 
     Attributes:
         node_id: 1–127.
-        name: for messages, such as ``joint 3``.
+        name: name in messages, such as ``joint 3``.
         numbers: vendor id, product code, revision number, serial number.
     """
 
@@ -51,7 +51,7 @@ def choose_assignments(
         wanted: the ids to give.
         unconfigured: devices without an id.
         present: devices that have one; None where 1018h is not complete.
-        channel: of the bus, for messages.
+        channel: channel of the bus, as messages name it.
         must: each wanted id needs a device; False: ids that no device fits are left out.
 
     Raises:

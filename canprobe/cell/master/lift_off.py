@@ -25,11 +25,11 @@ from canprobe.mechanics.robot.remaining_drives import lifting_step
 from canprobe.mechanics.types import Floats
 
 LIFT_WAY = 6e-3
-"""m: as far as a touch retreats, and further than the softest pad is pressed in."""
+"""Length of the way back, m: as far as a touch retreats, and further than the softest pad is pressed in."""
 LIFT_SPEED = 20e-3
-"""m/s, the mean; it begins with twice as much, which then falls to zero."""
+"""Mean speed of the way back, m/s; it begins with twice as much, which then falls to zero."""
 ARRIVAL_S = 0.02
-"""For the drives' lag at the end."""
+"""Time for the drives to make up their lag at the end."""
 
 
 class WayBack:
@@ -38,9 +38,9 @@ class WayBack:
     Args:
         model: the arm's geometry.
         flange_probe: transform (4, 4) from the probe's centre frame to the flange.
-        period_s: of the cycle.
+        period_s: period of the cycle.
         free: drives (n,) that may move.
-        targets: where the drives were sent last (n,), drive units.
+        targets: last targets of the drives (n,), drive units.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class WayBack:
 
     @staticmethod
     def cycles(period_s: float) -> int:
-        """How many there are at most."""
+        """Highest number of cycles that the way back takes."""
         return math.ceil((LIFT_WAY / LIFT_SPEED + ARRIVAL_S) / period_s) + 1
 
     @staticmethod
@@ -83,13 +83,13 @@ class WayBack:
 
 
 class LiftOff:
-    """One way back, cycle by cycle.
+    """A way back of the probe, cycle by cycle.
 
     Args:
-        plan: of a cell with an arm.
-        drives: of the arm; those that do not obey are stopped from now on.
-        watch: of the nodes.
-        error: that the cell is stopped for; the node that it names does not obey.
+        plan: plan of a cell with an arm.
+        drives: drives of the arm; those that do not obey are stopped from now on.
+        watch: what the nodes report of themselves.
+        error: why the cell is stopped; the node that it names does not obey.
     """
 
     def __init__(self, plan: Plan, drives: DriveGroup, watch: NodeWatch, error: BaseException) -> None:
@@ -109,7 +109,7 @@ class LiftOff:
 
     @property
     def possible(self) -> bool:
-        """Some drives obey, and none reports what cannot be."""
+        """Some drives obey, and none reports a position that it cannot have reached."""
         return bool(self._free.any()) and not self._drives.disbelieved
 
     def begin(self) -> None:

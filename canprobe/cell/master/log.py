@@ -22,7 +22,7 @@ class _RowKind:
     """Rows with the same names: how their values lie in one block of float64, as the first whole row has them.
 
     Args:
-        names: of the columns, in order.
+        names: names of the columns, in order.
     """
 
     def __init__(self, names: tuple[str, ...]) -> None:
@@ -43,7 +43,7 @@ class _RowKind:
 
     @property
     def width(self) -> int:
-        """Numbers in a block."""
+        """Count of numbers in a block."""
         return len(self._block)
 
     def column(self, name: str, blocks: Floats) -> Floats:

@@ -27,7 +27,7 @@ SECOND_NS = 1_000_000_000
 
 @dataclass(slots=True)
 class NodeView:
-    """One node as its frames show it.
+    """The state of a node, as its frames show it.
 
     Attributes:
         node_id, role: which.
@@ -50,16 +50,16 @@ class CellView:
     """The cell at one instant; what was not received is None.
 
     Attributes:
-        channel: of the bus, or buses.
+        channel: channel of the bus, or channels of the buses.
         t_s: since the first frame, s.
         nodes: ascending node ids, the master's heartbeat last.
         q: joint positions (n,), deg or mm.
-        units: of each of them.
-        force_n: of the last whole tactile frame, N.
+        units: unit of each of them.
+        force_n: force in the last whole tactile frame, N.
         taxels: (rows, columns) counts of that frame.
-        frames_per_s: of the last second, on all buses.
-        load: of the last second, by channel; without stuff bits, as a share of the bit rate.
-        sync_hz: of the last second.
+        frames_per_s: frames in the last second, on all buses.
+        load: bus load in the last second, by channel; without stuff bits, as a share of the bit rate.
+        sync_hz: SYNCs in the last second.
         sync_jitter_us: 99th percentile and largest distance of a SYNC interval from the planned one, µs.
         torn_frames: tactile frames that were not whole.
     """
@@ -78,7 +78,7 @@ class CellView:
     torn_frames: int = 0
 
     def as_document(self) -> dict[str, Any]:
-        """For `--json`."""
+        """The state as `--json` prints it."""
         document = asdict(self)
         document["taxels"] = self.taxels.tolist() if self.taxels is not None else None
         return document
@@ -125,7 +125,7 @@ class Monitor:
                 self._syncs.append(t_ns)
 
     def _bits(self, length: int) -> float:
-        """Of a frame, those of a data phase as bits of the nominal rate."""
+        """Length of a frame in bits of the nominal rate, its data phase converted to them."""
         if length <= CLASSIC_BYTES:
             return best_case_bits(length)
         bits = best_case_fd_bits(length)

@@ -15,7 +15,7 @@ OTHER_KINDS_TEXT = "more of other kinds"
 
 @dataclass(slots=True)
 class _NoteKind:
-    """One thing that happens again and again."""
+    """An event that happens again and again."""
 
     what: str
     nodes: set[int] = field(default_factory=set)
@@ -49,7 +49,7 @@ class Notes:
         Args:
             what: names the kind; nothing in it may change from one time to the next.
             node_id: the node that it happened to.
-            t_s: on the run's clock.
+            t_s: time on the run's clock.
         """
         if what not in self._kinds and len(self._kinds) >= KINDS_KEPT:
             what = OTHER_KINDS_TEXT

@@ -78,8 +78,8 @@ class Observers:
 
         Args:
             start_ns: deadline of the first SYNC, on the run's clock.
-            measurement: of the cycle.
-            command: of the cycle; None without a controller.
+            measurement: measurement of the cycle.
+            command: command of the cycle; None without a controller.
         """
         timed = measurement.cycle % TIMED_CYCLES == 0
         started_ns = elapsed_ns() if timed else 0

@@ -12,9 +12,9 @@ from canprobe.mechanics.robot.motors import units_per_motor
 REST_NS = 12_500_000
 """Time without a motion after which a drive is at rest."""
 REST_RAD = 1e-3
-"""Of a joint: what a report may be off by, whatever the motion, and within which a drive at rest stays."""
+"""Angle of a joint by which a report may be off, whatever the motion, and within which a drive at rest stays."""
 MIN_REST_COUNTS = 8
-"""The same of a coarse encoder, which has a count or two a milliradian: it dithers, and its drive starts in steps."""
+"""Least of these bounds in counts: a coarse encoder has a count or two a milliradian, and its drive starts in steps."""
 CARRIED_CYCLES = 3
 """Periods for which a motion is carried on without a report. After a late cycle too: a drive that gets no new target
 stops at its last one, however long the cycle lasts."""
@@ -23,7 +23,7 @@ FOLLOWED_CYCLES = 20
 _STEP_DECAY = 0.9
 """Share of the largest step of the target that still counts one period later: an eighth after `FOLLOWED_CYCLES`."""
 PERIOD_NS = 2_500_000
-"""Of a cycle at 400 Hz."""
+"""Period of a cycle at 400 Hz."""
 
 
 class PositionTrack:
@@ -35,11 +35,11 @@ class PositionTrack:
 
     Args:
         base: what a report may be off by, whatever the motion, counts: see `rest_counts`.
-        period_ns: of the cycle. A late cycle lasts many periods: all bounds are times.
+        period_ns: period of the cycle. A late cycle lasts many periods: all bounds are times.
 
     Attributes:
         counts: the last position that was believed.
-        cycle: of that position; −1 before the first.
+        cycle: cycle of that position; −1 before the first.
         rested_ns: how long the reports have stayed within ``base`` of the first of them.
     """
 
@@ -87,7 +87,7 @@ class PositionTrack:
 
         Args:
             counts: the position.
-            cycle: of the SYNC at which it was sampled.
+            cycle: cycle of the SYNC at which it was sampled.
             t_ns: that SYNC's deadline.
             guarded: the drive is enabled, so that it can only be where it can have gone.
 

@@ -35,8 +35,8 @@ class _Sighting:
     """What one node id sent during a scan.
 
     Attributes:
-        state: in its last heartbeat; None without one.
-        answers: to each SDO request, by index and sub-index as on the wire.
+        state: NMT state in its last heartbeat; None without one.
+        answers: answer to each SDO request, by index and sub-index as on the wire.
     """
 
     state: NmtState | None = None
@@ -69,7 +69,7 @@ def scan_nodes(port: Port, timeout_s: float) -> list[dict[str, Any]]:
 
     Args:
         port: the bus.
-        timeout_s: to wait for an answer.
+        timeout_s: longest time to an answer.
 
     Returns:
         By rising node id: ``node_id``; ``state`` of its heartbeat; ``devices`` that answer with this id, 0 where it

@@ -23,12 +23,12 @@ if TYPE_CHECKING:
     from canprobe.mechanics.touch.patch.image import Patch
 
 MAX_SPEED_SHARE = 1.5
-"""Measured motion above this share of the speed limit is no motion of the arm; SYNCs may be late by a period."""
+"""Share of the speed limit above which a measured motion is no motion of the arm; SYNCs may be late by a period."""
 ENCODER_TOLERANCE_COUNTS = 2
 """Encoder counts by which two readings may differ at rest."""
 _ROUNDING = 1e-9
 _NUMBER_KINDS = "fiu"
-"""Kinds of arrays that can be angles."""
+"""Kinds of numpy dtypes that can be joint positions."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class JointGuard:
     """Range, speed and workspace of the joint targets; speed of the measured joints.
 
     Args:
-        plan: of a cell with an arm.
+        plan: plan of a cell with an arm.
 
     Attributes:
         low, high: range of the joint targets (n,), rad or m.
@@ -148,19 +148,19 @@ NOTED_ONCE = ("error_frames", "frames_dropped", "clock_step", "estimator")
 """Conditions that the cell lives with and notes once; the others are figures of the summary."""
 SECOND_NS = 1_000_000_000
 LOOK_PERIOD_NS = 20_000_000
-"""Between two looks at where the probe presses: less than a millimetre of a retreat."""
+"""Time between two looks at where the probe presses; a retreat moves less than a millimetre meanwhile."""
 MEMORY_SHARE = 0.25
 """Share of a force that the array may show when it is gone: creep, 5 % a decade, of a press of a quarter of an hour."""
 CLEARANCE = 3e-3
-"""m, straight back along the pole: half a retreat, and more than `MEMORY_SHARE` of 50 N presses the softest pad in."""
+"""Way straight back along the pole, m: half a retreat; `MEMORY_SHARE` of 50 N presses the softest pad in less."""
 
 
 class PressDetector:
-    """Whether what the array shows is a press, or what it remembers of one.
+    """Tells a press from the memory that the array has of one.
 
-    After a long press the array creeps back for as long as it was pressed. By its size alone that is a light touch. But
-    a press needs the probe to be there: once it has gone straight back from where it pressed last, further than any pad
-    is pressed in, the rest is memory, and only what comes on top of it is a new press.
+    After a long press the array creeps back for as long as it was pressed; its signal alone looks like a light touch.
+    A press needs the probe in its place. Once the probe has gone straight back from its last press, further than any
+    pad is pressed in, the rest of the signal is memory, and only a force above it is a new press.
     """
 
     def __init__(self) -> None:
@@ -189,11 +189,11 @@ class PressDetector:
 
 
 class Supervisor:
-    """The checks of the table and what they have to remember.
+    """Runs the checks of the table, and keeps what they have to remember.
 
     Args:
         seen: the cell; brought up to date by :meth:`step`.
-        guard: of the joints; None without an arm.
+        guard: guard of the joints; None without an arm.
         patch_from: the patch of a tactile sample, for controllers that do not guard their contact; None without touch.
 
     Attributes:
@@ -283,7 +283,7 @@ class Supervisor:
         return hold
 
     def must_stop(self) -> bool:
-        """Something holds for which nothing may move any more."""
+        """Whether a condition holds that forbids every motion."""
         return any(c.reaction is Reaction.STOP and c.check(self.seen) is not None for c in CYCLE_CHECKS)  # type: ignore[misc]
 
     def felt(self) -> float:
@@ -304,14 +304,14 @@ class Supervisor:
             self._press.look(self.felt(), self._guard.T_base_tip(q))
 
     def guard_contact(self, measurement: Measurement) -> Finding | None:
-        """What must not go on in a touch, for a controller that does not guard its contact itself."""
+        """The first condition of a touch that holds, for a controller that does not guard its contact itself."""
         if self._patch_from is not None and measurement.tactile is not None:
             self._contact.feel(self._patch_from(measurement.tactile), measurement.tactile.t_sample_ns)
         self._contact.tactile_age = measurement.tactile_age
         return touch_finding(self._contact)
 
     def guard_target(self, command: Command) -> tuple[Command, Finding | None]:
-        """The command that may be sent: a target too far away is approached, one out of bounds is left out."""
+        """The command that may be sent: a target too far away is approached, a target out of bounds is left out."""
         if command.q_target is None or self._guard is None:
             return command, None
         guarded = self._guard.command(command.q_target, self.seen.measurement)
@@ -321,7 +321,7 @@ class Supervisor:
         return (command if guarded.q is command.q_target else replace(command, q_target=guarded.q)), None
 
     def notes(self) -> list[str]:
-        """What happened and was lived with, a line each."""
+        """Conditions that happened and did not stop the cell, a line each."""
         return [
             f"{BY_KEY[key].what}: {self.counts[key]}, the first in cycle {self.first[key]}"
             for key in NOTED_ONCE

@@ -18,13 +18,13 @@ from canprobe.mechanics.types import Floats
 
 @dataclass(frozen=True, slots=True)
 class PressMotion:
-    """What the probe does without an arm: slow sinusoidal indentation at the object's reference point.
+    """Motion of a probe without an arm: a slow sinusoidal indentation at the object's reference point.
 
     Args:
         force_n: force at the mean depth.
         swing: amplitude of the depth over its mean.
-        frequency_hz: of the swing.
-        after_s: from the first image; until then the probe is off the object, as an array that is tared has to be.
+        frequency_hz: frequency of the swing.
+        after_s: time from the first image; until then the probe is off the object, as an array that is tared has to be.
     """
 
     force_n: float = 2.0
@@ -42,18 +42,18 @@ class PlantConfig:
         q0: (n,) joint positions at time 0, rad or m; empty without an arm.
         T_flange_probe_centre: (4, 4) centre of the probe sphere in the flange frame, z = pole of the pad, m.
         radius_m: probe radius.
-        stiffness_n_m3: of the elastic layer (K/h).
+        stiffness_n_m3: stiffness of the elastic layer (K/h).
         damping_s_m: Hunt-Crossley alpha (assumed).
         object: what can be touched; None for nothing.
         taxels: the array's imperfections; None where there is no array.
         pad: the array's taxels.
         bandwidth_hz: -3 dB frequency of every drive.
-        damping_ratio: of every drive.
+        damping_ratio: damping ratio of every drive.
         press: motion of a probe without an arm.
-        seed: of taxel gains and noise.
+        seed: seed of taxel gains and noise.
         fidelity: "ideal": each motor is a second-order system; "dynamic": rigid links, friction, drive cascade, push
             of the object.
-        dynamics: of a dynamic arm.
+        dynamics: what a dynamic arm has beyond its geometry.
         bodies: (n,) of its joints, without the probe; None where nobody knows them.
         compliance: (n,) of the joints of an ideal arm between motor and link, rad/(N m) or m/N; None: they are rigid.
         base_offset_m: (3,) of the arm's base in the frame that counts as base.

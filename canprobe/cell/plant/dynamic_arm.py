@@ -43,7 +43,7 @@ class DynamicArm:
     Args:
         model: the arm's geometry.
         q0: (n,) joint positions at time 0, at rest, rad or m.
-        equations: of motion.
+        equations: equations of motion.
         stepping: how they are integrated.
     """
 
@@ -101,7 +101,7 @@ class DynamicArm:
         """Position of one motor now, counts, continuous.
 
         Args:
-            axis: from 0.
+            axis: number of the motor, from 0.
         """
         return float(self._state()[axis] * self._scales[axis] + self.model.zero_units[axis])
 
@@ -109,7 +109,7 @@ class DynamicArm:
         """Torque of one motor over its continuous limit, as a drive reports it (6077h).
 
         Args:
-            axis: from 0.
+            axis: number of the motor, from 0.
         """
         y = self._state()
         if self._torques is None or self._torques[0] is not y:
@@ -121,7 +121,7 @@ class DynamicArm:
         """Torque limit and feed-forwards of one drive from now on.
 
         Args:
-            axis: from 0.
+            axis: number of the motor, from 0.
             limit_permille: largest torque, of the continuous torque; the configured limit if that is less.
             speed: counts/s added behind the position loop.
             torque_permille: added behind the velocity loop.
@@ -137,7 +137,7 @@ class DynamicArm:
         """How one motor would answer to torque alone: its own inertia and friction, without the links.
 
         Args:
-            axis: from 0.
+            axis: number of the motor, from 0.
         """
         joint = self.model.joints[axis]
         return MotorDynamics(

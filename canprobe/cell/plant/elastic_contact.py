@@ -19,7 +19,7 @@ class Indentation(NamedTuple):
         a: half-axis of the patch along the direction of kappa1, m.
         b: half-axis along the direction of kappa2, m; a <= b.
         area: m^2.
-        peak_pressure: at the middle of the patch, Pa, damping included.
+        peak_pressure: pressure at the middle of the patch, Pa, damping included.
         stiffness: elastic dF/dd, N/m.
         damping_factor: factor of force and pressure due to the rate of indentation, >= 0.
     """
@@ -47,7 +47,7 @@ def relative_curvatures(kappa: tuple[float, float], radius: float) -> tuple[floa
         A >= B > 0, 1/m.
 
     Raises:
-        ValueError: for a hollow as tight as the probe: the contact is then not one small patch.
+        ValueError: the hollow is as tight as the probe: the contact is then not one small patch.
     """
     A, B = 0.5 * (1.0 / radius + kappa[0]), 0.5 * (1.0 / radius + kappa[1])
     if B <= 0.0:
@@ -80,7 +80,7 @@ def elastic_contact(
         The contact; ``NO_CONTACT`` where there is none.
 
     Raises:
-        ValueError: for a hollow as tight as the probe.
+        ValueError: the hollow is as tight as the probe.
 
     Source: F = pi k d^2 / (2 sqrt(A B)), integral of the pressure; Hunt & Crossley 1975 for the damping.
     """
@@ -114,7 +114,7 @@ def depth_for_force(force: float, kappa: tuple[float, float], radius: float, sti
         Indentation, m.
 
     Raises:
-        ValueError: for a hollow as tight as the probe.
+        ValueError: the hollow is as tight as the probe.
     """
     A, B = relative_curvatures(kappa, radius)
     return sqrt(2.0 * force * sqrt(A * B) / (pi * stiffness_n_m3))

@@ -31,7 +31,7 @@ class Effects:
     """What acts on the arm; each can be switched off.
 
     Args:
-        gravity, coriolis: of the links.
+        gravity, coriolis: forces on the links.
         friction: viscous and Coulomb, of motors and gears.
         links: False leaves the motors alone with the inertia at their own joint, without coupling.
         contact: the object pushes back.

@@ -19,9 +19,9 @@ from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_to_j
 from canprobe.mechanics.types import Floats
 
 PEAK_PERMILLE = 2000
-"""Of the rated torque: what a drive can give for a while (assumed)."""
+"""Peak torque of a drive, permille of its rated torque (assumed)."""
 STICTION_RATE = 0.01
-"""rad/s over which the Coulomb torque turns its sign; of a prismatic joint m/s."""
+"""Speed over which the Coulomb torque changes its sign, rad/s; of a prismatic joint m/s."""
 
 Transition = tuple[float, float, float, float]
 State = tuple[float, float, float]
@@ -138,7 +138,7 @@ class IdealArm:
         A ramp that began in the past acts from the present time on.
 
         Args:
-            axis: from 0.
+            axis: number of the motor, from 0.
             start_counts: reference at t0.
             end_counts: reference at t1 and after.
             t0_ns: start.
@@ -197,7 +197,7 @@ class IdealArm:
         """Position of one motor now, counts, continuous.
 
         Args:
-            axis: from 0.
+            axis: number of the motor, from 0.
         """
         return (self._evaluated or self._states())[axis][0]
 
@@ -207,7 +207,7 @@ class IdealArm:
         Model: reflected motor inertia, viscous and Coulomb friction; no gravity, no link inertia, no contact.
 
         Args:
-            axis: from 0.
+            axis: number of the motor, from 0.
 
         Returns:
             Permille, within the peak of +-2000.
@@ -228,10 +228,10 @@ class IdealArm:
         return max(-PEAK_PERMILLE, min(PEAK_PERMILLE, permille))
 
     def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
-        """Nothing: these motors track as they do, whatever torque that takes.
+        """Do nothing: these motors follow their reference whatever torque that takes.
 
         Args:
-            axis: from 0.
+            axis: number of the motor, from 0.
             limit_permille, speed, torque_permille: see ``DynamicArm.set_loop``.
         """
 
@@ -241,7 +241,7 @@ class IdealArm:
         The wrist's coupling is left out here: it acts on positions only.
 
         Args:
-            axis: from 0.
+            axis: number of the motor, from 0.
         """
         joint, units = self.model.joints[axis], abs(float(self.model.units_per_q[axis, axis]))
         return MotorDynamics(

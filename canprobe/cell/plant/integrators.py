@@ -25,7 +25,7 @@ import numpy as np
 from canprobe.mechanics.types import Floats
 
 GAMMA = 1.0 - sqrt(0.5)
-"""Of ROS2."""
+"""Parameter γ of ROS2."""
 _MAX_PARTS = 4096
 
 
@@ -85,7 +85,7 @@ def runge_kutta_4(problem: Problem, t: float, y: Floats, h: float) -> Floats:
 
 
 def implicit_euler(problem: Problem, t: float, y: Floats, h: float) -> Floats:
-    """One Newton iteration of backward Euler."""
+    """Backward Euler by one Newton iteration."""
     rate, drift, solve = problem.linearised(t, y, h)
     new: Floats = y + h * solve(rate + h * drift)
     return new

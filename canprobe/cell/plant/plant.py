@@ -35,7 +35,7 @@ from canprobe.mechanics.types import Floats
 
 Truth = dict[str, float | bool | Floats]
 SWITCH_DISTANCE_SHARE = 0.01
-"""How far outside of a joint's range its limit switches are, of the range."""
+"""Distance of the limit switches beyond a joint's range, as a share of the range."""
 
 
 class PlantState(NamedTuple):
@@ -63,7 +63,7 @@ class Plant:
             motor now, of its axis from 0: the arm's own methods; 0 without one.
 
     Raises:
-        PlanError: for a probe without an arm over a hollow as tight as itself.
+        PlanError: a probe without an arm is over a hollow as tight as itself.
     """
 
     def __init__(self, config: PlantConfig, *, waits: bool = False) -> None:
@@ -103,10 +103,10 @@ class Plant:
         self._first_image_s: float | None = None
 
     def begin(self, t_ns: int) -> None:
-        """Time goes on from here, unless it does already.
+        """Start the plant's time here, unless it runs already.
 
         Args:
-            t_ns: ns.
+            t_ns: present time, ns.
         """
         if self._origin_ns is None:
             self._origin_ns = t_ns
@@ -115,7 +115,7 @@ class Plant:
         """Move the present time on; earlier times and repeats change nothing.
 
         Args:
-            t_ns: ns.
+            t_ns: present time, ns.
         """
         if self._origin_ns is None:
             return
@@ -127,7 +127,7 @@ class Plant:
                 self.arm.advance(t_ns)
 
     def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
-        """Reference of one drive, see ``IdealArm.set_ramp``.
+        """Set the reference of a drive, see ``IdealArm.set_ramp``.
 
         Raises:
             RuntimeError: without an arm.
@@ -136,13 +136,13 @@ class Plant:
         (self.arm or self._need_arm()).set_ramp(axis, start_counts, end_counts, t0_ns - origin_ns, t1_ns - origin_ns)
 
     def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
-        """Torque limit and feed-forwards of one drive, see ``DynamicArm.set_loop``; nothing without an arm.
+        """Set torque limit and feed-forwards of a drive, see ``DynamicArm.set_loop``; nothing happens without an arm.
 
         Args:
-            axis: from 0.
-            limit_permille: of the rated torque.
-            speed: counts/s.
-            torque_permille: of the rated torque.
+            axis: number of the drive, from 0.
+            limit_permille: torque limit, permille of the rated torque.
+            speed: speed that is added, counts/s.
+            torque_permille: torque that is added, permille of the rated torque.
         """
         if self.arm is not None:
             self.arm.set_loop(axis, limit_permille, speed, torque_permille)
@@ -151,7 +151,7 @@ class Plant:
         """How one motor answers to torque, see ``IdealArm.motor_dynamics``.
 
         Args:
-            axis: from 0.
+            axis: number of the drive, from 0.
 
         Raises:
             RuntimeError: without an arm.
@@ -165,7 +165,7 @@ class Plant:
         follow from where the others are now. Infinite without an arm.
 
         Args:
-            axis: from 0.
+            axis: number of the drive, from 0.
         """
         arm = self.arm
         if arm is None:
@@ -203,7 +203,7 @@ class Plant:
         """(rows, columns) mean pressure of every taxel, Pa, before the array's imperfections; zeros without an array.
 
         Args:
-            state: of this plant; the present one by default.
+            state: state of this plant; the present one by default.
         """
         s = self._solution() if state is None else self._solve(state)
         if self.array is None or s.depth <= 0.0:
@@ -246,7 +246,7 @@ class Plant:
         """True values of a state, SI, base frame.
 
         Args:
-            state: of this plant; the present one by default.
+            state: state of this plant; the present one by default.
 
         Without contact ``force`` is 0 and the contact fields are those of the closest surface point; without an object
         they are zeros.
@@ -260,7 +260,7 @@ class Plant:
         return {name: np.array(value) if isinstance(value, tuple) else value for name, value in found.items()}
 
     def truths(self, states: Sequence[PlantState]) -> dict[str, Floats]:
-        """The same of many states, one row each; nothing of none."""
+        """`truth` of many states, a row each; empty without a state."""
         rows = [tuple(_true(self._solve(state)).values()) for state in states]
         names = _true(self._solve(states[0])) if states else ()
         return {name: np.array(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)}
@@ -280,7 +280,7 @@ class Plant:
         return ProbeState((c0 + b0, c1 + b1, c2 + b2), (c.x, c.y, c.z), point_velocity(c, c.flange, qd))
 
     def _joints(self, motors: Sequence[float]) -> tuple[float, ...]:
-        """What the joints do where the motors do something; none without an arm."""
+        """Joint positions, or rates, of motor positions or rates; empty without an arm."""
         joints = []
         for row in self._shares:
             value = 0.0
@@ -328,11 +328,11 @@ class Plant:
         return _Solution(q, probe, foot, depth, rate, contact, (k1, k2), uv, d, several)
 
     def _given_way(self, q: tuple[float, ...], foot: Nearest, compliance: Floats) -> tuple[float, ...]:
-        """Joints (n,) that the contact has pushed back, by torque over stiffness each.
+        """Joint positions (n,) after the contact has pushed each joint back by its torque over its stiffness.
 
-        Model: at rest and linear, `q + C Jᵀ F n` with the motors where they are. F is that of the depth that is left,
-        `F = f(δ − c F)` with `c = nᵀ J C Jᵀ n`; the layer's square law makes that a quadratic. The normal is that
-        before.
+        Model: at rest and linear, `q + C Jᵀ F n` with the motors where they are. F is the force at the depth that
+        remains, `F = f(δ − c F)` with `c = nᵀ J C Jᵀ n`; the layer's square law makes that a quadratic. The normal is
+        the one before the push.
         """
         assert self._chain is not None
         config, normal = self.config, np.array(foot.normal)
@@ -374,7 +374,7 @@ def _joints_at_zero(model: ArmModel | None) -> list[float] | None:
 
 @dataclass(slots=True, eq=False)
 class _Solution:
-    """Contact at one instant."""
+    """The contact at one instant."""
 
     q: tuple[float, ...]
     probe: ProbeState

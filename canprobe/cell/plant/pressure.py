@@ -154,7 +154,7 @@ class PressureField:
             uv: contact point on the pad, m.
             depth: indentation, m.
             kappa: principal curvatures of the object, 1/m, larger first.
-            directions_pad: of the contact on the pad.
+            directions_pad: directions of the contact on the pad.
 
         Returns:
             (rows, columns) layer compression, m, times taxel area over pitch^2; times k it is force over pitch^2, Pa.

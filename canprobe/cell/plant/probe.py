@@ -25,14 +25,14 @@ class ProbeState:
 
 
 PRESS_GAP = 1e-3
-"""How far the probe is off the object before the press begins, m."""
+"""Distance of the probe from the object before the press begins, m."""
 
 
 class PressedProbe:
     """Probe without an arm, pole against the object's normal at its origin.
 
     Args:
-        config: with an object.
+        config: configuration of a plant with an object.
     """
 
     def __init__(self, config: PlantConfig) -> None:
@@ -48,10 +48,10 @@ class PressedProbe:
         self._radius, self._press = config.radius_m, config.press
 
     def at(self, t_s: float, first_s: float | None) -> ProbeState:
-        """Where it is.
+        """State of the probe at a time.
 
         Args:
-            t_s: s.
+            t_s: time, s.
             first_s: time of the first image, s; None before it.
         """
         waits = self._press.after_s
@@ -69,8 +69,8 @@ def in_pad(foot: Nearest, probe: ProbeState, d: Vec) -> Directions:
     """Principal directions in the transported pad basis at the contact direction.
 
     Args:
-        foot: of the contact on the object.
-        probe: of which the pad is.
+        foot: nearest point of the object to the probe's centre.
+        probe: probe that carries the pad.
         d: direction of the contact from the probe's centre, pad frame.
     """
     u, v = (_along(probe.axes, e) for e in pad_basis(d))

@@ -106,8 +106,8 @@ class Neighbourhood:
         T_flange_probe: (4, 4) probe centre on the flange, m.
         base_offset: (3,) of the arm's base, m.
         shape: the object.
-        radius: of the probe, m.
-        stiffness_n_m3: of the layer.
+        radius: radius of the probe, m.
+        stiffness_n_m3: stiffness of the layer.
         rubbing: damping and friction.
     """
 

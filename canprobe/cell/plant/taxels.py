@@ -27,7 +27,7 @@ MAX_SAMPLE_DISTANCE_M = 1e-3
 """Distance of the samples of a pressure field: a first touch of 0.1 N on a probe of 10 mm is 3 mm wide, and of a mat
 with taxels 30 mm apart three samples a taxel would miss it."""
 _NOISE_IMAGES = 8
-"""How many images' noise is drawn at once."""
+"""Number of images whose noise is drawn at once."""
 _ONE = np.array(1.0)  # a number that is an array already costs a ufunc less
 
 
@@ -46,7 +46,7 @@ class TaxelConfig:
         noise: standard deviation per sample, in full scales.
         threshold: readings below this share of full scale become 0.
         dead: (row, column) of taxels that read 0.
-        adc_bits: of the ADC; 8 gives whole counts, more give parts of counts.
+        adc_bits: bits of the ADC; 8 gives whole counts, more give parts of counts.
         samples: samples of the pressure field per taxel and axis; more where they would lie more than
             `MAX_SAMPLE_DISTANCE_M` apart.
     """
@@ -81,7 +81,7 @@ class TaxelConfig:
             *effects: of "noise", "gain_error", "blur", "hysteresis", "creep", "crosstalk", "saturation", "threshold".
 
         Raises:
-            ValueError: for an effect that does not exist.
+            ValueError: there is no such effect.
         """
         fields = {"blur": "blur_pitch", "creep": "creep_per_decade"}
         known = ("noise", "gain_error", "blur", "hysteresis", "creep", "crosstalk", "saturation", "threshold")
@@ -93,7 +93,7 @@ class TaxelConfig:
 
 
 IDEAL_TAXELS = TaxelConfig().without("noise", "gain_error", "blur", "hysteresis", "creep", "crosstalk", "saturation")
-"""Only averaging, ADC and threshold."""
+"""An array without imperfections: averaging, ADC and threshold only."""
 
 
 class TaxelArray:
@@ -103,7 +103,7 @@ class TaxelArray:
         config: the imperfections.
         rng: source of gains and noise.
         radius_m: radius of the sphere it is wrapped on.
-        stiffness_n_m3: of the elastic layer.
+        stiffness_n_m3: stiffness of the elastic layer.
         pad: its taxels; None: 16×16 over one inch.
     """
 
@@ -161,9 +161,9 @@ class TaxelArray:
             uv: contact point on the pad, m.
             depth: indentation, m; <= 0 is no contact.
             kappa: principal curvatures of the object, 1/m, larger first.
-            directions_pad: of the contact on the pad.
+            directions_pad: directions of the contact on the pad.
             t_s: time of the sample, s, not before the previous one.
-            pressure_factor: of the layer's damping.
+            pressure_factor: factor of the pressure by the layer's damping.
 
         Returns:
             (rows, columns) counts of 255 at full scale; whole numbers (uint8) of an ADC of 8 bits, else float.
@@ -176,7 +176,7 @@ class TaxelArray:
         Args:
             compression: (rows, columns) taxel means as ``PressureField`` gives them, m; used up.
             t_s: time of the sample, s, not before the previous one.
-            pressure_factor: of the layer's damping.
+            pressure_factor: factor of the pressure by the layer's damping.
 
         Returns:
             (rows, columns) counts.
@@ -226,7 +226,7 @@ class TaxelArray:
         return matrix
 
     def _convert(self, counts: Floats) -> Image:
-        """Noise, ADC, threshold, dead taxels."""
+        """Apply noise, ADC, threshold and dead taxels."""
         if self.config.noise > 0.0:
             counts += self._drawn()
         else:

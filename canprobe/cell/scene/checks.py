@@ -1,4 +1,4 @@
-"""What a value of a file may be: small checks in the annotations of `canprobe.cell.scene.model`, and `convert`.
+"""Checks of the values of a file, which stand in the annotations of `canprobe.cell.scene.model`, and `convert`.
 
 `convert` turns what `tomllib` read into the annotated type, or says what was expected. Nothing is coerced silently
 except an integer where a number is wanted (TOML's `25` for `25.0`); a boolean is never a number.
@@ -69,9 +69,9 @@ class ScenePath:
 
 
 MAX_NUMBER = 1e20
-"""Size of a number in any unit of a scene: products of such numbers are numbers."""
+"""Largest size of a number in any unit of a scene: products of such numbers are finite."""
 _MIN_ABOVE_LIMIT = 1e-30
-"""What is above a limit is so by this: quotients by it are numbers."""
+"""Least distance of a number above an excluded limit: quotients by it are finite."""
 
 _UNIONS = (types.UnionType, typing.Union)
 _NAMES = {float: ("a number", "numbers"), int: ("an integer", "integers"), str: ("text", "texts")}
@@ -81,11 +81,11 @@ def convert(value: object, annotation: Any) -> Any:
     """Return `value` as the annotated type.
 
     Args:
-        value: as read by `tomllib`.
+        value: the value as `tomllib` read it.
         annotation: a type, `Annotated` with checks, `Literal`, `tuple[...]` or `X | None`.
 
     Raises:
-        MismatchError: with what was expected.
+        MismatchError: the value has another type or range; the text is what was expected.
     """
     try:
         return _converted(value, annotation)
@@ -96,7 +96,7 @@ def convert(value: object, annotation: Any) -> Any:
 
 
 def _converted(value: object, annotation: Any) -> Any:
-    """As `convert`; what does not match raises a ValueError without a text."""
+    """Convert as `convert` does; a value that does not match raises a ValueError without a text."""
     origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is typing.Annotated:
         converted = _converted(value, parts[0])
@@ -126,7 +126,7 @@ def _converted(value: object, annotation: Any) -> Any:
 
 
 def _beyond(value: object) -> bool:
-    """A number, or a list with one, that is not finite, or of a size that no scene has."""
+    """Whether a number, or one in a list, is not finite or larger than `MAX_NUMBER`."""
     if isinstance(value, list | tuple):
         return any(map(_beyond, value))
     return isinstance(value, int | float) and not abs(value) <= MAX_NUMBER
@@ -167,5 +167,5 @@ def choices_of(annotation: Any) -> tuple[str, ...]:
 
 
 def conditions_of(annotation: Any, kind: type[Any]) -> list[Any]:
-    """What stands in an annotation of one kind: `Check`, `Only`, `ScenePath`."""
+    """The conditions of one kind in an annotation: `Check`, `Only` or `ScenePath`."""
     return [part for part in getattr(annotation, "__metadata__", ()) if isinstance(part, kind)]

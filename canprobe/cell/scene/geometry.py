@@ -32,7 +32,7 @@ def true_object(settings: ObjectSettings) -> PlacedShape:
     """The object that a scene describes.
 
     Raises:
-        ValueError: for a matrix that describes no surface through the object's origin with z outward, or a file that
+        ValueError: the matrix describes no surface through the object's origin with z outward, or the file
             holds none.
         UsageError: a mesh, and no trimesh is installed.
     """

@@ -31,16 +31,16 @@ from canprobe.mechanics.robot.urdf_visuals import with_meshes_found
 DEFAULT_CELL = "puma260"
 """Cell of a scene that names none."""
 CHANGED_MARK = " (changed)"
-"""Behind the title of a scene whose object or task is no longer that of its file."""
+"""Text behind the title of a scene whose object or task is no longer that of its file."""
 _ALWAYS_PRESENT = ("scene", "task", "bus", "cycle", "limits", "bring_up")
 FILE_KEYS = {"array", "calibration", "eds", "file", "urdf", "true_cell"}
 """Keys whose files a saved scene takes along."""
 SAVED_AS = "scene.toml"
 """Name of a saved scene."""
 WRITTEN_BY_KEY = "written_by"
-"""Key above the sections of a file that canprobe wrote: by which version."""
+"""Key above the sections of a file that canprobe wrote; its value names the version."""
 MAX_BYTES, MAX_DEPTH = 64 << 20, 32
-"""Size of a TOML file, and how deep its tables and lists may be nested."""
+"""Largest size of a TOML file, and deepest nesting of its tables and lists."""
 _ESCAPES = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\t": "\\t", "\r": "\\r", "\b": "\\b", "\f": "\\f"}
 
 
@@ -172,7 +172,8 @@ def load_scene(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = 
         The scene, checked; its attributes are the sections and keys of a scene file.
 
     Raises:
-        SceneError: with every problem found, each with file, key path, what was expected and what was got.
+        SceneError: the scene has problems; the error has all of them, each with file, key path, what was expected and
+            what was got.
         UsageError: there is no such scene, or `overrides` is not a mapping.
     """
     if isinstance(scene, Scene):
@@ -248,13 +249,13 @@ def load_cell(name_or_path: str | Path) -> dict[str, Any]:
         name_or_path: a packaged cell's name, such as `puma260`, or the path of a TOML file.
 
     Raises:
-        SceneError: with every problem found.
+        SceneError: the file has problems; the error has all of them.
     """
     return _read_cell(name_or_path)[1]
 
 
 def read_cell(name_or_path: str | Path) -> CellFile:
-    """A cell file; as `load_cell`."""
+    """Read a cell file as `load_cell` does, as a dataclass."""
     return _read_cell(name_or_path)[0]
 
 
@@ -278,7 +279,7 @@ def _read_hardware(name_or_path: str | Path, what: str, kind: type[Any]) -> tupl
 
 
 def _complain_of_names(reader: Reader, arm: ArmSettings | None, joints: object) -> None:
-    """Joints that the URDF does not have; where nothing else is wrong, `arm_model` says so with the order."""
+    """Complain of joints that the URDF does not have; without other problems `arm_model` does, with the order."""
     if not reader.problems or arm is None or not arm.urdf or not isinstance(joints, dict):
         return
     with contextlib.suppress(PlanError):  # the URDF's own faults come once the cell can be read
@@ -296,7 +297,7 @@ def load_array(name_or_path: str | Path) -> dict[str, Any]:
         name_or_path: a packaged array's name, such as `inch16`, or the path of a TOML file.
 
     Raises:
-        SceneError: with every problem found.
+        SceneError: the file has problems; the error has all of them.
     """
     document = _read_hardware(name_or_path, "array", ArrayFile)[1]
     if "sensor" not in document:
@@ -356,7 +357,7 @@ def parse_scene(text: str, *, file: str = "scene", folder: Path | None = None) -
         folder: where files that the scene names are looked up first.
 
     Raises:
-        SceneError: with every problem found.
+        SceneError: the text has problems; the error has all of them.
     """
     return _scene(parse_toml(text, file), file, folder)
 
@@ -380,7 +381,7 @@ def read_toml(path: Path, file: str, else_what: str = "") -> dict[str, Any]:
 
 
 def parse_toml(text: str, file: str) -> dict[str, Any]:
-    """The document in a TOML text; as `read_toml`."""
+    """The document in a TOML text, with the errors of `read_toml`."""
     try:
         document = tomllib.loads(text)
     except ValueError as error:  # an integer of thousands of digits is no TOMLDecodeError
@@ -392,11 +393,11 @@ def parse_toml(text: str, file: str) -> dict[str, Any]:
 
 
 _NAMED_LEVELS = 3
-"""Of the key that is too deep: as many as a scene has, such as joints.joint_1.gear."""
+"""Levels of the key that a message about deep nesting names; a scene has as many, such as joints.joint_1.gear."""
 
 
 def _refuse_deep(document: Mapping[str, Any], file: str) -> None:
-    """Raise SceneError for tables and lists in each other that no scene has; others go through them by recursion."""
+    """Raise SceneError for tables and lists nested deeper than in any scene; other code visits them by recursion."""
     values: list[tuple[str, Any]] = [("", document)]
     for level in range(MAX_DEPTH):
         inner = [
@@ -511,15 +512,15 @@ class Reader:
         self._folder = folder
 
     def complain(self, path: str, message: str) -> None:
-        """Note a problem."""
+        """Add a problem."""
         self.bad.add(path)
         self.problems.append(f"{path}: {message}")
 
     def refuse(self, file: str) -> None:
-        """Raise the problems, if there are any, as those of a file.
+        """Raise an error with all problems, if there are any.
 
         Raises:
-            SceneError: with all of them.
+            SceneError: there are problems; the error has all of them.
         """
         if self.problems:
             raise SceneError([f"{file}: {problem}" for problem in self.problems])
@@ -529,7 +530,7 @@ class Reader:
 
         Args:
             file: dataclass of the sections.
-            document: as `tomllib` gives it.
+            document: the document as `tomllib` gives it.
             needed: sections that are read as empty ones where they are missing.
         """
         sections, needed = typing.get_type_hints(file), set(needed)
@@ -564,7 +565,7 @@ class Reader:
         return read
 
     def section(self, cls: type[Any], table: Any, name: str) -> Any:
-        """One section; a key that has a problem or is missing is None in it."""
+        """Read a section; a key that has a problem or is missing is None in it."""
         if not isinstance(table, dict):
             return self.complain(name, f"expected a section [{name}], got {toml_value(table)}")
         annotations = typing.get_type_hints(cls, include_extras=True)
@@ -600,7 +601,7 @@ class Reader:
         return value
 
     def _check_condition(self, path: str, given: bool, only: Only, actual: Any) -> None:
-        """A key stands where it belongs, and nowhere else."""
+        """Complain of a key that stands where it does not belong, or is missing where it must be given."""
         if given and actual is not None and actual not in only.values:
             needed = " or ".join(f'"{value}"' for value in only.values)
             self.complain(path, f'only with {only.key} = {needed}, got {only.key} = "{actual}"')
@@ -619,7 +620,7 @@ def _keys_that_belong(cls: type[Any], annotations: Mapping[str, Any], table: Map
 
 
 def _did_you_mean_key(got: str, sections: Mapping[str, Any]) -> str:
-    """For an unknown section: the section of a key of that name, or the nearest section."""
+    """A hint for an unknown section: the section that has a key of that name, or the nearest section."""
     classes = {name: next(iter(typing.get_args(hint)), hint) for name, hint in sections.items()}
     keys = [f"{name}.{got}" for name, cls in classes.items() if got in getattr(cls, "__dataclass_fields__", {})]
     return f"; did you mean {' or '.join(keys)}?" if keys else _did_you_mean(got, sections)

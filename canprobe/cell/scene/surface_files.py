@@ -26,10 +26,10 @@ HEIGHTS = (".npy", ".npz", ".csv", ".txt")
 MESHES = (".stl", ".obj", ".ply")
 _SPACING_MM = 1.0
 NO_DATA = (-9999.0, -99999.0, -32768.0, -32767.0, 65535.0)
-"""What programs of measuring machines and maps write where they saw nothing; a far outlier only then."""
+"""Values that measuring machines and map programs write for missing heights; they count so only as far outliers."""
 _MAX_HEIGHT_MM, _FAR = 1e30, 10.0
 _MIN_SLOPE, _MAX_SLOPE = 5e-4, 20.0
-"""Rise of a surface by the width of its grid, outside of which one of the two is in another unit."""
+"""Range of the rise of a surface over the width of its grid; outside of it one of them is in another unit."""
 _MIN_WIDTH_MM = 1.0
 _RETRY_HINT = "get the file again, or export it again"
 
@@ -112,7 +112,7 @@ def _mesh(
 
 
 def _refuse_other_content(path: Path) -> None:
-    """Name what stands in the place of a file that was not downloaded, or not whole."""
+    """Refuse content that stands in the place of a file which was not downloaded, or not whole."""
     try:
         with regular_file(path).open("rb") as file:
             start = file.read(200)
@@ -160,7 +160,7 @@ def _without(z: Floats, value: float) -> Floats:
 
 
 def _refuse_other_unit(path: Path, z: Floats, spacing: float, unit_mm: float) -> None:
-    """Heights and spacing of one unit give a surface: neither a wall nor, unless it is a plane, a flat."""
+    """Refuse heights and spacing of different units: together they give a wall, or a flat surface that is no plane."""
     rise, width = float(np.ptp(z)), spacing * min(z.shape)
     if unit_mm * width < _MIN_WIDTH_MM or (rise > 0.0 and not _MIN_SLOPE < rise / width < _MAX_SLOPE):
         raise ValueError(

@@ -23,25 +23,25 @@ from canprobe.mechanics.touch.stops import TOUCH_FORCE
 from canprobe.mechanics.types import Floats
 
 PRESS_SPEED = 0.8e-3
-"""m/s, from the first touch to the wanted force: what is still under way then sinks in by 0.02 mm."""
+"""Speed from the first touch to the wanted force, m/s: the motion that is then still under way presses in 0.02 mm."""
 MAX_SLOPE_SIGMA_SHARE = 0.06
 """Share of itself to which the slope of √F over the push must be known (1σ) for the depth to be read off it."""
 SETTLE_S = 0.15
 LISTEN_S = 0.25
-"""At rest before samples count, and while they do."""
+"""Time at rest before samples count, and the time in which they count."""
 
 
 class CalibrateTask(ProbingTask):
-    """Touch after touch; the estimate in the end.
+    """Touches the ball again and again, and estimates the tool in the end.
 
     Args:
-        plan: of the cell.
+        plan: plan of the cell.
         task: what to do.
         sensing: contacts from measurements.
 
     Attributes:
-        touches: what was felt so far.
-        estimate: of the tool; None before the end, or with too few touches.
+        touches: the touches so far.
+        estimate: estimate of the tool; None before the end, or with too few touches.
     """
 
     def __init__(self, plan: Plan, task: Calibrate, sensing: ContactSensing) -> None:
@@ -93,7 +93,7 @@ class CalibrateTask(ProbingTask):
         return ProbePose(self._ball.c_base + (self._ball.radii + gap) * touch.n_base, touch.pole_base)
 
     def _begin(self, pose: ProbePose) -> None:
-        """To the next touch, round the ball; or to the end."""
+        """Go to the next touch, round the ball, or end."""
         if self.reason is not None or self._number >= len(self._task.approaches):
             if self.reason is None and len(self.touches) >= 2:
                 self.estimate = calibrate_tool(self._corrected(), self._ball)
@@ -117,7 +117,7 @@ class CalibrateTask(ProbingTask):
         return self._at(-self._gone)
 
     def _settle(self) -> ProbePose:
-        """On, slowly, until the force is there."""
+        """Press on slowly until the force is reached."""
         if self._touch.force >= self._task.force:
             self._felt = []
             self._enter(Phase.SCAN)

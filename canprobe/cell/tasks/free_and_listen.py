@@ -19,10 +19,10 @@ class FreeTask(Task):
     """Swing every joint sinusoidally about where it stood, with a soft start and end.
 
     Args:
-        amplitude: of each joint (n,), rad or m.
-        swing_period_s: of the swing.
-        duration_s: of the whole task.
-        period_s: of the cycle.
+        amplitude: amplitude of each joint (n,), rad or m.
+        swing_period_s: period of the swing.
+        duration_s: duration of the whole task.
+        period_s: period of the cycle.
     """
 
     def __init__(self, amplitude: Floats, swing_period_s: float, duration_s: float, period_s: float) -> None:
@@ -50,9 +50,9 @@ class ListenTask(Task):
     """Read the sensor and do nothing.
 
     Args:
-        calibration: of the array.
+        calibration: calibration of the array.
         duration_s: how long.
-        period_s: of the cycle.
+        period_s: period of the cycle.
     """
 
     def __init__(self, calibration: PatchCalibration, duration_s: float, period_s: float) -> None:
@@ -85,5 +85,5 @@ class HoldTask(Task):
     """Stay where the drives are."""
 
     def step(self, _: Measurement) -> Command:
-        """Nothing to do."""
+        """Do nothing."""
         return Command()

@@ -1,4 +1,4 @@
-"""First motion: each joint alone by a small way, slowly, and what every encoder made of it.
+"""First motion: each joint moves alone by a small way, slowly, and every encoder is compared.
 
 Encoders are compared motor by motor, so that a drive that turns the wrong way, by another gear or not at all is named
 even where wrist joints drag each other's motors along. Whether the joint itself turned the way it must, no encoder
@@ -22,9 +22,9 @@ from canprobe.mechanics.types import Floats
 
 Script = Generator[Command, Measurement, Measurement]
 MOVE_ANGLE = math.radians(1.0)
-"""Of a prismatic joint its travel by `ArmModel.radian`: 3.5 mm."""
+"""Angle by which a revolute joint is moved; a prismatic joint moves by `ArmModel.radian` times that, 3.5 mm."""
 MOVE_S = 15 / 8 * 0.5
-"""With a highest speed of 2 deg/s (7 mm/s): that of the quintic is 15/8 of its mean."""
+"""Time of a motion, for a highest speed of 2 deg/s (7 mm/s); the highest speed of the quintic is 15/8 of its mean."""
 SETTLE_S = 0.25
 
 
@@ -32,11 +32,11 @@ class JointCheck(Controller):
     """The controller that moves one joint after the other, forth and back.
 
     Args:
-        plan: of a cell with an arm; a joint that would leave its limits is moved the other way, or not at all.
+        plan: plan of a cell with an arm; a joint that would leave its limits is moved the other way, or not at all.
         operator: asked before each motion, and after it whether the joint moved the right way; None: no questions.
 
     Attributes:
-        findings: one for each joint that its turn has come to.
+        findings: one for each joint that was checked so far.
         start: joint positions (n,), rad or m, before any motion; None as long as they are not known.
     """
 
@@ -51,7 +51,7 @@ class JointCheck(Controller):
         next(self._script)
 
     def step(self, measurement: Measurement) -> Command:
-        """One cycle."""
+        """Give the target of a cycle."""
         try:
             return self._script.send(measurement)
         except StopIteration:

@@ -42,7 +42,7 @@ class JointFinding:
     """What became of one joint.
 
     Attributes:
-        joint: from 0.
+        joint: number of the joint, from 0.
         start: where it stood, in its unit, as the next two.
         asked: the way of its target; 0 where it was not moved.
         moved: how far it moved, by its own motor's encoder.
@@ -73,8 +73,8 @@ def find_fault(joint: int, asked: Floats, moved: Floats, rest: Sequence[float], 
     Args:
         joint: that was to move, from 0.
         asked, moved: ways of the motors (n,), drive units.
-        rest: within which each is at rest (n,), drive units.
-        unit: of the joint, deg or mm.
+        rest: distance within which each is at rest (n,), drive units.
+        unit: unit of the joint, deg or mm.
     """
     least = TRAVEL_TOLERANCE_RESTS * np.array(rest)
     tolerance = np.maximum(TRAVEL_TOLERANCE_SHARE * np.abs(asked), least)

@@ -16,7 +16,7 @@ from canprobe.mechanics.types import Floats
 
 
 def _solve(J: Floats, twist: Any) -> list[float] | None:
-    """As `probe_motion.solve`, by LAPACK itself: numpy's wrapper costs four times as much in each cycle."""
+    """Solve as `probe_motion.solve` does, by LAPACK itself: numpy's wrapper costs four times as much in each cycle."""
     _, _, dq, info = dgesv(J, twist)
     step: list[float] = dq.tolist()
     return step if info == 0 else None
@@ -29,9 +29,9 @@ class ProbeMotion:
     command, and the step is small enough that its second-order error is gone in the next cycle.
 
     Args:
-        arm, probe: what moves.
-        safety: what joints and probe must keep to.
-        period_s: of the cycle.
+        arm, probe: the arm and the probe that move.
+        safety: limits of the joints and of the probe's tip.
+        period_s: period of the cycle.
         q: joint positions to start from (n,), rad or m; more than six joints stay near them.
 
     Attributes:
@@ -60,7 +60,7 @@ class ProbeMotion:
 
     @property
     def pose_matrix(self) -> Floats:
-        """The same with the turn about the pole, (4, 4), m."""
+        """The commanded pose with the turn about the pole, (4, 4), m."""
         return pose_of(self._steps.at)
 
     def step(self, pose: ProbePose) -> Floats:

@@ -43,13 +43,13 @@ class ProbingTask(Task):
     """Base of the tasks that touch: the order of a cycle, and the phases that all of them have.
 
     Args:
-        plan: of a cell with an arm; beyond its limits the probe retreats and the cell stops.
-        lag_s: of the drives behind a ramp.
+        plan: plan of a cell with an arm; beyond its limits the probe retreats and the cell stops.
+        lag_s: lag of the drives behind a ramp.
         sensing: contacts from measurements.
 
     Attributes:
         phase: what it does now.
-        sensing: as given.
+        sensing: source of the contacts, as given.
         reason: why it stopped; None as long as it goes on.
         taxels: last image of the touch itself.
     """

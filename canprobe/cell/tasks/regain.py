@@ -1,4 +1,4 @@
-"""Contact that a scan has lost: the probe stops along its path and goes on towards the object, slowly and not far."""
+"""Search for a lost contact: the probe stops along its path and goes on towards the object, slowly and not far."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from canprobe.mechanics.touch.servo import ProbePose
 from canprobe.mechanics.types import Floats
 
 SEARCH_SPEED = 2e-3
-"""m/s: until the first sample of the new touch has taken effect, 27 ms later, the layer sinks in by 0.05 mm."""
+"""Speed of the search, m/s: until the first sample of the new touch takes effect, 27 ms, the layer sinks in 0.05 mm."""
 BRAKE_S = 0.02
 """Time constant with which the motion along the path ends: 0.5 mm at 25 mm/s."""
 REST_S = 0.25
@@ -21,8 +21,8 @@ class Search:
     """The probe's motion from a lost contact to the object, along its pole.
 
     Args:
-        pose: of the probe where the contact was lost.
-        velocity: of its centre then (3,), m/s; what of it runs along the path fades out.
+        pose: pose of the probe where the contact was lost.
+        velocity: velocity of its centre then (3,), m/s; its part along the path fades out.
     """
 
     def __init__(self, pose: ProbePose, velocity: Floats) -> None:

@@ -21,27 +21,28 @@ from canprobe.mechanics.touch.stops import TOUCH_FORCE
 from canprobe.mechanics.types import Floats
 
 PRESS_SPEED = 0.8e-3
-"""m/s, from the first touch to the wanted force."""
+"""Speed from the first touch to the wanted force, m/s."""
 MOVE_SPEED = 30e-3
+"""Speed from touch to touch, m/s."""
 FORCE_HZ = 0.5
 """Bandwidth with which the force is held; slower than a roll, so that its images have one depth."""
 MAX_PRESS_WAY = 3e-3
-"""Way beyond the first touch, m, at which the object gives way."""
+"""Way beyond the first touch, m, after which the object counts as one that gives way."""
 ROLL_SAMPLES = 24
 """Poses of a roll whose reach is checked."""
 
 
 @dataclass(frozen=True, slots=True)
 class Press:
-    """One touch.
+    """A touch of the object, with its roll.
 
     Attributes:
-        force: N.
+        force: force of the touch, N.
         at: place on the pad where it begins, m.
         roll: half-widths of the roll over the pad along and across its heading, m; both: it is an eight.
-        heading: of the roll on the pad, rad.
-        hz: of the roll, one after the other, in equal parts of the time.
-        seconds: of the roll.
+        heading: heading of the roll on the pad, rad.
+        hz: rates of the roll, one after the other, in equal parts of the time.
+        seconds: duration of the roll, s.
     """
 
     force: float
@@ -63,14 +64,14 @@ class Press:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RollRecord:
-    """What was recorded of a touch, image by image, from the moment in which the force was reached.
+    """The record of a touch, image by image, from the moment in which the force was reached.
 
     Attributes:
-        press: what was asked for.
+        press: the touch as it was planned.
         t_s: times of the images, s.
         images, windows: counts (16, 16), and first row, first column, rows, columns of what was sent.
         T_base_probe: (4, 4) each, of the probe at these times.
-        cycles: of the SYNCs that triggered them.
+        cycles: cycles whose SYNCs triggered them.
     """
 
     press: Press
@@ -82,22 +83,22 @@ class RollRecord:
 
 
 class RollTask(ProbingTask):
-    """Touch after touch of one object that is known.
+    """Touches an object of known shape again and again, and rolls on it.
 
     The probe rolls without slipping: the contact goes as far over the object as over the pad. Its centre follows the
     object that is known; only slowly does the depth follow the force.
 
     Args:
-        plan: of the cell.
+        plan: plan of the cell.
         task: where the object is touched first.
         sensing: contacts from measurements; its force is not trusted, only held.
         presses: the touches.
-        radius: of the ball, m; infinite for a plane, and for a rod that is rolled along its axis.
+        radius: radius of the ball, m; infinite for a plane, and for a rod that is rolled along its axis.
         rest_s: how long the array is listened to before the first touch.
 
     Attributes:
-        presses: as given.
-        pressed: what was recorded, touch by touch.
+        presses: the touches, as given.
+        pressed: the records, touch by touch.
         unloaded: images before the first touch.
     """
 
@@ -145,7 +146,7 @@ class RollTask(ProbingTask):
     # where the probe is
 
     def poses(self, x: Floats) -> Iterator[ProbePose]:
-        """Above each touch, and round its roll, for a probe that begins with its x axis along `x` (3,)."""
+        """Poses above each touch and round its roll, for a probe that begins with its x axis along `x` (3,)."""
         self._set_axes(x)
         for number, press in enumerate(self.presses):
             self._number = number
@@ -184,7 +185,7 @@ class RollTask(ProbingTask):
     # phases: each returns the pose for this cycle
 
     def _begin(self, pose: ProbePose) -> None:
-        """To the next touch, or to the end."""
+        """Go to the next touch, or end."""
         assert self._motion is not None
         if self._number == 0:
             self._set_axes(self._motion.pose_matrix[:3, 0])
@@ -215,7 +216,7 @@ class RollTask(ProbingTask):
         return self._pose((0.0, 0.0), self._gone)
 
     def _settle(self) -> ProbePose:
-        """On, slowly, until the force is there."""
+        """Press on slowly until the force is reached."""
         press = self.presses[self._number]
         if self._touch.force >= press.force:
             self.pressed.append(RollRecord(press))

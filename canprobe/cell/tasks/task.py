@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 
 MAX_STEP_PERIODS = 4
-"""Periods by which a motion goes on in one cycle at most, and for which it makes up later; the rest is lost time."""
+"""Largest step of a motion in a cycle, and largest time that it makes up later, in periods; the rest is lost."""
 STEP_GROWTH_DIVISOR = 8
-"""Part of a period by which one step of a motion may be longer than the one before."""
+"""A step of a motion is longer than the one before by at most a period over this."""
 
 
 class MotionTime:
@@ -29,7 +29,7 @@ class MotionTime:
     once, the probe would be pushed by the way of four cycles into what it touches.
 
     Args:
-        period_ns: of the cycle.
+        period_ns: period of the cycle.
     """
 
     def __init__(self, period_ns: int) -> None:
@@ -38,7 +38,7 @@ class MotionTime:
         self._step_ns, self._owed_ns = period_ns, 0
 
     def step(self, t_ns: int) -> int:
-        """By how much the motion goes on in the cycle at ``t_ns``, ns; one period in the first."""
+        """Step of the motion in the cycle at ``t_ns``, ns; one period in the first cycle."""
         passed_ns = self._period_ns if self._last_ns is None else t_ns - self._last_ns
         self._last_ns = t_ns
         due_ns, longest_ns = self._owed_ns + passed_ns, MAX_STEP_PERIODS * self._period_ns
@@ -49,10 +49,10 @@ class MotionTime:
 
 @dataclass(slots=True)
 class Loss:
-    """One time that a scan lost its contact.
+    """A loss of contact in a scan.
 
     Attributes:
-        cycle: in which it was noticed.
+        cycle: cycle in which it was noticed.
         searched: how far the probe went towards the object, m.
         regained_s: time from there to the new touch; None without one.
     """

@@ -34,15 +34,15 @@ if TYPE_CHECKING:
 MAX_SLOPE_SIGMA_SHARE = 0.12
 """Share of itself to which the slope of √F over the push must be known (1σ) before it is used."""
 LONGEST_GAP_S = 0.02
-"""Between two contacts, for the servo's surface: after a longer one too it does not rest on one sample alone."""
+"""Longest gap between two contacts for the servo's surface: after a longer gap it does not rest on one sample alone."""
 REST_SHARE = 0.7
-"""Share of the settling time after which nothing is asked to change any more."""
+"""Share of the settling time after which force and depth are constant."""
 LOST_FORCE_SHARE = 0.1
 """Share of the wanted force below which a scan or a hold has lost its contact: the hysteresis of the array."""
 RETREAT_WAY = 6e-3
 """Way off the object, m."""
 RAMP_S = 0.05
-"""To reach the scan's speed."""
+"""Time to reach the scan's speed."""
 _LEAVING = (Phase.RETREAT, Phase.DONE)
 
 
@@ -50,7 +50,7 @@ class TouchTask(ProbingTask):
     """Approach an object, touch it with a given force, follow a strategy over it or hold still, and let go.
 
     Args:
-        plan: of the cell.
+        plan: plan of the cell.
         task: what to do.
         sensing: contacts from measurements.
         shape: the estimator in the loop; None where no shape is asked for.
