@@ -25,7 +25,7 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.configuration import NodeSetup, Write
 from canprobe.cell.planning.operation import INTERPOLATION_TIME
-from canprobe.cell.scene.model import BringUpSettings
+from canprobe.cell.scene.hardware import BringUpSettings
 from canprobe.errors import BusError, NodeError
 from canprobe.fieldbus.bus.presence import SECOND_ANSWER_S, UPLOAD_DEVICE_TYPE
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
@@ -51,15 +51,15 @@ MODE_DISPLAY = 0x6061
 REVISION_SUBINDEX = 3
 IDENTITY_NAMES = {1: "vendor id", 2: "product code", 3: "revision number", 4: "serial number"}
 RELEASE_S = 0.1
-"""For one answer of a node that is released."""
+"""Longest time to an answer of a node that is released."""
 
 
 @dataclass(slots=True)
 class NodeReport:
-    """How far a node came.
+    """How far a node came in bring-up.
 
     Attributes:
-        setup: the node.
+        setup: configuration of the node.
         software: its version by 100Ah; None where the node does not report it.
         kept: its configuration was there already, by 1020h.
         repeated: requests that were sent again.
@@ -87,7 +87,7 @@ class BringUp:
     Args:
         network: SDO and NMT, pumped.
         watch: sees every boot-up, heartbeat and EMCY that arrives meanwhile.
-        setups: the nodes.
+        setups: configurations of the nodes.
         settings: times, retries, and whether the nodes store their configuration.
         say: called with each step, for the user.
 
@@ -161,9 +161,12 @@ class BringUp:
         self.took_over = True
         for _ in range(1 + self._settings.retries):
             self._say(f"reset nodes {', '.join(str(s.node_id) for s in missing)}")
-            self._network.port.send_batch([pack_nmt(_reset_of(s), s.node_id) for s in missing])
-            for setup in missing:
+            frames = []
+            for setup in missing:  # a drive that is homed would lose its zero with the reset of the node
+                reset = NmtCommand.RESET_COMMUNICATION if setup.homing else NmtCommand.RESET_NODE
+                frames.append(pack_nmt(reset, setup.node_id))
                 resets[setup.node_id] += 1
+            self._network.port.send_batch(frames)
             self._network.pump_until(lambda: all(boot_ups[i] > before[i] for i in before), self._settings.boot_up_s)
             missing = [s for s in self._setups if boot_ups[s.node_id] == before[s.node_id]]
             if not missing:
@@ -183,7 +186,7 @@ class BringUp:
                 self._refuse_twins(setup, count)
 
     def _refuse_twins(self, setup: NodeSetup, boot_ups: int) -> None:
-        """Two nodes of one id answer a request twice; one that boots twice, as by way of its loader, answers once."""
+        """Refuse two nodes of one id: both answer a request. A node that boots twice, by its loader, answers once."""
         answers: list[bytes] = []
         cob_id = SDO_TX_BASE + setup.node_id
 
@@ -228,7 +231,7 @@ class BringUp:
                 self._say(f"{node} cannot take {left} by its EDS: left as the device has it")
 
     def _configure(self, report: NodeReport) -> Dialogue:
-        """All that is said to one node."""
+        """The whole dialogue with one node: identify, check, write, store."""
         setup = report.setup
         try:
             yield from self._identify(report)
@@ -249,7 +252,8 @@ class BringUp:
         setup = report.setup
         for subindex, expected in setup.identity.items():
             got = yield from read_entry(setup, 0x1018, subindex)
-            if subindex == REVISION_SUBINDEX and got != expected and _same_major(got, expected):
+            newer = got > expected and got >> 16 == expected >> 16  # CiA 301, 1018h:03: of the same major revision
+            if subindex == REVISION_SUBINDEX and newer:
                 report.remarks.append(
                     f"has revision {got:08X}h, {setup.eds} describes {expected:08X}h: the same major revision, taken"
                 )
@@ -277,7 +281,7 @@ class BringUp:
                 )
 
     def _check_units(self, report: NodeReport) -> Dialogue:
-        """How many units of a motor turn the device states; what it does not answer is not compared."""
+        """Compare the units of a motor turn that the device states; what it does not answer is not compared."""
         turn = report.setup.turn
         if turn is None:
             return
@@ -356,7 +360,7 @@ class BringUp:
         A drive may change its mode only once it is operational and SYNC runs.
 
         Raises:
-            NodeError: from the dialogues: a drive is in another mode when the time is over.
+            NodeError: raised by the dialogues: a drive is in another mode when the time is over.
         """
         until_ns = self._network.port.clock.now_ns() + round(timeout_s * 1e9)
         asked = {s.node_id: self._confirm_mode(s, s.mode, until_ns) for s in self._setups if s.mode is not None}
@@ -401,7 +405,7 @@ class BringUp:
         return hold_dialogues(self._network, dialogues, timeout_s=timeout_s, retries=self._settings.retries)
 
     def _write_all(self, report: NodeReport) -> Dialogue:
-        """The configuration; what is wished and refused is left out with a remark."""
+        """Write the configuration; a wish that the device refuses is left out with a remark."""
         setup = report.setup
         times = [tuple(write for write in setup.writes if write.index == INTERPOLATION_TIME), *setup.otherwise]
         for write in setup.writes:
@@ -420,7 +424,7 @@ class BringUp:
                 yield from self._write_one_of(report, times)
 
     def _write_one_of(self, report: NodeReport, options: Sequence[Sequence[Write]]) -> Dialogue:
-        """The first of several sets of writes that mean the same and that the device takes."""
+        """Write the first set that the device takes, of several sets that mean the same."""
         first: RefusedError | None = None
         for writes in options:
             try:
@@ -437,7 +441,7 @@ class BringUp:
         raise RefusedError(first.node_id, first.reason + (yield from _fitting_rate(report.setup, options))) from first
 
     def _recall(self, setup: NodeSetup) -> Dialogue:
-        """The newest entry in the error history of a node that has failed, unless its EMCY was received."""
+        """Read the newest entry in the error history of a node that has failed, unless its EMCY was received."""
         if setup.node_id in self._watch.last_alarm or ERROR_HISTORY not in setup.dictionary:
             return
         try:
@@ -455,7 +459,7 @@ class BringUp:
 
 
 class RefusedError(NodeError):
-    """A device refused a value, or holds another one."""
+    """A device refused a value, or holds another one after the write."""
 
 
 def read_entry(setup: NodeSetup, index: int, subindex: int) -> Generator[bytes | None, bytes, int]:
@@ -472,7 +476,7 @@ def read_entry(setup: NodeSetup, index: int, subindex: int) -> Generator[bytes |
 
 
 def write_entry(setup: NodeSetup, write: Write) -> Dialogue:
-    """Write a value and read it back; one that the device refuses and holds already is as good.
+    """Write a value and read it back; a refused value counts as written where the device holds it already.
 
     Raises:
         RefusedError: the device refuses it, or holds another one.
@@ -540,16 +544,6 @@ def _failed(setup: NodeSetup, write: Write, error: Exception) -> str:
 def _with_own_bits(write: Write, held: int) -> int:
     """The value with the bits that are the device's as it holds them."""
     return write.value & ~write.own_bits | held & write.own_bits
-
-
-def _same_major(got: int, expected: int) -> bool:
-    """Whether a revision is at or above another of the same major number. Source: CiA 301, object 1018h:03."""
-    return got >> 16 == expected >> 16 and got >= expected
-
-
-def _reset_of(setup: NodeSetup) -> NmtCommand:
-    """A drive that is homed would lose its zero with the reset of the node."""
-    return NmtCommand.RESET_COMMUNICATION if setup.homing else NmtCommand.RESET_NODE
 
 
 def _others(words: str, setups: Sequence[NodeSetup]) -> str:

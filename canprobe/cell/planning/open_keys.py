@@ -12,7 +12,7 @@ from canprobe.cell.planning.model import Choice
 from canprobe.cell.planning.window import (
     window_choices,
 )
-from canprobe.cell.scene.model import TactileModeName
+from canprobe.cell.scene.hardware import TactileModeName
 from canprobe.cell.scene.setup import Setup
 
 AUTO = "auto"

@@ -27,7 +27,7 @@ from canprobe.cell.planning.model import (
     SyncPlan,
     Traffic,
 )
-from canprobe.cell.scene.model import BusSettings
+from canprobe.cell.scene.hardware import BusSettings
 from canprobe.fieldbus.protocol.fifo_response_times import worst_case_response_fifo
 from canprobe.fieldbus.protocol.frame_bits import (
     best_case_bits,

@@ -5,7 +5,7 @@ Times are bit times of the nominal rate; the data phase of an FD frame is rounde
 
 from __future__ import annotations
 
-from canprobe.cell.scene.model import BusSettings
+from canprobe.cell.scene.hardware import BusSettings
 from canprobe.fieldbus.protocol.frame_bits import (
     FrameLength,
     best_case_bits,

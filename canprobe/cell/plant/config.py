@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from canprobe.cell.plant.taxels import TaxelConfig
-from canprobe.cell.scene.model import Fidelity
+from canprobe.cell.scene.hardware import Fidelity
 from canprobe.cell.scene.setup import Dynamics
 from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
 from canprobe.mechanics.robot.model import ArmModel, Body

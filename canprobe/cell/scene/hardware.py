@@ -1,4 +1,4 @@
-"""The hardware of a cell: the arm, its joints with their drives, and how the emulator may make drives difficult.
+"""The hardware of a cell: bus, bring-up, arm, joints with their drives, and what makes emulated drives difficult.
 
 These sections stand in cell files (`canprobe/cells`); a scene may change single keys of them. As in
 `canprobe.cell.scene.model`, a field says everything about its key.
@@ -15,12 +15,18 @@ from canprobe.cell.scene.checks import DISTINCT, Check, OneOf, Only, Pattern, Ra
 Auto = Literal["auto"]  # the plan chooses
 JointKind = Literal["revolute", "prismatic"]
 Convention = Literal["standard", "modified"]
+TactileModeName = Literal["window", "image", "features", "auto"]
+CobIds = Literal["default", "by_deadline", "auto"]
+Fidelity = Literal["ideal", "dynamic"]
+TransmitQueue = Literal["priority", "fifo"]
 Vec3 = tuple[float, float, float]
 Vec6 = tuple[float, float, float, float, float, float]
 Channel = Annotated[str, Pattern(r"[!-~]+", "without spaces, in ASCII")]  # as it stands in a candump log
 NodeId = Annotated[int, Range(1, 126)]  # 127 is the master
 SerialNumber = Annotated[int, Range(0, 0xFFFFFFFF)]
 
+DIRECT = "direct"
+"""The interface that is no bus."""
 MM = 1e-3
 """A millimetre in metres."""
 REVOLUTE_ONLY = Only("kind", ("revolute",))
@@ -37,6 +43,61 @@ class CellInfo:
     """Name of the cell."""
     title: str = ""
     """One line about the cell, which `canprobe cells` prints."""
+
+
+@dataclass(frozen=True, slots=True)
+class BusSettings:
+    """`[bus]`: the bus that connects the nodes."""
+
+    interface: Annotated[str, Pattern(r"[a-z0-9_-]+", "such as lockstep, socketcan, pcan")] = "lockstep"
+    """`lockstep` (in this process, in virtual time), `direct` (the same without a bus: counts and images in the place
+    of frames), `socketcan`, or any other python-can interface."""
+    channel: Channel = "can0"
+    """Channel of the interface. On a lockstep bus it is only a name in the log."""
+    bitrate: Annotated[int, Range(10_000, 1_000_000)] = 1_000_000
+    """Bit rate of the bus."""
+    timed: bool = True
+    """Lockstep: a frame takes its time on the wire, and frames wait for each other. false: no time."""
+    transmit_queue: TransmitQueue = "priority"
+    """Which frame a node sends first: the lowest identifier, or the oldest (`fifo`)."""
+    bit_error_rate: Annotated[float, Range(0, 0.01)] = 0.0
+    """Timed lockstep: share of bits that the wire corrupts."""
+    fd: bool | Auto = False
+    """Send PDOs of up to 64 bytes in CAN FD frames where a device has them. Other frames stay classical."""
+    data_bitrate: Annotated[int, Range(10_000, 8_000_000)] = 5_000_000
+    """Bit rate of the data phase of CAN FD frames."""
+    cob_ids: CobIds = "default"
+    """COB-IDs of the PDOs: the defaults of the cell, or priorities in the order of the deadlines."""
+
+    @property
+    def direct(self) -> bool:
+        """There is no bus."""
+        return self.interface == DIRECT
+
+
+@dataclass(frozen=True, slots=True)
+class BringUpSettings:
+    """`[bring_up]`: the time of each step of bring-up, and what happens when a step takes longer."""
+
+    listen_s: Annotated[float, Range(0, 60)] = 0.25
+    """Time in which bring-up only listens for another master."""
+    boot_up_s: Annotated[float, Range(0, 600, open_low=True)] = 2.0
+    """Longest time from the reset of a node to its boot-up message."""
+    sdo_s: Annotated[float, Range(0, 60, open_low=True)] = 0.5
+    """Longest time to one SDO answer."""
+    start_s: Annotated[float, Range(0, 60, open_low=True)] = 1.0
+    """Longest time from NMT start to the heartbeat that confirms it."""
+    enable_s: Annotated[float, Range(0, 600, open_low=True)] = 2.0
+    """Longest time in which the drives change to their mode, and from the command to enable operation to their
+    confirmation. Brakes and a search for the commutation take longer."""
+    stop_s: Annotated[float, Range(0, 600, open_low=True)] = 0.5
+    """Longest time of a quick stop, and of disabling the drives after it."""
+    emulated_s: Annotated[float, Range(0, 3600, open_low=True)] = 120.0
+    """Longest time in which the process of the emulated nodes starts."""
+    retries: Annotated[int, Range(0, 100)] = 2
+    """How often a reset, request or start without an answer is repeated."""
+    store: bool = False
+    """Store the configuration in the nodes (1010h). The next bring-up finds it by 1020h and does not write it."""
 
 
 @dataclass(frozen=True, slots=True)

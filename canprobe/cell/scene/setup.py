@@ -16,15 +16,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from canprobe.cell.scene.hardware import Auto
+from canprobe.cell.scene.hardware import Auto, BringUpSettings, BusSettings, Fidelity, TactileModeName
 from canprobe.cell.scene.model import (
     BridgeSettings,
-    BringUpSettings,
-    BusSettings,
-    Fidelity,
     Scene,
     ShapeMethod,
-    TactileModeName,
     TaskKind,
 )
 from canprobe.fieldbus.node.quirks import Quirks
