@@ -1,4 +1,4 @@
-"""From the sections `[arm]` and `[joints.*]` to the arm: chain, joints, drive units, bodies, drives.
+"""Makes the arm of the sections `[arm]` and `[joints.*]`: chain, joints, drive units, bodies, drives.
 
 The chain is read from a URDF or from Denavit-Hartenberg rows. What a joint's section gives replaces what the URDF says.
 """
@@ -16,7 +16,6 @@ from canprobe.cell.scene.geometry import transform
 from canprobe.cell.scene.hardware import MM, ArmSettings, JointSettings
 from canprobe.cell.scene.setup import HomingParameters
 from canprobe.errors import PlanError
-from canprobe.mechanics.robot.chain import Chain
 from canprobe.mechanics.robot.denavit_hartenberg import dh_step, from_dh
 from canprobe.mechanics.robot.model import ArmModel, Body, Joint, lopsided_inertia, negative_inertia
 from canprobe.mechanics.robot.urdf import UrdfArm, from_urdf, limit_warning
@@ -44,19 +43,19 @@ _OF_PRISMATIC = {
     "coulomb": ("coulomb_n", 1.0),
     "viscous": ("viscous_n_s_m", 1.0),
 }
-"""Field of a `Joint` → key of a section, and what its unit is in SI."""
+"""Field of a `Joint` → key of a section, and its unit in SI."""
 _PRISMATIC_DEFAULTS = {"rated_torque": 200.0, "rotor_inertia": 5.0, "coulomb": 20.0, "viscous": 20.0}
 
 
 def arm_model(
     name: str, arm: ArmSettings, sections: Mapping[str, JointSettings]
 ) -> tuple[ArmModel, Bodies, tuple[str, ...]]:
-    """The arm of a cell, the bodies of its links, None where masses are not known, and what its URDF hardly means.
+    """The arm of a cell, the bodies of its links (None where masses are not known), and warnings about its URDF.
 
     Args:
-        name: of the cell.
-        arm: its section.
-        sections: those of its joints, from the base.
+        name: name of the cell.
+        arm: the section `[arm]`.
+        sections: the sections of the joints, from the base.
 
     Raises:
         PlanError: the URDF cannot be used, or joints and sections contradict each other.
@@ -65,7 +64,9 @@ def arm_model(
     if arm.urdf is not None:
         found = from_urdf(arm.urdf, arm.base, arm.tip, name=name)
         _refuse_other_names(found, sections, arm)
-        chain = _moved(found.chain, mount, flange)
+        fixed = found.chain.fixed.copy()
+        fixed[0] = mount @ fixed[0]
+        chain = replace(found.chain, fixed=fixed, T_last_flange=found.chain.T_last_flange @ flange)
         joints = [_joint(section, joint) for section, joint in zip(sections.values(), found.joints, strict=True)]
         _refuse_standstill(arm.urdf, found.joints, sections)
         bodies: Bodies = found.bodies if any(found.bodies) else None
@@ -113,7 +114,7 @@ def _refuse_other_names(found: UrdfArm, sections: Mapping[str, JointSettings], a
 
 
 def _refuse_standstill(urdf: str, joints: Sequence[Joint], sections: Mapping[str, JointSettings]) -> None:
-    """The file's speed limit counts where the section has none; a missing or tiny one was hardly meant."""
+    """Refuse a missing or tiny speed limit of the file where the section has none: it was hardly meant."""
     problems = [
         f"{urdf}: joint {joint.name}: expected a velocity in its <limit> of at least {slowest:.3g} {unit}/s, got"
         f" {joint.qd_max:g}; put it right there, or set joints.{joint.name}.speed_{joint.unit}_s"
@@ -133,12 +134,6 @@ def _refuse_standstill(urdf: str, joints: Sequence[Joint], sections: Mapping[str
 
 def _stops(joint: Joint, section: JointSettings) -> tuple[float | None, float | None]:
     return (section.min_mm, section.max_mm) if joint.prismatic else (section.min_deg, section.max_deg)
-
-
-def _moved(chain: Chain, mount: Floats, flange: Floats) -> Chain:
-    fixed = chain.fixed.copy()
-    fixed[0] = mount @ fixed[0]
-    return replace(chain, fixed=fixed, T_last_flange=chain.T_last_flange @ flange)
 
 
 def _bare(name: str, section: JointSettings) -> Joint:

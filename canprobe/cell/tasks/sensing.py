@@ -1,4 +1,4 @@
-"""From a measurement to a contact: joints at the sample's instant, patch, and the squeezed layer."""
+"""Makes a contact of a measurement: joints at the sample's instant, patch, and the squeezed layer."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 
 
 MAX_STIFFNESS_RATIO = 6.0
-"""Between the slope that is felt and the one of the stated stiffness on a plane; further apart it is not believed."""
+"""Largest ratio of the measured slope and the slope by the stated stiffness on a plane; the slope is limited to it."""
 HOLLOW_LIMIT_SHARE = 0.9
-"""Least curvature over −1/radius of the probe at which a patch still makes sense."""
+"""Limit of a hollow: curvature over −1/radius of the probe up to which there is one patch of contact."""
 
 
 HISTORY_CYCLES = 64
@@ -86,11 +86,11 @@ class ContactSensing:
     Args:
         model: the arm.
         flange_probe: transform (4, 4) from the probe's centre frame (z = pole) to the flange.
-        calibration: of the array.
-        radius: of the probe, m.
+        calibration: calibration of the array.
+        radius: radius of the probe, m.
         stiffness: K/h of the layer, N/m³.
         moment_image: gives the contacts the second moments of their images; None leaves them out.
-        noise: of the centroids; None: the contacts do not state theirs.
+        noise: noise of the centroids; None: the contacts do not state any.
         lag: how far the array's centroids trail the contact; None: they do not.
     """
 
@@ -142,8 +142,8 @@ class ContactSensing:
         An estimate that is no contact of one patch any more (a hollow as tight as the probe) is taken at the limit.
 
         Args:
-            kappa: 1/m.
-            stiffness: K/h, N/m³; None from an estimator that has none: what the last touch showed, or else as before.
+            kappa: principal curvatures, 1/m.
+            stiffness: K/h, N/m³; None: the one that the last touch showed, or else as before.
         """
         possible = np.maximum(kappa, -HOLLOW_LIMIT_SHARE / self.radius)
         if stiffness is not None:
@@ -158,7 +158,7 @@ class ContactSensing:
         self._depth_at_1_n = depth
 
     def set_slope(self, slope: Slope) -> None:
-        """Take what a touch showed; the depth goes by it until the object's curvature is known."""
+        """Take the slope that a touch showed; depths follow from it until the object's curvature is known."""
         flat = 1.0 / float(indentation_from_force(1.0, self.stiffness, self.radius, np.zeros(2)))
         self._slope = slope._replace(
             value=min(max(slope.value, flat / MAX_STIFFNESS_RATIO), flat * MAX_STIFFNESS_RATIO)
@@ -183,6 +183,8 @@ class ContactSensing:
             return None
         t_s, uv = sample.t_sample_ns * 1e-9, (patch.u, patch.v)
         depth = self.depth(patch.force)
+        # level that is taken off the image, over the peak pressure of the contact
+        lightness = self._level_pa / (self.stiffness * depth) if depth > 0.0 else 1.0
         found = contact_sample(
             t_s=t_s,
             T_base_probe=T_base_probe,
@@ -190,7 +192,7 @@ class ContactSensing:
             depth=depth,
             radius=self.radius,
             force_n=patch.force,
-            sigma_point=None if self._noise is None else self._noise.sigma(self._lightness(depth)),
+            sigma_point=None if self._noise is None else self._noise.sigma(lightness),
             moments=self._moments(sample, patch),
             doubts=patch.doubts,
             slope=self._slope,
@@ -199,12 +201,8 @@ class ContactSensing:
             return found
         return replace(found, sigma_motion=sample.t_sigma_s * self._speed(sample.t_sample_ns, found))
 
-    def _lightness(self, depth: float) -> float:
-        """Level that is taken off the image over the peak pressure of a contact that sinks in by a depth (m)."""
-        return self._level_pa / (self.stiffness * depth) if depth > 0.0 else 1.0
-
     def _speed(self, t_ns: int, contact: ContactSample) -> float:
-        """Of the probe at the contact, m/s: what an error of the instant displaces the contact by; 0 without a past."""
+        """Speed of the probe at the contact, m/s: errors of the instant displace a contact by it; 0 without a past."""
         before = self._history.at(t_ns - SPEED_OVER_NS)
         if before is None:
             return 0.0

@@ -20,9 +20,9 @@ from canprobe.mechanics.types import Floats
 FIRST_POINT_TOLERANCE_RAD = 0.01
 """How far a first point at time 0 may be from where the arm stands; of a joint that slides its `ArmModel.radian`."""
 BRAKE_S = 0.5
-"""How long an arm takes to stand still after a stop."""
+"""Time in which an arm comes to rest after a stop."""
 CHECKS_PER_SEGMENT = 33
-"""Instants of each segment at which range, speed and workspace are checked."""
+"""Number of instants of each segment at which range, speed and workspace are checked."""
 
 
 class Trajectory(Controller):
@@ -36,7 +36,7 @@ class Trajectory(Controller):
     makes up for four periods, little by little, and ends later by the rest.
 
     Args:
-        plan: of a cell with an arm.
+        plan: plan of a cell with an arm.
         points: (time from the start, s; joint positions (n,), rad or m), in the order of time. A first one at time 0
             must be where the arm stands, within 0.01 rad (3.5 mm).
         velocities: (n,) of each point, rad/s or m/s; by default they follow from the points.
@@ -63,7 +63,9 @@ class Trajectory(Controller):
         self._limits: SafetyLimits = plan.setup.limits
         self._guard = JointGuard(plan)
         self._times, self._q = _table(points, arm.model.n)
-        self._given = None if velocities is None else _velocities(velocities, self._q.shape)
+        self._given = (
+            None if velocities is None else checked("trajectory: velocities", velocities, self._q.shape).copy()
+        )
         self._hold_s = float(checked("trajectory: hold_s", hold_s, ()))
         self._time = MotionTime(plan.sync.period_ns)
         self._gone_ns: int | None = None
@@ -110,7 +112,7 @@ class Trajectory(Controller):
 
     @classmethod
     def braking(cls, plan: Plan, q: Floats, qd: Floats) -> Trajectory:
-        """From a motion at q with speed qd (n,) to rest, evenly in `BRAKE_S`; within the joints' range."""
+        """A trajectory from a motion at q with speed qd (n,) to rest, evenly in `BRAKE_S`, within the joints' range."""
         guard = JointGuard(plan)
         end = np.clip(q + 0.5 * BRAKE_S * qd, guard.low, guard.high)
         way = cls(plan, [(BRAKE_S, end)], hold_s=0.0)
@@ -126,7 +128,7 @@ class Trajectory(Controller):
         return q
 
     def step(self, measurement: Measurement) -> Command:
-        """One cycle."""
+        """Give the target of a cycle."""
         passed_ns = self._time.step(measurement.t_ns)
         if self._gone_ns is None:
             assert measurement.q is not None
@@ -189,10 +191,6 @@ def _table(points: Iterable[tuple[float, ArrayLike]], n: int) -> tuple[Floats, F
     if times[0] < 0.0 or (np.diff(times) <= 0.0).any():
         raise UsageError("trajectory: expected times from 0 on, each later than the one before")
     return times, q
-
-
-def _velocities(velocities: Sequence[ArrayLike], shape: tuple[int, ...]) -> Floats:
-    return checked("trajectory: velocities", velocities, shape).copy()
 
 
 def _slopes(times: Floats, q: Floats) -> Floats:
