@@ -272,8 +272,8 @@ def _preload(seen: Seen) -> SafetyStop | None:
         return None
     return SafetyStop(
         f"the array measures {seen.preload:.2f} N before the run, more than limits.preload_max_n ="
-        f" {limits.safety.preload_max:g}, and its tare takes that for zero: free the probe; if it is free, it was"
-        " pressed until just now, which its array forgets in a minute, or the array's offsets are larger than that"
+        f" {limits.safety.preload_max:g}; its tare would take that for zero: free the probe. If it is free, wait a"
+        " minute after the last press, or raise limits.preload_max_n for an array with larger offsets"
     )
 
 
@@ -290,7 +290,7 @@ def _force_hidden(contact: TouchState) -> SafetyStop | None:
     if contact.hidden_s * 1e9 <= FORCE_HIDDEN_NS:
         return None
     return SafetyStop(
-        f"the array is saturated and no stiffness was felt: the true force is above the {contact.force:.1f} N "
+        f"the array is saturated and no stiffness was measured: the true force is above the {contact.force:.1f} N "
         "measured; raise sensor.full_scale_kpa or lower task.force_n"
     )
 

@@ -65,13 +65,13 @@ class CalibrateTask(ProbingTask):
             self._let_go()
 
     def stop(self) -> None:
-        """Let go, and estimate from what was felt so far."""
+        """Let go, and estimate from the touches so far."""
         self._number = len(self._task.approaches)
         if self.phase not in (Phase.RETREAT, Phase.DONE) and self._motion is not None:
             self._let_go()
 
     def record(self) -> TaskRecord:
-        """What it knows so far."""
+        """The record of the calibration so far."""
         return replace(super().record(), tool=self.estimate)
 
     def _feel(self, sample: TactileSample, patch: Patch) -> None:
@@ -112,7 +112,7 @@ class CalibrateTask(ProbingTask):
         elif self._gone > self._task.approach.search:
             self.retreat(
                 f"touch {self._number + 1}: no ball found up to {self._task.approach.search * 1e3:.0f} mm beyond the"
-                " expected place"
+                " expected place: correct task.start_mm and task.ball_radius_mm, or raise task.search_mm"
             )
         return self._at(-self._gone)
 
@@ -122,7 +122,10 @@ class CalibrateTask(ProbingTask):
             self._felt = []
             self._enter(Phase.SCAN)
         elif self._gone > self._task.approach.search:
-            self.retreat(f"touch {self._number + 1}: {self._task.force:g} N are not reached where the ball is expected")
+            self.retreat(
+                f"touch {self._number + 1}: expected {self._task.force:g} N at the ball, got {self._touch.force:.2f} N"
+                f" {self._task.approach.search * 1e3:g} mm beyond: fix the ball in its place, or correct task.start_mm"
+            )
         else:
             self._gone += PRESS_SPEED * self._dt
         return self._at(-self._gone)
@@ -134,7 +137,7 @@ class CalibrateTask(ProbingTask):
                 self._number += 1
                 self._let_go()
             else:
-                self.retreat(f"touch {self._number + 1}: no tactile sample while it rested")
+                self.retreat(f"touch {self._number + 1}: no tactile sample while the probe rested: check the array")
         return self._at(-self._gone) if self.phase is Phase.SCAN else self._retreat()
 
     def _ball_touch(self, felt: Sequence[ContactSample]) -> BallTouch:

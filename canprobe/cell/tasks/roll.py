@@ -212,7 +212,10 @@ class RollTask(ProbingTask):
             self._enter(Phase.SETTLE)
         elif self._gone > self._approach_of.search:
             far = self._approach_of.search * 1e3
-            self.retreat(f"touch {self._number + 1}: nothing found up to {far:.0f} mm beyond the expected place")
+            self.retreat(
+                f"touch {self._number + 1}: no object found up to {far:.0f} mm beyond the expected place: move the"
+                " object there, or correct its place"
+            )
         return self._pose((0.0, 0.0), self._gone)
 
     def _settle(self) -> ProbePose:
@@ -222,7 +225,10 @@ class RollTask(ProbingTask):
             self.pressed.append(RollRecord(press))
             self._enter(Phase.SCAN)
         elif self._gone > self._touched_at + MAX_PRESS_WAY:
-            self.retreat(f"touch {self._number + 1}: {press.force:g} N are not reached where the object is expected")
+            self.retreat(
+                f"touch {self._number + 1}: expected {press.force:g} N within {MAX_PRESS_WAY * 1e3:g} mm of the first"
+                f" touch, got {self._touch.force:.2f} N: fix the object in its place"
+            )
         else:
             self._gone += PRESS_SPEED * self._dt
         return self._pose((0.0, 0.0), self._gone)

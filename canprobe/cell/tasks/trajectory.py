@@ -187,7 +187,7 @@ def _table(points: Iterable[tuple[float, ArrayLike]], n: int) -> tuple[Floats, F
     if q.shape != (len(rows), n):
         raise UsageError(f"trajectory: expected {n} positions in each point, got {q.shape[1:]}")
     if not (np.isfinite(times).all() and np.isfinite(q).all()):
-        raise UsageError("trajectory: times and positions must be finite")
+        raise UsageError("trajectory: expected finite times and positions, got NaN or infinity")
     if times[0] < 0.0 or (np.diff(times) <= 0.0).any():
         raise UsageError("trajectory: expected times from 0 on, each later than the one before")
     return times, q
