@@ -1,4 +1,4 @@
-"""Plan → the emulated side: one plant, its nodes, and the recorder of what is true."""
+"""Makes the emulated side of a plan: one plant, its nodes, and the recorder of the truth."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class TruthRecorder(Participant):
     What is true in that state is computed afterwards: in real time it would make the nodes' next answers late.
 
     Args:
-        plant: whose truth.
+        plant: plant whose truth is recorded.
 
     Attributes:
         origin_ns: time on the bus's clock that is 0 in the column ``t_s``.
@@ -84,14 +84,14 @@ def _set_turn_units(node: SlaveNode, units: float | None) -> None:
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """The emulated nodes and what they share.
+    """The emulated nodes and the plant that they share.
 
     Attributes:
         nodes: the slaves, ascending by node id.
         plant: arm, probe, object and array.
-        recorder: notes the truth at every SYNC; None where nobody wants it, as it grows with time.
+        recorder: notes the truth at every SYNC; None where it is not wanted, as it grows with time.
         raw_array: an array that is no node; None without one.
-        participants: what is put on the bus: the nodes, or what stands between them and it (`FaultyNode`), and the
+        participants: participants of the bus: the nodes, or the `FaultyNode` between a node and the bus, and the
             recorder, which listens only.
     """
 
@@ -121,7 +121,7 @@ def make_world(
     Args:
         plan: plan of the scene.
         node_ids: which of its nodes to emulate.
-        truth: whether what is true is recorded.
+        truth: whether the truth is recorded.
         without_id: which of them start without a node id and wait for LSS to give them one.
         homed: drives that have to be homed start with their zeros, and keep them.
     """

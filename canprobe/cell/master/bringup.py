@@ -118,7 +118,7 @@ class BringUp:
         """All steps up to the NMT start.
 
         Raises:
-            NodeError: nodes are missing, are others than the EDS says, or refused a value; it names all of them.
+            NodeError: nodes are missing, do not match their EDS, or refused a value; it names all of them.
             BusError: another master uses this bus.
         """
         self.listen()

@@ -89,7 +89,7 @@ def check_command(command: Command, *, arm: bool) -> None:
         arm: the scene has one.
 
     Raises:
-        UsageError: a field is of another kind than `Command` says.
+        UsageError: a field of the command has the wrong type.
     """
     if not isinstance(command.done, bool | np.bool_):
         raise UsageError(f"controller: expected done to be True or False, got {command.done!r}")
@@ -174,10 +174,10 @@ class _Function(Controller):
 
 
 def as_controller(controller: object) -> Controller:
-    """A controller as it is, or of a function.
+    """The controller, or a controller made of a function.
 
     Raises:
-        UsageError: it is neither.
+        UsageError: it is neither a controller nor a function.
     """
     if isinstance(controller, Controller):
         return controller

@@ -38,7 +38,7 @@ CONTROLWORD, TARGET, CONSTANT = range(3)
 """Kinds of values in a command."""
 _QUICK_STOP, _DISABLE_VOLTAGE = 0x0002, 0x0000
 _STATE_BITS, _ENABLED = 0x6F, DriveState.OPERATION_ENABLED.value
-"""Bits of the statusword that tell the state, and their value in operation enabled; `known_state` has the others."""
+"""Bits of the statusword that encode the state, and their value in operation enabled; see `known_state` for others."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""What went wrong in a run and was lived with: one line a kind, however often it happened."""
+"""Faults in a run that did not stop it: one line a kind, however often it happened."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Notes:
         return len(self._kinds)
 
     def add(self, what: str, *, node_id: int | None = None, t_s: float | None = None) -> None:
-        """It happened, once more.
+        """Count an event.
 
         Args:
             what: names the kind; nothing in it may change from one time to the next.
@@ -62,7 +62,7 @@ class Notes:
             kind.last_s = t_s
 
     def add_error(self, error: CanprobeError, then: str, t_s: float) -> None:
-        """The cell found an error, and ``then`` did something about it."""
+        """Count an error, with the reaction of the cell to it in ``then``."""
         reason, node_id = (error.reason, error.node_id) if isinstance(error, NodeError) else (str(error), None)
         self.add(f"{reason}: {then}", node_id=node_id, t_s=t_s)
 
@@ -72,7 +72,7 @@ class Notes:
 
 
 def nodes_text(node_ids: Iterable[int]) -> str:
-    """Nodes in words, neighbours joined: ``nodes 1-6, 16``."""
+    """A list of nodes in words, neighbours joined: ``nodes 1-6, 16``."""
     ids = sorted(node_ids)
     steps = count()
     runs = [list(run) for _, run in groupby(ids, key=lambda node_id: node_id - next(steps))]

@@ -123,7 +123,7 @@ class PositionTrack:
         return min(periods, FOLLOWED_CYCLES) * self._asked
 
     def _carried(self, passed_ns: int) -> float:
-        """How far the motion has gone on since the last report, counts, as far as that can be said."""
+        """Estimated motion since the last report, counts."""
         return self._rate * min(passed_ns, CARRIED_CYCLES * self._period_ns)
 
 

@@ -32,7 +32,7 @@ _INITIATED, _ABORTED = 0x40, 0x80
 
 @dataclass(slots=True)
 class _Sighting:
-    """What one node id sent during a scan.
+    """The frames of a node id during a scan.
 
     Attributes:
         state: NMT state in its last heartbeat; None without one.
@@ -43,12 +43,12 @@ class _Sighting:
     answers: dict[bytes, list[bytes]] = field(default_factory=dict)
 
     def take_heartbeat(self, _id: int, data: bytes, _t_ns: int) -> None:
-        """Keep the state; another frame on this identifier is none."""
+        """Keep the state; another frame on this identifier is not a heartbeat."""
         with suppress(ProtocolError):
             self.state = unpack_heartbeat(data)
 
     def take_answer(self, _id: int, data: bytes, _t_ns: int) -> None:
-        """Keep an answer that names what it answers, which segments do not."""
+        """Keep an answer that names its entry; segments do not name one."""
         if data[:1] and data[0] & 0xE0 in (_INITIATED, _ABORTED):
             self.answers.setdefault(data[1:4], []).append(data)
 
@@ -104,7 +104,7 @@ def scan_nodes(port: Port, timeout_s: float) -> list[dict[str, Any]]:
 
 
 def _identify(node: dict[str, Any]) -> Generator[bytes | None, bytes, None]:
-    """Ask one node what it is; each answer goes into ``node``."""
+    """Read the identity of a node; each answer goes into ``node``."""
     for name, subindex in IDENTITY_SUBINDICES.items():
         data = yield from _upload(IDENTITY, subindex)
         node[name] = int.from_bytes(data, "little") if data is not None and len(data) == 4 else None  # UNSIGNED32

@@ -1,4 +1,4 @@
-"""What a plant is made of."""
+"""Configuration of a plant: arm, probe, object and array."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class PressMotion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlantConfig:
-    """What the plant is made of.
+    """Configuration of a plant.
 
     Args:
         model: the arm; None for a sensor alone, pressed on the object by ``press``.
@@ -43,20 +43,21 @@ class PlantConfig:
         T_flange_probe_centre: (4, 4) centre of the probe sphere in the flange frame, z = pole of the pad, m.
         radius_m: probe radius.
         stiffness_n_m3: stiffness of the elastic layer (K/h).
-        damping_s_m: Hunt-Crossley alpha (assumed).
-        object: what can be touched; None for nothing.
+        damping_s_m: damping of the contact, Hunt-Crossley alpha (assumed).
+        object: object that can be touched; None without one.
         taxels: the array's imperfections; None where there is no array.
         pad: the array's taxels.
-        bandwidth_hz: -3 dB frequency of every drive.
+        bandwidth_hz: bandwidth of every drive, -3 dB.
         damping_ratio: damping ratio of every drive.
         press: motion of a probe without an arm.
         seed: seed of taxel gains and noise.
         fidelity: "ideal": each motor is a second-order system; "dynamic": rigid links, friction, drive cascade, push
             of the object.
         dynamics: what a dynamic arm has beyond its geometry.
-        bodies: (n,) of its joints, without the probe; None where nobody knows them.
-        compliance: (n,) of the joints of an ideal arm between motor and link, rad/(N m) or m/N; None: they are rigid.
-        base_offset_m: (3,) of the arm's base in the frame that counts as base.
+        bodies: bodies (n,) of the links behind its joints, without the probe; None where they are not known.
+        compliance: compliance (n,) of the joints of an ideal arm between motor and link, rad/(N m) or m/N; None: all
+            are rigid.
+        base_offset_m: position (3,) of the arm's base in the frame that counts as base.
     """
 
     model: ArmModel | None

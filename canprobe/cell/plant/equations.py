@@ -28,11 +28,11 @@ Touching = Callable[[Floats], HeldContact | None]
 
 @dataclass(frozen=True, slots=True)
 class Effects:
-    """What acts on the arm; each can be switched off.
+    """Effects that act on the arm; each can be switched off.
 
     Args:
         gravity, coriolis: forces on the links.
-        friction: viscous and Coulomb, of motors and gears.
+        friction: viscous and Coulomb friction of motors and gears.
         links: False leaves the motors alone with the inertia at their own joint, without coupling.
         contact: the object pushes back.
     """
@@ -45,14 +45,14 @@ class Effects:
 
 
 class ArmEquations:
-    """The driven arm.
+    """Equations of the driven arm.
 
     Args:
         model: the arm.
         body: links and payload.
         loops: the drives; references and feed-forwards are set there.
         touching: contact near a posture.
-        effects: what acts; whether there is gravity is the body's.
+        effects: effects that act; gravity is a property of the body.
         held: whether ``hold`` sets what the calls use; else each call evaluates everything.
 
     Attributes:

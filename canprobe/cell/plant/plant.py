@@ -55,8 +55,8 @@ class Plant:
     """Arm, probe, object and array.
 
     Args:
-        config: what the plant is made of.
-        waits: its time stands at 0 until `begin`; False: it is the time of the calls.
+        config: configuration of the plant.
+        waits: the plant's time stands at 0 until `begin`; False: it is the time of the calls.
 
     Attributes:
         motor_counts, torque_permille: position (counts, continuous) and torque (see ``IdealArm.torque_permille``) of a
@@ -348,7 +348,7 @@ class Plant:
         return given
 
     def _squeezed(self, shape: PlacedShape, probe: ProbeState, depth: float, rate: float) -> Indentation:
-        """The force of all that is pressed in, whatever its shape; it has no patch of its own."""
+        """The contact with the force of the whole volume that is pressed in; it has no patch."""
         if depth <= 0.0:
             return NO_CONTACT
         config = self.config
@@ -357,7 +357,7 @@ class Plant:
         return NO_CONTACT._replace(force=force, damping_factor=factor)
 
     def _resting(self, touches: TouchedPlaces, probe: ProbeState) -> Indentation:
-        """Several places at once, as one contact with the resultant force; it has no patch of its own."""
+        """Several places at once as one contact with the resultant force; it has no patch."""
         config = self.config
         rates = -(touches.normals @ np.array(probe.velocity))
         force = total_force(touches, config.radius_m, config.stiffness_n_m3, rates, config.damping_s_m)
@@ -389,7 +389,7 @@ class _Solution:
 
 
 def _true(s: _Solution) -> dict[str, float | tuple[float, ...]]:
-    """What `Plant.truth` says, in plain numbers."""
+    """The values of `Plant.truth` in plain numbers."""
     return {
         "q": s.q,
         "probe_centre": s.probe.centre,

@@ -176,7 +176,7 @@ class PressureField:
 
 
 class ListField:
-    """As `PressureField`, of taxels at given places: each is a square of its own, without blur.
+    """A `PressureField` of taxels at given places: each is a separate square, without blur.
 
     Args:
         radius_m: probe radius.

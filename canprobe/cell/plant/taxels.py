@@ -66,12 +66,12 @@ class TaxelConfig:
 
     @property
     def adc_max(self) -> int:
-        """What the ADC says at full scale."""
+        """Reading of the ADC at full scale."""
         return (1 << self.adc_bits) - 1
 
     @property
     def adc_threshold(self) -> int:
-        """Least that the ADC says above the threshold."""
+        """Least reading of the ADC above the threshold."""
         return int(np.ceil(self.threshold * self.adc_max))
 
     def without(self, *effects: str) -> TaxelConfig:

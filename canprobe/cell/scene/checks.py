@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 
 class MismatchError(ValueError):
-    """A value that is not what its annotation says; the text is what was expected."""
+    """A value that does not match its annotation; the text is what was expected."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -416,7 +416,7 @@ def _too_deep(where: str) -> SceneError:
 
 
 def _scene(own: Mapping[str, Any], file: str, folder: Path | None) -> Scene:
-    """The scene in a document, with what its cell says and the sections that its task has by default.
+    """The scene in a document, with the keys of its cell and the sections that its task has by default.
 
     Everything is checked together.
     """

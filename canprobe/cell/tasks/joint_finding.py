@@ -16,7 +16,7 @@ TRAVEL_TOLERANCE_SHARE, TRAVEL_TOLERANCE_RESTS = 0.05, 0.5
 
 
 class Answer(Enum):
-    """What an operator says."""
+    """The answer of an operator."""
 
     YES = "yes"
     NO = "no"
@@ -24,7 +24,7 @@ class Answer(Enum):
 
 
 class Operator(Protocol):
-    """Somebody who looks at the arm. The cell goes on meanwhile: `answer` never waits."""
+    """A person who watches the arm. The cell goes on meanwhile: `answer` never waits."""
 
     def ask(self, question: str) -> None:
         """Put a question."""

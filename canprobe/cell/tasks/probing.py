@@ -148,7 +148,7 @@ class ProbingTask(Task):
     def _felt_columns(
         self, sample: TactileSample, patch: Patch, contact: ContactSample | None
     ) -> dict[str, float | Floats]:
-        """What an image says, for the log."""
+        """Columns of the log with the data of an image."""
         return {
             "phase": float(self.phase),
             "sample_cycle": float(sample.cycle),

@@ -1,4 +1,4 @@
-"""What a task leaves for the summary, besides what it did as a controller."""
+"""Data that a task leaves for the summary."""
 
 from __future__ import annotations
 
