@@ -52,7 +52,7 @@ _MAX_AGE_US = 0xFFFF
 
 
 class TactilePlant(Protocol):
-    """What the sensor needs of the plant."""
+    """The functions of the plant that the sensor needs."""
 
     def begin(self, t_ns: int) -> None:
         """Time goes on from `t_ns`, unless it does already: the array is triggered."""

@@ -31,7 +31,7 @@ class RawArray(Participant):
         seed: seed of its unloaded values.
 
     Attributes:
-        running: it was started; a device without a start frame always runs.
+        running: whether it was started; a device without a start frame always runs.
     """
 
     def __init__(self, array: Array, plant: TactilePlant, *, sync_ratio: int, seed: int) -> None:

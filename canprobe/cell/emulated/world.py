@@ -120,9 +120,9 @@ def make_world(
 
     Args:
         plan: plan of the scene.
-        node_ids: which of its nodes to emulate.
+        node_ids: ids of the nodes to emulate.
         truth: whether the truth is recorded.
-        without_id: which of them start without a node id and wait for LSS to give them one.
+        without_id: ids of the nodes that start without a node id and wait for LSS to give them one.
         homed: drives that have to be homed start with their zeros, and keep them.
     """
     plant = Plant(_plant_config(plan.setup), waits=True)
@@ -207,7 +207,7 @@ def _plant_config(setup: Setup) -> PlantConfig:
 
 
 def _base_offset(believed: Chain, real: Chain, q: Floats, T_flange_probe: Floats) -> Floats:
-    """Where the real arm's base stands in the controller's base frame, (3,), m.
+    """Position of the real arm's base in the controller's base frame, (3,), m.
 
     An experimenter moves the arm to the object and takes that place for what the encoders show: both arms hold the
     probe at one place in the first posture.
@@ -217,7 +217,7 @@ def _base_offset(believed: Chain, real: Chain, q: Floats, T_flange_probe: Floats
 
 
 def _tared_s(setup: Setup) -> float:
-    """How long an array that takes its tare at the beginning takes for it, with some to spare, s; 0 for others."""
+    """Time of the tare at the beginning of an array that takes one, with a reserve, s; 0 for others."""
     raw = setup.array.raw if setup.array is not None else None
     if raw is None or not raw.tare_images:
         return 0.0

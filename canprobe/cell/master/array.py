@@ -67,7 +67,7 @@ class ArrayReceiver(ABC):
             cycle: the present cycle; its SYNC has not been answered by this image.
             sync_counter: counter of the present cycle's SYNC; 0 where it has none.
             sync_times: times of the last SYNCs (ns), the present one last.
-            sync_stamps: when they went out, on the clock of the frames.
+            sync_stamps: times at which they were sent, on the clock of the frames.
         """
 
     def requests(self, cycle: int) -> tuple[Frame, ...]:
@@ -188,7 +188,7 @@ class RawReceiver(ArrayReceiver):
         ratio: cycles between two images of a polled device.
 
     Attributes:
-        wire: how the images of the array lie in its frames.
+        wire: description of the raw frames of the array.
         rate_hz: rate of its images.
     """
 

@@ -56,15 +56,15 @@ RELEASE_S = 0.1
 
 @dataclass(slots=True)
 class NodeReport:
-    """How far a node came in bring-up.
+    """The result of bring-up for a node.
 
     Attributes:
         setup: configuration of the node.
         software: its version by 100Ah; None where the node does not report it.
         kept: its configuration was there already, by 1020h.
         repeated: requests that were sent again.
-        remarks: how the device differs from its EDS or from what was wished, and was taken all the same.
-        failure: what went wrong; None where nothing did.
+        remarks: accepted differences of the device from its EDS or from the wished configuration.
+        failure: error of this node; None without one.
     """
 
     setup: NodeSetup
@@ -139,7 +139,7 @@ class BringUp:
         Nothing is sent.
 
         Raises:
-            BusError: there is one.
+            BusError: another master uses this bus.
         """
         if not self._listened:
             self._say("listen for another master")
@@ -453,7 +453,7 @@ class BringUp:
             self._history[setup.node_id] = words
 
     def _error(self, reason: str, *setups: NodeSetup) -> NodeError:
-        """What these nodes failed in, with the last EMCY of each of them."""
+        """The error of these nodes, with the last EMCY of each of them."""
         ids = [setup.node_id for setup in setups]
         return NodeError(ids[0], reason + "".join([self._watch.last_words(i) or self._history.get(i, "") for i in ids]))
 
@@ -466,7 +466,7 @@ def read_entry(setup: NodeSetup, index: int, subindex: int) -> Generator[bytes |
     """Read an integer of a node.
 
     Raises:
-        NodeError: it has no such entry, refuses, or does not answer.
+        NodeError: the node has no such entry, refuses, or does not answer.
     """
     variable = _variable(setup, index, subindex)
     try:
@@ -480,7 +480,7 @@ def write_entry(setup: NodeSetup, write: Write) -> Dialogue:
 
     Raises:
         RefusedError: the device refuses it, or holds another one.
-        NodeError: there is no answer.
+        NodeError: the device does not answer.
     """
     variable = _variable(setup, write.index, write.subindex)
     value = write.value

@@ -1,4 +1,4 @@
-"""What a controller gets and returns in one cycle."""
+"""The input and the output of a controller in a cycle: `Measurement` and `Command`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class TactileSample:
 
     Attributes:
         frame: the frame, complete and with the right CRC.
-        t_sample_ns: when the array was sampled, in the time of the cycle.
+        t_sample_ns: instant at which the array was sampled, in the time of the cycle.
         cycle: the cycle whose SYNC triggered it, or the last one before it was sampled.
         t_sigma_s: standard deviation of that instant, s; 0 where a SYNC triggers the sample.
     """
@@ -64,7 +64,7 @@ class Measurement:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """What a controller returns for one cycle.
+    """The command of a controller for one cycle.
 
     Attributes:
         q_target: joint positions to reach two cycles later (n,), rad or m; None leaves the drives where they are.
@@ -153,7 +153,7 @@ class Controller:
         Called once, and only where `lets_go` is True and the condition leaves time for it.
 
         Args:
-            reason: what becomes `Command.stop_reason`.
+            reason: reason for `Command.stop_reason`.
         """
 
     @property

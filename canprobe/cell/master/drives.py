@@ -82,7 +82,7 @@ class FeedbackFrame:
         """Its values; what is beyond the mapping is not read.
 
         Raises:
-            ProtocolError: it is too short.
+            ProtocolError: the frame is too short.
         """
         layout = self.layout
         if len(data) == layout.length:
@@ -113,7 +113,7 @@ class CommandFrame:
 
     Attributes:
         cob_id: COB-ID of the frame.
-        every_cycle: it goes in every cycle; False: on change.
+        every_cycle: the frame is sent in every cycle; False: on change.
         parts: part of each drive: axis, layout, and the kinds of its values: `CONTROLWORD`, `TARGET`, `CONSTANT`.
     """
 
@@ -206,7 +206,7 @@ class DriveGroup:
         self._sync_ns = self._sync_before_ns = 0
 
     def _places_of(self, axis: int, layout: PdoLayout, picks: tuple[int, ...]) -> list[int]:
-        """Where each value of a part stands in controlwords, targets and constants, one after another."""
+        """Places of the values of a part in the list of controlwords, targets and constants."""
         places, n = [], len(self.axes)
         for entry, pick in zip(layout.signals, picks, strict=True):
             if pick == CONSTANT:

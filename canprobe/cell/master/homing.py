@@ -159,7 +159,7 @@ class Homing:
     # which drives have their zeros
 
     def look(self) -> None:
-        """Ask the drives whether they are as the record has them."""
+        """Compare the drives with the record; a zero is known where all agrees."""
         for axis in self._recorded:
             now, before = self._evidence(axis), self._record.entry(self._drives[axis].node_id)
             there, then = now.pop("position"), before.get("position")
@@ -168,7 +168,7 @@ class Homing:
                 self.known.add(axis)
 
     def refuse_unhomed(self) -> None:
-        """Return where all zeros are known.
+        """Refuse to go on where a zero is not known.
 
         Raises:
             NodeError: a drive has to be homed; with the command to type.
@@ -184,7 +184,7 @@ class Homing:
             )
 
     def keep(self) -> None:
-        """Write down where the drives are left, as far as their zeros are known.
+        """Record the positions in which the drives are left, as far as their zeros are known.
 
         Raises:
             CanprobeError: a drive does not answer; the others are written down all the same.
@@ -200,7 +200,7 @@ class Homing:
             raise failures[0]
 
     def _evidence(self, axis: int) -> dict[str, Any]:
-        """What a drive answers now, and the settings by which its zero would be right, as JSON gives it back."""
+        """The answers of a drive now, and the settings with which its zero is valid, as JSON gives them back."""
         setup, drive, model = self._setups[axis], self._drives[axis], self._model
         assert drive.zero is not None
         there = [sub for sub in range(1, 5) if Description(setup.dictionary).entry(IDENTITY, sub) is not None]
@@ -213,13 +213,13 @@ class Homing:
         }
 
     def _tolerance(self, axis: int) -> float:
-        """Drive units."""
+        """Tolerance of the position of a joint, drive units."""
         return abs(float(self._model.units_per_q[axis, axis] * self._model.radian[axis])) * TOLERANCE_RAD
 
     # homing
 
     def question(self, axis: int) -> str:
-        """What is about to happen to a joint."""
+        """The question to an operator before a joint is homed: method, direction and speeds."""
         joint, zero, setup = self._model.joints[axis], self._zero(axis), self._setups[axis]
         up = 1 if self._model.units_per_q[axis, axis] > 0.0 else -1
         speeds = f"{joint.shown(zero.speed):g} and {joint.shown(zero.zero_speed):g} {joint.unit}/s"
@@ -236,7 +236,7 @@ class Homing:
         """Home one joint.
 
         Returns:
-            Where it is, for people.
+            A line for the operator: where the joint stands.
 
         Raises:
             NodeError: the drive reports an error, is lost, or does not find its home position in time.
@@ -273,7 +273,7 @@ class Homing:
         return f"{setup.name} ({joint.name}) is homed: home is at {joint.text(zero.home, '.2f')}; {stands}"
 
     def keep_alive(self) -> None:
-        """Let a little time pass, with heartbeats, as while an operator thinks.
+        """Let a little time pass with heartbeats, such as while an operator thinks.
 
         Raises:
             CanprobeError: a node was lost or reports an error, or the bus fails.
@@ -308,7 +308,7 @@ class Homing:
         self._await_bits(setup, (HOMING_ATTAINED, TARGET_REACHED), zero.timeout_s, what, late, error=HOMING_ERROR)
 
     def _move(self, setup: NodeSetup, zero: HomingParameters, target: int, speed: int) -> None:
-        """Profile position."""
+        """Move a drive to a target in profile position."""
         self._write(setup, Write(PROFILE_SPEED, 0, speed, "profile velocity"))
         self._enable(setup, OperationMode.PROFILE_POSITION)
         self._write(setup, Write(TARGET, 0, target, "target position"))
@@ -337,7 +337,7 @@ class Homing:
         *,
         error: int | None = None,
     ) -> None:
-        """Until the statusword has these bits; the time limit, the error bit and a drive that is off are errors."""
+        """Wait until the statusword has these bits; a time-out, the error bit or a drive that is off is an error."""
         wanted = sum(1 << bit for bit in bits)
 
         def reached() -> bool:
@@ -364,7 +364,7 @@ class Homing:
             raise failure
 
     def _stop(self, setup: NodeSetup) -> CanprobeError | None:
-        """Stop, disable, and leave homing; an interrupt repeats it once. What went wrong is returned."""
+        """Stop, disable, and leave homing; an interrupt repeats it once. A failure is returned."""
         for _ in range(2):
             try:
                 stop_s = self._times.stop_s
@@ -435,7 +435,7 @@ class Homing:
         self._talk(setup, write_entry(setup, write))
 
     def _talk(self, setup: NodeSetup, dialogue: Dialogue) -> Any:
-        """Hold a dialogue with heartbeats meanwhile; what it returns."""
+        """Hold a dialogue, with heartbeats meanwhile, and return its result."""
         results: list[Any] = []
 
         def held() -> Dialogue:

@@ -1,4 +1,4 @@
-"""Which device gets which node id."""
+"""Assignment of node ids to devices by their identities."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from canprobe.fieldbus.protocol.lss import LssAddress
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """A node id and the device that is to have it; a number of 1018h that is None may be any.
+    """A node id and the identity of the device that is to have it; a number that is None matches any.
 
     Attributes:
         node_id: 1–127.
@@ -45,7 +45,7 @@ def choose_assignments(
     channel: str,
     must: bool = True,
 ) -> list[Assignment]:
-    """Which device gets which id.
+    """Choose the device of each node id.
 
     Args:
         wanted: the ids to give.

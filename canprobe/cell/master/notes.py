@@ -40,7 +40,7 @@ class Notes:
         self._kinds: dict[str, _NoteKind] = {}
 
     def __len__(self) -> int:
-        """How many kinds there are."""
+        """Number of kinds."""
         return len(self._kinds)
 
     def add(self, what: str, *, node_id: int | None = None, t_s: float | None = None) -> None:

@@ -34,13 +34,13 @@ class PositionTrack:
     make up a motion that grows from nothing.
 
     Args:
-        base: what a report may be off by, whatever the motion, counts: see `rest_counts`.
+        base: largest error of a report, whatever the motion, counts: see `rest_counts`.
         period_ns: period of the cycle. A late cycle lasts many periods: all bounds are times.
 
     Attributes:
         counts: the last position that was believed.
         cycle: cycle of that position; −1 before the first.
-        rested_ns: how long the reports have stayed within ``base`` of the first of them.
+        rested_ns: time in which the reports have stayed within ``base`` of the first of them.
     """
 
     __slots__ = (
@@ -88,7 +88,7 @@ class PositionTrack:
         Args:
             counts: the position.
             cycle: cycle of the SYNC at which it was sampled.
-            t_ns: that SYNC's deadline.
+            t_ns: deadline of that SYNC.
             guarded: the drive is enabled, so that it can only be where it can have gone.
 
         Returns:
@@ -113,13 +113,13 @@ class PositionTrack:
         return True
 
     def position(self, cycle: int, t_ns: int) -> float:
-        """Where the motor is at a SYNC: as reported, or carried on by its rate for a bounded time."""
+        """Position of the motor at a SYNC: as reported, or carried on by its rate for a bounded time."""
         if cycle <= self.cycle or self.cycle < 0:
             return float(self.counts)
         return self.counts + self._carried(t_ns - self._t_ns)
 
     def _followed(self, periods: float) -> float:
-        """How far a drive can have followed its last targets after so many periods, counts."""
+        """Largest motion of a drive towards its last targets after so many periods, counts."""
         return min(periods, FOLLOWED_CYCLES) * self._asked
 
     def _carried(self, passed_ns: int) -> float:

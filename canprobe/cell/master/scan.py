@@ -54,7 +54,7 @@ class _Sighting:
 
     @property
     def devices(self) -> int:
-        """How many devices answer one request: more than one have this node id; 0: none answers at all."""
+        """Number of devices that answer a request; more than one share this node id, 0: no answer."""
         return max(map(len, self.answers.values()), default=0)
 
     @property

@@ -87,15 +87,15 @@ class Seen:
     Attributes:
         limits: limits of the plan.
         watch: heartbeats and emergencies.
-        drives, tactile: the arm and the sensor, None where there is none.
+        drives, tactile: the drives of the arm and the receiver of the array; None without an arm or an array.
         counters: counters of the port.
         controller_state: state of the CAN controller.
         measurement: measurement of this cycle.
-        sync_ns: when its SYNC went out, on the port's clock.
+        sync_ns: time at which its SYNC was sent, on the port's clock.
         gap_ns: time from the SYNC before to this one; 0 for the first.
         overruns: cycles late so far.
         late_share: share of the last second's cycles that were late.
-        passive_ns: how long the controller has been error-passive.
+        passive_ns: time for which the CAN controller has been error-passive.
         speeding: a measured motion that no joint can make; None without one.
         slowed: targets so far that were too far away for one cycle.
         restarts: how often a diverging estimator has started again so far.
@@ -131,12 +131,12 @@ class TouchState:
         force: force that was measured last, N.
         tactile_age: cycles since the trigger of the newest sample, or since the first SYNC where none has come; None
             without a sensor.
-        lost_s: how long the force has been below that of a contact, where there must be one.
-        hidden_s: how long the array has been saturated without other knowledge of the force.
-        off_pad_s: how long a good part of the contact has been beyond the array's edge.
+        lost_s: time for which the force has been below that of a contact, in a phase with contact.
+        hidden_s: time for which the array has been saturated and the force is not known otherwise.
+        off_pad_s: time for which a good part of the contact has been beyond the array's edge.
         path: the touch is a scan, which may search for a contact that it has lost.
         searched: distance towards the object that was searched since then, m.
-        limit: what a joint or the workspace forbids; None where nothing does.
+        limit: message of a joint or workspace limit that is reached; None without one.
     """
 
     limits: Limits
@@ -156,7 +156,7 @@ class TouchState:
 
         Args:
             patch: patch that the sample shows.
-            t_ns: when it was taken.
+            t_ns: time of the sample.
             known: the force is known where the array is saturated, too.
         """
         self.force = patch.force
@@ -179,7 +179,7 @@ def _passed_s(since_ns: int | None, t_ns: int) -> float:
 
 
 class Reaction(Enum):
-    """What the cell does about a condition, the mildest first."""
+    """The reaction of the cell to a condition, the mildest first."""
 
     DEGRADE = "degrade"
     HOLD = "hold"
@@ -195,8 +195,8 @@ class Condition:
 
     Attributes:
         key: its name in code, tests and studies.
-        what: what is wrong, in words for users.
-        reaction: what the cell does.
+        what: the condition in words for users.
+        reaction: reaction of the cell.
         within: longest time from the fault to the reaction, ns; None where no such time applies.
         check: function of a `Seen` in every cycle, or of a `TouchState` in a touch; it returns the error that names
             what is wrong, or None. A condition without check and count shows by itself: an exception, a dead master.

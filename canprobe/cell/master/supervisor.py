@@ -40,7 +40,7 @@ class GuardedTarget:
 
 
 def outside_workspace(tip: Floats, workspace: Floats) -> str | None:
-    """What is wrong with the tip's position (3,), m, in a box (2, 3), m; None where it is inside."""
+    """A message that the tip, at a position (3,), m, is outside of a box (2, 3), m; None where it is inside."""
     below, above = tip < workspace[0], tip > workspace[1]
     if not (below | above).any():
         return None
@@ -86,7 +86,7 @@ class JointGuard:
         return forward(self._model.chain, q) @ self._T_flange_tip
 
     def outside(self, q: Floats) -> str | None:
-        """How the probe's tip leaves the workspace at joint positions (n,), rad or m; None where it does not."""
+        """A message that the probe's tip is outside of the workspace at joint positions (n,), rad or m; None inside."""
         return None if self._workspace is None else outside_workspace(self.T_base_tip(q)[:3, 3], self._workspace)
 
     def measure(self, measurement: Measurement) -> str | None:
@@ -197,8 +197,8 @@ class Supervisor:
         patch_from: the patch of a tactile sample, for controllers that do not guard their contact; None without touch.
 
     Attributes:
-        counts: how often each condition that the cell lives with has happened.
-        first: cycle in which each condition was seen first.
+        counts: how often each condition that does not stop the cell has happened.
+        first: first cycle of each condition.
     """
 
     def __init__(

@@ -36,7 +36,7 @@ def make_equations(config: PlantConfig, effects: Effects | None = None, *, held:
 
     Args:
         config: configuration of a plant with an arm and the bodies of its links.
-        effects: what acts; everything by default.
+        effects: effects that act; all by default.
         held: see ``ArmEquations``.
 
     Raises:

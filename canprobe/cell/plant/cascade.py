@@ -95,7 +95,7 @@ class DriveLoops:
         self.ahead = self._share * self.slope + self._speed_fed
 
     def drives(self, t: float, y: Floats) -> Drives:
-        """What the cascades do.
+        """Velocity errors and torques of the cascades.
 
         Args:
             t: s.
@@ -112,7 +112,7 @@ class DriveLoops:
 
         Args:
             v: (n,) rates of the motors, rad/s.
-            drives: what the cascades do.
+            drives: result of `drives`.
         """
         free = drives.asked == drives.given
         bent = np.tanh(v / STICTION_RATE)

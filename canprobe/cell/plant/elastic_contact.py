@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 
 class Indentation(NamedTuple):
-    """What one indentation gives.
+    """The contact of an indentation.
 
     Attributes:
         force: N, never negative (never adhesive).

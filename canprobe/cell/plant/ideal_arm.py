@@ -119,7 +119,7 @@ class IdealArm:
         self.model = model
         self.w, self.z = natural_frequency(bandwidth_hz, damping_ratio), damping_ratio
         self.lag_s = 2.0 * damping_ratio / self.w
-        """How far the motors stay behind a steady ramp, s."""
+        """Lag of the motors behind a steady ramp, s."""
         self._stiffness, self._damping = self.w * self.w, 2 * damping_ratio * self.w
         self.t_ns = 0
         self._axes = [_Axis(c, self.lag_s) for c in joints_to_units(model, q0).tolist()]

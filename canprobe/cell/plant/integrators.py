@@ -44,7 +44,7 @@ class Linearised(NamedTuple):
 
 
 class Problem(Protocol):
-    """What a step asks of the equations. States begin with n positions, then their n rates, then anything."""
+    """The equations that a step needs. States begin with n positions, then their n rates, then anything."""
 
     @property
     def positions(self) -> int:
@@ -123,7 +123,7 @@ def adaptive(problem: Problem, t: float, y: Floats, h: float, *, rtol: float = 1
     """``rosenbrock2`` in parts whose estimated error stays within ``atol + rtol |y|``, component by component.
 
     Raises:
-        ArithmeticError: when it would take more than 4096 parts.
+        ArithmeticError: the step needs more than 4096 parts.
     """
     done, part = 0.0, h
     for _ in range(_MAX_PARTS):

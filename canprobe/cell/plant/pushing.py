@@ -22,7 +22,7 @@ SLIP_M_S = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class Rubbing:
-    """What acts besides the layer's elasticity.
+    """Damping and friction of the contact.
 
     Args:
         damping_s_m: Hunt-Crossley alpha.
@@ -98,7 +98,7 @@ class HeldContact:
 
 
 class Neighbourhood:
-    """What ``ArmEquations`` asks for the contact.
+    """Makes the contact near a posture, for ``ArmEquations``.
 
     Args:
         chain: the arm.

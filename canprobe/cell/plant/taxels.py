@@ -255,7 +255,7 @@ def _leaks(taxels: int, crosstalk: float) -> Floats:
 
 
 def _readings(config: TaxelConfig) -> npt.NDArray[Any]:
-    """What is read at each count of the ADC, in counts of 255 at full scale; 0 below the threshold."""
+    """Reading at each count of the ADC, in counts of 255 at full scale; 0 below the threshold."""
     counts = np.arange(config.adc_max + 1)
     counts[counts < config.adc_threshold] = 0
     return counts.astype(np.uint8) if config.adc_max == COUNTS_MAX else counts * float(COUNTS_MAX) / config.adc_max

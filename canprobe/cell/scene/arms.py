@@ -202,7 +202,7 @@ def per_joint(sections: Mapping[str, JointSettings], key: Literal["start", "swin
 
 
 def homing_of(section: JointSettings, number: int) -> HomingParameters | None:
-    """How the drive of a joint, by its number from 1, is homed; None where its encoder is absolute."""
+    """Parameters of homing of a joint, by its number from 1; None where its encoder is absolute."""
     if section.zero == "absolute":
         return None
     slides = section.kind == "prismatic"

@@ -138,7 +138,7 @@ def _members(annotation: Any) -> list[Any]:
 
 
 def expected(annotation: Any) -> str:
-    """What an annotation asks for, in words."""
+    """The expected value of an annotation, in words."""
     origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is typing.Annotated:
         return " ".join([expected(parts[0]), *(check.text for check in conditions_of(annotation, Check))])

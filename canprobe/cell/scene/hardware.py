@@ -244,7 +244,7 @@ class JointSettings:
     """Stiffness of the emulated joint between its motor, which the encoder is on, and its link. Left out: rigid. Of an
     ideal arm, that of its own cell."""
     stiffness_n_m: Annotated[float | None, Range(1, 1e12), PRISMATIC_ONLY] = None
-    """The same of a prismatic joint."""
+    """Stiffness of a prismatic joint between its motor and its link."""
     mass_kg: Annotated[float | None, Range(0, 1e5)] = None
     """Mass of the link behind the joint. Without the masses of all links an arm of rows cannot be `dynamic`."""
     com_mm: Vec3 = (0.0, 0.0, 0.0)

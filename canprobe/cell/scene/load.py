@@ -319,7 +319,7 @@ def find_file(name: str, packaged: Mapping[str, Path], what: str) -> Path:
 
 
 def scenes_folder() -> Path:
-    """Where the packaged scenes are, for a copy to change."""
+    """The folder of the packaged scenes, from which a copy can be made."""
     return Path(str(resources.files("canprobe"))) / "scenes"
 
 
@@ -353,8 +353,8 @@ def parse_scene(text: str, *, file: str = "scene", folder: Path | None = None) -
 
     Args:
         text: the TOML document.
-        file: what messages call it.
-        folder: where files that the scene names are looked up first.
+        file: name of the document in messages.
+        folder: folder in which files that the scene names are looked up first.
 
     Raises:
         SceneError: the text has problems; the error has all of them.
@@ -366,7 +366,7 @@ def read_toml(path: Path, file: str, else_what: str = "") -> dict[str, Any]:
     """The document of a TOML file, whose messages call it `file`; `else_what` ends that of a file that is missing.
 
     Raises:
-        SceneError: it cannot be read, or is not TOML.
+        SceneError: the file cannot be read, or is not TOML.
     """
     try:
         text = regular_file(path, MAX_BYTES).read_text(

@@ -162,7 +162,7 @@ class WireSettings:
     axes: Annotated[int, Range(1, 3), RAW_ONLY] = 1
     """Values of a taxel."""
     normal_axis: Annotated[int, Range(1, 3), RAW_ONLY] = 1
-    """Which of them is the normal pressure, from 1."""
+    """Number of the value that is the normal pressure, from 1."""
     order: Annotated[Literal["rows", "columns"], RAW_ONLY] = "rows"
     """Taxels come row by row, or column by column."""
     unloaded_counts: Annotated[int, Range(0, 0xFFFFFFFF), RAW_ONLY] = 0
@@ -180,7 +180,7 @@ class WireSettings:
     poll: Annotated[tuple[Annotated[str, COMMAND_PATTERN], ...], RAW_ONLY] = ()
     """Frames that ask a polled device for one image."""
     latency_ms: Annotated[float, Range(0, 1000), RAW_ONLY] = 0.0
-    """From the sample of an image to its first frame on the bus."""
+    """Time from the sample of an image to its first frame on the bus."""
     latency_sigma_ms: Annotated[float, Range(0, 1000), RAW_ONLY] = 0.0
     """Standard deviation of `latency_ms`."""
 

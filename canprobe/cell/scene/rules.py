@@ -1,4 +1,4 @@
-"""Which parts of a scene go together: sections and kinds of task, rules across keys, and what a plan chose."""
+"""Rules of what goes together in a scene: sections and kinds of task, keys across sections, choices of a plan."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ from canprobe.mechanics.types import Floats
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """What every node of a cell has.
+    """Data that every node of a cell has.
 
     Attributes:
         node_id: node id, 1–126, different on all buses together.
@@ -57,7 +57,7 @@ class Node:
 
 @dataclass(frozen=True, slots=True)
 class HomingParameters:
-    """How a drive that does not know its zero after power on finds it. Units are rad or m, and s.
+    """Parameters of homing, for a drive that does not know its zero after power on. Units are rad or m, and s.
 
     Attributes:
         method: homing method of CiA 402, 6098h.
@@ -132,13 +132,13 @@ class RawWire:
     Attributes:
         image: layout of its images in frames.
         normal: number of the taxel's value that is the normal pressure, from 0.
-        unloaded, full_scale: that value without load, and at the pad's full scale; it may fall with pressure.
+        unloaded, full_scale: value without load, and at the pad's full scale; it may fall with pressure.
         tare_images: number of images at the beginning whose mean is the unloaded value of each taxel; 0: `unloaded` is.
-        sampling: what an image begins with.
+        sampling: event that an image begins with.
         start, stop: frames that start and stop the device.
         poll: frames that ask for one image.
         latency_s, latency_sigma_s: time from the sample to the first frame, as stated, and its standard deviation.
-        found_s, found_sigma_s: what a calibration has found beyond that, and its standard deviation.
+        found_s, found_sigma_s: latency that a calibration found beyond that, and its standard deviation.
     """
 
     image: ImageFormat

@@ -36,7 +36,7 @@ class CalibrateTask(ProbingTask):
 
     Args:
         plan: plan of the cell.
-        task: what to do.
+        task: settings of the calibration.
         sensing: contacts from measurements.
 
     Attributes:

@@ -51,7 +51,7 @@ class ListenTask(Task):
 
     Args:
         calibration: calibration of the array.
-        duration_s: how long.
+        duration_s: duration of the task.
         period_s: period of the cycle.
     """
 
@@ -63,7 +63,7 @@ class ListenTask(Task):
         self._columns: dict[str, float | Floats] = {}
 
     def record(self) -> TaskRecord:
-        """What it knows so far."""
+        """The results so far."""
         return TaskRecord(taxels=self.taxels)
 
     def step(self, measurement: Measurement) -> Command:

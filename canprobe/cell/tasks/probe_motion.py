@@ -35,7 +35,7 @@ class ProbeMotion:
         q: joint positions to start from (n,), rad or m; more than six joints stay near them.
 
     Attributes:
-        limit: what a joint or the workspace forbids; None where nothing does.
+        limit: message of a joint or workspace limit that is reached; None without one.
         slowed: cycles in which a joint could not keep up.
     """
 

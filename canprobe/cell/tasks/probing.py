@@ -1,4 +1,4 @@
-"""What every task that touches with the probe has: phases, and the order of a cycle."""
+"""Base of the tasks that touch with the probe: their phases, and the order of a cycle."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class ProbingTask(Task):
         }
 
     def record(self) -> TaskRecord:
-        """What it knows so far."""
+        """The results so far."""
         slowed = self._motion.slowed if self._motion is not None else 0
         return TaskRecord(taxels=self.taxels, unplaced=self.sensing.dropped, slowed=slowed)
 

@@ -47,7 +47,7 @@ def summarise_losses(losses: Sequence[Loss]) -> list[dict[str, float | None]]:
 
 
 def losses_text(losses: Sequence[Mapping[str, float | None]]) -> str:
-    """How often contact was lost in the scan, and what was done about it, in words."""
+    """The losses of contact in a scan in words: how many, and whether each was regained."""
     told = ", ".join(
         f"not regained within {loss['searched_mm']:.1f} mm"
         if loss["regained_after_ms"] is None

@@ -41,7 +41,7 @@ _VALUES: dict[str, Callable[[object], bool]] = {
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What another tool asks of a running task; it cannot be made of anything else.
+    """A request of another tool to a running task; other kinds and values are refused.
 
     Args:
         kind: start, stop, target_force_n, speed_m_s or trajectory.
@@ -74,7 +74,7 @@ class RequestedTask(Controller):
     Args:
         task: the task; None holds still until a `start`.
         make: makes a new task at every `start`; None where the task runs once, from the beginning.
-        requests: where requests arrive.
+        requests: queues in which requests arrive.
         period_s: period of the cycle.
         plan: plan of a cell whose arm follows trajectories on request; None: none is requested.
     """
@@ -166,7 +166,7 @@ class RequestedTask(Controller):
         self._task, self._stopping = trajectory, False
 
     def _motion(self) -> tuple[Floats, Floats]:
-        """Where the last two targets lead in this cycle: position and speed (n,)."""
+        """Position and speed (n,) in this cycle, as the last two targets lead on."""
         before, last = self._targets
         qd = (last - before) / self._step_s
         return last + qd * self._period_s, qd

@@ -90,11 +90,11 @@ class RollTask(ProbingTask):
 
     Args:
         plan: plan of the cell.
-        task: where the object is touched first.
+        task: settings with the place that is touched first.
         sensing: contacts from measurements; its force is not trusted, only held.
         presses: the touches.
         radius: radius of the ball, m; infinite for a plane, and for a rod that is rolled along its axis.
-        rest_s: how long the array is listened to before the first touch.
+        rest_s: time for which images without load are kept before the first touch.
 
     Attributes:
         presses: the touches, as given.

@@ -91,7 +91,7 @@ class ContactSensing:
         stiffness: K/h of the layer, N/m³.
         moment_image: gives the contacts the second moments of their images; None leaves them out.
         noise: noise of the centroids; None: the contacts do not state any.
-        lag: how far the array's centroids trail the contact; None: they do not.
+        lag: lag of the array's centroids behind the contact; None: no lag.
     """
 
     def __init__(

@@ -53,7 +53,7 @@ class Loss:
 
     Attributes:
         cycle: cycle in which it was noticed.
-        searched: how far the probe went towards the object, m.
+        searched: distance that the probe went towards the object, m.
         regained_s: time from there to the new touch; None without one.
     """
 
@@ -64,7 +64,7 @@ class Loss:
 
 @dataclass(frozen=True, slots=True)
 class TaskRecord:
-    """What a task knows at its end; a user's own controller leaves an empty one.
+    """The results of a task at its end; a user's own controller leaves an empty record.
 
     Attributes:
         shape: the estimator's contacts and answers; None where no shape was asked for.
@@ -89,10 +89,10 @@ class Task(Controller):
     """A controller that carries out the task of a scene."""
 
     def record(self) -> TaskRecord:
-        """What it knows so far."""
+        """The results so far."""
         return TaskRecord()
 
 
 def record_of(controller: Controller | None) -> TaskRecord:
-    """What a controller left, whoever wrote it."""
+    """The record of any controller, packaged or the user's."""
     return controller.record() if isinstance(controller, Task) else TaskRecord()

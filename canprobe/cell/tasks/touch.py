@@ -51,7 +51,7 @@ class TouchTask(ProbingTask):
 
     Args:
         plan: plan of the cell.
-        task: what to do.
+        task: settings of the touch.
         sensing: contacts from measurements.
         shape: the estimator in the loop; None where no shape is asked for.
     """
@@ -86,7 +86,7 @@ class TouchTask(ProbingTask):
         return self.shape.restarts if self.shape is not None else 0
 
     def record(self) -> TaskRecord:
-        """What it knows so far."""
+        """The results so far."""
         return replace(super().record(), shape=self.shape, losses=self.losses, scan_cycles=self.scan_cycles)
 
     @property

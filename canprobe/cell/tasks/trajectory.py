@@ -18,7 +18,7 @@ from canprobe.mechanics.touch.linear_algebra import checked, instance, real_numb
 from canprobe.mechanics.types import Floats
 
 FIRST_POINT_TOLERANCE_RAD = 0.01
-"""How far a first point at time 0 may be from where the arm stands; of a joint that slides its `ArmModel.radian`."""
+"""Largest distance of a first point at time 0 from the arm's position, rad; of a sliding joint by `ArmModel.radian`."""
 BRAKE_S = 0.5
 """Time in which an arm comes to rest after a stop."""
 CHECKS_PER_SEGMENT = 33
@@ -40,7 +40,7 @@ class Trajectory(Controller):
         points: (time from the start, s; joint positions (n,), rad or m), in the order of time. A first one at time 0
             must be where the arm stands, within 0.01 rad (3.5 mm).
         velocities: (n,) of each point, rad/s or m/s; by default they follow from the points.
-        hold_s: how long the last point is held before the controller is done.
+        hold_s: time for which the last point is held before the controller is done.
 
     Raises:
         UsageError: no arm, no point, times that do not ascend, wrong numbers of joints, or a point out of range.
@@ -149,7 +149,7 @@ class Trajectory(Controller):
         return None
 
     def _outside_way(self) -> str | None:
-        """What is wrong between two points, with the time that would be enough for a speed."""
+        """A message about a limit that is exceeded between two points, with the time that the speed limit allows."""
         highest = self._model.qd_max * self._limits.speed_share
         s = np.linspace(0.0, 1.0, CHECKS_PER_SEGMENT)[:, None]
         for k, h in enumerate(np.diff(self._times)):
