@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from canprobe.cell.master.controller import TactileSample
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Touch
+from canprobe.cell.tasks.calibrate import PRESS_SPEED
 from canprobe.cell.tasks.probing import Phase, ProbingTask
 from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.mechanics.touch.patch.image import Patch
@@ -20,9 +21,7 @@ from canprobe.mechanics.touch.servo import ProbePose
 from canprobe.mechanics.touch.stops import TOUCH_FORCE
 from canprobe.mechanics.types import Floats
 
-PRESS_SPEED = 0.8e-3
-"""Speed from the first touch to the wanted force, m/s."""
-MOVE_SPEED = 30e-3
+TOUCH_TO_TOUCH_SPEED = 30e-3
 """Speed from touch to touch, m/s."""
 FORCE_HZ = 0.5
 """Bandwidth with which the force is held; slower than a roll, so that its images have one depth."""
@@ -191,7 +190,7 @@ class RollTask(ProbingTask):
             self._set_axes(self._motion.pose_matrix[:3, 0])
         if self.reason is not None or self._number >= len(self.presses):
             return self._enter(Phase.DONE)
-        self._line = LineMotion(pose, self._pose((0.0, 0.0), -self._approach_of.clearance), MOVE_SPEED)
+        self._line = LineMotion(pose, self._pose((0.0, 0.0), -self._approach_of.clearance), TOUCH_TO_TOUCH_SPEED)
         self._enter(Phase.MOVE)
 
     def _off(self) -> None:
