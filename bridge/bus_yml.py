@@ -29,7 +29,7 @@ from canprobe.cell.planning.model import (
     PlannedNode,
     PlannedPdo,
 )
-from canprobe.cell.scene.load import MOST_BYTES
+from canprobe.cell.scene.load import MAX_BYTES
 from canprobe.errors import UsageError, regular_file
 from canprobe.fieldbus.bus.files import whole_file, write_text
 from canprobe.fieldbus.eds.device_info import commissioned_node
@@ -211,7 +211,7 @@ def read_bus_yml(path: Path | str, say: Callable[[str], None] = lambda _: None) 
     yaml = need("yaml", "can", _PURPOSE)
     path = Path(path)
     try:
-        text = regular_file(path, MOST_BYTES).read_text(encoding="utf-8")
+        text = regular_file(path, MAX_BYTES).read_text(encoding="utf-8")
         document = yaml.safe_load(text)
         _refuse_twice(path, yaml.compose(text, Loader=yaml.SafeLoader))
     except OSError as error:

@@ -34,12 +34,12 @@ def read_npz(path: Path, expected: str = "an .npz of a run") -> dict[str, NDArra
     """Every array of an ``.npz`` file.
 
     Args:
-        path: of the file.
-        expected: what it should be, in words.
+        path: path of the file.
+        expected: what the file should be, in words, for the message.
 
     Raises:
-        UsageError: no such file, or it is cut off, empty or something else; memory is asked for what is in the file,
-            whatever its headers say.
+        UsageError: there is no such file, or it is cut off, empty or of another kind. Memory is allocated for the bytes
+            in the file, whatever its headers say.
     """
     try:
         with regular_file(path).open("rb") as opened:
@@ -52,7 +52,7 @@ def read_npz(path: Path, expected: str = "an .npz of a run") -> dict[str, NDArra
 
 
 def _why(error: Exception) -> str:
-    """What a reader of files says, in a line."""
+    """The message of an error of a file reader, in a line."""
     text = error.strerror if isinstance(error, OSError) else None
     return (text or str(error) or type(error).__name__).partition("\n")[0]
 

@@ -1,9 +1,9 @@
 """The emulated side of a cell: its drives and its array, made of a plan and put on one plant.
 
-- `world` makes all of it from a plan, with a recorder of what is true.
-- `truth_columns` names what is true as `truth.npz` does.
+- `world` makes the nodes from a plan, with a recorder of the truth.
+- `truth_columns` has the names of the columns of `truth.npz`.
 - `array` is the tactile node of a CANopen array, `raw_array` an array that knows no CANopen.
-- `image_processing` is what the sensor makes of a raw image before it sends it.
+- `image_processing` is the processing of a raw image in the sensor before it is sent.
 
 The nodes are those of `canprobe.fieldbus`; the model behind them is `canprobe.cell.plant`, which they ask for positions
 and images by time. The emulated side never imports the master's, nor the reverse: they know each other only by the bus,

@@ -15,7 +15,6 @@ from typing import Protocol
 
 import numpy as np
 from canopen.objectdictionary import ObjectDictionary
-from numpy.typing import NDArray
 
 from canprobe.cell.emulated.image_processing import (
     Image,
@@ -43,6 +42,7 @@ from canprobe.fieldbus.protocol.tactile import (
     pack_whole,
 )
 from canprobe.mechanics.touch.pad import Pad
+from canprobe.mechanics.types import Floats
 
 TARE = int.from_bytes(b"tare", "little")
 MODE, THRESHOLD, GAIN, TARE_COMMAND, FULL_SCALE_PA, OVERLOAD, ORIGIN = range(0x2000, 0x2007)
@@ -52,7 +52,7 @@ _MAX_AGE_US = 0xFFFF
 
 
 class TactilePlant(Protocol):
-    """What the sensor needs of the plant."""
+    """The functions of the plant that the sensor needs."""
 
     def begin(self, t_ns: int) -> None:
         """Time goes on from `t_ns`, unless it does already: the array is triggered."""
@@ -90,7 +90,7 @@ class TactileApplication(Application):
         self._pad = pad or Pad()
         self._latency, self._tare_images = latency_frames, tare_images
         self._pipeline: deque[tuple[int, Raw]] = deque()
-        self._tare: NDArray[np.float64] | None = None
+        self._tare: Floats | None = None
         self._taring: list[Raw] | None = None
         self._frames = 0
         self._origin = middle(shape=self._pad.shape)
@@ -236,7 +236,7 @@ def make_tactile_node(
     """A tactile node on the plant.
 
     Args:
-        od: of `tactile_array.eds`, for this node id.
+        od: object dictionary of `tactile_array.eds`, for this node id.
         node_id: 1–127, or 255 for none.
         plant: shared by all nodes.
         od_of: the EDS for another node id, where LSS may give the node one.

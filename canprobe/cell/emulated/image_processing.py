@@ -1,4 +1,4 @@
-"""What the sensor makes of a raw image: tare, gain, threshold, the window that follows the contact, features."""
+"""The sensor's processing of a raw image: tare, gain, threshold, the window that follows the contact, features."""
 
 from __future__ import annotations
 
@@ -13,25 +13,26 @@ from canprobe.fieldbus.protocol.tactile import (
     Features,
     Shape,
 )
+from canprobe.mechanics.touch.pad import COUNTS_MAX
+from canprobe.mechanics.types import Floats
 
 Image = NDArray[np.uint8]
-Raw = NDArray[np.uint8] | NDArray[np.float64]
+Raw = NDArray[np.uint8] | Floats
 """Counts of 255 at full scale: whole ones of an ADC of 8 bits, parts of counts of a finer one."""
-FULL_SCALE = 255
-GAIN_ONE = 1000
+UNIT_GAIN_PERMILLE = 1000
 _HYSTERESIS = 0.75  # taxels the ideal origin must be away before the window moves; 0.5 would flicker
 
 
 def is_overloaded(raw: Raw) -> bool:
     """Whether a taxel has reached full scale."""
     if raw.dtype == np.uint8:
-        return FULL_SCALE in raw.tobytes()
-    return bool(raw.max() == FULL_SCALE)
+        return COUNTS_MAX in raw.tobytes()
+    return bool(raw.max() == COUNTS_MAX)
 
 
-def correct(raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int, threshold: int) -> Image:
+def correct(raw: Raw, tare: Floats | None, gain_permille: int, threshold: int) -> Image:
     """Raw counts → whole counts, tare subtracted, times the gain, saturated, zero below the threshold."""
-    as_sampled = tare is None and gain_permille == GAIN_ONE and raw.dtype == np.uint8
+    as_sampled = tare is None and gain_permille == UNIT_GAIN_PERMILLE and raw.dtype == np.uint8
     counts = raw if as_sampled else np.rint(_scaled(raw, tare, gain_permille))
     return _kept(threshold).take(counts.astype(np.intp), mode="clip")
 
@@ -39,31 +40,29 @@ def correct(raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int, thre
 @cache
 def _kept(threshold: int) -> Image:
     """(256,) what remains of each count."""
-    counts = np.arange(FULL_SCALE + 1, dtype=np.uint8)
+    counts = np.arange(COUNTS_MAX + 1, dtype=np.uint8)
     counts[: max(threshold, 0)] = 0
     return counts
 
 
-def correct_finely(
-    raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int, threshold: int
-) -> NDArray[np.float64]:
+def correct_finely(raw: Raw, tare: Floats | None, gain_permille: int, threshold: int) -> Floats:
     """As ``correct``, with the parts of counts that a finer ADC sees and an image on the bus cannot carry."""
-    counts = np.minimum(_scaled(raw, tare, gain_permille), FULL_SCALE)
+    counts = np.minimum(_scaled(raw, tare, gain_permille), COUNTS_MAX)
     counts[counts < max(threshold, 0)] = 0.0
     return counts
 
 
-def _scaled(raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int) -> NDArray[np.float64]:
+def _scaled(raw: Raw, tare: Floats | None, gain_permille: int) -> Floats:
     counts = raw.astype(np.float64)
     if tare is not None:
         counts -= tare
-    if gain_permille != GAIN_ONE:
-        counts *= gain_permille / GAIN_ONE
+    if gain_permille != UNIT_GAIN_PERMILLE:
+        counts *= gain_permille / UNIT_GAIN_PERMILLE
     return counts
 
 
 @cache
-def _sums(rows: int, columns: int) -> NDArray[np.float64]:
+def _sums(rows: int, columns: int) -> Floats:
     """(3, rows · columns): 1, row and column of each taxel."""
     row, column = np.indices((rows, columns), dtype=np.float64)
     return np.stack((np.ones(rows * columns), row.reshape(-1), column.reshape(-1)))
@@ -107,7 +106,7 @@ def compute_features(image: Raw, full_scale_pa: float, pitch_m: float) -> Featur
     Args:
         image: corrected counts, (rows, columns), whole or not.
         full_scale_pa: pressure at 255 counts, Pa.
-        pitch_m: of the taxels.
+        pitch_m: pitch of the taxels.
     """
     total, row, column = _moments(image)
     if total == 0.0:
@@ -116,7 +115,7 @@ def compute_features(image: Raw, full_scale_pa: float, pitch_m: float) -> Featur
     rows, columns = image.shape
     d_row, d_column = np.arange(rows) - row, np.arange(columns) - column
     return Features(
-        force_n=total / FULL_SCALE * full_scale_pa * pitch_m**2,
+        force_n=total / COUNTS_MAX * full_scale_pa * pitch_m**2,
         row=row,
         col=column,
         var_rr=float(d_row**2 @ weights.sum(axis=1)),

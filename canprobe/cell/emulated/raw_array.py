@@ -12,26 +12,26 @@ from collections.abc import Container, Sequence
 import numpy as np
 
 from canprobe.cell.emulated.array import TactilePlant
-from canprobe.cell.emulated.image_processing import FULL_SCALE
 from canprobe.cell.scene.setup import Array
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.protocol.frames import SYNC_ID, Frame
+from canprobe.mechanics.touch.pad import COUNTS_MAX
 
-OFFSETS = 0.02
+OFFSET_SHARE = 0.02
 """Half-width of the unloaded values' spread, as a share of the full scale."""
 
 
 class RawArray(Participant):
-    """The device.
+    """The emulated device.
 
     Args:
-        array: with a raw wire.
+        array: an array that sends raw frames.
         plant: shared with the nodes.
         sync_ratio: SYNCs between two images of a device that samples at SYNC.
-        seed: of its unloaded values.
+        seed: seed of its unloaded values.
 
     Attributes:
-        running: it was started; a device without a start frame always runs.
+        running: whether it was started; a device without a start frame always runs.
     """
 
     def __init__(self, array: Array, plant: TactilePlant, *, sync_ratio: int, seed: int) -> None:
@@ -44,7 +44,7 @@ class RawArray(Participant):
         self.running = not wire.start
         self._due_ns: int | None = None
         self._span = wire.full_scale - wire.unloaded
-        spread = OFFSETS * self._span if wire.tare_images else 0.0
+        spread = OFFSET_SHARE * self._span if wire.tare_images else 0.0
         offsets = np.random.default_rng(seed).uniform(-spread, spread, array.pad.shape) if spread else 0.0
         self._unloaded = np.rint(wire.unloaded + np.zeros(array.pad.shape) + offsets)
         self._largest = (1 << wire.image.bits) - 1
@@ -52,13 +52,13 @@ class RawArray(Participant):
 
     @property
     def listens(self) -> Container[int]:
-        """Its commands, and SYNC where that samples."""
+        """Identifiers of its commands, and of SYNC where a SYNC triggers its images."""
         commands = {can_id for can_id, _ in (*self._wire.start, *self._wire.stop, *self._wire.poll)}
         return frozenset(commands | {SYNC_ID} if self._wire.sampling == "sync" else commands)
 
     @property
     def next_deadline_ns(self) -> int | None:
-        """Of the next sample, or of the next image to send."""
+        """Time of the next sample, or of the next image to send, ns."""
         dues = [due for due, _ in self._waiting]
         return min([*dues, self._due_ns]) if self._due_ns is not None else min(dues, default=None)
 
@@ -95,7 +95,7 @@ class RawArray(Participant):
     def _sample(self, t_ns: int) -> None:
         self._plant.begin(t_ns)
         self._plant.advance(t_ns)
-        loads = self._plant.sample_image(t_ns).astype(np.float64) / FULL_SCALE
+        loads = self._plant.sample_image(t_ns).astype(np.float64) / COUNTS_MAX
         image = self._wire.image
         counts = np.empty((image.rows, image.columns, image.axes), dtype=np.int64)
         counts[:] = self._unloaded[:, :, None]

@@ -56,7 +56,7 @@ def with_units(columns: Mapping[str, NDArray[Any]], prismatic: Sequence[bool]) -
     """The plant's columns under the names of the file.
 
     Args:
-        columns: as `Plant.truths` names them, others among them.
+        columns: columns as `Plant.truths` names them, others among them.
         prismatic: which joints slide; their positions are in ``q_m``, where other joints are NaN, as in ``log.npz``.
     """
     named = TruthColumns()
@@ -86,9 +86,9 @@ def with_present_names(
     """Columns as they were read from a file; former names become the present ones, with one warning.
 
     Args:
-        columns: by name.
+        columns: columns by name.
         prismatic: which joints slide; None where it is not known, and ``q`` keeps its name.
-        file: for the warning.
+        file: name of the file in the warning.
     """
     old = [name for name in columns if name in NAMES or (name == "q" and prismatic is not None)]
     if not old:

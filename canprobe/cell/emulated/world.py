@@ -1,4 +1,4 @@
-"""Plan → the emulated side: one plant, its nodes, and the recorder of what is true."""
+"""Makes the emulated side of a plan: one plant, its nodes, and the recorder of the truth."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class TruthRecorder(Participant):
     What is true in that state is computed afterwards: in real time it would make the nodes' next answers late.
 
     Args:
-        plant: whose truth.
+        plant: plant whose truth is recorded.
 
     Attributes:
         origin_ns: time on the bus's clock that is 0 in the column ``t_s``.
@@ -55,7 +55,7 @@ class TruthRecorder(Participant):
         self._rows: list[tuple[int, int, Any]] = []
 
     def receive(self, can_id: int, data: bytes, t_ns: int) -> list[Frame]:
-        """On a SYNC, take the state."""
+        """Take the state of the plant at a SYNC."""
         if can_id == SYNC_ID:
             self._plant.advance(t_ns)
             self._rows.append((t_ns, data[0] if data else 0, self._plant.state()))
@@ -84,14 +84,14 @@ def _set_turn_units(node: SlaveNode, units: float | None) -> None:
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """The emulated nodes and what they share.
+    """The emulated nodes and the plant that they share.
 
     Attributes:
         nodes: the slaves, ascending by node id.
         plant: arm, probe, object and array.
-        recorder: notes the truth at every SYNC; None where nobody wants it, as it grows with time.
+        recorder: notes the truth at every SYNC; None where it is not wanted, as it grows with time.
         raw_array: an array that is no node; None without one.
-        participants: what is put on the bus: the nodes, or what stands between them and it (`FaultyNode`), and the
+        participants: participants of the bus: the nodes, or the `FaultyNode` between a node and the bus, and the
             recorder, which listens only.
     """
 
@@ -119,10 +119,10 @@ def make_world(
     Where the scene gives a node no serial number, its node id in the scene is one.
 
     Args:
-        plan: of the scene.
-        node_ids: which of its nodes to emulate.
-        truth: whether what is true is recorded.
-        without_id: which of them start without a node id and wait for LSS to give them one.
+        plan: plan of the scene.
+        node_ids: ids of the nodes to emulate.
+        truth: whether the truth is recorded.
+        without_id: ids of the nodes that start without a node id and wait for LSS to give them one.
         homed: drives that have to be homed start with their zeros, and keep them.
     """
     plant = Plant(_plant_config(plan.setup), waits=True)
@@ -207,7 +207,7 @@ def _plant_config(setup: Setup) -> PlantConfig:
 
 
 def _base_offset(believed: Chain, real: Chain, q: Floats, T_flange_probe: Floats) -> Floats:
-    """Where the real arm's base stands in the controller's base frame, (3,), m.
+    """Position of the real arm's base in the controller's base frame, (3,), m.
 
     An experimenter moves the arm to the object and takes that place for what the encoders show: both arms hold the
     probe at one place in the first posture.
@@ -217,7 +217,7 @@ def _base_offset(believed: Chain, real: Chain, q: Floats, T_flange_probe: Floats
 
 
 def _tared_s(setup: Setup) -> float:
-    """How long an array that takes its tare at the beginning takes for it, with some to spare, s; 0 for others."""
+    """Time of the tare at the beginning of an array that takes one, with a reserve, s; 0 for others."""
     raw = setup.array.raw if setup.array is not None else None
     if raw is None or not raw.tare_images:
         return 0.0

@@ -8,15 +8,14 @@ A `cell.Cell` is made of a plan and a port; nothing is sent before it is entered
 2. `Cell.run` enables the drives and runs a `controller.Controller`. Each cycle: SYNC on an absolute deadline, TPDOs
    matched by identifier and arrival (`cycle`, `drives`, `array`), a `Measurement`, the supervision, `step`, RPDOs,
    then `update`, log, observers.
-3. `conditions` is the table of what can go wrong, each row with its check, its reaction and its time. `supervision` has
-   what checks look at, `supervisor` runs the table in every cycle and guards the joints. `watch` keeps what the nodes
-   report of themselves.
-   `notes` keeps what went wrong and was lived with.
+3. `conditions` is the table of faults, each row with its check, its reaction and its time. `supervision` has the data
+   that checks read, `supervisor` runs the table in every cycle and guards the joints. `watch` follows boot-ups,
+   heartbeats and emergencies of the nodes. `notes` counts the faults that did not stop the run.
 4. Leaving, by whatever way, lifts the probe off if it can (`lift_off`), disables the drives, puts the nodes
    pre-operational and closes the bus.
 
-`position_track` is the position of one motor as its TPDOs report it, `tactile_frame` the frame that controllers see,
-`observers` what looks at every cycle after its work. `log` keeps rows, with positions as `joint_columns`. `homing`
+`position_track` is the position of a motor as its TPDOs report it, `tactile_frame` the frame that controllers see;
+`observers` see every cycle after its work. `log` keeps rows, with positions as `joint_columns`. `homing`
 finds the zeros of drives without an absolute encoder. `monitor` reads a bus without sending and `monitor_text` writes
 it as lines. `scan` lists nodes; `commission` gives node ids by LSS: `id_assignment` decides which, `lss_session` sends.
 `raw_array_start` starts an array that is no node; `options` is what the caller of a run sets.

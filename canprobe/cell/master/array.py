@@ -7,7 +7,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.cell.master.controller import TactileSample
 from canprobe.cell.master.tactile_frame import TactileFrame, decode
@@ -20,14 +19,15 @@ from canprobe.fieldbus.protocol.tactile import TactileHeader, TactileMode
 from canprobe.fieldbus.protocol.tactile_assembler import FrameAssembler
 from canprobe.mechanics.touch.pad import COUNTS_MAX
 from canprobe.mechanics.touch.patch.image import Patch, PatchCalibration, compute_patch, patch_from_features
+from canprobe.mechanics.types import Floats
 
 DEADLINE_CYCLES = 2
-"""From the first PDO of a frame to its last."""
+"""Longest time from the first PDO of a frame to its last, in cycles."""
 JITTER_NS = 300_000
-"""By how much the stamps of a SYNC and a header may contradict each other: other loggers do not keep order."""
-LATEST_CYCLES = 4
-"""SYNCs after its trigger up to which a header is believed; the bus is planned for two."""
-WITHIN = 0.75
+"""Largest contradiction between the stamps of a SYNC and a header: other loggers do not keep order."""
+MAX_HEADER_AGE_CYCLES = 4
+"""SYNCs after its trigger within which a header is accepted; the bus is planned for two."""
+IMAGE_SPREAD_PERIODS = 0.75
 """Share of the period of raw images within which the frames of one come; so the next ones are not mixed with it."""
 
 
@@ -35,11 +35,11 @@ class ArrayReceiver(ABC):
     """Collects the frames of an array into images and hands each out with its place in time.
 
     Args:
-        cob_ids: of its frames.
-        channel: of their bus.
+        cob_ids: identifiers of its frames.
+        channel: channel of their bus.
 
     Attributes:
-        newest_cycle: trigger of the newest sample.
+        newest_cycle: cycle whose SYNC triggered the newest sample.
         stale: images dropped because they name no SYNC that they can have followed.
     """
 
@@ -67,26 +67,26 @@ class ArrayReceiver(ABC):
             cycle: the present cycle; its SYNC has not been answered by this image.
             sync_counter: counter of the present cycle's SYNC; 0 where it has none.
             sync_times: times of the last SYNCs (ns), the present one last.
-            sync_stamps: when they went out, on the clock of the frames.
+            sync_stamps: times at which they were sent, on the clock of the frames.
         """
 
     def requests(self, cycle: int) -> tuple[Frame, ...]:
-        """What has to be sent in a cycle so that an image comes."""
+        """Frames to send in a cycle so that an image comes."""
         return ()
 
     @property
     @abstractmethod
     def torn(self) -> int:
-        """Images that were not whole."""
+        """Count of images that were not whole."""
 
     @property
     @abstractmethod
     def unusable(self) -> int:
-        """Images and frames of images that could not be used."""
+        """Count of images and frames of images that could not be used."""
 
     @property
     def lost(self) -> int:
-        """Images that were sent and did not come, as far as the array counts them."""
+        """Count of images that were sent and did not come, as far as the array counts them."""
         return 0
 
 
@@ -95,9 +95,9 @@ class TactileReceiver(ArrayReceiver):
 
     Args:
         assembler: puts the frames together.
-        cob_ids: of its PDOs.
-        sync_overflow: at which the SYNC counter starts again.
-        channel: of their bus.
+        cob_ids: COB-IDs of its PDOs.
+        sync_overflow: highest SYNC counter; after it comes 1.
+        channel: channel of their bus.
     """
 
     def __init__(
@@ -148,17 +148,17 @@ class TactileReceiver(ArrayReceiver):
 
     @property
     def torn(self) -> int:
-        """Torn, corrupt or mixed frames."""
+        """Count of torn, corrupt or mixed frames."""
         return self.assembler.torn + self.assembler.crc_errors + self.assembler.orphans
 
     @property
     def unusable(self) -> int:
-        """Those, and what means nothing or came twice."""
+        """Count of frames that were torn, malformed or sent twice."""
         return self.torn + self.assembler.malformed + self.assembler.duplicates
 
     @property
     def lost(self) -> int:
-        """From gaps of the frame counter."""
+        """Count of lost frames, from gaps of the frame counter."""
         return self.assembler.lost
 
     def _misplaced(self, frame: TactileFrame, cycles_ago: int, sync_stamps: Sequence[int]) -> bool:
@@ -167,7 +167,7 @@ class TactileReceiver(ArrayReceiver):
             return False
         if frame.t_ns + JITTER_NS < sync_stamps[-1 - cycles_ago]:
             return True
-        later = cycles_ago - LATEST_CYCLES
+        later = cycles_ago - MAX_HEADER_AGE_CYCLES
         return later > 0 and sync_stamps[-later] <= frame.t_ns
 
     def _cycles_ago(self, frame: TactileFrame, sync_counter: int, sync_stamps: Sequence[int]) -> int:
@@ -184,12 +184,12 @@ class RawReceiver(ArrayReceiver):
     of a free-running device are fitted (`PeriodFit`).
 
     Args:
-        array: with a raw wire.
+        array: an array that sends raw frames.
         ratio: cycles between two images of a polled device.
 
     Attributes:
-        wire: of the array.
-        rate_hz: of its images.
+        wire: description of the raw frames of the array.
+        rate_hz: rate of its images.
     """
 
     def __init__(self, array: Array, ratio: int) -> None:
@@ -198,18 +198,18 @@ class RawReceiver(ArrayReceiver):
         self.wire: RawWire = array.raw
         self.rate_hz = array.rate_hz
         period_ns = 1e9 / array.rate_hz
-        self.assembler = ImageAssembler(self.wire.image, round(WITHIN * period_ns))
+        self.assembler = ImageAssembler(self.wire.image, round(IMAGE_SPREAD_PERIODS * period_ns))
         self._fit = PeriodFit(period_ns) if self.wire.sampling == "free" else None
         self._ratio = ratio
-        self._unloaded: NDArray[np.float64] | None = None
+        self._unloaded: Floats | None = None
         if not self.wire.tare_images:
             self._unloaded = np.full(array.pad.shape, float(self.wire.unloaded))
-        self._taring: list[NDArray[np.float64]] = []
+        self._taring: list[Floats] = []
         self._complete: list[tuple[TactileFrame, int, float]] = []
 
     @property
     def images(self) -> int:
-        """Whole images so far."""
+        """Count of whole images so far."""
         return self.assembler.frames
 
     def has(self, images: int) -> bool:
@@ -249,17 +249,17 @@ class RawReceiver(ArrayReceiver):
         return sample
 
     def requests(self, cycle: int) -> tuple[Frame, ...]:
-        """The poll of a polled device."""
+        """Frames that poll a polled device in a cycle."""
         return self.wire.poll if self.wire.poll and cycle % self._ratio == 0 else ()
 
     @property
     def torn(self) -> int:
-        """Images that were dropped incomplete."""
+        """Count of images that were dropped incomplete."""
         return self.assembler.torn
 
     @property
     def unusable(self) -> int:
-        """The same."""
+        """Count of images that were dropped incomplete."""
         return self.assembler.torn
 
     def _frame(self, image: RawImage) -> TactileFrame | None:

@@ -25,11 +25,12 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.configuration import NodeSetup, Write
 from canprobe.cell.planning.operation import INTERPOLATION_TIME
-from canprobe.cell.scene.setup import BringUpTimes as Settings
+from canprobe.cell.scene.hardware import BringUpSettings
 from canprobe.errors import BusError, NodeError
 from canprobe.fieldbus.bus.presence import SECOND_ANSWER_S, UPLOAD_DEVICE_TYPE
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.sdo import (
+    Dialogue,
     Dialogues,
     SdoTimeoutError,
     decode_text,
@@ -43,28 +44,27 @@ from canprobe.fieldbus.protocol.frames import SDO_RX_BASE, SDO_TX_BASE, NmtComma
 
 ERROR_HISTORY = 0x1003
 SOFTWARE_VERSION, STORE_PARAMETERS, VERIFY_CONFIGURATION = 0x100A, 0x1010, 0x1020
-SAVE = int.from_bytes(b"save", "little")
+SAVE_SIGNATURE = int.from_bytes(b"save", "little")
 HEARTBEAT_CONSUMER = 0x1016
 PDO_PARAMETERS = range(0x1400, 0x1C00)
 MODE_DISPLAY = 0x6061
-REVISION = 3
+REVISION_SUBINDEX = 3
 IDENTITY_NAMES = {1: "vendor id", 2: "product code", 3: "revision number", 4: "serial number"}
 RELEASE_S = 0.1
-"""For one answer of a node that is released."""
-Dialogue = Generator[bytes | None, bytes, None]
+"""Longest time to an answer of a node that is released."""
 
 
 @dataclass(slots=True)
 class NodeReport:
-    """How far a node came.
+    """The result of bring-up for a node.
 
     Attributes:
-        setup: the node.
+        setup: configuration of the node.
         software: its version by 100Ah; None where the node does not report it.
         kept: its configuration was there already, by 1020h.
         repeated: requests that were sent again.
-        remarks: how the device differs from its EDS or from what was wished, and was taken all the same.
-        failure: what went wrong; None where nothing did.
+        remarks: accepted differences of the device from its EDS or from the wished configuration.
+        failure: error of this node; None without one.
     """
 
     setup: NodeSetup
@@ -87,7 +87,7 @@ class BringUp:
     Args:
         network: SDO and NMT, pumped.
         watch: sees every boot-up, heartbeat and EMCY that arrives meanwhile.
-        setups: the nodes.
+        setups: configurations of the nodes.
         settings: times, retries, and whether the nodes store their configuration.
         say: called with each step, for the user.
 
@@ -100,7 +100,7 @@ class BringUp:
         network: PumpedNetwork,
         watch: NodeWatch,
         setups: tuple[NodeSetup, ...],
-        settings: Settings,
+        settings: BringUpSettings,
         say: Callable[[str], None],
     ) -> None:
         self._network = network
@@ -118,7 +118,7 @@ class BringUp:
         """All steps up to the NMT start.
 
         Raises:
-            NodeError: nodes are missing, are others than the EDS says, or refused a value; it names all of them.
+            NodeError: nodes are missing, do not match their EDS, or refused a value; it names all of them.
             BusError: another master uses this bus.
         """
         self.listen()
@@ -139,7 +139,7 @@ class BringUp:
         Nothing is sent.
 
         Raises:
-            BusError: there is one.
+            BusError: another master uses this bus.
         """
         if not self._listened:
             self._say("listen for another master")
@@ -161,9 +161,12 @@ class BringUp:
         self.took_over = True
         for _ in range(1 + self._settings.retries):
             self._say(f"reset nodes {', '.join(str(s.node_id) for s in missing)}")
-            self._network.port.send_batch([pack_nmt(_reset_of(s), s.node_id) for s in missing])
-            for setup in missing:
+            frames = []
+            for setup in missing:  # a drive that is homed would lose its zero with the reset of the node
+                reset = NmtCommand.RESET_COMMUNICATION if setup.homing else NmtCommand.RESET_NODE
+                frames.append(pack_nmt(reset, setup.node_id))
                 resets[setup.node_id] += 1
+            self._network.port.send_batch(frames)
             self._network.pump_until(lambda: all(boot_ups[i] > before[i] for i in before), self._settings.boot_up_s)
             missing = [s for s in self._setups if boot_ups[s.node_id] == before[s.node_id]]
             if not missing:
@@ -183,7 +186,7 @@ class BringUp:
                 self._refuse_twins(setup, count)
 
     def _refuse_twins(self, setup: NodeSetup, boot_ups: int) -> None:
-        """Two nodes of one id answer a request twice; one that boots twice, as by way of its loader, answers once."""
+        """Refuse two nodes of one id: both answer a request. A node that boots twice, by its loader, answers once."""
         answers: list[bytes] = []
         cob_id = SDO_TX_BASE + setup.node_id
 
@@ -228,7 +231,7 @@ class BringUp:
                 self._say(f"{node} cannot take {left} by its EDS: left as the device has it")
 
     def _configure(self, report: NodeReport) -> Dialogue:
-        """All that is said to one node."""
+        """The whole dialogue with one node: identify, check, write, store."""
         setup = report.setup
         try:
             yield from self._identify(report)
@@ -249,7 +252,8 @@ class BringUp:
         setup = report.setup
         for subindex, expected in setup.identity.items():
             got = yield from read_entry(setup, 0x1018, subindex)
-            if subindex == REVISION and got != expected and _same_major(got, expected):
+            newer = got > expected and got >> 16 == expected >> 16  # CiA 301, 1018h:03: of the same major revision
+            if subindex == REVISION_SUBINDEX and newer:
                 report.remarks.append(
                     f"has revision {got:08X}h, {setup.eds} describes {expected:08X}h: the same major revision, taken"
                 )
@@ -277,7 +281,7 @@ class BringUp:
                 )
 
     def _check_units(self, report: NodeReport) -> Dialogue:
-        """How many units of a motor turn the device states; what it does not answer is not compared."""
+        """Compare the units of a motor turn that the device states; what it does not answer is not compared."""
         turn = report.setup.turn
         if turn is None:
             return
@@ -311,7 +315,7 @@ class BringUp:
             return
         for subindex, value in setup.configuration_date.items():
             yield from write_entry(setup, Write(VERIFY_CONFIGURATION, subindex, value, "configuration date"))
-        yield from write_entry(setup, Write(STORE_PARAMETERS, 1, SAVE, "store", read_back=False))
+        yield from write_entry(setup, Write(STORE_PARAMETERS, 1, SAVE_SIGNATURE, "store", read_back=False))
 
     # 4. start
 
@@ -356,7 +360,7 @@ class BringUp:
         A drive may change its mode only once it is operational and SYNC runs.
 
         Raises:
-            NodeError: from the dialogues: a drive is in another mode when the time is over.
+            NodeError: raised by the dialogues: a drive is in another mode when the time is over.
         """
         until_ns = self._network.port.clock.now_ns() + round(timeout_s * 1e9)
         asked = {s.node_id: self._confirm_mode(s, s.mode, until_ns) for s in self._setups if s.mode is not None}
@@ -401,7 +405,7 @@ class BringUp:
         return hold_dialogues(self._network, dialogues, timeout_s=timeout_s, retries=self._settings.retries)
 
     def _write_all(self, report: NodeReport) -> Dialogue:
-        """The configuration; what is wished and refused is left out with a remark."""
+        """Write the configuration; a wish that the device refuses is left out with a remark."""
         setup = report.setup
         times = [tuple(write for write in setup.writes if write.index == INTERPOLATION_TIME), *setup.otherwise]
         for write in setup.writes:
@@ -420,7 +424,7 @@ class BringUp:
                 yield from self._write_one_of(report, times)
 
     def _write_one_of(self, report: NodeReport, options: Sequence[Sequence[Write]]) -> Dialogue:
-        """The first of several sets of writes that mean the same and that the device takes."""
+        """Write the first set that the device takes, of several sets that mean the same."""
         first: RefusedError | None = None
         for writes in options:
             try:
@@ -437,7 +441,7 @@ class BringUp:
         raise RefusedError(first.node_id, first.reason + (yield from _fitting_rate(report.setup, options))) from first
 
     def _recall(self, setup: NodeSetup) -> Dialogue:
-        """The newest entry in the error history of a node that has failed, unless its EMCY was received."""
+        """Read the newest entry in the error history of a node that has failed, unless its EMCY was received."""
         if setup.node_id in self._watch.last_alarm or ERROR_HISTORY not in setup.dictionary:
             return
         try:
@@ -449,20 +453,20 @@ class BringUp:
             self._history[setup.node_id] = words
 
     def _error(self, reason: str, *setups: NodeSetup) -> NodeError:
-        """What these nodes failed in, with the last EMCY of each of them."""
+        """The error of these nodes, with the last EMCY of each of them."""
         ids = [setup.node_id for setup in setups]
         return NodeError(ids[0], reason + "".join([self._watch.last_words(i) or self._history.get(i, "") for i in ids]))
 
 
 class RefusedError(NodeError):
-    """A device refused a value, or holds another one."""
+    """A device refused a value, or holds another one after the write."""
 
 
 def read_entry(setup: NodeSetup, index: int, subindex: int) -> Generator[bytes | None, bytes, int]:
     """Read an integer of a node.
 
     Raises:
-        NodeError: it has no such entry, refuses, or does not answer.
+        NodeError: the node has no such entry, refuses, or does not answer.
     """
     variable = _variable(setup, index, subindex)
     try:
@@ -472,11 +476,11 @@ def read_entry(setup: NodeSetup, index: int, subindex: int) -> Generator[bytes |
 
 
 def write_entry(setup: NodeSetup, write: Write) -> Dialogue:
-    """Write a value and read it back; one that the device refuses and holds already is as good.
+    """Write a value and read it back; a refused value counts as written where the device holds it already.
 
     Raises:
         RefusedError: the device refuses it, or holds another one.
-        NodeError: there is no answer.
+        NodeError: the device does not answer.
     """
     variable = _variable(setup, write.index, write.subindex)
     value = write.value
@@ -540,16 +544,6 @@ def _failed(setup: NodeSetup, write: Write, error: Exception) -> str:
 def _with_own_bits(write: Write, held: int) -> int:
     """The value with the bits that are the device's as it holds them."""
     return write.value & ~write.own_bits | held & write.own_bits
-
-
-def _same_major(got: int, expected: int) -> bool:
-    """Whether a revision is at or above another of the same major number. Source: CiA 301, object 1018h:03."""
-    return got >> 16 == expected >> 16 and got >= expected
-
-
-def _reset_of(setup: NodeSetup) -> NmtCommand:
-    """A drive that is homed would lose its zero with the reset of the node."""
-    return NmtCommand.RESET_COMMUNICATION if setup.homing else NmtCommand.RESET_NODE
 
 
 def _others(words: str, setups: Sequence[NodeSetup]) -> str:

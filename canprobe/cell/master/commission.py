@@ -1,4 +1,4 @@
-"""What `canprobe scan --lss` does: list the nodes, find devices without an id, give them ids, list again.
+"""The work of `canprobe scan --lss`: list the nodes, find devices without an id, give them ids, list again.
 
 `commission` is the whole of it. Which device gets which id follows from identities; where two devices could be meant
 it is an error. Source: CiA 305, by canopen's LSS client.
@@ -12,7 +12,7 @@ from typing import Any
 
 from canprobe.cell.master.id_assignment import Assignment, Wanted, choose_assignments
 from canprobe.cell.master.lss_session import FoundTwiceError, assign, find_unconfigured
-from canprobe.cell.master.scan import NUMBERS, scan_nodes
+from canprobe.cell.master.scan import IDENTITY_SUBINDICES, scan_nodes
 from canprobe.cell.planning.model import Plan
 from canprobe.errors import BusError
 from canprobe.fieldbus.bus.port import Port
@@ -22,10 +22,10 @@ from canprobe.fieldbus.protocol.lss import LssAddress
 
 @dataclass(frozen=True, slots=True)
 class Commissioned:
-    """What was found and done.
+    """The result of a commissioning.
 
     Attributes:
-        nodes: those with an id at the end, as `scan_nodes` returns them.
+        nodes: nodes with an id at the end, as `scan_nodes` returns them.
         unconfigured: devices that still have none.
         assigned: devices that got an id, and whether each keeps it when its power goes.
     """
@@ -35,7 +35,7 @@ class Commissioned:
     assigned: list[tuple[Assignment, bool]]
 
     def as_document(self) -> dict[str, Any]:
-        """For JSON."""
+        """The result as JSON has it."""
         return {
             "nodes": self.nodes,
             "unconfigured": [_numbers(address) for address in self.unconfigured],
@@ -53,15 +53,15 @@ def commission(
 
     Args:
         port: the bus.
-        wanted: which ids are to be given to whom; none only looks.
+        wanted: ids to give and the devices that get them; empty: only look.
         must: each of them needs its device; False: as far as there is one.
         store: let the devices keep their ids when their power goes.
-        timeout_s: for an SDO answer.
+        timeout_s: longest time to an SDO answer.
 
     Raises:
         BusError: no device without an id answers though ids are wanted, it is not clear which one is meant, or a device
             hides others from the search; nothing was changed.
-        NodeError: one device did not take its id; those before it have theirs.
+        NodeError: a device did not take its id; the devices before it have theirs.
         InterfaceError: the interface failed.
     """
     nodes = scan_nodes(port, timeout_s)
@@ -103,9 +103,9 @@ def _check_all_placed(
 
 
 def _address(node: dict[str, Any]) -> LssAddress | None:
-    numbers = [node[name] for name in NUMBERS]
+    numbers = [node[name] for name in IDENTITY_SUBINDICES]
     return None if None in numbers else LssAddress(*numbers)
 
 
 def _numbers(address: LssAddress) -> dict[str, int]:
-    return dict(zip(NUMBERS, address.numbers, strict=True))
+    return dict(zip(IDENTITY_SUBINDICES, address.numbers, strict=True))

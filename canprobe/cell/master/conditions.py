@@ -1,9 +1,9 @@
 """The table of conditions: what can go wrong, how it is seen, how fast, and what the cell does about it.
 
-Each row stands on its check. A check looks at the cell (`Seen`) or at a touch (`Contact`) and returns the error that
-names what is wrong, or None; what the cell lives with is counted. Pure: no clock, no port. The order is the order of
-precedence. docs/supervision.md has the same table for users, with what they can do about each condition; a test
-compares the two.
+Each row stands on its check. A check looks at the cell (`Seen`) or at a touch (`TouchState`) and returns the error that
+names what is wrong, or None; conditions that do not stop the cell are counted. Pure: no clock, no port. The order is
+the order of precedence. docs/supervision.md has the same table for users, with what they can do about each condition;
+a test compares the two.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 from canprobe.cell.master.supervision import (
-    HIDDEN_NS,
+    CONTACT_LOST_NS,
+    FORCE_HIDDEN_NS,
     HOLD_CYCLES,
-    HOLD_NS,
-    LOST_NS,
+    MAX_HOLD_NS,
     Condition,
-    Contact,
     Finding,
     Limits,
     Reaction,
     Seen,
+    TouchState,
 )
 from canprobe.cell.planning.model import HEARTBEAT_CONSUMED_MS, HEARTBEAT_PRODUCED_MS
 from canprobe.errors import InterfaceError, NodeError, ResultsError, SafetyStop
@@ -29,30 +29,30 @@ from canprobe.fieldbus.bus.port import ControllerState
 from canprobe.fieldbus.protocol.cia402 import DriveState
 from canprobe.fieldbus.protocol.frames import NmtState
 
-MS = 1_000_000
-ARRAY_RECOVERY_NS = 30 * MS
-"""For so long after the touch the array's creep and hysteresis may still show half of the touch force."""
+NS_PER_MS = 1_000_000
+ARRAY_RECOVERY_NS = 30 * NS_PER_MS
+"""Time after a touch in which the array's creep and hysteresis may still show half of the touch force."""
 Check = TypeVar("Check", bound=Callable[..., Any])
 _TABLE: list[Condition] = []
 
 
 def _unchecked(*row: Any, **more: Any) -> None:
-    """A row that shows by itself."""
+    """Add a row without a check: the condition shows by itself."""
     _TABLE.append(Condition(*row, **more))
 
 
 def _checked(*row: Any, **more: Any) -> Callable[[Check], Check]:
-    """A row whose check looks at the cell in every cycle."""
+    """Add a row whose check looks at the cell in every cycle."""
     return lambda check: _add(check, *row, check=check, **more)
 
 
 def _touch(*row: Any, **more: Any) -> Callable[[Check], Check]:
-    """A row whose check looks at a touch."""
+    """Add a row whose check looks at a touch."""
     return lambda check: _add(check, *row, check=check, touch=True, **more)
 
 
 def _counted(key: str, what: str, within: Callable[[Limits], int]) -> Callable[[Check], Check]:
-    """A row of what the cell lives with."""
+    """Add a row of a condition that is counted and does not stop the cell."""
     return lambda count: _add(count, key, what, Reaction.DEGRADE, within, count=count)
 
 
@@ -66,26 +66,26 @@ def _cycles(number: int) -> Callable[[Limits], int]:
 
 
 def _after(time_ns: int, cycles: int = 1) -> Callable[[Limits], int]:
-    """A time, and some cycles until it is looked at."""
+    """A time, and the cycles until the check runs."""
     return lambda limits: time_ns + cycles * limits.period_ns
 
 
 def _frame(limits: Limits) -> int:
-    """From a tactile frame to the reaction on it."""
+    """Time from a tactile frame to the reaction on it."""
     return (limits.tactile_cycles + 2) * limits.period_ns
 
 
 def _sample(limits: Limits) -> int:
-    """From an instant to the reaction on the tactile sample that shows it: sampled, sent one frame later, taken in."""
+    """Time from an instant to the reaction on the tactile sample of it, which is sent a frame later."""
     return limits.cycles_to_feel * limits.period_ns
 
 
 def _hidden(limits: Limits) -> int:
-    return HIDDEN_NS + _sample(limits)
+    return FORCE_HIDDEN_NS + _sample(limits)
 
 
 def _lost(limits: Limits) -> int:
-    return LOST_NS + _sample(limits) + ARRAY_RECOVERY_NS
+    return CONTACT_LOST_NS + _sample(limits) + ARRAY_RECOVERY_NS
 
 
 # nodes; another master first: what the nodes then report is what it made of them
@@ -97,7 +97,9 @@ def _foreign_master(seen: Seen) -> SafetyStop | None:
     return SafetyStop(words) if words is not None else None
 
 
-@_checked("heartbeat", "heartbeat of a node lost", Reaction.LIFT, _after(HEARTBEAT_CONSUMED_MS * MS), enabling=True)
+@_checked(
+    "heartbeat", "heartbeat of a node lost", Reaction.LIFT, _after(HEARTBEAT_CONSUMED_MS * NS_PER_MS), enabling=True
+)
 def _heartbeat(seen: Seen) -> NodeError | None:
     node_id = seen.watch.silent(seen.sync_ns)
     if node_id is None:
@@ -109,7 +111,7 @@ def _heartbeat(seen: Seen) -> NodeError | None:
     "nmt_state",
     "node not operational, or booted again",
     Reaction.LIFT,
-    _after(HEARTBEAT_PRODUCED_MS * MS),
+    _after(HEARTBEAT_PRODUCED_MS * NS_PER_MS),
     enabling=True,
 )
 def _nmt_state(seen: Seen) -> NodeError | None:
@@ -198,7 +200,7 @@ def _sync_mismatch(seen: Seen) -> int:
     Reaction.RETREAT,
     lambda limits: (limits.tactile_timeout + limits.tactile_cycles + 1) * limits.period_ns,
 )
-def _sensor_stale(contact: Contact) -> SafetyStop | None:
+def _sensor_stale(contact: TouchState) -> SafetyStop | None:
     age = contact.tactile_age
     if age is None or age <= contact.limits.tactile_timeout:
         return None
@@ -220,14 +222,14 @@ def _frames_dropped(seen: Seen) -> int:
 
 @_checked("error_passive", "CAN controller error-passive", Reaction.HOLD, _cycles(2), enabling=True)
 def _error_passive(seen: Seen) -> SafetyStop | None:
-    if seen.controller_state is not ControllerState.PASSIVE or seen.passive_ns > HOLD_NS:
+    if seen.controller_state is not ControllerState.PASSIVE or seen.passive_ns > MAX_HOLD_NS:
         return None
     return SafetyStop("CAN controller error-passive")
 
 
-@_checked("error_passive_long", "CAN controller error-passive for 1 s", Reaction.RETREAT, _after(HOLD_NS, 2))
+@_checked("error_passive_long", "CAN controller error-passive for 1 s", Reaction.RETREAT, _after(MAX_HOLD_NS, 2))
 def _error_passive_long(seen: Seen) -> SafetyStop | None:
-    if seen.passive_ns <= HOLD_NS:
+    if seen.passive_ns <= MAX_HOLD_NS:
         return None
     return SafetyStop(f"CAN controller error-passive for {seen.passive_ns * 1e-9:.1f} s: check termination and cabling")
 
@@ -250,7 +252,7 @@ def _clock_step(seen: Seen) -> int:
     return seen.counters.clock_steps
 
 
-@_checked("overruns", "overrun budget used up", Reaction.RETREAT, _after(HOLD_NS, 2))
+@_checked("overruns", "overrun budget used up", Reaction.RETREAT, _after(MAX_HOLD_NS, 2))
 def _overruns(seen: Seen) -> SafetyStop | None:
     if seen.late_share <= seen.limits.safety.late_share:
         return None
@@ -270,13 +272,13 @@ def _preload(seen: Seen) -> SafetyStop | None:
         return None
     return SafetyStop(
         f"the array measures {seen.preload:.2f} N before the run, more than limits.preload_max_n ="
-        f" {limits.safety.preload_max:g}, and its tare takes that for zero: free the probe; if it is free, it was"
-        " pressed until just now, which its array forgets in a minute, or the array's offsets are larger than that"
+        f" {limits.safety.preload_max:g}; its tare would take that for zero: free the probe. If it is free, wait a"
+        " minute after the last press, or raise limits.preload_max_n for an array with larger offsets"
     )
 
 
 @_touch("force", "measured force above `limits.force_max_n`", Reaction.RETREAT, _sample)
-def _force(contact: Contact) -> SafetyStop | None:
+def _force(contact: TouchState) -> SafetyStop | None:
     limit = contact.limits.safety.force_max
     if contact.force <= limit:
         return None
@@ -284,18 +286,18 @@ def _force(contact: Contact) -> SafetyStop | None:
 
 
 @_touch("force_hidden", "force hidden by a saturated array", Reaction.RETREAT, _hidden)
-def _force_hidden(contact: Contact) -> SafetyStop | None:
-    if contact.hidden_s * 1e9 <= HIDDEN_NS:
+def _force_hidden(contact: TouchState) -> SafetyStop | None:
+    if contact.hidden_s * 1e9 <= FORCE_HIDDEN_NS:
         return None
     return SafetyStop(
-        f"the array is saturated and no stiffness was felt: the true force is above the {contact.force:.1f} N "
+        f"the array is saturated and no stiffness was measured: the true force is above the {contact.force:.1f} N "
         "measured; raise sensor.full_scale_kpa or lower task.force_n"
     )
 
 
 @_touch("off_pad", "contact that runs off the array", Reaction.RETREAT, _hidden)
-def _off_pad(contact: Contact) -> SafetyStop | None:
-    if contact.off_pad_s * 1e9 <= HIDDEN_NS:
+def _off_pad(contact: TouchState) -> SafetyStop | None:
+    if contact.off_pad_s * 1e9 <= FORCE_HIDDEN_NS:
         return None
     return SafetyStop(
         f"the contact runs off the edge of the array: the true force is above the {contact.force:.1f} N measured; let"
@@ -304,28 +306,28 @@ def _off_pad(contact: Contact) -> SafetyStop | None:
 
 
 @_touch("contact_lost", "contact lost in a hold", Reaction.RETREAT, _lost)
-def _contact_lost(contact: Contact) -> SafetyStop | None:
+def _contact_lost(contact: TouchState) -> SafetyStop | None:
     if contact.path and contact.limits.regain > 0.0:
         return None
-    return SafetyStop("contact lost") if contact.lost_s * 1e9 > LOST_NS else None
+    return SafetyStop("contact lost") if contact.lost_s * 1e9 > CONTACT_LOST_NS else None
 
 
 @_touch("contact_to_regain", "contact lost in a scan", Reaction.SEARCH, _lost)
-def _contact_to_regain(contact: Contact) -> SafetyStop | None:
-    if not contact.path or contact.lost_s * 1e9 <= LOST_NS:
+def _contact_to_regain(contact: TouchState) -> SafetyStop | None:
+    if not contact.path or contact.lost_s * 1e9 <= CONTACT_LOST_NS:
         return None
     return SafetyStop("contact lost")
 
 
 @_touch("contact_not_regained", "lost contact not found again", Reaction.RETREAT, _cycles(1))
-def _contact_not_regained(contact: Contact) -> SafetyStop | None:
+def _contact_not_regained(contact: TouchState) -> SafetyStop | None:
     if contact.searched <= contact.limits.regain:
         return None
     return SafetyStop(f"contact lost, and not found again within {contact.limits.regain * 1e3:.1f} mm")
 
 
 @_touch("joint_stop", "joint or workspace limit", Reaction.RETREAT, _cycles(1))
-def _joint_stop(contact: Contact) -> SafetyStop | None:
+def _joint_stop(contact: TouchState) -> SafetyStop | None:
     return SafetyStop(contact.limit) if contact.limit is not None else None
 
 
@@ -375,7 +377,7 @@ TOUCH_CHECKS = tuple(c for c in CONDITIONS if c.check is not None and c.touch)
 COUNTERS = tuple((c.key, c.count) for c in CONDITIONS if c.count is not None)
 
 
-def touch_finding(contact: Contact) -> Finding | None:
+def touch_finding(contact: TouchState) -> Finding | None:
     """The first condition of a touch that holds."""
     for condition in TOUCH_CHECKS:
         error = condition.check(contact)  # type: ignore[misc]  # TOUCH_CHECKS have one

@@ -1,4 +1,4 @@
-"""What a controller gets and returns in one cycle."""
+"""The input and the output of a controller in a cycle: `Measurement` and `Command`."""
 
 from __future__ import annotations
 
@@ -7,16 +7,13 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.cell.master.tactile_frame import TactileFrame
 from canprobe.errors import UsageError
+from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-
-
-Vector = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +22,7 @@ class TactileSample:
 
     Attributes:
         frame: the frame, complete and with the right CRC.
-        t_sample_ns: when the array was sampled, in the time of the cycle.
+        t_sample_ns: instant at which the array was sampled, in the time of the cycle.
         cycle: the cycle whose SYNC triggered it, or the last one before it was sampled.
         t_sigma_s: standard deviation of that instant, s; 0 where a SYNC triggers the sample.
     """
@@ -56,7 +53,7 @@ class Measurement:
 
     cycle: int
     t_ns: int
-    q: Vector | None = None
+    q: Floats | None = None
     q_age: tuple[int, ...] = ()
     torque_permille: tuple[float, ...] = ()
     statuswords: tuple[int, ...] = ()
@@ -67,7 +64,7 @@ class Measurement:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """What a controller returns for one cycle.
+    """The command of a controller for one cycle.
 
     Attributes:
         q_target: joint positions to reach two cycles later (n,), rad or m; None leaves the drives where they are.
@@ -77,10 +74,10 @@ class Command:
         estimate: a new answer of its surface estimator, for observers; None in cycles without one.
     """
 
-    q_target: Vector | None = None
+    q_target: Floats | None = None
     done: bool = False
     stop_reason: str | None = None
-    columns: dict[str, float | Vector] = field(default_factory=dict)
+    columns: dict[str, float | Floats] = field(default_factory=dict)
     estimate: SurfaceEstimate | None = None
 
 
@@ -88,11 +85,11 @@ def check_command(command: Command, *, arm: bool) -> None:
     """Check what a controller returned, but for the joint target of an arm: the supervision checks that.
 
     Args:
-        command: of this cycle.
+        command: command of this cycle.
         arm: the scene has one.
 
     Raises:
-        UsageError: a field is of another kind than `Command` says.
+        UsageError: a field of the command has the wrong type.
     """
     if not isinstance(command.done, bool | np.bool_):
         raise UsageError(f"controller: expected done to be True or False, got {command.done!r}")
@@ -136,7 +133,7 @@ class Controller:
         """
         raise NotImplementedError(f"{type(self).__name__} has no step(measurement)")
 
-    def inspect(self, q: Vector) -> str | None:
+    def inspect(self, q: Floats) -> str | None:
         """Check the joint positions before the drives are enabled.
 
         Args:
@@ -156,7 +153,7 @@ class Controller:
         Called once, and only where `lets_go` is True and the condition leaves time for it.
 
         Args:
-            reason: for `Command.stop_reason`.
+            reason: reason for `Command.stop_reason`.
         """
 
     @property
@@ -172,15 +169,15 @@ class _Function(Controller):
         self._step = step
 
     def step(self, measurement: Measurement) -> Command:
-        """One cycle."""
+        """Call the function for one cycle."""
         return self._step(measurement)
 
 
 def as_controller(controller: object) -> Controller:
-    """A controller as it is, or of a function.
+    """The controller, or a controller made of a function.
 
     Raises:
-        UsageError: it is neither.
+        UsageError: it is neither a controller nor a function.
     """
     if isinstance(controller, Controller):
         return controller

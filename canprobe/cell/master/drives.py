@@ -1,4 +1,4 @@
-"""The drives as one: TPDOs in and joint positions out, targets in and RPDOs out.
+"""The drives of the arm as a group: TPDOs in and joint positions out, targets in and RPDOs out.
 
 The drives hold *motor* positions; gears and couplings are undone here and nowhere else.
 """
@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from operator import itemgetter
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.cell.master.position_track import PERIOD_NS, REST_NS, PositionTrack, rest_counts
 from canprobe.cell.planning.model import Plan
@@ -28,32 +27,32 @@ from canprobe.fieldbus.protocol.cia402 import (
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.protocol.pdo import PdoEntry, PdoLayout
 from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_to_joints
+from canprobe.mechanics.types import Floats
 
-Vector = NDArray[np.float64]
 SYNCHRONOUS_MAX = 240
-"""Highest transmission type that follows SYNC; above it an RPDO is sent on change and again every so often."""
+"""Highest transmission type that follows SYNC; above it an RPDO is sent on change and repeated at intervals."""
 COMMAND_REPEAT_NS = 100_000_000
 _FEEDBACK: tuple[Place, ...] = ((0x6041, 0), (0x6064, 0), (0x6077, 0))
 _TARGETS = frozenset(TARGETS.values())
 CONTROLWORD, TARGET, CONSTANT = range(3)
-"""What a value of a command is."""
+"""Kinds of values in a command."""
 _QUICK_STOP, _DISABLE_VOLTAGE = 0x0002, 0x0000
 _STATE_BITS, _ENABLED = 0x6F, DriveState.OPERATION_ENABLED.value
-"""Of a statusword of operation enabled; see `known_state` for the other states."""
+"""Bits of the statusword that encode the state, and their value in operation enabled; see `known_state` for others."""
 
 
 @dataclass(frozen=True, slots=True)
 class DriveAxis:
-    """One drive's place on the bus.
+    """The PDOs of a drive.
 
     Attributes:
-        node_id: the node.
+        node_id: node id of the drive.
         feedback: layouts of its TPDOs, which between them have statusword, position (counts) and, where the drive can
             send it, torque (permille). What else they have is not read.
         commands: layouts of its RPDOs, which between them map controlword and target position (counts). Drives whose
             RPDOs share a COB-ID (the foreign half a dummy) get one frame together.
-        mode: of operation.
-        constants: what entries of the RPDOs hold that are neither, by (index, sub-index).
+        mode: mode of operation (6060h).
+        constants: values of the other entries of the RPDOs, by (index, sub-index).
     """
 
     node_id: int
@@ -65,12 +64,12 @@ class DriveAxis:
 
 @dataclass(frozen=True, slots=True)
 class FeedbackFrame:
-    """One TPDO frame of a drive.
+    """A TPDO frame of a drive.
 
     Attributes:
-        axis: of the drive, from 0.
-        layout: of the frame; longer ones are taken too.
-        word, counts, torque: which of its values statusword, position and torque are; None: another TPDO has them.
+        axis: number of the drive, from 0.
+        layout: layout of the frame; longer frames are taken too.
+        word, counts, torque: places of statusword, position and torque among its values; None: another TPDO has them.
     """
 
     axis: int
@@ -83,7 +82,7 @@ class FeedbackFrame:
         """Its values; what is beyond the mapping is not read.
 
         Raises:
-            ProtocolError: it is too short.
+            ProtocolError: the frame is too short.
         """
         layout = self.layout
         if len(data) == layout.length:
@@ -92,7 +91,7 @@ class FeedbackFrame:
 
 
 def feedback_frames(axes: Sequence[DriveAxis]) -> tuple[FeedbackFrame, ...]:
-    """The TPDO frames that the drives send between them."""
+    """The TPDO frames of all drives."""
     frames = []
     for i, axis in enumerate(axes):
         taken: set[Place] = set()
@@ -110,12 +109,12 @@ DriveCommand = tuple[int, list[Callable[..., bytes]], list[tuple[int, ...]]]
 
 @dataclass(frozen=True, slots=True)
 class CommandFrame:
-    """One RPDO frame.
+    """An RPDO frame, for one drive or for two.
 
     Attributes:
-        cob_id: of the frame.
-        every_cycle: it goes in every cycle; False: on change.
-        parts: who has a part in it: axis, layout, and what each of its values is: `CONTROLWORD`, `TARGET`, `CONSTANT`.
+        cob_id: COB-ID of the frame.
+        every_cycle: the frame is sent in every cycle; False: on change.
+        parts: part of each drive: axis, layout, and the kinds of its values: `CONTROLWORD`, `TARGET`, `CONSTANT`.
     """
 
     cob_id: int
@@ -124,7 +123,7 @@ class CommandFrame:
 
 
 def command_frames(axes: tuple[DriveAxis, ...]) -> tuple[CommandFrame, ...]:
-    """The RPDO frames that the drives take between them, by COB-ID."""
+    """The RPDO frames of all drives, by COB-ID."""
     parts: dict[int, list[tuple[int, PdoLayout, tuple[int, ...]]]] = {}
     for i, axis in enumerate(axes):
         for layout in axis.commands:
@@ -150,13 +149,13 @@ class DriveGroup:
         axes: the drives, joint 1 first.
         model: the arm, for drive units ↔ joint positions.
         repeat_cycles: after how many cycles an event-driven RPDO is sent again without a change.
-        period_ns: of the cycle.
+        period_ns: period of the cycle.
 
     Attributes:
-        torque_permille: of each drive, NaN for one whose TPDO has no torque; empty where none has.
-        late, missed, malformed: TPDOs that were not used, or not there.
+        torque_permille: torque of each drive, NaN for one whose TPDO has no torque; empty where none has.
+        late, missed, malformed: counts of TPDOs that came late, not at all, or too short.
         lateness_ns: time of the last late TPDO of each drive behind its SYNC, ns.
-        answer_ns: from the SYNC to the last TPDO that was used.
+        answer_ns: time from the SYNC to the last TPDO that was used.
         stopped: node ids of drives that stop while the others go on.
     """
 
@@ -207,7 +206,7 @@ class DriveGroup:
         self._sync_ns = self._sync_before_ns = 0
 
     def _places_of(self, axis: int, layout: PdoLayout, picks: tuple[int, ...]) -> list[int]:
-        """Where each value of a part stands in controlwords, targets and constants, one after another."""
+        """Places of the values of a part in the list of controlwords, targets and constants."""
         places, n = [], len(self.axes)
         for entry, pick in zip(layout.signals, picks, strict=True):
             if pick == CONSTANT:
@@ -223,7 +222,7 @@ class DriveGroup:
         return frozenset(self._sources)
 
     def begin(self, cycle: int, t_ns: int = 0, deadline_ns: int | None = None) -> None:
-        """A new SYNC is out, at ``t_ns``, meant for ``deadline_ns``: every TPDO is expected once more."""
+        """Begin a cycle: a SYNC was sent at ``t_ns`` for ``deadline_ns``, and every TPDO is expected once."""
         self._cycle = cycle
         self._deadline_ns = t_ns if deadline_ns is None else deadline_ns
         self._sync_before_ns, self._sync_ns = self._sync_ns, t_ns
@@ -276,7 +275,7 @@ class DriveGroup:
             self.implausible += 1
 
     def end_collect(self) -> None:
-        """The collection window of this cycle is over: what is not in is missed."""
+        """End the collection window of this cycle: a TPDO that has not come counts as missed."""
         self.missed += self._pending
         self._open = False
 
@@ -295,7 +294,7 @@ class DriveGroup:
         """Whether each drive has reported the same position for a while."""
         return tuple([track.rested_ns >= REST_NS for track in self._tracks])
 
-    def joints(self) -> Vector:
+    def joints(self) -> Floats:
         """Joint positions (n,), rad or m, at this SYNC; where a report is missing, carried on for a short time."""
         now, now_ns = self._cycle, self._deadline_ns
         counts = [t.counts if t.cycle == now else t.position(now, now_ns) for t in self._tracks]
@@ -309,7 +308,7 @@ class DriveGroup:
         return tuple([known_state(word) for word in self.statuswords])
 
     def first_not_in(self, state: DriveState) -> tuple[int, str]:
-        """The first drive that is not in a state: which one, from 0, and what it is instead."""
+        """The first drive that is not in a state: its number from 0, and the state that it is in."""
         i = next(i for i, other in enumerate(self.states) if other is not state)
         return i, describe_state(self.statuswords[i])
 
@@ -334,18 +333,18 @@ class DriveGroup:
         """Every drive is in one of ``states``."""
         return all(state in states for state in self.states)
 
-    def set_target(self, q: Vector | None) -> None:
+    def set_target(self, q: Floats | None) -> None:
         """Joint target (n,), rad or m, of the next RPDOs; None holds the last one."""
         if q is not None:
             self._targets = [round(c) for c in joints_to_units(self._model, q).tolist()]
 
-    def targets(self) -> Vector:
-        """Where the motors were sent last (n,), counts; where they are, before they were sent anywhere."""
+    def targets(self) -> Floats:
+        """Last targets of the motors (n,), counts; their positions where no target was set."""
         targets = self._targets if self._targets is not None else [track.counts for track in self._tracks]
         return np.array(targets, dtype=float)
 
     def aim(self, targets: Sequence[int]) -> None:
-        """The drives get `targets` (counts) in this cycle, which bound what they may do next."""
+        """Note the `targets` (counts) of this cycle: they bound the motion that the drives may report next."""
         before, periods = self._aimed, max((self._deadline_ns - self._aimed_ns) / self._period_ns, 1.0)
         if before is None:
             before, periods = tuple([track.counts for track in self._tracks]), 1.0
@@ -360,7 +359,8 @@ class DriveGroup:
             data = packs[0](*parts[0])
             if len(parts) > 1:
                 for pack, values in zip(packs[1:], parts[1:], strict=True):
-                    data = _overlaid(data, pack(*values))
+                    bits = int.from_bytes(data, "little") | int.from_bytes(pack(*values), "little")
+                    data = bits.to_bytes(len(data), "little")  # each leaves zeros where the values of the other are
             frames.append((cob_id, data))
         return frames
 
@@ -414,19 +414,14 @@ def _controlword(state: DriveState | None, goal: DriveState, previous: int, inte
 
 
 def _fetcher(places: Sequence[int]) -> Callable[[Sequence[int]], tuple[int, ...]]:
-    """All of these places at once, by one call into C."""
+    """A function that reads all of these places by one call into C."""
     if len(places) == 1:
         return lambda values, place=places[0]: (values[place],)  # type: ignore[misc]
     return itemgetter(*places)
 
 
-def _overlaid(data: bytes, part: bytes) -> bytes:
-    """One frame for two drives: each leaves zeros where the other's values are."""
-    return (int.from_bytes(data, "little") | int.from_bytes(part, "little")).to_bytes(len(data), "little")
-
-
 def make_drives(plan: Plan) -> DriveGroup | None:
-    """The plan's drives as one; None without an arm."""
+    """The plan's drives as a group; None without an arm."""
     arm = plan.setup.arm
     if arm is None:
         return None
@@ -435,7 +430,7 @@ def make_drives(plan: Plan) -> DriveGroup | None:
 
 
 def drive_axes(plan: Plan) -> tuple[DriveAxis, ...]:
-    """The places of the plan's drives on the bus, joint by joint; none without an arm."""
+    """The PDOs of the plan's drives, joint by joint; empty without an arm."""
     modes = {node.node_id: node.mode for node in plan.nodes}
     axes = []
     for node_id in plan.setup.arm.node_ids if plan.setup.arm is not None else ():

@@ -30,7 +30,7 @@ from canprobe.cell.master.supervisor import JointGuard
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.configuration import HOME_OFFSET, HOMES_HERE, MODE, NodeSetup, Write
 from canprobe.cell.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan
-from canprobe.cell.scene.setup import Homing as Settings
+from canprobe.cell.scene.setup import HomingParameters
 from canprobe.errors import CanprobeError, NodeError, UsageError
 from canprobe.fieldbus.bus.files import write_text
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
@@ -56,8 +56,8 @@ from canprobe.mechanics.robot.model import coupled_joints, drive_position_at
 from canprobe.mechanics.types import Floats
 
 POLL_S = 0.01
-TOLERANCE = math.radians(1.0)
-"""By which a position may differ from the record, and at home from the home offset, rad; a slide's is in proportion."""
+TOLERANCE_RAD = math.radians(1.0)
+"""Largest difference of a position from the record, and at home from the home offset, rad; of a slide in proportion."""
 CONTROLWORD, STATUSWORD, POSITION, IDENTITY = 0x6040, 0x6041, 0x6064, 0x1018
 TARGET, PROFILE_SPEED = 0x607A, 0x6081
 _ENABLE = 0x0F
@@ -72,10 +72,10 @@ _MOVES = {
 
 
 class ZeroRecord:
-    """What is known of the zeros of a cell's drives, by node id, in a file.
+    """The record of the zeros of a cell's drives, by node id, in a file.
 
     Args:
-        path: of a JSON file; None keeps nothing.
+        path: path of a JSON file; None: nothing is kept.
     """
 
     def __init__(self, path: Path | None) -> None:
@@ -88,12 +88,12 @@ class ZeroRecord:
                 self._nodes = {}  # as where it was never written: the drives are homed again
 
     def entry(self, node_id: int) -> dict[str, Any]:
-        """Of one node; empty where nothing is known."""
+        """The entry of a node; empty where nothing is known."""
         found = self._nodes.get(str(node_id))
         return found if isinstance(found, dict) else {}
 
     def put(self, node_id: int, entry: dict[str, Any] | None) -> None:
-        """Write the entry of a node, or that there is none.
+        """Write the entry of a node; None removes it.
 
         Raises:
             CanprobeError: the file cannot be written.
@@ -110,15 +110,15 @@ class ZeroRecord:
 
 
 class Homing:
-    """The drives of a cell that are homed: which of them have their zeros, and how they get them.
+    """Homes the drives of a cell that have no absolute encoder, and knows which of them have their zeros.
 
     Args:
-        plan: of a cell with an arm.
-        setups: of its nodes.
+        plan: plan of a cell with an arm.
+        setups: configurations of its nodes.
         network: pumped; the nodes are operational.
-        watch: of the nodes.
-        supervise: raises the error of what goes wrong besides.
-        record: file of the zeros; None: none is kept.
+        watch: what the nodes report of themselves.
+        supervise: called meanwhile; it raises the error of whatever else goes wrong.
+        record: file of the zeros; None: no record is kept.
         say: called with each step.
 
     Attributes:
@@ -146,7 +146,10 @@ class Homing:
         self._network, self._watch, self._supervise = network, watch, supervise
         self._record, self._say = ZeroRecord(record), say
         guard = JointGuard(plan)
-        self._low, self._high = guard.low + TOLERANCE * self._model.radian, guard.high - TOLERANCE * self._model.radian
+        self._low, self._high = (
+            guard.low + TOLERANCE_RAD * self._model.radian,
+            guard.high - TOLERANCE_RAD * self._model.radian,
+        )
         self._beats, self._heartbeat_ns = False, 0
         zeros = {axis: drive.zero for axis, drive in enumerate(self._drives) if drive.zero is not None}
         self.order = tuple(sorted(zeros, key=lambda axis: (zeros[axis].order, axis)))
@@ -156,7 +159,7 @@ class Homing:
     # which drives have their zeros
 
     def look(self) -> None:
-        """Ask the drives whether they are as the record has them."""
+        """Compare the drives with the record; a zero is known where all agrees."""
         for axis in self._recorded:
             now, before = self._evidence(axis), self._record.entry(self._drives[axis].node_id)
             there, then = now.pop("position"), before.get("position")
@@ -165,7 +168,7 @@ class Homing:
                 self.known.add(axis)
 
     def refuse_unhomed(self) -> None:
-        """Return where all zeros are known.
+        """Refuse to go on where a zero is not known.
 
         Raises:
             NodeError: a drive has to be homed; with the command to type.
@@ -181,7 +184,7 @@ class Homing:
             )
 
     def keep(self) -> None:
-        """Write down where the drives are left, as far as their zeros are known.
+        """Record the positions in which the drives are left, as far as their zeros are known.
 
         Raises:
             CanprobeError: a drive does not answer; the others are written down all the same.
@@ -197,7 +200,7 @@ class Homing:
             raise failures[0]
 
     def _evidence(self, axis: int) -> dict[str, Any]:
-        """What a drive answers now, and the settings by which its zero would be right, as JSON gives it back."""
+        """The answers of a drive now, and the settings with which its zero is valid, as JSON gives them back."""
         setup, drive, model = self._setups[axis], self._drives[axis], self._model
         assert drive.zero is not None
         there = [sub for sub in range(1, 5) if Description(setup.dictionary).entry(IDENTITY, sub) is not None]
@@ -210,13 +213,13 @@ class Homing:
         }
 
     def _tolerance(self, axis: int) -> float:
-        """Drive units."""
-        return abs(float(self._model.units_per_q[axis, axis] * self._model.radian[axis])) * TOLERANCE
+        """Tolerance of the position of a joint, drive units."""
+        return abs(float(self._model.units_per_q[axis, axis] * self._model.radian[axis])) * TOLERANCE_RAD
 
     # homing
 
     def question(self, axis: int) -> str:
-        """What is about to happen to a joint."""
+        """The question to an operator before a joint is homed: method, direction and speeds."""
         joint, zero, setup = self._model.joints[axis], self._zero(axis), self._setups[axis]
         up = 1 if self._model.units_per_q[axis, axis] > 0.0 else -1
         speeds = f"{joint.shown(zero.speed):g} and {joint.shown(zero.zero_speed):g} {joint.unit}/s"
@@ -233,7 +236,7 @@ class Homing:
         """Home one joint.
 
         Returns:
-            Where it is, for people.
+            A line for the operator: where the joint stands.
 
         Raises:
             NodeError: the drive reports an error, is lost, or does not find its home position in time.
@@ -270,7 +273,7 @@ class Homing:
         return f"{setup.name} ({joint.name}) is homed: home is at {joint.text(zero.home, '.2f')}; {stands}"
 
     def keep_alive(self) -> None:
-        """Let a little time pass, with heartbeats, as while an operator thinks.
+        """Let a little time pass with heartbeats, such as while an operator thinks.
 
         Raises:
             CanprobeError: a node was lost or reports an error, or the bus fails.
@@ -278,7 +281,7 @@ class Homing:
         self._pump(lambda: False, POLL_S)
         self._supervise()
 
-    def _zero(self, axis: int) -> Settings:
+    def _zero(self, axis: int) -> HomingParameters:
         zero = self._drives[axis].zero
         assert zero is not None
         return zero
@@ -295,7 +298,7 @@ class Homing:
             units[other] = self._read(self._setups[other], POSITION, 0)
         return units
 
-    def _find_home(self, setup: NodeSetup, zero: Settings, home: int) -> None:
+    def _find_home(self, setup: NodeSetup, zero: HomingParameters, home: int) -> None:
         for write in setup.homing:
             self._write(setup, replace(write, value=-home) if write.index == HOME_OFFSET else write)
         self._enable(setup, OperationMode.HOMING)
@@ -304,8 +307,8 @@ class Homing:
         late = f"did not {what} in {zero.timeout_s:g} s (homing_timeout_s)"
         self._await_bits(setup, (HOMING_ATTAINED, TARGET_REACHED), zero.timeout_s, what, late, error=HOMING_ERROR)
 
-    def _move(self, setup: NodeSetup, zero: Settings, target: int, speed: int) -> None:
-        """Profile position."""
+    def _move(self, setup: NodeSetup, zero: HomingParameters, target: int, speed: int) -> None:
+        """Move a drive to a target in profile position."""
         self._write(setup, Write(PROFILE_SPEED, 0, speed, "profile velocity"))
         self._enable(setup, OperationMode.PROFILE_POSITION)
         self._write(setup, Write(TARGET, 0, target, "target position"))
@@ -334,7 +337,7 @@ class Homing:
         *,
         error: int | None = None,
     ) -> None:
-        """Until the statusword has these bits; the time limit, the error bit and a drive that is off are errors."""
+        """Wait until the statusword has these bits; a time-out, the error bit or a drive that is off is an error."""
         wanted = sum(1 << bit for bit in bits)
 
         def reached() -> bool:
@@ -349,7 +352,7 @@ class Homing:
 
     @contextlib.contextmanager
     def _left_disabled(self, setup: NodeSetup) -> Iterator[None]:
-        """On every way out the drive is stopped, disabled, and in its mode of the cycle."""
+        """A context on every way out of which the drive is stopped, disabled, and in its mode of the cycle."""
         try:
             yield
         except BaseException:
@@ -361,7 +364,7 @@ class Homing:
             raise failure
 
     def _stop(self, setup: NodeSetup) -> CanprobeError | None:
-        """Stop, disable, and leave homing; an interrupt repeats it once. What went wrong is returned."""
+        """Stop, disable, and leave homing; an interrupt repeats it once. A failure is returned."""
         for _ in range(2):
             try:
                 stop_s = self._times.stop_s
@@ -432,7 +435,7 @@ class Homing:
         self._talk(setup, write_entry(setup, write))
 
     def _talk(self, setup: NodeSetup, dialogue: Dialogue) -> Any:
-        """Hold a dialogue with heartbeats meanwhile; what it returns."""
+        """Hold a dialogue, with heartbeats meanwhile, and return its result."""
         results: list[Any] = []
 
         def held() -> Dialogue:

@@ -1,4 +1,4 @@
-"""Which device gets which node id."""
+"""Assignment of node ids to devices by their identities."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from canprobe.fieldbus.protocol.lss import LssAddress
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """A node id and the device that is to have it; a number of 1018h that is None may be any.
+    """A node id and the identity of the device that is to have it; a number that is None matches any.
 
     Attributes:
         node_id: 1–127.
-        name: for messages, such as ``joint 3``.
+        name: name in messages, such as ``joint 3``.
         numbers: vendor id, product code, revision number, serial number.
     """
 
@@ -45,13 +45,13 @@ def choose_assignments(
     channel: str,
     must: bool = True,
 ) -> list[Assignment]:
-    """Which device gets which id.
+    """Choose the device of each node id.
 
     Args:
         wanted: the ids to give.
         unconfigured: devices without an id.
         present: devices that have one; None where 1018h is not complete.
-        channel: of the bus, for messages.
+        channel: channel of the bus, as messages name it.
         must: each wanted id needs a device; False: ids that no device fits are left out.
 
     Raises:

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from canprobe.cell.master.controller import TactileSample
 from canprobe.fieldbus.protocol.tactile import Features
+from canprobe.mechanics.types import Floats
 
 
-def joint_columns(
-    name: str, q: NDArray[np.float64], prismatic: NDArray[np.bool_] | None
-) -> dict[str, NDArray[np.float64]]:
+def joint_columns(name: str, q: Floats, prismatic: NDArray[np.bool_] | None) -> dict[str, Floats]:
     """Joint positions as columns of the log: of an arm whose joints all turn `name_rad` alone, else with `name_m`.
 
     Args:
@@ -33,7 +32,7 @@ def joint_columns(
     return sliding if prismatic.all() else {f"{name}_rad": np.where(prismatic, np.nan, q), **sliding}
 
 
-def joint_positions(log: Mapping[str, NDArray[np.float64]], name: str = "q") -> NDArray[np.float64] | None:
+def joint_positions(log: Mapping[str, Floats], name: str = "q") -> Floats | None:
     """The inverse of `joint_columns` for a whole log: (rows, n) rad or m; None where it has no such columns.
 
     Args:

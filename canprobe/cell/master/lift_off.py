@@ -22,14 +22,14 @@ from canprobe.fieldbus.protocol.frames import NmtState
 from canprobe.mechanics.robot.chain import forward_jacobian
 from canprobe.mechanics.robot.model import ArmModel, units_to_joints
 from canprobe.mechanics.robot.remaining_drives import lifting_step
+from canprobe.mechanics.types import Floats
 
-Vector = NDArray[np.float64]
-WAY = 6e-3
-"""m: as far as a touch retreats, and further than the softest pad is pressed in."""
-SPEED = 20e-3
-"""m/s, the mean; it begins with twice as much, which then falls to zero."""
-ARRIVE_S = 0.02
-"""For the drives' lag at the end."""
+LIFT_WAY = 6e-3
+"""Length of the way back, m: as far as a touch retreats, and further than the softest pad is pressed in."""
+LIFT_SPEED = 20e-3
+"""Mean speed of the way back, m/s; it begins with twice as much, which then falls to zero."""
+ARRIVAL_S = 0.02
+"""Time for the drives to make up their lag at the end."""
 
 
 class WayBack:
@@ -38,20 +38,20 @@ class WayBack:
     Args:
         model: the arm's geometry.
         flange_probe: transform (4, 4) from the probe's centre frame to the flange.
-        period_s: of the cycle.
+        period_s: period of the cycle.
         free: drives (n,) that may move.
-        targets: where the drives were sent last (n,), drive units.
+        targets: last targets of the drives (n,), drive units.
     """
 
     def __init__(
-        self, model: ArmModel, flange_probe: Vector, period_s: float, free: NDArray[np.bool_], targets: Vector
+        self, model: ArmModel, flange_probe: Floats, period_s: float, free: NDArray[np.bool_], targets: Floats
     ) -> None:
         self._model, self._flange_probe, self._period_s = model, flange_probe, period_s
         self._free, self._targets = free, targets
-        self._away: Vector | None = None
+        self._away: Floats | None = None
         self._t = 0.0
 
-    def step(self, measured: Vector) -> Vector | None:
+    def step(self, measured: Floats) -> Floats | None:
         """Joint targets (n,), rad or m, of this cycle; None at the end of the way, or where it cannot go on.
 
         Args:
@@ -61,7 +61,7 @@ class WayBack:
         if self._away is None:
             self._away = -T[:3, 2]
         before, self._t = self._gone(self._t), self._t + self._period_s
-        if before >= WAY and self._t > WAY / SPEED + ARRIVE_S:
+        if before >= LIFT_WAY and self._t > LIFT_WAY / LIFT_SPEED + ARRIVAL_S:
             return None
         move = self._away * (self._gone(self._t) - before)
         if move.any():
@@ -73,23 +73,23 @@ class WayBack:
 
     @staticmethod
     def cycles(period_s: float) -> int:
-        """How many there are at most."""
-        return math.ceil((WAY / SPEED + ARRIVE_S) / period_s) + 1
+        """Highest number of cycles that the way back takes."""
+        return math.ceil((LIFT_WAY / LIFT_SPEED + ARRIVAL_S) / period_s) + 1
 
     @staticmethod
     def _gone(t: float) -> float:
         """Way after ``t`` seconds, m."""
-        return WAY * (1.0 - max(1.0 - t * SPEED / WAY, 0.0) ** 2)
+        return LIFT_WAY * (1.0 - max(1.0 - t * LIFT_SPEED / LIFT_WAY, 0.0) ** 2)
 
 
 class LiftOff:
-    """One way back, cycle by cycle.
+    """A way back of the probe, cycle by cycle.
 
     Args:
-        plan: of a cell with an arm.
-        drives: of the arm; those that do not obey are stopped from now on.
-        watch: of the nodes.
-        error: that the cell is stopped for; the node that it names does not obey.
+        plan: plan of a cell with an arm.
+        drives: drives of the arm; those that do not obey are stopped from now on.
+        watch: what the nodes report of themselves.
+        error: why the cell is stopped; the node that it names does not obey.
     """
 
     def __init__(self, plan: Plan, drives: DriveGroup, watch: NodeWatch, error: BaseException) -> None:
@@ -109,7 +109,7 @@ class LiftOff:
 
     @property
     def possible(self) -> bool:
-        """Some drives obey, and none reports what cannot be."""
+        """Some drives obey, and none reports a position that it cannot have reached."""
         return bool(self._free.any()) and not self._drives.disbelieved
 
     def begin(self) -> None:

@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.mechanics.types import Floats
+
 _NO_NUMBERS = (TypeError, ValueError, OverflowError)
-_Part = tuple[list[int], Sequence[Any] | NDArray[np.float64]]
+_Part = tuple[list[int], Sequence[Any] | Floats]
 """Rows of a column and their values."""
 
 
@@ -20,13 +22,13 @@ class _RowKind:
     """Rows with the same names: how their values lie in one block of float64, as the first whole row has them.
 
     Args:
-        names: of the columns, in order.
+        names: names of the columns, in order.
     """
 
     def __init__(self, names: tuple[str, ...]) -> None:
         self.names = names
         self._block = np.empty(0)
-        self._views: list[NDArray[np.float64]] = []
+        self._views: list[Floats] = []
 
     def packed(self, values: Iterable[Any]) -> bytes | tuple[Any, ...]:
         """A copy of a row's values: one block, or a tuple where one of them is no number or has another shape."""
@@ -41,10 +43,10 @@ class _RowKind:
 
     @property
     def width(self) -> int:
-        """Numbers in a block."""
+        """Count of numbers in a block."""
         return len(self._block)
 
-    def column(self, name: str, blocks: NDArray[np.float64]) -> NDArray[np.float64]:
+    def column(self, name: str, blocks: Floats) -> Floats:
         """The values (n, ...) of a name in blocks (n, width)."""
         place = self.names.index(name)
         start, shape = sum(view.size for view in self._views[:place]), self._views[place].shape
@@ -87,7 +89,7 @@ class RunLog:
             kind = self._kinds[names] = _RowKind(names)
         self._rows.append((kind, kind.packed(row.values())))
 
-    def arrays(self) -> dict[str, NDArray[np.float64]]:
+    def arrays(self) -> dict[str, Floats]:
         """Every column that the rows have, (n,) or (n, k).
 
         A value of another shape than its column's first, or none, is NaN, with a warning: one must not cost the others.
@@ -110,7 +112,7 @@ class RunLog:
                 columns[name].append((rows, kind.column(name, table)))
         return {name: self._column(name, parts) for name, parts in columns.items()}
 
-    def _column(self, name: str, parts: list[_Part]) -> NDArray[np.float64]:
+    def _column(self, name: str, parts: list[_Part]) -> Floats:
         """A column of its parts; the first value of all decides the shape."""
         parts = sorted(parts, key=lambda part: part[0][0])
         try:

@@ -17,7 +17,7 @@ from canprobe.fieldbus.protocol.frames import (
 from canprobe.fieldbus.protocol.lss import LssAddress
 
 BOOT_UP_S = 2.0
-MOST_NODES = 127
+MAX_NODES = 127
 
 
 class FoundTwiceError(BusError):
@@ -48,7 +48,7 @@ def find_unconfigured(network: PumpedNetwork) -> list[LssAddress]:
     lss.release()
     found: list[LssAddress] = []
     try:
-        for _ in range(MOST_NODES):
+        for _ in range(MAX_NODES):
             address = lss.fast_scan()  # those found stay in configuration, where they no longer answer it
             if address is None:
                 return found

@@ -1,4 +1,4 @@
-"""What a bus says about a cell, from listening alone: nodes, joints, touch, load and the steadiness of SYNC. Pure."""
+"""The state of a cell, from listening to its bus alone: nodes, joints, touch, load and jitter of SYNC. Pure."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ SECOND_NS = 1_000_000_000
 
 @dataclass(slots=True)
 class NodeView:
-    """One node as its frames show it.
+    """The state of a node, as its frames show it.
 
     Attributes:
-        node_id, role: which.
+        node_id, role: node id and role of the node.
         state: NMT state of its last heartbeat; None before the first.
         heard_s: time since that heartbeat, s; None before the first.
         drive: CiA 402 state of its last statusword; None of a sensor or before the first.
@@ -50,16 +50,16 @@ class CellView:
     """The cell at one instant; what was not received is None.
 
     Attributes:
-        channel: of the bus, or buses.
-        t_s: since the first frame, s.
+        channel: channel of the bus, or channels of the buses.
+        t_s: time since the first frame, s.
         nodes: ascending node ids, the master's heartbeat last.
         q: joint positions (n,), deg or mm.
-        units: of each of them.
-        force_n: of the last whole tactile frame, N.
+        units: unit of each of them.
+        force_n: force in the last whole tactile frame, N.
         taxels: (rows, columns) counts of that frame.
-        frames_per_s: of the last second, on all buses.
-        load: of the last second, by channel; without stuff bits, as a share of the bit rate.
-        sync_hz: of the last second.
+        frames_per_s: frames in the last second, on all buses.
+        load: bus load in the last second, by channel; without stuff bits, as a share of the bit rate.
+        sync_hz: SYNCs in the last second.
         sync_jitter_us: 99th percentile and largest distance of a SYNC interval from the planned one, µs.
         torn_frames: tactile frames that were not whole.
     """
@@ -78,7 +78,7 @@ class CellView:
     torn_frames: int = 0
 
     def as_document(self) -> dict[str, Any]:
-        """For `--json`."""
+        """The state as `--json` prints it."""
         document = asdict(self)
         document["taxels"] = self.taxels.tolist() if self.taxels is not None else None
         return document
@@ -88,7 +88,7 @@ class Monitor:
     """Listens to the frames of a plan's nodes.
 
     Args:
-        plan: what is on the bus.
+        plan: plan of the cell on the bus.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -111,7 +111,7 @@ class Monitor:
         self._syncs: deque[int] = deque()
 
     def push(self, frames: Iterable[TimedFrame], channel: str | None = None) -> None:
-        """Take what was on one bus; by default the first, whose SYNC is the one that is timed: all of them have it."""
+        """Take the frames of a bus, by default of the first. The SYNC is timed on the first bus; all buses have it."""
         first = next(iter(self._recent))
         recent = self._recent[first if channel is None else channel]
         timed = recent is self._recent[first]
@@ -125,7 +125,7 @@ class Monitor:
                 self._syncs.append(t_ns)
 
     def _bits(self, length: int) -> float:
-        """Of a frame, those of a data phase as bits of the nominal rate."""
+        """Length of a frame in bits of the nominal rate, its data phase converted to them."""
         if length <= CLASSIC_BYTES:
             return best_case_bits(length)
         bits = best_case_fd_bits(length)
@@ -170,7 +170,7 @@ class Monitor:
         self._heard[node.node_id] = t_ns
 
     def view(self, now_ns: int) -> CellView:
-        """What is known at an instant."""
+        """The view of the cell at an instant."""
         view = self._view
         view.t_s = (now_ns - self._first_ns) * 1e-9 if self._first_ns is not None else 0.0
         for node_id, node in self._nodes.items():

@@ -11,7 +11,7 @@ from canprobe.cell.master.monitor import CellView, NodeView
 
 HOME, CLEAR_LINE, CLEAR_BELOW = "\x1b[H", "\x1b[K", "\x1b[J"
 SHADES = " ·░▒▓█"
-LATE_S = 0.25
+LATE_HEARTBEAT_S = 0.25
 """A heartbeat older than that is late."""
 
 
@@ -45,7 +45,7 @@ def lines(view: CellView) -> Iterator[str]:
 
 
 def _node_line(node: NodeView) -> str:
-    late = "" if node.heard_s is None or node.heard_s <= LATE_S else f"  SILENT for {node.heard_s:.1f} s"
+    late = "" if node.heard_s is None or node.heard_s <= LATE_HEARTBEAT_S else f"  SILENT for {node.heard_s:.1f} s"
     drive = node.drive or ""
     emcy = f"  EMCY {node.emcy}" if node.emcy else ""
     return f"node {node.node_id:3d}  {node.role:<14} {node.state or 'not heard':<16} {drive:<20}{late}{emcy}".rstrip()

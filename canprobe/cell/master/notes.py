@@ -1,4 +1,4 @@
-"""What went wrong in a run and was lived with: one line a kind, however often it happened."""
+"""Faults in a run that did not stop it: one line a kind, however often it happened."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from canprobe.errors import CanprobeError, NodeError
 
 KINDS_KEPT = 100
 """Kinds that are distinguished; a node that sends another EMCY each time must not fill the memory."""
-OTHERS = "more of other kinds"
+OTHER_KINDS_TEXT = "more of other kinds"
 
 
 @dataclass(slots=True)
 class _NoteKind:
-    """One thing that happens again and again."""
+    """An event that happens again and again."""
 
     what: str
     nodes: set[int] = field(default_factory=set)
@@ -40,19 +40,19 @@ class Notes:
         self._kinds: dict[str, _NoteKind] = {}
 
     def __len__(self) -> int:
-        """How many kinds there are."""
+        """Number of kinds."""
         return len(self._kinds)
 
     def add(self, what: str, *, node_id: int | None = None, t_s: float | None = None) -> None:
-        """It happened, once more.
+        """Count an event.
 
         Args:
             what: names the kind; nothing in it may change from one time to the next.
             node_id: the node that it happened to.
-            t_s: on the run's clock.
+            t_s: time on the run's clock.
         """
         if what not in self._kinds and len(self._kinds) >= KINDS_KEPT:
-            what = OTHERS
+            what = OTHER_KINDS_TEXT
         kind = self._kinds.setdefault(what, _NoteKind(what))
         kind.times += 1
         if node_id is not None:
@@ -62,7 +62,7 @@ class Notes:
             kind.last_s = t_s
 
     def add_error(self, error: CanprobeError, then: str, t_s: float) -> None:
-        """The cell found an error, and ``then`` did something about it."""
+        """Count an error, with the reaction of the cell to it in ``then``."""
         reason, node_id = (error.reason, error.node_id) if isinstance(error, NodeError) else (str(error), None)
         self.add(f"{reason}: {then}", node_id=node_id, t_s=t_s)
 
@@ -72,7 +72,7 @@ class Notes:
 
 
 def nodes_text(node_ids: Iterable[int]) -> str:
-    """Nodes in words, neighbours joined: ``nodes 1-6, 16``."""
+    """A list of nodes in words, neighbours joined: ``nodes 1-6, 16``."""
     ids = sorted(node_ids)
     steps = count()
     runs = [list(run) for _, run in groupby(ids, key=lambda node_id: node_id - next(steps))]

@@ -1,4 +1,4 @@
-"""Observers of a cell: what they see of every cycle after its work is done, and why they cannot harm it."""
+"""Observers of a cell: they see every cycle after its work is done, and a failure of theirs does not stop it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from canprobe.cell.master.cycle import TIMED_CYCLES
 from canprobe.fieldbus.bus.clock import elapsed_ns
 from canprobe.fieldbus.bus.port import TimedFrame
 
-MOST_FRAMES = 100_000
+MAX_FRAMES = 100_000
 """Frames that are kept for the next observation: bring-up has a few thousand and no cycle."""
 COSTS_KEPT = 100_000
 """Costs that are kept: a cell may stay up for days."""
@@ -20,14 +20,14 @@ COSTS_KEPT = 100_000
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """One cycle as an observer sees it, once its commands are on the bus.
+    """A cycle as an observer sees it, once its commands are on the bus.
 
     Attributes:
         t_ns: deadline of its SYNC on the run's clock, ns, as in `bus.log`. A time of the cycle's own, such as
             `measurement.t_ns` or a tactile sample's, is on this clock with `t_ns - measurement.t_ns` added.
-        measurement: what the controller got; None where there are frames alone, at bring-up and after the last cycle.
-        command: what the controller returned; None while the drives are enabled and stopped.
-        frames: what was on the bus since the last observation, (can_id, data, t_ns).
+        measurement: measurement of the controller; None with frames alone, at bring-up and after the last cycle.
+        command: command of the controller; None while the drives are enabled or stopped.
+        frames: frames on the bus since the last observation, (can_id, data, t_ns).
     """
 
     t_ns: int
@@ -37,7 +37,7 @@ class Observation:
 
 
 class Observer(Protocol):
-    """Anything with ``observe(observation)``; a plain function will do as well."""
+    """An object with ``observe(observation)``; a plain function is accepted as well."""
 
     def observe(self, observation: Observation) -> None:
         """Take one observation, quickly: the next SYNC is waiting."""
@@ -50,12 +50,12 @@ class Observers:
     """Calls every observer after each cycle. One that raises is not called again; the cell goes on.
 
     Args:
-        observers: whom to call.
+        observers: observers to call.
 
     Attributes:
-        origin_ns: where the run's clock is 0, on the clock of the frames.
-        cost_ns: what all of them took together, every ``TIMED_CYCLES`` cycles.
-        faults: those that failed, one line each.
+        origin_ns: zero of the run's clock, on the clock of the frames.
+        cost_ns: time that all observers took together, every ``TIMED_CYCLES`` cycles.
+        faults: observers that failed, a line each.
     """
 
     def __init__(self, observers: Iterable[AnyObserver]) -> None:
@@ -71,18 +71,18 @@ class Observers:
         def both(can_id: int, data: bytes, t_ns: int) -> None:
             write(can_id, data, t_ns)
             frames = self._frames
-            if len(frames) < MOST_FRAMES:
+            if len(frames) < MAX_FRAMES:
                 frames.append((can_id, data, t_ns - self.origin_ns))
 
         return both
 
     def cycle(self, start_ns: int, measurement: Measurement, command: Command | None) -> None:
-        """A cycle is over.
+        """Call the observers after a cycle.
 
         Args:
             start_ns: deadline of the first SYNC, on the run's clock.
-            measurement: of the cycle.
-            command: of the cycle; None without a controller.
+            measurement: measurement of the cycle.
+            command: command of the cycle; None without a controller.
         """
         timed = measurement.cycle % TIMED_CYCLES == 0
         started_ns = elapsed_ns() if timed else 0
@@ -92,7 +92,7 @@ class Observers:
             self.cost_ns.append(elapsed_ns() - started_ns)
 
     def frames_alone(self, t_ns: int) -> None:
-        """Hand over what was on the bus where there is no cycle, at ``t_ns`` on the clock of the frames."""
+        """Hand over the frames of a time without cycles, at ``t_ns`` on the clock of the frames."""
         frames, self._frames = self._frames, []
         if frames:
             self._call(Observation(t_ns - self.origin_ns, None, None, frames))

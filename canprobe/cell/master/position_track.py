@@ -12,18 +12,18 @@ from canprobe.mechanics.robot.motors import units_per_motor
 REST_NS = 12_500_000
 """Time without a motion after which a drive is at rest."""
 REST_RAD = 1e-3
-"""Of a joint: what a report may be off by, whatever the motion, and within which a drive at rest stays."""
-REST_COUNTS_LEAST = 8
-"""The same of a coarse encoder, which has a count or two a milliradian: it dithers, and its drive starts in steps."""
+"""Angle of a joint by which a report may be off, whatever the motion, and within which a drive at rest stays."""
+MIN_REST_COUNTS = 8
+"""Least of these bounds in counts: a coarse encoder has a count or two a milliradian, and its drive starts in steps."""
 CARRIED_CYCLES = 3
 """Periods for which a motion is carried on without a report. After a late cycle too: a drive that gets no new target
 stops at its last one, however long the cycle lasts."""
 FOLLOWED_CYCLES = 20
 """Periods within which a drive has followed its target."""
-_FORGET = 0.9
+_STEP_DECAY = 0.9
 """Share of the largest step of the target that still counts one period later: an eighth after `FOLLOWED_CYCLES`."""
 PERIOD_NS = 2_500_000
-"""Of a cycle at 400 Hz."""
+"""Period of a cycle at 400 Hz."""
 
 
 class PositionTrack:
@@ -34,13 +34,13 @@ class PositionTrack:
     make up a motion that grows from nothing.
 
     Args:
-        base: what a report may be off by, whatever the motion, counts: see `rest_counts`.
-        period_ns: of the cycle. A late cycle lasts many periods: all bounds are times.
+        base: largest error of a report, whatever the motion, counts: see `rest_counts`.
+        period_ns: period of the cycle. A late cycle lasts many periods: all bounds are times.
 
     Attributes:
         counts: the last position that was believed.
-        cycle: of that position; −1 before the first.
-        rested_ns: how long the reports have stayed within ``base`` of the first of them.
+        cycle: cycle of that position; −1 before the first.
+        rested_ns: time in which the reports have stayed within ``base`` of the first of them.
     """
 
     __slots__ = (
@@ -79,7 +79,7 @@ class PositionTrack:
             self._way += self._followed(periods)
             self._periods += periods
         self._heard = False
-        faded = _FORGET**periods * self._asked
+        faded = _STEP_DECAY**periods * self._asked
         self._asked = step_counts if step_counts > faded else faded
 
     def take(self, counts: int, cycle: int, t_ns: int, *, guarded: bool) -> bool:
@@ -87,8 +87,8 @@ class PositionTrack:
 
         Args:
             counts: the position.
-            cycle: of the SYNC at which it was sampled.
-            t_ns: that SYNC's deadline.
+            cycle: cycle of the SYNC at which it was sampled.
+            t_ns: deadline of that SYNC.
             guarded: the drive is enabled, so that it can only be where it can have gone.
 
         Returns:
@@ -113,21 +113,21 @@ class PositionTrack:
         return True
 
     def position(self, cycle: int, t_ns: int) -> float:
-        """Where the motor is at a SYNC: as reported, or carried on by its rate for a bounded time."""
+        """Position of the motor at a SYNC: as reported, or carried on by its rate for a bounded time."""
         if cycle <= self.cycle or self.cycle < 0:
             return float(self.counts)
         return self.counts + self._carried(t_ns - self._t_ns)
 
     def _followed(self, periods: float) -> float:
-        """How far a drive can have followed its last targets after so many periods, counts."""
+        """Largest motion of a drive towards its last targets after so many periods, counts."""
         return min(periods, FOLLOWED_CYCLES) * self._asked
 
     def _carried(self, passed_ns: int) -> float:
-        """How far the motion has gone on since the last report, counts, as far as that can be said."""
+        """Estimated motion since the last report, counts."""
         return self._rate * min(passed_ns, CARRIED_CYCLES * self._period_ns)
 
 
 def rest_counts(model: ArmModel) -> list[float]:
     """A milliradian (0.2 mm) of each drive's joint in its units: more than encoders are noisy, less than a motion."""
     counts = np.abs(units_per_motor(model)) * model.radian * REST_RAD
-    return np.maximum(counts, REST_COUNTS_LEAST).tolist()  # type: ignore[no-any-return]
+    return np.maximum(counts, MIN_REST_COUNTS).tolist()  # type: ignore[no-any-return]

@@ -9,7 +9,7 @@ from typing import Any
 
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from canprobe.cell.master.lss_session import MOST_NODES
+from canprobe.cell.master.lss_session import MAX_NODES
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.bus.port import Port
 from canprobe.fieldbus.bus.presence import SECOND_ANSWER_S, answering_nodes
@@ -22,39 +22,39 @@ from canprobe.fieldbus.protocol.frames import (
     unpack_heartbeat,
 )
 
-NUMBERS = {"vendor_id": 1, "product_code": 2, "revision_number": 3, "serial_number": 4}
+IDENTITY_SUBINDICES = {"vendor_id": 1, "product_code": 2, "revision_number": 3, "serial_number": 4}
 IDENTITY, DEVICE_NAME = 0x1018, 0x1008
 LISTEN_S = 1.0
 """Shortest time in which heartbeats are listened for; few devices send one less often."""
-_SERIAL = IDENTITY.to_bytes(2, "little") + bytes((NUMBERS["serial_number"],))
+_SERIAL = IDENTITY.to_bytes(2, "little") + bytes((IDENTITY_SUBINDICES["serial_number"],))
 _INITIATED, _ABORTED = 0x40, 0x80
 
 
 @dataclass(slots=True)
 class _Sighting:
-    """What one node id sent during a scan.
+    """The frames of a node id during a scan.
 
     Attributes:
-        state: in its last heartbeat; None without one.
-        answers: to each SDO request, by index and sub-index as on the wire.
+        state: NMT state in its last heartbeat; None without one.
+        answers: answer to each SDO request, by index and sub-index as on the wire.
     """
 
     state: NmtState | None = None
     answers: dict[bytes, list[bytes]] = field(default_factory=dict)
 
     def take_heartbeat(self, _id: int, data: bytes, _t_ns: int) -> None:
-        """Keep the state; another frame on this identifier is none."""
+        """Keep the state; another frame on this identifier is not a heartbeat."""
         with suppress(ProtocolError):
             self.state = unpack_heartbeat(data)
 
     def take_answer(self, _id: int, data: bytes, _t_ns: int) -> None:
-        """Keep an answer that names what it answers, which segments do not."""
+        """Keep an answer that names its entry; segments do not name one."""
         if data[:1] and data[0] & 0xE0 in (_INITIATED, _ABORTED):
             self.answers.setdefault(data[1:4], []).append(data)
 
     @property
     def devices(self) -> int:
-        """How many devices answer one request: more than one have this node id; 0: none answers at all."""
+        """Number of devices that answer a request; more than one share this node id, 0: no answer."""
         return max(map(len, self.answers.values()), default=0)
 
     @property
@@ -69,7 +69,7 @@ def scan_nodes(port: Port, timeout_s: float) -> list[dict[str, Any]]:
 
     Args:
         port: the bus.
-        timeout_s: to wait for an answer.
+        timeout_s: longest time to an answer.
 
     Returns:
         By rising node id: ``node_id``; ``state`` of its heartbeat; ``devices`` that answer with this id, 0 where it
@@ -80,7 +80,7 @@ def scan_nodes(port: Port, timeout_s: float) -> list[dict[str, Any]]:
         InterfaceError: the interface failed.
     """
     network = PumpedNetwork(port)
-    seen = {node_id: _Sighting() for node_id in range(1, MOST_NODES + 1)}
+    seen = {node_id: _Sighting() for node_id in range(1, MAX_NODES + 1)}
     for node_id, sighting in seen.items():
         network.subscribe(HEARTBEAT_BASE + node_id, sighting.take_heartbeat)
         network.subscribe(SDO_TX_BASE + node_id, sighting.take_answer)
@@ -89,7 +89,7 @@ def scan_nodes(port: Port, timeout_s: float) -> list[dict[str, Any]]:
     hold_dialogues(network, {node_id: _identify(node) for node_id, node in read.items()}, timeout_s=timeout_s)
     rest_s = (end_ns - port.clock.now_ns()) * 1e-9
     network.pump_until(lambda: False, max(rest_s, SECOND_ANSWER_S))
-    unread: dict[str, Any] = dict.fromkeys((*NUMBERS, "device_name"))
+    unread: dict[str, Any] = dict.fromkeys((*IDENTITY_SUBINDICES, "device_name"))
     return [
         {
             "node_id": node_id,
@@ -104,8 +104,8 @@ def scan_nodes(port: Port, timeout_s: float) -> list[dict[str, Any]]:
 
 
 def _identify(node: dict[str, Any]) -> Generator[bytes | None, bytes, None]:
-    """Ask one node what it is; each answer goes into ``node``."""
-    for name, subindex in NUMBERS.items():
+    """Read the identity of a node; each answer goes into ``node``."""
+    for name, subindex in IDENTITY_SUBINDICES.items():
         data = yield from _upload(IDENTITY, subindex)
         node[name] = int.from_bytes(data, "little") if data is not None and len(data) == 4 else None  # UNSIGNED32
     data = yield from _upload(DEVICE_NAME, 0)

@@ -1,4 +1,4 @@
-"""What the supervision works with: the numbers of a plan, the cell and the touch as checks see them, and a condition.
+"""Data of the supervision: the limits of a plan, the cell and the touch as checks see them, and a condition.
 
 The table of conditions with its checks is in `canprobe.cell.master.conditions`; `canprobe.cell.master.supervisor` runs
 it.
@@ -25,26 +25,28 @@ from canprobe.mechanics.touch.stops import TOUCH_FORCE
 
 HOLD_CYCLES = 3
 """Cycles without a TPDO of one drive after which all of them hold."""
-HOLD_NS = 1_000_000_000
+MAX_HOLD_NS = 1_000_000_000
 """Longest hold."""
-LOST_NS = 30_000_000
-"""Without contact force in a touch, after which the contact is lost."""
-HIDDEN_NS = 20_000_000
-"""With a force that the array shows only in part, after which it may be above the limit."""
+CONTACT_LOST_NS = 30_000_000
+"""Time without contact force in a touch after which the contact is lost."""
+FORCE_HIDDEN_NS = 20_000_000
+"""Time with a force that the array shows only in part, after which the force may be above the limit."""
 TACTILE_TIMEOUT_PERIODS = 6
+"""Periods of the array without a sample after which it counts as silent."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Limits:
-    """The numbers of a plan behind the checks.
+    """The limits of a plan that the checks compare with.
 
     Attributes:
         safety: the limits of the setup.
-        period_ns: of the cycle.
-        missed_cycles: without a TPDO after which a drive is lost, and SYNCs after which it takes its master for dead.
-        tactile_cycles: between two tactile frames.
+        period_ns: period of the cycle.
+        missed_cycles: cycles without a TPDO after which a drive is lost, and SYNCs after which it takes its master for
+            dead.
+        tactile_cycles: cycles between two tactile frames.
         tactile_timeout: cycles without a tactile sample.
-        regain: way towards the object on which a scan searches for a lost contact, m; 0: it does not.
+        regain: distance towards the object on which a scan searches for a lost contact, m; 0: it does not.
         tares: the array is tared in bring-up, so that nothing may press on it then.
     """
 
@@ -58,12 +60,12 @@ class Limits:
 
     @property
     def cycles_to_feel(self) -> int:
-        """From a motion to the cycle that has taken in a tactile sample of it."""
+        """Cycles from a motion to the cycle that has taken in a tactile sample of it."""
         return 2 * self.tactile_cycles + 2
 
 
 def limits_of(plan: Plan) -> Limits:
-    """What the cell of a plan must not go beyond, and how fast it notices."""
+    """The limits of a plan, and how fast the cell notices that they are exceeded."""
     setup = plan.setup
     ratio = setup.rate_hz / setup.array.rate_hz if setup.array is not None else 1.0
     scan = setup.task.scan if isinstance(setup.task, Touch) else None
@@ -83,20 +85,20 @@ class Seen:
     """The cell in one cycle, as the checks see it.
 
     Attributes:
-        limits: of the plan.
+        limits: limits of the plan.
         watch: heartbeats and emergencies.
-        drives, tactile: the arm and the sensor, None where there is none.
-        counters: of the port.
-        controller_state: of the CAN controller.
-        measurement: of this cycle.
-        sync_ns: when its SYNC went out, on the port's clock.
-        gap_ns: from the SYNC before to it; 0 for the first.
+        drives, tactile: the drives of the arm and the receiver of the array; None without an arm or an array.
+        counters: counters of the port.
+        controller_state: state of the CAN controller.
+        measurement: measurement of this cycle.
+        sync_ns: time at which its SYNC was sent, on the port's clock.
+        gap_ns: time from the SYNC before to this one; 0 for the first.
         overruns: cycles late so far.
         late_share: share of the last second's cycles that were late.
-        passive_ns: how long the controller has been error-passive.
+        passive_ns: time for which the CAN controller has been error-passive.
         speeding: a measured motion that no joint can make; None without one.
         slowed: targets so far that were too far away for one cycle.
-        restarts: of a diverging estimator so far.
+        restarts: how often a diverging estimator has started again so far.
         preload: highest force in the images before the drives are enabled, N.
         log_failure: why frames are no longer written down; None while they are.
     """
@@ -121,20 +123,20 @@ class Seen:
 
 
 @dataclass(slots=True, eq=False)
-class Contact:
-    """A touch as its checks see it: one object, kept up to date from sample to sample.
+class TouchState:
+    """A touch as its checks see it, kept up to date from sample to sample.
 
     Attributes:
-        limits: of the plan.
-        force: as measured last, N.
+        limits: limits of the plan.
+        force: force that was measured last, N.
         tactile_age: cycles since the trigger of the newest sample, or since the first SYNC where none has come; None
             without a sensor.
-        lost_s: how long the force has been below that of a contact, where there must be one.
-        hidden_s: how long the array has been saturated without other knowledge of the force.
-        off_pad_s: how long a good part of the contact has been beyond the array's edge.
+        lost_s: time for which the force has been below that of a contact, in a phase with contact.
+        hidden_s: time for which the array has been saturated and the force is not known otherwise.
+        off_pad_s: time for which a good part of the contact has been beyond the array's edge.
         path: the touch is a scan, which may search for a contact that it has lost.
-        searched: way towards the object since, m.
-        limit: what a joint or the workspace forbids; None where nothing does.
+        searched: distance towards the object that was searched since then, m.
+        limit: message of a joint or workspace limit that is reached; None without one.
     """
 
     limits: Limits
@@ -153,8 +155,8 @@ class Contact:
         """Take the patch of a tactile sample.
 
         Args:
-            patch: of the sample.
-            t_ns: when it was taken.
+            patch: patch that the sample shows.
+            t_ns: time of the sample.
             known: the force is known where the array is saturated, too.
         """
         self.force = patch.force
@@ -177,7 +179,7 @@ def _passed_s(since_ns: int | None, t_ns: int) -> float:
 
 
 class Reaction(Enum):
-    """What the cell does about a condition, the mildest first."""
+    """The reaction of the cell to a condition, the mildest first."""
 
     DEGRADE = "degrade"
     HOLD = "hold"
@@ -193,13 +195,13 @@ class Condition:
 
     Attributes:
         key: its name in code, tests and studies.
-        what: for people.
-        reaction: what the cell does.
+        what: the condition in words for users.
+        reaction: reaction of the cell.
         within: longest time from the fault to the reaction, ns; None where no such time applies.
-        check: of a `Seen` in every cycle, or of a `Contact` in a touch: the error that names what is wrong, or None.
-            A condition without check and count shows by itself: an exception, or a node that stops.
-        count: for what the cell lives with: how often it has happened.
-        touch: the check takes a `Contact`.
+        check: function of a `Seen` in every cycle, or of a `TouchState` in a touch; it returns the error that names
+            what is wrong, or None. A condition without check and count shows by itself: an exception, a dead master.
+        count: function of a `Seen`; it returns how often a condition that does not stop the cell has happened.
+        touch: the check takes a `TouchState`.
         enabling: the check holds already while the drives are enabled.
     """
 

@@ -9,39 +9,38 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.cell.master.conditions import BY_KEY, COUNTERS, CYCLE_CHECKS, touch_finding
 from canprobe.cell.master.controller import Command, Measurement, TactileSample
-from canprobe.cell.master.supervision import Contact, Finding, Reaction, Seen
+from canprobe.cell.master.supervision import Finding, Reaction, Seen, TouchState
 from canprobe.cell.planning.model import Plan
 from canprobe.fieldbus.bus.port import ControllerState, PortCounters
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.touch.stops import TOUCH_FORCE
+from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.patch.image import Patch
 
-Vector = NDArray[np.float64]
-MEASURED_SHARE = 1.5
-"""Measured motion above this share of the speed limit is no motion of the arm; SYNCs may be late by a period."""
-COUNTS = 2
+MAX_SPEED_SHARE = 1.5
+"""Share of the speed limit above which a measured motion is no motion of the arm; SYNCs may be late by a period."""
+ENCODER_TOLERANCE_COUNTS = 2
 """Encoder counts by which two readings may differ at rest."""
 _ROUNDING = 1e-9
-_NUMBERS = "fiu"
-"""Kinds of arrays that can be angles."""
+_NUMBER_KINDS = "fiu"
+"""Kinds of numpy dtypes that can be joint positions."""
 
 
 @dataclass(frozen=True, slots=True)
 class GuardedTarget:
     """A joint target as it may be sent (n,), rad or m; or why it may not."""
 
-    q: Vector | None
+    q: Floats | None
     limit: str | None = None
 
 
-def outside_workspace(tip: Vector, workspace: Vector) -> str | None:
-    """What is wrong with the tip's position (3,), m, in a box (2, 3), m; None where it is inside."""
+def outside_workspace(tip: Floats, workspace: Floats) -> str | None:
+    """A message that the tip, at a position (3,), m, is outside of a box (2, 3), m; None where it is inside."""
     below, above = tip < workspace[0], tip > workspace[1]
     if not (below | above).any():
         return None
@@ -54,7 +53,7 @@ class JointGuard:
     """Range, speed and workspace of the joint targets; speed of the measured joints.
 
     Args:
-        plan: of a cell with an arm.
+        plan: plan of a cell with an arm.
 
     Attributes:
         low, high: range of the joint targets (n,), rad or m.
@@ -82,12 +81,12 @@ class JointGuard:
         self._q: list[float] | None = None
         self._t_ns = 0
 
-    def T_base_tip(self, q: Vector) -> Vector:
+    def T_base_tip(self, q: Floats) -> Floats:
         """Transform (4, 4) from the probe's tip (z = pole, towards the object) to base at joints (n,), rad or m."""
         return forward(self._model.chain, q) @ self._T_flange_tip
 
-    def outside(self, q: Vector) -> str | None:
-        """How the probe's tip leaves the workspace at joint positions (n,), rad or m; None where it does not."""
+    def outside(self, q: Floats) -> str | None:
+        """A message that the probe's tip is outside of the workspace at joint positions (n,), rad or m; None inside."""
         return None if self._workspace is None else outside_workspace(self.T_base_tip(q)[:3, 3], self._workspace)
 
     def measure(self, measurement: Measurement) -> str | None:
@@ -95,19 +94,19 @@ class JointGuard:
         if measurement.q is None or any(measurement.q_age):
             return None
         before, self._q = self._q, measurement.q.tolist()
-        share = MEASURED_SHARE * (measurement.t_ns - self._t_ns + self._period_ns) * 1e-9
+        share = MAX_SPEED_SHARE * (measurement.t_ns - self._t_ns + self._period_ns) * 1e-9
         self._t_ns = measurement.t_ns
         if before is None:
             return None
         joints = zip(self._q, before, self._speed, self._counts, strict=True)
-        beyond = [abs(q - was) - share * speed - COUNTS * count for q, was, speed, count in joints]
+        beyond = [abs(q - was) - share * speed - ENCODER_TOLERANCE_COUNTS * count for q, was, speed, count in joints]
         if max(beyond) <= 0.0:
             return None
         joint = beyond.index(max(beyond))
         way = self._model.joints[joint].text(abs(self._q[joint] - before[joint]))
         return f"joint {joint + 1} reports a motion of {way} in one cycle, more than it can make"
 
-    def command(self, q_target: Vector, measurement: Measurement) -> GuardedTarget:
+    def command(self, q_target: Floats, measurement: Measurement) -> GuardedTarget:
         """The target that may be sent for `q_target` (n,), rad or m."""
         n = len(self._range)
         if type(q_target) is not np.ndarray or q_target.dtype != np.float64:
@@ -115,7 +114,7 @@ class JointGuard:
                 given = np.asanyarray(q_target)
             except (TypeError, ValueError):
                 given = np.array(None)
-            if given.dtype.kind not in _NUMBERS or isinstance(given, np.ma.MaskedArray):
+            if given.dtype.kind not in _NUMBER_KINDS or isinstance(given, np.ma.MaskedArray):
                 return GuardedTarget(None, f"the controller's q_target is {q_target!r}: expected {n} {self._si}")
             target = np.asarray(given, dtype=np.float64)
         else:
@@ -148,30 +147,30 @@ class JointGuard:
 NOTED_ONCE = ("error_frames", "frames_dropped", "clock_step", "estimator")
 """Conditions that the cell lives with and notes once; the others are figures of the summary."""
 SECOND_NS = 1_000_000_000
-LOOK_NS = 20_000_000
-"""Between two looks at where the probe presses: less than a millimetre of a retreat."""
-MEMORY = 0.25
+LOOK_PERIOD_NS = 20_000_000
+"""Time between two looks at where the probe presses; a retreat moves less than a millimetre meanwhile."""
+MEMORY_SHARE = 0.25
 """Share of a force that the array may show when it is gone: creep, 5 % a decade, of a press of a quarter of an hour."""
-CLEAR = 3e-3
-"""m, straight back along the pole: half a retreat, and more than `MEMORY` of 50 N presses the softest pad in."""
+CLEARANCE = 3e-3
+"""Way straight back along the pole, m: half a retreat; `MEMORY_SHARE` of 50 N presses the softest pad in less."""
 
 
-class Press:
-    """Whether what the array shows is a press, or what it remembers of one.
+class PressDetector:
+    """Tells a press from the memory that the array has of one.
 
-    After a long press the array creeps back for as long as it was pressed. By its size alone that is a light touch. But
-    a press needs the probe to be there: once it has gone straight back from where it pressed last, further than any pad
-    is pressed in, the rest is memory, and only what comes on top of it is a new press.
+    After a long press the array creeps back for as long as it was pressed; its signal alone looks like a light touch.
+    A press needs the probe in its place. Once the probe has gone straight back from its last press, further than any
+    pad is pressed in, the rest of the signal is memory, and only a force above it is a new press.
     """
 
     def __init__(self) -> None:
-        self._T_base_tip: Vector | None = None
+        self._T_base_tip: Floats | None = None
         self._highest = 0.0
         self._remembered = 0.0
 
-    def look(self, force: float, T_base_tip: Vector) -> None:
+    def look(self, force: float, T_base_tip: Floats) -> None:
         """Take the array's force, N, and where the probe's tip is (4, 4)."""
-        if self.holds(force) and force >= MEMORY * self._highest:
+        if self.holds(force) and force >= MEMORY_SHARE * self._highest:
             self._T_base_tip, self._highest = T_base_tip, max(force, self._highest)
         elif self._T_base_tip is None:
             self._remembered = min(force, self._remembered)
@@ -182,24 +181,24 @@ class Press:
         """Whether a force that the array shows, N, is a press."""
         return force >= TOUCH_FORCE + (self._remembered if self._T_base_tip is None else 0.0)
 
-    def _is_clear(self, way: Vector) -> bool:
+    def _is_clear(self, way: Floats) -> bool:
         assert self._T_base_tip is not None
         pole = self._T_base_tip[:3, 2]
         back = -float(way @ pole)
-        return back > CLEAR and float(np.linalg.norm(way + back * pole)) < back
+        return back > CLEARANCE and float(np.linalg.norm(way + back * pole)) < back
 
 
 class Supervisor:
-    """The checks of the table and what they have to remember.
+    """Runs the checks of the table, and keeps what they have to remember.
 
     Args:
         seen: the cell; brought up to date by :meth:`step`.
-        guard: of the joints; None without an arm.
+        guard: guard of the joints; None without an arm.
         patch_from: the patch of a tactile sample, for controllers that do not guard their contact; None without touch.
 
     Attributes:
-        counts: how often each condition that the cell lives with has happened.
-        first: cycle in which each condition was seen first.
+        counts: how often each condition that does not stop the cell has happened.
+        first: first cycle of each condition.
     """
 
     def __init__(
@@ -210,9 +209,9 @@ class Supervisor:
         self.first: dict[str, int] = {}
         self._patch_from = patch_from
         self._guard = guard
-        self._contact = Contact(seen.limits)
+        self._contact = TouchState(seen.limits)
         self._sample: TactileSample | None = None
-        self._press = Press()
+        self._press = PressDetector()
         self._look_ns = 0
         self._untouched = seen.limits.tares
         self._late: deque[tuple[int, int]] = deque()  # while one of them is late, the last second's cycles
@@ -247,7 +246,7 @@ class Supervisor:
             if measurement.tactile is not None:
                 seen.preload = max(seen.preload, self.felt())
         if measurement.t_ns >= self._look_ns:
-            self._look_ns = measurement.t_ns + LOOK_NS
+            self._look_ns = measurement.t_ns + LOOK_PERIOD_NS
             self._look()
         for key, count in COUNTERS:
             if (number := count(seen)) != self.counts[key]:
@@ -284,7 +283,7 @@ class Supervisor:
         return hold
 
     def must_stop(self) -> bool:
-        """Something holds for which nothing may move any more."""
+        """Whether a condition holds that forbids every motion."""
         return any(c.reaction is Reaction.STOP and c.check(self.seen) is not None for c in CYCLE_CHECKS)  # type: ignore[misc]
 
     def felt(self) -> float:
@@ -305,24 +304,24 @@ class Supervisor:
             self._press.look(self.felt(), self._guard.T_base_tip(q))
 
     def guard_contact(self, measurement: Measurement) -> Finding | None:
-        """What must not go on in a touch, for a controller that does not guard its contact itself."""
+        """The first condition of a touch that holds, for a controller that does not guard its contact itself."""
         if self._patch_from is not None and measurement.tactile is not None:
             self._contact.feel(self._patch_from(measurement.tactile), measurement.tactile.t_sample_ns)
         self._contact.tactile_age = measurement.tactile_age
         return touch_finding(self._contact)
 
     def guard_target(self, command: Command) -> tuple[Command, Finding | None]:
-        """The command that may be sent: a target too far away is approached, one out of bounds is left out."""
+        """The command that may be sent: a target too far away is approached, a target out of bounds is left out."""
         if command.q_target is None or self._guard is None:
             return command, None
         guarded = self._guard.command(command.q_target, self.seen.measurement)
         self.seen.slowed = self._guard.slowed
         if guarded.limit is not None:
-            return replace(command, q_target=None), touch_finding(Contact(self.seen.limits, limit=guarded.limit))
+            return replace(command, q_target=None), touch_finding(TouchState(self.seen.limits, limit=guarded.limit))
         return (command if guarded.q is command.q_target else replace(command, q_target=guarded.q)), None
 
     def notes(self) -> list[str]:
-        """What happened and was lived with, a line each."""
+        """Conditions that happened and did not stop the cell, a line each."""
         return [
             f"{BY_KEY[key].what}: {self.counts[key]}, the first in cycle {self.first[key]}"
             for key in NOTED_ONCE

@@ -16,7 +16,7 @@ class TactileFrame:
     """One complete, checked tactile frame.
 
     Attributes:
-        header: as received.
+        header: header of the frame, as received.
         taxels: uint8 (rows, columns), full pad, counts; zero outside the window, all zero in features mode; read-only.
         window: (first row, first column, rows, columns) that the taxels cover; (0, 0, 0, 0) in features mode.
         features: contact features, in features mode only.
@@ -44,7 +44,7 @@ def frame_of(header: TactileHeader, content: NDArray[np.uint8] | Features, shape
     """The frame with a content.
 
     Args:
-        header: of the frame.
+        header: header of the frame.
         content: counts of the taxels that the frame carries (`covered`), or features.
         shape: rows and columns of the pad.
         t_ns: arrival.

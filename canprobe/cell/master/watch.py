@@ -1,4 +1,4 @@
-"""What the nodes say about themselves: boot-ups, heartbeats and emergencies."""
+"""Boot-ups, heartbeats and emergencies of the nodes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.emcy import Emcy, describe, is_no_error
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NMT_ID, SYNC_ID, NmtState, unpack_heartbeat
 
-UNTOLD = 64
+MAX_NEW_ALARMS = 64
 """Alarms that are kept until `NodeWatch.news` is called."""
 
 
@@ -24,7 +24,7 @@ class EmcyEvent:
 
     @property
     def is_communication(self) -> bool:
-        """Whether it is about frames rather than the device. Source: CiA 301, error codes 81xxh and 82xxh."""
+        """Whether the message is about frames rather than the device. Source: CiA 301, error codes 81xxh and 82xxh."""
         return self.emcy.code >> 8 in (0x81, 0x82)
 
     @property
@@ -47,10 +47,10 @@ class NodeWatch:
         boot_ups: boot-up messages of each node.
         last_emcy: the last EMCY of each node, the end of an error too.
         last_alarm: the last EMCY of each node that reports an error, not its end.
-        device_alarm: the first one since the start that is about a device rather than frames; None without one.
-        alarmed: nodes that have sent one since the start.
-        communication: how many were about frames.
-        foreign: what another master sent first.
+        device_alarm: first alarm since the start that is about a device rather than frames; None without one.
+        alarmed: nodes that have sent such an alarm since the start.
+        communication: count of alarms about frames.
+        foreign: first frame of another master, in words; None without one.
     """
 
     def __init__(self, node_ids: tuple[int, ...]) -> None:
@@ -63,11 +63,11 @@ class NodeWatch:
         self.alarmed: set[int] = set()
         self.communication = 0
         self.foreign: str | None = None
-        self._untold: deque[EmcyEvent] = deque(maxlen=UNTOLD)
+        self._untold: deque[EmcyEvent] = deque(maxlen=MAX_NEW_ALARMS)
         self._heard: dict[int, int] = {}
 
     def push(self, can_id: int, data: bytes, t_ns: int) -> bool:
-        """Take a frame that is no PDO; True where it was one of those watched."""
+        """Take a frame that is no PDO; True where it was a frame of error control, EMCY or another master."""
         node_id = can_id & 0x7F
         if can_id == HEARTBEAT_BASE + MASTER_NODE_ID:
             self.foreign = self.foreign or f"a heartbeat of node {MASTER_NODE_ID}, our own id"
@@ -109,7 +109,7 @@ class NodeWatch:
             self.alarmed.add(node_id)
 
     def news(self) -> list[EmcyEvent]:
-        """Alarms since the last call, the last `UNTOLD` of them."""
+        """Alarms since the last call, the last `MAX_NEW_ALARMS` of them."""
         if not self._untold:
             return []
         news = list(self._untold)
@@ -118,7 +118,7 @@ class NodeWatch:
 
     @property
     def another_master(self) -> str | None:
-        """That another master was heard, and by what; None where none was."""
+        """A message that another master was heard, with its frame; None where none was heard."""
         return None if self.foreign is None else f"another master is on the bus: {self.foreign}"
 
     def last_words(self, node_id: int) -> str:

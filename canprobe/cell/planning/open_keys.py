@@ -12,10 +12,11 @@ from canprobe.cell.planning.model import Choice
 from canprobe.cell.planning.window import (
     window_choices,
 )
-from canprobe.cell.scene.setup import ArrayMode, Setup
+from canprobe.cell.scene.hardware import TactileModeName
+from canprobe.cell.scene.setup import Setup
 
 AUTO = "auto"
-MODES: dict[ArrayMode, str] = {
+MODES: dict[TactileModeName, str] = {
     "image": "nothing is left out",
     "window": "the window round the contact holds the patch",
     "features": "the sensor computes force, centroid and moments itself",
@@ -43,7 +44,7 @@ class _OpenKey:
         return getattr(getattr(setup, self.part), self.field, None)
 
 
-def _modes(setup: Setup) -> list[tuple[ArrayMode, str]]:
+def _modes(setup: Setup) -> list[tuple[TactileModeName, str]]:
     """Of an array that only listens all; of one that is touched those that follow the contact."""
     return [(mode, why) for mode, why in MODES.items() if mode != "image" or setup.kind == "listen"]
 

@@ -27,7 +27,7 @@ from canprobe.cell.planning.model import (
     SyncPlan,
     Traffic,
 )
-from canprobe.cell.scene.setup import Bus
+from canprobe.cell.scene.hardware import BusSettings
 from canprobe.fieldbus.protocol.fifo_response_times import worst_case_response_fifo
 from canprobe.fieldbus.protocol.frame_bits import (
     best_case_bits,
@@ -106,7 +106,7 @@ def plan_traffic(
     pdos: Sequence[PlannedPdo],
     sync: SyncPlan,
     channels: Mapping[str, tuple[int, ...]],
-    bus: Bus,
+    bus: BusSettings,
     compute_ns: int = 0,
     *,
     raw: Sequence[PlannedFrames] = (),
@@ -153,7 +153,7 @@ def plan_traffic(
     return PlannedTraffic(tuple(buses), tuple(timed), tuple(raw_timed), _problems(buses, analyses, bus))
 
 
-def _raw_messages(raw: Sequence[PlannedFrames], bus: Bus) -> Iterator[Message]:
+def _raw_messages(raw: Sequence[PlannedFrames], bus: BusSettings) -> Iterator[Message]:
     """Raw frames that repeat, as one message an identifier: its frames go one behind the other."""
     repeated: dict[int, list[PlannedFrames]] = {}
     for frames in raw:
@@ -167,7 +167,7 @@ def _raw_messages(raw: Sequence[PlannedFrames], bus: Bus) -> Iterator[Message]:
 
 
 def _messages(
-    wire: Sequence[PlannedPdo], raw: Sequence[PlannedFrames], sync: SyncPlan, node_ids: Sequence[int], bus: Bus
+    wire: Sequence[PlannedPdo], raw: Sequence[PlannedFrames], sync: SyncPlan, node_ids: Sequence[int], bus: BusSettings
 ) -> _Messages:
     """What SYNC triggers, by its part in the cycle, and what keeps its own time."""
     queues = {"SYNC": MASTER_NODE_ID}
@@ -324,7 +324,7 @@ def _demands(wire: Sequence[PlannedPdo], sync: SyncPlan, bitrate: int) -> Iterat
         yield Demand("tactile frame and all above it", cycles, wire_ns(used, bitrate), cycles * sync.period_ns)
 
 
-def _problems(buses: Sequence[PlannedBus], analyses: Sequence[BusAnalysis], bus: Bus) -> list[str]:
+def _problems(buses: Sequence[PlannedBus], analyses: Sequence[BusAnalysis], bus: BusSettings) -> list[str]:
     """What does not fit: load and demands of a bus, or else the cycle, or else the first late message of each bus."""
     found = [(one.channel, problem) for one in buses for problem in _excess(one.traffic)]
     if not found and (behind := _behind(buses[0].traffic.budget)) is not None:

@@ -10,7 +10,7 @@
   damping, regularised friction), `several_contacts` a ball that touches in several places.
 - `pressure` averages the contact over each taxel; `taxels` makes counts of it: blur, gains, saturation, hysteresis,
   creep, crosstalk, noise, quantisation.
-- `config` says what a plant is made of.
+- `config` is the configuration of a plant.
 
 The image model shares no formula with the estimators. Energy is not created in a closed contact cycle without
 friction.

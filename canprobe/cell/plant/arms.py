@@ -19,7 +19,7 @@ def make_arm(config: PlantConfig) -> IdealArm | DynamicArm:
     """An ideal or a dynamic arm.
 
     Args:
-        config: with a model.
+        config: configuration of a plant with an arm.
 
     Raises:
         PlanError: a dynamic arm without bodies, or without the extra `dynamics`.
@@ -35,8 +35,8 @@ def make_equations(config: PlantConfig, effects: Effects | None = None, *, held:
     """Equations of motion of a dynamic arm.
 
     Args:
-        config: with a model and its bodies.
-        effects: what acts; everything by default.
+        config: configuration of a plant with an arm and the bodies of its links.
+        effects: effects that act; all by default.
         held: see ``ArmEquations``.
 
     Raises:

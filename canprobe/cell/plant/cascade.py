@@ -33,7 +33,7 @@ class DriveLoops:
 
     Args:
         model: the arm, for rated torques and friction.
-        inertia: (n,) what each drive takes for its motor's inertia, kg m^2.
+        inertia: (n,) inertia of the motors as the drives are tuned for, kg m^2.
         bandwidth_hz: -3 dB frequency of position.
         damping_ratio: 1 is critical.
         dynamics: the rest of the tuning.
@@ -85,7 +85,7 @@ class DriveLoops:
         """Torque limit and feed-forwards of one motor from now on.
 
         Args:
-            axis: from 0.
+            axis: number of the motor, from 0.
             limit: largest torque, N m; the configured one if that is less.
             speed: added behind the position loop, rad/s.
             torque: added behind the velocity loop, N m.
@@ -95,7 +95,7 @@ class DriveLoops:
         self.ahead = self._share * self.slope + self._speed_fed
 
     def drives(self, t: float, y: Floats) -> Drives:
-        """What the cascades do.
+        """Velocity errors and torques of the cascades.
 
         Args:
             t: s.
@@ -112,7 +112,7 @@ class DriveLoops:
 
         Args:
             v: (n,) rates of the motors, rad/s.
-            drives: what the cascades do.
+            drives: result of `drives`.
         """
         free = drives.asked == drives.given
         bent = np.tanh(v / STICTION_RATE)

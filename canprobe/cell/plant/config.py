@@ -1,4 +1,4 @@
-"""What a plant is made of."""
+"""Configuration of a plant: arm, probe, object and array."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from canprobe.cell.plant.taxels import TaxelConfig
-from canprobe.cell.scene.setup import Dynamics, Fidelity
+from canprobe.cell.scene.hardware import Fidelity
+from canprobe.cell.scene.setup import Dynamics
 from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
 from canprobe.mechanics.robot.model import ArmModel, Body
 from canprobe.mechanics.touch.pad import Pad
@@ -17,13 +18,13 @@ from canprobe.mechanics.types import Floats
 
 @dataclass(frozen=True, slots=True)
 class PressMotion:
-    """What the probe does without an arm: slow sinusoidal indentation at the object's reference point.
+    """Motion of a probe without an arm: a slow sinusoidal indentation at the object's reference point.
 
     Args:
         force_n: force at the mean depth.
         swing: amplitude of the depth over its mean.
-        frequency_hz: of the swing.
-        after_s: from the first image; until then the probe is off the object, as an array that is tared has to be.
+        frequency_hz: frequency of the swing.
+        after_s: time from the first image; until then the probe is off the object, as an array that is tared has to be.
     """
 
     force_n: float = 2.0
@@ -34,28 +35,29 @@ class PressMotion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlantConfig:
-    """What the plant is made of.
+    """Configuration of a plant.
 
     Args:
         model: the arm; None for a sensor alone, pressed on the object by ``press``.
         q0: (n,) joint positions at time 0, rad or m; empty without an arm.
         T_flange_probe_centre: (4, 4) centre of the probe sphere in the flange frame, z = pole of the pad, m.
         radius_m: probe radius.
-        stiffness_n_m3: of the elastic layer (K/h).
-        damping_s_m: Hunt-Crossley alpha (assumed).
-        object: what can be touched; None for nothing.
+        stiffness_n_m3: stiffness of the elastic layer (K/h).
+        damping_s_m: damping of the contact, Hunt-Crossley alpha (assumed).
+        object: object that can be touched; None without one.
         taxels: the array's imperfections; None where there is no array.
         pad: the array's taxels.
-        bandwidth_hz: -3 dB frequency of every drive.
-        damping_ratio: of every drive.
+        bandwidth_hz: bandwidth of every drive, -3 dB.
+        damping_ratio: damping ratio of every drive.
         press: motion of a probe without an arm.
-        seed: of taxel gains and noise.
+        seed: seed of taxel gains and noise.
         fidelity: "ideal": each motor is a second-order system; "dynamic": rigid links, friction, drive cascade, push
             of the object.
-        dynamics: of a dynamic arm.
-        bodies: (n,) of its joints, without the probe; None where nobody knows them.
-        compliance: (n,) of the joints of an ideal arm between motor and link, rad/(N m) or m/N; None: they are rigid.
-        base_offset_m: (3,) of the arm's base in the frame that counts as base.
+        dynamics: what a dynamic arm has beyond its geometry.
+        bodies: bodies (n,) of the links behind its joints, without the probe; None where they are not known.
+        compliance: compliance (n,) of the joints of an ideal arm between motor and link, rad/(N m) or m/N; None: all
+            are rigid.
+        base_offset_m: position (3,) of the arm's base in the frame that counts as base.
     """
 
     model: ArmModel | None

@@ -24,12 +24,12 @@ from canprobe.mechanics.types import Floats
 
 @dataclass(frozen=True, slots=True)
 class Stepping:
-    """How the arm is integrated.
+    """Settings of the integration of the arm.
 
     Args:
-        method: a key of ``equations.STEPS``.
+        method: name of the integrator, a key of ``integrators.STEPS``.
         step_ns: longest step.
-        hold_ns: how long mass matrix, bias and contact geometry are held.
+        hold_ns: time for which mass matrix, bias and contact geometry are held.
     """
 
     method: str = "rosenbrock"
@@ -43,7 +43,7 @@ class DynamicArm:
     Args:
         model: the arm's geometry.
         q0: (n,) joint positions at time 0, at rest, rad or m.
-        equations: of motion.
+        equations: equations of motion.
         stepping: how they are integrated.
     """
 
@@ -77,7 +77,7 @@ class DynamicArm:
         """Move the present time on; earlier times and repeats change nothing.
 
         Args:
-            t_ns: ns.
+            t_ns: present time, ns.
         """
         self.t_ns = max(self.t_ns, t_ns)
 
@@ -101,7 +101,7 @@ class DynamicArm:
         """Position of one motor now, counts, continuous.
 
         Args:
-            axis: from 0.
+            axis: number of the motor, from 0.
         """
         return float(self._state()[axis] * self._scales[axis] + self.model.zero_units[axis])
 
@@ -109,7 +109,7 @@ class DynamicArm:
         """Torque of one motor over its continuous limit, as a drive reports it (6077h).
 
         Args:
-            axis: from 0.
+            axis: number of the motor, from 0.
         """
         y = self._state()
         if self._torques is None or self._torques[0] is not y:
@@ -121,10 +121,10 @@ class DynamicArm:
         """Torque limit and feed-forwards of one drive from now on.
 
         Args:
-            axis: from 0.
-            limit_permille: largest torque, of the continuous torque; the configured limit if that is less.
-            speed: counts/s added behind the position loop.
-            torque_permille: added behind the velocity loop.
+            axis: number of the motor, from 0.
+            limit_permille: largest torque, permille of the continuous torque; the configured limit if that is less.
+            speed: speed added behind the position loop, counts/s.
+            torque_permille: torque added behind the velocity loop.
         """
         self._advance_to(self.t_ns)
         rated = 1e-3 * float(self._rated[axis])
@@ -137,7 +137,7 @@ class DynamicArm:
         """How one motor would answer to torque alone: its own inertia and friction, without the links.
 
         Args:
-            axis: from 0.
+            axis: number of the motor, from 0.
         """
         joint = self.model.joints[axis]
         return MotorDynamics(
@@ -147,7 +147,7 @@ class DynamicArm:
         )
 
     def _state(self) -> Floats:
-        """State now."""
+        """The state at the present time."""
         if self._now is None or self._now[0] != self.t_ns:
             self._advance_to(self.t_ns, keep=False)
         assert self._now is not None
@@ -168,7 +168,7 @@ class DynamicArm:
         self._now = (t_ns, y)
 
     def _bend(self) -> None:
-        """Some reference changes its slope here."""
+        """Take the slopes of the references, of which one changes here."""
         now_ns = self._y_ns
         x, v = np.array([reference.at(now_ns) for reference in self._references]).T
         theta = (x - self.model.zero_units) / self._scales

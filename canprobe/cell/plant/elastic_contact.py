@@ -11,15 +11,15 @@ from math import pi, sqrt
 from typing import NamedTuple
 
 
-class Contact(NamedTuple):
-    """What one indentation gives.
+class Indentation(NamedTuple):
+    """The contact of an indentation.
 
     Attributes:
         force: N, never negative (never adhesive).
         a: half-axis of the patch along the direction of kappa1, m.
         b: half-axis along the direction of kappa2, m; a <= b.
         area: m^2.
-        peak_pressure: at the middle of the patch, Pa, damping included.
+        peak_pressure: pressure at the middle of the patch, Pa, damping included.
         stiffness: elastic dF/dd, N/m.
         damping_factor: factor of force and pressure due to the rate of indentation, >= 0.
     """
@@ -33,7 +33,7 @@ class Contact(NamedTuple):
     damping_factor: float
 
 
-NO_CONTACT = Contact(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+NO_CONTACT = Indentation(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 def relative_curvatures(kappa: tuple[float, float], radius: float) -> tuple[float, float]:
@@ -47,7 +47,7 @@ def relative_curvatures(kappa: tuple[float, float], radius: float) -> tuple[floa
         A >= B > 0, 1/m.
 
     Raises:
-        ValueError: for a hollow as tight as the probe: the contact is then not one small patch.
+        ValueError: the hollow is as tight as the probe: the contact is then not one small patch.
     """
     A, B = 0.5 * (1.0 / radius + kappa[0]), 0.5 * (1.0 / radius + kappa[1])
     if B <= 0.0:
@@ -65,7 +65,7 @@ def elastic_contact(
     *,
     depth_rate: float = 0.0,
     damping: float = 0.0,
-) -> Contact:
+) -> Indentation:
     """Force and patch of an indentation.
 
     Args:
@@ -80,7 +80,7 @@ def elastic_contact(
         The contact; ``NO_CONTACT`` where there is none.
 
     Raises:
-        ValueError: for a hollow as tight as the probe.
+        ValueError: the hollow is as tight as the probe.
 
     Source: F = pi k d^2 / (2 sqrt(A B)), integral of the pressure; Hunt & Crossley 1975 for the damping.
     """
@@ -90,7 +90,7 @@ def elastic_contact(
     factor = max(0.0, 1.0 + 1.5 * damping * depth_rate)
     elastic = pi * stiffness_n_m3 * depth * depth / (2.0 * sqrt(A * B))
     a, b = sqrt(depth / A), sqrt(depth / B)
-    return Contact(
+    return Indentation(
         force=factor * elastic,
         a=a,
         b=b,
@@ -114,7 +114,7 @@ def depth_for_force(force: float, kappa: tuple[float, float], radius: float, sti
         Indentation, m.
 
     Raises:
-        ValueError: for a hollow as tight as the probe.
+        ValueError: the hollow is as tight as the probe.
     """
     A, B = relative_curvatures(kappa, radius)
     return sqrt(2.0 * force * sqrt(A * B) / (pi * stiffness_n_m3))

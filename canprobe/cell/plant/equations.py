@@ -16,23 +16,23 @@ import numpy as np
 from canprobe.cell.plant.cascade import DriveLoops, Drives
 from canprobe.cell.plant.ideal_arm import STICTION_RATE
 from canprobe.cell.plant.integrators import Linearised
-from canprobe.cell.plant.pushing import Contact
+from canprobe.cell.plant.pushing import HeldContact
 from canprobe.mechanics.robot.dynamics import RigidBody
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.robot.motors import joints_per_motor
 from canprobe.mechanics.types import Floats
 
-Touching = Callable[[Floats], Contact | None]
+Touching = Callable[[Floats], HeldContact | None]
 """Motor positions (n,) -> the contact near there, None where nothing is near."""
 
 
 @dataclass(frozen=True, slots=True)
 class Effects:
-    """What acts on the arm; each can be switched off.
+    """Effects that act on the arm; each can be switched off.
 
     Args:
-        gravity, coriolis: of the links.
-        friction: viscous and Coulomb, of motors and gears.
+        gravity, coriolis: forces on the links.
+        friction: viscous and Coulomb friction of motors and gears.
         links: False leaves the motors alone with the inertia at their own joint, without coupling.
         contact: the object pushes back.
     """
@@ -45,14 +45,14 @@ class Effects:
 
 
 class ArmEquations:
-    """The driven arm.
+    """Equations of the driven arm.
 
     Args:
         model: the arm.
         body: links and payload.
         loops: the drives; references and feed-forwards are set there.
         touching: contact near a posture.
-        effects: what acts; whether there is gravity is the body's.
+        effects: effects that act; gravity is a property of the body.
         held: whether ``hold`` sets what the calls use; else each call evaluates everything.
 
     Attributes:
@@ -72,7 +72,7 @@ class ArmEquations:
     ) -> None:
         self.body, self.loops, self.effects, self.held = body, loops, effects, held
         self.positions = model.n
-        self.contact: Contact | None = None
+        self.contact: HeldContact | None = None
         self._touching = touching
         self._joints_per_motor = joints_per_motor(model)
         self._rotors = np.diag([joint.rotor_inertia for joint in model.joints])

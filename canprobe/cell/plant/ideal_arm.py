@@ -13,19 +13,19 @@ from math import cos, exp, pi, sin, sqrt, tanh
 import numpy as np
 import numpy.typing as npt
 
+from canprobe.cell.plant.ramps import NEVER
 from canprobe.fieldbus.drive.motor import MotorDynamics
 from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_to_joints
 from canprobe.mechanics.types import Floats
 
 PEAK_PERMILLE = 2000
-"""Of the rated torque: what a drive can give for a while (assumed)."""
+"""Peak torque of a drive, permille of its rated torque (assumed)."""
 STICTION_RATE = 0.01
-"""rad/s over which the Coulomb torque turns its sign; of a prismatic joint m/s."""
+"""Speed over which the Coulomb torque changes its sign, rad/s; of a prismatic joint m/s."""
 
 Transition = tuple[float, float, float, float]
 State = tuple[float, float, float]
 """Position, rate and reference of one motor: counts, counts/s, counts."""
-_NEVER = 1 << 62
 
 
 def natural_frequency(bandwidth_hz: float, damping_ratio: float) -> float:
@@ -68,7 +68,7 @@ class _Axis:
 
     def __init__(self, q: float, lag: float) -> None:
         self.t_ns, self.q, self.v, self.r, self.slope = 0, q, 0.0, q, 0.0
-        self.end, self.end_ns, self.event_ns, self.lag = q, _NEVER, _NEVER, lag
+        self.end, self.end_ns, self.event_ns, self.lag = q, NEVER, NEVER, lag
         self.coming: list[tuple[int, int, float, float]] = []
 
     def at(self, phi: Transition, tau: float) -> tuple[float, float, float]:
@@ -82,7 +82,7 @@ class _Axis:
         """Follow a ramp from the anchor on (the anchor is at or after the ramp's start)."""
         t0, t1, start, end = ramp
         if self.t_ns >= t1:
-            self.r, self.slope, self.end_ns = end, 0.0, _NEVER
+            self.r, self.slope, self.end_ns = end, 0.0, NEVER
         else:
             self.slope = (end - start) / (1e-9 * (t1 - t0))
             self.r, self.end, self.end_ns = start + self.slope * 1e-9 * (self.t_ns - t0), end, t1
@@ -99,8 +99,8 @@ class _Axis:
         if self.coming and self.coming[0][0] <= self.t_ns:
             self.begin(self.coming.pop(0))
         else:
-            self.r, self.slope, self.end_ns = self.end, 0.0, _NEVER
-            self.event_ns = self.coming[0][0] if self.coming else _NEVER
+            self.r, self.slope, self.end_ns = self.end, 0.0, NEVER
+            self.event_ns = self.coming[0][0] if self.coming else NEVER
 
 
 class IdealArm:
@@ -119,7 +119,7 @@ class IdealArm:
         self.model = model
         self.w, self.z = natural_frequency(bandwidth_hz, damping_ratio), damping_ratio
         self.lag_s = 2.0 * damping_ratio / self.w
-        """How far the motors stay behind a steady ramp, s."""
+        """Lag of the motors behind a steady ramp, s."""
         self._stiffness, self._damping = self.w * self.w, 2 * damping_ratio * self.w
         self.t_ns = 0
         self._axes = [_Axis(c, self.lag_s) for c in joints_to_units(model, q0).tolist()]
@@ -138,7 +138,7 @@ class IdealArm:
         A ramp that began in the past acts from the present time on.
 
         Args:
-            axis: from 0.
+            axis: number of the motor, from 0.
             start_counts: reference at t0.
             end_counts: reference at t1 and after.
             t0_ns: start.
@@ -197,7 +197,7 @@ class IdealArm:
         """Position of one motor now, counts, continuous.
 
         Args:
-            axis: from 0.
+            axis: number of the motor, from 0.
         """
         return (self._evaluated or self._states())[axis][0]
 
@@ -207,7 +207,7 @@ class IdealArm:
         Model: reflected motor inertia, viscous and Coulomb friction; no gravity, no link inertia, no contact.
 
         Args:
-            axis: from 0.
+            axis: number of the motor, from 0.
 
         Returns:
             Permille, within the peak of +-2000.
@@ -228,10 +228,10 @@ class IdealArm:
         return max(-PEAK_PERMILLE, min(PEAK_PERMILLE, permille))
 
     def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
-        """Nothing: these motors track as they do, whatever torque that takes.
+        """Do nothing: these motors follow their reference whatever torque that takes.
 
         Args:
-            axis: from 0.
+            axis: number of the motor, from 0.
             limit_permille, speed, torque_permille: see ``DynamicArm.set_loop``.
         """
 
@@ -241,7 +241,7 @@ class IdealArm:
         The wrist's coupling is left out here: it acts on positions only.
 
         Args:
-            axis: from 0.
+            axis: number of the motor, from 0.
         """
         joint, units = self.model.joints[axis], abs(float(self.model.units_per_q[axis, axis]))
         return MotorDynamics(

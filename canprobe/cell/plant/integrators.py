@@ -25,8 +25,8 @@ import numpy as np
 from canprobe.mechanics.types import Floats
 
 GAMMA = 1.0 - sqrt(0.5)
-"""Of ROS2."""
-_MOST_PARTS = 4096
+"""Parameter γ of ROS2."""
+_MAX_PARTS = 4096
 
 
 class Linearised(NamedTuple):
@@ -44,7 +44,7 @@ class Linearised(NamedTuple):
 
 
 class Problem(Protocol):
-    """What a step asks of the equations. States begin with n positions, then their n rates, then anything."""
+    """The equations that a step needs. States begin with n positions, then their n rates, then anything."""
 
     @property
     def positions(self) -> int:
@@ -85,7 +85,7 @@ def runge_kutta_4(problem: Problem, t: float, y: Floats, h: float) -> Floats:
 
 
 def implicit_euler(problem: Problem, t: float, y: Floats, h: float) -> Floats:
-    """One Newton iteration of backward Euler."""
+    """Backward Euler by one Newton iteration."""
     rate, drift, solve = problem.linearised(t, y, h)
     new: Floats = y + h * solve(rate + h * drift)
     return new
@@ -123,10 +123,10 @@ def adaptive(problem: Problem, t: float, y: Floats, h: float, *, rtol: float = 1
     """``rosenbrock2`` in parts whose estimated error stays within ``atol + rtol |y|``, component by component.
 
     Raises:
-        ArithmeticError: when it would take more than 4096 parts.
+        ArithmeticError: the step needs more than 4096 parts.
     """
     done, part = 0.0, h
-    for _ in range(_MOST_PARTS):
+    for _ in range(_MAX_PARTS):
         part = min(part, h - done)
         new, error = _rosenbrock2(problem, t + done, y, part)
         size = float(np.max(np.abs(error) / (atol + rtol * np.maximum(np.abs(y), np.abs(new)))))
@@ -136,7 +136,7 @@ def adaptive(problem: Problem, t: float, y: Floats, h: float, *, rtol: float = 1
                 return y
         # NaN counts as an error too large
         part *= min(4.0, max(0.2, 0.9 / sqrt(size))) if size > 0.0 else 4.0 if size == 0.0 else 0.2
-    raise ArithmeticError(f"a step of {h:g} s at t = {t:g} s needs more than {_MOST_PARTS} parts")
+    raise ArithmeticError(f"a step of {h:g} s at t = {t:g} s needs more than {_MAX_PARTS} parts")
 
 
 STEPS: Mapping[str, Step] = MappingProxyType(

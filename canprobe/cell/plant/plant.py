@@ -20,11 +20,11 @@ import numpy as np
 from canprobe.cell.plant.arms import make_arm
 from canprobe.cell.plant.config import PlantConfig
 from canprobe.cell.plant.dynamic_arm import DynamicArm
-from canprobe.cell.plant.elastic_contact import NO_CONTACT, Contact, elastic_contact
+from canprobe.cell.plant.elastic_contact import NO_CONTACT, Indentation, elastic_contact
 from canprobe.cell.plant.ideal_arm import IdealArm
 from canprobe.cell.plant.pressure import Vec, pad_coordinates
-from canprobe.cell.plant.probe import PressedProbe, Probe, in_pad
-from canprobe.cell.plant.several_contacts import LEAST_CURVATURE, total_force
+from canprobe.cell.plant.probe import PressedProbe, ProbeState, in_pad
+from canprobe.cell.plant.several_contacts import MIN_CURVATURE_SHARE, total_force
 from canprobe.cell.plant.taxels import Image, TaxelArray
 from canprobe.errors import PlanError
 from canprobe.fieldbus.drive.motor import MotorDynamics
@@ -34,8 +34,8 @@ from canprobe.mechanics.touch.shapes import Nearest, PlacedShape, TouchedPlaces
 from canprobe.mechanics.types import Floats
 
 Truth = dict[str, float | bool | Floats]
-SWITCH_BEYOND = 0.01
-"""How far outside of a joint's range its limit switches are, of the range."""
+SWITCH_DISTANCE_SHARE = 0.01
+"""Distance of the limit switches beyond a joint's range, as a share of the range."""
 
 
 class PlantState(NamedTuple):
@@ -55,15 +55,15 @@ class Plant:
     """Arm, probe, object and array.
 
     Args:
-        config: what the plant is made of.
-        waits: its time stands at 0 until `begin`; False: it is the time of the calls.
+        config: configuration of the plant.
+        waits: the plant's time stands at 0 until `begin`; False: it is the time of the calls.
 
     Attributes:
         motor_counts, torque_permille: position (counts, continuous) and torque (see ``IdealArm.torque_permille``) of a
             motor now, of its axis from 0: the arm's own methods; 0 without one.
 
     Raises:
-        PlanError: for a probe without an arm over a hollow as tight as itself.
+        PlanError: a probe without an arm is over a hollow as tight as itself.
     """
 
     def __init__(self, config: PlantConfig, *, waits: bool = False) -> None:
@@ -80,7 +80,7 @@ class Plant:
         if config.object is not None and config.model is None:
             _refuse_tight_hollow(config)
             self._pressed = PressedProbe(config)
-        self._tightest = (LEAST_CURVATURE - 1.0) / config.radius_m
+        self._tightest = (MIN_CURVATURE_SHARE - 1.0) / config.radius_m
         self.array: TaxelArray | None = None
         if config.taxels is not None:
             rng = np.random.default_rng(config.seed)
@@ -103,10 +103,10 @@ class Plant:
         self._first_image_s: float | None = None
 
     def begin(self, t_ns: int) -> None:
-        """Time goes on from here, unless it does already.
+        """Start the plant's time here, unless it runs already.
 
         Args:
-            t_ns: ns.
+            t_ns: present time, ns.
         """
         if self._origin_ns is None:
             self._origin_ns = t_ns
@@ -115,7 +115,7 @@ class Plant:
         """Move the present time on; earlier times and repeats change nothing.
 
         Args:
-            t_ns: ns.
+            t_ns: present time, ns.
         """
         if self._origin_ns is None:
             return
@@ -127,7 +127,7 @@ class Plant:
                 self.arm.advance(t_ns)
 
     def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
-        """Reference of one drive, see ``IdealArm.set_ramp``.
+        """Set the reference of a drive, see ``IdealArm.set_ramp``.
 
         Raises:
             RuntimeError: without an arm.
@@ -136,13 +136,13 @@ class Plant:
         (self.arm or self._need_arm()).set_ramp(axis, start_counts, end_counts, t0_ns - origin_ns, t1_ns - origin_ns)
 
     def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
-        """Torque limit and feed-forwards of one drive, see ``DynamicArm.set_loop``; nothing without an arm.
+        """Set torque limit and feed-forwards of a drive, see ``DynamicArm.set_loop``; nothing happens without an arm.
 
         Args:
-            axis: from 0.
-            limit_permille: of the rated torque.
-            speed: counts/s.
-            torque_permille: of the rated torque.
+            axis: number of the drive, from 0.
+            limit_permille: torque limit, permille of the rated torque.
+            speed: speed that is added, counts/s.
+            torque_permille: torque that is added, permille of the rated torque.
         """
         if self.arm is not None:
             self.arm.set_loop(axis, limit_permille, speed, torque_permille)
@@ -151,7 +151,7 @@ class Plant:
         """How one motor answers to torque, see ``IdealArm.motor_dynamics``.
 
         Args:
-            axis: from 0.
+            axis: number of the drive, from 0.
 
         Raises:
             RuntimeError: without an arm.
@@ -165,13 +165,13 @@ class Plant:
         follow from where the others are now. Infinite without an arm.
 
         Args:
-            axis: from 0.
+            axis: number of the drive, from 0.
         """
         arm = self.arm
         if arm is None:
             return -inf, inf
         model, q, here = arm.model, float(arm.q[axis]), arm.motor_counts(axis)
-        beyond = SWITCH_BEYOND * (model.q_max[axis] - model.q_min[axis])
+        beyond = SWITCH_DISTANCE_SHARE * (model.q_max[axis] - model.q_min[axis])
         per_count = float(model.q_per_unit[axis, axis])
         ends = [here + (end - q) / per_count for end in (model.q_min[axis] - beyond, model.q_max[axis] + beyond)]
         return min(ends), max(ends)
@@ -203,7 +203,7 @@ class Plant:
         """(rows, columns) mean pressure of every taxel, Pa, before the array's imperfections; zeros without an array.
 
         Args:
-            state: of this plant; the present one by default.
+            state: state of this plant; the present one by default.
         """
         s = self._solution() if state is None else self._solve(state)
         if self.array is None or s.depth <= 0.0:
@@ -246,7 +246,7 @@ class Plant:
         """True values of a state, SI, base frame.
 
         Args:
-            state: of this plant; the present one by default.
+            state: state of this plant; the present one by default.
 
         Without contact ``force`` is 0 and the contact fields are those of the closest surface point; without an object
         they are zeros.
@@ -260,7 +260,7 @@ class Plant:
         return {name: np.array(value) if isinstance(value, tuple) else value for name, value in found.items()}
 
     def truths(self, states: Sequence[PlantState]) -> dict[str, Floats]:
-        """The same of many states, one row each; nothing of none."""
+        """`truth` of many states, a row each; empty without a state."""
         rows = [tuple(_true(self._solve(state)).values()) for state in states]
         names = _true(self._solve(states[0])) if states else ()
         return {name: np.array(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)}
@@ -270,17 +270,17 @@ class Plant:
             self._solved = self._solve(self.state())
         return self._solved
 
-    def _probe(self, t_ns: int, q: tuple[float, ...], qd: tuple[float, ...]) -> Probe:
+    def _probe(self, t_ns: int, q: tuple[float, ...], qd: tuple[float, ...]) -> ProbeState:
         if self._pressed is not None:
             return self._pressed.at(1e-9 * t_ns, self._first_image_s)
         if self._chain is None:
-            return Probe((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 0.0))
+            return ProbeState((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 0.0))
         c = posture(self._chain, q)
         (c0, c1, c2), (b0, b1, b2) = c.flange, self._base
-        return Probe((c0 + b0, c1 + b1, c2 + b2), (c.x, c.y, c.z), point_velocity(c, c.flange, qd))
+        return ProbeState((c0 + b0, c1 + b1, c2 + b2), (c.x, c.y, c.z), point_velocity(c, c.flange, qd))
 
     def _joints(self, motors: Sequence[float]) -> tuple[float, ...]:
-        """What the joints do where the motors do something; none without an arm."""
+        """Joint positions, or rates, of motor positions or rates; empty without an arm."""
         joints = []
         for row in self._shares:
             value = 0.0
@@ -328,11 +328,11 @@ class Plant:
         return _Solution(q, probe, foot, depth, rate, contact, (k1, k2), uv, d, several)
 
     def _given_way(self, q: tuple[float, ...], foot: Nearest, compliance: Floats) -> tuple[float, ...]:
-        """Joints (n,) that the contact has pushed back, by torque over stiffness each.
+        """Joint positions (n,) after the contact has pushed each joint back by its torque over its stiffness.
 
-        Model: at rest and linear, `q + C Jᵀ F n` with the motors where they are. F is that of the depth that is left,
-        `F = f(δ − c F)` with `c = nᵀ J C Jᵀ n`; the layer's square law makes that a quadratic. The normal is that
-        before.
+        Model: at rest and linear, `q + C Jᵀ F n` with the motors where they are. F is the force at the depth that
+        remains, `F = f(δ − c F)` with `c = nᵀ J C Jᵀ n`; the layer's square law makes that a quadratic. The normal is
+        the one before the push.
         """
         assert self._chain is not None
         config, normal = self.config, np.array(foot.normal)
@@ -347,8 +347,8 @@ class Plant:
         given: tuple[float, ...] = tuple((np.array(q) + compliance * lever * (unit * left * left)).tolist())
         return given
 
-    def _squeezed(self, shape: PlacedShape, probe: Probe, depth: float, rate: float) -> Contact:
-        """The force of all that is pressed in, whatever its shape; it has no patch of its own."""
+    def _squeezed(self, shape: PlacedShape, probe: ProbeState, depth: float, rate: float) -> Indentation:
+        """The contact with the force of the whole volume that is pressed in; it has no patch."""
         if depth <= 0.0:
             return NO_CONTACT
         config = self.config
@@ -356,8 +356,8 @@ class Plant:
         force = factor * config.stiffness_n_m3 * shape.squeezed(probe.centre, config.radius_m)
         return NO_CONTACT._replace(force=force, damping_factor=factor)
 
-    def _resting(self, touches: TouchedPlaces, probe: Probe) -> Contact:
-        """Several places at once, as one contact with the resultant force; it has no patch of its own."""
+    def _resting(self, touches: TouchedPlaces, probe: ProbeState) -> Indentation:
+        """Several places at once as one contact with the resultant force; it has no patch."""
         config = self.config
         rates = -(touches.normals @ np.array(probe.velocity))
         force = total_force(touches, config.radius_m, config.stiffness_n_m3, rates, config.damping_s_m)
@@ -374,14 +374,14 @@ def _joints_at_zero(model: ArmModel | None) -> list[float] | None:
 
 @dataclass(slots=True, eq=False)
 class _Solution:
-    """Contact at one instant."""
+    """The contact at one instant."""
 
     q: tuple[float, ...]
-    probe: Probe
+    probe: ProbeState
     foot: Nearest
     depth: float
     depth_rate: float
-    contact: Contact
+    contact: Indentation
     kappa: tuple[float, float]
     pad_uv: tuple[float, float]
     direction: Vec  # of the contact from the probe's centre, pad frame
@@ -389,7 +389,7 @@ class _Solution:
 
 
 def _true(s: _Solution) -> dict[str, float | tuple[float, ...]]:
-    """What `Plant.truth` says, in plain numbers."""
+    """The values of `Plant.truth` in plain numbers."""
     return {
         "q": s.q,
         "probe_centre": s.probe.centre,

@@ -14,17 +14,16 @@ from math import atan2, ceil, cos, floor, hypot, sin, sqrt
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from canprobe.mechanics.touch.pad import Pad
+from canprobe.mechanics.types import Floats
 
-Array = npt.NDArray[np.float64]
 Vec = tuple[float, float, float]
-Directions = tuple[tuple[float, float], tuple[float, float]] | Array
+Directions = tuple[tuple[float, float], tuple[float, float]] | Floats
 """(2, 2) rows: principal directions in the basis ``pad_basis`` of the contact direction."""
-_MARGIN = 2
+_BLUR_MARGIN = 2
 """Taxels of pressure beyond the array's edge that still blur into it."""
-_NOTHING = np.array(0.0)
+_NO_PRESSURE = np.array(0.0)
 
 
 def pad_direction(u: float, v: float, radius: float) -> Vec:
@@ -70,19 +69,19 @@ def pad_basis(direction: Vec) -> tuple[Vec, Vec]:
     return (1.0 - c * x * x, -c * x * y, -x), (-c * x * y, 1.0 - c * y * y, -y)
 
 
-def _averaging_matrix(taxels: int, samples: int, blur_pitch: float) -> Array:
+def _averaging_matrix(taxels: int, samples: int, blur_pitch: float) -> Floats:
     """(taxels, n) weights along one axis: mean over each taxel of the blurred samples."""
-    count = (taxels + 2 * _MARGIN) * samples
+    count = (taxels + 2 * _BLUR_MARGIN) * samples
     mean = np.zeros((taxels, count))
     for i in range(taxels):
-        start = (i + _MARGIN) * samples
+        start = (i + _BLUR_MARGIN) * samples
         mean[i, start : start + samples] = 1.0 / samples
     if blur_pitch <= 0.0:
         return mean
     offsets = np.subtract.outer(np.arange(count), np.arange(count)) / samples
     kernel = np.exp(-0.5 * (offsets / blur_pitch) ** 2)
     reach = np.arange(-10 * samples, 10 * samples + 1) / samples
-    weights: Array = mean @ kernel / np.exp(-0.5 * (reach / blur_pitch) ** 2).sum()
+    weights: Floats = mean @ kernel / np.exp(-0.5 * (reach / blur_pitch) ** 2).sum()
     weights[weights < 1e-12] = 0.0  # products of far tails would be denormal numbers, and slow
     return weights
 
@@ -108,9 +107,9 @@ class PressureField:
         self.radius = radius_m
         self.shape = pad.shape
         self._step = pad.pitch_m / samples
-        self._counts = (pad.rows + 2 * _MARGIN) * samples, (pad.columns + 2 * _MARGIN) * samples
+        self._counts = (pad.rows + 2 * _BLUR_MARGIN) * samples, (pad.columns + 2 * _BLUR_MARGIN) * samples
         v, u = (
-            (np.arange(count) + 0.5) * self._step - (taxels / 2 + _MARGIN) * pad.pitch_m
+            (np.arange(count) + 0.5) * self._step - (taxels / 2 + _BLUR_MARGIN) * pad.pitch_m
             for count, taxels in zip(self._counts, pad.shape, strict=True)
         )
         u, v = np.meshgrid(u, v)
@@ -126,36 +125,36 @@ class PressureField:
         low, high = floor(max(middle - reach, 0.0)), ceil(min(middle + reach, count - 1.0)) + 1
         return low, high
 
-    def points(self, centre: Array, axes: Array) -> Array:
+    def points(self, centre: Floats, axes: Floats) -> Floats:
         """(n, 3) places of all samples on the undeformed probe, base frame.
 
         Args:
             centre: (3,) of the probe, m.
             axes: (3, 3) rows: its x, y and z axes.
         """
-        places: Array = centre + self.radius * self._directions.reshape(3, -1).T @ axes
+        places: Floats = centre + self.radius * self._directions.reshape(3, -1).T @ axes
         return places
 
-    def mean_of(self, compression: Array) -> Array:
+    def mean_of(self, compression: Floats) -> Floats:
         """Taxel means of a compression given at all samples, as ``mean_pressure`` gives them.
 
         Args:
             compression: (n,) m, in the order of ``points``; negative for gaps.
         """
         grid = np.maximum(compression, 0.0).reshape(self._counts) * self._area
-        means: Array = self._rows @ grid @ self._columns
+        means: Floats = self._rows @ grid @ self._columns
         return means
 
     def mean_pressure(
         self, uv: tuple[float, float], depth: float, kappa: tuple[float, float], directions_pad: Directions
-    ) -> Array:
+    ) -> Floats:
         """Taxel means of ``depth - probe height - object height`` where positive.
 
         Args:
             uv: contact point on the pad, m.
             depth: indentation, m.
             kappa: principal curvatures of the object, 1/m, larger first.
-            directions_pad: of the contact on the pad.
+            directions_pad: directions of the contact on the pad.
 
         Returns:
             (rows, columns) layer compression, m, times taxel area over pitch^2; times k it is force over pitch^2, Pa.
@@ -172,12 +171,12 @@ class PressureField:
             return np.zeros(self.shape)
         samples = self._samples[:, r0:r1, c0:c1].reshape(5, -1)
         squeeze = _compression(samples, uv, depth, kappa, directions=given, radius=radius)
-        means: Array = self._rows[:, r0:r1].dot(squeeze.reshape(r1 - r0, -1)).dot(self._columns[c0:c1])
+        means: Floats = self._rows[:, r0:r1].dot(squeeze.reshape(r1 - r0, -1)).dot(self._columns[c0:c1])
         return means
 
 
 class ListField:
-    """As `PressureField`, of taxels at given places: each is a square of its own, without blur.
+    """A `PressureField` of taxels at given places: each is a separate square, without blur.
 
     Args:
         radius_m: probe radius.
@@ -194,29 +193,29 @@ class ListField:
         self._samples = _sample_rows(u, v, radius_m).reshape(5, -1)
         self._each = samples**2
 
-    def points(self, centre: Array, axes: Array) -> Array:
+    def points(self, centre: Floats, axes: Floats) -> Floats:
         """(n, 3) places of all samples on the undeformed probe, base frame."""
-        places: Array = centre + self.radius * self._samples[:3].T @ axes
+        places: Floats = centre + self.radius * self._samples[:3].T @ axes
         return places
 
-    def mean_of(self, compression: Array) -> Array:
+    def mean_of(self, compression: Floats) -> Floats:
         """Taxel means of a compression given at all samples."""
-        means: Array = (np.maximum(compression, 0.0) * self._samples[4]).reshape(-1, self._each).mean(axis=1)
+        means: Floats = (np.maximum(compression, 0.0) * self._samples[4]).reshape(-1, self._each).mean(axis=1)
         return means.reshape(self.shape)
 
     def mean_pressure(
         self, uv: tuple[float, float], depth: float, kappa: tuple[float, float], directions_pad: Directions
-    ) -> Array:
+    ) -> Floats:
         """Taxel means of the compression under one contact."""
         if depth <= 0.0:
             return np.zeros(self.shape)
         given = directions_pad.tolist() if isinstance(directions_pad, np.ndarray) else directions_pad
         squeeze = _compression(self._samples, uv, depth, kappa, directions=given, radius=self.radius)
-        means: Array = squeeze.reshape(-1, self._each).mean(axis=1)
+        means: Floats = squeeze.reshape(-1, self._each).mean(axis=1)
         return means.reshape(self.shape)
 
 
-def _sample_rows(u: Array, v: Array, radius: float) -> Array:
+def _sample_rows(u: Floats, v: Floats, radius: float) -> Floats:
     """(5, …) of samples at pad points: their directions; 1; and the area of a pad cell on the sphere over du dv."""
     arc = np.hypot(u, v) / radius
     sinc = np.sinc(arc / np.pi)
@@ -224,14 +223,14 @@ def _sample_rows(u: Array, v: Array, radius: float) -> Array:
 
 
 def _compression(
-    samples: Array,
+    samples: Floats,
     uv: tuple[float, float],
     depth: float,
     kappa: tuple[float, float],
     *,
     directions: Any,
     radius: float,
-) -> Array:
+) -> Floats:
     """Compression of the layer at samples (5, n), times the area of their cells.
 
     Depth less the probe's height above its lowest point, R (1 - s.d), which is exact, less the object's heights along
@@ -246,7 +245,7 @@ def _compression(
             root = radius * sqrt(0.5 * abs(curvature))
             a, b = root * mx, root * my
             rows.append((a * x0 + b * y0, a * x1 + b * y1, a * x2 + b * y2, 0.0))
-    squeeze: Array
+    squeeze: Floats
     squeeze, *across = np.array(rows).dot(samples[:4])
     for curvature, height in zip(filter(None, kappa), across, strict=True):
         np.square(height, out=height)
@@ -254,6 +253,6 @@ def _compression(
             squeeze -= height
         else:
             squeeze += height
-    np.maximum(squeeze, _NOTHING, out=squeeze)
+    np.maximum(squeeze, _NO_PRESSURE, out=squeeze)
     squeeze *= samples[4]
     return squeeze

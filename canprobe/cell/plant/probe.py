@@ -16,7 +16,7 @@ Axes = tuple[Vec, Vec, Vec]
 
 
 @dataclass(slots=True, eq=False)
-class Probe:
+class ProbeState:
     """Probe sphere now: centre, axes (columns x, y, z = pole) and velocity of the centre, base frame."""
 
     centre: Vec
@@ -24,15 +24,15 @@ class Probe:
     velocity: Vec
 
 
-OFF = 1e-3
-"""How far the probe is off the object before the press begins, m."""
+PRESS_GAP = 1e-3
+"""Distance of the probe from the object before the press begins, m."""
 
 
 class PressedProbe:
     """Probe without an arm, pole against the object's normal at its origin.
 
     Args:
-        config: with an object.
+        config: configuration of a plant with an object.
     """
 
     def __init__(self, config: PlantConfig) -> None:
@@ -47,30 +47,30 @@ class PressedProbe:
         )
         self._radius, self._press = config.radius_m, config.press
 
-    def at(self, t_s: float, first_s: float | None) -> Probe:
-        """Where it is.
+    def at(self, t_s: float, first_s: float | None) -> ProbeState:
+        """State of the probe at a time.
 
         Args:
-            t_s: s.
+            t_s: time, s.
             first_s: time of the first image, s; None before it.
         """
         waits = self._press.after_s
         if waits and (first_s is None or t_s < first_s + waits):
-            centre = self._origin + (self._radius + OFF) * self._normal
-            return Probe(tuple(centre.tolist()), self._axes, (0.0, 0.0, 0.0))
+            centre = self._origin + (self._radius + PRESS_GAP) * self._normal
+            return ProbeState(tuple(centre.tolist()), self._axes, (0.0, 0.0, 0.0))
         rate = 2 * pi * self._press.frequency_hz
         depth = self._mean * (1.0 + self._press.swing * sin(rate * t_s))
         speed = -self._mean * self._press.swing * rate * cos(rate * t_s)
         centre, velocity = self._origin + (self._radius - depth) * self._normal, speed * self._normal
-        return Probe(tuple(centre.tolist()), self._axes, tuple(velocity.tolist()))
+        return ProbeState(tuple(centre.tolist()), self._axes, tuple(velocity.tolist()))
 
 
-def in_pad(foot: Nearest, probe: Probe, d: Vec) -> Directions:
+def in_pad(foot: Nearest, probe: ProbeState, d: Vec) -> Directions:
     """Principal directions in the transported pad basis at the contact direction.
 
     Args:
-        foot: of the contact on the object.
-        probe: of which the pad is.
+        foot: nearest point of the object to the probe's centre.
+        probe: probe that carries the pad.
         d: direction of the contact from the probe's centre, pad frame.
     """
     u, v = (_along(probe.axes, e) for e in pad_basis(d))

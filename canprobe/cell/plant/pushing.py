@@ -22,7 +22,7 @@ SLIP_M_S = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class Rubbing:
-    """What acts besides the layer's elasticity.
+    """Damping and friction of the contact.
 
     Args:
         damping_s_m: Hunt-Crossley alpha.
@@ -33,7 +33,7 @@ class Rubbing:
     friction: float = 0.3
 
 
-class Contact:
+class HeldContact:
     """The object's push on the n motors near a posture, in k places.
 
     Args:
@@ -98,7 +98,7 @@ class Contact:
 
 
 class Neighbourhood:
-    """What ``ArmEquations`` asks for the contact.
+    """Makes the contact near a posture, for ``ArmEquations``.
 
     Args:
         chain: the arm.
@@ -106,8 +106,8 @@ class Neighbourhood:
         T_flange_probe: (4, 4) probe centre on the flange, m.
         base_offset: (3,) of the arm's base, m.
         shape: the object.
-        radius: of the probe, m.
-        stiffness_n_m3: of the layer.
+        radius: radius of the probe, m.
+        stiffness_n_m3: stiffness of the layer.
         rubbing: damping and friction.
     """
 
@@ -127,7 +127,7 @@ class Neighbourhood:
         self.stiffness_n_m3, self.rubbing = stiffness_n_m3, rubbing
         self._joints_per_motor, self._base = joints_per_motor, base_offset
 
-    def __call__(self, theta: Floats) -> Contact | None:
+    def __call__(self, theta: Floats) -> HeldContact | None:
         """Contact held at a posture of the motors; None where the object is farther than a cycle's way.
 
         Args:
@@ -149,7 +149,7 @@ class Neighbourhood:
         touched = own + np.minimum(touches.distances, self.radius)[:, None] * -normals
         J = np.array([jacobian(at, tuple(point))[:3] for point in touched.tolist()])
         coefficient, exponent = force_laws(touches, self.radius, self.stiffness_n_m3)
-        return Contact(
+        return HeldContact(
             theta,
             depth,
             (frames[:, :, None] @ J)[:, :, 0] @ self._joints_per_motor,

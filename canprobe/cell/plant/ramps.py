@@ -1,10 +1,11 @@
-"""What a drive is asked for: straight ramps of counts, one after the other, each holding its end."""
+"""The reference of a drive: straight ramps of counts, one after the other; the end of a ramp is held."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 NEVER = 1 << 62
+"""A time, ns, that no run reaches."""
 Ramp = tuple[int, int, float, float]
 """Start and end time (ns), start and end (counts)."""
 
@@ -13,7 +14,7 @@ class Reference:
     """Reference of one motor.
 
     Args:
-        counts: where it stands until the first ramp.
+        counts: position until the first ramp.
     """
 
     __slots__ = ("_ramps",)

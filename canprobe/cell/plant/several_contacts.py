@@ -12,8 +12,8 @@ import numpy as np
 from canprobe.mechanics.touch.shapes import TouchedPlaces
 from canprobe.mechanics.types import Floats
 
-LEAST_CURVATURE = 1e-2
-"""Of the gap, in curvatures of the ball: a hollow nearer to the ball's own radius counts as this much wider."""
+MIN_CURVATURE_SHARE = 1e-2
+"""Least curvature of the gap, as a share of the ball's: a tighter hollow counts as a hollow that leaves this much."""
 NEAR_M = 2e-3
 """Gaps wider than this cannot close within a cycle of the cell."""
 
@@ -23,9 +23,9 @@ def widened(kappa: Floats, radius: float) -> Floats:
 
     Args:
         kappa: (..., 2) 1/m.
-        radius: of the ball, m.
+        radius: radius of the ball, m.
     """
-    return np.maximum(kappa, (LEAST_CURVATURE - 1.0) / radius)
+    return np.maximum(kappa, (MIN_CURVATURE_SHARE - 1.0) / radius)
 
 
 def force_laws(touches: TouchedPlaces, radius: float, stiffness_n_m3: float) -> tuple[Floats, Floats]:
@@ -33,8 +33,8 @@ def force_laws(touches: TouchedPlaces, radius: float, stiffness_n_m3: float) -> 
 
     Args:
         touches: n places.
-        radius: of the ball, m.
-        stiffness_n_m3: of its layer.
+        radius: radius of the ball, m.
+        stiffness_n_m3: stiffness of its layer.
 
     Returns:
         (n,) in N and m, and (n,).
@@ -51,8 +51,8 @@ def total_force(touches: TouchedPlaces, radius: float, stiffness_n_m3: float, ra
 
     Args:
         touches: n places.
-        radius: of the ball, m.
-        stiffness_n_m3: of its layer.
+        radius: radius of the ball, m.
+        stiffness_n_m3: stiffness of its layer.
         rates: (n,) of indentation, m/s.
         damping: Hunt-Crossley alpha, s/m.
     """

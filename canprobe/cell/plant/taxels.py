@@ -15,20 +15,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from canprobe.cell.plant.pressure import Array, Directions, ListField, PressureField
-from canprobe.mechanics.touch.pad import Pad
+from canprobe.cell.plant.pressure import Directions, ListField, PressureField
+from canprobe.mechanics.touch.pad import COUNTS_MAX, Pad
+from canprobe.mechanics.types import Floats
 
-Image = npt.NDArray[np.uint8] | npt.NDArray[np.float64]
+Image = npt.NDArray[np.uint8] | Floats
 
 _CREEP_TIMES_S = (0.3, 3.0, 30.0, 300.0)
 _SATURATION_KNEE = 1.25
-_FULL_SCALE = 255
-"""Counts of full scale, whatever the ADC resolves."""
 MAX_SAMPLE_DISTANCE_M = 1e-3
 """Distance of the samples of a pressure field: a first touch of 0.1 N on a probe of 10 mm is 3 mm wide, and of a mat
 with taxels 30 mm apart three samples a taxel would miss it."""
 _NOISE_IMAGES = 8
-"""How many images' noise is drawn at once."""
+"""Number of images whose noise is drawn at once."""
 _ONE = np.array(1.0)  # a number that is an array already costs a ufunc less
 
 
@@ -47,7 +46,7 @@ class TaxelConfig:
         noise: standard deviation per sample, in full scales.
         threshold: readings below this share of full scale become 0.
         dead: (row, column) of taxels that read 0.
-        adc_bits: of the ADC; 8 gives whole counts, more give parts of counts.
+        adc_bits: bits of the ADC; 8 gives whole counts, more give parts of counts.
         samples: samples of the pressure field per taxel and axis; more where they would lie more than
             `MAX_SAMPLE_DISTANCE_M` apart.
     """
@@ -67,12 +66,12 @@ class TaxelConfig:
 
     @property
     def adc_max(self) -> int:
-        """What the ADC says at full scale."""
+        """Reading of the ADC at full scale."""
         return (1 << self.adc_bits) - 1
 
     @property
     def adc_threshold(self) -> int:
-        """Least that the ADC says above the threshold."""
+        """Least reading of the ADC above the threshold."""
         return int(np.ceil(self.threshold * self.adc_max))
 
     def without(self, *effects: str) -> TaxelConfig:
@@ -82,7 +81,7 @@ class TaxelConfig:
             *effects: of "noise", "gain_error", "blur", "hysteresis", "creep", "crosstalk", "saturation", "threshold".
 
         Raises:
-            ValueError: for an effect that does not exist.
+            ValueError: there is no such effect.
         """
         fields = {"blur": "blur_pitch", "creep": "creep_per_decade"}
         known = ("noise", "gain_error", "blur", "hysteresis", "creep", "crosstalk", "saturation", "threshold")
@@ -94,7 +93,7 @@ class TaxelConfig:
 
 
 IDEAL_TAXELS = TaxelConfig().without("noise", "gain_error", "blur", "hysteresis", "creep", "crosstalk", "saturation")
-"""Only averaging, ADC and threshold."""
+"""An array without imperfections: averaging, ADC and threshold only."""
 
 
 class TaxelArray:
@@ -104,7 +103,7 @@ class TaxelArray:
         config: the imperfections.
         rng: source of gains and noise.
         radius_m: radius of the sphere it is wrapped on.
-        stiffness_n_m3: of the elastic layer.
+        stiffness_n_m3: stiffness of the elastic layer.
         pad: its taxels; None: 16×16 over one inch.
     """
 
@@ -133,11 +132,11 @@ class TaxelArray:
         self._loop = np.zeros(pad.shape)
         # Rows: the relaxations, and the image that drives them; and where the next ones are put.
         self._creep, self._next = np.zeros((2, len(_CREEP_TIMES_S) + 1, pad.taxels))
-        self._relaxed: dict[int, Array] = {}
+        self._relaxed: dict[int, Floats] = {}
         self._t_s: float | None = None
         self._columns = _leaks(pad.columns, config.crosstalk)
         self._rows = _leaks(pad.rows, config.crosstalk) * float(config.adc_max)
-        self._noise: list[Array] = []
+        self._noise: list[Floats] = []
         self._readings = _readings(config)
         self._has_dead = bool(config.dead)
         self._dead = tuple(np.array(config.dead, dtype=np.intp).reshape(-1, 2).T)
@@ -162,22 +161,22 @@ class TaxelArray:
             uv: contact point on the pad, m.
             depth: indentation, m; <= 0 is no contact.
             kappa: principal curvatures of the object, 1/m, larger first.
-            directions_pad: of the contact on the pad.
+            directions_pad: directions of the contact on the pad.
             t_s: time of the sample, s, not before the previous one.
-            pressure_factor: of the layer's damping.
+            pressure_factor: factor of the pressure by the layer's damping.
 
         Returns:
             (rows, columns) counts of 255 at full scale; whole numbers (uint8) of an ADC of 8 bits, else float.
         """
         return self.image_of(self.field.mean_pressure(uv, depth, kappa, directions_pad), t_s, pressure_factor)
 
-    def image_of(self, compression: Array, t_s: float, pressure_factor: float = 1.0) -> Image:
+    def image_of(self, compression: Floats, t_s: float, pressure_factor: float = 1.0) -> Image:
         """The rest of the pipeline: sample the array once under a known compression of the layer.
 
         Args:
             compression: (rows, columns) taxel means as ``PressureField`` gives them, m; used up.
             t_s: time of the sample, s, not before the previous one.
-            pressure_factor: of the layer's damping.
+            pressure_factor: factor of the pressure by the layer's damping.
 
         Returns:
             (rows, columns) counts.
@@ -191,7 +190,7 @@ class TaxelArray:
             return self._convert(self._rows.dot(y).dot(self._columns))
         return self._convert(y * float(self.config.adc_max))
 
-    def _remember(self, y: Array, t_s: float) -> Array:
+    def _remember(self, y: Floats, t_s: float) -> Floats:
         """Hysteresis, then creep."""
         if self.config.hysteresis > 0.0:
             # Play with proportional edges (generalised Prandtl-Ishlinskii): the output rests until the input has
@@ -203,11 +202,11 @@ class TaxelArray:
         if self.config.creep_per_decade > 0.0:
             self._creep[-1] = y.reshape(-1)
             self._creep, self._next = np.dot(self._relaxed_by(dt), self._creep, out=self._next), self._creep
-            crept: Array = self._creep[-1].reshape(self.pad.shape)
+            crept: Floats = self._creep[-1].reshape(self.pad.shape)
             return crept
         return y
 
-    def _relaxed_by(self, dt: float) -> Array:
+    def _relaxed_by(self, dt: float) -> Floats:
         """(5, 5) what becomes of relaxations and image in a time: the relaxations then, and the crept image.
 
         Sum of relaxations a decade apart: c per decade for a step, linear, superposes under moving loads.
@@ -226,8 +225,8 @@ class TaxelArray:
             self._relaxed[dt_ns] = matrix
         return matrix
 
-    def _convert(self, counts: Array) -> Image:
-        """Noise, ADC, threshold, dead taxels."""
+    def _convert(self, counts: Floats) -> Image:
+        """Apply noise, ADC, threshold and dead taxels."""
         if self.config.noise > 0.0:
             counts += self._drawn()
         else:
@@ -237,7 +236,7 @@ class TaxelArray:
             read[self._dead] = 0
         return read
 
-    def _drawn(self) -> Array:
+    def _drawn(self) -> Floats:
         """(rows, columns) noise of one image in counts, and the half count that makes cutting off rounding."""
         if not self._noise:
             noise = self._rng.standard_normal((_NOISE_IMAGES, *self.pad.shape))
@@ -247,7 +246,7 @@ class TaxelArray:
         return self._noise.pop()
 
 
-def _leaks(taxels: int, crosstalk: float) -> Array:
+def _leaks(taxels: int, crosstalk: float) -> Floats:
     """(n, n) what becomes of the signals along a row or column: a share of each spreads over the others."""
     if taxels == 1:
         return np.ones((1, 1))
@@ -256,13 +255,13 @@ def _leaks(taxels: int, crosstalk: float) -> Array:
 
 
 def _readings(config: TaxelConfig) -> npt.NDArray[Any]:
-    """What is read at each count of the ADC, in counts of 255 at full scale; 0 below the threshold."""
+    """Reading at each count of the ADC, in counts of 255 at full scale; 0 below the threshold."""
     counts = np.arange(config.adc_max + 1)
     counts[counts < config.adc_threshold] = 0
-    return counts.astype(np.uint8) if config.adc_max == _FULL_SCALE else counts * float(_FULL_SCALE) / config.adc_max
+    return counts.astype(np.uint8) if config.adc_max == COUNTS_MAX else counts * float(COUNTS_MAX) / config.adc_max
 
 
-def _saturate(x: Array) -> Array:
+def _saturate(x: Floats) -> Floats:
     """Power-law knee, exponent 4: 0.2 % low at half of full scale, 8 % at full scale, then flat; in place."""
     fourth = x * (1.0 / _SATURATION_KNEE)
     np.square(fourth, out=fourth)

@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from canprobe.cell.scene.geometry import Array, T_flange_probe, expected_ball
+from canprobe.cell.scene.geometry import T_flange_probe, expected_ball
 from canprobe.cell.scene.load import Reader, read_toml, with_writer, written_by_line
 from canprobe.cell.scene.model import PlantSettings, ProbeSettings, Scene
 from canprobe.errors import SceneError
 from canprobe.mechanics.robot.tool_calibration import ToolEstimate
+from canprobe.mechanics.types import Floats
 
 FILE = "tool.toml"
 KEYS = ("centre_offset_mm", "centre_lateral_mm")
@@ -45,7 +46,7 @@ def summarise_calibration(scene: Scene, estimate: ToolEstimate | None) -> dict[s
     }
 
 
-def _known(values: Array) -> list[float | None]:
+def _known(values: Floats) -> list[float | None]:
     return [float(value) if np.isfinite(value) else None for value in values]
 
 

@@ -8,7 +8,7 @@ whole for its task).
 
 - `model` is the scene as frozen dataclasses: one field a key, its type and checks in the annotation, its meaning
   below. `checks` has the checks, `rules` what goes together across keys, and which sections a task needs.
-- `hardware` has the sections of a cell file: chain, joints and drives, what makes emulated drives difficult. A scene
+- `hardware` has sections of a cell file: bus, bring-up, chain, joints and drives, emulated difficulties. A scene
   names a cell and takes from it what it does not say itself; a scene with a section `[cell]` is whole.
 - `load` reads a file and reports every mistake at once; `dump_scene` writes a scene back. Scenes cross processes as
   text.

@@ -1,4 +1,4 @@
-"""From the sections `[arm]` and `[joints.*]` to the arm: chain, joints, drive units, bodies, drives.
+"""Makes the arm of the sections `[arm]` and `[joints.*]`: chain, joints, drive units, bodies, drives.
 
 The chain is read from a URDF or from Denavit-Hartenberg rows. What a joint's section gives replaces what the URDF says.
 """
@@ -13,20 +13,18 @@ from typing import Literal
 import numpy as np
 
 from canprobe.cell.scene.geometry import transform
-from canprobe.cell.scene.hardware import ArmSettings, JointSettings
-from canprobe.cell.scene.setup import Homing
+from canprobe.cell.scene.hardware import MM, ArmSettings, JointSettings
+from canprobe.cell.scene.setup import HomingParameters
 from canprobe.errors import PlanError
-from canprobe.mechanics.robot.chain import Chain
 from canprobe.mechanics.robot.denavit_hartenberg import dh_step, from_dh
 from canprobe.mechanics.robot.model import ArmModel, Body, Joint, lopsided_inertia, negative_inertia
 from canprobe.mechanics.robot.urdf import UrdfArm, from_urdf, limit_warning
 from canprobe.mechanics.types import Floats
 
 Bodies = tuple[Body | None, ...] | None
-SLOWEST_RAD_S, SLOWEST_M_S = math.radians(0.01), 1e-5
+MIN_SPEED_RAD_S, MIN_SPEED_M_S = math.radians(0.01), 1e-5
 """Speed limits below which a joint of a URDF practically stands: a degree takes it longer than a minute and a half."""
 
-_MM = 1e-3
 _OF_REVOLUTE = {
     "q_min": ("min_deg", math.radians(1)),
     "q_max": ("max_deg", math.radians(1)),
@@ -37,27 +35,27 @@ _OF_REVOLUTE = {
     "viscous": ("viscous_nm_s", 1.0),
 }
 _OF_PRISMATIC = {
-    "q_min": ("min_mm", _MM),
-    "q_max": ("max_mm", _MM),
-    "qd_max": ("speed_mm_s", _MM),
+    "q_min": ("min_mm", MM),
+    "q_max": ("max_mm", MM),
+    "qd_max": ("speed_mm_s", MM),
     "rated_torque": ("rated_force_n", 1.0),
     "rotor_inertia": ("rotor_mass_kg", 1.0),
     "coulomb": ("coulomb_n", 1.0),
     "viscous": ("viscous_n_s_m", 1.0),
 }
-"""Field of a `Joint` → key of a section, and what its unit is in SI."""
+"""Field of a `Joint` → key of a section, and its unit in SI."""
 _PRISMATIC_DEFAULTS = {"rated_torque": 200.0, "rotor_inertia": 5.0, "coulomb": 20.0, "viscous": 20.0}
 
 
 def arm_model(
     name: str, arm: ArmSettings, sections: Mapping[str, JointSettings]
 ) -> tuple[ArmModel, Bodies, tuple[str, ...]]:
-    """The arm of a cell, the bodies of its links, None where masses are not known, and what its URDF hardly means.
+    """The arm of a cell, the bodies of its links (None where masses are not known), and warnings about its URDF.
 
     Args:
-        name: of the cell.
-        arm: its section.
-        sections: those of its joints, from the base.
+        name: name of the cell.
+        arm: the section `[arm]`.
+        sections: the sections of the joints, from the base.
 
     Raises:
         PlanError: the URDF cannot be used, or joints and sections contradict each other.
@@ -66,7 +64,9 @@ def arm_model(
     if arm.urdf is not None:
         found = from_urdf(arm.urdf, arm.base, arm.tip, name=name)
         _refuse_other_names(found, sections, arm)
-        chain = _moved(found.chain, mount, flange)
+        fixed = found.chain.fixed.copy()
+        fixed[0] = mount @ fixed[0]
+        chain = replace(found.chain, fixed=fixed, T_last_flange=found.chain.T_last_flange @ flange)
         joints = [_joint(section, joint) for section, joint in zip(sections.values(), found.joints, strict=True)]
         _refuse_standstill(arm.urdf, found.joints, sections)
         bodies: Bodies = found.bodies if any(found.bodies) else None
@@ -78,8 +78,7 @@ def arm_model(
         warnings = tuple(warning for warning in found.warnings if warning not in settled)
     else:
         rows = [
-            (s.a_mm * _MM, math.radians(s.alpha_deg), s.d_mm * _MM, math.radians(s.theta_deg))
-            for s in sections.values()
+            (s.a_mm * MM, math.radians(s.alpha_deg), s.d_mm * MM, math.radians(s.theta_deg)) for s in sections.values()
         ]
         slides = [section.kind == "prismatic" for section in sections.values()]
         chain = from_dh(
@@ -115,12 +114,12 @@ def _refuse_other_names(found: UrdfArm, sections: Mapping[str, JointSettings], a
 
 
 def _refuse_standstill(urdf: str, joints: Sequence[Joint], sections: Mapping[str, JointSettings]) -> None:
-    """The file's speed limit counts where the section has none; a missing or tiny one was hardly meant."""
+    """Refuse a missing or tiny speed limit of the file where the section has none: it was hardly meant."""
     problems = [
         f"{urdf}: joint {joint.name}: expected a velocity in its <limit> of at least {slowest:.3g} {unit}/s, got"
         f" {joint.qd_max:g}; put it right there, or set joints.{joint.name}.speed_{joint.unit}_s"
         for joint, section in zip(joints, sections.values(), strict=True)
-        for slowest, unit in [(SLOWEST_M_S, "m") if joint.prismatic else (SLOWEST_RAD_S, "rad")]
+        for slowest, unit in [(MIN_SPEED_M_S, "m") if joint.prismatic else (MIN_SPEED_RAD_S, "rad")]
         if (section.speed_mm_s if joint.prismatic else section.speed_deg_s) is None and not joint.qd_max >= slowest
     ]
     problems += [
@@ -135,12 +134,6 @@ def _refuse_standstill(urdf: str, joints: Sequence[Joint], sections: Mapping[str
 
 def _stops(joint: Joint, section: JointSettings) -> tuple[float | None, float | None]:
     return (section.min_mm, section.max_mm) if joint.prismatic else (section.min_deg, section.max_deg)
-
-
-def _moved(chain: Chain, mount: Floats, flange: Floats) -> Chain:
-    fixed = chain.fixed.copy()
-    fixed[0] = mount @ fixed[0]
-    return replace(chain, fixed=fixed, T_last_flange=chain.T_last_flange @ flange)
 
 
 def _bare(name: str, section: JointSettings) -> Joint:
@@ -189,7 +182,7 @@ def _refuse_impossible_inertia(sections: Mapping[str, JointSettings]) -> None:
 def _body(section: JointSettings, row: tuple[float, float, float, float], arm: ArmSettings) -> Body:
     """The link behind a joint, in the frame of the joint; a row gives it in the frame that the row leads to."""
     T = np.eye(4) if arm.convention == "modified" else dh_step(*row)
-    return Body(section.mass_kg or 0.0, np.array(section.com_mm) * _MM, _tensor(section)).moved(T)
+    return Body(section.mass_kg or 0.0, np.array(section.com_mm) * MM, _tensor(section)).moved(T)
 
 
 def joint_compliance(sections: Mapping[str, JointSettings]) -> Floats | None:
@@ -202,25 +195,25 @@ def per_joint(sections: Mapping[str, JointSettings], key: Literal["start", "swin
     """(n,) rad or m of a key that is in degrees or in millimetres, as the joint turns or slides."""
     return np.array(
         [
-            getattr(s, f"{key}_mm") * _MM if s.kind == "prismatic" else math.radians(getattr(s, f"{key}_deg"))
+            getattr(s, f"{key}_mm") * MM if s.kind == "prismatic" else math.radians(getattr(s, f"{key}_deg"))
             for s in sections.values()
         ]
     )
 
 
-def homing_of(section: JointSettings, number: int) -> Homing | None:
-    """How the drive of a joint, by its number from 1, is homed; None where its encoder is absolute."""
+def homing_of(section: JointSettings, number: int) -> HomingParameters | None:
+    """Parameters of homing of a joint, by its number from 1; None where its encoder is absolute."""
     if section.zero == "absolute":
         return None
     slides = section.kind == "prismatic"
     assert section.homing_method is not None
-    return Homing(
+    return HomingParameters(
         section.homing_method,
         section.homing_order or number,
-        home=(section.home_mm or 0.0) * _MM if slides else math.radians(section.home_deg or 0.0),
-        speed=section.homing_speed_mm_s * _MM if slides else math.radians(section.homing_speed_deg_s),
-        zero_speed=section.homing_zero_speed_mm_s * _MM if slides else math.radians(section.homing_zero_speed_deg_s),
-        acceleration=section.homing_acceleration_mm_s2 * _MM
+        home=(section.home_mm or 0.0) * MM if slides else math.radians(section.home_deg or 0.0),
+        speed=section.homing_speed_mm_s * MM if slides else math.radians(section.homing_speed_deg_s),
+        zero_speed=section.homing_zero_speed_mm_s * MM if slides else math.radians(section.homing_zero_speed_deg_s),
+        acceleration=section.homing_acceleration_mm_s2 * MM
         if slides
         else math.radians(section.homing_acceleration_deg_s2),
         timeout_s=section.homing_timeout_s,

@@ -41,16 +41,16 @@ Stiffness = Annotated[float, Range(1e5, 1e12)]
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """`[calibration]`: what the file is of."""
+    """`[calibration]`: about the file."""
 
     schema: Annotated[int, OneOf((SCHEMA,))]
     """Version of the file's form."""
     array: str
-    """Which array, or which make."""
+    """Name of the array, or of its make."""
     date: str
     """Date of the touches."""
     made_on: str
-    """Cell and objects."""
+    """Cell and objects of the touches."""
     force_reference: ForceReference
     """What newtons rest on: `scale`, `weights`, `unit` (the stated full scale), or `none`: nominal newtons."""
     full_scale_kpa: Annotated[float, Range(10, 1000)]
@@ -80,13 +80,13 @@ class MomentKeys:
     """`[moments]`: errors of second moments, relative."""
 
     sigma_percent: Percent
-    """Along an axis of the patch: what no averaging removes."""
+    """Error along an axis of the patch that no averaging removes."""
     both: Annotated[float, Range(-1, 1)]
     """Correlation of the errors along the two axes."""
     shear_percent: Percent
-    """Of the mixed moment."""
+    """Error of the mixed moment."""
     frame_percent: Percent
-    """From one image to the next."""
+    """Error that changes from one image to the next."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,13 +102,13 @@ class CentroidKeys:
     correlated: Share
     """Share of the variance that this part has."""
     latency_ms: Annotated[float, Range(-1000, 1000)]
-    """By which images are older than their time stamps."""
+    """Time by which images are older than their time stamps."""
     latency_sigma_ms: Annotated[float, Range(0, 1e6)]
     """Standard deviation of `latency_ms`."""
     lag_um: Annotated[float, Range(0, 100_000)]
-    """By which the centroid trails the contact at most."""
+    """Largest distance by which the centroid trails the contact."""
     lag_way_um: Annotated[float, Range(0, 1e9, open_low=True)]
-    """Way at which it trails by half of that."""
+    """Way after which the centroid trails by half of that."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +118,7 @@ class StiffnessKeys:
     moments_sigma_percent: Percent
     """Standard deviation of `image.stiffness_n_m3`."""
     depth_n_m3: Stiffness | None = None
-    """From the way of the arm into the object."""
+    """Stiffness from the way of the arm into the object."""
     depth_sigma_percent: Percent | None = None
     """Its standard deviation."""
     arm_compliance_um_n: float | None = None
@@ -132,20 +132,20 @@ class ResidualKeys:
     """`[residuals]`: RMS errors of touches that the fit has not seen; of curvatures relative to (K + 1/R)."""
 
     touches: Annotated[int, Range(0, 1000)]
-    """Touches of plane and ball."""
+    """Number of touches of plane and ball."""
     moments_percent: Percent
-    """Of second moments."""
+    """Error of second moments."""
     curvature_percent: Percent
-    """Of curvatures from one touch."""
+    """Error of curvatures from one touch."""
     force_percent: Percent | None = None
-    """Of reference forces."""
+    """Error of reference forces."""
     rod_curvature_percent: Percent | None = None
-    """Of the curvature of the rod, which no fit has used."""
+    """Error of the curvature of the rod, which no fit has used."""
 
 
 @dataclass(frozen=True, slots=True)
 class TaxelKeys:
-    """`[taxels]`: of this one array. A file of a make has no such section."""
+    """`[taxels]`: taxels of a single array. The file of a make has no such section."""
 
     dead: tuple[tuple[int, int], ...] = ()
     """Row and column of taxels that read nothing."""
@@ -173,7 +173,7 @@ def load_calibration(name_or_path: str | Path) -> ArrayCalibration:
         name_or_path: a packaged calibration's name, such as `inch16`, or the path of a TOML file.
 
     Raises:
-        SceneError: with every problem found.
+        SceneError: the file has problems; the error has all of them.
     """
     name = str(name_or_path)
     packaged = packaged_files("calibrations")
@@ -194,7 +194,7 @@ def load_calibration(name_or_path: str | Path) -> ArrayCalibration:
 
 
 def _calibration(file: CalibrationFile) -> ArrayCalibration:
-    """In SI units."""
+    """The calibration of a file in SI units."""
     about, image, moments, centroid = file.calibration, file.image, file.moments, file.centroid
     variance = (1e-2 * moments.sigma_percent) ** 2
     k = image.stiffness_n_m3

@@ -1,4 +1,4 @@
-"""What a value of a file may be: small checks in the annotations of `canprobe.cell.scene.model`, and `convert`.
+"""Checks of the values of a file, which stand in the annotations of `canprobe.cell.scene.model`, and `convert`.
 
 `convert` turns what `tomllib` read into the annotated type, or says what was expected. Nothing is coerced silently
 except an integer where a number is wanted (TOML's `25` for `25.0`); a boolean is never a number.
@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 
 class MismatchError(ValueError):
-    """A value that is not what its annotation says; the text is what was expected."""
+    """A value that does not match its annotation; the text is what was expected."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ def Range(low: float, high: float, *, open_low: bool = False) -> Check:
     """Numbers from `low` to `high`, both included unless `open_low` leaves the lower end out."""
     first, last = (str(end) if isinstance(end, int) else f"{end:g}" for end in (low, high))
     if open_low:
-        return Check(f"above {first} up to {last}", lambda value: value - low >= _LEAST_ABOVE and value <= high)
+        return Check(f"above {first} up to {last}", lambda value: value - low >= _MIN_ABOVE_LIMIT and value <= high)
     return Check(f"from {first} to {last}", lambda value: low <= value <= high)
 
 
@@ -68,10 +68,10 @@ class ScenePath:
     """A packaged file's name, or a path that is looked up beside the file first."""
 
 
-LARGEST = 1e20
-"""Size of a number in any unit of a scene: products of such numbers are numbers."""
-_LEAST_ABOVE = 1e-30
-"""What is above a limit is so by this: quotients by it are numbers."""
+MAX_NUMBER = 1e20
+"""Largest size of a number in any unit of a scene: products of such numbers are finite."""
+_MIN_ABOVE_LIMIT = 1e-30
+"""Least distance of a number above an excluded limit: quotients by it are finite."""
 
 _UNIONS = (types.UnionType, typing.Union)
 _NAMES = {float: ("a number", "numbers"), int: ("an integer", "integers"), str: ("text", "texts")}
@@ -81,22 +81,22 @@ def convert(value: object, annotation: Any) -> Any:
     """Return `value` as the annotated type.
 
     Args:
-        value: as read by `tomllib`.
+        value: the value as `tomllib` read it.
         annotation: a type, `Annotated` with checks, `Literal`, `tuple[...]` or `X | None`.
 
     Raises:
-        MismatchError: with what was expected.
+        MismatchError: the value has another type or range; the text is what was expected.
     """
     try:
         return _converted(value, annotation)
     except (ValueError, OverflowError):  # the latter for an integer that no float holds
         unsaid = _beyond(value) and not conditions_of(annotation, Check)  # no range says it
-        beyond = f", at most {LARGEST:g} in size" if unsaid else ""
+        beyond = f", at most {MAX_NUMBER:g} in size" if unsaid else ""
         raise MismatchError(f"{expected(annotation)}{beyond}") from None
 
 
 def _converted(value: object, annotation: Any) -> Any:
-    """As `convert`; what does not match raises a ValueError without a text."""
+    """Convert as `convert` does; a value that does not match raises a ValueError without a text."""
     origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is typing.Annotated:
         converted = _converted(value, parts[0])
@@ -126,10 +126,10 @@ def _converted(value: object, annotation: Any) -> Any:
 
 
 def _beyond(value: object) -> bool:
-    """A number, or a list with one, that is not finite, or of a size that no scene has."""
+    """Whether a number, or one in a list, is not finite or larger than `MAX_NUMBER`."""
     if isinstance(value, list | tuple):
         return any(map(_beyond, value))
-    return isinstance(value, int | float) and not abs(value) <= LARGEST
+    return isinstance(value, int | float) and not abs(value) <= MAX_NUMBER
 
 
 def _members(annotation: Any) -> list[Any]:
@@ -138,7 +138,7 @@ def _members(annotation: Any) -> list[Any]:
 
 
 def expected(annotation: Any) -> str:
-    """What an annotation asks for, in words."""
+    """The expected value of an annotation, in words."""
     origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is typing.Annotated:
         return " ".join([expected(parts[0]), *(check.text for check in conditions_of(annotation, Check))])
@@ -167,5 +167,5 @@ def choices_of(annotation: Any) -> tuple[str, ...]:
 
 
 def conditions_of(annotation: Any, kind: type[Any]) -> list[Any]:
-    """What stands in an annotation of one kind: `Check`, `Only`, `ScenePath`."""
+    """The conditions of one kind in an annotation: `Check`, `Only` or `ScenePath`."""
     return [part for part in getattr(annotation, "__metadata__", ()) if isinstance(part, kind)]

@@ -1,4 +1,4 @@
-"""The hardware of a cell: the arm, its joints with their drives, and how the emulator may make drives difficult.
+"""The hardware of a cell: bus, bring-up, arm, joints with their drives, and what makes emulated drives difficult.
 
 These sections stand in cell files (`canprobe/cells`); a scene may change single keys of them. As in
 `canprobe.cell.scene.model`, a field says everything about its key.
@@ -15,16 +15,24 @@ from canprobe.cell.scene.checks import DISTINCT, Check, OneOf, Only, Pattern, Ra
 Auto = Literal["auto"]  # the plan chooses
 JointKind = Literal["revolute", "prismatic"]
 Convention = Literal["standard", "modified"]
+TactileModeName = Literal["window", "image", "features", "auto"]
+CobIds = Literal["default", "by_deadline", "auto"]
+Fidelity = Literal["ideal", "dynamic"]
+TransmitQueue = Literal["priority", "fifo"]
 Vec3 = tuple[float, float, float]
 Vec6 = tuple[float, float, float, float, float, float]
 Channel = Annotated[str, Pattern(r"[!-~]+", "without spaces, in ASCII")]  # as it stands in a candump log
 NodeId = Annotated[int, Range(1, 126)]  # 127 is the master
 SerialNumber = Annotated[int, Range(0, 0xFFFFFFFF)]
 
-TURNS = Only("kind", ("revolute",))
-SLIDES = Only("kind", ("prismatic",))
-HOMES = Only("zero", ("homing",))
-METHOD = Check("from -128 to 127, but not 0", lambda value: -128 <= value <= 127 and value != 0)
+DIRECT = "direct"
+"""The interface that is no bus."""
+MM = 1e-3
+"""A millimetre in metres."""
+REVOLUTE_ONLY = Only("kind", ("revolute",))
+PRISMATIC_ONLY = Only("kind", ("prismatic",))
+HOMING_ONLY = Only("zero", ("homing",))
+HOMING_METHOD = Check("from -128 to 127, but not 0", lambda value: -128 <= value <= 127 and value != 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +43,61 @@ class CellInfo:
     """Name of the cell."""
     title: str = ""
     """One line about the cell, which `canprobe cells` prints."""
+
+
+@dataclass(frozen=True, slots=True)
+class BusSettings:
+    """`[bus]`: the bus that connects the nodes."""
+
+    interface: Annotated[str, Pattern(r"[a-z0-9_-]+", "such as lockstep, socketcan, pcan")] = "lockstep"
+    """`lockstep` (in this process, in virtual time), `direct` (the same without a bus: counts and images in the place
+    of frames), `socketcan`, or any other python-can interface."""
+    channel: Channel = "can0"
+    """Channel of the interface. On a lockstep bus it is only a name in the log."""
+    bitrate: Annotated[int, Range(10_000, 1_000_000)] = 1_000_000
+    """Bit rate of the bus."""
+    timed: bool = True
+    """Lockstep: a frame takes its time on the wire, and frames wait for each other. false: no time."""
+    transmit_queue: TransmitQueue = "priority"
+    """Which frame a node sends first: the lowest identifier, or the oldest (`fifo`)."""
+    bit_error_rate: Annotated[float, Range(0, 0.01)] = 0.0
+    """Timed lockstep: share of bits that the wire corrupts."""
+    fd: bool | Auto = False
+    """Send PDOs of up to 64 bytes in CAN FD frames where a device has them. Other frames stay classical."""
+    data_bitrate: Annotated[int, Range(10_000, 8_000_000)] = 5_000_000
+    """Bit rate of the data phase of CAN FD frames."""
+    cob_ids: CobIds = "default"
+    """COB-IDs of the PDOs: the defaults of the cell, or priorities in the order of the deadlines."""
+
+    @property
+    def direct(self) -> bool:
+        """There is no bus."""
+        return self.interface == DIRECT
+
+
+@dataclass(frozen=True, slots=True)
+class BringUpSettings:
+    """`[bring_up]`: the time of each step of bring-up, and what happens when a step takes longer."""
+
+    listen_s: Annotated[float, Range(0, 60)] = 0.25
+    """Time in which bring-up only listens for another master."""
+    boot_up_s: Annotated[float, Range(0, 600, open_low=True)] = 2.0
+    """Longest time from the reset of a node to its boot-up message."""
+    sdo_s: Annotated[float, Range(0, 60, open_low=True)] = 0.5
+    """Longest time to one SDO answer."""
+    start_s: Annotated[float, Range(0, 60, open_low=True)] = 1.0
+    """Longest time from NMT start to the heartbeat that confirms it."""
+    enable_s: Annotated[float, Range(0, 600, open_low=True)] = 2.0
+    """Longest time in which the drives change to their mode, and from the command to enable operation to their
+    confirmation. Brakes and a search for the commutation take longer."""
+    stop_s: Annotated[float, Range(0, 600, open_low=True)] = 0.5
+    """Longest time of a quick stop, and of disabling the drives after it."""
+    emulated_s: Annotated[float, Range(0, 3600, open_low=True)] = 120.0
+    """Longest time in which the process of the emulated nodes starts."""
+    retries: Annotated[int, Range(0, 100)] = 2
+    """How often a reset, request or start without an answer is repeated."""
+    store: bool = False
+    """Store the configuration in the nodes (1010h). The next bring-up finds it by 1020h and does not write it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,26 +154,26 @@ class JointSettings:
     """Denavit-Hartenberg row: offset d along the axis; of a prismatic joint, what its position is added to."""
     theta_deg: float = 0.0
     """Denavit-Hartenberg row: angle about the axis; of a revolute joint, what its position is added to."""
-    min_deg: Annotated[float | None, Range(-3600, 3600), TURNS] = None
+    min_deg: Annotated[float | None, Range(-3600, 3600), REVOLUTE_ONLY] = None
     """Lowest position."""
-    max_deg: Annotated[float | None, Range(-3600, 3600), TURNS] = None
+    max_deg: Annotated[float | None, Range(-3600, 3600), REVOLUTE_ONLY] = None
     """Highest position."""
-    speed_deg_s: Annotated[float | None, Range(0, 36_000, open_low=True), TURNS] = None
+    speed_deg_s: Annotated[float | None, Range(0, 36_000, open_low=True), REVOLUTE_ONLY] = None
     """Highest speed."""
-    start_deg: Annotated[float, Range(-3600, 3600), TURNS] = 0.0
+    start_deg: Annotated[float, Range(-3600, 3600), REVOLUTE_ONLY] = 0.0
     """Start posture. It selects the branch of the inverse kinematics. An emulated arm starts here in `free`, and
     above the start point in other tasks."""
-    swing_deg: Annotated[float, Range(0, 360), TURNS] = 5.0
+    swing_deg: Annotated[float, Range(0, 360), REVOLUTE_ONLY] = 5.0
     """Amplitude of the swing in `free`."""
-    min_mm: Annotated[float | None, Range(-100_000, 100_000), SLIDES] = None
+    min_mm: Annotated[float | None, Range(-100_000, 100_000), PRISMATIC_ONLY] = None
     """Lowest position."""
-    max_mm: Annotated[float | None, Range(-100_000, 100_000), SLIDES] = None
+    max_mm: Annotated[float | None, Range(-100_000, 100_000), PRISMATIC_ONLY] = None
     """Highest position."""
-    speed_mm_s: Annotated[float | None, Range(0, 100_000, open_low=True), SLIDES] = None
+    speed_mm_s: Annotated[float | None, Range(0, 100_000, open_low=True), PRISMATIC_ONLY] = None
     """Highest speed."""
-    start_mm: Annotated[float, Range(-100_000, 100_000), SLIDES] = 0.0
+    start_mm: Annotated[float, Range(-100_000, 100_000), PRISMATIC_ONLY] = 0.0
     """Start posture."""
-    swing_mm: Annotated[float, Range(0, 10_000), SLIDES] = 10.0
+    swing_mm: Annotated[float, Range(0, 10_000), PRISMATIC_ONLY] = 10.0
     """Amplitude of the swing in `free`."""
     node_id: NodeId | None = None
     """Node id of the drive. Left out: the number of the joint, from 1."""
@@ -122,9 +185,9 @@ class JointSettings:
     """canprobe serves the drive. Left out: `arm.emulated`."""
     serial_number: SerialNumber | None = None
     """Serial number (1018h:04) that the drive must have. Left out: any."""
-    counts_per_turn: Annotated[float | None, Range(1, 1e9), TURNS] = None
+    counts_per_turn: Annotated[float | None, Range(1, 1e9), REVOLUTE_ONLY] = None
     """Position units of the drive per turn of its motor."""
-    counts_per_m: Annotated[float | None, Range(1, 1e12), SLIDES] = None
+    counts_per_m: Annotated[float | None, Range(1, 1e12), PRISMATIC_ONLY] = None
     """Position units of the drive per metre of its carriage, where `gear` is 1."""
     gear: Annotated[float, Range(0, 100_000, open_low=True)] = 1.0
     """Turns of the motor per turn of the joint."""
@@ -136,52 +199,52 @@ class JointSettings:
     """Turns of this motor per turn of other joints, by their names: a wrist whose motors stand in the forearm."""
     zero: Literal["absolute", "homing"] = "absolute"
     """absolute: the drive knows its position after power on. homing: it has to be homed, by `canprobe up --home`."""
-    homing_method: Annotated[int | None, METHOD, Only("zero", ("homing",), required=True)] = None
+    homing_method: Annotated[int | None, HOMING_METHOD, Only("zero", ("homing",), required=True)] = None
     """Homing method (6098h), such as 17 for the negative limit switch, 35 or 37 for where the joint stands."""
-    homing_order: Annotated[int | None, Range(1, 1000), HOMES] = None
+    homing_order: Annotated[int | None, Range(1, 1000), HOMING_ONLY] = None
     """Joints of lower numbers are homed first. Left out: the number of the joint, from 1."""
-    home_deg: Annotated[float | None, Range(-3600, 3600), TURNS, HOMES] = None
+    home_deg: Annotated[float | None, Range(-3600, 3600), REVOLUTE_ONLY, HOMING_ONLY] = None
     """Position of the joint at its home position. The home offset (607Ch) follows from it."""
-    homing_speed_deg_s: Annotated[float, Range(0, 36_000, open_low=True), TURNS, HOMES] = 5.0
+    homing_speed_deg_s: Annotated[float, Range(0, 36_000, open_low=True), REVOLUTE_ONLY, HOMING_ONLY] = 5.0
     """Speed of the search for the switch (6099h:01)."""
-    homing_zero_speed_deg_s: Annotated[float, Range(0, 36_000, open_low=True), TURNS, HOMES] = 1.0
+    homing_zero_speed_deg_s: Annotated[float, Range(0, 36_000, open_low=True), REVOLUTE_ONLY, HOMING_ONLY] = 1.0
     """Speed of the search for the edge of the switch or the index pulse (6099h:02)."""
-    homing_acceleration_deg_s2: Annotated[float, Range(0, 360_000, open_low=True), TURNS, HOMES] = 20.0
+    homing_acceleration_deg_s2: Annotated[float, Range(0, 360_000, open_low=True), REVOLUTE_ONLY, HOMING_ONLY] = 20.0
     """Acceleration in homing (609Ah)."""
-    home_mm: Annotated[float | None, Range(-100_000, 100_000), SLIDES, HOMES] = None
+    home_mm: Annotated[float | None, Range(-100_000, 100_000), PRISMATIC_ONLY, HOMING_ONLY] = None
     """Position of the joint at its home position. The home offset (607Ch) follows from it."""
-    homing_speed_mm_s: Annotated[float, Range(0, 100_000, open_low=True), SLIDES, HOMES] = 10.0
+    homing_speed_mm_s: Annotated[float, Range(0, 100_000, open_low=True), PRISMATIC_ONLY, HOMING_ONLY] = 10.0
     """Speed of the search for the switch (6099h:01)."""
-    homing_zero_speed_mm_s: Annotated[float, Range(0, 100_000, open_low=True), SLIDES, HOMES] = 2.0
+    homing_zero_speed_mm_s: Annotated[float, Range(0, 100_000, open_low=True), PRISMATIC_ONLY, HOMING_ONLY] = 2.0
     """Speed of the search for the edge of the switch or the index pulse (6099h:02)."""
-    homing_acceleration_mm_s2: Annotated[float, Range(0, 1e6, open_low=True), SLIDES, HOMES] = 50.0
+    homing_acceleration_mm_s2: Annotated[float, Range(0, 1e6, open_low=True), PRISMATIC_ONLY, HOMING_ONLY] = 50.0
     """Acceleration in homing (609Ah)."""
-    homing_timeout_s: Annotated[float, Range(1, 3600), HOMES] = 180.0
+    homing_timeout_s: Annotated[float, Range(1, 3600), HOMING_ONLY] = 180.0
     """Longest time of one homing run."""
     noise_counts: Annotated[float, Range(0, 10_000)] = 0.0
     """Standard deviation of the emulated encoder, besides `emulate.noise_counts`."""
-    rated_torque_nm: Annotated[float | None, Range(0, 1e6, open_low=True), TURNS] = None
+    rated_torque_nm: Annotated[float | None, Range(0, 1e6, open_low=True), REVOLUTE_ONLY] = None
     """Continuous torque of the drive at the joint; 6071h and 6077h are thousandths of it. Left out: that of the URDF,
     or 10."""
-    rotor_inertia_kg_m2: Annotated[float | None, Range(0, 1e6, open_low=True), TURNS] = None
+    rotor_inertia_kg_m2: Annotated[float | None, Range(0, 1e6, open_low=True), REVOLUTE_ONLY] = None
     """Inertia of the motor at the joint. Left out: 0.05."""
-    coulomb_nm: Annotated[float | None, Range(0, 1e6), TURNS] = None
+    coulomb_nm: Annotated[float | None, Range(0, 1e6), REVOLUTE_ONLY] = None
     """Coulomb friction at the joint. Left out: that of the URDF, or 0.5."""
-    viscous_nm_s: Annotated[float | None, Range(0, 1e6), TURNS] = None
+    viscous_nm_s: Annotated[float | None, Range(0, 1e6), REVOLUTE_ONLY] = None
     """Viscous friction at the joint. Left out: that of the URDF, or 0.3."""
-    rated_force_n: Annotated[float | None, Range(0, 1e6, open_low=True), SLIDES] = None
+    rated_force_n: Annotated[float | None, Range(0, 1e6, open_low=True), PRISMATIC_ONLY] = None
     """Continuous force of the drive. Left out: 200."""
-    rotor_mass_kg: Annotated[float | None, Range(0, 1e6, open_low=True), SLIDES] = None
+    rotor_mass_kg: Annotated[float | None, Range(0, 1e6, open_low=True), PRISMATIC_ONLY] = None
     """Inertia of the motor, seen at the carriage. Left out: 5."""
-    coulomb_n: Annotated[float | None, Range(0, 1e6), SLIDES] = None
+    coulomb_n: Annotated[float | None, Range(0, 1e6), PRISMATIC_ONLY] = None
     """Coulomb friction. Left out: 20."""
-    viscous_n_s_m: Annotated[float | None, Range(0, 1e6), SLIDES] = None
+    viscous_n_s_m: Annotated[float | None, Range(0, 1e6), PRISMATIC_ONLY] = None
     """Viscous friction. Left out: 20."""
-    stiffness_nm_rad: Annotated[float | None, Range(1, 1e9), TURNS] = None
+    stiffness_nm_rad: Annotated[float | None, Range(1, 1e9), REVOLUTE_ONLY] = None
     """Stiffness of the emulated joint between its motor, which the encoder is on, and its link. Left out: rigid. Of an
     ideal arm, that of its own cell."""
-    stiffness_n_m: Annotated[float | None, Range(1, 1e12), SLIDES] = None
-    """The same of a prismatic joint."""
+    stiffness_n_m: Annotated[float | None, Range(1, 1e12), PRISMATIC_ONLY] = None
+    """Stiffness of a prismatic joint between its motor and its link."""
     mass_kg: Annotated[float | None, Range(0, 1e5)] = None
     """Mass of the link behind the joint. Without the masses of all links an arm of rows cannot be `dynamic`."""
     com_mm: Vec3 = (0.0, 0.0, 0.0)

@@ -22,7 +22,7 @@ from typing import Any
 from canprobe import __version__
 from canprobe.cell.scene.checks import MismatchError, Only, ScenePath, choices_of, conditions_of, convert
 from canprobe.cell.scene.hardware import ArmSettings, CellInfo
-from canprobe.cell.scene.model import DEFAULT_ARRAY, TOUCH_KINDS, ArrayFile, Cell, Scene
+from canprobe.cell.scene.model import DEFAULT_ARRAY, TOUCH_KINDS, ArrayFile, CellFile, Scene
 from canprobe.cell.scene.rules import SECTIONS_OF_TASK, broken_rules
 from canprobe.errors import PlanError, SceneError, UsageError, regular_file
 from canprobe.mechanics.robot.urdf import from_urdf
@@ -30,21 +30,21 @@ from canprobe.mechanics.robot.urdf_visuals import with_meshes_found
 
 DEFAULT_CELL = "puma260"
 """Cell of a scene that names none."""
-CHANGED = " (changed)"
-"""Behind the title of a scene whose object or task is no longer that of its file."""
-_ALWAYS = ("scene", "task", "bus", "cycle", "limits", "bring_up")
+CHANGED_MARK = " (changed)"
+"""Text behind the title of a scene whose object or task is no longer that of its file."""
+_ALWAYS_PRESENT = ("scene", "task", "bus", "cycle", "limits", "bring_up")
 FILE_KEYS = {"array", "calibration", "eds", "file", "urdf", "true_cell"}
 """Keys whose files a saved scene takes along."""
 SAVED_AS = "scene.toml"
 """Name of a saved scene."""
-WRITTEN_BY = "written_by"
-"""Key above the sections of a file that canprobe wrote: by which version."""
-MOST_BYTES, MOST_DEPTH = 64 << 20, 32
-"""Size of a TOML file, and how deep its tables and lists may be nested."""
+WRITTEN_BY_KEY = "written_by"
+"""Key above the sections of a file that canprobe wrote; its value names the version."""
+MAX_BYTES, MAX_DEPTH = 64 << 20, 32
+"""Largest size of a TOML file, and deepest nesting of its tables and lists."""
 _ESCAPES = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\t": "\\t", "\r": "\\r", "\b": "\\b", "\f": "\\f"}
 
 
-def dump_scene(scene: Scene | Cell) -> str:
+def dump_scene(scene: Scene | CellFile) -> str:
     """The scene as a TOML document that loads back equal, with every value that its kind uses.
 
     Args:
@@ -85,13 +85,13 @@ def _values(section: Any) -> dict[str, Any]:
 
 def written_by_line() -> str:
     """The first line of a file that this canprobe writes."""
-    return f"{WRITTEN_BY} = {toml_value(f'canprobe {__version__}')}\n"
+    return f"{WRITTEN_BY_KEY} = {toml_value(f'canprobe {__version__}')}\n"
 
 
 def with_writer(document: Mapping[str, Any], file: str) -> tuple[dict[str, Any], str]:
-    """A document without `WRITTEN_BY`, and what messages call its file: with its writer, where that is another one."""
-    writer = document.get(WRITTEN_BY, f"canprobe {__version__}")
-    rest = {name: value for name, value in document.items() if name != WRITTEN_BY}
+    """A document without `WRITTEN_BY_KEY`, and the name of its file in messages, with a writer of another version."""
+    writer = document.get(WRITTEN_BY_KEY, f"canprobe {__version__}")
+    rest = {name: value for name, value in document.items() if name != WRITTEN_BY_KEY}
     return rest, f"{file}{written_by_other(writer)}"
 
 
@@ -186,7 +186,8 @@ def load_scene(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = 
         The scene, checked; its attributes are the sections and keys of a scene file.
 
     Raises:
-        SceneError: with every problem found, each with file, key path, what was expected and what was got.
+        SceneError: the scene has problems; the error has all of them, each with file, key path, what was expected and
+            what was got.
         UsageError: there is no such scene, or `overrides` is not a mapping.
     """
     whole = False
@@ -232,7 +233,7 @@ def _with_overrides(own: Mapping[str, Any], overrides: Mapping[str, Any], file: 
             table[key] = _as_toml(value)
     info, touched = changed.get("scene"), {path.partition(".")[0] for path in overrides if path != "task.duration_s"}
     if isinstance(info, dict) and info.get("title") and touched & {"object", "task"} and "scene.title" not in overrides:
-        changed["scene"] = {**info, "title": f"{str(info['title']).removesuffix(CHANGED)}{CHANGED}"}
+        changed["scene"] = {**info, "title": f"{str(info['title']).removesuffix(CHANGED_MARK)}{CHANGED_MARK}"}
     return changed
 
 
@@ -268,19 +269,19 @@ def load_cell(name_or_path: str | Path) -> dict[str, Any]:
         name_or_path: a packaged cell's name, such as `puma260`, or the path of a TOML file.
 
     Raises:
-        SceneError: with every problem found.
+        SceneError: the file has problems; the error has all of them.
     """
     return _read_cell(name_or_path)[1]
 
 
-def read_cell(name_or_path: str | Path) -> Cell:
-    """A cell file; as `load_cell`."""
+def read_cell(name_or_path: str | Path) -> CellFile:
+    """Read a cell file as `load_cell` does, as a dataclass."""
     return _read_cell(name_or_path)[0]
 
 
-def _read_cell(name_or_path: str | Path) -> tuple[Cell, dict[str, Any]]:
-    sections, document = _read_hardware(name_or_path, "cell", Cell)
-    return Cell(**sections), document
+def _read_cell(name_or_path: str | Path) -> tuple[CellFile, dict[str, Any]]:
+    sections, document = _read_hardware(name_or_path, "cell", CellFile)
+    return CellFile(**sections), document
 
 
 def _read_hardware(name_or_path: str | Path, what: str, kind: type[Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -298,7 +299,7 @@ def _read_hardware(name_or_path: str | Path, what: str, kind: type[Any]) -> tupl
 
 
 def _complain_of_names(reader: Reader, arm: ArmSettings | None, joints: object) -> None:
-    """Joints that the URDF does not have; where nothing else is wrong, `arm_model` says so with the order."""
+    """Complain of joints that the URDF does not have; without other problems `arm_model` does, with the order."""
     if not reader.problems or arm is None or not arm.urdf or not isinstance(joints, dict):
         return
     with contextlib.suppress(PlanError):  # the URDF's own faults come once the cell can be read
@@ -316,7 +317,7 @@ def load_array(name_or_path: str | Path) -> dict[str, Any]:
         name_or_path: a packaged array's name, such as `inch16`, or the path of a TOML file.
 
     Raises:
-        SceneError: with every problem found.
+        SceneError: the file has problems; the error has all of them.
     """
     document = _read_hardware(name_or_path, "array", ArrayFile)[1]
     if "sensor" not in document:
@@ -338,7 +339,7 @@ def find_file(name: str, packaged: Mapping[str, Path], what: str) -> Path:
 
 
 def scenes_folder() -> Path:
-    """Where the packaged scenes are, for a copy to change."""
+    """The folder of the packaged scenes, from which a copy can be made."""
     return Path(str(resources.files("canprobe"))) / "scenes"
 
 
@@ -372,11 +373,11 @@ def parse_scene(text: str, *, file: str = "scene", folder: Path | None = None) -
 
     Args:
         text: the TOML document.
-        file: what messages call it.
-        folder: where files that the scene names are looked up first.
+        file: name of the document in messages.
+        folder: folder in which files that the scene names are looked up first.
 
     Raises:
-        SceneError: with every problem found.
+        SceneError: the text has problems; the error has all of them.
     """
     return _scene(parse_toml(text, file), file, folder)
 
@@ -385,10 +386,10 @@ def read_toml(path: Path, file: str, else_what: str = "") -> dict[str, Any]:
     """The document of a TOML file, whose messages call it `file`; `else_what` ends that of a file that is missing.
 
     Raises:
-        SceneError: it cannot be read, or is not TOML.
+        SceneError: the file cannot be read, or is not TOML.
     """
     try:
-        text = regular_file(path, MOST_BYTES).read_text(
+        text = regular_file(path, MAX_BYTES).read_text(
             encoding="utf-8-sig"
         )  # some editors begin with a byte order mark
     except OSError as error:
@@ -400,7 +401,7 @@ def read_toml(path: Path, file: str, else_what: str = "") -> dict[str, Any]:
 
 
 def parse_toml(text: str, file: str) -> dict[str, Any]:
-    """The document in a TOML text; as `read_toml`."""
+    """The document in a TOML text, with the errors of `read_toml`."""
     try:
         document = tomllib.loads(text)
     except ValueError as error:  # an integer of thousands of digits is no TOMLDecodeError
@@ -412,13 +413,13 @@ def parse_toml(text: str, file: str) -> dict[str, Any]:
 
 
 _NAMED_LEVELS = 3
-"""Of the key that is too deep: as many as a scene has, such as joints.joint_1.gear."""
+"""Levels of the key that a message about deep nesting names; a scene has as many, such as joints.joint_1.gear."""
 
 
 def _refuse_deep(document: Mapping[str, Any], file: str) -> None:
-    """Raise SceneError for tables and lists in each other that no scene has; others go through them by recursion."""
+    """Raise SceneError for tables and lists nested deeper than in any scene; other code visits them by recursion."""
     values: list[tuple[str, Any]] = [("", document)]
-    for level in range(MOST_DEPTH):
+    for level in range(MAX_DEPTH):
         inner = [
             (f"{path}{key}." if isinstance(value, Mapping) and level < _NAMED_LEVELS else path, item)
             for path, value in values
@@ -431,11 +432,11 @@ def _refuse_deep(document: Mapping[str, Any], file: str) -> None:
 
 
 def _too_deep(where: str) -> SceneError:
-    return SceneError([f"{where}: expected tables and lists of at most {MOST_DEPTH} levels, got more of them"])
+    return SceneError([f"{where}: expected tables and lists of at most {MAX_DEPTH} levels, got more of them"])
 
 
 def _scene(own: Mapping[str, Any], file: str, folder: Path | None, *, whole: bool = False) -> Scene:
-    """The scene in a document, with what its cell says and the sections that its task has by default.
+    """The scene in a document, with the keys of its cell and the sections that its task has by default.
 
     Everything is checked together. A whole document has what its array file says: the file is not read again.
     """
@@ -451,7 +452,7 @@ def _scene(own: Mapping[str, Any], file: str, folder: Path | None, *, whole: boo
     if not whole:
         document = _with_array(document, folder)
     reader = Reader(folder)
-    values = reader.read(Scene, document, (*_ALWAYS, *defaults))
+    values = reader.read(Scene, document, (*_ALWAYS_PRESENT, *defaults))
     for section, (need, why) in needs.items():
         if need == "must" and section not in document:
             reader.complain(section, f'missing: task.kind = "{kind}" needs a section [{section}]: {why}')
@@ -533,15 +534,15 @@ class Reader:
         self._folder = folder
 
     def complain(self, path: str, message: str) -> None:
-        """Note a problem."""
+        """Add a problem."""
         self.bad.add(path)
         self.problems.append(f"{path}: {message}")
 
     def refuse(self, file: str) -> None:
-        """Raise the problems, if there are any, as those of a file.
+        """Raise an error with all problems, if there are any.
 
         Raises:
-            SceneError: with all of them.
+            SceneError: there are problems; the error has all of them.
         """
         if self.problems:
             raise SceneError([f"{file}: {problem}" for problem in self.problems])
@@ -551,7 +552,7 @@ class Reader:
 
         Args:
             file: dataclass of the sections.
-            document: as `tomllib` gives it.
+            document: the document as `tomllib` gives it.
             needed: sections that are read as empty ones where they are missing.
         """
         sections, needed = typing.get_type_hints(file), set(needed)
@@ -586,7 +587,7 @@ class Reader:
         return read
 
     def section(self, cls: type[Any], table: Any, name: str) -> Any:
-        """One section; a key that has a problem or is missing is None in it."""
+        """Read a section; a key that has a problem or is missing is None in it."""
         if not isinstance(table, dict):
             return self.complain(name, f"expected a section [{name}], got {toml_value(table)}")
         annotations = typing.get_type_hints(cls, include_extras=True)
@@ -622,7 +623,7 @@ class Reader:
         return value
 
     def _check_condition(self, path: str, given: bool, only: Only, actual: Any) -> None:
-        """A key stands where it belongs, and nowhere else."""
+        """Complain of a key that stands where it does not belong, or is missing where it must be given."""
         if given and actual is not None and actual not in only.values:
             needed = " or ".join(f'"{value}"' for value in only.values)
             self.complain(path, f'only with {only.key} = {needed}, got {only.key} = "{actual}"')
@@ -641,7 +642,7 @@ def _keys_that_belong(cls: type[Any], annotations: Mapping[str, Any], table: Map
 
 
 def _did_you_mean_key(got: str, sections: Mapping[str, Any]) -> str:
-    """For an unknown section: the section of a key of that name, or the nearest section."""
+    """A hint for an unknown section: the section that has a key of that name, or the nearest section."""
     classes = {name: next(iter(typing.get_args(hint)), hint) for name, hint in sections.items()}
     keys = [f"{name}.{got}" for name, cls in classes.items() if got in getattr(cls, "__dataclass_fields__", {})]
     return f"; did you mean {' or '.join(keys)}?" if keys else _did_you_mean(got, sections)

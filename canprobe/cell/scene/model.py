@@ -15,20 +15,22 @@ from canprobe.cell.scene.checks import DIRECTION, DISTINCT, SYMMETRIC, OneOf, On
 from canprobe.cell.scene.hardware import (
     ArmSettings,
     Auto,
+    BringUpSettings,
+    BusSettings,
     CellInfo,
     Channel,
     EmulateSettings,
+    Fidelity,
     JointSettings,
     NodeId,
     SerialNumber,
+    TactileModeName,
     Vec3,
 )
 from canprobe.fieldbus.protocol.tactile import WINDOWS
 
 TaskKind = Literal["scan", "press", "calibrate", "listen", "free"]
 Strategy = Literal["weave", "straight", "circle"]
-TactileModeName = Literal["window", "image", "features", "auto"]
-CobIds = Literal["default", "by_deadline", "auto"]
 ShapeMethod = Literal["recursive", "ml", "chord", "chen1996"]
 ObjectKind = Literal[
     "plane",
@@ -44,9 +46,7 @@ ObjectKind = Literal[
     "heights",
     "mesh",
 ]
-Fidelity = Literal["ideal", "dynamic"]
 Integrator = Literal["semi-implicit", "rk4", "implicit", "rosenbrock", "exponential", "adaptive"]
-TransmitQueue = Literal["priority", "fifo"]
 BridgeName = Literal["mcap", "foxglove", "ros2", "view"]
 
 Vec2 = tuple[float, float]
@@ -54,20 +54,20 @@ Row4 = tuple[float, float, float, float]
 
 TOUCH_KINDS: tuple[TaskKind, ...] = ("scan", "press", "calibrate")
 """Tasks that touch an object."""
-TOUCHING = Only("kind", TOUCH_KINDS)
-SCANNING = Only("kind", ("scan",))
-CALIBRATING = Only("kind", ("calibrate",))
-FREE = Only("kind", ("free",))
-DYNAMIC = Only("fidelity", ("dynamic",))
-RAW = Only("kind", ("frames",))
-RAW_NEEDED = Only("kind", ("frames",), required=True)
-IDENTIFIERS = Pattern(r"[0-7]?[0-9A-F]{1,2}h(-[0-7]?[0-9A-F]{1,2}h)?", 'such as "710h" or "710h-71Fh"')
-COMMAND = Pattern(r"[0-7]?[0-9A-F]{1,2}#([0-9A-F]{2}){0,8}", 'such as "201#0700"')
+TOUCH_ONLY = Only("kind", TOUCH_KINDS)
+SCAN_ONLY = Only("kind", ("scan",))
+CALIBRATE_ONLY = Only("kind", ("calibrate",))
+FREE_ONLY = Only("kind", ("free",))
+DYNAMIC_ONLY = Only("fidelity", ("dynamic",))
+RAW_ONLY = Only("kind", ("frames",))
+RAW_REQUIRED = Only("kind", ("frames",), required=True)
+IDENTIFIER_PATTERN = Pattern(r"[0-7]?[0-9A-F]{1,2}h(-[0-7]?[0-9A-F]{1,2}h)?", 'such as "710h" or "710h-71Fh"')
+COMMAND_PATTERN = Pattern(r"[0-7]?[0-9A-F]{1,2}#([0-9A-F]{2}){0,8}", 'such as "201#0700"')
 DEFAULT_ARRAY = "inch16"
 """Array file of a sensor that names none."""
-TWO_RADII = Only("kind", ("saddle", "ellipsoid"), required=True)
-WAVE = Only("kind", ("wave",), required=True)
-OF_A_FILE = Only("kind", ("heights", "mesh"))
+RADII_REQUIRED = Only("kind", ("saddle", "ellipsoid"), required=True)
+WAVE_REQUIRED = Only("kind", ("wave",), required=True)
+FILE_ONLY = Only("kind", ("heights", "mesh"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,40 +82,6 @@ class SceneInfo:
     """Seed of all random numbers. In lockstep the same seed gives the same `bus.log`."""
     figures: bool = True
     """Draw `report.png`, `surface.png` and `report.html` after a run. false saves seconds."""
-
-
-DIRECT = "direct"
-"""The interface that is no bus."""
-
-
-@dataclass(frozen=True, slots=True)
-class BusSettings:
-    """`[bus]`: the bus that connects the nodes."""
-
-    interface: Annotated[str, Pattern(r"[a-z0-9_-]+", "such as lockstep, socketcan, pcan")] = "lockstep"
-    """`lockstep` (in this process, in virtual time), `direct` (the same without a bus: counts and images in the place
-    of frames), `socketcan`, or any other python-can interface."""
-    channel: Channel = "can0"
-    """Channel of the interface. On a lockstep bus it is only a name in the log."""
-    bitrate: Annotated[int, Range(10_000, 1_000_000)] = 1_000_000
-    """Bit rate of the bus."""
-    timed: bool = True
-    """Lockstep: a frame takes its time on the wire, and frames wait for each other. false: no time."""
-    transmit_queue: TransmitQueue = "priority"
-    """Which frame a node sends first: the lowest identifier, or the oldest (`fifo`)."""
-    bit_error_rate: Annotated[float, Range(0, 0.01)] = 0.0
-    """Timed lockstep: share of bits that the wire corrupts."""
-    fd: bool | Auto = False
-    """Send PDOs of up to 64 bytes in CAN FD frames where a device has them. Other frames stay classical."""
-    data_bitrate: Annotated[int, Range(10_000, 8_000_000)] = 5_000_000
-    """Bit rate of the data phase of CAN FD frames."""
-    cob_ids: CobIds = "default"
-    """COB-IDs of the PDOs: the defaults of the cell, or priorities in the order of the deadlines."""
-
-    @property
-    def direct(self) -> bool:
-        """There is no bus."""
-        return self.interface == DIRECT
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,36 +152,36 @@ class WireSettings:
 
     kind: Literal["canopen", "frames"] = "canopen"
     """Kind of device."""
-    ids: Annotated[tuple[Annotated[str, IDENTIFIERS], ...], RAW_NEEDED] = ()
+    ids: Annotated[tuple[Annotated[str, IDENTIFIER_PATTERN], ...], RAW_REQUIRED] = ()
     """Identifiers of its frames: each a number or a range in hexadecimal, such as "710h-71Fh"."""
-    frames: Annotated[tuple[str, ...], RAW_NEEDED] = ()
+    frames: Annotated[tuple[str, ...], RAW_REQUIRED] = ()
     """Frames of one image from each identifier, two characters a byte: 0-9 and A-F are a tag that must stand there,
     "." is not read, a small letter is 4 bits of a value, whose values are in the order of the alphabet."""
-    byte_order: Annotated[Literal["big", "little"], RAW] = "big"
+    byte_order: Annotated[Literal["big", "little"], RAW_ONLY] = "big"
     """Byte order of a value of several bytes."""
-    axes: Annotated[int, Range(1, 3), RAW] = 1
+    axes: Annotated[int, Range(1, 3), RAW_ONLY] = 1
     """Values of a taxel."""
-    normal_axis: Annotated[int, Range(1, 3), RAW] = 1
-    """Which of them is the normal pressure, from 1."""
-    order: Annotated[Literal["rows", "columns"], RAW] = "rows"
+    normal_axis: Annotated[int, Range(1, 3), RAW_ONLY] = 1
+    """Number of the value that is the normal pressure, from 1."""
+    order: Annotated[Literal["rows", "columns"], RAW_ONLY] = "rows"
     """Taxels come row by row, or column by column."""
-    unloaded_counts: Annotated[int, Range(0, 0xFFFFFFFF), RAW] = 0
+    unloaded_counts: Annotated[int, Range(0, 0xFFFFFFFF), RAW_ONLY] = 0
     """Value of a taxel without load."""
-    full_scale_counts: Annotated[int, Range(0, 0xFFFFFFFF), RAW] = 255
+    full_scale_counts: Annotated[int, Range(0, 0xFFFFFFFF), RAW_ONLY] = 255
     """Value of a taxel at `sensor.full_scale_kpa`: below `unloaded_counts` where values fall with pressure."""
-    tare_images: Annotated[int, Range(0, 10_000), RAW] = 0
+    tare_images: Annotated[int, Range(0, 10_000), RAW_ONLY] = 0
     """Images at the beginning of which the mean is the unloaded value of each taxel. 0: `unloaded_counts` is."""
-    sampling: Annotated[Literal["free", "polled", "sync"], RAW] = "free"
+    sampling: Annotated[Literal["free", "polled", "sync"], RAW_ONLY] = "free"
     """What an image begins with: the time of the device, a poll of the master, or a SYNC."""
-    start: Annotated[tuple[Annotated[str, COMMAND], ...], RAW] = ()
+    start: Annotated[tuple[Annotated[str, COMMAND_PATTERN], ...], RAW_ONLY] = ()
     """Frames that start the device, as cansend writes them: "201#0700"."""
-    stop: Annotated[tuple[Annotated[str, COMMAND], ...], RAW] = ()
+    stop: Annotated[tuple[Annotated[str, COMMAND_PATTERN], ...], RAW_ONLY] = ()
     """Frames that stop it."""
-    poll: Annotated[tuple[Annotated[str, COMMAND], ...], RAW] = ()
+    poll: Annotated[tuple[Annotated[str, COMMAND_PATTERN], ...], RAW_ONLY] = ()
     """Frames that ask a polled device for one image."""
-    latency_ms: Annotated[float, Range(0, 1000), RAW] = 0.0
-    """From the sample of an image to its first frame on the bus."""
-    latency_sigma_ms: Annotated[float, Range(0, 1000), RAW] = 0.0
+    latency_ms: Annotated[float, Range(0, 1000), RAW_ONLY] = 0.0
+    """Time from the sample of an image to its first frame on the bus."""
+    latency_sigma_ms: Annotated[float, Range(0, 1000), RAW_ONLY] = 0.0
     """Standard deviation of `latency_ms`."""
 
 
@@ -257,17 +223,17 @@ class ObjectSettings:
         Only("kind", ("sphere", "cylinder", "bowl", "torus", "fillet"), required=True),
     ] = None
     """Radius; of a torus, the radius of its tube."""
-    radius_x_mm: Annotated[float | None, Range(-100_000, 100_000), TWO_RADII] = None
+    radius_x_mm: Annotated[float | None, Range(-100_000, 100_000), RADII_REQUIRED] = None
     """Radius or semi-axis along x of the object frame."""
-    radius_y_mm: Annotated[float | None, Range(-100_000, 100_000), TWO_RADII] = None
+    radius_y_mm: Annotated[float | None, Range(-100_000, 100_000), RADII_REQUIRED] = None
     """Radius or semi-axis along y of the object frame."""
     radius_z_mm: Annotated[float | None, Range(1, 100_000), Only("kind", ("ellipsoid",), required=True)] = None
     """Semi-axis along z of the object frame."""
     ring_radius_mm: Annotated[float | None, Range(1, 100_000), Only("kind", ("torus",), required=True)] = None
     """Radius of the circle on which the centre of the tube lies; above `radius_mm`."""
-    amplitude_mm: Annotated[float | None, Range(0, 1000, open_low=True), WAVE] = None
+    amplitude_mm: Annotated[float | None, Range(0, 1000, open_low=True), WAVE_REQUIRED] = None
     """Half of the height from trough to crest."""
-    wavelength_mm: Annotated[float | None, Range(1, 100_000), WAVE] = None
+    wavelength_mm: Annotated[float | None, Range(1, 100_000), WAVE_REQUIRED] = None
     """Distance from crest to crest."""
     angle_deg: Annotated[float | None, Range(1, 179), Only("kind", ("fillet",), required=True)] = None
     """Angle between the two normals."""
@@ -275,12 +241,12 @@ class ObjectSettings:
     """Matrix S of the quadric XᵀSX = 0, with lengths in metres."""
     file: Annotated[str | None, ScenePath(), Only("kind", ("heights", "mesh"), required=True)] = None
     """Heights: a .npy, .npz, .csv or .txt file, a row of which is a line along y. Mesh: an STL, OBJ or PLY file."""
-    unit_mm: Annotated[float, Range(1e-6, 1e6), OF_A_FILE] = 1.0
+    unit_mm: Annotated[float, Range(1e-6, 1e6), FILE_ONLY] = 1.0
     """Unit of the lengths in the file: 1000 for metres, 25.4 for inches."""
-    spacing_mm: Annotated[float | None, Range(1e-3, 1000), OF_A_FILE] = None
+    spacing_mm: Annotated[float | None, Range(1e-3, 1000), FILE_ONLY] = None
     """Spacing of the grid of heights; left out: the `spacing` in a .npz file, in its unit. Of a mesh: that of the grid
     that is fitted to it, best twice the length of the mesh's edges; left out: 1 mm."""
-    origin_mm: Annotated[Vec2 | None, OF_A_FILE] = None
+    origin_mm: Annotated[Vec2 | None, FILE_ONLY] = None
     """Point x, y of the file that is the origin of the object frame; left out: the middle. x and y of heights are
     counted from the grid's first corner, those of a mesh are its own."""
     position_mm: Vec3 = (-120.0, -122.5, 374.0)
@@ -303,45 +269,45 @@ class TaskSettings:
     """Kind of task."""
     duration_s: Annotated[float, Range(0, 86_400, open_low=True)] = 20.0
     """Length of the scan, press, listen or free phase."""
-    force_n: Annotated[float, Range(0, 20, open_low=True), TOUCHING] = 2.0
+    force_n: Annotated[float, Range(0, 20, open_low=True), TOUCH_ONLY] = 2.0
     """Target of the contact force."""
-    approach_mm_s: Annotated[float, Range(0, 4, open_low=True), TOUCHING] = 4.0
+    approach_mm_s: Annotated[float, Range(0, 4, open_low=True), TOUCH_ONLY] = 4.0
     """Speed of the approach."""
-    start_mm: Annotated[Vec3, TOUCHING] = (-120.0, -122.5, 374.0)
+    start_mm: Annotated[Vec3, TOUCH_ONLY] = (-120.0, -122.5, 374.0)
     """Expected contact point, in the base frame."""
-    approach_normal: Annotated[Vec3, DIRECTION, TOUCHING] = (0.0, 0.0, 1.0)
+    approach_normal: Annotated[Vec3, DIRECTION, TOUCH_ONLY] = (0.0, 0.0, 1.0)
     """Expected outward normal at `start_mm`, of any length. The probe approaches against it."""
-    clearance_mm: Annotated[float, Range(0, 50, open_low=True), TOUCHING] = 3.0
+    clearance_mm: Annotated[float, Range(0, 50, open_low=True), TOUCH_ONLY] = 3.0
     """Distance from `start_mm` at which the approach begins."""
-    search_mm: Annotated[float, Range(0, 50, open_low=True), TOUCHING] = 8.0
+    search_mm: Annotated[float, Range(0, 50, open_low=True), TOUCH_ONLY] = 8.0
     """Distance beyond `start_mm` at which the approach gives up."""
-    strategy: Annotated[Strategy, SCANNING] = "weave"
+    strategy: Annotated[Strategy, SCAN_ONLY] = "weave"
     """Path of the scan."""
-    speed_mm_s: Annotated[float, Range(0, 200, open_low=True), SCANNING] = 25.0
+    speed_mm_s: Annotated[float, Range(0, 200, open_low=True), SCAN_ONLY] = 25.0
     """Speed of the contact over the surface."""
-    heading_deg: Annotated[float, Range(-360, 360), SCANNING] = 0.0
+    heading_deg: Annotated[float, Range(-360, 360), SCAN_ONLY] = 0.0
     """Heading of the path in the xy plane of the base frame, from x."""
-    regain_mm: Annotated[float, Range(0, 20), SCANNING] = 2.0
+    regain_mm: Annotated[float, Range(0, 20), SCAN_ONLY] = 2.0
     """Distance over which a scan searches towards the object for a lost contact. 0: it retreats at once."""
-    length_mm: Annotated[float, Range(0.1, 500), SCANNING] = 36.0
+    length_mm: Annotated[float, Range(0.1, 500), SCAN_ONLY] = 36.0
     """Full length of the path along the heading; diameter of a circle."""
-    width_mm: Annotated[float, Range(0, 500, open_low=True), SCANNING, Only("strategy", ("weave",))] = 9.0
+    width_mm: Annotated[float, Range(0, 500, open_low=True), SCAN_ONLY, Only("strategy", ("weave",))] = 9.0
     """Full width of the path across the heading."""
-    wavelength_mm: Annotated[float, Range(1, 500), SCANNING, Only("strategy", ("weave",))] = 12.0
+    wavelength_mm: Annotated[float, Range(1, 500), SCAN_ONLY, Only("strategy", ("weave",))] = 12.0
     """Length of one weave along the heading."""
-    rolling_share: Annotated[float, Range(0, 1), SCANNING] = 0.05
+    rolling_share: Annotated[float, Range(0, 1), SCAN_ONLY] = 0.05
     """How the probe turns: 0 follows the normal of the surface, 1 keeps its orientation."""
-    ball_radius_mm: Annotated[float, Range(5, 500), CALIBRATING] = 25.0
+    ball_radius_mm: Annotated[float, Range(5, 500), CALIBRATE_ONLY] = 25.0
     """Radius of the ball."""
-    ball_sigma_mm: Annotated[float, Range(0, 20, open_low=True), CALIBRATING] = 3.0
+    ball_sigma_mm: Annotated[float, Range(0, 20, open_low=True), CALIBRATE_ONLY] = 3.0
     """Standard deviation of the expected centre of the ball, per axis."""
-    touches: Annotated[int, Range(2, 200), CALIBRATING] = 13
+    touches: Annotated[int, Range(2, 200), CALIBRATE_ONLY] = 13
     """Number of touches."""
-    tilt_deg: Annotated[float, Range(0, 60), CALIBRATING] = 22.0
+    tilt_deg: Annotated[float, Range(0, 60), CALIBRATE_ONLY] = 22.0
     """Angle of the outer touches from the top of the ball."""
-    beside_deg: Annotated[float, Range(0, 15), CALIBRATING] = 9.0
+    beside_deg: Annotated[float, Range(0, 15), CALIBRATE_ONLY] = 9.0
     """Angle of each touch from the pole of the probe."""
-    swing_period_s: Annotated[float, Range(0.1, 3600), FREE] = 4.0
+    swing_period_s: Annotated[float, Range(0.1, 3600), FREE_ONLY] = 4.0
     """Period of the swing."""
 
 
@@ -384,31 +350,6 @@ class LimitSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class BringUpSettings:
-    """`[bring_up]`: the time of each step of bring-up, and what happens when a step takes longer."""
-
-    listen_s: Annotated[float, Range(0, 60)] = 0.25
-    """Time in which bring-up only listens for another master."""
-    boot_up_s: Annotated[float, Range(0, 600, open_low=True)] = 2.0
-    """Longest time from the reset of a node to its boot-up message."""
-    sdo_s: Annotated[float, Range(0, 60, open_low=True)] = 0.5
-    """Longest time to one SDO answer."""
-    start_s: Annotated[float, Range(0, 60, open_low=True)] = 1.0
-    """Longest time from NMT start to the heartbeat that confirms it."""
-    enable_s: Annotated[float, Range(0, 600, open_low=True)] = 2.0
-    """Longest time in which the drives change to their mode, and from the command to enable operation to their
-    confirmation. Brakes and a search for the commutation take longer."""
-    stop_s: Annotated[float, Range(0, 600, open_low=True)] = 0.5
-    """Longest time of a quick stop, and of disabling the drives after it."""
-    emulated_s: Annotated[float, Range(0, 3600, open_low=True)] = 120.0
-    """Longest time in which the process of the emulated nodes starts."""
-    retries: Annotated[int, Range(0, 100)] = 2
-    """How often a reset, request or start without an answer is repeated."""
-    store: bool = False
-    """Store the configuration in the nodes (1010h). The next bring-up finds it by 1020h and does not write it."""
-
-
-@dataclass(frozen=True, slots=True)
 class ServoSettings:
     """`[servo]`: the gains of the tactile servo."""
 
@@ -433,17 +374,17 @@ class PlantSettings:
     true_cell: Annotated[str | None, ScenePath()] = None
     """Cell whose chain the emulated arm has where it differs from the one that the controller uses: a packaged name, or
     a path relative to the file. Its base is placed so that the start point stays where it is."""
-    integrator: Annotated[Integrator, DYNAMIC] = "rosenbrock"
+    integrator: Annotated[Integrator, DYNAMIC_ONLY] = "rosenbrock"
     """Integrator of the equations of motion."""
-    step_us: Annotated[float, Range(10, 2500), DYNAMIC] = 625.0
+    step_us: Annotated[float, Range(10, 2500), DYNAMIC_ONLY] = 625.0
     """Step of the integrator."""
-    friction: Annotated[float, Range(0, 2), DYNAMIC] = 0.3
+    friction: Annotated[float, Range(0, 2), DYNAMIC_ONLY] = 0.3
     """Coefficient of Coulomb friction between probe and object."""
-    integral_ms: Annotated[float, Range(0, 10_000), DYNAMIC] = 20.0
+    integral_ms: Annotated[float, Range(0, 10_000), DYNAMIC_ONLY] = 20.0
     """Reset time of the velocity loops. 0: no integral part."""
-    velocity_feed_forward: Annotated[float, Range(0, 1), DYNAMIC] = 0.0
+    velocity_feed_forward: Annotated[float, Range(0, 1), DYNAMIC_ONLY] = 0.0
     """Share of velocity feed-forward in the drives. 1 removes their lag."""
-    torque_limit_permille: Annotated[int, Range(1, 2000), DYNAMIC] = 2000
+    torque_limit_permille: Annotated[int, Range(1, 2000), DYNAMIC_ONLY] = 2000
     """Torque limit of the drives, relative to their continuous torque."""
     drive_bandwidth_hz: Annotated[float, Range(1, 1000)] = 30.0
     """Bandwidth of the drives (−3 dB)."""
@@ -496,7 +437,7 @@ class BridgeSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class Cell:
+class CellFile:
     """What a cell file may hold: the sections of a scene that describe hardware. Those that are None are absent."""
 
     cell: CellInfo
@@ -538,10 +479,10 @@ class Scene:
 
     scene: SceneInfo
     task: TaskSettings
-    bus: BusSettings = BusSettings()
+    bus: BusSettings = BusSettings()  # noqa: RUF009 - frozen
     cycle: CycleSettings = CycleSettings()
     limits: LimitSettings = LimitSettings()
-    bring_up: BringUpSettings = BringUpSettings()
+    bring_up: BringUpSettings = BringUpSettings()  # noqa: RUF009 - frozen
     cell: CellInfo = CellInfo()  # noqa: RUF009 - frozen
     arm: ArmSettings | None = None
     joints: Mapping[str, JointSettings] = field(default_factory=dict)

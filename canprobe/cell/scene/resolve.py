@@ -10,7 +10,7 @@ import numpy as np
 from canprobe.cell.scene.arms import Bodies, arm_model, homing_of, joint_compliance, per_joint
 from canprobe.cell.scene.calibrations import load_calibration
 from canprobe.cell.scene.geometry import T_flange_probe, expected_ball, scan_axes, true_object
-from canprobe.cell.scene.hardware import EmulateSettings
+from canprobe.cell.scene.hardware import MM, EmulateSettings
 from canprobe.cell.scene.load import gathered, read_cell
 from canprobe.cell.scene.model import (
     BridgeSettings,
@@ -20,7 +20,6 @@ from canprobe.cell.scene.model import (
     Scene,
     SensorSettings,
     ServoSettings,
-    ShapeSettings,
     TaskSettings,
     WireSettings,
 )
@@ -57,13 +56,12 @@ from canprobe.mechanics.touch.patch.array_calibration import ArrayCalibration
 from canprobe.mechanics.touch.servo import SurfaceGains
 from canprobe.mechanics.touch.strategies import make_strategy
 
-MM = 1e-3
-LAYER_N_M3 = 1.27e8
+LAYER_STIFFNESS = 1.27e8
 """Stiffness of the emulated layer where nothing else is stated."""
 EMULATED_ARRAY = "inch16"
 """Calibration of the emulated array."""
-SURE = 3.0
-"""Standard deviations of a calibrated latency from which on it is told from none."""
+LATENCY_SIGMAS = 3.0
+"""Standard deviations from which on a calibrated latency counts as different from 0."""
 EFFECTS = ("noise", "gain_error", "blur", "hysteresis", "creep", "crosstalk", "saturation", "threshold")
 
 
@@ -71,7 +69,7 @@ def resolve(scene: Scene) -> Setup:
     """The setup of a scene.
 
     Args:
-        scene: as `load_scene` gave it, or changed since.
+        scene: a scene as `load_scene` gave it, or changed since.
 
     Raises:
         PlanError: the scene describes an object without a surface.
@@ -83,10 +81,10 @@ def resolve(scene: Scene) -> Setup:
     array = _array(scene, settings.radius_mm * MM, settings.stiffness_n_m3)
     flat = array is not None and array.pad.is_flat
     T, radius = T_flange_probe(settings), settings.radius_mm * MM
-    if flat:  # as a sphere so large that it is one: the point of its pole stays
+    if flat:  # a flat array is a sphere of a very large radius; the point of its pole stays
         T[:3, 3] += (radius - FLAT_RADIUS_M) * T[:3, 2]
         radius = FLAT_RADIUS_M
-    stiffness = array.calibration.image.stiffness if array is not None else LAYER_N_M3
+    stiffness = array.calibration.image.stiffness if array is not None else LAYER_STIFFNESS
     probe = Probe(T, radius, stiffness, settings.mass_kg)
     return Setup(
         scene=scene,
@@ -141,7 +139,7 @@ def _arm(scene: Scene) -> tuple[Arm | None, Bodies]:
 
 
 def _quirks(settings: EmulateSettings | None, node_id: int, noise: float) -> Quirks | None:
-    """What makes one emulated drive difficult; None where nothing does."""
+    """The difficulties of an emulated drive; None where it has none."""
     if settings is None or (settings.nodes and node_id not in settings.nodes):
         settings = EmulateSettings()
     quirks = Quirks(
@@ -161,9 +159,9 @@ def _array(scene: Scene, radius: float, stiffness: float | None) -> Array | None
     """The array with its calibration, and the wire of one that is no CANopen node.
 
     Args:
-        scene: with or without an array.
-        radius: of the sphere that it may be wrapped on, m.
-        stiffness: of the layer, N/m³, in the place of the calibrated one; None: that.
+        scene: a scene with or without an array.
+        radius: radius of the sphere that it may be wrapped on, m.
+        stiffness: stiffness of the layer, N/m³; None: the calibrated one.
     """
     settings = scene.sensor
     if settings is None:
@@ -200,7 +198,7 @@ def _array(scene: Scene, radius: float, stiffness: float | None) -> Array | None
 
 def _raw_wire(wire: WireSettings, settings: SensorSettings, calibration: ArrayCalibration) -> RawWire:
     found = calibration.centroid
-    sure = settings.calibration is not None and abs(found.latency_s) > SURE * found.latency_sigma_s
+    sure = settings.calibration is not None and abs(found.latency_s) > LATENCY_SIGMAS * found.latency_sigma_s
     return RawWire(
         image=image_format(wire, settings.rows, settings.columns),
         normal=wire.normal_axis - 1,
@@ -239,7 +237,7 @@ def _limits(settings: LimitSettings, arm: Arm | None) -> SafetyLimits:
 
 
 def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> Task:
-    """The task's setup; `canprobe.cell.scene.rules` has seen to it that a scene has what its task needs."""
+    """The setup of the task; `canprobe.cell.scene.rules` has checked that the scene has what it needs."""
     settings = scene.task
     if settings.kind == "free":
         assert arm is not None
@@ -274,13 +272,13 @@ def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> T
             ball_sigma=settings.ball_sigma_mm * MM,
             approaches=ball_approaches(settings.touches, tilt, beside, touching["approach"].normal),
         )
-    scanning = settings.kind == "scan"
-    return Touch(
-        **touching,
-        gains=SurfaceGains(servo.surface_height_hz, servo.surface_tilt_hz),
-        scan=_scan(settings, arm) if scanning else None,
-        shape=_shape(scene.shape) if scanning and scene.shape is not None else None,
-    )
+    scan, shape = None, None
+    if settings.kind == "scan":
+        scan = _scan(settings, arm)
+        if (s := scene.shape) is not None:
+            shape = Shape(s.method, s.also, s.memory_mm * MM, s.every_ms * 1e-3, s.patch)
+    gains = SurfaceGains(servo.surface_height_hz, servo.surface_tilt_hz)
+    return Touch(**touching, gains=gains, scan=scan, shape=shape)
 
 
 def _scan(settings: TaskSettings, arm: Arm) -> Scan:
@@ -292,10 +290,6 @@ def _scan(settings: TaskSettings, arm: Arm) -> Scan:
         rolling_share=1.0 if task_rows(arm.model) == FIXED_POLE else settings.rolling_share,
         regain=settings.regain_mm * MM,
     )
-
-
-def _shape(settings: ShapeSettings) -> Shape:
-    return Shape(settings.method, settings.also, settings.memory_mm * MM, settings.every_ms * 1e-3, settings.patch)
 
 
 def _true_arm(scene: Scene, arm: Arm | None, bodies: Bodies) -> tuple[ArmModel | None, Bodies]:
@@ -328,7 +322,7 @@ def _truth(scene: Scene, arm: Arm | None, array: Array | None, bodies: Bodies, p
         bodies=bodies,
         compliance=joint_compliance(scene.joints),
         T_flange_probe=T_flange_there,
-        stiffness=plant.stiffness_n_m3 or (scene.probe.stiffness_n_m3 if scene.probe else None) or LAYER_N_M3,
+        stiffness=plant.stiffness_n_m3 or (scene.probe.stiffness_n_m3 if scene.probe else None) or LAYER_STIFFNESS,
         damping=plant.contact_damping_s_m,
         bandwidth_hz=plant.drive_bandwidth_hz,
         fidelity=plant.fidelity,

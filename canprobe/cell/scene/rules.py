@@ -1,4 +1,4 @@
-"""Which parts of a scene go together: sections and kinds of task, rules across keys, and what a plan chose."""
+"""Rules of what goes together in a scene: sections and kinds of task, keys across sections, choices of a plan."""
 
 from __future__ import annotations
 
@@ -223,7 +223,7 @@ def _taxels_apart(positions: Sequence[Vec3], pitch: float) -> _Complaint:
 
 
 TINY_SHARE = 0.1
-"""Width of an array by its pitch, below which its places are in another unit."""
+"""Width of an array over its pitch below which the places of its taxels are in another unit."""
 _WIRE = ("ids", "frames", "byte_order", "axes", "normal_axis", "unloaded_counts", "full_scale_counts", "poll")
 
 
@@ -277,7 +277,7 @@ def _raw_frames(wire: WireSettings, rows: int, columns: int, mode: str) -> _Comp
 
 
 def image_format(wire: WireSettings, rows: int, columns: int) -> ImageFormat:
-    """How the images of a device of raw frames lie in them.
+    """Layout of the images of a device of raw frames.
 
     Raises:
         ProtocolError: its keys contradict each other.
@@ -314,10 +314,10 @@ def broken_rules(lookup: Callable[[str], Any]) -> Iterator[tuple[str, str]]:
 
 
 def with_choices(scene: Scene, choices: Mapping[str, object]) -> Scene:
-    """A scene with what was chosen in the place of its "auto".
+    """A scene with the choices of the plan in the place of its "auto".
 
     Args:
-        scene: with open keys.
+        scene: scene with open keys.
         choices: value by key path: `{"sensor.mode": "window"}`.
     """
     for path, value in choices.items():

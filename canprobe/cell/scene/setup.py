@@ -16,17 +16,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
-from canprobe.cell.scene.hardware import Auto
+from canprobe.cell.scene.hardware import Auto, BringUpSettings, BusSettings, Fidelity, TactileModeName
 from canprobe.cell.scene.model import (
     BridgeSettings,
-    BringUpSettings,
-    BusSettings,
     Scene,
     ShapeMethod,
-    TactileModeName,
     TaskKind,
 )
 from canprobe.fieldbus.node.quirks import Quirks
@@ -39,25 +33,19 @@ from canprobe.mechanics.touch.patch.array_calibration import NO_FORCE_REFERENCE,
 from canprobe.mechanics.touch.servo import SurfaceGains
 from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.touch.strategies import Strategy
-
-Floats = NDArray[np.float64]
-Bus = BusSettings
-BringUpTimes = BringUpSettings
-Bridges = BridgeSettings
-ArrayMode = TactileModeName
-Fidelity = Literal["ideal", "dynamic"]
+from canprobe.mechanics.types import Floats
 
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """What every node has.
+    """Data that every node of a cell has.
 
     Attributes:
-        node_id: 1–126, on all buses together.
-        channel: of its bus.
+        node_id: node id, 1–126, different on all buses together.
+        channel: channel of its bus.
         eds: name or path of its EDS.
         emulated: served by the emulator.
-        serial: what 1018h:04 must answer; None: anything.
+        serial: serial number that 1018h:04 must have; None: any.
     """
 
     node_id: int
@@ -68,16 +56,16 @@ class Node:
 
 
 @dataclass(frozen=True, slots=True)
-class Homing:
-    """How a drive that does not know its zero after power on finds it. Units are rad or m, and s.
+class HomingParameters:
+    """Parameters of homing, for a drive that does not know its zero after power on. Units are rad or m, and s.
 
     Attributes:
-        method: of CiA 402, 6098h.
+        method: homing method of CiA 402, 6098h.
         order: lower numbers are homed first.
         home: position of the joint at its home position.
-        speed: of the search for the switch.
-        zero_speed: of the search for its edge or the index pulse.
-        acceleration: in homing.
+        speed: speed of the search for the switch.
+        zero_speed: speed of the search for its edge or the index pulse.
+        acceleration: acceleration in homing.
         timeout_s: longest time that it may take.
     """
 
@@ -92,17 +80,17 @@ class Homing:
 
 @dataclass(frozen=True, slots=True)
 class Drive(Node):
-    """One joint drive.
+    """The drive of a joint.
 
     Attributes:
-        zero: how it is homed; None: its encoder is absolute.
+        zero: how the drive is homed; None: its encoder is absolute.
         turn_units: position units of a motor turn; None: of a prismatic joint.
         metre_units: position units of a metre; None: of a revolute joint.
         gear: turns of the motor per turn of the joint.
-        quirks: of an emulated one; None: it has none.
+        quirks: what makes the emulated drive difficult; None: nothing does.
     """
 
-    zero: Homing | None = None
+    zero: HomingParameters | None = None
     turn_units: float | None = None
     metre_units: float | None = None
     gear: float = 1.0
@@ -117,10 +105,10 @@ class Arm:
         model: geometry, limits and motor counts.
         drives: one a joint, from the base.
         q_start: (n,) rad; selects the branch of the inverse kinematics, and is where an emulated arm stands.
-        missed_syncs: SYNC periods without a sign of life after which drive and master take each other for dead.
+        missed_syncs: SYNC periods of silence after which drive and master treat each other as lost.
         grouped: two targets share an RPDO through dummy mapping.
         torque: the drives send their torque where they can; the plan gives it up where the bus has no room for it.
-        warnings: what its URDF says and hardly means.
+        warnings: values of its URDF that are hardly meant.
     """
 
     model: ArmModel
@@ -133,7 +121,7 @@ class Arm:
 
     @property
     def node_ids(self) -> tuple[int, ...]:
-        """Of the drives, joint by joint."""
+        """Node ids of the drives, joint by joint."""
         return tuple(drive.node_id for drive in self.drives)
 
 
@@ -142,15 +130,15 @@ class RawWire:
     """A device of raw frames, which knows no CANopen.
 
     Attributes:
-        image: how its images lie in frames.
-        normal: which of a taxel's values is the normal pressure, from 0.
-        unloaded, full_scale: that value without load, and at the pad's full scale; it may fall with pressure.
-        tare_images: at the beginning whose mean is the unloaded value of each taxel; 0: `unloaded` is.
-        sampling: what an image begins with.
+        image: layout of its images in frames.
+        normal: number of the taxel's value that is the normal pressure, from 0.
+        unloaded, full_scale: value without load, and at the pad's full scale; it may fall with pressure.
+        tare_images: number of images at the beginning whose mean is the unloaded value of each taxel; 0: `unloaded` is.
+        sampling: event that an image begins with.
         start, stop: frames that start and stop the device.
         poll: frames that ask for one image.
-        latency_s, latency_sigma_s: from the sample to the first frame, as stated, and its standard deviation.
-        found_s, found_sigma_s: what a calibration has found beyond that, and its standard deviation.
+        latency_s, latency_sigma_s: time from the sample to the first frame, as stated, and its standard deviation.
+        found_s, found_sigma_s: latency that a calibration found beyond that, and its standard deviation.
     """
 
     image: ImageFormat
@@ -173,18 +161,18 @@ class Array(Node):
     """The tactile array. What makes a node of it counts only without a `raw` wire.
 
     Attributes:
-        name: of its file.
-        mode: what it sends.
+        name: name of its file.
+        mode: what the array sends.
         window: taxels along the window that follows the contact.
-        rate_hz: of its images.
+        rate_hz: rate of its images.
         pad: its taxels.
-        calibration: of the array, with the stiffness of the layer that `Probe` has.
-        calibrated: it was stated, or the array is the emulated one; else the array is real and nobody calibrated it.
-        raw: what it sends where it is no CANopen node; None: it is one.
+        calibration: calibration of the array, with the stiffness of the layer that `Probe` has.
+        calibrated: a calibration was stated, or the array is emulated; False: a real array that nobody has calibrated.
+        raw: the raw frames that it sends; None: it is a CANopen node.
     """
 
     name: str
-    mode: ArrayMode
+    mode: TactileModeName
     window: int | Auto
     rate_hz: float
     pad: Pad
@@ -199,7 +187,7 @@ class Array(Node):
 
     @property
     def newtons(self) -> str:
-        """What the array's newtons are, in words."""
+        """What the array's newtons rest on, in words."""
         return self.calibration.newtons if self.calibrated else NO_FORCE_REFERENCE
 
 
@@ -209,9 +197,9 @@ class Probe:
 
     Attributes:
         T_flange_probe: (4, 4) of its centre on the flange; z is the pole.
-        radius: m.
-        stiffness: K/h of the layer, N/m³.
-        mass: kg.
+        radius: radius of the sphere, m.
+        stiffness: stiffness K/h of the layer, N/m³.
+        mass: mass of the probe, kg.
     """
 
     T_flange_probe: Floats
@@ -222,14 +210,14 @@ class Probe:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SafetyLimits:
-    """Where the cell is stopped.
+    """Limits at which the cell stops for safety.
 
     Attributes:
-        force_max: N.
-        preload_max: N before the run, which the array's tare takes for zero.
-        joint_margin: (n,) kept from the stops of each joint, rad or m; empty without an arm.
-        speed_share: of the joints' speed limits.
-        late_share: of the last second's cycles, late by half a period.
+        force_max: highest measured contact force, N; above it the probe retreats.
+        preload_max: highest force before the run, N; the array's tare takes it for zero.
+        joint_margin: distance (n,) kept from the stops of each joint, rad or m; empty without an arm.
+        speed_share: share of the joints' speed limits that a motion may use.
+        late_share: share of the last second's cycles that may be late by half a period.
         workspace: box (2, 3) of the probe's tip in base, m; an open side is infinite; None without any.
     """
 
@@ -246,10 +234,10 @@ class Shape:
     """The surface estimator.
 
     Attributes:
-        method: in the loop.
-        also: methods on the same data afterwards.
-        memory: of path, m, whatever the time.
-        every_s: between two answers; every sample is taken in.
+        method: estimator in the loop.
+        also: estimators that run on the same data afterwards.
+        memory: length of path on which an estimate rests, m, whatever the time.
+        every_s: time between two answers; every sample is taken in.
         patch: complete what the path leaves open by the second moments of the images.
     """
 
@@ -267,9 +255,9 @@ class Approach:
     Attributes:
         start: expected contact point (3,), base frame, approached along −normal.
         axes: (3, 3) rows heading, across, approach normal (outward); base frame, right-handed.
-        speed: m/s.
-        clearance: of the probe's surface from `start` before it, m.
-        search: beyond `start` where it gives up, m.
+        speed: speed of the approach, m/s.
+        clearance: distance of the probe's surface from `start` where it begins, m.
+        search: distance beyond `start` where it gives up, m.
     """
 
     start: Floats
@@ -291,10 +279,10 @@ class Scan:
 
     Attributes:
         strategy: closed curve in the scan plane.
-        name: of the strategy.
-        speed: of the contact, m/s.
+        name: name of the strategy.
+        speed: speed of the contact, m/s.
         rolling_share: 0: the pad follows the normal, 1: it keeps its orientation.
-        regain: towards the object where contact is lost, m; 0: give up.
+        regain: distance towards the object that is searched for a lost contact, m; 0: none.
     """
 
     strategy: Strategy
@@ -306,12 +294,12 @@ class Scan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Touching:
-    """What every task has that touches an object.
+    """What the tasks have in common that touch an object.
 
     Attributes:
-        force: target, N.
-        duration_s: of the scan, or of the hold; of a calibration what the plan reckons with.
-        lag_s: of the drives behind a ramp.
+        force: target of the contact force, N.
+        duration_s: duration of the scan or of the hold; of a calibration, the duration that the plan expects.
+        lag_s: lag of the drives behind a ramp.
     """
 
     arm: Arm
@@ -328,7 +316,7 @@ class Touch(Touching):
     """Approach, touch, and follow the surface; without a scan hold the force.
 
     Attributes:
-        gains: of the servo's surface.
+        gains: gains of the servo's surface.
         shape: the estimator; None where no shape is estimated.
     """
 
@@ -342,9 +330,9 @@ class Calibrate(Touching):
     """Touch a ball of known radius from several sides to find the probe's centre on the flange.
 
     Attributes:
-        ball_centre: expected (3,), base frame.
-        ball_radius: m.
-        ball_sigma: of the expected centre per axis, m.
+        ball_centre: expected centre of the ball (3,), base frame.
+        ball_radius: radius of the ball, m.
+        ball_sigma: standard deviation of the expected centre per axis, m.
         approaches: the touches in their order.
     """
 
@@ -369,7 +357,7 @@ class Free:
 
     Attributes:
         swing: amplitude of each joint (n,), rad.
-        period_s: of the swing.
+        period_s: period of the swing.
     """
 
     arm: Arm
@@ -390,10 +378,10 @@ class Dynamics:
         friction: Coulomb coefficient between probe and object.
         integral_s: reset time of the velocity loops; 0: none.
         velocity_feed_forward: share of the reference's speed that the drives add.
-        torque_limit_permille: of the continuous torque.
-        integrator: a key of the plant's integrators.
-        step_ns: its longest step.
-        hold_ns: how long mass matrix, bias and contact geometry are held.
+        torque_limit_permille: torque limit of the drives, permille of the continuous torque.
+        integrator: name of the integrator, a key of the plant's `STEPS`.
+        step_ns: longest step of the integrator.
+        hold_ns: time for which mass matrix, bias and contact geometry are held.
     """
 
     payload: float = 0.3
@@ -408,21 +396,22 @@ class Dynamics:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """What is really there: for the emulator, the check of the motion and the scores. The controller never sees it.
+    """What is true in an emulation, for plant, check of the motion and scores. The controller never reads it.
 
     Attributes:
-        object: None where nothing can be touched.
-        model: the arm; None without one.
-        T_flange_probe: (4, 4) of the probe's centre.
+        object: the object; None where nothing can be touched.
+        model: model of the arm; None without an arm.
+        T_flange_probe: frame of the probe's centre on the flange (4, 4).
         stiffness: K/h of its layer, N/m³.
-        damping: Hunt–Crossley α, s/m.
-        bandwidth_hz: −3 dB of every drive.
-        fidelity: of the plant.
-        dynamics: of a dynamic arm.
+        damping: damping of the contact, Hunt–Crossley α, s/m.
+        bandwidth_hz: bandwidth of every drive, −3 dB.
+        fidelity: fidelity of the plant.
+        dynamics: what a dynamic arm has beyond its geometry.
         without: effects of the array that are switched off.
-        adc_bits: of the array.
-        bodies: (n,) of the joints, without the probe; None where nobody knows them, which refuses "dynamic".
-        compliance: (n,) of the joints between motor and link, rad/(N m) or m/N; None: all are rigid.
+        adc_bits: bits of the array's ADC.
+        bodies: bodies (n,) of the links behind the joints, without the probe; None where nobody knows them, which
+            refuses "dynamic".
+        compliance: compliance (n,) of the joints between motor and link, rad/(N m) or m/N; None: all are rigid.
     """
 
     object: PlacedShape | None
@@ -441,20 +430,20 @@ class Truth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setup:
-    """One experiment, whole.
+    """A whole experiment.
 
     Attributes:
-        scene: the user's words, for who writes, sends or changes them. Nobody who plans, drives or emulates reads it.
+        scene: scene in the user's words, to write, send or change it; planning, master and emulation do not read it.
         saved, files: the scene as it names its files beside it, and their contents by name, as they were read for this
             setup. Who writes the scene, or hands it to another process, takes them, whatever became of the originals.
-        name, title, seed: of the scene.
-        figures: whether its run is drawn.
+        name, title, seed: name, title and seed of the scene.
+        figures: whether figures of the run are drawn.
         bus: interface, channel, bit rates and what a lockstep bus is like.
-        rate_hz: of SYNC and servo.
+        rate_hz: rate of SYNC and servo.
         realtime: SCHED_FIFO, a reserved processor, locked memory, on a real interface.
-        compute_ns: that the plan leaves to the controller in each cycle.
-        kind: of the task, as scenes say it.
-        truth: what is really there.
+        compute_ns: time that the plan leaves to the controller in each cycle.
+        kind: kind of the task, as scenes name it.
+        truth: what is true in the emulation.
     """
 
     scene: Scene
@@ -464,13 +453,13 @@ class Setup:
     title: str
     seed: int
     figures: bool
-    bus: Bus
+    bus: BusSettings
     rate_hz: float
     realtime: bool
     compute_ns: int
     limits: SafetyLimits
-    bring_up: BringUpTimes
-    bridge: Bridges
+    bring_up: BringUpSettings
+    bridge: BridgeSettings
     arm: Arm | None
     array: Array | None
     probe: Probe
@@ -503,10 +492,10 @@ class Setup:
 
     @property
     def emulates(self) -> bool:
-        """Something of it is emulated."""
+        """Whether any part of the cell is emulated."""
         return bool(self.emulated_node_ids) or (self.array is not None and self.array.emulated)
 
     def changed(self, part: Literal["bus", "arm", "array"], **values: Any) -> Setup:
-        """With other values of one part, in the task too."""
+        """A setup with other values of one part, in the task too."""
         new = {part: replace(getattr(self, part), **values)}
         return replace(self, **new, task=replace(self.task, **new) if hasattr(self.task, part) else self.task)

@@ -31,7 +31,7 @@ _SOLID, _ENDSOLID = _pattern(rb"solid(?:[ \t][^\n]*)?"), _pattern(rb"endsolid(?:
 
 
 def stl_damage(content: bytes) -> str | None:
-    """What is wrong with the content of an STL file, with the line or the number of bytes; None where it is whole."""
+    """The damage of an STL file, with the line or the number of bytes; None where the file is whole."""
     facets, size = int.from_bytes(content[80:_HEAD], "little"), len(content)
     if size >= _HEAD and size == _HEAD + _FACET * facets:  # its head may begin with "solid" as well
         return None if facets else "it holds no facet"

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from canprobe.cell.scene.hardware import MM
 from canprobe.cell.scene.model import ObjectSettings
 from canprobe.cell.scene.stl_files import stl_damage
 from canprobe.errors import UsageError, install_line, regular_file
@@ -20,23 +20,21 @@ from canprobe.mechanics.touch.mesh_fit import HeightGrid, fit_mesh
 from canprobe.mechanics.touch.objects import make_object
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.shapes import PlacedShape
-
-Array = NDArray[np.float64]
+from canprobe.mechanics.types import Floats
 
 HEIGHTS = (".npy", ".npz", ".csv", ".txt")
 MESHES = (".stl", ".obj", ".ply")
-_MM = 1e-3
 _SPACING_MM = 1.0
 NO_DATA = (-9999.0, -99999.0, -32768.0, -32767.0, 65535.0)
-"""What programs of measuring machines and maps write where they saw nothing; a far outlier only then."""
-_HUGE, _FAR = 1e30, 10.0
-_FLATTEST, _STEEP = 5e-4, 20.0
-"""Rise of a surface by the width of its grid, outside of which one of the two is in another unit."""
-_NARROWEST_MM = 1.0
-_AGAIN = "get the file again, or export it again"
+"""Values that measuring machines and map programs write for missing heights; they count so only as far outliers."""
+_MAX_HEIGHT_MM, _FAR = 1e30, 10.0
+_MIN_SLOPE, _MAX_SLOPE = 5e-4, 20.0
+"""Range of the rise of a surface over the width of its grid; outside of it one of them is in another unit."""
+_MIN_WIDTH_MM = 1.0
+_RETRY_HINT = "get the file again, or export it again"
 
 
-def object_of_file(settings: ObjectSettings, T_base_object: Array) -> PlacedShape:
+def object_of_file(settings: ObjectSettings, T_base_object: Floats) -> PlacedShape:
     """The object whose surface is read from a file.
 
     Raises:
@@ -57,8 +55,8 @@ def object_of_file(settings: ObjectSettings, T_base_object: Array) -> PlacedShap
         changed_ns = regular_file(path).stat().st_mtime_ns
     except OSError as error:
         raise ValueError(f"file: {path}: cannot be read: {error.strerror}") from error
-    spacing = (settings.spacing_mm or _SPACING_MM) * _MM
-    fit = _mesh(path, changed_ns, settings.unit_mm * _MM, spacing, settings.origin_mm)
+    spacing = (settings.spacing_mm or _SPACING_MM) * MM
+    fit = _mesh(path, changed_ns, settings.unit_mm * MM, spacing, settings.origin_mm)
     try:
         return Heights(T_base_object, fit.heights, fit.spacing, fit.origin, fit.there)
     except ValueError as error:
@@ -94,7 +92,7 @@ def _mesh(
     except OSError as error:
         raise ValueError(f"file: {path}: cannot be read: {error.strerror}") from error
     if damage is not None:
-        raise ValueError(f"file: {path.name} is a damaged STL: {damage}; {_AGAIN}")
+        raise ValueError(f"file: {path.name} is a damaged STL: {damage}; {_RETRY_HINT}")
     logging.getLogger("trimesh").addHandler(logging.NullHandler())  # it logs tracebacks of what it does without
     try:
         with warnings.catch_warnings():
@@ -102,10 +100,10 @@ def _mesh(
             read = trimesh.load_mesh(path, process=False)
     except Exception as error:  # each of its readers has its own
         why = str(error) or type(error).__name__
-        raise ValueError(f"file: {path.name} is no mesh that can be read: {why}; {_AGAIN}") from error
+        raise ValueError(f"file: {path.name} is no mesh that can be read: {why}; {_RETRY_HINT}") from error
     if not len(getattr(read, "faces", ())):
         raise ValueError(f"file: {path.name} holds no facets: export the body as a mesh of triangles")
-    origin = None if origin_mm is None else np.array(origin_mm) * _MM
+    origin = None if origin_mm is None else np.array(origin_mm) * MM
     try:
         return fit_mesh(read.vertices * unit, read.faces, spacing, origin)
     except ValueError as error:
@@ -114,14 +112,14 @@ def _mesh(
 
 
 def _refuse_other_content(path: Path) -> None:
-    """Name what stands in the place of a file that was not downloaded, or not whole."""
+    """Refuse content that stands in the place of a file which was not downloaded, or not whole."""
     try:
         with regular_file(path).open("rb") as file:
             start = file.read(200)
     except OSError:  # which its reader names
         return
     if not start.strip():
-        raise ValueError(f"file: {path.name} is empty: {_AGAIN}")
+        raise ValueError(f"file: {path.name} is empty: {_RETRY_HINT}")
     if start.startswith(b"version https://git-lfs"):
         raise ValueError(
             f"file: {path.name} is a pointer of Git LFS, not the file: type `git lfs pull` where it is from"
@@ -143,35 +141,35 @@ def _heights(settings: ObjectSettings, path: Path) -> dict[str, Any]:
         raise ValueError(
             f"file: {path.name}: height {z[row, column]} in row {row + 1}, column {column + 1}: fill gaps first"
         )
-    huge = np.abs(z) > _HUGE
+    huge = np.abs(z) > _MAX_HEIGHT_MM
     gaps = z[np.isin(z, NO_DATA) | huge]
     if huge.any() or (gaps.size and np.ptp(z) > _FAR * np.ptp(_without(z, gaps[0]))):
         raise ValueError(
             f"file: {path.name}: {gaps.size} of {z.size} heights are {gaps[0]:g}: no data; fill gaps first"
         )
     _refuse_other_unit(path, z, spacing, settings.unit_mm)
-    unit = settings.unit_mm * _MM
+    unit = settings.unit_mm * MM
     middle = 0.5 * spacing * unit * (np.array(z.shape) - 1)
-    origin = np.zeros(2) if settings.origin_mm is None else np.array(settings.origin_mm) * _MM - middle
+    origin = np.zeros(2) if settings.origin_mm is None else np.array(settings.origin_mm) * MM - middle
     return {"heights": z * unit, "spacing": spacing * unit, "origin": origin}
 
 
-def _without(z: Array, value: float) -> Array:
-    rest: Array = z[z != value]
+def _without(z: Floats, value: float) -> Floats:
+    rest: Floats = z[z != value]
     return rest if rest.size else np.zeros(1)
 
 
-def _refuse_other_unit(path: Path, z: Array, spacing: float, unit_mm: float) -> None:
-    """Heights and spacing of one unit give a surface: neither a wall nor, unless it is a plane, a flat."""
+def _refuse_other_unit(path: Path, z: Floats, spacing: float, unit_mm: float) -> None:
+    """Refuse heights and spacing of different units: together they give a wall, or a flat surface that is no plane."""
     rise, width = float(np.ptp(z)), spacing * min(z.shape)
-    if unit_mm * width < _NARROWEST_MM or (rise > 0.0 and not _FLATTEST < rise / width < _STEEP):
+    if unit_mm * width < _MIN_WIDTH_MM or (rise > 0.0 and not _MIN_SLOPE < rise / width < _MAX_SLOPE):
         raise ValueError(
             f"file: {path.name}: its heights rise by {unit_mm * rise:.3g} mm over a grid {unit_mm * width:.3g} mm wide:"
             f" are heights and spacing in one unit, and is unit_mm = {unit_mm:g} that unit?"
         )
 
 
-def _grid(path: Path) -> tuple[Array, float | None]:
+def _grid(path: Path) -> tuple[Floats, float | None]:
     """Heights in the file's unit, and their spacing where the file holds it."""
     kind = path.suffix.lower()
     if kind not in HEIGHTS:
@@ -190,13 +188,13 @@ def _grid(path: Path) -> tuple[Array, float | None]:
         return np.asarray(read, dtype=np.float64), None
     except UnicodeDecodeError as error:
         why = f"byte {error.start} is {error.object[error.start]:#04x}, which is no text"
-        raise ValueError(f"file: {path.name} is no grid of numbers: {why}; {_AGAIN}") from error
+        raise ValueError(f"file: {path.name} is no grid of numbers: {why}; {_RETRY_HINT}") from error
     except Exception as error:  # numpy raises what zip, its decompression and the parser of headers raise
         why = "it is damaged, or holds Python objects" if "pickle" in str(error) else str(error) or type(error).__name__
-        raise ValueError(f"file: {path.name} is no grid of numbers: {why}; {_AGAIN}") from error
+        raise ValueError(f"file: {path.name} is no grid of numbers: {why}; {_RETRY_HINT}") from error
 
 
-def _of_text(text: str) -> Array:
+def _of_text(text: str) -> Floats:
     """The numbers of a text, a row on each line."""
     rows = [line.partition("#")[0] for line in text.splitlines()]
     if any(";" in row for row in rows):  # then a comma is a decimal one
@@ -213,7 +211,7 @@ def _of_text(text: str) -> Array:
     return np.array(grid)
 
 
-def _of_archive(arrays: dict[str, Any]) -> tuple[Array, float | None]:
+def _of_archive(arrays: dict[str, Any]) -> tuple[Floats, float | None]:
     heights = arrays.get("heights", next(iter(arrays.values())) if len(arrays) == 1 else None)
     if heights is None:
         raise ValueError(f'expected an array "heights", got {", ".join(arrays) or "none"}')

@@ -30,7 +30,7 @@ from canprobe.cell.session.session import Session
 from canprobe.cell.session.target import LOCKSTEP, Target
 from canprobe.cell.tasks.from_plan import make_sensing
 from canprobe.cell.tasks.probing import Phase
-from canprobe.cell.tasks.roll import Press, Pressed, RollTask
+from canprobe.cell.tasks.roll import Press, RollRecord, RollTask
 from canprobe.errors import PlanError, UsageError
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.inverse import task_rows
@@ -371,7 +371,7 @@ def _along_rod(plan: Plan, known: KnownObject) -> float:
 
 
 def as_dwell(  # noqa: PLR0917
-    pressed: Pressed, visit: Visit, start: Floats, probe_radius: float, place: int, force: float | None
+    pressed: RollRecord, visit: Visit, start: Floats, probe_radius: float, place: int, force: float | None
 ) -> Dwell:
     """A touch as the fit takes it: where its contacts should lie by joints and object.
 

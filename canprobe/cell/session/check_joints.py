@@ -12,9 +12,9 @@ from canprobe.cell.session.session import Session
 from canprobe.cell.session.up import ROWS_OF_UP
 from canprobe.errors import NodeError, UsageError
 from canprobe.mechanics.robot.chain import forward
+from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
-    from canprobe.cell.tasks.free_and_listen import Vector
     from canprobe.cell.tasks.joint_finding import JointFinding, Operator
     from canprobe.mechanics.robot.model import ArmModel
 
@@ -58,7 +58,7 @@ def check_joints(scene: Scene, *, operator: Operator | None = None, say: Say = q
     return check.findings
 
 
-def _zero_pose(model: ArmModel, start: Vector) -> str:
+def _zero_pose(model: ArmModel, start: Floats) -> str:
     """Where the arm has to be if its zeros are right, for a look at its marks."""
     units = [joint.unit for joint in model.joints]
     each = [f"{joint.shown(q):.2f}" for joint, q in zip(model.joints, start, strict=True)]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.scene.model import BusSettings
+from canprobe.cell.scene.hardware import BusSettings
 from canprobe.fieldbus.bus.real.link import (
     FAST_SAMPLE,
     SLOW_BIT_S,

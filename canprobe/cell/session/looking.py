@@ -14,7 +14,8 @@ from canprobe.cell.master.monitor import CellView, Monitor
 from canprobe.cell.master.options import Say, quiet
 from canprobe.cell.master.scan import scan_nodes
 from canprobe.cell.planning.make import make_plan
-from canprobe.cell.scene.model import BringUpSettings, Scene
+from canprobe.cell.scene.hardware import BringUpSettings
+from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.buses import open_ports
 from canprobe.cell.session.link_faults import ExpectedLink, expected_of

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
+from canprobe.cell.scene.hardware import DIRECT
 from canprobe.cell.scene.load import load_scene
-from canprobe.cell.scene.model import DIRECT, Scene
+from canprobe.cell.scene.model import Scene
 from canprobe.errors import UsageError
 
 LOCKSTEP = "lockstep"

@@ -3,16 +3,16 @@
 `from_plan.make_task` gives the controller of a plan's task; nothing is imported that the task does not need.
 
 - `touch` approaches, settles, scans or holds, and retreats; `regain` searches for a lost contact, `requested` lets a
-  bridge start, stop and set the task. `calibrate` touches a ball
-  from several sides; `roll` presses and rolls on a known object. All derive from `probing.ProbingTask`: the order of a
-  cycle and its phases; `probe_motion` turns the probe's pose into joint targets.
+  bridge start, stop and set the task. `calibrate` touches a ball from several sides; `roll` presses and rolls on a
+  known object. All derive from `probing.ProbingTask`, which has the order of a cycle and its phases; `probe_motion`
+  turns the probe's pose into joint targets.
 - `sensing` makes a contact of a measurement: joints at the instant of the image, the patch, the squeezed layer.
-- `shape` is the estimator in the loop: contacts go in when they are felt, answers are computed in `update` when the
+- `shape` is the estimator in the loop: contacts go in when they are measured, answers are computed in `update` when the
   commands are out, and are used from the next cycle on.
 - `free_and_listen` has the tasks without touch: hold, swing, listen. `joint_check` moves each joint alone for the first
-  time, and `joint_finding` is what that showed.
+  time, and `joint_finding` has the results.
 - `trajectory` follows points, for own scripts and for ROS 2: `canprobe.cell.tasks.Trajectory`.
-- `task` is what a task leaves for the summary.
+- `task` has the results that a task leaves for the summary.
 
 A task guards its own contact (`lets_go`): it decides by the same table of conditions as the cell when to let go. A
 task reads its setup (`canprobe.cell.scene.setup`) and nothing of a scene.

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.cell.master.controller import TactileSample
 from canprobe.cell.planning.model import Plan
@@ -21,28 +20,28 @@ from canprobe.mechanics.touch.patch.image import Patch
 from canprobe.mechanics.touch.probe_motion import EXTRA_CLEARANCE_M, ROUND_SPEED, ArcMotion
 from canprobe.mechanics.touch.servo import ProbePose
 from canprobe.mechanics.touch.stops import TOUCH_FORCE
+from canprobe.mechanics.types import Floats
 
-Vector = NDArray[np.float64]
 PRESS_SPEED = 0.8e-3
-"""m/s, from the first touch to the wanted force: what is still under way then sinks in by 0.02 mm."""
-CERTAIN = 0.06
+"""Speed from the first touch to the wanted force, m/s: the motion that is then still under way presses in 0.02 mm."""
+MAX_SLOPE_SIGMA_SHARE = 0.06
 """Share of itself to which the slope of √F over the push must be known (1σ) for the depth to be read off it."""
 SETTLE_S = 0.15
 LISTEN_S = 0.25
-"""At rest before samples count, and while they do."""
+"""Time at rest before samples count, and the time in which they count."""
 
 
 class CalibrateTask(ProbingTask):
-    """Touch after touch; the estimate in the end.
+    """Touches the ball again and again, and estimates the tool in the end.
 
     Args:
-        plan: of the cell.
-        task: what to do.
+        plan: plan of the cell.
+        task: settings of the calibration.
         sensing: contacts from measurements.
 
     Attributes:
-        touches: what was felt so far.
-        estimate: of the tool; None before the end, or with too few touches.
+        touches: the touches so far.
+        estimate: estimate of the tool; None before the end, or with too few touches.
     """
 
     def __init__(self, plan: Plan, task: Calibrate, sensing: ContactSensing) -> None:
@@ -66,13 +65,13 @@ class CalibrateTask(ProbingTask):
             self._let_go()
 
     def stop(self) -> None:
-        """Let go, and estimate from what was felt so far."""
+        """Let go, and estimate from the touches so far."""
         self._number = len(self._task.approaches)
         if self.phase not in (Phase.RETREAT, Phase.DONE) and self._motion is not None:
             self._let_go()
 
     def record(self) -> TaskRecord:
-        """What it knows so far."""
+        """The record of the calibration so far."""
         return replace(super().record(), tool=self.estimate)
 
     def _feel(self, sample: TactileSample, patch: Patch) -> None:
@@ -94,7 +93,7 @@ class CalibrateTask(ProbingTask):
         return ProbePose(self._ball.c_base + (self._ball.radii + gap) * touch.n_base, touch.pole_base)
 
     def _begin(self, pose: ProbePose) -> None:
-        """To the next touch, round the ball; or to the end."""
+        """Go to the next touch, round the ball, or end."""
         if self.reason is not None or self._number >= len(self._task.approaches):
             if self.reason is None and len(self.touches) >= 2:
                 self.estimate = calibrate_tool(self._corrected(), self._ball)
@@ -113,17 +112,20 @@ class CalibrateTask(ProbingTask):
         elif self._gone > self._task.approach.search:
             self.retreat(
                 f"touch {self._number + 1}: no ball found up to {self._task.approach.search * 1e3:.0f} mm beyond the"
-                " expected place"
+                " expected place: correct task.start_mm and task.ball_radius_mm, or raise task.search_mm"
             )
         return self._at(-self._gone)
 
     def _settle(self) -> ProbePose:
-        """On, slowly, until the force is there."""
+        """Press on slowly until the force is reached."""
         if self._touch.force >= self._task.force:
             self._felt = []
             self._enter(Phase.SCAN)
         elif self._gone > self._task.approach.search:
-            self.retreat(f"touch {self._number + 1}: {self._task.force:g} N are not reached where the ball is expected")
+            self.retreat(
+                f"touch {self._number + 1}: expected {self._task.force:g} N at the ball, got {self._touch.force:.2f} N"
+                f" {self._task.approach.search * 1e3:g} mm beyond: fix the ball in its place, or correct task.start_mm"
+            )
         else:
             self._gone += PRESS_SPEED * self._dt
         return self._at(-self._gone)
@@ -135,7 +137,7 @@ class CalibrateTask(ProbingTask):
                 self._number += 1
                 self._let_go()
             else:
-                self.retreat(f"touch {self._number + 1}: no tactile sample while it rested")
+                self.retreat(f"touch {self._number + 1}: no tactile sample while the probe rested: check the array")
         return self._at(-self._gone) if self.phase is Phase.SCAN else self._retreat()
 
     def _ball_touch(self, felt: Sequence[ContactSample]) -> BallTouch:
@@ -146,11 +148,11 @@ class CalibrateTask(ProbingTask):
         T_base_flange = T_base_probe @ np.linalg.inv(self.sensing.flange_probe)
         d_flange = -(T_base_flange[:3, :3].T @ n) / float(np.linalg.norm(n))
         depth = float(np.mean([self.sensing.depth(contact.force_n) for contact in felt]))
-        if self._push.certain(CERTAIN):
+        if self._push.certain(MAX_SLOPE_SIGMA_SHARE):
             self._depths.append((depth, self._pushed(T_base_probe[:3, 3]) - self._push.start))
         return BallTouch(T_base_flange, d_flange, depth)
 
-    def _pushed(self, centre: Vector) -> float:
+    def _pushed(self, centre: Floats) -> float:
         """Way of the probe's centre (3,), m, towards the ball along this touch's direction, from the ball's centre."""
         return -float(self._task.approaches[self._number].n_base @ (centre - self._ball.c_base))
 

@@ -12,28 +12,27 @@ from canprobe.cell.master.controller import Command, Measurement
 from canprobe.cell.tasks.task import Task, TaskRecord
 from canprobe.mechanics.touch.patch.image import PatchCalibration
 from canprobe.mechanics.touch.probe_motion import smooth_step
-
-Vector = NDArray[np.float64]
+from canprobe.mechanics.types import Floats
 
 
 class FreeTask(Task):
     """Swing every joint sinusoidally about where it stood, with a soft start and end.
 
     Args:
-        amplitude: of each joint (n,), rad or m.
-        swing_period_s: of the swing.
-        duration_s: of the whole task.
-        period_s: of the cycle.
+        amplitude: amplitude of each joint (n,), rad or m.
+        swing_period_s: period of the swing.
+        duration_s: duration of the whole task.
+        period_s: period of the cycle.
     """
 
-    def __init__(self, amplitude: Vector, swing_period_s: float, duration_s: float, period_s: float) -> None:
+    def __init__(self, amplitude: Floats, swing_period_s: float, duration_s: float, period_s: float) -> None:
         self._amplitude = amplitude
         self._omega = 2 * math.pi / swing_period_s
         self._duration = duration_s
         self._soft = min(1.0, duration_s / 4)
         self._period = period_s
         self._t = 0.0
-        self._q0: Vector | None = None
+        self._q0: Floats | None = None
 
     def step(self, measurement: Measurement) -> Command:
         """One cycle."""
@@ -51,9 +50,9 @@ class ListenTask(Task):
     """Read the sensor and do nothing.
 
     Args:
-        calibration: of the array.
-        duration_s: how long.
-        period_s: of the cycle.
+        calibration: calibration of the array.
+        duration_s: duration of the task.
+        period_s: period of the cycle.
     """
 
     def __init__(self, calibration: PatchCalibration, duration_s: float, period_s: float) -> None:
@@ -61,10 +60,10 @@ class ListenTask(Task):
         self._left = duration_s
         self._period = period_s
         self.taxels: NDArray[np.uint8] | None = None
-        self._columns: dict[str, float | Vector] = {}
+        self._columns: dict[str, float | Floats] = {}
 
     def record(self) -> TaskRecord:
-        """What it knows so far."""
+        """The results so far."""
         return TaskRecord(taxels=self.taxels)
 
     def step(self, measurement: Measurement) -> Command:
@@ -86,5 +85,5 @@ class HoldTask(Task):
     """Stay where the drives are."""
 
     def step(self, _: Measurement) -> Command:
-        """Nothing to do."""
+        """Do nothing."""
         return Command()

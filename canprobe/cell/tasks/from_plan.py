@@ -23,26 +23,27 @@ if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.online import Estimator
 
 
-ALIKE = (2e-3, 0.3)
-"""Path of the contact (m) along which a share of the centroids' variance is alike, over 87 random scenes. That of a
-calibration is a way over the pad, of which a pad that follows the normal goes a twentieth."""
-SCANNING = 1.6
-"""Error of a centroid in a scan over that of a calibration's touches, which roll over 1 mm. Over 87 random scenes at
-100 kPa it is 1.25 (RMS), but not Gaussian: at 1.35 one scan of the cylinder in ten raises a false alarm of another
-surface, at 1.6 none, and saddle, torus and wave err less."""
+CENTROID_CORRELATION = (2e-3, 0.3)
+"""Correlation length of centroids along the path of the contact, m, and the share of their variance that is correlated,
+over 87 random scenes. The length in a calibration is along the pad, over which a pad that follows the normal moves a
+twentieth of the path."""
+SCAN_CENTROID_FACTOR = 1.6
+"""Error of a centroid in a scan over the error in a calibration's touches, which roll over 1 mm. Over 87 random scenes
+at 100 kPa it is 1.25 (RMS), but not Gaussian: at 1.35 one scan of the cylinder in ten raises a false alarm of another
+surface, at 1.6 none does, and the errors on saddle, torus and wave are smaller."""
 SIGMA_NORMAL_RAD = 0.3e-3
-"""Of what turns no centroid: joint counts displace the probe by 11 µm, and the surface bends by 28 1/m of it."""
+"""Error of a normal that does not come from its centroid: joint counts displace the probe by 11 µm, times 28 1/m."""
 SIGMA_STIFFNESS = 0.6
-"""Of the logarithm of the layer's stiffness, before any touch."""
-SCALE, SCALE_ROLLING = 4e-3, 0.08
-"""Relative error of curvature that no path averages, and what a probe that keeps its orientation adds to it: creep
-shows the ways of the contact over the pad too short, and the rolling share is their part of what bends the normal."""
-WITH_PATCH = ("recursive", "ml")
-"""Estimators whose answers the patch completes and whose regions follow changes; the others stay as they were."""
+"""Standard deviation of the logarithm of the layer's stiffness before any touch."""
+SCALE_ERROR, ROLLING_SCALE_ERROR = 4e-3, 0.08
+"""Relative error of curvature that no path averages, and the error that a probe adds which keeps its orientation: creep
+shortens the measured way of the contact over the pad, and the rolling share is its part in the turn of the normal."""
+PATCH_METHODS = ("recursive", "ml")
+"""Estimators that use the patch, and whose confidence regions follow changes; the others are as published."""
 
 
 def make_sensing(task: Touch | Calibrate) -> ContactSensing:
-    """Contacts from measurements, as the task's arm, probe and array give them."""
+    """The contact sensing of a task, for its arm, probe and array."""
     calibration = make_patch_calibration(task.array.calibration, task.array.pad)
     return ContactSensing(
         task.arm.model,
@@ -58,23 +59,23 @@ def make_sensing(task: Touch | Calibrate) -> ContactSensing:
 
 def _centroid_errors(task: Touch | Calibrate) -> CentroidErrors:
     calibrated = task.array.calibration.centroid
-    return replace(calibrated, scale=SCANNING * calibrated.scale)
+    return replace(calibrated, scale=SCAN_CENTROID_FACTOR * calibrated.scale)
 
 
 def centroid_coupling(probe: Probe) -> float:
-    """`Noise.coupling` of contacts that the array on this probe feels, 1/m."""
+    """`Noise.coupling` of contacts that the array on this probe measures, 1/m."""
     return 1.0 / probe.radius
 
 
 def centroid_correlation() -> Correlation:
-    """Of the noise of contacts along their path."""
+    """Correlation of the noise of contacts along their path."""
     from canprobe.mechanics.touch.estimate.noise import Correlation  # only where a shape is asked for
 
-    return Correlation(*ALIKE)
+    return Correlation(*CENTROID_CORRELATION)
 
 
 def make_shape_estimator(task: Touch, method: str) -> Estimator:
-    """An estimator as a scan's setup has it, by name."""
+    """An estimator by its name, with the settings of a scan."""
     from canprobe.mechanics.touch.estimate.fit import make_estimator  # only where a shape is asked for
 
     assert task.shape is not None and task.scan is not None
@@ -89,16 +90,16 @@ def make_shape_estimator(task: Touch, method: str) -> Estimator:
         correlation=centroid_correlation(),
         coupling=centroid_coupling(task.probe),
     )
-    if method not in WITH_PATCH:
+    if method not in PATCH_METHODS:
         return estimator
     from canprobe.mechanics.touch.estimate.following import FollowingEstimator
 
-    scale = SCALE + SCALE_ROLLING * task.scan.rolling_share
+    scale = SCALE_ERROR + ROLLING_SCALE_ERROR * task.scan.rolling_share
     return FollowingEstimator(_with_patch(task, estimator, memory) if _uses_patch(task) else estimator, memory, scale)
 
 
 def _typical_sigma(task: Touch) -> float:
-    """Standard deviation of a contact at the wanted force on a plane, m: of what has none of its own."""
+    """Standard deviation of a contact at the wanted force on a plane, m, for contacts that state none."""
     probe = task.probe
     depth = indentation_from_force(task.force, probe.stiffness, probe.radius, (0.0, 0.0))
     level_pa = MomentImage(make_patch_calibration(task.array.calibration, task.array.pad)).level_pa
@@ -123,7 +124,7 @@ def _uses_patch(task: Touch) -> bool:
 
 
 def make_shape_tracker(setup: Setup) -> ShapeTracker | None:
-    """The estimator of a setup that asks for a shape, None of one that does not."""
+    """The estimator in the loop; None where the setup estimates no shape."""
     task = setup.task
     if not isinstance(task, Touch) or task.shape is None:
         return None
@@ -132,7 +133,7 @@ def make_shape_tracker(setup: Setup) -> ShapeTracker | None:
 
 
 def estimates_of(setup: Setup, tracker: ShapeTracker, methods: Iterable[str]) -> dict[str, list[ShapeRecord]]:
-    """What the tracker's estimator said, where it is one of ``methods``, and the others on the same contacts."""
+    """The answers of ``methods`` on the tracker's contacts; those of its own estimator are taken from the tracker."""
     task = setup.task
     assert isinstance(task, Touch) and task.shape is not None
     every = max(1, round(0.1 * task.array.rate_hz))

@@ -1,4 +1,4 @@
-"""First motion: each joint alone by a small way, slowly, and what every encoder made of it.
+"""First motion: each joint moves alone by a small way, slowly, and every encoder is compared.
 
 Encoders are compared motor by motor, so that a drive that turns the wrong way, by another gear or not at all is named
 even where wrist joints drag each other's motors along. Whether the joint itself turned the way it must, no encoder
@@ -16,15 +16,15 @@ from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.master.position_track import rest_counts
 from canprobe.cell.master.supervisor import JointGuard
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.tasks.free_and_listen import Vector
 from canprobe.cell.tasks.joint_finding import VERBS, Answer, JointFinding, Operator, find_fault
 from canprobe.mechanics.touch.probe_motion import smooth_step
+from canprobe.mechanics.types import Floats
 
 Script = Generator[Command, Measurement, Measurement]
-ANGLE = math.radians(1.0)
-"""Of a prismatic joint its travel by `ArmModel.radian`: 3.5 mm."""
+MOVE_ANGLE = math.radians(1.0)
+"""Angle by which a revolute joint is moved; a prismatic joint moves by `ArmModel.radian` times that, 3.5 mm."""
 MOVE_S = 15 / 8 * 0.5
-"""With a highest speed of 2 deg/s (7 mm/s): that of the quintic is 15/8 of its mean."""
+"""Time of a motion, for a highest speed of 2 deg/s (7 mm/s); the highest speed of the quintic is 15/8 of its mean."""
 SETTLE_S = 0.25
 
 
@@ -32,11 +32,11 @@ class JointCheck(Controller):
     """The controller that moves one joint after the other, forth and back.
 
     Args:
-        plan: of a cell with an arm; a joint that would leave its limits is moved the other way, or not at all.
+        plan: plan of a cell with an arm; a joint that would leave its limits is moved the other way, or not at all.
         operator: asked before each motion, and after it whether the joint moved the right way; None: no questions.
 
     Attributes:
-        findings: one for each joint that its turn has come to.
+        findings: one for each joint that was checked so far.
         start: joint positions (n,), rad or m, before any motion; None as long as they are not known.
     """
 
@@ -45,19 +45,19 @@ class JointCheck(Controller):
         self._guard, self._model = JointGuard(plan), plan.setup.arm.model
         self._period_s, self._operator = plan.sync.period_ns * 1e-9, operator
         self.findings: list[JointFinding] = []
-        self.start: Vector | None = None
+        self.start: Floats | None = None
         self._quits = False
         self._script: Generator[Command, Measurement, None] = self._all_joints()
         next(self._script)
 
     def step(self, measurement: Measurement) -> Command:
-        """One cycle."""
+        """Give the target of a cycle."""
         try:
             return self._script.send(measurement)
         except StopIteration:
             return Command(done=True)
 
-    def inspect(self, q: Vector) -> str | None:
+    def inspect(self, q: Floats) -> str | None:
         """Why an arm that stands at joint positions (n,), rad or m, must not be enabled."""
         self.start = q
         outside = np.flatnonzero((q < self._guard.low) | (q > self._guard.high))
@@ -82,7 +82,7 @@ class JointCheck(Controller):
             if self._quits:
                 return
 
-    def _joint(self, joint: int, start: Vector) -> Generator[Command, Measurement, JointFinding | None]:
+    def _joint(self, joint: int, start: Floats) -> Generator[Command, Measurement, JointFinding | None]:
         """Ask, move, look, ask, move back; None where the operator has enough before it has moved."""
         its, units_per_q = self._model.joints[joint], self._model.units_per_q
         stood, unit = its.shown(start[joint]), its.unit
@@ -109,9 +109,9 @@ class JointCheck(Controller):
         way_made = its.shown(float(moved[joint] / units_per_q[joint, joint]))
         return JointFinding(joint, stood, told, way_made, fault, unit=unit)
 
-    def _way(self, joint: int, start: Vector) -> Vector | None:
+    def _way(self, joint: int, start: Floats) -> Floats | None:
         """The change of the joints (n,), rad or m: forwards, or else backwards; None where there is no room."""
-        for angle in (ANGLE, -ANGLE):
+        for angle in (MOVE_ANGLE, -MOVE_ANGLE):
             way = np.zeros_like(start)
             way[joint] = angle * self._model.radian[joint]
             goal = start + way
@@ -121,7 +121,7 @@ class JointCheck(Controller):
 
     # parts of the script
 
-    def _asked(self, question: str, q: Vector) -> Generator[Command, Measurement, Answer]:
+    def _asked(self, question: str, q: Floats) -> Generator[Command, Measurement, Answer]:
         if self._operator is None:
             return Answer.YES
         self._operator.ask(question)
@@ -130,12 +130,12 @@ class JointCheck(Controller):
         self._quits = answer is Answer.QUIT
         return answer
 
-    def _hold(self, q: Vector) -> Script:
+    def _hold(self, q: Floats) -> Script:
         for _ in range(max(1, round(SETTLE_S / self._period_s))):
             measurement = yield Command(q_target=q)
         return measurement
 
-    def _move(self, q_from: Vector, q_to: Vector) -> Script:
+    def _move(self, q_from: Floats, q_to: Floats) -> Script:
         cycles = max(1, round(MOVE_S / self._period_s))
         for k in range(1, cycles + 1):
             yield Command(q_target=q_from + smooth_step(k / cycles) * (q_to - q_from))

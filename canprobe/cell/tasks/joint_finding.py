@@ -1,4 +1,4 @@
-"""What a joint's first motion showed, and the operator who looks at it."""
+"""The result of a joint's first motion, and the operator who watches it."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Protocol
 
 import numpy as np
 
-from canprobe.cell.tasks.free_and_listen import Vector
+from canprobe.mechanics.types import Floats
 
-TOLERANCE, TOLERANCE_RESTS = 0.05, 0.5
-"""How far an encoder's way may be from what was asked: this share, but at least this part of `rest_counts`."""
+TRAVEL_TOLERANCE_SHARE, TRAVEL_TOLERANCE_RESTS = 0.05, 0.5
+"""Tolerance of an encoder's way: this share of the commanded way, but at least this part of `rest_counts`."""
 
 
 class Answer(Enum):
-    """What an operator says."""
+    """The answer of an operator."""
 
     YES = "yes"
     NO = "no"
@@ -24,7 +24,7 @@ class Answer(Enum):
 
 
 class Operator(Protocol):
-    """Somebody who looks at the arm. The cell goes on meanwhile: `answer` never waits."""
+    """A person who watches the arm. The cell goes on meanwhile: `answer` never waits."""
 
     def ask(self, question: str) -> None:
         """Put a question."""
@@ -34,20 +34,20 @@ class Operator(Protocol):
 
 
 VERBS = {"deg": ("turn", "turned"), "mm": ("move", "moved")}
-"""What a joint does and did, by its unit."""
+"""Verbs for the motion of a joint, present and past, by its unit."""
 
 
 @dataclass(frozen=True, slots=True)
 class JointFinding:
-    """What became of one joint.
+    """The result of the check of a joint.
 
     Attributes:
-        joint: from 0.
-        start: where it stood, in its unit, as the next two.
+        joint: number of the joint, from 0.
+        start: position before the motion, in the joint's unit, as the next two.
         asked: the way of its target; 0 where it was not moved.
-        moved: how far it moved, by its own motor's encoder.
+        moved: way by its own motor's encoder.
         unit: deg or mm.
-        fault: what is wrong; None where nothing is.
+        fault: fault that was found; None without one.
         skipped: why it was not moved; None where it was.
     """
 
@@ -67,17 +67,17 @@ class JointFinding:
         return where + way + (f": {self.fault}" if self.fault is not None else ": as expected")
 
 
-def find_fault(joint: int, asked: Vector, moved: Vector, rest: Sequence[float], unit: str = "deg") -> str | None:
-    """What is wrong with the motors' ways, the joint's own first; None where nothing is.
+def find_fault(joint: int, asked: Floats, moved: Floats, rest: Sequence[float], unit: str = "deg") -> str | None:
+    """The fault in the motors' ways, the joint's own first; None without one.
 
     Args:
-        joint: that was to move, from 0.
+        joint: number of the joint that was to move, from 0.
         asked, moved: ways of the motors (n,), drive units.
-        rest: within which each is at rest (n,), drive units.
-        unit: of the joint, deg or mm.
+        rest: distance within which each is at rest (n,), drive units.
+        unit: unit of the joint, deg or mm.
     """
-    least = TOLERANCE_RESTS * np.array(rest)
-    tolerance = np.maximum(TOLERANCE * np.abs(asked), least)
+    least = TRAVEL_TOLERANCE_RESTS * np.array(rest)
+    tolerance = np.maximum(TRAVEL_TOLERANCE_SHARE * np.abs(asked), least)
     wrong = np.abs(moved - asked) > tolerance
     if wrong[joint]:
         share = float(moved[joint] / asked[joint])

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg.lapack import dgesv
 
 from canprobe.cell.master.supervisor import outside_workspace
@@ -13,15 +12,11 @@ from canprobe.cell.scene.setup import Arm, Probe, SafetyLimits
 from canprobe.mechanics.robot.chain import pose_of
 from canprobe.mechanics.touch.probe_motion import PoseSteps
 from canprobe.mechanics.touch.servo import ProbePose
-
-if TYPE_CHECKING:
-    pass
-
-Vector = NDArray[np.float64]
+from canprobe.mechanics.types import Floats
 
 
-def _solve(J: Vector, twist: Any) -> list[float] | None:
-    """As `probe_motion.solve`, by LAPACK itself: numpy's wrapper costs four times as much in each cycle."""
+def _solve(J: Floats, twist: Any) -> list[float] | None:
+    """Solve as `probe_motion.solve` does, by LAPACK itself: numpy's wrapper costs four times as much in each cycle."""
     _, _, dq, info = dgesv(J, twist)
     step: list[float] = dq.tolist()
     return step if info == 0 else None
@@ -34,17 +29,17 @@ class ProbeMotion:
     command, and the step is small enough that its second-order error is gone in the next cycle.
 
     Args:
-        arm, probe: what moves.
-        safety: what joints and probe must keep to.
-        period_s: of the cycle.
+        arm, probe: the arm and the probe that move.
+        safety: limits of the joints and of the probe's tip.
+        period_s: period of the cycle.
         q: joint positions to start from (n,), rad or m; more than six joints stay near them.
 
     Attributes:
-        limit: what a joint or the workspace forbids; None where nothing does.
+        limit: message of a joint or workspace limit that is reached; None without one.
         slowed: cycles in which a joint could not keep up.
     """
 
-    def __init__(self, arm: Arm, probe: Probe, safety: SafetyLimits, period_s: float, q: Vector) -> None:
+    def __init__(self, arm: Arm, probe: Probe, safety: SafetyLimits, period_s: float, q: Floats) -> None:
         self.q = np.array(q, dtype=float)
         self._model = model = arm.model
         self._steps = PoseSteps(model, probe.T_flange_probe, self.q, _solve)
@@ -64,11 +59,11 @@ class ProbeMotion:
         return ProbePose(np.array(at.flange), np.array(at.z))
 
     @property
-    def pose_matrix(self) -> Vector:
-        """The same with the turn about the pole, (4, 4), m."""
+    def pose_matrix(self) -> Floats:
+        """The commanded pose with the turn about the pole, (4, 4), m."""
         return pose_of(self._steps.at)
 
-    def step(self, pose: ProbePose) -> Vector:
+    def step(self, pose: ProbePose) -> Floats:
         """Joint targets (n,), rad or m, one step nearer to ``pose``."""
         before = self.q.tolist()
         dq = self._steps.step(before, pose, self._period_s)

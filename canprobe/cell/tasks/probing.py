@@ -1,4 +1,4 @@
-"""What every task that touches with the probe has: phases, and the order of a cycle."""
+"""Base of the tasks that touch with the probe: their phases, and the order of a cycle."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from numpy.typing import NDArray
 
 from canprobe.cell.master.conditions import touch_finding
 from canprobe.cell.master.controller import Command, Measurement, TactileSample
-from canprobe.cell.master.supervision import Contact, limits_of
+from canprobe.cell.master.supervision import TouchState, limits_of
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.sync import CYCLES_TO_EFFECT
-from canprobe.cell.tasks.probe_motion import ProbeMotion, Vector
+from canprobe.cell.tasks.probe_motion import ProbeMotion
 from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.task import MotionTime, Task, TaskRecord
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.patch.image import Patch
 from canprobe.mechanics.touch.probe_motion import RETREAT_SPEED, ArcMotion, LineMotion
 from canprobe.mechanics.touch.servo import ProbePose
+from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
@@ -42,13 +43,13 @@ class ProbingTask(Task):
     """Base of the tasks that touch: the order of a cycle, and the phases that all of them have.
 
     Args:
-        plan: of a cell with an arm; beyond its limits the probe retreats and the cell stops.
-        lag_s: of the drives behind a ramp.
+        plan: plan of a cell with an arm; beyond its limits the probe retreats and the cell stops.
+        lag_s: lag of the drives behind a ramp.
         sensing: contacts from measurements.
 
     Attributes:
         phase: what it does now.
-        sensing: as given.
+        sensing: source of the contacts, as given.
         reason: why it stopped; None as long as it goes on.
         taxels: last image of the touch itself.
     """
@@ -61,7 +62,7 @@ class ProbingTask(Task):
         self.reason: str | None = None
         self.taxels: NDArray[np.uint8] | None = None
         self._setup = plan.setup
-        self._touch = Contact(limits_of(plan))
+        self._touch = TouchState(limits_of(plan))
         self._period_s = self._dt = plan.sync.period_ns * 1e-9
         self._time = MotionTime(plan.sync.period_ns)
         self._lead_s = CYCLES_TO_EFFECT * self._period_s + lag_s
@@ -70,7 +71,7 @@ class ProbingTask(Task):
         self._cycle = 0
         self._t = 0.0
         self._floor = 0.0
-        self._columns: dict[str, float | Vector] = {}
+        self._columns: dict[str, float | Floats] = {}
         self._estimate: SurfaceEstimate | None = None
         self._phases: dict[Phase, Callable[[], ProbePose]] = {
             Phase.MOVE: self._move,
@@ -83,7 +84,7 @@ class ProbingTask(Task):
         }
 
     def record(self) -> TaskRecord:
-        """What it knows so far."""
+        """The results so far."""
         slowed = self._motion.slowed if self._motion is not None else 0
         return TaskRecord(taxels=self.taxels, unplaced=self.sensing.dropped, slowed=slowed)
 
@@ -146,8 +147,8 @@ class ProbingTask(Task):
 
     def _felt_columns(
         self, sample: TactileSample, patch: Patch, contact: ContactSample | None
-    ) -> dict[str, float | Vector]:
-        """What an image says, for the log."""
+    ) -> dict[str, float | Floats]:
+        """Columns of the log with the data of an image."""
         return {
             "phase": float(self.phase),
             "sample_cycle": float(sample.cycle),
@@ -184,7 +185,7 @@ class ProbingTask(Task):
     def _regain(self) -> ProbePose:
         raise NotImplementedError
 
-    def _draw_back(self, way: Vector) -> None:
+    def _draw_back(self, way: Floats) -> None:
         """Begin the retreat by a way (3,), m, off the object."""
         assert self._motion is not None
         pose = self._motion.pose

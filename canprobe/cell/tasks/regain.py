@@ -1,23 +1,16 @@
-"""Contact that a scan has lost: the probe stops along its path and goes on towards the object, slowly and not far."""
+"""Search for a lost contact: the probe stops along its path and goes on towards the object, slowly and not far."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
-
-import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.cell.tasks.task import Loss
 from canprobe.mechanics.touch.servo import ProbePose
+from canprobe.mechanics.types import Floats
 
-if TYPE_CHECKING:
-    pass
-
-Vector = NDArray[np.float64]
-SPEED = 2e-3
-"""m/s: until the first sample of the new touch has taken effect, 27 ms later, the layer sinks in by 0.05 mm."""
+SEARCH_SPEED = 2e-3
+"""Speed of the search, m/s: until the first sample of the new touch takes effect, 27 ms, the layer sinks in 0.05 mm."""
 BRAKE_S = 0.02
 """Time constant with which the motion along the path ends: 0.5 mm at 25 mm/s."""
 REST_S = 0.25
@@ -28,18 +21,18 @@ class Search:
     """The probe's motion from a lost contact to the object, along its pole.
 
     Args:
-        pose: of the probe where the contact was lost.
-        velocity: of its centre then (3,), m/s; what of it runs along the path fades out.
+        pose: pose of the probe where the contact was lost.
+        velocity: velocity of its centre then (3,), m/s; its part along the path fades out.
     """
 
-    def __init__(self, pose: ProbePose, velocity: Vector) -> None:
+    def __init__(self, pose: ProbePose, velocity: Floats) -> None:
         self._start = pose
         self._sideways = velocity - pose.pole * float(velocity @ pose.pole)
 
     def pose(self, t: float) -> ProbePose:
         """Pose ``t`` seconds after the loss."""
         sideways = self._sideways * (BRAKE_S * (1.0 - math.exp(-t / BRAKE_S)))
-        return ProbePose(self._start.centre + sideways + self._start.pole * (SPEED * t), self._start.pole)
+        return ProbePose(self._start.centre + sideways + self._start.pole * (SEARCH_SPEED * t), self._start.pole)
 
 
 def summarise_losses(losses: Sequence[Loss]) -> list[dict[str, float | None]]:
@@ -54,7 +47,7 @@ def summarise_losses(losses: Sequence[Loss]) -> list[dict[str, float | None]]:
 
 
 def losses_text(losses: Sequence[Mapping[str, float | None]]) -> str:
-    """How often contact was lost in the scan, and what was done about it, in words."""
+    """The losses of contact in a scan in words: how many, and whether each was regained."""
     told = ", ".join(
         f"not regained within {loss['searched_mm']:.1f} mm"
         if loss["regained_after_ms"] is None

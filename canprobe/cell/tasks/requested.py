@@ -9,18 +9,16 @@ import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.tasks.probing import ProbingTask
 from canprobe.cell.tasks.task import MotionTime
 from canprobe.cell.tasks.touch import TouchTask
+from canprobe.cell.tasks.trajectory import Trajectory
 from canprobe.errors import UsageError
 from canprobe.mechanics.types import Floats
-
-if TYPE_CHECKING:
-    pass
 
 
 def _is_number(value: object) -> bool:
@@ -43,7 +41,7 @@ _VALUES: dict[str, Callable[[object], bool]] = {
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What another tool asks of a running task; it cannot be made of anything else.
+    """A request of another tool to a running task; other kinds and values are refused.
 
     Args:
         kind: start, stop, target_force_n, speed_m_s or trajectory.
@@ -65,9 +63,9 @@ class Request:
 
 
 FORCE_RATE = 2.0
-"""N/s."""
+"""Rate at which a requested force is approached, N/s."""
 SPEED_RATE = 0.1
-"""m/s²."""
+"""Rate at which a requested speed is approached, m/s²."""
 
 
 class RequestedTask(Controller):
@@ -76,9 +74,9 @@ class RequestedTask(Controller):
     Args:
         task: the task; None holds still until a `start`.
         make: makes a new task at every `start`; None where the task runs once, from the beginning.
-        requests: where requests arrive.
-        period_s: of the cycle.
-        plan: of an arm that follows trajectories on request; without, none is asked for.
+        requests: queues in which requests arrive.
+        period_s: period of the cycle.
+        plan: plan of a cell whose arm follows trajectories on request; None: none is requested.
     """
 
     def __init__(
@@ -102,7 +100,7 @@ class RequestedTask(Controller):
         self._stopping = False
 
     def step(self, measurement: Measurement) -> Command:
-        """One cycle."""
+        """Take the requests, and give the command of a cycle."""
         for queue in self._requests:
             while queue:
                 request = queue.popleft()
@@ -127,23 +125,23 @@ class RequestedTask(Controller):
         return command
 
     def update(self) -> None:
-        """What the task does once its commands are out."""
+        """Let the task do its work once its commands are sent."""
         if self._task is not None:
             self._task.update()
 
     @property
     def lets_go(self) -> bool:  # type: ignore[override]
-        """As the task does."""
+        """Whether the task lets go by itself."""
         return self._task is not None and self._task.lets_go
 
     def retreat(self, reason: str) -> None:
-        """Ask the task to let go."""
+        """Let the task let go."""
         if self._task is not None:
             self._task.retreat(reason)
 
     @property
     def restarts(self) -> int:
-        """Of the task's estimator."""
+        """How often the task's estimator started again."""
         return 0 if self._task is None else self._task.restarts
 
     def _take(self, request: Request) -> None:
@@ -151,8 +149,6 @@ class RequestedTask(Controller):
             if isinstance(self._task, ProbingTask):
                 self._task.stop()
             elif self._plan is not None and len(self._targets) == 2:
-                from canprobe.cell.tasks.trajectory import Trajectory
-
                 self._task = Trajectory.braking(self._plan, *self._motion())
                 return
             self._stopping = self._task is not None
@@ -164,15 +160,13 @@ class RequestedTask(Controller):
 
     def _follow(self, measurement: Measurement, **way: Any) -> None:
         """Leave what the arm does for a trajectory, at the speed that it has; the bridge has checked the way."""
-        from canprobe.cell.tasks.trajectory import Trajectory
-
         assert self._plan is not None and measurement.q is not None
         trajectory = Trajectory(self._plan, **way)
         trajectory.lead(*(self._motion() if len(self._targets) == 2 else (measurement.q, None)))
         self._task, self._stopping = trajectory, False
 
     def _motion(self) -> tuple[Floats, Floats]:
-        """Where the last two targets lead in this cycle: position and speed (n,)."""
+        """Position and speed (n,) in this cycle, as the last two targets lead on."""
         before, last = self._targets
         qd = (last - before) / self._step_s
         return last + qd * self._period_s, qd

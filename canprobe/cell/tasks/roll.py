@@ -12,36 +12,36 @@ from numpy.typing import NDArray
 from canprobe.cell.master.controller import TactileSample
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Touch
+from canprobe.cell.tasks.calibrate import PRESS_SPEED
 from canprobe.cell.tasks.probing import Phase, ProbingTask
 from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.mechanics.touch.patch.image import Patch
 from canprobe.mechanics.touch.probe_motion import LineMotion
 from canprobe.mechanics.touch.servo import ProbePose
 from canprobe.mechanics.touch.stops import TOUCH_FORCE
+from canprobe.mechanics.types import Floats
 
-Vector = NDArray[np.float64]
-PRESS_SPEED = 0.8e-3
-"""m/s, from the first touch to the wanted force."""
-MOVE_SPEED = 30e-3
+TOUCH_TO_TOUCH_SPEED = 30e-3
+"""Speed from touch to touch, m/s."""
 FORCE_HZ = 0.5
 """Bandwidth with which the force is held; slower than a roll, so that its images have one depth."""
-MOST_DEPTH = 3e-3
-"""Way beyond the first touch, m, at which the object gives way."""
+MAX_PRESS_WAY = 3e-3
+"""Way beyond the first touch, m, after which the object counts as one that gives way."""
 ROLL_SAMPLES = 24
 """Poses of a roll whose reach is checked."""
 
 
 @dataclass(frozen=True, slots=True)
 class Press:
-    """One touch.
+    """A touch of the object, with its roll.
 
     Attributes:
-        force: N.
+        force: force of the touch, N.
         at: place on the pad where it begins, m.
         roll: half-widths of the roll over the pad along and across its heading, m; both: it is an eight.
-        heading: of the roll on the pad, rad.
-        hz: of the roll, one after the other, in equal parts of the time.
-        seconds: of the roll.
+        heading: heading of the roll on the pad, rad.
+        hz: rates of the roll, one after the other, in equal parts of the time.
+        seconds: duration of the roll, s.
     """
 
     force: float
@@ -62,42 +62,42 @@ class Press:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Pressed:
-    """What was recorded of a touch, image by image, from the moment in which the force was reached.
+class RollRecord:
+    """The record of a touch, image by image, from the moment in which the force was reached.
 
     Attributes:
-        press: what was asked for.
+        press: the touch as it was planned.
         t_s: times of the images, s.
         images, windows: counts (16, 16), and first row, first column, rows, columns of what was sent.
         T_base_probe: (4, 4) each, of the probe at these times.
-        cycles: of the SYNCs that triggered them.
+        cycles: cycles whose SYNCs triggered them.
     """
 
     press: Press
     t_s: list[float] = field(default_factory=list)
     images: list[NDArray[np.uint8]] = field(default_factory=list)
     windows: list[tuple[int, int, int, int] | None] = field(default_factory=list)
-    T_base_probe: list[Vector] = field(default_factory=list)
+    T_base_probe: list[Floats] = field(default_factory=list)
     cycles: list[int] = field(default_factory=list)
 
 
 class RollTask(ProbingTask):
-    """Touch after touch of one object that is known.
+    """Touches an object of known shape again and again, and rolls on it.
 
     The probe rolls without slipping: the contact goes as far over the object as over the pad. Its centre follows the
     object that is known; only slowly does the depth follow the force.
 
     Args:
-        plan: of the cell.
-        task: where the object is touched first.
+        plan: plan of the cell.
+        task: settings with the place that is touched first.
         sensing: contacts from measurements; its force is not trusted, only held.
         presses: the touches.
-        radius: of the ball, m; infinite for a plane, and for a rod that is rolled along its axis.
-        rest_s: how long the array is listened to before the first touch.
+        radius: radius of the ball, m; infinite for a plane, and for a rod that is rolled along its axis.
+        rest_s: time for which images without load are kept before the first touch.
 
     Attributes:
-        presses: as given.
-        pressed: what was recorded, touch by touch.
+        presses: the touches, as given.
+        pressed: the records, touch by touch.
         unloaded: images before the first touch.
     """
 
@@ -105,7 +105,7 @@ class RollTask(ProbingTask):
         self, plan: Plan, task: Touch, sensing: ContactSensing, presses: Sequence[Press], radius: float, rest_s: float
     ) -> None:
         super().__init__(plan, task.lag_s, sensing)
-        self.pressed: list[Pressed] = []
+        self.pressed: list[RollRecord] = []
         self.unloaded: list[NDArray[np.uint8]] = []
         self._approach_of = task.approach
         self.presses, self._radius, self._rest_s = presses, radius, rest_s
@@ -144,8 +144,8 @@ class RollTask(ProbingTask):
 
     # where the probe is
 
-    def poses(self, x: Vector) -> Iterator[ProbePose]:
-        """Above each touch, and round its roll, for a probe that begins with its x axis along `x` (3,)."""
+    def poses(self, x: Floats) -> Iterator[ProbePose]:
+        """Poses above each touch and round its roll, for a probe that begins with its x axis along `x` (3,)."""
         self._set_axes(x)
         for number, press in enumerate(self.presses):
             self._number = number
@@ -154,7 +154,7 @@ class RollTask(ProbingTask):
                 yield self._pose(press.way(float(t)), 0.0)
         self._number = 0
 
-    def _set_axes(self, x: Vector) -> None:
+    def _set_axes(self, x: Floats) -> None:
         inward = -self._approach_of.normal
         x = x - inward * float(inward @ x)
         x = x / np.linalg.norm(x)
@@ -184,13 +184,13 @@ class RollTask(ProbingTask):
     # phases: each returns the pose for this cycle
 
     def _begin(self, pose: ProbePose) -> None:
-        """To the next touch, or to the end."""
+        """Go to the next touch, or end."""
         assert self._motion is not None
         if self._number == 0:
             self._set_axes(self._motion.pose_matrix[:3, 0])
         if self.reason is not None or self._number >= len(self.presses):
             return self._enter(Phase.DONE)
-        self._line = LineMotion(pose, self._pose((0.0, 0.0), -self._approach_of.clearance), MOVE_SPEED)
+        self._line = LineMotion(pose, self._pose((0.0, 0.0), -self._approach_of.clearance), TOUCH_TO_TOUCH_SPEED)
         self._enter(Phase.MOVE)
 
     def _off(self) -> None:
@@ -211,17 +211,23 @@ class RollTask(ProbingTask):
             self._enter(Phase.SETTLE)
         elif self._gone > self._approach_of.search:
             far = self._approach_of.search * 1e3
-            self.retreat(f"touch {self._number + 1}: nothing found up to {far:.0f} mm beyond the expected place")
+            self.retreat(
+                f"touch {self._number + 1}: no object found up to {far:.0f} mm beyond the expected place: move the"
+                " object there, or correct its place"
+            )
         return self._pose((0.0, 0.0), self._gone)
 
     def _settle(self) -> ProbePose:
-        """On, slowly, until the force is there."""
+        """Press on slowly until the force is reached."""
         press = self.presses[self._number]
         if self._touch.force >= press.force:
-            self.pressed.append(Pressed(press))
+            self.pressed.append(RollRecord(press))
             self._enter(Phase.SCAN)
-        elif self._gone > self._touched_at + MOST_DEPTH:
-            self.retreat(f"touch {self._number + 1}: {press.force:g} N are not reached where the object is expected")
+        elif self._gone > self._touched_at + MAX_PRESS_WAY:
+            self.retreat(
+                f"touch {self._number + 1}: expected {press.force:g} N within {MAX_PRESS_WAY * 1e3:g} mm of the first"
+                f" touch, got {self._touch.force:.2f} N: fix the object in its place"
+            )
         else:
             self._gone += PRESS_SPEED * self._dt
         return self._pose((0.0, 0.0), self._gone)

@@ -1,4 +1,4 @@
-"""From a measurement to a contact: joints at the sample's instant, patch, and the squeezed layer."""
+"""Makes a contact of a measurement: joints at the sample's instant, patch, and the squeezed layer."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.cell.master.array import patch_of
 from canprobe.cell.master.controller import Measurement, TactileSample
@@ -22,19 +21,19 @@ from canprobe.mechanics.touch.patch.dead_taxels import mended
 from canprobe.mechanics.touch.patch.image import Patch, PatchCalibration
 from canprobe.mechanics.touch.patch.moments import MomentImage, Moments
 from canprobe.mechanics.touch.patch.pad_lag import PadLag
+from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 
 
-Vector = NDArray[np.float64]
-MOST_RATIO = 6.0
-"""Between the slope that is felt and the one of the stated stiffness on a plane; further apart it is not believed."""
-HOLLOWEST = 0.9
-"""Least curvature over −1/radius of the probe at which a patch still makes sense."""
+MAX_STIFFNESS_RATIO = 6.0
+"""Largest ratio of the measured slope and the slope by the stated stiffness on a plane; the slope is limited to it."""
+HOLLOW_LIMIT_SHARE = 0.9
+"""Limit of a hollow: curvature over −1/radius of the probe up to which there is one patch of contact."""
 
 
-HISTORY = 64
+HISTORY_CYCLES = 64
 """Cycles whose joints are kept."""
 SPEED_OVER_NS = 10_000_000
 """Time over which the speed of the probe is taken."""
@@ -44,20 +43,20 @@ class JointHistory:
     """The last joint positions with their times, to be interpolated at a tactile sample's instant."""
 
     def __init__(self) -> None:
-        self._times: deque[int] = deque(maxlen=HISTORY)
-        self._joints: deque[Vector] = deque(maxlen=HISTORY)
+        self._times: deque[int] = deque(maxlen=HISTORY_CYCLES)
+        self._joints: deque[Floats] = deque(maxlen=HISTORY_CYCLES)
 
-    def add(self, t_ns: int, q: Vector) -> None:
+    def add(self, t_ns: int, q: Floats) -> None:
         """Remember joint positions (n,), rad or m, at ``t_ns``; times must increase."""
         self._times.append(t_ns)
         self._joints.append(q)
 
     @property
-    def newest(self) -> Vector:
+    def newest(self) -> Floats:
         """Joint positions (n,), rad or m, that were added last."""
         return self._joints[-1]
 
-    def at(self, t_ns: int) -> Vector | None:
+    def at(self, t_ns: int) -> Floats | None:
         """Joint positions (n,), rad or m, at ``t_ns``, linear between SYNCs; None outside the history."""
         if not self._times or not self._times[0] <= t_ns <= self._times[-1]:
             return None
@@ -78,7 +77,7 @@ def is_too_hollow(estimate: SurfaceEstimate, radius: float) -> bool:
     x, y = (estimate.T_frame_contact[:3, :2].T @ estimate.directions[1]).tolist()
     weight = np.array([x * x, 2.0 * x * y, y * y])
     sigma = math.sqrt(max(float(weight @ estimate.covariance @ weight), 0.0))
-    return float(estimate.kappa[1]) + 3.0 * sigma < -HOLLOWEST / radius
+    return float(estimate.kappa[1]) + 3.0 * sigma < -HOLLOW_LIMIT_SHARE / radius
 
 
 class ContactSensing:
@@ -87,18 +86,18 @@ class ContactSensing:
     Args:
         model: the arm.
         flange_probe: transform (4, 4) from the probe's centre frame (z = pole) to the flange.
-        calibration: of the array.
-        radius: of the probe, m.
+        calibration: calibration of the array.
+        radius: radius of the probe, m.
         stiffness: K/h of the layer, N/m³.
         moment_image: gives the contacts the second moments of their images; None leaves them out.
-        noise: of the centroids; None: the contacts do not state theirs.
-        lag: how far the array's centroids trail the contact; None: they do not.
+        noise: noise of the centroids; None: the contacts do not state any.
+        lag: lag of the array's centroids behind the contact; None: no lag.
     """
 
     def __init__(
         self,
         model: ArmModel,
-        flange_probe: Vector,
+        flange_probe: Floats,
         calibration: PatchCalibration,
         radius: float,
         stiffness: float,
@@ -133,20 +132,20 @@ class ContactSensing:
         self.patch = patch_of(measurement.tactile, self._calibration)
         return self.patch
 
-    def position_sigma(self, direction: Vector) -> float:
+    def position_sigma(self, direction: Floats) -> float:
         """Standard deviation of the probe's position along a unit vector (3,), m: joints come in whole counts."""
         return position_sigma(self.model, self._history.newest, self.flange_probe, direction)
 
-    def set_kappa(self, kappa: Vector, stiffness: float | None = None) -> None:
+    def set_kappa(self, kappa: Floats, stiffness: float | None = None) -> None:
         """Take the object's principal curvatures (2,), 1/m, and the layer's stiffness as the estimator knows them.
 
         An estimate that is no contact of one patch any more (a hollow as tight as the probe) is taken at the limit.
 
         Args:
-            kappa: 1/m.
-            stiffness: K/h, N/m³; None from an estimator that has none: what the last touch showed, or else as before.
+            kappa: principal curvatures, 1/m.
+            stiffness: K/h, N/m³; None: the one that the last touch showed, or else as before.
         """
-        possible = np.maximum(kappa, -HOLLOWEST / self.radius)
+        possible = np.maximum(kappa, -HOLLOW_LIMIT_SHARE / self.radius)
         if stiffness is not None:
             self.stiffness = stiffness
         elif self._slope is not None and not self._settled:
@@ -159,9 +158,11 @@ class ContactSensing:
         self._depth_at_1_n = depth
 
     def set_slope(self, slope: Slope) -> None:
-        """Take what a touch showed; the depth goes by it until the object's curvature is known."""
+        """Take the slope that a touch showed; depths follow from it until the object's curvature is known."""
         flat = 1.0 / float(indentation_from_force(1.0, self.stiffness, self.radius, np.zeros(2)))
-        self._slope = slope._replace(value=min(max(slope.value, flat / MOST_RATIO), flat * MOST_RATIO))
+        self._slope = slope._replace(
+            value=min(max(slope.value, flat / MAX_STIFFNESS_RATIO), flat * MAX_STIFFNESS_RATIO)
+        )
         self._settled = False
         self._depth_at_1_n = 1.0 / self._slope.value
 
@@ -169,7 +170,7 @@ class ContactSensing:
         """Indentation (m) of the layer at ``force`` (N) on the curvature known so far: the root of the force."""
         return self._depth_at_1_n * math.sqrt(force) if force > 0 else 0.0
 
-    def probe_at(self, t_ns: int) -> Vector | None:
+    def probe_at(self, t_ns: int) -> Floats | None:
         """The probe (4, 4) in base at a time of the last cycles; None where the joints of that time are unknown."""
         q = self._history.at(t_ns)
         return None if q is None else forward(self._chain, q)
@@ -182,6 +183,8 @@ class ContactSensing:
             return None
         t_s, uv = sample.t_sample_ns * 1e-9, (patch.u, patch.v)
         depth = self.depth(patch.force)
+        # level that is taken off the image, over the peak pressure of the contact
+        lightness = self._level_pa / (self.stiffness * depth) if depth > 0.0 else 1.0
         found = contact_sample(
             t_s=t_s,
             T_base_probe=T_base_probe,
@@ -189,7 +192,7 @@ class ContactSensing:
             depth=depth,
             radius=self.radius,
             force_n=patch.force,
-            sigma_point=None if self._noise is None else self._noise.sigma(self._lightness(depth)),
+            sigma_point=None if self._noise is None else self._noise.sigma(lightness),
             moments=self._moments(sample, patch),
             doubts=patch.doubts,
             slope=self._slope,
@@ -198,12 +201,8 @@ class ContactSensing:
             return found
         return replace(found, sigma_motion=sample.t_sigma_s * self._speed(sample.t_sample_ns, found))
 
-    def _lightness(self, depth: float) -> float:
-        """Level that is taken off the image over the peak pressure of a contact that sinks in by a depth (m)."""
-        return self._level_pa / (self.stiffness * depth) if depth > 0.0 else 1.0
-
     def _speed(self, t_ns: int, contact: ContactSample) -> float:
-        """Of the probe at the contact, m/s: what an error of the instant displaces the contact by; 0 without a past."""
+        """Speed of the probe at the contact, m/s: errors of the instant displace a contact by it; 0 without a past."""
         before = self._history.at(t_ns - SPEED_OVER_NS)
         if before is None:
             return 0.0

@@ -1,4 +1,4 @@
-"""The estimator in the loop: what it is fed, and how its answer reaches the servo and the log."""
+"""The estimator in the loop: it takes the contacts of a scan, and its answers go to the servo and the log."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 
 GAP_S = 0.1
 """Time without contact after which an estimator starts afresh: a contact that is regained may be of another surface."""
-SHARPEST = 1e3
-"""1/m; no pad measures a ball of 1 mm, so an answer beyond it has diverged."""
+MAX_CURVATURE = 1e3
+"""Largest curvature of an answer, 1/m: no pad measures a ball of 1 mm, so an answer beyond it has diverged."""
 
 
 @dataclass(frozen=True, slots=True)
 class ShapeRecord:
-    """One estimate with its place in the run.
+    """An estimate with its place in the run.
 
     Attributes:
         t_s: instant of its last sample, s, since the first SYNC; in results on the run's clock.
@@ -44,7 +44,7 @@ def on_run_clock(records: Sequence[ShapeRecord], start_s: float) -> list[ShapeRe
 
 
 class ShapeTracker:
-    """Feeds an estimator with the contacts of a scan and keeps what it said.
+    """Feeds an estimator with the contacts of a scan and keeps its answers.
 
     Args:
         estimator: the online estimator.
@@ -123,7 +123,7 @@ def has_diverged(estimate: SurfaceEstimate) -> bool:
     """Whether an answer is not finite, or sharper than anything that a pad can measure."""
     known = np.asarray(estimate.kappa)[np.asarray(estimate.observed)]
     finite = np.isfinite(known).all() and np.isfinite(estimate.S).all() and np.isfinite(estimate.T_frame_contact).all()
-    return not (finite and bool((np.abs(known) < SHARPEST).all()))
+    return not (finite and bool((np.abs(known) < MAX_CURVATURE).all()))
 
 
 def replay_samples(estimator: Estimator, samples: Sequence[ContactSample], every: int) -> list[ShapeRecord]:

@@ -1,4 +1,4 @@
-"""What a task leaves for the summary, besides what it did as a controller."""
+"""Data that a task leaves for the summary."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from canprobe.mechanics.robot.tool_calibration import ToolEstimate
 
 
-LONGEST_STEP = 4
-"""Periods by which a motion goes on in one cycle at most, and for which it makes up later; the rest is lost time."""
-QUICKER = 8
-"""Part of a period by which one step of a motion may be longer than the one before."""
+MAX_STEP_PERIODS = 4
+"""Largest step of a motion in a cycle, and largest time that it makes up later, in periods; the rest is lost."""
+STEP_GROWTH_DIVISOR = 8
+"""A step of a motion is longer than the one before by at most a period over this."""
 
 
 class MotionTime:
@@ -29,7 +29,7 @@ class MotionTime:
     once, the probe would be pushed by the way of four cycles into what it touches.
 
     Args:
-        period_ns: of the cycle.
+        period_ns: period of the cycle.
     """
 
     def __init__(self, period_ns: int) -> None:
@@ -38,22 +38,22 @@ class MotionTime:
         self._step_ns, self._owed_ns = period_ns, 0
 
     def step(self, t_ns: int) -> int:
-        """By how much the motion goes on in the cycle at ``t_ns``, ns; one period in the first."""
+        """Step of the motion in the cycle at ``t_ns``, ns; one period in the first cycle."""
         passed_ns = self._period_ns if self._last_ns is None else t_ns - self._last_ns
         self._last_ns = t_ns
-        due_ns, longest_ns = self._owed_ns + passed_ns, LONGEST_STEP * self._period_ns
-        self._step_ns = min(due_ns, self._step_ns + self._period_ns // QUICKER, longest_ns)
+        due_ns, longest_ns = self._owed_ns + passed_ns, MAX_STEP_PERIODS * self._period_ns
+        self._step_ns = min(due_ns, self._step_ns + self._period_ns // STEP_GROWTH_DIVISOR, longest_ns)
         self._owed_ns = min(due_ns - self._step_ns, longest_ns)
         return self._step_ns
 
 
 @dataclass(slots=True)
 class Loss:
-    """One time that a scan lost its contact.
+    """A loss of contact in a scan.
 
     Attributes:
-        cycle: in which it was noticed.
-        searched: how far the probe went towards the object, m.
+        cycle: cycle in which it was noticed.
+        searched: distance that the probe went towards the object, m.
         regained_s: time from there to the new touch; None without one.
     """
 
@@ -64,7 +64,7 @@ class Loss:
 
 @dataclass(frozen=True, slots=True)
 class TaskRecord:
-    """What a task knows at its end; a user's own controller leaves an empty one.
+    """The results of a task at its end; a user's own controller leaves an empty record.
 
     Attributes:
         shape: the estimator's contacts and answers; None where no shape was asked for.
@@ -89,10 +89,10 @@ class Task(Controller):
     """A controller that carries out the task of a scene."""
 
     def record(self) -> TaskRecord:
-        """What it knows so far."""
+        """The results so far."""
         return TaskRecord()
 
 
 def record_of(controller: Controller | None) -> TaskRecord:
-    """What a controller left, whoever wrote it."""
+    """The record of any controller, packaged or the user's."""
     return controller.record() if isinstance(controller, Task) else TaskRecord()

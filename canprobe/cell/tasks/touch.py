@@ -13,7 +13,7 @@ from canprobe.cell.master.supervision import Reaction
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Touch
 from canprobe.cell.tasks.probing import Phase, ProbingTask
-from canprobe.cell.tasks.regain import REST_S, SPEED, Search, Vector
+from canprobe.cell.tasks.regain import REST_S, SEARCH_SPEED, Search
 from canprobe.cell.tasks.sensing import ContactSensing, is_too_hollow
 from canprobe.cell.tasks.shape import ShapeTracker
 from canprobe.cell.tasks.task import Loss, TaskRecord
@@ -25,23 +25,24 @@ from canprobe.mechanics.touch.probe_motion import MOVE_SPEED, SETTLE_S, LineMoti
 from canprobe.mechanics.touch.servo import LocalSurface, ProbePose, TactileServo
 from canprobe.mechanics.touch.stops import TOUCH_FORCE
 from canprobe.mechanics.touch.strategies import PathFollower
+from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 
 
-CERTAIN = 0.12
+MAX_SLOPE_SIGMA_SHARE = 0.12
 """Share of itself to which the slope of √F over the push must be known (1σ) before it is used."""
 LONGEST_GAP_S = 0.02
-"""Between two contacts, for the servo's surface: after a longer one too it does not rest on one sample alone."""
-AT_REST = 0.7
-"""Share of the settling time after which nothing is asked to change any more."""
-LOST = 0.1
+"""Longest gap between two contacts for the servo's surface: after a longer gap it does not rest on one sample alone."""
+REST_SHARE = 0.7
+"""Share of the settling time after which force and depth are constant."""
+LOST_FORCE_SHARE = 0.1
 """Share of the wanted force below which a scan or a hold has lost its contact: the hysteresis of the array."""
-RETREAT = 6e-3
+RETREAT_WAY = 6e-3
 """Way off the object, m."""
 RAMP_S = 0.05
-"""To reach the scan's speed."""
+"""Time to reach the scan's speed."""
 _LEAVING = (Phase.RETREAT, Phase.DONE)
 
 
@@ -49,8 +50,8 @@ class TouchTask(ProbingTask):
     """Approach an object, touch it with a given force, follow a strategy over it or hold still, and let go.
 
     Args:
-        plan: of the cell.
-        task: what to do.
+        plan: plan of the cell.
+        task: settings of the touch.
         sensing: contacts from measurements.
         shape: the estimator in the loop; None where no shape is asked for.
     """
@@ -68,15 +69,15 @@ class TouchTask(ProbingTask):
         self.losses: list[Loss] = []
         self._search: Search | None = None
         self._asked: ProbePose | None = None
-        self._velocity: Vector = np.zeros(3)
+        self._velocity: Floats = np.zeros(3)
         self._scan_t = self._searched_before = 0.0
         self._contact: ContactSample | None = None
         self._depth0 = 0.0
         self._push = PushFit()
-        self._push_from: tuple[Vector, Vector] | None = None
+        self._push_from: tuple[Floats, Floats] | None = None
         self._at_rest = AtRest()
-        self._pole0: Vector = np.zeros(3)
-        self._shape_columns: dict[str, float | Vector] = {}
+        self._pole0: Floats = np.zeros(3)
+        self._shape_columns: dict[str, float | Floats] = {}
         self._updated = True
 
     @property
@@ -85,7 +86,7 @@ class TouchTask(ProbingTask):
         return self.shape.restarts if self.shape is not None else 0
 
     def record(self) -> TaskRecord:
-        """What it knows so far."""
+        """The results so far."""
         return replace(super().record(), shape=self.shape, losses=self.losses, scan_cycles=self.scan_cycles)
 
     @property
@@ -131,7 +132,7 @@ class TouchTask(ProbingTask):
     # sensing and supervision
 
     def _feel(self, sample: TactileSample, patch: Patch) -> None:
-        self._touch.feel(patch, sample.t_sample_ns, known=patch.saturated and self._push.certain(CERTAIN))
+        self._touch.feel(patch, sample.t_sample_ns, known=patch.saturated and self._push.certain(MAX_SLOPE_SIGMA_SHARE))
         if self.phase is Phase.SCAN:
             self.taxels = sample.frame.taxels
         depth_at_1n_mm = self.sensing.depth(1.0) * 1e3
@@ -146,7 +147,7 @@ class TouchTask(ProbingTask):
             self._sample_t = contact.t_s
             if self.phase is Phase.SETTLE:
                 self._feel_stiffness(contact)
-                if self._t > AT_REST * SETTLE_S:
+                if self._t > REST_SHARE * SETTLE_S:
                     self._at_rest.add(contact.force_n, patch.saturated)
             if self.phase is Phase.SCAN and self.shape is not None:
                 self.shape.add(contact)
@@ -162,7 +163,7 @@ class TouchTask(ProbingTask):
             self._push = PushFit(self.sensing.position_sigma(contact.n_base))
         first, normal = self._push_from
         self._push.add(float(normal @ (first - centre)), contact.force_n)
-        if self._push.certain(CERTAIN):
+        if self._push.certain(MAX_SLOPE_SIGMA_SHARE):
             before = self.sensing.depth(contact.force_n)
             self.sensing.set_slope(Slope(self._push.slope, self._push.sigma))
             rise = self.sensing.depth(contact.force_n) - before
@@ -209,7 +210,7 @@ class TouchTask(ProbingTask):
     def _least_force(self) -> float:
         """The force below which the contact is lost, N; an array that has let go shows a tenth of it for a while."""
         if self.phase is Phase.SCAN:
-            return max(TOUCH_FORCE / 2, LOST * self._target_force)
+            return max(TOUCH_FORCE / 2, LOST_FORCE_SHARE * self._target_force)
         resting = self.phase is Phase.SETTLE or (self.phase is Phase.REGAIN and self._search is None)
         return TOUCH_FORCE / 2 if resting else 0.0
 
@@ -224,7 +225,7 @@ class TouchTask(ProbingTask):
         if self.phase in (Phase.SCAN, Phase.REGAIN):
             self._scan_end = self._cycle
         self.reason = reason
-        self._draw_back(-RETREAT * self._motion.pose.pole)
+        self._draw_back(-RETREAT_WAY * self._motion.pose.pole)
 
     # phases: each returns the pose for this cycle
 
@@ -291,7 +292,7 @@ class TouchTask(ProbingTask):
         if self._t >= SETTLE_S:
             self._enter(Phase.SCAN)
             self._scan_start = self._cycle
-            doubt = self._at_rest.doubt(self._target_force, self._push.certain(CERTAIN))
+            doubt = self._at_rest.doubt(self._target_force, self._push.certain(MAX_SLOPE_SIGMA_SHARE))
             if doubt is not None:
                 self._leave(doubt)
         return pose
@@ -329,7 +330,7 @@ class TouchTask(ProbingTask):
                 self._enter(Phase.SCAN)
             return self._sink(smooth_step(self._t / (0.6 * REST_S)))
         pose, loss = self._search.pose(self._t), self.losses[-1]
-        loss.searched = self._searched_before + SPEED * self._t
+        loss.searched = self._searched_before + SEARCH_SPEED * self._t
         if self._contact is not None and self._touch.force > TOUCH_FORCE + self._floor:
             loss.regained_s = (self._cycle - loss.cycle) * self._period_s
             self._servo.rest_on(self._contact.p_base, self._contact.n_base)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.master.supervisor import JointGuard
@@ -15,14 +15,14 @@ from canprobe.cell.tasks.task import MotionTime
 from canprobe.errors import UsageError
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.touch.linear_algebra import checked, instance, real_numbers
+from canprobe.mechanics.types import Floats
 
-Vector = NDArray[np.float64]
-NEAR_RAD = 0.01
-"""How far a first point at time 0 may be from where the arm stands; of a joint that slides its `ArmModel.radian`."""
+FIRST_POINT_TOLERANCE_RAD = 0.01
+"""Largest distance of a first point at time 0 from the arm's position, rad; of a sliding joint by `ArmModel.radian`."""
 BRAKE_S = 0.5
-"""How long an arm takes to stand still after a stop."""
-LOOKED_AT = 33
-"""Instants of each segment at which range, speed and workspace are checked."""
+"""Time in which an arm comes to rest after a stop."""
+CHECKS_PER_SEGMENT = 33
+"""Number of instants of each segment at which range, speed and workspace are checked."""
 
 
 class Trajectory(Controller):
@@ -36,11 +36,11 @@ class Trajectory(Controller):
     makes up for four periods, little by little, and ends later by the rest.
 
     Args:
-        plan: of a cell with an arm.
+        plan: plan of a cell with an arm.
         points: (time from the start, s; joint positions (n,), rad or m), in the order of time. A first one at time 0
             must be where the arm stands, within 0.01 rad (3.5 mm).
         velocities: (n,) of each point, rad/s or m/s; by default they follow from the points.
-        hold_s: how long the last point is held before the controller is done.
+        hold_s: time for which the last point is held before the controller is done.
 
     Raises:
         UsageError: no arm, no point, times that do not ascend, wrong numbers of joints, or a point out of range.
@@ -63,7 +63,9 @@ class Trajectory(Controller):
         self._limits: SafetyLimits = plan.setup.limits
         self._guard = JointGuard(plan)
         self._times, self._q = _table(points, arm.model.n)
-        self._given = None if velocities is None else _velocities(velocities, self._q.shape)
+        self._given = (
+            None if velocities is None else checked("trajectory: velocities", velocities, self._q.shape).copy()
+        )
         self._hold_s = float(checked("trajectory: hold_s", hold_s, ()))
         self._time = MotionTime(plan.sync.period_ns)
         self._gone_ns: int | None = None
@@ -76,11 +78,11 @@ class Trajectory(Controller):
         """Time of the last point, s from the start."""
         return float(self._times[-1])
 
-    def inspect(self, q: Vector) -> str | None:
+    def inspect(self, q: Floats) -> str | None:
         """Why the motion from the joint positions q (n,), rad or m, is refused; None where it is allowed."""
         if self._times[0] == 0.0:
             away = np.abs(self._q[0] - q) / self._model.radian
-            if away.max() > NEAR_RAD:
+            if away.max() > FIRST_POINT_TOLERANCE_RAD:
                 joint = int(away.argmax())
                 its = self._model.joints[joint]
                 stands, first = (its.text(float(one[joint]), ".2f") for one in (q, self._q[0]))
@@ -89,7 +91,7 @@ class Trajectory(Controller):
         reason = self._outside_way()
         return None if reason is None else f"trajectory: {reason}"
 
-    def lead(self, q: Vector, qd: Vector | None = None) -> None:
+    def lead(self, q: Floats, qd: Floats | None = None) -> None:
         """Start the motion at the joint positions q, without a check.
 
         Args:
@@ -109,15 +111,15 @@ class Trajectory(Controller):
         self._qd[0], self._qd[-1] = (0.0 if qd is None else qd), 0.0
 
     @classmethod
-    def braking(cls, plan: Plan, q: Vector, qd: Vector) -> Trajectory:
-        """From a motion at q with speed qd (n,) to rest, evenly in `BRAKE_S`; within the joints' range."""
+    def braking(cls, plan: Plan, q: Floats, qd: Floats) -> Trajectory:
+        """A trajectory from a motion at q with speed qd (n,) to rest, evenly in `BRAKE_S`, within the joints' range."""
         guard = JointGuard(plan)
         end = np.clip(q + 0.5 * BRAKE_S * qd, guard.low, guard.high)
         way = cls(plan, [(BRAKE_S, end)], hold_s=0.0)
         way.lead(q, qd)
         return way
 
-    def at(self, t_s: float) -> Vector:
+    def at(self, t_s: float) -> Floats:
         """Joint positions (n,), rad or m, at a time from the start, s; after the last point those at it."""
         t = min(max(t_s, 0.0), self.duration_s)
         k = min(int(np.searchsorted(self._times, t, side="right")) - 1, len(self._times) - 2)
@@ -126,7 +128,7 @@ class Trajectory(Controller):
         return q
 
     def step(self, measurement: Measurement) -> Command:
-        """One cycle."""
+        """Give the target of a cycle."""
         passed_ns = self._time.step(measurement.t_ns)
         if self._gone_ns is None:
             assert measurement.q is not None
@@ -147,9 +149,9 @@ class Trajectory(Controller):
         return None
 
     def _outside_way(self) -> str | None:
-        """What is wrong between two points, with the time that would be enough for a speed."""
+        """A message about a limit that is exceeded between two points, with the time that the speed limit allows."""
         highest = self._model.qd_max * self._limits.speed_share
-        s = np.linspace(0.0, 1.0, LOOKED_AT)[:, None]
+        s = np.linspace(0.0, 1.0, CHECKS_PER_SEGMENT)[:, None]
         for k, h in enumerate(np.diff(self._times)):
             q, qd = _cubic(s, h, self._q[k : k + 2], self._qd[k : k + 2])
             where = f"at {self._times[k]:g} to {self._times[k + 1]:g} s: joint"
@@ -167,7 +169,7 @@ class Trajectory(Controller):
         return None
 
 
-def _table(points: Iterable[tuple[float, ArrayLike]], n: int) -> tuple[Vector, Vector]:
+def _table(points: Iterable[tuple[float, ArrayLike]], n: int) -> tuple[Floats, Floats]:
     """Times (m,) s and positions (m, n) of the points, finite and in the order of time."""
     try:
         rows = list(points)
@@ -185,17 +187,13 @@ def _table(points: Iterable[tuple[float, ArrayLike]], n: int) -> tuple[Vector, V
     if q.shape != (len(rows), n):
         raise UsageError(f"trajectory: expected {n} positions in each point, got {q.shape[1:]}")
     if not (np.isfinite(times).all() and np.isfinite(q).all()):
-        raise UsageError("trajectory: times and positions must be finite")
+        raise UsageError("trajectory: expected finite times and positions, got NaN or infinity")
     if times[0] < 0.0 or (np.diff(times) <= 0.0).any():
         raise UsageError("trajectory: expected times from 0 on, each later than the one before")
     return times, q
 
 
-def _velocities(velocities: Sequence[ArrayLike], shape: tuple[int, ...]) -> Vector:
-    return checked("trajectory: velocities", velocities, shape).copy()
-
-
-def _slopes(times: Vector, q: Vector) -> Vector:
+def _slopes(times: Floats, q: Floats) -> Floats:
     """Speed (m, n) in each point: a weighted harmonic mean of the means beside it; 0 at the ends and in extremes."""
     h = np.diff(times)[:, None]
     mean = np.diff(q, axis=0) / h
@@ -208,7 +206,7 @@ def _slopes(times: Vector, q: Vector) -> Vector:
     return slopes
 
 
-def _cubic(s: Vector | float, h: float, q: Vector, qd: Vector) -> tuple[Vector, Vector]:
+def _cubic(s: Floats | float, h: float, q: Floats, qd: Floats) -> tuple[Floats, Floats]:
     """Position and speed at the share s of a segment of h seconds, from those at its ends, (2, n) each."""
     way = q[1] - q[0]
     c2, c3 = 3.0 * way - h * (2.0 * qd[0] + qd[1]), -2.0 * way + h * (qd[0] + qd[1])

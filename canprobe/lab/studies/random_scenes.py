@@ -10,7 +10,7 @@ import numpy as np
 
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import ObjectSettings, PlantSettings, Scene
-from canprobe.cell.scene.resolve import LAYER_N_M3
+from canprobe.cell.scene.resolve import LAYER_STIFFNESS
 
 _PLACE_MM = (-170.0, -175.0, 300.0)
 """Where the arm reaches in all directions."""
@@ -53,7 +53,7 @@ def random_scene(number: int, duration_s: float) -> Scene:
         task=task,
         sensor=replace(base.sensor, full_scale_kpa=full_scale),
         shape=replace(base.shape, also=()),
-        plant=PlantSettings(stiffness_n_m3=LAYER_N_M3 * softer),
+        plant=PlantSettings(stiffness_n_m3=LAYER_STIFFNESS * softer),
     )
 
 

@@ -18,7 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import SubFigure
 
 from canprobe.cell.results.picture import BLUE, GREY, INK, ORANGE, SKY, legend, log_scale, parts, picture
-from canprobe.cell.scene.model import TactileModeName
+from canprobe.cell.scene.hardware import TactileModeName
 from canprobe.fieldbus.bus.real.socketcan import check_interface
 from canprobe.lab.studies.cycle_times import CycleTimes, Times
 from canprobe.lab.studies.harness import CHANNEL, Column, Row, Say, StudyResult

@@ -15,8 +15,9 @@ import numpy as np
 from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.master.options import RunOptions
 from canprobe.cell.planning.make import make_plan
+from canprobe.cell.scene.hardware import TactileModeName
 from canprobe.cell.scene.load import load_scene
-from canprobe.cell.scene.model import Scene, TactileModeName
+from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.emulator_child import EmulatorChild
 from canprobe.cell.session.session import Session

@@ -12,7 +12,7 @@ from canprobe.cell.emulated import world as build
 from canprobe.cell.emulated.array import make_tactile_node
 from canprobe.cell.emulated.world import TruthRecorder
 from canprobe.cell.scene.load import load_scene
-from canprobe.cell.scene.setup import Homing
+from canprobe.cell.scene.setup import HomingParameters
 from canprobe.errors import BusError
 from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.port import PlainPort
@@ -323,7 +323,7 @@ def test_quirks_and_encoders_of_the_setup_are_those_of_its_drives():
     plan = canprobe.plan(load_scene("free"))
     assert plan.setup.arm is not None
     first, second, *others = plan.setup.arm.drives
-    incremental = replace(second, zero=Homing(35, 1, 0.0, 0.1, 0.1, 1.0, 10.0))
+    incremental = replace(second, zero=HomingParameters(35, 1, 0.0, 0.1, 0.1, 1.0, 10.0))
     drives = (replace(first, quirks=Quirks(boot_ns=5, refuse=(0x605A,))), incremental, *others)
     quirky = replace(plan, setup=plan.setup.changed("arm", drives=drives))
     nodes = build.make_world(quirky, plan.node_ids, homed=False).nodes

@@ -472,7 +472,7 @@ def test_a_saturated_array_makes_the_probe_retreat():
 
     stiff = {"stiffness_n_m3": 1.4e10}  # 0.1 MN/m: a few taxels carry all of it
     run = Saturated("press", FREE_CYCLE, lambda _: None, until=1000, plant=stiff, servo={"surface_height_hz": 2.0})
-    assert "the array is saturated and no stiffness was felt" in str(run.error)
+    assert "the array is saturated and no stiffness was measured" in str(run.error)
     assert 0 < run.answered_ns - run.saturated_ns <= BY_KEY["force_hidden"].within(run.limits)
     assert run.session.truth["force_n"][-1] == 0.0
 

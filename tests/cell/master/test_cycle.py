@@ -9,7 +9,7 @@ from undrawn import undrawn, undrawn_run
 import canprobe
 from canprobe.cell.master.controller import Command
 from canprobe.cell.master.cycle import SYNCS_REMEMBERED, Cycle, Intake
-from canprobe.cell.master.observers import MOST_FRAMES, Observers
+from canprobe.cell.master.observers import MAX_FRAMES, Observers
 from canprobe.fieldbus.bus.candump import read_candump
 from canprobe.fieldbus.protocol.frames import SYNC_ID
 
@@ -218,8 +218,8 @@ def test_frames_without_a_cycle_do_not_pile_up():
     watcher = Watcher()
     observers = Observers((watcher,))
     write = observers.tap(lambda *_: None)
-    for i in range(MOST_FRAMES + 10):
+    for i in range(MAX_FRAMES + 10):
         write(0x181, b"", i)
     observers.frames_alone(7)
     observers.frames_alone(8)
-    assert [len(o.frames) for o in watcher.seen] == [MOST_FRAMES]
+    assert [len(o.frames) for o in watcher.seen] == [MAX_FRAMES]

@@ -8,7 +8,7 @@ from puma_arm import MODELS
 
 from canprobe.cell.master.array import TactileReceiver
 from canprobe.cell.master.drives import DriveAxis, DriveGroup
-from canprobe.cell.master.position_track import REST_COUNTS_LEAST, REST_NS, PositionTrack, rest_counts
+from canprobe.cell.master.position_track import MIN_REST_COUNTS, REST_NS, PositionTrack, rest_counts
 from canprobe.fieldbus.protocol.cia402 import DriveState, OperationMode
 from canprobe.fieldbus.protocol.pdo import PdoEntry, PdoLayout
 from canprobe.fieldbus.protocol.tactile import TactileHeader, TactileMode, pack_whole
@@ -358,8 +358,8 @@ def test_a_slow_motion_is_no_rest():
 
 def test_a_milliradian_in_the_counts_of_each_drive():
     milliradians = np.abs(np.diag(MODEL.units_per_q)) / 1000
-    assert milliradians.min() < REST_COUNTS_LEAST < milliradians.max(), "the PUMA's encoders are coarse at the wrist"
-    assert rest_counts(MODEL) == pytest.approx(np.maximum(milliradians, REST_COUNTS_LEAST))
+    assert milliradians.min() < MIN_REST_COUNTS < milliradians.max(), "the PUMA's encoders are coarse at the wrist"
+    assert rest_counts(MODEL) == pytest.approx(np.maximum(milliradians, MIN_REST_COUNTS))
     fine = dataclasses.replace(MODEL, units_per_q=100 * MODEL.units_per_q)
     assert rest_counts(fine) == pytest.approx(100 * milliradians)
 

@@ -5,7 +5,7 @@ import pytest
 
 from canprobe.cell.master.cycle import CycleStatistics
 from canprobe.cell.master.log import RunLog
-from canprobe.cell.master.notes import KINDS_KEPT, OTHERS, Notes, nodes_text
+from canprobe.cell.master.notes import KINDS_KEPT, OTHER_KINDS_TEXT, Notes, nodes_text
 
 
 def rows(count):
@@ -107,4 +107,4 @@ def test_a_node_that_always_says_something_else_does_not_fill_the_memory():
     for code in range(1000):
         notes.add(f"EMCY {code:04X}h", node_id=3, t_s=0.0)
     assert len(notes) == KINDS_KEPT + 1
-    assert notes.lines()[-1].startswith(f"node 3: {OTHERS}, {1000 - KINDS_KEPT} times")
+    assert notes.lines()[-1].startswith(f"node 3: {OTHER_KINDS_TEXT}, {1000 - KINDS_KEPT} times")

@@ -11,7 +11,7 @@ from puma_arm import UPENN
 import canprobe
 from canprobe.cell.master.conditions import BY_KEY, CONDITIONS
 from canprobe.cell.master.controller import Measurement
-from canprobe.cell.master.supervision import Contact, Limits, Reaction, Seen
+from canprobe.cell.master.supervision import Limits, Reaction, Seen, TouchState
 from canprobe.cell.master.supervisor import JointGuard, Supervisor
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.scene.setup import SafetyLimits
@@ -39,7 +39,7 @@ def check(key):
 
 
 def touch(force=2.0, age=2, lost_s=0.0):
-    return Contact(LIMITS, force, age, lost_s)
+    return TouchState(LIMITS, force, age, lost_s)
 
 
 @pytest.mark.parametrize(
@@ -112,7 +112,7 @@ PERIOD_NS = 5_000_000
 
 
 def test_only_an_unbroken_run_of_saturated_samples_counts():
-    contact = Contact(LIMITS)
+    contact = TouchState(LIMITS)
     told = []
     for k, saturated in enumerate((True, True, True, False, True, True)):
         contact.feel(SimpleNamespace(force=2.0, saturated=saturated, off_pad=False), k * PERIOD_NS)

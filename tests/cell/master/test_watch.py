@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from canprobe.cell.master.watch import UNTOLD, NodeWatch
+from canprobe.cell.master.watch import MAX_NEW_ALARMS, NodeWatch
 from canprobe.fieldbus.protocol.emcy import Emcy
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE
 
@@ -73,7 +73,7 @@ def test_only_00xxh_is_no_error(code, alarms):
 
 def test_memory_does_not_grow_with_what_is_said():
     watch = a_watch()
-    for _ in range(UNTOLD):
+    for _ in range(MAX_NEW_ALARMS):
         told(watch, 1, SYNC_LOST)
         watch.push(0x80, b"", 0)
     before = size_of(watch)
@@ -82,5 +82,5 @@ def test_memory_does_not_grow_with_what_is_said():
         watch.push(0x80, b"", 0)
         watch.push(HEARTBEAT_BASE + 1, b"\x05", 0)
     assert size_of(watch) <= before + 1000  # numbers have grown by a digit, a table by its first entry
-    assert len(watch.news()) == UNTOLD
+    assert len(watch.news()) == MAX_NEW_ALARMS
     assert watch.foreign == "SYNC from another master"

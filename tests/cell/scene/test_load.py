@@ -12,10 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import canprobe
-from canprobe.cell.scene.hardware import ArmSettings, JointSettings
+from canprobe.cell.scene.hardware import ArmSettings, BringUpSettings, JointSettings
 from canprobe.cell.scene.load import dump_scene, load_scene, packaged_scenes, parse_scene
 from canprobe.cell.scene.model import (
-    BringUpSettings,
     LimitSettings,
     ProbeSettings,
     Scene,

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from canprobe.cell.tasks.shape import SHARPEST, ShapeTracker, replay_samples
+from canprobe.cell.tasks.shape import MAX_CURVATURE, ShapeTracker, replay_samples
 
 
 def contact(t_s, x=0.0):
@@ -74,7 +74,7 @@ def test_a_new_contact_after_a_gap_makes_an_answer_void():
 
 
 def test_a_diverged_answer_starts_the_estimator_afresh():
-    estimator = Counting(curvature=2.0 * SHARPEST)
+    estimator = Counting(curvature=2.0 * MAX_CURVATURE)
     tracker = ShapeTracker(estimator, every=2)
     assert not any(cycle(tracker, 2.5e-3 * k, contacts=[2.5e-3 * k]) for k in range(5))
     assert tracker.restarts == 2 and estimator.resets == 2 and not tracker.records

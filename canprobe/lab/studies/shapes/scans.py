@@ -23,7 +23,7 @@ from canprobe.cell.results.scores import curvature_tensor
 from canprobe.cell.scene.geometry import true_object
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import ObjectSettings, PlantSettings, Scene
-from canprobe.cell.scene.resolve import LAYER_N_M3, resolve
+from canprobe.cell.scene.resolve import LAYER_STIFFNESS, resolve
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.lab.studies.harness import Array
@@ -116,7 +116,7 @@ def scene_of(name: str, folder: Path, seconds: float = SECONDS) -> Scene:
         object=object_of(name, folder),
         task=task,
         shape=replace(base.shape, also=()),
-        plant=PlantSettings(stiffness_n_m3=LAYER_N_M3 * softer),
+        plant=PlantSettings(stiffness_n_m3=LAYER_STIFFNESS * softer),
     )
 
 
