@@ -6,17 +6,13 @@ import math
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.load import dump_scene, parse_scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.tasks import Trajectory
 from canprobe.errors import UsageError
-
-Array = NDArray[np.float64]
+from canprobe.mechanics.types import Floats
 
 
 def refuse(plan: Plan, kind: str, value: float | None) -> str | None:
@@ -46,7 +42,7 @@ def refuse(plan: Plan, kind: str, value: float | None) -> str | None:
     return None
 
 
-def trajectory_of(plan: Plan, message: Any, q: Array | None) -> dict[str, Any]:
+def trajectory_of(plan: Plan, message: Any, q: Floats | None) -> dict[str, Any]:
     """The way that a `trajectory_msgs/msg/JointTrajectory` asks for, checked from where the arm stands.
 
     Args:

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.fieldbus.bus.port import TimedFrame
-
-Array = NDArray[np.float64]
+from canprobe.mechanics.types import Floats
 
 BASE, FLANGE, PROBE, CONTACT = "base_link", "flange", "probe", "contact"
 """Names of frames; between base and flange stand link_1, link_2, …, the frame that each joint moves."""
@@ -28,15 +27,15 @@ class ContactFrame:
         T_base_contact: (4, 4) contact frame to base, m: origin at the contact point, z along the inward normal.
     """
 
-    T_base_contact: Array
+    T_base_contact: Floats
 
     @property
-    def point(self) -> Array:
+    def point(self) -> Floats:
         """(3,) contact point, base frame, m."""
         return self.T_base_contact[:3, 3]
 
     @property
-    def normal(self) -> Array:
+    def normal(self) -> Floats:
         """(3,) outward unit normal of the object, base frame."""
         return -self.T_base_contact[:3, 2]
 
@@ -55,7 +54,7 @@ class TouchFrame:
 
     t_ns: int
     counts: NDArray[np.uint8] | None
-    force: Array
+    force: Floats
     contact: ContactFrame | None
 
 
@@ -72,9 +71,9 @@ class SurfacePatch:
     """
 
     t_ns: int
-    T_base_contact: Array
-    K: Array
-    covariance: Array
+    T_base_contact: Floats
+    K: Floats
+    covariance: Floats
     observed: tuple[bool, bool]
 
     @property
@@ -85,7 +84,7 @@ class SurfacePatch:
         low, high = np.linalg.eigvalsh(self.K).tolist()
         return (high if self.observed[0] else np.nan, low if self.observed[1] else np.nan)
 
-    def heights(self, x: Array, y: Array) -> tuple[Array, Array]:
+    def heights(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
         """The surface over points of its tangent plane.
 
         Args:
@@ -97,13 +96,13 @@ class SurfacePatch:
         """
         weights = np.stack([0.5 * x * x, x * y, 0.5 * y * y], axis=-1)
         K = self.K if np.isfinite(self.K).all() else np.zeros((2, 2))
-        z: Array = weights @ np.array([K[0, 0], K[0, 1], K[1, 1]])
+        z: Floats = weights @ np.array([K[0, 0], K[0, 1], K[1, 1]])
         if np.isfinite(self.covariance).all():
             variance = np.einsum("...i,ij,...j->...", weights, self.covariance, weights)
             return z, np.sqrt(np.maximum(variance, 0.0))
         return z, np.where(weights.any(axis=-1), np.inf, 0.0)
 
-    def grid(self, radius: float = 8e-3, n: int = 17) -> tuple[Array, Array]:
+    def grid(self, radius: float = 8e-3, n: int = 17) -> tuple[Floats, Floats]:
         """A disc of points of the patch.
 
         Args:
@@ -158,7 +157,7 @@ class Sample:
     t_ns: int
     cycle: int | None = None
     phase: str | None = None
-    q: Array | None = None
+    q: Floats | None = None
     touch: TouchFrame | None = None
     patch: SurfacePatch | None = None
     frames: Sequence[TimedFrame] = ()

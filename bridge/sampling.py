@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.cell.master.array import patch_of
 from canprobe.cell.master.controller import Measurement
@@ -21,7 +20,6 @@ from canprobe.mechanics.touch.patch.array_models import make_patch_calibration
 from canprobe.mechanics.touch.stops import TOUCH_FORCE
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 
-Array = NDArray[np.float64]
 _PHASES = {float(phase): phase.name.lower() for phase in Phase}
 
 

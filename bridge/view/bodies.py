@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from canprobe.lab.bridge.frames import link_transforms
-from canprobe.lab.bridge.view.meshes import Array, TriangleMesh, cylinder, dome, link, merged, revolved
+from canprobe.lab.bridge.view.meshes import TriangleMesh, cylinder, dome, link, merged, revolved
 from canprobe.mechanics.robot.chain import Chain
 from canprobe.mechanics.robot.denavit_hartenberg import dh_step
 from canprobe.mechanics.touch.tangent_frames import tangent_rotation
+from canprobe.mechanics.types import Floats
 
 WHITE, GREY, DARK = (236, 233, 224), (150, 156, 163), (76, 84, 94)
 RIM = 5e-3
@@ -52,7 +53,7 @@ class Part:
     flat: bool = False
 
 
-def link_frames(chain: Chain, q: ArrayLike) -> Array:
+def link_frames(chain: Chain, q: ArrayLike) -> Floats:
     """Frames of the base and of every link.
 
     Args:
@@ -183,7 +184,7 @@ def _span(a: float, b: float) -> tuple[float, float]:
     return (a, b) if a <= b else (b, a)
 
 
-def probe_parts(radius: float, T_flange_probe: Array) -> tuple[TriangleMesh, TriangleMesh]:
+def probe_parts(radius: float, T_flange_probe: Floats) -> tuple[TriangleMesh, TriangleMesh]:
     """The probe in its own frame (origin at the sphere's centre, z the pole): its holder, and its elastic dome.
 
     Args:
@@ -197,7 +198,7 @@ def probe_parts(radius: float, T_flange_probe: Array) -> tuple[TriangleMesh, Tri
     return holder, dome(radius, math.radians(110.0))
 
 
-def _axes(x: ArrayLike, y: ArrayLike, z: ArrayLike) -> Array:
+def _axes(x: ArrayLike, y: ArrayLike, z: ArrayLike) -> Floats:
     T = np.eye(4)
     T[:3, :3] = np.column_stack([x, y, z])
     return T

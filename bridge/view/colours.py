@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from canprobe.lab.bridge.view.meshes import Array
+from canprobe.mechanics.types import Floats
 
 Colours = NDArray[np.uint8]
 VIRIDIS = np.array(
@@ -21,7 +21,7 @@ MAGMA = np.array(((0, 0, 4), (81, 18, 124), (183, 55, 121), (252, 137, 97), (252
 UNKNOWN = (138, 148, 160)
 
 
-def scale(values: ArrayLike, low: float, high: float, stops: Array = VIRIDIS) -> Colours:
+def scale(values: ArrayLike, low: float, high: float, stops: Floats = VIRIDIS) -> Colours:
     """Colours of values between two ends, those beyond take the end's; what is not finite is grey.
 
     Args:

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.lab.bridge.sample import ContactFrame, Sample, SurfacePatch
-from canprobe.lab.bridge.view.meshes import Array
 from canprobe.mechanics.touch.shapes import PlacedShape
+from canprobe.mechanics.types import Floats
 
 SILENT_NS = 250_000_000
 """A contact is shown no longer than this after the tactile frame that showed it."""
@@ -52,7 +52,7 @@ class Moment:
 
     t_s: float = 0.0
     phase: str | None = None
-    q: Array | None = None
+    q: Floats | None = None
     contact: ContactFrame | None = None
     answer: JudgedAnswer | None = None
     taxels: NDArray[np.uint8] | None = None

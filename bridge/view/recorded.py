@@ -22,8 +22,8 @@ from canprobe.cell.tasks.probing import Phase
 from canprobe.errors import UsageError
 from canprobe.lab.bridge.sample import ContactFrame, SurfacePatch
 from canprobe.lab.bridge.view.instants import JudgedAnswer, Moment, judge
-from canprobe.lab.bridge.view.meshes import Array
 from canprobe.mechanics.touch.tangent_frames import tangent_rotation
+from canprobe.mechanics.types import Floats
 
 
 @dataclass(frozen=True, eq=False)  # without slots: `cached_property`
@@ -39,7 +39,7 @@ class RecordedRun:
     """
 
     scene: Scene
-    log: dict[str, Array]
+    log: dict[str, Floats]
     answer_rows: NDArray[np.int64]
     answers: tuple[JudgedAnswer, ...]
     taxels: tuple[tuple[float, NDArray[np.uint8]], ...]
@@ -55,11 +55,11 @@ class RecordedRun:
         return float(self.log["t_s"][-1])
 
     @cached_property
-    def _q(self) -> Array | None:
+    def _q(self) -> Floats | None:
         """(rows, n) rad or m."""
         return joint_positions(self.log)
 
-    def times(self, step_s: float) -> Array:
+    def times(self, step_s: float) -> Floats:
         """Instants at an even distance from the first cycle to the last, s."""
         start = float(self.log["t_s"][0])
         return np.append(np.arange(start, self.duration_s - 1e-9, step_s), self.duration_s)
@@ -133,7 +133,7 @@ def _read_taxels(file: Path, setup: Setup) -> Iterator[tuple[float, NDArray[np.u
         yield from zip(columns["t_s"].tolist(), columns["taxels"], strict=True)
 
 
-def _new_answers(log: dict[str, Array]) -> NDArray[np.int64]:
+def _new_answers(log: dict[str, Floats]) -> NDArray[np.int64]:
     """Rows at which the estimate changed; the log repeats each until the next."""
     if "K_per_m" not in log or "T_base_contact_m" not in log:
         return np.empty(0, np.int64)
@@ -143,7 +143,7 @@ def _new_answers(log: dict[str, Array]) -> NDArray[np.int64]:
     return np.nonzero(new)[0]
 
 
-def _patch(log: dict[str, Array], row: int) -> SurfacePatch:
+def _patch(log: dict[str, Floats], row: int) -> SurfacePatch:
     unknown = np.full((3, 3), np.nan)
     observed = np.isfinite(log["kappa_per_m"][row]) if "kappa_per_m" in log else (True, True)
     return SurfacePatch(

@@ -18,13 +18,14 @@ from canprobe.lab.bridge.view.bodies import link_frames, probe_parts
 from canprobe.lab.bridge.view.colours import linear_light
 from canprobe.lab.bridge.view.instants import Moment
 from canprobe.lab.bridge.view.links import arm_links
-from canprobe.lab.bridge.view.meshes import Array, TriangleMesh
+from canprobe.lab.bridge.view.meshes import TriangleMesh
 from canprobe.lab.bridge.view.object_sheet import object_lines, object_mesh
 from canprobe.lab.bridge.view.path_nodes import PATH
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.patch.array_calibration import NO_FORCE_REFERENCE
 from canprobe.mechanics.touch.shapes import PlacedShape
+from canprobe.mechanics.types import Floats
 
 OBJECT, PROBE, FORCE = (126, 150, 176), (78, 88, 104), (214, 40, 30)
 FORCE_M_PER_N = 0.012
@@ -50,7 +51,7 @@ def legend_of(scene: Scene) -> list[tuple[tuple[int, int, int], str]]:
     return rows
 
 
-def place_of(scene: Scene) -> Array:
+def place_of(scene: Scene) -> Floats:
     """(3,) where the object's surface is, or where it is looked for, base frame, m."""
     if scene.object is None:
         return np.array(scene.task.start_mm) * 1e-3
@@ -79,7 +80,7 @@ class Stage:
         self.notes: list[str] = (
             [] if array is None or array.newtons != NO_FORCE_REFERENCE else [f"force in {NO_FORCE_REFERENCE}"]
         )
-        self._place, self._moved, self._met = place_of(scene), dict[int, Array](), dict[int, float]()
+        self._place, self._moved, self._met = place_of(scene), dict[int, Floats](), dict[int, float]()
         self._clock = MonotonicClock()
         self._truth: list[Any] = []
         self._follows = None
@@ -197,7 +198,7 @@ class Stage:
         if moment.contact is not None and self._follows is not None and self._follows.value:
             self._follow(moment.contact.point - self._place)
 
-    def _follow(self, away: Array) -> None:
+    def _follow(self, away: Floats) -> None:
         """Carry every browser's camera along, in steps; how it was turned by hand stays."""
         now = 1e-9 * self._clock.now_ns()
         for number, client in self._server.get_clients().items():
@@ -210,7 +211,7 @@ class Stage:
                 self._moved[number] = away
                 camera.position, camera.look_at = position + step, look_at + step
 
-    def _move_arm(self, model: ArmModel, q: Array) -> None:
+    def _move_arm(self, model: ArmModel, q: Floats) -> None:
         frames = link_frames(model.chain, q)
         for handle, T in zip(self._links[1:], frames[1:], strict=True):  # the base stands still
             _place(handle, T)
@@ -237,7 +238,7 @@ def _taxel_scales(counts: NDArray[np.uint8]) -> NDArray[np.float32]:
     return np.where(counts > 0, 1.0, 0.12).astype(np.float32)
 
 
-def _place(handle: Any, T: Array) -> None:
+def _place(handle: Any, T: Floats) -> None:
     x, y, z, w = quaternion_of(T[:3, :3])
     handle.wxyz = (w, x, y, z)
     handle.position = T[:3, 3]

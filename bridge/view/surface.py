@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from canprobe.lab.bridge.view.instants import JudgedAnswer
-from canprobe.lab.bridge.view.meshes import Array
 from canprobe.lab.bridge.view.path import DeviationScale
 from canprobe.lab.bridge.view.path_nodes import Parts
 from canprobe.mechanics.touch.blend import REACH_M
 from canprobe.mechanics.touch.meshing import Mesh
 from canprobe.mechanics.touch.surface_map import SPACING_M, LocalPatch, SurfaceMap
+from canprobe.mechanics.types import Floats
 
 CELL_M = 1e-3
 """Size of its triangles."""
@@ -59,13 +59,13 @@ class BlendedSurface:
         return mesh, self._scale.colours(np.array(best))
 
 
-def _near(vertices: Array, answers: Sequence[JudgedAnswer]) -> list[list[int]]:
+def _near(vertices: Floats, answers: Sequence[JudgedAnswer]) -> list[list[int]]:
     """For each vertex (n, 3) the indices of the answers within `REACH_M`."""
     tree = cKDTree([_point(answer) for answer in answers])
     return [tree.query_ball_point(vertex, REACH_M) for vertex in vertices]
 
 
-def _point(answer: JudgedAnswer) -> Array:
+def _point(answer: JudgedAnswer) -> Floats:
     return answer.patch.T_base_contact[:3, 3]
 
 

@@ -116,7 +116,7 @@ class TouchScan(gymnasium.Env[Any, NDArray[np.float32]]):
         Args:
             seed: of all episodes from here on.
             options: values by the keys of a scene file, such as `{"object.radius_mm": 50}`, fixed or drawn (`Uniform`,
-                `Choice`), and `objects`: the name of a set of `OBJECTS`, or None for the object of the scene. They come
+                `OneOf`), and `objects`: the name of a set of `OBJECTS`, or None for the object of the scene. They come
                 on top of those of the environment; one that names a key of the object starts from that of the scene.
 
         Returns:

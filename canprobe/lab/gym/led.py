@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.cell.master.controller import TactileSample
 from canprobe.cell.planning.model import Plan
@@ -19,12 +18,10 @@ from canprobe.mechanics.touch.contact import ContactSample, direction_to_pad
 from canprobe.mechanics.touch.patch.image import Patch
 from canprobe.mechanics.touch.servo import ProbePose
 from canprobe.mechanics.touch.strategies import PathFollower
+from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-
-
-Vector = NDArray[np.float64]
 
 
 class _Heading(PathFollower):
@@ -61,8 +58,8 @@ class LedTask(TouchTask):
         task = plan.setup.task
         assert isinstance(task, Touch) and task.scan is not None
         super().__init__(plan, replace(task, duration_s=math.inf), make_sensing(task), make_shape_tracker(plan.setup))
-        self.axes: Vector = np.asarray(task.approach.axes, dtype=float)
-        self.start: Vector = np.asarray(task.approach.start, dtype=float)
+        self.axes: Floats = np.asarray(task.approach.axes, dtype=float)
+        self.start: Floats = np.asarray(task.approach.start, dtype=float)
         self.wanted_force = task.force
         self.top_speed = task.scan.speed
         self.velocity = 0.0, 0.0
@@ -109,13 +106,13 @@ class LedTask(TouchTask):
         """What the servo aims at, N."""
         return self._target_force
 
-    def frame(self, normal: Vector) -> Vector:
+    def frame(self, normal: Floats) -> Floats:
         """(3, 3) rows x, y, z of the contact frame in base, for an outward unit normal (3,)."""
         x = self.axes[0] - (normal @ self.axes[0]) * normal
         x /= np.linalg.norm(x)
         return np.array((x, np.cross(normal, x), normal))
 
-    def lead(self, velocity: Vector, force: float, cycles: int) -> None:
+    def lead(self, velocity: Floats, force: float, cycles: int) -> None:
         """Go over to a velocity of the contact (2,), m/s, and a force, N, evenly within so many cycles."""
         vx, vy = self.velocity
         dx, dy, more = float(velocity[0]) - vx, float(velocity[1]) - vy, force - self._target_force

@@ -11,8 +11,9 @@ from gymnasium import spaces
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Touch
 from canprobe.lab.gym.led import LedTask
-from canprobe.lab.gym.region import SECTORS, Coverage, Vector
+from canprobe.lab.gym.region import SECTORS, Coverage
 from canprobe.mechanics.touch.pad import COUNTS_MAX
+from canprobe.mechanics.types import Floats
 
 Kind = Literal["features", "tactile", "oracle"]
 KINDS: tuple[Kind, ...] = ("features", "tactile", "oracle")
@@ -72,7 +73,7 @@ class Observations:
     def observe(
         self,
         task: LedTask,
-        origin: Vector,
+        origin: Floats,
         coverage: Coverage,
         forces: Sequence[float],
         truth: Mapping[str, Any],
@@ -136,7 +137,7 @@ def _curvature(which: str, bend: float) -> dict[str, tuple[float, float]]:
     return {f"{which}k_{axes}_per_m": (-bend, bend) for axes in ("xx", "xy", "yy")}
 
 
-def _in_frame(tensor: Vector, frame: Vector) -> list[float]:
+def _in_frame(tensor: Floats, frame: Floats) -> list[float]:
     """A tensor (3, 3) of base as xx, xy, yy in the frame of rows x, y, z."""
     x, y, _ = frame
     return [float(x @ tensor @ x), float(x @ tensor @ y), float(y @ tensor @ y)]

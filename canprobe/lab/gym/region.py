@@ -7,7 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-Vector = NDArray[np.float64]
+from canprobe.mechanics.types import Floats
+
 CELL = 0.5e-3
 """Side of a cell of the grid, m."""
 BRUSH = 1.5e-3
@@ -50,7 +51,7 @@ class Coverage:
         """Touched so far, of the rectangle."""
         return self._cells / (self._shape[0] * self._shape[1])
 
-    def touch(self, place: Vector) -> float:
+    def touch(self, place: Floats) -> float:
         """Touch the surface at a place (2,) along the heading and across it, m; the area that is new, m²."""
         window = self._window(place)
         if window is None:
@@ -60,7 +61,7 @@ class Coverage:
         self._cells += new
         return new * CELL**2
 
-    def left(self, place: Vector) -> Vector:
+    def left(self, place: Floats) -> Floats:
         """Share within sight of a place (2,), m, that is left to be touched, by direction (`SECTORS`,).
 
         The first is round the heading; the others follow towards the side across.
@@ -68,10 +69,10 @@ class Coverage:
         window = self._window(place)
         if window is None:
             return np.zeros(SECTORS)
-        left: Vector = np.bincount(self._sector, weights=~window[self._sight], minlength=SECTORS) / self._in_sector
+        left: Floats = np.bincount(self._sector, weights=~window[self._sight], minlength=SECTORS) / self._in_sector
         return left
 
-    def _window(self, place: Vector) -> NDArray[np.bool_] | None:
+    def _window(self, place: Floats) -> NDArray[np.bool_] | None:
         """The part of the grid within sight of a place, as a view; None outside of the rectangle."""
         i, j = np.floor((place + self._half) / CELL).astype(int).tolist()
         if not (0 <= i < self._shape[0] and 0 <= j < self._shape[1]):

@@ -24,7 +24,7 @@ from canprobe.cell.emulated.image_processing import follow
 from canprobe.cell.plant.elastic_contact import depth_for_force
 from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig
 from canprobe.cell.results.picture import BLUE, INK, picture
-from canprobe.lab.studies.harness import Array, Column, Row, StudyResult
+from canprobe.lab.studies.harness import Column, Row, StudyResult
 from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.touch.pad import Pad
@@ -33,6 +33,7 @@ from canprobe.mechanics.touch.patch.calibrate import calibrate_array
 from canprobe.mechanics.touch.patch.image import PatchCalibration
 from canprobe.mechanics.touch.patch.image_fit import Dwell, what_is_shown
 from canprobe.mechanics.touch.patch.parameter_fit import curvature_errors, moment_errors
+from canprobe.mechanics.types import Floats
 
 RADIUS_M = 0.040
 BALL_PER_M = 40.0
@@ -259,7 +260,7 @@ def measure(seed: int) -> dict[str, Any]:
     }
 
 
-def _rms_percent(values: Array) -> float:
+def _rms_percent(values: Floats) -> float:
     return 100.0 * math.sqrt(float(np.mean(np.square(values))))
 
 

@@ -26,13 +26,14 @@ from matplotlib.axes import Axes
 from canprobe.cell.results.picture import BLUE, INK, ORANGE, SHADE, legend, picture
 from canprobe.lab.studies.cell_store import as_json
 from canprobe.lab.studies.ground import PATHS, SURFACES, Ground, make_ground
-from canprobe.lab.studies.harness import CHI2_95_OF_3, FROBENIUS, Array, Column, Row, StudyResult
+from canprobe.lab.studies.harness import CHI2_95_OF_3, FROBENIUS, Column, Row, StudyResult
 from canprobe.lab.studies.result_files import SIGMA_COLUMNS, measuring_facts, sigma_values
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 from canprobe.mechanics.touch.estimate.fit import fit_surface
 from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
 from canprobe.mechanics.touch.estimate.prior import Prior
+from canprobe.mechanics.types import Floats
 
 RATIOS, COVERAGES = (0.0, 2.0), (0.85, 1.0)
 """Scales of the picture; a case beyond is drawn at the edge."""
@@ -135,7 +136,7 @@ def quick_cases() -> Iterator[BoundCase]:
         yield BoundCase(surface, PATHS[i % 2], size, min(size, LONGEST_M), *NOISES[i % 3])
 
 
-def criteria(case: BoundCase, ground: Ground, C: Array, model_bias: float) -> dict[str, float]:
+def criteria(case: BoundCase, ground: Ground, C: Floats, model_bias: float) -> dict[str, float]:
     """The values of a case that `REGION` limits."""
     size = float(np.linalg.norm(ground.K))
     return {
@@ -181,7 +182,7 @@ def score(answers: Sequence[Answer], bound: float) -> dict[str, Any]:
     }
 
 
-def length(error: Array) -> float:
+def length(error: Floats) -> float:
     """‖·‖ of (K11, K12, K22)."""
     return math.sqrt(float(FROBENIUS @ error**2))
 

@@ -8,10 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 Say = Callable[[str], None]
-Array = NDArray[np.float64]
 Row = dict[str, Any]
 """A row of a table, by the keys of its columns."""
 CHANNEL = "vcan0"

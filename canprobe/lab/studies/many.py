@@ -28,8 +28,9 @@ from canprobe.cell.session.terminal import Report
 from canprobe.errors import CanprobeError, SafetyStop, UsageError, install_line
 from canprobe.fieldbus.bus.files import make_folder, whole_file
 from canprobe.lab.studies.cell_store import model_digest
-from canprobe.lab.studies.harness import Array, Row
+from canprobe.lab.studies.harness import Row
 from canprobe.lab.studies.sweep import error_text, open_sweep
+from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     import pandas
@@ -84,7 +85,7 @@ def measure(case: RunCase) -> dict[str, Any]:
     }
 
 
-def _sampled(result: RunResult, column: Array, every_s: float) -> Array:
+def _sampled(result: RunResult, column: Floats, every_s: float) -> Floats:
     """The values of a column that held at even distances of time from the first SYNC on."""
     t = result.log["t_s"][: len(column)] - result.log["t_s"][0]
     rows = np.searchsorted(t, np.arange(0.0, t[-1] + 1e-9, every_s) + 1e-9, side="right") - 1

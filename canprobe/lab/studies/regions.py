@@ -33,10 +33,11 @@ from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.errors import PlanError
-from canprobe.lab.studies.harness import CHI2_95_OF_3, FROBENIUS, Array, Column, Row, StudyResult
+from canprobe.lab.studies.harness import CHI2_95_OF_3, FROBENIUS, Column, Row, StudyResult
 from canprobe.lab.studies.random_scenes import random_scene
 from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.sweep import Sweep
+from canprobe.mechanics.types import Floats
 
 PACKAGED = ("cylinder", "sphere", "plane", "saddle", "ellipsoid", "bowl", "torus", "wave", "fillet")
 SEEDS = range(102, 107)
@@ -87,7 +88,7 @@ class ScoredScan(NamedTuple):
     path: str
     full_scale_kpa: float
     late: int
-    scores: Array
+    scores: Floats
 
 
 def run(*, quick: bool, sweep: Sweep) -> StudyResult:
@@ -128,7 +129,7 @@ def measure(case: RegionCase) -> ScoredScan:
     )
 
 
-def scored(record: ShapeRecord, truth: dict[str, Array], times: Array) -> list[float]:
+def scored(record: ShapeRecord, truth: dict[str, Floats], times: Floats) -> list[float]:
     """One of `ScoredScan.scores`, in the answer's own axes."""
     row = int(np.searchsorted(times, record.t_s - 1e-6))
     P = record.estimate.T_frame_contact[:3, :2]
@@ -179,7 +180,7 @@ def row_of(group: str, name: str, scans: Sequence[ScoredScan]) -> Row:
     }  # fmt: skip
 
 
-def _interval(values: Array) -> tuple[float, float]:
+def _interval(values: Floats) -> tuple[float, float]:
     """Where 95 % of the draws lie."""
     if not len(values):
         return math.nan, math.nan

@@ -25,11 +25,12 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from canprobe.cell.results.picture import AMBER, BLUE, GREY, INK, ORANGE, PINK, legend, log_scale, parts, picture
-from canprobe.lab.studies.harness import Array, Column, Row, StudyResult
+from canprobe.lab.studies.harness import Column, Row, StudyResult
 from canprobe.lab.studies.linear_loop import ForceLoop, spectral_radius
 from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.stability_runs import HUNTING, LoopCase, carry_out, loop_of, touch_in_posture
 from canprobe.lab.studies.sweep import Sweep
+from canprobe.mechanics.types import Floats
 
 STIFFNESSES = (1e2, 1e3, 1e4, 2e4, 4e4, 6e4, 1e5, 1e6, 1e7)
 GAINS_HZ = (2.0, 8.0, 25.0)
@@ -268,7 +269,7 @@ def draw_stability(rows: Sequence[Row], path: Path) -> None:
         legend(lower, marks)
 
 
-def _draw_map(axes: Axes, stiffness: Array, ratios: Sequence[float], bus: ForceLoop, rows: Sequence[Row]) -> None:
+def _draw_map(axes: Axes, stiffness: Floats, ratios: Sequence[float], bus: ForceLoop, rows: Sequence[Row]) -> None:
     """One panel of the map."""
     gains = np.geomspace(1.5, 70.0, 20)
     radius = [

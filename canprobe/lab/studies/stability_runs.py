@@ -29,7 +29,7 @@ from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.node.wrapped import WrappedNode
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.lab.studies.fault_scores import RELEASE_NS, longest_above, reaction_ns
-from canprobe.lab.studies.harness import Array, Row
+from canprobe.lab.studies.harness import Row
 from canprobe.lab.studies.linear_loop import ForceLoop
 from canprobe.lab.studies.witnessed_run import Witness, run_to_end
 from canprobe.mechanics.robot.chain import forward
@@ -37,6 +37,7 @@ from canprobe.mechanics.robot.inverse import inverse_near
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.touch.contact import Slope, indentation_from_force
 from canprobe.mechanics.touch.patch.array_models import make_patch_calibration
+from canprobe.mechanics.types import Floats
 
 
 class LateNode(WrappedNode):
@@ -156,7 +157,7 @@ def layer_stiffness(case: LoopCase) -> float:
     return float(indentation_from_force(case.force_n, 1.0, case.probe_mm * 1e-3, _kappa(case)) / depth) ** 2
 
 
-def _kappa(case: LoopCase) -> Array:
+def _kappa(case: LoopCase) -> Floats:
     place = true_object(_object(case))
     return np.maximum(place.closest(np.array(case.at_mm) * 1e-3).kappa, -0.9e3 / case.probe_mm)
 

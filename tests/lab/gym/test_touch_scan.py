@@ -117,7 +117,7 @@ def test_options_have_the_keys_and_the_checks_of_a_scene(make):
     env = make(estimate=False)
     drawn = {
         "plant.drive_bandwidth_hz": canprobe.lab.gym.Uniform(20, 40),
-        "task.force_n": canprobe.lab.gym.Choice((1.5, 2.5)),
+        "task.force_n": canprobe.lab.gym.OneOf((1.5, 2.5)),
     }
     _, info = env.reset(seed=0, options={"objects": "held_out", **drawn})
     overrides = info["overrides"]

@@ -15,13 +15,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from canprobe.cell.results.picture import GREEN, INK, METHOD_COLOURS, PINK, SKY, legend, log_scale, picture
-from canprobe.lab.studies.harness import Array, Column, Row, StudyResult
+from canprobe.lab.studies.harness import Column, Row, StudyResult
 from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.shapes.contacts_file import ShapeContacts, read_columns, read_contacts, write_contacts
 from canprobe.lab.studies.shapes.methods import METHODS, FittedSurface, Method
 from canprobe.lab.studies.shapes.scans import DEVELOPMENT, SECONDS, TEST, ScanCase, scan
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.touch.meshing import Mesh, mesh_of
+from canprobe.mechanics.types import Floats
 
 FILE = "contacts.npz"
 CELL_M = 1e-3
@@ -120,7 +121,7 @@ def score(fit: MethodFit) -> dict[str, Any]:
     return scored(surface, mesh, read_columns(Path(fit.path), fit.shape))
 
 
-def scored(surface: FittedSurface, mesh: Mesh, truth: Mapping[str, Array]) -> dict[str, Any]:
+def scored(surface: FittedSurface, mesh: Mesh, truth: Mapping[str, Floats]) -> dict[str, Any]:
     """Scores of a surface and its mesh against the columns of the truth; None where there is nothing to score."""
     points, normals = truth["truth_point"], truth["truth_normal"]
     tensors = truth["truth_tensor"].reshape(-1, 3, 3)
@@ -149,13 +150,13 @@ def scored(surface: FittedSurface, mesh: Mesh, truth: Mapping[str, Array]) -> di
     }  # fmt: skip
 
 
-def distance_from(points: Array, normals: Array, tensors: Array, at: Array) -> Array:
+def distance_from(points: Floats, normals: Floats, tensors: Floats, at: Floats) -> Floats:
     """(n,) signed distances of places from a surface known at close points: the quadric of the nearest one, m."""
     nearest = cKDTree(points).query(at)[1] if len(at) else np.zeros(0, np.intp)
     d = at - points[nearest]
     up = np.einsum("ij,ij->i", d, normals[nearest])
     flat = d - up[:, None] * normals[nearest]
-    result: Array = up + 0.5 * np.einsum("ij,ijk,ik->i", flat, tensors[nearest], flat)
+    result: Floats = up + 0.5 * np.einsum("ij,ijk,ik->i", flat, tensors[nearest], flat)
     return result
 
 
@@ -163,7 +164,7 @@ def _harmonic(a: float, b: float) -> float:
     return 2.0 * a * b / (a + b) if a + b else 0.0
 
 
-def _rms(values: Array) -> float:
+def _rms(values: Floats) -> float:
     return math.sqrt(float(np.mean(values**2))) if len(values) else math.nan
 
 
