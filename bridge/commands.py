@@ -22,7 +22,7 @@ def refuse(plan: Plan, kind: str, value: float | None) -> str | None:
     ranges, `limits.force_max_n`, the speeds of the joints.
 
     Args:
-        plan: of the run.
+        plan: plan of the run.
         kind: start, stop, target_force_n or speed_m_s.
         value: N or m/s; None for start and stop.
     """
@@ -46,8 +46,8 @@ def trajectory_of(plan: Plan, message: Any, q: Floats | None) -> dict[str, Any]:
     """The way that a `trajectory_msgs/msg/JointTrajectory` asks for, checked from where the arm stands.
 
     Args:
-        plan: of the run.
-        message: with names, points, and positions in each; velocities in all of them or in none.
+        plan: plan of the run.
+        message: trajectory with joint names and points; positions in each point, velocities in all of them or in none.
         q: (n,) joint positions now, rad or m; None as long as they are not known.
 
     Returns:

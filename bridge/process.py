@@ -49,8 +49,8 @@ class BridgeProcess:
     """One bridge in its process.
 
     Args:
-        name: of the bridge.
-        plan: of the run.
+        name: name of the bridge.
+        plan: plan of the run.
         out: folder of the run; None where no files are written.
         virtual: the run is not in real time: its feed waits for room, and its time begins at 0.
 

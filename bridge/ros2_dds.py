@@ -96,7 +96,7 @@ class Ros2Sink:
     """Publishes one run, and takes commands where the scene allows them.
 
     Args:
-        context: of the run.
+        context: plan and settings of the run.
     """
 
     def __init__(self, context: Context) -> None:

@@ -45,7 +45,7 @@ class TouchFrame:
     """One frame of the tactile array.
 
     Attributes:
-        t_ns: when it was sampled, on the clock of the samples.
+        t_ns: time of sampling, on the clock of the samples.
         counts: (rows, columns) uint8, row by row; zero outside the window; None in features mode.
         force: (3,) N that the object exerts on the probe, in the probe's centre frame. The array measures pressure
             only: the force runs along the contact normal, without a torque about the sphere's centre.
@@ -63,11 +63,11 @@ class SurfacePatch:
     """A new answer of the estimator in the loop: the surface round the contact, z = ½ (x, y) K (x, y)ᵀ.
 
     Attributes:
-        t_ns: of the cycle that got it.
+        t_ns: time of the cycle that received it.
         T_base_contact: (4, 4) the estimate's contact frame to base, m; z is the inward normal.
         K: (2, 2) curvature in that frame, 1/m, positive where convex.
         covariance: (3, 3) of (K11, K12, K22), 1/m²; not finite where not observed.
-        observed: of each principal curvature (κ1 ≥ κ2).
+        observed: whether each principal curvature is observed (κ1 ≥ κ2).
     """
 
     t_ns: int
@@ -106,7 +106,7 @@ class SurfacePatch:
         """A disc of points of the patch.
 
         Args:
-            radius: of the disc, m.
+            radius: radius of the disc, m.
             n: points along a diameter.
 
         Returns:
@@ -145,12 +145,12 @@ class Sample:
     Attributes:
         t_ns: time of its SYNC since the bus was opened, as in `bus.log`.
         cycle: its number; None before the first cycle and after the last.
-        phase: of the task in lower case (`approach`, `scan`, …); None where the controller gives none.
+        phase: phase of the task in lower case (`approach`, `scan`, …); None where the controller gives none.
         q: (n,) joint positions at the SYNC, rad or m; None without an arm, or before all joints were heard.
         touch: a tactile frame that became usable in this cycle.
         patch: a new answer of the estimator.
         frames: what was on the bus since the sample before, with `EFF_FLAG` and `RTR_FLAG` on identifiers.
-        diagnostics: of all nodes and of the bridge, about once a second.
+        diagnostics: states of all nodes and of the bridge, about once a second.
         dropped: samples that were lost on the way to this bridge so far.
     """
 

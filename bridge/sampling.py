@@ -27,7 +27,7 @@ class SampleSource:
     """Makes the samples of one run, with the scene's own calibration and geometry.
 
     Args:
-        plan: of the run.
+        plan: plan of the run.
     """
 
     def __init__(self, plan: Plan) -> None:

@@ -29,7 +29,7 @@ class Topic:
     Attributes:
         name: as ROS writes it.
         type_name: as rosbags and ROS write it.
-        depth: of the history that is kept.
+        depth: number of messages that are kept.
         transient: late readers get the last message (transient local).
         best_effort: a lost message is not sent again (sensor data); reliable otherwise.
     """
@@ -67,10 +67,10 @@ class Messages:
     """Makes the messages of one run.
 
     Args:
-        plan: of the run.
+        plan: plan of the run.
         encoder: the one encoder.
         wanted: whether anybody takes a topic; nothing is made of the others.
-        static_every_ns: when the fixed frames are sent again; by default once is enough.
+        static_every_ns: period at which the fixed frames are sent again; by default they are sent once.
     """
 
     def __init__(

@@ -24,7 +24,7 @@ def taxel_poses(pad: Pad, radius: float) -> tuple[Floats, Floats]:
 
     Args:
         pad: the taxels.
-        radius: from the origin of the probe's frame to its pole, m.
+        radius: distance from the origin of the probe's frame to its pole, m.
 
     Returns:
         (n, 3) positions in the probe frame, m, and (n, 4) unit quaternions w, x, y, z that turn a tile lying in

@@ -41,7 +41,7 @@ class Part:
     Attributes:
         name: unique in the arm.
         frame: 0 for the base, i for the frame behind joint i.
-        mesh: in that frame, m.
+        mesh: triangles in that frame, m.
         colour: RGB, 0–255.
         flat: its triangles are shaded apart: edges stay sharp without doubled vertices.
     """
@@ -188,7 +188,7 @@ def probe_parts(radius: float, T_flange_probe: Floats) -> tuple[TriangleMesh, Tr
     """The probe in its own frame (origin at the sphere's centre, z the pole): its holder, and its elastic dome.
 
     Args:
-        radius: of the sphere, m.
+        radius: radius of the sphere, m.
         T_flange_probe: (4, 4); the holder goes back along z to the flange.
     """
     back = float(T_flange_probe[2, 3])

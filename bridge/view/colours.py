@@ -26,7 +26,7 @@ def scale(values: ArrayLike, low: float, high: float, stops: Floats = VIRIDIS) -
 
     Args:
         values: (...,) any unit.
-        low, high: in the same unit, low < high.
+        low, high: limits of the scale in the same unit, low < high.
         stops: `VIRIDIS`, dark blue to yellow, or `MAGMA`, black to light yellow.
 
     Returns:

@@ -41,12 +41,12 @@ class Moment:
 
     Attributes:
         t_s: on the clock of the samples, s.
-        phase: of the task.
+        phase: phase of the task.
         q: (n,) joint positions, rad or m; None without an arm.
-        contact: where the probe touches; None without contact.
+        contact: place of the contact; None without contact.
         answer: the newest one of the estimator; None before the first.
         taxels: (rows, columns) counts of the newest frame; None before the first.
-        force: N, of the newest frame; NaN before the first.
+        force: contact force of the newest frame, N; NaN before the first.
         dropped: samples lost on the way so far.
     """
 

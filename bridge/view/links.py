@@ -32,8 +32,8 @@ def arm_links(arm: ArmSettings, chain: Chain) -> tuple[list[Part], list[str]]:
     """What is drawn of an arm, and a line for what its URDF shows and cannot be drawn.
 
     Args:
-        arm: of the scene.
-        chain: that follows from it.
+        arm: arm of the scene.
+        chain: kinematic chain of that arm.
     """
     plain = arm_parts(chain)
     if arm.urdf is None:

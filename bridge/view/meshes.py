@@ -82,7 +82,7 @@ def link_outline(first: Circle, second: Circle, sectors: int = SECTORS) -> Float
     """Outline of a link seen along its joint axes: two circles and their common tangents, (sectors + 2, 2).
 
     Args:
-        first, second: where the axes pass and the radii round them; where one lies in the other, the larger radius
+        first, second: centre and radius of each circle; where one lies in the other, the larger radius
             round the first centre.
         sectors: even number of points on the two arcs together.
     """
@@ -108,7 +108,7 @@ def link(first: Circle, second: Circle, span: tuple[float, float], rim: float = 
     """A link between two parallel joint axes along z, its rims rounded off.
 
     Args:
-        first, second: where the axes pass (x, y) and the radii round them, m.
+        first, second: centre (x, y) and radius of each circle, m.
         span: its two flat sides, lower first, m.
         rim: radius of the rounding, m, below both radii and half the thickness.
     """
@@ -146,7 +146,7 @@ def dome(radius: float, opening_rad: float, rings: int = 24) -> TriangleMesh:
     Args:
         radius: m.
         opening_rad: angle from the pole to the rim; π for the whole sphere.
-        rings: from the rim to the pole.
+        rings: number of rings from the rim to the pole.
     """
     angle = np.linspace(opening_rad, 0.0, rings + 1)
     return revolved(np.column_stack([radius * np.sin(angle), radius * np.cos(angle)]))

@@ -36,8 +36,8 @@ def write_page(run: RecordedRun, file: Path, say: Callable[[str], None]) -> None
     """Write the replay of a run into one file.
 
     Args:
-        run: from `read_run`.
-        file: to write; an older one is replaced.
+        run: a run that `read_run` has read.
+        file: file that is written; an older one is replaced.
         say: called with each line about what cannot be drawn.
 
     Raises:

@@ -28,7 +28,7 @@ class Panel:
 
     Args:
         server: a `viser.ViserServer`.
-        scene: that is shown.
+        scene: scene that is shown.
         errors: what the path's colours mean.
         stage: what is beside, with lines about what cannot be drawn.
     """

@@ -34,7 +34,7 @@ class RecordedRun:
         scene: as resolved.
         log: the columns of ``log.npz``; every row one cycle.
         answer_rows: rows at which the estimator gave a new answer.
-        answers: at each of them.
+        answers: estimate at each of them.
         taxels: (t_s, (rows, columns) uint8 counts) of each tactile frame, by rising time of the cycle that used it.
     """
 
@@ -97,7 +97,7 @@ def read_run(folder: Path) -> RecordedRun:
     """Read what is shown of a run.
 
     Args:
-        folder: that `canprobe run` wrote: ``scene.toml``, ``log.npz`` and, for the taxels, ``tactile.npz``.
+        folder: folder that `canprobe run` wrote: ``scene.toml``, ``log.npz`` and, for the taxels, ``tactile.npz``.
 
     Raises:
         UsageError: no such folder, a file that is missing or of another canprobe, or a column that is not as it should

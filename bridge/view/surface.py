@@ -29,7 +29,7 @@ class BlendedSurface:
     """Answers as one surface: of those within `SPACING_M` of each other the best known one.
 
     Args:
-        scale: of its colours, which show the stated deviation of K, 1/m.
+        scale: scale of the colours, which show the stated deviation of K, 1/m.
     """
 
     def __init__(self, scale: DeviationScale) -> None:
@@ -85,8 +85,8 @@ class GrowingSurface:
     """A surface that grows while the cell runs.
 
     Args:
-        api: of viser's scene.
-        scale: of its colours.
+        api: viser's scene.
+        scale: scale of the colours.
     """
 
     def __init__(self, api: Any, scale: DeviationScale) -> None:
@@ -112,9 +112,9 @@ class LoadedSurface(Parts):
     """The surface of a recorded run as it is known at the end, shown as far as it was touched by an instant.
 
     Args:
-        api: of viser's scene.
-        answers: of the run, by rising time, each with its instant, s.
-        scale: of its colours.
+        api: viser's scene.
+        answers: estimates of the run, by rising time, each with its instant, s.
+        scale: scale of the colours.
     """
 
     def __init__(self, api: Any, answers: Iterable[tuple[float, JudgedAnswer]], scale: DeviationScale) -> None:

@@ -40,8 +40,8 @@ def print_packaged(
     """Print name and title of every packaged file of some kinds, their folders, and what can be done with them.
 
     Args:
-        advice: by kind.
-        args: of the command.
+        advice: line of advice for each kind.
+        args: arguments of the command.
         expected: their figures, as `read_expected` has them.
     """
     from canprobe.cell.results.expected import SHORT, expected_text, seeds_text

@@ -45,13 +45,13 @@ class LedTask(TouchTask):
     laid into the tangent plane, y = z × x.
 
     Args:
-        plan: of a scan.
+        plan: plan of a scan.
 
     Attributes:
         axes: (3, 3) rows of the scan plane: heading, across, approach normal; base frame.
-        wanted_force: of the scene, N.
-        top_speed: of the scene's scan, m/s.
-        velocity: of the contact now (2,), in the contact frame, m/s.
+        wanted_force: contact force that the scene asks for, N.
+        top_speed: speed of the scene's scan, m/s.
+        velocity: present velocity of the contact (2,), in the contact frame, m/s.
     """
 
     def __init__(self, plan: Plan) -> None:

@@ -29,11 +29,11 @@ class Observations:
     Args:
         kind: `features`, which the master measures; `tactile`, the same and the last image; `oracle`, the features and
             what is true.
-        plan: of the scene; another scene of the same cell has the same spaces.
+        plan: plan of the scene; another scene of the same cell has the same spaces.
         shape: there is a surface estimator.
 
     Attributes:
-        names: of the entries of the vector, in order, with their units.
+        names: names of the entries of the vector, in order, with their units.
         space: bounds in these units.
     """
 
@@ -81,11 +81,11 @@ class Observations:
         """An element of the space.
 
         Args:
-            task: in contact, or as it was last.
+            task: the led task, in contact or as it was last.
             origin: first contact (3,), base frame, m.
             coverage: so far.
             forces: as measured since the last observation, N.
-            truth: of the plant.
+            truth: true state of the plant.
         """
         contact = task.last_contact
         along, across, up = (task.axes @ (contact.p_base - origin)).tolist()

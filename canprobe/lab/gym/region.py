@@ -23,7 +23,7 @@ class Coverage:
     """A grid over the scan plane: a rectangle round the first contact, and the cells that were touched.
 
     Args:
-        length, width: of the rectangle along the heading and across it, m.
+        length, width: sides of the rectangle along the heading and across it, m.
     """
 
     def __init__(self, length: float, width: float) -> None:

@@ -93,8 +93,8 @@ class Presses:
     """Presses known shapes on one array, one after the other: it remembers, until it is left to `rest`.
 
     Args:
-        config, stiffness: of the array and its layer, N/m³.
-        rng: of gains and noise.
+        config, stiffness: the array, and the stiffness of its layer, N/m³.
+        rng: generator of gains and noise.
     """
 
     def __init__(self, config: TaxelConfig, stiffness: float, rng: np.random.Generator) -> None:
@@ -119,16 +119,16 @@ class Presses:
         """One touch, pressed for half a second and rolled over the pad.
 
         Args:
-            name: of the object.
+            name: name of the object.
             force: N.
             kappa: principal curvatures, larger first, 1/m.
-            number: of the place.
+            number: number of the place.
             at: on the pad, m.
-            angle: of the first principal direction on the pad, rad.
-            seconds: of the roll.
-            heading: of the roll on the pad, rad.
+            angle: angle of the first principal direction on the pad, rad.
+            seconds: duration of the roll.
+            heading: heading of the roll on the pad, rad.
             roll: half-widths along and across the heading, m.
-            hz: of the roll, one after the other.
+            hz: rates of the roll, one after the other.
             measured: the true force is told, with the error of a scale.
         """
         array, began = self._array, self._t

@@ -56,7 +56,7 @@ def dask_executor(address: str) -> Iterator[Executor]:
     """The workers of a Dask cluster; they need the same canprobe.
 
     Args:
-        address: of the scheduler, such as "tcp://10.0.0.1:8786".
+        address: address of the scheduler, such as "tcp://10.0.0.1:8786".
 
     Raises:
         UsageError: package `distributed` is missing.

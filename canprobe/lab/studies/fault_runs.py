@@ -106,8 +106,8 @@ class _LockstepRun:
     """One case, carried out.
 
     Attributes:
-        begun: when each phase of the task began, ns.
-        end_ns: when the session was closed.
+        begun: start of each phase of the task, ns.
+        end_ns: time at which the session was closed.
     """
 
     def __init__(self, case: FaultCase, folder: Path | None = None) -> None:

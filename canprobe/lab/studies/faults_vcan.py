@@ -83,7 +83,7 @@ class ProcessCase:
     Attributes:
         seed: its number.
         fault: what happens.
-        after_s: from the enabling of the drives to the fault.
+        after_s: time from the enabling of the drives to the fault.
     """
 
     seed: int

@@ -76,10 +76,10 @@ def make_ground(surface: str, size: float, path: str, length: float, samples: in
         path: one of `PATHS`.
         length: along the path as seen from above, m.
         samples: equally spaced points.
-        waves: of a weave; it is as wide as such a wave is long, times 5/6.
+        waves: number of waves of a weave; it is as wide as such a wave is long, times 5/6.
 
     Raises:
-        UsageError: for an unknown name.
+        UsageError: the name is unknown.
     """
     if path not in PATHS:
         raise UsageError(f"path: expected one of {', '.join(PATHS)}, got {path!r}")

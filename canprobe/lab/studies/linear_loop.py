@@ -32,7 +32,7 @@ class ForceLoop:
 
     Attributes:
         depth_ratio: g, measured over true depth.
-        period_s: of the cycle.
+        period_s: period of the cycle.
         sample_cycles: cycles between two tactile images.
         height_hz: bandwidth of the surface's height correction, the force gain.
         late_s: delay of targets and tactile frames on the bus.

@@ -51,7 +51,7 @@ class RunCase:
     Attributes:
         scene: as TOML.
         files: digest of the files that it names.
-        seed: in the place of the scene's.
+        seed: seed in the place of the scene's.
         series: columns of the log, or of the truth, that are kept.
         every_ms: time between two of their values.
     """
@@ -120,7 +120,7 @@ def run_many(
         seeds: how many, from 0 on, or which; the scene's by default.
         bus: ``direct`` or ``lockstep``; the scene's by default. Where the wire is of no interest, ``direct`` gives the
             results of a lockstep bus without delays, several times as fast.
-        duration_s: in the place of the scene's, s.
+        duration_s: duration in the place of the scene's, s.
         workers: number of processes, one for each core by default; or the address of a Dask scheduler, such as
             ``tcp://10.0.0.1:8786``, whose workers have the same canprobe.
         out: folder of the finished runs; ``runs/many-<scene>`` by default.
@@ -211,10 +211,10 @@ class Runs:
 
     Attributes:
         scene: what they have in common.
-        keys: that were varied.
+        keys: keys that were varied.
         rows: the value of each key, and ``seed``, of each run.
-        outcomes: of each run ``status`` (``done``; ``stopped`` for safety; ``refused`` by the plan; ``failed``),
-            ``reason``, ``summary`` (as in ``summary.json``; None where nothing ran) and ``series``.
+        outcomes: what became of each run: ``status`` (``done``; ``stopped`` for safety; ``refused`` by the plan;
+            ``failed``), ``reason``, ``summary`` (as in ``summary.json``; None where nothing ran) and ``series``.
         series: names of the columns that were kept.
         every_s: time between two of their values, s.
     """

@@ -46,7 +46,7 @@ class LateNode(WrappedNode):
     Args:
         node: the node.
         late_ids: COB-IDs that come late, both ways.
-        late_ns: by how much.
+        late_ns: time by which it is late.
     """
 
     def __init__(self, node: SlaveNode, late_ids: Container[int], late_ns: int) -> None:
@@ -109,20 +109,20 @@ class LoopCase:
     Attributes:
         view: part of the map.
         contact_n_m: stiffness dF/dδ of the contact at the wanted force, N/m.
-        rate_hz: of the servo.
+        rate_hz: rate of the servo.
         late_ms: delay of targets and tactile frames.
         height_hz: the force gain.
         feels: the servo estimates the stiffness from the touch; else it uses that of the default pad.
-        bandwidth_hz: of the drives.
-        fidelity: of the plant.
+        bandwidth_hz: bandwidth of the drives.
+        fidelity: fidelity of the plant.
         probe_mm: radius of the probe.
-        kind, radius_mm: of the object.
-        speed_mm_s: of a scan; 0 presses.
-        at_mm: where the object is touched, base frame.
+        kind, radius_mm: kind and radius of the object.
+        speed_mm_s: speed of a scan; 0 presses.
+        at_mm: point at which the object is touched, base frame.
         normal: outward normal there.
         posture_deg: selects the branch of the inverse kinematics.
         force_n: target.
-        hold_s: of the press or scan.
+        hold_s: duration of the press or scan.
     """
 
     view: str

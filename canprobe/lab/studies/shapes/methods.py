@@ -45,7 +45,7 @@ class Method(Protocol):
     """A method.
 
     Attributes:
-        name: in the table.
+        name: name in the table.
         budgets: what it may spend, the least first; `unit` of them.
     """
 
