@@ -152,10 +152,10 @@ class Stage:
             "/contact", axes_length=0.012, axes_radius=0.0004, origin_radius=0.0008, visible=False
         )
         self._force = api.add_arrows(
-            "/force", np.zeros((1, 2, 3), np.float32), FORCE, shaft_radius=0.0012, head_radius=0.003,
+            "/contact/force", np.zeros((1, 2, 3), np.float32), FORCE, shaft_radius=0.0012, head_radius=0.003,
             head_length=FORCE_HEAD_M, visible=False,
         )  # fmt: skip
-        self._label = api.add_label("/force/label", "", anchor="bottom-center", visible=False)
+        self._label = api.add_label("/contact/force/label", "", anchor="bottom-center", visible=False)
 
     def _look(self, server: Any, scene: Scene) -> None:
         """At probe and contact, across the line from the base to them: there the arm hides nothing."""
@@ -224,9 +224,10 @@ class Stage:
         if contact is None:
             return
         _place(self._contact, contact.T_base_contact)
-        tip = contact.point + (FORCE_M_PER_N * moment.force + FORCE_HEAD_M) * contact.normal
-        self._force.points = np.array([[contact.point, tip]], np.float32)
-        self._label.position = tuple(tip)
+        # in the contact frame, whose z points inward: a browser that draws slowly moves arrow and frame at one time
+        tip = (0.0, 0.0, -(FORCE_M_PER_N * moment.force + FORCE_HEAD_M))
+        self._force.points = np.array([[(0.0, 0.0, 0.0), tip]], np.float32)
+        self._label.position = tip
         self._label.text = f"{moment.force:.2f} N"
 
 
