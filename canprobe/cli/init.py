@@ -19,7 +19,9 @@ from canprobe.errors import UsageError
 HELP = "write a cell file and a first scene for your own arm"
 EXAMPLE = """\
 examples:
+  canprobe init my-cell
   canprobe init my-cell --urdf arm.urdf --tip tool0 --eds drive.eds
+  canprobe init my-cell --urdf arm.urdf --eds big.eds --eds big.eds --eds small.eds
   canprobe run my-cell/first.toml
 """
 
@@ -36,7 +38,7 @@ def add_arguments(parser: Parser) -> None:
         type=Path,
         action="append",
         default=[],
-        help="EDS or DCF of the drives; once, or once a joint",
+        help="EDS or DCF of the drives: given once for all of them, or once for each joint from the base",
     )
 
 
