@@ -22,7 +22,7 @@ from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotatio
 from canprobe.mechanics.types import Floats
 
 WHITE, DARK = (236, 233, 224), (76, 84, 94)
-THICK = 0.045
+DRUM_RADIUS_M = 0.045
 """Radius of the first drum, m; they get thinner towards the flange."""
 
 
@@ -132,7 +132,7 @@ def _shape(urdf: Path, visual: Visual) -> dict[str, str] | None:
 def _plain(frames: dict[int, Xml.Element], chain: Chain) -> None:
     """A drum along every axis, and a bar to the next one."""
     for i, T in enumerate((*chain.fixed[1:], chain.T_last_flange), start=1):
-        radius, frame, way = THICK * (1.0 - 0.5 * (i - 1) / chain.n), frames[i], T[:3, 3]
+        radius, frame, way = DRUM_RADIUS_M * (1.0 - 0.5 * (i - 1) / chain.n), frames[i], T[:3, 3]
         _visual(frame, np.eye(4), DARK, "cylinder", radius=f"{radius:.4g}", length=f"{2.0 * radius:.4g}")
         length = float(np.linalg.norm(way))
         if length > radius:

@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 
 READY_TIMEOUT_S = 60.0
 END_TIMEOUT_S = 30.0
-"""For everything that is still in the queue, however slow the machine; an interrupt cuts it short."""
+"""Time for everything that is still in the queue, however slow the machine; an interrupt cuts it short."""
 CLOSE_TIMEOUT_S = 1.0
-"""For the process to end once its bridge is done: a viewer that does not read is not waited for."""
+"""Time for the process to end once its bridge is done: a viewer that does not read is not waited for."""
 KILL_TIMEOUT_S = 2.0
 LATENCY_S = 0.02
 """Samples of this time leave by one system call."""
@@ -95,7 +95,7 @@ class BridgeProcess:
 
     @property
     def pid(self) -> int:
-        """Of its process."""
+        """Identifier of its process."""
         return self._process.pid
 
     def await_ready(self) -> str:

@@ -53,7 +53,7 @@ CAN_FRAMES = Topic("/can_frames", CAN_FRAME, depth=500)
 DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 ROBOT_DESCRIPTION = Topic("/robot_description", "std_msgs/msg/String", depth=1, transient=True)
 CLOCK = Topic("/clock", "rosgraph_msgs/msg/Clock", depth=1)
-"""Of a run in virtual time, for nodes with `use_sim_time`; a recording has its own times, and no clock."""
+"""Time of a run in virtual time, for nodes with `use_sim_time`; a recording has its own times, and no clock."""
 TOPICS = (
     *(JOINT_STATES, WRENCH, TF, TF_STATIC, TAXELS, PATCH, CURVATURE, CAN_FRAMES, CAN_FD_FRAMES, DIAGNOSTICS),
     *(ROBOT_DESCRIPTION, CLOCK),

@@ -13,7 +13,7 @@ from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.types import Floats
 
 FULL_COUNTS = 255
-SHARE = 0.9
+TAXEL_SHARE = 0.9
 """Side of a drawn taxel over the pitch."""
 TAXEL_LIFT_M = 2e-4
 """How far above the dome taxels are drawn."""
@@ -40,7 +40,7 @@ def taxel_poses(pad: Pad, radius: float) -> tuple[Floats, Floats]:
 
 def tile(pad: Pad) -> tuple[Floats, NDArray[np.int64]]:
     """One taxel: vertices (4, 3), m, and faces (2, 3), front side towards +z."""
-    half = 0.5 * SHARE * pad.pitch_m
+    half = 0.5 * TAXEL_SHARE * pad.pitch_m
     corners = half * np.array(((-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)), dtype=np.float64)
     return corners, np.array(((0, 1, 2), (0, 2, 3)))
 

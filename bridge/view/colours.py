@@ -15,9 +15,9 @@ VIRIDIS = np.array(
     ),
     dtype=np.float64,
 )  # fmt: skip
-"""At ninths. Source: Smith and van der Walt, matplotlib 2.0, CC0."""
+"""Colours at ninths of the scale. Source: Smith and van der Walt, matplotlib 2.0, CC0."""
 MAGMA = np.array(((0, 0, 4), (81, 18, 124), (183, 55, 121), (252, 137, 97), (252, 253, 191)), dtype=np.float64)
-"""At quarters, of the same source."""
+"""Colours at quarters of the scale, from the same source."""
 UNKNOWN = (138, 148, 160)
 
 

@@ -46,7 +46,7 @@ class RecordedRun:
 
     @property
     def title(self) -> str:
-        """Of the scene."""
+        """Name of the scene."""
         return self.scene.title or self.scene.name
 
     @property

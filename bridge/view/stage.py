@@ -31,13 +31,13 @@ OBJECT, PROBE, FORCE = (126, 150, 176), (78, 88, 104), (214, 40, 30)
 FORCE_M_PER_N = 0.012
 """Length of the shaft of the force arrow; its head is added, so that the smallest force has an arrow, too."""
 FORCE_HEAD_M = 0.007
-LOOK_ASIDE = math.radians(55.0)
-"""Of the camera, from the line that leads from base to contact, seen from above: the arm hides nothing there."""
+LOOK_ASIDE_RAD = math.radians(55.0)
+"""Angle of the camera from the line that leads from base to contact, seen from above: the arm hides nothing there."""
 FOLLOW_M = 4e-3
 """The camera of a browser follows the contact in steps of this size: between them it is the user's."""
 ARRIVING_S = 3.0
-"""From the first time that it was moved; until then a page may set its camera anew while it is laid out."""
-ALONE = (0.0, 0.0, 0.12)
+"""Time from its first motion; until then a page may set its camera anew while it is laid out."""
+LONE_PROBE_M = (0.0, 0.0, 0.12)
 """Where the probe stands, pole up, in a scene without an arm, m."""
 
 
@@ -130,7 +130,7 @@ class Stage:
         self._truth = [ghost, lines]
 
     def _add_probe(self, radius: float, pad: Pad | None) -> None:
-        self._probe = self._api.add_frame("/probe", show_axes=False, position=ALONE)
+        self._probe = self._api.add_frame("/probe", show_axes=False, position=LONE_PROBE_M)
         holder, elastic = probe_parts(radius, self._tool)
         self._add("/probe/holder", holder, PROBE)
         self._add("/probe/dome", elastic, (120, 128, 140), opacity=0.14, side="double", cast_shadow=False)
@@ -158,18 +158,18 @@ class Stage:
         self._label = api.add_label("/contact/force/label", "", anchor="bottom-center", visible=False)
 
     def _look(self, server: Any, scene: Scene) -> None:
-        """At probe and contact, across the line from the base to them: there the arm hides nothing."""
+        """Look at probe and contact, across the line from the base to them: there the arm hides nothing."""
         camera = server.initial_camera
         if self._shape is not None or scene.task.kind in ("scan", "press"):
             place = place_of(scene)
             out, heading = math.atan2(place[1], place[0]), math.radians(scene.task.heading_deg)
-            across = max((out - LOOK_ASIDE, out + LOOK_ASIDE), key=lambda angle: abs(math.sin(angle - heading)))
+            across = max((out - LOOK_ASIDE_RAD, out + LOOK_ASIDE_RAD), key=lambda angle: abs(math.sin(angle - heading)))
             target = place + np.array((0.0, 0.0, 0.012))
             away = 0.21 * np.array((math.cos(across), math.sin(across), 0.5))
         elif self._model is not None:
             target, away = np.array((0.0, 0.0, 0.32)), np.array((-1.0, 0.55, 0.3))
         else:
-            target, away = np.array(ALONE), np.array((-0.12, -0.16, 0.16))
+            target, away = np.array(LONE_PROBE_M), np.array((-0.12, -0.16, 0.16))
         self._view = target + away, target
         camera.position, camera.look_at, camera.up = *self._view, (0.0, 0.0, 1.0)
         camera.fov = math.radians(34.0)

@@ -60,7 +60,7 @@ class BlendedSurface:
 
 
 def _near(vertices: Floats, answers: Sequence[JudgedAnswer]) -> list[list[int]]:
-    """For each vertex (n, 3) the indices of the answers within `REACH_M`."""
+    """Find for each vertex (n, 3) the indices of the answers within `REACH_M`."""
     tree = cKDTree([_point(answer) for answer in answers])
     return [tree.query_ball_point(vertex, REACH_M) for vertex in vertices]
 

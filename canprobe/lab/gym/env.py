@@ -166,7 +166,7 @@ class TouchScan(gymnasium.Env[Any, NDArray[np.float32]]):
         return self._observations.observe(episode.task, episode.origin, episode.coverage, episode.forces, episode.truth)
 
     def _folder(self) -> Path | None:
-        """Of the next episode that is recorded."""
+        """The folder of the next recorded episode; None where none is recorded."""
         if self._record is None:
             return None
         self._recorded += 1

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class _Heading(PathFollower):
-    """A follower of no curve: it goes where it is told."""
+    """A follower without a curve: it moves at the velocity that the agent sets."""
 
     def __init__(self) -> None:
         self.direction = (1.0, 0.0)

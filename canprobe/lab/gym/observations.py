@@ -20,7 +20,7 @@ KINDS: tuple[Kind, ...] = ("features", "tactile", "oracle")
 
 
 FARTHEST_MM = 50.0
-"""From the first contact: bound of an observation."""
+"""Largest observed distance from the first contact."""
 
 
 class Observations:

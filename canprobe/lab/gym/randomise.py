@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 Values = Mapping[str, Any]
-"""By dotted key; a value is one of the scene's, or a draw."""
+"""Dotted key → value as in a scene file, or draw of one."""
 
 
 @dataclass(frozen=True, slots=True)

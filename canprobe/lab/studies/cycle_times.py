@@ -78,7 +78,7 @@ def woken(clock: Clock, period_ns: int, cycles: int, lateness: list[int]) -> Ite
 
 
 def answer_latencies(path: Path, feedback_ids: frozenset[int], period_ns: int) -> Times:
-    """From each SYNC of a candump log to the last of the TPDOs that answer it within a period.
+    """Measure the time from each SYNC of a candump log to the last of the TPDOs that answer it within a period.
 
     Args:
         path: path of the log.

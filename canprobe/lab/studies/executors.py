@@ -21,7 +21,7 @@ from canprobe.fieldbus.bus.real.processor import BLAS_THREADS
 
 _DASK_WAIT = "10s"
 _GRACE_S = 1.0
-"""For workers to end by themselves: a run catches SIGTERM, stops, and its worker continues."""
+"""Time in which workers end by themselves: a run catches SIGTERM, stops, and its worker continues."""
 
 
 @contextlib.contextmanager

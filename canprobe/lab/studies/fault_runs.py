@@ -37,7 +37,7 @@ STOP_NS = 20_000_000
 
 @cache
 def phase_windows(scenario: str, timed: bool) -> Windows:
-    """When each phase of a scenario begins and ends in a run without faults, ns."""
+    """Start and end of each phase of a scenario in a run without faults, ns."""
     run = _LockstepRun(FaultCase(0, scenario, "", (), timed, files=False))
     cycle, begun = run.session.cell.cycle, run.begun
     assert cycle is not None

@@ -28,7 +28,7 @@ from canprobe.cell.results.picture import AMBER, BLUE, GREY, INK, ORANGE, PINK, 
 from canprobe.lab.studies.harness import Column, Row, StudyResult
 from canprobe.lab.studies.linear_loop import ForceLoop, spectral_radius
 from canprobe.lab.studies.result_files import measuring_facts
-from canprobe.lab.studies.stability_runs import HUNTING, LoopCase, carry_out, loop_of, touch_in_posture
+from canprobe.lab.studies.stability_runs import HUNTING_SPREAD, LoopCase, carry_out, loop_of, touch_in_posture
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.types import Floats
 
@@ -45,7 +45,7 @@ WRISTS_DEG = (0.0, 3.0, 10.0)
 RADII_MM = (1.0, 5.0, 40.0, 10_000.0)
 SPEEDS_MM_S = (25.0, 50.0, 100.0, 250.0)
 SCAN_S = 1.5
-"""Of a scan: the curvature is known in its second half."""
+"""Duration of a scan: the curvature is known in its second half."""
 _AT = (-120.0, -122.5, 374.0)
 WIDE_PERCENT = 20.0
 ENDS = ("stable", "stopped", "refused")
@@ -204,7 +204,7 @@ def findings(rows: Sequence[Row]) -> list[str]:
     if not other:
         said.append("Every touch is stable within limits, stopped safely with the reason, or refused by the plan.")
     elif any(r["ended"] == "hunting" for r in other):
-        said.append(f"Hunting: the force's standard deviation is above {100 * HUNTING:.0f} % of the target.")
+        said.append(f"Hunting: the force's standard deviation is above {100 * HUNTING_SPREAD:.0f} % of the target.")
     return said
 
 

@@ -97,7 +97,7 @@ class LateNode(WrappedNode):
 
 
 LOOK_NS = 1_250_000
-HUNTING = 0.2
+HUNTING_SPREAD = 0.2
 """Standard deviation of the force over the second half of the hold, over the target, above which it did not settle."""
 SENSOR_HZ = 200.0
 
@@ -308,7 +308,7 @@ def carry_out(case: LoopCase) -> Row:
         ended, reason = "failed", "the force is not finite"
     elif above_ns > allowed_ns:
         ended, reason = "failed", f"force above the limit for {above_ns * 1e-6:.0f} ms; ended: {reason}"
-    elif ended == "stable" and not (spread is not None and spread <= 100.0 * HUNTING):
+    elif ended == "stable" and not (spread is not None and spread <= 100.0 * HUNTING_SPREAD):
         ended = "hunting"
     figures = (float(forces.max()), above_ns * 1e-6, allowed_ns * 1e-6, force_error, spread)
     return {"ended": ended, "reason": reason, **dict(zip(names, figures, strict=True))}

@@ -134,7 +134,7 @@ def open_sweep(
 
 
 def _compute(measure: Callable[[Any], object], parts: tuple[str, ...], model: str, cell: Any) -> tuple[bool, str]:
-    """In the worker: success, and the answer or the error as text. Not every exception can be pickled."""
+    """Measure a cell in the worker: success, and the answer, or the error as text: not all exceptions are pickled."""
     try:
         if (here := model_digest(parts)) != model:
             return False, f"the worker on {platform.node()} has another canprobe or numpy (model {here}, not {model})"

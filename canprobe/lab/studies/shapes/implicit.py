@@ -28,8 +28,8 @@ from canprobe.mechanics.types import Floats
 Kernel = Callable[[Floats, float, float], tuple[Floats, Floats, Floats]]
 """Distances r, scale of f (m) and length (m) → k, a, b."""
 _STEP_M = 2e-4
-"""Of the differences that curvature is taken from."""
-_AT_ONCE = 400
+"""Step of the differences that give the curvature."""
+_BATCH_POINTS = 400
 """Query points; more would only take more memory."""
 
 
@@ -100,15 +100,18 @@ class ImplicitSurface:
 
     def value(self, x: Floats) -> tuple[Floats, Floats]:
         """f (n,) and ∇f (n, 3) at points (n, 3)."""
-        parts = [self._covariance(x[i : i + _AT_ONCE], self.points) @ self._weights for i in range(0, len(x), _AT_ONCE)]
+        parts = [
+            self._covariance(x[i : i + _BATCH_POINTS], self.points) @ self._weights
+            for i in range(0, len(x), _BATCH_POINTS)
+        ]
         both = np.concatenate([np.zeros(0), *parts]).reshape(-1, 4)
         return both[:, 0] + (x - self._middle) @ self._up, both[:, 1:] + self._up
 
     def sigma(self, x: Floats) -> Floats:
         """Standard deviation of f at points, (n,)."""
         found = [np.zeros(0)]
-        for i in range(0, len(x), _AT_ONCE):
-            C = self._covariance(x[i : i + _AT_ONCE], self.points)[::4]
+        for i in range(0, len(x), _BATCH_POINTS):
+            C = self._covariance(x[i : i + _BATCH_POINTS], self.points)[::4]
             half = solve_triangular(self._root[0], C.T, lower=True, check_finite=False)
             k0 = self._k(np.zeros(1), *self._settings)[0]
             found.append(np.sqrt(np.maximum(k0 - np.einsum("ij,ij->j", half, half), 0.0)))

@@ -101,7 +101,7 @@ class Online:
 
     @property
     def name(self) -> str:
-        """In the table."""
+        """Name in the table."""
         return f"{self.method} + patch" if self.patch else self.method
 
     def develop(self, shapes: Sequence[ShapeContacts]) -> Settings:
@@ -122,7 +122,7 @@ class Online:
 
 @dataclass(frozen=True, slots=True)
 class LocalFits:
-    """Least-squares quadrics of all contacts within a radius, whenever they were felt, every 2 mm of path."""
+    """Least-squares quadrics of all contacts within a radius, whenever they were touched, every 2 mm of path."""
 
     name: str = "quadrics"
     budgets: Sequence[float] = (3.0, 4.0, 6.0, 9.0)

@@ -25,14 +25,14 @@ from canprobe.mechanics.touch.meshing import Mesh, mesh_of
 from canprobe.mechanics.types import Floats
 
 FILE = "contacts.npz"
-CELL_M = 1e-3
-"""Of the meshes that are scored."""
+MESH_CELL_M = 1e-3
+"""Side of a cell of the scored meshes."""
 LIMITS_MM = (0.05, 0.1, 0.2, 0.5)
 WORST_M = 1e-3
 """A larger error counts as this much, and so does truth where a method has no surface."""
 TRUTH_STEP = 2
 """Every so manyth point of the truth is looked for in the map."""
-TIMED = "free-2"
+TIMED_SHAPE = "free-2"
 """Shape on which time and memory are measured; a contact costs the same on all."""
 REPEATS, DRAWS = 3, 2000
 _SCANS = ("fieldbus", "mechanics", "cell", "scenes", "lab/studies/shapes/scans.py")
@@ -86,7 +86,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
         ]
 
     scores = sweep.map(score, fits(test), model=_FITS)
-    timed = fits([TIMED if TIMED in test else test[0]])
+    timed = fits([TIMED_SHAPE if TIMED_SHAPE in test else test[0]])
     costs = sweep.time(cost, timed, model=_FITS)
     each = [scores[k * len(test) : (k + 1) * len(test)] for k in range(len(timed))]
     rows = [row_of(METHODS[f.method], f.budget, mine) | c for f, mine, c in zip(timed, each, costs, strict=True)]
@@ -97,7 +97,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
 def surface_of(fit: MethodFit, contacts: ShapeContacts) -> tuple[FittedSurface, Mesh]:
     """A method's answer and its mesh; the cost of both is what a method costs."""
     surface = METHODS[fit.method].fit(contacts, fit.budget, fit.settings)
-    return surface, mesh_of(surface.closest, contacts.touched.points[::20], CELL_M)
+    return surface, mesh_of(surface.closest, contacts.touched.points[::20], MESH_CELL_M)
 
 
 def cost(fit: MethodFit) -> dict[str, float]:
@@ -189,8 +189,8 @@ def findings(rows: Sequence[Row], each: Sequence[Sequence[Mapping[str, Any]]]) -
     """The best of the package against the best of the others, score by score; `each` has the scores of every row."""
     said = [
         f"Means over {len(each[0])} test shapes. accuracy: map to truth; completeness: truth in the footprint to map;"
-        f" both mean distances, at most {1e3 * WORST_M:g} mm; NLL: of the height in mm; time and memory on {TIMED}."
-        " Differences with 95 % of the draws of shapes."
+        f" both mean distances, at most {1e3 * WORST_M:g} mm; NLL: of the height in mm; time and memory on"
+        f" {TIMED_SHAPE}. Differences with 95 % of the draws of shapes."
     ]
     ours = [k for k, row in enumerate(rows) if row["method"].startswith(("ml", "recursive"))]
     others = [k for k in range(len(rows)) if k not in ours]
