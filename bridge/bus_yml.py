@@ -198,9 +198,9 @@ def read_bus_yml(path: Path | str, say: Callable[[str], None] = lambda _: None) 
     """Read the nodes of a bus.yml, whether they stand under `nodes` or beside `master`.
 
     Args:
-        path: of the file; ``@BUS_CONFIG_PATH@`` is its folder. `dcf` paths are looked up in `dcf_path`, then beside the
-            file, and at last there by their names alone, as other folders are those of another machine.
-        say: called with what is not understood, and is passed over.
+        path: path of the file; ``@BUS_CONFIG_PATH@`` is its folder. `dcf` paths are looked up in `dcf_path`, then
+            beside the file, and at last there by their names alone, as other folders are those of another machine.
+        say: function that reports what is not understood and is passed over.
 
     Returns:
         The slaves by rising node id.

@@ -6,17 +6,13 @@ import math
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.load import dump_scene, parse_scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.tasks import Trajectory
 from canprobe.errors import UsageError
-
-Array = NDArray[np.float64]
+from canprobe.mechanics.types import Floats
 
 
 def refuse(plan: Plan, kind: str, value: float | None) -> str | None:
@@ -26,7 +22,7 @@ def refuse(plan: Plan, kind: str, value: float | None) -> str | None:
     ranges, `limits.force_max_n`, the speeds of the joints.
 
     Args:
-        plan: of the run.
+        plan: plan of the run.
         kind: start, stop, target_force_n or speed_m_s.
         value: N or m/s; None for start and stop.
     """
@@ -46,12 +42,12 @@ def refuse(plan: Plan, kind: str, value: float | None) -> str | None:
     return None
 
 
-def trajectory_of(plan: Plan, message: Any, q: Array | None) -> dict[str, Any]:
+def trajectory_of(plan: Plan, message: Any, q: Floats | None) -> dict[str, Any]:
     """The way that a `trajectory_msgs/msg/JointTrajectory` asks for, checked from where the arm stands.
 
     Args:
-        plan: of the run.
-        message: with names, points, and positions in each; velocities in all of them or in none.
+        plan: plan of the run.
+        message: trajectory with joint names and points; positions in each point, velocities in all of them or in none.
         q: (n,) joint positions now, rad or m; None as long as they are not known.
 
     Returns:

@@ -61,7 +61,7 @@ def need(module: str, extra: str, purpose: str) -> Any:
 
     Args:
         module: its import name.
-        extra: of canprobe's.
+        extra: extra of canprobe that installs the package.
         purpose: what it is needed for, for the message.
 
     Raises:

@@ -19,7 +19,7 @@ from canprobe.fieldbus.eds.packaged import eds_file
 from canprobe.fieldbus.eds.sections import LINE_END, Section, Sections, decode, split_sections
 
 Values = Mapping[tuple[int, int], int]
-"""By (index, sub-index)."""
+"""(index, sub-index) → value."""
 
 
 def write_dcfs(plan: Plan, folder: Path) -> list[Path]:

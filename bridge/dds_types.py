@@ -43,7 +43,7 @@ class DdsTypes:
     """The DDS types of one type store, each made when it is first asked for.
 
     Args:
-        encoder: with the store.
+        encoder: encoder whose store has the message types.
     """
 
     def __init__(self, encoder: Encoder) -> None:

@@ -10,7 +10,6 @@ from pathlib import Path
 from xml.etree import ElementTree as Xml
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.geometry import transform
@@ -20,10 +19,10 @@ from canprobe.lab.bridge.sample import BASE, FLANGE, PROBE
 from canprobe.mechanics.robot.chain import Chain
 from canprobe.mechanics.robot.urdf_visuals import Visual, find_mesh, visuals_of
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
+from canprobe.mechanics.types import Floats
 
-Array = NDArray[np.float64]
 WHITE, DARK = (236, 233, 224), (76, 84, 94)
-THICK = 0.045
+DRUM_RADIUS_M = 0.045
 """Radius of the first drum, m; they get thinner towards the flange."""
 
 
@@ -32,7 +31,7 @@ def axis_frame(number: int) -> str:
     return f"axis_{number}"
 
 
-def axis_transforms(chain: Chain) -> list[tuple[str, str, Array]]:
+def axis_transforms(chain: Chain) -> list[tuple[str, str, Floats]]:
     """(parent, child, (4, 4) T_parent_child) of the joints' own frames, each behind its link, m."""
     behind = (*chain.fixed[1:], chain.T_last_flange)
     return [(f"link_{i}", axis_frame(i), np.linalg.inv(T)) for i, T in enumerate(behind, start=1)]
@@ -87,7 +86,7 @@ def _joint(robot: Xml.Element, name: str, kind: str, parent: str, child: str) ->
     return joint
 
 
-def _fix(robot: Xml.Element, name: str, parent: str, T: Array) -> Xml.Element:
+def _fix(robot: Xml.Element, name: str, parent: str, T: Floats) -> Xml.Element:
     """A link that stands still in another."""
     link = Xml.SubElement(robot, "link", name=name)
     _origin(_joint(robot, f"{name}_fixed", "fixed", parent, name), T)
@@ -133,7 +132,7 @@ def _shape(urdf: Path, visual: Visual) -> dict[str, str] | None:
 def _plain(frames: dict[int, Xml.Element], chain: Chain) -> None:
     """A drum along every axis, and a bar to the next one."""
     for i, T in enumerate((*chain.fixed[1:], chain.T_last_flange), start=1):
-        radius, frame, way = THICK * (1.0 - 0.5 * (i - 1) / chain.n), frames[i], T[:3, 3]
+        radius, frame, way = DRUM_RADIUS_M * (1.0 - 0.5 * (i - 1) / chain.n), frames[i], T[:3, 3]
         _visual(frame, np.eye(4), DARK, "cylinder", radius=f"{radius:.4g}", length=f"{2.0 * radius:.4g}")
         length = float(np.linalg.norm(way))
         if length > radius:
@@ -141,7 +140,7 @@ def _plain(frames: dict[int, Xml.Element], chain: Chain) -> None:
             _visual(frame, bar, WHITE, "cylinder", radius=f"{0.7 * radius:.4g}", length=f"{length:.4g}")
 
 
-def _visual(link: Xml.Element, T: Array, colour: tuple[int, int, int], kind: str, **attributes: str) -> None:
+def _visual(link: Xml.Element, T: Floats, colour: tuple[int, int, int], kind: str, **attributes: str) -> None:
     visual = Xml.SubElement(link, "visual")
     _origin(visual, T)
     Xml.SubElement(Xml.SubElement(visual, "geometry"), kind, attributes)
@@ -149,7 +148,7 @@ def _visual(link: Xml.Element, T: Array, colour: tuple[int, int, int], kind: str
     Xml.SubElement(material, "color", rgba=" ".join(f"{part / 255:.3f}" for part in (*colour, 255)))
 
 
-def _origin(parent: Xml.Element, T: Array) -> None:
+def _origin(parent: Xml.Element, T: Floats) -> None:
     """Translation, and roll, pitch and yaw about fixed axes, as a URDF has them."""
     R = T[:3, :3]
     pitch = float(np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0])))

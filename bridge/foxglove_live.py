@@ -25,7 +25,7 @@ class FoxgloveSink:
     """Serves one run.
 
     Args:
-        context: of the run.
+        context: plan and settings of the run.
 
     Raises:
         UsageError: the address is taken, or does not belong to this machine.

@@ -6,12 +6,13 @@ import math
 
 import numpy as np
 
-from canprobe.lab.bridge.sample import BASE, FLANGE, Array
+from canprobe.lab.bridge.sample import BASE, FLANGE
 from canprobe.mechanics.robot import chain as serial
 from canprobe.mechanics.robot.chain import Chain
+from canprobe.mechanics.types import Floats
 
 
-def link_transforms(chain: Chain, q: Array) -> list[tuple[str, str, Array]]:
+def link_transforms(chain: Chain, q: Floats) -> list[tuple[str, str, Floats]]:
     """Frame of every link in that of the one before.
 
     Args:
@@ -26,12 +27,12 @@ def link_transforms(chain: Chain, q: Array) -> list[tuple[str, str, Array]]:
     return [(names[i], names[i + 1], T) for i, T in enumerate(serial.link_transforms(chain, q))]
 
 
-def flange_transform(chain: Chain) -> tuple[str, str, Array]:
+def flange_transform(chain: Chain) -> tuple[str, str, Floats]:
     """The flange lies in the last link's frame."""
     return (f"link_{chain.n}", FLANGE, np.eye(4))
 
 
-def quaternion_of(R: Array) -> tuple[float, float, float, float]:
+def quaternion_of(R: Floats) -> tuple[float, float, float, float]:
     """Unit quaternion x, y, z, w of a rotation (3, 3), w ≥ 0.
 
     Source: Shepperd's choice of the largest of the four squares, which divides by no small number.

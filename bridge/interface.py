@@ -17,7 +17,7 @@ class Context:
     """What a sink gets at its start.
 
     Attributes:
-        plan: of the run.
+        plan: plan of the run.
         settings: section `[bridge]`.
         out: folder of the run; None where no files are written.
         send: hands a request (see `canprobe.cell.tasks.requested.RequestedTask`) back to the cell.

@@ -33,7 +33,7 @@ class McapSink:
     """Writes `run.mcap` into the run's folder.
 
     Args:
-        context: of the run.
+        context: plan and settings of the run.
     """
 
     def __init__(self, context: Context) -> None:

@@ -43,7 +43,7 @@ def encode_can_frame(t_ns: int, can_id: int, data: bytes) -> bytes:
 
     Args:
         t_ns: since the epoch.
-        can_id: with `EFF_FLAG` and `RTR_FLAG`.
+        can_id: identifier with `EFF_FLAG` and `RTR_FLAG`.
         data: up to 8 bytes.
     """
     seconds, ns = divmod(t_ns, 1_000_000_000)
@@ -62,7 +62,7 @@ class Encoder:
     """ROS 2 messages → CDR, their definitions, and their RIHS01 hashes; one for each sink.
 
     Attributes:
-        store: of rosbags; `types[name]` are the message classes.
+        store: type store of rosbags; `types[name]` are the message classes.
     """
 
     def __init__(self) -> None:

@@ -33,7 +33,7 @@ class Feed:
 
     Attributes:
         taken: records that were given.
-        dropped: of these, those that found the queue full or the reader gone.
+        dropped: number of these that found the queue full or the reader gone.
         broken: the reader is gone.
     """
 

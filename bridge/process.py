@@ -26,9 +26,9 @@ from canprobe.lab.bridge.pipe_queue import Feed
 
 READY_TIMEOUT_S = 60.0
 END_TIMEOUT_S = 30.0
-"""For everything that is still in the queue, however slow the machine; an interrupt cuts it short."""
+"""Time for everything that is still in the queue, however slow the machine; an interrupt cuts it short."""
 CLOSE_TIMEOUT_S = 1.0
-"""For the process to end once its bridge is done: a viewer that does not read is not waited for."""
+"""Time for the process to end once its bridge is done: a viewer that does not read is not waited for."""
 KILL_TIMEOUT_S = 2.0
 LATENCY_S = 0.02
 """Samples of this time leave by one system call."""
@@ -40,8 +40,8 @@ class BridgeProcess(ChildProcess):
     """One bridge in its process.
 
     Args:
-        name: of the bridge.
-        plan: of the run.
+        name: name of the bridge.
+        plan: plan of the run.
         out: folder of the run; None where no files are written.
         virtual: the run is not in real time: its feed waits for room, and its time begins at 0.
 

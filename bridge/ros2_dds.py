@@ -23,12 +23,13 @@ from cyclonedds.topic import Topic as DdsTopic
 from cyclonedds.util import duration
 
 from canprobe.errors import UsageError
-from canprobe.lab.bridge.commands import Array, refuse, trajectory_of
+from canprobe.lab.bridge.commands import refuse, trajectory_of
 from canprobe.lab.bridge.dds_types import DdsTypes
 from canprobe.lab.bridge.interface import Context
 from canprobe.lab.bridge.messages import Encoder
 from canprobe.lab.bridge.sample import Sample
 from canprobe.lab.bridge.topics import TOPICS, Messages, Topic
+from canprobe.mechanics.types import Floats
 
 EMPTY, FLOAT64, STRING = "std_msgs/msg/Empty", "std_msgs/msg/Float64", "std_msgs/msg/String"
 START, STOP = Topic("/canprobe/start", EMPTY), Topic("/canprobe/stop", EMPTY)
@@ -95,7 +96,7 @@ class Ros2Sink:
     """Publishes one run, and takes commands where the scene allows them.
 
     Args:
-        context: of the run.
+        context: plan and settings of the run.
     """
 
     def __init__(self, context: Context) -> None:
@@ -109,7 +110,7 @@ class Ros2Sink:
         self._messages = Messages(context.plan, encoder, self._is_read)
         topics = (*COMMANDS, TRAJECTORY) if settings.ros2_commands else ()
         self._readers = {topic: self._node.reader(topic) for topic in topics}
-        self._q: Array | None = None
+        self._q: Floats | None = None
         self._status = self._node.writer(STATUS) if settings.ros2_commands else None
         self._poll_in = 0
         self.where = f"domain {domain}{', this machine only' if settings.ros2_loopback else ''}"

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.fieldbus.bus.port import TimedFrame
-
-Array = NDArray[np.float64]
+from canprobe.mechanics.types import Floats
 
 BASE, FLANGE, PROBE, CONTACT = "base_link", "flange", "probe", "contact"
 """Names of frames; between base and flange stand link_1, link_2, …, the frame that each joint moves."""
@@ -28,15 +27,15 @@ class ContactFrame:
         T_base_contact: (4, 4) contact frame to base, m: origin at the contact point, z along the inward normal.
     """
 
-    T_base_contact: Array
+    T_base_contact: Floats
 
     @property
-    def point(self) -> Array:
+    def point(self) -> Floats:
         """(3,) contact point, base frame, m."""
         return self.T_base_contact[:3, 3]
 
     @property
-    def normal(self) -> Array:
+    def normal(self) -> Floats:
         """(3,) outward unit normal of the object, base frame."""
         return -self.T_base_contact[:3, 2]
 
@@ -46,7 +45,7 @@ class TouchFrame:
     """One frame of the tactile array.
 
     Attributes:
-        t_ns: when it was sampled, on the clock of the samples.
+        t_ns: time of sampling, on the clock of the samples.
         counts: (rows, columns) uint8, row by row; zero outside the window; None in features mode.
         force: (3,) N that the object exerts on the probe, in the probe's centre frame. The array measures pressure
             only: the force runs along the contact normal, without a torque about the sphere's centre.
@@ -55,7 +54,7 @@ class TouchFrame:
 
     t_ns: int
     counts: NDArray[np.uint8] | None
-    force: Array
+    force: Floats
     contact: ContactFrame | None
 
 
@@ -64,17 +63,17 @@ class SurfacePatch:
     """A new answer of the estimator in the loop: the surface round the contact, z = ½ (x, y) K (x, y)ᵀ.
 
     Attributes:
-        t_ns: of the cycle that got it.
+        t_ns: time of the cycle that received it.
         T_base_contact: (4, 4) the estimate's contact frame to base, m; z is the inward normal.
         K: (2, 2) curvature in that frame, 1/m, positive where convex.
         covariance: (3, 3) of (K11, K12, K22), 1/m²; not finite where not observed.
-        observed: of each principal curvature (κ1 ≥ κ2).
+        observed: whether each principal curvature is observed (κ1 ≥ κ2).
     """
 
     t_ns: int
-    T_base_contact: Array
-    K: Array
-    covariance: Array
+    T_base_contact: Floats
+    K: Floats
+    covariance: Floats
     observed: tuple[bool, bool]
 
     @property
@@ -85,7 +84,7 @@ class SurfacePatch:
         low, high = np.linalg.eigvalsh(self.K).tolist()
         return (high if self.observed[0] else np.nan, low if self.observed[1] else np.nan)
 
-    def heights(self, x: Array, y: Array) -> tuple[Array, Array]:
+    def heights(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
         """The surface over points of its tangent plane.
 
         Args:
@@ -97,17 +96,17 @@ class SurfacePatch:
         """
         weights = np.stack([0.5 * x * x, x * y, 0.5 * y * y], axis=-1)
         K = self.K if np.isfinite(self.K).all() else np.zeros((2, 2))
-        z: Array = weights @ np.array([K[0, 0], K[0, 1], K[1, 1]])
+        z: Floats = weights @ np.array([K[0, 0], K[0, 1], K[1, 1]])
         if np.isfinite(self.covariance).all():
             variance = np.einsum("...i,ij,...j->...", weights, self.covariance, weights)
             return z, np.sqrt(np.maximum(variance, 0.0))
         return z, np.where(weights.any(axis=-1), np.inf, 0.0)
 
-    def grid(self, radius: float = 8e-3, n: int = 17) -> tuple[Array, Array]:
+    def grid(self, radius: float = 8e-3, n: int = 17) -> tuple[Floats, Floats]:
         """A disc of points of the patch.
 
         Args:
-            radius: of the disc, m.
+            radius: radius of the disc, m.
             n: points along a diameter.
 
         Returns:
@@ -146,19 +145,19 @@ class Sample:
     Attributes:
         t_ns: time of its SYNC since the bus was opened, as in `bus.log`.
         cycle: its number; None before the first cycle and after the last.
-        phase: of the task in lower case (`approach`, `scan`, …); None where the controller gives none.
+        phase: phase of the task in lower case (`approach`, `scan`, …); None where the controller gives none.
         q: (n,) joint positions at the SYNC, rad or m; None without an arm, or before all joints were heard.
         touch: a tactile frame that became usable in this cycle.
         patch: a new answer of the estimator.
         frames: what was on the bus since the sample before, with `EFF_FLAG` and `RTR_FLAG` on identifiers.
-        diagnostics: of all nodes and of the bridge, about once a second.
+        diagnostics: states of all nodes and of the bridge, about once a second.
         dropped: samples that were lost on the way to this bridge so far.
     """
 
     t_ns: int
     cycle: int | None = None
     phase: str | None = None
-    q: Array | None = None
+    q: Floats | None = None
     touch: TouchFrame | None = None
     patch: SurfacePatch | None = None
     frames: Sequence[TimedFrame] = ()

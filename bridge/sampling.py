@@ -5,23 +5,22 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.cell.master.array import patch_of
 from canprobe.cell.master.controller import Measurement
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Setup, Touch
+from canprobe.cell.tasks.from_plan import make_sensing
 from canprobe.cell.tasks.probing import Phase
 from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.lab.bridge.codec import Received
 from canprobe.lab.bridge.node_states import Health
 from canprobe.lab.bridge.sample import ContactFrame, Sample, SurfacePatch, TouchFrame
-from canprobe.mechanics.touch.contact import ContactSample, pad_to_direction
+from canprobe.mechanics.touch.contact import pad_to_direction
 from canprobe.mechanics.touch.patch.array_models import make_patch_calibration
 from canprobe.mechanics.touch.stops import TOUCH_FORCE
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 
-Array = NDArray[np.float64]
 _PHASES = {float(phase): phase.name.lower() for phase in Phase}
 
 
@@ -29,7 +28,7 @@ class SampleSource:
     """Makes the samples of one run, with the scene's own calibration and geometry.
 
     Args:
-        plan: of the run.
+        plan: plan of the run.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -68,6 +67,9 @@ class SampleSource:
         if patch is None:
             patch = patch_of(sample, self._calibration)
         contact = sensing.contact(sample, patch) if sensing is not None and patch.force > TOUCH_FORCE / 2 else None
+        placed = None
+        if contact is not None:
+            placed = ContactFrame(homogeneous(tangent_rotation(-contact.n_base), contact.p_base))
         force = np.zeros(3)
         if patch.force > 0.0:  # the object pushes the probe back along the direction of the contact
             force = -patch.force * pad_to_direction(patch.u, patch.v, self._radius)
@@ -75,7 +77,7 @@ class SampleSource:
             t_ns=sample.t_sample_ns + shift_ns,
             counts=sample.frame.taxels if sample.frame.features is None else None,
             force=force,
-            contact=_contact(contact) if contact is not None else None,
+            contact=placed,
         )
 
     def _place_on(self, patch: SurfacePatch | None) -> None:
@@ -87,13 +89,7 @@ class SampleSource:
 
 def _sensing(setup: Setup) -> ContactSensing | None:
     """Contacts, where there is an arm to place them; second moments are the estimator's business."""
-    from canprobe.cell.tasks.from_plan import make_sensing
-
     touch = setup.touch
     if touch is None:
         return None
     return make_sensing(replace(touch, shape=None) if isinstance(touch, Touch) else touch)
-
-
-def _contact(contact: ContactSample) -> ContactFrame:
-    return ContactFrame(homogeneous(tangent_rotation(-contact.n_base), contact.p_base))

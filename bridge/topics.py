@@ -19,6 +19,7 @@ from canprobe.lab.bridge.frames import flange_transform, link_transforms, quater
 from canprobe.lab.bridge.messages import CAN_FD_FRAME, CAN_FRAME, Encoder, _identifier, encode_can_frame
 from canprobe.lab.bridge.sample import BASE, CONTACT, FLANGE, PROBE, Sample, SurfacePatch, TouchFrame
 from canprobe.mechanics.robot.chain import Chain
+from canprobe.mechanics.types import Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +29,7 @@ class Topic:
     Attributes:
         name: as ROS writes it.
         type_name: as rosbags and ROS write it.
-        depth: of the history that is kept.
+        depth: number of messages that are kept.
         transient: late readers get the last message (transient local).
         best_effort: a lost message is not sent again (sensor data); reliable otherwise.
     """
@@ -52,12 +53,11 @@ CAN_FRAMES = Topic("/can_frames", CAN_FRAME, depth=500)
 DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 ROBOT_DESCRIPTION = Topic("/robot_description", "std_msgs/msg/String", depth=1, transient=True)
 CLOCK = Topic("/clock", "rosgraph_msgs/msg/Clock", depth=1)
-"""Of a run in virtual time, for nodes with `use_sim_time`; a recording has its own times, and no clock."""
+"""Time of a run in virtual time, for nodes with `use_sim_time`; a recording has its own times, and no clock."""
 TOPICS = (
     *(JOINT_STATES, WRENCH, TF, TF_STATIC, TAXELS, PATCH, CURVATURE, CAN_FRAMES, CAN_FD_FRAMES, DIAGNOSTICS),
     *(ROBOT_DESCRIPTION, CLOCK),
 )
-Array = NDArray[np.float64]
 Message = tuple[Topic, int, bytes]
 """Topic, time in ns since the epoch, CDR."""
 _FLOAT32, _PATCH_FIELDS = 7, ("x", "y", "z", "sigma")
@@ -67,10 +67,10 @@ class Messages:
     """Makes the messages of one run.
 
     Args:
-        plan: of the run.
+        plan: plan of the run.
         encoder: the one encoder.
         wanted: whether anybody takes a topic; nothing is made of the others.
-        static_every_ns: when the fixed frames are sent again; by default once is enough.
+        static_every_ns: period at which the fixed frames are sent again; by default they are sent once.
     """
 
     def __init__(
@@ -150,7 +150,7 @@ class Messages:
 
     # one function a message
 
-    def _joint_state(self, t_ns: int, chain: Chain, q: Array) -> Any:
+    def _joint_state(self, t_ns: int, chain: Chain, q: Floats) -> Any:
         unknown = np.zeros(0)  # rates and torques in SI units are not measured: left empty, as the message allows
         header, names = self._header(t_ns, BASE), list(chain.joints)
         return self._make(
@@ -228,11 +228,11 @@ class Messages:
         seconds, ns = divmod(self._epoch_time(t_ns), 1_000_000_000)
         return self._make("builtin_interfaces/msg/Time", sec=seconds, nanosec=ns)
 
-    def _vector(self, v: Array) -> Any:
+    def _vector(self, v: Floats) -> Any:
         x, y, z = v.tolist()
         return self._make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
 
-    def _tf(self, t_ns: int, transforms: list[tuple[str, str, Array]]) -> Any:
+    def _tf(self, t_ns: int, transforms: list[tuple[str, str, Floats]]) -> Any:
         stamped = []
         for parent, child, T in transforms:
             x, y, z, w = quaternion_of(T[:3, :3])

@@ -38,9 +38,9 @@ def run(name: str, records: Iterator[bytes], fd: int) -> int:
     """Serve one bridge to the end of its records.
 
     Args:
-        name: of the bridge.
+        name: name of the bridge.
         records: the first is the configuration, the others are observations, the last may be the end.
-        fd: where lines are written back.
+        fd: file descriptor on which lines are written back.
 
     Returns:
         The exit status: 0, or 1 after an error, which was written back.

@@ -8,23 +8,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.lab.bridge.view.colours import MAGMA, Colours, scale
-from canprobe.lab.bridge.view.meshes import Array
 from canprobe.mechanics.touch.contact import pad_to_direction
 from canprobe.mechanics.touch.pad import Pad
+from canprobe.mechanics.types import Floats
 
 FULL_COUNTS = 255
-SHARE = 0.9
+TAXEL_SHARE = 0.9
 """Side of a drawn taxel over the pitch."""
 TAXEL_LIFT_M = 2e-4
 """How far above the dome taxels are drawn."""
 
 
-def taxel_poses(pad: Pad, radius: float) -> tuple[Array, Array]:
+def taxel_poses(pad: Pad, radius: float) -> tuple[Floats, Floats]:
     """Where the taxels lie on the probe.
 
     Args:
         pad: the taxels.
-        radius: from the origin of the probe's frame to its pole, m.
+        radius: distance from the origin of the probe's frame to its pole, m.
 
     Returns:
         (n, 3) positions in the probe frame, m, and (n, 4) unit quaternions w, x, y, z that turn a tile lying in
@@ -38,9 +38,9 @@ def taxel_poses(pad: Pad, radius: float) -> tuple[Array, Array]:
     return pole + (pad.radius_m + TAXEL_LIFT_M) * directions, turns
 
 
-def tile(pad: Pad) -> tuple[Array, NDArray[np.int64]]:
+def tile(pad: Pad) -> tuple[Floats, NDArray[np.int64]]:
     """One taxel: vertices (4, 3), m, and faces (2, 3), front side towards +z."""
-    half = 0.5 * SHARE * pad.pitch_m
+    half = 0.5 * TAXEL_SHARE * pad.pitch_m
     corners = half * np.array(((-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)), dtype=np.float64)
     return corners, np.array(((0, 1, 2), (0, 2, 3)))
 

@@ -13,16 +13,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from canprobe.lab.bridge.frames import link_transforms
-from canprobe.lab.bridge.view.meshes import Array, TriangleMesh, cylinder, dome, link, merged, revolved
+from canprobe.lab.bridge.view.meshes import TriangleMesh, cylinder, dome, link, merged, revolved
 from canprobe.mechanics.robot.chain import Chain
 from canprobe.mechanics.robot.denavit_hartenberg import dh_step
 from canprobe.mechanics.touch.tangent_frames import tangent_rotation
+from canprobe.mechanics.types import Floats
 
 WHITE, GREY, DARK = (236, 233, 224), (150, 156, 163), (76, 84, 94)
-RIM = 5e-3
+RIM_RADIUS_M = 5e-3
 SHOULDER, ELBOW, WRIST = 0.050, 0.040, 0.026
 """Radii round joints 2, 3 and 5, m."""
-PLAIN = 0.045
+JOINT_RADIUS_M = 0.045
 """Radius round the first joint of any other arm, m."""
 UPPER_ARM, FOREARM = 0.046, 0.058
 """Thickness of the two long links along the shoulder's axis, m."""
@@ -30,7 +31,7 @@ _TWISTS = 0.5 * math.pi * np.array((1.0, 0.0, -1.0, 1.0, -1.0, 0.0))
 """Between the axes of a PUMA, rad."""
 _SIZE = (0.2, 0.2)
 """Upper arm and forearm of the 260, m."""
-_SAME = 1e-9
+_EQUAL_M = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +41,7 @@ class Part:
     Attributes:
         name: unique in the arm.
         frame: 0 for the base, i for the frame behind joint i.
-        mesh: in that frame, m.
+        mesh: triangles in that frame, m.
         colour: RGB, 0–255.
         flat: its triangles are shaded apart: edges stay sharp without doubled vertices.
     """
@@ -52,7 +53,7 @@ class Part:
     flat: bool = False
 
 
-def link_frames(chain: Chain, q: ArrayLike) -> Array:
+def link_frames(chain: Chain, q: ArrayLike) -> Floats:
     """Frames of the base and of every link.
 
     Args:
@@ -80,14 +81,16 @@ def _plain(chain: Chain) -> list[Part]:
     parts = []
     here = chain.fixed[0]  # of a joint in the frame that it stands in
     for i, T in enumerate((*chain.fixed[1:], chain.T_last_flange)):
-        radius = PLAIN * (1.0 - 0.5 * i / chain.n)
-        parts.append(Part(f"joint_{i + 1}", i, cylinder(radius, (-radius, radius), RIM).moved(here), DARK))
+        radius = JOINT_RADIUS_M * (1.0 - 0.5 * i / chain.n)
+        parts.append(Part(f"joint_{i + 1}", i, cylinder(radius, (-radius, radius), RIM_RADIUS_M).moved(here), DARK))
         back = np.linalg.inv(T)[:3, 3]  # the bar stands in the frame of the next joint
         length = float(np.linalg.norm(back))
         if length > radius:
             bar = np.eye(4)
             bar[:3, :3] = tangent_rotation(back / length)
-            parts.append(Part(f"link_{i + 1}", i + 1, cylinder(0.7 * radius, (0.0, length), RIM).moved(bar), WHITE))
+            parts.append(
+                Part(f"link_{i + 1}", i + 1, cylinder(0.7 * radius, (0.0, length), RIM_RADIUS_M).moved(bar), WHITE)
+            )
         here = np.eye(4)
     return parts
 
@@ -106,7 +109,7 @@ class _Puma:
 
     @property
     def offset(self) -> float:
-        """From the trunk's axis to the forearm, along axis 2."""
+        """Distance from the trunk's axis to the forearm, along axis 2."""
         return self.d2 + self.d3
 
 
@@ -117,20 +120,20 @@ def _puma(chain: Chain) -> _Puma | None:
         return None
     a, d = [float(T[0, 3]) for T in steps], [float(T[2, 3]) for T in steps]
     rows = [dh_step(*row, 0.0) for row in zip(a, _TWISTS, d, strict=True)]
-    crossing = max(map(abs, (a[0], *a[3:], d[4]))) < _SAME
-    if not (crossing and np.allclose((np.eye(4), *rows), (chain.fixed[0], *steps), rtol=0.0, atol=_SAME)):
+    crossing = max(map(abs, (a[0], *a[3:], d[4]))) < _EQUAL_M
+    if not (crossing and np.allclose((np.eye(4), *rows), (chain.fixed[0], *steps), rtol=0.0, atol=_EQUAL_M)):
         return None
     return _Puma(d[0], a[1], d[1], d[2], a[2], d[3], d[5]) if math.dist((a[1], d[3]), _SIZE) < 0.02 else None
 
 
 def _trunk(puma: _Puma) -> list[Part]:
     side = math.copysign(1.0, puma.offset)  # on which side of the trunk the arm hangs, along axis 2
-    foot = merged([cylinder(0.092, (0.0, 0.016), 4e-3), cylinder(0.066, (0.016, 0.034), RIM)])
-    column = cylinder(0.054, (0.030, puma.d1 - 0.072), RIM)
+    foot = merged([cylinder(0.092, (0.0, 0.016), 4e-3), cylinder(0.066, (0.016, 0.034), RIM_RADIUS_M)])
+    column = cylinder(0.054, (0.030, puma.d1 - 0.072), RIM_RADIUS_M)
     # frame 1: z along axis 2, y up along the trunk, origin at the shoulder
     collar = cylinder(0.056, (-0.070, -0.058), 2e-3).moved(_UP)
-    neck = cylinder(0.052, (-0.058, 0.0), RIM).moved(_UP)
-    drum = cylinder(SHOULDER, _span(-side * 0.062, side * (_reach(puma) - 0.002)), RIM)
+    neck = cylinder(0.052, (-0.058, 0.0), RIM_RADIUS_M).moved(_UP)
+    drum = cylinder(SHOULDER, _span(-side * 0.062, side * (_reach(puma) - 0.002)), RIM_RADIUS_M)
     return [
         Part("foot", 0, foot, DARK),
         Part("column", 0, column, WHITE),
@@ -140,7 +143,7 @@ def _trunk(puma: _Puma) -> list[Part]:
 
 
 def _reach(puma: _Puma) -> float:
-    """From the trunk's axis to the near side of the upper arm, m, along axis 2."""
+    """Distance from the trunk's axis to the near side of the upper arm, m, along axis 2."""
     return max(abs(puma.offset) - 0.5 * FOREARM - 0.004 - UPPER_ARM, 0.02)
 
 
@@ -183,11 +186,11 @@ def _span(a: float, b: float) -> tuple[float, float]:
     return (a, b) if a <= b else (b, a)
 
 
-def probe_parts(radius: float, T_flange_probe: Array) -> tuple[TriangleMesh, TriangleMesh]:
+def probe_parts(radius: float, T_flange_probe: Floats) -> tuple[TriangleMesh, TriangleMesh]:
     """The probe in its own frame (origin at the sphere's centre, z the pole): its holder, and its elastic dome.
 
     Args:
-        radius: of the sphere, m.
+        radius: radius of the sphere, m.
         T_flange_probe: (4, 4); the holder goes back along z to the flange.
     """
     back = float(T_flange_probe[2, 3])
@@ -197,7 +200,7 @@ def probe_parts(radius: float, T_flange_probe: Array) -> tuple[TriangleMesh, Tri
     return holder, dome(radius, math.radians(110.0))
 
 
-def _axes(x: ArrayLike, y: ArrayLike, z: ArrayLike) -> Array:
+def _axes(x: ArrayLike, y: ArrayLike, z: ArrayLike) -> Floats:
     T = np.eye(4)
     T[:3, :3] = np.column_stack([x, y, z])
     return T

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from canprobe.lab.bridge.view.meshes import Array
+from canprobe.mechanics.types import Floats
 
 Colours = NDArray[np.uint8]
 VIRIDIS = np.array(
@@ -15,18 +15,18 @@ VIRIDIS = np.array(
     ),
     dtype=np.float64,
 )  # fmt: skip
-"""At ninths. Source: Smith and van der Walt, matplotlib 2.0, CC0."""
+"""Colours at ninths of the scale. Source: Smith and van der Walt, matplotlib 2.0, CC0."""
 MAGMA = np.array(((0, 0, 4), (81, 18, 124), (183, 55, 121), (252, 137, 97), (252, 253, 191)), dtype=np.float64)
-"""At quarters, of the same source."""
+"""Colours at quarters of the scale, from the same source."""
 UNKNOWN = (138, 148, 160)
 
 
-def scale(values: ArrayLike, low: float, high: float, stops: Array = VIRIDIS) -> Colours:
+def scale(values: ArrayLike, low: float, high: float, stops: Floats = VIRIDIS) -> Colours:
     """Colours of values between two ends, those beyond take the end's; what is not finite is grey.
 
     Args:
         values: (...,) any unit.
-        low, high: in the same unit, low < high.
+        low, high: limits of the scale in the same unit, low < high.
         stops: `VIRIDIS`, dark blue to yellow, or `MAGMA`, black to light yellow.
 
     Returns:

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.lab.bridge.sample import ContactFrame, Sample, SurfacePatch
-from canprobe.lab.bridge.view.meshes import Array
 from canprobe.mechanics.touch.shapes import PlacedShape
+from canprobe.mechanics.types import Floats
 
 SILENT_NS = 250_000_000
 """A contact is shown no longer than this after the tactile frame that showed it."""
@@ -41,18 +41,18 @@ class Moment:
 
     Attributes:
         t_s: on the clock of the samples, s.
-        phase: of the task.
+        phase: phase of the task.
         q: (n,) joint positions, rad or m; None without an arm.
-        contact: where the probe touches; None without contact.
+        contact: place of the contact; None without contact.
         answer: the newest one of the estimator; None before the first.
         taxels: (rows, columns) counts of the newest frame; None before the first.
-        force: N, of the newest frame; NaN before the first.
+        force: contact force of the newest frame, N; NaN before the first.
         dropped: samples lost on the way so far.
     """
 
     t_s: float = 0.0
     phase: str | None = None
-    q: Array | None = None
+    q: Floats | None = None
     contact: ContactFrame | None = None
     answer: JudgedAnswer | None = None
     taxels: NDArray[np.uint8] | None = None

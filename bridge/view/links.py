@@ -18,9 +18,10 @@ from canprobe.cell.scene.hardware import ArmSettings
 from canprobe.errors import PlanError
 from canprobe.lab.bridge.database import need
 from canprobe.lab.bridge.view.bodies import WHITE, Part, arm_parts
-from canprobe.lab.bridge.view.meshes import Array, TriangleMesh
+from canprobe.lab.bridge.view.meshes import TriangleMesh
 from canprobe.mechanics.robot.chain import Chain
 from canprobe.mechanics.robot.urdf_visuals import Visual, find_mesh, visuals_of
+from canprobe.mechanics.types import Floats
 
 _NAMED = 3
 """Missing meshes that a line names."""
@@ -31,8 +32,8 @@ def arm_links(arm: ArmSettings, chain: Chain) -> tuple[list[Part], list[str]]:
     """What is drawn of an arm, and a line for what its URDF shows and cannot be drawn.
 
     Args:
-        arm: of the scene.
-        chain: that follows from it.
+        arm: arm of the scene.
+        chain: kinematic chain of that arm.
     """
     plain = arm_parts(chain)
     if arm.urdf is None:
@@ -103,7 +104,7 @@ def _mesh(body: Any) -> TriangleMesh:
     return TriangleMesh(np.array(body.vertices, np.float64), np.array(body.faces, np.int64))
 
 
-def _scaled(mesh: TriangleMesh, scale: Array) -> TriangleMesh:
+def _scaled(mesh: TriangleMesh, scale: Floats) -> TriangleMesh:
     faces = mesh.faces if scale.prod() > 0.0 else mesh.faces[:, ::-1]  # mirrored, it would be inside out
     return TriangleMesh(mesh.vertices * scale, faces)
 

@@ -13,7 +13,8 @@ from itertools import accumulate, pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+from canprobe.mechanics.types import Floats
+
 Faces = NDArray[np.int64]
 
 SECTORS = 48
@@ -30,10 +31,10 @@ class TriangleMesh:
         faces: (m, 3) indices into them.
     """
 
-    vertices: Array
+    vertices: Floats
     faces: Faces
 
-    def moved(self, T: Array) -> TriangleMesh:
+    def moved(self, T: Floats) -> TriangleMesh:
         """The mesh carried by a transform (4, 4)."""
         return TriangleMesh(self.vertices @ T[:3, :3].T + T[:3, 3], self.faces)
 
@@ -60,7 +61,7 @@ def grid(points: ArrayLike) -> TriangleMesh:
     return TriangleMesh(p.reshape(-1, 3), faces)
 
 
-def _prism(rings: Iterable[tuple[Array, float]]) -> TriangleMesh:
+def _prism(rings: Iterable[tuple[Floats, float]]) -> TriangleMesh:
     """A closed body along z: walls between rising (outline (n, 2), counter-clockwise and convex; height), flat ends."""
     outlines = [np.column_stack([outline, np.full(len(outline), z)]) for outline, z in rings]
     closed = [np.vstack([ring, ring[:1]]) for ring in outlines]
@@ -69,7 +70,7 @@ def _prism(rings: Iterable[tuple[Array, float]]) -> TriangleMesh:
     return merged([*walls, _fan(outlines[0][::-1]), _fan(outlines[-1])])
 
 
-def _fan(ring: Array) -> TriangleMesh:
+def _fan(ring: Floats) -> TriangleMesh:
     """A convex flat face round its middle."""
     n = len(ring)
     around = np.arange(n)
@@ -77,11 +78,11 @@ def _fan(ring: Array) -> TriangleMesh:
     return TriangleMesh(np.vstack([ring, ring.mean(axis=0)]), faces)
 
 
-def link_outline(first: Circle, second: Circle, sectors: int = SECTORS) -> Array:
+def link_outline(first: Circle, second: Circle, sectors: int = SECTORS) -> Floats:
     """Outline of a link seen along its joint axes: two circles and their common tangents, (sectors + 2, 2).
 
     Args:
-        first, second: where the axes pass and the radii round them; where one lies in the other, the larger radius
+        first, second: centre and radius of each circle; where one lies in the other, the larger radius
             round the first centre.
         sectors: even number of points on the two arcs together.
     """
@@ -98,8 +99,8 @@ def link_outline(first: Circle, second: Circle, sectors: int = SECTORS) -> Array
     return np.concatenate([_arc(b, r1, near), _arc(a, r0, far)])
 
 
-def _arc(centre: tuple[float, float], radius: float, angles: Array) -> Array:
-    points: Array = centre + radius * np.column_stack([np.cos(angles), np.sin(angles)])
+def _arc(centre: tuple[float, float], radius: float, angles: Floats) -> Floats:
+    points: Floats = centre + radius * np.column_stack([np.cos(angles), np.sin(angles)])
     return points
 
 
@@ -107,7 +108,7 @@ def link(first: Circle, second: Circle, span: tuple[float, float], rim: float = 
     """A link between two parallel joint axes along z, its rims rounded off.
 
     Args:
-        first, second: where the axes pass (x, y) and the radii round them, m.
+        first, second: centre (x, y) and radius of each circle, m.
         span: its two flat sides, lower first, m.
         rim: radius of the rounding, m, below both radii and half the thickness.
     """
@@ -145,7 +146,7 @@ def dome(radius: float, opening_rad: float, rings: int = 24) -> TriangleMesh:
     Args:
         radius: m.
         opening_rad: angle from the pole to the rim; π for the whole sphere.
-        rings: from the rim to the pole.
+        rings: number of rings from the rim to the pole.
     """
     angle = np.linspace(opening_rad, 0.0, rings + 1)
     return revolved(np.column_stack([radius * np.sin(angle), radius * np.cos(angle)]))

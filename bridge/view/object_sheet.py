@@ -7,10 +7,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.lab.bridge.view.meshes import Array, TriangleMesh, dome, grid, revolved
+from canprobe.lab.bridge.view.meshes import TriangleMesh, dome, grid, revolved
 from canprobe.mechanics.touch.heights import Heights
 from canprobe.mechanics.touch.objects import Cylinder, Sphere
 from canprobe.mechanics.touch.shapes import Bowl, PlacedShape, Torus, Wave
+from canprobe.mechanics.types import Floats
 
 REACH_M = 0.055
 """How much of a surface without end is shown round the object's origin, to each side."""
@@ -45,7 +46,7 @@ def object_mesh(shape: PlacedShape) -> TriangleMesh:
     return grid(_sheet(shape, REACH_M))
 
 
-def object_lines(shape: PlacedShape) -> Array:
+def object_lines(shape: PlacedShape) -> Floats:
     """Lines on the surface in two directions, which make its curvature visible: (n, 2, 3) segments, base frame, m."""
     radius = math.inf if isinstance(shape, Cylinder) else getattr(shape, "radius", math.inf)
     if isinstance(shape, Heights):
@@ -56,14 +57,14 @@ def object_lines(shape: PlacedShape) -> Array:
     return _lines(sheet)
 
 
-def _lines(sheet: Array) -> Array:
+def _lines(sheet: Floats) -> Floats:
     rows, columns = (np.linspace(0, n - 1, LINES).round().astype(int) for n in sheet.shape[:2])
     along = [np.stack([sheet[i, :-1], sheet[i, 1:]], axis=1) for i in rows]
     across = [np.stack([sheet[:-1, j], sheet[1:, j]], axis=1) for j in columns]
     return np.concatenate([*along, *across])
 
 
-def _relief(shape: Heights) -> tuple[Array, NDArray[np.bool_]]:
+def _relief(shape: Heights) -> tuple[Floats, NDArray[np.bool_]]:
     """(m, n, 3) points of heights within `REACH_M` of the origin, base frame, and (m, n) whether the surface exists."""
     x, y = (
         np.linspace(max(low, -REACH_M), min(high, REACH_M), RELIEF)
@@ -72,11 +73,11 @@ def _relief(shape: Heights) -> tuple[Array, NDArray[np.bool_]]:
     x, y = (one.ravel() for one in np.meshgrid(x, y, indexing="ij"))
     local = np.column_stack((x, y, shape.spline.many(x, y)[0]))
     T = shape.T_base_object
-    points: Array = (local @ T[:3, :3].T + T[:3, 3]).reshape(RELIEF, RELIEF, 3)
+    points: Floats = (local @ T[:3, :3].T + T[:3, 3]).reshape(RELIEF, RELIEF, 3)
     return points, shape.exists(x, y).reshape(RELIEF, RELIEF)
 
 
-def _sheet(shape: PlacedShape, reach_m: float) -> Array:
+def _sheet(shape: PlacedShape, reach_m: float) -> Floats:
     """(STEPS + 1, STEPS + 1, 3) feet of a square of the tangent plane, base frame; its front side is outside."""
     T = shape.T_base_object
     across = min(reach_m, 0.85 * shape.radius) if isinstance(shape, Cylinder) else reach_m

@@ -18,7 +18,6 @@ import numpy as np
 
 from canprobe.fieldbus.bus.files import write_text
 from canprobe.lab.bridge.view.colours import MAGMA, scale
-from canprobe.lab.bridge.view.meshes import Array
 from canprobe.lab.bridge.view.path import deviation_scale
 from canprobe.lab.bridge.view.path_nodes import LoadedPath
 from canprobe.lab.bridge.view.plots import NAMES, curves_of, row_of
@@ -27,6 +26,7 @@ from canprobe.lab.bridge.view.replay import FRAME_S, answers_of, shape_of, trail
 from canprobe.lab.bridge.view.server import open_server
 from canprobe.lab.bridge.view.stage import Stage, legend_of, place_of
 from canprobe.lab.bridge.view.surface import LoadedSurface
+from canprobe.mechanics.types import Floats
 
 MOST_FRAMES = 900
 """A longer run is shown in larger steps: the file stays below ten megabytes."""
@@ -36,8 +36,8 @@ def write_page(run: RecordedRun, file: Path, say: Callable[[str], None]) -> None
     """Write the replay of a run into one file.
 
     Args:
-        run: from `read_run`.
-        file: to write; an older one is replaced.
+        run: a run that `read_run` has read.
+        file: file that is written; an older one is replaced.
         say: called with each line about what cannot be drawn.
 
     Raises:
@@ -56,7 +56,7 @@ def write_page(run: RecordedRun, file: Path, say: Callable[[str], None]) -> None
     write_text(file, f"{head}{panel.replace('/*DATA*/null', data)}{middle}{tail}")
 
 
-def _record(run: RecordedRun, times: Array) -> tuple[str, list[str]]:
+def _record(run: RecordedRun, times: Floats) -> tuple[str, list[str]]:
     """Viser's page with every frame in it, and lines about what cannot be drawn."""
     with open_server(0) as server:
         stage = Stage(server, run.setup)
@@ -76,7 +76,7 @@ def _record(run: RecordedRun, times: Array) -> tuple[str, list[str]]:
         return str(recorder.as_html()), stage.notes
 
 
-def _panel_data(run: RecordedRun, times: Array, notes: list[str]) -> dict[str, Any]:
+def _panel_data(run: RecordedRun, times: Floats, notes: list[str]) -> dict[str, Any]:
     """What the panel plots: columns, taxel images, colours; None for what is not finite."""
     moments = [run.at(t) for t in times.tolist()]
     curves = curves_of(map(row_of, moments))

@@ -19,8 +19,8 @@ from canprobe.lab.bridge.view.stage import Stage, legend_of
 
 INK, FIRST, SECOND, FAINT = "#1f2933", "#c2410c", "#0f6e84", "#9aa5b1"
 HEIGHT = 96
-PIXELS = 5
-"""Of a taxel in its image."""
+TAXEL_PIXELS = 5
+"""Side of a taxel in its image."""
 
 
 class Panel:
@@ -28,7 +28,7 @@ class Panel:
 
     Args:
         server: a `viser.ViserServer`.
-        scene: that is shown.
+        scene: scene that is shown.
         errors: what the path's colours mean.
         stage: what is beside, with lines about what cannot be drawn.
     """
@@ -50,7 +50,7 @@ class Panel:
             )
         if scene.sensor is not None:
             blank = np.zeros((scene.sensor.rows, scene.sensor.columns), np.uint8)
-            self._taxels = gui.add_image(taxel_image(blank, PIXELS), label="taxel image", format="png")
+            self._taxels = gui.add_image(taxel_image(blank, TAXEL_PIXELS), label="taxel image", format="png")
             self._add_plot(gui, "force (N)", ("force", "target"), (FIRST, FAINT))
         if scene.shape is not None:
             names = ("true1", "true2", "low1", "high1", "low2", "high2", "kappa1", "kappa2")
@@ -75,7 +75,7 @@ class Panel:
         """Show a moment, and curves where there are new ones."""
         self._status.content = _STYLED.format("<br>".join(self._lines(moment)))
         if self._taxels is not None and moment.taxels is not None:
-            self._taxels.image = taxel_image(moment.taxels, PIXELS)
+            self._taxels.image = taxel_image(moment.taxels, TAXEL_PIXELS)
         if curves is None or len(curves["t_s"]) < 2:
             return
         for handle, names in self._plots:

@@ -10,8 +10,8 @@ import numpy as np
 
 from canprobe.cell.tasks.probing import Phase
 from canprobe.lab.bridge.view.colours import Colours, scale
-from canprobe.lab.bridge.view.meshes import Array
 from canprobe.mechanics.touch.shapes import PlacedShape
+from canprobe.mechanics.types import Floats
 
 SPACING_M = 4e-4
 """Path between two points that are drawn."""
@@ -36,7 +36,7 @@ class DeviationScale:
     high: float
     text: str
 
-    def colours(self, values: Array) -> Colours:
+    def colours(self, values: Floats) -> Colours:
         """(n, 3) colours of values (n,), 1/m, what is well known bright; grey where a value is not finite."""
         return scale(self.high - np.asarray(values), 0.0, self.high)
 
@@ -58,14 +58,14 @@ class Trail:
     """Collects contacts into segments."""
 
     def __init__(self) -> None:
-        self._last: Array | None = None
-        self.segments: list[Array] = []
+        self._last: Floats | None = None
+        self.segments: list[Floats] = []
         self.times: list[float] = []
 
     def __len__(self) -> int:
         return len(self.segments)
 
-    def add(self, t_s: float, point: Array, normal: Array) -> bool:
+    def add(self, t_s: float, point: Floats, normal: Floats) -> bool:
         """Take one contact; whether a segment has come of it.
 
         Args:

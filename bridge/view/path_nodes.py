@@ -40,8 +40,8 @@ class LoadedPath(Parts):
     """A whole recorded path, shown up to an instant.
 
     Args:
-        api: of viser's scene.
-        trail: of the run.
+        api: viser's scene.
+        trail: path of the contact in the run.
     """
 
     def __init__(self, api: Any, trail: Trail) -> None:
@@ -54,7 +54,7 @@ class GrowingPath:
     """A path that grows while the cell runs.
 
     Args:
-        api: of viser's scene.
+        api: viser's scene.
         trail: which grows elsewhere.
     """
 

@@ -9,10 +9,10 @@ import numpy as np
 
 from canprobe.lab.bridge.sample import SurfacePatch
 from canprobe.lab.bridge.view.instants import Moment
-from canprobe.lab.bridge.view.meshes import Array
+from canprobe.mechanics.types import Floats
 
 NAMES = ("t_s", "force", "kappa1", "low1", "high1", "kappa2", "low2", "high2", "true1", "true2", "error", "sigma")
-Curves = dict[str, Array]
+Curves = dict[str, Floats]
 """Columns by the names of `NAMES`; s, N, 1/m; low and high are the ends of the 95 % bands; NaN: nothing to plot."""
 
 

@@ -22,8 +22,8 @@ from canprobe.cell.tasks.probing import Phase
 from canprobe.errors import UsageError
 from canprobe.lab.bridge.sample import ContactFrame, SurfacePatch
 from canprobe.lab.bridge.view.instants import JudgedAnswer, Moment, judge
-from canprobe.lab.bridge.view.meshes import Array
 from canprobe.mechanics.touch.tangent_frames import tangent_rotation
+from canprobe.mechanics.types import Floats
 
 
 @dataclass(frozen=True, eq=False)  # without slots: `cached_property`
@@ -34,12 +34,12 @@ class RecordedRun:
         setup: the scene as resolved.
         log: the columns of ``log.npz``; every row one cycle.
         answer_rows: rows at which the estimator gave a new answer.
-        answers: at each of them.
+        answers: estimate at each of them.
         taxels: (t_s, (rows, columns) uint8 counts) of each tactile frame, by rising time of the cycle that used it.
     """
 
     setup: Setup
-    log: dict[str, Array]
+    log: dict[str, Floats]
     answer_rows: NDArray[np.int64]
     answers: tuple[JudgedAnswer, ...]
     taxels: tuple[tuple[float, NDArray[np.uint8]], ...]
@@ -51,7 +51,7 @@ class RecordedRun:
 
     @property
     def title(self) -> str:
-        """Of the scene."""
+        """Name of the scene."""
         return self.scene.title or self.scene.name
 
     @property
@@ -60,11 +60,11 @@ class RecordedRun:
         return float(self.log["t_s"][-1])
 
     @cached_property
-    def _q(self) -> Array | None:
+    def _q(self) -> Floats | None:
         """(rows, n) rad or m."""
         return joint_positions(self.log)
 
-    def times(self, step_s: float) -> Array:
+    def times(self, step_s: float) -> Floats:
         """Instants at an even distance from the first cycle to the last, s."""
         start = float(self.log["t_s"][0])
         return np.append(np.arange(start, self.duration_s - 1e-9, step_s), self.duration_s)
@@ -102,8 +102,8 @@ def read_run(folder: Path, setup: Setup | None = None) -> RecordedRun:
     """Read what is shown of a run.
 
     Args:
-        folder: that `canprobe run` wrote: ``scene.toml``, ``log.npz`` and, for the taxels, ``tactile.npz``.
-        setup: that the run had; None reads ``scene.toml``.
+        folder: folder that `canprobe run` wrote: ``scene.toml``, ``log.npz`` and, for the taxels, ``tactile.npz``.
+        setup: setup that the run had; None reads ``scene.toml``.
 
     Raises:
         UsageError: no such folder, a file that is missing or of another canprobe, or a column that is not as it should
@@ -139,7 +139,7 @@ def _read_taxels(file: Path, setup: Setup) -> Iterator[tuple[float, NDArray[np.u
         yield from zip(columns["t_s"].tolist(), columns["taxels"], strict=True)
 
 
-def _new_answers(log: dict[str, Array]) -> NDArray[np.int64]:
+def _new_answers(log: dict[str, Floats]) -> NDArray[np.int64]:
     """Rows at which the estimate changed; the log repeats each until the next."""
     if "K_per_m" not in log or "T_base_contact_m" not in log:
         return np.empty(0, np.int64)
@@ -149,7 +149,7 @@ def _new_answers(log: dict[str, Array]) -> NDArray[np.int64]:
     return np.nonzero(new)[0]
 
 
-def _patch(log: dict[str, Array], row: int) -> SurfacePatch:
+def _patch(log: dict[str, Floats], row: int) -> SurfacePatch:
     unknown = np.full((3, 3), np.nan)
     observed = np.isfinite(log["kappa_per_m"][row]) if "kappa_per_m" in log else (True, True)
     return SurfacePatch(

@@ -39,7 +39,7 @@ def serve_run(
     """Show a run until it is interrupted.
 
     Args:
-        run: from `read_run`.
+        run: a run that `read_run` has read.
         port, host: see `open_server`.
         ready: called with the address.
         say: called with each line about what cannot be drawn.

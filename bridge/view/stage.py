@@ -18,25 +18,26 @@ from canprobe.lab.bridge.view.bodies import link_frames, probe_parts
 from canprobe.lab.bridge.view.colours import linear_light
 from canprobe.lab.bridge.view.instants import Moment
 from canprobe.lab.bridge.view.links import arm_links
-from canprobe.lab.bridge.view.meshes import Array, TriangleMesh
+from canprobe.lab.bridge.view.meshes import TriangleMesh
 from canprobe.lab.bridge.view.object_sheet import object_lines, object_mesh
 from canprobe.lab.bridge.view.path_nodes import PATH
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.patch.array_calibration import NO_FORCE_REFERENCE
 from canprobe.mechanics.touch.shapes import PlacedShape
+from canprobe.mechanics.types import Floats
 
 OBJECT, PROBE, FORCE = (126, 150, 176), (78, 88, 104), (214, 40, 30)
 FORCE_M_PER_N = 0.012
 """Length of the shaft of the force arrow; its head is added, so that the smallest force has an arrow, too."""
 FORCE_HEAD_M = 0.007
-LOOK_ASIDE = math.radians(55.0)
-"""Of the camera, from the line that leads from base to contact, seen from above: the arm hides nothing there."""
+LOOK_ASIDE_RAD = math.radians(55.0)
+"""Angle of the camera from the line that leads from base to contact, seen from above: the arm hides nothing there."""
 FOLLOW_M = 4e-3
 """The camera of a browser follows the contact in steps of this size: between them it is the user's."""
 ARRIVING_S = 3.0
-"""From the first time that it was moved; until then a page may set its camera anew while it is laid out."""
-ALONE = (0.0, 0.0, 0.12)
+"""Time from its first motion; until then a page may set its camera anew while it is laid out."""
+LONE_PROBE_M = (0.0, 0.0, 0.12)
 """Where the probe stands, pole up, in a scene without an arm, m."""
 
 
@@ -50,7 +51,7 @@ def legend_of(scene: Scene) -> list[tuple[tuple[int, int, int], str]]:
     return rows
 
 
-def place_of(scene: Scene) -> Array:
+def place_of(scene: Scene) -> Floats:
     """(3,) where the object's surface is, or where it is looked for, base frame, m."""
     if scene.object is None:
         return np.array(scene.task.start_mm) * 1e-3
@@ -78,7 +79,7 @@ class Stage:
         self.notes: list[str] = (
             [] if array is None or array.newtons != NO_FORCE_REFERENCE else [f"force in {NO_FORCE_REFERENCE}"]
         )
-        self._place, self._moved, self._met = place_of(scene), dict[int, Array](), dict[int, float]()
+        self._place, self._moved, self._met = place_of(scene), dict[int, Floats](), dict[int, float]()
         self._clock = MonotonicClock()
         self._truth: list[Any] = []
         self._follows = None
@@ -128,7 +129,7 @@ class Stage:
         self._truth = [ghost, lines]
 
     def _add_probe(self, radius: float, pad: Pad | None) -> None:
-        self._probe = self._api.add_frame("/probe", show_axes=False, position=ALONE)
+        self._probe = self._api.add_frame("/probe", show_axes=False, position=LONE_PROBE_M)
         holder, elastic = probe_parts(radius, self._tool)
         self._add("/probe/holder", holder, PROBE)
         self._add("/probe/dome", elastic, (120, 128, 140), opacity=0.14, side="double", cast_shadow=False)
@@ -150,24 +151,24 @@ class Stage:
             "/contact", axes_length=0.012, axes_radius=0.0004, origin_radius=0.0008, visible=False
         )
         self._force = api.add_arrows(
-            "/force", np.zeros((1, 2, 3), np.float32), FORCE, shaft_radius=0.0012, head_radius=0.003,
+            "/contact/force", np.zeros((1, 2, 3), np.float32), FORCE, shaft_radius=0.0012, head_radius=0.003,
             head_length=FORCE_HEAD_M, visible=False,
         )  # fmt: skip
-        self._label = api.add_label("/force/label", "", anchor="bottom-center", visible=False)
+        self._label = api.add_label("/contact/force/label", "", anchor="bottom-center", visible=False)
 
     def _look(self, server: Any, scene: Scene) -> None:
-        """At probe and contact, across the line from the base to them: there the arm hides nothing."""
+        """Look at probe and contact, across the line from the base to them: there the arm hides nothing."""
         camera = server.initial_camera
         if self._shape is not None or scene.task.kind in ("scan", "press"):
             place = place_of(scene)
             out, heading = math.atan2(place[1], place[0]), math.radians(scene.task.heading_deg)
-            across = max((out - LOOK_ASIDE, out + LOOK_ASIDE), key=lambda angle: abs(math.sin(angle - heading)))
+            across = max((out - LOOK_ASIDE_RAD, out + LOOK_ASIDE_RAD), key=lambda angle: abs(math.sin(angle - heading)))
             target = place + np.array((0.0, 0.0, 0.012))
             away = 0.21 * np.array((math.cos(across), math.sin(across), 0.5))
         elif self._model is not None:
             target, away = np.array((0.0, 0.0, 0.32)), np.array((-1.0, 0.55, 0.3))
         else:
-            target, away = np.array(ALONE), np.array((-0.12, -0.16, 0.16))
+            target, away = np.array(LONE_PROBE_M), np.array((-0.12, -0.16, 0.16))
         self._view = target + away, target
         camera.position, camera.look_at, camera.up = *self._view, (0.0, 0.0, 1.0)
         camera.fov = math.radians(34.0)
@@ -196,7 +197,7 @@ class Stage:
         if moment.contact is not None and self._follows is not None and self._follows.value:
             self._follow(moment.contact.point - self._place)
 
-    def _follow(self, away: Array) -> None:
+    def _follow(self, away: Floats) -> None:
         """Carry every browser's camera along, in steps; how it was turned by hand stays."""
         now = 1e-9 * self._clock.now_ns()
         for number, client in self._server.get_clients().items():
@@ -209,7 +210,7 @@ class Stage:
                 self._moved[number] = away
                 camera.position, camera.look_at = position + step, look_at + step
 
-    def _move_arm(self, model: ArmModel, q: Array) -> None:
+    def _move_arm(self, model: ArmModel, q: Floats) -> None:
         frames = link_frames(model.chain, q)
         for handle, T in zip(self._links[1:], frames[1:], strict=True):  # the base stands still
             _place(handle, T)
@@ -222,9 +223,10 @@ class Stage:
         if contact is None:
             return
         _place(self._contact, contact.T_base_contact)
-        tip = contact.point + (FORCE_M_PER_N * moment.force + FORCE_HEAD_M) * contact.normal
-        self._force.points = np.array([[contact.point, tip]], np.float32)
-        self._label.position = tuple(tip)
+        # in the contact frame, whose z points inward: a browser that draws slowly moves arrow and frame at one time
+        tip = (0.0, 0.0, -(FORCE_M_PER_N * moment.force + FORCE_HEAD_M))
+        self._force.points = np.array([[(0.0, 0.0, 0.0), tip]], np.float32)
+        self._label.position = tip
         self._label.text = f"{moment.force:.2f} N"
 
 
@@ -236,7 +238,7 @@ def _taxel_scales(counts: NDArray[np.uint8]) -> NDArray[np.float32]:
     return np.where(counts > 0, 1.0, 0.12).astype(np.float32)
 
 
-def _place(handle: Any, T: Array) -> None:
+def _place(handle: Any, T: Floats) -> None:
     x, y, z, w = quaternion_of(T[:3, :3])
     handle.wxyz = (w, x, y, z)
     handle.position = T[:3, 3]

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from canprobe.lab.bridge.view.instants import JudgedAnswer
-from canprobe.lab.bridge.view.meshes import Array
 from canprobe.lab.bridge.view.path import DeviationScale
 from canprobe.lab.bridge.view.path_nodes import Parts
 from canprobe.mechanics.touch.blend import REACH_M
 from canprobe.mechanics.touch.meshing import Mesh
 from canprobe.mechanics.touch.surface_map import SPACING_M, LocalPatch, SurfaceMap
+from canprobe.mechanics.types import Floats
 
 CELL_M = 1e-3
 """Size of its triangles."""
@@ -29,7 +29,7 @@ class BlendedSurface:
     """Answers as one surface: of those within `SPACING_M` of each other the best known one.
 
     Args:
-        scale: of its colours, which show the stated deviation of K, 1/m.
+        scale: scale of the colours, which show the stated deviation of K, 1/m.
     """
 
     def __init__(self, scale: DeviationScale) -> None:
@@ -59,13 +59,13 @@ class BlendedSurface:
         return mesh, self._scale.colours(np.array(best))
 
 
-def _near(vertices: Array, answers: Sequence[JudgedAnswer]) -> list[list[int]]:
-    """For each vertex (n, 3) the indices of the answers within `REACH_M`."""
+def _near(vertices: Floats, answers: Sequence[JudgedAnswer]) -> list[list[int]]:
+    """Find for each vertex (n, 3) the indices of the answers within `REACH_M`."""
     tree = cKDTree([_point(answer) for answer in answers])
     return [tree.query_ball_point(vertex, REACH_M) for vertex in vertices]
 
 
-def _point(answer: JudgedAnswer) -> Array:
+def _point(answer: JudgedAnswer) -> Floats:
     return answer.patch.T_base_contact[:3, 3]
 
 
@@ -85,8 +85,8 @@ class GrowingSurface:
     """A surface that grows while the cell runs.
 
     Args:
-        api: of viser's scene.
-        scale: of its colours.
+        api: viser's scene.
+        scale: scale of the colours.
     """
 
     def __init__(self, api: Any, scale: DeviationScale) -> None:
@@ -112,9 +112,9 @@ class LoadedSurface(Parts):
     """The surface of a recorded run as it is known at the end, shown as far as it was touched by an instant.
 
     Args:
-        api: of viser's scene.
-        answers: of the run, by rising time, each with its instant, s.
-        scale: of its colours.
+        api: viser's scene.
+        answers: estimates of the run, by rising time, each with its instant, s.
+        scale: scale of the colours.
     """
 
     def __init__(self, api: Any, answers: Iterable[tuple[float, JudgedAnswer]], scale: DeviationScale) -> None:

@@ -1,8 +1,9 @@
 """Calibrate a tactile array by touching a plane, a ball and a rod of known size with the arm of a cell.
 
-39 touches in about five minutes: force, stiffness of the layer, blur, crosstalk, noise and lag of the array. An
-emulated cell has the objects; at a real one you are asked to place them. Images alone do not show newtons: name what
-they rest on, or the calibration is in nominal newtons. The result is a file for the key sensor.calibration.
+39 touches take about five minutes. They give the force, the stiffness of the layer, the blur, the crosstalk, the noise
+and the lag of the array. An emulated cell has the objects; at a real one you are asked to place them. Images alone do
+not show newtons: --force-reference names what you measured the force with, else the calibration is in nominal newtons.
+The result is a file for the key sensor.calibration.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from canprobe.cli.parser import Parser
 from canprobe.cli.target import target_of
 from canprobe.errors import install_line
 
-HELP = "calibrate a tactile array by touching known things"
+HELP = "calibrate a tactile array on objects of known size"
 EXAMPLE = """\
 examples:
   canprobe calibrate array puma260 --force-reference scale --sigma 0.5
@@ -47,22 +48,24 @@ def add_arguments(parser: Parser) -> None:
         "--force-reference",
         choices=["scale", "weights", "unit", "none"],
         default="none",
-        help="what newtons rest on: a scale or load cell under the object, known weights, the stated full scale, or"
-        " nothing [none: nominal newtons]",
+        help="what the force in newtons comes from: a scale or load cell under the object, known weights, the stated"
+        " full scale of the array (unit), or nothing [none: nominal newtons]",
     )
     parser.add_argument(
-        "--sigma", metavar="PERCENT", type=_positive, default=1.0, help="standard deviation of that reference [1]"
+        "--sigma", metavar="PERCENT", type=_positive, default=1.0, help="standard deviation of that force [1]"
     )
     parser.add_argument(
         "--at", metavar=("X", "Y", "Z"), nargs=3, type=float,
-        help="point of the base frame that is touched, mm [of a cell file: under the probe in its start posture]",
+        help="touched point in the base frame, mm [for a cell file: below the probe in its start posture]",
     )  # fmt: skip
     parser.add_argument("--ball-radius", metavar="MM", type=_positive, default=25.0, help="radius of the ball [25]")
     parser.add_argument("--rod-radius", metavar="MM", type=_positive, default=25.0, help="radius of the rod [25]")
     parser.add_argument(
-        "--make", action="store_true", help="calibrate the make: leave out gains and dead taxels of this one array"
+        "--make",
+        action="store_true",
+        help="write a calibration for all arrays of this make, without the gains and dead taxels of this one",
     )
-    parser.add_argument("--yes", action="store_true", help="ask nobody; for an emulated cell, where it is the default")
+    parser.add_argument("--yes", action="store_true", help="ask for no object to be placed; for an emulated cell only")
     add_options(parser, *BUS)
     parser.add_argument("--seed", metavar="N", type=seed, default=0, help="seed of the emulation [0]")
     parser.add_argument(

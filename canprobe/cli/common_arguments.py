@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from canprobe.cli.argument_types import channel, folder_path, seconds, setting, whole, word
 from canprobe.cli.parser import Parser
-
-if TYPE_CHECKING:
-    pass
 
 PATIENT_SYNCS = 40
 """100 ms at 400 Hz: a virtual machine may stand still as long."""

@@ -77,7 +77,7 @@ def add_arguments(parser: Parser) -> None:
         "--nodes", metavar="IDS", type=node_ids, help="nodes to serve, such as 1-6,16 [those with emulated = true]"
     )
     parser.add_argument(
-        "--truth", metavar="FILE", type=Path, help="at the end write the true values of the model to this npz file"
+        "--truth", metavar="FILE", type=Path, help="write the true values of the model to this npz file at the end"
     )
     parser.add_argument(
         "--store",

@@ -19,7 +19,7 @@ class TerminalOperator:
     """Reads whole lines from a file descriptor.
 
     Args:
-        descriptor: of a terminal or pipe; stdin by default. At its end the answer is `QUIT`.
+        descriptor: file descriptor of a terminal or pipe; stdin by default. At its end the answer is `QUIT`.
     """
 
     def __init__(self, descriptor: int | None = None) -> None:

@@ -1,7 +1,7 @@
 """List the packaged scenes, with the figures to expect of them, and print the folder of their files.
 
-The figures are the lowest and the highest of some seeds: RMS errors of the contact force, and of the curvature as the
-estimator in the loop has it.
+The figures are RMS errors of the contact force, and of the curvature that the estimator in the loop reports. Each is
+given as the lowest and the highest over several seeds.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ def print_packaged(
     """Print name and title of every packaged file of some kinds, their folders, and what can be done with them.
 
     Args:
-        advice: by kind.
-        args: of the command.
+        advice: line of advice for each kind.
+        args: arguments of the command.
         expected: their figures, as `read_expected` has them.
     """
     from canprobe.cell.results.expected import SHORT, expected_text, seeds_text

@@ -32,9 +32,12 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("name", metavar="NAME", nargs="?", help="study to run; --list lists them")
     parser.add_argument("--list", action="store_true", help="list the studies, and end")
     parser.add_argument("--out", metavar="DIR", type=Path, help="folder of the files [runs/study-NAME]")
-    parser.add_argument("--quick", action="store_true", help="fewer cases and repeats")
+    parser.add_argument("--quick", action="store_true", help="measure fewer cases, with fewer repeats")
     parser.add_argument(
-        "--seed", metavar="N", type=whole(0, 2**63 - 1), help="faults: only the run with this number, step by step"
+        "--seed",
+        metavar="N",
+        type=whole(0, 2**63 - 1),
+        help="faults: run only the case of this seed, and report each step",
     )
     parser.add_argument(
         "--vcan", action="store_true", help="faults: on a real vcan0; processes are killed and the link is taken down"

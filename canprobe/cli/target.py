@@ -91,8 +91,8 @@ def real_target(
     """The bus of a command that needs one between processes: the command line's, else python-can's configuration's.
 
     Args:
-        bus, channel, bitrate: of the command line.
-        channel_else, bitrate_else: where neither says anything.
+        bus, channel, bitrate: options of the command line; None where not given.
+        channel_else, bitrate_else: values where neither the command line nor the configuration gives one.
 
     Raises:
         UsageError: nothing names a channel, or nothing is configured and the command line asks for what is.

@@ -30,8 +30,8 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--check-joints",
         action="store_true",
-        help="move one joint after the other by 1 deg (3.5 mm where it slides) and back, compare the encoders, and end;"
-        " asks before each motion",
+        help="move one joint after the other by 1 deg (3.5 mm for a sliding joint) and back, compare the encoders, and"
+        " end; asks before each motion",
     )
     parser.add_argument(
         "--home",

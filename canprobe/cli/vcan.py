@@ -13,7 +13,7 @@ import argparse
 from canprobe.cli.argument_types import seconds
 from canprobe.cli.parser import Parser
 
-HELP = "run a command where a vcan0 exists"
+HELP = "run a command with a virtual CAN interface vcan0"
 EXAMPLE = """\
 exit status: that of the command, 128 + n after signal n; 124 time-out, 125 no vcan0 possible here, 123 the virtual
 machine ended early

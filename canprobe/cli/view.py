@@ -127,12 +127,12 @@ class _Browser:
     """Prints the address of the page and opens it in the user's browser, once.
 
     Args:
-        port: that was asked for.
-        say: reports the other steps.
+        port: requested port.
+        say: function that reports the other steps.
         quiet: only print the address.
 
     Attributes:
-        port: where it was last, so that a page that is open finds the next one there.
+        port: port of the last page, so that a browser that shows it finds the next page there.
     """
 
     def __init__(self, port: int, say: Callable[[str], None], *, quiet: bool) -> None:

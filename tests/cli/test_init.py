@@ -227,7 +227,7 @@ def test_a_joint_without_range_gets_a_placeholder_and_a_tilt_is_explained(tmp_pa
     few = URDF.replace('type="revolute"', 'type="fixed"', 3).replace('lower="-2" upper="2"', 'lower="-0.2" upper="0.2"')
     urdf.write_text(few)
     main(["init", str(tmp_path / "stiff"), "--urdf", str(urdf)])
-    assert "from straight down: of 400 tried postures" in capsys.readouterr().err
+    assert "from straight down; it is the best of 400 tried postures" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

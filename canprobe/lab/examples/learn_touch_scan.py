@@ -17,8 +17,7 @@ import numpy as np
 
 import canprobe.lab.gym  # it registers the environment
 
-Array = np.ndarray[Any, Any]
-
+Floats = np.ndarray[Any, Any]
 LANES = [(11, 0), (11, 3), (-11, 3), (-11, 6), (11, 6), (11, -3), (-11, -3), (-11, 0), (-2, 0), (-11, -6), (11, -6)]
 """Corners of the path, mm along the heading and across it."""
 NAMES = ["speed", "slower by the error of the force", "slower by the turn", "correct the force", "more force at speed"]
@@ -27,11 +26,11 @@ NAMES = ["speed", "slower by the error of the force", "slower by the turn", "cor
 class Agent:
     """Follows the lanes; `theta` (5,) says how fast and how hard, see `NAMES`."""
 
-    def __init__(self, theta: Array, names: Sequence[str]) -> None:
+    def __init__(self, theta: Floats, names: Sequence[str]) -> None:
         self.theta, self.at = theta, {name: i for i, name in enumerate(names)}
         self.corner, self.normal = 0, np.full(2, np.nan)
 
-    def act(self, observation: Array) -> Array:
+    def act(self, observation: Floats) -> Floats:
         """The action for an observation."""
         place, normal, (wanted, force) = (
             np.array([observation[self.at[name]] for name in names])
@@ -53,7 +52,7 @@ class Agent:
         return np.array([*(speed * way / np.hypot(*way)), press], dtype=np.float32)
 
 
-def fixed(speed: float) -> Array:
+def fixed(speed: float) -> Floats:
     """The policy that keeps to a speed, as a share of the highest, and to the wanted force."""
     return np.array([np.log(speed / (1 - speed)), 0, 0, 0, 0])
 
@@ -70,7 +69,7 @@ def start_worker() -> None:
     open_environment()
 
 
-def episode_return(job: tuple[Array, int, str]) -> float:
+def episode_return(job: tuple[Floats, int, str]) -> float:
     """The area that one episode touched well, mm²; a job is (theta, seed, objects)."""
     theta, seed, objects = job
     env = globals()["env"]
@@ -82,14 +81,14 @@ def episode_return(job: tuple[Array, int, str]) -> float:
     return total
 
 
-def returns(pool: Any, thetas: Sequence[Array] | Array, seeds: Sequence[int], objects: str) -> Array:
+def returns(pool: Any, thetas: Sequence[Floats] | Floats, seeds: Sequence[int], objects: str) -> Floats:
     """(thetas, seeds) returns."""
     jobs = [(theta, seed, objects) for theta in thetas for seed in seeds]
     return np.array(pool.map(episode_return, jobs, chunksize=1)).reshape(len(thetas), len(seeds))
 
 
 # %% Learn it, and compare it with the wanted force at fixed speeds
-def learn(pool: Any, seed: int, generations: int, population: int, episodes: int) -> Array:
+def learn(pool: Any, seed: int, generations: int, population: int, episodes: int) -> Floats:
     """The mean of the last elite (5,)."""
     rng = np.random.default_rng(seed)
     mean, sigma = fixed(0.6), np.ones(5)

@@ -28,8 +28,11 @@ except ImportError as error:
 
 from canprobe.lab.gym.env import TouchScan
 from canprobe.lab.gym.objects import OBJECTS
-from canprobe.lab.gym.randomise import Choice, Uniform
+from canprobe.lab.gym.randomise import OneOf, Uniform
 
-__all__ = ["OBJECTS", "Choice", "TouchScan", "Uniform"]
+__all__ = ["OBJECTS", "Choice", "OneOf", "TouchScan", "Uniform"]
+
+Choice = OneOf
+"""The earlier name of `OneOf`."""
 
 gymnasium.register(id="canprobe/TouchScan-v0", entry_point="canprobe.lab.gym.env:TouchScan")

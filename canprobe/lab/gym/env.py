@@ -56,11 +56,11 @@ class TouchScan(gymnasium.Env[Any, NDArray[np.float32]]):
     supervision ends the episode, 20 mm² are subtracted. The return of an episode, in mm², is the area touched well.
 
     Args:
-        scene: of a scan: a packaged name, a path or a `Scene`; None for `cylinder` with `DEFAULT_SCENE`.
+        scene: scene of a scan: a packaged name, a path or a `Scene`; None for `cylinder` with `DEFAULT_SCENE`.
         observation: `features`, `tactile` or `oracle`, see `Observations`.
         estimate: run the surface estimator in the loop; False leaves it out, and its features.
         control_hz: actions a second; a whole number of cycles must go into each.
-        options: of every episode, on which those of `reset` come.
+        options: options of every episode; those of `reset` come on top.
         record: folder; each episode leaves the files of a run there, in `episode-N`, for `canprobe view`.
         render_mode: None; there is no other.
 
@@ -114,9 +114,9 @@ class TouchScan(gymnasium.Env[Any, NDArray[np.float32]]):
         """Draw a scene, bring its cell up, approach and touch.
 
         Args:
-            seed: of all episodes from here on.
+            seed: seed of all episodes from here on.
             options: values by the keys of a scene file, such as `{"object.radius_mm": 50}`, fixed or drawn (`Uniform`,
-                `Choice`), and `objects`: the name of a set of `OBJECTS`, or None for the object of the scene. They come
+                `OneOf`), and `objects`: the name of a set of `OBJECTS`, or None for the object of the scene. They come
                 on top of those of the environment; one that names a key of the object starts from that of the scene.
 
         Returns:
@@ -166,7 +166,7 @@ class TouchScan(gymnasium.Env[Any, NDArray[np.float32]]):
         return self._observations.observe(episode.task, episode.origin, episode.coverage, episode.forces, episode.truth)
 
     def _folder(self) -> Path | None:
-        """Of the next episode that is recorded."""
+        """The folder of the next recorded episode; None where none is recorded."""
         if self._record is None:
             return None
         self._recorded += 1

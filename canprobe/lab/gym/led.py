@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.cell.master.controller import TactileSample
 from canprobe.cell.planning.model import Plan
@@ -19,16 +18,14 @@ from canprobe.mechanics.touch.contact import ContactSample, direction_to_pad
 from canprobe.mechanics.touch.patch.image import Patch
 from canprobe.mechanics.touch.servo import ProbePose
 from canprobe.mechanics.touch.strategies import PathFollower
+from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 
 
-Vector = NDArray[np.float64]
-
-
 class _Heading(PathFollower):
-    """A follower of no curve: it goes where it is told."""
+    """A follower without a curve: it moves at the velocity that the agent sets."""
 
     def __init__(self) -> None:
         self.direction = (1.0, 0.0)
@@ -48,21 +45,21 @@ class LedTask(TouchTask):
     laid into the tangent plane, y = z × x.
 
     Args:
-        plan: of a scan.
+        plan: plan of a scan.
 
     Attributes:
         axes: (3, 3) rows of the scan plane: heading, across, approach normal; base frame.
-        wanted_force: of the scene, N.
-        top_speed: of the scene's scan, m/s.
-        velocity: of the contact now (2,), in the contact frame, m/s.
+        wanted_force: contact force that the scene asks for, N.
+        top_speed: speed of the scene's scan, m/s.
+        velocity: present velocity of the contact (2,), in the contact frame, m/s.
     """
 
     def __init__(self, plan: Plan) -> None:
         task = plan.setup.task
         assert isinstance(task, Touch) and task.scan is not None
         super().__init__(plan, replace(task, duration_s=math.inf), make_sensing(task), make_shape_tracker(plan.setup))
-        self.axes: Vector = np.asarray(task.approach.axes, dtype=float)
-        self.start: Vector = np.asarray(task.approach.start, dtype=float)
+        self.axes: Floats = np.asarray(task.approach.axes, dtype=float)
+        self.start: Floats = np.asarray(task.approach.start, dtype=float)
         self.wanted_force = task.force
         self.top_speed = task.scan.speed
         self.velocity = 0.0, 0.0
@@ -109,13 +106,13 @@ class LedTask(TouchTask):
         """What the servo aims at, N."""
         return self._target_force
 
-    def frame(self, normal: Vector) -> Vector:
+    def frame(self, normal: Floats) -> Floats:
         """(3, 3) rows x, y, z of the contact frame in base, for an outward unit normal (3,)."""
         x = self.axes[0] - (normal @ self.axes[0]) * normal
         x /= np.linalg.norm(x)
         return np.array((x, np.cross(normal, x), normal))
 
-    def lead(self, velocity: Vector, force: float, cycles: int) -> None:
+    def lead(self, velocity: Floats, force: float, cycles: int) -> None:
         """Go over to a velocity of the contact (2,), m/s, and a force, N, evenly within so many cycles."""
         vx, vy = self.velocity
         dx, dy, more = float(velocity[0]) - vx, float(velocity[1]) - vy, force - self._target_force

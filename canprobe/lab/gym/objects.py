@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from canprobe.errors import UsageError
-from canprobe.lab.gym.randomise import Choice, Uniform, Values, drawn
+from canprobe.lab.gym.randomise import OneOf, Uniform, Values, drawn
 
 START_MM = (-150.0, -150.0, 374.0)
 """Where the default scene expects its object."""
@@ -27,7 +27,7 @@ _HELD_OUT = (
     {"kind": "torus", "ring_radius_mm": Uniform(100.0, 140.0), "radius_mm": Uniform(40.0, 60.0), **_TURNED},
     {"kind": "fillet", "radius_mm": Uniform(30.0, 50.0), "angle_deg": Uniform(20.0, 30.0), **_TURNED},
 )
-OBJECTS: Mapping[str, Choice] = MappingProxyType({"train": Choice(_TRAIN), "held_out": Choice(_HELD_OUT)})
+OBJECTS: Mapping[str, OneOf] = MappingProxyType({"train": OneOf(_TRAIN), "held_out": OneOf(_HELD_OUT)})
 """Sets of objects by name: the section `[object]` of an episode's scene, round the start point of the default scene."""
 
 

@@ -11,15 +11,16 @@ from gymnasium import spaces
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Touch
 from canprobe.lab.gym.led import LedTask
-from canprobe.lab.gym.region import SECTORS, Coverage, Vector
+from canprobe.lab.gym.region import SECTORS, Coverage
 from canprobe.mechanics.touch.pad import COUNTS_MAX
+from canprobe.mechanics.types import Floats
 
 Kind = Literal["features", "tactile", "oracle"]
 KINDS: tuple[Kind, ...] = ("features", "tactile", "oracle")
 
 
 FARTHEST_MM = 50.0
-"""From the first contact: bound of an observation."""
+"""Largest observed distance from the first contact."""
 
 
 class Observations:
@@ -28,11 +29,11 @@ class Observations:
     Args:
         kind: `features`, which the master measures; `tactile`, the same and the last image; `oracle`, the features and
             what is true.
-        plan: of the scene; another scene of the same cell has the same spaces.
+        plan: plan of the scene; another scene of the same cell has the same spaces.
         shape: there is a surface estimator.
 
     Attributes:
-        names: of the entries of the vector, in order, with their units.
+        names: names of the entries of the vector, in order, with their units.
         space: bounds in these units.
     """
 
@@ -72,7 +73,7 @@ class Observations:
     def observe(
         self,
         task: LedTask,
-        origin: Vector,
+        origin: Floats,
         coverage: Coverage,
         forces: Sequence[float],
         truth: Mapping[str, Any],
@@ -80,11 +81,11 @@ class Observations:
         """An element of the space.
 
         Args:
-            task: in contact, or as it was last.
+            task: the led task, in contact or as it was last.
             origin: first contact (3,), base frame, m.
             coverage: so far.
             forces: as measured since the last observation, N.
-            truth: of the plant.
+            truth: true state of the plant.
         """
         contact = task.last_contact
         along, across, up = (task.axes @ (contact.p_base - origin)).tolist()
@@ -136,7 +137,7 @@ def _curvature(which: str, bend: float) -> dict[str, tuple[float, float]]:
     return {f"{which}k_{axes}_per_m": (-bend, bend) for axes in ("xx", "xy", "yy")}
 
 
-def _in_frame(tensor: Vector, frame: Vector) -> list[float]:
+def _in_frame(tensor: Floats, frame: Floats) -> list[float]:
     """A tensor (3, 3) of base as xx, xy, yy in the frame of rows x, y, z."""
     x, y, _ = frame
     return [float(x @ tensor @ x), float(x @ tensor @ y), float(y @ tensor @ y)]

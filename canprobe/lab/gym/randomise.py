@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 Values = Mapping[str, Any]
-"""By dotted key; a value is one of the scene's, or a draw."""
+"""Dotted key → value as in a scene file, or draw of one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,23 +31,23 @@ class Uniform:
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
+class OneOf:
     """A value that is one of several, each as likely, for each episode.
 
     Attributes:
-        values: of the key; they may be draws themselves, or tables with draws in them.
+        values: possible values of the key; a value may itself be a draw, or a table with draws in it.
     """
 
     values: Sequence[Any]
 
     def draw(self, rng: np.random.Generator) -> Any:
-        """One of them."""
+        """Draw one of the values."""
         return drawn(self.values[int(rng.integers(len(self.values)))], rng)
 
 
 def drawn(value: Any, rng: np.random.Generator) -> Any:
     """The value with everything drawn that is to be drawn."""
-    if isinstance(value, Uniform | Choice):
+    if isinstance(value, Uniform | OneOf):
         return value.draw(rng)
     if isinstance(value, Mapping):
         return {key: drawn(item, rng) for key, item in value.items()}

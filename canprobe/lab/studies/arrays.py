@@ -24,7 +24,7 @@ from canprobe.cell.emulated.image_processing import follow
 from canprobe.cell.plant.elastic_contact import depth_for_force
 from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig
 from canprobe.cell.results.picture import BLUE, INK, picture
-from canprobe.lab.studies.harness import Array, Column, Row, StudyResult
+from canprobe.lab.studies.harness import Column, Row, StudyResult
 from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.touch.pad import Pad
@@ -33,6 +33,7 @@ from canprobe.mechanics.touch.patch.calibrate import calibrate_array
 from canprobe.mechanics.touch.patch.image import PatchCalibration
 from canprobe.mechanics.touch.patch.image_fit import Dwell, what_is_shown
 from canprobe.mechanics.touch.patch.parameter_fit import curvature_errors, moment_errors
+from canprobe.mechanics.types import Floats
 
 RADIUS_M = 0.040
 BALL_PER_M = 40.0
@@ -44,7 +45,7 @@ FRAME_S, LOADING_S, DWELL_S, APART_S = 0.02, 0.5, 3.0, 2.5
 REFERENCE_S = 9.0
 """Reference loads rest longer: what creeps has then crept."""
 REFERENCE_SIGMA = 0.005
-UNREST, UNREST_S = 0.03, 0.1
+FORCE_RELATIVE_SIGMA, FORCE_CORRELATION_S = 0.03, 0.1
 """The force wanders under a servo: relative standard deviation, and correlation time."""
 ENCODER_M = 3e-6
 EIGHT_M, STROKE_M, STROKE_HZ = (1.5e-3, 0.6e-3), (0.5e-3, 0.0), (0.5, 1.5)
@@ -92,8 +93,8 @@ class Presses:
     """Presses known shapes on one array, one after the other: it remembers, until it is left to `rest`.
 
     Args:
-        config, stiffness: of the array and its layer, N/m³.
-        rng: of gains and noise.
+        config, stiffness: the array, and the stiffness of its layer, N/m³.
+        rng: generator of gains and noise.
     """
 
     def __init__(self, config: TaxelConfig, stiffness: float, rng: np.random.Generator) -> None:
@@ -118,17 +119,17 @@ class Presses:
         """One touch, pressed for half a second and rolled over the pad.
 
         Args:
-            name: of the object.
+            name: name of the object.
             force: N.
             kappa: principal curvatures, larger first, 1/m.
-            number: of the place.
+            number: number of the place.
             at: on the pad, m.
-            angle: of the first principal direction on the pad, rad.
-            seconds: of the roll.
-            heading: of the roll on the pad, rad.
+            angle: angle of the first principal direction on the pad, rad.
+            seconds: duration of the roll.
+            heading: heading of the roll on the pad, rad.
             roll: half-widths along and across the heading, m.
-            hz: of the roll, one after the other.
-            measured: the true force is told, with the error of a scale.
+            hz: rates of the roll, one after the other.
+            measured: whether the true force is given, with the error of a scale.
         """
         array, began = self._array, self._t
         rng, depth = self._rng, depth_for_force(force, kappa, RADIUS_M, self._stiffness)
@@ -136,10 +137,10 @@ class Presses:
         axes, origin = np.array([[c, s], [-s, c]]), (4, 4)
         c, s = math.cos(heading), math.sin(heading)
         unrest = phase = 0.0
-        kept = math.exp(-FRAME_S / UNREST_S)
+        kept = math.exp(-FRAME_S / FORCE_CORRELATION_S)
         rows = []
         for t in np.arange(0.0, LOADING_S + seconds, FRAME_S).tolist():
-            unrest = kept * unrest + UNREST * math.sqrt(1.0 - kept**2) * float(rng.standard_normal())
+            unrest = kept * unrest + FORCE_RELATIVE_SIGMA * math.sqrt(1.0 - kept**2) * float(rng.standard_normal())
             share = max(0.0, t - LOADING_S) / seconds
             phase += 2.0 * math.pi * FRAME_S * hz[min(int(share * len(hz)), len(hz) - 1)] * (share > 0.0)
             x, y = roll[0] * math.sin(phase), roll[1] * math.sin(2.0 * phase)
@@ -204,7 +205,7 @@ class Presses:
             yield self.dwell("rod", 2.0, (BALL_PER_M, 0.0), number, angle=angle, heading=heading, roll=(1.5e-3, 0.0))
 
     def by_chance(self) -> Dwell:
-        """A quadric, a force, a place and a time by chance; the true force is told exactly."""
+        """A random quadric, force, place and time; the true force is given exactly."""
         self.rest()
         rng = self._rng
         k1, k2 = sorted(rng.uniform(-12.0, 60.0, 2).tolist(), reverse=True)
@@ -259,7 +260,7 @@ def measure(seed: int) -> dict[str, Any]:
     }
 
 
-def _rms_percent(values: Array) -> float:
+def _rms_percent(values: Floats) -> float:
     return 100.0 * math.sqrt(float(np.mean(np.square(values))))
 
 

@@ -12,236 +12,31 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
 from functools import partial
-from itertools import product
-from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 
-from canprobe.cell.results.picture import BLUE, INK, ORANGE, SHADE, legend, picture
+from canprobe.lab.studies.bound_cases import REGION, BoundCase, all_cases, criteria, quick_cases
+from canprobe.lab.studies.bound_figure import draw_bound
+from canprobe.lab.studies.bound_scores import METHODS, Answer, answer_of, findings, length, score, verdict
 from canprobe.lab.studies.cell_store import as_json
-from canprobe.lab.studies.ground import PATHS, SURFACES, Ground, make_ground
-from canprobe.lab.studies.harness import CHI2_95_OF_3, FROBENIUS, Array, Column, Row, StudyResult
+from canprobe.lab.studies.harness import FROBENIUS, Column, Row, StudyResult
 from canprobe.lab.studies.result_files import SIGMA_COLUMNS, measuring_facts, sigma_values
 from canprobe.lab.studies.sweep import Sweep
-from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 from canprobe.mechanics.touch.estimate.fit import fit_surface
 from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
 from canprobe.mechanics.touch.estimate.prior import Prior
 
-RATIOS, COVERAGES = (0.0, 2.0), (0.85, 1.0)
-"""Scales of the picture; a case beyond is drawn at the edge."""
-
-
-def draw_bound(rows: Sequence[Row], path: Path) -> None:
-    """Error over bound, and coverage, of every case: two panels for each method."""
-    methods = list(dict.fromkeys(r["method"] for r in rows))
-    surfaces = list(dict.fromkeys(r["surface"] for r in rows))
-    title = (
-        "Error of curvature over the least that any estimator can have (Cramér–Rao bound; below 1 the prior helps),\n"
-        "and how often the stated 95 % regions hold the true curvature; a mark: one surface, size, noise and path\n"
-        "filled: a local quadric describes what was felt (inside), so the bound means something; open: it does not\n"
-        "on each surface from left to right: 5 mm, 40 mm, 1 m in size, each with more and more noise\n"
-        "shade: target; values beyond the scale are drawn at its edge"
-    )
-    with picture(path, title, 1.3 + 3.3 * len(methods)) as figure:
-        grid = figure.subplots(2 * len(methods), 1, squeeze=False, sharex=True)[:, 0]
-        for method, upper, lower in zip(methods, grid[::2], grid[1::2], strict=True):
-            mine = [r for r in rows if r["method"] == method and r["ratio"] is not None]
-            _draw(upper, mine, surfaces, "ratio", RATIOS)
-            upper.axhline(1.0, color=INK)
-            upper.axhspan(0.0, 1.1 if method == "ml" else 1.25, color=SHADE, linewidth=0, zorder=0)
-            upper.set(title=f"{method}: error", ylabel="error / bound")
-            _draw(lower, mine, surfaces, "coverage", COVERAGES)
-            lower.axhline(0.95, color=INK)
-            lower.axhspan(0.90, 0.99, color=SHADE, linewidth=0, zorder=0)
-            lower.set(title=f"{method}: coverage of 95 % regions", ylabel="coverage")
-        legend(figure)
-
-
-def _draw(axes: Axes, rows: Sequence[Row], surfaces: Sequence[str], key: str, limits: tuple[float, float]) -> None:
-    for inside, colour in ((False, ORANGE), (True, BLUE)):
-        for path, marker in (("weave", "o"), ("circle", "s")):
-            mine = [r for r in rows if r["inside"] == inside and r["path"] == path]
-            axes.scatter(
-                [_place(r, surfaces) for r in mine], np.clip([r[key] for r in mine], *limits), s=22, marker=marker,
-                linewidths=1.0, edgecolors=colour, facecolors=colour if inside else "none", clip_on=False, zorder=3,
-                label=f"{path}, {'inside' if inside else 'outside'}",
-            )  # fmt: skip
-    axes.set_xticks(range(len(surfaces)), surfaces)
-    axes.set_xlim(-0.6, len(surfaces) - 0.4)
-    axes.set_ylim(limits[0], limits[1] + 0.07 * (limits[1] - limits[0]))
-    axes.grid(visible=False, axis="x")
-
-
-def _place(row: Row, surfaces: Sequence[str]) -> float:
-    """Smaller sizes to the left, more noise to the right."""
-    size = 0.11 * (np.log10(row["size_mm"]) - 1.85)
-    return surfaces.index(row["surface"]) + 2.2 * float(size) + 0.04 * float(np.log2(row["sigma_point_um"] / 20.0))
-
-
-# The cases, and the region in which a local quadratic bound has a meaning.
-
-SIZES_M, LONGEST_M, SAMPLES = (0.005, 0.04, 1.0), 0.02, 160
-NOISES = ((5e-6, 2e-4), (20e-6, 1e-3), (100e-6, 5e-3))
-LEAST_SIZE = 50.0
-"""A ‖K‖ below this counts as this, 1/m."""
-REGION: Mapping[str, float] = MappingProxyType(
-    {"path": 1.0, "bound": 0.2, "κσ": 5e-3, "cubic": 1.0 / 3.0, "spread": 0.25}
-)
-"""Largest path over the radius, bound on an entry of K over its size, κσ_p (turn of the normal over the noise of a
-point, rad), error of the quadric without noise (its prior, and cubic terms of the surface) over the bound, and noise of
-a point over the spread of the points where that is narrowest: beyond, a path is not well excited.
-"""
-
-
-@dataclass(frozen=True, slots=True)
-class BoundCase:
-    """One row of the study, m and rad."""
-
-    surface: str
-    path: str
-    size: float
-    length: float
-    sigma_point: float
-    sigma_normal: float
-
-    @property
-    def ground(self) -> Ground:
-        """The path over the exact surface."""
-        return make_ground(self.surface, self.size, self.path, self.length, SAMPLES)
-
-
-def all_cases() -> Iterator[BoundCase]:
-    """Weaves and circles over every surface and size with every noise, and weaves of 1.5 radii."""
-    for surface in SURFACES:
-        for size in SIZES_M[:2] if surface == "plane" else SIZES_M:
-            for path, noise in product(PATHS, NOISES):
-                yield BoundCase(surface, path, size, min(size, LONGEST_M), *noise)
-        if surface != "plane":
-            for noise in NOISES[1:]:
-                yield BoundCase(surface, "weave", SIZES_M[0], 1.5 * SIZES_M[0], *noise)
-
-
-def quick_cases() -> Iterator[BoundCase]:
-    """Every surface once, and sizes, paths and noises in turn."""
-    for i, surface in enumerate(SURFACES):
-        size = SIZES_M[i % 2]
-        yield BoundCase(surface, PATHS[i % 2], size, min(size, LONGEST_M), *NOISES[i % 3])
-
-
-def criteria(case: BoundCase, ground: Ground, C: Array, model_bias: float) -> dict[str, float]:
-    """The values of a case that `REGION` limits."""
-    size = float(np.linalg.norm(ground.K))
-    return {
-        "path": 0.0 if case.surface == "plane" else case.length / case.size,
-        "bound": math.sqrt(float(np.diag(C).max())) / max(size, LEAST_SIZE),
-        "κσ": float(np.abs(np.linalg.eigvalsh(ground.K)).max()) * case.sigma_point,
-        "cubic": model_bias,
-        "spread": case.sigma_point / math.sqrt(float(np.linalg.eigvalsh(np.cov(ground.points[:, :2].T))[0])),
-    }
-
-
-# From answers to rows: error, bias and coverage over the bound, and the verdict.
-
-METHODS = ("ml", "recursive")
-POOLED_RATIO, CASE_RATIO = {"ml": 1.1, "recursive": 1.25}, {"ml": 1.25, "recursive": 1.4}
-LARGEST_BIAS = 1.0 / 3.0
-"""Of K over the bound."""
-Answer = list[float] | None
-"""Error of K11, K12, K22, its squared length in standard deviations, and the stated ‖·‖²; None where not observed."""
-
-
-def answer_of(ground: Ground, estimate: SurfaceEstimate) -> Answer:
-    """The scored figures of an estimate."""
-    if estimate.rank < 3:
-        return None
-    e, C = ground.error(estimate.T_frame_contact, estimate.K), estimate.covariance
-    return [*e.tolist(), float(e @ np.linalg.solve(C, e)), float(FROBENIUS @ np.diag(C))]
-
-
-def score(answers: Sequence[Answer], bound: float) -> dict[str, Any]:
-    """Error, stated error and bias over the bound on ‖K‖ (1/m), coverage, and the share observed."""
-    seen = np.array([a for a in answers if a is not None])
-    if not len(seen):
-        return dict.fromkeys(("ratio", "claimed", "bias", "coverage")) | {"observed": 0.0}
-    errors = seen[:, :3]
-    mean, scatter = errors.mean(axis=0), float(errors.var(axis=0) @ FROBENIUS) / len(errors)  # the mean's own scatter
-    return {
-        "ratio": math.sqrt(float(np.mean(errors**2 @ FROBENIUS))) / bound,
-        "claimed": math.sqrt(float(np.median(seen[:, 4]))) / bound,
-        "bias": math.sqrt(max(length(mean) ** 2 - scatter, 0.0)) / bound,
-        "coverage": float(np.mean(seen[:, 3] < CHI2_95_OF_3)),
-        "observed": len(seen) / len(answers),
-    }
-
-
-def length(error: Array) -> float:
-    """‖·‖ of (K11, K12, K22)."""
-    return math.sqrt(float(FROBENIUS @ error**2))
-
-
-def verdict(row: Row, seeds: int) -> str:
-    """`good`, or the figures of a row that are out of line.
-
-    With few seeds the limits are wider: by three standard deviations of the coverage (where that is more than 5 %), one
-    of the mean error and two of its size (1/√(6n): three entries, sum of squares).
-    """
-    if row["ratio"] is None:
-        return "not observed" if row["inside"] else "good"
-    open_cover = max(0.05, 3.0 * math.sqrt(0.95 * 0.05 / seeds))
-    wrong = []
-    if row["inside"]:
-        if row["ratio"] > CASE_RATIO[row["method"]] * (1.0 + (0.0 if seeds >= 200 else 2.0 / math.sqrt(6.0 * seeds))):
-            wrong.append("error")
-        if row["bias"] > LARGEST_BIAS + row["ratio"] / math.sqrt(seeds):
-            wrong.append("bias")
-        if row["observed"] < 1.0:
-            wrong.append("not observed")
-    if row["coverage"] < 0.95 - open_cover:
-        wrong.append("overconfident")
-    elif row["inside"] and row["coverage"] > min(0.99, 0.95 + open_cover) and seeds >= 200:
-        wrong.append("covers too much")
-    return ", ".join(wrong) or "good"
-
-
-def findings(rows: Sequence[Row]) -> list[str]:
-    """Pooled figures inside the region, the cases out of line there, and the count outside."""
-    said = []
-    for method in METHODS:
-        mine = [r for r in rows if r["method"] == method]
-        inside = [r for r in mine if r["inside"] and r["ratio"] is not None]
-        outside = [r for r in mine if not r["inside"]]
-        pooled = math.sqrt(float(np.mean([r["ratio"] ** 2 for r in inside])))
-        cover = float(np.mean([r["coverage"] for r in inside]))
-        bad = [r for r in inside if r["verdict"] != "good"]
-        honest = [r for r in outside if r["verdict"] == "good"]
-        said.append(
-            f"{method}: inside the region {len(inside)} cases, error pooled {pooled:.3f} × bound (asked for: at most "
-            f"{POOLED_RATIO[method]}), 95 % regions cover {100 * cover:.1f} % pooled (asked for: 94–96 %), "
-            f"{len(bad)} cases out of line; outside {len(outside)} cases, {len(honest)} with honest covariance."
-        )
-        said += [f"  out of line: {_named(r)}: {r['verdict']}" for r in bad]
-    return said
-
-
-def _named(row: Row) -> str:
-    return (
-        f"{row['surface']} {row['size_mm']:.0f} mm, {row['path']}, {row['sigma_point_um']:.0f} µm "
-        f"(error {row['ratio']:.2f}, bias {row['bias']:.2f}, cover {row['coverage']:.3f})"
-    )
-
-
 SEEDS, BLOCK = 200, 20
 """Seeds of a case, and how many of them make a cell of the sweep."""
-MODEL = ("mechanics/touch", "lab/studies/bound.py", "lab/studies/ground.py")
-AT = "at_"
-"""Before the names of `criteria` in a row."""
+MODEL = (
+    "mechanics/touch",
+    *(f"lab/studies/{name}.py" for name in ("bound", "bound_cases", "bound_scores", "ground")),
+)
+CRITERION_PREFIX = "at_"
+"""Prefix of the names of `criteria` in a row."""
 COLUMNS = (
     Column("surface", "surface"),
     Column("path", "path"),
@@ -307,7 +102,8 @@ def _rows(case: BoundCase, answers: dict[str, list[Answer]]) -> Iterator[Row]:
         "surface": case.surface, "path": case.path, "size_mm": case.size * 1e3, "length_mm": case.length * 1e3,
         **sigma_values(case.sigma_point, case.sigma_normal),
         "bound_per_m": bound, "size_of_K_per_m": float(np.linalg.norm(ground.K)),
-        **{AT + name: value for name, value in values.items()}, "inside": not why, "outside_for": ", ".join(why) or "–",
+        **{CRITERION_PREFIX + name: value for name, value in values.items()},
+        "inside": not why, "outside_for": ", ".join(why) or "–",
     }  # fmt: skip
     for method, mine in answers.items():
         row = shared | {"method": method} | score(mine, bound)

@@ -78,7 +78,7 @@ class CellStore:
         fresh: forget what is kept.
 
     Attributes:
-        path: of the file.
+        path: path of the file.
         damaged: number of lines that were left out because they were cut short or changed.
 
     Raises:

@@ -27,12 +27,12 @@ class CycleTimes:
     """Times of the cycles of one run; empty arrays where a time was not measured.
 
     Attributes:
-        period_ns: of SYNC, as asked.
-        lateness_ns: of each SYNC behind its deadline (n,), ns.
-        seconds: from the first SYNC to the last.
-        response_ns: from the last TPDO to the RPDOs, of every fifth cycle (m,), ns.
+        period_ns: requested period of SYNC.
+        lateness_ns: time of each SYNC behind its deadline (n,), ns.
+        seconds: time from the first SYNC to the last.
+        response_ns: time from the last TPDO to the RPDOs in every fifth cycle (m,), ns.
         compute_ns: the same with the controller's work after the RPDOs (m,), ns.
-        latency_ns: from each SYNC to the last of the drives' TPDOs that answer it (k,), ns.
+        latency_ns: time from each SYNC to the last of the drives' TPDOs that answer it (k,), ns.
         missed: TPDOs that a cycle did without.
         processor_share: processor time of the master's process over `seconds`; None where it cannot be measured.
     """
@@ -78,12 +78,12 @@ def woken(clock: Clock, period_ns: int, cycles: int, lateness: list[int]) -> Ite
 
 
 def answer_latencies(path: Path, feedback_ids: frozenset[int], period_ns: int) -> Times:
-    """From each SYNC of a candump log to the last of the TPDOs that answer it within a period.
+    """Measure the time from each SYNC of a candump log to the last of the TPDOs that answer it within a period.
 
     Args:
-        path: of the log.
+        path: path of the log.
         feedback_ids: COB-IDs of the TPDOs.
-        period_ns: of SYNC.
+        period_ns: period of SYNC.
 
     Returns:
         One number for each SYNC that all of them answered (k,), ns, in whole microseconds.

@@ -22,7 +22,7 @@ from matplotlib.axes import Axes
 
 from canprobe.cell.results.picture import INK, METHOD_COLOURS, SHADE, legend, log_scale, picture
 from canprobe.lab.studies.ground import Ground, make_ground
-from canprobe.lab.studies.harness import FROBENIUS, Array, Column, Row, StudyResult
+from canprobe.lab.studies.harness import FROBENIUS, Column, Row, StudyResult
 from canprobe.lab.studies.result_files import SIGMA_COLUMNS, measuring_facts, sigma_values
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.touch.contact import ContactSample
@@ -30,6 +30,7 @@ from canprobe.mechanics.touch.estimate.fit import make_estimator
 from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
 from canprobe.mechanics.touch.estimate.online import Estimator
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
+from canprobe.mechanics.types import Floats
 
 STEP_M, FRAME_US, SHARE = 0.125e-3, 5000.0, 8
 """Path between two frames, time between them, frames between two answers of the loop."""
@@ -111,7 +112,7 @@ def on_the_move(surface: str, size: float) -> Ground:
     return make_ground(surface, size, "weave", SAMPLES * STEP_M, SAMPLES, waves=WAVES)
 
 
-def contacts(points: Array, normals: Array, first: int = 0) -> list[ContactSample]:
+def contacts(points: Floats, normals: Floats, first: int = 0) -> list[ContactSample]:
     """Contacts of a probe whose pole follows the normal."""
     pole = np.array([0.0, 0.0, PROBE_M])
     return [
@@ -120,12 +121,12 @@ def contacts(points: Array, normals: Array, first: int = 0) -> list[ContactSampl
     ]
 
 
-def measure_errors(cell: tuple[Place, Noise, bool, int]) -> list[Array | None]:
+def measure_errors(cell: tuple[Place, Noise, bool, int]) -> list[Floats | None]:
     """Error (3,) of K of each setting, of one seed; None where not all of K was observed."""
     (name, size), noise, quick, seed = cell
     ground = on_the_move(name, size)
     samples = contacts(*ground.felt(*noise, np.random.default_rng([seed, round(noise[0] * 1e9)])))
-    errors: list[Array | None] = []
+    errors: list[Floats | None] = []
     for setting in settings(quick):
         estimator = setting.make(*noise)
         for sample in samples if setting.method == "recursive" else samples[-setting.window :]:
@@ -176,7 +177,7 @@ def _row(  # noqa: PLR0917 - one row of a table
     noise: Noise,
     setting: EstimatorSetting,
     times: Sequence[tuple[float, float]],
-    errors: Sequence[Array | None],
+    errors: Sequence[Floats | None],
 ) -> Row:
     size = float(np.linalg.norm(ground.K))
     # the filter's memory fades, it has no window: its bound is that of all samples

@@ -21,7 +21,7 @@ from canprobe.fieldbus.bus.real.processor import BLAS_THREADS
 
 _DASK_WAIT = "10s"
 _GRACE_S = 1.0
-"""For workers to end by themselves: a run catches SIGTERM, stops, and its worker continues."""
+"""Time in which workers end by themselves: a run catches SIGTERM, stops, and its worker continues."""
 
 
 @contextlib.contextmanager
@@ -56,7 +56,7 @@ def dask_executor(address: str) -> Iterator[Executor]:
     """The workers of a Dask cluster; they need the same canprobe.
 
     Args:
-        address: of the scheduler, such as "tcp://10.0.0.1:8786".
+        address: address of the scheduler, such as "tcp://10.0.0.1:8786".
 
     Raises:
         UsageError: package `distributed` is missing.

@@ -28,12 +28,12 @@ class FaultCase:
     """One run.
 
     Attributes:
-        seed: of everything random in the run.
+        seed: seed of everything random in the run.
         scenario: one of `SCENARIOS`.
-        phase: in which the first fault begins.
-        faults: what happens.
-        timed: frames take time on the bus.
-        files: the run writes its log.
+        phase: phase in which the first fault begins.
+        faults: the drawn faults.
+        timed: whether frames take time on the bus.
+        files: whether the run writes its log.
     """
 
     seed: int

@@ -29,12 +29,12 @@ class Scenario:
     """One kind of run.
 
     Attributes:
-        share: of the runs.
+        share: share of the runs.
         scene: packaged scene that it is derived from.
-        rate_hz: of SYNC and sensor.
-        duration_s: of the task itself.
-        mode: of the sensor; None where the scene has no sensor.
-        speed_share: of the joints' speed limits, enough for the task: a drive refuses faster targets.
+        rate_hz: rate of SYNC and sensor.
+        duration_s: duration of the task itself.
+        mode: mode of the sensor; None where the scene has no sensor.
+        speed_share: share of the joints' speed limits, enough for the task: a drive refuses faster targets.
     """
 
     share: float

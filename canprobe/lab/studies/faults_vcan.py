@@ -47,7 +47,7 @@ from canprobe.lab.studies.sweep import Sweep
 RUNS = 40
 SCENARIO, HOLD_S = "press, features", 3.0
 MISSED_SYNCS = 20
-"""Of the drives: a guest stands still for tens of milliseconds, which is no fault of the cell."""
+"""Missed SYNCs that the drives bear: a guest stands still for tens of milliseconds, which is no fault of the cell."""
 PATIENCE_S = 60.0
 REACTION_S = 2.0
 """After the fault, until drives without a master must have stopped: theirs are 0.2 s, the rest is for a slow guest."""
@@ -84,7 +84,7 @@ class ProcessCase:
     Attributes:
         seed: its number.
         fault: what happens.
-        after_s: from the enabling of the drives to the fault.
+        after_s: time from the enabling of the drives to the fault.
     """
 
     seed: int
@@ -103,7 +103,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     check_interface(CHANNEL)
     if (missing := missing_ip()) is not None:
         raise InterfaceError(f"{CHANNEL}: the study takes it down and up: {missing}")
-    link("up")  # whoever may not do that is told before anything moves
+    link("up")  # a user who may not do that learns it before anything moves
     rows = []
     total = len(ProcessFault) if quick else RUNS
     for seed in range(total):

@@ -12,8 +12,8 @@ from functools import partial
 import numpy as np
 
 from canprobe.errors import UsageError
-from canprobe.lab.studies.harness import Array
 from canprobe.mechanics.touch.surface import SurfaceMatrix
+from canprobe.mechanics.types import Floats
 
 SURFACES = ("plane", "cylinder", "sphere", "ellipsoid", "saddle", "hyperboloid", "torus")
 PATHS = ("weave", "circle")
@@ -39,24 +39,24 @@ class Ground:
         tensor: the true curvature tensor (3, 3) at the foot of a point (3,) near the contact, 1/m.
     """
 
-    points: Array
-    normals: Array
+    points: Floats
+    normals: Floats
     surface: SurfaceMatrix
     length: float
-    tensor: Callable[[Array], Array]
+    tensor: Callable[[Floats], Floats]
 
     @property
-    def K(self) -> Array:
+    def K(self) -> Floats:
         """(2, 2) shape operator at the last point, in its contact frame, 1/m."""
         return self.surface.curvature_at(np.zeros(3))[0]
 
-    def felt(self, sigma_point: float, sigma_normal: float, rng: np.random.Generator) -> tuple[Array, Array]:
+    def felt(self, sigma_point: float, sigma_normal: float, rng: np.random.Generator) -> tuple[Floats, Floats]:
         """Points and unit normals with independent noise: m per axis, rad per tangent axis."""
         points = self.points + sigma_point * rng.normal(size=self.points.shape)
         normals = self.normals + sigma_normal * rng.normal(size=self.normals.shape)
         return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
-    def error(self, T_frame_contact: Array, K: Array) -> Array:
+    def error(self, T_frame_contact: Floats, K: Floats) -> Floats:
         """(3,) K11, K12, K22 of an estimate less the truth at its contact point, in its contact frame, 1/m.
 
         An estimate holds at the foot of the last *measured* point, which is off by that point's noise; on a tight
@@ -76,10 +76,10 @@ def make_ground(surface: str, size: float, path: str, length: float, samples: in
         path: one of `PATHS`.
         length: along the path as seen from above, m.
         samples: equally spaced points.
-        waves: of a weave; it is as wide as such a wave is long, times 5/6.
+        waves: number of waves of a weave; it is as wide as such a wave is long, times 5/6.
 
     Raises:
-        UsageError: for an unknown name.
+        UsageError: the name is unknown.
     """
     if path not in PATHS:
         raise UsageError(f"path: expected one of {', '.join(PATHS)}, got {path!r}")
@@ -93,12 +93,12 @@ def make_ground(surface: str, size: float, path: str, length: float, samples: in
     return Ground(points, matrix.normal(points), matrix, length, partial(_tensor_of_quadric, matrix))
 
 
-def _tensor_of_quadric(surface: SurfaceMatrix, near: Array) -> Array:
+def _tensor_of_quadric(surface: SurfaceMatrix, near: Floats) -> Floats:
     K, basis = surface.curvature_at(surface.project(near))
     return np.asarray(basis @ K @ basis.T, dtype=np.float64)
 
 
-def _weave(length: float, samples: int, waves: float) -> tuple[Array, Array]:
+def _weave(length: float, samples: int, waves: float) -> tuple[Floats, Floats]:
     """A sine whose amplitude is 5/12 of its wave length, cut to the wanted length; it ends at the origin."""
     t = np.linspace(-waves, 0.0, 8001)
     y = _AMPLITUDE * np.sin(2.0 * np.pi * t)
@@ -108,7 +108,7 @@ def _weave(length: float, samples: int, waves: float) -> tuple[Array, Array]:
     return scale * np.interp(at, arc, t), scale * np.interp(at, arc, y)
 
 
-def _circle(length: float, samples: int) -> tuple[Array, Array]:
+def _circle(length: float, samples: int) -> tuple[Floats, Floats]:
     """One turn that ends at the origin."""
     a = np.linspace(0.0, 2.0 * np.pi, samples)
     radius = length / (2.0 * np.pi)
@@ -138,7 +138,7 @@ def _turned(surface: SurfaceMatrix) -> SurfaceMatrix:
     return surface.transformed(T)
 
 
-def _on_torus(tube: float, x: Array, y: Array, length: float) -> Ground:
+def _on_torus(tube: float, x: Floats, y: Floats, length: float) -> Ground:
     """Outside of a torus; the path is laid on its two angles, which keeps points and normals exact."""
     ring, a = _TORUS_RING * tube, _TORUS_ANGLE
     c, s = np.cos(_OFF_AXIS), np.sin(_OFF_AXIS)
@@ -155,7 +155,7 @@ def _on_torus(tube: float, x: Array, y: Array, length: float) -> Ground:
     w = -np.array([np.cos(a), 0.0, np.sin(a)])
     axes = np.stack([c * u + s * v, -s * u + c * v, w], axis=1)
 
-    def tensor(near: Array) -> Array:
+    def tensor(near: Floats) -> Floats:
         x, y, z = axes @ near + contact
         about, height = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y) - ring)
         along = np.array([-np.sin(about), np.cos(about), 0.0])

@@ -8,10 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 Say = Callable[[str], None]
-Array = NDArray[np.float64]
 Row = dict[str, Any]
 """A row of a table, by the keys of its columns."""
 CHANNEL = "vcan0"
@@ -26,8 +24,8 @@ class Column:
     """A column of a study's table.
 
     Attributes:
-        key: of the rows, and the heading in the CSV; ends in the unit.
-        heading: in the printed table.
+        key: key of the rows, and heading in the CSV; it ends in the unit.
+        heading: heading in the printed table.
         form: how a value is printed, as for `format`.
     """
 
@@ -41,8 +39,8 @@ class StudyResult:
     """What a study found.
 
     Attributes:
-        name: of the study.
-        columns: of the table.
+        name: name of the study.
+        columns: columns of the table.
         rows: one a case; None where a value does not apply.
         findings: sentences with figures.
         facts: what it was measured with.

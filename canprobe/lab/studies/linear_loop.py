@@ -23,7 +23,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.linalg import expm
 
-from canprobe.lab.studies.harness import Array
+from canprobe.mechanics.types import Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class ForceLoop:
 
     Attributes:
         depth_ratio: g, measured over true depth.
-        period_s: of the cycle.
+        period_s: period of the cycle.
         sample_cycles: cycles between two tactile images.
         height_hz: bandwidth of the surface's height correction, the force gain.
         late_s: delay of targets and tactile frames on the bus.
@@ -55,7 +55,7 @@ class ForceLoop:
 
 
 @lru_cache(maxsize=64)
-def drive_step(period_s: float, omega: float, damping: float) -> Array:
+def drive_step(period_s: float, omega: float, damping: float) -> Floats:
     """Map (3, 4) of position, rate, reference and the target that is latched to the first three a cycle later."""
     rates = np.zeros((4, 4))  # of position, rate, reference, slope
     rates[0, 1] = 1.0
@@ -63,12 +63,12 @@ def drive_step(period_s: float, omega: float, damping: float) -> Array:
     rates[2, 3] = 1.0
     ramp = np.eye(4)
     ramp[3] = 0.0, 0.0, -1.0 / period_s, 1.0 / period_s
-    step: Array = (expm(rates * period_s) @ ramp)[:3]
+    step: Floats = (expm(rates * period_s) @ ramp)[:3]
     step.flags.writeable = False
     return step
 
 
-def sample_map(loop: ForceLoop) -> Array:
+def sample_map(loop: ForceLoop) -> Floats:
     """Map of the whole state over one period of the sensor.
 
     The state at a SYNC: position, rate, reference, a, the last targets, newest first, and the positions at the SYNCs

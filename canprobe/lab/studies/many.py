@@ -28,8 +28,9 @@ from canprobe.cell.session.terminal import Report
 from canprobe.errors import CanprobeError, SafetyStop, UsageError, install_line
 from canprobe.fieldbus.bus.files import make_folder, whole_file
 from canprobe.lab.studies.cell_store import model_digest
-from canprobe.lab.studies.harness import Array, Row
+from canprobe.lab.studies.harness import Row
 from canprobe.lab.studies.sweep import error_text, open_sweep
+from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     import pandas
@@ -50,7 +51,7 @@ class RunCase:
     Attributes:
         scene: as TOML.
         files: digest of the files that it names.
-        seed: in the place of the scene's.
+        seed: seed in the place of the scene's.
         series: columns of the log, or of the truth, that are kept.
         every_ms: time between two of their values.
     """
@@ -84,7 +85,7 @@ def measure(case: RunCase) -> dict[str, Any]:
     }
 
 
-def _sampled(result: RunResult, column: Array, every_s: float) -> Array:
+def _sampled(result: RunResult, column: Floats, every_s: float) -> Floats:
     """The values of a column that held at even distances of time from the first SYNC on."""
     t = result.log["t_s"][: len(column)] - result.log["t_s"][0]
     rows = np.searchsorted(t, np.arange(0.0, t[-1] + 1e-9, every_s) + 1e-9, side="right") - 1
@@ -119,7 +120,7 @@ def run_many(
         seeds: how many, from 0 on, or which; the scene's by default.
         bus: ``direct`` or ``lockstep``; the scene's by default. Where the wire is of no interest, ``direct`` gives the
             results of a lockstep bus without delays, several times as fast.
-        duration_s: in the place of the scene's, s.
+        duration_s: duration in the place of the scene's, s.
         workers: number of processes, one for each core by default; or the address of a Dask scheduler, such as
             ``tcp://10.0.0.1:8786``, whose workers have the same canprobe.
         out: folder of the finished runs; ``runs/many-<scene>`` by default.
@@ -210,10 +211,10 @@ class Runs:
 
     Attributes:
         scene: what they have in common.
-        keys: that were varied.
+        keys: keys that were varied.
         rows: the value of each key, and ``seed``, of each run.
-        outcomes: of each run ``status`` (``done``; ``stopped`` for safety; ``refused`` by the plan; ``failed``),
-            ``reason``, ``summary`` (as in ``summary.json``; None where nothing ran) and ``series``.
+        outcomes: what became of each run: ``status`` (``done``; ``stopped`` for safety; ``refused`` by the plan;
+            ``failed``), ``reason``, ``summary`` (as in ``summary.json``; None where nothing ran) and ``series``.
         series: names of the columns that were kept.
         every_s: time between two of their values, s.
     """

@@ -34,9 +34,9 @@ from canprobe.lab.studies.plain_canopen import run_plain
 RATE_HZ = 400.0
 MISSED_SYNCS, LATE_PERCENT = 250, 100
 PATIENCE = {"missed_syncs": MISSED_SYNCS, "late_cycles_max_percent": LATE_PERCENT}
-"""Of the cases' scenes: neither a drop-out nor late cycles end a run at a rate that cannot be held."""
+"""Limits in the scenes of the cases: neither a drop-out nor late cycles end a run at a rate that cannot be held."""
 WIRE_BITRATE = 50_000_000
-"""Of the plans at any rate: a virtual bus has no bit rate."""
+"""Bit rate of the plans at any rate: a virtual bus has none."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,18 +33,19 @@ from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.errors import PlanError
-from canprobe.lab.studies.harness import CHI2_95_OF_3, FROBENIUS, Array, Column, Row, StudyResult
+from canprobe.lab.studies.harness import CHI2_95_OF_3, FROBENIUS, Column, Row, StudyResult
 from canprobe.lab.studies.random_scenes import random_scene
 from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.sweep import Sweep
+from canprobe.mechanics.types import Floats
 
 PACKAGED = ("cylinder", "sphere", "plane", "saddle", "ellipsoid", "bowl", "torus", "wave", "fillet")
 SEEDS = range(102, 107)
-NUMBERS = range(1000, 1270)
-"""Of random scenes; 0 to 89 were used to look at the estimator's errors."""
+SCENE_NUMBERS = range(1000, 1270)
+"""Numbers of the random scenes; 0 to 89 were used to look at the estimator's errors."""
 PACKAGED_S, RANDOM_S = 10.0, 5.0
-ASKED = (0.93, 0.97)
-SELDOM, HARDLY = 0.8, 0.4
+ASKED_COVERAGE = (0.93, 0.97)
+SELDOM_SHARE, HARDLY_SHARE = 0.8, 0.4
 """Shares of the answers of a scene."""
 DRAWS = 2000
 MODEL = ("fieldbus", "mechanics", "cell", "scenes", "lab/studies/regions.py", "lab/studies/random_scenes.py")
@@ -87,12 +88,14 @@ class ScoredScan(NamedTuple):
     path: str
     full_scale_kpa: float
     late: int
-    scores: Array
+    scores: Floats
 
 
 def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     """Scan the scenes."""
-    packaged, seeds, numbers = (PACKAGED[:1], SEEDS[:1], NUMBERS[2:4]) if quick else (PACKAGED, SEEDS, NUMBERS)
+    packaged, seeds, numbers = (
+        (PACKAGED[:1], SEEDS[:1], SCENE_NUMBERS[2:4]) if quick else (PACKAGED, SEEDS, SCENE_NUMBERS)
+    )
     seconds = (1.8, 1.8) if quick else (PACKAGED_S, RANDOM_S)
     cases = [RegionCase(scene, seed, seconds[0]) for seed in seeds for scene in packaged]
     cases += [RegionCase("random", number, seconds[1]) for number in numbers]
@@ -128,7 +131,7 @@ def measure(case: RegionCase) -> ScoredScan:
     )
 
 
-def scored(record: ShapeRecord, truth: dict[str, Array], times: Array) -> list[float]:
+def scored(record: ShapeRecord, truth: dict[str, Floats], times: Floats) -> list[float]:
     """One of `ScoredScan.scores`, in the answer's own axes."""
     row = int(np.searchsorted(times, record.t_s - 1e-6))
     P = record.estimate.T_frame_contact[:3, :2]
@@ -171,15 +174,15 @@ def row_of(group: str, name: str, scans: Sequence[ScoredScan]) -> Row:
         "group": group, "of": name, "scenes": len(scans), "refused": sum(scan.late == 0 for scan in scans),
         "answers": int(total[0]), "observed": float(total[0]) / max(sum(scan.late for scan in scans), 1),
         "coverage": float(np.mean(answers[:, 2] < CHI2_95_OF_3)), "coverage_low": coverage[0],
-        "coverage_high": coverage[1], "below_80": float(np.mean(shares < SELDOM)) if len(shares) else math.nan,
-        "below_40": float(np.mean(shares < HARDLY)) if len(shares) else math.nan,
+        "coverage_high": coverage[1], "below_80": float(np.mean(shares < SELDOM_SHARE)) if len(shares) else math.nan,
+        "below_40": float(np.mean(shares < HARDLY_SHARE)) if len(shares) else math.nan,
         "error_per_m": math.sqrt(float(np.mean(answers[:, 0]))),
         "stated_over_error": math.sqrt(float(np.mean(answers[:, 1]) / np.mean(answers[:, 0]))),
         "stated_low": stated[0], "stated_high": stated[1], "log_score": float(np.mean(answers[:, 3])),
     }  # fmt: skip
 
 
-def _interval(values: Array) -> tuple[float, float]:
+def _interval(values: Floats) -> tuple[float, float]:
     """Where 95 % of the draws lie."""
     if not len(values):
         return math.nan, math.nan
@@ -202,7 +205,9 @@ def findings(rows: Sequence[Row]) -> list[str]:
         outside = [
             f"{row['of']} {100 * row['coverage']:.1f} %"
             for row in rows
-            if row["group"] == whole["group"] and row is not whole and not ASKED[0] <= row["coverage"] <= ASKED[1]
+            if row["group"] == whole["group"]
+            and row is not whole
+            and not ASKED_COVERAGE[0] <= row["coverage"] <= ASKED_COVERAGE[1]
         ]
         said.append(f"  outside what is asked for: {', '.join(outside) or 'none'}.")
     return said
@@ -221,7 +226,7 @@ def draw_regions(rows: Sequence[Row], path: Path) -> None:
     )
     with picture(path, title, 4.4) as figure:
         left, right = figure.subplots(1, 2)
-        left.axhspan(*ASKED, color=SHADE, linewidth=0, zorder=0)
+        left.axhspan(*ASKED_COVERAGE, color=SHADE, linewidth=0, zorder=0)
         right.axhspan(0.9, 1.15, color=SHADE, linewidth=0, zorder=0)
         right.axhline(1.0, color=INK, linewidth=0.8)
         for j, group in enumerate(dict.fromkeys(r["group"] for r in rows)):

@@ -81,7 +81,7 @@ def text_of(result: StudyResult) -> str:
 
 
 def as_document(result: StudyResult) -> dict[str, Any]:
-    """For `--json`: no NaN, what does not apply is null."""
+    """The document of `--json`; what does not apply is null, never NaN."""
     more = {"more": [as_document(part) for part in result.more]} if result.more else {}
     return {
         "study": result.name,

@@ -25,11 +25,12 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from canprobe.cell.results.picture import AMBER, BLUE, GREY, INK, ORANGE, PINK, legend, log_scale, parts, picture
-from canprobe.lab.studies.harness import Array, Column, Row, StudyResult
+from canprobe.lab.studies.harness import Column, Row, StudyResult
 from canprobe.lab.studies.linear_loop import ForceLoop, spectral_radius
 from canprobe.lab.studies.result_files import measuring_facts
-from canprobe.lab.studies.stability_runs import HUNTING, LoopCase, carry_out, loop_of, touch_in_posture
+from canprobe.lab.studies.stability_runs import HUNTING_SPREAD, LoopCase, carry_out, loop_of, touch_in_posture
 from canprobe.lab.studies.sweep import Sweep
+from canprobe.mechanics.types import Floats
 
 STIFFNESSES = (1e2, 1e3, 1e4, 2e4, 4e4, 6e4, 1e5, 1e6, 1e7)
 GAINS_HZ = (2.0, 8.0, 25.0)
@@ -44,7 +45,7 @@ WRISTS_DEG = (0.0, 3.0, 10.0)
 RADII_MM = (1.0, 5.0, 40.0, 10_000.0)
 SPEEDS_MM_S = (25.0, 50.0, 100.0, 250.0)
 SCAN_S = 1.5
-"""Of a scan: the curvature is known in its second half."""
+"""Duration of a scan: the curvature is known in its second half."""
 _AT = (-120.0, -122.5, 374.0)
 WIDE_PERCENT = 20.0
 ENDS = ("stable", "stopped", "refused")
@@ -203,7 +204,7 @@ def findings(rows: Sequence[Row]) -> list[str]:
     if not other:
         said.append("Every touch is stable within limits, stopped safely with the reason, or refused by the plan.")
     elif any(r["ended"] == "hunting" for r in other):
-        said.append(f"Hunting: the force's standard deviation is above {100 * HUNTING:.0f} % of the target.")
+        said.append(f"Hunting: the force's standard deviation is above {100 * HUNTING_SPREAD:.0f} % of the target.")
     return said
 
 
@@ -268,7 +269,7 @@ def draw_stability(rows: Sequence[Row], path: Path) -> None:
         legend(lower, marks)
 
 
-def _draw_map(axes: Axes, stiffness: Array, ratios: Sequence[float], bus: ForceLoop, rows: Sequence[Row]) -> None:
+def _draw_map(axes: Axes, stiffness: Floats, ratios: Sequence[float], bus: ForceLoop, rows: Sequence[Row]) -> None:
     """One panel of the map."""
     gains = np.geomspace(1.5, 70.0, 20)
     radius = [

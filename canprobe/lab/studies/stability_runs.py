@@ -29,7 +29,7 @@ from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.node.wrapped import WrappedNode
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.lab.studies.fault_scores import RELEASE_NS, longest_above, reaction_ns
-from canprobe.lab.studies.harness import Array, Row
+from canprobe.lab.studies.harness import Row
 from canprobe.lab.studies.linear_loop import ForceLoop
 from canprobe.lab.studies.witnessed_run import Witness, run_to_end
 from canprobe.mechanics.robot.chain import forward
@@ -37,6 +37,7 @@ from canprobe.mechanics.robot.inverse import inverse_near
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.touch.contact import Slope, indentation_from_force
 from canprobe.mechanics.touch.patch.array_models import make_patch_calibration
+from canprobe.mechanics.types import Floats
 
 
 class LateNode(WrappedNode):
@@ -45,7 +46,7 @@ class LateNode(WrappedNode):
     Args:
         node: the node.
         late_ids: COB-IDs that come late, both ways.
-        late_ns: by how much.
+        late_ns: time by which it is late.
     """
 
     def __init__(self, node: SlaveNode, late_ids: Container[int], late_ns: int) -> None:
@@ -96,7 +97,7 @@ class LateNode(WrappedNode):
 
 
 LOOK_NS = 1_250_000
-HUNTING = 0.2
+HUNTING_SPREAD = 0.2
 """Standard deviation of the force over the second half of the hold, over the target, above which it did not settle."""
 SENSOR_HZ = 200.0
 
@@ -108,20 +109,20 @@ class LoopCase:
     Attributes:
         view: part of the map.
         contact_n_m: stiffness dF/dδ of the contact at the wanted force, N/m.
-        rate_hz: of the servo.
+        rate_hz: rate of the servo.
         late_ms: delay of targets and tactile frames.
         height_hz: the force gain.
         feels: the servo estimates the stiffness from the touch; else it uses that of the default pad.
-        bandwidth_hz: of the drives.
-        fidelity: of the plant.
+        bandwidth_hz: bandwidth of the drives.
+        fidelity: fidelity of the plant.
         probe_mm: radius of the probe.
-        kind, radius_mm: of the object.
-        speed_mm_s: of a scan; 0 presses.
-        at_mm: where the object is touched, base frame.
+        kind, radius_mm: kind and radius of the object.
+        speed_mm_s: speed of a scan; 0 presses.
+        at_mm: point at which the object is touched, base frame.
         normal: outward normal there.
         posture_deg: selects the branch of the inverse kinematics.
         force_n: target.
-        hold_s: of the press or scan.
+        hold_s: duration of the press or scan.
     """
 
     view: str
@@ -156,7 +157,7 @@ def layer_stiffness(case: LoopCase) -> float:
     return float(indentation_from_force(case.force_n, 1.0, case.probe_mm * 1e-3, _kappa(case)) / depth) ** 2
 
 
-def _kappa(case: LoopCase) -> Array:
+def _kappa(case: LoopCase) -> Floats:
     place = true_object(_object(case))
     return np.maximum(place.closest(np.array(case.at_mm) * 1e-3).kappa, -0.9e3 / case.probe_mm)
 
@@ -307,7 +308,7 @@ def carry_out(case: LoopCase) -> Row:
         ended, reason = "failed", "the force is not finite"
     elif above_ns > allowed_ns:
         ended, reason = "failed", f"force above the limit for {above_ns * 1e-6:.0f} ms; ended: {reason}"
-    elif ended == "stable" and not (spread is not None and spread <= 100.0 * HUNTING):
+    elif ended == "stable" and not (spread is not None and spread <= 100.0 * HUNTING_SPREAD):
         ended = "hunting"
     figures = (float(forces.max()), above_ns * 1e-6, allowed_ns * 1e-6, force_error, spread)
     return {"ended": ended, "reason": reason, **dict(zip(names, figures, strict=True))}

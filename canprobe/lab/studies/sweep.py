@@ -57,7 +57,7 @@ class Sweep:
         progress: called after each cell.
 
     Attributes:
-        folder: of the store, for what a study publishes besides its table.
+        folder: folder of the store, for what a study publishes besides its table.
     """
 
     def __init__(self, executor: Opener, store: CellStore, *, say: Say, progress: Progress | None = None) -> None:
@@ -117,7 +117,7 @@ def open_sweep(
     """A sweep over the processes of this machine, or a Dask cluster, that keeps its cells in a folder.
 
     Args:
-        folder: for `cells.jsonl`; what it holds is not computed again.
+        folder: folder of `cells.jsonl`; what that holds is not computed again.
         workers: number of processes, one for each core by default.
         dask: address of a Dask scheduler to use instead.
         fresh: forget what the folder holds.
@@ -134,7 +134,7 @@ def open_sweep(
 
 
 def _compute(measure: Callable[[Any], object], parts: tuple[str, ...], model: str, cell: Any) -> tuple[bool, str]:
-    """In the worker: success, and the answer or the error as text. Not every exception can be pickled."""
+    """Measure a cell in the worker: success, and the answer, or the error as text: not all exceptions are pickled."""
     try:
         if (here := model_digest(parts)) != model:
             return False, f"the worker on {platform.node()} has another canprobe or numpy (model {here}, not {model})"

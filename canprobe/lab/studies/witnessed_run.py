@@ -21,7 +21,7 @@ class Witness(Participant):
     """A participant of the bus that looks at the plant periodically, also when the master sends no SYNC any more.
 
     Args:
-        plant: of the run.
+        plant: plant of the run.
         period_ns: between two looks.
 
     Attributes:

@@ -34,7 +34,7 @@ from canprobe.cell.results.picture import AMBER, BLUE, GREY, INK, ORANGE, PINK, 
 from canprobe.cell.scene.arms import Bodies, arm_model
 from canprobe.cell.scene.load import read_cell
 from canprobe.cell.scene.setup import Dynamics
-from canprobe.lab.studies.harness import Array, Column, Row, StudyResult
+from canprobe.lab.studies.harness import Column, Row, StudyResult
 from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.lab.studies.workprec_cell import run_cell
@@ -44,6 +44,7 @@ from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_to_j
 from canprobe.mechanics.robot.motors import units_per_motor
 from canprobe.mechanics.robot.probe_poses import probe_pose, start_posture
 from canprobe.mechanics.touch.objects import make_object
+from canprobe.mechanics.types import Floats
 
 CYCLE_NS = 2_500_000
 SPEED_M_S, FORCE_N = 0.025, 2.0
@@ -61,7 +62,7 @@ def _arm() -> tuple[ArmModel, Bodies]:
 
 
 @cache
-def trial(stiffness_n_m3: float, cycles: int) -> tuple[PlantConfig, Array]:
+def trial(stiffness_n_m3: float, cycles: int) -> tuple[PlantConfig, Floats]:
     """The plant with a layer of a stiffness, and its drives' targets: (cycles + 1, 6) counts, one row per 2.5 ms."""
     pose = np.eye(4)
     pose[:3, 3] = _POINT
@@ -83,7 +84,7 @@ def trial(stiffness_n_m3: float, cycles: int) -> tuple[PlantConfig, Array]:
     ), counts
 
 
-def integrated(stiffness_n_m3: float, cycles: int, stepping: Stepping, held: bool) -> Array | None:
+def integrated(stiffness_n_m3: float, cycles: int, stepping: Stepping, held: bool) -> Floats | None:
     """(cycles, 12) motor counts and rates at the ends of the cycles; None where the integration broke down."""
     config, targets = trial(stiffness_n_m3, cycles)
     arm = DynamicArm(_arm()[0], config.q0, make_equations(config, held=held), stepping)
@@ -117,7 +118,7 @@ def stands(stiffness_n_m3: float, cycles: int, stepping: Stepping) -> bool:
     return bool(max(fastest[-cycles // 4 :]) < AT_REST_COUNTS_S)  # false for NaN too
 
 
-def reference(stiffness_n_m3: float, cycles: int, rtol: float) -> Array:
+def reference(stiffness_n_m3: float, cycles: int, rtol: float) -> Floats:
     """The same by scipy's Radau, cycle by cycle, nothing held."""
     config, targets = trial(stiffness_n_m3, cycles)
     equations, scale = make_equations(config, held=False), units_per_motor(_arm()[0])
@@ -134,7 +135,7 @@ def reference(stiffness_n_m3: float, cycles: int, rtol: float) -> Array:
     return np.array(seen)
 
 
-def observed(stiffness_n_m3: float, cycles: int, states: Array) -> dict[str, Array]:
+def observed(stiffness_n_m3: float, cycles: int, states: Floats) -> dict[str, Floats]:
     """Force (n,) N, probe centre (n, 3) m and taxel pressures (n, 256) Pa of states (n, 12), counts and rates."""
     plant = Plant(trial(stiffness_n_m3, cycles)[0])
     at = [PlantState(0, tuple(row[:6].tolist()), tuple(row[6:].tolist())) for row in states]
@@ -245,7 +246,7 @@ def measure(case: IntegrationCase) -> dict[str, Any]:
     """States of one integration, None where it broke down, and its cost in µs a cycle."""
     stepping = Stepping(case.method, round(1000.0 * case.step_us))
     costs: list[float] = []
-    states: Array | None = None
+    states: Floats | None = None
     for _ in range(1 + case.repeats):
         begun = process_time()
         states = integrated(case.stiffness_n_m3, case.cycles, stepping, case.held)
@@ -253,7 +254,7 @@ def measure(case: IntegrationCase) -> dict[str, Any]:
     return {"states": None if states is None else states.tolist(), "cost_us": min(costs[1:])}
 
 
-def errors(truth: dict[str, Array], seen: dict[str, Array]) -> dict[str, float]:
+def errors(truth: dict[str, Floats], seen: dict[str, Floats]) -> dict[str, float]:
     """RMS errors of an integration."""
     taxels = (seen["taxels"] - truth["taxels"])[:, np.any(truth["taxels"] > 0.0, axis=0)]
     return {
@@ -263,7 +264,7 @@ def errors(truth: dict[str, Array], seen: dict[str, Array]) -> dict[str, float]:
     }
 
 
-def _rms(values: Array) -> float:
+def _rms(values: Floats) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 

@@ -113,7 +113,13 @@ def run_cell(*, quick: bool, sweep: Sweep) -> StudyResult:
     answers = dict(zip(todo, sweep.time(measure, todo), strict=True))
     stiff = [CellCase(s, "recursive", "ideal", duration, 1, STIFF_N_M3) for s in fits]
     held = {case.setting: holds(answer) for case, answer in zip(stiff, sweep.map(measure, stiff), strict=True)}
-    rows = [_row(case, answer) | {"stiff": held[case.setting]} for case, answer in answers.items()]
+    rows = [
+        _named(case.setting)
+        | {"method": case.method, "fidelity": case.fidelity, "reason": ""}
+        | answer
+        | {"stiff": held[case.setting]}
+        for case, answer in answers.items()
+    ]
     rows += [
         {**_named(s), "method": "any", "fidelity": "any", "ended": "refused", "reason": reason}
         for s, reason in why.items()
@@ -197,10 +203,6 @@ def holds(answer: Row) -> str:
 
 def _named(setting: BusSetting) -> Row:
     return {"rate_hz": setting.rate_hz, "mode": setting.mode, "bus": setting.bus}
-
-
-def _row(case: CellCase, answer: Row) -> Row:
-    return {**_named(case.setting), "method": case.method, "fidelity": case.fidelity, "reason": "", **answer}
 
 
 def good(rows: Iterable[Row], fidelity: str) -> list[Row]:

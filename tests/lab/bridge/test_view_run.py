@@ -247,7 +247,7 @@ def test_the_page_holds_the_whole_run(page, run):
     scene = embedded(page)
     names = {message.get("name") for _, message in scene["messages"]}
     assert scene["durationSeconds"] == pytest.approx(run.duration_s)
-    assert {f"/arm/{i}" for i in range(7)} | {"/object/ghost", "/probe/dome", "/contact", "/force"} <= names
+    assert {f"/arm/{i}" for i in range(7)} | {"/object/ghost", "/probe/dome", "/contact", "/contact/force"} <= names
     assert {"/probe/taxels", "/path/000"} <= names and any(str(name).startswith("/surface/") for name in names)
     data = panel_data(page)
     assert data["curves"]["t_s"][-1] == pytest.approx(run.duration_s, rel=1e-4)
@@ -293,9 +293,9 @@ def test_the_arrow_is_seen_wherever_a_contact_is_known(page, run):
     seen, length = {}, math.nan
     shown = False
     for t, message in recording["messages"]:
-        if message.get("name") == "/force" and message["type"] == "SetSceneNodeVisibilityMessage":
+        if message.get("name") == "/contact/force" and message["type"] == "SetSceneNodeVisibilityMessage":
             shown = message["visible"]
-        elif message.get("name") == "/force" and message["type"] == "SceneNodeUpdateMessage":
+        elif message.get("name") == "/contact/force" and message["type"] == "SceneNodeUpdateMessage":
             foot, tip = np.frombuffer(arrays[message["updates"]["points"]["__binary_index"]], "<f4").reshape(2, 3)
             length = np.linalg.norm(tip - foot)
         seen[t] = length if shown else math.nan

@@ -16,7 +16,7 @@ from canprobe.cell.results.files import load_table
 from canprobe.errors import SceneError, UsageError
 from canprobe.fieldbus.protocol.cia402 import DriveState
 from canprobe.lab.examples import learn_touch_scan
-from canprobe.lab.gym.region import BRUSH, SIGHT, Coverage
+from canprobe.lab.gym.region import SIGHT_RADIUS_M, TOUCH_RADIUS_M, Coverage
 
 STILL = np.zeros(3, dtype=np.float32)
 
@@ -117,7 +117,7 @@ def test_options_have_the_keys_and_the_checks_of_a_scene(make):
     env = make(estimate=False)
     drawn = {
         "plant.drive_bandwidth_hz": canprobe.lab.gym.Uniform(20, 40),
-        "task.force_n": canprobe.lab.gym.Choice((1.5, 2.5)),
+        "task.force_n": canprobe.lab.gym.OneOf((1.5, 2.5)),
     }
     _, info = env.reset(seed=0, options={"objects": "held_out", **drawn})
     overrides = info["overrides"]
@@ -218,17 +218,17 @@ def test_the_example_ends_in_one_line_at_ctrl_c():
 def test_coverage_counts_each_part_once():
     coverage = Coverage(40e-3, 20e-3)
     disc = coverage.touch(np.zeros(2))
-    assert disc == pytest.approx(np.pi * BRUSH**2, rel=0.1)
+    assert disc == pytest.approx(np.pi * TOUCH_RADIUS_M**2, rel=0.1)
     assert coverage.touch(np.zeros(2)) == 0.0
     for x in np.arange(0.5e-3, 10.01e-3, 0.5e-3):
         coverage.touch(np.array((x, 0.0)))
-    assert coverage.area == pytest.approx(disc + 10e-3 * 2 * BRUSH, rel=0.2)
+    assert coverage.area == pytest.approx(disc + 10e-3 * 2 * TOUCH_RADIUS_M, rel=0.2)
     assert coverage.share == pytest.approx(coverage.area / (40e-3 * 20e-3))
     left = coverage.left(np.array((10e-3, 0.0)))  # it came from behind: nothing is left there, all is ahead
     assert left[0] == 1.0 and left[4] < 0.5 < left[2]
     corner = coverage.left(np.array((19.9e-3, 9.9e-3)))
     assert corner[0] == corner[1] == corner[2] == 0.0 and corner[5] == 1.0
-    assert coverage.touch(np.array((20e-3 + SIGHT, 0.0))) == 0.0
+    assert coverage.touch(np.array((20e-3 + SIGHT_RADIUS_M, 0.0))) == 0.0
 
 
 def test_an_action_that_is_not_three_finite_numbers_is_refused(make):

@@ -12,7 +12,8 @@ import pytest
 from canprobe.cli import main
 from canprobe.errors import UsageError
 from canprobe.lab.studies import bound
-from canprobe.lab.studies.bound import BoundCase, all_cases, findings
+from canprobe.lab.studies.bound_cases import BoundCase, all_cases
+from canprobe.lab.studies.bound_scores import findings
 from canprobe.lab.studies.cell_store import CellStore
 from canprobe.lab.studies.ground import PATHS, SURFACES, make_ground
 from canprobe.lab.studies.sweep import Sweep

@@ -13,9 +13,10 @@ from canprobe.cli import main
 from canprobe.fieldbus.node.fault import Fault, FaultKind
 from canprobe.lab.studies import witnessed_run
 from canprobe.lab.studies.fault_cases import PHASES, FaultCase
+from canprobe.lab.studies.fault_runs import carry_out, draw_case, peak, phase_windows, run_seed
 from canprobe.lab.studies.fault_scenes import FORCE_MAX_N, SCENARIOS, seeded_plan
 from canprobe.lab.studies.fault_scores import Peak, score_force
-from canprobe.lab.studies.faults import carry_out, draw_case, findings, peak, phase_windows, run_seed, table_rows
+from canprobe.lab.studies.faults import findings, table_rows
 from canprobe.lab.studies.faults_vcan import HOLD_S, ProcessFault, draw_process_case, score_end
 from canprobe.lab.studies.faults_vcan import findings as findings_on_vcan
 

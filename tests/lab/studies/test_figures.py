@@ -21,7 +21,8 @@ from canprobe.cell.results.surface_figure import draw_surface
 from canprobe.fieldbus.node.fault import FaultKind
 from canprobe.lab.studies import estimators, stability, workprec
 from canprobe.lab.studies import stability as stability_figure
-from canprobe.lab.studies.bound import NOISES, SIZES_M, draw_bound
+from canprobe.lab.studies.bound_cases import NOISES, SIZES_M
+from canprobe.lab.studies.bound_figure import draw_bound
 from canprobe.lab.studies.cycle_times import CycleTimes
 from canprobe.lab.studies.estimators import draw_estimators
 from canprobe.lab.studies.fault_scenes import draw_ends, draw_faults

@@ -14,7 +14,7 @@ from canprobe.cell.scene.resolve import resolve
 from canprobe.cli import main
 from canprobe.errors import PlanError
 from canprobe.lab.studies.random_scenes import random_scene
-from canprobe.lab.studies.regions import NUMBERS, ScoredScan, findings, row_of, scored
+from canprobe.lab.studies.regions import SCENE_NUMBERS, ScoredScan, findings, row_of, scored
 
 TIMES = np.arange(0.0, 5.0, 0.0025)
 TRUTH = {
@@ -60,7 +60,7 @@ def test_a_row_tells_overconfidence_and_its_interval_is_over_scenes():
 
 
 def test_random_scenes_differ_and_nearly_all_can_be_planned():
-    scenes = [random_scene(number, 5.0) for number in NUMBERS[:18]]
+    scenes = [random_scene(number, 5.0) for number in SCENE_NUMBERS[:18]]
     assert len({scene.object for scene in scenes}) == 18
     refused = 0
     for scene in scenes:

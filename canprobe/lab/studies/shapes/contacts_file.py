@@ -14,10 +14,10 @@ from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.scene.setup import Touch
 from canprobe.cell.tasks.from_plan import SIGMA_NORMAL_RAD, centroid_coupling
-from canprobe.lab.studies.harness import Array
 from canprobe.lab.studies.shapes.implicit import Touched
 from canprobe.lab.studies.shapes.scans import samples_of
 from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.types import Floats
 
 
 class ShapeContacts(NamedTuple):
@@ -40,7 +40,7 @@ def write_contacts(path: Path, shapes: Mapping[str, Mapping[str, Any]]) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def read_columns(path: Path, name: str) -> dict[str, Array]:
+def read_columns(path: Path, name: str) -> dict[str, Floats]:
     """Columns of a shape."""
     prefix = f"{name}/"
     return {k.removeprefix(prefix): v for k, v in read_npz(path, "contacts").items() if k.startswith(prefix)}

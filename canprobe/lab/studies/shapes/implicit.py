@@ -22,24 +22,24 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
-from canprobe.lab.studies.harness import Array
 from canprobe.mechanics.touch.tangent_frames import tangent_rotation
+from canprobe.mechanics.types import Floats
 
-Kernel = Callable[[Array, float, float], tuple[Array, Array, Array]]
+Kernel = Callable[[Floats, float, float], tuple[Floats, Floats, Floats]]
 """Distances r, scale of f (m) and length (m) → k, a, b."""
 _STEP_M = 2e-4
-"""Of the differences that curvature is taken from."""
-_AT_ONCE = 400
+"""Step of the differences that give the curvature."""
+_BATCH_POINTS = 400
 """Query points; more would only take more memory."""
 
 
-def rbf(r: Array, scale: float, length: float) -> tuple[Array, Array, Array]:
+def rbf(r: Floats, scale: float, length: float) -> tuple[Floats, Floats, Floats]:
     """s² exp(−r²/2ℓ²)."""
     k = scale**2 * np.exp(-0.5 * (r / length) ** 2)
     return k, -k / length**2, k / length**4
 
 
-def thin_plate(r: Array, scale: float, length: float) -> tuple[Array, Array, Array]:
+def thin_plate(r: Floats, scale: float, length: float) -> tuple[Floats, Floats, Floats]:
     """s² (2 r³ − 3 R r² + R³) / R³; R is `length`, to be above every distance."""
     unit = scale**2 / length**3
     k = unit * (2.0 * r**3 - 3.0 * length * r**2 + length**3)
@@ -49,12 +49,12 @@ def thin_plate(r: Array, scale: float, length: float) -> tuple[Array, Array, Arr
 class Touched(NamedTuple):
     """Contacts with their noise: points (n, 3), m, outward normals, and standard deviations (n,), m and rad."""
 
-    points: Array
-    normals: Array
-    sigma_point: Array
-    sigma_normal: Array
+    points: Floats
+    normals: Floats
+    sigma_point: Floats
+    sigma_normal: Floats
 
-    def some(self, i: Array | slice) -> Touched:
+    def some(self, i: Floats | slice) -> Touched:
         """Those of some indices."""
         return Touched(*(values[i] for values in self))
 
@@ -80,11 +80,11 @@ class ImplicitSurface:
         C = self._covariance(points, points)
         C[np.diag_indices_from(C)] += noise**2
         self._root = cho_factor(C, lower=True, overwrite_a=True)
-        self._weights: Array = cho_solve(self._root, observed)
+        self._weights: Floats = cho_solve(self._root, observed)
         self.log_likelihood = -0.5 * float(observed @ self._weights) - float(np.log(np.diag(self._root[0])).sum())
         self.log_likelihood -= 0.5 * len(observed) * math.log(2.0 * math.pi)
 
-    def _covariance(self, x: Array, y: Array) -> Array:
+    def _covariance(self, x: Floats, y: Floats) -> Floats:
         """(4 n, 4 m) of (f, ∇f) at points x and at points y."""
         d = x[:, None] - y
         k, a, b = self._k(np.sqrt(np.einsum("ijk,ijk->ij", d, d)), *self._settings)
@@ -98,23 +98,26 @@ class ImplicitSurface:
                 C[:, 1 + i, :, 1 + j] = -bd[:, :, i] * d[:, :, j] - (a if i == j else 0.0)
         return C.reshape(4 * len(x), 4 * len(y))
 
-    def value(self, x: Array) -> tuple[Array, Array]:
+    def value(self, x: Floats) -> tuple[Floats, Floats]:
         """f (n,) and ∇f (n, 3) at points (n, 3)."""
-        parts = [self._covariance(x[i : i + _AT_ONCE], self.points) @ self._weights for i in range(0, len(x), _AT_ONCE)]
+        parts = [
+            self._covariance(x[i : i + _BATCH_POINTS], self.points) @ self._weights
+            for i in range(0, len(x), _BATCH_POINTS)
+        ]
         both = np.concatenate([np.zeros(0), *parts]).reshape(-1, 4)
         return both[:, 0] + (x - self._middle) @ self._up, both[:, 1:] + self._up
 
-    def sigma(self, x: Array) -> Array:
+    def sigma(self, x: Floats) -> Floats:
         """Standard deviation of f at points, (n,)."""
         found = [np.zeros(0)]
-        for i in range(0, len(x), _AT_ONCE):
-            C = self._covariance(x[i : i + _AT_ONCE], self.points)[::4]
+        for i in range(0, len(x), _BATCH_POINTS):
+            C = self._covariance(x[i : i + _BATCH_POINTS], self.points)[::4]
             half = solve_triangular(self._root[0], C.T, lower=True, check_finite=False)
             k0 = self._k(np.zeros(1), *self._settings)[0]
             found.append(np.sqrt(np.maximum(k0 - np.einsum("ij,ij->j", half, half), 0.0)))
         return np.concatenate(found)
 
-    def curvature(self, x: Array) -> Array:
+    def curvature(self, x: Floats) -> Floats:
         """(n, 3, 3) curvature tensors of the level sets through points, 1/m."""
         steps = [self.value(x + s * _STEP_M * e)[1] for e in np.eye(3) for s in (1.0, -1.0)]
         hessian = np.stack([(steps[2 * k] - steps[2 * k + 1]) / (2.0 * _STEP_M) for k in range(3)], axis=2)
@@ -122,11 +125,11 @@ class ImplicitSurface:
         size = np.linalg.norm(g, axis=1)[:, None, None]
         n = g / size[:, 0]
         P = np.eye(3) - n[:, :, None] * n[:, None, :]
-        result: Array = P @ hessian @ P / size
+        result: Floats = P @ hessian @ P / size
         return result
 
 
-def fit_quadric(at: Array, up: Array, touched: Touched) -> tuple[Array, Array, Array] | None:
+def fit_quadric(at: Floats, up: Floats, touched: Touched) -> tuple[Floats, Floats, Floats] | None:
     """Least squares of a quadric over a tangent plane, weighted by stated noise: a second usual answer.
 
     The height over the plane and the slopes of the normals are fitted; the plane follows the answer in three rounds.

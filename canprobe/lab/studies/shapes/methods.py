@@ -18,12 +18,12 @@ from scipy.spatial import cKDTree
 
 from canprobe.cell.tasks.from_plan import make_shape_estimator
 from canprobe.cell.tasks.shape import replay_samples
-from canprobe.lab.studies.harness import Array
 from canprobe.lab.studies.shapes.contacts_file import ShapeContacts
 from canprobe.lab.studies.shapes.implicit import ImplicitSurface, Kernel, fit_quadric, rbf, thin_plate
 from canprobe.mechanics.touch.blend import REACH_M, Feet
 from canprobe.mechanics.touch.surface import SurfaceMatrix
 from canprobe.mechanics.touch.surface_map import SPACING_M, LocalPatch, SurfaceMap, merge_patches
+from canprobe.mechanics.types import Floats
 
 Settings = Mapping[str, float]
 
@@ -31,13 +31,13 @@ Settings = Mapping[str, float]
 class FittedSurface(Protocol):
     """What a method answers with; NaN where it has no surface, farther than `REACH_M` from every contact."""
 
-    def closest(self, points: Array) -> Feet:
+    def closest(self, points: Floats) -> Feet:
         """Closest points of the surface to points (n, 3) near it; its σ may be left NaN."""
 
-    def sigma(self, points: Array) -> Array:
+    def sigma(self, points: Floats) -> Floats:
         """(n,) standard deviation of the surface's height at points, m."""
 
-    def curvature(self, points: Array) -> Array:
+    def curvature(self, points: Floats) -> Floats:
         """(n, 3, 3) curvature tensors at points, base frame, 1/m."""
 
 
@@ -45,7 +45,7 @@ class Method(Protocol):
     """A method.
 
     Attributes:
-        name: in the table.
+        name: name in the table.
         budgets: what it may spend, the least first; `unit` of them.
     """
 
@@ -71,15 +71,15 @@ class MapSurface:
     def __init__(self, surface_map: SurfaceMap) -> None:
         self.map = surface_map
 
-    def closest(self, points: Array) -> Feet:
+    def closest(self, points: Floats) -> Feet:
         """See `FittedSurface`."""
         return self.map.closest(points)
 
-    def sigma(self, points: Array) -> Array:
+    def sigma(self, points: Floats) -> Floats:
         """See `FittedSurface`."""
         return self.map.distance(points)[1]
 
-    def curvature(self, points: Array) -> Array:
+    def curvature(self, points: Floats) -> Floats:
         """See `FittedSurface`."""
         if not len(self.map):
             return np.full((len(points), 3, 3), math.nan)
@@ -101,7 +101,7 @@ class Online:
 
     @property
     def name(self) -> str:
-        """In the table."""
+        """Name in the table."""
         return f"{self.method} + patch" if self.patch else self.method
 
     def develop(self, shapes: Sequence[ShapeContacts]) -> Settings:
@@ -122,7 +122,7 @@ class Online:
 
 @dataclass(frozen=True, slots=True)
 class LocalFits:
-    """Least-squares quadrics of all contacts within a radius, whenever they were felt, every 2 mm of path."""
+    """Least-squares quadrics of all contacts within a radius, whenever they were touched, every 2 mm of path."""
 
     name: str = "quadrics"
     budgets: Sequence[float] = (3.0, 4.0, 6.0, 9.0)
@@ -146,7 +146,7 @@ class LocalFits:
         return MapSurface(SurfaceMap(patches=tuple(patches), path=p, method=self.name))
 
 
-def _patch(T: Array, K: Array, covariance: Array, *, t_s: float, travelled_m: float) -> LocalPatch:
+def _patch(T: Floats, K: Floats, covariance: Floats, *, t_s: float, travelled_m: float) -> LocalPatch:
     """A patch of a fitted quadric; c13, c23, c33 are 0 and taken as known."""
     of = [2, 0, 1, 6, 7, 8]  # height, slopes and K among the entries of S
     to_S = np.array([1.0, 0.5, 0.5, 0.5, 0.5, 0.5])
@@ -162,11 +162,11 @@ def _patch(T: Array, K: Array, covariance: Array, *, t_s: float, travelled_m: fl
 class ProcessSurface:
     """The zero of a Gaussian process within reach of the contacts."""
 
-    def __init__(self, process: ImplicitSurface, contacts: Array) -> None:
+    def __init__(self, process: ImplicitSurface, contacts: Floats) -> None:
         self._process = process
         self._tree = cKDTree(contacts)
 
-    def closest(self, points: Array) -> Feet:
+    def closest(self, points: Floats) -> Feet:
         """See `FittedSurface`."""
         f, g = self._process.value(points)
         size = np.linalg.norm(g, axis=1)
@@ -182,12 +182,12 @@ class ProcessSurface:
             near.astype(int),
         )
 
-    def sigma(self, points: Array) -> Array:
+    def sigma(self, points: Floats) -> Floats:
         """See `FittedSurface`."""
-        sigma: Array = self._process.sigma(points) / np.linalg.norm(self._process.value(points)[1], axis=1)
+        sigma: Floats = self._process.sigma(points) / np.linalg.norm(self._process.value(points)[1], axis=1)
         return sigma
 
-    def curvature(self, points: Array) -> Array:
+    def curvature(self, points: Floats) -> Floats:
         """See `FittedSurface`."""
         return self._process.curvature(points)
 
@@ -209,7 +209,7 @@ class Process:
     def develop(self, shapes: Sequence[ShapeContacts]) -> Settings:
         """Scale and length."""
 
-        def cost(x: Array) -> float:
+        def cost(x: Floats) -> float:
             settings = dict(zip(("scale", "length"), np.exp(x).tolist(), strict=False))
             try:
                 return -sum(self._process(shape, 80, settings).log_likelihood for shape in shapes)

@@ -26,9 +26,9 @@ from canprobe.cell.scene.model import ObjectSettings, PlantSettings, Scene
 from canprobe.cell.scene.resolve import LAYER_STIFFNESS, resolve
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
-from canprobe.lab.studies.harness import Array
 from canprobe.mechanics.touch.contact import ContactSample, Doubt, Slope
 from canprobe.mechanics.touch.shapes import PlacedShape
+from canprobe.mechanics.types import Floats
 
 FORMS: Mapping[str, Mapping[str, Any]] = {
     # development: for settings of methods
@@ -67,7 +67,7 @@ EDGE_PER_M = 20.0
 SPACING_MM = 0.5
 
 
-def heights_mm(form: str, seed: int) -> Array:
+def heights_mm(form: str, seed: int) -> Floats:
     """Heights over 64 by 64 mm, mm: free forms of waves, some with a groove or an edge."""
     rng = np.random.default_rng([26, seed])
     side = np.arange(-32, 32.1, SPACING_MM)
@@ -84,7 +84,7 @@ def heights_mm(form: str, seed: int) -> Array:
     if form == "edge":  # the surface falls off by another 10 degrees
         over = 0.96 * (x - rng.uniform(-3, 3)) + 0.28 * y
         z -= np.tan(np.radians(10.0)) * 0.5 * (over + np.hypot(over, 0.5))
-    heights: Array = z - z[len(side) // 2, len(side) // 2]
+    heights: Floats = z - z[len(side) // 2, len(side) // 2]
     return heights
 
 
@@ -127,7 +127,7 @@ class ScanCase(NamedTuple):
     seconds: float
 
 
-def scan(case: ScanCase) -> dict[str, Array]:
+def scan(case: ScanCase) -> dict[str, Floats]:
     """Columns of the file for one shape."""
     with TemporaryDirectory() as folder:
         scene = scene_of(case.shape, Path(folder), case.seconds)
@@ -139,7 +139,7 @@ def scan(case: ScanCase) -> dict[str, Array]:
         return columns | truth_under(true_object(scene.object), columns["p_base"])
 
 
-def columns_of(samples: Sequence[ContactSample]) -> dict[str, Array]:
+def columns_of(samples: Sequence[ContactSample]) -> dict[str, Floats]:
     """Contacts as columns, a row each; NaN where one has no such value."""
 
     def number(value: float | None) -> float:
@@ -162,7 +162,7 @@ def columns_of(samples: Sequence[ContactSample]) -> dict[str, Array]:
 _DOUBTS = tuple(Doubt)
 
 
-def samples_of(columns: Mapping[str, Array]) -> list[ContactSample]:
+def samples_of(columns: Mapping[str, Floats]) -> list[ContactSample]:
     """The contacts of `columns_of`."""
 
     def value(number: float) -> float | None:
@@ -185,7 +185,7 @@ def samples_of(columns: Mapping[str, Array]) -> list[ContactSample]:
     return found
 
 
-def truth_under(shape: PlacedShape, contacts: Array) -> dict[str, Array]:
+def truth_under(shape: PlacedShape, contacts: Floats) -> dict[str, Floats]:
     """The true surface under contacts (n, 3): points, normals, curvature tensors, and which count, on a grid."""
     feet = np.array([shape.nearest(tuple(p)).point for p in contacts[::4].tolist()])
     up = shape.T_base_object[:3, :3]

@@ -15,23 +15,24 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from canprobe.cell.results.picture import GREEN, INK, METHOD_COLOURS, PINK, SKY, legend, log_scale, picture
-from canprobe.lab.studies.harness import Array, Column, Row, StudyResult
+from canprobe.lab.studies.harness import Column, Row, StudyResult
 from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.shapes.contacts_file import ShapeContacts, read_columns, read_contacts, write_contacts
 from canprobe.lab.studies.shapes.methods import METHODS, FittedSurface, Method
 from canprobe.lab.studies.shapes.scans import DEVELOPMENT, SECONDS, TEST, ScanCase, scan
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.touch.meshing import Mesh, mesh_of
+from canprobe.mechanics.types import Floats
 
 FILE = "contacts.npz"
-CELL_M = 1e-3
-"""Of the meshes that are scored."""
+MESH_CELL_M = 1e-3
+"""Side of a cell of the scored meshes."""
 LIMITS_MM = (0.05, 0.1, 0.2, 0.5)
 WORST_M = 1e-3
 """A larger error counts as this much, and so does truth where a method has no surface."""
 TRUTH_STEP = 2
 """Every so manyth point of the truth is looked for in the map."""
-TIMED = "free-2"
+TIMED_SHAPE = "free-2"
 """Shape on which time and memory are measured; a contact costs the same on all."""
 REPEATS, DRAWS = 3, 2000
 _SCANS = ("fieldbus", "mechanics", "cell", "scenes", "lab/studies/shapes/scans.py")
@@ -85,7 +86,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
         ]
 
     scores = sweep.map(score, fits(test), model=_FITS)
-    timed = fits([TIMED if TIMED in test else test[0]])
+    timed = fits([TIMED_SHAPE if TIMED_SHAPE in test else test[0]])
     costs = sweep.time(cost, timed, model=_FITS)
     each = [scores[k * len(test) : (k + 1) * len(test)] for k in range(len(timed))]
     rows = [row_of(METHODS[f.method], f.budget, mine) | c for f, mine, c in zip(timed, each, costs, strict=True)]
@@ -96,7 +97,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
 def surface_of(fit: MethodFit, contacts: ShapeContacts) -> tuple[FittedSurface, Mesh]:
     """A method's answer and its mesh; the cost of both is what a method costs."""
     surface = METHODS[fit.method].fit(contacts, fit.budget, fit.settings)
-    return surface, mesh_of(surface.closest, contacts.touched.points[::20], CELL_M)
+    return surface, mesh_of(surface.closest, contacts.touched.points[::20], MESH_CELL_M)
 
 
 def cost(fit: MethodFit) -> dict[str, float]:
@@ -120,7 +121,7 @@ def score(fit: MethodFit) -> dict[str, Any]:
     return scored(surface, mesh, read_columns(Path(fit.path), fit.shape))
 
 
-def scored(surface: FittedSurface, mesh: Mesh, truth: Mapping[str, Array]) -> dict[str, Any]:
+def scored(surface: FittedSurface, mesh: Mesh, truth: Mapping[str, Floats]) -> dict[str, Any]:
     """Scores of a surface and its mesh against the columns of the truth; None where there is nothing to score."""
     points, normals = truth["truth_point"], truth["truth_normal"]
     tensors = truth["truth_tensor"].reshape(-1, 3, 3)
@@ -149,13 +150,13 @@ def scored(surface: FittedSurface, mesh: Mesh, truth: Mapping[str, Array]) -> di
     }  # fmt: skip
 
 
-def distance_from(points: Array, normals: Array, tensors: Array, at: Array) -> Array:
+def distance_from(points: Floats, normals: Floats, tensors: Floats, at: Floats) -> Floats:
     """(n,) signed distances of places from a surface known at close points: the quadric of the nearest one, m."""
     nearest = cKDTree(points).query(at)[1] if len(at) else np.zeros(0, np.intp)
     d = at - points[nearest]
     up = np.einsum("ij,ij->i", d, normals[nearest])
     flat = d - up[:, None] * normals[nearest]
-    result: Array = up + 0.5 * np.einsum("ij,ijk,ik->i", flat, tensors[nearest], flat)
+    result: Floats = up + 0.5 * np.einsum("ij,ijk,ik->i", flat, tensors[nearest], flat)
     return result
 
 
@@ -163,7 +164,7 @@ def _harmonic(a: float, b: float) -> float:
     return 2.0 * a * b / (a + b) if a + b else 0.0
 
 
-def _rms(values: Array) -> float:
+def _rms(values: Floats) -> float:
     return math.sqrt(float(np.mean(values**2))) if len(values) else math.nan
 
 
@@ -188,8 +189,8 @@ def findings(rows: Sequence[Row], each: Sequence[Sequence[Mapping[str, Any]]]) -
     """The best of the package against the best of the others, score by score; `each` has the scores of every row."""
     said = [
         f"Means over {len(each[0])} test shapes. accuracy: map to truth; completeness: truth in the footprint to map;"
-        f" both mean distances, at most {1e3 * WORST_M:g} mm; NLL: of the height in mm; time and memory on {TIMED}."
-        " Differences with 95 % of the draws of shapes."
+        f" both mean distances, at most {1e3 * WORST_M:g} mm; NLL: of the height in mm; time and memory on"
+        f" {TIMED_SHAPE}. Differences with 95 % of the draws of shapes."
     ]
     ours = [k for k, row in enumerate(rows) if row["method"].startswith(("ml", "recursive"))]
     others = [k for k in range(len(rows)) if k not in ours]
