@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
 
 from canprobe.fieldbus.node.abort import Abort, SdoAbort, nothing
 from canprobe.fieldbus.node.dictionary import Dictionary
@@ -71,6 +72,39 @@ def _refuse(dictionary: Dictionary, quirks: Quirks) -> None:
                 raise SdoAbort(Abort.VALUE)
 
         dictionary.on_check(index, keep_bit30)
+
+
+class DelayedFrames:
+    """Frames of a node that is slow: each leaves some time after it was made.
+
+    Args:
+        core: the node's core.
+        delay_ns: time from the making of a frame until it leaves; 0: it leaves at once.
+    """
+
+    def __init__(self, core: NodeCore, delay_ns: int) -> None:
+        self._core, self._delay_ns = core, delay_ns
+        self._waiting: deque[tuple[int, Sequence[Frame]]] = deque()  # when they leave, and the frames
+        self._timer = core.timers.new(self._leave)
+
+    def send(self, frames: Sequence[Frame], t_ns: int) -> None:
+        """Send frames that were made at `t_ns`."""
+        if not self._delay_ns:
+            self._core.out += frames
+            return
+        self._waiting.append((t_ns + self._delay_ns, frames))
+        self._timer.arm(self._waiting[0][0])
+
+    def clear(self) -> None:
+        """Forget the frames that wait."""
+        self._waiting.clear()
+        self._timer.cancel()
+
+    def _leave(self, due_ns: int) -> None:
+        while self._waiting and self._waiting[0][0] <= due_ns:
+            self._core.out += self._waiting.popleft()[1]
+        if self._waiting:
+            self._timer.arm(self._waiting[0][0])
 
 
 class Service:

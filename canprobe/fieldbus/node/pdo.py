@@ -8,10 +8,9 @@ Source: CiA 301, "Process data object (PDO)", objects 1007h, 1019h, 18xxh:06.
 from __future__ import annotations
 
 import struct
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 
-from canprobe.fieldbus.node.core import NO_ROUTES, NodeCore, Route, Service
+from canprobe.fieldbus.node.core import NO_ROUTES, DelayedFrames, NodeCore, Route, Service
 from canprobe.fieldbus.node.emcy import Emergency
 from canprobe.fieldbus.node.entry import Value, key_of
 from canprobe.fieldbus.node.pdo_rules import PdoRules
@@ -55,8 +54,8 @@ class PdoEngine(Service):
         self._groups: list[_Group] = []
         self._on_event: list[Tpdo] = []
         self._buffered: list[Tpdo] = []
-        self._late: deque[tuple[int, list[Frame]]] = deque()  # when, and what
-        self._late_timer = core.timers.new(self._send_late)
+        self._delay_ns = core.quirks.tpdo_delay_ns
+        self._late = DelayedFrames(core, self._delay_ns)
         self._count = self._sync_ns = self._window_ns = 0
         for rules in _discover(core, 0x1400, transmits=False):
             self._rpdos.append(rpdo := Rpdo(core, emcy, rules))
@@ -97,7 +96,6 @@ class PdoEngine(Service):
         for pdo in self._all:
             pdo.stop()
         self._late.clear()
-        self._late_timer.cancel()
         if self._core.state is NmtState.OPERATIONAL:
             self._groups = []
             self._rebuild()
@@ -166,9 +164,8 @@ class PdoEngine(Service):
         core = self._core
         for group in self._triggered(t_ns, counter, elapsed):
             frames = self._packed(group, t_ns)
-            if core.quirks.tpdo_delay_ns:
-                self._late.append((t_ns + core.quirks.tpdo_delay_ns, frames))
-                self._late_timer.arm(self._late[0][0])
+            if self._delay_ns:  # what the frames carry is as old as the SYNC
+                self._late.send(frames, t_ns)
             else:
                 core.out += frames
         for tpdo in self._buffered:
@@ -211,13 +208,6 @@ class PdoEngine(Service):
             for tpdo in group.tpdos:
                 tpdo.send(t_ns)  # the one with the value that does not fit raises, with its name
             raise
-
-    def _send_late(self, due_ns: int) -> None:
-        """Frames of a node that is slow after SYNC: what they carry is as old as the SYNC."""
-        while self._late and self._late[0][0] <= due_ns:
-            self._core.out += self._late.popleft()[1]
-        if self._late:
-            self._late_timer.arm(self._late[0][0])
 
     def _rebuild(self) -> None:
         dictionary = self._core.dictionary
