@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 
 from canopen.objectdictionary import ObjectDictionary, ODArray, ODVariable, datatypes
 
-from canprobe.fieldbus.eds.values import OCTETS, SIGNED, TEXTS, UNSIGNED, Value
+from canprobe.fieldbus.eds.values import OCTET_TYPES, SIGNED_BITS, TEXT_TYPES, UNSIGNED_BITS, Value
 
 LAST_DUMMY = 0x0007
 """Indices up to here are data types: DummyUsage says which of them an RPDO may map to fill room."""
-_MODES = 0x6502
+_MODES_INDEX = 0x6502
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ class DescribedEntry:
     @property
     def is_integer(self) -> bool:
         """Whether it holds an integer: not a real number, text or octets."""
-        return self.data_type in SIGNED or self.data_type in UNSIGNED
+        return self.data_type in SIGNED_BITS or self.data_type in UNSIGNED_BITS
 
     @property
     def readable(self) -> bool:
@@ -133,7 +133,7 @@ class Description:
     @property
     def modes(self) -> frozenset[int] | None:
         """Modes of operation that the default of 6502h lists, as 6060h numbers them; None where it is not stated."""
-        entry = self.entry(_MODES)
+        entry = self.entry(_MODES_INDEX)
         if entry is None or not isinstance(entry.initial, int):
             return None
         return frozenset(bit + 1 for bit in range(32) if entry.initial >> bit & 1)
@@ -176,8 +176,8 @@ def _entry(variable: ODVariable) -> DescribedEntry:
         subindex=variable.subindex,
         name=variable.name,
         data_type=data_type,
-        bits=0 if data_type in TEXTS | OCTETS else len(variable),
-        signed=data_type in SIGNED,
+        bits=0 if data_type in TEXT_TYPES | OCTET_TYPES else len(variable),
+        signed=data_type in SIGNED_BITS,
         access=variable.access_type,
         mappable=variable.pdo_mappable,
         low=variable.min,

@@ -12,15 +12,15 @@ from canprobe.fieldbus.eds.sections import Section, Sections
 from canprobe.fieldbus.eds.source import Source
 
 _RATES_KBIT_S = (10, 20, 50, 125, 250, 500, 800, 1000)
-_TEXTS = {"VendorName": "vendor_name", "ProductName": "product_name", "OrderCode": "order_code"}
-_NUMBERS = {
+_TEXT_FIELDS = {"VendorName": "vendor_name", "ProductName": "product_name", "OrderCode": "order_code"}
+_NUMBER_FIELDS = {
     "VendorNumber": "vendor_number",
     "ProductNumber": "product_number",
     "RevisionNumber": "revision_number",
     "NrOfRXPDO": "nr_of_RXPDO",
     "NrOfTXPDO": "nr_of_TXPDO",
 }
-_FLAGS = {
+_FLAG_FIELDS = {
     "SimpleBootUpMaster": "simple_boot_up_master",
     "SimpleBootUpSlave": "simple_boot_up_slave",
     "Granularity": "granularity",
@@ -41,13 +41,13 @@ def read_information(source: Source, od: ObjectDictionary) -> None:
         for rate in _RATES_KBIT_S:
             if source.number(section, f"BaudRate_{rate}"):
                 information.allowed_baudrates.add(rate * 1000)
-        for key, field in _TEXTS.items():
+        for key, field in _TEXT_FIELDS.items():
             if key.lower() in section.items:
                 setattr(information, field, section.value(key))
-        for key, field in {**_NUMBERS, **_FLAGS}.items():
+        for key, field in {**_NUMBER_FIELDS, **_FLAG_FIELDS}.items():
             if section.value(key):
                 number = source.number(section, key)
-                setattr(information, field, bool(number) if key in _FLAGS else number)
+                setattr(information, field, bool(number) if key in _FLAG_FIELDS else number)
     if (section := _commissioning(source.sections)) is not None:
         if rate := source.number(section, "Baudrate"):
             od.bitrate = rate * 1000

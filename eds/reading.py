@@ -25,21 +25,20 @@ from canprobe.fieldbus.eds.object_lists import check_lists
 from canprobe.fieldbus.eds.sections import Section, decode, split_sections
 from canprobe.fieldbus.eds.source import Source
 from canprobe.fieldbus.eds.structure import build_objects, find_objects
+from canprobe.fieldbus.protocol.frames import EFF_MASK, INVALID_FLAG
+from canprobe.fieldbus.protocol.pdo import MAX_PDO_BITS
 
-_INVALID = 1 << 31
-_CAN_ID = 0x1FFFFFFF
-_MOST = 0xFFFFFFFF
-_MAX_BITS = 64
-_PROFILE = 0xFFFF
+_MAX_U32 = 0xFFFFFFFF
+_PROFILE_MASK = 0xFFFF
 _DRIVE_PROFILE = 402
-_SERVO_DRIVE = 0x00020192
+_SERVO_DRIVE_TYPE = 0x00020192
 """Device type of a servo drive of CiA 402."""
 _DRIVE_OBJECTS = (0x6040, 0x6041)
 _FURTHER_CONTROLWORDS = range(0x6840, 0xA000, 0x800)
 _MODES_OF_OPERATION = 0x6060
-_IDENTITY = {1: "vendor", 2: "product", 3: "revision"}
+_IDENTITY_NAMES = {1: "vendor", 2: "product", 3: "revision"}
 """Whose number is at which sub-index of 1018h, as [DeviceInfo] and canopen call it."""
-_PREDEFINED = (
+_PREDEFINED_COB_IDS = (
     (0x1014, 0, 0x80),
     *((0x1400 + n, 1, 0x200 + 0x100 * n) for n in range(4)),
     *((0x1800 + n, 1, 0x180 + 0x100 * n) for n in range(4)),
@@ -128,7 +127,7 @@ def read_eds(path: Path, node_id: int | None, *, serving: bool = True) -> Readin
 
 def device_profile(od: ObjectDictionary) -> int:
     """Number of the device profile in 1000h, such as 402; 0 for none."""
-    return _present(variable_at(od, 0x1000, 0)) & _PROFILE
+    return _present(variable_at(od, 0x1000, 0)) & _PROFILE_MASK
 
 
 def is_drive(od: ObjectDictionary) -> bool:
@@ -143,7 +142,7 @@ def _describes_drive(heads: dict[int, Section], composites: set[int], node_id: i
     if not text:
         return heads.keys() - composites >= {*_DRIVE_OBJECTS, _MODES_OF_OPERATION}
     try:
-        return parse_sum(text, node_id, lambda _: None)[0] & _PROFILE == _DRIVE_PROFILE
+        return parse_sum(text, node_id, lambda _: None)[0] & _PROFILE_MASK == _DRIVE_PROFILE
     except ValueError:  # a fault, found where the value is read
         return False
 
@@ -159,8 +158,8 @@ class _Repair:
 
     def __init__(self, source: Source, heads: dict[int, Section], od: ObjectDictionary) -> None:
         self._source, self._heads, self._od = source, heads, od
-        stated = {sub: getattr(od.device_information, f"{name}_number") for sub, name in _IDENTITY.items()}
-        self._identity = {sub: number for sub, number in stated.items() if number and 0 < number <= _MOST}
+        stated = {sub: getattr(od.device_information, f"{name}_number") for sub, name in _IDENTITY_NAMES.items()}
+        self._identity = {sub: number for sub, number in stated.items() if number and 0 < number <= _MAX_U32}
         """What [DeviceInfo] states of 1018h, by sub-index; a 0 there is an empty field."""
 
     def run(self, serving: bool) -> None:
@@ -168,11 +167,11 @@ class _Repair:
         if serving:
             self._add_mandatory()
         if self._source.drive:
-            text = f"missing; {_SERVO_DRIVE:#010x} taken, a CiA 402 drive: 6040h, 6041h and 6060h are there"
-            self._fill((0x1000, 0), _SERVO_DRIVE, text)
+            text = f"missing; {_SERVO_DRIVE_TYPE:#010x} taken, a CiA 402 drive: 6040h, 6041h and 6060h are there"
+            self._fill((0x1000, 0), _SERVO_DRIVE_TYPE, text)
         for subindex, number in self._identity.items():
             self._fill((0x1018, subindex), number, f"missing; {number:#x} taken, as [DeviceInfo] has it")
-        for subindex, name in _IDENTITY.items():
+        for subindex, name in _IDENTITY_NAMES.items():
             variable = variable_at(self._od, 0x1018, subindex)
             if variable is not None and _present(variable) == 0 and _text(variable)[0] != "empty":
                 text = f"0, as where nobody has filled it in; bring-up does not compare the {name}"
@@ -188,17 +187,17 @@ class _Repair:
         source, od = self._source, self._od
         for index, name, data_type in ((0x1000, "Device type", 0x07), (0x1001, "Error register", 0x05)):
             if index not in od.indices:
-                value = _SERVO_DRIVE if index == 0x1000 and source.drive else 0
+                value = _SERVO_DRIVE_TYPE if index == 0x1000 and source.drive else 0
                 source.faults.warn(0, f"{index:04X}", "", f"{name} is mandatory, but not there; served as {value:#x}")
                 od.add_object(_variable(name, index, 0, data_type, value))
         if 0x1018 not in od.indices:
             numbers = {1: 0, **self._identity}
-            text = ", ".join(f"{_IDENTITY[subindex]} {number:#x}" for subindex, number in numbers.items())
+            text = ", ".join(f"{_IDENTITY_NAMES[subindex]} {number:#x}" for subindex, number in numbers.items())
             source.faults.warn(0, "1018", "", f"Identity object is mandatory, but not there; served with {text}")
             identity = ODRecord("Identity object", 0x1018)
             identity.add_member(_variable("Highest sub-index supported", 0x1018, 0, datatypes.UNSIGNED8, max(numbers)))
             for subindex, number in numbers.items():
-                name = _IDENTITY[subindex].capitalize()
+                name = _IDENTITY_NAMES[subindex].capitalize()
                 identity.add_member(_variable(name, 0x1018, subindex, datatypes.UNSIGNED32, number))
             od.add_object(identity)
 
@@ -227,17 +226,17 @@ class _Repair:
         """
         node_id = self._source.node_id
         made_for = commissioned_node(self._source.sections) or node_id
-        for index, subindex, base in _PREDEFINED:
+        for index, subindex, base in _PREDEFINED_COB_IDS:
             variable = variable_at(self._od, index, subindex)
             if variable is None:
                 continue
             written, key = _text(variable)
             default, cob_id = variable.default, _present(variable)
-            forgotten = isinstance(default, int) and not variable.relative and default & ~_INVALID == base
+            forgotten = isinstance(default, int) and not variable.relative and default & ~INVALID_FLAG == base
             if variable.value is None and forgotten:
                 self._warn((index, subindex), f"{written} without $NODEID, which is added")
                 variable.default, variable.relative = cob_id + node_id, True
-            elif made_for != node_id and cob_id & _CAN_ID == base + made_for:
+            elif made_for != node_id and cob_id & EFF_MASK == base + made_for:
                 cob_id += node_id - made_for
                 self._warn((index, subindex), f"{written} is of node {made_for}; {cob_id:#x} taken", key)
                 setattr(variable, "value" if key == "ParameterValue" else "default", cob_id)
@@ -257,8 +256,8 @@ class _Repair:
             elif not target.pdo_mappable and target.index > 7:
                 self._warn((target.index, target.subindex), f"is mapped in {index:04X}h, so 1", "PDOMapping")
                 target.pdo_mappable = serving
-        if bits > _MAX_BITS:
-            self._warn((index, 0), f"maps {bits} bits, but a frame has {_MAX_BITS}; the PDO is served empty")
+        if bits > MAX_PDO_BITS:
+            self._warn((index, 0), f"maps {bits} bits, but a frame has {MAX_PDO_BITS}; the PDO is served empty")
 
     def _check_pdo_counts(self) -> None:
         section = self._source.sections.get("deviceinfo")
@@ -296,7 +295,7 @@ def _text(variable: ODVariable) -> tuple[str, str]:
 def _words(od: ObjectDictionary, index: int) -> Iterator[tuple[int, int]]:
     """Sub-index and word of each entry that is mapped."""
     count = _present(variable_at(od, index, 0))
-    for subindex in range(1, min(count, _MAX_BITS) + 1):
+    for subindex in range(1, min(count, MAX_PDO_BITS) + 1):
         if word := _present(variable_at(od, index, subindex)):
             yield subindex, word
 

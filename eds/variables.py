@@ -10,13 +10,13 @@ from contextlib import suppress
 from canopen.objectdictionary import ODVariable, datatypes
 
 from canprobe.fieldbus.eds.data_types import data_type_of
-from canprobe.fieldbus.eds.mandatory import CHOICES, decides, standard_access
+from canprobe.fieldbus.eds.mandatory import CHOICE_INDICES, decides, standard_access
 from canprobe.fieldbus.eds.numbers import parse_flag, parse_sum
 from canprobe.fieldbus.eds.sections import Section
 from canprobe.fieldbus.eds.source import Source
-from canprobe.fieldbus.eds.values import TEXTS, convert, convert_limit, name_of
+from canprobe.fieldbus.eds.values import TEXT_TYPES, convert, convert_limit, name_of
 
-_ACCESS = frozenset({"ro", "wo", "rw", "rwr", "rww", "const"})
+_ACCESS_TYPES = frozenset({"ro", "wo", "rw", "rwr", "rww", "const"})
 _ACCESS_WORDS = {"r": "ro", "w": "wo", "wr": "rw", "readonly": "ro", "writeonly": "wo", "readwrite": "rw", "c": "const"}
 
 
@@ -55,7 +55,7 @@ def set_value(source: Source, section: Section, key: str, variable: ODVariable, 
     text = section.value(where)
     field = "default" if key == "DefaultValue" else "value"
     setattr(variable, f"{field}_raw", text)
-    if not text and data_type not in TEXTS:
+    if not text and data_type not in TEXT_TYPES:
         return
     try:
         setattr(variable, field, convert(text, data_type, source.node_id, source.remark(section, where)))
@@ -66,7 +66,7 @@ def set_value(source: Source, section: Section, key: str, variable: ODVariable, 
         else:
             source.warn(section, where, f"{wrong}; left out, as if the file had none")
         return
-    if field == "default" and "$" in text and data_type not in TEXTS:
+    if field == "default" and "$" in text and data_type not in TEXT_TYPES:
         with suppress(ValueError):
             variable.relative = parse_sum(text, source.node_id, lambda _: None)[1]
 
@@ -81,7 +81,7 @@ def _name(source: Source, section: Section, index: int, subindex: int) -> str:
 
 def _access(source: Source, section: Section, index: int, subindex: int, composite: bool) -> str:
     text = section.value("AccessType").lower()
-    if text in _ACCESS:
+    if text in _ACCESS_TYPES:
         return text
     taken = _ACCESS_WORDS.get("".join(filter(str.isalpha, text))) or standard_access(
         index, subindex, composite, source.drive
@@ -105,7 +105,7 @@ def _flag(source: Source, section: Section, key: str) -> bool:
 def _set_limits(source: Source, section: Section, variable: ODVariable, data_type: int) -> None:
     low = _limit(source, section, "LowLimit", data_type)
     high = _limit(source, section, "HighLimit", data_type)
-    if low == high == 0 and not (source.drive and variable.index in CHOICES):
+    if low == high == 0 and not (source.drive and variable.index in CHOICE_INDICES):
         source.warn(
             section, "LowLimit", "0, and HighLimit 0 too, as editors fill in what nobody stated; neither is used"
         )

@@ -20,20 +20,20 @@ from types import TracebackType
 from canprobe.errors import UsageError, regular_file
 from canprobe.fieldbus.bus.files import writing
 from canprobe.fieldbus.bus.port import ControllerState, PlainPort, Port, TimedFrame
-from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EFF_FLAG, RTR_FLAG, Frame
+from canprobe.fieldbus.protocol.frames import BRS_FLAG, CLASSIC_BYTES, EFF_FLAG, EFF_MASK, RTR_FLAG, Frame
 
 # candump log files: `(0000000000.002500) can0 181#37060000`, time with six digits, from 0 in a recording of ours.
 # candump pads the channel on the left (several interfaces), writes nine digits with -N, the DLC of a frame of 8 bytes
 # behind "_" with -8, and a line of its own for lost frames with -d.
 
-_LINE = re.compile(
+_LINE_PATTERN = re.compile(
     r"\((?P<s>\d+)\.(?P<fraction>\d{6}(?:\d{3})?)\) +(?P<channel>\S+) (?:(?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#"
     r"(?:R(?:[0-7]?|8(?:_[9A-Fa-f])?)|#[0-9A-Fa-f](?P<fd>(?:[0-9A-Fa-f]{2}){0,64})|"
     r"(?P<data>(?:[0-9A-Fa-f]{2}){0,7}|(?:[0-9A-Fa-f]{2}){8}(?:_[9A-Fa-f])?))|"
     r"(?P<xl>[0-9A-Fa-f]{5}#[0-9A-Fa-f]{2}:[0-9A-Fa-f]{2}:[0-9A-Fa-f]{8}#(?:[0-9A-Fa-f]{2})*))(?: [RT])?|"
     r"DROPCOUNT: dropped (?P<dropped>\d+) CAN frames? on '(?P<socket>[^']+)' socket \(total drops \d+\)"
 )
-_ON_SCREEN = re.compile(r" *(?P<stamp>\([-0-9: .]+\))? *\S+ +(?:TX|RX)?[ \-BE]*[0-9A-Fa-f]{3,8} +\[ *\d+\].*")
+_SCREEN_PATTERN = re.compile(r" *(?P<stamp>\([-0-9: .]+\))? *\S+ +(?:TX|RX)?[ \-BE]*[0-9A-Fa-f]{3,8} +\[ *\d+\].*")
 """What candump prints without -l and -L: `(000.002500)  can0  181   [4]  37 06 00 00`."""
 _ENCODINGS = {
     b"\xff\xfe": "utf-16",
@@ -45,10 +45,9 @@ _ENCODINGS = {
 """By the first two bytes; anything else is ASCII."""
 
 
-_BIT_RATE_SWITCH = 1
-_FRAMES = 32
+_BUFFERED_FRAMES = 32
 """Frames that are kept as they are before they become lines, which is quicker for many at once."""
-_LINES = 256
+_BUFFERED_LINES = 256
 """Lines that are joined before they go to the file."""
 
 
@@ -110,9 +109,9 @@ class CandumpWriter:
                 self._take = take
             frames = self._frames
             frames.append((can_id, data, t_ns))
-            if len(frames) >= _FRAMES:
+            if len(frames) >= _BUFFERED_FRAMES:
                 self._form_lines()
-                if len(self._lines) >= _LINES:
+                if len(self._lines) >= _BUFFERED_LINES:
                     self.flush()
 
         return write
@@ -171,7 +170,7 @@ class _ChannelLines:
         if name is None:
             name = self._names[can_id] = f") {self._channel} {_format_id(can_id)}#"
         if len(data) > CLASSIC_BYTES:
-            payload = f"#{_BIT_RATE_SWITCH}{data.hex().upper()}"
+            payload = f"#{BRS_FLAG}{data.hex().upper()}"
         else:
             payload = "R" if can_id & RTR_FLAG else data.hex().upper()
         return f"{self._prefix}{us:06d}{name}{payload}\n"
@@ -236,7 +235,7 @@ class CandumpReader:
             with TextIOWrapper(file, encoding, errors="replace") as lines:
                 for self.number, line in enumerate(lines, 1):
                     text = line.rstrip("\r\n")
-                    match = _LINE.fullmatch(text)
+                    match = _LINE_PATTERN.fullmatch(text)
                     if match is None:
                         if text and (self._whole or line.endswith("\n")):
                             raise self._no_line(text)
@@ -262,7 +261,7 @@ class CandumpReader:
 
     def _no_line(self, text: str) -> UsageError:
         where = f"{self._path}:{self.number}: no candump line: {text[:60]!r}"
-        if (shown := _ON_SCREEN.fullmatch(text)) is not None:
+        if (shown := _SCREEN_PATTERN.fullmatch(text)) is not None:
             short = re.fullmatch(r"\(\d{3}\.\d+\)", shown["stamp"] or "")
             stamps = " with stamps that are differences (-td) or count from its first frame (-tz)" if short else ""
             return UsageError(f"{where}; it is what candump prints on a screen{stamps}; record with `candump -l` or -L")
@@ -283,7 +282,7 @@ def _frame_of(match: re.Match[str]) -> CandumpLine:
 def _parse_id(match: re.Match[str]) -> int:
     can_id = int(match["id"], 16)
     if len(match["id"]) == 8:  # 29 bits, or an error frame, which carries its own flag in the text
-        can_id = can_id | EFF_FLAG if can_id <= 0x1FFFFFFF else can_id
+        can_id = can_id | EFF_FLAG if can_id <= EFF_MASK else can_id
     return can_id | RTR_FLAG if match["data"] is None and match["fd"] is None else can_id
 
 

@@ -9,7 +9,7 @@ from canprobe.errors import BusError
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.protocol.lss import (
     LSS_ANSWER_ID,
-    LSS_LENGTH,
+    LSS_BYTES,
     LSS_REQUEST_ID,
     PRESENCE_CHECK,
     LssAddress,
@@ -21,10 +21,10 @@ from canprobe.fieldbus.protocol.lss import (
     pack_number,
 )
 
-SETTLE_S = 0.005
+SETTLING_S = 0.005
 """Wait after the first answer: several nodes may give the same answer to one question, one after another."""
-ANSWER_S = 0.5
-SEARCH_S = 0.05
+ANSWER_TIMEOUT_S = 0.5
+SEARCH_TIMEOUT_S = 0.05
 """Time without an answer after which a question of fastscan counts as answered with no."""
 
 
@@ -49,12 +49,12 @@ class Lss:
         ]
         for message in first:
             self._send(message)
-        return bool(self._ask(last, ANSWER_S, LssCommand.SELECTED))
+        return bool(self._ask(last, ANSWER_TIMEOUT_S, LssCommand.SELECTED))
 
     def inquire_node_ids(self) -> list[int]:
         """What all the nodes in configuration answer: one node id, unless several devices have one address."""
         command = LssCommand.INQUIRE_NODE_ID
-        return [answer[1] for answer in self._ask(pack_lss(command), ANSWER_S, command)]
+        return [answer[1] for answer in self._ask(pack_lss(command), ANSWER_TIMEOUT_S, command)]
 
     def configure_node_id(self, node_id: int) -> None:
         """Give the node in configuration its id.
@@ -84,8 +84,8 @@ class Lss:
         Raises:
             LssAnswerError: somebody answers, but to no address: answers were lost or came late.
         """
-        for timeout_s in (SEARCH_S, 5 * SEARCH_S):
-            if not self._identified(0, PRESENCE_CHECK, 0, 0, ANSWER_S):
+        for timeout_s in (SEARCH_TIMEOUT_S, 5 * SEARCH_TIMEOUT_S):
+            if not self._identified(0, PRESENCE_CHECK, 0, 0, ANSWER_TIMEOUT_S):
                 return None
             if (address := self._search(timeout_s)) is not None:
                 return address
@@ -101,7 +101,7 @@ class Lss:
             for bit in range(31, -1, -1):
                 if not self._identified(number, bit, position, position, timeout_s):
                     number |= 1 << bit
-            if not self._identified(number, 0, position, (position + 1) % 4, ANSWER_S):
+            if not self._identified(number, 0, position, (position + 1) % 4, ANSWER_TIMEOUT_S):
                 return None
             found.append(number)
         return LssAddress(*found)
@@ -110,7 +110,7 @@ class Lss:
         return bool(self._ask(pack_fastscan(number, bit, position, following), timeout_s, LssCommand.IDENTIFIED))
 
     def _configure(self, command: LssCommand, value: int = 0) -> int:
-        answers = self._ask(pack_lss(command, bytes((value,))), ANSWER_S, command)
+        answers = self._ask(pack_lss(command, bytes((value,))), ANSWER_TIMEOUT_S, command)
         if not answers:
             raise LssAnswerError(f"no answer to {command.name.lower().replace('_', ' ')}")
         return answers[0][1]
@@ -124,7 +124,7 @@ class Lss:
         answers: list[bytes] = []
 
         def take(_id: int, data: bytes, _t_ns: int) -> None:
-            if len(data) == LSS_LENGTH:
+            if len(data) == LSS_BYTES:
                 answers.append(data)
 
         network.pump_until(lambda: True, 0.0)  # late answers to earlier questions
@@ -132,7 +132,7 @@ class Lss:
         try:
             self._send(message)
             if network.pump_until(lambda: bool(answers), timeout_s):
-                network.pump_until(lambda: False, SETTLE_S)
+                network.pump_until(lambda: False, SETTLING_S)
         finally:
             network.unsubscribe(LSS_ANSWER_ID, take)
         return [answer for answer in answers if answer[0] == command]

@@ -9,7 +9,7 @@ from canprobe.fieldbus.protocol.frames import SDO_RX_BASE, SDO_TX_BASE
 
 SECOND_ANSWER_S = 0.05
 """In which a second answer to one request is waited for: two devices have one node id."""
-UPLOAD_DEVICE_TYPE = bytes((0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0))
+DEVICE_TYPE_REQUEST = bytes((0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0))
 BURST_FRAMES = 8
 BURST_PAUSE_S = 0.002
 
@@ -36,7 +36,7 @@ def answering_nodes(network: PumpedNetwork, node_ids: Iterable[int], timeout_s: 
     try:
         for first in range(0, len(asked), BURST_FRAMES):
             network.port.send_batch(
-                [(SDO_RX_BASE + n, UPLOAD_DEVICE_TYPE) for n in asked[first : first + BURST_FRAMES]]
+                [(SDO_RX_BASE + n, DEVICE_TYPE_REQUEST) for n in asked[first : first + BURST_FRAMES]]
             )
             network.pump_until(lambda: len(found) == len(asked), BURST_PAUSE_S)
         network.pump_until(lambda: len(found) == len(asked), timeout_s)

@@ -24,16 +24,17 @@ from canprobe.fieldbus.protocol.frames import SDO_RX_BASE, SDO_TX_BASE
 Dialogue = Generator[bytes | None, bytes, Any]
 """The transfers with one node."""
 
-_LENGTH = 8
-_ABORT, _DOWNLOADED, _UPLOADED, _SEGMENT, _EXPEDITED, _SIZED = 0x80, 0x60, 0x40, 0x00, 0x02, 0x01
-_MAX_EXPEDITED = 4
+_SDO_BYTES = 8
+_ABORT_COMMAND, _DOWNLOAD_ANSWER, _UPLOAD_ANSWER, _SEGMENT_ANSWER = 0x80, 0x60, 0x40, 0x00
+_EXPEDITED_FLAG, _SIZE_FLAG = 0x02, 0x01
+_MAX_EXPEDITED_BYTES = 4
 _NOT_TOGGLED, _TIMED_OUT, _OUT_OF_MEMORY = 0x05030000, 0x05040000, 0x05040005
 _TOO_LONG, _TOO_SHORT, _GENERAL = 0x06070012, 0x06070013, 0x08000000
 MAX_UPLOAD_BYTES = 4096
 """Longest value that is read: names and numbers are far shorter. A node that sends more is not asked for the rest."""
-TRANSFER_TIMEOUTS = 10
+MAX_TRANSFER_TIMEOUTS = 10
 """Longest time of one transfer of several segments, in time-outs of one answer."""
-ROUND_S = 0.02
+MAX_ROUND_S = 0.02
 """How long the others wait for the slowest answer: asking again at once, low node ids would take the whole bus."""
 
 
@@ -48,10 +49,10 @@ def download(index: int, subindex: int, data: bytes) -> Generator[bytes | None, 
         SdoAbortedError: the node refused.
         SdoCommunicationError: no answer, or more than four bytes.
     """
-    if not 0 < len(data) <= _MAX_EXPEDITED:
+    if not 0 < len(data) <= _MAX_EXPEDITED_BYTES:
         raise SdoCommunicationError(f"{index:04X}h:{subindex:02X} takes {len(data)} bytes; a concise write has 1 to 4")
-    command = 0x23 | (_MAX_EXPEDITED - len(data)) << 2
-    yield from _answered(bytes((command,)), index, subindex, data.ljust(4, b"\0"), _DOWNLOADED)
+    command = 0x23 | (_MAX_EXPEDITED_BYTES - len(data)) << 2
+    yield from _answered(bytes((command,)), index, subindex, data.ljust(4, b"\0"), _DOWNLOAD_ANSWER)
 
 
 def read_value(variable: ODVariable) -> Generator[bytes | None, bytes, Any]:
@@ -73,7 +74,7 @@ def read_value(variable: ODVariable) -> Generator[bytes | None, bytes, Any]:
     return variable.decode_raw(own)
 
 
-def upload(index: int, subindex: int, size: int = _MAX_EXPEDITED) -> Generator[bytes | None, bytes, bytes]:
+def upload(index: int, subindex: int, size: int = _MAX_EXPEDITED_BYTES) -> Generator[bytes | None, bytes, bytes]:
     """Read an entry of any length.
 
     Args:
@@ -85,10 +86,10 @@ def upload(index: int, subindex: int, size: int = _MAX_EXPEDITED) -> Generator[b
         SdoCommunicationError: no answer, one segment twice, more or fewer bytes than the node announced, or more than
             `MAX_UPLOAD_BYTES`. The node got an abort.
     """
-    answer = yield from _answered(b"\x40", index, subindex, bytes(4), _UPLOADED)
-    if answer[0] & _EXPEDITED:
-        return answer[4 : 8 - (answer[0] >> 2 & 3)] if answer[0] & _SIZED else answer[4 : 4 + size]
-    announced = int.from_bytes(answer[4:], "little") if answer[0] & _SIZED else None
+    answer = yield from _answered(b"\x40", index, subindex, bytes(4), _UPLOAD_ANSWER)
+    if answer[0] & _EXPEDITED_FLAG:
+        return answer[4 : 8 - (answer[0] >> 2 & 3)] if answer[0] & _SIZE_FLAG else answer[4 : 4 + size]
+    announced = int.from_bytes(answer[4:], "little") if answer[0] & _SIZE_FLAG else None
     return (yield from _segments(answer[1:4], announced))
 
 
@@ -106,8 +107,8 @@ def _answered(
 ) -> Generator[bytes | None, bytes, bytes]:
     multiplexer = index.to_bytes(2, "little") + bytes((subindex,))
     answer = yield command + multiplexer + data
-    while answer[1:4] != multiplexer or not (answer[0] == _ABORT or answer[0] & 0xE0 == expected):
-        answer = yield None  # a late one, to an earlier request: of this entry too, which is read after it was written
+    while answer[1:4] != multiplexer or not (answer[0] == _ABORT_COMMAND or answer[0] & 0xE0 == expected):
+        answer = yield None  # a late one, to an earlier request, maybe of the same entry
     _check_abort(answer)
     return answer
 
@@ -118,8 +119,8 @@ def _segments(multiplexer: bytes, announced: int | None) -> Generator[bytes | No
     data, toggle, last = b"", 0, False
     while not last:
         answer = yield bytes((0x60 | toggle,)) + bytes(7)
-        while not (answer[0] == _ABORT or answer[0] & 0xE0 == _SEGMENT):  # a late one, to the request that began this
-            answer = yield None
+        while answer[0] != _ABORT_COMMAND and answer[0] & 0xE0 != _SEGMENT_ANSWER:
+            answer = yield None  # a late one, to the request that began this transfer
         _check_abort(answer)
         if answer[0] & 0xF0 != toggle:
             yield from _give_up(multiplexer, _NOT_TOGGLED, "Toggle bit mismatch")
@@ -145,11 +146,11 @@ def _give_up(multiplexer: bytes, code: int, why: str) -> Generator[bytes | None,
 
 
 def _abort(multiplexer: bytes, code: int) -> bytes:
-    return bytes((_ABORT,)) + multiplexer + code.to_bytes(4, "little")
+    return bytes((_ABORT_COMMAND,)) + multiplexer + code.to_bytes(4, "little")
 
 
 def _check_abort(answer: bytes) -> None:
-    if answer[0] == _ABORT:
+    if answer[0] == _ABORT_COMMAND:
         raise SdoAbortedError(int.from_bytes(answer[4:], "little"))
 
 
@@ -174,7 +175,7 @@ class _Talk:
 
     def take(self, _id: int, data: bytes, _t_ns: int) -> None:
         """Keep an answer; anything but 8 bytes is no SDO (CiA 301, 7.2.4.3)."""
-        if len(data) == _LENGTH and not self.over:
+        if len(data) == _SDO_BYTES and not self.over:
             self.inbox.append(data)
 
     def serve(self) -> None:
@@ -199,14 +200,14 @@ class _Talk:
     def _lateness(self) -> str:
         timeout_s = self._timeout_ns * 1e-9
         if self._asks_for_segment and self._network.port.clock.now_ns() >= self._end_ns:
-            return f"SDO transfer not complete after {TRANSFER_TIMEOUTS * timeout_s:g} s"
+            return f"SDO transfer not complete after {MAX_TRANSFER_TIMEOUTS * timeout_s:g} s"
         tries = f", {self._tries} times" if self._tries > 1 else ""
         return f"No SDO response received within {timeout_s:g} s{tries}"
 
     def _go_on(self, step: Callable[[], bytes | None]) -> None:
         try:
             request = step()
-            while request is not None and request[0] == _ABORT:
+            while request is not None and request[0] == _ABORT_COMMAND:
                 self._transmit(request)
                 request = next(self._dialogue)
         except StopIteration:
@@ -224,7 +225,7 @@ class _Talk:
             self.due_ns = min(self.due_ns, self._end_ns)
         else:
             self._multiplexer = self._request[1:4]
-            self._end_ns = self.due_ns + (TRANSFER_TIMEOUTS - 1) * self._timeout_ns
+            self._end_ns = self.due_ns + (MAX_TRANSFER_TIMEOUTS - 1) * self._timeout_ns
         self._transmit(self._request)
 
     def _transmit(self, data: bytes) -> None:
@@ -298,6 +299,6 @@ def hold_dialogues(
     with Dialogues(network, dialogues, timeout_s=timeout_s, retries=retries) as held:
         while waiting := held.waiting:
             left_s = max(0, min(talk.due_ns for talk in waiting) - network.port.clock.now_ns()) * 1e-9
-            network.pump_until(lambda: all(talk.inbox for talk in waiting), min(left_s, ROUND_S))
+            network.pump_until(lambda: all(talk.inbox for talk in waiting), min(left_s, MAX_ROUND_S))
             held.serve()
     return held.repeated

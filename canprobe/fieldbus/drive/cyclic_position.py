@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from canprobe.fieldbus.drive.mode import CyclicMode, DriveParts
-from canprobe.fieldbus.drive.parameters import PEAK_PERMILLE
+from canprobe.fieldbus.drive.parameters import PEAK_TORQUE_PERMILLE
 from canprobe.fieldbus.node.entry import key_of
 from canprobe.fieldbus.protocol.cia402 import (
     OperationMode,
 )
-from canprobe.fieldbus.protocol.emcy import REFERENCE_LIMIT
+from canprobe.fieldbus.protocol.emcy import REFERENCE_LIMIT_CODE
 
-ROUNDING_COUNTS = 2
-POSITION_TARGET = key_of(0x607A)
-_POSITION_OFFSET = key_of(0x60B0)
+MAX_ROUNDING_COUNTS = 2
+POSITION_TARGET_KEY = key_of(0x607A)
+_POSITION_OFFSET_KEY = key_of(0x60B0)
 
 
 class CyclicPosition(CyclicMode):
@@ -26,7 +26,7 @@ class CyclicPosition(CyclicMode):
     target = 0x607A
     needs = (key_of(target),)
     repeats, lags = False, True
-    wanted = POSITION_TARGET, _POSITION_OFFSET
+    wanted = POSITION_TARGET_KEY, _POSITION_OFFSET_KEY
 
     def __init__(self, parts: DriveParts) -> None:
         super().__init__(parts)
@@ -47,13 +47,13 @@ class CyclicPosition(CyclicMode):
         counts, onset = allowed * units.scale + units.origin, motion.onset(t_ns)
         reach_ns, passed_ns = parameters.interpolation_ns, t_ns - self._latched_ns
         passed_ns = passed_ns if passed_ns > reach_ns else reach_ns
-        if abs(counts - onset) > parameters.max_speed * passed_ns * 1e-9 + ROUNDING_COUNTS:
-            self.parts.fault(REFERENCE_LIMIT, t_ns)
+        if abs(counts - onset) > parameters.max_speed * passed_ns * 1e-9 + MAX_ROUNDING_COUNTS:
+            self.parts.fault(REFERENCE_LIMIT_CODE, t_ns)
             return
         self._latched_ns = t_ns
         if self.parts.loop.changed:
             self.parts.loop.feed_forward()
         motion.reach(onset, counts, t_ns, t_ns + reach_ns)
-        limited = allowed != target or (parameters.max_torque < PEAK_PERMILLE and self._strains())
+        limited = allowed != target or (parameters.max_torque < PEAK_TORQUE_PERMILLE and self._strains())
         if limited is not self.limited:
             self._limit(limited)

@@ -17,7 +17,7 @@ from canprobe.fieldbus.protocol.cia402 import (
     OperationMode,
 )
 
-_TORQUE_TARGET, _TORQUE_OFFSET = key_of(0x6071), key_of(0x60B2)
+_TORQUE_TARGET_KEY, _TORQUE_OFFSET_KEY = key_of(0x6071), key_of(0x60B2)
 
 
 class CyclicTorque(CyclicMode):
@@ -43,7 +43,7 @@ class CyclicTorque(CyclicMode):
     def latch(self, t_ns: int) -> None:
         """Go on with the velocity that the last torque has left."""
         values, parameters, parts = self._values, self._parameters, self.parts
-        wanted = int(values[_TORQUE_TARGET]) + int(values.get(_TORQUE_OFFSET, 0))
+        wanted = int(values[_TORQUE_TARGET_KEY]) + int(values.get(_TORQUE_OFFSET_KEY, 0))
         self._torque = min(max(wanted, -parameters.max_torque), parameters.max_torque)
         parts.feedback.show_torque(lambda: self._torque)
         here, speed, (low, high) = self._motion.demand(t_ns), self._motion.speed(t_ns), parameters.fence

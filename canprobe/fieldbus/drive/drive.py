@@ -18,7 +18,7 @@ from canprobe.fieldbus.drive.mode import DriveParts
 from canprobe.fieldbus.drive.modes import make_modes
 from canprobe.fieldbus.drive.parameters import STAYING_QUICK_STOP_OPTIONS
 from canprobe.fieldbus.drive.reference import STEP_NS, AxisPlant
-from canprobe.fieldbus.drive.units import FACTORS, Delivery
+from canprobe.fieldbus.drive.units import FACTOR_INDICES, Delivery
 from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.entry import Value, key_of
 from canprobe.fieldbus.node.quirks import Quirks
@@ -34,14 +34,14 @@ from canprobe.fieldbus.protocol.cia402 import (
     Event,
     command_of,
 )
-from canprobe.fieldbus.protocol.emcy import FOLLOWING_ERROR, HEARTBEAT_LOST
+from canprobe.fieldbus.protocol.emcy import FOLLOWING_ERROR_CODE, HEARTBEAT_LOST_CODE
 from canprobe.fieldbus.protocol.frames import NmtState
 
-_STATUSWORD = key_of(0x6041)
-_VOLATILE = frozenset({0x6040, 0x6071, 0x607A, 0x60B0, 0x60B1, 0x60B2, 0x60C1, 0x60FF})
+_STATUSWORD_KEY = key_of(0x6041)
+_VOLATILE_INDICES = frozenset({0x6040, 0x6071, 0x607A, 0x60B0, 0x60B1, 0x60B2, 0x60C1, 0x60FF})
 _ABORT_COMMANDS = {2: DriveCommand.DISABLE_VOLTAGE, 3: DriveCommand.QUICK_STOP}  # of 6007h; 1 is a fault, 0 nothing
-_ENABLED = DriveState.OPERATION_ENABLED
-STAND_ALONE = Delivery()
+_ENABLED_STATE = DriveState.OPERATION_ENABLED
+STAND_ALONE_DELIVERY = Delivery()
 """Of a drive that belongs to no cell."""
 
 
@@ -61,7 +61,7 @@ class DriveApplication(Application):
         axis: int,
         plant: AxisPlant,
         *,
-        delivery: Delivery = STAND_ALONE,
+        delivery: Delivery = STAND_ALONE_DELIVERY,
         incremental: bool = False,
         noise: Callable[[], float] | None = None,
     ) -> None:
@@ -103,9 +103,9 @@ class DriveApplication(Application):
         self._mode = self._modes[0]
         self._take_word_soon = node.core.timers.new(self._take_word)
         self._pass_on_soon = node.core.timers.new(self._pass_on)
-        node.store.volatile |= _VOLATILE
+        node.store.volatile |= _VOLATILE_INDICES
         dictionary = node.dictionary
-        for index in FACTORS:
+        for index in FACTOR_INDICES:
             dictionary.on_check(index, self._check_not_moving)
         dictionary.on_write(0x6040, self._controlword)
         dictionary.on_read(0x6041, lambda _sub: self._take_word(self._core.now_ns))
@@ -143,7 +143,7 @@ class DriveApplication(Application):
 
     def connection_lost(self, t_ns: int) -> None:
         """Act by 6007h."""
-        self._abort_connection(HEARTBEAT_LOST, t_ns)
+        self._abort_connection(HEARTBEAT_LOST_CODE, t_ns)
 
     def sync(self, t_ns: int, counter: int) -> None:
         """The mode watches and latches, one SYNC after it was enabled at the earliest."""
@@ -151,7 +151,7 @@ class DriveApplication(Application):
         counts = self.parts.feedback.measure(t_ns)
         if self._word_waits:
             self._take_word(t_ns)
-        if self.state is _ENABLED and t_ns > self._since_ns:
+        if self.state is _ENABLED_STATE and t_ns > self._since_ns:
             self._mode.sync(t_ns, counts)
 
     # ------------------------------------------------------------------ controlword
@@ -163,9 +163,9 @@ class DriveApplication(Application):
         if word != previous:
             self._take_word(now_ns)
             self._word = word
-        enabled = self.state is _ENABLED
+        enabled = self.state is _ENABLED_STATE
         self._obey(word, previous, now_ns)
-        if word != previous and enabled and self.state is _ENABLED:
+        if word != previous and enabled and self.state is _ENABLED_STATE:
             self._word_waits = True
             self._take_word_soon.arm(now_ns)
 
@@ -174,7 +174,7 @@ class DriveApplication(Application):
         command = command_of(word, previous)
         repeated, self._command = command is self._command, command
         goal = None if command is None else TRANSITIONS.get((self.state, command))
-        resumes = self.state is DriveState.QUICK_STOP_ACTIVE and goal is _ENABLED
+        resumes = self.state is DriveState.QUICK_STOP_ACTIVE and goal is _ENABLED_STATE
         if goal is None or (resumes and (repeated or self._parameters.quick_stop not in STAYING_QUICK_STOP_OPTIONS)):
             self._idle_word = word
             return  # a drive that stopped by itself is not restarted by a controlword that merely repeats
@@ -184,13 +184,13 @@ class DriveApplication(Application):
         """Let the active mode see the controlword that waits, if one does."""
         waits, self._word_waits = self._word_waits, False
         self._take_word_soon.cancel()
-        if waits and self.state is _ENABLED:
+        if waits and self.state is _ENABLED_STATE:
             self._mode.command(self._word, t_ns)
 
     def _pass_on(self, t_ns: int) -> None:
         """Transition 4 after 3, when the controlword that switched on also enables."""
         if self.state is DriveState.SWITCHED_ON and self._command is DriveCommand.ENABLE_OPERATION:
-            self._go(_ENABLED, t_ns)
+            self._go(_ENABLED_STATE, t_ns)
 
     # ------------------------------------------------------------------ mode of operation
 
@@ -200,7 +200,7 @@ class DriveApplication(Application):
 
     def _select_mode(self, number: int) -> None:
         mode = self._modes[number]
-        if mode is not self._mode and self.state is _ENABLED:
+        if mode is not self._mode and self.state is _ENABLED_STATE:
             t_ns = self._core.now_ns
             self._mode.leave(t_ns)
             self._motion.decelerate(t_ns, self._parameters.deceleration)
@@ -235,10 +235,10 @@ class DriveApplication(Application):
     def _go(self, new: DriveState, t_ns: int) -> None:
         old, self.state, self._idle_word = self.state, new, None
         self._standstill = False
-        if old is _ENABLED:
+        if old is _ENABLED_STATE:
             self._mode.leave(t_ns)
             self.parts.loop.close_brake()
-        if new is _ENABLED:
+        if new is _ENABLED_STATE:
             self._plant.begin(t_ns)
             here = self._motion.hold(t_ns)
             self.parts.loop.open_brake(t_ns)
@@ -249,7 +249,7 @@ class DriveApplication(Application):
         elif new is DriveState.FAULT_REACTION_ACTIVE:
             reacted = partial(self._happen, Event.FAULT_REACTION_DONE)
             self._motion.decelerate(t_ns, self._parameters.fault_rate, reacted)
-        elif old is _ENABLED:
+        elif old is _ENABLED_STATE:
             self._disable(t_ns)
         elif new is DriveState.SWITCHED_ON:
             self._pass_on_soon.arm(t_ns + STEP_NS)
@@ -257,7 +257,7 @@ class DriveApplication(Application):
             self._forget_faults()
         elif old is DriveState.QUICK_STOP_ACTIVE and self._motion.busy:
             self._motion.hold(t_ns)
-        if new is not _ENABLED:
+        if new is not _ENABLED_STATE:
             self.parts.supervision.stop()
         self._show()
 
@@ -279,25 +279,25 @@ class DriveApplication(Application):
 
     def _abort_connection(self, code: int, t_ns: int) -> None:
         option = self._parameters.abort_connection
-        if self.state is not _ENABLED:
+        if self.state is not _ENABLED_STATE:
             return
         if option == 1:
             self._find_fault(code, t_ns)
         elif option in _ABORT_COMMANDS:
-            self._go(TRANSITIONS[_ENABLED, _ABORT_COMMANDS[option]], t_ns)
+            self._go(TRANSITIONS[_ENABLED_STATE, _ABORT_COMMANDS[option]], t_ns)
 
     def _show(self) -> None:
         """Put the statusword together; a change is an event for the PDOs that carry it."""
         word = (
             cia402.statusword_of(self.state)
-            | 1 << cia402.VOLTAGE_ENABLED
-            | (self._core.state is NmtState.OPERATIONAL) << cia402.REMOTE
-            | self._standstill << cia402.TARGET_REACHED
-            | (FOLLOWING_ERROR in self._faults) << cia402.FOLLOWING_ERROR
+            | 1 << cia402.VOLTAGE_ENABLED_BIT
+            | (self._core.state is NmtState.OPERATIONAL) << cia402.REMOTE_BIT
+            | self._standstill << cia402.TARGET_REACHED_BIT
+            | (FOLLOWING_ERROR_CODE in self._faults) << cia402.FOLLOWING_ERROR_BIT
         )
-        if self.state is _ENABLED:
-            word |= self._mode.status() | self._mode.limited << cia402.INTERNAL_LIMIT
-        if word != self._values.get(_STATUSWORD):
+        if self.state is _ENABLED_STATE:
+            word |= self._mode.status() | self._mode.limited << cia402.INTERNAL_LIMIT_BIT
+        if word != self._values.get(_STATUSWORD_KEY):
             self._node.dictionary.put(0x6041, 0, word)
             self._node.pdos.event(0x6041)
 
@@ -329,7 +329,7 @@ def make_drive_node(
     plant: AxisPlant,
     od_of: OdOf | None = None,
     *,
-    delivery: Delivery = STAND_ALONE,
+    delivery: Delivery = STAND_ALONE_DELIVERY,
     quirks: Quirks | None = None,
     incremental: bool = False,
     seed: int = 0,

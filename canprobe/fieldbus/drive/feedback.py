@@ -13,9 +13,9 @@ from canprobe.fieldbus.drive.reference import AxisPlant, Motion
 from canprobe.fieldbus.drive.units import Units
 from canprobe.fieldbus.node.slave_node import SlaveNode
 
-_I16, _I32 = 1 << 15, 1 << 31
-_TORQUES = (0x6074, 0x6077)
-NEGATIVE_SWITCH, POSITIVE_SWITCH = 1, 2
+_I16_LIMIT, _I32_LIMIT = 1 << 15, 1 << 31
+_TORQUE_INDICES = (0x6074, 0x6077)
+NEGATIVE_SWITCH_FLAG, POSITIVE_SWITCH_FLAG = 1, 2
 """Bits of 60FDh."""
 
 
@@ -61,7 +61,7 @@ class DriveFeedback:
         self.show_torque(self.plant_torque)
         for index in self._sources:
             if node.dictionary.has_index(index):
-                sample = self._sampler(index, _I16 if index in _TORQUES else _I32)
+                sample = self._sampler(index, _I16_LIMIT if index in _TORQUE_INDICES else _I32_LIMIT)
                 node.pdos.on_trigger(index, sample)
                 node.dictionary.on_read(index, lambda _sub, sample=sample: sample(self._core.now_ns))  # type: ignore[misc]
 
@@ -94,11 +94,11 @@ class DriveFeedback:
         counts = self._plant.motor_counts(self._axis)
         below, above = counts <= low, counts >= high
         negative, positive = (below, above) if self._units.scale > 0.0 else (above, below)
-        return NEGATIVE_SWITCH * negative | POSITIVE_SWITCH * positive
+        return NEGATIVE_SWITCH_FLAG * negative | POSITIVE_SWITCH_FLAG * positive
 
     def show_torque(self, source: Callable[[], float]) -> None:
         """Take the torque, permille, from `source` from now on: the plant's, or that of a mode that controls it."""
-        self._sources.update(dict.fromkeys(_TORQUES, source))
+        self._sources.update(dict.fromkeys(_TORQUE_INDICES, source))
 
     def _sampler(self, index: int, limit: int) -> Callable[[int], None]:
         """What puts a value into the dictionary, as a whole number within +-limit."""

@@ -10,16 +10,16 @@ Source: CiA 402-2, "Interpolated position mode", objects 60C0h, 60C1h, 60C2h.
 from __future__ import annotations
 
 from canprobe.fieldbus.drive.cyclic_position import CyclicPosition
-from canprobe.fieldbus.drive.mode import REACHED, DriveParts
+from canprobe.fieldbus.drive.mode import REACHED_FLAG, DriveParts
 from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.entry import Value, key_of
 from canprobe.fieldbus.protocol.cia402 import (
-    ENABLE_INTERPOLATION,
-    INTERPOLATION_ACTIVE,
+    ENABLE_INTERPOLATION_BIT,
+    INTERPOLATION_ACTIVE_BIT,
     OperationMode,
 )
 
-_RECORD = key_of(0x60C1, 1)
+_RECORD_KEY = key_of(0x60C1, 1)
 
 
 class InterpolatedPosition(CyclicPosition):
@@ -27,8 +27,8 @@ class InterpolatedPosition(CyclicPosition):
 
     number = OperationMode.INTERPOLATED_POSITION
     target = 0x60C1
-    needs = (_RECORD,)
-    wanted = _RECORD, 0  # 0000h has no value
+    needs = (_RECORD_KEY,)
+    wanted = _RECORD_KEY, 0  # 0000h has no value
 
     def __init__(self, parts: DriveParts) -> None:
         super().__init__(parts)
@@ -38,16 +38,16 @@ class InterpolatedPosition(CyclicPosition):
     def start(self, word: int, t_ns: int) -> None:
         """Active at once where bit 4 is set already."""
         super().start(word, t_ns)
-        self._active = self._fresh = bool(word >> ENABLE_INTERPOLATION & 1)
+        self._active = self._fresh = bool(word >> ENABLE_INTERPOLATION_BIT & 1)
 
     def status(self) -> int:
         """Interpolation active; with halt, or without bit 4, at rest."""
-        return 1 << INTERPOLATION_ACTIVE if self._active and not self.halted else REACHED * self._standstill
+        return 1 << INTERPOLATION_ACTIVE_BIT if self._active and not self.halted else REACHED_FLAG * self._standstill
 
     def bits(self, word: int, changed: int, t_ns: int) -> None:
         """Bit 4 starts the interpolation, and stops it when it is taken away."""
-        if changed >> ENABLE_INTERPOLATION & 1:
-            self._active = self._fresh = bool(word >> ENABLE_INTERPOLATION & 1)
+        if changed >> ENABLE_INTERPOLATION_BIT & 1:
+            self._active = self._fresh = bool(word >> ENABLE_INTERPOLATION_BIT & 1)
             if self._active:
                 self._latched_ns = t_ns
             elif not self.halted:

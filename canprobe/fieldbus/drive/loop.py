@@ -9,11 +9,11 @@ Source: CiA 402-2, objects 6072h, 60B1h, 60B2h.
 
 from __future__ import annotations
 
-from canprobe.fieldbus.drive.parameters import PEAK_PERMILLE, DriveParameters
+from canprobe.fieldbus.drive.parameters import PEAK_TORQUE_PERMILLE, DriveParameters
 from canprobe.fieldbus.drive.reference import AxisPlant
 from canprobe.fieldbus.node.slave_node import SlaveNode
 
-_LIMIT, _SPEED, _TORQUE = 0x6072, 0x60B1, 0x60B2
+_LIMIT_INDEX, _SPEED_INDEX, _TORQUE_INDEX = 0x6072, 0x60B1, 0x60B2
 
 
 class DriveLoop:
@@ -34,9 +34,9 @@ class DriveLoop:
         self._axis, self._plant, self._parameters, self._number = axis, plant, parameters, dictionary.number
         self._early_ns = node.core.quirks.brake_early_ns
         self._torque_comes = node.core.timers.new(lambda _due_ns: self._give(*self._given[1:]))
-        self._given: tuple[int, float, float] = (PEAK_PERMILLE, 0.0, 0.0)
+        self._given: tuple[int, float, float] = (PEAK_TORQUE_PERMILLE, 0.0, 0.0)
         self.changed = True
-        for index in (_LIMIT, _SPEED, _TORQUE):
+        for index in (_LIMIT_INDEX, _SPEED_INDEX, _TORQUE_INDEX):
             dictionary.on_write(index, lambda _sub, _value: self._give(*self._given[1:]))
 
     def open_brake(self, t_ns: int) -> None:
@@ -53,12 +53,12 @@ class DriveLoop:
 
     def feed_forward(self) -> None:
         """Take limit and offsets as they are now."""
-        self._give(self._number(_SPEED) * self._parameters.units.speed_scale, float(self._number(_TORQUE)))
+        self._give(self._number(_SPEED_INDEX) * self._parameters.units.speed_scale, float(self._number(_TORQUE_INDEX)))
         self.changed = False
 
     def feed_torque(self) -> None:
         """Take limit and torque offset: every cycle of a velocity mode."""
-        self._give(0.0, float(self._number(_TORQUE)))
+        self._give(0.0, float(self._number(_TORQUE_INDEX)))
 
     def release(self) -> None:
         """Limit only."""

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 from canprobe.fieldbus.drive.feedback import DriveFeedback
 from canprobe.fieldbus.drive.loop import DriveLoop
-from canprobe.fieldbus.drive.parameters import PEAK_PERMILLE, DriveParameters
+from canprobe.fieldbus.drive.parameters import PEAK_TORQUE_PERMILLE, DriveParameters
 from canprobe.fieldbus.drive.reference import STEP_NS, AxisPlant, Motion
 from canprobe.fieldbus.drive.self_stop import Supervision
 from canprobe.fieldbus.drive.units import Delivery
@@ -19,10 +19,10 @@ from canprobe.fieldbus.node.entry import Value
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol import cia402
 from canprobe.fieldbus.protocol.cia402 import OperationMode
-from canprobe.fieldbus.protocol.emcy import FOLLOWING_ERROR
+from canprobe.fieldbus.protocol.emcy import FOLLOWING_ERROR_CODE
 
-REACHED = 1 << cia402.TARGET_REACHED
-FOLLOWS = 1 << cia402.DRIVE_FOLLOWS
+REACHED_FLAG = 1 << cia402.TARGET_REACHED_BIT
+FOLLOWS_FLAG = 1 << cia402.DRIVE_FOLLOWS_BIT
 
 
 class DriveParts:
@@ -89,7 +89,7 @@ class DriveMode:
         """The mode takes over; the reference stands, or slows down. `word` is the present controlword."""
         self._word = word
         self.limited = self._standstill = False
-        self.halted = bool(word >> cia402.HALT & 1)
+        self.halted = bool(word >> cia402.HALT_BIT & 1)
         if self.halted:
             self._halt(t_ns)
 
@@ -102,13 +102,13 @@ class DriveMode:
 
     def status(self) -> int:
         """Bits 10, 12 and 13 of the statusword."""
-        return REACHED if self._standstill else 0
+        return REACHED_FLAG if self._standstill else 0
 
     def command(self, word: int, t_ns: int) -> None:
         """The controlword changed; all values that came with it are stored."""
         changed, self._word = word ^ self._word, word
-        if changed >> cia402.HALT & 1:
-            self.halted = bool(word >> cia402.HALT & 1)
+        if changed >> cia402.HALT_BIT & 1:
+            self.halted = bool(word >> cia402.HALT_BIT & 1)
             if self.halted:
                 self._halt(t_ns)
             else:
@@ -138,7 +138,7 @@ class DriveMode:
     def _strains(self) -> bool:
         """Whether the motion takes all of 6072h, or more, which an ideal plant gives all the same."""
         limit = self._parameters.max_torque
-        return limit < PEAK_PERMILLE and abs(self.parts.feedback.plant_torque()) >= limit
+        return limit < PEAK_TORQUE_PERMILLE and abs(self.parts.feedback.plant_torque()) >= limit
 
     def _lags(self, t_ns: int, counts: float) -> bool:
         """Watch the following error; True when it has become a fault."""
@@ -150,7 +150,7 @@ class DriveMode:
             supervision.outside_ns = t_ns
         if t_ns - supervision.outside_ns < self._parameters.following_timeout_ns:
             return False
-        self.parts.fault(FOLLOWING_ERROR, t_ns)
+        self.parts.fault(FOLLOWING_ERROR_CODE, t_ns)
         return True
 
 
@@ -199,7 +199,7 @@ class CyclicMode(DriveMode):
 
     def status(self) -> int:
         """The drive follows the command value, unless halted."""
-        return super().status() if self.halted else FOLLOWS
+        return super().status() if self.halted else FOLLOWS_FLAG
 
     def sync(self, t_ns: int, counts: float) -> None:
         """Watch the following error and the master, latch the target."""

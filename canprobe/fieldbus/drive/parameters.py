@@ -8,27 +8,27 @@ from __future__ import annotations
 from functools import partial
 from math import inf
 
-from canprobe.fieldbus.drive.units import FACTORS, Delivery, Units
+from canprobe.fieldbus.drive.units import FACTOR_INDICES, Delivery, Units
 from canprobe.fieldbus.eds.packaged import MISSED_SYNCS, MISSED_SYNCS_NAME, SYNC_FACTOR, SYNC_FACTOR_NAME
 from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.dictionary import Dictionary
 from canprobe.fieldbus.node.entry import Value
 
 STAYING_QUICK_STOP_OPTIONS = frozenset({5, 6})  # of 605Ah: remain in QUICK_STOP_ACTIVE
-NO_WINDOW = 0xFFFFFFFF
+UNLIMITED_WINDOW = 0xFFFFFFFF
 DEFAULT_ACCELERATION = 100_000
 """Position units/s², of a drive whose EDS has no profile acceleration."""
 DEFAULT_WINDOW = 10
 """Position units, of a drive whose EDS has no 6067h."""
 CONTROL_PERIOD_NS = 1_000_000
 """Of the drive's own position loop: a target is reached after it where 60C2h is 0."""
-PEAK_PERMILLE = 2000
+PEAK_TORQUE_PERMILLE = 2000
 """What the plant's motors can do at most."""
-_OPTIONS = {0x605A: frozenset({1, 2, 5, 6}), 0x605D: frozenset({1, 2}), 0x6086: frozenset({0})}
+_ALLOWED_OPTIONS = {0x605A: frozenset({1, 2, 5, 6}), 0x605D: frozenset({1, 2}), 0x6086: frozenset({0})}
 _INDICES = (
     *(0x1006, MISSED_SYNCS, SYNC_FACTOR, 0x6007, 0x605A, 0x605B, 0x605C, 0x605D, 0x605E),
     *(0x6065, 0x6066, 0x6067, 0x6068, 0x6072, 0x607D, 0x607F, 0x6080, 0x6083, 0x6084, 0x6085, 0x609A, 0x60C2),
-    *FACTORS,
+    *FACTOR_INDICES,
 )
 
 
@@ -60,7 +60,7 @@ class DriveParameters:
         self.units = Units(dictionary, delivery)
         self.read()
         dictionary.on_change(self.read, *_INDICES)
-        for index, allowed in _OPTIONS.items():
+        for index, allowed in _ALLOWED_OPTIONS.items():
             dictionary.on_check(index, partial(_check_among, allowed))
         dictionary.on_check(0x60C2, _check_interpolation)
 
@@ -91,11 +91,11 @@ class DriveParameters:
         profile = number(0x607F) * units.speed if units.knows_speed else 0.0
         motor = number(0x6080) / 60.0 * units.turn if units.knows_turn else 0.0
         self.max_speed = min(profile or inf, motor or inf)
-        self.max_torque = min(number(0x6072, 0, PEAK_PERMILLE), PEAK_PERMILLE)
+        self.max_torque = min(number(0x6072, 0, PEAK_TORQUE_PERMILLE), PEAK_TORQUE_PERMILLE)
 
-    def _window(self, index: int, absent: int = NO_WINDOW) -> float:
+    def _window(self, index: int, absent: int = UNLIMITED_WINDOW) -> float:
         value = self._dictionary.number(index, 0, absent)
-        return inf if value == NO_WINDOW else value * self.units.magnitude
+        return inf if value == UNLIMITED_WINDOW else value * self.units.magnitude
 
     @property
     def fence(self) -> tuple[float, float]:

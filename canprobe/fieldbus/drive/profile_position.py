@@ -12,20 +12,20 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from canprobe.fieldbus.drive.cyclic_position import POSITION_TARGET
-from canprobe.fieldbus.drive.mode import REACHED, DriveParts, ProfiledMode
+from canprobe.fieldbus.drive.cyclic_position import POSITION_TARGET_KEY
+from canprobe.fieldbus.drive.mode import REACHED_FLAG, DriveParts, ProfiledMode
 from canprobe.fieldbus.drive.profile import Rates
 from canprobe.fieldbus.drive.reference import STEP_NS
 from canprobe.fieldbus.node.entry import key_of
 from canprobe.fieldbus.protocol.cia402 import (
-    CHANGE_IMMEDIATELY,
-    NEW_SETPOINT,
-    RELATIVE,
-    SETPOINT_ACKNOWLEDGE,
+    CHANGE_IMMEDIATELY_BIT,
+    NEW_SETPOINT_BIT,
+    RELATIVE_BIT,
+    SETPOINT_ACKNOWLEDGE_BIT,
     OperationMode,
 )
 
-_PROFILE_SPEED = key_of(0x6081)
+_PROFILE_SPEED_KEY = key_of(0x6081)
 
 
 class SetPoint(NamedTuple):
@@ -67,19 +67,19 @@ class ProfilePosition(ProfiledMode):
     def status(self) -> int:
         """Target reached (with halt: standing still), set-point acknowledge."""
         acknowledged = self._offered or self._next is not None
-        reached = super().status() if self.halted else REACHED * self._reached
-        return reached | acknowledged << SETPOINT_ACKNOWLEDGE
+        reached = super().status() if self.halted else REACHED_FLAG * self._reached
+        return reached | acknowledged << SETPOINT_ACKNOWLEDGE_BIT
 
     def bits(self, word: int, changed: int, t_ns: int) -> None:
         """A set-point is offered, or the offer taken back."""
-        offers = word >> NEW_SETPOINT & 1
+        offers = word >> NEW_SETPOINT_BIT & 1
         if not offers:
             self._offered = False
-        elif changed >> NEW_SETPOINT & 1:
-            at_once = bool(word >> CHANGE_IMMEDIATELY & 1)
+        elif changed >> NEW_SETPOINT_BIT & 1:
+            at_once = bool(word >> CHANGE_IMMEDIATELY_BIT & 1)
             if at_once or self._next is None:
                 self._offered = True
-                point = self._set_point(relative=bool(word >> RELATIVE & 1))
+                point = self._set_point(relative=bool(word >> RELATIVE_BIT & 1))
                 if at_once or self._active is None or self._reached:
                     self._next = None
                     self._begin(point, t_ns)
@@ -93,9 +93,9 @@ class ProfilePosition(ProfiledMode):
 
     def _set_point(self, relative: bool) -> SetPoint:
         parameters, units = self._parameters, self._units
-        wanted = int(self._values[POSITION_TARGET]) + (self._last if relative else 0)
+        wanted = int(self._values[POSITION_TARGET_KEY]) + (self._last if relative else 0)
         target = self._last = parameters.clamp(wanted)
-        speed = min(int(self._values.get(_PROFILE_SPEED, 0)) * units.speed, parameters.max_speed)
+        speed = min(int(self._values.get(_PROFILE_SPEED_KEY, 0)) * units.speed, parameters.max_speed)
         rates = Rates(speed, parameters.acceleration, parameters.deceleration or parameters.acceleration)
         return SetPoint(units.counts(target), rates, limited=target != wanted)
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from canprobe.fieldbus.drive.parameters import DriveParameters
 from canprobe.fieldbus.node.slave_node import SlaveNode
-from canprobe.fieldbus.protocol.emcy import RPDO_TIMEOUT, SYNC_LOST
+from canprobe.fieldbus.protocol.emcy import RPDO_TIMEOUT_CODE, SYNC_LOST_CODE
 
 
 class Supervision:
@@ -54,10 +54,10 @@ class Supervision:
             return
         self._misses += 1
         if 0 < self._parameters.misses <= self._misses:
-            self._lose(RPDO_TIMEOUT, t_ns)
+            self._lose(RPDO_TIMEOUT_CODE, t_ns)
 
     def _sync_missing(self, due_ns: int) -> None:
-        self._lose(SYNC_LOST, due_ns)
+        self._lose(SYNC_LOST_CODE, due_ns)
 
     def _lose(self, code: int, t_ns: int) -> None:
         self._node.emcy.report(code)

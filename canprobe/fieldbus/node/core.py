@@ -10,7 +10,7 @@ from canprobe.fieldbus.node.dictionary import Dictionary
 from canprobe.fieldbus.node.entry import Value
 from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.node.timers import Holder, Timers
-from canprobe.fieldbus.protocol.frames import Frame, NmtState, is_restricted
+from canprobe.fieldbus.protocol.frames import INVALID_FLAG, Frame, NmtState, is_restricted
 
 Route = Callable[[bytes, int], None]
 NO_ROUTES: Mapping[int, Route] = {}
@@ -68,7 +68,7 @@ def _refuse(dictionary: Dictionary, quirks: Quirks) -> None:
     for index in dictionary.indices_in(range(0x1800, 0x1A00)) if quirks.keep_bit30 else ():
 
         def keep_bit30(subindex: int, value: Value, index: int = index) -> None:
-            if subindex == 1 and (int(value) ^ dictionary.number(index, 1)) & NO_RTR:
+            if subindex == 1 and (int(value) ^ dictionary.number(index, 1)) & NO_RTR_FLAG:
                 raise SdoAbort(Abort.VALUE)
 
         dictionary.on_check(index, keep_bit30)
@@ -121,10 +121,8 @@ class Service:
         return NO_ROUTES
 
 
-INVALID = 1 << 31
-"""Of a COB-ID: the object does not exist."""
-NO_RTR = 1 << 30
-"""Of the COB-ID of a TPDO: a remote request is not answered."""
+NO_RTR_FLAG = 1 << 30
+"""Bit 30 of the COB-ID of a TPDO: a remote request is not answered."""
 
 
 def check_cob_id(new: Value, old: int, reserved: int = 0x3FFFF800) -> None:
@@ -133,6 +131,6 @@ def check_cob_id(new: Value, old: int, reserved: int = 0x3FFFF800) -> None:
     Source: CiA 301, objects 1014h, 1200h, 1400h, 1800h, "Restricted CAN-IDs".
     """
     word = int(new)
-    changed_while_valid = not (word | old) & INVALID and (word ^ old) & 0x7FF
-    if word & reserved or changed_while_valid or (not word & INVALID and is_restricted(word & 0x7FF)):
+    changed_while_valid = not (word | old) & INVALID_FLAG and (word ^ old) & 0x7FF
+    if word & reserved or changed_while_valid or (not word & INVALID_FLAG and is_restricted(word & 0x7FF)):
         raise SdoAbort(Abort.VALUE)

@@ -18,7 +18,7 @@ Check = Callable[[int, Value], None]
 Hook = Callable[[int, Value], None]
 Slot = tuple[int, int, float, float, tuple[Check, ...], tuple[Hook, ...]]
 """Where a value of a cyclic RPDO goes, looked up once: key, subindex, least, greatest, checks, hooks."""
-_ANY = 1 << 64
+_BEYOND_INTEGERS = 1 << 64
 """Beyond every integer: compared in half the time of an infinity."""
 
 
@@ -116,7 +116,10 @@ class Dictionary:
     def slot(self, key: int) -> Slot:
         """What `write_value` of a cyclic RPDO needs. Hooks and checks hung in later are not seen."""
         entry, index = self.entries[key], key >> 8
-        low, high = -_ANY if entry.low is None else entry.low, _ANY if entry.high is None else entry.high
+        low, high = (
+            -_BEYOND_INTEGERS if entry.low is None else entry.low,
+            _BEYOND_INTEGERS if entry.high is None else entry.high,
+        )
         return key, key & 0xFF, low, high, tuple(self._checks.get(index, ())), tuple(self._hooks.get(index, ()))
 
     def find(self, index: int, subindex: int) -> Entry:

@@ -9,15 +9,15 @@ from collections import deque
 from collections.abc import Hashable
 
 from canprobe.fieldbus.node.abort import Abort, SdoAbort
-from canprobe.fieldbus.node.core import INVALID, NodeCore, Service, check_cob_id
+from canprobe.fieldbus.node.core import NodeCore, Service, check_cob_id
 from canprobe.fieldbus.node.entry import Value
-from canprobe.fieldbus.protocol.emcy import NO_ERROR, Emcy
-from canprobe.fieldbus.protocol.frames import NmtState
+from canprobe.fieldbus.protocol.emcy import NO_ERROR_CODE, Emcy
+from canprobe.fieldbus.protocol.frames import INVALID_FLAG, NmtState
 
-_GENERIC = 0x01
+_GENERIC_FLAG = 0x01
 # Bits of 1001h by the first nibble of the code: current, voltage, temperature, communication/profile, manufacturer.
 _REGISTER_BITS = {0x2: 0x02, 0x3: 0x04, 0x4: 0x08, 0x7: 0x80, 0xF: 0x80}
-_SENDING = frozenset({NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL})
+_SENDING_STATES = frozenset({NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL})
 
 
 def register_bit(code: int) -> int:
@@ -27,7 +27,7 @@ def register_bit(code: int) -> int:
     return _REGISTER_BITS.get(code >> 12, 0)
 
 
-_MAX_WAITING = 16
+_MAX_WAITING_MESSAGES = 16
 """Messages kept while the inhibit time runs; of a flood the oldest go."""
 
 
@@ -43,7 +43,7 @@ class Emergency(Service):
         self._active: dict[int, set[Hashable]] = {}
         self.any = False
         self._history: list[int] = []
-        self._waiting: deque[tuple[int, int, bytes]] = deque(maxlen=_MAX_WAITING)
+        self._waiting: deque[tuple[int, int, bytes]] = deque(maxlen=_MAX_WAITING_MESSAGES)
         self._room = sum(1 for key in core.dictionary.entries if key >> 8 == 0x1003 and key & 0xFF)
         self._timer = core.timers.new(self._inhibit_over)
         core.dictionary.on_check(0x1003, self._check_history)
@@ -92,10 +92,10 @@ class Emergency(Service):
         if self._waiting and self._waiting[-1][0] == code:
             self._waiting.pop()  # come and gone within the inhibit time: nobody needs to hear of it
         else:
-            self._send(NO_ERROR, b"")
+            self._send(NO_ERROR_CODE, b"")
 
     def _send(self, code: int, data: bytes) -> None:
-        if self._core.state not in _SENDING:
+        if self._core.state not in _SENDING_STATES:
             return
         self._waiting.append((code, self._register(), data))
         if self._timer.due_ns is None:
@@ -105,13 +105,13 @@ class Emergency(Service):
         if self._waiting:
             cob_id = self._core.dictionary.number(0x1014, 0, 0x80 + self._core.node_id)
             emcy = Emcy(*self._waiting.popleft())
-            if not cob_id & INVALID:
+            if not cob_id & INVALID_FLAG:
                 self._core.send(cob_id & 0x7FF, emcy.pack())
             if inhibit := self._core.dictionary.number(0x1015):
                 self._timer.arm(due_ns + inhibit * 100_000)
 
     def _register(self) -> int:
-        bits = _GENERIC if self._active else 0
+        bits = _GENERIC_FLAG if self._active else 0
         for code in self._active:
             bits |= register_bit(code)
         return bits

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from canopen.objectdictionary import ObjectDictionary, datatypes
 
 from canprobe.fieldbus.eds.description import LAST_DUMMY, DescribedEntry, Description
-from canprobe.fieldbus.eds.values import REALS, SIGNED, UNSIGNED
+from canprobe.fieldbus.eds.values import REAL_FORMS, SIGNED_BITS, UNSIGNED_BITS
 from canprobe.fieldbus.node.abort import Abort, SdoAbort
 
 Value = int | float | bytes
@@ -91,14 +91,14 @@ def read_entries(od: ObjectDictionary) -> Iterator[Entry]:
 
 def _entry(described: DescribedEntry) -> Entry:
     data_type = described.data_type
-    number = data_type in SIGNED or data_type in UNSIGNED or data_type in REALS
+    number = data_type in SIGNED_BITS or data_type in UNSIGNED_BITS or data_type in REAL_FORMS
     bits = 8 if data_type == datatypes.BOOLEAN else described.bits if number else 0
     return Entry(
         key=key_of(described.index, described.subindex),
         name=described.name,
         bits=bits,
         signed=described.signed,
-        real=REALS[data_type][0] if data_type in REALS else "",
+        real=REAL_FORMS[data_type][0] if data_type in REAL_FORMS else "",
         readable=described.readable,
         writable=described.writable,
         in_tpdo=described.in_tpdo and described.index > LAST_DUMMY,

@@ -17,7 +17,7 @@ from canprobe.fieldbus.protocol.tactile import TactileHeader, crc16_ccitt
 
 _GARBAGE_ID = 0x050
 _TPDO1 = 0x180
-_DARK = (FaultKind.REBOOT, FaultKind.FREEZE)
+_DARK_KINDS = (FaultKind.REBOOT, FaultKind.FREEZE)
 
 
 class FaultyNode(WrappedNode):
@@ -54,7 +54,7 @@ class FaultyNode(WrappedNode):
             self._babble_ns[fault] = fault.start_ns
         if fault.kind is FaultKind.REBOOT:
             self._boots = sorted((*self._boots, fault.start_ns, fault.end_ns))
-        if fault.kind in _DARK:
+        if fault.kind in _DARK_KINDS:
             self._thaws = sorted((*self._thaws, fault.end_ns))
 
     @property
@@ -65,7 +65,7 @@ class FaultyNode(WrappedNode):
         due += self._boots[:1] + self._thaws[:1]
         own = self.node.next_deadline_ns
         if own is not None:
-            due.append(max((own, *(f.end_ns for f, _ in self._faults if f.kind in _DARK and f.holds(own)))))
+            due.append(max((own, *(f.end_ns for f, _ in self._faults if f.kind in _DARK_KINDS and f.holds(own)))))
         return min(due, default=None)
 
     def start(self, t_ns: int) -> Sequence[Frame]:
@@ -100,7 +100,7 @@ class FaultyNode(WrappedNode):
         return [*ready, *self._sent(answers, t_ns), *self._babble(t_ns)]
 
     def _is_dark(self, t_ns: int) -> bool:
-        return any(f.kind in _DARK and f.holds(t_ns) for f, _ in self._faults)
+        return any(f.kind in _DARK_KINDS and f.holds(t_ns) for f, _ in self._faults)
 
     def _reboot(self, t_ns: int) -> list[Frame]:
         """Power fails: the node is as new, and silent until power is back."""

@@ -13,7 +13,7 @@ from canprobe.fieldbus.node.core import NO_ROUTES, NodeCore, Route, Service
 from canprobe.fieldbus.node.emcy import Emergency
 from canprobe.fieldbus.node.entry import Value
 from canprobe.fieldbus.node.timers import Timer
-from canprobe.fieldbus.protocol.emcy import HEARTBEAT_LOST
+from canprobe.fieldbus.protocol.emcy import HEARTBEAT_LOST_CODE
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, NmtState, pack_heartbeat
 
 
@@ -84,7 +84,7 @@ class HeartbeatConsumer(Service):
     def _configure(self) -> None:
         for node_id, (timer, _) in self._watched.items():
             timer.cancel()
-            self._emcy.clear(HEARTBEAT_LOST, node_id)
+            self._emcy.clear(HEARTBEAT_LOST_CODE, node_id)
         self._watched = {
             node_id: (self._core.timers.new(partial(self._timed_out, node_id)), period * 1_000_000)
             for node_id, period in self._entries().values()
@@ -96,10 +96,10 @@ class HeartbeatConsumer(Service):
             timer, period_ns = self._watched[node_id]
             timer.arm(t_ns + period_ns)
             if self._emcy.any:
-                self._emcy.clear(HEARTBEAT_LOST, node_id)
+                self._emcy.clear(HEARTBEAT_LOST_CODE, node_id)
 
     def _timed_out(self, node_id: int, due_ns: int) -> None:
-        self._emcy.report(HEARTBEAT_LOST, bytes((node_id,)), source=node_id)
+        self._emcy.report(HEARTBEAT_LOST_CODE, bytes((node_id,)), source=node_id)
         self._on_loss(due_ns)
 
     def _check(self, subindex: int, value: Value) -> None:

@@ -12,14 +12,14 @@ from collections.abc import Callable, Mapping
 
 from canprobe.fieldbus.node.abort import SdoAbort
 from canprobe.fieldbus.node.core import NodeCore, Route, Service
-from canprobe.fieldbus.node.lss_search import IDENTIFY, SELECT, LssSearch
+from canprobe.fieldbus.node.lss_search import IDENTIFY_COMMANDS, SELECT_COMMANDS, LssSearch
 from canprobe.fieldbus.node.store import Store
 from canprobe.fieldbus.protocol.lss import (
     BIT_RATES,
     LSS_ANSWER_ID,
-    LSS_LENGTH,
+    LSS_BYTES,
     LSS_REQUEST_ID,
-    UNCONFIGURED,
+    UNCONFIGURED_ID,
     LssAddress,
     LssCommand,
     LssError,
@@ -28,7 +28,7 @@ from canprobe.fieldbus.protocol.lss import (
     pack_number,
 )
 
-_INQUIRE = range(LssCommand.INQUIRE_VENDOR, LssCommand.INQUIRE_SERIAL + 1)
+_INQUIRE_COMMANDS = range(LssCommand.INQUIRE_VENDOR, LssCommand.INQUIRE_SERIAL + 1)
 
 
 class LssSlave(Service):
@@ -41,7 +41,7 @@ class LssSlave(Service):
         bitrate: see below.
 
     Attributes:
-        pending: node id from the next reset communication on, or `UNCONFIGURED`.
+        pending: node id from the next reset communication on, or `UNCONFIGURED_ID`.
         state: waiting or configuration.
         bitrate: of the bus, bit/s.
     """
@@ -60,7 +60,7 @@ class LssSlave(Service):
     @property
     def unconfigured(self) -> bool:
         """The node has no id and waits for one."""
-        return self._core.node_id == UNCONFIGURED
+        return self._core.node_id == UNCONFIGURED_ID
 
     def power_on(self) -> None:
         """Take the id that was stored, if one was."""
@@ -76,7 +76,7 @@ class LssSlave(Service):
         return {LSS_REQUEST_ID: self._receive}
 
     def _receive(self, data: bytes, t_ns: int) -> None:
-        if len(data) != LSS_LENGTH:
+        if len(data) != LSS_BYTES:
             return
         if data[0] == LssCommand.SWITCH_GLOBAL:
             self._switch(data[1], t_ns)
@@ -90,7 +90,7 @@ class LssSlave(Service):
     def _switch(self, mode: int, t_ns: int) -> None:
         if mode not in tuple(LssState):
             return
-        boots = self.state is LssState.CONFIGURATION and self.unconfigured and self.pending != UNCONFIGURED
+        boots = self.state is LssState.CONFIGURATION and self.unconfigured and self.pending != UNCONFIGURED_ID
         self._enter(LssState(mode))
         if boots and mode == LssState.WAITING:
             self._reset(t_ns)
@@ -102,12 +102,12 @@ class LssSlave(Service):
     def _searched(self, data: bytes) -> bytes | None:
         """Answer the questions by which a master finds the slave; fastscan is for slaves without an id alone."""
         command, waits = data[0], self.state is LssState.WAITING
-        blank = self.unconfigured and self.pending == UNCONFIGURED  # no id, and it was not given one yet
-        if command in IDENTIFY and self._search.identifies(data, self.address):
+        blank = self.unconfigured and self.pending == UNCONFIGURED_ID  # no id, and it was not given one yet
+        if command in IDENTIFY_COMMANDS and self._search.identifies(data, self.address):
             return pack_lss(LssCommand.IDENTIFIED)
         if command == LssCommand.IDENTIFY_UNCONFIGURED and blank:
             return pack_lss(LssCommand.IDENTIFIED_UNCONFIGURED)
-        if waits and command in SELECT and self._search.selects(data, self.address):
+        if waits and command in SELECT_COMMANDS and self._search.selects(data, self.address):
             self._enter(LssState.CONFIGURATION)
             return pack_lss(LssCommand.SELECTED)
         if waits and command == LssCommand.FASTSCAN and blank:
@@ -120,12 +120,12 @@ class LssSlave(Service):
     def _configured(self, data: bytes) -> bytes | None:
         """Answer what a master asks and orders in configuration state."""
         command, error = data[0], LssError.NONE
-        if command in _INQUIRE:
-            return pack_number(LssCommand(command), self.address.numbers[command - _INQUIRE[0]])
+        if command in _INQUIRE_COMMANDS:
+            return pack_number(LssCommand(command), self.address.numbers[command - _INQUIRE_COMMANDS[0]])
         if command == LssCommand.INQUIRE_NODE_ID:  # in initialisation the pending one, which is about to be active
             return pack_lss(LssCommand(command), bytes((self.pending if self.unconfigured else self._core.node_id,)))
         if command == LssCommand.CONFIGURE_NODE_ID:
-            if 1 <= data[1] <= 127 or data[1] == UNCONFIGURED:
+            if 1 <= data[1] <= 127 or data[1] == UNCONFIGURED_ID:
                 self.pending = data[1]
             else:
                 error = LssError.REFUSED

@@ -11,9 +11,9 @@ from canprobe.fieldbus.protocol.lss import (
     LssCommand,
 )
 
-SELECT = range(LssCommand.SELECT_VENDOR, LssCommand.SELECT_SERIAL + 1)
-IDENTIFY = range(LssCommand.IDENTIFY_VENDOR, LssCommand.IDENTIFY_SERIAL_HIGH + 1)
-_MASK = 0xFFFFFFFF
+SELECT_COMMANDS = range(LssCommand.SELECT_VENDOR, LssCommand.SELECT_SERIAL + 1)
+IDENTIFY_COMMANDS = range(LssCommand.IDENTIFY_VENDOR, LssCommand.IDENTIFY_SERIAL_HIGH + 1)
+_NUMBER_MASK = 0xFFFFFFFF
 
 
 class LssSearch:
@@ -30,11 +30,11 @@ class LssSearch:
 
     def selects(self, data: bytes, mine: LssAddress) -> bool:
         """Switch state selective: the four numbers one after another, the last one decides."""
-        return tuple(self._complete(data, SELECT)) == mine.numbers
+        return tuple(self._complete(data, SELECT_COMMANDS)) == mine.numbers
 
     def identifies(self, data: bytes, mine: LssAddress) -> bool:
         """Identify remote slave: vendor and product, revision and serial number each from a lowest to a highest."""
-        numbers = self._complete(data, IDENTIFY)
+        numbers = self._complete(data, IDENTIFY_COMMANDS)
         if not numbers:
             return False
         vendor, product, revision_low, revision_high, serial_low, serial_high = numbers
@@ -52,7 +52,7 @@ class LssSearch:
         if bit == PRESENCE_CHECK:
             self._position = 0
             return True, False
-        asked = _MASK << bit & _MASK
+        asked = _NUMBER_MASK << bit & _NUMBER_MASK
         if position != self._position or (_number_in(data) ^ mine.numbers[position]) & asked:
             return False, False
         self._position = following

@@ -15,7 +15,7 @@ from canprobe.fieldbus.node.emcy import Emergency
 from canprobe.fieldbus.node.entry import Value, key_of
 from canprobe.fieldbus.node.pdo_rules import PdoRules
 from canprobe.fieldbus.node.rpdo import Rpdo
-from canprobe.fieldbus.node.tpdo import BUFFERED, Packing, Sampler, Tpdo
+from canprobe.fieldbus.node.tpdo import BUFFERED_TYPE, Packing, Sampler, Tpdo
 from canprobe.fieldbus.protocol.frames import Frame, NmtState
 
 
@@ -215,7 +215,7 @@ class PdoEngine(Service):
         self._waiting = [rpdo for rpdo in self._rpdos if rpdo.cob_id is not None and rpdo.synchronous]
         active = [tpdo for tpdo in self._tpdos if tpdo.active]
         self._on_event = [tpdo for tpdo in active if tpdo.type == 0 or tpdo.by_event]
-        self._buffered = [tpdo for tpdo in active if tpdo.type == BUFFERED]
+        self._buffered = [tpdo for tpdo in active if tpdo.type == BUFFERED_TYPE]
         dictionary.watched = frozenset(key for tpdo in self._on_event for key in tpdo.keys)
         counted = bool(dictionary.number(0x1019))
         groups: dict[tuple[int, int], _Group] = {}

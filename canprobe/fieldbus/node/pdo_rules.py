@@ -9,14 +9,15 @@ from dataclasses import dataclass
 
 from canprobe.fieldbus.eds.packaged import LONG_PDOS, LONG_PDOS_NAME
 from canprobe.fieldbus.node.abort import Abort, SdoAbort
-from canprobe.fieldbus.node.core import INVALID, check_cob_id
+from canprobe.fieldbus.node.core import check_cob_id
 from canprobe.fieldbus.node.dictionary import Dictionary
 from canprobe.fieldbus.node.entry import Value, key_of
-from canprobe.fieldbus.protocol.pdo import FD_MAX_BITS, MAX_BITS, PdoEntry
+from canprobe.fieldbus.protocol.frames import INVALID_FLAG
+from canprobe.fieldbus.protocol.pdo import MAX_FD_PDO_BITS, MAX_PDO_BITS, PdoEntry
 
-COB_ID, TYPE, INHIBIT, EVENT, START = 1, 2, 3, 5, 6
-_RESERVED_RPDO = range(0xF1, 0xFE)
-_RESERVED_TPDO = range(0xF1, 0xFC)
+COB_ID_SUB, TYPE_SUB, INHIBIT_SUB, EVENT_SUB, START_SUB = 1, 2, 3, 5, 6
+_RESERVED_RPDO_TYPES = range(0xF1, 0xFE)
+_RESERVED_TPDO_TYPES = range(0xF1, 0xFC)
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +38,7 @@ class PdoRules:
     @property
     def valid(self) -> bool:
         """Whether the PDO exists now (bit 31 of its COB-ID is 0)."""
-        return not self.dictionary.number(self.communication, COB_ID, INVALID) & INVALID
+        return not self.dictionary.number(self.communication, COB_ID_SUB, INVALID_FLAG) & INVALID_FLAG
 
     @property
     def long(self) -> bool:
@@ -48,13 +49,13 @@ class PdoRules:
     def check_communication(self, subindex: int, value: Value) -> None:
         """Raises SdoAbort for a value that the standard forbids now."""
         new, old = int(value), self.dictionary.number(self.communication, subindex)
-        if subindex == COB_ID:
+        if subindex == COB_ID_SUB:
             check_cob_id(new, old)
-        elif subindex == TYPE:
-            if new in (_RESERVED_TPDO if self.transmits else _RESERVED_RPDO):
+        elif subindex == TYPE_SUB:
+            if new in (_RESERVED_TPDO_TYPES if self.transmits else _RESERVED_RPDO_TYPES):
                 raise SdoAbort(Abort.VALUE)
-        elif subindex in (INHIBIT, START):
-            too_big = subindex == START and new > 240
+        elif subindex in (INHIBIT_SUB, START_SUB):
+            too_big = subindex == START_SUB and new > 240
             if too_big or (self.valid and new != old):
                 raise SdoAbort(Abort.VALUE)
 
@@ -76,7 +77,7 @@ class PdoRules:
         if total and key_of(self.mapping, total) not in self.dictionary:
             raise SdoAbort(Abort.MAPPING_LENGTH)
         found = tuple(self.entry(self.dictionary.number(self.mapping, sub), fixed) for sub in range(1, total + 1))
-        if sum(entry.bits for entry in found) > (FD_MAX_BITS if self.long else MAX_BITS):
+        if sum(entry.bits for entry in found) > (MAX_FD_PDO_BITS if self.long else MAX_PDO_BITS):
             raise SdoAbort(Abort.MAPPING_LENGTH)
         return found
 

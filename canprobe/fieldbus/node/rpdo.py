@@ -10,8 +10,8 @@ from canprobe.fieldbus.node.core import NodeCore
 from canprobe.fieldbus.node.dictionary import Slot
 from canprobe.fieldbus.node.emcy import Emergency
 from canprobe.fieldbus.node.entry import key_of
-from canprobe.fieldbus.node.pdo_rules import COB_ID, EVENT, TYPE, PdoRules
-from canprobe.fieldbus.protocol.emcy import PDO_TOO_LONG, PDO_TOO_SHORT, RPDO_TIMEOUT
+from canprobe.fieldbus.node.pdo_rules import COB_ID_SUB, EVENT_SUB, TYPE_SUB, PdoRules
+from canprobe.fieldbus.protocol.emcy import PDO_TOO_LONG_CODE, PDO_TOO_SHORT_CODE, RPDO_TIMEOUT_CODE
 from canprobe.fieldbus.protocol.pdo import PdoLayout
 
 
@@ -43,13 +43,13 @@ class Rpdo:
         self.stop()
         if self._emcy.any:
             self._forgive()  # what was wrong with the old parameters
-        self.cob_id = dictionary.number(index, COB_ID) & 0x7FF if self._rules.valid else None
+        self.cob_id = dictionary.number(index, COB_ID_SUB) & 0x7FF if self._rules.valid else None
         self._layout = PdoLayout(self.cob_id or 0, self._rules.present())
         self._unpack = self._layout.raw_unpack  # the length is checked before
         self.keys = tuple(key_of(signal.index, signal.subindex) for signal in self._layout.signals)
         self._slots = tuple(dictionary.slot(key) for key in self.keys)
-        self.synchronous = dictionary.number(index, TYPE) <= 240
-        self._event_ns = dictionary.number(index, EVENT) * 1_000_000
+        self.synchronous = dictionary.number(index, TYPE_SUB) <= 240
+        self._event_ns = dictionary.number(index, EVENT_SUB) * 1_000_000
 
     @property
     def patient(self) -> bool:
@@ -66,9 +66,9 @@ class Rpdo:
         length = self._layout.length
         if len(data) != length:
             if len(data) < length:
-                self._emcy.report(PDO_TOO_SHORT, source=self)
+                self._emcy.report(PDO_TOO_SHORT_CODE, source=self)
                 return
-            self._emcy.report(PDO_TOO_LONG, source=self)
+            self._emcy.report(PDO_TOO_LONG_CODE, source=self)
             data = data[:length]
         elif self._emcy.any:
             self._forgive()
@@ -105,9 +105,9 @@ class Rpdo:
             dictionary.written(reported)
 
     def _forgive(self) -> None:
-        for code in (PDO_TOO_SHORT, PDO_TOO_LONG, RPDO_TIMEOUT):
+        for code in (PDO_TOO_SHORT_CODE, PDO_TOO_LONG_CODE, RPDO_TIMEOUT_CODE):
             self._emcy.clear(code, self)
-        self._emcy.clear(RPDO_TIMEOUT)  # a drive's, which misses targets whatever PDO brings them
+        self._emcy.clear(RPDO_TIMEOUT_CODE)  # a drive's, which misses targets whatever PDO brings them
 
     def _timed_out(self, due_ns: int) -> None:
-        self._emcy.report(RPDO_TIMEOUT, source=self)
+        self._emcy.report(RPDO_TIMEOUT_CODE, source=self)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 
 from canprobe.fieldbus.node.abort import Abort, SdoAbort
-from canprobe.fieldbus.node.core import INVALID, NO_ROUTES, DelayedFrames, NodeCore, Route, Service, check_cob_id
+from canprobe.fieldbus.node.core import NO_ROUTES, DelayedFrames, NodeCore, Route, Service, check_cob_id
 from canprobe.fieldbus.node.entry import Value
 from canprobe.fieldbus.node.sdo_states import SDO_TRANSITIONS, SdoRequest, SdoState, request_of
 from canprobe.fieldbus.node.sdo_transfers import (
@@ -24,13 +24,13 @@ from canprobe.fieldbus.node.sdo_transfers import (
     Transfer,
     check_block_size,
 )
-from canprobe.fieldbus.protocol.frames import SDO_RX_BASE, SDO_TX_BASE, NmtState
+from canprobe.fieldbus.protocol.frames import INVALID_FLAG, SDO_RX_BASE, SDO_TX_BASE, NmtState
 
 SDO_TIMEOUT_NS = 1_000_000_000
 """Time without a frame of the client after which a transfer is aborted with 05040000h."""
-_HEAD = struct.Struct("<BHBI")
-_EXPEDITED = {size: partial(struct.Struct("<BHB4s").pack, 0x43 | (4 - size) << 2) for size in (1, 2, 3, 4)}
-_SERVED = frozenset({NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL})
+_INITIATE_FORM = struct.Struct("<BHBI")
+_EXPEDITED_PACKERS = {size: partial(struct.Struct("<BHB4s").pack, 0x43 | (4 - size) << 2) for size in (1, 2, 3, 4)}
+_SERVED_STATES = frozenset({NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL})
 
 
 class SdoServer(Service):
@@ -67,24 +67,24 @@ class SdoServer(Service):
 
     def entered(self, t_ns: int) -> None:
         """End a transfer in the stopped state, which none survives."""
-        if self._core.state not in _SERVED:
+        if self._core.state not in _SERVED_STATES:
             self.reset(t_ns)
 
     def routes(self) -> Mapping[int, Route]:
         """The request identifier, in pre-operational and operational."""
         cob_id, answer_id = self._cob_id(1, SDO_RX_BASE), self._cob_id(2, SDO_TX_BASE)
         self._answer_id = answer_id & 0x7FF
-        if self._core.state not in _SERVED or (cob_id | answer_id) & INVALID:
+        if self._core.state not in _SERVED_STATES or (cob_id | answer_id) & INVALID_FLAG:
             return NO_ROUTES
         return {cob_id & 0x7FF: self._receive}
 
     def _cob_id(self, subindex: int, base: int) -> int:
-        default = base + self._core.node_id if self._index == 0x1200 else INVALID
+        default = base + self._core.node_id if self._index == 0x1200 else INVALID_FLAG
         return self._core.dictionary.number(self._index, subindex, default)
 
     def _check_cob_id(self, subindex: int, value: Value) -> None:
         if subindex in (1, 2):
-            check_cob_id(value, self._core.dictionary.number(self._index, subindex, INVALID))
+            check_cob_id(value, self._core.dictionary.number(self._index, subindex, INVALID_FLAG))
 
     def _receive(self, data: bytes, t_ns: int) -> None:
         if len(data) != 8:
@@ -107,7 +107,7 @@ class SdoServer(Service):
         request = request_of(state, data[0])
         initiate = self._initiate.get(request)
         if initiate is not None or (state is SdoState.IDLE and request is not SdoRequest.ABORT):
-            self._multiplexer = _HEAD.unpack(data)[1:3]
+            self._multiplexer = _INITIATE_FORM.unpack(data)[1:3]
         if initiate is not None:
             self._transfer = None
             return [initiate(data)]
@@ -129,13 +129,13 @@ class SdoServer(Service):
             dictionary.configured(index)
         else:
             self._transfer = SegmentedDownload(entry, _size_in(data) if command & 1 else None, self._store)
-        return _HEAD.pack(0x60, index, subindex, 0)
+        return _INITIATE_FORM.pack(0x60, index, subindex, 0)
 
     def _block_download(self, data: bytes) -> bytes:
         entry, command = self._core.dictionary.find_writable(*self._multiplexer), data[0]
         announced, with_crc = _size_in(data) if command & 2 else None, bool(command & 4)
         self._transfer = BlockDownload(entry, announced, self._store, with_crc)
-        return _HEAD.pack(0xA4, *self._multiplexer, MAX_BLOCK_SEGMENTS)
+        return _INITIATE_FORM.pack(0xA4, *self._multiplexer, MAX_BLOCK_SEGMENTS)
 
     def _store(self, value: bytes) -> None:
         self._core.dictionary.write(*self._multiplexer, value)
@@ -144,9 +144,9 @@ class SdoServer(Service):
     def _upload(self, data: bytes) -> bytes:
         value = self._core.dictionary.read(*self._multiplexer)
         if 1 <= len(value) <= 4:
-            return _EXPEDITED[len(value)](*self._multiplexer, value)
+            return _EXPEDITED_PACKERS[len(value)](*self._multiplexer, value)
         self._transfer = SegmentedUpload(value)
-        return _HEAD.pack(0x41, *self._multiplexer, len(value))
+        return _INITIATE_FORM.pack(0x41, *self._multiplexer, len(value))
 
     def _block_upload(self, data: bytes) -> bytes:
         value = self._core.dictionary.read(*self._multiplexer)
@@ -154,7 +154,7 @@ class SdoServer(Service):
         if 0 < len(value) <= data[5]:  # the protocol switch threshold
             return self._upload(data)
         self._transfer = BlockUpload(value, block_size, with_crc=bool(data[0] & 4))
-        return _HEAD.pack(0xC6, *self._multiplexer, len(value))
+        return _INITIATE_FORM.pack(0xC6, *self._multiplexer, len(value))
 
     def _drop(self) -> None:
         self._transfer = None
@@ -162,7 +162,7 @@ class SdoServer(Service):
 
     def _abort(self, code: Abort) -> None:
         self._drop()
-        self._send(_HEAD.pack(0x80, *self._multiplexer, code))
+        self._send(_INITIATE_FORM.pack(0x80, *self._multiplexer, code))
 
     def _send(self, answer: bytes) -> None:
         self._late.send([(self._answer_id, answer)], self._core.now_ns)

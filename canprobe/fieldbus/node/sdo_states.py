@@ -46,15 +46,15 @@ class SdoRequest(IntEnum):
 
 
 _S, _R = SdoState, SdoRequest
-_COMMANDED = tuple(state for state in SdoState if state is not SdoState.BLOCK_DOWNLOAD)
-_INITIATE = {
+_COMMAND_STATES = tuple(state for state in SdoState if state is not SdoState.BLOCK_DOWNLOAD)
+_INITIATE_GOALS = {
     _R.INITIATE_DOWNLOAD: (_S.IDLE, _S.DOWNLOAD),  # expedited; segmented
     _R.INITIATE_UPLOAD: (_S.IDLE, _S.UPLOAD),
     _R.INITIATE_BLOCK_DOWNLOAD: (_S.BLOCK_DOWNLOAD,),
     _R.INITIATE_BLOCK_UPLOAD: (_S.BLOCK_UPLOAD_START, _S.IDLE, _S.UPLOAD),  # the last two by the protocol switch
 }
 SDO_TRANSITIONS: dict[tuple[SdoState, SdoRequest], tuple[SdoState, ...]] = {
-    **{(state, request): goals for state in _COMMANDED for request, goals in _INITIATE.items()},
+    **{(state, request): goals for state in _COMMAND_STATES for request, goals in _INITIATE_GOALS.items()},
     **{(state, _R.ABORT): (_S.IDLE,) for state in SdoState},
     (_S.DOWNLOAD, _R.DOWNLOAD_SEGMENT): (_S.DOWNLOAD, _S.IDLE),
     (_S.UPLOAD, _R.UPLOAD_SEGMENT): (_S.UPLOAD, _S.IDLE),
@@ -66,9 +66,9 @@ SDO_TRANSITIONS: dict[tuple[SdoState, SdoRequest], tuple[SdoState, ...]] = {
 }
 """State and request → the states that may follow when the request is right in itself; IDLE by an abort if not."""
 _ABORT_COMMAND = 0x80
-_BY_SPECIFIER = (_R.DOWNLOAD_SEGMENT, _R.INITIATE_DOWNLOAD, _R.INITIATE_UPLOAD, _R.UPLOAD_SEGMENT)
-_BLOCK_UPLOAD = (_R.INITIATE_BLOCK_UPLOAD, _R.END_BLOCK_UPLOAD, _R.ACKNOWLEDGE_BLOCK, _R.START_BLOCK_UPLOAD)
-_BLOCK_DOWNLOAD = (_R.INITIATE_BLOCK_DOWNLOAD, _R.END_BLOCK_DOWNLOAD)
+_SPECIFIED_REQUESTS = (_R.DOWNLOAD_SEGMENT, _R.INITIATE_DOWNLOAD, _R.INITIATE_UPLOAD, _R.UPLOAD_SEGMENT)
+_BLOCK_UPLOAD_REQUESTS = (_R.INITIATE_BLOCK_UPLOAD, _R.END_BLOCK_UPLOAD, _R.ACKNOWLEDGE_BLOCK, _R.START_BLOCK_UPLOAD)
+_BLOCK_DOWNLOAD_REQUESTS = (_R.INITIATE_BLOCK_DOWNLOAD, _R.END_BLOCK_DOWNLOAD)
 
 
 def _read(command: int) -> SdoRequest:
@@ -76,10 +76,10 @@ def _read(command: int) -> SdoRequest:
     if command == _ABORT_COMMAND:
         return _R.ABORT
     if specifier == 5:
-        return _BLOCK_UPLOAD[command & 3]
+        return _BLOCK_UPLOAD_REQUESTS[command & 3]
     if specifier == 6:
-        return _BLOCK_DOWNLOAD[command & 1]
-    return _BY_SPECIFIER[specifier] if specifier < 4 else _R.UNKNOWN
+        return _BLOCK_DOWNLOAD_REQUESTS[command & 1]
+    return _SPECIFIED_REQUESTS[specifier] if specifier < 4 else _R.UNKNOWN
 
 
 _REQUESTS = tuple(_read(command) for command in range(256))

@@ -22,7 +22,7 @@ MAX_VALUE_BYTES = 1 << 20
 """Longest value that a node takes; a longer one is refused with 05040005h."""
 MAX_BLOCK_SEGMENTS = 127
 _SEGMENT_BYTES = 7
-_TOGGLE = 0x10
+_TOGGLE_FLAG = 0x10
 
 
 class Transfer(ABC):
@@ -47,7 +47,7 @@ def check_block_size(size: int) -> int:
 
 
 def _check_toggle(command: int, toggle: int) -> None:
-    if command & _TOGGLE != toggle:
+    if command & _TOGGLE_FLAG != toggle:
         raise SdoAbort(Abort.TOGGLE)
 
 
@@ -94,7 +94,7 @@ class SegmentedDownload(_Download):
         """Take a segment; the last one stores the value."""
         toggle = self._toggle
         _check_toggle(data[0], toggle)
-        self._toggle ^= _TOGGLE
+        self._toggle ^= _TOGGLE_FLAG
         self._take(data[1 : 8 - (data[0] >> 1 & 7)])
         if data[0] & 1:
             self._store(self._received())
@@ -159,7 +159,7 @@ class SegmentedUpload(Transfer):
         """Send the segment that is asked for."""
         toggle = self._toggle
         _check_toggle(data[0], toggle)
-        self._toggle ^= _TOGGLE
+        self._toggle ^= _TOGGLE_FLAG
         piece = self._value[self._position : self._position + _SEGMENT_BYTES]
         self._position += _SEGMENT_BYTES
         last = self._position >= len(self._value)

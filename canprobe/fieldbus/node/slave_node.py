@@ -30,11 +30,11 @@ from canprobe.fieldbus.node.sdo_server import SdoServer
 from canprobe.fieldbus.node.store import Store
 from canprobe.fieldbus.node.sync import SyncConsumer
 from canprobe.fieldbus.protocol.frames import NMT_ID, Frame, NmtCommand, NmtState
-from canprobe.fieldbus.protocol.lss import UNCONFIGURED
+from canprobe.fieldbus.protocol.lss import UNCONFIGURED_ID
 
 OdOf = Callable[[int], ObjectDictionary]
 """Parses a node's EDS for a node id."""
-_ON_COMMUNICATION_ERROR = {0: NmtState.PRE_OPERATIONAL, 2: NmtState.STOPPED}  # 1029h:01; 1: no change
+_COMMUNICATION_ERROR_STATES = {0: NmtState.PRE_OPERATIONAL, 2: NmtState.STOPPED}  # 1029h:01; 1: no change
 
 
 class Application:
@@ -91,7 +91,7 @@ class SlaveNode(Participant):
 
         Args:
             od: parsed EDS, with $NODEID already put in.
-            node_id: 1–127; or 255 (`UNCONFIGURED`): it waits for LSS to give it one.
+            node_id: 1–127; or 255 (`UNCONFIGURED_ID`): it waits for LSS to give it one.
             application: what the device does; none by default.
             od_of: the same EDS for another node id. Where it is given, the node speaks LSS.
             quirks: what makes it difficult, such as a slow boot, during which nothing is served; None: nothing.
@@ -129,7 +129,7 @@ class SlaveNode(Participant):
     @property
     def name(self) -> str:
         """For messages."""
-        return f"node {self.core.node_id}" if self.core.node_id != UNCONFIGURED else "node without an id"
+        return f"node {self.core.node_id}" if self.core.node_id != UNCONFIGURED_ID else "node without an id"
 
     @property
     def state(self) -> NmtState:
@@ -207,7 +207,7 @@ class SlaveNode(Participant):
         if self.lss is None or self._od_of is None or self.lss.pending == self.core.node_id:
             return
         self.core.node_id = self.lss.pending
-        if self.core.node_id != UNCONFIGURED:
+        if self.core.node_id != UNCONFIGURED_ID:
             self.core.dictionary.take_defaults(self._od_of(self.core.node_id))
 
     def _initialise(self, t_ns: int, communication_only: bool) -> None:
@@ -221,7 +221,7 @@ class SlaveNode(Participant):
             self.application.recall(self.store.kept)
             self.application.reset(t_ns)
         self._reroute()
-        if self.core.node_id == UNCONFIGURED:
+        if self.core.node_id == UNCONFIGURED_ID:
             return
         if boot_ns := self.core.quirks.boot_ns:
             self._boot_timer.arm(t_ns + boot_ns)
@@ -247,7 +247,7 @@ class SlaveNode(Participant):
 
     def _communication_error(self, t_ns: int) -> None:
         self.application.connection_lost(t_ns)
-        goal = _ON_COMMUNICATION_ERROR.get(self.core.dictionary.number(0x1029, 1))
+        goal = _COMMUNICATION_ERROR_STATES.get(self.core.dictionary.number(0x1029, 1))
         if goal is NmtState.STOPPED or (goal is not None and self.core.state is NmtState.OPERATIONAL):
             self._enter(goal, t_ns)
 

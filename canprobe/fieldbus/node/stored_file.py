@@ -11,7 +11,7 @@ from canprobe.fieldbus.bus.files import write_text
 from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.entry import Value
 from canprobe.fieldbus.node.slave_node import SlaveNode
-from canprobe.fieldbus.protocol.lss import UNCONFIGURED
+from canprobe.fieldbus.protocol.lss import UNCONFIGURED_ID
 
 _SCHEMA = 1
 
@@ -79,7 +79,7 @@ def _read(node: SlaveNode, path: Path) -> None:
 
 
 def _node_id(value: Any) -> int | None:
-    if value is None or value == UNCONFIGURED or (type(value) is int and 1 <= value <= 127):
+    if value is None or value == UNCONFIGURED_ID or (type(value) is int and 1 <= value <= 127):
         return value  # type: ignore[no-any-return]
     raise ValueError(f"expected a node id from 1 to 127, or 255, got {value!r}")
 

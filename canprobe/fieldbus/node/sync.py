@@ -11,11 +11,11 @@ from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.core import NO_ROUTES, NodeCore, Route, Service
 from canprobe.fieldbus.node.emcy import Emergency
 from canprobe.fieldbus.node.entry import Value
-from canprobe.fieldbus.protocol.emcy import SYNC_LENGTH, SYNC_LOST
+from canprobe.fieldbus.protocol.emcy import SYNC_LENGTH_CODE, SYNC_LOST_CODE
 from canprobe.fieldbus.protocol.frames import SYNC_ID, NmtState, is_restricted
 
-_PRODUCER = 1 << 30
-_HEARD = frozenset({NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL})
+_PRODUCER_FLAG = 1 << 30
+_LISTENING_STATES = frozenset({NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL})
 
 
 class SyncConsumer(Service):
@@ -50,18 +50,18 @@ class SyncConsumer(Service):
 
     def routes(self) -> Mapping[int, Route]:
         """The SYNC identifier, in pre-operational and operational."""
-        if self._core.state not in _HEARD:
+        if self._core.state not in _LISTENING_STATES:
             return NO_ROUTES
         return {self._core.dictionary.number(0x1005, 0, SYNC_ID) & 0x7FF: self._receive}
 
     def _receive(self, data: bytes, t_ns: int) -> None:
         overflow = self._overflow
         if len(data) != (1 if overflow else 0):
-            self._emcy.report(SYNC_LENGTH)
+            self._emcy.report(SYNC_LENGTH_CODE)
             return
         if self._emcy.any:
-            self._emcy.clear(SYNC_LENGTH)
-            self._emcy.clear(SYNC_LOST)
+            self._emcy.clear(SYNC_LENGTH_CODE)
+            self._emcy.clear(SYNC_LOST_CODE)
         counter, elapsed = 0, 1
         if overflow:
             counter, last = data[0], self._last
@@ -74,11 +74,11 @@ class SyncConsumer(Service):
             self._on_sync(t_ns, counter, elapsed)
 
     def _timed_out(self, due_ns: int) -> None:
-        self._emcy.report(SYNC_LOST)
+        self._emcy.report(SYNC_LOST_CODE)
 
     def _check_cob_id(self, subindex: int, value: Value) -> None:
         new = int(value)
-        if new & _PRODUCER or new & 0x3FFFF800 or is_restricted(new & 0x7FF):
+        if new & _PRODUCER_FLAG or new & 0x3FFFF800 or is_restricted(new & 0x7FF):
             raise SdoAbort(Abort.VALUE)
 
     def _check_overflow(self, subindex: int, value: Value) -> None:

@@ -9,13 +9,13 @@ from collections.abc import Callable, Mapping, Sequence
 from operator import itemgetter
 from typing import Any
 
-from canprobe.fieldbus.node.core import NO_RTR, NodeCore
+from canprobe.fieldbus.node.core import NO_RTR_FLAG, NodeCore
 from canprobe.fieldbus.node.entry import key_of
-from canprobe.fieldbus.node.pdo_rules import COB_ID, EVENT, INHIBIT, START, TYPE, PdoRules
+from canprobe.fieldbus.node.pdo_rules import COB_ID_SUB, EVENT_SUB, INHIBIT_SUB, START_SUB, TYPE_SUB, PdoRules
 from canprobe.fieldbus.protocol.frames import RTR_FLAG
 from canprobe.fieldbus.protocol.pdo import PdoLayout
 
-BUFFERED, ON_REQUEST = 252, 253
+BUFFERED_TYPE, ON_REQUEST_TYPE = 252, 253
 
 Sampler = Callable[[int], None]
 Fetch = Callable[[Mapping[int, Any]], tuple[int, ...]]
@@ -62,14 +62,14 @@ class Tpdo:
         """Read the parameters. A mapping that makes no sense leaves the PDO silent."""
         number, index, entries = self._core.dictionary.number, self._rules.communication, self._rules.present()
         self.stop()
-        cob_id = number(index, COB_ID)
+        cob_id = number(index, COB_ID_SUB)
         self._cob_id = cob_id & 0x7FF
         self.active = self._rules.valid and bool(entries)
-        self.remote_id = self._cob_id | RTR_FLAG if self.active and not cob_id & NO_RTR else None
+        self.remote_id = self._cob_id | RTR_FLAG if self.active and not cob_id & NO_RTR_FLAG else None
         self.keys = tuple(key_of(entry.index, entry.subindex) for entry in entries)
-        self.type, self.start = number(index, TYPE), number(index, START)
-        self._inhibit_ns = number(index, INHIBIT) * 100_000
-        self._event_ns = number(index, EVENT) * 1_000_000
+        self.type, self.start = number(index, TYPE_SUB), number(index, START_SUB)
+        self._inhibit_ns = number(index, INHIBIT_SUB) * 100_000
+        self._event_ns = number(index, EVENT_SUB) * 1_000_000
         if self.active:
             self._layout = PdoLayout(self._cob_id, entries, self.type, fd=True)
             self.packing = self._cob_id, self._layout.raw_pack, _fetcher(self.keys)
@@ -124,7 +124,7 @@ class Tpdo:
         elif self._buffer is not None:
             self._core.send(self._cob_id, self._buffer)
         else:  # an event that waits for a SYNC goes on waiting
-            self._core.send(self._cob_id, self._packed(t_ns if self.type in (BUFFERED, ON_REQUEST) else None))
+            self._core.send(self._cob_id, self._packed(t_ns if self.type in (BUFFERED_TYPE, ON_REQUEST_TYPE) else None))
 
     def _packed(self, t_ns: int | None) -> bytes:
         """The values of `t_ns`; None: as they were sampled last."""

@@ -14,26 +14,26 @@ from enum import Enum, IntEnum, auto
 from canprobe.errors import ProtocolError
 
 # Statusword bit numbers (6041h) outside the state bits 0..3, 5, 6.
-VOLTAGE_ENABLED = 4
-WARNING = 7
-REMOTE = 9
-TARGET_REACHED = 10
-INTERNAL_LIMIT = 11
-DRIVE_FOLLOWS = 12  # CSP, CSV, CST: the drive follows the command value
-SETPOINT_ACKNOWLEDGE = 12  # PP
-HOMING_ATTAINED = 12  # homing
-INTERPOLATION_ACTIVE = 12  # interpolated position
-FOLLOWING_ERROR = 13  # PP, CSP
-HOMING_ERROR = 13  # homing
+VOLTAGE_ENABLED_BIT = 4
+WARNING_BIT = 7
+REMOTE_BIT = 9
+TARGET_REACHED_BIT = 10
+INTERNAL_LIMIT_BIT = 11
+DRIVE_FOLLOWS_BIT = 12  # CSP, CSV, CST: the drive follows the command value
+SETPOINT_ACKNOWLEDGE_BIT = 12  # PP
+HOMING_ATTAINED_BIT = 12  # homing
+INTERPOLATION_ACTIVE_BIT = 12  # interpolated position
+FOLLOWING_ERROR_BIT = 13  # PP, CSP
+HOMING_ERROR_BIT = 13  # homing
 
 # Controlword bit numbers (6040h) outside the command bits 0..3.
-NEW_SETPOINT = 4  # PP
-HOMING_START = 4  # homing
-ENABLE_INTERPOLATION = 4  # interpolated position
-CHANGE_IMMEDIATELY = 5  # PP
-RELATIVE = 6  # PP
+NEW_SETPOINT_BIT = 4  # PP
+HOMING_START_BIT = 4  # homing
+ENABLE_INTERPOLATION_BIT = 4  # interpolated position
+CHANGE_IMMEDIATELY_BIT = 5  # PP
+RELATIVE_BIT = 6  # PP
 FAULT_RESET_BIT = 7
-HALT = 8
+HALT_BIT = 8
 
 
 class OperationMode(IntEnum):
@@ -179,11 +179,11 @@ def command_of(controlword: int, previous: int = 0) -> DriveCommand | None:
     return _COMMANDS.get(controlword & 0xFF)
 
 
-_DISABLE = dict.fromkeys(DriveState, 0x0000)
-_TOWARD: dict[DriveState, dict[DriveState, int]] = {
-    _S.SWITCH_ON_DISABLED: _DISABLE,
-    _S.QUICK_STOP_ACTIVE: _DISABLE | {_S.OPERATION_ENABLED: 0x0002, _S.QUICK_STOP_ACTIVE: 0x0002},
-    _S.OPERATION_ENABLED: _DISABLE
+_DISABLING_WORDS = dict.fromkeys(DriveState, 0x0000)
+_WORDS_TOWARD: dict[DriveState, dict[DriveState, int]] = {
+    _S.SWITCH_ON_DISABLED: _DISABLING_WORDS,
+    _S.QUICK_STOP_ACTIVE: _DISABLING_WORDS | {_S.OPERATION_ENABLED: 0x0002, _S.QUICK_STOP_ACTIVE: 0x0002},
+    _S.OPERATION_ENABLED: _DISABLING_WORDS
     | {
         _S.SWITCH_ON_DISABLED: 0x0006,
         _S.READY_TO_SWITCH_ON: 0x0007,
@@ -209,7 +209,7 @@ def controlword_toward(state: DriveState, goal: DriveState, previous: int = 0) -
         ProtocolError: another goal.
     """
     try:
-        word = _TOWARD[goal][state]
+        word = _WORDS_TOWARD[goal][state]
     except KeyError:
-        raise ProtocolError(f"no way to {goal.name}: goals are {', '.join(s.name for s in _TOWARD)}") from None
+        raise ProtocolError(f"no way to {goal.name}: goals are {', '.join(s.name for s in _WORDS_TOWARD)}") from None
     return word & ~(previous & 1 << FAULT_RESET_BIT)

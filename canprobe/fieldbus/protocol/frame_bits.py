@@ -17,7 +17,7 @@ from functools import cache, lru_cache
 from typing import Any
 
 from canprobe.errors import ProtocolError
-from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG
+from canprobe.fieldbus.protocol.frames import EFF_FLAG, EFF_MASK, RTR_FLAG
 
 ERROR_FLAG_BITS = 6
 ERROR_DELIMITER_BITS = 8
@@ -30,8 +30,8 @@ others behind it, and an error-passive sender (Tindell and Burns 1994)."""
 FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 """Data bytes of an FD frame by its data length code."""
 
-_TAIL = 1 + 1 + 1 + 7 + INTERMISSION_BITS  # CRC delimiter, ACK slot, ACK delimiter, end of frame
-_FD_TAIL = _TAIL - 1  # its CRC delimiter belongs to the data phase
+_TAIL_BITS = 1 + 1 + 1 + 7 + INTERMISSION_BITS  # CRC delimiter, ACK slot, ACK delimiter, end of frame
+_FD_TAIL_BITS = _TAIL_BITS - 1  # its CRC delimiter belongs to the data phase
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,17 +51,17 @@ class FrameLength:
 # Bit stuffing. The state of the wire is the level of the last bits and how many of them are equal; the fifth equal bit
 # is followed by its stuff bit at once, so that there are 2 levels × 4 states.
 
-_RUN = 5
+_STUFF_RUN_BITS = 5
 
 
 def _step(state: int, bit: int) -> tuple[int, int]:
     """State after one more bit, and the stuff bits that it causes."""
-    level, run = divmod(state, _RUN)
+    level, run = divmod(state, _STUFF_RUN_BITS)
     run = run + 1 if bit == level else 1
-    return (bit * _RUN + run, 0) if run < _RUN else ((1 - bit) * _RUN + 1, 1)
+    return (bit * _STUFF_RUN_BITS + run, 0) if run < _STUFF_RUN_BITS else ((1 - bit) * _STUFF_RUN_BITS + 1, 1)
 
 
-_START_OF_FRAME = 1  # one dominant bit
+_START_STATE = 1  # one dominant bit
 
 
 def _feed(state: int, value: int, n_bits: int) -> tuple[int, int]:
@@ -79,7 +79,7 @@ _Row = list[tuple[int, Any]]  # a row refers to rows
 @cache
 def _rows() -> dict[int, _Row]:
     """By state and byte: the stuff bits of the byte, and the row of the state after it."""
-    rows: dict[int, _Row] = {level * _RUN + run: [] for level in (0, 1) for run in range(1, _RUN)}
+    rows: dict[int, _Row] = {level * _STUFF_RUN_BITS + run: [] for level in (0, 1) for run in range(1, _STUFF_RUN_BITS)}
     for state, row in rows.items():
         for byte in range(256):
             following, stuffed = _feed(state, byte, 8)
@@ -89,7 +89,7 @@ def _rows() -> dict[int, _Row]:
 
 # CRC-15 of classical frames. Source: ISO 11898-1:2015, CRC sequence.
 
-_CRC15 = 0x4599
+_CRC15_POLYNOMIAL = 0x4599
 
 
 def crc15(value: int, n_bits: int) -> int:
@@ -97,7 +97,7 @@ def crc15(value: int, n_bits: int) -> int:
     register = 0
     for place in range(n_bits - 1, -1, -1):
         feedback = (register >> 14 ^ value >> place) & 1
-        register = register << 1 & 0x7FFF ^ feedback * _CRC15
+        register = register << 1 & 0x7FFF ^ feedback * _CRC15_POLYNOMIAL
     return register
 
 
@@ -113,7 +113,7 @@ def best_case_bits(n_data: int) -> int:
     Raises:
         ProtocolError: not 0..8 data bytes.
     """
-    return _stuffed_part(n_data) + _TAIL
+    return _stuffed_part(n_data) + _TAIL_BITS
 
 
 def worst_case_bits(n_data: int) -> int:
@@ -125,7 +125,7 @@ def worst_case_bits(n_data: int) -> int:
     Source: Davis et al. 2007 (maximum number of stuff bits).
     """
     stuffed = _stuffed_part(n_data)
-    return stuffed + (stuffed - 1) // 4 + _TAIL
+    return stuffed + (stuffed - 1) // 4 + _TAIL_BITS
 
 
 def _stuffed_part(n_data: int) -> int:
@@ -153,8 +153,8 @@ def _length_of(can_id: int, n_data: int) -> Callable[[bytes], int]:
     if n_data > (0 if can_id & RTR_FLAG else 8):
         raise ProtocolError(f"{can_id:X}: no classical frame has {n_data} data bytes")
     header, n_header = _header(can_id, n_data)
-    state, stuffed = _feed(_START_OF_FRAME, header, n_header - 1)
-    bits = n_header + stuffed + 8 * n_data + 15 + _TAIL
+    state, stuffed = _feed(_START_STATE, header, n_header - 1)
+    bits = n_header + stuffed + 8 * n_data + 15 + _TAIL_BITS
     first, start, effects = _rows()[state], crc15(header, n_header), _CRC15_OF_BYTE
 
     def length(data: bytes) -> int:
@@ -175,7 +175,7 @@ def _header(can_id: int, code: int) -> tuple[int, int]:
     """Start of frame to the data length code: value and number of bits."""
     remote = 1 if can_id & RTR_FLAG else 0
     identifier = can_id & ~(EFF_FLAG | RTR_FLAG)
-    if can_id & EFF_FLAG and 0 <= identifier <= 0x1FFFFFFF:
+    if can_id & EFF_FLAG and 0 <= identifier <= EFF_MASK:
         return (identifier >> 18) << 27 | 0b11 << 25 | (identifier & 0x3FFFF) << 7 | remote << 6 | code, 39
     if 0 <= identifier <= 0x7FF:
         return identifier << 7 | remote << 6 | code, 19
@@ -192,7 +192,7 @@ def best_case_fd_bits(n_data: int) -> FrameLength:
         ProtocolError: an FD frame cannot have this length.
     """
     _fd_code(n_data)
-    return FrameLength(17 + _FD_TAIL, _fd_data_phase(n_data))
+    return FrameLength(17 + _FD_TAIL_BITS, _fd_data_phase(n_data))
 
 
 @lru_cache(maxsize=16)
@@ -204,7 +204,7 @@ def worst_case_fd_bits(n_data: int) -> FrameLength:
     """
     data_phase = f"10{_fd_code(n_data):04b}" + "x" * (8 * n_data)  # from BRS to the last data bit
     nominal, fast = _most_stuff_bits("0" + "x" * 11 + "00101"), _most_stuff_bits(data_phase[:-1])
-    return FrameLength(17 + nominal + _FD_TAIL, _fd_data_phase(n_data) + fast)
+    return FrameLength(17 + nominal + _FD_TAIL_BITS, _fd_data_phase(n_data) + fast)
 
 
 def exact_fd_bits(can_id: int, data: bytes) -> FrameLength:
@@ -218,7 +218,7 @@ def exact_fd_bits(can_id: int, data: bytes) -> FrameLength:
         ProtocolError: a remote request, an identifier or a length that no FD frame has.
     """
     code, (header, n_header) = _fd_code(len(data)), _fd_header(can_id)
-    state, nominal = _feed(_START_OF_FRAME, header, n_header - 1)
+    state, nominal = _feed(_START_STATE, header, n_header - 1)
     # the last bit before the CRC field causes no stuff bit: the field begins with one, whatever came before
     state, fast = _feed(state, code, 5) if data else _feed(state, code >> 1, 4)
     row = _rows()[state]
@@ -228,7 +228,7 @@ def exact_fd_bits(can_id: int, data: bytes) -> FrameLength:
     if data:
         last = data[-1] & 0xFE
         fast += row[last | ~last >> 1 & 1][0]  # a bit that differs from the one before it
-    return FrameLength(n_header + nominal + _FD_TAIL, _fd_data_phase(len(data)) + fast)
+    return FrameLength(n_header + nominal + _FD_TAIL_BITS, _fd_data_phase(len(data)) + fast)
 
 
 def _fd_code(n_data: int) -> int:
@@ -241,7 +241,7 @@ def _fd_code(n_data: int) -> int:
 def _fd_header(can_id: int) -> tuple[int, int]:
     """Start of frame to BRS: value and number of bits."""
     identifier = can_id & ~EFF_FLAG
-    if can_id & EFF_FLAG and 0 <= identifier <= 0x1FFFFFFF:
+    if can_id & EFF_FLAG and 0 <= identifier <= EFF_MASK:
         return ((identifier >> 18) << 20 | 0b11 << 18 | identifier & 0x3FFFF) << 4 | 0b0101, 36
     if 0 <= can_id <= 0x7FF:
         return can_id << 5 | 0b00101, 17
@@ -260,7 +260,7 @@ def _most_stuff_bits(pattern: str) -> int:
     Args:
         pattern: `0`, `1` and `x` for a free bit.
     """
-    reached = {(1 - int(pattern[0])) * _RUN + 1: 0}
+    reached = {(1 - int(pattern[0])) * _STUFF_RUN_BITS + 1: 0}
     for symbol in pattern:
         following: dict[int, int] = {}
         for state, count in reached.items():

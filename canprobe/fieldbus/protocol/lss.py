@@ -13,8 +13,8 @@ LSS_REQUEST_ID = 0x7E5
 """LSS master to all LSS slaves."""
 LSS_ANSWER_ID = 0x7E4
 """An LSS slave to the LSS master."""
-LSS_LENGTH = 8
-UNCONFIGURED = 255
+LSS_BYTES = 8
+UNCONFIGURED_ID = 255
 """Node-ID FFh: the node has none and waits in initialisation for LSS."""
 PRESENCE_CHECK = 0x80
 """Bit check of fastscan that asks who is there at all and starts the search again."""
@@ -87,7 +87,7 @@ class LssAddress:
 
 def pack_lss(command: LssCommand, data: bytes = b"") -> bytes:
     """The eight bytes of a message."""
-    return (bytes((command,)) + data).ljust(LSS_LENGTH, b"\0")
+    return (bytes((command,)) + data).ljust(LSS_BYTES, b"\0")
 
 
 def pack_number(command: LssCommand, number: int) -> bytes:

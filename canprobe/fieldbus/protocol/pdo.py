@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.frame_bits import FD_LENGTHS
 
-MAX_BITS = 64
-FD_MAX_BITS = 512
+MAX_PDO_BITS = 64
+MAX_FD_PDO_BITS = 512
 """Of a PDO in a CAN FD frame. Source: CiA 1301."""
 _STRUCT_CODES = {8: "b", 16: "h", 32: "i", 64: "q"}
 
@@ -132,8 +132,8 @@ class PdoLayout:
     def __post_init__(self) -> None:
         entries = tuple(self.entries)
         bits = sum(entry.bits for entry in entries)
-        most = FD_MAX_BITS if self.fd else MAX_BITS
-        if any(not 1 <= entry.bits <= MAX_BITS for entry in entries) or bits > most:
+        most = MAX_FD_PDO_BITS if self.fd else MAX_PDO_BITS
+        if any(not 1 <= entry.bits <= MAX_PDO_BITS for entry in entries) or bits > most:
             raise ProtocolError(f"PDO {self.cob_id:#05x}: mapping of {bits} bits, at most {most}, none empty")
         length = next(size for size in FD_LENGTHS if 8 * size >= bits)
         form = _struct_format(entries, length)

@@ -22,7 +22,7 @@ from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, Frame
 
 Counts = tuple[int, ...]
 """Counts as the device sends them: row by row, in a row column by column, of a taxel axis by axis."""
-_TAG = "0123456789ABCDEF"
+_TAG_CHARACTERS = "0123456789ABCDEF"
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ class FramePattern:
         places: dict[str, list[int]] = {}
         for place, character in enumerate(characters):
             shift = 4 * (2 * length - 1 - place)
-            if character in _TAG:
+            if character in _TAG_CHARACTERS:
                 mask |= 0xF << shift
                 tag |= int(character, 16) << shift
             elif character != ".":

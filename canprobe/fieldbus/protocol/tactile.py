@@ -30,15 +30,15 @@ from enum import IntEnum
 
 from canprobe.errors import ProtocolError
 
-SIDE = 16
+MAX_SIDE = 16
 """Most rows and columns of an array: the header names a taxel in 8 bits."""
 Shape = tuple[int, int]
 """Rows and columns of an array."""
-WINDOW = 8  # taxels along the window, where nothing else is said
-WINDOWS = (4, 6, 8, 10, 12)
+DEFAULT_WINDOW = 8  # taxels along the window, where nothing else is said
+WINDOW_SIZES = (4, 6, 8, 10, 12)
 """Taxels along the window that a sensor can be set to."""
 _FORM = struct.Struct("<BBBBHH")
-_OVERLOAD = 0x04
+_OVERLOAD_FLAG = 0x04
 _FORCE_SCALE, _CENTROID_SCALE, _MOMENT_SCALE = 400.0, 128.0, 64.0
 
 # bits, signed, scale, in the order of the wire
@@ -102,7 +102,7 @@ class TactileHeader:
     overload: bool
     sample_age_us: int
     crc: int = 0
-    window: int = WINDOW
+    window: int = DEFAULT_WINDOW
 
     @property
     def peak(self) -> int:
@@ -126,10 +126,10 @@ class TactileHeader:
         return self._packed(0)[:6]
 
     def _packed(self, crc: int) -> bytes:
-        if not (0 <= self.origin_row < SIDE and 0 <= self.origin_col < SIDE):
+        if not (0 <= self.origin_row < MAX_SIDE and 0 <= self.origin_col < MAX_SIDE):
             raise ProtocolError(f"tactile header: window origin ({self.origin_row}, {self.origin_col}) is off the pad")
-        size = self.window << 4 if self.mode is TactileMode.WINDOW and self.window != WINDOW else 0
-        flags = self.mode | (_OVERLOAD if self.overload else 0) | size
+        size = self.window << 4 if self.mode is TactileMode.WINDOW and self.window != DEFAULT_WINDOW else 0
+        flags = self.mode | (_OVERLOAD_FLAG if self.overload else 0) | size
         peak = self.origin_row << 4 | self.origin_col
         try:
             return _FORM.pack(self.frame_counter, self.sync_counter, peak, flags, self.sample_age_us, crc)
@@ -146,29 +146,35 @@ class TactileHeader:
         if len(data) != _FORM.size:
             raise ProtocolError(f"tactile header: expected 8 bytes, got {len(data)}")
         counter, sync, origin, flags, age, crc = _FORM.unpack(data)
-        if (read := _FLAGS.get(flags)) is None:
+        if (read := _FLAG_MEANINGS.get(flags)) is None:
             raise ProtocolError(f"tactile header: reserved flags {flags:#04x}")
-        header = cls(counter, sync, origin >> 4, origin & 0x0F, read[0], bool(flags & _OVERLOAD), age, crc, read[1])
-        check_origin(header, (SIDE, SIDE))
+        header = cls(
+            counter, sync, origin >> 4, origin & 0x0F, read[0], bool(flags & _OVERLOAD_FLAG), age, crc, read[1]
+        )
+        check_origin(header, (MAX_SIDE, MAX_SIDE))
         return header
 
 
-_FLAGS = {mode | overload: (mode, WINDOW) for mode in TactileMode for overload in (0, _OVERLOAD)} | {
+_FLAG_MEANINGS = {
+    mode | overload: (mode, DEFAULT_WINDOW) for mode in TactileMode for overload in (0, _OVERLOAD_FLAG)
+} | {
     TactileMode.WINDOW | overload | side << 4: (TactileMode.WINDOW, side)
-    for side in WINDOWS
-    if side != WINDOW
-    for overload in (0, _OVERLOAD)
+    for side in WINDOW_SIZES
+    if side != DEFAULT_WINDOW
+    for overload in (0, _OVERLOAD_FLAG)
 }
 """What byte 3 can be: mode and taxels along the window."""
 
 
-_LAST_ORIGIN = {TactileMode.FEATURES: SIDE - 1, TactileMode.IMAGE: 0}
+_LAST_ORIGINS = {TactileMode.FEATURES: MAX_SIDE - 1, TactileMode.IMAGE: 0}
 
 
 def check_origin(header: TactileHeader, shape: Shape) -> None:
-    if header.window not in WINDOWS:
-        raise ProtocolError(f"tactile header: a window has {', '.join(map(str, WINDOWS))} taxels, not {header.window}")
-    last = (_LAST_ORIGIN.get(header.mode, 0),) * 2
+    if header.window not in WINDOW_SIZES:
+        raise ProtocolError(
+            f"tactile header: a window has {', '.join(map(str, WINDOW_SIZES))} taxels, not {header.window}"
+        )
+    last = (_LAST_ORIGINS.get(header.mode, 0),) * 2
     if header.mode is TactileMode.WINDOW:
         last = (shape[0] - header.window, shape[1] - header.window)
     if header.origin_row > last[0] or header.origin_col > last[1]:
@@ -253,6 +259,6 @@ def pack_whole(header: TactileHeader, content: bytes | Features) -> bytes:
         if len(content) != expected or not content:
             raise ProtocolError(f"taxels: expected {expected or 'those of an image'}, got {len(content)}")
         body = content + bytes(-len(content) % 8)
-    check_origin(header, (SIDE, SIDE))
+    check_origin(header, (MAX_SIDE, MAX_SIDE))
     start = header.start()
     return start + crc16_ccitt(body, crc16_ccitt(start)).to_bytes(2, "little") + body

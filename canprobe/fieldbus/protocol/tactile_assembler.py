@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.tactile import (
-    SIDE,
-    WINDOW,
+    DEFAULT_WINDOW,
+    MAX_SIDE,
     Features,
     Shape,
     TactileHeader,
@@ -69,8 +69,8 @@ class FrameAssembler:
         deadline_ns: int,
         sizes: Sequence[int] | None = None,
         *,
-        window: int = WINDOW,
-        shape: Shape = (SIDE, SIDE),
+        window: int = DEFAULT_WINDOW,
+        shape: Shape = (MAX_SIDE, MAX_SIDE),
     ) -> None:
         """Expect the given identifiers.
 

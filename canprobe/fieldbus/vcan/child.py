@@ -10,11 +10,11 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Protocol
 
-TIMED_OUT = 124
+TIMED_OUT_STATUS = 124
 _GRACE_S = 5.0
-_POLL_S = 0.02
+_POLL_PERIOD_S = 0.02
 _MAX_SIGNALS = 3
-_FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+_FORWARDED_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 
 
 @contextlib.contextmanager
@@ -25,7 +25,7 @@ def caught_signals(*, keyboard: bool = True) -> Iterator[list[int]]:
         keyboard: False drops SIGINT and SIGQUIT, which the terminal sends to a shell in this group as well.
     """
     signals: list[int] = []
-    before = {number: signal.getsignal(number) for number in _FORWARDED}
+    before = {number: signal.getsignal(number) for number in _FORWARDED_SIGNALS}
     try:
         for number, handler in before.items():
             if handler != signal.SIG_IGN:
@@ -84,8 +84,8 @@ def supervise(job: Job, signals: list[int], timeout_s: float | None) -> tuple[in
             timed_out = True
             job.send_signal(signal.SIGTERM)
             deadline += _GRACE_S
-        time.sleep(_POLL_S)
-    return (TIMED_OUT if timed_out or status is None else status), timed_out
+        time.sleep(_POLL_PERIOD_S)
+    return (TIMED_OUT_STATUS if timed_out or status is None else status), timed_out
 
 
 class LocalJob:

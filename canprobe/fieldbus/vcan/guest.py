@@ -38,13 +38,13 @@ PACKAGE, COMPILER_PACKAGE = "user-mode-linux", "build-essential"
 _WIDE_REGISTERS = "amx_tile"
 """Flag of processors whose extended registers do not fit into the guest's kernel, which then needs `xstate.c`."""
 _PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
-_MEMORY = 2 << 30
-_BOOT_S = 60.0
-_HALT_S = 5.0
-_TERMINATE_S = 2.0
-_HIDDEN = ("/dev", "/proc", "/run", "/sys")
+_MEMORY_BYTES = 2 << 30
+_MAX_BOOT_S = 60.0
+_MAX_HALT_S = 5.0
+_MAX_TERMINATION_S = 2.0
+_HIDDEN_FOLDERS = ("/dev", "/proc", "/run", "/sys")
 
-_INIT = """\
+_INIT_SCRIPT = """\
 #!/bin/sh
 PATH={path}
 export PATH
@@ -74,7 +74,7 @@ echo $? > "$job/status"
 end
 """
 
-_COMMAND = """\
+_COMMAND_SCRIPT = """\
 echo $$ > {job}/pid
 umask {umask:03o}
 cd {folder} || exit 125
@@ -141,7 +141,7 @@ class GuestJob:
         except BaseException:
             self._remove()
             raise
-        self._boot_deadline = time.monotonic() + _BOOT_S
+        self._boot_deadline = time.monotonic() + _MAX_BOOT_S
 
     def __enter__(self) -> GuestJob:
         return self
@@ -170,7 +170,7 @@ class GuestJob:
         if ended:
             raise self._lost("the guest ended before the command did" if self.started else "the guest did not boot")
         if not self.started and time.monotonic() > self._boot_deadline:
-            raise self._lost(f"the guest did not boot in {_BOOT_S:.0f} s")
+            raise self._lost(f"the guest did not boot in {_MAX_BOOT_S:.0f} s")
         return None
 
     def send_signal(self, number: int) -> None:
@@ -187,14 +187,14 @@ class GuestJob:
     def halt(self) -> None:
         """Give a guest whose command has ended the time to power off."""
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(_HALT_S)
+            self._process.wait(_MAX_HALT_S)
 
     def kill(self) -> None:
         """End the guest at once; nothing of it is left running."""
         if self._process.poll() is None:
             self._process.terminate()  # the kernel ends its own processes
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self._process.wait(_TERMINATE_S)
+                self._process.wait(_MAX_TERMINATION_S)
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
@@ -220,7 +220,7 @@ class GuestJob:
             stdin = '"$job/stdin"'
             with (self._job / "stdin").open("wb") as file:
                 shutil.copyfileobj(sys.stdin.buffer, file)
-        script = _INIT.format(
+        script = _INIT_SCRIPT.format(
             path=_PATH,
             job=job,
             modules=MODULES,
@@ -235,7 +235,7 @@ class GuestJob:
         init.write_text(script)
         init.chmod(0o755)
         os.umask(umask := os.umask(0o077))
-        text = _COMMAND.format(
+        text = _COMMAND_SCRIPT.format(
             job=job,
             umask=umask,
             folder=shlex.quote(_visible_folder()),
@@ -332,13 +332,15 @@ def _job_folder() -> Path:
 def _visible_folder() -> str:
     folder = os.getcwd()
     if _hidden(folder):
-        raise GuestError(f"the working folder {folder} does not exist in the guest, which has its own {_HIDDEN}", False)
+        raise GuestError(
+            f"the working folder {folder} does not exist in the guest, which has its own {_HIDDEN_FOLDERS}", False
+        )
     return folder
 
 
 def _hidden(folder: str) -> bool:
     path = os.path.realpath(folder)
-    return any(path == top or path.startswith(top + "/") for top in _HIDDEN)
+    return any(path == top or path.startswith(top + "/") for top in _HIDDEN_FOLDERS)
 
 
 def memory_folder(folders: Sequence[str]) -> tuple[str, int]:
@@ -361,11 +363,11 @@ def memory_folder(folders: Sequence[str]) -> tuple[str, int]:
         free = state.f_bavail * state.f_frsize
         if state.f_flag & os.ST_NOEXEC:
             problems.append(f"{folder} is mounted noexec")
-        elif free < _MEMORY // 4:
-            problems.append(f"{folder} has {free >> 20} MiB free, of {_MEMORY // 4 >> 20}")
+        elif free < _MEMORY_BYTES // 4:
+            problems.append(f"{folder} has {free >> 20} MiB free, of {_MEMORY_BYTES // 4 >> 20}")
         else:
-            return folder, min(_MEMORY, free)
-    wanted = f"a folder that can be written, is not mounted noexec and has {_MEMORY // 4 >> 20} MiB free"
+            return folder, min(_MEMORY_BYTES, free)
+    wanted = f"a folder that can be written, is not mounted noexec and has {_MEMORY_BYTES // 4 >> 20} MiB free"
     raise GuestError(f"no folder for the guest's memory: {'; '.join(problems)}; set TMPDIR to {wanted}", False)
 
 

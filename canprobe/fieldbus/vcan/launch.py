@@ -24,16 +24,18 @@ from canprobe.fieldbus.bus.real.socketcan import check_interface, has_socketcan
 from canprobe.fieldbus.vcan.child import LocalJob, caught_signals, supervise
 from canprobe.fieldbus.vcan.guest import GuestError, GuestJob, missing_packages
 
-CHANNEL, SECOND = "vcan0", "vcan1"
-NO_VCAN = 125
-GUEST_LOST = 123
+CHANNEL, SECOND_CHANNEL = "vcan0", "vcan1"
+NO_VCAN_STATUS = 125
+GUEST_LOST_STATUS = 123
 WAY_VARIABLE = "CANPROBE_VCAN"
 
 _MAPPINGS = Path("/proc/sys/vm/max_map_count")
 _MIN_MAPPINGS = 1 << 20  # of 4 KiB: more than the guest's memory
 
-_MAKE_LINK, _MAKE_SECOND = (f"ip link add dev {name} type vcan && ip link set {name} up" for name in (CHANNEL, SECOND))
-_IN_NAMESPACE = f'ip link set lo up; {_MAKE_LINK} && {_MAKE_SECOND} && exec "$@"'
+_LINK_COMMAND, _SECOND_LINK_COMMAND = (
+    f"ip link add dev {name} type vcan && ip link set {name} up" for name in (CHANNEL, SECOND_CHANNEL)
+)
+_NAMESPACE_COMMAND = f'ip link set lo up; {_LINK_COMMAND} && {_SECOND_LINK_COMMAND} && exec "$@"'
 
 
 def run_with_vcan(
@@ -94,7 +96,7 @@ def _run_in_guest(boot: Callable[[], GuestJob], signals: list[int], timeout_s: f
         if not error.started:
             return _no_vcan(str(error))
         _say(str(error))
-        return GUEST_LOST
+        return GUEST_LOST_STATUS
 
 
 def _supervise_guest(job: GuestJob, signals: list[int], timeout_s: float | None) -> int:
@@ -134,13 +136,16 @@ class _Boot:
 @contextlib.contextmanager
 def _local_way() -> Iterator[tuple[str, list[str]] | None]:
     """Yield (name of the way, prefix of the command) of the first way that works on this kernel, or None."""
-    namespace = ["unshare", "--net" if os.geteuid() == 0 else "-rn", "--", "sh", "-c", _IN_NAMESPACE, "sh"]
+    namespace = ["unshare", "--net" if os.geteuid() == 0 else "-rn", "--", "sh", "-c", _NAMESPACE_COMMAND, "sh"]
     if _has_vcan():
         yield "here", []
     elif shutil.which("unshare") and _succeeds([*namespace, "true"]):
         yield "namespace", namespace
-    elif os.geteuid() == 0 and _succeeds(["sh", "-c", _MAKE_LINK]):
-        made = [CHANNEL, *([SECOND] if _succeeds(["sh", "-c", _MAKE_SECOND]) else [])]  # unless it is there already
+    elif os.geteuid() == 0 and _succeeds(["sh", "-c", _LINK_COMMAND]):
+        made = [
+            CHANNEL,
+            *([SECOND_CHANNEL] if _succeeds(["sh", "-c", _SECOND_LINK_COMMAND]) else []),
+        ]  # unless it is there already
         try:
             yield "link", []
         finally:
@@ -200,7 +205,7 @@ def _report_killed() -> None:
 
 def _no_vcan(why: str) -> int:
     _say(why)
-    return NO_VCAN
+    return NO_VCAN_STATUS
 
 
 def _say(text: str) -> None:

@@ -6,7 +6,7 @@ from collections import deque
 
 from canprobe.fieldbus.protocol.frames import Frame
 
-_LIFE_NS = 1_000_000_000
+_MAX_ECHO_DELAY_NS = 1_000_000_000
 
 
 class Echoes:
@@ -26,7 +26,7 @@ class Echoes:
     def is_one(self, frame: Frame, t_ns: int) -> bool:
         """Whether a received frame is the echo of one that was sent, which it then answers for."""
         waiting = self._waiting.get(frame)
-        while waiting and t_ns - waiting[0] > _LIFE_NS:
+        while waiting and t_ns - waiting[0] > _MAX_ECHO_DELAY_NS:
             waiting.popleft()
         if not waiting:
             self._waiting.pop(frame, None)

@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterator
 from types import FrameType, TracebackType
 from typing import Any
 
-TERMINATIONS = (signal.SIGTERM, signal.SIGHUP)
+TERMINATION_SIGNALS = (signal.SIGTERM, signal.SIGHUP)
 """What ends a process from outside: a service that is stopped, a terminal that is closed."""
-REPEAT_S = 0.1
+REPEAT_PERIOD_S = 0.1
 
 
 class Terminated(KeyboardInterrupt):
@@ -34,7 +34,7 @@ def interrupts_held() -> Iterator[None]:
     came: list[int] = []
     before: dict[int, Any] = {}
     with contextlib.suppress(ValueError):  # not the main thread: signals are not ours to receive
-        for number in (signal.SIGINT, *TERMINATIONS):
+        for number in (signal.SIGINT, *TERMINATION_SIGNALS):
             if signal.getsignal(number) is not signal.SIG_IGN:
                 before[number] = signal.signal(number, lambda n, _: came.append(n))
     try:
@@ -48,7 +48,7 @@ def interrupts_held() -> Iterator[None]:
 
 @contextlib.contextmanager
 def interrupts_repeated() -> Iterator[None]:
-    """An interrupt is raised every `REPEAT_S` until the block is left. In the main thread only.
+    """An interrupt is raised every `REPEAT_PERIOD_S` until the block is left. In the main thread only.
 
     For work with libraries that draw: Python drops what is raised in the callback of a weak reference or in `__del__`,
     of which they have thousands, so that one Ctrl-C in twenty was lost in them, with a traceback on stderr.
@@ -58,7 +58,7 @@ def interrupts_repeated() -> Iterator[None]:
         return
     came: list[signal.Signals] = []
     left = threading.Event()
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, *TERMINATIONS)}
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, *TERMINATION_SIGNALS)}
     handlers = {number: handler for number, handler in before.items() if callable(handler)}
     hook = sys.unraisablehook
 
@@ -68,7 +68,7 @@ def interrupts_repeated() -> Iterator[None]:
             handlers[kind](number, frame)
 
     def repeat() -> None:
-        while not left.wait(REPEAT_S):
+        while not left.wait(REPEAT_PERIOD_S):
             if came:
                 _thread.interrupt_main(came[0])
 
@@ -111,9 +111,9 @@ class Interrupts:
         self._waiting: int | None = None
 
     def __enter__(self) -> Interrupts:
-        for number in (signal.SIGINT, *TERMINATIONS):
+        for number in (signal.SIGINT, *TERMINATION_SIGNALS):
             before = signal.getsignal(number)
-            handler = raise_terminated if before is signal.SIG_DFL and number in TERMINATIONS else before
+            handler = raise_terminated if before is signal.SIG_DFL and number in TERMINATION_SIGNALS else before
             if not callable(handler):
                 continue
             try:

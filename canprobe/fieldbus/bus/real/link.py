@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from typing import Any
 
 VIRTUAL_KINDS = ("vcan", "vxcan")
-SLOW_BIT_S = 500_000
-SLOW_SAMPLE, FAST_SAMPLE = (0.85, 0.875, 0.90), (0.75, 0.80, 0.90)  # lowest, recommended, highest
-RESTART_MS, TX_QUEUE = 100, 1000
-_FD_MTU = 72
+MAX_SLOW_BITRATE = 500_000
+SLOW_SAMPLE_POINTS, FAST_SAMPLE_POINTS = (0.85, 0.875, 0.90), (0.75, 0.80, 0.90)  # lowest, recommended, highest
+RESTART_MS, TX_QUEUE_FRAMES = 100, 1000
+FD_MTU_BYTES = 72
 _TIMEOUT_S = 5.0
 _SYSTEM_FOLDERS = ("/usr/sbin", "/sbin")
 """Where `tc` is on Debian, and where the PATH of a user does not lead."""
@@ -116,13 +116,14 @@ def setting_line(name: str, bitrate: int, data_bitrate: int | None = None) -> st
         data_bitrate: of CAN FD, bit/s; None: classical frames only.
     """
     if name.startswith(VIRTUAL_KINDS):
-        return ip_line(f"{name} up") if data_bitrate is None else ip_line(f"{name} down", f"{name} mtu {_FD_MTU} up")
-    sample = (SLOW_SAMPLE if bitrate <= SLOW_BIT_S else FAST_SAMPLE)[1]
+        fd = (f"{name} down", f"{name} mtu {FD_MTU_BYTES} up")
+        return ip_line(f"{name} up") if data_bitrate is None else ip_line(*fd)
+    sample = (SLOW_SAMPLE_POINTS if bitrate <= MAX_SLOW_BITRATE else FAST_SAMPLE_POINTS)[1]
     fast = "" if data_bitrate is None else f" dbitrate {data_bitrate} fd on"
     return ip_line(
         f"{name} down",
         f"{name} type can bitrate {bitrate} sample-point {sample:g}{fast} restart-ms {RESTART_MS}",
-        f"{name} txqueuelen {TX_QUEUE} up",
+        f"{name} txqueuelen {TX_QUEUE_FRAMES} up",
     )
 
 

@@ -9,10 +9,10 @@ from collections.abc import Iterator
 
 BYTES_PER_CYCLE = 4 << 10
 """A cycle that keeps its frames, log rows and truth grows by 1 to 3 KiB."""
-MIN_RESERVE, MAX_RESERVE = 4 << 20, 32 << 20
+MIN_RESERVE_BYTES, MAX_RESERVE_BYTES = 4 << 20, 32 << 20
 """Bytes taken in advance; more than a run of 20 s at 400 Hz grows by."""
-_SMALL = 480  # bytes; objects up to 512 come from Python's own allocator, larger ones from the C library
-_KEEP_EVERY = (256 << 10) // 512
+_SMALL_OBJECT_BYTES = 480  # bytes; objects up to 512 come from Python's own allocator, larger ones from the C library
+_KEPT_STRIDE = (256 << 10) // 512
 
 
 @functools.cache
@@ -28,11 +28,12 @@ def reserve_memory(cycles: int) -> tuple[bytes, ...]:
     Returns:
         What holds the memory, kept until the process ends; a second call has nothing left to do.
     """
-    size = min(MIN_RESERVE + cycles * BYTES_PER_CYCLE, MAX_RESERVE)  # half for small objects, half for large ones
-    blocks = [bytes(_SMALL) for _ in range(size // 2 // 512)]
+    # half for small objects, half for large ones
+    size = min(MIN_RESERVE_BYTES + cycles * BYTES_PER_CYCLE, MAX_RESERVE_BYTES)
+    blocks = [bytes(_SMALL_OBJECT_BYTES) for _ in range(size // 2 // 512)]
     for _ in range(2):  # the first raises glibc's limits above this size, the second then comes out of its heap
         bytearray(size // 2)
-    return tuple(blocks[::_KEEP_EVERY])  # an arena with nothing in it would go back to the system
+    return tuple(blocks[::_KEPT_STRIDE])  # an arena with nothing in it would go back to the system
 
 
 @contextlib.contextmanager

@@ -15,7 +15,7 @@ import socket
 import struct
 from collections.abc import Sequence
 
-from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, Frame
+from canprobe.fieldbus.protocol.frames import BRS_FLAG, CLASSIC_BYTES, Frame
 
 SO_TIMESTAMPNS = 35
 SO_RXQ_OVFL = 40
@@ -23,16 +23,15 @@ SO_RXQ_OVFL = 40
 Row = tuple[int, bytes, int, int]
 """can_id with flags, data, CLOCK_REALTIME of reception in ns (0: unknown), frames dropped so far."""
 
-_BIT_RATE_SWITCH = 0x01
 _FRAME = struct.Struct("=IBB2x8s")  # struct can_frame; its first 16 bytes are also those of a struct canfd_frame
 _FD_FRAME = struct.Struct("=IBB2x64s")
 # the control messages behind a frame, in the order in which the kernel writes them: SCM_TIMESTAMPNS, SO_RXQ_OVFL
 _CONTROL_FORM = "QiiqqQiiI4x8x"
 _SLOT = struct.Struct(_FRAME.format + _CONTROL_FORM)
 _FD_SLOT = struct.Struct(_FD_FRAME.format + _CONTROL_FORM)
-_CONTROL = _SLOT.size - _FRAME.size
+_CONTROL_BYTES = _SLOT.size - _FRAME.size
 _MSG_WAITFORONE = 0x10000
-_BATCH = 64
+_BATCH_FRAMES = 64
 
 
 HAS_BATCHES = struct.calcsize("P") == 8
@@ -64,12 +63,12 @@ class _Slots:
 
     def __init__(self, frame: int, control: int) -> None:
         size = frame + control
-        self.buffer = ctypes.create_string_buffer(size * _BATCH)
+        self.buffer = ctypes.create_string_buffer(size * _BATCH_FRAMES)
         self.view = memoryview(self.buffer).cast("B")
-        self.headers = (_MMsgHdr * _BATCH)()
-        self.vectors = (_IoVec * _BATCH)()
+        self.headers = (_MMsgHdr * _BATCH_FRAMES)()
+        self.vectors = (_IoVec * _BATCH_FRAMES)()
         start = ctypes.addressof(self.buffer)
-        for k in range(_BATCH):
+        for k in range(_BATCH_FRAMES):
             self.vectors[k] = _IoVec(start + k * size, frame)
             header = self.headers[k].header
             header.iov = ctypes.addressof(self.vectors[k])
@@ -95,7 +94,7 @@ class FrameSocket:
         self._fd = sock.fileno()
         self._fd_frames = fd
         self._frame, self._slot = (_FD_FRAME, _FD_SLOT) if fd else (_FRAME, _SLOT)
-        self._in = _Slots(self._frame.size, _CONTROL)
+        self._in = _Slots(self._frame.size, _CONTROL_BYTES)
         self._out = _Slots(self._frame.size, 0)
 
     def receive(self, wait: bool = False) -> list[Row]:
@@ -106,10 +105,10 @@ class FrameSocket:
         """
         rows: list[Row] = []
         slots = self._in
-        count = _BATCH
+        count = _BATCH_FRAMES
         flags = _MSG_WAITFORONE if wait else socket.MSG_DONTWAIT
-        while count == _BATCH:
-            count = self._recvmmsg(self._fd, slots.headers, _BATCH, flags, None)
+        while count == _BATCH_FRAMES:
+            count = self._recvmmsg(self._fd, slots.headers, _BATCH_FRAMES, flags, None)
             flags = socket.MSG_DONTWAIT
             if count < 0:
                 if ctypes.get_errno() in (errno.EAGAIN, errno.EINTR):
@@ -127,9 +126,9 @@ class FrameSocket:
         """Hand over up to 64 frames with one call; return how many were taken; OSError if not even one was."""
         out, form = self._out, self._frame
         offset = 0
-        for k, (can_id, data) in enumerate(frames[:_BATCH]):
+        for k, (can_id, data) in enumerate(frames[:_BATCH_FRAMES]):
             long = len(data) > CLASSIC_BYTES
-            form.pack_into(out.view, offset, can_id, len(data), _BIT_RATE_SWITCH if long else 0, data)
+            form.pack_into(out.view, offset, can_id, len(data), BRS_FLAG if long else 0, data)
             if self._fd_frames:
                 out.vectors[k].length = _FD_FRAME.size if long else _FRAME.size
             offset += form.size

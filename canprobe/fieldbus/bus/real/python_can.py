@@ -28,17 +28,16 @@ from canprobe.fieldbus.bus.port import (
 )
 from canprobe.fieldbus.bus.real.echoes import Echoes
 from canprobe.fieldbus.protocol.frame_bits import FD_LENGTHS
-from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EFF_FLAG, RTR_FLAG, Frame
+from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EFF_FLAG, EFF_MASK, RTR_FLAG, Frame
 
-_EXTENDED_MASK = 0x1FFFFFFF
 _STATES = {
     can.BusState.ACTIVE: ControllerState.ACTIVE,
     can.BusState.PASSIVE: ControllerState.PASSIVE,
     can.BusState.ERROR: ControllerState.BUS_OFF,
 }
-_HEARS_ITSELF = ("udp_multicast",)
+_ECHOING_INTERFACES = ("udp_multicast",)
 """Interfaces on which python-can gives a sender its own frames back, without a mark on them."""
-_HAS_CLASSES = ("socketcan", "socketcand")
+_ERROR_CLASS_INTERFACES = ("socketcan", "socketcand")
 """Interfaces whose error frames have SocketCAN's class bits; those of others are bus errors."""
 
 
@@ -74,13 +73,13 @@ class PythonCanPort(PlainPort):
     ) -> None:
         self._fd = data_bitrate is not None
         self._reports = reports or Reports()
-        self._has_classes = interface in _HAS_CLASSES
+        self._has_classes = interface in _ERROR_CLASS_INTERFACES
         self.clock = clock
         self.channel = channel
         self.counters = PortCounters()
         self.state = ControllerState.ACTIVE
         self._arrived: deque[can.Message] = deque()
-        self._echoes = Echoes() if interface in _HEARS_ITSELF else None
+        self._echoes = Echoes() if interface in _ECHOING_INTERFACES else None
         self._bus: can.BusABC | None = _open(interface, channel, bitrate, data_bitrate)
 
     stamps_arrival = False
@@ -196,7 +195,7 @@ def _message(channel: str, can_id: int, data: bytes, fd: bool) -> can.Message:
         if long and fd and len(data) not in FD_LENGTHS:
             raise ValueError(f"CAN FD has {', '.join(map(str, FD_LENGTHS))}")
         return can.Message(
-            arbitration_id=can_id & (_EXTENDED_MASK if extended else ~RTR_FLAG),
+            arbitration_id=can_id & (EFF_MASK if extended else ~RTR_FLAG),
             data=data,
             is_extended_id=extended,
             is_remote_frame=bool(can_id & RTR_FLAG),

@@ -25,7 +25,15 @@ from collections.abc import Callable, Collection, Sequence
 from canprobe.errors import InterfaceError
 from canprobe.fieldbus.bus.clock import Clock, Timespec
 from canprobe.fieldbus.bus.port import ERR_FLAG, ControllerState, PortCounters, Reports, TimedFrame, state_after
-from canprobe.fieldbus.bus.real.link import TX_QUEUE, drop_queued, emptying_line, ip_line, setting_line, sudo
+from canprobe.fieldbus.bus.real.link import (
+    FD_MTU_BYTES,
+    TX_QUEUE_FRAMES,
+    drop_queued,
+    emptying_line,
+    ip_line,
+    setting_line,
+    sudo,
+)
 from canprobe.fieldbus.bus.real.mmsg import SO_RXQ_OVFL, SO_TIMESTAMPNS, FrameSocket, Row
 from canprobe.fieldbus.protocol.frame_bits import FD_LENGTHS
 from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EFF_FLAG, RTR_FLAG, Frame
@@ -43,16 +51,15 @@ _SO_MEMINFO, _MEMINFO, _WMEM_ALLOC = 55, struct.Struct("=9I"), 2
 _SIOCGIFFLAGS = 0x8913
 _SIOCGIFMTU = 0x8921
 _SIOCGIFTXQLEN = 0x8942
-_CANFD_MTU = 72
 _IFF_UP = 0x1
-_RECEIVE_BUFFER = 4 << 20
+_RECEIVE_BUFFER_BYTES = 4 << 20
 _RETRY_S, _LATER_RETRY_S = 200e-6, 2e-3
 _MAX_QUEUE_WAIT_NS = 10_000_000
 _REPORTED_WAIT_NS = 1_000_000_000
 """A port that waits reports a queue that has been full for so long."""
-_STUCK_NS, _LINGER_NS = 100_000_000, 1_000_000_000
+_MAX_STUCK_NS, _MAX_LINGER_NS = 100_000_000, 1_000_000_000
 """How long a port that closes waits for the next queued frame to leave, and for all of them."""
-_COMPARE_NS = 1_000_000
+_COMPARISON_PERIOD_NS = 1_000_000
 """Time of stamps after which the two clocks are compared again: less than a cycle."""
 _CLOCK_READING_ERROR_NS = 50_000
 """Difference that is none: reading both clocks takes as long in a virtual machine. No TPDO follows its SYNC sooner."""
@@ -90,7 +97,7 @@ class StampClock:
         Returns:
             By how much the wall clock was set since the last comparison, ns, negative for back; 0 where it was not.
         """
-        if self._compared_ns <= oldest_ns and newest_ns < self._compared_ns + _COMPARE_NS:
+        if self._compared_ns <= oldest_ns and newest_ns < self._compared_ns + _COMPARISON_PERIOD_NS:
             return 0
         self._compared_ns = self._realtime_ns()
         if abs(self._compared_ns - self._monotonic_ns() - self.offset_ns) <= _CLOCK_READING_ERROR_NS:
@@ -294,8 +301,8 @@ class SocketCanPort:
     def _await_empty(self) -> bool:
         """Wait while the queue empties; whether it is empty."""
         now_ns = self.clock.now_ns()
-        end_ns, moved_ns, left = now_ns + _LINGER_NS, now_ns, self._queued_bytes()
-        while left and self.clock.now_ns() < min(end_ns, moved_ns + _STUCK_NS):
+        end_ns, moved_ns, left = now_ns + _MAX_LINGER_NS, now_ns, self._queued_bytes()
+        while left and self.clock.now_ns() < min(end_ns, moved_ns + _MAX_STUCK_NS):
             time.sleep(_LATER_RETRY_S)
             if (still := self._queued_bytes()) != left:
                 left, moved_ns = still, self.clock.now_ns()
@@ -336,9 +343,9 @@ class SocketCanPort:
             length = struct.unpack("=16si12x", fcntl.ioctl(self._socket, _SIOCGIFTXQLEN, _ifreq(self.channel)))[1]
         except OSError:  # the interface has gone meanwhile
             return ""
-        if length >= TX_QUEUE:
+        if length >= TX_QUEUE_FRAMES:
             return ""
-        return f"; it holds {length} frames; type: {ip_line(f'{self.channel} txqueuelen {TX_QUEUE}')}"
+        return f"; it holds {length} frames; type: {ip_line(f'{self.channel} txqueuelen {TX_QUEUE_FRAMES}')}"
 
     def _failed(self, error: OSError) -> InterfaceError:
         if error.errno == errno.ENETDOWN:
@@ -420,7 +427,7 @@ def _check_fd(channel: str, setting: str) -> None:
             mtu = struct.unpack("=16si12x", fcntl.ioctl(probe, _SIOCGIFMTU, _ifreq(channel)))[1]
         except OSError as error:
             raise InterfaceError(f"{channel}: no such interface; {_how_to_make(channel)}") from error
-    if mtu < _CANFD_MTU:
+    if mtu < FD_MTU_BYTES:
         raise InterfaceError(f"{channel}: not set up for CAN FD; type: {setting}")
 
 
@@ -471,9 +478,9 @@ def _stamp(row: Row) -> int:
 
 def _enlarge_buffer(sock: socket.socket) -> None:
     try:
-        sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _RECEIVE_BUFFER)
+        sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _RECEIVE_BUFFER_BYTES)
     except PermissionError:  # needs CAP_NET_ADMIN; without it the kernel caps the size at net.core.rmem_max
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_BYTES)
 
 
 class _PollFd(ctypes.Structure):

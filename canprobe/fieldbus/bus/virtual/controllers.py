@@ -9,10 +9,9 @@ from canprobe.fieldbus.bus.virtual.error_counters import ErrorCounters
 from canprobe.fieldbus.bus.virtual.lockstep import Attachment, LockstepPort
 from canprobe.fieldbus.protocol.frame_bits import INTERMISSION_BITS, SUSPEND_BITS
 
-_RECESSIVE_BITS = 11
-_AFTER_ACK_BITS = (
-    8  # recessive bits before a frame's or an error frame's end: ACK delimiter and end of frame, delimiter
-)
+_RECOVERY_BITS = 11
+_AFTER_ACK_BITS = 8
+"""Recessive bits at the end of a frame (ACK delimiter, end of frame) and of an error frame (delimiter)."""
 
 
 class Controllers:
@@ -89,7 +88,7 @@ class Controllers:
 
     def hear_silence(self, until_ns: int) -> None:
         """The wire has been recessive until now: nodes that are bus off count sequences of eleven such bits."""
-        sequence = self._bits_ns(_RECESSIVE_BITS)
+        sequence = self._bits_ns(_RECOVERY_BITS)
         count = (until_ns - self._quiet_ns) // sequence
         self._quiet_ns += count * sequence
         if any([counters.heard_recessive(count) for counters in self._counters.values()]):
@@ -98,7 +97,7 @@ class Controllers:
     def next_return_ns(self) -> int | None:
         """When the next node that is bus off comes back, if the wire stays silent."""
         least = min((c.outstanding for c in self._counters.values() if c.outstanding), default=None)
-        return None if least is None else self._quiet_ns + least * self._bits_ns(_RECESSIVE_BITS)
+        return None if least is None else self._quiet_ns + least * self._bits_ns(_RECOVERY_BITS)
 
     def _suspend(self, sender: Attachment, end_ns: int) -> None:
         """After its own frame an error-passive node waits for eight bits more."""

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 from canprobe.fieldbus.bus.port import ControllerState
 
-PASSIVE_FROM = 128
-WARNING_FROM = 96
-BUS_OFF_FROM = 256
-RECOVERIES = 128
+MIN_PASSIVE_COUNT = 128
+MIN_WARNING_COUNT = 96
+MIN_BUS_OFF_COUNT = 256
+RECOVERY_SEQUENCES = 128
 """Sequences of eleven recessive bits that a controller has to hear while it is bus off."""
 
 
@@ -38,9 +38,9 @@ class ErrorCounters:
         if self.outstanding:
             return ControllerState.BUS_OFF
         worst = max(self.transmit, self.receive)
-        if worst >= PASSIVE_FROM:
+        if worst >= MIN_PASSIVE_COUNT:
             return ControllerState.PASSIVE
-        return ControllerState.WARNING if worst >= WARNING_FROM else ControllerState.ACTIVE
+        return ControllerState.WARNING if worst >= MIN_WARNING_COUNT else ControllerState.ACTIVE
 
     def transmit_error(self, *, acknowledge: bool = False) -> None:
         """It sent an error flag as the transmitter.
@@ -52,9 +52,9 @@ class ErrorCounters:
         if acknowledge and self.state is ControllerState.PASSIVE:
             return
         self.transmit += 8
-        if self.transmit >= BUS_OFF_FROM:
+        if self.transmit >= MIN_BUS_OFF_COUNT:
             self.bus_offs += 1
-            self.outstanding = RECOVERIES
+            self.outstanding = RECOVERY_SEQUENCES
 
     def receive_error(self) -> None:
         """It saw an error as a receiver."""
@@ -67,8 +67,8 @@ class ErrorCounters:
 
     def received(self) -> None:
         """It received a frame without an error."""
-        if self.receive >= PASSIVE_FROM:
-            self.receive = PASSIVE_FROM - 1  # the standard leaves 119 to 127
+        if self.receive >= MIN_PASSIVE_COUNT:
+            self.receive = MIN_PASSIVE_COUNT - 1  # the standard leaves 119 to 127
         elif self.receive:
             self.receive -= 1
 

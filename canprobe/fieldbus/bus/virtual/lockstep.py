@@ -18,13 +18,13 @@ from canprobe.errors import BusError, InterfaceError
 from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.port import ControllerState, PlainPort, PortCounters, TimedFrame
 from canprobe.fieldbus.protocol.frame_bits import FD_LENGTHS
-from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EFF_FLAG, RTR_FLAG, Frame
+from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EFF_FLAG, EFF_MASK, RTR_FLAG, Frame
 
 Recorder = Callable[[int, bytes, int], None]
 """Called with (can_id, data, t_ns)."""
 
 
-EVERY_ID = range(1 << 32)
+ALL_IDS = range(1 << 32)
 
 
 class Participant:
@@ -56,7 +56,7 @@ class Participant:
     @property
     def listens(self) -> Container[int]:
         """The identifiers that it takes at present; the bus spares it the others."""
-        return EVERY_ID
+        return ALL_IDS
 
     @property
     def patient(self) -> frozenset[int]:
@@ -356,6 +356,6 @@ def arbitration_key(can_id: int) -> int:
         return can_id << 21
     remote = 1 if can_id & RTR_FLAG else 0
     if can_id & EFF_FLAG:
-        can_id &= 0x1FFFFFFF
+        can_id &= EFF_MASK
         return (can_id >> 18) << 21 | 0b11 << 19 | (can_id & 0x3FFFF) << 1 | remote
     return (can_id & 0x7FF) << 21 | remote << 20
