@@ -19,7 +19,7 @@ _OBJECT_DOMAIN = 2
 
 
 def data_type_of(source: Source, section: Section, index: int, subindex: int, composite: bool) -> int | None:
-    """The data type that a section means, one of `KNOWN_TYPES`; None where it cannot be known."""
+    """Data type that a section means, one of `KNOWN_TYPES`; None where it cannot be known."""
     text = section.value("DataType")
     demanded = standard_type(index, subindex, source.drive)
     usual = U8 if composite and subindex == 0 else USUAL_TYPES.get((index, subindex)) if source.drive else None
@@ -60,7 +60,7 @@ def _untyped(source: Source, section: Section, demanded: int | None, why: str) -
 
 
 def _foreign(source: Source, section: Section, data_type: int) -> int:
-    """A type of the maker's own: defined in a section such as [A0] by some editors, else served as octets."""
+    """A type of the maker, which some editors define in a section such as [A0]; else it is served as octets."""
     definition = source.sections.get(f"{data_type:x}sub1")
     base = source.number(definition, "DefaultValue") if definition is not None else 0
     if base in KNOWN_TYPES:

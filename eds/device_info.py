@@ -1,4 +1,4 @@
-"""[DeviceInfo], [Comments] and [DeviceComissioning] → what canopen keeps of them.
+"""Reads [DeviceInfo], [Comments] and [DeviceComissioning] into the fields that canopen has for them.
 
 Source: CiA 306-1, "Device information", "Comments", "Device commissioning" (the standard's own spelling has one m).
 """
@@ -31,7 +31,7 @@ _FLAG_FIELDS = {
 
 
 def read_information(source: Source, od: ObjectDictionary) -> None:
-    """Fill in what the dictionary knows of its device; a wrong number is left out with a warning."""
+    """Fill in the dictionary's fields on its device; a wrong number is left out with a warning."""
     od.node_id = source.node_id
     if (section := source.sections.get("comments")) is not None:
         lines = [item.value for key, item in section.items.items() if key.startswith("line") and key != "lines"]
@@ -56,7 +56,7 @@ def read_information(source: Source, od: ObjectDictionary) -> None:
 
 
 def commissioned_node(sections: Sections) -> int | None:
-    """Node id that a DCF has been made for; None where it has none."""
+    """Node id for which a DCF was made; None where it states none."""
     section = _commissioning(sections)
     if section is None:
         return None

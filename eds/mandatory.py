@@ -1,4 +1,4 @@
-"""What the standards themselves fix about objects that a node cannot do without.
+"""Facts that the standards fix about the objects that every node needs.
 
 Source: CiA 301, "Communication profile area"; CiA 402-2, object descriptions.
 """
@@ -28,14 +28,14 @@ USUAL_TYPES = {
     **{(0x607D, 1): _I32, (0x607D, 2): _I32, (0x6099, 1): _U32, (0x6099, 2): _U32},
     **{(0x60C1, 1): _I32, (0x60C2, 1): U8, (0x60C2, 2): _I8},
 }
-"""Types of a drive's objects that makers change, by index and sub-index: taken where a file states none."""
+"""Types of a drive's objects that makers may change, by index and sub-index; taken where a file states none."""
 _COMMUNICATION_TYPES = {1: _U32, 2: U8, 3: _U16, 5: _U16, 6: U8}
 CHOICE_INDICES = frozenset({0x6007, *range(0x605A, 0x605F), 0x6086, 0x6098, 0x60C0})
-"""Objects of a drive whose 0 is a choice and may be the only one, such as a linear ramp."""
+"""Objects of a drive whose value 0 is a choice, maybe the only one, such as a linear ramp."""
 COUNTING_INDICES = frozenset({0x1003, *range(0x1600, 0x1800), *range(0x1A00, 0x1C00)})
-"""Where sub-index 0 says how many entries are in use, and can be written."""
+"""Objects whose sub-index 0 is the number of entries in use, and can be written."""
 _FIRST_PROFILE_INDEX = 0x6000
-"""From here on CiA 402 describes drives alone; what other profiles have there is not known here."""
+"""First index of the profile area, where CiA 402 describes drives; other profiles are not known here."""
 
 
 def is_variable(index: int, drive: bool) -> bool:
@@ -63,7 +63,7 @@ def standard_type(index: int, subindex: int, drive: bool) -> int | None:
 
 
 def standard_access(index: int, subindex: int, composite: bool, drive: bool) -> str:
-    """What AccessType is where the file does not say: the standard's, else free access."""
+    """AccessType where the file states none: that of the standard, else free access."""
     read_only = index in _READ_ONLY_INDICES and (drive or index < _FIRST_PROFILE_INDEX)
     if read_only or (composite and subindex == 0 and index not in COUNTING_INDICES):
         return "ro"

@@ -20,14 +20,14 @@ _ODD_NODE_ID_PATTERN = re.compile(r"\$?\(?\$?\{?\s*node[ _-]?id\s*\}?\)?", re.IG
 
 
 def parse_integer(text: str, remark: Remark) -> int:
-    """One number.
+    """Read one number.
 
     Args:
-        text: without blanks round it.
-        remark: called with what is odd about it.
+        text: text of the number, without blanks around it.
+        remark: function that is called with a remark on an odd spelling.
 
     Raises:
-        ValueError: it is not a number.
+        ValueError: the text is not a number.
     """
     if match := _HEX_PATTERN.fullmatch(text):
         return int(match[1] + match[2], 16)
@@ -40,7 +40,7 @@ def parse_integer(text: str, remark: Remark) -> int:
 
 
 def _written_as_elsewhere(text: str, remark: Remark) -> int:
-    """A whole number as programming languages write it: 0.0, 100UL, 0x0001_0000, 0x00 01."""
+    """Read a whole number as programming languages write it: 0.0, 100UL, 0x0001_0000, 0x00 01."""
     if (match := _C_SUFFIX_PATTERN.fullmatch(text)) or (match := _WHOLE_REAL_PATTERN.fullmatch(text)):
         plain = match[1]
     elif _GROUPED_PATTERN.fullmatch(text):
@@ -66,13 +66,13 @@ def _leading_zeros(text: str, remark: Remark) -> int:
 
 
 def parse_sum(text: str, node_id: int, remark: Remark) -> tuple[int, bool]:
-    """A number or a sum of numbers and $NODEID, in any order and case.
+    """Read a number, or a sum of numbers and $NODEID in any order and case.
 
     Returns:
         The value for this node, and whether it depends on the node.
 
     Raises:
-        ValueError: it is not a number.
+        ValueError: the text is not a number.
     """
     total, relative = 0, False
     for term in map(str.strip, _terms(text, remark)):
@@ -89,7 +89,7 @@ def parse_sum(text: str, node_id: int, remark: Remark) -> tuple[int, bool]:
 
 
 def _terms(text: str, remark: Remark) -> list[str]:
-    """What is added up: without brackets round all of it, or a plus before a number."""
+    """Terms of a sum, without brackets around all of it or a plus before a number."""
     whole = text.strip()
     if whole[:1] == "(" and whole[-1:] == ")" and "+" in whole:
         remark(f"{text} is read without its brackets")
@@ -103,10 +103,10 @@ _FLAG_WORDS = {"true": True, "yes": True, "false": False, "no": False}
 
 
 def parse_flag(text: str, remark: Remark) -> bool:
-    """0 or 1; a word for it is remarked upon.
+    """Read 0 or 1; a word for it causes a remark.
 
     Raises:
-        ValueError: it is neither.
+        ValueError: the text is neither.
     """
     word = _FLAG_WORDS.get(text.lower())
     if word is None:

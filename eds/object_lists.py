@@ -1,4 +1,4 @@
-"""The lists of objects in an EDS file, against the objects that it describes.
+"""Checks the lists of objects in an EDS file against the objects that it describes.
 
 Source: CiA 306-1, "Object lists".
 """
@@ -24,7 +24,7 @@ def check_lists(source: Source, described: dict[int, Section]) -> None:
 
     Args:
         source: the file.
-        described: the section of each object by index.
+        described: section of each object, by index.
     """
     listed: dict[int, str] = {}
     for title in _REQUIRED_SECTIONS:
@@ -60,7 +60,7 @@ def _check_list(
 
 
 def _index(source: Source, section: Section, key: str, text: str, described: dict[int, Section]) -> int | None:
-    """An index of a list; without 0x it is taken as hexadecimal where only that names an object."""
+    """Index in a list; a number without 0x is hexadecimal where only that names an object."""
     bare = int(text, 16) if re.fullmatch("[0-9A-Fa-f]{4}", text) else None
     remarks: list[str] = []
     try:

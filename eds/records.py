@@ -1,4 +1,4 @@
-"""Sections → arrays and records, also in the compact form, with their counts checked.
+"""Builds arrays and records from sections, also in the compact form, and checks their counts.
 
 Source: CiA 306-1, "Object description", "CompactSubObj".
 """
@@ -17,7 +17,7 @@ from canprobe.fieldbus.eds.variables import build_variable, set_value
 ARRAY, RECORD = 8, 9
 """Object codes."""
 Subs = dict[int, Section]
-"""Sections of an object's sub-objects by subindex."""
+"""Sections of the sub-objects of an object, by subindex."""
 _MAX_COMPACT_MEMBERS = 254
 
 
@@ -26,10 +26,10 @@ def build_composite(source: Source, index: int, head: Section, subs: Subs, kind:
 
     Args:
         source: the file.
-        index: of the object.
-        head: its own section.
-        subs: the sections of its sub-objects.
-        kind: `ARRAY` or `RECORD`.
+        index: index of the object.
+        head: section of the object itself.
+        subs: sections of its sub-objects.
+        kind: object code, `ARRAY` or `RECORD`.
     """
     if is_variable(index, source.drive):
         source.fault(head, "", "the standard has a variable at this index, not an array or record")

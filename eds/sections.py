@@ -1,6 +1,6 @@
-"""Bytes of an EDS file → its sections and keys, each with its line, and what is wrong with them.
+"""Splits the bytes of an EDS file into sections and keys, each with its line, and reports what is wrong with them.
 
-They are read as Windows reads an INI file, which is what vendors' tools do: names count in any case, and of two equal
+The file is read as Windows reads an INI file, as the tools of vendors do: names count in any case, and of two equal
 names the first one counts. Source: CiA 306-1, "General structure".
 """
 
@@ -19,7 +19,7 @@ _UTF16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """One `key=value`; the value without blanks, quotes round it and a comment behind it."""
+    """One `key=value`; the value is without blanks and quotes around it, and without a comment behind it."""
 
     key: str
     value: str
@@ -31,9 +31,9 @@ class Section:
     """One section.
 
     Attributes:
-        name: as written, without the brackets.
-        line: of its head.
-        items: by key in lower case.
+        name: name in the spelling of the file, without the brackets.
+        line: number of the line of its head.
+        items: keys and values, by key in lower case.
     """
 
     name: str
@@ -41,18 +41,18 @@ class Section:
     items: dict[str, Item] = field(default_factory=dict)
 
     def value(self, key: str) -> str:
-        """The value; empty where the key is missing."""
+        """Value of a key; empty where the key is missing."""
         item = self.items.get(key.lower())
         return "" if item is None else item.value
 
     def line_of(self, key: str) -> int:
-        """Where the key is, or the section where it is missing."""
+        """Line of a key, or of the section where the key is missing."""
         item = self.items.get(key.lower())
         return self.line if item is None else item.line
 
 
 Sections = dict[str, Section]
-"""By name in lower case, in the order of the file."""
+"""Sections by name in lower case, in the order of the file."""
 
 
 def decode(data: bytes, faults: EdsFindings) -> str:

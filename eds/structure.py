@@ -1,4 +1,4 @@
-"""Sections → objects of the dictionary: variables, arrays, records, dummy types, the device's own information.
+"""Builds the objects of the dictionary from sections: variables, arrays, records and dummy types.
 
 Source: CiA 306-1, "Object description", "Dummy usage".
 """
@@ -22,7 +22,7 @@ _OBJECT_CODES = frozenset({_NULL, _DOMAIN, _DEFTYPE, _DEFSTRUCT, _VAR, ARRAY, RE
 
 
 def find_objects(source: Source) -> tuple[dict[int, Section], dict[int, Subs]]:
-    """The sections of objects by index, and those of their sub-objects by index and subindex."""
+    """Sections of objects by index, and of their sub-objects by index and subindex."""
     heads: dict[int, Section] = {}
     subs: dict[int, Subs] = {}
     for name, section in source.sections.items():
@@ -57,7 +57,7 @@ def _build(source: Source, index: int, head: Section | None, subs: Subs) -> ODVa
 
 
 def _kind(source: Source, head: Section, subs: Subs) -> int:
-    """ObjectType, or what the rest of the section shows where that is missing or cannot be."""
+    """ObjectType, or the type that the rest of the section shows where it is missing or impossible."""
     stated = _VAR
     if text := head.value("ObjectType"):
         try:

@@ -31,7 +31,7 @@ FOREIGN_TYPE_NUMBERS = {
     **{"USINT": 0x05, "UINT": 0x06, "UDINT": 0x07, "ULINT": 0x1B, "REAL": 0x08, "LREAL": 0x11},
     **{"FLOAT": 0x08, "DOUBLE": 0x11, "STRING": 0x09},
 }
-"""Names of data types elsewhere. Source: IEC 61131-3, "Elementary data types"; C's <stdint.h>."""
+"""Data types by their names in other standards. Source: IEC 61131-3, "Elementary data types"; C's <stdint.h>."""
 _TIME_BYTES = 6
 
 
@@ -41,16 +41,16 @@ def name_of(data_type: int) -> str:
 
 
 def convert(text: str, data_type: int, node_id: int, remark: Remark) -> Value:
-    """A value as the file writes it → as the dictionary holds it.
+    """Convert a value from the text in the file to that in the dictionary.
 
     Args:
-        text: not empty, except for texts.
-        data_type: one of `KNOWN_TYPES`.
-        node_id: for $NODEID.
-        remark: called with what is odd about it.
+        text: text of the value; only that of a text may be empty.
+        data_type: data type, one of `KNOWN_TYPES`.
+        node_id: node id, which replaces $NODEID.
+        remark: function that is called with a remark on an odd spelling.
 
     Raises:
-        ValueError, OverflowError: it does not mean a value of that type.
+        ValueError, OverflowError: the text means no value of that type.
     """
     if data_type in TEXT_TYPES:
         return text
@@ -67,10 +67,10 @@ def convert(text: str, data_type: int, node_id: int, remark: Remark) -> Value:
 
 
 def convert_limit(text: str, data_type: int, node_id: int, remark: Remark) -> int | float | None:
-    """A limit; None where a type has none.
+    """Convert a limit; None for a type without limits.
 
     Raises:
-        ValueError, OverflowError: it does not mean a number of that type.
+        ValueError, OverflowError: the text means no number of that type.
     """
     if data_type not in SIGNED_BITS | UNSIGNED_BITS | REAL_FORMS:
         return None
@@ -80,7 +80,7 @@ def convert_limit(text: str, data_type: int, node_id: int, remark: Remark) -> in
 
 
 def _fitted(number: int, text: str, data_type: int, remark: Remark) -> int:
-    """The number in its type's range; 0xFFFF for -1 is usual, -1 for 0xFFFF is odd."""
+    """Number in the range of its type; 0xFFFF for -1 is usual, -1 for 0xFFFF is odd."""
     signed = data_type in SIGNED_BITS
     bits = SIGNED_BITS[data_type] if signed else UNSIGNED_BITS[data_type]
     low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)

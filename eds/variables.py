@@ -1,4 +1,4 @@
-"""One section of an EDS file → one variable of the dictionary: its data type, its values, its limits.
+"""Builds a variable of the dictionary from a section of an EDS file: data type, values and limits.
 
 Source: CiA 306-1, "Object description".
 """
@@ -21,13 +21,13 @@ _ACCESS_WORDS = {"r": "ro", "w": "wo", "wr": "rw", "readonly": "ro", "writeonly"
 
 
 def build_variable(source: Source, section: Section, index: int, subindex: int, composite: bool = False) -> ODVariable:
-    """The variable that a section describes; one whose data type cannot be known holds octets and has no value.
+    """Build the variable that a section describes; without a known data type it holds octets and has no value.
 
     Args:
         source: the file.
-        section: the variable's, or with CompactSubObj that of the whole object.
-        index, subindex: of the variable.
-        composite: it is part of an array or record.
+        section: section of the variable, or with CompactSubObj that of the whole object.
+        index, subindex: place of the variable.
+        composite: whether it is part of an array or record.
     """
     known = data_type_of(source, section, index, subindex, composite)
     data_type = int(datatypes.DOMAIN) if known is None else known
@@ -48,7 +48,7 @@ def build_variable(source: Source, section: Section, index: int, subindex: int, 
 
 
 def set_value(source: Source, section: Section, key: str, variable: ODVariable, name: str = "") -> None:
-    """Give the variable its `DefaultValue` or `ParameterValue`; `name` is the key where it is another one."""
+    """Give the variable its `DefaultValue` or `ParameterValue`; `name` is the key where it has another name."""
     where, data_type = name or key, variable.data_type or datatypes.DOMAIN
     if where.lower() not in section.items:
         return
@@ -113,7 +113,7 @@ def _set_limits(source: Source, section: Section, variable: ODVariable, data_typ
     if low is not None and high is not None and low > high:
         source.warn(section, "LowLimit", f"{low} is above HighLimit {high}; neither is used")
         return
-    variable.min, variable.max = low, high  # type: ignore[assignment]  # of a REAL they are floats
+    variable.min, variable.max = low, high  # type: ignore[assignment]  # those of a REAL are floats
 
 
 def _limit(source: Source, section: Section, key: str, data_type: int) -> int | float | None:

@@ -34,7 +34,7 @@ _LINE_PATTERN = re.compile(
     r"DROPCOUNT: dropped (?P<dropped>\d+) CAN frames? on '(?P<socket>[^']+)' socket \(total drops \d+\)"
 )
 _SCREEN_PATTERN = re.compile(r" *(?P<stamp>\([-0-9: .]+\))? *\S+ +(?:TX|RX)?[ \-BE]*[0-9A-Fa-f]{3,8} +\[ *\d+\].*")
-"""What candump prints without -l and -L: `(000.002500)  can0  181   [4]  37 06 00 00`."""
+"""Line that candump prints without -l and -L: `(000.002500)  can0  181   [4]  37 06 00 00`."""
 _ENCODINGS = {
     b"\xff\xfe": "utf-16",
     b"\xfe\xff": "utf-16",
@@ -42,40 +42,40 @@ _ENCODINGS = {
     b"\0(": "utf-16-be",
     b"\xef\xbb": "utf-8-sig",
 }
-"""By the first two bytes; anything else is ASCII."""
+"""Encodings by the first two bytes; anything else is ASCII."""
 
 
 _BUFFERED_FRAMES = 32
-"""Frames that are kept as they are before they become lines, which is quicker for many at once."""
+"""Frames that are kept before they become lines together, which is quicker."""
 _BUFFERED_LINES = 256
-"""Lines that are joined before they go to the file."""
+"""Lines that are kept before they are joined and go to the file."""
 
 
 Take = Callable[[Sequence[TimedFrame]], None]
-"""Takes frames, some at a time."""
+"""Called with some frames at a time."""
 
 
 def _nobody(_: Sequence[TimedFrame]) -> None:
-    """Takes nothing."""
+    """Ignore the frames."""
 
 
 class CandumpWriter:
     """Writes frames as candump does; a context manager. Its `write` is a recorder for a `LockstepBus`.
 
-    A file that fails (full disk) ends the log after a whole line and raises nothing: whoever records a moving machine
-    looks at `failure`.
+    A file that fails (full disk) ends the log after a whole line and raises nothing, as a machine moves meanwhile: look
+    at `failure`.
 
     Args:
-        path: the file to write; an existing one is replaced.
-        channel: the name in each line.
-        t0_ns: the time on the frames' clock that is written as 0.
+        path: file to write; an existing one is replaced.
+        channel: name in each line.
+        t0_ns: time on the frames' clock that is written as 0.
 
     Raises:
         ResultsError: the file cannot be opened.
-        UsageError: somebody else writes this file just now.
+        UsageError: another run writes this file now.
 
     Attributes:
-        failure: why nothing is written any more; None while all is well.
+        failure: reason why nothing is written any more; None while there is none.
     """
 
     def __init__(self, path: str | Path, channel: str, t0_ns: int = 0) -> None:
@@ -94,8 +94,8 @@ class CandumpWriter:
         """A recorder of the frames of one channel: called with (can_id, data, t_ns), it adds a line to this file.
 
         Args:
-            channel: the name in its lines.
-            also: takes the same frames.
+            channel: name in its lines.
+            also: function that takes the same frames.
         """
         form = _ChannelLines(channel, self._t0_ns).line
 
@@ -121,7 +121,7 @@ class CandumpWriter:
         self._take(frames)
 
     def flush(self) -> None:
-        """Hand what was written to the file."""
+        """Write to the file what was recorded so far."""
         self._form_lines()
         data = "".join(self._lines).encode("ascii")
         self._lines.clear()
@@ -138,7 +138,7 @@ class CandumpWriter:
         self._size += written
 
     def close(self) -> None:
-        """Flush and close the file; twice is allowed."""
+        """Flush and close the file; it may be called twice."""
         if not self._file.closed:
             self.flush()
         self._file.close()
@@ -199,21 +199,20 @@ def _opened_alone(path: str | Path) -> FileIO:
 
 
 CandumpLine = tuple[int, str, int, bytes]
-"""A frame of a log: t_ns, channel, can_id with the flags of `canprobe.fieldbus.bus.port`, data."""
+"""Frame of a log: t_ns, channel, can_id with the flags of `protocol.frames` and `bus.port`, data."""
 
 
 class CandumpReader:
-    """Reads a candump log, line by line: an iterable of `CandumpLine`. What is no CAN or CAN FD frame is counted.
+    """Reads a candump log line by line: an iterable of `CandumpLine`. Lines without a CAN or CAN FD frame are counted.
 
     Args:
-        path: the log, in ASCII, UTF-8 or UTF-16.
-        whole: a torn last line is an error like any other; else it is passed over, as a logger that is killed leaves
-            one.
+        path: path of the log, in ASCII, UTF-8 or UTF-16.
+        whole: whether a torn last line is an error; else it is passed over, as a logger that is killed leaves one.
 
     Attributes:
-        number: of the line that was read last, from 1.
-        lost: frames of each channel that candump did not receive (its option -d).
-        xl: CAN XL frames of each channel.
+        number: number of the line that was read last, from 1.
+        lost: number of frames that candump did not receive (its option -d), by channel.
+        xl: number of CAN XL frames, by channel.
     """
 
     def __init__(self, path: str | Path, *, whole: bool = False) -> None:
@@ -227,7 +226,7 @@ class CandumpReader:
         """Yield the frames.
 
         Raises:
-            UsageError: the file cannot be read, or a line is not one of candump's; with file and line number.
+            UsageError: the file cannot be read, or a line is none of candump; the message has file and line number.
         """
         try:
             file = self._opened()
@@ -249,7 +248,7 @@ class CandumpReader:
             raise UsageError(f"{self._path}: {error.strerror}") from error
 
     def _opened(self) -> BufferedReader:
-        """The file from its start; what comes through a pipe is kept, as it comes once."""
+        """The file from its start; the content of a pipe is kept, as it comes only once."""
         self.lost.clear()
         self.xl.clear()
         path = Path(self._path)
@@ -270,7 +269,7 @@ class CandumpReader:
 
 
 def read_candump(path: str | Path, *, whole: bool = False) -> Iterator[CandumpLine]:
-    """Read the frames of a candump log as they stand there: see `CandumpReader`."""
+    """Read the frames of a candump log in the order of its lines: see `CandumpReader`."""
     return iter(CandumpReader(path, whole=whole))
 
 
@@ -287,14 +286,14 @@ def _parse_id(match: re.Match[str]) -> int:
 
 
 class RecordingPort(PlainPort):
-    """A `Port` that writes down what passes through it, sent frames with the time of sending.
+    """A `Port` that records what passes through it, sent frames with the time of sending.
 
     In real time a received frame is written when it is drained, with the time of its reception, so a line may be older
     than the line above it.
 
     Args:
-        port: the port to use.
-        write: called with (can_id, data, t_ns), such as `CandumpWriter.write`.
+        port: port to use.
+        write: recorder that is called with (can_id, data, t_ns), such as `CandumpWriter.write`.
     """
 
     def __init__(self, port: Port, write: Callable[[int, bytes, int], None]) -> None:
@@ -305,23 +304,23 @@ class RecordingPort(PlainPort):
 
     @property
     def state(self) -> ControllerState:
-        """That of the port."""
+        """State of the port's controller."""
         return self._port.state
 
     @property
     def descriptor(self) -> int | None:
-        """That of the port."""
+        """Descriptor of the port."""
         return self._port.descriptor
 
     def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
-        """Send `frames` and write them down, with `t_ns` where it is given."""
+        """Send `frames` and record them, with `t_ns` where it is given."""
         sent_ns = self.clock.now_ns() if t_ns is None else t_ns
         self._port.send_batch(frames)
         for can_id, data in frames:
             self._write(can_id, data, sent_ns)
 
     def drain(self) -> list[TimedFrame]:
-        """Return what arrived, written down."""
+        """Return what arrived, and record it."""
         frames = self._port.drain()
         for can_id, data, t_ns in frames:
             self._write(can_id, data, t_ns)

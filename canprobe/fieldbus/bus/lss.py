@@ -1,4 +1,4 @@
-"""LSS requests: find nodes without an id, one after another, and give each an id.
+"""LSS requests: find nodes without an id one after another, and give each an id.
 
 Source: CiA 305, "LSS services".
 """
@@ -22,10 +22,10 @@ from canprobe.fieldbus.protocol.lss import (
 )
 
 SETTLING_S = 0.005
-"""Wait after the first answer: several nodes may give the same answer to one question, one after another."""
+"""Time that is waited after the first answer, as several nodes may answer one question one after another."""
 ANSWER_TIMEOUT_S = 0.5
 SEARCH_TIMEOUT_S = 0.05
-"""Time without an answer after which a question of fastscan counts as answered with no."""
+"""Time without an answer after which the answer to a question of fastscan is no."""
 
 
 class LssAnswerError(BusError):
@@ -43,7 +43,7 @@ class Lss:
         self._send(pack_lss(LssCommand.SWITCH_GLOBAL, bytes((LssState.WAITING,))))
 
     def select(self, address: LssAddress) -> bool:
-        """Put the node of this address into configuration; whether it answered."""
+        """Put the node of this address into configuration; return whether it answered."""
         *first, last = [
             pack_number(LssCommand(LssCommand.SELECT_VENDOR + i), number) for i, number in enumerate(address.numbers)
         ]
@@ -52,7 +52,7 @@ class Lss:
         return bool(self._ask(last, ANSWER_TIMEOUT_S, LssCommand.SELECTED))
 
     def inquire_node_ids(self) -> list[int]:
-        """What all the nodes in configuration answer: one node id, unless several devices have one address."""
+        """Node ids of all nodes in configuration: one, unless several devices have one address."""
         command = LssCommand.INQUIRE_NODE_ID
         return [answer[1] for answer in self._ask(pack_lss(command), ANSWER_TIMEOUT_S, command)]
 
@@ -60,16 +60,16 @@ class Lss:
         """Give the node in configuration its id.
 
         Raises:
-            LssAnswerError: it does not answer or refuses.
+            LssAnswerError: the node does not answer, or refuses.
         """
         if code := self._configure(LssCommand.CONFIGURE_NODE_ID, node_id):
             raise LssAnswerError(f"LSS error {code}")
 
     def store(self) -> bool:
-        """Let the node in configuration keep its id when its power goes; False where it does not support that.
+        """Let the node in configuration store its id over a power cycle; return False where it does not support that.
 
         Raises:
-            LssAnswerError: it does not answer or could not store it.
+            LssAnswerError: the node does not answer, or could not store its id.
         """
         if (code := self._configure(LssCommand.STORE)) > LssError.REFUSED:
             raise LssAnswerError(f"it could not store it: LSS error {code}")
@@ -79,10 +79,10 @@ class Lss:
         """Find the unconfigured node with the lowest address; it is in configuration afterwards.
 
         Returns:
-            Its address; None where nobody answers.
+            Its address; None where no node answers.
 
         Raises:
-            LssAnswerError: somebody answers, but to no address: answers were lost or came late.
+            LssAnswerError: nodes answer, but no address is found: answers were lost or came late.
         """
         for timeout_s in (SEARCH_TIMEOUT_S, 5 * SEARCH_TIMEOUT_S):
             if not self._identified(0, PRESENCE_CHECK, 0, 0, ANSWER_TIMEOUT_S):
@@ -119,7 +119,7 @@ class Lss:
         self._network.send_message(LSS_REQUEST_ID, message)
 
     def _ask(self, message: bytes, timeout_s: float, command: LssCommand) -> list[bytes]:
-        """Send a question; the answers with this command that come."""
+        """Send a question; return the answers with this command."""
         network = self._network
         answers: list[bytes] = []
 

@@ -1,10 +1,10 @@
 """SDO transfers to many nodes at once, over any `Port`, without threads.
 
-A *dialogue* is a generator: it yields the 8 bytes of a request, or None to wait on, and is sent the 8 bytes of each
-answer; an abort that it yields is sent, and nobody answers it. `upload` and `download` are parts of such dialogues
-(`yield from`). What a node needs is written as a plain sequence, and `hold_dialogues` waits for all nodes together: the
-accesses of one node come one after another, those of different nodes side by side. canopen's client is not used,
-because it waits for a thread and for one node at a time. `pumped` is how the port is read meanwhile.
+A *dialogue* is a generator. It yields the 8 bytes of a request, or None to wait further, and gets the 8 bytes of each
+answer; an abort that it yields is sent and not answered. `upload` and `download` are parts of dialogues (`yield from`).
+So the accesses to a node are written as a plain sequence, and `hold_dialogues` waits for all nodes together: the
+accesses to one node come one after another, those to different nodes side by side. The client of canopen is not used,
+because it waits for a thread and for one node at a time. `pumped` reads the port meanwhile.
 
 Source: CiA 301, SDO protocols (expedited download, expedited and segmented upload, abort).
 """
@@ -31,11 +31,11 @@ _MAX_EXPEDITED_BYTES = 4
 _NOT_TOGGLED, _TIMED_OUT, _OUT_OF_MEMORY = 0x05030000, 0x05040000, 0x05040005
 _TOO_LONG, _TOO_SHORT, _GENERAL = 0x06070012, 0x06070013, 0x08000000
 MAX_UPLOAD_BYTES = 4096
-"""Longest value that is read: names and numbers are far shorter. A node that sends more is not asked for the rest."""
+"""Longest value that is read; names and numbers are far shorter. The transfer of a longer one is aborted."""
 MAX_TRANSFER_TIMEOUTS = 10
 """Longest time of one transfer of several segments, in time-outs of one answer."""
 MAX_ROUND_S = 0.02
-"""How long the others wait for the slowest answer: asking again at once, low node ids would take the whole bus."""
+"""Longest time that the others wait for the slowest answer; else requests to low node ids would fill the bus."""
 
 
 class SdoTimeoutError(SdoCommunicationError):
@@ -47,7 +47,7 @@ def download(index: int, subindex: int, data: bytes) -> Generator[bytes | None, 
 
     Raises:
         SdoAbortedError: the node refused.
-        SdoCommunicationError: no answer, or more than four bytes.
+        SdoCommunicationError: no answer came, or there are not one to four bytes.
     """
     if not 0 < len(data) <= _MAX_EXPEDITED_BYTES:
         raise SdoCommunicationError(f"{index:04X}h:{subindex:02X} takes {len(data)} bytes; a concise write has 1 to 4")
@@ -56,13 +56,13 @@ def download(index: int, subindex: int, data: bytes) -> Generator[bytes | None, 
 
 
 def read_value(variable: ODVariable) -> Generator[bytes | None, bytes, Any]:
-    """Read an entry by its data type, in the entry's own length whatever the length of the answer.
+    """Read an entry by its data type, in the length of the entry, whatever the length of the answer.
 
     Many nodes answer with four bytes where the entry has one or two. The bytes beyond its length must be padding.
 
     Raises:
         SdoAbortedError: the node refused.
-        SdoCommunicationError: no answer, or one that does not fit the entry.
+        SdoCommunicationError: no answer came, or one that does not fit the entry.
     """
     size = len(variable) // 8
     data = yield from upload(variable.index, variable.subindex, size)
@@ -78,13 +78,13 @@ def upload(index: int, subindex: int, size: int = _MAX_EXPEDITED_BYTES) -> Gener
     """Read an entry of any length.
 
     Args:
-        index, subindex: of the entry.
-        size: bytes to take of an expedited answer that does not state how many of its four bytes are the value.
+        index, subindex: place of the entry.
+        size: number of bytes to take of an expedited answer that does not state how many of its four it uses.
 
     Raises:
         SdoAbortedError: the node refused.
-        SdoCommunicationError: no answer, one segment twice, more or fewer bytes than the node announced, or more than
-            `MAX_UPLOAD_BYTES`. The node got an abort.
+        SdoCommunicationError: no answer came, one segment came twice, or the node sent more or fewer bytes than it
+            announced, or more than `MAX_UPLOAD_BYTES`. The node gets an abort.
     """
     answer = yield from _answered(b"\x40", index, subindex, bytes(4), _UPLOAD_ANSWER)
     if answer[0] & _EXPEDITED_FLAG:
@@ -140,7 +140,7 @@ def _segments(multiplexer: bytes, announced: int | None) -> Generator[bytes | No
 
 
 def _give_up(multiplexer: bytes, code: int, why: str) -> Generator[bytes | None, bytes, NoReturn]:
-    """Tell the node that its transfer is over."""
+    """Abort the transfer of the node, and raise SdoCommunicationError."""
     yield _abort(multiplexer, code)
     raise SdoCommunicationError(f"transfer aborted: {why}")
 
@@ -155,7 +155,7 @@ def _check_abort(answer: bytes) -> None:
 
 
 class _Talk:
-    """One dialogue under way."""
+    """One dialogue that is under way."""
 
     def __init__(self, network: PumpedNetwork, node_id: int, dialogue: Dialogue, timeout_ns: int, retries: int) -> None:
         self.node_id = node_id
@@ -168,18 +168,18 @@ class _Talk:
         self._timeout_ns = timeout_ns
         self._retries = retries
         self._request = b""
-        self._multiplexer = b""  # of the transfer: a request for a segment has none
-        self._end_ns = 0  # of the transfer
+        self._multiplexer = b""  # that of the transfer: a request for a segment has none
+        self._end_ns = 0  # latest end of the transfer
         self._tries = 0
         self._go_on(lambda: next(dialogue))
 
     def take(self, _id: int, data: bytes, _t_ns: int) -> None:
-        """Keep an answer; anything but 8 bytes is no SDO (CiA 301, 7.2.4.3)."""
+        """Keep an answer; a frame of another length than 8 bytes is no SDO (CiA 301, 7.2.4.3)."""
         if len(data) == _SDO_BYTES and not self.over:
             self.inbox.append(data)
 
     def serve(self) -> None:
-        """Hand the dialogue its answers; where none came in time, ask again or give up."""
+        """Give the dialogue its answers; where none came in time, ask again or give up."""
         while self.inbox and not self.over:
             answer = self.inbox.pop(0)
             self._go_on(lambda answer=answer: self._dialogue.send(answer))  # type: ignore[misc]
@@ -233,15 +233,15 @@ class _Talk:
 
 
 class Dialogues:
-    """Dialogues with several nodes at once, served by whoever receives the frames meanwhile: see `hold_dialogues`.
+    """Dialogues with several nodes at once, for a caller that receives the frames itself: see `hold_dialogues`.
 
     A context manager: the first requests go out on entering.
 
     Args:
-        network: it is pumped, or fed, by the caller.
-        dialogues: by node id; each catches the errors that it can go on after, any other ends them all.
-        timeout_s: for an answer.
-        retries: how often a request without an answer is sent again.
+        network: network, which the caller pumps or feeds.
+        dialogues: dialogues by node id; an error that one does not catch itself ends them all.
+        timeout_s: time-out of an answer.
+        retries: number of times that a request without an answer is sent again.
     """
 
     def __init__(
@@ -268,17 +268,17 @@ class Dialogues:
 
     @property
     def waiting(self) -> list[_Talk]:
-        """Those that are not over."""
+        """Dialogues that are not over."""
         return [talk for talk in self._talks if not talk.over]
 
     def serve(self) -> None:
-        """Hand each dialogue the answers that have come; where none came in time, ask again or give up."""
+        """Give each dialogue the answers that have come; where none came in time, ask again or give up."""
         for talk in self.waiting:
             talk.serve()
 
     @property
     def repeated(self) -> dict[int, int]:
-        """Requests that were sent again, by node id."""
+        """Number of requests that were sent again, by node id."""
         return {talk.node_id: talk.repeated for talk in self._talks}
 
 
@@ -288,13 +288,13 @@ def hold_dialogues(
     """Carry out dialogues with several nodes at once, on the predefined SDO channel.
 
     Args:
-        network: pumped meanwhile.
-        dialogues: by node id; each catches the errors that it can go on after, any other ends them all.
-        timeout_s: for an answer.
-        retries: how often a request without an answer is sent again.
+        network: network, which is pumped meanwhile.
+        dialogues: dialogues by node id; an error that one does not catch itself ends them all.
+        timeout_s: time-out of an answer.
+        retries: number of times that a request without an answer is sent again.
 
     Returns:
-        Requests that were sent again, by node id.
+        The number of requests that were sent again, by node id.
     """
     with Dialogues(network, dialogues, timeout_s=timeout_s, retries=retries) as held:
         while waiting := held.waiting:

@@ -1,4 +1,4 @@
-"""Cyclic synchronous position: a target latched at a SYNC is reached by a straight ramp after 60C2h."""
+"""Cyclic synchronous position: the motor reaches a target latched at a SYNC by a straight ramp after 60C2h."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _POSITION_OFFSET_KEY = key_of(0x60B0)
 
 
 class CyclicPosition(CyclicMode):
-    """Mode 8. A ramp under way is not begun again where a target is missing.
+    """Mode 8. A missing target does not begin the ramp under way again.
 
     Attributes:
-        wanted: dictionary keys whose sum is the target, position units.
+        wanted: dictionary keys of the two values whose sum is the target, position units.
     """
 
     number = OperationMode.CYCLIC_SYNC_POSITION
@@ -33,7 +33,7 @@ class CyclicPosition(CyclicMode):
         self._latched_ns = 0
 
     def start(self, word: int, t_ns: int) -> None:
-        """The first target is as far away as the time since now allows."""
+        """Start; the first target may be as far away as the time from now on allows."""
         self._latched_ns = t_ns
         super().start(word, t_ns)
 
@@ -41,7 +41,7 @@ class CyclicPosition(CyclicMode):
         """Follow the target from the one before it."""
         parameters, units, motion, values = self._parameters, self._units, self._motion, self._values
         key, offset = self.wanted
-        target: int = values[key] + values.get(offset, 0)  # type: ignore[assignment, operator]  # of whole numbers
+        target: int = values[key] + values.get(offset, 0)  # type: ignore[assignment, operator]  # they are whole numbers
         low, high = parameters.low, parameters.high
         allowed = target if low <= target <= high else parameters.clamp(target)
         counts, onset = allowed * units.scale + units.origin, motion.onset(t_ns)

@@ -25,7 +25,7 @@ class CyclicVelocity(CyclicMode):
     needs = (key_of(target),)
 
     def latch(self, t_ns: int) -> None:
-        """Go on from where the reference is, with the new velocity."""
+        """Move the reference on from where it is, with the new velocity."""
         values, parameters = self._values, self._parameters
         target, offset = int(values[_VELOCITY_TARGET_KEY]), int(values.get(_VELOCITY_OFFSET_KEY, 0))
         wanted = (target + offset) * self._units.speed_scale

@@ -36,13 +36,13 @@ SWITCH_AND_INDEX_METHODS = frozenset({1, 2})
 HOMING_METHODS = frozenset({0, *PRESENT_POSITION_METHODS, *INDEX_DIRECTIONS, *SWITCH_DIRECTIONS})
 MAX_SEARCH_TURNS = 2.0
 MAX_SEARCH_S = 180.0
-"""Time at full speed in which a limit switch has to be found, or left."""
+"""Longest time at full speed to find a limit switch, or to leave it."""
 _METHOD_KEY = key_of(0x6098)
 _SWITCH_SPEED_SUB, _ZERO_SPEED_SUB = 1, 2  # sub-indices of 6099h
 
 
 class HomingPhase(Enum):
-    """Where a homing run is."""
+    """Phases of a homing run."""
 
     IDLE = auto()
     TO_SWITCH = auto()
@@ -67,16 +67,16 @@ class HomingMode(ProfiledMode):
         super().__init__(parts)
         self._phase = HomingPhase.IDLE
         self._method = 0
-        self._direction = 1  # in which the edge or the pulse is passed, of the motor
-        self._passed = self._home = 0.0  # counts: behind which the pulse comes; the home position
+        self._direction = 1  # direction of the motor in which it passes the edge or the pulse
+        self._passed = self._home = 0.0  # counts: position before the pulse; the home position
         parts.node.dictionary.on_check(0x6098, _check_method)
 
     def reset(self) -> None:
-        """Power on: not homed."""
+        """Power on: the drive is not homed."""
         self._phase = HomingPhase.IDLE
 
     def start(self, word: int, t_ns: int) -> None:
-        """A drive that was homed stays so."""
+        """Start; a drive that was homed stays homed."""
         if self._phase is not HomingPhase.DONE:
             self._phase = HomingPhase.IDLE
         super().start(word, t_ns)
@@ -84,16 +84,16 @@ class HomingMode(ProfiledMode):
             self._motion.decelerate(t_ns, self._parameters.deceleration, self._at_standstill)
 
     def leave(self, t_ns: int) -> None:
-        """A run under way is given up."""
+        """Give up a run that is under way."""
         self._give_up()
 
     def status(self) -> int:
-        """Homing attained, error, and target reached (when at rest)."""
+        """Bits for homing attained, error, and target reached, when at rest."""
         rests = self._standstill and self._phase in (HomingPhase.IDLE, HomingPhase.FAILED)
         return _PHASE_BITS.get(self._phase, 0) | REACHED_FLAG * rests
 
     def bits(self, word: int, changed: int, t_ns: int) -> None:
-        """Bit 4 starts, and interrupts when it is taken away."""
+        """Start with bit 4, and interrupt the run when it is cleared."""
         starts = word >> HOMING_START_BIT & 1
         if changed >> HOMING_START_BIT & 1 and not self.halted:
             if starts:
@@ -102,7 +102,7 @@ class HomingMode(ProfiledMode):
                 self._stop(HomingPhase.IDLE, t_ns)
 
     def resume(self, t_ns: int) -> None:
-        """With bit 4 still set, homing starts again."""
+        """Start homing again, if bit 4 is still set."""
         if self._word >> HOMING_START_BIT & 1:
             self._begin(t_ns)
 
@@ -114,8 +114,6 @@ class HomingMode(ProfiledMode):
         self._timer.cancel()
         if self._phase in _MOVING_PHASES:
             self._phase = HomingPhase.IDLE
-
-    # ------------------------------------------------------------------ a run
 
     def _begin(self, t_ns: int) -> None:
         self._method, self._standstill = int(self._values.get(_METHOD_KEY, 0)), False
@@ -202,7 +200,7 @@ class HomingMode(ProfiledMode):
 
 
 def next_pulse(counts: float, direction: int, turn: float) -> float:
-    """The next index pulse behind `counts`, in a direction; one that lies right there has been passed."""
+    """Position of the next index pulse behind `counts`, in a direction; a pulse right there has been passed."""
     turns = counts / turn
     return (floor(turns) + 1 if direction > 0 else ceil(turns) - 1) * turn
 

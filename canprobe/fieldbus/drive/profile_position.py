@@ -2,9 +2,9 @@
 
 A rising edge of controlword bit 4 offers a set-point (607Ah with 6081h, 6083h and 6084h of that moment); bit 5 puts
 it in place of everything else at once, bit 6 makes it relative to the set-point before. Statusword bit 12 is set when
-it was taken, and stays while bit 4 does or while no further one could be taken; one offered then is ignored.
+it was taken, and stays set while bit 4 is or while no other one can be taken; one that is offered then is ignored.
 The next set-point starts when the last is reached: the actual position has been within 6067h for 6068h (bit 10).
-Not here: bit 9 (change on set-point), 60F2h. Halt interrupts a move, which goes on when halt is over.
+Bit 9 (change on set-point) and 60F2h are not supported. Halt interrupts a move, which goes on when halt is over.
 Source: CiA 402-2, "Profile position mode", objects 6067h, 6068h, 607Ah, 607Dh, 607Fh, 6081h, 6083h, 6084h, 6086h.
 """
 
@@ -33,8 +33,8 @@ class SetPoint(NamedTuple):
 
     Attributes:
         counts: target within the software limits, motor counts.
-        rates: of the move; with a speed of 0 the drive stands still.
-        limited: the master wanted to go beyond.
+        rates: rates of the move; with a speed of 0 the drive stands still.
+        limited: whether the target of the master was beyond the limits.
     """
 
     counts: float
@@ -57,7 +57,7 @@ class ProfilePosition(ProfiledMode):
         self._reached = self._offered = False
 
     def start(self, word: int, t_ns: int) -> None:
-        """No set-point; the present position is what relative ones begin from."""
+        """Start without a set-point; relative ones begin from the present position."""
         self._active = self._next = self._inside_ns = None
         self._offered = self._reached = False
         self._last = round(self._units.position(self._motion.demand(t_ns)))
@@ -65,13 +65,13 @@ class ProfilePosition(ProfiledMode):
         self._timer.arm(t_ns + STEP_NS)
 
     def status(self) -> int:
-        """Target reached (with halt: standing still), set-point acknowledge."""
+        """Bits for target reached, with halt for standstill, and for set-point acknowledge."""
         acknowledged = self._offered or self._next is not None
         reached = super().status() if self.halted else REACHED_FLAG * self._reached
         return reached | acknowledged << SETPOINT_ACKNOWLEDGE_BIT
 
     def bits(self, word: int, changed: int, t_ns: int) -> None:
-        """A set-point is offered, or the offer taken back."""
+        """Take a set-point that is offered, or the end of the offer."""
         offers = word >> NEW_SETPOINT_BIT & 1
         if not offers:
             self._offered = False
@@ -87,7 +87,7 @@ class ProfilePosition(ProfiledMode):
                     self._next = point
 
     def resume(self, t_ns: int) -> None:
-        """The interrupted move goes on."""
+        """Go on with the interrupted move."""
         if self._active is not None and not self._reached:
             self._move(self._active, t_ns)
 
@@ -113,7 +113,7 @@ class ProfilePosition(ProfiledMode):
             self._motion.decelerate(t_ns, point.rates.deceleration)
 
     def watch(self, t_ns: int, counts: float) -> None:
-        """Look whether the set-point is reached."""
+        """Check whether the set-point is reached."""
         point = self._active
         if point is not None and not self._reached and not self.halted:
             if abs(point.counts - counts) > self._parameters.position_window:

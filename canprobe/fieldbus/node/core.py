@@ -1,4 +1,4 @@
-"""What the services of one node share: identity, NMT state, time, dictionary, timers and the frames to send."""
+"""State that the services of one node share: identity, NMT state, time, dictionary, timers and frames to send."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ NO_ROUTES: Mapping[int, Route] = {}
 
 
 class NodeCore:
-    """Shared by the services of one node; the node itself drives it.
+    """State that the services of one node share; the node itself changes it.
 
     Args:
-        node_id: 1–127, or 255 for none.
-        dictionary: the node's.
-        holder: shows the next deadline of the timers.
-        quirks: what makes the node difficult.
+        node_id: node id, 1–127, or 255 for none.
+        dictionary: the node's dictionary.
+        holder: object that shows the next deadline of the timers.
+        quirks: difficulties of the node.
 
     Attributes:
         state: NMT state.
         now_ns: time of the event being served.
         out: frames to send, in order.
-        reroute: to be called when the routes of a service have changed.
+        reroute: function that a service calls when its routes have changed.
     """
 
     def __init__(self, node_id: int, dictionary: Dictionary, holder: Holder, quirks: Quirks) -> None:
@@ -44,12 +44,12 @@ class NodeCore:
         self.reroute: Callable[[], None] = nothing
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Queue a frame behind those the node already sends."""
+        """Queue a frame behind those that the node already sends."""
         self.out.append((can_id, data))
 
 
 def _refuse(dictionary: Dictionary, quirks: Quirks) -> None:
-    """Hang the checks of a node that refuses writes, before any other."""
+    """Add the checks of a node that refuses writes, before any other check."""
 
     def refuse(subindex: int, value: Value) -> None:
         raise SdoAbort(Abort.UNSUPPORTED_ACCESS)
@@ -108,16 +108,16 @@ class DelayedFrames:
 
 
 class Service:
-    """One CiA 301 service of a node. The base class keeps nothing and hears nothing."""
+    """One CiA 301 service of a node. The base class has no state and no routes."""
 
     def reset(self, t_ns: int) -> None:
-        """Forget everything and read the parameters again (the dictionary holds its defaults)."""
+        """Forget everything and read the parameters again; the dictionary holds its defaults."""
 
     def entered(self, t_ns: int) -> None:
-        """The NMT state has just changed to `core.state`."""
+        """Act on the new NMT state, which is `core.state`."""
 
     def routes(self) -> Mapping[int, Route]:
-        """What to call for which CAN-ID, in the present NMT state."""
+        """Receivers by CAN-ID, in the present NMT state."""
         return NO_ROUTES
 
 
@@ -126,7 +126,7 @@ NO_RTR_FLAG = 1 << 30
 
 
 def check_cob_id(new: Value, old: int, reserved: int = 0x3FFFF800) -> None:
-    """Raises SdoAbort for a COB-ID with reserved or 29-bit bits, of a restricted identifier, or of another while valid.
+    """Check a new COB-ID. Raises SdoAbort for reserved bits, 29 bits, a restricted identifier, or a change while valid.
 
     Source: CiA 301, objects 1014h, 1200h, 1400h, 1800h, "Restricted CAN-IDs".
     """

@@ -28,11 +28,11 @@ def register_bit(code: int) -> int:
 
 
 _MAX_WAITING_MESSAGES = 16
-"""Messages kept while the inhibit time runs; of a flood the oldest go."""
+"""Most messages that wait while the inhibit time runs; beyond it the oldest are dropped."""
 
 
 class Emergency(Service):
-    """Reports errors once, and when they are gone, and remembers them.
+    """Reports each error once when it comes and once when it is gone, and keeps the history.
 
     Attributes:
         any: whether any error is present.
@@ -52,7 +52,7 @@ class Emergency(Service):
         core.dictionary.on_check(0x1014, self._check_cob_id)
 
     def reset(self, t_ns: int) -> None:
-        """No error, nothing waiting; the history survives (it is non-volatile where a device can keep it)."""
+        """Forget the errors and what waits; the history stays, as in the non-volatile memory of a device."""
         self._active.clear()
         self._waiting.clear()
         self._timer.cancel()
@@ -60,16 +60,16 @@ class Emergency(Service):
 
     @property
     def active(self) -> frozenset[int]:
-        """Codes of the errors present."""
+        """Codes of the errors that are present."""
         return frozenset(self._active)
 
     def report(self, code: int, data: bytes = b"", source: Hashable = None) -> None:
-        """An error is present: remember and send it, once until it is cleared.
+        """Report that an error is present: it is kept and sent, once until it is cleared.
 
         Args:
             code: emergency error code.
-            data: manufacturer's bytes, up to five.
-            source: which of several PDOs, producers… has it; the error lasts until the last one is cleared.
+            data: bytes of the manufacturer, up to five.
+            source: the PDO, producer… that has the error; the error lasts until it is cleared for the last one.
         """
         if (sources := self._active.get(code)) is not None:
             sources.add(source)
@@ -80,7 +80,7 @@ class Emergency(Service):
         self._send(code, data)
 
     def clear(self, code: int, source: Hashable = None) -> None:
-        """An error of one source is gone: EMCY 0000h with what remains in the register, if it was the last source."""
+        """Report that an error of one source is gone; with the last source EMCY 0000h is sent."""
         sources = self._active.get(code)
         if sources is None:
             return
@@ -90,7 +90,7 @@ class Emergency(Service):
         del self._active[code]
         self._show()
         if self._waiting and self._waiting[-1][0] == code:
-            self._waiting.pop()  # come and gone within the inhibit time: nobody needs to hear of it
+            self._waiting.pop()  # it came and went within the inhibit time: no message is needed
         else:
             self._send(NO_ERROR_CODE, b"")
 
@@ -124,7 +124,7 @@ class Emergency(Service):
         dictionary.put(0x1003, 0, len(self._history))
 
     def _check_read(self, subindex: int) -> None:
-        """Refuse an entry that is not there; bring one that is up to date, which is only needed now."""
+        """Refuse an entry that is not there; bring one that is there up to date, which only a reader needs."""
         if 0 < subindex <= len(self._history):
             self._core.dictionary.put(0x1003, subindex, self._history[subindex - 1])
         if subindex > len(self._history):

@@ -12,12 +12,12 @@ from canprobe.fieldbus.node.emcy import Emergency
 from canprobe.fieldbus.protocol.emcy import HEARTBEAT_LOST_CODE
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, RTR_FLAG, NmtState
 
-_MASTER_SOURCE = 0  # whoever guards this node: the protocol does not carry its id
+_MASTER_SOURCE = 0  # source of the error: the protocol does not carry the id of the master
 _TOGGLE_FLAG = 0x80
 
 
 class NodeGuarding(Service):
-    """Answers remote requests with toggle bit and state, and watches them from the first on, while 1017h is 0."""
+    """Answers remote requests with toggle bit and state, and watches them from the first one on, while 1017h is 0."""
 
     def __init__(self, core: NodeCore, emcy: Emergency, on_loss: Callable[[int], None]) -> None:
         """`on_loss(t_ns)` is called when the life guarding error occurs."""
@@ -28,7 +28,7 @@ class NodeGuarding(Service):
         core.dictionary.on_change(self._configure, 0x100C, 0x100D, 0x1017)
 
     def reset(self, t_ns: int) -> None:
-        """The first answer after a boot-up has the toggle bit 0."""
+        """Clear the toggle bit, as the first answer after a boot-up has it, and read the parameters."""
         self._toggle = 0
         self._configure()
 

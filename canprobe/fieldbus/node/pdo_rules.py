@@ -1,4 +1,4 @@
-"""What may be written to PDO communication and mapping parameters, and when.
+"""Rules for writing PDO communication and mapping parameters.
 
 Source: CiA 301, "PDO mapping", objects 1400h to 1BFFh.
 """
@@ -25,9 +25,9 @@ class PdoRules:
     """Rules of one PDO.
 
     Attributes:
-        dictionary: the node's.
-        communication, mapping: indices of its two parameter records.
-        transmits: TPDO or RPDO.
+        dictionary: dictionary of the node.
+        communication, mapping: indices of the two parameter records.
+        transmits: whether it is a TPDO; else it is an RPDO.
     """
 
     dictionary: Dictionary
@@ -37,17 +37,17 @@ class PdoRules:
 
     @property
     def valid(self) -> bool:
-        """Whether the PDO exists now (bit 31 of its COB-ID is 0)."""
+        """Whether the PDO exists now: bit 31 of its COB-ID is 0."""
         return not self.dictionary.number(self.communication, COB_ID_SUB, INVALID_FLAG) & INVALID_FLAG
 
     @property
     def long(self) -> bool:
-        """Whether PDOs of up to 64 bytes were switched on, in a device that has them."""
+        """Whether the device has PDOs of up to 64 bytes, and they were switched on."""
         dictionary = self.dictionary
         return self.transmits and dictionary.has_named(LONG_PDOS, LONG_PDOS_NAME) and bool(dictionary.number(LONG_PDOS))
 
     def check_communication(self, subindex: int, value: Value) -> None:
-        """Raises SdoAbort for a value that the standard forbids now."""
+        """Check a communication parameter. Raises SdoAbort for a value that the standard forbids now."""
         new, old = int(value), self.dictionary.number(self.communication, subindex)
         if subindex == COB_ID_SUB:
             check_cob_id(new, old)
@@ -60,7 +60,7 @@ class PdoRules:
                 raise SdoAbort(Abort.VALUE)
 
     def check_mapping(self, subindex: int, value: Value) -> None:
-        """Raises SdoAbort for a mapping that cannot be, or cannot be changed now."""
+        """Check a mapping parameter. Raises SdoAbort for a mapping that is impossible, or cannot be changed now."""
         new, old = int(value), self.dictionary.number(self.mapping, subindex)
         if new == old:
             return
@@ -72,7 +72,7 @@ class PdoRules:
             self.entry(new)
 
     def entries(self, count: int | None = None, fixed: bool = False) -> tuple[PdoEntry, ...]:
-        """The first `count` mapped entries (all: None). Raises SdoAbort when they do not make a PDO."""
+        """The first `count` mapped entries; None: all. Raises SdoAbort when they make no PDO."""
         total = self.dictionary.number(self.mapping, 0) if count is None else count
         if total and key_of(self.mapping, total) not in self.dictionary:
             raise SdoAbort(Abort.MAPPING_LENGTH)
@@ -82,16 +82,16 @@ class PdoRules:
         return found
 
     def present(self) -> tuple[PdoEntry, ...]:
-        """All mapped entries; none where the mapping makes no sense."""
+        """All mapped entries; empty where the mapping is impossible."""
         try:
             return self.entries(fixed=True)
         except SdoAbort:
             return ()
 
     def entry(self, word: int, fixed: bool = False) -> PdoEntry:
-        """One mapping word. Raises SdoAbort when its object does not exist, may not be mapped or has another length.
+        """Entry of a mapping word. Raises SdoAbort when its object is missing, not mappable or of another length.
 
-        What is there already may map anything: an EDS often does not list as mappable what a fixed mapping holds.
+        A fixed mapping may hold any object, as an EDS often does not list as mappable what it maps.
         """
         target = self.dictionary.entries.get(word >> 8)
         mappable = target is not None and (fixed or (target.in_tpdo if self.transmits else target.in_rpdo))

@@ -1,4 +1,4 @@
-"""One RPDO: reception, length check, event timer, and what happens to its values.
+"""One RPDO: reception, length check, event timer, and the storing of its values.
 
 Source: CiA 301, "RPDO", objects 1400h and 1600h; errors 8210h, 8220h, 8250h.
 """
@@ -20,9 +20,9 @@ class Rpdo:
 
     Attributes:
         cob_id: identifier, or None while the PDO is not valid.
-        keys: mapped dictionary keys, dummies left out.
-        synchronous: applied at the next SYNC (types 0–240).
-        pending: values waiting for that SYNC.
+        keys: mapped dictionary keys, without dummies.
+        synchronous: whether values are stored at the next SYNC (types 0–240).
+        pending: values that wait for that SYNC.
     """
 
     def __init__(self, core: NodeCore, emcy: Emergency, rules: PdoRules) -> None:
@@ -38,11 +38,11 @@ class Rpdo:
         self.pending: tuple[int, ...] | None = None
 
     def configure(self) -> None:
-        """Read the parameters. A mapping that makes no sense leaves the PDO without values."""
+        """Read the parameters. A PDO with an impossible mapping has no values."""
         dictionary, index = self._core.dictionary, self._rules.communication
         self.stop()
         if self._emcy.any:
-            self._forgive()  # what was wrong with the old parameters
+            self._forgive()  # the errors of the old parameters
         self.cob_id = dictionary.number(index, COB_ID_SUB) & 0x7FF if self._rules.valid else None
         self._layout = PdoLayout(self.cob_id or 0, self._rules.present())
         self._unpack = self._layout.raw_unpack  # the length is checked before
@@ -53,7 +53,7 @@ class Rpdo:
 
     @property
     def patient(self) -> bool:
-        """Nothing has to be done about a frame before the next SYNC."""
+        """Whether a frame requires nothing before the next SYNC."""
         return self.synchronous and not self._event_ns
 
     def stop(self) -> None:
@@ -62,7 +62,7 @@ class Rpdo:
         self._timer.cancel()
 
     def receive(self, data: bytes, t_ns: int) -> None:
-        """A frame with this PDO's identifier."""
+        """Take a frame with the identifier of this PDO."""
         length = self._layout.length
         if len(data) != length:
             if len(data) < length:
@@ -77,7 +77,7 @@ class Rpdo:
         self.take(self._unpack(data))
 
     def take(self, values: tuple[int, ...]) -> None:
-        """One value for each mapped entry but the dummies, for now or for the next SYNC."""
+        """Take one value for each mapped entry but the dummies, for now or for the next SYNC."""
         if self.synchronous:
             self.pending = values
         else:
@@ -107,7 +107,7 @@ class Rpdo:
     def _forgive(self) -> None:
         for code in (PDO_TOO_SHORT_CODE, PDO_TOO_LONG_CODE, RPDO_TIMEOUT_CODE):
             self._emcy.clear(code, self)
-        self._emcy.clear(RPDO_TIMEOUT_CODE)  # a drive's, which misses targets whatever PDO brings them
+        self._emcy.clear(RPDO_TIMEOUT_CODE)  # that of a drive, which misses targets whatever PDO brings them
 
     def _timed_out(self, due_ns: int) -> None:
         self._emcy.report(RPDO_TIMEOUT_CODE, source=self)

@@ -4,9 +4,9 @@
          → BLOCK_DOWNLOAD → BLOCK_DOWNLOAD_END → IDLE
          → BLOCK_UPLOAD_START → BLOCK_UPLOAD → BLOCK_UPLOAD_END → IDLE
 
-Expedited transfers begin and end in IDLE. A request that the table has not is aborted (05040001h), and every abort,
-the time-out and the stopped state lead to IDLE. An initiate request takes the place of an open transfer: a master
-that was restarted is served at once. Source: CiA 301, "SDO protocols".
+Expedited transfers begin and end in IDLE. A request that is not in the table is aborted (05040001h), and every abort,
+the time-out and the stopped state lead to IDLE. An initiate request takes the place of an open transfer, so that a
+master that was restarted is served at once. Source: CiA 301, "SDO protocols".
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from enum import IntEnum, auto
 
 
 class SdoState(IntEnum):
-    """What a server waits for: a new request, or the next frame of a transfer."""
+    """States of a server, which waits for a new request or for the next frame of a transfer."""
 
     IDLE = auto()
     DOWNLOAD = auto()
@@ -28,7 +28,7 @@ class SdoState(IntEnum):
 
 
 class SdoRequest(IntEnum):
-    """What a client's frame is, by its command byte."""
+    """Kinds of a client's frames, by the command byte."""
 
     INITIATE_DOWNLOAD = auto()
     INITIATE_UPLOAD = auto()
@@ -64,7 +64,7 @@ SDO_TRANSITIONS: dict[tuple[SdoState, SdoRequest], tuple[SdoState, ...]] = {
     (_S.BLOCK_UPLOAD, _R.ACKNOWLEDGE_BLOCK): (_S.BLOCK_UPLOAD, _S.BLOCK_UPLOAD_END),
     (_S.BLOCK_UPLOAD_END, _R.END_BLOCK_UPLOAD): (_S.IDLE,),
 }
-"""State and request → the states that may follow when the request is right in itself; IDLE by an abort if not."""
+"""States that may follow a request without an error, by state and request; an error leads to IDLE with an abort."""
 _ABORT_COMMAND = 0x80
 _SPECIFIED_REQUESTS = (_R.DOWNLOAD_SEGMENT, _R.INITIATE_DOWNLOAD, _R.INITIATE_UPLOAD, _R.UPLOAD_SEGMENT)
 _BLOCK_UPLOAD_REQUESTS = (_R.INITIATE_BLOCK_UPLOAD, _R.END_BLOCK_UPLOAD, _R.ACKNOWLEDGE_BLOCK, _R.START_BLOCK_UPLOAD)
@@ -86,7 +86,7 @@ _REQUESTS = tuple(_read(command) for command in range(256))
 
 
 def request_of(state: SdoState, command: int) -> SdoRequest:
-    """What a command byte means; during a block download every frame but an abort is a numbered segment."""
+    """Request of a command byte; during a block download every frame but an abort is a numbered segment."""
     if state is SdoState.BLOCK_DOWNLOAD and command != _ABORT_COMMAND:
         return SdoRequest.BLOCK_SEGMENT
     return _REQUESTS[command]

@@ -29,7 +29,7 @@ class Transfer(ABC):
     """One transfer under way.
 
     Attributes:
-        state: which frame of the client it waits for; IDLE when it is over.
+        state: state, which says for what frame of the client it waits; IDLE when it is over.
     """
 
     state: SdoState
@@ -40,7 +40,7 @@ class Transfer(ABC):
 
 
 def check_block_size(size: int) -> int:
-    """The number of segments in a block, unless it is refused. Raises SdoAbort."""
+    """Return the number of segments in a block. Raises SdoAbort where it is not 1 to 127."""
     if not 1 <= size <= MAX_BLOCK_SEGMENTS:
         raise SdoAbort(Abort.BLOCK_SIZE)
     return size
@@ -55,9 +55,9 @@ class _Download(Transfer):
     """A value that comes in.
 
     Args:
-        entry: the entry that the value is for.
+        entry: entry that gets the value.
         announced: size that the client announced, bytes; None: it announced none.
-        store: stores the whole value; it may raise SdoAbort.
+        store: function that stores the whole value; it may raise SdoAbort.
     """
 
     def __init__(self, entry: Entry, announced: int | None, store: Callable[[bytes], None]) -> None:
@@ -71,13 +71,13 @@ class _Download(Transfer):
         self._data = bytearray()
 
     def _take(self, piece: bytes, slack: int = 0) -> None:
-        """Append what came, of which `slack` bytes may be filling."""
+        """Append received bytes, of which `slack` may be filling."""
         self._data += piece
         if len(self._data) - slack > self._most:
             raise SdoAbort(Abort.TOO_LONG)
 
     def _received(self, unused: int = 0) -> bytes:
-        """What was received, but for the last `unused` bytes."""
+        """The bytes that were received, without the last `unused` ones."""
         value = bytes(self._data[: len(self._data) - unused])
         if self._announced is not None and len(value) != self._announced:
             raise SdoAbort(Abort.TOO_SHORT if len(value) < self._announced else Abort.TOO_LONG)
@@ -106,8 +106,8 @@ class BlockDownload(_Download):
     """A value that comes in by blocks of numbered segments, each block with one answer.
 
     Args:
-        entry, announced, store: as for a segmented download.
-        with_crc: the client sends a CRC at the end.
+        entry, announced, store: entry, size and function, as for a segmented download.
+        with_crc: whether the client sends a CRC at the end.
     """
 
     state = SdoState.BLOCK_DOWNLOAD
@@ -122,7 +122,7 @@ class BlockDownload(_Download):
         return self._segment(data) if self.state is SdoState.BLOCK_DOWNLOAD else self._end(data)
 
     def _segment(self, data: bytes) -> list[bytes]:
-        """A numbered segment; behind a lost one the others are not taken, and the client sends them again."""
+        """Take a numbered segment; those behind a lost one are dropped, and the client sends them again."""
         number, last = data[0] & 0x7F, bool(data[0] & 0x80)
         if number == 0:
             raise SdoAbort(Abort.SEQUENCE)
@@ -172,9 +172,9 @@ class BlockUpload(Transfer):
     """A value that goes out by blocks of numbered segments, each block acknowledged.
 
     Args:
-        value: the value.
-        block_size: segments in a block, at most.
-        with_crc: the client wants a CRC at the end.
+        value: bytes of the value.
+        block_size: most segments in a block.
+        with_crc: whether the client wants a CRC at the end.
     """
 
     def __init__(self, value: bytes, block_size: int, with_crc: bool) -> None:
@@ -184,7 +184,7 @@ class BlockUpload(Transfer):
         self._sent = 0  # segments of the last block
 
     def step(self, data: bytes) -> list[bytes]:
-        """Begin to send, go on by what was acknowledged, or end."""
+        """Begin to send, go on after an acknowledgement, or end."""
         if self.state is SdoState.BLOCK_UPLOAD:
             return self._acknowledged(data)
         if self.state is SdoState.BLOCK_UPLOAD_START:

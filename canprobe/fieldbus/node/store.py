@@ -27,14 +27,14 @@ class Store:
 
     Attributes:
         saved: stored values by dictionary key; hand it to another node's store to model a power cycle.
-        kept: what the application stored beside the dictionary.
-        volatile: indices that are process data, never stored.
-        node_id: stored by LSS for the next power on, 255 for none; None where LSS never stored any.
-        changed: called after every "save" and "load"; it may raise SdoAbort, then nothing has changed.
+        kept: bytes that the application stored beside the dictionary.
+        volatile: indices of process data, which are never stored.
+        node_id: node id that LSS stored for the next power on, 255 for none; None where LSS never stored one.
+        changed: function that is called after every "save" and "load"; where it raises SdoAbort, nothing changes.
     """
 
     def __init__(self, core: NodeCore, keep: Callable[[], bytes]) -> None:
-        """`keep()` returns what "save" stores of the application beside the dictionary."""
+        """Make an empty store; `keep()` returns what "save" stores of the application beside the dictionary."""
         self._core, self._keep = core, keep
         self.saved: dict[int, Value] = {}
         self.kept = b""
@@ -47,7 +47,7 @@ class Store:
             core.dictionary.on_write(index, self._show)
 
     def recall(self, communication_only: bool) -> None:
-        """Defaults of the EDS, then what was stored; all of it, or the communication area alone."""
+        """Restore the defaults of the EDS, then what was stored: all of it, or the communication area alone."""
         area = _COMMUNICATION_AREA if communication_only else range(0x10000)
         dictionary = self._core.dictionary
         dictionary.restore(key for key in dictionary.entries if key >> 8 in area)
@@ -56,7 +56,7 @@ class Store:
                 dictionary.values[key] = value
 
     def keep_node_id(self, node_id: int) -> None:
-        """Store a node id (LSS store configuration). Raises SdoAbort when it could not be written."""
+        """Store a node id (LSS store configuration). Raises SdoAbort when it cannot be written."""
         self._replace(self.saved, self.kept, node_id)
 
     def _save(self, subindex: int, value: Value) -> None:
@@ -85,7 +85,7 @@ class Store:
             raise
 
     def _unverify(self, index: int) -> None:
-        """Another value came over SDO: 1020h no longer identifies the configuration."""
+        """Clear 1020h, as it no longer identifies the configuration once another value came over SDO."""
         if index == _VERIFICATION_INDEX or index in _UNSTORED_INDICES or index in self.volatile:
             return
         for subindex in (1, 2):

@@ -17,17 +17,16 @@ _SCHEMA = 1
 
 
 def keep_in_file(node: SlaveNode, path: Path) -> None:
-    """Take over what the file holds, if there is one; from now on write it at every "save" and "load" and when
-    LSS stores a node id.
+    """Read the file, if there is one; from now on write it at every "save" and "load", and when LSS stores an id.
 
     Call it before the node is started. A write that fails aborts the SDO with 06060000h, or LSS with error 2.
 
     Args:
         node: the node, not yet started.
-        path: of the file; its folder is made.
+        path: path of the file; its folder is made.
 
     Raises:
-        UsageError: the file cannot be read, or is another device's.
+        UsageError: the file cannot be read, or holds the values of another device.
     """
     if path.exists():
         _read(node, path)
@@ -98,7 +97,7 @@ def _value(plain: Any) -> Value:
 
 
 def _check(node: SlaveNode, path: Path, key: int, value: Value) -> None:
-    """What the file puts into the dictionary must be a value of that entry: the cyclic code packs it unchecked."""
+    """Check that a value from the file is one of its entry, as the cyclic code packs it unchecked."""
     where = f"{path}: {key >> 8:04X}h:{key & 0xFF:02X}"
     entry = node.dictionary.entries.get(key)
     if entry is None:

@@ -19,7 +19,7 @@ _LISTENING_STATES = frozenset({NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL})
 
 
 class SyncConsumer(Service):
-    """Hears SYNC and passes it to the PDOs as `on_sync(t_ns, counter, elapsed)` in operational."""
+    """Checks each SYNC and passes it to the PDOs as `on_sync(t_ns, counter, elapsed)` in operational."""
 
     def __init__(self, core: NodeCore, emcy: Emergency, on_sync: Callable[[int, int, int], None]) -> None:
         self._core, self._emcy, self._on_sync = core, emcy, on_sync
@@ -39,12 +39,12 @@ class SyncConsumer(Service):
     def _configure(self) -> None:
         number = self._core.dictionary.number
         self._overflow = number(0x1019)
-        self._timeout_ns = number(0x1006) * 1500  # 1.5 periods
+        self._timeout_ns = number(0x1006) * 1500  # 1.5 periods of 1006h, which is in µs
         self._last = 0
         self._timer.cancel()
 
     def entered(self, t_ns: int) -> None:
-        """The time-out runs in operational, from the first SYNC there."""
+        """Stop the time-out, which runs in operational from the first SYNC on."""
         self._operational = self._core.state is NmtState.OPERATIONAL
         self._timer.cancel()
 

@@ -62,7 +62,7 @@ class DriveState(Enum):
 
 
 class DriveCommand(Enum):
-    """What a controlword commands; switching on and disabling operation are the same pattern."""
+    """Commands of a controlword; switching on and disabling operation have the same pattern."""
 
     SHUTDOWN = auto()
     SWITCH_ON = auto()
@@ -74,7 +74,7 @@ class DriveCommand(Enum):
 
 
 class Event(Enum):
-    """What changes the state without a controlword."""
+    """Events in the drive that change the state without a controlword."""
 
     INITIALISED = auto()
     QUICK_STOP_DONE = auto()
@@ -119,7 +119,7 @@ TRANSITIONS: dict[tuple[DriveState, DriveCommand], DriveState] = {
     (source, command): target for _, source, command, target in NUMBERED_TRANSITIONS
 }
 """Where a command leads. What is not in the table changes nothing. Transition 16 is only for 605Ah = 5..8, and
-transition 15 only when no cause of the fault remains: both are the drive's to check."""
+transition 15 only when no cause of the fault remains: the drive checks both."""
 
 AUTOMATIC_TRANSITIONS: dict[tuple[DriveState, Event], DriveState] = {
     (_S.NOT_READY_TO_SWITCH_ON, Event.INITIALISED): _S.SWITCH_ON_DISABLED,  # 1
@@ -132,7 +132,7 @@ AUTOMATIC_TRANSITIONS: dict[tuple[DriveState, Event], DriveState] = {
 }
 
 POWERED_STATES = frozenset({_S.OPERATION_ENABLED, _S.QUICK_STOP_ACTIVE, _S.FAULT_REACTION_ACTIVE})
-"""States in which the drive function is on: torque may act on the motor."""
+"""States in which the drive function is on, so that torque may act on the motor."""
 
 _BIT_5_FREE = (_S.NOT_READY_TO_SWITCH_ON, _S.SWITCH_ON_DISABLED, _S.FAULT_REACTION_ACTIVE, _S.FAULT)
 _STATES = {state.value: state for state in DriveState} | {state.value | 0x20: state for state in _BIT_5_FREE}
@@ -145,7 +145,7 @@ def state_of(statusword: int) -> DriveState:
     """The drive state in a statusword.
 
     Raises:
-        ProtocolError: a bit pattern that is no state.
+        ProtocolError: the bits are the pattern of no state.
     """
     state = known_state(statusword)
     if state is None:
@@ -159,7 +159,7 @@ def known_state(statusword: int) -> DriveState | None:
 
 
 def describe_state(statusword: int) -> str:
-    """The drive state in words, to be put behind "the drive is"."""
+    """The drive state in words that go on after "the drive is"."""
     state = known_state(statusword)
     return state.name if state is not None else f"in no CiA 402 state (statusword {statusword:#06x})"
 
@@ -206,7 +206,7 @@ def controlword_toward(state: DriveState, goal: DriveState, previous: int = 0) -
         previous: the controlword sent before, so that a reset that did not take is tried with a new edge.
 
     Raises:
-        ProtocolError: another goal.
+        ProtocolError: the goal is none of the three.
     """
     try:
         word = _WORDS_TOWARD[goal][state]

@@ -10,7 +10,7 @@ from canprobe.fieldbus.protocol.frames import EMCY_BASE, Frame
 
 _FORM = struct.Struct("<HB5s")
 NO_ERROR_CODE = 0x0000
-"""What a node sends when an error is over."""
+"""Code that a node sends when an error is over."""
 HEARTBEAT_LOST_CODE = 0x8130
 SYNC_LOST_CODE = 0x8100
 PDO_TOO_SHORT_CODE = 0x8210
@@ -92,7 +92,7 @@ class Emcy:
         """Pack into the 8 bytes of the wire.
 
         Raises:
-            ProtocolError: a field that does not fit.
+            ProtocolError: a field does not fit.
         """
         if len(self.data) > 5:
             raise ProtocolError(f"EMCY: at most 5 manufacturer bytes, got {len(self.data)}")
@@ -106,7 +106,7 @@ class Emcy:
         """Unpack exactly 8 bytes.
 
         Raises:
-            ProtocolError: another length.
+            ProtocolError: the data have another length.
         """
         if len(data) != 8:
             raise ProtocolError(f"EMCY: expected 8 bytes, got {len(data)}")

@@ -10,7 +10,7 @@ Frame = tuple[int, bytes]
 """An 11-bit identifier and up to 8 data bytes."""
 
 CLASSIC_BYTES = 8
-"""Longest data of a classic CAN frame; longer ones are CAN FD frames."""
+"""Most data bytes of a classical CAN frame; a frame with more is one of CAN FD."""
 BRS_FLAG = 0x01
 """Bit rate switch of a CAN FD frame, as in Linux's `struct canfd_frame`."""
 EFF_FLAG = 0x80000000
@@ -91,7 +91,7 @@ def unpack_heartbeat(data: bytes) -> NmtState:
     """Unpack the state from a heartbeat, boot-up or node-guarding answer (whose toggle bit 7 is dropped).
 
     Raises:
-        ProtocolError: not one byte, or no NMT state.
+        ProtocolError: the data are not one byte, or the byte is no NMT state.
     """
     if len(data) != 1:
         raise ProtocolError(f"heartbeat: expected 1 byte, got {len(data)}")

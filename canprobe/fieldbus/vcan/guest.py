@@ -1,9 +1,9 @@
-"""A command in a user-mode Linux guest: a Linux kernel with CAN as an ordinary process on this machine's own files.
+"""A command in a user-mode Linux guest: a kernel with CAN as an ordinary process on the files of this machine.
 
-The guest has the machine's file system as its root (hostfs), so the same programs, interpreters and folders, and a
-vcan0 and a vcan1 of its own. The command's output goes to two files that are followed from outside; signals go in as
-lines on the guest's console; the exit status comes out through a file, because the kernel's own status is always 0.
-A shell for the user has a second console on the user's own terminal; what it is given from a pipe goes in as a file.
+The root of the guest is the file system of the machine (hostfs), with the same programs, interpreters and folders; the
+guest has a vcan0 and a vcan1. The output of the command goes to two files that are followed from outside. Signals go in
+as lines on the guest's console. The exit status comes out through a file, because that of the kernel is always 0. A
+shell for the user has a second console on the user's terminal; input from a pipe goes in as a file.
 
     JOB/            a folder under the temporary folder, removed afterwards
       init          the guest's first process: mounts, modules, vcan0, vcan1, then the command
@@ -86,7 +86,7 @@ class GuestError(BusError):
     """The guest could not be started, or ended before the command did.
 
     Attributes:
-        started: whether the command was running already.
+        started: whether the command was already running.
     """
 
     def __init__(self, message: str, started: bool) -> None:
@@ -95,7 +95,7 @@ class GuestError(BusError):
 
 
 def missing_packages() -> list[str]:
-    """Debian packages that a guest on this machine needs and that are not installed."""
+    """Debian packages that a guest on this machine needs and that are missing."""
     installed = shutil.which(PROGRAM, path=_search_path()) is not None and any(
         MODULES.glob("*/kernel/drivers/net/can/vcan.ko")
     )
@@ -118,9 +118,9 @@ class GuestJob:
 
     Args:
         command: program and arguments.
-        environment: the command's whole environment.
-        realtime: pin the guest to the last processor under SCHED_FIFO, and keep that one from idling.
-        shell: the command is a shell for the user; it has our standard input, and our terminal if that is one.
+        environment: whole environment of the command.
+        realtime: whether to pin the guest to the last processor under SCHED_FIFO, and keep that processor awake.
+        shell: whether the command is a shell for the user, with the standard input, and the terminal, of this process.
 
     Raises:
         GuestError: the guest cannot be started from here.
@@ -152,7 +152,7 @@ class GuestJob:
 
     @property
     def started(self) -> bool:
-        """Whether the command runs, or ran."""
+        """Whether the command runs or has run."""
         return self._read("pid").endswith("\n")
 
     def poll(self) -> int | None:
@@ -302,14 +302,14 @@ class GuestJob:
 
 
 def _second_console() -> str:
-    """What makes the guest's second console, as large as our terminal."""
+    """Commands that make the second console of the guest, as large as our terminal."""
     size = os.get_terminal_size(1)
     node = "/run/canprobe.tty"
     return f"mknod {node} c 4 1\nstty -F {node} sane rows {size.lines} cols {size.columns}"
 
 
 def _compile_xstate(folder: Path) -> str:
-    """The library that is loaded before the guest's own; see `xstate.c`."""
+    """Compile the library that is loaded before those of the guest; see `xstate.c`."""
     library = folder / "xstate.so"
     source = Path(__file__).with_name("xstate.c")
     command = ["cc", "-shared", "-fPIC", "-O2", "-o", str(library), str(source), "-ldl"]
@@ -347,10 +347,10 @@ def memory_folder(folders: Sequence[str]) -> tuple[str, int]:
     """Return the first folder that can hold the guest's memory file, and the bytes for it.
 
     Args:
-        folders: what is tried, one after the other; one in RAM is quicker than one on a disk.
+        folders: folders that are tried one after the other; one in RAM is quicker than one on a disk.
 
     Raises:
-        GuestError: none of them can, each with its reason.
+        GuestError: none of them can; the message has the reason of each.
     """
     problems = []
     for folder in dict.fromkeys(folders):
@@ -372,7 +372,7 @@ def memory_folder(folders: Sequence[str]) -> tuple[str, int]:
 
 
 def _on_last_processor() -> list[str]:
-    """Words that keep a command on the last of several processors; none where that cannot be."""
+    """Words that keep a command on the last of several processors; empty where that is impossible."""
     processors = sorted(os.sched_getaffinity(0))
     if len(processors) < 2 or shutil.which("taskset") is None:
         return []
@@ -380,7 +380,7 @@ def _on_last_processor() -> list[str]:
 
 
 def _favour() -> list[str]:
-    """Words before the guest that keep it on one processor and before others, as far as they are to be had.
+    """Words before the guest that keep it on one processor and before others, as far as that is permitted.
 
     A guest that wanders between processors loses half its speed: the host faults its pages anew on each.
     """

@@ -1,9 +1,8 @@
 """Run a command where a real vcan0 exists: here if there is one or one can be made, else in a guest.
 
 In this order: a vcan0 that is up; one in a network namespace of its own; one made by root and removed afterwards; a
-user-mode Linux guest (`canprobe.fieldbus.vcan.guest`). Where a vcan0 is made, a vcan1 is made beside it. The command
-finds the
-way taken in the environment: CANPROBE_VCAN is `here`, `namespace`, `link` or `guest`.
+user-mode Linux guest (`canprobe.fieldbus.vcan.guest`). Where a vcan0 is made, a vcan1 is made beside it. The variable
+CANPROBE_VCAN shows the command which way was taken: `here`, `namespace`, `link` or `guest`.
 """
 
 from __future__ import annotations
@@ -45,13 +44,13 @@ def run_with_vcan(
 
     Args:
         command: program and arguments; none for the user's shell, which has standard input.
-        timeout_s: how long the command may run; booting a guest does not count.
-        install: install the guest's Debian package if a guest is needed, and iproute2 where `ip` is missing.
-        realtime: steady the guest's timing; see `GuestJob`.
+        timeout_s: time that the command may run; the boot of a guest does not count.
+        install: whether to install the Debian package of the guest if needed, and iproute2 where `ip` is missing.
+        realtime: whether to steady the timing of the guest; see `GuestJob`.
 
     Returns:
-        The command's exit status (128 + n after signal n); 124 after the time-out; 125 if no vcan can be had; 123 if
-        the guest died under the command. Messages go to stderr.
+        The command's exit status (128 + n after signal n); 124 after the time-out; 125 if there is no way to a vcan;
+        123 if the guest ended before the command. Messages go to stderr.
     """
     shell = not command
     if shell:
@@ -71,7 +70,7 @@ def run_with_vcan(
 
 
 def _check_guest(install: bool) -> int:
-    """0 where a guest can be started; else 125, with the line to type."""
+    """Check what a guest needs: return 0 where it can be started; else 125, after a message with the line to type."""
     missing = missing_packages()
     if install and missing_ip() is not None:
         missing.append("iproute2")  # for commands in the guest
@@ -113,7 +112,7 @@ def _supervise_guest(job: GuestJob, signals: list[int], timeout_s: float | None)
 
 
 class _Boot:
-    """The boot of a guest as a job of its own: ends with 0 when the command starts, with 128 + n at a signal."""
+    """The boot of a guest as a job: it ends with 0 when the command starts, with 128 + n at a signal."""
 
     def __init__(self, job: GuestJob) -> None:
         self._job = job
@@ -190,7 +189,7 @@ def _report_time_out(timed_out: bool, timeout_s: float | None) -> None:
 
 
 def _report_killed() -> None:
-    """The guest maps the pages of its processes one by one, and its kernel kills a process that cannot map another."""
+    """Report a command that its kernel killed because it could not map another page: the guest maps them one by one."""
     try:
         mappings = int(_MAPPINGS.read_text())
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""Many CAN frames a system call: recvmmsg and sendmmsg through ctypes, on systems of 64 bits.
+"""Many CAN frames in one system call: recvmmsg and sendmmsg through ctypes, on systems of 64 bits.
 
 Where a system call costs 20 µs, as in a user-mode Linux guest, a burst costs a tenth of what single calls do.
 
@@ -35,7 +35,7 @@ _BATCH_FRAMES = 64
 
 
 HAS_BATCHES = struct.calcsize("P") == 8
-"""The layout of the control messages above is that of 64 bits."""
+"""Whether the system has 64 bits, as the layout of the control messages above requires."""
 
 
 class _IoVec(ctypes.Structure):
@@ -83,8 +83,8 @@ class FrameSocket:
     """Moves frames through one socket with recvmmsg and sendmmsg.
 
     Args:
-        sock: a raw CAN socket.
-        fd: it takes CAN FD frames too.
+        sock: raw CAN socket.
+        fd: whether it takes CAN FD frames too.
     """
 
     def __init__(self, sock: socket.socket, fd: bool = False) -> None:
@@ -98,10 +98,10 @@ class FrameSocket:
         self._out = _Slots(self._frame.size, 0)
 
     def receive(self, wait: bool = False) -> list[Row]:
-        """Return everything that is there, 64 frames a call; OSError if the interface failed.
+        """Return all frames that have arrived, 64 by each system call; raise OSError if the interface failed.
 
         Args:
-            wait: for the first frame, as long as the socket's own time-out says; it must be a blocking one.
+            wait: whether to wait for the first frame, up to the time-out of the socket, which must be a blocking one.
         """
         rows: list[Row] = []
         slots = self._in
@@ -123,7 +123,7 @@ class FrameSocket:
         return rows
 
     def send(self, frames: Sequence[Frame]) -> int:
-        """Hand over up to 64 frames with one call; return how many were taken; OSError if not even one was."""
+        """Send up to 64 frames with one call; return how many were taken; raise OSError if none was."""
         out, form = self._out, self._frame
         offset = 0
         for k, (can_id, data) in enumerate(frames[:_BATCH_FRAMES]):

@@ -1,7 +1,7 @@
-"""A `Port` over any interface of python-can: the portable way, for adapters that SocketCAN does not drive.
+"""A `Port` over any interface of python-can, for adapters that SocketCAN does not drive.
 
 Frames are stamped with the time at which they are taken from python-can, whose own stamps differ between interfaces.
-It costs some 10 µs a frame; for SocketCAN use `canprobe.fieldbus.bus.real.socketcan`.
+A frame costs some 10 µs; for SocketCAN use `canprobe.fieldbus.bus.real.socketcan`.
 """
 
 from __future__ import annotations
@@ -45,16 +45,16 @@ class PythonCanPort(PlainPort):
     """One python-can bus.
 
     Args:
-        interface: python-can's name of the interface, such as `virtual`, `pcan`, `slcan`.
-        channel: the channel as that interface names it.
+        interface: name of the interface in python-can, such as `virtual`, `pcan`, `slcan`.
+        channel: channel in the words of that interface.
         bitrate: bit rate, bit/s, for interfaces that set it themselves.
-        clock: the clock for waits and stamps.
+        clock: clock for waits and stamps.
         data_bitrate: bit rate of the data phase of CAN FD frames; None: classical frames only.
-        reports: receives error frames.
+        reports: receivers of error frames.
 
     Attributes:
-        counters: what has passed; `ignored` are CAN FD frames where they are not wanted.
-        state: the controller's state as of the last error frame.
+        counters: counters of the port; `ignored` counts CAN FD frames where only classical ones are wanted.
+        state: state of the controller by the last error frame.
 
     Raises:
         UsageError: python-can has no such interface.
@@ -85,7 +85,7 @@ class PythonCanPort(PlainPort):
     stamps_arrival = False
 
     def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
-        """Send `frames` in order, one call of python-can each."""
+        """Send `frames` in order, each with one call of python-can."""
         bus = self._open_bus()
         for can_id, data in frames:
             message = _message(self.channel, can_id, data, self._fd)
@@ -183,7 +183,7 @@ def _open(interface: str, channel: str, bitrate: int, data_bitrate: int | None) 
         missing = interface == "udp_multicast" and importlib.util.find_spec("msgpack") is None
         way = f": {install_line('can')}" if missing else ""
         raise InterfaceError(f"{channel}: {interface} cannot be opened: {error}{way}") from error
-    except Exception as error:  # where a driver's library is missing, python-can trips over anything
+    except Exception as error:  # where the library of a driver is missing, python-can raises anything
         why = f"is its driver installed? python-can says {type(error).__name__}: {error}"
         raise InterfaceError(f"{channel}: {interface} cannot be opened; {why}") from error
 
