@@ -19,7 +19,7 @@ from types import TracebackType
 
 from canprobe.errors import UsageError, regular_file
 from canprobe.fieldbus.bus.files import writing
-from canprobe.fieldbus.bus.port import ControllerState, PlainPort, Port, TimedFrame
+from canprobe.fieldbus.bus.port import ControllerState, PlainPort, Port, TimedFrame, nothing
 from canprobe.fieldbus.protocol.frames import BRS_FLAG, CLASSIC_BYTES, EFF_FLAG, EFF_MASK, RTR_FLAG, Frame
 
 # candump log files: `(0000000000.002500) can0 181#37060000`, time with six digits, from 0 in a recording of ours.
@@ -55,10 +55,6 @@ Take = Callable[[Sequence[TimedFrame]], None]
 """Called with some frames at a time."""
 
 
-def _nobody(_: Sequence[TimedFrame]) -> None:
-    """Ignore the frames."""
-
-
 class CandumpWriter:
     """Writes frames as candump does; a context manager. Its `write` is a recorder for a `LockstepBus`.
 
@@ -86,11 +82,11 @@ class CandumpWriter:
             self._file = _opened_alone(path)
         self._size = 0
         self._frames: list[TimedFrame] = []  # of the channel that takes them
-        self._take: Take = _nobody
+        self._take: Take = nothing
         self._lines: list[str] = []
         self.write = self.on(channel)
 
-    def on(self, channel: str, also: Take = _nobody) -> Callable[[int, bytes, int], None]:
+    def on(self, channel: str, also: Take = nothing) -> Callable[[int, bytes, int], None]:
         """A recorder of the frames of one channel: called with (can_id, data, t_ns), it adds a line to this file.
 
         Args:

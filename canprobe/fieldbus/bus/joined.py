@@ -9,6 +9,7 @@ from __future__ import annotations
 import select
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
+from operator import itemgetter
 
 from canprobe.errors import InterfaceError
 from canprobe.fieldbus.bus.port import ControllerState, PlainPort, Port, PortCounters, TimedFrame
@@ -118,7 +119,7 @@ class JoinedPort(PlainPort):
             self._on_each(lambda port: new.extend(port.drain()))
         finally:
             if new:
-                self._arrived = sorted([*self._arrived, *new], key=_time)
+                self._arrived = sorted([*self._arrived, *new], key=itemgetter(2))  # by time
 
     def _on_each(self, act: Callable[[Port], None]) -> None:
         """Call `act` for every bus, lost ones too as they may come back; then raise the first failure that is new."""
@@ -137,10 +138,6 @@ class JoinedPort(PlainPort):
             raise news
         if failed and len(self._lost) == len(self._ports):
             raise last
-
-
-def _time(frame: TimedFrame) -> int:
-    return frame[2]
 
 
 def send_on(port: Port, channel: str, frames: Sequence[Frame]) -> None:

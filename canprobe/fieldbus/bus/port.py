@@ -94,8 +94,8 @@ class PortCounters:
         self.overruns += bool(_of_controller(can_id, data) & _OVERFLOWS)
 
 
-def _nobody(*_: object) -> None:
-    """Ignore a report."""
+def nothing(*_: object) -> None:
+    """Do nothing, as a callback that nobody has set."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,8 +107,8 @@ class Reports:
         say: function that is called with each message for the user.
     """
 
-    error_frame: Callable[[int, bytes, int], None] = _nobody
-    say: Callable[[str], None] = _nobody
+    error_frame: Callable[[int, bytes, int], None] = nothing
+    say: Callable[[str], None] = nothing
 
 
 class Port(Protocol):

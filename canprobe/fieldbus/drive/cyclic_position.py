@@ -5,9 +5,7 @@ from __future__ import annotations
 from canprobe.fieldbus.drive.mode import CyclicMode, DriveParts
 from canprobe.fieldbus.drive.parameters import PEAK_TORQUE_PERMILLE
 from canprobe.fieldbus.node.entry import key_of
-from canprobe.fieldbus.protocol.cia402 import (
-    OperationMode,
-)
+from canprobe.fieldbus.protocol.cia402 import OperationMode
 from canprobe.fieldbus.protocol.emcy import REFERENCE_LIMIT_CODE
 
 MAX_ROUNDING_COUNTS = 2

@@ -13,9 +13,7 @@ from __future__ import annotations
 from canprobe.fieldbus.drive.mode import CyclicMode, DriveParts
 from canprobe.fieldbus.drive.profile import torque_run
 from canprobe.fieldbus.node.entry import key_of
-from canprobe.fieldbus.protocol.cia402 import (
-    OperationMode,
-)
+from canprobe.fieldbus.protocol.cia402 import OperationMode
 
 _TORQUE_TARGET_KEY, _TORQUE_OFFSET_KEY = key_of(0x6071), key_of(0x60B2)
 

@@ -10,9 +10,7 @@ from __future__ import annotations
 from canprobe.fieldbus.drive.mode import CyclicMode
 from canprobe.fieldbus.drive.profile import uniform
 from canprobe.fieldbus.node.entry import key_of
-from canprobe.fieldbus.protocol.cia402 import (
-    OperationMode,
-)
+from canprobe.fieldbus.protocol.cia402 import OperationMode
 
 _VELOCITY_TARGET_KEY, _VELOCITY_OFFSET_KEY = key_of(0x60FF), key_of(0x60B1)
 

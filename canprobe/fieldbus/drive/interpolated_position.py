@@ -13,11 +13,7 @@ from canprobe.fieldbus.drive.cyclic_position import CyclicPosition
 from canprobe.fieldbus.drive.mode import REACHED_FLAG, DriveParts
 from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.entry import Value, key_of
-from canprobe.fieldbus.protocol.cia402 import (
-    ENABLE_INTERPOLATION_BIT,
-    INTERPOLATION_ACTIVE_BIT,
-    OperationMode,
-)
+from canprobe.fieldbus.protocol.cia402 import ENABLE_INTERPOLATION_BIT, INTERPOLATION_ACTIVE_BIT, OperationMode
 
 _RECORD_KEY = key_of(0x60C1, 1)
 

@@ -24,7 +24,7 @@ class Supervision:
         """Make the supervision; `on_loss(code, t_ns)` is called when the master counts as lost."""
         self.watching = False
         self._node, self._parameters, self._on_loss = node, parameters, on_loss
-        self._timer = node.core.timers.new(self._sync_missing)
+        self._timer = node.core.timers.new(lambda due_ns: self._lose(SYNC_LOST_CODE, due_ns))
         self._misses = 0
         self._by_rpdo = False
         self.outside_ns: int | None = None
@@ -55,9 +55,6 @@ class Supervision:
         self._misses += 1
         if 0 < self._parameters.misses <= self._misses:
             self._lose(RPDO_TIMEOUT_CODE, t_ns)
-
-    def _sync_missing(self, due_ns: int) -> None:
-        self._lose(SYNC_LOST_CODE, due_ns)
 
     def _lose(self, code: int, t_ns: int) -> None:
         self._node.emcy.report(code)

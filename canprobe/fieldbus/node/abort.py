@@ -50,7 +50,3 @@ class SdoAbort(ProtocolError):  # noqa: N818 - the standard's word
     def __init__(self, code: Abort) -> None:
         self.code = code
         super().__init__(f"{code.name.lower().replace('_', ' ')} ({code:08X}h)")
-
-
-def nothing(*_: object) -> None:
-    """Do nothing, as a callback that nobody has set."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 
-from canprobe.fieldbus.node.abort import Abort, SdoAbort, nothing
+from canprobe.fieldbus.bus.port import nothing
+from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.dictionary import Dictionary
 from canprobe.fieldbus.node.entry import Value
 from canprobe.fieldbus.node.quirks import Quirks

@@ -11,7 +11,8 @@ from dataclasses import replace
 
 from canopen.objectdictionary import ObjectDictionary
 
-from canprobe.fieldbus.node.abort import Abort, SdoAbort, nothing
+from canprobe.fieldbus.bus.port import nothing
+from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.entry import Entry, Value, key_of, read_entries
 
 Check = Callable[[int, Value], None]

@@ -5,11 +5,7 @@ Source: CiA 305, switch state selective, identify remote slave, fastscan.
 
 from __future__ import annotations
 
-from canprobe.fieldbus.protocol.lss import (
-    PRESENCE_CHECK,
-    LssAddress,
-    LssCommand,
-)
+from canprobe.fieldbus.protocol.lss import PRESENCE_CHECK, LssAddress, LssCommand
 
 SELECT_COMMANDS = range(LssCommand.SELECT_VENDOR, LssCommand.SELECT_SERIAL + 1)
 IDENTIFY_COMMANDS = range(LssCommand.IDENTIFY_VENDOR, LssCommand.IDENTIFY_SERIAL_HIGH + 1)

@@ -27,7 +27,7 @@ class Rpdo:
 
     def __init__(self, core: NodeCore, emcy: Emergency, rules: PdoRules) -> None:
         self._core, self._emcy, self._rules = core, emcy, rules
-        self._timer = core.timers.new(self._timed_out)
+        self._timer = core.timers.new(lambda _due_ns: emcy.report(RPDO_TIMEOUT_CODE, source=self))
         self._layout = PdoLayout(0, ())
         self._unpack = self._layout.raw_unpack
         self._slots: tuple[Slot, ...] = ()
@@ -108,6 +108,3 @@ class Rpdo:
         for code in (PDO_TOO_SHORT_CODE, PDO_TOO_LONG_CODE, RPDO_TIMEOUT_CODE):
             self._emcy.clear(code, self)
         self._emcy.clear(RPDO_TIMEOUT_CODE)  # that of a drive, which misses targets whatever PDO brings them
-
-    def _timed_out(self, due_ns: int) -> None:
-        self._emcy.report(RPDO_TIMEOUT_CODE, source=self)

@@ -12,11 +12,12 @@ Source: CiA 301 (the clauses are cited in the services).
 from __future__ import annotations
 
 from collections.abc import Callable, Container
+from functools import partial
 
 from canopen.objectdictionary import ObjectDictionary
 
+from canprobe.fieldbus.bus.port import nothing
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
-from canprobe.fieldbus.node.abort import nothing
 from canprobe.fieldbus.node.core import NodeCore, Route, Service
 from canprobe.fieldbus.node.dictionary import Dictionary
 from canprobe.fieldbus.node.emcy import Emergency
@@ -107,7 +108,8 @@ class SlaveNode(Participant):
         self._heartbeat = HeartbeatProducer(core)
         channels = [0x1200, *(index for index in range(0x1201, 0x1280) if core.dictionary.has_index(index))]
         self._od_of = od_of
-        self.lss = LssSlave(core, self.store, self._renamed) if od_of is not None else None
+        reset = partial(self._initialise, communication_only=True)
+        self.lss = LssSlave(core, self.store, reset) if od_of is not None else None
         self._services: tuple[Service, ...] = (
             *([self.lss] if self.lss is not None else []),
             self.emcy,
@@ -197,10 +199,6 @@ class SlaveNode(Participant):
             self._initialise(t_ns, data[0] == NmtCommand.RESET_COMMUNICATION)
         else:
             self._enter(goal, t_ns)
-
-    def _renamed(self, t_ns: int) -> None:
-        """Reset communication, as a node does that had no id and has one now (CiA 305)."""
-        self._initialise(t_ns, communication_only=True)
 
     def _adopt_node_id(self) -> None:
         """Use the id that LSS has configured, with the defaults that the EDS gives for it."""

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from canprobe.fieldbus.node.abort import Abort, SdoAbort, nothing
+from canprobe.fieldbus.bus.port import nothing
+from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.core import NodeCore
 from canprobe.fieldbus.node.entry import Value
 

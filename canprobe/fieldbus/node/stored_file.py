@@ -51,15 +51,12 @@ def _write(node: SlaveNode, path: Path) -> None:
         "device": node.store.kept.hex(),
         **({} if node.store.node_id is None else {"node_id": node.store.node_id}),
         "values": {
-            f"{key >> 8:04X}:{key & 0xFF:02X}": _plain(value) for key, value in sorted(node.store.saved.items())
+            f"{key >> 8:04X}:{key & 0xFF:02X}": {"hex": value.hex()} if isinstance(value, bytes) else value
+            for key, value in sorted(node.store.saved.items())
         },
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, json.dumps(content, indent=1))
-
-
-def _plain(value: Value) -> Any:
-    return {"hex": value.hex()} if isinstance(value, bytes) else value
 
 
 def _read(node: SlaveNode, path: Path) -> None:

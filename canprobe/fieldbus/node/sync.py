@@ -23,7 +23,7 @@ class SyncConsumer(Service):
 
     def __init__(self, core: NodeCore, emcy: Emergency, on_sync: Callable[[int, int, int], None]) -> None:
         self._core, self._emcy, self._on_sync = core, emcy, on_sync
-        self._timer = core.timers.new(self._timed_out)
+        self._timer = core.timers.new(lambda _due_ns: emcy.report(SYNC_LOST_CODE))
         self._overflow = self._timeout_ns = self._last = 0
         self._operational = False
         dictionary = core.dictionary
@@ -72,9 +72,6 @@ class SyncConsumer(Service):
             if self._timeout_ns:
                 self._timer.arm(t_ns + self._timeout_ns)
             self._on_sync(t_ns, counter, elapsed)
-
-    def _timed_out(self, due_ns: int) -> None:
-        self._emcy.report(SYNC_LOST_CODE)
 
     def _check_cob_id(self, subindex: int, value: Value) -> None:
         new = int(value)

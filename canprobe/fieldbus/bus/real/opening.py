@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.clock import Clock
-from canprobe.fieldbus.bus.port import (
-    Port,
-    Reports,
-)
+from canprobe.fieldbus.bus.port import Port, Reports
 from canprobe.fieldbus.bus.real.mmsg import HAS_BATCHES
 from canprobe.fieldbus.bus.real.python_can import PythonCanPort
 from canprobe.fieldbus.bus.real.socketcan import SocketCanPort

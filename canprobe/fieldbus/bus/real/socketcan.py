@@ -21,6 +21,7 @@ import socket
 import struct
 import time
 from collections.abc import Callable, Collection, Sequence
+from operator import itemgetter
 
 from canprobe.errors import InterfaceError
 from canprobe.fieldbus.bus.clock import Clock, Timespec
@@ -225,7 +226,7 @@ class SocketCanPort:
         if step_ns := self._stamps.follow(min(stamps), max(stamps)):
             rows = self._stamped_anew(rows, step_ns)
         if self._patient_frames is not None:
-            rows = sorted(rows, key=_stamp)
+            rows = sorted(rows, key=itemgetter(2))  # by stamp
         offset_ns = self._stamps.offset_ns
         frames = [(can_id, data, t_ns - offset_ns) for can_id, data, t_ns, _ in rows if not can_id & ERR_FLAG]
         if len(frames) < len(rows):
@@ -471,10 +472,6 @@ def _open(channel: str, only: Sequence[tuple[int, int]] | None = None, *, fd: bo
 
 def _packed(filters: Sequence[tuple[int, int]]) -> bytes:
     return b"".join(struct.pack("=II", can_id, mask) for can_id, mask in filters)
-
-
-def _stamp(row: Row) -> int:
-    return row[2]
 
 
 def _enlarge_buffer(sock: socket.socket) -> None:

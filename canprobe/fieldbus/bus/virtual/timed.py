@@ -24,11 +24,11 @@ from canprobe.fieldbus.bus.virtual.error_counters import ErrorCounters
 from canprobe.fieldbus.bus.virtual.lockstep import Attachment, LockstepBus, LockstepPort, Participant, arbitration_key
 from canprobe.fieldbus.protocol.frame_bits import ERROR_DELIMITER_BITS, ERROR_FLAG_BITS, INTERMISSION_BITS, exact_bits
 from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, Frame
+from canprobe.fieldbus.protocol.response_times import NS_PER_S
 
 Queue = Literal["priority", "fifo"]
 MAX_CLOSING_NS = 50_000_000
 """Longest time that a port which closes lets the bus carry what is queued."""
-_NS = 1_000_000_000
 _ERROR_BITS = 2 * ERROR_FLAG_BITS + ERROR_DELIMITER_BITS  # the other nodes answer the flag of the first one with theirs
 
 _Entry = tuple[int, int, Attachment, Frame]
@@ -66,7 +66,7 @@ class TimedBus(LockstepBus):
     ) -> None:
         super().__init__(clock, channel, max_frames=max_frames)
         self.bitrate = bitrate
-        self._bit_ns = 0 if _NS % bitrate else _NS // bitrate  # 0: no whole number
+        self._bit_ns = 0 if NS_PER_S % bitrate else NS_PER_S // bitrate  # 0: no whole number
         self._gap_ns = self._bits_ns(INTERMISSION_BITS)
         self.frames = self.error_frames = self.busy_ns = 0
         self._fifo = queue == "fifo"
@@ -203,7 +203,7 @@ class TimedBus(LockstepBus):
         return min(dues) if dues else None
 
     def _bits_ns(self, bits: int) -> int:
-        return bits * self._bit_ns if self._bit_ns else -(-bits * _NS // self.bitrate)
+        return bits * self._bit_ns if self._bit_ns else -(-bits * NS_PER_S // self.bitrate)
 
     def _queue(self, node: Attachment, frames: Sequence[Frame]) -> None:
         if not frames or (self._controllers.troubled and self._controllers.is_off(node)):
