@@ -16,7 +16,7 @@ from canprobe.cell.planning.model import (
 from canprobe.fieldbus.bus.files import write_text
 from canprobe.fieldbus.eds.findings import EdsFindings
 from canprobe.fieldbus.eds.packaged import eds_file
-from canprobe.fieldbus.eds.sections import LINE_END, Section, Sections, decode, split_sections
+from canprobe.fieldbus.eds.sections import LINE_END_PATTERN, Section, Sections, decode, split_sections
 
 Values = Mapping[tuple[int, int], int]
 """(index, sub-index) → value."""
@@ -67,7 +67,7 @@ def dcf_text(eds: str, values: Values, keys: Mapping[str, Mapping[str, str]]) ->
         values: the `ParameterValue` of each entry.
         keys: other keys by section in lower case; a section that is not there is added.
     """
-    lines = LINE_END.split(eds.rstrip())
+    lines = LINE_END_PATTERN.split(eds.rstrip())
     sections = split_sections(eds, EdsFindings())
     wanted: dict[str, dict[str, str]] = {name: dict(items) for name, items in keys.items()}
     for (index, subindex), value in values.items():

@@ -7,7 +7,7 @@ from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.model import HEARTBEAT_CONSUMED_MS, Plan, PlannedNode
 from canprobe.fieldbus.bus.port import TimedFrame
 from canprobe.fieldbus.protocol.cia402 import DriveState, known_state
-from canprobe.fieldbus.protocol.emcy import NO_ERROR, describe
+from canprobe.fieldbus.protocol.emcy import NO_ERROR_CODE, describe
 from canprobe.fieldbus.protocol.frames import NmtState
 from canprobe.lab.bridge.codec import Received
 from canprobe.lab.bridge.sample import Diagnostic
@@ -57,7 +57,7 @@ class Health:
         silent = t_ns - self._heard.get(node_id, 0) > HEARTBEAT_CONSUMED_MS * 1_000_000
         if silent:
             level, message = SILENT, f"no heartbeat for more than {HEARTBEAT_CONSUMED_MS} ms"
-        elif event is not None and event.emcy.code != NO_ERROR:
+        elif event is not None and event.emcy.code != NO_ERROR_CODE:
             level, message = FAILED, f"EMCY {event.emcy.code:04X}h, {describe(event.emcy.code)}"
         elif drive in (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE):
             level, message = FAILED, "drive fault"

@@ -1,7 +1,7 @@
 """Device descriptions: a reader for EDS and DCF files of any vendor, and the packaged files of the cell's nodes.
 
-The bytes of a file come in; an object dictionary (canopen's) and a list of findings go out. A finding is a warning,
-where the meaning is clear or the standard decides it, or it prevents serving, where nobody can know what the device is.
+The bytes of a file come in; an object dictionary of canopen and a list of findings go out. A finding is a warning where
+the meaning is clear or the standard decides it; it prevents serving where it is unknown what the device is.
 The stages, each in its module:
 
     sections      bytes → sections and keys, each with its line

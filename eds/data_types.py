@@ -9,20 +9,20 @@ import re
 
 from canopen.objectdictionary import datatypes
 
-from canprobe.fieldbus.eds.mandatory import MISSING, U8, standard_type
+from canprobe.fieldbus.eds.mandatory import U8, USUAL_TYPES, standard_type
 from canprobe.fieldbus.eds.numbers import parse_integer
 from canprobe.fieldbus.eds.sections import Section
 from canprobe.fieldbus.eds.source import Source
-from canprobe.fieldbus.eds.values import KNOWN, NAMES, WORDS_OF_TYPES, name_of
+from canprobe.fieldbus.eds.values import FOREIGN_TYPE_NUMBERS, KNOWN_TYPES, TYPE_NUMBERS, name_of
 
 _OBJECT_DOMAIN = 2
 
 
 def data_type_of(source: Source, section: Section, index: int, subindex: int, composite: bool) -> int | None:
-    """The data type that a section means, one of `KNOWN`; None where it cannot be known."""
+    """Data type that a section means, one of `KNOWN_TYPES`; None where it cannot be known."""
     text = section.value("DataType")
     demanded = standard_type(index, subindex, source.drive)
-    usual = U8 if composite and subindex == 0 else MISSING.get((index, subindex)) if source.drive else None
+    usual = U8 if composite and subindex == 0 else USUAL_TYPES.get((index, subindex)) if source.drive else None
     if not text:
         return _untyped(source, section, demanded or usual, "missing")
     if (named := _named_type(text)) is not None:
@@ -33,7 +33,7 @@ def data_type_of(source: Source, section: Section, index: int, subindex: int, co
             data_type = parse_integer(text, source.remark(section, "DataType"))
         except ValueError:
             return _untyped(source, section, demanded or usual, f"{text!r} is not a data type")
-    if data_type not in KNOWN:
+    if data_type not in KNOWN_TYPES:
         data_type = _foreign(source, section, data_type)
     if demanded is not None and data_type != demanded:
         source.warn(section, "DataType", f"{name_of(data_type)}, but the standard demands {name_of(demanded)}; taken")
@@ -43,8 +43,10 @@ def data_type_of(source: Source, section: Section, index: int, subindex: int, co
 
 def _named_type(text: str) -> int | None:
     word = re.sub(r"[\s_]", "", text.upper())
-    named = NAMES.get(text.upper(), WORDS_OF_TYPES.get(word.removesuffix("T") if word[-2:-1].isdigit() else word))
-    return named if named in KNOWN else None
+    named = TYPE_NUMBERS.get(
+        text.upper(), FOREIGN_TYPE_NUMBERS.get(word.removesuffix("T") if word[-2:-1].isdigit() else word)
+    )
+    return named if named in KNOWN_TYPES else None
 
 
 def _untyped(source: Source, section: Section, demanded: int | None, why: str) -> int | None:
@@ -58,10 +60,10 @@ def _untyped(source: Source, section: Section, demanded: int | None, why: str) -
 
 
 def _foreign(source: Source, section: Section, data_type: int) -> int:
-    """A type of the maker's own: defined in a section such as [A0] by some editors, else served as octets."""
+    """A type of the maker, which some editors define in a section such as [A0]; else it is served as octets."""
     definition = source.sections.get(f"{data_type:x}sub1")
     base = source.number(definition, "DefaultValue") if definition is not None else 0
-    if base in KNOWN:
+    if base in KNOWN_TYPES:
         return base
     source.warn(section, "DataType", f"{data_type:#06x} is not a type of CiA 301; the object is served as octets")
     return int(datatypes.DOMAIN)

@@ -1,7 +1,7 @@
-"""What an EDS file states of a device: a `DescribedEntry` per (index, subindex), and the features of [DeviceInfo].
+"""Statements of an EDS file on a device: a `DescribedEntry` per (index, subindex), and the features of [DeviceInfo].
 
-`load_eds` gives the dictionary, `Description(od)` reads it; an object or sub-index that the file does not describe is
-None. Source: CiA 306-1, "Object description", "Dummy usage", "Device information"; CiA 402-2, 6502h.
+`load_eds` gives the dictionary, `Description(od)` reads it. The entry of an object or sub-index that the file does not
+describe is None. Source: CiA 306-1, "Object description", "Dummy usage", "Device information"; CiA 402-2, 6502h.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 
 from canopen.objectdictionary import ObjectDictionary, ODArray, ODVariable, datatypes
 
-from canprobe.fieldbus.eds.values import OCTETS, SIGNED, TEXTS, UNSIGNED, Value
+from canprobe.fieldbus.eds.values import OCTET_TYPES, SIGNED_BITS, TEXT_TYPES, UNSIGNED_BITS, Value
 
 LAST_DUMMY = 0x0007
-"""Indices up to here are data types: DummyUsage says which of them an RPDO may map to fill room."""
-_MODES = 0x6502
+"""Last index of a data type; DummyUsage lists those that an RPDO may map to fill room."""
+_MODES_INDEX = 0x6502
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,16 +23,16 @@ class DescribedEntry:
     """One value of the object dictionary, as the file describes it for one node.
 
     Attributes:
-        index, subindex: where it is; an index up to `LAST_DUMMY` is a dummy type.
-        name: ParameterName.
-        data_type: of CiA 301, such as 7 for UNSIGNED32.
-        bits: length of a value; 0 for texts, octets and domains, which have none.
-        signed: an integer in two's complement.
-        access: AccessType: ro, wo, rw, rwr, rww or const.
-        mappable: PDOMapping.
-        low, high: LowLimit and HighLimit; None: not stated.
-        default: DefaultValue with $NODEID put in; None: not stated.
-        configured: ParameterValue of a DCF; None: not stated.
+        index, subindex: place of the entry; an index up to `LAST_DUMMY` is a dummy type.
+        name: name, ParameterName.
+        data_type: data type of CiA 301, such as 7 for UNSIGNED32.
+        bits: length of a value; 0 for texts, octets and domains, which have no fixed one.
+        signed: whether it is an integer in two's complement.
+        access: access, AccessType: ro, wo, rw, rwr, rww or const.
+        mappable: whether a PDO may map it, PDOMapping.
+        low, high: limits, LowLimit and HighLimit; None: not stated.
+        default: value after a reset, DefaultValue with $NODEID put in; None: not stated.
+        configured: value of a DCF, ParameterValue; None: not stated.
     """
 
     index: int
@@ -50,13 +50,13 @@ class DescribedEntry:
 
     @property
     def initial(self) -> Value | None:
-        """The value at boot: ParameterValue, or else DefaultValue."""
+        """Value at boot: ParameterValue, or else DefaultValue."""
         return self.default if self.configured is None else self.configured
 
     @property
     def is_integer(self) -> bool:
-        """Whether it holds an integer: not a real number, text or octets."""
-        return self.data_type in SIGNED or self.data_type in UNSIGNED
+        """Whether it holds an integer, and not a real number, text or octets."""
+        return self.data_type in SIGNED_BITS or self.data_type in UNSIGNED_BITS
 
     @property
     def readable(self) -> bool:
@@ -75,7 +75,7 @@ class DescribedEntry:
 
     @property
     def in_rpdo(self) -> bool:
-        """Whether an RPDO may map it: what can be written and mapped, and a dummy."""
+        """Whether an RPDO may map it: it can be written and mapped, or is a dummy."""
         return self.index <= LAST_DUMMY or (self.mappable and self.access in {"wo", "rw", "rww"})
 
     def allows(self, value: float) -> bool:
@@ -93,13 +93,13 @@ class Description:
     """A device as its EDS file describes it.
 
     Attributes:
-        od: from `load_eds`.
+        od: object dictionary from `load_eds`.
     """
 
     od: ObjectDictionary
 
     def entry(self, index: int, subindex: int = 0) -> DescribedEntry | None:
-        """What is described there; None where the object or the sub-index is missing."""
+        """Entry at a place; None where the object or the sub-index is missing."""
         found = variable_at(self.od, index, subindex)
         if found is not None:
             return _entry(found)
@@ -110,7 +110,7 @@ class Description:
         return replace(first, subindex=subindex, name=f"{first.name}_{subindex:x}")
 
     def entries(self) -> Iterator[DescribedEntry]:
-        """Everything that is described, the dummy types included."""
+        """All entries that are described, with the dummy types."""
         for found in self.od.indices.values():
             for variable in (found,) if isinstance(found, ODVariable) else found.subindices.values():
                 yield _entry(variable)
@@ -133,7 +133,7 @@ class Description:
     @property
     def modes(self) -> frozenset[int] | None:
         """Modes of operation that the default of 6502h lists, as 6060h numbers them; None where it is not stated."""
-        entry = self.entry(_MODES)
+        entry = self.entry(_MODES_INDEX)
         if entry is None or not isinstance(entry.initial, int):
             return None
         return frozenset(bit + 1 for bit in range(32) if entry.initial >> bit & 1)
@@ -155,7 +155,7 @@ class Description:
 
 
 def variable_at(od: ObjectDictionary, index: int, subindex: int) -> ODVariable | None:
-    """What the dictionary has there itself; canopen makes up members of an array."""
+    """Variable that the dictionary itself has at a place, without the array members that canopen makes up."""
     found = od.indices.get(index)
     if isinstance(found, ODVariable):
         return found if subindex == 0 else None
@@ -176,8 +176,8 @@ def _entry(variable: ODVariable) -> DescribedEntry:
         subindex=variable.subindex,
         name=variable.name,
         data_type=data_type,
-        bits=0 if data_type in TEXTS | OCTETS else len(variable),
-        signed=data_type in SIGNED,
+        bits=0 if data_type in TEXT_TYPES | OCTET_TYPES else len(variable),
+        signed=data_type in SIGNED_BITS,
         access=variable.access_type,
         mappable=variable.pdo_mappable,
         low=variable.min,

@@ -1,4 +1,4 @@
-"""[DeviceInfo], [Comments] and [DeviceComissioning] → what canopen keeps of them.
+"""Reads [DeviceInfo], [Comments] and [DeviceComissioning] into the fields that canopen has for them.
 
 Source: CiA 306-1, "Device information", "Comments", "Device commissioning" (the standard's own spelling has one m).
 """
@@ -12,15 +12,15 @@ from canprobe.fieldbus.eds.sections import Section, Sections
 from canprobe.fieldbus.eds.source import Source
 
 _RATES_KBIT_S = (10, 20, 50, 125, 250, 500, 800, 1000)
-_TEXTS = {"VendorName": "vendor_name", "ProductName": "product_name", "OrderCode": "order_code"}
-_NUMBERS = {
+_TEXT_FIELDS = {"VendorName": "vendor_name", "ProductName": "product_name", "OrderCode": "order_code"}
+_NUMBER_FIELDS = {
     "VendorNumber": "vendor_number",
     "ProductNumber": "product_number",
     "RevisionNumber": "revision_number",
     "NrOfRXPDO": "nr_of_RXPDO",
     "NrOfTXPDO": "nr_of_TXPDO",
 }
-_FLAGS = {
+_FLAG_FIELDS = {
     "SimpleBootUpMaster": "simple_boot_up_master",
     "SimpleBootUpSlave": "simple_boot_up_slave",
     "Granularity": "granularity",
@@ -31,7 +31,7 @@ _FLAGS = {
 
 
 def read_information(source: Source, od: ObjectDictionary) -> None:
-    """Fill in what the dictionary knows of its device; a wrong number is left out with a warning."""
+    """Fill in the dictionary's fields on its device; a wrong number is left out with a warning."""
     od.node_id = source.node_id
     if (section := source.sections.get("comments")) is not None:
         lines = [item.value for key, item in section.items.items() if key.startswith("line") and key != "lines"]
@@ -41,13 +41,13 @@ def read_information(source: Source, od: ObjectDictionary) -> None:
         for rate in _RATES_KBIT_S:
             if source.number(section, f"BaudRate_{rate}"):
                 information.allowed_baudrates.add(rate * 1000)
-        for key, field in _TEXTS.items():
+        for key, field in _TEXT_FIELDS.items():
             if key.lower() in section.items:
                 setattr(information, field, section.value(key))
-        for key, field in {**_NUMBERS, **_FLAGS}.items():
+        for key, field in {**_NUMBER_FIELDS, **_FLAG_FIELDS}.items():
             if section.value(key):
                 number = source.number(section, key)
-                setattr(information, field, bool(number) if key in _FLAGS else number)
+                setattr(information, field, bool(number) if key in _FLAG_FIELDS else number)
     if (section := _commissioning(source.sections)) is not None:
         if rate := source.number(section, "Baudrate"):
             od.bitrate = rate * 1000
@@ -56,7 +56,7 @@ def read_information(source: Source, od: ObjectDictionary) -> None:
 
 
 def commissioned_node(sections: Sections) -> int | None:
-    """Node id that a DCF has been made for; None where it has none."""
+    """Node id for which a DCF was made; None where it states none."""
     section = _commissioning(sections)
     if section is None:
         return None

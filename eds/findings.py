@@ -1,4 +1,4 @@
-"""What is wrong in an EDS file, and where."""
+"""Findings in an EDS file: what is wrong, and where."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True, slots=True)
 class EdsFinding:
-    """One thing that is wrong.
+    """One finding.
 
     Attributes:
-        line: in the file, from 1; 0 where it concerns the whole file.
-        section: without brackets; empty outside any.
-        key: as the standard writes it; empty where it concerns the section.
+        line: number of the line, from 1; 0 where it concerns the whole file.
+        section: name of the section, without brackets; empty outside any section.
+        key: key in the spelling of the standard; empty where the finding concerns the section.
         text: what is wrong, and for a warning what was taken instead.
-        prevents: the file cannot be served as it is; False makes it a warning.
+        prevents: whether it prevents serving; else it is a warning.
     """
 
     line: int
@@ -36,13 +36,13 @@ class EdsFindings:
     found: list[EdsFinding] = field(default_factory=list)
 
     def fault(self, line: int, section: str, key: str, text: str) -> None:
-        """What the device would answer cannot be known."""
+        """Add a fault: it cannot be known what the device would answer."""
         self.found.append(EdsFinding(line, section, key, text, True))
 
     def warn(self, line: int, section: str, key: str, text: str) -> None:
-        """Not as it should be, but the meaning is clear or the rest can be served."""
+        """Add a warning: the meaning is clear, or the rest can be served."""
         self.found.append(EdsFinding(line, section, key, text, False))
 
     def sorted(self) -> tuple[EdsFinding, ...]:
-        """By line."""
+        """All findings, by line."""
         return tuple(sorted(self.found, key=lambda fault: fault.line))

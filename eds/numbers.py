@@ -9,41 +9,41 @@ import re
 from collections.abc import Callable
 
 Remark = Callable[[str], None]
-_HEX = re.compile(r"([+-]?)0x([0-9a-f]+)", re.IGNORECASE)
-_HEX_SUFFIX = re.compile(r"()([0-9][0-9a-f]*)h", re.IGNORECASE)
-_DECIMAL = re.compile(r"[+-]?[0-9]+")
-_WHOLE_REAL = re.compile(r"([+-]?[0-9]+)[.,]0*")
-_C_SUFFIX = re.compile(r"(.*[0-9a-f])(?:u|l|ul|lu|ll|ull|llu)", re.IGNORECASE)
-_GROUPED = re.compile(r"[+-]?(?:0x[0-9a-f]+(?:[ _]+[0-9a-f]+)+|[0-9]+(?:_+[0-9]+)+)", re.IGNORECASE)
-_NODE_ID = re.compile(r"\$node_?id", re.IGNORECASE)
-_ODD_NODE_ID = re.compile(r"\$?\(?\$?\{?\s*node[ _-]?id\s*\}?\)?", re.IGNORECASE)
+_HEX_PATTERN = re.compile(r"([+-]?)0x([0-9a-f]+)", re.IGNORECASE)
+_HEX_SUFFIX_PATTERN = re.compile(r"()([0-9][0-9a-f]*)h", re.IGNORECASE)
+_DECIMAL_PATTERN = re.compile(r"[+-]?[0-9]+")
+_WHOLE_REAL_PATTERN = re.compile(r"([+-]?[0-9]+)[.,]0*")
+_C_SUFFIX_PATTERN = re.compile(r"(.*[0-9a-f])(?:u|l|ul|lu|ll|ull|llu)", re.IGNORECASE)
+_GROUPED_PATTERN = re.compile(r"[+-]?(?:0x[0-9a-f]+(?:[ _]+[0-9a-f]+)+|[0-9]+(?:_+[0-9]+)+)", re.IGNORECASE)
+_NODE_ID_PATTERN = re.compile(r"\$node_?id", re.IGNORECASE)
+_ODD_NODE_ID_PATTERN = re.compile(r"\$?\(?\$?\{?\s*node[ _-]?id\s*\}?\)?", re.IGNORECASE)
 
 
 def parse_integer(text: str, remark: Remark) -> int:
-    """One number.
+    """Read one number.
 
     Args:
-        text: without blanks round it.
-        remark: called with what is odd about it.
+        text: text of the number, without blanks around it.
+        remark: function that is called with a remark on an odd spelling.
 
     Raises:
-        ValueError: it is not a number.
+        ValueError: the text is not a number.
     """
-    if match := _HEX.fullmatch(text):
+    if match := _HEX_PATTERN.fullmatch(text):
         return int(match[1] + match[2], 16)
-    if match := _HEX_SUFFIX.fullmatch(text):
+    if match := _HEX_SUFFIX_PATTERN.fullmatch(text):
         remark(f"{text} is read as {int(match[2], 16):#x}; hexadecimal numbers begin with 0x")
         return int(match[2], 16)
-    if not _DECIMAL.fullmatch(text):
+    if not _DECIMAL_PATTERN.fullmatch(text):
         return _written_as_elsewhere(text, remark)
     return _leading_zeros(text, remark)
 
 
 def _written_as_elsewhere(text: str, remark: Remark) -> int:
-    """A whole number as programming languages write it: 0.0, 100UL, 0x0001_0000, 0x00 01."""
-    if (match := _C_SUFFIX.fullmatch(text)) or (match := _WHOLE_REAL.fullmatch(text)):
+    """Read a whole number as programming languages write it: 0.0, 100UL, 0x0001_0000, 0x00 01."""
+    if (match := _C_SUFFIX_PATTERN.fullmatch(text)) or (match := _WHOLE_REAL_PATTERN.fullmatch(text)):
         plain = match[1]
-    elif _GROUPED.fullmatch(text):
+    elif _GROUPED_PATTERN.fullmatch(text):
         plain = text.replace(" ", "").replace("_", "")
     else:
         raise ValueError(f"{text!r} is not a number")
@@ -66,19 +66,19 @@ def _leading_zeros(text: str, remark: Remark) -> int:
 
 
 def parse_sum(text: str, node_id: int, remark: Remark) -> tuple[int, bool]:
-    """A number or a sum of numbers and $NODEID, in any order and case.
+    """Read a number, or a sum of numbers and $NODEID in any order and case.
 
     Returns:
         The value for this node, and whether it depends on the node.
 
     Raises:
-        ValueError: it is not a number.
+        ValueError: the text is not a number.
     """
     total, relative = 0, False
     for term in map(str.strip, _terms(text, remark)):
-        if _NODE_ID.fullmatch(term):
+        if _NODE_ID_PATTERN.fullmatch(term):
             total, relative = total + node_id, True
-        elif _ODD_NODE_ID.fullmatch(term):
+        elif _ODD_NODE_ID_PATTERN.fullmatch(term):
             remark(f"{term} is read as $NODEID")
             total, relative = total + node_id, True
         elif term:
@@ -89,7 +89,7 @@ def parse_sum(text: str, node_id: int, remark: Remark) -> tuple[int, bool]:
 
 
 def _terms(text: str, remark: Remark) -> list[str]:
-    """What is added up: without brackets round all of it, or a plus before a number."""
+    """Terms of a sum, without brackets around all of it or a plus before a number."""
     whole = text.strip()
     if whole[:1] == "(" and whole[-1:] == ")" and "+" in whole:
         remark(f"{text} is read without its brackets")
@@ -99,16 +99,16 @@ def _terms(text: str, remark: Remark) -> list[str]:
     return whole.split("+")
 
 
-_WORDS = {"true": True, "yes": True, "false": False, "no": False}
+_FLAG_WORDS = {"true": True, "yes": True, "false": False, "no": False}
 
 
 def parse_flag(text: str, remark: Remark) -> bool:
-    """0 or 1; a word for it is remarked upon.
+    """Read 0 or 1; a word for it causes a remark.
 
     Raises:
-        ValueError: it is neither.
+        ValueError: the text is neither.
     """
-    word = _WORDS.get(text.lower())
+    word = _FLAG_WORDS.get(text.lower())
     if word is None:
         return parse_integer(text, remark) != 0
     remark(f"{text} is read as {int(word)}")

@@ -1,4 +1,4 @@
-"""The lists of objects in an EDS file, against the objects that it describes.
+"""Checks the lists of objects in an EDS file against the objects that it describes.
 
 Source: CiA 306-1, "Object lists".
 """
@@ -11,12 +11,12 @@ from canprobe.fieldbus.eds.numbers import parse_integer
 from canprobe.fieldbus.eds.sections import Section
 from canprobe.fieldbus.eds.source import Source
 
-_LISTS = {
+_LISTED_AREAS = {
     "MandatoryObjects": (range(0x1000, 0x1002), range(0x1018, 0x1019)),
     "OptionalObjects": (range(0x1002, 0x1018), range(0x1019, 0x2000), range(0x6000, 0x10000)),
     "ManufacturerObjects": (range(0x2000, 0x6000),),
 }
-_REQUIRED = ("FileInfo", "DeviceInfo", "MandatoryObjects")
+_REQUIRED_SECTIONS = ("FileInfo", "DeviceInfo", "MandatoryObjects")
 
 
 def check_lists(source: Source, described: dict[int, Section]) -> None:
@@ -24,16 +24,16 @@ def check_lists(source: Source, described: dict[int, Section]) -> None:
 
     Args:
         source: the file.
-        described: the section of each object by index.
+        described: section of each object, by index.
     """
     listed: dict[int, str] = {}
-    for title in _REQUIRED:
+    for title in _REQUIRED_SECTIONS:
         if title.lower() not in source.sections:
             source.faults.warn(0, title, "", "section missing")
-    present = [title for title in _LISTS if title.lower() in source.sections]
+    present = [title for title in _LISTED_AREAS if title.lower() in source.sections]
     for title in present:
         _check_list(source, source.sections[title.lower()], title, described, listed)
-    covered = [area for title in present for area in _LISTS[title]]
+    covered = [area for title in present for area in _LISTED_AREAS[title]]
     for index, section in described.items():
         if index not in listed and any(index in area for area in covered):
             source.warn(section, "", "is in no list of objects; served")
@@ -60,7 +60,7 @@ def _check_list(
 
 
 def _index(source: Source, section: Section, key: str, text: str, described: dict[int, Section]) -> int | None:
-    """An index of a list; without 0x it is taken as hexadecimal where only that names an object."""
+    """Index in a list; a number without 0x is hexadecimal where only that names an object."""
     bare = int(text, 16) if re.fullmatch("[0-9A-Fa-f]{4}", text) else None
     remarks: list[str] = []
     try:

@@ -24,19 +24,19 @@ if TYPE_CHECKING:
 
 
 MISSED_SYNCS = 0x2000
-"""Manufacturer's object of our drives: how many SYNCs a drive misses before it takes its master for dead."""
+"""Manufacturer's object of our drives: number of missed SYNCs after which the master counts as lost."""
 MISSED_SYNCS_NAME = "Missed SYNCs tolerated"
 SYNC_FACTOR = 0x200E
-"""The same of PRBT joints, and of others with these drives: SYNC periods without a SYNC."""
+"""The like object of PRBT joints, and of others with these drives: number of SYNC periods without a SYNC."""
 SYNC_FACTOR_NAME = "SYNC time-out factor"
 LONG_PDOS = 0x2007
 """Manufacturer's object of our CAN FD array: 1 lets its TPDOs map up to 64 bytes; SDO stays classical."""
 LONG_PDOS_NAME = "Long PDOs (CAN FD)"
 FULL_SCALE = 0x2004
-"""Of the tactile array: the pressure of its largest count, Pa."""
+"""Manufacturer's object of our arrays: pressure of the largest count, Pa."""
 FULL_SCALE_NAME = "Full scale pressure"
 WINDOW_SIZE = 0x2008
-"""Manufacturer's object of our arrays: taxels along the window that follows the contact."""
+"""Manufacturer's object of our arrays: number of taxels along the window that follows the contact."""
 WINDOW_SIZE_NAME = "Window size"
 _FOLDER = Path(__file__).resolve().parent
 
@@ -50,7 +50,7 @@ def eds_path(name: str) -> Path:
     """Path of a packaged EDS file.
 
     Args:
-        name: with or without the suffix .eds.
+        name: name of the file, with or without the suffix .eds.
 
     Raises:
         EdsError: no packaged file has this name.
@@ -65,12 +65,12 @@ def eds_path(name: str) -> Path:
 
 
 def has_missed_syncs(od: canopen.ObjectDictionary) -> bool:
-    """Whether 2000h is that object here: another maker's drive may mean something else by the same index."""
+    """Whether 2000h is that object here; drives of other makers use the index for something else."""
     return MISSED_SYNCS in od and od[MISSED_SYNCS].name == MISSED_SYNCS_NAME
 
 
 def sync_patience(od: canopen.ObjectDictionary) -> int | None:
-    """Index of the object that says how many SYNCs a drive misses before it stops by itself; None without one."""
+    """Index of the object for the number of missed SYNCs after which a drive stops by itself; None without one."""
     named = ((MISSED_SYNCS, MISSED_SYNCS_NAME), (SYNC_FACTOR, SYNC_FACTOR_NAME))
     return next((index for index, name in named if index in od and od[index].name == name), None)
 
@@ -91,13 +91,13 @@ def has_full_scale(od: canopen.ObjectDictionary) -> bool:
 
 
 def eds_file(source: str | os.PathLike[str]) -> Path:
-    """The file that a name or path means: a bare word names a packaged one, unless a file of that name lies here.
+    """Path of the file that a name or path means; a bare word names a packaged file, unless a file has that name.
 
     Raises:
-        EdsError: no such file.
+        EdsError: there is no such file.
     """
     path = Path(source)
-    if os.path.isfile(path):  # False, too, for what no system takes as a path
+    if os.path.isfile(path):  # False also for what no system takes as a path
         return path
     if isinstance(source, str) and path.name == source:
         return eds_path(source)
@@ -113,15 +113,15 @@ def load_eds(name_or_path: str | os.PathLike[str], node_id: int) -> canopen.Obje
     """Load an EDS or DCF file into canopen's object dictionary for one node.
 
     Planner, master and emulator each ask for the same file, and parsing costs 60 ms: they get one object. Treat it as
-    read-only; a node's values live elsewhere.
+    read-only; a node keeps its values elsewhere.
 
     Args:
-        name_or_path: a packaged name (see `eds_names`) or the path of any EDS file.
-        node_id: 1..127, put in for $NODEID.
+        name_or_path: packaged name (see `eds_names`) or path of any EDS file.
+        node_id: node id, 1..127, which replaces $NODEID.
 
     Raises:
-        EdsError: missing, unreadable or with faults that prevent its use; names the file and each fault. What is
-            merely untidy is accepted, see `check_eds`.
+        EdsError: the file is missing, unreadable, or has faults that prevent its use; the message names the file and
+            each fault. Warnings are accepted, see `check_eds`.
     """
     _check_node_id(name_or_path, node_id)
     path = eds_file(name_or_path)
@@ -129,24 +129,24 @@ def load_eds(name_or_path: str | os.PathLike[str], node_id: int) -> canopen.Obje
 
 
 def check_eds(name_or_path: str | os.PathLike[str], node_id: int | None = None) -> Reading:
-    """Read an EDS or DCF file with everything that is wrong with it.
+    """Read an EDS or DCF file with all findings.
 
     Args:
-        name_or_path: as for `load_eds`.
-        node_id: 1..127, put in for $NODEID; None for that of the DCF, or else 1.
+        name_or_path: packaged name or path, as for `load_eds`.
+        node_id: node id, 1..127, which replaces $NODEID; None for that of the DCF, or else 1.
 
     Raises:
-        EdsError: missing or unreadable, or no such node id.
+        EdsError: the file is missing or unreadable, or the node id is not 1..127.
     """
     if node_id is not None:
         _check_node_id(name_or_path, node_id)
-    from canprobe.fieldbus.eds.reading import read_eds  # late, as it imports canopen: --help must not pay for it
+    from canprobe.fieldbus.eds.reading import read_eds  # here, as it imports canopen, which --help must not pay for
 
     return read_eds(eds_file(name_or_path), node_id)
 
 
 @lru_cache(maxsize=64)
 def _parse(path: Path, _mtime_ns: int, node_id: int) -> canopen.ObjectDictionary:
-    from canprobe.fieldbus.eds.reading import read_eds  # late, as above
+    from canprobe.fieldbus.eds.reading import read_eds  # here, as above
 
     return read_eds(path, node_id, serving=False).usable()

@@ -1,8 +1,8 @@
-"""Any vendor's EDS or DCF file → an object dictionary and the list of what is wrong with the file.
+"""Reads an EDS or DCF file of any vendor into an object dictionary and a list of findings.
 
-Faults are of two kinds: what *prevents* serving (it is not known what the device is, or which PDOs it has) and warnings
-(the meaning is clear, or the rest can be served without it). What a file leaves out or gets wrong although the standard
-fixes it (mandatory objects, identifiers, mappings) is put right with a warning.
+Findings are of two kinds: faults *prevent* serving (it is unknown what the device is, or which PDOs it has), warnings
+do not (the meaning is clear, or the rest can be served). What a file lacks or has wrong although the standard fixes it
+(mandatory objects, identifiers, mappings) is repaired with a warning.
 
 Source: CiA 306-1, "Device information"; CiA 301, objects 1000h, 1001h, 1018h, "Pre-defined connection set", "PDO
 mapping".
@@ -25,36 +25,35 @@ from canprobe.fieldbus.eds.object_lists import check_lists
 from canprobe.fieldbus.eds.sections import Section, decode, split_sections
 from canprobe.fieldbus.eds.source import Source
 from canprobe.fieldbus.eds.structure import build_objects, find_objects
+from canprobe.fieldbus.protocol.frames import EFF_MASK, INVALID_FLAG
+from canprobe.fieldbus.protocol.pdo import MAX_PDO_BITS
 
-_INVALID = 1 << 31
-_CAN_ID = 0x1FFFFFFF
-_MOST = 0xFFFFFFFF
-_MAX_BITS = 64
-_PROFILE = 0xFFFF
+_MAX_U32 = 0xFFFFFFFF
+_PROFILE_MASK = 0xFFFF
 _DRIVE_PROFILE = 402
-_SERVO_DRIVE = 0x00020192
+_SERVO_DRIVE_TYPE = 0x00020192
 """Device type of a servo drive of CiA 402."""
 _DRIVE_OBJECTS = (0x6040, 0x6041)
 _FURTHER_CONTROLWORDS = range(0x6840, 0xA000, 0x800)
 _MODES_OF_OPERATION = 0x6060
-_IDENTITY = {1: "vendor", 2: "product", 3: "revision"}
-"""Whose number is at which sub-index of 1018h, as [DeviceInfo] and canopen call it."""
-_PREDEFINED = (
+_IDENTITY_NAMES = {1: "vendor", 2: "product", 3: "revision"}
+"""Names of the numbers in 1018h, by sub-index, as [DeviceInfo] and canopen have them."""
+_PREDEFINED_COB_IDS = (
     (0x1014, 0, 0x80),
     *((0x1400 + n, 1, 0x200 + 0x100 * n) for n in range(4)),
     *((0x1800 + n, 1, 0x180 + 0x100 * n) for n in range(4)),
 )
-"""Index, sub-index and COB-ID without the node-ID."""
+"""Index, sub-index and COB-ID without the node-ID, of the pre-defined connection set."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """What came of a file.
+    """Result of reading a file.
 
     Attributes:
-        path: of the file.
-        dictionary: as far as it could be built; complete where nothing prevents serving.
-        found: everything wrong, by line.
+        path: path of the file.
+        dictionary: object dictionary as far as it could be built; it is complete where nothing prevents serving.
+        found: all findings, by line.
     """
 
     path: Path
@@ -63,12 +62,12 @@ class Reading:
 
     @property
     def faults(self) -> tuple[EdsFinding, ...]:
-        """What prevents serving."""
+        """Findings that prevent serving."""
         return tuple(fault for fault in self.found if fault.prevents)
 
     @property
     def warnings(self) -> tuple[EdsFinding, ...]:
-        """What was put right, or left out."""
+        """Findings that were repaired, or left out."""
         return tuple(fault for fault in self.found if not fault.prevents)
 
     @property
@@ -77,10 +76,10 @@ class Reading:
         return device_profile(self.dictionary)
 
     def usable(self) -> ObjectDictionary:
-        """The dictionary.
+        """The dictionary of a file without faults.
 
         Raises:
-            EdsError: a fault prevents its use; one line a fault.
+            EdsError: faults prevent its use; the message has one line for each.
         """
         if self.faults:
             raise EdsError("\n".join(f"{self.path}: not a usable EDS file: {fault}" for fault in self.faults))
@@ -91,10 +90,10 @@ def read_eds(path: Path, node_id: int | None, *, serving: bool = True) -> Readin
     """Read a file, whatever is in it.
 
     Args:
-        path: of an EDS or DCF file.
-        node_id: 1..127, for $NODEID; None for that of the DCF, or else 1.
-        serving: add the mandatory objects that are missing, and take what the default mapping of a PDO carries as
-            mappable, whatever PDOMapping says. A master had better not rely on either.
+        path: path of an EDS or DCF file.
+        node_id: node id, 1..127, which replaces $NODEID; None for that of the DCF, or else 1.
+        serving: whether to add mandatory objects that are missing, and to take what the default mapping of a PDO holds
+            as mappable, whatever PDOMapping states. A master should not rely on either.
 
     Raises:
         EdsError: the file itself cannot be read.
@@ -128,7 +127,7 @@ def read_eds(path: Path, node_id: int | None, *, serving: bool = True) -> Readin
 
 def device_profile(od: ObjectDictionary) -> int:
     """Number of the device profile in 1000h, such as 402; 0 for none."""
-    return _present(variable_at(od, 0x1000, 0)) & _PROFILE
+    return _present(variable_at(od, 0x1000, 0)) & _PROFILE_MASK
 
 
 def is_drive(od: ObjectDictionary) -> bool:
@@ -137,42 +136,42 @@ def is_drive(od: ObjectDictionary) -> bool:
 
 
 def _describes_drive(heads: dict[int, Section], composites: set[int], node_id: int) -> bool:
-    """Whether CiA 402 describes this device: by 1000h, or, where the file gives it no value, by what a drive has."""
+    """Whether CiA 402 describes this device: by 1000h, or, without a value there, by the objects of a drive."""
     head = heads.get(0x1000)
     text = (head.value("ParameterValue") or head.value("DefaultValue")) if head is not None else ""
     if not text:
         return heads.keys() - composites >= {*_DRIVE_OBJECTS, _MODES_OF_OPERATION}
     try:
-        return parse_sum(text, node_id, lambda _: None)[0] & _PROFILE == _DRIVE_PROFILE
-    except ValueError:  # a fault, found where the value is read
+        return parse_sum(text, node_id, lambda _: None)[0] & _PROFILE_MASK == _DRIVE_PROFILE
+    except ValueError:  # a fault, which is found where the value is read
         return False
 
 
 class _Repair:
-    """Puts right what the standard fixes, each time with a warning.
+    """Repairs what the standard fixes, each time with a warning.
 
     Args:
         source: the file.
-        heads: the section of each object.
-        od: what was built of them; it is changed.
+        heads: section of each object.
+        od: dictionary that was built from them; it is changed.
     """
 
     def __init__(self, source: Source, heads: dict[int, Section], od: ObjectDictionary) -> None:
         self._source, self._heads, self._od = source, heads, od
-        stated = {sub: getattr(od.device_information, f"{name}_number") for sub, name in _IDENTITY.items()}
-        self._identity = {sub: number for sub, number in stated.items() if number and 0 < number <= _MOST}
-        """What [DeviceInfo] states of 1018h, by sub-index; a 0 there is an empty field."""
+        stated = {sub: getattr(od.device_information, f"{name}_number") for sub, name in _IDENTITY_NAMES.items()}
+        self._identity = {sub: number for sub, number in stated.items() if number and 0 < number <= _MAX_U32}
+        """Numbers in [DeviceInfo] for 1018h, by sub-index; a 0 there is an empty field."""
 
     def run(self, serving: bool) -> None:
-        """Every repair; `serving` as in `read_eds`."""
+        """Make every repair; `serving` is that of `read_eds`."""
         if serving:
             self._add_mandatory()
         if self._source.drive:
-            text = f"missing; {_SERVO_DRIVE:#010x} taken, a CiA 402 drive: 6040h, 6041h and 6060h are there"
-            self._fill((0x1000, 0), _SERVO_DRIVE, text)
+            text = f"missing; {_SERVO_DRIVE_TYPE:#010x} taken, a CiA 402 drive: 6040h, 6041h and 6060h are there"
+            self._fill((0x1000, 0), _SERVO_DRIVE_TYPE, text)
         for subindex, number in self._identity.items():
             self._fill((0x1018, subindex), number, f"missing; {number:#x} taken, as [DeviceInfo] has it")
-        for subindex, name in _IDENTITY.items():
+        for subindex, name in _IDENTITY_NAMES.items():
             variable = variable_at(self._od, 0x1018, subindex)
             if variable is not None and _present(variable) == 0 and _text(variable)[0] != "empty":
                 text = f"0, as where nobody has filled it in; bring-up does not compare the {name}"
@@ -188,29 +187,29 @@ class _Repair:
         source, od = self._source, self._od
         for index, name, data_type in ((0x1000, "Device type", 0x07), (0x1001, "Error register", 0x05)):
             if index not in od.indices:
-                value = _SERVO_DRIVE if index == 0x1000 and source.drive else 0
+                value = _SERVO_DRIVE_TYPE if index == 0x1000 and source.drive else 0
                 source.faults.warn(0, f"{index:04X}", "", f"{name} is mandatory, but not there; served as {value:#x}")
                 od.add_object(_variable(name, index, 0, data_type, value))
         if 0x1018 not in od.indices:
             numbers = {1: 0, **self._identity}
-            text = ", ".join(f"{_IDENTITY[subindex]} {number:#x}" for subindex, number in numbers.items())
+            text = ", ".join(f"{_IDENTITY_NAMES[subindex]} {number:#x}" for subindex, number in numbers.items())
             source.faults.warn(0, "1018", "", f"Identity object is mandatory, but not there; served with {text}")
             identity = ODRecord("Identity object", 0x1018)
             identity.add_member(_variable("Highest sub-index supported", 0x1018, 0, datatypes.UNSIGNED8, max(numbers)))
             for subindex, number in numbers.items():
-                name = _IDENTITY[subindex].capitalize()
+                name = _IDENTITY_NAMES[subindex].capitalize()
                 identity.add_member(_variable(name, 0x1018, subindex, datatypes.UNSIGNED32, number))
             od.add_object(identity)
 
     def _fill(self, place: tuple[int, int], value: int, text: str) -> None:
-        """Give a described object that has no value this one."""
+        """Give a described object without a value this one."""
         variable = variable_at(self._od, *place)
         if variable is not None and variable.default is None and variable.value is None:
             self._warn(place, text)
             variable.default = value
 
     def _repair_sdo_server(self) -> None:
-        """The first SDO server has the COB-IDs of the pre-defined connection set."""
+        """Give the first SDO server the COB-IDs of the pre-defined connection set."""
         node_id = self._source.node_id
         for subindex, base in ((1, 0x600), (2, 0x580)):
             variable = variable_at(self._od, 0x1200, subindex)
@@ -221,29 +220,29 @@ class _Repair:
                 variable.default, variable.value, variable.relative = base + node_id, None, True
 
     def _repair_identifiers(self) -> None:
-        """COB-IDs of the pre-defined connection set that forget the node-ID, or are of the node that a DCF is made for.
+        """Repair COB-IDs of the pre-defined connection set without the node-ID, or with that for which a DCF was made.
 
         Any other COB-ID was chosen by somebody and stays.
         """
         node_id = self._source.node_id
         made_for = commissioned_node(self._source.sections) or node_id
-        for index, subindex, base in _PREDEFINED:
+        for index, subindex, base in _PREDEFINED_COB_IDS:
             variable = variable_at(self._od, index, subindex)
             if variable is None:
                 continue
             written, key = _text(variable)
             default, cob_id = variable.default, _present(variable)
-            forgotten = isinstance(default, int) and not variable.relative and default & ~_INVALID == base
+            forgotten = isinstance(default, int) and not variable.relative and default & ~INVALID_FLAG == base
             if variable.value is None and forgotten:
                 self._warn((index, subindex), f"{written} without $NODEID, which is added")
                 variable.default, variable.relative = cob_id + node_id, True
-            elif made_for != node_id and cob_id & _CAN_ID == base + made_for:
+            elif made_for != node_id and cob_id & EFF_MASK == base + made_for:
                 cob_id += node_id - made_for
                 self._warn((index, subindex), f"{written} is of node {made_for}; {cob_id:#x} taken", key)
                 setattr(variable, "value" if key == "ParameterValue" else "default", cob_id)
 
     def _check_mapping(self, index: int, serving: bool) -> None:
-        """The default mapping of a PDO."""
+        """Check the default mapping of a PDO."""
         bits = 0
         for subindex, word in _words(self._od, index):
             name, length = f"{word >> 16:04X}h:{word >> 8 & 0xFF:02X}", word & 0xFF
@@ -257,8 +256,8 @@ class _Repair:
             elif not target.pdo_mappable and target.index > 7:
                 self._warn((target.index, target.subindex), f"is mapped in {index:04X}h, so 1", "PDOMapping")
                 target.pdo_mappable = serving
-        if bits > _MAX_BITS:
-            self._warn((index, 0), f"maps {bits} bits, but a frame has {_MAX_BITS}; the PDO is served empty")
+        if bits > MAX_PDO_BITS:
+            self._warn((index, 0), f"maps {bits} bits, but a frame has {MAX_PDO_BITS}; the PDO is served empty")
 
     def _check_pdo_counts(self) -> None:
         section = self._source.sections.get("deviceinfo")
@@ -272,7 +271,7 @@ class _Repair:
                 self._source.warn(section, key, f"{stated}, but {described} {name} are described; those are served")
 
     def _warn(self, place: tuple[int, int], text: str, key: str = "DefaultValue") -> None:
-        """A warning at the section of a sub-object (index, sub-index), or else of its object."""
+        """Add a warning at the section of a sub-object (index, sub-index), or else of its object."""
         index, subindex = place
         section = self._source.sections.get(f"{index:04x}sub{subindex:x}") or self._heads.get(index)
         if section is None:
@@ -288,20 +287,20 @@ def _variable(name: str, index: int, subindex: int, data_type: int, default: int
 
 
 def _text(variable: ODVariable) -> tuple[str, str]:
-    """The value that counts, as the file writes it, and its key."""
+    """Text in the file of the value that counts, and its key."""
     field, key = ("default_raw", "DefaultValue") if variable.value is None else ("value_raw", "ParameterValue")
     return str(getattr(variable, field, "")) or "empty", key
 
 
 def _words(od: ObjectDictionary, index: int) -> Iterator[tuple[int, int]]:
-    """Sub-index and word of each entry that is mapped."""
+    """Sub-index and mapping word of each mapped entry."""
     count = _present(variable_at(od, index, 0))
-    for subindex in range(1, min(count, _MAX_BITS) + 1):
+    for subindex in range(1, min(count, MAX_PDO_BITS) + 1):
         if word := _present(variable_at(od, index, subindex)):
             yield subindex, word
 
 
 def _present(variable: ODVariable | None) -> int:
-    """The integer at boot; 0 for none."""
+    """Integer value at boot; 0 for none."""
     value = None if variable is None else variable.default if variable.value is None else variable.value
     return value if isinstance(value, int) else 0

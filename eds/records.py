@@ -1,4 +1,4 @@
-"""Sections → arrays and records, also in the compact form, with their counts checked.
+"""Builds arrays and records from sections, also in the compact form, and checks their counts.
 
 Source: CiA 306-1, "Object description", "CompactSubObj".
 """
@@ -9,7 +9,7 @@ import copy
 
 from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 
-from canprobe.fieldbus.eds.mandatory import COUNTING, is_variable
+from canprobe.fieldbus.eds.mandatory import COUNTING_INDICES, is_variable
 from canprobe.fieldbus.eds.sections import Section
 from canprobe.fieldbus.eds.source import Source
 from canprobe.fieldbus.eds.variables import build_variable, set_value
@@ -17,8 +17,8 @@ from canprobe.fieldbus.eds.variables import build_variable, set_value
 ARRAY, RECORD = 8, 9
 """Object codes."""
 Subs = dict[int, Section]
-"""Sections of an object's sub-objects by subindex."""
-_MAX_COMPACT = 254
+"""Sections of the sub-objects of an object, by subindex."""
+_MAX_COMPACT_MEMBERS = 254
 
 
 def build_composite(source: Source, index: int, head: Section, subs: Subs, kind: int) -> ODArray | ODRecord | None:
@@ -26,10 +26,10 @@ def build_composite(source: Source, index: int, head: Section, subs: Subs, kind:
 
     Args:
         source: the file.
-        index: of the object.
-        head: its own section.
-        subs: the sections of its sub-objects.
-        kind: `ARRAY` or `RECORD`.
+        index: index of the object.
+        head: section of the object itself.
+        subs: sections of its sub-objects.
+        kind: object code, `ARRAY` or `RECORD`.
     """
     if is_variable(index, source.drive):
         source.fault(head, "", "the standard has a variable at this index, not an array or record")
@@ -56,12 +56,12 @@ def build_composite(source: Source, index: int, head: Section, subs: Subs, kind:
 def _compact_members(source: Source, index: int, head: Section) -> dict[int, ODVariable]:
     """Members of an object with CompactSubObj; names and values from [indexName] and [indexValue]."""
     count = source.number(head, "CompactSubObj")
-    if not 0 < count <= _MAX_COMPACT:
+    if not 0 < count <= _MAX_COMPACT_MEMBERS:
         if count:
-            source.warn(head, "CompactSubObj", f"{count} is not 1..{_MAX_COMPACT}; ignored")
+            source.warn(head, "CompactSubObj", f"{count} is not 1..{_MAX_COMPACT_MEMBERS}; ignored")
         return {}
     template = build_variable(source, head, index, 1, composite=True)
-    members = {0: _count_of(index, 0 if index in COUNTING else count)}
+    members = {0: _count_of(index, 0 if index in COUNTING_INDICES else count)}
     names = source.sections.get(f"{index:04x}name")
     values = source.sections.get(f"{index:04x}value")
     for subindex in range(1, count + 1):
@@ -76,7 +76,7 @@ def _compact_members(source: Source, index: int, head: Section) -> dict[int, ODV
 def _count_of(index: int, count: int) -> ODVariable:
     variable = ODVariable("Number of entries", index, 0)
     variable.data_type = datatypes.UNSIGNED8
-    variable.access_type = "rw" if index in COUNTING else "ro"
+    variable.access_type = "rw" if index in COUNTING_INDICES else "ro"
     variable.default = count
     return variable
 
@@ -96,7 +96,7 @@ def _check_highest(source: Source, index: int, head: Section, subs: Subs, member
     if 0 not in members:
         source.warn(head, "", f"subindex 0 is not described; taken for {highest}")
         members[0] = _count_of(index, highest)
-    elif index not in COUNTING and members[0].default != highest and 0 in subs:
+    elif index not in COUNTING_INDICES and members[0].default != highest and 0 in subs:
         default = members[0].default
         if default is None:
             source.warn(subs[0], "DefaultValue", f"missing, but the highest subindex is {highest}; taken")

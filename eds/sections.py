@@ -1,6 +1,6 @@
-"""Bytes of an EDS file → its sections and keys, each with its line, and what is wrong with them.
+"""Splits the bytes of an EDS file into sections and keys, each with its line, and reports what is wrong with them.
 
-They are read as Windows reads an INI file, which is what vendors' tools do: names count in any case, and of two equal
+The file is read as Windows reads an INI file, as the tools of vendors do: names count in any case, and of two equal
 names the first one counts. Source: CiA 306-1, "General structure".
 """
 
@@ -12,14 +12,14 @@ from dataclasses import dataclass, field
 
 from canprobe.fieldbus.eds.findings import EdsFindings
 
-LINE_END = re.compile(r"\r\n|\n|\r")
-_INLINE_COMMENT = re.compile(r"\s;.*")
-_UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+LINE_END_PATTERN = re.compile(r"\r\n|\n|\r")
+_COMMENT_PATTERN = re.compile(r"\s;.*")
+_UTF16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """One `key=value`; the value without blanks, quotes round it and a comment behind it."""
+    """One `key=value`; the value is without blanks and quotes around it, and without a comment behind it."""
 
     key: str
     value: str
@@ -31,9 +31,9 @@ class Section:
     """One section.
 
     Attributes:
-        name: as written, without the brackets.
-        line: of its head.
-        items: by key in lower case.
+        name: name in the spelling of the file, without the brackets.
+        line: number of the line of its head.
+        items: keys and values, by key in lower case.
     """
 
     name: str
@@ -41,29 +41,29 @@ class Section:
     items: dict[str, Item] = field(default_factory=dict)
 
     def value(self, key: str) -> str:
-        """The value; empty where the key is missing."""
+        """Value of a key; empty where the key is missing."""
         item = self.items.get(key.lower())
         return "" if item is None else item.value
 
     def line_of(self, key: str) -> int:
-        """Where the key is, or the section where it is missing."""
+        """Line of a key, or of the section where the key is missing."""
         item = self.items.get(key.lower())
         return self.line if item is None else item.line
 
 
 Sections = dict[str, Section]
-"""By name in lower case, in the order of the file."""
+"""Sections by name in lower case, in the order of the file."""
 
 
 def decode(data: bytes, faults: EdsFindings) -> str:
     """Text of a file in ASCII, UTF-8, UTF-16 with its mark, or else Latin-1."""
     try:
-        text = data.decode("utf-16" if data.startswith(_UTF16) else "utf-8-sig")
+        text = data.decode("utf-16" if data.startswith(_UTF16_MARKS) else "utf-8-sig")
     except UnicodeDecodeError as error:
-        if data.startswith(_UTF16):
+        if data.startswith(_UTF16_MARKS):
             faults.fault(0, "", "", f"not a text file: {error.reason}")
             return ""
-        line = len(LINE_END.split(data[: error.start].decode("latin-1")))
+        line = len(LINE_END_PATTERN.split(data[: error.start].decode("latin-1")))
         faults.warn(line, "", "", f"byte {data[error.start]:02X}h is not UTF-8; the file is read as Latin-1")
         text = data.decode("latin-1")
     if "\0" in text:
@@ -77,7 +77,7 @@ def split_sections(text: str, faults: EdsFindings) -> Sections:
     sections: Sections = {}
     repeated: list[tuple[Section, Section]] = []
     current: Section | None = None
-    for number, raw in enumerate(LINE_END.split(text), start=1):
+    for number, raw in enumerate(LINE_END_PATTERN.split(text), start=1):
         line = raw.strip()
         if not line or line[0] in ";#":
             continue
@@ -99,14 +99,14 @@ def split_sections(text: str, faults: EdsFindings) -> Sections:
 def _head(line: str, number: int, faults: EdsFindings) -> Section:
     name, bracket, _ = line[1:].partition("]")
     if not bracket:
-        name = _INLINE_COMMENT.sub("", name)
+        name = _COMMENT_PATTERN.sub("", name)
         faults.warn(number, name.strip(), "", "the closing bracket is missing")
     return Section(name.strip(), number)
 
 
 def _add(section: Section, line: str, number: int, faults: EdsFindings) -> None:
     key, _, value = line.partition("=")
-    value = _INLINE_COMMENT.sub("", f" {value}").strip()
+    value = _COMMENT_PATTERN.sub("", f" {value}").strip()
     if len(value) >= 2 and value[0] == value[-1] and value[0] in "\"'":
         value = value[1:-1]
     item = Item(key.strip(), value, number)

@@ -18,7 +18,7 @@ class Source:
         sections: sections of the file.
         node_id: value of $NODEID.
         faults: findings so far.
-        drive: the device is a drive of CiA 402.
+        drive: whether the device is a drive of CiA 402.
     """
 
     sections: Sections
@@ -27,19 +27,19 @@ class Source:
     drive: bool = False
 
     def warn(self, section: Section, key: str, text: str) -> None:
-        """A warning at a key, or at its section where the key is missing."""
+        """Add a warning at a key, or at its section where the key is missing."""
         self.faults.warn(section.line_of(key), section.name, key, text)
 
     def fault(self, section: Section, key: str, text: str) -> None:
-        """A fault at a key, or at its section where the key is missing."""
+        """Add a fault at a key, or at its section where the key is missing."""
         self.faults.fault(section.line_of(key), section.name, key, text)
 
     def remark(self, section: Section, key: str) -> Callable[[str], None]:
-        """What a parser calls with what is odd about a value."""
+        """The function that a parser calls with a remark on the value of a key."""
         return lambda text: self.warn(section, key, text)
 
     def number(self, section: Section, key: str, default: int = 0) -> int:
-        """An integer that does no harm when it is wrong; `default` where it is missing, empty or not a number."""
+        """Integer that does no harm when it is wrong; `default` where it is missing, empty or not a number."""
         text = section.value(key)
         if not text:
             return default

@@ -1,4 +1,4 @@
-"""Sections → objects of the dictionary: variables, arrays, records, dummy types, the device's own information.
+"""Builds the objects of the dictionary from sections: variables, arrays, records and dummy types.
 
 Source: CiA 306-1, "Object description", "Dummy usage".
 """
@@ -15,20 +15,20 @@ from canprobe.fieldbus.eds.sections import Section
 from canprobe.fieldbus.eds.source import Source
 from canprobe.fieldbus.eds.variables import build_variable
 
-_OBJECT = re.compile(r"(?:0x)?([0-9a-f]{4})")
-_SUB_OBJECT = re.compile(r"(?:0x)?([0-9a-f]{4})\s*sub\s*(?:0x)?([0-9a-f]{1,2})")
+_OBJECT_PATTERN = re.compile(r"(?:0x)?([0-9a-f]{4})")
+_SUB_OBJECT_PATTERN = re.compile(r"(?:0x)?([0-9a-f]{4})\s*sub\s*(?:0x)?([0-9a-f]{1,2})")
 _NULL, _DOMAIN, _DEFTYPE, _DEFSTRUCT, _VAR = 0, 2, 5, 6, 7
-_KINDS = frozenset({_NULL, _DOMAIN, _DEFTYPE, _DEFSTRUCT, _VAR, ARRAY, RECORD})
+_OBJECT_CODES = frozenset({_NULL, _DOMAIN, _DEFTYPE, _DEFSTRUCT, _VAR, ARRAY, RECORD})
 
 
 def find_objects(source: Source) -> tuple[dict[int, Section], dict[int, Subs]]:
-    """The sections of objects by index, and those of their sub-objects by index and subindex."""
+    """Sections of objects by index, and of their sub-objects by index and subindex."""
     heads: dict[int, Section] = {}
     subs: dict[int, Subs] = {}
     for name, section in source.sections.items():
-        if match := _OBJECT.fullmatch(name):
+        if match := _OBJECT_PATTERN.fullmatch(name):
             heads.setdefault(int(match[1], 16), section)
-        elif match := _SUB_OBJECT.fullmatch(name):
+        elif match := _SUB_OBJECT_PATTERN.fullmatch(name):
             members = subs.setdefault(int(match[1], 16), {})
             if members.setdefault(int(match[2], 16), section) is not section:
                 source.warn(section, "", f"is described in line {members[int(match[2], 16)].line} already")
@@ -57,7 +57,7 @@ def _build(source: Source, index: int, head: Section | None, subs: Subs) -> ODVa
 
 
 def _kind(source: Source, head: Section, subs: Subs) -> int:
-    """ObjectType, or what the rest of the section shows where that is missing or cannot be."""
+    """ObjectType, or the type that the rest of the section shows where it is missing or impossible."""
     stated = _VAR
     if text := head.value("ObjectType"):
         try:

@@ -13,66 +13,66 @@ from canopen.objectdictionary import datatypes
 from canprobe.fieldbus.eds.numbers import Remark, parse_flag, parse_sum
 
 Value = int | float | bytes | str
-SIGNED = {0x02: 8, 0x03: 16, 0x10: 24, 0x04: 32, 0x12: 40, 0x13: 48, 0x14: 56, 0x15: 64}
-UNSIGNED = {0x05: 8, 0x06: 16, 0x16: 24, 0x07: 32, 0x18: 40, 0x19: 48, 0x1A: 56, 0x1B: 64}
-REALS = {datatypes.REAL32: ("<f", 8), datatypes.REAL64: ("<d", 16)}
-TEXTS = {datatypes.VISIBLE_STRING, datatypes.UNICODE_STRING}
-OCTETS = {datatypes.OCTET_STRING, datatypes.DOMAIN}
-TIMES = {datatypes.TIME_OF_DAY, datatypes.TIME_DIFFERENCE}
-KNOWN = {datatypes.BOOLEAN, *SIGNED, *UNSIGNED, *REALS, *TEXTS, *OCTETS, *TIMES}
-NAMES = {name: number for name, number in vars(datatypes).items() if name.isupper() and isinstance(number, int)}
-_NAME_OF = {number: name for name, number in NAMES.items()}
-WORDS_OF_TYPES = {
-    **{f"INT{bits}": number for number, bits in SIGNED.items()},
-    **{f"UINT{bits}": number for number, bits in UNSIGNED.items()},
-    **{f"I{bits}": number for number, bits in SIGNED.items()},
-    **{f"U{bits}": number for number, bits in UNSIGNED.items()},
+SIGNED_BITS = {0x02: 8, 0x03: 16, 0x10: 24, 0x04: 32, 0x12: 40, 0x13: 48, 0x14: 56, 0x15: 64}
+UNSIGNED_BITS = {0x05: 8, 0x06: 16, 0x16: 24, 0x07: 32, 0x18: 40, 0x19: 48, 0x1A: 56, 0x1B: 64}
+REAL_FORMS = {datatypes.REAL32: ("<f", 8), datatypes.REAL64: ("<d", 16)}
+TEXT_TYPES = {datatypes.VISIBLE_STRING, datatypes.UNICODE_STRING}
+OCTET_TYPES = {datatypes.OCTET_STRING, datatypes.DOMAIN}
+TIME_TYPES = {datatypes.TIME_OF_DAY, datatypes.TIME_DIFFERENCE}
+KNOWN_TYPES = {datatypes.BOOLEAN, *SIGNED_BITS, *UNSIGNED_BITS, *REAL_FORMS, *TEXT_TYPES, *OCTET_TYPES, *TIME_TYPES}
+TYPE_NUMBERS = {name: number for name, number in vars(datatypes).items() if name.isupper() and isinstance(number, int)}
+_TYPE_NAMES = {number: name for name, number in TYPE_NUMBERS.items()}
+FOREIGN_TYPE_NUMBERS = {
+    **{f"INT{bits}": number for number, bits in SIGNED_BITS.items()},
+    **{f"UINT{bits}": number for number, bits in UNSIGNED_BITS.items()},
+    **{f"I{bits}": number for number, bits in SIGNED_BITS.items()},
+    **{f"U{bits}": number for number, bits in UNSIGNED_BITS.items()},
     **{"BOOL": 0x01, "SINT": 0x02, "INT": 0x03, "DINT": 0x04, "LINT": 0x15},
     **{"USINT": 0x05, "UINT": 0x06, "UDINT": 0x07, "ULINT": 0x1B, "REAL": 0x08, "LREAL": 0x11},
     **{"FLOAT": 0x08, "DOUBLE": 0x11, "STRING": 0x09},
 }
-"""Names of data types elsewhere. Source: IEC 61131-3, "Elementary data types"; C's <stdint.h>."""
+"""Data types by their names in other standards. Source: IEC 61131-3, "Elementary data types"; C's <stdint.h>."""
 _TIME_BYTES = 6
 
 
 def name_of(data_type: int) -> str:
     """The standard's name of a data type."""
-    return _NAME_OF.get(data_type, f"{data_type:04X}h")
+    return _TYPE_NAMES.get(data_type, f"{data_type:04X}h")
 
 
 def convert(text: str, data_type: int, node_id: int, remark: Remark) -> Value:
-    """A value as the file writes it → as the dictionary holds it.
+    """Convert a value from the text in the file to that in the dictionary.
 
     Args:
-        text: not empty, except for texts.
-        data_type: one of `KNOWN`.
-        node_id: for $NODEID.
-        remark: called with what is odd about it.
+        text: text of the value; only that of a text may be empty.
+        data_type: data type, one of `KNOWN_TYPES`.
+        node_id: node id, which replaces $NODEID.
+        remark: function that is called with a remark on an odd spelling.
 
     Raises:
-        ValueError, OverflowError: it does not mean a value of that type.
+        ValueError, OverflowError: the text means no value of that type.
     """
-    if data_type in TEXTS:
+    if data_type in TEXT_TYPES:
         return text
-    if data_type in OCTETS:
+    if data_type in OCTET_TYPES:
         return _octets(text, remark)
-    if data_type in REALS:
+    if data_type in REAL_FORMS:
         return _real(text, data_type, remark)
     if data_type == datatypes.BOOLEAN:
         return int(parse_flag(text, remark))
     number, _ = parse_sum(text, node_id, remark)
-    if data_type in TIMES:
+    if data_type in TIME_TYPES:
         return number.to_bytes(_TIME_BYTES, "little")
     return _fitted(number, text, data_type, remark)
 
 
 def convert_limit(text: str, data_type: int, node_id: int, remark: Remark) -> int | float | None:
-    """A limit; None where a type has none.
+    """Convert a limit; None for a type without limits.
 
     Raises:
-        ValueError, OverflowError: it does not mean a number of that type.
+        ValueError, OverflowError: the text means no number of that type.
     """
-    if data_type not in SIGNED | UNSIGNED | REALS:
+    if data_type not in SIGNED_BITS | UNSIGNED_BITS | REAL_FORMS:
         return None
     value = convert(text, data_type, node_id, remark)
     assert not isinstance(value, (bytes, str))
@@ -80,9 +80,9 @@ def convert_limit(text: str, data_type: int, node_id: int, remark: Remark) -> in
 
 
 def _fitted(number: int, text: str, data_type: int, remark: Remark) -> int:
-    """The number in its type's range; 0xFFFF for -1 is usual, -1 for 0xFFFF is odd."""
-    signed = data_type in SIGNED
-    bits = SIGNED[data_type] if signed else UNSIGNED[data_type]
+    """Number in the range of its type; 0xFFFF for -1 is usual, -1 for 0xFFFF is odd."""
+    signed = data_type in SIGNED_BITS
+    bits = SIGNED_BITS[data_type] if signed else UNSIGNED_BITS[data_type]
     low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
     if low <= number <= high:
         return number
@@ -103,7 +103,7 @@ def _octets(text: str, remark: Remark) -> bytes:
 
 
 def _real(text: str, data_type: int, remark: Remark) -> float:
-    form, digits = REALS[data_type]
+    form, digits = REAL_FORMS[data_type]
     if re.fullmatch(rf"0[xX][0-9A-Fa-f]{{{digits}}}", text):
         real: float = struct.unpack(form, bytes.fromhex(text[2:])[::-1])[0]
         remark(f"{text} is taken for the bytes of {real:g}")

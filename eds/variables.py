@@ -1,4 +1,4 @@
-"""One section of an EDS file → one variable of the dictionary: its data type, its values, its limits.
+"""Builds a variable of the dictionary from a section of an EDS file: data type, values and limits.
 
 Source: CiA 306-1, "Object description".
 """
@@ -10,24 +10,24 @@ from contextlib import suppress
 from canopen.objectdictionary import ODVariable, datatypes
 
 from canprobe.fieldbus.eds.data_types import data_type_of
-from canprobe.fieldbus.eds.mandatory import CHOICES, decides, standard_access
+from canprobe.fieldbus.eds.mandatory import CHOICE_INDICES, decides, standard_access
 from canprobe.fieldbus.eds.numbers import parse_flag, parse_sum
 from canprobe.fieldbus.eds.sections import Section
 from canprobe.fieldbus.eds.source import Source
-from canprobe.fieldbus.eds.values import TEXTS, convert, convert_limit, name_of
+from canprobe.fieldbus.eds.values import TEXT_TYPES, convert, convert_limit, name_of
 
-_ACCESS = frozenset({"ro", "wo", "rw", "rwr", "rww", "const"})
+_ACCESS_TYPES = frozenset({"ro", "wo", "rw", "rwr", "rww", "const"})
 _ACCESS_WORDS = {"r": "ro", "w": "wo", "wr": "rw", "readonly": "ro", "writeonly": "wo", "readwrite": "rw", "c": "const"}
 
 
 def build_variable(source: Source, section: Section, index: int, subindex: int, composite: bool = False) -> ODVariable:
-    """The variable that a section describes; one whose data type cannot be known holds octets and has no value.
+    """Build the variable that a section describes; without a known data type it holds octets and has no value.
 
     Args:
         source: the file.
-        section: the variable's, or with CompactSubObj that of the whole object.
-        index, subindex: of the variable.
-        composite: it is part of an array or record.
+        section: section of the variable, or with CompactSubObj that of the whole object.
+        index, subindex: place of the variable.
+        composite: whether it is part of an array or record.
     """
     known = data_type_of(source, section, index, subindex, composite)
     data_type = int(datatypes.DOMAIN) if known is None else known
@@ -48,14 +48,14 @@ def build_variable(source: Source, section: Section, index: int, subindex: int, 
 
 
 def set_value(source: Source, section: Section, key: str, variable: ODVariable, name: str = "") -> None:
-    """Give the variable its `DefaultValue` or `ParameterValue`; `name` is the key where it is another one."""
+    """Give the variable its `DefaultValue` or `ParameterValue`; `name` is the key where it has another name."""
     where, data_type = name or key, variable.data_type or datatypes.DOMAIN
     if where.lower() not in section.items:
         return
     text = section.value(where)
     field = "default" if key == "DefaultValue" else "value"
     setattr(variable, f"{field}_raw", text)
-    if not text and data_type not in TEXTS:
+    if not text and data_type not in TEXT_TYPES:
         return
     try:
         setattr(variable, field, convert(text, data_type, source.node_id, source.remark(section, where)))
@@ -66,7 +66,7 @@ def set_value(source: Source, section: Section, key: str, variable: ODVariable, 
         else:
             source.warn(section, where, f"{wrong}; left out, as if the file had none")
         return
-    if field == "default" and "$" in text and data_type not in TEXTS:
+    if field == "default" and "$" in text and data_type not in TEXT_TYPES:
         with suppress(ValueError):
             variable.relative = parse_sum(text, source.node_id, lambda _: None)[1]
 
@@ -81,7 +81,7 @@ def _name(source: Source, section: Section, index: int, subindex: int) -> str:
 
 def _access(source: Source, section: Section, index: int, subindex: int, composite: bool) -> str:
     text = section.value("AccessType").lower()
-    if text in _ACCESS:
+    if text in _ACCESS_TYPES:
         return text
     taken = _ACCESS_WORDS.get("".join(filter(str.isalpha, text))) or standard_access(
         index, subindex, composite, source.drive
@@ -105,7 +105,7 @@ def _flag(source: Source, section: Section, key: str) -> bool:
 def _set_limits(source: Source, section: Section, variable: ODVariable, data_type: int) -> None:
     low = _limit(source, section, "LowLimit", data_type)
     high = _limit(source, section, "HighLimit", data_type)
-    if low == high == 0 and not (source.drive and variable.index in CHOICES):
+    if low == high == 0 and not (source.drive and variable.index in CHOICE_INDICES):
         source.warn(
             section, "LowLimit", "0, and HighLimit 0 too, as editors fill in what nobody stated; neither is used"
         )
@@ -113,7 +113,7 @@ def _set_limits(source: Source, section: Section, variable: ODVariable, data_typ
     if low is not None and high is not None and low > high:
         source.warn(section, "LowLimit", f"{low} is above HighLimit {high}; neither is used")
         return
-    variable.min, variable.max = low, high  # type: ignore[assignment]  # of a REAL they are floats
+    variable.min, variable.max = low, high  # type: ignore[assignment]  # those of a REAL are floats
 
 
 def _limit(source: Source, section: Section, key: str, data_type: int) -> int | float | None:

@@ -6,13 +6,13 @@ import contextlib
 import signal
 from collections.abc import Iterator
 
-from canprobe.fieldbus.bus.real.interrupts import TERMINATIONS, Terminated, raise_terminated
+from canprobe.fieldbus.bus.real.interrupts import TERMINATION_SIGNALS, Terminated, raise_terminated
 
 
 @contextlib.contextmanager
 def termination_interrupts() -> Iterator[None]:
     """Within the block SIGTERM and SIGHUP raise `Terminated`; outside a main thread nothing changes."""
-    before = {number: signal.getsignal(number) for number in TERMINATIONS}
+    before = {number: signal.getsignal(number) for number in TERMINATION_SIGNALS}
     try:
         for number, handler in before.items():
             if handler != signal.SIG_IGN:  # as nohup has it

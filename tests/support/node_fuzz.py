@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import random
 
-from canprobe.fieldbus.node.sdo_server import MAX_BYTES, SdoServer
+from canprobe.fieldbus.node.sdo_server import SdoServer
 from canprobe.fieldbus.node.sdo_states import SDO_TRANSITIONS, SdoState, request_of
+from canprobe.fieldbus.node.sdo_transfers import MAX_VALUE_BYTES
 from canprobe.fieldbus.protocol.frames import NmtState
 
 INIT, PRE, OP, STOPPED = NmtState.INITIALISING, NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL, NmtState.STOPPED
@@ -81,7 +82,7 @@ class Watched:
         assert entries <= 2 * len(self.node.dictionary.entries)
         assert heap < 400 and waiting <= 16 and history <= 254
         strings = sum(not entry.bits for entry in self.node.dictionary.entries.values())
-        assert texts <= 2 * strings * MAX_BYTES
+        assert texts <= 2 * strings * MAX_VALUE_BYTES
         self.feed(0, b"\x81\x05")
         answers = self.node.receive(0x605, IDENTITY, self.t_ns)
         assert [data[0] for can_id, data in answers if can_id == 0x585] == [0x43]

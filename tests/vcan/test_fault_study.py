@@ -8,7 +8,7 @@ import pytest
 from rights import type_as_root
 
 from canprobe.cli import main
-from canprobe.fieldbus.protocol.emcy import FOLLOWING_ERROR, REFERENCE_LIMIT
+from canprobe.fieldbus.protocol.emcy import FOLLOWING_ERROR_CODE, REFERENCE_LIMIT_CODE
 from canprobe.lab.studies.faults_vcan import ProcessFault
 
 pytestmark = pytest.mark.vcan
@@ -27,5 +27,5 @@ def test_the_quick_campaign_kills_each_process_once(tmp_path, capsys):
     # still, one of them has found a following error (longer than 6066h) or a target of two cycles at once, which a SYNC
     # was lost between: a fault takes its power just as well
     states = set(rows["master killed"]["drives"].split(", "))
-    assert states <= {"SWITCH_ON_DISABLED", f"FAULT {FOLLOWING_ERROR:04X}h", f"FAULT {REFERENCE_LIMIT:04X}h"}
+    assert states <= {"SWITCH_ON_DISABLED", f"FAULT {FOLLOWING_ERROR_CODE:04X}h", f"FAULT {REFERENCE_LIMIT_CODE:04X}h"}
     assert rows["nodes killed"]["drives"] == "gone"

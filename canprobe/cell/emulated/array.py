@@ -34,8 +34,8 @@ from canprobe.fieldbus.node.entry import Value, key_of
 from canprobe.fieldbus.node.slave_node import Application, OdOf, SlaveNode
 from canprobe.fieldbus.protocol.frames import NmtState
 from canprobe.fieldbus.protocol.tactile import (
-    WINDOW,
-    WINDOWS,
+    DEFAULT_WINDOW,
+    WINDOW_SIZES,
     Features,
     TactileHeader,
     TactileMode,
@@ -119,7 +119,7 @@ class TactileApplication(Application):
         self._mode = TactileMode(number(MODE, 0, TactileMode.WINDOW))
         self._gain, self._threshold = number(GAIN, 0, 1000), number(THRESHOLD)
         self._full_scale = number(FULL_SCALE_PA, 0, 100_000)
-        self._window = number(WINDOW_SIZE, 0, WINDOW) if self._sized else WINDOW
+        self._window = number(WINDOW_SIZE, 0, DEFAULT_WINDOW) if self._sized else DEFAULT_WINDOW
 
     def keep(self) -> bytes:
         """The tare."""
@@ -204,7 +204,7 @@ class TactileApplication(Application):
         dictionary.put(HEADER, 0, words[0])
 
     def _check_window(self, subindex: int, value: Value) -> None:
-        if value not in WINDOWS or int(value) > min(self._pad.shape):
+        if value not in WINDOW_SIZES or int(value) > min(self._pad.shape):
             raise SdoAbort(Abort.VALUE)
         if self._node.state is NmtState.OPERATIONAL and value != self._window:
             raise SdoAbort(Abort.DEVICE_STATE)

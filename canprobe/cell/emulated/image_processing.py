@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.fieldbus.protocol.tactile import (
-    SIDE,
-    WINDOW,
+    DEFAULT_WINDOW,
+    MAX_SIDE,
     Features,
     Shape,
 )
@@ -76,12 +76,12 @@ def _moments(image: Raw) -> tuple[float, float, float]:
     return total, rows / total, columns / total
 
 
-def middle(window: int = WINDOW, shape: Shape = (SIDE, SIDE)) -> tuple[int, int]:
+def middle(window: int = DEFAULT_WINDOW, shape: Shape = (MAX_SIDE, MAX_SIDE)) -> tuple[int, int]:
     """First taxel (row, column) of a window in the middle of the pad."""
     return max(shape[0] - window, 0) // 2, max(shape[1] - window, 0) // 2
 
 
-def follow(image: Raw, origin: tuple[int, int], window: int = WINDOW) -> tuple[int, int]:
+def follow(image: Raw, origin: tuple[int, int], window: int = DEFAULT_WINDOW) -> tuple[int, int]:
     """First taxel (row, column) of the window of so many taxels a side round the contact.
 
     The window stays while the contact's centroid is near its middle, and where it is without a contact.

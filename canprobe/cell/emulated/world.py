@@ -27,7 +27,7 @@ from canprobe.fieldbus.drive.units import Delivery
 from canprobe.fieldbus.eds.packaged import FULL_SCALE, has_full_scale, load_eds
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol.frames import SYNC_ID, Frame
-from canprobe.fieldbus.protocol.lss import UNCONFIGURED
+from canprobe.fieldbus.protocol.lss import UNCONFIGURED_ID
 from canprobe.mechanics.robot.chain import Chain, forward
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.types import Floats
@@ -130,7 +130,7 @@ def make_world(
     for node in plan.nodes:
         if node.node_id not in node_ids:
             continue
-        node_id = UNCONFIGURED if node.node_id in without_id else node.node_id
+        node_id = UNCONFIGURED_ID if node.node_id in without_id else node.node_id
         nodes.append(_node(plan.setup, node, node_id, plant, homed))
     return World(tuple(nodes), plant, TruthRecorder(plant) if truth else None, _raw_array(plan.setup, plant))
 
@@ -145,7 +145,7 @@ def _raw_array(setup: Setup, plant: Plant) -> RawArray | None:
 
 def _node(setup: Setup, planned: PlannedNode, node_id: int, plant: Plant, homed: bool) -> SlaveNode:
     dictionary = planned.dictionary
-    speaks_lss = node_id == UNCONFIGURED or dictionary.device_information.LSS_supported
+    speaks_lss = node_id == UNCONFIGURED_ID or dictionary.device_information.LSS_supported
     od_of = partial(load_eds, planned.eds) if speaks_lss else None
     if planned.kind == "drive":
         assert setup.arm is not None

@@ -27,7 +27,7 @@ from canprobe.cell.planning.configuration import NodeSetup, Write
 from canprobe.cell.planning.operation import INTERPOLATION_TIME
 from canprobe.cell.scene.hardware import BringUpSettings
 from canprobe.errors import BusError, NodeError
-from canprobe.fieldbus.bus.presence import SECOND_ANSWER_S, UPLOAD_DEVICE_TYPE
+from canprobe.fieldbus.bus.presence import DEVICE_TYPE_REQUEST, SECOND_ANSWER_S
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.sdo import (
     Dialogue,
@@ -195,7 +195,7 @@ class BringUp:
 
         self._network.subscribe(cob_id, take)
         try:
-            self._network.send_message(SDO_RX_BASE + setup.node_id, UPLOAD_DEVICE_TYPE)
+            self._network.send_message(SDO_RX_BASE + setup.node_id, DEVICE_TYPE_REQUEST)
             self._network.pump_until(lambda: bool(answers), self._settings.sdo_s)
             self._network.pump_until(lambda: len(answers) > 1, SECOND_ANSWER_S)
         finally:

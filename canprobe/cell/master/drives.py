@@ -17,7 +17,7 @@ from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.operation import TARGETS, Place
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.cia402 import (
-    ENABLE_INTERPOLATION,
+    ENABLE_INTERPOLATION_BIT,
     DriveState,
     OperationMode,
     controlword_toward,
@@ -410,7 +410,7 @@ def _controlword(state: DriveState | None, goal: DriveState, previous: int, inte
         return _QUICK_STOP if goal is not DriveState.SWITCH_ON_DISABLED else _DISABLE_VOLTAGE
     word = controlword_toward(state, goal, previous)
     follows = interpolated and state is goal is DriveState.OPERATION_ENABLED
-    return word | 1 << ENABLE_INTERPOLATION if follows else word
+    return word | 1 << ENABLE_INTERPOLATION_BIT if follows else word
 
 
 def _fetcher(places: Sequence[int]) -> Callable[[Sequence[int]], tuple[int, ...]]:

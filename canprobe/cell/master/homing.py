@@ -37,14 +37,14 @@ from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.sdo import Dialogue, Dialogues
 from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.protocol.cia402 import (
-    CHANGE_IMMEDIATELY,
-    HOMING_ATTAINED,
-    HOMING_ERROR,
-    HOMING_START,
-    NEW_SETPOINT,
+    CHANGE_IMMEDIATELY_BIT,
+    HOMING_ATTAINED_BIT,
+    HOMING_ERROR_BIT,
+    HOMING_START_BIT,
+    NEW_SETPOINT_BIT,
     POWERED_STATES,
-    SETPOINT_ACKNOWLEDGE,
-    TARGET_REACHED,
+    SETPOINT_ACKNOWLEDGE_BIT,
+    TARGET_REACHED_BIT,
     DriveState,
     OperationMode,
     controlword_toward,
@@ -302,21 +302,23 @@ class Homing:
         for write in setup.homing:
             self._write(setup, replace(write, value=-home) if write.index == HOME_OFFSET else write)
         self._enable(setup, OperationMode.HOMING)
-        self._command(setup, _ENABLE | 1 << HOMING_START)
+        self._command(setup, _ENABLE | 1 << HOMING_START_BIT)
         what = f"find its home position by method {zero.method}"
         late = f"did not {what} in {zero.timeout_s:g} s (homing_timeout_s)"
-        self._await_bits(setup, (HOMING_ATTAINED, TARGET_REACHED), zero.timeout_s, what, late, error=HOMING_ERROR)
+        self._await_bits(
+            setup, (HOMING_ATTAINED_BIT, TARGET_REACHED_BIT), zero.timeout_s, what, late, error=HOMING_ERROR_BIT
+        )
 
     def _move(self, setup: NodeSetup, zero: HomingParameters, target: int, speed: int) -> None:
         """Move a drive to a target in profile position."""
         self._write(setup, Write(PROFILE_SPEED, 0, speed, "profile velocity"))
         self._enable(setup, OperationMode.PROFILE_POSITION)
         self._write(setup, Write(TARGET, 0, target, "target position"))
-        self._command(setup, _ENABLE | 1 << NEW_SETPOINT | 1 << CHANGE_IMMEDIATELY)
+        self._command(setup, _ENABLE | 1 << NEW_SETPOINT_BIT | 1 << CHANGE_IMMEDIATELY_BIT)
         what, late = "move back into its range", f"is homed, but did not reach {target} (607Ah), inside its range"
-        self._await_bits(setup, (SETPOINT_ACKNOWLEDGE,), self._times.enable_s, what, late)
+        self._await_bits(setup, (SETPOINT_ACKNOWLEDGE_BIT,), self._times.enable_s, what, late)
         self._command(setup, _ENABLE)
-        self._await_bits(setup, (TARGET_REACHED,), zero.timeout_s, what, late)
+        self._await_bits(setup, (TARGET_REACHED_BIT,), zero.timeout_s, what, late)
 
     def _enable(self, setup: NodeSetup, mode: OperationMode) -> None:
         self._write(setup, Write(MODE, 0, mode, "mode of operation"))

@@ -55,7 +55,7 @@ from canprobe.fieldbus.eds.packaged import (
 from canprobe.fieldbus.eds.values import name_of
 from canprobe.fieldbus.protocol.cia402 import OperationMode
 from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES
-from canprobe.fieldbus.protocol.si_unit import ACCELERATION, VELOCITY
+from canprobe.fieldbus.protocol.si_unit import ACCELERATION_UNIT_INDEX, VELOCITY_UNIT_INDEX
 from canprobe.fieldbus.protocol.tactile import TactileMode
 from canprobe.mechanics.robot.model import coupled_joints, drive_position_at, joints_to_units
 
@@ -219,7 +219,7 @@ def _setup(plan: Plan, node: PlannedNode) -> NodeSetup:
         mode=node.mode,
         homing=tuple(homing),
         turn=None if drive is None else turn_units(device, drive.turn_units, drive.gear),
-        speed_unit=1.0 if drive is None else speed_unit(device, drive, VELOCITY) or 1.0,
+        speed_unit=1.0 if drive is None else speed_unit(device, drive, VELOCITY_UNIT_INDEX) or 1.0,
     )
 
 
@@ -341,7 +341,7 @@ def _drive_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Writ
     model, axis = arm.model, arm.node_ids.index(node.node_id)
     low, high = software_limits(model)
     limit = motor_speed_limit(model, axis, setup.limits.speed_share, plan.sync.period_ns)
-    unit = speed_unit(device, arm.drives[axis], VELOCITY)
+    unit = speed_unit(device, arm.drives[axis], VELOCITY_UNIT_INDEX)
     fastest = "highest speed of the motor"
     speed = [Write(PROFILE_SPEED_LIMIT, 0, math.ceil(limit / unit), fastest, _FAST)] if unit else []
     interpolated = node.mode is OperationMode.INTERPOLATED_POSITION
@@ -375,7 +375,8 @@ def _homing_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Wri
     home = drive_position_at(arm.model, axis, zero.home, joints_to_units(arm.model, arm.q_start))
     units = abs(float(arm.model.units_per_q[axis, axis]))
     speed, acceleration = (
-        units / (speed_unit(device, arm.drives[axis], index) or 1.0) for index in (VELOCITY, ACCELERATION)
+        units / (speed_unit(device, arm.drives[axis], index) or 1.0)
+        for index in (VELOCITY_UNIT_INDEX, ACCELERATION_UNIT_INDEX)
     )
     ramp = "homing accelerates as the device has it"
     still = f"method {zero.method} does without" if zero.method in HOMES_HERE else None
@@ -430,8 +431,8 @@ def _drive_given(device: Abilities) -> tuple[Given, ...]:
     """The cell states in `sign` how a drive counts; 607Eh would turn that round. Speeds are written in unit 60A9h."""
     otherwise = {
         POLARITY: "it would count the other way round than the cell's sign says; set 607Eh back in the drive",
-        VELOCITY: "limits of speed would be wrong by the ratio of the units; set 60A9h back in the drive, or take the"
-        " drive's value into the EDS",
+        VELOCITY_UNIT_INDEX: "limits of speed would be wrong by the ratio of the units; set 60A9h back in the drive, or"
+        " take the drive's value into the EDS",
     }
     return tuple(
         Given(index, 0, device.number(index) or 0, "as its EDS says", text)

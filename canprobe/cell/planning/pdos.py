@@ -19,8 +19,8 @@ from canprobe.cell.planning.wire_time import frame_bits
 from canprobe.cell.scene.setup import Array, Setup
 from canprobe.fieldbus.eds.packaged import has_long_pdos, has_window_size
 from canprobe.fieldbus.protocol.frames import is_restricted
-from canprobe.fieldbus.protocol.pdo import MAX_BITS, PdoEntry, PdoLayout
-from canprobe.fieldbus.protocol.tactile import WINDOW, image_words, window_words
+from canprobe.fieldbus.protocol.pdo import MAX_PDO_BITS, PdoEntry, PdoLayout
+from canprobe.fieldbus.protocol.tactile import DEFAULT_WINDOW, image_words, window_words
 
 STATUSWORD, CONTROLWORD = (0x6041, 0), (0x6040, 0)
 POSITION = (0x6064, 0)
@@ -143,7 +143,7 @@ class PdoPlanning:
             elif not device.capacity(direction, number):
                 one = ChosenPdo(number, tuple(map(device.mapped_entry, device.fixed_mapping(direction, number))))
                 sends = all(entry.bits and _exists(device, entry) for entry in one.entries)
-                if sends and 0 < sum(entry.bits for entry in one.entries) <= MAX_BITS:
+                if sends and 0 < sum(entry.bits for entry in one.entries) <= MAX_PDO_BITS:
                     fixed.append(one)
                     if set(needed) <= _places(one):
                         alone.append((len(one.entries) > len(needed), one))
@@ -346,10 +346,12 @@ def plan_tactile_pdos(planning: PdoPlanning, ratio: int) -> None:
         why = f"{device.eds} has no PDOs of up to 64 bytes (2007h); tactile_array_fd.eds is of an array that has"
         planning.not_available.append(("CAN FD frames from the sensor", why))
     if array.mode == "window" and not has_window_size(device.od):
-        why = f"{device.eds} has no window size (2008h), so the window keeps {WINDOW}×{WINDOW} taxels"
+        why = f"{device.eds} has no window size (2008h), so the window keeps {DEFAULT_WINDOW}×{DEFAULT_WINDOW} taxels"
         planning.not_available.append(("another window", why))
-        if array.window != WINDOW:
-            planning.problems.append(f"node {array.node_id}: {why}: sensor.window = {WINDOW}, not {array.window}")
+        if array.window != DEFAULT_WINDOW:
+            planning.problems.append(
+                f"node {array.node_id}: {why}: sensor.window = {DEFAULT_WINDOW}, not {array.window}"
+            )
     if (lacking := _lacking_words(device, array)) is not None:
         planning.problems.append(f"node {array.node_id}: {lacking}")
         return

@@ -19,7 +19,7 @@ import numpy as np
 
 from canprobe.cell.planning.abilities import Abilities
 from canprobe.cell.scene.setup import Arm, Calibrate, Drive, Setup, Touch
-from canprobe.fieldbus.protocol.si_unit import VELOCITY, rate_unit
+from canprobe.fieldbus.protocol.si_unit import VELOCITY_UNIT_INDEX, rate_unit
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.types import Floats
 
@@ -228,7 +228,7 @@ def _lowest_limit(setup: Setup, axis: int, devices: Mapping[int, Abilities], wan
     assert arm is not None
     device, drive = devices[arm.node_ids[axis]], arm.drives[axis]
     limits = [_SpeedLimit(PROFILE_SPEED_LIMIT, math.inf, 0.0)]
-    entry, unit = device.description.entry(PROFILE_SPEED_LIMIT), speed_unit(device, drive, VELOCITY)
+    entry, unit = device.description.entry(PROFILE_SPEED_LIMIT), speed_unit(device, drive, VELOCITY_UNIT_INDEX)
     if (
         entry is not None
         and unit is not None

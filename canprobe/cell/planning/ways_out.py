@@ -12,7 +12,7 @@ from canprobe.cell.planning.window import (
     windows_of,
 )
 from canprobe.cell.scene.setup import Array, Setup
-from canprobe.fieldbus.protocol.tactile import WINDOW
+from canprobe.fieldbus.protocol.tactile import DEFAULT_WINDOW
 
 FD_ARRAY = "tactile_array_fd.eds"
 Fit = Callable[[Setup], tuple[Setup, Traffic] | None]
@@ -55,7 +55,7 @@ def _changes(setup: Setup) -> Iterator[tuple[str, Setup]]:
         yield 'sensor.mode = "window"', setup.changed("array", mode="window")
     if array.mode != "features":  # only a window may have another size
         text = 'sensor.mode = "features"' + " without sensor.window" * (array.mode == "window")
-        yield text, setup.changed("array", mode="features", window=WINDOW)
+        yield text, setup.changed("array", mode="features", window=DEFAULT_WINDOW)
     yield from _own_bus(setup, array)
     if not bus.fd and array.emulated:
         fd = setup.changed("bus", fd=True)

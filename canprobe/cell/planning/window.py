@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from canprobe.cell.scene.setup import Array, Probe, Setup
-from canprobe.fieldbus.protocol.tactile import WINDOWS
+from canprobe.fieldbus.protocol.tactile import WINDOW_SIZES
 
 FOLLOWING_TAXELS = 0.75
 """By how much the contact's centroid may be off the middle of the window before the window moves."""
@@ -48,13 +48,13 @@ def patch_across_taxels(force_n: float, probe: Probe, pitch_m: float) -> float:
 
 def windows_of(array: Array) -> tuple[int, ...]:
     """Taxels along each window that the array has room for."""
-    return tuple(side for side in WINDOWS if side <= min(array.pad.shape))
+    return tuple(side for side in WINDOW_SIZES if side <= min(array.pad.shape))
 
 
 def window_choices(setup: Setup) -> tuple[tuple[int, str], ...]:
     """Windows by preference, with the reason: the smallest that holds the patch; without a force the largest first."""
     touch, array = setup.touch, setup.array
-    windows = windows_of(array) if array is not None else WINDOWS
+    windows = windows_of(array) if array is not None else WINDOW_SIZES
     if touch is None:
         return tuple((side, "the largest that fits; nothing is pressed") for side in reversed(windows))
     across = patch_across_taxels(touch.force, touch.probe, touch.array.pad.pitch_m)

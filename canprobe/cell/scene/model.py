@@ -27,7 +27,7 @@ from canprobe.cell.scene.hardware import (
     TactileModeName,
     Vec3,
 )
-from canprobe.fieldbus.protocol.tactile import WINDOWS
+from canprobe.fieldbus.protocol.tactile import WINDOW_SIZES
 
 TaskKind = Literal["scan", "press", "calibrate", "listen", "free"]
 Strategy = Literal["weave", "straight", "circle"]
@@ -128,7 +128,7 @@ class SensorSettings:
     mode: TactileModeName = "window"
     """What the array sends: the taxels round the contact, all taxels, or force, centroid and moments that it
     computes from them."""
-    window: Annotated[Annotated[int, OneOf(WINDOWS)] | Auto, Only("mode", ("window", "auto"))] = 8
+    window: Annotated[Annotated[int, OneOf(WINDOW_SIZES)] | Auto, Only("mode", ("window", "auto"))] = 8
     """Side of the window that follows the contact, in taxels."""
     rate_hz: Annotated[float, Range(1, 1000)] = 200.0
     """Rate of the images. A SYNC triggers each, or what `wire.sampling` names."""

@@ -11,7 +11,7 @@ from canprobe.cell.scene.hardware import JointSettings, Vec3
 from canprobe.cell.scene.model import TOUCH_KINDS, Scene, WireSettings
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.raw_image import FramePattern, ImageFormat
-from canprobe.fieldbus.protocol.tactile import SIDE, WINDOWS
+from canprobe.fieldbus.protocol.tactile import MAX_SIDE, WINDOW_SIZES
 from canprobe.mechanics.robot.chain import MAX_JOINTS
 
 _USUALLY = {
@@ -234,15 +234,15 @@ def _array_fits_wire(
     if wire.kind == "frames":
         yield from _raw_frames(wire, rows, columns, mode)
         return
-    if rows > SIDE or columns > SIDE:
-        key = "rows" if rows > SIDE else "columns"
+    if rows > MAX_SIDE or columns > MAX_SIDE:
+        key = "rows" if rows > MAX_SIDE else "columns"
         got = f"got {max(rows, columns)}: its header names a taxel in 8 bits"
-        yield f"sensor.{key}", f'expected at most {SIDE} with wire.kind = "canopen", {got}'
+        yield f"sensor.{key}", f'expected at most {MAX_SIDE} with wire.kind = "canopen", {got}'
     elif mode == "window" and isinstance(window, int) and window > min(rows, columns):
         least = min(rows, columns)
         way_out = 'take a smaller one, or sensor.mode = "image"'
-        if least < min(WINDOWS):
-            way_out = f'the smallest window has {min(WINDOWS)}: set sensor.mode = "image"'
+        if least < min(WINDOW_SIZES):
+            way_out = f'the smallest window has {min(WINDOW_SIZES)}: set sensor.mode = "image"'
         yield (
             "sensor.window",
             f"expected at most the {least} taxels of sensor.rows and columns, got {window}; {way_out}",

@@ -29,10 +29,10 @@ from canprobe.cell.planning.configuration import NodeSetup, Write, make_setups
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.operation import INTERPOLATION_TIME
 from canprobe.errors import NodeError
-from canprobe.fieldbus.bus.port import Port
+from canprobe.fieldbus.bus.port import Port, nothing
 from canprobe.fieldbus.bus.presence import SECOND_ANSWER_S
 from canprobe.fieldbus.drive.drive import DriveApplication
-from canprobe.fieldbus.node.abort import SdoAbort, nothing
+from canprobe.fieldbus.node.abort import SdoAbort
 from canprobe.fieldbus.node.core import NodeCore
 from canprobe.fieldbus.node.dictionary import Dictionary
 from canprobe.fieldbus.node.rpdo import Rpdo

@@ -31,7 +31,7 @@ from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.real.memory import reserve_memory
 from canprobe.fieldbus.bus.real.processor import DEVICE_PRIORITY, ask_for_processor, realtime
 from canprobe.fieldbus.eds.packaged import check_eds
-from canprobe.fieldbus.protocol.lss import UNCONFIGURED
+from canprobe.fieldbus.protocol.lss import UNCONFIGURED_ID
 
 if TYPE_CHECKING:
     from canprobe.fieldbus.bus.virtual.lockstep import Participant
@@ -142,14 +142,14 @@ def emulate_eds(
     """
     from canprobe.fieldbus.drive.from_eds import make_eds_node
 
-    node_ids = tuple(node_id for _, node_id in files if node_id != UNCONFIGURED)
+    node_ids = tuple(node_id for _, node_id in files if node_id != UNCONFIGURED_ID)
     if twice := sorted({node_id for node_id in node_ids if node_ids.count(node_id) > 1}):
         raise UsageError(f"node id {twice[0]} is given to more than one EDS file")
     nodes: list[SlaveNode] = []
     for (name, node_id), serial in zip_longest(files, serial_numbers):
-        reading = check_eds(name, 1 if node_id == UNCONFIGURED else node_id)
+        reading = check_eds(name, 1 if node_id == UNCONFIGURED_ID else node_id)
         od = reading.usable()
-        speaks_lss = node_id == UNCONFIGURED or od.device_information.LSS_supported
+        speaks_lss = node_id == UNCONFIGURED_ID or od.device_information.LSS_supported
         nodes.append(make_eds_node(od, node_id, eds=name if speaks_lss else None, serial=serial))
         if warnings := len(reading.warnings):
             check = f"canprobe eds check {name} --node-id {od.node_id}"
@@ -233,7 +233,7 @@ def _serve(
 
 def _named(nodes: Sequence[SlaveNode]) -> str:
     """Nodes by their ids, those without one by their LSS addresses."""
-    ids = sorted(node.node_id for node in nodes if node.node_id != UNCONFIGURED)
+    ids = sorted(node.node_id for node in nodes if node.node_id != UNCONFIGURED_ID)
     blank = [str(node.lss.address) for node in nodes if node.lss is not None and node.lss.unconfigured]
     with_ids = [f"nodes {', '.join(map(str, ids))}"] if ids else []
     return ", and ".join(with_ids + ([f"without an id {', '.join(blank)}"] if blank else []))
@@ -250,6 +250,6 @@ def _keep(nodes: Iterable[SlaveNode], folder: Path | None) -> None:
 
 def _file_name(node: SlaveNode) -> str:
     """By node id, or by serial number where the node has no id yet."""
-    if node.node_id != UNCONFIGURED:
+    if node.node_id != UNCONFIGURED_ID:
         return f"node{node.node_id:03}.json"
     return f"serial{node.dictionary.number(0x1018, 4):08x}.json"

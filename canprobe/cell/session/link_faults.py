@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.hardware import BusSettings
 from canprobe.fieldbus.bus.real.link import (
-    FAST_SAMPLE,
-    SLOW_BIT_S,
-    SLOW_SAMPLE,
-    TX_QUEUE,
+    FAST_SAMPLE_POINTS,
+    MAX_SLOW_BITRATE,
+    SLOW_SAMPLE_POINTS,
+    TX_QUEUE_FRAMES,
     VIRTUAL_KINDS,
     LinkState,
     emptying_line,
@@ -152,7 +152,7 @@ def _symptom(link: LinkState) -> str:
 
 
 def _sample_point(link: LinkState, expected: ExpectedLink) -> Iterator[Remark]:
-    low, best, high = SLOW_SAMPLE if expected.bitrate <= SLOW_BIT_S else FAST_SAMPLE
+    low, best, high = SLOW_SAMPLE_POINTS if expected.bitrate <= MAX_SLOW_BITRATE else FAST_SAMPLE_POINTS
     point = link.sample_point
     if point is not None and not low - 1e-3 <= point <= high + 1e-3:
         yield Remark(
@@ -175,5 +175,5 @@ def _queue(link: LinkState, expected: ExpectedLink) -> Iterator[Remark]:
         yield Remark(
             False,
             f"its queue holds {link.tx_queue} frames, and {expected.frames_at_once} may be sent at once;"
-            f" type: {ip_line(f'{link.name} txqueuelen {TX_QUEUE}')}",
+            f" type: {ip_line(f'{link.name} txqueuelen {TX_QUEUE_FRAMES}')}",
         )

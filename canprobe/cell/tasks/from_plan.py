@@ -12,7 +12,7 @@ from canprobe.cell.scene.setup import Calibrate, Free, Probe, Setup, Touch
 from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, replay_samples
 from canprobe.cell.tasks.touch import TouchTask
-from canprobe.fieldbus.protocol.tactile import WINDOW
+from canprobe.fieldbus.protocol.tactile import DEFAULT_WINDOW
 from canprobe.mechanics.touch.contact import indentation_from_force
 from canprobe.mechanics.touch.patch.array_calibration import CentroidErrors
 from canprobe.mechanics.touch.patch.array_models import make_image_model, make_patch_calibration
@@ -113,7 +113,7 @@ def _with_patch(task: Touch, estimator: Estimator, memory: float) -> Estimator:
 
     array = task.array
     patch = make_patch_calibration(array.calibration, array.pad)
-    windowed = array.mode == "window" and int(array.window) <= WINDOW
+    windowed = array.mode == "window" and int(array.window) <= DEFAULT_WINDOW
     model = make_image_model(array.calibration, patch, seen=int(array.window) if windowed else None)
     return PatchedEstimator(estimator, PatchCurvature(model, SIGMA_STIFFNESS), memory)
 

@@ -19,22 +19,22 @@ from types import TracebackType
 
 from canprobe.errors import UsageError, regular_file
 from canprobe.fieldbus.bus.files import writing
-from canprobe.fieldbus.bus.port import ControllerState, PlainPort, Port, TimedFrame
-from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EFF_FLAG, RTR_FLAG, Frame
+from canprobe.fieldbus.bus.port import ControllerState, PlainPort, Port, TimedFrame, nothing
+from canprobe.fieldbus.protocol.frames import BRS_FLAG, CLASSIC_BYTES, EFF_FLAG, EFF_MASK, RTR_FLAG, Frame
 
 # candump log files: `(0000000000.002500) can0 181#37060000`, time with six digits, from 0 in a recording of ours.
 # candump pads the channel on the left (several interfaces), writes nine digits with -N, the DLC of a frame of 8 bytes
 # behind "_" with -8, and a line of its own for lost frames with -d.
 
-_LINE = re.compile(
+_LINE_PATTERN = re.compile(
     r"\((?P<s>\d+)\.(?P<fraction>\d{6}(?:\d{3})?)\) +(?P<channel>\S+) (?:(?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#"
     r"(?:R(?:[0-7]?|8(?:_[9A-Fa-f])?)|#[0-9A-Fa-f](?P<fd>(?:[0-9A-Fa-f]{2}){0,64})|"
     r"(?P<data>(?:[0-9A-Fa-f]{2}){0,7}|(?:[0-9A-Fa-f]{2}){8}(?:_[9A-Fa-f])?))|"
     r"(?P<xl>[0-9A-Fa-f]{5}#[0-9A-Fa-f]{2}:[0-9A-Fa-f]{2}:[0-9A-Fa-f]{8}#(?:[0-9A-Fa-f]{2})*))(?: [RT])?|"
     r"DROPCOUNT: dropped (?P<dropped>\d+) CAN frames? on '(?P<socket>[^']+)' socket \(total drops \d+\)"
 )
-_ON_SCREEN = re.compile(r" *(?P<stamp>\([-0-9: .]+\))? *\S+ +(?:TX|RX)?[ \-BE]*[0-9A-Fa-f]{3,8} +\[ *\d+\].*")
-"""What candump prints without -l and -L: `(000.002500)  can0  181   [4]  37 06 00 00`."""
+_SCREEN_PATTERN = re.compile(r" *(?P<stamp>\([-0-9: .]+\))? *\S+ +(?:TX|RX)?[ \-BE]*[0-9A-Fa-f]{3,8} +\[ *\d+\].*")
+"""Line that candump prints without -l and -L: `(000.002500)  can0  181   [4]  37 06 00 00`."""
 _ENCODINGS = {
     b"\xff\xfe": "utf-16",
     b"\xfe\xff": "utf-16",
@@ -42,41 +42,36 @@ _ENCODINGS = {
     b"\0(": "utf-16-be",
     b"\xef\xbb": "utf-8-sig",
 }
-"""By the first two bytes; anything else is ASCII."""
+"""Encodings by the first two bytes; anything else is ASCII."""
 
 
-_BIT_RATE_SWITCH = 1
-_FRAMES = 32
-"""Frames that are kept as they are before they become lines, which is quicker for many at once."""
-_LINES = 256
-"""Lines that are joined before they go to the file."""
+_BUFFERED_FRAMES = 32
+"""Frames that are kept before they become lines together, which is quicker."""
+_BUFFERED_LINES = 256
+"""Lines that are kept before they are joined and go to the file."""
 
 
 Take = Callable[[Sequence[TimedFrame]], None]
-"""Takes frames, some at a time."""
-
-
-def _nobody(_: Sequence[TimedFrame]) -> None:
-    """Takes nothing."""
+"""Called with some frames at a time."""
 
 
 class CandumpWriter:
     """Writes frames as candump does; a context manager. Its `write` is a recorder for a `LockstepBus`.
 
-    A file that fails (full disk) ends the log after a whole line and raises nothing: whoever records a moving machine
-    looks at `failure`.
+    A file that fails (full disk) ends the log after a whole line and raises nothing, as a machine moves meanwhile: look
+    at `failure`.
 
     Args:
-        path: the file to write; an existing one is replaced.
-        channel: the name in each line.
-        t0_ns: the time on the frames' clock that is written as 0.
+        path: file to write; an existing one is replaced.
+        channel: name in each line.
+        t0_ns: time on the frames' clock that is written as 0.
 
     Raises:
         ResultsError: the file cannot be opened.
-        UsageError: somebody else writes this file just now.
+        UsageError: another run writes this file now.
 
     Attributes:
-        failure: why nothing is written any more; None while all is well.
+        failure: reason why nothing is written any more; None while there is none.
     """
 
     def __init__(self, path: str | Path, channel: str, t0_ns: int = 0) -> None:
@@ -87,16 +82,16 @@ class CandumpWriter:
             self._file = _opened_alone(path)
         self._size = 0
         self._frames: list[TimedFrame] = []  # of the channel that takes them
-        self._take: Take = _nobody
+        self._take: Take = nothing
         self._lines: list[str] = []
         self.write = self.on(channel)
 
-    def on(self, channel: str, also: Take = _nobody) -> Callable[[int, bytes, int], None]:
+    def on(self, channel: str, also: Take = nothing) -> Callable[[int, bytes, int], None]:
         """A recorder of the frames of one channel: called with (can_id, data, t_ns), it adds a line to this file.
 
         Args:
-            channel: the name in its lines.
-            also: takes the same frames.
+            channel: name in its lines.
+            also: function that takes the same frames.
         """
         form = _ChannelLines(channel, self._t0_ns).line
 
@@ -110,9 +105,9 @@ class CandumpWriter:
                 self._take = take
             frames = self._frames
             frames.append((can_id, data, t_ns))
-            if len(frames) >= _FRAMES:
+            if len(frames) >= _BUFFERED_FRAMES:
                 self._form_lines()
-                if len(self._lines) >= _LINES:
+                if len(self._lines) >= _BUFFERED_LINES:
                     self.flush()
 
         return write
@@ -122,7 +117,7 @@ class CandumpWriter:
         self._take(frames)
 
     def flush(self) -> None:
-        """Hand what was written to the file."""
+        """Write to the file what was recorded so far."""
         self._form_lines()
         data = "".join(self._lines).encode("ascii")
         self._lines.clear()
@@ -139,7 +134,7 @@ class CandumpWriter:
         self._size += written
 
     def close(self) -> None:
-        """Flush and close the file; twice is allowed."""
+        """Flush and close the file; it may be called twice."""
         if not self._file.closed:
             self.flush()
         self._file.close()
@@ -171,7 +166,7 @@ class _ChannelLines:
         if name is None:
             name = self._names[can_id] = f") {self._channel} {_format_id(can_id)}#"
         if len(data) > CLASSIC_BYTES:
-            payload = f"#{_BIT_RATE_SWITCH}{data.hex().upper()}"
+            payload = f"#{BRS_FLAG}{data.hex().upper()}"
         else:
             payload = "R" if can_id & RTR_FLAG else data.hex().upper()
         return f"{self._prefix}{us:06d}{name}{payload}\n"
@@ -200,21 +195,20 @@ def _opened_alone(path: str | Path) -> FileIO:
 
 
 CandumpLine = tuple[int, str, int, bytes]
-"""A frame of a log: t_ns, channel, can_id with the flags of `canprobe.fieldbus.bus.port`, data."""
+"""Frame of a log: t_ns, channel, can_id with the flags of `protocol.frames` and `bus.port`, data."""
 
 
 class CandumpReader:
-    """Reads a candump log, line by line: an iterable of `CandumpLine`. What is no CAN or CAN FD frame is counted.
+    """Reads a candump log line by line: an iterable of `CandumpLine`. Lines without a CAN or CAN FD frame are counted.
 
     Args:
-        path: the log, in ASCII, UTF-8 or UTF-16.
-        whole: a torn last line is an error like any other; else it is passed over, as a logger that is killed leaves
-            one.
+        path: path of the log, in ASCII, UTF-8 or UTF-16.
+        whole: whether a torn last line is an error; else it is passed over, as a logger that is killed leaves one.
 
     Attributes:
-        number: of the line that was read last, from 1.
-        lost: frames of each channel that candump did not receive (its option -d).
-        xl: CAN XL frames of each channel.
+        number: number of the line that was read last, from 1.
+        lost: number of frames that candump did not receive (its option -d), by channel.
+        xl: number of CAN XL frames, by channel.
     """
 
     def __init__(self, path: str | Path, *, whole: bool = False) -> None:
@@ -228,7 +222,7 @@ class CandumpReader:
         """Yield the frames.
 
         Raises:
-            UsageError: the file cannot be read, or a line is not one of candump's; with file and line number.
+            UsageError: the file cannot be read, or a line is none of candump; the message has file and line number.
         """
         try:
             file = self._opened()
@@ -236,7 +230,7 @@ class CandumpReader:
             with TextIOWrapper(file, encoding, errors="replace") as lines:
                 for self.number, line in enumerate(lines, 1):
                     text = line.rstrip("\r\n")
-                    match = _LINE.fullmatch(text)
+                    match = _LINE_PATTERN.fullmatch(text)
                     if match is None:
                         if text and (self._whole or line.endswith("\n")):
                             raise self._no_line(text)
@@ -250,7 +244,7 @@ class CandumpReader:
             raise UsageError(f"{self._path}: {error.strerror}") from error
 
     def _opened(self) -> BufferedReader:
-        """The file from its start; what comes through a pipe is kept, as it comes once."""
+        """The file from its start; the content of a pipe is kept, as it comes only once."""
         self.lost.clear()
         self.xl.clear()
         path = Path(self._path)
@@ -262,7 +256,7 @@ class CandumpReader:
 
     def _no_line(self, text: str) -> UsageError:
         where = f"{self._path}:{self.number}: no candump line: {text[:60]!r}"
-        if (shown := _ON_SCREEN.fullmatch(text)) is not None:
+        if (shown := _SCREEN_PATTERN.fullmatch(text)) is not None:
             short = re.fullmatch(r"\(\d{3}\.\d+\)", shown["stamp"] or "")
             stamps = " with stamps that are differences (-td) or count from its first frame (-tz)" if short else ""
             return UsageError(f"{where}; it is what candump prints on a screen{stamps}; record with `candump -l` or -L")
@@ -271,7 +265,7 @@ class CandumpReader:
 
 
 def read_candump(path: str | Path, *, whole: bool = False) -> Iterator[CandumpLine]:
-    """Read the frames of a candump log as they stand there: see `CandumpReader`."""
+    """Read the frames of a candump log in the order of its lines: see `CandumpReader`."""
     return iter(CandumpReader(path, whole=whole))
 
 
@@ -283,19 +277,19 @@ def _frame_of(match: re.Match[str]) -> CandumpLine:
 def _parse_id(match: re.Match[str]) -> int:
     can_id = int(match["id"], 16)
     if len(match["id"]) == 8:  # 29 bits, or an error frame, which carries its own flag in the text
-        can_id = can_id | EFF_FLAG if can_id <= 0x1FFFFFFF else can_id
+        can_id = can_id | EFF_FLAG if can_id <= EFF_MASK else can_id
     return can_id | RTR_FLAG if match["data"] is None and match["fd"] is None else can_id
 
 
 class RecordingPort(PlainPort):
-    """A `Port` that writes down what passes through it, sent frames with the time of sending.
+    """A `Port` that records what passes through it, sent frames with the time of sending.
 
     In real time a received frame is written when it is drained, with the time of its reception, so a line may be older
     than the line above it.
 
     Args:
-        port: the port to use.
-        write: called with (can_id, data, t_ns), such as `CandumpWriter.write`.
+        port: port to use.
+        write: recorder that is called with (can_id, data, t_ns), such as `CandumpWriter.write`.
     """
 
     def __init__(self, port: Port, write: Callable[[int, bytes, int], None]) -> None:
@@ -306,23 +300,23 @@ class RecordingPort(PlainPort):
 
     @property
     def state(self) -> ControllerState:
-        """That of the port."""
+        """State of the port's controller."""
         return self._port.state
 
     @property
     def descriptor(self) -> int | None:
-        """That of the port."""
+        """Descriptor of the port."""
         return self._port.descriptor
 
     def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
-        """Send `frames` and write them down, with `t_ns` where it is given."""
+        """Send `frames` and record them, with `t_ns` where it is given."""
         sent_ns = self.clock.now_ns() if t_ns is None else t_ns
         self._port.send_batch(frames)
         for can_id, data in frames:
             self._write(can_id, data, sent_ns)
 
     def drain(self) -> list[TimedFrame]:
-        """Return what arrived, written down."""
+        """Return what arrived, and record it."""
         frames = self._port.drain()
         for can_id, data, t_ns in frames:
             self._write(can_id, data, t_ns)

@@ -1,4 +1,4 @@
-"""canopen-python on a port: a master that somebody else wrote works with whatever is on the bus."""
+"""canopen-python on a port, so that a master that somebody else wrote works with the devices of a bus."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ class PortNetwork(canopen.Network):
     """A network of canopen-python that sends and receives through a port instead of python-can.
 
     It has no thread: frames are received after each one that is sent, and in `pass_time`. On a virtual bus a node
-    answers at once, so that SDO, PDO and NMT of canopen-python work as they do on a real bus. What waits for a frame
-    that nobody asked for (`wait_for_heartbeat`) waits in vain: let time pass instead, and read what came.
+    answers at once, so that SDO, PDO and NMT of canopen-python work as they do on a real bus. A function that waits for
+    a frame that nobody asked for (`wait_for_heartbeat`) waits in vain: let time pass instead, and read what came.
 
     Args:
         port: connection to the bus; it is closed by `disconnect`.
@@ -28,20 +28,20 @@ class PortNetwork(canopen.Network):
         self._pumped = PumpedNetwork(port, self._take)
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
-        """Send a frame, and receive what comes at once."""
+        """Send a frame, and receive the frames that come at once."""
         self._pumped.send_message(can_id | RTR_FLAG if remote else can_id, bytes(data))
         self.pass_time(0.0)
 
     def send_periodic(self, can_id: int, data: bytes, period: float, remote: bool = False) -> Any:
-        """Refused: nothing is sent by itself here.
+        """Refuse: a network without a thread sends nothing by itself.
 
         Raises:
-            NotImplementedError: always.
+            NotImplementedError: it is always raised.
         """
         raise NotImplementedError("a network without a thread sends nothing by itself: send in a loop with pass_time")
 
     def pass_time(self, seconds: float) -> None:
-        """Let time pass on the port's clock, and receive what comes."""
+        """Let time pass on the port's clock, and receive the frames that come."""
         self._pumped.pump_until(lambda: False, seconds)
 
     def disconnect(self) -> None:

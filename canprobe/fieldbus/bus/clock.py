@@ -1,4 +1,4 @@
-"""Two kinds of time behind one interface: virtual time that jumps, and the monotonic clock of the machine.
+"""Clocks: virtual time that jumps, and the monotonic clock of the machine, behind one interface.
 
 All times are integer nanoseconds. The cycle asks only for `now_ns` and `sleep_until_ns`; with a `VirtualClock` a
 sleep is a jump that runs everything due on the way, so a simulated second lasts as long as its computation.
@@ -32,7 +32,7 @@ class Driver(Protocol):
     """Something that lives in virtual time, such as a `LockstepBus`."""
 
     def next_deadline_ns(self) -> int | None:
-        """Return when it next has something to do, `None` if it only waits for others."""
+        """Return the time at which it next has something to do; `None` if it only waits for others."""
         ...
 
     def settle(self) -> None:
@@ -45,12 +45,12 @@ class Driver(Protocol):
 
 
 class VirtualClock:
-    """A clock that stands still until somebody waits, then jumps from one thing that is due to the next.
+    """A clock that stands still until somebody waits, then jumps from one deadline to the next.
 
     Several drivers (buses) may share one clock: they are settled at each instant in the order of their attachment.
 
     Args:
-        start_ns: the time at which the clock starts.
+        start_ns: time at which the clock starts.
     """
 
     __slots__ = ("_drivers", "_now_ns")
@@ -91,11 +91,11 @@ class VirtualClock:
         return True
 
     def move_ns(self, t_ns: int) -> None:
-        """Show `t_ns`, unless it is past; for a driver that runs."""
+        """Move the clock to `t_ns`, unless that is past; a running driver calls it."""
         self._now_ns = t_ns if t_ns > self._now_ns else self._now_ns
 
     def sleep_until_ns(self, t_ns: int) -> None:
-        """Run every driver up to and including `t_ns`; whoever is first runs alone until the next one is due."""
+        """Run every driver up to and including `t_ns`; the first one runs alone until the next one is due."""
         if len(self._drivers) == 1:
             self._drivers[0].run_until_ns(t_ns)
             self.move_ns(t_ns)
@@ -141,7 +141,7 @@ class MonotonicClock:
     def sleep_until_ns(self, t_ns: int) -> None:
         """Sleep until CLOCK_MONOTONIC shows `t_ns`; a signal handler that raises ends the sleep.
 
-        A time that is past costs a reading of the clock: the system call alone costs five in a virtual machine.
+        A time that is past costs one reading of the clock; the system call would cost five in a virtual machine.
         """
         now_ns = time.monotonic_ns()
         if now_ns >= t_ns:
@@ -158,13 +158,13 @@ class MonotonicClock:
 
 
 def epoch_now_ns() -> int:
-    """The time of day in ns since the Unix epoch, for what leaves this machine; nothing is decided by it."""
+    """Time of day in ns since the Unix epoch, for data that leave this machine; no decision uses it."""
     return time.time_ns()
 
 
 def elapsed_ns() -> int:
-    """A running count of real nanoseconds, to measure what something costs; never to decide anything.
+    """Running count of real nanoseconds, to measure costs; no decision uses it.
 
-    On a virtual clock too this is real time: the cost of a cycle is the same question in lockstep.
+    It is real time on a virtual clock too, so that the cost of a cycle is measured in lockstep as well.
     """
     return time.perf_counter_ns()

@@ -1,11 +1,10 @@
-"""A recorded bus whose clock was set while it was recorded (NTP, suspend): its frames with stamps that go on.
+"""Frames of a bus whose clock was set while it was recorded (NTP, suspend), with their stamps on one clock.
 
 The cell sends SYNC in one period, so the SYNCs of a channel show a clock that was set: their stamps go back, or leap
 over a pause in which nothing else was sent either, and go on from there for good. The lines keep their order, and all
-later stamps of that channel are shifted until SYNC goes on in its period. A clock that was set back by less than lines
-may be out of order shows by the SYNCs on both sides, counted in periods. Before the first SYNC a step back is mended,
-too, without the time that passed. Frames whose lines are in another order than their stamps stay so: whoever needs
-their order sorts them.
+later stamps of that channel are shifted until SYNC goes on in its period. A step back that is smaller than the disorder
+of lines shows by the SYNCs on both sides, counted in periods. A step back before the first SYNC is mended too, but
+without the time that passed. Frames whose lines are in another order than their stamps keep that order.
 """
 
 from __future__ import annotations
@@ -20,31 +19,31 @@ from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.candump import CandumpLine, CandumpReader
 from canprobe.fieldbus.protocol.frames import SYNC_ID
 
-DISORDER_NS = 10_000_000
-"""Lines may be in another order than their stamps by so much; the stamp of a SYNC that is older was set back."""
-STRAY_NS = 1_000_000_000
-"""A single SYNC that is older by more belongs nowhere."""
-PAUSE_NS = 500_000_000
-"""No frame of a running cell for so long: the recorder slept, or its clock was set forward."""
-_SYNCS_AFTER = 3
-"""SYNCs after a step that show that it is for good."""
-_PERIODS_LEFT = 20
-"""SYNC periods that a pause may leave to the SYNCs beside it; the bring-up of a cell takes longer."""
-_SYNCS_COUNTED = 12
-"""SYNCs on each side of a small step that say by how much."""
-_TIMELESS_NS = 100_000
-"""SYNCs that are nearer to each other, by the middle half of their stamps, have no stamps of a clock."""
-_MAX_REPORTED = 5
+MAX_DISORDER_NS = 10_000_000
+"""Largest difference of stamps by which lines may be out of order; a SYNC that is older by more was set back."""
+MIN_STRAY_NS = 1_000_000_000
+"""Age of a single SYNC from which on it belongs to no place in the log."""
+MIN_PAUSE_NS = 500_000_000
+"""Time without a frame of a running cell that shows that the recorder slept, or its clock was set forward."""
+_CONFIRMING_SYNCS = 3
+"""SYNCs after a step that show that it is permanent."""
+_MAX_PERIODS_LEFT = 20
+"""Most SYNC periods between a pause and the SYNCs beside it; the bring-up of a cell takes longer."""
+_COUNTED_SYNCS = 12
+"""SYNCs on each side of a small step that give its size."""
+_MIN_SYNC_DISTANCE_NS = 100_000
+"""Distance of SYNCs, by the middle half of their stamps, below which the stamps are of no clock."""
+_MAX_REPORTED_STEPS = 5
 
 
 @dataclass(frozen=True, slots=True)
 class ClockStep:
-    """A step of the clock in a log.
+    """Step of the clock in a log.
 
     Attributes:
-        line: of the first frame behind it.
-        channel: whose stamps step.
-        step_ns: by how much the clock was set, without the time that passed; negative: back.
+        line: number of the line of the first frame behind it.
+        channel: channel whose stamps step.
+        step_ns: step of the clock, without the time that passed; negative: back.
     """
 
     line: int
@@ -62,7 +61,7 @@ class ClockStep:
 
 @dataclass(slots=True)
 class _Leap:
-    """Between two lines of a channel: the second line's number, and its stamp less the latest before it."""
+    """Difference between two lines of a channel: number of the second, and its stamp less the latest before it."""
 
     line: int = 0
     ns: int = 0
@@ -80,7 +79,7 @@ class _Sync:
 
 @dataclass(slots=True)
 class _ChannelSyncs:
-    """What the first pass keeps of a channel."""
+    """Data of a channel that the first pass keeps."""
 
     latest_ns: int | None = None
     back: _Leap = field(default_factory=_Leap)
@@ -102,11 +101,11 @@ class _ChannelSyncs:
 def _are_early(syncs: list[_Sync], i: int, period: int) -> bool:
     """Whether the SYNCs from the i-th on are early for good, against those before, by more than half a period."""
     sides = []
-    for side in (range(max(i - _SYNCS_COUNTED, 0), i), range(i, min(i + _SYNCS_COUNTED, len(syncs)))):
+    for side in (range(max(i - _COUNTED_SYNCS, 0), i), range(i, min(i + _COUNTED_SYNCS, len(syncs)))):
         offsets = [syncs[k].t_ns - k * period for k in side]
         middle = round(median(offsets))
-        if 4 * sum(abs(offset - middle) <= period // 4 for offset in offsets) < 3 * _SYNCS_COUNTED:
-            return False  # too few that go on in their period: lines in another order, or the SYNCs of two masters
+        if 4 * sum(abs(offset - middle) <= period // 4 for offset in offsets) < 3 * _COUNTED_SYNCS:
+            return False  # too few go on in their period: lines are out of order, or the SYNCs are those of two masters
         sides.append(middle)
     return 2 * (sides[0] - sides[1]) > period
 
@@ -115,15 +114,15 @@ class RecordedBus:
     """The frames of a candump log, in the order of its lines, with stamps on one clock. It is read twice.
 
     Args:
-        path: the log, as for `CandumpReader`.
+        path: path of the log, as for `CandumpReader`.
 
     Attributes:
-        steps: where the clock was set, by line.
-        lost: frames of each channel that candump did not receive.
-        xl: CAN XL frames of each channel.
+        steps: steps of the clock, by line.
+        lost: number of frames that candump did not receive, by channel.
+        xl: number of CAN XL frames, by channel.
 
     Raises:
-        UsageError: as `CandumpReader`; the stamps are no times, or stand still where they step and step back.
+        UsageError: the file cannot be read, its stamps are no times, or the clock was set to and fro.
     """
 
     def __init__(self, path: Path) -> None:
@@ -151,39 +150,39 @@ class RecordedBus:
             yield t_ns + shift_of.get(channel, 0), channel, can_id, data
 
     def notes(self) -> list[str]:
-        """What was mended, as lines of a report."""
-        told = [step.text() for step in self.steps[:_MAX_REPORTED]]
-        more = len(self.steps) - _MAX_REPORTED
+        """Lines of a report on what was mended."""
+        told = [step.text() for step in self.steps[:_MAX_REPORTED_STEPS]]
+        more = len(self.steps) - _MAX_REPORTED_STEPS
         return [*told, f"and {more} more steps of the clock"] if more > 0 else told
 
     def _steps_of(self, channel: str, syncs: list[_Sync]) -> Iterator[ClockStep]:
-        """The steps of one channel; what shifts its stamps from which line on is kept."""
-        if len(syncs) <= _SYNCS_AFTER:
+        """The steps of one channel; the shift of its stamps is kept by the line from which on it holds."""
+        if len(syncs) <= _CONFIRMING_SYNCS:
             return
         self._refuse_no_times(channel, [sync.t_ns for sync in syncs])
         period = round(median(b.t_ns - a.t_ns for a, b in pairwise(syncs)))
         shift, first = 0, syncs[0]
-        if first.back.ns < -DISORDER_NS and first.back.ns + first.forward.ns < -DISORDER_NS:  # no stray frame
+        if first.back.ns < -MAX_DISORDER_NS and first.back.ns + first.forward.ns < -MAX_DISORDER_NS:  # no stray frame
             shift = self._shifts[channel, first.back.line] = -first.back.ns
             yield ClockStep(first.back.line, channel, first.back.ns)
         last_ns = first.t_ns + shift
         for i, sync in enumerate(syncs[1:], 1):
             at_ns = sync.t_ns + shift
-            if last_ns - DISORDER_NS <= at_ns < last_ns + period // 2 and _are_early(syncs, i, period):
+            if last_ns - MAX_DISORDER_NS <= at_ns < last_ns + period // 2 and _are_early(syncs, i, period):
                 step, line = last_ns + period - at_ns, sync.back.line or sync.line
                 shift += step
                 last_ns = at_ns + step
                 self._shifts[channel, line] = shift
                 yield ClockStep(line, channel, -step)
                 continue
-            pause = sync.forward.ns >= PAUSE_NS and at_ns - last_ns - sync.forward.ns <= _PERIODS_LEFT * period
-            if at_ns >= last_ns - DISORDER_NS and not pause:
+            pause = sync.forward.ns >= MIN_PAUSE_NS and at_ns - last_ns - sync.forward.ns <= _MAX_PERIODS_LEFT * period
+            if at_ns >= last_ns - MAX_DISORDER_NS and not pause:
                 last_ns = max(last_ns, at_ns)
                 continue
             leap = sync.forward if pause else sync.back
-            after = [later.t_ns + shift - k * period for k, later in enumerate(syncs[i : i + 1 + _SYNCS_AFTER])]
+            after = [later.t_ns + shift - k * period for k, later in enumerate(syncs[i : i + 1 + _CONFIRMING_SYNCS])]
             for_good = all((2 * t_ns > at_ns + last_ns) == pause for t_ns in after)
-            if not for_good and (pause or at_ns < last_ns - STRAY_NS):
+            if not for_good and (pause or at_ns < last_ns - MIN_STRAY_NS):
                 raise UsageError(
                     f"{self._path}:{sync.line}: the SYNC of {channel} is {abs(at_ns - last_ns) * 1e-9:.3f} s"
                     f" {'after' if pause else 'before'} the one above, and later ones are not: its clock was set to"
@@ -200,7 +199,7 @@ class RecordedBus:
     def _refuse_no_times(self, channel: str, stamps: list[int]) -> None:
         quarter = len(stamps) // 4
         middle = sorted(stamps)[quarter : len(stamps) - quarter]
-        if middle[-1] - middle[0] >= _TIMELESS_NS * (len(middle) // 2):
+        if middle[-1] - middle[0] >= _MIN_SYNC_DISTANCE_NS * (len(middle) // 2):
             return
         if stamps[0] == stamps[-1] == min(stamps) == max(stamps):
             what = "all the same, as candump -H writes them without stamps of the hardware"

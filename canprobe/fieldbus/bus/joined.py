@@ -1,4 +1,4 @@
-"""Several buses as one `Port`: what is sent goes to the bus of its receiver, what arrives comes in the order of time.
+"""Several buses as one `Port`: a frame goes to the bus of its receiver, and what arrives comes in the order of time.
 
 SYNC, NMT, TIME and the master's heartbeat go to all of them, so that one SYNC counts on every bus. A bus that is lost
 is reported once; then the others go on without it, so that their nodes can be stopped in an orderly way.
@@ -9,24 +9,25 @@ from __future__ import annotations
 import select
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
+from operator import itemgetter
 
 from canprobe.errors import InterfaceError
 from canprobe.fieldbus.bus.port import ControllerState, PlainPort, Port, PortCounters, TimedFrame
 from canprobe.fieldbus.protocol.frames import Frame
 
 _SLICE_NS = 200_000
-"""How long one bus without a descriptor is waited for before the others are looked at again."""
+"""Time that one bus without a descriptor is waited for before the others are checked again."""
 
 
 def wait_for_any(ports: Sequence[Port], until_ns: int) -> None:
     """Return as soon as `drain` of one of the ports may have something, at `until_ns` at the latest, or earlier.
 
     Args:
-        ports: at least one, all on one clock.
-        until_ns: on that clock.
+        ports: ports, at least one, all on one clock.
+        until_ns: latest time to return, on that clock.
 
     Raises:
-        InterfaceError: one is closed or lost.
+        InterfaceError: a port is closed or lost.
     """
     clock = ports[0].clock
     descriptors = [one for port in ports if (one := port.descriptor) is not None]
@@ -44,7 +45,7 @@ class JoinedPort(PlainPort):
     """A port on several buses.
 
     Args:
-        ports: by channel; all on one clock.
+        ports: ports by channel, all on one clock.
         routes: channel of each identifier that belongs to one bus alone.
     """
 
@@ -59,7 +60,7 @@ class JoinedPort(PlainPort):
 
     @property
     def counters(self) -> PortCounters:
-        """What has passed through all of them; each of them notices a step of the one wall clock."""
+        """Sum of the counters of all ports; a step of the wall clock, which each port notices, counts once."""
         every = [port.counters for port in self._ports.values()]
         total = PortCounters(*(sum(getattr(one, field.name) for one in every) for field in fields(PortCounters)))
         total.clock_steps = max(one.clock_steps for one in every)
@@ -71,11 +72,11 @@ class JoinedPort(PlainPort):
         return max(port.state for port in self._ports.values())
 
     def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
-        """Send each frame on the bus of its identifier, or on all.
+        """Send each frame on the bus of its identifier, or on all buses.
 
         Raises:
-            InterfaceError: a bus is down, closed, lost or stays full; the others have their frames. Each is reported
-                once, as long as there is another.
+            InterfaceError: a bus is down, closed, lost or stays full; the others have their frames. It is raised once
+                for each bus, as long as another one works.
         """
 
         def send(port: Port) -> None:
@@ -86,14 +87,14 @@ class JoinedPort(PlainPort):
         self._on_each(send)
 
     def send_on(self, channel: str, frames: Sequence[Frame]) -> None:
-        """Send frames on one bus, whoever else has their identifiers."""
+        """Send frames on one bus, whatever their identifiers."""
         self._on_each(lambda port: port.send_batch(frames) if port is self._ports[channel] else None)
 
     def drain(self) -> list[TimedFrame]:
         """Return every frame that has arrived on any bus, by time.
 
         Raises:
-            InterfaceError: as `send_batch`; what came on the others is kept for the next call.
+            InterfaceError: as for `send_batch`; frames of the other buses are kept for the next call.
         """
         self._take()
         frames, self._arrived = self._arrived, []
@@ -118,10 +119,10 @@ class JoinedPort(PlainPort):
             self._on_each(lambda port: new.extend(port.drain()))
         finally:
             if new:
-                self._arrived = sorted([*self._arrived, *new], key=_time)
+                self._arrived = sorted([*self._arrived, *new], key=itemgetter(2))  # by time
 
     def _on_each(self, act: Callable[[Port], None]) -> None:
-        """Do it on every bus, then raise the first failure that is news; on lost ones too, as they may come back."""
+        """Call `act` for every bus, lost ones too as they may come back; then raise the first failure that is new."""
         news: InterfaceError | None = None
         failed: set[str] = set()
         for name, port in self._ports.items():
@@ -139,12 +140,8 @@ class JoinedPort(PlainPort):
             raise last
 
 
-def _time(frame: TimedFrame) -> int:
-    return frame[2]
-
-
 def send_on(port: Port, channel: str, frames: Sequence[Frame]) -> None:
-    """Send frames on the bus of a channel, whether the port is on that one alone or on several."""
+    """Send frames on the bus of a channel, whether the port is on that bus alone or on several."""
     if isinstance(port, JoinedPort):
         port.send_on(channel, frames)
     else:

@@ -1,4 +1,4 @@
-"""LSS requests: find nodes without an id, one after another, and give each an id.
+"""LSS requests: find nodes without an id one after another, and give each an id.
 
 Source: CiA 305, "LSS services".
 """
@@ -9,7 +9,7 @@ from canprobe.errors import BusError
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.protocol.lss import (
     LSS_ANSWER_ID,
-    LSS_LENGTH,
+    LSS_BYTES,
     LSS_REQUEST_ID,
     PRESENCE_CHECK,
     LssAddress,
@@ -21,11 +21,11 @@ from canprobe.fieldbus.protocol.lss import (
     pack_number,
 )
 
-SETTLE_S = 0.005
-"""Wait after the first answer: several nodes may give the same answer to one question, one after another."""
-ANSWER_S = 0.5
-SEARCH_S = 0.05
-"""Time without an answer after which a question of fastscan counts as answered with no."""
+SETTLING_S = 0.005
+"""Time that is waited after the first answer, as several nodes may answer one question one after another."""
+ANSWER_TIMEOUT_S = 0.5
+SEARCH_TIMEOUT_S = 0.05
+"""Time without an answer after which the answer to a question of fastscan is no."""
 
 
 class LssAnswerError(BusError):
@@ -43,33 +43,33 @@ class Lss:
         self._send(pack_lss(LssCommand.SWITCH_GLOBAL, bytes((LssState.WAITING,))))
 
     def select(self, address: LssAddress) -> bool:
-        """Put the node of this address into configuration; whether it answered."""
+        """Put the node of this address into configuration; return whether it answered."""
         *first, last = [
             pack_number(LssCommand(LssCommand.SELECT_VENDOR + i), number) for i, number in enumerate(address.numbers)
         ]
         for message in first:
             self._send(message)
-        return bool(self._ask(last, ANSWER_S, LssCommand.SELECTED))
+        return bool(self._ask(last, ANSWER_TIMEOUT_S, LssCommand.SELECTED))
 
     def inquire_node_ids(self) -> list[int]:
-        """What all the nodes in configuration answer: one node id, unless several devices have one address."""
+        """Node ids of all nodes in configuration: one, unless several devices have one address."""
         command = LssCommand.INQUIRE_NODE_ID
-        return [answer[1] for answer in self._ask(pack_lss(command), ANSWER_S, command)]
+        return [answer[1] for answer in self._ask(pack_lss(command), ANSWER_TIMEOUT_S, command)]
 
     def configure_node_id(self, node_id: int) -> None:
         """Give the node in configuration its id.
 
         Raises:
-            LssAnswerError: it does not answer or refuses.
+            LssAnswerError: the node does not answer, or refuses.
         """
         if code := self._configure(LssCommand.CONFIGURE_NODE_ID, node_id):
             raise LssAnswerError(f"LSS error {code}")
 
     def store(self) -> bool:
-        """Let the node in configuration keep its id when its power goes; False where it does not support that.
+        """Let the node in configuration store its id over a power cycle; return False where it does not support that.
 
         Raises:
-            LssAnswerError: it does not answer or could not store it.
+            LssAnswerError: the node does not answer, or could not store its id.
         """
         if (code := self._configure(LssCommand.STORE)) > LssError.REFUSED:
             raise LssAnswerError(f"it could not store it: LSS error {code}")
@@ -79,13 +79,13 @@ class Lss:
         """Find the unconfigured node with the lowest address; it is in configuration afterwards.
 
         Returns:
-            Its address; None where nobody answers.
+            Its address; None where no node answers.
 
         Raises:
-            LssAnswerError: somebody answers, but to no address: answers were lost or came late.
+            LssAnswerError: nodes answer, but no address is found: answers were lost or came late.
         """
-        for timeout_s in (SEARCH_S, 5 * SEARCH_S):
-            if not self._identified(0, PRESENCE_CHECK, 0, 0, ANSWER_S):
+        for timeout_s in (SEARCH_TIMEOUT_S, 5 * SEARCH_TIMEOUT_S):
+            if not self._identified(0, PRESENCE_CHECK, 0, 0, ANSWER_TIMEOUT_S):
                 return None
             if (address := self._search(timeout_s)) is not None:
                 return address
@@ -101,7 +101,7 @@ class Lss:
             for bit in range(31, -1, -1):
                 if not self._identified(number, bit, position, position, timeout_s):
                     number |= 1 << bit
-            if not self._identified(number, 0, position, (position + 1) % 4, ANSWER_S):
+            if not self._identified(number, 0, position, (position + 1) % 4, ANSWER_TIMEOUT_S):
                 return None
             found.append(number)
         return LssAddress(*found)
@@ -110,7 +110,7 @@ class Lss:
         return bool(self._ask(pack_fastscan(number, bit, position, following), timeout_s, LssCommand.IDENTIFIED))
 
     def _configure(self, command: LssCommand, value: int = 0) -> int:
-        answers = self._ask(pack_lss(command, bytes((value,))), ANSWER_S, command)
+        answers = self._ask(pack_lss(command, bytes((value,))), ANSWER_TIMEOUT_S, command)
         if not answers:
             raise LssAnswerError(f"no answer to {command.name.lower().replace('_', ' ')}")
         return answers[0][1]
@@ -119,12 +119,12 @@ class Lss:
         self._network.send_message(LSS_REQUEST_ID, message)
 
     def _ask(self, message: bytes, timeout_s: float, command: LssCommand) -> list[bytes]:
-        """Send a question; the answers with this command that come."""
+        """Send a question; return the answers with this command."""
         network = self._network
         answers: list[bytes] = []
 
         def take(_id: int, data: bytes, _t_ns: int) -> None:
-            if len(data) == LSS_LENGTH:
+            if len(data) == LSS_BYTES:
                 answers.append(data)
 
         network.pump_until(lambda: True, 0.0)  # late answers to earlier questions
@@ -132,7 +132,7 @@ class Lss:
         try:
             self._send(message)
             if network.pump_until(lambda: bool(answers), timeout_s):
-                network.pump_until(lambda: False, SETTLE_S)
+                network.pump_until(lambda: False, SETTLING_S)
         finally:
             network.unsubscribe(LSS_ANSWER_ID, take)
         return [answer for answer in answers if answer[0] == command]

@@ -1,9 +1,9 @@
-"""What the cycle sees of a CAN bus: frames out in batches, frames in with their time, and a wait.
+"""A CAN bus as the cycle sees it: frames out in batches, frames in with their time, and a wait.
 
 A frame is `(can_id, data)`. Identifiers above 11 bits and remote requests carry the flags of Linux's `struct
 can_frame`: `EFF_FLAG` for a 29-bit identifier, `RTR_FLAG` for a remote request; plain data frames are the bare
 identifier. Error frames are never passed on as frames: a hardware port reads their class bits, counts bus errors and
-lost frames, shows its controller's state, and hands each of them to whoever writes a log.
+lost frames, shows its controller's state, and gives each of them to `Reports.error_frame`, for a log.
 
 Source: Linux include/uapi/linux/can/error.h (error classes).
 """
@@ -38,7 +38,7 @@ class ControllerState(IntEnum):
 
 
 def is_bus_error(can_id: int) -> bool:
-    """Whether this is an error frame of a frame that went wrong: protocol, acknowledgement or bit error.
+    """Whether an error frame reports a frame that went wrong: protocol, acknowledgement or bit error.
 
     A lost arbitration, which some drivers report every time, and a change of the controller's state do not count.
     """
@@ -67,17 +67,17 @@ def _of_controller(can_id: int, data: bytes) -> int:
 
 @dataclass(slots=True)
 class PortCounters:
-    """What a port has counted since it was opened.
+    """Counters of a port since it was opened.
 
     Attributes:
-        sent: frames handed to the bus.
-        received: data and remote frames given to the reader.
-        error_frames: bus errors, as error frames report them.
-        overruns: frames that were lost on this machine: dropped by the kernel because the reader was late, and
-            overflows of the controller's buffers.
-        transmit_full: times that the transmit queue was full, retries included.
-        ignored: frames that classic CAN cannot carry (CAN FD) and that were dropped.
-        clock_steps: times that the wall clock, by which the kernel stamps frames, was set.
+        sent: number of frames that were handed to the bus.
+        received: number of data and remote frames that were given to the reader.
+        error_frames: number of bus errors, as error frames report them.
+        overruns: number of frames that were lost on this machine: dropped by the kernel because the reader was late, or
+            lost in an overflow of the controller's buffers.
+        transmit_full: number of times that the transmit queue was full, with retries.
+        ignored: number of frames that classical CAN cannot carry (CAN FD) and that were dropped.
+        clock_steps: number of times that the wall clock, by which the kernel stamps frames, was set.
     """
 
     sent: int = 0
@@ -89,26 +89,26 @@ class PortCounters:
     clock_steps: int = 0
 
     def note_error(self, can_id: int, data: bytes) -> None:
-        """Count an error frame for what it is; an overflow is one lost frame, whichever way it was to go."""
+        """Count an error frame by its class; an overflow is one lost frame, received or sent."""
         self.error_frames += is_bus_error(can_id)
         self.overruns += bool(_of_controller(can_id, data) & _OVERFLOWS)
 
 
-def _nobody(*_: object) -> None:
-    """Hears nothing."""
+def nothing(*_: object) -> None:
+    """Do nothing, as a callback that nobody has set."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reports:
-    """Who hears what a port does not hand to its reader.
+    """Receivers of what a port does not give to its reader.
 
     Attributes:
-        error_frame: called with (can_id, data, t_ns) of every error frame.
-        say: called with each message for the user.
+        error_frame: function that is called with (can_id, data, t_ns) of every error frame.
+        say: function that is called with each message for the user.
     """
 
-    error_frame: Callable[[int, bytes, int], None] = _nobody
-    say: Callable[[str], None] = _nobody
+    error_frame: Callable[[int, bytes, int], None] = nothing
+    say: Callable[[str], None] = nothing
 
 
 class Port(Protocol):
@@ -116,22 +116,22 @@ class Port(Protocol):
 
     @property
     def clock(self) -> Clock:
-        """The clock on which this port waits and stamps."""
+        """Clock on which this port waits and stamps."""
         ...
 
     @property
     def channel(self) -> str:
-        """The bus's name, as in messages and logs."""
+        """Name of the bus in messages and logs."""
         ...
 
     @property
     def counters(self) -> PortCounters:
-        """What has passed since the port was opened."""
+        """Counters since the port was opened."""
         ...
 
     @property
     def state(self) -> ControllerState:
-        """The CAN controller's error state, as far as the port knows it."""
+        """Error state of the CAN controller, as far as the port knows it."""
         ...
 
     @property
@@ -152,8 +152,8 @@ class Port(Protocol):
         """Send `frames` in this order.
 
         Args:
-            frames: the frames.
-            t_ns: the present time, where the caller has just read it; only a port that writes down uses it.
+            frames: frames to send.
+            t_ns: present time, where the caller has just read it; only a port that records uses it.
 
         Raises:
             InterfaceError: the interface is down, closed, lost or stays full.
@@ -185,7 +185,7 @@ class Port(Protocol):
         ...
 
     def defer(self, can_ids: Collection[int]) -> None:
-        """Let frames with these 11-bit identifiers wake nobody, where the interface can: they come with the next other.
+        """Let frames with these 11-bit identifiers wake nobody, where the interface can; the next other brings them.
 
         Raises:
             InterfaceError: the port has filters, or the interface is lost.
@@ -193,7 +193,7 @@ class Port(Protocol):
         ...
 
     def close(self) -> None:
-        """Give the interface back; closing twice is allowed, everything else afterwards raises InterfaceError."""
+        """Give the interface back. A second call is allowed; every other call afterwards raises InterfaceError."""
         ...
 
 
@@ -202,7 +202,7 @@ class PlainPort:
 
     @property
     def descriptor(self) -> int | None:
-        """None: nothing but the port itself can wait for its frames."""
+        """None, as only the port itself can wait for its frames."""
         return None
 
     def wait_and_drain(self: Port, until_ns: int) -> list[TimedFrame]:
@@ -211,4 +211,4 @@ class PlainPort:
         return self.drain()
 
     def defer(self, can_ids: Collection[int]) -> None:
-        """Nothing: these frames wake the port too."""
+        """Do nothing: these frames wake the port too."""

@@ -1,4 +1,4 @@
-"""Who is there? One SDO read of 1000h to each node id, all at once; any answer counts, an abort too."""
+"""Nodes that are present: each node id gets an SDO read of 1000h, all at once; any answer counts, an abort too."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.protocol.frames import SDO_RX_BASE, SDO_TX_BASE
 
 SECOND_ANSWER_S = 0.05
-"""In which a second answer to one request is waited for: two devices have one node id."""
-UPLOAD_DEVICE_TYPE = bytes((0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0))
+"""Time in which a second answer to one request shows that two devices have one node id."""
+DEVICE_TYPE_REQUEST = bytes((0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0))
 BURST_FRAMES = 8
 BURST_PAUSE_S = 0.002
 
@@ -18,9 +18,9 @@ def answering_nodes(network: PumpedNetwork, node_ids: Iterable[int], timeout_s: 
     """Node ids, ascending, whose SDO server answers within the time-out.
 
     Args:
-        network: pumped meanwhile.
-        node_ids: whom to ask, 1–127.
-        timeout_s: after the last question.
+        network: network, which is pumped meanwhile.
+        node_ids: node ids to ask, 1–127.
+        timeout_s: time-out after the last question.
 
     Raises:
         InterfaceError: the interface failed.
@@ -36,7 +36,7 @@ def answering_nodes(network: PumpedNetwork, node_ids: Iterable[int], timeout_s: 
     try:
         for first in range(0, len(asked), BURST_FRAMES):
             network.port.send_batch(
-                [(SDO_RX_BASE + n, UPLOAD_DEVICE_TYPE) for n in asked[first : first + BURST_FRAMES]]
+                [(SDO_RX_BASE + n, DEVICE_TYPE_REQUEST) for n in asked[first : first + BURST_FRAMES]]
             )
             network.pump_until(lambda: len(found) == len(asked), BURST_PAUSE_S)
         network.pump_until(lambda: len(found) == len(asked), timeout_s)

@@ -1,8 +1,8 @@
 """A port that is read by whoever waits for an answer.
 
-Whoever waits pumps the port: it receives the frames itself, gives each to those that subscribed to its identifier and
-everything else to a callback, so that nothing is lost. Time-outs run on the port's clock; on a `LockstepBus` they cost
-no real time. It is not for the cycle, which has its own way to the port.
+Whoever waits pumps the port: it receives the frames itself, gives each to the subscribers of its identifier and every
+other one to a callback, so that nothing is lost. Time-outs run on the port's clock; on a `LockstepBus` they cost
+no real time. The cycle does not use it: it reads the port itself.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ Taker = Callable[[int, bytes, int], object]
 
 
 class PumpedNetwork:
-    """A port with subscribers, which receives only while somebody waits, or what it is fed.
+    """A port with subscribers; frames come only while somebody waits, or by `feed`.
 
     Args:
-        port: the connection to the bus; it is not closed with the network.
-        other: called with each frame that arrives during a wait and that nobody subscribed to.
+        port: connection to the bus; it is not closed with the network.
+        other: function that is called with each frame that arrives during a wait and has no subscriber.
     """
 
     def __init__(self, port: Port, other: Taker = lambda *_: None) -> None:
@@ -29,7 +29,7 @@ class PumpedNetwork:
         self._takers: dict[int, list[Taker]] = {}
 
     def subscribe(self, can_id: int, take: Taker) -> None:
-        """Let `take` have the frames of an identifier."""
+        """Call `take` with the frames of an identifier."""
         self._takers.setdefault(can_id, []).append(take)
 
     def unsubscribe(self, can_id: int, take: Taker) -> None:
@@ -53,7 +53,7 @@ class PumpedNetwork:
         """Receive until `done()`, at most `timeout_s` on the port's clock.
 
         Returns:
-            The last answer of `done`.
+            The last value of `done()`.
         """
         port = self.port
         deadline_ns = port.clock.now_ns() + round(timeout_s * 1e9)

@@ -1,10 +1,10 @@
 """SDO transfers to many nodes at once, over any `Port`, without threads.
 
-A *dialogue* is a generator: it yields the 8 bytes of a request, or None to wait on, and is sent the 8 bytes of each
-answer; an abort that it yields is sent, and nobody answers it. `upload` and `download` are parts of such dialogues
-(`yield from`). What a node needs is written as a plain sequence, and `hold_dialogues` waits for all nodes together: the
-accesses of one node come one after another, those of different nodes side by side. canopen's client is not used,
-because it waits for a thread and for one node at a time. `pumped` is how the port is read meanwhile.
+A *dialogue* is a generator. It yields the 8 bytes of a request, or None to wait further, and gets the 8 bytes of each
+answer; an abort that it yields is sent and not answered. `upload` and `download` are parts of dialogues (`yield from`).
+So the accesses to a node are written as a plain sequence, and `hold_dialogues` waits for all nodes together: the
+accesses to one node come one after another, those to different nodes side by side. The client of canopen is not used,
+because it waits for a thread and for one node at a time. `pumped` reads the port meanwhile.
 
 Source: CiA 301, SDO protocols (expedited download, expedited and segmented upload, abort).
 """
@@ -24,17 +24,18 @@ from canprobe.fieldbus.protocol.frames import SDO_RX_BASE, SDO_TX_BASE
 Dialogue = Generator[bytes | None, bytes, Any]
 """The transfers with one node."""
 
-_LENGTH = 8
-_ABORT, _DOWNLOADED, _UPLOADED, _SEGMENT, _EXPEDITED, _SIZED = 0x80, 0x60, 0x40, 0x00, 0x02, 0x01
-_MAX_EXPEDITED = 4
+_SDO_BYTES = 8
+_ABORT_COMMAND, _DOWNLOAD_ANSWER, _UPLOAD_ANSWER, _SEGMENT_ANSWER = 0x80, 0x60, 0x40, 0x00
+_EXPEDITED_FLAG, _SIZE_FLAG = 0x02, 0x01
+_MAX_EXPEDITED_BYTES = 4
 _NOT_TOGGLED, _TIMED_OUT, _OUT_OF_MEMORY = 0x05030000, 0x05040000, 0x05040005
 _TOO_LONG, _TOO_SHORT, _GENERAL = 0x06070012, 0x06070013, 0x08000000
 MAX_UPLOAD_BYTES = 4096
-"""Longest value that is read: names and numbers are far shorter. A node that sends more is not asked for the rest."""
-TRANSFER_TIMEOUTS = 10
+"""Longest value that is read; names and numbers are far shorter. The transfer of a longer one is aborted."""
+MAX_TRANSFER_TIMEOUTS = 10
 """Longest time of one transfer of several segments, in time-outs of one answer."""
-ROUND_S = 0.02
-"""How long the others wait for the slowest answer: asking again at once, low node ids would take the whole bus."""
+MAX_ROUND_S = 0.02
+"""Longest time that the others wait for the slowest answer; else requests to low node ids would fill the bus."""
 
 
 class SdoTimeoutError(SdoCommunicationError):
@@ -46,22 +47,22 @@ def download(index: int, subindex: int, data: bytes) -> Generator[bytes | None, 
 
     Raises:
         SdoAbortedError: the node refused.
-        SdoCommunicationError: no answer, or more than four bytes.
+        SdoCommunicationError: no answer came, or there are not one to four bytes.
     """
-    if not 0 < len(data) <= _MAX_EXPEDITED:
+    if not 0 < len(data) <= _MAX_EXPEDITED_BYTES:
         raise SdoCommunicationError(f"{index:04X}h:{subindex:02X} takes {len(data)} bytes; a concise write has 1 to 4")
-    command = 0x23 | (_MAX_EXPEDITED - len(data)) << 2
-    yield from _answered(bytes((command,)), index, subindex, data.ljust(4, b"\0"), _DOWNLOADED)
+    command = 0x23 | (_MAX_EXPEDITED_BYTES - len(data)) << 2
+    yield from _answered(bytes((command,)), index, subindex, data.ljust(4, b"\0"), _DOWNLOAD_ANSWER)
 
 
 def read_value(variable: ODVariable) -> Generator[bytes | None, bytes, Any]:
-    """Read an entry by its data type, in the entry's own length whatever the length of the answer.
+    """Read an entry by its data type, in the length of the entry, whatever the length of the answer.
 
     Many nodes answer with four bytes where the entry has one or two. The bytes beyond its length must be padding.
 
     Raises:
         SdoAbortedError: the node refused.
-        SdoCommunicationError: no answer, or one that does not fit the entry.
+        SdoCommunicationError: no answer came, or one that does not fit the entry.
     """
     size = len(variable) // 8
     data = yield from upload(variable.index, variable.subindex, size)
@@ -73,22 +74,22 @@ def read_value(variable: ODVariable) -> Generator[bytes | None, bytes, Any]:
     return variable.decode_raw(own)
 
 
-def upload(index: int, subindex: int, size: int = _MAX_EXPEDITED) -> Generator[bytes | None, bytes, bytes]:
+def upload(index: int, subindex: int, size: int = _MAX_EXPEDITED_BYTES) -> Generator[bytes | None, bytes, bytes]:
     """Read an entry of any length.
 
     Args:
-        index, subindex: of the entry.
-        size: bytes to take of an expedited answer that does not state how many of its four bytes are the value.
+        index, subindex: place of the entry.
+        size: number of bytes to take of an expedited answer that does not state how many of its four it uses.
 
     Raises:
         SdoAbortedError: the node refused.
-        SdoCommunicationError: no answer, one segment twice, more or fewer bytes than the node announced, or more than
-            `MAX_UPLOAD_BYTES`. The node got an abort.
+        SdoCommunicationError: no answer came, one segment came twice, or the node sent more or fewer bytes than it
+            announced, or more than `MAX_UPLOAD_BYTES`. The node gets an abort.
     """
-    answer = yield from _answered(b"\x40", index, subindex, bytes(4), _UPLOADED)
-    if answer[0] & _EXPEDITED:
-        return answer[4 : 8 - (answer[0] >> 2 & 3)] if answer[0] & _SIZED else answer[4 : 4 + size]
-    announced = int.from_bytes(answer[4:], "little") if answer[0] & _SIZED else None
+    answer = yield from _answered(b"\x40", index, subindex, bytes(4), _UPLOAD_ANSWER)
+    if answer[0] & _EXPEDITED_FLAG:
+        return answer[4 : 8 - (answer[0] >> 2 & 3)] if answer[0] & _SIZE_FLAG else answer[4 : 4 + size]
+    announced = int.from_bytes(answer[4:], "little") if answer[0] & _SIZE_FLAG else None
     return (yield from _segments(answer[1:4], announced))
 
 
@@ -106,8 +107,8 @@ def _answered(
 ) -> Generator[bytes | None, bytes, bytes]:
     multiplexer = index.to_bytes(2, "little") + bytes((subindex,))
     answer = yield command + multiplexer + data
-    while answer[1:4] != multiplexer or not (answer[0] == _ABORT or answer[0] & 0xE0 == expected):
-        answer = yield None  # a late one, to an earlier request: of this entry too, which is read after it was written
+    while answer[1:4] != multiplexer or not (answer[0] == _ABORT_COMMAND or answer[0] & 0xE0 == expected):
+        answer = yield None  # a late one, to an earlier request, maybe of the same entry
     _check_abort(answer)
     return answer
 
@@ -118,8 +119,8 @@ def _segments(multiplexer: bytes, announced: int | None) -> Generator[bytes | No
     data, toggle, last = b"", 0, False
     while not last:
         answer = yield bytes((0x60 | toggle,)) + bytes(7)
-        while not (answer[0] == _ABORT or answer[0] & 0xE0 == _SEGMENT):  # a late one, to the request that began this
-            answer = yield None
+        while answer[0] != _ABORT_COMMAND and answer[0] & 0xE0 != _SEGMENT_ANSWER:
+            answer = yield None  # a late one, to the request that began this transfer
         _check_abort(answer)
         if answer[0] & 0xF0 != toggle:
             yield from _give_up(multiplexer, _NOT_TOGGLED, "Toggle bit mismatch")
@@ -139,22 +140,22 @@ def _segments(multiplexer: bytes, announced: int | None) -> Generator[bytes | No
 
 
 def _give_up(multiplexer: bytes, code: int, why: str) -> Generator[bytes | None, bytes, NoReturn]:
-    """Tell the node that its transfer is over."""
+    """Abort the transfer of the node, and raise SdoCommunicationError."""
     yield _abort(multiplexer, code)
     raise SdoCommunicationError(f"transfer aborted: {why}")
 
 
 def _abort(multiplexer: bytes, code: int) -> bytes:
-    return bytes((_ABORT,)) + multiplexer + code.to_bytes(4, "little")
+    return bytes((_ABORT_COMMAND,)) + multiplexer + code.to_bytes(4, "little")
 
 
 def _check_abort(answer: bytes) -> None:
-    if answer[0] == _ABORT:
+    if answer[0] == _ABORT_COMMAND:
         raise SdoAbortedError(int.from_bytes(answer[4:], "little"))
 
 
 class _Talk:
-    """One dialogue under way."""
+    """One dialogue that is under way."""
 
     def __init__(self, network: PumpedNetwork, node_id: int, dialogue: Dialogue, timeout_ns: int, retries: int) -> None:
         self.node_id = node_id
@@ -167,18 +168,18 @@ class _Talk:
         self._timeout_ns = timeout_ns
         self._retries = retries
         self._request = b""
-        self._multiplexer = b""  # of the transfer: a request for a segment has none
-        self._end_ns = 0  # of the transfer
+        self._multiplexer = b""  # that of the transfer: a request for a segment has none
+        self._end_ns = 0  # latest end of the transfer
         self._tries = 0
         self._go_on(lambda: next(dialogue))
 
     def take(self, _id: int, data: bytes, _t_ns: int) -> None:
-        """Keep an answer; anything but 8 bytes is no SDO (CiA 301, 7.2.4.3)."""
-        if len(data) == _LENGTH and not self.over:
+        """Keep an answer; a frame of another length than 8 bytes is no SDO (CiA 301, 7.2.4.3)."""
+        if len(data) == _SDO_BYTES and not self.over:
             self.inbox.append(data)
 
     def serve(self) -> None:
-        """Hand the dialogue its answers; where none came in time, ask again or give up."""
+        """Give the dialogue its answers; where none came in time, ask again or give up."""
         while self.inbox and not self.over:
             answer = self.inbox.pop(0)
             self._go_on(lambda answer=answer: self._dialogue.send(answer))  # type: ignore[misc]
@@ -199,14 +200,14 @@ class _Talk:
     def _lateness(self) -> str:
         timeout_s = self._timeout_ns * 1e-9
         if self._asks_for_segment and self._network.port.clock.now_ns() >= self._end_ns:
-            return f"SDO transfer not complete after {TRANSFER_TIMEOUTS * timeout_s:g} s"
+            return f"SDO transfer not complete after {MAX_TRANSFER_TIMEOUTS * timeout_s:g} s"
         tries = f", {self._tries} times" if self._tries > 1 else ""
         return f"No SDO response received within {timeout_s:g} s{tries}"
 
     def _go_on(self, step: Callable[[], bytes | None]) -> None:
         try:
             request = step()
-            while request is not None and request[0] == _ABORT:
+            while request is not None and request[0] == _ABORT_COMMAND:
                 self._transmit(request)
                 request = next(self._dialogue)
         except StopIteration:
@@ -224,7 +225,7 @@ class _Talk:
             self.due_ns = min(self.due_ns, self._end_ns)
         else:
             self._multiplexer = self._request[1:4]
-            self._end_ns = self.due_ns + (TRANSFER_TIMEOUTS - 1) * self._timeout_ns
+            self._end_ns = self.due_ns + (MAX_TRANSFER_TIMEOUTS - 1) * self._timeout_ns
         self._transmit(self._request)
 
     def _transmit(self, data: bytes) -> None:
@@ -232,15 +233,15 @@ class _Talk:
 
 
 class Dialogues:
-    """Dialogues with several nodes at once, served by whoever receives the frames meanwhile: see `hold_dialogues`.
+    """Dialogues with several nodes at once, for a caller that receives the frames itself: see `hold_dialogues`.
 
     A context manager: the first requests go out on entering.
 
     Args:
-        network: it is pumped, or fed, by the caller.
-        dialogues: by node id; each catches the errors that it can go on after, any other ends them all.
-        timeout_s: for an answer.
-        retries: how often a request without an answer is sent again.
+        network: network, which the caller pumps or feeds.
+        dialogues: dialogues by node id; an error that one does not catch itself ends them all.
+        timeout_s: time-out of an answer.
+        retries: number of times that a request without an answer is sent again.
     """
 
     def __init__(
@@ -267,17 +268,17 @@ class Dialogues:
 
     @property
     def waiting(self) -> list[_Talk]:
-        """Those that are not over."""
+        """Dialogues that are not over."""
         return [talk for talk in self._talks if not talk.over]
 
     def serve(self) -> None:
-        """Hand each dialogue the answers that have come; where none came in time, ask again or give up."""
+        """Give each dialogue the answers that have come; where none came in time, ask again or give up."""
         for talk in self.waiting:
             talk.serve()
 
     @property
     def repeated(self) -> dict[int, int]:
-        """Requests that were sent again, by node id."""
+        """Number of requests that were sent again, by node id."""
         return {talk.node_id: talk.repeated for talk in self._talks}
 
 
@@ -287,17 +288,17 @@ def hold_dialogues(
     """Carry out dialogues with several nodes at once, on the predefined SDO channel.
 
     Args:
-        network: pumped meanwhile.
-        dialogues: by node id; each catches the errors that it can go on after, any other ends them all.
-        timeout_s: for an answer.
-        retries: how often a request without an answer is sent again.
+        network: network, which is pumped meanwhile.
+        dialogues: dialogues by node id; an error that one does not catch itself ends them all.
+        timeout_s: time-out of an answer.
+        retries: number of times that a request without an answer is sent again.
 
     Returns:
-        Requests that were sent again, by node id.
+        The number of requests that were sent again, by node id.
     """
     with Dialogues(network, dialogues, timeout_s=timeout_s, retries=retries) as held:
         while waiting := held.waiting:
             left_s = max(0, min(talk.due_ns for talk in waiting) - network.port.clock.now_ns()) * 1e-9
-            network.pump_until(lambda: all(talk.inbox for talk in waiting), min(left_s, ROUND_S))
+            network.pump_until(lambda: all(talk.inbox for talk in waiting), min(left_s, MAX_ROUND_S))
             held.serve()
     return held.repeated

@@ -1,8 +1,8 @@
 """Cyclic synchronous torque: 6071h + 60B2h, within 6072h, moves the motor against inertia and friction.
 
-The ideal plant follows references, so the drive works out what the torque does, from the motor's inertia, viscous
-and Coulomb friction at the joint (`MotorDynamics`), and gives the plant that motion. There is no gravity, no contact
-force and no coupling between the joints in it. Speed is cut to 607Fh and 6080h, and the motor waits at a software
+The ideal plant follows references. So the drive computes the motion that the torque causes, from inertia, viscous and
+Coulomb friction at the joint (`MotorDynamics`), and gives the plant that motion. Gravity, contact force and coupling
+between the joints are not in it. Speed is cut to 607Fh and 6080h, and the motor waits at a software
 limit; a cut of torque, speed or position sets bit 11. 6074h and 6077h show the torque that acts: the torque loop
 is ideal. Torques are in 1/1000 of the plant's rated torque, which 6076h shows to the master.
 Source: CiA 402-2, "Cyclic synchronous torque mode", objects 6071h, 6072h, 6074h, 6077h, 60B2h.
@@ -13,11 +13,9 @@ from __future__ import annotations
 from canprobe.fieldbus.drive.mode import CyclicMode, DriveParts
 from canprobe.fieldbus.drive.profile import torque_run
 from canprobe.fieldbus.node.entry import key_of
-from canprobe.fieldbus.protocol.cia402 import (
-    OperationMode,
-)
+from canprobe.fieldbus.protocol.cia402 import OperationMode
 
-_TORQUE_TARGET, _TORQUE_OFFSET = key_of(0x6071), key_of(0x60B2)
+_TORQUE_TARGET_KEY, _TORQUE_OFFSET_KEY = key_of(0x6071), key_of(0x60B2)
 
 
 class CyclicTorque(CyclicMode):
@@ -32,18 +30,18 @@ class CyclicTorque(CyclicMode):
         self._torque = 0
 
     def start(self, word: int, t_ns: int) -> None:
-        """No torque until a target comes."""
+        """Start without torque, until a target comes."""
         self._torque = 0
         super().start(word, t_ns)
 
     def leave(self, t_ns: int) -> None:
-        """The torque is the plant's again."""
+        """Show the torque of the plant again."""
         self._give_up()
 
     def latch(self, t_ns: int) -> None:
-        """Go on with the velocity that the last torque has left."""
+        """Follow the new torque from the velocity that the last one has left."""
         values, parameters, parts = self._values, self._parameters, self.parts
-        wanted = int(values[_TORQUE_TARGET]) + int(values.get(_TORQUE_OFFSET, 0))
+        wanted = int(values[_TORQUE_TARGET_KEY]) + int(values.get(_TORQUE_OFFSET_KEY, 0))
         self._torque = min(max(wanted, -parameters.max_torque), parameters.max_torque)
         parts.feedback.show_torque(lambda: self._torque)
         here, speed, (low, high) = self._motion.demand(t_ns), self._motion.speed(t_ns), parameters.fence

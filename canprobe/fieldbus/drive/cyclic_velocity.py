@@ -10,11 +10,9 @@ from __future__ import annotations
 from canprobe.fieldbus.drive.mode import CyclicMode
 from canprobe.fieldbus.drive.profile import uniform
 from canprobe.fieldbus.node.entry import key_of
-from canprobe.fieldbus.protocol.cia402 import (
-    OperationMode,
-)
+from canprobe.fieldbus.protocol.cia402 import OperationMode
 
-_VELOCITY_TARGET, _VELOCITY_OFFSET = key_of(0x60FF), key_of(0x60B1)
+_VELOCITY_TARGET_KEY, _VELOCITY_OFFSET_KEY = key_of(0x60FF), key_of(0x60B1)
 
 
 class CyclicVelocity(CyclicMode):
@@ -25,9 +23,10 @@ class CyclicVelocity(CyclicMode):
     needs = (key_of(target),)
 
     def latch(self, t_ns: int) -> None:
-        """Go on from where the reference is, with the new velocity."""
+        """Move the reference on from where it is, with the new velocity."""
         values, parameters = self._values, self._parameters
-        wanted = (int(values[_VELOCITY_TARGET]) + int(values.get(_VELOCITY_OFFSET, 0))) * self._units.speed_scale
+        target, offset = int(values[_VELOCITY_TARGET_KEY]), int(values.get(_VELOCITY_OFFSET_KEY, 0))
+        wanted = (target + offset) * self._units.speed_scale
         velocity = min(max(wanted, -parameters.max_speed), parameters.max_speed)
         self.parts.loop.feed_torque()
         here, (low, high) = self._motion.demand(t_ns), parameters.fence

@@ -1,8 +1,8 @@
 """A CiA 402 drive on one axis of the plant: states, faults, options, and which mode is active.
 
-Outside operation enabled the drive holds. It stops by itself when the master dies: in the cyclic modes when SYNC or
-targets are missing, in all modes when the heartbeat is. A change of mode under way slows the motion down by 6084h
-until the new mode is given a target.
+Outside operation enabled the drive holds its position. It stops by itself when the master is lost: in the cyclic modes
+when SYNC or targets are missing, in all modes when the heartbeat is. A change of mode under way slows the motion down
+by 6084h until the new mode gets a target.
 Source: CiA 402-2 (IEC 61800-7-201), finite state automaton, modes of operation.
 """
 
@@ -18,7 +18,7 @@ from canprobe.fieldbus.drive.mode import DriveParts
 from canprobe.fieldbus.drive.modes import make_modes
 from canprobe.fieldbus.drive.parameters import STAYING_QUICK_STOP_OPTIONS
 from canprobe.fieldbus.drive.reference import STEP_NS, AxisPlant
-from canprobe.fieldbus.drive.units import FACTORS, Delivery
+from canprobe.fieldbus.drive.units import FACTOR_INDICES, Delivery
 from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.entry import Value, key_of
 from canprobe.fieldbus.node.quirks import Quirks
@@ -34,15 +34,15 @@ from canprobe.fieldbus.protocol.cia402 import (
     Event,
     command_of,
 )
-from canprobe.fieldbus.protocol.emcy import FOLLOWING_ERROR, HEARTBEAT_LOST
+from canprobe.fieldbus.protocol.emcy import FOLLOWING_ERROR_CODE, HEARTBEAT_LOST_CODE
 from canprobe.fieldbus.protocol.frames import NmtState
 
-_STATUSWORD = key_of(0x6041)
-_VOLATILE = frozenset({0x6040, 0x6071, 0x607A, 0x60B0, 0x60B1, 0x60B2, 0x60C1, 0x60FF})
-_ABORT_COMMANDS = {2: DriveCommand.DISABLE_VOLTAGE, 3: DriveCommand.QUICK_STOP}  # of 6007h; 1 is a fault, 0 nothing
-_ENABLED = DriveState.OPERATION_ENABLED
-STAND_ALONE = Delivery()
-"""Of a drive that belongs to no cell."""
+_STATUSWORD_KEY = key_of(0x6041)
+_VOLATILE_INDICES = frozenset({0x6040, 0x6071, 0x607A, 0x60B0, 0x60B1, 0x60B2, 0x60C1, 0x60FF})
+_ABORT_COMMANDS = {2: DriveCommand.DISABLE_VOLTAGE, 3: DriveCommand.QUICK_STOP}  # by 6007h; 1 is a fault, 0 nothing
+_ENABLED_STATE = DriveState.OPERATION_ENABLED
+STAND_ALONE_DELIVERY = Delivery()
+"""State as delivered of a drive that belongs to no cell."""
 
 
 class DriveApplication(Application):
@@ -53,7 +53,7 @@ class DriveApplication(Application):
 
     Attributes:
         state: state of the finite state automaton.
-        parts: motion, feedback, supervision and parameters, from `attach` on.
+        parts: motion, feedback, supervision and parameters, which exist from `attach` on.
     """
 
     def __init__(
@@ -61,32 +61,32 @@ class DriveApplication(Application):
         axis: int,
         plant: AxisPlant,
         *,
-        delivery: Delivery = STAND_ALONE,
+        delivery: Delivery = STAND_ALONE_DELIVERY,
         incremental: bool = False,
         noise: Callable[[], float] | None = None,
     ) -> None:
         """Make the drive of one axis.
 
         Args:
-            axis: of the plant, 0-based.
-            plant: shared with the other nodes.
-            delivery: what its EDS does not say.
-            incremental: its encoder counts from 0 at every power on and node reset, wherever the motor is.
-            noise: what the encoder adds to a position, counts; None: nothing.
+            axis: number of the axis in the plant, 0-based.
+            plant: plant, which the nodes share.
+            delivery: settings that the EDS does not state.
+            incremental: whether the encoder counts from 0 at every power on and node reset, wherever the motor is.
+            noise: function for the noise that the encoder adds to a position, counts; None: there is none.
         """
         self._axis, self._plant, self._incremental, self._noise = axis, plant, incremental, noise
         self._delivery = delivery
         self.state = INITIAL_STATE
-        self._command: DriveCommand | None = None  # the one that stands
+        self._command: DriveCommand | None = None  # the present command
         self._word = 0  # the last controlword
-        self._idle_word: int | None = None  # the same if it did nothing and nothing has happened since
-        self._word_waits = False  # the active mode has not seen it yet
+        self._idle_word: int | None = None  # the same, if it had no effect and nothing has happened since
+        self._word_waits = False  # the active mode has not got it yet
         self._since_ns = 0  # when the mode took over
         self._standstill = False
         self._faults: list[int] = []
 
     def attach(self, node: SlaveNode) -> None:
-        """Hang the drive's objects on the node."""
+        """Connect the drive with the objects of the node."""
         self._node, self._core, self._values = node, node.core, node.dictionary.values
         self.parts = parts = DriveParts(
             node,
@@ -103,19 +103,17 @@ class DriveApplication(Application):
         self._mode = self._modes[0]
         self._take_word_soon = node.core.timers.new(self._take_word)
         self._pass_on_soon = node.core.timers.new(self._pass_on)
-        node.store.volatile |= _VOLATILE
+        node.store.volatile |= _VOLATILE_INDICES
         dictionary = node.dictionary
-        for index in FACTORS:
+        for index in FACTOR_INDICES:
             dictionary.on_check(index, self._check_not_moving)
         dictionary.on_write(0x6040, self._controlword)
         dictionary.on_read(0x6041, lambda _sub: self._take_word(self._core.now_ns))
         dictionary.on_check(0x6060, self._check_mode)
         dictionary.on_write(0x6060, lambda _sub, value: self._select_mode(int(value)))
 
-    # ------------------------------------------------------------------ the node's events
-
     def reset(self, t_ns: int) -> None:
-        """Power on: brake closed, faults and home forgotten, self-test passed at once."""
+        """Power on: close the brake, forget faults and home; the self-test is passed at once."""
         self._forget_faults()
         self._standstill = self._word_waits = False
         self._parameters.read()
@@ -132,29 +130,27 @@ class DriveApplication(Application):
         self._happen(Event.INITIALISED, t_ns)
 
     def entered(self, t_ns: int) -> None:
-        """NMT stop and the resets abort the connection; bit 9 follows operational."""
+        """Abort the connection at NMT stop and at resets; bit 9 follows operational."""
         if self._core.state in (NmtState.STOPPED, NmtState.INITIALISING):
             self.connection_lost(t_ns)
         self._show()
 
     def advance(self, t_ns: int) -> None:
-        """The plant moves on."""
+        """Let the plant move on."""
         self._plant.advance(t_ns)
 
     def connection_lost(self, t_ns: int) -> None:
-        """Act by 6007h."""
-        self._abort_connection(HEARTBEAT_LOST, t_ns)
+        """React as 6007h says."""
+        self._abort_connection(HEARTBEAT_LOST_CODE, t_ns)
 
     def sync(self, t_ns: int, counter: int) -> None:
-        """The mode watches and latches, one SYNC after it was enabled at the earliest."""
+        """Let the mode watch and latch, one SYNC after it was enabled at the earliest."""
         self._plant.begin(t_ns)
         counts = self.parts.feedback.measure(t_ns)
         if self._word_waits:
             self._take_word(t_ns)
-        if self.state is _ENABLED and t_ns > self._since_ns:
+        if self.state is _ENABLED_STATE and t_ns > self._since_ns:
             self._mode.sync(t_ns, counts)
-
-    # ------------------------------------------------------------------ controlword
 
     def _controlword(self, subindex: int, value: Value) -> None:
         if value == self._idle_word:
@@ -163,9 +159,9 @@ class DriveApplication(Application):
         if word != previous:
             self._take_word(now_ns)
             self._word = word
-        enabled = self.state is _ENABLED
+        enabled = self.state is _ENABLED_STATE
         self._obey(word, previous, now_ns)
-        if word != previous and enabled and self.state is _ENABLED:
+        if word != previous and enabled and self.state is _ENABLED_STATE:
             self._word_waits = True
             self._take_word_soon.arm(now_ns)
 
@@ -174,25 +170,23 @@ class DriveApplication(Application):
         command = command_of(word, previous)
         repeated, self._command = command is self._command, command
         goal = None if command is None else TRANSITIONS.get((self.state, command))
-        resumes = self.state is DriveState.QUICK_STOP_ACTIVE and goal is _ENABLED
+        resumes = self.state is DriveState.QUICK_STOP_ACTIVE and goal is _ENABLED_STATE
         if goal is None or (resumes and (repeated or self._parameters.quick_stop not in STAYING_QUICK_STOP_OPTIONS)):
             self._idle_word = word
             return  # a drive that stopped by itself is not restarted by a controlword that merely repeats
         self._go(goal, t_ns)
 
     def _take_word(self, t_ns: int) -> None:
-        """Let the active mode see the controlword that waits, if one does."""
+        """Give the active mode the controlword that waits, if there is one."""
         waits, self._word_waits = self._word_waits, False
         self._take_word_soon.cancel()
-        if waits and self.state is _ENABLED:
+        if waits and self.state is _ENABLED_STATE:
             self._mode.command(self._word, t_ns)
 
     def _pass_on(self, t_ns: int) -> None:
-        """Transition 4 after 3, when the controlword that switched on also enables."""
+        """Make transition 4 after 3, when the controlword that switched on also enables."""
         if self.state is DriveState.SWITCHED_ON and self._command is DriveCommand.ENABLE_OPERATION:
-            self._go(_ENABLED, t_ns)
-
-    # ------------------------------------------------------------------ mode of operation
+            self._go(_ENABLED_STATE, t_ns)
 
     def _check_mode(self, subindex: int, value: Value) -> None:
         if value not in self._modes:
@@ -200,7 +194,7 @@ class DriveApplication(Application):
 
     def _select_mode(self, number: int) -> None:
         mode = self._modes[number]
-        if mode is not self._mode and self.state is _ENABLED:
+        if mode is not self._mode and self.state is _ENABLED_STATE:
             t_ns = self._core.now_ns
             self._mode.leave(t_ns)
             self._motion.decelerate(t_ns, self._parameters.deceleration)
@@ -215,7 +209,7 @@ class DriveApplication(Application):
         self._show()
 
     def _start_mode(self, t_ns: int) -> None:
-        """The active mode takes over: operation is enabled, or the mode is new."""
+        """Start the active mode: operation is enabled, or the mode is new."""
         self._since_ns = t_ns
         self.parts.supervision.start(self._mode.target, t_ns)
         self._mode.start(self._word, t_ns)
@@ -224,10 +218,8 @@ class DriveApplication(Application):
         if self.state in POWERED_STATES:
             raise SdoAbort(Abort.DEVICE_STATE)
 
-    # ------------------------------------------------------------------ states
-
     def _happen(self, event: Event, t_ns: int) -> None:
-        """Something in the drive changes the state."""
+        """Change the state by an event in the drive."""
         goal = AUTOMATIC_TRANSITIONS.get((self.state, event))
         if goal is not None:
             self._go(goal, t_ns)
@@ -235,10 +227,10 @@ class DriveApplication(Application):
     def _go(self, new: DriveState, t_ns: int) -> None:
         old, self.state, self._idle_word = self.state, new, None
         self._standstill = False
-        if old is _ENABLED:
+        if old is _ENABLED_STATE:
             self._mode.leave(t_ns)
             self.parts.loop.close_brake()
-        if new is _ENABLED:
+        if new is _ENABLED_STATE:
             self._plant.begin(t_ns)
             here = self._motion.hold(t_ns)
             self.parts.loop.open_brake(t_ns)
@@ -249,7 +241,7 @@ class DriveApplication(Application):
         elif new is DriveState.FAULT_REACTION_ACTIVE:
             reacted = partial(self._happen, Event.FAULT_REACTION_DONE)
             self._motion.decelerate(t_ns, self._parameters.fault_rate, reacted)
-        elif old is _ENABLED:
+        elif old is _ENABLED_STATE:
             self._disable(t_ns)
         elif new is DriveState.SWITCHED_ON:
             self._pass_on_soon.arm(t_ns + STEP_NS)
@@ -257,12 +249,12 @@ class DriveApplication(Application):
             self._forget_faults()
         elif old is DriveState.QUICK_STOP_ACTIVE and self._motion.busy:
             self._motion.hold(t_ns)
-        if new is not _ENABLED:
+        if new is not _ENABLED_STATE:
             self.parts.supervision.stop()
         self._show()
 
     def _disable(self, t_ns: int) -> None:
-        """605Bh and 605Ch: on the slow-down ramp (1) or by the brake at once (0); disable voltage is the brake."""
+        """Stop by 605Bh or 605Ch: by the slow-down ramp (1) or the brake at once (0); disable voltage is the brake."""
         parameters = self._parameters
         options = {DriveState.READY_TO_SWITCH_ON: parameters.shutdown, DriveState.SWITCHED_ON: parameters.disable}
         if options.get(self.state) == 1 and parameters.deceleration:
@@ -279,43 +271,41 @@ class DriveApplication(Application):
 
     def _abort_connection(self, code: int, t_ns: int) -> None:
         option = self._parameters.abort_connection
-        if self.state is not _ENABLED:
+        if self.state is not _ENABLED_STATE:
             return
         if option == 1:
             self._find_fault(code, t_ns)
         elif option in _ABORT_COMMANDS:
-            self._go(TRANSITIONS[_ENABLED, _ABORT_COMMANDS[option]], t_ns)
+            self._go(TRANSITIONS[_ENABLED_STATE, _ABORT_COMMANDS[option]], t_ns)
 
     def _show(self) -> None:
-        """Put the statusword together; a change is an event for the PDOs that carry it."""
+        """Compose the statusword; a change is an event for the PDOs that carry it."""
         word = (
             cia402.statusword_of(self.state)
-            | 1 << cia402.VOLTAGE_ENABLED
-            | (self._core.state is NmtState.OPERATIONAL) << cia402.REMOTE
-            | self._standstill << cia402.TARGET_REACHED
-            | (FOLLOWING_ERROR in self._faults) << cia402.FOLLOWING_ERROR
+            | 1 << cia402.VOLTAGE_ENABLED_BIT
+            | (self._core.state is NmtState.OPERATIONAL) << cia402.REMOTE_BIT
+            | self._standstill << cia402.TARGET_REACHED_BIT
+            | (FOLLOWING_ERROR_CODE in self._faults) << cia402.FOLLOWING_ERROR_BIT
         )
-        if self.state is _ENABLED:
-            word |= self._mode.status() | self._mode.limited << cia402.INTERNAL_LIMIT
-        if word != self._values.get(_STATUSWORD):
+        if self.state is _ENABLED_STATE:
+            word |= self._mode.status() | self._mode.limited << cia402.INTERNAL_LIMIT_BIT
+        if word != self._values.get(_STATUSWORD_KEY):
             self._node.dictionary.put(0x6041, 0, word)
             self._node.pdos.event(0x6041)
 
-    # ------------------------------------------------------------------ faults
-
     def inject_fault(self, code: int) -> None:
-        """Let the drive detect a fault now: EMCY `code`, fault reaction, fault. Goes out at the next `advance`."""
+        """Let the drive detect a fault, at the next `advance`: EMCY `code`, fault reaction, fault."""
         self._core.timers.new(partial(self._find_fault, code)).arm(self._core.now_ns)
 
     def _find_fault(self, code: int, t_ns: int) -> None:
-        """A fault is present: report it, show it in 603Fh, and react."""
+        """Report a fault that is present, show it in 603Fh, and react."""
         self._faults.append(code)
         self._node.dictionary.put(0x603F, 0, code)
         self._node.emcy.report(code)
         self._happen(Event.FAULT_DETECTED, t_ns)
 
     def _forget_faults(self) -> None:
-        """Power on or fault reset."""
+        """Forget all faults, at power on or fault reset."""
         for code in self._faults:
             self._node.emcy.clear(code)
         self._faults.clear()
@@ -329,23 +319,23 @@ def make_drive_node(
     plant: AxisPlant,
     od_of: OdOf | None = None,
     *,
-    delivery: Delivery = STAND_ALONE,
+    delivery: Delivery = STAND_ALONE_DELIVERY,
     quirks: Quirks | None = None,
     incremental: bool = False,
     seed: int = 0,
 ) -> SlaveNode:
-    """A drive node on one axis of the plant.
+    """Make a drive node on one axis of the plant.
 
     Args:
-        od: of any CiA 402 EDS, for this node id.
-        node_id: 1–127, or 255 for none.
-        axis: of the plant, 0-based.
-        plant: shared by all nodes.
-        od_of: the EDS for another node id, where LSS may give the node one.
-        delivery: what its EDS does not say.
-        quirks: what makes it difficult; None: nothing.
-        incremental: it forgets its zero with the power and has to be homed.
-        seed: of the encoder's noise.
+        od: parsed EDS of any CiA 402 drive, for this node id.
+        node_id: node id, 1–127, or 255 for none.
+        axis: number of the axis in the plant, 0-based.
+        plant: plant, which all nodes share.
+        od_of: parser of the EDS for another node id, where LSS may give the node one.
+        delivery: settings that the EDS does not state.
+        quirks: difficulties of the node; None: it has none.
+        incremental: whether the drive forgets its zero with the power and has to be homed.
+        seed: seed of the noise of the encoder.
     """
     sigma = quirks.noise_counts if quirks is not None else 0.0
     noise = partial(random.Random(f"{seed} {axis}").gauss, 0.0, sigma) if sigma else None

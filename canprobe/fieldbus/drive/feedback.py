@@ -1,4 +1,4 @@
-"""What a drive reports of itself: actual and demand values, brought up to date only where somebody reads them.
+"""Actual and demand values that a drive reports, brought up to date only where somebody reads them.
 
 Positions and velocities are in the units of the factor group, torques in 1/1000 of the rated torque.
 Source: CiA 402-2, objects 6062h, 6064h, 606Bh, 606Ch, 6074h, 6077h, 60F4h, 60FDh.
@@ -13,26 +13,26 @@ from canprobe.fieldbus.drive.reference import AxisPlant, Motion
 from canprobe.fieldbus.drive.units import Units
 from canprobe.fieldbus.node.slave_node import SlaveNode
 
-_I16, _I32 = 1 << 15, 1 << 31
-_TORQUES = (0x6074, 0x6077)
-NEGATIVE_SWITCH, POSITIVE_SWITCH = 1, 2
-"""Bits of 60FDh."""
+_I16_LIMIT, _I32_LIMIT = 1 << 15, 1 << 31
+_TORQUE_INDICES = (0x6074, 0x6077)
+NEGATIVE_SWITCH_FLAG, POSITIVE_SWITCH_FLAG = 1, 2
+"""Flags of 60FDh."""
 
 
 class DriveFeedback:
     """Actual values of one axis.
 
     Args:
-        node: the drive's.
-        axis: of the plant, 0-based.
-        plant: shared with the other drives.
+        node: node of the drive.
+        axis: number of the axis in the plant, 0-based.
+        plant: plant, which the drives share.
         motion: reference of the axis.
-        units: of the drive.
-        noise: what the encoder adds to a position, counts; None: nothing.
+        units: units of the drive.
+        noise: function for the noise that the encoder adds to a position, counts; None: there is none.
 
     Attributes:
-        counts: motor position at the last `measure`.
-        plant_torque: returns the torque that the plant needs for its motion now, permille.
+        counts: motor position at the last `measure`, counts.
+        plant_torque: function for the torque that the plant needs for its motion now, permille.
     """
 
     def __init__(
@@ -61,17 +61,17 @@ class DriveFeedback:
         self.show_torque(self.plant_torque)
         for index in self._sources:
             if node.dictionary.has_index(index):
-                sample = self._sampler(index, _I16 if index in _TORQUES else _I32)
+                sample = self._sampler(index, _I16_LIMIT if index in _TORQUE_INDICES else _I32_LIMIT)
                 node.pdos.on_trigger(index, sample)
                 node.dictionary.on_read(index, lambda _sub, sample=sample: sample(self._core.now_ns))  # type: ignore[misc]
 
     def reset(self, t_ns: int) -> None:
-        """Velocity starts anew."""
+        """Forget the velocity."""
         self._t_ns = None
         self._velocity = 0.0
 
     def measure(self, t_ns: int) -> float:
-        """Position at `t_ns`, counts; the velocity is the mean since the last call."""
+        """Measure and return the position at `t_ns`, counts; the velocity is the mean since the last call."""
         last_ns = self._t_ns
         if t_ns != last_ns:
             self._plant.advance(t_ns)
@@ -84,24 +84,24 @@ class DriveFeedback:
         return self.counts
 
     def switch_positions(self) -> tuple[float, float]:
-        """Of the negative and the positive limit switch, counts: the negative one ends motion to lower positions."""
+        """Positions of the negative and positive limit switch, counts; the negative one stops motion downward."""
         low, high = self._plant.limit_switches(self._axis)
         return (low, high) if self._units.scale > 0.0 else (high, low)
 
     def switches(self) -> int:
-        """Which limit switches are active: bits 0 (negative) and 1 (positive) of 60FDh."""
+        """Active limit switches: bits 0 (negative) and 1 (positive) of 60FDh."""
         low, high = self._plant.limit_switches(self._axis)
         counts = self._plant.motor_counts(self._axis)
         below, above = counts <= low, counts >= high
         negative, positive = (below, above) if self._units.scale > 0.0 else (above, below)
-        return NEGATIVE_SWITCH * negative | POSITIVE_SWITCH * positive
+        return NEGATIVE_SWITCH_FLAG * negative | POSITIVE_SWITCH_FLAG * positive
 
     def show_torque(self, source: Callable[[], float]) -> None:
-        """Take the torque, permille, from `source` from now on: the plant's, or that of a mode that controls it."""
-        self._sources.update(dict.fromkeys(_TORQUES, source))
+        """Show the torque, permille, from `source` from now on: that of the plant, or of a mode that controls it."""
+        self._sources.update(dict.fromkeys(_TORQUE_INDICES, source))
 
     def _sampler(self, index: int, limit: int) -> Callable[[int], None]:
-        """What puts a value into the dictionary, as a whole number within +-limit."""
+        """The function that puts a value into the dictionary, as a whole number within ±limit."""
         values, key, sources, least, most = self._core.dictionary.values, index << 8, self._sources, -limit, limit - 1
 
         def sample(t_ns: int) -> None:

@@ -16,7 +16,7 @@ from canprobe.fieldbus.node.slave_node import SlaveNode
 
 
 def set_serial_number(node: SlaveNode, serial: int) -> None:
-    """Give a device its serial number, by which two of one EDS differ; a device without 1018h:04 has none."""
+    """Give a device its serial number, in which two devices of one EDS differ; without 1018h:04 it has none."""
     if key_of(0x1018, 4) in node.dictionary:
         node.dictionary.set_default(0x1018, 4, serial)
 
@@ -24,13 +24,13 @@ def set_serial_number(node: SlaveNode, serial: int) -> None:
 def make_eds_node(
     od: ObjectDictionary, node_id: int, *, eds: str | Path | None = None, serial: int | None = None
 ) -> SlaveNode:
-    """A conforming CiA 301 node with the values of its EDS; a CiA 402 drive moves an ideal axis.
+    """Make a conforming CiA 301 node with the values of its EDS; a CiA 402 drive moves an ideal axis.
 
     Args:
-        od: of any EDS, for this node id.
-        node_id: 1–127; or 255: it waits for LSS to give it one.
-        eds: the file, for a node that speaks LSS; None for one that does not.
-        serial: number for 1018h:04, in the place of the file's.
+        od: parsed EDS, for this node id.
+        node_id: node id, 1–127; with 255 the node waits for LSS to give it one.
+        eds: name or path of the EDS, for a node that speaks LSS; None for one that does not.
+        serial: serial number for 1018h:04, in the place of that of the file.
     """
     od_of = None if eds is None else partial(load_eds, eds)
     drive = is_drive(od)

@@ -6,13 +6,13 @@
     33, 34  first index pulse in negative or positive direction
     35, 37  the present position
 
-The switch is searched at 6099h:01; its edge and the pulses are passed at 6099h:02, all with 609Ah. Edge and pulse are
-caught by hardware, at their exact place, and then driven back to. The encoder gives one pulse a motor turn. There is no
-home switch: other methods are refused with 06090030h. Bits 13, 12, 10 of the statusword:
-000 under way, 001 not started or interrupted, 011 done, 100 error and moving, 101 error and at rest.
+The motor searches the switch at 6099h:01 and passes its edge and the pulses at 6099h:02, all with 609Ah. Hardware
+catches edge and pulse at their exact place; then the motor drives back to it. The encoder gives one pulse a motor turn.
+There is no home switch: other methods are refused with 06090030h. Bits 13, 12 and 10 of the statusword mean: 000 under
+way, 001 not started or interrupted, 011 done, 100 error and moving, 101 error and at rest.
 Zero is the home position *plus* the home offset, by the clause: at home the actual position is then -607Ch.
-An error is: no such method, a speed of 0, no switch within `SEARCH_S`, no pulse within two turns. Software limits do
-not act meanwhile.
+These are errors: an unknown method, a speed of 0, no switch within `MAX_SEARCH_S`, no pulse within two turns. Software
+limits do not act meanwhile.
 Source: CiA 402-2, "Homing mode", objects 607Ch, 6098h, 6099h, 609Ah.
 """
 
@@ -21,28 +21,28 @@ from __future__ import annotations
 from enum import Enum, auto
 from math import ceil, floor
 
-from canprobe.fieldbus.drive.feedback import NEGATIVE_SWITCH, POSITIVE_SWITCH
-from canprobe.fieldbus.drive.mode import REACHED, DriveParts, ProfiledMode
+from canprobe.fieldbus.drive.feedback import NEGATIVE_SWITCH_FLAG, POSITIVE_SWITCH_FLAG
+from canprobe.fieldbus.drive.mode import REACHED_FLAG, DriveParts, ProfiledMode
 from canprobe.fieldbus.drive.profile import Rates
 from canprobe.fieldbus.drive.reference import STEP_NS
 from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.entry import Value, key_of
-from canprobe.fieldbus.protocol.cia402 import HOMING_ATTAINED, HOMING_ERROR, HOMING_START, OperationMode
+from canprobe.fieldbus.protocol.cia402 import HOMING_ATTAINED_BIT, HOMING_ERROR_BIT, HOMING_START_BIT, OperationMode
 
 PRESENT_POSITION_METHODS = frozenset({35, 37})
 INDEX_DIRECTIONS = {33: -1, 34: 1}
 SWITCH_DIRECTIONS = {1: -1, 2: 1, 17: -1, 18: 1}
-SWITCH_AND_INDEX = frozenset({1, 2})
+SWITCH_AND_INDEX_METHODS = frozenset({1, 2})
 HOMING_METHODS = frozenset({0, *PRESENT_POSITION_METHODS, *INDEX_DIRECTIONS, *SWITCH_DIRECTIONS})
-SEARCH_TURNS = 2.0
-SEARCH_S = 180.0
-"""Time at full speed in which a limit switch has to be found, or left."""
-_METHOD = key_of(0x6098)
-_TO_SWITCH, _TO_ZERO = 1, 2  # sub-indices of 6099h
+MAX_SEARCH_TURNS = 2.0
+MAX_SEARCH_S = 180.0
+"""Longest time at full speed to find a limit switch, or to leave it."""
+_METHOD_KEY = key_of(0x6098)
+_SWITCH_SPEED_SUB, _ZERO_SPEED_SUB = 1, 2  # sub-indices of 6099h
 
 
 class HomingPhase(Enum):
-    """Where a homing run is."""
+    """Phases of a homing run."""
 
     IDLE = auto()
     TO_SWITCH = auto()
@@ -53,30 +53,30 @@ class HomingPhase(Enum):
     FAILED = auto()
 
 
-_BITS = {HomingPhase.DONE: REACHED | 1 << HOMING_ATTAINED, HomingPhase.FAILED: 1 << HOMING_ERROR}
-_UNDER_WAY = frozenset({HomingPhase.TO_SWITCH, HomingPhase.OFF_SWITCH, HomingPhase.TO_PULSE, HomingPhase.RETURNING})
+_PHASE_BITS = {HomingPhase.DONE: REACHED_FLAG | 1 << HOMING_ATTAINED_BIT, HomingPhase.FAILED: 1 << HOMING_ERROR_BIT}
+_MOVING_PHASES = frozenset({HomingPhase.TO_SWITCH, HomingPhase.OFF_SWITCH, HomingPhase.TO_PULSE, HomingPhase.RETURNING})
 
 
 class HomingMode(ProfiledMode):
     """Mode 6."""
 
     number = OperationMode.HOMING
-    needs = (_METHOD,)
+    needs = (_METHOD_KEY,)
 
     def __init__(self, parts: DriveParts) -> None:
         super().__init__(parts)
         self._phase = HomingPhase.IDLE
         self._method = 0
-        self._direction = 1  # in which the edge or the pulse is passed, of the motor
-        self._passed = self._home = 0.0  # counts: behind which the pulse comes; the home position
+        self._direction = 1  # direction of the motor in which it passes the edge or the pulse
+        self._passed = self._home = 0.0  # counts: position before the pulse; the home position
         parts.node.dictionary.on_check(0x6098, _check_method)
 
     def reset(self) -> None:
-        """Power on: not homed."""
+        """Power on: the drive is not homed."""
         self._phase = HomingPhase.IDLE
 
     def start(self, word: int, t_ns: int) -> None:
-        """A drive that was homed stays so."""
+        """Start; a drive that was homed stays homed."""
         if self._phase is not HomingPhase.DONE:
             self._phase = HomingPhase.IDLE
         super().start(word, t_ns)
@@ -84,26 +84,26 @@ class HomingMode(ProfiledMode):
             self._motion.decelerate(t_ns, self._parameters.deceleration, self._at_standstill)
 
     def leave(self, t_ns: int) -> None:
-        """A run under way is given up."""
+        """Give up a run that is under way."""
         self._give_up()
 
     def status(self) -> int:
-        """Homing attained, error, and target reached (when at rest)."""
+        """Bits for homing attained, error, and target reached, when at rest."""
         rests = self._standstill and self._phase in (HomingPhase.IDLE, HomingPhase.FAILED)
-        return _BITS.get(self._phase, 0) | REACHED * rests
+        return _PHASE_BITS.get(self._phase, 0) | REACHED_FLAG * rests
 
     def bits(self, word: int, changed: int, t_ns: int) -> None:
-        """Bit 4 starts, and interrupts when it is taken away."""
-        starts = word >> HOMING_START & 1
-        if changed >> HOMING_START & 1 and not self.halted:
+        """Start with bit 4, and interrupt the run when it is cleared."""
+        starts = word >> HOMING_START_BIT & 1
+        if changed >> HOMING_START_BIT & 1 and not self.halted:
             if starts:
                 self._begin(t_ns)
-            elif self._phase in _UNDER_WAY:
+            elif self._phase in _MOVING_PHASES:
                 self._stop(HomingPhase.IDLE, t_ns)
 
     def resume(self, t_ns: int) -> None:
-        """With bit 4 still set, homing starts again."""
-        if self._word >> HOMING_START & 1:
+        """Start homing again, if bit 4 is still set."""
+        if self._word >> HOMING_START_BIT & 1:
             self._begin(t_ns)
 
     def _halt(self, t_ns: int) -> None:
@@ -112,33 +112,31 @@ class HomingMode(ProfiledMode):
 
     def _give_up(self) -> None:
         self._timer.cancel()
-        if self._phase in _UNDER_WAY:
+        if self._phase in _MOVING_PHASES:
             self._phase = HomingPhase.IDLE
 
-    # ------------------------------------------------------------------ a run
-
     def _begin(self, t_ns: int) -> None:
-        self._method, self._standstill = int(self._values.get(_METHOD, 0)), False
+        self._method, self._standstill = int(self._values.get(_METHOD_KEY, 0)), False
         positive = 1 if self._units.scale > 0.0 else -1
         here = self.parts.feedback.measure(t_ns)
         if self._method in PRESENT_POSITION_METHODS:
             self._motion.decelerate(t_ns, self._parameters.homing_acceleration)
             self._home = here
             self._attain(t_ns)
-        elif self._method in INDEX_DIRECTIONS and self._speed(_TO_ZERO) > 0.0:
+        elif self._method in INDEX_DIRECTIONS and self._speed(_ZERO_SPEED_SUB) > 0.0:
             self._direction = INDEX_DIRECTIONS[self._method] * positive
             self._seek_pulse(here, t_ns)
-        elif self._method in SWITCH_DIRECTIONS and min(self._speed(_TO_SWITCH), self._speed(_TO_ZERO)) > 0.0:
+        elif self._method in SWITCH_DIRECTIONS and all(map(self._speed, (_SWITCH_SPEED_SUB, _ZERO_SPEED_SUB))):
             self._direction = -SWITCH_DIRECTIONS[self._method] * positive  # away from the switch
             if self._on_switch():
                 self._leave_switch(here, t_ns)
             else:
                 self._phase = HomingPhase.TO_SWITCH
-                reach = SEARCH_S * self._speed(_TO_SWITCH)
-                self._drive_to(here - self._direction * reach, t_ns, _TO_SWITCH)
+                reach = MAX_SEARCH_S * self._speed(_SWITCH_SPEED_SUB)
+                self._drive_to(here - self._direction * reach, t_ns, _SWITCH_SPEED_SUB)
         else:
             self._stop(HomingPhase.FAILED, t_ns)
-        if self._phase in _UNDER_WAY:
+        if self._phase in _MOVING_PHASES:
             self._timer.arm(t_ns + STEP_NS)
 
     def watch(self, t_ns: int, counts: float) -> None:
@@ -147,7 +145,7 @@ class HomingMode(ProfiledMode):
             self._leave_switch(counts, t_ns)
         elif self._phase is HomingPhase.OFF_SWITCH and not self._on_switch():
             edge = self.parts.feedback.switch_positions()[SWITCH_DIRECTIONS[self._method] > 0]
-            if self._method in SWITCH_AND_INDEX:
+            if self._method in SWITCH_AND_INDEX_METHODS:
                 self._seek_pulse(edge, t_ns)
             else:
                 self._return_to(edge, t_ns)
@@ -157,22 +155,22 @@ class HomingMode(ProfiledMode):
                 self._return_to(pulse, t_ns)
 
     def _on_switch(self) -> bool:
-        wanted = NEGATIVE_SWITCH if SWITCH_DIRECTIONS[self._method] < 0 else POSITIVE_SWITCH
+        wanted = NEGATIVE_SWITCH_FLAG if SWITCH_DIRECTIONS[self._method] < 0 else POSITIVE_SWITCH_FLAG
         return bool(self.parts.feedback.switches() & wanted)
 
     def _leave_switch(self, counts: float, t_ns: int) -> None:
         self._phase = HomingPhase.OFF_SWITCH
-        self._drive_to(counts + self._direction * SEARCH_S * self._speed(_TO_ZERO), t_ns)
+        self._drive_to(counts + self._direction * MAX_SEARCH_S * self._speed(_ZERO_SPEED_SUB), t_ns)
 
     def _seek_pulse(self, passed: float, t_ns: int) -> None:
         self._phase, self._passed = HomingPhase.TO_PULSE, passed
-        self._drive_to(passed + self._direction * SEARCH_TURNS * self._units.turn, t_ns)
+        self._drive_to(passed + self._direction * MAX_SEARCH_TURNS * self._units.turn, t_ns)
 
     def _return_to(self, home: float, t_ns: int) -> None:
         self._phase, self._home = HomingPhase.RETURNING, home
         self._drive_to(home, t_ns)
 
-    def _drive_to(self, counts: float, t_ns: int, speed: int = _TO_ZERO) -> None:
+    def _drive_to(self, counts: float, t_ns: int, speed: int = _ZERO_SPEED_SUB) -> None:
         rate = self._parameters.homing_acceleration
         self._motion.move(counts, t_ns, Rates(self._speed(speed), rate, rate), self._arrived)
 
@@ -202,7 +200,7 @@ class HomingMode(ProfiledMode):
 
 
 def next_pulse(counts: float, direction: int, turn: float) -> float:
-    """The next index pulse behind `counts`, in a direction; one that lies right there has been passed."""
+    """Position of the next index pulse behind `counts`, in a direction; a pulse right there has been passed."""
     turns = counts / turn
     return (floor(turns) + 1 if direction > 0 else ceil(turns) - 1) * turn
 

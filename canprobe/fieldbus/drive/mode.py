@@ -1,7 +1,8 @@
-"""What every mode of operation shares: the parts of the drive, halt, and the bits of controlword and statusword.
+"""Base classes of the modes of operation: parts of the drive, halt, and the bits of controlword and statusword.
 
-A mode lives between `start` and `leave`, in operation enabled only. One more mode is a class that derives from
-`CyclicMode` if it has a target for every SYNC, or from `ProfiledMode` if it makes its own way; `modes.MODES` lists it.
+A mode is active between `start` and `leave`, in operation enabled only. A new mode is a class that derives from
+`CyclicMode` if it has a target for every SYNC, or from `ProfiledMode` if it makes its own profile; `modes.MODES` lists
+it.
 Source: CiA 402-2, controlword bits 4–6, 8 and 9, statusword bits 10–13, halt option code 605Dh.
 """
 
@@ -11,7 +12,7 @@ from collections.abc import Callable
 
 from canprobe.fieldbus.drive.feedback import DriveFeedback
 from canprobe.fieldbus.drive.loop import DriveLoop
-from canprobe.fieldbus.drive.parameters import PEAK_PERMILLE, DriveParameters
+from canprobe.fieldbus.drive.parameters import PEAK_TORQUE_PERMILLE, DriveParameters
 from canprobe.fieldbus.drive.reference import STEP_NS, AxisPlant, Motion
 from canprobe.fieldbus.drive.self_stop import Supervision
 from canprobe.fieldbus.drive.units import Delivery
@@ -19,24 +20,24 @@ from canprobe.fieldbus.node.entry import Value
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol import cia402
 from canprobe.fieldbus.protocol.cia402 import OperationMode
-from canprobe.fieldbus.protocol.emcy import FOLLOWING_ERROR
+from canprobe.fieldbus.protocol.emcy import FOLLOWING_ERROR_CODE
 
-REACHED = 1 << cia402.TARGET_REACHED
-FOLLOWS = 1 << cia402.DRIVE_FOLLOWS
+REACHED_FLAG = 1 << cia402.TARGET_REACHED_BIT
+FOLLOWS_FLAG = 1 << cia402.DRIVE_FOLLOWS_BIT
 
 
 class DriveParts:
     """The parts of one drive, which its application and its modes share.
 
     Args:
-        node: the drive's.
-        axis: of the plant, 0-based.
-        plant: shared with the other drives.
-        fault: `fault(code, t_ns)` when a mode has found one.
-        on_loss: `on_loss(code, t_ns)` when the master is taken for dead.
-        show: the mode's part of the statusword may have changed.
-        delivery: what its EDS does not say.
-        noise: of the encoder, counts; None: it has none.
+        node: node of the drive.
+        axis: number of the axis in the plant, 0-based.
+        plant: plant, which the drives share.
+        fault: function that is called as `fault(code, t_ns)` when a mode has found a fault.
+        on_loss: function that is called as `on_loss(code, t_ns)` when the master counts as lost.
+        show: function that is called when the mode's part of the statusword may have changed.
+        delivery: settings that the EDS does not state.
+        noise: function for the noise of the encoder, counts; None: there is none.
     """
 
     def __init__(
@@ -60,14 +61,14 @@ class DriveParts:
 
 
 class DriveMode:
-    """Mode 0, none: it stands still. Base of the others.
+    """Mode 0, none: the drive stands still. It is the base class of the others.
 
     Attributes:
-        number: in 6060h; bit number - 1 of 6502h.
+        number: number of the mode in 6060h; 6502h has bit number - 1 for it.
         needs: dictionary keys of the objects without which the EDS does not describe the mode.
-        target: index of the object that a cyclic mode lives by; None: SYNC and RPDOs are not watched.
-        limited: statusword bit 11.
-        halted: controlword bit 8.
+        target: index of the object that a cyclic mode needs in every cycle; None: SYNC and RPDOs are not watched.
+        limited: whether a value is limited, statusword bit 11.
+        halted: whether halt is commanded, controlword bit 8.
     """
 
     number = OperationMode.NONE
@@ -83,32 +84,32 @@ class DriveMode:
         self._word = 0
 
     def reset(self) -> None:
-        """Power on."""
+        """Forget everything, at power on."""
 
     def start(self, word: int, t_ns: int) -> None:
-        """The mode takes over; the reference stands, or slows down. `word` is the present controlword."""
+        """Take over; the reference is at rest, or slows down. `word` is the present controlword."""
         self._word = word
         self.limited = self._standstill = False
-        self.halted = bool(word >> cia402.HALT & 1)
+        self.halted = bool(word >> cia402.HALT_BIT & 1)
         if self.halted:
             self._halt(t_ns)
 
     def leave(self, t_ns: int) -> None:
-        """Another mode takes over, or operation is disabled."""
+        """Give up, as another mode takes over or operation is disabled."""
         self.parts.loop.release()
 
     def sync(self, t_ns: int, counts: float) -> None:
-        """A SYNC; the motor is at `counts`."""
+        """Act on a SYNC; the motor is at `counts`."""
 
     def status(self) -> int:
         """Bits 10, 12 and 13 of the statusword."""
-        return REACHED if self._standstill else 0
+        return REACHED_FLAG if self._standstill else 0
 
     def command(self, word: int, t_ns: int) -> None:
-        """The controlword changed; all values that came with it are stored."""
+        """Act on a new controlword; all values that came with it are stored."""
         changed, self._word = word ^ self._word, word
-        if changed >> cia402.HALT & 1:
-            self.halted = bool(word >> cia402.HALT & 1)
+        if changed >> cia402.HALT_BIT & 1:
+            self.halted = bool(word >> cia402.HALT_BIT & 1)
             if self.halted:
                 self._halt(t_ns)
             else:
@@ -118,10 +119,10 @@ class DriveMode:
         self.parts.show()
 
     def bits(self, word: int, changed: int, t_ns: int) -> None:
-        """The controlword's bits beside halt."""
+        """Act on the bits of the controlword other than halt."""
 
     def resume(self, t_ns: int) -> None:
-        """Halt is over."""
+        """Go on, as halt is over."""
 
     def _halt(self, t_ns: int) -> None:
         self._motion.decelerate(t_ns, self._parameters.halt_rate, self._at_standstill)
@@ -136,12 +137,12 @@ class DriveMode:
             self.parts.show()
 
     def _strains(self) -> bool:
-        """Whether the motion takes all of 6072h, or more, which an ideal plant gives all the same."""
+        """Whether the motion takes all of 6072h, or more, which an ideal plant gives nevertheless."""
         limit = self._parameters.max_torque
-        return limit < PEAK_PERMILLE and abs(self.parts.feedback.plant_torque()) >= limit
+        return limit < PEAK_TORQUE_PERMILLE and abs(self.parts.feedback.plant_torque()) >= limit
 
     def _lags(self, t_ns: int, counts: float) -> bool:
-        """Watch the following error; True when it has become a fault."""
+        """Watch the following error; return True when it has become a fault."""
         error, supervision = self._motion.demand(t_ns) - counts, self._supervision
         if abs(error) <= self._parameters.following_window:
             supervision.outside_ns = None
@@ -150,26 +151,26 @@ class DriveMode:
             supervision.outside_ns = t_ns
         if t_ns - supervision.outside_ns < self._parameters.following_timeout_ns:
             return False
-        self.parts.fault(FOLLOWING_ERROR, t_ns)
+        self.parts.fault(FOLLOWING_ERROR_CODE, t_ns)
         return True
 
 
 class ProfiledMode(DriveMode):
-    """A mode that makes its own profile; while its timer runs it looks at the motor every `STEP_NS`."""
+    """A mode that makes its own profile; while its timer runs it checks the motor every `STEP_NS`."""
 
     def __init__(self, parts: DriveParts) -> None:
         super().__init__(parts)
         self._timer = parts.node.core.timers.new(self._look)
 
     def leave(self, t_ns: int) -> None:
-        """Look no more."""
+        """Stop the timer."""
         self._timer.cancel()
 
     def watch(self, t_ns: int, counts: float) -> None:
-        """The motor is at `counts`, and its following error is no fault."""
+        """Act on the motor position `counts`; its following error is no fault."""
 
     def _look(self, due_ns: int) -> None:
-        t_ns = self.parts.node.core.now_ns  # a late timer sees the motor of now
+        t_ns = self.parts.node.core.now_ns  # a late timer measures the present motor
         counts = self.parts.feedback.measure(t_ns)
         if not self._lags(t_ns, counts):
             self._timer.arm_next(due_ns, STEP_NS)
@@ -177,11 +178,11 @@ class ProfiledMode(DriveMode):
 
 
 class CyclicMode(DriveMode):
-    """A mode with a target for every SYNC, until the master is taken for dead.
+    """A mode with a target for every SYNC, until the master counts as lost.
 
     Attributes:
-        repeats: without a new target the last one is latched again.
-        lags: the following error is watched.
+        repeats: whether the last target is latched again where a new one is missing.
+        lags: whether the following error is watched.
     """
 
     target: int
@@ -193,16 +194,16 @@ class CyclicMode(DriveMode):
         parts.node.dictionary.on_write(self.target, self._target_written)
 
     def start(self, word: int, t_ns: int) -> None:
-        """Nothing is followed until a target comes."""
+        """Start; nothing is followed until a target comes."""
         self._fresh = self._commanded = False
         super().start(word, t_ns)
 
     def status(self) -> int:
-        """The drive follows the command value, unless halted."""
-        return super().status() if self.halted else FOLLOWS
+        """Bit for a drive that follows the command value, unless it is halted."""
+        return super().status() if self.halted else FOLLOWS_FLAG
 
     def sync(self, t_ns: int, counts: float) -> None:
-        """Watch the following error and the master, latch the target."""
+        """Watch the following error and the master, and latch the target."""
         if self.lags and self._lags(t_ns, counts):
             return
         fresh, self._fresh = self._fresh, False

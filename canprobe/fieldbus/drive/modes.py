@@ -1,4 +1,4 @@
-"""The table of all modes of operation. One more mode is one more class in it."""
+"""The table of all modes of operation, with one class for each mode."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MODES: tuple[type[DriveMode], ...] = (
 
 
 def make_modes(parts: DriveParts) -> dict[int, DriveMode]:
-    """The modes that a drive offers: known here, their objects in the EDS, and claimed by its 6502h if it has one."""
+    """Modes of a drive, by number: the EDS has their objects, and lists them in 6502h if it has that."""
     dictionary = parts.node.dictionary
     claimed = dictionary.number(0x6502) or ~0
     return {

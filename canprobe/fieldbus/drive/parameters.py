@@ -8,48 +8,48 @@ from __future__ import annotations
 from functools import partial
 from math import inf
 
-from canprobe.fieldbus.drive.units import FACTORS, Delivery, Units
+from canprobe.fieldbus.drive.units import FACTOR_INDICES, Delivery, Units
 from canprobe.fieldbus.eds.packaged import MISSED_SYNCS, MISSED_SYNCS_NAME, SYNC_FACTOR, SYNC_FACTOR_NAME
 from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.dictionary import Dictionary
 from canprobe.fieldbus.node.entry import Value
 
-STAYING_QUICK_STOP_OPTIONS = frozenset({5, 6})  # of 605Ah: remain in QUICK_STOP_ACTIVE
-NO_WINDOW = 0xFFFFFFFF
+STAYING_QUICK_STOP_OPTIONS = frozenset({5, 6})  # values of 605Ah by which the drive stays in QUICK_STOP_ACTIVE
+UNLIMITED_WINDOW = 0xFFFFFFFF
 DEFAULT_ACCELERATION = 100_000
-"""Position units/s², of a drive whose EDS has no profile acceleration."""
+"""Acceleration of a drive whose EDS has no profile acceleration, position units/s²."""
 DEFAULT_WINDOW = 10
-"""Position units, of a drive whose EDS has no 6067h."""
+"""Position window of a drive whose EDS has no 6067h, position units."""
 CONTROL_PERIOD_NS = 1_000_000
-"""Of the drive's own position loop: a target is reached after it where 60C2h is 0."""
-PEAK_PERMILLE = 2000
-"""What the plant's motors can do at most."""
-_OPTIONS = {0x605A: frozenset({1, 2, 5, 6}), 0x605D: frozenset({1, 2}), 0x6086: frozenset({0})}
+"""Period of the position loop in the drive; a target is reached after it where 60C2h is 0."""
+PEAK_TORQUE_PERMILLE = 2000
+"""Greatest torque of the motors of the plant, 1/1000 of the rated torque."""
+_ALLOWED_OPTIONS = {0x605A: frozenset({1, 2, 5, 6}), 0x605D: frozenset({1, 2}), 0x6086: frozenset({0})}
 _INDICES = (
     *(0x1006, MISSED_SYNCS, SYNC_FACTOR, 0x6007, 0x605A, 0x605B, 0x605C, 0x605D, 0x605E),
     *(0x6065, 0x6066, 0x6067, 0x6068, 0x6072, 0x607D, 0x607F, 0x6080, 0x6083, 0x6084, 0x6085, 0x609A, 0x60C2),
-    *FACTORS,
+    *FACTOR_INDICES,
 )
 
 
 class DriveParameters:
-    """Plain numbers; `read` refreshes them. Lengths, speeds and accelerations are counts here, whatever the units.
+    """Parameters of a drive as numbers, which `read` refreshes. Lengths, speeds and accelerations are in counts here.
 
     Attributes:
-        units: the factor group.
-        interpolation_ns: 60C2h, or 1006h of a drive without it: time to reach a latched target; never 0.
-        following_window, following_timeout_ns: 6065h (counts, infinite for none), 6066h.
-        position_window, position_time_ns: 6067h (counts, infinite for none), 6068h.
-        misses: SYNCs missed before the master is taken for dead: 2000h or 200Eh, whichever the make has; 0: any number.
-        patience_ns: time without a SYNC before it is: so many periods of 1006h, or else of 60C2h, and a half; 0: for
-            ever, as where neither is set.
-        low, high: 607Dh, position units; low >= high means no limits.
-        abort_connection, quick_stop, shutdown, disable: option codes.
-        acceleration, deceleration, homing_acceleration: 6083h, 6084h, 609Ah, counts/s².
-        quick_stop_rate, halt_rate, fault_rate: deceleration by 605Ah, 605Dh, 605Eh: the slow-down ramp 6084h or the
+        units: units of the factor group.
+        interpolation_ns: time to reach a latched target: 60C2h, or 1006h of a drive without it; never 0.
+        following_window, following_timeout_ns: window 6065h (counts, infinite for none) and time-out 6066h.
+        position_window, position_time_ns: window 6067h (counts, infinite for none) and time 6068h.
+        misses: number of missed SYNCs after which the master counts as lost: 2000h or 200Eh, by the make; 0: never.
+        patience_ns: time without a SYNC after which the master counts as lost: that many periods of 1006h, or else of
+            60C2h, and a half; 0: never, as where neither is set.
+        low, high: software limits 607Dh, position units; low >= high means no limits.
+        abort_connection, quick_stop, shutdown, disable: option codes 6007h, 605Ah, 605Bh, 605Ch.
+        acceleration, deceleration, homing_acceleration: rates 6083h, 6084h, 609Ah, counts/s².
+        quick_stop_rate, halt_rate, fault_rate: decelerations by 605Ah, 605Dh, 605Eh: the slow-down ramp 6084h or the
             quick stop ramp 6085h, counts/s²; 0 means the brake at once.
-        max_speed: the lower of 607Fh and 6080h, counts/s; infinite for neither.
-        max_torque: 6072h, permille.
+        max_speed: the lower limit of 607Fh and 6080h, counts/s; infinite without both.
+        max_torque: torque limit 6072h, permille.
     """
 
     def __init__(self, dictionary: Dictionary, delivery: Delivery) -> None:
@@ -60,12 +60,12 @@ class DriveParameters:
         self.units = Units(dictionary, delivery)
         self.read()
         dictionary.on_change(self.read, *_INDICES)
-        for index, allowed in _OPTIONS.items():
+        for index, allowed in _ALLOWED_OPTIONS.items():
             dictionary.on_check(index, partial(_check_among, allowed))
         dictionary.on_check(0x60C2, _check_interpolation)
 
     def read(self) -> None:
-        """Take the present values of the dictionary."""
+        """Read the present values of the dictionary."""
         number = self._dictionary.number
         self.units.read()
         sync_ns, value = number(0x1006) * 1000, number(0x60C2, 1, -1)
@@ -91,15 +91,15 @@ class DriveParameters:
         profile = number(0x607F) * units.speed if units.knows_speed else 0.0
         motor = number(0x6080) / 60.0 * units.turn if units.knows_turn else 0.0
         self.max_speed = min(profile or inf, motor or inf)
-        self.max_torque = min(number(0x6072, 0, PEAK_PERMILLE), PEAK_PERMILLE)
+        self.max_torque = min(number(0x6072, 0, PEAK_TORQUE_PERMILLE), PEAK_TORQUE_PERMILLE)
 
-    def _window(self, index: int, absent: int = NO_WINDOW) -> float:
+    def _window(self, index: int, absent: int = UNLIMITED_WINDOW) -> float:
         value = self._dictionary.number(index, 0, absent)
-        return inf if value == NO_WINDOW else value * self.units.magnitude
+        return inf if value == UNLIMITED_WINDOW else value * self.units.magnitude
 
     @property
     def fence(self) -> tuple[float, float]:
-        """The software limits, counts, lower first; infinite for none."""
+        """Software limits, counts, the lower one first; infinite for none."""
         if self.low >= self.high:
             return -inf, inf
         ends = self.units.counts(self.low), self.units.counts(self.high)

@@ -1,5 +1,5 @@
-"""Trapezoidal motion to a target, constant velocity, and what a constant torque does to the motor, as pieces one after
-the other, from any position and speed.
+"""Motion in pieces one after the other, from any position and speed: a trapezoid to a target, constant velocity, and
+the motion under a constant torque.
 
 A motor that moves the wrong way, or too fast to stop in time, is braked to rest first and turned round. One that is
 faster than allowed is braked to the profile velocity.
@@ -16,7 +16,7 @@ from canprobe.fieldbus.drive.motor import MotorDynamics
 
 
 class Piece(NamedTuple):
-    """Constant acceleration over some time: s, counts, counts/s, counts/s²."""
+    """Constant acceleration over some time; duration in s, then counts, counts/s and counts/s²."""
 
     duration_s: float
     position: float
@@ -32,7 +32,7 @@ class Piece(NamedTuple):
 
 
 class Decay(NamedTuple):
-    """Velocity that tends exponentially towards `final`: s, counts, counts/s, counts/s, 1/s."""
+    """Velocity that tends exponentially towards `final`; duration in s, then counts, counts/s, counts/s and 1/s."""
 
     duration_s: float
     position: float
@@ -41,14 +41,14 @@ class Decay(NamedTuple):
     damping: float
 
     def at(self, t_s: float) -> tuple[float, float]:
-        """As of `Piece`."""
+        """Position and velocity `t_s` after the piece began."""
         decay = exp(-self.damping * t_s)
         excess = self.velocity - self.final
         return self.position + self.final * t_s + excess * (1.0 - decay) / self.damping, self.final + excess * decay
 
 
 class Rates(NamedTuple):
-    """Limits of a move: counts/s and counts/s², all positive."""
+    """Speed limit, counts/s, and rates of a move, counts/s²; all are positive."""
 
     speed: float
     acceleration: float
@@ -59,8 +59,8 @@ class Profile:
     """A reference as a function of the time since its start: pieces one after the other, at rest at `end` after them.
 
     Attributes:
-        duration_s: s; infinite for a motion without an end.
-        end: position at rest, counts.
+        duration_s: duration, s; infinite for a motion without an end.
+        end: position of rest, counts.
     """
 
     def __init__(self, pieces: tuple[Piece | Decay, ...], end: float) -> None:
@@ -70,7 +70,7 @@ class Profile:
         self._low, self._high = -inf, inf
 
     def fenced(self, low: float, high: float) -> Profile:
-        """The same cut off at the software limits, counts: the motor waits there. One outside may only come in."""
+        """Cut the profile off at the software limits, counts, where the motor waits; one outside may only come in."""
         start, _ = self.at(0.0)
         self._low, self._high = min(low, start), max(high, start)
         return self
@@ -89,13 +89,13 @@ class Profile:
 
 
 def braking(position: float, velocity: float, deceleration: float) -> Profile:
-    """To rest, as soon as the deceleration (counts/s², positive) allows."""
+    """Motion to rest with a deceleration, counts/s², positive."""
     piece = Piece(abs(velocity) / deceleration, position, velocity, -copysign(deceleration, velocity))
     return Profile((piece,), piece.at(piece.duration_s)[0])
 
 
 def trapezoid(position: float, velocity: float, target: float, rates: Rates) -> Profile:
-    """From a position (counts) and velocity (counts/s) to rest at a target (counts)."""
+    """Motion from a position (counts) and velocity (counts/s) to rest at a target (counts)."""
     speed, acceleration, deceleration = rates
     pieces: list[Piece] = []
     stop = position + 0.5 * velocity * abs(velocity) / deceleration
@@ -119,7 +119,7 @@ def trapezoid(position: float, velocity: float, target: float, rates: Rates) -> 
 
 
 def uniform(position: float, velocity: float) -> Profile:
-    """Constant velocity without an end."""
+    """Motion with constant velocity, without an end."""
     return Profile((Piece(inf, position, velocity, 0.0),), position)
 
 
@@ -132,11 +132,11 @@ def torque_run(
     above the Coulomb torque. Gravity, contact and the other joints do not act, as in the ideal arm.
 
     Args:
-        position: at the start, counts.
-        velocity: at the start, counts/s; cut to the limit.
+        position: position at the start, counts.
+        velocity: velocity at the start, counts/s; it is cut to the limit.
         permille: torque, 1/1000 of the rated torque.
-        dynamics: of the motor.
-        speed_limit: counts/s, may be infinite.
+        dynamics: dynamics of the motor.
+        speed_limit: greatest speed, counts/s; it may be infinite.
     """
     gain, coulomb, damping = dynamics
     velocity = min(max(velocity, -speed_limit), speed_limit)

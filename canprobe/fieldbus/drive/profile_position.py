@@ -2,9 +2,9 @@
 
 A rising edge of controlword bit 4 offers a set-point (607Ah with 6081h, 6083h and 6084h of that moment); bit 5 puts
 it in place of everything else at once, bit 6 makes it relative to the set-point before. Statusword bit 12 is set when
-it was taken, and stays while bit 4 does or while no further one could be taken; one offered then is ignored.
+it was taken, and stays set while bit 4 is or while no other one can be taken; one that is offered then is ignored.
 The next set-point starts when the last is reached: the actual position has been within 6067h for 6068h (bit 10).
-Not here: bit 9 (change on set-point), 60F2h. Halt interrupts a move, which goes on when halt is over.
+Bit 9 (change on set-point) and 60F2h are not supported. Halt interrupts a move, which goes on when halt is over.
 Source: CiA 402-2, "Profile position mode", objects 6067h, 6068h, 607Ah, 607Dh, 607Fh, 6081h, 6083h, 6084h, 6086h.
 """
 
@@ -12,20 +12,20 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from canprobe.fieldbus.drive.cyclic_position import POSITION_TARGET
-from canprobe.fieldbus.drive.mode import REACHED, DriveParts, ProfiledMode
+from canprobe.fieldbus.drive.cyclic_position import POSITION_TARGET_KEY
+from canprobe.fieldbus.drive.mode import REACHED_FLAG, DriveParts, ProfiledMode
 from canprobe.fieldbus.drive.profile import Rates
 from canprobe.fieldbus.drive.reference import STEP_NS
 from canprobe.fieldbus.node.entry import key_of
 from canprobe.fieldbus.protocol.cia402 import (
-    CHANGE_IMMEDIATELY,
-    NEW_SETPOINT,
-    RELATIVE,
-    SETPOINT_ACKNOWLEDGE,
+    CHANGE_IMMEDIATELY_BIT,
+    NEW_SETPOINT_BIT,
+    RELATIVE_BIT,
+    SETPOINT_ACKNOWLEDGE_BIT,
     OperationMode,
 )
 
-_PROFILE_SPEED = key_of(0x6081)
+_PROFILE_SPEED_KEY = key_of(0x6081)
 
 
 class SetPoint(NamedTuple):
@@ -33,8 +33,8 @@ class SetPoint(NamedTuple):
 
     Attributes:
         counts: target within the software limits, motor counts.
-        rates: of the move; with a speed of 0 the drive stands still.
-        limited: the master wanted to go beyond.
+        rates: rates of the move; with a speed of 0 the drive stands still.
+        limited: whether the target of the master was beyond the limits.
     """
 
     counts: float
@@ -57,7 +57,7 @@ class ProfilePosition(ProfiledMode):
         self._reached = self._offered = False
 
     def start(self, word: int, t_ns: int) -> None:
-        """No set-point; the present position is what relative ones begin from."""
+        """Start without a set-point; relative ones begin from the present position."""
         self._active = self._next = self._inside_ns = None
         self._offered = self._reached = False
         self._last = round(self._units.position(self._motion.demand(t_ns)))
@@ -65,21 +65,21 @@ class ProfilePosition(ProfiledMode):
         self._timer.arm(t_ns + STEP_NS)
 
     def status(self) -> int:
-        """Target reached (with halt: standing still), set-point acknowledge."""
+        """Bits for target reached, with halt for standstill, and for set-point acknowledge."""
         acknowledged = self._offered or self._next is not None
-        reached = super().status() if self.halted else REACHED * self._reached
-        return reached | acknowledged << SETPOINT_ACKNOWLEDGE
+        reached = super().status() if self.halted else REACHED_FLAG * self._reached
+        return reached | acknowledged << SETPOINT_ACKNOWLEDGE_BIT
 
     def bits(self, word: int, changed: int, t_ns: int) -> None:
-        """A set-point is offered, or the offer taken back."""
-        offers = word >> NEW_SETPOINT & 1
+        """Take a set-point that is offered, or the end of the offer."""
+        offers = word >> NEW_SETPOINT_BIT & 1
         if not offers:
             self._offered = False
-        elif changed >> NEW_SETPOINT & 1:
-            at_once = bool(word >> CHANGE_IMMEDIATELY & 1)
+        elif changed >> NEW_SETPOINT_BIT & 1:
+            at_once = bool(word >> CHANGE_IMMEDIATELY_BIT & 1)
             if at_once or self._next is None:
                 self._offered = True
-                point = self._set_point(relative=bool(word >> RELATIVE & 1))
+                point = self._set_point(relative=bool(word >> RELATIVE_BIT & 1))
                 if at_once or self._active is None or self._reached:
                     self._next = None
                     self._begin(point, t_ns)
@@ -87,15 +87,15 @@ class ProfilePosition(ProfiledMode):
                     self._next = point
 
     def resume(self, t_ns: int) -> None:
-        """The interrupted move goes on."""
+        """Go on with the interrupted move."""
         if self._active is not None and not self._reached:
             self._move(self._active, t_ns)
 
     def _set_point(self, relative: bool) -> SetPoint:
         parameters, units = self._parameters, self._units
-        wanted = int(self._values[POSITION_TARGET]) + (self._last if relative else 0)
+        wanted = int(self._values[POSITION_TARGET_KEY]) + (self._last if relative else 0)
         target = self._last = parameters.clamp(wanted)
-        speed = min(int(self._values.get(_PROFILE_SPEED, 0)) * units.speed, parameters.max_speed)
+        speed = min(int(self._values.get(_PROFILE_SPEED_KEY, 0)) * units.speed, parameters.max_speed)
         rates = Rates(speed, parameters.acceleration, parameters.deceleration or parameters.acceleration)
         return SetPoint(units.counts(target), rates, limited=target != wanted)
 
@@ -113,7 +113,7 @@ class ProfilePosition(ProfiledMode):
             self._motion.decelerate(t_ns, point.rates.deceleration)
 
     def watch(self, t_ns: int, counts: float) -> None:
-        """Look whether the set-point is reached."""
+        """Check whether the set-point is reached."""
         point = self._active
         if point is not None and not self._reached and not self.halted:
             if abs(point.counts - counts) > self._parameters.position_window:

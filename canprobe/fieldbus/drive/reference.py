@@ -11,21 +11,23 @@ from canprobe.fieldbus.drive.profile import Profile, Rates, braking, trapezoid
 from canprobe.fieldbus.node.timers import Timers
 
 STEP_NS = 2_500_000
+"""Time between two steps of a motion that the drive makes itself."""
 STANDSTILL_COUNTS = 0.1
-"""Motion in one step below which the motor is at rest."""
+"""Motion in one step below which the motor counts as at rest."""
 MAX_WAIT_STEPS = 400
+"""Most steps that standstill is waited for: one second."""
 END_TOLERANCE_S = 1e-9
-"""Rest of a trajectory below which it has ended."""
+"""Remaining time of a trajectory below which it has ended."""
 
 Done = Callable[[int], None] | None
 """Called with the time, ns, when a motion is over."""
 
 
 class AxisPlant(Protocol):
-    """What a drive needs of the plant. Positions are motor counts, calls at one instant are idempotent."""
+    """The plant as a drive needs it. Positions are motor counts; calls at one instant are idempotent."""
 
     def begin(self, t_ns: int) -> None:
-        """Time goes on from `t_ns`, unless it does already: a SYNC came, or a drive was enabled without one."""
+        """Let time pass from `t_ns` on, if it does not yet: a SYNC came, or a drive was enabled without one."""
 
     def advance(self, t_ns: int) -> None:
         """Bring the plant to `t_ns`."""
@@ -43,16 +45,16 @@ class AxisPlant(Protocol):
         """
 
     def motor_dynamics(self, axis: int) -> MotorDynamics:
-        """How the motor answers to torque."""
+        """Answer of the motor to torque."""
 
     def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
-        """What the position loop may do: called when a drive's limit or feed-forward changes.
+        """Set limit and feed-forward of the position loop; called when one of them changes.
 
         Args:
-            axis: 0-based.
+            axis: number of the axis, 0-based.
             limit_permille: largest torque, 1/1000 of the rated torque.
-            speed: counts/s added behind the position loop.
-            torque_permille: added behind the velocity loop.
+            speed: speed that is added behind the position loop, counts/s.
+            torque_permille: torque that is added behind the velocity loop, 1/1000 of the rated torque.
         """
 
     def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
@@ -60,7 +62,7 @@ class AxisPlant(Protocol):
 
 
 class Motion:
-    """Reference of one axis; remembers the ramp it gave last.
+    """Reference of one axis, with the last ramp that it gave.
 
     A trajectory goes to the plant as straight ramps of one step each, whose ends lie on it.
     """
@@ -78,11 +80,11 @@ class Motion:
 
     @property
     def busy(self) -> bool:
-        """A trajectory or a deceleration is under way."""
+        """Whether a trajectory or a deceleration is under way."""
         return self._timer.due_ns is not None
 
     def hold(self, t_ns: int) -> float:
-        """Stay where the motor is; returns that position, counts."""
+        """Hold the motor where it is; return that position, counts."""
         self._stop()
         self._plant.advance(t_ns)
         here = self._plant.motor_counts(self._axis)
@@ -90,14 +92,14 @@ class Motion:
         return here
 
     def onset(self, t_ns: int) -> float:
-        """Where a new ramp begins, counts: at the target before it, whenever the SYNC comes, or on a trajectory."""
+        """Start of a new ramp, counts: the target before it, whenever the SYNC comes, or a place on the trajectory."""
         return self._end if self._timer.due_ns is None else self.demand(t_ns)
 
     def reach(self, onset: float, counts: float, t_ns: int, end_ns: int) -> None:
-        """From `onset` to `counts`, from now to `end_ns`."""
+        """Move the reference from `onset` to `counts`, from now to `end_ns`."""
         if self._timer.due_ns is not None:
             self._stop()
-        self._start, self._end, self._t0, self._t1 = onset, counts, t_ns, end_ns  # as `_ramp`, in every cycle
+        self._start, self._end, self._t0, self._t1 = onset, counts, t_ns, end_ns  # inlined `_ramp`, for speed
         self._plant.set_ramp(self._axis, onset, counts, t_ns, end_ns)
 
     def demand(self, t_ns: int) -> float:
@@ -114,11 +116,11 @@ class Motion:
         return (self._end - self._start) / (self._t1 - self._t0) * 1e9 if moving else 0.0
 
     def move(self, target: float, t_ns: int, rates: Rates, done: Done = None) -> None:
-        """Move to `target`, counts, from the present position and speed; as `follow`."""
+        """Move to `target`, counts, from the present position and speed, as `follow` does."""
         self.follow(trapezoid(self.demand(t_ns), self.speed(t_ns), target, rates), t_ns, done)
 
     def follow(self, trajectory: Profile, t_ns: int, done: Done = None) -> None:
-        """Follow a trajectory from now on; `done(t_ns)` when the motor is at rest behind its end."""
+        """Follow a trajectory from now on; call `done(t_ns)` when the motor is at rest at its end."""
         self._trajectory, self._begin_ns, self._done = trajectory, t_ns, done
         self._patience, self._was = MAX_WAIT_STEPS, inf
         if trajectory.duration_s < END_TOLERANCE_S:
@@ -129,7 +131,7 @@ class Motion:
     def decelerate(self, t_ns: int, rate: float, done: Done = None) -> None:
         """Slow the reference down by `rate` counts/s² and call `done(t_ns)` at standstill, one step from now or later.
 
-        Standstill is the motor's, not the reference's: it is waited for, a second at most. A rate of 0 stops the
+        Standstill is that of the motor, not of the reference; it is waited for, a second at most. A rate of 0 stops the
         reference at once.
         """
         here, speed = self.demand(t_ns), self.speed(t_ns) if rate > 0 else 0.0

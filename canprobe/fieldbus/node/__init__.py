@@ -11,7 +11,8 @@ Each service of the standard is one module:
     dictionary          all values, with the checks that an access over the bus must pass
     abort               SDO abort codes
     sdo_states          the state machine of an SDO server as a table
-    sdo_server          expedited, segmented and block transfers by that table
+    sdo_transfers       segmented and block transfers, each an object with its state
+    sdo_server          expedited transfers, and the beginning and end of the others
     pdo                 all PDOs of a node: which frame goes where, and what a SYNC does
     rpdo, tpdo          one RPDO, one TPDO
     pdo_rules           what may be written to their parameters, and when

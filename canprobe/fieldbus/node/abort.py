@@ -11,7 +11,7 @@ from canprobe.errors import ProtocolError
 
 
 class Abort(IntEnum):
-    """SDO abort codes that a node here can answer with."""
+    """SDO abort codes with which a node here can answer."""
 
     TOGGLE = 0x05030000
     TIMED_OUT = 0x05040000
@@ -41,16 +41,12 @@ class Abort(IntEnum):
 
 
 class SdoAbort(ProtocolError):  # noqa: N818 - the standard's word
-    """An access that the dictionary refuses.
+    """The dictionary or the server refuses an access.
 
     Attributes:
-        code: the abort code that goes to the client.
+        code: abort code that goes to the client.
     """
 
     def __init__(self, code: Abort) -> None:
         self.code = code
         super().__init__(f"{code.name.lower().replace('_', ' ')} ({code:08X}h)")
-
-
-def nothing(*_: object) -> None:
-    """Does nothing: what a callback is until somebody sets it."""

@@ -1,34 +1,36 @@
-"""What the services of one node share: identity, NMT state, time, dictionary, timers and the frames to send."""
+"""State that the services of one node share: identity, NMT state, time, dictionary, timers and frames to send."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
 
-from canprobe.fieldbus.node.abort import Abort, SdoAbort, nothing
+from canprobe.fieldbus.bus.port import nothing
+from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.dictionary import Dictionary
 from canprobe.fieldbus.node.entry import Value
 from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.node.timers import Holder, Timers
-from canprobe.fieldbus.protocol.frames import Frame, NmtState, is_restricted
+from canprobe.fieldbus.protocol.frames import INVALID_FLAG, Frame, NmtState, is_restricted
 
 Route = Callable[[bytes, int], None]
 NO_ROUTES: Mapping[int, Route] = {}
 
 
 class NodeCore:
-    """Shared by the services of one node; the node itself drives it.
+    """State that the services of one node share; the node itself changes it.
 
     Args:
-        node_id: 1–127, or 255 for none.
-        dictionary: the node's.
-        holder: shows the next deadline of the timers.
-        quirks: what makes the node difficult.
+        node_id: node id, 1–127, or 255 for none.
+        dictionary: the node's dictionary.
+        holder: object that shows the next deadline of the timers.
+        quirks: difficulties of the node.
 
     Attributes:
         state: NMT state.
         now_ns: time of the event being served.
         out: frames to send, in order.
-        reroute: to be called when the routes of a service have changed.
+        reroute: function that a service calls when its routes have changed.
     """
 
     def __init__(self, node_id: int, dictionary: Dictionary, holder: Holder, quirks: Quirks) -> None:
@@ -43,12 +45,12 @@ class NodeCore:
         self.reroute: Callable[[], None] = nothing
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Queue a frame behind those the node already sends."""
+        """Queue a frame behind those that the node already sends."""
         self.out.append((can_id, data))
 
 
 def _refuse(dictionary: Dictionary, quirks: Quirks) -> None:
-    """Hang the checks of a node that refuses writes, before any other."""
+    """Add the checks of a node that refuses writes, before any other check."""
 
     def refuse(subindex: int, value: Value) -> None:
         raise SdoAbort(Abort.UNSUPPORTED_ACCESS)
@@ -67,38 +69,69 @@ def _refuse(dictionary: Dictionary, quirks: Quirks) -> None:
     for index in dictionary.indices_in(range(0x1800, 0x1A00)) if quirks.keep_bit30 else ():
 
         def keep_bit30(subindex: int, value: Value, index: int = index) -> None:
-            if subindex == 1 and (int(value) ^ dictionary.number(index, 1)) & NO_RTR:
+            if subindex == 1 and (int(value) ^ dictionary.number(index, 1)) & NO_RTR_FLAG:
                 raise SdoAbort(Abort.VALUE)
 
         dictionary.on_check(index, keep_bit30)
 
 
+class DelayedFrames:
+    """Frames of a node that is slow: each leaves some time after it was made.
+
+    Args:
+        core: the node's core.
+        delay_ns: time from the making of a frame until it leaves; 0: it leaves at once.
+    """
+
+    def __init__(self, core: NodeCore, delay_ns: int) -> None:
+        self._core, self._delay_ns = core, delay_ns
+        self._waiting: deque[tuple[int, Sequence[Frame]]] = deque()  # when they leave, and the frames
+        self._timer = core.timers.new(self._leave)
+
+    def send(self, frames: Sequence[Frame], t_ns: int) -> None:
+        """Send frames that were made at `t_ns`."""
+        if not self._delay_ns:
+            self._core.out += frames
+            return
+        self._waiting.append((t_ns + self._delay_ns, frames))
+        self._timer.arm(self._waiting[0][0])
+
+    def clear(self) -> None:
+        """Forget the frames that wait."""
+        self._waiting.clear()
+        self._timer.cancel()
+
+    def _leave(self, due_ns: int) -> None:
+        while self._waiting and self._waiting[0][0] <= due_ns:
+            self._core.out += self._waiting.popleft()[1]
+        if self._waiting:
+            self._timer.arm(self._waiting[0][0])
+
+
 class Service:
-    """One CiA 301 service of a node. The base class keeps nothing and hears nothing."""
+    """One CiA 301 service of a node. The base class has no state and no routes."""
 
     def reset(self, t_ns: int) -> None:
-        """Forget everything and read the parameters again (the dictionary holds its defaults)."""
+        """Forget everything and read the parameters again; the dictionary holds its defaults."""
 
     def entered(self, t_ns: int) -> None:
-        """The NMT state has just changed to `core.state`."""
+        """Act on the new NMT state, which is `core.state`."""
 
     def routes(self) -> Mapping[int, Route]:
-        """What to call for which CAN-ID, in the present NMT state."""
+        """Receivers by CAN-ID, in the present NMT state."""
         return NO_ROUTES
 
 
-INVALID = 1 << 31
-"""Of a COB-ID: the object does not exist."""
-NO_RTR = 1 << 30
-"""Of the COB-ID of a TPDO: a remote request is not answered."""
+NO_RTR_FLAG = 1 << 30
+"""Bit 30 of the COB-ID of a TPDO: a remote request is not answered."""
 
 
 def check_cob_id(new: Value, old: int, reserved: int = 0x3FFFF800) -> None:
-    """Raises SdoAbort for a COB-ID with reserved or 29-bit bits, of a restricted identifier, or of another while valid.
+    """Check a new COB-ID. Raises SdoAbort for reserved bits, 29 bits, a restricted identifier, or a change while valid.
 
     Source: CiA 301, objects 1014h, 1200h, 1400h, 1800h, "Restricted CAN-IDs".
     """
     word = int(new)
-    changed_while_valid = not (word | old) & INVALID and (word ^ old) & 0x7FF
-    if word & reserved or changed_while_valid or (not word & INVALID and is_restricted(word & 0x7FF)):
+    changed_while_valid = not (word | old) & INVALID_FLAG and (word ^ old) & 0x7FF
+    if word & reserved or changed_while_valid or (not word & INVALID_FLAG and is_restricted(word & 0x7FF)):
         raise SdoAbort(Abort.VALUE)

@@ -1,7 +1,7 @@
-"""Values of a node's object dictionary, with the checks an access over the bus must pass.
+"""Values of a node's object dictionary, with the checks that an access over the bus must pass.
 
-Services hang their rules here: a *check* may refuse a value before it is stored, a *hook* acts after, a *refresh*
-brings a live value up to date before it is read.
+Services add their rules: a *check* may refuse a value before it is stored, a *hook* acts after that, and a *refresh*
+brings a value up to date before it is read.
 """
 
 from __future__ import annotations
@@ -11,27 +11,28 @@ from dataclasses import replace
 
 from canopen.objectdictionary import ObjectDictionary
 
-from canprobe.fieldbus.node.abort import Abort, SdoAbort, nothing
+from canprobe.fieldbus.bus.port import nothing
+from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.entry import Entry, Value, key_of, read_entries
 
 Check = Callable[[int, Value], None]
 Hook = Callable[[int, Value], None]
 Slot = tuple[int, int, float, float, tuple[Check, ...], tuple[Hook, ...]]
-"""Where a value of a cyclic RPDO goes, looked up once: key, subindex, least, greatest, checks, hooks."""
-_ANY = 1 << 64
-"""Beyond every integer: compared in half the time of an infinity."""
+"""Destination of a value of a cyclic RPDO, looked up once: key, subindex, least, greatest, checks, hooks."""
+_BEYOND_INTEGERS = 1 << 64
+"""Limit beyond every integer; a comparison with it takes half the time of one with infinity."""
 
 
 class Dictionary:
     """The object dictionary of one node.
 
     Attributes:
-        entries: by key (index << 8 | subindex).
-        values: present values by key; cyclic code reads and writes here directly.
-        written: called with the keys of values that were stored together: one over SDO, or those of an RPDO that are
-            `watched`.
-        watched: keys of which `written` is called when an RPDO brings them.
-        configured: called with the index after a value was stored over SDO.
+        entries: entries by key (index << 8 | subindex).
+        values: present values by key; cyclic code reads and writes them directly.
+        written: function that is called with the keys of values that were stored together: one over SDO, or those of an
+            RPDO that are `watched`.
+        watched: keys for which `written` is called when an RPDO brings them.
+        configured: function that is called with the index after a value was stored over SDO.
     """
 
     def __init__(self, od: ObjectDictionary) -> None:
@@ -48,12 +49,12 @@ class Dictionary:
         self.restore(self.entries)
 
     def restore(self, keys: Iterable[int]) -> None:
-        """Put the EDS's defaults back, without checks or hooks."""
+        """Put the defaults of the EDS back, without checks or hooks."""
         for key in keys:
             self.values[key] = self.entries[key].default
 
     def set_default(self, index: int, subindex: int, value: Value) -> None:
-        """Give an entry a default of this very device's, such as its serial number. KeyError: no such entry."""
+        """Give an entry a default that only this device has, such as a serial number. Raises KeyError without one."""
         key = key_of(index, subindex)
         self._own[key] = value
         self.entries[key] = replace(self.entries[key], default=value)
@@ -72,11 +73,11 @@ class Dictionary:
         return index in self._indices
 
     def indices_in(self, area: range) -> list[int]:
-        """The indices there, ascending."""
+        """Indices in an area, ascending."""
         return sorted(index for index in self._indices if index in area)
 
     def has_named(self, index: int, name: str) -> bool:
-        """Whether the EDS has an object with this name there; of another maker a manufacturer's index is another's."""
+        """Whether the object at this index has this name; other makers use the index for something else."""
         entry = self.entries.get(key_of(index))
         return entry is not None and entry.name == name
 
@@ -91,50 +92,53 @@ class Dictionary:
         return 0 if entry is None or isinstance(entry.default, bytes) else int(entry.default)
 
     def put(self, index: int, subindex: int, value: Value) -> None:
-        """Store a value of the device's own; nothing happens where the EDS has no such entry."""
+        """Store a value that the device itself makes; nothing happens where the EDS has no such entry."""
         key = key_of(index, subindex)
         if key in self.entries:
             self.values[key] = value
 
     def on_check(self, index: int, check: Check) -> None:
-        """`check(subindex, value)` may raise SdoAbort before a value of `index` is stored."""
+        """Call `check(subindex, value)` before a value of `index` is stored; it may raise SdoAbort."""
         self._checks.setdefault(index, []).append(check)
 
     def on_write(self, index: int, hook: Hook) -> None:
-        """`hook(subindex, value)` after a value of `index` was stored over SDO or RPDO."""
+        """Call `hook(subindex, value)` after a value of `index` was stored over SDO or RPDO."""
         self._hooks.setdefault(index, []).append(hook)
 
     def on_change(self, act: Callable[[], None], *indices: int) -> None:
-        """`act()` after a value of one of the indices was stored over SDO or RPDO."""
+        """Call `act()` after a value of one of the indices was stored over SDO or RPDO."""
         for index in indices:
             self.on_write(index, lambda _subindex, _value: act())
 
     def on_read(self, index: int, refresh: Callable[[int], None]) -> None:
-        """`refresh(subindex)` before a value of `index` is read over SDO; it may raise SdoAbort."""
+        """Call `refresh(subindex)` before a value of `index` is read over SDO; it may raise SdoAbort."""
         self._refreshers[index] = refresh
 
     def slot(self, key: int) -> Slot:
-        """What `write_value` of a cyclic RPDO needs. Hooks and checks hung in later are not seen."""
+        """Slot of a value for cyclic RPDOs. It does not have hooks and checks that are added later."""
         entry, index = self.entries[key], key >> 8
-        low, high = -_ANY if entry.low is None else entry.low, _ANY if entry.high is None else entry.high
+        low, high = (
+            -_BEYOND_INTEGERS if entry.low is None else entry.low,
+            _BEYOND_INTEGERS if entry.high is None else entry.high,
+        )
         return key, key & 0xFF, low, high, tuple(self._checks.get(index, ())), tuple(self._hooks.get(index, ()))
 
     def find(self, index: int, subindex: int) -> Entry:
-        """The entry, or SdoAbort: no object, or no such subindex of it."""
+        """The entry. Raises SdoAbort where there is no such object or subindex."""
         entry = self.entries.get(key_of(index, subindex))
         if entry is None:
             raise SdoAbort(Abort.NO_SUBINDEX if index in self._indices else Abort.NO_OBJECT)
         return entry
 
     def find_writable(self, index: int, subindex: int) -> Entry:
-        """The entry, or SdoAbort also when it is read-only."""
+        """The entry. Raises SdoAbort where there is none, or it is read-only."""
         entry = self.find(index, subindex)
         if not entry.writable:
             raise SdoAbort(Abort.READ_ONLY)
         return entry
 
     def read(self, index: int, subindex: int) -> bytes:
-        """SDO upload. Raises SdoAbort."""
+        """Read a value for an SDO upload. Raises SdoAbort."""
         entry = self.entries.get(index << 8 | subindex) or self.find(index, subindex)
         if not entry.readable:
             raise SdoAbort(Abort.WRITE_ONLY)
@@ -143,12 +147,12 @@ class Dictionary:
         return entry.to_bytes(self.values[entry.key])
 
     def write(self, index: int, subindex: int, data: bytes) -> None:
-        """SDO download. Raises SdoAbort; the value is then unchanged."""
+        """Write a value of an SDO download. Raises SdoAbort; the value is then unchanged."""
         entry = self.find_writable(index, subindex)
         self.write_value(entry, entry.from_bytes(data))
 
     def write_value(self, entry: Entry, value: Value) -> None:
-        """Limits, checks, store, hooks: the common end of SDO and RPDO. Raises SdoAbort."""
+        """Check limits and checks, store, call the hooks: the common end of SDO and RPDO. Raises SdoAbort."""
         index, subindex = entry.key >> 8, entry.key & 0xFF
         entry.check_limits(value)
         for check in self._checks.get(index, ()):

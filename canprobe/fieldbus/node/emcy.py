@@ -9,15 +9,15 @@ from collections import deque
 from collections.abc import Hashable
 
 from canprobe.fieldbus.node.abort import Abort, SdoAbort
-from canprobe.fieldbus.node.core import INVALID, NodeCore, Service, check_cob_id
+from canprobe.fieldbus.node.core import NodeCore, Service, check_cob_id
 from canprobe.fieldbus.node.entry import Value
-from canprobe.fieldbus.protocol.emcy import NO_ERROR, Emcy
-from canprobe.fieldbus.protocol.frames import NmtState
+from canprobe.fieldbus.protocol.emcy import NO_ERROR_CODE, Emcy
+from canprobe.fieldbus.protocol.frames import INVALID_FLAG, NmtState
 
-_GENERIC = 0x01
+_GENERIC_FLAG = 0x01
 # Bits of 1001h by the first nibble of the code: current, voltage, temperature, communication/profile, manufacturer.
 _REGISTER_BITS = {0x2: 0x02, 0x3: 0x04, 0x4: 0x08, 0x7: 0x80, 0xF: 0x80}
-_SENDING = frozenset({NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL})
+_SENDING_STATES = frozenset({NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL})
 
 
 def register_bit(code: int) -> int:
@@ -27,12 +27,12 @@ def register_bit(code: int) -> int:
     return _REGISTER_BITS.get(code >> 12, 0)
 
 
-_MAX_WAITING = 16
-"""Messages kept while the inhibit time runs; of a flood the oldest go."""
+_MAX_WAITING_MESSAGES = 16
+"""Most messages that wait while the inhibit time runs; beyond it the oldest are dropped."""
 
 
 class Emergency(Service):
-    """Reports errors once, and when they are gone, and remembers them.
+    """Reports each error once when it comes and once when it is gone, and keeps the history.
 
     Attributes:
         any: whether any error is present.
@@ -43,7 +43,7 @@ class Emergency(Service):
         self._active: dict[int, set[Hashable]] = {}
         self.any = False
         self._history: list[int] = []
-        self._waiting: deque[tuple[int, int, bytes]] = deque(maxlen=_MAX_WAITING)
+        self._waiting: deque[tuple[int, int, bytes]] = deque(maxlen=_MAX_WAITING_MESSAGES)
         self._room = sum(1 for key in core.dictionary.entries if key >> 8 == 0x1003 and key & 0xFF)
         self._timer = core.timers.new(self._inhibit_over)
         core.dictionary.on_check(0x1003, self._check_history)
@@ -52,7 +52,7 @@ class Emergency(Service):
         core.dictionary.on_check(0x1014, self._check_cob_id)
 
     def reset(self, t_ns: int) -> None:
-        """No error, nothing waiting; the history survives (it is non-volatile where a device can keep it)."""
+        """Forget the errors and what waits; the history stays, as in the non-volatile memory of a device."""
         self._active.clear()
         self._waiting.clear()
         self._timer.cancel()
@@ -60,16 +60,16 @@ class Emergency(Service):
 
     @property
     def active(self) -> frozenset[int]:
-        """Codes of the errors present."""
+        """Codes of the errors that are present."""
         return frozenset(self._active)
 
     def report(self, code: int, data: bytes = b"", source: Hashable = None) -> None:
-        """An error is present: remember and send it, once until it is cleared.
+        """Report that an error is present: it is kept and sent, once until it is cleared.
 
         Args:
             code: emergency error code.
-            data: manufacturer's bytes, up to five.
-            source: which of several PDOs, producers… has it; the error lasts until the last one is cleared.
+            data: bytes of the manufacturer, up to five.
+            source: the PDO, producer… that has the error; the error lasts until it is cleared for the last one.
         """
         if (sources := self._active.get(code)) is not None:
             sources.add(source)
@@ -80,7 +80,7 @@ class Emergency(Service):
         self._send(code, data)
 
     def clear(self, code: int, source: Hashable = None) -> None:
-        """An error of one source is gone: EMCY 0000h with what remains in the register, if it was the last source."""
+        """Report that an error of one source is gone; with the last source EMCY 0000h is sent."""
         sources = self._active.get(code)
         if sources is None:
             return
@@ -90,12 +90,12 @@ class Emergency(Service):
         del self._active[code]
         self._show()
         if self._waiting and self._waiting[-1][0] == code:
-            self._waiting.pop()  # come and gone within the inhibit time: nobody needs to hear of it
+            self._waiting.pop()  # it came and went within the inhibit time: no message is needed
         else:
-            self._send(NO_ERROR, b"")
+            self._send(NO_ERROR_CODE, b"")
 
     def _send(self, code: int, data: bytes) -> None:
-        if self._core.state not in _SENDING:
+        if self._core.state not in _SENDING_STATES:
             return
         self._waiting.append((code, self._register(), data))
         if self._timer.due_ns is None:
@@ -105,13 +105,13 @@ class Emergency(Service):
         if self._waiting:
             cob_id = self._core.dictionary.number(0x1014, 0, 0x80 + self._core.node_id)
             emcy = Emcy(*self._waiting.popleft())
-            if not cob_id & INVALID:
+            if not cob_id & INVALID_FLAG:
                 self._core.send(cob_id & 0x7FF, emcy.pack())
             if inhibit := self._core.dictionary.number(0x1015):
                 self._timer.arm(due_ns + inhibit * 100_000)
 
     def _register(self) -> int:
-        bits = _GENERIC if self._active else 0
+        bits = _GENERIC_FLAG if self._active else 0
         for code in self._active:
             bits |= register_bit(code)
         return bits
@@ -124,7 +124,7 @@ class Emergency(Service):
         dictionary.put(0x1003, 0, len(self._history))
 
     def _check_read(self, subindex: int) -> None:
-        """Refuse an entry that is not there; bring one that is up to date, which is only needed now."""
+        """Refuse an entry that is not there; bring one that is there up to date, which only a reader needs."""
         if 0 < subindex <= len(self._history):
             self._core.dictionary.put(0x1003, subindex, self._history[subindex - 1])
         if subindex > len(self._history):

@@ -1,4 +1,4 @@
-"""One entry of the object dictionary: its type, its rights, its limits, and the bytes of a value.
+"""One entry of the object dictionary: type, rights, limits, and the bytes of a value.
 
 Source: CiA 301, "Data type entry usage" and "Object dictionary", EDS keywords of CiA 306.
 """
@@ -12,14 +12,14 @@ from dataclasses import dataclass
 from canopen.objectdictionary import ObjectDictionary, datatypes
 
 from canprobe.fieldbus.eds.description import LAST_DUMMY, DescribedEntry, Description
-from canprobe.fieldbus.eds.values import REALS, SIGNED, UNSIGNED
+from canprobe.fieldbus.eds.values import REAL_FORMS, SIGNED_BITS, UNSIGNED_BITS
 from canprobe.fieldbus.node.abort import Abort, SdoAbort
 
 Value = int | float | bytes
 
 
 def key_of(index: int, subindex: int = 0) -> int:
-    """Index and subindex as one dictionary key."""
+    """Dictionary key of an index and a subindex."""
     return index << 8 | subindex
 
 
@@ -29,12 +29,13 @@ class Entry:
 
     Attributes:
         key: index << 8 | subindex.
-        bits: length of a fixed-size value; 0 for strings and domains.
+        name: name in the EDS.
+        bits: length of a value of fixed size; 0 for strings and domains.
         signed: whether an integer is signed.
-        real: struct format of a REAL32/REAL64, or empty.
-        readable, writable: access over SDO.
-        in_tpdo, in_rpdo: may be mapped there.
-        low, high: limits of the EDS, or None.
+        real: struct format of a REAL32 or REAL64; empty for other types.
+        readable, writable: whether SDO may read and write it.
+        in_tpdo, in_rpdo: whether a TPDO, an RPDO may map it.
+        low, high: limits in the EDS, or None.
         default: value after a reset.
     """
 
@@ -52,7 +53,7 @@ class Entry:
     default: Value
 
     def to_bytes(self, value: Value) -> bytes:
-        """Value → bytes on the wire."""
+        """Bytes of a value on the wire."""
         if isinstance(value, bytes):
             return value
         if self.real:
@@ -60,7 +61,7 @@ class Entry:
         return int(value).to_bytes(self.bits // 8, "little", signed=self.signed)
 
     def from_bytes(self, data: bytes) -> Value:
-        """Bytes on the wire → value. Raises SdoAbort when the length is not the object's."""
+        """Value of bytes on the wire. Raises SdoAbort when the length is not the object's."""
         if not self.bits:
             return bytes(data)
         self.check_size(len(data))
@@ -70,12 +71,12 @@ class Entry:
         return int.from_bytes(data, "little", signed=self.signed)
 
     def check_size(self, size: int) -> None:
-        """Raises SdoAbort when a value of a fixed size has another size than `size` bytes."""
+        """Check the size of a value, bytes. Raises SdoAbort when the object has another size."""
         if self.bits and size * 8 != self.bits:
             raise SdoAbort(Abort.TOO_LONG if size * 8 > self.bits else Abort.TOO_SHORT)
 
     def check_limits(self, value: Value) -> None:
-        """Raises SdoAbort when the value is outside the EDS's limits."""
+        """Check a value against the limits of the EDS. Raises SdoAbort when it is outside."""
         if isinstance(value, bytes):
             return
         if self.high is not None and value > self.high:
@@ -85,20 +86,20 @@ class Entry:
 
 
 def read_entries(od: ObjectDictionary) -> Iterator[Entry]:
-    """Every entry of a parsed EDS, the dummy types 0001h–0007h that DummyUsage allows included."""
+    """Every entry of a parsed EDS, with the dummy types 0001h–0007h that DummyUsage allows."""
     return map(_entry, Description(od).entries())
 
 
 def _entry(described: DescribedEntry) -> Entry:
     data_type = described.data_type
-    number = data_type in SIGNED or data_type in UNSIGNED or data_type in REALS
+    number = data_type in SIGNED_BITS or data_type in UNSIGNED_BITS or data_type in REAL_FORMS
     bits = 8 if data_type == datatypes.BOOLEAN else described.bits if number else 0
     return Entry(
         key=key_of(described.index, described.subindex),
         name=described.name,
         bits=bits,
         signed=described.signed,
-        real=REALS[data_type][0] if data_type in REALS else "",
+        real=REAL_FORMS[data_type][0] if data_type in REAL_FORMS else "",
         readable=described.readable,
         writable=described.writable,
         in_tpdo=described.in_tpdo and described.index > LAST_DUMMY,

@@ -8,7 +8,7 @@ from random import Random
 
 
 class FaultKind(Enum):
-    """What goes wrong between a node and the bus, or in the node."""
+    """Kinds of faults between a node and the bus, or in the node."""
 
     DROP = "drop"
     DELAY = "delay"
@@ -28,13 +28,13 @@ class Fault:
     """One fault.
 
     Attributes:
-        kind: what goes wrong.
-        node_id: whose.
-        start_ns, duration_ns: when it begins, on the bus's clock, and how long it lasts.
-        share: of the frames that it hits, 0…1.
-        incoming: it hits what the node receives; else what it sends.
+        kind: kind of the fault.
+        node_id: id of the node.
+        start_ns, duration_ns: beginning, on the clock of the bus, and duration.
+        share: share of the frames that it hits, 0…1.
+        incoming: whether it hits the frames that the node receives; else it hits those that the node sends.
         amount_ns: delay of a frame, or time between two frames of a babbling node.
-        seed: of its chances.
+        seed: seed of its random choices.
     """
 
     kind: FaultKind
@@ -48,11 +48,11 @@ class Fault:
 
     @property
     def end_ns(self) -> int:
-        """When it is over."""
+        """End of the fault, on the clock of the bus."""
         return self.start_ns + self.duration_ns
 
     def holds(self, t_ns: int) -> bool:
-        """Whether it is at work."""
+        """Whether the fault is present."""
         return self.start_ns <= t_ns < self.end_ns
 
     def __str__(self) -> str:
@@ -64,7 +64,7 @@ class Fault:
 
 
 def flip_bit(data: bytes, rng: Random) -> bytes:
-    """The data with one bit changed, or cut short: what a CRC on the wire lets through once in a lifetime."""
+    """The data with one bit changed, or cut short, as the CRC of the wire lets it pass once in a lifetime."""
     if not data:
         return data
     if rng.random() < 0.2:

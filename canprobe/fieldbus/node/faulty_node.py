@@ -17,19 +17,19 @@ from canprobe.fieldbus.protocol.tactile import TactileHeader, crc16_ccitt
 
 _GARBAGE_ID = 0x050
 _TPDO1 = 0x180
-_DARK = (FaultKind.REBOOT, FaultKind.FREEZE)
+_DARK_KINDS = (FaultKind.REBOOT, FaultKind.FREEZE)
 
 
 class FaultyNode(WrappedNode):
-    """One node and its faults; without any it is the node itself.
+    """One node and its faults; without faults it behaves as the node itself.
 
     Args:
         node: the node.
-        faults: of this node; those of others are left out.
-        tactile_ids: COB-IDs of a tactile frame, header first; for wrong data with the right CRC.
+        faults: faults; those of other nodes are left out.
+        tactile_ids: COB-IDs of a tactile frame, header first, for wrong data with the right CRC.
 
     Attributes:
-        hits: frames that were changed, lost, moved or made up, and reboots.
+        hits: number of frames that were changed, lost, moved or made up, and of reboots.
     """
 
     def __init__(self, node: SlaveNode, faults: Iterable[Fault] = (), tactile_ids: Sequence[int] = ()) -> None:
@@ -48,24 +48,24 @@ class FaultyNode(WrappedNode):
                 self.add(fault)
 
     def add(self, fault: Fault) -> None:
-        """Let one more fault happen, from its start or from now on."""
+        """Add a fault; it happens from its start on, or from now on."""
         self._faults.append((fault, Random(fault.seed)))
         if fault.kind is FaultKind.BABBLE:
             self._babble_ns[fault] = fault.start_ns
         if fault.kind is FaultKind.REBOOT:
             self._boots = sorted((*self._boots, fault.start_ns, fault.end_ns))
-        if fault.kind in _DARK:
+        if fault.kind in _DARK_KINDS:
             self._thaws = sorted((*self._thaws, fault.end_ns))
 
     @property
     def next_deadline_ns(self) -> int | None:
-        """The node's, while its time goes on; and that of the faults."""
+        """The next deadline of the node, while its time goes on, and of the faults."""
         due = [self._later[0][0]] if self._later else []
         due += [t for f, t in self._babble_ns.items() if t < f.end_ns]
         due += self._boots[:1] + self._thaws[:1]
         own = self.node.next_deadline_ns
         if own is not None:
-            due.append(max((own, *(f.end_ns for f, _ in self._faults if f.kind in _DARK and f.holds(own)))))
+            due.append(max((own, *(f.end_ns for f, _ in self._faults if f.kind in _DARK_KINDS and f.holds(own)))))
         return min(due, default=None)
 
     def start(self, t_ns: int) -> Sequence[Frame]:
@@ -73,7 +73,7 @@ class FaultyNode(WrappedNode):
         return self._sent(self.node.start(t_ns), t_ns)
 
     def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
-        """A frame from the bus, which may not come through."""
+        """Take a frame from the bus, which may not reach the node."""
         if self._is_dark(t_ns):
             self.hits += 1
             return ()
@@ -83,7 +83,7 @@ class FaultyNode(WrappedNode):
         return self._sent(out, t_ns)
 
     def advance(self, t_ns: int) -> Sequence[Frame]:
-        """What is due: of the node, of its faults."""
+        """Do what is due in the node and in its faults."""
         ready = self._reboot(t_ns)
         while self._thaws and self._thaws[0] <= t_ns:
             self._thaws.pop(0)
@@ -100,10 +100,10 @@ class FaultyNode(WrappedNode):
         return [*ready, *self._sent(answers, t_ns), *self._babble(t_ns)]
 
     def _is_dark(self, t_ns: int) -> bool:
-        return any(f.kind in _DARK and f.holds(t_ns) for f, _ in self._faults)
+        return any(f.kind in _DARK_KINDS and f.holds(t_ns) for f, _ in self._faults)
 
     def _reboot(self, t_ns: int) -> list[Frame]:
-        """Power fails: the node is as new, and silent until power is back."""
+        """Let the power fail: the node starts anew, and is silent until the power is back."""
         out: list[Frame] = []
         while self._boots and self._boots[0] <= t_ns:
             self._boots.pop(0)
@@ -121,7 +121,7 @@ class FaultyNode(WrappedNode):
         return out
 
     def _sent(self, frames: Sequence[Frame], t_ns: int) -> Sequence[Frame]:
-        """What of the node's frames comes to the bus now."""
+        """Those of the node's frames that reach the bus now."""
         if not frames and not self._swapped:
             return frames
         if self._is_dark(t_ns):
@@ -170,7 +170,7 @@ class FaultyNode(WrappedNode):
         return frames
 
     def _wrong_position(self, frame: Frame, rng: Random) -> Frame:
-        """The drive's TPDO with another position: bytes 2 to 5."""
+        """The TPDO of the drive with another position in bytes 2 to 5."""
         can_id, data = frame
         if can_id != _TPDO1 + self.node.node_id or len(data) != 8:
             return frame
@@ -179,7 +179,7 @@ class FaultyNode(WrappedNode):
         return can_id, data[:2] + position.to_bytes(4, "little", signed=True) + data[6:]
 
     def _wrong_header(self, frames: list[Frame], seed: int, rng: Random) -> list[Frame]:
-        """A tactile frame that names another SYNC (even seeds) or another age, with the right CRC."""
+        """A tactile frame with another SYNC counter (even seeds) or another age, and the right CRC."""
         parts = dict(frames)
         if not all(can_id in parts for can_id in self._tactile_ids):
             return frames
@@ -199,7 +199,7 @@ class FaultyNode(WrappedNode):
 
 
 def _nonsense(node_id: int, seed: int, rng: Random) -> Frame:
-    """A frame of a babbling node, of one sort for each fault."""
+    """A frame of a babbling node; each fault has its own sort of frames."""
     data = rng.randbytes(8)
     sorts: tuple[Frame, ...] = (
         (_GARBAGE_ID, data),

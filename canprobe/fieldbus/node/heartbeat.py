@@ -13,7 +13,7 @@ from canprobe.fieldbus.node.core import NO_ROUTES, NodeCore, Route, Service
 from canprobe.fieldbus.node.emcy import Emergency
 from canprobe.fieldbus.node.entry import Value
 from canprobe.fieldbus.node.timers import Timer
-from canprobe.fieldbus.protocol.emcy import HEARTBEAT_LOST
+from canprobe.fieldbus.protocol.emcy import HEARTBEAT_LOST_CODE
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, NmtState, pack_heartbeat
 
 
@@ -26,11 +26,11 @@ class HeartbeatProducer(Service):
         core.dictionary.on_write(0x1017, lambda _sub, _value: self._begin(core.now_ns))
 
     def reset(self, t_ns: int) -> None:
-        """Silent until `boot_up`."""
+        """Stay silent until `boot_up`."""
         self._timer.cancel()
 
     def entered(self, t_ns: int) -> None:
-        """A heartbeat with the new state."""
+        """Send a heartbeat with the new state."""
         self._begin(t_ns)
 
     def boot_up(self, t_ns: int) -> None:
@@ -53,27 +53,27 @@ class HeartbeatProducer(Service):
 
 
 class HeartbeatConsumer(Service):
-    """Watches the producers of 1016h, each from its first heartbeat on."""
+    """Watches the producers that 1016h names, each from its first heartbeat on."""
 
     def __init__(self, core: NodeCore, emcy: Emergency, on_loss: Callable[[int], None]) -> None:
         """`on_loss(t_ns)` is called when a producer is lost."""
         self._core, self._emcy, self._on_loss = core, emcy, on_loss
-        self._watched: dict[int, tuple[Timer, int]] = {}  # by node id: its timer, its period in ns
+        self._watched: dict[int, tuple[Timer, int]] = {}  # timer and period in ns by node id
         core.dictionary.on_check(0x1016, self._check)
         core.dictionary.on_change(self._configure, 0x1016)
 
     def reset(self, t_ns: int) -> None:
-        """Read 1016h; nobody has been heard."""
+        """Read 1016h; no producer has been heard."""
         self._configure()
 
     def routes(self) -> Mapping[int, Route]:
-        """Heartbeat identifiers of the producers watched."""
+        """Heartbeat identifiers of the producers that are watched."""
         if self._core.state is NmtState.INITIALISING:
             return NO_ROUTES
         return {HEARTBEAT_BASE + node_id: partial(self._heard, node_id) for node_id in self._watched}
 
     def _entries(self) -> dict[int, tuple[int, int]]:
-        """Subindex → (node id, period in ms) of the entries in use."""
+        """Node id and period in ms of the entries in use, by subindex."""
         number, found = self._core.dictionary.number, {}
         for subindex in range(1, 128):
             word = number(0x1016, subindex)
@@ -84,7 +84,7 @@ class HeartbeatConsumer(Service):
     def _configure(self) -> None:
         for node_id, (timer, _) in self._watched.items():
             timer.cancel()
-            self._emcy.clear(HEARTBEAT_LOST, node_id)
+            self._emcy.clear(HEARTBEAT_LOST_CODE, node_id)
         self._watched = {
             node_id: (self._core.timers.new(partial(self._timed_out, node_id)), period * 1_000_000)
             for node_id, period in self._entries().values()
@@ -96,10 +96,10 @@ class HeartbeatConsumer(Service):
             timer, period_ns = self._watched[node_id]
             timer.arm(t_ns + period_ns)
             if self._emcy.any:
-                self._emcy.clear(HEARTBEAT_LOST, node_id)
+                self._emcy.clear(HEARTBEAT_LOST_CODE, node_id)
 
     def _timed_out(self, node_id: int, due_ns: int) -> None:
-        self._emcy.report(HEARTBEAT_LOST, bytes((node_id,)), source=node_id)
+        self._emcy.report(HEARTBEAT_LOST_CODE, bytes((node_id,)), source=node_id)
         self._on_loss(due_ns)
 
     def _check(self, subindex: int, value: Value) -> None:

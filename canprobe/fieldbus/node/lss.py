@@ -1,8 +1,8 @@
-"""LSS slave: the node gets its id over the bus. Without one it stays in initialisation and hears LSS alone.
+"""LSS slave: the node gets its id over the bus. Without an id it stays in initialisation and only hears LSS.
 
-An id that was configured is used from the next NMT reset communication on; a node that had none makes that reset by
-itself when it is switched back to waiting. What was stored is used after the next power on. The bit rate is that of
-the bus: another one is refused.
+An id that was configured holds from the next NMT reset communication on. A node without an id makes that reset by
+itself when it is switched back to waiting. An id that was stored holds after the next power on. The bit rate is that
+of the bus; any other one is refused.
 Source: CiA 305, "LSS slave", "LSS services".
 """
 
@@ -12,14 +12,14 @@ from collections.abc import Callable, Mapping
 
 from canprobe.fieldbus.node.abort import SdoAbort
 from canprobe.fieldbus.node.core import NodeCore, Route, Service
-from canprobe.fieldbus.node.lss_search import IDENTIFY, SELECT, LssSearch
+from canprobe.fieldbus.node.lss_search import IDENTIFY_COMMANDS, SELECT_COMMANDS, LssSearch
 from canprobe.fieldbus.node.store import Store
 from canprobe.fieldbus.protocol.lss import (
     BIT_RATES,
     LSS_ANSWER_ID,
-    LSS_LENGTH,
+    LSS_BYTES,
     LSS_REQUEST_ID,
-    UNCONFIGURED,
+    UNCONFIGURED_ID,
     LssAddress,
     LssCommand,
     LssError,
@@ -28,22 +28,22 @@ from canprobe.fieldbus.protocol.lss import (
     pack_number,
 )
 
-_INQUIRE = range(LssCommand.INQUIRE_VENDOR, LssCommand.INQUIRE_SERIAL + 1)
+_INQUIRE_COMMANDS = range(LssCommand.INQUIRE_VENDOR, LssCommand.INQUIRE_SERIAL + 1)
 
 
 class LssSlave(Service):
     """The LSS service of one node.
 
     Args:
-        core: of the node; its `node_id` is the active one.
-        store: keeps the id that "store configuration" stores.
-        reset: called with the time when a node that had no id is to boot with its new one.
-        bitrate: see below.
+        core: core of the node; its `node_id` is the active one.
+        store: store for the id that "store configuration" stores.
+        reset: function that is called with the time when a node that had no id boots with its new one.
+        bitrate: bit rate of the bus, bit/s.
 
     Attributes:
-        pending: node id from the next reset communication on, or `UNCONFIGURED`.
+        pending: node id from the next reset communication on, or `UNCONFIGURED_ID`.
         state: waiting or configuration.
-        bitrate: of the bus, bit/s.
+        bitrate: bit rate of the bus, bit/s.
     """
 
     def __init__(self, core: NodeCore, store: Store, reset: Callable[[int], None], bitrate: int = 1_000_000) -> None:
@@ -54,29 +54,29 @@ class LssSlave(Service):
 
     @property
     def address(self) -> LssAddress:
-        """What 1018h holds."""
+        """The LSS address, which 1018h holds."""
         return LssAddress(*(self._core.dictionary.number(0x1018, subindex) for subindex in (1, 2, 3, 4)))
 
     @property
     def unconfigured(self) -> bool:
-        """The node has no id and waits for one."""
-        return self._core.node_id == UNCONFIGURED
+        """Whether the node has no id and waits for one."""
+        return self._core.node_id == UNCONFIGURED_ID
 
     def power_on(self) -> None:
-        """Take the id that was stored, if one was."""
+        """Take the stored id, if there is one."""
         if self._store.node_id is not None:
             self.pending = self._store.node_id
 
     def reset(self, t_ns: int) -> None:
-        """Back to waiting, nothing heard."""
+        """Go back to waiting, with nothing heard."""
         self._enter(LssState.WAITING)
 
     def routes(self) -> Mapping[int, Route]:
-        """The LSS master's messages, in every NMT state."""
+        """Identifier of the LSS master, in every NMT state."""
         return {LSS_REQUEST_ID: self._receive}
 
     def _receive(self, data: bytes, t_ns: int) -> None:
-        if len(data) != LSS_LENGTH:
+        if len(data) != LSS_BYTES:
             return
         if data[0] == LssCommand.SWITCH_GLOBAL:
             self._switch(data[1], t_ns)
@@ -90,7 +90,7 @@ class LssSlave(Service):
     def _switch(self, mode: int, t_ns: int) -> None:
         if mode not in tuple(LssState):
             return
-        boots = self.state is LssState.CONFIGURATION and self.unconfigured and self.pending != UNCONFIGURED
+        boots = self.state is LssState.CONFIGURATION and self.unconfigured and self.pending != UNCONFIGURED_ID
         self._enter(LssState(mode))
         if boots and mode == LssState.WAITING:
             self._reset(t_ns)
@@ -100,14 +100,14 @@ class LssSlave(Service):
         self._search.forget()
 
     def _searched(self, data: bytes) -> bytes | None:
-        """Answer the questions by which a master finds the slave; fastscan is for slaves without an id alone."""
+        """Answer the questions by which a master finds the slave; only a slave without an id answers fastscan."""
         command, waits = data[0], self.state is LssState.WAITING
-        blank = self.unconfigured and self.pending == UNCONFIGURED  # no id, and it was not given one yet
-        if command in IDENTIFY and self._search.identifies(data, self.address):
+        blank = self.unconfigured and self.pending == UNCONFIGURED_ID  # it has no id, and was given none yet
+        if command in IDENTIFY_COMMANDS and self._search.identifies(data, self.address):
             return pack_lss(LssCommand.IDENTIFIED)
         if command == LssCommand.IDENTIFY_UNCONFIGURED and blank:
             return pack_lss(LssCommand.IDENTIFIED_UNCONFIGURED)
-        if waits and command in SELECT and self._search.selects(data, self.address):
+        if waits and command in SELECT_COMMANDS and self._search.selects(data, self.address):
             self._enter(LssState.CONFIGURATION)
             return pack_lss(LssCommand.SELECTED)
         if waits and command == LssCommand.FASTSCAN and blank:
@@ -118,14 +118,14 @@ class LssSlave(Service):
         return None
 
     def _configured(self, data: bytes) -> bytes | None:
-        """Answer what a master asks and orders in configuration state."""
+        """Answer the questions and orders of a master in configuration state."""
         command, error = data[0], LssError.NONE
-        if command in _INQUIRE:
-            return pack_number(LssCommand(command), self.address.numbers[command - _INQUIRE[0]])
-        if command == LssCommand.INQUIRE_NODE_ID:  # in initialisation the pending one, which is about to be active
+        if command in _INQUIRE_COMMANDS:
+            return pack_number(LssCommand(command), self.address.numbers[command - _INQUIRE_COMMANDS[0]])
+        if command == LssCommand.INQUIRE_NODE_ID:  # in initialisation the pending one, which becomes active
             return pack_lss(LssCommand(command), bytes((self.pending if self.unconfigured else self._core.node_id,)))
         if command == LssCommand.CONFIGURE_NODE_ID:
-            if 1 <= data[1] <= 127 or data[1] == UNCONFIGURED:
+            if 1 <= data[1] <= 127 or data[1] == UNCONFIGURED_ID:
                 self.pending = data[1]
             else:
                 error = LssError.REFUSED

@@ -2,7 +2,7 @@
 
     power on / reset → INITIALISING → (boot-up) PRE_OPERATIONAL ⇄ OPERATIONAL ⇄ STOPPED ⇄ PRE_OPERATIONAL
 
-Every command works in every state but INITIALISING, where none does.
+Every command works in every state but INITIALISING, in which no command works.
 Source: CiA 301, "NMT state machine" and "NMT node control".
 """
 

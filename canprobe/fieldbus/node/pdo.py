@@ -1,31 +1,30 @@
 """All PDOs of a node: which frame goes where, and what a SYNC does.
 
-At a SYNC in operational: waiting synchronous RPDOs are applied, the application moves on, then every TPDO whose turn
-it is is sampled and packed. TPDOs of equal type and start value share one group, so they always go together.
+At a SYNC in operational the values of waiting synchronous RPDOs are stored, the application moves on, and the TPDOs
+whose turn it is are sampled and packed. TPDOs of equal type and start value are one group, so they always go together.
 Source: CiA 301, "Process data object (PDO)", objects 1007h, 1019h, 18xxh:06.
 """
 
 from __future__ import annotations
 
 import struct
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 
-from canprobe.fieldbus.node.core import NO_ROUTES, NodeCore, Route, Service
+from canprobe.fieldbus.node.core import NO_ROUTES, DelayedFrames, NodeCore, Route, Service
 from canprobe.fieldbus.node.emcy import Emergency
 from canprobe.fieldbus.node.entry import Value, key_of
 from canprobe.fieldbus.node.pdo_rules import PdoRules
 from canprobe.fieldbus.node.rpdo import Rpdo
-from canprobe.fieldbus.node.tpdo import BUFFERED, Packing, Sampler, Tpdo
+from canprobe.fieldbus.node.tpdo import BUFFERED_TYPE, Packing, Sampler, Tpdo
 from canprobe.fieldbus.protocol.frames import Frame, NmtState
 
 
 class _Group:
-    """TPDOs that a SYNC triggers together: every `every`-th, counted from the SYNC with counter `start`.
+    """TPDOs that a SYNC triggers together: every `every`-th SYNC, counted from the one with counter `start`.
 
     Attributes:
-        samplers: bring their values up to date.
-        packing: how each is then packed.
+        samplers: functions that bring the values up to date.
+        packing: identifier, packer and source of values of each TPDO.
     """
 
     def __init__(self, every: int, start: int) -> None:
@@ -40,9 +39,9 @@ class PdoEngine(Service):
     """The PDOs of one node.
 
     Args:
-        core: of the node.
-        emcy: reports what is wrong with an RPDO.
-        on_sync: `on_sync(t_ns, counter)` at a SYNC in operational, before the TPDOs are packed.
+        core: core of the node.
+        emcy: EMCY producer for errors of an RPDO.
+        on_sync: function that is called as `on_sync(t_ns, counter)` at a SYNC in operational, before TPDOs are packed.
     """
 
     def __init__(self, core: NodeCore, emcy: Emergency, on_sync: Callable[[int, int], None]) -> None:
@@ -55,8 +54,8 @@ class PdoEngine(Service):
         self._groups: list[_Group] = []
         self._on_event: list[Tpdo] = []
         self._buffered: list[Tpdo] = []
-        self._late: deque[tuple[int, list[Frame]]] = deque()  # when, and what
-        self._late_timer = core.timers.new(self._send_late)
+        self._delay_ns = core.quirks.tpdo_delay_ns
+        self._late = DelayedFrames(core, self._delay_ns)
         self._count = self._sync_ns = self._window_ns = 0
         for rules in _discover(core, 0x1400, transmits=False):
             self._rpdos.append(rpdo := Rpdo(core, emcy, rules))
@@ -83,7 +82,7 @@ class PdoEngine(Service):
         dictionary.on_write(rules.mapping, reconfigure)
 
     def on_trigger(self, index: int, sampler: Sampler) -> None:
-        """`sampler(t_ns)` is called once before TPDOs that map `index` are packed."""
+        """Call `sampler(t_ns)` once before TPDOs that map `index` are packed."""
         self._samplers[index] = sampler
 
     def reset(self, t_ns: int) -> None:
@@ -93,11 +92,10 @@ class PdoEngine(Service):
         self._rebuild()
 
     def entered(self, t_ns: int) -> None:
-        """Count SYNCs anew in operational; be silent elsewhere."""
+        """Count SYNCs anew in operational; stay silent in other states."""
         for pdo in self._all:
             pdo.stop()
         self._late.clear()
-        self._late_timer.cancel()
         if self._core.state is NmtState.OPERATIONAL:
             self._groups = []
             self._rebuild()
@@ -105,7 +103,7 @@ class PdoEngine(Service):
                 tpdo.started(t_ns)
 
     def routes(self) -> Mapping[int, Route]:
-        """RPDOs and remote requests for TPDOs, in operational only; PDOs that share an identifier are all served."""
+        """Identifiers of RPDOs and of remote requests for TPDOs, in operational; PDOs may share an identifier."""
         if self._core.state is not NmtState.OPERATIONAL:
             return NO_ROUTES
         routes: dict[int, Route] = {}
@@ -137,7 +135,7 @@ class PdoEngine(Service):
         return inside_window
 
     def rpdo(self, cob_id: int) -> Rpdo:
-        """The RPDO with this identifier. StopIteration: none."""
+        """The RPDO with this identifier. Raises StopIteration where there is none."""
         return next(rpdo for rpdo in self._rpdos if rpdo.cob_id == cob_id)
 
     def receives(self, index: int) -> bool:
@@ -145,30 +143,29 @@ class PdoEngine(Service):
         return any(key >> 8 == index for rpdo in self._rpdos if rpdo.cob_id is not None for key in rpdo.keys)
 
     def event(self, index: int, subindex: int = 0) -> None:
-        """A value of the device changed: TPDOs of type 0, 254 and 255 that carry it are due."""
+        """Report that a value of the device changed: TPDOs of type 0, 254 and 255 that carry it are due."""
         self._written((key_of(index, subindex),))
 
     def _written(self, keys: Sequence[int]) -> None:
-        """As `event`, of values that changed together: one event for each TPDO."""
+        """Report values that changed together: one event for each TPDO that carries one of them."""
         if self._core.state is NmtState.OPERATIONAL:
             for tpdo in self._on_event:
                 if any(key in tpdo.keys for key in keys):
                     tpdo.event(self._core.now_ns)
 
     def sync(self, t_ns: int, counter: int, elapsed: int) -> None:
-        """A SYNC in operational.
+        """Serve a SYNC in operational.
 
         Args:
-            t_ns: its time.
-            counter: its counter, 0 without one.
-            elapsed: SYNCs since the last one heard; the counter shows the lost ones, which are included.
+            t_ns: time of the SYNC.
+            counter: counter of the SYNC, 0 without one.
+            elapsed: number of SYNCs since the last one that was heard, with the lost ones that the counter shows.
         """
         core = self._core
         for group in self._triggered(t_ns, counter, elapsed):
             frames = self._packed(group, t_ns)
-            if core.quirks.tpdo_delay_ns:
-                self._late.append((t_ns + core.quirks.tpdo_delay_ns, frames))
-                self._late_timer.arm(self._late[0][0])
+            if self._delay_ns:  # what the frames carry is as old as the SYNC
+                self._late.send(frames, t_ns)
             else:
                 core.out += frames
         for tpdo in self._buffered:
@@ -178,12 +175,12 @@ class PdoEngine(Service):
                 tpdo.send(t_ns)
 
     def exchange(self, t_ns: int, counter: int) -> list[tuple[int, tuple[int, ...]]]:
-        """As `sync`, for a master that takes values: the TPDOs whose turn it is, each (COB-ID, its values)."""
+        """Serve a SYNC of a master that takes values: return COB-ID and values of the TPDOs whose turn it is."""
         groups, values = self._triggered(t_ns, counter, 1), self._core.dictionary.values
         return [(cob_id, fetch(values)) for group in groups for cob_id, _, fetch in group.packing]
 
     def _triggered(self, t_ns: int, counter: int, elapsed: int) -> list[_Group]:
-        """What a SYNC does before anything is packed: the TPDOs whose turn it is, their values up to date."""
+        """Do what a SYNC does before TPDOs are packed; return the groups whose turn it is, with fresh values."""
         self._sync_ns = t_ns
         count = self._count = self._count + elapsed
         for rpdo in self._waiting:
@@ -212,20 +209,13 @@ class PdoEngine(Service):
                 tpdo.send(t_ns)  # the one with the value that does not fit raises, with its name
             raise
 
-    def _send_late(self, due_ns: int) -> None:
-        """Frames of a node that is slow after SYNC: what they carry is as old as the SYNC."""
-        while self._late and self._late[0][0] <= due_ns:
-            self._core.out += self._late.popleft()[1]
-        if self._late:
-            self._late_timer.arm(self._late[0][0])
-
     def _rebuild(self) -> None:
         dictionary = self._core.dictionary
         self._window_ns = dictionary.number(0x1007) * 1000
         self._waiting = [rpdo for rpdo in self._rpdos if rpdo.cob_id is not None and rpdo.synchronous]
         active = [tpdo for tpdo in self._tpdos if tpdo.active]
         self._on_event = [tpdo for tpdo in active if tpdo.type == 0 or tpdo.by_event]
-        self._buffered = [tpdo for tpdo in active if tpdo.type == BUFFERED]
+        self._buffered = [tpdo for tpdo in active if tpdo.type == BUFFERED_TYPE]
         dictionary.watched = frozenset(key for tpdo in self._on_event for key in tpdo.keys)
         counted = bool(dictionary.number(0x1019))
         groups: dict[tuple[int, int], _Group] = {}

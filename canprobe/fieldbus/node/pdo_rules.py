@@ -1,4 +1,4 @@
-"""What may be written to PDO communication and mapping parameters, and when.
+"""Rules for writing PDO communication and mapping parameters.
 
 Source: CiA 301, "PDO mapping", objects 1400h to 1BFFh.
 """
@@ -9,14 +9,15 @@ from dataclasses import dataclass
 
 from canprobe.fieldbus.eds.packaged import LONG_PDOS, LONG_PDOS_NAME
 from canprobe.fieldbus.node.abort import Abort, SdoAbort
-from canprobe.fieldbus.node.core import INVALID, check_cob_id
+from canprobe.fieldbus.node.core import check_cob_id
 from canprobe.fieldbus.node.dictionary import Dictionary
 from canprobe.fieldbus.node.entry import Value, key_of
-from canprobe.fieldbus.protocol.pdo import FD_MAX_BITS, MAX_BITS, PdoEntry
+from canprobe.fieldbus.protocol.frames import INVALID_FLAG
+from canprobe.fieldbus.protocol.pdo import MAX_FD_PDO_BITS, MAX_PDO_BITS, PdoEntry
 
-COB_ID, TYPE, INHIBIT, EVENT, START = 1, 2, 3, 5, 6
-_RESERVED_RPDO = range(0xF1, 0xFE)
-_RESERVED_TPDO = range(0xF1, 0xFC)
+COB_ID_SUB, TYPE_SUB, INHIBIT_SUB, EVENT_SUB, START_SUB = 1, 2, 3, 5, 6
+_RESERVED_RPDO_TYPES = range(0xF1, 0xFE)
+_RESERVED_TPDO_TYPES = range(0xF1, 0xFC)
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,9 +25,9 @@ class PdoRules:
     """Rules of one PDO.
 
     Attributes:
-        dictionary: the node's.
-        communication, mapping: indices of its two parameter records.
-        transmits: TPDO or RPDO.
+        dictionary: dictionary of the node.
+        communication, mapping: indices of the two parameter records.
+        transmits: whether it is a TPDO; else it is an RPDO.
     """
 
     dictionary: Dictionary
@@ -36,30 +37,30 @@ class PdoRules:
 
     @property
     def valid(self) -> bool:
-        """Whether the PDO exists now (bit 31 of its COB-ID is 0)."""
-        return not self.dictionary.number(self.communication, COB_ID, INVALID) & INVALID
+        """Whether the PDO exists now: bit 31 of its COB-ID is 0."""
+        return not self.dictionary.number(self.communication, COB_ID_SUB, INVALID_FLAG) & INVALID_FLAG
 
     @property
     def long(self) -> bool:
-        """Whether PDOs of up to 64 bytes were switched on, in a device that has them."""
+        """Whether the device has PDOs of up to 64 bytes, and they were switched on."""
         dictionary = self.dictionary
         return self.transmits and dictionary.has_named(LONG_PDOS, LONG_PDOS_NAME) and bool(dictionary.number(LONG_PDOS))
 
     def check_communication(self, subindex: int, value: Value) -> None:
-        """Raises SdoAbort for a value that the standard forbids now."""
+        """Check a communication parameter. Raises SdoAbort for a value that the standard forbids now."""
         new, old = int(value), self.dictionary.number(self.communication, subindex)
-        if subindex == COB_ID:
+        if subindex == COB_ID_SUB:
             check_cob_id(new, old)
-        elif subindex == TYPE:
-            if new in (_RESERVED_TPDO if self.transmits else _RESERVED_RPDO):
+        elif subindex == TYPE_SUB:
+            if new in (_RESERVED_TPDO_TYPES if self.transmits else _RESERVED_RPDO_TYPES):
                 raise SdoAbort(Abort.VALUE)
-        elif subindex in (INHIBIT, START):
-            too_big = subindex == START and new > 240
+        elif subindex in (INHIBIT_SUB, START_SUB):
+            too_big = subindex == START_SUB and new > 240
             if too_big or (self.valid and new != old):
                 raise SdoAbort(Abort.VALUE)
 
     def check_mapping(self, subindex: int, value: Value) -> None:
-        """Raises SdoAbort for a mapping that cannot be, or cannot be changed now."""
+        """Check a mapping parameter. Raises SdoAbort for a mapping that is impossible, or cannot be changed now."""
         new, old = int(value), self.dictionary.number(self.mapping, subindex)
         if new == old:
             return
@@ -71,26 +72,26 @@ class PdoRules:
             self.entry(new)
 
     def entries(self, count: int | None = None, fixed: bool = False) -> tuple[PdoEntry, ...]:
-        """The first `count` mapped entries (all: None). Raises SdoAbort when they do not make a PDO."""
+        """The first `count` mapped entries; None: all. Raises SdoAbort when they make no PDO."""
         total = self.dictionary.number(self.mapping, 0) if count is None else count
         if total and key_of(self.mapping, total) not in self.dictionary:
             raise SdoAbort(Abort.MAPPING_LENGTH)
         found = tuple(self.entry(self.dictionary.number(self.mapping, sub), fixed) for sub in range(1, total + 1))
-        if sum(entry.bits for entry in found) > (FD_MAX_BITS if self.long else MAX_BITS):
+        if sum(entry.bits for entry in found) > (MAX_FD_PDO_BITS if self.long else MAX_PDO_BITS):
             raise SdoAbort(Abort.MAPPING_LENGTH)
         return found
 
     def present(self) -> tuple[PdoEntry, ...]:
-        """All mapped entries; none where the mapping makes no sense."""
+        """All mapped entries; empty where the mapping is impossible."""
         try:
             return self.entries(fixed=True)
         except SdoAbort:
             return ()
 
     def entry(self, word: int, fixed: bool = False) -> PdoEntry:
-        """One mapping word. Raises SdoAbort when its object does not exist, may not be mapped or has another length.
+        """Entry of a mapping word. Raises SdoAbort when its object is missing, not mappable or of another length.
 
-        What is there already may map anything: an EDS often does not list as mappable what a fixed mapping holds.
+        A fixed mapping may hold any object, as an EDS often does not list as mappable what it maps.
         """
         target = self.dictionary.entries.get(word >> 8)
         mappable = target is not None and (fixed or (target.in_tpdo if self.transmits else target.in_rpdo))

@@ -1,4 +1,4 @@
-"""What makes an emulated node difficult, on request."""
+"""Difficulties that an emulated node has on request."""
 
 from __future__ import annotations
 
@@ -7,17 +7,18 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Quirks:
-    """What makes an emulated drive difficult, to rehearse one that is.
+    """Difficulties of an emulated drive, to rehearse those of a real one.
 
     Attributes:
         refuse: indices of objects that refuse every write with 06010000h.
-        boot_ns: from reset to the boot-up message.
-        sdo_ns: from an SDO request to its answer.
-        fixed_mapping: mappings and COB-IDs of PDOs are read-only, whatever the EDS states.
-        tpdo_delay_ns: from SYNC to the TPDOs that it triggers.
+        boot_ns: time from a reset to the boot-up message.
+        sdo_ns: time from an SDO request to its answer.
+        fixed_mapping: whether mappings and COB-IDs of PDOs are read-only, whatever the EDS states.
+        tpdo_delay_ns: time from a SYNC to the TPDOs that it triggers.
         noise_counts: standard deviation of the encoder, counts.
-        keep_bit30: a COB-ID of a TPDO that is written must have bit 30 (no RTR) as it is, else 06090030h.
-        brake_early_ns: from the brake's opening to torque in the motor; a vertical axis of a dynamic arm falls.
+        keep_bit30: whether a write to the COB-ID of a TPDO that changes bit 30 (no RTR) is refused with 06090030h.
+        brake_early_ns: time from the opening of the brake to torque in the motor, in which a vertical axis of a dynamic
+            arm falls.
     """
 
     refuse: tuple[int, ...] = ()

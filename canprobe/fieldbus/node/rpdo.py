@@ -1,4 +1,4 @@
-"""One RPDO: reception, length check, event timer, and what happens to its values.
+"""One RPDO: reception, length check, event timer, and the storing of its values.
 
 Source: CiA 301, "RPDO", objects 1400h and 1600h; errors 8210h, 8220h, 8250h.
 """
@@ -10,8 +10,8 @@ from canprobe.fieldbus.node.core import NodeCore
 from canprobe.fieldbus.node.dictionary import Slot
 from canprobe.fieldbus.node.emcy import Emergency
 from canprobe.fieldbus.node.entry import key_of
-from canprobe.fieldbus.node.pdo_rules import COB_ID, EVENT, TYPE, PdoRules
-from canprobe.fieldbus.protocol.emcy import PDO_TOO_LONG, PDO_TOO_SHORT, RPDO_TIMEOUT
+from canprobe.fieldbus.node.pdo_rules import COB_ID_SUB, EVENT_SUB, TYPE_SUB, PdoRules
+from canprobe.fieldbus.protocol.emcy import PDO_TOO_LONG_CODE, PDO_TOO_SHORT_CODE, RPDO_TIMEOUT_CODE
 from canprobe.fieldbus.protocol.pdo import PdoLayout
 
 
@@ -20,14 +20,14 @@ class Rpdo:
 
     Attributes:
         cob_id: identifier, or None while the PDO is not valid.
-        keys: mapped dictionary keys, dummies left out.
-        synchronous: applied at the next SYNC (types 0–240).
-        pending: values waiting for that SYNC.
+        keys: mapped dictionary keys, without dummies.
+        synchronous: whether values are stored at the next SYNC (types 0–240).
+        pending: values that wait for that SYNC.
     """
 
     def __init__(self, core: NodeCore, emcy: Emergency, rules: PdoRules) -> None:
         self._core, self._emcy, self._rules = core, emcy, rules
-        self._timer = core.timers.new(self._timed_out)
+        self._timer = core.timers.new(lambda _due_ns: emcy.report(RPDO_TIMEOUT_CODE, source=self))
         self._layout = PdoLayout(0, ())
         self._unpack = self._layout.raw_unpack
         self._slots: tuple[Slot, ...] = ()
@@ -38,22 +38,22 @@ class Rpdo:
         self.pending: tuple[int, ...] | None = None
 
     def configure(self) -> None:
-        """Read the parameters. A mapping that makes no sense leaves the PDO without values."""
+        """Read the parameters. A PDO with an impossible mapping has no values."""
         dictionary, index = self._core.dictionary, self._rules.communication
         self.stop()
         if self._emcy.any:
-            self._forgive()  # what was wrong with the old parameters
-        self.cob_id = dictionary.number(index, COB_ID) & 0x7FF if self._rules.valid else None
+            self._forgive()  # the errors of the old parameters
+        self.cob_id = dictionary.number(index, COB_ID_SUB) & 0x7FF if self._rules.valid else None
         self._layout = PdoLayout(self.cob_id or 0, self._rules.present())
         self._unpack = self._layout.raw_unpack  # the length is checked before
         self.keys = tuple(key_of(signal.index, signal.subindex) for signal in self._layout.signals)
         self._slots = tuple(dictionary.slot(key) for key in self.keys)
-        self.synchronous = dictionary.number(index, TYPE) <= 240
-        self._event_ns = dictionary.number(index, EVENT) * 1_000_000
+        self.synchronous = dictionary.number(index, TYPE_SUB) <= 240
+        self._event_ns = dictionary.number(index, EVENT_SUB) * 1_000_000
 
     @property
     def patient(self) -> bool:
-        """Nothing has to be done about a frame before the next SYNC."""
+        """Whether a frame requires nothing before the next SYNC."""
         return self.synchronous and not self._event_ns
 
     def stop(self) -> None:
@@ -62,13 +62,13 @@ class Rpdo:
         self._timer.cancel()
 
     def receive(self, data: bytes, t_ns: int) -> None:
-        """A frame with this PDO's identifier."""
+        """Take a frame with the identifier of this PDO."""
         length = self._layout.length
         if len(data) != length:
             if len(data) < length:
-                self._emcy.report(PDO_TOO_SHORT, source=self)
+                self._emcy.report(PDO_TOO_SHORT_CODE, source=self)
                 return
-            self._emcy.report(PDO_TOO_LONG, source=self)
+            self._emcy.report(PDO_TOO_LONG_CODE, source=self)
             data = data[:length]
         elif self._emcy.any:
             self._forgive()
@@ -77,7 +77,7 @@ class Rpdo:
         self.take(self._unpack(data))
 
     def take(self, values: tuple[int, ...]) -> None:
-        """One value for each mapped entry but the dummies, for now or for the next SYNC."""
+        """Take one value for each mapped entry but the dummies, for now or for the next SYNC."""
         if self.synchronous:
             self.pending = values
         else:
@@ -105,9 +105,6 @@ class Rpdo:
             dictionary.written(reported)
 
     def _forgive(self) -> None:
-        for code in (PDO_TOO_SHORT, PDO_TOO_LONG, RPDO_TIMEOUT):
+        for code in (PDO_TOO_SHORT_CODE, PDO_TOO_LONG_CODE, RPDO_TIMEOUT_CODE):
             self._emcy.clear(code, self)
-        self._emcy.clear(RPDO_TIMEOUT)  # a drive's, which misses targets whatever PDO brings them
-
-    def _timed_out(self, due_ns: int) -> None:
-        self._emcy.report(RPDO_TIMEOUT, source=self)
+        self._emcy.clear(RPDO_TIMEOUT_CODE)  # that of a drive, which misses targets whatever PDO brings them

@@ -18,12 +18,12 @@ _MAX_WAIT_NS = 100_000_000
 class Exchange(LockstepBus):
     """The nodes of one process behind one bus: a lockstep bus whose time is that of the real one.
 
-    A SYNC goes to one kind of device after the other, in the order of `nodes`, and what one kind answers leaves before
+    A SYNC goes to one kind of device after the other, in the order of `nodes`, and the answers of one kind leave before
     the next kind starts to work: the drives' quick feedback does not wait for the sensor's image.
 
     Attributes:
-        skipped: SYNCs that were left unanswered because the next one had come already.
-        rerouted: set when a node has changed what it listens to; whoever acts on that clears it.
+        skipped: number of SYNCs that were left unanswered because the next one had come already.
+        rerouted: whether a node has changed what it listens to; whoever acts on that clears it.
     """
 
     def __init__(self, nodes: Sequence[Participant]) -> None:
@@ -42,31 +42,31 @@ class Exchange(LockstepBus):
 
     @property
     def patient(self) -> frozenset[int]:
-        """Identifiers that can wait for the next SYNC, whoever listens to them."""
+        """Identifiers that can wait for the next SYNC, for every node that listens to them."""
         wanted = {can_id for node in self._served for can_id in node.patient}
         return frozenset(i for i in wanted if all(i in node.patient or i not in node.listens for node in self._served))
 
     def start(self, t_ns: int) -> list[Frame]:
-        """Power on all nodes; returns what goes on the bus."""
+        """Power on all nodes; return the frames for the bus."""
         self.clock.move_ns(t_ns)
         for node in self._served:
             self.attach(node)
         return self._carry(t_ns)
 
     def step(self, frames: Sequence[TimedFrame], t_ns: int) -> list[Frame]:
-        """Feed what came from the bus, then do what is due by `t_ns`; returns what goes on the bus.
+        """Feed frames from the bus, then do what is due by `t_ns`; return the frames for the bus.
 
         Args:
-            frames: (can_id, data, time of reception in ns), in order.
-            t_ns: now; receptions in the future count as now, and none is earlier than the one before it.
+            frames: received frames, each (can_id, data, time of reception in ns), in order.
+            t_ns: present time; a reception after it counts as now, and none counts as earlier than the one before it.
         """
         return [frame for batch in self.batches(frames, t_ns) for frame in batch]
 
     def batches(self, frames: Sequence[TimedFrame], t_ns: int) -> Iterator[list[Frame]]:
-        """As `step`, but each batch is computed only when the one before it has been sent.
+        """Do the same as `step`, but compute each batch only when the one before it has been sent.
 
-        Of several SYNCs only the last is answered: nodes that are behind miss SYNCs, as busy devices do, instead of
-        answering old ones ever later.
+        Of several SYNCs only the last is answered: nodes that are late miss SYNCs, as busy devices do, instead of
+        answering old ones later and later.
         """
         self.clock.move_ns(t_ns)
         syncs = [can_id for can_id, _, _ in frames].count(SYNC_ID)
@@ -90,7 +90,7 @@ class Exchange(LockstepBus):
             yield rest
 
     def _synchronise(self, data: bytes, t_ns: int) -> Iterator[list[Frame]]:
-        """Pass a SYNC on. The nodes hear each other's answers to it only once they have all heard the SYNC itself."""
+        """Pass a SYNC on. The nodes hear each other's answers only after all of them have heard the SYNC."""
         if before := self._carry(t_ns):
             yield before
         spoken: list[tuple[Attachment, Frame]] = []
@@ -108,14 +108,14 @@ class Exchange(LockstepBus):
             self._hand_over(sender, *frame, t_ns)
 
     def _carry(self, t_ns: int) -> list[Frame]:
-        """Let the nodes hear what is queued and what they answer each other; returns it for the bus."""
+        """Let the nodes hear what is queued and what they answer each other; return it for the bus."""
         self._deliver(t_ns, self._max_frames)
         sent, self._sent = self._sent, []
         return sent
 
 
 class _Outside(Participant):
-    """Stands for everybody on the real bus, whose frames the nodes hear; what the nodes send leaves by the port."""
+    """Stands for all devices on the real bus, whose frames the nodes hear; frames of the nodes leave by the port."""
 
     listens = ()
 
@@ -131,9 +131,9 @@ class _Served:
             port.send_batch(boot_ups)
 
     def get_ready(self) -> int | None:
-        """Before a wait: when a node is due, None without any; the port wakes for what the nodes listen to now."""
+        """Prepare a wait: the port wakes for what the nodes listen to now. Returns when a node is due; None: never."""
         if self.exchange.rerouted:
-            # Being woken for each RPDO, in the middle of its sender's burst, costs both sides more than all else.
+            # A wake-up for each RPDO, in the middle of its sender's burst, costs both sides more than all else.
             self.exchange.rerouted = False
             if (patient := self.exchange.patient) != self._deferred:
                 self._deferred = patient
@@ -147,13 +147,13 @@ class _Served:
 
 
 def serve(buses: Sequence[tuple[Sequence[Participant], Port]], stop: Callable[[], bool]) -> None:
-    """Power on the nodes and serve them until `stop()`; it is called after every wait, of 100 ms at most.
+    """Power on the nodes and serve them until `stop()` is true.
 
     Nodes hear what is on their own bus. All of them may share one plant: they work one after the other.
 
     Args:
-        buses: of each bus its participants, for example `SlaveNode`s, and the port; the clock of the ports is theirs.
-        stop: ends the loop when it returns True.
+        buses: participants, for example `SlaveNode`s, and port of each bus; the participants live on the ports' clock.
+        stop: function that ends the loop by True; it is called after every wait, which lasts 100 ms at most.
     """
     ports = [port for _, port in buses]
     clock = ports[0].clock
@@ -167,7 +167,7 @@ def serve(buses: Sequence[tuple[Sequence[Participant], Port]], stop: Callable[[]
             else:
                 wait_for_any(ports, until_ns)
                 received = [port.drain() for port in ports]
-            # The last arrival is the time to work at: one reading of the clock less before the answers leave.
+            # The last arrival serves as present time, which saves a reading of the clock before the answers leave.
             arrivals_ns = [frames[-1][2] for frames in received if frames]
             now_ns = max(now_ns, *arrivals_ns) if arrivals_ns else clock.now_ns()
             for one, frames in zip(served, received, strict=True):

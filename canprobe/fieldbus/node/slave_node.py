@@ -2,7 +2,7 @@
 
     node = SlaveNode(od, node_id, application)
     frames = node.start(t_ns)                       # boot-up
-    frames = node.receive(can_id, data, t_ns)       # whatever is on the bus; never raises
+    frames = node.receive(can_id, data, t_ns)       # any frame on the bus; it never raises
     frames = node.advance(t_ns)                     # everything due up to t_ns
     node.next_deadline_ns                           # when to call advance, or None
 
@@ -12,11 +12,12 @@ Source: CiA 301 (the clauses are cited in the services).
 from __future__ import annotations
 
 from collections.abc import Callable, Container
+from functools import partial
 
 from canopen.objectdictionary import ObjectDictionary
 
+from canprobe.fieldbus.bus.port import nothing
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
-from canprobe.fieldbus.node.abort import nothing
 from canprobe.fieldbus.node.core import NodeCore, Route, Service
 from canprobe.fieldbus.node.dictionary import Dictionary
 from canprobe.fieldbus.node.emcy import Emergency
@@ -30,51 +31,51 @@ from canprobe.fieldbus.node.sdo_server import SdoServer
 from canprobe.fieldbus.node.store import Store
 from canprobe.fieldbus.node.sync import SyncConsumer
 from canprobe.fieldbus.protocol.frames import NMT_ID, Frame, NmtCommand, NmtState
-from canprobe.fieldbus.protocol.lss import UNCONFIGURED
+from canprobe.fieldbus.protocol.lss import UNCONFIGURED_ID
 
 OdOf = Callable[[int], ObjectDictionary]
-"""Parses a node's EDS for a node id."""
-_ON_COMMUNICATION_ERROR = {0: NmtState.PRE_OPERATIONAL, 2: NmtState.STOPPED}  # 1029h:01; 1: no change
+"""Parser of a node's EDS for a node id."""
+_COMMUNICATION_ERROR_STATES = {0: NmtState.PRE_OPERATIONAL, 2: NmtState.STOPPED}  # 1029h:01; 1: no change
 
 
 class Application:
-    """What a device does with its CANopen node. The base class does nothing; subclasses override what they need."""
+    """The function of a device on its CANopen node. The base class does nothing; subclasses override what they need."""
 
     def attach(self, node: SlaveNode) -> None:
-        """Once, at construction of the node: hang checks, hooks and samplers on its dictionary and PDOs."""
+        """Add checks, hooks and samplers to dictionary and PDOs; called once, at construction of the node."""
 
     def keep(self) -> bytes:
-        """What "save" (1010h) stores of the device beside its dictionary."""
+        """Bytes that "save" (1010h) stores of the device beside its dictionary."""
         return b""
 
     def recall(self, kept: bytes) -> None:
-        """Before `reset`: what was stored; empty when nothing was, or after "load" (1011h)."""
+        """Take what was stored, before `reset`; it is empty when nothing was stored, or after "load" (1011h)."""
 
     def reset(self, t_ns: int) -> None:
-        """The node boots; the dictionary holds its defaults or what was stored."""
+        """Boot; the dictionary holds its defaults or what was stored."""
 
     def entered(self, t_ns: int) -> None:
-        """The NMT state has just changed."""
+        """Act on the new NMT state."""
 
     def sync(self, t_ns: int, counter: int) -> None:
-        """A SYNC in operational: synchronous RPDOs have been applied, TPDOs are packed next."""
+        """Act on a SYNC in operational: values of synchronous RPDOs are stored, TPDOs are packed next."""
 
     def advance(self, t_ns: int) -> None:
-        """Time has come to `t_ns`; called before anything that the node does then."""
+        """Advance to `t_ns`; called before anything that the node does at that time."""
 
     def connection_lost(self, t_ns: int) -> None:
-        """The network is gone: heartbeat consumer, life guarding, NMT stop."""
+        """Act on the loss of the network: heartbeat consumer, life guarding, NMT stop."""
 
 
 class SlaveNode(Participant):
     """One node, made from an EDS and an application.
 
     Attributes:
-        core: state, dictionary and timers, shared with the services.
-        emcy, pdos, store: the services an application works with.
-        application: the device.
-        next_deadline_ns: when `advance` has something to do, or None.
-        lss: the LSS service; None where the node's id cannot be changed over the bus.
+        core: state, dictionary and timers, which the services share.
+        emcy, pdos, store: services that an application works with.
+        application: function of the device.
+        next_deadline_ns: time at which `advance` has something to do, or None.
+        lss: LSS service; None where the node's id cannot be changed over the bus.
     """
 
     next_deadline_ns: int | None = None
@@ -91,10 +92,10 @@ class SlaveNode(Participant):
 
         Args:
             od: parsed EDS, with $NODEID already put in.
-            node_id: 1–127; or 255 (`UNCONFIGURED`): it waits for LSS to give it one.
-            application: what the device does; none by default.
-            od_of: the same EDS for another node id. Where it is given, the node speaks LSS.
-            quirks: what makes it difficult, such as a slow boot, during which nothing is served; None: nothing.
+            node_id: node id, 1–127; with 255 (`UNCONFIGURED_ID`) the node waits for LSS to give it one.
+            application: function of the device; the default does nothing.
+            od_of: parser of the same EDS for another node id; with it the node speaks LSS.
+            quirks: difficulties of the node, such as a slow boot, during which nothing is served; None: it has none.
         """
         self.application = application if application is not None else Application()
         self.core = core = NodeCore(node_id, Dictionary(od), self, quirks if quirks is not None else Quirks())
@@ -107,7 +108,8 @@ class SlaveNode(Participant):
         self._heartbeat = HeartbeatProducer(core)
         channels = [0x1200, *(index for index in range(0x1201, 0x1280) if core.dictionary.has_index(index))]
         self._od_of = od_of
-        self.lss = LssSlave(core, self.store, self._renamed) if od_of is not None else None
+        reset = partial(self._initialise, communication_only=True)
+        self.lss = LssSlave(core, self.store, reset) if od_of is not None else None
         self._services: tuple[Service, ...] = (
             *([self.lss] if self.lss is not None else []),
             self.emcy,
@@ -123,17 +125,17 @@ class SlaveNode(Participant):
 
     @property
     def node_id(self) -> int:
-        """1–127, or 255 without one."""
+        """Node id, 1–127, or 255 without one."""
         return self.core.node_id
 
     @property
     def name(self) -> str:
-        """For messages."""
-        return f"node {self.core.node_id}" if self.core.node_id != UNCONFIGURED else "node without an id"
+        """Name of the node in messages."""
+        return f"node {self.core.node_id}" if self.core.node_id != UNCONFIGURED_ID else "node without an id"
 
     @property
     def state(self) -> NmtState:
-        """NMT state."""
+        """NMT state of the node."""
         return self.core.state
 
     @property
@@ -143,11 +145,11 @@ class SlaveNode(Participant):
 
     @property
     def kind(self) -> type:
-        """That of the device."""
+        """Class of the application, which is that of the device."""
         return type(self.application)
 
     def connect(self, rerouted: Callable[[], None]) -> None:
-        """Call `rerouted` from now on."""
+        """Call `rerouted` from now on whenever identifiers have changed."""
         self._rerouted = rerouted
 
     def start(self, t_ns: int) -> list[Frame]:
@@ -159,7 +161,7 @@ class SlaveNode(Participant):
         return self._taken()
 
     def receive(self, can_id: int, data: bytes, t_ns: int) -> list[Frame]:
-        """A frame from the bus, of anyone to anyone (a remote request has RTR_FLAG). Never raises, whatever it is."""
+        """Take any frame from the bus (a remote request has RTR_FLAG); return the answers. No frame makes it raise."""
         route = self._routes.get(can_id)
         if route is None:
             return []
@@ -198,16 +200,12 @@ class SlaveNode(Participant):
         else:
             self._enter(goal, t_ns)
 
-    def _renamed(self, t_ns: int) -> None:
-        """The node had no id and has one now: reset communication by itself (CiA 305)."""
-        self._initialise(t_ns, communication_only=True)
-
     def _adopt_node_id(self) -> None:
         """Use the id that LSS has configured, with the defaults that the EDS gives for it."""
         if self.lss is None or self._od_of is None or self.lss.pending == self.core.node_id:
             return
         self.core.node_id = self.lss.pending
-        if self.core.node_id != UNCONFIGURED:
+        if self.core.node_id != UNCONFIGURED_ID:
             self.core.dictionary.take_defaults(self._od_of(self.core.node_id))
 
     def _initialise(self, t_ns: int, communication_only: bool) -> None:
@@ -221,7 +219,7 @@ class SlaveNode(Participant):
             self.application.recall(self.store.kept)
             self.application.reset(t_ns)
         self._reroute()
-        if self.core.node_id == UNCONFIGURED:
+        if self.core.node_id == UNCONFIGURED_ID:
             return
         if boot_ns := self.core.quirks.boot_ns:
             self._boot_timer.arm(t_ns + boot_ns)
@@ -247,18 +245,18 @@ class SlaveNode(Participant):
 
     def _communication_error(self, t_ns: int) -> None:
         self.application.connection_lost(t_ns)
-        goal = _ON_COMMUNICATION_ERROR.get(self.core.dictionary.number(0x1029, 1))
+        goal = _COMMUNICATION_ERROR_STATES.get(self.core.dictionary.number(0x1029, 1))
         if goal is NmtState.STOPPED or (goal is not None and self.core.state is NmtState.OPERATIONAL):
             self._enter(goal, t_ns)
 
     @property
     def listens(self) -> Container[int]:
-        """Identifiers that this node takes now; the same object for ever, so that a bus may keep it."""
+        """Identifiers that this node takes now; it is always the same object, so that a bus may keep it."""
         return self._routes
 
     @property
     def patient(self) -> frozenset[int]:
-        """Those of them that need nothing done before the next SYNC."""
+        """Those of them that require nothing before the next SYNC."""
         return self.pdos.patient
 
     def _reroute(self) -> None:

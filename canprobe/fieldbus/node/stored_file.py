@@ -11,23 +11,22 @@ from canprobe.fieldbus.bus.files import write_text
 from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.entry import Value
 from canprobe.fieldbus.node.slave_node import SlaveNode
-from canprobe.fieldbus.protocol.lss import UNCONFIGURED
+from canprobe.fieldbus.protocol.lss import UNCONFIGURED_ID
 
 _SCHEMA = 1
 
 
 def keep_in_file(node: SlaveNode, path: Path) -> None:
-    """Take over what the file holds, if there is one; from now on write it at every "save" and "load" and when
-    LSS stores a node id.
+    """Read the file, if there is one; from now on write it at every "save" and "load", and when LSS stores an id.
 
     Call it before the node is started. A write that fails aborts the SDO with 06060000h, or LSS with error 2.
 
     Args:
         node: the node, not yet started.
-        path: of the file; its folder is made.
+        path: path of the file; its folder is made.
 
     Raises:
-        UsageError: the file cannot be read, or is another device's.
+        UsageError: the file cannot be read, or holds the values of another device.
     """
     if path.exists():
         _read(node, path)
@@ -52,15 +51,12 @@ def _write(node: SlaveNode, path: Path) -> None:
         "device": node.store.kept.hex(),
         **({} if node.store.node_id is None else {"node_id": node.store.node_id}),
         "values": {
-            f"{key >> 8:04X}:{key & 0xFF:02X}": _plain(value) for key, value in sorted(node.store.saved.items())
+            f"{key >> 8:04X}:{key & 0xFF:02X}": {"hex": value.hex()} if isinstance(value, bytes) else value
+            for key, value in sorted(node.store.saved.items())
         },
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, json.dumps(content, indent=1))
-
-
-def _plain(value: Value) -> Any:
-    return {"hex": value.hex()} if isinstance(value, bytes) else value
 
 
 def _read(node: SlaveNode, path: Path) -> None:
@@ -79,7 +75,7 @@ def _read(node: SlaveNode, path: Path) -> None:
 
 
 def _node_id(value: Any) -> int | None:
-    if value is None or value == UNCONFIGURED or (type(value) is int and 1 <= value <= 127):
+    if value is None or value == UNCONFIGURED_ID or (type(value) is int and 1 <= value <= 127):
         return value  # type: ignore[no-any-return]
     raise ValueError(f"expected a node id from 1 to 127, or 255, got {value!r}")
 
@@ -98,7 +94,7 @@ def _value(plain: Any) -> Value:
 
 
 def _check(node: SlaveNode, path: Path, key: int, value: Value) -> None:
-    """What the file puts into the dictionary must be a value of that entry: the cyclic code packs it unchecked."""
+    """Check that a value from the file is one of its entry, as the cyclic code packs it unchecked."""
     where = f"{path}: {key >> 8:04X}h:{key & 0xFF:02X}"
     entry = node.dictionary.entries.get(key)
     if entry is None:

@@ -11,19 +11,19 @@ from canprobe.fieldbus.node.abort import Abort, SdoAbort
 from canprobe.fieldbus.node.core import NO_ROUTES, NodeCore, Route, Service
 from canprobe.fieldbus.node.emcy import Emergency
 from canprobe.fieldbus.node.entry import Value
-from canprobe.fieldbus.protocol.emcy import SYNC_LENGTH, SYNC_LOST
+from canprobe.fieldbus.protocol.emcy import SYNC_LENGTH_CODE, SYNC_LOST_CODE
 from canprobe.fieldbus.protocol.frames import SYNC_ID, NmtState, is_restricted
 
-_PRODUCER = 1 << 30
-_HEARD = frozenset({NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL})
+_PRODUCER_FLAG = 1 << 30
+_LISTENING_STATES = frozenset({NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL})
 
 
 class SyncConsumer(Service):
-    """Hears SYNC and passes it to the PDOs as `on_sync(t_ns, counter, elapsed)` in operational."""
+    """Checks each SYNC and passes it to the PDOs as `on_sync(t_ns, counter, elapsed)` in operational."""
 
     def __init__(self, core: NodeCore, emcy: Emergency, on_sync: Callable[[int, int, int], None]) -> None:
         self._core, self._emcy, self._on_sync = core, emcy, on_sync
-        self._timer = core.timers.new(self._timed_out)
+        self._timer = core.timers.new(lambda _due_ns: emcy.report(SYNC_LOST_CODE))
         self._overflow = self._timeout_ns = self._last = 0
         self._operational = False
         dictionary = core.dictionary
@@ -39,29 +39,29 @@ class SyncConsumer(Service):
     def _configure(self) -> None:
         number = self._core.dictionary.number
         self._overflow = number(0x1019)
-        self._timeout_ns = number(0x1006) * 1500  # 1.5 periods
+        self._timeout_ns = number(0x1006) * 1500  # 1.5 periods of 1006h, which is in µs
         self._last = 0
         self._timer.cancel()
 
     def entered(self, t_ns: int) -> None:
-        """The time-out runs in operational, from the first SYNC there."""
+        """Stop the time-out, which runs in operational from the first SYNC on."""
         self._operational = self._core.state is NmtState.OPERATIONAL
         self._timer.cancel()
 
     def routes(self) -> Mapping[int, Route]:
         """The SYNC identifier, in pre-operational and operational."""
-        if self._core.state not in _HEARD:
+        if self._core.state not in _LISTENING_STATES:
             return NO_ROUTES
         return {self._core.dictionary.number(0x1005, 0, SYNC_ID) & 0x7FF: self._receive}
 
     def _receive(self, data: bytes, t_ns: int) -> None:
         overflow = self._overflow
         if len(data) != (1 if overflow else 0):
-            self._emcy.report(SYNC_LENGTH)
+            self._emcy.report(SYNC_LENGTH_CODE)
             return
         if self._emcy.any:
-            self._emcy.clear(SYNC_LENGTH)
-            self._emcy.clear(SYNC_LOST)
+            self._emcy.clear(SYNC_LENGTH_CODE)
+            self._emcy.clear(SYNC_LOST_CODE)
         counter, elapsed = 0, 1
         if overflow:
             counter, last = data[0], self._last
@@ -73,12 +73,9 @@ class SyncConsumer(Service):
                 self._timer.arm(t_ns + self._timeout_ns)
             self._on_sync(t_ns, counter, elapsed)
 
-    def _timed_out(self, due_ns: int) -> None:
-        self._emcy.report(SYNC_LOST)
-
     def _check_cob_id(self, subindex: int, value: Value) -> None:
         new = int(value)
-        if new & _PRODUCER or new & 0x3FFFF800 or is_restricted(new & 0x7FF):
+        if new & _PRODUCER_FLAG or new & 0x3FFFF800 or is_restricted(new & 0x7FF):
             raise SdoAbort(Abort.VALUE)
 
     def _check_overflow(self, subindex: int, value: Value) -> None:

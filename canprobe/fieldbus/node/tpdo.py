@@ -9,22 +9,22 @@ from collections.abc import Callable, Mapping, Sequence
 from operator import itemgetter
 from typing import Any
 
-from canprobe.fieldbus.node.core import NO_RTR, NodeCore
+from canprobe.fieldbus.node.core import NO_RTR_FLAG, NodeCore
 from canprobe.fieldbus.node.entry import key_of
-from canprobe.fieldbus.node.pdo_rules import COB_ID, EVENT, INHIBIT, START, TYPE, PdoRules
+from canprobe.fieldbus.node.pdo_rules import COB_ID_SUB, EVENT_SUB, INHIBIT_SUB, START_SUB, TYPE_SUB, PdoRules
 from canprobe.fieldbus.protocol.frames import RTR_FLAG
 from canprobe.fieldbus.protocol.pdo import PdoLayout
 
-BUFFERED, ON_REQUEST = 252, 253
+BUFFERED_TYPE, ON_REQUEST_TYPE = 252, 253
 
 Sampler = Callable[[int], None]
 Fetch = Callable[[Mapping[int, Any]], tuple[int, ...]]
 Packing = tuple[int, Callable[..., bytes], Fetch]
-"""Identifier, what packs the values, what takes them from the dictionary."""
+"""Identifier, packer of the values, and function that takes them from the dictionary."""
 
 
 def _fetcher(keys: tuple[int, ...]) -> Fetch:
-    """All mapped values at once, by one call into C."""
+    """The function that takes all mapped values at once, by one call into C."""
     if len(keys) == 1:
         return lambda values, key=keys[0]: (values[key],)  # type: ignore[misc]
     return itemgetter(*keys)
@@ -34,14 +34,14 @@ class Tpdo:
     """One transmit PDO, compiled from its parameters by `configure`.
 
     Attributes:
-        active: valid and with something mapped.
-        samplers: bring what is mapped up to date, each by `sampler(t_ns)`.
+        active: whether the PDO is valid and maps something.
+        samplers: functions that bring mapped values up to date, each called as `sampler(t_ns)`.
         keys: mapped dictionary keys.
-        packing: how to make the frame; of an active PDO.
+        packing: identifier, packer and source of the values of an active PDO.
         type: transmission type.
         start: SYNC start value (18xxh:06).
         remote_id: identifier of the remote request that is answered, or None.
-        requested: an event waits for the next SYNC (type 0).
+        requested: whether an event waits for the next SYNC (type 0).
     """
 
     def __init__(self, core: NodeCore, rules: PdoRules) -> None:
@@ -59,46 +59,46 @@ class Tpdo:
         self.samplers: Sequence[Sampler] = ()
 
     def configure(self) -> None:
-        """Read the parameters. A mapping that makes no sense leaves the PDO silent."""
+        """Read the parameters. A PDO with an impossible mapping stays silent."""
         number, index, entries = self._core.dictionary.number, self._rules.communication, self._rules.present()
         self.stop()
-        cob_id = number(index, COB_ID)
+        cob_id = number(index, COB_ID_SUB)
         self._cob_id = cob_id & 0x7FF
         self.active = self._rules.valid and bool(entries)
-        self.remote_id = self._cob_id | RTR_FLAG if self.active and not cob_id & NO_RTR else None
+        self.remote_id = self._cob_id | RTR_FLAG if self.active and not cob_id & NO_RTR_FLAG else None
         self.keys = tuple(key_of(entry.index, entry.subindex) for entry in entries)
-        self.type, self.start = number(index, TYPE), number(index, START)
-        self._inhibit_ns = number(index, INHIBIT) * 100_000
-        self._event_ns = number(index, EVENT) * 1_000_000
+        self.type, self.start = number(index, TYPE_SUB), number(index, START_SUB)
+        self._inhibit_ns = number(index, INHIBIT_SUB) * 100_000
+        self._event_ns = number(index, EVENT_SUB) * 1_000_000
         if self.active:
             self._layout = PdoLayout(self._cob_id, entries, self.type, fd=True)
             self.packing = self._cob_id, self._layout.raw_pack, _fetcher(self.keys)
 
     @property
     def by_event(self) -> bool:
-        """Sent on events at once (254, 255), not at a SYNC."""
+        """Whether it is sent at once on events (254, 255), not at a SYNC."""
         return self.type >= 254
 
     def stop(self) -> None:
-        """No longer operational: nothing is due."""
+        """Stop, as the node is no longer operational: nothing is due."""
         self._event_timer.cancel()
         self._inhibit_timer.cancel()
         self.requested = False
         self._buffer = None
 
     def started(self, t_ns: int) -> None:
-        """Operational: an event-driven PDO sends its first values."""
+        """Start, as the node is operational: an event-driven PDO sends its first values."""
         if self.active and self.by_event:
             self._earliest_ns = t_ns
             self.event(t_ns)
 
     def reconfigured(self, t_ns: int) -> None:
-        """New parameters in operational: the event timer runs from now on."""
+        """Let the event timer run from now on, as there are new parameters in operational."""
         if self.active and self.by_event and self._event_ns:
             self._event_timer.arm(t_ns + self._event_ns)
 
     def event(self, t_ns: int) -> None:
-        """A mapped value changed."""
+        """Report that a mapped value changed."""
         if not self.active:
             return
         if not self.by_event:
@@ -114,20 +114,20 @@ class Tpdo:
         self._core.send(self._cob_id, self._packed(t_ns))
 
     def sample(self, t_ns: int) -> None:
-        """Type 252: pack the values of this SYNC, for the next remote request."""
+        """Pack the values of this SYNC for the next remote request (type 252)."""
         self._buffer = self._packed(t_ns)
 
     def remote(self, data: bytes, t_ns: int) -> None:
-        """A remote request. Synchronous PDOs answer with the values of the last SYNC, the others with the present."""
+        """Answer a remote request: synchronous PDOs with the values of the last SYNC, others with present ones."""
         if self.by_event:
             self.event(t_ns)
         elif self._buffer is not None:
             self._core.send(self._cob_id, self._buffer)
-        else:  # an event that waits for a SYNC goes on waiting
-            self._core.send(self._cob_id, self._packed(t_ns if self.type in (BUFFERED, ON_REQUEST) else None))
+        else:  # an event that waits for a SYNC still waits
+            self._core.send(self._cob_id, self._packed(t_ns if self.type in (BUFFERED_TYPE, ON_REQUEST_TYPE) else None))
 
     def _packed(self, t_ns: int | None) -> bytes:
-        """The values of `t_ns`; None: as they were sampled last."""
+        """Pack the values of `t_ns`; None: those that were sampled last."""
         if t_ns is not None:
             for sampler in self.samplers:
                 sampler(t_ns)
@@ -141,4 +141,4 @@ class Tpdo:
 
     def _event_due(self, due_ns: int) -> None:
         now_ns = self._core.timers.now_ns
-        self.event(now_ns if now_ns - due_ns > self._event_ns else due_ns)  # late: do not catch up
+        self.event(now_ns if now_ns - due_ns > self._event_ns else due_ns)  # late: no catching up

@@ -1,4 +1,4 @@
-"""The base of what stands between a node and a lockstep bus, attached in the node's place."""
+"""Base class of what stands between a node and a lockstep bus, attached in the node's place."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from canprobe.fieldbus.node.slave_node import SlaveNode
 
 
 class WrappedNode(Participant):
-    """Passes on what the bus asks of a node; what is done to its frames is the derived class's.
+    """Passes the questions of the bus on to a node; the derived class changes the frames.
 
     Args:
         node: the node.
@@ -20,29 +20,29 @@ class WrappedNode(Participant):
 
     @property
     def node_id(self) -> int:
-        """As the node."""
+        """Node id of the node."""
         return self.node.node_id
 
     @property
     def name(self) -> str:
-        """For messages."""
+        """Name of the node in messages."""
         return self.node.name
 
     @property
     def listens(self) -> Container[int]:
-        """As the node."""
+        """Identifiers that the node takes now."""
         return self.node.listens
 
     @property
     def kind(self) -> type:
-        """As the node."""
+        """Class of the device of the node."""
         return self.node.kind
 
     @property
     def patient(self) -> frozenset[int]:
-        """As the node."""
+        """Identifiers that require nothing of the node before the next SYNC."""
         return self.node.patient
 
     def connect(self, rerouted: Callable[[], None]) -> None:
-        """Of the node."""
+        """Connect the node."""
         self.node.connect(rerouted)

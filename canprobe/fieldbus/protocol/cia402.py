@@ -14,26 +14,26 @@ from enum import Enum, IntEnum, auto
 from canprobe.errors import ProtocolError
 
 # Statusword bit numbers (6041h) outside the state bits 0..3, 5, 6.
-VOLTAGE_ENABLED = 4
-WARNING = 7
-REMOTE = 9
-TARGET_REACHED = 10
-INTERNAL_LIMIT = 11
-DRIVE_FOLLOWS = 12  # CSP, CSV, CST: the drive follows the command value
-SETPOINT_ACKNOWLEDGE = 12  # PP
-HOMING_ATTAINED = 12  # homing
-INTERPOLATION_ACTIVE = 12  # interpolated position
-FOLLOWING_ERROR = 13  # PP, CSP
-HOMING_ERROR = 13  # homing
+VOLTAGE_ENABLED_BIT = 4
+WARNING_BIT = 7
+REMOTE_BIT = 9
+TARGET_REACHED_BIT = 10
+INTERNAL_LIMIT_BIT = 11
+DRIVE_FOLLOWS_BIT = 12  # CSP, CSV, CST: the drive follows the command value
+SETPOINT_ACKNOWLEDGE_BIT = 12  # PP
+HOMING_ATTAINED_BIT = 12  # homing
+INTERPOLATION_ACTIVE_BIT = 12  # interpolated position
+FOLLOWING_ERROR_BIT = 13  # PP, CSP
+HOMING_ERROR_BIT = 13  # homing
 
 # Controlword bit numbers (6040h) outside the command bits 0..3.
-NEW_SETPOINT = 4  # PP
-HOMING_START = 4  # homing
-ENABLE_INTERPOLATION = 4  # interpolated position
-CHANGE_IMMEDIATELY = 5  # PP
-RELATIVE = 6  # PP
+NEW_SETPOINT_BIT = 4  # PP
+HOMING_START_BIT = 4  # homing
+ENABLE_INTERPOLATION_BIT = 4  # interpolated position
+CHANGE_IMMEDIATELY_BIT = 5  # PP
+RELATIVE_BIT = 6  # PP
 FAULT_RESET_BIT = 7
-HALT = 8
+HALT_BIT = 8
 
 
 class OperationMode(IntEnum):
@@ -62,7 +62,7 @@ class DriveState(Enum):
 
 
 class DriveCommand(Enum):
-    """What a controlword commands; switching on and disabling operation are the same pattern."""
+    """Commands of a controlword; switching on and disabling operation have the same pattern."""
 
     SHUTDOWN = auto()
     SWITCH_ON = auto()
@@ -74,7 +74,7 @@ class DriveCommand(Enum):
 
 
 class Event(Enum):
-    """What changes the state without a controlword."""
+    """Events in the drive that change the state without a controlword."""
 
     INITIALISED = auto()
     QUICK_STOP_DONE = auto()
@@ -119,7 +119,7 @@ TRANSITIONS: dict[tuple[DriveState, DriveCommand], DriveState] = {
     (source, command): target for _, source, command, target in NUMBERED_TRANSITIONS
 }
 """Where a command leads. What is not in the table changes nothing. Transition 16 is only for 605Ah = 5..8, and
-transition 15 only when no cause of the fault remains: both are the drive's to check."""
+transition 15 only when no cause of the fault remains: the drive checks both."""
 
 AUTOMATIC_TRANSITIONS: dict[tuple[DriveState, Event], DriveState] = {
     (_S.NOT_READY_TO_SWITCH_ON, Event.INITIALISED): _S.SWITCH_ON_DISABLED,  # 1
@@ -132,7 +132,7 @@ AUTOMATIC_TRANSITIONS: dict[tuple[DriveState, Event], DriveState] = {
 }
 
 POWERED_STATES = frozenset({_S.OPERATION_ENABLED, _S.QUICK_STOP_ACTIVE, _S.FAULT_REACTION_ACTIVE})
-"""States in which the drive function is on: torque may act on the motor."""
+"""States in which the drive function is on, so that torque may act on the motor."""
 
 _BIT_5_FREE = (_S.NOT_READY_TO_SWITCH_ON, _S.SWITCH_ON_DISABLED, _S.FAULT_REACTION_ACTIVE, _S.FAULT)
 _STATES = {state.value: state for state in DriveState} | {state.value | 0x20: state for state in _BIT_5_FREE}
@@ -145,7 +145,7 @@ def state_of(statusword: int) -> DriveState:
     """The drive state in a statusword.
 
     Raises:
-        ProtocolError: a bit pattern that is no state.
+        ProtocolError: the bits are the pattern of no state.
     """
     state = known_state(statusword)
     if state is None:
@@ -159,7 +159,7 @@ def known_state(statusword: int) -> DriveState | None:
 
 
 def describe_state(statusword: int) -> str:
-    """The drive state in words, to be put behind "the drive is"."""
+    """The drive state in words that go on after "the drive is"."""
     state = known_state(statusword)
     return state.name if state is not None else f"in no CiA 402 state (statusword {statusword:#06x})"
 
@@ -179,11 +179,11 @@ def command_of(controlword: int, previous: int = 0) -> DriveCommand | None:
     return _COMMANDS.get(controlword & 0xFF)
 
 
-_DISABLE = dict.fromkeys(DriveState, 0x0000)
-_TOWARD: dict[DriveState, dict[DriveState, int]] = {
-    _S.SWITCH_ON_DISABLED: _DISABLE,
-    _S.QUICK_STOP_ACTIVE: _DISABLE | {_S.OPERATION_ENABLED: 0x0002, _S.QUICK_STOP_ACTIVE: 0x0002},
-    _S.OPERATION_ENABLED: _DISABLE
+_DISABLING_WORDS = dict.fromkeys(DriveState, 0x0000)
+_WORDS_TOWARD: dict[DriveState, dict[DriveState, int]] = {
+    _S.SWITCH_ON_DISABLED: _DISABLING_WORDS,
+    _S.QUICK_STOP_ACTIVE: _DISABLING_WORDS | {_S.OPERATION_ENABLED: 0x0002, _S.QUICK_STOP_ACTIVE: 0x0002},
+    _S.OPERATION_ENABLED: _DISABLING_WORDS
     | {
         _S.SWITCH_ON_DISABLED: 0x0006,
         _S.READY_TO_SWITCH_ON: 0x0007,
@@ -206,10 +206,10 @@ def controlword_toward(state: DriveState, goal: DriveState, previous: int = 0) -
         previous: the controlword sent before, so that a reset that did not take is tried with a new edge.
 
     Raises:
-        ProtocolError: another goal.
+        ProtocolError: the goal is none of the three.
     """
     try:
-        word = _TOWARD[goal][state]
+        word = _WORDS_TOWARD[goal][state]
     except KeyError:
-        raise ProtocolError(f"no way to {goal.name}: goals are {', '.join(s.name for s in _TOWARD)}") from None
+        raise ProtocolError(f"no way to {goal.name}: goals are {', '.join(s.name for s in _WORDS_TOWARD)}") from None
     return word & ~(previous & 1 << FAULT_RESET_BIT)

@@ -9,16 +9,16 @@ from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, Frame
 
 _FORM = struct.Struct("<HB5s")
-NO_ERROR = 0x0000
-"""What a node sends when an error is over."""
-HEARTBEAT_LOST = 0x8130
-SYNC_LOST = 0x8100
-PDO_TOO_SHORT = 0x8210
-PDO_TOO_LONG = 0x8220
-SYNC_LENGTH = 0x8240
-RPDO_TIMEOUT = 0x8250
-FOLLOWING_ERROR = 0x8611
-REFERENCE_LIMIT = 0x8612
+NO_ERROR_CODE = 0x0000
+"""Code that a node sends when an error is over."""
+HEARTBEAT_LOST_CODE = 0x8130
+SYNC_LOST_CODE = 0x8100
+PDO_TOO_SHORT_CODE = 0x8210
+PDO_TOO_LONG_CODE = 0x8220
+SYNC_LENGTH_CODE = 0x8240
+RPDO_TIMEOUT_CODE = 0x8250
+FOLLOWING_ERROR_CODE = 0x8611
+REFERENCE_LIMIT_CODE = 0x8612
 # Longest match wins: the code itself, then with its last digit, last two and last three digits cleared.
 # Source: CiA 301 (emergency error codes) and CiA 402-2 (error codes of drives).
 _WORDS = {
@@ -71,7 +71,7 @@ _WORDS = {
     0xF000: "additional functions",
     0xFF00: "device specific",
 }
-_MASKS = (0xFFFF, 0xFFF0, 0xFF00, 0xF000)
+_CODE_MASKS = (0xFFFF, 0xFFF0, 0xFF00, 0xF000)
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +92,7 @@ class Emcy:
         """Pack into the 8 bytes of the wire.
 
         Raises:
-            ProtocolError: a field that does not fit.
+            ProtocolError: a field does not fit.
         """
         if len(self.data) > 5:
             raise ProtocolError(f"EMCY: at most 5 manufacturer bytes, got {len(self.data)}")
@@ -106,7 +106,7 @@ class Emcy:
         """Unpack exactly 8 bytes.
 
         Raises:
-            ProtocolError: another length.
+            ProtocolError: the data have another length.
         """
         if len(data) != 8:
             raise ProtocolError(f"EMCY: expected 8 bytes, got {len(data)}")
@@ -125,8 +125,8 @@ def is_no_error(code: int) -> bool:
 def describe(code: int) -> str:
     """An emergency error code in words: the most specific entry of CiA 301 or CiA 402 that covers it."""
     if is_no_error(code):
-        return _WORDS[NO_ERROR]
-    for mask in _MASKS:
+        return _WORDS[NO_ERROR_CODE]
+    for mask in _CODE_MASKS:
         words = _WORDS.get(code & mask)
         if words is not None and code & mask:
             return words

@@ -1,8 +1,8 @@
 """How late a message can be where nodes send their oldest frame first, as SocketCAN's queue and many controllers do.
 
-A frame then waits for everything that its own node has queued before it, and each of those competes with its own
-identifier: the one of lowest priority holds up all behind it. Messages are independent of each other; an offset
-counts as jitter. It stops being a bound where a message's response time exceeds its period: its own last frame could
+A frame then waits for everything that its own node has queued before it. Each of those frames competes with its own
+identifier, so the one of lowest priority holds up all behind it. Messages are independent of each other; an offset
+counts as jitter. The result is no bound where a message's response time exceeds its period, as its own last frame could
 then still be in the queue. Such messages have no response time here, nor have those that they could disturb.
 
 Source: Davis, Kollmann, Pollex, Slomka, "Controller Area Network (CAN) schedulability analysis with FIFO queues",
@@ -20,7 +20,7 @@ from canprobe.fieldbus.protocol.response_times import NS_PER_S, BusAnalysis, Mes
 
 @dataclass(frozen=True, slots=True)
 class _Sent:
-    """A message, its frame's time, the messages of its queue (itself alone with a priority queue), ns."""
+    """A message, the time of its frame in ns, and the messages of its queue: itself alone with a priority queue."""
 
     message: Message
     frame_ns: int
@@ -34,16 +34,16 @@ def worst_case_response_fifo(
 
     Args:
         messages: everything that is sent on this bus; identifiers are unique.
-        fifo_nodes: of every message that goes through a FIFO queue: its name → whose queue; the others' nodes send
-            their message of highest priority first.
+        fifo_nodes: the owner of the queue, by the name of each message that goes through a FIFO queue; the nodes of
+            the other messages send their message of highest priority first.
         bitrate: bit/s.
 
     Raises:
-        ProtocolError: an identifier twice, or a name that no message has.
+        ProtocolError: two messages have one identifier, or no message has a name of `fifo_nodes`.
     """
     timed = _timed(messages, bitrate)
     if unknown := set(fifo_nodes) - {message.name for message in messages}:
-        raise ProtocolError(f"no message is called {min(unknown)}")
+        raise ProtocolError(f"fifo_nodes: no message is called {min(unknown)}")
     owners = [fifo_nodes.get(message.name) for message, _ in timed]
     sent = []
     for rank, ((message, frame_ns), owner) in enumerate(zip(timed, owners, strict=True)):
@@ -61,7 +61,7 @@ def worst_case_response_fifo(
 
 
 def _settled(sent: Sequence[_Sent], bit: int) -> list[int | None]:
-    """Responses from the events, repeated until the delays in the queues, which they hang on, move no more."""
+    """Responses from the events, computed again until the delays in the queues, on which they depend, stay the same."""
     delays: list[int | None] = [0] * len(sent)
     while True:
         found = [_response(sent, rank, delays, bit) for rank in range(len(sent))]
@@ -72,13 +72,13 @@ def _settled(sent: Sequence[_Sent], bit: int) -> list[int | None]:
 
 
 def _in_the_queue(sent: Sequence[_Sent], rank: int, total: int) -> int:
-    """How long after its queueing a frame can begin to compete."""
+    """Longest time from the queueing of a frame until it competes, ns."""
     one = sent[rank]
     return total - one.message.jitter_ns - one.frame_ns if len(one.queue) > 1 else 0
 
 
 def _response(sent: Sequence[_Sent], rank: int, delays: Sequence[int | None], bit: int) -> int | None:
-    """From the event to the end of the frame; None where that is no bound."""
+    """Time from the event to the end of the frame, ns; None where there is no bound."""
     one = sent[rank]
     lowest, frames = max(one.queue), [sent[other].frame_ns for other in one.queue]
     above = [other for other in range(lowest) if other not in one.queue]

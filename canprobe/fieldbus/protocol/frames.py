@@ -10,12 +10,19 @@ Frame = tuple[int, bytes]
 """An 11-bit identifier and up to 8 data bytes."""
 
 CLASSIC_BYTES = 8
-"""Longest data of a classic CAN frame; longer ones are CAN FD frames."""
+"""Most data bytes of a classical CAN frame; a frame with more is one of CAN FD."""
+BRS_FLAG = 0x01
+"""Bit rate switch of a CAN FD frame, as in Linux's `struct canfd_frame`."""
 EFF_FLAG = 0x80000000
-"""On a 29-bit identifier, as in Linux's `struct can_frame`."""
+"""Flag on a 29-bit identifier, as in Linux's `struct can_frame`."""
+EFF_MASK = 0x1FFFFFFF
+"""The bits of a 29-bit identifier."""
 
 RTR_FLAG = 0x40000000
-"""On the identifier of a remote request (which has no data), as in Linux's `struct can_frame`."""
+"""Flag on the identifier of a remote request, which has no data, as in Linux's `struct can_frame`."""
+
+INVALID_FLAG = 1 << 31
+"""Bit 31 of a COB-ID in the object dictionary: the PDO, SDO or EMCY does not exist."""
 
 NMT_ID = 0x000
 SYNC_ID = 0x080
@@ -25,7 +32,7 @@ SDO_RX_BASE = 0x600  # client (master) to server (node)
 HEARTBEAT_BASE = 0x700
 
 # Source: CiA 301, table "restricted COB-IDs"; last row of CANopen's predefined set included.
-_RESTRICTED = (
+_RESTRICTED_RANGES = (
     (0x000, 0x000),  # NMT
     (0x001, 0x07F),
     (0x101, 0x180),
@@ -84,7 +91,7 @@ def unpack_heartbeat(data: bytes) -> NmtState:
     """Unpack the state from a heartbeat, boot-up or node-guarding answer (whose toggle bit 7 is dropped).
 
     Raises:
-        ProtocolError: not one byte, or no NMT state.
+        ProtocolError: the data are not one byte, or the byte is no NMT state.
     """
     if len(data) != 1:
         raise ProtocolError(f"heartbeat: expected 1 byte, got {len(data)}")
@@ -99,4 +106,4 @@ def is_restricted(cob_id: int) -> bool:
 
     080h itself (SYNC) and the bases 580h and 600h are not in the standard's table.
     """
-    return any(first <= cob_id <= last for first, last in _RESTRICTED)
+    return any(first <= cob_id <= last for first, last in _RESTRICTED_RANGES)

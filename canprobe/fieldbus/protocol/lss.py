@@ -10,20 +10,20 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 LSS_REQUEST_ID = 0x7E5
-"""LSS master to all LSS slaves."""
+"""Identifier of what the LSS master sends to all LSS slaves."""
 LSS_ANSWER_ID = 0x7E4
-"""An LSS slave to the LSS master."""
-LSS_LENGTH = 8
-UNCONFIGURED = 255
-"""Node-ID FFh: the node has none and waits in initialisation for LSS."""
+"""Identifier of what an LSS slave sends to the LSS master."""
+LSS_BYTES = 8
+UNCONFIGURED_ID = 255
+"""Node-ID FFh of a node without an id, which waits in initialisation for LSS."""
 PRESENCE_CHECK = 0x80
-"""Bit check of fastscan that asks who is there at all and starts the search again."""
+"""Bit check of the fastscan question that every slave without an id answers; it starts the search again."""
 BIT_RATES = {0: 1_000_000, 1: 800_000, 2: 500_000, 3: 250_000, 4: 125_000, 6: 50_000, 7: 20_000, 8: 10_000}
-"""Table selector 0 of configure bit timing: index → bit/s."""
+"""Bit rates by table index, bit/s, of table selector 0 of configure bit timing."""
 
 
 class LssCommand(IntEnum):
-    """Command specifiers."""
+    """Command specifiers, the first byte of a message."""
 
     SWITCH_GLOBAL = 0x04
     CONFIGURE_NODE_ID = 0x11
@@ -86,22 +86,22 @@ class LssAddress:
 
 
 def pack_lss(command: LssCommand, data: bytes = b"") -> bytes:
-    """The eight bytes of a message."""
-    return (bytes((command,)) + data).ljust(LSS_LENGTH, b"\0")
+    """Pack a message into its eight bytes."""
+    return (bytes((command,)) + data).ljust(LSS_BYTES, b"\0")
 
 
 def pack_number(command: LssCommand, number: int) -> bytes:
-    """A message that carries one of the four numbers."""
+    """Pack a message that carries one of the four numbers."""
     return pack_lss(command, number.to_bytes(4, "little"))
 
 
 def pack_fastscan(number: int, bit: int, position: int, following: int) -> bytes:
-    """A question of fastscan.
+    """Pack a question of fastscan.
 
     Args:
-        number: bits from `bit` upwards are compared.
-        bit: 31 to 0, or `PRESENCE_CHECK`.
+        number: the number that is looked for; its bits from `bit` upwards are compared.
+        bit: lowest bit that is compared, 31 to 0, or `PRESENCE_CHECK`.
         position: which of the four numbers is asked for, 0 to 3.
-        following: which one those that answer expect next; one below `position` ends the search.
+        following: number that the slaves which answer expect next; one below `position` ends the search.
     """
     return pack_lss(LssCommand.FASTSCAN, number.to_bytes(4, "little") + bytes((bit, position, following)))

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.frame_bits import FD_LENGTHS
 
-MAX_BITS = 64
-FD_MAX_BITS = 512
-"""Of a PDO in a CAN FD frame. Source: CiA 1301."""
+MAX_PDO_BITS = 64
+MAX_FD_PDO_BITS = 512
+"""Most bits of a PDO in a CAN FD frame. Source: CiA 1301."""
 _STRUCT_CODES = {8: "b", 16: "h", 32: "i", 64: "q"}
 
 
@@ -23,8 +23,8 @@ class PdoEntry:
         index: object index; 0001h..0007h are CiA 301's dummy types.
         subindex: sub-index.
         bits: length on the wire, 1..64.
-        signed: two's complement.
-        name: for people and logs.
+        signed: whether the value is in two's complement.
+        name: name of the object, for people and logs.
     """
 
     index: int
@@ -35,7 +35,7 @@ class PdoEntry:
 
     @property
     def is_dummy(self) -> bool:
-        """Whether this entry only fills room."""
+        """Whether this entry only takes up room."""
         return self.index <= 0x0007
 
     @property
@@ -50,7 +50,7 @@ class PdoEntry:
 
 
 class _BitCodec:
-    """Packs entries that struct cannot: any width, any alignment, least significant bit first."""
+    """Packs the entries that struct cannot pack: any width and alignment, least significant bit first."""
 
     __slots__ = ("_fields", "_length")
 
@@ -107,14 +107,14 @@ class PdoLayout:
         cob_id: 11-bit identifier.
         entries: mapped objects, in the order of the wire.
         transmission_type: 0..240 synchronous, 252/253 by RTR, 254/255 by event (CiA 301).
-        fd: the mapping may have up to 512 bits; above 64 the frame is one of CAN FD, filled up with zeros to a length
-            that FD has.
+        fd: whether the mapping may have up to 512 bits; above 64 the frame is one of CAN FD, filled up with zeros to a
+            length that FD has.
         length: data bytes of the frame.
-        raw_pack, raw_unpack: as `pack` and `unpack`, where errors are excluded or looked into later: a struct.error or
-            TypeError that names no PDO.
+        raw_pack, raw_unpack: `pack` and `unpack` for callers that exclude errors or look into them later; they raise
+            struct.error or TypeError, which names no PDO.
 
     Raises:
-        ProtocolError: an entry without length, or more bits in all than a frame has.
+        ProtocolError: an entry has no length, or all together have more bits than a frame.
     """
 
     cob_id: int
@@ -126,15 +126,17 @@ class PdoLayout:
     raw_unpack: Callable[[bytes], tuple[int, ...]] = field(init=False, repr=False, compare=False)
 
     def __reduce__(self) -> tuple[type[PdoLayout], tuple[object, ...]]:
-        """Pickled as it was made: what is compiled cannot go to another process, as results of runs do."""
+        """Pickle the arguments alone, as the compiled functions cannot go to another process."""
         return type(self), (self.cob_id, self.entries, self.transmission_type, self.fd)
 
     def __post_init__(self) -> None:
         entries = tuple(self.entries)
         bits = sum(entry.bits for entry in entries)
-        most = FD_MAX_BITS if self.fd else MAX_BITS
-        if any(not 1 <= entry.bits <= MAX_BITS for entry in entries) or bits > most:
-            raise ProtocolError(f"PDO {self.cob_id:#05x}: mapping of {bits} bits, at most {most}, none empty")
+        most = MAX_FD_PDO_BITS if self.fd else MAX_PDO_BITS
+        if any(not 1 <= entry.bits <= MAX_PDO_BITS for entry in entries) or bits > most:
+            raise ProtocolError(
+                f"PDO {self.cob_id:#05x}: mapping of {bits} bits; expected at most {most}, and none without a length"
+            )
         length = next(size for size in FD_LENGTHS if 8 * size >= bits)
         form = _struct_format(entries, length)
         codec = _BitCodec(entries, length) if form is None else struct.Struct(form)
@@ -152,7 +154,7 @@ class PdoLayout:
         """Pack one value per signal.
 
         Raises:
-            ProtocolError: wrong number of values, or a value that does not fit its entry.
+            ProtocolError: the number of values is wrong, or a value does not fit its entry.
         """
         try:
             return self.raw_pack(*values)
@@ -163,7 +165,7 @@ class PdoLayout:
         """Unpack exactly `length` bytes into one value per signal.
 
         Raises:
-            ProtocolError: shorter or longer data. (A slave accepts longer RPDOs: cut before.)
+            ProtocolError: the data have another length. (A slave accepts longer RPDOs: cut them before.)
         """
         try:
             return self.raw_unpack(data)

@@ -1,9 +1,9 @@
-"""The instants of a free-running device from the arrivals of its frames: a line through the last of them.
+"""Sampling instants of a free-running device, from the arrivals of its frames: a line through the last of them.
 
 A device that samples on its own time has a steady period; what it sends waits for the bus, for a driver, for the
-receiver. The instants are `t0 + n·T`, fitted by least squares to the last `MAX_ARRIVALS` arrivals, each with its number
-n, which steps over images that were lost. A mean delay of the frames is in t0: it is part of the latency.
-Stops being true where the device changes its period, or where arrivals scatter by more than a quarter of it.
+receiver. The instants are `t0 + n·T`, fitted by least squares to the last `MAX_ARRIVALS` arrivals. Each has its number
+n, which steps over images that were lost. The mean delay of the frames is in t0: it is part of the latency.
+The fit stops being true where the device changes its period, or where arrivals scatter by more than a quarter of it.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ import math
 from collections import deque
 
 MAX_ARRIVALS = 64
-"""Arrivals in the fit."""
+"""Most arrivals in the fit."""
 MIN_ARRIVALS = 4
-"""Arrivals from which there is a fit."""
+"""Fewest arrivals for a fit."""
 MAX_ERROR_SHARE = 0.25
 """Share of the period by which an arrival, and the fitted period, may be off; beyond it the fit begins anew."""
 
@@ -23,7 +23,7 @@ class PeriodFit:
     """Fits a period to arrivals.
 
     Args:
-        period_ns: stated period; until there is a fit it gives the number of lost images.
+        period_ns: stated period; it gives the number of lost images until there is a fit.
 
     Attributes:
         period_ns: fitted period.
@@ -36,14 +36,14 @@ class PeriodFit:
         self._arrivals: deque[tuple[int, int]] = deque(maxlen=MAX_ARRIVALS)
 
     def step(self, t_ns: int) -> tuple[int, float]:
-        """Take an arrival.
+        """Add an arrival to the fit.
 
         Args:
             t_ns: arrival of the first frame of an image, after that of the image before.
 
         Returns:
-            The fitted instant of this image, ns, and its standard deviation, s. Without a fit the arrival, and the
-            deviation of an instant that may be anywhere in a period.
+            The fitted instant of this image, ns, and its standard deviation, s. Without a fit they are the arrival, and
+            the deviation of an instant that lies anywhere in a period.
         """
         arrivals = self._arrivals
         number = 0

@@ -21,8 +21,8 @@ from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, Frame
 
 Counts = tuple[int, ...]
-"""Counts as the device sends them: row by row, in a row column by column, of a taxel axis by axis."""
-_TAG = "0123456789ABCDEF"
+"""Counts of an image: row by row, in a row column by column, in a taxel axis by axis."""
+_TAG_CHARACTERS = "0123456789ABCDEF"
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,9 +30,9 @@ class FramePattern:
     """One frame of an image.
 
     Attributes:
-        length: bytes that it has at least; what follows is not read.
-        mask, tag: of these bytes as one big-endian number: the bits that name the frame, and what they are.
-        values: of each value, the shifts of its nibbles in that number, the most significant first.
+        length: fewest bytes of the frame; what follows them is not read.
+        mask, tag: bits that name the frame, and their values, in these bytes as one big-endian number.
+        values: shifts of the nibbles of each value in that number, the most significant nibble first.
     """
 
     length: int
@@ -42,10 +42,10 @@ class FramePattern:
 
     @classmethod
     def parse(cls, text: str, byte_order: str = "big") -> FramePattern:
-        """The pattern in a text (see the module).
+        """Read a pattern from its text, as the module describes it.
 
         Raises:
-            ProtocolError: it is none, or longer than 8 bytes.
+            ProtocolError: the text is no pattern, or longer than 8 bytes.
         """
         characters = text.replace(" ", "")
         if not re.fullmatch(r"([0-9A-Za-z.]{2}){1,8}", characters) or re.search(r"[G-Z]", characters):
@@ -57,7 +57,7 @@ class FramePattern:
         places: dict[str, list[int]] = {}
         for place, character in enumerate(characters):
             shift = 4 * (2 * length - 1 - place)
-            if character in _TAG:
+            if character in _TAG_CHARACTERS:
                 mask |= 0xF << shift
                 tag |= int(character, 16) << shift
             elif character != ".":
@@ -71,11 +71,11 @@ class FramePattern:
         return cls(length, mask, tag, tuple(values))
 
     def matches(self, data: bytes) -> bool:
-        """Whether bytes are this frame."""
+        """Whether the bytes are this frame."""
         return len(data) >= self.length and self._number(data) & self.mask == self.tag
 
     def resembles(self, other: FramePattern) -> bool:
-        """Whether there are bytes that are both frames."""
+        """Whether there are bytes that match both frames."""
         length = max(self.length, other.length)
         mine, its = 8 * (length - self.length), 8 * (length - other.length)
         common = (self.mask << mine) & (other.mask << its)
@@ -92,10 +92,10 @@ class FramePattern:
         return values
 
     def pack(self, values: Sequence[int]) -> bytes:
-        """The frame with these values; what is not read is 0.
+        """Pack values into the frame; what is not read is 0.
 
         Raises:
-            ProtocolError: a value that does not fit.
+            ProtocolError: a value does not fit.
         """
         number = self.tag
         for value, shifts in zip(values, self.values, strict=True):
@@ -115,10 +115,10 @@ class ImageFormat:
 
     Attributes:
         ids: 11-bit identifiers of its frames.
-        frames: what each identifier sends for one image.
-        rows, columns: of the image.
-        axes: values of a taxel.
-        by_columns: taxels come column by column; else row by row.
+        frames: frames that each identifier sends for one image.
+        rows, columns: numbers of rows and columns of the image.
+        axes: number of values of a taxel.
+        by_columns: whether taxels come column by column; else they come row by row.
     """
 
     ids: tuple[int, ...]
@@ -129,13 +129,13 @@ class ImageFormat:
     by_columns: bool = False
 
     def __post_init__(self) -> None:
-        """Check it.
+        """Check the format.
 
         Raises:
-            ProtocolError: an identifier twice, frames that cannot be told apart, or another number of values.
+            ProtocolError: an identifier is there twice, two frames look alike, or the number of values is wrong.
         """
         if len(set(self.ids)) != len(self.ids):
-            raise ProtocolError("an identifier is there twice")
+            raise ProtocolError("an identifier of the image is there twice; give each frame its own")
         for number, frame in enumerate(self.frames):
             if any(frame.resembles(other) for other in self.frames[:number]):
                 raise ProtocolError(f"frame {number + 1} cannot be told from one before it: give each its own tag")
@@ -149,22 +149,22 @@ class ImageFormat:
 
     @property
     def parts(self) -> int:
-        """Frames of an image."""
+        """Number of frames of an image."""
         return len(self.ids) * len(self.frames)
 
     @property
     def longest(self) -> int:
-        """Bytes of its longest frame."""
+        """Number of bytes of the longest frame."""
         return max(frame.length for frame in self.frames)
 
     @property
     def bits(self) -> int:
-        """Of its narrowest value."""
+        """Number of bits of the narrowest value."""
         return min(4 * len(shifts) for frame in self.frames for shifts in frame.values)
 
     @cached_property
     def _places(self) -> tuple[int, ...]:
-        """Of each count, in the order of `Counts`, its place among the values of the frames."""
+        """Place of each count, in the order of `Counts`, among the values of the frames."""
         by_row = self.columns * self.axes, self.axes
         by_column = self.axes, self.rows * self.axes
         row_step, column_step = by_column if self.by_columns else by_row
@@ -180,7 +180,7 @@ class ImageFormat:
         return {can_id: number for number, can_id in enumerate(self.ids)}
 
     def part_of(self, can_id: int, data: bytes) -> int | None:
-        """Which frame of the image this is, from 0; None where it is none."""
+        """Number of this frame in the image, from 0; None for a frame of something else."""
         number = self._id_numbers.get(can_id)
         if number is None:
             return None
@@ -190,19 +190,19 @@ class ImageFormat:
         return None
 
     def values_of(self, part: int, data: bytes) -> list[int]:
-        """The values in a frame of the image."""
+        """Values in a frame of the image."""
         return self.frames[part % len(self.frames)].unpack(data)
 
     def decode(self, parts: Sequence[bytes]) -> Counts:
-        """The image in all its frames, in the order of identifiers and frames."""
+        """Counts of an image from all its frames, in the order of identifiers and frames."""
         values = [value for part, data in enumerate(parts) for value in self.values_of(part, data)]
         return tuple(values[place] for place in self._places)
 
     def encode(self, counts: Sequence[int]) -> list[Frame]:
-        """The frames of an image, in the order of identifiers and frames.
+        """Frames of an image, in the order of identifiers and frames.
 
         Raises:
-            ProtocolError: another number of counts, or a count that does not fit.
+            ProtocolError: the number of counts is wrong, or a count does not fit.
         """
         if len(counts) != len(self._places):
             raise ProtocolError(f"image: expected {len(self._places)} counts, got {len(counts)}")
@@ -223,9 +223,9 @@ class RawImage:
     """One complete image.
 
     Attributes:
-        counts: as sent.
-        t_ns: arrival of its first frame.
-        number: of the complete images so far, from 0.
+        counts: counts as the device sent them.
+        t_ns: arrival of the first frame.
+        number: number of the image among the complete ones, from 0.
     """
 
     counts: Counts
@@ -237,17 +237,17 @@ class ImageAssembler:
     """Collects the frames of images; `push` returns an image when the last of its distinct frames arrives.
 
     An image opens at any of its frames. A frame that it has already begins the next one: the open image was torn. So a
-    lost frame costs its image and no other. The formats have no counter and no checksum: a changed bit is not noticed,
-    nor is a lost image, and two images are mixed without notice where the first frames of one and the last ones of the
-    other are lost and the rest comes within the deadline.
+    lost frame costs its image and no other. The formats have no counter and no checksum: neither a changed bit nor a
+    lost image is noticed. Two images are mixed unnoticed where the last frames of one and the first of the next
+    are lost and the rest comes within the deadline.
 
     Args:
-        image: what is expected.
+        image: format of the images.
         deadline_ns: longest time from the first frame to the last.
 
     Attributes:
-        frames: images published.
-        torn: opened and dropped incomplete.
+        frames: number of images that were returned.
+        torn: number of images that were opened and dropped incomplete.
     """
 
     def __init__(self, image: ImageFormat, deadline_ns: int) -> None:
@@ -258,7 +258,7 @@ class ImageAssembler:
         self._opened_ns = 0
 
     def push(self, can_id: int, data: bytes, t_ns: int) -> RawImage | None:
-        """Take one received frame; what is no part of an image is ignored. Never raises on bytes."""
+        """Take one received frame; a frame that is no part of an image is ignored. No bytes make it raise."""
         part = self.image.part_of(can_id, data)
         if part is None:
             return None

@@ -1,8 +1,8 @@
-"""How late each message on a CAN bus can be in the worst case.
+"""Worst-case response time of each message on a CAN bus.
 
-Holds for a bus whose nodes send their highest-priority message first. Messages are independent of each other, or part
-of one transaction: released at fixed offsets after an event that they share, such as SYNC. `worst_case_response_fifo`
-holds for a bus on which nodes send their oldest frame first. Errors on the wire are not allowed for.
+The analysis holds for a bus whose nodes send their highest-priority message first. Messages are independent of each
+other, or part of one transaction: released at fixed offsets after an event that they share, such as SYNC. For nodes
+that send their oldest frame first there is `worst_case_response_fifo`. The wire has no errors here.
 
 Source: Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis: refuted, revisited and
 revised", Real-Time Systems 35 (2007). Offsets: Palencia and González Harbour, "Schedulability analysis for tasks with
@@ -28,12 +28,12 @@ class Message:
     """One periodic or sporadic message.
 
     Attributes:
-        name: for people.
-        cob_id: identifier, which is its priority: lower wins.
-        n_data: data bytes, 0..8.
+        name: name of the message, for people.
+        cob_id: identifier, which is the priority: the lower one wins.
+        n_data: number of data bytes, 0..8.
         period_ns: shortest time between two of its events.
         jitter_ns: largest delay from its earliest to its latest queueing.
-        deadline_ns: latest end of its transmission after the event; None: the period. May exceed the period.
+        deadline_ns: latest end of its transmission, from the event on; it may exceed the period; None: the period.
         frame_ns: time of one frame, where it is not the worst case of a classical frame at the bit rate.
         offset_ns: earliest queueing after the event that all messages with an offset share, up to multiples of their
             periods; None for a message that keeps its own time, queued at its event at the earliest.
@@ -56,13 +56,13 @@ class Message:
 
 @dataclass(frozen=True, slots=True)
 class Response:
-    """What the analysis says of one message.
+    """Result of the analysis for one message.
 
     Attributes:
-        message: of which.
+        message: the message.
         frame_ns: longest time of one frame.
-        response_ns: worst case from the event to the end of the transmission; None: no bound, the bus cannot carry it.
-        instances: releases in the longest busy period; with more than one the first need not be the worst.
+        response_ns: longest time from the event to the end of the transmission; None: the bus cannot carry the message.
+        instances: number of releases in the longest busy period; of several the first need not be the worst.
     """
 
     message: Message
@@ -78,10 +78,10 @@ class Response:
 
 @dataclass(frozen=True, slots=True)
 class BusAnalysis:
-    """Worst case of a whole bus.
+    """Worst case of all messages on a bus.
 
     Attributes:
-        responses: one per message, highest priority first.
+        responses: response of each message, highest priority first.
         load: share of the bus that all messages take with worst-case stuffing, 1.0 = full.
     """
 
@@ -102,7 +102,8 @@ def worst_case_response(messages: Sequence[Message], bitrate: int = 1_000_000) -
         bitrate: bit/s.
 
     Raises:
-        ProtocolError: an identifier twice, or a message with no period, a bad identifier, length, offset or jitter.
+        ProtocolError: two messages have one identifier, or a message has no period, or a bad identifier, length, offset
+            or jitter.
     """
     timed = _timed(messages, bitrate)
     responses = _respond_all(timed, [None] * len(timed), bitrate)
@@ -116,7 +117,7 @@ _Timed = tuple[Message, int]
 
 
 def _timed(messages: Sequence[Message], bitrate: int) -> list[_Timed]:
-    """The messages by rising identifier."""
+    """The messages and the times of their frames, by rising identifier."""
     ordered = sorted(messages, key=lambda message: message.cob_id)
     for first, second in itertools.pairwise(ordered):
         if first.cob_id == second.cob_id:
@@ -162,9 +163,9 @@ class _Queued(NamedTuple):
 
     Attributes:
         cost: time of one frame.
-        period: between two releases.
-        first: of the releases after the beginning, 0 ≤ first < period.
-        early: releases before the beginning that jitter has held back until then.
+        period: time between two releases.
+        first: time of the first release after the beginning, 0 ≤ first < period.
+        early: number of releases before the beginning that jitter has held back until then.
     """
 
     cost: int
@@ -173,7 +174,7 @@ class _Queued(NamedTuple):
     early: int
 
     def before(self, t: int) -> int:
-        """Frames queued in [0, t), at most."""
+        """Most frames that are queued in [0, t)."""
         return max(-((self.first - t) // self.period), 0) + self.early
 
 
@@ -183,8 +184,8 @@ class _BusyPeriod(NamedTuple):
     Attributes:
         above: the messages of higher priority.
         own: the message.
-        blocking: of the longest frame of lower priority.
-        bit: a bit time: a frame queued so late can still win the arbitration.
+        blocking: time of the longest frame of lower priority.
+        bit: time of one bit; a frame that is queued so much later can still win the arbitration.
     """
 
     above: tuple[_Queued, ...]
@@ -193,7 +194,7 @@ class _BusyPeriod(NamedTuple):
     bit: int
 
     def delays(self) -> list[int]:
-        """From each release of the message in the busy period to its last bit, at most."""
+        """Longest times from each release of the message in the busy period to its last bit."""
         own, length = self.own, 1
         while (longer := self.blocking + self._ahead(length) + own.before(length) * own.cost) > length:
             length = longer
@@ -204,7 +205,7 @@ class _BusyPeriod(NamedTuple):
         return found
 
     def _started(self, delay: int, before: int) -> int:
-        """Smallest time at which nothing is before the message, searched upward. Source: Davis et al. 2007."""
+        """First time at which no frame is before the message, found from below. Source: Davis et al. 2007."""
         while (longer := self.blocking + before + self._ahead(delay + self.bit)) > delay:
             delay = longer
         return delay
@@ -224,10 +225,11 @@ def _busy_period(level: Sequence[_Timed], start: int, blocking: int, bit: int) -
 
 
 def _starts(level: Sequence[_Timed], below: Sequence[tuple[_Timed, int | None]]) -> dict[int, int]:
-    """Where a busy period has to begin in the transaction → how long a frame from below can block it.
+    """Longest blocking by a frame from below, by the time in the transaction at which a busy period has to begin.
 
-    It begins where one of the transaction's messages is at its latest. If nothing of the level keeps its own time, then
-    really with that message, so that what blocks it is on the bus between its earliest and its latest queueing.
+    It begins where one of the transaction's messages is at its latest. If no message of the level keeps its own time,
+    the period begins with that very message, and a frame that blocks it is on the bus between its earliest and its
+    latest queueing.
     """
     longest = max((c for (_, c), _ in below), default=0)
     members = [(m, m.offset_ns) for m, _ in level if m.offset_ns is not None]

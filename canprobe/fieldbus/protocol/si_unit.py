@@ -10,22 +10,22 @@ from __future__ import annotations
 
 import math
 
-VELOCITY, ACCELERATION = 0x60A9, 0x60AA
+VELOCITY_UNIT_INDEX, ACCELERATION_UNIT_INDEX = 0x60A9, 0x60AA
 _INCREMENT, _TURN, _TURN_A_MINUTE, _DEGREE, _RADIAN, _METRE = 0xB5, 0xB4, 0xC0, 0x41, 0x10, 0x01
-_SECONDS = {0x03: 1.0, 0x47: 60.0, 0x57: 1.0}
-"""Second, minute, second squared."""
+_SECONDS_OF_UNIT = {0x03: 1.0, 0x47: 60.0, 0x57: 1.0}
+"""Seconds in a second, a minute, a second squared, by the code of the denominator."""
 
 
 def rate_unit(word: int, *, turn: float | None, metre: float | None) -> float | None:
-    """A unit of velocity, position units/s, or of acceleration, position units/s².
+    """Factor of a unit of velocity, position units/s, or of acceleration, position units/s².
 
     Args:
-        word: of 60A9h or 60AAh; 0 where the device has none.
-        turn: position units of a turn of the drive's shaft; None: unknown.
-        metre: position units of a metre; None: unknown.
+        word: value of 60A9h or 60AAh; 0 where the device has none.
+        turn: number of position units in a turn of the drive's shaft; None: unknown.
+        metre: number of position units in a metre; None: unknown.
 
     Returns:
-        The factor; None where the unit cannot be expressed in what is known.
+        The factor; None where what is known does not give it.
     """
     if word == 0:
         return 1.0
@@ -35,7 +35,7 @@ def rate_unit(word: int, *, turn: float | None, metre: float | None) -> float | 
         lengths |= {_TURN: turn, _TURN_A_MINUTE: turn / 60.0, _DEGREE: turn / 360.0, _RADIAN: turn / (2.0 * math.pi)}
     if metre is not None:
         lengths[_METRE] = metre
-    length, seconds = lengths.get(numerator), _SECONDS.get(denominator)
+    length, seconds = lengths.get(numerator), _SECONDS_OF_UNIT.get(denominator)
     if length is None or seconds is None:
         return None
     return 10.0 ** (prefix - 256 if prefix > 127 else prefix) * length / seconds

@@ -41,15 +41,15 @@ class SyncCounter:
 
 
 def is_sync(can_id: int, data: bytes) -> bool:
-    """Whether a frame is a SYNC: 080h without data, or with its counter."""
+    """Whether a frame is a SYNC: identifier 080h, without data or with the counter."""
     return can_id == SYNC_ID and len(data) <= 1
 
 
 def long_syncs_text(lengths: Mapping[int, int]) -> str:
-    """What is said of 080h with more data than a SYNC has; empty without any.
+    """Words for frames 080h with more data than a SYNC has; empty where there are none.
 
     Args:
-        lengths: how many such frames there are of each length, bytes.
+        lengths: number of such frames by their length in bytes.
     """
     each = ", ".join(f"{count} frames 080h of {length} bytes" for length, count in sorted(lengths.items()))
     return each and f"{each}, which CiA 301 does not know"

@@ -1,4 +1,4 @@
-"""Tactile frames: what they are on the wire, in PDO order, and their reassembly.
+"""Tactile frames as they are on the wire, in PDO order.
 
 Every frame begins with the same 8 bytes, little-endian:
 
@@ -30,15 +30,16 @@ from enum import IntEnum
 
 from canprobe.errors import ProtocolError
 
-SIDE = 16
+MAX_SIDE = 16
 """Most rows and columns of an array: the header names a taxel in 8 bits."""
 Shape = tuple[int, int]
 """Rows and columns of an array."""
-WINDOW = 8  # taxels along the window, where nothing else is said
-WINDOWS = (4, 6, 8, 10, 12)
+DEFAULT_WINDOW = 8
+"""Taxels along the window of a sensor that has no other."""
+WINDOW_SIZES = (4, 6, 8, 10, 12)
 """Taxels along the window that a sensor can be set to."""
 _FORM = struct.Struct("<BBBBHH")
-_OVERLOAD = 0x04
+_OVERLOAD_FLAG = 0x04
 _FORCE_SCALE, _CENTROID_SCALE, _MOMENT_SCALE = 400.0, 128.0, 64.0
 
 # bits, signed, scale, in the order of the wire
@@ -53,7 +54,7 @@ _FEATURE_FIELDS = (
 
 
 class TactileMode(IntEnum):
-    """What the sensor sends, object 2000h."""
+    """Contents of a frame, object 2000h."""
 
     FEATURES = 0
     WINDOW = 1
@@ -61,12 +62,12 @@ class TactileMode(IntEnum):
 
 
 def image_words(taxels: int) -> int:
-    """Payloads of 8 taxels that so many taxels fill."""
+    """Number of payloads of 8 taxels for so many taxels."""
     return -(-taxels // 8)
 
 
 def window_words(side: int) -> int:
-    """Payloads of 8 taxels that a window of side × side taxels fills."""
+    """Number of payloads of 8 taxels for a window of side × side taxels."""
     return image_words(side * side)
 
 
@@ -86,12 +87,12 @@ class TactileHeader:
     Attributes:
         frame_counter: 0..255.
         sync_counter: SYNC counter of the trigger, 1..240; 0 without a counter.
-        origin_row, origin_col: window's first taxel in the full pad; in features mode together the peak.
-        mode: what follows.
-        overload: a taxel reached full scale.
-        sample_age_us: trigger SYNC minus sample time, µs; 65535 is that or more.
-        crc: over the six bytes before it and the payloads after; `pack_whole` computes it.
-        window: taxels along the window.
+        origin_row, origin_col: first taxel of the window in the full pad; in features mode together the peak.
+        mode: kind of the payloads that follow.
+        overload: whether a taxel reached full scale.
+        sample_age_us: trigger SYNC minus sample time, µs; 65535 means that or more.
+        crc: CRC over the six bytes before it and the payloads after it; `pack_whole` computes it.
+        window: number of taxels along the window.
     """
 
     frame_counter: int
@@ -102,7 +103,7 @@ class TactileHeader:
     overload: bool
     sample_age_us: int
     crc: int = 0
-    window: int = WINDOW
+    window: int = DEFAULT_WINDOW
 
     @property
     def peak(self) -> int:
@@ -113,23 +114,23 @@ class TactileHeader:
         """Pack into 8 bytes.
 
         Raises:
-            ProtocolError: a field that does not fit.
+            ProtocolError: a field does not fit.
         """
         return self._packed(self.crc)
 
     def start(self) -> bytes:
-        """The 6 bytes before the CRC, which stand in front of what it is computed over.
+        """The 6 bytes before the CRC, which it covers first.
 
         Raises:
-            ProtocolError: a field that does not fit.
+            ProtocolError: a field does not fit.
         """
         return self._packed(0)[:6]
 
     def _packed(self, crc: int) -> bytes:
-        if not (0 <= self.origin_row < SIDE and 0 <= self.origin_col < SIDE):
+        if not (0 <= self.origin_row < MAX_SIDE and 0 <= self.origin_col < MAX_SIDE):
             raise ProtocolError(f"tactile header: window origin ({self.origin_row}, {self.origin_col}) is off the pad")
-        size = self.window << 4 if self.mode is TactileMode.WINDOW and self.window != WINDOW else 0
-        flags = self.mode | (_OVERLOAD if self.overload else 0) | size
+        size = self.window << 4 if self.mode is TactileMode.WINDOW and self.window != DEFAULT_WINDOW else 0
+        flags = self.mode | (_OVERLOAD_FLAG if self.overload else 0) | size
         peak = self.origin_row << 4 | self.origin_col
         try:
             return _FORM.pack(self.frame_counter, self.sync_counter, peak, flags, self.sample_age_us, crc)
@@ -141,34 +142,40 @@ class TactileHeader:
         """Unpack exactly 8 bytes.
 
         Raises:
-            ProtocolError: another length, reserved flags or mode, a window that leaves the pad.
+            ProtocolError: the length, the flags or the mode are wrong, or the window leaves the pad.
         """
         if len(data) != _FORM.size:
             raise ProtocolError(f"tactile header: expected 8 bytes, got {len(data)}")
         counter, sync, origin, flags, age, crc = _FORM.unpack(data)
-        if (read := _FLAGS.get(flags)) is None:
+        if (read := _FLAG_MEANINGS.get(flags)) is None:
             raise ProtocolError(f"tactile header: reserved flags {flags:#04x}")
-        header = cls(counter, sync, origin >> 4, origin & 0x0F, read[0], bool(flags & _OVERLOAD), age, crc, read[1])
-        check_origin(header, (SIDE, SIDE))
+        header = cls(
+            counter, sync, origin >> 4, origin & 0x0F, read[0], bool(flags & _OVERLOAD_FLAG), age, crc, read[1]
+        )
+        check_origin(header, (MAX_SIDE, MAX_SIDE))
         return header
 
 
-_FLAGS = {mode | overload: (mode, WINDOW) for mode in TactileMode for overload in (0, _OVERLOAD)} | {
+_FLAG_MEANINGS = {
+    mode | overload: (mode, DEFAULT_WINDOW) for mode in TactileMode for overload in (0, _OVERLOAD_FLAG)
+} | {
     TactileMode.WINDOW | overload | side << 4: (TactileMode.WINDOW, side)
-    for side in WINDOWS
-    if side != WINDOW
-    for overload in (0, _OVERLOAD)
+    for side in WINDOW_SIZES
+    if side != DEFAULT_WINDOW
+    for overload in (0, _OVERLOAD_FLAG)
 }
-"""What byte 3 can be: mode and taxels along the window."""
+"""Mode and taxels along the window, by byte 3."""
 
 
-_LAST_ORIGIN = {TactileMode.FEATURES: SIDE - 1, TactileMode.IMAGE: 0}
+_LAST_ORIGINS = {TactileMode.FEATURES: MAX_SIDE - 1, TactileMode.IMAGE: 0}
 
 
 def check_origin(header: TactileHeader, shape: Shape) -> None:
-    if header.window not in WINDOWS:
-        raise ProtocolError(f"tactile header: a window has {', '.join(map(str, WINDOWS))} taxels, not {header.window}")
-    last = (_LAST_ORIGIN.get(header.mode, 0),) * 2
+    if header.window not in WINDOW_SIZES:
+        raise ProtocolError(
+            f"tactile header: a window has {', '.join(map(str, WINDOW_SIZES))} taxels, not {header.window}"
+        )
+    last = (_LAST_ORIGINS.get(header.mode, 0),) * 2
     if header.mode is TactileMode.WINDOW:
         last = (shape[0] - header.window, shape[1] - header.window)
     if header.origin_row > last[0] or header.origin_col > last[1]:
@@ -181,7 +188,7 @@ class Features:
     """Contact features computed by the sensor.
 
     Attributes:
-        force_n: force over the pad, N.
+        force_n: sum of the force over the pad, N.
         row, col: centroid in taxels of the full pad, from 0 (7.5 is the middle of 16).
         var_rr, var_rc, var_cc: central second moments, taxel².
         peak: highest taxel, counts 0..255.
@@ -199,7 +206,7 @@ class Features:
         """The 8 bytes after the header; values beyond a range saturate at its end (module text).
 
         Raises:
-            ProtocolError: a value that is not a number.
+            ProtocolError: a value is not a number.
         """
         word = shift = 0
         values = (self.force_n, self.row, self.col, self.var_rr, self.var_rc, self.var_cc)
@@ -217,7 +224,7 @@ class Features:
         """Unpack exactly 8 bytes; the peak comes from the header.
 
         Raises:
-            ProtocolError: another length.
+            ProtocolError: the data have another length.
         """
         if len(data) != 8:
             raise ProtocolError(f"features: expected 8 bytes, got {len(data)}")
@@ -234,11 +241,11 @@ def pack_whole(header: TactileHeader, content: bytes | Features) -> bytes:
     """Pack a whole tactile frame into one string: its payloads of 8 bytes, in PDO order, with the CRC set.
 
     Args:
-        header: its crc is ignored; in features mode its origin too (the peak of the features takes that byte).
-        content: a byte for each taxel of the window or the whole image, row by row; or features.
+        header: the header; its crc is ignored, in features mode its origin too, as the peak takes that byte.
+        content: one byte for each taxel of the window or the whole image, row by row; or features.
 
     Raises:
-        ProtocolError: content and mode do not match, or a field does not fit.
+        ProtocolError: the content is not that of the mode, or a field does not fit.
     """
     if isinstance(content, Features) is not (header.mode is TactileMode.FEATURES):
         what = "features" if isinstance(content, Features) else "taxels"
@@ -253,6 +260,6 @@ def pack_whole(header: TactileHeader, content: bytes | Features) -> bytes:
         if len(content) != expected or not content:
             raise ProtocolError(f"taxels: expected {expected or 'those of an image'}, got {len(content)}")
         body = content + bytes(-len(content) % 8)
-    check_origin(header, (SIDE, SIDE))
+    check_origin(header, (MAX_SIDE, MAX_SIDE))
     start = header.start()
     return start + crc16_ccitt(body, crc16_ccitt(start)).to_bytes(2, "little") + body

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from canprobe.errors import ProtocolError
 from canprobe.fieldbus.protocol.tactile import (
-    SIDE,
-    WINDOW,
+    DEFAULT_WINDOW,
+    MAX_SIDE,
     Features,
     Shape,
     TactileHeader,
@@ -25,8 +25,8 @@ class TactileMessage:
     """One complete, checked tactile frame as it stood on the wire.
 
     Attributes:
-        header: as received.
-        body: what follows it: taxels row by row, filled up with zeros to a multiple of 8 bytes; or features.
+        header: the header as received.
+        body: bytes behind the header: taxels row by row, filled up with zeros to a multiple of 8 bytes; or features.
         t_ns: arrival of the header.
     """
 
@@ -44,17 +44,18 @@ class FrameAssembler:
     """Collects one sensor's PDOs; `push` returns a frame when its last PDO arrives and the CRC matches.
 
     A frame opens at a header and takes each expected COB-ID exactly once, in any order. A new header, a duplicate or
-    the deadline before it is complete: torn, dropped.
+    the deadline before it is complete tears the frame, which is dropped.
 
     Attributes:
         shape: rows and columns of the array.
-        frames: published.
-        torn: opened and dropped incomplete.
-        crc_errors: complete with a wrong CRC (corrupted, or mixed from two triggers where a header was lost).
-        duplicates: taxel PDOs that came twice, and complete frames with the counter of the frame before.
-        lost: frames of the sensor that were not published, from gaps of the frame counter (mod 256).
-        orphans: taxel PDOs without an open frame.
-        malformed: PDOs of a wrong length, headers that mean nothing, frames of another mode or window.
+        frames: number of frames that were returned.
+        torn: number of frames that were opened and dropped incomplete.
+        crc_errors: number of complete frames with a wrong CRC: corrupted, or mixed from two triggers where a header was
+            lost.
+        duplicates: number of taxel PDOs that came twice, and of complete frames with the counter of the one before.
+        lost: number of frames of the sensor that were not returned, from gaps of the frame counter (mod 256).
+        orphans: number of taxel PDOs without an open frame.
+        malformed: number of PDOs of a wrong length, of headers without a meaning, of frames of another mode or window.
     """
 
     __slots__ = (
@@ -69,21 +70,21 @@ class FrameAssembler:
         deadline_ns: int,
         sizes: Sequence[int] | None = None,
         *,
-        window: int = WINDOW,
-        shape: Shape = (SIDE, SIDE),
+        window: int = DEFAULT_WINDOW,
+        shape: Shape = (MAX_SIDE, MAX_SIDE),
     ) -> None:
-        """Expect the given identifiers.
+        """Make an assembler for the given identifiers.
 
         Args:
-            cob_ids: header first, then the payloads in PDO order.
-            mode: what the sensor is set to.
-            deadline_ns: longest time from header to last PDO; two cycles as a rule.
-            sizes: bytes of each PDO; 8 by default, up to 64 on CAN FD.
-            window: taxels along the window that the sensor is set to.
+            cob_ids: identifiers of the header and then of the payloads, in PDO order.
+            mode: mode of the sensor.
+            deadline_ns: longest time from the header to the last PDO; two cycles as a rule.
+            sizes: number of bytes of each PDO; 8 by default, up to 64 on CAN FD.
+            window: number of taxels along the window of the sensor.
             shape: rows and columns of the array.
 
         Raises:
-            ProtocolError: the PDOs do not add up to a frame of the mode, or an identifier is there twice.
+            ProtocolError: the PDOs together are no frame of the mode, or an identifier is there twice.
         """
         self._slots = {cob_id: slot for slot, cob_id in enumerate(cob_ids)}
         self._sizes = tuple(sizes) if sizes is not None else (8,) * len(cob_ids)
@@ -104,7 +105,7 @@ class FrameAssembler:
         self.frames = self.torn = self.crc_errors = self.duplicates = self.lost = self.orphans = self.malformed = 0
 
     def push(self, can_id: int, data: bytes, t_ns: int) -> TactileMessage | None:
-        """Take one received frame; identifiers of others are ignored. Never raises on bytes."""
+        """Take one received frame; other identifiers are ignored. No bytes make it raise."""
         slot = self._slots.get(can_id)
         if slot is None:
             return None

@@ -10,11 +10,11 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Protocol
 
-TIMED_OUT = 124
+TIMED_OUT_STATUS = 124
 _GRACE_S = 5.0
-_POLL_S = 0.02
+_POLL_PERIOD_S = 0.02
 _MAX_SIGNALS = 3
-_FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+_FORWARDED_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 
 
 @contextlib.contextmanager
@@ -25,7 +25,7 @@ def caught_signals(*, keyboard: bool = True) -> Iterator[list[int]]:
         keyboard: False drops SIGINT and SIGQUIT, which the terminal sends to a shell in this group as well.
     """
     signals: list[int] = []
-    before = {number: signal.getsignal(number) for number in _FORWARDED}
+    before = {number: signal.getsignal(number) for number in _FORWARDED_SIGNALS}
     try:
         for number, handler in before.items():
             if handler != signal.SIG_IGN:
@@ -38,10 +38,10 @@ def caught_signals(*, keyboard: bool = True) -> Iterator[list[int]]:
 
 
 class Job(Protocol):
-    """A command that runs somewhere."""
+    """A command that runs."""
 
     def poll(self) -> int | None:
-        """Pass its output on; return its exit status once it has ended."""
+        """Pass the output on; return the exit status once the command has ended."""
         ...
 
     def send_signal(self, number: int) -> None:
@@ -49,7 +49,7 @@ class Job(Protocol):
         ...
 
     def kill(self) -> None:
-        """End it at once, whatever it does."""
+        """End the command at once, whatever it does."""
         ...
 
 
@@ -59,12 +59,12 @@ def supervise(job: Job, signals: list[int], timeout_s: float | None) -> tuple[in
     Every signal is passed on; the third one kills. On the time-out the job gets SIGTERM and 5 s, then it is killed.
 
     Args:
-        job: what runs already.
-        signals: where signals of this process arrive; those that were passed on are taken out.
-        timeout_s: how long it may run, from now; `None` for ever.
+        job: command that runs already.
+        signals: list in which signals of this process arrive; those that were passed on are taken out.
+        timeout_s: time that it may run, from now; `None`: without a limit.
 
     Returns:
-        Its exit status, and whether it ran into the time-out (the status is then 124).
+        The exit status, and whether the time-out came, with status 124.
     """
     deadline = None if timeout_s is None else time.monotonic() + timeout_s
     timed_out = False
@@ -84,8 +84,8 @@ def supervise(job: Job, signals: list[int], timeout_s: float | None) -> tuple[in
             timed_out = True
             job.send_signal(signal.SIGTERM)
             deadline += _GRACE_S
-        time.sleep(_POLL_S)
-    return (TIMED_OUT if timed_out or status is None else status), timed_out
+        time.sleep(_POLL_PERIOD_S)
+    return (TIMED_OUT_STATUS if timed_out or status is None else status), timed_out
 
 
 class LocalJob:
@@ -96,7 +96,7 @@ class LocalJob:
     Args:
         command: program and arguments.
         environment: the command's whole environment.
-        shell: it is one for the user, with this process's standard input and terminal.
+        shell: whether it is a shell for the user, with standard input and terminal of this process.
     """
 
     def __init__(self, command: Sequence[str], environment: Mapping[str, str], shell: bool = False) -> None:

@@ -1,9 +1,9 @@
-"""A command in a user-mode Linux guest: a Linux kernel with CAN as an ordinary process on this machine's own files.
+"""A command in a user-mode Linux guest: a kernel with CAN as an ordinary process on the files of this machine.
 
-The guest has the machine's file system as its root (hostfs), so the same programs, interpreters and folders, and a
-vcan0 and a vcan1 of its own. The command's output goes to two files that are followed from outside; signals go in as
-lines on the guest's console; the exit status comes out through a file, because the kernel's own status is always 0.
-A shell for the user has a second console on the user's own terminal; what it is given from a pipe goes in as a file.
+The root of the guest is the file system of the machine (hostfs), with the same programs, interpreters and folders; the
+guest has a vcan0 and a vcan1. The output of the command goes to two files that are followed from outside. Signals go in
+as lines on the guest's console. The exit status comes out through a file, because that of the kernel is always 0. A
+shell for the user has a second console on the user's terminal; input from a pipe goes in as a file.
 
     JOB/            a folder under the temporary folder, removed afterwards
       init          the guest's first process: mounts, modules, vcan0, vcan1, then the command
@@ -38,13 +38,13 @@ PACKAGE, COMPILER_PACKAGE = "user-mode-linux", "build-essential"
 _WIDE_REGISTERS = "amx_tile"
 """Flag of processors whose extended registers do not fit into the guest's kernel, which then needs `xstate.c`."""
 _PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
-_MEMORY = 2 << 30
-_BOOT_S = 60.0
-_HALT_S = 5.0
-_TERMINATE_S = 2.0
-_HIDDEN = ("/dev", "/proc", "/run", "/sys")
+_MEMORY_BYTES = 2 << 30
+_MAX_BOOT_S = 60.0
+_MAX_HALT_S = 5.0
+_MAX_TERMINATION_S = 2.0
+_HIDDEN_FOLDERS = ("/dev", "/proc", "/run", "/sys")
 
-_INIT = """\
+_INIT_SCRIPT = """\
 #!/bin/sh
 PATH={path}
 export PATH
@@ -74,7 +74,7 @@ echo $? > "$job/status"
 end
 """
 
-_COMMAND = """\
+_COMMAND_SCRIPT = """\
 echo $$ > {job}/pid
 umask {umask:03o}
 cd {folder} || exit 125
@@ -86,7 +86,7 @@ class GuestError(BusError):
     """The guest could not be started, or ended before the command did.
 
     Attributes:
-        started: whether the command was running already.
+        started: whether the command was already running.
     """
 
     def __init__(self, message: str, started: bool) -> None:
@@ -95,7 +95,7 @@ class GuestError(BusError):
 
 
 def missing_packages() -> list[str]:
-    """Debian packages that a guest on this machine needs and that are not installed."""
+    """Debian packages that a guest on this machine needs and that are missing."""
     installed = shutil.which(PROGRAM, path=_search_path()) is not None and any(
         MODULES.glob("*/kernel/drivers/net/can/vcan.ko")
     )
@@ -118,9 +118,9 @@ class GuestJob:
 
     Args:
         command: program and arguments.
-        environment: the command's whole environment.
-        realtime: pin the guest to the last processor under SCHED_FIFO, and keep that one from idling.
-        shell: the command is a shell for the user; it has our standard input, and our terminal if that is one.
+        environment: whole environment of the command.
+        realtime: whether to pin the guest to the last processor under SCHED_FIFO, and keep that processor awake.
+        shell: whether the command is a shell for the user, with the standard input, and the terminal, of this process.
 
     Raises:
         GuestError: the guest cannot be started from here.
@@ -141,7 +141,7 @@ class GuestJob:
         except BaseException:
             self._remove()
             raise
-        self._boot_deadline = time.monotonic() + _BOOT_S
+        self._boot_deadline = time.monotonic() + _MAX_BOOT_S
 
     def __enter__(self) -> GuestJob:
         return self
@@ -152,7 +152,7 @@ class GuestJob:
 
     @property
     def started(self) -> bool:
-        """Whether the command runs, or ran."""
+        """Whether the command runs or has run."""
         return self._read("pid").endswith("\n")
 
     def poll(self) -> int | None:
@@ -170,7 +170,7 @@ class GuestJob:
         if ended:
             raise self._lost("the guest ended before the command did" if self.started else "the guest did not boot")
         if not self.started and time.monotonic() > self._boot_deadline:
-            raise self._lost(f"the guest did not boot in {_BOOT_S:.0f} s")
+            raise self._lost(f"the guest did not boot in {_MAX_BOOT_S:.0f} s")
         return None
 
     def send_signal(self, number: int) -> None:
@@ -187,14 +187,14 @@ class GuestJob:
     def halt(self) -> None:
         """Give a guest whose command has ended the time to power off."""
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(_HALT_S)
+            self._process.wait(_MAX_HALT_S)
 
     def kill(self) -> None:
         """End the guest at once; nothing of it is left running."""
         if self._process.poll() is None:
             self._process.terminate()  # the kernel ends its own processes
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self._process.wait(_TERMINATE_S)
+                self._process.wait(_MAX_TERMINATION_S)
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
@@ -220,7 +220,7 @@ class GuestJob:
             stdin = '"$job/stdin"'
             with (self._job / "stdin").open("wb") as file:
                 shutil.copyfileobj(sys.stdin.buffer, file)
-        script = _INIT.format(
+        script = _INIT_SCRIPT.format(
             path=_PATH,
             job=job,
             modules=MODULES,
@@ -235,7 +235,7 @@ class GuestJob:
         init.write_text(script)
         init.chmod(0o755)
         os.umask(umask := os.umask(0o077))
-        text = _COMMAND.format(
+        text = _COMMAND_SCRIPT.format(
             job=job,
             umask=umask,
             folder=shlex.quote(_visible_folder()),
@@ -302,14 +302,14 @@ class GuestJob:
 
 
 def _second_console() -> str:
-    """What makes the guest's second console, as large as our terminal."""
+    """Commands that make the second console of the guest, as large as our terminal."""
     size = os.get_terminal_size(1)
     node = "/run/canprobe.tty"
     return f"mknod {node} c 4 1\nstty -F {node} sane rows {size.lines} cols {size.columns}"
 
 
 def _compile_xstate(folder: Path) -> str:
-    """The library that is loaded before the guest's own; see `xstate.c`."""
+    """Compile the library that is loaded before those of the guest; see `xstate.c`."""
     library = folder / "xstate.so"
     source = Path(__file__).with_name("xstate.c")
     command = ["cc", "-shared", "-fPIC", "-O2", "-o", str(library), str(source), "-ldl"]
@@ -332,23 +332,25 @@ def _job_folder() -> Path:
 def _visible_folder() -> str:
     folder = os.getcwd()
     if _hidden(folder):
-        raise GuestError(f"the working folder {folder} does not exist in the guest, which has its own {_HIDDEN}", False)
+        raise GuestError(
+            f"the working folder {folder} does not exist in the guest, which has its own {_HIDDEN_FOLDERS}", False
+        )
     return folder
 
 
 def _hidden(folder: str) -> bool:
     path = os.path.realpath(folder)
-    return any(path == top or path.startswith(top + "/") for top in _HIDDEN)
+    return any(path == top or path.startswith(top + "/") for top in _HIDDEN_FOLDERS)
 
 
 def memory_folder(folders: Sequence[str]) -> tuple[str, int]:
     """Return the first folder that can hold the guest's memory file, and the bytes for it.
 
     Args:
-        folders: what is tried, one after the other; one in RAM is quicker than one on a disk.
+        folders: folders that are tried one after the other; one in RAM is quicker than one on a disk.
 
     Raises:
-        GuestError: none of them can, each with its reason.
+        GuestError: none of them can; the message has the reason of each.
     """
     problems = []
     for folder in dict.fromkeys(folders):
@@ -361,16 +363,16 @@ def memory_folder(folders: Sequence[str]) -> tuple[str, int]:
         free = state.f_bavail * state.f_frsize
         if state.f_flag & os.ST_NOEXEC:
             problems.append(f"{folder} is mounted noexec")
-        elif free < _MEMORY // 4:
-            problems.append(f"{folder} has {free >> 20} MiB free, of {_MEMORY // 4 >> 20}")
+        elif free < _MEMORY_BYTES // 4:
+            problems.append(f"{folder} has {free >> 20} MiB free, of {_MEMORY_BYTES // 4 >> 20}")
         else:
-            return folder, min(_MEMORY, free)
-    wanted = f"a folder that can be written, is not mounted noexec and has {_MEMORY // 4 >> 20} MiB free"
+            return folder, min(_MEMORY_BYTES, free)
+    wanted = f"a folder that can be written, is not mounted noexec and has {_MEMORY_BYTES // 4 >> 20} MiB free"
     raise GuestError(f"no folder for the guest's memory: {'; '.join(problems)}; set TMPDIR to {wanted}", False)
 
 
 def _on_last_processor() -> list[str]:
-    """Words that keep a command on the last of several processors; none where that cannot be."""
+    """Words that keep a command on the last of several processors; empty where that is impossible."""
     processors = sorted(os.sched_getaffinity(0))
     if len(processors) < 2 or shutil.which("taskset") is None:
         return []
@@ -378,7 +380,7 @@ def _on_last_processor() -> list[str]:
 
 
 def _favour() -> list[str]:
-    """Words before the guest that keep it on one processor and before others, as far as they are to be had.
+    """Words before the guest that keep it on one processor and before others, as far as that is permitted.
 
     A guest that wanders between processors loses half its speed: the host faults its pages anew on each.
     """

@@ -1,9 +1,8 @@
 """Run a command where a real vcan0 exists: here if there is one or one can be made, else in a guest.
 
 In this order: a vcan0 that is up; one in a network namespace of its own; one made by root and removed afterwards; a
-user-mode Linux guest (`canprobe.fieldbus.vcan.guest`). Where a vcan0 is made, a vcan1 is made beside it. The command
-finds the
-way taken in the environment: CANPROBE_VCAN is `here`, `namespace`, `link` or `guest`.
+user-mode Linux guest (`canprobe.fieldbus.vcan.guest`). Where a vcan0 is made, a vcan1 is made beside it. The variable
+CANPROBE_VCAN shows the command which way was taken: `here`, `namespace`, `link` or `guest`.
 """
 
 from __future__ import annotations
@@ -24,16 +23,18 @@ from canprobe.fieldbus.bus.real.socketcan import check_interface, has_socketcan
 from canprobe.fieldbus.vcan.child import LocalJob, caught_signals, supervise
 from canprobe.fieldbus.vcan.guest import GuestError, GuestJob, missing_packages
 
-CHANNEL, SECOND = "vcan0", "vcan1"
-NO_VCAN = 125
-GUEST_LOST = 123
+CHANNEL, SECOND_CHANNEL = "vcan0", "vcan1"
+NO_VCAN_STATUS = 125
+GUEST_LOST_STATUS = 123
 WAY_VARIABLE = "CANPROBE_VCAN"
 
 _MAPPINGS = Path("/proc/sys/vm/max_map_count")
 _MIN_MAPPINGS = 1 << 20  # of 4 KiB: more than the guest's memory
 
-_MAKE_LINK, _MAKE_SECOND = (f"ip link add dev {name} type vcan && ip link set {name} up" for name in (CHANNEL, SECOND))
-_IN_NAMESPACE = f'ip link set lo up; {_MAKE_LINK} && {_MAKE_SECOND} && exec "$@"'
+_LINK_COMMAND, _SECOND_LINK_COMMAND = (
+    f"ip link add dev {name} type vcan && ip link set {name} up" for name in (CHANNEL, SECOND_CHANNEL)
+)
+_NAMESPACE_COMMAND = f'ip link set lo up; {_LINK_COMMAND} && {_SECOND_LINK_COMMAND} && exec "$@"'
 
 
 def run_with_vcan(
@@ -43,13 +44,13 @@ def run_with_vcan(
 
     Args:
         command: program and arguments; none for the user's shell, which has standard input.
-        timeout_s: how long the command may run; booting a guest does not count.
-        install: install the guest's Debian package if a guest is needed, and iproute2 where `ip` is missing.
-        realtime: steady the guest's timing; see `GuestJob`.
+        timeout_s: time that the command may run; the boot of a guest does not count.
+        install: whether to install the Debian package of the guest if needed, and iproute2 where `ip` is missing.
+        realtime: whether to steady the timing of the guest; see `GuestJob`.
 
     Returns:
-        The command's exit status (128 + n after signal n); 124 after the time-out; 125 if no vcan can be had; 123 if
-        the guest died under the command. Messages go to stderr.
+        The command's exit status (128 + n after signal n); 124 after the time-out; 125 if there is no way to a vcan;
+        123 if the guest ended before the command. Messages go to stderr.
     """
     shell = not command
     if shell:
@@ -69,7 +70,7 @@ def run_with_vcan(
 
 
 def _check_guest(install: bool) -> int:
-    """0 where a guest can be started; else 125, with the line to type."""
+    """Check what a guest needs: return 0 where it can be started; else 125, after a message with the line to type."""
     missing = missing_packages()
     if install and missing_ip() is not None:
         missing.append("iproute2")  # for commands in the guest
@@ -94,7 +95,7 @@ def _run_in_guest(boot: Callable[[], GuestJob], signals: list[int], timeout_s: f
         if not error.started:
             return _no_vcan(str(error))
         _say(str(error))
-        return GUEST_LOST
+        return GUEST_LOST_STATUS
 
 
 def _supervise_guest(job: GuestJob, signals: list[int], timeout_s: float | None) -> int:
@@ -111,7 +112,7 @@ def _supervise_guest(job: GuestJob, signals: list[int], timeout_s: float | None)
 
 
 class _Boot:
-    """The boot of a guest as a job of its own: ends with 0 when the command starts, with 128 + n at a signal."""
+    """The boot of a guest as a job: it ends with 0 when the command starts, with 128 + n at a signal."""
 
     def __init__(self, job: GuestJob) -> None:
         self._job = job
@@ -134,13 +135,16 @@ class _Boot:
 @contextlib.contextmanager
 def _local_way() -> Iterator[tuple[str, list[str]] | None]:
     """Yield (name of the way, prefix of the command) of the first way that works on this kernel, or None."""
-    namespace = ["unshare", "--net" if os.geteuid() == 0 else "-rn", "--", "sh", "-c", _IN_NAMESPACE, "sh"]
+    namespace = ["unshare", "--net" if os.geteuid() == 0 else "-rn", "--", "sh", "-c", _NAMESPACE_COMMAND, "sh"]
     if _has_vcan():
         yield "here", []
     elif shutil.which("unshare") and _succeeds([*namespace, "true"]):
         yield "namespace", namespace
-    elif os.geteuid() == 0 and _succeeds(["sh", "-c", _MAKE_LINK]):
-        made = [CHANNEL, *([SECOND] if _succeeds(["sh", "-c", _MAKE_SECOND]) else [])]  # unless it is there already
+    elif os.geteuid() == 0 and _succeeds(["sh", "-c", _LINK_COMMAND]):
+        made = [
+            CHANNEL,
+            *([SECOND_CHANNEL] if _succeeds(["sh", "-c", _SECOND_LINK_COMMAND]) else []),
+        ]  # unless it is there already
         try:
             yield "link", []
         finally:
@@ -185,7 +189,7 @@ def _report_time_out(timed_out: bool, timeout_s: float | None) -> None:
 
 
 def _report_killed() -> None:
-    """The guest maps the pages of its processes one by one, and its kernel kills a process that cannot map another."""
+    """Report a command that its kernel killed because it could not map another page: the guest maps them one by one."""
     try:
         mappings = int(_MAPPINGS.read_text())
     except (OSError, ValueError):
@@ -200,7 +204,7 @@ def _report_killed() -> None:
 
 def _no_vcan(why: str) -> int:
     _say(why)
-    return NO_VCAN
+    return NO_VCAN_STATUS
 
 
 def _say(text: str) -> None:

@@ -10,7 +10,7 @@ from canprobe.fieldbus.eds.packaged import load_eds
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.node.stored_file import keep_in_file
 from canprobe.fieldbus.protocol.frames import NmtState
-from canprobe.fieldbus.protocol.tactile import WINDOWS, TactileMode, window_words
+from canprobe.fieldbus.protocol.tactile import WINDOW_SIZES, TactileMode, window_words
 from canprobe.fieldbus.protocol.tactile_assembler import FrameAssembler
 
 MS = 1_000_000
@@ -327,7 +327,7 @@ def test_sizes_that_it_does_not_have(sensor, value, abort):
     assert sensor.node.dictionary.number(SIZE) == 8
 
 
-@pytest.mark.parametrize("value", WINDOWS)
+@pytest.mark.parametrize("value", WINDOW_SIZES)
 def test_sizes_that_it_has_until_it_is_operational(sensor, value):
     assert sensor.write(SIZE, 0, value, 1) == 0
     sensor.nmt(0x01)
@@ -337,7 +337,7 @@ def test_sizes_that_it_has_until_it_is_operational(sensor, value):
     assert sensor.write(SIZE, 0, 4 if value != 4 else 6, 1) == 0
 
 
-@pytest.mark.parametrize("side", WINDOWS)
+@pytest.mark.parametrize("side", WINDOW_SIZES)
 @pytest.mark.parametrize("spot", [(0, 15), (8, 3), (15, 0)])
 def test_the_window_holds_the_contact_wherever_it_is(sensor, plant, side, spot):
     plant.image = np.zeros((16, 16), np.uint8)

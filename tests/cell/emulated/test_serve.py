@@ -16,7 +16,7 @@ from canprobe.cell.scene.setup import HomingParameters
 from canprobe.errors import BusError
 from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.port import PlainPort
-from canprobe.fieldbus.bus.virtual.lockstep import EVERY_ID, LockstepBus, Participant
+from canprobe.fieldbus.bus.virtual.lockstep import ALL_IDS, LockstepBus, Participant
 from canprobe.fieldbus.drive.drive import make_drive_node
 from canprobe.fieldbus.eds.packaged import load_eds
 from canprobe.fieldbus.node.quirks import Quirks
@@ -29,7 +29,7 @@ CYCLE = 2_500_000
 class Scripted(Participant):
     """A participant that answers by table and remembers what it heard."""
 
-    listens, patient, next_deadline_ns = EVERY_ID, frozenset(), None
+    listens, patient, next_deadline_ns = ALL_IDS, frozenset(), None
 
     def __init__(self, boot, answers=(), deadline=None):
         self.boot, self.answers, self.heard = boot, dict(answers), []

@@ -270,7 +270,7 @@ def test_a_switch_that_is_never_found(tmp_path, monkeypatch):
 
 
 def test_a_homing_error_of_the_drive(tmp_path, monkeypatch):
-    monkeypatch.setattr("canprobe.fieldbus.drive.homing.SEARCH_S", 0.5)
+    monkeypatch.setattr("canprobe.fieldbus.drive.homing.MAX_SEARCH_S", 0.5)
     bench = Bench(scene_of([17]), tmp_path)
     assert failure(bench) == (
         "node 1: (joint 1) could not find its home position by method 17: its statusword (6041h) has bit 13"

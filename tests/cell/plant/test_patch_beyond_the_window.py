@@ -10,7 +10,7 @@ from canprobe.cell.planning.window import CARRIED_ERROR, CARRIED_SHARE, CARRIED_
 from canprobe.cell.plant.elastic_contact import depth_for_force
 from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig
 from canprobe.cell.scene.setup import Probe
-from canprobe.fieldbus.protocol.tactile import SIDE
+from canprobe.fieldbus.protocol.tactile import MAX_SIDE
 from canprobe.mechanics.touch.patch.beyond_window import Continuation
 from canprobe.mechanics.touch.patch.image import PatchCalibration, compute_patch
 
@@ -23,7 +23,7 @@ SHAPES = {"plane": (0.0, 0.0), "cylinder": (1 / 0.036, 0.0), "sphere": (20.0, 20
 
 def paraboloid(u=0.4, v=-0.3, half=(4.5, 7.0), turn=0.5, peak=60e3):
     """Pressure (16, 16) in Pa of an elliptic patch: middle and half-axes in pitches."""
-    k = np.arange(SIDE) - 7.5
+    k = np.arange(MAX_SIDE) - 7.5
     x, y = np.meshgrid(k - u, k - v)
     along, across = np.cos(turn) * x + np.sin(turn) * y, np.cos(turn) * y - np.sin(turn) * x
     return peak * np.maximum(1.0 - (along / half[0]) ** 2 - (across / half[1]) ** 2, 0.0)
@@ -60,11 +60,11 @@ def test_saturated_taxels_do_not_flatten_it():
 @pytest.mark.parametrize(
     "pressure",
     [
-        np.zeros((SIDE, SIDE)),
-        seen(np.full((SIDE, SIDE), 5e4), (4, 4, 8, 8)),  # no summit
+        np.zeros((MAX_SIDE, MAX_SIDE)),
+        seen(np.full((MAX_SIDE, MAX_SIDE), 5e4), (4, 4, 8, 8)),  # no summit
         seen(paraboloid(half=(2.0, 1.5)), (4, 4, 8, 8)),  # too few taxels
         seen(1e5 - paraboloid(), (4, 4, 8, 8)),  # a pit
-        np.eye(SIDE) * 5e4,  # all in one line
+        np.eye(MAX_SIDE) * 5e4,  # all in one line
     ],
 )
 def test_what_is_no_patch_is_left_alone(pressure):
@@ -127,7 +127,7 @@ def test_what_the_plan_says_of_a_window_that_cuts(side, stiffness):
 def around(image, side):
     """First row and column of the window that has the centroid in its middle."""
     places = np.indices(image.shape).reshape(2, -1) @ image.reshape(-1).astype(float) / image.sum()
-    return [int(np.clip(round(place - (side - 1) / 2), 0, SIDE - side)) for place in places]
+    return [int(np.clip(round(place - (side - 1) / 2), 0, MAX_SIDE - side)) for place in places]
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -9,7 +9,7 @@ import pytest
 from canprobe.cell.plant.elastic_contact import depth_for_force
 from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig
 from canprobe.errors import UsageError
-from canprobe.fieldbus.protocol.tactile import SIDE
+from canprobe.fieldbus.protocol.tactile import MAX_SIDE
 from canprobe.mechanics.touch.contact import Doubt
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.patch.dead_taxels import mended
@@ -180,7 +180,7 @@ def test_a_dead_taxel_is_bridged_and_told(place):
         assert patch.doubts == (Doubt.DEAD,)
         bridged.append(np.hypot(patch.u - whole.u, patch.v - whole.v) / TAXEL_PITCH)
         assert patch.force == pytest.approx(whole.force, rel=0.02)
-        axis = np.arange(SIDE) - 7.5
+        axis = np.arange(MAX_SIDE) - 7.5
         counts = image / image.sum()
         alone.append(
             np.hypot(
@@ -193,7 +193,7 @@ def test_a_dead_taxel_is_bridged_and_told(place):
 
 
 def test_the_mean_of_its_neighbours_is_put_in():
-    image = np.zeros((SIDE, SIDE), np.uint8)
+    image = np.zeros((MAX_SIDE, MAX_SIDE), np.uint8)
     image[4:9, 4:9] = 100
     image[5, 6], image[7, 6], image[6, 5], image[6, 7] = 40, 60, 80, 120
     image[6, 6] = 0
@@ -201,4 +201,6 @@ def test_the_mean_of_its_neighbours_is_put_in():
     assert dead == 1
     assert whole[6, 6] == 75
     assert image[6, 6] == 0
-    assert np.array_equal(np.delete(whole.reshape(-1), 6 * SIDE + 6), np.delete(image.reshape(-1), 6 * SIDE + 6))
+    assert np.array_equal(
+        np.delete(whole.reshape(-1), 6 * MAX_SIDE + 6), np.delete(image.reshape(-1), 6 * MAX_SIDE + 6)
+    )

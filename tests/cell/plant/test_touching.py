@@ -16,7 +16,7 @@ from canprobe.cell.plant.plant import Plant
 from canprobe.cell.plant.several_contacts import force_laws, total_force
 from canprobe.cell.plant.taxels import IDEAL_TAXELS
 from canprobe.cell.scene.setup import Dynamics
-from canprobe.fieldbus.protocol.tactile import SIDE
+from canprobe.fieldbus.protocol.tactile import MAX_SIDE
 from canprobe.mechanics.robot.chain import forward, forward_jacobian
 from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
 from canprobe.mechanics.robot.model import joints_to_units
@@ -260,7 +260,7 @@ def test_the_plant_rests_a_large_probe_on_a_bowl():
     assert truth["in_contact"]
     plant.advance(200_000_000)
     assert plant.truth()["force"] == pytest.approx(truth["force"], rel=0.2)
-    assert image.shape == (SIDE, SIDE)  # the lip lies off the pad: 29 mm from its pole
+    assert image.shape == (MAX_SIDE, MAX_SIDE)  # the lip lies off the pad: 29 mm from its pole
     assert not image.any()
 
 
@@ -282,6 +282,6 @@ def test_an_image_of_two_walls_shows_two_patches():
     profiles = [image.sum(axis=0), image.sum(axis=1)]
     across = max(profiles, key=lambda p: p.std())
     assert image.any()
-    middle = across[SIDE // 2 - 2 : SIDE // 2 + 2].max()
-    assert across[: SIDE // 2 - 2].max() > 1.5 * middle
-    assert across[SIDE // 2 + 2 :].max() > 1.5 * middle
+    middle = across[MAX_SIDE // 2 - 2 : MAX_SIDE // 2 + 2].max()
+    assert across[: MAX_SIDE // 2 - 2].max() > 1.5 * middle
+    assert across[MAX_SIDE // 2 + 2 :].max() > 1.5 * middle

@@ -14,8 +14,8 @@ from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.lss import Lss, LssAnswerError
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.sdo import (
+    MAX_TRANSFER_TIMEOUTS,
     MAX_UPLOAD_BYTES,
-    TRANSFER_TIMEOUTS,
     SdoTimeoutError,
     download,
     hold_dialogues,
@@ -217,7 +217,7 @@ def test_a_transfer_that_creeps_ends_with_one_failed_read() -> None:
     bus.attach(server)
     with pytest.raises(SdoTimeoutError, match="SDO transfer not complete after 5 s"):
         held(PumpedNetwork(bus.port()), upload(0x1008, 0), timeout_s=0.5, retries=2)
-    assert bus.clock.now_ns() == 500 * MS * TRANSFER_TIMEOUTS
+    assert bus.clock.now_ns() == 500 * MS * MAX_TRANSFER_TIMEOUTS
     assert server.aborts == [("081000", 0x05040000)]
 
 

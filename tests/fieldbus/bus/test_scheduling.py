@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from canprobe.fieldbus.bus.real.memory import MAX_RESERVE, MIN_RESERVE, reserve_memory
+from canprobe.fieldbus.bus.real.memory import MAX_RESERVE_BYTES, MIN_RESERVE_BYTES, reserve_memory
 from canprobe.fieldbus.bus.real.processor import realtime
 
 SCRIPT = """
@@ -78,6 +78,8 @@ def held(cycles):
     return len(kept) * (256 << 10)
 
 
-@pytest.mark.parametrize("cycles, size", [(0, MIN_RESERVE), (1024, MIN_RESERVE + (4 << 20)), (10**9, MAX_RESERVE)])
+@pytest.mark.parametrize(
+    "cycles, size", [(0, MIN_RESERVE_BYTES), (1024, MIN_RESERVE_BYTES + (4 << 20)), (10**9, MAX_RESERVE_BYTES)]
+)
 def test_as_much_as_the_cycles_will_keep(cycles, size):
     assert held(cycles) == pytest.approx(size / 2, rel=0.05)

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from canprobe.fieldbus.eds.numbers import parse_integer, parse_sum
-from canprobe.fieldbus.eds.values import SIGNED, UNSIGNED, convert
+from canprobe.fieldbus.eds.values import SIGNED_BITS, UNSIGNED_BITS, convert
 
 WORDS = st.integers(0, 2**64 - 1)
 
@@ -61,11 +61,11 @@ def test_what_is_no_number(text):
         parse_sum(text, 1, silent)
 
 
-@given(st.sampled_from([*SIGNED, *UNSIGNED]), st.integers(-(2**65), 2**65))
+@given(st.sampled_from([*SIGNED_BITS, *UNSIGNED_BITS]), st.integers(-(2**65), 2**65))
 def test_a_value_fits_its_type_or_is_refused(data_type, number):
     """Independent: Python's own conversion to bytes of that length and sign."""
-    bits = SIGNED.get(data_type) or UNSIGNED[data_type]
-    signed = data_type in SIGNED
+    bits = SIGNED_BITS.get(data_type) or UNSIGNED_BITS[data_type]
+    signed = data_type in SIGNED_BITS
     try:
         value = convert(str(number), data_type, 1, lambda _: None)
     except ValueError:

@@ -116,11 +116,11 @@ def test_automatic_transitions():
 
 
 def test_bits_stand_where_the_standard_has_them():
-    assert (cia402.VOLTAGE_ENABLED, cia402.WARNING, cia402.REMOTE) == (4, 7, 9)
-    assert (cia402.TARGET_REACHED, cia402.INTERNAL_LIMIT) == (10, 11)
-    assert (cia402.DRIVE_FOLLOWS, cia402.FOLLOWING_ERROR, cia402.HALT) == (12, 13, 8)
+    assert (cia402.VOLTAGE_ENABLED_BIT, cia402.WARNING_BIT, cia402.REMOTE_BIT) == (4, 7, 9)
+    assert (cia402.TARGET_REACHED_BIT, cia402.INTERNAL_LIMIT_BIT) == (10, 11)
+    assert (cia402.DRIVE_FOLLOWS_BIT, cia402.FOLLOWING_ERROR_BIT, cia402.HALT_BIT) == (12, 13, 8)
     assert [m.value for m in cia402.OperationMode] == [0, 1, 6, 7, 8, 9, 10]
-    assert (cia402.ENABLE_INTERPOLATION, cia402.INTERPOLATION_ACTIVE) == (4, 12)
+    assert (cia402.ENABLE_INTERPOLATION_BIT, cia402.INTERPOLATION_ACTIVE_BIT) == (4, 12)
 
 
 def run_drive(state, goal, cycles=12, resets_fail=0):

@@ -10,7 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from canprobe.errors import ProtocolError
-from canprobe.fieldbus.protocol.tactile import WINDOWS, Features, TactileHeader, TactileMode, crc16_ccitt, pack_whole
+from canprobe.fieldbus.protocol.tactile import (
+    WINDOW_SIZES,
+    Features,
+    TactileHeader,
+    TactileMode,
+    crc16_ccitt,
+    pack_whole,
+)
 from canprobe.fieldbus.protocol.tactile_assembler import FrameAssembler
 
 FEATURES, WINDOW, IMAGE = TactileMode
@@ -436,7 +443,7 @@ def assemble(side, payloads, expected=None):
     return assembler, frames[-1]
 
 
-@given(st.sampled_from(WINDOWS), st.data())
+@given(st.sampled_from(WINDOW_SIZES), st.data())
 def test_every_taxel_comes_back_to_its_place(side, data):
     row, col = (data.draw(st.integers(0, 16 - side), label=name) for name in ("row", "column"))
     pad = data.draw(st.binary(min_size=256, max_size=256))
@@ -449,7 +456,7 @@ def test_every_taxel_comes_back_to_its_place(side, data):
     assert frame.body == inside(pad, row, col, side) + filled
 
 
-@pytest.mark.parametrize("side", WINDOWS)
+@pytest.mark.parametrize("side", WINDOW_SIZES)
 def test_the_flags_tell_the_size_and_8_is_as_it_always_was(side):
     start = pack_frame(window_header(side), bytes(side * side))[0]
     assert start[3] == 1 + (0 if side == 8 else side << 4)

@@ -14,7 +14,7 @@ from canprobe.errors import UsageError
 
 @dataclass(frozen=True, slots=True)
 class ConfiguredBus:
-    """What the configuration says; None where it says nothing."""
+    """Bus of the configuration; None where it states nothing."""
 
     interface: str
     channel: str | None
@@ -25,9 +25,9 @@ def configured_bus() -> ConfiguredBus | None:
     """Read python-can's configuration; None where no interface is configured.
 
     Raises:
-        UsageError: it cannot be read, or names an interface that python-can does not know.
+        UsageError: the configuration cannot be read, or names an interface that python-can does not know.
     """
-    import can.util  # late: python-can is loaded only where a bus is opened
+    import can.util  # here, as python-can is loaded only where a bus is opened
 
     named: dict[str, Any] = {}
     try:

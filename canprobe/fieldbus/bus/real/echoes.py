@@ -1,4 +1,4 @@
-"""Which received frames are our own, on a bus that gives a sender back what it sent."""
+"""Recognises our own frames on a bus that returns to a sender what it sent."""
 
 from __future__ import annotations
 
@@ -6,27 +6,27 @@ from collections import deque
 
 from canprobe.fieldbus.protocol.frames import Frame
 
-_LIFE_NS = 1_000_000_000
+_MAX_ECHO_DELAY_NS = 1_000_000_000
 
 
 class Echoes:
-    """The first frame that equals one we sent is taken for its echo, once.
+    """Takes the first received frame that equals a sent one for its echo, once.
 
-    Somebody else's frame with the same identifier and data comes besides the echo, so one of the two is kept. An echo
-    that does not come within a second is waited for no longer.
+    A frame of another sender with the same identifier and data comes besides the echo, so one of the two is kept. An
+    echo is expected for a second.
     """
 
     def __init__(self) -> None:
         self._waiting: dict[Frame, deque[int]] = {}
 
     def sent(self, frame: Frame, t_ns: int) -> None:
-        """Note a frame of ours."""
+        """Note a frame that was sent."""
         self._waiting.setdefault(frame, deque()).append(t_ns)
 
     def is_one(self, frame: Frame, t_ns: int) -> bool:
-        """Whether a received frame is the echo of one that was sent, which it then answers for."""
+        """Whether a received frame is the echo of a sent one, which then expects no other."""
         waiting = self._waiting.get(frame)
-        while waiting and t_ns - waiting[0] > _LIFE_NS:
+        while waiting and t_ns - waiting[0] > _MAX_ECHO_DELAY_NS:
             waiting.popleft()
         if not waiting:
             self._waiting.pop(frame, None)

@@ -11,30 +11,31 @@ from collections.abc import Callable, Iterator
 from types import FrameType, TracebackType
 from typing import Any
 
-TERMINATIONS = (signal.SIGTERM, signal.SIGHUP)
-"""What ends a process from outside: a service that is stopped, a terminal that is closed."""
-REPEAT_S = 0.1
+TERMINATION_SIGNALS = (signal.SIGTERM, signal.SIGHUP)
+"""Signals that end a process from outside: a service is stopped, a terminal is closed."""
+REPEAT_PERIOD_S = 0.1
+"""Time between two repetitions of an interrupt."""
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM or SIGHUP, raised like Ctrl-C where the program stands."""
+    """SIGTERM or SIGHUP came; it is raised where the program is, as Ctrl-C is."""
 
 
 def raise_terminated(_number: int, _frame: FrameType | None) -> None:
-    """The handler of both."""
+    """Raise `Terminated`; the handler of SIGTERM and SIGHUP."""
     raise Terminated
 
 
 @contextlib.contextmanager
 def interrupts_held() -> Iterator[None]:
-    """An interrupt waits for the end of the block: what is begun in it is done whole. In the main thread only.
+    """Hold an interrupt until the end of the block, so that the block is done whole. It works in the main thread only.
 
-    Ignored signals stay ignored, as `nohup` has SIGHUP, and a shell without job control SIGINT in the background.
+    Ignored signals stay ignored: SIGHUP under `nohup`, and SIGINT in the background of a shell without job control.
     """
     came: list[int] = []
     before: dict[int, Any] = {}
     with contextlib.suppress(ValueError):  # not the main thread: signals are not ours to receive
-        for number in (signal.SIGINT, *TERMINATIONS):
+        for number in (signal.SIGINT, *TERMINATION_SIGNALS):
             if signal.getsignal(number) is not signal.SIG_IGN:
                 before[number] = signal.signal(number, lambda n, _: came.append(n))
     try:
@@ -48,17 +49,17 @@ def interrupts_held() -> Iterator[None]:
 
 @contextlib.contextmanager
 def interrupts_repeated() -> Iterator[None]:
-    """An interrupt is raised every `REPEAT_S` until the block is left. In the main thread only.
+    """Raise an interrupt again every `REPEAT_PERIOD_S` until the block is left. It works in the main thread only.
 
-    For work with libraries that draw: Python drops what is raised in the callback of a weak reference or in `__del__`,
-    of which they have thousands, so that one Ctrl-C in twenty was lost in them, with a traceback on stderr.
+    It is for libraries that draw. Python drops what is raised in the callback of a weak reference or in `__del__`, of
+    which they have thousands: one Ctrl-C in twenty was lost there, with a traceback on stderr.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     came: list[signal.Signals] = []
     left = threading.Event()
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, *TERMINATIONS)}
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, *TERMINATION_SIGNALS)}
     handlers = {number: handler for number, handler in before.items() if callable(handler)}
     hook = sys.unraisablehook
 
@@ -68,7 +69,7 @@ def interrupts_repeated() -> Iterator[None]:
             handlers[kind](number, frame)
 
     def repeat() -> None:
-        while not left.wait(REPEAT_S):
+        while not left.wait(REPEAT_PERIOD_S):
             if came:
                 _thread.interrupt_main(came[0])
 
@@ -94,13 +95,14 @@ def interrupts_repeated() -> Iterator[None]:
 
 
 class Interrupts:
-    """Within the block the first interrupt waits until it is taken; a second one is raised where the program stands.
+    """Holds the first interrupt within the block until it is taken; a second one is raised where the program is.
 
-    So is the first where ``stuck`` says that nobody will come to take it. Ignored signals stay ignored (as `nohup` has
-    it), one that would end the process raises `Terminated`, and outside a main thread nothing changes.
+    The first one is raised at once, too, where ``stuck()`` is true, as nobody would take it. Ignored signals stay
+    ignored (as under `nohup`), one that would end the process raises `Terminated`, and outside the main thread nothing
+    changes.
 
     Args:
-        stuck: whether the program is held up somewhere.
+        stuck: function that returns whether the program is held up somewhere.
     """
 
     def __init__(self, stuck: Callable[[], bool] = lambda: False) -> None:
@@ -111,9 +113,9 @@ class Interrupts:
         self._waiting: int | None = None
 
     def __enter__(self) -> Interrupts:
-        for number in (signal.SIGINT, *TERMINATIONS):
+        for number in (signal.SIGINT, *TERMINATION_SIGNALS):
             before = signal.getsignal(number)
-            handler = raise_terminated if before is signal.SIG_DFL and number in TERMINATIONS else before
+            handler = raise_terminated if before is signal.SIG_DFL and number in TERMINATION_SIGNALS else before
             if not callable(handler):
                 continue
             try:
@@ -139,7 +141,7 @@ class Interrupts:
             self._before[number](number, frame)
 
     def take(self) -> None:
-        """Give what waits to who would have had it without us, which raises it as a rule; nothing where none waits."""
+        """Give the held interrupt, if there is one, to its former handler, which raises it as a rule."""
         if self._waiting is not None:
             number, self._waiting = self._waiting, None
             self._before[number](number, None)

@@ -1,7 +1,7 @@
-"""How a SocketCAN interface is set: what `ip -details -statistics -json link show` shows of it, and the lines
+"""Settings of a SocketCAN interface, as `ip -details -statistics -json link show` shows them, and the lines to type
 that set it.
 
-Drivers and versions of iproute2 leave things out, and write numbers as texts: what is not there is None.
+Drivers and versions of iproute2 leave fields out, and write numbers as texts. A missing field is None.
 
 Sample points: CiA 301 recommends 87.5 % of the bit (85 to 90 %). Above 500 kbit/s, where 75 to 80 % is usual, 80 %.
 """
@@ -16,31 +16,31 @@ from dataclasses import dataclass
 from typing import Any
 
 VIRTUAL_KINDS = ("vcan", "vxcan")
-SLOW_BIT_S = 500_000
-SLOW_SAMPLE, FAST_SAMPLE = (0.85, 0.875, 0.90), (0.75, 0.80, 0.90)  # lowest, recommended, highest
-RESTART_MS, TX_QUEUE = 100, 1000
-_FD_MTU = 72
+MAX_SLOW_BITRATE = 500_000
+SLOW_SAMPLE_POINTS, FAST_SAMPLE_POINTS = (0.85, 0.875, 0.90), (0.75, 0.80, 0.90)  # lowest, recommended, highest
+RESTART_MS, TX_QUEUE_FRAMES = 100, 1000
+FD_MTU_BYTES = 72
 _TIMEOUT_S = 5.0
 _SYSTEM_FOLDERS = ("/usr/sbin", "/sbin")
-"""Where `tc` is on Debian, and where the PATH of a user does not lead."""
+"""Folders of `tc` on Debian that are not in the PATH of a user."""
 
 
 @dataclass(frozen=True, slots=True)
 class LinkState:
-    """One interface.
+    """State of one interface.
 
     Attributes:
-        name: such as `can0`.
+        name: name of the interface, such as `can0`.
         kind: `can` for hardware, `vcan` or `vxcan`; None where the driver does not report it.
-        is_up: it is there and switched on.
-        tx_queue: frames that the kernel queues (txqueuelen).
-        bitrate, data_bitrate: bit/s; the second of CAN FD.
+        is_up: whether it exists and is switched on.
+        tx_queue: number of frames that the kernel queues (txqueuelen).
+        bitrate, data_bitrate: bit rates, bit/s; the second one is that of CAN FD.
         sample_point: share of the bit, 0 to 1.
-        restart_ms: after which a bus-off is left by itself; 0 never.
-        state: of the controller, such as `ERROR-ACTIVE`.
+        restart_ms: time after which the controller leaves bus off by itself; 0: never.
+        state: state of the controller, such as `ERROR-ACTIVE`.
         tx_errors, rx_errors: the controller's error counters.
-        modes: such as `LISTEN-ONLY`, `FD`.
-        bus_errors, bus_offs: counted since the interface was made.
+        modes: modes of the controller, such as `LISTEN-ONLY`, `FD`.
+        bus_errors, bus_offs: numbers of them since the interface was made.
     """
 
     name: str
@@ -63,7 +63,7 @@ def parse_link(text: str) -> LinkState:
     """Read the JSON of one link.
 
     Raises:
-        ValueError: it is not that.
+        ValueError: the text is not the JSON of one link.
     """
     links = json.loads(text)
     found = [link for link in links if isinstance(link, dict) and link.get("ifname")] if isinstance(links, list) else []
@@ -93,7 +93,7 @@ def parse_link(text: str) -> LinkState:
 
 
 def read_link(name: str) -> LinkState | None:
-    """Ask `ip` about an interface; None where there is no `ip`, or it says nothing that can be read."""
+    """Read the state of an interface by `ip`; None where there is no `ip`, or its output cannot be read."""
     command = ["ip", "-details", "-statistics", "-json", "link", "show", "dev", name]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False)
@@ -108,34 +108,35 @@ def read_link(name: str) -> LinkState | None:
 
 
 def setting_line(name: str, bitrate: int, data_bitrate: int | None = None) -> str:
-    """The line to type that sets an interface as a cell wants it and brings it up.
+    """The line to type that sets an interface as a cell needs it and brings it up.
 
     Args:
-        name: of the interface; a virtual one, `vcan0` or `vxcan0`, has no bit rate.
-        bitrate: bit/s.
-        data_bitrate: of CAN FD, bit/s; None: classical frames only.
+        name: name of the interface; a virtual one, `vcan0` or `vxcan0`, has no bit rate.
+        bitrate: bit rate, bit/s.
+        data_bitrate: data bit rate of CAN FD, bit/s; None: classical frames only.
     """
     if name.startswith(VIRTUAL_KINDS):
-        return ip_line(f"{name} up") if data_bitrate is None else ip_line(f"{name} down", f"{name} mtu {_FD_MTU} up")
-    sample = (SLOW_SAMPLE if bitrate <= SLOW_BIT_S else FAST_SAMPLE)[1]
+        fd = (f"{name} down", f"{name} mtu {FD_MTU_BYTES} up")
+        return ip_line(f"{name} up") if data_bitrate is None else ip_line(*fd)
+    sample = (SLOW_SAMPLE_POINTS if bitrate <= MAX_SLOW_BITRATE else FAST_SAMPLE_POINTS)[1]
     fast = "" if data_bitrate is None else f" dbitrate {data_bitrate} fd on"
     return ip_line(
         f"{name} down",
         f"{name} type can bitrate {bitrate} sample-point {sample:g}{fast} restart-ms {RESTART_MS}",
-        f"{name} txqueuelen {TX_QUEUE} up",
+        f"{name} txqueuelen {TX_QUEUE_FRAMES} up",
     )
 
 
 def emptying_line(name: str) -> str:
-    """The line to type that drops the frames which wait in an interface, and starts its controller afresh."""
+    """The line to type that drops the frames which wait in an interface, and restarts its controller."""
     return ip_line(f"{name} down", f"{name} up")
 
 
 def drop_queued(name: str) -> bool:
-    """Drop the frames that wait in an interface's transmit queue; False where the right to do so, or `tc`, is missing.
+    """Drop the frames in an interface's transmit queue; return False where the right to do so, or `tc`, is missing.
 
-    A queue that another one replaces lets go of its frames; then the default one comes back. The link stays up, and the
-    frame that the controller itself holds stays in it.
+    A queue that is replaced drops its frames; then the default one comes back. The link stays up, and the controller
+    keeps the frame that it holds.
     """
     program = shutil.which("tc", path=os.pathsep.join([os.environ.get("PATH", ""), *_SYSTEM_FOLDERS]))
     if program is None:
@@ -148,19 +149,19 @@ def drop_queued(name: str) -> bool:
 
 
 def ip_line(*settings: str) -> str:
-    """The line to type that sets links one way after the other, with `sudo` for who needs it."""
+    """The line to type that makes settings of links one after the other, with `sudo` where it is needed."""
     return " && ".join(f"{sudo()}ip link set {setting}" for setting in settings)
 
 
 def missing_ip() -> str | None:
-    """What is said where there is no `ip`, with the line to type; None where there is one."""
+    """Message that there is no `ip`, with the line to type; None where there is one."""
     if shutil.which("ip") is not None:
         return None
     return f"`ip` is not installed; type:  {sudo()}apt-get install -y iproute2"
 
 
 def sudo() -> str:
-    """What a line begins with for who is not root."""
+    """Beginning of a line to type: `sudo` for users who are not root."""
     return "" if os.geteuid() == 0 else "sudo "
 
 

@@ -1,4 +1,4 @@
-"""Many CAN frames a system call: recvmmsg and sendmmsg through ctypes, on systems of 64 bits.
+"""Many CAN frames in one system call: recvmmsg and sendmmsg through ctypes, on systems of 64 bits.
 
 Where a system call costs 20 µs, as in a user-mode Linux guest, a burst costs a tenth of what single calls do.
 
@@ -15,7 +15,7 @@ import socket
 import struct
 from collections.abc import Sequence
 
-from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, Frame
+from canprobe.fieldbus.protocol.frames import BRS_FLAG, CLASSIC_BYTES, Frame
 
 SO_TIMESTAMPNS = 35
 SO_RXQ_OVFL = 40
@@ -23,20 +23,19 @@ SO_RXQ_OVFL = 40
 Row = tuple[int, bytes, int, int]
 """can_id with flags, data, CLOCK_REALTIME of reception in ns (0: unknown), frames dropped so far."""
 
-_BIT_RATE_SWITCH = 0x01
 _FRAME = struct.Struct("=IBB2x8s")  # struct can_frame; its first 16 bytes are also those of a struct canfd_frame
 _FD_FRAME = struct.Struct("=IBB2x64s")
 # the control messages behind a frame, in the order in which the kernel writes them: SCM_TIMESTAMPNS, SO_RXQ_OVFL
 _CONTROL_FORM = "QiiqqQiiI4x8x"
 _SLOT = struct.Struct(_FRAME.format + _CONTROL_FORM)
 _FD_SLOT = struct.Struct(_FD_FRAME.format + _CONTROL_FORM)
-_CONTROL = _SLOT.size - _FRAME.size
+_CONTROL_BYTES = _SLOT.size - _FRAME.size
 _MSG_WAITFORONE = 0x10000
-_BATCH = 64
+_BATCH_FRAMES = 64
 
 
 HAS_BATCHES = struct.calcsize("P") == 8
-"""The layout of the control messages above is that of 64 bits."""
+"""Whether the system has 64 bits, as the layout of the control messages above requires."""
 
 
 class _IoVec(ctypes.Structure):
@@ -64,12 +63,12 @@ class _Slots:
 
     def __init__(self, frame: int, control: int) -> None:
         size = frame + control
-        self.buffer = ctypes.create_string_buffer(size * _BATCH)
+        self.buffer = ctypes.create_string_buffer(size * _BATCH_FRAMES)
         self.view = memoryview(self.buffer).cast("B")
-        self.headers = (_MMsgHdr * _BATCH)()
-        self.vectors = (_IoVec * _BATCH)()
+        self.headers = (_MMsgHdr * _BATCH_FRAMES)()
+        self.vectors = (_IoVec * _BATCH_FRAMES)()
         start = ctypes.addressof(self.buffer)
-        for k in range(_BATCH):
+        for k in range(_BATCH_FRAMES):
             self.vectors[k] = _IoVec(start + k * size, frame)
             header = self.headers[k].header
             header.iov = ctypes.addressof(self.vectors[k])
@@ -84,8 +83,8 @@ class FrameSocket:
     """Moves frames through one socket with recvmmsg and sendmmsg.
 
     Args:
-        sock: a raw CAN socket.
-        fd: it takes CAN FD frames too.
+        sock: raw CAN socket.
+        fd: whether it takes CAN FD frames too.
     """
 
     def __init__(self, sock: socket.socket, fd: bool = False) -> None:
@@ -95,21 +94,21 @@ class FrameSocket:
         self._fd = sock.fileno()
         self._fd_frames = fd
         self._frame, self._slot = (_FD_FRAME, _FD_SLOT) if fd else (_FRAME, _SLOT)
-        self._in = _Slots(self._frame.size, _CONTROL)
+        self._in = _Slots(self._frame.size, _CONTROL_BYTES)
         self._out = _Slots(self._frame.size, 0)
 
     def receive(self, wait: bool = False) -> list[Row]:
-        """Return everything that is there, 64 frames a call; OSError if the interface failed.
+        """Return all frames that have arrived, 64 by each system call; raise OSError if the interface failed.
 
         Args:
-            wait: for the first frame, as long as the socket's own time-out says; it must be a blocking one.
+            wait: whether to wait for the first frame, up to the time-out of the socket, which must be a blocking one.
         """
         rows: list[Row] = []
         slots = self._in
-        count = _BATCH
+        count = _BATCH_FRAMES
         flags = _MSG_WAITFORONE if wait else socket.MSG_DONTWAIT
-        while count == _BATCH:
-            count = self._recvmmsg(self._fd, slots.headers, _BATCH, flags, None)
+        while count == _BATCH_FRAMES:
+            count = self._recvmmsg(self._fd, slots.headers, _BATCH_FRAMES, flags, None)
             flags = socket.MSG_DONTWAIT
             if count < 0:
                 if ctypes.get_errno() in (errno.EAGAIN, errno.EINTR):
@@ -124,12 +123,12 @@ class FrameSocket:
         return rows
 
     def send(self, frames: Sequence[Frame]) -> int:
-        """Hand over up to 64 frames with one call; return how many were taken; OSError if not even one was."""
+        """Send up to 64 frames with one call; return how many were taken; raise OSError if none was."""
         out, form = self._out, self._frame
         offset = 0
-        for k, (can_id, data) in enumerate(frames[:_BATCH]):
+        for k, (can_id, data) in enumerate(frames[:_BATCH_FRAMES]):
             long = len(data) > CLASSIC_BYTES
-            form.pack_into(out.view, offset, can_id, len(data), _BIT_RATE_SWITCH if long else 0, data)
+            form.pack_into(out.view, offset, can_id, len(data), BRS_FLAG if long else 0, data)
             if self._fd_frames:
                 out.vectors[k].length = _FD_FRAME.size if long else _FRAME.size
             offset += form.size

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.clock import Clock
-from canprobe.fieldbus.bus.port import (
-    Port,
-    Reports,
-)
+from canprobe.fieldbus.bus.port import Port, Reports
 from canprobe.fieldbus.bus.real.mmsg import HAS_BATCHES
 from canprobe.fieldbus.bus.real.python_can import PythonCanPort
 from canprobe.fieldbus.bus.real.socketcan import SocketCanPort
@@ -27,16 +24,16 @@ def open_port(
 
     Args:
         interface: `socketcan` for a raw socket of our own, or any of python-can's interfaces.
-        channel: the channel as that interface names it, such as `can0`.
+        channel: channel in the words of that interface, such as `can0`.
         bitrate: bit rate, bit/s; a SocketCAN interface has its own, set with `ip link`.
-        clock: a clock in real time.
+        clock: clock in real time.
         data_bitrate: bit rate of the data phase of CAN FD frames; None: classical frames only.
-        waits: wait for a full transmit queue as long as it takes; only SocketCAN can.
-        reports: receives error frames, and what the user has to know.
+        waits: whether to wait for a full transmit queue without a limit; only SocketCAN can.
+        reports: receivers of error frames and of messages for the user.
 
     Raises:
         UsageError: there is no interface of that name.
-        InterfaceError: the interface is missing, down, or cannot be opened; the message says what to do.
+        InterfaceError: the interface is missing, down, or cannot be opened; the message has the line to type.
     """
     if interface == "socketcan" and HAS_BATCHES:  # else python-can's
         return SocketCanPort(channel, clock, bitrate=bitrate, data_bitrate=data_bitrate, waits=waits, reports=reports)

@@ -1,4 +1,4 @@
-"""What a process in real time asks of its machine: priority, one processor, locked memory."""
+"""Requests of a process in real time to its machine: priority, one processor, locked memory."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ import os
 from collections.abc import Callable, Iterator
 
 NICE_VALUE = -15
-"""Nice value asked for."""
+"""Nice value that is asked for."""
 MASTER_PRIORITY = 40
 DEVICE_PRIORITY = 50
-"""SCHED_FIFO priorities. Emulated nodes come first: a real device answers whatever the master is busy with."""
+"""SCHED_FIFO priorities. Emulated nodes come first, as a real device answers whatever the master does."""
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 BLAS_THREADS = (
     "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS", "VECLIB_MAXIMUM_THREADS",
 )  # fmt: skip
-"""Variables that a BLAS reads when it is loaded. Matrices here are small: threads only wait for each other, on busy
-processors ten times as long as one thread computes."""
+"""Variables that a BLAS reads when it is loaded. Matrices here are small: several threads only wait for each other, on
+busy processors ten times as long as one thread computes."""
 
 
 def ask_for_processor() -> bool:
-    """Ask to be scheduled before ordinary processes; True where that was permitted.
+    """Ask to be scheduled before ordinary processes; return whether that was permitted.
 
-    Emulated nodes stand for devices of their own, which answer SYNC whatever the master is busy with. On one processor
-    that takes a favour, else both sides wait for each other.
+    Emulated nodes stand for devices that answer SYNC whatever the master does. On one processor they need precedence,
+    else both sides wait for each other.
     """
     with contextlib.suppress(OSError, AttributeError):
         os.setpriority(os.PRIO_PROCESS, 0, NICE_VALUE)
@@ -34,15 +34,15 @@ def ask_for_processor() -> bool:
 
 @contextlib.contextmanager
 def realtime(priority: int, say: Callable[[str], None], *, processor_from_last: int = 0) -> Iterator[None]:
-    """Within the block this process is scheduled by SCHED_FIFO, on one processor, with its memory locked.
+    """Run the block by SCHED_FIFO, on one processor, with the memory locked.
 
-    Each of the three is asked for by itself; what is not permitted is reported, with the way to it, and left out.
-    Everything is given back at the end.
+    Each of the three is asked for separately; what is not permitted is left out and reported, with what to type.
+    Everything is undone at the end.
 
     Args:
         priority: SCHED_FIFO priority, 1–99; interrupt threads of a PREEMPT_RT kernel have 50.
-        say: called with what was not permitted.
-        processor_from_last: 0 for the last processor, 1 for the one before it; no choice where there are not so many.
+        say: function that is called with what was not permitted.
+        processor_from_last: 0 for the last processor, 1 for the one before it; ignored where there are not so many.
     """
     wishes: tuple[tuple[Callable[[], Callable[[], object]], str, str], ...] = (
         (lambda: _fifo(priority), f"SCHED_FIFO priority {priority}", "run as root, or allow it: ulimit -r 50"),

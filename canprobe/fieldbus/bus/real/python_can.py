@@ -1,7 +1,7 @@
-"""A `Port` over any interface of python-can: the portable way, for adapters that SocketCAN does not drive.
+"""A `Port` over any interface of python-can, for adapters that SocketCAN does not drive.
 
 Frames are stamped with the time at which they are taken from python-can, whose own stamps differ between interfaces.
-It costs some 10 µs a frame; for SocketCAN use `canprobe.fieldbus.bus.real.socketcan`.
+A frame costs some 10 µs; for SocketCAN use `canprobe.fieldbus.bus.real.socketcan`.
 """
 
 from __future__ import annotations
@@ -28,17 +28,16 @@ from canprobe.fieldbus.bus.port import (
 )
 from canprobe.fieldbus.bus.real.echoes import Echoes
 from canprobe.fieldbus.protocol.frame_bits import FD_LENGTHS
-from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EFF_FLAG, RTR_FLAG, Frame
+from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EFF_FLAG, EFF_MASK, RTR_FLAG, Frame
 
-_EXTENDED_MASK = 0x1FFFFFFF
 _STATES = {
     can.BusState.ACTIVE: ControllerState.ACTIVE,
     can.BusState.PASSIVE: ControllerState.PASSIVE,
     can.BusState.ERROR: ControllerState.BUS_OFF,
 }
-_HEARS_ITSELF = ("udp_multicast",)
+_ECHOING_INTERFACES = ("udp_multicast",)
 """Interfaces on which python-can gives a sender its own frames back, without a mark on them."""
-_HAS_CLASSES = ("socketcan", "socketcand")
+_ERROR_CLASS_INTERFACES = ("socketcan", "socketcand")
 """Interfaces whose error frames have SocketCAN's class bits; those of others are bus errors."""
 
 
@@ -46,16 +45,16 @@ class PythonCanPort(PlainPort):
     """One python-can bus.
 
     Args:
-        interface: python-can's name of the interface, such as `virtual`, `pcan`, `slcan`.
-        channel: the channel as that interface names it.
+        interface: name of the interface in python-can, such as `virtual`, `pcan`, `slcan`.
+        channel: channel in the words of that interface.
         bitrate: bit rate, bit/s, for interfaces that set it themselves.
-        clock: the clock for waits and stamps.
+        clock: clock for waits and stamps.
         data_bitrate: bit rate of the data phase of CAN FD frames; None: classical frames only.
-        reports: receives error frames.
+        reports: receivers of error frames.
 
     Attributes:
-        counters: what has passed; `ignored` are CAN FD frames where they are not wanted.
-        state: the controller's state as of the last error frame.
+        counters: counters of the port; `ignored` counts CAN FD frames where only classical ones are wanted.
+        state: state of the controller by the last error frame.
 
     Raises:
         UsageError: python-can has no such interface.
@@ -74,19 +73,19 @@ class PythonCanPort(PlainPort):
     ) -> None:
         self._fd = data_bitrate is not None
         self._reports = reports or Reports()
-        self._has_classes = interface in _HAS_CLASSES
+        self._has_classes = interface in _ERROR_CLASS_INTERFACES
         self.clock = clock
         self.channel = channel
         self.counters = PortCounters()
         self.state = ControllerState.ACTIVE
         self._arrived: deque[can.Message] = deque()
-        self._echoes = Echoes() if interface in _HEARS_ITSELF else None
+        self._echoes = Echoes() if interface in _ECHOING_INTERFACES else None
         self._bus: can.BusABC | None = _open(interface, channel, bitrate, data_bitrate)
 
     stamps_arrival = False
 
     def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
-        """Send `frames` in order, one call of python-can each."""
+        """Send `frames` in order, each with one call of python-can."""
         bus = self._open_bus()
         for can_id, data in frames:
             message = _message(self.channel, can_id, data, self._fd)
@@ -184,7 +183,7 @@ def _open(interface: str, channel: str, bitrate: int, data_bitrate: int | None) 
         missing = interface == "udp_multicast" and importlib.util.find_spec("msgpack") is None
         way = f": {install_line('can')}" if missing else ""
         raise InterfaceError(f"{channel}: {interface} cannot be opened: {error}{way}") from error
-    except Exception as error:  # where a driver's library is missing, python-can trips over anything
+    except Exception as error:  # where the library of a driver is missing, python-can raises anything
         why = f"is its driver installed? python-can says {type(error).__name__}: {error}"
         raise InterfaceError(f"{channel}: {interface} cannot be opened; {why}") from error
 
@@ -196,7 +195,7 @@ def _message(channel: str, can_id: int, data: bytes, fd: bool) -> can.Message:
         if long and fd and len(data) not in FD_LENGTHS:
             raise ValueError(f"CAN FD has {', '.join(map(str, FD_LENGTHS))}")
         return can.Message(
-            arbitration_id=can_id & (_EXTENDED_MASK if extended else ~RTR_FLAG),
+            arbitration_id=can_id & (EFF_MASK if extended else ~RTR_FLAG),
             data=data,
             is_extended_id=extended,
             is_remote_frame=bool(can_id & RTR_FLAG),

@@ -1,8 +1,8 @@
-"""A `Port` on a SocketCAN interface, with a raw socket of its own: bursts of frames a system call, kernel time stamps.
+"""A `Port` on a SocketCAN interface with a raw socket: bursts of frames in one system call, kernel time stamps.
 
-Time stamps are those of the kernel at reception (CLOCK_REALTIME), brought to CLOCK_MONOTONIC by the difference between
-the two clocks, which is looked at again after each sending (`StampClock`): a wall clock that is set is noticed and
-counted.
+Time stamps are those of the kernel at reception (CLOCK_REALTIME), converted to CLOCK_MONOTONIC by the difference of the
+two clocks. The difference is measured again after each sending (`StampClock`), so that a wall clock that is set is
+noticed and counted.
 29-bit identifiers and remote requests are passed with `EFF_FLAG` and `RTR_FLAG`. With a data bit rate frames of more
 than 8 bytes are CAN FD frames with bit-rate switch; without it none are received.
 
@@ -21,11 +21,20 @@ import socket
 import struct
 import time
 from collections.abc import Callable, Collection, Sequence
+from operator import itemgetter
 
 from canprobe.errors import InterfaceError
 from canprobe.fieldbus.bus.clock import Clock, Timespec
 from canprobe.fieldbus.bus.port import ERR_FLAG, ControllerState, PortCounters, Reports, TimedFrame, state_after
-from canprobe.fieldbus.bus.real.link import TX_QUEUE, drop_queued, emptying_line, ip_line, setting_line, sudo
+from canprobe.fieldbus.bus.real.link import (
+    FD_MTU_BYTES,
+    TX_QUEUE_FRAMES,
+    drop_queued,
+    emptying_line,
+    ip_line,
+    setting_line,
+    sudo,
+)
 from canprobe.fieldbus.bus.real.mmsg import SO_RXQ_OVFL, SO_TIMESTAMPNS, FrameSocket, Row
 from canprobe.fieldbus.protocol.frame_bits import FD_LENGTHS
 from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EFF_FLAG, RTR_FLAG, Frame
@@ -43,32 +52,32 @@ _SO_MEMINFO, _MEMINFO, _WMEM_ALLOC = 55, struct.Struct("=9I"), 2
 _SIOCGIFFLAGS = 0x8913
 _SIOCGIFMTU = 0x8921
 _SIOCGIFTXQLEN = 0x8942
-_CANFD_MTU = 72
 _IFF_UP = 0x1
-_RECEIVE_BUFFER = 4 << 20
+_RECEIVE_BUFFER_BYTES = 4 << 20
 _RETRY_S, _LATER_RETRY_S = 200e-6, 2e-3
 _MAX_QUEUE_WAIT_NS = 10_000_000
 _REPORTED_WAIT_NS = 1_000_000_000
-"""A port that waits reports a queue that has been full for so long."""
-_STUCK_NS, _LINGER_NS = 100_000_000, 1_000_000_000
-"""How long a port that closes waits for the next queued frame to leave, and for all of them."""
-_COMPARE_NS = 1_000_000
+"""Time of a full queue after which a port that waits reports it."""
+_MAX_STUCK_NS, _MAX_LINGER_NS = 100_000_000, 1_000_000_000
+"""Longest time that a port which closes waits for the next queued frame to leave, and for all of them."""
+_COMPARISON_PERIOD_NS = 1_000_000
 """Time of stamps after which the two clocks are compared again: less than a cycle."""
 _CLOCK_READING_ERROR_NS = 50_000
-"""Difference that is none: reading both clocks takes as long in a virtual machine. No TPDO follows its SYNC sooner."""
+"""Largest difference of the clocks that counts as none: in a virtual machine it takes so long to read both clocks. No
+TPDO follows its SYNC sooner."""
 
 
 class StampClock:
     """Brings stamps of CLOCK_REALTIME to CLOCK_MONOTONIC, and notices when the wall clock was set.
 
     NTP slows down and speeds up both clocks alike, so their difference stays the same until somebody sets the wall
-    clock: chrony or ntpd after a long absence, `date`, a leap second. Two readings tell whether it is the same.
+    clock: chrony or ntpd after a long absence, `date`, a leap second. Two readings show whether it is the same.
 
     Args:
-        realtime_ns, monotonic_ns: read the clocks.
+        realtime_ns, monotonic_ns: functions that read the clocks.
 
     Attributes:
-        offset_ns: realtime minus monotonic.
+        offset_ns: realtime clock minus monotonic clock.
     """
 
     def __init__(
@@ -88,9 +97,9 @@ class StampClock:
         A stamp of a frame that came after it and is older shows by itself that the wall clock was set back.
 
         Returns:
-            By how much the wall clock was set since the last comparison, ns, negative for back; 0 where it was not.
+            The step of the wall clock since the last comparison, ns, negative for back; 0 where it was not set.
         """
-        if self._compared_ns <= oldest_ns and newest_ns < self._compared_ns + _COMPARE_NS:
+        if self._compared_ns <= oldest_ns and newest_ns < self._compared_ns + _COMPARISON_PERIOD_NS:
             return 0
         self._compared_ns = self._realtime_ns()
         if abs(self._compared_ns - self._monotonic_ns() - self.offset_ns) <= _CLOCK_READING_ERROR_NS:
@@ -103,7 +112,7 @@ class StampClock:
         return step_ns
 
     def _measure(self) -> tuple[int, int]:
-        """The difference of the clocks and what it may be off by, ns, from the quickest of three readings."""
+        """The difference of the clocks and its uncertainty, ns, from the quickest of three readings."""
         readings = []
         for _ in range(3):
             before = self._monotonic_ns()
@@ -118,20 +127,20 @@ class SocketCanPort:
     """One raw socket on one interface; it does not hear itself, but it hears every other socket of this machine.
 
     Args:
-        channel: the interface, such as `can0`.
-        clock: a clock that shows CLOCK_MONOTONIC.
-        bitrate: that the interface is to have, bit/s: for the lines to type; it is not looked at.
-        data_bitrate: send and receive CAN FD frames too; None: classical frames only.
-        waits: wait for a full queue as long as it takes, as a device does for its bus; else up to 10 ms.
-        reports: who hears of error frames, of a queue that is waited for and of frames that are left in it.
+        channel: name of the interface, such as `can0`.
+        clock: clock that shows CLOCK_MONOTONIC.
+        bitrate: bit rate that the interface should have, bit/s, for the lines to type; it is not checked.
+        data_bitrate: data bit rate of CAN FD, whose frames are then sent and received too; None: classical frames only.
+        waits: whether to wait for a full queue without a limit, as a device does for its bus; else up to 10 ms.
+        reports: receivers of error frames, and of messages on a full queue and on frames that are left in it.
 
     Attributes:
-        counters: what has passed.
-        state: the controller's state as of the last error frame; ACTIVE before the first.
+        counters: counters of the port.
+        state: state of the controller by the last error frame; ACTIVE before the first.
 
     Raises:
-        InterfaceError: the interface is missing, down, no CAN interface, or not set up for CAN FD; with the line to
-            type.
+        InterfaceError: the interface is missing, down, no CAN interface, or not set up for CAN FD; the message has the
+            line to type.
     """
 
     def __init__(
@@ -169,7 +178,7 @@ class SocketCanPort:
 
     @property
     def descriptor(self) -> int:
-        """The socket; it is not readable for frames that wake nobody (`defer`)."""
+        """Descriptor of the socket; frames that wake nobody (`defer`) do not make it readable."""
         self._check_open()
         return self._socket.fileno()
 
@@ -177,10 +186,10 @@ class SocketCanPort:
         """Send `frames` in order; a full queue is waited for.
 
         Raises:
-            InterfaceError: the queue stays full, the interface is down or gone, or a frame is none.
+            InterfaceError: the queue stays full, the interface is down or gone, or a frame is impossible on it.
         """
         self._check_open()
-        self._stamps.doubt()  # no answer may seem to be older than what it answers
+        self._stamps.doubt()  # no answer may seem older than its question
         for can_id, data in frames:
             long = len(data) > CLASSIC_BYTES and not (self._fd and len(data) in FD_LENGTHS)
             if long or (can_id > 0x7FF and can_id < ERR_FLAG):
@@ -217,7 +226,7 @@ class SocketCanPort:
         if step_ns := self._stamps.follow(min(stamps), max(stamps)):
             rows = self._stamped_anew(rows, step_ns)
         if self._patient_frames is not None:
-            rows = sorted(rows, key=_stamp)
+            rows = sorted(rows, key=itemgetter(2))  # by stamp
         offset_ns = self._stamps.offset_ns
         frames = [(can_id, data, t_ns - offset_ns) for can_id, data, t_ns, _ in rows if not can_id & ERR_FLAG]
         if len(frames) < len(rows):
@@ -233,7 +242,7 @@ class SocketCanPort:
                 return
 
     def wait_and_drain(self, until_ns: int) -> list[TimedFrame]:
-        """As `wait` and `drain`, with one system call where they take three. It waits 2 ms, whatever `until_ns` is."""
+        """Do `wait` and `drain` with one system call instead of three. It waits 2 ms, whatever `until_ns` is."""
         self._check_open()
         if not self._blocks:
             self._socket.setblocking(True)
@@ -292,17 +301,17 @@ class SocketCanPort:
                 self._patient.close()
 
     def _await_empty(self) -> bool:
-        """Wait while the queue empties; whether it is empty."""
+        """Wait while the queue empties; return whether it is empty."""
         now_ns = self.clock.now_ns()
-        end_ns, moved_ns, left = now_ns + _LINGER_NS, now_ns, self._queued_bytes()
-        while left and self.clock.now_ns() < min(end_ns, moved_ns + _STUCK_NS):
+        end_ns, moved_ns, left = now_ns + _MAX_LINGER_NS, now_ns, self._queued_bytes()
+        while left and self.clock.now_ns() < min(end_ns, moved_ns + _MAX_STUCK_NS):
             time.sleep(_LATER_RETRY_S)
             if (still := self._queued_bytes()) != left:
                 left, moved_ns = still, self.clock.now_ns()
         return not left
 
     def _queued_bytes(self) -> int:
-        """Memory of this socket's frames that the driver has not taken yet."""
+        """Number of bytes of this socket's frames that the driver has not taken yet."""
         numbers = self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)
         return int(_MEMINFO.unpack(numbers)[_WMEM_ALLOC])
 
@@ -329,16 +338,16 @@ class SocketCanPort:
         return f"{self.channel}: {what} stays full, as nobody acknowledges or the bus is overloaded"
 
     def _longer_queue(self, error: OSError) -> str:
-        """What to type where it is the interface's queue that is full, and short."""
+        """What to type where the queue of the interface is full and short; else empty."""
         if error.errno != errno.ENOBUFS:
             return ""
         try:
             length = struct.unpack("=16si12x", fcntl.ioctl(self._socket, _SIOCGIFTXQLEN, _ifreq(self.channel)))[1]
         except OSError:  # the interface has gone meanwhile
             return ""
-        if length >= TX_QUEUE:
+        if length >= TX_QUEUE_FRAMES:
             return ""
-        return f"; it holds {length} frames; type: {ip_line(f'{self.channel} txqueuelen {TX_QUEUE}')}"
+        return f"; it holds {length} frames; type: {ip_line(f'{self.channel} txqueuelen {TX_QUEUE_FRAMES}')}"
 
     def _failed(self, error: OSError) -> InterfaceError:
         if error.errno == errno.ENETDOWN:
@@ -351,10 +360,10 @@ class SocketCanPort:
         self.counters.overruns += dropped
 
     def _stamped_anew(self, rows: Sequence[Row], step_ns: int) -> list[Row]:
-        """The wall clock was set: some of these frames came before that and some after it, all of them until now.
+        """Stamp frames anew after the wall clock was set; some came before that, some after it, all of them until now.
 
-        Of both times that a stamp may mean the later one that is no future is taken: it is right, or late by less than
-        the step, and no frame is older than it is.
+        A stamp may mean two times. The later one that is not in the future is taken: it is right, or late by less than
+        the step, and no frame gets older than it is.
         """
         self.counters.clock_steps += 1
         if self.counters.clock_steps == 1:
@@ -376,7 +385,7 @@ class SocketCanPort:
 
 
 def has_socketcan() -> bool:
-    """Return whether this kernel (and this Python) has SocketCAN; loads the module if it is allowed to."""
+    """Return whether this kernel and this Python have SocketCAN; load the module if that is allowed."""
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except (AttributeError, OSError):
@@ -388,11 +397,11 @@ def check_interface(channel: str, setting: str | None = None) -> None:
     """Return if `channel` is a CAN interface that is up.
 
     Args:
-        channel: its name.
-        setting: the line that sets it up; None where it needs no setting.
+        channel: name of the interface.
+        setting: line to type that sets it up; None where it needs no setting.
 
     Raises:
-        InterfaceError: it is not, with the line to type.
+        InterfaceError: the interface is missing, down or no CAN interface; the message has the line to type.
     """
     if not has_socketcan():
         raise InterfaceError(
@@ -414,13 +423,13 @@ def check_interface(channel: str, setting: str | None = None) -> None:
 
 
 def _check_fd(channel: str, setting: str) -> None:
-    """Return if the interface carries CAN FD frames."""
+    """Return if the interface carries CAN FD frames; else raise InterfaceError."""
     with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as probe:
         try:
             mtu = struct.unpack("=16si12x", fcntl.ioctl(probe, _SIOCGIFMTU, _ifreq(channel)))[1]
         except OSError as error:
             raise InterfaceError(f"{channel}: no such interface; {_how_to_make(channel)}") from error
-    if mtu < _CANFD_MTU:
+    if mtu < FD_MTU_BYTES:
         raise InterfaceError(f"{channel}: not set up for CAN FD; type: {setting}")
 
 
@@ -465,15 +474,11 @@ def _packed(filters: Sequence[tuple[int, int]]) -> bytes:
     return b"".join(struct.pack("=II", can_id, mask) for can_id, mask in filters)
 
 
-def _stamp(row: Row) -> int:
-    return row[2]
-
-
 def _enlarge_buffer(sock: socket.socket) -> None:
     try:
-        sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _RECEIVE_BUFFER)
+        sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _RECEIVE_BUFFER_BYTES)
     except PermissionError:  # needs CAP_NET_ADMIN; without it the kernel caps the size at net.core.rmem_max
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_BYTES)
 
 
 class _PollFd(ctypes.Structure):

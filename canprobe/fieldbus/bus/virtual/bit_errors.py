@@ -1,4 +1,4 @@
-"""Where the wire of a timed bus fails. A model is asked once for every transmission; one seed, always the same bits."""
+"""Bit errors on the wire of a timed bus. A model is asked once for each transmission; one seed gives the same bits."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import random
 from collections.abc import Callable
 
 WireErrors = Callable[[int, bytes, int], int | None]
-"""Called with (can_id, data, bits) of a frame that starts: which of its bits is hit, from 0, or None."""
+"""Called with (can_id, data, bits) of a frame that starts; returns the bit that is hit, counted from 0, or None."""
 
 
 class BitErrors:
-    """Bits fail independently of each other, every one with the same probability.
+    """Errors of bits that fail independently of each other, each with the same probability.
 
     Args:
         rate: bit error rate, 0..1; 1e-7 in an industrial hall, 3e-5 next to a welder (Ferreira et al. 2004).
-        seed: of the sequence.
+        seed: seed of the sequence.
     """
 
     def __init__(self, rate: float, seed: int) -> None:
@@ -26,7 +26,7 @@ class BitErrors:
         self._left = self._gap()
 
     def __call__(self, can_id: int, data: bytes, bits: int) -> int | None:
-        """The first bit of this frame that is hit."""
+        """Number of the first bit of this frame that is hit, or None."""
         if self._left >= bits:
             self._left -= bits
             return None
@@ -34,5 +34,5 @@ class BitErrors:
         return hit
 
     def _gap(self) -> float:
-        """Good bits before the next bad one."""
+        """Number of good bits before the next bad one."""
         return math.floor(math.log(1.0 - self._random.random()) / self._log) if self._log else math.inf

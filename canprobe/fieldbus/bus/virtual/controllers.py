@@ -1,4 +1,4 @@
-"""The CAN controllers on one timed bus: which have to wait, which are bus off, and when they come back."""
+"""CAN controllers on one timed bus: which have to wait, which are bus off, and when they come back."""
 
 from __future__ import annotations
 
@@ -9,21 +9,20 @@ from canprobe.fieldbus.bus.virtual.error_counters import ErrorCounters
 from canprobe.fieldbus.bus.virtual.lockstep import Attachment, LockstepPort
 from canprobe.fieldbus.protocol.frame_bits import INTERMISSION_BITS, SUSPEND_BITS
 
-_RECESSIVE_BITS = 11
-_AFTER_ACK_BITS = (
-    8  # recessive bits before a frame's or an error frame's end: ACK delimiter and end of frame, delimiter
-)
+_RECOVERY_BITS = 11
+_AFTER_ACK_BITS = 8
+"""Recessive bits at the end of a frame (ACK delimiter, end of frame) and of an error frame (delimiter)."""
 
 
 class Controllers:
-    """Error counters of every node, and what follows from them. They matter only once a bit has failed.
+    """Error counters of every node, and their consequences. They matter only once a bit has failed.
 
     Args:
-        bits_ns: time of so many bits.
+        bits_ns: function that gives the time of so many bits.
 
     Attributes:
-        troubled: a controller's counters are not 0.
-        suspended: error-passive nodes that must not start before this time after a frame of their own.
+        troubled: whether a counter is not 0.
+        suspended: times before which error-passive nodes must not send again after a frame of their own.
     """
 
     def __init__(self, bits_ns: Callable[[int], int]) -> None:
@@ -34,19 +33,19 @@ class Controllers:
         self._quiet_ns = 0  # since when the wire has been recessive, less what was counted of it
 
     def add(self, node: Attachment) -> None:
-        """A new node."""
+        """Add a node."""
         self._counters[node] = ErrorCounters()
 
     def remove(self, node: Attachment) -> None:
-        """A node that leaves."""
+        """Remove a node."""
         self.suspended.pop(node, None)
         del self._counters[node]
 
     def of(self, owner: object) -> ErrorCounters:
-        """Counters of a participant or a port.
+        """Error counters of a participant or a port.
 
         Raises:
-            KeyError: it is not on the bus.
+            KeyError: the owner is not on the bus.
         """
         for node, counters in self._counters.items():
             if node.owner is owner:
@@ -54,7 +53,7 @@ class Controllers:
         raise KeyError(owner)
 
     def is_off(self, node: Attachment) -> bool:
-        """It is bus off: it neither sends nor hears."""
+        """Whether a node is bus off: it neither sends nor hears."""
         return self.troubled and bool(self._counters[node].outstanding)
 
     def off(self) -> list[Attachment]:
@@ -62,7 +61,7 @@ class Controllers:
         return [node for node, counters in self._counters.items() if counters.outstanding]
 
     def fail(self, sender: Attachment, end_ns: int) -> None:
-        """An error frame has ended at `end_ns`; everybody saw it."""
+        """Count an error frame that ended at `end_ns`, which all controllers saw."""
         self.troubled = True
         self._quiet_ns = end_ns - self._bits_ns(_AFTER_ACK_BITS)
         for node, counters in self._counters.items():
@@ -76,7 +75,7 @@ class Controllers:
         self._show_states()
 
     def succeed(self, sender: Attachment, end_ns: int) -> None:
-        """A frame has ended at `end_ns`; only of interest while a controller is troubled."""
+        """Count a frame that ended at `end_ns`; this is only needed while a counter is not 0."""
         self._quiet_ns = end_ns - self._bits_ns(_AFTER_ACK_BITS)
         for node, counters in self._counters.items():
             if node is sender:
@@ -88,27 +87,27 @@ class Controllers:
         self.troubled = any(c.transmit or c.receive or c.outstanding for c in self._counters.values())
 
     def hear_silence(self, until_ns: int) -> None:
-        """The wire has been recessive until now: nodes that are bus off count sequences of eleven such bits."""
-        sequence = self._bits_ns(_RECESSIVE_BITS)
+        """Let nodes that are bus off count sequences of eleven recessive bits; the wire was silent until now."""
+        sequence = self._bits_ns(_RECOVERY_BITS)
         count = (until_ns - self._quiet_ns) // sequence
         self._quiet_ns += count * sequence
         if any([counters.heard_recessive(count) for counters in self._counters.values()]):
             self._show_states()
 
     def next_return_ns(self) -> int | None:
-        """When the next node that is bus off comes back, if the wire stays silent."""
+        """Time at which the next node that is bus off comes back, if the wire stays silent."""
         least = min((c.outstanding for c in self._counters.values() if c.outstanding), default=None)
-        return None if least is None else self._quiet_ns + least * self._bits_ns(_RECESSIVE_BITS)
+        return None if least is None else self._quiet_ns + least * self._bits_ns(_RECOVERY_BITS)
 
     def _suspend(self, sender: Attachment, end_ns: int) -> None:
-        """After its own frame an error-passive node waits for eight bits more."""
+        """Let an error-passive node wait for eight more bits after its own frame."""
         if self._counters[sender].state is ControllerState.PASSIVE:
             self.suspended[sender] = end_ns + self._bits_ns(INTERMISSION_BITS + SUSPEND_BITS)
         else:
             self.suspended.pop(sender, None)
 
     def _show_states(self) -> None:
-        """Ports show the state of their controller."""
+        """Give each port the state of its controller."""
         for node, counters in self._counters.items():
             if isinstance(node.owner, LockstepPort):
                 node.owner.state = counters.state

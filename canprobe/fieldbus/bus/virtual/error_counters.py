@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 from canprobe.fieldbus.bus.port import ControllerState
 
-PASSIVE_FROM = 128
-WARNING_FROM = 96
-BUS_OFF_FROM = 256
-RECOVERIES = 128
+MIN_PASSIVE_COUNT = 128
+MIN_WARNING_COUNT = 96
+MIN_BUS_OFF_COUNT = 256
+RECOVERY_SEQUENCES = 128
 """Sequences of eleven recessive bits that a controller has to hear while it is bus off."""
 
 
@@ -21,10 +21,10 @@ class ErrorCounters:
     """Counters of one controller.
 
     Attributes:
-        transmit: TEC.
-        receive: REC.
-        bus_offs: how often it went bus off.
-        outstanding: sequences of eleven recessive bits until it comes back; 0 where it is not bus off.
+        transmit: transmit error counter (TEC).
+        receive: receive error counter (REC).
+        bus_offs: number of times that the controller went bus off.
+        outstanding: number of sequences of eleven recessive bits until it comes back; 0 where it is not bus off.
     """
 
     transmit: int = 0
@@ -34,46 +34,46 @@ class ErrorCounters:
 
     @property
     def state(self) -> ControllerState:
-        """What the counters make of the controller."""
+        """Error state of the controller by its counters."""
         if self.outstanding:
             return ControllerState.BUS_OFF
         worst = max(self.transmit, self.receive)
-        if worst >= PASSIVE_FROM:
+        if worst >= MIN_PASSIVE_COUNT:
             return ControllerState.PASSIVE
-        return ControllerState.WARNING if worst >= WARNING_FROM else ControllerState.ACTIVE
+        return ControllerState.WARNING if worst >= MIN_WARNING_COUNT else ControllerState.ACTIVE
 
     def transmit_error(self, *, acknowledge: bool = False) -> None:
-        """It sent an error flag as the transmitter.
+        """Count an error flag that the controller sent as the transmitter.
 
         Args:
-            acknowledge: the acknowledgement was missing and no other node sent an error flag. An error-passive node
-                does not count that, so that a node alone on its bus never goes bus off.
+            acknowledge: whether the acknowledgement was missing and no other node sent an error flag. An error-passive
+                node does not count that, so that a node alone on its bus never goes bus off.
         """
         if acknowledge and self.state is ControllerState.PASSIVE:
             return
         self.transmit += 8
-        if self.transmit >= BUS_OFF_FROM:
+        if self.transmit >= MIN_BUS_OFF_COUNT:
             self.bus_offs += 1
-            self.outstanding = RECOVERIES
+            self.outstanding = RECOVERY_SEQUENCES
 
     def receive_error(self) -> None:
-        """It saw an error as a receiver."""
+        """Count an error that the controller saw as a receiver."""
         if not self.outstanding:
             self.receive += 1
 
     def transmitted(self) -> None:
-        """It sent a frame without an error."""
+        """Count a frame that was sent without an error."""
         self.transmit = max(0, self.transmit - 1)
 
     def received(self) -> None:
-        """It received a frame without an error."""
-        if self.receive >= PASSIVE_FROM:
-            self.receive = PASSIVE_FROM - 1  # the standard leaves 119 to 127
+        """Count a frame that was received without an error."""
+        if self.receive >= MIN_PASSIVE_COUNT:
+            self.receive = MIN_PASSIVE_COUNT - 1  # the standard allows 119 to 127
         elif self.receive:
             self.receive -= 1
 
     def heard_recessive(self, sequences: int) -> bool:
-        """It heard so many sequences of eleven recessive bits; whether it is active again, with both counters at 0."""
+        """Count sequences of eleven recessive bits; return whether the controller came back, with both counters 0."""
         if not self.outstanding:
             return False
         self.outstanding = max(0, self.outstanding - sequences)

@@ -1,11 +1,11 @@
 """A CAN bus inside one process and one thread, in virtual time: deterministic, and as fast as the processor.
 
-Each participant and each port has one outgoing queue. At one instant the bus first lets everybody speak whose deadline
-has come, then carries the frames one by one: of the heads of all queues the one that wins the arbitration, so lowest
-identifier first, first in first out for each sender, ties by order of attachment. Nobody receives what it sent. Answers
-join at the same instant, until nobody has anything to send. A frame takes no time on the wire.
+Each participant and each port has one outgoing queue. At one instant the bus first serves everybody whose deadline has
+come, then carries the frames one by one. Of the heads of all queues it takes the one that wins the arbitration: the
+lowest identifier first, each sender's frames in their order, ties by order of attachment. No participant receives what
+it sent. Answers join at the same instant, until nothing is left to send. A frame takes no time on the wire.
 
-A deadline that a reception moves to the present is served when the frames already waiting have gone.
+A deadline that a reception moves to the present is served after the frames that already wait.
 """
 
 from __future__ import annotations
@@ -18,45 +18,45 @@ from canprobe.errors import BusError, InterfaceError
 from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.port import ControllerState, PlainPort, PortCounters, TimedFrame
 from canprobe.fieldbus.protocol.frame_bits import FD_LENGTHS
-from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EFF_FLAG, RTR_FLAG, Frame
+from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EFF_FLAG, EFF_MASK, RTR_FLAG, Frame
 
 Recorder = Callable[[int, bytes, int], None]
 """Called with (can_id, data, t_ns)."""
 
 
-EVERY_ID = range(1 << 32)
+ALL_IDS = range(1 << 32)
 
 
 class Participant:
-    """What lives on an emulated bus, as a function of frames and time. The base class hears all and sends nothing.
+    """A device on an emulated bus, as a function of frames and time. The base class hears all and sends nothing.
 
     The bus sends what `start`, `receive` and `advance` return, in that order.
 
     Attributes:
-        hears_every_sync: also a SYNC that a served bus leaves unanswered, because the next one has come already.
+        hears_every_sync: whether it also gets a SYNC that a served bus leaves unanswered because the next one has come.
     """
 
     hears_every_sync = False
 
     @property
     def name(self) -> str:
-        """For messages."""
+        """Name of the participant in messages."""
         return type(self).__name__
 
     @property
     def kind(self) -> type:
-        """On a served bus participants of one kind answer a SYNC before those of the next kind hear it."""
+        """Kind of device; on a served bus those of one kind answer a SYNC before those of the next kind hear it."""
         return type(self)
 
     @property
     def next_deadline_ns(self) -> int | None:
-        """When `advance` has to be called next, `None` if only a frame can wake it."""
+        """Time of the next call of `advance`; `None` if only a frame can wake it."""
         return None
 
     @property
     def listens(self) -> Container[int]:
-        """The identifiers that it takes at present; the bus spares it the others."""
-        return EVERY_ID
+        """Identifiers that it takes at present; the bus gives it no others."""
+        return ALL_IDS
 
     @property
     def patient(self) -> frozenset[int]:
@@ -64,7 +64,7 @@ class Participant:
         return frozenset()
 
     def connect(self, rerouted: Callable[[], None]) -> None:
-        """Before `start`: `rerouted` is to be called whenever `listens` or `patient` has changed."""
+        """Take the function to call whenever `listens` or `patient` has changed; called before `start`."""
 
     def start(self, t_ns: int) -> Sequence[Frame]:
         """Power on at `t_ns`."""
@@ -83,7 +83,7 @@ Listener = tuple[Callable[[int, bytes, int], Sequence[Frame]], "Attachment"]
 
 
 class Attachment:
-    """The bus's view of one sender: its queue, and where its frames go."""
+    """One sender as the bus sees it: its queue, and the receivers of its frames."""
 
     __slots__ = ("due", "listeners", "order", "outbox", "owner")
 
@@ -92,17 +92,17 @@ class Attachment:
         self.order = order
         self.outbox: deque[Frame] = deque()
         self.due: int | None = None  # the owner's deadline, as last seen
-        self.listeners: dict[int, tuple[Listener, ...]] = {}  # of an identifier, found once until somebody reroutes
+        self.listeners: dict[int, tuple[Listener, ...]] = {}  # by identifier, found once until a participant reroutes
 
 
 class LockstepBus:
-    """The bus itself. It drives its clock: every wait on the clock runs the participants up to then.
+    """The bus. It drives its clock: every wait on the clock runs the participants up to then.
 
     Args:
-        clock: virtual time, possibly shared with other buses.
-        channel: the bus's name in messages and logs.
-        max_frames: frames at one instant above which the participants are taken to answer each other for ever.
-        fd: frames of up to 64 bytes are carried too.
+        clock: virtual clock, which other buses may share.
+        channel: name of the bus in messages and logs.
+        max_frames: most frames at one instant; more mean that the participants answer each other without an end.
+        fd: whether frames of up to 64 bytes are carried too.
     """
 
     def __init__(
@@ -121,14 +121,14 @@ class LockstepBus:
         clock.attach(self)
 
     def attach(self, participant: Participant) -> None:
-        """Put `participant` on the bus and start it; what it sends is carried when time moves or a port is used."""
+        """Put `participant` on the bus and start it; its frames are carried when time moves or a port is used."""
         node = self._add(participant)
         participant.connect(self._forget_listeners)
         self._queue(node, participant.start(self.clock.now_ns()))
         node.due = participant.next_deadline_ns
 
     def detach(self, participant: Participant) -> None:
-        """Cut `participant` off; frames that it had queued are lost."""
+        """Take `participant` off the bus; frames that it had queued are lost."""
         self._remove(participant)
 
     def port(self) -> LockstepPort:
@@ -152,7 +152,7 @@ class LockstepBus:
         """Carry everything due at the present instant.
 
         Raises:
-            BusError: the participants keep answering without an end.
+            BusError: the participants answer each other without an end.
         """
         if self._settling:
             return
@@ -172,7 +172,7 @@ class LockstepBus:
         """Carry everything due up to and including `until_ns`.
 
         Raises:
-            BusError: the participants keep answering without an end.
+            BusError: the participants answer each other without an end.
         """
         while (due := self.next_deadline_ns()) is not None and due <= until_ns:
             self.clock.move_ns(due)
@@ -220,7 +220,7 @@ class LockstepBus:
         return sender, frame
 
     def _hand_over(self, sender: Attachment, can_id: int, data: bytes, t_ns: int) -> None:
-        """Everybody hears a frame but its sender; the answers are queued."""
+        """Give a frame to everybody but its sender; queue the answers."""
         for receive, receiver in self._listeners_of(sender, can_id):
             answers = receive(can_id, data, t_ns)
             receiver.due = receiver.owner.next_deadline_ns
@@ -282,11 +282,10 @@ class LockstepBus:
 
 
 class LockstepPort(Participant, PlainPort):
-    """A master's `Port` on a `LockstepBus`; see there for the order of frames.
+    """A master's `Port` on a `LockstepBus`, whose module gives the order of frames.
 
     Attributes:
-        state: error state of the controller; a timed bus with bit errors sets it
-        (`canprobe.fieldbus.bus.virtual.controllers`).
+        state: error state of the controller; a timed bus with bit errors sets it (`controllers`).
     """
 
     node: Attachment
@@ -301,12 +300,12 @@ class LockstepPort(Participant, PlainPort):
 
     @property
     def clock(self) -> VirtualClock:
-        """The bus's virtual clock."""
+        """Virtual clock of the bus."""
         return self._bus.clock
 
     @property
     def channel(self) -> str:
-        """The bus's name."""
+        """Name of the bus."""
         return self._bus.channel
 
     stamps_arrival = True
@@ -351,11 +350,11 @@ class LockstepPort(Participant, PlainPort):
 
 
 def arbitration_key(can_id: int) -> int:
-    """Return the bits in the order in which the wire arbitrates them: the lowest value wins (ISO 11898-1)."""
+    """Return the identifier's bits in the order of arbitration: the lowest value wins (ISO 11898-1)."""
     if can_id <= 0x7FF:
         return can_id << 21
     remote = 1 if can_id & RTR_FLAG else 0
     if can_id & EFF_FLAG:
-        can_id &= 0x1FFFFFFF
+        can_id &= EFF_MASK
         return (can_id >> 18) << 21 | 0b11 << 19 | (can_id & 0x3FFFF) << 1 | remote
     return (can_id & 0x7FF) << 21 | remote << 20

@@ -1,13 +1,13 @@
 """A lockstep bus with a bit rate: one frame at a time, each as long as its bits, the lowest identifier first.
 
-A frame that was queued while another is on the wire waits for its end; whoever has the lowest identifier when the bus
-is free again sends, to the end. Receivers get a frame with the last bit of its end-of-frame field; the next may follow
-after three bits of intermission. A frame that the wire corrupts ends in an error frame and is sent again; every
-controller counts errors as ISO 11898-1 has it, waits as an error-passive transmitter, and is cut off when it is bus off
-until it has heard 128 times eleven recessive bits.
+A frame that is queued while another is on the wire waits for its end; then the frame with the lowest identifier is sent
+to its end. Receivers get a frame with the last bit of its end-of-frame field; the next may follow after three bits of
+intermission. A frame that the wire corrupts ends in an error frame and is sent again. Every controller counts errors by
+ISO 11898-1; it waits as an error-passive transmitter, and is off the bus from bus off until it has heard 128 times
+eleven recessive bits.
 
-All of it in virtual time and deterministic, like the `LockstepBus`. Which of its frames a node sends first is its
-controller's: with `queue="priority"` the lowest identifier, as from mailboxes; with "fifo" the oldest.
+All of it runs in virtual time and is deterministic, as on a `LockstepBus`. The controller decides which of its frames a
+node sends first: with `queue="priority"` that of the lowest identifier, as from mailboxes; with "fifo" the oldest.
 """
 
 from __future__ import annotations
@@ -24,32 +24,33 @@ from canprobe.fieldbus.bus.virtual.error_counters import ErrorCounters
 from canprobe.fieldbus.bus.virtual.lockstep import Attachment, LockstepBus, LockstepPort, Participant, arbitration_key
 from canprobe.fieldbus.protocol.frame_bits import ERROR_DELIMITER_BITS, ERROR_FLAG_BITS, INTERMISSION_BITS, exact_bits
 from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, Frame
+from canprobe.fieldbus.protocol.response_times import NS_PER_S
 
 Queue = Literal["priority", "fifo"]
 MAX_CLOSING_NS = 50_000_000
-"""How long a port that closes lets the bus carry what is queued, at most."""
-_NS = 1_000_000_000
-_ERROR_BITS = 2 * ERROR_FLAG_BITS + ERROR_DELIMITER_BITS  # the others answer the flag of the first with theirs
+"""Longest time that a port which closes lets the bus carry what is queued."""
+_ERROR_BITS = 2 * ERROR_FLAG_BITS + ERROR_DELIMITER_BITS  # the other nodes answer the flag of the first one with theirs
 
 _Entry = tuple[int, int, Attachment, Frame]
-"""A frame that takes part in the arbitration: what the wire compares, order of queueing, sender, frame."""
+"""A frame in the arbitration: bits that the wire compares, order of queueing, sender, frame."""
 
 
 class TimedBus(LockstepBus):
-    """The bus itself; attach participants and take ports as of a `LockstepBus`.
+    """The bus; participants attach and ports are taken as on a `LockstepBus`.
 
     Args:
-        clock: virtual time, possibly shared with other buses.
-        channel: the bus's name in messages and logs.
-        bitrate: bit/s.
-        queue: what a node with several frames sends first.
-        errors: where the wire fails; None: nowhere.
-        length: bits of a frame with its intermission, exact by default.
-        max_frames: frames that may wait at once before somebody is taken to send for ever.
+        clock: virtual clock, which other buses may share.
+        channel: name of the bus in messages and logs.
+        bitrate: bit rate, bit/s.
+        queue: order in which a node with several frames sends them.
+        errors: model of the errors on the wire; None: there are none.
+        length: function for the bits of a frame with its intermission, exact by default.
+        max_frames: most frames that may wait at once; more mean that somebody sends without an end.
 
     Attributes:
-        errors: as above; another model may take its place while the bus runs.
-        frames, error_frames, busy_ns: so far; the time includes intermissions.
+        errors: model of the errors; another one may take its place while the bus runs.
+        frames, error_frames: number of frames and error frames so far.
+        busy_ns: time so far in which the bus was busy, with intermissions.
     """
 
     def __init__(
@@ -65,38 +66,34 @@ class TimedBus(LockstepBus):
     ) -> None:
         super().__init__(clock, channel, max_frames=max_frames)
         self.bitrate = bitrate
-        self._bit_ns = 0 if _NS % bitrate else _NS // bitrate  # 0: no whole number
+        self._bit_ns = 0 if NS_PER_S % bitrate else NS_PER_S // bitrate  # 0: no whole number
         self._gap_ns = self._bits_ns(INTERMISSION_BITS)
         self.frames = self.error_frames = self.busy_ns = 0
         self._fifo = queue == "fifo"
         self.errors = errors
         self._length = length
-        self._ready: list[_Entry] = []  # a heap
+        self._ready: list[_Entry] = []  # heap of the frames that wait
         self._order = 0
         self._flying: _Entry | None = None
         self._hit = False
         self._end_ns = self._free_ns = 0
-        self._since_ns = 0  # when the first of those who are ready queued its frame
+        self._since_ns = 0  # time at which the first of the waiting frames was queued
         self._controllers = Controllers(self._bits_ns)
         self._stale = True  # the participants' deadlines have to be read again
         self._first_due: int | None = None
-
-    # what is to be seen
 
     def counters(self, owner: Participant) -> ErrorCounters:
         """Error counters of a participant or a port.
 
         Raises:
-            KeyError: it is not on the bus.
+            KeyError: the owner is not on the bus.
         """
         if self._flying is None:
             self._controllers.hear_silence(self.clock.now_ns())
         return self._controllers.of(owner)
 
-    # time
-
     def next_deadline_ns(self) -> int | None:
-        """Return when the wire or a participant next has something to do."""
+        """Return the time at which the wire or a participant next has something to do."""
         if self._stale or (self._flying is None and not self._ready):
             self._first_due = super().next_deadline_ns()
             self._stale = False
@@ -145,13 +142,13 @@ class TimedBus(LockstepBus):
         """Do everything due up to and including `until_ns`: in one pass while no bit can fail, else instant by instant.
 
         Raises:
-            BusError: a participant's deadline never moves on, or more frames wait than may.
+            BusError: the deadline of a participant never moves on, or too many frames wait.
         """
         if len(self._nodes) < 2 or self._settling or self._controllers.troubled or not self._glide(until_ns):
             super().run_until_ns(until_ns)
 
     def _glide(self, until_ns: int) -> bool:
-        """Frame after frame without errors, in the order of `settle`; False where errors came up before the end."""
+        """Carry frames without errors, in the order of `settle`; return False where errors come before the end."""
         self._first_due = super().next_deadline_ns()
         self._stale, self._settling = False, True
         move_ns, controllers, length = self.clock.move_ns, self._controllers, self._length
@@ -162,7 +159,7 @@ class TimedBus(LockstepBus):
                 if entry is None and self._ready:
                     start = self._free_ns if self._free_ns > self._since_ns else self._since_ns
                     if start <= until_ns and (due is None or start < due):
-                        entry, self._hit = heappop(self._ready), False  # as `_fly`, of every frame
+                        entry, self._hit = heappop(self._ready), False  # inlined `_fly`, for speed
                         bits = length(*entry[3]) - INTERMISSION_BITS
                         self._end_ns = end_ns = start + (bits * bit_ns or self._bits_ns(bits))
                         self._free_ns = end_ns + gap_ns
@@ -185,7 +182,7 @@ class TimedBus(LockstepBus):
             self._settling = False
 
     def _serve(self, due_ns: int) -> None:
-        """Let everybody speak whose deadline has come."""
+        """Serve everybody whose deadline has come."""
         self.clock.move_ns(due_ns)
         t_ns = self.clock.now_ns()
         for _ in range(self._max_frames):
@@ -196,7 +193,7 @@ class TimedBus(LockstepBus):
         raise self._endless(t_ns, "deadlines that never move on, of " + self._names_due(t_ns))
 
     def send(self, node: Attachment, frames: Sequence[Frame]) -> None:
-        """Queue the frames of a port; they go when the bus is free and theirs is the lowest identifier."""
+        """Queue the frames of a port; each is sent when the bus is free and its identifier is the lowest."""
         self._stale = True
         self._queue(node, frames)
         self.settle()
@@ -206,13 +203,11 @@ class TimedBus(LockstepBus):
         return min(dues) if dues else None
 
     def _bits_ns(self, bits: int) -> int:
-        return bits * self._bit_ns if self._bit_ns else -(-bits * _NS // self.bitrate)
-
-    # queues and arbitration
+        return bits * self._bit_ns if self._bit_ns else -(-bits * NS_PER_S // self.bitrate)
 
     def _queue(self, node: Attachment, frames: Sequence[Frame]) -> None:
         if not frames or (self._controllers.troubled and self._controllers.is_off(node)):
-            return  # a controller that is bus off takes no part
+            return  # a controller that is bus off sends nothing
         for frame in frames:
             if len(frame[1]) > CLASSIC_BYTES:
                 self._check(node, frame)
@@ -241,7 +236,7 @@ class TimedBus(LockstepBus):
         self._order = order
 
     def _start(self, t_ns: int) -> bool:
-        """Let the winner of the arbitration send; False where all who want to have to wait."""
+        """Let the winner of the arbitration send; return False where all nodes with a frame have to wait."""
         entry = self._winner(t_ns) if self._controllers.suspended else heappop(self._ready)
         if entry is None:
             return False
@@ -251,7 +246,7 @@ class TimedBus(LockstepBus):
             self._controllers.hear_silence(t_ns)
         hit = None if self.errors is None else self.errors(can_id, data, bits)
         if len(self._nodes) < 2:
-            hit = bits - 9  # the slot in which nobody acknowledges it
+            hit = bits - 9  # the ACK slot, in which nobody acknowledges it
         if hit is not None:
             bits = hit + 1 + _ERROR_BITS
         self._fly(entry, t_ns, t_ns + self._bits_ns(bits))
@@ -266,7 +261,7 @@ class TimedBus(LockstepBus):
         self.busy_ns += self._free_ns - start_ns
 
     def _winner(self, t_ns: int) -> _Entry | None:
-        """The winner among those who do not have to wait after a frame of their own."""
+        """Winner among the nodes that do not have to wait after a frame of their own."""
         waiting = []
         found = None
         while self._ready and found is None:
@@ -280,16 +275,14 @@ class TimedBus(LockstepBus):
         return found
 
     def _next_start(self) -> int:
-        """When the next frame can start."""
+        """Time at which the next frame can start."""
         start = self._free_ns if self._free_ns > self._since_ns else self._since_ns
         if self._controllers.suspended:
             start = max(start, min(self._controllers.suspended.get(entry[2], 0) for entry in self._ready))
         return start
 
-    # the end of a frame
-
     def _finish(self) -> None:
-        """End what is on the wire: deliver it, or count its error and let it compete again."""
+        """End the frame on the wire: deliver it, or count its error and let it compete again."""
         entry = self._flying
         assert entry is not None
         _, _, sender, frame = entry
@@ -304,7 +297,7 @@ class TimedBus(LockstepBus):
         self._deliver_frame(sender, frame, t_ns, off)
 
     def _deliver_frame(self, sender: Attachment, frame: Frame, t_ns: int, off: Sequence[Attachment] = ()) -> None:
-        """Everybody but its sender hears a frame, and those that are bus off; the answers are queued."""
+        """Give a frame to everybody but its sender and the nodes that are bus off; queue the answers."""
         self.frames += 1
         if self._fifo and sender.outbox:
             self._compete(sender, (sender.outbox.popleft(),))
@@ -324,10 +317,8 @@ class TimedBus(LockstepBus):
         if moved:
             self._first_due = self._earliest()
 
-    # errors
-
     def _fail(self, entry: _Entry, t_ns: int) -> None:
-        """What was on the wire is lost: its sender tries again, unless that was once too often."""
+        """Drop the frame on the wire; its sender tries again, unless it is bus off now."""
         self.error_frames += 1
         if self.error_recorder is not None:
             self.error_recorder(ERR_FLAG | ERR_PROTOCOL | ERR_BUS, bytes(CLASSIC_BYTES), t_ns)
@@ -339,15 +330,13 @@ class TimedBus(LockstepBus):
             heappush(self._ready, entry)
 
     def _silence(self, node: Attachment) -> None:
-        """A node that is bus off loses what it wanted to send."""
+        """Drop what a node that is bus off wanted to send."""
         node.outbox.clear()
         self._ready = [entry for entry in self._ready if entry[2] is not node]
         heapify(self._ready)
 
-    # who is there
-
     def remove_port(self, port: LockstepPort) -> None:
-        """Take a closed port off the bus, after what it has sent is through, and what is answered at once."""
+        """Take a closed port off the bus after its frames and the answers at once have been carried."""
         limit_ns = self.clock.now_ns() + MAX_CLOSING_NS
         while (self._flying is not None or self._ready) and self.clock.step(limit_ns):
             pass
@@ -364,6 +353,6 @@ class TimedBus(LockstepBus):
             self._silence(node)
             self._controllers.remove(node)
             if self._flying is not None and self._flying[2] is node:
-                self._flying = None  # it falls silent in the middle of a frame
+                self._flying = None  # the node falls silent in the middle of a frame
         super()._remove(owner)
         self._stale = True
