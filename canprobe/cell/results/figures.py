@@ -24,7 +24,7 @@ from canprobe.cell.results.picture import (
     sheet,
 )
 from canprobe.cell.results.summary import RunResult
-from canprobe.cell.results.surface_panels import Array, Plane, add_sheet, map_surface, true_surface
+from canprobe.cell.results.surface_panels import Array, ScanPlane, add_sheet, map_surface, true_surface
 from canprobe.cell.tasks.probing import Phase
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.errors import UsageError
@@ -124,7 +124,7 @@ def _draw_trajectory(part: SubFigure, result: RunResult) -> None:
     axes.plot(*1e3 * points.T, color=ORANGE, linewidth=0.9, zorder=3)
     shown, azimuth = ["orange: measured path"], -60.0
     if len(points):
-        plane = Plane.of(points, normals)
+        plane = ScanPlane.of(points, normals)
         azimuth = math.degrees(math.atan2(plane.axes[0, 1], plane.axes[0, 0])) - 68.0  # the long side across the page
         if result.surface_map is not None and len(result.surface_map):
             shown.append("blue: recovered surface")

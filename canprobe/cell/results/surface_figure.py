@@ -14,7 +14,15 @@ from matplotlib.figure import SubFigure
 from canprobe.cell.results.map_score import SAME_DIRECTION_RAD
 from canprobe.cell.results.picture import BLUE, FAINT, GREEN, GREY, INK, ORANGE, Part, box, legend, parts, picture
 from canprobe.cell.results.summary import RunResult
-from canprobe.cell.results.surface_panels import Array, MapView, Plane, add_sheet, map_surface, rejected, true_surface
+from canprobe.cell.results.surface_panels import (
+    Array,
+    MapView,
+    ScanPlane,
+    add_sheet,
+    map_surface,
+    rejected,
+    true_surface,
+)
 from canprobe.mechanics.touch.consistency import Consistency, check_consistency
 from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.touch.surface_map import SurfaceMap
@@ -99,7 +107,7 @@ def draw_map(
         title: first line.
     """
     walked = surface_map.path if len(surface_map.path) else surface_map.points
-    plane = Plane.of(walked, surface_map.normals)
+    plane = ScanPlane.of(walked, surface_map.normals)
     view = MapView(surface_map, consistency or check_consistency(surface_map), shape, plane)
     crossings = len(view.consistency.crossings)
     told = (

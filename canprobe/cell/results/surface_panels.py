@@ -28,17 +28,17 @@ class MapView(NamedTuple):
     map: SurfaceMap
     consistency: Consistency
     shape: PlacedShape | None
-    plane: Plane
+    plane: ScanPlane
 
 
-class Plane(NamedTuple):
+class ScanPlane(NamedTuple):
     """The plane of a scan: `axes` (3, 3), rows along, across, outward, and `origin` (3,), the middle of the path, m."""
 
     axes: Array
     origin: Array
 
     @classmethod
-    def of(cls, path: Array, normals: Array) -> Plane:
+    def of(cls, path: Array, normals: Array) -> ScanPlane:
         """Of points of a path (n, 3), m, and outward normals (m, 3) along it."""
         middle = 0.5 * (path.min(axis=0) + path.max(axis=0))
         outward = normals.mean(axis=0)
@@ -64,7 +64,7 @@ def rejected(consistency: Consistency) -> NDArray[np.bool_]:
     return np.array([c.joint.p < SIGNIFICANCE_LEVEL for c in consistency.crossings], dtype=bool)
 
 
-def true_surface(shape: PlacedShape, path: Array, plane: Plane) -> Array:
+def true_surface(shape: PlacedShape, path: Array, plane: ScanPlane) -> Array:
     """An object's surface below a path (n, 3): (GRID, GRID, 3) points of base, m."""
     flat = plane.mm(path)
     low, high = flat.min(axis=0) - 1e3 * MARGIN_M, flat.max(axis=0) + 1e3 * MARGIN_M
@@ -73,7 +73,7 @@ def true_surface(shape: PlacedShape, path: Array, plane: Plane) -> Array:
     return np.array([shape.closest(point).point for point in above.reshape(-1, 3)]).reshape(GRID, GRID, 3)
 
 
-def map_surface(surface_map: SurfaceMap, plane: Plane) -> tuple[Array, Array]:
+def map_surface(surface_map: SurfaceMap, plane: ScanPlane) -> tuple[Array, Array]:
     """The one surface of a map: points (rows, columns, 3) of base, m, and its σ there, m; NaN beyond its patches.
 
     A grid over the plane of the scan, in a tenth of the time of the triangles that `SurfaceMap.mesh` finds.
