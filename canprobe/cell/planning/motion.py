@@ -17,13 +17,13 @@ from canprobe.cell.planning.surface_path import Array, SurfacePath, _mm, surface
 from canprobe.cell.scene.setup import Arm, Calibrate, Free, Probe, SafetyLimits, Setup, Touch
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.chain import forward, forward_jacobian
-from canprobe.mechanics.robot.inverse import FIXED_POLE, LENGTH_M, in_rows, inverse_near, task_rows
+from canprobe.mechanics.robot.inverse import ERROR_LENGTH_M, FIXED_POLE, in_rows, inverse_near, task_rows
 from canprobe.mechanics.robot.probe_poses import probe_pose, start_posture
 from canprobe.mechanics.touch.probe_motion import (
     EXTRA_CLEARANCE_M,
-    MOVE_SPEED,
-    RETREAT_SPEED,
-    ROUND_SPEED,
+    MOVE_SPEED_M_S,
+    RETREAT_SPEED_M_S,
+    ROUND_SPEED_M_S,
     SETTLE_S,
     ArcMotion,
     LineMotion,
@@ -135,7 +135,7 @@ def _lacking_rows(setup: Setup) -> str | None:
         return f"task.kind: a calibration tilts the probe, and the {name} arm of {arm.model.n} joints cannot choose it"
     T, J = forward_jacobian(arm.model.chain, arm.q_start, task.probe.T_flange_probe)
     held = in_rows(rows, T[:3, :3], J) * arm.model.radian
-    held[:3] /= LENGTH_M
+    held[:3] /= ERROR_LENGTH_M
     weakest = float(np.linalg.svd(held, compute_uv=False)[-1]) if len(held) <= arm.model.n else 0.0
     if weakest > _SINGULAR:
         return None
@@ -376,7 +376,7 @@ def _over_path(task: Touch, path: SurfacePath, pose: ProbePose) -> Iterator[_Tim
     """To the approach, down, at rest, and once round the path."""
     approach, radius = task.approach, task.probe.radius
     above = ProbePose(approach.start + (approach.clearance + radius) * approach.normal, -approach.normal)
-    yield from _moving(LineMotion(pose, above, MOVE_SPEED))
+    yield from _moving(LineMotion(pose, above, MOVE_SPEED_M_S))
     poses = [
         ProbePose(point + radius * normal, -pole)
         for point, normal, pole in zip(path.points, path.normals, _poles(task, path), strict=True)
@@ -396,9 +396,9 @@ def _round_ball(task: Calibrate, pose: ProbePose) -> Iterator[_Timed]:
             ProbePose(task.ball_centre + (radii + gap) * touch.n_base, touch.pole_base)
             for gap in (task.approach.clearance, 0.0, task.approach.clearance + EXTRA_CLEARANCE_M)
         )
-        yield from _moving(ArcMotion(task.ball_centre, pose, above, ROUND_SPEED))
+        yield from _moving(ArcMotion(task.ball_centre, pose, above, ROUND_SPEED_M_S))
         yield on, down_s
-        yield from _moving(LineMotion(on, off, RETREAT_SPEED))
+        yield from _moving(LineMotion(on, off, RETREAT_SPEED_M_S))
         pose = off
 
 

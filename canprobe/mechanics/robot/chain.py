@@ -28,7 +28,7 @@ from canprobe.mechanics.types import Floats, Vec
 
 Convention = Literal["standard", "modified"]
 MAX_JOINTS = 8
-_RIGID = 1e-9
+_RIGIDITY_TOLERANCE = 1e-9
 """How far a fixed transform may be from a rotation with a translation."""
 
 
@@ -103,7 +103,7 @@ class Chain:
             )
         for place, T in zip((*self.joints, "flange"), (*fixed, flange), strict=True):
             R = T[:3, :3]
-            rigid = np.abs(R @ R.T - np.eye(3)).max() < _RIGID and np.linalg.det(R) > 0.0
+            rigid = np.abs(R @ R.T - np.eye(3)).max() < _RIGIDITY_TOLERANCE and np.linalg.det(R) > 0.0
             if not (np.all(np.isfinite(T)) and rigid and np.array_equal(T[3], (0.0, 0.0, 0.0, 1.0))):
                 raise PlanError([f"{where}: the transform to {place} is not a rotation with a translation: {T!r}"])
 

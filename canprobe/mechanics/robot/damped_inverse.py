@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from canprobe.mechanics.robot.inverse import LENGTH_M
+from canprobe.mechanics.robot.inverse import ERROR_LENGTH_M
 from canprobe.mechanics.types import Floats
 
-_DAMPING, _THRESHOLD = 0.05, 0.08
-"""Largest damping, and the singular value below which it starts; linear rows are divided by `LENGTH_M`."""
+_MAX_DAMPING, _DAMPING_THRESHOLD = 0.05, 0.08
+"""Largest damping, and the singular value below which it starts; linear rows are divided by `ERROR_LENGTH_M`."""
 
 
 def damped_step(J: Floats, twist: Floats, wish: Floats | None = None) -> Floats:
@@ -29,14 +29,14 @@ def damped_step(J: Floats, twist: Floats, wish: Floats | None = None) -> Floats:
     Source: Nakamura & Hanafusa 1986; Maciejewski & Klein 1988 (variable damping factor); Liegeois 1977 (null space).
     """
     rows, joints = J.shape
-    scale = np.array((1 / LENGTH_M,) * 3 + (1.0,) * (rows - 3))
+    scale = np.array((1 / ERROR_LENGTH_M,) * 3 + (1.0,) * (rows - 3))
     scaled, aim = J * scale[:, None], scale * twist
     regular = _regular_step(scaled, aim) if rows == joints else None
     if regular is not None:
         return regular
     U, s, Vt = np.linalg.svd(scaled, full_matrices=False)
-    ratio = float(s[-1]) / _THRESHOLD
-    lambda2 = _DAMPING**2 * (1.0 - ratio**2) if ratio < 1.0 else 0.0
+    ratio = float(s[-1]) / _DAMPING_THRESHOLD
+    lambda2 = _MAX_DAMPING**2 * (1.0 - ratio**2) if ratio < 1.0 else 0.0
     step: Floats = Vt.T @ ((U.T @ aim) * (s / (s * s + lambda2)))
     return step if wish is None else step + wish - Vt.T @ (Vt @ wish)
 
@@ -47,7 +47,7 @@ def _regular_step(J: Floats, twist: Floats) -> Floats | None:
         inverse = np.linalg.inv(J)
     except np.linalg.LinAlgError:
         return None
-    if float(np.vdot(inverse, inverse)) * _THRESHOLD**2 >= 1.0:
+    if float(np.vdot(inverse, inverse)) * _DAMPING_THRESHOLD**2 >= 1.0:
         return None
     step: Floats = inverse @ twist
     return step

@@ -20,7 +20,7 @@ from canprobe.mechanics.robot.model import Body, lopsided_inertia
 from canprobe.mechanics.types import Floats
 
 GRAVITY_M_S2 = 9.81
-_PLACEHOLDER = '<inertial pos="1 2 3" quat="1 2 3 4" mass="1" diaginertia="1 1.1 1.2"/>'
+_PLACEHOLDER_INERTIAL = '<inertial pos="1 2 3" quat="1 2 3 4" mass="1" diaginertia="1 1.1 1.2"/>'
 """A body that MuJoCo's compiler neither refuses nor simplifies; the real one, which it may refuse, follows after."""
 
 
@@ -151,7 +151,7 @@ def _opened(mujoco: Any, T: Floats, slides: bool) -> str:
     """A joint's frame with its joint. The armature of 1 keeps MuJoCo's matrix regular where nothing has a mass."""
     pos, quat = (" ".join(map(repr, values.tolist())) for values in (T[:3, 3], _quaternion(mujoco, T[:3, :3])))
     joint = f'<joint type="{"slide" if slides else "hinge"}" axis="0 0 1" armature="1"/>'
-    return f'<body pos="{pos}" quat="{quat}">{joint}{_PLACEHOLDER}'
+    return f'<body pos="{pos}" quat="{quat}">{joint}{_PLACEHOLDER_INERTIAL}'
 
 
 def _quaternion(mujoco: Any, R: Floats) -> Floats:

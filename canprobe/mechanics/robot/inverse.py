@@ -25,7 +25,7 @@ from canprobe.mechanics.robot.chain import forward, forward_jacobian
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.types import Floats
 
-LENGTH_M = 0.2
+ERROR_LENGTH_M = 0.2
 """Makes linear rows comparable to angular ones: about the length of a link."""
 
 
@@ -65,8 +65,8 @@ def in_rows(rows: int, R_base_tool: Floats, six: Floats) -> Floats:
 
 
 _ROUNDING_ERROR = 1e-9
-"""Error of a pose, rad or m over `LENGTH_M`, that is rounding."""
-_STEPS = 200
+"""Error of a pose, rad or m over `ERROR_LENGTH_M`, that is rounding."""
+_MAX_STEPS = 200
 _MAX_STEP_RAD = 0.3
 """Of a joint in one step, rad: farther the Jacobian is another one."""
 _MIN_DAMPING, _MAX_DAMPING = 1e-12, 1e8
@@ -132,15 +132,15 @@ class _PosedTool:
         return task_rows(self.model)
 
     def error(self, q: Floats) -> tuple[Floats, Floats]:
-        """What is left (rows,) and its Jacobian (rows, n), in rad: lengths are divided by `LENGTH_M`.
+        """What is left (rows,) and its Jacobian (rows, n), in rad: lengths are divided by `ERROR_LENGTH_M`.
 
         The Jacobian is per radian of a joint, see `ArmModel.radian`.
         """
         T, J = forward_jacobian(self.model.chain, q, self.T_flange_tool)
         R, aim, rows = T[:3, :3], self.T_base_tool, self.rows
         turn = _turn(R, aim[:3, :3]) if rows == 6 else _turn_of_pole(R, aim[:3, 2])
-        left = np.concatenate(((aim[:3, 3] - T[:3, 3]) / LENGTH_M, turn))
-        J[:3] /= LENGTH_M
+        left = np.concatenate(((aim[:3, 3] - T[:3, 3]) / ERROR_LENGTH_M, turn))
+        J[:3] /= ERROR_LENGTH_M
         return in_rows(rows, R, left), in_rows(rows, R, J) * self.model.radian
 
 
@@ -172,7 +172,7 @@ def _reach(pose: _PosedTool, near: Floats) -> Floats:
     q = np.clip(near, model.q_min, model.q_max)
     left, J = pose.error(q)
     damping = 1e-3
-    for _ in range(_STEPS):
+    for _ in range(_MAX_STEPS):
         cost = float(left @ left)
         uphill = J.T @ left
         free = ~(((q <= model.q_min) & (uphill < 0.0)) | ((q >= model.q_max) & (uphill > 0.0)))
@@ -204,7 +204,7 @@ def _rest(pose: _PosedTool, reached: Floats, rest: Floats) -> Floats:
     """Of the joints that hold a pose the ones nearest to a posture: Newton's steps towards the pose, and along the
     null space towards the posture. What was reached, where that does not settle."""
     model, q = pose.model, reached
-    for _ in range(_STEPS):
+    for _ in range(_MAX_STEPS):
         left, J = pose.error(q)
         wish = (rest - q) / model.radian
         free = ~(((q <= model.q_min) & (wish < 0.0)) | ((q >= model.q_max) & (wish > 0.0)))

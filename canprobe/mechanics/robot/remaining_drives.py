@@ -10,7 +10,7 @@ from canprobe.mechanics.types import Floats
 
 MAX_GAIN = 30.0
 """Joint motion per motion of the tool, rad/m, beyond which the drives that are left are badly placed for it."""
-_EXACT = 1e-6
+_MAX_ERROR_SHARE = 1e-6
 
 
 def lifting_step(model: ArmModel, J: Floats, move: Floats, free: NDArray[np.bool_]) -> Floats | None:
@@ -37,6 +37,6 @@ def lifting_step(model: ArmModel, J: Floats, move: Floats, free: NDArray[np.bool
     units[free] = scale * shares
     dq = model.q_per_unit @ units
     size = float(np.linalg.norm(move))
-    if np.linalg.norm(J @ dq - move) > _EXACT * size or np.linalg.norm(dq / model.radian) > MAX_GAIN * size:
+    if np.linalg.norm(J @ dq - move) > _MAX_ERROR_SHARE * size or np.linalg.norm(dq / model.radian) > MAX_GAIN * size:
         return None
     return units

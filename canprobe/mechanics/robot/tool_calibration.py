@@ -23,11 +23,11 @@ from canprobe.mechanics.types import Floats
 
 LENGTH_UNIT_M = 1e-3
 ANGLE_UNIT_RAD = 1e-2
-_SCALE = np.array([LENGTH_UNIT_M] * 7 + [ANGLE_UNIT_RAD] * 2)
+_UNKNOWN_UNITS = np.array([LENGTH_UNIT_M] * 7 + [ANGLE_UNIT_RAD] * 2)
 """Of the unknowns: tool centre, ball centre, radii, tilt. The condition number is of the problem in these units."""
 GOLDEN_ANGLE_RAD = np.pi * (3.0 - np.sqrt(5.0))
 """rad."""
-_ROUNDS = 20
+_MAX_ROUNDS = 20
 _T, _C, _RHO, _TILT = slice(0, 3), slice(3, 6), 6, slice(7, 9)
 
 
@@ -126,11 +126,11 @@ def calibrate_tool(touches: Sequence[BallTouch], model: BallModel) -> ToolEstima
             raise UsageError(f"touches: touch {number} is not finite")
     x0 = np.concatenate([model.t_flange, model.c_base, np.zeros(3)])
     x = x0.copy()
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         r, J = _rows(touches, model, x, x0)
-        step = _SCALE * np.linalg.lstsq(J * _SCALE, -r, rcond=1e-12)[0]
+        step = _UNKNOWN_UNITS * np.linalg.lstsq(J * _UNKNOWN_UNITS, -r, rcond=1e-12)[0]
         x += step
-        if np.abs(step / _SCALE).max() < 1e-9:
+        if np.abs(step / _UNKNOWN_UNITS).max() < 1e-9:
             break
     r, J = _rows(touches, model, x, x0)
     return _estimate(touches, model, x, r, J)
@@ -177,7 +177,7 @@ def _rows(touches: Sequence[BallTouch], model: BallModel, x: Floats, x0: Floats)
 
 
 def _estimate(touches: Sequence[BallTouch], model: BallModel, x: Floats, r: Floats, J: Floats) -> ToolEstimate:
-    _, s, Vt = np.linalg.svd(J * _SCALE, full_matrices=False)
+    _, s, Vt = np.linalg.svd(J * _UNKNOWN_UNITS, full_matrices=False)
     known = s > s[0] * 1e-12
     condition = float(s[0] / s[-1]) if known.all() else float("inf")
     weights = np.where(known, 1.0 / np.where(known, s, 1.0), np.inf)

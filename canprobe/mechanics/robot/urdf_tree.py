@@ -24,8 +24,8 @@ from canprobe.mechanics.types import Floats
 
 MAX_FILE_BYTES = 64 << 20
 """Largest size of a URDF, bytes."""
-_MOVING = {"revolute", "continuous", "prismatic"}
-_DEFINITIONS = {"xacro:property", "xacro:macro", "xacro:arg"}
+_MOVING_KINDS = {"revolute", "continuous", "prismatic"}
+_XACRO_DEFINITIONS = {"xacro:property", "xacro:macro", "xacro:arg"}
 _LATE_DECLARATION = re.compile(rb"\A(?P<before>(?:\s|<!--.*?-->)+)(?P<declaration><\?xml\b.*?\?>)", re.DOTALL)
 CONTINUOUS_RAD = 2 * math.pi
 """Stops of a continuous joint to either side: it has none itself, but cables and the counts of a drive have."""
@@ -145,7 +145,7 @@ class UrdfTree:
 
     def joint(self, edge: UrdfEdge) -> Joint:
         """What a joint of the path can do."""
-        if edge.kind not in _MOVING:
+        if edge.kind not in _MOVING_KINDS:
             kinds = "revolute, continuous, prismatic or fixed on the way to the tip"
             raise self.wrong(edge.name, kinds, edge.kind)
         mimic = edge.element.find("mimic")
@@ -292,13 +292,13 @@ def _parsed(content: bytes) -> ElementTree.Element:
 def _is_xacro(element: ElementTree.Element) -> bool:
     """Whether something is still to be expanded; definitions that nothing uses are left over."""
     for child in element:
-        if child.tag in _DEFINITIONS:
+        if child.tag in _XACRO_DEFINITIONS:
             continue
         if child.tag.startswith("xacro:") or any("${" in value or "$(" in value for value in child.attrib.values()):
             return True
         if _is_xacro(child):
             return True
-    return element.tag == "robot" and element.find("link") is None and any(c.tag in _DEFINITIONS for c in element)
+    return element.tag == "robot" and element.find("link") is None and any(c.tag in _XACRO_DEFINITIONS for c in element)
 
 
 def _colour(material: ElementTree.Element) -> tuple[int, int, int] | None:

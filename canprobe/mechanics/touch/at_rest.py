@@ -1,4 +1,4 @@
-"""What the samples of a touch at rest say against going on: the force swings, or the array cannot show it."""
+"""Reasons, seen in the samples of a touch at rest, not to go on: the force swings, or the array cannot show it."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ from canprobe.mechanics.touch.stops import MAX_FORCE_SPREAD
 MAX_SATURATED_SHARE = 0.75
 """Share of saturated samples above which the measured force is only a lower bound of the true one.
 
-That alone is no reason: up to 40 kN/m the bound is near enough. Where √F did not grow on a line either, it is not.
+Saturation alone is no reason to stop: up to 40 kN/m the bound is near enough. Where √F did not grow on a line either,
+it is not.
 """
-SAMPLES_AT_REST = 10
+MIN_REST_SAMPLES = 10
+"""Least number of samples that are judged."""
 
 
 class AtRest:
@@ -30,11 +32,13 @@ class AtRest:
         self._spread += from_mean * (force - self._mean)
 
     def doubt(self, target: float, felt: bool) -> str | None:
-        """Why the force is not the wanted one (N); None where all is well or not known.
+        """Why the force is not the wanted one; None where it is, or where that is not known yet.
 
-        `felt`: the touch showed the layer's stiffness (`PushFit`).
+        Args:
+            target: wanted force, N.
+            felt: whether the touch showed the layer's stiffness (`PushFit`).
         """
-        if self._n < SAMPLES_AT_REST:
+        if self._n < MIN_REST_SAMPLES:
             return None
         if not felt and self._saturated > MAX_SATURATED_SHARE * self._n:
             return (

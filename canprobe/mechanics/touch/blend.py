@@ -28,13 +28,13 @@ REACH_M = 4e-3
 """Default distance from a contact at which its patch no longer counts, m."""
 MIN_FACING_COSINE = 0.5
 """Least cosine between a patch's normal and the surface's: others are another side of a thin body."""
-_FULL, _LIMB = 0.75, 0.25
+_FULL_FACING_COSINE, _LIMB_SHARE = 0.75, 0.25
 """Cosine from which a patch counts in full, and share of the discriminant of a line that grazes it."""
 UNKNOWN_HEIGHT_SIGMA_M = 1e-4
 """Standard deviation of the height of a patch that does not know its own, for its weight: as contacts have at most."""
-_ITERATIONS = 40
+_MAX_ROUNDS = 40
 """Most rounds; each shrinks the error of the normal by the height over the radius of curvature."""
-_SETTLED = 1e-8
+_SETTLED_NORMAL_CHANGE = 1e-8
 
 
 class Feet(NamedTuple):
@@ -97,8 +97,8 @@ class Quadrics(NamedTuple):
         u, v, w = np.einsum("ijk,ij->ki", self.R[i], x + t[:, None] * d)
         F = np.stack([2 * u, 2 * v, np.ones_like(u), 2 * u * w, 2 * v * w, w * w, u * u, 2 * u * v, v * v], 1)  # df/dc
         variance = _dot(_times(self.covariance[i], F), F) / slope**2
-        limb = np.where(met, square / np.where(met, b * b * _LIMB, 1.0), 0.0)
-        facing = (_dot(self.normal[i], d) - MIN_FACING_COSINE) / (_FULL - MIN_FACING_COSINE)
+        limb = np.where(met, square / np.where(met, b * b * _LIMB_SHARE, 1.0), 0.0)
+        facing = (_dot(self.normal[i], d) - MIN_FACING_COSINE) / (_FULL_FACING_COSINE - MIN_FACING_COSINE)
         return t, g / np.sqrt(_dot(g, g))[:, None], variance, _eased(limb) * _eased(facing)
 
 
@@ -137,7 +137,7 @@ def feet_on(patches: Quadrics, points: Floats, reach: float) -> Feet:
     normal, foot = normal[left], foot[left]
     row: NDArray[np.intp] = np.repeat(np.arange(len(left)), counts[left])
     patch = np.fromiter((i for one in near for i in one), np.intp, len(row))
-    for _ in range(_ITERATIONS):
+    for _ in range(_MAX_ROUNDS):
         height, outward, variance, valid = patches.heights(patch, points[left[row]], normal[row])
         apart = patches.contact[patch] - foot[row]
         fade = np.maximum(0.0, 1.0 - _dot(apart, apart) / reach**2) ** 2 * valid
@@ -154,7 +154,7 @@ def feet_on(patches: Quadrics, points: Floats, reach: float) -> Feet:
         found.point[left], found.normal[left], found.height[left] = foot, normal, -height
         found.sigma[left] = np.where(knowing > 0.0, sigma / np.maximum(knowing, 1e-300), math.nan)
         found.patches[left] = np.bincount(row, weight > 0.0, len(left))
-        more = np.abs(normal - before).max(axis=1) > _SETTLED
+        more = np.abs(normal - before).max(axis=1) > _SETTLED_NORMAL_CHANGE
         left, normal, foot = left[more], normal[more], foot[more]
         row, patch = (np.cumsum(more) - 1)[row[more[row]]], patch[more[row]]
         if not len(left):

@@ -27,19 +27,19 @@ MAX_SPACING_M, MAX_RISE_M = 5e-4, 4e-6
 farther than the foot beside it; on a sharp edge half of the grid's spacing stands for that."""
 MAX_BALL_RADIUS_M = 0.03
 """Of the ball that touches, as far as the spacing of the nodes depends on it."""
-_MARGIN_M = 1.5e-4
+_WINDOW_MARGIN_M = 1.5e-4
 """How far a query may move before the window of nodes is taken anew."""
-_MAX_DEPTH_M = 3e-4
+_MAX_INDENTATION_M = 3e-4
 """Indentation up to which that window holds all that a ball presses on."""
-_BLOCK = 4
-_OVER_NODES_M = 5e-5
+_BLOCK_NODES = 4
+_MAX_RISE_BETWEEN_NODES_M = 5e-5
 """How far the surface may rise between its nodes, on the safe side."""
-_NEWTON = 40
+_MAX_NEWTON_STEPS = 40
 _LAST_STEP_M = 1e-8
 """A Newton step after which the rest, its square over a radius of curvature, is below 1e-12 m."""
 _SAME_PLACE_M = 1e-6
 _NO_HEIGHT_M = -1e3
-_SIDE = 1e-6
+_BORDER_SPACINGS = 1e-6
 """Spacings to the cells on both sides of a node."""
 
 _Bends = tuple[float, float, float, float, float, float]
@@ -212,13 +212,13 @@ class Heights(PlacedShape):
         if there is not None and not there.all():
             self._cells = there[:-1, :-1] & there[1:, :-1] & there[:-1, 1:] & there[1:, 1:]
             self._z[~self.exists(x, y).reshape(shape)] = _NO_HEIGHT_M
-        starts = [np.arange(0, n, _BLOCK) for n in shape]
+        starts = [np.arange(0, n, _BLOCK_NODES) for n in shape]
         self._tops = np.maximum.reduceat(np.maximum.reduceat(self._z, starts[0], axis=0), starts[1], axis=1)
-        lids = np.pad(self._tops, 1, mode="edge") + _OVER_NODES_M
+        lids = np.pad(self._tops, 1, mode="edge") + _MAX_RISE_BETWEEN_NODES_M
         lids = np.maximum(np.maximum(lids[:-2], lids[1:-1]), lids[2:])
         self._lids = np.maximum(np.maximum(lids[:, :-2], lids[:, 1:-1]), lids[:, 2:])
         self._boxes = [
-            (at[start], at[np.minimum(start + _BLOCK, len(at)) - 1])
+            (at[start], at[np.minimum(start + _BLOCK_NODES, len(at)) - 1])
             for at, start in zip((self._x, self._y), starts, strict=True)
         ]
         self._kept: tuple[Vec, float, float, tuple[slice, slice]] | None = None
@@ -234,14 +234,14 @@ class Heights(PlacedShape):
         # No node of a block is nearer than the box that holds it; the nodes of the nearest box bound the nearest.
         dx, dy = (at - np.clip(at, low, high) for at, (low, high) in zip((x, y), self._boxes, strict=True))
         boxes = np.maximum(z - self._tops, 0.0) ** 2 + (dx * dx)[:, None] + dy * dy
-        i, j = (_BLOCK * int(k) for k in divmod(int(boxes.argmin()), boxes.shape[1]))
-        block = slice(i, i + _BLOCK), slice(j, j + _BLOCK)
+        i, j = (_BLOCK_NODES * int(k) for k in divmod(int(boxes.argmin()), boxes.shape[1]))
+        block = slice(i, i + _BLOCK_NODES), slice(j, j + _BLOCK_NODES)
         squares = (self._z[block] - z) ** 2 + ((self._x[block[0]] - x) ** 2)[:, None] + (self._y[block[1]] - y) ** 2
         nearest = sqrt(float(squares.min()))
-        widest = max(nearest + _MAX_DEPTH_M, reach) + 2.0 * _MARGIN_M + 0.5 * self._step
+        widest = max(nearest + _MAX_INDENTATION_M, reach) + 2.0 * _WINDOW_MARGIN_M + 0.5 * self._step
         inside = boxes <= widest * widest
         rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
-        first, last = (slice(_BLOCK * int(k[0]), _BLOCK * int(k[-1] + 1)) for k in (rows, columns))
+        first, last = (slice(_BLOCK_NODES * int(k[0]), _BLOCK_NODES * int(k[-1] + 1)) for k in (rows, columns))
         window = first, last
         self._kept = (x, y, z), nearest, widest, window
         return window
@@ -274,7 +274,7 @@ class Heights(PlacedShape):
         """The stationary point of the distance near (u, v), by Newton of at most a node's spacing a step."""
         at, most, node = self.spline.at, self._step, (u, v)
         (u0, v0), (u1, v1) = self.spline.corner, self.spline.far
-        for _ in range(_NEWTON):
+        for _ in range(_MAX_NEWTON_STEPS):
             h, hx, hy, hxx, hxy, hyy = at(u, v)
             up = h - z
             gx, gy = u - x + up * hx, v - y + up * hy
@@ -346,8 +346,8 @@ class Heights(PlacedShape):
         """
         x, y, z = self._to_object(points_base).T
         gaps, near = np.ones(len(x)), self.exists(x, y)
-        i = ((x[near] - self._x[0]) * (1.0 / (_BLOCK * self._cell[0]))).astype(np.intp)
-        j = ((y[near] - self._y[0]) * (1.0 / (_BLOCK * self._cell[1]))).astype(np.intp)
+        i = ((x[near] - self._x[0]) * (1.0 / (_BLOCK_NODES * self._cell[0]))).astype(np.intp)
+        j = ((y[near] - self._y[0]) * (1.0 / (_BLOCK_NODES * self._cell[1]))).astype(np.intp)
         near[near] = z[near] < self._lids[i, j]
         height, along, across = self.spline.many(x[near], y[near])
         gaps[near] = (z[near] - height) / np.sqrt(1.0 + along * along + across * across)
@@ -359,8 +359,10 @@ class Heights(PlacedShape):
         if self._cells is not None:
             (x0, y0), (m, n) = self.spline.corner, self._cells.shape
             s, t = (x[inside] - x0) / self.spline.spacing, (y[inside] - y0) / self.spline.spacing
-            rows = [(s + side).astype(np.intp).clip(0, m - 1) for side in (-_SIDE, _SIDE)]  # of both cells on a border
-            columns = [(t + side).astype(np.intp).clip(0, n - 1) for side in (-_SIDE, _SIDE)]
+            rows = [
+                (s + side).astype(np.intp).clip(0, m - 1) for side in (-_BORDER_SPACINGS, _BORDER_SPACINGS)
+            ]  # of both cells on a border
+            columns = [(t + side).astype(np.intp).clip(0, n - 1) for side in (-_BORDER_SPACINGS, _BORDER_SPACINGS)]
             inside[inside] = np.any([self._cells[i, j] for i in rows for j in columns], axis=0)
         return inside
 

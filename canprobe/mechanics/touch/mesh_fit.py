@@ -24,12 +24,12 @@ from canprobe.mechanics.types import Floats
 
 Index = npt.NDArray[np.intp]
 
-EDGE_RAD = np.radians(30.0)
+MIN_EDGE_RAD = np.radians(30.0)
 """Facets that meet at a larger angle have an edge between them."""
-COARSE_RAD = np.radians(15.0)
+MAX_FACET_TURN_RAD = np.radians(15.0)
 """A median angle between the facets of a curved surface from which on they show no curvature."""
 MIN_WALL_COSINE = np.cos(np.radians(70.0))
-LAYER_SPACINGS = 6.0
+HIDDEN_DEPTH_SPACINGS = 6.0
 """Spacings below the highest sample of a cell from which on a sample is taken as hidden."""
 MIN_COVERED_SHARE = 0.1
 """Share of a mesh's grid that has a surface, below which single vertices far away make the grid."""
@@ -43,7 +43,7 @@ FILL_WEIGHT = 0.01
 """Of a point of a curved triangle in the fit: a vertex is exact, and only where there are none these count."""
 BORDER_SPACINGS = 1e-3
 """Spacings beyond the border up to which a node lies on it: files have single precision."""
-_STIFFNESS = 1e-7
+_SMOOTHING_WEIGHT = 1e-7
 """Of the fit against second differences, per sample of a cell: it only matters where there are no samples."""
 
 
@@ -156,13 +156,13 @@ def _refuse_coarse(points: Floats, corners: Index, normals: Floats) -> None:
     ends, faces = ends[order], faces[order]
     shared = np.flatnonzero((ends[1:] == ends[:-1]).all(axis=1))
     angles = np.arccos(np.clip(np.sum(normals[faces[shared]] * normals[faces[shared + 1]], axis=1), -1.0, 1.0))
-    curved = (angles > 1e-3) & (angles < EDGE_RAD)
-    if curved.any() and np.median(angles[curved]) > COARSE_RAD:
+    curved = (angles > 1e-3) & (angles < MIN_EDGE_RAD)
+    if curved.any() and np.median(angles[curved]) > MAX_FACET_TURN_RAD:
         long = np.linalg.norm(points[ends[shared, 0]] - points[ends[shared, 1]], axis=1)[curved]
         raise ValueError(
             f"the mesh is too coarse: facets of about {1e3 * np.median(long):.3g} mm turn the normal by "
             f"{np.degrees(np.median(angles[curved])):.0f} deg from one to the next, at most "
-            f"{np.degrees(COARSE_RAD):.0f} deg; export it finer"
+            f"{np.degrees(MAX_FACET_TURN_RAD):.0f} deg; export it finer"
         )
 
 
@@ -198,7 +198,7 @@ def _corner_normals(points: Floats, corners: Index, normals: Floats) -> Floats:
     total, still, step = np.zeros_like(weight), np.arange(len(vertex)), 0
     while len(still):
         other = first[still] + step
-        near = np.sum(normals[face[still]] * normals[face[other]], axis=1) > np.cos(EDGE_RAD)
+        near = np.sum(normals[face[still]] * normals[face[other]], axis=1) > np.cos(MIN_EDGE_RAD)
         total[still] += weight[other] * near[:, None]
         step += 1
         still = still[first[still] + step < beyond[still]]
@@ -234,7 +234,7 @@ def _seen(samples: Floats, spacing: float) -> npt.NDArray[np.bool_]:
     cell = cell.reshape(-1)
     top = np.full(cell.max() + 1, -np.inf)
     np.maximum.at(top, cell, samples[:, 2])
-    seen: npt.NDArray[np.bool_] = samples[:, 2] >= top[cell] - LAYER_SPACINGS * spacing
+    seen: npt.NDArray[np.bool_] = samples[:, 2] >= top[cell] - HIDDEN_DEPTH_SPACINGS * spacing
     return seen
 
 
@@ -297,7 +297,7 @@ def _fitted(samples: Floats, weights: Floats, facing: Floats, spacing: float, at
     bends = [sparse.diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(k - 2, k)) for k in (m, n)]
     along, across = sparse.kron(bends[0], sparse.identity(n)), sparse.kron(sparse.identity(m), bends[1])
     weighted = A.T @ sparse.diags_array(weights)
-    weak = _STIFFNESS * max(count / (m * n), 1.0)
+    weak = _SMOOTHING_WEIGHT * max(count / (m * n), 1.0)
     normal = weighted @ A + weak * (along.T @ along + across.T @ across)
     try:
         factors = splu(

@@ -29,11 +29,11 @@ Numbers = NDArray[np.int64]
 CELL_M = 0.5e-3
 """Default side of a cell, m."""
 _BITS, _BIAS = 21, 1 << 20
-_STEPS = np.array([1 << 2 * _BITS, 1 << _BITS, 1], np.int64)
+_CELL_STEPS = np.array([1 << 2 * _BITS, 1 << _BITS, 1], np.int64)
 """What a step along x, y, z adds to the number of a cell; a corner has the number of the cell above it."""
 _CORNERS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
 _EDGES = np.array([[a, a + step] for step, axis in ((4, 0), (2, 1), (1, 2)) for a in range(8) if not _CORNERS[a, axis]])
-_AROUND = np.array([[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)])
+_NEIGHBOURS = np.array([[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,8 +87,8 @@ def mesh_of(field: Field, seeds: Floats, cell: float) -> Mesh:
         raise UsageError(
             f"cell: expected at least {np.abs(seeds).max() / (0.9 * _BIAS):.2g} m for points so far away, got {cell}"
         )
-    corners, sides = _CORNERS @ _STEPS, np.concatenate([_STEPS, -_STEPS])
-    todo: Numbers = np.unique(((low.astype(np.int64) + _BIAS) @ _STEPS)[:, None] + _AROUND @ _STEPS)
+    corners, sides = _CORNERS @ _CELL_STEPS, np.concatenate([_CELL_STEPS, -_CELL_STEPS])
+    todo: Numbers = np.unique(((low.astype(np.int64) + _BIAS) @ _CELL_STEPS)[:, None] + _NEIGHBOURS @ _CELL_STEPS)
     seen: Numbers = todo[:0]
     known, values = seen, np.zeros(0)
     crossed, heights = [seen], [np.zeros((0, 8))]
@@ -142,7 +142,7 @@ def _triangles(cells: Numbers, height: Floats, vertices: Floats) -> NDArray[np.i
     finite: NDArray[np.bool_] = np.isfinite(vertices[:, 0])
     inside = height < 0.0
     for along, end in enumerate((4, 2, 1)):
-        a, b = _STEPS[along - 2], _STEPS[along - 1]
+        a, b = _CELL_STEPS[along - 2], _CELL_STEPS[along - 1]
         edge = np.flatnonzero(inside[:, 0] != inside[:, end])
         around = cells[edge][:, None] + np.array([-a - b, -b, 0, -a])
         index = np.minimum(np.searchsorted(cells, around), len(cells) - 1)

@@ -19,15 +19,15 @@ from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.touch.servo import ProbePose
 from canprobe.mechanics.types import Floats, Vec
 
-MOVE_SPEED, ROUND_SPEED, RETREAT_SPEED = 30e-3, 40e-3, 20e-3
+MOVE_SPEED_M_S, ROUND_SPEED_M_S, RETREAT_SPEED_M_S = 30e-3, 40e-3, 20e-3
 """Mean speeds of the way to an object, round a ball, and off an object, m/s."""
 EXTRA_CLEARANCE_M = 2e-3
 """By which a probe draws back farther from a ball than the clearance from which it came."""
 SETTLE_S = 0.5
 """At rest in contact before a scan."""
-SMALL_STEP_RAD = 0.01
+MAX_EXACT_STEP_RAD = 0.01
 """Joint step (rad) below which the exact inverse is taken: in a cycle of 400 Hz 230 deg/s."""
-REST_HZ = 1.0
+REST_RETURN_HZ = 1.0
 """How fast more joints than a pose needs go back to the posture they began with."""
 
 
@@ -89,10 +89,10 @@ class PoseSteps:
             J, twist = in_rows(self._rows, R, J), in_rows(self._rows, R, six)
         if J.shape[0] == J.shape[1]:
             exact = self._solve(J, twist)
-            if exact is not None and max(map(abs, exact)) < SMALL_STEP_RAD:
+            if exact is not None and max(map(abs, exact)) < MAX_EXACT_STEP_RAD:
                 return exact
         # the exact step would be no small one, as near a singular pose
-        wish = 2.0 * math.pi * REST_HZ * dt * (self._rest - q)
+        wish = 2.0 * math.pi * REST_RETURN_HZ * dt * (self._rest - q)
         damped: list[float] = damped_step(J, np.asarray(twist), wish).tolist()
         return damped
 

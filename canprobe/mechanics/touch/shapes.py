@@ -207,7 +207,7 @@ def tangent_of(nx: float, ny: float, nz: float) -> tuple[float, float, float]:
 
 LIP_M = 1e-3
 """Radius of the rounding between the hollow's wall and the top."""
-_PIECES = 360
+_LIP_PIECES = 360
 
 
 class Bowl(RoundShape):
@@ -219,9 +219,9 @@ class Bowl(RoundShape):
 
     def __init__(self, T_base_object: npt.ArrayLike, radius: float) -> None:
         super().__init__(T_base_object, radius)
-        angles = np.arange(_PIECES) * (2.0 * pi / _PIECES)
+        angles = np.arange(_LIP_PIECES) * (2.0 * pi / _LIP_PIECES)
         ring = radius + LIP_M
-        self._ring = np.column_stack((ring * np.cos(angles), ring * np.sin(angles), np.full(_PIECES, radius)))
+        self._ring = np.column_stack((ring * np.cos(angles), ring * np.sin(angles), np.full(_LIP_PIECES, radius)))
 
     def _foot(self, x: float, y: float, z: float) -> Foot:
         radius = self.radius
@@ -262,7 +262,7 @@ class Bowl(RoundShape):
         points = self._ring[near] + LIP_M * normals
         across = np.sum(normals[:, :2] * points[:, :2], axis=1)
         kappa = np.column_stack((np.full(len(points), 1.0 / LIP_M), across / np.sum(points[:, :2] ** 2, axis=1)))
-        length = np.full(len(points), 2.0 * pi * (self.radius + LIP_M) / _PIECES)
+        length = np.full(len(points), 2.0 * pi * (self.radius + LIP_M) / _LIP_PIECES)
         return self._placed(points, normals, size[near] - LIP_M, kappa, length)
 
     def gaps(self, points_base: Floats) -> Floats:
@@ -279,8 +279,8 @@ class Bowl(RoundShape):
         return self.radius
 
 
-_PER_WAVE = 48
-_NEWTON = 60
+_POINTS_PER_WAVE = 48
+_MAX_NEWTON_STEPS = 60
 
 
 class Wave(PlacedShape):
@@ -299,7 +299,7 @@ class Wave(PlacedShape):
         require_positive(amplitude=amplitude, wavelength=wavelength)
         self.amplitude, self.wavelength = amplitude, wavelength
         self._k = 2.0 * pi / wavelength
-        self._spacing = wavelength / _PER_WAVE
+        self._spacing = wavelength / _POINTS_PER_WAVE
 
     def _height(self, y: float) -> tuple[float, float, float]:
         """z, dz/dy and d2z/dy2."""
@@ -320,7 +320,7 @@ class Wave(PlacedShape):
     def _polished(self, start: float, y: float, z: float) -> float:
         """Root of half the squared distance's slope within a grid step of the start."""
         low, high, v = start - self._spacing, start + self._spacing, start
-        for _ in range(_NEWTON):
+        for _ in range(_MAX_NEWTON_STEPS):
             h, slope, bend = self._height(v)
             g = v - y + (h - z) * slope
             low, high = (v, high) if g < 0.0 else (low, v)

@@ -17,12 +17,12 @@ from canprobe.mechanics.touch.surface import SurfaceMatrix
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 from canprobe.mechanics.types import Floats, Vec
 
-_ENTRY_LIMIT = 0.02
+_MAX_HIDDEN_ENTRY = 0.02
 """Largest unobserved part of an entry of K that still has a number."""
-_DIRECTION_LIMIT = 0.05
+_MAX_HIDDEN_DIRECTION = 0.05
 """The same for the normal curvature along a direction."""
 _UMBILIC_CHI2 = 5.99
-_ARRAYS = (
+_ARRAY_FIELDS = (
     *("S", "T_frame_contact", "K", "kappa", "directions", "covariance"),
     *("observed", "combinations", "information"),
 )
@@ -87,7 +87,7 @@ class SurfaceEstimate:
     stiffness: float | None = None
 
     def __post_init__(self) -> None:
-        for name in _ARRAYS:
+        for name in _ARRAY_FIELDS:
             getattr(self, name).setflags(write=False)
         if self.model_root is not None:
             self.model_root.setflags(write=False)
@@ -271,13 +271,13 @@ def _partly(
     """K, covariance, kappa, directions and flags where the data left something open."""
     if has_prior:
         kappa, local = _principal(K)
-        flags = [outside(decision, _projector(d)) < _DIRECTION_LIMIT for d in local]
+        flags = [outside(decision, _projector(d)) < _MAX_HIDDEN_DIRECTION for d in local]
         return K, covariance, kappa, local, np.array(flags)
     t = _observed_direction(decision)
     local = np.array([t, [-t[1], t[0]]])
-    seen = decision.rank > 0 and outside(decision, _projector(t)) < _DIRECTION_LIMIT
+    seen = decision.rank > 0 and outside(decision, _projector(t)) < _MAX_HIDDEN_DIRECTION
     kappa = np.array([float(t @ K @ t) if seen else math.nan, math.nan])
-    hidden = np.array([outside(decision, e) >= _ENTRY_LIMIT for e in np.eye(3)])
+    hidden = np.array([outside(decision, e) >= _MAX_HIDDEN_ENTRY for e in np.eye(3)])
     K = np.where(hidden[[[0, 1], [1, 2]]], math.nan, K)
     V, passed = decision.vectors, decision.passed
     covariance = partial_covariance(V[:, passed], decision.information[passed], hidden) / length**2

@@ -14,11 +14,11 @@ import numpy as np
 from canprobe.mechanics.touch.estimate.noise import CHI2_999, CHI2_MEDIAN
 from canprobe.mechanics.types import Floats
 
-LAST_FEW, BEST = 8, 3
+LAST_SAMPLES, BEST_SAMPLES = 8, 3
 """Of so many last samples so many are the best: they stay right while no more than five of eight are wrong."""
-BEST_SHARE = 0.37
+BEST_INNOVATION_SHARE = 0.37
 """Innovation of the best three of eight over that of all, when nothing is wrong."""
-ALARM, ALARM_OF_BEST = 2.2, 3.5
+ALARM_RATIO, BEST_ALARM_RATIO = 2.2, 3.5
 """Innovations, over what is usual, at which the surface is taken to have changed. By chance, or with three wrong
 samples among the eight, one in a thousand and one in a hundred are above the second."""
 USUAL_INNOVATION = (0.3, 2.0)
@@ -26,7 +26,7 @@ USUAL_INNOVATION = (0.3, 2.0)
 the upper bound no innovation, capped as it is, could ever set off an alarm."""
 MAX_AGREEING_RESIDUAL = 4.8
 """Squared residual over the median one up to which a sample may lie on the surface before a change: 99 % of χ² of 3."""
-RUNNING, LONG_TERM = 0.1, 0.004
+RUNNING_WEIGHT, LONG_TERM_WEIGHT = 0.1, 0.004
 """Weights of one sample in the running and in the long-term innovation."""
 
 
@@ -41,8 +41,8 @@ class ChangeTest:
     def __init__(self) -> None:
         self.alarms = 0
         self.innovation = self._all = 1.0
-        self._of_best = BEST_SHARE
-        self._last: deque[float] = deque(maxlen=LAST_FEW)
+        self._of_best = BEST_INNOVATION_SHARE
+        self._last: deque[float] = deque(maxlen=LAST_SAMPLES)
 
     @property
     def usual(self) -> float:
@@ -56,19 +56,19 @@ class ChangeTest:
         """
         now = min(square, CHI2_999) / 3.0
         self._last.append(now)
-        best = sum(sorted(self._last)[:BEST]) / BEST if len(self._last) == LAST_FEW else 0.0
-        self.innovation += RUNNING * (now - self.innovation)
-        usual_best = BEST_SHARE * _bounded(self._of_best / BEST_SHARE)
-        if self.innovation >= caution * ALARM * self.usual and best >= caution * ALARM_OF_BEST * usual_best:
+        best = sum(sorted(self._last)[:BEST_SAMPLES]) / BEST_SAMPLES if len(self._last) == LAST_SAMPLES else 0.0
+        self.innovation += RUNNING_WEIGHT * (now - self.innovation)
+        usual_best = BEST_INNOVATION_SHARE * _bounded(self._of_best / BEST_INNOVATION_SHARE)
+        if self.innovation >= caution * ALARM_RATIO * self.usual and best >= caution * BEST_ALARM_RATIO * usual_best:
             return True
-        self._all += LONG_TERM * (now - self._all)
-        if len(self._last) == LAST_FEW:
-            self._of_best += LONG_TERM * (best - self._of_best)
+        self._all += LONG_TERM_WEIGHT * (now - self._all)
+        if len(self._last) == LAST_SAMPLES:
+            self._of_best += LONG_TERM_WEIGHT * (best - self._of_best)
         return False
 
     def usual_again(self, squares: Floats) -> bool:
         """Whether such squared innovations alone would set off no alarm, once something is taken into account."""
-        return float(np.minimum(squares, CHI2_999).mean()) / 3.0 < ALARM * self.usual
+        return float(np.minimum(squares, CHI2_999).mean()) / 3.0 < ALARM_RATIO * self.usual
 
     def alarm(self) -> None:
         """Count a change; the running innovation begins again at what is usual."""
@@ -86,5 +86,8 @@ def looks_changed(squares: Floats) -> bool:
     fit of all.
     """
     usual = _bounded(float(np.median(squares)) / CHI2_MEDIAN)
-    last = np.sort(np.minimum(squares[-LAST_FEW:], CHI2_999)) / 3.0
-    return bool(last.mean() >= ALARM * usual and last[:BEST].mean() >= ALARM_OF_BEST * BEST_SHARE * usual)
+    last = np.sort(np.minimum(squares[-LAST_SAMPLES:], CHI2_999)) / 3.0
+    return bool(
+        last.mean() >= ALARM_RATIO * usual
+        and last[:BEST_SAMPLES].mean() >= BEST_ALARM_RATIO * BEST_INNOVATION_SHARE * usual
+    )

@@ -21,8 +21,8 @@ _FROM_SIX = [2, 4, 5, 0, 1, 3]
 """c13 c23 c33 c11 c12 c22 of the nine-parameter order, as places among the six."""
 _K_OF_SIX = [0, 1, 3]
 """2 c11, 2 c12, 2 c22, which are K itself, among the six."""
-_NUMERIC = 1e-10
-_OPEN = 1e-8
+_MIN_SINGULAR_SHARE = 1e-10
+_MIN_OPEN_PART = 1e-8
 """Part of K in a unit vector of the six that the differences leave open, from which it is no rounding."""
 
 
@@ -82,7 +82,7 @@ def solve_pairs(touches: ContactBatch, data: Pairs, method: str) -> SurfaceEstim
     length = touches.extent
     A, b = three_rows(data.points), data.normals.reshape(-1)
     U, s, Vt = np.linalg.svd(A, full_matrices=len(A) < 6)  # all six of Vt, however few the rows
-    rank = int(np.count_nonzero(s > _NUMERIC * max(float(s[0]), 1e-300)))
+    rank = int(np.count_nonzero(s > _MIN_SINGULAR_SHARE * max(float(s[0]), 1e-300)))
     inverse = (Vt[:rank].T / s[:rank]) @ U[:, :rank].T
     double = inverse @ b
     residual = b - A @ double
@@ -123,7 +123,7 @@ def _root_of(covariance: Floats, open_ways: Floats) -> Floats:
     Nothing is known along the columns of `open_ways` (3, m) either.
     """
     ways, sizes, _ = np.linalg.svd(open_ways)
-    known = ways[:, np.count_nonzero(sizes > _OPEN) :]
+    known = ways[:, np.count_nonzero(sizes > _MIN_OPEN_PART) :]
     values, vectors = np.linalg.eigh(known.T @ covariance @ known)
     inverse = np.where(values > 1e-14 * values.max(initial=1e-300), 1.0 / np.maximum(values, 1e-300), 0.0)
     result: Floats = np.sqrt(inverse)[:, None] * (known @ vectors).T

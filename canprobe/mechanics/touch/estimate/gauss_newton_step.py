@@ -12,7 +12,7 @@ from canprobe.mechanics.touch.estimate.quadric import size_of
 from canprobe.mechanics.touch.estimate.residuals import Design, linearise
 from canprobe.mechanics.types import Floats
 
-_SHORTER = (1.0, 0.25)
+_STEP_SHARES = (1.0, 0.25)
 """Shares of a step that are tried."""
 SETTLED_STEP = 0.1
 """Squared length of a step, in standard deviations, below which an answer has settled."""
@@ -74,7 +74,7 @@ def gauss_newton(now: Solved, d: Design, prior: tuple[Floats, Floats]) -> Solved
 
     Source: Deuflhard, "Newton methods for nonlinear problems", 2004 (the natural monotonicity test).
     """
-    for share in _SHORTER:
+    for share in _STEP_SHARES:
         there = solved_once(now.c + share * (now.target - now.c), d, prior)
         if there.step <= max(now.step, SETTLED_STEP):
             return there

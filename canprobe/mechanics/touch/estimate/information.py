@@ -46,7 +46,7 @@ def batch_design(T_base_work: Floats, length: float, touches: Sequence[MeasuredC
     return design(points, np.array([t.normal for t in touches]).dot(R), noise)
 
 
-ANCHOR = 0.05
+REANCHOR_TRAVEL_SHARE = 0.05
 """Travel between two changes of the working frame over the memory."""
 
 
@@ -146,7 +146,7 @@ class InformationFilter:
     def follow(self, point: Floats) -> None:
         """Carry everything to a contact frame at the foot of a point (3,) of base, once that is far enough away."""
         near = u, v, w = self.place(point)
-        if u * u + v * v + w * w < ANCHOR**2:
+        if u * u + v * v + w * w < REANCHOR_TRAVEL_SHARE**2:
             return
         x, z_axis = foot(self.c, near)
         turned = np.array((*transported((1.0, 0.0, 0.0), z_axis), z_axis)).T

@@ -29,10 +29,10 @@ from canprobe.mechanics.touch.surface import SurfaceMatrix
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 from canprobe.mechanics.types import Floats
 
-_FLOOR = 20.0
+_MIN_EXTENT_SIGMAS = 20.0
 """Least extent in standard deviations of a point: shorter paths are noise, and no length to measure curvature by."""
 
-_MEAN_OF = 8
+_MEAN_POINTS = 8
 
 
 class ContactBatch(NamedTuple):
@@ -64,7 +64,7 @@ def make_touches(points: Floats, normals: Floats, noise: Noise, correlation: Cor
     """Extent and length of arrays that are already checked."""
     if correlation is not None:
         instance("correlation", correlation, Correlation)
-    floor = _FLOOR * math.sqrt(float(np.median(noise.point_variance)))
+    floor = _MIN_EXTENT_SIGMAS * math.sqrt(float(np.median(noise.point_variance)))
     offset = points - points[-1]
     extent = max(math.sqrt(float(np.einsum("ij,ij->i", offset, offset).max())), floor)
     return ContactBatch(points, normals, noise, extent, _travelled(points), correlation)
@@ -72,7 +72,7 @@ def make_touches(points: Floats, normals: Floats, noise: Noise, correlation: Cor
 
 def _travelled(points: Floats) -> float:
     """Length along noisy points (n, 3): of means over up to eight, or their noise alone would add up to a path."""
-    each = min(_MEAN_OF, max(1, len(points) // 20))
+    each = min(_MEAN_POINTS, max(1, len(points) // 20))
     means = points[len(points) % each :].reshape(-1, each, 3).mean(axis=1)
     steps = np.diff(means, axis=0)
     share = (len(points) - 1) / max(len(points) - each, 1)  # the ends that the means cut off

@@ -31,7 +31,7 @@ from canprobe.mechanics.touch.estimate.terms import DEGREE
 from canprobe.mechanics.touch.linear_algebra import inverted, upper_root
 from canprobe.mechanics.types import Floats
 
-NONE, USUAL, TAIL = 0.88, 0.11, 0.01
+NO_MISFIT_WEIGHT, USUAL_MISFIT_WEIGHT, TAIL_MISFIT_WEIGHT = 0.88, 0.11, 0.01
 """Prior weights of: no misfit; a usual one; one that is only believed when seen.
 
 Some nine in ten places on what is felt are taken to be like a quadric over a path no longer than a radius: flat, round,
@@ -40,10 +40,11 @@ or nearly so. An edge or a seam is one in a hundred; it shows, and then its like
 USUAL_CURVATURE_CHANGES = (0.1, 0.5)
 """A usual change of curvature along a surface, dK/ds over ‖K‖²: a torus 2.5 times as wide as its tube has 0.1 on its
 outer side and 0.4 on top, a fillet more. Slower ones change K by some percent over a path of a radius."""
-BLUR_RAD = 5e-3
-"""κσ_p, rad: a point's noise over the least radius. Up to here `NONE` holds, from twice as much on a usual misfit is
-certain. A path on which points err by so much of the radius says next to nothing about cubic terms, so the prior alone
-answers for them, and it is the cautious one: there a region may hold the truth too often, not too seldom."""
+BLUR_LIMIT_RAD = 5e-3
+"""Largest κσ_p (noise of a point over the least radius), rad, at which `NO_MISFIT_WEIGHT` holds in full; from twice as
+much on the prior takes a usual misfit for certain. A path on which points err by so much of the radius says next to
+nothing about cubic terms, so the prior alone answers for them, and the cautious one is taken: there a region may hold
+the truth too often, not too seldom."""
 TAIL_VARIANCES = 10.0 ** np.arange(1.0, 9.0)
 """Variances of the tail over that of the best known of the terms."""
 HIGHER_TERMS_SHARE = 0.35
@@ -52,19 +53,23 @@ MAX_CORRECTION_SHARE = 0.1
 """Largest change of K that is believed, over ‖K‖ or 1/length."""
 MENTIONED_PROBABILITY = 0.99
 """Probability of a misfit from which an estimate mentions it."""
-_PER_SQUARE = C_PER_Q**-2.0
-_CUBIC = DEGREE == 3
-_MIN_CURVATURE = 0.1
+_Q_PER_C_SQUARED = C_PER_Q**-2.0
+_IS_CUBIC = DEGREE == 3
+_MIN_SCALED_CURVATURE = 0.1
 """‖K‖ · length at which the ratio of quartic to cubic terms stops falling."""
-_USUAL = np.concatenate([[0.0], np.square(USUAL_CURVATURE_CHANGES) / 36.0])
-_VARIANCES = np.concatenate([_USUAL, TAIL_VARIANCES])
+_USUAL_VARIANCES = np.concatenate([[0.0], np.square(USUAL_CURVATURE_CHANGES) / 36.0])
+_VARIANCES = np.concatenate([_USUAL_VARIANCES, TAIL_VARIANCES])
 """No misfit, usual ones per ‖K‖⁴ (the length being 1), and the tail."""
-_PRIOR = np.repeat(
-    [NONE, USUAL / len(USUAL_CURVATURE_CHANGES), TAIL / len(TAIL_VARIANCES)],
+_PRIOR_WEIGHTS = np.repeat(
+    [NO_MISFIT_WEIGHT, USUAL_MISFIT_WEIGHT / len(USUAL_CURVATURE_CHANGES), TAIL_MISFIT_WEIGHT / len(TAIL_VARIANCES)],
     [1, len(USUAL_CURVATURE_CHANGES), len(TAIL_VARIANCES)],
 )
-_CAUTIOUS = np.repeat(
-    [0.0, (NONE + USUAL) / len(USUAL_CURVATURE_CHANGES), TAIL / len(TAIL_VARIANCES)],
+_CAUTIOUS_WEIGHTS = np.repeat(
+    [
+        0.0,
+        (NO_MISFIT_WEIGHT + USUAL_MISFIT_WEIGHT) / len(USUAL_CURVATURE_CHANGES),
+        TAIL_MISFIT_WEIGHT / len(TAIL_VARIANCES),
+    ],
     [1, len(USUAL_CURVATURE_CHANGES), len(TAIL_VARIANCES)],
 )
 
@@ -89,8 +94,8 @@ class Averaged(NamedTuple):
         spread: (9, 9) covariance that the terms add to theirs.
         share: (9,) how much of each direction of the terms the data settle: mean variance left.
         terms: (9,) the terms in these directions.
-        misfit: probability of there being one, without the caution of `BLUR_RAD`; `1 − NONE` where the residuals do not
-            show it.
+        misfit: probability of a misfit, without the caution of `BLUR_LIMIT_RAD`; `1 − NO_MISFIT_WEIGHT` where the
+            residuals show none.
         trusted: the change of K is small enough for a linear step.
     """
 
@@ -104,7 +109,7 @@ class Averaged(NamedTuple):
 
 def scales(curvature: float) -> Floats:
     """(9,) usual size of each term over that of the cubic ones, at ‖K‖ · length."""
-    return np.where(_CUBIC, 1.0, 0.25 * max(curvature, _MIN_CURVATURE))
+    return np.where(_IS_CUBIC, 1.0, 0.25 * max(curvature, _MIN_SCALED_CURVATURE))
 
 
 def averaged(m: Floats, s: Floats, carried: Floats, curvature: float, blur: float = 0.0) -> Averaged:
@@ -118,8 +123,8 @@ def averaged(m: Floats, s: Floats, carried: Floats, curvature: float, blur: floa
         blur: κσ_p, rad.
     """
     variance = _VARIANCES.copy()
-    variance[: len(_USUAL)] *= curvature**4
-    variance[len(_USUAL) :] /= max(float(m.max()), 1e-300)
+    variance[: len(_USUAL_VARIANCES)] *= curvature**4
+    variance[len(_USUAL_VARIANCES) :] /= max(float(m.max()), 1e-300)
     wider = 1.0 + variance[:, None] * m
     share = variance[:, None] / wider
     likelihood = 0.5 * (share.dot(s * s) - np.log(wider).sum(axis=1))
@@ -131,18 +136,18 @@ def averaged(m: Floats, s: Floats, carried: Floats, curvature: float, blur: floa
     apart = shifts - mean
     left = weight.dot(share)
     spread = (carried * left).dot(carried.T) + (apart.T * weight).dot(apart)
-    changed = float(weight.dot(np.square(shifts[:, 6:])).dot(_PER_SQUARE))
-    spread.flat[60::10] += HIGHER_TERMS_SHARE**2 * changed / _PER_SQUARE  # of K
+    changed = float(weight.dot(np.square(shifts[:, 6:])).dot(_Q_PER_C_SQUARED))
+    spread.flat[60::10] += HIGHER_TERMS_SHARE**2 * changed / _Q_PER_C_SQUARED  # of K
     trusted = changed <= (MAX_CORRECTION_SHARE * max(curvature, 1.0)) ** 2
-    shown = 1.0 - NONE * float(evidence[0] / _PRIOR.dot(evidence))
+    shown = 1.0 - NO_MISFIT_WEIGHT * float(evidence[0] / _PRIOR_WEIGHTS.dot(evidence))
     return Averaged(mean, spread, left, weight.dot(share * s), shown, trusted)
 
 
 def _prior(blur: float) -> Floats:
     """Prior weights of no misfit, the usual ones and the tail, at κσ_p (rad)."""
-    if blur <= BLUR_RAD:
-        return _PRIOR
-    result: Floats = _PRIOR + min(blur / BLUR_RAD - 1.0, 1.0) * (_CAUTIOUS - _PRIOR)
+    if blur <= BLUR_LIMIT_RAD:
+        return _PRIOR_WEIGHTS
+    result: Floats = _PRIOR_WEIGHTS + min(blur / BLUR_LIMIT_RAD - 1.0, 1.0) * (_CAUTIOUS_WEIGHTS - _PRIOR_WEIGHTS)
     return result
 
 

@@ -20,15 +20,15 @@ from canprobe.mechanics.types import Floats
 
 DIFFUSE_INFORMATION = 1e-2
 """Root of the information, in units of the length, that keeps a root regular: K known to ±200/length."""
-_TOLERANCE = 3e-8
-_ITERATIONS = 40
-_START_ROUNDS = 8
-_UPHILL = 0.05
+_STEP_TOLERANCE = 3e-8
+_MAX_ITERATIONS = 40
+_MAX_START_ROUNDS = 8
+_MAX_COST_RISE_SHARE = 0.05
 """Rise of the cost that a step may bring: the steps end where the residuals balance, which is not quite where the cost
 is least, since the whitening changes with K and wrong samples pull."""
-_PINNED = 10.0
+_START_PRIOR_NARROWING = 10.0
 """How much narrower the linear start takes the prior on c13, c23, c33."""
-_GROSS = 60.0
+_GROSS_SQUARE_RATIO = 60.0
 """Squared residual over its scale, of some sample, at which the linear start is made robust."""
 
 
@@ -65,7 +65,7 @@ def fit(d: Design, prior: tuple[Floats, Floats], independent: Floats | None = No
     c, root, decision = linear_start(d, prior, spread)
     best_cost, step, halvings, converged = np.inf, np.zeros(9), 0, False
     best = c
-    for _ in range(_ITERATIONS):
+    for _ in range(_MAX_ITERATIONS):
         at = linearise(c, d)
         square = np.einsum("ij,ij->i", at.r, at.r)
         weight, cost = robust(square)
@@ -80,7 +80,7 @@ def fit(d: Design, prior: tuple[Floats, Floats], independent: Floats | None = No
         # tight curvature it draws K down by a tenth
         assumed = prior[0] @ c - prior[1]
         cost += float(assumed @ assumed)
-        if cost > (1.0 + _UPHILL) * best_cost and halvings < 12:
+        if cost > (1.0 + _MAX_COST_RISE_SHARE) * best_cost and halvings < 12:
             step, halvings = 0.5 * step, halvings + 1
             c = best + step
             continue
@@ -90,7 +90,7 @@ def fit(d: Design, prior: tuple[Floats, Floats], independent: Floats | None = No
         target, root, decision = solve_rows(A, b, prior, spread, size_of(c), known=decision)
         step = target - best
         c = target
-        if np.abs(step).max() < _TOLERANCE:
+        if np.abs(step).max() < _STEP_TOLERANCE:
             final = solve_rows(A, b, prior, spread, size_of(c))
             if final[2].rank == decision.rank:
                 c, root, decision = final
@@ -119,13 +119,13 @@ def linear_start(
     """
     A, b = linear_rows(d)
     # the points' noise in z² and its kin would draw c13, c23, c33 far off, from where there is no way back
-    prior = np.concatenate([_PINNED * prior[0][:3], prior[0][3:]]), prior[1]
+    prior = np.concatenate([_START_PRIOR_NARROWING * prior[0][:3], prior[0][3:]]), prior[1]
     w = np.ones(len(b)) if weight is None else np.sqrt(weight).repeat(3)
     answer = solve_rows(A * w[:, None], b * w, prior, spread, 0.0)
-    for _ in range(_START_ROUNDS):
+    for _ in range(_MAX_START_ROUNDS):
         square = np.square(A @ answer[0] - b).reshape(-1, 3).sum(axis=1)
         scale = _median(square) / CHI2_MEDIAN
-        if float(square.max()) < _GROSS * scale:
+        if float(square.max()) < _GROSS_SQUARE_RATIO * scale:
             break
         w = np.sqrt(1.0 / (1.0 + square / (9.0 * max(scale, 1e-300)))).repeat(3)
         answer = solve_rows(A * w[:, None], b * w, prior, spread, 0.0)

@@ -8,7 +8,7 @@ not depend on the choice of axes. A combination of K counts as observed when
    but false σ. This is decided first, on the places alone, so that no fit can talk itself into it;
 2. its standard deviation, all other parameters unknown, is at most `SIGMA_LIMIT · max(‖K‖, 1/L)`, L the length of the
    path;
-3. its information is at least `NUMERIC_SHARE` times the largest: rounding.
+3. its information is at least `MIN_INFORMATION_SHARE` times the largest: rounding.
 
 A straight path passes two of three: the normal curvature along it and the twist. Combinations that fail are held at
 the value nearest to flat.
@@ -27,8 +27,11 @@ from canprobe.mechanics.touch.linear_algebra import eigen, principal
 from canprobe.mechanics.types import Floats
 
 MIN_SPREAD = 10.0
+"""Least mean square distance of points from their mean over σ_p² (rule 1)."""
 SIGMA_LIMIT = 0.3
-NUMERIC_SHARE = 1e-12
+"""Largest standard deviation of a combination over `max(‖K‖, 1/L)` (rule 2)."""
+MIN_INFORMATION_SHARE = 1e-12
+"""Least information of a combination over the largest (rule 3)."""
 
 
 class Decision(NamedTuple):
@@ -81,7 +84,7 @@ def decide(root_q: Floats, spread: Floats, curvature: float) -> Decision:
 
 
 def _least(curvature: float, largest: float) -> float:
-    return max(1.0 / (SIGMA_LIMIT * max(curvature, 1.0)) ** 2, NUMERIC_SHARE * largest)
+    return max(1.0 / (SIGMA_LIMIT * max(curvature, 1.0)) ** 2, MIN_INFORMATION_SHARE * largest)
 
 
 def excited(spread: Floats) -> tuple[Floats, NDArray[np.bool_]]:

@@ -20,7 +20,7 @@ from canprobe.mechanics.touch.estimate.terms import shifted
 from canprobe.mechanics.touch.linear_algebra import eigen, solved
 from canprobe.mechanics.types import Floats, Vec
 
-_REGULAR = 1e-9
+_REGULARISATION_SHARE = 1e-9
 """What keeps the covariance of the terms' score regular, over its mean."""
 
 
@@ -133,7 +133,7 @@ class OmittedTerms:
         X[9:].flat[::10] = D
         shared = self.score.matrix.dot(X)
         V = X.T.dot(shared)  # of y = m a + noise, all that the samples say about the terms
-        V.flat[::10] += _REGULAR * V.trace()
+        V.flat[::10] += _REGULARISATION_SHARE * V.trace()
         m = D[:, None] * self._information[9:].dot(X)
         weighted = solved(V, m)
         values, U = eigen(m.dot(weighted))

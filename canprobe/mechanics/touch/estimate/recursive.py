@@ -34,9 +34,9 @@ from canprobe.mechanics.touch.linear_algebra import instance, inverted, inverted
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 from canprobe.mechanics.types import Floats
 
-STEP_SHARE = 0.025
+UPDATE_TRAVEL_SHARE = 0.025
 """Travel between two updates over the memory."""
-MAX_CROWDING = 2.0
+MAX_DENSITY_RATIO = 2.0
 """Most samples per metre that count in full, over the nominal `window / memory`."""
 MAX_PENDING = 16
 """Samples of one step that are kept; of a slower motion the last ones."""
@@ -95,7 +95,7 @@ class RecursiveEstimator:
         self._gate = Gate(sigma_point, sigma_normal)
         self._memory = positive("memory_m", memory_m)
         self._quadric = quadric
-        self._crowd = MAX_CROWDING * positive("window", window) / self._memory
+        self._crowd = MAX_DENSITY_RATIO * positive("window", window) / self._memory
         self._prior = Prior.weak(self._memory) if prior is None else instance("prior", prior, Prior)
         if math.isfinite(self._prior.sigma_curvature):
             raise UsageError("prior: expected none on curvature itself for 'recursive', got " + self._prior.name)
@@ -108,7 +108,7 @@ class RecursiveEstimator:
         self._gate.reset()
         self._last: MeasuredContact | None = None
         self._pending: deque[_Pending] = deque(maxlen=MAX_PENDING)
-        self._travel = Travel(max(STEP_SHARE * self._memory, 3.0 * self._gate.sigma_point))
+        self._travel = Travel(max(UPDATE_TRAVEL_SHARE * self._memory, 3.0 * self._gate.sigma_point))
         self._spread = Spread()
         self._change = ChangeTest()
         self._start: Start | None = Start(self._memory, self._prior)

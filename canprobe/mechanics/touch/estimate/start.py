@@ -32,7 +32,7 @@ LATEST_TAKEOVER_SHARE = 0.8
 """Travel over the memory at which it takes over even where the solution still moves."""
 MAX_CONTACTS = 128
 """Contacts that are kept; of more every second one goes."""
-_FRAME_OF = 5
+_FRAME_CONTACTS = 5
 """Contacts whose median place and normal make the working frame."""
 
 
@@ -73,7 +73,7 @@ class Start:
         if share < FIRST_SOLUTION_SHARE:
             return
         if self.solution is None:
-            self.T = _frame(self._touches[-_FRAME_OF:])
+            self.T = _frame(self._touches[-_FRAME_CONTACTS:])
         d = batch_design(self.T, self._length, self._touches)
         if share < TAKEOVER_SHARE and float(np.linalg.eigvalsh(spread_of(d.X, d.point_variance))[0]) < MIN_SPREAD:
             return

@@ -18,11 +18,11 @@ from canprobe.mechanics.types import Floats
 _POWER_Y = (0, 1, 2, 3, 0, 1, 2, 3, 4)
 DEGREE = np.array([3, 3, 3, 3, 4, 4, 4, 4, 4])
 """(9,) degree of each term that a quadric leaves out."""
-_FACTOR = [math.sqrt(math.comb(int(n), k)) for n, k in zip(DEGREE, _POWER_Y, strict=True)]
+_HIGHER_FACTOR = [math.sqrt(math.comb(int(n), k)) for n, k in zip(DEGREE, _POWER_Y, strict=True)]
 _HIGHER = [(int(n) - k, k, 0) for n, k in zip(DEGREE, _POWER_Y, strict=True)]
 _QUADRIC = [(1, 0, 0), (0, 1, 0), (0, 0, 0), (1, 0, 1), (0, 1, 1), (0, 0, 2), (2, 0, 0), (1, 1, 0), (0, 2, 0)]
 """Powers of x, y, z in the terms of the nine parameters, in their order."""
-_OWN = [2.0, 2.0, 1.0, 2.0, 2.0, 1.0, 1.0, 2.0, 1.0]
+_QUADRIC_FACTOR = [2.0, 2.0, 1.0, 2.0, 2.0, 1.0, 1.0, 2.0, 1.0]
 _POWERS = [
     (0, 0, 0),
     (1, 0, 0),
@@ -48,7 +48,7 @@ def _monomials(x: Any, y: Any, z: Any) -> Floats:
 def _derivatives() -> Floats:
     """(19, 4, 18): values and derivatives by x, y, z of the 18 terms, per monomial."""
     found = np.zeros((len(_POWERS), 4, 18))
-    for column, (powers, factor) in enumerate(zip(_QUADRIC + _HIGHER, _OWN + _FACTOR, strict=True)):
+    for column, (powers, factor) in enumerate(zip(_QUADRIC + _HIGHER, _QUADRIC_FACTOR + _HIGHER_FACTOR, strict=True)):
         found[_POWERS.index(powers), 0, column] = factor
         for axis in range(3):
             i, k, n = np.array(powers) - np.eye(3, dtype=int)[axis]
@@ -60,9 +60,11 @@ def _derivatives() -> Floats:
 def _shift() -> Floats:
     """(19, 162): A and Q of `shifted`, per monomial of the new place."""
     found = np.zeros((len(_POWERS), 18, 9))
-    own = {powers: (row, factor) for row, (powers, factor) in enumerate(zip(_HIGHER, _FACTOR, strict=True))}
-    low = {powers: (9 + row, factor) for row, (powers, factor) in enumerate(zip(_QUADRIC, _OWN, strict=True))}
-    for column, ((i, k, _), factor) in enumerate(zip(_HIGHER, _FACTOR, strict=True)):
+    own = {powers: (row, factor) for row, (powers, factor) in enumerate(zip(_HIGHER, _HIGHER_FACTOR, strict=True))}
+    low = {
+        powers: (9 + row, factor) for row, (powers, factor) in enumerate(zip(_QUADRIC, _QUADRIC_FACTOR, strict=True))
+    }
+    for column, ((i, k, _), factor) in enumerate(zip(_HIGHER, _HIGHER_FACTOR, strict=True)):
         for a in range(i + 1):
             for b in range(k + 1):
                 row, per = (own if a + b > 2 else low)[a, b, 0]
@@ -71,13 +73,13 @@ def _shift() -> Floats:
     return found.reshape(len(_POWERS), -1)
 
 
-_SHIFT = _shift()
-_TABLE = {count: _derivatives()[:, :, :count].reshape(len(_POWERS), -1) for count in (9, 18)}
+_SHIFT_TABLE = _shift()
+_DERIVATIVE_TABLES = {count: _derivatives()[:, :, :count].reshape(len(_POWERS), -1) for count in (9, 18)}
 
 
 def terms(X: Floats, count: int = 18) -> Floats:
     """Values and derivatives by x, y, z (n, 4, count) of the first terms of f, the quadric's nine first, at (n, 3)."""
-    values: Floats = _monomials(*X.T).T.dot(_TABLE[count]).reshape(len(X), 4, count)
+    values: Floats = _monomials(*X.T).T.dot(_DERIVATIVE_TABLES[count]).reshape(len(X), 4, count)
     return values
 
 
@@ -87,5 +89,5 @@ def shifted(x: float, y: float) -> tuple[Floats, Floats]:
     Returns:
         A (9, 9) and Q (9, 9): terms a become terms `A a` there, and `Q a` more in the nine parameters.
     """
-    both = _monomials(x, y, 0.0).dot(_SHIFT).reshape(18, 9)
+    both = _monomials(x, y, 0.0).dot(_SHIFT_TABLE).reshape(18, 9)
     return both[:9], both[9:]

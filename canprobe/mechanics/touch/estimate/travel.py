@@ -9,8 +9,8 @@ import numpy as np
 
 from canprobe.mechanics.types import Floats
 
-_MEDIAN_OF, _MEAN_OF = 5, 8
-_FAR2, _SLOWLY = 16.0, 0.05
+_MEDIAN_POINTS, _MEAN_POINTS = 5, 8
+_MAX_SQUARE_RATIO, _USUAL_UPDATE_SHARE = 16.0, 0.05
 """Squared distance from the median, over the usual, that is no jump; and the share of one point in the usual."""
 
 
@@ -35,7 +35,7 @@ class Travel:
         self.measured = 0
         self._usual2 = 0.0
         self._step2 = step * step
-        self._last: deque[list[float]] = deque(maxlen=_MEDIAN_OF)
+        self._last: deque[list[float]] = deque(maxlen=_MEDIAN_POINTS)
         self._mean = self._mark = (0.0, 0.0, 0.0)
         self._count = 0
 
@@ -46,11 +46,11 @@ class Travel:
         middle = len(self._last) // 2
         a, b, c = [sorted(axis)[middle] for axis in zip(*self._last, strict=True)]
         self._weigh((px - a) ** 2 + (py - b) ** 2 + (pz - c) ** 2)
-        self._count = min(self._count + 1, _MEAN_OF)
+        self._count = min(self._count + 1, _MEAN_POINTS)
         share = 1.0 / self._count
         x, y, z = self._mean
         self._mean = x, y, z = x + share * (a - x), y + share * (b - y), z + share * (c - z)
-        if self._count < _MEAN_OF:
+        if self._count < _MEAN_POINTS:
             self._mark = self._mean
             return 0.0
         self.measured += 1
@@ -65,10 +65,10 @@ class Travel:
 
     def _weigh(self, square: float) -> None:
         """A contact does not jump from frame to frame; one that does is not believed, however little is known there."""
-        limit = max(_FAR2 * self._usual2, self._step2)
+        limit = max(_MAX_SQUARE_RATIO * self._usual2, self._step2)
         ratio = limit / max(square, limit)
         self.weight = ratio * ratio
-        self._usual2 += _SLOWLY * (min(square, limit) - self._usual2)
+        self._usual2 += _USUAL_UPDATE_SHARE * (min(square, limit) - self._usual2)
 
 
 class Spread:

@@ -15,7 +15,7 @@ import numpy as np
 
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-from canprobe.mechanics.touch.estimate.change import LAST_FEW, MAX_AGREEING_RESIDUAL, looks_changed
+from canprobe.mechanics.touch.estimate.change import LAST_SAMPLES, MAX_AGREEING_RESIDUAL, looks_changed
 from canprobe.mechanics.touch.estimate.differences import chord_pairs, solve_pairs
 from canprobe.mechanics.touch.estimate.likelihood import ContactBatch, fit_ml, make_touches
 from canprobe.mechanics.touch.estimate.noise import Correlation, make_noise
@@ -100,10 +100,10 @@ class MlEstimator(WindowEstimator):
     def _solve(self, touches: ContactBatch) -> SurfaceEstimate:
         answer = fit_ml(touches, self._prior)
         squares = _squared_residuals(answer, touches)
-        if len(squares) < 3 * LAST_FEW or answer.rank < 3 or not looks_changed(squares):
+        if len(squares) < 3 * LAST_SAMPLES or answer.rank < 3 or not looks_changed(squares):
             return answer
         agree = np.flatnonzero(squares <= MAX_AGREEING_RESIDUAL * float(np.median(squares)))
-        for _ in range(min(int(agree[-1]) + 1, len(squares) - LAST_FEW)):
+        for _ in range(min(int(agree[-1]) + 1, len(squares) - LAST_SAMPLES)):
             self._rows.popleft()
         answer = fit_ml(self._touches(), self._prior)
         return replace(answer, notes=(*answer.notes, "the surface changed: memory shortened"))

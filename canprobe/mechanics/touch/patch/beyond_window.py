@@ -20,14 +20,14 @@ from canprobe.mechanics.types import Floats
 
 MAX_EDGE_SHARE = 0.1
 """Share of the peak at the window's edge up to which a patch ends within the next taxel."""
-MIN_PEAK = 3
+MIN_PEAK_RATIO = 3
 """Highest count over the threshold up to which whole counts and noise hide the shape: what creep leaves of a long press
 was carried on to up to five times its force."""
-MIN_SHARE = 0.2
+MIN_FITTED_SHARE = 0.2
 """Share of the peak below which a taxel is left out of the fit: blur and threshold bend the rim."""
-MIN_TAXELS = 12
+MIN_FITTED_TAXELS = 12
 """Twice the six unknowns."""
-MIN_FALL = 0.3
+MIN_FALL_SHARE = 0.3
 """Share of the peak by which the pressure must fall over half the pad in every direction: else it is no patch."""
 
 
@@ -61,15 +61,15 @@ class Continuation:
         width = pressure.shape[1]
         strip = slice(width * row, width * (row + rows))  # the rows of the window: all else is 0
         seen = pressure.reshape(-1)[strip]
-        used = (seen >= MIN_SHARE * peak_pa) & (seen < self._saturated_pa)
-        if np.count_nonzero(used) < MIN_TAXELS:
+        used = (seen >= MIN_FITTED_SHARE * peak_pa) & (seen < self._saturated_pa)
+        if np.count_nonzero(used) < MIN_FITTED_TAXELS:
             return pressure
         weights = self._weights[strip]
         used_weights = (weights * used[:, None]).T
         _, quadratic, singular = dposv(used_weights.dot(weights), used_weights.dot(self._area[strip] * seen))
         _, _, _, uu, uv, vv = quadratic.tolist()
         least_fall = -0.5 * (uu + vv + math.hypot(uu - vv, uv)) * self._corner
-        if singular or not least_fall > MIN_FALL * peak_pa:
+        if singular or not least_fall > MIN_FALL_SHARE * peak_pa:
             return pressure
         whole: Floats = np.maximum(self._terms.dot(quadratic), 0.0).reshape(pressure.shape)
         inside = slice(row, row + rows), slice(column, column + columns)

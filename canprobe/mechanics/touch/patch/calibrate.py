@@ -26,7 +26,7 @@ from canprobe.mechanics.touch.patch.array_calibration import (
 )
 from canprobe.mechanics.touch.patch.array_models import make_image_model, make_patch_calibration
 from canprobe.mechanics.touch.patch.image import PatchCalibration
-from canprobe.mechanics.touch.patch.image_fit import AGE_S, NO_ERRORS, Dwell, Shown, what_is_shown
+from canprobe.mechanics.touch.patch.image_fit import LAST_IMAGE_S, NO_ERRORS, Dwell, Shown, what_is_shown
 from canprobe.mechanics.touch.patch.image_model import USUAL_LIGHTNESS
 from canprobe.mechanics.touch.patch.layer_fit import stiffness_by_depth
 from canprobe.mechanics.touch.patch.pad_fit import fit_centroids
@@ -106,7 +106,7 @@ def calibrate_array(
     by_force = reference in ("scale", "weights")
     dwells = dwells if by_force else [replace(d, force=None) for d in dwells]
     plain = PatchCalibration(pad)
-    every = [(d, what_is_shown(d, plain, AGE_S)) for d in dwells]
+    every = [(d, what_is_shown(d, plain, LAST_IMAGE_S)) for d in dwells]
     used = {id(d) for d, s in every if s.usable}
     count = sum(s.usable and d.name != "rod" for d, s in every)
     if count < MIN_TOUCHES or len({d.name for d, s in every if s.usable and d.name != "rod"}) < 2:
@@ -135,7 +135,7 @@ def calibrate_array(
     own = plain
     if own_gains and gained < MAX_ERROR_LEFT_SHARE * alike:
         own = replace(plain, gains=tuple(tuple(row) for row in np.round(gains, 4).tolist()))
-        good = [(d, what_is_shown(d, own, AGE_S)) for d, _ in good]
+        good = [(d, what_is_shown(d, own, LAST_IMAGE_S)) for d, _ in good]
         fitted = [(d, s) for d, s in good if d.name != "rod"]
         first, found = fit(fitted, own)
     errors, curvatures, force_errors = _held_out(fitted, lambda pairs: fit(pairs, own)[0], own, seen)
@@ -254,7 +254,7 @@ def _by_gains(pairs: Pairs, calibration: ArrayCalibration, plain: PatchCalibrati
     for half in (0, 1):
         gains = _gains(pairs[half::2], calibration, plain)[0]
         own = replace(plain, gains=tuple(tuple(row) for row in gains.tolist()))
-        check = [(d, what_is_shown(d, own, AGE_S)) for d, _ in pairs[1 - half :: 2]]
+        check = [(d, what_is_shown(d, own, LAST_IMAGE_S)) for d, _ in pairs[1 - half :: 2]]
         gained.append(_checked(calibration, check, plain, seen)[0][:, :2])
         alike.append(_checked(calibration, pairs[1 - half :: 2], plain, seen)[0][:, :2])
     return _rms(np.concatenate(gained)), _rms(np.concatenate(alike))

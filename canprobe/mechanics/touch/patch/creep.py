@@ -19,7 +19,7 @@ import math
 
 from canprobe.mechanics.touch.patch.moments import Moments
 
-TIMES_S = (0.3, 3.0, 30.0)
+TIME_CONSTANTS_S = (0.3, 3.0, 30.0)
 """Time constants of the memories."""
 
 
@@ -32,7 +32,7 @@ class PadMemory:
     def reset(self) -> None:
         """Contact was lost."""
         self._t_s: float | None = None
-        self._sums = [(0.0, 0.0, 0.0, 0.0, 0.0, 0.0) for _ in TIMES_S]  # of 1, u, v, uu, uv, vv
+        self._sums = [(0.0, 0.0, 0.0, 0.0, 0.0, 0.0) for _ in TIME_CONSTANTS_S]  # of 1, u, v, uu, uv, vv
 
     def add(self, t_s: float, u: float, v: float) -> Moments:
         """Take the centroid (m) of an image at a time (s).
@@ -42,7 +42,7 @@ class PadMemory:
         dt = 0.0 if self._t_s is None else max(t_s - self._t_s, 0.0)
         self._t_s = t_s
         mass = su = sv = uu = uv = vv = 0.0
-        for k, tau in enumerate(TIMES_S):
+        for k, tau in enumerate(TIME_CONSTANTS_S):
             kept = math.exp(-dt / tau)
             new = 1.0 - kept
             m, a, b, aa, ab, bb = self._sums[k]

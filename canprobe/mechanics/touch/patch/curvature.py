@@ -39,9 +39,9 @@ MIN_FRAMES = 8
 """Fewer frames make no estimate."""
 MAX_FRAMES = 32
 """Frames that the running mean reaches back: 0.16 s at 200 Hz, 4 mm at 25 mm/s."""
-FEW_FRAMES = 8
+MAX_RECENT_FRAMES = 8
 """The same of the shorter mean."""
-FINE_OUTLIER_SHARE = 0.05
+RECENT_OUTLIER_SHARE = 0.05
 """`OUTLIER_SHARE` of the shorter mean, in which one image weighs more: four times the noise of a frame."""
 MIN_AGE_DIFFERENCE_FRAMES = 4.0
 """Frames by which the shorter mean must be the younger one to tell a drift."""
@@ -157,7 +157,7 @@ class PatchCurvature:
         self._last: Floats | None = None
         self._slope: Slope | None = None
         self._touched = False
-        self._mean, self._recent = _Mean(MAX_FRAMES, OUTLIER_SHARE), _Mean(FEW_FRAMES, FINE_OUTLIER_SHARE)
+        self._mean, self._recent = _Mean(MAX_FRAMES, OUTLIER_SHARE), _Mean(MAX_RECENT_FRAMES, RECENT_OUTLIER_SHARE)
 
     def add(self, sample: ContactSample) -> None:
         """Take the image of one contact."""

@@ -16,7 +16,7 @@ from canprobe.mechanics.touch.patch.curvature import Fused, PatchCurvature
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 from canprobe.mechanics.types import Floats
 
-NAMED_SHARE = 0.1
+MIN_NAMED_SHARE = 0.1
 """Share of the information about K that the patch gives from which on the estimate's method names it."""
 CONTRADICTION_NOTE = "the patch contradicts the motion"
 WITHDRAWAL_SHARE = 0.25
@@ -29,7 +29,7 @@ def with_patch(motion: SurfaceEstimate, found: Fused, length: float, *, withdraw
 
     Place, normal and c13, c23, c33 stay the motion's; the patch says nothing about them. Curvatures below 1/length (the
     memory, m) count as flat; `withdrawn`: nothing is called observed. The `method` ends in "+patch" where the patch
-    gave at least `NAMED_SHARE`; a note says how much.
+    gave at least `MIN_NAMED_SHARE`; a note says how much.
     """
     assert motion.evidence is not None
     weight = CHI2_95 / max(found.cost, CHI2_95)
@@ -48,7 +48,7 @@ def with_patch(motion: SurfaceEstimate, found: Fused, length: float, *, withdraw
         innovation=motion.innovation,
         distance=motion.distance,
         samples=motion.samples,
-        method=motion.method + "+patch" if share >= NAMED_SHARE else motion.method,
+        method=motion.method + "+patch" if share >= MIN_NAMED_SHARE else motion.method,
         prior=motion.prior,
         notes=(*motion.notes, *_notes(found, share)),
         stiffness=found.stiffness,

@@ -20,13 +20,13 @@ from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import Doubt
 from canprobe.mechanics.touch.linear_algebra import checked, positive, read_only
 from canprobe.mechanics.touch.pad import COUNTS_MAX, THRESHOLD_COUNTS, Pad
-from canprobe.mechanics.touch.patch.beyond_window import MAX_EDGE_SHARE, MIN_PEAK, Continuation
+from canprobe.mechanics.touch.patch.beyond_window import MAX_EDGE_SHARE, MIN_PEAK_RATIO, Continuation
 from canprobe.mechanics.touch.patch.dead_taxels import may_be_dead, mended
 from canprobe.mechanics.touch.stops import OFF_PAD_EDGE_SHARE, OFF_PAD_SIGMAS, OFF_PAD_TAXELS
 from canprobe.mechanics.types import Floats
 
 _MIN_TAXELS = 4
-_COUNTS = bytes(range(COUNTS_MAX + 1))
+_ALL_COUNTS = bytes(range(COUNTS_MAX + 1))
 
 
 class FeaturesLike(Protocol):
@@ -179,12 +179,12 @@ def compute_patch(
             taxels, dead = mended(taxels)
             counts = taxels.tobytes()
         edges = _edges(counts, pad.shape, window)
-    active = counts.translate(None, _COUNTS[: max(calibration.threshold_counts, 1)])
+    active = counts.translate(None, _ALL_COUNTS[: max(calibration.threshold_counts, 1)])
     n_active, peak = len(active), max(active, default=0)
     pascals = calibration.pascals
     peak_pa, at_pad, at_window = [pascals.item(count) for count in (peak, *edges)]
     pressure = pascals.take(taxels)
-    shows_shape = peak > MIN_PEAK * calibration.threshold_counts
+    shows_shape = peak > MIN_PEAK_RATIO * calibration.threshold_counts
     if window is not None and at_window > MAX_EDGE_SHARE * peak_pa and shows_shape:
         pressure = calibration.continuation.completed(pressure, window, peak_pa)
     total, u, v, *_ = pressure.reshape(-1).dot(calibration.weights).tolist()

@@ -25,15 +25,15 @@ from canprobe.mechanics.touch.patch.image import PatchCalibration, compute_patch
 from canprobe.mechanics.touch.patch.moments import LEVEL_COUNTS, MomentImage
 from canprobe.mechanics.types import Floats
 
-BLUR_PITCH = (0.7, 0.2)
-CROSSTALK = (0.025, 0.01)
-MEMORY = (0.03, 0.02)
+BLUR_PRIOR_PITCH = (0.7, 0.2)
+CROSSTALK_PRIOR = (0.025, 0.01)
+MEMORY_PRIOR = (0.03, 0.02)
 """Mean and standard deviation of what is expected of any array."""
 TOUCH_SIGMA = 0.012
 """Relative error of moments and sums of a touch: gains, hysteresis and creep."""
-SETTLED_S, AGE_S = 0.5, 3.5
+FIRST_IMAGE_S, LAST_IMAGE_S = 0.5, 3.5
 """From the touch to the first image that counts, and to the last: all touches are compared after as much creep."""
-MAX_OF_FULL_SCALE = 0.7
+MAX_PEAK_SHARE = 0.7
 """Peak over full scale above which a touch is left out: taxels bend off before they saturate."""
 MIN_CURVATURE_SHARE = -0.9
 """Least curvature that is looked for, over that of the probe."""
@@ -114,7 +114,7 @@ def what_is_shown(dwell: Dwell, plain: PatchCalibration, age_s: float = math.inf
         UsageError: its images show no patch.
     """
     image_moments, memory = MomentImage(plain), PadMemory()
-    start, end = dwell.t_s[0] + SETTLED_S, dwell.t_s[0] + age_s
+    start, end = dwell.t_s[0] + FIRST_IMAGE_S, dwell.t_s[0] + age_s
     late = []
     sums, moments, ways, at, peaks, kept, bad = [], [], [], [], [], [], 0
     for i, (t, image) in enumerate(zip(dwell.t_s.tolist(), dwell.images, strict=True)):
@@ -154,6 +154,6 @@ def what_is_shown(dwell: Dwell, plain: PatchCalibration, age_s: float = math.inf
         way=dwell.expected[kept],
         t_s=dwell.t_s[kept],
         raw=raw,
-        usable=bad <= 0.2 * len(kept) and peak < MAX_OF_FULL_SCALE * plain.full_scale_pa,
+        usable=bad <= 0.2 * len(kept) and peak < MAX_PEAK_SHARE * plain.full_scale_pa,
         push=float(dwell.push[kept].mean()),
     )

@@ -41,10 +41,10 @@ USUAL_LIGHTNESS = 0.05
 """Level over peak pressure at which the floor holds; it grows in proportion, as light touches cover few taxels."""
 GAIN_LIGHTNESS = 0.25
 """Level over peak pressure from which on the forces of `force_gains` are made larger."""
-_STEP = 1e-3
+_DIFFERENCE_STEP = 1e-3
 """Relative step of the difference quotients, of the curvature relative to the probe and of the force."""
-_ROOT = math.sqrt(2.0)
-_ROUND = 1e-4
+_ROOT2 = math.sqrt(2.0)
+_MIN_CURVATURE_DIFFERENCE = 1e-4
 """Least difference of the principal curvatures, relative, at which the shear of the image is a quotient."""
 
 
@@ -256,7 +256,7 @@ class ImageModel:
             ValueError: where the surface is as hollow as the probe, or nothing is above the level.
         """
         (a, b), (c, s), det = self._principal(k)
-        h = _STEP * a
+        h = _DIFFERENCE_STEP * a
         depth = self.depth(force, det)
         bent = depth * (1.0 + h / a) ** 0.25, depth * (1.0 + h / b) ** 0.25
         shown = self.shown(np.array((depth, *bent)), np.array((a, a + h, a)), np.array((b, b, b + h)))
@@ -264,7 +264,7 @@ class ImageModel:
         # by the entries of K in its own axes, K = 2 A − I/R_p; an isotropic function turns with its argument
         d11, d21, d12, d22 = (0.5 * d / h for d in (a1 - v1, a2 - v2, b1 - v1, b2 - v2))
         apart = 2.0 * (a - b)
-        shear = (v1 - v2) / apart if apart > _ROUND * a else d11 - d12
+        shear = (v1 - v2) / apart if apart > _MIN_CURVATURE_DIFFERENCE * a else d11 - d12
         scale = 1.0 / v[0], 1.0 / math.sqrt(v[0] * v[2]), 1.0 / v[2]
         cc, cs, ss = c * c, c * s, s * s
         rows = []
@@ -272,7 +272,7 @@ class ImageModel:
             by1, by2, by12 = x * d11 + z * d21, x * d12 + z * d22, y * shear
             k11 = weight * (by1 * cc + by2 * ss - by12 * cs)
             k22 = weight * (by1 * ss + by2 * cc + by12 * cs)
-            rows.append((k11, weight * _ROOT * ((by1 - by2) * cs + 0.5 * by12 * (cc - ss)), k22))
+            rows.append((k11, weight * _ROOT2 * ((by1 - by2) * cs + 0.5 * by12 * (cc - ss)), k22))
         here = _in_axes(v1, v2, (c, s))
         residual = np.array([weight * (m - m0) for weight, m, m0 in zip(scale, v, here, strict=True)])
         return np.array(rows), residual, self._information(frames, self._lightness(depth))

@@ -20,7 +20,7 @@ CORRELATED_FRAMES = 20
 """Images in a row whose centroids err alike, about."""
 LAG_STEPS, LAG_STEP_M = 16, 1e-4
 """Of the autocorrelation along the way over the pad."""
-TAU_S = 0.02, 0.3
+TIME_CONSTANTS_S = 0.02, 0.3
 """Time constants of `Lag`."""
 
 
@@ -30,8 +30,8 @@ def _means(t: Floats, at: Floats) -> Floats:
     ways = np.zeros_like(at)
     for i in range(1, len(t)):
         dt = t[i] - t[i - 1]
-        quick = quick + (1.0 - math.exp(-dt / TAU_S[0])) * (at[i] - quick)
-        slow = slow + (1.0 - math.exp(-dt / TAU_S[1])) * (at[i] - slow)
+        quick = quick + (1.0 - math.exp(-dt / TIME_CONSTANTS_S[0])) * (at[i] - quick)
+        slow = slow + (1.0 - math.exp(-dt / TIME_CONSTANTS_S[1])) * (at[i] - slow)
         ways[i] = quick - slow
     return ways
 
