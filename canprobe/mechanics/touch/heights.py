@@ -1,11 +1,11 @@
-"""A surface that is no formula: heights over a grid, as one C² bicubic spline.
+"""A surface without a formula: heights over a grid, as one C² bicubic spline.
 
 Closest point, normal, curvature, gaps and force all come from that spline. A spline through heights at a spacing d is
-true for features of several d: a sharp edge becomes a rounded one, of a radius of about d. Only what is seen from +z
-is a surface; there are no undercuts.
+true for features of several d: a sharp edge becomes a rounded one, with a radius of about d. Only the surface as seen
+from +z is there; undercuts are not.
 
-The closest point is the best of all local minima over the spline's nodes, each polished by Newton. Nothing depends on
-what was asked before: the window that is kept from query to query holds every node that can matter.
+The closest point is the best of all local minima over the spline's nodes, each refined by Newton's method. No answer
+depends on earlier queries: the window that is kept from one query to the next holds every node that can matter.
 
 Source: de Boor, A Practical Guide to Splines (cubic B-splines on equal knots, not-a-knot ends).
 """
@@ -21,38 +21,38 @@ from canprobe.mechanics.touch.shapes import Foot, PlacedShape, TouchedPlaces, re
 from canprobe.mechanics.types import Floats, Vec
 
 MIN_NODES = 8
-"""Along each side of a grid."""
+"""Least number of heights along each side of a grid."""
 MAX_SPACING_M, MAX_RISE_M = 5e-4, 4e-6
-"""Of the nodes over which minima are searched and pressure is summed: their widest spacing, and how much a node may be
-farther than the foot beside it; on a sharp edge half of the grid's spacing stands for that."""
+"""Widest spacing of the nodes over which minima are searched and pressure is summed, and the distance by which a node
+may be farther than the foot beside it. Sharp edges do not make the spacing finer than half of the grid's."""
 MAX_BALL_RADIUS_M = 0.03
-"""Of the ball that touches, as far as the spacing of the nodes depends on it."""
+"""Largest radius of a ball for which the spacing of the nodes is chosen, m."""
 _WINDOW_MARGIN_M = 1.5e-4
-"""How far a query may move before the window of nodes is taken anew."""
+"""Distance of a query from that of the kept window, m, for which the window is made larger than it need be."""
 _MAX_INDENTATION_M = 3e-4
-"""Indentation up to which that window holds all that a ball presses on."""
+"""Largest indentation of a ball for which the window holds all pressed nodes, m."""
 _BLOCK_NODES = 4
 _MAX_RISE_BETWEEN_NODES_M = 5e-5
-"""How far the surface may rise between its nodes, on the safe side."""
+"""Most by which the surface rises between its nodes, m; an upper bound."""
 _MAX_NEWTON_STEPS = 40
 _LAST_STEP_M = 1e-8
-"""A Newton step after which the rest, its square over a radius of curvature, is below 1e-12 m."""
+"""Largest last Newton step: the remaining error, its square over a radius of curvature, is below 1e-12 m."""
 _SAME_PLACE_M = 1e-6
 _NO_HEIGHT_M = -1e3
 _BORDER_SPACINGS = 1e-6
-"""Spacings to the cells on both sides of a node."""
+"""Distance, in spacings, by which a place on a border of cells is moved to look up the cells on both sides."""
 
 _Bends = tuple[float, float, float, float, float, float]
 _Place = tuple[float, float, float, _Bends]
-"""Distance squared of a point to a place of the surface, its x and y, and the spline there."""
+"""Squared distance of a point from a place of the surface, x and y of that place, and the spline there."""
 
 
 class Spline:
     """C² bicubic spline through heights on a grid of equal spacing.
 
     Args:
-        heights: (m, n) m, at x rising along the rows' index, y along the columns'.
-        spacing: m, of both.
+        heights: (m, n) heights, m; x rises with the row's index, y with the column's.
+        spacing: spacing along both, m.
         corner: (2,) x and y of the first height, m.
     """
 
@@ -146,22 +146,22 @@ def _coefficients(f: Floats) -> Floats:
 
 
 class Heights(PlacedShape):
-    """Surface over a grid of heights, solid below, ending at the grid's border. z of its frame is that of the heights.
+    """Surface over a grid of heights, solid below, that ends at the grid's border. Heights are along z of its frame.
 
-    A ball may bridge a groove or stand on an edge: what presses on it follows from the gaps all over the pad, not from
-    one curvature (`by_gaps`).
+    A ball may bridge a groove or stand on an edge, so the pressure on it follows from the gaps all over the pad and not
+    from one curvature (`by_gaps`).
 
     Args:
         T_base_object: (4, 4) pose, m.
-        heights: (m, n) m, 8 or more along each side; x rises with the first index, y with the second.
-        spacing: of the grid, m.
-        origin: (2,) point of the grid that is the object's origin, from the grid's middle, m; the surface there gets
-            the height 0.
-        there: (m, n) whether the surface exists at a node; between nodes it does where it exists at all four round the
-            place. None: everywhere.
+        heights: (m, n) heights, m, 8 or more along each side; x rises with the first index, y with the second.
+        spacing: spacing of the grid, m.
+        origin: (2,) point of the grid that becomes the object's origin, from the grid's middle, m; the surface there
+            gets the height 0.
+        there: (m, n) whether the surface exists at a node; a place between nodes has a surface where all four nodes
+            round it have one. None: the surface is everywhere.
 
     Raises:
-        ValueError: for heights that are no finite grid, or an origin beside the surface.
+        ValueError: the heights are not a finite grid, or the origin lies beside the surface.
     """
 
     by_gaps = True
@@ -271,7 +271,7 @@ class Heights(PlacedShape):
         return feet if len(feet) == 1 else sorted(feet)
 
     def _polished(self, u: float, v: float, x: float, y: float, z: float) -> _Place:
-        """The stationary point of the distance near (u, v), by Newton of at most a node's spacing a step."""
+        """The stationary point of the distance near (u, v), by Newton steps of at most a node's spacing."""
         at, most, node = self.spline.at, self._step, (u, v)
         (u0, v0), (u1, v1) = self.spline.corner, self.spline.far
         for _ in range(_MAX_NEWTON_STEPS):
@@ -326,12 +326,12 @@ class Heights(PlacedShape):
         )
 
     def _tightest_anywhere(self) -> float:
-        """At the origin: elsewhere a ball bridges what is tighter."""
+        """The hollow at the origin: elsewhere a ball bridges a tighter one."""
         tightest = self._foot_at((0.0, 0.0, 0.0, self.spline.at(0.0, 0.0)), 0.0, 0.0, 0.0)[8]
         return -1.0 / tightest if tightest < -1e-12 else inf
 
     def touches(self, point_base: npt.ArrayLike, reach: float) -> TouchedPlaces | None:
-        """Every local minimum of the distance within reach, where there are several: edges of a groove, say."""
+        """Every local minimum of the distance within reach, where there are several, as on the edges of a groove."""
         x, y, z = self._to_object(np.asarray(point_base, dtype=float)[None])[0].tolist()
         near = [place for place in self._minima(x, y, z, reach) if place[0] < reach * reach]
         if len(near) < 2:
@@ -342,7 +342,7 @@ class Heights(PlacedShape):
     def gaps(self, points_base: Floats) -> Floats:
         """Distances of (n, 3) points to the tangent over or under them, (n,) m: first order near the surface.
 
-        Of points higher than all of the surface near them it is only known that they do not touch; 1 m stands for that.
+        A point higher than all of the surface near it does not touch; its gap is given as 1 m.
         """
         x, y, z = self._to_object(points_base).T
         gaps, near = np.ones(len(x)), self.exists(x, y)
@@ -367,7 +367,7 @@ class Heights(PlacedShape):
         return inside
 
     def squeezed(self, centre_base: Vec, radius: float) -> float:
-        """Volume by which the layer of a ball is squeezed, m³; times its stiffness that is the force.
+        """Volume by which the layer of a ball is squeezed, m³; the force is this volume times the stiffness K/h.
 
         Each column of the layer is pressed along its own radius: the sum over the nodes inside the ball of
         ``(R − |r|) R² dΩ``.

@@ -1,4 +1,4 @@
-"""One Gauss–Newton step of the robust fit: what `nonlinear.fit` iterates, for those who cannot wait."""
+"""One Gauss–Newton step of the robust fit that `nonlinear.fit` iterates, for a loop with bounded work per call."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from canprobe.mechanics.touch.estimate.residuals import Design, linearise
 from canprobe.mechanics.types import Floats
 
 _STEP_SHARES = (1.0, 0.25)
-"""Shares of a step that are tried."""
+"""Shares of a step that are tried, in this order."""
 SETTLED_STEP = 0.1
-"""Squared length of a step, in standard deviations, below which an answer has settled."""
+"""Largest squared length of a step, in standard deviations, of an answer that has settled."""
 
 
 class Solved(NamedTuple):
@@ -23,13 +23,13 @@ class Solved(NamedTuple):
 
     Attributes:
         c: (9,) parameters.
-        cost: robust, with the prior's part and the log-determinant of the noise.
-        rows: (n, 3, 18) whitened, weighted: of the parameters and of the terms that a quadric leaves out.
+        cost: robust cost, with the prior's part and the log-determinant of the noise.
+        rows: (n, 3, 18) whitened and weighted rows of the parameters and of the terms that a quadric leaves out.
         r: (n, 3) their residuals.
-        weight: (n,) of the samples.
+        weight: (n,) weights of the samples.
         target: (9,) solution of the linearised problem.
-        root: (9, 9) of its information.
-        decision: on the data.
+        root: (9, 9) root of its information.
+        decision: rank decision on the data.
     """
 
     c: Floats
@@ -67,10 +67,10 @@ def solved_once(c: Floats, d: Design, prior: tuple[Floats, Floats]) -> Solved:
 
 
 def gauss_newton(now: Solved, d: Design, prior: tuple[Floats, Floats]) -> Solved:
-    """The next one at the target, or nearer where the step from there is longer; `now` where that is no better either.
+    """The problem solved at the target, or at a quarter of the way; `now` where both are worse.
 
-    The length of the next step says whether a step was good, not the cost: the whitening changes with K, so the place
-    where the steps end is not quite where the cost is least.
+    A step is worse if the next step from there is longer. Why not compare costs: the whitening changes with K, so the
+    place where the steps end is not quite where the cost is least.
 
     Source: Deuflhard, "Newton methods for nonlinear problems", 2004 (the natural monotonicity test).
     """

@@ -14,7 +14,7 @@ import numpy as np
 from canprobe.mechanics.types import Floats
 
 TO_Q = np.array([1.0, math.sqrt(2.0), 1.0])
-"""K11, K12, K22 to q = (K11, √2 K12, K22), in which a rotation of the frame is orthogonal."""
+"""Factors from K11, K12, K22 to q = (K11, √2 K12, K22), in which a rotation of the frame is orthogonal."""
 C_PER_Q = 0.5 / TO_Q
 """c11, c12, c22 per unit of q."""
 
@@ -30,7 +30,7 @@ _CONSTANT[2, 3] = _CONSTANT[3, 2] = -0.5
 STACKED_BASIS = np.concatenate([_BASIS, _CONSTANT[None]]).transpose(1, 0, 2).reshape(4, 40)
 """S as the sum of ten matrices, side by side."""
 STACKED_ENTRIES = np.array([[40 * i + 4 * k + j for k in range(10)] for i, j in (*_ENTRY_INDICES, (2, 3))])
-"""Where the parameters stand in each of them, and c34."""
+"""Flat indices of the nine parameters, and of c34, in each of those ten matrices."""
 
 
 def matrix_of(c: Floats) -> Floats:

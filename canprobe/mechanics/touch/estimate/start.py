@@ -1,9 +1,9 @@
-"""The first stretch of a filter: all its contacts at once, by one Gauss–Newton step whenever some more have come.
+"""The first stretch of a filter: all its contacts are solved together, by one Gauss–Newton step for each step of path.
 
-A filter that is linearised on a plane would be off by the tilt of a curved surface along the first stretch, and would
-keep it. So the contacts of the first stretch are kept and solved together. The solution is never iterated to the end:
-each call takes one step from the last answer on the data that are there by now, which bounds the work of every call
-(the real-time iteration of model predictive control); by the end of the stretch it has settled.
+A filter that begins linearised on a plane would be off by the tilt of a curved surface along the first stretch, and
+would keep that error. So the contacts of the first stretch are kept and solved together. The solution is never iterated
+to convergence: each call takes one step from the last answer on the data so far, which bounds the work of every call
+(the real-time iteration of model predictive control). By the end of the stretch it has settled.
 
 Source: Diehl, Bock and Schlöder, "A real-time iteration scheme for nonlinear optimization in optimal feedback
 control", 2005.
@@ -25,15 +25,15 @@ from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotatio
 from canprobe.mechanics.types import Floats
 
 FIRST_SOLUTION_SHARE = 0.1
-"""Travel over the memory at the first solution."""
+"""Travel, over the memory, at the first solution."""
 TAKEOVER_SHARE = 0.4
-"""Travel over the memory at which the filter takes over, once the solution has settled."""
+"""Travel, over the memory, from which on the filter takes over once the solution has settled."""
 LATEST_TAKEOVER_SHARE = 0.8
-"""Travel over the memory at which it takes over even where the solution still moves."""
+"""Travel, over the memory, at which it takes over even if the solution still moves."""
 MAX_CONTACTS = 128
-"""Contacts that are kept; of more every second one goes."""
+"""Most contacts that are kept; when there are more, every second one is dropped."""
 _FRAME_CONTACTS = 5
-"""Contacts whose median place and normal make the working frame."""
+"""Number of contacts whose median place and normal make the working frame: medians, as one may be wrong."""
 
 
 class Start:
@@ -41,8 +41,8 @@ class Start:
 
     Attributes:
         T: (4, 4) working frame of the solution to base, m.
-        solution: None before there is one.
-        settled: the solution is one: its last step was small, and all of K was observed or the stretch is over.
+        solution: the solution so far; None before the first.
+        settled: whether the last step was small, and all of K was observed or the stretch is over.
         travelled: path so far, m.
     """
 
@@ -73,14 +73,17 @@ class Start:
         if share < FIRST_SOLUTION_SHARE:
             return
         if self.solution is None:
-            self.T = _frame(self._touches[-_FRAME_CONTACTS:])
+            last = self._touches[-_FRAME_CONTACTS:]
+            normal = np.median([t.normal for t in last], axis=0)
+            normal = normal / np.sqrt(normal @ normal)
+            self.T = homogeneous(tangent_rotation(-normal), np.median([t.point for t in last], axis=0))
         d = batch_design(self.T, self._length, self._touches)
         if share < TAKEOVER_SHARE and float(np.linalg.eigvalsh(spread_of(d.X, d.point_variance))[0]) < MIN_SPREAD:
             return
         self._improve(d, share >= TAKEOVER_SHARE)
 
     def _improve(self, d: Design, stretch_over: bool) -> None:
-        """From the better of the last solution and, until that has settled, a linear one."""
+        """Take a step from the last solution or, until that has settled, from a linear one where that costs less."""
         now = None if self.solution is None else solved_once(self.solution.target, d, self._prior)
         if now is None or not self.settled:
             spread = spread_of(d.X, d.point_variance)
@@ -94,10 +97,10 @@ class Start:
 
 
 def isolation(points: Floats, variance: Floats) -> Floats:
-    """Weights (n,) of points (n, 3) along a path: far below 1 for single ones that lie off between their neighbours.
+    """Weights (n,) of points (n, 3) along a path: far below 1 for a single point far from its neighbours.
 
-    A point is compared with the median of the five about it. What is usual is the median of these distances, and never
-    less than the variance (n,) of the points' noise per axis.
+    A point is compared with the median of the five about it. Its squared distance is measured by the median of all, or
+    by the variance (n,) of the points' noise per axis where that is larger.
     """
     if len(points) < 5:
         return np.ones(len(points))
@@ -108,10 +111,3 @@ def isolation(points: Floats, variance: Floats) -> Floats:
     usual = 9.0 * np.maximum(float(np.median(square)), variance)
     result: Floats = usual / np.maximum(square, usual)
     return result
-
-
-def _frame(touches: Sequence[MeasuredContact]) -> Floats:
-    """A frame (4, 4) at the median place of contacts, z against their median normal."""
-    normal = np.median([t.normal for t in touches], axis=0)
-    normal = normal / np.sqrt(normal @ normal)
-    return homogeneous(tangent_rotation(-normal), np.median([t.point for t in touches], axis=0))

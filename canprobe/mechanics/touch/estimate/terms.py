@@ -1,9 +1,9 @@
 """The eighteen terms of f: nine of the quadric, and the cubic and quartic ones that it leaves out.
 
-The latter are terms `Σ a_j φ_j(x, y)` of the height over the tangent plane, φ all monomials of third and fourth
-degree, each times the root of its binomial coefficient, so that independent a of one variance mean the same in all
-directions. All terms are polynomials of the place, so values, gradients and changes of the origin are each one
-product of a constant matrix with the place's monomials.
+The latter are terms `Σ a_j φ_j(x, y)` of the height over the tangent plane. φ are all monomials of third and fourth
+degree, each times the root of its binomial coefficient: then independent a of one variance have the same distribution
+in axes that are turned. All terms are polynomials of the place, so values, gradients and changes of the origin are each
+one product of a constant matrix with the place's monomials.
 """
 
 from __future__ import annotations
@@ -19,10 +19,13 @@ _POWER_Y = (0, 1, 2, 3, 0, 1, 2, 3, 4)
 DEGREE = np.array([3, 3, 3, 3, 4, 4, 4, 4, 4])
 """(9,) degree of each term that a quadric leaves out."""
 _HIGHER_FACTOR = [math.sqrt(math.comb(int(n), k)) for n, k in zip(DEGREE, _POWER_Y, strict=True)]
+"""Root of the binomial coefficient of each of them."""
 _HIGHER = [(int(n) - k, k, 0) for n, k in zip(DEGREE, _POWER_Y, strict=True)]
+"""Powers of x, y, z in each of them."""
 _QUADRIC = [(1, 0, 0), (0, 1, 0), (0, 0, 0), (1, 0, 1), (0, 1, 1), (0, 0, 2), (2, 0, 0), (1, 1, 0), (0, 2, 0)]
 """Powers of x, y, z in the terms of the nine parameters, in their order."""
 _QUADRIC_FACTOR = [2.0, 2.0, 1.0, 2.0, 2.0, 1.0, 1.0, 2.0, 1.0]
+"""Factors of these terms: an entry off the diagonal of S stands in it twice."""
 _POWERS = [
     (0, 0, 0),
     (1, 0, 0),
@@ -78,7 +81,10 @@ _DERIVATIVE_TABLES = {count: _derivatives()[:, :, :count].reshape(len(_POWERS), 
 
 
 def terms(X: Floats, count: int = 18) -> Floats:
-    """Values and derivatives by x, y, z (n, 4, count) of the first terms of f, the quadric's nine first, at (n, 3)."""
+    """Values and derivatives by x, y, z (n, 4, count) of the first `count` terms of f at places (n, 3).
+
+    The quadric's nine terms come first; `count` is 9 or 18.
+    """
     values: Floats = _monomials(*X.T).T.dot(_DERIVATIVE_TABLES[count]).reshape(len(X), 4, count)
     return values
 

@@ -29,15 +29,16 @@ class WindowEstimator:
     """Base of the estimators that keep their last samples and solve them as a batch when asked.
 
     Args:
-        sigma_point, sigma_normal: effective noise, m and rad; with differences they only enter covariance and flags.
-        window: samples that are kept.
-        prior: of `ml`; None for `Prior.weak` over the extent of the window.
-        coupling: of the errors of point and normal (`Noise`), 1/m; of `ml`.
-        correlation: of the noise along the path; of `ml`.
+        sigma_point, sigma_normal: effective standard deviations of points and normals, m and rad; the methods of
+            differences use them for covariance and flags only.
+        window: number of samples that are kept.
+        prior: prior of `ml`; None for `Prior.weak` over the extent of the window.
+        coupling: coupling of the errors of point and normal (`Noise`) for `ml`, 1/m.
+        correlation: correlation of the noise along the path, for `ml`.
     """
 
     least = 2
-    """Fewer samples give no answer."""
+    """Least number of samples that give an answer."""
 
     def __init__(
         self,
@@ -91,10 +92,10 @@ class WindowEstimator:
 
 
 class MlEstimator(WindowEstimator):
-    """Nine-parameter Gauss–Newton over a window (`nonlinear`): the reference, some milliseconds an answer.
+    """Nine-parameter Gauss–Newton over a window (`likelihood`): the reference, some milliseconds an answer.
 
-    A window over a change of the surface has no quadric, and its last samples would be taken for wrong ones. So they
-    are held against the fit first; where they disagree as a changed surface does, what was before is forgotten.
+    No quadric describes a window over a change of the surface, and its last samples would be taken for outliers. So
+    they are compared with the fit first; where they disagree as after a change, earlier samples are forgotten.
     """
 
     def _solve(self, touches: ContactBatch) -> SurfaceEstimate:
