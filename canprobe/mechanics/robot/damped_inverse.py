@@ -1,4 +1,4 @@
-"""The inverse of the Jacobian by damped least squares, damped only near singular poses."""
+"""One step of the inverse Jacobian by damped least squares, damped only near singular poses."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ def damped_step(J: Floats, twist: Floats, wish: Floats | None = None) -> Floats:
     """Joint rates for a tool twist.
 
     Away from singular poses this is the exact inverse, of least norm where there are more joints than rows. Where the
-    smallest singular value s falls below the threshold the squared damping rises as
-    0.05^2 (1 - (s / 0.08)^2), on all directions alike, so that rates stay bounded and continuous.
+    smallest singular value s falls below the threshold, the squared damping rises as 0.05^2 (1 - (s / 0.08)^2), equally
+    in all directions, so that rates stay bounded and continuous. Why not always damped: the tool would lag at every
+    pose.
 
     Args:
         J: (m, n) rows of the geometric Jacobian that the arm can hold, linear rows first, see `task_rows`.
-        twist: (m,) linear m/s then angular rad/s, or a displacement: the map is linear.
-        wish: (n,) rates that the joints have as far as the tool does not notice; none by default.
+        twist: (m,) twist, linear rows in m/s, then angular ones in rad/s; or a displacement, as the map is linear.
+        wish: (n,) wanted joint rates; only their part in the null space, which does not move the tool, is used.
 
     Returns:
         (n,) joint rates, rad/s or m/s.
@@ -42,7 +43,7 @@ def damped_step(J: Floats, twist: Floats, wish: Floats | None = None) -> Floats:
 
 
 def _regular_step(J: Floats, twist: Floats) -> Floats | None:
-    """The exact inverse where it is cheap to see that no damping is due (1/‖J⁻¹‖ is below every singular value)."""
+    """The exact step where a cheap test rules out damping (1/‖J⁻¹‖ is below every singular value); else None."""
     try:
         inverse = np.linalg.inv(J)
     except np.linalg.LinAlgError:

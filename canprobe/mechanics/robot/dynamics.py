@@ -1,8 +1,7 @@
 """Rigid-body dynamics of any arm: mass matrix, Coriolis and centrifugal torques, gravity; computed by MuJoCo.
 
-Equation of motion: ``M(q) q'' + b(q, q') = tau``, all at the joints; b holds gravity. Motors, gears and friction are
-not in it (``canprobe.mechanics.robot.model``). MuJoCo is in the extra `dynamics` and is imported where a `RigidBody` is
-made.
+Equation of motion: ``M(q) q'' + b(q, q') = tau``, all at the joints; b includes gravity. Motors, gears and friction are
+not in it (`motors`). MuJoCo is in the extra `dynamics` and is imported when a `RigidBody` is made.
 """
 
 from __future__ import annotations
@@ -21,15 +20,15 @@ from canprobe.mechanics.types import Floats
 
 GRAVITY_M_S2 = 9.81
 _PLACEHOLDER_INERTIAL = '<inertial pos="1 2 3" quat="1 2 3 4" mass="1" diaginertia="1 1.1 1.2"/>'
-"""A body that MuJoCo's compiler neither refuses nor simplifies; the real one, which it may refuse, follows after."""
+"""A body that MuJoCo's compiler neither refuses nor simplifies; it is replaced by the real one, which it may refuse."""
 
 
 def dynamics_problem(name: str, bodies: Sequence[Body | None] | None) -> str | None:
-    """Why an arm cannot be emulated with its dynamics, and what mends it; None where it can.
+    """Why an arm cannot be emulated with its dynamics, and what to do about it; None where it can.
 
     Args:
-        name: of the arm.
-        bodies: (n,) of its joints; None where nobody knows them.
+        name: name of the arm.
+        bodies: (n,) bodies of its joints; None where they are not known.
     """
     lead = 'plant.fidelity = "dynamic"'
     if bodies is None:
@@ -60,21 +59,21 @@ def ball(mass: float, radius: float, centre: Floats) -> Body:
     """A homogeneous ball.
 
     Args:
-        mass: kg.
-        radius: m.
-        centre: (3,) m.
+        mass: mass, kg.
+        radius: radius, m.
+        centre: (3,) centre, m.
     """
     return Body(mass, centre, 0.4 * mass * radius**2 * np.eye(3))
 
 
 def joined(a: Body | None, b: Body) -> Body:
-    """Two bodies of one frame as one.
+    """Two bodies in one frame as one body.
 
     Args:
-        a: None for nothing.
-        b: the other.
+        a: first body; None for none.
+        b: second body.
 
-    Source: parallel axes (Steiner).
+    Source: parallel axis theorem (Steiner).
     """
     if a is None or a.mass + b.mass == 0.0:
         return b
@@ -91,9 +90,9 @@ class RigidBody:
     """Dynamics of one arm with what it carries.
 
     Args:
-        chain: its geometry.
-        bodies: (n,) of its joints; None for a joint that carries nothing itself. Numbers that no solid could have are
-            taken as they are, as published tables leave out what does not matter.
+        chain: geometry of the arm.
+        bodies: (n,) bodies of its joints; None for a joint without one. Values that no solid could have are used as
+            they are, as published tables leave out what does not matter.
         gravity: acceleration of free fall along base -z, m/s^2.
 
     Raises:
@@ -104,7 +103,7 @@ class RigidBody:
         problem = dynamics_problem(chain.name, bodies)
         if problem is not None:
             raise PlanError([problem])
-        import mujoco  # late: of the extra `dynamics`
+        import mujoco  # here, as it is in the extra `dynamics`
 
         self._mujoco: Any = mujoco
         text = "".join(_opened(mujoco, T, slides) for T, slides in zip(chain.fixed, chain.prismatic, strict=True))
@@ -124,12 +123,12 @@ class RigidBody:
         """Mass matrix and bias.
 
         Args:
-            q: (n,) rad or m.
-            qd: (n,) rad/s or m/s.
+            q: (n,) joint positions, rad or m.
+            qd: (n,) joint rates, rad/s or m/s.
 
         Returns:
-            (n, n) M, kg m^2 (kg m and kg where joints slide), and (n,) bias: torque or force that holds the joint rates
-            constant against gravity, Coriolis and centrifugal effects, N m or N.
+            M (n, n), kg m^2 (kg m and kg where joints slide), and bias (n,): torques or forces that keep the joint
+            rates constant against gravity, Coriolis and centrifugal effects, N m or N.
         """
         made, data, mass = self._model, self._data, np.empty_like(self._armature)
         data.qpos[:], data.qvel[:] = q, qd
@@ -139,10 +138,10 @@ class RigidBody:
         return mass - self._armature, data.qfrc_bias.copy()
 
     def gravity(self, q: npt.ArrayLike) -> Floats:
-        """(n,) torque that carries the arm's weight at rest, N m or N.
+        """(n,) torques that carry the arm's weight at rest, N m or N.
 
         Args:
-            q: (n,) rad or m.
+            q: (n,) joint positions, rad or m.
         """
         return self.terms(q, np.zeros(len(self._armature)))[1]
 

@@ -31,20 +31,20 @@ class AtRest:
         self._mean += from_mean / self._n
         self._spread += from_mean * (force - self._mean)
 
-    def doubt(self, target: float, felt: bool) -> str | None:
+    def doubt(self, target: float, stiffness_known: bool) -> str | None:
         """Why the force is not the wanted one; None where it is, or where that is not known yet.
 
         Args:
             target: wanted force, N.
-            felt: whether the touch showed the layer's stiffness (`PushFit`).
+            stiffness_known: whether the touch showed the layer's stiffness (`PushFit`).
         """
         if self._n < MIN_REST_SAMPLES:
             return None
-        if not felt and self._saturated > MAX_SATURATED_SHARE * self._n:
+        if not stiffness_known and self._saturated > MAX_SATURATED_SHARE * self._n:
             return (
                 f"the array is saturated in {100.0 * self._saturated / self._n:.0f} % of the samples and no stiffness "
-                f"was felt: the true force is above the {self._mean:.1f} N measured; raise sensor.full_scale_kpa or "
-                "lower task.force_n"
+                f"was measured: the true force is above the measured {self._mean:.1f} N; raise sensor.full_scale_kpa "
+                "or lower task.force_n"
             )
         sigma = math.sqrt(self._spread / (self._n - 1))
         if sigma > MAX_FORCE_SPREAD * target:

@@ -95,8 +95,8 @@ def find_crossings(
 ) -> list[Crossing]:
     """Places where two passes come close, one pair of patches for each; radius and gap as for `check_consistency`.
 
-    Of the pairs within the radius the closest is taken; others whose contacts both lie within two radii of its
-    contacts along the path are the same crossing. A path that follows itself gives one every two radii.
+    The closest of the pairs within the radius is taken; others whose contacts both lie within two radii of its contacts
+    along the path are the same crossing. A path that follows itself gives one crossing every two radii.
     """
     limit = positive("radius", radius)
     least = positive("gap", gap) if gap is not None else MEMORY_SCALE * surface_map.memory

@@ -35,7 +35,7 @@ class ClosestPoint:
     """The surface point nearest to a query point, in the base frame.
 
     Attributes:
-        point: (3,) m.
+        point: (3,) closest point, m.
         normal: (3,) outward unit normal of the body there.
         distance: signed distance of the query point, m, positive outside.
         kappa: (2,) principal curvatures, 1/m, larger first, positive for convex.

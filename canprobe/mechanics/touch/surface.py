@@ -150,7 +150,7 @@ class SurfaceMatrix:
         """Shape operator at a point of the surface.
 
         Args:
-            point: (3,) m.
+            point: (3,) point on the surface, m.
 
         Returns:
             The shape operator (2, 2) in 1/m, positive where convex, and its tangent basis (3, 2), the x and y axes of
@@ -172,7 +172,7 @@ class SurfaceMatrix:
         """z of the surface over (x, y), the root that is 0 at the contact; NaN where there is none.
 
         Args:
-            x, y: m, in a contact frame (or any frame where the z axis crosses the surface near the origin).
+            x, y: places, m, in a contact frame (or any frame where the z axis crosses the surface near the origin).
 
         Returns:
             z, m, in the shape of x and y.

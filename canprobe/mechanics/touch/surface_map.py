@@ -204,7 +204,7 @@ class SurfaceMap:
             if after < before:
                 raise UsageError(
                     f"patches[{i}].travelled_m: expected at least {before} of the one before, got {after}; patches"
-                    " stand in the order in which they were felt"
+                    " stand in the order in which they were measured"
                 )
 
     def __len__(self) -> int:

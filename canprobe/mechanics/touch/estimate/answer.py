@@ -1,4 +1,4 @@
-"""The answer of an estimator: local shape at the last contact, with what is known about it and what is not."""
+"""The answer of an estimator: local shape at the last contact, its covariance, and what was not observed."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ class SurfaceEstimate:
         kappa: (2,) principal curvatures, κ1 ≥ κ2, 1/m. With one observed it stands first, whatever its size, and is the
             normal curvature along `directions[0]`.
         directions: (2, 3) rows: unit vectors of `kappa` in the frame of the points.
-        covariance: (3, 3) of (K11, K12, K22), 1/m².
-        observed: (2,) bool, for each of `kappa`.
+        covariance: (3, 3) covariance of (K11, K12, K22), 1/m².
+        observed: (2,) whether each of `kappa` was observed.
         rank: how many independent combinations of (K11, K12, K22) were observed, 0–3 (thresholds: `quadric`).
         combinations: (rank, 3) rows: the observed ones as weights of (K11, √2 K12, K22).
         information: (3, 3) information of the data about (K11, √2 K12, K22), m²; finite also where nothing is observed.

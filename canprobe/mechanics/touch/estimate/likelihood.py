@@ -39,7 +39,7 @@ class ContactBatch(NamedTuple):
     """Checked input of a batch fit.
 
     Attributes:
-        points, normals: (n, 3) m and unit vectors; the answer is at the last row.
+        points, normals: (n, 3) points, m, and outward unit normals; the answer is at the last row.
         noise: noise of the n samples.
         extent: largest distance from the last point, but at least `_MIN_EXTENT_SIGMAS` of noise, m: the unit of length
             of the problem.
@@ -184,8 +184,8 @@ def cramer_rao(
     method. Sorted principal curvatures are not differentiable at umbilics, so the bound is on the entries of K.
 
     Args:
-        points: (n, 3) m, on the true surface, or measured: not further off than `MAX_OFF_SURFACE_SIGMAS` times their
-            noise; the bound is for the last row.
+        points: (n, 3) points on the true surface, or measured, m: not further off than `MAX_OFF_SURFACE_SIGMAS` times
+            the noise; the bound is for the last row.
         normals: (n, 3) outward unit normals.
         S: (4, 4) matrix of the true surface in the frame of the points.
         sigma_point, sigma_normal, prior, correlation, coupling: as for `fit_surface`; the prior is that of the

@@ -35,12 +35,12 @@ MIN_INFORMATION_SHARE = 1e-12
 
 
 class Decision(NamedTuple):
-    """What is known about q, combination by combination.
+    """Information about q, combination by combination, and which combinations were observed.
 
     Attributes:
-        information: (3,) information 1/σ² of each; 0 for what the points were not spread for.
-        vectors: (3, 3) columns, orthonormal in q.
-        passed: (3,) bool.
+        information: (3,) information 1/σ² about each; 0 where the points were not spread for it.
+        vectors: (3, 3) columns: the combinations, orthonormal in q.
+        passed: (3,) whether each combination counts as observed.
     """
 
     information: Floats
@@ -54,17 +54,17 @@ class Decision(NamedTuple):
 
 
 def nothing_observed() -> Decision:
-    """The decision where a model does not hold."""
+    """The decision where the model does not hold: nothing was observed."""
     return Decision(np.zeros(3), np.eye(3), np.zeros(3, dtype=bool))
 
 
 def decide(root_q: Floats, spread: Floats, curvature: float) -> Decision:
-    """Rank decision.
+    """Rank decision by the rules of this module.
 
     Args:
         root_q: (m, 3) root of the data's information about q, all else unknown, dimensionless.
         spread: (2, 2) covariance of the points in the tangent plane over the variance of their noise.
-        curvature: ‖K‖, dimensionless.
+        curvature: norm ‖K‖, dimensionless.
     """
     axes, wide = excited(spread)
     if wide.all():
@@ -88,8 +88,13 @@ def _least(curvature: float, largest: float) -> float:
 
 
 def excited(spread: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """As columns (3, 3) in q the curvature along the main axis of a spread, the twist, and across; and for which of
-    them (3,) the points were spread.
+    """Combinations of q along the main axes of a spread, and whether the points were spread for them (rule 1).
+
+    Args:
+        spread: (2, 2) as for `decide`.
+
+    Returns:
+        Columns (3, 3) in q: curvature along the main axis, twist, curvature across; and a flag (3,) for each.
     """
     mean, radius, angle = principal(spread)
     return turned(angle).T, np.array([mean + radius, mean, mean - radius]) >= MIN_SPREAD

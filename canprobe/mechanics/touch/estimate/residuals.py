@@ -121,10 +121,10 @@ def linearise(c: Floats, d: Design) -> LinearisedResiduals:
     V[:, 0], V[:, 1:] = g * inverse[:, None], d.T
     r[:, 1:] = (d.T @ V[:, 0, :, None])[:, :, 0]
     bend = V.reshape(-1, 3).dot(B).reshape(V.shape) @ d.T.mT * inverse[:, None, None]
-    felt = bend[:, 1:] + d.noise.coupling * np.eye(2)  # turn of the normal against the surface by an error of the point
-    W = _whitener(felt, V[:, 0], d)
+    turn = bend[:, 1:] + d.noise.coupling * np.eye(2)  # turn of the normal against the surface by an error of the point
+    W = _whitener(turn, V[:, 0], d)
     r = (W @ r[:, :, None])[:, :, 0]
-    X = _likely_places(d, X, (r[:, None] @ W)[:, 0], felt, V[:, 0])
+    X = _likely_places(d, X, (r[:, None] @ W)[:, 0], turn, V[:, 0])
     g = X.dot(B) + h
     inverse = 1.0 / np.sqrt(np.einsum("ij,ij->i", g, g))
     V[:, 0] = g * inverse[:, None]

@@ -82,7 +82,7 @@ class WindowEstimator:
         raise NotImplementedError
 
     def _row(self, sample: ContactSample) -> Sequence[float]:
-        """What is kept of a sample: point, normal, their standard deviations; a subclass adds what it needs."""
+        """The row that is kept of a sample: point, normal, their standard deviations; a subclass adds what it needs."""
         return (*sample.p_base.tolist(), *sample.n_base.tolist(), *self._gate.sigmas(sample))
 
     def _touches(self) -> ContactBatch:
@@ -117,8 +117,8 @@ def _squared_residuals(answer: SurfaceEstimate, touches: ContactBatch) -> Floats
     size = np.sqrt(np.einsum("ij,ij->i", gradient, gradient))
     tilt = gradient / size[:, None] - touches.normals @ answer.T_frame_contact[:3, :3]
     point = touches.noise.point_variance
-    felt = np.abs(answer.kappa).max() + touches.noise.coupling
-    normal = touches.noise.normal_variance + felt**2 * point
+    turn = np.abs(answer.kappa).max() + touches.noise.coupling
+    normal = touches.noise.normal_variance + turn**2 * point
     result: Floats = (answer.surface.value(places) / size) ** 2 / point + np.einsum("ij,ij->i", tilt, tilt) / normal
     return result
 

@@ -17,19 +17,24 @@ from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotatio
 from canprobe.mechanics.types import Floats
 
 MIN_NAMED_SHARE = 0.1
-"""Share of the information about K that the patch gives from which on the estimate's method names it."""
+"""Least share of the patch in the information about K at which the estimate's method names it."""
 CONTRADICTION_NOTE = "the patch contradicts the motion"
 WITHDRAWAL_SHARE = 0.25
-"""Path over the memory after which a contradiction that lasts withdraws that anything was observed."""
+"""Path, over the memory, along which a contradiction must last before nothing is called observed any more."""
 _TO_K = 1.0 / np.outer(TO_Q, TO_Q)
 
 
 def with_patch(motion: SurfaceEstimate, found: Fused, length: float, *, withdrawn: bool = False) -> SurfaceEstimate:
-    """A motion estimate with its `evidence`, and what was found of that and the patch.
+    """A motion estimate, with its curvature replaced by that of motion and patch together.
 
-    Place, normal and c13, c23, c33 stay the motion's; the patch says nothing about them. Curvatures below 1/length (the
-    memory, m) count as flat; `withdrawn`: nothing is called observed. The `method` ends in "+patch" where the patch
-    gave at least `MIN_NAMED_SHARE`; a note says how much.
+    Place, normal and c13, c23, c33 stay the motion's; the patch says nothing about them. The `method` ends in "+patch"
+    where the patch gave at least `MIN_NAMED_SHARE`; a note gives its share.
+
+    Args:
+        motion: the estimate, with its `evidence`.
+        found: the curvature of both (`PatchCurvature.fuse`).
+        length: memory of the estimator, m; curvatures below its inverse count as flat.
+        withdrawn: whether nothing is called observed.
     """
     assert motion.evidence is not None
     weight = CHI2_95 / max(found.cost, CHI2_95)
@@ -37,9 +42,16 @@ def with_patch(motion: SurfaceEstimate, found: Fused, length: float, *, withdraw
     has_prior = motion.rank < 3 and bool(np.isfinite(motion.covariance).all())
     data = weight * motion.information if has_prior else evidence
     decision = nothing_observed() if withdrawn else _decide(data + patch, found.q, length)
-    root = None if motion.model_root is None else _joined(math.sqrt(weight) * motion.model_root, patch)
+    root = None
+    if motion.model_root is not None:
+        rows = np.zeros((3, 9))
+        rows[:, 6:] = _root(patch) / C_PER_Q
+        root = np.concatenate([math.sqrt(weight) * motion.model_root, rows])
     inverse = inverted(evidence + patch)
     share = float((inverse * patch).sum()) / 3.0
+    notes = [f"{100.0 * share:.0f} % of the curvature from the patch"]
+    if found.contradicted:
+        notes.append(CONTRADICTION_NOTE)
     return build_estimate(
         _solution(motion.S, found.q, inverse, decision, has_prior=has_prior, root=root),
         length=1.0,
@@ -50,13 +62,16 @@ def with_patch(motion: SurfaceEstimate, found: Fused, length: float, *, withdraw
         samples=motion.samples,
         method=motion.method + "+patch" if share >= MIN_NAMED_SHARE else motion.method,
         prior=motion.prior,
-        notes=(*motion.notes, *_notes(found, share)),
+        notes=(*motion.notes, *notes),
         stiffness=found.stiffness,
     )
 
 
 def patch_estimate(contact: ContactSample, patch: PatchCurvature, length: float) -> SurfaceEstimate | None:
-    """Shape from the patch alone, at the last contact, as of a touch that stands still; None where it knows nothing."""
+    """Shape from the patch alone at a contact that has not moved; None where the patch gives none.
+
+    `length` is the memory of the estimator, m, as for `with_patch`.
+    """
     T = homogeneous(tangent_rotation(-contact.n_base), contact.p_base)
     found = patch.fuse(T)
     if found is None:
@@ -75,18 +90,6 @@ def patch_estimate(contact: ContactSample, patch: PatchCurvature, length: float)
     )
 
 
-def _notes(found: Fused, share: float) -> tuple[str, ...]:
-    said = (f"{100.0 * share:.0f} % of the curvature from the patch",)
-    return (*said, CONTRADICTION_NOTE) if found.contradicted else said
-
-
-def _joined(model_root: Floats, patch: Floats) -> Floats:
-    """(n + 3, 9) root of the information about the entries of S with the patch's part about K."""
-    rows = np.zeros((3, 9))
-    rows[:, 6:] = _root(patch) / C_PER_Q
-    return np.concatenate([model_root, rows])
-
-
 def _root(information: Floats) -> Floats:
     """(3, 3) root of the patch's information, which may be singular."""
     values, vectors = eigen(information)
@@ -95,7 +98,7 @@ def _root(information: Floats) -> Floats:
 
 
 def _decide(information: Floats, q: Floats, length: float) -> Decision:
-    """The rank decision's second rule on what patch and motion together know; the first is about motion alone."""
+    """Rank decision by rule 2 of `observed` alone: rule 1, the spread of the points, is about motion."""
     values, vectors = eigen(information)
     size = max(math.sqrt(float(q @ q)), 1.0 / length)
     return Decision(np.maximum(values, 0.0), vectors, values >= 1.0 / (SIGMA_LIMIT * size) ** 2)
@@ -104,7 +107,7 @@ def _decide(information: Floats, q: Floats, length: float) -> Decision:
 def _solution(
     S: Floats, q: Floats, covariance: Floats, decision: Decision, *, has_prior: bool = False, root: Floats | None = None
 ) -> Solution:
-    """From q and its covariance (3, 3)."""
+    """A solution with the place and the other entries of S (4, 4), and with q and its covariance (3, 3)."""
     c = parameters_of(S)
     if has_prior or decision.rank == 3:
         c[6:] = C_PER_Q * q

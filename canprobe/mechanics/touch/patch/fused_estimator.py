@@ -13,11 +13,11 @@ from canprobe.mechanics.types import Floats
 
 
 class PatchedEstimator:
-    """Any estimator, its answers completed by the patch (`with_patch`); before the contact moves, the patch alone.
+    """An estimator with answers that the patch completes (`with_patch`); before the contact moves, the patch's alone.
 
     Args:
-        motion: the estimator of points and normals.
-        patch: the images.
+        motion: estimator from points and normals.
+        patch: estimator from images.
         length: memory of `motion`, m.
     """
 
@@ -31,7 +31,7 @@ class PatchedEstimator:
 
     @property
     def dropped(self) -> Dropped:
-        """Samples that were not used, by neither sensor."""
+        """Samples that neither sensor used, by reason."""
         return self._motion.dropped
 
     def add(self, sample: ContactSample) -> None:

@@ -1,4 +1,4 @@
-"""Fits the parameters of the image model to what images show, and the errors that are left."""
+"""Fits the parameters of the image model to images of touches, and gives the errors that are left."""
 
 from __future__ import annotations
 
@@ -68,9 +68,10 @@ def fit_parameters(  # noqa: PLR0917
     Args:
         dwells, shown: the touches.
         plain: full scale, pitch and radius of the probe.
-        scale_sigma: of ln(scale) about 0, where the stated full scale is the reference; None: forces are.
-        reference_sigma: relative, of reference forces.
-        seen: taxels along the side of the window.
+        scale_sigma: standard deviation of ln(scale) about 0, where the stated full scale is the reference; None where
+            forces are.
+        reference_sigma: relative standard deviation of reference forces.
+        seen: number of taxels along the side of the window.
     """
     n = len(dwells)
     kappa = np.array([d.kappa for d in dwells])
