@@ -67,23 +67,8 @@ def ball(mass: float, radius: float, centre: Floats) -> Body:
 
 
 def joined(a: Body | None, b: Body) -> Body:
-    """Two bodies in one frame as one body.
-
-    Args:
-        a: first body; None for none.
-        b: second body.
-
-    Source: parallel axis theorem (Steiner).
-    """
-    if a is None or a.mass + b.mass == 0.0:
-        return b
-    mass = a.mass + b.mass
-    com = (a.mass * a.com + b.mass * b.com) / mass
-    tensor = np.zeros((3, 3))
-    for body in (a, b):
-        d = body.com - com
-        tensor += body.tensor + body.mass * (float(d @ d) * np.eye(3) - np.outer(d, d))
-    return Body(mass, com, tensor)
+    """A body, or None for none, and another one in the same frame, as one body."""
+    return b if a is None or a.mass + b.mass == 0.0 else Body.combined((a, b))
 
 
 class RigidBody:

@@ -7,6 +7,7 @@ are one matrix, the drives' zeros one vector: `units = units_per_q @ q + zero_un
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -83,6 +84,20 @@ class Body:
     mass: float
     com: Floats
     tensor: Floats
+
+    @classmethod
+    def combined(cls, parts: Sequence[Body]) -> Body:
+        """Several bodies in one frame, of a positive mass together, as one body.
+
+        Source: parallel axis theorem (Steiner).
+        """
+        mass = sum(part.mass for part in parts)
+        com = np.sum([part.mass * part.com for part in parts], axis=0) / mass
+        tensor = np.zeros((3, 3))
+        for part in parts:
+            off = part.com - com
+            tensor += part.tensor + part.mass * (float(off @ off) * np.eye(3) - np.outer(off, off))
+        return cls(mass, com, tensor)
 
     def moved(self, T: Floats) -> Body:
         """The same body in another frame.

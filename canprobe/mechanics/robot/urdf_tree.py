@@ -202,18 +202,13 @@ class UrdfTree:
         """Everything that a joint of the path carries up to the next one, branches included, in its turned frame."""
         parts = ((link, self.links[link].find("inertial"), T) for link, T in self.carried(edge.child, path, turned.T))
         found = [self._inertial(link, element, T) for link, element, T in parts if element is not None]
-        mass = sum(body.mass for body in found)
-        if not mass > 0.0:
+        if not sum(body.mass for body in found) > 0.0:
             return None
-        com = np.sum([body.mass * body.com for body in found], axis=0) / mass
-        tensor = np.zeros((3, 3))
-        for body in found:
-            off = body.com - com
-            tensor += body.tensor + body.mass * (float(off @ off) * np.eye(3) - np.outer(off, off))
+        together = Body.combined(found)
         # checked for the sum only: real files have sensors and fingertips with values that no body has
-        if (why := negative_inertia(tensor)) is not None:
+        if (why := negative_inertia(together.tensor)) is not None:
             raise self.wrong(f"link {edge.child}, with what it carries", "an <inertia> that a body can have", why)
-        return Body(mass, com, tensor)
+        return together
 
     def colour_of(self, material: ElementTree.Element | None) -> tuple[int, int, int] | None:
         """RGB of a material, by itself or by its name; None where the file gives none."""
