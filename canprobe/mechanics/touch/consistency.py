@@ -10,7 +10,7 @@ import numpy as np
 
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.blend import MIN_FACING_COSINE
-from canprobe.mechanics.touch.crossings import NO_TEST, ChiSquared, Crossing, _tested, compare
+from canprobe.mechanics.touch.crossings import NO_TEST, ChiSquared, Crossing, chi_squared_test, compare
 from canprobe.mechanics.touch.linear_algebra import positive
 from canprobe.mechanics.touch.surface_map import SurfaceMap
 from canprobe.mechanics.types import Floats
@@ -163,4 +163,4 @@ def fisher(p_values: list[float]) -> ChiSquared:
     """
     if not p_values:
         return NO_TEST
-    return _tested(-2.0 * float(np.sum(np.log(np.maximum(p_values, 1e-300)))), 2 * len(p_values))
+    return chi_squared_test(-2.0 * float(np.sum(np.log(np.maximum(p_values, 1e-300)))), 2 * len(p_values))

@@ -163,10 +163,11 @@ def _chi_squared(rows: Floats, d: Floats, C: Floats) -> ChiSquared:
     e, V = rows @ d, rows @ C @ rows.T
     scale = 1.0 / np.sqrt(np.diag(V))  # metres beside 1/m
     e, V = e * scale, V * np.outer(scale, scale)
-    return _tested(float(e @ np.linalg.solve(V, e)), len(rows))
+    return chi_squared_test(float(e @ np.linalg.solve(V, e)), len(rows))
 
 
-def _tested(chi2: float, dof: int) -> ChiSquared:
-    from scipy.special import chdtrc  # late: only a test of crossings needs it, and it takes long to load
+def chi_squared_test(chi2: float, dof: int) -> ChiSquared:
+    """A statistic with its p-value."""
+    from scipy.special import chdtrc  # here, as it takes long to load and only a test of crossings needs it
 
     return ChiSquared(chi2, dof, float(chdtrc(dof, chi2)))

@@ -16,8 +16,7 @@ Curvature:
 
     image_model         the forward model: force and moments of an image, from curvature, force and five parameters
     curvature           its inverse over several images: a likelihood of K, fused with what the motion has shown
-    fused_answer        the answer of patch and motion together
-    fused_estimator     an estimator of motion with the patch as its second sensor
+    fused_estimator     an estimator of motion with the patch as its second sensor, and the answer of both
 
 Calibration:
 

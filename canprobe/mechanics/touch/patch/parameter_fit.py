@@ -29,7 +29,7 @@ Pairs = Sequence[tuple[Dwell, Shown]]
 
 
 class ParameterFit(NamedTuple):
-    """Parameters, their covariance (5, 5) in the order of `_as_vector`, and the forces (n,) of the touches, N."""
+    """Parameters, their covariance (5, 5) in the order of `ImageParameters`, and the forces (n,) of the touches, N."""
 
     parameters: ImageParameters
     covariance: Floats
