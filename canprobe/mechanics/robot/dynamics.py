@@ -42,9 +42,9 @@ def dynamics_problem(name: str, bodies: Sequence[Body | None] | None) -> str | N
 
 
 def impossible_bodies(joints: Sequence[str], bodies: Sequence[Body | None]) -> list[str]:
-    """Why no motion follows from the bodies (n,) of joints: moments of inertia that no solid has.
+    """Why the motion of bodies (n,) of joints cannot be computed: they have moments of inertia that no solid has.
 
-    A body with a moment of 0 beside others is one of which not all is known, and is taken as it is.
+    A moment of 0 on the diagonal stands for an unknown one; such a body is used as it is.
     """
     tensors = {joint: body.tensor for joint, body in zip(joints, bodies, strict=False) if body is not None}
     return [

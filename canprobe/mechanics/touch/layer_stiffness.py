@@ -57,7 +57,7 @@ class PushFit:
 
     @property
     def slope(self) -> float:
-        """b, √N per m; NaN where there is none yet."""
+        """Slope b, √N per m; NaN before it is determined."""
         return self._joint / self._spread if self._determined else math.nan
 
     @property

@@ -18,7 +18,7 @@ from canprobe.mechanics.types import Floats
 COUNTS_MAX = 255
 """Counts of an image at full scale; 0 is no pressure. What a device counts instead its wire converts."""
 THRESHOLD_COUNTS = 5
-"""Smaller counts are taken as 0."""
+"""Least count of an image that is not taken as 0."""
 FLAT_RADIUS_M = 10.0
 """Radius of the sphere that a flat pad is taken for where a radius is needed: 8 µm deep over one inch."""
 

@@ -15,7 +15,8 @@ OFF_PAD_SIGMAS, OFF_PAD_TAXELS = 1.55, 1.0
 pressure (the width of a taxel included), and in taxels. A paraboloid has lost a fourth of its force by the first; one
 of which only a rim is left has its centroid in the last row of taxels."""
 TOUCH_FORCE = 0.15
-"""N; contact is made above it, and gone below half of it: an image of less says nothing about its place."""
+"""Force above which there is contact, N, and below half of which there is none: an image of less force does not show
+the place of the contact."""
 MAX_FORCE_SPREAD = 0.2
 """Largest standard deviation of a settled force over its target: twice that of a contact of 40 kN/m."""
 MAX_SATURATED_SHARE = 0.75

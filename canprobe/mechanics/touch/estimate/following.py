@@ -96,7 +96,7 @@ def less_certain(answer: SurfaceEstimate, *errors: Floats) -> SurfaceEstimate:
 
     Args:
         answer: the answer.
-        errors: tensors (3, 3), 1/m; each is an error, times a standard normal variate of its own.
+        errors: tensors (3, 3), 1/m; each is an error, times an independent standard normal variate.
     """
     P = answer.T_frame_contact[:3, :2]
     covariance, information, root = answer.covariance, answer.information, answer.model_root
