@@ -1,6 +1,6 @@
 """The mathematics of the cell, which stands alone: arms, touch, surfaces. It needs numpy and scipy.
 
-Nothing here knows a bus, a file of a scene or a clock. A list of contacts is enough for a surface:
+Nothing here depends on a bus, a scene file or a clock. A list of contacts is enough for a surface:
 
     estimate = fit_surface(points, normals, sigma_point=20e-6, sigma_normal=2e-3)
     estimate.kappa, estimate.observed, estimate.covariance
@@ -10,10 +10,10 @@ Nothing here knows a bus, a file of a scene or a clock. A list of contacts is en
   follows a surface. It also holds the true objects of an emulation.
 
 Invariants: SI units throughout; frames are spelled in names (`T_base_flange` takes flange coordinates to base);
-functions are pure, and an algorithm with a state is a small class with one `step`; what was not observed is said to be
-unobserved, never zero.
+functions are pure, and an algorithm with a state is a small class; what was not observed is marked as unobserved, and
+never given as zero.
 
-Of the rest of the package only `canprobe.errors` is seen. Start reading at `touch`, whose text shows the path of a
+Of the rest of the package only `canprobe.errors` is imported. Start reading at `touch`, whose text shows the path of a
 contact.
 """
 

@@ -6,6 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
-"""An array of numbers; its shape and unit stand in the docstring of what takes or returns it."""
+"""Array of numbers; the docstring of a function or field gives its shape and unit."""
 Vec = tuple[float, float, float]
-"""A vector in plain floats, for what runs in every cycle."""
+"""Vector in plain floats, for code that runs in every cycle."""

@@ -17,7 +17,7 @@ from canprobe.cell.planning.task_way import joints_on_way, over_path, poles_at_c
 from canprobe.cell.scene.setup import Arm, Calibrate, Free, Probe, SafetyLimits, Setup, Touch
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.chain import forward, forward_jacobian
-from canprobe.mechanics.robot.inverse import LENGTH_M, in_rows, inverse_near, task_rows
+from canprobe.mechanics.robot.inverse import ERROR_LENGTH_M, in_rows, inverse_near, task_rows
 from canprobe.mechanics.robot.probe_poses import probe_pose, start_posture
 from canprobe.mechanics.types import Floats
 
@@ -124,7 +124,7 @@ def _lacking_rows(setup: Setup) -> str | None:
         return f"task.kind: a calibration tilts the probe, and the {name} arm of {arm.model.n} joints cannot choose it"
     T, J = forward_jacobian(arm.model.chain, arm.q_start, task.probe.T_flange_probe)
     held = in_rows(rows, T[:3, :3], J) * arm.model.radian
-    held[:3] /= LENGTH_M
+    held[:3] /= ERROR_LENGTH_M
     weakest = float(np.linalg.svd(held, compute_uv=False)[-1]) if len(held) <= arm.model.n else 0.0
     if weakest > _MIN_SINGULAR:
         return None

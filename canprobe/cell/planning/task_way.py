@@ -13,9 +13,9 @@ from canprobe.cell.scene.setup import Arm, Calibrate, Probe, Touch
 from canprobe.mechanics.robot.inverse import FIXED_POLE, task_rows
 from canprobe.mechanics.touch.probe_motion import (
     EXTRA_CLEARANCE_M,
-    MOVE_SPEED,
-    RETREAT_SPEED,
-    ROUND_SPEED,
+    MOVE_SPEED_M_S,
+    RETREAT_SPEED_M_S,
+    ROUND_SPEED_M_S,
     SETTLE_S,
     ArcMotion,
     LineMotion,
@@ -60,7 +60,7 @@ def over_path(task: Touch, path: SurfacePath, pose: ProbePose) -> Iterator[Timed
     """To the approach, down, at rest, and once round the path."""
     approach, radius = task.approach, task.probe.radius
     above = ProbePose(approach.start + (approach.clearance + radius) * approach.normal, -approach.normal)
-    yield from _moving(LineMotion(pose, above, MOVE_SPEED))
+    yield from _moving(LineMotion(pose, above, MOVE_SPEED_M_S))
     poses = [
         ProbePose(point + radius * normal, -pole)
         for point, normal, pole in zip(path.points, path.normals, poles_at_contacts(task, path), strict=True)
@@ -80,9 +80,9 @@ def round_ball(task: Calibrate, pose: ProbePose) -> Iterator[TimedPose]:
             ProbePose(task.ball_centre + (radii + gap) * touch.n_base, touch.pole_base)
             for gap in (task.approach.clearance, 0.0, task.approach.clearance + EXTRA_CLEARANCE_M)
         )
-        yield from _moving(ArcMotion(task.ball_centre, pose, above, ROUND_SPEED))
+        yield from _moving(ArcMotion(task.ball_centre, pose, above, ROUND_SPEED_M_S))
         yield on, down_s
-        yield from _moving(LineMotion(on, off, RETREAT_SPEED))
+        yield from _moving(LineMotion(on, off, RETREAT_SPEED_M_S))
         pose = off
 
 

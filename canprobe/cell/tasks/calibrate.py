@@ -17,7 +17,7 @@ from canprobe.mechanics.robot.tool_calibration import BallModel, BallTouch, Tool
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.layer_stiffness import PushFit
 from canprobe.mechanics.touch.patch.image import Patch
-from canprobe.mechanics.touch.probe_motion import EXTRA_CLEARANCE_M, ROUND_SPEED, ArcMotion
+from canprobe.mechanics.touch.probe_motion import EXTRA_CLEARANCE_M, ROUND_SPEED_M_S, ArcMotion
 from canprobe.mechanics.touch.servo import ProbePose
 from canprobe.mechanics.touch.stops import TOUCH_FORCE
 from canprobe.mechanics.types import Floats
@@ -99,7 +99,7 @@ class CalibrateTask(ProbingTask):
                 self.estimate = calibrate_tool(self._corrected(), self._ball)
             return self._enter(Phase.DONE)
         self._push = PushFit()
-        self._line = ArcMotion(self._ball.c_base, pose, self._at(self._task.approach.clearance), ROUND_SPEED)
+        self._line = ArcMotion(self._ball.c_base, pose, self._at(self._task.approach.clearance), ROUND_SPEED_M_S)
         self._enter(Phase.MOVE)
 
     def _off(self) -> None:

@@ -19,7 +19,7 @@ from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.task import MotionTime, Task, TaskRecord
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.patch.image import Patch
-from canprobe.mechanics.touch.probe_motion import RETREAT_SPEED, ArcMotion, LineMotion
+from canprobe.mechanics.touch.probe_motion import RETREAT_SPEED_M_S, ArcMotion, LineMotion
 from canprobe.mechanics.touch.servo import ProbePose
 from canprobe.mechanics.types import Floats
 
@@ -189,7 +189,7 @@ class ProbingTask(Task):
         """Begin the retreat by a way (3,), m, off the object."""
         assert self._motion is not None
         pose = self._motion.pose
-        self._line = LineMotion(pose, ProbePose(pose.centre + way, pose.pole), RETREAT_SPEED, at_once=True)
+        self._line = LineMotion(pose, ProbePose(pose.centre + way, pose.pole), RETREAT_SPEED_M_S, at_once=True)
         self._enter(Phase.RETREAT)
 
     def _retreat(self) -> ProbePose:

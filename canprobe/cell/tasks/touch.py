@@ -17,13 +17,12 @@ from canprobe.cell.tasks.regain import REST_S, SEARCH_SPEED, Search
 from canprobe.cell.tasks.sensing import ContactSensing, is_too_hollow
 from canprobe.cell.tasks.shape import ShapeTracker
 from canprobe.cell.tasks.task import Loss, TaskRecord
-from canprobe.mechanics.touch.at_rest import AtRest
 from canprobe.mechanics.touch.contact import ContactSample, Slope
 from canprobe.mechanics.touch.layer_stiffness import PushFit
 from canprobe.mechanics.touch.patch.image import Patch
-from canprobe.mechanics.touch.probe_motion import MOVE_SPEED, SETTLE_S, LineMotion, smooth_step
+from canprobe.mechanics.touch.probe_motion import MOVE_SPEED_M_S, SETTLE_S, LineMotion, smooth_step
 from canprobe.mechanics.touch.servo import LocalSurface, ProbePose, TactileServo
-from canprobe.mechanics.touch.stops import TOUCH_FORCE
+from canprobe.mechanics.touch.stops import TOUCH_FORCE, AtRest
 from canprobe.mechanics.touch.strategies import PathFollower
 from canprobe.mechanics.types import Floats
 
@@ -234,7 +233,7 @@ class TouchTask(ProbingTask):
         return ProbePose(self._task.approach.start + up * (self.sensing.radius + distance), -up)
 
     def _begin(self, pose: ProbePose) -> None:
-        self._line = LineMotion(pose, self._above(self._task.approach.clearance), MOVE_SPEED)
+        self._line = LineMotion(pose, self._above(self._task.approach.clearance), MOVE_SPEED_M_S)
 
     def _approach(self) -> ProbePose:
         distance = self._task.approach.clearance - self._task.approach.speed * self._t

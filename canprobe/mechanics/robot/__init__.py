@@ -1,20 +1,20 @@
-"""The arm as mathematics: geometry, kinematics, inverse kinematics, dynamics, tool calibration. Pure functions.
+"""The mathematics of an arm: geometry, kinematics, inverse kinematics, dynamics, tool calibration. Pure functions.
 
-Joint positions come in and poses, Jacobians and torques go out, or poses come in and joint positions go out.
+Joint positions come in, and poses, Jacobians and torques go out; or poses come in, and joint positions go out.
 
     chain                any serial arm of 1 to 8 joints: poses, Jacobians and velocities from one evaluation
     denavit_hartenberg   chains from Denavit-Hartenberg rows
     urdf, urdf_tree      an arm from a URDF, and the links and joints of that file
-    urdf_visuals         what links look like: only a view needs it
+    urdf_visuals         solids and meshes of the links, for a view
     model                joints of a chain with stops, speeds, motors, friction, bodies; units of its drives
     motors               motor coordinates, where rotor inertia, friction and drive torque act
-    inverse              from poses to joints: what n joints can hold of a pose, and the joints near a known posture
+    inverse              from poses to joints: rows of a pose that n joints can hold, and joints near a known posture
     damped_inverse       one step of the Jacobian, damped near singular poses
     remaining_drives     the same with some drives at rest
     probe_poses          poses and postures that put a probe on a surface
     dynamics             mass matrix and bias torques, computed by MuJoCo
     tool_calibration     the probe's centre on the flange, from touches of a ball
 
-Invariants: frames are spelled in names (`T_base_flange` takes flange coordinates to base). Joint vectors are in rad, of
-prismatic joints in m. A pose that no posture reaches is a `PlanError` that says why. Start reading at `chain`.
+Invariants: frames are spelled in names (`T_base_flange` takes flange coordinates to base). Joint vectors are in rad, or
+in m for prismatic joints. A pose that no posture reaches raises a `PlanError` that says why. Start reading at `chain`.
 """

@@ -1,15 +1,16 @@
-"""A serial arm as a chain of frames: where its axes and its flange are, and how a point on the flange moves.
+"""A serial arm as a chain of frames: places of its axes and its flange, and the motion of points on the flange.
 
 A chain is any geometry of 1 to 8 joints, revolute or prismatic. Joint i turns about, or slides along, the z axis of its
 own frame; a fixed transform leads from the frame of joint i - 1, moved by that joint, to the frame of joint i. The
 first transform holds the mount pose of the arm, the last one leads to the flange.
 
 One evaluation (`posture`) goes through the chain once and keeps axes and origins, from which poses, Jacobians and
-velocities follow. It is a plain loop on plain floats: a 2.5 ms cycle cannot pay for small numpy calls. A frame may be
-turned about its own z axis if the angle of its joint is counted from there. With that freedom every fixed rotation
-becomes a turn about x alone, which costs half of a product of matrices (`Chain._straighten`).
+velocities follow. It is a loop on plain floats. Why not matrix products: a cycle of 2.5 ms has no time for many small
+numpy calls. A frame may be turned about its own z axis if the angle of its joint is counted from there. With that
+freedom every fixed rotation becomes a turn about x alone, which costs half of a product of matrices
+(`Chain._straighten`).
 
-Joint vectors q are in rad, of prismatic joints in m. Frames are spelled in names: `T_base_flange` takes flange
+Joint vectors q are in rad, or in m for prismatic joints. Frames are spelled in names: `T_base_flange` takes flange
 coordinates to base.
 """
 
@@ -28,15 +29,15 @@ from canprobe.mechanics.types import Floats, Vec
 
 Convention = Literal["standard", "modified"]
 MAX_JOINTS = 8
-_RIGID = 1e-9
-"""How far a fixed transform may be from a rotation with a translation."""
+_RIGIDITY_TOLERANCE = 1e-9
+"""Largest error of a fixed transform as a rotation."""
 
 
 class _Link(NamedTuple):
     """From the frame of a joint to the next one: a turn or slide by q, then a translation and a turn about x.
 
     Attributes:
-        prismatic: the joint slides.
+        prismatic: whether the joint slides.
         offset: angle of the joint at q = 0, rad.
         px, py, pz: translation, m.
         c, s: cosine and sine of the turn about x.
@@ -56,14 +57,15 @@ class Chain:
     """Geometry of a serial arm; compared by identity.
 
     Args:
-        name: of the arm.
+        name: name of the arm.
         joints: names of the n joints, from the base.
-        prismatic: which of them slide along z; the others turn about it.
-        fixed: (n, 4, 4) frame of each joint at q = 0 in the frame of the joint before, of the first one in base, m.
-        T_last_flange: (4, 4) flange in the frame of the last joint, m.
+        prismatic: whether each joint slides along z; the others turn about z.
+        fixed: (n, 4, 4) transforms from the frame of each joint at q = 0 to that of the joint before, of the first
+            joint to base, m.
+        T_last_flange: (4, 4) flange to the frame of the last joint, m.
 
     Raises:
-        PlanError: no joint, more than 8, lengths that differ, or a transform that is not rigid.
+        PlanError: there is no joint or more than 8, lengths differ, or a transform is not rigid.
     """
 
     name: str
@@ -103,7 +105,7 @@ class Chain:
             )
         for place, T in zip((*self.joints, "flange"), (*fixed, flange), strict=True):
             R = T[:3, :3]
-            rigid = np.abs(R @ R.T - np.eye(3)).max() < _RIGID and np.linalg.det(R) > 0.0
+            rigid = np.abs(R @ R.T - np.eye(3)).max() < _RIGIDITY_TOLERANCE and np.linalg.det(R) > 0.0
             if not (np.all(np.isfinite(T)) and rigid and np.array_equal(T[3], (0.0, 0.0, 0.0, 1.0))):
                 raise PlanError([f"{where}: the transform to {place} is not a rotation with a translation: {T!r}"])
 
@@ -126,7 +128,11 @@ class Chain:
 
 
 def ending_in(chain: Chain, T_flange_tool: Floats) -> Chain:
-    """The same arm with a tool, (4, 4) in its flange's frame (m), for a flange: its posture is that of the tool.
+    """The same arm with the frame of a tool in place of its flange, so that its posture is that of the tool.
+
+    Args:
+        chain: the arm.
+        T_flange_tool: (4, 4) tool to flange, m.
 
     Raises:
         PlanError: the tool's frame is not a rotation with a translation.
@@ -139,11 +145,11 @@ class Posture:
     """Axes and origins of a chain at some q, and its flange, in the base frame, as plain floats.
 
     Attributes:
-        axes: unit vector of each joint.
+        axes: unit vector of each joint's axis.
         origins: a point on each joint's axis, m.
-        prismatic: which joints slide.
+        prismatic: whether each joint slides.
         x, y, z: axes of the flange.
-        flange: its origin, m.
+        flange: origin of the flange, m.
     """
 
     axes: list[Vec]
@@ -268,14 +274,17 @@ def point_velocity(at: Posture, point: Vec, qd: npt.ArrayLike) -> Vec:
 
 
 def link_transforms(chain: Chain, q: npt.ArrayLike) -> list[Floats]:
-    """Frame of each link in that of the link before, (4, 4) each, m.
+    """Frames of all links, each in that of the link before.
 
-    The frame of a link is where the next joint begins, of the last link the flange: that is the frame of a standard
-    Denavit-Hartenberg row. The first transform is from base, the product of all is the flange pose.
+    The frame of a link is the one where the next joint begins, as of a standard Denavit-Hartenberg row; that of the
+    last link is the flange.
 
     Args:
         chain: the arm.
         q: (n,) joint positions, rad or m.
+
+    Returns:
+        n transforms (4, 4), m; the first is in base, and the product of all is the flange pose.
     """
     moved = [_motion(slides, value) for slides, value in zip(chain.prismatic, np.asarray(q).tolist(), strict=True)]
     links = [motion @ T for motion, T in zip(moved, (*chain.fixed[1:], chain.T_last_flange), strict=True)]

@@ -1,27 +1,28 @@
-"""The inverse of the Jacobian by damped least squares, damped only near singular poses."""
+"""One step of the inverse Jacobian by damped least squares, damped only near singular poses."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from canprobe.mechanics.robot.inverse import LENGTH_M
+from canprobe.mechanics.robot.inverse import ERROR_LENGTH_M
 from canprobe.mechanics.types import Floats
 
-_DAMPING, _THRESHOLD = 0.05, 0.08
-"""Largest damping, and the singular value below which it starts; linear rows are divided by `LENGTH_M`."""
+_MAX_DAMPING, _DAMPING_THRESHOLD = 0.05, 0.08
+"""Largest damping, and the singular value below which it starts; linear rows are divided by `ERROR_LENGTH_M`."""
 
 
 def damped_step(J: Floats, twist: Floats, wish: Floats | None = None) -> Floats:
     """Joint rates for a tool twist.
 
     Away from singular poses this is the exact inverse, of least norm where there are more joints than rows. Where the
-    smallest singular value s falls below the threshold the squared damping rises as
-    0.05^2 (1 - (s / 0.08)^2), on all directions alike, so that rates stay bounded and continuous.
+    smallest singular value s falls below the threshold, the squared damping rises as 0.05^2 (1 - (s / 0.08)^2), equally
+    in all directions, so that rates stay bounded and continuous. Why not always damped: the tool would lag at every
+    pose.
 
     Args:
         J: (m, n) rows of the geometric Jacobian that the arm can hold, linear rows first, see `task_rows`.
-        twist: (m,) linear m/s then angular rad/s, or a displacement: the map is linear.
-        wish: (n,) rates that the joints have as far as the tool does not notice; none by default.
+        twist: (m,) twist, linear rows in m/s, then angular ones in rad/s; or a displacement, as the map is linear.
+        wish: (n,) wanted joint rates; only their part in the null space, which does not move the tool, is used.
 
     Returns:
         (n,) joint rates, rad/s or m/s.
@@ -29,25 +30,25 @@ def damped_step(J: Floats, twist: Floats, wish: Floats | None = None) -> Floats:
     Source: Nakamura & Hanafusa 1986; Maciejewski & Klein 1988 (variable damping factor); Liegeois 1977 (null space).
     """
     rows, joints = J.shape
-    scale = np.array((1 / LENGTH_M,) * 3 + (1.0,) * (rows - 3))
+    scale = np.array((1 / ERROR_LENGTH_M,) * 3 + (1.0,) * (rows - 3))
     scaled, aim = J * scale[:, None], scale * twist
     regular = _regular_step(scaled, aim) if rows == joints else None
     if regular is not None:
         return regular
     U, s, Vt = np.linalg.svd(scaled, full_matrices=False)
-    ratio = float(s[-1]) / _THRESHOLD
-    lambda2 = _DAMPING**2 * (1.0 - ratio**2) if ratio < 1.0 else 0.0
+    ratio = float(s[-1]) / _DAMPING_THRESHOLD
+    lambda2 = _MAX_DAMPING**2 * (1.0 - ratio**2) if ratio < 1.0 else 0.0
     step: Floats = Vt.T @ ((U.T @ aim) * (s / (s * s + lambda2)))
     return step if wish is None else step + wish - Vt.T @ (Vt @ wish)
 
 
 def _regular_step(J: Floats, twist: Floats) -> Floats | None:
-    """The exact inverse where it is cheap to see that no damping is due (1/‖J⁻¹‖ is below every singular value)."""
+    """The exact step where a cheap test rules out damping (1/‖J⁻¹‖ is below every singular value); else None."""
     try:
         inverse = np.linalg.inv(J)
     except np.linalg.LinAlgError:
         return None
-    if float(np.vdot(inverse, inverse)) * _THRESHOLD**2 >= 1.0:
+    if float(np.vdot(inverse, inverse)) * _DAMPING_THRESHOLD**2 >= 1.0:
         return None
     step: Floats = inverse @ twist
     return step

@@ -26,17 +26,17 @@ def from_dh(
     """A chain from Denavit-Hartenberg rows.
 
     Args:
-        rows: (n, 4) a in m, alpha in rad, d in m, theta in rad; q adds to theta, of a prismatic joint to d.
+        rows: (n, 4) a in m, alpha in rad, d in m, theta in rad; q is added to theta, for a prismatic joint to d.
         convention: "standard": a row is Rz(theta) Tz(d) Tx(a) Rx(alpha). "modified" (Craig): a row is
             Rx(alpha) Tx(a) Rz(theta) Tz(d), with a and alpha of the link before the joint.
-        name: of the arm.
-        joints: names; joint_1, joint_2, … by default.
-        prismatic: which joints slide; none by default.
-        T_base_mount: (4, 4) where the first row begins, in base, m; base itself by default.
+        name: name of the arm.
+        joints: names of the joints; joint_1, joint_2, … by default.
+        prismatic: whether each joint slides; none by default.
+        T_base_mount: (4, 4) frame in which the first row begins, in base, m; base itself by default.
         T_last_flange: (4, 4) flange in the frame behind the last row, m; that frame by default.
 
     Raises:
-        PlanError: another convention, rows that are not (n, 4), or what `Chain` refuses.
+        PlanError: the convention is another one, the rows are not (n, 4), or `Chain` refuses the result.
 
     Source: Siciliano et al., Robotics, 2.8.2 (standard); Craig, Introduction to Robotics, 3.4 (modified).
     """
@@ -63,7 +63,7 @@ def from_dh(
 
 
 def dh_step(a: float, alpha: float, d: float, theta: float, *, convention: Convention = "standard") -> Floats:
-    """(4, 4) of one Denavit-Hartenberg row, m and rad, see `from_dh`."""
+    """(4, 4) transform of one Denavit-Hartenberg row in m and rad, see `from_dh`."""
     ct, st, ca, sa = cos(theta), sin(theta), cos(alpha), sin(alpha)
     if convention == "standard":
         rows = ((ct, -st * ca, st * sa, a * ct), (st, ct * ca, -ct * sa, a * st), (0.0, sa, ca, d))
@@ -76,9 +76,9 @@ def rotation_rpy(roll: float, pitch: float, yaw: float) -> Floats:
     """Rotation about the fixed axes x, then y, then z: Rz(yaw) Ry(pitch) Rx(roll), (3, 3).
 
     Args:
-        roll: about x, rad.
-        pitch: about y, rad.
-        yaw: about z, rad.
+        roll: angle about x, rad.
+        pitch: angle about y, rad.
+        yaw: angle about z, rad.
     """
     cr, sr, cp, sp, cy, sy = (f(angle) for angle in (roll, pitch, yaw) for f in (cos, sin))
     return np.array(

@@ -1,8 +1,7 @@
 """Rigid-body dynamics of any arm: mass matrix, Coriolis and centrifugal torques, gravity; computed by MuJoCo.
 
-Equation of motion: ``M(q) q'' + b(q, q') = tau``, all at the joints; b holds gravity. Motors, gears and friction are
-not in it (``canprobe.mechanics.robot.model``). MuJoCo is in the extra `dynamics` and is imported where a `RigidBody` is
-made.
+Equation of motion: ``M(q) q'' + b(q, q') = tau``, all at the joints; b includes gravity. Motors, gears and friction are
+not in it (`motors`). MuJoCo is in the extra `dynamics` and is imported when a `RigidBody` is made.
 """
 
 from __future__ import annotations
@@ -20,16 +19,16 @@ from canprobe.mechanics.robot.model import Body, lopsided_inertia
 from canprobe.mechanics.types import Floats
 
 GRAVITY_M_S2 = 9.81
-_PLACEHOLDER = '<inertial pos="1 2 3" quat="1 2 3 4" mass="1" diaginertia="1 1.1 1.2"/>'
-"""A body that MuJoCo's compiler neither refuses nor simplifies; the real one, which it may refuse, follows after."""
+_PLACEHOLDER_INERTIAL = '<inertial pos="1 2 3" quat="1 2 3 4" mass="1" diaginertia="1 1.1 1.2"/>'
+"""A body that MuJoCo's compiler neither refuses nor simplifies; it is replaced by the real one, which it may refuse."""
 
 
 def dynamics_problem(name: str, bodies: Sequence[Body | None] | None) -> str | None:
-    """Why an arm cannot be emulated with its dynamics, and what mends it; None where it can.
+    """Why an arm cannot be emulated with its dynamics, and what to do about it; None where it can.
 
     Args:
-        name: of the arm.
-        bodies: (n,) of its joints; None where nobody knows them.
+        name: name of the arm.
+        bodies: (n,) bodies of its joints; None where they are not known.
     """
     lead = 'plant.fidelity = "dynamic"'
     if bodies is None:
@@ -43,9 +42,9 @@ def dynamics_problem(name: str, bodies: Sequence[Body | None] | None) -> str | N
 
 
 def impossible_bodies(joints: Sequence[str], bodies: Sequence[Body | None]) -> list[str]:
-    """Why no motion follows from the bodies (n,) of joints: moments of inertia that no solid has.
+    """Why the motion of bodies (n,) of joints cannot be computed: they have moments of inertia that no solid has.
 
-    A body with a moment of 0 beside others is one of which not all is known, and is taken as it is.
+    A moment of 0 on the diagonal stands for an unknown one; such a body is used as it is.
     """
     tensors = {joint: body.tensor for joint, body in zip(joints, bodies, strict=False) if body is not None}
     return [
@@ -60,40 +59,25 @@ def ball(mass: float, radius: float, centre: Floats) -> Body:
     """A homogeneous ball.
 
     Args:
-        mass: kg.
-        radius: m.
-        centre: (3,) m.
+        mass: mass, kg.
+        radius: radius, m.
+        centre: (3,) centre, m.
     """
     return Body(mass, centre, 0.4 * mass * radius**2 * np.eye(3))
 
 
 def joined(a: Body | None, b: Body) -> Body:
-    """Two bodies of one frame as one.
-
-    Args:
-        a: None for nothing.
-        b: the other.
-
-    Source: parallel axes (Steiner).
-    """
-    if a is None or a.mass + b.mass == 0.0:
-        return b
-    mass = a.mass + b.mass
-    com = (a.mass * a.com + b.mass * b.com) / mass
-    tensor = np.zeros((3, 3))
-    for body in (a, b):
-        d = body.com - com
-        tensor += body.tensor + body.mass * (float(d @ d) * np.eye(3) - np.outer(d, d))
-    return Body(mass, com, tensor)
+    """A body, or None for none, and another one in the same frame, as one body."""
+    return b if a is None or a.mass + b.mass == 0.0 else Body.combined((a, b))
 
 
 class RigidBody:
     """Dynamics of one arm with what it carries.
 
     Args:
-        chain: its geometry.
-        bodies: (n,) of its joints; None for a joint that carries nothing itself. Numbers that no solid could have are
-            taken as they are, as published tables leave out what does not matter.
+        chain: geometry of the arm.
+        bodies: (n,) bodies of its joints; None for a joint without one. Values that no solid could have are used as
+            they are, as published tables leave out what does not matter.
         gravity: acceleration of free fall along base -z, m/s^2.
 
     Raises:
@@ -104,7 +88,7 @@ class RigidBody:
         problem = dynamics_problem(chain.name, bodies)
         if problem is not None:
             raise PlanError([problem])
-        import mujoco  # late: of the extra `dynamics`
+        import mujoco  # here, as it is in the extra `dynamics`
 
         self._mujoco: Any = mujoco
         text = "".join(_opened(mujoco, T, slides) for T, slides in zip(chain.fixed, chain.prismatic, strict=True))
@@ -124,12 +108,12 @@ class RigidBody:
         """Mass matrix and bias.
 
         Args:
-            q: (n,) rad or m.
-            qd: (n,) rad/s or m/s.
+            q: (n,) joint positions, rad or m.
+            qd: (n,) joint rates, rad/s or m/s.
 
         Returns:
-            (n, n) M, kg m^2 (kg m and kg where joints slide), and (n,) bias: torque or force that holds the joint rates
-            constant against gravity, Coriolis and centrifugal effects, N m or N.
+            M (n, n), kg m^2 (kg m and kg where joints slide), and bias (n,): torques or forces that keep the joint
+            rates constant against gravity, Coriolis and centrifugal effects, N m or N.
         """
         made, data, mass = self._model, self._data, np.empty_like(self._armature)
         data.qpos[:], data.qvel[:] = q, qd
@@ -139,10 +123,10 @@ class RigidBody:
         return mass - self._armature, data.qfrc_bias.copy()
 
     def gravity(self, q: npt.ArrayLike) -> Floats:
-        """(n,) torque that carries the arm's weight at rest, N m or N.
+        """(n,) torques that carry the arm's weight at rest, N m or N.
 
         Args:
-            q: (n,) rad or m.
+            q: (n,) joint positions, rad or m.
         """
         return self.terms(q, np.zeros(len(self._armature)))[1]
 
@@ -151,7 +135,7 @@ def _opened(mujoco: Any, T: Floats, slides: bool) -> str:
     """A joint's frame with its joint. The armature of 1 keeps MuJoCo's matrix regular where nothing has a mass."""
     pos, quat = (" ".join(map(repr, values.tolist())) for values in (T[:3, 3], _quaternion(mujoco, T[:3, :3])))
     joint = f'<joint type="{"slide" if slides else "hinge"}" axis="0 0 1" armature="1"/>'
-    return f'<body pos="{pos}" quat="{quat}">{joint}{_PLACEHOLDER}'
+    return f'<body pos="{pos}" quat="{quat}">{joint}{_PLACEHOLDER_INERTIAL}'
 
 
 def _quaternion(mujoco: Any, R: Floats) -> Floats:

@@ -1,14 +1,13 @@
 """From poses and velocities of the tool to the joints of any arm, numerically.
 
-What n joints can hold of a tool's pose is a number of rows, in this order: position (3), the direction of the pole, the
-tool's z axis (2), and the turn about the pole (1). Six or more joints hold all six rows, with more than six they stay
-near a posture besides. Five joints hold position and pole. Fewer hold the position; the pole comes out as it does.
-`task_rows` says so for a model, `in_rows` takes those rows out of a Jacobian or a twist; tasks and planning use both.
+A tool's pose has six rows, in this order: position (3), direction of the pole, the tool's z axis (2), and turn about
+the pole (1). Six or more joints hold all six; more than six also stay near a posture. Five joints hold position and
+pole. Fewer hold the position, and the pole is what follows from it. `task_rows` gives the number for a model, `in_rows`
+takes those rows out of a Jacobian or a twist; tasks and planning use both.
 
-- `inverse_near` finds the joints for a pose from a known posture on, within the joint limits (Levenberg-Marquardt). It
-  stays on the branch of that posture, as an arm that moves there does.
-- `damped_step` is one step of the Jacobian, damped near singular poses; `lifting_step` one with some drives at rest.
-- `probe_pose` and `start_posture` put a probe on a surface.
+`inverse_near` finds the joints for a pose, starting from a known posture and within the joint limits
+(Levenberg-Marquardt). It stays on the branch of that posture, as an arm that moves there does. Why not a closed form:
+that exists only for some arms, and would have to be told which of its branches the arm is on.
 """
 
 from __future__ import annotations
@@ -25,25 +24,24 @@ from canprobe.mechanics.robot.chain import forward, forward_jacobian
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.types import Floats
 
-LENGTH_M = 0.2
-"""Makes linear rows comparable to angular ones: about the length of a link."""
-
-
+ERROR_LENGTH_M = 0.2
+"""Length by which linear rows are divided to compare with angular ones, m: about the length of a link."""
 FULL_POSE, FIXED_POLE = 6, 3
 """Rows of an arm that holds a whole pose, and of one that holds the position alone."""
 
 
 def task_rows(model: ArmModel) -> int:
-    """How many rows of a tool's pose an arm can hold, by its number of joints.
+    """Number of rows of a tool's pose that an arm can hold, by its number of joints.
 
     It stops being true where the geometry wastes a joint: five joints of which the last one rolls about the pole cannot
-    lean it sideways. Such poses are out of reach to `inverse_near`, and the step is damped as near singular poses.
+    lean it sideways. Such poses are out of reach of `inverse_near`, and `damped_step` is damped as near singular poses.
 
     Args:
         model: the arm.
 
     Returns:
-        6 from six joints on: position, pole and the turn about it; 5 of five: position and pole; 3 of fewer: position.
+        6 for six joints or more (position, pole and the turn about it), 5 for five (position and pole), 3 for fewer
+        (position).
     """
     return 6 if model.n >= 6 else 5 if model.n == 5 else 3
 
@@ -52,12 +50,13 @@ def in_rows(rows: int, R_base_tool: Floats, six: Floats) -> Floats:
     """The rows that an arm can hold, of a Jacobian (6, n) or a twist (6,).
 
     Args:
-        rows: of `task_rows`.
-        R_base_tool: (3, 3) axes of the tool; the turns about its x and y are those of the pole.
-        six: linear rows, then angular ones, base frame.
+        rows: number of rows, of `task_rows`.
+        R_base_tool: (3, 3) axes of the tool; turns about its x and y are those of the pole.
+        six: (6, n) or (6,) linear rows, then angular ones, base frame.
 
     Returns:
-        (rows, n) or (rows,): linear rows in the base frame, then angular ones, of five rows in the frame of the tool.
+        (rows, n) or (rows,): linear rows in the base frame, then angular ones; with five rows these are in the frame of
+        the tool.
     """
     if rows == 5:
         return np.concatenate((six[:3], R_base_tool[:, :2].T @ six[3:]))
@@ -65,10 +64,10 @@ def in_rows(rows: int, R_base_tool: Floats, six: Floats) -> Floats:
 
 
 _ROUNDING_ERROR = 1e-9
-"""Error of a pose, rad or m over `LENGTH_M`, that is rounding."""
-_STEPS = 200
+"""Largest error of a pose that is rounding, rad, or m over `ERROR_LENGTH_M`."""
+_MAX_STEPS = 200
 _MAX_STEP_RAD = 0.3
-"""Of a joint in one step, rad: farther the Jacobian is another one."""
+"""Largest step of a joint, rad: farther off the Jacobian is no longer that of the start."""
 _MIN_DAMPING, _MAX_DAMPING = 1e-12, 1e8
 
 
@@ -81,21 +80,21 @@ def inverse_near(
     max_move_rad: float = inf,
     q_rest: npt.ArrayLike | None = None,
 ) -> Floats:
-    """Joints within their limits that hold a tool at a pose, reached from a known posture on.
+    """Joints within their limits that hold a tool at a pose, on the branch of a known posture.
 
     Args:
-        model: the arm; `task_rows` says what of the pose it can hold.
+        model: the arm; `task_rows` gives the rows of the pose that it can hold.
         T_base_tool: (4, 4) pose of the tool, m.
         T_flange_tool: (4, 4) tool in the flange frame, m.
-        q_near: (n,) rad or m; the answer is on its branch.
-        max_move_rad: farthest that a joint may be from `q_near`, rad; for a prismatic one see `ArmModel.radian`.
-        q_rest: (n,) posture near which more than six joints stay; `q_near` by default.
+        q_near: (n,) known posture, rad or m.
+        max_move_rad: largest distance of a joint from `q_near`, rad; for a prismatic one see `ArmModel.radian`.
+        q_rest: (n,) posture near which more than six joints stay, rad or m; `q_near` by default.
 
     Returns:
         (n,) joint positions, rad or m.
 
     Raises:
-        PlanError: out of reach from there, with the nearest pose that can be reached; or too far, with the joint.
+        PlanError: the pose is out of reach from there (the message has the nearest), or a joint would move too far.
 
     Source: Nocedal & Wright, Numerical Optimization, 10.3 (Levenberg-Marquardt), 16.7 (projected to bounds).
     """
@@ -121,7 +120,7 @@ def inverse_near(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _PosedTool:
-    """A pose to be reached by an arm."""
+    """A pose that an arm shall reach."""
 
     model: ArmModel
     T_base_tool: Floats
@@ -132,15 +131,15 @@ class _PosedTool:
         return task_rows(self.model)
 
     def error(self, q: Floats) -> tuple[Floats, Floats]:
-        """What is left (rows,) and its Jacobian (rows, n), in rad: lengths are divided by `LENGTH_M`.
+        """Error of the pose (rows,) and its Jacobian (rows, n), in rad: lengths are divided by `ERROR_LENGTH_M`.
 
         The Jacobian is per radian of a joint, see `ArmModel.radian`.
         """
         T, J = forward_jacobian(self.model.chain, q, self.T_flange_tool)
         R, aim, rows = T[:3, :3], self.T_base_tool, self.rows
         turn = _turn(R, aim[:3, :3]) if rows == 6 else _turn_of_pole(R, aim[:3, 2])
-        left = np.concatenate(((aim[:3, 3] - T[:3, 3]) / LENGTH_M, turn))
-        J[:3] /= LENGTH_M
+        left = np.concatenate(((aim[:3, 3] - T[:3, 3]) / ERROR_LENGTH_M, turn))
+        J[:3] /= ERROR_LENGTH_M
         return in_rows(rows, R, left), in_rows(rows, R, J) * self.model.radian
 
 
@@ -167,12 +166,12 @@ def _turn_of_pole(R: Floats, pole: Floats) -> Floats:
 
 
 def _reach(pose: _PosedTool, near: Floats) -> Floats:
-    """The joints where the error of a pose is least, from a posture on: Levenberg-Marquardt, joints held at stops."""
+    """The joints with the least error of a pose, starting from a posture: Levenberg-Marquardt, joints held at stops."""
     model = pose.model
     q = np.clip(near, model.q_min, model.q_max)
     left, J = pose.error(q)
     damping = 1e-3
-    for _ in range(_STEPS):
+    for _ in range(_MAX_STEPS):
         cost = float(left @ left)
         uphill = J.T @ left
         free = ~(((q <= model.q_min) & (uphill < 0.0)) | ((q >= model.q_max) & (uphill > 0.0)))
@@ -192,7 +191,7 @@ def _reach(pose: _PosedTool, near: Floats) -> Floats:
 
 
 def _step(J: Floats, left: Floats, free: NDArray[np.bool_], damping: float) -> Floats:
-    """A damped step of the free joints, no longer than the Jacobian holds, rad."""
+    """A damped step of the free joints, of at most `_MAX_STEP_RAD`, rad."""
     A = J[:, free]
     step = np.zeros(len(free))
     step[free] = A.T @ np.linalg.solve(A @ A.T + damping * np.eye(len(left)), left)
@@ -201,10 +200,13 @@ def _step(J: Floats, left: Floats, free: NDArray[np.bool_], damping: float) -> F
 
 
 def _rest(pose: _PosedTool, reached: Floats, rest: Floats) -> Floats:
-    """Of the joints that hold a pose the ones nearest to a posture: Newton's steps towards the pose, and along the
-    null space towards the posture. What was reached, where that does not settle."""
+    """Of the joints that hold a pose, those nearest to a posture `rest`.
+
+    Newton steps go towards the pose, and along the null space towards the posture. Where they do not settle, the answer
+    is `reached`.
+    """
     model, q = pose.model, reached
-    for _ in range(_STEPS):
+    for _ in range(_MAX_STEPS):
         left, J = pose.error(q)
         wish = (rest - q) / model.radian
         free = ~(((q <= model.q_min) & (wish < 0.0)) | ((q >= model.q_max) & (wish > 0.0)))
@@ -224,7 +226,7 @@ def _rest(pose: _PosedTool, reached: Floats, rest: Floats) -> Floats:
 
 
 def _out_of_reach(pose: _PosedTool, q: Floats) -> str:
-    """What is nearest, and what holds it there."""
+    """The message for a pose out of reach: the nearest pose, and the joints at their stops there."""
     model, T = pose.model, forward(pose.model.chain, q) @ pose.T_flange_tool
     away = 1e3 * float(np.linalg.norm(T[:3, 3] - pose.T_base_tool[:3, 3]))
     turned = degrees(float(np.linalg.norm(pose.error(q)[0][3:])))

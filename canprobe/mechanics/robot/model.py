@@ -1,12 +1,13 @@
-"""An arm as its controller knows it: a chain, what its joints can do, and how the units of its drives follow from them.
+"""The model of an arm that its controller has: chain, limits of its joints, and the units of its drives.
 
-A drive counts in units of its own: encoder counts, 1/1000 of a degree. Gears, signs and couplings between the joints
+Each drive counts in units such as encoder counts or 1/1000 of a degree. Gears, signs and couplings between the joints
 are one matrix, the drives' zeros one vector: `units = units_per_q @ q + zero_units`.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,24 +18,24 @@ from canprobe.mechanics.robot.chain import Chain
 from canprobe.mechanics.types import Floats
 
 METRES_PER_RADIAN = 0.2
-"""Travel of a prismatic joint that counts as much as a radian of a revolute one: about the length of a link."""
+"""Travel of a prismatic joint that counts as much as a radian of a revolute one, m: about the length of a link."""
 
 
 @dataclass(frozen=True, slots=True)
 class Joint:
-    """What one joint can do. Units are rad, N m and kg m^2; of a prismatic joint m, N and kg.
+    """Limits and drive of one joint. Units are rad, N m and kg m^2; m, N and kg for a prismatic joint.
 
     Attributes:
-        name: as in the chain.
-        prismatic: it slides; otherwise it turns.
-        q_min, q_max: its stops.
+        name: name of the joint, as in the chain.
+        prismatic: whether the joint slides; otherwise it turns.
+        q_min, q_max: positions of its stops.
         qd_max: speed limit, per second.
         rated_torque: continuous torque of its drive, at the joint.
-        rotor_inertia: of its motor, at the joint; emulation only, as friction is.
-        coulomb: friction torque whatever the speed.
+        rotor_inertia: inertia of its motor's rotor, at the joint; only emulation uses it, and friction.
+        coulomb: friction torque that does not depend on the speed.
         viscous: friction torque per speed.
 
-    The defaults of drive and friction are assumed: a geared motor of a small arm.
+    The defaults of drive and friction are assumptions: a geared motor of a small arm.
     """
 
     name: str
@@ -56,7 +57,7 @@ class Joint:
         """A position or speed in the unit for people.
 
         Args:
-            q: rad or m, or per second.
+            q: position, rad or m, or speed, per second.
         """
         return 1e3 * q if self.prismatic else math.degrees(q)
 
@@ -64,7 +65,7 @@ class Joint:
         """A position with its unit, for people.
 
         Args:
-            q: rad or m.
+            q: position, rad or m.
             places: format of the number.
         """
         return f"{self.shown(q):{places}} {self.unit}"
@@ -72,36 +73,51 @@ class Joint:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Body:
-    """What a joint carries up to the next one, in the frame of the joint.
+    """Everything that a joint carries up to the next joint, as one rigid body in the frame of the joint.
 
     Attributes:
-        mass: kg.
+        mass: mass, kg.
         com: (3,) centre of mass, m.
-        tensor: (3, 3) inertia about it, kg m^2.
+        tensor: (3, 3) inertia about the centre of mass, kg m^2.
     """
 
     mass: float
     com: Floats
     tensor: Floats
 
+    @classmethod
+    def combined(cls, parts: Sequence[Body]) -> Body:
+        """Several bodies in one frame, of a positive mass together, as one body.
+
+        Source: parallel axis theorem (Steiner).
+        """
+        mass = sum(part.mass for part in parts)
+        com = np.sum([part.mass * part.com for part in parts], axis=0) / mass
+        tensor = np.zeros((3, 3))
+        for part in parts:
+            off = part.com - com
+            tensor += part.tensor + part.mass * (float(off @ off) * np.eye(3) - np.outer(off, off))
+        return cls(mass, com, tensor)
+
     def moved(self, T: Floats) -> Body:
         """The same body in another frame.
 
         Args:
-            T: (4, 4) this frame in the other one, m.
+            T: (4, 4) transform from this frame to the other one, m.
         """
         R = T[:3, :3]
         return Body(self.mass, R @ self.com + T[:3, 3], R @ self.tensor @ R.T)
 
 
 INERTIA_TOLERANCE = 0.1
-"""Share of the largest moment by which the others may miss the rules of a body: published numbers are measured."""
+"""Share of the largest principal moment by which moments may break the rules of a rigid body: published values are
+measured."""
 ROUNDING_KG_M2 = 1e-12
-"""A moment of inertia that is 0 but for rounding."""
+"""Largest moment of inertia that is rounding error, kg m^2."""
 
 
 def negative_inertia(tensor: Floats) -> str | None:
-    """Why no dynamics follow from a (3, 3) tensor: a principal moment is negative; None where none is."""
+    """Why dynamics cannot be computed from a (3, 3) tensor, as a principal moment is negative; None where none is."""
     low, _, high = np.linalg.eigvalsh(tensor).tolist()
     if low >= -max(INERTIA_TOLERANCE * high, ROUNDING_KG_M2):
         return None
@@ -109,7 +125,7 @@ def negative_inertia(tensor: Floats) -> str | None:
 
 
 def lopsided_inertia(tensor: Floats) -> str | None:
-    """Why a (3, 3) tensor is the inertia of no body: one moment exceeds the sum of the others; None where none does."""
+    """Why no body has the inertia (3, 3): one principal moment exceeds the sum of the others; None where none does."""
     low, middle, high = np.linalg.eigvalsh(tensor).tolist()
     if low + middle >= high * (1.0 - INERTIA_TOLERANCE) - ROUNDING_KG_M2:
         return None
@@ -132,13 +148,13 @@ class ArmModel:
         zero_units: (n,) drive units at q = 0.
 
     Attributes:
-        q_min, q_max, qd_max: (n,) of the joints.
+        q_min, q_max, qd_max: (n,) stops and speed limits of the joints, rad or m, and per second.
         q_per_unit: (n, n) inverse of `units_per_q`.
-        radian: (n,) what counts as a radian of each joint: 1, of a prismatic one `METRES_PER_RADIAN`.
+        radian: (n,) motion of each joint that counts as a radian: 1 rad, or `METRES_PER_RADIAN` of a prismatic one.
 
     Raises:
-        PlanError: joints that are not the chain's, stops or speeds that leave no motion, units that do not follow from
-            the joints.
+        PlanError: the joints are not those of the chain, stops or speeds leave no motion, or the units cannot be
+            computed from the joints and back.
     """
 
     chain: Chain
@@ -170,7 +186,7 @@ class ArmModel:
 
     @property
     def name(self) -> str:
-        """Of the chain."""
+        """Name of the chain."""
         return self.chain.name
 
     @property
@@ -227,7 +243,7 @@ def units_to_joints(model: ArmModel, units: npt.ArrayLike) -> Floats:
 
 
 def coupled_joints(model: ArmModel, axis: int) -> frozenset[int]:
-    """The other joints on which the position of a drive depends, directly or by way of their own drives, from 0."""
+    """Indices, from 0, of the other joints on which a drive's position depends, directly or through their drives."""
     found: set[int] = set()
     new = {axis}
     while new:
@@ -241,9 +257,9 @@ def drive_position_at(model: ArmModel, axis: int, q: float, units: npt.ArrayLike
 
     Args:
         model: the arm.
-        axis: of the drive, from 0.
+        axis: index of the drive, from 0.
         q: position of its joint, rad or m.
-        units: (n,) positions of the drives; that of `axis`, and of drives that it is not coupled to, may be anything.
+        units: (n,) positions of the drives; those of `axis` and of drives that it is not coupled to have no effect.
     """
     rows, right = model.units_per_q.copy(), np.asarray(units, dtype=float) - model.zero_units
     rows[axis], right[axis] = np.eye(model.n)[axis], q

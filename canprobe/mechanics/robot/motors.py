@@ -35,7 +35,7 @@ def joints_per_motor(model: ArmModel) -> Floats:
 
 
 def position_sigma(model: ArmModel, q: npt.ArrayLike, T_flange_tool: Floats, direction: npt.ArrayLike) -> float:
-    """Standard deviation of the tool's position along a direction, m, as drives round to whole units.
+    """Standard deviation of the tool's position along a direction, m, by the rounding of drives to whole units.
 
     Args:
         model: the arm.
@@ -49,7 +49,7 @@ def position_sigma(model: ArmModel, q: npt.ArrayLike, T_flange_tool: Floats, dir
 
 
 def position_per_unit(model: ArmModel, q: npt.ArrayLike, T_flange_tool: Floats, direction: npt.ArrayLike) -> Floats:
-    """(n,) by how much a unit of each drive moves the tool along a direction, m; arguments as of `position_sigma`."""
+    """(n,) motion of the tool along a direction by one unit of each drive, m; arguments as for `position_sigma`."""
     _, J = forward_jacobian(model.chain, q, T_flange_tool)
     per_unit: Floats = np.asarray(direction, dtype=float) @ J[:3] @ model.q_per_unit
     return per_unit

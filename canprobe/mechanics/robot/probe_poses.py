@@ -25,7 +25,7 @@ def probe_pose(point: npt.ArrayLike, normal: npt.ArrayLike, centre_height_m: flo
         (4, 4) T_base_probe, m.
 
     Raises:
-        ValueError: for a hint parallel to the normal.
+        ValueError: the hint is parallel to the normal.
     """
     n = np.asarray(normal, dtype=float) / np.linalg.norm(normal)
     hint = np.asarray(x_hint, dtype=float)
@@ -51,15 +51,15 @@ def start_posture(
     T_flange_probe: Floats,
     clearance_m: float = 0.0,
 ) -> Floats:
-    """Joints that hold the probe over a surface point, pole against the normal, from a known posture on.
+    """Joints that hold the probe over a surface point, pole against the normal, near a known posture.
 
-    The turn about the normal is free: it is what `q_near` has.
+    The turn about the normal is free; it is taken from `q_near`.
 
     Args:
         model: the arm.
         point: (3,) surface point, base frame, m.
         normal: (3,) outward normal there.
-        q_near: (n,) rad or m.
+        q_near: (n,) known posture, rad or m.
         radius_m: probe radius, m.
         T_flange_probe: (4, 4) probe centre in the flange frame, m.
         clearance_m: gap between probe and surface, m; negative presses.

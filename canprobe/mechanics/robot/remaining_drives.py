@@ -1,4 +1,4 @@
-"""Moving the tool with the drives that are left: they share the motion of those that are at rest."""
+"""One step of the tool with some drives at rest: the others share the motion."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.types import Floats
 
 MAX_GAIN = 30.0
-"""Joint motion per motion of the tool, rad/m, beyond which the drives that are left are badly placed for it."""
-_EXACT = 1e-6
+"""Largest joint motion per motion of the tool, rad/m; with more the remaining drives are badly placed for it."""
+_MAX_ERROR_SHARE = 1e-6
 
 
 def lifting_step(model: ArmModel, J: Floats, move: Floats, free: NDArray[np.bool_]) -> Floats | None:
-    """Drive steps that move the tool's point, its orientation left open, while some drives stand still.
+    """Drive steps that move the tool's point, with free orientation, while some drives stand still.
 
-    Of all steps the one with the least joint motion. Couplings between the joints are in it: a drive that stands still
-    is not a joint that stands still.
+    Of all such steps it is the one with the least joint motion. Couplings between joints are included: where a drive
+    stands still its joint may move.
 
     Args:
         model: the arm.
         J: (3, n) velocity of the point per joint rate, base frame.
-        move: (3,) of the point, m, base frame.
-        free: (n,) drives that may move.
+        move: (3,) displacement of the point, m, base frame.
+        free: (n,) whether each drive may move.
 
     Returns:
-        (n,) drive units; None where the free drives cannot make this move, or only by moving far.
+        (n,) steps in drive units; None where the free drives cannot make this move within `MAX_GAIN`.
 
     Source: least-norm solution of an underdetermined system (Golub and Van Loan, Matrix Computations, 5.6).
     """
@@ -37,6 +37,6 @@ def lifting_step(model: ArmModel, J: Floats, move: Floats, free: NDArray[np.bool
     units[free] = scale * shares
     dq = model.q_per_unit @ units
     size = float(np.linalg.norm(move))
-    if np.linalg.norm(J @ dq - move) > _EXACT * size or np.linalg.norm(dq / model.radian) > MAX_GAIN * size:
+    if np.linalg.norm(J @ dq - move) > _MAX_ERROR_SHARE * size or np.linalg.norm(dq / model.radian) > MAX_GAIN * size:
         return None
     return units

@@ -1,13 +1,14 @@
-"""Where the probe's centre really is in the flange frame: from touches of a ball, in several orientations.
+"""Calibration of the probe's centre in the flange frame, by touches of a ball in several orientations.
 
-Each touch says where the ball's centre must be: ``p + R (t + (r + ρ − δ) E d) = c`` with the flange at ``p, R``, the
-tool centre ``t``, the direction ``d`` in which the probe feels the ball, the sum ``r`` of both radii, the indentation
-``δ``, the ball's centre ``c``, an error ``ρ`` of the radii and a tilt ``E`` of the array on the probe. Along ``d`` this
-is known to a few hundredths of a millimetre, across it as well as the array tells directions. Least squares over all of
-it by Gauss-Newton; ``t`` has no prior, so what the touches do not tell about it is said to be unobserved.
+Each touch gives an equation for the ball's centre: ``p + R (t + (r + ρ − δ) E d) = c`` with the flange at ``p, R``, the
+tool centre ``t``, the direction ``d`` of the ball that the array measures, the sum ``r`` of both radii, the indentation
+``δ``, the ball's centre ``c``, an error ``ρ`` of the radii and a tilt ``E`` of the array on the probe. Along ``d`` the
+equation holds to a few hundredths of a millimetre, across it as well as the array measures directions. All equations
+are solved by Gauss-Newton least squares; ``t`` has no prior, so the part of it that the touches do not observe is
+marked as unobserved.
 
-A tilt of the array and a sideways offset of the tool look alike where the pole is always turned to the ball: touches
-beside the pole tell them apart.
+A tilt of the array and a sideways offset of the tool have the same effect if the pole always points to the ball;
+touches beside the pole separate them.
 """
 
 from __future__ import annotations
@@ -23,11 +24,10 @@ from canprobe.mechanics.types import Floats
 
 LENGTH_UNIT_M = 1e-3
 ANGLE_UNIT_RAD = 1e-2
-_SCALE = np.array([LENGTH_UNIT_M] * 7 + [ANGLE_UNIT_RAD] * 2)
-"""Of the unknowns: tool centre, ball centre, radii, tilt. The condition number is of the problem in these units."""
+_UNKNOWN_UNITS = np.array([LENGTH_UNIT_M] * 7 + [ANGLE_UNIT_RAD] * 2)
+"""Units of the unknowns (tool centre, ball centre, radii, tilt) in which the problem is solved."""
 GOLDEN_ANGLE_RAD = np.pi * (3.0 - np.sqrt(5.0))
-"""rad."""
-_ROUNDS = 20
+_MAX_ROUNDS = 20
 _T, _C, _RHO, _TILT = slice(0, 3), slice(3, 6), 6, slice(7, 9)
 
 
@@ -36,8 +36,8 @@ class BallTouch:
     """One touch at rest.
 
     Attributes:
-        T_base_flange: (4, 4) the flange, m.
-        d_flange: (3,) unit vector from the probe's centre to the ball, as the array tells it, flange frame.
+        T_base_flange: (4, 4) pose of the flange, m.
+        d_flange: (3,) unit vector from the probe's centre to the ball, as the array measured it, flange frame.
         depth: indentation of the layer, m.
     """
 
@@ -48,17 +48,17 @@ class BallTouch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BallModel:
-    """What is known before the touches: values and standard deviations.
+    """Values before the touches, and standard deviations.
 
     Attributes:
-        t_flange: (3,) tool centre that is believed, m: where the search begins, no prior.
+        t_flange: (3,) assumed tool centre, m, from which the search starts; it is no prior.
         c_base: (3,) centre of the ball, m.
         radii: sum of the radii of probe and ball, m.
-        sigma_c: of the ball's centre per axis, m.
-        sigma_radii: of the sum of the radii with the indentation, m.
-        sigma_tilt: of the array's orientation on the flange, rad.
-        sigma_along: of one touch along the direction of the touch, m.
-        sigma_across: and across it, m.
+        sigma_c: standard deviation of the ball's centre per axis, m.
+        sigma_radii: standard deviation of the sum of the radii with the indentation, m.
+        sigma_tilt: standard deviation of the array's orientation on the flange, rad.
+        sigma_along: standard deviation of one touch along its direction, m.
+        sigma_across: standard deviation of one touch across its direction, m.
         observed_below: standard deviation of a coordinate of the tool centre below which it counts as observed, m.
     """
 
@@ -75,19 +75,20 @@ class BallModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ToolEstimate:
-    """What the touches tell.
+    """Result of a calibration.
 
     Attributes:
         t_flange: (3,) tool centre, m, flange frame; NaN where not observed.
-        covariance: (3, 3) of it, m²; infinite where nothing is known.
-        observed: (3,) whether, of each coordinate.
+        covariance: (3, 3) covariance of the tool centre, m²; infinite where nothing is known.
+        observed: (3,) whether each coordinate was observed.
         c_base: (3,) centre of the ball, m.
-        radii_error: of the sum of the radii, m.
-        tilt: (2,) of the array about the flange's x and y, rad.
-        condition_number: of the whole problem, priors included, in units of `LENGTH_UNIT_M` and `ANGLE_UNIT_RAD`.
-        along_rms, across_rms: residuals, m.
+        radii_error: error of the sum of the radii, m.
+        tilt: (2,) tilt of the array about the flange's x and y, rad.
+        condition_number: condition number of the whole problem, priors included, in units of `LENGTH_UNIT_M` and
+            `ANGLE_UNIT_RAD`.
+        along_rms, across_rms: RMS residuals along and across the touches, m.
         chi2_per_dof: sum of squared residuals over their expectation; None without more rows than unknowns.
-        touches: how many.
+        touches: number of touches.
     """
 
     t_flange: Floats
@@ -113,39 +114,39 @@ def calibrate_tool(touches: Sequence[BallTouch], model: BallModel) -> ToolEstima
     """Estimate the tool centre.
 
     Args:
-        touches: of one ball, at least two.
-        model: what is known of it.
+        touches: touches of one ball, at least two.
+        model: values and standard deviations before the touches.
 
     Raises:
-        UsageError: fewer than two touches, or one that is not finite.
+        UsageError: there are fewer than two touches, or one is not finite.
     """
     if len(touches) < 2:
-        raise UsageError(f"touches: expected 2 or more, got {len(touches)}: one tells where the ball is, no more")
+        raise UsageError(f"touches: expected 2 or more, got {len(touches)}: one shows only where the ball is")
     for number, touch in enumerate(touches, start=1):
         if not (np.isfinite(touch.T_base_flange).all() and np.isfinite(touch.d_flange).all()):
             raise UsageError(f"touches: touch {number} is not finite")
     x0 = np.concatenate([model.t_flange, model.c_base, np.zeros(3)])
     x = x0.copy()
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         r, J = _rows(touches, model, x, x0)
-        step = _SCALE * np.linalg.lstsq(J * _SCALE, -r, rcond=1e-12)[0]
+        step = _UNKNOWN_UNITS * np.linalg.lstsq(J * _UNKNOWN_UNITS, -r, rcond=1e-12)[0]
         x += step
-        if np.abs(step / _SCALE).max() < 1e-9:
+        if np.abs(step / _UNKNOWN_UNITS).max() < 1e-9:
             break
     r, J = _rows(touches, model, x, x0)
     return _estimate(touches, model, x, r, J)
 
 
 def residual(touch: BallTouch, model: BallModel, x: Floats) -> tuple[Floats, Floats]:
-    """Where a touch puts the ball's centre less where it is, and its derivative by the unknowns.
+    """Residual of one touch: the ball's centre by the touch less the ball's centre, and its derivative.
 
     Args:
         touch: one touch.
-        model: gives the radii.
-        x: (9,) tool centre, ball centre (m), error of the radii (m), tilt (rad).
+        model: model with the radii.
+        x: (9,) unknowns: tool centre (m), ball centre (m), error of the radii (m), tilt (rad).
 
     Returns:
-        (3,) m, base frame; (3, 9).
+        Residual (3,), m, base frame, and its derivative (3, 9) by the unknowns.
     """
     R, p = touch.T_base_flange[:3, :3], touch.T_base_flange[:3, 3]
     d = touch.d_flange
@@ -177,7 +178,7 @@ def _rows(touches: Sequence[BallTouch], model: BallModel, x: Floats, x0: Floats)
 
 
 def _estimate(touches: Sequence[BallTouch], model: BallModel, x: Floats, r: Floats, J: Floats) -> ToolEstimate:
-    _, s, Vt = np.linalg.svd(J * _SCALE, full_matrices=False)
+    _, s, Vt = np.linalg.svd(J * _UNKNOWN_UNITS, full_matrices=False)
     known = s > s[0] * 1e-12
     condition = float(s[0] / s[-1]) if known.all() else float("inf")
     weights = np.where(known, 1.0 / np.where(known, s, 1.0), np.inf)
@@ -209,10 +210,10 @@ def _estimate(touches: Sequence[BallTouch], model: BallModel, x: Floats, r: Floa
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BallApproach:
-    """How one touch is made.
+    """Direction of one touch and orientation of the probe in it.
 
     Attributes:
-        n_base: (3,) outward unit normal of the ball where it is touched.
+        n_base: (3,) outward unit normal of the ball at the contact.
         pole_base: (3,) unit vector of the probe's pole during the touch.
     """
 
@@ -224,12 +225,12 @@ def ball_approaches(count: int, tilt: float, beside: float, up: Floats) -> list[
     """Touches all round a ball: on a ring about its top, each beside the pole of the probe in another direction.
 
     Neighbours on the ball are neighbours in the list. From one to the next the direction beside the pole turns by the
-    golden angle, so that no turn of the tool goes with a place on the ball.
+    golden angle, so that the turn of the tool is not correlated with the place on the ball.
 
     Args:
-        count: of touches, the first on top.
-        tilt: of the ring from the top, rad.
-        beside: of the touch from the pole, rad; 0 turns the pole to the ball.
+        count: number of touches, the first on top.
+        tilt: angle of the ring from the top, rad.
+        beside: angle of the touch from the pole, rad; 0 turns the pole to the ball.
         up: (3,) unit vector to the top.
     """
     e1 = np.cross(up, np.array([0.0, 1.0, 0.0]) if abs(up[1]) < 0.9 else np.array([1.0, 0.0, 0.0]))

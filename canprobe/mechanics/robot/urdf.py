@@ -1,8 +1,8 @@
-"""A serial arm out of a URDF: its chain from a base link to a tip link, what its joints can do, its bodies.
+"""A serial arm from a URDF: its chain from a base link to a tip link, limits of its joints, and bodies.
 
-Fixed joints are folded into the transforms beside them. A joint's own frame is turned until its axis is z, as `Chain`
-has it. What hangs off the path (a gripper, a cover) stands still at its zero and counts as a body of the link that
-carries it. What links look like is read apart (`urdf_visuals`): only a view needs it.
+Fixed joints are merged into the transforms beside them. A joint's frame is turned until its axis is z, as `Chain`
+expects. Branches off the path (a gripper, a cover) stand still at their zeros and count as bodies of the link that
+carries them. Visuals are read separately (`urdf_visuals`), as only a view needs them.
 
 Source: URDF specification (wiki.ros.org/urdf/XML, joint, link, inertial).
 """
@@ -21,19 +21,19 @@ from canprobe.mechanics.robot.model import Body, Joint, lopsided_inertia
 from canprobe.mechanics.robot.urdf_tree import UrdfTree, source_name, z_along
 
 MAX_STOP_RAD = 4 * math.pi
-"""A stop of a revolute joint beyond it looks like one in degrees."""
+"""Largest stop of a revolute joint that does not look like one in degrees, rad."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UrdfArm:
-    """What a URDF says about an arm.
+    """An arm as a URDF describes it.
 
     Attributes:
-        chain: from base to tip.
-        joints: stops, speeds, friction; the effort limit stands for the rated torque. What the file leaves out has the
-            defaults of `Joint`, but a speed limit that is missing is 0, which an `ArmModel` refuses.
+        chain: chain from base to tip.
+        joints: stops, speeds and friction of its joints; the effort limit is taken as the rated torque. Values that the
+            file leaves out are the defaults of `Joint`, but a missing speed limit is 0, which an `ArmModel` refuses.
         bodies: (n,) bodies of the joints; None for a joint without any inertial.
-        warnings: statements of the file that look like mistakes.
+        warnings: messages about values of the file that look like mistakes.
     """
 
     chain: Chain
@@ -45,7 +45,7 @@ class UrdfArm:
 def from_urdf(
     source: str | Path, base: str | None = None, tip: str | None = None, *, name: str | None = None
 ) -> UrdfArm:
-    """Read a serial arm out of a URDF.
+    """Read a serial arm from a URDF.
 
     Args:
         source: path of the file, or its text.
@@ -54,8 +54,8 @@ def from_urdf(
         name: name of the arm; by default that of the robot.
 
     Raises:
-        PlanError: no URDF, no path from base to tip, a joint on the path that a drive cannot move, or what `Chain`
-            refuses.
+        PlanError: the file is no URDF, there is no path from base to tip, a joint on the path cannot be moved by a
+            drive, or `Chain` refuses the result.
     """
     tree = UrdfTree.read(source)
     path = tree.path(base or tree.root(), tip or tree.only_end())
@@ -70,7 +70,7 @@ def from_urdf(
         )
     places, joints, bodies = [], [], []
     T = np.eye(4)  # from the last joint's frame, its axis along z, to where the path has come
-    turned = np.eye(4)  # of that frame within the frame that the file gives the joint
+    turned = np.eye(4)  # rotation of that frame within the frame that the file gives the joint
     for edge in path:
         T = T @ edge.T_parent_child
         if edge.kind == "fixed":
@@ -97,7 +97,7 @@ def from_urdf(
 
 
 def limit_warning(source: str | Path, joint: Joint) -> str | None:
-    """What is said of the stops of a joint that look like degrees; None where they do not.
+    """A warning about the stops of a joint if they look like degrees; else None.
 
     Args:
         source: path of the file, or its text.

@@ -24,11 +24,11 @@ from canprobe.mechanics.types import Floats
 
 MAX_FILE_BYTES = 64 << 20
 """Largest size of a URDF, bytes."""
-_MOVING = {"revolute", "continuous", "prismatic"}
-_DEFINITIONS = {"xacro:property", "xacro:macro", "xacro:arg"}
+_MOVING_KINDS = {"revolute", "continuous", "prismatic"}
+_XACRO_DEFINITIONS = {"xacro:property", "xacro:macro", "xacro:arg"}
 _LATE_DECLARATION = re.compile(rb"\A(?P<before>(?:\s|<!--.*?-->)+)(?P<declaration><\?xml\b.*?\?>)", re.DOTALL)
 CONTINUOUS_RAD = 2 * math.pi
-"""Stops of a continuous joint to either side: it has none itself, but cables and the counts of a drive have."""
+"""Assumed stops of a continuous joint to either side, rad: the joint has none, but cables and drive counts do."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,7 +51,7 @@ class UrdfTree:
     name: str
     links: dict[str, ElementTree.Element]
     colours: dict[str, tuple[int, int, int]]
-    """By the names of the materials."""
+    """RGB of each named material."""
     into: dict[str, UrdfEdge]
     """The joint that carries each link."""
 
@@ -106,7 +106,7 @@ class UrdfTree:
         )
 
     def wrong(self, joint: str, expected: str, got: str) -> PlanError:
-        """What is wrong with a joint or link."""
+        """The error for a joint or link."""
         return PlanError([f"{self.where}: {joint}: expected {expected}, got {got}"])
 
     def root(self) -> str:
@@ -118,7 +118,7 @@ class UrdfTree:
         return roots[0]
 
     def only_end(self) -> str:
-        """The link that carries no other; of several, that which a joint moves."""
+        """The only link that carries no other; several are an error that names those that a joint moves."""
         parents = {edge.parent for edge in self.into.values()}
         ends = [link for link in self.links if link not in parents]
         moved = [link for link in ends if any(edge.kind != "fixed" for edge in self.path(self.root(), link))]
@@ -144,8 +144,8 @@ class UrdfTree:
         return path
 
     def joint(self, edge: UrdfEdge) -> Joint:
-        """What a joint of the path can do."""
-        if edge.kind not in _MOVING:
+        """Limits, friction and torque of a joint of the path."""
+        if edge.kind not in _MOVING_KINDS:
             kinds = "revolute, continuous, prismatic or fixed on the way to the tip"
             raise self.wrong(edge.name, kinds, edge.kind)
         mimic = edge.element.find("mimic")
@@ -189,7 +189,7 @@ class UrdfTree:
         return inside
 
     def axis(self, edge: UrdfEdge) -> Floats:
-        """(3,) unit vector in the joint's frame."""
+        """(3,) unit vector of the joint's axis in its frame."""
         element = edge.element.find("axis")
         axis = np.array((1.0, 0.0, 0.0) if element is None else self.three_numbers(edge.name, element, "xyz"))
         length = float(np.linalg.norm(axis))
@@ -199,21 +199,16 @@ class UrdfTree:
         return unit
 
     def body(self, edge: UrdfEdge, path: set[str], turned: Floats) -> Body | None:
-        """All that a joint of the path carries up to the next one, with what hangs there, in its turned frame."""
+        """Everything that a joint of the path carries up to the next one, branches included, in its turned frame."""
         parts = ((link, self.links[link].find("inertial"), T) for link, T in self.carried(edge.child, path, turned.T))
         found = [self._inertial(link, element, T) for link, element, T in parts if element is not None]
-        mass = sum(body.mass for body in found)
-        if not mass > 0.0:
+        if not sum(body.mass for body in found) > 0.0:
             return None
-        com = np.sum([body.mass * body.com for body in found], axis=0) / mass
-        tensor = np.zeros((3, 3))
-        for body in found:
-            off = body.com - com
-            tensor += body.tensor + body.mass * (float(off @ off) * np.eye(3) - np.outer(off, off))
-        # of all together: real files have sensors and fingertips with numbers that no body has
-        if (why := negative_inertia(tensor)) is not None:
+        together = Body.combined(found)
+        # checked for the sum only: real files have sensors and fingertips with values that no body has
+        if (why := negative_inertia(together.tensor)) is not None:
             raise self.wrong(f"link {edge.child}, with what it carries", "an <inertia> that a body can have", why)
-        return Body(mass, com, tensor)
+        return together
 
     def colour_of(self, material: ElementTree.Element | None) -> tuple[int, int, int] | None:
         """RGB of a material, by itself or by its name; None where the file gives none."""
@@ -271,12 +266,12 @@ class UrdfTree:
 
 
 def source_name(source: str | Path) -> str:
-    """What messages call a file, or its text."""
+    """Name of a file, or of its text, in messages."""
     return "URDF text" if str(source).lstrip().startswith("<") else f"URDF {source}"
 
 
 def _parsed(content: bytes) -> ElementTree.Element:
-    """The XML of a URDF as its readers take it: prefixes, which nobody declares, are a part of names."""
+    """The XML of a URDF as common readers take it: undeclared prefixes are a part of names."""
     content = content.removeprefix(b"\xef\xbb\xbf")
     if late := _LATE_DECLARATION.match(content):
         content = late["declaration"] + late["before"] + content[late.end() :]
@@ -292,13 +287,13 @@ def _parsed(content: bytes) -> ElementTree.Element:
 def _is_xacro(element: ElementTree.Element) -> bool:
     """Whether something is still to be expanded; definitions that nothing uses are left over."""
     for child in element:
-        if child.tag in _DEFINITIONS:
+        if child.tag in _XACRO_DEFINITIONS:
             continue
         if child.tag.startswith("xacro:") or any("${" in value or "$(" in value for value in child.attrib.values()):
             return True
         if _is_xacro(child):
             return True
-    return element.tag == "robot" and element.find("link") is None and any(c.tag in _DEFINITIONS for c in element)
+    return element.tag == "robot" and element.find("link") is None and any(c.tag in _XACRO_DEFINITIONS for c in element)
 
 
 def _colour(material: ElementTree.Element) -> tuple[int, int, int] | None:
@@ -312,7 +307,7 @@ def _colour(material: ElementTree.Element) -> tuple[int, int, int] | None:
 
 
 def z_along(axis: Floats) -> Floats:
-    """(4, 4) rotation that turns z into a unit vector by a short way; one that points down is turned over before."""
+    """(4, 4) rotation that turns z into a unit vector the short way; one that points down is first turned over x."""
     T = np.eye(4)
     over = np.diag((1.0, -1.0, -1.0)) if axis[2] < 0.0 else np.eye(3)
     x, y, z = (over @ axis).tolist()

@@ -1,4 +1,4 @@
-"""What the links of a URDF look like: their solids in the frames of `from_urdf`, and the files of their meshes.
+"""The visuals of a URDF: solids of the links in the frames of `from_urdf`, and the files of their meshes.
 
 Source: URDF specification (wiki.ros.org/urdf/XML, link, visual).
 """
@@ -23,15 +23,15 @@ from canprobe.mechanics.types import Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Visual:
-    """One solid that a URDF shows.
+    """One visual solid of a URDF.
 
     Attributes:
         joint: number of the joint that moves it, from 1; 0 where it stands with the base.
-        T: (4, 4) the solid in the frame of that joint in the chain of `from_urdf`, of the base for 0, m.
-        kind: "mesh", "box", "cylinder" along z, or "sphere".
-        size: of a mesh (3,) what its coordinates are multiplied by; of a box its edges, of a cylinder radius and
-            length, of a sphere its radius, m.
-        mesh: name of the mesh file, as it stands in the URDF; "" of another kind.
+        T: (4, 4) solid to the frame of that joint in the chain of `from_urdf`, or to the base for 0, m.
+        kind: kind of solid: "mesh", "box", "cylinder" along z, or "sphere".
+        size: (3,) factors on the coordinates of a mesh; edges (3,) of a box, radius and length of a cylinder, or radius
+            of a sphere, m.
+        mesh: name of the mesh file as in the URDF; "" for another kind.
         colour: RGB, 0–255; None where the URDF gives no colour.
     """
 
@@ -44,14 +44,14 @@ class Visual:
 
 
 def visuals_of(source: str | Path, base: str | None = None, tip: str | None = None) -> list[Visual]:
-    """What the links from base to tip look like, with what hangs on them; as `from_urdf`.
+    """Solids of the links from base to tip, and of all that they carry.
 
     Args:
         source: path of the file, or its text.
-        base, tip: links, as of `from_urdf`.
+        base, tip: names of links, as for `from_urdf`.
 
     Raises:
-        PlanError: as `from_urdf`, or a solid without its numbers.
+        PlanError: `from_urdf` would raise it, or a solid lacks its numbers.
     """
     tree = UrdfTree.read(source)
     start = base or tree.root()
@@ -82,12 +82,12 @@ def _size(tree: UrdfTree, name: str, solid: ElementTree.Element) -> tuple[float,
 
 
 def find_mesh(urdf: Path, name: str) -> Path | None:
-    """The file of a mesh: beside the URDF or in a folder above it; None where it is not there.
+    """The file of a mesh: beside the URDF or in a folder above it; None where it is not found.
 
     Args:
-        urdf: path of the file that names it.
-        name: a path relative to the URDF, `file://`, or `package://PACKAGE/…`. A package is looked for above the URDF;
-            a folder above it that has the rest of the path will do.
+        urdf: path of the URDF that names it.
+        name: path relative to the URDF, `file://` URL, or `package://PACKAGE/…`. A package is searched for above the
+            URDF; a folder there with the rest of the path is accepted too.
     """
     folder, scheme = urdf.absolute().parent, name.partition("://")[0] if "://" in name else ""
     rest = name.removeprefix(f"{scheme}://")
@@ -107,7 +107,7 @@ def _is_file(path: Path) -> bool:
 
 
 def with_meshes_found(urdf: Path) -> bytes:
-    """The content of a URDF, with absolute `file://` paths of the meshes that are found: a copy of it finds them too.
+    """The content of a URDF with absolute `file://` paths of the meshes that are found, so that a copy finds them too.
 
     Args:
         urdf: path of the file.

@@ -10,7 +10,7 @@ Reading a touch:
     patch/            images: force, centroid, moments, and curvature from them
     contact           from the centroid on the wrapped pad to the object's point and normal in base
     layer_stiffness   the stiffness of the layer from a push
-    at_rest, stops    what a touch at rest shows, and the limits at which a touch ends
+    stops             the limits at which a touch is stopped, and why a touch at rest must not go on
 
 Shape:
 
@@ -27,8 +27,8 @@ Motion:
     strategies        where the contact goes next
     probe_motion      ways between poses, and the joint steps that follow them
 
-True objects, which no estimator knows: `shapes` (a shape at a pose; bowl, wave, fillet, torus), `objects` (by name, and
-the quadrics), `heights` (a spline over a grid), `mesh_fit` (such a spline from a mesh).
+True objects, which no estimator sees: `shapes` (a shape at a pose; bowl, wave, fillet, torus), `objects` (all shapes by
+name, and the quadrics), `heights` (a spline over a grid), `mesh_fit` (such a spline from a mesh).
 
 Invariants: SI units, base frame unless a name says otherwise. z of a contact frame is the inward normal; in its own
 contact frame a surface has c14 = c24 = c44 = 0 and c34 = −½, so that K = 2 [[c11, c12], [c12, c22]] is the curvature;

@@ -1,4 +1,4 @@
-"""Where the surface of a map is: patches near a point, blended by distance and covariance, for many points at once.
+"""The surface of a map: patches near a point, blended by distance and covariance, for many points at once.
 
 Each patch within `reach` gives the height of its quadric along one common normal through the query point, and its
 normal there. Patch i weighs `w_i = (1 − r_i²/reach²)² g_i / v_i`: r_i is the distance from its contact to the surface
@@ -8,9 +8,10 @@ with a slope of zero: a patch enters and leaves without a step or a kink. The co
 normals, iterated, so that the answer is the closest point.
 
 Valid within `reach` of a contact and for a point nearer to the surface than its radius of curvature; with no patch in
-reach the answer is NaN, never an extrapolation. The blend neither averages noise away in `sigma` nor knows of errors
-that all patches share (calibration, indentation): neighbours on one pass rest on the same samples. Across an edge that
-is sharper than `MIN_FACING_COSINE` the patches of one side stand alone.
+reach the answer is NaN, never an extrapolation. `sigma` is a mean of the patches' own. Why not that of their weighted
+mean: neighbours on one pass rest on the same samples, so blending averages no noise away. Errors that all patches share
+(calibration, indentation) are not in it. Across an edge that is sharper than `MIN_FACING_COSINE` only the patches of
+one side count.
 """
 
 from __future__ import annotations
@@ -27,14 +28,14 @@ from canprobe.mechanics.types import Floats
 REACH_M = 4e-3
 """Default distance from a contact at which its patch no longer counts, m."""
 MIN_FACING_COSINE = 0.5
-"""Least cosine between a patch's normal and the surface's: others are another side of a thin body."""
-_FULL, _LIMB = 0.75, 0.25
-"""Cosine from which a patch counts in full, and share of the discriminant of a line that grazes it."""
+"""Least cosine between a patch's normal and the surface's; other patches belong to another side of a thin body."""
+_FULL_FACING_COSINE, _LIMB_SHARE = 0.75, 0.25
+"""Least cosine at which a patch counts in full, and share of the discriminant below which a line grazes its quadric."""
 UNKNOWN_HEIGHT_SIGMA_M = 1e-4
-"""Standard deviation of the height of a patch that does not know its own, for its weight: as contacts have at most."""
-_ITERATIONS = 40
+"""Standard deviation, m, that weighs a patch whose height has no known one: the largest that contacts have."""
+_MAX_ROUNDS = 40
 """Most rounds; each shrinks the error of the normal by the height over the radius of curvature."""
-_SETTLED = 1e-8
+_SETTLED_NORMAL_CHANGE = 1e-8
 
 
 class Feet(NamedTuple):
@@ -44,9 +45,9 @@ class Feet(NamedTuple):
         point: (n, 3) closest points of the surface, m.
         normal: (n, 3) outward unit normals there.
         height: (n,) signed distances of the query points from the surface, m, positive outside.
-        sigma: (n,) standard deviations of the surface's height, m; of a map the weighted mean of the patches that know
-            it, NaN where none does.
-        patches: (n,) how many were blended.
+        sigma: (n,) standard deviations of the surface's height, m; a map gives the weighted mean over the patches that
+            know theirs, NaN where none does.
+        patches: (n,) numbers of patches that were blended.
     """
 
     point: Floats
@@ -60,10 +61,12 @@ class Quadrics(NamedTuple):
     """Patches as arrays, in base.
 
     Attributes:
-        R: (m, 3, 3) axes of the contact frames; `contact` (m, 3), m, `normal` (m, 3) outward.
-        B, h: Hessian (m, 3, 3) and gradient (m, 3) of the quadric at the contact, along the axes of base.
-        covariance: (m, 9, 9) of the entries of S.
-        known: (m,) whether the patch knows its height.
+        R: (m, 3, 3) axes of the contact frames, as columns.
+        contact: (m, 3) contact points, m.
+        normal: (m, 3) outward unit normals there.
+        B, h: (m, 3, 3) Hessians and (m, 3) gradients of the quadrics at the contacts, along the axes of base.
+        covariance: (m, 9, 9) covariances of the entries of S.
+        known: (m,) whether the height of the patch is known.
     """
 
     R: Floats
@@ -76,14 +79,14 @@ class Quadrics(NamedTuple):
 
     @classmethod
     def of(cls, T: Floats, S: Floats, covariance: Floats, known: NDArray[np.bool_]) -> Quadrics:
-        """Of contact frames and matrices (m, 4, 4); covariances (m, 9, 9), of those that know their height."""
+        """Patches with contact frames T and matrices S (m, 4, 4) and covariances (m, 9, 9); known (m,) heights."""
         R, covariance = T[:, :3, :3], covariance.copy()
         covariance[~known, 2, 2] = UNKNOWN_HEIGHT_SIGMA_M**2
         B = 2.0 * R @ S[:, :3, :3] @ R.transpose(0, 2, 1)
         return cls(R, T[:, :3, 3], -R[:, :, 2], B, 2.0 * _times(R, S[:, :3, 3]), covariance, known)
 
     def heights(self, i: NDArray[np.intp], p: Floats, d: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Where the lines p + t d meet the patches i: t (m), outward normals, variances of t (m²), and `g`."""
+        """Where lines p + t d meet the patches i: t (m), outward unit normals, variances of t (m²), and weights `g`."""
         x, B, h = p - self.contact[i], self.B[i], self.h[i]
         Bx, Bd = _times(B, x), _times(B, d)
         # f(x + t d) = ½ a t² + b t + c
@@ -97,8 +100,8 @@ class Quadrics(NamedTuple):
         u, v, w = np.einsum("ijk,ij->ki", self.R[i], x + t[:, None] * d)
         F = np.stack([2 * u, 2 * v, np.ones_like(u), 2 * u * w, 2 * v * w, w * w, u * u, 2 * u * v, v * v], 1)  # df/dc
         variance = _dot(_times(self.covariance[i], F), F) / slope**2
-        limb = np.where(met, square / np.where(met, b * b * _LIMB, 1.0), 0.0)
-        facing = (_dot(self.normal[i], d) - MIN_FACING_COSINE) / (_FULL - MIN_FACING_COSINE)
+        limb = np.where(met, square / np.where(met, b * b * _LIMB_SHARE, 1.0), 0.0)
+        facing = (_dot(self.normal[i], d) - MIN_FACING_COSINE) / (_FULL_FACING_COSINE - MIN_FACING_COSINE)
         return t, g / np.sqrt(_dot(g, g))[:, None], variance, _eased(limb) * _eased(facing)
 
 
@@ -119,7 +122,7 @@ def _eased(x: Floats) -> Floats:
 
 
 def feet_on(patches: Quadrics, points: Floats, reach: float) -> Feet:
-    """Closest points of the blend of patches to points (n, 3), base frame, m."""
+    """Closest points of the blended patches to points (n, 3), m, base frame; patches count within `reach`, m."""
     n = len(points)
     places, numbers = np.full((2, n, 3), math.nan), np.full((2, n), math.nan)
     found = Feet(places[0], places[1], numbers[0], numbers[1], np.zeros(n, np.intp))
@@ -137,7 +140,7 @@ def feet_on(patches: Quadrics, points: Floats, reach: float) -> Feet:
     normal, foot = normal[left], foot[left]
     row: NDArray[np.intp] = np.repeat(np.arange(len(left)), counts[left])
     patch = np.fromiter((i for one in near for i in one), np.intp, len(row))
-    for _ in range(_ITERATIONS):
+    for _ in range(_MAX_ROUNDS):
         height, outward, variance, valid = patches.heights(patch, points[left[row]], normal[row])
         apart = patches.contact[patch] - foot[row]
         fade = np.maximum(0.0, 1.0 - _dot(apart, apart) / reach**2) ** 2 * valid
@@ -154,7 +157,7 @@ def feet_on(patches: Quadrics, points: Floats, reach: float) -> Feet:
         found.point[left], found.normal[left], found.height[left] = foot, normal, -height
         found.sigma[left] = np.where(knowing > 0.0, sigma / np.maximum(knowing, 1e-300), math.nan)
         found.patches[left] = np.bincount(row, weight > 0.0, len(left))
-        more = np.abs(normal - before).max(axis=1) > _SETTLED
+        more = np.abs(normal - before).max(axis=1) > _SETTLED_NORMAL_CHANGE
         left, normal, foot = left[more], normal[more], foot[more]
         row, patch = (np.cumsum(more) - 1)[row[more[row]]], patch[more[row]]
         if not len(left):

@@ -10,7 +10,7 @@ import numpy as np
 
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.blend import MIN_FACING_COSINE
-from canprobe.mechanics.touch.crossings import NO_TEST, ChiSquared, Crossing, _tested, compare
+from canprobe.mechanics.touch.crossings import NO_TEST, ChiSquared, Crossing, chi_squared_test, compare
 from canprobe.mechanics.touch.linear_algebra import positive
 from canprobe.mechanics.touch.surface_map import SurfaceMap
 from canprobe.mechanics.types import Floats
@@ -22,6 +22,7 @@ MEMORY_SCALE = 3.0
 
 With forgetting by exp(−s/memory) two answers s apart share exp(−s/memory) of their data: 5 % at three."""
 SIGNIFICANCE_LEVEL = 0.05
+"""Probability below which a test counts as failed."""
 PARTS = ("curvature", "normal", "height", "joint")
 
 
@@ -29,10 +30,11 @@ class Verdict(NamedTuple):
     """One part of the tests over all crossings.
 
     Attributes:
-        tested: crossings where it could be tested.
+        tested: number of crossings where it could be tested.
         share_below: share of the p-values below 0.05; 0.05 is expected of one surface and right covariances. Crossings
-            share patches' data, so they are no independent trials. NaN where nothing was tested.
-        chi2_per_dof: Σ χ² / Σ dof; 1 where the covariances are right, less where they are generous. NaN likewise.
+            share patches' data, so they are not independent trials. NaN where nothing was tested.
+        chi2_per_dof: Σ χ² / Σ dof; 1 where the covariances are right, less where they are too large. NaN where nothing
+            was tested.
         pooled: Fisher's χ² over the p-values of independent crossings, −2 Σ ln p with 2 n degrees of freedom.
     """
 
@@ -59,10 +61,11 @@ class Consistency:
 
         Args:
             part: "curvature", "normal", "height" or "joint".
-            angles: from, up to (rad); crossings whose angle is not known count only in the whole range.
+            angles: least angle, and the angle (rad) below which all must be; crossings whose angle is not known count
+                only in the whole range.
 
         Raises:
-            UsageError: on an unknown part.
+            UsageError: the part is unknown.
         """
         if part not in PARTS:
             raise UsageError(f"part: expected one of {', '.join(PARTS)}, got {part!r}")
@@ -90,10 +93,10 @@ class Consistency:
 def find_crossings(
     surface_map: SurfaceMap, *, radius: float = CROSSING_RADIUS_M, gap: float | None = None
 ) -> list[Crossing]:
-    """Places where two passes come close, one pair of patches for each; radius, gap: as of `check_consistency`.
+    """Places where two passes come close, one pair of patches for each; radius and gap as for `check_consistency`.
 
-    Of the pairs within the radius the closest is taken; others whose contacts both lie within two radii of its
-    contacts along the path are the same crossing. A path that follows itself gives one every two radii.
+    The closest of the pairs within the radius is taken; others whose contacts both lie within two radii of its contacts
+    along the path are the same crossing. A path that follows itself gives one crossing every two radii.
     """
     limit = positive("radius", radius)
     least = positive("gap", gap) if gap is not None else MEMORY_SCALE * surface_map.memory
@@ -109,22 +112,19 @@ def find_crossings(
         chosen.append((int(pairs[0, 0]), int(pairs[0, 1])))
         pairs = pairs[np.abs(along[pairs] - along[pairs[0]]).max(axis=1) > 2.0 * limit]
     heading = _headings(surface_map)
-    return [
-        compare(surface_map.patches[i], surface_map.patches[j], i, j, _angle(heading[i], heading[j]))
-        for i, j in sorted(chosen)
-    ]
+    found = []
+    for i, j in sorted(chosen):
+        sine, cosine = float(np.linalg.norm(np.cross(heading[i], heading[j]))), float(heading[i] @ heading[j])
+        found.append(compare(surface_map.patches[i], surface_map.patches[j], i, j, math.atan2(sine, cosine)))
+    return found
 
 
 def _headings(surface_map: SurfaceMap) -> Floats:
-    """(n, 3) unit direction of travel at each patch, from the patch before; the first as the second; NaN at rest."""
+    """(n, 3) unit direction of travel at each patch, from the patch before; the first has the second's; NaN at rest."""
     steps = np.diff(surface_map.points, axis=0)
     sizes = np.linalg.norm(steps, axis=1, keepdims=True)
     headings: Floats = steps / np.where(sizes > 0.0, sizes, math.nan)
     return np.concatenate([headings[:1], headings])
-
-
-def _angle(a: Floats, b: Floats) -> float:
-    return math.atan2(float(np.linalg.norm(np.cross(a, b))), float(a @ b))
 
 
 def check_consistency(
@@ -163,4 +163,4 @@ def fisher(p_values: list[float]) -> ChiSquared:
     """
     if not p_values:
         return NO_TEST
-    return _tested(-2.0 * float(np.sum(np.log(np.maximum(p_values, 1e-300)))), 2 * len(p_values))
+    return chi_squared_test(-2.0 * float(np.sum(np.log(np.maximum(p_values, 1e-300)))), 2 * len(p_values))

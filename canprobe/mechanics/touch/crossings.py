@@ -1,22 +1,23 @@
 """A χ² test where the contact's path crosses itself.
 
-Two patches that are close in space but far apart along the path were felt from different samples. Both are expressed
-in one frame between their contacts (`S' = Tᵀ S T`, the covariance of all nine entries of S carried along), so that
-extrapolation, the turn of the tangent axes and what the weak prior leaves open are in the covariance. There the
-difference d of (height, slope x, slope y, K11, K12, K22) has the covariance C = C_a + C_b, and under "same surface"
-`χ² = dᵀ C⁻¹ d` with as many degrees of freedom as were compared:
+Two patches that are close in space but far apart along the path rest on different samples. Both are expressed in one
+frame between their contacts (`S' = Tᵀ S T`, with the covariance of all nine entries of S), so that the covariance
+includes extrapolation, the turn of the tangent axes and what the weak prior leaves open. In that frame the difference d
+of (height, slope x, slope y, K11, K12, K22) has the covariance C = C_a + C_b. If both patches are one surface,
+`χ² = dᵀ C⁻¹ d` has as many degrees of freedom as were compared:
 
-- of K only the combinations that *both* passes observed;
-- slope and height where the estimator knows their covariance. An unobserved curvature widens them, beside the
-  contact, by `surface_map.WIDE`;
-- `joint` is all of it together, with the correlations between the parts.
+- `curvature` compares the combinations of K that *both* passes observed;
+- `normal` and `height` are compared where the estimator knows their covariance. An unobserved curvature widens them,
+  beside the contact, by `surface_map.UNSEEN_CURVATURE_SIGMA`;
+- `joint` compares all of it together, with the correlations between the parts.
 
 The covariances rest on the σ's that the estimator was given, as if every sample's error were independent, and on its
 prior; they are not rescaled by the innovation. On independent noise of the stated size `ml` gives uniform p-values
 where c13, c23, c33 are what the prior expects; where they vanish (plane, saddle at its middle) χ² per degree of
-freedom is 0.85, and with forgetting 0.83. Generous σ's make p-values crowd towards 1. Errors that are correlated
-along a pass do the opposite (hysteresis differs by direction; creep shifts whole passes). A small p is no proof of
-two surfaces, but of a difference that the stated noise does not explain; `Crossing.angle` says how they ran.
+freedom is 0.85, and with forgetting 0.83. σ's that are too large make p-values crowd towards 1. Errors that are
+correlated along a pass do the opposite (hysteresis differs by direction; creep shifts whole passes). A small p does not
+prove two surfaces; it proves a difference that the stated noise does not explain. `Crossing.angle` gives the angle
+between the two passes.
 """
 
 from __future__ import annotations
@@ -44,9 +45,9 @@ class ChiSquared(NamedTuple):
     """One test.
 
     Attributes:
-        chi2: statistic.
+        chi2: test statistic.
         dof: degrees of freedom; 0 where nothing could be compared.
-        p: probability of a larger χ² if both passes felt one surface; NaN where nothing could be compared.
+        p: probability of a larger χ² if both passes measured one surface; NaN where nothing could be compared.
     """
 
     chi2: float
@@ -64,11 +65,12 @@ class Crossing:
     Attributes:
         first, second: indices of the patches in the map, the earlier one first.
         gap_m: path between them, m.
-        distance_m: between their contacts, m.
-        angle: between the directions of travel, rad, 0…π; NaN where the path does not tell.
-        T_base_common: (4, 4) the frame of the comparison; its z is the inward normal.
+        distance_m: distance between their contacts, m.
+        angle: angle between the directions of travel, rad, 0…π; NaN where the path does not show it.
+        T_base_common: (4, 4) frame of the comparison to base, m; its z is the inward normal.
         difference: (6,) second − first: height along z (m), slopes of z in x and y, K11, K12, K22 (1/m).
-        covariance: (6, 6) of it by the stated noise; what was not observed stands with `surface_map.WIDE`.
+        covariance: (6, 6) covariance of the difference by the stated noise; what was not observed has the variance of
+            `surface_map.UNSEEN_CURVATURE_SIGMA`.
         curvature, normal, height, joint: the tests.
     """
 
@@ -161,10 +163,11 @@ def _chi_squared(rows: Floats, d: Floats, C: Floats) -> ChiSquared:
     e, V = rows @ d, rows @ C @ rows.T
     scale = 1.0 / np.sqrt(np.diag(V))  # metres beside 1/m
     e, V = e * scale, V * np.outer(scale, scale)
-    return _tested(float(e @ np.linalg.solve(V, e)), len(rows))
+    return chi_squared_test(float(e @ np.linalg.solve(V, e)), len(rows))
 
 
-def _tested(chi2: float, dof: int) -> ChiSquared:
-    from scipy.special import chdtrc  # late: only a test of crossings needs it, and it takes long to load
+def chi_squared_test(chi2: float, dof: int) -> ChiSquared:
+    """A statistic with its p-value."""
+    from scipy.special import chdtrc  # here, as it takes long to load and only a test of crossings needs it
 
     return ChiSquared(chi2, dof, float(chdtrc(dof, chi2)))

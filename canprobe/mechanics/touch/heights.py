@@ -1,11 +1,11 @@
-"""A surface that is no formula: heights over a grid, as one C² bicubic spline.
+"""A surface without a formula: heights over a grid, as one C² bicubic spline.
 
 Closest point, normal, curvature, gaps and force all come from that spline. A spline through heights at a spacing d is
-true for features of several d: a sharp edge becomes a rounded one, of a radius of about d. Only what is seen from +z
-is a surface; there are no undercuts.
+true for features of several d: a sharp edge becomes a rounded one, with a radius of about d. Only the surface as seen
+from +z is there; undercuts are not.
 
-The closest point is the best of all local minima over the spline's nodes, each polished by Newton. Nothing depends on
-what was asked before: the window that is kept from query to query holds every node that can matter.
+The closest point is the best of all local minima over the spline's nodes, each refined by Newton's method. No answer
+depends on earlier queries: the window that is kept from one query to the next holds every node that can matter.
 
 Source: de Boor, A Practical Guide to Splines (cubic B-splines on equal knots, not-a-knot ends).
 """
@@ -21,38 +21,38 @@ from canprobe.mechanics.touch.shapes import Foot, PlacedShape, TouchedPlaces, re
 from canprobe.mechanics.types import Floats, Vec
 
 MIN_NODES = 8
-"""Along each side of a grid."""
+"""Least number of heights along each side of a grid."""
 MAX_SPACING_M, MAX_RISE_M = 5e-4, 4e-6
-"""Of the nodes over which minima are searched and pressure is summed: their widest spacing, and how much a node may be
-farther than the foot beside it; on a sharp edge half of the grid's spacing stands for that."""
+"""Widest spacing of the nodes over which minima are searched and pressure is summed, and the distance by which a node
+may be farther than the foot beside it. Sharp edges do not make the spacing finer than half of the grid's."""
 MAX_BALL_RADIUS_M = 0.03
-"""Of the ball that touches, as far as the spacing of the nodes depends on it."""
-_MARGIN_M = 1.5e-4
-"""How far a query may move before the window of nodes is taken anew."""
-_MAX_DEPTH_M = 3e-4
-"""Indentation up to which that window holds all that a ball presses on."""
-_BLOCK = 4
-_OVER_NODES_M = 5e-5
-"""How far the surface may rise between its nodes, on the safe side."""
-_NEWTON = 40
+"""Largest radius of a ball for which the spacing of the nodes is chosen, m."""
+_WINDOW_MARGIN_M = 1.5e-4
+"""Distance of a query from that of the kept window, m, for which the window is made larger than it need be."""
+_MAX_INDENTATION_M = 3e-4
+"""Largest indentation of a ball for which the window holds all pressed nodes, m."""
+_BLOCK_NODES = 4
+_MAX_RISE_BETWEEN_NODES_M = 5e-5
+"""Most by which the surface rises between its nodes, m; an upper bound."""
+_MAX_NEWTON_STEPS = 40
 _LAST_STEP_M = 1e-8
-"""A Newton step after which the rest, its square over a radius of curvature, is below 1e-12 m."""
+"""Largest last Newton step: the remaining error, its square over a radius of curvature, is below 1e-12 m."""
 _SAME_PLACE_M = 1e-6
 _NO_HEIGHT_M = -1e3
-_SIDE = 1e-6
-"""Spacings to the cells on both sides of a node."""
+_BORDER_SPACINGS = 1e-6
+"""Distance, in spacings, by which a place on a border of cells is moved to look up the cells on both sides."""
 
 _Bends = tuple[float, float, float, float, float, float]
 _Place = tuple[float, float, float, _Bends]
-"""Distance squared of a point to a place of the surface, its x and y, and the spline there."""
+"""Squared distance of a point from a place of the surface, x and y of that place, and the spline there."""
 
 
 class Spline:
     """C² bicubic spline through heights on a grid of equal spacing.
 
     Args:
-        heights: (m, n) m, at x rising along the rows' index, y along the columns'.
-        spacing: m, of both.
+        heights: (m, n) heights, m; x rises with the row's index, y with the column's.
+        spacing: spacing along both, m.
         corner: (2,) x and y of the first height, m.
     """
 
@@ -146,22 +146,22 @@ def _coefficients(f: Floats) -> Floats:
 
 
 class Heights(PlacedShape):
-    """Surface over a grid of heights, solid below, ending at the grid's border. z of its frame is that of the heights.
+    """Surface over a grid of heights, solid below, that ends at the grid's border. Heights are along z of its frame.
 
-    A ball may bridge a groove or stand on an edge: what presses on it follows from the gaps all over the pad, not from
-    one curvature (`by_gaps`).
+    A ball may bridge a groove or stand on an edge, so the pressure on it follows from the gaps all over the pad and not
+    from one curvature (`by_gaps`).
 
     Args:
         T_base_object: (4, 4) pose, m.
-        heights: (m, n) m, 8 or more along each side; x rises with the first index, y with the second.
-        spacing: of the grid, m.
-        origin: (2,) point of the grid that is the object's origin, from the grid's middle, m; the surface there gets
-            the height 0.
-        there: (m, n) whether the surface exists at a node; between nodes it does where it exists at all four round the
-            place. None: everywhere.
+        heights: (m, n) heights, m, 8 or more along each side; x rises with the first index, y with the second.
+        spacing: spacing of the grid, m.
+        origin: (2,) point of the grid that becomes the object's origin, from the grid's middle, m; the surface there
+            gets the height 0.
+        there: (m, n) whether the surface exists at a node; a place between nodes has a surface where all four nodes
+            round it have one. None: the surface is everywhere.
 
     Raises:
-        ValueError: for heights that are no finite grid, or an origin beside the surface.
+        ValueError: the heights are not a finite grid, or the origin lies beside the surface.
     """
 
     by_gaps = True
@@ -212,13 +212,13 @@ class Heights(PlacedShape):
         if there is not None and not there.all():
             self._cells = there[:-1, :-1] & there[1:, :-1] & there[:-1, 1:] & there[1:, 1:]
             self._z[~self.exists(x, y).reshape(shape)] = _NO_HEIGHT_M
-        starts = [np.arange(0, n, _BLOCK) for n in shape]
+        starts = [np.arange(0, n, _BLOCK_NODES) for n in shape]
         self._tops = np.maximum.reduceat(np.maximum.reduceat(self._z, starts[0], axis=0), starts[1], axis=1)
-        lids = np.pad(self._tops, 1, mode="edge") + _OVER_NODES_M
+        lids = np.pad(self._tops, 1, mode="edge") + _MAX_RISE_BETWEEN_NODES_M
         lids = np.maximum(np.maximum(lids[:-2], lids[1:-1]), lids[2:])
         self._lids = np.maximum(np.maximum(lids[:, :-2], lids[:, 1:-1]), lids[:, 2:])
         self._boxes = [
-            (at[start], at[np.minimum(start + _BLOCK, len(at)) - 1])
+            (at[start], at[np.minimum(start + _BLOCK_NODES, len(at)) - 1])
             for at, start in zip((self._x, self._y), starts, strict=True)
         ]
         self._kept: tuple[Vec, float, float, tuple[slice, slice]] | None = None
@@ -234,14 +234,14 @@ class Heights(PlacedShape):
         # No node of a block is nearer than the box that holds it; the nodes of the nearest box bound the nearest.
         dx, dy = (at - np.clip(at, low, high) for at, (low, high) in zip((x, y), self._boxes, strict=True))
         boxes = np.maximum(z - self._tops, 0.0) ** 2 + (dx * dx)[:, None] + dy * dy
-        i, j = (_BLOCK * int(k) for k in divmod(int(boxes.argmin()), boxes.shape[1]))
-        block = slice(i, i + _BLOCK), slice(j, j + _BLOCK)
+        i, j = (_BLOCK_NODES * int(k) for k in divmod(int(boxes.argmin()), boxes.shape[1]))
+        block = slice(i, i + _BLOCK_NODES), slice(j, j + _BLOCK_NODES)
         squares = (self._z[block] - z) ** 2 + ((self._x[block[0]] - x) ** 2)[:, None] + (self._y[block[1]] - y) ** 2
         nearest = sqrt(float(squares.min()))
-        widest = max(nearest + _MAX_DEPTH_M, reach) + 2.0 * _MARGIN_M + 0.5 * self._step
+        widest = max(nearest + _MAX_INDENTATION_M, reach) + 2.0 * _WINDOW_MARGIN_M + 0.5 * self._step
         inside = boxes <= widest * widest
         rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
-        first, last = (slice(_BLOCK * int(k[0]), _BLOCK * int(k[-1] + 1)) for k in (rows, columns))
+        first, last = (slice(_BLOCK_NODES * int(k[0]), _BLOCK_NODES * int(k[-1] + 1)) for k in (rows, columns))
         window = first, last
         self._kept = (x, y, z), nearest, widest, window
         return window
@@ -271,10 +271,10 @@ class Heights(PlacedShape):
         return feet if len(feet) == 1 else sorted(feet)
 
     def _polished(self, u: float, v: float, x: float, y: float, z: float) -> _Place:
-        """The stationary point of the distance near (u, v), by Newton of at most a node's spacing a step."""
+        """The stationary point of the distance near (u, v), by Newton steps of at most a node's spacing."""
         at, most, node = self.spline.at, self._step, (u, v)
         (u0, v0), (u1, v1) = self.spline.corner, self.spline.far
-        for _ in range(_NEWTON):
+        for _ in range(_MAX_NEWTON_STEPS):
             h, hx, hy, hxx, hxy, hyy = at(u, v)
             up = h - z
             gx, gy = u - x + up * hx, v - y + up * hy
@@ -326,12 +326,12 @@ class Heights(PlacedShape):
         )
 
     def _tightest_anywhere(self) -> float:
-        """At the origin: elsewhere a ball bridges what is tighter."""
+        """The hollow at the origin: elsewhere a ball bridges a tighter one."""
         tightest = self._foot_at((0.0, 0.0, 0.0, self.spline.at(0.0, 0.0)), 0.0, 0.0, 0.0)[8]
         return -1.0 / tightest if tightest < -1e-12 else inf
 
     def touches(self, point_base: npt.ArrayLike, reach: float) -> TouchedPlaces | None:
-        """Every local minimum of the distance within reach, where there are several: edges of a groove, say."""
+        """Every local minimum of the distance within reach, where there are several, as on the edges of a groove."""
         x, y, z = self._to_object(np.asarray(point_base, dtype=float)[None])[0].tolist()
         near = [place for place in self._minima(x, y, z, reach) if place[0] < reach * reach]
         if len(near) < 2:
@@ -342,12 +342,12 @@ class Heights(PlacedShape):
     def gaps(self, points_base: Floats) -> Floats:
         """Distances of (n, 3) points to the tangent over or under them, (n,) m: first order near the surface.
 
-        Of points higher than all of the surface near them it is only known that they do not touch; 1 m stands for that.
+        A point higher than all of the surface near it does not touch; its gap is given as 1 m.
         """
         x, y, z = self._to_object(points_base).T
         gaps, near = np.ones(len(x)), self.exists(x, y)
-        i = ((x[near] - self._x[0]) * (1.0 / (_BLOCK * self._cell[0]))).astype(np.intp)
-        j = ((y[near] - self._y[0]) * (1.0 / (_BLOCK * self._cell[1]))).astype(np.intp)
+        i = ((x[near] - self._x[0]) * (1.0 / (_BLOCK_NODES * self._cell[0]))).astype(np.intp)
+        j = ((y[near] - self._y[0]) * (1.0 / (_BLOCK_NODES * self._cell[1]))).astype(np.intp)
         near[near] = z[near] < self._lids[i, j]
         height, along, across = self.spline.many(x[near], y[near])
         gaps[near] = (z[near] - height) / np.sqrt(1.0 + along * along + across * across)
@@ -359,13 +359,15 @@ class Heights(PlacedShape):
         if self._cells is not None:
             (x0, y0), (m, n) = self.spline.corner, self._cells.shape
             s, t = (x[inside] - x0) / self.spline.spacing, (y[inside] - y0) / self.spline.spacing
-            rows = [(s + side).astype(np.intp).clip(0, m - 1) for side in (-_SIDE, _SIDE)]  # of both cells on a border
-            columns = [(t + side).astype(np.intp).clip(0, n - 1) for side in (-_SIDE, _SIDE)]
+            rows = [
+                (s + side).astype(np.intp).clip(0, m - 1) for side in (-_BORDER_SPACINGS, _BORDER_SPACINGS)
+            ]  # of both cells on a border
+            columns = [(t + side).astype(np.intp).clip(0, n - 1) for side in (-_BORDER_SPACINGS, _BORDER_SPACINGS)]
             inside[inside] = np.any([self._cells[i, j] for i in rows for j in columns], axis=0)
         return inside
 
     def squeezed(self, centre_base: Vec, radius: float) -> float:
-        """Volume by which the layer of a ball is squeezed, m³; times its stiffness that is the force.
+        """Volume by which the layer of a ball is squeezed, m³; the force is this volume times the stiffness K/h.
 
         Each column of the layer is pressed along its own radius: the sum over the nodes inside the ball of
         ``(R − |r|) R² dΩ``.

@@ -12,20 +12,22 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-SIGMA_ROOT = 0.03
+ROOT_FORCE_SIGMA = 0.03
 """Noise of √F, √N: a force of 1 N known to 6 %, its slow errors (hysteresis, creep) included."""
-MAX_SCATTER = 3.3
-"""RMS distance from the line over the noise above which it is none."""
+MAX_SCATTER_RATIO = 3.3
+"""Largest RMS distance of the samples from the line, over their noise, at which they count as a line."""
 MIN_FORCE_N = 0.1
-"""Below it threshold and noise of the array bend the line."""
-SAMPLES_OF_A_PUSH = 6
+"""Least force of a sample, N: below it threshold and noise of the array bend the line."""
+MIN_PUSH_SAMPLES = 6
+"""Least number of samples that give a slope."""
 
 
 class PushFit:
     """Straight line of √F over the push, from running means (Welford): constant time and memory.
 
-    Both have errors, and on a stiff contact a micrometre of the push is a large force. The line is that of the root on
-    the push as it was measured, which errors make flatter: it predicts the force where the encoders see the probe.
+    Push and force have errors, and on a stiff contact a micrometre of push is a large force. The line is the regression
+    of the root on the measured push, which errors of the push make flatter. Why not the true slope: the servo knows the
+    push from the same encoders, and this line predicts the force at what they report.
 
     Example: `fit.add(push, force)` for every tactile frame of a touch; `fit.slope` once `fit.certain(0.1)`.
 
@@ -55,7 +57,7 @@ class PushFit:
 
     @property
     def slope(self) -> float:
-        """b, √N per m; NaN where there is none yet."""
+        """Slope b, √N per m; NaN before it is determined."""
         return self._joint / self._spread if self._determined else math.nan
 
     @property
@@ -65,7 +67,7 @@ class PushFit:
 
     @property
     def sigma(self) -> float:
-        """Its standard deviation, √N per m; infinite where there is no slope."""
+        """Standard deviation of the slope, √N per m; infinite where there is no slope."""
         return self._noise / math.sqrt(self._spread) if self._determined else math.inf
 
     def certain(self, share: float) -> bool:
@@ -73,7 +75,7 @@ class PushFit:
 
         A sensor that sends nonsense has a slope too; its samples are off the line.
         """
-        return self.slope > 0.0 and self.sigma < share * self.slope and self.scatter < MAX_SCATTER * self._noise
+        return self.slope > 0.0 and self.sigma < share * self.slope and self.scatter < MAX_SCATTER_RATIO * self._noise
 
     @property
     def scatter(self) -> float:
@@ -84,12 +86,12 @@ class PushFit:
 
     @property
     def _noise(self) -> float:
-        """Of a sample about the line, √N: that of the root and that of the push, seen along the slope."""
-        return math.sqrt(SIGMA_ROOT**2 + self.slope**2 * self._push_variance)
+        """Standard deviation of a sample about the line, √N: noise of the root, and of the push times the slope."""
+        return math.sqrt(ROOT_FORCE_SIGMA**2 + self.slope**2 * self._push_variance)
 
     @property
     def _determined(self) -> bool:
-        return self._n >= SAMPLES_OF_A_PUSH and self._spread > 0.0
+        return self._n >= MIN_PUSH_SAMPLES and self._spread > 0.0
 
 
 def stiffness_from_slope(slope: float, radius: float, kappa: ArrayLike) -> float:

@@ -69,7 +69,7 @@ def principal(A: Floats) -> tuple[float, float, float]:
 
 
 def principal_of(a: float, b: float, d: float) -> tuple[float, float, float]:
-    """The same of the matrix a, b; b, d."""
+    """As `principal`, for the matrix [[a, b], [b, d]] in plain floats."""
     half = 0.5 * (a - d)
     return 0.5 * (a + d), math.hypot(half, b), 0.5 * math.atan2(b, half)
 
@@ -84,7 +84,7 @@ def lower_root(A: Floats) -> Floats:
 
 
 def read_only(values: ArrayLike) -> Floats:
-    """A private copy that nobody can write to."""
+    """A copy that cannot be written to."""
     array = np.array(values, dtype=np.float64)
     array.flags.writeable = False
     return array
@@ -94,7 +94,7 @@ def real_numbers(values: Any) -> Floats:
     """Values as floats.
 
     Raises:
-        TypeError, ValueError: one is no real number, as text and complex numbers are not; or rows differ in length.
+        TypeError, ValueError: a value is not a real number (text, a complex number), or rows differ in length.
     """
     found = np.asarray(values)
     texts = found.dtype == object and any(isinstance(value, str | bytes) for value in found.flat)
@@ -107,7 +107,7 @@ def real_numbers(values: Any) -> Floats:
 
 
 def real(name: str, values: Any, form: str = "") -> Floats:
-    """Values as floats, of any shape and also NaN; else a UsageError that names the field."""
+    """Values as floats, of any shape, NaN allowed; else a UsageError that names the field."""
     try:
         return real_numbers(values)
     except (TypeError, ValueError) as error:
@@ -115,9 +115,9 @@ def real(name: str, values: Any, form: str = "") -> Floats:
 
 
 MAX_MAGNITUDE = 1e60
-"""Of numbers, in any unit: products of five of them are still numbers."""
+"""Largest size of an input, in any unit: products of five of them stay finite."""
 MAX_LENGTH = 1e12
-"""Of points and standard deviations, in any unit: beyond, an estimate would be rounding."""
+"""Largest coordinate or standard deviation, in any unit: beyond it an estimate would be rounding error."""
 
 
 def checked(name: str, values: Any, shape: Sequence[int | None]) -> Floats:

@@ -1,12 +1,12 @@
-"""A mesh as one smooth surface: what is seen of it from +z, as heights over a grid.
+"""A mesh as one smooth surface: its heights over a grid, as seen from +z.
 
 The vertices of a mesh of a smooth body lie on the body, its facets do not. A bicubic spline is fitted by least squares
 to the vertices; where facets are larger than the grid's spacing, points of curved triangles (PN triangles, from the
 vertices and their normals) fill them. Edges that turn by more than 30 degrees stay edges, others are taken as curved.
-The surface ends with the facets: a node beyond their border, or over a hole that they leave, is none of it.
+The surface ends with the facets: a node beyond their border, or over a hole in them, has no surface.
 
-It stops being true at sharp edges, which become round over two spacings to each side; on walls steeper than 70
-degrees, which are bridged; and under overhangs, which are not seen.
+The fit is not true at sharp edges, which become round over two spacings to each side; on walls steeper than 70 degrees,
+which are bridged; and under overhangs, which are not seen.
 
 Source: Vlachos et al., Curved PN triangles, I3D 2001; Max, Weights for computing vertex normals, JGT 4, 1999.
 """
@@ -24,27 +24,28 @@ from canprobe.mechanics.types import Floats
 
 Index = npt.NDArray[np.intp]
 
-EDGE_RAD = np.radians(30.0)
-"""Facets that meet at a larger angle have an edge between them."""
-COARSE_RAD = np.radians(15.0)
-"""A median angle between the facets of a curved surface from which on they show no curvature."""
+MIN_EDGE_RAD = np.radians(30.0)
+"""Least angle between two facets that counts as an edge; a smaller one is taken as curved."""
+MAX_FACET_TURN_RAD = np.radians(15.0)
+"""Largest median angle between the facets of a curved surface; coarser facets do not show its curvature."""
 MIN_WALL_COSINE = np.cos(np.radians(70.0))
-LAYER_SPACINGS = 6.0
-"""Spacings below the highest sample of a cell from which on a sample is taken as hidden."""
+"""Least z of a facet's unit normal; a facet that is steeper is a wall, which is bridged."""
+HIDDEN_DEPTH_SPACINGS = 6.0
+"""Depth below the highest sample of a cell, in spacings, from which on a sample counts as hidden."""
 MIN_COVERED_SHARE = 0.1
-"""Share of a mesh's grid that has a surface, below which single vertices far away make the grid."""
+"""Least share of the grid that has a surface; below it single vertices far away make the grid."""
 MAX_COORDINATE_M = 1e6
-"""Coordinates from which on a mesh is no part."""
+"""Largest coordinate of a mesh, m."""
 MAX_NODES = 1_000_000
 MAX_SAMPLES = 8_000_000
 RINGING_SPACINGS, EDGE_NODES = 0.02, 3
-"""Distance of a sample from the fit, in spacings, that tells a wall; and how many nodes round it are rounded off."""
+"""Distance of a sample from the fit, in spacings, that shows a wall, and number of nodes round it that are rounded."""
 FILL_WEIGHT = 0.01
-"""Of a point of a curved triangle in the fit: a vertex is exact, and only where there are none these count."""
+"""Weight of a point of a curved triangle over that of a vertex: a vertex is exact, such points only fill gaps."""
 BORDER_SPACINGS = 1e-3
-"""Spacings beyond the border up to which a node lies on it: files have single precision."""
-_STIFFNESS = 1e-7
-"""Of the fit against second differences, per sample of a cell: it only matters where there are no samples."""
+"""Distance beyond the border, in spacings, up to which a node lies on it: files have single precision."""
+_SMOOTHING_WEIGHT = 1e-7
+"""Weight of second differences in the fit, per sample of a cell: it only matters where there are no samples."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,7 +73,7 @@ class MeshHeights(Heights):
         vertices, faces, spacing, origin: as `fit_mesh` takes them.
 
     Raises:
-        ValueError: the mesh shows no smooth surface, or none over the origin.
+        ValueError: the mesh has no smooth surface, or none over the origin.
     """
 
     def __init__(
@@ -93,13 +94,13 @@ def fit_mesh(
     """Heights of a mesh over x and y.
 
     Args:
-        vertices: (k, 3) m.
-        faces: (f, 3) indices, counter-clockwise as seen from outside.
-        spacing: of the grid, m; about twice the length of the mesh's edges where it is fine.
-        origin: (2,) x and y of the point that becomes the object's origin, m; None: the middle of the mesh.
+        vertices: (k, 3) vertices, m.
+        faces: (f, 3) indices of vertices, counter-clockwise as seen from outside.
+        spacing: spacing of the grid, m; about twice the length of the mesh's edges where it is fine.
+        origin: (2,) x and y of the point that becomes the object's origin, m; None for the middle of the mesh.
 
     Raises:
-        ValueError: no mesh, none that is seen from +z, one inside out, or one too coarse or too large.
+        ValueError: the arrays are not a mesh, or the mesh is not seen from +z, inside out, too coarse or too large.
     """
     require_positive(spacing=spacing)
     points, corners = _merged(np.asarray(vertices, dtype=float), np.asarray(faces, dtype=np.intp))
@@ -122,7 +123,7 @@ def fit_mesh(
 
 
 def _merged(points: Floats, corners: Index) -> tuple[Floats, Index]:
-    """Vertices at one place are one vertex, which STL files do not say."""
+    """Checked mesh with vertices at one place made one vertex: an STL file has each several times."""
     if points.ndim != 2 or points.shape[1] != 3 or corners.ndim != 2 or corners.shape[1] != 3 or not len(corners):
         raise ValueError(f"a mesh needs vertices (k, 3) and faces (f, 3), got {points.shape} and {corners.shape}")
     if not (np.abs(points) < MAX_COORDINATE_M).all():
@@ -139,7 +140,7 @@ def _merged(points: Floats, corners: Index) -> tuple[Floats, Index]:
 
 
 def _refuse_inside_out(points: Floats, corners: Index) -> None:
-    """Only a closed mesh has a volume, whose sign tells."""
+    """Refuse a closed mesh whose volume is negative; an open mesh has no volume to judge by."""
     ends = np.concatenate((corners[:, (0, 1)], corners[:, (1, 2)], corners[:, (2, 0)]))
     there = np.unique(ends[:, 0] * len(points) + ends[:, 1])
     back = np.unique(ends[:, 1] * len(points) + ends[:, 0])
@@ -156,13 +157,13 @@ def _refuse_coarse(points: Floats, corners: Index, normals: Floats) -> None:
     ends, faces = ends[order], faces[order]
     shared = np.flatnonzero((ends[1:] == ends[:-1]).all(axis=1))
     angles = np.arccos(np.clip(np.sum(normals[faces[shared]] * normals[faces[shared + 1]], axis=1), -1.0, 1.0))
-    curved = (angles > 1e-3) & (angles < EDGE_RAD)
-    if curved.any() and np.median(angles[curved]) > COARSE_RAD:
+    curved = (angles > 1e-3) & (angles < MIN_EDGE_RAD)
+    if curved.any() and np.median(angles[curved]) > MAX_FACET_TURN_RAD:
         long = np.linalg.norm(points[ends[shared, 0]] - points[ends[shared, 1]], axis=1)[curved]
         raise ValueError(
             f"the mesh is too coarse: facets of about {1e3 * np.median(long):.3g} mm turn the normal by "
             f"{np.degrees(np.median(angles[curved])):.0f} deg from one to the next, at most "
-            f"{np.degrees(COARSE_RAD):.0f} deg; export it finer"
+            f"{np.degrees(MAX_FACET_TURN_RAD):.0f} deg; export it finer"
         )
 
 
@@ -198,7 +199,7 @@ def _corner_normals(points: Floats, corners: Index, normals: Floats) -> Floats:
     total, still, step = np.zeros_like(weight), np.arange(len(vertex)), 0
     while len(still):
         other = first[still] + step
-        near = np.sum(normals[face[still]] * normals[face[other]], axis=1) > np.cos(EDGE_RAD)
+        near = np.sum(normals[face[still]] * normals[face[other]], axis=1) > np.cos(MIN_EDGE_RAD)
         total[still] += weight[other] * near[:, None]
         step += 1
         still = still[first[still] + step < beyond[still]]
@@ -234,7 +235,7 @@ def _seen(samples: Floats, spacing: float) -> npt.NDArray[np.bool_]:
     cell = cell.reshape(-1)
     top = np.full(cell.max() + 1, -np.inf)
     np.maximum.at(top, cell, samples[:, 2])
-    seen: npt.NDArray[np.bool_] = samples[:, 2] >= top[cell] - LAYER_SPACINGS * spacing
+    seen: npt.NDArray[np.bool_] = samples[:, 2] >= top[cell] - HIDDEN_DEPTH_SPACINGS * spacing
     return seen
 
 
@@ -297,7 +298,7 @@ def _fitted(samples: Floats, weights: Floats, facing: Floats, spacing: float, at
     bends = [sparse.diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(k - 2, k)) for k in (m, n)]
     along, across = sparse.kron(bends[0], sparse.identity(n)), sparse.kron(sparse.identity(m), bends[1])
     weighted = A.T @ sparse.diags_array(weights)
-    weak = _STIFFNESS * max(count / (m * n), 1.0)
+    weak = _SMOOTHING_WEIGHT * max(count / (m * n), 1.0)
     normal = weighted @ A + weak * (along.T @ along + across.T @ across)
     try:
         factors = splu(

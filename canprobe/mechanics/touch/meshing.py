@@ -1,10 +1,10 @@
-"""Triangles of any surface that answers with its closest point: maps of patches, and implicit surfaces.
+"""Triangles of any surface that gives the closest point to a place: maps of patches, and implicit surfaces.
 
-The surface is met on a cubic lattice, cell by cell outward from seeds, so that only cells near it are asked. A cell
+A cubic lattice is searched cell by cell outward from seeds, so that only cells near the surface are evaluated. A cell
 with corners inside and outside the body holds one vertex; it starts at the mean of the crossings of the cell's edges
-and is then laid on the surface. Every edge of the lattice that crosses the surface is a quadrilateral of the vertices
-of the four cells round it. Where the surface is not defined, as beyond the reach of a map, the mesh ends. The lattice
-stands still, whatever is added to a surface: the triangles of what did not change do not change.
+and is then moved to its foot on the surface. Every edge of the lattice that crosses the surface gives a quadrilateral
+of the vertices of the four cells round it. Where the surface is not defined, as beyond the reach of a map, the mesh
+ends. The lattice is fixed in base: where a surface did not change, its triangles do not change.
 
 Source: Gibson, "Constrained elastic surface nets", MICCAI 1998.
 """
@@ -25,15 +25,15 @@ from canprobe.mechanics.types import Floats
 Field = Callable[[Floats], Feet]
 """Points (n, 3) → closest points of a surface, NaN where it is not defined."""
 Numbers = NDArray[np.int64]
-"""Of cells or corners of the lattice."""
+"""Numbers of cells or corners of the lattice."""
 CELL_M = 0.5e-3
 """Default side of a cell, m."""
 _BITS, _BIAS = 21, 1 << 20
-_STEPS = np.array([1 << 2 * _BITS, 1 << _BITS, 1], np.int64)
-"""What a step along x, y, z adds to the number of a cell; a corner has the number of the cell above it."""
+_CELL_STEPS = np.array([1 << 2 * _BITS, 1 << _BITS, 1], np.int64)
+"""Difference of the numbers of neighbouring cells along x, y, z; a corner has the number of the cell above it."""
 _CORNERS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
 _EDGES = np.array([[a, a + step] for step, axis in ((4, 0), (2, 1), (1, 2)) for a in range(8) if not _CORNERS[a, axis]])
-_AROUND = np.array([[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)])
+_NEIGHBOURS = np.array([[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +56,7 @@ class Mesh:
         """Write a binary PLY file: vertices in m, normals, σ as the property `sigma`, and triangles.
 
         Raises:
-            ResultsError: it cannot be written.
+            ResultsError: the file cannot be written.
         """
         columns = ("x", "y", "z", "nx", "ny", "nz", "sigma")
         points = np.column_stack([self.vertices, self.normals, self.sigma]).astype("<f4")
@@ -75,7 +75,7 @@ def mesh_of(field: Field, seeds: Floats, cell: float) -> Mesh:
     """Triangles of a surface.
 
     Args:
-        field: the surface.
+        field: the surface, as a function from points to their feet.
         seeds: (n, 3) points near it, m; every part that is connected to a cell beside one of them is found.
         cell: side of a cell of the lattice, m.
 
@@ -87,8 +87,8 @@ def mesh_of(field: Field, seeds: Floats, cell: float) -> Mesh:
         raise UsageError(
             f"cell: expected at least {np.abs(seeds).max() / (0.9 * _BIAS):.2g} m for points so far away, got {cell}"
         )
-    corners, sides = _CORNERS @ _STEPS, np.concatenate([_STEPS, -_STEPS])
-    todo: Numbers = np.unique(((low.astype(np.int64) + _BIAS) @ _STEPS)[:, None] + _AROUND @ _STEPS)
+    corners, sides = _CORNERS @ _CELL_STEPS, np.concatenate([_CELL_STEPS, -_CELL_STEPS])
+    todo: Numbers = np.unique(((low.astype(np.int64) + _BIAS) @ _CELL_STEPS)[:, None] + _NEIGHBOURS @ _CELL_STEPS)
     seen: Numbers = todo[:0]
     known, values = seen, np.zeros(0)
     crossed, heights = [seen], [np.zeros((0, 8))]
@@ -106,14 +106,16 @@ def mesh_of(field: Field, seeds: Floats, cell: float) -> Mesh:
     cells: Numbers = np.concatenate(crossed)
     order = np.argsort(cells)
     cells, height = cells[order], np.concatenate(heights)[order]
-    vertices, normals, sigma = _laid_on(field, _place(cells, cell) + cell * _crossing(height))
+    start = _place(cells, cell) + cell * _crossing(height)
+    feet = field(start)  # twice: the first foot may be off where the start is far from the surface
+    vertices, normals, _, sigma, _ = field(np.where(np.isfinite(feet.point), feet.point, start))
     triangles = _triangles(cells, height, vertices)
     used, renumbered = np.unique(triangles, return_inverse=True)
     return Mesh(vertices[used], renumbered.reshape(-1, 3).astype(np.int32), normals[used], sigma[used])
 
 
 def _place(number: Numbers, cell: float) -> Floats:
-    """(n, 3) where corners stand, m."""
+    """(n, 3) places of corners, m."""
     mask = (1 << _BITS) - 1
     steps = np.stack([number >> 2 * _BITS, number >> _BITS & mask, number & mask], axis=1)
     return (steps - _BIAS) * cell
@@ -129,20 +131,13 @@ def _crossing(height: Floats) -> Floats:
     return result
 
 
-def _laid_on(field: Field, points: Floats) -> tuple[Floats, Floats, Floats]:
-    """Points moved to their feet, and normals and σ there."""
-    feet = field(points)
-    feet = field(np.where(np.isfinite(feet.point), feet.point, points))
-    return feet.point, feet.normal, feet.sigma
-
-
 def _triangles(cells: Numbers, height: Floats, vertices: Floats) -> NDArray[np.intp]:
     """(m, 3) two triangles for each edge of the lattice that meets the surface amid four cells with a vertex."""
     found = [np.zeros((0, 3), np.intp)]
     finite: NDArray[np.bool_] = np.isfinite(vertices[:, 0])
     inside = height < 0.0
     for along, end in enumerate((4, 2, 1)):
-        a, b = _STEPS[along - 2], _STEPS[along - 1]
+        a, b = _CELL_STEPS[along - 2], _CELL_STEPS[along - 1]
         edge = np.flatnonzero(inside[:, 0] != inside[:, end])
         around = cells[edge][:, None] + np.array([-a - b, -b, 0, -a])
         index = np.minimum(np.searchsorted(cells, around), len(cells) - 1)

@@ -1,4 +1,4 @@
-"""True object geometry: the touchable surfaces by name (``make_object``), and the quadrics; frames as in ``shapes``."""
+"""True objects: all touchable surfaces by name (`make_object`), and those that are quadrics; frames as in `shapes`."""
 
 from __future__ import annotations
 
@@ -68,7 +68,8 @@ class Quadric(PlacedShape):
         matrix: (4, 4) symmetric S in the object's frame, lengths in m, f < 0 inside; any positive multiple will do.
 
     Raises:
-        ValueError: not symmetric, not through the origin, or gradient at the origin not along +z.
+        ValueError: the matrix is not symmetric, the surface does not pass through the origin, or its gradient there is
+            not along +z.
 
     Source: More, "Generalizations of the trust region problem", Optim. Methods Softw. 2, 1993 (global optimality).
     """
@@ -147,7 +148,7 @@ class Quadric(PlacedShape):
         return self._medial_foot((x0, x1, x2), 2 if f < 0.0 else 0)
 
     def _medial_foot(self, x: Vec, free: int) -> Vec:
-        """From a point of symmetry two feet are equally near: keep the one on the side of x.
+        """The foot on the side of x, where two are equally near, as seen from a point of symmetry.
 
         The multiplier stands at the end of its interval, where the coordinate ``free`` follows from f = 0 alone.
         """
@@ -178,10 +179,10 @@ class Saddle(Quadric):
     Args:
         T_base_object: (4, 4) pose, m.
         radius_x: radius of the section along x at the origin, m.
-        radius_y: radius of the section along y there, m. The hollow one is the tightest of the whole surface.
+        radius_y: radius of the section along y there, m. The negative radius is the tightest hollow of the surface.
 
     Raises:
-        ValueError: unless one radius is positive and the other negative.
+        ValueError: the radii are not one positive and one negative.
     """
 
     def __init__(self, T_base_object: npt.ArrayLike, radius_x: float, radius_y: float) -> None:
@@ -203,8 +204,8 @@ class Ellipsoid(Quadric):
     Args:
         T_base_object: (4, 4) pose, m.
         radius_x: semi-axis along x, m.
-        radius_y: along y, m.
-        radius_z: along z, m.
+        radius_y: semi-axis along y, m.
+        radius_z: semi-axis along z, m.
     """
 
     def __init__(self, T_base_object: npt.ArrayLike, radius_x: float, radius_y: float, radius_z: float) -> None:
@@ -249,7 +250,7 @@ def make_object(kind: str, *, T_base_object: npt.ArrayLike, **params: object) ->
         The placed shape.
 
     Raises:
-        ValueError: unknown kind, wrong parameters or values, with what was expected.
+        ValueError: the kind is unknown, or parameters or values are wrong; the message says what was expected.
     """
     if kind not in _KINDS:
         raise ValueError(f"unknown object kind {kind!r}; one of {', '.join(_KINDS)}")

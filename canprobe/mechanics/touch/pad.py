@@ -18,7 +18,7 @@ from canprobe.mechanics.types import Floats
 COUNTS_MAX = 255
 """Counts of an image at full scale; 0 is no pressure. What a device counts instead its wire converts."""
 THRESHOLD_COUNTS = 5
-"""Smaller counts are taken as 0."""
+"""Least count of an image that is not taken as 0."""
 FLAT_RADIUS_M = 10.0
 """Radius of the sphere that a flat pad is taken for where a radius is needed: 8 µm deep over one inch."""
 
@@ -27,17 +27,17 @@ FLAT_RADIUS_M = 10.0
 class Pad:
     """Taxels of one array.
 
-    Images of it are (rows, columns) counts, row by row; those of a list of taxels are (rows, columns) too, with
+    Its images are (rows, columns) counts, row by row. An array that is a list of taxels has such images too, with
     `positions` in the same order.
 
     Attributes:
-        rows, columns: of its images.
-        pitch_m: distance of neighbours; its square is the area that one taxel stands for.
-        full_scale_pa: pressure at `COUNTS_MAX` counts.
-        mount_radius_m: of the sphere that it is wrapped on; None: it is flat.
-        positions: (rows · columns, 3) of a list of taxels, m; None: a grid of the pitch.
-        normals: (rows · columns, 3) outward unit normals of a list of taxels; None: of a grid those of its sphere, else
-            z.
+        rows, columns: shape of the images.
+        pitch_m: distance of neighbours, m; its square is the area that one taxel stands for.
+        full_scale_pa: pressure at `COUNTS_MAX` counts, Pa.
+        mount_radius_m: radius of the sphere that the array is wrapped on, m; None for a flat array.
+        positions: (rows · columns, 3) places of listed taxels, m; None for a grid of the pitch.
+        normals: (rows · columns, 3) outward unit normals of listed taxels; None: a grid has those of its sphere, a list
+            has z.
     """
 
     rows: int = 16
@@ -59,32 +59,32 @@ class Pad:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Of its images."""
+        """Rows and columns of its images."""
         return self.rows, self.columns
 
     @property
     def taxels(self) -> int:
-        """How many it has."""
+        """Number of taxels."""
         return self.rows * self.columns
 
     @property
     def is_flat(self) -> bool:
-        """It is mounted on no sphere."""
+        """Whether the array is mounted flat, on no sphere."""
         return self.mount_radius_m is None
 
     @property
     def is_grid(self) -> bool:
-        """Its taxels are a grid of rows, columns and pitch; a scan needs that."""
+        """Whether the taxels are a grid of rows, columns and pitch; a scan needs a grid."""
         return self.positions is None
 
     @property
     def radius_m(self) -> float:
-        """Of the sphere that it is wrapped on, or that a flat pad is taken for."""
+        """Radius of the sphere that the array is wrapped on, or that a flat pad is taken for, m."""
         return FLAT_RADIUS_M if self.mount_radius_m is None else self.mount_radius_m
 
     @property
     def reach_m(self) -> float:
-        """From the middle to the nearest edge."""
+        """Distance from the middle to the nearest edge, m."""
         if self.positions is None:
             return 0.5 * min(self.shape) * self.pitch_m
         return float(np.abs(self.uv).max(axis=0).min()) + 0.5 * self.pitch_m
@@ -101,8 +101,8 @@ class Pad:
     def areas(self) -> Floats:
         """(rows · columns,) area that each taxel stands for, m².
 
-        Of a grid on a sphere `pitch² · sin(ρ)/ρ` with ρ = √(u² + v²)/R; of a list the part across z, so that pressure
-        times area is the force along z.
+        A taxel of a grid on a sphere has `pitch² · sin(ρ)/ρ` with ρ = √(u² + v²)/R. A listed taxel has the part of its
+        area across z, so that pressure times area is the force along z.
         """
         if self.positions is not None:
             tilt = 1.0 if self.normals is None else np.asarray(self.normals, dtype=np.float64)[:, 2]

@@ -1,7 +1,9 @@
-"""How a probe moves: lines and arcs between its poses, and the joint steps that follow its poses, in `plan` and `run`.
+"""Motion of a probe: lines and arcs between poses, and the joint steps that follow poses, for tasks and for the plan.
 
-A line or an arc gives the pose at a time. `PoseSteps` turns pose after pose into joints by one damped Newton step of
-the inverse kinematics each: a task takes one a cycle, the plan takes longer ones along the path that the task will go.
+A line or an arc gives the pose at a time. `PoseSteps` turns each pose into joints by one Newton step of the inverse
+kinematics, damped near singular poses: a task takes one step a cycle, the plan takes longer ones along the path that
+the task will go. Why not the whole inverse (`inverse_near`): its iterations do not fit into a cycle, and one step from
+a posture a fraction of a millimetre away is exact enough.
 """
 
 from __future__ import annotations
@@ -19,16 +21,16 @@ from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.touch.servo import ProbePose
 from canprobe.mechanics.types import Floats, Vec
 
-MOVE_SPEED, ROUND_SPEED, RETREAT_SPEED = 30e-3, 40e-3, 20e-3
+MOVE_SPEED_M_S, ROUND_SPEED_M_S, RETREAT_SPEED_M_S = 30e-3, 40e-3, 20e-3
 """Mean speeds of the way to an object, round a ball, and off an object, m/s."""
 EXTRA_CLEARANCE_M = 2e-3
-"""By which a probe draws back farther from a ball than the clearance from which it came."""
+"""Distance by which a probe draws back farther from a ball than the clearance from which it came, m."""
 SETTLE_S = 0.5
-"""At rest in contact before a scan."""
-SMALL_STEP_RAD = 0.01
-"""Joint step (rad) below which the exact inverse is taken: in a cycle of 400 Hz 230 deg/s."""
-REST_HZ = 1.0
-"""How fast more joints than a pose needs go back to the posture they began with."""
+"""Time at rest in contact before a scan, s."""
+MAX_EXACT_STEP_RAD = 0.01
+"""Largest joint step of the exact inverse that is taken undamped, rad: 230 deg/s in a cycle of 400 Hz."""
+REST_RETURN_HZ = 1.0
+"""Bandwidth with which joints that a pose leaves free go back to the posture they began with, Hz."""
 
 
 def solve(J: Floats, twist: Any) -> list[float] | None:
@@ -43,14 +45,14 @@ def solve(J: Floats, twist: Any) -> list[float] | None:
 class PoseSteps:
     """Joint steps that follow the poses of a probe.
 
-    An arm follows the rows of the pose that it can hold (`task_rows`). With six of them the turn about the pole is as
-    near to that of the beginning as the pole allows. More joints than rows stay near the posture that they began with.
+    An arm follows the rows of the pose that it can hold (`task_rows`). With six rows the turn about the pole stays as
+    near to the first one as the pole allows. Where there are more joints than rows, they stay near the first posture.
 
     Args:
         model: the arm.
-        T_flange_probe: (4, 4) of the probe's centre, m.
-        q: (n,) joint positions of the beginning, rad or m.
-        solve: what solves a square system, as `solve` does; a cycle has a quicker one.
+        T_flange_probe: (4, 4) probe frame to flange, m.
+        q: (n,) first joint positions, rad or m.
+        solve: solver of a square system, as the function `solve`; a control cycle has a quicker one.
 
     Attributes:
         at: chain and probe in the joints of the last step.
@@ -71,12 +73,12 @@ class PoseSteps:
         self._x_reference = self.at.x
 
     def step(self, q: list[float], pose: ProbePose, dt: float) -> list[float]:
-        """The step (n,), rad or m, by which joints come nearer to a pose.
+        """The joint step (n,), rad or m, towards a pose.
 
         Args:
-            q: (n,) joint positions before it.
+            q: (n,) joint positions before the step, rad or m.
             pose: the pose.
-            dt: how long the step takes, s.
+            dt: duration of the step, s.
         """
         self.at = at = posture(self._chain, q)
         J = jacobian(at, at.flange)
@@ -89,10 +91,11 @@ class PoseSteps:
             J, twist = in_rows(self._rows, R, J), in_rows(self._rows, R, six)
         if J.shape[0] == J.shape[1]:
             exact = self._solve(J, twist)
-            if exact is not None and max(map(abs, exact)) < SMALL_STEP_RAD:
+            if exact is not None and max(map(abs, exact)) < MAX_EXACT_STEP_RAD:
                 return exact
-        # the exact step would be no small one, as near a singular pose
-        wish = 2.0 * math.pi * REST_HZ * dt * (self._rest - q)
+        # The exact step is large, as near a singular pose, or there is none. Why not always the damped step: it costs a
+        # decomposition in every cycle.
+        wish = 2.0 * math.pi * REST_RETURN_HZ * dt * (self._rest - q)
         damped: list[float] = damped_step(J, np.asarray(twist), wish).tolist()
         return damped
 
@@ -100,7 +103,7 @@ class PoseSteps:
 def _pose_error(at: Posture, centre: list[float], pole: list[float], x_reference: Vec) -> tuple[float, ...]:
     """Twist (6) from a probe's pose to a centre and a pole, x as near to the reference as the pole allows.
 
-    Unrolled floats: on 3-vectors numpy costs ten times as much.
+    Plain floats are used, as numpy costs ten times as much on 3-vectors.
     """
     (r00, r10, r20), (r01, r11, r21), (r02, r12, r22), (t0, t1, t2) = at.x, at.y, at.z, at.flange
     p0, p1, p2 = pole
@@ -133,7 +136,7 @@ class LineMotion:
         start: pose to leave.
         end: pose to reach.
         speed: mean speed, m/s.
-        at_once: leave with twice the mean speed, which then falls to zero: to let go of what is pressed.
+        at_once: whether to leave with twice the mean speed, which then falls to zero, as when a press must end at once.
     """
 
     def __init__(self, start: ProbePose, end: ProbePose, speed: float, *, at_once: bool = False) -> None:
@@ -152,10 +155,10 @@ class LineMotion:
 
 
 class ArcMotion:
-    """Round a centre: direction along a great circle, distance and pole by a quintic time law.
+    """A move round a centre: direction along a great circle, distance and pole by a quintic time law.
 
     Args:
-        centre: of the ball (3,), m.
+        centre: (3,) centre of the ball, m.
         start: pose to leave, not at the centre.
         end: pose to reach; not opposite to the first.
         speed: mean speed, m/s.

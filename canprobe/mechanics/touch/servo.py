@@ -1,13 +1,16 @@
 """The tactile servo, from contact samples to the pose of the probe.
 
-One idea: the surface stands still, the probe does not. A local model of the surface (point, normal, curvature) is
-corrected by every tactile sample *at the instant it was sampled*; the pose that will hold the wanted indentation is
-then read off that model, however late the command takes effect. Force is regulated as indentation: measured force and
-wanted force are turned into depth by the same elastic law, so a wrong stiffness cannot leave a steady error, only
-change the loop's gain: with a relative error e the delayed loop has the gain |e|, so it is stable for any delay while
-the stiffness is known to better than a factor of two.
+The surface stands still while the probe moves. So a local model of the surface (point, normal, curvature) is corrected
+by every tactile sample *at the instant it was sampled*; the pose that will hold the wanted indentation is then read off
+that model, however late the command takes effect. Why not close the loop on the force itself: with the whole delay of
+about 27 ms feedback alone has 2 to 4.5 Hz of bandwidth, and at 25 mm/s a slope would lift the probe off.
 
-Source: Chen, Rink & Zhang, section 4.2 (the five steps around (36)), with a damped inverse instead of ``J`` in step 4.
+Force is regulated as indentation: one elastic law turns measured force and wanted force into depth. Why not by a gain
+in N/m: on a spherical probe the force grows with the square of the depth, so a fixed gain would be right at one force.
+A wrong stiffness then leaves no steady error; it only changes the loop's gain. With a relative error e the delayed loop
+has the gain |e|, so it is stable for any delay while the stiffness is known to better than a factor of two.
+
+Source: Chen, Rink and Zhang, section 4.2 (five steps around (36)), with a damped inverse instead of ``J`` in step 4.
 """
 
 from __future__ import annotations
@@ -23,7 +26,7 @@ from canprobe.mechanics.touch.strategies import PathFollower
 from canprobe.mechanics.types import Floats
 
 MIN_SLOPE_COSINE = 0.2
-"""Least cosine between surface normal and approach direction that is reckoned with: 78 degrees."""
+"""Least cosine between surface normal and approach direction, 78 degrees: a steeper slope is taken as this steep."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,10 +34,10 @@ class SurfaceGains:
     """How fast the servo's local surface follows the tactile samples.
 
     Args:
-        height_hz: bandwidth of the height correction (Hz).
-        tilt_hz: bandwidth of the normal's correction (Hz).
-        curvature_hz: bandwidth with which a new curvature is taken up (Hz): at once it would turn the normal ahead of
-            the last sample by its change times that distance, and the probe with it.
+        height_hz: bandwidth of the height correction, Hz.
+        tilt_hz: bandwidth of the normal's correction, Hz.
+        curvature_hz: bandwidth with which a new curvature is adopted, Hz. Why not at once: the normal ahead of the
+            last sample would jump by the change of curvature times that distance, and the probe with it.
     """
 
     height_hz: float = 8.0
@@ -45,7 +48,9 @@ class SurfaceGains:
 class LocalSurface:
     """The surface near the contact: ``a + d − ½ (dᵀ K d) m`` over the tangent plane at ``a`` with outward normal ``m``.
 
-    Second order only: true within a few millimetres of the last sample, which is all the servo looks ahead.
+    It is of second order only: true within a few millimetres of the last sample, and the servo looks no further ahead.
+    Why not the estimator's surface itself: that is 0.4 ms of work and comes after some path, while height and tilt must
+    follow every sample from the first one on. Only its curvature is taken over (`set_curvature`).
 
     Args:
         point: a point of the surface (3,), m.
@@ -62,7 +67,7 @@ class LocalSurface:
 
     @property
     def point(self) -> Floats:
-        """The point (3,), m, that the model stands on."""
+        """Point (3,) of the surface at which the model is expanded, m."""
         return np.array(self._point)
 
     @property
@@ -71,9 +76,9 @@ class LocalSurface:
         return np.array(self._normal)
 
     def foot(self, x: Sequence[float]) -> tuple[Sequence[float], Sequence[float]]:
-        """Surface point and outward unit normal over the tangential position of a point, m.
+        """Surface point (m) and outward unit normal where a line along the model's normal through a point (m) meets it.
 
-        On plain floats: on 3-vectors numpy costs ten times as much.
+        Plain floats are used, as numpy costs ten times as much on 3-vectors.
         """
         a0, a1, a2 = self._point
         m0, m1, m2 = self._normal
@@ -93,9 +98,21 @@ class LocalSurface:
         )
 
     def correct(self, point: Floats, normal: Floats, dt: float) -> float:
-        """Move the model to a measured point (3,), m, and towards it and its outward normal (3,), `dt` (s) later.
+        """Expand the model at a measured contact, and correct its height, normal and curvature towards it.
 
-        Returns the height error before, m, positive where the surface was found higher than modelled.
+        Each is corrected by the share `1 − exp(−2π f dt)` of a first-order filter of its bandwidth f, which is right
+        for samples at any spacing.
+
+        Args:
+            point: (3,) measured contact point, m.
+            normal: (3,) measured outward unit normal.
+            dt: time since the last sample, s.
+
+        Returns:
+            Height error before the correction, m, positive where the surface was found higher than modelled.
+
+        Raises:
+            UsageError: `dt` is negative.
         """
         if dt < 0:
             raise UsageError(f"dt: expected a time that has passed, got {dt:g} s")
@@ -112,39 +129,43 @@ class LocalSurface:
         return error
 
     def raise_by(self, height: float) -> None:
-        """Move the model outward along its normal by a height, m: what was measured so far lies that much higher."""
+        """Move the model outward along its normal by a height, m, as when all samples so far turn out to lie higher."""
         (a0, a1, a2), (m0, m1, m2) = self._point, self._normal
         self._point = a0 + height * m0, a1 + height * m1, a2 + height * m2
 
     def move_to(self, point: Floats, normal: Floats) -> None:
-        """Stand on another point (3,), m, with an outward unit normal (3,)."""
+        """Expand the model at another point (3,), m, with an outward unit normal (3,); the curvature is kept."""
         self._point = tuple(point.tolist())
         self._normal = _unit(normal.tolist())
 
     def set_curvature(self, tensor: Floats) -> None:
-        """Go over, with the next samples, to a curvature tensor (3, 3), symmetric, 1/m, in the same frame."""
+        """Adopt, with the next samples, a curvature tensor (3, 3), symmetric, 1/m, in the same frame."""
         (xx, xy, xz), (_, yy, yz), (_, _, zz) = tensor.tolist()
         self._wanted = [xx, xy, xz, yy, yz, zz]
 
 
 @dataclass(frozen=True, slots=True)
 class ProbePose:
-    """Where the probe sphere must be: its centre (3,), m, and the direction of its pole (3,), in base."""
+    """Pose of the probe but for the turn about its pole: centre (3,), m, and unit vector (3,) of the pole, in base."""
 
     centre: Floats
     pole: Floats
 
 
 class TactileServo:
-    """Marches a reference contact over the local surface and turns it into a probe pose.
+    """Marches a reference contact over the local surface and gives the pose of the probe that holds it.
+
+    The reference is carried from cycle to cycle and does not start from the measured contact. Why not from that one:
+    its noise and its delay would enter the speed, and each cycle would step back by the path of the delay.
 
     Args:
         surface: the local surface, corrected by the caller with every tactile sample.
-        follower: gives the heading in the scan plane; None only holds.
+        follower: path that gives the heading in the scan plane; None to hold the contact where it is.
         axes: (3, 3) rows: heading, across, approach normal of the scan plane, in the base frame.
-        origin: origin of the scan plane's curve (3,), m.
+        origin: (3,) origin of the scan plane's curve, m.
         probe_radius: radius of the undeformed probe, m.
-        rolling_share: 0 the pad follows the normal, 1 it keeps its first orientation.
+        rolling_share: 0 if the pad follows the normal, 1 if it keeps its first orientation, or between. Why not always
+            0: to follow the normal takes joint speeds that an arm may not have.
     """
 
     def __init__(
@@ -167,7 +188,7 @@ class TactileServo:
         self._first_pole = (-surface.normal).tolist()
 
     def rest_on(self, point: Floats, normal: Floats) -> None:
-        """Go on from another contact: its point (3,), m, and outward unit normal (3,); the curvature is kept."""
+        """Continue from another contact: its point (3,), m, and outward unit normal (3,); the curvature is kept."""
         self.surface.move_to(point, normal)
         self._reference = tuple(point.tolist())
 
@@ -175,7 +196,7 @@ class TactileServo:
         """The pose that the probe must have when this cycle's command takes effect.
 
         Args:
-            speed: of the contact over the surface, m/s.
+            speed: speed of the contact over the surface, m/s.
             depth: wanted indentation, m.
             dt: servo period, s.
         """
@@ -191,7 +212,11 @@ class TactileServo:
     def _march(
         self, follower: PathFollower, foot: Sequence[float], normal: Sequence[float], distance: float
     ) -> tuple[Sequence[float], Sequence[float]]:
-        """One step along the heading, lifted out of the scan plane into the tangent plane."""
+        """One step along the heading, lifted from the scan plane into the tangent plane.
+
+        On a slope the step in the scan plane is shorter than the distance, so that the speed over the surface is the
+        wanted one.
+        """
         (h0, h1, h2), (c0, c1, c2), (u0, u1, u2) = self._heading, self._across, self._up
         (f0, f1, f2), (n0, n1, n2), (o0, o1, o2) = foot, normal, self._origin
         d0, d1, d2 = f0 - o0, f1 - o1, f2 - o2

@@ -1,8 +1,8 @@
-"""A shape at a pose, which all touchable surfaces share, and those that are no quadric: bowl, wave, fillet, torus.
+"""The base class of all touchable surfaces, a shape at a pose, and shapes beyond quadrics: bowl, wave, fillet, torus.
 
-Every shape has a frame of its own: the origin lies ON the surface at its reference (top-most) point, z is the outward
-normal there. A scene thus places a surface by one of its points. Bodies are solid below the origin; curvature is
-positive for convex. Distances are exact or by a safeguarded Newton iteration to 1e-12 m.
+Every shape has a frame: its origin lies ON the surface at the reference (top-most) point, and z is the outward normal
+there. A scene thus places a surface by one of its points. Bodies are solid below the origin; curvature is positive for
+convex. Distances are exact or by a safeguarded Newton iteration to 1e-12 m.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Foot = tuple[float, float, float, float, float, float, float, float, float, floa
 
 
 class Nearest(NamedTuple):
-    """What ``ClosestPoint`` holds, in plain floats for what asks in every cycle."""
+    """As `ClosestPoint`, in plain floats, for callers in every cycle."""
 
     point: Vec
     normal: Vec
@@ -35,8 +35,8 @@ class ClosestPoint:
     """The surface point nearest to a query point, in the base frame.
 
     Attributes:
-        point: (3,) m.
-        normal: (3,) outward unit normal of the body.
+        point: (3,) closest point, m.
+        normal: (3,) outward unit normal of the body there.
         distance: signed distance of the query point, m, positive outside.
         kappa: (2,) principal curvatures, 1/m, larger first, positive for convex.
         directions: (2, 3) unit rows d1, d2 with d1 x d2 = normal. They are axes: the common sign is arbitrary, and at
@@ -55,8 +55,8 @@ class TouchedPlaces:
     """All places where a ball touches at once, base frame.
 
     Attributes:
-        points, normals: (n, 3) m, outward.
-        distances: (n,) from the ball's centre, m.
+        points, normals: (n, 3) points, m, and outward unit normals.
+        distances: (n,) distances from the ball's centre, m.
         kappa: (n, 2) principal curvatures, 1/m, larger first.
         edge_m: (n,) length of edge that a place stands for, m; 0 for a point of a smooth surface.
     """
@@ -75,11 +75,11 @@ class PlacedShape:
         T_base_object: (4, 4) pose of the object's frame, m.
 
     Raises:
-        ValueError: for a pose that is not a rotation and a translation.
+        ValueError: the pose is not a rotation and a translation.
     """
 
     by_gaps = False
-    """Whether force and pressure follow from the gaps all over a ball, not from the curvature where it touches."""
+    """Whether force and pressure follow from the gaps all over a ball, and not from the curvature at the contact."""
 
     def __init__(self, T_base_object: npt.ArrayLike) -> None:
         pose = np.array(T_base_object, dtype=float)
@@ -137,7 +137,7 @@ class PlacedShape:
         return np.array([self.closest(p).distance for p in points_base])
 
     def squeezed(self, centre_base: Vec, radius: float) -> float:
-        """Volume (m³) by which the layer of a ball is squeezed; of surfaces that press by their gaps only."""
+        """Volume (m³) by which the layer of a ball is squeezed; only surfaces with `by_gaps` have it."""
         raise NotImplementedError
 
     def _to_object(self, points_base: Floats) -> Floats:
@@ -187,7 +187,7 @@ class RoundShape(PlacedShape):
 
     Args:
         T_base_object: (4, 4) pose, m.
-        radius: m.
+        radius: radius, m.
     """
 
     def __init__(self, T_base_object: npt.ArrayLike, radius: float) -> None:
@@ -206,8 +206,9 @@ def tangent_of(nx: float, ny: float, nz: float) -> tuple[float, float, float]:
 
 
 LIP_M = 1e-3
-"""Radius of the rounding between the hollow's wall and the top."""
-_PIECES = 360
+"""Radius of the rounding between the hollow's wall and the top, m."""
+_LIP_PIECES = 360
+"""Number of short edges into which the ring of contact on a lip is cut."""
 
 
 class Bowl(RoundShape):
@@ -219,9 +220,9 @@ class Bowl(RoundShape):
 
     def __init__(self, T_base_object: npt.ArrayLike, radius: float) -> None:
         super().__init__(T_base_object, radius)
-        angles = np.arange(_PIECES) * (2.0 * pi / _PIECES)
+        angles = np.arange(_LIP_PIECES) * (2.0 * pi / _LIP_PIECES)
         ring = radius + LIP_M
-        self._ring = np.column_stack((ring * np.cos(angles), ring * np.sin(angles), np.full(_PIECES, radius)))
+        self._ring = np.column_stack((ring * np.cos(angles), ring * np.sin(angles), np.full(_LIP_PIECES, radius)))
 
     def _foot(self, x: float, y: float, z: float) -> Foot:
         radius = self.radius
@@ -262,7 +263,7 @@ class Bowl(RoundShape):
         points = self._ring[near] + LIP_M * normals
         across = np.sum(normals[:, :2] * points[:, :2], axis=1)
         kappa = np.column_stack((np.full(len(points), 1.0 / LIP_M), across / np.sum(points[:, :2] ** 2, axis=1)))
-        length = np.full(len(points), 2.0 * pi * (self.radius + LIP_M) / _PIECES)
+        length = np.full(len(points), 2.0 * pi * (self.radius + LIP_M) / _LIP_PIECES)
         return self._placed(points, normals, size[near] - LIP_M, kappa, length)
 
     def gaps(self, points_base: Floats) -> Floats:
@@ -279,8 +280,9 @@ class Bowl(RoundShape):
         return self.radius
 
 
-_PER_WAVE = 48
-_NEWTON = 60
+_POINTS_PER_WAVE = 48
+"""Points of the grid on which a wave's minima are looked for, per wavelength."""
+_MAX_NEWTON_STEPS = 60
 
 
 class Wave(PlacedShape):
@@ -291,7 +293,7 @@ class Wave(PlacedShape):
     Args:
         T_base_object: (4, 4) pose, m.
         amplitude: half of the height from trough to crest, m.
-        wavelength: along y, m.
+        wavelength: length of a wave along y, m.
     """
 
     def __init__(self, T_base_object: npt.ArrayLike, amplitude: float, wavelength: float) -> None:
@@ -299,7 +301,7 @@ class Wave(PlacedShape):
         require_positive(amplitude=amplitude, wavelength=wavelength)
         self.amplitude, self.wavelength = amplitude, wavelength
         self._k = 2.0 * pi / wavelength
-        self._spacing = wavelength / _PER_WAVE
+        self._spacing = wavelength / _POINTS_PER_WAVE
 
     def _height(self, y: float) -> tuple[float, float, float]:
         """z, dz/dy and d2z/dy2."""
@@ -320,7 +322,7 @@ class Wave(PlacedShape):
     def _polished(self, start: float, y: float, z: float) -> float:
         """Root of half the squared distance's slope within a grid step of the start."""
         low, high, v = start - self._spacing, start + self._spacing, start
-        for _ in range(_NEWTON):
+        for _ in range(_MAX_NEWTON_STEPS):
             h, slope, bend = self._height(v)
             g = v - y + (h - z) * slope
             low, high = (v, high) if g < 0.0 else (low, v)
@@ -371,8 +373,8 @@ class Fillet(RoundShape):
 
     Args:
         T_base_object: (4, 4) pose, m.
-        radius: of the arc, m.
-        angle: by which the edge turns, rad; each plane slopes down by half of it.
+        radius: radius of the arc, m.
+        angle: angle by which the edge turns, rad; each plane slopes down by half of it.
     """
 
     def __init__(self, T_base_object: npt.ArrayLike, radius: float, angle: float) -> None:
@@ -402,8 +404,8 @@ class Torus(RoundShape):
 
     Args:
         T_base_object: (4, 4) pose, m.
-        ring_radius: of the tube's centre line, m.
-        radius: of the tube, m; smaller than the ring's.
+        ring_radius: radius of the tube's centre line, m.
+        radius: radius of the tube, m, smaller than `ring_radius`.
     """
 
     def __init__(self, T_base_object: npt.ArrayLike, ring_radius: float, radius: float) -> None:

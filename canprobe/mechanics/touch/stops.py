@@ -1,16 +1,68 @@
-"""The limits at which a touch ends, as images and forces show it.
+"""The limits of image and force at which a touch is stopped.
 
-The plan reckons with the same numbers, so that what it accepts comes to its end.
+The plan uses the same numbers, so that a scene that it accepts is not stopped by them.
 """
 
 from __future__ import annotations
 
+import math
+
 OFF_PAD_EDGE_SHARE = 0.95
-"""Pressure at the pad's edge over the highest from which the contact runs off: a paraboloid has lost a sixth."""
+"""Pressure at the pad's edge over the highest pressure from which on a contact counts as off the pad: a paraboloid has
+lost a sixth of its force by then."""
 OFF_PAD_SIGMAS, OFF_PAD_TAXELS = 1.55, 1.0
-"""The same where only moments are known: from the centroid to the edge, a taxel's own width included in σ. A paraboloid
-has lost a fourth by then, and one of which only a rim is left lies in the last row of taxels."""
+"""The same limit where only moments are known: distance of the centroid from the edge, in standard deviations of the
+pressure (the width of a taxel included), and in taxels. A paraboloid has lost a fourth of its force by the first; one
+of which only a rim is left has its centroid in the last row of taxels."""
 TOUCH_FORCE = 0.15
-"""N; contact is made above it, and gone below half of it: an image of less says nothing about its place."""
+"""Force above which there is contact, N, and below half of which there is none: an image of less force does not show
+the place of the contact."""
 MAX_FORCE_SPREAD = 0.2
-"""Standard deviation of the force over the target above which it has not settled: twice that of a 40 kN/m contact."""
+"""Largest standard deviation of a settled force over its target: twice that of a contact of 40 kN/m."""
+MAX_SATURATED_SHARE = 0.75
+"""Share of saturated samples above which the measured force is only a lower bound of the true one.
+
+Saturation alone is no reason to stop: up to 40 kN/m the bound is near enough. Where √F did not grow on a line either,
+it is not.
+"""
+MIN_REST_SAMPLES = 10
+"""Least number of samples that are judged."""
+
+
+class AtRest:
+    """Spread and saturation from running means (Welford): constant time and memory."""
+
+    def __init__(self) -> None:
+        self._n = self._saturated = 0
+        self._mean = self._spread = 0.0
+
+    def add(self, force: float, saturated: bool) -> None:
+        """Take a force (N), and whether a taxel was at its largest count."""
+        self._n += 1
+        self._saturated += saturated
+        from_mean = force - self._mean
+        self._mean += from_mean / self._n
+        self._spread += from_mean * (force - self._mean)
+
+    def doubt(self, target: float, stiffness_known: bool) -> str | None:
+        """Why the force is not the wanted one; None where it is, or where that is not known yet.
+
+        Args:
+            target: wanted force, N.
+            stiffness_known: whether the touch showed the layer's stiffness (`PushFit`).
+        """
+        if self._n < MIN_REST_SAMPLES:
+            return None
+        if not stiffness_known and self._saturated > MAX_SATURATED_SHARE * self._n:
+            return (
+                f"the array is saturated in {100.0 * self._saturated / self._n:.0f} % of the samples and no stiffness "
+                f"was measured: the true force is above the measured {self._mean:.1f} N; raise sensor.full_scale_kpa "
+                "or lower task.force_n"
+            )
+        sigma = math.sqrt(self._spread / (self._n - 1))
+        if sigma > MAX_FORCE_SPREAD * target:
+            return (
+                f"the force does not settle: {self._mean:.1f} ± {sigma:.1f} N where {target:.1f} N are wanted; the "
+                "contact is too stiff for the arm's encoder counts, or servo.surface_height_hz too high"
+            )
+        return None

@@ -1,7 +1,7 @@
 """Strategies: where the contact goes next, as a heading in the scan plane.
 
-The scan plane is perpendicular to the approach direction. A strategy is a closed curve in it, followed by arc length,
-so that the contact speed is the same everywhere; the servo lifts the heading into the surface's tangent plane.
+The scan plane is perpendicular to the approach direction. A strategy is a closed curve in that plane, followed by arc
+length, so that the contact has one speed everywhere; the servo lifts the heading into the surface's tangent plane.
 """
 
 from __future__ import annotations
@@ -18,20 +18,21 @@ class Strategy(Protocol):
         """Point of the curve (m, m: along the heading, across) at ``phase`` (rad)."""
 
     def tangent(self, phase: float) -> tuple[float, float]:
-        """Derivative of :meth:`point` by the phase (m/rad)."""
+        """Derivative of `point` by the phase (m/rad)."""
 
 
 class Weave:
-    """To and fro along the heading with a sine across it: excites the curvature in both directions everywhere.
+    """To and fro along the heading with a sine across it, which excites the curvature in both directions everywhere.
 
-    Along the heading it is a triangle wave without its sharp tips (three terms of its series), so that the path does
-    not linger at the ends, where a plain sine would leave the curvature along the heading without excitation.
+    Along the heading it is a triangle wave without its sharp tips (three terms of its series). Why not a plain sine:
+    the path would linger at its ends and leave the curvature along the heading without excitation there.
 
     Args:
-        length_m: full size along the heading.
-        width_m: full size across it.
-        wavelength_m: mean distance along the heading of one full weave; sets the even ratio ``m``: at
-            the ends the path then turns round smoothly and comes back beside itself, where an odd one would reverse.
+        length_m: full size along the heading, m.
+        width_m: full size across it, m.
+        wavelength_m: mean distance along the heading of one full weave, m. It sets the even ratio ``m`` of the two
+            frequencies: with an even ratio the path turns round smoothly at the ends and comes back beside itself; with
+            an odd one it would reverse on itself.
     """
 
     def __init__(self, length_m: float, width_m: float, wavelength_m: float) -> None:
@@ -48,7 +49,11 @@ class Weave:
 
 
 class Circle:
-    """A circle through the start point, its centre ``diameter/2`` along the heading."""
+    """A circle through the start point with its centre ``diameter/2`` along the heading.
+
+    Args:
+        diameter_m: diameter, m.
+    """
 
     def __init__(self, diameter_m: float) -> None:
         self._r = diameter_m / 2
@@ -63,10 +68,10 @@ class Circle:
 class Straight:
     """To and fro along the heading: a triangle wave, one stroke of ``length/2`` per quarter turn of the phase.
 
-    A straight path leaves the curvature across it unobserved; that is what this strategy is for.
+    A straight path leaves the curvature across it unobserved; the strategy serves to show that.
 
     Args:
-        length_m: full size along the heading.
+        length_m: full size along the heading, m.
     """
 
     def __init__(self, length_m: float) -> None:
@@ -81,10 +86,10 @@ class Straight:
 
 
 def make_strategy(name: str, length_m: float, width_m: float, wavelength_m: float = 0.012) -> Strategy:
-    """Strategy by name.
+    """A strategy by name: ``weave``, ``circle`` or ``straight``; each takes of the sizes, m, those that it has.
 
     Raises:
-        KeyError: for a name that is none of ``weave``, ``circle``, ``straight``.
+        KeyError: the name is another one.
     """
     makers: dict[str, Callable[[], Strategy]] = {
         "weave": lambda: Weave(length_m, width_m, wavelength_m),
@@ -95,7 +100,12 @@ def make_strategy(name: str, length_m: float, width_m: float, wavelength_m: floa
 
 
 class PathFollower:
-    """Follows a curve by arc length; `cross_track_per_m`: how strongly the heading turns back to it."""
+    """Follows a curve by arc length.
+
+    Args:
+        strategy: the curve.
+        cross_track_per_m: turn of the heading back to the curve, as the tangent of an angle over the distance, 1/m.
+    """
 
     def __init__(self, strategy: Strategy, cross_track_per_m: float = 60.0) -> None:
         self._strategy = strategy
@@ -111,9 +121,11 @@ class PathFollower:
         return tx / norm, ty / norm
 
     def step(self, x: float, y: float, distance_m: float) -> tuple[float, float]:
-        """Unit heading (along, across) in the scan plane for the next step, from where the contact is (m, m).
+        """Unit heading (along, across) in the scan plane for the next step.
 
-        `distance_m`: how far it moves in that plane until the next call.
+        Args:
+            x, y: place of the contact in the scan plane, m.
+            distance_m: way of the contact in that plane until the next call, m.
         """
         tx, ty = self._tangent
         norm = math.hypot(tx, ty)

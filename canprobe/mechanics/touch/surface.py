@@ -53,7 +53,7 @@ class SurfaceMatrix:
         """A sphere in its contact frame.
 
         Args:
-            radius: m; negative for the inside of a spherical bowl.
+            radius: radius, m; negative for the inside of a spherical bowl.
         """
         k = 1.0 / _nonzero("radius", radius)
         return cls.from_curvature(k * np.eye(2), c33=0.5 * k)
@@ -63,7 +63,7 @@ class SurfaceMatrix:
         """A circular cylinder in its contact frame.
 
         Args:
-            radius: m; negative for the inside of a tube.
+            radius: radius, m; negative for the inside of a tube.
             axis: direction of the centre line in the tangent plane, "x", "y" or an angle from x in rad.
         """
         named = {"x": (0.0, 1.0), "y": (1.0, 0.0)}
@@ -115,7 +115,7 @@ class SurfaceMatrix:
         """The same surface in new coordinates, `S' = Tᵀ S T` (8), exact.
 
         Args:
-            T: (4, 4) takes new coordinates to the present ones.
+            T: (4, 4) transform that takes new coordinates to the present ones.
         """
         matrix = checked("T", T, (4, 4))
         S = matrix.T @ self.S @ matrix
@@ -150,7 +150,7 @@ class SurfaceMatrix:
         """Shape operator at a point of the surface.
 
         Args:
-            point: (3,) m.
+            point: (3,) point on the surface, m.
 
         Returns:
             The shape operator (2, 2) in 1/m, positive where convex, and its tangent basis (3, 2), the x and y axes of
@@ -163,7 +163,7 @@ class SurfaceMatrix:
     def contact_frame(self, point: ArrayLike) -> Floats:
         """T (4, 4) from the contact frame at a point to this frame: z is the inward normal.
 
-        The x axis is this frame's x axis laid on the tangent plane (`linear_algebra.tangent_rotation`).
+        The x axis is this frame's x axis laid on the tangent plane (`tangent_frames.tangent_rotation`).
         """
         p = checked("point", point, (3,))
         return homogeneous(tangent_rotation(-self.gradient(p) / self._gradient_size(p)), p)
@@ -172,7 +172,7 @@ class SurfaceMatrix:
         """z of the surface over (x, y), the root that is 0 at the contact; NaN where there is none.
 
         Args:
-            x, y: m, in a contact frame (or any frame where the z axis crosses the surface near the origin).
+            x, y: places, m, in a contact frame (or any frame where the z axis crosses the surface near the origin).
 
         Returns:
             z, m, in the shape of x and y.

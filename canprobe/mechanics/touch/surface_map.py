@@ -1,4 +1,4 @@
-"""A whole scan as one surface description: local patches along the contact's path, and where their surface is.
+"""A whole scan as one description: local patches along the contact's path, and the surface that they make.
 
 Source: Chen, Rink and Zhang, "Local object shape from tactile sensing": an object is described by a set of local
 contact frames with their surface matrices.
@@ -23,10 +23,10 @@ from canprobe.mechanics.touch.surface import SurfaceMatrix
 from canprobe.mechanics.types import Floats
 
 UNSEEN_CURVATURE_SIGMA = 10.0
-"""Standard deviation of a combination of curvature that was not observed, over the path that the estimate rests on:
-±500 1/m for 20 mm, a radius of 2 mm. It only ever widens what is said of heights and normals beside the contact."""
+"""Standard deviation of a combination of curvature that was not observed, times the path that the estimate rests on:
+±500 1/m for 20 mm, a radius of 2 mm. It only widens the covariance of heights and normals beside the contact."""
 MIN_LENGTH_M = 1e-3
-"""A shorter path counts as this long."""
+"""Least path of an estimate for that standard deviation, m; a shorter one counts as this long."""
 
 _SHAPES: dict[str, tuple[int | None, ...]] = {
     "T_base_contact": (4, 4),
@@ -44,19 +44,21 @@ class LocalPatch:
 
     Attributes:
         T_base_contact: (4, 4) contact frame to base, m; z is the inward normal.
-        S: (4, 4) in the contact frame, c14 = c24 = c44 = 0, c34 = −½; unobserved combinations nearest to flat.
-        K_covariance: (3, 3) of (K11, K12, K22), 1/m²; NaN or infinite where not observed, as in `SurfaceEstimate`.
-        S_covariance: (9, 9) of (c14, c24, c44, c13, c23, c33, c11, c12, c22), SI units, always finite: a combination
-            that the data did not observe has the variance of `UNSEEN_CURVATURE_SIGMA` there, whatever the prior. c44 is
-            the height, 2 c14 and 2 c24 are the tilt.
-        pose_known: the part of `S_covariance` about height and tilt is the estimator's; False from methods that do
-            not know it, which leave zeros there.
+        S: (4, 4) surface matrix in the contact frame, c14 = c24 = c44 = 0, c34 = −½; unobserved combinations nearest to
+            flat.
+        K_covariance: (3, 3) covariance of (K11, K12, K22), 1/m²; NaN or infinite where not observed, as in
+            `SurfaceEstimate`.
+        S_covariance: (9, 9) covariance of (c14, c24, c44, c13, c23, c33, c11, c12, c22), SI units, always finite: a
+            combination that the data did not observe has the variance of `UNSEEN_CURVATURE_SIGMA` there, whatever the
+            prior. c44 is the height, 2 c14 and 2 c24 are the tilt.
+        pose_known: whether the part of `S_covariance` about height and tilt is known; False from methods that do not
+            know it and leave zeros there.
         observed: (2,) 1 or 0, for each principal curvature.
-        combinations: (rank, 3) rows: what was observed, as weights of (K11, √2 K12, K22).
+        combinations: (rank, 3) rows: the observed combinations, as weights of (K11, √2 K12, K22).
         t_s: instant of the last sample, s.
         travelled_m: path of the contact until then, m.
-        distance_m: path that the patch rests on, m; patches nearer than some of it along the path share their data.
-        innovation: mean squared whitened residual per degree of freedom; well below 1 where the σ's are generous.
+        distance_m: path that the patch rests on, m; patches that are nearer along the path share data.
+        innovation: mean squared whitened residual per degree of freedom; well below 1 where the σ's are too large.
     """
 
     T_base_contact: Floats
@@ -97,7 +99,7 @@ class LocalPatch:
 
     @property
     def rank(self) -> int:
-        """How many combinations of curvature were observed, 0–3."""
+        """Number of observed combinations of curvature, 0–3."""
         return len(self.combinations)
 
     @property
@@ -121,7 +123,7 @@ class LocalPatch:
         return parameters_of(self.S)
 
     def equals(self, other: LocalPatch) -> bool:
-        """Every field is the same, bit by bit (NaN equals NaN)."""
+        """Whether every field is the same, bit by bit (NaN equals NaN)."""
         return all(
             np.array_equal(np.asarray(getattr(self, f.name), float), np.asarray(getattr(other, f.name), float), True)
             for f in fields(self)
@@ -140,7 +142,7 @@ def _covariance(estimate: SurfaceEstimate) -> Floats:
     units = np.array([1.0, 1.0, 1.0 / length] + 6 * [length])
     root = estimate.model_root / units  # dimensionless, or the inverse would lose its digits
     if estimate.rank < 3:
-        # noise among the regressors feigns knowledge of what was not observed: taken out, and held wide instead
+        # noise in the regressors looks like information about unobserved combinations: it is replaced by a wide prior
         open_ = np.eye(3) - V @ V.T
         root = np.concatenate([root, np.zeros((3, 9))])
         root[:-3, 6:] = root[:-3, 6:] @ (_Q_TO_C * (V @ V.T) / _Q_TO_C.T)
@@ -162,8 +164,9 @@ def _curvature_covariance(estimate: SurfaceEstimate, V: Floats, weak: float) -> 
 
 
 SPACING_M = 2e-3
-"""Path from one patch to the next, m: well below the radius of what can be felt, so that neighbours overlap."""
+"""Path from one patch to the next, m: well below the radius of what a probe can touch, so that neighbours overlap."""
 MIN_RANK = 1
+"""Least number of observed combinations of curvature of a patch in a map."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -171,9 +174,9 @@ class SurfaceMap:
     """Local patches in the order in which they were measured, and the path of the contact.
 
     Attributes:
-        patches: each with its frame, matrix and covariance, by increasing `travelled_m`.
+        patches: patches, each with its frame, matrix and covariance, by increasing `travelled_m`.
         path: (n, 3) contact points, base frame, m.
-        method: estimator that the patches are from.
+        method: name of the estimator that made the patches.
         points: (m, 3) contact points of the patches, base frame, m.
         normals: (m, 3) outward unit normals there.
         travelled: (m,) path of the contact until each patch, m.
@@ -201,7 +204,7 @@ class SurfaceMap:
             if after < before:
                 raise UsageError(
                     f"patches[{i}].travelled_m: expected at least {before} of the one before, got {after}; patches"
-                    " stand in the order in which they were felt"
+                    " stand in the order in which they were measured"
                 )
 
     def __len__(self) -> int:
@@ -225,10 +228,10 @@ class SurfaceMap:
             reach: distance from a contact at which its patch no longer counts, m.
 
         Returns:
-            One row a point; NaN where no patch is in reach.
+            Feet with one row a point; NaN where no patch is in reach.
 
         Raises:
-            UsageError: not finite points (n, 3), or no positive reach.
+            UsageError: the points are not finite (n, 3), or the reach is not positive.
         """
         return feet_on(self._quadrics(), checked("points", points, (None, 3)), positive("reach", reach))
 
@@ -270,7 +273,7 @@ class SurfaceMap:
         )
 
     def equals(self, other: SurfaceMap) -> bool:
-        """The same patches, path and method, bit by bit."""
+        """Whether patches, path and method are the same, bit by bit."""
         same = len(self) == len(other) and self.method == other.method and np.array_equal(self.path, other.path)
         return same and all(a.equals(b) for a, b in zip(self.patches, other.patches, strict=True))
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from canprobe.mechanics.types import Floats, Vec
 
-_AXIS_LIMIT = 0.95
-"""Above this |component| of the normal the frame's own x axis is too close to it, and y is used."""
+_MAX_AXIS_COSINE = 0.95
+"""Largest |x component| of a normal at which the parent's x axis is laid on the plane; beyond it the y axis is."""
 
 
 def tangent_rotation(z_axis: Sequence[float] | Floats) -> Floats:
@@ -20,7 +20,7 @@ def tangent_rotation(z_axis: Sequence[float] | Floats) -> Floats:
     on z alone, so that two nearly equal normals give nearly equal axes.
     """
     zx, zy, zz = float(z_axis[0]), float(z_axis[1]), float(z_axis[2])
-    if abs(zx) <= _AXIS_LIMIT:
+    if abs(zx) <= _MAX_AXIS_COSINE:
         scale = 1.0 / math.sqrt(max(zy * zy + zz * zz, 1e-300))
         xx, xy, xz = (zy * zy + zz * zz) * scale, -zx * zy * scale, -zx * zz * scale
     else:

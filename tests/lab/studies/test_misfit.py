@@ -152,7 +152,7 @@ def held(method, seeds, sigma_point=1e-4, sigma_normal=5e-3):
 def test_where_noise_is_a_share_of_the_radius_a_hidden_misfit_is_reckoned_with(method, seeds, monkeypatch):
     """Without caution every second region misses."""
     assert held(method, seeds) >= 0.9
-    monkeypatch.setattr(misfit, "BLUR_RAD", 1.0)
+    monkeypatch.setattr(misfit, "BLUR_LIMIT_RAD", 1.0)
     assert held(method, seeds) <= 0.7
 
 
@@ -163,7 +163,7 @@ def test_caution_begins_at_its_limit_and_is_no_evidence(monkeypatch):
     for sigma_point, sigma_normal in ((20e-6, 1e-3), (1e-4, 5e-3)):
         points, normals = ground.felt(sigma_point, sigma_normal, np.random.default_rng(1))
         for limit in (5e-3, 1.0):
-            monkeypatch.setattr(misfit, "BLUR_RAD", limit)
+            monkeypatch.setattr(misfit, "BLUR_LIMIT_RAD", limit)
             e = fit_surface(points, normals, sigma_point=sigma_point, sigma_normal=sigma_normal)
             variances.append(np.trace(e.covariance))
             notes += e.notes

@@ -11,7 +11,7 @@ from canprobe.errors import PlanError
 from canprobe.mechanics.robot.chain import forward, forward_jacobian
 from canprobe.mechanics.robot.damped_inverse import damped_step
 from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
-from canprobe.mechanics.robot.inverse import LENGTH_M, in_rows, inverse_near, task_rows
+from canprobe.mechanics.robot.inverse import ERROR_LENGTH_M, in_rows, inverse_near, task_rows
 from canprobe.mechanics.robot.model import joints_to_units, units_to_joints
 from canprobe.mechanics.robot.probe_poses import probe_pose, start_posture
 from canprobe.mechanics.robot.remaining_drives import lifting_step
@@ -267,7 +267,7 @@ def test_damping_rises_by_its_law_below_the_threshold(smallest):
     lambda2 = 0.05**2 * (1 - (smallest / 0.08) ** 2)
     twist = rng.normal(size=6)
     rates = V @ (s / (s**2 + lambda2) * (U.T @ twist))
-    metres = np.array((LENGTH_M,) * 3 + (1.0,) * 3)
+    metres = np.array((ERROR_LENGTH_M,) * 3 + (1.0,) * 3)
     assert damped_step(metres[:, None] * (U * s) @ V.T, metres * twist) == pytest.approx(rates, rel=1e-9)
 
 

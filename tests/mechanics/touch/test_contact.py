@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch import contact as c
-from canprobe.mechanics.touch.at_rest import SAMPLES_AT_REST, AtRest
 from canprobe.mechanics.touch.contact import indentation_from_force
-from canprobe.mechanics.touch.layer_stiffness import SAMPLES_OF_A_PUSH, PushFit, stiffness_from_slope
+from canprobe.mechanics.touch.layer_stiffness import MIN_PUSH_SAMPLES, PushFit, stiffness_from_slope
+from canprobe.mechanics.touch.stops import MIN_REST_SAMPLES, AtRest
 from canprobe.mechanics.touch.surface import SurfaceMatrix
 from canprobe.mechanics.touch.tangent_frames import homogeneous, rotation_vectors, tangent_rotation
 
@@ -253,7 +253,7 @@ def test_pulling_counted_as_pushing_gives_no_stiffness():
 
 
 def test_too_little_is_not_certain():
-    depths = np.linspace(0.2e-3, 0.4e-3, SAMPLES_OF_A_PUSH - 1)
+    depths = np.linspace(0.2e-3, 0.4e-3, MIN_PUSH_SAMPLES - 1)
     few = pushed(1.27e8, (0.0, 0.0), depths)
     assert math.isnan(few.slope) and few.sigma == math.inf and not few.certain(0.5)
     still = pushed(1.27e8, (0.0, 0.0), np.full(50, 0.3e-3))
@@ -341,5 +341,5 @@ def test_a_saturated_array_shows_a_lower_bound_only():
 
 
 def test_a_few_samples_tell_nothing():
-    assert doubt_of([0.0, 4.0] * (SAMPLES_AT_REST // 2 - 1)) is None
-    assert doubt_of([0.0, 4.0] * (SAMPLES_AT_REST // 2)) is not None
+    assert doubt_of([0.0, 4.0] * (MIN_REST_SAMPLES // 2 - 1)) is None
+    assert doubt_of([0.0, 4.0] * (MIN_REST_SAMPLES // 2)) is not None

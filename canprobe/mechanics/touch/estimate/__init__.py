@@ -14,7 +14,7 @@ Model and assumptions:
 
 Fits of a batch:
 
-    nonlinear           robust Gauss–Newton on the model; `gauss_newton_step` is one step of it
+    nonlinear           robust Gauss–Newton on the model
     likelihood          the `ml` fit and the Cramér–Rao bound
     differences         linear estimates from differences of points and normals
     misfit              the terms that a quadric leaves out, found in the residuals or allowed for
@@ -25,7 +25,7 @@ Estimators, one sample after another:
     window              over the last samples: `ml` and `chord`; `chen1996` is the paper's
     recursive           what runs in the loop: forgets per millimetre, starts afresh where the surface changes
     information         the square-root information filter under it
-    start               its first stretch, solved as a whole
+    start               its first stretch, solved as a whole by single Gauss–Newton steps
     omitted_terms       the terms of `misfit`, in constant time and memory
     sandwich            the covariance of weighted and correlated rows
     change              the test for a changed surface

@@ -1,4 +1,4 @@
-"""The answer of an estimator: local shape at the last contact, with what is known about it and what is not."""
+"""The answer of an estimator: local shape at the last contact, its covariance, and what was not observed."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from canprobe.mechanics.touch.surface import SurfaceMatrix
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 from canprobe.mechanics.types import Floats, Vec
 
-_ENTRY_LIMIT = 0.02
-"""Largest unobserved part of an entry of K that still has a number."""
-_DIRECTION_LIMIT = 0.05
-"""The same for the normal curvature along a direction."""
+_MAX_HIDDEN_ENTRY = 0.02
+"""Largest unobserved part of an entry of K that is still given as a number."""
+_MAX_HIDDEN_DIRECTION = 0.05
+"""Largest unobserved part of the normal curvature along a direction that still counts as observed."""
 _UMBILIC_CHI2 = 5.99
-_ARRAYS = (
+"""95 % point of χ² with two degrees of freedom, which the deviator of K has."""
+_ARRAY_FIELDS = (
     *("S", "T_frame_contact", "K", "kappa", "directions", "covariance"),
     *("observed", "combinations", "information"),
 )
@@ -37,31 +38,31 @@ class SurfaceEstimate:
     path that was travelled and for nothing else.
 
     Attributes:
-        S: (4, 4) in the contact frame, c14 = c24 = c44 = 0, c34 = −½.
+        S: (4, 4) surface matrix in the contact frame, c14 = c24 = c44 = 0, c34 = −½.
         T_frame_contact: (4, 4) contact frame to the frame of the points; its origin is on the estimated surface.
         K: (2, 2) shape operator in the contact frame, 1/m.
         kappa: (2,) principal curvatures, κ1 ≥ κ2, 1/m. With one observed it stands first, whatever its size, and is the
             normal curvature along `directions[0]`.
         directions: (2, 3) rows: unit vectors of `kappa` in the frame of the points.
-        covariance: (3, 3) of (K11, K12, K22), 1/m².
-        observed: (2,) bool, for each of `kappa`.
+        covariance: (3, 3) covariance of (K11, K12, K22), 1/m².
+        observed: (2,) whether each of `kappa` was observed.
         rank: how many independent combinations of (K11, K12, K22) were observed, 0–3 (thresholds: `quadric`).
         combinations: (rank, 3) rows: the observed ones as weights of (K11, √2 K12, K22).
         information: (3, 3) information of the data about (K11, √2 K12, K22), m²; finite also where nothing is observed.
-        umbilic: κ1 and κ2 do not differ significantly (95 %): the directions mean nothing.
+        umbilic: κ1 and κ2 do not differ significantly (95 %), so that the directions are arbitrary.
         innovation: mean squared whitened residual per degree of freedom; about 1 when the model and the σ's are right.
         distance: path that the estimate rests on, m.
         samples: number of samples it rests on (effective, with forgetting).
         method: name of the estimator.
-        prior: name of what was assumed.
-        notes: what a reader should know.
-        stiffness: K/h of the probe's layer, N/m³, from an estimator that knows it; else None.
+        prior: name of the prior that was assumed.
+        notes: notes for a reader, one sentence each.
+        stiffness: stiffness K/h of the probe's layer, N/m³, from an estimator that knows it; else None.
         problem_root: root of the information (`rootᵀ root`) of the whitened dimensionless least-squares problem.
         model_root: (n, 9) root of the information (`rootᵀ root`, prior included) about the entries of `S` in the
-            contact frame, in the order c14, c24, c44, c13, c23, c33, c11, c12, c22; SI units. It holds also what is
-            known of place and normal. None from the methods of differences, which do not know it.
-        evidence: what the data (and a prior on curvature) say about K before the rank decision, to be fused with
-            another source. None from the methods of differences.
+            contact frame, in the order c14, c24, c44, c13, c23, c33, c11, c12, c22; SI units. It includes the
+            information about place and normal. None from the methods of differences, which do not know it.
+        evidence: value and information of K from the data (and a prior on curvature) before the rank decision, to be
+            fused with another source. None from the methods of differences.
     """
 
     S: Floats
@@ -87,7 +88,7 @@ class SurfaceEstimate:
     stiffness: float | None = None
 
     def __post_init__(self) -> None:
-        for name in _ARRAYS:
+        for name in _ARRAY_FIELDS:
             getattr(self, name).setflags(write=False)
         if self.model_root is not None:
             self.model_root.setflags(write=False)
@@ -126,7 +127,7 @@ class SurfaceEstimate:
 
     @property
     def condition_number(self) -> float:
-        """Of the whitened dimensionless least-squares problem; infinite where it is singular."""
+        """Condition number of the whitened dimensionless least-squares problem; infinite where it is singular."""
         singular = np.linalg.svd(self.problem_root, compute_uv=False)
         return float(singular[0] / singular[-1]) if singular[-1] > 0.0 else math.inf
 
@@ -153,20 +154,20 @@ class SurfaceEstimate:
     def curvature_tensor_base(self) -> Floats:
         """(3, 3) shape operator as a tensor in the frame of the points, `P K Pᵀ`, 1/m.
 
-        From `S`, so always finite; it means nothing where `observed` is False.
+        It is taken from `S` and so always finite; do not use it where `observed` is False.
         """
         P = self.T_frame_contact[:3, :2]
         result: Floats = P.dot(2.0 * self.S[:2, :2]).dot(P.T)
         return result
 
     def predict(self, point: Floats) -> tuple[Floats, Floats]:
-        """Surface point and outward unit normal over (along the contact normal) a place near the contact.
+        """Point and outward normal of the estimated surface where a line along the contact normal meets it.
 
         Args:
-            point: (3,) in the frame of the points, m.
+            point: (3,) a point of that line near the contact, in the frame of the points, m.
 
         Returns:
-            Point (3,), m, and normal (3,), in the frame of the points; NaN where the quadric has no point there.
+            Point (3,), m, and unit normal (3,), in the frame of the points; NaN where the quadric has no point there.
         """
         R, origin = self.T_frame_contact[:3, :3], self.T_frame_contact[:3, 3]
         local = R.T @ (point - origin)
@@ -179,11 +180,11 @@ class Solution(NamedTuple):
     """A solved local model, dimensionless, before it becomes an estimate.
 
     Attributes:
-        c: (9,) in the contact frame (c14 = c24 = c44 = 0).
-        covariance: (3, 3) of (K11, K12, K22); used as it is where all is observed.
-        decision: on the data's information.
-        has_prior: a prior makes every combination finite.
-        root: (9, 9) root of the information about c with c14, c24, c44, prior included; None where it is not known.
+        c: (9,) parameters in the contact frame (c14 = c24 = c44 = 0).
+        covariance: (3, 3) covariance of (K11, K12, K22); used as it is where all is observed.
+        decision: rank decision on the data's information.
+        has_prior: whether a prior makes every combination finite.
+        root: (9, 9) root of the information about c, prior included; None where it is not known.
     """
 
     c: Floats
@@ -256,7 +257,7 @@ def _principal(K: Floats) -> tuple[Floats, Floats]:
 
 
 def is_umbilic(K: Floats, covariance: Floats) -> bool:
-    """The deviator (K11 − K22, 2 K12) is within its 95 % region of 0."""
+    """Whether the deviator (K11 − K22, 2 K12) of K is 0 within its 95 % region."""
     (k11, k12), (_, k22) = K.tolist()
     (c11, c12, c13), (_, c22, c23), (_, _, c33) = covariance.tolist()
     x, y = k11 - k22, 2.0 * k12
@@ -268,16 +269,16 @@ def is_umbilic(K: Floats, covariance: Floats) -> bool:
 def _partly(
     K: Floats, covariance: Floats, decision: Decision, has_prior: bool, length: float
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """K, covariance, kappa, directions and flags where the data left something open."""
+    """K, covariance, kappa, directions and flags where the data did not observe all of K."""
     if has_prior:
         kappa, local = _principal(K)
-        flags = [outside(decision, _projector(d)) < _DIRECTION_LIMIT for d in local]
+        flags = [outside(decision, _projector(d)) < _MAX_HIDDEN_DIRECTION for d in local]
         return K, covariance, kappa, local, np.array(flags)
     t = _observed_direction(decision)
     local = np.array([t, [-t[1], t[0]]])
-    seen = decision.rank > 0 and outside(decision, _projector(t)) < _DIRECTION_LIMIT
+    seen = decision.rank > 0 and outside(decision, _projector(t)) < _MAX_HIDDEN_DIRECTION
     kappa = np.array([float(t @ K @ t) if seen else math.nan, math.nan])
-    hidden = np.array([outside(decision, e) >= _ENTRY_LIMIT for e in np.eye(3)])
+    hidden = np.array([outside(decision, e) >= _MAX_HIDDEN_ENTRY for e in np.eye(3)])
     K = np.where(hidden[[[0, 1], [1, 2]]], math.nan, K)
     V, passed = decision.vectors, decision.passed
     covariance = partial_covariance(V[:, passed], decision.information[passed], hidden) / length**2
@@ -288,9 +289,9 @@ def partial_covariance(V: Floats, information: Floats, hidden: Floats) -> Floats
     """Covariance (3, 3) of (K11, K12, K22), NaN and infinite in the hidden (3,) entries.
 
     Args:
-        V: (3, k) columns: observed combinations of q, and
-        information: (k,) about each.
-        hidden: (3,) bool.
+        V: (3, k) columns: observed combinations of q.
+        information: (k,) information about each of them.
+        hidden: (3,) whether an entry of K is hidden.
     """
     C: Floats = (V / information) @ V.T / np.outer(TO_Q, TO_Q)
     C[hidden] = C[:, hidden] = math.nan
@@ -308,8 +309,8 @@ def _projector(t: Floats) -> Floats:
 def _observed_direction(decision: Decision) -> Floats:
     """The tangent direction whose normal curvature the data know best.
 
-    With one combination open it is the null direction of that combination; with two, the main direction of the
-    observed one.
+    With one unobserved combination it is the null direction of that combination; with two it is the main direction of
+    the observed one.
     """
     if decision.rank == 0:
         return np.array([1.0, 0.0])
@@ -326,9 +327,9 @@ class Anchor(NamedTuple):
     """A solution in its own contact frame.
 
     Attributes:
-        c: (9,) dimensionless, c14 = c24 = c44 = 0.
-        M: (9, 9) d(c)/d(c of the working frame).
-        T_frame_contact: (4, 4), m.
+        c: (9,) dimensionless parameters, c14 = c24 = c44 = 0.
+        M: (9, 9) derivative of c by the parameters in the working frame.
+        T_frame_contact: (4, 4) contact frame to the frame of the points, m.
         turn: angle of the contact frame's x axis from the working frame's, rad.
     """
 
@@ -339,7 +340,11 @@ class Anchor(NamedTuple):
 
 
 def foot(c: Floats, start: Vec) -> tuple[Vec, Vec]:
-    """Foot of a nearby point on the model's surface and the inward unit normal there, dimensionless."""
+    """Foot of a nearby point on the model's surface and the inward unit normal there, dimensionless.
+
+    Why not Newton on the Lagrange conditions, as in `SurfaceMatrix.project`: this runs for every answer in the loop,
+    and for a point near the surface four rounds in plain floats suffice.
+    """
     half0, half1, constant, *entries = c.tolist()
     b02, b12, b22, b00, b01, b11 = [2.0 * entry for entry in entries]
     h0, h1, h2 = 2.0 * half0, 2.0 * half1, -1.0

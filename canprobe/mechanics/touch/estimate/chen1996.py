@@ -10,7 +10,8 @@ settled:
   c14 = c24 = c44 = 0, c34 = −½.
 - Rates are differences of samples `lag` apart.
 
-Known faults, reproduced: a bias of some percent where |∇f| is not constant, and noise in y that draws κ towards 0.
+Faults of the scheme that are reproduced: a bias of some percent where |∇f| is not constant, and noise in y that draws κ
+towards 0.
 
 Source: Chen, Rink and Zhang, "Local object shape from tactile sensing", section 4.1.2.
 """
@@ -35,8 +36,9 @@ class Chen1996Estimator(WindowEstimator):
     """The paper's own scheme, with the rates of a robot and its pad.
 
     Args:
-        sigma_point, sigma_normal, window: as of `WindowEstimator`.
-        lag: samples between the two of a difference. 1 is the paper's; noise of the points then swamps the motion.
+        sigma_point, sigma_normal, window: as for `WindowEstimator`.
+        lag: number of samples between the two of a difference. The paper has 1, with which the noise of the points is
+            larger than the motion.
     """
 
     least = 3
@@ -59,15 +61,15 @@ class Chen1996Estimator(WindowEstimator):
 
 
 def paper_rates(T_base_probe: Floats, r_probe: Floats, n_base: Floats, lag: int) -> tuple[Floats, Floats]:
-    """x (28) and y (29) (n − lag, 3) times the time between samples `lag` apart, in base axes; the object stands still.
+    """x (28) and y (29), each (n − lag, 3), times the time between samples `lag` apart; the object stands still.
 
-    `x = ω × n_f + K_f v_f`, `y = V_f + v_f`, everything taken half-way; K_f = 1/|r_probe|.
+    `x = ω × n_f + K_f v_f`, `y = V_f + v_f`, in base axes, all taken half-way between the samples; K_f = 1/|r_probe|.
 
     Args:
-        T_base_probe: (n, 3 or 4, 4) poses of the probe.
+        T_base_probe: (n, 3 or 4, 4) poses of the probe, m.
         r_probe: (n, 3) contact points in its frame, m.
-        n_base: (n, 3) outward normals of the object there.
-        lag: samples between the two of a difference.
+        n_base: (n, 3) outward unit normals of the object there.
+        lag: number of samples between the two of a difference.
     """
     R, r = T_base_probe[:, :3, :3], r_probe[:, :, None]
     Ra, Rb, ra, rb = R[:-lag], R[lag:], r[:-lag], r[lag:]

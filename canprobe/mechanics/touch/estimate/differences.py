@@ -18,12 +18,13 @@ NO_PRIOR = "none (the method takes none)"
 _COLUMNS = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
 """Columns of c11 c12 c13 c22 c23 c33 in the rows of S₃ y."""
 _FROM_SIX = [2, 4, 5, 0, 1, 3]
-"""c13 c23 c33 c11 c12 c22 of the nine-parameter order, as places among the six."""
+"""Indices among the six of c13 c23 c33 c11 c12 c22, the nine-parameter order."""
 _K_OF_SIX = [0, 1, 3]
-"""2 c11, 2 c12, 2 c22, which are K itself, among the six."""
-_NUMERIC = 1e-10
-_OPEN = 1e-8
-"""Part of K in a unit vector of the six that the differences leave open, from which it is no rounding."""
+"""Indices among the six of 2 c11, 2 c12, 2 c22, which are K itself."""
+_MIN_SINGULAR_SHARE = 1e-10
+"""Least singular value over the largest that is used."""
+_MIN_OPEN_PART = 1e-8
+"""Least part of K in a unit vector of the six that the differences leave open; a smaller one is rounding."""
 
 
 class Pairs(NamedTuple):
@@ -31,8 +32,8 @@ class Pairs(NamedTuple):
 
     Attributes:
         newer, older: (m,) indices of the samples.
-        points: (m, 3) differences of points, in the contact frame's axes, over the extent.
-        normals: (m, 3) differences of outward normals.
+        points: (m, 3) differences of points in the contact frame's axes, over the extent.
+        normals: (m, 3) differences of outward normals in these axes.
     """
 
     newer: NDArray[np.intp]
@@ -42,13 +43,13 @@ class Pairs(NamedTuple):
 
 
 def chord_pairs(touches: ContactBatch) -> Pairs:
-    """Every sample against the last."""
+    """Differences of every sample and the last."""
     n = len(touches.points)
     return _pairs(touches, np.full(n - 1, n - 1), np.arange(n - 1))
 
 
 def lag_pairs(touches: ContactBatch, lag: int) -> Pairs:
-    """Every sample against the one `lag` before it."""
+    """Differences of every sample and the one `lag` before it."""
     newer = np.arange(lag, len(touches.points))
     return _pairs(touches, newer, newer - lag)
 
@@ -60,7 +61,7 @@ def _pairs(touches: ContactBatch, newer: NDArray[np.intp], older: NDArray[np.int
 
 
 def usable_lag(n: int, lag: int) -> int:
-    """The lag that n samples allow: at most half of them."""
+    """A lag cut to what n samples allow, at most half of them."""
     return max(1, min(lag, (n - 1) // 2))
 
 
@@ -75,14 +76,16 @@ def three_rows(y: Floats) -> Floats:
 def solve_pairs(touches: ContactBatch, data: Pairs, method: str) -> SurfaceEstimate:
     """Least squares for 2 S₃, in the contact frame of the last *measured* point and normal.
 
-    By SVD; singular values below 1e-10 of the largest are left out, and what of K lies along their vectors is not
-    observed: three points leave one open that mixes c33 with K. The covariance is propagated from the samples' noise;
-    it does not know the method's bias.
+    By SVD: singular values below 1e-10 of the largest are left out, and the part of K along their vectors is not
+    observed. Three points leave one combination open that mixes c33 with K. The covariance is propagated from the
+    samples' noise; it does not include the method's bias.
+
+    Source: Chen, Rink and Zhang, (30)–(35), with a pseudo-inverse instead of `(AᵀA)⁻¹`.
     """
     length = touches.extent
     A, b = three_rows(data.points), data.normals.reshape(-1)
     U, s, Vt = np.linalg.svd(A, full_matrices=len(A) < 6)  # all six of Vt, however few the rows
-    rank = int(np.count_nonzero(s > _NUMERIC * max(float(s[0]), 1e-300)))
+    rank = int(np.count_nonzero(s > _MIN_SINGULAR_SHARE * max(float(s[0]), 1e-300)))
     inverse = (Vt[:rank].T / s[:rank]) @ U[:, :rank].T
     double = inverse @ b
     residual = b - A @ double
@@ -123,7 +126,7 @@ def _root_of(covariance: Floats, open_ways: Floats) -> Floats:
     Nothing is known along the columns of `open_ways` (3, m) either.
     """
     ways, sizes, _ = np.linalg.svd(open_ways)
-    known = ways[:, np.count_nonzero(sizes > _OPEN) :]
+    known = ways[:, np.count_nonzero(sizes > _MIN_OPEN_PART) :]
     values, vectors = np.linalg.eigh(known.T @ covariance @ known)
     inverse = np.where(values > 1e-14 * values.max(initial=1e-300), 1.0 / np.maximum(values, 1e-300), 0.0)
     result: Floats = np.sqrt(inverse)[:, None] * (known @ vectors).T

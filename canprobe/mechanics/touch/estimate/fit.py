@@ -22,6 +22,9 @@ from canprobe.mechanics.touch.estimate.window import ChordEstimator, MlEstimator
 from canprobe.mechanics.touch.linear_algebra import whole
 
 METHODS = ("chen1996", "chord", "ml", "recursive")
+"""Names of the methods."""
+EXTENT_SCALE = 2.0
+"""Longest memory over the extent of the points: a weave or a circle has seen all directions by then."""
 
 
 def make_estimator(
@@ -41,13 +44,14 @@ def make_estimator(
     Args:
         method: one of `METHODS`.
         sigma_point: effective standard deviation of a contact point per axis, m.
-        sigma_normal: of a normal per tangent axis, rad.
+        sigma_normal: effective standard deviation of a normal per tangent axis, rad.
         memory_m: path that `recursive` remembers (e-folding), m.
-        window: samples that the batch methods keep; for `recursive` the samples on one memory at the nominal pace.
+        window: number of samples that the batch methods keep; for `recursive` the number on one memory at the nominal
+            speed.
         prior, lag, correlation, coupling: as for `fit_surface`.
 
     Raises:
-        UsageError: on an unknown method or a value out of range.
+        UsageError: the method is unknown, or a value is out of range.
     """
     if method == "recursive":
         return RecursiveEstimator(
@@ -76,7 +80,7 @@ def make_estimator(
 
 
 def unknown_method(method: str) -> UsageError:
-    """The error for a name that is no method, with the nearest one."""
+    """The error for an unknown method, with the nearest name."""
     near = difflib.get_close_matches(str(method), METHODS, n=1)
     hint = f'; did you mean "{near[0]}"?' if near else ""
     return UsageError(f"method: expected one of {', '.join(METHODS)}, got {method!r}{hint}")
@@ -97,31 +101,32 @@ def fit_surface(
 ) -> SurfaceEstimate:
     """Local shape at the last of a series of contact points.
 
-    Lengths may be in any unit as long as it is one: the answer scales with it.
+    Lengths may be in any unit, as long as all are in the same; the answer is in that unit too.
 
     Args:
-        points: (n, 3) contact points on the object in one frame, in the order of time; the last row is now.
+        points: (n, 3) contact points on the object in one frame, in the order of time; the answer is at the last row.
         normals: (n, 3) outward unit normals of the object there.
         sigma_point: standard deviation of a point per axis: a number, (n,), or covariances (3, 3) or (n, 3, 3).
-        sigma_normal: the same of a normal, rad (of a covariance only the tangential part counts).
+        sigma_normal: standard deviation of a normal per tangent axis, rad, in the same forms (of a covariance only the
+            tangential part counts).
         method: "ml" (reaches the Cramér–Rao bound), "recursive" (the online filter run over the points; it remembers
             all of a short path, of a longer one at most twice the points' extent and the surface's radius), "chord",
             or "chen1996". The last has no robot here: its rates are differences of points and normals `lag` apart,
             (16) with the object at rest.
-        prior: for "ml" and "recursive"; None for `Prior.weak` over the path, nothing on curvature itself.
-        lag: for "chen1996".
-        correlation: of the noise along the path, for "ml", which weighs the samples by it, and "recursive", whose
-            covariance grows by it; None for independent samples.
-        coupling: for "ml" and "recursive": 1/R_p where point and normal come from one centroid on a spherical probe, so
-            that their errors are coupled (`Noise`); 0 for independent ones.
-        quadric: for "ml" and "recursive": the surface is known to be one. Otherwise its cubic and quartic terms are
-            corrected for where they show and allowed for in the covariance where they could hide (`nonlinear`).
+        prior: prior of "ml" and "recursive"; None for `Prior.weak` over the path, which says nothing of curvature.
+        lag: number of samples between the two of a difference of "chen1996".
+        correlation: correlation of the noise along the path; "ml" weighs the samples by it, the covariance of
+            "recursive" grows by it; None for independent samples.
+        coupling: coupling of the errors of a point and its normal (`Noise`), for "ml" and "recursive": 1/R_p where both
+            come from one centroid on a spherical probe; 0 for independent errors.
+        quadric: whether the surface is known to be a quadric, for "ml" and "recursive". Otherwise cubic and quartic
+            terms are corrected where they show, and enter the covariance where noise could hide them (`misfit`).
 
     Returns:
-        The estimate; what the points did not observe is marked, not guessed.
+        The estimate; what the points did not observe is marked as unobserved, not guessed.
 
     Raises:
-        UsageError: naming the field, what was expected and what was got.
+        UsageError: a value is not usable; the message names the field, what was expected and what was got.
 
     Example:
         >>> import numpy as np
@@ -181,15 +186,11 @@ def _run_filter(touches: ContactBatch, prior: Prior | None, quadric: bool) -> Su
     return answer
 
 
-EXTENT_SCALE = 2.0
-"""Longest memory over the extent of the points: a weave or a circle has seen all directions by then."""
-
-
 def _memory_of(touches: ContactBatch) -> float:
     """Path that `recursive` remembers, m: all of a short one; of a longer one as much as extent and radius allow.
 
-    The filter's unit of length, its steps and its prior are shares of the memory. On a long path over a small patch the
-    length of the path would make steps larger than the patch.
+    Why not always the whole path: the filter's unit of length, its steps and its prior are shares of the memory, and on
+    a long path over a small patch the steps would be larger than the patch.
     """
     off, turned = touches.points - touches.points[-1], touches.normals - touches.normals[-1]
     square = float(np.square(turned).sum())

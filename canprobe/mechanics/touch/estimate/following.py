@@ -1,10 +1,11 @@
 """An estimator whose regions grow where its answers change along the path.
 
-A memory is a mean over the path, and a patch is one over its own size. Where curvature changes along the path the
-mean is that of an earlier place; the terms that a quadric leaves out (`nonlinear`) follow most of the change, not
-all of it. What is left has the direction in which the answers move, and is taken to be what they moved by over a
-small share of the memory. So it is nothing where the answers stay, however uncertain the surface was before, and it
-is large for a while where they go over from one curvature to another. The answers themselves are not touched.
+An answer is a mean over the memory, and a patch is one over its own size. Where curvature changes along the path the
+mean belongs to an earlier place; the terms that a quadric leaves out (`misfit`) follow most of the change, not all of
+it. The error that is left points in the direction in which the answers move, and is taken to be their movement over a
+small share of the memory. So it is zero where the answers stay, however uncertain the surface was before, and large for
+a while where they change from one curvature to another. Only the covariance is changed. Why not move the answer on too:
+the movement is itself an estimate, and extrapolated noise would do more harm than the lag.
 """
 
 from __future__ import annotations
@@ -22,21 +23,21 @@ from canprobe.mechanics.touch.estimate.quadric import TO_Q
 from canprobe.mechanics.types import Floats
 
 SPAN_SHARE = 0.5
-"""Path, over the memory, along which a change of the answers is looked for."""
+"""Path, over the memory, over which a change of the answers is measured."""
 MIN_SPAN_SHARE = 0.05
-"""The same just after a start."""
+"""Least such path, just after a start."""
 LAG_SHARE = 0.075
-"""Path, over the memory, that an answer lags behind, one standard deviation: 1.5 mm of 20 mm, half a patch. Set on
-scans of nine packaged scenes."""
+"""Path, over the memory, by which an answer lags (one standard deviation): 1.5 mm of 20 mm, half a patch. The value was
+set on scans of nine packaged scenes."""
 
 
 class FollowingEstimator:
-    """Any estimator; the covariance of its answers grows by what they lag behind.
+    """An estimator, with covariances that grow by the lag of its answers.
 
     Args:
         inner: the estimator.
         memory_m: path that it remembers, m.
-        scale: relative error that all curvatures have in common.
+        scale: relative error that all curvatures have in common, one standard deviation.
     """
 
     def __init__(self, inner: Estimator, memory_m: float, scale: float = 0.0) -> None:
@@ -49,7 +50,7 @@ class FollowingEstimator:
 
     @property
     def dropped(self) -> Dropped:
-        """Samples that were not used."""
+        """Samples that were not used, by reason."""
         return self._inner.dropped
 
     def add(self, sample: ContactSample) -> None:
@@ -79,7 +80,7 @@ class FollowingEstimator:
         return less_certain(answer, *errors)
 
     def _late(self, tensor: Floats) -> Floats | None:
-        """(3, 3) change of the curvature tensor over the path that an answer lags behind; None where there is none."""
+        """(3, 3) change of the curvature tensor over the path by which an answer lags; None where it is not known."""
         past = self._past
         while len(past) > 1 and self._travelled - past[1][0] >= SPAN_SHARE * self._memory:
             past.popleft()
@@ -91,7 +92,12 @@ class FollowingEstimator:
 
 
 def less_certain(answer: SurfaceEstimate, *errors: Floats) -> SurfaceEstimate:
-    """An answer, all observed, whose curvature is also off by tensors (3, 3, 1/m), each times a normal variate."""
+    """A fully observed answer with additional errors of curvature.
+
+    Args:
+        answer: the answer.
+        errors: tensors (3, 3), 1/m; each is an error, times an independent standard normal variate.
+    """
     P = answer.T_frame_contact[:3, :2]
     covariance, information, root = answer.covariance, answer.information, answer.model_root
     for error in errors:
@@ -113,7 +119,7 @@ def less_certain(answer: SurfaceEstimate, *errors: Floats) -> SurfaceEstimate:
 
 
 def _with_error(root: Floats, error: Floats) -> Floats:
-    """A root (n, k) of an information once the last parameters have one more error (3,) of random size."""
+    """A root (n, k) of an information after the last parameters got one more error (3,) times a normal variate."""
     u = root[:, -len(error) :].dot(error)
     square = float(u.dot(u))
     if square == 0.0:

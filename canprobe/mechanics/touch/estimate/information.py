@@ -1,8 +1,11 @@
 """A square-root information filter for the nine-parameter model and the terms that a quadric leaves out.
 
-Forgetting makes samples count for less than they know: with weights w they leave the variance that `(Σ w)² / Σ w²` of
-them would in full, and count for `Σ w`. A prior in full would outweigh them by more than was stated, twice as much
-after a long path. So it counts by `Σ w² / Σ w`: the least mean square of the errors, over surfaces as it says they are.
+Samples with weights w leave the variance of `(Σ w)² / Σ w²` samples in full, but count as `Σ w` in the information. A
+prior in full would then outweigh them by more than was stated, twice as much after a long path. So the prior is
+weighted by `Σ w² / Σ w`, which gives the least mean square error over surfaces that are as the prior says.
+
+Why a root of the information and not the information itself: forming `JᵀJ` squares the condition number, which is
+10³ to 10⁵ here. Why information and not a covariance (a Kalman filter): what was not observed has no finite covariance.
 """
 
 from __future__ import annotations
@@ -25,9 +28,14 @@ from canprobe.mechanics.types import Floats, Vec
 
 
 class MeasuredContact(NamedTuple):
-    """What a contact gives the filter: place (3,) m and outward unit normal (3,) in base, and their noise.
+    """A contact as the filter takes it.
 
-    The noise is in m, rad and, what couples them (`Noise.coupling`), 1/m.
+    Attributes:
+        point: (3,) contact point in base, m.
+        normal: (3,) outward unit normal of the object there, in base.
+        sigma_point: standard deviation of the point per axis, m.
+        sigma_normal: standard deviation of the normal per tangent axis, rad.
+        coupling: coupling of their errors (`Noise.coupling`), 1/m.
     """
 
     point: Floats
@@ -38,7 +46,7 @@ class MeasuredContact(NamedTuple):
 
 
 def batch_design(T_base_work: Floats, length: float, touches: Sequence[MeasuredContact]) -> Design:
-    """Contacts (`quadric.design`) in a working frame (4, 4), in units of a length (m)."""
+    """The design (`residuals.design`) of contacts in a working frame (4, 4), in units of a length (m)."""
     R = T_base_work[:3, :3]
     points = (np.array([t.point for t in touches]) - T_base_work[:3, 3]).dot(R) / length
     sigma_point = np.array([t.sigma_point for t in touches]) / length
@@ -46,40 +54,40 @@ def batch_design(T_base_work: Floats, length: float, touches: Sequence[MeasuredC
     return design(points, np.array([t.normal for t in touches]).dot(R), noise)
 
 
-ANCHOR = 0.05
-"""Travel between two changes of the working frame over the memory."""
+REANCHOR_TRAVEL_SHARE = 0.05
+"""Distance from the origin of the working frame, over the memory, from which on that frame is moved along."""
 
 
 class _Path(NamedTuple):
-    """What the path counts for, m: the sums of its pieces' weights and of their squares."""
+    """Weight of the path, m: the sums of its pieces' weights and of their squares."""
 
     weight: float = 0.0
     square: float = 0.0
 
     @property
     def share(self) -> float:
-        """By how much the prior counts."""
+        """Weight of the prior."""
         return self.square / self.weight if self.weight else 1.0
 
     def on(self, moved: float, kept: float) -> _Path:
-        """With a new piece (m), after which the others count `kept` times what they did."""
+        """The path with a new piece (m), and the weights of the others multiplied by `kept`."""
         return _Path(kept * self.weight + moved, kept**2 * self.square + moved)
 
 
 class InformationFilter:
-    """Parameters with a root of their information in a working frame; rows come in, old ones fade.
+    """Parameters with a root of their information in a working frame; new rows are added, and old ones fade.
 
     Args:
         length: the memory, and the unit of length of the problem, m.
-        prior: counts as the samples do, which are new and in full at first and faded to a half after a long path.
-        correlation: of the rows along the path; only the covariance of the answer knows of it.
+        prior: the prior; its weight falls from 1 at the start to a half after a long path, as that of the samples does.
+        correlation: correlation of the rows along the path; it enters the covariance of the answer only.
 
     Attributes:
         T: (4, 4) working frame to base, m.
         c: (9,) parameters (`quadric`).
-        root: (9, 9) `rootᵀ root` is their information.
-        inverse: (9, 9) of `root`.
-        left_out: what the rows say about the terms that a quadric has not, and what their noise does.
+        root: (9, 9) root of their information, which is `rootᵀ root`.
+        inverse: (9, 9) inverse of `root`.
+        left_out: sums for the terms that a quadric leaves out, and for the covariance of the answer.
     """
 
     def __init__(self, length: float, prior: Prior, correlation: Correlation | None) -> None:
@@ -91,26 +99,34 @@ class InformationFilter:
         self.begin(np.eye(4))
 
     def begin(self, T: Floats) -> None:
-        """Know nothing but the prior: a plane in a frame (4, 4)."""
+        """Start from the prior alone: a plane in a frame (4, 4)."""
         self.T = T
         self.c = np.zeros(9)
         self._path = _Path()
-        self._set_root(self._prior_rows)
+        self.root, self.inverse = self._prior_rows, inverted_upper(self._prior_rows)
         self.left_out.reset()
 
     def adopt(  # noqa: PLR0917 - what a batch solution is
         self, T: Floats, c: Floats, root: Floats, rows: Floats, residuals: Floats, travelled: float
     ) -> None:
-        """Take over a batch solution: its working frame (4, 4), parameters (9,), root (9, 9) of their information,
-        whitened and weighted rows (n, 3, 18), and minus their residuals (n, 3), evenly spread over the path (m).
+        """Take over a batch solution.
+
+        Args:
+            T: (4, 4) working frame of the solution to base, m.
+            c: (9,) parameters.
+            root: (9, 9) root of their information.
+            rows: (n, 3, 18) whitened and weighted rows, evenly spread over the path.
+            residuals: (n, 3) minus their residuals.
+            travelled: length of the path, m.
         """
         self.T, self.c = T, c.copy()
         self._path = _Path(travelled, travelled)
-        self._set_root(upper_root(np.concatenate([root, DIFFUSE_INFORMATION * np.eye(9)])))
+        self.root = upper_root(np.concatenate([root, DIFFUSE_INFORMATION * np.eye(9)]))
+        self.inverse = inverted_upper(self.root)
         self.left_out.start(rows, residuals, travelled)
 
     def take(self, rows: Floats, residuals: Floats, moved: float) -> None:
-        """Forget over a step of the path (m), then take in weighted rows (n, 3, 18), minus residuals (n, 3): one QR."""
+        """Forget over a step of the path (m), then add weighted rows (n, 3, 18) and minus residuals (n, 3): one QR."""
         rows, residuals = rows.reshape(-1, 18), residuals.reshape(-1)
         kept = math.exp(-moved / self.length)
         left = kept * self._path.share
@@ -122,7 +138,8 @@ class InformationFilter:
         stacked[9:18, :9], stacked[9:18, 9] = lost, -lost.dot(self.c)
         stacked[18:, :9], stacked[18:, 9] = rows[:, :9], residuals
         full = upper_root(stacked)
-        self._set_root(full[:9, :9])
+        self.root = full[:9, :9]
+        self.inverse = inverted_upper(self.root)
         step = self.inverse.dot(full[:9, 9])
         self.c = self.c + step
         self.left_out.take(rows, residuals, step, moved, kept, share**2 - left**2)
@@ -144,9 +161,12 @@ class InformationFilter:
         return x / self.length, y / self.length, z / self.length
 
     def follow(self, point: Floats) -> None:
-        """Carry everything to a contact frame at the foot of a point (3,) of base, once that is far enough away."""
+        """Move to a contact frame at the foot of a point (3,) of base, once that is far enough from the working frame.
+
+        The information is carried along with the frame (`transport`), so nothing is forgotten by it.
+        """
         near = u, v, w = self.place(point)
-        if u * u + v * v + w * w < ANCHOR**2:
+        if u * u + v * v + w * w < REANCHOR_TRAVEL_SHARE**2:
             return
         x, z_axis = foot(self.c, near)
         turned = np.array((*transported((1.0, 0.0, 0.0), z_axis), z_axis)).T
@@ -158,13 +178,9 @@ class InformationFilter:
         R = self.T[:3, :3]
         self.T = homogeneous(R.dot(turned), self.T[:3, 3] + self.length * R.dot(x))
 
-    def _set_root(self, root: Floats) -> None:
-        """Take an upper triangular root."""
-        self.root, self.inverse = root, inverted_upper(root)
-
 
 def _prior_rows(prior: Prior, length: float) -> Floats:
-    """(9, 9) root of what is always known."""
+    """(9, 9) root of the information that the filter has without samples."""
     own = DIFFUSE_INFORMATION * np.eye(9)
     own[3:6] = prior.rows(length)[0][:3]
     return own

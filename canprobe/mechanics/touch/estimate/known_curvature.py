@@ -1,4 +1,4 @@
-"""What a source says about curvature: value and information, before any decision on what is observed."""
+"""The evidence of one source about curvature: value and information, before any decision on what is observed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class CurvatureInformation(NamedTuple):
     """What a source says about q = (K11, √2 K12, K22) in some contact frame.
 
     Attributes:
-        q: (3,) its own value, 1/m; counts only where there is information.
+        q: (3,) value, 1/m; it counts only where there is information.
         information: (3, 3) inverse covariance, m².
     """
 
@@ -33,10 +33,10 @@ def evidence_of(c: Floats, covariance: Floats, spread: Floats | None, length: fl
 
     Args:
         c: (9,) parameters in the contact frame, in units of `length` (m).
-        covariance: (3, 3) of (K11, K12, K22) (`curvature_covariance`).
-        spread: (2, 2) covariance of the points in the tangent plane over the variance of their noise. What they were
-            not spread for is marginalised: noise alone answers it, with −1/R_p where it is that of centroids on a
-            probe. None where a prior answers it.
+        covariance: (3, 3) covariance of (K11, K12, K22) (`curvature_covariance`).
+        spread: (2, 2) covariance of the points in the tangent plane over the variance of their noise. Combinations
+            that the points were not spread for are marginalised: noise alone would answer for them, with −1/R_p where
+            it is that of centroids on a probe. None where a prior answers for them.
     """
     covariance = _TO_Q_SQUARED * covariance / length**2
     q = c[6:] / (C_PER_Q * length)
@@ -51,13 +51,13 @@ def evidence_of(c: Floats, covariance: Floats, spread: Floats | None, length: fl
 def curvature_covariance(c: Floats, deviation: Floats) -> Floats:
     """Covariance (3, 3) of (K11, K12, K22) by the delta method, dimensionless.
 
-    What c13, c23, c33 put K off by is proportional to K. Where the K found is its own noise so is that part, and it is
-    largest where the noise is: a region round a plane would grow with its own error and hold K = 0 always. So it
-    counts only where K = 0 is refuted, by 1 − (q/χ²)², χ² that of K = 0 with c13, c23, c33 known, q its 99 % point.
+    The error of K by c13, c23, c33 is proportional to K. On a plane the K that is found is noise, and so is that part:
+    a region would grow with its own error and contain K = 0 always. So the part counts only as far as K = 0 is refuted,
+    by the factor 1 − (q/χ²)²: χ² is the statistic of K = 0 with c13, c23, c33 known, q its 99 % point.
 
     Args:
         c: (9,) parameters in the contact frame.
-        deviation: (9, k) root of their covariance: `deviation @ deviationᵀ`.
+        deviation: (9, k) root of their covariance, which is `deviation @ deviationᵀ`.
 
     Source: Judge and Bock, "The statistical implications of pre-test and Stein-rule estimators in econometrics", 1978.
     """

@@ -29,19 +29,20 @@ from canprobe.mechanics.touch.surface import SurfaceMatrix
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 from canprobe.mechanics.types import Floats
 
-_FLOOR = 20.0
-"""Least extent in standard deviations of a point: shorter paths are noise, and no length to measure curvature by."""
-
-_MEAN_OF = 8
+_MIN_EXTENT_SIGMAS = 20.0
+"""Least extent of a path in standard deviations of a point: a shorter one is noise, and no unit of length."""
+_MEAN_POINTS = 8
+"""Most points in a mean of the path."""
 
 
 class ContactBatch(NamedTuple):
     """Checked input of a batch fit.
 
     Attributes:
-        points, normals: (n, 3) m and unit vectors; the last row is now.
+        points, normals: (n, 3) points, m, and outward unit normals; the answer is at the last row.
         noise: noise of the n samples.
-        extent: largest distance from the last point, never below noise, m: the unit of length.
+        extent: largest distance from the last point, but at least `_MIN_EXTENT_SIGMAS` of noise, m: the unit of length
+            of the problem.
         distance: length along the path, m.
         correlation: correlation of the noise along the path; None for independent samples.
     """
@@ -54,25 +55,25 @@ class ContactBatch(NamedTuple):
     correlation: Correlation | None = None
 
     def whitener(self) -> Floats | None:
-        """(3, n, n) that makes the whitened samples independent; None where they are."""
+        """(3, n, n) matrices that make the whitened samples independent; None where they are independent."""
         if self.correlation is None:
             return None
         return self.correlation.whitener(np.linspace(0.0, self.distance, len(self.points)))
 
 
 def make_touches(points: Floats, normals: Floats, noise: Noise, correlation: Correlation | None = None) -> ContactBatch:
-    """Extent and length of arrays that are already checked."""
+    """A batch of arrays that are already checked, with its extent and length."""
     if correlation is not None:
         instance("correlation", correlation, Correlation)
-    floor = _FLOOR * math.sqrt(float(np.median(noise.point_variance)))
+    floor = _MIN_EXTENT_SIGMAS * math.sqrt(float(np.median(noise.point_variance)))
     offset = points - points[-1]
     extent = max(math.sqrt(float(np.einsum("ij,ij->i", offset, offset).max())), floor)
     return ContactBatch(points, normals, noise, extent, _travelled(points), correlation)
 
 
 def _travelled(points: Floats) -> float:
-    """Length along noisy points (n, 3): of means over up to eight, or their noise alone would add up to a path."""
-    each = min(_MEAN_OF, max(1, len(points) // 20))
+    """Length along noisy points (n, 3), m: along means of up to eight, as the noise of each would add up to a path."""
+    each = min(_MEAN_POINTS, max(1, len(points) // 20))
     means = points[len(points) % each :].reshape(-1, each, 3).mean(axis=1)
     steps = np.diff(means, axis=0)
     share = (len(points) - 1) / max(len(points) - each, 1)  # the ends that the means cut off
@@ -103,8 +104,11 @@ def working_frame(touches: ContactBatch) -> Floats:
 
 
 def fit_ml(touches: ContactBatch, prior: Prior | None, quadric: bool = False) -> SurfaceEstimate:
-    """The `ml` estimate (`nonlinear`), in the estimated contact frame of the last point; prior, quadric: as for
-    `fit_surface`.
+    """The `ml` estimate (`nonlinear`) in the estimated contact frame of the last point.
+
+    Args:
+        touches: the samples.
+        prior, quadric: as for `fit_surface`.
     """
     length = touches.extent
     stated = Prior.weak(length) if prior is None else instance("prior", prior, Prior)
@@ -160,7 +164,7 @@ def _turned_spread(spread: Floats, angle: float) -> Floats:
 
 
 MAX_OFF_SURFACE_SIGMAS = 10.0
-"""Distance of a point from the surface over its standard deviation, beyond which the point is taken to be off it."""
+"""Largest distance of a point from the surface, in its standard deviations, at which it counts as on it."""
 
 
 def cramer_rao(
@@ -180,18 +184,19 @@ def cramer_rao(
     method. Sorted principal curvatures are not differentiable at umbilics, so the bound is on the entries of K.
 
     Args:
-        points: (n, 3) m, on the true surface, or measured: not further off than `MAX_OFF_SURFACE_SIGMAS` times their
-            noise; the last row is now.
+        points: (n, 3) points on the true surface, or measured, m: not further off than `MAX_OFF_SURFACE_SIGMAS` times
+            the noise; the bound is for the last row.
         normals: (n, 3) outward unit normals.
-        S: (4, 4) the true surface in the frame of the points.
-        sigma_point, sigma_normal, prior, correlation, coupling: as for `fit_surface`; the prior that the estimator has.
+        S: (4, 4) matrix of the true surface in the frame of the points.
+        sigma_point, sigma_normal, prior, correlation, coupling: as for `fit_surface`; the prior is that of the
+            estimator.
 
     Returns:
         (3, 3) covariance of (K11, K12, K22), 1/m², in the contact frame of the last point,
         `SurfaceMatrix(S).contact_frame(foot of the last point)`; infinite where nothing is known.
 
     Raises:
-        UsageError: naming the field, what was expected and what was got.
+        UsageError: a value is not usable; the message names the field, what was expected and what was got.
 
     Source: Kay, "Fundamentals of statistical signal processing: estimation theory", ch. 3.
     """

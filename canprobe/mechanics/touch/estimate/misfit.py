@@ -8,9 +8,12 @@ and, should the residuals insist, anything (`TAIL_VARIANCES`). The weights are t
 likelihood of the residuals: a quadric stays one, a misfit that shows is corrected, one that could hide in the noise
 widens the covariance.
 
-The correction is one linear step, and higher terms follow where quartic ones matter: their part is taken to be a
-third of the correction, and goes into the covariance. A correction of more than a tenth of K is
-beyond that: the path has no local quadric, and K is not observed.
+The correction is one linear step. Where quartic terms matter, still higher ones do too: they are taken to be a third of
+the correction (`HIGHER_TERMS_SHARE`), which goes into the covariance. A correction of more than a tenth of K is too
+large for a linear step: then the path has no local quadric, and K is not observed.
+
+Why not fit all eighteen terms: noise alone would fill the nine additional ones on a short path, and the covariance of K
+would grow also where the surface is a quadric.
 
 Source: Hoeting, Madigan, Raftery and Volinsky, "Bayesian model averaging: a tutorial", 1999, (1)–(3), with the
 marginal likelihood of a linear model.
@@ -31,48 +34,57 @@ from canprobe.mechanics.touch.estimate.terms import DEGREE
 from canprobe.mechanics.touch.linear_algebra import inverted, upper_root
 from canprobe.mechanics.types import Floats
 
-NONE, USUAL, TAIL = 0.88, 0.11, 0.01
-"""Prior weights of: no misfit; a usual one; one that is only believed when seen.
+NO_MISFIT_WEIGHT, USUAL_MISFIT_WEIGHT, TAIL_MISFIT_WEIGHT = 0.88, 0.11, 0.01
+"""Prior weights of no misfit, of a usual one, and of one of any size that counts only when the residuals show it.
 
-Some nine in ten places on what is felt are taken to be like a quadric over a path no longer than a radius: flat, round,
-or nearly so. An edge or a seam is one in a hundred; it shows, and then its likelihood outweighs that.
+Some nine in ten places on real objects are taken to be like a quadric over a path no longer than a radius: flat, round,
+or nearly so. An edge or a seam is one in a hundred; it shows, and then its likelihood outweighs the prior.
 """
 USUAL_CURVATURE_CHANGES = (0.1, 0.5)
-"""A usual change of curvature along a surface, dK/ds over ‖K‖²: a torus 2.5 times as wide as its tube has 0.1 on its
-outer side and 0.4 on top, a fillet more. Slower ones change K by some percent over a path of a radius."""
-BLUR_RAD = 5e-3
-"""κσ_p, rad: a point's noise over the least radius. Up to here `NONE` holds, from twice as much on a usual misfit is
-certain. A path on which points err by so much of the radius says next to nothing about cubic terms, so the prior alone
-answers for them, and it is the cautious one: there a region may hold the truth too often, not too seldom."""
+"""Usual changes of curvature along a surface, dK/ds over ‖K‖²: a torus 2.5 times as wide as its tube has 0.1 on its
+outer side and 0.4 on top, a fillet more. Slower changes are some percent of K over a path of a radius."""
+BLUR_LIMIT_RAD = 5e-3
+"""Largest κσ_p (noise of a point over the least radius), rad, at which `NO_MISFIT_WEIGHT` holds in full; from twice as
+much on the prior takes a usual misfit for certain. A path on which points err by so much of the radius says next to
+nothing about cubic terms, so the prior alone answers for them, and the cautious one is taken: there a region may hold
+the truth too often, not too seldom."""
 TAIL_VARIANCES = 10.0 ** np.arange(1.0, 9.0)
-"""Variances of the tail over that of the best known of the terms."""
+"""Variances of the terms in the tail, over the variance to which the data know the best known term."""
 HIGHER_TERMS_SHARE = 0.35
-"""Higher terms over what cubic and quartic ones changed; on an edge they are no smaller where the surface is flat."""
+"""Standard deviation that higher terms add, over the change by cubic and quartic ones. It follows the change and not K:
+on an edge higher terms are no smaller where the surface is flat."""
 MAX_CORRECTION_SHARE = 0.1
-"""Largest change of K that is believed, over ‖K‖ or 1/length."""
+"""Largest change of K by a correction that is used, over the larger of ‖K‖ and 1/length."""
 MENTIONED_PROBABILITY = 0.99
-"""Probability of a misfit from which an estimate mentions it."""
-_PER_SQUARE = C_PER_Q**-2.0
-_CUBIC = DEGREE == 3
-_MIN_CURVATURE = 0.1
-"""‖K‖ · length at which the ratio of quartic to cubic terms stops falling."""
-_USUAL = np.concatenate([[0.0], np.square(USUAL_CURVATURE_CHANGES) / 36.0])
-_VARIANCES = np.concatenate([_USUAL, TAIL_VARIANCES])
-"""No misfit, usual ones per ‖K‖⁴ (the length being 1), and the tail."""
-_PRIOR = np.repeat(
-    [NONE, USUAL / len(USUAL_CURVATURE_CHANGES), TAIL / len(TAIL_VARIANCES)],
+"""Least probability of a misfit that an estimate mentions."""
+_Q_PER_C_SQUARED = C_PER_Q**-2.0
+_IS_CUBIC = DEGREE == 3
+_MIN_SCALED_CURVATURE = 0.1
+"""Least ‖K‖ · length by which the usual size of quartic terms over cubic ones falls."""
+_USUAL_VARIANCES = np.concatenate([[0.0], np.square(USUAL_CURVATURE_CHANGES) / 36.0])
+_VARIANCES = np.concatenate([_USUAL_VARIANCES, TAIL_VARIANCES])
+"""Variances of the terms: without a misfit, usual ones over ‖K‖⁴ (in units of the length), and the tail's."""
+_PRIOR_WEIGHTS = np.repeat(
+    [NO_MISFIT_WEIGHT, USUAL_MISFIT_WEIGHT / len(USUAL_CURVATURE_CHANGES), TAIL_MISFIT_WEIGHT / len(TAIL_VARIANCES)],
     [1, len(USUAL_CURVATURE_CHANGES), len(TAIL_VARIANCES)],
 )
-_CAUTIOUS = np.repeat(
-    [0.0, (NONE + USUAL) / len(USUAL_CURVATURE_CHANGES), TAIL / len(TAIL_VARIANCES)],
+_CAUTIOUS_WEIGHTS = np.repeat(
+    [
+        0.0,
+        (NO_MISFIT_WEIGHT + USUAL_MISFIT_WEIGHT) / len(USUAL_CURVATURE_CHANGES),
+        TAIL_MISFIT_WEIGHT / len(TAIL_VARIANCES),
+    ],
     [1, len(USUAL_CURVATURE_CHANGES), len(TAIL_VARIANCES)],
 )
 
 
 class Corrected(NamedTuple):
-    """A fit with what it leaves out: parameters (9,) and the upper triangular root (9, 9) of their information.
+    """A fit that is corrected for what it leaves out.
 
-    misfit, trusted: as of `Averaged`.
+    Attributes:
+        c: (9,) parameters.
+        root: (9, 9) upper triangular root of their information.
+        misfit, trusted: as in `Averaged`.
     """
 
     c: Floats
@@ -85,12 +97,12 @@ class Averaged(NamedTuple):
     """The parameters of a quadric, averaged over what it leaves out.
 
     Attributes:
-        shift: (9,) what to add to them.
-        spread: (9, 9) covariance that the terms add to theirs.
-        share: (9,) how much of each direction of the terms the data settle: mean variance left.
-        terms: (9,) the terms in these directions.
-        misfit: probability of there being one, without the caution of `BLUR_RAD`; `1 − NONE` where the residuals do not
-            show it.
+        shift: (9,) correction to add to the parameters.
+        spread: (9, 9) covariance that the terms add to that of the parameters.
+        share: (9,) mean variance that the data leave to the terms, in each of their directions.
+        terms: (9,) mean of the terms in these directions.
+        misfit: probability of a misfit, without the caution of `BLUR_LIMIT_RAD`; `1 − NO_MISFIT_WEIGHT` where the
+            residuals show none.
         trusted: the change of K is small enough for a linear step.
     """
 
@@ -103,23 +115,23 @@ class Averaged(NamedTuple):
 
 
 def scales(curvature: float) -> Floats:
-    """(9,) usual size of each term over that of the cubic ones, at ‖K‖ · length."""
-    return np.where(_CUBIC, 1.0, 0.25 * max(curvature, _MIN_CURVATURE))
+    """(9,) usual size of each term over that of the cubic ones, for a curvature ‖K‖ · length."""
+    return np.where(_IS_CUBIC, 1.0, 0.25 * max(curvature, _MIN_SCALED_CURVATURE))
 
 
 def averaged(m: Floats, s: Floats, carried: Floats, curvature: float, blur: float = 0.0) -> Averaged:
     """Average over the variance of the terms, given in directions in which the data's information is diagonal.
 
     Args:
-        m: (9,) information about them.
-        s: (9,) its score; terms `s / m` fit best.
-        carried: (9, 9) what a unit of each puts the parameters off by, with the sign turned.
-        curvature: ‖K‖ · length.
-        blur: κσ_p, rad.
+        m: (9,) information about the terms.
+        s: (9,) score of the residuals; the terms `s / m` fit best.
+        carried: (9, 9) change of the fitted parameters by a unit of each term, with the sign turned.
+        curvature: curvature ‖K‖ · length.
+        blur: noise of a point over the least radius, κσ_p, rad.
     """
     variance = _VARIANCES.copy()
-    variance[: len(_USUAL)] *= curvature**4
-    variance[len(_USUAL) :] /= max(float(m.max()), 1e-300)
+    variance[: len(_USUAL_VARIANCES)] *= curvature**4
+    variance[len(_USUAL_VARIANCES) :] /= max(float(m.max()), 1e-300)
     wider = 1.0 + variance[:, None] * m
     share = variance[:, None] / wider
     likelihood = 0.5 * (share.dot(s * s) - np.log(wider).sum(axis=1))
@@ -131,23 +143,29 @@ def averaged(m: Floats, s: Floats, carried: Floats, curvature: float, blur: floa
     apart = shifts - mean
     left = weight.dot(share)
     spread = (carried * left).dot(carried.T) + (apart.T * weight).dot(apart)
-    changed = float(weight.dot(np.square(shifts[:, 6:])).dot(_PER_SQUARE))
-    spread.flat[60::10] += HIGHER_TERMS_SHARE**2 * changed / _PER_SQUARE  # of K
+    changed = float(weight.dot(np.square(shifts[:, 6:])).dot(_Q_PER_C_SQUARED))
+    spread.flat[60::10] += HIGHER_TERMS_SHARE**2 * changed / _Q_PER_C_SQUARED  # of K
     trusted = changed <= (MAX_CORRECTION_SHARE * max(curvature, 1.0)) ** 2
-    shown = 1.0 - NONE * float(evidence[0] / _PRIOR.dot(evidence))
+    shown = 1.0 - NO_MISFIT_WEIGHT * float(evidence[0] / _PRIOR_WEIGHTS.dot(evidence))
     return Averaged(mean, spread, left, weight.dot(share * s), shown, trusted)
 
 
 def _prior(blur: float) -> Floats:
     """Prior weights of no misfit, the usual ones and the tail, at κσ_p (rad)."""
-    if blur <= BLUR_RAD:
-        return _PRIOR
-    result: Floats = _PRIOR + min(blur / BLUR_RAD - 1.0, 1.0) * (_CAUTIOUS - _PRIOR)
+    if blur <= BLUR_LIMIT_RAD:
+        return _PRIOR_WEIGHTS
+    result: Floats = _PRIOR_WEIGHTS + min(blur / BLUR_LIMIT_RAD - 1.0, 1.0) * (_CAUTIOUS_WEIGHTS - _PRIOR_WEIGHTS)
     return result
 
 
 def correct(c: Floats, root: Floats, d: Design, independent: Floats | None) -> Corrected:
-    """Average a converged fit (c in the frame at the last sample, its root; else as `fit`) over its misfit."""
+    """Average a converged fit over its misfit.
+
+    Args:
+        c: (9,) parameters in the frame at the last sample.
+        root: (9, 9) root of their information.
+        d, independent: as for `nonlinear.fit`.
+    """
     J, E, r, slack = _rows(c, d, independent)
     inverse = inverted(root)
     H = inverse @ inverse.T
@@ -163,9 +181,9 @@ def correct(c: Floats, root: Floats, d: Design, independent: Floats | None) -> C
 
 
 def _rows(c: Floats, d: Design, independent: Floats | None) -> tuple[Floats, Floats, Floats, Floats]:
-    """Whitened rows of the parameters (3n, 9) and of the terms (3n, 9), residuals (3n,), what is left of Jᵀ r (9,).
+    """Whitened rows of the parameters (3n, 9) and of the terms (3n, 9), residuals (3n,), and what is left of Jᵀ r (9,).
 
-    Wrong samples count by the square of their weight: some that still pull at the fit would look like a misfit.
+    Wrong samples count by the square of their weight: those that still pull at the fit would look like a misfit.
     """
     at = linearise(c, d)
     weight = robust(np.einsum("ij,ij->i", at.r, at.r))[0][:, None, None]
@@ -179,7 +197,7 @@ def _rows(c: Floats, d: Design, independent: Floats | None) -> tuple[Floats, Flo
 
 
 def misfit_notes(misfit: float, *, trusted: bool) -> tuple[str, ...]:
-    """What a reader should know about a misfit."""
+    """Notes of an estimate about a misfit."""
     if not trusted:
         return ("no quadric: K varies too much along the path to be observed",)
     return ("no quadric: corrected for cubic and quartic terms",) if misfit > MENTIONED_PROBABILITY else ()

@@ -1,4 +1,4 @@
-"""The stated noise of points and normals: σ or covariances, coupled, and correlated along the path."""
+"""The stated noise of points and normals: standard deviations or covariances, coupling, correlation along the path."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ CHI2_MEDIAN, CHI2_95, CHI2_99, CHI2_999 = 2.366, 7.815, 11.34, 16.27
 
 @dataclass(frozen=True, slots=True)
 class Correlation:
-    """Noise that is alike from sample to sample: hysteresis, aliasing of a moving centroid, an arm that bends.
+    """Noise that is correlated from sample to sample: hysteresis, aliasing of a moving centroid, an arm that bends.
 
     Between samples a path of s apart the noise of points and normals, whitened to unit variance, has the correlation
     `share · exp(−s / length)`; the rest of the variance, 1 − share, is independent (a first-order autoregression over
-    the path plus white noise). Where the contact comes back to the same place its error is taken for a new one.
+    the path plus white noise). A contact that comes back to the same place has an independent error there.
 
     Attributes:
         length: correlation length, m (the unit of the points).
-        share: of the variance, 0 to 1.
-        point_share: that of the points along the normal, where it is another than that of the normals.
+        share: share of the variance that is correlated, 0 to 1.
+        point_share: the same share of the points along the normal, where it differs from that of the normals.
     """
 
     length: float
@@ -51,7 +51,7 @@ class Correlation:
 
     @property
     def shares(self) -> Floats:
-        """(3,) of a sample's three rows: height, and the two parts of the normal."""
+        """(3,) correlated shares of a sample's three rows: height, and the two parts of the normal."""
         return np.array([self.share if self.point_share is None else self.point_share, self.share, self.share])
 
     def matrix(self, path: Floats) -> Floats:
@@ -62,7 +62,7 @@ class Correlation:
         return R
 
     def whitener(self, path: Floats) -> Floats:
-        """(3, n, n): inverse lower Cholesky factors of `matrix`; samples at one place are told apart by 1e-9."""
+        """(3, n, n) inverse lower Cholesky factors of `matrix`, which 1e-9 keeps regular for samples at one place."""
         of = {share: R + 1e-9 * np.eye(len(path)) for share, R in zip(self.shares, self.matrix(path), strict=True)}
         found = {share: inverted_upper(lower_root(R).T).T for share, R in of.items()}  # once for rows that are alike
         return np.array([found[share] for share in self.shares])
@@ -81,9 +81,9 @@ class Noise:
     Attributes:
         point: (n,) standard deviation per axis, m, or (n, 3, 3) covariances, m².
         normal: (n,) standard deviation per tangent axis, rad, or (n, 3, 3) covariances.
-        coupling: 1/m; an error e of a point along the surface comes with one of `−coupling · e` of its outward normal.
-            0 for independent errors; 1/R_p where both come from one centroid on a probe of that radius, which is felt
-            as a turn of `(K + coupling) e` against the surface.
+        coupling: error of the outward normal, with its sign turned, over the error of the point along the surface, 1/m:
+            0 for independent errors, 1/R_p where both come from one centroid on a probe of that radius. An error e of
+            the point then turns the normal by `(K + coupling) e` against the surface.
     """
 
     point: Floats
@@ -92,17 +92,17 @@ class Noise:
 
     @property
     def isotropic(self) -> bool:
-        """Both are plain standard deviations."""
+        """Whether both are plain standard deviations."""
         return self.point.ndim == 1 and self.normal.ndim == 1
 
     @property
     def point_variance(self) -> Floats:
-        """(n,) variance per axis, the mean one where axes differ, m²."""
+        """(n,) variance of the points per axis, the mean one where axes differ, m²."""
         return _mean_variance(self.point)
 
     @property
     def normal_variance(self) -> Floats:
-        """The same of the normals, rad²."""
+        """(n,) variance of the normals per axis, the mean one where axes differ, rad²."""
         return _mean_variance(self.normal)
 
     def scaled(self, length: float, R: Floats) -> Noise:
@@ -112,7 +112,7 @@ class Noise:
         return Noise(point, normal, self.coupling * length)
 
     def covariances(self) -> tuple[Floats, Floats]:
-        """Both as (n, 3, 3)."""
+        """Covariances (n, 3, 3) of the points, m², and of the normals, rad²."""
         return _as_covariance(self.point), _as_covariance(self.normal)
 
 
@@ -120,7 +120,7 @@ def make_noise(n: int, sigma_point: ArrayLike, sigma_normal: ArrayLike, coupling
     """Checked noise of n samples, each sigma a number, (n,), or covariances (3, 3) or (n, 3, 3).
 
     Raises:
-        UsageError: naming the field, when it has another shape, or is not finite and above 0 (definite).
+        UsageError: a sigma has another shape, or is not finite and above 0 (definite); the message names the field.
     """
     alike = float(checked("coupling", coupling, ()))
     return Noise(_one(n, "sigma_point", sigma_point), _one(n, "sigma_normal", sigma_normal), alike)
@@ -151,7 +151,7 @@ def _one(n: int, name: str, value: ArrayLike) -> Floats:
 
 
 def _refuse_extremes(name: str, deviations: Floats) -> None:
-    """Refuse deviations that leave an estimate nothing but rounding, or whose information is no number."""
+    """Refuse deviations with which an estimate would be rounding error, or its information would overflow."""
     for one in (float(deviations.min()), float(deviations.max())):
         if not 1.0 / MAX_MAGNITUDE <= one <= MAX_LENGTH:
             limits = f"from {1.0 / MAX_MAGNITUDE:g} to {MAX_LENGTH:g}"

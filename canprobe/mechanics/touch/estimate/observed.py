@@ -8,7 +8,7 @@ not depend on the choice of axes. A combination of K counts as observed when
    but false σ. This is decided first, on the places alone, so that no fit can talk itself into it;
 2. its standard deviation, all other parameters unknown, is at most `SIGMA_LIMIT · max(‖K‖, 1/L)`, L the length of the
    path;
-3. its information is at least `NUMERIC_SHARE` times the largest: rounding.
+3. its information is at least `MIN_INFORMATION_SHARE` times the largest: rounding.
 
 A straight path passes two of three: the normal curvature along it and the twist. Combinations that fail are held at
 the value nearest to flat.
@@ -27,17 +27,20 @@ from canprobe.mechanics.touch.linear_algebra import eigen, principal
 from canprobe.mechanics.types import Floats
 
 MIN_SPREAD = 10.0
+"""Least mean square distance of points from their mean over σ_p² (rule 1)."""
 SIGMA_LIMIT = 0.3
-NUMERIC_SHARE = 1e-12
+"""Largest standard deviation of a combination over `max(‖K‖, 1/L)` (rule 2)."""
+MIN_INFORMATION_SHARE = 1e-12
+"""Least information of a combination over the largest (rule 3)."""
 
 
 class Decision(NamedTuple):
-    """What is known about q, combination by combination.
+    """Information about q, combination by combination, and which combinations were observed.
 
     Attributes:
-        information: (3,) information 1/σ² of each; 0 for what the points were not spread for.
-        vectors: (3, 3) columns, orthonormal in q.
-        passed: (3,) bool.
+        information: (3,) information 1/σ² about each; 0 where the points were not spread for it.
+        vectors: (3, 3) columns: the combinations, orthonormal in q.
+        passed: (3,) whether each combination counts as observed.
     """
 
     information: Floats
@@ -51,17 +54,17 @@ class Decision(NamedTuple):
 
 
 def nothing_observed() -> Decision:
-    """The decision where a model does not hold."""
+    """The decision where the model does not hold: nothing was observed."""
     return Decision(np.zeros(3), np.eye(3), np.zeros(3, dtype=bool))
 
 
 def decide(root_q: Floats, spread: Floats, curvature: float) -> Decision:
-    """Rank decision.
+    """Rank decision by the rules of this module.
 
     Args:
         root_q: (m, 3) root of the data's information about q, all else unknown, dimensionless.
         spread: (2, 2) covariance of the points in the tangent plane over the variance of their noise.
-        curvature: ‖K‖, dimensionless.
+        curvature: norm ‖K‖, dimensionless.
     """
     axes, wide = excited(spread)
     if wide.all():
@@ -81,12 +84,17 @@ def decide(root_q: Floats, spread: Floats, curvature: float) -> Decision:
 
 
 def _least(curvature: float, largest: float) -> float:
-    return max(1.0 / (SIGMA_LIMIT * max(curvature, 1.0)) ** 2, NUMERIC_SHARE * largest)
+    return max(1.0 / (SIGMA_LIMIT * max(curvature, 1.0)) ** 2, MIN_INFORMATION_SHARE * largest)
 
 
 def excited(spread: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """As columns (3, 3) in q the curvature along the main axis of a spread, the twist, and across; and for which of
-    them (3,) the points were spread.
+    """Combinations of q along the main axes of a spread, and whether the points were spread for them (rule 1).
+
+    Args:
+        spread: (2, 2) as for `decide`.
+
+    Returns:
+        Columns (3, 3) in q: curvature along the main axis, twist, curvature across; and a flag (3,) for each.
     """
     mean, radius, angle = principal(spread)
     return turned(angle).T, np.array([mean + radius, mean, mean - radius]) >= MIN_SPREAD

@@ -1,8 +1,9 @@
 """What a filter knows about the terms that a quadric leaves out, in constant time and memory.
 
-The filter fits a quadric. Beside it, its samples' rows of the cubic and quartic terms are summed with those of its
-parameters, forgotten alike and carried from frame to frame: as much as `nonlinear` needs of a batch. The terms are
-what the samples say at terms of zero; they are never put into the filter, only into its answers.
+The filter fits a quadric. Beside it, the rows of the cubic and quartic terms are summed with those of the parameters,
+forgotten alike and carried from frame to frame: the same sums that `misfit` takes of a batch. The terms are estimated
+from residuals at terms of zero. They correct the answers of the filter and never its state: a correction that turns out
+wrong would otherwise stay in the memory.
 """
 
 from __future__ import annotations
@@ -20,14 +21,17 @@ from canprobe.mechanics.touch.estimate.terms import shifted
 from canprobe.mechanics.touch.linear_algebra import eigen, solved
 from canprobe.mechanics.types import Floats, Vec
 
-_REGULAR = 1e-9
-"""What keeps the covariance of the terms' score regular, over its mean."""
+_REGULARISATION_SHARE = 1e-9
+"""Share of the trace of the covariance of the terms' score that is added to its diagonal, to keep it regular."""
 
 
 class Amended(NamedTuple):
-    """An answer of a filter, averaged over what its quadric leaves out; misfit, trusted: as of `nonlinear.Averaged`.
+    """An answer of a filter, averaged over what its quadric leaves out.
 
-    The covariance (9, 9) is what the terms add to that of the noise; symmetric, not definite by itself.
+    Attributes:
+        c: (9,) parameters.
+        covariance: (9, 9) covariance that the terms add to that of the noise; symmetric, not definite by itself.
+        misfit, trusted: as in `misfit.Averaged`.
     """
 
     c: Floats
@@ -37,11 +41,12 @@ class Amended(NamedTuple):
 
 
 class ExpectedMisfit(NamedTuple):
-    """What is known beforehand of what a filter is given.
+    """What is assumed where a filter looks for a misfit.
 
     Attributes:
-        noise: variance of the residuals over what is stated. Generous deviations make a misfit look like noise.
-        curvature: least ‖K‖ · length whose usual changes are reckoned with: a flat place need not lie on a plane.
+        noise: variance of the residuals over the stated one. Without it a σ that is stated too large would make a
+            misfit look like noise.
+        curvature: least ‖K‖ · length whose usual changes are allowed for: a flat place need not lie on a plane.
         sigma_point: stated standard deviation of a point over the length.
     """
 
@@ -51,14 +56,14 @@ class ExpectedMisfit(NamedTuple):
 
 
 class _Along(NamedTuple):
-    """The average over the terms, in directions in which what the samples say about them is independent.
+    """The average over the terms, in directions in which the samples' information about them is diagonal.
 
     Attributes:
         found: the average.
-        off: (9, 9) what a unit along each direction does to the parameters.
+        off: (9, 9) change of the parameters by a unit along each direction.
         terms: (9, 9) the terms of such a unit.
-        shared: (18, 9) covariance of the score with that of the terms.
-        weighted: (9, 9) weights of what the samples say.
+        shared: (18, 9) covariance of the whole score with the part of the terms.
+        weighted: (9, 9) weights of the terms' score.
     """
 
     found: Averaged
@@ -69,10 +74,11 @@ class _Along(NamedTuple):
 
 
 class OmittedTerms:
-    """Sums over the rows of parameters and terms; `score` is that of both.
+    """Sums over the rows of parameters and terms; `score` is the `Score` of all eighteen.
 
     Args:
-        prior, correlation: as of `Score`, for the nine parameters.
+        prior: (9, 9) information of the prior about the nine parameters.
+        correlation: correlation of the rows along the path; None for independent samples.
     """
 
     def __init__(self, prior: Floats, correlation: Correlation | None) -> None:
@@ -82,7 +88,7 @@ class OmittedTerms:
         self.reset()
 
     def reset(self) -> None:
-        """No samples."""
+        """Forget all samples."""
         self.score.reset()
         self._information = np.zeros((18, 18))
         self._slope = np.zeros(9)
@@ -97,13 +103,13 @@ class OmittedTerms:
     def take(  # noqa: PLR0917 - as `Score.take`, and what the sums need
         self, rows: Floats, residuals: Floats, step: Floats, moved: float, kept: float, known: float
     ) -> None:
-        """Take new rows (3n, 18), minus their residuals (3n,) before the parameters made a step (9,)."""
+        """Take new rows (3n, 18), and minus their residuals (3n,) before the parameters made a step (9,)."""
         self.score.take(rows, moved, kept, known)
         self._information = kept * self._information + rows.T.dot(rows)
         self._slope = kept * self._slope + rows[:, 9:].T.dot(residuals) - self._information[9:, :9].dot(step)
 
     def carry(self, back: Floats, x: float, y: float) -> None:
-        """Go over to a frame at (x, y); back (9, 9) is d(old)/d(new) of the parameters."""
+        """Change to a frame at (x, y); back (9, 9) is d(old)/d(new) of the parameters."""
         A, Q = shifted(x, y)
         away = 2.0 * np.eye(9) - A  # its inverse: a quartic term leaves cubic ones behind, a cubic one none
         wide = np.zeros((18, 18))
@@ -113,15 +119,20 @@ class OmittedTerms:
         self._slope = away.T.dot(self._slope)
 
     def amend(self, c: Floats, H: Floats, place: Vec, expected: ExpectedMisfit) -> Amended:
-        """Average an answer at a place over the terms; c (9,) of the filter, H (9, 9) the inverse of its
-        information.
+        """Average an answer at a place over the terms.
+
+        Args:
+            c: (9,) parameters of the filter.
+            H: (9, 9) inverse of their information.
+            place: the place in the working frame, dimensionless.
+            expected: what is assumed.
         """
         a = self._along(c, H, expected, place)
         both = H.dot(a.shared[:9]).dot(a.weighted * a.found.share).dot(a.off.T)
         return Amended(c + a.found.shift, a.found.spread + both + both.T, a.found.misfit, a.found.trusted)
 
     def explanation(self, c: Floats, H: Floats, expected: ExpectedMisfit) -> Floats:
-        """What the terms most likely are: (18,) what they add to the filter's parameters, and the terms."""
+        """(18,) most likely terms: their part in the filter's parameters, then the terms themselves."""
         a = self._along(c, H, expected, (0.0, 0.0, 0.0))
         return np.concatenate([a.found.shift, a.terms @ a.found.terms])
 
@@ -133,7 +144,7 @@ class OmittedTerms:
         X[9:].flat[::10] = D
         shared = self.score.matrix.dot(X)
         V = X.T.dot(shared)  # of y = m a + noise, all that the samples say about the terms
-        V.flat[::10] += _REGULAR * V.trace()
+        V.flat[::10] += _REGULARISATION_SHARE * V.trace()
         m = D[:, None] * self._information[9:].dot(X)
         weighted = solved(V, m)
         values, U = eigen(m.dot(weighted))

@@ -1,4 +1,4 @@
-"""What an online estimator is, and the gate that every sample passes."""
+"""The interface of an online estimator, and the gate that every sample passes."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from canprobe.mechanics.touch.linear_algebra import positive
 
 @dataclass(slots=True)
 class Dropped:
-    """Samples that were not used, by reason."""
+    """Numbers of samples that were not used, by reason."""
 
     not_finite: int = 0
-    """A NaN or infinite time, place or normal."""
+    """Samples with a NaN or infinite time, place or normal."""
     repeated: int = 0
-    """The time of the sample before."""
+    """Samples with the time of the sample before."""
     backwards: int = 0
-    """A time before that of the sample before."""
+    """Samples with an earlier time than the sample before."""
     zero_sigma: int = 0
-    """A standard deviation of 0 or less, or not finite."""
+    """Samples with a standard deviation of 0 or less, or not finite."""
     not_unit: int = 0
-    """A normal that is not a unit vector."""
+    """Samples with a normal that is not a unit vector."""
 
     @property
     def total(self) -> int:
-        """All of them."""
+        """Number of all dropped samples."""
         return self.not_finite + self.repeated + self.backwards + self.zero_sigma + self.not_unit
 
 
 DOUBT_SIGMA_SCALE = {Doubt.SATURATED: 3.0, Doubt.CUT: 3.0, Doubt.SMALL: 3.0, Doubt.DEAD: 1.5}
-"""Factor of both standard deviations of a contact whose image is in doubt."""
+"""Factor on both standard deviations of a contact whose image is in doubt."""
 DOUBT_WINDOW_SAMPLES = 160
-"""Last contacts whose doubts an estimate reports."""
+"""Number of last contacts whose doubts an estimate reports."""
 
 
 class Estimator(Protocol):
@@ -44,7 +44,7 @@ class Estimator(Protocol):
 
     @property
     def dropped(self) -> Dropped:
-        """Samples that were not used."""
+        """Samples that were not used, by reason."""
 
     def add(self, sample: ContactSample) -> None:
         """Take one contact; a sample that cannot be used is dropped and counted, never an error."""
@@ -57,7 +57,15 @@ class Estimator(Protocol):
 
 
 class Gate:
-    """Lets through what an estimator can use and counts the rest; sigmas: of points (m) and normals (rad), above 0."""
+    """Passes the samples that an estimator can use, and counts the rest.
+
+    Args:
+        sigma_point: standard deviation of a point that states none, m.
+        sigma_normal: standard deviation of a normal that states none, rad.
+
+    Raises:
+        UsageError: a standard deviation is not above 0.
+    """
 
     def __init__(self, sigma_point: float, sigma_normal: float) -> None:
         self.sigma_point = positive("sigma_point", sigma_point)
@@ -71,14 +79,14 @@ class Gate:
         self._doubts.clear()
 
     def notes(self) -> tuple[str, ...]:
-        """What was in doubt about the images of the last contacts."""
+        """Notes on the doubts about the images of the last contacts."""
         if not any(self._doubts):
             return ()
         counts = Counter(doubt for doubts in self._doubts if doubts for doubt in doubts)
         return tuple(f"{n} of the last {len(self._doubts)} contacts: {doubt.value}" for doubt, n in counts.items())
 
     def passes(self, sample: ContactSample, dropped: Dropped) -> bool:
-        """Whether to use a sample; counts it where not."""
+        """Whether a sample can be used; a sample that cannot is counted in `dropped`."""
         t = sample.t_s
         x, y, z = sample.p_base.tolist()
         nx, ny, nz = sample.n_base.tolist()

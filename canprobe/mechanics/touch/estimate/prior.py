@@ -26,11 +26,12 @@ class Prior:
     """Independent normal priors on entries of the normalised surface matrix in its contact frame.
 
     Attributes:
-        name: appears in the estimate.
-        sigma_c13, sigma_c23, sigma_c33: 1/m, mean 0.
-        curvature: mean of the shape operator, `curvature · I`, 1/m.
-        sigma_curvature: standard deviation of K11 and K22 (of K12 its √½), 1/m; infinite for none, the default.
-            With it every combination has a finite answer; `observed` still says what the data alone observed.
+        name: name of the prior, which the estimate carries.
+        sigma_c13, sigma_c23, sigma_c33: standard deviations of these entries about 0, 1/m.
+        curvature: mean κ of the shape operator, which is κ I, 1/m.
+        sigma_curvature: standard deviation of K11 and K22 (of K12 its √½), 1/m; infinite, the default, for no prior on
+            curvature. With one every combination has a finite answer; `observed` still says what the data alone
+            observed.
     """
 
     name: str
@@ -44,12 +45,12 @@ class Prior:
         checked("curvature", self.curvature, ())
         for field in ("sigma_c13", "sigma_c23", "sigma_c33", "sigma_curvature"):
             value = getattr(self, field)
-            if not (isinstance(value, Real) and float(value) > 0.0):  # infinite: none
+            if not (isinstance(value, Real) and float(value) > 0.0):  # may be infinite
                 raise UsageError(f"prior.{field}: expected a number above 0, got {value!r}")
 
     @classmethod
     def weak(cls, length: float) -> Prior:
-        """The default: nothing on curvature, `NUISANCE / length` on c13, c23, c33."""
+        """The default: `NUISANCE_SIGMA / length` on c13, c23, c33, and nothing on curvature."""
         s13, s23, s33 = (s / positive("length", length) for s in NUISANCE_SIGMA)
         return cls("weak on c13, c23, c33", s13, s23, s33)
 

@@ -1,9 +1,9 @@
-"""`recursive`: the nine-parameter model as a square-root information filter; what runs in the 200 Hz loop.
+"""`recursive`: the nine-parameter model as a square-root information filter, the estimator that runs in the loop.
 
-Constant work per sample whatever the memory, and no sample much dearer than another. Samples are collected until the
-contact has moved on by a step, then taken in together (`information`). Forgetting is per millimetre travelled, never
-per second; a contact that does not move adds nothing and forgets nothing. The first stretch, also after a change of
-the surface, is solved as a whole (`start`). The covariance is the sandwich of `Score`.
+The work per sample is constant whatever the memory, and no sample costs much more than another. Samples are collected
+until the contact has moved on by a step, then added together (`information`). Forgetting is per millimetre travelled.
+Why not per second: a contact at rest would lose what it knows, and its noise would count as new. The first stretch,
+also after a change of the surface, is solved as a whole (`start`). The covariance is the sandwich of `Score`.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ from canprobe.mechanics.touch.linear_algebra import instance, inverted, inverted
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 from canprobe.mechanics.types import Floats
 
-STEP_SHARE = 0.025
-"""Travel between two updates over the memory."""
-MAX_CROWDING = 2.0
-"""Most samples per metre that count in full, over the nominal `window / memory`."""
+UPDATE_TRAVEL_SHARE = 0.025
+"""Travel between two updates, over the memory."""
+MAX_DENSITY_RATIO = 2.0
+"""Largest number of samples per metre that count in full, over the nominal number `window / memory`."""
 MAX_PENDING = 16
-"""Samples of one step that are kept; of a slower motion the last ones."""
+"""Most samples of one step that are kept; a slower motion keeps the last ones."""
 START_ALARM_SCALE = 1.6
-"""How much higher the alarm's thresholds are during a start: the first answers are soon put right by themselves."""
+"""Factor on the alarm's thresholds during a start, whose first answers soon correct themselves."""
 CORRELATED_ALARM_SCALE = 1.4
-"""The same where the errors of neighbours are alike: running means vary more."""
+"""Factor on the alarm's thresholds where errors of neighbours are correlated: running means vary more."""
 MIN_BELIEVED_INNOVATION = 0.5
-"""Usual innovation below which the stated noise is not believed where a misfit is looked for."""
+"""Usual innovation below which the stated noise is replaced by the observed one when a misfit is looked for."""
 
 
 class _Pending(NamedTuple):
@@ -56,7 +56,7 @@ class _Pending(NamedTuple):
 
 
 class _Compared(NamedTuple):
-    """Contacts against what the filter says: their equations, squared innovations (n,) and weights (n,)."""
+    """Contacts compared with the filter: their equations, squared innovations (n,) and weights (n,)."""
 
     rows: Floats
     residuals: Floats
@@ -68,14 +68,20 @@ class RecursiveEstimator:
     """Square-root information filter over the contact's path.
 
     Args:
-        sigma_point, sigma_normal: effective noise, m and rad.
+        sigma_point, sigma_normal: effective standard deviations of points and normals, m and rad.
         memory_m: path after which a sample's information has fallen to 1/e, m.
-        window: samples per memory at the nominal pace; slower motion is not believed more than twice that.
-        prior: None for `Prior.weak` over the memory; none on curvature itself, which forgetting would wear away.
-        coupling: of the errors of point and normal (`Noise`), 1/m.
-        correlation: of the noise along the path. The samples are weighed as if they were independent, the covariance
-            is what such an answer has under correlated noise.
-        quadric: the surface is known to be one; else its cubic and quartic terms are allowed for (`LeftOut`).
+        window: number of samples on one memory at the nominal speed; a slower motion has more, which count as twice
+            that at most.
+        prior: prior on c13, c23, c33; None for `Prior.weak` over the memory. A prior on curvature is refused, as
+            forgetting would wear it away.
+        coupling: coupling of the errors of point and normal (`Noise`), 1/m.
+        correlation: correlation of the noise along the path. The samples are weighed as if they were independent; the
+            covariance is what such an answer has under correlated noise.
+        quadric: whether the surface is known to be a quadric; otherwise cubic and quartic terms are allowed for
+            (`OmittedTerms`).
+
+    Raises:
+        UsageError: a value is out of range, or the prior is on curvature.
     """
 
     def __init__(
@@ -95,7 +101,7 @@ class RecursiveEstimator:
         self._gate = Gate(sigma_point, sigma_normal)
         self._memory = positive("memory_m", memory_m)
         self._quadric = quadric
-        self._crowd = MAX_CROWDING * positive("window", window) / self._memory
+        self._full_density = MAX_DENSITY_RATIO * positive("window", window) / self._memory
         self._prior = Prior.weak(self._memory) if prior is None else instance("prior", prior, Prior)
         if math.isfinite(self._prior.sigma_curvature):
             raise UsageError("prior: expected none on curvature itself for 'recursive', got " + self._prior.name)
@@ -108,7 +114,7 @@ class RecursiveEstimator:
         self._gate.reset()
         self._last: MeasuredContact | None = None
         self._pending: deque[_Pending] = deque(maxlen=MAX_PENDING)
-        self._travel = Travel(max(STEP_SHARE * self._memory, 3.0 * self._gate.sigma_point))
+        self._travel = Travel(max(UPDATE_TRAVEL_SHARE * self._memory, 3.0 * self._gate.sigma_point))
         self._spread = Spread()
         self._change = ChangeTest()
         self._start: Start | None = Start(self._memory, self._prior)
@@ -135,7 +141,7 @@ class RecursiveEstimator:
         state, notes = self._filter, self._notes()
         place = state.place(self._last.point)
         a = anchor(state.c, state.T, place, state.length)
-        # what has not settled is not called observed
+        # a start that has not settled has spread 0, so that nothing counts as observed
         certain = float(self._settled) / self._gate.sigma_point**2
         P = a.T_frame_contact[:3, :2]
         flat = P.T.dot(self._spread.covariance * certain).dot(P)
@@ -175,7 +181,7 @@ class RecursiveEstimator:
         )
 
     def _expected(self) -> ExpectedMisfit:
-        """Stated noise counts unless it is twice the usual; a probe feels surfaces about as curved as itself."""
+        """The stated noise is used unless it is twice the usual; surfaces are taken to be as curved as the probe."""
         usual = self._change.usual
         noise = usual if usual < MIN_BELIEVED_INNOVATION else 1.0
         return ExpectedMisfit(noise, self._coupling * self._memory, self._gate.sigma_point / self._memory)
@@ -187,14 +193,17 @@ class RecursiveEstimator:
         return (*notes, *self._gate.notes())
 
     def _step(self, moved: float) -> None:
-        """Take what is pending into the filter or its start; after a change of the surface into a new start."""
+        """Add the pending samples to the filter or its start; after a change of the surface, to a new start."""
         compared = self._compared() if self._settled else None
         caution = self._caution if self._start is None else START_ALARM_SCALE * self._caution
         if compared and any([self._change.take(square, caution) for square in compared.squares.tolist()]):
             explained = self._explained(compared)
             if explained is None:
                 self._change.alarm()
-                self._drop_agreeing(compared.squares)
+                # pending samples up to the last that agrees with the old surface belong to that
+                agree = np.flatnonzero(compared.squares[:-1] <= CHI2_99 * self._change.usual)
+                for _ in range(int(agree[-1]) + 1 if len(agree) else 0):
+                    self._pending.popleft()
                 self._spread.fade(0.0)
                 self._start = Start(self._memory, self._prior)
             else:
@@ -202,7 +211,8 @@ class RecursiveEstimator:
         if self._start is not None:
             self._beginning(self._start, moved)
         elif compared:
-            self._absorb(compared, moved)
+            root = np.sqrt(self._weigh(moved, compared.weights) * compared.weights)[:, None]
+            self._filter.take(compared.rows * root[:, :, None], compared.residuals * root, moved)
             if self._last is not None:
                 self._filter.follow(self._last.point)
 
@@ -211,7 +221,7 @@ class RecursiveEstimator:
         return self._judged(rows, residuals, residuals)
 
     def _explained(self, found: _Compared) -> _Compared | None:
-        """As `_compared`, where the contacts are as the terms that a quadric leaves out had them expected."""
+        """As `_compared`, where the terms that a quadric leaves out explain the contacts; else None."""
         if self._quadric:
             return None
         f = self._filter
@@ -220,24 +230,18 @@ class RecursiveEstimator:
         return left if self._change.usual_again(left.squares) else None
 
     def _judged(self, rows: Floats, residuals: Floats, unexplained: Floats) -> _Compared:
-        """Weighted by their places, and from a limit on by the square of `limit / d²`.
+        """Contacts weighted by their places and, beyond a limit of the squared innovation d², by `(limit / d²)²`.
 
-        It is the 99.9 % point of χ², times the running innovation: where all disagree none is wrong.
+        The limit is the 99.9 % point of χ² times the running innovation: where all samples disagree, none is wrong.
         """
         squares = self._filter.squared_innovations(rows, unexplained)
         limit = CHI2_999 * max(1.0, self._change.innovation)
         weights = np.array([p.weight for p in self._pending]) * np.square(limit / np.maximum(squares, limit))
         return _Compared(rows, residuals, squares, weights)
 
-    def _absorb(self, compared: _Compared, moved: float) -> None:
-        """Take a step (m) into the filter."""
-        root = np.sqrt(self._weigh(moved, compared.weights) * compared.weights)[:, None]
-        self._filter.take(compared.rows * root[:, :, None], compared.residuals * root, moved)
-
     def _beginning(self, start: Start, moved: float) -> None:
-        """Take a step (m) into the solution of the first stretch; the filter is given what that is by now."""
-        crowd = self._weigh(moved, np.ones(len(self._pending)))
-        wider = 1.0 / math.sqrt(crowd)
+        """Add a step (m) to the solution of the first stretch, and give the filter the solution so far."""
+        wider = 1.0 / math.sqrt(self._weigh(moved, np.ones(len(self._pending))))
         touches = [p.touch for p in self._pending]
         start.add(
             [t._replace(sigma_point=wider * t.sigma_point, sigma_normal=wider * t.sigma_normal) for t in touches], moved
@@ -254,16 +258,10 @@ class RecursiveEstimator:
             self._start, self._settled = None, True
 
     def _weigh(self, moved: float, weight: Floats) -> float:
-        """Count a step; the weight of each sample where they are crowded, else 1."""
-        crowd = min(1.0, self._crowd * moved / min(len(weight), self._travel.measured))
+        """Count a step (m) with the samples' weights (n,); returns the weight of each for their density, at most 1."""
+        thinned = min(1.0, self._full_density * moved / min(len(weight), self._travel.measured))
         kept = math.exp(-moved / self._memory)
         self._doubtful = kept * self._doubtful + np.count_nonzero(weight < 1.0)
         self._spread.fade(kept)
-        self._spread.add(np.array([p.touch.point for p in self._pending]), crowd * weight)
-        return crowd
-
-    def _drop_agreeing(self, squares: Floats) -> None:
-        """Forget the pending samples up to the last that still agrees with the surface before a change."""
-        agree = np.flatnonzero(squares[:-1] <= CHI2_99 * self._change.usual)
-        for _ in range(int(agree[-1]) + 1 if len(agree) else 0):
-            self._pending.popleft()
+        self._spread.add(np.array([p.touch.point for p in self._pending]), thinned * weight)
+        return thinned

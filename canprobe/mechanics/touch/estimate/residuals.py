@@ -17,13 +17,13 @@ from canprobe.mechanics.types import Floats
 
 
 class Design(NamedTuple):
-    """What does not change from one iteration to the next.
+    """The samples of a fit in its working frame: what does not change from one iteration to the next.
 
     Attributes:
         X: (n, 3) points in the working frame.
         T: (n, 2, 3) tangent axes of the measured normals.
-        noise: of the samples.
-        point_variance, normal_variance: (n,) the noise per axis.
+        noise: noise of the samples.
+        point_variance, normal_variance: (n,) variances of the noise per axis.
     """
 
     X: Floats
@@ -34,7 +34,7 @@ class Design(NamedTuple):
 
 
 def design(points: Floats, normals: Floats, noise: Noise) -> Design:
-    """Constant parts for points and outward normals (n, 3) in the working frame."""
+    """The design of points and outward normals (n, 3) in the working frame."""
     return Design(points, tangents(normals), noise, noise.point_variance, noise.normal_variance)
 
 
@@ -54,7 +54,8 @@ def tangents(normals: Floats) -> Floats:
 def linear_rows(d: Design) -> tuple[Floats, Floats]:
     """Whitened linear equations (3n, 9), (3n,): f = 0 and t·∇f = 0, as if |∇f| were 1 everywhere.
 
-    The second multiplies the normals' noise into the regressor and shrinks K by some percent: a start, no answer.
+    They are a start and not an answer: the second multiplies the normals' noise into the regressor, which shrinks K by
+    some percent.
     """
     w_p = 1.0 / np.sqrt(d.point_variance)
     w_n = 1.0 / np.sqrt(d.normal_variance + d.noise.coupling**2 * d.point_variance)
@@ -65,19 +66,19 @@ def linear_rows(d: Design) -> tuple[Floats, Floats]:
 
 
 class LinearisedResiduals(NamedTuple):
-    """The model at the likely places of samples.
+    """The model, linearised at the likely places of samples.
 
-    The model's normal is compared at the foot of the measured point, and the Jacobian is taken where the sample most
-    likely was (foot moved by the part of the residual that the point's tangential noise explains). At the measured
-    point itself its noise would enter the regressors together with the residuals, which draws K towards 0.
+    The model's normal is compared at the foot of the measured point. The Jacobian is taken where the sample most likely
+    was: the foot, moved by the part of the residual that the point's tangential noise explains. Why not at the measured
+    point: its noise would enter the regressors together with the residuals, which draws K towards 0.
 
     Attributes:
         r: (n, 3) whitened residuals.
-        X: (n, 3) likely places.
-        V: (n, 3, 3) rows: the model's unit normal and the tangent axes of the measured one.
+        X: (n, 3) likely places of the samples.
+        V: (n, 3, 3) rows: the model's unit normal and the tangent axes of the measured normal.
         bend: (n, 3, 2) change of the model's normal along the tangent axes when its foot moves along V.
-        inverse: (n,) 1/|∇f|.
-        W: (n, 3, 3) whitener.
+        inverse: (n,) inverse of |∇f|.
+        W: (n, 3, 3) whitener of the residuals.
     """
 
     r: Floats
@@ -105,7 +106,7 @@ class LinearisedResiduals(NamedTuple):
 
 
 def linearise(c: Floats, d: Design) -> LinearisedResiduals:
-    """The model at parameters (9,) with samples."""
+    """The model at parameters (9,), linearised for the samples of a design."""
     S = matrix_of(c)
     B, h = 2.0 * S[:3, :3], 2.0 * S[:3, 3]
     g = d.X.dot(B) + h
@@ -120,10 +121,10 @@ def linearise(c: Floats, d: Design) -> LinearisedResiduals:
     V[:, 0], V[:, 1:] = g * inverse[:, None], d.T
     r[:, 1:] = (d.T @ V[:, 0, :, None])[:, :, 0]
     bend = V.reshape(-1, 3).dot(B).reshape(V.shape) @ d.T.mT * inverse[:, None, None]
-    felt = bend[:, 1:] + d.noise.coupling * np.eye(2)  # turn against the surface that an error of the point is felt as
-    W = _whitener(felt, V[:, 0], d)
+    turn = bend[:, 1:] + d.noise.coupling * np.eye(2)  # turn of the normal against the surface by an error of the point
+    W = _whitener(turn, V[:, 0], d)
     r = (W @ r[:, :, None])[:, :, 0]
-    X = _likely_places(d, X, (r[:, None] @ W)[:, 0], felt, V[:, 0])
+    X = _likely_places(d, X, (r[:, None] @ W)[:, 0], turn, V[:, 0])
     g = X.dot(B) + h
     inverse = 1.0 / np.sqrt(np.einsum("ij,ij->i", g, g))
     V[:, 0] = g * inverse[:, None]

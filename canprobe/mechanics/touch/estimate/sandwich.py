@@ -1,7 +1,7 @@
-"""What the noise of weighted and forgotten rows does to an answer: the middle of the sandwich covariance.
+"""The middle of the sandwich covariance: how noise gets through weighted and forgotten rows into an answer.
 
-An answer `c = A⁻¹ Jᵀ W e` has the covariance `A⁻¹ (Jᵀ W R W J) A⁻¹`, not `A⁻¹`: forgetting weighs rows without making
-them noisier, so weights enter squared, and correlated rows add what they share.
+An answer `c = A⁻¹ Jᵀ W e` has the covariance `A⁻¹ (Jᵀ W R W J) A⁻¹`. Why not `A⁻¹`, as for plain least squares:
+forgetting weighs rows without making them noisier, so weights enter squared, and correlated rows add what they share.
 
 Source: Huber, "The behavior of maximum likelihood estimates under nonstandard conditions", 1967; White 1980.
 """
@@ -20,8 +20,8 @@ class Score:
     """Covariance `matrix` (k, k) of the score `Jᵀ W e` of a filter that forgets along the path.
 
     Args:
-        prior: (k, k) information of what is always known about the k parameters.
-        correlation: of the rows along the path; None for independent samples.
+        prior: (k, k) information of the prior about the k parameters.
+        correlation: correlation of the rows along the path; None for independent samples.
     """
 
     def __init__(self, prior: Floats, correlation: Correlation | None) -> None:
@@ -31,12 +31,12 @@ class Score:
         self.reset()
 
     def reset(self) -> None:
-        """Only the prior is left."""
+        """Forget all rows; the prior stays."""
         self.matrix = self._prior.copy()
         self._recent = np.zeros((3, len(self.matrix)))
 
     def start(self, J: Floats, travelled: float) -> None:
-        """Take a batch's whitened rows (n, 3, k), evenly spread over a path (m), which all count in full."""
+        """Take a batch's whitened rows (n, 3, k), evenly spread over a path (m), all in full."""
         self.reset()
         k = len(self.matrix)
         rows = J.reshape(-1, k)
@@ -49,19 +49,23 @@ class Score:
         self._recent = self._shares * (fades @ J.reshape(-1, 3 * k)).reshape(3, k)
 
     def take(self, J: Floats, moved: float, kept: float, known: float) -> None:
-        """Take new whitened rows (3n, k) over a step (m) of the path, which leaves `kept` of the information.
+        """Take new whitened rows (3n, k) of a step of the path.
 
-        `known` is what of the prior is put back into the matrix, over the whole prior.
+        Args:
+            J: the rows.
+            moved: length of the step, m.
+            kept: share of the earlier information that the step leaves.
+            known: share of the prior that is put back into the matrix.
         """
         self.matrix = kept**2 * self.matrix + known * self._prior + self._added(J, moved, kept)
 
     def carry(self, back: Floats) -> None:
-        """Go over to other parameters; back (k, k) is d(old)/d(new)."""
+        """Change to other parameters; back (k, k) is d(old)/d(new)."""
         self.matrix = back.T.dot(self.matrix).dot(back)
         self._recent = self._recent.dot(back)
 
     def _added(self, J: Floats, moved: float, kept: float) -> Floats:
-        """What new rows add: with each other, and with earlier ones that they resemble."""
+        """(k, k) that new rows add: by themselves, and with earlier rows with which they are correlated."""
         if self._correlation is None:
             return np.asarray(J.T.dot(J), dtype=np.float64)
         n, k = len(J) // 3, J.shape[1]

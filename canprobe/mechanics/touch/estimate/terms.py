@@ -1,9 +1,9 @@
 """The eighteen terms of f: nine of the quadric, and the cubic and quartic ones that it leaves out.
 
-The latter are terms `Σ a_j φ_j(x, y)` of the height over the tangent plane, φ all monomials of third and fourth
-degree, each times the root of its binomial coefficient, so that independent a of one variance mean the same in all
-directions. All terms are polynomials of the place, so values, gradients and changes of the origin are each one
-product of a constant matrix with the place's monomials.
+The latter are terms `Σ a_j φ_j(x, y)` of the height over the tangent plane. φ are all monomials of third and fourth
+degree, each times the root of its binomial coefficient: then independent a of one variance have the same distribution
+in axes that are turned. All terms are polynomials of the place, so values, gradients and changes of the origin are each
+one product of a constant matrix with the place's monomials.
 """
 
 from __future__ import annotations
@@ -18,11 +18,14 @@ from canprobe.mechanics.types import Floats
 _POWER_Y = (0, 1, 2, 3, 0, 1, 2, 3, 4)
 DEGREE = np.array([3, 3, 3, 3, 4, 4, 4, 4, 4])
 """(9,) degree of each term that a quadric leaves out."""
-_FACTOR = [math.sqrt(math.comb(int(n), k)) for n, k in zip(DEGREE, _POWER_Y, strict=True)]
+_HIGHER_FACTOR = [math.sqrt(math.comb(int(n), k)) for n, k in zip(DEGREE, _POWER_Y, strict=True)]
+"""Root of the binomial coefficient of each of them."""
 _HIGHER = [(int(n) - k, k, 0) for n, k in zip(DEGREE, _POWER_Y, strict=True)]
+"""Powers of x, y, z in each of them."""
 _QUADRIC = [(1, 0, 0), (0, 1, 0), (0, 0, 0), (1, 0, 1), (0, 1, 1), (0, 0, 2), (2, 0, 0), (1, 1, 0), (0, 2, 0)]
 """Powers of x, y, z in the terms of the nine parameters, in their order."""
-_OWN = [2.0, 2.0, 1.0, 2.0, 2.0, 1.0, 1.0, 2.0, 1.0]
+_QUADRIC_FACTOR = [2.0, 2.0, 1.0, 2.0, 2.0, 1.0, 1.0, 2.0, 1.0]
+"""Factors of these terms: an entry off the diagonal of S stands in it twice."""
 _POWERS = [
     (0, 0, 0),
     (1, 0, 0),
@@ -48,7 +51,7 @@ def _monomials(x: Any, y: Any, z: Any) -> Floats:
 def _derivatives() -> Floats:
     """(19, 4, 18): values and derivatives by x, y, z of the 18 terms, per monomial."""
     found = np.zeros((len(_POWERS), 4, 18))
-    for column, (powers, factor) in enumerate(zip(_QUADRIC + _HIGHER, _OWN + _FACTOR, strict=True)):
+    for column, (powers, factor) in enumerate(zip(_QUADRIC + _HIGHER, _QUADRIC_FACTOR + _HIGHER_FACTOR, strict=True)):
         found[_POWERS.index(powers), 0, column] = factor
         for axis in range(3):
             i, k, n = np.array(powers) - np.eye(3, dtype=int)[axis]
@@ -60,9 +63,11 @@ def _derivatives() -> Floats:
 def _shift() -> Floats:
     """(19, 162): A and Q of `shifted`, per monomial of the new place."""
     found = np.zeros((len(_POWERS), 18, 9))
-    own = {powers: (row, factor) for row, (powers, factor) in enumerate(zip(_HIGHER, _FACTOR, strict=True))}
-    low = {powers: (9 + row, factor) for row, (powers, factor) in enumerate(zip(_QUADRIC, _OWN, strict=True))}
-    for column, ((i, k, _), factor) in enumerate(zip(_HIGHER, _FACTOR, strict=True)):
+    own = {powers: (row, factor) for row, (powers, factor) in enumerate(zip(_HIGHER, _HIGHER_FACTOR, strict=True))}
+    low = {
+        powers: (9 + row, factor) for row, (powers, factor) in enumerate(zip(_QUADRIC, _QUADRIC_FACTOR, strict=True))
+    }
+    for column, ((i, k, _), factor) in enumerate(zip(_HIGHER, _HIGHER_FACTOR, strict=True)):
         for a in range(i + 1):
             for b in range(k + 1):
                 row, per = (own if a + b > 2 else low)[a, b, 0]
@@ -71,13 +76,16 @@ def _shift() -> Floats:
     return found.reshape(len(_POWERS), -1)
 
 
-_SHIFT = _shift()
-_TABLE = {count: _derivatives()[:, :, :count].reshape(len(_POWERS), -1) for count in (9, 18)}
+_SHIFT_TABLE = _shift()
+_DERIVATIVE_TABLES = {count: _derivatives()[:, :, :count].reshape(len(_POWERS), -1) for count in (9, 18)}
 
 
 def terms(X: Floats, count: int = 18) -> Floats:
-    """Values and derivatives by x, y, z (n, 4, count) of the first terms of f, the quadric's nine first, at (n, 3)."""
-    values: Floats = _monomials(*X.T).T.dot(_TABLE[count]).reshape(len(X), 4, count)
+    """Values and derivatives by x, y, z (n, 4, count) of the first `count` terms of f at places (n, 3).
+
+    The quadric's nine terms come first; `count` is 9 or 18.
+    """
+    values: Floats = _monomials(*X.T).T.dot(_DERIVATIVE_TABLES[count]).reshape(len(X), 4, count)
     return values
 
 
@@ -87,5 +95,5 @@ def shifted(x: float, y: float) -> tuple[Floats, Floats]:
     Returns:
         A (9, 9) and Q (9, 9): terms a become terms `A a` there, and `Q a` more in the nine parameters.
     """
-    both = _monomials(x, y, 0.0).dot(_SHIFT).reshape(18, 9)
+    both = _monomials(x, y, 0.0).dot(_SHIFT_TABLE).reshape(18, 9)
     return both[:9], both[9:]

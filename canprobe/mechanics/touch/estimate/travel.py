@@ -1,4 +1,4 @@
-"""How far a contact has moved, beyond its noise, and how its places spread."""
+"""How far a contact has moved beyond its noise, and how its places spread."""
 
 from __future__ import annotations
 
@@ -9,24 +9,25 @@ import numpy as np
 
 from canprobe.mechanics.types import Floats
 
-_MEDIAN_OF, _MEAN_OF = 5, 8
-_FAR2, _SLOWLY = 16.0, 0.05
-"""Squared distance from the median, over the usual, that is no jump; and the share of one point in the usual."""
+_MEDIAN_POINTS, _MEAN_POINTS = 5, 8
+_MAX_SQUARE_RATIO, _USUAL_UPDATE_SHARE = 16.0, 0.05
+"""Largest squared distance from the median, over the usual one, at full weight; share of one point in the usual one."""
 
 
 class Travel:
     """Path of a noisy point: its running mean over some samples, taken in steps well above the noise.
 
-    A point that stands still never makes a step, however long it stands; nor do single wrong points among the right
-    ones, for the mean is one of medians.
+    Why not the sum of distances between samples: noise alone would add up to a path, and a filter that forgets along
+    the path would forget at rest. A point that stands still never makes a step here, however long it stands. Nor does a
+    single wrong point among right ones, as the mean is taken of medians.
 
     Args:
         step: least distance that counts, m; some standard deviations of the point.
 
     Attributes:
         total: path so far, m.
-        weight: of the last point: below 1 where it lies several times further from the median than points usually do.
-        measured: points over which the path was measured so far; the first ones, before there is a mean, are not.
+        weight: weight of the last point, below 1 where it lies several times further from the median than usual.
+        measured: number of points over which the path was measured; those before the first mean do not count.
     """
 
     def __init__(self, step: float) -> None:
@@ -35,22 +36,22 @@ class Travel:
         self.measured = 0
         self._usual2 = 0.0
         self._step2 = step * step
-        self._last: deque[list[float]] = deque(maxlen=_MEDIAN_OF)
+        self._last: deque[list[float]] = deque(maxlen=_MEDIAN_POINTS)
         self._mean = self._mark = (0.0, 0.0, 0.0)
         self._count = 0
 
     def add(self, point: Floats) -> float:
-        """Take a point (3,), m; the length of the step that it completes, or 0."""
+        """Take a point (3,), m; returns the length of the step that it completes, m, or 0."""
         px, py, pz = here = point.tolist()
         self._last.append(here)
         middle = len(self._last) // 2
         a, b, c = [sorted(axis)[middle] for axis in zip(*self._last, strict=True)]
         self._weigh((px - a) ** 2 + (py - b) ** 2 + (pz - c) ** 2)
-        self._count = min(self._count + 1, _MEAN_OF)
+        self._count = min(self._count + 1, _MEAN_POINTS)
         share = 1.0 / self._count
         x, y, z = self._mean
         self._mean = x, y, z = x + share * (a - x), y + share * (b - y), z + share * (c - z)
-        if self._count < _MEAN_OF:
+        if self._count < _MEAN_POINTS:
             self._mark = self._mean
             return 0.0
         self.measured += 1
@@ -64,11 +65,11 @@ class Travel:
         return length
 
     def _weigh(self, square: float) -> None:
-        """A contact does not jump from frame to frame; one that does is not believed, however little is known there."""
-        limit = max(_FAR2 * self._usual2, self._step2)
+        """Weigh a point by its squared distance from the median: a contact does not jump from one frame to the next."""
+        limit = max(_MAX_SQUARE_RATIO * self._usual2, self._step2)
         ratio = limit / max(square, limit)
         self.weight = ratio * ratio
-        self._usual2 += _SLOWLY * (min(square, limit) - self._usual2)
+        self._usual2 += _USUAL_UPDATE_SHARE * (min(square, limit) - self._usual2)
 
 
 class Spread:
@@ -85,7 +86,7 @@ class Spread:
 
     @property
     def covariance(self) -> Floats:
-        """(3, 3), m²."""
+        """(3, 3) covariance of the points, m²."""
         M = self._moments / max(self.weight, 1e-300)
         mean = M[:3, 3]
         result: Floats = M[:3, :3] - mean[:, None] * mean

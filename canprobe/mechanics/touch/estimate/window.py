@@ -15,7 +15,7 @@ import numpy as np
 
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
-from canprobe.mechanics.touch.estimate.change import LAST_FEW, MAX_AGREEING_RESIDUAL, looks_changed
+from canprobe.mechanics.touch.estimate.change import LAST_SAMPLES, MAX_AGREEING_RESIDUAL, looks_changed
 from canprobe.mechanics.touch.estimate.differences import chord_pairs, solve_pairs
 from canprobe.mechanics.touch.estimate.likelihood import ContactBatch, fit_ml, make_touches
 from canprobe.mechanics.touch.estimate.noise import Correlation, make_noise
@@ -29,15 +29,16 @@ class WindowEstimator:
     """Base of the estimators that keep their last samples and solve them as a batch when asked.
 
     Args:
-        sigma_point, sigma_normal: effective noise, m and rad; with differences they only enter covariance and flags.
-        window: samples that are kept.
-        prior: of `ml`; None for `Prior.weak` over the extent of the window.
-        coupling: of the errors of point and normal (`Noise`), 1/m; of `ml`.
-        correlation: of the noise along the path; of `ml`.
+        sigma_point, sigma_normal: effective standard deviations of points and normals, m and rad; the methods of
+            differences use them for covariance and flags only.
+        window: number of samples that are kept.
+        prior: prior of `ml`; None for `Prior.weak` over the extent of the window.
+        coupling: coupling of the errors of point and normal (`Noise`) for `ml`, 1/m.
+        correlation: correlation of the noise along the path, for `ml`.
     """
 
     least = 2
-    """Fewer samples give no answer."""
+    """Least number of samples that give an answer."""
 
     def __init__(
         self,
@@ -81,7 +82,7 @@ class WindowEstimator:
         raise NotImplementedError
 
     def _row(self, sample: ContactSample) -> Sequence[float]:
-        """What is kept of a sample: point, normal, their standard deviations; a subclass adds what it needs."""
+        """The row that is kept of a sample: point, normal, their standard deviations; a subclass adds what it needs."""
         return (*sample.p_base.tolist(), *sample.n_base.tolist(), *self._gate.sigmas(sample))
 
     def _touches(self) -> ContactBatch:
@@ -91,19 +92,19 @@ class WindowEstimator:
 
 
 class MlEstimator(WindowEstimator):
-    """Nine-parameter Gauss–Newton over a window (`nonlinear`): the reference, some milliseconds an answer.
+    """Nine-parameter Gauss–Newton over a window (`likelihood`): the reference, some milliseconds an answer.
 
-    A window over a change of the surface has no quadric, and its last samples would be taken for wrong ones. So they
-    are held against the fit first; where they disagree as a changed surface does, what was before is forgotten.
+    No quadric describes a window over a change of the surface, and its last samples would be taken for outliers. So
+    they are compared with the fit first; where they disagree as after a change, earlier samples are forgotten.
     """
 
     def _solve(self, touches: ContactBatch) -> SurfaceEstimate:
         answer = fit_ml(touches, self._prior)
         squares = _squared_residuals(answer, touches)
-        if len(squares) < 3 * LAST_FEW or answer.rank < 3 or not looks_changed(squares):
+        if len(squares) < 3 * LAST_SAMPLES or answer.rank < 3 or not looks_changed(squares):
             return answer
         agree = np.flatnonzero(squares <= MAX_AGREEING_RESIDUAL * float(np.median(squares)))
-        for _ in range(min(int(agree[-1]) + 1, len(squares) - LAST_FEW)):
+        for _ in range(min(int(agree[-1]) + 1, len(squares) - LAST_SAMPLES)):
             self._rows.popleft()
         answer = fit_ml(self._touches(), self._prior)
         return replace(answer, notes=(*answer.notes, "the surface changed: memory shortened"))
@@ -116,8 +117,8 @@ def _squared_residuals(answer: SurfaceEstimate, touches: ContactBatch) -> Floats
     size = np.sqrt(np.einsum("ij,ij->i", gradient, gradient))
     tilt = gradient / size[:, None] - touches.normals @ answer.T_frame_contact[:3, :3]
     point = touches.noise.point_variance
-    felt = np.abs(answer.kappa).max() + touches.noise.coupling
-    normal = touches.noise.normal_variance + felt**2 * point
+    turn = np.abs(answer.kappa).max() + touches.noise.coupling
+    normal = touches.noise.normal_variance + turn**2 * point
     result: Floats = (answer.surface.value(places) / size) ** 2 / point + np.einsum("ij,ij->i", tilt, tilt) / normal
     return result
 

@@ -1,8 +1,8 @@
-"""What is known of one tactile array.
+"""The calibration of one tactile array.
 
 `canprobe calibrate array` finds it by touching a plane and a ball (`calibrate`), and writes it to a file. Images alone
 do not show newtons: stiffness, full scale and mean gain times 1.3 give identical images and 1.3 times the force. So a
-calibration names its force reference; without one forces and stiffness are in nominal newtons.
+calibration names its force reference; without one, forces and stiffness are in nominal newtons.
 """
 
 from __future__ import annotations
@@ -19,14 +19,17 @@ NO_FORCE_REFERENCE = "nominal newtons: no force reference"
 
 @dataclass(frozen=True, slots=True)
 class ImageParameters:
-    """What makes the images of an array, found by touching known things (`calibrate`).
+    """Parameters of an array's image model, found by touching known objects (`calibrate`).
 
     Attributes:
-        stiffness: K/h of the layer, N/m³.
+        stiffness: stiffness K/h of the layer, N/m³.
         scale: pressure that the array shows over the true one.
-        blur: standard deviation of cover and taxel together, m.
+        blur: standard deviation of the blur by cover and taxel together, m.
         crosstalk: share of a taxel's signal that spreads over its row, and again over its column.
-        memory: share of the patch's past ways on the pad (`PadMemory`) in the moments.
+        memory: share of the patch's earlier places on the pad (`PadMemory`) in the moments.
+
+    Raises:
+        UsageError: stiffness, scale or blur is not above 0.
     """
 
     stiffness: float
@@ -46,10 +49,11 @@ class MomentErrors:
     """Relative errors of second moments.
 
     Attributes:
-        moment: variance along a principal axis that no averaging removes (gains, hysteresis, creep, the model's form).
-        both: covariance of those along the two axes.
+        moment: variance of a moment along a principal axis that no averaging removes (gains, hysteresis, creep, form of
+            the model).
+        both: covariance of the errors along the two axes.
         shear: variance of V_12 over √(V_1 V_2).
-        frame_sigma: standard deviation from one frame to the next.
+        frame_sigma: standard deviation of a moment from one frame to the next.
     """
 
     moment: float
@@ -60,12 +64,12 @@ class MomentErrors:
 
 @dataclass(frozen=True, slots=True)
 class Lag:
-    """How far the centroid trails the contact, as a calibration found it.
+    """Lag of the centroid behind the contact, as a calibration found it; the model is that of `pad_lag`.
 
     Attributes:
-        most: largest distance, m.
-        reach: way at which it is half of that, m.
-        quick_s, slow_s: time constants of the places, s.
+        most: largest lag, m.
+        reach: way at which the lag is half of that, m.
+        quick_s, slow_s: time constants of the mean places between which the way is taken, s.
     """
 
     most: float
@@ -76,14 +80,15 @@ class Lag:
 
 @dataclass(frozen=True, slots=True)
 class CentroidErrors:
-    """How well an image shows the place of the contact.
+    """Errors of the centroid as the place of the contact.
 
     Attributes:
-        scale, power: the standard deviation is `scale · t^power`, m, with t the level over the peak pressure.
-        correlation: way over the pad along which a part of the errors is alike, m.
-        share: of the variance that this part has.
-        latency_s, latency_sigma_s: by which an image is older than its time stamp says, and its standard deviation.
-        lag: by which the centroid trails the contact, whatever the speed.
+        scale, power: parameters of the standard deviation `scale · t^power`, m, with t the level over the peak
+            pressure.
+        correlation: correlation length of a part of the errors along the way over the pad, m.
+        share: share of this part in the variance.
+        latency_s, latency_sigma_s: age of an image at its time stamp, and the standard deviation of this age, s.
+        lag: lag of the centroid behind the contact, which does not depend on the speed.
     """
 
     scale: float
@@ -101,9 +106,12 @@ class CentroidErrors:
 
 @dataclass(frozen=True, slots=True)
 class StiffnessSources:
-    """Stiffness of the layer (K/h, N/m³) from the images, and from the arm's way into the object; each with its 1σ.
+    """Stiffness K/h of the layer from two sources, each with its standard deviation.
 
-    The arm's way holds its own compliance too.
+    Attributes:
+        moments, moments_sigma: stiffness from the moments of images, N/m³.
+        depth, depth_sigma: stiffness from the arm's way into the object, N/m³; the arm's compliance makes it smaller.
+        arm_compliance, arm_compliance_sigma: compliance of arm and mount, from the difference of both, m/N.
     """
 
     moments: float
@@ -111,13 +119,20 @@ class StiffnessSources:
     depth: float
     depth_sigma: float
     arm_compliance: float
-    """m/N: of what the probe stands on, from the difference of both."""
     arm_compliance_sigma: float
 
 
 @dataclass(frozen=True, slots=True)
 class Residuals:
-    """RMS errors relative to the truth, or to (K + 1/R_p): of touches that the fit has not seen, and of the rod."""
+    """RMS errors of touches that the fit has not seen, relative to the truth.
+
+    Attributes:
+        touches: number of touches.
+        force: error of the force.
+        moments: error of second moments.
+        curvature: error of curvature relative to (κ + 1/R_p).
+        rod_curvature: error of the curvature across the rod, relative to the same.
+    """
 
     touches: int
     force: float
@@ -128,22 +143,22 @@ class Residuals:
 
 @dataclass(frozen=True, slots=True)
 class ArrayCalibration:
-    """Of one array.
+    """The calibration of one array.
 
     Attributes:
-        array: which one: name and serial number.
-        date: ISO 8601.
-        made_on: cell, objects, and what moved.
-        force_reference: what newtons rest on.
+        array: name and serial number of the array.
+        date: date in ISO 8601.
+        made_on: cell and objects on which it was made, and what moved.
+        force_reference: the reference of newtons.
         force_sigma: relative standard deviation of that reference; NaN for "none".
-        full_scale: at which it was made, Pa.
-        image: the image model's parameters.
+        full_scale: pressure of a full count at which it was made, Pa.
+        image: parameters of the image model.
         moments: errors of second moments.
         centroid: errors of the centroid.
-        stiffness: from both sources.
+        stiffness: stiffness of the layer from both sources.
         residuals: held-out errors.
-        gains: (rows, columns) of the taxels over their mean; empty where they were not found or are not used.
-        dead: (row, column) of taxels that read nothing under a patch.
+        gains: (rows, columns) gains of the taxels over their mean; empty where they were not found or are not used.
+        dead: (row, column) of each taxel that reads nothing under a patch.
     """
 
     array: str
@@ -162,16 +177,16 @@ class ArrayCalibration:
 
     @property
     def nominal(self) -> bool:
-        """Newtons rest on nothing but the stated full scale."""
+        """Whether newtons rest on nothing but the stated full scale."""
         return self.force_reference == "none"
 
     @property
     def newtons(self) -> str:
-        """What a newton of this array is, in words."""
+        """The reference of newtons, in words."""
         if self.nominal:
             return NO_FORCE_REFERENCE
         return f"newtons by {self.force_reference} (1σ {100.0 * self.force_sigma:.1f} %)"
 
     def with_stiffness(self, stiffness: float) -> ArrayCalibration:
-        """The same with another layer, K/h in N/m³."""
+        """The same calibration with another stiffness K/h of the layer, N/m³."""
         return replace(self, image=replace(self.image, stiffness=stiffness))

@@ -17,10 +17,11 @@ saddle."""
 
 
 def make_patch_calibration(calibration: ArrayCalibration, pad: Pad) -> PatchCalibration:
-    """From counts to force, for an array of these taxels; without a sphere or a grid the force is that of the pressure.
+    """From counts to force, for an array of these taxels.
 
-    At another full scale than that of the calibration level, threshold and noise are the same counts of another
-    pressure, and layer, blur, crosstalk and scale stay.
+    On a flat array or a list of taxels, which have no image model, the force is the plain sum of pressure times area
+    over the scale. At another full scale than that of the calibration, level, threshold and noise are the same counts
+    of another pressure; layer, blur, crosstalk and scale stay.
     """
     if pad.is_flat or not pad.is_grid:
         return PatchCalibration(pad, force_gain=1.0 / calibration.image.scale)
@@ -30,7 +31,7 @@ def make_patch_calibration(calibration: ArrayCalibration, pad: Pad) -> PatchCali
 
 
 def make_image_model(calibration: ArrayCalibration, patch: PatchCalibration, *, seen: int | None) -> ImageModel:
-    """What an array shows; `seen`: taxels along the side of the window, None for all."""
+    """The image model of an array; `seen` is the number of taxels along the side of the window, None for all."""
     count, side = patch.full_scale_pa / COUNTS_MAX, max(patch.pad.shape)
     return ImageModel(
         calibration.image,

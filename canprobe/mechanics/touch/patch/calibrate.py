@@ -1,7 +1,8 @@
 """Calibrate an array by touches of a plane and a ball that were rolled to and fro; a rod verifies.
 
-`image_fit` finds the parameters of the image model, `pad_fit` how centroids err, gains of taxels, and the stiffness by
-the arm's way into the object. Errors are held out: each fifth of the touches is predicted by a fit to the others.
+`parameter_fit` finds the parameters of the image model, `pad_fit` the errors of centroids, `taxel_gains` the gains of
+taxels, and `layer_fit` the stiffness by the arm's way into the object. Errors are held out: each fifth of the touches
+is predicted by a fit to the others.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from canprobe.mechanics.touch.patch.array_calibration import (
 )
 from canprobe.mechanics.touch.patch.array_models import make_image_model, make_patch_calibration
 from canprobe.mechanics.touch.patch.image import PatchCalibration
-from canprobe.mechanics.touch.patch.image_fit import AGE_S, NO_ERRORS, Dwell, Shown, what_is_shown
+from canprobe.mechanics.touch.patch.image_fit import LAST_IMAGE_S, NO_ERRORS, Dwell, Shown, what_is_shown
 from canprobe.mechanics.touch.patch.image_model import USUAL_LIGHTNESS
 from canprobe.mechanics.touch.patch.layer_fit import stiffness_by_depth
 from canprobe.mechanics.touch.patch.pad_fit import fit_centroids
@@ -41,27 +42,31 @@ from canprobe.mechanics.touch.patch.taxel_gains import taxel_gains
 from canprobe.mechanics.types import Floats
 
 FORM_SIGMA = 0.01
-"""Relative error of a moment that planes and balls do not show: of cylinders and saddles, by the model's form."""
+"""Relative error of a moment on cylinders and saddles by the form of the model, which planes and balls do not show."""
 FOLDS = 5
+"""Number of parts of the touches, each of which is held out once."""
 MIN_TOUCHES = 10
+"""Least number of touches of plane and ball."""
 MAX_ERROR_LEFT_SHARE = 0.9
-"""Share of the moments' error that may be left with gains of the taxels, for these to be used."""
+"""Largest error of moments with gains of the taxels, over the error without, at which the gains are used."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArrayFit:
-    """A calibration, and what people want to see of it.
+    """A calibration, with the data for its report.
 
     Attributes:
         calibration: the result.
-        dwells, shown, forces: the touches that were used, and their forces by it, N.
+        dwells, shown: the touches that were used.
+        forces: (n,) their forces by the calibration, N.
         errors: (n, 3) relative errors of moments of each touch by a fit that has not seen it.
-        curvature_errors: (n, 2) the same of the curvatures, relative to (κ + 1/R_p).
-        scatter: (n,) of the centroids of each touch, m.
-        left_out: touches that saturated or ran off the pad.
-        gains: (16, 16) of the taxels; with them moments err by `gained`, without by `plain` (RMS, relative).
-        offset, object_offset: (2,) of centroids that turns with the probe, and that stays with the object, m; NaN
-            without turned touches.
+        curvature_errors: (n, 2) errors of curvatures by that fit, relative to (κ + 1/R_p).
+        scatter: (n,) scatter of the centroids of each touch, m.
+        left_out: number of touches that saturated or ran off the pad.
+        gains: (16, 16) gains of the taxels.
+        gained, plain: relative RMS error of moments with these gains, and without.
+        offset, object_offset: (2,) offset of centroids that turns with the probe, and offset that stays with the
+            object, m; NaN without turned touches.
     """
 
     calibration: ArrayCalibration
@@ -90,23 +95,24 @@ def calibrate_array(
     made_on: str,
     own_gains: bool = True,
 ) -> ArrayFit:
-    """Everything that touches of known things say about an array.
+    """Calibrate an array by touches of known objects.
 
     Args:
         dwells: touches of plane and ball, at more than one force and place; those of a rod only verify.
-        pad: its taxels, and the stated pressure of a full count.
-        reference: what newtons rest on. "scale" and "weights" need touches with a force; "unit" trusts the full scale.
-        reference_sigma: its relative standard deviation.
-        array, date, made_on: for the file.
-        own_gains: use taxel gains where they help: the file is of this array, not of its make.
+        pad: taxels of the array, and the stated pressure of a full count.
+        reference: reference of newtons. "scale" and "weights" need touches with a force; "unit" relies on the stated
+            full scale.
+        reference_sigma: relative standard deviation of the reference.
+        array, date, made_on: entries of the file.
+        own_gains: whether taxel gains are used where they help; False where the file is for all arrays of a make.
 
     Raises:
-        UsageError: too few touches, or no force where the reference is one.
+        UsageError: there are too few touches, or none has a force where the reference is one.
     """
     by_force = reference in ("scale", "weights")
     dwells = dwells if by_force else [replace(d, force=None) for d in dwells]
     plain = PatchCalibration(pad)
-    every = [(d, what_is_shown(d, plain, AGE_S)) for d in dwells]
+    every = [(d, what_is_shown(d, plain, LAST_IMAGE_S)) for d in dwells]
     used = {id(d) for d, s in every if s.usable}
     count = sum(s.usable and d.name != "rod" for d, s in every)
     if count < MIN_TOUCHES or len({d.name for d, s in every if s.usable and d.name != "rod"}) < 2:
@@ -135,7 +141,7 @@ def calibrate_array(
     own = plain
     if own_gains and gained < MAX_ERROR_LEFT_SHARE * alike:
         own = replace(plain, gains=tuple(tuple(row) for row in np.round(gains, 4).tolist()))
-        good = [(d, what_is_shown(d, own, AGE_S)) for d, _ in good]
+        good = [(d, what_is_shown(d, own, LAST_IMAGE_S)) for d, _ in good]
         fitted = [(d, s) for d, s in good if d.name != "rod"]
         first, found = fit(fitted, own)
     errors, curvatures, force_errors = _held_out(fitted, lambda pairs: fit(pairs, own)[0], own, seen)
@@ -227,7 +233,7 @@ def _held_out(
 
 
 def _moment_errors(errors: Floats, shown: Sequence[Shown]) -> MomentErrors:
-    """What is left of touches that the fit had not seen, and of shapes that nobody touched."""
+    """Errors of moments from touches that the fit has not seen, with `FORM_SIGMA` for shapes that were not touched."""
     scaled = errors * np.sqrt(USUAL_LIGHTNESS / np.array([s.lightness for s in shown]))[:, None]
     moment = float(np.mean(scaled[:, :2] ** 2)) + FORM_SIGMA**2
     return MomentErrors(
@@ -254,7 +260,7 @@ def _by_gains(pairs: Pairs, calibration: ArrayCalibration, plain: PatchCalibrati
     for half in (0, 1):
         gains = _gains(pairs[half::2], calibration, plain)[0]
         own = replace(plain, gains=tuple(tuple(row) for row in gains.tolist()))
-        check = [(d, what_is_shown(d, own, AGE_S)) for d, _ in pairs[1 - half :: 2]]
+        check = [(d, what_is_shown(d, own, LAST_IMAGE_S)) for d, _ in pairs[1 - half :: 2]]
         gained.append(_checked(calibration, check, plain, seen)[0][:, :2])
         alike.append(_checked(calibration, pairs[1 - half :: 2], plain, seen)[0][:, :2])
     return _rms(np.concatenate(gained)), _rms(np.concatenate(alike))
@@ -263,8 +269,7 @@ def _by_gains(pairs: Pairs, calibration: ArrayCalibration, plain: PatchCalibrati
 def _offsets(pairs: Pairs) -> tuple[Floats, Floats]:
     """(2,) offset of centroids that turns with the probe, and (2,) that stays with the object, m.
 
-    A gradient of the taxels' gains and an error of the tool turn with the probe; an object that does not stand where it
-    should be does not.
+    A gradient of the taxels' gains and an error of the tool turn with the probe; a wrong place of the object does not.
     """
     unknown = np.full(2, math.nan)
     mine, its = [], []

@@ -1,13 +1,13 @@
-"""What an array that creeps remembers of where the patch has been.
+"""Creep of an array: traces of earlier places of the patch in its images.
 
-A taxel's reading goes on growing under a constant load, by some percent a decade of time, and falls as slowly when
-the load is gone. So an image is the patch as it is, with a faint and blurred picture of where it was: the second
-moments of a patch that rolls over the pad are larger than those of one that rests, by a share of how far it has been
-away. The share is calibrated (`ImageParameters.memory`); with it images at rest and on the move say the same of the
-surface.
+A taxel's reading goes on growing under a constant load, by some percent a decade of time, and falls as slowly after the
+load is gone. So an image is that of the present patch with a faint and blurred trace of earlier ones: the second
+moments of a patch that rolls over the pad are larger than those of one at rest, by a share of its squared distance from
+earlier places. The share is calibrated (`ImageParameters.memory`); with it images at rest and in motion give the same
+curvature.
 
-Model: memories that fade exponentially, a decade apart, all of one strength. It stops being true where the patch has
-been further away than its own size.
+Model: traces that fade exponentially, with time constants a decade apart and of equal strength. It stops being true
+where the patch has been further away than its own size.
 
 Source: logarithmic creep as a sum of exponentials a decade apart: Findley, Lai and Onaran, "Creep and relaxation of
 nonlinear viscoelastic materials", ch. 5.
@@ -19,30 +19,31 @@ import math
 
 from canprobe.mechanics.touch.patch.moments import Moments
 
-TIMES_S = (0.3, 3.0, 30.0)
-"""Time constants of the memories."""
+TIME_CONSTANTS_S = (0.3, 3.0, 30.0)
+"""Time constants of the traces, s."""
 
 
 class PadMemory:
-    """Places of the patch on the pad since the contact began, as faded memories."""
+    """Fading traces of the places of the patch on the pad since the contact began."""
 
     def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
-        """Contact was lost."""
+        """Forget all places: contact was lost."""
         self._t_s: float | None = None
-        self._sums = [(0.0, 0.0, 0.0, 0.0, 0.0, 0.0) for _ in TIMES_S]  # of 1, u, v, uu, uv, vv
+        self._sums = [(0.0, 0.0, 0.0, 0.0, 0.0, 0.0) for _ in TIME_CONSTANTS_S]  # of 1, u, v, uu, uv, vv
 
     def add(self, t_s: float, u: float, v: float) -> Moments:
         """Take the centroid (m) of an image at a time (s).
 
-        Returns uu, uv, vv of the way from here to where the patch was, mean over what each memory holds, added up, m².
+        Returns:
+            Second moments uu, uv, vv of the earlier places about this one, summed over the traces, m².
         """
         dt = 0.0 if self._t_s is None else max(t_s - self._t_s, 0.0)
         self._t_s = t_s
         mass = su = sv = uu = uv = vv = 0.0
-        for k, tau in enumerate(TIMES_S):
+        for k, tau in enumerate(TIME_CONSTANTS_S):
             kept = math.exp(-dt / tau)
             new = 1.0 - kept
             m, a, b, aa, ab, bb = self._sums[k]

@@ -1,18 +1,18 @@
 """The contact patch as a second sensor: curvature from the second moments of tactile images, fused with the motion's.
 
 The moments are averaged over the last frames, in axes that follow the contact normal, and compared with a calibrated
-model of the sensor (`image_model`). What gains, hysteresis and blur do to them is common to all images of a contact:
-however many are averaged, the patch never knows more than the calibration's floor.
+model of the sensor (`image_model`). Errors by gains, hysteresis and blur are common to all images of a contact: however
+many images are averaged, the information never exceeds that of the calibration (`MomentErrors`).
 
-The fusion is that of measurements: the informations of motion and patch are added, each with its whole covariance, so
-the patch fades where a path excites all of K and speaks where it does not. The stiffness of the layer is a fourth
-unknown beside q: known from the scene to begin with, then from the slope of a touch together with the first images, and
-in every answer from what the motion adds. Outside the calibrated range the patch counts less and less. Where patch and
-motion contradict each other both count less, by χ² over its 95 % point; where they go on doing so nothing is
-called observed.
+Motion and patch are fused as measurements: their informations are added, each with its whole covariance. So the patch
+has little weight where a path excites all of K, and much where it does not. The stiffness of the layer is a fourth
+unknown beside q. Why not a constant: an error of it looks like isotropic curvature. It is known from the scene at
+first, then from the slope of a touch together with the first images, and in every answer from the motion too. Outside
+the calibrated range the patch counts less and less. Where patch and motion contradict each other both count less, by χ²
+over its 95 % point; where that lasts, nothing is called observed.
 
-Where the surface bends along the path a mean over some millimetres is that of an earlier place. A second, shorter mean
-shows it: how far the two are apart, carried on to now, is an error of the longer one, and counts as such.
+Where the curvature changes along the path, a mean over some millimetres belongs to an earlier place. A second, shorter
+mean shows it: the difference of the two, extrapolated to now, counts as an error of the longer one.
 """
 
 from __future__ import annotations
@@ -36,35 +36,36 @@ from canprobe.mechanics.touch.tangent_frames import tangent_rotation, transporte
 from canprobe.mechanics.types import Floats, Vec
 
 MIN_FRAMES = 8
-"""Fewer frames make no estimate."""
+"""Least number of frames for an estimate."""
 MAX_FRAMES = 32
-"""Frames that the running mean reaches back: 0.16 s at 200 Hz, 4 mm at 25 mm/s."""
-FEW_FRAMES = 8
-"""The same of the shorter mean."""
-FINE_OUTLIER_SHARE = 0.05
-"""`OUTLIER_SHARE` of the shorter mean, in which one image weighs more: four times the noise of a frame."""
+"""Most frames in the running mean: 0.16 s at 200 Hz, 4 mm at 25 mm/s."""
+MAX_RECENT_FRAMES = 8
+"""Most frames in the shorter mean."""
+RECENT_OUTLIER_SHARE = 0.05
+"""`OUTLIER_SHARE` of the shorter mean, in which one image has more weight: four times the noise of a frame."""
 MIN_AGE_DIFFERENCE_FRAMES = 4.0
-"""Frames by which the shorter mean must be the younger one to tell a drift."""
+"""Least difference of the ages of both means, in frames, from which a drift is computed."""
 OUTLIER_SHARE = 0.2
-"""Departure from the mean, over its trace, beyond which one image counts less: ten times the noise of a frame."""
+"""Largest departure from the mean, over its trace, of an image that counts in full: ten times the noise of a frame."""
 MAX_ROUNDS = 6
-"""Gauss–Newton steps; from the last answer one or two do."""
+"""Most Gauss–Newton steps; from the last answer one or two suffice."""
 SLOPE_SIGMA = 0.08
-"""Error of a touch's slope in the logarithm of the stiffness that its own deviation leaves out: that of the force."""
+"""Standard deviation of ln(stiffness) from the slope of a touch, by the error of the force; that of the slope comes on
+top."""
 _STIFFNESS_STEP = 0.01
 _ROOT2 = math.sqrt(2.0)
 SETTLED_STEP, MAX_LAST_STEP = 0.002, 0.05
-"""Step, in units of the probe's curvature, that ends the iteration, and the largest that a last step may have."""
+"""Step, in units of the probe's curvature, that ends the iteration; largest last step of a solution that is used."""
 
 
 class Fused(NamedTuple):
     """What patch and motion say together about q in a contact frame.
 
     Attributes:
-        q: (3,) 1/m.
-        patch: (3, 3) the patch's part of the information, the layer's stiffness unknown, m².
-        cost: of all that disagrees with the answer, χ².
-        stiffness: K/h of the layer, N/m³.
+        q: (3,) value of (K11, √2 K12, K22), 1/m.
+        patch: (3, 3) the patch's part of the information, with the layer's stiffness unknown, m².
+        cost: χ² of patch, motion and stiffness against the answer.
+        stiffness: stiffness K/h of the layer, N/m³.
     """
 
     q: Floats
@@ -74,7 +75,7 @@ class Fused(NamedTuple):
 
     @property
     def contradicted(self) -> bool:
-        """Patch and motion do not go together."""
+        """Whether patch and motion contradict each other (99.9 %)."""
         return self.cost > CHI2_999
 
 
@@ -86,14 +87,17 @@ class LayerStiffness(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """Moments in their principal axes, and how far they are off by what changed along the path."""
+    """Moments in their principal axes, and their error by a change along the path, m²."""
 
     moments: Moments
     drift: Moments
 
 
 class _Mean:
-    """Running mean of moments over at most `most` frames, their number, and its age; `gross`: as `OUTLIER_SHARE`."""
+    """Running mean of moments over at most `most` frames, with their number and age.
+
+    `gross` is the largest departure of a frame that counts in full, as `OUTLIER_SHARE`.
+    """
 
     def __init__(self, most: int, gross: float) -> None:
         self.moments: Moments = (0.0, 0.0, 0.0)
@@ -103,7 +107,7 @@ class _Mean:
         self._apart = 0
 
     def add(self, xx: float, xy: float, yy: float) -> float:
-        """Take the moments of a frame; its share in the mean, small where it is far from it."""
+        """Take the moments of a frame; returns its share in the mean, which is small for a frame far from the mean."""
         self.frames = min(self.frames + 1, self._most)
         share = 1.0 / self.frames
         mxx, mxy, myy = self.moments
@@ -112,7 +116,7 @@ class _Mean:
             nearness = self._gross * (mxx + myy) / max(abs(dxx) + 2.0 * abs(dxy) + abs(dyy), 1e-300)
             self._apart = self._apart + 1 if nearness < 1.0 else 0
             if self._apart == MIN_FRAMES:
-                # so many in a row are no outliers: what was before them is not what is felt now
+                # so many in a row are no outliers: the surface has changed, and the mean starts afresh
                 self.moments, self.age, self.frames, self._apart = (xx, xy, yy), 0.0, 1, 0
                 return 1.0
             share *= min(1.0, nearness)
@@ -121,7 +125,7 @@ class _Mean:
         return share
 
     def drift_from(self, younger: _Mean) -> Moments:
-        """How far this is off by what changed since, if it went on as a younger mean says."""
+        """Error of this mean by a change since its age, extrapolated from the difference to a younger mean."""
         apart = self.age - younger.age
         if apart < MIN_AGE_DIFFERENCE_FRAMES:
             return 0.0, 0.0, 0.0
@@ -134,12 +138,13 @@ class PatchCurvature:
     """Running mean of second moments in axes that are carried along with the contact normal.
 
     Args:
-        model: of the sensor.
+        model: model of the sensor.
         sigma_stiffness: standard deviation of the logarithm of the model's stiffness, before any touch.
 
     Attributes:
-        frames: how many the mean stands for, at most `MAX_FRAMES`.
-        refused: contacts without moments (saturated, at the pad's edge, hardly any taxel, or a sensor that sends none).
+        frames: number of frames in the mean, at most `MAX_FRAMES`.
+        force: mean force over these frames, N.
+        refused: number of contacts without moments (saturated, at the pad's edge, hardly any taxel, or none sent).
     """
 
     def __init__(self, model: ImageModel, sigma_stiffness: float = 1e-3) -> None:
@@ -157,7 +162,7 @@ class PatchCurvature:
         self._last: Floats | None = None
         self._slope: Slope | None = None
         self._touched = False
-        self._mean, self._recent = _Mean(MAX_FRAMES, OUTLIER_SHARE), _Mean(FEW_FRAMES, FINE_OUTLIER_SHARE)
+        self._mean, self._recent = _Mean(MAX_FRAMES, OUTLIER_SHARE), _Mean(MAX_RECENT_FRAMES, RECENT_OUTLIER_SHARE)
 
     def add(self, sample: ContactSample) -> None:
         """Take the image of one contact."""
@@ -198,7 +203,10 @@ class PatchCurvature:
         return x * size, y * size
 
     def fuse(self, T_base_contact: Floats, motion: CurvatureInformation | None = None) -> Fused | None:
-        """The patch, with what the motion knows about q, in a contact frame (4, 4); None where it knows nothing."""
+        """Curvature by the patch and the motion's evidence about q, in a contact frame (4, 4), m.
+
+        None where the patch has too few frames, or the iteration does not settle.
+        """
         if self.frames < MIN_FRAMES:
             return None
         c, s = self._in_axes(T_base_contact[:3, 0].tolist())
@@ -215,7 +223,7 @@ class PatchCurvature:
         return Fused(q, patch, found.cost, found.stiffness)
 
     def _solve(self, seen: _Seen, motion: CurvatureInformation) -> Fused | None:
-        """From the last answer, and where that fails from the ideal layer."""
+        """Solve from the last answer, and where that fails from that of the ideal layer."""
         last, self._last = self._last, None
         found = None if last is None else self._iterated(last, seen, motion)
         for guess in self._guesses():
@@ -226,15 +234,17 @@ class PatchCurvature:
             return None
         self._last, fused, stiffness = found
         if self._slope is not None:
-            # the layer stays what it is; where the touch was is left behind
+            # the slope belongs to the place of the touch and is used once; the stiffness that it gave is kept
             self._slope, self._stiffness = None, stiffness
         return fused
 
     def _iterated(
         self, x: Floats, seen: _Seen, motion: CurvatureInformation
     ) -> tuple[Floats, Fused, LayerStiffness] | None:
-        """Gauss–Newton from x = (q, ln of the stiffness over the stated one): where it ends, the answer, and what is
-        known of the stiffness then; None where it does not settle.
+        """Gauss–Newton from x (4,) = (q, ln of the stiffness over the stated one).
+
+        Returns:
+            The last x, the answer, and the stiffness with its σ; None where the steps do not settle.
         """
         known, mean = np.zeros((4, 4)), np.array([*motion.q, self._stiffness.mean])
         known[:3, :3], known[3, 3] = motion.information, self._stiffness.sigma**-2
@@ -255,17 +265,17 @@ class PatchCurvature:
                 W = _less_certain(W, seen)
                 W *= model.trust(k, self.force)
                 JW = J.T.dot(W)
-                felt, pull, cost = JW.dot(J), JW.dot(r), float(r.dot(W).dot(r))
-                if not felt.any():
+                information, pull, cost = JW.dot(J), JW.dot(r), float(r.dot(W).dot(r))
+                if not information.any():
                     return None
                 if self._slope is not None:
                     row, off, weight = self._push(x, k, self._slope)
-                    felt += weight * np.outer(row, row)
+                    information += weight * np.outer(row, row)
                     pull += weight * off * row
                     cost += weight * off**2
                 apart = mean - x
                 drawn = known.dot(apart)
-                way = solved(felt + known, pull + drawn)
+                way = solved(information + known, pull + drawn)
                 cost += float(apart.dot(drawn))
                 x = x + way
                 *of_q, of_stiffness = map(abs, way.tolist())
@@ -276,12 +286,12 @@ class PatchCurvature:
             return None
         if step > MAX_LAST_STEP / self.model.radius:
             return None
-        stiffness = LayerStiffness(float(x[3]), math.sqrt(float(inverted(felt + known)[3, 3])))
-        patch = felt[:3, :3] - felt[:3, 3, None] * felt[3, :3] / (felt[3, 3] + known[3, 3])
+        stiffness = LayerStiffness(float(x[3]), math.sqrt(float(inverted(information + known)[3, 3])))
+        patch = information[:3, :3] - information[:3, 3, None] * information[3, :3] / (information[3, 3] + known[3, 3])
         return x, Fused(x[:3], patch, cost, self.model.stiffness * math.exp(x[3])), stiffness
 
     def _guesses(self) -> tuple[float, ...]:
-        """What is known of the stiffness, and what the touch would show on a plane."""
+        """Starting values of ln(stiffness over the stated one): the known one, and that of the touch on a plane."""
         known, slope = self._stiffness.mean, self._slope
         if slope is None:
             return (known,)
@@ -291,7 +301,7 @@ class PatchCurvature:
         return self.model.with_stiffness(self.model.stiffness * math.exp(stiffer))
 
     def _push(self, x: Floats, k: Moments, slope: Slope) -> tuple[Floats, float, float]:
-        """Row (4,) of the slope of a touch at x, its residual and its information."""
+        """Row (4,) of a touch's slope at x, its residual in ln(stiffness), and its information."""
         K = np.array([[k[0], k[1]], [k[1], k[2]]])
         half = 0.5 * inverted(np.eye(2) / self.model.radius + K)
         kappa = np.linalg.eigvalsh(K)

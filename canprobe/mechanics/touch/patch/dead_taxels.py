@@ -1,7 +1,7 @@
-"""Dead taxels: found where a taxel reads nothing in the midst of a patch, and bridged by their neighbours.
+"""Dead taxels: found where a taxel reads nothing inside a patch, and bridged by their neighbours.
 
-A dead taxel in the midst of a patch at 2 N moves the centroid by up to a tenth of a pitch and takes some percent off
-the force. At the rim, where it cannot be told from the patch's end, it hardly matters.
+A dead taxel inside a patch at 2 N moves the centroid by up to a tenth of a pitch and lowers the force by some percent.
+At the rim it cannot be distinguished from the end of the patch, and hardly matters.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 MIN_COUNTS = 20
-"""Counts that each of the four neighbours must show: more than a patch's slope can fall to nothing from."""
+"""Least count of each of the four neighbours: more than the pressure of a patch can fall from one taxel to the next."""
 _LEVELS = bytes((count > 0) + (count >= MIN_COUNTS) for count in range(256))
 _GAP = bytes((2, 0, 2))
 """A dead taxel between its left and its right neighbour, in levels of counts."""
@@ -18,9 +18,10 @@ Image = NDArray[np.uint8]
 
 
 def mended(taxels: Image) -> tuple[Image, int]:
-    """The image with its dead taxels bridged, and how many there were.
+    """The image with its dead taxels bridged, and their number.
 
-    The same array (rows, columns) where none is dead; else a copy in which each has the mean of its four neighbours.
+    The same array (rows, columns) is returned where none is dead; else a copy in which each dead taxel has the mean of
+    its four neighbours.
     """
     if not may_be_dead(taxels.tobytes()):
         return taxels, 0
@@ -38,5 +39,5 @@ def mended(taxels: Image) -> tuple[Image, int]:
 
 
 def may_be_dead(counts: bytes) -> bool:
-    """Whether a taxel reads nothing between two pressed ones: no as a rule, and in a fraction of the whole search."""
+    """Whether a taxel reads nothing between two pressed ones; a quick test before the whole search, mostly False."""
     return _GAP in counts.translate(_LEVELS)

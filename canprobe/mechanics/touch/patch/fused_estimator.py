@@ -1,23 +1,36 @@
-"""An estimator of motion with the contact patch as its second sensor."""
+"""An estimator of motion with the contact patch as its second sensor, and its answers."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
 from canprobe.mechanics.touch.contact import ContactSample
-from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
+from canprobe.mechanics.touch.estimate.answer import Solution, SurfaceEstimate, build_estimate
+from canprobe.mechanics.touch.estimate.noise import CHI2_95
+from canprobe.mechanics.touch.estimate.observed import SIGMA_LIMIT, Decision, nothing_observed
 from canprobe.mechanics.touch.estimate.online import Dropped, Estimator
-from canprobe.mechanics.touch.patch.curvature import PatchCurvature
-from canprobe.mechanics.touch.patch.fused_answer import WITHDRAWAL_SHARE, patch_estimate, with_patch
+from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, TO_Q, matrix_of, parameters_of
+from canprobe.mechanics.touch.linear_algebra import eigen, inverted
+from canprobe.mechanics.touch.patch.curvature import Fused, PatchCurvature
+from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 from canprobe.mechanics.types import Floats
+
+MIN_NAMED_SHARE = 0.1
+"""Least share of the patch in the information about K at which the estimate's method names it."""
+CONTRADICTION_NOTE = "the patch contradicts the motion"
+WITHDRAWAL_SHARE = 0.25
+"""Path, over the memory, along which a contradiction must last before nothing is called observed any more."""
+_TO_K = 1.0 / np.outer(TO_Q, TO_Q)
 
 
 class PatchedEstimator:
-    """Any estimator, its answers completed by the patch (`with_patch`); before the contact moves, the patch alone.
+    """An estimator with answers that the patch completes (`with_patch`); before the contact moves, the patch's alone.
 
     Args:
-        motion: the estimator of points and normals.
-        patch: the images.
+        motion: estimator from points and normals.
+        patch: estimator from images.
         length: memory of `motion`, m.
     """
 
@@ -31,7 +44,7 @@ class PatchedEstimator:
 
     @property
     def dropped(self) -> Dropped:
-        """Samples that were not used, by neither sensor."""
+        """Samples that neither sensor used, by reason."""
         return self._motion.dropped
 
     def add(self, sample: ContactSample) -> None:
@@ -65,3 +78,96 @@ class PatchedEstimator:
         self.patch.reset()
         self._last = self._place = None
         self._contradicted = 0.0
+
+
+def with_patch(motion: SurfaceEstimate, found: Fused, length: float, *, withdrawn: bool = False) -> SurfaceEstimate:
+    """A motion estimate, with its curvature replaced by that of motion and patch together.
+
+    Place, normal and c13, c23, c33 stay the motion's; the patch says nothing about them. The `method` ends in "+patch"
+    where the patch gave at least `MIN_NAMED_SHARE`; a note gives its share.
+
+    Args:
+        motion: the estimate, with its `evidence`.
+        found: the curvature of both (`PatchCurvature.fuse`).
+        length: memory of the estimator, m; curvatures below its inverse count as flat.
+        withdrawn: whether nothing is called observed.
+    """
+    assert motion.evidence is not None
+    weight = CHI2_95 / max(found.cost, CHI2_95)
+    evidence, patch = weight * motion.evidence.information, weight * found.patch
+    has_prior = motion.rank < 3 and bool(np.isfinite(motion.covariance).all())
+    data = weight * motion.information if has_prior else evidence
+    decision = nothing_observed() if withdrawn else _decide(data + patch, found.q, length)
+    root = None
+    if motion.model_root is not None:
+        rows = np.zeros((3, 9))
+        rows[:, 6:] = _root(patch) / C_PER_Q
+        root = np.concatenate([math.sqrt(weight) * motion.model_root, rows])
+    inverse = inverted(evidence + patch)
+    share = float((inverse * patch).sum()) / 3.0
+    notes = [f"{100.0 * share:.0f} % of the curvature from the patch"]
+    if found.contradicted:
+        notes.append(CONTRADICTION_NOTE)
+    return build_estimate(
+        _solution(motion.S, found.q, inverse, decision, has_prior=has_prior, root=root),
+        length=1.0,
+        T_frame_contact=motion.T_frame_contact,
+        problem_root=motion.problem_root,
+        innovation=motion.innovation,
+        distance=motion.distance,
+        samples=motion.samples,
+        method=motion.method + "+patch" if share >= MIN_NAMED_SHARE else motion.method,
+        prior=motion.prior,
+        notes=(*motion.notes, *notes),
+        stiffness=found.stiffness,
+    )
+
+
+def patch_estimate(contact: ContactSample, patch: PatchCurvature, length: float) -> SurfaceEstimate | None:
+    """Shape from the patch alone at a contact that has not moved; None where the patch gives none.
+
+    `length` is the memory of the estimator, m, as for `with_patch`.
+    """
+    T = homogeneous(tangent_rotation(-contact.n_base), contact.p_base)
+    found = patch.fuse(T)
+    if found is None:
+        return None
+    return build_estimate(
+        _solution(matrix_of(np.zeros(9)), found.q, inverted(found.patch), _decide(found.patch, found.q, length)),
+        length=1.0,
+        T_frame_contact=T,
+        problem_root=_root(found.patch),
+        innovation=1.0,
+        distance=0.0,
+        samples=float(patch.frames),
+        method="patch",
+        prior="none",
+        stiffness=found.stiffness,
+    )
+
+
+def _root(information: Floats) -> Floats:
+    """(3, 3) root of the patch's information, which may be singular."""
+    values, vectors = eigen(information)
+    result: Floats = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+    return result
+
+
+def _decide(information: Floats, q: Floats, length: float) -> Decision:
+    """Rank decision by rule 2 of `observed` alone: rule 1, the spread of the points, is about motion."""
+    values, vectors = eigen(information)
+    size = max(math.sqrt(float(q @ q)), 1.0 / length)
+    return Decision(np.maximum(values, 0.0), vectors, values >= 1.0 / (SIGMA_LIMIT * size) ** 2)
+
+
+def _solution(
+    S: Floats, q: Floats, covariance: Floats, decision: Decision, *, has_prior: bool = False, root: Floats | None = None
+) -> Solution:
+    """A solution with the place and the other entries of S (4, 4), and with q and its covariance (3, 3)."""
+    c = parameters_of(S)
+    if has_prior or decision.rank == 3:
+        c[6:] = C_PER_Q * q
+        return Solution(c, covariance * _TO_K, decision, has_prior, root)
+    V = decision.vectors[:, decision.passed]
+    c[6:] = C_PER_Q * (V @ (V.T @ q))
+    return Solution(c, np.full((3, 3), math.nan), decision, has_prior, root)

@@ -1,9 +1,10 @@
 """The contact patch in a tactile image: force and centroid, with what makes them doubtful.
 
-Taxels lie as `touch.pad` says; (u, v) are azimuthal-equidistant on the sphere, so a taxel's true area is
+Taxels lie as `touch.pad` says: (u, v) are azimuthal-equidistant on the sphere, so a taxel's true area is
 `pitch² · sin(ρ)/ρ` with ρ = √(u² + v²)/R_p.
 
-This is the *inverse* of a sensor, kept apart from any model that makes images: its constants are calibrated ones.
+This is the *inverse* of a sensor. It shares nothing with the models that make images; its constants come from a
+calibration.
 """
 
 from __future__ import annotations
@@ -20,17 +21,18 @@ from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import Doubt
 from canprobe.mechanics.touch.linear_algebra import checked, positive, read_only
 from canprobe.mechanics.touch.pad import COUNTS_MAX, THRESHOLD_COUNTS, Pad
-from canprobe.mechanics.touch.patch.beyond_window import MAX_EDGE_SHARE, MIN_PEAK, Continuation
+from canprobe.mechanics.touch.patch.beyond_window import MAX_EDGE_SHARE, MIN_PEAK_RATIO, Continuation
 from canprobe.mechanics.touch.patch.dead_taxels import may_be_dead, mended
 from canprobe.mechanics.touch.stops import OFF_PAD_EDGE_SHARE, OFF_PAD_SIGMAS, OFF_PAD_TAXELS
 from canprobe.mechanics.types import Floats
 
 _MIN_TAXELS = 4
-_COUNTS = bytes(range(COUNTS_MAX + 1))
+"""Least number of active taxels of a patch with usable moments."""
+_ALL_COUNTS = bytes(range(COUNTS_MAX + 1))
 
 
 class FeaturesLike(Protocol):
-    """Moments as a sensor node computes them: newtons, taxel units (row, column), counts."""
+    """Moments as a sensor node computes them: force in N, places in taxels (row, column), peak in counts."""
 
     @property
     def force_n(self) -> float: ...
@@ -50,18 +52,18 @@ class Patch(NamedTuple):
     """What one image says about the contact.
 
     Attributes:
-        force: N, corrected by the calibration.
+        force: force, N, corrected by the calibration.
         u, v: centroid of pressure on the pad, m; NaN without contact.
-        n_active: taxels at or above the threshold; −1 where only features were sent.
+        n_active: number of taxels at or above the threshold; −1 where only features were sent.
         peak_pa: highest taxel pressure, Pa.
-        saturated: a taxel is at its largest count.
-        cut_by_window: the patch reaches an edge of the window inside the pad; what is beyond it is carried on
-            (`Continuation`) in force and centroid.
-        cut_by_pad: the patch reaches the pad's edge.
-        too_few: fewer than four active taxels: no moments to speak of.
-        dead: taxels in the midst of the patch that read nothing, bridged by their neighbours (`mended`).
-        off_pad: the pressure is highest at the pad's edge, so that a good part of the contact, a fifth or all but a
-            rim of it, lies beyond: the force is only a lower bound.
+        saturated: whether a taxel is at its largest count.
+        cut_by_window: whether the patch reaches an edge of the window inside the pad; force and centroid include an
+            extrapolation beyond it (`Continuation`).
+        cut_by_pad: whether the patch reaches the pad's edge.
+        too_few: whether fewer than four taxels are active, too few for moments.
+        dead: number of taxels inside the patch that read nothing, bridged by their neighbours (`mended`).
+        off_pad: whether the pressure is highest at the pad's edge: a fifth of the contact or more lies beyond it, and
+            the force is only a lower bound.
     """
 
     force: float
@@ -78,12 +80,12 @@ class Patch(NamedTuple):
 
     @property
     def good(self) -> bool:
-        """Nothing makes the centroid doubtful."""
+        """Whether nothing makes the centroid doubtful."""
         return not (self.saturated or self.cut_by_window or self.cut_by_pad or self.too_few or self.dead)
 
     @property
     def doubts(self) -> tuple[Doubt, ...]:
-        """What an estimator should know of."""
+        """Doubts that an estimator takes into account."""
         said = (
             (Doubt.SATURATED, self.saturated),
             (Doubt.CUT, self.cut_by_pad),
@@ -97,16 +99,19 @@ class Patch(NamedTuple):
 class PatchCalibration:
     """From counts to pascals and from the pressure sum to force.
 
-    Pressure of a taxel is `full_scale_pa · counts / 255`; force is `force_gain · S + edge_gain · √(S · 1 N)` with
-    S the sum of pressure times area: the second term stands for what the patch loses at its rim under the threshold,
-    both follow from the image model (`ArrayCalibration.patch_calibration`).
+    The pressure of a taxel is `full_scale_pa · counts / 255`. The force is `force_gain · S + edge_gain · √(S · 1 N)`
+    with S the sum of pressure times area; the second term stands for what the patch loses at its rim under the
+    threshold. Both gains follow from the image model (`array_models.make_patch_calibration`).
 
     Attributes:
-        full_scale_pa: pressure at the largest count.
-        threshold_counts: smaller counts are taken as 0.
-        pad: the taxels; its pressure at the largest count is `full_scale_pa`.
-        force_gain, edge_gain: see above; edge_gain in √N.
-        gains: (rows, columns) of the taxels, over their mean; empty: all are alike.
+        pad: the taxels, with their pressure at the largest count.
+        threshold_counts: least count that is not taken as 0.
+        force_gain: gain of the pressure sum.
+        edge_gain: gain of its root, √N.
+        gains: (rows, columns) gains of the taxels over their mean; empty where all are alike.
+        pascals: (256,) pressure of each count, Pa.
+        weights: (n, 6) area × (1, u, v, uu, uv, vv) of each taxel over its gain, lengths in pitches, the area in m².
+        continuation: extrapolation beyond a window.
     """
 
     pad: Pad = field(default_factory=Pad)
@@ -120,17 +125,17 @@ class PatchCalibration:
 
     @property
     def full_scale_pa(self) -> float:
-        """Pressure at the largest count."""
+        """Pressure at the largest count, Pa."""
         return self.pad.full_scale_pa
 
     @property
     def pitch_m(self) -> float:
-        """Distance of taxels."""
+        """Distance of neighbouring taxels, m."""
         return self.pad.pitch_m
 
     @property
     def radius_m(self) -> float:
-        """R_p of the probe that the array is wrapped on; of a flat one, of the sphere that it is taken for."""
+        """Radius R_p of the probe that the array is wrapped on, or of the sphere that a flat array is taken for, m."""
         return self.pad.radius_m
 
     def __post_init__(self) -> None:
@@ -164,11 +169,11 @@ def compute_patch(
 
     Args:
         taxels: (rows, columns) uint8 counts in pad coordinates, zeros outside the window.
-        calibration: of the array.
+        calibration: calibration of the array.
         window: first row, first column, rows, columns that were sent; None for the whole pad.
 
     Raises:
-        UsageError: when the image is not one of the calibration's pad, in uint8.
+        UsageError: the image does not have the shape of the calibration's pad, or is not uint8.
     """
     pad = calibration.pad
     if taxels.shape != pad.shape or taxels.dtype != np.uint8:
@@ -179,12 +184,12 @@ def compute_patch(
             taxels, dead = mended(taxels)
             counts = taxels.tobytes()
         edges = _edges(counts, pad.shape, window)
-    active = counts.translate(None, _COUNTS[: max(calibration.threshold_counts, 1)])
+    active = counts.translate(None, _ALL_COUNTS[: max(calibration.threshold_counts, 1)])
     n_active, peak = len(active), max(active, default=0)
     pascals = calibration.pascals
     peak_pa, at_pad, at_window = [pascals.item(count) for count in (peak, *edges)]
     pressure = pascals.take(taxels)
-    shows_shape = peak > MIN_PEAK * calibration.threshold_counts
+    shows_shape = peak > MIN_PEAK_RATIO * calibration.threshold_counts
     if window is not None and at_window > MAX_EDGE_SHARE * peak_pa and shows_shape:
         pressure = calibration.continuation.completed(pressure, window, peak_pa)
     total, u, v, *_ = pressure.reshape(-1).dot(calibration.weights).tolist()
@@ -217,7 +222,7 @@ def _edges(counts: bytes, shape: tuple[int, int], window: Sequence[int] | None) 
     """Highest count at the pad's edge, and at an edge of the window inside the pad."""
     height, width = shape
     edges = counts[:width] + counts[-width:] + counts[::width] + counts[width - 1 :: width]
-    at_pad = max(edges.strip(b"\0"), default=0)  # none is left as a rule
+    at_pad = max(edges.strip(b"\0"), default=0)  # usually nothing is left: the strip is faster than the maximum
     if window is None:
         return at_pad, 0
     r0, c0, n_rows, n_cols = window
@@ -234,13 +239,13 @@ def _edges(counts: bytes, shape: tuple[int, int], window: Sequence[int] | None) 
 def patch_from_features(features: FeaturesLike, calibration: PatchCalibration) -> Patch:
     """Patch from moments that the sensor node computed itself.
 
-    The node's force is its plain sum of pressure times area; the calibration's gains are applied here. Cuts cannot be
-    seen; `cut_by_pad` is set where two standard deviations reach past the pad, `off_pad` where `OFF_PAD_SIGMAS` do or
-    the centroid lies in the last row of taxels.
+    The node's force is its plain sum of pressure times area; the calibration's gains are applied here. Moments do not
+    show a cut: `cut_by_pad` is set where two standard deviations reach past the pad, `off_pad` where `OFF_PAD_SIGMAS`
+    do or the centroid lies in the last row of taxels.
 
     Args:
         features: force in N, row and column in taxels, variances in taxels², peak in counts.
-        calibration: of the array.
+        calibration: calibration of the array.
     """
     rows, columns = calibration.pad.shape
     row, col = features.row - (rows - 1) / 2, features.col - (columns - 1) / 2

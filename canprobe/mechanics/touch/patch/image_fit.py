@@ -1,11 +1,11 @@
-"""Touches of known objects, what their images show, and the image model's parameters that fit to them.
+"""Touches of known objects, what their images show, and the priors of the image model's parameters.
 
-What is known of a touch is the curvature of the object and where on the pad it should lie. Its force is an unknown of
-its own, but for a few whose force something else measured: the reference. Without any the scale of the force is a
-guess, and stiffness goes with it.
+The curvature of the object and the place on the pad are known for each touch. The force is an unknown of each touch,
+but for those with a reference force that something else measured. Without any reference the scale of the force is a
+guess, and the stiffness with it.
 
-Three of the parameters are hardly told apart by planes and balls alone: blur, crosstalk and memory carry a weak prior
-of what arrays of films and foams are like.
+Planes and balls alone hardly separate blur, crosstalk and memory: these three have a weak prior from arrays of films
+and foams.
 """
 
 from __future__ import annotations
@@ -25,22 +25,23 @@ from canprobe.mechanics.touch.patch.image import PatchCalibration, compute_patch
 from canprobe.mechanics.touch.patch.moments import LEVEL_COUNTS, MomentImage
 from canprobe.mechanics.types import Floats
 
-BLUR_PITCH = (0.7, 0.2)
-CROSSTALK = (0.025, 0.01)
-MEMORY = (0.03, 0.02)
-"""Mean and standard deviation of what is expected of any array."""
+BLUR_PRIOR_PITCH = (0.7, 0.2)
+CROSSTALK_PRIOR = (0.025, 0.01)
+MEMORY_PRIOR = (0.03, 0.02)
+"""Mean and standard deviation of the parameters' priors; the blur is in pitches."""
 TOUCH_SIGMA = 0.012
 """Relative error of moments and sums of a touch: gains, hysteresis and creep."""
-SETTLED_S, AGE_S = 0.5, 3.5
-"""From the touch to the first image that counts, and to the last: all touches are compared after as much creep."""
-MAX_OF_FULL_SCALE = 0.7
-"""Peak over full scale above which a touch is left out: taxels bend off before they saturate."""
+FIRST_IMAGE_S, LAST_IMAGE_S = 0.5, 3.5
+"""Time from the touch to the first image that is used, and to the last, s: all touches are compared after the same
+creep."""
+MAX_PEAK_SHARE = 0.7
+"""Largest peak over full scale of a touch that is used: taxels bend off before they saturate."""
 MIN_CURVATURE_SHARE = -0.9
-"""Least curvature that is looked for, over that of the probe."""
-
+"""Least curvature in a search, over that of the probe."""
 MIN_IMAGES = 10
+"""Least number of images with a patch in a touch."""
 NO_ERRORS = MomentErrors(1.0, 0.0, 1.0, 0.0)
-"""Of a model that is only asked forward."""
+"""Errors for a model that is only used forward."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,18 +49,18 @@ class Dwell:
     """One touch of a known object, pressed and rolled.
 
     Attributes:
-        name: of the object: "plane", "ball", "rod".
+        name: name of the object: "plane", "ball", "rod".
         kappa: principal curvatures of the object, larger first, 1/m.
         angle: direction of the first on the pad, from u, rad.
         place: number of the place that is touched; touches at one place differ in force only.
         t_s: (n,) time stamps of the images, s.
-        images: (n) of them, (16, 16) counts, 0 outside the window.
-        windows: (n) first row, first column, rows, columns; None for whole images.
-        expected: (n, 2) where the contact lies on the pad by joints and object, m.
+        images: (n,) images, (16, 16) counts, 0 outside the window.
+        windows: (n,) first row, first column, rows, columns of each window; None for whole images.
+        expected: (n, 2) places of the contact on the pad by joints and object, m.
         push: (n,) way of the probe's centre towards the object, from any zero, m.
-        turn: of the probe about its pole, against the first touch, rad.
+        turn: turn of the probe about its pole, from the first touch, rad.
         force: reference force, N; None where nothing measured it.
-        to_and_fro: it rolls along one line, slowly and then fast; else an eight.
+        to_and_fro: whether it rolls along one line, slowly and then fast; else along an eight.
     """
 
     name: str
@@ -80,17 +81,17 @@ class Shown(NamedTuple):
     """What the images of a dwell show, averaged; moments in the object's principal axes, m².
 
     Attributes:
-        total: pressure times area, N.
-        crept: the same over the whole touch, over `total`.
-        moments, remembered: (3,) xx, xy, yy of the image, and of the ways that the pad remembers.
+        total: sum of pressure times area, N.
+        crept: mean of that sum over the whole touch, over `total`.
+        moments, remembered: (3,) xx, xy, yy of the image, and of the earlier places (`PadMemory`).
         frame_sigma: relative standard deviation of a moment from frame to frame.
         lightness: level over peak pressure.
         off: (n, 2) centroids less their expected places, m.
         way: (n, 2) expected places, m.
-        t_s: (n,) s.
+        t_s: (n,) time stamps, s.
         raw: (n, 2) centroids, m.
-        usable: neither saturated nor off the pad.
-        push: mean, m.
+        usable: whether the touch neither saturates nor leaves the pad.
+        push: mean way of the probe's centre, m.
     """
 
     total: float
@@ -108,13 +109,18 @@ class Shown(NamedTuple):
 
 
 def what_is_shown(dwell: Dwell, plain: PatchCalibration, age_s: float = math.inf) -> Shown:
-    """Mean sum and moments of a dwell's images, up to an age of the touch; `plain` with gains of 1 and 0.
+    """Mean sum and moments of a dwell's images.
+
+    Args:
+        dwell: the touch.
+        plain: pressures of the array, with a force gain of 1 and an edge gain of 0.
+        age_s: time from the touch to the last image that is used, s.
 
     Raises:
-        UsageError: its images show no patch.
+        UsageError: the images show no patch.
     """
     image_moments, memory = MomentImage(plain), PadMemory()
-    start, end = dwell.t_s[0] + SETTLED_S, dwell.t_s[0] + age_s
+    start, end = dwell.t_s[0] + FIRST_IMAGE_S, dwell.t_s[0] + age_s
     late = []
     sums, moments, ways, at, peaks, kept, bad = [], [], [], [], [], [], 0
     for i, (t, image) in enumerate(zip(dwell.t_s.tolist(), dwell.images, strict=True)):
@@ -154,6 +160,6 @@ def what_is_shown(dwell: Dwell, plain: PatchCalibration, age_s: float = math.inf
         way=dwell.expected[kept],
         t_s=dwell.t_s[kept],
         raw=raw,
-        usable=bad <= 0.2 * len(kept) and peak < MAX_OF_FULL_SCALE * plain.full_scale_pa,
+        usable=bad <= 0.2 * len(kept) and peak < MAX_PEAK_SHARE * plain.full_scale_pa,
         push=float(dwell.push[kept].mean()),
     )

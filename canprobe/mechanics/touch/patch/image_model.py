@@ -1,14 +1,14 @@
-"""What an array shows of a contact: force and second moments of its image, from the curvature under the probe.
+"""The forward model of an array: force and second moments of its image, from the curvature under the probe.
 
 On a Winkler layer of stiffness k a probe of radius R_p leaves an elliptic patch on a surface with shape operator K:
 with `A = ½ (I/R_p + K)` and `F = π k δ² / (2 √det A)` the pressure is `k (δ − xᵀ A x)₊`, and its second moments are
-`(δ/6) A⁻¹`. The array blurs that pressure, spreads some of it over rows and columns, scales it, and shows what is
-above a level. Five numbers say how much: stiffness, scale, blur, crosstalk, and what the image remembers of earlier
-places (`creep.PadMemory`). The level and the pitch are those of the device.
+`(δ/6) A⁻¹`. The array blurs that pressure, spreads some of it over rows and columns, scales it, and shows the part
+above a level. Five parameters describe it: stiffness, scale, blur, crosstalk, and memory, the share of earlier places
+in the image (`creep.PadMemory`). The level and the pitch are those of the device.
 
-The blurred patch has no closed form: the pressure is taken on a grid of thirds of a pitch over one quadrant, in the
-principal axes, and blurred by a folded Gaussian matrix. Stops being true where taxels saturate, where the patch is no
-paraboloid (an edge, a hollow nearly as tight as the probe), and where only some taxels are above the level.
+The blurred patch has no closed form: the pressure is computed on a grid of thirds of a pitch over one quadrant, in the
+principal axes, and blurred by a folded Gaussian matrix. The model is not true where taxels saturate, where the patch is
+no paraboloid (an edge, a hollow nearly as tight as the probe), and where only some taxels are above the level.
 
 Source: Johnson, Contact Mechanics (1985), 4.3, the elastic foundation.
 """
@@ -30,21 +30,22 @@ from canprobe.mechanics.types import Floats
 STEPS_PER_PITCH = 3
 """Grid points in a pitch: with more of them a moment changes by 0.1 %."""
 MIN_MOMENT_PITCH2 = 0.4
-"""Least moment of the ideal layer over the squared pitch, a patch three pitches wide; smaller ones blur away."""
+"""Least moment of the ideal layer over the squared pitch, of a patch three pitches wide; blur hides a smaller one."""
 MAX_MOMENT_SHARE = 0.2
-"""Largest such moment over the squared half-width, in pitches, of what is seen: the patch just fits."""
+"""Largest moment of the ideal layer over the squared half-width of the window: the patch just fits."""
 MAX_LIGHTNESS = 0.3
-"""Level over peak pressure from which too little of a patch is above the level."""
+"""Largest level over peak pressure; beyond it too little of a patch is above the level."""
 TAPER_SHARE = 0.1
-"""How far beyond these limits a patch still counts, as a share of the limit."""
+"""Share of these limits within which, beyond them, the trust in a patch falls to 0."""
 USUAL_LIGHTNESS = 0.05
-"""Level over peak pressure at which the floor holds; it grows in proportion, as light touches cover few taxels."""
+"""Level over peak pressure for which `MomentErrors` hold; the errors grow in proportion, as light touches cover few
+taxels."""
 GAIN_LIGHTNESS = 0.25
-"""Level over peak pressure from which on the forces of `force_gains` are made larger."""
-_STEP = 1e-3
+"""Largest level over peak pressure of the forces of `force_gains`; smaller forces are made larger."""
+_DIFFERENCE_STEP = 1e-3
 """Relative step of the difference quotients, of the curvature relative to the probe and of the force."""
-_ROOT = math.sqrt(2.0)
-_ROUND = 1e-4
+_ROOT2 = math.sqrt(2.0)
+_MIN_CURVATURE_DIFFERENCE = 1e-4
 """Least difference of the principal curvatures, relative, at which the shear of the image is a quotient."""
 
 
@@ -53,15 +54,15 @@ class ImageModel:
     """The images of one array on one probe.
 
     Attributes:
-        parameters: of the array.
-        radius: R_p, m.
-        pitch: m.
-        level: taken off the pressure of every taxel before moments are taken (`MomentImage`), Pa: the first count above
-            the array's threshold.
+        parameters: parameters of the array.
+        radius: radius R_p of the probe, m.
+        pitch: distance of neighbouring taxels, m.
+        level: pressure that is subtracted from every taxel before moments are taken (`MomentImage`), Pa: the first
+            count above the array's threshold.
         count: pressure of one count, Pa.
-        side: taxels along a side of the array.
-        seen: taxels along the side that moments are taken of: the window's.
-        errors: of the moments.
+        side: number of taxels along a side of the array.
+        seen: number of taxels along a side of the window that moments are taken of.
+        errors: errors of the moments.
     """
 
     parameters: ImageParameters
@@ -101,16 +102,19 @@ class ImageModel:
 
     @property
     def memory(self) -> float:
-        """As `ImageParameters.memory`."""
+        """Share of the patch's earlier places in its moments (`ImageParameters.memory`)."""
         return self.parameters.memory
 
     @property
     def stiffness(self) -> float:
-        """Of the layer (K/h), N/m³."""
+        """Stiffness K/h of the layer, N/m³."""
         return self.parameters.stiffness
 
     def with_stiffness(self, stiffness: float) -> ImageModel:
-        """The same array on another layer (N/m³): its blur stays."""
+        """The same array on a layer of another stiffness (N/m³).
+
+        Why not `replace`: the blur matrices do not depend on the stiffness and are kept; this runs in the loop.
+        """
         other, p = object.__new__(ImageModel), self.parameters
         for name in self.__slots__:
             object.__setattr__(other, name, getattr(self, name))
@@ -124,7 +128,7 @@ class ImageModel:
         return math.sqrt(2.0 * force * math.sqrt(det) / (math.pi * self.parameters.stiffness))
 
     def shown(self, depth: Floats, a: Floats, b: Floats) -> Floats:
-        """Pressure that is shown in a quadrant of the patch.
+        """Pressure that the array shows in a quadrant of the patch.
 
         Args:
             depth: (n,) indentation, m.
@@ -146,7 +150,7 @@ class ImageModel:
         """Second moments above the level along both axes, m², of each of the n that `shown` gives.
 
         Raises:
-            ValueError: where nothing is above the level.
+            ValueError: nothing is above the level.
         """
         above = np.maximum(shown - self.level, 0.0).reshape(len(shown), -1)
         square = self.pitch**2
@@ -168,7 +172,7 @@ class ImageModel:
         """Second moments of the image (m²) for a shape operator (K11, K12, K22; 1/m) and a force (N).
 
         Raises:
-            ValueError: where the surface is as hollow as the probe, or nothing is above the level.
+            ValueError: the surface is as hollow as the probe, or nothing is above the level.
         """
         (a, b), axes, det = self._principal(k)
         depth = self.depth(force, det)
@@ -193,8 +197,8 @@ class ImageModel:
         The second term stands for what the patch loses at its rim. Least squares of relative errors, within 1 %.
 
         Args:
-            forces: N; larger ones where the second of them would hardly show on a plane.
-            curvatures: principal ones over that of the probe; each is pressed with each force.
+            forces: forces, N; all are made larger where the second would hardly show on a plane.
+            curvatures: principal curvatures over that of the probe; each is pressed with each force.
         """
         light = self._lightness(self.depth(forces[1], 0.25 / self.radius**2))
         forces = [force * max(1.0, light / GAIN_LIGHTNESS) ** 2 for force in forces]
@@ -208,7 +212,7 @@ class ImageModel:
     def trust(self, k: Moments, force: float) -> float:
         """1 where the model holds (K in 1/m, force in N), falling to 0 beyond its limits of moment and lightness.
 
-        A peak beyond full scale contradicts an image that is not saturated: the layer is another one.
+        A model with its peak beyond full scale contradicts an image that is not saturated: its stiffness is wrong.
         """
         (a, b), _, det = self._principal(k)
         depth = self.depth(force, det)
@@ -224,13 +228,13 @@ class ImageModel:
         return min(max(1.0 - (max(ends) - 1.0) / TAPER_SHARE, 0.0), 1.0)
 
     def _lightness(self, depth: float) -> float:
-        """Level over the peak pressure that is shown."""
+        """Level over the peak pressure that the array shows."""
         return self.level / (self.parameters.scale * self.parameters.stiffness * depth)
 
     def start(self, v: Moments, force: float) -> Moments | None:
-        """K (1/m) to begin with, from moments (m²) in their principal axes and force (N); None where blur is all.
+        """K (1/m) to start from, by moments (m²) in their principal axes and force (N); None where they are only blur.
 
-        The ideal layer, blurred: the level takes off about what the blur adds to a small patch.
+        It is that of the ideal layer with half of the blur: the level subtracts about what the rest adds.
         """
         blur = 0.5 * self.parameters.blur**2
         x, y = v[0] - blur, v[2] - blur
@@ -244,27 +248,27 @@ class ImageModel:
         """Relative residual at K, its Jacobian, and the information of the residual.
 
         Args:
-            v: measured moments (m²) in their principal axes, so that the second is 0.
-            force: measured, N.
-            frames: how many were averaged.
+            v: measured moments, m², in their principal axes, so that the second is 0.
+            force: measured force, N.
+            frames: number of frames that were averaged.
             k: K11, K12, K22 in the same axes, 1/m.
 
         Returns:
             J (3, 3) on q = (K11, √2 K12, K22), m; residual (3,); its inverse covariance (3, 3).
 
         Raises:
-            ValueError: where the surface is as hollow as the probe, or nothing is above the level.
+            ValueError: the surface is as hollow as the probe, or nothing is above the level.
         """
         (a, b), (c, s), det = self._principal(k)
-        h = _STEP * a
+        h = _DIFFERENCE_STEP * a
         depth = self.depth(force, det)
         bent = depth * (1.0 + h / a) ** 0.25, depth * (1.0 + h / b) ** 0.25
         shown = self.shown(np.array((depth, *bent)), np.array((a, a + h, a)), np.array((b, b, b + h)))
         (v1, v2), (a1, a2), (b1, b2) = self.moments_of(shown)
-        # by the entries of K in its own axes, K = 2 A − I/R_p; an isotropic function turns with its argument
+        # derivatives by K in its principal axes, K = 2 A − I/R_p; moments turn with K, which gives that by K12 (shear)
         d11, d21, d12, d22 = (0.5 * d / h for d in (a1 - v1, a2 - v2, b1 - v1, b2 - v2))
         apart = 2.0 * (a - b)
-        shear = (v1 - v2) / apart if apart > _ROUND * a else d11 - d12
+        shear = (v1 - v2) / apart if apart > _MIN_CURVATURE_DIFFERENCE * a else d11 - d12
         scale = 1.0 / v[0], 1.0 / math.sqrt(v[0] * v[2]), 1.0 / v[2]
         cc, cs, ss = c * c, c * s, s * s
         rows = []
@@ -272,7 +276,7 @@ class ImageModel:
             by1, by2, by12 = x * d11 + z * d21, x * d12 + z * d22, y * shear
             k11 = weight * (by1 * cc + by2 * ss - by12 * cs)
             k22 = weight * (by1 * ss + by2 * cc + by12 * cs)
-            rows.append((k11, weight * _ROOT * ((by1 - by2) * cs + 0.5 * by12 * (cc - ss)), k22))
+            rows.append((k11, weight * _ROOT2 * ((by1 - by2) * cs + 0.5 * by12 * (cc - ss)), k22))
         here = _in_axes(v1, v2, (c, s))
         residual = np.array([weight * (m - m0) for weight, m, m0 in zip(scale, v, here, strict=True)])
         return np.array(rows), residual, self._information(frames, self._lightness(depth))

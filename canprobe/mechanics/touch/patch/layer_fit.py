@@ -1,4 +1,4 @@
-"""Fits the stiffness of the layer to the arm's way into the object."""
+"""Fits the stiffness of the layer, and the arm's compliance, to the arm's way into the object."""
 
 from __future__ import annotations
 
@@ -18,14 +18,20 @@ def stiffness_by_depth(
     radius: float,
     by_images: tuple[float, float],
 ) -> tuple[float, float, float, float]:
-    """K/h (N/m³) by how far the arm went in between touches of one place; the arm's compliance (m/N); each with its σ.
+    """Stiffness by the arm's way between touches of one place with different forces, and the arm's compliance.
 
-    On a stiff arm the way between two forces at one place is that of the layer, `δ = √(2 F √det A / (π k))`. What the
-    way has more than the stiffness that the images show (with its σ) grows with the force: the arm's compliance. Its
-    σ is that of the ways' scatter and of that stiffness.
+    On a stiff arm the way between two forces at one place is that of the layer, `δ = √(2 F √det A / (π k))`. The part
+    of the way beyond the stiffness that the images show grows with the force: it is the arm's compliance. Its σ is that
+    of the scatter of the ways and of the images' stiffness.
+
+    Args:
+        dwells, shown: the touches.
+        forces: their forces, N.
+        radius: radius of the probe, m.
+        by_images: stiffness K/h from the images and its σ, N/m³.
 
     Returns:
-        NaN where no place was touched with two forces.
+        K/h and its σ (N/m³), compliance and its σ (m/N); NaN where no place was touched with two forces.
     """
     stiffness, stiffness_sigma = by_images
     rows = []

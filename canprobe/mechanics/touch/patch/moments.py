@@ -9,7 +9,7 @@ from canprobe.mechanics.touch.linear_algebra import read_only
 from canprobe.mechanics.touch.patch.image import PatchCalibration
 
 LEVEL_COUNTS = 6
-"""Taken off every taxel: the first count above the sensor's threshold of 2 %."""
+"""Counts that are subtracted from every taxel: the first count above the sensor's threshold of 2 %."""
 
 Moments = tuple[float, float, float]
 """xx, xy, yy of a symmetric tensor in the tangent plane."""
@@ -18,10 +18,13 @@ Moments = tuple[float, float, float]
 class MomentImage:
     """Second central moments of the pressure above a level.
 
-    A taxel at the patch's rim has the longest lever. Cut off at the threshold it enters and leaves with a jump, and
-    the moments depend on where a resting patch lies on the grid: 2.5–4 % of the moment across a cylinder of 36 mm at
-    2 N. With the level taken off it fades; there 0.6 % are left.
+    A taxel at the patch's rim has the longest lever. Why not just cut at the threshold: a taxel would enter and leave
+    with a jump, and the moments would depend on where a patch lies on the grid, by 2.5–4 % of the moment across a
+    cylinder of 36 mm at 2 N. With the level subtracted the pressure fades out, and 0.6 % are left.
 
+    Args:
+        calibration: pressures and weights of the taxels.
+        level_counts: the level, in counts.
     """
 
     def __init__(self, calibration: PatchCalibration, level_counts: int = LEVEL_COUNTS) -> None:

@@ -1,4 +1,4 @@
-"""Fits how centroids trail, how they scatter, and over which way an error of theirs lasts."""
+"""Fits the lag and the scatter of centroids, and the way over which an error of a centroid lasts."""
 
 from __future__ import annotations
 
@@ -12,37 +12,38 @@ from canprobe.mechanics.touch.patch.array_calibration import CentroidErrors, Lag
 from canprobe.mechanics.touch.patch.image_fit import Dwell, Shown
 from canprobe.mechanics.types import Floats
 
-REACH_M = 200e-6, 0.2
-"""Expected `Lag.reach`, m, and how far its logarithm may be off: rolls of one length hardly tell it from `Lag.most`."""
+REACH_M, REACH_LOG_SIGMA = 200e-6, 0.2
+"""Expected `Lag.reach`, m, and the standard deviation of its logarithm: rolls of one length hardly separate it from
+`Lag.most`."""
 SCATTER_WAY_M = 1e-3
 """Way over the pad within which centroids scatter as their noise: 20 mm of a scan whose pad follows the normal."""
 CORRELATED_FRAMES = 20
-"""Images in a row whose centroids err alike, about."""
+"""Number of successive images whose centroids have about the same error."""
 LAG_STEPS, LAG_STEP_M = 16, 1e-4
-"""Of the autocorrelation along the way over the pad."""
-TAU_S = 0.02, 0.3
-"""Time constants of `Lag`."""
+"""Number and length (m) of the steps of the autocorrelation along the way over the pad."""
+TIME_CONSTANTS_S = 0.02, 0.3
+"""Time constants `Lag.quick_s` and `Lag.slow_s`, s."""
 
 
 def _means(t: Floats, at: Floats) -> Floats:
-    """(n, 2) from the slow to the quick exponential mean of places (n, 2), as `PadLag` has them."""
+    """(n, 2) ways from the slow to the quick exponential mean of places (n, 2), as `PadLag` computes them."""
     quick = slow = at[0]
     ways = np.zeros_like(at)
     for i in range(1, len(t)):
         dt = t[i] - t[i - 1]
-        quick = quick + (1.0 - math.exp(-dt / TAU_S[0])) * (at[i] - quick)
-        slow = slow + (1.0 - math.exp(-dt / TAU_S[1])) * (at[i] - slow)
+        quick = quick + (1.0 - math.exp(-dt / TIME_CONSTANTS_S[0])) * (at[i] - quick)
+        slow = slow + (1.0 - math.exp(-dt / TIME_CONSTANTS_S[1])) * (at[i] - slow)
         ways[i] = quick - slow
     return ways
 
 
 def fit_centroids(dwells: Sequence[Dwell], shown: Sequence[Shown]) -> tuple[CentroidErrors, Floats]:
-    """How centroids err, and the (n,) scatter of those of each touch, m.
+    """Errors of centroids, and the (n,) scatter of the centroids of each touch, m.
 
-    Latency and lag from the rolls to and fro, then what is left of all by load, and how long it lasts.
+    Latency and lag are fitted to the rolls to and fro; then the scatter of all touches by load, and its correlation.
 
-    Hysteresis trails by a way and latency by a time: in the middle of a stroke the ways are alike at any speed. The
-    rolls are as short as a scan's: over longer ways the centroid trails further.
+    Hysteresis lags by a way and latency by a time: in the middle of a stroke the way is the same at any speed, which
+    separates them. The rolls are as short as those of a scan: over longer ways the centroid lags further.
     """
     rolls = [s for d, s in zip(dwells, shown, strict=True) if d.to_and_fro]
     latency, latency_sigma = _latency(rolls)
@@ -56,9 +57,9 @@ def fit_centroids(dwells: Sequence[Dwell], shown: Sequence[Shown]) -> tuple[Cent
     def residuals(z: Floats) -> Floats:
         each = [left(z, *pair) for pair in taught]
         centred = [1e5 * (r - r.mean(axis=0)).reshape(-1) / math.sqrt(len(r)) for r in each]
-        return np.concatenate([*centred, [math.log(abs(z[1]) / (1e4 * REACH_M[0])) / REACH_M[1]]])
+        return np.concatenate([*centred, [math.log(abs(z[1]) / (1e4 * REACH_M)) / REACH_LOG_SIGMA]])
 
-    z = least_squares(residuals, np.array([1.0, 1e4 * REACH_M[0]])).x
+    z = least_squares(residuals, np.array([1.0, 1e4 * REACH_M])).x
     most, reach = (1e-4 * z).tolist()
     rest = [left(z, s, _means(s.t_s, s.raw)) for s in shown]
     sigma = [_scatter(r, s.way) for r, s in zip(rest, shown, strict=True)]
@@ -89,7 +90,7 @@ def _scatter(r: Floats, way: Floats) -> float:
 
 
 def _latency(rolls: Sequence[Shown]) -> tuple[float, float]:
-    """By which images are older than their stamps, s, and its σ: by the middle of strokes at several speeds."""
+    """Age of images at their time stamps, s, and its σ, from the middle of strokes at several speeds."""
     rows = []
     for s in rolls:
         along = s.way - s.way.mean(axis=0)
@@ -119,7 +120,7 @@ def _lasting(errors: Sequence[Floats], ways: Sequence[Floats]) -> tuple[float, f
         lags += [float((on_grid[:, : len(grid) - k] * on_grid[:, k:]).mean()) for k in range(LAG_STEPS)]
     if lags[0] <= 0.0:
         return 0.0, LAG_STEP_M
-    # that each error has its mean taken off shifts all of them down
+    # the mean of each error was subtracted, which shifts the whole autocorrelation down
     at = LAG_STEP_M * np.arange(1, LAG_STEPS)
 
     def residuals(z: Floats) -> Floats:

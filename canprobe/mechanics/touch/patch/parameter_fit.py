@@ -1,4 +1,4 @@
-"""Fits the parameters of the image model to what images show, and the errors that are left."""
+"""Fits the parameters of the image model to images of touches, and gives the errors that are left."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from scipy.optimize import least_squares
 from canprobe.mechanics.touch.patch.array_calibration import ImageParameters, MomentErrors
 from canprobe.mechanics.touch.patch.image import PatchCalibration
 from canprobe.mechanics.touch.patch.image_fit import (
-    BLUR_PITCH,
-    CROSSTALK,
-    MEMORY,
+    BLUR_PRIOR_PITCH,
+    CROSSTALK_PRIOR,
+    MEMORY_PRIOR,
     MIN_CURVATURE_SHARE,
     NO_ERRORS,
     TOUCH_SIGMA,
@@ -29,7 +29,7 @@ Pairs = Sequence[tuple[Dwell, Shown]]
 
 
 class ParameterFit(NamedTuple):
-    """Parameters, their covariance (5, 5) in the order of `_as_vector`, and the forces (n,) of the touches, N."""
+    """Parameters, their covariance (5, 5) in the order of `ImageParameters`, and the forces (n,) of the touches, N."""
 
     parameters: ImageParameters
     covariance: Floats
@@ -68,9 +68,10 @@ def fit_parameters(  # noqa: PLR0917
     Args:
         dwells, shown: the touches.
         plain: full scale, pitch and radius of the probe.
-        scale_sigma: of ln(scale) about 0, where the stated full scale is the reference; None: forces are.
-        reference_sigma: relative, of reference forces.
-        seen: taxels along the side of the window.
+        scale_sigma: standard deviation of ln(scale) about 0, where the stated full scale is the reference; None where
+            forces are.
+        reference_sigma: relative standard deviation of reference forces.
+        seen: number of taxels along the side of the window.
     """
     n = len(dwells)
     kappa = np.array([d.kappa for d in dwells])
@@ -79,8 +80,10 @@ def fit_parameters(  # noqa: PLR0917
     reference = np.array([dwells[i].force for i in known], dtype=float)
     a, b = (0.5 * (1.0 / plain.radius_m + kappa)).T
     side = max(plain.pad.shape)
-    prior = np.array([math.log(1e8), 0.0, BLUR_PITCH[0], CROSSTALK[0], MEMORY[0]])
-    widths = np.array([5.0, 5.0 if scale_sigma is None else scale_sigma, BLUR_PITCH[1], CROSSTALK[1], MEMORY[1]])
+    prior = np.array([math.log(1e8), 0.0, BLUR_PRIOR_PITCH[0], CROSSTALK_PRIOR[0], MEMORY_PRIOR[0]])
+    widths = np.array(
+        [5.0, 5.0 if scale_sigma is None else scale_sigma, BLUR_PRIOR_PITCH[1], CROSSTALK_PRIOR[1], MEMORY_PRIOR[1]]
+    )
 
     def residuals(z: Floats) -> Floats:
         parameters = _as_parameters(z[:5], plain.pitch_m)

@@ -16,9 +16,15 @@ from canprobe.mechanics.types import Floats
 def taxel_gains(
     pad: Pad, model: ImageModel, dwells: Sequence[Dwell], shown: Sequence[Shown], forces: Sequence[float]
 ) -> tuple[Floats, tuple[tuple[int, int], ...]]:
-    """Gain of each taxel over the mean, and those that are dead.
+    """Gain of each taxel over the mean, and dead taxels.
 
-    The image of the model is laid on the centroid of each image; taxels above a fifth of the peak count.
+    The model's image is placed on the centroid of each image; taxels above a quarter of its peak are used.
+
+    Args:
+        pad: the taxels.
+        model: the image model.
+        dwells, shown: the touches.
+        forces: their forces, N.
 
     Returns:
         (rows, columns) gains, 1 where nothing is known; (row, column) of dead taxels.

@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 
-from canprobe.mechanics.touch.estimate.gauss_newton_step import solved_once
 from canprobe.mechanics.touch.estimate.information import InformationFilter
 from canprobe.mechanics.touch.estimate.known_curvature import curvature_covariance
 from canprobe.mechanics.touch.estimate.noise import Correlation, Noise
@@ -14,6 +13,7 @@ from canprobe.mechanics.touch.estimate.omitted_terms import ExpectedMisfit, Omit
 from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.estimate.residuals import curvature_jacobian, design
 from canprobe.mechanics.touch.estimate.sandwich import Score
+from canprobe.mechanics.touch.estimate.start import solved_once
 from canprobe.mechanics.touch.estimate.terms import shifted, terms
 
 MEMORY = 0.02

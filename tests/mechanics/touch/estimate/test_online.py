@@ -9,7 +9,7 @@ from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.change import ChangeTest
 from canprobe.mechanics.touch.estimate.fit import fit_surface, make_estimator
 from canprobe.mechanics.touch.estimate.following import LAG_SHARE, SPAN_SHARE, FollowingEstimator, less_certain
-from canprobe.mechanics.touch.patch.curvature import FEW_FRAMES, FINE_OUTLIER_SHARE, MIN_FRAMES, _Mean
+from canprobe.mechanics.touch.patch.curvature import MAX_RECENT_FRAMES, MIN_FRAMES, RECENT_OUTLIER_SHARE, _Mean
 
 MEMORY = 0.02
 SIGMAS = {"sigma_point": 2e-5, "sigma_normal": 1e-3}
@@ -104,7 +104,7 @@ def test_ml_forgets_what_was_before_an_edge():
 
 
 def test_a_mean_of_moments_takes_a_row_of_far_ones_for_a_change_and_a_single_one_for_wrong():
-    mean = _Mean(FEW_FRAMES, FINE_OUTLIER_SHARE)
+    mean = _Mean(MAX_RECENT_FRAMES, RECENT_OUTLIER_SHARE)
     for _ in range(20):
         mean.add(1.0, 0.0, 1.0)
     mean.add(5.0, 0.0, 5.0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from canprobe.mechanics.touch.contact import ContactSample
-from canprobe.mechanics.touch.estimate import gauss_newton_step as one_step
+from canprobe.mechanics.touch.estimate import start as first_stretch
 from canprobe.mechanics.touch.estimate.fit import make_estimator
 from canprobe.mechanics.touch.estimate.information import MeasuredContact, batch_design
 from canprobe.mechanics.touch.estimate.nonlinear import fit
@@ -78,13 +78,13 @@ class TestWork:
     @pytest.fixture
     def evaluations(self, monkeypatch):
         sizes = []
-        linearise = one_step.linearise
+        linearise = first_stretch.linearise
 
         def counted(c, d):
             sizes.append(len(d.X))
             return linearise(c, d)
 
-        monkeypatch.setattr(one_step, "linearise", counted)
+        monkeypatch.setattr(first_stretch, "linearise", counted)
         return sizes
 
     @pytest.mark.parametrize("pace", [0.125e-3, 0.02e-3], ids=["nominal", "slow"])

@@ -16,8 +16,7 @@ from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.patch.array_calibration import ImageParameters, MomentErrors
 from canprobe.mechanics.touch.patch.creep import PadMemory
 from canprobe.mechanics.touch.patch.curvature import MIN_FRAMES, PatchCurvature
-from canprobe.mechanics.touch.patch.fused_answer import patch_estimate
-from canprobe.mechanics.touch.patch.fused_estimator import PatchedEstimator
+from canprobe.mechanics.touch.patch.fused_estimator import PatchedEstimator, patch_estimate
 from canprobe.mechanics.touch.patch.image import PatchCalibration
 from canprobe.mechanics.touch.patch.image_model import USUAL_LIGHTNESS, ImageModel
 from canprobe.mechanics.touch.patch.moments import LEVEL_COUNTS, MomentImage

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from canprobe.mechanics.touch.patch.array_calibration import Lag
-from canprobe.mechanics.touch.patch.creep import TIMES_S, PadMemory
+from canprobe.mechanics.touch.patch.creep import TIME_CONSTANTS_S, PadMemory
 from canprobe.mechanics.touch.patch.pad_lag import GAP_S, PadLag
 
 
@@ -14,7 +14,7 @@ def remembered(t, uv):
     """(3,) uu, uv, vv of the way back, each past place with the share of the memory that it filled, all memories."""
     total = np.zeros(3)
     back = uv - uv[-1]
-    for tau in TIMES_S:
+    for tau in TIME_CONSTANTS_S:
         filled = np.exp(-(t[-1] - t[1:]) / tau) - np.exp(-(t[-1] - t[:-1]) / tau)
         total += filled @ np.stack([back[1:, 0] ** 2, back[1:, 0] * back[1:, 1], back[1:, 1] ** 2], axis=1)
     return total
@@ -36,7 +36,7 @@ def test_a_patch_that_rests_leaves_nothing_and_one_that_has_moved_is_forgotten()
     for i in range(200):
         assert memory.add(0.05 * i, 1e-3, -2e-3) == pytest.approx((0.0, 0.0, 0.0), abs=1e-17)
     moved = [memory.add(10.0 + 0.05 * i, 3e-3, -2e-3)[0] for i in range(4000)]
-    full = 1.0 - np.exp(-10.0 / np.array(TIMES_S))
+    full = 1.0 - np.exp(-10.0 / np.array(TIME_CONSTANTS_S))
     assert moved[0] == pytest.approx(4e-6 * full.sum(), rel=0.1)
     assert np.all(np.diff(moved) < 0.0)
     assert moved[-1] < 0.005 * moved[0]
