@@ -47,9 +47,9 @@ def test_a_touch_is_as_planned_to_the_frame(press):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["axial", "cylinder", "free", "listen", "plane", "saddle", "sphere"])
+@pytest.mark.parametrize("name", ["axial", "cylinder", "free", "listen"])
 def test_a_packaged_scene_sends_what_its_plan_lists_and_nothing_else(name, tmp_path):
-    """The others are measured where they are run anyway."""
+    """The others are measured where they run anyway, or differ from `cylinder` by the object, which no frame knows."""
     result = undrawn_run(canprobe.load_scene(name), out=tmp_path, duration_s=0.5)
     measured = canprobe.measure_traffic(tmp_path, result.plan)
     assert measured.as_planned and measured.exact

@@ -1,4 +1,4 @@
-"""Each packaged object and stiffness, six seconds of scan in lockstep, scored against the plant's truth."""
+"""Each packaged object and stiffness, some seconds of scan in lockstep, scored against the plant's truth."""
 
 from dataclasses import replace
 
@@ -30,7 +30,8 @@ def test_scene_runs_completely_with_sensible_figures(name, tmp_path):
     force_percent, kappa_percent = TABLE[name]
     scene = canprobe.load_scene(name)
     run = undrawn_run if scene.object.kind == "cylinder" else canprobe.run  # a cylinder is drawn elsewhere
-    result = run(scene, out=tmp_path, duration_s=6.0)
+    seconds = 6.0 if name == "miscalibrated" else 3.0  # a wrong tool is seen over a longer way only
+    result = run(scene, out=tmp_path, duration_s=seconds)
     taken_along = {"relief.npz"} if name == "relief" else set()
     assert {path.name for path in tmp_path.iterdir()} == set(result.plan.outputs) | taken_along
     measured = canprobe.measure_traffic(tmp_path, result.plan)

@@ -1,5 +1,6 @@
 """What a plan uses and leaves out, as data, JSON and text."""
 
+import functools
 import json
 import subprocess
 import sys
@@ -95,9 +96,14 @@ def test_outputs_without_truth():
     assert "truth.npz" not in canprobe.plan(real).outputs
 
 
+@functools.cache
+def packaged_plan(name):
+    return canprobe.plan(load_scene(name))
+
+
 @pytest.mark.parametrize("name", [name for name, _ in packaged_scenes()])
 def test_json_says_what_the_plan_says(name):
-    plan = canprobe.plan(load_scene(name))
+    plan = packaged_plan(name)
     document = json.loads(json.dumps(plan_dict(plan), allow_nan=False))
     assert document["scene"] == name
     assert [node["node_id"] for node in document["nodes"]] == list(plan.node_ids)
@@ -108,7 +114,7 @@ def test_json_says_what_the_plan_says(name):
 
 @pytest.mark.parametrize("name", [name for name, _ in packaged_scenes()])
 def test_text_shows_every_node_pdo_and_omission(name):
-    plan = canprobe.plan(load_scene(name))
+    plan = packaged_plan(name)
     text = plan_text(plan)
     assert all(f"{pdo.cob_id:03X}h" in text for pdo in plan.pdos)
     assert all(node.role in text for node in plan.nodes)

@@ -135,8 +135,12 @@ def test_eight_drives_with_an_array_need_a_second_bus_or_a_third_of_a_kilohertz(
     assert f"a second bus for half of the drives ({half})" in texts
 
 
-def test_average_below_one_but_peak_too_high_is_refused(cylinder):
-    """At 50 Hz the image takes 85 % on average, yet a frame is not through before its deadline of two cycles."""
+def test_average_below_one_but_peak_too_high_is_refused(cylinder, monkeypatch):
+    """At 50 Hz the image takes 85 % on average, yet a frame is not through before its deadline of two cycles.
+
+    The search for ways out, which takes a quarter of a minute at this rate, is tried elsewhere.
+    """
+    monkeypatch.setattr("canprobe.cell.planning.make.ways_out", lambda *_: [])
     problems = reasons(change(cylinder, sensor={"mode": "image", "rate_hz": 50.0}))
     assert not any("load" in problem for problem in problems)
     assert any("7585 µs of the 5000 µs" in problem for problem in problems)
