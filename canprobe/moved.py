@@ -13,8 +13,7 @@ import importlib.util
 import sys
 import warnings
 from collections.abc import Sequence
-from importlib.abc import InspectLoader, MetaPathFinder
-from importlib.machinery import ModuleSpec
+from importlib.machinery import ModuleSpec, SourceFileLoader
 from types import CodeType, ModuleType
 
 _ROOMS = {
@@ -57,8 +56,8 @@ def new_name(name: str) -> str | None:
     return None
 
 
-class MovedModules(MetaPathFinder, InspectLoader):
-    """Finds a module under its old name."""
+class MovedModules:
+    """Finds and loads a module under its old name; without the base classes of `importlib.abc`, which load slowly."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
@@ -66,7 +65,10 @@ class MovedModules(MetaPathFinder, InspectLoader):
         """The specification of a module that moved."""
         new = new_name(fullname)
         found = importlib.util.find_spec(new) if new is not None else None
-        return None if found is None else ModuleSpec(fullname, self, origin=found.origin)
+        return None if found is None else ModuleSpec(fullname, self, origin=found.origin)  # type: ignore[arg-type]
+
+    def create_module(self, spec: ModuleSpec) -> None:
+        """A module as always."""
 
     def exec_module(self, module: ModuleType) -> None:
         """Put the module into the place of its old name."""
@@ -82,12 +84,8 @@ class MovedModules(MetaPathFinder, InspectLoader):
         """The code of the module, for `python -m`."""
         spec = importlib.util.find_spec(self._named(fullname))
         assert spec is not None
-        assert isinstance(spec.loader, InspectLoader)
+        assert isinstance(spec.loader, SourceFileLoader)
         return spec.loader.get_code(spec.name)
-
-    def get_source(self, fullname: str) -> str | None:
-        """The source is found under the new name."""
-        return None
 
     def _named(self, old: str) -> str:
         new = new_name(old)
