@@ -241,8 +241,7 @@ def test_run_passes_everything_on(calls, tmp_path, capsys):
     ((name, (scene,), kwargs),) = calls
     assert (name, scene.name) == ("run", "free")
     assert bus_of(scene) == ("socketcan", "vcan3", 500_000)
-    given = {key: kwargs[key] for key in ("seed", "duration_s", "out")}
-    assert given == {"seed": 7, "duration_s": 2.5, "out": tmp_path / "out"}
+    assert (scene.seed, scene.task.duration_s, kwargs["out"]) == (7, 2.5, tmp_path / "out")
     assert capsys.readouterr().out == f"all went well\nnext: canprobe view {tmp_path / 'out'}\n"
 
 
@@ -279,7 +278,6 @@ def test_run_takes_the_scenes_bus_by_default(calls):
     assert main(["run", "free"]) == 0
     ((_, (scene,), kwargs),) = calls
     assert bus_of(scene) == ("lockstep", "can0", 1_000_000)
-    assert (kwargs["seed"], kwargs["duration_s"]) == (None, None)
     assert (kwargs["out"].parent, kwargs["out"].name[:5]) == (Path("runs"), "free-")
 
 

@@ -168,11 +168,20 @@ def test_a_run_of_a_packaged_scene_as_it_is_shows_what_to_expect(capsys, tmp_pat
 
 
 def test_a_true_force_above_the_limit_is_a_warning_of_the_summary(capsys, tmp_path):
-    stiff = ["--set", "plant.stiffness_n_m3=5e9", "--duration", "0.5", "--out", str(tmp_path / "run")]
+    stiff = [
+        "--set",
+        "plant.stiffness_n_m3=5e9",
+        "--set",
+        "limits.force_max_n=4",
+        "--duration",
+        "0.5",
+        "--out",
+        str(tmp_path / "run"),
+    ]
     assert main(["run", "press", "--bus", "direct", *stiff]) == 0
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     (warning,) = summary["warnings"]
-    assert f"{summary['contact']['force_max_n']:.2f} N, above limits.force_max_n = 5" in warning
+    assert f"{summary['contact']['force_max_n']:.2f} N, above limits.force_max_n = 4" in warning
     assert f"  warning    {warning}" in capsys.readouterr().out
 
 

@@ -38,7 +38,6 @@ from canprobe.cell.planning.units import range_problems, speed_problems, within_
 from canprobe.cell.planning.warnings import warnings
 from canprobe.cell.planning.ways_out import ways_out
 from canprobe.cell.planning.window import cut_patch
-from canprobe.cell.scene.rules import with_choices
 from canprobe.cell.scene.setup import Node, Setup
 from canprobe.errors import EdsError, PlanError
 from canprobe.mechanics.robot.dynamics import dynamics_problem, impossible_bodies
@@ -90,7 +89,7 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
     if problems or bus is None:
         raise PlanError(_shared(problems), ways)
     chosen = {choice.key: choice.value for choice in bus.choices}
-    setup = replace(setup, scene=with_choices(setup.scene, chosen), saved=with_choices(setup.saved, chosen))
+    setup = setup.with_choices(chosen)
     absent = left_out(setup)
     plan = Plan(
         setup=setup,

@@ -206,10 +206,11 @@ def load_scene(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = 
         own = read_toml(path, file, "; `canprobe scenes` lists the packaged ones")
     else:
         raise UsageError(f"scene: expected a packaged name, the path of a TOML file or a Scene, got {scene!r}")
+    document = _as_scene(own)
     if overrides:
-        own, file = _with_overrides(own, overrides, file), f"{file} as changed"
-        _refuse_deep(own, file)
-    return _scene(own, file, folder, whole=whole)
+        document, file = _with_overrides(document, overrides, file), f"{file} as changed"
+        _refuse_deep(document, file)
+    return _scene(document, file, folder, whole=whole)
 
 
 def _with_overrides(own: Mapping[str, Any], overrides: Mapping[str, Any], file: str) -> dict[str, Any]:
@@ -379,7 +380,7 @@ def parse_scene(text: str, *, file: str = "scene", folder: Path | None = None) -
     Raises:
         SceneError: the text has problems; the error has all of them.
     """
-    return _scene(parse_toml(text, file), file, folder)
+    return _scene(_as_scene(parse_toml(text, file)), file, folder)
 
 
 def read_toml(path: Path, file: str, else_what: str = "") -> dict[str, Any]:
@@ -441,8 +442,6 @@ def _scene(own: Mapping[str, Any], file: str, folder: Path | None, *, whole: boo
     Everything is checked together. A whole document has what its array file says: the file is not read again.
     """
     own, file = with_writer(own, file)
-    if _are_tables(own.get("cell")) and not {"scene", "task"} & set(own):
-        own = _free_scene(own)
     task = own.get("task")
     kind = task.get("kind") if isinstance(task, dict) else None
     needs = SECTIONS_OF_TASK.get(kind, {}) if isinstance(kind, str) else {}
@@ -478,8 +477,12 @@ def _scene(own: Mapping[str, Any], file: str, folder: Path | None, *, whole: boo
     return Scene(**values)
 
 
+def _as_scene(own: Mapping[str, Any]) -> Mapping[str, Any]:
+    """A document of a scene, or of the one that moves the arm of a cell freely."""
+    return _free_scene(own) if _are_tables(own.get("cell")) and not {"scene", "task"} & set(own) else own
+
+
 def _free_scene(cell: Mapping[str, Any]) -> dict[str, Any]:
-    """A scene that moves the arm of a cell freely."""
     used = {name: table for name, table in cell.items() if SECTIONS_OF_TASK["free"].get(name, ("",))[0] != "never"}
     name = cell["cell"].get("name", CellInfo().name)
     return {"scene": {"name": name}, "task": {"kind": "free"}, **used}

@@ -23,6 +23,7 @@ from canprobe.cell.scene.model import (
     ShapeMethod,
     TaskKind,
 )
+from canprobe.cell.scene.rules import with_choices
 from canprobe.fieldbus.node.quirks import Quirks
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.protocol.raw_image import ImageFormat
@@ -466,6 +467,14 @@ class Setup:
     kind: TaskKind
     task: Task
     truth: Truth
+
+    def with_choices(self, choices: Mapping[str, object]) -> Setup:
+        """The setup of the scene in which the choices of the plan stand in the place of "auto".
+
+        Args:
+            choices: value by key path of the scene: `{"sensor.mode": "window"}`.
+        """
+        return replace(self, scene=with_choices(self.scene, choices), saved=with_choices(self.saved, choices))
 
     @property
     def touch(self) -> Touch | Calibrate | None:

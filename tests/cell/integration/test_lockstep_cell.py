@@ -235,8 +235,8 @@ def test_own_controller_in_ten_lines():
             return Command(q_target=target, done=measurement.cycle > 600)
 
         cell.run(nod)
-    assert np.ptp(cell.truth["q_rad"][:, 5]) == pytest.approx(0.2, abs=0.01)
-    assert np.ptp(cell.truth["q_rad"][:, 0]) < 1e-3
+    assert np.ptp(cell.session.truth["q_rad"][:, 5]) == pytest.approx(0.2, abs=0.01)
+    assert np.ptp(cell.session.truth["q_rad"][:, 0]) < 1e-3
 
 
 def test_what_is_no_controller_is_told_before_a_drive_is_enabled():

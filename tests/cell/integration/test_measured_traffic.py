@@ -127,10 +127,10 @@ def test_a_bus_with_errors_carries_every_frame_and_the_same_seed_the_same_errors
     buses = [session.lockstep for session in (first, second)]
     assert buses[0].error_frames / buses[0].frames == pytest.approx(110 * 1e-4, rel=0.3)
     assert (buses[0].frames, buses[0].error_frames) == (buses[1].frames, buses[1].error_frames)
-    assert all(one.as_planned for one in first.meters["can0"].report().classes)
+    assert all(one.as_planned for one in first.record.meters["can0"].report().classes)
     assert first.cell.drives.missed == 0
     measured = canprobe.measure_traffic(tmp_path, first.plan)
-    assert measured.error_frames == first.meters["can0"].report().error_frames == buses[0].error_frames > 0
+    assert measured.error_frames == first.record.meters["can0"].report().error_frames == buses[0].error_frames > 0
     assert not measured.as_planned and f"error frames: {measured.error_frames}" in measured.text()
     lines = [line for line in (tmp_path / "bus.log").read_text().splitlines() if " 20000088#" in line]
     assert len(lines) == measured.error_frames

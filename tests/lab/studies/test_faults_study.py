@@ -137,7 +137,7 @@ def test_the_score_sees_a_force_above_the_limit(monkeypatch):
 def test_the_score_sees_motion_and_power_after_the_stop(monkeypatch):
     monkeypatch.setattr("canprobe.cell.master.cell.Cell._stop_drives", lambda self: None)
     monkeypatch.setattr("canprobe.cell.master.bringup.BringUp.release", lambda self: None)
-    monkeypatch.setattr("canprobe.fieldbus.drive.self_stop.Supervision._sync_missing", lambda self, due_ns: None)
+    monkeypatch.setattr("canprobe.fieldbus.drive.self_stop.Supervision._lose", lambda self, code, t_ns: None)
     monkeypatch.setattr("canprobe.fieldbus.node.slave_node.SlaveNode._communication_error", lambda self, t_ns: None)
     run = carry_out(FaultCase(0, FEATURES, "", ()))
     assert any("OPERATION_ENABLED after the stop" in failure for failure in run["failures"])
@@ -152,7 +152,7 @@ def test_the_score_sees_a_hang_a_crash_a_torn_log_and_no_summary(monkeypatch):
         raise ZeroDivisionError("nobody thought of it")
 
     monkeypatch.setattr(touch.TouchTask, "step", crash)
-    monkeypatch.setattr("canprobe.cell.session.session.TrafficMeter.frames", property(lambda self: 1))
+    monkeypatch.setattr("canprobe.cell.session.bus_record.TrafficMeter.frames", property(lambda self: 1))
     monkeypatch.setattr("canprobe.lab.studies.fault_scores.summarise", lambda *_: {"force": float("nan")})
     failures = carry_out(FaultCase(0, FEATURES, "", ()))["failures"]
     assert any("ZeroDivisionError" in failure for failure in failures)

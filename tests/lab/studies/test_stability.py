@@ -147,7 +147,7 @@ class InLine:
 ENDINGS = [
     ("stable", ""),
     ("stopped", "above the limit"),
-    ("stopped", "the array is saturated and no stiffness was measured"),
+    ("stopped", "the force does not settle"),
     ("stopped", "no tactile frame"),
     ("refused", "worst-case load"),
     ("refused", "out of reach"),
