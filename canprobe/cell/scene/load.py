@@ -44,6 +44,16 @@ MAX_BYTES, MAX_DEPTH = 64 << 20, 32
 _ESCAPES = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\t": "\\t", "\r": "\\r", "\b": "\\b", "\f": "\\f"}
 
 
+_ANNOTATIONS: dict[type, Mapping[str, Any]] = {}
+
+
+def _annotations(cls: type[Any]) -> Mapping[str, Any]:
+    """The types of a dataclass's fields, evaluated once: that takes longer than to read a file."""
+    if cls not in _ANNOTATIONS:
+        _ANNOTATIONS[cls] = typing.get_type_hints(cls, include_extras=True)
+    return _ANNOTATIONS[cls]
+
+
 def dump_scene(scene: Scene | CellFile) -> str:
     """The scene as a TOML document that loads back equal, with every value that its kind uses.
 
@@ -74,7 +84,7 @@ def _document(scene: Scene) -> dict[str, Any]:
 
 def _values(section: Any) -> dict[str, Any]:
     """The keys of a section that have a value and belong to the others."""
-    annotations, values = typing.get_type_hints(type(section), include_extras=True), {}
+    annotations, values = _annotations(type(section)), {}
     for field in dataclasses.fields(section):
         value = getattr(section, field.name)
         only = conditions_of(annotations[field.name], Only)
@@ -114,7 +124,7 @@ def gathered(scene: Scene) -> tuple[Scene, dict[str, bytes]]:
     files: dict[str, bytes] = {}
 
     def beside(section: Any) -> Any:
-        annotations = typing.get_type_hints(type(section), include_extras=True)
+        annotations = _annotations(type(section))
         names = {}
         for key in FILE_KEYS & set(annotations):
             value = getattr(section, key)
@@ -555,7 +565,7 @@ class Reader:
             document: the document as `tomllib` gives it.
             needed: sections that are read as empty ones where they are missing.
         """
-        sections, needed = typing.get_type_hints(file), set(needed)
+        sections, needed = _annotations(file), set(needed)
         for name in document:
             if name not in sections:
                 self.complain(name, f"unknown section{_did_you_mean_key(name, sections)}")
@@ -590,7 +600,7 @@ class Reader:
         """Read a section; a key that has a problem or is missing is None in it."""
         if not isinstance(table, dict):
             return self.complain(name, f"expected a section [{name}], got {toml_value(table)}")
-        annotations = typing.get_type_hints(cls, include_extras=True)
+        annotations = _annotations(cls)
         for key in table:
             if key not in annotations:
                 above = '; cell = "NAME" stands above the first section' if key == "cell" else ""
