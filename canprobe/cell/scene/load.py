@@ -213,7 +213,7 @@ def load_scene(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = 
             packaged = packaged_files("cells")
         path = find_file(name, packaged, "scene")
         file, folder = path.name if name in packaged else name, path.parent
-        own = read_toml(path, file, "; `canprobe scenes` lists the packaged ones")
+        own = _as_scene(read_toml(path, file, "; `canprobe scenes` lists the packaged ones"))
     else:
         raise UsageError(f"scene: expected a packaged name, the path of a TOML file or a Scene, got {scene!r}")
     if overrides:
@@ -445,14 +445,12 @@ def _too_deep(where: str) -> SceneError:
     return SceneError([f"{where}: expected tables and lists of at most {MAX_DEPTH} levels, got more of them"])
 
 
-def _scene(own: Mapping[str, Any], file: str, folder: Path | None, *, whole: bool = False) -> Scene:
+def _scene(own: dict[str, Any], file: str, folder: Path | None, *, whole: bool = False) -> Scene:
     """The scene in a document, with the keys of its cell and the sections that its task has by default.
 
     Everything is checked together. A whole document has what its array file says: the file is not read again.
     """
-    own, file = with_writer(own, file)
-    if _are_tables(own.get("cell")) and not {"scene", "task"} & set(own):
-        own = _free_scene(own)
+    own, file = with_writer(_as_scene(own), file)
     task = own.get("task")
     kind = task.get("kind") if isinstance(task, dict) else None
     needs = SECTIONS_OF_TASK.get(kind, {}) if isinstance(kind, str) else {}
@@ -488,10 +486,12 @@ def _scene(own: Mapping[str, Any], file: str, folder: Path | None, *, whole: boo
     return Scene(**values)
 
 
-def _free_scene(cell: Mapping[str, Any]) -> dict[str, Any]:
-    """A scene that moves the arm of a cell freely."""
-    used = {name: table for name, table in cell.items() if SECTIONS_OF_TASK["free"].get(name, ("",))[0] != "never"}
-    name = cell["cell"].get("name", CellInfo().name)
+def _as_scene(own: dict[str, Any]) -> dict[str, Any]:
+    """The document of a scene; that of a cell alone becomes a scene that moves the arm freely."""
+    if not _are_tables(own.get("cell")) or {"scene", "task"} & set(own):
+        return own
+    used = {name: table for name, table in own.items() if SECTIONS_OF_TASK["free"].get(name, ("",))[0] != "never"}
+    name = own["cell"].get("name", CellInfo().name)
     return {"scene": {"name": name}, "task": {"kind": "free"}, **used}
 
 
