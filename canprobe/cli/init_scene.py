@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from pathlib import Path
 
 import numpy as np
 
-from canprobe.cell.planning.make import make_plan
+from canprobe.cell.planning.make import device_problems, make_plan
 from canprobe.cell.scene.load import parse_scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.errors import PlanError
@@ -33,16 +34,18 @@ def write_with_first_scene(folder: Path, cell: str) -> tuple[str, str | None]:
     refused: dict[float, str] = {}
     problems: list[str] = []
     for scenes in (_scans(folder), (_FREE,)):
-        for rate in _RATES_HZ:
+        for rate, text in itertools.product(_RATES_HZ, scenes):
             write_text(folder / "cell.toml", _at_rate(cell, rate))
-            for text in scenes:
-                try:
-                    make_plan(resolve(parse_scene(text, file="first.toml", folder=folder)), find_ways=False)
-                except PlanError as error:
-                    refused.setdefault(rate, error.problems[0])
-                    problems = problems or list(error.problems)
-                else:
-                    return text, refused[rate] if text is _FREE else None
+            setup = resolve(parse_scene(text, file="first.toml", folder=folder))
+            try:
+                make_plan(setup, find_ways=False)
+            except PlanError as error:
+                refused.setdefault(rate, error.problems[0])
+                problems = problems or list(error.problems)
+                if device_problems(setup):  # then no rate helps
+                    break
+            else:
+                return text, refused.get(rate, problems[0]) if text is _FREE else None
     way = (
         "if the EDS or the URDF that this names is wrong, correct it and type the command again; if it is right, this"
         " cell needs other devices; nothing was written"

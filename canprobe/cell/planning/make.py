@@ -160,6 +160,11 @@ class _BusPlan:
         return len(self.problems), max(shares)
 
 
+def device_problems(setup: Setup) -> list[str]:
+    """What the devices of a setup lack for its task, whatever the rate."""
+    return _devices(setup)[1]
+
+
 def _choose(setup: Setup, devices: Mapping[int, Abilities], problems: list[str]) -> _BusPlan:
     """The first candidate that fits, or else the nearest to it, and then why it does not."""
     found: list[_BusPlan] = []

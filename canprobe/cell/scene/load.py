@@ -44,6 +44,16 @@ MAX_BYTES, MAX_DEPTH = 64 << 20, 32
 _ESCAPES = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\t": "\\t", "\r": "\\r", "\b": "\\b", "\f": "\\f"}
 
 
+_ANNOTATIONS: dict[type, Mapping[str, Any]] = {}
+
+
+def _annotations(cls: type[Any]) -> Mapping[str, Any]:
+    """The types of a dataclass's fields, evaluated once: that takes longer than to read a file."""
+    if cls not in _ANNOTATIONS:
+        _ANNOTATIONS[cls] = typing.get_type_hints(cls, include_extras=True)
+    return _ANNOTATIONS[cls]
+
+
 def dump_scene(scene: Scene | CellFile) -> str:
     """The scene as a TOML document that loads back equal, with every value that its kind uses.
 
@@ -74,7 +84,7 @@ def _document(scene: Scene) -> dict[str, Any]:
 
 def _values(section: Any) -> dict[str, Any]:
     """The keys of a section that have a value and belong to the others."""
-    annotations, values = typing.get_type_hints(type(section), include_extras=True), {}
+    annotations, values = _annotations(type(section)), {}
     for field in dataclasses.fields(section):
         value = getattr(section, field.name)
         only = conditions_of(annotations[field.name], Only)
@@ -114,7 +124,7 @@ def gathered(scene: Scene) -> tuple[Scene, dict[str, bytes]]:
     files: dict[str, bytes] = {}
 
     def beside(section: Any) -> Any:
-        annotations = typing.get_type_hints(type(section), include_extras=True)
+        annotations = _annotations(type(section))
         names = {}
         for key in FILE_KEYS & set(annotations):
             value = getattr(section, key)
@@ -203,14 +213,13 @@ def load_scene(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = 
             packaged = packaged_files("cells")
         path = find_file(name, packaged, "scene")
         file, folder = path.name if name in packaged else name, path.parent
-        own = read_toml(path, file, "; `canprobe scenes` lists the packaged ones")
+        own = _as_scene(read_toml(path, file, "; `canprobe scenes` lists the packaged ones"))
     else:
         raise UsageError(f"scene: expected a packaged name, the path of a TOML file or a Scene, got {scene!r}")
-    document = _as_scene(own)
     if overrides:
-        document, file = _with_overrides(document, overrides, file), f"{file} as changed"
-        _refuse_deep(document, file)
-    return _scene(document, file, folder, whole=whole)
+        own, file = _with_overrides(own, overrides, file), f"{file} as changed"
+        _refuse_deep(own, file)
+    return _scene(own, file, folder, whole=whole)
 
 
 def _with_overrides(own: Mapping[str, Any], overrides: Mapping[str, Any], file: str) -> dict[str, Any]:
@@ -436,12 +445,12 @@ def _too_deep(where: str) -> SceneError:
     return SceneError([f"{where}: expected tables and lists of at most {MAX_DEPTH} levels, got more of them"])
 
 
-def _scene(own: Mapping[str, Any], file: str, folder: Path | None, *, whole: bool = False) -> Scene:
+def _scene(own: dict[str, Any], file: str, folder: Path | None, *, whole: bool = False) -> Scene:
     """The scene in a document, with the keys of its cell and the sections that its task has by default.
 
     Everything is checked together. A whole document has what its array file says: the file is not read again.
     """
-    own, file = with_writer(own, file)
+    own, file = with_writer(_as_scene(own), file)
     task = own.get("task")
     kind = task.get("kind") if isinstance(task, dict) else None
     needs = SECTIONS_OF_TASK.get(kind, {}) if isinstance(kind, str) else {}
@@ -477,14 +486,12 @@ def _scene(own: Mapping[str, Any], file: str, folder: Path | None, *, whole: boo
     return Scene(**values)
 
 
-def _as_scene(own: Mapping[str, Any]) -> Mapping[str, Any]:
-    """A document of a scene, or of the one that moves the arm of a cell freely."""
-    return _free_scene(own) if _are_tables(own.get("cell")) and not {"scene", "task"} & set(own) else own
-
-
-def _free_scene(cell: Mapping[str, Any]) -> dict[str, Any]:
-    used = {name: table for name, table in cell.items() if SECTIONS_OF_TASK["free"].get(name, ("",))[0] != "never"}
-    name = cell["cell"].get("name", CellInfo().name)
+def _as_scene(own: dict[str, Any]) -> dict[str, Any]:
+    """The document of a scene; that of a cell alone becomes a scene that moves the arm freely."""
+    if not _are_tables(own.get("cell")) or {"scene", "task"} & set(own):
+        return own
+    used = {name: table for name, table in own.items() if SECTIONS_OF_TASK["free"].get(name, ("",))[0] != "never"}
+    name = own["cell"].get("name", CellInfo().name)
     return {"scene": {"name": name}, "task": {"kind": "free"}, **used}
 
 
@@ -558,7 +565,7 @@ class Reader:
             document: the document as `tomllib` gives it.
             needed: sections that are read as empty ones where they are missing.
         """
-        sections, needed = typing.get_type_hints(file), set(needed)
+        sections, needed = _annotations(file), set(needed)
         for name in document:
             if name not in sections:
                 self.complain(name, f"unknown section{_did_you_mean_key(name, sections)}")
@@ -593,7 +600,7 @@ class Reader:
         """Read a section; a key that has a problem or is missing is None in it."""
         if not isinstance(table, dict):
             return self.complain(name, f"expected a section [{name}], got {toml_value(table)}")
-        annotations = typing.get_type_hints(cls, include_extras=True)
+        annotations = _annotations(cls)
         for key in table:
             if key not in annotations:
                 above = '; cell = "NAME" stands above the first section' if key == "cell" else ""

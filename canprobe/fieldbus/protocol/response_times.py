@@ -144,12 +144,26 @@ def _respond_all(timed: Sequence[_Timed], bounds: Sequence[int | None], bitrate:
 def _respond(level: Sequence[_Timed], below: Sequence[tuple[_Timed, int | None]], bitrate: int) -> Response:
     """The response of the last message of a level, which is the message and all of higher priority."""
     message, frame_ns = level[-1]
+    level = [*_merged(level[:-1]), level[-1]]
     if _overloaded(level):
         return Response(message, frame_ns, None, 0)
     bit = -(-NS_PER_S // bitrate)
     found = [_busy_period(level, start, block, bit).delays() for start, block in _starts(level, below).items()]
     worst = max((delay for delays in found for delay in delays), default=0)
     return Response(message, frame_ns, max(0, (message.offset_ns or 0) + worst), max(map(len, found)))
+
+
+def _merged(messages: Sequence[_Timed]) -> list[_Timed]:
+    """The messages, where those of one timing count as one message with the time of all their frames.
+
+    They are queued together in every busy period, and who is below waits for all of them.
+    """
+    merged: dict[tuple[int | None, int, int], _Timed] = {}
+    for m, cost in messages:
+        timing = m.offset_ns, m.jitter_ns, m.period_ns
+        one, so_far = merged.get(timing, (m, 0))
+        merged[timing] = one, so_far + cost
+    return list(merged.values())
 
 
 def _overloaded(level: Sequence[_Timed]) -> bool:
@@ -174,8 +188,8 @@ class _Queued(NamedTuple):
     early: int
 
     def before(self, t: int) -> int:
-        """Most frames that are queued in [0, t)."""
-        return max(-((self.first - t) // self.period), 0) + self.early
+        """Most frames that are queued in [0, t), t ≥ 0."""
+        return self.early - (self.first - t) // self.period
 
 
 class _BusyPeriod(NamedTuple):
@@ -231,7 +245,8 @@ def _starts(level: Sequence[_Timed], below: Sequence[tuple[_Timed, int | None]])
     the period begins with that very message, and a frame that blocks it is on the bus between its earliest and its
     latest queueing.
     """
-    longest = max((c for (_, c), _ in below), default=0)
+    below = sorted(below, key=lambda one: one[0][1], reverse=True)  # the longest frame first
+    longest = below[0][0][1] if below else 0
     members = [(m, m.offset_ns) for m, _ in level if m.offset_ns is not None]
     if not members:
         return {0: longest}
@@ -249,7 +264,7 @@ def _starts(level: Sequence[_Timed], below: Sequence[tuple[_Timed, int | None]])
 
 
 def _blocking(below: Sequence[tuple[_Timed, int | None]], first: int, jitter: int) -> int:
-    """Longest frame that can be on the bus at `first` or within `jitter` after it."""
+    """First of the frames from below that can be on the bus at `first` or within `jitter` after it; 0 without any."""
 
     def can_be_on_the_bus(m: Message, end: int | None) -> bool:
         if m.offset_ns is None or end is None:
@@ -257,4 +272,4 @@ def _blocking(below: Sequence[tuple[_Timed, int | None]], first: int, jitter: in
         into = (first - m.offset_ns) % m.period_ns  # since it was last released
         return into < end - m.offset_ns or into + jitter >= m.period_ns  # it is through `end` after its event
 
-    return max((c for (m, c), end in below if can_be_on_the_bus(m, end)), default=0)
+    return next((c for (m, c), end in below if can_be_on_the_bus(m, end)), 0)

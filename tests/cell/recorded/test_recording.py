@@ -54,6 +54,16 @@ def stepped(lines, *steps_us):
         yield restamped(line, 10**15 + stamp_us(line) + sum(a * b for a, b in zip(steps_us, parts, strict=False)))
 
 
+@pytest.fixture(scope="module")
+def undisturbed(lockstep_run):
+    """The replay and the traffic of the log as it is."""
+    log = lockstep_run.out / "bus.log"
+    return (
+        canprobe.replay(log, scene=lockstep_run.plan.scene),
+        canprobe.measure_traffic(log, lockstep_run.plan, exact=False),
+    )
+
+
 @pytest.mark.parametrize(
     "steps_us",
     [
@@ -68,32 +78,32 @@ def stepped(lines, *steps_us):
     ],
     ids=lambda steps: "_".join(map(str, steps)),
 )
-def test_a_clock_that_was_set_changes_no_estimate_and_no_load(lockstep_run, tmp_path, steps_us):
-    plain = lockstep_run.out / "bus.log"
-    log = tmp_path / "stepped.log"
-    lines = plain.read_text().splitlines()
+def test_a_clock_that_was_set_changes_no_estimate_and_no_load(lockstep_run, undisturbed, tmp_path, steps_us):
+    log, (expected, before) = tmp_path / "stepped.log", undisturbed
+    lines = (lockstep_run.out / "bus.log").read_text().splitlines()
     log.write_text("\n".join(stepped(lines, *steps_us)) + "\n")
     bus = RecordedBus(log)
     first = next(n for n, line in enumerate(lines) if 2 * n >= len(lines)) + 1
     assert bus.steps[0].line == first and len(bus.steps) == len(steps_us)
     for step, us in zip(bus.steps, steps_us, strict=True):
         assert abs(step.step_ns / 1000 - us) < 2500  # to the SYNC period
-    found, expected = (canprobe.replay(one, scene=lockstep_run.plan.scene) for one in (log, plain))
+    found = canprobe.replay(log, scene=lockstep_run.plan.scene)
     np.testing.assert_allclose(
         found.estimates["recursive"][-1].estimate.kappa, expected.estimates["recursive"][-1].estimate.kappa, rtol=1e-9
     )
     assert found.summary["cycle"] == expected.summary["cycle"]
     assert f"log        line {first}: the stamps of can0 step " in found.text()
-    measured, before = (canprobe.measure_traffic(one, lockstep_run.plan, exact=False) for one in (log, plain))
+    measured = canprobe.measure_traffic(log, lockstep_run.plan, exact=False)
     assert measured.load == pytest.approx(before.load, rel=1e-3)
     assert measured.as_planned and f"line {first}: the stamps of can0 step" in measured.text()
 
 
 @pytest.mark.parametrize("step_us", [-5_000_000, -3_600_000_000])
-def test_a_clock_that_was_set_back_before_the_first_sync_changes_no_estimate(lockstep_run, tmp_path, step_us):
-    plain = lockstep_run.out / "bus.log"
+def test_a_clock_that_was_set_back_before_the_first_sync_changes_no_estimate(
+    lockstep_run, undisturbed, tmp_path, step_us
+):
     log = tmp_path / "stepped.log"
-    lines = plain.read_text().splitlines()
+    lines = (lockstep_run.out / "bus.log").read_text().splitlines()
     at = next(n for n, line in enumerate(lines) if can_id_of(line) == "080") // 2
     log.write_text(
         "".join(f"{restamped(x, 10**15 + stamp_us(x) + step_us * (n >= at))}\n" for n, x in enumerate(lines))
@@ -103,7 +113,7 @@ def test_a_clock_that_was_set_back_before_the_first_sync_changes_no_estimate(loc
     assert step.line == at + 1 and step.step_ns == pytest.approx(step_us * 1000, abs=5e6)
     stamps = [line[0] for line in bus]
     assert stamps == sorted(stamps)
-    found, expected = (canprobe.replay(one, scene=lockstep_run.plan.scene) for one in (log, plain))
+    found, (expected, _) = canprobe.replay(log, scene=lockstep_run.plan.scene), undisturbed
     assert found.summary["cycle"] == expected.summary["cycle"]
     assert f"log        line {at + 1}: the stamps of can0 step back" in found.text()
 
@@ -145,7 +155,7 @@ def test_stamps_that_cannot_be_mended_are_refused(lockstep_run, tmp_path, change
         canprobe.measure_traffic(log, lockstep_run.plan)
 
 
-def test_frames_that_candump_lost_and_can_xl_are_reported(lockstep_run, tmp_path):
+def test_frames_that_candump_lost_and_can_xl_are_reported(lockstep_run, undisturbed, tmp_path):
     log = tmp_path / "candump.log"
     lines = (lockstep_run.out / "bus.log").read_text().splitlines()
     lines[50:50] = [
@@ -153,7 +163,7 @@ def test_frames_that_candump_lost_and_can_xl_are_reported(lockstep_run, tmp_path
         restamped("() can0 45123#81:00:12345678#11223344", stamp_us(lines[50])),
     ]
     log.write_text("\n".join(lines) + "\n")
-    plain = canprobe.replay(lockstep_run.out / "bus.log", scene=lockstep_run.plan.scene).summary["cycle"]
+    plain = undisturbed[0].summary["cycle"]
     counts = canprobe.replay(log, scene=lockstep_run.plan.scene).summary["cycle"]
     assert counts["frames_lost_by_candump"] == 3 and counts["other_frames"] == plain["other_frames"] + 1
     measured = canprobe.measure_traffic(log, lockstep_run.plan, exact=False)
