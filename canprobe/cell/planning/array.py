@@ -27,9 +27,9 @@ class Support:
     """What an array measures of the contact that its task makes.
 
     Attributes:
-        taxels: under the patch on a plane at the task's force; all of them where nothing is pressed.
-        centroid: there is one.
-        no_curvature: why there is no curvature; None where there is one. Force is always there.
+        taxels: number of taxels under the patch on a plane at the task's force; all where the task presses nothing.
+        centroid: whether there are enough taxels for a centroid.
+        no_curvature: why the patch shows no curvature; None where it shows it. The force is always measured.
     """
 
     taxels: float
@@ -38,7 +38,7 @@ class Support:
 
     @property
     def curvature(self) -> bool:
-        """The patch shows it."""
+        """Whether the patch shows the curvature."""
         return self.no_curvature is None
 
     def __str__(self) -> str:
@@ -119,7 +119,7 @@ def array_problems(setup: Setup) -> Iterator[str]:
 
 
 def _unreadable(array: Array) -> Iterator[str]:
-    """That no force can be read from the array, because a contact falls between its taxels."""
+    """Problem where no force can be read from the array, because a contact falls between its taxels."""
     from canprobe.mechanics.touch.patch.array_models import make_patch_calibration
 
     try:
