@@ -37,12 +37,12 @@ def run(args: argparse.Namespace) -> int:
 def print_packaged(
     advice: Mapping[str, str], args: argparse.Namespace, expected: Mapping[str, Any] | None = None
 ) -> int:
-    """Print name and title of every packaged file of some kinds, their folders, and what can be done with them.
+    """Print name and title of every packaged file of some kinds, their folders, and advice.
 
     Args:
         advice: line of advice for each kind.
         args: arguments of the command.
-        expected: their figures, as `read_expected` has them.
+        expected: expected figures from `read_expected`.
     """
     from canprobe.cell.results.expected import LISTED_FIGURES, expected_text, seeds_text
     from canprobe.cell.scene.load import packaged_arrays, packaged_cells, packaged_files, packaged_scenes
