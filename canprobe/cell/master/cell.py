@@ -18,6 +18,7 @@ from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.drives import make_drives
 from canprobe.cell.master.homing import Homing
 from canprobe.cell.master.joint_columns import TactileLog, joint_columns
+from canprobe.cell.master.lift_off import LiftOff
 from canprobe.cell.master.log import RunLog
 from canprobe.cell.master.notes import Notes
 from canprobe.cell.master.observers import Observers
@@ -450,8 +451,6 @@ class Cell:
         supervisor = self.supervisor
         if self.drives is None or self.tactile is None or not supervisor.pressing() or supervisor.must_stop():
             return
-        from canprobe.cell.master.lift_off import LiftOff
-
         lift = LiftOff(self._plan, self.drives, self.watch, error)
         t_s = (self.start_ns + supervisor.seen.measurement.t_ns) * 1e-9
         if not lift.possible:

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.touch.estimate.noise import Correlation, make_noise
+from canprobe.mechanics.touch.surface import SurfaceMatrix
 from canprobe.mechanics.types import Floats
-
-if TYPE_CHECKING:
-    from canprobe.mechanics.touch.estimate.noise import Correlation
 
 RUN_IN_M = 0.020
 """Path after which the answers of an estimator count."""
@@ -144,8 +142,6 @@ def bound_of_scan(
         coupling: coupling of the errors of point and normal (`Noise`), 1/m.
     """
     from canprobe.mechanics.touch.estimate.likelihood import make_touches, osculating_bound
-    from canprobe.mechanics.touch.estimate.noise import make_noise
-    from canprobe.mechanics.touch.surface import SurfaceMatrix
 
     points = np.array([s.p_base for s in samples])
     normals = np.array([s.n_base for s in samples])

@@ -10,6 +10,7 @@ from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.session import Session
 from canprobe.cell.session.up import ROWS_OF_UP
+from canprobe.cell.tasks.joint_check import JointCheck
 from canprobe.errors import NodeError, UsageError
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.types import Floats
@@ -37,8 +38,6 @@ def check_joints(scene: Scene, *, operator: Operator | None = None, say: Say = q
     """
     if scene.arm is None:
         raise UsageError(f"up --check-joints: scene {scene.name} has no [arm]")
-    from canprobe.cell.tasks.joint_check import JointCheck
-
     plan = make_plan(resolve(scene))
     assert plan.setup.arm is not None
     arm, check = plan.setup.arm, JointCheck(plan, operator)
