@@ -140,7 +140,7 @@ class Diagnostic:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sample:
-    """What was new in one cycle.
+    """New data of one cycle.
 
     Attributes:
         t_ns: time of its SYNC since the bus was opened, as in `bus.log`.

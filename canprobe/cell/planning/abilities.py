@@ -1,4 +1,4 @@
-"""What a device can do, read from its EDS: objects, PDOs, mapping, dummies, identity."""
+"""Abilities of a device, read from its EDS: objects, PDOs, mapping, dummies, identity."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _IDENTIFIER = 0x7FF
 
 @dataclass(frozen=True, slots=True)
 class Abilities:
-    """What one device can do as a node of the cell, by its EDS.
+    """Abilities of one device as a node of the cell, by its EDS.
 
     Attributes:
         eds: its name or path, for messages.
@@ -84,7 +84,7 @@ class Abilities:
         return tuple(number for number in numbers if self.has(MAPPING[direction] + number - 1))
 
     def capacity(self, direction: Direction, number: int) -> int:
-        """How many objects may be mapped to a PDO; 0: its mapping is fixed."""
+        """Number of objects that may be mapped to a PDO; 0: its mapping is fixed."""
         index = MAPPING[direction] + number - 1
         count = self.description.entry(index)
         if count is None or not count.writable:

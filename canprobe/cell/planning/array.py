@@ -25,7 +25,7 @@ COARSE_SHARE = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Support:
-    """What an array measures of the contact that its task makes.
+    """Quantities of its task's contact that an array measures.
 
     Attributes:
         taxels: number of taxels under the patch on a plane at the task's force; all where the task presses nothing.
@@ -49,7 +49,7 @@ class Support:
 
 
 def support_of(setup: Setup) -> Support | None:
-    """What the setup's array supports; None without one."""
+    """The quantities that the setup's array measures; None without an array."""
     array, touch = setup.array, setup.touch
     if array is None:
         return None

@@ -140,7 +140,7 @@ class Given:
 
 @dataclass(frozen=True, slots=True)
 class NodeSetup:
-    """What one node must be, and how it is configured.
+    """Requirements on one node, and its configuration.
 
     Attributes:
         node_id: the node.
@@ -179,7 +179,7 @@ class NodeSetup:
 
     @property
     def configuration_date(self) -> dict[int, int]:
-        """What 1020h holds where the node has this configuration: days since 1984, milliseconds after midnight.
+        """Value of 1020h in a node with this configuration: days since 1984, milliseconds after midnight.
 
         They follow from the values, so that any change of them, of the EDS or of the scene, gives another date.
         """
@@ -390,7 +390,7 @@ def _homing_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Wri
 
 
 def _coupling_problems(plan: Plan, node: PlannedNode) -> list[str]:
-    """Where the zero of a drive depends on other joints, they have to be known when it is homed."""
+    """Problems where a drive is homed before joints on which its zero depends."""
     arm = plan.setup.arm
     assert arm is not None
     axis = arm.node_ids.index(node.node_id)
@@ -442,7 +442,7 @@ def _drive_given(device: Abilities) -> tuple[Given, ...]:
 
 
 def _array_given(plan: Plan, dictionary: Any) -> tuple[Given, ...]:
-    """With another full scale the force would be wrong by the ratio of the two."""
+    """The full scale that the array must hold: with another one the force would be wrong by their ratio."""
     array = plan.setup.array
     assert array is not None
     if not has_full_scale(dictionary):

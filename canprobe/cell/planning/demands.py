@@ -1,4 +1,4 @@
-"""What every node needs: objects, each with its purpose, and the bit rate of the bus."""
+"""Needs of every node: objects, each with its purpose, and the bit rate of the bus."""
 
 from __future__ import annotations
 

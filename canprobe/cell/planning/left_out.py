@@ -1,4 +1,4 @@
-"""What a scene does not need, and the files that follow from what it does."""
+"""Parts that a scene does not need, and the files that its run writes."""
 
 from __future__ import annotations
 

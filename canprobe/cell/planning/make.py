@@ -155,7 +155,7 @@ class _BusPlan:
 
     @property
     def misfit(self) -> tuple[int, float]:
-        """How far it is from fitting: problems, then the largest share of a bus, or of a trigger's time, in demand."""
+        """Distance from fitting: number of problems, then the largest load of a bus, or of a trigger's time."""
         shares = [bus.traffic.load for bus in self.buses]
         shares += [demand.used_ns / demand.available_ns for bus in self.buses for demand in bus.traffic.demands]
         return len(self.problems), max(shares)
@@ -269,7 +269,7 @@ def _roles(setup: Setup) -> list[tuple[NodeKind, str, Node]]:
 
 
 def _devices(setup: Setup) -> tuple[dict[int, Abilities], list[str]]:
-    """What each node can do by its EDS, and what is missing there, once for a file that several nodes share."""
+    """Abilities of each node by its EDS, and what it lacks, once for a file that several nodes share."""
     seen: set[tuple[NodeKind, str]] = set()
     devices: dict[int, Abilities] = {}
     problems: list[str] = []

@@ -32,7 +32,7 @@ DEVIATION_RAD = math.radians(1.0)
 prismatic one see `ArmModel.radian`. Without the last retreat, which no stop ends; near a singular posture there is no
 such bound."""
 PARKED_ABOVE_M = 5e-3
-"""How far above the approach's first point an emulated arm stands at power on, m."""
+"""Height of an emulated arm above the approach's first point at power on, m."""
 
 
 def check_motion(setup: Setup) -> tuple[JointSpeeds | None, list[str]]:
@@ -71,7 +71,7 @@ def check_motion(setup: Setup) -> tuple[JointSpeeds | None, list[str]]:
 
 
 def parked_posture(setup: Setup, arm: Arm) -> Floats:
-    """Where an emulated arm stands at power on, (n,) rad or m: above the start of a touch, else as in the scene.
+    """Posture of an emulated arm at power on (n,), rad or m: above the start of a touch, else as in the scene.
 
     Raises:
         PlanError: when it cannot stand there.
@@ -197,7 +197,7 @@ def _too_fast(arm: Arm, speeds: JointSpeeds, way_out: str) -> list[str]:
 
 
 def _beginning(setup: Setup, task: Touch | Calibrate, contacts: Iterable[_Pose]) -> Floats:
-    """Where the arm moves from, (n,) rad or m, as far as it is known.
+    """Posture from which the arm moves (n,), rad or m, as far as it is known.
 
     Raises:
         PlanError: when an emulated arm cannot be parked; or the contacts are out of reach, which is reported instead.

@@ -219,7 +219,7 @@ def _use_rows(plan: Plan) -> Iterator[list[str]]:
 
 
 def _measured(setup: Setup) -> str:
-    """What the array measures of the task's contact."""
+    """The quantities of the task's contact that the array measures, in words."""
     support, array = support_of(setup), setup.array
     assert support is not None and array is not None
     if setup.touch is None or array.pad.is_flat:

@@ -138,7 +138,7 @@ def _pdo(pdo: PlannedPdo) -> dict[str, Any]:
 
 
 def _in_us(values: dict[str, Any]) -> dict[str, Any]:
-    """The same with its times in µs: `start_ns` becomes `start_us`."""
+    """The values with times in µs: `start_ns` becomes `start_us`."""
     return {
         f"{name.removesuffix('_ns')}_us" if name.endswith("_ns") else name: (
             _microseconds(value) if name.endswith("_ns") else value

@@ -70,7 +70,7 @@ def surface_path(task: Touch, shape: PlacedShape | None) -> SurfacePath:
 
 
 def _first_contact(shape: PlacedShape, approach: Approach, radius: float) -> Floats:
-    """Where a ball first touches, (3,) m across the approach from its end: the path begins there."""
+    """Place where a ball first touches (3,), m, across the approach from its end: the path begins there."""
     height = _along(shape, approach.start, approach.normal, radius)
     if height is None or shape.tightest_concave_radius(approach.start[None]) <= radius:
         return np.zeros(3)  # in a tighter hollow it touches in two places, which is refused elsewhere
@@ -80,7 +80,7 @@ def _first_contact(shape: PlacedShape, approach: Approach, radius: float) -> Flo
 
 
 def _contacts(shape: PlacedShape, plane: Floats, up: Floats, radius: float) -> SurfacePath:
-    """Where a ball of `radius` over each point (n, 3) rests, or the surface itself with 0."""
+    """Contacts of a ball of `radius` that rests over each point (n, 3); with 0 the points of the surface."""
     contacts = []
     for point in plane:
         height = _along(shape, point, up, radius)

@@ -24,7 +24,7 @@ def plan_sync(setup: Setup) -> tuple[SyncPlan, bool]:
 
 
 def plan_ratio(setup: Setup) -> tuple[int, list[str]]:
-    """How many SYNCs make one tactile frame (18xxh:02), and why the rate is not possible."""
+    """Number of SYNCs for one tactile frame (18xxh:02), and why the rate is not possible."""
     array = setup.array
     if array is None or (array.raw is not None and array.raw.sampling == "free"):
         return 1, []

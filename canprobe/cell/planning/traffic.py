@@ -280,7 +280,7 @@ def _placed(
 
 
 def look_times(period_ns: int, feedback_ns: int) -> tuple[int, ...]:
-    """When the cell looks for TPDOs, ns after the SYNC's deadline.
+    """Times when the cell looks for TPDOs, ns after the SYNC's deadline.
 
     Args:
         period_ns: period of SYNC.
@@ -325,7 +325,7 @@ def _demands(wire: Sequence[PlannedPdo], sync: SyncPlan, bitrate: int) -> Iterat
 
 
 def _problems(buses: Sequence[PlannedBus], analyses: Sequence[BusAnalysis], bus: BusSettings) -> list[str]:
-    """What does not fit: load and demands of a bus, or else the cycle, or else the first late message of each bus."""
+    """Problems: load and demands of a bus, or else the cycle, or else the first late message of each bus."""
     found = [(one.channel, problem) for one in buses for problem in _excess(one.traffic)]
     if not found and (behind := _behind(buses[0].traffic.budget)) is not None:
         found = [(" and ".join(one.channel for one in buses), behind)]

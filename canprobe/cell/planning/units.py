@@ -54,7 +54,7 @@ class TurnUnits:
     ratio: int | None
 
     def mismatch(self, feed: float, ratio: float) -> str | None:
-        """How the quotients that a device holds differ from the cell; None where they fit.
+        """Difference of a device's quotients from the cell, in words; None where they fit.
 
         The shaft of a device may be that of the motor, or that of the joint.
 

@@ -55,7 +55,7 @@ def _is_interface_local(channel: str) -> bool:
 
 
 def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
-    """What a user has to know before trusting the plan, most important first."""
+    """Warnings that a user must know before trusting the plan, most important first."""
     cut, bus = cut_patch(setup), setup.bus
     yield from _open_to_others(setup)
     if setup.arm is not None:

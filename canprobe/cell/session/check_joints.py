@@ -58,7 +58,7 @@ def check_joints(scene: Scene, *, operator: Operator | None = None, say: Say = q
 
 
 def _zero_pose(model: ArmModel, start: Floats) -> str:
-    """Where the arm is if its zeros are right, to compare with the marks on it."""
+    """Pose of the arm if its zeros are right, to compare with the marks on it."""
     units = [joint.unit for joint in model.joints]
     each = [f"{joint.shown(q):.2f}" for joint, q in zip(model.joints, start, strict=True)]
     positions = f"{', '.join(each)} {units[0]}"

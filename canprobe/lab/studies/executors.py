@@ -1,4 +1,4 @@
-"""Where cells are computed: a pool of processes on this machine, or the workers of a Dask cluster."""
+"""Executors that compute cells: a pool of processes on this machine, or the workers of a Dask cluster."""
 
 from __future__ import annotations
 

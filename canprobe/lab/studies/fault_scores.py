@@ -110,7 +110,7 @@ def _model(session: Session) -> ArmModel:
 
 
 def _wrong_reach(session: Session) -> float:
-    """How far (m) the probe sinks in where one motor moves as far in a cycle as its drive allows."""
+    """Depth (m) to which the probe sinks in where one motor moves as far in a cycle as its drive allows."""
     scene, period_ns = session.scene, session.plan.sync.period_ns
     assert scene.arm is not None and scene.probe is not None
     model, share = _model(session), scene.limits.joint_speed_share

@@ -162,7 +162,7 @@ def approach_limit(row: Row, approach_m_s: float = 4e-3, force_max: float = 5.0)
 
 
 def findings(rows: Sequence[Row]) -> list[str]:
-    """How the cells end, whether the prediction holds, and every cell that hunts or fails."""
+    """Numbers of the ends, whether the prediction holds, and every cell that hunts or fails."""
     ends = Counter(str(row["ended"]) for row in rows)
     said = [f"{len(rows)} touches: " + ", ".join(f"{number} {end}" for end, number in ends.most_common()) + "."]
     told = [r for r in rows if r["view"] == "told" and r["ended"] != "refused" and r["contact_n_m"] >= 1e3]
@@ -229,7 +229,7 @@ END_MARKS = {
     "hunting": (PINK, "D", "force not settled"),
     "failed": (ORANGE, "v", "failed"),
 }
-"""How a touch ended: colour, marker, words."""
+"""Colour, marker and words for each end of a touch."""
 VIEWS = {"told": "servo with the stated stiffness", "felt": "servo that estimates the stiffness"}
 SIDES = {"drives": "bandwidth of the drives", "pose": "pose", "radii": "radii", "speed": "speed of a scan"}
 PANELS_IN_A_ROW = 3
@@ -292,7 +292,7 @@ def _mark(axes: Axes, row: Row, x: float, y: float) -> None:
 
 
 def _draw_side(axes: Axes, title: str, rows: Sequence[Row]) -> None:
-    """How the cases of one line end: a table with a mark for each."""
+    """Draw the ends of the cases of one line: a table with a mark for each."""
     places = [_place(r) for r in rows]
     lines, columns = (list(dict.fromkeys(names)) for names in zip(*places, strict=True)) if places else ([], [])
     for row, (line, column) in zip(rows, places, strict=True):
