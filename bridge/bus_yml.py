@@ -1,8 +1,8 @@
-"""ros2_canopen's `bus.yml`: a plan written as one, and the nodes of one read.
+"""ros2_canopen's `bus.yml`: writes a plan as one, and reads the nodes of one.
 
 The file's keys are those of Lely's dcfgen, which makes the master's configuration of it; ros2_canopen adds those of
 its drivers, and `defaults` and `nodes`: the slaves stand under `nodes`, where dcfgen has them beside `master`. dcfgen
-maps neither dummies nor PDOs of CAN FD: such a one is written by `sdo` entries, in the order of bring-up, and the
+maps neither dummies nor PDOs of CAN FD: such a PDO is written by `sdo` entries, in the order of bring-up, and the
 master's side of it has to be configured by hand. Source: ros2_canopen manual, "Bus configuration file"; lely-core's
 dcfgen.
 """
@@ -72,7 +72,7 @@ class ListedNode:
 
     Attributes:
         name: its key.
-        node_id: 1–127.
+        node_id: node id, 1–127.
         eds: its EDS or DCF file, found beside the bus.yml where the path is relative.
     """
 
@@ -82,11 +82,11 @@ class ListedNode:
 
 
 def write_bus_yml(plan: Plan, folder: Path) -> list[Path]:
-    """Write ``bus.yml``, or of several buses ``bus-can0.yml`` and so on, and the EDS files that they name.
+    """Write ``bus.yml``, or for several buses ``bus-can0.yml`` and so on, and the EDS files that they name.
 
     Args:
-        plan: whose nodes.
-        folder: exists.
+        plan: plan of the nodes.
+        folder: existing folder.
 
     Returns:
         The files.
@@ -114,12 +114,12 @@ def write_bus_yml(plan: Plan, folder: Path) -> list[Path]:
 
 
 class _Hex(int):
-    """An integer that people read in hexadecimal."""
+    """An integer to write in hexadecimal."""
 
 
 def _dump(yaml: Any, document: Mapping[str, Any]) -> str:
     class Dumper(yaml.SafeDumper):  # type: ignore[misc]
-        """As PyYAML's, with hexadecimal numbers, and without anchors."""
+        """PyYAML's dumper with hexadecimal numbers and without anchors."""
 
         def ignore_aliases(self, data: object) -> bool:
             return True
@@ -199,8 +199,8 @@ def read_bus_yml(path: Path | str, say: Callable[[str], None] = lambda _: None) 
 
     Args:
         path: path of the file; ``@BUS_CONFIG_PATH@`` is its folder. `dcf` paths are looked up in `dcf_path`, then
-            beside the file, and at last there by their names alone, as other folders are those of another machine.
-        say: function that reports what is not understood and is passed over.
+            beside the file, and at last there by their names alone, as folders may be those of another machine.
+        say: function that reports each key that is not understood and passed over.
 
     Returns:
         The slaves by rising node id.
@@ -228,7 +228,7 @@ def read_bus_yml(path: Path | str, say: Callable[[str], None] = lambda _: None) 
             del beside[name]
     slaves = {**beside, **{str(name): keys for name, keys in under.items()}}
     if both := sorted(beside.keys() & set(map(str, under))):
-        raise UsageError(f"{path}: {both[0]}: stands under nodes and beside master; which one counts?")
+        raise UsageError(f"{path}: {both[0]}: stands under nodes and beside master; remove one of them")
     _name_unknown(path, "options", options, _OPTION_KEYS, say)
     _name_unknown(path, "defaults", defaults, _SLAVE_KEYS, say)
     nodes = []
@@ -258,7 +258,7 @@ def _refuse_twice(path: Path, root: Any) -> None:
         for key in keys:
             if [other.value for other in keys].count(key.value) > 1:
                 line = max(other.start_mark.line for other in keys if other.value == key.value) + 1
-                raise UsageError(f"{path}:{line}: {key.value}: stands twice; which one counts?")
+                raise UsageError(f"{path}:{line}: {key.value}: stands twice; remove one of them")
         left += [value for _, value in pairs]
 
 

@@ -1,6 +1,6 @@
-"""One observation ↔ bytes, for the way into a bridge's process: 3 µs where pickle takes 35.
+"""One observation ↔ bytes, for the pipe to a bridge's process: 3 µs where pickle takes 35.
 
-Only what a sample is made of is carried. Both ends are the same program, so that `marshal` will do.
+Only the parts that a sample needs are carried. Both ends are the same program, so that `marshal` is enough.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ class Received:
     """An observation at the other end.
 
     Attributes:
-        t_ns, measurement, frames: as in `Observation`.
+        t_ns, measurement, frames: fields of the `Observation`.
         phase: column `phase` of the command, None without one.
         depth: column `depth_at_1n_mm`: indentation at 1 N with which its contact was placed, None without one.
-        patch: the estimate of the command.
-        dropped: observations that were lost before this one.
+        patch: estimate of the command.
+        dropped: number of observations that were lost before this one.
     """
 
     t_ns: int
@@ -47,8 +47,8 @@ def pack_observation(observation: Observation, dropped: int = 0) -> bytes:
     """One observation as bytes.
 
     Args:
-        observation: as the cell hands it out.
-        dropped: how many were lost before it.
+        observation: observation from the cell.
+        dropped: number of observations that were lost before it.
     """
     measurement, command = observation.measurement, observation.command
     columns = command.columns if command is not None else {}
@@ -67,7 +67,7 @@ def pack_observation(observation: Observation, dropped: int = 0) -> bytes:
 
 
 def _number(value: object) -> float | None:
-    """A plain float of whatever a controller has put there; None where it is no number."""
+    """A controller's value as a float; None where it is no number."""
     return float(value) if isinstance(value, int | float | np.number) else None
 
 

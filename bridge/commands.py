@@ -1,4 +1,4 @@
-"""Whether a command from outside may reach the cell: by the same checks that the scene itself has to pass."""
+"""Check of commands from other tools, by the same checks that the scene itself has to pass."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from canprobe.mechanics.types import Floats
 def refuse(plan: Plan, kind: str, value: float | None) -> str | None:
     """Why a command is refused, or None.
 
-    A target force or a speed is put into the scene, which is then checked and planned as if it had been written so:
+    A target force or a speed is put into the scene, which is then checked and planned as if its file had it:
     ranges, `limits.force_max_n`, the speeds of the joints.
 
     Args:
         plan: plan of the run.
-        kind: start, stop, target_force_n or speed_m_s.
-        value: N or m/s; None for start and stop.
+        kind: kind of the command: start, stop, target_force_n or speed_m_s.
+        value: value in N or m/s; None for start and stop.
     """
     if kind in ("start", "stop"):
         return None
@@ -43,22 +43,22 @@ def refuse(plan: Plan, kind: str, value: float | None) -> str | None:
 
 
 def trajectory_of(plan: Plan, message: Any, q: Floats | None) -> dict[str, Any]:
-    """The way that a `trajectory_msgs/msg/JointTrajectory` asks for, checked from where the arm stands.
+    """The trajectory of a `trajectory_msgs/msg/JointTrajectory`, checked from the present position of the arm.
 
     Args:
         plan: plan of the run.
         message: trajectory with joint names and points; positions in each point, velocities in all of them or in none.
-        q: (n,) joint positions now, rad or m; None as long as they are not known.
+        q: present joint positions (n,), rad or m; None as long as they are not known.
 
     Returns:
         `points` and `velocities` of a `canprobe.cell.tasks.Trajectory`.
 
     Raises:
-        UsageError: the cell cannot or must not follow it.
+        UsageError: when the cell cannot or must not follow it.
     """
     arm = plan.setup.arm
     if arm is None or plan.scene.task.kind != "free":
-        raise UsageError(f'task.kind = "{plan.scene.task.kind}" follows none: task.kind = "free" does')
+        raise UsageError(f'task.kind = "{plan.scene.task.kind}" follows no trajectory: task.kind = "free" does')
     if q is None:
         raise UsageError("the joints have not reported yet")
     names, known = list(message.joint_names), list(arm.model.chain.joints)

@@ -1,6 +1,6 @@
-"""A plan's frames as a DBC or KCD file, by cantools: for SavvyCAN, Vector's tools, Kayak and whatever reads those.
+"""A plan's frames as a DBC or KCD file, by cantools: for SavvyCAN, Vector's tools, Kayak and other readers.
 
-A message for SYNC, each PDO, emergencies and heartbeats; a signal for each mapped object, for each taxel, and for each
+It has a message for SYNC, each PDO, emergencies and heartbeats; a signal for each mapped object, taxel, and each
 field of what the array packs. Bit positions count from the least significant bit of byte 0, as CANopen does.
 """
 
@@ -62,10 +62,10 @@ def need(module: str, extra: str, purpose: str) -> Any:
     Args:
         module: its import name.
         extra: extra of canprobe that installs the package.
-        purpose: what it is needed for, for the message.
+        purpose: purpose of the package, for the message.
 
     Raises:
-        UsageError: it is not installed; with the line that installs it.
+        UsageError: when it is not installed; with the line that installs it.
     """
     try:
         return importlib.import_module(module)
@@ -74,7 +74,7 @@ def need(module: str, extra: str, purpose: str) -> Any:
 
 
 def identifier(text: str) -> str:
-    """Letters, digits and underscores only, not beginning with a digit."""
+    """The text as an identifier: letters, digits and underscores, without a digit at the beginning."""
     name = re.sub(r"\W+", "_", text, flags=re.ASCII).strip("_") or "signal"
     return f"_{name}" if name[0].isdigit() else name
 
@@ -84,8 +84,8 @@ def write_database(plan: Plan, folder: Path, form: str) -> Path:
 
     Args:
         plan: whose frames.
-        folder: exists.
-        form: one of `FORMATS`.
+        folder: existing folder.
+        form: format, one of `FORMATS`.
 
     Returns:
         The file.
@@ -107,7 +107,7 @@ def plan_database(plan: Plan) -> Any:
         `cantools.database.can.Database`, with a message for SYNC, each PDO, emergencies and heartbeats.
 
     Raises:
-        UsageError: cantools is not installed.
+        UsageError: when cantools is not installed.
     """
     return _Describer(plan).database()
 
@@ -240,7 +240,7 @@ class _Describer:
 
 
 def _fields(entry: PdoEntry) -> tuple[_Field, ...]:
-    """The parts of an entry: taxels one by one, the fields of what the array packs, everything else as it is."""
+    """The fields of an entry: its taxels, the fields that the array packs, or the entry itself."""
     if packed := _PACKED.get((entry.index, entry.subindex)):
         return packed
     if entry.index in _TAXELS and entry.bits % 8 == 0:

@@ -19,15 +19,15 @@ from canprobe.fieldbus.eds.packaged import eds_file
 from canprobe.fieldbus.eds.sections import LINE_END_PATTERN, Section, Sections, decode, split_sections
 
 Values = Mapping[tuple[int, int], int]
-"""(index, sub-index) → value."""
+"""Value by (index, sub-index)."""
 
 
 def write_dcfs(plan: Plan, folder: Path) -> list[Path]:
     """Write ``node001.dcf`` and so on, one for each node of the plan.
 
     Args:
-        plan: whose nodes.
-        folder: exists.
+        plan: plan of the nodes.
+        folder: existing folder.
 
     Returns:
         The files.
@@ -41,7 +41,7 @@ def write_dcfs(plan: Plan, folder: Path) -> list[Path]:
 
 
 def final_values(setup: NodeSetup) -> dict[tuple[int, int], int]:
-    """What each entry holds after bring-up; commands, which hold nothing, are left out."""
+    """Value of each entry after bring-up; commands, which keep no value, are left out."""
     return {(write.index, write.subindex): write.value for write in setup.writes if write.read_back}
 
 
@@ -64,7 +64,7 @@ def dcf_text(eds: str, values: Values, keys: Mapping[str, Mapping[str, str]]) ->
 
     Args:
         eds: text of the file.
-        values: the `ParameterValue` of each entry.
+        values: `ParameterValue` of each entry.
         keys: other keys by section in lower case; a section that is not there is added.
     """
     lines = LINE_END_PATTERN.split(eds.rstrip())

@@ -1,4 +1,4 @@
-"""ROS 2 message types as Cyclone DDS knows types, made from rosbags' definitions: one type store for all sinks.
+"""ROS 2 message types as types of Cyclone DDS, made from rosbags' definitions: one type store for all sinks.
 
 A type made here carries messages that are CDR already, byte for byte. Built field by field it is serialised by
 Cyclone itself, which the tests hold against rosbags.
@@ -31,7 +31,7 @@ _NODE_BASE, _NODE_NAME, _NODE_ARRAY = 1, 2, 3
 
 
 def _serialize(self: Any, buffer: Any = None, endianness: Any = None, use_version_2: Any = None) -> bytes:
-    """What goes onto the wire, encapsulation included: the bytes that a message carries, or its fields."""
+    """The bytes for the wire, encapsulation included: those that a message carries, or its serialised fields."""
     carried = self.__dict__.get("carried")
     if carried is not None:
         return bytes(carried)
@@ -40,7 +40,7 @@ def _serialize(self: Any, buffer: Any = None, endianness: Any = None, use_versio
 
 
 class DdsTypes:
-    """The DDS types of one type store, each made when it is first asked for.
+    """The DDS types of one type store, each made at its first use.
 
     Args:
         encoder: encoder whose store has the message types.
@@ -58,7 +58,7 @@ class DdsTypes:
         return self._made[type_name]
 
     def carry(self, type_name: str, cdr: bytes) -> Any:
-        """A message of a type that will be sent as the bytes that it is."""
+        """A message of a type whose bytes are sent unchanged."""
         cls = self.of(type_name)
         message = cls.__new__(cls)
         message.__dict__["carried"] = cdr
@@ -89,6 +89,6 @@ class DdsTypes:
 
 
 def dds_name(type_name: str) -> str:
-    """`sensor_msgs/msg/JointState` → `sensor_msgs::msg::dds_::JointState_`."""
+    """Name of a type in DDS: `sensor_msgs/msg/JointState` → `sensor_msgs::msg::dds_::JointState_`."""
     package, kind, name = type_name.split("/")
     return f"{package}::{kind}::dds_::{name}_"

@@ -1,4 +1,4 @@
-"""The arm of a cell as a URDF whose links are the frames of the bridges: what RViz and Foxglove draw of it.
+"""The arm of a cell as a URDF whose links are the frames of the bridges, for RViz and Foxglove.
 
 `link_i` is the frame behind joint i, as `/tf` has it. The solids of an arm from a URDF hang on `axis_i`, the frame that
 the joint turns; `/tf_static` has it behind `link_i`. Any other arm is a drum along every axis and bars between them.
@@ -32,13 +32,13 @@ def axis_frame(number: int) -> str:
 
 
 def axis_transforms(chain: Chain) -> list[tuple[str, str, Floats]]:
-    """(parent, child, (4, 4) T_parent_child) of the joints' own frames, each behind its link, m."""
+    """Parent, child and T_parent_child (4, 4), m, of each joint's frame behind its link."""
     behind = (*chain.fixed[1:], chain.T_last_flange)
     return [(f"link_{i}", axis_frame(i), np.linalg.inv(T)) for i, T in enumerate(behind, start=1)]
 
 
 def robot_description(plan: Plan) -> str | None:
-    """The URDF of a plan's arm, with its probe; None of a cell without an arm.
+    """The URDF of a plan's arm, with its probe; None for a cell without an arm.
 
     Joints have the names of the scene, their ranges and speeds. Meshes are named by absolute `file://` addresses; those
     that are not found are left out.
@@ -99,7 +99,7 @@ def _probe(robot: Xml.Element, probe: Probe) -> None:
 
 
 def _shown_by_urdf(plan: Plan, frames: dict[int, Xml.Element], chain: Chain) -> bool:
-    """The solids of the arm's own URDF; False where it has none, or none that is found."""
+    """Add the solids of the arm's own URDF; False where it has none, or none is found."""
     arm = plan.scene.arm
     if arm is None or arm.urdf is None:
         return False
@@ -149,7 +149,7 @@ def _visual(link: Xml.Element, T: Floats, colour: tuple[int, int, int], kind: st
 
 
 def _origin(parent: Xml.Element, T: Floats) -> None:
-    """Translation, and roll, pitch and yaw about fixed axes, as a URDF has them."""
+    """Add translation, and roll, pitch and yaw about fixed axes, as in a URDF."""
     R = T[:3, :3]
     pitch = float(np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0])))
     if abs(np.cos(pitch)) > 1e-9:

@@ -18,16 +18,16 @@ def export_plan(plan: Plan, folder: Path, formats: Iterable[str]) -> list[Path]:
     """Write a plan in each format.
 
     Args:
-        plan: what to write.
-        folder: made where it is not there.
-        formats: `dcf`, `dbc`, `kcd`, `bus.yml`.
+        plan: plan to write.
+        folder: folder of the files; made where it is missing.
+        formats: names of formats: `dcf`, `dbc`, `kcd`, `bus.yml`.
 
     Returns:
         The files.
 
     Raises:
-        UsageError: an extra is missing.
-        ResultsError: the folder or a file cannot be written.
+        UsageError: when an extra is missing.
+        ResultsError: when the folder or a file cannot be written.
     """
     make_folder(folder)
     files = []

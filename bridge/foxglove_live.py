@@ -18,7 +18,7 @@ from canprobe.lab.bridge.topics import TOPICS, Messages, Topic
 
 LAYOUT = "foxglove_layout.json"
 STATIC_EVERY_NS = 1_000_000_000
-"""The protocol keeps no last message for viewers that come later, so that the fixed frames are sent again."""
+"""Period of the fixed frames, ns: the protocol keeps no last message for viewers that connect later."""
 
 
 class FoxgloveSink:
@@ -28,7 +28,7 @@ class FoxgloveSink:
         context: plan and settings of the run.
 
     Raises:
-        UsageError: the address is taken, or does not belong to this machine.
+        UsageError: when the address is taken, or does not belong to this machine.
     """
 
     def __init__(self, context: Context) -> None:
@@ -58,7 +58,7 @@ class FoxgloveSink:
         self._messages.epoch_ns = epoch_ns
 
     def write(self, sample: Sample) -> None:
-        """Send what somebody looks at."""
+        """Send the messages that have a subscriber."""
         for topic, t_ns, data in self._messages.of(sample):
             self._channels[topic.name].log(data, log_time=t_ns)
 

@@ -1,4 +1,4 @@
-"""The tree of frames, base to contact, as every viewer with tf wants it."""
+"""The tree of frames from base to contact, for viewers with tf."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from canprobe.mechanics.types import Floats
 
 
 def link_transforms(chain: Chain, q: Floats) -> list[tuple[str, str, Floats]]:
-    """Frame of every link in that of the one before.
+    """Frame of every link in the frame of the link before.
 
     Args:
         chain: the arm.
-        q: (n,) joint positions, rad or m.
+        q: joint positions (n,), rad or m.
 
     Returns:
         (parent, child, (4, 4) T_parent_child) of the n links, m, base_link first; the last link and the flange are the

@@ -1,4 +1,4 @@
-"""What a bridge's module has to offer, and what it gets at its start."""
+"""Interface of a bridge's module: its sink, and the context that it gets at its start."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from canprobe.lab.bridge.sample import Sample
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """What a sink gets at its start.
+    """Plan and settings that a sink gets at its start.
 
     Attributes:
         plan: plan of the run.
-        settings: section `[bridge]`.
+        settings: settings of section `[bridge]`.
         out: folder of the run; None where no files are written.
         send: hands a request (see `canprobe.cell.tasks.requested.RequestedTask`) back to the cell.
     """
@@ -34,11 +34,11 @@ class Sink(Protocol):
 
     @property
     def where(self) -> str:
-        """Where it is to be found, for people: a file, an address."""
+        """Place of the output, for people: a file, an address."""
         ...
 
     def start(self, epoch_ns: int) -> None:
-        """The first sample is here; time 0 of the samples is `epoch_ns` after the Unix epoch (0 in virtual time)."""
+        """Take the epoch: time 0 of the samples is `epoch_ns` after the Unix epoch, or 0 in virtual time."""
         ...
 
     def write(self, sample: Sample) -> None:
@@ -46,9 +46,9 @@ class Sink(Protocol):
         ...
 
     def close(self, summary: str | None) -> None:
-        """The end of the run.
+        """End the output at the end of the run.
 
         Args:
-            summary: the content of `summary.json`; None where the cell went away without a word.
+            summary: content of `summary.json`; None where the cell ended without one.
         """
         ...

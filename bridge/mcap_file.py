@@ -1,4 +1,4 @@
-"""One MCAP file a run: ROS 2 messages with their definitions, and scene, EDS, DBC and summary as attachments.
+"""One MCAP file for a run: ROS 2 messages with their definitions, and scene, EDS, DBC and summary as attachments.
 
 Source: MCAP specification, well-known profile `ros2`, message encoding `cdr`, schema encoding `ros2msg`; channel
 metadata as rosbag2_storage_mcap writes it.
@@ -38,7 +38,7 @@ class McapSink:
 
     def __init__(self, context: Context) -> None:
         if context.out is None:
-            raise UsageError("it writes a file, and this run writes none: name a folder (out=, --out)")
+            raise UsageError("it writes a file, and this run has no folder: name one (out=, --out)")
         make_folder(context.out)
         self._context = context
         self._path = context.out / str(BRIDGES["mcap"].output)
@@ -55,11 +55,11 @@ class McapSink:
 
     @property
     def where(self) -> str:
-        """The file."""
+        """Path of the file."""
         return str(self._path)
 
     def start(self, epoch_ns: int) -> None:
-        """Take the epoch; every channel is there from the first message on, whether or not it will have any."""
+        """Take the epoch, and register every channel, even those that will have no message."""
         self._messages.epoch_ns = epoch_ns
         for topic in TOPICS:
             if topic is not CLOCK:
@@ -74,7 +74,7 @@ class McapSink:
                 self._last_ns = max(self._last_ns, t_ns)
 
     def close(self, summary: str | None) -> None:
-        """Attach what the run was, write the index, and give the file its name."""
+        """Attach scene and summary, write the index, and give the file its name."""
         attachments = _attachments(self._context.plan, self._path.parent, summary)
         with self._or_none():
             for name, media_type, content in attachments:
@@ -85,7 +85,7 @@ class McapSink:
 
     @contextlib.contextmanager
     def _or_none(self) -> Iterator[None]:
-        """Where the file cannot be written (full disk) no part of it is left."""
+        """Remove the file where it cannot be written (full disk), and raise ResultsError."""
         try:
             yield
         except OSError as error:
@@ -125,7 +125,7 @@ def _qos_yaml(topic: Topic) -> str:
 
 
 def _attachments(plan: Plan, folder: Path, summary: str | None) -> Iterator[tuple[str, str, bytes]]:
-    """Name, media type and content of what a recording carries; without a summary the one in the folder, if any."""
+    """Name, media type and content of each attachment; without a summary that of the folder, if any."""
     yield SAVED_AS, "application/toml", plan.files[SAVED_AS]
     for eds in dict.fromkeys(node.eds for node in plan.nodes):
         path = eds_file(eds)

@@ -1,4 +1,4 @@
-"""One sample → the ROS 2 messages that it makes, each for its topic and instant, as CDR.
+"""Encoder of ROS 2 messages, and their definitions: message → CDR.
 
 The encoder is `rosbags`. Source: ROS 2 Jazzy's message definitions as rosbags carries them; can_msgs of ros_canopen and
 ros2_socketcan_msgs, which it does not carry.
@@ -34,7 +34,7 @@ uint8 len
 uint8[<=64] data
 """
 _CAN_FRAME_CDR = struct.Struct("<4siIIB3xI???B8s")
-"""Encapsulation, stamp, an empty frame_id, id, three flags, dlc, data: a bus has twenty of them a cycle."""
+"""Encapsulation, stamp, an empty frame_id, id, three flags, dlc, data: a cycle has twenty such frames."""
 _LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 
 
@@ -42,9 +42,9 @@ def encode_can_frame(t_ns: int, can_id: int, data: bytes) -> bytes:
     """A `can_msgs/msg/Frame` as the encoder makes it, for a fiftieth of its time.
 
     Args:
-        t_ns: since the epoch.
+        t_ns: time since the epoch.
         can_id: identifier with `EFF_FLAG` and `RTR_FLAG`.
-        data: up to 8 bytes.
+        data: data, up to 8 bytes.
     """
     seconds, ns = divmod(t_ns, 1_000_000_000)
     identifier, extended = _identifier(can_id)
@@ -79,10 +79,10 @@ class Encoder:
         return self.store.deserialize_cdr(data, type_name)
 
     def definition(self, type_name: str) -> str:
-        """The definition as MCAP's `ros2msg` and Foxglove want it: with all that it refers to."""
+        """The definition for MCAP's `ros2msg` and Foxglove, with all types that it refers to."""
         text, _ = self.store.generate_msgdef(type_name, ros_version=2)
         return str(text)
 
     def type_hash(self, type_name: str) -> str:
-        """`RIHS01_…`, which ROS 2 compares before it connects (REP 2016)."""
+        """The hash `RIHS01_…`, which ROS 2 compares before it connects (REP 2016)."""
         return str(self.store.hash_rihs01(type_name))

@@ -13,7 +13,8 @@ from canprobe.lab.bridge.codec import Received
 from canprobe.lab.bridge.sample import Diagnostic
 
 PERIOD_NS = 1_000_000_000
-WELL, LOOK, FAILED, SILENT = range(4)
+OK, WARN, ERROR, STALE = range(4)
+"""Levels of `diagnostic_msgs/msg/DiagnosticStatus`."""
 _SUPERVISED = (0x080, 0x700)
 
 
@@ -21,7 +22,7 @@ class Health:
     """Follows the nodes of a plan.
 
     Args:
-        plan: whose nodes.
+        plan: plan of the nodes.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -31,7 +32,7 @@ class Health:
         self._due_ns: int | None = None
 
     def step(self, t_ns: int, received: Received) -> tuple[Diagnostic, ...]:
-        """Take what one observation says; the state of all where it is time for it, else nothing."""
+        """Take one observation; the states of all nodes where they are due, else none."""
         for frame in received.frames:
             self._push(frame)
         if received.measurement is None or (self._due_ns is not None and t_ns < self._due_ns):
@@ -56,15 +57,15 @@ class Health:
         event = watch.last_emcy.get(node_id)
         silent = t_ns - self._heard.get(node_id, 0) > HEARTBEAT_CONSUMED_MS * 1_000_000
         if silent:
-            level, message = SILENT, f"no heartbeat for more than {HEARTBEAT_CONSUMED_MS} ms"
+            level, message = STALE, f"no heartbeat for more than {HEARTBEAT_CONSUMED_MS} ms"
         elif event is not None and event.emcy.code != NO_ERROR_CODE:
-            level, message = FAILED, f"EMCY {event.emcy.code:04X}h, {describe(event.emcy.code)}"
+            level, message = ERROR, f"EMCY {event.emcy.code:04X}h, {describe(event.emcy.code)}"
         elif drive in (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE):
-            level, message = FAILED, "drive fault"
+            level, message = ERROR, "drive fault"
         elif state is not NmtState.OPERATIONAL:
-            level, message = LOOK, state.name.lower() if state is not None else "no heartbeat yet"
+            level, message = WARN, state.name.lower() if state is not None else "no heartbeat yet"
         else:
-            level, message = WELL, "operational"
+            level, message = OK, "operational"
         values = [("nmt_state", state.name.lower() if state is not None else "unknown")]
         if drive is not None:
             values.append(("drive_state", drive.name.lower()))
@@ -78,7 +79,7 @@ class Health:
 
 
 def _cell(received: Received) -> Diagnostic:
-    """The cell as a whole, and what was lost on the way to this bridge."""
+    """State of the cell as a whole, with the samples that this bridge lost."""
     m = received.measurement
     assert m is not None
     oldest = max(m.q_age, default=0)
@@ -86,5 +87,5 @@ def _cell(received: Received) -> Diagnostic:
     if m.tactile_age is not None:
         values.append(("tactile_age_cycles", str(m.tactile_age)))
     if received.dropped:
-        return Diagnostic("cell", LOOK, f"{received.dropped} samples were lost on the way here", tuple(values))
-    return Diagnostic("cell", WELL, "running", tuple(values))
+        return Diagnostic("cell", WARN, f"this bridge lost {received.dropped} samples", tuple(values))
+    return Diagnostic("cell", OK, "running", tuple(values))

@@ -11,15 +11,12 @@ import os
 import select
 import struct
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, BinaryIO
-
-if TYPE_CHECKING:
-    pass
+from typing import BinaryIO
 
 CAPACITY = 1 << 20
-"""Bytes asked of the kernel: above a second of a whole cell at 400 Hz. It may grant less."""
+"""Requested size of the kernel's buffer, bytes: above a second of a whole cell at 400 Hz. The kernel may grant less."""
 PATIENCE_S = 5.0
-"""How long a lossless feed waits for a reader that stands still before it, too, drops."""
+"""Time that a lossless feed waits for a stalled reader before it drops records too, s."""
 _LENGTH = struct.Struct("<I")
 
 
@@ -27,14 +24,14 @@ class Feed:
     """Writes records into a pipe.
 
     Args:
-        fd: the writing end; it becomes non-blocking.
-        batch: records that go out by one system call.
-        lossless: wait for room, where nobody minds: in virtual time, and from a recorded log.
+        fd: file descriptor of the writing end; it becomes non-blocking.
+        batch: number of records that one system call writes.
+        lossless: whether to wait for room, as in virtual time and from a recorded log.
 
     Attributes:
-        taken: records that were given.
+        taken: number of records that were given.
         dropped: number of these that found the queue full or the reader gone.
-        broken: the reader is gone.
+        broken: whether the reader is gone.
     """
 
     def __init__(self, fd: int, *, batch: int = 1, lossless: bool = False) -> None:
@@ -67,10 +64,10 @@ class Feed:
             self.flush()
 
     def flush(self, patience_s: float | None = None) -> None:
-        """Send what is waiting, as far as there is room.
+        """Send the waiting records, as far as there is room.
 
         Args:
-            patience_s: how long to wait for room; by default not at all, or `PATIENCE_S` where lossless.
+            patience_s: longest wait for room, s; by default 0, or `PATIENCE_S` where lossless.
         """
         patience = (PATIENCE_S if self._lossless else 0.0) if patience_s is None else patience_s
         while not self.broken and (self._rest or self._waiting):
@@ -82,7 +79,7 @@ class Feed:
                 return
 
     def _write(self) -> bool:
-        """Write a part of what is left; False where there is no room."""
+        """Write a part of the rest; False where there is no room."""
         try:
             self._rest = self._rest[os.write(self._fd, self._rest) :]
         except BlockingIOError:
@@ -95,7 +92,7 @@ class Feed:
     def _wait(self, patience_s: float) -> bool:
         _, writable, _ = select.select([], [self._fd], [], patience_s)
         if not writable:
-            self._lossless = False  # this reader stands still: it is waited for once
+            self._lossless = False  # this reader is stalled: it is waited for only once
         return bool(writable)
 
     def close(self) -> None:

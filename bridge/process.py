@@ -1,6 +1,6 @@
-"""A bridge as the cell sees it: an observer that hands everything to another process and never waits for it.
+"""The cell's side of a bridge: an observer that hands observations to another process and never waits for it.
 
-A crash, a hang or a full queue over there costs samples, which are counted, and nothing else.
+A crash, a hang or a full queue of that process costs samples, which are counted, and nothing else.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from canprobe.lab.bridge.pipe_queue import Feed
 
 READY_TIMEOUT_S = 60.0
 END_TIMEOUT_S = 30.0
-"""Time for everything that is still in the queue, however slow the machine; an interrupt cuts it short."""
+"""Longest time for the records in the queue, s, on a slow machine too; an interrupt ends it early."""
 CLOSE_TIMEOUT_S = 1.0
-"""Time for the process to end once its bridge is done: a viewer that does not read is not waited for."""
+"""Longest time for the process to end after its bridge is done, s: a viewer may have stopped reading."""
 KILL_TIMEOUT_S = 2.0
 LATENCY_S = 0.02
-"""Samples of this time leave by one system call."""
+"""Time whose samples one system call sends, s."""
 OBSERVATION, END = b"o", b"e"
-"""First byte of a record: what follows."""
+"""First byte of a record, which names its kind."""
 
 
 class BridgeProcess(ChildProcess):
@@ -43,10 +43,10 @@ class BridgeProcess(ChildProcess):
         name: name of the bridge.
         plan: plan of the run.
         out: folder of the run; None where no files are written.
-        virtual: the run is not in real time: its feed waits for room, and its time begins at 0.
+        virtual: whether the run is in virtual time: its feed waits for room, and its time begins at 0.
 
     Attributes:
-        requests: what the other tool asked of the cell, oldest first.
+        requests: requests of the other tool, oldest first.
     """
 
     def __init__(self, name: str, plan: Plan, out: Path | None, *, virtual: bool) -> None:
@@ -76,11 +76,11 @@ class BridgeProcess(ChildProcess):
         self._feed = Feed(writer, batch=self._batch, lossless=virtual)
 
     def await_ready(self) -> str:
-        """Wait until the bridge says where it is to be found; at once where it has.
+        """Wait until the bridge reports its address, and return it.
 
         Raises:
-            UsageError: it could not begin; with its own words.
-            ResultsError: it could not write where it is to write.
+            UsageError: when it could not start; with its message.
+            ResultsError: when it could not write its file.
         """
         if self._where is not None:
             return self._where
@@ -99,7 +99,7 @@ class BridgeProcess(ChildProcess):
         return self._where
 
     def observe(self, observation: Observation) -> None:
-        """Hand one observation over, or drop it; where commands are allowed, see now and then whether there is one."""
+        """Hand one observation over, or drop it; where commands are allowed, look for one from time to time."""
         if self._epoch is None:
             epoch = 0 if self._virtual else epoch_now_ns() - observation.t_ns
             self._epoch = epoch.to_bytes(8, "little")
@@ -112,7 +112,7 @@ class BridgeProcess(ChildProcess):
                 self._listen(0.0)
 
     def _listen(self, timeout_s: float) -> bool:
-        """Take what came back; False at its end."""
+        """Take the lines that came back; False at their end."""
         readable, _, _ = select.select([self._back], [], [], timeout_s)
         if not readable:
             return True
@@ -140,7 +140,7 @@ class BridgeProcess(ChildProcess):
     # the end
 
     def status(self) -> dict[str, Any]:
-        """What stands in the summary: samples handed over and dropped, where it is, and what went wrong."""
+        """Entry of the summary: samples handed over and dropped, the place of the output, and an error."""
         feed = self._feed
         dropped = feed.dropped if self._received is None else feed.taken - self._received
         return {"samples": feed.taken, "dropped": dropped, "where": self._where, "error": self._error}
@@ -152,7 +152,7 @@ class BridgeProcess(ChildProcess):
             summary: content of `summary.json`, or None.
 
         Returns:
-            `status`, with what was lost until the very end.
+            `status`, with all losses until the end.
         """
         deadline = elapsed_ns() + round(END_TIMEOUT_S * 1e9)
         try:
@@ -181,7 +181,7 @@ class BridgeProcess(ChildProcess):
             )
 
     def kill(self) -> None:
-        """Make sure that nothing is left of the process. Twice is allowed."""
+        """Kill the process and remove its files. Twice is allowed."""
         self._feed.close()
         if self.process.poll() is None:
             self.process.kill()

@@ -38,7 +38,7 @@ TRAJECTORY = Topic("/joint_trajectory_controller/joint_trajectory", "trajectory_
 STATUS = Topic("/canprobe/status", STRING, depth=10, transient=True)
 COMMANDS = {START: "start", STOP: "stop", FORCE: "target_force_n", SPEED: "speed_m_s"}
 POLL_SAMPLES = 8
-"""Commands are looked for every so many samples."""
+"""Number of samples between two looks for commands."""
 LOOPBACK = """\
 <CycloneDDS><Domain Id="any">
 <General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>
@@ -46,15 +46,15 @@ LOOPBACK = """\
 <Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>
 <Peers><Peer Address="127.0.0.1"/></Peers></Discovery>
 </Domain></CycloneDDS>"""
-"""One machine, without multicast: as ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST."""
+"""Configuration for one machine, without multicast, like ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST."""
 
 
 class Ros2Node:
-    """A participant with writers and readers that ROS 2 takes for its own.
+    """A participant whose writers and readers ROS 2 accepts as its own.
 
     Args:
-        domain: ROS_DOMAIN_ID.
-        loopback: stay on this machine; otherwise as Cyclone is configured (`CYCLONEDDS_URI`).
+        domain: domain, as in ROS_DOMAIN_ID.
+        loopback: whether to stay on this machine; else Cyclone's configuration decides (`CYCLONEDDS_URI`).
         encoder: the one encoder.
     """
 
@@ -120,7 +120,7 @@ class Ros2Sink:
         self._messages.epoch_ns = epoch_ns
 
     def write(self, sample: Sample) -> None:
-        """Publish a sample's messages; now and then look for commands."""
+        """Publish a sample's messages, and from time to time look for commands."""
         for topic, t_ns, data in self._messages.of(sample):
             self._writers[topic.name].write(self._node.types.carry(topic.type_name, data), t_ns)
         self._q = sample.q if sample.q is not None else self._q
@@ -134,7 +134,7 @@ class Ros2Sink:
                         self._take(topic, message)
 
     def close(self, summary: str | None) -> None:
-        """Let the last messages arrive; the domain is left with the last reference, that is with this process."""
+        """Let the last messages arrive; the domain is left when this process ends."""
         for topic in TOPICS:
             if not topic.best_effort:
                 with contextlib.suppress(DDSException, AttributeError):  # the latter is its time-out in 11.0.1
@@ -143,11 +143,11 @@ class Ros2Sink:
         self._readers.clear()
 
     def _is_read(self, topic: Topic) -> bool:
-        """Nothing is made for a topic without a reader, unless one that comes later is to have it."""
+        """Whether a topic has a reader, or keeps its last message for a later one."""
         return topic.transient or bool(self._writers[topic.name].get_matched_subscriptions())
 
     def _take(self, topic: Topic, message: Any) -> None:
-        """A command; it is a message of the topic's type."""
+        """Take a command, a message of the topic's type."""
         if topic is TRAJECTORY:
             self._follow(message)
         else:
@@ -162,7 +162,7 @@ class Ros2Sink:
         self._say(f"{shown}: taken" if why is None else f"{shown}: refused: {why}")
 
     def _follow(self, message: Any) -> None:
-        """A trajectory; one without points stops the arm, as ros2_control has it."""
+        """Take a trajectory; one without points stops the arm, as in ros2_control."""
         if not message.points:
             self._command(STOP, None)
             return
@@ -182,7 +182,7 @@ class Ros2Sink:
 
 
 def domain_of(wanted: int | None) -> int:
-    """The scene's domain, else that of ROS_DOMAIN_ID, else 0."""
+    """The domain of the scene, else of ROS_DOMAIN_ID, else 0."""
     if wanted is not None:
         return wanted
     text = os.environ.get("ROS_DOMAIN_ID") or "0"

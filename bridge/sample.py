@@ -1,7 +1,7 @@
 """The neutral sample of a cell in SI units, which every bridge gets.
 
-A sample belongs to one cycle and holds what was new in it; a part that was not is None. Nothing in it knows a tool or a
-message type. Times are in nanoseconds. z of the contact frame is the inward normal.
+A sample belongs to one cycle and holds what was new in it; a part without news is None. It knows neither tools nor
+message types. Times are in nanoseconds. z of the contact frame is the inward normal.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ BASE, FLANGE, PROBE, CONTACT = "base_link", "flange", "probe", "contact"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ContactFrame:
-    """Where the probe touches.
+    """The place where the probe touches.
 
     Attributes:
-        T_base_contact: (4, 4) contact frame to base, m: origin at the contact point, z along the inward normal.
+        T_base_contact: contact frame to base (4, 4), m: origin at the contact point, z along the inward normal.
     """
 
     T_base_contact: Floats
 
     @property
     def point(self) -> Floats:
-        """(3,) contact point, base frame, m."""
+        """Contact point (3,), base frame, m."""
         return self.T_base_contact[:3, 3]
 
     @property
     def normal(self) -> Floats:
-        """(3,) outward unit normal of the object, base frame."""
+        """Outward unit normal of the object (3,), base frame."""
         return -self.T_base_contact[:3, 2]
 
 
@@ -46,10 +46,10 @@ class TouchFrame:
 
     Attributes:
         t_ns: time of sampling, on the clock of the samples.
-        counts: (rows, columns) uint8, row by row; zero outside the window; None in features mode.
-        force: (3,) N that the object exerts on the probe, in the probe's centre frame. The array measures pressure
+        counts: image (rows, columns), uint8, row by row; zero outside the window; None in features mode.
+        force: force (3,), N, of the object on the probe, in the probe's centre frame. The array measures pressure
             only: the force runs along the contact normal, without a torque about the sphere's centre.
-        contact: None without contact, or without an arm.
+        contact: place of the contact; None without contact, or without an arm.
     """
 
     t_ns: int
@@ -64,9 +64,9 @@ class SurfacePatch:
 
     Attributes:
         t_ns: time of the cycle that received it.
-        T_base_contact: (4, 4) the estimate's contact frame to base, m; z is the inward normal.
-        K: (2, 2) curvature in that frame, 1/m, positive where convex.
-        covariance: (3, 3) of (K11, K12, K22), 1/m²; not finite where not observed.
+        T_base_contact: contact frame of the estimate to base (4, 4), m; z is the inward normal.
+        K: curvature in that frame (2, 2), 1/m, positive where convex.
+        covariance: covariance of (K11, K12, K22) (3, 3), 1/m²; not finite where not observed.
         observed: whether each principal curvature is observed (κ1 ≥ κ2).
     """
 
@@ -91,7 +91,7 @@ class SurfacePatch:
             x, y: coordinates in the contact frame, any shape, m.
 
         Returns:
-            z towards the object's inside and its standard deviation, each of that shape, m. Where the curvature is not
+            Depth z, positive inwards, and its standard deviation, each of that shape, m. Where the curvature is not
             known the surface is taken as flat, with an infinite deviation away from the contact.
         """
         weights = np.stack([0.5 * x * x, x * y, 0.5 * y * y], axis=-1)
@@ -126,9 +126,9 @@ class Diagnostic:
     """The state of a node, or of the cell.
 
     Attributes:
-        name: such as `node 3 (joint 3)`.
-        level: 0 well, 1 worth a look, 2 failed, 3 silent.
-        message: one line.
+        name: its name, such as `node 3 (joint 3)`.
+        level: 0 OK, 1 warning, 2 error, 3 stale: no heartbeat.
+        message: text of one line.
         values: (name, value) pairs as text, units in the name.
     """
 
@@ -140,18 +140,18 @@ class Diagnostic:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sample:
-    """What was new in one cycle.
+    """New data of one cycle.
 
     Attributes:
         t_ns: time of its SYNC since the bus was opened, as in `bus.log`.
-        cycle: its number; None before the first cycle and after the last.
+        cycle: number of the cycle; None before the first and after the last.
         phase: phase of the task in lower case (`approach`, `scan`, …); None where the controller gives none.
-        q: (n,) joint positions at the SYNC, rad or m; None without an arm, or before all joints were heard.
+        q: joint positions (n,) at the SYNC, rad or m; None without an arm, or before all joints have reported.
         touch: a tactile frame that became usable in this cycle.
         patch: a new answer of the estimator.
-        frames: what was on the bus since the sample before, with `EFF_FLAG` and `RTR_FLAG` on identifiers.
+        frames: frames on the bus since the sample before, with `EFF_FLAG` and `RTR_FLAG` on identifiers.
         diagnostics: states of all nodes and of the bridge, about once a second.
-        dropped: samples that were lost on the way to this bridge so far.
+        dropped: number of samples that this bridge has lost so far.
     """
 
     t_ns: int

@@ -59,7 +59,7 @@ class SampleSource:
         )
 
     def _touch(self, m: Measurement, shift_ns: int) -> TouchFrame | None:
-        """What the array measured; ``shift_ns`` takes the cycle's clock to that of the samples."""
+        """The array's frame; ``shift_ns`` converts the cycle's clock to that of the samples."""
         sensing, sample = self._sensing, m.tactile
         patch = sensing.step(m) if sensing is not None else None
         if sample is None or self._calibration is None:
@@ -81,14 +81,14 @@ class SampleSource:
         )
 
     def _place_on(self, patch: SurfacePatch | None) -> None:
-        """Contacts are placed on the estimated curvature from now on."""
+        """Place contacts on the estimated curvature from now on."""
         if patch is not None and self._sensing is not None and all(patch.observed):
             low, high = np.linalg.eigvalsh(patch.K).tolist()
             self._sensing.set_kappa(np.array([high, low]))
 
 
 def _sensing(setup: Setup) -> ContactSensing | None:
-    """Contacts, where there is an arm to place them; second moments are the estimator's business."""
+    """Sensing that places contacts, where there is an arm; it needs no second moments."""
     touch = setup.touch
     if touch is None:
         return None

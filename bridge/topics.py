@@ -1,4 +1,4 @@
-"""The topics that every ROS sink has."""
+"""The topics of every ROS sink, and their messages from a sample."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class Topic:
     """One topic, with the quality of service that ROS expects of it.
 
     Attributes:
-        name: as ROS writes it.
-        type_name: as rosbags and ROS write it.
+        name: name in ROS.
+        type_name: name of the type in rosbags and ROS.
         depth: number of messages that are kept.
-        transient: late readers get the last message (transient local).
-        best_effort: a lost message is not sent again (sensor data); reliable otherwise.
+        transient: whether late readers get the last message (transient local).
+        best_effort: whether a lost message is not sent again (sensor data); else reliable.
     """
 
     name: str
@@ -53,7 +53,7 @@ CAN_FRAMES = Topic("/can_frames", CAN_FRAME, depth=500)
 DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 ROBOT_DESCRIPTION = Topic("/robot_description", "std_msgs/msg/String", depth=1, transient=True)
 CLOCK = Topic("/clock", "rosgraph_msgs/msg/Clock", depth=1)
-"""Time of a run in virtual time, for nodes with `use_sim_time`; a recording has its own times, and no clock."""
+"""Clock of a run in virtual time, for nodes with `use_sim_time`; in a recording each message has its time."""
 TOPICS = (
     *(JOINT_STATES, WRENCH, TF, TF_STATIC, TAXELS, PATCH, CURVATURE, CAN_FRAMES, CAN_FD_FRAMES, DIAGNOSTICS),
     *(ROBOT_DESCRIPTION, CLOCK),
@@ -69,7 +69,7 @@ class Messages:
     Args:
         plan: plan of the run.
         encoder: the one encoder.
-        wanted: whether anybody takes a topic; nothing is made of the others.
+        wanted: whether a topic has a reader; messages of other topics are not made.
         static_every_ns: period at which the fixed frames are sent again; by default they are sent once.
     """
 
@@ -97,14 +97,14 @@ class Messages:
         ]
 
     def of(self, sample: Sample) -> Iterator[Message]:
-        """Every message of a sample that is wanted; the time of each is its own."""
+        """Every wanted message of a sample, with its time."""
         yield from self._can_frames(sample.frames)
         for topic, t_ns, make in self._parts(sample):
             if self._wanted(topic):
                 yield topic, self._epoch_time(t_ns), self.encoder.encode(topic.type_name, make())
 
     def _can_frames(self, frames: Sequence[TimedFrame]) -> Iterator[Message]:
-        """A message a frame: those of up to 8 bytes, and those that only CAN FD can carry."""
+        """One message for each frame: up to 8 bytes, or a longer one of CAN FD."""
         classic, fd = self._wanted(CAN_FRAMES), self._wanted(CAN_FD_FRAMES)
         for can_id, data, at_ns in frames:
             t_ns = self._epoch_time(at_ns)
@@ -125,7 +125,7 @@ class Messages:
                 yield CAN_FD_FRAMES, t_ns, self.encoder.encode(CAN_FD_FRAMES.type_name, message)
 
     def _parts(self, sample: Sample) -> Iterator[tuple[Topic, int, Callable[[], Any]]]:
-        """What there is in a sample: topic, time, and how to make the message."""
+        """Parts of a sample: topic, time, and function that makes the message."""
         t_ns, q, touch, patch = sample.t_ns, sample.q, sample.touch, sample.patch
         if self._chain is not None and t_ns >= self._static_due_ns:
             self._static_due_ns = t_ns + self._static_every_ns

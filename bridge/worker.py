@@ -1,8 +1,8 @@
-"""The process of one bridge: records from the cell on stdin, made into samples, lines of JSON back on stdout.
+"""The process of one bridge: it reads records of the cell from stdin, makes samples, and answers with lines of JSON.
 
-Back go `{"ready": where}`, then requests of the other tool, then `{"done": {"received": n, "where": …}}`, or `{"error":
-text}` at any time. The end of stdin without a last record means that the cell is gone: the sink is closed all the same.
-A file is done when it is closed. A live view is done before that: a viewer that does not read holds its close up.
+The lines are `{"ready": where}`, then requests of the other tool, then `{"done": {"received": n, "where": …}}`, or
+`{"error": text}` at any time. Where stdin ends without a last record the cell is gone, and the sink is closed too.
+A file is done when it is closed. A live view is done before that: a viewer that does not read delays its close.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from canprobe.lab.bridge.process import END
 from canprobe.lab.bridge.sampling import SampleSource
 
 NICE = 10
-"""Whatever a bridge computes, the cell and its nodes come first."""
+"""Niceness of the process: the cell and its nodes have priority over a bridge."""
 
 
 def run(name: str, records: Iterator[bytes], fd: int) -> int:
@@ -79,7 +79,7 @@ def _context(config: dict[str, Any], send: Callable[[dict[str, object]], None]) 
 
 
 def _serve(sink: Sink, source: SampleSource, records: Iterator[bytes]) -> tuple[int, str | None]:
-    """Give the sink every sample; how many there were, and the summary."""
+    """Give the sink every sample; returns their number, and the summary."""
     received = 0
     for record in records:
         body = record[1:]

@@ -1,4 +1,4 @@
-"""The Python API: run a scene's task, or open its cell for controllers; and the commands that need no results."""
+"""The Python API: run a scene's task, or open its cell for controllers; and the functions behind the commands."""
 
 from __future__ import annotations
 
@@ -67,21 +67,21 @@ def run(
     observers: Sequence[AnyObserver] = (),
     bridge: Sequence[str] = (),
 ) -> RunResult:
-    """Run a scene's task and write what was measured.
+    """Run a scene's task and write its results.
 
     Args:
-        scene: a packaged name, the path of a TOML file, or what `canprobe.load_scene` returns.
-        overrides: values in the place of the scene's, such as ``{"task.force_n": 3}``; see `canprobe.load_scene`.
-        bus: ``lockstep``, ``direct`` (no bus), ``socketcan`` or another interface, in the place of the scene's.
-        channel: in the place of the scene's; ``{"can0": "vcan0", "can1": "vcan1"}`` where it names several.
-        bitrate: in the place of the scene's, bit/s.
+        scene: a packaged name, the path of a TOML file, or a scene from `canprobe.load_scene`.
+        overrides: values that replace the scene's, such as ``{"task.force_n": 3}``; see `canprobe.load_scene`.
+        bus: ``lockstep``, ``direct`` (no bus), ``socketcan`` or another interface; replaces the scene's.
+        channel: replaces the scene's; ``{"can0": "vcan0", "can1": "vcan1"}`` where it names several.
+        bitrate: replaces the scene's, bit/s.
         out: folder for the files; ``runs/<scene>-<time>`` by default.
-        seed: of the emulation, in the place of the scene's.
-        duration_s: of the task, in the place of the scene's, s.
+        seed: seed of the emulation; replaces the scene's.
+        duration_s: length of the task, s; replaces the scene's.
         progress: called with (seconds done, seconds in all).
         say: called with each step of bring-up and stop.
-        files: False writes nothing.
-        force: let the files replace those of an earlier run in ``out``; without, a folder that is not empty is refused.
+        files: whether to write files.
+        force: whether files may replace those of an earlier run in ``out``; else a folder that is not empty is refused.
         observers: called after each cycle with its measurement, command and frames (`Observation`).
         bridge: names of bridges to other tools, besides those of the scene; see `canprobe.cell.planning.bridges`.
 
@@ -109,7 +109,7 @@ def run(
 
 
 def _refuse_wrong(overrides: object, out: object, observers: object, bridge: object) -> None:
-    """Raise a UsageError where an argument of `run` or `open_cell` is of another kind than it must be."""
+    """Raise UsageError where an argument of `run` or `open_cell` has a wrong type."""
     for name, value, kinds, expected in (
         ("overrides", overrides, (Mapping, NoneType), 'values by key such as {"task.force_n": 3}'),
         ("out", out, (str, os.PathLike, NoneType), "the path of a folder"),
@@ -121,22 +121,22 @@ def _refuse_wrong(overrides: object, out: object, observers: object, bridge: obj
 
 
 def _over(overrides: Mapping[str, Any] | None, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Overrides, and over them what an argument gives."""
+    """The overrides, replaced by the arguments that are given."""
     return {**(overrides or {}), **{key: value for key, value in given.items() if value is not None}}
 
 
 def results_folder(scene: Scene, out: Path | str | None = None) -> Path:
-    """Where `run` puts the files: ``out``, or ``runs/<scene>-<time>`` to the millisecond."""
+    """Folder of the files of `run`: ``out``, or ``runs/<scene>-<time>`` to the millisecond."""
     return Path(out) if out is not None else timed_folder(scene.name)
 
 
 def timed_folder(name: str) -> Path:
-    """``runs/<name>-<time>`` to the millisecond."""
+    """The folder ``runs/<name>-<time>``, with the time to the millisecond."""
     return Path("runs") / f"{name}-{datetime.now():%Y%m%d-%H%M%S-%f}"[:-3]
 
 
 def plan(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = None) -> Plan:
-    """Everything that follows from a scene before anything is started; see `canprobe.cell.planning.make.make_plan`.
+    """Plan a scene without starting anything; see `canprobe.cell.planning.make.make_plan`.
 
     Args:
         scene, overrides: as for `run`.
@@ -147,16 +147,16 @@ def plan(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = None) 
     Raises:
         UsageError: there is no such scene.
         SceneError: the scene has mistakes.
-        PlanError: with every reason why it does not fit, its numbers and the ways out.
+        PlanError: when it does not fit; the error has every reason with its numbers, and the ways out.
     """
     return make_plan(resolve(load_scene(scene, overrides)))
 
 
 def check_free(folder: Path | None, *, force: bool) -> None:
-    """Refuse a folder that holds anything: results never replace others unless that is wanted.
+    """Refuse a folder that is not empty: results replace others only with ``force``.
 
     Raises:
-        UsageError: it is not empty, and ``force`` is False.
+        UsageError: when the folder is not empty, and ``force`` is False.
     """
     if folder is not None and not force and folder.is_dir() and any(folder.iterdir()):
         raise UsageError(
@@ -186,7 +186,7 @@ def open_cell(
     bridge: Sequence[str] = (),
     rows_kept: int | None = None,
 ) -> OpenCell:
-    """A cell for controllers of your own; leaving its block always disables the drives and closes the bus.
+    """A cell for your own controllers; leaving its block always disables the drives and closes the bus.
 
     Example::
 
@@ -194,15 +194,15 @@ def open_cell(
             result = cell.run(my_controller)
         print(result.text())
 
-    The block is the run: its result is complete, and its files are written, when it is left, however it is left.
+    The block is the run: when it is left, in whatever way, its result is complete and its files are written.
 
     Args:
         scene, overrides, bus, channel, bitrate, seed: as for `run`.
         out: folder for the same files as those of `run`; None writes nothing.
         say: called with each step.
         force, observers, bridge: as for `run`.
-        rows_kept: cycles whose row of the log is kept; all by default, which grows by about 1 KiB a cycle. With a
-            number the truth is not kept, and the scan is not scored.
+        rows_kept: number of cycles whose rows of the log are kept; by default all, about 1 KiB for each. With a
+            number the truth is not kept, and a scan is not scored.
 
     Returns:
         The cell; ``with`` brings it up.

@@ -29,7 +29,7 @@ class CanprobeError(Exception):
     """Base of every error that canprobe raises on purpose.
 
     Attributes:
-        summary: of the run that the error ended, as in ``summary.json``; None where nothing had been brought up.
+        summary: summary of the run that the error ended, as in ``summary.json``; None where no bus was opened.
     """
 
     exit_status = 3
@@ -59,7 +59,7 @@ class PlanError(UsageError):
 
     Attributes:
         problems: every reason with its numbers, one line each.
-        ways_out: changes of the scene each of which makes it fit, with the numbers that it leaves.
+        ways_out: changes of the scene, each of which makes it fit, with the load that it leaves.
     """
 
     def __init__(self, problems: Sequence[str], ways_out: Sequence[str] = ()) -> None:
@@ -96,7 +96,7 @@ class NodeError(BusError):
 
 
 class StudyError(CanprobeError):
-    """A case of a study, a worker process, or the files that a study keeps failed."""
+    """A case of a study, a worker process, or a file of a study failed."""
 
 
 class ProtocolError(BusError):
@@ -122,16 +122,16 @@ class SafetyStop(CanprobeError):  # noqa: N818 - it is a stop, not a mistake
 
 
 def regular_file(path: Path, most_bytes: int | None = None) -> Path:
-    """A path to read from, if a file with an end is there: a device or a pipe may never end.
+    """A path to read from, if it is a regular file: a device or a pipe may never end.
 
-    It stands here, as every wing reads files, and raises what the opening of a file raises.
+    It is here because every wing reads files; it raises the errors of `open`.
 
     Args:
-        path: of the file.
-        most_bytes: size up to which it is read whole; None: it is not.
+        path: path of the file.
+        most_bytes: largest size of a file that is read whole; None: any size.
 
     Raises:
-        OSError: there is none, it is something else, or it is larger.
+        OSError: when there is no such file, it is not a regular one, or it is larger.
     """
     try:
         found = path.stat()
@@ -164,11 +164,11 @@ EXTRA_OF = {
     "xarray": "data",
     "pyarrow": "data",
 }
-"""Extra that brings a package, by the name that is imported."""
+"""Extra that installs a package, by the package's import name."""
 
 
 def install_line(extra: str) -> str:
-    """What to type to install an extra: from where canprobe itself was installed, if that is known."""
+    """Command line that installs an extra, from where canprobe itself was installed, if that is known."""
     import importlib.metadata  # only where something is missing
     import json
     import os

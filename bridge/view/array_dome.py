@@ -16,19 +16,19 @@ FULL_COUNTS = 255
 TAXEL_SHARE = 0.9
 """Side of a drawn taxel over the pitch."""
 TAXEL_LIFT_M = 2e-4
-"""How far above the dome taxels are drawn."""
+"""Height of the drawn taxels above the dome, m."""
 
 
 def taxel_poses(pad: Pad, radius: float) -> tuple[Floats, Floats]:
-    """Where the taxels lie on the probe.
+    """Poses of the taxels on the probe.
 
     Args:
         pad: the taxels.
         radius: distance from the origin of the probe's frame to its pole, m.
 
     Returns:
-        (n, 3) positions in the probe frame, m, and (n, 4) unit quaternions w, x, y, z that turn a tile lying in
-        the xy plane to its place; row by row, v and then u rising.
+        Positions in the probe frame (n, 3), m, and unit quaternions w, x, y, z (n, 4) that turn a tile from the
+        xy plane to its place; row by row, v and then u rising.
     """
     directions = np.array([pad_to_direction(u, v, pad.radius_m) for u, v in pad.uv.tolist()])
     # the shortest turn from z to d: (1 + d_z, z × d), normalised
@@ -46,16 +46,16 @@ def tile(pad: Pad) -> tuple[Floats, NDArray[np.int64]]:
 
 
 def taxel_colours(taxels: NDArray[np.uint8]) -> Colours:
-    """(..., 3) colours of counts; a square-root scale, so that the rim of a patch is seen."""
+    """Colours (..., 3) of counts, on a square-root scale, so that the rim of a patch is visible."""
     return scale(np.sqrt(taxels.astype(np.float64)), 0.0, math.sqrt(FULL_COUNTS), MAGMA)
 
 
 def taxel_image(taxels: NDArray[np.uint8], pixels: int) -> Colours:
-    """The image as RGB, each taxel a square of so many pixels; v rises upward.
+    """The image as RGB, each taxel as a square; v rises upward.
 
     Args:
-        taxels: (rows, columns) counts, rows v, columns u.
-        pixels: per taxel.
+        taxels: counts (rows, columns), rows v, columns u.
+        pixels: side of a taxel, pixels.
     """
     colours = taxel_colours(taxels[::-1])
     return np.repeat(np.repeat(colours, pixels, axis=0), pixels, axis=1)

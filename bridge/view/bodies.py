@@ -1,7 +1,7 @@
-"""What is seen as solid: the arm's links, and the estimated patch.
+"""Solids of the view: the arm's links, and the probe.
 
-Radii and thicknesses follow photographs of the arm; where the joints are follows the model, so shapes and kinematics
-cannot disagree.
+Radii and thicknesses are taken from photographs of the arm, places of the joints from its model, so that shapes and
+kinematics agree.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ JOINT_RADIUS_M = 0.045
 UPPER_ARM, FOREARM = 0.046, 0.058
 """Thickness of the two long links along the shoulder's axis, m."""
 _TWISTS = 0.5 * math.pi * np.array((1.0, 0.0, -1.0, 1.0, -1.0, 0.0))
-"""Between the axes of a PUMA, rad."""
+"""Angles between the axes of a PUMA, rad."""
 _SIZE = (0.2, 0.2)
-"""Upper arm and forearm of the 260, m."""
+"""Lengths of upper arm and forearm of the 260, m."""
 _EQUAL_M = 1e-9
 
 
@@ -39,11 +39,11 @@ class Part:
     """One solid of one colour, fixed to a link.
 
     Attributes:
-        name: unique in the arm.
+        name: name, unique in the arm.
         frame: 0 for the base, i for the frame behind joint i.
-        mesh: triangles in that frame, m.
+        mesh: its triangles in that frame, m.
         colour: RGB, 0–255.
-        flat: its triangles are shaded apart: edges stay sharp without doubled vertices.
+        flat: whether its triangles are shaded apart: edges stay sharp without doubled vertices.
     """
 
     name: str
@@ -58,10 +58,10 @@ def link_frames(chain: Chain, q: ArrayLike) -> Floats:
 
     Args:
         chain: the arm.
-        q: (n,) joint positions, rad or m.
+        q: joint positions (n,), rad or m.
 
     Returns:
-        (n + 1, 4, 4) T_base_link; the last is the flange.
+        Poses T_base_link (n + 1, 4, 4); the last is the flange.
     """
     frames = np.empty((chain.n + 1, 4, 4))
     frames[0] = np.eye(4)
@@ -114,7 +114,7 @@ class _Puma:
 
 
 def _puma(chain: Chain) -> _Puma | None:
-    """The lengths, where a chain has the axes of a PUMA and the size of the 260; None of any other."""
+    """The lengths, where a chain has the axes of a PUMA and the size of the 260; None for any other."""
     steps = (*chain.fixed[1:], chain.T_last_flange)
     if chain.n != _TWISTS.size or any(chain.prismatic):
         return None

@@ -21,15 +21,15 @@ from canprobe.lab.bridge.view.surface import GrowingSurface
 FRAME_NS, PLOT_NS = 40_000_000, 250_000_000
 """Time on the wall between two pictures, and between two drawings of the plots."""
 ROW_S, WINDOW_S = 0.05, 30.0
-"""Time between two points of a plot, and how much of the past it shows."""
+"""Time between two points of a plot, and length of the past that it shows."""
 _OFF_PATH = tuple(phase.name.lower() for phase in OFF_PATH)
 
 
 class LiveView:
-    """A sink of samples that shows the newest of them, as often as a browser wants to see it.
+    """A sink of samples that shows the newest one at the rate of a browser.
 
     Args:
-        context: the plan, and where to listen.
+        context: plan, and address of the server.
     """
 
     def __init__(self, context: Context) -> None:
@@ -50,14 +50,14 @@ class LiveView:
 
     @property
     def where(self) -> str:
-        """Its address."""
+        """Address of the page."""
         return address(self._server)
 
     def start(self, epoch_ns: int) -> None:
-        """Nothing to do: times are shown from the opening of the bus."""
+        """Do nothing: times are shown from the opening of the bus."""
 
     def write(self, sample: Sample) -> None:
-        """Take one sample; now and then show where the cell is."""
+        """Take one sample, and from time to time show the cell."""
         moment = self._follower.take(sample)
         contact = sample.touch.contact if sample.touch is not None else None
         if contact is not None and moment.phase not in _OFF_PATH:
@@ -83,7 +83,7 @@ class LiveView:
             self._panel.show(moment, curves)
 
     def close(self, summary: str | None) -> None:
-        """Take the page away."""
+        """Stop the server."""
         self._show(self._follower.moment, self._plot_ns + PLOT_NS)
         self._stack.close()
 

@@ -1,4 +1,4 @@
-"""Colours of numbers: a scale that is even to the eye, dark blue to yellow."""
+"""Colours of numbers on a scale that looks even, dark blue to yellow."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ UNKNOWN = (138, 148, 160)
 
 
 def scale(values: ArrayLike, low: float, high: float, stops: Floats = VIRIDIS) -> Colours:
-    """Colours of values between two ends, those beyond take the end's; what is not finite is grey.
+    """Colours of values between two limits; a value beyond has the colour of the limit, one that is not finite is grey.
 
     Args:
-        values: (...,) any unit.
+        values: values (...,) in any unit.
         low, high: limits of the scale in the same unit, low < high.
         stops: `VIRIDIS`, dark blue to yellow, or `MAGMA`, black to light yellow.
 
     Returns:
-        (..., 3) RGB, 0–255.
+        Colours (..., 3), RGB, 0–255.
     """
     x = np.asarray(values, dtype=np.float64)
     known = np.isfinite(x)
@@ -42,7 +42,7 @@ def scale(values: ArrayLike, low: float, high: float, stops: Floats = VIRIDIS) -
 
 
 def linear_light(colours: Colours) -> Colours:
-    """RGB as amounts of light, which viser wants of lines and of batches; anything else would look too bright.
+    """RGB as amounts of light, which viser expects for lines and batches; else they would look too bright.
 
     Source: IEC 61966-2-1 (sRGB), decoding.
     """

@@ -1,4 +1,4 @@
-"""What is shown of one instant and plotted over time, and how it comes from samples, live or recorded."""
+"""The cell at one instant, for view and plots, made from live or recorded samples."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.types import Floats
 
 SILENT_NS = 250_000_000
-"""A contact is shown no longer than this after the tactile frame that showed it."""
+"""Longest time that a contact is shown after its tactile frame, ns."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,14 +40,14 @@ class Moment:
     """The cell at one instant.
 
     Attributes:
-        t_s: on the clock of the samples, s.
+        t_s: time on the clock of the samples, s.
         phase: phase of the task.
-        q: (n,) joint positions, rad or m; None without an arm.
+        q: joint positions (n,), rad or m; None without an arm.
         contact: place of the contact; None without contact.
-        answer: the newest one of the estimator; None before the first.
-        taxels: (rows, columns) counts of the newest frame; None before the first.
+        answer: newest answer of the estimator; None before the first.
+        taxels: counts (rows, columns) of the newest frame; None before the first.
         force: contact force of the newest frame, N; NaN before the first.
-        dropped: samples lost on the way so far.
+        dropped: number of samples lost so far.
     """
 
     t_s: float = 0.0
@@ -78,7 +78,7 @@ def judge(patch: SurfacePatch, shape: PlacedShape | None) -> JudgedAnswer:
 
 
 class Follower:
-    """Keeps the newest of everything while samples come in.
+    """Keeps the newest state of the cell while samples come in.
 
     Args:
         shape: the true object, for the error; None where it is not known.

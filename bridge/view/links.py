@@ -1,4 +1,4 @@
-"""The links of an arm as its URDF shows them: meshes that are found beside it, and plain solids.
+"""The links of an arm from its URDF: meshes that are found beside it, and plain solids.
 
 Meshes (STL, DAE, OBJ) are read by trimesh (extra `view`). Where a link has nothing to show, or one of its
 meshes is missing or cannot be read, the simple link of `canprobe.lab.bridge.view.bodies` is drawn, and a line says so.
@@ -24,12 +24,12 @@ from canprobe.mechanics.robot.urdf_visuals import Visual, find_mesh, visuals_of
 from canprobe.mechanics.types import Floats
 
 _NAMED = 3
-"""Missing meshes that a line names."""
+"""Number of missing meshes that a line names."""
 _FORMATS = (".stl", ".dae", ".obj")
 
 
 def arm_links(arm: ArmSettings, chain: Chain) -> tuple[list[Part], list[str]]:
-    """What is drawn of an arm, and a line for what its URDF shows and cannot be drawn.
+    """Solids of an arm, and lines about parts of its URDF that cannot be drawn.
 
     Args:
         arm: arm of the scene.

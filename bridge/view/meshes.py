@@ -27,8 +27,8 @@ class TriangleMesh:
     """A triangle mesh.
 
     Attributes:
-        vertices: (n, 3) m.
-        faces: (m, 3) indices into them.
+        vertices: positions (n, 3), m.
+        faces: indices into the vertices (m, 3).
     """
 
     vertices: Floats
@@ -51,7 +51,7 @@ def grid(points: ArrayLike) -> TriangleMesh:
     """A sheet through a grid of points.
 
     Args:
-        points: (rows, columns, 3); the front side is that of rows × columns directions.
+        points: points (rows, columns, 3); the front side is that of rows × columns directions.
     """
     p = np.asarray(points, dtype=np.float64)
     rows, columns = p.shape[:2]
@@ -131,8 +131,8 @@ def revolved(profile: ArrayLike, sectors: int = SECTORS) -> TriangleMesh:
     """A surface of revolution about z.
 
     Args:
-        profile: (n, 2) rows (distance from the axis, height), m; the outside lies to its right.
-        sectors: round the axis.
+        profile: rows (distance from the axis, height) (n, 2), m; the outside lies to its right.
+        sectors: number of sectors round the axis.
     """
     p = np.asarray(profile, dtype=np.float64)
     angles = np.linspace(0.0, 2.0 * math.pi, sectors + 1)
@@ -144,7 +144,7 @@ def dome(radius: float, opening_rad: float, rings: int = 24) -> TriangleMesh:
     """The part of a sphere round its pole (+z), centre at the origin.
 
     Args:
-        radius: m.
+        radius: radius of the sphere, m.
         opening_rad: angle from the pole to the rim; π for the whole sphere.
         rings: number of rings from the rim to the pole.
     """

@@ -14,9 +14,9 @@ from canprobe.mechanics.touch.shapes import Bowl, PlacedShape, Torus, Wave
 from canprobe.mechanics.types import Floats
 
 REACH_M = 0.055
-"""How much of a surface without end is shown round the object's origin, to each side."""
+"""Half width of the shown part of an infinite surface round the object's origin, m."""
 WHOLE_M = 0.12
-"""Largest radius of a body that is shown whole."""
+"""Largest radius of a body that is shown whole, m."""
 STEPS = 40
 LINES = 15
 RELIEF = 161
@@ -47,7 +47,7 @@ def object_mesh(shape: PlacedShape) -> TriangleMesh:
 
 
 def object_lines(shape: PlacedShape) -> Floats:
-    """Lines on the surface in two directions, which make its curvature visible: (n, 2, 3) segments, base frame, m."""
+    """Lines on the surface in two directions, which show its curvature: segments (n, 2, 3), base frame, m."""
     radius = math.inf if isinstance(shape, Cylinder) else getattr(shape, "radius", math.inf)
     if isinstance(shape, Heights):
         points, exists = _relief(shape)
@@ -65,7 +65,7 @@ def _lines(sheet: Floats) -> Floats:
 
 
 def _relief(shape: Heights) -> tuple[Floats, NDArray[np.bool_]]:
-    """(m, n, 3) points of heights within `REACH_M` of the origin, base frame, and (m, n) whether the surface exists."""
+    """Points (m, n, 3) of heights within `REACH_M` of the origin, base frame, and whether the surface exists (m, n)."""
     x, y = (
         np.linspace(max(low, -REACH_M), min(high, REACH_M), RELIEF)
         for low, high in zip(shape.spline.corner, shape.spline.far, strict=True)
@@ -78,7 +78,7 @@ def _relief(shape: Heights) -> tuple[Floats, NDArray[np.bool_]]:
 
 
 def _sheet(shape: PlacedShape, reach_m: float) -> Floats:
-    """(STEPS + 1, STEPS + 1, 3) feet of a square of the tangent plane, base frame; its front side is outside."""
+    """Feet (STEPS + 1, STEPS + 1, 3) of a square of the tangent plane, base frame; its front side is outside."""
     T = shape.T_base_object
     across = min(reach_m, 0.85 * shape.radius) if isinstance(shape, Cylinder) else reach_m
     xs, ys = np.linspace(-reach_m, reach_m, STEPS + 1), np.linspace(-across, across, STEPS + 1)
@@ -87,7 +87,7 @@ def _sheet(shape: PlacedShape, reach_m: float) -> Floats:
 
 
 def _height(shape: PlacedShape, y: float) -> float:
-    """Where to look for a foot: in the troughs too."""
+    """Height at which the search for a foot begins, in the troughs too."""
     if isinstance(shape, Wave):
         return shape.amplitude * (math.cos(2.0 * math.pi * y / shape.wavelength) - 1.0)
     return 0.0

@@ -1,6 +1,6 @@
 """One HTML file that replays a run: viser's own client with the scene in it, and a panel of plots beside it.
 
-Nothing is loaded when it is opened, so that it can be mailed, and looked at years later, from any disk.
+It loads nothing when it is opened, so that it can be mailed, and opened years later from any disk.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from canprobe.lab.bridge.view.surface import LoadedSurface
 from canprobe.mechanics.types import Floats
 
 MOST_FRAMES = 900
-"""A longer run is shown in larger steps: the file stays below ten megabytes."""
+"""Most frames of a page; a longer run has larger steps, so that the file stays below ten megabytes."""
 
 
 def write_page(run: RecordedRun, file: Path, say: Callable[[str], None]) -> None:
@@ -38,11 +38,11 @@ def write_page(run: RecordedRun, file: Path, say: Callable[[str], None]) -> None
     Args:
         run: a run that `read_run` has read.
         file: file that is written; an older one is replaced.
-        say: called with each line about what cannot be drawn.
+        say: called with a line for each part that cannot be drawn.
 
     Raises:
-        UsageError: viser is not installed.
-        ResultsError: the file cannot be written.
+        UsageError: when viser is not installed.
+        ResultsError: when the file cannot be written.
     """
     times = run.times(max(FRAME_S, run.duration_s / MOST_FRAMES))
     recorded, notes = _record(run, times)
@@ -57,7 +57,7 @@ def write_page(run: RecordedRun, file: Path, say: Callable[[str], None]) -> None
 
 
 def _record(run: RecordedRun, times: Floats) -> tuple[str, list[str]]:
-    """Viser's page with every frame in it, and lines about what cannot be drawn."""
+    """Viser's page with every frame in it, and lines about parts that cannot be drawn."""
     with open_server(0) as server:
         stage = Stage(server, run.setup)
         errors = deviation_scale(shape_of(run))
@@ -77,7 +77,7 @@ def _record(run: RecordedRun, times: Floats) -> tuple[str, list[str]]:
 
 
 def _panel_data(run: RecordedRun, times: Floats, notes: list[str]) -> dict[str, Any]:
-    """What the panel plots: columns, taxel images, colours; None for what is not finite."""
+    """Data of the panel: columns, taxel images, colours; None for a value that is not finite."""
     moments = [run.at(t) for t in times.tolist()]
     curves = curves_of(map(row_of, moments))
     shape = shape_of(run)

@@ -1,4 +1,4 @@
-"""Beside the scene: what the task does in figures, the taxel image, plots over time."""
+"""The panel beside the scene: figures of the task, the taxel image, plots over time."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from canprobe.lab.bridge.view.path import DeviationScale
 from canprobe.lab.bridge.view.plots import Curves
 from canprobe.lab.bridge.view.stage import Stage, legend_of
 
-INK, FIRST, SECOND, FAINT = "#1f2933", "#c2410c", "#0f6e84", "#9aa5b1"
+INK, FIRST_INK, SECOND_INK, FAINT = "#1f2933", "#c2410c", "#0f6e84", "#9aa5b1"
 HEIGHT = 96
 TAXEL_PIXELS = 5
 """Side of a taxel in its image."""
 
 
 class Panel:
-    """What a browser shows beside the scene.
+    """The panel that a browser shows beside the scene.
 
     Args:
         server: a `viser.ViserServer`.
         scene: scene that is shown.
-        errors: what the path's colours mean.
-        stage: what is beside, with lines about what cannot be drawn.
+        errors: scale of the surface's colours.
+        stage: stage beside the panel, with lines about parts that cannot be drawn.
     """
 
     def __init__(self, server: Any, scene: Scene, errors: DeviationScale, stage: Stage) -> None:
@@ -51,10 +51,10 @@ class Panel:
         if scene.sensor is not None:
             blank = np.zeros((scene.sensor.rows, scene.sensor.columns), np.uint8)
             self._taxels = gui.add_image(taxel_image(blank, TAXEL_PIXELS), label="taxel image", format="png")
-            self._add_plot(gui, "force (N)", ("force", "target"), (FIRST, FAINT))
+            self._add_plot(gui, "force (N)", ("force", "target"), (FIRST_INK, FAINT))
         if scene.shape is not None:
             names = ("true1", "true2", "low1", "high1", "low2", "high2", "kappa1", "kappa2")
-            colours = (FAINT, FAINT, FIRST, FIRST, SECOND, SECOND, FIRST, SECOND)
+            colours = (FAINT, FAINT, FIRST_INK, FIRST_INK, SECOND_INK, SECOND_INK, FIRST_INK, SECOND_INK)
             self._add_plot(gui, "κ1, κ2 with 95 % bands; grey: true (1/m)", names, colours)
             self._add_plot(gui, "error of K; grey: stated deviation (1/m)", ("error", "sigma"), (INK, FAINT))
 

@@ -1,4 +1,4 @@
-"""The contact's path as coloured segments: thinned, lifted off the surface, and cut into chunks by time."""
+"""The contact's path as segments: thinned, lifted off the surface, and cut into chunks by time."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.types import Floats
 
 SPACING_M = 4e-4
-"""Path between two points that are drawn."""
+"""Distance between two drawn points of the path, m."""
 LIFT_M = 6e-4
-"""Off the surface, along the normal, so that the ghost does not hide the path."""
+"""Distance of the path from the surface along the normal, m, so that the surface does not hide it."""
 GAP_M = 8e-3
-"""Two contacts farther apart are not joined: the probe was lifted between them."""
+"""Distance of two contacts above which they are not joined, m: the probe was lifted between them."""
 OFF_PATH = (Phase.APPROACH, Phase.RETREAT, Phase.DONE)
 """Phases whose contacts are not points of the path."""
 SHARE, LEAST_PER_M, UNCERTAIN_PER_M = 0.05, 0.5, 2.0
@@ -26,18 +26,18 @@ SHARE, LEAST_PER_M, UNCERTAIN_PER_M = 0.05, 0.5, 2.0
 
 @dataclass(frozen=True, slots=True)
 class DeviationScale:
-    """What the colours of the recovered surface mean.
+    """Scale of the colours of the recovered surface.
 
     Attributes:
         high: value of the last colour, 1/m; the first is 0.
-        text: what is coloured, for a legend.
+        text: name of the coloured quantity, for a legend.
     """
 
     high: float
     text: str
 
     def colours(self, values: Floats) -> Colours:
-        """(n, 3) colours of values (n,), 1/m, what is well known bright; grey where a value is not finite."""
+        """Colours (n, 3) of values (n,), 1/m: bright for a small deviation, grey where a value is not finite."""
         return scale(self.high - np.asarray(values), 0.0, self.high)
 
 
@@ -66,12 +66,12 @@ class Trail:
         return len(self.segments)
 
     def add(self, t_s: float, point: Floats, normal: Floats) -> bool:
-        """Take one contact; whether a segment has come of it.
+        """Take one contact; returns whether it has made a segment.
 
         Args:
-            t_s: its time, s.
-            point: (3,) m.
-            normal: (3,) outward.
+            t_s: time of the contact, s.
+            point: contact point (3,), m.
+            normal: outward normal (3,).
         """
         lifted = point + LIFT_M * normal
         if self._last is None:
@@ -92,7 +92,7 @@ class Trail:
 
         Args:
             most: number of groups.
-            least_s: time that a group spans at least.
+            least_s: least time of a group, s.
         """
         if not self.times:
             return []

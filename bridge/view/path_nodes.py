@@ -11,7 +11,7 @@ from canprobe.lab.bridge.view.path import Trail
 PATH = (40, 44, 52)
 THICKNESS_M = 4e-4
 STRETCH = 150
-"""Segments of one node of a live path."""
+"""Number of segments in one node of a live path."""
 
 
 class Parts:
@@ -23,12 +23,12 @@ class Parts:
         self._shown = 0
 
     def add(self, t_s: float, node: Any) -> None:
-        """A hidden node that appears at an instant, s, no earlier than those before."""
+        """Add a hidden node that appears at an instant, s, no earlier than those before."""
         self._starts.append(t_s)
         self._nodes.append(node)
 
     def until(self, t_s: float) -> None:
-        """Show what has appeared by an instant, and hide the rest."""
+        """Show the nodes that have appeared by an instant, and hide the others."""
         wanted = int(np.searchsorted(self._starts, t_s, side="right"))
         low, high = sorted((self._shown, wanted))
         for node in self._nodes[low:high]:
@@ -55,7 +55,7 @@ class GrowingPath:
 
     Args:
         api: viser's scene.
-        trail: which grows elsewhere.
+        trail: path that the owner extends.
     """
 
     def __init__(self, api: Any, trail: Trail) -> None:
@@ -63,7 +63,7 @@ class GrowingPath:
         self._done = self._sent = 0
 
     def refresh(self) -> None:
-        """Send what has come since."""
+        """Send the new segments."""
         while self._sent < len(self._trail):
             end = min(self._done + STRETCH, len(self._trail))
             name = f"/path/{self._done // STRETCH:04d}"

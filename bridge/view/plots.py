@@ -1,4 +1,4 @@
-"""What is plotted over time: force, principal curvatures with their bands, the error of the curvature."""
+"""Curves over time: force, principal curvatures with their bands, the error of the curvature."""
 
 from __future__ import annotations
 

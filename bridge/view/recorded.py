@@ -1,4 +1,4 @@
-"""A folder that `canprobe run` wrote → what there is to show, instant by instant."""
+"""The folder of a run → its moments to show, instant by instant."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from canprobe.mechanics.types import Floats
 
 @dataclass(frozen=True, eq=False)  # without slots: `cached_property`
 class RecordedRun:
-    """What is shown of a run.
+    """The data of a run that the view shows.
 
     Attributes:
-        setup: the scene as resolved.
+        setup: resolved scene.
         log: the columns of ``log.npz``; every row one cycle.
         answer_rows: rows at which the estimator gave a new answer.
         answers: estimate at each of them.
-        taxels: (t_s, (rows, columns) uint8 counts) of each tactile frame, by rising time of the cycle that used it.
+        taxels: time, s, and counts (rows, columns) of each tactile frame, by rising time of the cycle that used it.
     """
 
     setup: Setup
@@ -61,7 +61,7 @@ class RecordedRun:
 
     @cached_property
     def _q(self) -> Floats | None:
-        """(rows, n) rad or m."""
+        """Joint positions (rows, n), rad or m."""
         return joint_positions(self.log)
 
     def times(self, step_s: float) -> Floats:
@@ -70,7 +70,7 @@ class RecordedRun:
         return np.append(np.arange(start, self.duration_s - 1e-9, step_s), self.duration_s)
 
     def at(self, t_s: float) -> Moment:
-        """What the cell knew at an instant."""
+        """The moment of an instant, with what the cell knew then."""
         log, q = self.log, self._q
         row = max(int(np.searchsorted(log["t_s"], t_s + 1e-9, side="right")) - 1, 0)
         answer = int(np.searchsorted(self.answer_rows, row, side="right")) - 1
@@ -99,7 +99,7 @@ class RecordedRun:
 
 
 def read_run(folder: Path, setup: Setup | None = None) -> RecordedRun:
-    """Read what is shown of a run.
+    """Read the data of a run that the view shows.
 
     Args:
         folder: folder that `canprobe run` wrote: ``scene.toml``, ``log.npz`` and, for the taxels, ``tactile.npz``.

@@ -24,7 +24,7 @@ from canprobe.mechanics.touch.shapes import PlacedShape
 
 FRAME_S = 0.04
 MOST_POINTS = 600
-"""Points of a curve in a plot."""
+"""Most points of a curve in a plot."""
 
 
 def serve_run(
@@ -42,8 +42,8 @@ def serve_run(
         run: a run that `read_run` has read.
         port, host: see `open_server`.
         ready: called with the address.
-        say: called with each line about what cannot be drawn.
-        whole: what is done within it is not to be interrupted; pictures are made by libraries that take it ill.
+        say: called with a line for each part that cannot be drawn.
+        whole: block that must not be interrupted: libraries that draw pictures fail then.
     """
     with open_server(port, host) as server:
         player = Player(server, run)
@@ -64,10 +64,10 @@ class Player:
 
     Args:
         server: a `viser.ViserServer`.
-        run: what is shown.
+        run: run to show.
 
     Attributes:
-        notes: lines about what cannot be drawn.
+        notes: lines about parts that cannot be drawn.
     """
 
     def __init__(self, server: Any, run: RecordedRun) -> None:
@@ -89,7 +89,7 @@ class Player:
         self._shown = math.nan
 
     def step(self, dt_s: float) -> None:
-        """Go on by so much of the wall's time, and show where the slider stands."""
+        """Go on by a time on the wall, s, and show the moment of the slider."""
         t = float(self._slider.value)
         if self._play.value:
             t = round(t + dt_s * float(self._speed.value), 2)

@@ -1,4 +1,4 @@
-"""A viser server that says nothing on stdout and leaves nothing behind."""
+"""A viser server that writes nothing on stdout and is stopped at the end."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ def open_server(port: int, host: str = "127.0.0.1") -> Iterator[Any]:
     """A server for browsers, stopped on leaving.
 
     Args:
-        port: 0 lets the system choose; where it is taken, the next free one.
-        host: 0.0.0.0 for other machines too.
+        port: wanted port, or the next free one; 0 lets the system choose.
+        host: address to listen on; 0.0.0.0 serves other machines too.
 
     Raises:
-        UsageError: viser is not installed.
-        InterfaceError: no port can be had.
+        UsageError: when viser is not installed.
+        InterfaceError: when no port is free.
     """
     viser = need("viser", "view", "the view")
     with contextlib.redirect_stdout(io.StringIO()):  # viser greets and leaves with a box on stdout
@@ -37,6 +37,6 @@ def open_server(port: int, host: str = "127.0.0.1") -> Iterator[Any]:
 
 
 def address(server: Any) -> str:
-    """Where a browser finds a server."""
+    """Address of a server for a browser."""
     host = server.get_host()
     return f"http://{'localhost' if host == '0.0.0.0' else host}:{server.get_port()}"

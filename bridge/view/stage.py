@@ -34,15 +34,15 @@ FORCE_HEAD_M = 0.007
 LOOK_ASIDE_RAD = math.radians(55.0)
 """Angle of the camera from the line that leads from base to contact, seen from above: the arm hides nothing there."""
 FOLLOW_M = 4e-3
-"""The camera of a browser follows the contact in steps of this size: between them it is the user's."""
+"""Step in which the camera follows the contact, m: between steps the user may move it."""
 ARRIVING_S = 3.0
-"""Time from its first motion; until then a page may set its camera anew while it is laid out."""
+"""Time after its first motion in which a page may set its camera anew while it is laid out, s."""
 LONE_PROBE_M = (0.0, 0.0, 0.12)
-"""Where the probe stands, pole up, in a scene without an arm, m."""
+"""Place of the probe, pole up, in a scene without an arm, m."""
 
 
 def legend_of(scene: Scene) -> list[tuple[tuple[int, int, int], str]]:
-    """Colours of what is drawn, and what it is."""
+    """Colours of the drawn parts, and their names."""
     rows = []
     if scene.object is not None:
         rows.append((OBJECT, "true object"))
@@ -52,7 +52,7 @@ def legend_of(scene: Scene) -> list[tuple[tuple[int, int, int], str]]:
 
 
 def place_of(scene: Scene) -> Floats:
-    """(3,) where the object's surface is, or where it is looked for, base frame, m."""
+    """Place of the object's surface (3,), or the place where it is searched for, base frame, m."""
     if scene.object is None:
         return np.array(scene.task.start_mm) * 1e-3
     return true_object(scene.object).T_base_object[:3, 3]
@@ -63,10 +63,10 @@ class Stage:
 
     Args:
         server: a `viser.ViserServer`, or a client handle; only its `scene` and `initial_camera` are used.
-        setup: which arm, probe and object.
+        setup: setup with arm, probe and object.
 
     Attributes:
-        notes: lines about what cannot be drawn, and what the newtons are.
+        notes: lines about parts that cannot be drawn, and about the unit of force.
     """
 
     def __init__(self, server: Any, setup: Setup) -> None:
@@ -174,7 +174,7 @@ class Stage:
         camera.fov = math.radians(34.0)
 
     def add_switches(self, gui: Any) -> None:
-        """Add what decides whether the camera follows, and whether the true object is shown."""
+        """Add switches for the camera that follows, and for the true object."""
         self._follows = gui.add_checkbox("follow", True)
         if self._truth:
             gui.add_checkbox("true object", True).on_update(self._show_truth)
@@ -186,7 +186,7 @@ class Stage:
     # showing
 
     def show(self, moment: Moment) -> None:
-        """Move everything to a moment."""
+        """Show a moment."""
         if moment.q is not None and self._model is not None:
             self._move_arm(self._model, moment.q)
         if moment.taxels is not None and self._taxels is not None:
@@ -198,7 +198,7 @@ class Stage:
             self._follow(moment.contact.point - self._place)
 
     def _follow(self, away: Floats) -> None:
-        """Carry every browser's camera along, in steps; how it was turned by hand stays."""
+        """Move every browser's camera along, in steps, without changing its view."""
         now = 1e-9 * self._clock.now_ns()
         for number, client in self._server.get_clients().items():
             camera = client.camera
@@ -231,9 +231,9 @@ class Stage:
 
 
 def _taxel_scales(counts: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Taxels without pressure are dots.
+    """Scales of the drawn taxels: those without pressure are dots.
 
-    Not by their opacity: a browser builds all taxels anew when one opacity changes, and draws none of them meanwhile.
+    Opacity is not used: a browser builds all taxels anew when one opacity changes, and draws none of them meanwhile.
     """
     return np.where(counts > 0, 1.0, 0.12).astype(np.float32)
 

@@ -20,13 +20,13 @@ from canprobe.mechanics.touch.surface_map import SPACING_M, LocalPatch, SurfaceM
 from canprobe.mechanics.types import Floats
 
 CELL_M = 1e-3
-"""Size of its triangles."""
+"""Side of a triangle of the surface, m."""
 LIFT_M = 3e-4
-"""Off the true surface, outward, so that the two do not flicker through each other."""
+"""Distance outward from the true surface, m, so that the two do not flicker through each other."""
 
 
 class BlendedSurface:
-    """Answers as one surface: of those within `SPACING_M` of each other the best known one.
+    """Answers as one surface: of those within `SPACING_M` of each other the one with the least deviation.
 
     Args:
         scale: scale of the colours, which show the stated deviation of K, 1/m.
@@ -40,7 +40,7 @@ class BlendedSurface:
         return bool(self._answers)
 
     def add(self, answer: JudgedAnswer) -> bool:
-        """Take an answer; whether the surface has changed by it."""
+        """Take an answer; returns whether it has changed the surface."""
         if not (np.isfinite(answer.sigma) and np.isfinite(answer.patch.K).all()):
             return False
         point = _point(answer)
@@ -51,7 +51,7 @@ class BlendedSurface:
         return True
 
     def mesh(self) -> tuple[Mesh, NDArray[np.uint8]]:
-        """What is known so far, and the (n, 3) colours of its vertices."""
+        """The surface so far, and the colours of its vertices (n, 3)."""
         mesh = SurfaceMap(patches=tuple(map(_patch, self._answers)), path=np.zeros((0, 3))).mesh(cell=CELL_M)
         # a place is as well known as the best answer in reach
         sigmas = np.array([answer.sigma for answer in self._answers])
@@ -70,7 +70,7 @@ def _point(answer: JudgedAnswer) -> Floats:
 
 
 def _patch(answer: JudgedAnswer) -> LocalPatch:
-    """An answer as a patch of a map, as far as it is shown: its shape, not where its contact might be instead."""
+    """An answer as a patch of a map, with the part that is shown: its shape, without the uncertainty of its place."""
     patch, S, covariance = answer.patch, np.zeros((4, 4)), np.zeros((9, 9))
     S[:2, :2], S[2, 3], S[3, 2] = 0.5 * patch.K, -0.5, -0.5
     covariance[6:, 6:] = 0.25 * patch.covariance
@@ -97,7 +97,7 @@ class GrowingSurface:
         self._grown |= self._surface.add(answer)
 
     def refresh(self) -> None:
-        """Send the surface, where it has changed."""
+        """Send the surface if it has changed."""
         if self._grown:
             mesh, colours = self._surface.mesh()
             _add(self._api, "/surface", mesh, mesh.triangles, colours)
@@ -105,11 +105,11 @@ class GrowingSurface:
 
 
 STAGES = 40
-"""Parts of a recorded surface."""
+"""Number of parts of a recorded surface."""
 
 
 class LoadedSurface(Parts):
-    """The surface of a recorded run as it is known at the end, shown as far as it was touched by an instant.
+    """The surface of a recorded run at its end, shown as far as it was touched by an instant.
 
     Args:
         api: viser's scene.

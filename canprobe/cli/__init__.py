@@ -1,8 +1,8 @@
 # PYTHON_ARGCOMPLETE_OK
-"""The command line: parse, call, print. One module a command, imported only when it is used.
+"""The command line: parse, call, print. Each command is a module, imported only when it is used.
 
 A command module has `HELP`, `EXAMPLE`, `add_arguments(parser)` and `run(args) -> int`; its docstring is the description
-in its help. What it needs beyond argparse it imports inside `run`: `canprobe --help` stays quick.
+in its help. It imports everything besides argparse inside `run`, so that `canprobe --help` stays quick.
 
 Commands share `common_arguments` with their `argument_types`, `target` (scene and bus of a command), `output` (stdout),
 `interrupts`, `operator` (questions), `parser` and `completion`.
@@ -75,7 +75,7 @@ def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911 - one per w
     """Run one command line.
 
     Args:
-        argv: arguments without the program's name; those of the process by default.
+        argv: arguments without the program's name; by default those of the process.
 
     Returns:
         The exit status: 0, 1, 2, 3, 130 or 143 as `--help` says; 141 when the reader of our output went away; 70 after
@@ -124,7 +124,7 @@ def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911 - one per w
 
 
 def _prepare_streams() -> None:
-    """Closed standard streams (`>&-`) take and give nothing; what an encoding does not have is printed as `\\xb5`.
+    """Make closed standard streams (`>&-`) usable, and print characters that an encoding lacks as `\\xb5`.
 
     Unless PYTHONIOENCODING says otherwise. Strict streams raise, and so do those of the C locale (`surrogateescape`).
     """

@@ -12,14 +12,14 @@ from typing import Any
 
 
 def word(text: str) -> str:
-    """An argument type: any text but none, which is what a shell makes of a variable that is not set."""
+    """An argument type: any text but an empty one, which a shell makes of a variable that is not set."""
     if not text:
         raise argparse.ArgumentTypeError("expected a name, got ''")
     return text
 
 
 def folder_path(text: str) -> Path:
-    """An argument type: a folder; not the current one for want of a name."""
+    """An argument type: a folder; an empty name is refused, as it would be the current one."""
     return Path(word(text))
 
 

@@ -48,11 +48,11 @@ def add_arguments(parser: Parser) -> None:
         "--force-reference",
         choices=["scale", "weights", "unit", "none"],
         default="none",
-        help="what the force in newtons comes from: a scale or load cell under the object, known weights, the stated"
+        help="reference of the force in newtons: a scale or load cell under the object, known weights, the stated"
         " full scale of the array (unit), or nothing [none: nominal newtons]",
     )
     parser.add_argument(
-        "--sigma", metavar="PERCENT", type=_positive, default=1.0, help="standard deviation of that force [1]"
+        "--sigma", metavar="PERCENT", type=_positive, default=1.0, help="standard deviation of that reference [1]"
     )
     parser.add_argument(
         "--at", metavar=("X", "Y", "Z"), nargs=3, type=float,
@@ -65,7 +65,7 @@ def add_arguments(parser: Parser) -> None:
         action="store_true",
         help="write a calibration for all arrays of this make, without the gains and dead taxels of this one",
     )
-    parser.add_argument("--yes", action="store_true", help="ask for no object to be placed; for an emulated cell only")
+    parser.add_argument("--yes", action="store_true", help="do not ask for objects; for an emulated cell only")
     add_options(parser, *BUS)
     parser.add_argument("--seed", metavar="N", type=seed, default=0, help="seed of the emulation [0]")
     parser.add_argument(
@@ -117,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _steps(report: Report) -> Callable[[str], None]:
-    """Reports what is done next; the steps of each bring-up only where every step is wanted."""
+    """A function that reports the next step; the steps of each bring-up only with -v."""
 
     def say(line: str) -> None:
         if report.verbosity > 0 or line.startswith(("visit", "warning")):
@@ -131,5 +131,5 @@ def _ask(text: str) -> str:
     sys.stderr.flush()
     answer = sys.stdin.readline()
     if not answer:
-        raise EOFError("nobody answers: standard input is closed")
+        raise EOFError("no answer: standard input is closed")
     return answer.strip()

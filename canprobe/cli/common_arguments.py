@@ -63,7 +63,7 @@ BUS = ("--bus", "--channel", "--bitrate")
 
 
 def add_scene(parser: Parser, optional: bool = False) -> None:
-    """SCENE, which most commands take; optional where another argument can stand for it."""
+    """Add SCENE, which most commands take; optional where another argument can replace it."""
     parser.add_argument(
         "scene",
         metavar="SCENE",
@@ -77,13 +77,13 @@ def add_scene(parser: Parser, optional: bool = False) -> None:
 
 
 def add_options(parser: argparse._ActionsContainer, *names: str) -> None:
-    """Options of `OPTIONS`, in this order."""
+    """Add options of `OPTIONS`, in this order."""
     for name in names:
         parser.add_argument(name, **OPTIONS[name])
 
 
 def add_verbosity(parser: Parser) -> None:
-    """-v and -q of a command that reports its steps."""
+    """Add -v and -q to a command that reports its steps."""
     either = parser.add_mutually_exclusive_group()
     either.add_argument(
         "-v",
@@ -92,7 +92,7 @@ def add_verbosity(parser: Parser) -> None:
         action="store_const",
         const=1,
         default=0,
-        help="report every step on stderr, even where that is no terminal",
+        help="report every step on stderr, even without a terminal",
     )
     either.add_argument(
         "-q", "--quiet", dest="verbosity", action="store_const", const=-1, help="report only warnings and errors"

@@ -11,11 +11,11 @@ from collections.abc import Callable, Iterable, Sequence
 
 
 def complete(parser_of: Callable[[Sequence[str]], argparse.ArgumentParser], commands: Sequence[str]) -> None:
-    """Answer the shell, and end the process; nothing without argcomplete.
+    """Answer the shell and end the process, where argcomplete is installed.
 
     Args:
-        parser_of: gives the parser of some arguments.
-        commands: known ones.
+        parser_of: returns the parser for arguments.
+        commands: names of all commands.
     """
     try:
         import argcomplete

@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def run_check(args: argparse.Namespace) -> int:
-    """Print what is wrong with a file; status 2 when it cannot be served."""
+    """Print the faults and warnings of a file; status 2 when it cannot be served."""
     from canprobe.fieldbus.eds.packaged import check_eds
 
     reading = check_eds(args.file, args.node_id)

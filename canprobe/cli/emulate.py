@@ -127,7 +127,7 @@ def _scene_server(args: argparse.Namespace) -> Callable[[], None]:
         origin_ns=args.origin,
         store_folder=args.store,
         without_id=args.without_id,
-        homed=args.parent is not None,  # there is nobody who could home the nodes of a run
+        homed=args.parent is not None,  # a run cannot home its emulated nodes
         say=args.report.say,
     )
 
@@ -156,7 +156,7 @@ def _eds_server(args: argparse.Namespace) -> Callable[[], None]:
 
 
 def _eds_files(args: argparse.Namespace) -> list[tuple[str | Path, int]]:
-    """(file, node id) of each node without a scene."""
+    """File and node id of each node without a scene."""
     if args.bus_yml is not None:
         from canprobe.lab.bridge.bus_yml import read_bus_yml
 
@@ -171,7 +171,7 @@ def _eds_files(args: argparse.Namespace) -> list[tuple[str | Path, int]]:
 
 
 def _scene_target(args: argparse.Namespace, scene: Scene) -> Target:
-    """The bus of these nodes: a channel without a name is for all of them, else each is on its own of the scene."""
+    """The bus of the nodes: a channel without a name is for all of them, else each has that of the scene."""
     given = args.channel or []
     real = real_target(args.bus, given[0][1] if given else None, args.bitrate, bitrate_else=scene.bus.bitrate)
     given = given or [(scene.bus.channel, real.channel)]

@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
 
 @contextlib.contextmanager
 def _folder_or_nothing(folder: Path) -> Iterator[None]:
-    """The folder for the files that the block writes; where the block fails, neither it nor they are left."""
+    """Make the folder for the files of the block; where the block fails, folder and files are removed."""
     from canprobe.fieldbus.bus.files import make_folder
 
     new = [path for path in (folder, *folder.parents) if not path.exists()]

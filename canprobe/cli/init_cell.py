@@ -26,7 +26,7 @@ _GEAR, _COUNTS_PER_TURN, _COUNTS_PER_M = 100, 10_000, 1_000_000
 
 _HEAD = """\
 # A cell: the hardware that scenes run on. All keys: docs/scene-keys.md.
-# What is marked "check" is a placeholder that neither the URDF nor the EDS says.
+# A value marked "check" is a placeholder: neither the URDF nor the EDS states it.
 
 [cell]
 name = "{name}"
@@ -56,7 +56,7 @@ sdo_s = 0.5
 
 
 def urdf_cell(args: argparse.Namespace) -> str:
-    """Write the text of a cell file whose chain comes from a URDF, and warn of what the URDF leaves open."""
+    """Write the text of a cell file whose chain comes from a URDF, and warn of values that the URDF leaves open."""
     found = from_urdf(args.urdf, args.base, args.tip)
     for warning in found.warnings:
         say(f"canprobe: {warning}")
@@ -81,7 +81,7 @@ def _common_bitrate(eds: Sequence[Path]) -> int:
     """The fastest bit rate, bit/s, that all EDS files have; a file that lists none has any.
 
     Raises:
-        UsageError: they have none in common.
+        UsageError: when they have no common one.
     """
     rates = {str(path): set(Description(check_eds(path).dictionary).bitrates) for path in dict.fromkeys(eds)}
     rates[_ARRAY_EDS] = set(Description(check_eds(_ARRAY_EDS).dictionary).bitrates)
@@ -102,7 +102,7 @@ def _common_eds(eds: Sequence[Path], joints: int) -> str:
 
 
 def _joint_section(number: int, joint: Joint, start: float, eds: Sequence[Path]) -> str:
-    """One joint; its range and speed stand in the URDF."""
+    """The section of one joint; its range and speed are in the URDF."""
     lines = [f"[joints.{toml_key(joint.name)}]"]
     if joint.prismatic:
         lines += ['kind = "prismatic"', f"start_mm = {start:g}"]
@@ -126,7 +126,7 @@ def _joint_section(number: int, joint: Joint, start: float, eds: Sequence[Path])
 
 
 def _range(joint: Joint) -> tuple[float, float]:
-    """Its stops, rad or m; those of a joint without any room between them are placeholders."""
+    """Stops of a joint, rad or m; placeholders where they are equal."""
     if joint.q_min < joint.q_max:
         return joint.q_min, joint.q_max
     return (0.0, 0.1) if joint.prismatic else (-math.pi, math.pi)

@@ -1,4 +1,4 @@
-"""SIGTERM and SIGHUP as interrupts: whatever stops a command, it leaves by the same safe way."""
+"""SIGTERM and SIGHUP as interrupts, so that each of them ends a command in the same safe way."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def termination_interrupts() -> Iterator[None]:
         for number, handler in before.items():
             if handler != signal.SIG_IGN:  # as nohup has it
                 signal.signal(number, raise_terminated)
-    except ValueError:  # not the main thread: signals are not ours to receive
+    except ValueError:  # not the main thread, which alone receives signals
         yield
         return
     try:

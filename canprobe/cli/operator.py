@@ -28,14 +28,14 @@ class TerminalOperator:
         self._left = 0
 
     def ask(self, question: str) -> None:
-        """Put a question; what was typed before it is no answer to it."""
+        """Ask a question; lines typed before it are ignored."""
         self._read()
         self._text = b""
         self._left = 0
         say(f"{question} [{_CHOICES}]")
 
     def answer(self) -> Answer | None:
-        """What the next whole line says; one that says nothing is asked for again."""
+        """The answer in the next whole line; after an unknown word it asks again."""
         self._left -= 1
         if self._left > 0:
             return None
@@ -52,7 +52,7 @@ class TerminalOperator:
         return answer
 
     def _read(self) -> bool:
-        """Take what is there; False at the end of the file."""
+        """Read the available text; False at the end of the file."""
         while select.select([self._descriptor], [], [], 0)[0]:
             data = os.read(self._descriptor, 4096)
             if not data:

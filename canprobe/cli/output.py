@@ -1,4 +1,4 @@
-"""What commands print on stdout: JSON documents, tables, summaries."""
+"""Output of commands on stdout: JSON documents, tables, summaries."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from canprobe.cell.session.terminal import MARKED_WORDS, MIN_COLUMNS, columns, p
 
 
 def print_json(document: object) -> None:
-    """One JSON document on stdout; NaN is refused rather than written.
+    """Print one JSON document; NaN is refused.
 
     Where stdout is not UTF-8 the document is ASCII: JSON has its own escapes, not those of the stream.
     """
@@ -24,7 +24,7 @@ def print_json(document: object) -> None:
 
 
 def print_table(rows: Sequence[Sequence[str]]) -> None:
-    """Rows in columns as wide as they need to be; on a terminal that is too narrow the widest are broken."""
+    """Print rows in columns; on a terminal that is too narrow the widest are broken."""
     if not rows:
         return
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -43,7 +43,7 @@ def print_table(rows: Sequence[Sequence[str]]) -> None:
 
 
 def print_summary(text: str) -> None:
-    """A summary: a headline, and lines that begin with what they are about; coloured on a terminal."""
+    """Print a summary: a headline, and lines that begin with their subject; coloured on a terminal."""
     head, *lines = text.splitlines()
     print(painted(head, "green" if head.endswith(": done") else "red", sys.stdout))
     for line in lines:

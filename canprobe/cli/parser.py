@@ -1,4 +1,4 @@
-"""argparse as the commands use it: one clear line for a wrong command line."""
+"""argparse for the commands: one clear line for a wrong command line."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ class Parser(argparse.ArgumentParser):
         super().__init__(**settings)  # type: ignore[arg-type]
 
     def error(self, message: str) -> NoReturn:
-        """Say what is wrong in one line and leave with status 2."""
+        """Report the error in one line and exit with status 2."""
         self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """As argparse does it; what is left over is said by the command that has no such argument, not by the root."""
+        """Parse like argparse; unknown arguments are reported by their command, not by the root."""
         found, rest = super().parse_known_args(args, namespace)
         if rest:
             self.refuse_unknown(rest)
         return found, rest
 
     def refuse_unknown(self, words: Sequence[str]) -> NoReturn:
-        """Complain about arguments that nothing takes."""
+        """Report unknown arguments and exit."""
         hint = did_you_mean(words[0], self._option_string_actions, 0.7) if words[0].startswith("-") else ""
         self.error(f"unrecognized arguments: {' '.join(words)}{hint}")
 
 
 def did_you_mean(got: str, known: Iterable[str], cutoff: float = 0.5) -> str:
-    """`; did you mean X?`, or nothing when no known word is close."""
+    """The text `; did you mean X?`, empty when no known word is close."""
     close = difflib.get_close_matches(got, list(known), n=1, cutoff=cutoff)
     return f"; did you mean {close[0]}?" if close else ""

@@ -82,7 +82,7 @@ def _draw(plan: Plan, path: Path) -> Path:
         path = path.with_suffix(".png")  # as matplotlib would do without a message
     try:
         draw_plan(plan, path)
-    except ValueError as error:  # matplotlib knows no such form
+    except ValueError as error:  # matplotlib does not know the format
         raise UsageError(f"--figure {path}: {error}") from error
     return path
 
@@ -96,9 +96,9 @@ def run(args: argparse.Namespace) -> int:
     from canprobe.cell.scene.resolve import resolve
 
     if args.measured is not None and (args.export or args.figure is not None):
-        raise UsageError("plan: --measured sets a log beside the plan and writes no --export or --figure")
+        raise UsageError("plan: --measured compares a log with the plan and writes no --export or --figure")
     if args.measured is not None and args.rehearse:
-        raise UsageError("plan: --measured sets a log beside the plan and rehearses nothing: leave out one of both")
+        raise UsageError("plan: --measured compares a log with the plan and rehearses nothing: leave out one of both")
     scene = loaded(args)
     try:
         setup = resolve(scene)
@@ -128,10 +128,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _rehearse(plan: Plan) -> str:
-    """Run the beginning of a plan, all of it emulated; what was done, for people.
+    """Run the beginning of a plan, all of it emulated; returns its steps in words.
 
     Raises:
-        PlanError: it did not come to its end.
+        PlanError: when it did not reach its end.
     """
     from canprobe.cell.session.session import run_beginning
 
@@ -156,11 +156,11 @@ def _scene_beside(log: Path) -> str | None:
 
 
 def _compare(plan: Plan, log: Path, as_json: bool) -> int:
-    """Print what was measured on each bus; 3 where it is not what was planned."""
+    """Print the measured traffic of each bus; status 3 where it is not as planned."""
     from canprobe.cell.results.traffic import measure_traffic
 
     if (ran := _scene_beside(log)) not in (None, plan.scene.name):
-        say(f"canprobe: {log} is a run of scene {ran}, set beside the plan of {plan.scene.name}")
+        say(f"canprobe: {log} is a run of scene {ran}, compared with the plan of {plan.scene.name}")
     several = len(plan.buses) > 1
     measured = {bus.channel: measure_traffic(log, plan, channel=bus.channel if several else None) for bus in plan.buses}
     if as_json:

@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
             print_json(error.summary)
         raise
     except KeyboardInterrupt:
-        where = f"; what was measured until then: {folder}" if folder.exists() else ""
+        where = f"; results until then: {folder}" if folder.exists() else ""
         args.report.complain(f"canprobe: interrupted, the cell is stopped{where}")
         raise
     if args.json:
@@ -77,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _expected(args: argparse.Namespace) -> str:
-    """A line with the figures to expect, where a packaged scene ran as it is."""
+    """A line with the expected figures, where a packaged scene ran unchanged."""
     from canprobe.cell.results.expected import expected_text, read_expected, seeds_text
 
     read = read_expected()

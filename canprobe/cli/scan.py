@@ -82,7 +82,7 @@ def assignment(text: str) -> Assignment:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print one row a node."""
+    """Print one row for each node."""
     from canprobe.cell.session.target import refuse_virtual
 
     refuse_virtual(args.bus, "scan")

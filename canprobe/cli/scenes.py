@@ -37,14 +37,14 @@ def run(args: argparse.Namespace) -> int:
 def print_packaged(
     advice: Mapping[str, str], args: argparse.Namespace, expected: Mapping[str, Any] | None = None
 ) -> int:
-    """Print name and title of every packaged file of some kinds, their folders, and what can be done with them.
+    """Print name and title of every packaged file of some kinds, their folders, and advice.
 
     Args:
         advice: line of advice for each kind.
         args: arguments of the command.
-        expected: their figures, as `read_expected` has them.
+        expected: expected figures from `read_expected`.
     """
-    from canprobe.cell.results.expected import SHORT, expected_text, seeds_text
+    from canprobe.cell.results.expected import LISTED_FIGURES, expected_text, seeds_text
     from canprobe.cell.scene.load import packaged_arrays, packaged_cells, packaged_files, packaged_scenes
 
     titles = {"scene": packaged_scenes, "cell": packaged_cells, "array": packaged_arrays}
@@ -59,7 +59,9 @@ def print_packaged(
             if expected is None:
                 print_table(found)
             else:
-                print_table([(*row, expected_text(expected["scenes"].get(row[0], {}), SHORT)) for row in found])
+                print_table(
+                    [(*row, expected_text(expected["scenes"].get(row[0], {}), LISTED_FIGURES)) for row in found]
+                )
                 print(f"figures: RMS errors to expect, lowest–highest of the seeds {seeds_text(expected)}")
             print(f"in {next(iter(paths.values())).parent}; {then}")
     if args.json:

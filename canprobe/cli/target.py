@@ -1,4 +1,4 @@
-"""Where a command goes: what the command line says, else the scene, else python-can's configuration."""
+"""The bus of a command: from the command line, else the scene, else python-can's configuration."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
     from canprobe.fieldbus.bus.real.configured import ConfiguredBus
 
 CONFIG = "config"
-"""Stands for the interface where python-can's configuration is to name it."""
+"""Value of --bus for the interface that python-can's configuration names."""
 
 
 def scene_of(args: argparse.Namespace) -> Scene:
-    """The scene of `run` and `up`, as their options change it.
+    """The scene of `run` and `up`, changed by their options.
 
     Raises:
-        UsageError: --patient is given and a node is real, or as `target_of`.
+        UsageError: when --patient is given and a node is real, or as in `target_of`.
     """
     from canprobe.cell.scene.load import load_scene
     from canprobe.cell.session.target import VIRTUAL
@@ -50,7 +50,7 @@ def scene_of(args: argparse.Namespace) -> Scene:
 
 
 def loaded(args: argparse.Namespace, more: Mapping[str, Any] | None = None) -> Scene:
-    """The scene of a command with `add_scene`, as --cell, --set, --realtime and more overrides change it."""
+    """The scene of a command with `add_scene`, changed by --cell, --set, --realtime and more overrides."""
     from canprobe.cell.scene.load import load_scene
 
     overrides = {**dict(args.set), **(more or {})}
@@ -88,14 +88,14 @@ def real_target(
     channel_else: str | None = None,
     bitrate_else: int = 1_000_000,
 ) -> Target:
-    """The bus of a command that needs one between processes: the command line's, else python-can's configuration's.
+    """The bus of a command that needs a real one: from the command line, else from python-can's configuration.
 
     Args:
         bus, channel, bitrate: options of the command line; None where not given.
         channel_else, bitrate_else: values where neither the command line nor the configuration gives one.
 
     Raises:
-        UsageError: nothing names a channel, or nothing is configured and the command line asks for what is.
+        UsageError: when nothing names a channel, or --bus config is given and nothing is configured.
     """
     from canprobe.cell.session.target import Target
 
@@ -125,7 +125,7 @@ def _has_real_nodes(scene: Scene) -> bool:
 
 
 def _channels(given: Sequence[tuple[str | None, str]], names: Sequence[str]) -> dict[str, str]:
-    """What stands for which of the scene's channels; a channel without a name stands for the first."""
+    """New channel of each channel of the scene; one without a name replaces the first."""
     main = names[0]
     found: dict[str, str] = {}
     for name, target in given:

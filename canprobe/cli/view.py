@@ -84,14 +84,14 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _is_scene(what: str) -> bool:
-    """A packaged scene's name goes before a folder that is called like it; `./cylinder` is the folder."""
+    """Whether it names a packaged scene, which goes before a folder of that name; `./cylinder` is the folder."""
     from canprobe.cell.scene.load import packaged_files
 
     return not Path(what).is_dir() or what in packaged_files("scenes")
 
 
 def _run_scene(args: argparse.Namespace, browser: _Browser) -> Path:
-    """Run the scene, shown live unless only a file is wanted; the folder of its results."""
+    """Run the scene, live unless only a file is wanted; returns the folder of its results."""
     from dataclasses import replace
 
     from canprobe import api
@@ -129,7 +129,7 @@ class _Browser:
     Args:
         port: requested port.
         say: function that reports the other steps.
-        quiet: only print the address.
+        quiet: whether to print the address only.
 
     Attributes:
         port: port of the last page, so that a browser that shows it finds the next page there.
@@ -141,7 +141,7 @@ class _Browser:
         self._quiet = quiet or not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
     def show(self, address: str) -> None:
-        """The page is there."""
+        """Print the address of the page, and open the browser."""
         print(f"{address} (Ctrl-C ends it)", flush=True)
         self.port = int(address.rpartition(":")[2])
         if not self._quiet:
@@ -168,7 +168,7 @@ def _paced() -> AnyObserver:
     def wait(observation: Observation) -> None:
         nonlocal offset_ns
         now_ns = clock.now_ns()
-        if offset_ns is None or now_ns > offset_ns + observation.t_ns:  # behind: what is lost is not caught up
+        if offset_ns is None or now_ns > offset_ns + observation.t_ns:  # behind: lost time is not caught up
             offset_ns = now_ns - observation.t_ns
         clock.sleep_until_ns(offset_ns + observation.t_ns)
 

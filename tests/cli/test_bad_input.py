@@ -276,7 +276,7 @@ def test_an_interrupted_run_stops_the_cell_and_keeps_its_files(number, status, t
     process.send_signal(number)
     out, err = process.communicate()
     assert (process.returncode, out) == (status, "")
-    assert err == "canprobe: interrupted, the cell is stopped; what was measured until then: results\n"
+    assert err == "canprobe: interrupted, the cell is stopped; results until then: results\n"
     summary = json.loads((results / "summary.json").read_text())
     assert (summary["completed"], summary["stop_reason"]) == (False, "interrupted")
     assert 0 < summary["cycle"]["cycles"] < 8000

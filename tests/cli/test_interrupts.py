@@ -68,9 +68,7 @@ def test_an_interrupt_ends_the_drawing_of_a_run_even_if_a_library_drops_it(
     monkeypatch.setattr("canprobe.lab.bridge.view.page.write_page", lambda *_: draw(number))
     out = tmp_path / "run"
     assert main(["run", "free", "--duration", "0.05", "--out", str(out)]) == status
-    assert (
-        capfd.readouterr().err == f"canprobe: interrupted, the cell is stopped; what was measured until then: {out}\n"
-    )
+    assert capfd.readouterr().err == f"canprobe: interrupted, the cell is stopped; results until then: {out}\n"
     assert (out / "summary.json").exists() and (out / "log.npz").exists()
 
 

@@ -23,7 +23,7 @@ def test_an_interrupt_in_mid_run(bench: Any, name: str, cycles: int, number: int
     command = bench.start("run", bench.scene(name), *ON_VCAN0, "--out", "results")
     bench.bus.until_enabled(6, by=command, cycles=cycles)
     command.send(number)
-    assert command.end(status) == ["canprobe: interrupted, the cell is stopped; what was measured until then: results"]
+    assert command.end(status) == ["canprobe: interrupted, the cell is stopped; results until then: results"]
     results = bench.results("results")
     assert (results.summary["completed"], results.summary["stop_reason"]) == (False, "interrupted")
     assert results.summary["cycle"]["cycles"] >= cycles

@@ -1,4 +1,4 @@
-"""The cell: brought up, run cycle by cycle under supervision, and left with the drives disabled on every way out."""
+"""The cell: bring-up, cycles under supervision, and a stop that disables the drives on every way out."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.drives import make_drives
 from canprobe.cell.master.homing import Homing
 from canprobe.cell.master.joint_columns import TactileLog, joint_columns
+from canprobe.cell.master.lift_off import LiftOff
 from canprobe.cell.master.log import RunLog
 from canprobe.cell.master.notes import Notes
 from canprobe.cell.master.observers import Observers
@@ -39,17 +40,16 @@ from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE
 Result = TypeVar("Result")
 
 WARM_UP_S = 0.1
-"""Cycling before the drives are enabled, until both sides are up to speed."""
+"""Time of cycles before the drives are enabled, s, until both sides run at their usual speed."""
 REST_TIMEOUT_S = 2.0
-FREE_IT = "free it; a run does not begin while the array measures a force"
 OWN_COLUMNS = frozenset({"t_s", "q_rad", "q_m", "statusword", "torque_permille", "q_target_rad", "q_target_m"})
-"""Of the log; a controller's `Command.columns` have other names."""
+"""Columns of the cell in the log; a controller's `Command.columns` have other names."""
 STUCK_NS = 1_000_000_000
 """Time in a cycle after which an interrupt does not wait for its end."""
 
 
 def _hold(_: Measurement) -> Command:
-    """Stay where the drives are."""
+    """Hold the targets of the drives."""
     return Command()
 
 
@@ -57,26 +57,26 @@ class Cell:
     """One cell on one bus. A context manager: entering brings the nodes up, leaving stops them safely.
 
     Args:
-        plan: of the scene.
-        port: the bus; it is closed on leaving.
-        options: of the run.
+        plan: plan of the scene.
+        port: port of the bus; it is closed on leaving.
+        options: options of the run.
         observers: called after each cycle.
-        log_failure: says why frames are no longer written down, None while they are.
-        direct: makes the cycle of nodes that are reached without a bus, as `Cycle` is made, and starts them; None: they
-            are brought up and reached over the port.
+        log_failure: returns why frames are no longer written into the log, None while they are.
+        direct: makes a cycle without a bus, with the arguments of `Cycle`, and starts its nodes; None: the nodes are
+            brought up and reached over the port.
         origin_ns: time on the port's clock from which the run counts, as ``bus.log`` does.
         zeros: file that records the zeros of real drives that are homed.
 
     Attributes:
-        drives, tactile: of the arm and the array; None in a scene without one.
-        log: one row a cycle, with times since the first SYNC, so that nothing that is computed from them depends on
-            how long bring-up took; `start_ns` brings them onto the run's clock.
-        tactile_log: one row a tactile frame, on the same clock.
-        notes: what went wrong and was lived with.
-        watch: what the nodes report of themselves.
+        drives, tactile: drives of the arm, and receiver of the array; None in a scene without one.
+        log: one row for each cycle, with times since the first SYNC, so that results do not depend on the time of
+            bring-up; `start_ns` converts them to the run's clock.
+        tactile_log: one row for each tactile frame, on the same clock.
+        notes: faults that did not stop the cell.
+        watch: states and errors that the nodes report.
         supervisor: the checks, from bring-up on.
         cycle: None before bring-up is done.
-        homing: of the drives without an absolute encoder; None where there are none.
+        homing: homing of the drives without an absolute encoder; None where there are none.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class Cell:
         self._origin_ns = origin_ns
         self._network = PumpedNetwork(port, other=self._other)
         self._make_cycle = direct or Cycle
-        setups = make_setups(plan) if direct is None else ()  # of none only its time passes
+        setups = make_setups(plan) if direct is None else ()  # without setups, bring-up only takes its time
         self._bring_up = BringUp(self._network, self.watch, setups, setup.bring_up, self._say)
         self._raw_array = (
             RawArrayStart(self.tactile, self._network, setup.bring_up.boot_up_s, self._say)
@@ -132,28 +132,28 @@ class Cell:
 
     @property
     def start_ns(self) -> int:
-        """When the first cycle was due, on the run's clock; 0 where it came to none."""
+        """Deadline of the first cycle on the run's clock; 0 where there was no cycle."""
         return self.cycle.t_first_ns - self._origin_ns if self.cycle is not None else 0
 
     @property
     def faults(self) -> list[str]:
-        """What went wrong, a line for each kind of it."""
+        """The faults, one line for each kind."""
         return self.notes.lines()
 
     @property
     def counters(self) -> PortCounters:
-        """What has passed through the cell's port."""
+        """Counters of the cell's port."""
         return self._port.counters
 
     def _say(self, text: str) -> None:
-        """Report a step to the user; a failure of that must not decide what becomes of the drives."""
+        """Report a step to the user; a failure of the report must not stop the drives."""
         try:
             self._options.say(text)
         except Exception as error:
             self.notes.add(f"steps could not be reported: {type(error).__name__}")
 
     def _other(self, can_id: int, data: bytes, t_ns: int) -> None:
-        """A frame that arrived during bring-up and that nobody subscribed to."""
+        """Take a frame that arrived during bring-up and has no subscriber."""
         if self.tactile is not None and can_id in self.tactile.cob_ids:
             self.tactile.push(can_id, data, t_ns)
         else:
@@ -163,12 +163,12 @@ class Cell:
         """Listen for another master, before anything is started for this cell; nothing is sent.
 
         Raises:
-            BusError: there is one.
+            BusError: when there is one.
         """
         self._bring_up.listen()
 
     def hear(self, frames: Iterable[TimedFrame]) -> None:
-        """Take what arrived before bring-up, while another reader waited on the port."""
+        """Take frames that arrived before bring-up, while another reader waited on the port."""
         for frame in frames:
             self.watch.push(*frame)
 
@@ -217,11 +217,11 @@ class Cell:
             progress: called after each cycle.
 
         Raises:
-            UsageError: this is no controller, it returned no `Command`, or another one is running.
-            SafetyStop: the controller or the supervision stopped the cell.
-            ResultsError: frames can no longer be written down.
-            NodeError: a node was lost or failed.
-            InterfaceError: the bus was lost.
+            UsageError: when it is no controller, it returned no `Command`, or another one is running.
+            SafetyStop: when the controller or the supervision stopped the cell.
+            ResultsError: when frames can no longer be written into the log.
+            NodeError: when a node was lost or failed.
+            InterfaceError: when the bus was lost.
         """
         self.start(controller)
         self.advance(None, progress)
@@ -239,7 +239,7 @@ class Cell:
         On a real bus the drives stop by themselves where the next call does not come within a cycle.
 
         Args:
-            cycles: at most so many; None until the controller is done.
+            cycles: most cycles to run; None: until the controller is done.
             progress: called after each cycle.
 
         Returns:
@@ -253,7 +253,7 @@ class Cell:
 
     @contextmanager
     def _one_at_a_time(self) -> Iterator[None]:
-        """Refuse a controller that runs another one in its step."""
+        """Refuse a controller that runs another controller in its step."""
         if self._running:
             raise UsageError("the cell runs a controller already, which must not run another one in its step")
         self._running = True
@@ -264,7 +264,7 @@ class Cell:
 
     @contextmanager
     def _naming_another_master(self) -> Iterator[None]:
-        """Whatever ends the cell names another master that was heard: it may be the cause."""
+        """Add another master that was heard to any error that ends the cell: it may be the cause."""
         try:
             yield
         except BaseException as error:
@@ -281,7 +281,7 @@ class Cell:
             self.notes.add(words)
 
     def _run_cycle(self, interrupts: Interrupts, progress: Callable[[Measurement], None]) -> bool:
-        """One cycle of the controller; True where it is done."""
+        """Run one cycle of the controller; True where the controller is done."""
         assert self.cycle is not None
         measurement = self.cycle.begin()
         held = self._supervise(measurement)
@@ -301,11 +301,11 @@ class Cell:
         return bool(command.done)
 
     def _ask(self, step: Callable[[Measurement], Command], measurement: Measurement, interrupts: Interrupts) -> Command:
-        """What the controller wants.
+        """Ask the controller for its command, and check it.
 
         Raises:
-            KeyboardInterrupt: an interrupt came.
-            UsageError: the controller gives something else.
+            KeyboardInterrupt: when an interrupt came.
+            UsageError: when the controller returns something else.
         """
         interrupts.take()
         command = step(measurement)
@@ -318,7 +318,7 @@ class Cell:
         return command
 
     def _or_lift_off(self, work: Callable[..., Result], *arguments: object) -> Result:
-        """What the controller's work returns; what it raises ends the run off the object."""
+        """Do the controller's work; where it raises, the probe is lifted off before the run ends."""
         try:
             return work(*arguments)
         except BaseException as error:
@@ -326,7 +326,7 @@ class Cell:
             raise
 
     def _stuck(self) -> bool:
-        """The controller, or what is called after it, has not returned for long."""
+        """Whether the controller, or a function after it, has not returned for `STUCK_NS`."""
         assert self.cycle is not None
         return self._port.clock.now_ns() - self.cycle.sync_ns > STUCK_NS
 
@@ -356,7 +356,7 @@ class Cell:
             )
 
     def _await_rest(self) -> None:
-        """Enable nothing that is not known to stand still: the first target of a drive is its reported position."""
+        """Wait until every drive is known to be at rest: its first target is its reported position."""
         assert self.drives is not None
         for _ in range(int(REST_TIMEOUT_S * 1e9 / self._plan.sync.period_ns)):
             if all(self.drives.rests):
@@ -422,7 +422,7 @@ class Cell:
         self._supervise_enabling()
 
     def _supervise(self, measurement: Measurement) -> bool:
-        """Check the table's conditions; True: hold in this cycle."""
+        """Check the conditions of the table; True: hold in this cycle."""
         self._look(measurement)
         finding = self.supervisor.finding()
         if finding is None and not self._controller.lets_go:
@@ -447,12 +447,10 @@ class Cell:
         raise finding.error
 
     def _lift_off(self, error: BaseException) -> None:
-        """Take the probe off what it presses on, as far as that goes, before the cell is stopped for ``error``."""
+        """Lift the probe off its object, as far as the drives obey, before the cell is stopped for ``error``."""
         supervisor = self.supervisor
         if self.drives is None or self.tactile is None or not supervisor.pressing() or supervisor.must_stop():
             return
-        from canprobe.cell.master.lift_off import LiftOff
-
         lift = LiftOff(self._plan, self.drives, self.watch, error)
         t_s = (self.start_ns + supervisor.seen.measurement.t_ns) * 1e-9
         if not lift.possible:
@@ -502,7 +500,8 @@ class Cell:
         """Stop safely and close the bus: quick stop, disable, pre-operational. Never raises; failures are faults."""
         self._try(self._stop_drives)
         if force := self.supervisor.pressing():
-            self.notes.add(f"the probe is left pressing with {force:.1f} N: {FREE_IT}")
+            free = "free it; a run does not begin while the array measures a force"
+            self.notes.add(f"the probe is left pressing with {force:.1f} N: {free}")
         if self._raw_array is not None:
             self._try(self._raw_array.stop)
         if self.homing is not None:
@@ -537,7 +536,7 @@ class Cell:
             self.notes.add(f"while stopping: node {stuck[0] if stuck else '?'} did not confirm that it is disabled")
 
     def _stop_until(self, states: tuple[DriveState, ...]) -> bool:
-        """As `_cycle_until`, for a bus that may come and go: what fails is tried again in the next cycle."""
+        """Like `_cycle_until`, for a bus that may come and go: a failed cycle is tried again."""
         assert self.cycle is not None
         end_ns = self._port.clock.now_ns() + int(self._plan.setup.bring_up.stop_s * 1e9)
         failure: CanprobeError | None = None

@@ -18,15 +18,15 @@ from canprobe.fieldbus.protocol.frames import NmtState, pack_heartbeat
 from canprobe.fieldbus.protocol.sync import SyncCounter, pack_sync
 
 SYNCS_REMEMBERED = 240
-"""Where the SYNC has no counter."""
+"""Number of SYNCs that are remembered where SYNC has no counter."""
 
 
 class Intake:
-    """Routes the PDOs of one cycle to the drives and the sensor, and says what they know together.
+    """Routes the PDOs of one cycle to the drives and the array, and makes the measurement from them.
 
     Args:
-        drives, tactile: of the arm and the array; None in a scene without one.
-        sync_overflow: of the SYNC counter (1019h); so many SYNCs are remembered.
+        drives, tactile: drives of the arm, and receiver of the array; None in a scene without one.
+        sync_overflow: overflow of the SYNC counter (1019h), and number of SYNCs that are remembered.
     """
 
     def __init__(self, drives: DriveGroup | None, tactile: ArrayReceiver | None, sync_overflow: int) -> None:
@@ -39,12 +39,12 @@ class Intake:
         self._sync_stamps: deque[int] = deque(maxlen=sync_overflow)
 
     def begin(self, number: int, t_ns: int, sync_ns: int) -> None:
-        """A SYNC is out.
+        """Begin the cycle of a SYNC that was sent.
 
         Args:
-            number: of its cycle.
-            t_ns: its deadline, ns since the first one.
-            sync_ns: when it went out, on the clock of the frames.
+            number: number of its cycle.
+            t_ns: deadline of the SYNC, ns since the first one.
+            sync_ns: time when it was sent, on the clock of the frames.
         """
         self.number = number
         self._sync_times.append(t_ns)
@@ -68,19 +68,19 @@ class Intake:
 
     @property
     def complete(self) -> bool:
-        """No drive's TPDO of this cycle is outstanding."""
+        """Whether all drives have sent their TPDOs of this cycle."""
         return self.drives is None or self.drives.complete
 
     def end(self) -> None:
-        """The collection window is over: what comes now is late."""
+        """End the collection: a TPDO that comes now is late."""
         if self.drives is not None:
             self.drives.end_collect()
 
     def measure(self, counter: int) -> Measurement:
-        """The cell at this SYNC.
+        """The measurement of the cell at this SYNC.
 
         Args:
-            counter: of the SYNC; 0 where it has none.
+            counter: counter of the SYNC; 0 where it has none.
         """
         drives, tactile, times = self.drives, self.tactile, self._sync_times
         sample = tactile.take(self.number, counter, times, self._sync_stamps) if tactile is not None else None
@@ -101,19 +101,19 @@ class Intake:
 
 
 TIMED_CYCLES = 5
-"""The computing time of every fifth cycle is taken: in a virtual machine reading a clock costs as much as sending. What
-comes back every 2, 4 or 16 cycles, as images and answers do, then has its share in the sample."""
+"""The computing time of every fifth cycle is taken: in a virtual machine reading a clock costs as much as sending.
+Images and answers, which come every 2, 4 or 16 cycles, then have their share in the sample."""
 
 
 @dataclass(slots=True)
 class CycleStatistics:
-    """What the cycle counted and timed.
+    """Counts and times of the cycle.
 
     Attributes:
-        overruns: SYNCs that went out more than half a period late.
-        period_error_ns: of every SYNC behind its deadline.
-        response_ns: from the last TPDO in to the RPDOs out, of every cycle of `TIMED_CYCLES`.
-        compute_ns: the same with what the controller does once the RPDOs are out.
+        overruns: number of SYNCs that were sent more than half a period late.
+        period_error_ns: delay of every SYNC behind its deadline.
+        response_ns: time from the last TPDO to the RPDOs, of one cycle in `TIMED_CYCLES`.
+        compute_ns: that time and the work of the controller after the RPDOs.
     """
 
     overruns: int = 0
@@ -123,7 +123,7 @@ class CycleStatistics:
 
     @classmethod
     def of_last(cls, cycles: int | None) -> CycleStatistics:
-        """With the times of the last cycles only; None for all."""
+        """Make statistics that keep the times of the last cycles only; None: of all."""
         if cycles is None:
             return cls()
         return cls(0, deque(maxlen=cycles), deque(maxlen=cycles), deque(maxlen=cycles))
@@ -136,13 +136,13 @@ class Cycle:
 
     Args:
         port: the bus.
-        plan: its times: SYNC, and when TPDOs are looked for until all are in; then they are late.
-        drives, tactile: of the arm and the array; None in a scene without one.
-        watch: sees heartbeats and EMCYs.
+        plan: plan with the period of SYNC and the looks for TPDOs; after the last look a TPDO is late.
+        drives, tactile: drives of the arm, and receiver of the array; None in a scene without one.
+        watch: takes heartbeats and EMCYs.
         other: takes all other frames, such as SDO answers.
-        on_arrival: on a clock that goes on by itself: do not wait for the next look once all are in. Before the first
-            look they wake nobody: a real bus brings one after the other, and most are in by then.
-        kept: cycles whose times are kept; None for all.
+        on_arrival: whether the cycle goes on when the last TPDO arrives, in real time. Before the first look arrivals
+            do not wake the process: a real bus brings one after the other, and most are in by then.
+        kept: number of cycles whose times are kept; None for all.
     """
 
     def __init__(
@@ -195,9 +195,9 @@ class Cycle:
         return self._intake.measure(counter or 0)
 
     def send_sync(self, counter: int | None) -> None:
-        """Send SYNC; `sync_ns` is when."""
+        """Send SYNC, and note its time as `sync_ns`."""
         port = self._port
-        if not port.stamps_arrival:  # the only way to separate what came before the SYNC from what came after it
+        if not port.stamps_arrival:  # the only way to separate frames before the SYNC from those after it
             self._route(port.drain())
         self.sync_ns = port.clock.now_ns()
         port.send_batch([pack_sync(counter)], self.sync_ns)
@@ -217,7 +217,7 @@ class Cycle:
                     break
 
     def _collect_on_arrival(self, first_ns: int, last_ns: int) -> None:
-        """Look at a time, then whenever something comes, until all TPDOs are in or another time is over."""
+        """Look at `first_ns`, then at each arrival, until all TPDOs are in or `last_ns` is over."""
         port, clock, intake = self._port, self._port.clock, self._intake
         clock.sleep_until_ns(first_ns)
         self._route(port.drain())
@@ -232,7 +232,7 @@ class Cycle:
             self._other(rest)
 
     def skip(self) -> None:
-        """Let this cycle be: wait for the end of its period."""
+        """Skip this cycle: wait for the end of its period."""
         self._deadline += self._period_ns
         self._port.clock.sleep_until_ns(self._deadline)
 
@@ -256,7 +256,7 @@ class Cycle:
             send_on(self._port, self._tactile.channel, requests)
 
     def count_work(self) -> None:
-        """The controller has done all that it does in this cycle."""
+        """Take the computing time: the work of the controller in this cycle is done."""
         if self._started_ns:
             self.statistics.response_ns.append(self._sent_ns - self._started_ns)
             self.statistics.compute_ns.append(elapsed_ns() - self._started_ns)

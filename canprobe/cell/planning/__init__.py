@@ -5,7 +5,7 @@ changes that would fit. Nothing is opened or sent here.
 
 1. `abilities` reads what each device can from its EDS file: objects, PDOs, mappings, bit rates; `demands` names what a
    device cannot take its part without. `operation` finds the mode of each drive, `interpolation_period` the period as
-   its 60C2h can express it, `sync` the SYNC period and the tactile trigger. `units` compares counts, `pdos` and
+   its 60C2h can express it, `sync` the SYNC period and the trigger of the array. `units` compares counts, `pdos` and
    `raw_frames` find the messages that carry what is needed, `identifiers` gives them their order, and `configuration`
    has what is written. What a device lacks and what cannot be done without is a reason; what can be done without is
    listed as not available, with what that means.

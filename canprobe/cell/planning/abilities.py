@@ -1,4 +1,4 @@
-"""What a device can, read from its EDS: objects, PDOs, mapping, dummies, identity."""
+"""Abilities of a device, read from its EDS: objects, PDOs, mapping, dummies, identity."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from canprobe.fieldbus.protocol.pdo import PdoEntry
 COMMUNICATION: dict[Direction, int] = {"rpdo": 0x1400, "tpdo": 0x1800}
 MAPPING: dict[Direction, int] = {"rpdo": 0x1600, "tpdo": 0x1A00}
 INVALID = 1 << 31
-"""Of a COB-ID: the PDO is off."""
+"""Bit 31 of a COB-ID: the PDO is off."""
 OWN_BITS = 0x6000_0000
-"""Bits 29 and 30 of a COB-ID, which are the device's: its frame format, and that it sends nothing on request (RTR)."""
+"""Bits 29 and 30 of a COB-ID, which the device sets: the frame format, and that it answers no remote frame (RTR)."""
 MOST_ENTRIES = 64
 _MOST_AXES = 8
 _IDENTIFIER = 0x7FF
@@ -24,11 +24,11 @@ _IDENTIFIER = 0x7FF
 
 @dataclass(frozen=True, slots=True)
 class Abilities:
-    """What one device can as a node of the cell, by its description.
+    """Abilities of one device as a node of the cell, by its EDS.
 
     Attributes:
-        eds: name or path, for messages.
-        description: what its EDS states.
+        eds: its name or path, for messages.
+        description: the content of the EDS.
     """
 
     eds: str
@@ -39,18 +39,18 @@ class Abilities:
         """Read an EDS.
 
         Raises:
-            EdsError: when it is missing or not usable.
+            EdsError: when the EDS is missing or not usable.
         """
         return cls(eds, Description(load_eds(eds, node_id)))
 
     @property
     def od(self) -> Any:
-        """canopen's object dictionary."""
+        """Object dictionary of the package canopen."""
         return self.description.od
 
     @property
     def identity(self) -> Identity:
-        """Vendor, product and revision of 1018h; None where the file states none, or 0 as nobody filled it in."""
+        """Vendor, product and revision of 1018h; None where the file states none, or the 0 of a field left empty."""
         return Identity(*(self.number(0x1018, subindex) or None for subindex in (1, 2, 3)))
 
     def has(self, index: int, subindex: int = 0) -> bool:
@@ -59,7 +59,7 @@ class Abilities:
 
     @property
     def axes(self) -> tuple[int, ...]:
-        """Axes of a drive from 1: those whose controlword is described, 800h apart. Source: CiA 402-1."""
+        """Axes of a drive, counted from 1: their controlwords are in the EDS, 800h apart. Source: CiA 402-1."""
         return tuple(axis for axis in range(1, _MOST_AXES + 1) if self.has(0x6040 + 0x800 * (axis - 1)))
 
     def number(self, index: int, subindex: int = 0) -> int | None:
@@ -84,7 +84,7 @@ class Abilities:
         return tuple(number for number in numbers if self.has(MAPPING[direction] + number - 1))
 
     def capacity(self, direction: Direction, number: int) -> int:
-        """How many objects may be mapped to a PDO; 0: its mapping is fixed."""
+        """Number of objects that may be mapped to a PDO; 0: its mapping is fixed."""
         index = MAPPING[direction] + number - 1
         count = self.description.entry(index)
         if count is None or not count.writable:

@@ -14,6 +14,7 @@ from typing import Literal
 from canprobe.cell.planning.window import patch_radius_m
 from canprobe.cell.scene.setup import Array, Calibrate, Setup, Touch
 from canprobe.errors import UsageError
+from canprobe.mechanics.touch.patch.array_models import make_patch_calibration
 
 What = Literal["image", "start", "stop", "poll"]
 PRESS_TAXELS, CENTROID_TAXELS, CURVATURE_TAXELS = 2, 4, 16
@@ -24,12 +25,12 @@ COARSE_SHARE = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Support:
-    """What an array measures of the contact that its task makes.
+    """Quantities of its task's contact that an array measures.
 
     Attributes:
-        taxels: under the patch on a plane at the task's force; all of them where nothing is pressed.
-        centroid: there is one.
-        no_curvature: why there is no curvature; None where there is one. Force is always there.
+        taxels: number of taxels under the patch on a plane at the task's force; all where the task presses nothing.
+        centroid: whether there are enough taxels for a centroid.
+        no_curvature: why the patch shows no curvature; None where it shows it. The force is always measured.
     """
 
     taxels: float
@@ -38,7 +39,7 @@ class Support:
 
     @property
     def curvature(self) -> bool:
-        """The patch shows it."""
+        """Whether the patch shows the curvature."""
         return self.no_curvature is None
 
     def __str__(self) -> str:
@@ -48,7 +49,7 @@ class Support:
 
 
 def support_of(setup: Setup) -> Support | None:
-    """What the setup's array supports; None without one."""
+    """The quantities that the setup's array measures; None without an array."""
     array, touch = setup.array, setup.touch
     if array is None:
         return None
@@ -119,9 +120,7 @@ def array_problems(setup: Setup) -> Iterator[str]:
 
 
 def _unreadable(array: Array) -> Iterator[str]:
-    """That no force can be read from the array, because a contact falls between its taxels."""
-    from canprobe.mechanics.touch.patch.array_models import make_patch_calibration
-
+    """Problem where no force can be read from the array, because a contact falls between its taxels."""
     try:
         make_patch_calibration(array.calibration, array.pad)
     except UsageError:

@@ -1,4 +1,4 @@
-"""The bridges that there are: what each is for, what it needs, and how that is installed. One table."""
+"""Table of the bridges: what each is for, which packages it needs, and how they are installed."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ class BridgeInfo:
     """One bridge.
 
     Attributes:
-        what: one line for people.
-        module: of `canprobe.lab.bridge`, loaded in the bridge's own process only.
-        extra: of this package, which installs what the bridge needs.
-        packages: to be imported, by their import names.
-        live: it shows the cell while it runs.
-        output: the file that it writes into the run's folder, None where it writes none.
+        what: its purpose in one line, for people.
+        module: its module in `canprobe.lab.bridge`, loaded in the process of the bridge only.
+        extra: extra of canprobe that installs these packages.
+        packages: import names of the packages that it needs.
+        live: whether it shows the cell while the cell runs.
+        output: file that it writes into the run's folder; None where it writes none.
     """
 
     what: str
@@ -38,7 +38,7 @@ class BridgeInfo:
 
     @property
     def pip(self) -> str:
-        """The line that installs them."""
+        """Command line that installs them."""
         return install_line(self.extra)
 
 
@@ -65,10 +65,10 @@ BRIDGES: Mapping[str, BridgeInfo] = {
 
 
 def check_bridges(names: Iterable[str], what: str = "bridge ") -> None:
-    """Every name is a bridge, and what it needs is installed; `what` precedes the name in what is said.
+    """Check that every name is a bridge whose packages are installed; `what` precedes the name in the message.
 
     Raises:
-        UsageError: with what there is, or the line that installs what is missing; nothing was started.
+        UsageError: when one is unknown or lacks packages; the message lists the bridges, or has the line to type.
     """
     for name in names:
         if name not in BRIDGES:

@@ -1,11 +1,11 @@
-"""Plan → what each node must be, and the list of writes that configure it.
+"""Plan → the configuration of each node: what it must be, and the writes that make it so.
 
 The configuration of a node is an explicit list: one `Write` is an object, its value and the purpose. The order matters:
-PDOs first, then what all nodes have, then what a drive or the array needs.
+PDOs first, then the objects of every node, then those of a drive or the array.
 
 A write is *required*, or it is *wished* and says what its absence means. What the EDS excludes (no such object,
 read-only with another value, limits) is left out where it is wished, `NodeSetup.left_out`, and makes the plan
-impossible where it is required, `NodeSetup.problems`. What only the device refuses is bring-up's.
+impossible where it is required, `NodeSetup.problems`. What the EDS allows and the device refuses is for bring-up.
 """
 
 from __future__ import annotations
@@ -83,9 +83,9 @@ class Write:
         index, subindex: the entry.
         value: integer value.
         purpose: what the device needs it for.
-        absence: of a wished one, what it means that the device does not have it; None: it is required.
+        absence: what follows where the device lacks the entry; None: the write is required.
         read_back: False for commands, whose entry answers another value than the written one.
-        own_bits: bits that are the device's: it may refuse other ones, or hold them whatever is written.
+        own_bits: bits that the device sets: it may refuse other values of them, or keep its own.
     """
 
     index: int
@@ -107,7 +107,7 @@ class LeftOut:
     """A wished write that the EDS excludes.
 
     Attributes:
-        write: that is not made.
+        write: the write that is not made.
         why: what the EDS offers instead.
     """
 
@@ -126,7 +126,7 @@ class Given:
 
     Attributes:
         index, subindex: the entry.
-        value: that it must hold.
+        value: value that it must hold.
         says: who states the value.
         otherwise: what would be wrong, and what puts it right.
     """
@@ -140,25 +140,25 @@ class Given:
 
 @dataclass(frozen=True, slots=True)
 class NodeSetup:
-    """What one node must be and become.
+    """Requirements on one node, and its configuration.
 
     Attributes:
         node_id: the node.
-        name: for messages, such as ``joint 3``.
-        channel: of the bus that it is on.
+        name: its name in messages, such as ``joint 3``.
+        channel: channel of its bus.
         eds: name of its EDS file, for messages.
         dictionary: its object dictionary, from the EDS.
         identity: expected values of 1018h by sub-index; an absent sub-index is not checked.
         writes: its configuration, in order.
         given: what it must hold by itself.
-        otherwise: writes that mean the same as those of 60C2h, tried in this order where the device refuses them.
-        left_out: what the EDS excludes of what the cell would have set.
-        problems: what the EDS excludes of what must be set; empty in a plan.
-        mode: of operation, which 6061h must confirm; None: no drive.
-        homing: what a drive needs for homing, in order; empty: it is not homed. Where the drive is coupled to other
-            joints, the home offset depends on where they are; here they are in the start posture.
-        turn: units of a motor turn, with which the device's own statement is compared; None: there is none.
-        speed_unit: position units/s of what the drive has for a velocity.
+        otherwise: other writes of the same interpolation time, tried in this order where the device refuses 60C2h.
+        left_out: wished writes that the EDS excludes.
+        problems: why required writes are excluded by the EDS; empty in a plan.
+        mode: mode of operation, which 6061h must confirm; None: the node is no drive.
+        homing: writes for homing, in order; empty: the drive is not homed. Where the drive is coupled to other
+            joints, the home offset depends on their positions; here they are in the start posture.
+        turn: position units of a motor turn, to compare with those that the device states; None: not known.
+        speed_unit: position units/s in one velocity unit of the drive.
     """
 
     node_id: int
@@ -179,7 +179,7 @@ class NodeSetup:
 
     @property
     def configuration_date(self) -> dict[int, int]:
-        """What 1020h holds where the node has this configuration: days since 1984, milliseconds after midnight.
+        """Value of 1020h in a node with this configuration: days since 1984, milliseconds after midnight.
 
         They follow from the values, so that any change of them, of the EDS or of the scene, gives another date.
         """
@@ -189,7 +189,7 @@ class NodeSetup:
 
 
 def make_setups(plan: Plan) -> tuple[NodeSetup, ...]:
-    """What every planned node must be and become, drives first."""
+    """Make the configuration of every planned node, drives first."""
     return tuple(_setup(plan, node) for node in plan.nodes)
 
 
@@ -240,7 +240,7 @@ def _possible(device: Abilities, writes: Iterable[Write]) -> tuple[list[Write], 
 
 
 def _excluded(device: Abilities, write: Write) -> str | None:
-    """Why a device cannot take a write; empty where it need not, as the entry always holds the value."""
+    """Why a device cannot take a write; empty where the entry always holds the value, None where it can."""
     entry = device.description.entry(write.index, write.subindex)
     if entry is None or (write.purpose == _MISSED_SYNCS and not has_missed_syncs(device.od)):
         return "no such object"
@@ -390,7 +390,7 @@ def _homing_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Wri
 
 
 def _coupling_problems(plan: Plan, node: PlannedNode) -> list[str]:
-    """Where the zero of a drive depends on other joints, they have to be known when it is homed."""
+    """Problems where a drive is homed before joints on which its zero depends."""
     arm = plan.setup.arm
     assert arm is not None
     axis = arm.node_ids.index(node.node_id)
@@ -442,7 +442,7 @@ def _drive_given(device: Abilities) -> tuple[Given, ...]:
 
 
 def _array_given(plan: Plan, dictionary: Any) -> tuple[Given, ...]:
-    """With another full scale the force would be wrong by the ratio of the two."""
+    """The full scale that the array must hold: with another one the force would be wrong by their ratio."""
     array = plan.setup.array
     assert array is not None
     if not has_full_scale(dictionary):

@@ -3,7 +3,7 @@
 The layer on the probe is a bed of springs of stiffness k a volume. On an object of principal curvatures κ, with A and B
 = ½ (1/R + κ), a force F presses it in by δ = √(2 F √(AB) / (π k)), with the pressure k (δ - A x² - B y²) inside a patch
 of half axes √(δ/A) and √(δ/B). The array shows that pressure blurred: a Gaussian of standard deviation σ takes
-k (A + B) σ² off its peak. Stops being true where the blur is as wide as the patch, which then has a higher peak, and
+k (A + B) σ² off its peak. The model fails where the blur is as wide as the patch, which then has a higher peak, and
 on a flat array, which has no such layer.
 
 Source: Johnson, Contact Mechanics (1985), 4.3, the elastic foundation.
@@ -26,11 +26,11 @@ from canprobe.mechanics.touch.stops import MAX_FORCE_SPREAD, OFF_PAD_EDGE_SHARE,
 from canprobe.mechanics.types import Floats
 
 GAIN_SPREAD = 0.05
-"""By which one taxel shows more than another: at the edge it may seem to be pressed harder by as much."""
+"""Share by which one taxel shows more than another: at the edge it may seem to be pressed harder by as much."""
 BLUR_TAXELS = 0.72
-"""Standard deviation of the blur, in taxels, that the packaged calibration has: a finer array blurs over less way."""
+"""Standard deviation of the blur in taxels, from the packaged calibration: a finer array blurs over less distance."""
 _EVERY = 8
-"""Of the contacts along a path, for what changes little from one to the next."""
+"""Every so many contacts along a path are enough for what changes little from one to the next."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,8 +39,8 @@ class Pressed:
 
     Attributes:
         depth: δ, m.
-        half_axis: the longer one of the patch, m.
-        shown_pa: peak of the pressure as the array shows it.
+        half_axis: longer half axis of the patch, m.
+        shown_pa: peak pressure that the array shows, Pa.
     """
 
     depth: float
@@ -52,9 +52,9 @@ def pressed(force_n: float, probe: Probe, array: Array, kappa: Sequence[float]) 
     """The layer under a force.
 
     Args:
-        force_n: of the touch.
-        probe: with the layer.
-        array: under the layer.
+        force_n: normal force of the contact, N.
+        probe: the probe that carries the layer.
+        array: the array under the layer.
         kappa: (2,) principal curvatures of the object, above -1/R, 1/m.
     """
     a, b = (0.5 * (1.0 / probe.radius + one) for one in kappa)
@@ -68,7 +68,7 @@ def _blur_m(array: Array) -> float:
 
 
 def contact_problems(task: Touch, joints: Floats, normals: Floats, kappas: Floats, force_max_n: float) -> list[str]:
-    """Why a touch cannot hold its force along its path; nothing is known of a flat array, which has no layer.
+    """Why a touch cannot hold its force along its path; empty for a flat array, which has no layer.
 
     Args:
         task: a scan or a press.
@@ -88,7 +88,7 @@ def contact_problems(task: Touch, joints: Floats, normals: Floats, kappas: Float
 
 
 def settling_problem(task: Touch, joints: Floats, normals: Floats, force_max_n: float) -> str | None:
-    """That the force cannot settle, because the drives count too coarsely for the layer; None where it can.
+    """Problem where the force cannot settle, because the drives count too coarsely for the layer; else None.
 
     Rounding to whole counts displaces the probe by σ along the normal, and with F ~ δ² the force by 2 σ/δ of itself.
 
@@ -121,18 +121,18 @@ def settling_problem(task: Touch, joints: Floats, normals: Floats, force_max_n: 
 
 
 def saturation_problem(task: Touch | Calibrate, kappas: Floats) -> str | None:
-    """That the array cannot show the wanted force, because its taxels saturate; None where it can.
+    """Problem where the array cannot show the wanted force, because its taxels saturate; else None.
 
     Where a window cuts the patch, more than that force presses until the window measures it.
 
     Args:
-        task: that touches.
+        task: the task that touches.
         kappas: (m, 2) principal curvatures of the object at its contacts, 1/m.
     """
     probe, array, pitch = task.probe, task.array, task.array.pad.pitch_m
     full_pa = array.pad.full_scale_pa
     if array.pad.is_flat:
-        return None  # a calibration with one is refused as that
+        return None  # a calibration with a flat array is refused elsewhere
     windowed = array.mode == "window" and array.window != "auto"
     inside = measured_share(task.force, probe, int(array.window), pitch) if windowed else 1.0
     at_most = max(
@@ -150,7 +150,7 @@ def saturation_problem(task: Touch | Calibrate, kappas: Floats) -> str | None:
 
 
 def edge_margin(task: Touch, kappa: Sequence[float] = (0.0, 0.0)) -> float:
-    """How far from the array's edge the middle of the contact must stay, m; else the cell takes it for run off.
+    """Least distance of the contact's middle from the array's edge, m; nearer, the cell takes the contact as lost.
 
     Args:
         task: a scan or a press with an array that is wrapped on the probe.
@@ -166,7 +166,7 @@ def edge_margin(task: Touch, kappa: Sequence[float] = (0.0, 0.0)) -> float:
 
 
 def edge_problem(task: Touch, joints: Floats, normals: Floats, kappas: Floats) -> str | None:
-    """That the contact would run off the array; None where it stays.
+    """Problem where the contact would run off the array; else None.
 
     Args:
         task: a scan or a press.

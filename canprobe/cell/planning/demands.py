@@ -1,4 +1,4 @@
-"""What a device cannot take its part without: objects, with what they are needed for, and the bus's bit rate."""
+"""Needs of every node: objects, each with its purpose, and the bit rate of the bus."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def missing_objects(device: Abilities, kind: NodeKind, setup: Setup) -> list[str
 
 
 def missing_bitrate(device: Abilities, kind: NodeKind, setup: Setup) -> list[str]:
-    """That the device does not have the bus's bit rate, where its EDS lists them."""
+    """One line where the EDS lists bit rates and that of the bus is not among them."""
     bitrates = device.description.bitrates
     if not bitrates or setup.bus.bitrate in bitrates:
         return []

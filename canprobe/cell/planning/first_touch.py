@@ -53,7 +53,7 @@ def depth_at(force_n: float, probe: Probe, array: Array, kappa: Sequence[float])
 
 
 def blind_s(setup: Setup, task: Touch | Calibrate) -> float:
-    """Longest time from a contact that the array shows to the end of the approach, s.
+    """Longest time from the moment when the array can show the contact to the end of the approach, s.
 
     The next image comes up to a period later, it arrives a period after its sample (a device of raw frames says how
     much later), and the command of that cycle takes effect `CYCLES_TO_EFFECT` later, behind the lag of the drives.
@@ -64,11 +64,11 @@ def blind_s(setup: Setup, task: Touch | Calibrate) -> float:
 
 
 def first_touch_problems(setup: Setup, task: Touch | Calibrate, kappa: Sequence[float]) -> Iterator[str]:
-    """Why a touch cannot begin: the array does not show its force, or shows the contact when too much presses.
+    """Why a touch cannot begin: the array does not show its force, or shows it when the probe presses too hard.
 
     Args:
-        setup: whole.
-        task: of it.
+        setup: the closed setup.
+        task: its task.
         kappa: (2,) principal curvatures of the object at the first contact, above -1/R, 1/m.
     """
     array, probe, limit_n = task.array, task.probe, setup.limits.force_max

@@ -25,8 +25,8 @@ def order_by_deadline(pdos: Sequence[PlannedPdo], devices: Iterable[Abilities] =
     keeps one identifier, and so does a PDO whose COB-ID cannot be changed.
 
     Args:
-        pdos: of all nodes.
-        devices: whose RPDOs may listen to an identifier for ever, which no other PDO gets then.
+        pdos: PDOs of all nodes.
+        devices: devices whose RPDOs may have fixed identifiers, which no other PDO gets.
     """
     fixed = {pdo.cob_id for pdo in pdos if pdo.fixed_id}
     fixed |= {

@@ -21,7 +21,7 @@ from canprobe.fieldbus.eds.description import DescribedEntry
 
 @dataclass(frozen=True, slots=True)
 class _Offer:
-    """What 60C2h of a device takes: values of :01, and indices of :02, the default first."""
+    """Values that 60C2h:01 of a device takes, and indices that 60C2h:02 takes, the default first."""
 
     values: range
     indices: tuple[int, ...]
@@ -76,7 +76,7 @@ def _can_take(device: Abilities, period_us: int) -> bool:
 
 
 def _period_offer(device: Abilities) -> str:
-    """What periods a drive takes, in words."""
+    """The periods that a drive takes, in words."""
     if not follows_sync_period(device):
         return str(_offer(device))
     entry = device.description.entry(SYNC_PERIOD)
@@ -91,9 +91,9 @@ def period_problem(rate_hz: float, period_us: int, exact: bool, devices: Iterabl
     """Why a rate cannot be set, with the nearest rates that every drive can; None where it can.
 
     Args:
-        rate_hz: as the scene asks.
-        period_us: the nearest whole one.
-        exact: whether it is that rate.
+        rate_hz: rate that the scene asks for.
+        period_us: nearest period in whole µs.
+        exact: whether that period has exactly the rate.
         devices: the drives; without any, 1006h decides.
     """
     makes = {device.eds: device for device in devices}

@@ -1,4 +1,4 @@
-"""What a scene does not need, and the files that follow from what it does."""
+"""Parts that a scene does not need, and the files that its run writes."""
 
 from __future__ import annotations
 
@@ -129,8 +129,8 @@ def outputs(setup: Setup, absent: Container[str]) -> tuple[str, ...]:
     """The files that a run of this scene writes.
 
     Args:
-        setup: of the scene.
-        absent: what the plan leaves out.
+        setup: closed setup of the scene.
+        absent: names of the parts that the plan leaves out.
     """
     written = {
         "summary.json": True,
@@ -149,7 +149,7 @@ def outputs(setup: Setup, absent: Container[str]) -> tuple[str, ...]:
 
 
 def long_waits(missed_syncs: int, rate_hz: float) -> Iterator[str]:
-    """What real drives may do that wait for long."""
+    """Warning for real drives that wait long for a SYNC."""
     if missed_syncs <= MISSED_SYNCS_REAL:
         return
     waited_ms = 1e3 * missed_syncs / rate_hz

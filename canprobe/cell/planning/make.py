@@ -49,14 +49,14 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
     """Derive the plan of a setup; what it leaves open ("auto") is chosen so that it fits.
 
     Args:
-        setup: of a scene; see `canprobe.cell.scene.resolve.resolve`.
-        find_ways: look for ways out where the bus is overloaded, which takes far longer than the plan.
+        setup: the setup of a scene; see `canprobe.cell.scene.resolve.resolve`.
+        find_ways: whether to look for ways out where the bus is overloaded, which takes far longer than the plan.
 
     Returns:
-        Nodes, PDOs, bus load, what is left out and why. Its setup has nothing open any more.
+        Nodes, PDOs, bus load, what is left out and why. No key of its setup is "auto" any more.
 
     Raises:
-        PlanError: with every reason why the setup does not fit, its numbers and the ways out.
+        PlanError: when the setup does not fit; the error has every reason with its numbers, and the ways out.
     """
     setup = as_supported(setup)
     devices, problems = _devices(setup)
@@ -109,7 +109,7 @@ def make_plan(setup: Setup, *, find_ways: bool = True) -> Plan:
 
 
 def _shared(problems: Sequence[str]) -> list[str]:
-    """The problems; what several nodes have alike is one, with their numbers."""
+    """The problems; one that several nodes share is listed once, with their numbers."""
     nodes: dict[str, list[str]] = {}
     for problem in problems:
         node, text = re.fullmatch(r"(?:node (\d+): )?(.*)", problem, re.DOTALL).groups()  # type: ignore[union-attr]
@@ -119,10 +119,10 @@ def _shared(problems: Sequence[str]) -> list[str]:
 
 
 def _with_configuration(plan: Plan) -> Plan:
-    """The plan with what its devices cannot take of their configuration.
+    """The plan with the wished writes that its devices cannot take, as not available.
 
     Raises:
-        PlanError: a device cannot take what it must.
+        PlanError: when a device cannot take a required write.
     """
     setups = make_setups(plan)
     if problems := [problem for setup in setups for problem in setup.problems]:
@@ -136,10 +136,10 @@ class _BusPlan:
     """The bus part of a plan.
 
     Attributes:
-        setup: with nothing open any more.
-        choices: what was open.
-        problems: what is wrong whatever the bit rate.
-        overload: what does not fit it.
+        setup: the closed setup: no key is "auto".
+        choices: values of the keys that were open.
+        problems: what is wrong at any bit rate.
+        overload: what does not fit the bit rate.
     """
 
     setup: Setup
@@ -154,7 +154,7 @@ class _BusPlan:
 
     @property
     def misfit(self) -> tuple[int, float]:
-        """How far it is from fitting: problems, then the largest share of a bus, or of a trigger's time, in demand."""
+        """Distance from fitting: number of problems, then the largest load of a bus, or of a trigger's time."""
         shares = [bus.traffic.load for bus in self.buses]
         shares += [demand.used_ns / demand.available_ns for bus in self.buses for demand in bus.traffic.demands]
         return len(self.problems), max(shares)
@@ -166,7 +166,7 @@ def device_problems(setup: Setup) -> list[str]:
 
 
 def _choose(setup: Setup, devices: Mapping[int, Abilities], problems: list[str]) -> _BusPlan:
-    """The first candidate that fits, or else the nearest to it, and then why it does not."""
+    """The first candidate that fits; else the nearest to fitting, whose problems are added."""
     found: list[_BusPlan] = []
     for candidate, choices in candidates(setup):
         bus = _plan_bus(candidate, devices, choices)
@@ -248,9 +248,9 @@ def _channels(setup: Setup) -> dict[str, tuple[int, ...]]:
 
 
 def _fits(setup: Setup, known: frozenset[str]) -> tuple[Setup, Traffic] | None:
-    """A changed setup as it is closed, and its fullest bus, if it fits and brings no problem that is not known already.
+    """A changed setup, closed, and the traffic of its fullest bus; None where it does not fit or has a new problem.
 
-    The plan would give up the motor torque for it too.
+    The motor torque may be given up for it, as in a plan.
     """
     devices, problems = _devices(setup)
     if problems:
@@ -273,7 +273,7 @@ def _roles(setup: Setup) -> list[tuple[NodeKind, str, Node]]:
 
 
 def _devices(setup: Setup) -> tuple[dict[int, Abilities], list[str]]:
-    """What each node can by its own EDS, and what is missing there, said once of a file that several nodes have."""
+    """Abilities of each node by its EDS, and what it lacks, once for a file that several nodes share."""
     seen: set[tuple[NodeKind, str]] = set()
     devices: dict[int, Abilities] = {}
     problems: list[str] = []

@@ -1,6 +1,6 @@
-"""What was on the bus against what was planned: counts, bits and times of every message, and what nobody planned.
+"""Recorded traffic beside the plan: counts, bits and times of every message, and frames that are not in the plan.
 
-Counted from the first SYNC to the last one, while the cell runs: bring-up and the way out have no rate.
+Frames are counted from the first SYNC to the last one: bring-up and shutdown have no rate.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ TOLERANCE = 0.02
 
 @dataclass(slots=True)
 class ClassTraffic:
-    """What was counted of one class of messages.
+    """Frames and bits of one class of messages, counted and planned.
 
     Attributes:
         kind: the class.
-        messages: identifiers in it.
-        frames: counted.
-        planned_frames: in the same time; None for services.
-        bits: counted, exact where the meter measured them, else without stuff bits.
-        planned_bits: in the same time at most; None for services.
+        messages: number of identifiers in it.
+        frames: number of frames that were counted.
+        planned_frames: planned number in the same time; None for services.
+        bits: number of bits, with stuff bits where the meter counts them, else without.
+        planned_bits: highest planned number in the same time; None for services.
         late: frames that came later behind their SYNC than the plan's worst case.
         slowest: the largest share of its worst case behind SYNC that a frame took; None where no time was measured.
     """
@@ -59,9 +59,9 @@ class ClassTraffic:
 
     @property
     def as_planned(self) -> bool:
-        """The count is the plan's within its tolerance, and its bits are no more than the worst case.
+        """Whether the frames are the planned ones within the tolerance, and the bits no more than the worst case.
 
-        What is sent on a change, too, is planned at its slowest rate: there may be more of it.
+        A message that is sent on changes too is planned at its slowest rate: more frames are no fault.
         """
         if self.planned_frames is None or self.planned_bits is None:
             return True
@@ -71,7 +71,7 @@ class ClassTraffic:
         return abs(self.frames - self.planned_frames) <= allowed and self.bits <= self.planned_bits
 
     def add(self, expected: Expected, count: _Count, seconds: float) -> None:
-        """Take one message, counted for so long."""
+        """Add one message that was counted for a time, s."""
         self.messages += 1
         self.frames += count.frames
         self.bits += count.bits
@@ -89,17 +89,17 @@ class MeasuredTraffic:
     """The measured traffic of a bus, compared with its plan.
 
     Attributes:
-        duration_s: from the first SYNC to the last one, s.
+        duration_s: time from the first SYNC to the last one, s.
         bitrate: bit/s.
-        exact: bits were counted with their stuff bits.
+        exact: whether stuff bits were counted.
         classes: counts, bits and times of each kind of message.
-        unlisted: identifiers that the plan does not list, with their counts; in the whole log.
+        unlisted: counts of identifiers that the plan does not list, in the whole log.
         missing: COB-IDs of planned PDOs that never came.
         error_frames: bus errors in the whole log.
-        planned_worst: load in the worst case by the plan, as a share of the bit rate.
+        planned_worst: planned load in the worst case, as a share of the bit rate.
         xl_frames: CAN XL frames, which no plan lists; in the whole log.
         lost_by_candump: frames that candump did not receive.
-        notes: what was mended in the log.
+        notes: what was repaired in the log.
     """
 
     duration_s: float
@@ -120,17 +120,17 @@ class MeasuredTraffic:
         return self.share(sum(one.bits for one in self.classes)) or 0.0
 
     def share(self, bits: float | None) -> float | None:
-        """Share of the bit rate that so many bits are; None where nothing was measured."""
+        """Share of the bit rate that a number of bits takes; None where nothing was measured."""
         return None if bits is None or self.duration_s <= 0 else bits / (self.bitrate * self.duration_s)
 
     @property
     def as_planned(self) -> bool:
-        """Every class is as planned, nothing is missing, nothing else was on the bus, and there was no bus error."""
+        """Whether each class is as planned, no message is missing or foreign, and no bus error was recorded."""
         nothing_else = not (self.unlisted or self.missing or self.error_frames or self.xl_frames)
         return nothing_else and all(one.as_planned for one in self.classes)
 
     def as_dict(self) -> dict[str, Any]:
-        """As JSON types."""
+        """The comparison in JSON types."""
         return {
             "duration_s": self.duration_s,
             "as_planned": self.as_planned,
@@ -202,9 +202,9 @@ class Expected:
     Attributes:
         cob_id: identifier.
         kind: its class.
-        rate_hz: planned; None for a service that has no rate.
-        bits_worst: of one frame; None where its length is open.
-        latest_ns: worst case from the end of the SYNC's frame to the end of this one; None where SYNC triggers none.
+        rate_hz: planned rate; None for a service, which has no rate.
+        bits_worst: most bits of one frame; None where its length is open.
+        latest_ns: worst case from the end of the SYNC frame to the end of this one; None: SYNC does not trigger it.
     """
 
     cob_id: int
@@ -249,7 +249,7 @@ def _kind(pdo: PlannedPdo) -> Kind:
 
 @dataclass(slots=True)
 class _Count:
-    """Of one identifier: frames, their bits, those later than planned, and the longest time behind SYNC."""
+    """Frames of one identifier, their bits, the number that came too late, and the longest time behind SYNC."""
 
     frames: int = 0
     bits: int = 0
@@ -264,16 +264,16 @@ class TrafficMeter:
     """Counts frames in the order of the bus; `report` sets them beside the plan.
 
     Attributes:
-        error_frames: to be counted by the reader.
+        error_frames: number of error frames; the reader counts them here.
     """
 
     def __init__(self, plan: Plan, channel: str | None = None, exact: bool = True) -> None:
-        """Count nothing yet.
+        """Make a meter without counts.
 
         Args:
-            plan: what to expect.
-            channel: of the bus, as the plan names it; None: its first one.
-            exact: count stuff bits too, which costs a few µs a frame.
+            plan: the plan with which frames are compared.
+            channel: channel of the bus, as the plan names it; None: its first one.
+            exact: whether to count stuff bits, which costs a few µs a frame.
         """
         self.error_frames = 0
         self._plan, self._exact = plan, exact
@@ -286,7 +286,7 @@ class TrafficMeter:
         self._enough = _AT_ONCE
         self._first_ns: int | None = None
         self._sync_ns = 0
-        # when the SYNC with each counter was through, and the one that the last tactile header named
+        # time of the SYNC with each counter, and of the one that the last tactile header named
         self._tactile_ids = {one.cob_id for one in self._expected.values() if one.kind == "tactile PDO"}
         self._header_id = min(self._tactile_ids, default=SYNC_ID)
         self._by_counter: dict[int, int] = {}
@@ -304,7 +304,7 @@ class TrafficMeter:
             self._enough = len(self._taken) + _AT_ONCE
 
     def _count(self) -> None:
-        """Count what was taken up to the last SYNC; the frames since then wait."""
+        """Count the frames up to the last SYNC; those since then wait."""
         taken = self._taken
         ids = [frame[0] for frame in taken]
         if SYNC_ID not in ids:
@@ -331,7 +331,7 @@ class TrafficMeter:
                 counts[can_id].bits += exact_frame_bits(can_id, data, self._plan.setup.bus)
 
     def _compare_times(self, frames: Sequence[_Frame]) -> None:
-        """How far behind their SYNC frames came, from one SYNC to before another."""
+        """Compare the times of frames behind their SYNC with the plan; the frames begin with a SYNC."""
         ids, times = (np.array([frame[at] for frame in frames], np.int64) for at in (0, 2))
         syncs = ids == SYNC_ID
         triggers = times[syncs][np.cumsum(syncs) - 1] if len(frames) else times
@@ -346,7 +346,7 @@ class TrafficMeter:
                 count.slowest_ns = max(count.slowest_ns, int(took.max(initial=0)))
 
     def _tactile_triggers(self, ids: Ints, frames: Sequence[_Frame]) -> Ints:
-        """For each frame, when the SYNC was through that the last tactile header named."""
+        """For each frame the time of the SYNC that the last tactile header named."""
         places, named = [0], [self._named_ns]
         for at in np.flatnonzero((ids == SYNC_ID) | (ids == self._header_id)).tolist():
             can_id, data, t_ns = frames[at]
@@ -360,12 +360,12 @@ class TrafficMeter:
 
     @property
     def frames(self) -> int:
-        """Frames so far, bring-up included."""
+        """Number of frames so far, bring-up included."""
         return sum(one.frames for one in self._all_counts())
 
     @property
     def bits(self) -> int:
-        """Their bits, counted as `exact` says."""
+        """Number of their bits, with stuff bits where the meter is `exact`."""
         return sum(one.bits for one in self._all_counts())
 
     def _all_counts(self) -> list[_Count]:
@@ -375,7 +375,7 @@ class TrafficMeter:
         return [*self._before.values(), *self._counts.values(), *waiting.values()]
 
     def report(self) -> MeasuredTraffic:
-        """What was counted so far, beside the plan."""
+        """The counts so far, beside the plan."""
         self._count()
         seconds = 0.0 if self._first_ns is None else (self._sync_ns - self._first_ns) * 1e-9
         seen = Counter(can_id for can_id, _, _ in self._taken)

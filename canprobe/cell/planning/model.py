@@ -1,4 +1,4 @@
-"""The plan: frozen data that bring-up, cycle, emulator and command line all work from."""
+"""The plan: frozen data from which bring-up, cycle, emulator and command line work."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ HEARTBEAT_PRODUCED_MS = 100
 HEARTBEAT_CONSUMED_MS = 250
 SYNC_OVERFLOW = 240
 TASK_OVERHEAD_S = 3.0
-"""What a task takes besides its phase, about: enabling, the way to the object, settling, letting go."""
+"""About the time that a task takes besides its phase: enabling, the way to the object, settling, letting go."""
 
 EVERY_SYNC = 1
-"""Transmission type of what goes in every cycle."""
+"""Transmission type of a PDO that is sent in every cycle."""
 
 NodeKind = Literal["drive", "tactile"]
 Direction = Literal["tpdo", "rpdo"]
@@ -30,7 +30,7 @@ Direction = Literal["tpdo", "rpdo"]
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Object 1018h as the EDS gives it, and its serial number as the scene does; None where it may be any."""
+    """Object 1018h by the EDS, and the serial number of the scene; None where any value is good."""
 
     vendor_id: int | None
     product_code: int | None
@@ -39,7 +39,7 @@ class Identity:
 
     @property
     def numbers(self) -> tuple[int | None, int | None, int | None, int | None]:
-        """1018h:01 to :04."""
+        """Values of 1018h:01 to :04."""
         return self.vendor_id, self.product_code, self.revision_number, self.serial_number
 
 
@@ -48,8 +48,8 @@ class Interpolation:
     """A time as 60C2h expresses it: value · 10^index s.
 
     Attributes:
-        value: 60C2h:01.
-        index: 60C2h:02.
+        value: value of 60C2h:01.
+        index: value of 60C2h:02.
     """
 
     value: int
@@ -67,17 +67,17 @@ class PlannedNode:
     """A node that is brought up.
 
     Attributes:
-        node_id: 1–126.
+        node_id: node id, 1–126.
         kind: `drive` or `tactile`.
-        role: for people: `joint 1`, `tactile array`.
+        role: its name for people: `joint 1`, `tactile array`.
         eds: name or path of its EDS.
         identity: what 1018h must answer.
-        emulated: served by the emulator.
-        channel: of the bus that it is on.
+        emulated: whether the emulator serves it.
+        channel: channel of its bus.
         switched_off: PDOs of the EDS that the scene does not need, (direction, number).
-        mode: of operation, 6060h; None: no drive.
-        interpolation: the period as 60C2h may express it, the first as it is written; empty: no drive.
-        dictionary: canopen's object dictionary, as the EDS was read for this plan. Treat it as read-only.
+        mode: mode of operation, 6060h; None: the node is no drive.
+        interpolation: values of 60C2h that express the period, the first is tried first; empty: the node is no drive.
+        dictionary: object dictionary of the package canopen, as the EDS was read for this plan. Treat it as read-only.
     """
 
     node_id: int
@@ -99,21 +99,21 @@ class PlannedPdo:
 
     Attributes:
         node_id: the node.
-        direction: from the device's view.
-        number: 1 for 1400h/1600h or 1800h/1A00h.
-        channel: of the bus that it is on.
+        direction: `tpdo` or `rpdo`, from the device's view.
+        number: number of the PDO, 1 for 1400h/1600h or 1800h/1A00h.
+        channel: channel of its bus.
         layout: COB-ID, mapping entries and transmission type.
-        rate_hz: how often it is on the bus; for an event-driven one the slowest rate.
-        bits_worst: length on the wire with worst-case stuffing.
-        deadline_ns: after the SYNC, or after its own queueing where event-driven.
+        rate_hz: rate on the bus; for an event-driven PDO the slowest one.
+        bits_worst: bits on the wire with worst-case stuffing.
+        deadline_ns: latest time of its end after the SYNC, or after its own queueing where event-driven.
         response_ns: worst case of its end after the SYNC, or after its own queueing where event-driven; None where
             the bus is overloaded.
-        event_timer_ms: 14xxh:05, 0 without.
-        kind: of the node.
-        used: False for a TPDO that nobody needs and that cannot be switched off.
-        fixed_id: its COB-ID cannot be changed.
-        own_bits: bits 29 and 30 of its COB-ID, as the device has them.
-        constants: what entries hold that the cycle does not command, by (index, sub-index).
+        event_timer_ms: value of 14xxh:05; 0: none.
+        kind: kind of the node.
+        used: False for a TPDO that the scene does not need and that cannot be switched off.
+        fixed_id: whether its COB-ID cannot be changed.
+        own_bits: bits 29 and 30 of its COB-ID, which the device sets.
+        constants: values of entries that the cycle does not command, by (index, sub-index).
     """
 
     node_id: int
@@ -139,7 +139,7 @@ class PlannedPdo:
 
     @property
     def slack_ns(self) -> int | None:
-        """What its deadline leaves after the worst case; None where that has no bound."""
+        """Time between the worst case and the deadline; None where the worst case has no bound."""
         return None if self.response_ns is None else self.deadline_ns - self.response_ns
 
     @property
@@ -149,7 +149,7 @@ class PlannedPdo:
 
     @property
     def transmission_type(self) -> int:
-        """18xxh:02 or 14xxh:02."""
+        """Value of 18xxh:02 or 14xxh:02."""
         return self.layout.transmission_type
 
 
@@ -159,13 +159,13 @@ class PlannedFrames:
 
     Attributes:
         can_id: 11-bit identifier.
-        channel: of the bus that they are on.
+        channel: channel of their bus.
         what: `image`, `start`, `stop` or `poll`.
-        sent: by the master; else by the device.
-        count: of one image, or of one command.
-        length: bytes of the longest.
-        rate_hz: of the images; 0 for what is sent at the beginning and the end.
-        bits_worst: of all of them with worst-case stuffing.
+        sent: whether the master sends them; else the device does.
+        count: number of frames of one image, or of one command.
+        length: bytes of the longest frame.
+        rate_hz: rate of the images; 0 for what is sent at the beginning and the end.
+        bits_worst: bits of all of them with worst-case stuffing.
         response_ns: worst case from the first one's queueing to the last one's end; None where the bus is overloaded,
             or where they have no rate.
     """
@@ -186,10 +186,10 @@ class SyncPlan:
     """SYNC as 1005h, 1006h and 1019h express it.
 
     Attributes:
-        rate_hz: as the scene asks.
-        period_ns: integer.
-        period_us: 1006h.
-        overflow: 1019h.
+        rate_hz: rate that the scene asks for.
+        period_ns: period, a whole number.
+        period_us: value of 1006h.
+        overflow: value of 1019h.
     """
 
     rate_hz: float
@@ -200,13 +200,13 @@ class SyncPlan:
 
 @dataclass(frozen=True, slots=True)
 class Demand:
-    """What the frames that one trigger releases ask of the bus, worst case.
+    """Time on the bus of the frames that one trigger releases, worst case.
 
     Attributes:
         what: which frames.
-        cycles: within how many cycles they must be through.
-        used_ns: wire time they and everything of higher priority take meanwhile.
-        available_ns: the cycles' length.
+        cycles: number of cycles within which they must be through.
+        used_ns: wire time of these and of all frames of higher priority meanwhile.
+        available_ns: length of the cycles.
     """
 
     what: str
@@ -217,20 +217,20 @@ class Demand:
 
 @dataclass(frozen=True, slots=True)
 class CycleBudget:
-    """The worst course of one cycle, ns after its SYNC is due; None without such a part, or without a bound.
+    """The worst course of one cycle, ns after its SYNC is due; None where a part is missing, or has no bound.
 
-    Of several buses each time is that of the last: the controller waits for the feedback of all of them.
+    With several buses each time is that of the slowest: the controller waits for the feedback of all of them.
 
     Attributes:
-        period_ns: of SYNC.
-        looks_ns: when the cell looks for TPDOs.
-        sync_ns: the SYNC is through.
-        feedback_ns: the last TPDO of a drive is in.
-        start_ns: the controller starts, at the first look that finds them all.
-        compute_ns: what it takes at most, as the scene says.
-        commands_ns: the last RPDO is through.
-        tactile_ns: the last PDO of a tactile frame is in.
-        slack_ns: what is left of the period; negative: the next SYNC comes too early.
+        period_ns: period of SYNC.
+        looks_ns: times when the cell looks for TPDOs.
+        sync_ns: time when the SYNC is through.
+        feedback_ns: time when the last TPDO of a drive is in.
+        start_ns: time when the controller starts, at the first look that finds them all.
+        compute_ns: longest computing time, as the scene says.
+        commands_ns: time when the last RPDO is through.
+        tactile_ns: time when the last PDO of a tactile frame is in.
+        slack_ns: rest of the period; negative: the next SYNC comes too early.
     """
 
     period_ns: int
@@ -245,7 +245,7 @@ class CycleBudget:
 
     @property
     def bus_ns(self) -> int | None:
-        """The period's share of the bus: until the controller starts, and from its end to the last RPDO."""
+        """Time of the bus in a period: until the controller starts, and from its end to the last RPDO."""
         if self.start_ns is None or self.slack_ns is None:
             return None
         return self.period_ns - self.compute_ns - self.slack_ns
@@ -253,14 +253,14 @@ class CycleBudget:
 
 @dataclass(frozen=True, slots=True)
 class Traffic:
-    """The bus, worst case.
+    """Traffic of a bus, worst case.
 
     Attributes:
-        load: share of the bit rate, everything that repeats.
-        parts: the same by (what, share).
+        load: share of the bit rate of everything that repeats.
+        parts: its parts, as (what, share).
         demands: peaks behind one SYNC.
         sync_response_ns: worst-case response time of SYNC.
-        budget: of one cycle of the cell, with all its buses.
+        budget: time budget of one cycle of the cell, over all its buses.
     """
 
     load: float
@@ -276,8 +276,8 @@ class PlannedBus:
 
     Attributes:
         channel: its name in the scene.
-        node_ids: who is on it.
-        traffic: whether it fits, with numbers.
+        node_ids: ids of its nodes.
+        traffic: its worst-case traffic.
     """
 
     channel: str
@@ -287,12 +287,12 @@ class PlannedBus:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Something that the scene left to the plan.
+    """One value that the scene left to the plan.
 
     Attributes:
-        key: of the scene file.
-        value: what was chosen.
-        why: for people.
+        key: key of the scene file.
+        value: the chosen value.
+        why: the reason, for people.
     """
 
     key: str
@@ -307,7 +307,7 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class JointSpeeds:
-    """Fastest joint motion of the task, and what is allowed, one value a joint, each in its unit: deg/s or mm/s."""
+    """Fastest motion of each joint in the task, and its limit, each in its unit: deg/s or mm/s."""
 
     needed: tuple[float, ...]
     limit: tuple[float, ...]
@@ -315,7 +315,7 @@ class JointSpeeds:
 
     @property
     def worst_share(self) -> float:
-        """Largest share of its limit that a joint is asked for; above 1 it cannot."""
+        """Largest share of a joint's limit that the task needs; above 1 it is too fast."""
         return max(need / limit for need, limit in zip(self.needed, self.limit, strict=True))
 
 
@@ -325,16 +325,16 @@ class Plan:
 
     Attributes:
         setup: the resolved scene in SI units, with every choice of the plan; its `scene` has them too.
-        nodes: that are brought up, by node id.
-        pdos: of all nodes, by priority on the bus.
+        nodes: nodes that are brought up, by node id.
+        pdos: PDOs of all nodes, by priority on the bus.
         raw: frames of an array that is no CANopen node.
-        sync: the cycle.
-        buses: that of the first joint first, then the others in the order of the joints, the array's last.
+        sync: rate and period of SYNC.
+        buses: the bus of the first joint, then the others in the order of the joints, the array's last.
         choices: values that the scene left to the plan, with reasons.
-        joint_speeds: needed and allowed; None without an arm.
+        joint_speeds: needed and allowed joint speeds; None without an arm.
         outputs: files that a run writes.
         left_out: what this scene does not bring up, and why.
-        not_available: what the EDS files could not give.
+        not_available: what the devices lack by their EDS files, and what that means.
         warnings: what is carried out although a number of the plan does not hold for it.
     """
 
@@ -369,12 +369,12 @@ class Plan:
 
     @property
     def cycles(self) -> int:
-        """About how many the whole task takes, with the ways to the object and back."""
+        """About the number of cycles of the whole task, with the ways to the object and back."""
         return round((self.setup.task.duration_s + TASK_OVERHEAD_S) * self.sync.rate_hz)
 
     @property
     def emulated_channels(self) -> tuple[str, ...]:
-        """Of the buses on which something is emulated."""
+        """Channels of the buses on which something is emulated."""
         channels = dict.fromkeys(node.channel for node in self.nodes if node.emulated)
         array = self.setup.array
         if array is not None and array.raw is not None and array.emulated:

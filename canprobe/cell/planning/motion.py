@@ -1,4 +1,4 @@
-"""Can the arm do it: reach, joint stops and joint speeds along the whole path."""
+"""Whether the arm can do the task: reach, joint stops and joint speeds along the whole path."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ _PATH_MOVE_RAD = 0.3  # between two points of a path; farther away lies another 
 _MIN_SINGULAR = 1e-3  # of the Jacobian in rows of a posture from which an arm cannot go on
 _TOUCH_MOVE_RAD = 1.0  # between the touches of a calibration, and from the approach to the first contact
 DEVIATION_RAD = math.radians(1.0)
-"""By which the joints of a touch may go beyond its planned way, which knows neither the depth nor the servo; for a
+"""Angle by which the joints of a touch may go beyond its planned way, which knows neither depth nor servo; for a
 prismatic one see `ArmModel.radian`. Without the last retreat, which no stop ends; near a singular posture there is no
 such bound."""
 PARKED_ABOVE_M = 5e-3
-"""How far above the approach's first point an emulated arm stands at power on, m."""
+"""Height of an emulated arm above the approach's first point at power on, m."""
 
 
 def check_motion(setup: Setup) -> tuple[JointSpeeds | None, list[str]]:
-    """What the task asks of the arm, and what the arm cannot do."""
+    """Joint speeds that the task needs, and why the arm cannot do it; empty where it can."""
     if setup.arm is None:
         return None, []
     stops = _Stops(setup.arm, setup.limits)
@@ -71,10 +71,10 @@ def check_motion(setup: Setup) -> tuple[JointSpeeds | None, list[str]]:
 
 
 def parked_posture(setup: Setup, arm: Arm) -> Floats:
-    """Where an emulated arm stands at power on, (n,) rad or m: above the start of a touch, else as in the scene.
+    """Posture of an emulated arm at power on (n,), rad or m: above the start of a touch, else as in the scene.
 
     Raises:
-        PlanError: it cannot stand there.
+        PlanError: when it cannot stand there.
     """
     touch = setup.touch
     if touch is None:
@@ -103,8 +103,8 @@ def reach_problems(setup: Setup, task: Touch, poses: Iterable[tuple[Floats, Floa
     """Why the arm of a touch cannot go through poses of its probe.
 
     Args:
-        setup: whole.
-        task: of it.
+        setup: the closed setup.
+        task: its task.
         poses: centre (3,), m, and pole (3,) away from the object, base frame.
     """
     targets = [_Pose(centre, pole, _TOUCH_MOVE_RAD, "out of reach: {why}") for centre, pole in poses]
@@ -115,7 +115,7 @@ def reach_problems(setup: Setup, task: Touch, poses: Iterable[tuple[Floats, Floa
 
 
 def _lacking_rows(setup: Setup) -> str | None:
-    """What the task needs of the probe's pose and the arm cannot do, whatever the path; None where nothing."""
+    """Problem where the arm cannot pose the probe as the task needs on any path; else None."""
     arm, task = setup.arm, setup.task
     if arm is None or not isinstance(task, Touch | Calibrate):
         return None
@@ -138,7 +138,7 @@ def _lacking_rows(setup: Setup) -> str | None:
 
 @dataclass(frozen=True, slots=True)
 class _Stops:
-    """The joints' stops and speeds, less what the limits keep from them."""
+    """Stops and highest speeds of the joints, less the margins that the limits keep."""
 
     arm: Arm
     limits: SafetyLimits
@@ -187,7 +187,7 @@ class _Stops:
 
 
 def _too_fast(arm: Arm, speeds: JointSpeeds, way_out: str) -> list[str]:
-    """One line for every joint that the task asks to be too fast."""
+    """One line for every joint that would have to be too fast."""
     each = zip(speeds.needed, speeds.limit, speeds.units, strict=True)
     return [
         f"task: joint {i} would need {need:.4g} {unit}, allowed {limit:.4g}; {way_out}"
@@ -197,10 +197,10 @@ def _too_fast(arm: Arm, speeds: JointSpeeds, way_out: str) -> list[str]:
 
 
 def _beginning(setup: Setup, task: Touch | Calibrate, contacts: Iterable[_Pose]) -> Floats:
-    """Where the arm moves from, (n,) rad or m, as far as it is known.
+    """Posture from which the arm moves (n,), rad or m, as far as it is known.
 
     Raises:
-        PlanError: an emulated arm cannot be parked; or the contacts are out of reach, which matters more.
+        PlanError: when an emulated arm cannot be parked; or the contacts are out of reach, which is reported instead.
     """
     if not setup.emulates:
         return task.arm.q_start
@@ -217,7 +217,7 @@ def _check_touch(
     joints = _follow(task.arm, task.probe, _along_path(task, path), q_start)
     gone = joints_on_way(task.arm, task.probe, q_start, lambda pose: over_path(task, path, pose))
     problems = stops.problems(gone, touching=True)
-    if path.hollow_radius > task.probe.radius:  # a tighter hollow is refused as that
+    if path.hollow_radius > task.probe.radius:  # a tighter hollow is refused elsewhere
         at_contacts = joints[_POSES_BEFORE_CONTACT:]
         problems += contact_problems(task, at_contacts, path.normals, path.kappas, stops.limits.force_max)
     approach = task.approach
@@ -255,13 +255,13 @@ def _hollow_problems(path: SurfacePath, probe: Probe) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class _Pose:
-    """Where the probe's centre is, with its pole; how far the joints may move to it, and what is said if they cannot.
+    """A pose of the probe, the joint move that is allowed to reach it, and the message where it is out of reach.
 
     Attributes:
-        centre: (3,), m, base frame.
-        pole: (3,) from the centre away from the object, base frame.
+        centre: centre of the probe (3,), m, base frame.
+        pole: unit vector (3,) from the centre away from the object, base frame.
         most_rad: largest move of a joint from the pose before, see `inverse_near`; farther away lies another branch.
-        out_of_reach: message, to be filled with why.
+        out_of_reach: message, with a place for the reason.
     """
 
     centre: Floats
@@ -295,7 +295,7 @@ def _along_path(task: Touch, path: SurfacePath) -> Iterator[_Pose]:
 
 
 def _over_ball(task: Calibrate) -> Iterator[_Pose]:
-    """Above and at each touch."""
+    """The pose above each touch, and the pose at it."""
     for number, touch in enumerate(task.approaches, start=1):
         out_of_reach = (
             f"task: touch {number} of {len(task.approaches)} is out of reach: {{why}}; move the ball, or lower "

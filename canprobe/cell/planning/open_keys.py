@@ -1,4 +1,4 @@
-"""What a scene leaves to the plan ("auto"), and in which order the plan tries it."""
+"""Keys that a scene leaves to the plan ("auto"), and the order in which the plan tries their values."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ class _OpenKey:
 
     Attributes:
         key: section and name in a scene file.
-        part: of the setup that has it.
+        part: part of the setup that has it.
         field: its name there.
-        options: of a setup: (value, why), the dearest last.
+        options: values to try for a setup, as (value, why), the dearest last.
     """
 
     key: str
@@ -40,12 +40,12 @@ class _OpenKey:
     options: Callable[[Setup], Sequence[tuple[Any, str]]]
 
     def value(self, setup: Setup) -> Any:
-        """What the setup says; None where it has no such part."""
+        """The value in the setup; None where it has no such part."""
         return getattr(getattr(setup, self.part), self.field, None)
 
 
 def _modes(setup: Setup) -> list[tuple[TactileModeName, str]]:
-    """Of an array that only listens all; of one that is touched those that follow the contact."""
+    """All modes where the array only listens; else those that follow the contact."""
     return [(mode, why) for mode, why in MODES.items() if mode != "image" or setup.kind == "listen"]
 
 

@@ -1,9 +1,9 @@
-"""How each drive is commanded in the cycle: its mode of operation, and the period as its 60C2h can express it.
+"""The mode of operation in which each drive is commanded, and the objects that hold the period of its targets.
 
 Cyclic synchronous position is taken where the drive has it, else interpolated position. 60C2h is value · 10^index s;
 devices take whole milliseconds only, or anything down to microseconds. The default index of the device comes first, as
 it is the one that surely works; then the others from milliseconds down. A drive without 60C2h takes the period from
-1006h, where it has that.
+1006h, where it has that object.
 Source: CiA 402-2, objects 6060h, 60C1h, 60C2h, 6502h; CiA 301, object 1006h.
 """
 
@@ -43,7 +43,7 @@ MAX_TIME_UNITS = 0xFFFF
 
 
 def choose_mode(device: Abilities) -> OperationMode | None:
-    """The mode in which the cell can drive a device; None where it has none.
+    """The best mode in which the cell can command a device; None where there is none.
 
     Where 6502h does not list the modes, the objects decide; bring-up confirms the mode in 6061h.
     """
@@ -71,7 +71,7 @@ def follows_sync_period(device: Abilities) -> bool:
 
 
 def early_stops(setup: Setup, devices: Mapping[int, Abilities]) -> Iterator[str]:
-    """Drives that take their master for dead sooner than the plan says, as their EDS has it."""
+    """Warnings for drives that by their EDS stop after fewer missed SYNCs than the scene says."""
     arm = setup.arm
     early: dict[tuple[str, int, int], list[int]] = {}
     for node_id in arm.node_ids if arm is not None else ():

@@ -1,8 +1,8 @@
-"""Which PDOs a scene needs, as far as the devices' EDS files allow, with the default identifiers of the cell.
+"""The PDOs that a scene needs and the devices' EDS files allow, with the default identifiers of the cell.
 
-A PDO whose mapping can be changed is mapped; else the one, or the several, whose fixed mapping has what is needed. What
-else a fixed RPDO carries gets a safe value; what else a fixed TPDO carries is not read. A TPDO that nobody needs and
-that cannot be switched off is planned as what it is: traffic.
+A PDO whose mapping can be changed is mapped; else one or several are taken whose fixed mappings have the objects. What
+else a fixed RPDO carries gets a safe value; what else a fixed TPDO carries is not read. A TPDO that is not needed and
+cannot be switched off is planned as traffic.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ STATES = frozenset((0x1001, 0x603F, 0x6041, 0x6061))
 DUMMY_INTEGER32 = 0x0004
 
 DRIVE_TPDOS, DRIVE_RPDOS = (0x180, 0x280, 0x380, 0x480), (0x200, 0x300, 0x400, 0x500)
-"""By use: the first PDO of a drive that is used has the first, whatever its number."""
+"""Bases of COB-IDs in the order of use: the first PDO of a drive in use has the first, whatever its number."""
 TACTILE_TPDO1 = 0x511
-"""Of the array, and those that follow it: 180h + 16 would beat every RPDO; behind them all it delays no drive's frame.
-RPDO4 of nodes 17 to 49 have them by default: where there are such nodes, the array has others."""
+"""First COB-ID of the array's PDOs: 180h + 16 would have priority over every RPDO; this one delays no drive's frame.
+RPDO4 of nodes 17 to 49 have these by default: where there are such nodes, the array gets others."""
 _LAST_COB_ID, _FIRST_COB_ID = 0x57F, 0x481
 TACTILE_DEADLINE_CYCLES = 2
 RESENT_MS, LOST_MS = 100, 250
-"""How often a PDO that is sent on a change comes at the slowest, and when its receiver takes it for lost."""
+"""Longest time between two PDOs that are sent on change, and the time after which the receiver reports a loss."""
 ON_EVENT = 255
 
 HEADER, WINDOW_TAXELS, IMAGE_TAXELS, FEATURES = (0x2120, 0), 0x2110, 0x2100, 0x2130
@@ -48,11 +48,11 @@ FD_WORDS = (8, 6, 4, 3, 2, 1)
 
 @dataclass(frozen=True, slots=True)
 class ChosenPdo:
-    """A PDO of a device for what has to be carried.
+    """A PDO of a device that carries objects of the scene.
 
     Attributes:
-        number: 1 for 1400h or 1800h.
-        entries: what it maps then.
+        number: number of the PDO, 1 for 1400h or 1800h.
+        entries: objects that it maps.
     """
 
     number: int
@@ -61,13 +61,13 @@ class ChosenPdo:
 
 @dataclass(slots=True)
 class PdoPlanning:
-    """PDOs found so far, with what was wrong and what a device could not give.
+    """PDOs planned so far, with problems and with what a device lacks.
 
     Attributes:
-        setup: of the scene.
-        sync: the cycle.
-        devices: what each node can.
-        channels: of the bus that each node is on.
+        setup: setup of the scene.
+        sync: rate and period of SYNC.
+        devices: what each node can do, by node id.
+        channels: channel of each node's bus, by node id.
     """
 
     setup: Setup
@@ -184,7 +184,7 @@ def _places(chosen: ChosenPdo) -> set[Place]:
 
 
 def _offered(device: Abilities, direction: Direction, number: int, count: int) -> str:
-    """Why a PDO does not carry what is needed."""
+    """Why a PDO does not carry the needed objects."""
     name = f"{direction.upper()}{number}"
     if not device.can_cycle(direction, number):
         return f"{name} cannot follow every SYNC"
@@ -291,7 +291,7 @@ def _plan_grouped(planning: PdoPlanning, node_id: int, first: int) -> None:
 
 
 def _plan_tolerated(planning: PdoPlanning, node_id: int) -> None:
-    """TPDOs that nobody needs and that cannot be switched off.
+    """Plan the TPDOs that are not needed and cannot be switched off.
 
     No EDS states how often one is sent on events. What only has a state is counted ten times a second; anything else,
     such as a position, changes in every cycle, unless the inhibit time allows less.
@@ -371,7 +371,7 @@ def plan_tactile_pdos(planning: PdoPlanning, ratio: int) -> None:
 
 
 def _lacking_words(device: Abilities, array: Array) -> str | None:
-    """That the node has another array than the file says; None where it has objects for all its taxels."""
+    """Problem where the EDS has too few objects for the taxels of the array file; else None."""
     words, needed = device.number(IMAGE_TAXELS), image_words(array.pad.taxels)
     if words is None or words >= needed:  # one without the object cannot send images, which is said of each of them
         return None

@@ -47,15 +47,15 @@ def plan_raw_frames(setup: Setup) -> tuple[PlannedFrames, ...]:
 def raw_frame_problems(
     frames: tuple[PlannedFrames, ...], pdos: list[PlannedPdo], buses: Mapping[str, tuple[int, ...]], name: str
 ) -> list[str]:
-    """Identifiers of raw frames that something else in the cell has.
+    """Problems where other frames of the cell have the identifiers of raw frames.
 
-    The cell knows what it receives by its identifier alone, whichever bus it comes from; what it sends goes to one bus.
+    The cell tells received frames apart by their identifiers, whatever their bus; a frame that it sends is on one bus.
 
     Args:
-        frames: of the array.
-        pdos: of all nodes.
+        frames: raw frames of the array.
+        pdos: PDOs of all nodes.
         buses: node ids by channel.
-        name: of the array.
+        name: name of the array.
     """
     problems = []
     received, on_bus = _identifiers(pdos, buses)
@@ -65,7 +65,7 @@ def raw_frame_problems(
         if other is None:
             continue
         if own:
-            ways = f'on {frame.channel}; give it a bus of its own (sensor.channel = "can1"), or take other node ids'
+            ways = f'on {frame.channel}; give it a separate bus (sensor.channel = "can1"), or take other node ids'
         else:
             ways = "on another bus, and the cell knows what it receives by the identifier alone; take other node ids"
         problems.append(f"array {name}: its {frame.what} frame {frame.can_id:03X}h is {other} {ways}")
@@ -77,7 +77,7 @@ def raw_frame_problems(
 def _identifiers(
     pdos: list[PlannedPdo], buses: Mapping[str, tuple[int, ...]]
 ) -> tuple[dict[int, str], dict[str, dict[int, str]]]:
-    """What the cell receives on any bus, and all that is on each bus, by identifier."""
+    """Frames that the cell receives on any bus, and all frames of each bus, by identifier."""
     received: dict[int, str] = {}
     on_bus: dict[str, dict[int, str]] = {}
     for channel, node_ids in buses.items():

@@ -1,4 +1,4 @@
-"""The plan as people read it on a terminal."""
+"""The plan as text for a terminal."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from canprobe.cell.scene.setup import Setup
 from canprobe.fieldbus.protocol.pdo import PdoEntry
 
 TIMELINE_WIDTH = 100
-"""Characters of a cycle."""
+"""Longest row of the timeline, characters of one cycle."""
 MIN_CHARACTERS = 40
-"""Characters below which no line is broken."""
+"""Least length of a line: no line is broken before it."""
 _BESIDE_TIMELINE, _NARROW, _LAST = 24, 8, 12
 
 
@@ -31,8 +31,8 @@ def plan_text(plan: Plan, width: int | None = None) -> str:
     """The whole plan, ending with a newline.
 
     Args:
-        plan: that fits.
-        width: characters of a line, which are broken there; None: lines stay whole.
+        plan: the plan.
+        width: characters after which a line is broken; None: lines stay whole.
     """
     room = None if width is None else max(width, MIN_CHARACTERS)
     lines = (part for line in _lines(plan, room) for part in _broken(line, room))
@@ -158,7 +158,7 @@ def _speed_rows(plan: Plan) -> Iterator[list[str]]:
 
 
 def _content(entries: Sequence[PdoEntry]) -> str:
-    """The objects of a mapping, a row of neighbours as its first and last."""
+    """The objects of a mapping; a row of neighbours is its first and last."""
     rows: list[list[PdoEntry]] = []
     for entry in entries:
         last = rows[-1][-1] if rows else None
@@ -185,7 +185,7 @@ def _bus_rows(traffic: Traffic) -> Iterator[list[str]]:
 
 
 def _budget_rows(budget: CycleBudget) -> Iterator[list[str]]:
-    """When what is done after the SYNC, and what each part takes."""
+    """Time of each part of the cycle after the SYNC."""
     yield ["SYNC through", _us(budget.sync_ns), ""]
     if budget.feedback_ns is not None:
         yield ["last TPDO of the drives in", _us(budget.feedback_ns), ""]
@@ -219,7 +219,7 @@ def _use_rows(plan: Plan) -> Iterator[list[str]]:
 
 
 def _measured(setup: Setup) -> str:
-    """What the array measures of the task's contact."""
+    """The quantities of the task's contact that the array measures, in words."""
     support, array = support_of(setup), setup.array
     assert support is not None and array is not None
     if setup.touch is None or array.pad.is_flat:

@@ -23,7 +23,7 @@ SCHEMA = 1
 
 
 def plan_dict(plan: Plan) -> dict[str, Any]:
-    """Every field of the plan; what does not apply is None."""
+    """The plan in JSON types; a field that does not apply is None."""
     setup, bus, shape = plan.setup, plan.setup.bus, plan.setup.shape
     return {
         "schema": SCHEMA,
@@ -65,7 +65,7 @@ def plan_dict(plan: Plan) -> dict[str, Any]:
 
 
 def refused_dict(name: str, problems: Sequence[str], ways_out: Sequence[str]) -> dict[str, Any]:
-    """What is said of a scene that does not fit."""
+    """The answer for a scene that does not fit: its problems and the ways out."""
     return {
         "schema": SCHEMA,
         "scene": name,
@@ -138,7 +138,7 @@ def _pdo(pdo: PlannedPdo) -> dict[str, Any]:
 
 
 def _in_us(values: dict[str, Any]) -> dict[str, Any]:
-    """The same with its times in µs: `start_ns` becomes `start_us`."""
+    """The values with times in µs: `start_ns` becomes `start_us`."""
     return {
         f"{name.removesuffix('_ns')}_us" if name.endswith("_ns") else name: (
             _microseconds(value) if name.endswith("_ns") else value

@@ -14,7 +14,7 @@ from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.types import Floats
 
 SAMPLES = 240
-"""Points of a path."""
+"""Number of points of a path."""
 _STEEPEST = math.radians(70.0)  # the servo steers in the scan plane: steeper than this it cannot follow
 _RESTS_M = 5e-6  # of a ball, which may stand on two places that differ by so much
 _BALL_STEPS = 6  # halves what is left of the way from under the centre to the contact
@@ -27,10 +27,10 @@ class SurfacePath:
     """Contacts that the task will make.
 
     Attributes:
-        points: (n, 3) m, base frame; the first is where the approach ends.
-        normals: (n, 3) outward unit normals there.
-        kappas: (n, 2) principal curvatures there, 1/m; 0 where a ball bridges what a formula does not describe.
-        hollow_radius: smallest concave radius met, m; inf without one.
+        points: contact points (n, 3), m, base frame; the approach ends at the first.
+        normals: outward unit normals there (n, 3).
+        kappas: principal curvatures there (n, 2), 1/m; 0 where a ball bridges gaps that no formula describes.
+        hollow_radius: smallest concave radius on the path, m; inf without one.
     """
 
     points: Floats
@@ -40,14 +40,14 @@ class SurfacePath:
 
 
 def surface_path(task: Touch, shape: PlacedShape | None) -> SurfacePath:
-    """Points of the object under the task's path; without a described object the plane that the approach expects.
+    """Points of the object under the task's path; without an object those of the plane that the approach expects.
 
     Args:
         task: a scan or a press.
-        shape: the object.
+        shape: the object; None where the scene describes none.
 
     Raises:
-        PlanError: the approach or the path misses the object, or the probe first meets it beside the array.
+        PlanError: when the approach or the path misses the object, or the probe first meets it beside the array.
     """
     approach, down = task.approach, task.approach.normal
     plane = approach.start[None, :]  # points in the scan plane; one for a press
@@ -56,7 +56,7 @@ def surface_path(task: Touch, shape: PlacedShape | None) -> SurfacePath:
         plane = approach.start + np.array(flat) @ approach.axes[:2]
     if shape is None:
         return SurfacePath(plane, np.tile(down, (len(plane), 1)), np.zeros((len(plane), 2)), math.inf)
-    # A ball bridges what a point would fall into.
+    # a ball bridges gaps into which a point would fall
     radius = task.probe.radius if shape.by_gaps and not task.array.pad.is_flat else 0.0
     _check_approach(approach, _along(shape, approach.start, down, radius))
     if not task.array.pad.is_flat:
@@ -64,23 +64,23 @@ def surface_path(task: Touch, shape: PlacedShape | None) -> SurfacePath:
     path = _contacts(shape, plane, down, radius)
     if shape.by_gaps:
         path = _under_ball(shape, path, plane, down, radius)
-    if path.hollow_radius > task.probe.radius:  # a tighter hollow is refused as that
+    if path.hollow_radius > task.probe.radius:  # a tighter hollow is refused elsewhere
         _check_first_touch(task, shape)
     return path
 
 
 def _first_contact(shape: PlacedShape, approach: Approach, radius: float) -> Floats:
-    """Where a ball first touches, (3,) m across the approach from its end: the path begins there."""
+    """Place where a ball first touches (3,), m, across the approach from its end: the path begins there."""
     height = _along(shape, approach.start, approach.normal, radius)
     if height is None or shape.tightest_concave_radius(approach.start[None]) <= radius:
-        return np.zeros(3)  # in a hollow that is tighter it touches in two places, which is refused as that
+        return np.zeros(3)  # in a tighter hollow it touches in two places, which is refused elsewhere
     beside = shape.closest(approach.start + (height + radius) * approach.normal).point - approach.start
     across: Floats = beside - float(beside @ approach.normal) * approach.normal
     return across
 
 
 def _contacts(shape: PlacedShape, plane: Floats, up: Floats, radius: float) -> SurfacePath:
-    """Where a ball of `radius` over each point (n, 3) rests, or the surface itself with 0."""
+    """Contacts of a ball of `radius` that rests over each point (n, 3); with 0 the points of the surface."""
     contacts = []
     for point in plane:
         height = _along(shape, point, up, radius)
@@ -110,7 +110,7 @@ def _under_ball(shape: PlacedShape, path: SurfacePath, plane: Floats, up: Floats
 
 
 def _over_patches(path: SurfacePath, plane: Floats, radius: float) -> SurfacePath:
-    """A ball's path with the normals as its pad shows them: of each point from a linear fit to those near it."""
+    """A ball's path with the normals that its pad shows: each from a linear fit to those near it."""
     beside = plane[None] - plane[:, None]
     weights = np.exp(-0.5 * np.sum((beside / _PATCH_M) ** 2, axis=2))
     terms = np.concatenate((np.ones((*weights.shape, 1)), beside / _PATCH_M), axis=2)
@@ -145,7 +145,7 @@ def _along(shape: PlacedShape, point: Floats, up: Floats, radius: float = 0.0) -
 
 
 def _check_approach(approach: Approach, miss: float | None) -> None:
-    """The approach finds the object, whose surface is `miss` above its end."""
+    """Check that the approach finds the object, whose surface is `miss` above the end of the approach."""
     x, y, z = (1e3 * approach.start).tolist()
     where = f"task.start_mm = ({x:g}, {y:g}, {z:g})"
     if miss is None:
@@ -160,7 +160,7 @@ def _check_approach(approach: Approach, miss: float | None) -> None:
 
 
 def _check_first_touch(task: Touch, shape: PlacedShape) -> None:
-    """The probe is not in the object before its approach, and first meets it where the array is."""
+    """Check that the probe is outside the object before its approach, and first meets it with the array."""
     approach, radius, up = task.approach, task.probe.radius, task.approach.normal
     nearest = shape.closest(approach.start + (approach.clearance + radius) * up)
     tilt = math.acos(min(max(float(nearest.normal @ up), -1.0), 1.0))

@@ -9,12 +9,12 @@ from canprobe.cell.planning.model import (
 from canprobe.cell.scene.setup import Setup
 
 CYCLES_TO_EFFECT = 2
-"""From a SYNC to the moment its command begins to take effect, behind which the drives lag."""
+"""Cycles from a SYNC until its command begins to take effect; the lag of the drives comes on top."""
 _TOLERANCE = 1e-5  # of a rate written with six digits
 
 
 def plan_sync(setup: Setup) -> tuple[SyncPlan, bool]:
-    """The SYNC of a scene, in whole µs, and whether that is the rate of the scene.
+    """The SYNC of a scene, in whole µs, and whether it has exactly the rate of the scene.
 
     Source: CiA 301 object 1006h (period in µs).
     """
@@ -24,7 +24,7 @@ def plan_sync(setup: Setup) -> tuple[SyncPlan, bool]:
 
 
 def plan_ratio(setup: Setup) -> tuple[int, list[str]]:
-    """How many SYNCs make one tactile frame (18xxh:02), and why the rate is not possible."""
+    """Number of SYNCs for one tactile frame (18xxh:02), and why the rate is not possible."""
     array = setup.array
     if array is None or (array.raw is not None and array.raw.sampling == "free"):
         return 1, []

@@ -1,4 +1,4 @@
-"""The way that a task will take, in time, and the joints on it: the steps of the task, though longer ones."""
+"""The way that a task will take, in time, and the joints on it: the task's motion, in longer steps."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from canprobe.mechanics.touch.servo import ProbePose
 from canprobe.mechanics.types import Floats
 
 _MAX_STEP_S, _MAX_STEP_M, _MAX_STEP_RAD = 0.05, 1e-3, 0.02
-"""Longest step, for the null space, the linear and the angular rows."""
+"""Longest steps: in time for the null space, and of the linear and the angular rows."""
 _MIN_STEPS = 4
 """Least number of steps between two poses."""
 TimedPose = tuple[ProbePose, float]
@@ -36,9 +36,9 @@ def joints_on_way(arm: Arm, probe: Probe, q_start: Floats, way: Callable[[ProbeP
     """Joint positions (m, n), rad or m, on the way of a task.
 
     Args:
-        arm, probe: what moves.
-        q_start: (n,) where it begins.
-        way: from the pose of the beginning, the poses of the task, each with the time to it from the one before, s.
+        arm, probe: the arm and its probe.
+        q_start: joint positions at the beginning (n,), rad or m.
+        way: function of the pose at the beginning that gives the poses of the task.
     """
     steps = PoseSteps(arm.model, probe.T_flange_probe, q_start)
     before = ProbePose(np.array(steps.at.flange), np.array(steps.at.z))
@@ -57,7 +57,7 @@ def joints_on_way(arm: Arm, probe: Probe, q_start: Floats, way: Callable[[ProbeP
 
 
 def over_path(task: Touch, path: SurfacePath, pose: ProbePose) -> Iterator[TimedPose]:
-    """To the approach, down, at rest, and once round the path."""
+    """The poses of a touch: to the approach, down, at rest, and once round the path."""
     approach, radius = task.approach, task.probe.radius
     above = ProbePose(approach.start + (approach.clearance + radius) * approach.normal, -approach.normal)
     yield from _moving(LineMotion(pose, above, MOVE_SPEED_M_S))
@@ -73,7 +73,7 @@ def over_path(task: Touch, path: SurfacePath, pose: ProbePose) -> Iterator[Timed
 
 
 def round_ball(task: Calibrate, pose: ProbePose) -> Iterator[TimedPose]:
-    """To each touch, down, and off again."""
+    """The poses of a calibration: to each touch, down, and off again."""
     radii, down_s = task.ball_radius + task.probe.radius, task.approach.clearance / task.approach.speed
     for touch in task.approaches:
         above, on, off = (

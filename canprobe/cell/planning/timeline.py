@@ -1,4 +1,4 @@
-"""The cycles of a plan as they go when every frame takes its worst-case length and nobody else speaks.
+"""The cycles of a plan in time, where every frame has its worst-case length and no other node sends.
 
 SYNC opens a cycle, the nodes queue what it triggers, the controller starts at the first look that finds all feedback,
 its commands follow. Heartbeats and what comes on events are left out: the worst case, with all of them, is the
@@ -21,19 +21,19 @@ from canprobe.cell.planning.traffic import SYNC_BITS, SYNCHRONOUS, on_the_wire, 
 from canprobe.fieldbus.protocol.frames import SYNC_ID
 
 Part = Literal["SYNC", "feedback", "controller", "command", "tactile", "other"]
-_ROUNDS = 4
+_MAX_ROUNDS = 4
 
 
 @dataclass(frozen=True, slots=True)
 class Slot:
-    """Something that takes its time in the cycles.
+    """Time of a frame or of the controller in the cycles.
 
     Attributes:
-        part: what it is.
-        channel: bus; empty for the controller.
+        part: its part in the cycle.
+        channel: its bus; empty for the controller.
         cob_id: identifier; None for the controller.
-        cycle: from 0, in which it was released.
-        start_ns, end_ns: after the first SYNC is queued.
+        cycle: cycle in which it was released, from 0.
+        start_ns, end_ns: times after the first SYNC was queued.
     """
 
     part: Part
@@ -45,20 +45,20 @@ class Slot:
 
 
 def timeline(plan: Plan) -> tuple[Slot, ...]:
-    """As many cycles as the slowest frame behind SYNC has, two with a sensor as a rule.
+    """Slots of as many cycles as the slowest frame behind SYNC has; two as a rule with an array.
 
     Args:
-        plan: that fits.
+        plan: the plan.
 
     Returns:
-        Frames and controller by start; those of the last cycles may end behind it.
+        Frames and controller by start; the last ones may end behind the last cycle.
     """
     cyclic = [pdo for pdo in plan.pdos if pdo.transmission_type <= SYNCHRONOUS]
     cycles = max((pdo.transmission_type for pdo in cyclic), default=1)
     period, compute = plan.sync.period_ns, plan.traffic.budget.compute_ns
     starts: list[int | None] = [None] * cycles
     slots: list[Slot] = []
-    for _ in range(_ROUNDS):  # when the commands go depends on the feedback, which earlier commands may delay
+    for _ in range(_MAX_ROUNDS):  # commands follow the feedback, which earlier commands may delay
         slots = [slot for bus in plan.buses for slot in _carried(_released(plan, bus, cyclic, starts))]
         found: list[int | None] = [_controller_start(plan, slots, cycle) for cycle in range(cycles)]
         if found == starts:
@@ -83,7 +83,7 @@ def _controller_start(plan: Plan, slots: Sequence[Slot], cycle: int) -> int:
 def _released(
     plan: Plan, bus: PlannedBus, cyclic: Sequence[PlannedPdo], starts: Sequence[int | None]
 ) -> Iterator[Slot]:
-    """Every frame of one bus as if it were alone on it."""
+    """Every frame of one bus, each as if the bus were free."""
     bitrate = plan.setup.bus.bitrate
     sync_ns = wire_ns(SYNC_BITS, bitrate)
     mine = on_the_wire([pdo for pdo in cyclic if pdo.channel == bus.channel])
@@ -102,7 +102,7 @@ def _released(
 
 
 def _carried(released: Iterator[Slot]) -> Iterator[Slot]:
-    """Frames one by one: of those that wait, the lowest identifier."""
+    """Frames one after the other: of those that wait, the lowest identifier first."""
     coming = sorted(released, key=lambda slot: slot.start_ns, reverse=True)
     waiting: list[tuple[int | None, int, Slot]] = []
     now = 0
@@ -126,14 +126,14 @@ LETTERS: dict[Part, str] = {
     "tactile": "t",
     "other": "o",
 }
-"""What stands for each part in `timeline_rows`."""
+"""Letter of each part in `timeline_rows`."""
 
 
 def timeline_rows(plan: Plan, width: int = 80) -> list[list[str]]:
     """A row for each bus and cycle, and for the controller; one character is a `width`-th of the period.
 
     Args:
-        plan: that fits.
+        plan: the plan.
         width: characters of a cycle.
     """
     slots, period = timeline(plan), plan.sync.period_ns

@@ -37,11 +37,11 @@ from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, SYNC_ID
 from canprobe.fieldbus.protocol.response_times import BusAnalysis, Message, Response, worst_case_response
 
 FIRST_LOOK, LAST_LOOK = 0.25, 0.6
-"""Shares of the period at which the cell looks for TPDOs besides the planned time; after the last they are late."""
+"""Shares of the period at which the cell looks for TPDOs besides the planned time; after the last one they are late."""
 SYNCHRONOUS = 240
 """The highest transmission type that SYNC triggers (CiA 301)."""
-ROUNDS = 20
-"""Of the analysis; where it still moves after them there is no bound."""
+MAX_ROUNDS = 20
+"""Most rounds of the analysis; where times still change after them there is no bound."""
 _SYNC_BYTES = 1 if SYNC_OVERFLOW else 0
 SYNC_BITS = worst_case_bits(_SYNC_BYTES)
 SYNC_BITS_LEAST = best_case_bits(_SYNC_BYTES)
@@ -49,17 +49,17 @@ SYNC_BITS_LEAST = best_case_bits(_SYNC_BYTES)
 
 @dataclass(frozen=True, slots=True)
 class _Messages:
-    """Everything on a bus, by its part in the cycle.
+    """All messages of a bus, by their part in the cycle.
 
     Attributes:
         sync: the SYNC; its offset is 0.
         feedback: TPDOs that the controller waits for.
         commands: RPDOs that it sends.
-        other: TPDOs that it does not wait for, of the array or not used.
-        strangers: what keeps its own time.
+        other: TPDOs that it does not wait for: those of the array, and unused ones.
+        strangers: messages that SYNC does not trigger.
         best_sync_ns: shortest time of a SYNC on the wire.
         best_feedback_ns: shortest time of the feedback.
-        fifo_nodes: name of every message that goes through a FIFO transmit queue → the node; empty: priority queues.
+        fifo_nodes: node of every message in a FIFO transmit queue, by the message's name; empty: priority queues.
     """
 
     sync: Message
@@ -78,21 +78,21 @@ def on_the_wire(pdos: Sequence[PlannedPdo]) -> list[PlannedPdo]:
 
 
 def wire_ns(bits: int, bitrate: int) -> int:
-    """Time of so many bits, rounded up."""
+    """Time of a number of bits, rounded up."""
     return -(-bits * 1_000_000_000 // bitrate)
 
 
 RAW_DEVICE = 0
-"""In the place of a node id: the transmit queue of an array that is no node."""
+"""Stands for the node id of an array that is no CANopen node, for its transmit queue."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedTraffic:
-    """What is on the buses.
+    """Traffic of all buses.
 
     Attributes:
-        buses: with their traffic.
-        pdos, raw: with their response times.
+        buses: the buses with their traffic.
+        pdos, raw: PDOs and raw frames with their response times.
         problems: what does not fit.
     """
 
@@ -114,12 +114,12 @@ def plan_traffic(
     """The buses with their traffic, PDOs and raw frames with their response times, and what does not fit.
 
     Args:
-        pdos: of all nodes.
-        sync: the cycle; every bus has its SYNC.
-        channels: of each bus, with the nodes on it, which produce heartbeats as the master does.
-        bus: bit rate of all of them.
-        compute_ns: what the controller takes of a cycle at most.
-        raw: of an array that is no CANopen node.
+        pdos: PDOs of all nodes.
+        sync: rate and period of SYNC, which every bus has.
+        channels: node ids by channel; each node produces heartbeats, and so does the master.
+        bus: settings of all buses, such as the bit rate.
+        compute_ns: longest computing time of the controller in a cycle.
+        raw: raw frames of an array that is no CANopen node.
     """
     wires = [on_the_wire([pdo for pdo in pdos if pdo.channel == channel]) for channel in channels]
     raws = [[frames for frames in raw if frames.channel == channel] for channel in channels]
@@ -154,7 +154,7 @@ def plan_traffic(
 
 
 def _raw_messages(raw: Sequence[PlannedFrames], bus: BusSettings) -> Iterator[Message]:
-    """Raw frames that repeat, as one message an identifier: its frames go one behind the other."""
+    """Raw frames that repeat, one message for each identifier: its frames follow one another."""
     repeated: dict[int, list[PlannedFrames]] = {}
     for frames in raw:
         if frames.rate_hz > 0:
@@ -169,7 +169,7 @@ def _raw_messages(raw: Sequence[PlannedFrames], bus: BusSettings) -> Iterator[Me
 def _messages(
     wire: Sequence[PlannedPdo], raw: Sequence[PlannedFrames], sync: SyncPlan, node_ids: Sequence[int], bus: BusSettings
 ) -> _Messages:
-    """What SYNC triggers, by its part in the cycle, and what keeps its own time."""
+    """Messages that SYNC triggers, by their part in the cycle, and those that it does not."""
     queues = {"SYNC": MASTER_NODE_ID}
     cyclic: dict[str, list[Message]] = {"feedback": [], "commands": [], "other": []}
     strangers, feedback_bits = [], SYNC_BITS_LEAST
@@ -213,13 +213,13 @@ def _messages(
 def _analyse(buses: Sequence[_Messages], compute_ns: int, bitrate: int) -> tuple[list[BusAnalysis], CycleBudget]:
     """Response times of each bus behind SYNC (of a stranger behind its own event), and the budget of one cycle.
 
-    The buses hang together by the controller: it starts when the feedback of all of them is in.
+    The controller couples the buses: it starts when the feedback of all of them is in.
     """
     period = buses[0].sync.period_ns
     best_ns = max(one.best_feedback_ns for one in buses) if any(one.feedback for one in buses) else None
     syncs_ns: list[int] = [one.best_sync_ns for one in buses]
     feedback_ns = max(*syncs_ns, best_ns or 0)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         looks = look_times(period, feedback_ns)
         starts = controller_starts(best_ns, looks, feedback_ns)
         analyses = [
@@ -232,7 +232,7 @@ def _analyse(buses: Sequence[_Messages], compute_ns: int, bitrate: int) -> tuple
         if None in late_syncs or late_feedback is None or full or not moved:
             break
         syncs_ns, feedback_ns = [ns for ns in late_syncs if ns is not None], late_feedback
-    else:  # the rounds do not end: there is no bound
+    else:  # the times do not settle: there is no bound
         analyses = [
             replace(analysis, responses=tuple(replace(one, response_ns=None) for one in analysis.responses))
             for analysis in analyses
@@ -261,10 +261,10 @@ def _placed(
     """Response times of one bus.
 
     Args:
-        messages: on it.
-        sync_ns: by when its SYNC is through.
-        starts_ns: of the controller, the earliest and the latest.
-        compute_ns: what the controller takes at most.
+        messages: messages of the bus.
+        sync_ns: latest time when its SYNC is through.
+        starts_ns: earliest and latest start of the controller.
+        compute_ns: longest computing time of the controller.
         bitrate: bit/s.
     """
     answered, (earliest, start) = messages.best_sync_ns, starts_ns
@@ -280,11 +280,11 @@ def _placed(
 
 
 def look_times(period_ns: int, feedback_ns: int) -> tuple[int, ...]:
-    """When the cell looks for TPDOs, ns after the SYNC's deadline.
+    """Times when the cell looks for TPDOs, ns after the SYNC's deadline.
 
     Args:
-        period_ns: of SYNC.
-        feedback_ns: by when they are in at the latest.
+        period_ns: period of SYNC.
+        feedback_ns: latest time when the TPDOs are in.
     """
     first, last = int(period_ns * FIRST_LOOK), int(period_ns * LAST_LOOK)
     return tuple(sorted(look for look in {first, last, min(feedback_ns, period_ns)} if look >= first))
@@ -294,9 +294,9 @@ def controller_starts(best_ns: int | None, looks: Sequence[int], feedback_ns: in
     """Earliest and latest start of the controller after the SYNC, ns.
 
     Args:
-        best_ns: when all feedback can be in at the earliest; None where it waits for none.
-        looks: when the cell looks for it.
-        feedback_ns: when it is in at the latest.
+        best_ns: earliest time when all feedback can be in; None where the controller waits for none.
+        looks: times when the cell looks for it.
+        feedback_ns: latest time when it is in.
     """
     if best_ns is None:
         return looks[0], looks[0]
@@ -305,14 +305,14 @@ def controller_starts(best_ns: int | None, looks: Sequence[int], feedback_ns: in
 
 
 def _last(analyses: Sequence[BusAnalysis], messages: Sequence[Message]) -> int | None:
-    """The latest end of several messages after the SYNC, on whatever bus; None without a bound."""
+    """The latest end of several messages after the SYNC, on any bus; None without a bound."""
     names = {message.name for message in messages}
     found = [one.response_ns for analysis in analyses for one in analysis.responses if one.message.name in names]
     return None if None in found or not found else max(ns for ns in found if ns is not None)
 
 
 def _demands(wire: Sequence[PlannedPdo], sync: SyncPlan, bitrate: int) -> Iterator[Demand]:
-    """What one SYNC releases, and what a tactile frame waits for until its last PDO is through."""
+    """Demand of the frames that one SYNC releases, and of those for which a tactile frame waits."""
     cyclic = [pdo for pdo in wire if pdo.transmission_type <= SYNCHRONOUS]
     drives = SYNC_BITS + sum(pdo.bits_worst for pdo in cyclic if pdo.kind == "drive")
     tactile = [pdo for pdo in cyclic if pdo.kind == "tactile"]
@@ -325,7 +325,7 @@ def _demands(wire: Sequence[PlannedPdo], sync: SyncPlan, bitrate: int) -> Iterat
 
 
 def _problems(buses: Sequence[PlannedBus], analyses: Sequence[BusAnalysis], bus: BusSettings) -> list[str]:
-    """What does not fit: load and demands of a bus, or else the cycle, or else the first late message of each bus."""
+    """Problems: load and demands of a bus, or else the cycle, or else the first late message of each bus."""
     found = [(one.channel, problem) for one in buses for problem in _excess(one.traffic)]
     if not found and (behind := _behind(buses[0].traffic.budget)) is not None:
         found = [(" and ".join(one.channel for one in buses), behind)]
@@ -352,7 +352,7 @@ def _excess(traffic: Traffic) -> Iterator[str]:
 
 
 def _behind(budget: CycleBudget) -> str | None:
-    """That the cycle ends behind the next SYNC; None where it does not, or has no bound."""
+    """Problem where the cycle ends behind the next SYNC; None where it does not, or has no bound."""
     if budget.slack_ns is None or budget.start_ns is None or budget.slack_ns >= 0:
         return None
     last = "the last RPDO is through" if budget.commands_ns is not None else "the controller is done"
@@ -365,7 +365,7 @@ def _behind(budget: CycleBudget) -> str | None:
 
 
 def _lateness(late: Sequence[Response]) -> str:
-    """The first message of a bus that is late."""
+    """Problem of the first late message of a bus."""
     first = late[0]
     response = "without bound" if first.response_ns is None else f"{first.response_ns / 1000:.0f} µs"
     return (

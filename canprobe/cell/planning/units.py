@@ -1,4 +1,4 @@
-"""Units of the drives: what the cell states, whether its counts fit 32 bits, and what a device says of them.
+"""Units of the drives: those of the cell, whether its counts fit 32 bits, and those that a device states.
 
 A cell states the units of a drive (`counts_per_turn`, `gear`, `sign`, `zero_counts`), and they count: nothing in a
 device is changed for them. Where a device has the factor group of CiA 402, its own statement is compared with the
@@ -27,11 +27,11 @@ POSITION_LIMITS, POLARITY, RESOLUTION, GEAR_RATIO, FEED = 0x607D, 0x607E, 0x608F
 PROFILE_SPEED_LIMIT, MOTOR_SPEED_LIMIT, FOLLOWING_WINDOW = 0x607F, 0x6080, 0x6065
 FOLLOWING_WINDOW_DEG = 5.0
 NO_WINDOW = 0xFFFFFFFF
-"""6065h of a drive that watches no following error."""
+"""Value of 6065h where a drive does not watch the following error."""
 LAG_BANDWIDTH = math.sqrt(math.sqrt(2.0) - 1.0) / math.pi
 """Lag behind a ramp, times the -3 dB frequency, of a critically damped loop of second order: 2/w."""
 ROUNDING_COUNTS = 2
-"""By which two targets may be rounded apart."""
+"""Counts by which rounding may move two targets apart."""
 _LOWEST, _HIGHEST = -(1 << 31), (1 << 31) - 1
 _TOLERANCE = 1e-3
 """Share by which units may differ: a factor of the device is a quotient of integers."""
@@ -39,13 +39,13 @@ _TOLERANCE = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class TurnUnits:
-    """Position units of a motor turn as the cell states them, and the objects in which the device does.
+    """Position units of a motor turn as the cell states them, and the objects in which the device states them.
 
     Attributes:
-        units: the cell's, per turn of the motor.
+        units: units of the cell per turn of the motor.
         gear: turns of the motor per turn of the joint.
-        feed: 6092h, or 608Fh where the device has no 6092h; the quotient of :01 and :02.
-        ratio: 6091h, motor turns per shaft turn; None where the device has none, or no 6092h.
+        feed: index of the units per turn, 6092h, or 608Fh where the device has no 6092h; the quotient of :01 and :02.
+        ratio: index of the motor turns per shaft turn, 6091h; None where the device lacks it, or 6092h.
     """
 
     units: float
@@ -54,13 +54,13 @@ class TurnUnits:
     ratio: int | None
 
     def mismatch(self, feed: float, ratio: float) -> str | None:
-        """How the quotients that a device holds differ from the cell; None where they fit.
+        """Difference of a device's quotients from the cell, in words; None where they fit.
 
-        A device may take the motor for its shaft, or the joint.
+        The shaft of a device may be that of the motor, or that of the joint.
 
         Args:
-            feed: quotient of `feed`.
-            ratio: quotient of `ratio`; 1 without.
+            feed: value of the object `feed`, a quotient.
+            ratio: value of the object `ratio`, a quotient; 1 without.
         """
         by_motor, by_joint = feed / ratio / self.units, feed / (self.units * self.gear)
         if min(abs(by_motor - 1), abs(by_joint - 1)) <= _TOLERANCE:
@@ -73,11 +73,11 @@ class TurnUnits:
 
 
 def turn_units(device: Abilities, units: float | None, gear: float) -> TurnUnits | None:
-    """What to compare with a device; None where it states nothing, or the cell counts no turns.
+    """The units to compare with a device; None where the device states none, or the cell counts no turns.
 
     Args:
-        device: by its EDS.
-        units: per motor turn, of the cell; None: of a prismatic joint.
+        device: the device by its EDS.
+        units: position units of the cell per motor turn; None for a prismatic joint.
         gear: turns of the motor per turn of the joint.
     """
     whole = {index: device.has(index, 1) and device.has(index, 2) for index in (FEED, GEAR_RATIO, RESOLUTION)}
@@ -89,16 +89,16 @@ def turn_units(device: Abilities, units: float | None, gear: float) -> TurnUnits
 
 
 def speed_unit(device: Abilities, drive: Drive, index: int) -> float | None:
-    """Position units/s, or /s², of what the device has for a velocity (60A9h) or an acceleration (60AAh).
+    """Position units/s in one velocity unit (60A9h) of a device, or /s² in one acceleration unit (60AAh).
 
-    None where its EDS names a unit that cannot be expressed in what the cell states.
+    None where its EDS names a unit that the cell's data cannot express.
     """
     turn, ratio = _motor_turn(device, drive)
     return rate_unit(device.number(index) or 0, turn=turn and turn * ratio, metre=drive.metre_units)
 
 
 def _motor_turn(device: Abilities, drive: Drive) -> tuple[float | None, float]:
-    """Position units of a motor turn, None where nobody states them; and motor turns of a turn of the shaft."""
+    """Position units of a motor turn, None where neither states them; and motor turns per turn of the shaft."""
     feed = _quotient(device, FEED)
     ratio = (_quotient(device, GEAR_RATIO) or 1.0) if feed else 1.0
     if drive.turn_units is not None:
@@ -108,7 +108,7 @@ def _motor_turn(device: Abilities, drive: Drive) -> tuple[float | None, float]:
 
 
 def _quotient(device: Abilities, index: int) -> float | None:
-    """Of :01 and :02 as delivered; None where the device has none."""
+    """Quotient of :01 and :02 by the EDS; None where the device has none."""
     over, under = device.number(index, 1), device.number(index, 2)
     return over / (under or 1) if over else None
 
@@ -131,12 +131,12 @@ def range_problems(setup: Setup) -> Iterator[str]:
 
 @dataclass(frozen=True, slots=True)
 class _SpeedLimit:
-    """A speed that an object of a drive holds the cell to, whether it limits speed or the following error.
+    """Limit of speed by an object of a drive, which limits speed or the following error.
 
     Attributes:
-        index: of the object.
-        most: position units/s, infinite for none.
-        rounding: what of it whole targets use up, position units/s.
+        index: index of the object.
+        most: highest speed, position units/s; infinite for none.
+        rounding: part of it that the rounding of targets uses up, position units/s.
     """
 
     index: int
@@ -145,12 +145,12 @@ class _SpeedLimit:
 
     @property
     def left(self) -> float:
-        """What the joints may ask for, position units/s."""
+        """Highest speed that the joints may ask for, position units/s."""
         return self.most - self.rounding
 
 
 def speed_problems(setup: Setup, devices: Mapping[int, Abilities]) -> Iterator[str]:
-    """Drives whose limit of speed is no more than what whole targets differ by from cycle to cycle."""
+    """Problems of drives whose limit of speed is no more than the rounding of targets takes from cycle to cycle."""
     arm = setup.arm
     for axis, joint in enumerate(arm.model.joints) if arm is not None else ():
         lowest = _lowest_limit(setup, axis, devices, math.inf)
@@ -165,26 +165,26 @@ def speed_problems(setup: Setup, devices: Mapping[int, Abilities]) -> Iterator[s
 
 
 def motor_speed_limit(model: ArmModel, axis: int, share: float, period_ns: int) -> int:
-    """Drive units/s beyond which it must not follow a target: all joints that move the motor, at their limits.
+    """Highest speed of a motor, drive units/s: all joints that move it at their limits.
 
     Args:
         model: the arm.
-        axis: of the motor, 0-based.
-        share: of the joints' speed limits.
-        period_ns: of the cycle; a target is a whole number of drive units.
+        axis: axis of the motor, 0-based.
+        share: allowed share of the joints' speed limits.
+        period_ns: period of the cycle; a target is a whole number of drive units.
     """
     fastest = float(np.abs(model.units_per_q[axis]) @ model.qd_max) * share
     return math.ceil(fastest + ROUNDING_COUNTS * 1e9 / period_ns)
 
 
 def software_limits(model: ArmModel) -> tuple[Floats, Floats]:
-    """Extremes of each drive (n,) and (n,), units, over the joints' ranges; the coupled ones span both joints'."""
+    """Lowest and highest position of each drive (n,), units, over the ranges of all joints that move it."""
     a, b, zero = model.units_per_q * model.q_min, model.units_per_q * model.q_max, model.zero_units
     return np.floor(np.minimum(a, b).sum(axis=1) + zero), np.ceil(np.maximum(a, b).sum(axis=1) + zero)
 
 
 def within_drives(setup: Setup, devices: Mapping[int, Abilities]) -> tuple[Setup, tuple[str, ...]]:
-    """The setup whose joints keep within the positions and speeds that their drives can allow, and what is less."""
+    """The setup with joints kept within positions and speeds of their drives, and warnings where that is less."""
     if setup.arm is None:
         return setup, ()
     setup, ranges = _within_ranges(setup, setup.arm, devices)
@@ -194,7 +194,7 @@ def within_drives(setup: Setup, devices: Mapping[int, Abilities]) -> tuple[Setup
 
 
 def _within_speeds(setup: Setup, arm: Arm, devices: Mapping[int, Abilities]) -> tuple[Setup, tuple[str, ...]]:
-    """Joints no faster than what stands in their drives as 607Fh, 6080h and 6065h: beyond it a drive faults."""
+    """Keep joints within 607Fh, 6080h and 6065h of their drives, beyond which a drive faults."""
     model, share = arm.model, setup.limits.speed_share
     slowest, objects = np.ones(model.n), set()
     for axis in range(model.n):
@@ -223,7 +223,7 @@ def _within_speeds(setup: Setup, arm: Arm, devices: Mapping[int, Abilities]) -> 
 
 
 def _lowest_limit(setup: Setup, axis: int, devices: Mapping[int, Abilities], wanted: float) -> _SpeedLimit:
-    """The lowest of the limits that stand in the drive of an axis, where so many position units/s are wanted."""
+    """The lowest limit in the drive of an axis, where a speed of `wanted` position units/s is needed."""
     arm, rounding = setup.arm, ROUNDING_COUNTS * setup.rate_hz
     assert arm is not None
     device, drive = devices[arm.node_ids[axis]], arm.drives[axis]
@@ -246,12 +246,12 @@ def _lowest_limit(setup: Setup, axis: int, devices: Mapping[int, Abilities], wan
 
 
 def following_window(model: ArmModel, axis: int) -> int:
-    """6065h as the cell would have it, units: so many degrees of the joint."""
+    """Wanted value of 6065h, units: `FOLLOWING_WINDOW_DEG` of the joint."""
     return round(abs(float(model.units_per_q[axis, axis] * model.radian[axis])) * math.radians(FOLLOWING_WINDOW_DEG))
 
 
 def _fixed_window(device: Abilities, wanted: int) -> int | None:
-    """The 6065h with which a drive runs, units, where it is another than wanted; None where it watches no error."""
+    """Value of 6065h, units, where it cannot be the wanted one; None where it can, or the drive watches no error."""
     entry = device.description.entry(FOLLOWING_WINDOW)
     if entry is None or (entry.writable and entry.allows(wanted)):
         return None
@@ -260,16 +260,16 @@ def _fixed_window(device: Abilities, wanted: int) -> int | None:
 
 
 def _lag_s(setup: Setup) -> float:
-    """How far the drives are behind a ramp, s: as the scene says, or as the emulated ones are, whichever is more."""
+    """Lag of the drives behind a ramp, s: the larger of the scene's and the emulated drives'."""
     believed = setup.task.lag_s if isinstance(setup.task, Touch | Calibrate) else 0.0
     emulated = setup.arm is not None and any(drive.emulated for drive in setup.arm.drives)
     return max(believed, LAG_BANDWIDTH / setup.truth.bandwidth_hz if emulated else 0.0)
 
 
 def _within_ranges(setup: Setup, arm: Arm, devices: Mapping[int, Abilities]) -> tuple[Setup, tuple[str, ...]]:
-    """Joints within what the 607Dh of their drives can allow: beyond it a drive faults.
+    """Keep joints within 607Dh of their drives, beyond which a drive faults.
 
-    One that moves with several joints is left as it is.
+    A drive that moves with several joints is left out.
     """
     narrower = []
     joints = list(arm.model.joints)
@@ -292,7 +292,7 @@ def _within_ranges(setup: Setup, arm: Arm, devices: Mapping[int, Abilities]) -> 
 
 
 def _guarded(device: Abilities, low: float, high: float) -> tuple[float, float]:
-    """How much of a range of positions a drive's 607Dh can allow."""
+    """The part of a range of positions that a drive's 607Dh can allow."""
     lowest, highest = (device.description.entry(POSITION_LIMITS, subindex) for subindex in (1, 2))
     if lowest is None or highest is None:
         return low, high

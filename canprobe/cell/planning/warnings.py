@@ -1,4 +1,4 @@
-"""What a plan carries out and yet says first: who else can command it, and where the numbers in it do not hold."""
+"""Warnings of a plan that fits: who else can command the cell, and where the plan's numbers do not hold."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LOCAL_GROUP = "ff11::ca"
 
 
 def _open_to_others(setup: Setup) -> Iterator[str]:
-    """What lets other machines reach the cell, and what to write to keep it on this one."""
+    """Warnings where other machines reach the cell, with the key that keeps it on this one."""
     bridge = setup.bridge
     yield from bus_open_to_others(setup.bus.interface, setup.bus.channel)
     if "ros2" in bridge.use and not bridge.ros2_loopback:
@@ -33,11 +33,11 @@ def _open_to_others(setup: Setup) -> Iterator[str]:
 
 
 def bus_open_to_others(interface: str, channel: str) -> Iterator[str]:
-    """A warning, where other machines reach a bus.
+    """A warning where other machines reach a bus.
 
     Args:
-        interface: of python-can.
-        channel: of it.
+        interface: interface of python-can.
+        channel: its channel.
     """
     if interface == "udp_multicast" and not _is_interface_local(channel):
         yield (
@@ -55,7 +55,7 @@ def _is_interface_local(channel: str) -> bool:
 
 
 def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
-    """What a user has to know before trusting the plan, most important first."""
+    """Warnings that a user must know before trusting the plan, most important first."""
     cut, bus = cut_patch(setup), setup.bus
     yield from _open_to_others(setup)
     if setup.arm is not None:

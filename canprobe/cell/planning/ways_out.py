@@ -1,4 +1,4 @@
-"""What to change when a scene does not fit its bus: each way is planned too, and only those that fit are named."""
+"""Changes that make a scene fit its bus: each one is planned, and only those that fit are named."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from canprobe.fieldbus.protocol.tactile import DEFAULT_WINDOW
 
 FD_ARRAY = "tactile_array_fd.eds"
 Fit = Callable[[Setup], tuple[Setup, Traffic] | None]
-"""A changed setup as the plan closes it and the traffic of its fullest bus; None where that does not fit either."""
+"""Closes a changed setup, and gives it with the traffic of its fullest bus; None where it does not fit either."""
 
 
 def ways_out(setup: Setup, fit: Fit) -> list[str]:
@@ -64,14 +64,14 @@ def _changes(setup: Setup) -> Iterator[tuple[str, Setup]]:
 
 
 def _own_bus(setup: Setup, array: Array) -> Iterator[tuple[str, Setup]]:
-    """The array on a bus of its own, where it shares one with drives."""
+    """The array on a separate bus, where it shares one with drives."""
     if setup.arm is not None and any(array.channel == drive.channel for drive in setup.arm.drives):
         own = free_channel(setup)
         yield f'a separate bus for the sensor (sensor.channel = "{own}")', setup.changed("array", channel=own)
 
 
 def _split(setup: Setup) -> Iterator[tuple[str, Setup]]:
-    """The second half of the drives on a bus of their own."""
+    """The second half of the drives on a separate bus."""
     arm = setup.arm
     if arm is None or len(arm.drives) < 2 or len({drive.channel for drive in arm.drives}) > 1:
         return
@@ -82,7 +82,7 @@ def _split(setup: Setup) -> Iterator[tuple[str, Setup]]:
 
 
 def _together(setup: Setup, fit: Fit) -> Iterator[tuple[str, Setup]]:
-    """The cheapest combination of what the plan could choose, where one change is not enough."""
+    """The cheapest combination of the keys that a plan can choose, where one change is not enough."""
     now = {key.key: key.value(setup) for key in KEYS}
     for changed, choices in candidates(opened(setup)):
         if fit(changed) is not None:
@@ -93,7 +93,7 @@ def _together(setup: Setup, fit: Fit) -> Iterator[tuple[str, Setup]]:
 
 
 def _quicker(setup: Setup, fit: Fit) -> Iterator[tuple[str, Setup]]:
-    """A controller that takes no longer than the bus leaves it, in whole microseconds."""
+    """A computing time that the bus leaves to the controller, in whole microseconds."""
     idle = fit(replace(setup, compute_ns=0))
     if idle is None or (slack_ns := idle[1].budget.slack_ns) is None:
         return

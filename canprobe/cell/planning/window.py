@@ -1,6 +1,6 @@
-"""The window that follows the contact: which one holds the patch, and what one does that cuts it.
+"""The window that follows the contact: which one holds the patch, and what follows where it cuts the patch.
 
-The patch is that on a plane, the widest that a surface makes which is nowhere hollow. The layer on the probe is a bed
+The patch is that on a plane, the widest on any surface without hollows. The layer on the probe is a bed
 of springs: a sphere of radius R with stiffness k a volume, pressed in by d, has the force F = π k R d² and a patch of
 radius a = √(2 R d), whose pressure falls from the middle to the rim as 1 - r²/a². The window follows the centroid in
 steps of a taxel and may be off its middle by `FOLLOWING_TAXELS`, which needs room on both sides. The array's blur,
@@ -24,13 +24,13 @@ from canprobe.cell.scene.setup import Array, Probe, Setup
 from canprobe.fieldbus.protocol.tactile import WINDOW_SIZES
 
 FOLLOWING_TAXELS = 0.75
-"""By how much the contact's centroid may be off the middle of the window before the window moves."""
+"""Distance of the contact's centroid from the middle of the window at which the window moves."""
 TOLERATED_LOSS_SHARE = 0.05
 """Share of the force that a window may miss without a warning; the array itself errs by as much."""
 CARRIED_SIDE, CARRIED_SHARE = 6, 0.5
-"""Smallest window, and share of the force inside, from which the rest of a patch follows."""
+"""Smallest window, and smallest share of the force inside it, from which the rest of a patch is computed."""
 CARRIED_ERROR = 0.1
-"""Share of the force by which it then errs at the most, on the emulated array with its spread, blur and noise."""
+"""Largest error of such a force, as a share of it, on the emulated array with its spread, blur and noise."""
 _STEPS = 200
 _HALVINGS = 40
 
@@ -78,11 +78,11 @@ def measured_share(
     """Share of a force that a window measures.
 
     Args:
-        force_n: on a plane.
-        probe: the layer on it.
+        force_n: force on a plane.
+        probe: the probe that carries the layer.
         side: taxels along the window.
-        pitch_m: of the taxels.
-        off_taxels: by how much the window's middle is off the contact's, along one of its sides.
+        pitch_m: pitch of the taxels.
+        off_taxels: distance of the window's middle from the contact's, along one of its sides.
     """
     radius, half = patch_across_taxels(force_n, probe, pitch_m) / 2, side / 2
     first, last = max(-radius, off_taxels - half), min(radius, off_taxels + half)
@@ -94,7 +94,7 @@ def measured_share(
 
 
 def true_force_n(force_n: float, probe: Probe, side: int, pitch_m: float, most_n: float) -> float | None:
-    """The force that presses where a window measures `force_n`, at the most; None where it is above `most_n`."""
+    """The largest true force where a window measures `force_n`; None where it is above `most_n`."""
     if most_n * measured_share(most_n, probe, side, pitch_m) < force_n:
         return None
     low, high = force_n, most_n
@@ -106,12 +106,12 @@ def true_force_n(force_n: float, probe: Probe, side: int, pitch_m: float, most_n
 
 @dataclass(frozen=True, slots=True)
 class CutPatch:
-    """What follows from a window that measures too little of the force.
+    """A window that measures too little of the force.
 
     Attributes:
-        text: for people, with the numbers.
-        safe: the force that presses stays below `limits.force_max_n`, which only the measured force is held against.
-        ways: changes after which the window measures it.
+        text: text for people, with the numbers.
+        safe: whether the true force stays below `limits.force_max_n`, which the cell compares with the measured one.
+        ways: changes after which the window measures the force.
     """
 
     text: str
@@ -120,7 +120,7 @@ class CutPatch:
 
 
 def cut_patch(setup: Setup) -> CutPatch | None:
-    """What the window of a scene misses; None where it measures nearly all of the force, or nothing is pressed."""
+    """The cut patch of a scene; None where its window measures nearly all of the force, or the task presses nothing."""
     touch = setup.touch
     if touch is None or touch.array.mode != "window":
         return None

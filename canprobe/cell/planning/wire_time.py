@@ -1,4 +1,4 @@
-"""How much of a bus a PDO takes, as a classical frame or, above 8 bytes, as one of CAN FD with bit-rate switch.
+"""Bits of a PDO on the wire, as a classical frame or, above 8 bytes, as one of CAN FD with bit-rate switch.
 
 Times are bit times of the nominal rate; the data phase of an FD frame is rounded up.
 """
@@ -19,12 +19,12 @@ from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES
 
 
 def frame_bits(n_data: int, bus: BusSettings) -> int:
-    """Worst case of one frame with so many data bytes."""
+    """Most bits of one frame with a number of data bytes."""
     return worst_case_bits(n_data) if n_data <= CLASSIC_BYTES else _nominal(worst_case_fd_bits(n_data), bus)
 
 
 def exact_frame_bits(can_id: int, data: bytes, bus: BusSettings) -> int:
-    """Bits of this very frame."""
+    """Bits of one frame, its stuff bits included."""
     return exact_bits(can_id, data) if len(data) <= CLASSIC_BYTES else _nominal(exact_fd_bits(can_id, data), bus)
 
 

@@ -1,4 +1,4 @@
-"""A recorded bus → the measurements that a cell makes of it, and the contacts in them, whoever drove."""
+"""A recorded bus → the measurements of its cell, and the contacts in them, for a cell with any master."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class LogCycles:
     SYNC, and all frames before the next SYNC belong to its cycle.
 
     Args:
-        plan: of the cell.
-        recording: the log.
+        plan: plan of the cell.
+        recording: frames of the log.
 
     Attributes:
         start_ns: stamp of the first SYNC; a measurement's time counts from there.
@@ -77,13 +77,13 @@ class LogCycles:
         self.sync_times_s.append(t_ns * 1e-9)
 
     def _lost(self, before: int, counter: int) -> int:
-        """How many SYNCs are missing in the log between two counters; they have a number and a time too."""
+        """Number of SYNCs missing in the log between two counters; they get a number and a time too."""
         lost = (counter - before - 1) % self._overflow if before and counter else 0
         return lost if lost <= MAX_LOST_SYNCS else 0
 
 
 def _check_states(drives: DriveGroup) -> None:
-    """A statusword without a state comes from another mapping, or from a faulty drive."""
+    """Refuse a statusword without a state, which comes from another mapping or a faulty drive."""
     for axis, word in zip(drives.axes, drives.statuswords, strict=True):
         if known_state(word) is None:
             raise ProtocolError(f"node {axis.node_id}: statusword {word:#06x} is no CiA 402 state")
@@ -93,7 +93,7 @@ def replay_contacts(plan: Plan, measurements: Iterable[Measurement]) -> tuple[Sh
     """Feed every contact, force above the touch threshold, to the scene's estimator.
 
     Returns:
-        The tracker; and how many contacts could not be placed, as the joints of their instant are missing.
+        The tracker, and the number of contacts without a place, because the joints of their instant are missing.
     """
     assert isinstance(plan.setup.task, Touch)
     sensing = make_sensing(plan.setup.task)

@@ -1,4 +1,4 @@
-"""A recorded run for bridges: the observations of the cell, made again from its log."""
+"""A recorded run for bridges: the observations of the cell, rebuilt from its log."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class RecordedBridges:
     """The result of a log that was fed to bridges.
 
     Attributes:
-        result: of its estimators; None where the scene has none.
+        result: result of its estimators; None where the scene has none.
         bridges: the entry of each bridge in `summary.json`.
     """
 
@@ -59,12 +59,12 @@ def replay_into(
     Args:
         log: folder of a run, or a candump file.
         bridge: names of the bridges.
-        scene: describes the nodes; by default the ``scene.toml`` beside the log.
+        scene: scene of the nodes; by default the ``scene.toml`` beside the log.
         method: estimators, as for :func:`canprobe.replay`.
         say: called with the address or file of each bridge.
 
     Raises:
-        UsageError: as :func:`canprobe.replay`; or a bridge is not available.
+        UsageError: as in :func:`canprobe.replay`, or when a bridge is not available.
     """
     path, folder = find_log(Path(log))
     check_bridges(bridge)
@@ -94,7 +94,7 @@ def _in_real_time(observations: Iterator[Observation]) -> Iterator[Observation]:
 
 
 def _observations(plan: Plan, path: Path, folder: Path | None, result: ReplayResult | None) -> Iterator[Observation]:
-    """The observations of a recorded log; `folder` of the run, None for another log; `result` of the estimators."""
+    """The observations of a recorded log; `folder` is that of a run, None for another log."""
     estimates = _estimates(result)
     run = read_run(folder, plan.setup) if folder is not None else None
     if run is not None:
@@ -115,7 +115,7 @@ def _observations(plan: Plan, path: Path, folder: Path | None, result: ReplayRes
 def _observations_of(
     run: RunFolder, path: Path, plan: Plan, estimates: dict[int, SurfaceEstimate]
 ) -> Iterator[Observation]:
-    """The observations of a run: what its master measured, with the frames from each SYNC to the next."""
+    """The observations of a run: the measurements of its master, with the frames from each SYNC to the next."""
     groups = frames_by_sync(path, plan.buses[0].channel, plan) if path.is_file() else iter(())
     if before := next(groups, []):
         yield Observation(before[-1][2], None, None, before)

@@ -1,4 +1,4 @@
-"""A recorded bus as the cell needs it: the frames of the planned nodes, in the order of the bus."""
+"""The frames of the planned nodes in a recorded bus, in the order of the bus."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from canprobe.fieldbus.protocol.sync import is_sync, long_syncs_text
 RATE_TOLERANCE = 0.2
 """Share by which the recorded SYNC period may differ from the scene's."""
 STAMP_JITTER_NS = 300_000
-"""Lines whose stamps go back by no more are in the order of the bus: the stamps are wrong."""
+"""Stamps that go back by no more are jitter: the lines are in the order of the bus."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,15 +28,15 @@ class Recording:
     """The frames of one channel that the cell receives or sends.
 
     Attributes:
-        path: the log.
-        channel: of the nodes.
+        path: path of the log.
+        channel: channel of the nodes.
         frames: SYNC, TPDOs and RPDOs of the planned nodes, (can_id, data, t_ns).
         times: their stamps (n,), ns.
         syncs: indices of the SYNCs among them.
         other: number of other frames on this channel.
         malformed: number of PDOs of a wrong length, left out.
         error_frames: bus errors on all channels.
-        bus: the log itself: where its clock was set, and what candump lost.
+        bus: reader of the log, with the steps of its clock and the frames that candump lost.
     """
 
     path: Path
@@ -51,7 +51,7 @@ class Recording:
 
     @property
     def sync_stamps(self) -> NDArray[np.int64]:
-        """When each SYNC was sent, ns."""
+        """Time of each SYNC (n,), ns."""
         return self.times[self.syncs]
 
     @property
@@ -64,7 +64,7 @@ class Recording:
 
 @dataclass(slots=True)
 class _RecordedChannel:
-    """What was read of one channel so far."""
+    """Frames and counts of one channel so far."""
 
     frames: list[TimedFrame] = field(default_factory=list)
     heard: set[int] = field(default_factory=set)
@@ -80,10 +80,11 @@ def read_recording(path: Path, plan: Plan) -> Recording:
     Args:
         path: the log; it may hold other nodes, other channels and error frames. The buses of a plan with several of
             them have the plan's names in the log, and are read as one.
-        plan: gives the identifiers and lengths.
+        plan: plan with the identifiers and lengths.
 
     Raises:
-        UsageError: no such file, a torn line, a node without any TPDO, no SYNC, or SYNCs of another rate.
+        UsageError: when there is no such file, a line is torn, a node sent no TPDO, or SYNCs are missing or of another
+            rate.
     """
     bus = RecordedBus(path)
     channels, error_frames = _read(bus, plan)

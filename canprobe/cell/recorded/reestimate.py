@@ -37,16 +37,16 @@ _SCORED = ("kappa_per_m", "direction1", "direction2", "contact_normal", "contact
 
 @dataclass(frozen=True, slots=True)
 class RecordedContacts:
-    """What a record says of the contacts, for estimates and the summary.
+    """The contacts of a record, for estimates and the summary.
 
     Attributes:
         tracker: the contacts, and the answers of the scene's estimator.
         driven_by: ``task``: the scene's task made its scan, and was stepped again; ``other``: every contact was used.
         start_s: time of the first cycle, s, on the record's clock.
         times_s: time of each cycle (n,), s, since the first.
-        counts: what was counted, by name.
-        channel: of the log; None for the folder of a run.
-        bus: the log; None for the folder of a run.
+        counts: counts by name.
+        channel: channel of the log; None for the folder of a run.
+        bus: reader of the log; None for the folder of a run.
     """
 
     tracker: ShapeTracker
@@ -59,7 +59,7 @@ class RecordedContacts:
 
 
 def _from_run(plan: Plan, run: RunFolder) -> RecordedContacts:
-    """The contacts of a run, as its master measured them."""
+    """The contacts that the master of a run measured."""
     task = replay_task(plan, run)
     if task is not None and task.shape is not None and task.shape.samples:
         tracker, unplaced, driven_by = task.shape, task.record().unplaced, "task"
@@ -99,7 +99,7 @@ def _from_log(plan: Plan, path: Path) -> RecordedContacts:
 def _summarise(
     plan: Plan, source: Path, contacts: RecordedContacts, estimates: dict[str, list[ShapeRecord]], folder: Path | None
 ) -> dict[str, Any]:
-    """The summary of a `ReplayResult`; what does not apply is None. `folder` of the run, for its truth and its log."""
+    """The summary of a `ReplayResult`; a value that does not apply is None. `folder` has the run's truth and log."""
     truth = _truth(folder / TRUTH, plan.setup) if folder is not None else {}
     tracker = contacts.tracker
     map_summary = None if plan.scene.shape is None else map_of_scan(tracker, plan.scene.shape.method)[2]
@@ -209,7 +209,7 @@ class ReplayResult:
     """One replayed log.
 
     Attributes:
-        plan: of the scene.
+        plan: plan of the scene.
         summary: ``schema, scene, log, channel``; ``driven_by`` (``task``: the scene's task made the scan and was
             stepped again; ``other``: every contact was used); ``cycle`` (number of cycles, counts of what is missing);
             ``contacts``; ``estimates`` (the last of each estimator); ``shape`` as in ``summary.json``; ``online`` (the
@@ -240,20 +240,20 @@ def replay(
 ) -> ReplayResult:
     """Estimate the shape again from the folder of a run, or from a recorded bus.
 
-    The folder of a run holds what its master measured, and gives the online result again. From a candump log of the
-    same nodes, whoever drove them, every contact is used. The summary states which of the two was done.
+    The folder of a run has the measurements of its master, and gives the online result again. From a candump log of the
+    same nodes with any master, every contact is used. The summary states which of the two was done.
 
     Args:
         log: folder of a run, or a candump file.
-        scene: describes nodes and estimators; by default the ``scene.toml`` beside the log.
+        scene: scene of the nodes and estimators; by default the ``scene.toml`` beside the log.
         method: the estimators, one or several; by default the scene's.
 
     Returns:
         The estimates, and a summary.
 
     Raises:
-        UsageError: no log or scene, an unknown method, a line that is not in candump format, a node without any TPDO,
-            no SYNC, or no contact.
+        UsageError: when there is no log, scene, SYNC or contact, a method is unknown, a line is not in candump format,
+            or a node sent no TPDO.
     """
     path, folder = find_log(Path(log))
     plan = make_plan(resolve(scene_of(path, folder, scene)))

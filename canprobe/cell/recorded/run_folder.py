@@ -1,4 +1,4 @@
-"""The folder of a run: what its master measured, cycle by cycle, and the scene's task stepped through it again."""
+"""The folder of a run: the measurements of its master, and the scene's task stepped through them again."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ LEAVING_PHASES = (Phase.RETREAT, Phase.DONE)
 
 @dataclass(frozen=True, slots=True)
 class RunFolder:
-    """What a run left behind of its measurements.
+    """The measurements in the folder of a run.
 
     Attributes:
         path: the folder.
@@ -51,11 +51,11 @@ class RunFolder:
 
     @property
     def times_s(self) -> NDArray[np.float64]:
-        """The same in s, to the last bit what the run's estimates were dated by."""
+        """Time of each cycle (n,), s, since the first; equal to the times of the run's estimates to the last bit."""
         return self.times_ns.astype(np.float64) * 1e-9
 
     def measurements(self) -> Iterator[Measurement]:
-        """The measurement of each cycle, as the cell had it; times count from the first cycle."""
+        """The measurement of each cycle in the cell; times count from the first cycle."""
         log, samples = self.log, self._samples()
         rows = len(log["t_s"])
         joints = joint_positions(log)
@@ -99,26 +99,26 @@ class RunFolder:
 
 
 def _frame(taxels: NDArray[np.uint8], window: tuple[int, int, int, int], features: list[float]) -> TactileFrame:
-    """A tactile frame as the cell used it; of its header only what the file tells."""
-    told = None
+    """A tactile frame that the cell used; its header has only what the file states."""
+    sent = None
     if np.isfinite(features).all():
         force, row, col, rr, rc, cc, peak = features
-        told = Features(force, row, col, rr, rc, cc, int(peak))
+        sent = Features(force, row, col, rr, rc, cc, int(peak))
     whole = TactileMode.IMAGE if window[2] == len(taxels) else TactileMode.WINDOW
-    mode = whole if told is None else TactileMode.FEATURES
+    mode = whole if sent is None else TactileMode.FEATURES
     header = TactileHeader(0, 0, window[0], window[1], mode, False, 0, window=window[2])
-    return TactileFrame(header, taxels, window, told, 0)
+    return TactileFrame(header, taxels, window, sent, 0)
 
 
 def read_run(folder: Path, setup: Setup) -> RunFolder | None:
-    """The measurements of a run; None where the folder has none, as that of a run that was killed.
+    """The measurements of a run; None where the folder has none, as when the run was killed.
 
     Args:
-        folder: of the run.
-        setup: of its scene.
+        folder: folder of the run.
+        setup: setup of its scene.
 
     Raises:
-        UsageError: a file of another canprobe, or one that cannot be read.
+        UsageError: when a file is of another version of canprobe, or cannot be read.
     """
     read_summary(folder)
     log, tactile = folder / LOG, folder / TACTILE
@@ -135,8 +135,8 @@ def replay_task(plan: Plan, run: RunFolder) -> TouchTask | None:
     """Step the scene's task through the measurements of a run, as the cell did.
 
     Returns:
-        The task at its end; None where the run's phases are not its own: another scene or controller, or one that was
-        told what to do while it ran.
+        The task at its end; None where the phases of the run differ: it had another scene or controller, or got
+        requests from another tool.
     """
     task = make_task(plan)
     assert isinstance(task, TouchTask)

@@ -1,12 +1,12 @@
-"""What a run leaves behind: summary, scores against the truth, files, tables and figures.
+"""Results of a run: summary, scores against the truth, files, tables and figures.
 
-`open_cell.OpenCell` holds a session. When its block is left it scores what was measured, and makes the `RunData` of the
+`open_cell.OpenCell` holds a session. When its block is left it scores the measurements, and makes the `RunData` of the
 run once, complete. Files are written and figures are drawn from `RunData`; `RunResult` hands it to the user, and
 refuses to be read before. All files of a run count time from the 0 of its `bus.log`, and each is whole or not there.
 
     open_cell      a cell for controllers, from its bring-up to its results
-    run_data       everything that is known of a run when it is over
-    result         the same as Python has it: tables, figures, pages and scores on request
+    run_data       all data of a finished run
+    result         the data for Python users: tables, figures, pages and scores on request
     summary        the document of `summary.json` (versioned by `schema`; what does not apply is null), and the files
     scores         comparison with the plant's truth, where there is one
     map_score      the map of a scan and its estimates, as columns and as part of the summary
@@ -17,10 +17,10 @@ refuses to be read before. All files of a run count time from the 0 of its `bus.
     run_files      the files of a run's folder, checked when they are read
     files          tables with their units
     surface_file   a surface map as a file
-    tool_file      a found tool centre as a file
-    array_report   what a calibration of an array found
-    figures, plan_figure, surface_figure, surface_sheet, surface_panels   pictures, in the one look of `picture`
-    page           a run as a page that replays it
+    tool_file      a calibrated tool centre as a file
+    array_report   text and picture of an array's calibration
+    figures, plan_figure, surface_figure, surface_sheet, surface_panels   pictures, all in the style of `picture`
+    page           HTML page that replays a run
 
-Matplotlib is imported where pictures are drawn only.
+Matplotlib is imported only where pictures are drawn.
 """

@@ -1,4 +1,4 @@
-"""What a calibration of an array found, for people: text, and a picture."""
+"""Report of an array's calibration: text, JSON and a picture."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def _percent(value: float, before: str = "") -> str:
 
 
 def as_document(fit: ArrayFit) -> dict[str, Any]:
-    """The same as JSON has it; None where something is not known."""
+    """The calibration in JSON types; None where a value is not known."""
     c = fit.calibration
 
     def known(value: float) -> float | None:
@@ -80,7 +80,7 @@ def as_document(fit: ArrayFit) -> dict[str, Any]:
 
 
 def draw_calibration(fit: ArrayFit, path: Path) -> None:
-    """Held-out errors of moments and curvatures, centroids by load, and gains of the taxels."""
+    """Draw held-out errors of moments and curvatures, centroids by load, and gains of the taxels."""
     from canprobe.cell.results.picture import BLUE, GREY, INK, ORANGE, legend, log_scale, picture
 
     c = fit.calibration

@@ -1,4 +1,4 @@
-"""The contacts of a scan as arrays, and estimators of anybody scored on them, beside ours."""
+"""The contacts of a scan as arrays, and the scores of any estimators on them."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ ESTIMATE_PERIOD_S = 0.1
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Contacts:
-    """What the master measured of the contact during a scan, one row a tactile frame; base frame, SI.
+    """Measured contacts of a scan, one row for each tactile frame; base frame, SI.
 
     Point and normal of a contact come from one centroid, so their errors are coupled: an error e of the point along
     the surface comes with an error of −e · coupling of the normal. With that, `canprobe.fit_surface` takes them as
     ``fit_surface(c.points, c.normals, sigma_point=c.covariances, sigma_normal=c.sigma_normal, coupling=c.coupling)``.
 
     Attributes:
-        t_s: (n,) instants, s, on the clock of the log.
-        points: (n, 3) contact points on the object, m.
-        normals: (n, 3) outward unit normals of the object there.
-        forces: (n,) contact forces, N.
-        covariances: (n, 3, 3) of the points, m².
-        normal_covariances: (n, 3, 3) of the normals, rad²; the part that is coupled to the point is included.
+        t_s: instants (n,), s, on the clock of the log.
+        points: contact points on the object (n, 3), m.
+        normals: outward unit normals of the object there (n, 3).
+        forces: contact forces (n,), N.
+        covariances: covariances of the points (n, 3, 3), m².
+        normal_covariances: covariances of the normals (n, 3, 3), rad², the part coupled to the point included.
         sigma_normal: standard deviation of a normal per tangent axis without the coupled part, rad.
-        coupling: 1/m; 0 where the errors are independent.
-        samples: as the estimators took them, with times since the first SYNC, s.
+        coupling: coupling of the errors, 1/m; 0 where they are independent.
+        samples: samples that the estimators took, with times since the first SYNC, s.
     """
 
     t_s: Floats
@@ -84,7 +84,7 @@ def contacts_of(samples: Sequence[ContactSample], task: Touch, start_s: float) -
 
 
 class OwnEstimator(Protocol):
-    """What an estimator of your own needs."""
+    """Methods that an estimator of your own needs."""
 
     def add(self, sample: ContactSample) -> None:
         """Take one contact."""
@@ -94,7 +94,7 @@ class OwnEstimator(Protocol):
 
 
 class _Renewed:
-    """An own estimator as the loop drives one: a new one after each loss of contact. It drops nothing that we count."""
+    """A user's estimator in the loop: a new one is made after each loss of contact; dropped samples are not counted."""
 
     def __init__(self, make: Callable[[], OwnEstimator]) -> None:
         self._make = make
@@ -107,7 +107,7 @@ class _Renewed:
 
 
 class Scores(dict[str, dict[str, Any]]):
-    """The errors of estimators on the same contacts, by name; those of `ShapeScore`, and ``us_per_contact``."""
+    """Errors of estimators on the same contacts, by name: the fields of `ShapeScore`, and ``us_per_contact``."""
 
     def __repr__(self) -> str:
         return "\n".join("  ".join(cell.rjust(12) for cell in row) for row in self._cells())
@@ -143,10 +143,10 @@ def score_estimators(
     """Feed the contacts of a scan to each estimator, as the loop would have, and score its answers.
 
     Args:
-        samples: of the scan.
-        task: as it was planned.
-        estimators: by the name in the table: one of our methods, or what makes another.
-        truth: columns of the plant's truth, one row a SYNC.
+        samples: contacts of the scan.
+        task: the planned task.
+        estimators: estimators by their name in the table: the name of a method, or a function that makes one.
+        truth: columns of the plant's truth, one row for each SYNC.
         sync_times: time of each SYNC on the clock of the samples (n,), s.
     """
     every, clock, scores = max(1, round(ESTIMATE_PERIOD_S * task.array.rate_hz)), MonotonicClock(), Scores()

@@ -1,8 +1,8 @@
-"""What the packaged scenes are measured to do: `scenes/expected.json`, which `python docs/generate.py` takes from what
-`python docs/measure.py` measured.
+"""Expected figures of the packaged scenes: `scenes/expected.json`, which `python docs/generate.py` takes from the
+measurements of `python docs/measure.py`.
 
-A figure is the lowest and the highest value over some seeds of the emulation. It says whether an own run is as good as
-it should be: the scenes differ in what can be had of them.
+A figure is the lowest and the highest value over some seeds of the emulation. It shows whether a run is as good as it
+should be: the scenes differ in their accuracy.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ FIGURES = {
     "position": ("position", "mm"),
     "tool": ("tool centre", "mm"),
 }
-"""What a figure is called, and its unit. All but the contact are errors, RMS over the scan."""
-SHORT = ("force", "curvature", "curvature_per_m", "tool")
-"""Figures of a list of scenes."""
+"""Name and unit of each figure. All but the contact are errors, RMS over the scan."""
+LISTED_FIGURES = ("force", "curvature", "curvature_per_m", "tool")
+"""Figures in the list of scenes."""
 
 
 def read_expected() -> dict[str, Any]:
@@ -34,7 +34,7 @@ def read_expected() -> dict[str, Any]:
 
 
 def figures_of(summary: Mapping[str, Any]) -> dict[str, float]:
-    """The figures of one run, from its summary; what does not apply is not among them."""
+    """The figures of one run that apply, from its summary."""
     contact, shape, tool = summary["contact"], summary["shape"], summary["calibration"]
     percent = shape["kappa_rms_error_percent"]
     found = {
@@ -60,7 +60,7 @@ def range_text(name: str, between: Sequence[float]) -> str:
 
 
 def expected_text(figures: Mapping[str, Sequence[float]], names: Sequence[str] = tuple(FIGURES)) -> str:
-    """Figures of one scene as `force 3.2–3.7 %, curvature 0.5–0.6 %`; empty where it has none of them."""
+    """Figures of one scene as `force 3.2–3.7 %, curvature 0.5–0.6 %`; empty where it has none."""
     return ", ".join(f"{FIGURES[name][0]} {range_text(name, figures[name])}" for name in names if name in figures)
 
 

@@ -1,4 +1,4 @@
-"""The figure of a run: contact trajectory like the paper's, force, curvature with its band, taxel image."""
+"""The figure of a run: contact trajectory as in the paper, force, curvature with its band, taxel image."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ from canprobe.mechanics.types import Floats
 Panel = Callable[[SubFigure, RunData], None]
 TWO_SIGMA = 1.96
 MIN_SPAN_PER_M = 1.0
-"""Least height of the panel of curvatures, 1/m: a plane's estimates are not blown up."""
+"""Least height of the panel of curvatures, 1/m, so that noise on a plane looks small."""
 
 
 def draw_run(result: RunData, path: Path) -> None:
-    """Draw what the run has and write a PNG; panels without data are left out."""
+    """Draw the panels for which the run has data, and write a PNG."""
     rows = _rows(result)
     if not rows:
         return
@@ -47,14 +47,14 @@ def draw_run(result: RunData, path: Path) -> None:
 
 
 def run_figure(result: RunData) -> Figure:
-    """The same figure, not written.
+    """The figure of a run, not written.
 
     Raises:
-        UsageError: the run has nothing to draw.
+        UsageError: when the run has nothing to draw.
     """
     rows = _rows(result)
     if not rows:
-        raise UsageError("plot: nothing was measured in this run that a panel shows")
+        raise UsageError("plot: this run has no data for any panel")
     with sheet(_title(result), 0.6 + 2.9 * len(rows)) as figure:
         _fill(figure, rows, result)
     return figure
@@ -80,7 +80,7 @@ def _rows(result: RunData) -> list[list[tuple[Panel, float]]]:
         rows = [[*force, *taxels]]
         if result.summary.get("calibration") is not None:
             rows.append([(_draw_tool, 1.0)])
-        elif joint_positions(log) is not None:  # of a failed bring-up nothing may be known
+        elif joint_positions(log) is not None:  # a failed bring-up may leave no data
             rows.append([(_draw_joints, 1.0)])
     return [row for row in rows if row]
 
@@ -95,7 +95,7 @@ def _title(result: RunData) -> str:
 
 
 def _draw_tool(part: SubFigure, result: RunData) -> None:
-    """Each coordinate of the tool centre beside what was believed, with its 95 % band, and the truth."""
+    """Draw each coordinate of the tool centre beside the believed one, with its 95 % band, and the truth."""
     axes, found = part.subplots(), result.summary["calibration"]
     rows = list(range(3))
     for row in rows:
@@ -117,7 +117,7 @@ def _draw_tool(part: SubFigure, result: RunData) -> None:
 
 
 def _draw_trajectory(part: SubFigure, result: RunData) -> None:
-    """The path of the contact and the surface that was recovered from it, over the true one."""
+    """Draw the path of the contact and the surface recovered from it, over the true one."""
     axes = part.add_subplot(projection="3d", computed_zorder=False)
     points, normals = result.log["contact_mm"] * 1e-3, result.log["normal"]
     touched = (result.log["phase"] == Phase.SCAN) & np.isfinite(points).all(axis=1)
@@ -163,12 +163,12 @@ def _draw_curvature(part: SubFigure, result: RunData) -> None:
         axes.fill_between(travelled, lower[:, i], upper[:, i], color=colour, alpha=0.22, linewidth=0)
         axes.plot(travelled, kappa[:, i], color=colour, label=f"{name}, {method}, 95 % band")
     known = [band[np.isfinite(band)] for band in (lower, upper)]
-    limits = [np.percentile(band, (20, 80)) for band in known if len(band)]  # how it begins does not set the scale
+    limits = [np.percentile(band, (20, 80)) for band in known if len(band)]  # the first answers do not set the scale
     if result.truth:
         true = result.truth["kappa_per_m"][np.searchsorted(result.log["t_s"], [r.t_s - 1e-6 for r in records])]
         axes.plot(travelled, true, color=INK, linestyle="--", label="true")
         seen = kappa[np.isfinite(kappa)]
-        if len(seen):  # nor does an edge that is far sharper than all that was estimated
+        if len(seen):  # nor does an edge that is far sharper than every estimate
             span = max(np.ptp(seen), MIN_SPAN_PER_M)
             limits.append(np.clip(true, seen.min() - span, seen.max() + span))
     if limits:
@@ -203,7 +203,7 @@ def _draw_taxels(part: SubFigure, result: RunData) -> None:
 
 
 def _draw_joints(part: SubFigure, result: RunData) -> None:
-    """A panel a joint: joints that move alike would hide each other in one."""
+    """Draw a panel for each joint: in one panel joints that move alike would hide each other."""
     arm = result.plan.setup.arm
     q = joint_positions(result.log)
     assert arm is not None and q is not None

@@ -29,11 +29,11 @@ _UNITS = {
     "per_m2": "1/m^2", "per_m": "1/m", "permille": "permille", "m_s": "m/s", "rad": "rad", "deg": "deg", "mm": "mm",
     "hz": "Hz", "ns": "ns", "us": "us", "n": "N", "m": "m", "s": "s",
 }  # fmt: skip
-_ATTRS = b"PANDAS_ATTRS"  # where pandas itself keeps a frame's attrs in Parquet
+_ATTRS = b"PANDAS_ATTRS"  # key under which pandas keeps a frame's attrs in Parquet
 
 
 def unit_of(name: str) -> str:
-    """The unit of a column of a log, of a truth file or of estimates; `1` for what has none."""
+    """The unit of a column of a log, of a truth file or of estimates; `1` for a column without unit."""
     return next((unit for suffix, unit in _UNITS.items() if name.endswith(f"_{suffix}")), "1")
 
 
@@ -41,8 +41,8 @@ def to_frame(columns: Mapping[str, NDArray[Any]], attrs: Mapping[str, Any] | Non
     """Columns as a table, by time.
 
     Args:
-        columns: arrays (n,), (n, k) or (n, k, l), one row per cycle; the suffix of a name is its unit.
-        attrs: added to the frame's `attrs`.
+        columns: arrays (n,), (n, k) or (n, k, l), one row for each cycle; the suffix of a name is its unit.
+        attrs: entries to add to the frame's `attrs`.
 
     Returns:
         The frame; its index is `t_s` where there is one. `attrs["units"]` maps every column to its unit.
@@ -62,13 +62,13 @@ def load_table(path: Path | str) -> pandas.DataFrame:
     """A table from a `.npz` of a run (`log.npz`, `truth.npz`) or from Parquet.
 
     Args:
-        path: of the file; the suffix `.npz` names the first kind.
+        path: path of the file; the suffix `.npz` names the first kind.
 
     Returns:
         The frame, by `t_s` where there is one; vectors are spread over columns, and `attrs["units"]` has every unit.
 
     Raises:
-        UsageError: no such file, another kind of file, or the extra is missing.
+        UsageError: when there is no such file, it is of another kind, or the extra is missing.
     """
     source = Path(path)
     if source.suffix == ".npz":

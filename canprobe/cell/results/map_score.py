@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -12,9 +12,6 @@ from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.mechanics.touch.consistency import PARTS, Consistency, check_consistency
 from canprobe.mechanics.touch.surface_map import LocalPatch, SurfaceMap, merge_patches
 from canprobe.mechanics.types import Floats
-
-if TYPE_CHECKING:
-    pass
 
 SAME_DIRECTION_RAD = math.radians(30.0)
 """Passes whose directions differ by less have the same hysteresis of the array."""
@@ -26,7 +23,7 @@ def map_of_scan(
     """Merge the answers of the estimator in the loop along a scan.
 
     Args:
-        tracker: with the answers and the contacts of the scan.
+        tracker: tracker with the answers and the contacts of the scan.
         method: name of the estimator.
         start_s: deadline of the first SYNC on the run's clock.
 
@@ -65,7 +62,7 @@ def _verdict(consistency: Consistency, part: str) -> dict[str, float | None]:
 
 
 def estimate_columns(records: Sequence[ShapeRecord]) -> dict[str, Floats]:
-    """Estimates as columns, one row each; the suffix of a name is its unit."""
+    """Estimates as columns, one row for each estimate; the suffix of a name is its unit."""
     answers = [r.estimate for r in records]
     return {
         "t_s": np.array([r.t_s for r in records]),

@@ -38,18 +38,18 @@ if TYPE_CHECKING:
 
 
 class OpenCell:
-    """A cell for controllers: brought up where its block is entered, stopped where it is left, with its results then.
+    """A cell for controllers: its block brings it up at the beginning, and at the end stops it and makes the results.
 
-    One block is one run, however many controllers it runs one after the other: one log, one summary, one folder. The
+    One block is one run with one log, one summary and one folder, even if it runs several controllers in turn. The
     summary's contact and shape are those of the controller that ran last.
 
     Args:
-        plan: of the scene.
-        options: of the run.
-        task: whose contact and shape stand in the summary, whatever is run.
+        plan: plan of the scene.
+        options: options of the run.
+        task: task whose contact and shape the summary has, whatever controllers run.
 
     Attributes:
-        plan: of the scene.
+        plan: plan of the scene.
         session: the cell with everything round it.
     """
 
@@ -92,10 +92,10 @@ class OpenCell:
             self._finish(failure)
 
     def patch(self, sample: TactileSample) -> Patch:
-        """What the array says of the contact: force, N, and place on the pad, m, with what makes them doubtful.
+        """The contact in a tactile sample: force, N, place on the pad, m, and what makes them doubtful.
 
         Args:
-            sample: of a measurement, `measurement.tactile`.
+            sample: sample of a measurement, `measurement.tactile`.
 
         Raises:
             UsageError: the scene has no array.
@@ -109,13 +109,13 @@ class OpenCell:
         return patch_from(self.plan.setup)
 
     def probe(self, q: npt.ArrayLike) -> tuple[Floats, Floats]:
-        """Where joint positions put the probe, and how it moves with them.
+        """Pose of the probe at joint positions, and its Jacobian there.
 
         Args:
-            q: (n,) joint positions, rad or m.
+            q: joint positions (n,), rad or m.
 
         Returns:
-            (4, 4) pose of the probe's centre in the base frame, m, whose z axis is the pole; and (6, n) its Jacobian:
+            Pose of the probe's centre in the base frame (4, 4), m, whose z axis is the pole; and its Jacobian (6, n):
             velocity (rows 0-2) and angular velocity (3-5) in the base frame, per rate of each joint.
 
         Raises:
@@ -141,9 +141,9 @@ class OpenCell:
             The result of the whole block, the same from every call; it is complete when the block is left.
 
         Raises:
-            UsageError: this is no controller, or its step returned no command.
-            BusError: the interface or a node failed.
-            SafetyStop: the cell was stopped for safety, or the controller gave a `stop_reason`.
+            UsageError: when it is no controller, or its step returned no command.
+            BusError: when the interface or a node failed.
+            SafetyStop: when the cell was stopped for safety, or the controller gave a `stop_reason`.
         """
         runs = as_controller(controller)
         if self._task is None:
@@ -152,11 +152,11 @@ class OpenCell:
         return self._result
 
     def open_to_requests(self, task: Controller) -> Controller:
-        """The task, which other tools may start, stop and set where the scene allows that."""
+        """The task, which other tools may start, stop and change where the scene allows it."""
         return self._bridges.open_to_requests(task)
 
     def _finish(self, failure: BaseException | None) -> None:
-        """What the run was, once the bus is closed; nothing where none was opened."""
+        """Make the results once the bus is closed, if it was opened, and end the bridges."""
         try:
             if self.session.started:
                 self._conclude(failure)
@@ -167,7 +167,7 @@ class OpenCell:
         log, tactile = log_columns(self.cell), tactile_columns(self.cell)
         try:
             data = self._score(log, tactile, failure)
-        except BaseException:  # what was measured is kept all the same
+        except BaseException:  # the measurements are kept all the same
             self._write(lambda out: write_columns(log, tactile, out))
             raise
         self._result.complete(data)
@@ -185,7 +185,7 @@ class OpenCell:
             unwritten = ResultsError("\n".join(lines))
             unwritten.summary = summary
             raise unwritten
-        for line in lines:  # what stopped the run comes first
+        for line in lines:  # the reason of the stop comes first
             if failure is not None and line != str(failure):
                 failure.add_note(line)
 
@@ -222,7 +222,7 @@ class OpenCell:
         )
 
     def _write(self, write: Callable[[Path], None]) -> None:
-        """Write files into the run's folder; what cannot be written is noted, and raised at the end."""
+        """Write files into the run's folder; a failure is noted, and raised at the end."""
         if self._out is None:
             return
         try:
@@ -261,7 +261,7 @@ def _mapped(
 
 
 def _drawings(data: RunData, out: Path, say: Say) -> dict[str, Callable[[], None]]:
-    """What draws each picture of a run of at least one cycle; the page of its scene comes last, it takes longest."""
+    """Functions that draw the pictures of a run of at least one cycle; the page is last, as it takes longest."""
 
     def report() -> None:
         from canprobe.cell.results.figures import draw_run
@@ -278,7 +278,7 @@ def _drawings(data: RunData, out: Path, say: Say) -> dict[str, Callable[[], None
 
         try:
             write_page_of(out, data.plan.setup, say)
-        except UsageError as error:  # a controller's column that is called like one of ours and is something else
+        except UsageError as error:  # a controller's column has the name of one of ours and another content
             say(f"report.html is left out: {error}")
 
     outputs = data.plan.outputs if len(data.log["t_s"]) else ()
@@ -287,7 +287,7 @@ def _drawings(data: RunData, out: Path, say: Say) -> dict[str, Callable[[], None
 
 
 def _draw(name: str, draw: Callable[[], None]) -> str | None:
-    """Draw one picture; why that failed. Whatever a library of pictures raises, the run's results are written."""
+    """Draw one picture; returns why that failed. Whatever a drawing library raises, the results are written."""
     try:
         with interrupts_repeated():
             draw()

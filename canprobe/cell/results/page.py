@@ -1,4 +1,4 @@
-"""A run in three dimensions, from Python: its page in a notebook or a browser."""
+"""The page of a run in three dimensions, for a notebook or a browser."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from canprobe.cell.scene.setup import Setup
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """One HTML file; a notebook shows it, and it can be kept and mailed.
+    """One HTML file, which a notebook shows and which can be kept and mailed.
 
     Attributes:
-        path: of the file.
+        path: path of the file.
     """
 
     path: Path
@@ -35,9 +35,9 @@ def write_page_of(folder: Path, setup: Setup, say: Callable[[str], None]) -> Non
     """Write ``report.html`` into a run's folder.
 
     Args:
-        folder: with the files of the run.
-        setup: that the run had.
-        say: called with each line about what cannot be drawn.
+        folder: folder with the files of the run.
+        setup: setup of the run.
+        say: called with a line for each part that cannot be drawn.
 
     Raises:
         UsageError: a controller's column has the name of one of ours.
@@ -48,7 +48,7 @@ def write_page_of(folder: Path, setup: Setup, say: Callable[[str], None]) -> Non
 
 
 def page_of(folder: Path, setup: Setup) -> Page:
-    """The page of a run's folder, written where it is missing; opened in a browser if there is one and no notebook.
+    """The page of a run's folder, written where it is missing, and opened in a browser outside of a notebook.
 
     Raises:
         UsageError: the extra `view` is missing, or a controller's column has the name of one of ours.

@@ -1,7 +1,7 @@
-"""The one look of all pictures: size, type, colours, ticks, where legends stand, how a picture is saved.
+"""Common style of all pictures: size, type, colours, ticks, place of legends, and the way to save.
 
-A picture is as wide as a page: in a column of 800 pixels, as the README has, its smallest type is 9 pixels high. Its
-title says what is seen and explains marks and shades. A legend stands below what it explains, never among the data.
+A picture is as wide as a page: in a column of 800 pixels, as in the README, its smallest type is 9 pixels high. Its
+title names its content and explains marks and shades. A legend stands below its panels, never among the data.
 The colours are those of Okabe and Ito, which people with any colour vision distinguish; a mark, a line style or a place
 distinguishes them as well.
 """
@@ -43,9 +43,9 @@ _STYLE: Any = MappingProxyType(
     }
 )  # fmt: skip
 _LETTER_IN = 0.062
-"""Mean width of a letter of a legend."""
+"""Mean width of a letter of a legend, inches."""
 MIN_DEPTH_MM = 6.0
-"""Least height of a box, mm: a plane's is not flat."""
+"""Least height of a box, mm, for planes."""
 
 
 class Sheet(Figure):
@@ -59,7 +59,7 @@ class Sheet(Figure):
 
 @contextmanager
 def sheet(title: str, height_in: float) -> Iterator[Figure]:
-    """A sheet to be drawn on within the block; arguments as for `picture`."""
+    """A sheet to draw on within the block; for its arguments see `picture`."""
     with rc_context(dict(_STYLE)):
         figure = Sheet(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="constrained")
         lines = [part for line in title.splitlines() for part in textwrap.wrap(line, 118)]
@@ -69,15 +69,15 @@ def sheet(title: str, height_in: float) -> Iterator[Figure]:
 
 @contextmanager
 def picture(path: Path | str, title: str, height_in: float) -> Iterator[Figure]:
-    """A sheet that is written, whole, when the block is done.
+    """A sheet that is written when the block ends.
 
     Args:
-        path: of the picture; its suffix names the form.
-        title: what is seen; more lines explain it.
-        height_in: of the sheet.
+        path: path of the picture; its suffix names the format.
+        title: name of the content; more lines explain it.
+        height_in: height of the sheet, inches.
 
     Raises:
-        ValueError: matplotlib knows no such form.
+        ValueError: when matplotlib does not know the format.
     """
     path = Path(path)
     with sheet(title, height_in) as figure:
@@ -96,7 +96,7 @@ def parts(of: Part, rows: int, columns: int, **ratios: Any) -> list[SubFigure]:
 
 
 def legend(part: Part, handles: Sequence[Any] = ()) -> None:
-    """Below the panels of a sheet or of a part of one: what they label, each label once, or `handles`."""
+    """Draw a legend below the panels of a sheet or a part of one: each of their labels once, or `handles`."""
     panels: list[Axes] = part.axes
     pairs = [pair for axes in panels for pair in zip(*axes.get_legend_handles_labels(), strict=True)]
     shown = {handle.get_label(): handle for handle in handles} or {label: handle for handle, label in pairs}
@@ -109,7 +109,7 @@ def legend(part: Part, handles: Sequence[Any] = ()) -> None:
 
 
 def log_scale(axes: Axes, names: str) -> None:
-    """Logarithmic `x`, `y` or `xy`, with plain numbers, as many as there is room for."""
+    """Make `x`, `y` or `xy` logarithmic, with as many plain numbers as there is room for."""
     for name in names:
         getattr(axes, f"set_{name}scale")("log")
         axis = getattr(axes, f"{name}axis")
@@ -119,7 +119,7 @@ def log_scale(axes: Axes, names: str) -> None:
 
 
 class _LogTicks(LogLocator):
-    """More numbers a decade the more room it has."""
+    """Logarithmic ticks: the more room there is, the more numbers a decade has."""
 
     def tick_values(self, vmin: float, vmax: float) -> Sequence[float]:
         axis: Any = self.axis
@@ -137,7 +137,7 @@ def _number(value: float) -> str:
 
 
 def box(part: Part, axes: Any, title: str, labels: Sequence[str], *, elev: float, azim: float) -> None:
-    """Axes in three dimensions that fill their part: one scale for all, ticks as each side has room for them."""
+    """Let axes in three dimensions fill their part: one scale for all, as many ticks as a side has room for."""
     low, high = axes.get_zlim()
     spare = max(0.0, MIN_DEPTH_MM - (high - low)) / 2
     axes.set_zlim(low - spare, high + spare)

@@ -1,4 +1,4 @@
-"""The picture of a plan: its cycles on every bus, and how much of its deadline each message may take."""
+"""The picture of a plan: its cycles on every bus, and the response time of each message in its deadline."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def draw_plan(plan: Plan, path: Path | str) -> None:
     """Draw the timeline and the response times.
 
     Args:
-        plan: that fits.
-        path: of the picture; its suffix names the form.
+        plan: the plan.
+        path: path of the picture; its suffix names the format.
     """
     messages = on_the_wire(plan.pdos)
     heights = [0.45 * (len(plan.buses) + 1) + 0.5, _ROW_INCHES * len(messages) + 0.6]

@@ -1,4 +1,4 @@
-"""The result of a run, as Python has it: its data, and what is made of them when somebody asks."""
+"""The result of a run for Python users: its data, and figures, tables and scores on request."""
 
 from __future__ import annotations
 
@@ -36,25 +36,25 @@ _FIELDS = frozenset(field.name for field in fields(RunData))
 
 
 class RunResult:
-    """One finished run; printed, it is its summary.
+    """One finished run; printing it shows its summary.
 
-    That of `canprobe.open_cell` is complete when its block is left: until then the drives are not disabled, the
-    bus is not closed, and reading an attribute raises.
+    The result of `canprobe.open_cell` is complete when its block is left: until then the drives may be enabled, and
+    reading an attribute raises.
 
     Attributes:
-        plan: what was planned.
+        plan: the plan of the run.
         summary: the content of ``summary.json``.
         log: the columns of ``log.npz``, one row per cycle; the suffix of a name is its unit. ``t_s`` here, in the truth
             and in the estimates counts from the instant that is 0 in ``bus.log``.
         truth: the plant's true values, one row per SYNC; empty where nothing was emulated.
         estimates: the answers of each estimator, by name; the online one first.
-        taxels: (rows, columns) counts of the task's last tactile frame, or None.
+        taxels: counts of the task's last tactile frame (rows, columns), or None.
         tactile: the columns of ``tactile.npz``, one row per tactile frame that the cell used: ``t_s`` of the cycle,
             ``t_sample_s``, ``taxels`` (m, rows, columns), their ``window``, ``features``; empty where there was none.
         surface_map: the local patches of the online estimator, or None without a shape.
         consistency: the tests at its crossings, or None.
         out: the folder with the files, or None.
-        contacts: of the scan, as the master measured them; None without a shape.
+        contacts: measured contacts of the scan; None without a shape.
     """
 
     __slots__ = ("_data",)
@@ -75,7 +75,7 @@ class RunResult:
         self._data: RunData | None = None
 
     def complete(self, data: RunData) -> None:
-        """Take the data of the run, which is over."""
+        """Take the data of the finished run."""
         self._data = data
 
     @property
@@ -83,7 +83,7 @@ class RunResult:
         """All attributes in one object.
 
         Raises:
-            UsageError: the run is under way.
+            UsageError: when the run is under way.
         """
         return self._known("data")
 
@@ -116,7 +116,7 @@ class RunResult:
         """The figure of ``report.png``; a notebook shows it.
 
         Raises:
-            UsageError: matplotlib is missing, or nothing was measured.
+            UsageError: when matplotlib is missing, or nothing was measured.
         """
         if importlib.util.find_spec("matplotlib") is None:
             raise UsageError(f"plot needs matplotlib: {install_line('study')}")
@@ -125,7 +125,7 @@ class RunResult:
         return run_figure(self.data)
 
     def view(self) -> Page:
-        """The run in three dimensions, as one page that replays it: in a notebook, else in a browser.
+        """The page that replays the run in three dimensions: in a notebook, else in a browser.
 
         It is ``report.html`` of the run's folder, or of a temporary one.
 
@@ -149,13 +149,13 @@ class RunResult:
             result.score("recursive", "ml", mine=MyEstimator)
 
         Args:
-            methods: ours, by name; without any, those of the scene.
-            own: makes an estimator of yours, such as its class, by the name that it has in the table. It has
+            methods: names of packaged methods; by default those of the scene.
+            own: functions that make your estimators, such as their classes, by their names in the table. Each has
                 ``add(sample)``, which takes a `canprobe.ContactSample`, and ``estimate()``, which returns a
                 `canprobe.SurfaceEstimate` or None. After a loss of contact a new one is made.
 
         Raises:
-            UsageError: nothing was scanned, no truth is known, or an unknown method.
+            UsageError: when nothing was scanned, no truth is known, or a method is unknown.
         """
         from canprobe.cell.results.contacts import score_estimators
 
@@ -163,7 +163,7 @@ class RunResult:
         if self.contacts is None or not len(self.contacts) or scene.shape is None or not isinstance(task, Touch):
             raise UsageError("score: expected a scan that touched its object, got no contacts")
         if "kappa_per_m" not in self.truth:
-            raise UsageError("score: expected an emulated object; nothing is known of the truth")
+            raise UsageError("score: expected an emulated object, got a run without truth")
         start_s = float(self.contacts.t_s[0] - self.contacts.samples[0].t_s)
         ours = {name: name for name in methods or (scene.shape.method, *scene.shape.also)}
         return score_estimators(
@@ -183,7 +183,7 @@ class RunResult:
         return to_frame(self._columns(what), self._attrs)
 
     def to_parquet(self, path: Path | str, what: Literal["log", "truth", "estimates"] = "log") -> None:
-        """Write the same table as Parquet; `canprobe.load_table` reads it.
+        """Write a table of the run as Parquet; `canprobe.load_table` reads it.
 
         Raises:
             UsageError: the extra `data` is missing.

@@ -1,4 +1,4 @@
-"""The data of a finished run, which the files are written from and the figures are drawn from."""
+"""The data of a finished run, the source of its files and figures."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class RunData:
-    """Everything that is known of a run when it is over; `RunResult` says what each attribute is."""
+    """All data of a finished run; `RunResult` explains each attribute."""
 
     plan: Plan
     summary: dict[str, Any]

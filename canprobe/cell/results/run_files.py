@@ -1,13 +1,13 @@
-"""The files of a run's folder, checked before anything is made of them: names, shapes and sizes of their columns.
+"""Readers of the files of a run's folder, which check names, shapes and sizes of their columns.
 
-Whoever reads a run comes by here: replay and its methods, the view, tables, measured traffic. A folder may be cut off,
+Replay, the view, tables and measured traffic read a run with them. A folder may be cut off,
 edited, or of another version of canprobe; the message then names file and column, and the version that wrote it.
 
-    summary.json   one object with `schema`; `written_by` says by which canprobe
+    summary.json   one object with `schema`; `written_by` names the version of canprobe
     scene.toml     read by `canprobe.cell.scene.load`
-    log.npz        a row a cycle: floats, `t_s` rises; columns of own controllers have any shape behind that
-    tactile.npz    a row a tactile frame
-    truth.npz      a row a SYNC
+    log.npz        a row for each cycle: floats, `t_s` rises; columns of users' controllers may have any further shape
+    tactile.npz    a row for each tactile frame
+    truth.npz      a row for each SYNC
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from canprobe.cell.tasks.probing import Phase
 from canprobe.errors import SceneError, UsageError, regular_file
 
 SCHEMA = 1
-"""Of ``summary.json``."""
+"""Version of ``summary.json``."""
 SUMMARY, LOG, TACTILE, TRUTH = "summary.json", "log.npz", "tactile.npz", "truth.npz"
 _MOST_SUMMARY_BYTES = 16 << 20
 _LATEST_S = 1e9
@@ -38,8 +38,8 @@ _WHOLE_NUMBERS = {"q_age": 1 << 31, "statusword": 0xFFFF, "tactile_age": 1 << 31
 
 Columns = dict[str, NDArray[Any]]
 _Shapes = Mapping[str, tuple[str, tuple[int | str, ...]]]
-"""Column → kinds of its numbers, as numpy's `dtype.kind` names them, and the shape of a row, by name where it is that
-of the cell."""
+"""By column: kinds of its numbers, as numpy's `dtype.kind` names them, and the shape of a row; sizes of the cell stand
+there by name."""
 
 _OF_LOG: _Shapes = {
     "t_s": ("f", ()),
@@ -80,10 +80,10 @@ _OF_TRUTH: _Shapes = {
 
 
 def read_summary(folder: Path) -> dict[str, Any] | None:
-    """The summary of a run; None where it left none, as one that was killed.
+    """The summary of a run; None where a run left none, as when it was killed.
 
     Raises:
-        UsageError: it is something else, or of another schema.
+        UsageError: when it is another kind of file, or of another schema.
     """
     file = folder / SUMMARY
     if not file.exists():
@@ -104,8 +104,8 @@ def read_scene(folder: Path) -> Scene:
     """The scene of a run.
 
     Raises:
-        UsageError: the folder has none.
-        SceneError: it cannot be loaded; with who wrote it, where that is another canprobe.
+        UsageError: when the folder has none.
+        SceneError: when it cannot be loaded; the message names the version that wrote it, where that is another one.
     """
     file = folder / SAVED_AS
     if not file.exists():
@@ -123,11 +123,11 @@ def read_log(file: Path, setup: Setup | None = None) -> Columns:
 
     Args:
         file: its path.
-        setup: of the run, for who makes something of its columns; without one, they may have any shape, as those of
-            own controllers do.
+        setup: setup of the run, with which shapes are checked; without one, columns may have any shape, as those of
+            users' controllers do.
 
     Raises:
-        UsageError: it cannot be read, or a column is not as a run writes it.
+        UsageError: when it cannot be read, or a column is not as a run writes it.
     """
     columns = _read(file, "the log of a run", _OF_LOG, setup)
     times = _times(columns, "t_s", file)
@@ -146,7 +146,7 @@ def read_log(file: Path, setup: Setup | None = None) -> Columns:
 
 
 def read_tactile(file: Path, setup: Setup | None = None) -> Columns:
-    """The columns of ``tactile.npz``; as `read_log`."""
+    """The columns of ``tactile.npz``; for arguments and errors see `read_log`."""
     columns = _read(file, "the tactile frames of a run", _OF_TACTILE, setup)
     if not columns:
         return columns
@@ -161,14 +161,14 @@ def read_tactile(file: Path, setup: Setup | None = None) -> Columns:
 
 
 def read_truth(file: Path, setup: Setup | None = None) -> Columns:
-    """The columns of ``truth.npz``; as `read_log`. Former names are understood, with one warning."""
+    """The columns of ``truth.npz``; see `read_log`. Former names are understood, with one warning."""
     prismatic = _prismatic(file.parent / LOG) if setup is None or setup.arm is None else setup.arm.model.chain.prismatic
     columns = with_present_names(read_npz(file, "the true values of a run"), prismatic, file)
     return _checked(columns, file, _OF_TRUTH, setup)
 
 
 def _prismatic(log: Path) -> tuple[bool, ...] | None:
-    """Which joints slide, by the log beside a truth that names no kind; None where it does not say."""
+    """Which joints are prismatic, by the log beside a truth that does not say so; None: nor does the log."""
     try:
         columns = read_npz(log)
     except UsageError:
@@ -192,12 +192,12 @@ READERS = {LOG: read_log, TACTILE: read_tactile, TRUTH: read_truth}
 
 
 def _read(file: Path, what: str, shapes: _Shapes, setup: Setup | None) -> Columns:
-    """The columns of a file, all numbers and of one length; of a setup, those that are known in their shapes."""
+    """Read the columns of a file and check them."""
     return _checked(read_npz(file, what), file, shapes, setup)
 
 
 def _checked(columns: Columns, file: Path, shapes: _Shapes, setup: Setup | None) -> Columns:
-    """Columns as they were read, after a look at their kinds and shapes."""
+    """The columns, after a check of their kinds and lengths; with a setup, of the shapes of known ones too."""
     sizes = _sizes(setup)
     rows = next((len(column) for column in columns.values() if column.ndim), 0)
     for name, column in columns.items():
@@ -219,7 +219,7 @@ _KINDS = {"f": "floats", "u": "counts (uint8)", "i": "integers", "biuf": "number
 
 
 def _sizes(setup: Setup | None) -> dict[str, int]:
-    """The sizes of a cell's rows, by the names of `_Shapes`; none of a part that it does not have."""
+    """The sizes of a cell's rows, by the names in `_Shapes`; without those of parts that it lacks."""
     if setup is None:
         return {}
     arm, array = setup.arm, setup.array
@@ -229,7 +229,7 @@ def _sizes(setup: Setup | None) -> dict[str, int]:
 
 
 def _times(columns: Columns, name: str, file: Path) -> NDArray[Any]:
-    """A column of times, s."""
+    """A column of times, s, checked."""
     needed(columns, (name,), file)
     times = columns[name]
     if times.ndim != 1 or times.dtype.kind != "f" or not (np.abs(times) < _LATEST_S).all():
@@ -238,7 +238,7 @@ def _times(columns: Columns, name: str, file: Path) -> NDArray[Any]:
 
 
 def _named(file: Path) -> str:
-    """What messages call a file of a folder: with who wrote it, where that is another canprobe."""
+    """Name of a file in messages: its path, and the version that wrote it, where that is another one."""
     try:
         summary = read_summary(file.parent)
     except UsageError:

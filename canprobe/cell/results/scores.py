@@ -1,20 +1,18 @@
-"""Scores of a run against the plant's truth: contact over the scan, shape after the first 20 mm; map and estimates."""
+"""Scores of a run against the plant's truth: contact over the scan, shape after the first 20 mm, and its bound."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import ContactSample
+from canprobe.mechanics.touch.estimate.noise import Correlation, make_noise
+from canprobe.mechanics.touch.surface import SurfaceMatrix
 from canprobe.mechanics.types import Floats
-
-if TYPE_CHECKING:
-    from canprobe.mechanics.touch.estimate.noise import Correlation
 
 RUN_IN_M = 0.020
 """Path after which the answers of an estimator count."""
@@ -31,9 +29,9 @@ def score_contact(truth: Mapping[str, Floats], first: int, last: int, target_n: 
     """Force, contact and speed over cycles ``first`` ≤ k < ``last``.
 
     Args:
-        truth: columns of the plant's truth, one row a SYNC.
-        first, last: the scan, as SYNC numbers.
-        target_n: wanted force.
+        truth: columns of the plant's truth, one row for each SYNC.
+        first, last: SYNC numbers of the scan.
+        target_n: wanted force, N.
     """
     force = truth["force_n"][first:last]
     points = truth["contact_point_m"][first:last]
@@ -56,11 +54,11 @@ class ShapeScore:
     Attributes:
         kappa_true_per_m: mean true principal curvatures (1/m) over the scored estimates; where none could be scored, as
             part of the curvature was not observed, over all after the run-in, or else over all.
-        kappa_est_per_m: mean estimated ones (1/m).
+        kappa_est_per_m: mean estimated principal curvatures (1/m).
         kappa_rms_error_per_m: RMS Frobenius norm of K_est − K_true (1/m).
-        kappa_rms_error_percent: the same relative to the RMS of ‖K_true‖; None on a plane.
-        normal_rms_deg, position_rms_mm: of the estimated contact frame.
-        estimates: how many were scored.
+        kappa_rms_error_percent: that error relative to the RMS of ‖K_true‖; None on a plane.
+        normal_rms_deg, position_rms_mm: RMS errors of the estimated contact frame.
+        estimates: number of scored estimates.
         observed_fraction: share of the answers after the run-in that observed all curvature.
         patch_fraction: share of the scored answers to which the contact patch contributed a tenth or more.
     """
@@ -81,7 +79,7 @@ def score_shape(records: Sequence[ShapeRecord], truth: Mapping[str, Floats], syn
 
     Args:
         records: the estimates.
-        truth: columns of the plant's truth, one row a SYNC.
+        truth: columns of the plant's truth, one row for each SYNC.
         sync_times: time of each SYNC on the master's clock (n,), s.
     """
     late = [r for r in records if r.travelled_m >= RUN_IN_M]
@@ -136,16 +134,14 @@ def bound_of_scan(
 
     Args:
         samples: the contacts of the scan.
-        truth: columns of the plant's truth, one row a SYNC.
+        truth: columns of the plant's truth, one row for each SYNC.
         sync_times: time of each SYNC on the master's clock (n,), s.
         memory_m: path that counts, m.
-        sigma_normal: of the normals, rad; that of the points is in the samples.
-        correlation: of the noise along the path.
-        coupling: of the errors of point and normal (`Noise`), 1/m.
+        sigma_normal: standard deviation of the normals, rad; that of the points is in the samples.
+        correlation: correlation of the noise along the path.
+        coupling: coupling of the errors of point and normal (`Noise`), 1/m.
     """
     from canprobe.mechanics.touch.estimate.likelihood import make_touches, osculating_bound
-    from canprobe.mechanics.touch.estimate.noise import make_noise
-    from canprobe.mechanics.touch.surface import SurfaceMatrix
 
     points = np.array([s.p_base for s in samples])
     normals = np.array([s.n_base for s in samples])

@@ -1,4 +1,4 @@
-"""What a run leaves behind: its summary, and the files of what was measured."""
+"""The summary of a run, and the files of its measurements."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def summarise(
     map_summary: dict[str, Any] | None = None,
     bridges: dict[str, dict[str, Any]] | None = None,
 ) -> dict[str, Any]:
-    """The content of ``summary.json``; what does not apply is None."""
+    """The content of ``summary.json``; a value that does not apply is None."""
     scene, cell = session.scene, session.cell
     cycle, direct = cell.cycle, scene.bus.direct
     sim_time = cycle.t_ns * 1e-9 if cycle is not None else 0.0
@@ -114,7 +114,7 @@ def _bus_load(session: Session) -> dict[str, Any]:
 
 
 def _traffic(session: Session) -> dict[str, Any]:
-    """The traffic of each bus beside the plan; that of a real one is counted afterwards, from the log.
+    """The traffic of each bus beside the plan; on a real bus it is counted afterwards, from the log.
 
     Without a log, or where it ends before the first SYNC, only the bus errors are known.
     """
@@ -154,7 +154,7 @@ def _contact(session: Session, record: TaskRecord, log: dict[str, Floats]) -> di
 
 
 def _hidden_force(session: Session, highest: float | None, log: dict[str, Floats]) -> list[str]:
-    """That the true force was above the limit, which acts on what the array measures."""
+    """Warning where the true force was above the limit, which acts on the measured force."""
     limit = session.scene.limits.force_max_n
     if not _truth(session) or highest is None or highest <= limit:
         return []
@@ -165,7 +165,7 @@ def _hidden_force(session: Session, highest: float | None, log: dict[str, Floats
 
 
 def _rms_error(values: Floats, target: float) -> float | None:
-    """RMS error over the cycles that have a value: a cycle in which the cell held has none."""
+    """RMS error over the cycles with a value: a cycle in which the cell held has none."""
     known = values[np.isfinite(values)]
     return float(np.sqrt(np.mean((known - target) ** 2))) if len(known) else None
 
@@ -179,15 +179,15 @@ def summarise_shape(
     *,
     map_summary: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """The section ``shape`` of ``summary.json``, of the first estimator and a table of all.
+    """The section ``shape`` of ``summary.json``: figures of the first estimator, and a table of all.
 
     Args:
-        setup: of the run.
-        tracker: its contacts; None without a shape.
+        setup: setup of the run.
+        tracker: tracker of its contacts; None without a shape.
         estimates: the answers of each estimator, by name.
         truth: columns of the plant's truth, one row per SYNC; empty without a truth.
         sync_times: time of each SYNC (n,), s, on the clock of the estimates.
-        map_summary: of the scan's surface map.
+        map_summary: section of the scan's surface map.
     """
     names = (
         *("method", "kappa_true_per_m", "kappa_est_per_m", "kappa_rms_error_per_m", "kappa_rms_error_percent"),
@@ -242,7 +242,7 @@ def _bound_ratio(
 
 
 def finite_or_none(values: Sequence[float] | Floats) -> list[float | None]:
-    """Floats for JSON; None for what was not observed, which is not finite."""
+    """Floats for JSON; None for a value that was not observed, which is not finite."""
     return [float(v) if np.isfinite(v) else None for v in values]
 
 
@@ -268,7 +268,7 @@ def _cycle(cell: Cell, record: TaskRecord) -> dict[str, Any]:
 
 
 def _observed(session: Session) -> dict[str, float | None] | None:
-    """Time that observers and bridges added to a cycle, after its work; None without any."""
+    """Time that observers and bridges added to a cycle, after its work; None without observers."""
     return _percentiles(list(session.observers.cost_ns)) if session.observers is not None else None
 
 
@@ -281,7 +281,7 @@ def _percentiles(values_ns: Sequence[int]) -> dict[str, float | None]:
 
 
 def write_columns(log: Mapping[str, Floats], tactile: Mapping[str, NDArray[Any]], out: Path) -> None:
-    """Write what a run measured, ``log.npz`` and ``tactile.npz``; as `write_files`."""
+    """Write the measurements of a run, ``log.npz`` and ``tactile.npz``; for errors see `write_files`."""
     _write_each(
         lambda: write_npz(out / "log.npz", log),
         lambda: write_npz(out / "tactile.npz", tactile) if tactile else None,
@@ -292,7 +292,7 @@ def write_files(result: RunData, out: Path) -> None:
     """Write the files of a run into ``out`` that the session has not written, without the figures.
 
     Raises:
-        ResultsError: a file cannot be written; no part of it is left, and the others are written all the same.
+        ResultsError: when a file cannot be written; no part of it is left, and the others are written.
     """
     text = json.dumps(result.summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
     found, surface_map = result.summary["calibration"], result.surface_map
@@ -306,7 +306,7 @@ def write_files(result: RunData, out: Path) -> None:
 
 
 def _write_each(*writers: Callable[[], None]) -> None:
-    """Write file by file; one that cannot be written does not cost the others."""
+    """Write the files one by one; where one cannot be written, the others still are."""
     failed = []
     for write in writers:
         try:

@@ -1,4 +1,4 @@
-"""The figure of a surface map: its surface over the true object, where passes cross, and their p-values."""
+"""The figure of a surface map: its surface over the true object, the crossings of passes, and their p-values."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PARTS = (("curvature", ORANGE), ("normal", BLUE), ("height", GREEN))
 
 
 def draw_surface(result: RunData, path: Path) -> None:
-    """Draw a run's surface map and write a PNG; nothing where there is none."""
+    """Draw a run's surface map and write a PNG; a run without a map has none."""
     if result.surface_map is None or result.consistency is None or not len(result.surface_map):
         return
     draw_map(
@@ -48,11 +48,11 @@ def draw_map(
     """Draw a map: its surface over the true object, crossings in the plane of the scan, their p-values.
 
     Args:
-        surface_map: with at least one patch.
-        path: of the PNG.
-        consistency: the tests at its crossings; None for `check_consistency`, which takes a second.
-        shape: the true object, for the ghost below the surface and for errors; None colours by σ.
-        title: first line.
+        surface_map: a map with at least one patch.
+        path: path of the PNG.
+        consistency: tests at its crossings; None: `check_consistency` makes them, which takes a second.
+        shape: true object, drawn below the surface and compared with it; None: the colour shows σ.
+        title: first line of the title.
     """
     walked = surface_map.path if len(surface_map.path) else surface_map.points
     plane = MapPlane.of(walked, surface_map.normals)

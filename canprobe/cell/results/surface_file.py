@@ -14,7 +14,7 @@ Columns (n patches, m path points; base frame; mixed units are SI in the stated 
 ``pose_known``             (n,)        1 where ``S_covariance_si`` has height and tilt
 ``observed``               (n, 2)      1 for each principal curvature that was observed
 ``combinations``           (n, 3, 3)   rows: observed combinations of (K11, √2 K12, K22); NaN beyond the rank
-``memory_m``               (n,)        path that the patch rests on
+``memory_m``               (n,)        path from which the patch was estimated
 ``innovation``             (n,)        mean squared whitened residual per degree of freedom
 ``path_m``                 (m, 3)      contact points
 =========================  ==========  ==============================================================================
@@ -24,7 +24,6 @@ from __future__ import annotations
 
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,9 +32,6 @@ from canprobe.cell.npz import read_npz, write_npz
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.surface_map import LocalPatch, SurfaceMap
 from canprobe.mechanics.types import Floats
-
-if TYPE_CHECKING:
-    pass
 
 FORMAT_VERSION = 1
 _PER_PATCH: dict[str, tuple[str, tuple[int, ...]]] = {
@@ -51,7 +47,7 @@ _PER_PATCH: dict[str, tuple[str, tuple[int, ...]]] = {
     "memory_m": ("distance_m", ()),
     "innovation": ("innovation", ()),
 }
-"""Column → field of a patch and shape."""
+"""Field of a patch and its shape, by column."""
 _COLUMNS = ("format_version", "method", "path_m", *_PER_PATCH)
 
 
@@ -75,7 +71,7 @@ def load_surface_map(path: str | PathLike[str]) -> SurfaceMap:
     """Read a map that `save_surface_map` or ``canprobe run`` has written.
 
     Args:
-        path: of the file, or of the folder of a run.
+        path: path of the file, or of the folder of a run.
 
     Returns:
         The map.

@@ -1,4 +1,4 @@
-"""What the panels of a surface figure share: the map, its tests, the true object, the plane of the scan."""
+"""Common data of the panels of a surface figure: the map, its tests, the true object, the plane of the scan."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from canprobe.mechanics.touch.tangent_frames import tangent_rotation
 from canprobe.mechanics.types import Floats
 
 MARGIN_M, TRUE_POINTS = 5e-3, 34
-"""How far a true surface is drawn beyond a path, and its points a side."""
+"""Margin of a true surface beyond the path, m, and its points on each side."""
 MAP_POINTS = 64
-"""Points of a map's surface along its longer side."""
+"""Number of points of a map's surface along its longer side."""
 
 
 class MapView(NamedTuple):
-    """A map, its tests, and the plane in which both are seen; `shape` is the true object or None."""
+    """A map, its tests, and the plane in which both are drawn; `shape` is the true object or None."""
 
     map: SurfaceMap
     consistency: Consistency
@@ -39,7 +39,7 @@ class MapPlane(NamedTuple):
 
     @classmethod
     def of(cls, path: Floats, normals: Floats) -> MapPlane:
-        """Of points of a path (n, 3), m, and outward normals (m, 3) along it."""
+        """Find the plane of a path (n, 3), m, with outward normals (m, 3) along it."""
         middle = 0.5 * (path.min(axis=0) + path.max(axis=0))
         outward = normals.mean(axis=0)
         R = tangent_rotation(outward / np.linalg.norm(outward))
@@ -54,13 +54,13 @@ class MapPlane(NamedTuple):
         return result
 
     def base(self, mm: Floats) -> Floats:
-        """The way back."""
+        """Points (..., 3) in mm along, across, outward, as points of base, m."""
         result: Floats = 1e-3 * mm @ self.axes + self.origin
         return result
 
 
 def rejected(consistency: Consistency) -> NDArray[np.bool_]:
-    """(n,) whether the joint test of each crossing rejects one surface."""
+    """Whether the joint test of each crossing rejects one surface (n,)."""
     return np.array([c.joint.p < SIGNIFICANCE_LEVEL for c in consistency.crossings], dtype=bool)
 
 

@@ -39,7 +39,7 @@ def draw_map_surface(part: Part, view: MapView) -> None:
 
 
 def _values(points: Floats, sigma: Floats, shape: PlacedShape | None) -> tuple[Floats, str, Colormap]:
-    """Values (rows, columns) of a surface, µm, what they are, and their colours."""
+    """Values (rows, columns) of a surface, µm, their name, and their colours."""
     if shape is None:
         return 1e6 * sigma, "σ of the surface's height (µm)", colormaps["viridis"]
     above = np.full(sigma.shape, np.nan)

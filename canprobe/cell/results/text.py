@@ -1,4 +1,4 @@
-"""A summary as text, as `canprobe run` and `canprobe replay` print it."""
+"""Text of a summary, which `canprobe run` and `canprobe replay` print."""
 
 from __future__ import annotations
 

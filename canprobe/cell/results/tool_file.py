@@ -1,4 +1,4 @@
-"""What a calibration found: for the summary, for people, and as a file that other scenes take."""
+"""The result of a tool calibration: in the summary, as text, and as a file that other scenes take."""
 
 from __future__ import annotations
 
@@ -86,14 +86,14 @@ def tool_text(found: Mapping[str, Any], name: str) -> str | None:
 def with_tool(scene: Scene, path: Path | str) -> Scene:
     """The scene with the probe's centre from a calibration's file; a real tool stays where the scene has it.
 
-    The emulated probe does not move: what the controller believes changes, and the plant's error with it.
+    The emulated probe does not move: the controller's belief changes, and the plant's error with it.
 
     Args:
-        scene: with a probe.
+        scene: a scene with a probe.
         path: ``tool.toml`` of a calibration.
 
     Raises:
-        SceneError: the file cannot be read or has other content, or the scene has no probe.
+        SceneError: when the file cannot be read or has other content, or the scene has no probe.
     """
     (document, file), reader = with_writer(read_toml(Path(path), str(path)), str(path)), Reader()
     table = document.get("probe")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.measured import MeasuredTraffic, TrafficMeter
@@ -19,9 +18,6 @@ from canprobe.fieldbus.bus.port import ERR_FLAG, is_bus_error
 from canprobe.fieldbus.protocol.frames import SYNC_ID
 from canprobe.fieldbus.protocol.sync import is_sync, long_syncs_text
 
-if TYPE_CHECKING:
-    pass
-
 LOG = "bus.log"
 
 
@@ -32,17 +28,17 @@ def measure_traffic(
 
     Args:
         log: a candump log, or the folder of a run.
-        scene: that ran, as for `canprobe.run`, or its plan.
-        channel: of the log; by default that of the scene's first bus, or the only one in the log.
-        exact: count stuff bits too, which takes a few µs per frame.
+        scene: the scene that ran, as for `canprobe.run`, or its plan.
+        channel: channel of the log; by default that of the scene's first bus, or the only one in the log.
+        exact: whether to count stuff bits, which takes a few µs per frame.
 
     Returns:
         Frames and bits (stuff bits included) of every class of messages, their times behind SYNC, and the identifiers
         that the plan does not list.
 
     Raises:
-        UsageError: the log cannot be read, has no SYNC on this channel, or several channels and none was named.
-        PlanError: the scene does not fit its bus.
+        UsageError: when the log cannot be read, has no SYNC on this channel, or has several channels and none is named.
+        PlanError: when the scene does not fit its bus.
     """
     path = Path(log) / LOG if Path(log).is_dir() else Path(log)
     plan = scene if isinstance(scene, Plan) else make_plan(resolve(load_scene(scene)))

@@ -8,21 +8,21 @@ it stops everything in the reverse order: drives disabled, logs flushed, bus clo
     session         one cell from bring-up to safe stop
     target          the bus of a run or a command: interface, channels and bit rate, put into a scene by one function
     buses           ports, buses in virtual time, routes between several buses, counters of their frames
-    links           how the interfaces are set, checked before anything is sent
-    link_faults     what is wrong with the setting of one interface
+    links           check of the interfaces' settings before anything is sent
+    link_faults     faults in the setting of one interface
     folder          the folder of a run before its first frame
     direct          a cell without a bus
     rehearsal       the scene of a short run in lockstep, before a real one
-    bus_record      what is recorded of its buses
+    bus_record      record of its buses
     child_process   a process beside the master
     emulator_child  the process of the emulated nodes
     children        the processes of the bridges to other tools
-    up              a cell that is held for days
+    up              a cell that holds its position for days
     check_joints, home   the joints of a cell, one after the other: which is which, and their zeros
     looking         a bus without a cell: scan, node ids, monitor
     emulation       emulated nodes for other masters
     array_calibration    touches of known objects, visit by visit, and the fit
-    terminal        what a terminal can show: steps and a progress bar
+    terminal        steps and a progress bar on a terminal
 
 A session holds the `Scene`, because scenes cross processes as text.
 """

@@ -1,4 +1,4 @@
-"""Touch a plane, a ball and a rod with the arm of a cell, and calibrate its array by what it shows of them.
+"""Touch a plane, a ball and a rod with the arm of a cell, and calibrate its array by the images of them.
 
 Thirty-nine touches: the plane at 4 places of the pad with 3 forces, three reference loads, two short rolls to and fro
 at two speeds along both axes of the pad; the ball at 9 places with 2 forces; plane and ball once more with the probe
@@ -41,22 +41,22 @@ from canprobe.mechanics.touch.patch.image_fit import Dwell
 from canprobe.mechanics.types import Floats
 
 Ask = Callable[[str], str]
-"""Asks a person: takes the text, gives the answer."""
+"""Asks a person a text, and returns the answer."""
 
-PACKAGED_AT: Vec3 = (-120.0, -122.5, 374.0)
-"""The point of a packaged cell, mm."""
-BELOW_M = 5e-3
-"""From the probe in the start posture down to the point that is touched."""
+PACKAGED_POINT_MM: Vec3 = (-120.0, -122.5, 374.0)
+"""Point that the packaged cells touch first, mm, base frame."""
+POINT_BELOW_PROBE_M = 5e-3
+"""Distance from the probe in the start posture down to the point that is touched, m."""
 REST_S = 30.0
 PLANE_FORCES_N, BALL_FORCES_N, LOADS_N = (0.7, 1.5, 3.0), (0.8, 2.0), (1.0, 2.0, 3.0)
 CORNERS_M = tuple((u, v) for u in (-2e-3, 2e-3) for v in (-2e-3, 2e-3))
 GRID_M = tuple((u, v) for u in (-2e-3, 0.0, 2e-3) for v in (-2e-3, 0.0, 2e-3))
 LOAD_S = 9.0
-"""Reference loads rest longer: what creeps has then crept, and a scale has come to rest."""
+"""Time of a reference load, s: creep has ended by then, and a scale shows a steady value."""
 STROKE_M, STROKE_HZ, STROKE_S = (0.5e-3, 0.0), (0.5, 1.5), 8.0
 ROD_ANGLES_DEG = (0.0, 45.0)
 EFFECTIVE_REST_S = 0.5
-"""From the moment in which the force is reached to the first image whose force counts."""
+"""Time from the moment when the force is reached to the first image whose force counts, s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +65,8 @@ class KnownObject:
 
     Attributes:
         name: "plane", "ball" or "rod".
-        radius: m; infinite for a plane.
-        angle: of a rod's axis from base x, rad.
+        radius: its radius, m; infinite for a plane.
+        angle: angle of a rod's axis from base x, rad.
     """
 
     name: str
@@ -74,7 +74,7 @@ class KnownObject:
     angle: float = 0.0
 
     def asked_for(self, at: Sequence[float]) -> str:
-        """What a person has to do."""
+        """Instruction for the person who places it."""
         where = "({:g}, {:g}, {:g}) mm of the base frame".format(*at)
         if self.name == "plane":
             return f"Place the plane level, its surface at {where}."
@@ -86,7 +86,7 @@ class KnownObject:
         )
 
     def settings(self, at: Vec3) -> ObjectSettings:
-        """The same for an emulated cell."""
+        """Settings of the object in an emulated cell."""
         if self.name == "plane":
             return ObjectSettings("plane", position_mm=at)
         kind = "sphere" if self.name == "ball" else "cylinder"
@@ -100,11 +100,11 @@ class Visit:
 
     Attributes:
         known: the object.
-        presses: on it.
+        presses: presses on it.
         first: number of the first place.
-        turned: the probe is turned about its pole by half a turn.
-        rest_s: listened to before the first touch.
-        load: each press is a reference load.
+        turned: whether the probe is turned about its pole by half a turn.
+        rest_s: time of images without load before the first touch, s.
+        load: whether each press is a reference load.
     """
 
     known: KnownObject
@@ -120,11 +120,11 @@ def visits(ball_radius: float, rod_radius: float, *, loads: bool, one_by_one: bo
 
     Args:
         ball_radius, rod_radius: m.
-        loads: reference loads are among them.
-        one_by_one: a person reads each reference load, so that the probe lets go after it.
+        loads: whether there are reference loads.
+        one_by_one: whether a person reads each reference load, so that the probe lets go after it.
     """
     plane, ball = KnownObject("plane", math.inf), KnownObject("ball", ball_radius)
-    # a light touch after a heavy one reads too much by what the array remembers: forces only grow
+    # after a heavy touch hysteresis raises the reading of a light one: forces only grow
     light, middle, heavy = (
         [Press(force, at, heading=0.8 * i) for i, at in enumerate(CORNERS_M)] for force in PLANE_FORCES_N
     )
@@ -144,18 +144,18 @@ def visits(ball_radius: float, rod_radius: float, *, loads: bool, one_by_one: bo
 
 @dataclass(frozen=True, slots=True)
 class CalibrationRequest:
-    """What is calibrated, and how.
+    """The array to calibrate, and the way to do it.
 
     Attributes:
-        cell: name or path.
-        target: interface and channels; None: the cell's.
+        cell: name or path of the cell.
+        target: interface and channels; None: those of the cell.
         at: point that is touched first, mm, base frame; None: the point under the probe in the start posture, or
-            `PACKAGED_AT` of a packaged cell.
+            `PACKAGED_POINT_MM` of a packaged cell.
         ball_radius, rod_radius: m.
-        reference: what newtons rest on.
+        reference: reference of the newtons.
         sigma: its relative standard deviation.
-        own_gains: the file is of this array; False: of its make.
-        seed: of the emulation.
+        own_gains: whether the file is for this array; False: for all arrays of its make.
+        seed: seed of the emulation.
     """
 
     cell: str | Path
@@ -171,13 +171,13 @@ class CalibrationRequest:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibrated:
-    """What a calibration found.
+    """Result of a calibration.
 
     Attributes:
-        fit: with the calibration.
+        fit: the fit, which has the calibration.
         restless: taxels that show counts without load, (row, column).
         drift_counts: RMS change of the images from the first to the last second without load.
-        notes: what was not done, and why.
+        notes: steps that were left out, and why.
     """
 
     fit: ArrayFit
@@ -189,26 +189,26 @@ class Calibrated:
 def calibrate(
     request: CalibrationRequest, *, date: str, ask: Ask | None = None, say: Say = quiet, out: Path | None = None
 ) -> Calibrated:
-    """Touch everything, and fit.
+    """Touch all objects, and fit the calibration.
 
     Args:
-        request: what and how.
-        date: for the file, ISO 8601.
-        ask: a person at a real cell; None: nobody is asked, which an emulated cell does not need.
+        request: the array and the way to do it.
+        date: date for the file, ISO 8601.
+        ask: asks a person at a real cell; None for an emulated cell.
         say: called with each step.
-        out: folder for the recorded buses, one folder a visit; None keeps none.
+        out: folder for the recorded buses, with a folder for each visit; None keeps none.
 
     Raises:
-        UsageError: the cell cannot do it, or a person is needed and nobody is asked.
-        PlanError: the point is out of reach.
-        SafetyStop, BusError: as of a run.
+        UsageError: when the cell cannot do it, or a person is needed and `ask` is None.
+        PlanError: when the point is out of reach.
+        SafetyStop, BusError: as in a run.
     """
     scene = _scene(request)
     at = scene.task.start_mm
     assert scene.sensor is not None and scene.arm is not None
     emulated = scene.sensor.emulated
     if not emulated and ask is None:
-        raise UsageError("a real array: somebody has to place the objects; leave --yes out")
+        raise UsageError("a real array: a person has to place the objects; leave --yes out")
     loads = request.reference in ("scale", "weights")
     every = list(visits(request.ball_radius, request.rod_radius, loads=loads, one_by_one=not emulated))
     notes: list[str] = []
@@ -219,7 +219,7 @@ def calibrate(
             notes.append(f"the {visit.known.name} with the probe turned: the last joint cannot turn by half a turn")
             continue
         planned.append((number, visit, _plan(replace(there, object=visit.known.settings(at)), visit)))
-    array = resolve(scene).array  # as it is now: its files may change while it is touched
+    array = resolve(scene).array  # read before the touches: its files may change meanwhile
     assert array is not None
     dwells: list[Dwell] = []
     unloaded: list[NDArray[np.uint8]] = []
@@ -251,13 +251,13 @@ def calibrate(
 
 
 def _scene(request: CalibrationRequest) -> Scene:
-    """A press on the cell; without a time on the wire where it is emulated in lockstep."""
+    """The scene of a press on the cell; on a lockstep bus frames take no time."""
     scene = load_scene("press", {"cell": request.cell})
     if request.target is not None:
         scene = request.target.applied_to(scene)
     bus = replace(scene.bus, timed=False) if scene.bus.interface == LOCKSTEP else scene.bus
     info = replace(scene.scene, name="calibrate-array", seed=request.seed, figures=False)
-    at = request.at or (PACKAGED_AT if str(request.cell) in packaged_files("cells") else _under_probe(scene))
+    at = request.at or (PACKAGED_POINT_MM if str(request.cell) in packaged_files("cells") else _under_probe(scene))
     task = replace(scene.task, start_mm=at, approach_normal=(0.0, 0.0, 1.0), force_n=max(PLANE_FORCES_N))
     scene = replace(scene, scene=info, bus=bus, task=task, object=ObjectSettings("plane", position_mm=at))
     setup = resolve(scene)
@@ -273,7 +273,7 @@ def _under_probe(scene: Scene) -> Vec3:
     setup = resolve(scene)
     assert setup.arm is not None
     centre = (forward(setup.arm.model.chain, setup.arm.q_start) @ setup.probe.T_flange_probe)[:3, 3]
-    x, y, z = (1e3 * (centre - (0.0, 0.0, setup.probe.radius + BELOW_M))).round(1).tolist()
+    x, y, z = (1e3 * (centre - (0.0, 0.0, setup.probe.radius + POINT_BELOW_PROBE_M))).round(1).tolist()
     return x, y, z
 
 
@@ -281,7 +281,7 @@ def _plan(scene: Scene, visit: Visit) -> Plan:
     """The plan of a visit, whose touches and rolls the arm reaches.
 
     Raises:
-        PlanError: it does not; with the option to type.
+        PlanError: when it does not; the message has the option to type.
     """
     where = f"{visit.known.name} at ({', '.join(f'{value:g}' for value in scene.task.start_mm)}) mm"
     try:
@@ -315,7 +315,7 @@ def _turned(scene: Scene) -> Scene | None:
 def touch_object(
     plan: Plan, visit: Visit, out: Path | None, say: Say, ask: Ask | None
 ) -> tuple[list[Dwell], list[NDArray[np.uint8]]]:
-    """Bring the cell up, touch, stop; the touches, and what the array showed before. `ask` reads reference loads."""
+    """Bring the cell up, touch, stop; the touches, and the images before them. `ask` asks for reference loads."""
     task, roll = plan.setup.task, _roll_task(plan, visit)
     assert isinstance(task, Touch)
     with Session(plan, RunOptions(out, say)) as session:
@@ -348,9 +348,9 @@ def _roll_task(plan: Plan, visit: Visit) -> RollTask:
 
 
 def _read(ask: Ask | None, force: float) -> float:
-    """A force (N) that a person reads."""
+    """Ask a person for the force (N) of a reference."""
     if ask is None:
-        raise UsageError("reference loads: somebody has to read them; leave --yes out")
+        raise UsageError("reference loads: a person has to read them; leave --yes out")
     while True:
         answer = ask(f"Reading of the reference during the load of about {force:g} N, in N: ")
         try:
@@ -362,7 +362,7 @@ def _read(ask: Ask | None, force: float) -> float:
 
 
 def _along_rod(plan: Plan, known: KnownObject) -> float:
-    """Heading on the pad, rad, of a rod's axis."""
+    """Heading of a rod's axis on the pad, rad."""
     arm, probe = plan.setup.arm, plan.setup.probe
     assert arm is not None
     x, y = (forward(arm.model.chain, arm.q_start) @ probe.T_flange_probe)[:2, 0].tolist()
@@ -373,15 +373,15 @@ def _along_rod(plan: Plan, known: KnownObject) -> float:
 def as_dwell(  # noqa: PLR0917
     pressed: RollRecord, visit: Visit, start: Floats, probe_radius: float, place: int, force: float | None
 ) -> Dwell:
-    """A touch as the fit takes it: where its contacts should lie by joints and object.
+    """Make the input of the fit from a touch: where its contacts should lie by joints and object.
 
     Args:
-        pressed: what was recorded.
-        visit: of the object, level under the probe.
-        start: its highest point (3,), m.
-        probe_radius: m.
-        place: its number.
-        force: by the reference, N.
+        pressed: record of the touch.
+        visit: visit of the object, which is level under the probe.
+        start: highest point of the object (3,), m.
+        probe_radius: radius of the probe, m.
+        place: number of the place.
+        force: force by the reference, N.
     """
     known, up = visit.known, np.array([0.0, 0.0, 1.0])
     axis = np.array([math.cos(known.angle), math.sin(known.angle), 0.0])

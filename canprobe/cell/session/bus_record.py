@@ -26,15 +26,15 @@ class BusRecord:
     """Record of every bus of a run. A context manager: leaving closes ``bus.log``.
 
     Args:
-        plan: of the run.
+        plan: plan of the run.
         out: folder for ``bus.log``, which the first `writer` prepares; None writes nothing.
-        observers: get the frames; None where there are none.
+        observers: observers that get the frames; None where there are none.
 
     Attributes:
         origin_ns: time on the clock of the buses from which the log counts.
         traffic: counter of each channel.
-        meters: those of a lockstep bus, which compare the traffic with the plan while it is there; on a real bus
-            that is done afterwards, from the log.
+        meters: meters of a lockstep bus, which compare the traffic with the plan during the run; on a real bus
+            the log is compared afterwards.
     """
 
     def __init__(self, plan: Plan, out: Path | None, observers: Observers | None) -> None:
@@ -57,7 +57,7 @@ class BusRecord:
         self._stack.close()
 
     def writer(self, channel: str) -> Write:
-        """What takes each frame of a bus."""
+        """Make the function that takes each frame of a bus."""
         bus = self._plan.scene.bus
         if bus.interface == LOCKSTEP:
             self.traffic[channel] = self.meters[channel] = TrafficMeter(self._plan, channel, exact=False)
@@ -77,7 +77,7 @@ class BusRecord:
         return write
 
     def error_writer(self, channel: str) -> Write:
-        """What takes each error frame of a bus: it is counted and written into the log."""
+        """Make the function that counts each error frame of a bus and writes it into the log."""
 
         def note(can_id: int, data: bytes, t_ns: int) -> None:
             self.traffic[channel].error_frames += is_bus_error(can_id)
@@ -87,12 +87,12 @@ class BusRecord:
         return note
 
     def failure(self) -> str | None:
-        """Why frames are no longer written down; None while they are."""
+        """Why frames are no longer written into the log; None while they are."""
         return self._candump.failure if self._candump is not None else None
 
     @contextmanager
     def timed(self, clock: Clock) -> Iterator[None]:
-        """Take the time that the loads refer to."""
+        """Measure the time over which the loads are taken."""
         start_ns = clock.now_ns()
         try:
             yield
@@ -100,7 +100,7 @@ class BusRecord:
             self._time_ns = clock.now_ns() - start_ns
 
     def load(self, channel: str) -> float | None:
-        """Measured share of a bus's bit rate, from the first frame to the last."""
+        """Measured load, a share of the bit rate; None where nothing was measured."""
         if channel not in self.traffic or self._time_ns <= 0:
             return None
         return self.traffic[channel].bits / (self._plan.scene.bus.bitrate * self._time_ns * 1e-9)

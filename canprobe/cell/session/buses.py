@@ -1,11 +1,10 @@
-"""What a session opens: buses in virtual time, the routes between several of them, and what counts their frames."""
+"""Buses that a session opens: ports, buses in virtual time, routes between several buses, counters of frames."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
-from typing import TYPE_CHECKING
 
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.planning.wire_time import exact_frame_bits
@@ -17,9 +16,6 @@ from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 from canprobe.fieldbus.protocol.frame_bits import best_case_bits, best_case_fd_bits, exact_bits
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE
 
-if TYPE_CHECKING:
-    pass
-
 
 class TrafficCounter:
     """Counts frames and bits of a bus in real time; bits without stuffing, as `canbusload -i` counts.
@@ -28,7 +24,7 @@ class TrafficCounter:
         speed_up: data bit rate of CAN FD over the nominal one.
 
     Attributes:
-        error_frames: bus errors, to be counted by who hears of them.
+        error_frames: number of bus errors; whoever receives one counts it here.
     """
 
     def __init__(self, speed_up: float) -> None:
@@ -38,12 +34,12 @@ class TrafficCounter:
 
     @property
     def frames(self) -> int:
-        """Frames so far."""
+        """Number of frames so far."""
         return sum(self._by_length)
 
     @property
     def bits(self) -> int:
-        """Bits so far, those of a data phase as bits of the nominal rate."""
+        """Number of bits so far, those of a data phase in bits of the nominal rate."""
         classic = sum(count * best_case_bits(n) for n, count in enumerate(self._by_length[:9]))
         long = [(count, best_case_fd_bits(n)) for n, count in enumerate(self._by_length[9:], start=9) if count]
         return classic + round(sum(count * (bits.nominal + bits.data / self._speed_up) for count, bits in long))
@@ -53,7 +49,7 @@ class TrafficCounter:
         self._by_length[len(data)] += 1
 
     def take(self, frames: Sequence[TimedFrame]) -> None:
-        """Count some."""
+        """Count several frames."""
         for _, data, _ in frames:
             self._by_length[len(data)] += 1
 
@@ -65,12 +61,12 @@ def open_ports(
     """The ports of a plan's buses, by channel; closed at the end.
 
     Args:
-        plan: whose buses.
-        clock: in real time.
-        reports: makes, of a channel, who hears what its port has to report.
+        plan: plan of the buses.
+        clock: clock in real time.
+        reports: makes the receivers of a port's reports, by channel.
 
     Raises:
-        InterfaceError: one is missing, down, or cannot be opened.
+        InterfaceError: when an interface is missing, down, or cannot be opened.
     """
     from canprobe.fieldbus.bus.real.opening import open_port
 
@@ -88,7 +84,7 @@ def open_ports(
 
 
 def channel_routes(plan: Plan) -> dict[int, str]:
-    """Which bus each identifier belongs to, of those that one node alone sends or reads."""
+    """Channel of each identifier that only one node sends or reads."""
     routes = {frames.can_id: frames.channel for frames in plan.raw}
     routes |= {pdo.cob_id: pdo.channel for pdo in plan.pdos}
     for node in plan.nodes:

@@ -10,6 +10,7 @@ from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.session import Session
 from canprobe.cell.session.up import ROWS_OF_UP
+from canprobe.cell.tasks.joint_check import JointCheck
 from canprobe.errors import NodeError, UsageError
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.types import Floats
@@ -23,7 +24,7 @@ def check_joints(scene: Scene, *, operator: Operator | None = None, say: Say = q
     """Bring the cell up, move each joint by 1 deg at 2 deg/s (3.5 mm at 7 mm/s) and back, and stop it safely.
 
     Args:
-        scene: with an arm.
+        scene: a scene with an arm.
         operator: asked before and after each motion; None leaves the questions out.
         say: called with each step and each finding.
 
@@ -31,14 +32,12 @@ def check_joints(scene: Scene, *, operator: Operator | None = None, say: Say = q
         One finding for each joint, all without a fault.
 
     Raises:
-        UsageError: the scene does not fit or has no arm.
-        NodeError: a joint has a fault; it names all of them.
-        BusError, SafetyStop: as :func:`canprobe.run`.
+        UsageError: when the scene does not fit or has no arm.
+        NodeError: when a joint has a fault; the message names all of them.
+        BusError, SafetyStop: as in :func:`canprobe.run`.
     """
     if scene.arm is None:
         raise UsageError(f"up --check-joints: scene {scene.name} has no [arm]")
-    from canprobe.cell.tasks.joint_check import JointCheck
-
     plan = make_plan(resolve(scene))
     assert plan.setup.arm is not None
     arm, check = plan.setup.arm, JointCheck(plan, operator)
@@ -59,7 +58,7 @@ def check_joints(scene: Scene, *, operator: Operator | None = None, say: Say = q
 
 
 def _zero_pose(model: ArmModel, start: Floats) -> str:
-    """Where the arm has to be if its zeros are right, for a look at its marks."""
+    """Pose of the arm if its zeros are right, to compare with the marks on it."""
     units = [joint.unit for joint in model.joints]
     each = [f"{joint.shown(q):.2f}" for joint, q in zip(model.joints, start, strict=True)]
     positions = f"{', '.join(each)} {units[0]}"

@@ -1,4 +1,4 @@
-"""A process of this package beside the master: its scene, its last words, and nothing left of it at the end."""
+"""A process of this package beside the master: its start with a scene, its last message, its removal."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ _PR_SET_PDEATHSIG = 1
 
 
 def with_our_imports() -> dict[str, str]:
-    """The environment in which `python -P -m` imports what this process does, whatever lies in the working folder."""
+    """Environment in which `python -P -m` imports the same modules as this process, whatever the working folder has."""
     return {**os.environ, "PYTHONPATH": os.pathsep.join(os.path.abspath(path) for path in sys.path)}
 
 
 def end_with_parent(parent: int, number: int = signal.SIGTERM) -> None:
-    """In the child: get a signal when the parent is killed. Linux only, and only a second line of defence.
+    """Called in the child: get a signal when the parent is killed. Linux only, a second line of defence.
 
     Args:
-        parent: its process id; if it has gone already, this process gets the signal at once.
-        number: of the signal.
+        parent: process id of the parent; if it has ended already, this process gets the signal at once.
+        number: number of the signal.
     """
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
@@ -42,7 +42,7 @@ def end_with_parent(parent: int, number: int = signal.SIGTERM) -> None:
 class ChildProcess:
     """A Python module that runs as a process with the scene of a plan.
 
-    It runs in another session, so that Ctrl-C reaches only the master, which stops the drives before their process.
+    It runs in a separate session, so that Ctrl-C reaches only the master, which stops the drives before their process.
 
     Attributes:
         folder: temporary folder of the process, which `remove` removes.
@@ -56,10 +56,10 @@ class ChildProcess:
     def launch(
         self, plan: Plan, words: Sequence[str], *, stdin: int = subprocess.DEVNULL, stdout: int = subprocess.DEVNULL
     ) -> None:
-        """Write the scene's files into the folder, as they were read for the plan, and start the process.
+        """Write the scene's files into the folder, as the plan has them, and start the process.
 
         Args:
-            plan: whose scene.
+            plan: plan with the scene.
             words: module to run, and its arguments.
             stdin, stdout: as for `subprocess.Popen`.
         """

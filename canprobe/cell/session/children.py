@@ -1,4 +1,4 @@
-"""The bridges of a run: started before its bus is opened, fed by its cycles, ended after its summary.
+"""The bridges of a run: they start before its bus is opened, get its cycles, and end after its summary.
 
 Nothing of `canprobe.lab.bridge` is imported unless a bridge is asked for, and then by name.
 """
@@ -19,16 +19,16 @@ from canprobe.cell.tasks.free_and_listen import HoldTask
 
 
 class Bridges:
-    """Every bridge that a scene asks for. A context manager: leaving ends those that are still there.
+    """All bridges that a scene asks for. A context manager: leaving ends those that still run.
 
     Args:
-        plan: of the run.
+        plan: plan of the run.
         out: folder of the run; None where no files are written.
-        virtual: the run is not in real time.
-        say: called with where each bridge is to be found.
+        virtual: whether the run is in virtual time.
+        say: called with the address of each bridge.
 
     Attributes:
-        observers: what the cell has to feed, one a bridge.
+        observers: one observer of the cell for each bridge.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class Bridges:
         """Start every bridge.
 
         Raises:
-            UsageError: one cannot be had, or could not begin; none is left.
+            UsageError: when a bridge is not installed or cannot start; then no bridge runs.
         """
         if not self._names:
             return self
@@ -57,7 +57,9 @@ class Bridges:
             for bridge in self.observers:
                 self._say(f"bridge {bridge.name}: {bridge.await_ready()}")
         except BaseException:
-            self._kill()
+            for bridge in self.observers:
+                bridge.kill()
+            self.observers = []
             raise
         return self
 
@@ -67,10 +69,10 @@ class Bridges:
         self.end(None)
 
     def open_to_requests(self, task: Controller | None, make: Callable[[], Controller] | None = None) -> Controller:
-        """The task, which other tools may start, stop and set where the scene allows that.
+        """The task, which other tools may start, stop and change where the scene allows it.
 
         Args:
-            task: None holds the arm still.
+            task: the task; None holds the arm still.
             make: makes a new task at every start; None where the task runs once, from the beginning.
         """
         settings = self._plan.scene.bridge
@@ -82,14 +84,14 @@ class Bridges:
         return RequestedTask(task, make, requests, self._plan.sync.period_ns * 1e-9, self._plan)
 
     def status(self) -> dict[str, dict[str, Any]] | None:
-        """What stands in the summary of each bridge; None without any."""
+        """Entry of each bridge in the summary; None without bridges."""
         return {bridge.name: bridge.status() for bridge in self.observers} or None
 
     def end(self, summary: dict[str, Any] | None) -> dict[str, dict[str, Any]] | None:
         """Hand the summary to every bridge, and end them. Twice is allowed.
 
         Returns:
-            Their status then, as `status`.
+            Their final status, as `status`.
         """
         bridges, self.observers = self.observers, []
         text = None if summary is None else json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
@@ -102,8 +104,3 @@ class Bridges:
             for bridge in bridges:  # an interrupt has cut the end of one short
                 bridge.kill()
         return statuses or None
-
-    def _kill(self) -> None:
-        for bridge in self.observers:
-            bridge.kill()
-        self.observers = []

@@ -1,12 +1,11 @@
-"""No bus: a cycle that exchanges counts and images with emulated nodes, in the place of frames.
+"""A cycle without a bus: it exchanges counts and images with emulated nodes, in the place of frames.
 
 The nodes are those of a lockstep bus, with their drives, array, plant and PDO parameters, and everything happens in the
 order and at the instants of a lockstep bus whose frames take no time: at a SYNC targets are latched, then positions and
 images are sampled; controlwords that go on change act when the commands are sent. So log and truth are the same to the
-last bit. What is left out is what lies between: packing, frames and their arbitration, SDO, the log of the bus.
+last bit. Left out is what lies between: packing, frames and their arbitration, SDO, the log of the bus.
 
-What a node sends by itself, its heartbeat and its emergencies, is handed over as it is: the supervision is that of a
-bus.
+Heartbeats and emergencies, which a node sends by itself, are handed over unchanged: the supervision is that of a bus.
 """
 
 from __future__ import annotations
@@ -46,12 +45,12 @@ Hear = Callable[[int, bytes, int], object]
 
 
 class DirectNodes:
-    """The emulated nodes of a world as their master reaches them without a bus.
+    """The emulated nodes of a world, reached without a bus.
 
     Args:
-        world: all nodes of the plan.
-        plan: their configuration.
-        hear: takes what a node sends by itself.
+        world: the world with all nodes of the plan.
+        plan: the plan, which has their configuration.
+        hear: takes the frames that a node sends by itself.
         see: takes the array's frames.
     """
 
@@ -71,7 +70,7 @@ class DirectNodes:
         """Power on, configure and start all nodes, so that they are operational at `t_ns`.
 
         Raises:
-            NodeError: one refuses what its scene requires.
+            NodeError: when a node refuses a required write.
         """
         power_on_ns = t_ns - max(node.core.quirks.boot_ns for node in self._nodes)
         for node in self._nodes:
@@ -103,9 +102,9 @@ class DirectNodes:
         """A SYNC: every node latches its targets and samples.
 
         Args:
-            t_ns: when.
-            counter: of the SYNC; 0 where it has none.
-            take: called with the COB-ID of each TPDO of a drive, its values, and when.
+            t_ns: time of the SYNC.
+            counter: counter of the SYNC; 0 where it has none.
+            take: called with the COB-ID of each TPDO of a drive, its values, and the time.
         """
         for core, exchange, of_drive in self._stations:
             core.now_ns = t_ns
@@ -120,7 +119,7 @@ class DirectNodes:
             self._recorder.receive(SYNC_ID, bytes((counter,)), t_ns)
 
     def command(self, commands: Sequence[DriveCommand], t_ns: int) -> None:
-        """RPDOs, whose parts go to one drive each."""
+        """Give the RPDOs to the drives; each part of one is for one drive."""
         for cob_id, _, parts in commands:
             for (core, rpdo), values in zip(self._rpdos[cob_id], parts, strict=True):
                 core.now_ns = t_ns
@@ -137,13 +136,13 @@ class DirectNodes:
 def tactile_frame(
     header: TactileHeader, content: NDArray[np.uint8] | Features, shape: tuple[int, int], t_ns: int
 ) -> TactileFrame:
-    """What arrives of a frame: the taxels that it carries, or the features as they are rounded on the wire.
+    """The frame that the master receives: the taxels that it carries, or the features as rounded on the wire.
 
     Args:
-        header: of the frame.
-        content: of the sensor: the full pad, or features.
+        header: header of the frame.
+        content: image of the full pad, or features.
         shape: rows and columns of the pad.
-        t_ns: when.
+        t_ns: time of its arrival.
     """
     if isinstance(content, Features):
         return frame_of(header, Features.unpack(content.pack(), content.peak), shape, t_ns)
@@ -157,7 +156,7 @@ def configure(node: SlaveNode, setup: NodeSetup) -> None:
     A node does not watch for its master, which is in the same process and cannot fall silent.
 
     Raises:
-        NodeError: the node refuses a value that is required.
+        NodeError: when the node refuses a required value.
     """
     times = [[write for write in setup.writes if write.index == INTERPOLATION_TIME], *setup.otherwise]
     for write in setup.writes:
@@ -174,7 +173,7 @@ def configure(node: SlaveNode, setup: NodeSetup) -> None:
 
 
 def _takes(dictionary: Dictionary, write: Write) -> bool:
-    """Whether a node takes a value, with the bits that are its own as it holds them, or holds it already."""
+    """Whether a node takes a value, or that value with the bits that the device sets, or holds it already."""
     held = dictionary.number(write.index, write.subindex)
     for value in (write.value, write.value & ~write.own_bits | held & write.own_bits):
         try:

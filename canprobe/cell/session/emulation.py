@@ -1,4 +1,4 @@
-"""Emulated nodes on a real interface: those of a scene, or one from each EDS file."""
+"""Emulated nodes on a real interface: the nodes of a scene, or one node from each EDS file."""
 
 from __future__ import annotations
 
@@ -54,27 +54,27 @@ def emulate(
     """Serve emulated nodes on a real interface until interrupted, for any master.
 
     Args:
-        scene: whose nodes.
-        target: the bus, and what stands for the scene's other channels; a channel that it does not name is the bus.
-        node_ids: which nodes.
-        seed: in the place of the scene's.
+        scene: the scene of the nodes.
+        target: the bus, and names for the scene's other channels; a channel that it does not name is the bus.
+        node_ids: ids of the nodes to serve.
+        seed: replaces the seed of the scene.
         truth_path: file for the plant's true values, written at the end.
-        origin_ns: time on CLOCK_MONOTONIC that is 0 in that file; by default when the nodes begin to be served.
-        store_folder: folder with a file for each node, where its 1010h and LSS store; None forgets at the end.
-        without_id: which of the nodes start without a node id, for LSS to give them one.
-        homed: drives that have to be homed start with their zeros, and keep them.
+        origin_ns: time on CLOCK_MONOTONIC that is 0 in that file; by default the time when the nodes begin.
+        store_folder: folder with a file for each node, where 1010h and LSS store; None: it forgets at the end.
+        without_id: ids of the nodes that start without a node id and wait for LSS.
+        homed: whether drives that need homing start with their zeros, and keep them.
         say: called when the nodes are about to be served.
 
     Raises:
-        UsageError: the scene does not fit, or a file of `store_folder` is not of its node.
-        InterfaceError: no such interface.
-        NodeError: somebody on the bus has one of the node ids already.
-        ResultsError: `truth_path` or `store_folder` cannot be written; raised before anything is served.
+        UsageError: when the scene does not fit, or a file of `store_folder` belongs to another node.
+        InterfaceError: when there is no such interface.
+        NodeError: when a node on the bus has one of the ids already.
+        ResultsError: when `truth_path` or `store_folder` cannot be written; raised before the nodes start.
     """
     from canprobe.cell.emulated.world import make_world
 
     scene = load_scene(scene, {} if seed is None else {"scene.seed": seed})
-    of_scene = replace(target, channel=scene.bus.channel, others={})  # who is on which bus is the scene's
+    of_scene = replace(target, channel=scene.bus.channel, others={})  # the scene says which node is on which bus
     plan = make_plan(resolve(of_scene.applied_to(scene)))
     names = {scene.bus.channel: target.channel, **target.others}
     placed = {n.node_id: names.get(n.channel, target.channel) for n in plan.nodes if n.node_id in node_ids}
@@ -125,20 +125,20 @@ def emulate_eds(
     """Serve a node from each EDS file on a real interface until interrupted, for any master.
 
     Args:
-        files: (name or path of an EDS or DCF file, node id) of each node; 255: it waits for LSS to give it one.
+        files: (name or path of an EDS or DCF file, node id) of each node; 255: it waits for LSS.
         target: the bus.
         store_folder: as for :func:`emulate`.
         serial_numbers: 1018h:04 of each node; None or left out: as its file has it.
-        in_realtime: SCHED_FIFO, a processor and locked memory, as far as permitted.
+        in_realtime: whether to ask for SCHED_FIFO, a processor and locked memory.
         say: called with the number of warnings of each file, and when the nodes are served.
 
     Raises:
-        EdsError: a file cannot be served; one line a fault.
-        UsageError: a node id is given twice, two nodes without one are the same device, or a file of `store_folder` is
-            not of its node.
-        InterfaceError: no such interface.
-        NodeError: somebody on the bus has one of the node ids already.
-        ResultsError: `store_folder` cannot be written.
+        EdsError: when a file cannot be served; one line for each fault.
+        UsageError: when a node id is given twice, two nodes without one are the same device, or a file of
+            `store_folder` belongs to another node.
+        InterfaceError: when there is no such interface.
+        NodeError: when a node on the bus has one of the ids already.
+        ResultsError: when `store_folder` cannot be written.
     """
     from canprobe.fieldbus.drive.from_eds import make_eds_node
 
@@ -179,7 +179,7 @@ def _make_places(truth_path: Path | None, store_folder: Path | None) -> None:
 def _free_port(
     target: Target, wanted: ExpectedLink, node_ids: tuple[int, ...], *, way_out: str, say: Say
 ) -> Iterator[Port]:
-    """A port on a bus where nobody has these node ids; it waits for the bus as a device does."""
+    """A port on a bus on which no node has these ids; it waits for the bus as a device does."""
     from canprobe.fieldbus.bus.real.opening import open_port
 
     check_links(target.interface, {target.channel: wanted}, say)
@@ -203,7 +203,7 @@ def _free_port(
 
 
 def _check_addresses(nodes: Sequence[SlaveNode]) -> None:
-    """Nodes without an id differ only by their LSS addresses."""
+    """Check that nodes without an id have different LSS addresses."""
     addresses = [node.lss.address for node in nodes if node.lss is not None and node.lss.unconfigured]
     for address in addresses:
         if addresses.count(address) > 1:
@@ -222,7 +222,7 @@ def _serve(
 
     reserve_memory(cycles_kept)
     for _, port in buses:
-        port.drain()  # what passed meanwhile
+        port.drain()  # frames that passed meanwhile
     ask_for_processor()
     favour = realtime(DEVICE_PRIORITY, say, processor_from_last=1) if in_realtime else contextlib.nullcontext()
     where = " and ".join(port.channel for _, port in buses)
@@ -232,7 +232,7 @@ def _serve(
 
 
 def _named(nodes: Sequence[SlaveNode]) -> str:
-    """Nodes by their ids, those without one by their LSS addresses."""
+    """Names of nodes: their ids, or their LSS addresses where they have none."""
     ids = sorted(node.node_id for node in nodes if node.node_id != UNCONFIGURED_ID)
     blank = [str(node.lss.address) for node in nodes if node.lss is not None and node.lss.unconfigured]
     with_ids = [f"nodes {', '.join(map(str, ids))}"] if ids else []
@@ -249,7 +249,7 @@ def _keep(nodes: Iterable[SlaveNode], folder: Path | None) -> None:
 
 
 def _file_name(node: SlaveNode) -> str:
-    """By node id, or by serial number where the node has no id yet."""
+    """File of a node: named by its id, or by its serial number where it has no id yet."""
     if node.node_id != UNCONFIGURED_ID:
         return f"node{node.node_id:03}.json"
     return f"serial{node.dictionary.number(0x1018, 4):08x}.json"

@@ -1,4 +1,4 @@
-"""The emulated nodes of a run in a process of their own: started, awaited, and ended on every way out."""
+"""The emulated nodes of a run in a separate process: its start, the wait for it, and its end on every way out."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE
 REPORT_EVERY_S = 10.0
 END_TIMEOUT_S = 10.0
 SERVING_WORD = "serving "
-"""What the process says when it serves."""
+"""Beginning of the line that the process writes when it serves."""
 TRUTH_SHARE = 0.2
-"""Time that the nodes may take at their end to work out what was true, over the time that they ran."""
+"""Longest time of the nodes at their end to compute the truth, as a share of the time that they ran."""
 
 
 class EmulatorChild(ChildProcess):
     """``canprobe emulate`` as a child process.
 
     Args:
-        plan: whose nodes.
+        plan: plan of the nodes.
         out: folder for ``truth.npz``; None uses a temporary one.
         channels: the buses of its nodes.
-        truth: whether what is true is recorded, which grows with time.
+        truth: whether to record the true values, which grow with time.
         origin_ns: time that is 0 in ``truth.npz``, on the clock that all processes of a machine share.
 
     Attributes:
-        unwritten: why there is no ``truth.npz`` at the end; None where nothing was wrong with it.
+        unwritten: why ``truth.npz`` could not be written; None where it could.
     """
 
     def __init__(
@@ -81,13 +81,13 @@ class EmulatorChild(ChildProcess):
         """Wait until it serves, and for the boot-up of each of its nodes, as long as the scene allows.
 
         Args:
-            port: of the nodes' buses.
+            port: port on the nodes' buses.
             say: called every 10 s with how long it has taken.
-            hear: gets all that arrives meanwhile: another master may begin, or a node report an error.
+            hear: gets all frames meanwhile: another master may begin, or a node report an error.
 
         Raises:
-            BusError: the process ended; with its own last words.
-            NodeError: a node did not boot in time.
+            BusError: when the process ended; with its last message.
+            NodeError: when a node did not boot in time.
         """
         waiting = set(self._scene.emulated_node_ids)
         clock = port.clock
@@ -111,7 +111,7 @@ class EmulatorChild(ChildProcess):
                     waiting.discard(can_id - HEARTBEAT_BASE)
 
     def _serves(self) -> bool:
-        """An array of raw frames sends no boot-up: the process has said that it is served."""
+        """Whether an array of raw frames is served: it sends no boot-up, and the process says so."""
         if self._scene.sensor is None or self._scene.array_is_node or not self._scene.sensor.emulated:
             return True
         assert self._errors is not None
@@ -125,12 +125,12 @@ class EmulatorChild(ChildProcess):
         )
 
     def end(self) -> dict[str, NDArray[np.float64]]:
-        """Stop the process, first politely, harder at an interrupt; the plant's truth where it left any."""
+        """Stop the process, by stronger signals where it does not end; the plant's truth where it left any."""
         if self._process is not None:
             patience_s = END_TIMEOUT_S + TRUTH_SHARE * (self._clock.now_ns() - self._started_ns) * 1e-9
             for number in (signal.SIGTERM, signal.SIGINT, signal.SIGKILL):  # SIGINT is ignored in the background
                 self._process.send_signal(number)
-                self._process.send_signal(signal.SIGCONT)  # one that was stopped hears it only then
+                self._process.send_signal(signal.SIGCONT)  # a stopped process receives the signal only then
                 with contextlib.suppress(subprocess.TimeoutExpired, KeyboardInterrupt):
                     self._process.wait(patience_s)
                     break

@@ -16,7 +16,7 @@ LEFT_BY_RUNS = (
 
 
 def prepare_folder(plan: Plan, out: Path) -> None:
-    """Make the folder of a run, with its scene and without what an earlier run left there.
+    """Make the folder of a run, with its scene and without the files of an earlier run.
 
     Raises:
         ResultsError: a file cannot be written or removed.
@@ -40,7 +40,7 @@ def write_scene(plan: Plan, folder: Path) -> None:
 
 
 def zeros_file(plan: Plan) -> Path | None:
-    """Where the zeros of a cell's real drives are recorded, in the user's state folder; None where none is homed."""
+    """File of the zeros of a cell's real drives, in the user's state folder; None where no drive is homed."""
     arm = plan.setup.arm
     if arm is None or all(drive.zero is None or drive.emulated for drive in arm.drives):
         return None

@@ -21,14 +21,14 @@ def home(scene: Scene, *, operator: Operator | None = None, say: Say = quiet) ->
     """Bring the cell up, home the joints that have `zero = "homing"` one after the other, and stop it safely.
 
     Args:
-        scene: with an arm.
+        scene: a scene with an arm.
         operator: asked before each joint; None leaves the questions out.
-        say: called with each step, and with what became of each joint.
+        say: called with each step, and with the result of each joint.
 
     Raises:
-        UsageError: the scene does not fit, or no joint of it is homed.
-        NodeError: a drive did not find its home position; it is stopped and disabled.
-        BusError, SafetyStop: as :func:`canprobe.run`.
+        UsageError: when the scene does not fit, or none of its joints is homed.
+        NodeError: when a drive did not find its home position; it is stopped and disabled.
+        BusError, SafetyStop: as in :func:`canprobe.run`.
     """
     plan = make_plan(resolve(scene))
     if plan.setup.arm is None or not any(drive.zero for drive in plan.setup.arm.drives):

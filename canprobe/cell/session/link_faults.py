@@ -1,10 +1,9 @@
-"""What is wrong with the setting of a SocketCAN interface, or its controller's state, and the line that mends it."""
+"""Faults in the setting of a SocketCAN interface, or in its controller's state, and the line to type."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.hardware import BusSettings
@@ -20,20 +19,17 @@ from canprobe.fieldbus.bus.real.link import (
     setting_line,
 )
 
-if TYPE_CHECKING:
-    pass
-
 RATE_TOLERANCE = 0.005
 TERMINATION = "with the bus unpowered, 60 ohm between CAN_H and CAN_L are right, 120 is one terminator missing"
 
 
 @dataclass(frozen=True, slots=True)
 class Remark:
-    """One finding.
+    """One finding about an interface.
 
     Attributes:
-        is_error: the cell cannot work so; else it can, but not well.
-        text: what is so, what it does, and what to type.
+        is_error: whether the cell cannot work with it; else it works badly.
+        text: the finding, its effect, and what to type.
     """
 
     is_error: bool
@@ -42,12 +38,12 @@ class Remark:
 
 @dataclass(frozen=True, slots=True)
 class ExpectedLink:
-    """What is wanted of an interface.
+    """Wanted setting of an interface.
 
     Attributes:
-        bitrate, data_bitrate: bit/s; the second of CAN FD, None without.
-        frames_at_once: that are queued at one time, at most; 0: nothing is sent.
-        of_scene: a scene says so; else whoever calls.
+        bitrate, data_bitrate: bit rates, bit/s; the second for CAN FD, None without.
+        frames_at_once: most frames that are queued at one time; 0: nothing is sent.
+        of_scene: whether a scene wants it; else the caller does.
     """
 
     bitrate: int
@@ -62,9 +58,9 @@ def data_bitrate(bus: BusSettings) -> int | None:
 
 
 def expected_of(plan: Plan) -> dict[str, ExpectedLink]:
-    """What a plan wants of each of its channels.
+    """Wanted setting of each channel of a plan.
 
-    After a late cycle the frames of two go at once, each SYNC, heartbeat and every RPDO.
+    After a late cycle the frames of two cycles are queued at once: SYNC, heartbeat and every RPDO of each.
     """
     bus = plan.setup.bus
     rpdos = {(pdo.channel, pdo.cob_id) for pdo in plan.pdos if pdo.direction == "rpdo"}
@@ -75,7 +71,7 @@ def expected_of(plan: Plan) -> dict[str, ExpectedLink]:
 
 
 def check_link(link: LinkState, expected: ExpectedLink) -> list[Remark]:
-    """Everything that is wrong with an interface; nothing where all is well, and nothing of a virtual one."""
+    """All findings about an interface; none for a virtual one."""
     if link.kind in VIRTUAL_KINDS:
         return []
     checks = (_rates, _modes, _state, _sample_point, _restart, _queue)
@@ -83,11 +79,11 @@ def check_link(link: LinkState, expected: ExpectedLink) -> list[Remark]:
 
 
 def controller_trouble(link: LinkState, *, typed: bool = True) -> str | None:
-    """Why a controller cannot send, or hear, and what to do; None where its state is no reason.
+    """Why a controller cannot send or receive, and what to do; None where its state is no reason.
 
     Args:
-        link: with its state.
-        typed: `ip` can set it.
+        link: the interface with its state.
+        typed: whether `ip` can set it.
     """
     known = link.tx_errors is not None or link.rx_errors is not None
     counters = f" (error counters: {link.tx_errors} transmit, {link.rx_errors} receive)" if known else ""
@@ -142,7 +138,7 @@ def _state(link: LinkState, _: ExpectedLink) -> Iterator[Remark]:
 
 
 def _symptom(link: LinkState) -> str:
-    """From its counters; a driver without them leaves both causes open."""
+    """Probable cause by the error counters; a driver without them leaves both causes open."""
     sent, heard = link.tx_errors or 0, link.rx_errors or 0
     unheard = "nobody acknowledges what it sends: nodes without power, another bit rate, a broken wire"
     broken = "frames arrive broken: another bit rate or sample point somewhere, or the termination"

@@ -1,4 +1,4 @@
-"""How the SocketCAN interfaces of a cell are set, before it is brought up: warnings and errors."""
+"""Check of the SocketCAN interfaces of a cell before it is brought up: warnings and errors."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ SOCKETCAN = "socketcan"
 def check_links(
     interface: str, channels: Mapping[str, ExpectedLink], say: Callable[[str], None], *, must: bool = True
 ) -> None:
-    """Check SocketCAN interfaces before anything is sent; of others, and of virtual ones, there is nothing to check.
+    """Check SocketCAN interfaces before anything is sent; other and virtual interfaces are not checked.
 
     Args:
-        interface: of all channels.
-        channels: and what is wanted of each.
+        interface: interface of all channels.
+        channels: the wanted setting of each channel.
         say: called with each warning.
-        must: an interface that cannot work ends it; else that is a warning too.
+        must: whether an interface that cannot work is an error; else it is a warning too.
 
     Raises:
-        InterfaceError: an interface is set so that nothing can work; with the line to type.
+        InterfaceError: when an interface cannot work as it is set; with the line to type.
     """
     if interface != SOCKETCAN:
         return
@@ -52,15 +52,15 @@ def check_links(
 
 
 def need_controllers(interface: str, ports: Mapping[str, Port], error: BaseException | None = None) -> None:
-    """Return where every CAN controller can send and hear, as far as is known.
+    """Check that every CAN controller can send and receive, as far as its state is known.
 
     Args:
-        interface: of all ports.
-        ports: by channel; closed ones still know their last state.
-        error: what went wrong on the bus, which a controller's state may explain; anything else is no matter of it.
+        interface: interface of all ports.
+        ports: ports by channel; closed ones still know their last state.
+        error: error that a controller's state may explain; only a `BusError` is looked at.
 
     Raises:
-        InterfaceError: a controller is bus-off or error-passive; with what to look at, the line to type, and `error`.
+        InterfaceError: when one is bus-off or error-passive; with what to check, the line to type, and `error`.
     """
     if error is not None and not isinstance(error, BusError):
         return
@@ -68,7 +68,7 @@ def need_controllers(interface: str, ports: Mapping[str, Port], error: BaseExcep
     troubles: list[str] = []
     for channel, port in ports.items():
         link = (read_link(channel) if interface == SOCKETCAN else None) or LinkState(channel)
-        if link.state is None:  # a virtual one, another interface, or no `ip`: as of the last error frame
+        if link.state is None:  # a virtual one, another interface, or no `ip`: the state of the last error frame
             state = port.state
             link = replace(link, state="BUS-OFF" if state is ControllerState.BUS_OFF else f"ERROR-{state.name}")
         if (trouble := controller_trouble(link, typed=interface == SOCKETCAN)) is not None:

@@ -1,4 +1,4 @@
-"""Look at a bus without a cell: list its nodes, give ids to those that have none, watch a running cell."""
+"""Look at a bus without a cell: list its nodes, give ids to nodes without one, watch a running cell."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from canprobe.fieldbus.bus.port import Port
 
 MONITOR_PERIOD_NS = 100_000_000
 SILENCE_NS = 1_000_000_000
-"""After so long without a frame on a bus the state of its controller is read."""
+"""Time without a frame on a bus after which the state of its controller is read."""
 
 
 def scan(target: Target, *, timeout_s: float | None = None, say: Say = quiet) -> list[dict[str, Any]]:
@@ -35,11 +35,11 @@ def scan(target: Target, *, timeout_s: float | None = None, say: Say = quiet) ->
 
     Args:
         target: the bus.
-        timeout_s: longest time to one SDO answer; that of a bring-up by default.
+        timeout_s: longest time to one SDO answer; by default that of a bring-up.
         say: called with each warning about the interface's setting.
 
     Raises:
-        InterfaceError: no such interface, or no node answers and the CAN controller's state is why.
+        InterfaceError: when there is no such interface, or the CAN controller's state explains that no node answers.
     """
     with _open(target, say) as port:
         nodes = scan_nodes(port, timeout_s or BringUpSettings().sdo_s)
@@ -61,16 +61,16 @@ def commission(
 
     Args:
         target: the bus.
-        scene: whose nodes get their ids, as far as EDS files and serial numbers show which device is which.
-        assign: or else ((vendor, product, revision, serial number), node id), None for a number that may be any.
-        store: let the devices keep their ids when their power goes.
+        scene: scene whose nodes get their ids, as far as EDS files and serial numbers identify the devices.
+        assign: without a scene: ((vendor, product, revision, serial number), node id), None for any number.
+        store: whether the devices store their ids.
         timeout_s: longest time to one SDO answer; by default that of the scene, or else of a bring-up.
         say: called with each warning about the interface's setting.
 
     Raises:
-        UsageError: the scene does not fit.
+        UsageError: when the scene does not fit.
         BusError: see `canprobe.cell.master.commission.commission`.
-        InterfaceError: no such interface, or no node answers and the CAN controller's state is why.
+        InterfaceError: when there is no such interface, or the CAN controller's state explains that no node answers.
     """
     wanted = [Wanted(node_id, "--assign", numbers) for numbers, node_id in assign]
     if scene is not None:
@@ -102,19 +102,19 @@ def _open(target: Target, say: Say) -> Iterator[Port]:
 
 
 def monitor(scene: Scene, *, duration_s: float | None = None, say: Say = quiet) -> Iterator[CellView]:
-    """Look at a running cell ten times a second, sending nothing.
+    """Watch a running cell ten times a second without sending anything.
 
     Args:
-        scene: what is on the bus.
-        duration_s: how long; for ever by default.
+        scene: scene of the cell.
+        duration_s: length of the watch; without end by default.
         say: called with each warning about the interface's setting.
 
     Yields:
-        What is known by then; the same object each time.
+        The view of the cell so far; the same object each time.
 
     Raises:
-        UsageError: the scene does not fit, or its bus is a lockstep bus, which lives inside one run.
-        InterfaceError: no such interface, or it was lost; or a bus is silent and its CAN controller's state is why.
+        UsageError: when the scene does not fit, or its bus is a lockstep bus, which lives inside one run.
+        InterfaceError: when there is no such interface, it was lost, or its controller's state explains its silence.
     """
     need_real_bus(scene, "monitor")
     plan, clock, interface = make_plan(resolve(scene)), MonotonicClock(), scene.bus.interface

@@ -1,7 +1,7 @@
-"""The scene of a short run on a lockstep bus before a real one, so that nothing happens for the first time in a cycle.
+"""The scene of a short run on a lockstep bus before a real one, so that no real cycle makes a first call.
 
-The first call of everything is slow: libraries are paged in, tables filled, the interpreter specialises its code. On
-one slow processor first cycles took 3 to 10 ms each, and the drives stopped by themselves for want of SYNC.
+A first call is slow: libraries are paged in, tables filled, the interpreter specialises its code. On a slow processor
+first cycles took 3 to 10 ms each, and the drives stopped by themselves because SYNCs were missing.
 """
 
 from __future__ import annotations
@@ -12,19 +12,19 @@ from canprobe.cell.scene.model import Scene
 from canprobe.cell.session.target import LOCKSTEP
 
 REHEARSED_S = 0.3
-"""Length of the scene's phase in a rehearsal: time for some answers of an estimator."""
+"""Length of the scene's phase in a rehearsal, s: an estimator answers several times in it."""
 CLEARANCE_MM = 0.5
-"""The way to the object is the same in every cycle."""
-TOUCHES = 2
+"""Longest way to the object, mm: its cycles are all alike."""
+MAX_TOUCHES = 2
 
 
 def shortened(scene: Scene) -> Scene:
-    """The scene on a lockstep bus that takes no time, with all that its cycles do in as few of them as will do."""
+    """The scene on a lockstep bus without bit times, with all parts of its cycles in as few cycles as possible."""
     task = replace(
         scene.task,
         duration_s=min(scene.task.duration_s, REHEARSED_S),
         clearance_mm=min(scene.task.clearance_mm, CLEARANCE_MM),
-        touches=min(scene.task.touches, TOUCHES),
+        touches=min(scene.task.touches, MAX_TOUCHES),
     )
     return replace(
         scene,

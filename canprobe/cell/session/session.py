@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 
 def with_bridges(scene: Scene, names: Sequence[str]) -> Scene:
-    """The scene with more bridges in use; an unknown one is a `UsageError`."""
+    """The scene with more bridges in use; an unknown bridge raises `UsageError`."""
     if not names:
         return scene
     names = (names,) if isinstance(names, str) else names
@@ -63,12 +63,12 @@ class Session:
     """One cell from bring-up to safe stop. A context manager; :meth:`run` may be called more than once inside.
 
     Args:
-        scene: what to bring up, resolved; or the plan of it.
-        options: of the run; ``bus.log``, ``scene.toml`` and ``truth.npz`` are written here.
+        scene: the scene to bring up, or its plan.
+        options: options of the run; the session writes ``bus.log``, ``scene.toml`` and ``truth.npz``.
 
     Attributes:
-        record: of the buses, from the entry on; every time in the files of the run counts from its `origin_ns`.
-        unwritten: files that could not be written, each with the reason; they are among the cell's faults too.
+        record: record of the buses, from the entry on; every time in the files of the run counts from its `origin_ns`.
+        unwritten: files that could not be written, each with the reason; the cell's faults list them too.
     """
 
     def __init__(self, scene: Scene | Plan, options: RunOptions = DEFAULT_OPTIONS) -> None:
@@ -105,22 +105,22 @@ class Session:
 
     @property
     def started(self) -> bool:
-        """The buses were opened and the cell was made: there is something to report, if only how bring-up failed."""
+        """Whether the buses were opened and the cell was made: a report is possible, even of a failed bring-up."""
         return self._cell is not None
 
     @property
     def opened(self) -> bool:
-        """The nodes were brought up."""
+        """Whether the nodes were brought up."""
         return self._cell is not None and self._cell.cycle is not None
 
     @property
     def virtual(self) -> bool:
-        """It runs in this process, in virtual time."""
+        """Whether it runs in this process, in virtual time."""
         return self.scene.bus.interface in VIRTUAL
 
     @property
     def keeps_all(self) -> bool:
-        """Every cycle has its row in the log, and every SYNC one in the truth."""
+        """Whether each cycle keeps its row in the log, and each SYNC its row in the truth."""
         return self.options.rows_kept is None
 
     def refuse_reentry(self) -> None:
@@ -205,7 +205,7 @@ class Session:
         return ports.popitem()[1] if len(ports) == 1 else JoinedPort(ports, channel_routes(self.plan))
 
     def _observe_frames(self, port: Port) -> None:
-        """What was on the bus at bring-up, and after the last cycle."""
+        """Give the observers the frames of bring-up, and those after the last cycle."""
         if self.observers is not None:
             self.observers.frames_alone(port.clock.now_ns())
 
@@ -214,7 +214,7 @@ class Session:
             raise UsageError(f"{what} emulated nodes only: node {min(missing)} is marked emulated = false")
 
     def _open_direct(self) -> Port:
-        """Counts and images in the place of frames: the port's bus has nobody on it, its clock is what is used."""
+        """Counts and images in the place of frames: the port's bus has no node, only its clock is used."""
         from canprobe.cell.session.direct import DirectCycle
 
         self._need_emulated("without a bus there are")
@@ -275,7 +275,7 @@ class Session:
         return self._join({name: RecordingPort(port, self.record.writer(name)) for name, port in real.items()})
 
     def _get_ready(self, port: Port) -> None:
-        """For real time: the emulated nodes in their process, everything done once before, the processor's favour."""
+        """Get ready for real time: start the emulated nodes, rehearse, reserve memory, ask for priority."""
         child = None
         if self.plan.setup.emulates:
             self.cell.listen()  # they would boot beside those of another master
@@ -298,10 +298,10 @@ class Session:
 
 
 def rehearse(plan: Plan) -> None:
-    """Run the beginning of a plan with every node emulated; what goes wrong in it is of no interest here.
+    """Run the beginning of a plan with every node emulated; its errors are ignored.
 
     Args:
-        plan: what is about to run on a real bus.
+        plan: the plan that is about to run on a real bus.
     """
     with contextlib.suppress(CanprobeError):
         run_beginning(plan)
@@ -314,7 +314,7 @@ def run_beginning(plan: Plan) -> Session:
         The session, closed.
 
     Raises:
-        CanprobeError: what goes wrong in it.
+        CanprobeError: as in a run.
     """
     with Session(shortened(plan.scene)) as session:
         session.run(make_task(session.plan))

@@ -1,4 +1,4 @@
-"""Where a scene or a command goes: interface, channels and bit rate as one object, put into a scene by one function."""
+"""The bus of a scene or a command: interface, channels and bit rate as one object, which is applied to a scene."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ VIRTUAL = frozenset({LOCKSTEP, DIRECT})
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A bus.
+    """The bus of a run or a command.
 
     Attributes:
         interface: `lockstep`, `direct` (no bus), `socketcan` or another interface of python-can.
-        channel: of the interface, in the place of the scene's `bus.channel`.
-        bitrate: bit/s.
-        others: what stands for the other channels that the scene names; one that is not here stays as it is.
+        channel: channel of the interface, which replaces the scene's `bus.channel`.
+        bitrate: bit rate, bit/s.
+        others: names that replace the scene's other channels; a channel that is not listed stays.
     """
 
     interface: str
@@ -39,15 +39,15 @@ class Target:
         channel: str | Mapping[str, str] | None = None,
         bitrate: int | None = None,
     ) -> Target:
-        """The bus of a scene, with what is given in the place of its values.
+        """The bus of a scene, with the given values in the place of its own.
 
         Args:
-            scene: whose.
-            bus, bitrate: in the place of the scene's interface and bit rate.
-            channel: in the place of `bus.channel`; or what stands for each channel that the scene names.
+            scene: the scene.
+            bus, bitrate: replace the scene's interface and bit rate.
+            channel: replaces `bus.channel`; or a mapping from each channel of the scene to another name.
 
         Raises:
-            UsageError: the scene names no such channel, or a value is none that its file could have.
+            UsageError: when the scene names no such channel, or a value would be refused in its file.
         """
         others = dict(channel) if isinstance(channel, Mapping) else {}
         if unknown := sorted(str(name) for name in others if name not in scene.channels):
@@ -76,7 +76,7 @@ def need_real_bus(scene: Scene, command: str) -> None:
     """Refuse a command that needs a bus which other processes can reach.
 
     Raises:
-        UsageError: the scene's bus lives inside one run, or it has none.
+        UsageError: when the scene's bus is lockstep or direct.
     """
     refuse_virtual(scene.bus.interface, command)
 
@@ -85,7 +85,7 @@ def refuse_virtual(interface: str, command: str) -> None:
     """Refuse an interface that ends with its run.
 
     Raises:
-        UsageError: it is one.
+        UsageError: when the interface is lockstep or direct.
     """
     if interface == LOCKSTEP:
         raise UsageError(f"{command}: a lockstep bus lives inside one run; name a real interface with --bus")

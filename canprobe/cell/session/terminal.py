@@ -1,4 +1,4 @@
-"""What a terminal can show, and what is reported while something works long: steps and a progress bar.
+"""Reports of a command while it works: steps and a progress bar, with colours where a terminal shows them.
 
 Colours and the width of the window are for terminals only; a bar is drawn in notebooks too.
 """
@@ -11,15 +11,15 @@ from collections.abc import Callable
 from typing import TextIO
 
 Progress = Callable[[float, float], None]
-"""Called with what is done and the whole, in one unit."""
+"""Called with the part that is done and the whole, in one unit."""
 COLOURS = {"bold": "1", "red": "31", "green": "32", "yellow": "33", "cyan": "36"}
 MIN_COLUMNS = 16
-"""Columns below which no cell of a table is broken, and no bar is drawn."""
+"""Least width for breaking the cells of a table, and for a bar, characters."""
 MARKED_WORDS = ("warning", "noted", "fault")
 
 
 def columns(stream: TextIO) -> int | None:
-    """Width of the terminal behind a stream; None where there is none: in a pipe a line stays whole."""
+    """Width of the terminal behind a stream; None for a pipe, where lines stay whole."""
     if not stream.isatty():
         return None
     try:
@@ -29,18 +29,18 @@ def columns(stream: TextIO) -> int | None:
 
 
 def painted(text: str, colour: str, stream: TextIO) -> str:
-    """The text in a colour, where the stream is a terminal that has them and NO_COLOR is empty (no-color.org)."""
+    """The text in a colour, where the stream is a terminal with colours and NO_COLOR is empty (no-color.org)."""
     if not stream.isatty() or os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
         return text
     return f"\x1b[{COLOURS[colour]}m{text}\x1b[0m"
 
 
 class Report:
-    """What is reported while something works: its steps, and one bar.
+    """Reports of a command while it works: its steps, and one bar.
 
     Args:
-        verbosity: -1 only warnings, 0 the steps of commands that work long, 1 every step.
-        stream: stderr by default.
+        verbosity: level of detail: -1 only warnings, 0 the steps of long commands, 1 every step.
+        stream: stream to write to; stderr by default.
     """
 
     def __init__(self, verbosity: int = 0, stream: TextIO | None = None) -> None:
@@ -49,22 +49,22 @@ class Report:
         self._bar = ""
 
     def say(self, line: str) -> None:
-        """Report one step; a warning comes through however quiet the command is."""
+        """Report one step; a warning is always written."""
         mark = next((mark for mark in MARKED_WORDS if line.startswith(f"{mark}:")), None)
         if mark is None and self.verbosity < 0:
             return
         self._write(line if mark is None else painted(mark, "yellow", self._stream) + line.removeprefix(mark))
 
     def detail(self, line: str) -> None:
-        """Report one step of a command whose result says it all: a terminal shows it, and `-v` does everywhere.
+        """Report one step of a command whose result is enough: on a terminal, and with `-v` everywhere.
 
-        Where a bridge is to be found is shown everywhere: it is gone with the run; and so are warnings.
+        The address of a bridge, which ends with the run, and warnings are shown everywhere.
         """
         if self.verbosity > 0 or self._stream.isatty() or line.startswith(("bridge ", "warning:")):
             self.say(line)
 
     def complain(self, line: str) -> None:
-        """Report what stops the command, below its bar."""
+        """Report the error that stops the command, below its bar."""
         self.end_bar()
         prog, colon, rest = line.partition(":")
         self._write(painted(prog + colon, "red", self._stream) + rest)
@@ -73,10 +73,10 @@ class Report:
         """A progress bar as wide as the terminal; None elsewhere, and where the command is quiet.
 
         Args:
-            unit: form of a number, and the unit's name.
+            unit: format of the numbers, and name of their unit.
 
         Returns:
-            A function of (done, total), both in the same unit, that redraws only when the picture changes.
+            A function of (done, total), both in the same unit, which redraws only when the picture changes.
         """
         if self.verbosity < 0 or (columns(self._stream) is None and "ipykernel" not in sys.modules):
             return None
@@ -99,7 +99,7 @@ class Report:
         return show
 
     def end_bar(self) -> None:
-        """Leave the bar as it is; what follows begins on a new line."""
+        """Leave the bar as it is; the next output begins on a new line."""
         if self._bar:
             self._bar = ""
             self._stream.write("\n")

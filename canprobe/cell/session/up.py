@@ -1,10 +1,9 @@
-"""`canprobe up`: a cell that is held and supervised for days, or whose joints are checked one after the other."""
+"""`canprobe up`: a cell that holds its position for days under supervision."""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING
 
 from canprobe.cell.master.controller import Measurement
 from canprobe.cell.master.options import RunOptions, Say, quiet
@@ -16,24 +15,21 @@ from canprobe.cell.session.session import Session, with_bridges
 from canprobe.cell.session.target import need_real_bus
 from canprobe.cell.tasks.from_plan import make_task
 
-if TYPE_CHECKING:
-    pass
-
 ROWS_OF_UP = 4000
-"""Cycles whose rows are kept: `up` runs for days."""
+"""Number of cycles whose rows are kept: `up` runs for days."""
 
 
 def up(scene: Scene, *, bridge: Sequence[str] = (), say: Say = quiet) -> None:
     """Bring the cell up, hold and supervise it until it is interrupted, then stop it safely.
 
     Args:
-        scene: on a bus that other processes can reach.
+        scene: a scene on a bus that other processes can reach.
         bridge: names of bridges to other tools, besides those of the scene.
-        say: called with each step, and with each kind of fault when it is new and once more, counted, at the end.
+        say: called with each step, with each new kind of fault, and at the end with the number of each.
 
     Raises:
-        UsageError: the scene does not fit or is on a lockstep bus.
-        BusError, SafetyStop: as :func:`canprobe.run`.
+        UsageError: when the scene does not fit or is on a lockstep bus.
+        BusError, SafetyStop: as in :func:`canprobe.run`.
     """
     need_real_bus(scene, "up")
     plan = make_plan(resolve(with_bridges(scene, bridge)))
@@ -46,10 +42,10 @@ def up(scene: Scene, *, bridge: Sequence[str] = (), say: Say = quiet) -> None:
 
 @contextlib.contextmanager
 def reporting_notes(session: Session, say: Say) -> Iterator[Callable[[Measurement], None]]:
-    """Open the session; at its end report the faults that did not stop it, each kind with its number.
+    """Open the session, and at its end report the faults that did not stop it, each kind with its number.
 
     Yields:
-        A function to be called after each cycle, which reports each kind when it is new.
+        A function to call after each cycle; it reports each new kind of fault.
     """
     said = 0
 

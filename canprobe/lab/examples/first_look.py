@@ -1,6 +1,6 @@
 """A first look at a run as a table: copy this file and go on from here. Needs the extra `data`."""
 
-# %% Run the emulated cell, or load a run that is there already: canprobe.load_table("runs/…/log.npz")
+# %% Run the emulated cell, or load an earlier run: canprobe.load_table("runs/…/log.npz")
 import canprobe
 
 result = canprobe.run("cylinder", out="runs/first-look", force=True, duration_s=2.0)
@@ -20,7 +20,7 @@ rms = ((truth.force_n - target) ** 2).mean() ** 0.5
 print(f"force in the scan: measured {scan.force_n.mean():.3f} ± {scan.force_n.std():.3f} N")
 print(f"                   true     {truth.force_n.mean():.3f} ± {truth.force_n.std():.3f} N, RMS error {rms:.3f} N")
 
-# %% How the curvature estimate comes in along the path
+# %% How the curvature estimate settles along the path
 estimates = result.to_pandas("estimates")
 estimates["sigma_per_m"] = estimates["K_covariance_per_m2_0_0"] ** 0.5
 print(estimates[["travelled_m", "kappa_per_m_0", "kappa_per_m_1", "sigma_per_m"]].iloc[::10])

@@ -59,12 +59,12 @@ def fixed(speed: float) -> Floats:
 
 # %% Episodes, on every processor
 def open_environment() -> None:
-    """Once in each process."""
+    """Open the environment, once in each process."""
     globals()["env"] = gymnasium.make("canprobe/TouchScan-v0", estimate=False)
 
 
 def start_worker() -> None:
-    """A process of the pool, which leaves Ctrl-C to its parent."""
+    """Begin a process of the pool, which leaves Ctrl-C to its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     open_environment()
 
@@ -82,7 +82,7 @@ def episode_return(job: tuple[Floats, int, str]) -> float:
 
 
 def returns(pool: Any, thetas: Sequence[Floats] | Floats, seeds: Sequence[int], objects: str) -> Floats:
-    """(thetas, seeds) returns."""
+    """Returns of episodes (thetas, seeds)."""
     jobs = [(theta, seed, objects) for theta in thetas for seed in seeds]
     return np.array(pool.map(episode_return, jobs, chunksize=1)).reshape(len(thetas), len(seeds))
 

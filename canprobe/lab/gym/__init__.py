@@ -1,15 +1,15 @@
-"""A Gymnasium environment: an agent leads the probe over an unknown surface, and the cell does the rest.
+"""A Gymnasium environment: an agent leads the probe of a cell over an unknown surface.
 
     import gymnasium, canprobe.lab.gym
     env = gymnasium.make("canprobe/TouchScan-v0")
 
-Comes in: an action, 25 times a second: the velocity of the contact in its tangent plane and the set-point of the force.
-Goes out: an observation, the reward of the step, and what is true in `info`.
+In comes an action, 25 times a second: velocity of the contact in its tangent plane, and set-point of the force.
+Out goes an observation, the reward of the step, and the truth in `info`.
 
-Between two actions the whole cell runs as ever: drives, array, supervision and the tactile servo, 16 cycles at 400 Hz,
+Between two actions the whole cell runs: drives, array, supervision and the tactile servo, 16 cycles at 400 Hz,
 in virtual time without a bus. `env` is the environment; start reading there. `episode` is one cell that is led step by
-step, `led` the touch task whose path and force are set from outside. `observations` says what an agent sees, `region`
-which part of the surface it has touched. `randomise` draws what differs from one episode to the next, with the keys of
+step, `led` the touch task whose path and force are set from outside. `observations` makes an agent's vectors, `region`
+the touched part of the surface. `randomise` draws the values that differ between episodes, with the keys of
 a scene file; `objects` are those to train on and those that are held out.
 
 An episode begins in contact: approach, touch-down and settling are part of `reset`. It ends by itself (`terminated`)

@@ -37,10 +37,10 @@ DEFAULT_SCENE: Mapping[str, Any] = {
     "task.clearance_mm": 1.5,
     "task.regain_mm": 0.0,
 }
-"""What the default scene changes in the packaged `cylinder`: a place where the arm reaches round every object of
+"""Changes of the default scene to the packaged `cylinder`: a place where the arm reaches round every object of
 `OBJECTS`, and a short scan of a wide region at up to 60 mm/s, which ends where contact is lost."""
 VIRTUAL_BUS: Mapping[str, Any] = {"bus.interface": "direct", "scene.figures": False, "shape.also": ()}
-"""What an environment changes in every scene."""
+"""Changes of an environment to every scene."""
 
 
 class TouchScan(gymnasium.Env[Any, NDArray[np.float32]]):
@@ -58,15 +58,15 @@ class TouchScan(gymnasium.Env[Any, NDArray[np.float32]]):
     Args:
         scene: scene of a scan: a packaged name, a path or a `Scene`; None for `cylinder` with `DEFAULT_SCENE`.
         observation: `features`, `tactile` or `oracle`, see `Observations`.
-        estimate: run the surface estimator in the loop; False leaves it out, and its features.
-        control_hz: actions a second; a whole number of cycles must go into each.
-        options: options of every episode; those of `reset` come on top.
-        record: folder; each episode leaves the files of a run there, in `episode-N`, for `canprobe view`.
+        estimate: whether the surface estimator runs in the loop; else its features are missing too.
+        control_hz: number of actions a second; each takes a whole number of cycles.
+        options: options of every episode; those of `reset` replace them.
+        record: folder in which each episode writes the files of a run, in `episode-N`, for `canprobe view`.
         render_mode: None; there is no other.
 
     Raises:
-        UsageError: an argument is wrong.
-        SceneError, PlanError: the scene is wrong, or does not fit.
+        UsageError: when an argument is wrong.
+        SceneError, PlanError: when the scene is wrong, or does not fit.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 - as Gymnasium has it
@@ -120,12 +120,12 @@ class TouchScan(gymnasium.Env[Any, NDArray[np.float32]]):
                 on top of those of the environment; one that names a key of the object starts from that of the scene.
 
         Returns:
-            Observation, and `info` with `overrides`: what was drawn.
+            Observation, and `info` with `overrides`: the drawn values.
 
         Raises:
-            SceneError: an option is wrong.
-            PlanError: the scene that was drawn does not fit.
-            SafetyStop, BusError: its object was not touched.
+            SceneError: when an option is wrong.
+            PlanError: when the drawn scene does not fit.
+            SafetyStop, BusError: when its object was not touched.
         """
         super().reset(seed=seed)
         self.close()
@@ -141,13 +141,13 @@ class TouchScan(gymnasium.Env[Any, NDArray[np.float32]]):
         """Lead the probe for one step.
 
         Args:
-            action: (3,) as the class describes it.
+            action: action (3,), as the class describes it.
 
         Returns:
             Observation, reward in mm², terminated, truncated, and `info` with the truth.
 
         Raises:
-            UsageError: no episode is under way, or the action is not three finite numbers.
+            UsageError: when no episode is under way, or the action is not three finite numbers.
         """
         episode = self.episode
         if episode is None or episode.over:

@@ -21,30 +21,30 @@ from canprobe.mechanics.types import Floats
 FORCE_SHARE = 0.5
 """Share of the wanted force by which an action moves the set-point up or down."""
 TOLERANCE = 0.05
-"""Error of the force, of the wanted force, at which a touch counts exp(−½) of one without error."""
+"""Error over the wanted force at which a touch counts exp(−½) of one without error."""
 PENALTY_MM2 = 20.0
-"""What it costs when the supervision ends an episode: the area of a few steps."""
+"""Cost of an episode that the supervision ends: the area of a few steps, mm²."""
 
 
 class Episode:
     """Brings a cell up and touches the object; then `step` leads the probe.
 
     Args:
-        plan: of a scan in virtual time.
-        cycles: in a step.
+        plan: plan of a scan in virtual time.
+        cycles: number of cycles in a step.
         record: folder for the files of the run; None writes nothing.
 
     Attributes:
         session: the open cell.
-        task: what the cell runs.
+        task: task that the cell runs.
         origin: first contact (3,), base frame, m.
-        coverage: what was touched.
-        forces: as measured in each cycle of the last step, N.
-        truth: of the plant after the last step.
-        over: no further step; `reason` says why, None where the time is over.
+        coverage: touched part of the region.
+        forces: measured force in each cycle of the last step, N.
+        truth: true state of the plant after the last step.
+        over: whether the episode has ended; `reason` says why, None where the time is over.
 
     Raises:
-        SafetyStop, BusError: nothing was touched. The cell is closed.
+        SafetyStop, BusError: when nothing was touched; the cell is closed.
     """
 
     def __init__(self, plan: Plan, cycles: int, record: Path | None) -> None:
@@ -57,7 +57,7 @@ class Episode:
         collecting = gc.isenabled()
         self._opened.__enter__()
         if collecting:
-            gc.enable()  # a session pauses the collection, which what learns beside it may need
+            gc.enable()  # a session pauses the collection, which a learner in this process may need
         try:
             self.session.cell.start(task)
             while not task.touching and not task.ended:
@@ -79,7 +79,7 @@ class Episode:
         self._steps, self._most_steps = 0, max(1, round(scan.duration_s / (cycles * self._period_s)))
 
     def step(self, action: Floats) -> float:
-        """Lead the probe by an action (3,) in [−1, 1] for one step; its reward, mm²."""
+        """Lead the probe by an action (3,) in [−1, 1] for one step; returns the reward, mm²."""
         task, forces = self.task, []
         velocity = action[:2] * task.top_speed / max(1.0, math.hypot(*action[:2]))
         task.lead(velocity, task.wanted_force * (1.0 + FORCE_SHARE * float(action[2])), self._cycles)
@@ -103,7 +103,7 @@ class Episode:
         return float(self.truth["force"]) - self.task.wanted_force
 
     def info(self) -> dict[str, Any]:
-        """What is true, with units; `reason` where the supervision has ended the episode."""
+        """The truth, with units; `reason` where the supervision has ended the episode."""
         truth = self.truth
         told = {
             "t_s": self._steps * self._cycles * self._period_s,

@@ -1,4 +1,4 @@
-"""A touch task whose path and force are set from outside, while the servo and the supervision go on as ever."""
+"""A touch task whose path and force are set from outside, with the usual servo and supervision."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ class _Heading(PathFollower):
 
 
 class LedTask(TouchTask):
-    """Approach and touch as a scan does; then go on as `lead` says, until the cell is closed or the probe lets go.
+    """Approaches and touches as a scan does; then follows `lead`, until the cell is closed or the probe lets go.
 
-    The contact frame stands on the surface as the servo knows it: z is the outward normal, x the heading of the scan
+    The contact frame is on the surface model of the servo: z is the outward normal, x the heading of the scan
     laid into the tangent plane, y = z × x.
 
     Args:
         plan: plan of a scan.
 
     Attributes:
-        axes: (3, 3) rows of the scan plane: heading, across, approach normal; base frame.
+        axes: rows of the scan plane (3, 3): heading, across, approach normal; base frame.
         wanted_force: contact force that the scene asks for, N.
         top_speed: speed of the scene's scan, m/s.
         velocity: present velocity of the contact (2,), in the contact frame, m/s.
@@ -71,23 +71,23 @@ class LedTask(TouchTask):
 
     @property
     def touching(self) -> bool:
-        """It is in contact and can be led."""
+        """Whether the probe is in contact and can be led."""
         return self.phase is Phase.SCAN
 
     @property
     def ended(self) -> bool:
-        """It lets go, or has."""
+        """Whether the probe lets go, or has let go."""
         return self.phase in (Phase.RETREAT, Phase.DONE)
 
     @property
     def last_contact(self) -> ContactSample:
-        """The newest that there is; there is one from the touch-down on."""
+        """The newest contact; there is one from the touch-down on."""
         assert self._newest is not None
         return self._newest
 
     @property
     def pad_uv(self) -> tuple[float, float]:
-        """Where on the pad it is, m."""
+        """Place of the contact on the pad, m."""
         u, v = direction_to_pad(self.last_contact.r_probe, self.sensing.radius)
         return u, v
 
@@ -98,22 +98,22 @@ class LedTask(TouchTask):
 
     @property
     def force(self) -> float:
-        """As measured last, N."""
+        """Last measured force, N."""
         return self._touch.force
 
     @property
     def force_set_point(self) -> float:
-        """What the servo aims at, N."""
+        """Wanted force of the servo, N."""
         return self._target_force
 
     def frame(self, normal: Floats) -> Floats:
-        """(3, 3) rows x, y, z of the contact frame in base, for an outward unit normal (3,)."""
+        """Rows x, y, z (3, 3) of the contact frame in base, for an outward unit normal (3,)."""
         x = self.axes[0] - (normal @ self.axes[0]) * normal
         x /= np.linalg.norm(x)
         return np.array((x, np.cross(normal, x), normal))
 
     def lead(self, velocity: Floats, force: float, cycles: int) -> None:
-        """Go over to a velocity of the contact (2,), m/s, and a force, N, evenly within so many cycles."""
+        """Change to a velocity of the contact (2,), m/s, and a force, N, evenly within a number of cycles."""
         vx, vy = self.velocity
         dx, dy, more = float(velocity[0]) - vx, float(velocity[1]) - vy, force - self._target_force
         self._change, self._left = (dx / cycles, dy / cycles, more / cycles), cycles

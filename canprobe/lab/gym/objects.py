@@ -12,7 +12,7 @@ from canprobe.errors import UsageError
 from canprobe.lab.gym.randomise import OneOf, Uniform, Values, drawn
 
 START_MM = (-150.0, -150.0, 374.0)
-"""Where the default scene expects its object."""
+"""Place where the default scene expects its object, mm."""
 _ABOUT = {"position_mm": Uniform((*START_MM[:2], START_MM[2] - 1.0), (*START_MM[:2], START_MM[2] + 1.0))}
 _TURNED = _ABOUT | {"rotation_deg": Uniform((0.0, 0.0, -90.0), (0.0, 0.0, 90.0))}
 _TRAIN = (
@@ -34,10 +34,10 @@ OBJECTS: Mapping[str, OneOf] = MappingProxyType({"train": OneOf(_TRAIN), "held_o
 def overrides_of(options: Values, rng: np.random.Generator) -> dict[str, Any]:
     """Options of a reset as overrides of a scene, with everything drawn.
 
-    `objects` names a set of `OBJECTS`; keys of the object come on top of what was drawn from it.
+    `objects` names a set of `OBJECTS`; keys of the object replace the values drawn from it.
 
     Raises:
-        UsageError: there is no such set.
+        UsageError: when there is no such set.
     """
     options = dict(options)
     objects = options.pop("objects", None)

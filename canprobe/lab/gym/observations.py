@@ -1,4 +1,4 @@
-"""What an agent sees, with the bounds of its spaces."""
+"""Observations of an agent, with the bounds of their spaces."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Observations:
         kind: `features`, which the master measures; `tactile`, the same and the last image; `oracle`, the features and
             what is true.
         plan: plan of the scene; another scene of the same cell has the same spaces.
-        shape: there is a surface estimator.
+        shape: whether there is a surface estimator.
 
     Attributes:
         names: names of the entries of the vector, in order, with their units.
@@ -83,8 +83,8 @@ class Observations:
         Args:
             task: the led task, in contact or as it was last.
             origin: first contact (3,), base frame, m.
-            coverage: so far.
-            forces: as measured since the last observation, N.
+            coverage: touched part of the region so far.
+            forces: forces measured since the last observation, N.
             truth: true state of the plant.
         """
         contact = task.last_contact
@@ -119,7 +119,7 @@ class Observations:
         return {"features": vector, "taxels": (taxels / COUNTS_MAX).astype(np.float32)}
 
     def _estimated(self, task: LedTask) -> list[float]:
-        """Curvature as the estimator has it, and the share of it that was observed."""
+        """Estimated curvature, and the share of it that was observed."""
         estimate = task.estimate
         if estimate is None:
             return [0.0] * 4

@@ -1,4 +1,4 @@
-"""What differs from one episode to the next: values by the keys of a scene file, fixed or drawn."""
+"""Values that differ between episodes, by the keys of a scene file, fixed or drawn."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 Values = Mapping[str, Any]
-"""Dotted key → value as in a scene file, or draw of one."""
+"""Value as in a scene file, or a draw of one, by dotted key."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class Uniform:
 
 @dataclass(frozen=True, slots=True)
 class OneOf:
-    """A value that is one of several, each as likely, for each episode.
+    """A value that is one of several, equally likely, for each episode.
 
     Attributes:
         values: possible values of the key; a value may itself be a draw, or a table with draws in it.
@@ -46,7 +46,7 @@ class OneOf:
 
 
 def drawn(value: Any, rng: np.random.Generator) -> Any:
-    """The value with everything drawn that is to be drawn."""
+    """The value with all its draws made."""
     if isinstance(value, Uniform | OneOf):
         return value.draw(rng)
     if isinstance(value, Mapping):

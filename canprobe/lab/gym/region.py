@@ -1,4 +1,4 @@
-"""The region of a scan and what of it has been touched."""
+"""The region of a scan, and its touched part."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ CELL_M = 0.5e-3
 TOUCH_RADIUS_M = 1.5e-3
 """Radius round a contact within which the surface counts as touched, m: a third of the patch at 2 N on a plane."""
 SECTORS = 8
-"""Directions in which an agent sees what is left to be touched."""
+"""Number of directions in which an agent sees the untouched part."""
 SIGHT_RADIUS_M = 6e-3
-"""How far it sees, m."""
+"""Radius within which it sees, m."""
 
 
 class Coverage:
@@ -43,16 +43,16 @@ class Coverage:
 
     @property
     def area(self) -> float:
-        """Touched so far, m²."""
+        """Touched area so far, m²."""
         return self._cells * CELL_M**2
 
     @property
     def share(self) -> float:
-        """Touched so far, of the rectangle."""
+        """Touched share of the rectangle so far."""
         return self._cells / (self._shape[0] * self._shape[1])
 
     def touch(self, place: Floats) -> float:
-        """Touch the surface at a place (2,) along the heading and across it, m; the area that is new, m²."""
+        """Touch the surface at a place (2,) along the heading and across it, m; returns the new area, m²."""
         window = self._window(place)
         if window is None:
             return 0.0
@@ -62,7 +62,7 @@ class Coverage:
         return new * CELL_M**2
 
     def left(self, place: Floats) -> Floats:
-        """Share within sight of a place (2,), m, that is left to be touched, by direction (`SECTORS`,).
+        """Untouched share within sight of a place (2,), m, by direction (`SECTORS`,).
 
         The first is round the heading; the others follow towards the side across.
         """

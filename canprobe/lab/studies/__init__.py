@@ -1,15 +1,15 @@
 """Studies: accuracy, limits, faults and timing of canprobe, each with a table, CSV, JSON and a picture.
 
 `canprobe study NAME` imports the module of that name and calls `run(quick=…, sweep=…) → StudyResult`. A study lists its
-cases; the sweep measures each case once, in any process; the study makes rows and findings of the answers, and a
+cases; the sweep measures each case once, in any process; the study makes rows and findings from the answers, and a
 function that draws them. `--quick` takes fewer cases and repeats. No other room imports a study.
 
     sweep         lists the studies; computes cells, keeps what is finished
     executors     where cells are computed: processes of this machine, or a Dask cluster
-    cell_store    finished cells on disk, with a digest of the code that they rest on
+    cell_store    finished cells on disk, with a digest of the code behind them
     harness       the result of a study: columns, rows, findings, picture
     result_files  the result as text, CSV, JSON and picture
-    many          one scene, many runs, for `canprobe.run_many`; no study
+    many          many runs of one scene, for `canprobe.run_many`; no study
 
 Estimators: `estimators` (error against run time) and `bound` (error and coverage over the Cramér–Rao bound) stand on
 `ground`, `bound` also on `bound_cases`, `bound_scores` and `bound_figure`; `regions` measures coverage with the whole

@@ -1,4 +1,4 @@
-"""Study `arrays`: how well forty touches calibrate an emulated array that nobody has seen.
+"""Study `arrays`: how well forty touches calibrate an unknown emulated array.
 
 Each cell is an array drawn at random: stiffness of its layer, full scale, blur, crosstalk, hysteresis, creep, gains. It
 is touched as `canprobe calibrate array` touches it, directly and without a bus: a plane at 4 places with 3 forces, a
@@ -43,7 +43,7 @@ PRESSES = 20
 WINDOW = 8
 FRAME_S, LOADING_S, DWELL_S, APART_S = 0.02, 0.5, 3.0, 2.5
 REFERENCE_S = 9.0
-"""Reference loads rest longer: what creeps has then crept."""
+"""Time of a reference load, s: creep has ended by then."""
 REFERENCE_SIGMA = 0.005
 FORCE_RELATIVE_SIGMA, FORCE_CORRELATION_S = 0.03, 0.1
 """The force wanders under a servo: relative standard deviation, and correlation time."""
@@ -76,7 +76,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
 
 
 def random_array(seed: int) -> tuple[TaxelConfig, float, np.random.Generator]:
-    """An array by chance, the stiffness of its layer (N/m³), and what draws its gains and noise."""
+    """A random array, the stiffness of its layer (N/m³), and the generator of its gains and noise."""
     rng = np.random.default_rng(seed)
     stiffness = 1.27e8 * math.exp(rng.uniform(-0.5, 0.5))
     config = TaxelConfig(
@@ -120,10 +120,10 @@ class Presses:
 
         Args:
             name: name of the object.
-            force: N.
+            force: normal force, N.
             kappa: principal curvatures, larger first, 1/m.
             number: number of the place.
-            at: on the pad, m.
+            at: place on the pad, m.
             angle: angle of the first principal direction on the pad, rad.
             seconds: duration of the roll.
             heading: heading of the roll on the pad, rad.
@@ -174,7 +174,7 @@ class Presses:
         )
 
     def rest(self) -> None:
-        """Let the array forget."""
+        """Wait until the array has recovered from the presses before."""
         array = TaxelArray(self._config, self._rng, radius_m=RADIUS_M, stiffness_n_m3=self._stiffness)
         array.take_gains(self._array)
         self._array, self._t = array, 0.0

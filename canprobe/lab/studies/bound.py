@@ -62,7 +62,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
 
 
 def measure_all(cases: list[BoundCase], seeds: int, sweep: Sweep, *, quick: bool = False) -> StudyResult:
-    """The study of some cases with so many seeds each."""
+    """The study of some cases with a number of seeds each."""
     sweep.say(f"{len(cases)} cases, {seeds} seeds each")
     blocks = [(first, min(BLOCK, seeds - first)) for first in range(0, seeds, BLOCK)]
     cells = [(case, method, *block) for block in blocks for case in cases for method in METHODS]
@@ -75,7 +75,7 @@ def measure_all(cases: list[BoundCase], seeds: int, sweep: Sweep, *, quick: bool
 
 
 def measure(cell: tuple[BoundCase, str, int, int]) -> list[Answer]:
-    """Answers of a method to a case, with so many seeds from the first one on."""
+    """Answers of a method to a case, with a number of seeds from the first one on."""
     case, method, first, count = cell
     ground, fit, own = case.ground, _fitter(case), zlib.crc32(as_json(case).encode())
     generators = [np.random.default_rng([own, seed]) for seed in range(first, first + count)]

@@ -16,7 +16,7 @@ from canprobe.mechanics.types import Floats
 SIZES_M, LONGEST_M, SAMPLES = (0.005, 0.04, 1.0), 0.02, 160
 NOISES = ((5e-6, 2e-4), (20e-6, 1e-3), (100e-6, 5e-3))
 LEAST_SIZE = 50.0
-"""A ‖K‖ below this counts as this, 1/m."""
+"""Least ‖K‖ that counts, 1/m: a smaller one counts as this."""
 REGION: Mapping[str, float] = MappingProxyType(
     {"path": 1.0, "bound": 0.2, "κσ": 5e-3, "cubic": 1.0 / 3.0, "spread": 0.25}
 )
@@ -62,7 +62,7 @@ def quick_cases() -> Iterator[BoundCase]:
 
 
 def criteria(case: BoundCase, ground: Ground, C: Floats, model_bias: float) -> dict[str, float]:
-    """The values of a case that `REGION` limits."""
+    """The figures of a case that `REGION` limits."""
     size = float(np.linalg.norm(ground.K))
     return {
         "path": 0.0 if case.surface == "plane" else case.length / case.size,

@@ -22,7 +22,7 @@ def draw_bound(rows: Sequence[Row], path: Path) -> None:
     title = (
         "Error of curvature over the least that any estimator can have (Cramér–Rao bound; below 1 the prior helps),\n"
         "and how often the stated 95 % regions hold the true curvature; a mark: one surface, size, noise and path\n"
-        "filled: a local quadric describes what was felt (inside), so the bound means something; open: it does not\n"
+        "filled: a local quadric describes the contacts (inside), so the bound has a meaning; open: it does not\n"
         "on each surface from left to right: 5 mm, 40 mm, 1 m in size, each with more and more noise\n"
         "shade: target; values beyond the scale are drawn at its edge"
     )

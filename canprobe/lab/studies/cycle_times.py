@@ -1,4 +1,4 @@
-"""What is measured of each cycle: lateness, response, computing time and the answers of the nodes."""
+"""Times of each cycle: lateness, response, computing time, and latency of the nodes' answers."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ class CycleTimes:
         lateness_ns: time of each SYNC behind its deadline (n,), ns.
         seconds: time from the first SYNC to the last.
         response_ns: time from the last TPDO to the RPDOs in every fifth cycle (m,), ns.
-        compute_ns: the same with the controller's work after the RPDOs (m,), ns.
+        compute_ns: that time and the controller's work after the RPDOs (m,), ns.
         latency_ns: time from each SYNC to the last of the drives' TPDOs that answer it (k,), ns.
-        missed: TPDOs that a cycle did without.
+        missed: number of TPDOs that did not come in their cycle.
         processor_share: processor time of the master's process over `seconds`; None where it cannot be measured.
     """
 
@@ -48,7 +48,7 @@ class CycleTimes:
 
     @property
     def overruns(self) -> int:
-        """Cycles woken more than half a period late."""
+        """Number of cycles woken more than half a period late."""
         return int(np.count_nonzero(self.lateness_ns > self.period_ns // 2))
 
     @property
@@ -58,12 +58,12 @@ class CycleTimes:
 
     @property
     def rate_hz(self) -> float:
-        """Cycles per second that were held."""
+        """Held rate, cycles per second."""
         return (self.cycles - 1) / self.seconds if self.seconds > 0 else 0.0
 
 
 def woken(clock: Clock, period_ns: int, cycles: int, lateness: list[int]) -> Iterator[int]:
-    """Wake at so many deadlines, a period apart, and append the lateness of each (ns); missed ones are skipped.
+    """Wake at a number of deadlines, a period apart, and append the lateness of each (ns); missed ones are skipped.
 
     Yields:
         The deadline, ns, or the last one that has passed by then.

@@ -70,7 +70,7 @@ class EstimatorSetting:
     lag: int | None = None
 
     def make(self, sigma_point: float, sigma_normal: float) -> Estimator:
-        """The estimator."""
+        """Make the estimator."""
         return make_estimator(
             self.method,
             sigma_point=sigma_point,
@@ -82,7 +82,7 @@ class EstimatorSetting:
 
 
 def settings(quick: bool = False) -> list[EstimatorSetting]:
-    """Every method and window; the lags below half a window."""
+    """Settings of every method and window, with lags below half a window."""
     windows, lags = ((40, 160), (10,)) if quick else (WINDOWS, LAGS)
     found = [EstimatorSetting(m, w) for m in ("chord", "ml", "recursive") for w in windows]
     return [EstimatorSetting("chen1996", w, lag) for w in windows for lag in lags if 2 * lag < w] + found

@@ -1,4 +1,4 @@
-"""Where cells are computed: a pool of processes on this machine, or the workers of a Dask cluster."""
+"""Executors that compute cells: a pool of processes on this machine, or the workers of a Dask cluster."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def dask_executor(address: str) -> Iterator[Executor]:
     try:
         client = Client(address, timeout=_DASK_WAIT, set_as_default=False)
     except (OSError, ValueError) as error:
-        raise StudyError(f"Dask scheduler {address}: expected it there, got: {error}") from error
+        raise StudyError(f"Dask scheduler {address}: expected an answer, got: {error}") from error
     executor = client.get_executor(pure=False)
     try:
         yield executor

@@ -14,7 +14,7 @@ FILES_EVERY = 8
 """One run in so many writes its log, and is scored on that."""
 SENSOR_SHARE = 0.3
 Windows = Mapping[str, tuple[int, int]]
-"""Phase → when it begins and ends in a run without faults, ns."""
+"""Beginning and end of each phase in a run without faults, ns."""
 KINDS = tuple(FaultKind)
 _BOTH_WAYS = (FaultKind.DROP, FaultKind.DELAY, FaultKind.DUPLICATE, FaultKind.CORRUPT)
 """A frame that the wire corrupts is dropped for its CRC-15, all but one in 10¹⁰; a frame that is corrupted here stands

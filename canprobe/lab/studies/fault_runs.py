@@ -31,9 +31,9 @@ SETTLED_S = 0.1
 """Time after which everything must be at rest."""
 LOOK_NS = 5_000_000
 BRING_UP_NS = 100_000_000
-"""Before the first SYNC: reset, configuration and start; before that the master only listens."""
+"""Time before the first SYNC for reset, configuration and start; before that the master only listens."""
 STOP_NS = 20_000_000
-"""Faults may begin for so long after the end too: an untimed bus stops all nodes at one instant."""
+"""Time after the end in which faults may begin too: an untimed bus stops all nodes at one instant."""
 
 
 @cache
@@ -57,7 +57,7 @@ def phase_windows(scenario: str, timed: bool) -> Windows:
 
 @cache
 def peak(scenario: str) -> Peak | None:
-    """How deep the probe of a scenario can sink in until the cell reacts; None where nothing presses."""
+    """Depths to which the probe of a scenario can sink in until the cell reacts; None where nothing presses."""
     return peak_of(_LockstepRun(FaultCase(0, scenario, "", (), timed=False, files=False)).session)
 
 
@@ -93,7 +93,7 @@ def run_seed(seed: int) -> dict[str, Any]:
 
 
 def carry_out(case: FaultCase) -> dict[str, Any]:
-    """Run a case to its end and a while beyond it; its outcome, its figures, and every failure in words."""
+    """Run a case to its end and some time beyond it; its outcome, its figures, and every failure in words."""
     reach = peak(case.scenario)
     wrong = any(fault.incoming and fault.kind is FaultKind.CORRUPT for fault in case.faults)
     bound = reach.force(len(case.faults), wrong) if reach is not None else None

@@ -102,7 +102,7 @@ BIN_N, FEW = 0.05, 20
 
 
 def draw_faults(runs: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """How the runs with each kind of fault ended, and the true force over all runs."""
+    """Draw how the runs with each kind of fault ended, and the true force over all runs."""
     failed = sum(bool(one["failures"]) for one in runs)
     title = (
         f"How {len(runs)} runs with random faults of nodes and links ended; in brackets: runs with the fault\n"
@@ -138,7 +138,7 @@ def draw_faults(runs: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 
 def draw_ends(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """How long the master took to end, by what happened on vcan0."""
+    """Draw the time that the master took to end, by the fault on vcan0."""
     kinds = list(dict.fromkeys(row["fault"] for row in rows))
     title = (
         "How long the master took to end after processes were killed or stopped, or the link failed, on vcan0\n"

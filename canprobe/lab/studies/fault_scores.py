@@ -62,11 +62,11 @@ LONGEST_S = 15.0
 
 @dataclass(frozen=True, slots=True)
 class Peak:
-    """How deep a probe can sink in until the cell reacts.
+    """Depths to which a probe can sink in until the cell reacts.
 
     Attributes:
-        force_limit: N.
-        depth_at_1n: m.
+        force_limit: force at the limit, N.
+        depth_at_1n: depth at 1 N, m.
         blind: depth without the sensor, m.
         torn: depth with 0, 1, 2, … drives that stand still, m.
         wrong: depth by one wrong target, m.
@@ -79,7 +79,7 @@ class Peak:
     wrong: float = 0.0
 
     def force(self, faults: int, wrong_targets: bool = False) -> float:
-        """The highest force of a run with so many faults, N; `wrong_targets`: frames to drives are corrupted."""
+        """Highest force of a run with a number of faults, N; `wrong_targets`: frames to drives are corrupted."""
         torn = self.torn[min(faults, len(self.torn) - 1)]
         ways = (self.blind, torn, self.wrong if wrong_targets else 0.0)
         sinks = max(ways) if faults < 2 else sum(ways)
@@ -110,7 +110,7 @@ def _model(session: Session) -> ArmModel:
 
 
 def _wrong_reach(session: Session) -> float:
-    """How far (m) the probe sinks in where one motor moves as far in a cycle as its drive allows."""
+    """Depth (m) to which the probe sinks in where one motor moves as far in a cycle as its drive allows."""
     scene, period_ns = session.scene, session.plan.sync.period_ns
     assert scene.arm is not None and scene.probe is not None
     model, share = _model(session), scene.limits.joint_speed_share
@@ -192,7 +192,7 @@ def score_rest(moved_rad: float, nodes: Sequence[SlaveNode]) -> list[str]:
 
 
 def score_summary(session: Session, task: Controller, reason: str) -> list[str]:
-    """A summary of the run can be made and written, whatever happened in it."""
+    """Failures to make and write a summary of the run, whatever happened in it."""
     if not session.started:
         return []
     try:
@@ -203,7 +203,7 @@ def score_summary(session: Session, task: Controller, reason: str) -> list[str]:
 
 
 def score_log(session: Session, steps: int) -> list[str]:
-    """Every cycle has its row in the log; every frame of the bus is in `bus.log`, where one is written."""
+    """Missing rows of cycles in the log, and missing frames in `bus.log`, where one is written."""
     failures = []
     if session.opened and (rows := len(session.cell.log)) < steps:
         failures.append(f"log: {rows} rows of {steps} cycles")

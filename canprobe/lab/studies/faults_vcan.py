@@ -50,10 +50,10 @@ MISSED_SYNCS = 20
 """Missed SYNCs that the drives bear: a guest stands still for tens of milliseconds, which is no fault of the cell."""
 PATIENCE_S = 60.0
 REACTION_S = 2.0
-"""After the fault, until drives without a master must have stopped: theirs are 0.2 s, the rest is for a slow guest."""
+"""Time after the fault until drives without a master must have stopped: they need 0.2 s, a slow guest needs more."""
 STALL_S = 1.0
 APART_S = 0.3
-"""Between two looks at the positions."""
+"""Time between two looks at the positions, s."""
 MOST_COUNTS = 8
 _TPDO1 = 0x181
 COLUMNS = (
@@ -68,7 +68,7 @@ COLUMNS = (
 
 
 class ProcessFault(Enum):
-    """What happens."""
+    """Kind of a fault on vcan0."""
 
     MASTER_KILLED = "master killed"
     MASTER_STALLED = "master stalled"
@@ -82,8 +82,8 @@ class ProcessCase:
     """One run.
 
     Attributes:
-        seed: its number.
-        fault: what happens.
+        seed: number of the run.
+        fault: kind of the fault.
         after_s: time from the enabling of the drives to the fault.
     """
 
@@ -132,7 +132,7 @@ def served_scene() -> Scene:
 
 
 def row_of(case: ProcessCase) -> Row:
-    """Bring the cell up, let the fault happen, and look at what is left: the row of the case."""
+    """Bring the cell up, let the fault happen, and score the end: the row of the case."""
     with tempfile.TemporaryDirectory(prefix="canprobe-faults-") as folder:
         run = _ServedRun(case, EmulatorChild(make_plan(resolve(served_scene())), None, (CHANNEL,)), Path(folder))
         try:
@@ -152,7 +152,7 @@ def row_of(case: ProcessCase) -> Row:
 
 
 class _ServedRun:
-    """One case being carried out."""
+    """One case that is carried out."""
 
     def __init__(self, case: ProcessCase, child: EmulatorChild, folder: Path) -> None:
         self.case, self.child, self.folder = case, child, folder

@@ -33,7 +33,7 @@ class Ground:
     """A path over an exact surface.
 
     Attributes:
-        points, normals: (n, 3) in the contact frame of the last point, m; outward unit normals.
+        points, normals: points (n, 3), m, and outward unit normals (n, 3) in the contact frame of the last point.
         surface: the quadric of the surface's second order there (the surface itself but for a torus).
         length: along the path, m.
         tensor: the true curvature tensor (3, 3) at the foot of a point (3,) near the contact, 1/m.
@@ -47,7 +47,7 @@ class Ground:
 
     @property
     def K(self) -> Floats:
-        """(2, 2) shape operator at the last point, in its contact frame, 1/m."""
+        """Shape operator at the last point (2, 2), in its contact frame, 1/m."""
         return self.surface.curvature_at(np.zeros(3))[0]
 
     def felt(self, sigma_point: float, sigma_normal: float, rng: np.random.Generator) -> tuple[Floats, Floats]:
@@ -57,7 +57,7 @@ class Ground:
         return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
     def error(self, T_frame_contact: Floats, K: Floats) -> Floats:
-        """(3,) K11, K12, K22 of an estimate less the truth at its contact point, in its contact frame, 1/m.
+        """Error (3,) of an estimate's K11, K12, K22 at its contact point, in its contact frame, 1/m.
 
         An estimate holds at the foot of the last *measured* point, which is off by that point's noise; on a tight
         surface the true curvature differs there by as much as the bound.
@@ -74,8 +74,8 @@ def make_ground(surface: str, size: float, path: str, length: float, samples: in
         surface: one of `SURFACES`.
         size: radius, or the length that its radii follow, m; without effect on a plane.
         path: one of `PATHS`.
-        length: along the path as seen from above, m.
-        samples: equally spaced points.
+        length: length of the path as seen from above, m.
+        samples: number of equally spaced points.
         waves: number of waves of a weave; it is as wide as such a wave is long, times 5/6.
 
     Raises:

@@ -26,7 +26,7 @@ class Column:
     Attributes:
         key: key of the rows, and heading in the CSV; it ends in the unit.
         heading: heading in the printed table.
-        form: how a value is printed, as for `format`.
+        form: format of a value, as for `format`.
     """
 
     key: str
@@ -36,15 +36,15 @@ class Column:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StudyResult:
-    """What a study found.
+    """The result of a study.
 
     Attributes:
         name: name of the study.
         columns: columns of the table.
-        rows: one a case; None where a value does not apply.
+        rows: one row for each case; None where a value does not apply.
         findings: sentences with figures.
-        facts: what it was measured with.
-        draw: writes the picture to a path; needs matplotlib.
+        facts: machine, versions and settings of the measurement.
+        draw: function that writes the picture to a path; it needs matplotlib.
         more: further tables of the study, each with its findings, files and picture.
     """
 

@@ -37,7 +37,7 @@ class ForceLoop:
         height_hz: bandwidth of the surface's height correction, the force gain.
         late_s: delay of targets and tactile frames on the bus.
         omega: undamped frequency of the drives, rad/s.
-        damping: their damping ratio.
+        damping: damping ratio of the drives.
     """
 
     depth_ratio: float

@@ -1,4 +1,4 @@
-"""One scene, many runs: every combination of values and seeds, on all cores or a cluster; as a table, or over time."""
+"""Many runs of one scene: each combination of values and seeds, on all cores or a cluster; as a table, or over time."""
 
 from __future__ import annotations
 
@@ -39,19 +39,19 @@ if TYPE_CHECKING:
 SERIES = ("force_n", "kappa_per_m")
 """Columns of a log that are kept by default, where there are any."""
 TRUTH = "truth."
-"""Begins the name of a series from the plant's truth."""
+"""Prefix of the name of a series from the plant's truth."""
 _FIGURES = ("sim_time_s", "wall_time_s", "contact", "shape", "calibration")
 """Parts of a summary whose numbers are columns of the table."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunCase:
-    """A run, with all that decides its outcome.
+    """A run, with everything that decides its outcome.
 
     Attributes:
-        scene: as TOML.
+        scene: scene as TOML.
         files: digest of the files that it names.
-        seed: seed in the place of the scene's.
+        seed: seed that replaces the scene's.
         series: columns of the log, or of the truth, that are kept.
         every_ms: time between two of their values.
     """
@@ -64,7 +64,7 @@ class RunCase:
 
 
 def measure(case: RunCase) -> dict[str, Any]:
-    """Carry a case out, in a worker; whatever ends it is its outcome."""
+    """Carry a case out in a worker; an error is an outcome too."""
     scene = parse_scene(case.scene)
     scene = replace(scene, scene=replace(scene.scene, seed=case.seed))
     outcome: dict[str, Any] = {"status": "done", "reason": None, "summary": None, "series": {}, "columns": []}
@@ -115,19 +115,19 @@ def run_many(
 
     Args:
         scene: as for `canprobe.run`.
-        vary: the values of each key, such as ``{"task.force_n": [1, 2, 3]}``. What goes together is one key: a table
-            takes the place of a section, ``{"object": [{"kind": "plane"}, {"kind": "sphere", "radius_mm": 40}]}``.
-        seeds: how many, from 0 on, or which; the scene's by default.
+        vary: the values of each key, such as ``{"task.force_n": [1, 2, 3]}``. Values that belong together are
+            one key, a section: ``{"object": [{"kind": "plane"}, {"kind": "sphere", "radius_mm": 40}]}``.
+        seeds: number of seeds, from 0 on, or a list of them; by default the scene's.
         bus: ``direct`` or ``lockstep``; the scene's by default. Where the wire is of no interest, ``direct`` gives the
             results of a lockstep bus without delays, several times as fast.
-        duration_s: duration in the place of the scene's, s.
+        duration_s: duration that replaces the scene's, s.
         workers: number of processes, one for each core by default; or the address of a Dask scheduler, such as
             ``tcp://10.0.0.1:8786``, whose workers have the same canprobe.
         out: folder of the finished runs; ``runs/many-<scene>`` by default.
-        fresh: forget what is in ``out``.
+        fresh: whether to forget the runs in ``out``.
         series: columns of the log to keep over time for `Runs.to_xarray`; ``truth.force_n`` is one of the truth.
         every_ms: time between two of their values, ms.
-        progress: show a bar on a terminal or in a notebook.
+        progress: whether to show a bar on a terminal or in a notebook.
         say: called with each step.
 
     Returns:
@@ -185,7 +185,7 @@ def _seeds(scene: Scene, seeds: SupportsIndex | Iterable[SupportsIndex] | None) 
     try:
         wanted = list(map(operator.index, seeds if isinstance(seeds, Iterable) else range(operator.index(seeds))))
     except TypeError:
-        raise UsageError(f"seeds: expected how many, or a list of integers, got {seeds!r}") from None
+        raise UsageError(f"seeds: expected a number, or a list of integers, got {seeds!r}") from None
     if not wanted:
         raise UsageError(f"seeds: expected at least one, got {seeds!r}")
     return [load_scene(scene, {"scene.seed": seed}).seed for seed in wanted]
@@ -210,10 +210,10 @@ class Runs:
     """The runs of `run_many`, in the order of the combinations, seeds last.
 
     Attributes:
-        scene: what they have in common.
+        scene: the scene of all runs.
         keys: keys that were varied.
         rows: the value of each key, and ``seed``, of each run.
-        outcomes: what became of each run: ``status`` (``done``; ``stopped`` for safety; ``refused`` by the plan;
+        outcomes: outcome of each run: ``status`` (``done``; ``stopped`` for safety; ``refused`` by the plan;
             ``failed``), ``reason``, ``summary`` (as in ``summary.json``; None where nothing ran) and ``series``.
         series: names of the columns that were kept.
         every_s: time between two of their values, s.
@@ -227,7 +227,7 @@ class Runs:
     every_s: float
 
     def table(self) -> pandas.DataFrame | list[Row]:
-        """A row a run: varied keys, seed, status, reason, version, and the figures of the summary by their path.
+        """A row for each run: varied keys, seed, status, reason, version, and the figures of the summary by their path.
 
         Returns:
             A frame where pandas is installed, else the rows as mappings.
@@ -295,7 +295,7 @@ class Runs:
 
 
 def _numbers(part: Any, path: str = "") -> Iterable[tuple[str, float]]:
-    """The numbers in a part of a summary, by their path; what does not apply is left out."""
+    """The numbers in a part of a summary, by their path."""
     if isinstance(part, Mapping):
         for name, value in part.items():
             yield from _numbers(value, f"{path}.{name}" if path else name)

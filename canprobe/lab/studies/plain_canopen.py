@@ -28,7 +28,7 @@ _WAIT_SHARE = 0.6
 
 
 def run_plain(plan: Plan, seconds: float) -> CycleTimes:
-    """Bring the nodes of a plan with drives 1–6 up, run the cycle for some time, stop them."""
+    """Bring the nodes of a plan with drives 1–6 up, run the cycle for a time, stop them."""
     network = canopen.Network()
     network.connect(interface="socketcan", channel=CHANNEL)
     try:

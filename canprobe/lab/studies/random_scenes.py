@@ -1,4 +1,4 @@
-"""Scenes that are drawn at random: object, place, path and what the emulated array does."""
+"""Random scenes: object, place, path, and effects of the emulated array."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from canprobe.cell.scene.model import ObjectSettings, PlantSettings, Scene
 from canprobe.cell.scene.resolve import LAYER_STIFFNESS
 
 _PLACE_MM = (-170.0, -175.0, 300.0)
-"""Where the arm reaches in all directions."""
+"""Place where the arm reaches in all directions, mm."""
 
 
 def random_scene(number: int, duration_s: float) -> Scene:

@@ -41,7 +41,7 @@ WIRE_BITRATE = 50_000_000
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """A case and its times; `ended`: why it ended early."""
+    """A case and its times; `ended` is the reason of an early end."""
 
     case: str
     sensor: str
@@ -88,7 +88,7 @@ def holding_scene(mode: TactileModeName, rate_hz: float) -> Scene:
 
 
 def with_real_nodes(scene: Scene) -> Scene:
-    """The scene with arm and sensor in another process."""
+    """The scene whose arm and array are served by another process."""
     assert scene.arm is not None and scene.sensor is not None
     arm, sensor = replace(scene.arm, emulated=False), replace(scene.sensor, emulated=False)
     return replace(scene, arm=arm, sensor=sensor)
@@ -108,7 +108,7 @@ def patient(scene: Scene, missed_syncs: int = MISSED_SYNCS) -> Scene:
 
 
 def _unheard(_: str) -> None:
-    """Drop what is not permitted: the first case has reported it."""
+    """Ignore reports of missing permissions: the first case has reported them."""
 
 
 class Hold(Controller):

@@ -100,7 +100,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
 
 
 def soak(seconds: float) -> list[Row]:
-    """Hold the cell; a sample every sixtieth of the time."""
+    """Hold the cell, and take a sample every sixtieth of the time."""
     scene = load_scene("cylinder")
     scene = Target.over(scene, "socketcan", CHANNEL).applied_to(scene)
     child = EmulatorChild(make_plan(resolve(scene)), None, (CHANNEL,), truth=False)
@@ -142,7 +142,7 @@ def findings(samples: Sequence[Row]) -> list[str]:
 
 
 def _growth(samples: Sequence[Row], name: str) -> float:
-    """Slope, MiB/h."""
+    """Slope of a column, MiB/h."""
     if len(samples) < 2:
         return 0.0
     t_h = np.array([s["t_s"] for s in samples]) / 3600

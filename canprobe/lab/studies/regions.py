@@ -78,7 +78,7 @@ class RegionCase(NamedTuple):
 
 
 class ScoredScan(NamedTuple):
-    """What a scan gave: its scene in words, answers after the run-in, and the scores (n, 4) of those with all of K.
+    """Result of a scan: its scene in words, answers after the run-in, and the scores (n, 4) of those with all of K.
 
     A score is: squared error and stated variance (Frobenius), squared length of the error in the region's, and the
     logarithm of the density at the truth.
@@ -132,7 +132,7 @@ def measure(case: RegionCase) -> ScoredScan:
 
 
 def scored(record: ShapeRecord, truth: dict[str, Floats], times: Floats) -> list[float]:
-    """One of `ScoredScan.scores`, in the answer's own axes."""
+    """One row of `ScoredScan.scores`, in the axes of the answer."""
     row = int(np.searchsorted(times, record.t_s - 1e-6))
     P = record.estimate.T_frame_contact[:3, :2]
     D = (
@@ -183,7 +183,7 @@ def row_of(group: str, name: str, scans: Sequence[ScoredScan]) -> Row:
 
 
 def _interval(values: Floats) -> tuple[float, float]:
-    """Where 95 % of the draws lie."""
+    """Interval of 95 % of the draws."""
     if not len(values):
         return math.nan, math.nan
     low, high = np.quantile(values, [0.025, 0.975])

@@ -48,7 +48,7 @@ SCAN_S = 1.5
 """Duration of a scan: the curvature is known in its second half."""
 _AT = (-120.0, -122.5, 374.0)
 WIDE_PERCENT = 20.0
-ENDS = ("stable", "stopped", "refused")
+SOUND_ENDS = ("stable", "stopped", "refused")
 MODEL = ("fieldbus", "mechanics", "cell", "lab/studies/stability_runs.py", "lab/studies/linear_loop.py")
 COLUMNS = (
     Column("view", "view"),
@@ -100,14 +100,14 @@ def _quick_cases() -> list[LoopCase]:
 
 
 def _at(reach_mm: float, speed_mm_s: float) -> LoopCase:
-    """A touch that far from the first joint's axis, in the default direction."""
+    """A touch at a distance from the first joint's axis, in the default direction."""
     share = reach_mm / math.hypot(*_AT[:2])
     at_mm = (_AT[0] * share, _AT[1] * share, _AT[2])
     return LoopCase("pose", 1e4, at_mm=at_mm, speed_mm_s=speed_mm_s, hold_s=SCAN_S if speed_mm_s else 0.4)
 
 
 def _bent(wrist_deg: float, speed_mm_s: float) -> LoopCase:
-    """A touch of a gently curved object in front of the arm, with the wrist bent by so much."""
+    """A touch of a gently curved object in front of the arm, with the wrist bent by an angle."""
     at_mm, normal, posture_deg = touch_in_posture((90.0, 65.0, 15.0, -360.0, wrist_deg, 0.0))
     return LoopCase(
         "pose", 1e4, at_mm=at_mm, normal=normal, posture_deg=posture_deg, kind="sphere", radius_mm=300.0,
@@ -162,7 +162,7 @@ def approach_limit(row: Row, approach_m_s: float = 4e-3, force_max: float = 5.0)
 
 
 def findings(rows: Sequence[Row]) -> list[str]:
-    """How the cells end, whether the prediction holds, and every cell that hunts or fails."""
+    """Numbers of the ends, whether the prediction holds, and every cell that hunts or fails."""
     ends = Counter(str(row["ended"]) for row in rows)
     said = [f"{len(rows)} touches: " + ", ".join(f"{number} {end}" for end, number in ends.most_common()) + "."]
     told = [r for r in rows if r["view"] == "told" and r["ended"] != "refused" and r["contact_n_m"] >= 1e3]
@@ -199,7 +199,7 @@ def findings(rows: Sequence[Row]) -> list[str]:
             f"Longest time above the force limit: {longest['above_ms']:.0f} ms, allowed {longest['allowed_ms']:.0f} ms "
             f"(stated reaction, twice the delay, and 100 ms for the retreat)."
         )
-    other = [r for r in rows if r["ended"] not in ENDS]
+    other = [r for r in rows if r["ended"] not in SOUND_ENDS]
     said += [f"{_named(r)}: {r['ended']}{_because(r)}" for r in other]
     if not other:
         said.append("Every touch is stable within limits, stopped safely with the reason, or refused by the plan.")
@@ -229,7 +229,7 @@ END_MARKS = {
     "hunting": (PINK, "D", "force not settled"),
     "failed": (ORANGE, "v", "failed"),
 }
-"""How a touch ended: colour, marker, words."""
+"""Colour, marker and words for each end of a touch."""
 VIEWS = {"told": "servo with the stated stiffness", "felt": "servo that estimates the stiffness"}
 SIDES = {"drives": "bandwidth of the drives", "pose": "pose", "radii": "radii", "speed": "speed of a scan"}
 PANELS_IN_A_ROW = 3
@@ -292,7 +292,7 @@ def _mark(axes: Axes, row: Row, x: float, y: float) -> None:
 
 
 def _draw_side(axes: Axes, title: str, rows: Sequence[Row]) -> None:
-    """How the cases of one line end: a table with a mark for each."""
+    """Draw the ends of the cases of one line: a table with a mark for each."""
     places = [_place(r) for r in rows]
     lines, columns = (list(dict.fromkeys(names)) for names in zip(*places, strict=True)) if places else ([], [])
     for row, (line, column) in zip(rows, places, strict=True):

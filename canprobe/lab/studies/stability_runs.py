@@ -46,7 +46,7 @@ class LateNode(WrappedNode):
     Args:
         node: the node.
         late_ids: COB-IDs that come late, both ways.
-        late_ns: time by which it is late.
+        late_ns: delay of these frames.
     """
 
     def __init__(self, node: SlaveNode, late_ids: Container[int], late_ns: int) -> None:
@@ -57,7 +57,7 @@ class LateNode(WrappedNode):
 
     @property
     def next_deadline_ns(self) -> int | None:
-        """The node's, or that of the next late frame."""
+        """Deadline of the node, or of the next late frame."""
         due = [queue[0][0] for queue in (self._in, self._out) if queue]
         own = self.node.next_deadline_ns
         return min(due if own is None else [*due, own], default=None)
@@ -67,14 +67,14 @@ class LateNode(WrappedNode):
         return self._sent(self.node.start(t_ns), t_ns)
 
     def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
-        """A frame from the bus, now or later."""
+        """Take a frame from the bus, now or later."""
         if can_id in self._late_ids:
             self._in.append((t_ns + self._late_ns, (can_id, data)))
             return ()
         return self._sent(self.node.receive(can_id, data, t_ns), t_ns)
 
     def advance(self, t_ns: int) -> Sequence[Frame]:
-        """What is due."""
+        """Do what is due."""
         ready: list[Frame] = []
         while self._out and self._out[0][0] <= t_ns:
             ready.append(self._out.popleft()[1])
@@ -111,8 +111,8 @@ class LoopCase:
         contact_n_m: stiffness dF/dδ of the contact at the wanted force, N/m.
         rate_hz: rate of the servo.
         late_ms: delay of targets and tactile frames.
-        height_hz: the force gain.
-        feels: the servo estimates the stiffness from the touch; else it uses that of the default pad.
+        height_hz: force gain.
+        feels: whether the servo estimates the stiffness from the touch; else it uses that of the default pad.
         bandwidth_hz: bandwidth of the drives.
         fidelity: fidelity of the plant.
         probe_mm: radius of the probe.
@@ -121,7 +121,7 @@ class LoopCase:
         at_mm: point at which the object is touched, base frame.
         normal: outward normal there.
         posture_deg: selects the branch of the inverse kinematics.
-        force_n: target.
+        force_n: wanted force, N.
         hold_s: duration of the press or scan.
     """
 
@@ -180,7 +180,7 @@ def touch_in_posture(
     """A touch with the pole of the default probe and these joint angles, deg.
 
     Returns:
-        Where it is, mm; the outward normal there; joint angles (n,) so far above it, deg.
+        Its place, mm; the outward normal there; joint angles (n,) at `above_mm` above it, deg.
     """
     model, probe = arm_of(load_scene("press")), ProbeSettings()
     q = np.radians(posture_deg)

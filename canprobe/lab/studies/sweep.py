@@ -19,9 +19,9 @@ and the cells; the sweep does the rest:
         ...
         return StudyResult("my_study", COLUMNS, rows, findings(rows), measuring_facts(quick, 40), partial(draw, rows))
 
-Answers come back in the order of the cells and as JSON gives them, whether they were computed now or earlier: tuples
+Answers come in the order of the cells and as JSON gives them, whether they were computed now or earlier: tuples
 and arrays are lists, keys of mappings are text. The cell holds all that decides an answer (parameters, seeds). `model`
-names the files and folders of the package that it rests on (all of it by default): when one of them changes, its cells
+names the files and folders of the package behind it (all of them by default): when one of them changes, its cells
 are computed again.
 """
 
@@ -48,16 +48,16 @@ from canprobe.lab.studies.harness import Say, StudyResult
 
 
 class Sweep:
-    """How a study's cells are computed, and where they are kept.
+    """Computes the cells of a study, and keeps them.
 
     Args:
-        executor: opens any `concurrent.futures` executor; called when there is something to compute.
-        store: finished cells.
+        executor: opens any `concurrent.futures` executor; called when there are cells to compute.
+        store: store of the finished cells.
         say: called with each step.
         progress: called after each cell.
 
     Attributes:
-        folder: folder of the store, for what a study publishes besides its table.
+        folder: folder of the store, for files that a study publishes besides its table.
     """
 
     def __init__(self, executor: Opener, store: CellStore, *, say: Say, progress: Progress | None = None) -> None:
@@ -72,8 +72,8 @@ class Sweep:
 
         Args:
             measure: a function of a module, of one cell; its answer has a JSON form.
-            cells: dataclasses or whatever else has a JSON form.
-            model: files and folders of the package that the answers rest on; all by default.
+            cells: dataclasses, or other values with a JSON form.
+            model: files and folders of the package behind the answers; by default all.
 
         Raises:
             StudyError: a cell or a worker failed; the cells that are finished by then are kept.
@@ -81,7 +81,7 @@ class Sweep:
         return self._all(measure, cells, tuple(model), None)
 
     def time(self, measure: Callable[[Any], object], cells: Sequence[Any], *, model: Sequence[str] = ()) -> list[Any]:
-        """The same for cells that measure run time: one after another, alone, in one process of this machine.
+        """Answers of cells that measure run time: one after another, alone, in one process of this machine.
 
         A kept answer counts on the machine that measured it only.
         """
@@ -120,7 +120,7 @@ def open_sweep(
         folder: folder of `cells.jsonl`; what that holds is not computed again.
         workers: number of processes, one for each core by default.
         dask: address of a Dask scheduler to use instead.
-        fresh: forget what the folder holds.
+        fresh: whether to forget the cells in the folder.
         watched: `say` and `progress` of the sweep.
 
     Raises:
@@ -144,7 +144,7 @@ def _compute(measure: Callable[[Any], object], parts: tuple[str, ...], model: st
 
 
 def error_text(error: Exception) -> str:
-    """What was raised, and where, in a line."""
+    """An error and its place in the source, in a line."""
     frame = traceback.extract_tb(error.__traceback__)[-1]
     return f"{type(error).__name__}: {error} ({Path(frame.filename).name}:{frame.lineno})"
 
@@ -183,7 +183,7 @@ STUDIES: Mapping[str, str] = MappingProxyType(
     {
         "estimators": "error of the shape estimators against their run time, with the Cramér–Rao bound",
         "bound": "error and coverage of the estimators over the Cramér–Rao bound: surfaces, sizes, paths and noise",
-        "arrays": "how well forty touches calibrate an emulated array that nobody has seen",
+        "arrays": "how well forty touches calibrate an unknown emulated array",
         "regions": "whether the online estimator's 95 % regions hold the truth, over packaged and random scenes",
         "shapes": "surfaces of unknown shapes by every estimator, by local fits and by Gaussian processes",
         "workprec": "error of the dynamic plant against its run time, and of the whole cell against its computing time",
@@ -192,7 +192,7 @@ STUDIES: Mapping[str, str] = MappingProxyType(
         "faults": "how the cell reacts to thousands of random faults of its nodes and their links",
     }
 )
-"""Name → what it measures. The module of that name in this package has `run(*, quick, sweep) -> StudyResult`."""
+"""Measured quantity of each study, by its name. The module of that name has `run(*, quick, sweep) -> StudyResult`."""
 
 
 def run_study(name: str, *, quick: bool, sweep: Sweep, form: str = "") -> StudyResult:
@@ -202,7 +202,7 @@ def run_study(name: str, *, quick: bool, sweep: Sweep, form: str = "") -> StudyR
         name: one of `STUDIES`.
         quick: fewer repeats and cases.
         sweep: computes its cells.
-        form: another form of it: ``vcan`` of `faults`, with processes on a real vcan0; ``soak`` of `realtime`, an hour.
+        form: variant of it: ``vcan`` of `faults`, with processes on a real vcan0; ``soak`` of `realtime`, an hour.
     """
     module = importlib.import_module(f"canprobe.lab.studies.{name}_{form}" if form else f"canprobe.lab.studies.{name}")
     result: StudyResult = module.run(quick=quick, sweep=sweep)

@@ -18,11 +18,11 @@ class HangError(Exception):
 
 
 class Witness(Participant):
-    """A participant of the bus that looks at the plant periodically, also when the master sends no SYNC any more.
+    """A participant of the bus that looks at the plant periodically, even when the master has stopped sending SYNC.
 
     Args:
         plant: plant of the run.
-        period_ns: between two looks.
+        period_ns: time between two looks.
 
     Attributes:
         rows: (t_ns, force in N) of each look.
@@ -37,7 +37,7 @@ class Witness(Participant):
         self._plant, self._period_ns = plant, period_ns
 
     def advance(self, t_ns: int) -> Sequence[Frame]:
-        """Look."""
+        """Look at the plant where it is time."""
         self.next_deadline_ns = t_ns + self._period_ns
         self._plant.advance(t_ns)
         self.rows.append((t_ns, float(self._plant.truth()["force"])))

@@ -85,7 +85,7 @@ def trial(stiffness_n_m3: float, cycles: int) -> tuple[PlantConfig, Floats]:
 
 
 def integrated(stiffness_n_m3: float, cycles: int, stepping: Stepping, held: bool) -> Floats | None:
-    """(cycles, 12) motor counts and rates at the ends of the cycles; None where the integration broke down."""
+    """Motor counts and rates at the ends of the cycles (cycles, 12); None where the integration broke down."""
     config, targets = trial(stiffness_n_m3, cycles)
     arm = DynamicArm(_arm()[0], config.q0, make_equations(config, held=held), stepping)
     seen: list[Any] = []
@@ -119,7 +119,7 @@ def stands(stiffness_n_m3: float, cycles: int, stepping: Stepping) -> bool:
 
 
 def reference(stiffness_n_m3: float, cycles: int, rtol: float) -> Floats:
-    """The same by scipy's Radau, cycle by cycle, nothing held."""
+    """Motor counts and rates by scipy's Radau, cycle by cycle, nothing held."""
     config, targets = trial(stiffness_n_m3, cycles)
     equations, scale = make_equations(config, held=False), units_per_motor(_arm()[0])
     h, seen = CYCLE_NS * 1e-9, []
@@ -150,7 +150,7 @@ def observed(stiffness_n_m3: float, cycles: int, states: Floats) -> dict[str, Fl
 STIFFNESSES = (1.6e7, 1.27e8, 1.27e9, 1.27e11)
 """K/h of the layer, N/m³: foam, the default pad, steel, and a hundred times that. At 2 N: 3.3, 9.4, 30, 300 kN/m."""
 METHODS = ("semi-implicit", "rk4", "implicit", "rosenbrock", "exponential")
-"""Those that a finding names; the plant has an adaptive one too, whose steps no fixed budget bounds."""
+"""Methods that a finding names; the plant has an adaptive one too, whose steps no fixed budget bounds."""
 STEPS_US = (2500.0, 1250.0, 625.0, 312.5, 156.25, 78.125)
 FULL_SCALE_PA = 100e3
 STIFFEST, REST_CYCLES = 1.4e14, 40

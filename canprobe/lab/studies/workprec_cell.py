@@ -304,7 +304,7 @@ def _text_of(row: Row) -> str:
 
 
 MARKS = {"features": "^", "window": "o", "image": "s"}
-SIZES = {100.0: 14.0, 200.0: 34.0, 400.0: 72.0, 500.0: 90.0, 1000.0: 140.0, 2000.0: 210.0}
+MARK_AREAS = {100.0: 14.0, 200.0: 34.0, 400.0: 72.0, 500.0: 90.0, 1000.0: 140.0, 2000.0: 210.0}
 PANELS = (
     ("curvature_percent", "curvature error (%)"),
     ("normal_deg", "normal error (deg)"),
@@ -337,7 +337,7 @@ def _draw(axes: Axes, rows: Sequence[Row], key: str, fidelity: str) -> None:
     for r in mine:
         filled = {CLASSICAL: METHOD_COLOURS[r["method"]], FASTER: FAINT}.get(r["bus"], "none")
         axes.scatter(
-            r["cost_ms_per_s"], r[key], s=SIZES.get(r["rate_hz"], 110.0), marker=MARKS[r["mode"]],
+            r["cost_ms_per_s"], r[key], s=MARK_AREAS.get(r["rate_hz"], 110.0), marker=MARKS[r["mode"]],
             facecolor=filled, edgecolor=METHOD_COLOURS[r["method"]], linewidth=1.2,
         )  # fmt: skip
     knee, default = next(iter(good(rows, fidelity)), None), default_of(rows, fidelity)
@@ -364,7 +364,7 @@ def _keys(rows: Sequence[Row]) -> list[Line2D]:
     found = [dot(m, c, "o", 7.0) for m, c in METHOD_COLOURS.items() if any(r["method"] == m for r in done)]
     found += [dot(m, INK, mark, 7.0) for m, mark in MARKS.items() if any(r["mode"] == m for r in done)]
     rates = sorted({r["rate_hz"] for r in done})
-    found += [dot(f"{rate:.0f} Hz", INK, "o", SIZES.get(rate, 110.0) ** 0.5) for rate in rates]
+    found += [dot(f"{rate:.0f} Hz", INK, "o", MARK_AREAS.get(rate, 110.0) ** 0.5) for rate in rates]
     if any(r["bus"] == FD for r in done):
         found.append(dot("CAN FD", INK, "o", 7.0, "white"))
     if any(r["bus"] == FASTER for r in done):

@@ -79,7 +79,7 @@ def test_plan_measured_on_the_command_line(press, capsys):
     assert main(["plan", "free", "--measured", str(folder)]) == 3
     captured = capsys.readouterr()
     assert "not in the plan: 511h" in captured.out
-    assert captured.err == f"canprobe: {folder} is a run of scene press, set beside the plan of free\n"
+    assert captured.err == f"canprobe: {folder} is a run of scene press, compared with the plan of free\n"
 
 
 def test_logs_that_cannot_be_measured(press, tmp_path):

@@ -57,5 +57,5 @@ def test_no_frame_of_a_run_is_later_than_planned(name, cycle, tmp_path):
 
 def test_a_bound_that_is_not_found_is_none(monkeypatch):
     """Should SYNC and feedback push each other on without end, there is no bound rather than the last guess."""
-    monkeypatch.setattr(traffic, "ROUNDS", 1)
+    monkeypatch.setattr(traffic, "MAX_ROUNDS", 1)
     assert any("without bound" in problem for problem in refused(load_scene("free")).problems)

@@ -119,7 +119,7 @@ def test_a_real_array_needs_somebody_to_place_things(tmp_path, capsys):
         str(tmp_path / "o"),
     ]
     assert main(args) == 2
-    assert "somebody has to place the objects" in capsys.readouterr().err
+    assert "a person has to place the objects" in capsys.readouterr().err
 
 
 def test_a_real_array_without_a_calibration_measures_nominal_newtons(tmp_path):

@@ -120,8 +120,8 @@ def test_numbers_of_numpy_are_integers_as_others(tmp_path, monkeypatch):
         ({"seeds": [-1]}, r"scene\.seed: expected an integer from 0"),
         ({"seeds": 0}, "seeds: expected at least one, got 0"),
         ({"seeds": []}, r"seeds: expected at least one, got \[\]"),
-        ({"seeds": 1.5}, "seeds: expected how many, or a list of integers, got 1.5"),
-        ({"seeds": [1.5]}, r"seeds: expected how many, or a list of integers, got \[1\.5\]"),
+        ({"seeds": 1.5}, "seeds: expected a number, or a list of integers, got 1.5"),
+        ({"seeds": [1.5]}, r"seeds: expected a number, or a list of integers, got \[1\.5\]"),
         ({"bus": "socketcan"}, 'runs share no bus: expected bus="direct" or "lockstep"'),
     ],
 )

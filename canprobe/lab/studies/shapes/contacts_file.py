@@ -21,7 +21,7 @@ from canprobe.mechanics.types import Floats
 
 
 class ShapeContacts(NamedTuple):
-    """What a method gets of a shape.
+    """Contacts of a shape, for a method.
 
     Attributes:
         samples: contacts in the order of time, with their stated noise.

@@ -55,7 +55,7 @@ class Touched(NamedTuple):
     sigma_normal: Floats
 
     def some(self, i: Floats | slice) -> Touched:
-        """Those of some indices."""
+        """The contacts of some indices."""
         return Touched(*(values[i] for values in self))
 
 
@@ -85,7 +85,7 @@ class ImplicitSurface:
         self.log_likelihood -= 0.5 * len(observed) * math.log(2.0 * math.pi)
 
     def _covariance(self, x: Floats, y: Floats) -> Floats:
-        """(4 n, 4 m) of (f, ∇f) at points x and at points y."""
+        """Covariance (4 n, 4 m) of (f, ∇f) at points x and at points y."""
         d = x[:, None] - y
         k, a, b = self._k(np.sqrt(np.einsum("ijk,ijk->ij", d, d)), *self._settings)
         C = np.empty((len(x), 4, len(y), 4))
@@ -118,7 +118,7 @@ class ImplicitSurface:
         return np.concatenate(found)
 
     def curvature(self, x: Floats) -> Floats:
-        """(n, 3, 3) curvature tensors of the level sets through points, 1/m."""
+        """Curvature tensors of the level sets through points (n, 3, 3), 1/m."""
         steps = [self.value(x + s * _STEP_M * e)[1] for e in np.eye(3) for s in (1.0, -1.0)]
         hessian = np.stack([(steps[2 * k] - steps[2 * k + 1]) / (2.0 * _STEP_M) for k in range(3)], axis=2)
         g = self.value(x)[1]
@@ -135,7 +135,7 @@ def fit_quadric(at: Floats, up: Floats, touched: Touched) -> tuple[Floats, Float
     The height over the plane and the slopes of the normals are fitted; the plane follows the answer in three rounds.
 
     Args:
-        at, up: (3,) where, and the outward normal about there.
+        at, up: place (3,), m, and the outward normal near it (3,).
         touched: the contacts near it.
 
     Returns:

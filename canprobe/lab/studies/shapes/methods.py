@@ -1,8 +1,8 @@
 """The methods that the benchmark compares: a class each, and a line in `METHODS`.
 
-A method makes a surface of the contacts of a shape within a budget: the path that a local estimate remembers, the
-radius of a local fit, the number of contacts. All get the same contacts and the same stated noise. What a method
-wants to set it sets on the development shapes (`develop`), before it sees a test shape.
+A method makes a surface from the contacts of a shape within a budget: the path that a local estimate remembers, the
+radius of a local fit, the number of contacts. All get the same contacts and the same stated noise. A method finds its
+settings on the development shapes (`develop`), before it sees a test shape.
 """
 
 from __future__ import annotations
@@ -29,24 +29,24 @@ Settings = Mapping[str, float]
 
 
 class FittedSurface(Protocol):
-    """What a method answers with; NaN where it has no surface, farther than `REACH_M` from every contact."""
+    """The surface of a method; NaN farther than `REACH_M` from every contact, where there is no surface."""
 
     def closest(self, points: Floats) -> Feet:
         """Closest points of the surface to points (n, 3) near it; its σ may be left NaN."""
 
     def sigma(self, points: Floats) -> Floats:
-        """(n,) standard deviation of the surface's height at points, m."""
+        """Standard deviation of the surface's height at points (n,), m."""
 
     def curvature(self, points: Floats) -> Floats:
-        """(n, 3, 3) curvature tensors at points, base frame, 1/m."""
+        """Curvature tensors at points (n, 3, 3), base frame, 1/m."""
 
 
 class Method(Protocol):
-    """A method.
+    """A method of the benchmark.
 
     Attributes:
         name: name in the table.
-        budgets: what it may spend, the least first; `unit` of them.
+        budgets: its budgets in `unit`, the least first.
     """
 
     @property
@@ -105,7 +105,7 @@ class Online:
         return f"{self.method} + patch" if self.patch else self.method
 
     def develop(self, shapes: Sequence[ShapeContacts]) -> Settings:
-        """Nothing: as packaged."""
+        """Set nothing: the packaged estimator is used."""
         return {}
 
     def fit(self, contacts: ShapeContacts, budget: float, settings: Settings) -> MapSurface:
@@ -129,7 +129,7 @@ class LocalFits:
     unit: str = "mm radius"
 
     def develop(self, shapes: Sequence[ShapeContacts]) -> Settings:
-        """Nothing to set."""
+        """Set nothing."""
         return {}
 
     def fit(self, contacts: ShapeContacts, budget: float, settings: Settings) -> MapSurface:
@@ -207,7 +207,7 @@ class Process:
     unit: str = "contacts"
 
     def develop(self, shapes: Sequence[ShapeContacts]) -> Settings:
-        """Scale and length."""
+        """Find scale and length."""
 
         def cost(x: Floats) -> float:
             settings = dict(zip(("scale", "length"), np.exp(x).tolist(), strict=False))

@@ -58,7 +58,7 @@ FORMS: Mapping[str, Mapping[str, Any]] = {
 DEVELOPMENT, TEST = tuple(FORMS)[:8], tuple(FORMS)[8:]
 FIRST_SEED = 260_000
 _PLACE_MM = (-170.0, -175.0, 300.0)
-"""Where the arm reaches in all directions."""
+"""Place where the arm reaches in all directions, mm."""
 LENGTH_MM, WIDTH_MM, WEAVE_MM, SECONDS = 32.0, 14.0, 9.0, 10.0
 FOOTPRINT_M, MARGIN_M, GRID_M = 3e-3, 5e-3, 0.5e-3
 """Truth counts as far from the contacts as the pad presses on it; it is kept farther, for what a map adds; its grid."""

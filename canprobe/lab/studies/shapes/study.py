@@ -31,7 +31,7 @@ LIMITS_MM = (0.05, 0.1, 0.2, 0.5)
 WORST_M = 1e-3
 """A larger error counts as this much, and so does truth where a method has no surface."""
 TRUTH_STEP = 2
-"""Every so manyth point of the truth is looked for in the map."""
+"""Step in the points of the truth that are looked for in the map."""
 TIMED_SHAPE = "free-2"
 """Shape on which time and memory are measured; a contact costs the same on all."""
 REPEATS, DRAWS = 3, 2000
@@ -151,7 +151,7 @@ def scored(surface: FittedSurface, mesh: Mesh, truth: Mapping[str, Floats]) -> d
 
 
 def distance_from(points: Floats, normals: Floats, tensors: Floats, at: Floats) -> Floats:
-    """(n,) signed distances of places from a surface known at close points: the quadric of the nearest one, m."""
+    """Signed distances of places from a surface known at close points (n,), m, by the quadric of the nearest one."""
     nearest = cKDTree(points).query(at)[1] if len(at) else np.zeros(0, np.intp)
     d = at - points[nearest]
     up = np.einsum("ij,ij->i", d, normals[nearest])
@@ -181,7 +181,7 @@ def row_of(method: Method, budget: float, scores: Sequence[Mapping[str, Any]]) -
 
 
 def _draws(count: int) -> Any:
-    """(DRAWS, count) indices: shapes drawn anew."""
+    """Indices (DRAWS, count) of shapes drawn anew."""
     return np.random.default_rng(0).integers(count, size=(DRAWS, count))
 
 
