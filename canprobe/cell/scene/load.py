@@ -389,7 +389,7 @@ def parse_scene(text: str, *, file: str = "scene", folder: Path | None = None) -
     Raises:
         SceneError: the text has problems; the error has all of them.
     """
-    return _scene(_as_scene(parse_toml(text, file)), file, folder)
+    return _scene(parse_toml(text, file), file, folder)
 
 
 def read_toml(path: Path, file: str, else_what: str = "") -> dict[str, Any]:
