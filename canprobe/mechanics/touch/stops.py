@@ -25,6 +25,9 @@ MAX_SATURATED_SHARE = 0.75
 Saturation alone is no reason to stop: up to 40 kN/m the bound is near enough. Where √F did not grow on a line either,
 it is not.
 """
+MAX_BRIDGED_SHARE = 0.5
+"""Share of the force, interpolated over taxels that do not measure, up to which it is known: over 300 random presses
+with one to three dead rows its error was at most 14 % up to there, and less than 5 % with one dead row."""
 MIN_REST_SAMPLES = 10
 """Least number of samples that are judged."""
 
