@@ -21,7 +21,8 @@ FIGURES = {
     "position": ("position", "mm"),
     "tool": ("tool centre", "mm"),
 }
-"""What a figure is called, and its unit. All but the contact are errors, RMS over the scan."""
+"""What a figure is called, and its unit. All but the contact are RMS over the scan: of the true force less its
+target, and of the errors of the others."""
 SHORT = ("force", "curvature", "curvature_per_m", "tool")
 """Figures of a list of scenes."""
 
