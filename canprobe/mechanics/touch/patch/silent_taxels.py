@@ -118,12 +118,13 @@ class SilentTaxels:
     def _find(self) -> None:
         """Put together what is bridged from now on."""
         silent = self._high - self._low <= MAX_CHANGE_COUNTS
-        mask = self._stated.copy()
+        # one taxel alone needs pressed ones on all sides, as the rim of a patch may look like it on two
+        mask = self._stated | (silent & (np.minimum(self._down, self._across) >= NEEDED_LOOKS))
         for looks, quiet, into in ((self._down, silent, mask), (self._across.T, silent.T, mask.T)):
             sure = (looks >= NEEDED_LOOKS) & quiet
             lines = sure.sum(axis=1) >= LINE_TAXELS
             lines[1:-1] |= lines[:-2] & lines[2:]  # nothing is pressed beside a row between two silent ones
-            np.logical_or(into, sure | (quiet & lines[:, None]), out=into)
+            np.logical_or(into, quiet & lines[:, None], out=into)
         if not np.array_equal(mask, self._mask):
             self._mask, self._found = mask, mask & ~self._stated
             self._any = bool(mask.any())
@@ -201,7 +202,8 @@ def _gaps(image: Image, steep: float) -> tuple[_Mask, _Mask]:
 
     Args:
         image: (rows, columns) counts.
-        steep: least count on one side that is enough.
+        steep: least count on one side that is enough where the next taxel of the row or column shows the same; one
+            taxel alone may be the rim of a patch on an array with less blur than its calibration has.
     """
     rows, columns = image.shape
     stride = columns + _SIDE  # rows one after the other, apart by what keeps the end of one from the next
@@ -209,13 +211,15 @@ def _gaps(image: Image, steep: float) -> tuple[_Mask, _Mask]:
     first, n = _SIDE * stride + _SIDE, rows * stride
     flat[first : first + n].reshape(rows, stride)[:, :columns] = image
     gaps = []
-    for step in (stride, 1):
+    for step, along in ((stride, 1), (1, stride)):
         far_up, up, down, far_down = [flat[first + k * step :][:n] for k in (-2, -1, 1, 2)]
         gap, most = np.minimum(up, down) >= MIN_COUNTS, np.maximum(up, down)
         if most.max() >= WIDE_GAP_COUNTS:
             gap |= np.maximum(np.minimum(up, far_down), np.minimum(far_up, down)) >= WIDE_GAP_COUNTS
         if steep <= COUNTS_MAX:
-            gap |= most >= steep
+            alone = (most >= steep) & (flat[first : first + n] == 0)
+            gap[along:] |= alone[along:] & alone[:-along]
+            gap[:-along] |= alone[along:] & alone[:-along]
         gaps.append(gap.reshape(rows, stride)[:, :columns])
     return gaps[0], gaps[1]
 
