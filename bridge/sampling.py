@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from canprobe.cell.master.array import patch_of
+from canprobe.cell.master.array import make_patch_reader
 from canprobe.cell.master.controller import Measurement
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import Setup, Touch
@@ -17,7 +17,6 @@ from canprobe.lab.bridge.codec import Received
 from canprobe.lab.bridge.node_states import Health
 from canprobe.lab.bridge.sample import ContactFrame, Sample, SurfacePatch, TouchFrame
 from canprobe.mechanics.touch.contact import pad_to_direction
-from canprobe.mechanics.touch.patch.array_models import make_patch_calibration
 from canprobe.mechanics.touch.stops import TOUCH_FORCE
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 
@@ -32,12 +31,13 @@ class SampleSource:
     """
 
     def __init__(self, plan: Plan) -> None:
-        arm, array, probe = plan.setup.arm, plan.setup.array, plan.setup.probe
+        arm, probe = plan.setup.arm, plan.setup.probe
         self._health = Health(plan)
         self._sensing = _sensing(plan.setup)
         self._has_arm = arm is not None
         self._radius = probe.radius
-        self._calibration = make_patch_calibration(array.calibration, array.pad) if array is not None else None
+        # one reader: that of the contacts, or that of an array without them
+        self._reader = self._sensing.reader if self._sensing is not None else make_patch_reader(plan.setup)
 
     def sample(self, received: Received) -> Sample:
         """The sample of one observation."""
@@ -62,10 +62,10 @@ class SampleSource:
         """The array's frame; ``shift_ns`` converts the cycle's clock to that of the samples."""
         sensing, sample = self._sensing, m.tactile
         patch = sensing.step(m) if sensing is not None else None
-        if sample is None or self._calibration is None:
+        if sample is None or self._reader is None:
             return None
         if patch is None:
-            patch = patch_of(sample, self._calibration)
+            patch = self._reader.read(sample)
         contact = sensing.contact(sample, patch) if sensing is not None and patch.force > TOUCH_FORCE / 2 else None
         placed = None
         if contact is not None:

@@ -238,9 +238,9 @@ def with_accuracy(readme: str, measured: Mapping[str, Any]) -> str:
     rows = dict(measured["one_scan"]["table"])
     force, curvature = (
         next(f"{reached} %" for what, reached in rows.items() if what.startswith(start))
-        for start in ("true force, RMS", "curvature after")
+        for start in ("true force off its target", "curvature after")
     )
-    readme = re.sub(r"(errs\sby\s)[\d.–]+ %(\s\(RMS\))", rf"\g<1>{force}\2", readme)
+    readme = re.sub(r"(off\sits\starget\sby\s)[\d.–]+ %(\s\(RMS\))", rf"\g<1>{force}\2", readme)
     return re.sub(r"(and the curvature\sby\s)[\d.–]+ %", rf"\g<1>{curvature}", readme)
 
 

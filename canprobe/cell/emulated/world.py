@@ -186,7 +186,9 @@ def _plant_config(setup: Setup) -> PlantConfig:
         object=truth.object,
         taxels=None
         if array is None
-        else TaxelConfig(full_scale_pa=array.full_scale, adc_bits=truth.adc_bits).without(*truth.without),
+        else TaxelConfig(full_scale_pa=array.full_scale, adc_bits=truth.adc_bits, dead=truth.dead).without(
+            *truth.without
+        ),
         pad=array.pad if array is not None else Pad(),
         bandwidth_hz=truth.bandwidth_hz,
         press=PressMotion(after_s=_tared_s(setup)),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from canprobe.fieldbus.protocol.tactile import TactileHeader, TactileMode
 from canprobe.fieldbus.protocol.tactile_assembler import FrameAssembler
 from canprobe.mechanics.touch.pad import COUNTS_MAX
 from canprobe.mechanics.touch.patch.image import Patch, PatchCalibration, compute_patch, patch_from_features
+from canprobe.mechanics.touch.patch.silent_taxels import SilentTaxels
 from canprobe.mechanics.types import Floats
 
 DEADLINE_CYCLES = 2
@@ -300,19 +301,59 @@ def make_tactile(plan: Plan, sync_overflow: int | None = None) -> ArrayReceiver 
     return TactileReceiver(assembler, cob_ids, sync_overflow or plan.sync.overflow, array.channel)
 
 
-def patch_of(sample: TactileSample, calibration: PatchCalibration) -> Patch:
-    """Patch of a tactile sample, in every mode of the array."""
-    frame = sample.frame
-    if frame.features is not None:
-        return patch_from_features(frame.features, calibration)
-    return compute_patch(frame.taxels, calibration, window=frame.window)
+class PatchReader:
+    """The patch of each tactile sample, in every mode of the array; taxels that do not measure are bridged.
+
+    Args:
+        calibration: calibration of the array.
+
+    Attributes:
+        taxels: finds the taxels that do not measure; None for a list of taxels, which have no neighbours.
+        image: (rows, columns) counts that the last patch was taken of.
+    """
+
+    def __init__(self, calibration: PatchCalibration) -> None:
+        pad = calibration.pad
+        self._calibration = calibration
+        self.image = np.zeros(pad.shape, np.uint8)
+        self.taxels = (
+            SilentTaxels(pad.shape, calibration.dead, blur_pitch=calibration.blur_m / pad.pitch_m)
+            if pad.is_grid
+            else None
+        )
+
+    def read(self, sample: TactileSample) -> Patch:
+        """The patch of a sample; samples come in the order of their times."""
+        frame = sample.frame
+        if frame.features is not None:  # moments do not show which taxels they are made of
+            return patch_from_features(frame.features, self._calibration)
+        self.image, bridged, share = frame.taxels, 0, 0.0
+        self.look(sample)
+        if self.taxels is not None:
+            self.image, bridged, share = self.taxels.bridged(frame.taxels, frame.window)
+        patch = compute_patch(self.image, self._calibration, window=frame.window)
+        return patch._replace(dead=patch.dead + bridged, bridged=share) if bridged else patch
+
+    def look(self, sample: TactileSample) -> None:
+        """Look for taxels that do not measure, without a patch; moments do not show them."""
+        if self.taxels is not None and sample.frame.features is None:
+            self.taxels.look(sample.frame.taxels, sample.frame.window, sample.t_sample_ns)
+
+    @property
+    def found(self) -> int:
+        """Number of taxels that were found not to measure."""
+        return self.taxels.found if self.taxels is not None else 0
+
+    @property
+    def faults(self) -> str:
+        """Taxels that do not measure, in words; empty where none was found."""
+        return self.taxels.words if self.taxels is not None else ""
 
 
-def patch_from(setup: Setup) -> Callable[[TactileSample], Patch] | None:
-    """The patch of a sample of the setup's array; None without one."""
+def make_patch_reader(setup: Setup) -> PatchReader | None:
+    """The reader of the setup's array; None without one."""
     if setup.array is None:
         return None
     from canprobe.mechanics.touch.patch.array_models import make_patch_calibration
 
-    calibration = make_patch_calibration(setup.array.calibration, setup.array.pad)
-    return lambda sample: patch_of(sample, calibration)
+    return PatchReader(make_patch_calibration(setup.array.calibration, setup.array.pad))

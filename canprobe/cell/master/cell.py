@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from canprobe.cell.master.array import RawReceiver, make_tactile, patch_from
+from canprobe.cell.master.array import RawReceiver, make_patch_reader, make_tactile
 from canprobe.cell.master.bringup import BringUp
 from canprobe.cell.master.controller import Command, Controller, Measurement, as_controller, check_command
 from canprobe.cell.master.cycle import Cycle
@@ -42,6 +42,9 @@ Result = TypeVar("Result")
 WARM_UP_S = 0.1
 """Time of cycles before the drives are enabled, s, until both sides run at their usual speed."""
 REST_TIMEOUT_S = 2.0
+SILENT_TAXELS = (
+    ": interpolated; have the array repaired, or state the taxels as `dead` in [taxels] of its calibration file"
+)
 OWN_COLUMNS = frozenset({"t_s", "q_rad", "q_m", "statusword", "torque_permille", "q_target_rad", "q_target_m"})
 """Columns of the cell in the log; a controller's `Command.columns` have other names."""
 STUCK_NS = 1_000_000_000
@@ -101,7 +104,8 @@ class Cell:
         self.cycle: Cycle | None = None
         guard = JointGuard(plan) if setup.arm is not None else None
         seen = Seen(limits_of(plan), self.watch, self.drives, self.tactile, port.counters)
-        self.supervisor = Supervisor(seen, guard, patch_from(setup) if setup.arm is not None else None)
+        self._reader = reader = make_patch_reader(setup)
+        self.supervisor = Supervisor(seen, guard, None if guard is None or reader is None else reader.read)
         slides = setup.arm.model.chain.prismatic if setup.arm is not None else ()
         self._slides = np.array(slides, dtype=bool) if any(slides) else None
         self._plan = plan
@@ -400,7 +404,11 @@ class Cell:
     def _look(self, measurement: Measurement) -> None:
         assert self.cycle is not None
         self._note_alarms()
-        self.supervisor.seen.restarts = self._controller.restarts
+        seen = self.supervisor.seen
+        seen.restarts = self._controller.restarts
+        if self._reader is not None and measurement.tactile is not None:
+            self._reader.look(measurement.tactile)
+            seen.silent_taxels = self._reader.found
         self.supervisor.step(
             measurement,
             sync_ns=self.cycle.sync_ns,
@@ -508,6 +516,8 @@ class Cell:
             self._try(self.homing.keep)
         self._try(self._bring_up.release)
         self._try(self._port.close)
+        if self._reader is not None and (words := self._reader.faults):
+            self.notes.add(words + SILENT_TAXELS)
         for line in self.supervisor.notes():
             self.notes.add(line)
 

@@ -29,7 +29,7 @@ from canprobe.fieldbus.bus.port import ControllerState
 from canprobe.fieldbus.protocol.cia402 import DriveState
 from canprobe.fieldbus.protocol.frames import NmtState
 
-NS_PER_MS = 1_000_000
+NS_PER_MS, NS_PER_S = 1_000_000, 1_000_000_000
 ARRAY_RECOVERY_NS = 30 * NS_PER_MS
 """Time after a touch in which the array's creep and hysteresis may still show half of the touch force."""
 Check = TypeVar("Check", bound=Callable[..., Any])
@@ -194,6 +194,11 @@ def _sync_mismatch(seen: Seen) -> int:
     return seen.tactile.stale if seen.tactile is not None else 0
 
 
+@_counted("silent_taxels", "row, column or taxel that does not measure", lambda limits: NS_PER_S)
+def _silent_taxels(seen: Seen) -> int:
+    return seen.silent_taxels
+
+
 @_touch(
     "sensor_stale",
     "no usable tactile frame",
@@ -302,6 +307,16 @@ def _off_pad(contact: TouchState) -> SafetyStop | None:
     return SafetyStop(
         f"the contact runs off the edge of the array: the true force is above the {contact.force:.1f} N measured; let"
         " the pad follow the surface (a smaller task.rolling_share or task.speed_mm_s), or take a smaller probe"
+    )
+
+
+@_touch("taxels_hidden", "force on taxels that do not measure", Reaction.RETREAT, _hidden)
+def _taxels_hidden(contact: TouchState) -> SafetyStop | None:
+    if contact.bridged_s * 1e9 <= FORCE_HIDDEN_NS:
+        return None
+    return SafetyStop(
+        f"{100.0 * contact.bridged:.0f} % of the force lies on taxels that do not measure (named in faults): it is not"
+        " known; press elsewhere on the array, or have it repaired"
     )
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.master.array import make_tactile, patch_from
+from canprobe.cell.master.array import make_patch_reader, make_tactile
 from canprobe.cell.master.controller import TactileSample
 from canprobe.cell.master.drives import drive_axes, feedback_frames
 from canprobe.cell.planning.model import MASTER_NODE_ID, Plan
@@ -104,7 +104,7 @@ class Monitor:
         self._feedback = {one.layout.cob_id: (axes[one.axis].node_id, one) for one in feedback_frames(axes)}
         self._counts: list[int | None] = [None] * len(axes)
         self._tactile = make_tactile(plan)
-        self._patch_from = patch_from(plan.setup)
+        self._reader = make_patch_reader(plan.setup)
         self._heard: dict[int, int] = {}
         self._first_ns: int | None = None
         self._recent: dict[str, deque[tuple[int, float]]] = {channel: deque() for channel in channels}
@@ -159,7 +159,7 @@ class Monitor:
         frame = self._tactile.assemble(can_id, data, t_ns)
         if frame is not None:
             self._view.taxels = frame.taxels
-            patch = self._patch_from(TactileSample(frame, t_ns, 0)) if self._patch_from is not None else None
+            patch = self._reader.read(TactileSample(frame, t_ns, 0)) if self._reader is not None else None
             self._view.force_n = patch.force if patch is not None else None
 
     def _take_heartbeat(self, node: NodeView, data: bytes, t_ns: int) -> None:

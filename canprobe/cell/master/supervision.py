@@ -21,7 +21,7 @@ from canprobe.cell.scene.setup import SafetyLimits, Touch
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.port import ControllerState, PortCounters
 from canprobe.mechanics.touch.patch.image import Patch
-from canprobe.mechanics.touch.stops import TOUCH_FORCE
+from canprobe.mechanics.touch.stops import MAX_BRIDGED_SHARE, TOUCH_FORCE
 
 HOLD_CYCLES = 3
 """Cycles without a TPDO of one drive after which all of them hold."""
@@ -99,6 +99,7 @@ class Seen:
         speeding: a measured motion that no joint can make; None without one.
         slowed: targets so far that were too far away for one cycle.
         restarts: how often a diverging estimator has started again so far.
+        silent_taxels: number of taxels that were found not to measure.
         preload: highest force in the images before the drives are enabled, N.
         log_failure: why frames are no longer written down; None while they are.
     """
@@ -118,6 +119,7 @@ class Seen:
     speeding: str | None = None
     slowed: int = 0
     restarts: int = 0
+    silent_taxels: int = 0
     preload: float = 0.0
     log_failure: str | None = None
 
@@ -134,6 +136,8 @@ class TouchState:
         lost_s: time for which the force has been below that of a contact, in a phase with contact.
         hidden_s: time for which the array has been saturated and the force is not known otherwise.
         off_pad_s: time for which a good part of the contact has been beyond the array's edge.
+        bridged: share of the force that is interpolated over taxels which do not measure.
+        bridged_s: time for which that share has been above `MAX_BRIDGED_SHARE`.
         path: the touch is a scan, which may search for a contact that it has lost.
         searched: distance towards the object that was searched since then, m.
         limit: message of a joint or workspace limit that is reached; None without one.
@@ -145,11 +149,14 @@ class TouchState:
     lost_s: float = 0.0
     hidden_s: float = 0.0
     off_pad_s: float = 0.0
+    bridged: float = 0.0
+    bridged_s: float = 0.0
     path: bool = False
     searched: float = 0.0
     limit: str | None = None
     _hidden_since_ns: int | None = None
     _off_pad_since_ns: int | None = None
+    _bridged_since_ns: int | None = None
 
     def feel(self, patch: Patch, t_ns: int, *, known: bool = False) -> None:
         """Take the patch of a tactile sample.
@@ -165,6 +172,10 @@ class TouchState:
         off_pad = patch.off_pad and patch.force > TOUCH_FORCE / 2
         self._off_pad_since_ns = _since(self._off_pad_since_ns, off_pad, t_ns)
         self.off_pad_s = _passed_s(self._off_pad_since_ns, t_ns)
+        self.bridged = patch.bridged
+        bridged = patch.bridged > MAX_BRIDGED_SHARE and patch.force > TOUCH_FORCE / 2
+        self._bridged_since_ns = _since(self._bridged_since_ns, bridged, t_ns)
+        self.bridged_s = _passed_s(self._bridged_since_ns, t_ns)
 
 
 def _since(since_ns: int | None, holds: bool, t_ns: int) -> int | None:

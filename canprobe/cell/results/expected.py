@@ -21,7 +21,8 @@ FIGURES = {
     "position": ("position", "mm"),
     "tool": ("tool centre", "mm"),
 }
-"""Name and unit of each figure. All but the contact are errors, RMS over the scan."""
+"""Name and unit of each figure. All but the contact are RMS over the scan: of the true force less its target, and of
+the errors of the others."""
 LISTED_FIGURES = ("force", "curvature", "curvature_per_m", "tool")
 """Figures in the list of scenes."""
 

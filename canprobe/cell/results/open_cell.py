@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy.typing as npt
 
-from canprobe.cell.master.array import patch_from
+from canprobe.cell.master.array import PatchReader, make_patch_reader
 from canprobe.cell.master.cell import Cell
 from canprobe.cell.master.controller import Command, Controller, Measurement, TactileSample, as_controller
 from canprobe.cell.master.observers import Observers
@@ -100,13 +100,13 @@ class OpenCell:
         Raises:
             UsageError: the scene has no array.
         """
-        if self._patch_from is None:
+        if self._patch_reader is None:
             raise UsageError(f"{self.plan.setup.name}: expected a scene with an array; got one without")
-        return self._patch_from(sample)
+        return self._patch_reader.read(sample)
 
     @cached_property
-    def _patch_from(self) -> Callable[[TactileSample], Patch] | None:
-        return patch_from(self.plan.setup)
+    def _patch_reader(self) -> PatchReader | None:
+        return make_patch_reader(self.plan.setup)
 
     def probe(self, q: npt.ArrayLike) -> tuple[Floats, Floats]:
         """Pose of the probe at joint positions, and its Jacobian there.

@@ -47,6 +47,24 @@ def score_contact(truth: Mapping[str, Floats], first: int, last: int, target_n: 
     }
 
 
+def score_measured_force(
+    log: Mapping[str, Floats], truth: Mapping[str, Floats], first: int, last: int
+) -> dict[str, float]:
+    """Error of the force that the array measured: mean and RMS of measured less true, at the instants of its samples.
+
+    Args:
+        log: columns of the log, one row a cycle.
+        truth: columns of the plant's truth, one row a SYNC.
+        first, last: the scan, as SYNC numbers; nothing is scored where it has no sample.
+    """
+    measured, sampled = log["force_n"][first:last], log["sample_cycle"][first:last]
+    known = np.isfinite(measured) & (sampled >= 0) & (sampled < len(truth["force_n"]))
+    if not known.any():
+        return {}
+    error = measured[known] - truth["force_n"][sampled[known].astype(int)]
+    return {"force_true_bias_n": float(error.mean()), "force_true_rms_error_n": float(np.sqrt(np.mean(error**2)))}
+
+
 @dataclass(frozen=True, slots=True)
 class ShapeScore:
     """Errors of one estimator over a run; None where nothing could be scored.

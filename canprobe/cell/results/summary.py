@@ -17,7 +17,7 @@ from canprobe.cell.master.cell import Cell
 from canprobe.cell.npz import write_npz
 from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.run_files import SCHEMA
-from canprobe.cell.results.scores import ShapeScore, bound_of_scan, score_contact, score_shape
+from canprobe.cell.results.scores import ShapeScore, bound_of_scan, score_contact, score_measured_force, score_shape
 from canprobe.cell.results.surface_file import save_surface_map
 from canprobe.cell.results.tool_file import FILE, summarise_calibration, tool_text
 from canprobe.cell.results.traffic import LOG, measure_traffic
@@ -140,15 +140,17 @@ def _contact(session: Session, record: TaskRecord, log: dict[str, Floats]) -> di
     target = task.force_n if task.kind in ("scan", "press") else None
     figures: dict[str, float | None] = dict.fromkeys(names)
     measured: float | None = None
+    error: dict[str, float | None] = dict.fromkeys(("force_true_bias_n", "force_true_rms_error_n"))
     if scan is not None and scan[1] > scan[0]:
-        measured = _rms_error(log["force_n"][scan[0] : scan[1]], task.force_n)
+        measured = _rms_off(log["force_n"][scan[0] : scan[1]], task.force_n)
         if truth := _truth(session):
             figures = score_contact(truth, *scan, task.force_n)
+            error |= score_measured_force(log, truth, *scan)
             if task.kind != "scan":
                 figures["speed_mean_m_s"] = None
         else:
             figures |= {"force_rms_error_n": measured, "force_max_n": float(np.nanmax(log["force_n"], initial=0.0))}
-    return {"force_target_n": target, **figures, "force_measured_rms_error_n": measured} | {
+    return {"force_target_n": target, **figures, "force_measured_rms_error_n": measured, **error} | {
         "losses": summarise_losses(record.losses)
     }
 
@@ -164,8 +166,8 @@ def _hidden_force(session: Session, highest: float | None, log: dict[str, Floats
     ]
 
 
-def _rms_error(values: Floats, target: float) -> float | None:
-    """RMS error over the cycles with a value: a cycle in which the cell held has none."""
+def _rms_off(values: Floats, target: float) -> float | None:
+    """RMS distance from the target over the cycles with a value: a cycle in which the cell held has none."""
     known = values[np.isfinite(values)]
     return float(np.sqrt(np.mean((known - target) ** 2))) if len(known) else None
 

@@ -33,11 +33,7 @@ def summary_text(summary: dict[str, Any], out: Path | None) -> str:
             f"  newtons    {summary['newtons']} of the array; forces and stiffness are as good as its full scale"
         )
     if contact["force_rms_error_n"] is not None:
-        target = contact["force_target_n"]
-        lines.append(
-            f"  force      target {target:g} N, RMS error {contact['force_rms_error_n']:.3f} N"
-            f" ({100 * contact['force_rms_error_n'] / target:.1f} %), highest {contact['force_max_n']:.2f} N"
-        )
+        lines += force_lines(contact)
     if contact["speed_mean_m_s"] is not None:
         lines.append(
             f"  contact    {100 * contact['contact_fraction']:.1f} % of the scan at"
@@ -55,6 +51,25 @@ def summary_text(summary: dict[str, Any], out: Path | None) -> str:
     if out is not None:
         lines.append(f"  files      {out}")
     return "\n".join(lines)
+
+
+def force_lines(contact: Mapping[str, Any]) -> list[str]:
+    """The force of a touch as text: how well it was held, and the error of its measurement where the truth is known."""
+    target, off = contact["force_target_n"], contact["force_rms_error_n"]
+    error = contact.get("force_true_rms_error_n")
+    which = "true force" if error is not None else "measured force"
+    lines = [
+        f"  force      target {target:g} N, {which} off it by {off:.3f} N RMS ({100 * off / target:.1f} %),"
+        f" highest {contact['force_max_n']:.2f} N"
+    ]
+    if error is None:
+        return [*lines, "             no true force is known here: how wrong the measured one is does not show"]
+    bias = contact["force_true_bias_n"]
+    return [
+        *lines,
+        f"             measured less true: mean {bias:+.3f} N ({100 * bias / target:+.1f} %),"
+        f" RMS {error:.3f} N ({100 * error / target:.1f} %)",
+    ]
 
 
 def bridge_lines(bridges: Mapping[str, Mapping[str, Any]]) -> list[str]:

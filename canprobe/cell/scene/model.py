@@ -412,6 +412,12 @@ class PlantSettings:
     """Threshold of the array, below which a taxel reads 0."""
     adc_bits: Annotated[int, Range(8, 16)] = 8
     """Resolution of the ADC. Taxels are sent in 8 bits; only the features that the array computes gain."""
+    dead_rows: tuple[Annotated[int, Range(0, 255)], ...] = ()
+    """Rows of the array that read nothing, from 0."""
+    dead_columns: tuple[Annotated[int, Range(0, 255)], ...] = ()
+    """Columns of the array that read nothing, from 0."""
+    dead_taxels: tuple[tuple[int, int], ...] = ()
+    """Row and column of single taxels that read nothing."""
 
 
 @dataclass(frozen=True, slots=True)

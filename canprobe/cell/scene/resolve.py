@@ -305,6 +305,19 @@ def _true_arm(scene: Scene, arm: Arm | None, bodies: Bodies) -> tuple[ArmModel |
     return arm_model(cell.cell.name, cell.arm, cell.joints)[:2]
 
 
+def _dead_taxels(plant: PlantSettings, array: Array | None) -> tuple[tuple[int, int], ...]:
+    """(row, column) of the taxels of the emulated array that read nothing."""
+    if array is None:
+        return ()
+    rows, columns = array.pad.shape
+    dead = {(row, column) for row in plant.dead_rows for column in range(columns)}
+    dead |= {(row, column) for column in plant.dead_columns for row in range(rows)}
+    dead |= set(plant.dead_taxels)
+    if outside := [place for place in sorted(dead) if not (0 <= place[0] < rows and 0 <= place[1] < columns)]:
+        raise PlanError([f"plant.dead_taxels: expected taxels of {rows} × {columns}, got {outside[0]}"])
+    return tuple(sorted(dead))
+
+
 def _truth(scene: Scene, arm: Arm | None, array: Array | None, bodies: Bodies, probe: Probe) -> Truth:
     plant = scene.plant or PlantSettings()
     try:
@@ -337,4 +350,5 @@ def _truth(scene: Scene, arm: Arm | None, array: Array | None, bodies: Bodies, p
         ),
         without=tuple(effect for effect in EFFECTS if not getattr(plant, effect)),
         adc_bits=plant.adc_bits,
+        dead=_dead_taxels(plant, array),
     )

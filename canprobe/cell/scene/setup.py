@@ -410,6 +410,7 @@ class Truth:
         dynamics: what a dynamic arm has beyond its geometry.
         without: effects of the array that are switched off.
         adc_bits: bits of the array's ADC.
+        dead: (row, column) of taxels that read nothing.
         bodies: bodies (n,) of the links behind the joints, without the probe; None where nobody knows them, which
             refuses "dynamic".
         compliance: compliance (n,) of the joints between motor and link, rad/(N m) or m/N; None: all are rigid.
@@ -425,6 +426,7 @@ class Truth:
     dynamics: Dynamics
     without: tuple[str, ...]
     adc_bits: int
+    dead: tuple[tuple[int, int], ...] = ()
     bodies: tuple[Body | None, ...] | None = None
     compliance: Floats | None = None
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.master.array import patch_of
+from canprobe.cell.master.array import PatchReader
 from canprobe.cell.master.controller import Command, Measurement
 from canprobe.cell.tasks.task import Task, TaskRecord
 from canprobe.mechanics.touch.patch.image import PatchCalibration
@@ -56,7 +56,7 @@ class ListenTask(Task):
     """
 
     def __init__(self, calibration: PatchCalibration, duration_s: float, period_s: float) -> None:
-        self._calibration = calibration
+        self._reader = PatchReader(calibration)
         self._left = duration_s
         self._period = period_s
         self.taxels: NDArray[np.uint8] | None = None
@@ -71,7 +71,7 @@ class ListenTask(Task):
         self._left -= self._period
         if measurement.tactile is not None:
             self.taxels = measurement.tactile.frame.taxels
-            patch = patch_of(measurement.tactile, self._calibration)
+            patch = self._reader.read(measurement.tactile)
             self._columns = {
                 "sample_cycle": float(measurement.tactile.cycle),
                 "force_n": patch.force,

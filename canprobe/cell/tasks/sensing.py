@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from canprobe.cell.master.array import patch_of
+from canprobe.cell.master.array import PatchReader
 from canprobe.cell.master.controller import Measurement, TactileSample
 from canprobe.mechanics.robot.chain import ending_in, forward
 from canprobe.mechanics.robot.model import ArmModel
@@ -116,7 +116,7 @@ class ContactSensing:
         self.set_kappa(np.zeros(2))
         self.patch: Patch | None = None
         self.dropped = 0
-        self._calibration = calibration
+        self.reader = PatchReader(calibration)
         self._noise = noise
         self._level_pa = MomentImage(calibration).level_pa
         self._moment_image = moment_image
@@ -129,7 +129,7 @@ class ContactSensing:
             self._history.add(measurement.t_ns, measurement.q)
         if measurement.tactile is None:
             return None
-        self.patch = patch_of(measurement.tactile, self._calibration)
+        self.patch = self.reader.read(measurement.tactile)
         return self.patch
 
     def position_sigma(self, direction: Floats) -> float:
@@ -193,7 +193,7 @@ class ContactSensing:
             radius=self.radius,
             force_n=patch.force,
             sigma_point=None if self._noise is None else self._noise.sigma(lightness),
-            moments=self._moments(sample, patch),
+            moments=self._moments(patch),
             doubts=patch.doubts,
             slope=self._slope,
         )
@@ -211,8 +211,8 @@ class ContactSensing:
         way = ((contact.T_base_probe - earlier) @ point)[:3]
         return float(np.linalg.norm(way)) / (1e-9 * SPEED_OVER_NS)
 
-    def _moments(self, sample: TactileSample, patch: Patch) -> Moments | None:
+    def _moments(self, patch: Patch) -> Moments | None:
         """Second moments of the image; None where they are not wanted, or not those of the whole patch."""
         if self._moment_image is None or patch.saturated or patch.cut_by_pad or patch.too_few:
             return None
-        return self._moment_image.moments(mended(sample.frame.taxels)[0] if patch.dead else sample.frame.taxels)
+        return self._moment_image.moments(mended(self.reader.image)[0] if patch.dead else self.reader.image)

@@ -18,7 +18,9 @@ truth = result.to_pandas("truth").reindex(scan.index, method="nearest")
 target = result.summary["contact"]["force_target_n"]
 rms = ((truth.force_n - target) ** 2).mean() ** 0.5
 print(f"force in the scan: measured {scan.force_n.mean():.3f} ± {scan.force_n.std():.3f} N")
-print(f"                   true     {truth.force_n.mean():.3f} ± {truth.force_n.std():.3f} N, RMS error {rms:.3f} N")
+print(
+    f"                   true     {truth.force_n.mean():.3f} ± {truth.force_n.std():.3f} N; {rms:.3f} N RMS off target"
+)
 
 # %% How the curvature estimate settles along the path
 estimates = result.to_pandas("estimates")

@@ -706,7 +706,7 @@ def canprobe_lines(path):
 
 def test_every_row_is_tested_here():
     source = Path(__file__).read_text(encoding="utf-8")
-    for name in ("test_preload.py", "test_off_pad.py"):
+    for name in ("test_preload.py", "test_off_pad.py", "test_dead_taxels.py"):
         source += Path(__file__).with_name(name).read_text(encoding="utf-8")
     special = {"error_passive": "error-passive: hold", "error_passive_long": "error-passive for 1.0 s"}
     special |= {"overruns": "overrun_budget", "estimator": 'counts["estimator"]', "force": 'BY_KEY["force"]'}
@@ -716,6 +716,8 @@ def test_every_row_is_tested_here():
         "log": "test_a_full_disk",
         "preload": 'BY_KEY["preload"]',
         "off_pad": 'BY_KEY["off_pad"]',
+        "silent_taxels": 'BY_KEY["silent_taxels"]',
+        "taxels_hidden": 'BY_KEY["taxels_hidden"]',
         "drive_late": 'BY_KEY["drive_late"]',
     }
     for condition in CONDITIONS:

@@ -115,7 +115,7 @@ def test_only_an_unbroken_run_of_saturated_samples_counts():
     contact = TouchState(LIMITS)
     told = []
     for k, saturated in enumerate((True, True, True, False, True, True)):
-        contact.feel(SimpleNamespace(force=2.0, saturated=saturated, off_pad=False), k * PERIOD_NS)
+        contact.feel(SimpleNamespace(force=2.0, saturated=saturated, off_pad=False, bridged=0.0), k * PERIOD_NS)
         told.append(contact.hidden_s)
     assert told == pytest.approx([0.0, 0.005, 0.01, 0.0, 0.0, 0.005])
 
@@ -126,7 +126,7 @@ def supervisor(patches):
 
 
 def findings(saturated):
-    patches = [SimpleNamespace(force=2.0, saturated=one, off_pad=False) for one in saturated]
+    patches = [SimpleNamespace(force=2.0, saturated=one, off_pad=False, bridged=0.0) for one in saturated]
     return guarded(patches)
 
 
@@ -149,12 +149,12 @@ def test_a_touch_that_saturates_now_and_then_goes_on():
 
 
 def test_nor_may_its_contact_run_off_the_array():
-    running_off = [SimpleNamespace(force=1.0, saturated=False, off_pad=k > 1) for k in range(8)]
+    running_off = [SimpleNamespace(force=1.0, saturated=False, off_pad=k > 1, bridged=0.0) for k in range(8)]
     found = guarded(running_off)
     assert found[:7] == [None] * 7
     assert found[7].condition.key == "off_pad" and found[7].condition.reaction is Reaction.RETREAT
     assert "the true force is above the 1.0 N measured" in str(found[7].error)
-    assert guarded([SimpleNamespace(force=0.05, saturated=False, off_pad=True)] * 20) == [None] * 20, (
+    assert guarded([SimpleNamespace(force=0.05, saturated=False, off_pad=True, bridged=0.0)] * 20) == [None] * 20, (
         "no contact at all"
     )
 

@@ -7,7 +7,8 @@ From an image:
 
     image               sums and centres the pressure
     beyond_window       extrapolates a patch that the window cuts
-    dead_taxels         finds dead taxels and bridges them by their neighbours
+    dead_taxels         finds dead taxels in one image and bridges them by their neighbours
+    silent_taxels       finds rows, columns and taxels that do not measure, by several images, and interpolates them
     pad_lag             corrects the lag of the centroid behind the contact
     moments             second moments of an image
     creep               traces of earlier places of the patch in the image of an array that creeps

@@ -24,10 +24,10 @@ def make_patch_calibration(calibration: ArrayCalibration, pad: Pad) -> PatchCali
     of another pressure; layer, blur, crosstalk and scale stay.
     """
     if pad.is_flat or not pad.is_grid:
-        return PatchCalibration(pad, force_gain=1.0 / calibration.image.scale)
+        return PatchCalibration(pad, force_gain=1.0 / calibration.image.scale, dead=calibration.dead)
     plain = PatchCalibration(pad, gains=calibration.gains)
     gain, edge = make_image_model(calibration, plain, seen=None).force_gains(GAIN_FORCES_N, GAIN_CURVATURES)
-    return replace(plain, force_gain=gain, edge_gain=edge)
+    return replace(plain, force_gain=gain, edge_gain=edge, dead=calibration.dead, blur_m=calibration.image.blur)
 
 
 def make_image_model(calibration: ArrayCalibration, patch: PatchCalibration, *, seen: int | None) -> ImageModel:

@@ -61,9 +61,11 @@ class Patch(NamedTuple):
             extrapolation beyond it (`Continuation`).
         cut_by_pad: whether the patch reaches the pad's edge.
         too_few: whether fewer than four taxels are active, too few for moments.
-        dead: number of taxels inside the patch that read nothing, bridged by their neighbours (`mended`).
+        dead: number of taxels inside the patch that do not measure, bridged by their neighbours (`mended`,
+            `silent_taxels`).
         off_pad: whether the pressure is highest at the pad's edge: a fifth of the contact or more lies beyond it, and
             the force is only a lower bound.
+        bridged: share of the force that taxels would measure which do not, interpolated.
     """
 
     force: float
@@ -77,6 +79,7 @@ class Patch(NamedTuple):
     too_few: bool
     dead: int = 0
     off_pad: bool = False
+    bridged: float = 0.0
 
     @property
     def good(self) -> bool:
@@ -109,6 +112,8 @@ class PatchCalibration:
         force_gain: gain of the pressure sum.
         edge_gain: gain of its root, √N.
         gains: (rows, columns) gains of the taxels over their mean; empty where all are alike.
+        dead: (row, column) of each taxel that is known to read nothing.
+        blur_m: standard deviation of the blur by the cover, m; 0 where it is not known.
         pascals: (256,) pressure of each count, Pa.
         weights: (n, 6) area × (1, u, v, uu, uv, vv) of each taxel over its gain, lengths in pitches, the area in m².
         continuation: extrapolation beyond a window.
@@ -119,6 +124,8 @@ class PatchCalibration:
     force_gain: float = 1.0
     edge_gain: float = 0.0
     gains: tuple[tuple[float, ...], ...] = ()
+    dead: tuple[tuple[int, int], ...] = ()
+    blur_m: float = 0.0
     pascals: Floats = field(init=False, repr=False)
     weights: Floats = field(init=False, repr=False)
     continuation: Continuation = field(init=False, repr=False)
