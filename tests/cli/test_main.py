@@ -14,6 +14,7 @@ from command_lines import command_lines, parse
 import canprobe
 from canprobe import api
 from canprobe.cell.master.monitor import Monitor
+from canprobe.cell.results import text
 from canprobe.cell.scene.load import load_scene, packaged_scenes
 from canprobe.cli import COMMANDS, main
 from canprobe.cli.argument_types import channel, node_ids
@@ -32,9 +33,6 @@ class FakeResult:
     def __init__(self):
         self.summary = SUMMARY
 
-    def text(self):
-        return "all went well"
-
 
 @pytest.fixture
 def calls(monkeypatch):
@@ -44,10 +42,13 @@ def calls(monkeypatch):
     def fake(name, answer=None):
         def call(*args, **kwargs):
             seen.append((name, args, kwargs))
+            if "early_summary" in kwargs:
+                kwargs["early_summary"](SUMMARY)
             return answer
 
         monkeypatch.setattr(api, name, call)
 
+    monkeypatch.setattr(text, "summary_text", lambda *_: "all went well")
     fake("run", FakeResult())
     fake("up")
     fake("emulate")
@@ -241,8 +242,7 @@ def test_run_passes_everything_on(calls, tmp_path, capsys):
     ((name, (scene,), kwargs),) = calls
     assert (name, scene.name) == ("run", "free")
     assert bus_of(scene) == ("socketcan", "vcan3", 500_000)
-    given = {key: kwargs[key] for key in ("seed", "duration_s", "out")}
-    assert given == {"seed": 7, "duration_s": 2.5, "out": tmp_path / "out"}
+    assert (scene.seed, scene.task.duration_s, kwargs["out"]) == (7, 2.5, tmp_path / "out")
     assert capsys.readouterr().out == f"all went well\nnext: canprobe view {tmp_path / 'out'}\n"
 
 
@@ -279,7 +279,7 @@ def test_run_takes_the_scenes_bus_by_default(calls):
     assert main(["run", "free"]) == 0
     ((_, (scene,), kwargs),) = calls
     assert bus_of(scene) == ("lockstep", "can0", 1_000_000)
-    assert (kwargs["seed"], kwargs["duration_s"]) == (None, None)
+    assert (scene.seed, scene.task.duration_s) == (0, load_scene("free").task.duration_s)
     assert (kwargs["out"].parent, kwargs["out"].name[:5]) == (Path("runs"), "free-")
 
 
