@@ -11,7 +11,7 @@ from typing import Any
 
 from canprobe.cell.master.controller import Command, Measurement
 from canprobe.cell.master.observers import AnyObserver, Observation
-from canprobe.cell.master.options import RunOptions, Say, quiet
+from canprobe.cell.master.options import DEFAULT_OPTIONS, RunOptions, Say, quiet, unread
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.open_cell import OpenCell
@@ -66,6 +66,7 @@ def run(
     force: bool = False,
     observers: Sequence[AnyObserver] = (),
     bridge: Sequence[str] = (),
+    early_summary: Callable[[Mapping[str, Any]], None] = unread,
 ) -> RunResult:
     """Run a scene's task and write its results.
 
@@ -84,6 +85,8 @@ def run(
         force: whether files may replace those of an earlier run in ``out``; else a folder that is not empty is refused.
         observers: called after each cycle with its measurement, command and frames (`Observation`).
         bridge: names of bridges to other tools, besides those of the scene; see `canprobe.cell.planning.bridges`.
+        early_summary: called with the summary of a completed run before other estimators compute (``shape.also``) and
+            pictures are drawn.
 
     Returns:
         The finished run.
@@ -102,10 +105,15 @@ def run(
     resolved = with_bridges(Target.over(scene, channel=channel).applied_to(scene), bridge)
     folder = results_folder(resolved, out) if files else None
     check_free(folder, force=force)
-    plan = make_plan(resolve(resolved))
+    options = RunOptions(folder, say, observers, early_summary=early_summary)
+    return run_plan(make_plan(resolve(resolved)), options, progress)
+
+
+def run_plan(plan: Plan, options: RunOptions = DEFAULT_OPTIONS, progress: Progress | None = None) -> RunResult:
+    """Run the task of a plan; a plan serves for any number of runs. Progress, result and errors are those of `run`."""
     task = make_task(plan)
-    with OpenCell(plan, RunOptions(folder, say, observers), task=task) as cell:
-        return cell.run(cell.open_to_requests(task), _report(progress, resolved.task.duration_s))
+    with OpenCell(plan, options, task=task) as cell:
+        return cell.run(cell.open_to_requests(task), _report(progress, plan.setup.task.duration_s))
 
 
 def _refuse_wrong(overrides: object, out: object, observers: object, bridge: object) -> None:

@@ -8,7 +8,7 @@ import json
 import re
 import sys
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from canprobe.cell.session.terminal import MARKED_WORDS, MIN_COLUMNS, columns, painted
 
@@ -46,6 +46,11 @@ def print_summary(text: str) -> None:
     """Print a summary: a headline, and lines that begin with their subject; coloured on a terminal."""
     head, *lines = text.splitlines()
     print(painted(head, "green" if head.endswith(": done") else "red", sys.stdout))
+    print_lines(lines)
+
+
+def print_lines(lines: Iterable[str]) -> None:
+    """Lines of a summary below its headline."""
     for line in lines:
         match = re.match(r"( +)(\S+)(.*)", line)
         colour = "yellow" if match and match[2] in MARKED_WORDS else "cyan"

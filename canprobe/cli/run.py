@@ -7,11 +7,15 @@ process, in real time.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import shlex
+import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from canprobe.cli.common_arguments import BUS, add_options, add_scene, add_verbosity
-from canprobe.cli.output import print_json, print_summary
+from canprobe.cli.output import print_json, print_lines, print_summary
 from canprobe.cli.parser import Parser
 from canprobe.cli.target import scene_of
 from canprobe.errors import CanprobeError
@@ -22,6 +26,7 @@ examples:
   canprobe run cylinder
   canprobe run cylinder --seed 3 --out runs/third --json
   canprobe run cylinder --set task.force_n=3 --set object.radius_mm=50
+  canprobe run cylinder --no-figures
   canprobe run cylinder --tool runs/calibrate/tool.toml
   canprobe run cylinder --bus socketcan --channel vcan0 --patient
 """
@@ -34,12 +39,22 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--tool", metavar="FILE", type=Path, help="centre of the probe, from the tool.toml of a calibration"
     )
+    parser.add_argument(
+        "--no-figures",
+        dest="figures",
+        action="store_false",
+        default=None,
+        help="draw no report.png, surface.png and report.html [the scene's scene.figures]",
+    )
     add_options(parser, "--json")
     add_verbosity(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the scene; the summary goes to stdout, the progress to stderr. A run that was stopped raises."""
+    """Run the scene; the summary goes to stdout, the progress to stderr. A run that was stopped raises.
+
+    The summary is printed as soon as it holds the estimator in the loop; the errors of the others follow below it.
+    """
     scene = scene_of(args)
     if args.tool is not None:
         from canprobe.cell.results.tool_file import with_tool
@@ -48,8 +63,16 @@ def run(args: argparse.Namespace) -> int:
 
     from canprobe import api
     from canprobe.cell.planning.bridges import BRIDGES
+    from canprobe.cell.results.text import bridge_lines, method_lines, summary_text
 
     folder = api.results_folder(scene, args.out)
+
+    def print_early(summary: Mapping[str, Any]) -> None:
+        if not args.json:
+            with contextlib.suppress(OSError):  # what follows is printed there too, and then it is reported
+                print_summary(summary_text({**summary, "bridges": None}, folder))
+                sys.stdout.flush()
+
     try:
         result = api.run(
             scene,
@@ -58,6 +81,7 @@ def run(args: argparse.Namespace) -> int:
             progress=args.report.bar(),
             say=args.report.detail,
             bridge=args.bridge,
+            early_summary=print_early,
         )
     except CanprobeError as error:
         if args.json and error.summary is not None:
@@ -70,18 +94,19 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(result.summary)
     else:
-        print_summary(result.text() + _expected(args))
+        of_others = dict(list(result.summary["shape"].get("methods", {}).items())[1:])
+        print_lines([*method_lines(of_others), *bridge_lines(result.summary.get("bridges") or {}), *_expected(args)])
         view = BRIDGES["view"]
         print(f"next: {f'{view.pip} && ' if view.missing else ''}canprobe view {shlex.quote(str(folder))}")
     return 0
 
 
-def _expected(args: argparse.Namespace) -> str:
+def _expected(args: argparse.Namespace) -> list[str]:
     """A line with the expected figures, where a packaged scene ran unchanged."""
     from canprobe.cell.results.expected import expected_text, read_expected, seeds_text
 
     read = read_expected()
     figures = read["scenes"].get(args.scene)
     if not figures or any(value is not None for value in (args.cell, args.duration, args.tool, args.set or None)):
-        return ""
-    return f"\n  expected   {expected_text(figures)} (seeds {seeds_text(read)})"
+        return []
+    return [f"  expected   {expected_text(figures)} (seeds {seeds_text(read)})"]

@@ -33,6 +33,7 @@ def scene_of(args: argparse.Namespace) -> Scene:
         "bus.bitrate": args.bitrate,
         "scene.seed": getattr(args, "seed", None),
         "task.duration_s": getattr(args, "duration", None),
+        "scene.figures": getattr(args, "figures", None),
     }
     scene = loaded(args, {key: value for key, value in given.items() if value is not None})
     if args.patient:

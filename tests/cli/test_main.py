@@ -14,6 +14,7 @@ from command_lines import command_lines, parse
 import canprobe
 from canprobe import api
 from canprobe.cell.master.monitor import Monitor
+from canprobe.cell.results import text
 from canprobe.cell.scene.load import load_scene, packaged_scenes
 from canprobe.cli import COMMANDS, main
 from canprobe.cli.argument_types import channel, node_ids
@@ -32,9 +33,6 @@ class FakeResult:
     def __init__(self):
         self.summary = SUMMARY
 
-    def text(self):
-        return "all went well"
-
 
 @pytest.fixture
 def calls(monkeypatch):
@@ -44,10 +42,13 @@ def calls(monkeypatch):
     def fake(name, answer=None):
         def call(*args, **kwargs):
             seen.append((name, args, kwargs))
+            if "early_summary" in kwargs:
+                kwargs["early_summary"](SUMMARY)
             return answer
 
         monkeypatch.setattr(api, name, call)
 
+    monkeypatch.setattr(text, "summary_text", lambda *_: "all went well")
     fake("run", FakeResult())
     fake("up")
     fake("emulate")
@@ -278,6 +279,7 @@ def test_run_takes_the_scenes_bus_by_default(calls):
     assert main(["run", "free"]) == 0
     ((_, (scene,), kwargs),) = calls
     assert bus_of(scene) == ("lockstep", "can0", 1_000_000)
+    assert (scene.seed, scene.task.duration_s) == (0, load_scene("free").task.duration_s)
     assert (kwargs["out"].parent, kwargs["out"].name[:5]) == (Path("runs"), "free-")
 
 

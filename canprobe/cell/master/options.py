@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from canprobe.cell.master.observers import AnyObserver
 
@@ -16,6 +17,10 @@ def quiet(_: str) -> None:
     """Report nothing."""
 
 
+def unread(_: Mapping[str, Any]) -> None:
+    """Read no summary."""
+
+
 @dataclass(frozen=True, slots=True)
 class RunOptions:
     """Options of one run, made once by its caller; every layer below takes the same object.
@@ -25,6 +30,8 @@ class RunOptions:
         say: called with each step.
         observers: called after each cycle with its measurement, command and frames.
         rows_kept: cycles whose row of the log is kept, and no truth; None for all.
+        early_summary: called with the summary of a completed run as soon as it holds the estimator in the loop: before
+            others estimate again, and before pictures are drawn.
         to_home: the drives are about to be homed; else bring-up refuses one that is not.
     """
 
@@ -32,6 +39,7 @@ class RunOptions:
     say: Say = quiet
     observers: Sequence[AnyObserver] = ()
     rows_kept: int | None = None
+    early_summary: Callable[[Mapping[str, Any]], None] = unread
     to_home: bool = False
 
 

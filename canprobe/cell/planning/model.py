@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 from canprobe.cell.scene.load import SAVED_AS, dump_scene, toml_value, written_by_line
@@ -355,6 +355,12 @@ class Plan:
     def scene(self) -> Scene:
         """The scene with every choice of the plan filled in."""
         return self.setup.scene
+
+    def with_seed(self, seed: int) -> Plan:
+        """The plan with another seed of the emulation, on which nothing else in it depends."""
+        setup = self.setup
+        scene, saved = (replace(one, scene=replace(one.scene, seed=seed)) for one in (setup.scene, setup.saved))
+        return replace(self, setup=replace(setup, scene=scene, saved=saved, seed=seed))
 
     @property
     def files(self) -> dict[str, bytes]:

@@ -18,7 +18,17 @@ from canprobe.cell.master.options import RunOptions, Say
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.result import RunResult
 from canprobe.cell.results.run_data import RunData
-from canprobe.cell.results.summary import log_columns, summarise, tactile_columns, write_columns, write_files
+from canprobe.cell.results.summary import (
+    log_columns,
+    score_methods,
+    summarise,
+    tactile_columns,
+    truth_of,
+    without_nan,
+    write_columns,
+    write_files,
+    write_summary,
+)
 from canprobe.cell.scene.setup import Setup, Touch
 from canprobe.cell.session.children import Bridges
 from canprobe.cell.session.session import Session
@@ -35,6 +45,10 @@ if TYPE_CHECKING:
     from canprobe.mechanics.touch.consistency import Consistency
     from canprobe.mechanics.touch.patch.image import Patch
     from canprobe.mechanics.touch.surface_map import SurfaceMap
+
+MOST_REPLAYED = 40
+"""Answers of an estimator that computes after the run. Its scores need no more: in a scan that is long enough for them,
+answers that are nearer to each other than a memory rest on the same contacts."""
 
 
 class OpenCell:
@@ -56,7 +70,7 @@ class OpenCell:
     def __init__(self, plan: Plan, options: RunOptions, *, task: Controller | None = None) -> None:
         self.plan = plan
         self.session = Session(plan, options)
-        self._out, self._say = options.out, options.say
+        self._out, self._say, self._early_summary = options.out, options.say, options.early_summary
         self._bridges = Bridges(plan, options.out, virtual=self.session.virtual, say=options.say)
         self._task = task
         self._last: Controller | None = task
@@ -175,6 +189,11 @@ class OpenCell:
         if isinstance(failure, CanprobeError):
             failure.summary = summary
         self._write(lambda out: write_files(data, out))
+        if failure is None:
+            self._early_summary(summary)
+        self._estimate_again(data)
+        summary["bridges"] = self._bridges.end(summary)
+        self._write(lambda out: write_summary(summary, out))
         if self._out is not None:
             for name, draw in _drawings(data, self._out, self._say).items():
                 self._say(f"draw {name}")
@@ -192,11 +211,11 @@ class OpenCell:
     def _score(
         self, log: dict[str, Floats], tactile: dict[str, npt.NDArray[Any]], failure: BaseException | None
     ) -> RunData:
-        """The data of the run, scored by the plan that it ran with."""
+        """The data of the run with the estimator in the loop, scored by the plan that it ran with."""
         record, start_s, setup = record_of(self._last), self.cell.start_ns * 1e-9, self.plan.setup
-        if record.shape is not None and setup.shape is not None and setup.shape.also:
-            self._say(f"estimate again with {', '.join(setup.shape.also)}")
-        estimates = _estimates(setup, record.shape)
+        estimates: dict[str, list[ShapeRecord]] = {}
+        if record.shape is not None and setup.shape is not None:
+            estimates[setup.shape.method] = record.shape.records
         surface_map, consistency, map_summary = _mapped(setup, record.shape, start_s)
         summary = summarise(
             self.session,
@@ -206,7 +225,6 @@ class OpenCell:
             map_summary=map_summary,
             bridges=self._bridges.status(),
         )
-        summary["bridges"] = self._bridges.end(summary)
         return RunData(
             plan=self.plan,
             summary=summary,
@@ -221,6 +239,20 @@ class OpenCell:
             contacts=self._contacts(record, start_s),
         )
 
+    def _estimate_again(self, data: RunData) -> None:
+        """Add the answers of the scene's other estimators on the same contacts, and their scores."""
+        setup, tracker = self.plan.setup, record_of(self._last).shape
+        if setup.shape is None or tracker is None:
+            return
+        for method in setup.shape.also:
+            self._say(f"estimate again with {method}")
+            found = estimates_of(setup, tracker, [method], MOST_REPLAYED)
+            if truth := truth_of(self.session):
+                scores = score_methods(found, truth, self.cell.log.arrays()["t_s"])
+                data.summary["shape"]["methods"] |= without_nan(scores)
+            start_s = self.cell.start_ns * 1e-9
+            data.estimates.update({name: on_run_clock(records, start_s) for name, records in found.items()})
+
     def _write(self, write: Callable[[Path], None]) -> None:
         """Write files into the run's folder; a failure is noted, and raised at the end."""
         if self._out is None:
@@ -230,7 +262,8 @@ class OpenCell:
                 write(self._out)
         except ResultsError as error:
             for line in str(error).splitlines():
-                self.session.note_unwritten(line)
+                if line not in self.session.unwritten:  # the summary is written twice
+                    self.session.note_unwritten(line)
 
     def _contacts(self, record: TaskRecord, start_s: float) -> Contacts | None:
         task = self.plan.setup.task
@@ -239,14 +272,6 @@ class OpenCell:
         from canprobe.cell.results.contacts import contacts_of
 
         return contacts_of(record.shape.samples, task, start_s)
-
-
-def _estimates(setup: Setup, tracker: ShapeTracker | None) -> dict[str, list[ShapeRecord]]:
-    """The answers of the estimator in the loop, and of the others on the same contacts."""
-    if tracker is None or setup.shape is None:
-        return {}
-
-    return estimates_of(setup, tracker, (setup.shape.method, *setup.shape.also))
 
 
 def _mapped(

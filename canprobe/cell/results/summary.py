@@ -65,7 +65,7 @@ def summarise(
             session.plan.setup,
             record.shape,
             estimates,
-            _truth(session),
+            truth_of(session),
             log.get("t_s", np.empty(0)),
             map_summary=map_summary,
         ),
@@ -79,7 +79,7 @@ def summarise(
         "bridges": bridges,
         "faults": [*cell.faults, *(session.observers.faults if session.observers is not None else ())],
     }
-    return {name: _without_nan(value) for name, value in summary.items()}
+    return {name: without_nan(value) for name, value in summary.items()}
 
 
 def log_columns(cell: Cell) -> dict[str, Floats]:
@@ -97,12 +97,12 @@ def _on_run_clock(columns: dict[str, NDArray[Any]], cell: Cell) -> dict[str, NDA
     return {name: column + start_s if name in ("t_s", "t_sample_s") else column for name, column in columns.items()}
 
 
-def _without_nan(value: Any) -> Any:
+def without_nan(value: Any) -> Any:
     """The value for JSON, null for numbers that are not finite."""
     if isinstance(value, dict):
-        return {name: _without_nan(part) for name, part in value.items()}
+        return {name: without_nan(part) for name, part in value.items()}
     if isinstance(value, list | tuple):
-        return [_without_nan(part) for part in value]
+        return [without_nan(part) for part in value]
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
@@ -129,7 +129,7 @@ def _traffic(session: Session) -> dict[str, Any]:
     return {channel: {"as_planned": None if n == 0 else False, "error_frames": n} for channel, n in errors.items()}
 
 
-def _truth(session: Session) -> dict[str, Floats]:
+def truth_of(session: Session) -> dict[str, Floats]:
     """The plant's truth; empty where nothing was emulated, or nothing happened."""
     return session.truth if "force_n" in session.truth else {}
 
@@ -143,7 +143,7 @@ def _contact(session: Session, record: TaskRecord, log: dict[str, Floats]) -> di
     error: dict[str, float | None] = dict.fromkeys(("force_true_bias_n", "force_true_rms_error_n"))
     if scan is not None and scan[1] > scan[0]:
         measured = _rms_off(log["force_n"][scan[0] : scan[1]], task.force_n)
-        if truth := _truth(session):
+        if truth := truth_of(session):
             figures = score_contact(truth, *scan, task.force_n)
             error |= score_measured_force(log, truth, *scan)
             if task.kind != "scan":
@@ -158,7 +158,7 @@ def _contact(session: Session, record: TaskRecord, log: dict[str, Floats]) -> di
 def _hidden_force(session: Session, highest: float | None, log: dict[str, Floats]) -> list[str]:
     """Warning where the true force was above the limit, which acts on the measured force."""
     limit = session.scene.limits.force_max_n
-    if not _truth(session) or highest is None or highest <= limit:
+    if not truth_of(session) or highest is None or highest <= limit:
         return []
     return [
         f"the true force rose to {highest:.2f} N, above limits.force_max_n = {limit:g}: the array measured at most"
@@ -208,17 +208,24 @@ def summarise_shape(
         shape["kappa_est_per_m"] = finite_or_none(records[-1].estimate.kappa)
     if not truth:
         return shape
-    scores = {name: score_shape(records, truth, sync_times) for name, records in estimates.items()}
-    score = asdict(scores[method])
+    of_method = score_shape(records, truth, sync_times)
+    score = asdict(of_method)
     score["kappa_est_per_m"] = score["kappa_est_per_m"] or shape["kappa_est_per_m"]
     shape |= {name: value for name, value in score.items() if name in names}
-    shape["cramer_rao_ratio"] = _bound_ratio(setup, tracker, scores[method], truth, sync_times)
-    of_run = ("kappa_true_per_m", "kappa_est_per_m")
-    shape["methods"] = {
-        method: {name: value for name, value in asdict(one).items() if name not in of_run}
-        for method, one in scores.items()
-    }
+    shape["cramer_rao_ratio"] = _bound_ratio(setup, tracker, of_method, truth, sync_times)
+    shape["methods"] = score_methods(estimates, truth, sync_times)
     return shape
+
+
+def score_methods(
+    estimates: Mapping[str, Sequence[ShapeRecord]], truth: Mapping[str, Floats], sync_times: Floats
+) -> dict[str, dict[str, Any]]:
+    """The table ``shape.methods`` of ``summary.json``; arguments as for `summarise_shape`."""
+    of_run = ("kappa_true_per_m", "kappa_est_per_m")
+    scores = {method: asdict(score_shape(records, truth, sync_times)) for method, records in estimates.items()}
+    return {
+        method: {name: value for name, value in score.items() if name not in of_run} for method, score in scores.items()
+    }
 
 
 def _bound_ratio(
@@ -296,15 +303,19 @@ def write_files(result: RunData, out: Path) -> None:
     Raises:
         ResultsError: when a file cannot be written; no part of it is left, and the others are written.
     """
-    text = json.dumps(result.summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
     found, surface_map = result.summary["calibration"], result.surface_map
     tool = None if found is None else tool_text(found, result.plan.scene.name)
     _write_each(
-        lambda: write_text(out / "summary.json", text),
+        lambda: write_summary(result.summary, out),
         lambda: write_columns(result.log, result.tactile, out),
         lambda: write_text(out / FILE, tool) if tool is not None else None,
         lambda: save_surface_map(surface_map, out / "surface.npz") if surface_map is not None else None,
     )
+
+
+def write_summary(summary: Mapping[str, Any], out: Path) -> None:
+    """Write ``summary.json``, whole, in the place of an earlier one."""
+    write_text(out / "summary.json", json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
 
 
 def _write_each(*writers: Callable[[], None]) -> None:

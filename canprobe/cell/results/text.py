@@ -95,7 +95,18 @@ def shape_lines(shape: dict[str, Any]) -> list[str]:
     """The section ``shape`` of a summary as text."""
     estimated, true = curvature_text(shape["kappa_est_per_m"]), curvature_text(shape["kappa_true_per_m"])
     lines = [f"  curvature  {estimated}; true {true}"]
-    for name, score in shape.get("methods", {}).items():
+    lines += method_lines(shape.get("methods", {}))
+    if (surface := shape.get("map")) is not None:
+        lines.append(
+            f"  map        {surface['patches']} patches, {surface['crossings']} crossings" + _crossings(surface)
+        )
+    return lines
+
+
+def method_lines(methods: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """The errors of estimators as text, a line for each."""
+    lines = []
+    for name, score in methods.items():
         if score["estimates"] == 0:
             lines.append(f"    {name:<10} not scored: no estimate of both curvatures after the first 20 mm")
             continue
@@ -106,10 +117,6 @@ def shape_lines(shape: dict[str, Any]) -> list[str]:
             + f", normal {_figure(score['normal_rms_deg'], 'deg', 3)},"
             f" position {_figure(score['position_rms_mm'], 'mm', 3)}"
             + (f", with the patch in {100 * score['patch_fraction']:.0f} %" if score["patch_fraction"] else "")
-        )
-    if (surface := shape.get("map")) is not None:
-        lines.append(
-            f"  map        {surface['patches']} patches, {surface['crossings']} crossings" + _crossings(surface)
         )
     return lines
 

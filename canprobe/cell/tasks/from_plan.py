@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -132,11 +133,22 @@ def make_shape_tracker(setup: Setup) -> ShapeTracker | None:
     return ShapeTracker(make_shape_estimator(task, task.shape.method), samples)
 
 
-def estimates_of(setup: Setup, tracker: ShapeTracker, methods: Iterable[str]) -> dict[str, list[ShapeRecord]]:
-    """The answers of ``methods`` on the tracker's contacts; those of its own estimator are taken from the tracker."""
+def estimates_of(
+    setup: Setup, tracker: ShapeTracker, methods: Iterable[str], most: int | None = None
+) -> dict[str, list[ShapeRecord]]:
+    """The answers of ``methods`` on the tracker's contacts; those of its own estimator are taken from the tracker.
+
+    Args:
+        setup: of the scan.
+        tracker: with the contacts.
+        methods: names of estimators.
+        most: number of answers of a method beyond which they are further apart than 0.1 s; None for no such number.
+    """
     task = setup.task
     assert isinstance(task, Touch) and task.shape is not None
     every = max(1, round(0.1 * task.array.rate_hz))
+    if most is not None:
+        every = max(every, math.ceil(len(tracker.samples) / most))
     return {
         method: tracker.records
         if method == task.shape.method

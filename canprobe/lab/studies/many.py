@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import html
 import importlib.util
 import operator
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, SupportsIndex, TypeGuard
@@ -16,13 +17,16 @@ from typing import TYPE_CHECKING, Any, SupportsIndex, TypeGuard
 import numpy as np
 
 import canprobe
-from canprobe.api import run
+from canprobe.api import run_plan
 from canprobe.cell.emulated.truth_columns import present_name
 from canprobe.cell.master.options import Say, quiet
+from canprobe.cell.planning.make import make_plan
+from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.files import unit_of
 from canprobe.cell.results.result import RunResult
 from canprobe.cell.scene.load import dump_scene, gathered, load_scene, parse_scene
 from canprobe.cell.scene.model import Scene
+from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.target import VIRTUAL, Target
 from canprobe.cell.session.terminal import Report
 from canprobe.errors import CanprobeError, SafetyStop, UsageError, install_line
@@ -64,12 +68,10 @@ class RunCase:
 
 
 def measure(case: RunCase) -> dict[str, Any]:
-    """Carry a case out in a worker; an error is an outcome too."""
-    scene = parse_scene(case.scene)
-    scene = replace(scene, scene=replace(scene.scene, seed=case.seed))
+    """Carry a case out, in a worker; whatever ends it is its outcome."""
     outcome: dict[str, Any] = {"status": "done", "reason": None, "summary": None, "series": {}, "columns": []}
     try:
-        result = run(scene, files=False)
+        result = run_plan(_planned(case.scene, case.files).with_seed(case.seed))
     except CanprobeError as error:
         status = {SafetyStop: "stopped", UsageError: "refused"}
         outcome["status"] = next((word for kind, word in status.items() if isinstance(error, kind)), "failed")
@@ -83,6 +85,12 @@ def measure(case: RunCase) -> dict[str, Any]:
         "series": {name: _sampled(result, column, 1e-3 * case.every_ms) for name, column in series.items()},
         "columns": sorted(columns),
     }
+
+
+@functools.lru_cache(maxsize=8)
+def _planned(scene: str, files: str) -> Plan:
+    """The plan of a scene (TOML) whose files have a digest, kept in a worker for its next seeds."""
+    return make_plan(resolve(parse_scene(scene)))
 
 
 def _sampled(result: RunResult, column: Floats, every_s: float) -> Floats:
@@ -111,7 +119,8 @@ def run_many(
 
     Finished runs are kept in ``out``: the same call computes what is missing, after an interrupt or a crash too. Runs
     of another canprobe are computed again. A run that fails is a row with its reason. Files that the scene names are
-    copied into ``out`` before the first run, and all runs use the copies.
+    copied into ``out`` before the first run, and all runs use the copies. No run writes files or draws, and the scene's
+    other estimators (``shape.also``) do not compute: ``vary={"shape.also": [["ml"]]}`` asks for them.
 
     Args:
         scene: as for `canprobe.run`.
@@ -141,6 +150,8 @@ def run_many(
     given = {} if duration_s is None else {"task.duration_s": duration_s}
     base = load_scene(scene, given)
     base = Target.over(base, bus).applied_to(base)
+    if base.shape is not None:
+        base = load_scene(base, {"shape.also": ()})
     if (name := base.bus.interface) not in VIRTUAL:
         raise UsageError(f'run_many: runs share no bus: expected bus="direct" or "lockstep", got "{name}"')
     keys, combinations = _combinations(vary or {})

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left, insort
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.blend import MIN_FACING_COSINE
@@ -103,20 +106,33 @@ def find_crossings(
     if not len(surface_map):
         return []
     along = surface_map.travelled
-    apart = np.linalg.norm(surface_map.points[:, None] - surface_map.points[None], axis=2)
-    facing = surface_map.normals @ surface_map.normals.T > MIN_FACING_COSINE
-    fits = np.triu((apart <= limit) & (along[None] - along[:, None] >= least) & facing, 1)
-    pairs = np.argwhere(fits)[np.argsort(apart[fits], kind="stable")]
-    chosen: list[tuple[int, int]] = []
-    while len(pairs):
-        chosen.append((int(pairs[0, 0]), int(pairs[0, 1])))
-        pairs = pairs[np.abs(along[pairs] - along[pairs[0]]).max(axis=1) > 2.0 * limit]
+    pairs = _close_pairs(surface_map, limit)
+    pairs = pairs[along[pairs[:, 1]] - along[pairs[:, 0]] >= least]
+    # two pairs are one crossing where they are near each other in the plane (path to the first, path to the second)
+    places, left = along[pairs], np.ones(len(pairs), bool)
+    tree, chosen = cKDTree(places), []
+    for k, (i, j) in enumerate(pairs.tolist()):
+        if left[k]:
+            chosen.append((i, j))
+            left[tree.query_ball_point(places[k], 2.0 * limit, p=math.inf)] = False
     heading = _headings(surface_map)
     found = []
     for i, j in sorted(chosen):
         sine, cosine = float(np.linalg.norm(np.cross(heading[i], heading[j]))), float(heading[i] @ heading[j])
         found.append(compare(surface_map.patches[i], surface_map.patches[j], i, j, math.atan2(sine, cosine)))
     return found
+
+
+def _close_pairs(surface_map: SurfaceMap, radius: float) -> NDArray[np.intp]:
+    """(m, 2) pairs i < j of patches within a radius that face one way, the closest first."""
+    points, normals = surface_map.points, surface_map.normals
+    pairs = cKDTree(points).query_pairs(radius, output_type="ndarray")
+    pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
+    first, second = pairs.T
+    facing = np.einsum("ij,ij->i", normals[first], normals[second]) > MIN_FACING_COSINE
+    apart = np.linalg.norm(points[first] - points[second], axis=1)
+    closest_first: NDArray[np.intp] = pairs[facing][np.argsort(apart[facing], kind="stable")]
+    return closest_first
 
 
 def _headings(surface_map: SurfaceMap) -> Floats:
@@ -146,14 +162,22 @@ def check_consistency(
 def _independent(surface_map: SurfaceMap, found: list[Crossing], gap: float) -> tuple[int, ...]:
     """Crossings, taken in the order of their later pass, whose patches are all at least a gap from those before."""
     along = surface_map.travelled
-    used: list[float] = []
+    used: list[float] = []  # sorted: only the neighbours of a place can be nearer to it than the gap
     chosen: list[int] = []
     for i in sorted(range(len(found)), key=lambda i: (found[i].second, -found[i].first)):
-        places = along[[found[i].first, found[i].second]]
-        if all(abs(place - other) >= gap for place in places for other in used):
-            used += places.tolist()
+        places = along[[found[i].first, found[i].second]].tolist()
+        near = [other for place in places for other in _neighbours(used, place) if abs(place - other) < gap]
+        if not near:
+            for place in places:
+                insort(used, place)
             chosen.append(i)
     return tuple(sorted(chosen))
+
+
+def _neighbours(values: list[float], value: float) -> list[float]:
+    """The nearest of sorted values below and above a value."""
+    above = bisect_left(values, value)
+    return values[max(above - 1, 0) : above + 1]
 
 
 def fisher(p_values: list[float]) -> ChiSquared:

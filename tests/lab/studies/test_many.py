@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import canprobe
+from canprobe.cell.planning.make import make_plan
 from canprobe.errors import SceneError, UsageError
 from canprobe.fieldbus.eds.packaged import eds_path
 from canprobe.lab.studies import many
@@ -71,7 +72,7 @@ def test_what_is_finished_is_found_again_and_the_rest_is_computed(runs, out, mon
 
 def test_a_fault_of_one_run_costs_that_run(monkeypatch, out):
     case = many.RunCase(many.dump_scene(canprobe.load_scene("press")), "", 0, (), 50.0)
-    monkeypatch.setattr(many, "run", lambda *_, **__: {}["nothing"])
+    monkeypatch.setattr(many, "run_plan", lambda *_, **__: {}["nothing"])
     outcome = many.measure(case)
     assert outcome["status"] == "failed" and outcome["reason"].startswith("KeyError: 'nothing' (test_many.py:")
 
@@ -99,6 +100,34 @@ def test_all_runs_use_the_files_as_they_were_and_changed_files_are_other_runs(tm
         run_many(scene, seeds=1, bus="direct", out=out)
     first, second, same, other = (digest for digest, _ in done)
     assert first == second == same != other
+
+
+def test_other_estimators_compute_where_they_are_asked_for(tmp_path, monkeypatch):
+    asked = []
+
+    def note(_, __, cases):
+        asked.extend(many.parse_scene(case.scene).shape.also for case in cases)
+        return [{"status": "done"}] * len(cases)
+
+    monkeypatch.setattr(Sweep, "map", note)
+    scene = canprobe.load_scene("cylinder")
+    assert scene.shape.also
+    run_many(scene, bus="direct", out=tmp_path)
+    run_many(scene, {"shape.also": [["ml"], []]}, bus="direct", out=tmp_path)
+    assert asked == [(), ("ml",), ()]
+
+
+def test_one_plan_serves_all_seeds_of_a_combination(monkeypatch):
+    planned = []
+    monkeypatch.setattr(many, "make_plan", lambda setup: planned.append(setup.seed) or make_plan(setup))
+    scene = many.dump_scene(canprobe.load_scene("press", QUICK | {"bus.interface": "direct", "task.force_n": 1.5}))
+    cases = [many.RunCase(scene, "", seed, ("truth.force_n",), 10.0) for seed in (3, 4, 3)]
+    first, other, again = (many.measure(case) for case in cases)
+    assert len(planned) == 1
+    alone = canprobe.run(many.parse_scene(scene), seed=3, files=False)
+    assert first["summary"]["contact"] == again["summary"]["contact"] == alone.summary["contact"]
+    assert first["summary"]["contact"] != other["summary"]["contact"]
+    assert [one["summary"]["seed"] for one in (first, other)] == [3, 4]
 
 
 def test_numbers_of_numpy_are_integers_as_others(tmp_path, monkeypatch):

@@ -189,6 +189,27 @@ def test_crossings_are_found_where_the_path_crosses_itself():
     assert find_crossings(dataclasses.replace(surface_map, patches=())) == []
 
 
+def test_they_are_those_of_all_pairs_closest_first():
+    """By their definition, over a path that wanders about one place."""
+    rng = np.random.default_rng(5)
+    points = np.cumsum(rng.normal(scale=2e-3, size=(400, 2)), axis=0) % 0.02
+    s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    patches = []
+    for (x, y), at in zip(points, s, strict=True):
+        T = np.diag([1.0, -1.0, -1.0, 1.0])
+        T[:2, 3] = x, y
+        patches.append(_exact(SurfaceMatrix.plane(), T, s=at))
+    apart = np.linalg.norm(points[:, None] - points, axis=2)
+    pairs = [(apart[i, j], i, j) for j in range(400) for i in range(j) if apart[i, j] <= 2e-3 and s[j] - s[i] >= 0.05]
+    chosen = []
+    for _, i, j in sorted(pairs):
+        if all(max(abs(s[i] - s[a]), abs(s[j] - s[b])) > 4e-3 for a, b in chosen):
+            chosen.append((i, j))
+    found = find_crossings(SurfaceMap(patches=tuple(patches), path=np.zeros((0, 3))), gap=0.05)
+    assert len(chosen) > 100
+    assert [(c.first, c.second) for c in found] == sorted(chosen)
+
+
 def test_opposite_sides_of_a_thin_body_do_not_cross():
     above = _exact(SurfaceMatrix.plane(), np.diag([1.0, -1.0, -1.0, 1.0]))
     below = _exact(SurfaceMatrix.plane(), np.eye(4), s=0.5)
