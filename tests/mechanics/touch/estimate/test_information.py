@@ -168,7 +168,7 @@ def test_without_forgetting_an_answer_is_that_of_a_batch():
     residuals = flat[:, 9:] @ a + e.reshape(-1)
     residuals -= flat[:, :9] @ (H @ (flat[:, :9].T @ residuals))  # at the quadric that fits best
     sums.start(rows, residuals.reshape(-1, 3), 0.01)
-    found = sums.amend(c, H, np.zeros(3), ExpectedMisfit())
+    found = sums.amend(c, H, np.zeros(3), ExpectedMisfit(), np.eye(3))
     both = np.linalg.lstsq(flat, residuals, rcond=None)[0]  # terms that show: those that fit best
     assert found.misfit > 0.999
     assert np.allclose(found.c - c, both[:9], atol=0.02)
@@ -206,7 +206,7 @@ def test_generous_noise_does_not_hide_a_misfit():
     sums = OmittedTerms(1e-9 * np.eye(9), None)
     c = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5, 0.1, 0.3])
     sums.start(rows, residuals.reshape(-1, 3), 0.01)
-    stated, known = (sums.amend(c, H, np.zeros(3), ExpectedMisfit(noise)) for noise in (1.0, 1.0 / 9.0))
+    stated, known = (sums.amend(c, H, np.zeros(3), ExpectedMisfit(noise), np.eye(3)) for noise in (1.0, 1.0 / 9.0))
     assert stated.misfit < 0.5
     assert known.misfit > 0.99
 
