@@ -55,18 +55,20 @@ class ShapeTracker:
         samples: every contact.
         travelled_m: path of the contact, m.
         restarts: how often the estimator diverged and started afresh.
+        withheld: answers that could not be computed: of a matrix that is singular or not definite.
     """
 
     def __init__(self, estimator: Estimator, every: int) -> None:
         self.records: list[ShapeRecord] = []
         self.samples: list[ContactSample] = []
         self.travelled_m = 0.0
-        self.restarts = 0
+        self.restarts = self.withheld = 0
         self._estimator = estimator
         self._every = max(1, every)
         self._waiting: list[ContactSample] = []
         self._taken = 0
         self._found: tuple[SurfaceEstimate, float] | None = None
+        self._last_withheld = False
 
     def add(self, sample: ContactSample) -> None:
         """Note one contact; `work` takes it."""
@@ -82,12 +84,18 @@ class ShapeTracker:
         self._waiting.append(sample)
 
     def work(self) -> SurfaceEstimate | None:
-        """Take the contacts that wait, and answer where one is due; the estimate that `answer` has yet to report."""
+        """Take the contacts that wait, and answer where one is due; the estimate that `answer` has yet to report.
+
+        An answer that cannot be computed is withheld; an estimator that cannot take a contact starts afresh.
+        """
         for sample in self._waiting:
-            self._estimator.add(sample)
             self._taken += 1
+            try:
+                self._estimator.add(sample)
+            except np.linalg.LinAlgError:
+                self._start_afresh()
             if self._taken % self._every == 0:
-                self._keep(self._estimator.estimate(), sample.t_s)
+                self._answer_at(sample.t_s)
         self._waiting.clear()
         return None if self._found is None else self._found[0]
 
@@ -108,15 +116,30 @@ class ShapeTracker:
         self.work()
         return self.answer(t_s)
 
+    def _answer_at(self, at_s: float) -> None:
+        """An answer at an instant (s); the estimator starts afresh where two in a row cannot be computed."""
+        try:
+            self._keep(self._estimator.estimate(), at_s)
+        except np.linalg.LinAlgError:
+            self.withheld += 1
+            if self._last_withheld:
+                self._start_afresh()
+            self._last_withheld = not self._last_withheld
+        else:
+            self._last_withheld = False
+
     def _keep(self, estimate: SurfaceEstimate | None, at_s: float) -> None:
         """An estimate to be reported; where it has diverged the estimator starts afresh."""
         if estimate is None:
             return
         if has_diverged(estimate):
-            self.restarts += 1
-            self._estimator.reset()
+            self._start_afresh()
             return
         self._found = estimate, at_s
+
+    def _start_afresh(self) -> None:
+        self.restarts += 1
+        self._estimator.reset()
 
 
 def has_diverged(estimate: SurfaceEstimate) -> bool:

@@ -81,6 +81,44 @@ def test_a_diverged_answer_starts_the_estimator_afresh():
     assert estimator.n == 1, "it goes on with the contacts that come"
 
 
+def failing(whole, *, fails):
+    """A call that raises as LAPACK's wrappers do, on its calls of these numbers."""
+    calls = iter(range(1000))
+
+    def call(*args):
+        if next(calls) in fails:
+            raise np.linalg.LinAlgError("matrix is not positive definite")
+        return whole(*args)
+
+    return call
+
+
+def test_a_matrix_that_is_not_definite_withholds_one_answer_and_the_run_goes_on():
+    estimator = Counting()
+    estimator.estimate = failing(estimator.estimate, fails={1})
+    tracker = ShapeTracker(estimator, every=2)
+    reported = [cycle(tracker, 2.5e-3 * k, contacts=[2.5e-3 * k]) for k in range(9)]
+    assert [k for k, one in enumerate(reported) if one] == [2, 6, 8]
+    assert tracker.withheld == 1 and tracker.restarts == 0 and estimator.n == 9
+
+
+def test_two_answers_in_a_row_that_cannot_be_computed_start_the_estimator_afresh():
+    estimator = Counting()
+    estimator.estimate = failing(estimator.estimate, fails={1, 2})
+    tracker = ShapeTracker(estimator, every=2)
+    cycle(tracker, 0.0, contacts=[2.5e-3 * k for k in range(8)])
+    assert tracker.withheld == 2 and tracker.restarts == 1
+    assert estimator.n == 2 and estimator.knew == [2, 2]
+
+
+def test_a_contact_that_an_estimator_cannot_take_starts_it_afresh():
+    estimator = Counting()
+    estimator.add = failing(estimator.add, fails={2})
+    tracker = ShapeTracker(estimator, every=2)
+    cycle(tracker, 0.0, contacts=[2.5e-3 * k for k in range(6)])
+    assert tracker.restarts == 1 and estimator.knew == [2, 1, 3]
+
+
 def test_recorded_contacts_are_answered_one_by_one():
     samples = [contact(0.005 * k) for k in range(10)]
     assert [r.t_s for r in replay_samples(Counting(), samples, 3)] == [s.t_s for s in samples[2::3]]

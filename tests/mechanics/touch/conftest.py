@@ -144,3 +144,52 @@ class Truth:
 def truth() -> Truth:
     """Closed-form surfaces, paths, noise."""
     return Truth()
+
+
+@dataclass(frozen=True)
+class TorusLine:
+    """A cut of a torus by a plane along a normal: points and outward normals (n, 3) of a straight path, and its K."""
+
+    ring: float
+    tube: float
+    points: Array
+    normals: Array
+
+    def tensor(self, point: Array) -> Array:
+        """(3, 3) curvature near a point, 1/m."""
+        u, v = self._angles(point)
+        along_ring = np.array([-math.sin(u), math.cos(u), 0.0])
+        along_tube = np.array([-math.sin(v) * math.cos(u), -math.sin(v) * math.sin(u), math.cos(v)])
+        across = math.cos(v) / (self.ring + self.tube * math.cos(v))
+        result: Array = np.outer(along_tube, along_tube) / self.tube + across * np.outer(along_ring, along_ring)
+        return result
+
+    def _angles(self, point: Array) -> tuple[float, float]:
+        """Along ring and tube, rad."""
+        return math.atan2(point[1], point[0]), math.atan2(point[2], math.hypot(point[0], point[1]) - self.ring)
+
+    def felt(self, sigma_point: float, sigma_normal: float, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Points and normals with noise."""
+        normals = self.normals + sigma_normal * rng.normal(size=self.normals.shape)
+        points = self.points + sigma_point * rng.normal(size=self.points.shape)
+        return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+@pytest.fixture(scope="session")
+def torus_line() -> Callable[..., TorusLine]:
+    """A straight path over a torus: ring and tube (m), where on the tube it ends and its heading there (rad)."""
+
+    def cut(ring: float, tube: float, end: float, heading: float, *, length: float, samples: int = 160) -> TorusLine:
+        up = np.array([math.cos(end), 0.0, math.sin(end)])
+        along = math.cos(heading) * np.array([-up[2], 0.0, up[0]]) + math.sin(heading) * np.array([0.0, 1.0, 0.0])
+        line = np.array([ring, 0.0, 0.0]) + tube * up + np.linspace(-length, 0.0, samples)[:, None] * along
+        height = np.zeros((samples, 1))
+        for _ in range(20):
+            p = line + height * up
+            rho = np.hypot(p[:, 0], p[:, 1])
+            gradient = np.stack([(rho - ring) * p[:, 0] / rho, (rho - ring) * p[:, 1] / rho, p[:, 2]], axis=1)
+            value = (rho - ring) ** 2 + p[:, 2] ** 2 - tube**2
+            height -= (0.5 * value / (gradient @ up))[:, None]
+        return TorusLine(ring, tube, p, gradient / np.linalg.norm(gradient, axis=1, keepdims=True))
+
+    return cut

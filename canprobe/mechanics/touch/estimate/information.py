@@ -20,7 +20,8 @@ from canprobe.mechanics.touch.estimate.answer import foot
 from canprobe.mechanics.touch.estimate.noise import Correlation, Noise
 from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE_INFORMATION
 from canprobe.mechanics.touch.estimate.omitted_terms import OmittedTerms
-from canprobe.mechanics.touch.estimate.prior import Prior
+from canprobe.mechanics.touch.estimate.prior import NUISANCE_SIGMA, Prior
+from canprobe.mechanics.touch.estimate.quadric import matrix_of
 from canprobe.mechanics.touch.estimate.residuals import Design, design, linearise, transport
 from canprobe.mechanics.touch.linear_algebra import inverted, inverted_upper, upper_root
 from canprobe.mechanics.touch.tangent_frames import homogeneous, transported
@@ -56,6 +57,13 @@ def batch_design(T_base_work: Floats, length: float, touches: Sequence[MeasuredC
 
 REANCHOR_TRAVEL_SHARE = 0.05
 """Distance from the origin of the working frame, over the memory, from which on that frame is moved along."""
+MAX_GRADIENT_GROWTH = 2.0 * NUISANCE_SIGMA[0]
+"""Largest growth of ln |∇f| over a memory that information may rest on: a standard deviation of the weak prior on c13.
+
+|∇f| is 1 − 2 c13 x along a path. In a frame that has moved on it is 1 again, so it is less at the earlier samples, and
+their information, which has |∇f|² in its denominator, is more. Where c13 stands for cubic terms of a surface that is no
+quadric, the information would grow faster than it fades. What is above the limit is forgotten.
+"""
 
 
 class _Path(NamedTuple):
@@ -102,6 +110,7 @@ class InformationFilter:
         """Start from the prior alone: a plane in a frame (4, 4)."""
         self.T = T
         self.c = np.zeros(9)
+        self._inflation = 1.0
         self._path = _Path()
         self.root, self.inverse = self._prior_rows, inverted_upper(self._prior_rows)
         self.left_out.reset()
@@ -120,6 +129,7 @@ class InformationFilter:
             travelled: length of the path, m.
         """
         self.T, self.c = T, c.copy()
+        self._inflation = 1.0
         self._path = _Path(travelled, travelled)
         self.root = upper_root(np.concatenate([root, DIFFUSE_INFORMATION * np.eye(9)]))
         self.inverse = inverted_upper(self.root)
@@ -128,7 +138,8 @@ class InformationFilter:
     def take(self, rows: Floats, residuals: Floats, moved: float) -> None:
         """Forget over a step of the path (m), then add weighted rows (n, 3, 18) and minus residuals (n, 3): one QR."""
         rows, residuals = rows.reshape(-1, 18), residuals.reshape(-1)
-        kept = math.exp(-moved / self.length)
+        kept = math.exp(-moved / self.length) / self._inflation
+        self._inflation = 1.0
         left = kept * self._path.share
         self._path = self._path.on(moved, kept)
         share = self._path.share
@@ -163,13 +174,17 @@ class InformationFilter:
     def follow(self, point: Floats) -> None:
         """Move to a contact frame at the foot of a point (3,) of base, once that is far enough from the working frame.
 
-        The information is carried along with the frame (`transport`), so nothing is forgotten by it.
+        The information is carried along with the frame (`transport`), so nothing is forgotten by it, unless |∇f| grows
+        faster than `MAX_GRADIENT_GROWTH` allows.
         """
         near = u, v, w = self.place(point)
         if u * u + v * v + w * w < REANCHOR_TRAVEL_SHARE**2:
             return
         x, z_axis = foot(self.c, near)
         turned = np.array((*transported((1.0, 0.0, 0.0), z_axis), z_axis)).T
+        gradient = 2.0 * matrix_of(self.c).dot((*x, 1.0))[:3]
+        allowed = math.exp(2.0 * MAX_GRADIENT_GROWTH * math.hypot(u, v, w))
+        self._inflation *= max(1.0, float(gradient.dot(gradient)) / allowed)
         self.c, M = transport(self.c, homogeneous(turned, x))
         self.c[:3] = 0.0
         back = inverted(M)

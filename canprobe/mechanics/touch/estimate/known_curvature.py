@@ -13,7 +13,8 @@ from canprobe.mechanics.touch.estimate.residuals import curvature_jacobian
 from canprobe.mechanics.touch.linear_algebra import inverted, solved
 from canprobe.mechanics.types import Floats
 
-_TO_Q_SQUARED = np.outer(TO_Q, TO_Q)
+TO_Q_SQUARED = np.outer(TO_Q, TO_Q)
+"""A covariance of (K11, K12, K22) to that of q, entry by entry."""
 
 
 class CurvatureInformation(NamedTuple):
@@ -38,7 +39,7 @@ def evidence_of(c: Floats, covariance: Floats, spread: Floats | None, length: fl
             that the points were not spread for are marginalised: noise alone would answer for them, with −1/R_p where
             it is that of centroids on a probe. None where a prior answers for them.
     """
-    covariance = _TO_Q_SQUARED * covariance / length**2
+    covariance = TO_Q_SQUARED * covariance / length**2
     q = c[6:] / (C_PER_Q * length)
     axes, wide = (np.eye(3), np.ones(3, dtype=bool)) if spread is None else excited(spread)
     if wide.all():

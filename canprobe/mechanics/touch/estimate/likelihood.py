@@ -16,11 +16,11 @@ from canprobe.mechanics.touch.estimate.answer import (
     build_estimate,
     partial_covariance,
 )
-from canprobe.mechanics.touch.estimate.known_curvature import curvature_covariance, evidence_of
+from canprobe.mechanics.touch.estimate.known_curvature import TO_Q_SQUARED, curvature_covariance, evidence_of
 from canprobe.mechanics.touch.estimate.misfit import MENTIONED_PROBABILITY, correct, misfit_notes
 from canprobe.mechanics.touch.estimate.noise import Correlation, Noise, make_noise, mixed
 from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE_INFORMATION, fit
-from canprobe.mechanics.touch.estimate.observed import decide, nothing_observed, spread_of, turned
+from canprobe.mechanics.touch.estimate.observed import decide, nothing_observed, spread_of
 from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, parameters_of
 from canprobe.mechanics.touch.estimate.residuals import curvature_jacobian, design, linearise
@@ -116,28 +116,37 @@ def fit_ml(touches: ContactBatch, prior: Prior | None, quadric: bool = False) ->
     R = T[:3, :3]
     d = design((touches.points - T[:3, 3]) @ R / length, touches.normals @ R, touches.noise.scaled(length, R))
     independent = touches.whitener()
-    result = fit(d, stated.rows(length), independent)
+    prior_rows = stated.rows(length)
+    result = fit(d, prior_rows, independent)
     problem_root = result.root
     notes: tuple[str, ...] = () if result.converged else ("the iteration did not settle",)
-    if result.decision.rank == 3 and not quadric:
-        corrected = correct(result.c, result.root, d, independent)
+    if result.decision.rank > 0 and not quadric:
+        root = result.root if result.decision.rank == 3 else result.free_root
+        observed = result.decision.vectors[:, result.decision.passed]
+        corrected = correct(result.c, root, d, independent, observed)
         trusted = corrected.trusted and (result.converged or corrected.misfit <= MENTIONED_PROBABILITY)
         notes += misfit_notes(corrected.misfit, trusted=trusted)
         if trusted:
-            c, root = corrected.c, corrected.root
-            result = result._replace(c=c, root=root, free=c, free_root=root)
+            c, root = result.c + corrected.shift, corrected.root
+            free = c if result.decision.rank == 3 else result.free + corrected.shift
+            result = result._replace(c=c, root=root, free=free, free_root=root)
         else:
-            result = result._replace(decision=nothing_observed(), free_root=DIFFUSE_INFORMATION * np.eye(9))
+            c, root = result.c.copy(), upper_root(np.concatenate([prior_rows[0], DIFFUSE_INFORMATION * np.eye(9)]))
+            c[3:] = 0.0
+            c[[6, 8]] = 0.5 * stated.curvature * length
+            result = result._replace(c=c, root=root, free=c, free_root=root, decision=nothing_observed())
     has_prior = math.isfinite(stated.sigma_curvature)
     a = anchor(result.c, T, (0.0, 0.0, 0.0), length)
-    decision = result.decision._replace(vectors=turned(a.turn) @ result.decision.vectors)
+    decision = result.decision.turned(a.turn)
+    freed = anchor(result.free, T, (0.0, 0.0, 0.0), length)
+    spread = None if has_prior else _turned_spread(spread_of(d.X, d.point_variance), freed.turn)
+    covariance = curvature_covariance(freed.c, solved(result.free_root.T, freed.M.T).T)
+    evidence = evidence_of(freed.c, covariance, spread, length)
     if decision.rank == 3 or has_prior:
         covariance = curvature_covariance(a.c, a.M @ inverted(result.root))
     else:
+        decision = decision.with_covariance(TO_Q_SQUARED * covariance)
         covariance = np.full((3, 3), math.nan)
-    free = anchor(result.free, T, (0.0, 0.0, 0.0), length)
-    spread = None if has_prior else _turned_spread(spread_of(d.X, d.point_variance), free.turn)
-    deviation = solved(result.free_root.T, free.M.T).T
     if result.outliers:
         notes += (f"{result.outliers} samples with reduced weight",)
     return build_estimate(
@@ -151,7 +160,7 @@ def fit_ml(touches: ContactBatch, prior: Prior | None, quadric: bool = False) ->
         method="ml",
         prior=stated.name,
         notes=notes,
-        evidence=evidence_of(free.c, curvature_covariance(free.c, deviation), spread, length),
+        evidence=evidence,
     )
 
 

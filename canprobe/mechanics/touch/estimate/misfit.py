@@ -10,7 +10,9 @@ widens the covariance.
 
 The correction is one linear step. Where quartic terms matter, still higher ones do too: they are taken to be a third of
 the correction (`HIGHER_TERMS_SHARE`), which goes into the covariance. A correction of more than a tenth of K is too
-large for a linear step: then the path has no local quadric, and K is not observed.
+large for a linear step: then the path has no local quadric, and K is not observed. Both are measured on the
+combinations of K that were observed, of a straight path the curvature along it and the twist: the rest of a fit is
+noise, and so is its correction.
 
 Why not fit all eighteen terms: noise alone would fill the nine additional ones on a short path, and the covariance of K
 would grow also where the surface is a quadric.
@@ -57,7 +59,7 @@ MAX_CORRECTION_SHARE = 0.1
 """Largest change of K by a correction that is used, over the larger of ‖K‖ and 1/length."""
 MENTIONED_PROBABILITY = 0.99
 """Least probability of a misfit that an estimate mentions."""
-_Q_PER_C_SQUARED = C_PER_Q**-2.0
+_ALL = np.eye(3)
 _IS_CUBIC = DEGREE == 3
 _MIN_SCALED_CURVATURE = 0.1
 """Least ‖K‖ · length by which the usual size of quartic terms over cubic ones falls."""
@@ -79,15 +81,15 @@ _CAUTIOUS_WEIGHTS = np.repeat(
 
 
 class Corrected(NamedTuple):
-    """A fit that is corrected for what it leaves out.
+    """What corrects a fit for what it leaves out.
 
     Attributes:
-        c: (9,) parameters.
-        root: (9, 9) upper triangular root of their information.
+        shift: (9,) correction to add to the parameters.
+        root: (9, 9) upper triangular root of the information about the corrected ones.
         misfit, trusted: as in `Averaged`.
     """
 
-    c: Floats
+    shift: Floats
     root: Floats
     misfit: float
     trusted: bool
@@ -119,7 +121,9 @@ def scales(curvature: float) -> Floats:
     return np.where(_IS_CUBIC, 1.0, 0.25 * max(curvature, _MIN_SCALED_CURVATURE))
 
 
-def averaged(m: Floats, s: Floats, carried: Floats, curvature: float, blur: float = 0.0) -> Averaged:
+def averaged(  # noqa: PLR0917 - what the terms are known by, and what is assumed of the surface
+    m: Floats, s: Floats, carried: Floats, curvature: float, blur: float = 0.0, observed: Floats = _ALL
+) -> Averaged:
     """Average over the variance of the terms, given in directions in which the data's information is diagonal.
 
     Args:
@@ -128,6 +132,7 @@ def averaged(m: Floats, s: Floats, carried: Floats, curvature: float, blur: floa
         carried: (9, 9) change of the fitted parameters by a unit of each term, with the sign turned.
         curvature: curvature ‖K‖ · length.
         blur: noise of a point over the least radius, κσ_p, rad.
+        observed: (3, k) columns: the observed combinations of q, whose change is measured. That of the others is noise.
     """
     variance = _VARIANCES.copy()
     variance[: len(_USUAL_VARIANCES)] *= curvature**4
@@ -143,8 +148,8 @@ def averaged(m: Floats, s: Floats, carried: Floats, curvature: float, blur: floa
     apart = shifts - mean
     left = weight.dot(share)
     spread = (carried * left).dot(carried.T) + (apart.T * weight).dot(apart)
-    changed = float(weight.dot(np.square(shifts[:, 6:])).dot(_Q_PER_C_SQUARED))
-    spread.flat[60::10] += HIGHER_TERMS_SHARE**2 * changed / _Q_PER_C_SQUARED  # of K
+    changed = float(weight.dot(np.square((shifts[:, 6:] / C_PER_Q).dot(observed)).sum(axis=1)))
+    spread.flat[60::10] += HIGHER_TERMS_SHARE**2 * changed * C_PER_Q**2  # of K
     trusted = changed <= (MAX_CORRECTION_SHARE * max(curvature, 1.0)) ** 2
     shown = 1.0 - NO_MISFIT_WEIGHT * float(evidence[0] / _PRIOR_WEIGHTS.dot(evidence))
     return Averaged(mean, spread, left, weight.dot(share * s), shown, trusted)
@@ -158,26 +163,29 @@ def _prior(blur: float) -> Floats:
     return result
 
 
-def correct(c: Floats, root: Floats, d: Design, independent: Floats | None) -> Corrected:
+def correct(c: Floats, root: Floats, d: Design, independent: Floats | None, observed: Floats) -> Corrected:
     """Average a converged fit over its misfit.
 
     Args:
         c: (9,) parameters in the frame at the last sample.
-        root: (9, 9) root of their information.
+        root: (9, 9) root of their information, regular.
         d, independent: as for `nonlinear.fit`.
+        observed: (3, k) columns: the observed combinations of q. The others are held at what they are.
     """
     J, E, r, slack = _rows(c, d, independent)
-    inverse = inverted(root)
-    H = inverse @ inverse.T
     curvature = float(np.linalg.norm(c[6:] / C_PER_Q))
     E *= scales(curvature)
-    carried = H @ (J.T @ E)  # terms a put the quadric off by −carried a
-    m, U = np.linalg.eigh(E.T @ (E - J @ carried))  # what the nine parameters and their prior cannot explain of them
+    fitted = np.zeros((9, 6 + observed.shape[1]))
+    fitted[:6, :6], fitted[6:, 6:] = np.eye(6), C_PER_Q[:, None] * observed
+    inverse = fitted @ inverted(upper_root(root @ fitted))
+    carried = inverse @ (inverse.T @ (J.T @ E))  # terms a put the quadric off by −carried a
+    m, U = np.linalg.eigh(E.T @ (E - J @ carried))  # what the parameters and their prior cannot explain of them
     s = U.T @ (carried.T @ slack - E.T @ r)
     blur = sharpest(c) * math.sqrt(float(d.point_variance.mean()))
-    found = averaged(np.maximum(m, 0.0), s, carried @ U, curvature, blur)
-    lower = np.asarray(np.linalg.cholesky(H + found.spread), dtype=np.float64)
-    return Corrected(c + found.shift, upper_root(inverted(lower)), found.misfit, found.trusted)
+    found = averaged(np.maximum(m, 0.0), s, carried @ U, curvature, blur, observed)
+    whole = inverted(root)
+    lower = np.asarray(np.linalg.cholesky(whole @ whole.T + found.spread), dtype=np.float64)
+    return Corrected(found.shift, upper_root(inverted(lower)), found.misfit, found.trusted)
 
 
 def _rows(c: Floats, d: Design, independent: Floats | None) -> tuple[Floats, Floats, Floats, Floats]:

@@ -52,6 +52,20 @@ class Decision(NamedTuple):
         """Number of observed combinations."""
         return int(self.passed.tolist().count(True))
 
+    def turned(self, angle: float) -> Decision:
+        """The decision in axes turned by an angle in rad."""
+        return self._replace(vectors=turned(angle).dot(self.vectors))
+
+    def with_covariance(self, covariance: Floats) -> Decision:
+        """The decision with the information about the observed combinations taken from a covariance (3, 3) of q."""
+        if not self.passed.any():
+            return self
+        seen = self.vectors[:, self.passed]
+        variances, turn = eigen(seen.T.dot(covariance).dot(seen))
+        vectors, information = self.vectors.copy(), self.information.copy()
+        vectors[:, self.passed], information[self.passed] = seen.dot(turn), 1.0 / variances
+        return self._replace(vectors=vectors, information=information)
+
 
 def nothing_observed() -> Decision:
     """The decision where the model does not hold: nothing was observed."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from canprobe.mechanics.touch.estimate.misfit import Averaged, averaged, scales
 from canprobe.mechanics.touch.estimate.noise import Correlation
-from canprobe.mechanics.touch.estimate.quadric import sharpest, size_of
+from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, sharpest, size_of
 from canprobe.mechanics.touch.estimate.sandwich import Score
 from canprobe.mechanics.touch.estimate.terms import shifted
 from canprobe.mechanics.touch.linear_algebra import eigen, solved
@@ -118,7 +118,7 @@ class OmittedTerms:
         self._information = wide.T.dot(self._information).dot(wide)
         self._slope = away.T.dot(self._slope)
 
-    def amend(self, c: Floats, H: Floats, place: Vec, expected: ExpectedMisfit) -> Amended:
+    def amend(self, c: Floats, H: Floats, place: Vec, expected: ExpectedMisfit, observed: Floats) -> Amended:
         """Average an answer at a place over the terms.
 
         Args:
@@ -126,17 +126,21 @@ class OmittedTerms:
             H: (9, 9) inverse of their information.
             place: the place in the working frame, dimensionless.
             expected: what is assumed.
+            observed: (3, k) columns: the observed combinations of q in the working frame.
         """
-        a = self._along(c, H, expected, place)
+        a = self._along(c, H, expected, place, observed)
         both = H.dot(a.shared[:9]).dot(a.weighted * a.found.share).dot(a.off.T)
         return Amended(c + a.found.shift, a.found.spread + both + both.T, a.found.misfit, a.found.trusted)
 
     def explanation(self, c: Floats, H: Floats, expected: ExpectedMisfit) -> Floats:
         """(18,) most likely terms: their part in the filter's parameters, then the terms themselves."""
-        a = self._along(c, H, expected, (0.0, 0.0, 0.0))
+        a = self._along(c, H, expected, (0.0, 0.0, 0.0), np.eye(3))
         return np.concatenate([a.found.shift, a.terms @ a.found.terms])
 
-    def _along(self, c: Floats, H: Floats, expected: ExpectedMisfit, place: Vec) -> _Along:
+    def _along(self, c: Floats, H: Floats, expected: ExpectedMisfit, place: Vec, observed: Floats) -> _Along:
+        if observed.shape[1] < 3:
+            c = c.copy()
+            c[6:] = C_PER_Q * observed.dot(observed.T.dot(c[6:] / C_PER_Q))
         curvature = max(size_of(c), expected.curvature)
         D = scales(curvature)
         X = np.zeros((18, 9))  # what a unit of each term does to the parameters, and the term itself
@@ -153,5 +157,5 @@ class OmittedTerms:
         blur = sharpest(c) * expected.sigma_point * math.sqrt(expected.noise)
         off, terms = X[:9].dot(U), D[:, None] * U
         off[6:] += shifted(place[0], place[1])[1][6:].dot(terms)
-        found = averaged(information, s, -off, curvature, blur)
+        found = averaged(information, s, -off, curvature, blur, observed)
         return _Along(found, off, terms, shared, weighted.dot(U))

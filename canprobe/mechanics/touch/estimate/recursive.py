@@ -16,10 +16,10 @@ import numpy as np
 
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import ContactSample
-from canprobe.mechanics.touch.estimate.answer import Solution, SurfaceEstimate, anchor, build_estimate
+from canprobe.mechanics.touch.estimate.answer import Anchor, Solution, SurfaceEstimate, anchor, build_estimate
 from canprobe.mechanics.touch.estimate.change import ChangeTest
 from canprobe.mechanics.touch.estimate.information import InformationFilter, MeasuredContact
-from canprobe.mechanics.touch.estimate.known_curvature import curvature_covariance, evidence_of
+from canprobe.mechanics.touch.estimate.known_curvature import TO_Q_SQUARED, curvature_covariance, evidence_of
 from canprobe.mechanics.touch.estimate.misfit import misfit_notes
 from canprobe.mechanics.touch.estimate.noise import CHI2_99, CHI2_999, Correlation
 from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE_INFORMATION
@@ -141,21 +141,21 @@ class RecursiveEstimator:
         state, notes = self._filter, self._notes()
         place = state.place(self._last.point)
         a = anchor(state.c, state.T, place, state.length)
-        # a start that has not settled has spread 0, so that nothing counts as observed
-        certain = float(self._settled) / self._gate.sigma_point**2
-        P = a.T_frame_contact[:3, :2]
-        flat = P.T.dot(self._spread.covariance * certain).dot(P)
+        flat = self._flat(a)
         q = a.M[6:].dot(state.inverse) / C_PER_Q[:, None]
         decision = decide(inverted_upper(upper_root(q.T)).T, flat, size_of(a.c))
         # the sandwich: A⁻¹ = inverse inverseᵀ, the score between
         noise = state.inverse.T.dot(state.left_out.score.matrix[:9, :9]).dot(state.inverse)
         believed = True
-        if decision.rank == 3 and not self._quadric:
-            amended = state.left_out.amend(state.c, state.inverse.dot(state.inverse.T), place, self._expected())
+        if decision.rank > 0 and not self._quadric:
+            observed = decision.turned(-a.turn).vectors[:, decision.passed]
+            H = state.inverse.dot(state.inverse.T)
+            amended = state.left_out.amend(state.c, H, place, self._expected(), observed)
             notes += misfit_notes(amended.misfit, trusted=amended.trusted)
             believed = amended.trusted
             if believed:
-                a = anchor(amended.c, state.T, place, state.length)
+                before, a = a, anchor(amended.c, state.T, place, state.length)
+                flat, decision = self._flat(a), decision.turned(a.turn - before.turn)
                 noise += state.root.dot(amended.covariance).dot(state.root.T)
             else:
                 decision = nothing_observed()
@@ -163,6 +163,7 @@ class RecursiveEstimator:
         covariance = curvature_covariance(a.c, deviation)
         evidence = evidence_of(a.c, covariance, flat, state.length)
         if decision.rank < 3:
+            decision = decision.with_covariance(TO_Q_SQUARED * covariance)
             known = decision.vectors[:, decision.passed]
             a.c[6:] = C_PER_Q * (known @ (known.T @ (a.c[6:] / C_PER_Q)))
             covariance = np.full((3, 3), math.nan)
@@ -179,6 +180,16 @@ class RecursiveEstimator:
             notes=notes,
             evidence=evidence,
         )
+
+    def _flat(self, a: Anchor) -> Floats:
+        """(2, 2) covariance of the samples in the tangent plane of an answer, over the variance of their noise.
+
+        It is 0 for a start that has not settled, so that nothing counts as observed.
+        """
+        P = a.T_frame_contact[:3, :2]
+        certain = float(self._settled) / self._gate.sigma_point**2
+        flat: Floats = P.T.dot(self._spread.covariance * certain).dot(P)
+        return flat
 
     def _expected(self) -> ExpectedMisfit:
         """The stated noise is used unless it is twice the usual; surfaces are taken to be as curved as the probe."""

@@ -168,7 +168,7 @@ def test_without_forgetting_an_answer_is_that_of_a_batch():
     residuals = flat[:, 9:] @ a + e.reshape(-1)
     residuals -= flat[:, :9] @ (H @ (flat[:, :9].T @ residuals))  # at the quadric that fits best
     sums.start(rows, residuals.reshape(-1, 3), 0.01)
-    found = sums.amend(c, H, np.zeros(3), ExpectedMisfit())
+    found = sums.amend(c, H, np.zeros(3), ExpectedMisfit(), np.eye(3))
     both = np.linalg.lstsq(flat, residuals, rcond=None)[0]  # terms that show: those that fit best
     assert found.misfit > 0.999
     assert np.allclose(found.c - c, both[:9], atol=0.02)
@@ -206,7 +206,7 @@ def test_generous_noise_does_not_hide_a_misfit():
     sums = OmittedTerms(1e-9 * np.eye(9), None)
     c = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5, 0.1, 0.3])
     sums.start(rows, residuals.reshape(-1, 3), 0.01)
-    stated, known = (sums.amend(c, H, np.zeros(3), ExpectedMisfit(noise)) for noise in (1.0, 1.0 / 9.0))
+    stated, known = (sums.amend(c, H, np.zeros(3), ExpectedMisfit(noise), np.eye(3)) for noise in (1.0, 1.0 / 9.0))
     assert stated.misfit < 0.5
     assert known.misfit > 0.99
 
@@ -267,3 +267,18 @@ def test_independent_rows_count_with_their_weight_squared():
     assert np.allclose(score.matrix, PRIOR + 0.25 * J[0].T @ J[0] + J[1].T @ J[1])
     score.reset()
     assert np.allclose(score.matrix, PRIOR)
+
+
+@pytest.mark.parametrize("c13", [-0.8, -0.5, -0.25])
+def test_information_about_curvature_fades_where_the_gradient_grows_along_the_path(c13):
+    """In the frame that moves on |∇f| at the samples falls below half; K would be known the better for it."""
+    state, none = InformationFilter(0.02, Prior.weak(0.02), None), (np.zeros((0, 3, 18)), np.zeros((0, 3)))
+    c = np.array([0.0, 0.0, 0.0, c13, 0.0, 0.0, 0.2, 0.0, 0.2])
+    state.adopt(np.eye(4), c, 100.0 * np.eye(9), *none, 0.02)
+    known = []
+    for _ in range(20):
+        state.take(*none, 1.2e-3)
+        state.follow(state.T[:3, 3] + 1.2e-3 * state.T[:3, 0])
+        known.append(-np.linalg.slogdet(state.inverse[6:] @ state.inverse[6:].T)[1])
+    assert (np.diff(known[1:]) < 0.0).all()
+    assert known[-1] < known[0] - 1.0
