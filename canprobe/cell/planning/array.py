@@ -14,7 +14,6 @@ from typing import Literal
 from canprobe.cell.planning.window import patch_radius_m
 from canprobe.cell.scene.setup import Array, Calibrate, Setup, Touch
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.patch.array_models import make_patch_calibration
 
 What = Literal["image", "start", "stop", "poll"]
 PRESS_TAXELS, CENTROID_TAXELS, CURVATURE_TAXELS = 2, 4, 16
@@ -121,6 +120,8 @@ def array_problems(setup: Setup) -> Iterator[str]:
 
 def _unreadable(array: Array) -> Iterator[str]:
     """Problem where no force can be read from the array, because a contact falls between its taxels."""
+    from canprobe.mechanics.touch.patch.array_models import make_patch_calibration  # scipy, for coarse arrays only
+
     try:
         make_patch_calibration(array.calibration, array.pad)
     except UsageError:
