@@ -15,6 +15,7 @@ from canprobe.cell.scene.setup import Setup
 from canprobe.fieldbus.protocol.frame_bits import WORST_ERROR_BITS
 from canprobe.mechanics.robot.inverse import FULL_POSE, task_rows
 from canprobe.mechanics.touch.patch.array_calibration import NO_FORCE_REFERENCE
+from canprobe.mechanics.touch.patch.force_errors import UNSTATED
 
 LOCAL_GROUP = "ff11::ca"
 """A multicast group of interface-local scope, which no packet leaves or enters. Source: RFC 4291, 2.7."""
@@ -66,6 +67,12 @@ def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
         yield (
             "sensor.calibration: the array measures in nominal newtons, as good as its stated full scale;"
             " `canprobe calibrate array CELL --force-reference scale` gives them a reference"
+        )
+    if setup.array is not None and setup.array.calibrated and setup.array.calibration.force is UNSTATED:
+        yield (
+            "sensor.calibration: its file has no section [force], so that creep is not corrected, and the force is"
+            f" taken to be known to {100 * UNSTATED.array:g} %, {100 * UNSTATED.spread:g} % from array to array and"
+            f" {100 * UNSTATED.creep_sigma:g} % a decade of creep (1σ); `canprobe calibrate array CELL` measures them"
         )
     if cut is not None:
         yield f"{cut.text}; {' or '.join(cut.ways)} leaves less than {100 * TOLERATED_LOSS_SHARE:.0f} % outside"
