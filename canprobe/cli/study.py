@@ -22,6 +22,7 @@ examples:
   canprobe study estimators --quick --out runs/estimators
   canprobe study bound --dask tcp://10.0.0.1:8786
   canprobe study faults --seed 4711
+  canprobe study arrays --draw 2
   canprobe vcan -- canprobe study faults --vcan
   canprobe vcan --realtime -- canprobe study realtime --soak
 """
@@ -38,6 +39,9 @@ def add_arguments(parser: Parser) -> None:
         metavar="N",
         type=whole(0, 2**63 - 1),
         help="faults: run only the case of this seed, and report each step",
+    )
+    parser.add_argument(
+        "--draw", metavar="N", type=whole(0, 9999), help="arrays: number that all seeds follow from [1]; 0: development"
     )
     parser.add_argument(
         "--vcan", action="store_true", help="faults: on a real vcan0; processes are killed and the link is taken down"
@@ -75,6 +79,7 @@ def run(args: argparse.Namespace) -> int:
         args.complain("--seed: the runs on vcan0 depend on the machine's timing and cannot be repeated from a seed")
     if args.soak and args.name != "realtime":
         args.complain(f"--soak: study {args.name} has no such form; only realtime has")
+    chosen = _chosen(args)
     if args.seed is not None:
         return _replay(args)
     from canprobe.lab.studies.result_files import as_document, text_of, write_study
@@ -85,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
     options = {"workers": args.workers, "dask": args.dask, "fresh": args.fresh}
     try:
         with open_sweep(out, say=args.report.say, progress=args.report.bar(".0f cells"), **options) as sweep:
-            result = run_study(args.name, quick=args.quick, sweep=sweep, form=form)
+            result = run_study(args.name, quick=args.quick, sweep=sweep, form=form, **chosen)
     except KeyboardInterrupt:
         args.report.complain(
             f"canprobe: interrupted; finished cells are kept in {out}, the same command computes the rest"
@@ -99,6 +104,13 @@ def run(args: argparse.Namespace) -> int:
         print(text_of(result), end="")
     args.report.say("wrote " + ", ".join(map(str, paths)))
     return 0
+
+
+def _chosen(args: argparse.Namespace) -> dict[str, int]:
+    """The options that only one study has, as far as they are given."""
+    if args.draw is not None and args.name != "arrays":
+        args.complain(f"--draw: study {args.name} has no draws; only arrays has")
+    return {} if args.draw is None else {"draw": args.draw}
 
 
 def _replay(args: argparse.Namespace) -> int:

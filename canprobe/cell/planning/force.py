@@ -36,6 +36,7 @@ def force_sigma_of(array: Array, probe: Probe, force: float, seconds: float) -> 
         force * (decades_after(seconds) - errors.creep_decades),
         late_decades_after(seconds),
         reference=0.0 if calibration.nominal else calibration.force_sigma,
+        peak=peak_pa / array.pad.full_scale_pa,
     )
 
 

@@ -195,7 +195,7 @@ STUDIES: Mapping[str, str] = MappingProxyType(
 """Measured quantity of each study, by its name. The module of that name has `run(*, quick, sweep) -> StudyResult`."""
 
 
-def run_study(name: str, *, quick: bool, sweep: Sweep, form: str = "") -> StudyResult:
+def run_study(name: str, *, quick: bool, sweep: Sweep, form: str = "", **chosen: Any) -> StudyResult:
     """Run a study.
 
     Args:
@@ -203,7 +203,8 @@ def run_study(name: str, *, quick: bool, sweep: Sweep, form: str = "") -> StudyR
         quick: fewer repeats and cases.
         sweep: computes its cells.
         form: variant of it: ``vcan`` of `faults`, with processes on a real vcan0; ``soak`` of `realtime`, an hour.
+        chosen: arguments of this study only.
     """
     module = importlib.import_module(f"canprobe.lab.studies.{name}_{form}" if form else f"canprobe.lab.studies.{name}")
-    result: StudyResult = module.run(quick=quick, sweep=sweep)
+    result: StudyResult = module.run(quick=quick, sweep=sweep, **chosen)
     return result

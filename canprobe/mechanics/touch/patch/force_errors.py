@@ -22,6 +22,9 @@ UPPER_SIGMAS = 2.0
 BRIDGED_SIGMA = 0.1
 """Error of what is interpolated over taxels that do not measure, over the interpolated force: over 200 random presses
 below 5 % of the force with one dead row, which takes up to a third of it."""
+STRAIGHT_SHARE, BENT_SIGMA = 0.7, 0.06
+"""Peak over full scale from which on taxels bend off before they saturate, and the error of the force that grows from
+there up to full scale, relative: touches with a higher peak are left out of a calibration."""
 CUT_SIGMA = 0.05
 """Error of the force of a patch that reaches the pad's edge, relative: a part of it lies beyond."""
 
@@ -38,7 +41,7 @@ class ForceSigma(NamedTuple):
         reference: the reference of newtons; 0 where there is none, and newtons are nominal.
         array: gains, hysteresis, threshold and form of the patch.
         creep: what the creep correction leaves.
-        taxels: what taxels that do not measure, saturated ones and the pad's edge hide; infinite for a lower bound.
+        taxels: what taxels that do not measure or bend off and the pad's edge hide; infinite for a lower bound.
     """
 
     reference: float = 0.0
@@ -78,6 +81,7 @@ class ForceErrors:
         late_decades: float = 0.0,
         *,
         reference: float = 0.0,
+        peak: float = 0.0,
         bridged: float = 0.0,
         cut: bool = False,
     ) -> ForceSigma:
@@ -90,16 +94,18 @@ class ForceErrors:
                 calibration, N.
             late_decades: decades of time beyond the slowest relaxation of the creep correction.
             reference: relative standard deviation of the reference of newtons.
+            peak: peak pressure over full scale.
             bridged: share of the force that is interpolated over taxels that do not measure.
             cut: whether the patch reaches the pad's edge.
         """
         light = self.array * math.sqrt(max(lightness / USUAL_LIGHTNESS, 1.0))
+        bent = min(max(peak - STRAIGHT_SHARE, 0.0) / (1.0 - STRAIGHT_SHARE), 1.0)
         late = force * late_decades * math.hypot(self.creep, self.creep_sigma)
         return ForceSigma(
             reference * force,
             force * math.hypot(light, self.spread),
             math.hypot(self.creep_sigma * creep_n, late),
-            force * math.hypot(BRIDGED_SIGMA * bridged, CUT_SIGMA * cut),
+            force * math.hypot(BRIDGED_SIGMA * bridged, BENT_SIGMA * bent, CUT_SIGMA * cut),
         )
 
 

@@ -20,7 +20,8 @@ class ForceReading:
 
     def __init__(self, calibration: PatchCalibration) -> None:
         self._errors, self._reference = calibration.force_errors, calibration.reference_sigma
-        self._level_pa = calibration.full_scale_pa * (calibration.threshold_counts + 1) / COUNTS_MAX
+        self._full_pa = calibration.full_scale_pa
+        self._level_pa = self._full_pa * (calibration.threshold_counts + 1) / COUNTS_MAX
         self._creep = ForceCreep(self._errors.creep)
 
     def step(self, t_s: float, patch: Patch) -> Patch:
@@ -39,6 +40,7 @@ class ForceReading:
             creep.decades_n - errors.creep_decades * shown,
             creep.late_decades,
             reference=self._reference,
+            peak=patch.peak_pa / self._full_pa,
             bridged=patch.bridged,
             cut=patch.cut_by_pad,
         )

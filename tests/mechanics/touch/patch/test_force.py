@@ -65,6 +65,8 @@ def test_the_causes_add_up_and_a_lower_bound_has_an_open_end():
         assert math.isinf(bound.total) and math.isinf(upper_end(2.0, bound.total))
     dead = ForceReading(CALIBRATION).step(0.0, PATCH._replace(bridged=0.3)).sigma
     assert dead.taxels == pytest.approx(0.03 * 2.0, rel=0.1)
+    high = ForceReading(CALIBRATION).step(0.0, PATCH._replace(peak_pa=95e3)).sigma
+    assert high.taxels == pytest.approx(0.05 * 2.0, rel=0.1)
     light = ForceReading(CALIBRATION).step(0.0, PATCH._replace(peak_pa=10e3)).sigma
     assert light.array > 1.5 * sigma.array
 
