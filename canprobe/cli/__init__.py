@@ -43,6 +43,7 @@ COMMANDS = (
     "monitor",
     "replay",
     "view",
+    "export",
     "calibrate",
     "study",
     "vcan",
