@@ -18,7 +18,7 @@ from canprobe.cell.planning.model import Plan, PlannedNode
 from canprobe.cell.planning.motion import parked_posture
 from canprobe.cell.planning.units import FEED, GEAR_RATIO, RESOLUTION
 from canprobe.cell.plant.config import PlantConfig, PressMotion
-from canprobe.cell.plant.plant import Plant, PlantState
+from canprobe.cell.plant.plant import Plant, PlantState, TruthRow, truth_columns
 from canprobe.cell.plant.taxels import TaxelConfig
 from canprobe.cell.rows import BLOCK_ROWS, LazyColumns, Rows
 from canprobe.cell.scene.setup import Setup
@@ -40,8 +40,8 @@ class TruthRecorder(Participant):
 
     Args:
         plant: plant whose truth is recorded.
-        at_once: whether what is true in the states is computed in blocks during the run. In real time it would make the
-            nodes' next answers late, and is computed afterwards.
+        at_once: whether what is true is computed at each SYNC. In real time it would make the nodes' next answers late,
+            and is computed afterwards.
         folder: folder for the blocks, in a file ``truth.npy``; None keeps them in memory.
 
     Attributes:
@@ -59,14 +59,20 @@ class TruthRecorder(Participant):
         self._file = folder / "truth.npy" if folder is not None else None
         self.origin_ns = 0
         self.rows: Rows | None = None
-        self._states: list[tuple[int, int, PlantState]] = []
+        self._stamps: list[tuple[int, int]] = []
+        self._states: list[PlantState] = []
+        self._truths: list[TruthRow] = []
 
     def receive(self, can_id: int, data: bytes, t_ns: int) -> list[Frame]:
         """Take the state of the plant at a SYNC."""
         if can_id == SYNC_ID:
             self._plant.advance(t_ns)
-            self._states.append((t_ns, data[0] if data else 0, self._plant.state()))
-            if self._at_once and len(self._states) >= BLOCK_ROWS:
+            self._stamps.append((t_ns, data[0] if data else 0))
+            if not self._at_once:
+                self._states.append(self._plant.state())
+                return []
+            self._truths.append(self._plant.truth_row())
+            if len(self._truths) >= BLOCK_ROWS:
                 self._compute()
         return []
 
@@ -80,21 +86,22 @@ class TruthRecorder(Participant):
             self.rows.remove()
 
     def _compute(self) -> Rows:
-        """Compute the truth of the states that wait."""
-        states, self._states = self._states, []
+        """Make rows of what waits."""
+        stamps, states, truths = self._stamps, self._states, self._truths
+        self._stamps, self._states, self._truths = [], [], []
         model = self._plant.config.model
-        found = self._plant.truths([state for _, _, state in states])
+        found = truth_columns(truths) if self._at_once else self._plant.truths(states)
         columns: dict[str, NDArray[Any]] = {
-            "t_s": np.array([t_ns - self.origin_ns for t_ns, _, _ in states], dtype=np.float64) * 1e-9,
-            "sync_count": np.arange(len(states), dtype=np.int64) + (0 if self.rows is None else len(self.rows)),
-            "sync_counter": np.array([counter for _, counter, _ in states], dtype=np.int64),
+            "t_s": np.array([t_ns - self.origin_ns for t_ns, _ in stamps], dtype=np.float64) * 1e-9,
+            "sync_count": np.arange(len(stamps), dtype=np.int64) + (0 if self.rows is None else len(self.rows)),
+            "sync_counter": np.array([counter for _, counter in stamps], dtype=np.int64),
             **{name: column if column.dtype == bool else np.asarray(column, float) for name, column in found.items()},
         }
         named = with_units(columns, () if model is None else model.chain.prismatic)
         if self.rows is None:
             fields = [(name, column.dtype, column.shape[1:]) for name, column in named.items()]
             self.rows = Rows(fields, self._file)
-        table = np.empty(len(states), self.rows.dtype)
+        table = np.empty(len(stamps), self.rows.dtype)
         for name in self.rows.dtype.names or ():
             table[name] = named[name]
         self.rows.add(table.tobytes())
