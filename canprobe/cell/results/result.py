@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.cell.npz import write_npz
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.files import to_frame, write_parquet
 from canprobe.cell.results.run_data import RunData
+from canprobe.cell.results.run_files import LOG, TACTILE
 from canprobe.cell.results.summary import write_files
 from canprobe.cell.results.text import summary_text
 from canprobe.cell.scene.setup import Touch
@@ -139,6 +141,8 @@ class RunResult:
         if folder is None:
             folder = Path(tempfile.mkdtemp(prefix="canprobe-view-"))
             write_scene(self.plan, folder)
+            write_npz(folder / LOG, self.log)
+            write_npz(folder / TACTILE, self.tactile)
             write_files(self.data, folder)
         return page_of(folder, self.plan.setup)
 
