@@ -22,6 +22,7 @@ examples:
   canprobe study estimators --quick --out runs/estimators
   canprobe study bound --dask tcp://10.0.0.1:8786
   canprobe study faults --seed 4711
+  canprobe study shapes --draw 7
   canprobe vcan -- canprobe study faults --vcan
   canprobe vcan --realtime -- canprobe study realtime --soak
 """
@@ -38,6 +39,12 @@ def add_arguments(parser: Parser) -> None:
         metavar="N",
         type=whole(0, 2**63 - 1),
         help="faults: run only the case of this seed, and report each step",
+    )
+    parser.add_argument(
+        "--draw",
+        metavar="N",
+        type=whole(0, 9999),
+        help="shapes: shapes that follow from this number take the place of the test shapes",
     )
     parser.add_argument(
         "--vcan", action="store_true", help="faults: on a real vcan0; processes are killed and the link is taken down"
@@ -82,10 +89,11 @@ def run(args: argparse.Namespace) -> int:
 
     out = args.out or Path("runs") / f"study-{args.name}"
     form = "vcan" if args.vcan else "soak" if args.soak else ""
+    chosen = _chosen(args)
     options = {"workers": args.workers, "dask": args.dask, "fresh": args.fresh}
     try:
         with open_sweep(out, say=args.report.say, progress=args.report.bar(".0f cells"), **options) as sweep:
-            result = run_study(args.name, quick=args.quick, sweep=sweep, form=form)
+            result = run_study(args.name, quick=args.quick, sweep=sweep, form=form, **chosen)
     except KeyboardInterrupt:
         args.report.complain(
             f"canprobe: interrupted; finished cells are kept in {out}, the same command computes the rest"
@@ -99,6 +107,15 @@ def run(args: argparse.Namespace) -> int:
         print(text_of(result), end="")
     args.report.say("wrote " + ", ".join(map(str, paths)))
     return 0
+
+
+def _chosen(args: argparse.Namespace) -> dict[str, int]:
+    """The options that only some studies have, as far as they are given."""
+    if args.draw is None:
+        return {}
+    if args.name != "shapes":
+        args.complain(f"--draw: study {args.name}: only shapes has it")
+    return {"draw": args.draw}
 
 
 def _replay(args: argparse.Namespace) -> int:

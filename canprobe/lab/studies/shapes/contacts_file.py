@@ -33,6 +33,11 @@ class ShapeContacts(NamedTuple):
     touched: Touched
     task: Touch
 
+    def until(self, seconds: float) -> ShapeContacts:
+        """The contacts of the first seconds of the scan."""
+        count = sum(sample.t_s <= self.samples[0].t_s + seconds for sample in self.samples)
+        return self._replace(samples=self.samples[:count], touched=self.touched.some(slice(count)))
+
 
 def write_contacts(path: Path, shapes: Mapping[str, Mapping[str, Any]]) -> str:
     """Write the file of contacts; its SHA-256."""
