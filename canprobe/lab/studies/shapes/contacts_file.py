@@ -58,5 +58,6 @@ def read_contacts(path: Path, name: str) -> ShapeContacts:
     task = resolve(load_scene("cylinder")).task
     assert isinstance(task, Touch)
     sigma = np.hypot(columns["sigma"][:, 0], columns["sigma"][:, 2])
+    height = np.where(np.isnan(columns["sigma"][:, 3]), sigma, columns["sigma"][:, 3])
     normal = np.hypot(SIGMA_NORMAL_RAD, sigma * centroid_coupling(task.probe))
-    return ShapeContacts(samples, Touched(columns["p_base"], columns["n_base"], sigma, normal), task)
+    return ShapeContacts(samples, Touched(columns["p_base"], columns["n_base"], height, normal), task)

@@ -156,10 +156,10 @@ def rows_of(samples: Sequence[ContactSample], radius: float, noise: MapNoise, tr
     T = np.array([sample.T_base_probe for sample in samples]).reshape(-1, 4, 4)
     rows[:, CENTRE], rows[:, X_PAD], rows[:, Y_PAD], rows[:, Z_PAD] = T[:, :3, 3], T[:, :3, 0], T[:, :3, 1], T[:, :3, 2]
     rows[:, NORMAL] = np.array([sample.n_base for sample in samples]).reshape(-1, 3)
-    rows[:, HEIGHT2], rows[:, NORMAL2], rows[:, PATCH] = noise.height**2, noise.normal**2, math.nan
+    rows[:, NORMAL2], rows[:, PATCH] = noise.normal**2, math.nan
     for row, sample in zip(rows, samples, strict=True):
         row[ROOT_FORCE] = math.sqrt(max(sample.force_n, 0.0))
-        row[LATERAL2] = noise.lateral2(sample)
+        row[LATERAL2], row[HEIGHT2] = noise.lateral2(sample), noise.height2(sample)
         if traces is not None:
             row[PATCH] = traces.size_of(sample, radius)
     return rows

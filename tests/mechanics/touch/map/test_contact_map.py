@@ -13,6 +13,7 @@ from canprobe.mechanics.touch.map.fit import fit_map
 from canprobe.mechanics.touch.map.local_fits import Pad
 from canprobe.mechanics.touch.map.noise import MapNoise
 from canprobe.mechanics.touch.map.quartic import LENGTH_M, fourth_of, heights_and_slopes, terms
+from canprobe.mechanics.touch.map.stiffness import SLOPE_BIAS
 from canprobe.mechanics.touch.patch.array_calibration import ImageParameters, MomentErrors
 from canprobe.mechanics.touch.patch.image_model import ImageModel
 
@@ -203,7 +204,7 @@ def pad_samples(radius, stiffness, true_stiffness, model):
     p, n, _ = on_sphere(RASTER, 0.05)
     depth = indentation_from_force(2.0, true_stiffness, radius, (20.0, 20.0))
     shown = model.with_stiffness(true_stiffness).moments((20.0, 0.0, 20.0), 2.0)
-    slope = Slope(math.sqrt(2.0) / depth, 20.0)
+    slope = Slope(math.sqrt(2.0) / depth * math.exp(-0.5 * SLOPE_BIAS), 20.0)
     for i, (place, up) in enumerate(zip(p, n, strict=True)):
         T = np.eye(4)
         x = np.array([1.0, 0.0, 0.0]) - up[0] * up
