@@ -100,7 +100,7 @@ def fit_discs(
     """
     if pad is not None:
         K_ref = _followed(K_ref, pad.radius)
-    A, y, places, variance = _rows(rows[discs.nodes], discs, pad, noise, K_ref)
+    A, y, places, variance, usual = _rows(rows[discs.nodes], discs, pad, noise, K_ref)
     root = np.sqrt(np.repeat(weight, 3, axis=1))
     weighted = (A * root[..., None]).transpose(0, 2, 1)
     G, b = weighted @ (A * root[..., None]), np.einsum("mik,mk->mi", weighted, y * root)
@@ -111,7 +111,8 @@ def fit_discs(
     chi2 = (residual**2).reshape(len(a), -1, 3).sum(axis=2)
     total = weight.sum(axis=1)
     dof = np.maximum(noise.used * total - held, 1.0)
-    excess = (weight * chi2).sum(axis=1) / dof - 1.0
+    expected = dof * (weight * usual).sum(axis=1) / np.maximum(noise.used * total, 1e-300)
+    excess = (weight * chi2).sum(axis=1) / np.maximum(expected, 1e-300) - 1.0
     excess = np.where(excess > CHANCE_SIGMAS * np.sqrt(2.0 / dof), excess, 0.0)
     share = weight / np.maximum(total, 1e-300)[:, None]
     off = places - np.einsum("mn,mni->mi", share, places)[:, None]
@@ -130,8 +131,12 @@ def _followed(K: Floats, radius: float) -> Floats:
 
 def _rows(
     node: Floats, discs: Discs, pad: Pad | None, noise: MapNoise, K_ref: Floats
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Whitened rows A (m, 3n, 15 + 4) of (a, θ) and y (m, 3n); places (m, n, 2), m, and their variances (m, n), m²."""
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Whitened rows A (m, 3n, 15 + 4) of (a, θ) and y (m, 3n); places (m, n, 2), m, and their variances (m, n), m².
+
+    The last is (m, n) the χ² that is usual for a node: below one a row where nodes are shorter than the path of an
+    independent sample, as the noise within a node is then that of its neighbours.
+    """
     m, n = node.shape[:2]
     normal = node[..., column.NORMAL] @ discs.R
     at = (node[..., column.CENTRE] - discs.origin[:, None]) @ discs.R
@@ -164,8 +169,10 @@ def _rows(
     scale = np.empty((m, n, 3))
     scale[..., 0] = np.sqrt(heights / node[..., column.HEIGHT2]) * LENGTH_M
     scale[..., 1:] = np.sqrt(normals / (lateral2 * tilt**2 + node[..., column.NORMAL2]))[..., None]
+    usual = math.isfinite(noise.height) * np.minimum(heights, 1.0)
+    usual = usual + 2.0 * math.isfinite(noise.normal) * np.minimum(normals, 1.0)
     A *= scale[..., None]
-    return A.reshape(m, -1, TERMS + COMMON), (values * scale).reshape(m, -1), at[..., :2], lateral2
+    return A.reshape(m, -1, TERMS + COMMON), (values * scale).reshape(m, -1), at[..., :2], lateral2, usual
 
 
 class _Posterior(NamedTuple):

@@ -65,5 +65,5 @@ class MapNoise:
 
 
 PAD_NOISE = MapNoise(USUAL_SIGMA_M, 14e-6, 0.3e-3, 1.6e-3, 3e-3, 0.9e-3, (25e-6, 0.08, 20e-6, 20e-6))
-"""Noise of a pad whose contacts state theirs. The paths were measured on 38 000 contacts of 59 scenes, the common errors
-on the emulated arrays; they belong to how a pad errs, and not to one array."""
+"""Noise of a pad whose contacts state theirs. The paths were measured on 38 000 contacts of 59 scenes, the common
+errors on the emulated arrays; they belong to how a pad errs, and not to one array."""

@@ -18,8 +18,8 @@ from canprobe.mechanics.touch.layer_stiffness import stiffness_from_slope
 from canprobe.mechanics.touch.patch.image_model import ImageModel
 from canprobe.mechanics.types import Floats
 
-SOURCE_SIGMA = 0.03
-"""Standard deviation of ln k from either source, on the development shapes."""
+SOURCE_SIGMA = 0.035
+"""Standard deviation of ln k from either source: both together err by −5 to +4 % over 59 scenes."""
 SLOPE_BIAS = 0.04
 """By how much ln k from a slope is too small: the arm yields, so that the push is measured too long. The value is the
 mean over the development shapes of `study shapes`; the slopes there scatter by 0.03."""
