@@ -202,7 +202,7 @@ class ContactMap:
         tensor = np.einsum("nk,nkip,nkpq,nkjq->nij", share, R[..., :2], H, R[..., :2])
         n = blend.feet.normal
         P = np.eye(3) - n[:, :, None] * n[:, None]
-        axes = np.array([tangent_rotation(one)[:, :2] for one in np.nan_to_num(n, nan=1.0).tolist()]).reshape(-1, 3, 2)
+        axes = np.array([tangent_rotation(one)[:, :2] for one in n.tolist()]).reshape(-1, 3, 2)
         tensor = P @ tensor @ P
         # the axes of a cell turned into those of the place: K' = Q K Qᵀ, written for (K11, K12, K22)
         Q = np.einsum("nip,nkiq->nkpq", axes, R[..., :2])
