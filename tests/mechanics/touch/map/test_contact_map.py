@@ -1,6 +1,7 @@
 """The map of contacts against closed forms: what it answers, what it leaves unobserved, and the σ that it states."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from canprobe.mechanics.touch.map import nodes
 from canprobe.mechanics.touch.map.contact_map import ContactMap
 from canprobe.mechanics.touch.map.fit import fit_map
 from canprobe.mechanics.touch.map.local_fits import Pad
-from canprobe.mechanics.touch.map.noise import MapNoise
+from canprobe.mechanics.touch.map.noise import PAD_NOISE, MapNoise
 from canprobe.mechanics.touch.map.quartic import LENGTH_M, fourth_of, heights_and_slopes, terms
 from canprobe.mechanics.touch.map.stiffness import SLOPE_BIAS
 from canprobe.mechanics.touch.patch.array_calibration import ImageParameters, MomentErrors
@@ -226,6 +227,47 @@ def test_the_scan_shows_the_stiffness_of_its_layer(true_share):
     at = on_sphere(PLACES, 0.05)[0]
     assert np.abs(found.distance(at)[0]).max() < 5e-6
     assert found.pad.stiffness == pytest.approx(true_share * model.stiffness, rel=0.02)
+
+
+def test_an_error_that_the_scan_has_in_common_is_found_and_taken_off():
+    """The pad shows distances 8 % too long, and keeps its orientation over a ball: K would be 8 % off."""
+    radius, scale = 0.04, 0.08
+    p, n, tensor = on_sphere(RASTER, 0.05)
+    T = np.diag([1.0, -1.0, -1.0, 1.0])
+    samples = []
+    for i, (place, up) in enumerate(zip(p, n, strict=True)):
+        T = T.copy()
+        T[:3, 3] = place + radius * up
+        seen = T[:3, 2] + (1.0 + scale) * (-up - T[:3, 2])
+        seen /= np.linalg.norm(seen)
+        arm = radius * seen @ T[:3, :3]
+        samples.append(
+            ContactSample(0.005 * i, T[:3, 3] + radius * seen, -seen, T, arm, 0.0, 30e-6, sigma_height=10e-6)
+        )
+    at, _, tensor = SHAPES["ball"](PLACES)
+    off = {}
+    for name, noise in (("common", PAD_NOISE), ("independent", replace(PAD_NOISE, common=(0.0, 0.0, 0.0, 0.0)))):
+        found = ContactMap(Pad(radius, 1e8), noise)
+        found.add_samples(samples)
+        off[name] = np.abs(found.curvature(at).tensor - tensor).max()
+        if name == "common":
+            assert abs(found.common.mean[1]) == pytest.approx(scale, rel=0.15)
+    assert off["independent"] > 0.8
+    assert off["common"] < 0.25 * off["independent"]
+
+
+def test_the_map_shows_where_passes_disagree():
+    p, n = touched("plane", RASTER)
+    again, up = touched("plane", RASTER, seed=1)
+    agreed = fit_map(np.concatenate([p, again]), np.concatenate([n, up]), sigma_point=SIGMA_POINT, sigma_normal=1e-3)
+    at = np.array([[-9e-3, 0.0, 0.0], [9e-3, 0.0, 0.0]])
+    assert (agreed.disagreement(at) < 0.5).all()
+    again[:, 2] += np.where(again[:, 0] > 2e-3, 0.2e-3, 0.0)
+    apart = fit_map(np.concatenate([p, again]), np.concatenate([n, up]), sigma_point=SIGMA_POINT, sigma_normal=1e-3)
+    same, other = apart.disagreement(at)
+    assert same < 0.5
+    assert other > 3.0
+    assert apart.distance(at)[1][1] > 0.1e-3  # half of the step between them
 
 
 def test_terms_are_the_derivatives_of_the_height():
