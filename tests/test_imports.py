@@ -84,6 +84,7 @@ ALLOWED = {
 ROOT = {"__init__", "__main__", "api", "errors", "moved"}
 # module → packages of its extra; it is imported only where the extra is asked for
 EXTRAS = {
+    "cell/results/lerobot.py": {"pyarrow", "pandas"},
     "lab/bridge/messages.py": {"rosbags"},
     "lab/bridge/mcap_file.py": {"mcap"},
     "lab/bridge/foxglove_live.py": {"foxglove"},

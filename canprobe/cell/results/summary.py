@@ -22,7 +22,7 @@ from canprobe.cell.results.tool_file import FILE, summarise_calibration, tool_te
 from canprobe.cell.results.traffic import LOG, measure_traffic
 from canprobe.cell.scene.setup import Setup
 from canprobe.cell.session.session import Session
-from canprobe.cell.tasks.from_plan import SIGMA_NORMAL_RAD, centroid_correlation, centroid_coupling
+from canprobe.cell.tasks.from_plan import SIGMA_NORMAL_RAD, centroid_coupling, contact_correlation
 from canprobe.cell.tasks.regain import summarise_losses
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.cell.tasks.task import TaskRecord
@@ -233,12 +233,13 @@ def _bound_ratio(
     shape = setup.shape
     if tracker is None or shape is None or score.kappa_rms_error_per_m is None or (score.patch_fraction or 0.0) > 0.5:
         return None
+    assert setup.array is not None
     bound = bound_of_scan(
         tracker.samples,
         truth,
         sync_times,
         memory_m=shape.memory,
-        correlation=centroid_correlation(),
+        correlation=contact_correlation(setup.array),
         sigma_normal=SIGMA_NORMAL_RAD,
         coupling=centroid_coupling(setup.probe),
     )
