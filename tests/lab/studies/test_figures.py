@@ -27,10 +27,13 @@ from canprobe.lab.studies.cycle_times import CycleTimes
 from canprobe.lab.studies.estimators import draw_estimators
 from canprobe.lab.studies.fault_scenes import draw_ends, draw_faults
 from canprobe.lab.studies.ground import SURFACES
+from canprobe.lab.studies.random_scenes import KINDS, SceneSeed
 from canprobe.lab.studies.realtime import draw_realtime
 from canprobe.lab.studies.realtime_cases import Measured
 from canprobe.lab.studies.realtime_soak import draw_soak
-from canprobe.lab.studies.regions import draw_regions
+from canprobe.lab.studies.region_figure import draw_regions
+from canprobe.lab.studies.region_scores import ScoredScan
+from canprobe.lab.studies.regions import rows_of
 from canprobe.lab.studies.workprec import draw_workprec
 from canprobe.lab.studies.workprec_cell import FASTER, FIDELITIES, MODES, RATES_HZ, REAL, draw_cell
 
@@ -84,14 +87,16 @@ def every_estimator(path):
 
 
 def regions(path):
-    kinds = ("cylinder", "ellipsoid", "fillet", "plane", "saddle", "sphere", "torus", "wave", "100 kPa", "all")
-    rows = [
-        {"group": group, "of": kind, "coverage": 0.9 + 0.01 * i, "coverage_low": 0.85, "coverage_high": 1.0}
-        | {"stated_over_error": 0.8 + 0.2 * i, "stated_low": 0.6, "stated_high": 3.0}
-        for i, kind in enumerate(kinds)
-        for group in ("packaged", "random")
-    ]
-    draw_regions(rows, path)
+    rng, scans = np.random.default_rng(0), []
+    for kind, number in itertools.product(KINDS, range(12)):
+        error, ratio = 10 ** rng.uniform(-1, 1), 10 ** rng.normal(-0.03 * KINDS.index(kind), 0.2)
+        square = (error * rng.normal(size=(50, 3))) ** 2 @ (1.0, 1.0, 1.0)
+        stated = np.full(50, 3 * (ratio * error) ** 2)
+        scores = np.stack([np.arange(50), square, stated, 3 * square / stated, -square], axis=1)
+        seed = SceneSeed(2, kind, number).value()
+        facts = (seed, kind, kind, "prbt", "foreign" if kind == "foreign" else "shipped", "weave", 25.0, 2.0, 100.0)
+        scans.append(ScoredScan(*facts, 0.0, "", 60, scores, 0, scores[:0]))
+    draw_regions(rows_of(scans), scans, path)
 
 
 def plant(path, stiffnesses=workprec.STIFFNESSES, steps=workprec.STEPS_US):
