@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from canprobe.cell.master.observers import AnyObserver
+from canprobe.cell.rows import ROWS_FOLDER
 
 Say = Callable[[str], None]
 """Called with a line of text for each step."""
@@ -41,6 +42,11 @@ class RunOptions:
     rows_kept: int | None = None
     early_summary: Callable[[Mapping[str, Any]], None] = unread
     to_home: bool = False
+
+    @property
+    def rows_folder(self) -> Path | None:
+        """Folder of the rows of a run while it goes on; None where they are kept in memory."""
+        return None if self.out is None or self.rows_kept is not None else self.out / ROWS_FOLDER
 
 
 DEFAULT_OPTIONS = RunOptions()

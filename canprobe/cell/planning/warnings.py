@@ -67,6 +67,11 @@ def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
             "sensor.calibration: the array measures in nominal newtons, as good as its stated full scale;"
             " `canprobe calibrate array CELL --force-reference scale` gives them a reference"
         )
+    if setup.array is not None and setup.array.calibration.noise.assumed:
+        yield (
+            "sensor.calibration: a file of an earlier form, without slow_um and height_um: the noise of contacts is"
+            " taken to be that of the emulated array; `canprobe calibrate array CELL` measures it"
+        )
     if cut is not None:
         yield f"{cut.text}; {' or '.join(cut.ways)} leaves less than {100 * TOLERATED_LOSS_SHARE:.0f} % outside"
     if setup.arm is not None and setup.touch is not None and task_rows(setup.arm.model) < FULL_POSE:

@@ -13,7 +13,7 @@ from canprobe.mechanics.touch.patch.calibrate import ArrayFit
 
 def calibration_text(fit: ArrayFit) -> str:
     """The calibration with its residuals and held-out errors, line by line."""
-    c, image, centroid = fit.calibration, fit.calibration.image, fit.calibration.centroid
+    c, image, noise, centroid = fit.calibration, fit.calibration.image, fit.calibration.noise, fit.calibration.centroid
     k, unit = c.stiffness, "nominal N" if c.nominal else "N"
     lines = [
         f"{c.array}: {c.residuals.touches} touches fitted, {fit.left_out} left out (saturated, or off the pad)",
@@ -28,8 +28,9 @@ def calibration_text(fit: ArrayFit) -> str:
         f" {100 * c.moments.frame_sigma:.1f} %",
         f"  curvature  held-out error{_percent(c.residuals.curvature)} of (K + 1/R) from one touch"
         + _percent(c.residuals.rod_curvature, "; rod, not fitted:"),
-        f"  centroid   {1e6 * centroid.scale:.0f} µm · t^{centroid.power:.2f}, t = level/peak;"
-        f" {100 * centroid.share:.0f} % of the variance alike over {1e3 * centroid.correlation:.1f} mm",
+        f"  place      {1e6 * noise.scale:.0f} µm · t^{noise.power:.2f} from image to image, t = level/peak;"
+        f" {1e6 * noise.slow:.0f} µm alike over {1e3 * noise.slow_way:.1f} mm of the pad; height"
+        f" {1e6 * noise.height:.0f} µm",
         f"  time       latency {1e3 * centroid.latency_s:.1f} ± {1e3 * centroid.latency_sigma_s:.1f} ms;"
         f" lag up to {1e6 * centroid.lag.most:.0f} µm",
         f"  taxels     gains spread by {100 * float(np.std(fit.gains[fit.gains != 1.0])):.1f} %:"
@@ -73,6 +74,11 @@ def as_document(fit: ArrayFit) -> dict[str, Any]:
         "moments_error_percent": 100 * c.residuals.moments,
         "curvature_error_percent": 100 * c.residuals.curvature,
         "rod_curvature_error_percent": known(100 * c.residuals.rod_curvature),
+        "image_noise_um": 1e6 * c.noise.scale,
+        "image_noise_power": c.noise.power,
+        "slow_noise_um": 1e6 * c.noise.slow,
+        "slow_noise_way_mm": 1e3 * c.noise.slow_way,
+        "height_noise_um": 1e6 * c.noise.height,
         "latency_ms": 1e3 * c.centroid.latency_s,
         "uses_gains": bool(c.gains),
         "dead": [list(place) for place in c.dead],
@@ -102,7 +108,7 @@ def draw_calibration(fit: ArrayFit, path: Path) -> None:
         t = np.array([s.lightness for s in fit.shown])
         scatter.scatter(t, 1e6 * fit.scatter, s=8, color=GREY, label="centroids of a touch")
         fine = np.geomspace(t.min(), t.max(), 50)
-        scatter.plot(fine, [1e6 * c.centroid.sigma(x) for x in fine], color=INK, label="fitted law")
+        scatter.plot(fine, [1e6 * c.noise.image(x) for x in fine], color=INK, label="fitted law")
         log_scale(scatter, "xy")
         scatter.set(title="centroid scatter, µm", xlabel="level over peak")
         shown = gains.imshow(np.where(fit.gains == 1.0, np.nan, fit.gains), cmap="PuOr", vmin=0.9, vmax=1.1)

@@ -67,16 +67,16 @@ def contacts_of(samples: Sequence[ContactSample], task: Touch, start_s: float) -
     n = len(samples)
     normals = np.array([s.n_base for s in samples]).reshape(n, 3)
     gate, coupling = Gate(1.0, SIGMA_NORMAL_RAD), centroid_coupling(task.probe)
-    sigmas = np.array([gate.sigmas(sample) for sample in samples]).reshape(n, 2)
-    across = np.eye(3) - normals[:, :, None] * normals[:, None, :]
-    variances = sigmas**2 @ np.array([[1.0, coupling**2], [0.0, 1.0]])
+    point, height, normal = np.square([gate.sigmas(sample) for sample in samples]).reshape(n, 3, 1, 1).swapaxes(0, 1)
+    along = normals[:, :, None] * normals[:, None, :]
+    across = np.eye(3) - along
     return Contacts(
         t_s=np.array([start_s + s.t_s for s in samples]),
         points=np.array([s.p_base for s in samples]).reshape(n, 3),
         normals=normals,
         forces=np.array([s.force_n for s in samples]),
-        covariances=variances[:, 0, None, None] * np.eye(3),
-        normal_covariances=variances[:, 1, None, None] * across,
+        covariances=point * across + height * along,
+        normal_covariances=(normal + coupling**2 * point) * across,
         sigma_normal=SIGMA_NORMAL_RAD,
         coupling=coupling,
         samples=tuple(samples),

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -12,9 +13,11 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.cell.npz import write_npz
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.files import to_frame, write_parquet
 from canprobe.cell.results.run_data import RunData
+from canprobe.cell.results.run_files import LOG, TACTILE
 from canprobe.cell.results.summary import write_files
 from canprobe.cell.results.text import summary_text
 from canprobe.cell.scene.setup import Touch
@@ -138,6 +141,8 @@ class RunResult:
         if folder is None:
             folder = Path(tempfile.mkdtemp(prefix="canprobe-view-"))
             write_scene(self.plan, folder)
+            write_npz(folder / LOG, self.log)
+            write_npz(folder / TACTILE, self.tactile)
             write_files(self.data, folder)
         return page_of(folder, self.plan.setup)
 
@@ -189,6 +194,32 @@ class RunResult:
             UsageError: the extra `data` is missing.
         """
         write_parquet(self._columns(what), path, self._attrs)
+
+    def to_lerobot(self, folder: Path | str, *, fps: int | None = None) -> None:
+        """Write the run as a LeRobotDataset v3.0 of one episode; `canprobe export` writes several runs.
+
+        Args:
+            folder: folder of the dataset, which must not exist.
+            fps: rows a second, a whole divisor of the cycle's rate; None for the rate.
+
+        Raises:
+            UsageError: the folder exists, `fps` does not divide the rate, or the extra `data` is missing.
+        """
+        from canprobe.cell.results.lerobot import export_lerobot
+
+        with self._folder() as run:
+            export_lerobot([run], folder, fps=fps)
+
+    @contextmanager
+    def _folder(self) -> Iterator[Path]:
+        """The folder with the files of the run; a temporary one where it has none."""
+        if self.out is not None:
+            yield self.out
+            return
+        with tempfile.TemporaryDirectory(prefix="canprobe-run-") as name:
+            write_scene(self.plan, Path(name))
+            write_files(self.data, Path(name))
+            yield Path(name)
 
     @property
     def _attrs(self) -> dict[str, Any]:

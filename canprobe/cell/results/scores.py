@@ -10,7 +10,9 @@ import numpy as np
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import ContactSample
-from canprobe.mechanics.touch.estimate.noise import Correlation, make_noise
+from canprobe.mechanics.touch.estimate.noise import Correlation, Noise, SlowErrors
+from canprobe.mechanics.touch.estimate.online import Gate, slow_share
+from canprobe.mechanics.touch.estimate.travel import Travel
 from canprobe.mechanics.touch.surface import SurfaceMatrix
 from canprobe.mechanics.types import Floats
 
@@ -163,7 +165,11 @@ def bound_of_scan(
 
     points = np.array([s.p_base for s in samples])
     normals = np.array([s.n_base for s in samples])
-    sigmas = np.array([s.sigma_point for s in samples], dtype=np.float64)
+    gate = Gate(1.0, sigma_normal)
+    point, height, normal = np.array([gate.sigmas(s) for s in samples]).T
+    share = np.array([slow_share(s, sigma) for s, sigma in zip(samples, point.tolist(), strict=True)])
+    pad = Travel(float(np.median(point)))
+    way = np.array([(pad.add(s.r_probe), pad.total)[1] for s in samples])
     path = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
     if len(path) < 3 or path[-1] < max(RUN_IN_M, memory_m):
         return None
@@ -178,8 +184,9 @@ def bound_of_scan(
         T[:3, 1] = np.cross(T[:3, 2], T[:3, 0])
         surface = SurfaceMatrix.from_curvature(np.diag(truth["kappa_per_m"][row])).transformed(np.linalg.inv(T))
         recent = slice(first, last + 1)
-        noise = make_noise(last + 1 - first, sigmas[recent], sigma_normal, coupling)
-        C = osculating_bound(make_touches(points[recent], normals[recent], noise, correlation), surface)
+        noise = Noise(point[recent], normal[recent], coupling, height[recent])
+        slow = SlowErrors(share[recent], way[recent])
+        C = osculating_bound(make_touches(points[recent], normals[recent], noise, correlation, slow), surface)
         squares.append(C[0, 0] + 2 * C[1, 1] + C[2, 2])
     mean = float(np.mean(squares))
     return float(np.sqrt(mean)) if np.isfinite(mean) else None

@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe import __version__
 from canprobe.cell.master.cell import Cell
-from canprobe.cell.npz import write_npz
+from canprobe.cell.master.log import since_first_sync
 from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.run_files import SCHEMA
 from canprobe.cell.results.scores import ShapeScore, bound_of_scan, score_contact, score_measured_force, score_shape
@@ -23,7 +22,7 @@ from canprobe.cell.results.tool_file import FILE, summarise_calibration, tool_te
 from canprobe.cell.results.traffic import LOG, measure_traffic
 from canprobe.cell.scene.setup import Setup
 from canprobe.cell.session.session import Session
-from canprobe.cell.tasks.from_plan import SIGMA_NORMAL_RAD, centroid_correlation, centroid_coupling
+from canprobe.cell.tasks.from_plan import SIGMA_NORMAL_RAD, centroid_coupling, contact_correlation
 from canprobe.cell.tasks.regain import summarise_losses
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.cell.tasks.task import TaskRecord
@@ -38,15 +37,26 @@ def summarise(
     estimates: dict[str, list[ShapeRecord]],
     stop_reason: str | None,
     *,
+    log: Mapping[str, Floats] | None = None,
     map_summary: dict[str, Any] | None = None,
     bridges: dict[str, dict[str, Any]] | None = None,
 ) -> dict[str, Any]:
-    """The content of ``summary.json``; a value that does not apply is None."""
+    """The content of ``summary.json``; a value that does not apply is None.
+
+    Args:
+        session: the closed session.
+        record: results of the task.
+        estimates: answers of its estimator, by name.
+        stop_reason: why the run ended before its end; None where it did not.
+        log: columns of ``log.npz``; None takes them from the session.
+        map_summary: section of the surface map.
+        bridges: status of each bridge.
+    """
     scene, cell = session.scene, session.cell
     cycle, direct = cell.cycle, scene.bus.direct
     sim_time = cycle.t_ns * 1e-9 if cycle is not None else 0.0
     wall = session.wall_ns * 1e-9
-    log = cell.log.arrays()
+    log = dict(cell.log.columns()) if log is None else log
     contact = _contact(session, record, log)
     summary = {
         "schema": SCHEMA,
@@ -66,7 +76,7 @@ def summarise(
             record.shape,
             estimates,
             truth_of(session),
-            log.get("t_s", np.empty(0)),
+            since_first_sync(log["t_s"], cell.log.start_s),
             map_summary=map_summary,
         ),
         "calibration": summarise_calibration(scene, record.tool),
@@ -80,21 +90,6 @@ def summarise(
         "faults": [*cell.faults, *(session.observers.faults if session.observers is not None else ())],
     }
     return {name: without_nan(value) for name, value in summary.items()}
-
-
-def log_columns(cell: Cell) -> dict[str, Floats]:
-    """The columns of ``log.npz``, on the run's clock; a run that was stopped before its first cycle has no row."""
-    return _on_run_clock({"t_s": np.empty(0), **cell.log.arrays()}, cell)
-
-
-def tactile_columns(cell: Cell) -> dict[str, NDArray[Any]]:
-    """The columns of ``tactile.npz``, on the run's clock; none where no frame was used."""
-    return _on_run_clock(cell.tactile_log.arrays(), cell)
-
-
-def _on_run_clock(columns: dict[str, NDArray[Any]], cell: Cell) -> dict[str, NDArray[Any]]:
-    start_s = cell.start_ns * 1e-9
-    return {name: column + start_s if name in ("t_s", "t_sample_s") else column for name, column in columns.items()}
 
 
 def without_nan(value: Any) -> Any:
@@ -134,7 +129,7 @@ def truth_of(session: Session) -> dict[str, Floats]:
     return session.truth if "force_n" in session.truth else {}
 
 
-def _contact(session: Session, record: TaskRecord, log: dict[str, Floats]) -> dict[str, Any]:
+def _contact(session: Session, record: TaskRecord, log: Mapping[str, Floats]) -> dict[str, Any]:
     task, scan = session.scene.task, record.scan_cycles if session.keeps_all else None
     names = ("force_rms_error_n", "force_max_n", "contact_fraction", "speed_mean_m_s")
     target = task.force_n if task.kind in ("scan", "press") else None
@@ -155,7 +150,7 @@ def _contact(session: Session, record: TaskRecord, log: dict[str, Floats]) -> di
     }
 
 
-def _hidden_force(session: Session, highest: float | None, log: dict[str, Floats]) -> list[str]:
+def _hidden_force(session: Session, highest: float | None, log: Mapping[str, Floats]) -> list[str]:
     """Warning where the true force was above the limit, which acts on the measured force."""
     limit = session.scene.limits.force_max_n
     if not truth_of(session) or highest is None or highest <= limit:
@@ -238,12 +233,13 @@ def _bound_ratio(
     shape = setup.shape
     if tracker is None or shape is None or score.kappa_rms_error_per_m is None or (score.patch_fraction or 0.0) > 0.5:
         return None
+    assert setup.array is not None
     bound = bound_of_scan(
         tracker.samples,
         truth,
         sync_times,
         memory_m=shape.memory,
-        correlation=centroid_correlation(),
+        correlation=contact_correlation(setup.array),
         sigma_normal=SIGMA_NORMAL_RAD,
         coupling=centroid_coupling(setup.probe),
     )
@@ -289,14 +285,6 @@ def _percentiles(values_ns: Sequence[int]) -> dict[str, float | None]:
     return {"p50": p50, "p99": p99, "p999": p999, "max": float(us.max())}
 
 
-def write_columns(log: Mapping[str, Floats], tactile: Mapping[str, NDArray[Any]], out: Path) -> None:
-    """Write the measurements of a run, ``log.npz`` and ``tactile.npz``; for errors see `write_files`."""
-    _write_each(
-        lambda: write_npz(out / "log.npz", log),
-        lambda: write_npz(out / "tactile.npz", tactile) if tactile else None,
-    )
-
-
 def write_files(result: RunData, out: Path) -> None:
     """Write the files of a run into ``out`` that the session has not written, without the figures.
 
@@ -307,7 +295,6 @@ def write_files(result: RunData, out: Path) -> None:
     tool = None if found is None else tool_text(found, result.plan.scene.name)
     _write_each(
         lambda: write_summary(result.summary, out),
-        lambda: write_columns(result.log, result.tactile, out),
         lambda: write_text(out / FILE, tool) if tool is not None else None,
         lambda: save_surface_map(surface_map, out / "surface.npz") if surface_map is not None else None,
     )

@@ -24,7 +24,8 @@ from canprobe.cell.scene.load import (
 )
 from canprobe.mechanics.touch.patch.array_calibration import (
     ArrayCalibration,
-    CentroidErrors,
+    CentroidDelays,
+    ContactNoise,
     ForceReference,
     ImageParameters,
     Lag,
@@ -37,6 +38,8 @@ SCHEMA = 1
 Share = Annotated[float, Range(0, 1)]
 Percent = Annotated[float, Range(0, 1000)]
 Stiffness = Annotated[float, Range(1e5, 1e12)]
+ASSUMED_NOISE = (25.0, 0.8, 12.0)
+"""`slow_um`, `correlation_mm` and `height_um` of a file that does not state them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,16 +94,14 @@ class MomentKeys:
 
 @dataclass(frozen=True, slots=True)
 class CentroidKeys:
-    """`[centroid]`: errors of the place of a contact: `sigma_um · t^power`, t the level over the peak pressure."""
+    """`[centroid]`: errors of the place of a contact, and the delays of the centroid."""
 
     sigma_um: Annotated[float, Range(0, 100_000)]
-    """Standard deviation at t = 1."""
+    """Error of the centroid from image to image: `sigma_um · t^power`, t the level over the peak pressure."""
     power: Annotated[float, Range(-10, 10)]
     """Exponent of t."""
-    correlation_mm: Annotated[float, Range(0, 1000)]
-    """Way over the pad along which a part of the errors is alike."""
-    correlated: Share
-    """Share of the variance that this part has."""
+    correlation_mm: Annotated[float, Range(0, 1000, open_low=True)]
+    """Way over the pad along which the slow error of the centroid is alike."""
     latency_ms: Annotated[float, Range(-1000, 1000)]
     """Time by which images are older than their time stamps."""
     latency_sigma_ms: Annotated[float, Range(0, 1e6)]
@@ -109,6 +110,12 @@ class CentroidKeys:
     """Largest distance by which the centroid trails the contact."""
     lag_way_um: Annotated[float, Range(0, 1e9, open_low=True)]
     """Way after which the centroid trails by half of that."""
+    slow_um: Annotated[float, Range(0, 100_000)] | None = None
+    """Error of the centroid that changes only as the contact moves over the pad."""
+    height_um: Annotated[float, Range(0, 100_000, open_low=True)] | None = None
+    """Error of the place of a contact along the normal."""
+    correlated: Share | None = None
+    """Of files without `slow_um`; not used."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,11 +216,8 @@ def _calibration(file: CalibrationFile) -> ArrayCalibration:
         moments=MomentErrors(
             variance, moments.both * variance, (1e-2 * moments.shear_percent) ** 2, 1e-2 * moments.frame_percent
         ),
-        centroid=CentroidErrors(
-            1e-6 * centroid.sigma_um,
-            centroid.power,
-            1e-3 * centroid.correlation_mm,
-            centroid.correlated,
+        noise=_noise(centroid),
+        centroid=CentroidDelays(
             1e-3 * centroid.latency_ms,
             1e-3 * centroid.latency_sigma_ms,
             Lag(1e-6 * centroid.lag_um, 1e-6 * centroid.lag_way_um),
@@ -235,6 +239,22 @@ def _calibration(file: CalibrationFile) -> ArrayCalibration:
         ),
         gains=file.taxels.gains,
         dead=file.taxels.dead,
+    )
+
+
+def _noise(centroid: CentroidKeys) -> ContactNoise:
+    """The noise of contacts; what a file of an earlier form does not state is assumed."""
+    assumed = centroid.slow_um is None or centroid.height_um is None
+    slow_um, way_mm, height_um = (
+        ASSUMED_NOISE if assumed else (centroid.slow_um, centroid.correlation_mm, centroid.height_um)
+    )
+    return ContactNoise(
+        1e-6 * centroid.sigma_um,
+        centroid.power,
+        1e-6 * _or_nan(slow_um),
+        1e-3 * _or_nan(way_mm),
+        1e-6 * _or_nan(height_um),
+        assumed=assumed,
     )
 
 
@@ -274,14 +294,15 @@ def dump_calibration(calibration: ArrayCalibration) -> str:
             _rounded(1e2 * c.moments.frame_sigma),
         ),
         CentroidKeys(
-            _rounded(1e6 * c.centroid.scale),
-            _rounded(c.centroid.power),
-            _rounded(1e3 * c.centroid.correlation),
-            _rounded(c.centroid.share),
+            _rounded(1e6 * c.noise.scale),
+            _rounded(c.noise.power),
+            _rounded(1e3 * c.noise.slow_way),
             _rounded(1e3 * c.centroid.latency_s),
             _rounded(min(1e3 * c.centroid.latency_sigma_s, 1e6)),
             _rounded(1e6 * c.centroid.lag.most),
             _rounded(1e6 * c.centroid.lag.reach),
+            _rounded(1e6 * c.noise.slow),
+            _rounded(1e6 * c.noise.height),
         ),
         StiffnessKeys(
             _rounded(1e2 * c.stiffness.moments_sigma / c.stiffness.moments),

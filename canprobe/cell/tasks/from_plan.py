@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from canprobe.cell.master.controller import Controller
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.scene.setup import Calibrate, Free, Probe, Setup, Touch
+from canprobe.cell.scene.setup import Array, Calibrate, Free, Probe, Setup, Touch
 from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, replay_samples
 from canprobe.cell.tasks.touch import TouchTask
 from canprobe.fieldbus.protocol.tactile import DEFAULT_WINDOW
 from canprobe.mechanics.touch.contact import indentation_from_force
-from canprobe.mechanics.touch.patch.array_calibration import CentroidErrors
 from canprobe.mechanics.touch.patch.array_models import make_image_model, make_patch_calibration
 from canprobe.mechanics.touch.patch.moments import MomentImage
 
@@ -24,14 +22,9 @@ if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.online import Estimator
 
 
-CENTROID_CORRELATION = (2e-3, 0.3)
-"""Correlation length of centroids along the path of the contact, m, and the share of their variance that is correlated,
-over 87 random scenes. The length in a calibration is along the pad, over which a pad that follows the normal moves a
-twentieth of the path."""
-SCAN_CENTROID_FACTOR = 1.6
-"""Error of a centroid in a scan over the error in a calibration's touches, which roll over 1 mm. Over 87 random scenes
-at 100 kPa it is 1.25 (RMS), but not Gaussian: at 1.35 one scan of the cylinder in ten raises a false alarm of another
-surface, at 1.6 none does, and the errors on saddle, torus and wave are smaller."""
+HEIGHT_CORRELATION = (2e-3, 0.2)
+"""Correlation length of the heights of contacts along the path, m, and the share of their variance that is correlated,
+over 90 random scenes: the depth follows the force of some images."""
 SIGMA_NORMAL_RAD = 0.3e-3
 """Error of a normal that does not come from its centroid: joint counts displace the probe by 11 µm, times 28 1/m."""
 SIGMA_STIFFNESS = 0.6
@@ -52,15 +45,10 @@ def make_sensing(task: Touch | Calibrate) -> ContactSensing:
         calibration,
         task.probe.radius,
         task.probe.stiffness,
-        noise=_centroid_errors(task),
+        noise=task.array.calibration.noise,
         moment_image=MomentImage(calibration) if isinstance(task, Touch) and _uses_patch(task) else None,
         lag=task.array.calibration.centroid.lag,
     )
-
-
-def _centroid_errors(task: Touch | Calibrate) -> CentroidErrors:
-    calibrated = task.array.calibration.centroid
-    return replace(calibrated, scale=SCAN_CENTROID_FACTOR * calibrated.scale)
 
 
 def centroid_coupling(probe: Probe) -> float:
@@ -68,11 +56,12 @@ def centroid_coupling(probe: Probe) -> float:
     return 1.0 / probe.radius
 
 
-def centroid_correlation() -> Correlation:
-    """Correlation of the noise of contacts along their path."""
+def contact_correlation(array: Array) -> Correlation:
+    """Correlation of the noise of an array's contacts along their path, and over the pad."""
     from canprobe.mechanics.touch.estimate.noise import Correlation  # only where a shape is asked for
 
-    return Correlation(*CENTROID_CORRELATION)
+    length, share = HEIGHT_CORRELATION
+    return Correlation(length, 0.0, share, array.calibration.noise.slow_way)
 
 
 def make_shape_estimator(task: Touch, method: str) -> Estimator:
@@ -88,7 +77,7 @@ def make_shape_estimator(task: Touch, method: str) -> Estimator:
         sigma_normal=SIGMA_NORMAL_RAD,
         memory_m=memory,
         window=window,
-        correlation=centroid_correlation(),
+        correlation=contact_correlation(task.array),
         coupling=centroid_coupling(task.probe),
     )
     if method not in PATCH_METHODS:
@@ -104,7 +93,7 @@ def _typical_sigma(task: Touch) -> float:
     probe = task.probe
     depth = indentation_from_force(task.force, probe.stiffness, probe.radius, (0.0, 0.0))
     level_pa = MomentImage(make_patch_calibration(task.array.calibration, task.array.pad)).level_pa
-    return _centroid_errors(task).sigma(level_pa / (probe.stiffness * float(depth)))
+    return task.array.calibration.noise.lateral(level_pa / (probe.stiffness * float(depth)))
 
 
 def _with_patch(task: Touch, estimator: Estimator, memory: float) -> Estimator:

@@ -16,7 +16,7 @@ from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.robot.motors import position_sigma
 from canprobe.mechanics.touch.contact import ContactSample, Slope, contact_sample, indentation_from_force
 from canprobe.mechanics.touch.layer_stiffness import stiffness_from_slope
-from canprobe.mechanics.touch.patch.array_calibration import CentroidErrors, Lag
+from canprobe.mechanics.touch.patch.array_calibration import ContactNoise, Lag
 from canprobe.mechanics.touch.patch.dead_taxels import mended
 from canprobe.mechanics.touch.patch.image import Patch, PatchCalibration
 from canprobe.mechanics.touch.patch.moments import MomentImage, Moments
@@ -90,7 +90,7 @@ class ContactSensing:
         radius: radius of the probe, m.
         stiffness: K/h of the layer, N/m³.
         moment_image: gives the contacts the second moments of their images; None leaves them out.
-        noise: noise of the centroids; None: the contacts do not state any.
+        noise: noise of the contacts; None: they do not state any.
         lag: lag of the array's centroids behind the contact; None: no lag.
     """
 
@@ -102,7 +102,7 @@ class ContactSensing:
         radius: float,
         stiffness: float,
         *,
-        noise: CentroidErrors | None = None,
+        noise: ContactNoise | None = None,
         moment_image: MomentImage | None = None,
         lag: Lag | None = None,
     ) -> None:
@@ -192,10 +192,12 @@ class ContactSensing:
             depth=depth,
             radius=self.radius,
             force_n=patch.force,
-            sigma_point=None if self._noise is None else self._noise.sigma(lightness),
+            sigma_point=None if self._noise is None else self._noise.lateral(lightness),
             moments=self._moments(patch),
             doubts=patch.doubts,
             slope=self._slope,
+            sigma_height=None if self._noise is None else self._noise.height,
+            sigma_slow=0.0 if self._noise is None else self._noise.slow,
         )
         if not sample.t_sigma_s:
             return found

@@ -47,13 +47,18 @@ class ContactSample:
         T_base_probe: (4, 4) probe frame (origin at the sphere's centre, z through the pole of the pad) to base.
         r_probe: (3,) contact point in the probe frame, m.
         force_n: contact force, N.
-        sigma_point: effective standard deviation of the point per axis, m; None takes the estimator's setting.
+        sigma_point: effective standard deviation of the point per axis, m; None takes the estimator's setting. With a
+            `sigma_height` it is that along the surface only, the error of the centroid.
         sigma_normal: standard deviation of the normal per tangent axis, rad; None takes the estimator's setting.
         moments: second moments uu, uv, vv of the patch along the pad's axes, m² (`patch.moments`); or None.
         doubts: doubts about the image; an estimator gives the contact less weight and notes them.
         sigma_motion: standard deviation of the point that an inexact time stamp causes while the probe moves, m; its
             variance is added to that of the point.
         slope: slope of √F over the indentation in this touch; None where it was not measured.
+        sigma_height: standard deviation of the point along the normal, m; None: `sigma_point`. It is the smaller one: a
+            sphere that is tangent to the surface keeps its height where the centroid errs.
+        sigma_slow: standard deviation of the part of the error along the surface that changes only as the contact moves
+            over the pad, m; it is included in `sigma_point`. 0: the errors of all contacts are independent.
     """
 
     t_s: float
@@ -68,6 +73,8 @@ class ContactSample:
     doubts: tuple[Doubt, ...] = ()
     sigma_motion: float = 0.0
     slope: Slope | None = None
+    sigma_height: float | None = None
+    sigma_slow: float = 0.0
 
 
 def pad_to_direction(u: float, v: float, radius: float) -> Floats:
@@ -128,6 +135,8 @@ def contact_sample(
     moments: tuple[float, float, float] | None = None,
     doubts: tuple[Doubt, ...] = (),
     slope: Slope | None = None,
+    sigma_height: float | None = None,
+    sigma_slow: float = 0.0,
 ) -> ContactSample:
     """A sample from the centroid uv (2,) on the pad (m), the indentation (m) and the probe's radius (m).
 
@@ -140,7 +149,18 @@ def contact_sample(
     reach = radius - depth
     arm = np.array((reach * x, reach * y, reach * z))
     return ContactSample(
-        t_s, point, normal, T_base_probe, arm, force_n, sigma_point, moments=moments, doubts=doubts, slope=slope
+        t_s,
+        point,
+        normal,
+        T_base_probe,
+        arm,
+        force_n,
+        sigma_point,
+        moments=moments,
+        doubts=doubts,
+        slope=slope,
+        sigma_height=sigma_height,
+        sigma_slow=sigma_slow,
     )
 
 

@@ -6,10 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from canprobe.cell.planning.make import make_plan
 from canprobe.cell.plant.elastic_contact import depth_for_force
 from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig
 from canprobe.cell.results.array_report import as_document, calibration_text
 from canprobe.cell.scene.calibrations import dump_calibration, load_calibration
+from canprobe.cell.scene.load import load_scene
+from canprobe.cell.scene.resolve import resolve
 from canprobe.errors import SceneError, UsageError
 from canprobe.lab.studies.arrays import RADIUS_M, Presses, measure, random_array
 from canprobe.mechanics.touch.pad import Pad
@@ -101,6 +104,7 @@ def test_a_file_reads_back_and_bad_ones_are_refused(fit, tmp_path):
     assert back.image.stiffness == pytest.approx(fit.calibration.image.stiffness, rel=1e-4)
     assert back.gains == fit.calibration.gains and back.dead == fit.calibration.dead
     assert back.centroid.lag.most == pytest.approx(fit.calibration.centroid.lag.most, rel=1e-4)
+    assert back.noise.slow == pytest.approx(fit.calibration.noise.slow, rel=1e-4) and not back.noise.assumed
     assert dump_calibration(back) == text
     for old, new, what in (
         ("schema = 1", "schema = 2", "calibration.schema"),
@@ -110,6 +114,32 @@ def test_a_file_reads_back_and_bad_ones_are_refused(fit, tmp_path):
         path.write_text(text.replace(old, new))
         with pytest.raises(SceneError, match=what):
             load_calibration(path)
+
+
+def test_a_file_of_an_earlier_form_is_read_with_one_warning(fit, tmp_path):
+    """It has no slow errors and no height; those of the emulated array are assumed."""
+    lines = dump_calibration(fit.calibration).splitlines(keepends=True)
+    path = tmp_path / "old.toml"
+    path.write_text(
+        "".join("correlated = 0.9\n" if k.startswith("slow_um") else k for k in lines if "height_um" not in k)
+    )
+    noise = load_calibration(path).noise
+    assert noise.assumed and (noise.slow, noise.slow_way, noise.height) == pytest.approx((25e-6, 0.8e-3, 12e-6))
+    for calibration, said in ((str(path), 1), ("inch16", 0)):
+        plan = make_plan(resolve(load_scene("cylinder", {"sensor.calibration": calibration})))
+        assert sum("canprobe calibrate array" in text for text in plan.warnings) == said
+
+
+def test_the_noise_of_a_scan_is_found_by_the_touches(fit, touched):
+    """Errors from image to image, the slow one that grows with the way over the pad, and that of the height."""
+    noise = fit.calibration.noise
+    held = {d.place: s for d, s in zip(fit.dwells, fit.shown, strict=True) if d.name == "ball" and s.lightness < 0.1}
+    for s in held.values():
+        jumps = np.diff(s.off, axis=0)[1:] - np.diff(s.off, axis=0)[:-1]
+        assert noise.image(s.lightness) == pytest.approx(np.sqrt(np.mean(jumps**2) / 6.0), rel=0.3)
+    assert 0.5 < noise.power < 1.5  # light touches cover few taxels
+    assert 15e-6 < noise.slow < 80e-6 and 0.1e-3 < noise.slow_way < 2e-3
+    assert 2e-6 < noise.height < 15e-6  # encoders of 3 µm, and a force that wanders by 3 %
 
 
 def test_the_shipped_calibration_holds_for_the_make_at_both_full_scales():

@@ -98,5 +98,6 @@ def test_an_uncertain_instant_widens_the_contact_by_the_way_of_the_probe():
     way = np.linalg.norm(((at[1] - at[0]) @ task.probe.T_flange_probe @ r)[:3])
     assert guessed.sigma_motion == pytest.approx(way, rel=0.03)
     gate = Gate(30e-6, 1e-3)
-    assert gate.sigmas(known) == (known.sigma_point, 1e-3)
-    assert gate.sigmas(guessed) == pytest.approx((np.hypot(known.sigma_point, way), 1e-3), rel=0.03)
+    assert gate.sigmas(known) == (known.sigma_point, known.sigma_height, 1e-3)
+    wider = np.hypot(known.sigma_point, way), known.sigma_height, 1e-3  # the height stays: the probe moves along
+    assert gate.sigmas(guessed) == pytest.approx(wider, rel=0.03)

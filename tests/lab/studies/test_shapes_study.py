@@ -177,7 +177,7 @@ def test_contacts_are_read_as_they_were_felt():
     T[:3, 3] = 0.1, 0.2, 0.3
     whole = ContactSample(
         0.5, np.arange(3.0), np.array([0.0, 0.0, 1.0]), T, np.arange(3.0), 2.0, 2e-5, None, (1e-6, 0.0, 2e-6),
-        (Doubt.CUT, Doubt.DEAD), 1e-6, Slope(3.0, 0.1),
+        (Doubt.CUT, Doubt.DEAD), 1e-6, Slope(3.0, 0.1), 1e-5, 1.5e-5,
     )  # fmt: skip
     bare = ContactSample(0.6, np.arange(3.0), np.array([0.0, 0.0, 1.0]), T, np.arange(3.0), 2.0)
     read = samples_of({k: np.array(v) for k, v in json.loads(json.dumps(_plain(columns_of([whole, bare])))).items()})

@@ -152,7 +152,12 @@ def columns_of(samples: Sequence[ContactSample]) -> dict[str, Floats]:
         "T_base_probe": np.array([s.T_base_probe[:3].ravel() for s in samples]),
         "r_probe": np.array([s.r_probe for s in samples]),
         "force_n": np.array([s.force_n for s in samples]),
-        "sigma": np.array([[number(s.sigma_point), number(s.sigma_normal), s.sigma_motion] for s in samples]),
+        "sigma": np.array(
+            [
+                [number(s.sigma_point), number(s.sigma_normal), s.sigma_motion, number(s.sigma_height), s.sigma_slow]
+                for s in samples
+            ]
+        ),
         "moments": np.array([s.moments or (np.nan,) * 3 for s in samples]),
         "slope": np.array([s.slope or (np.nan,) * 2 for s in samples]),
         "doubts": np.array([sum(1 << _DOUBTS.index(d) for d in s.doubts) for s in samples], float),
@@ -179,7 +184,7 @@ def samples_of(columns: Mapping[str, Floats]) -> list[ContactSample]:
             ContactSample(
                 t, columns["p_base"][i], columns["n_base"][i], T, columns["r_probe"][i], float(columns["force_n"][i]),
                 value(sigma[0]), value(sigma[1]), None if np.isnan(uu) else (uu, uv, vv), doubts, float(sigma[2]),
-                None if np.isnan(slope[0]) else Slope(*slope.tolist()),
+                None if np.isnan(slope[0]) else Slope(*slope.tolist()), value(sigma[3]), float(sigma[4]),
             )
         )  # fmt: skip
     return found

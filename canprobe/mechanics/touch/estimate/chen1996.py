@@ -55,7 +55,7 @@ class Chen1996Estimator(WindowEstimator):
         rows = np.array(self._rows)
         lag = usable_lag(len(rows), self._lag)
         newer = np.arange(lag, len(rows))
-        rates = paper_rates(rows[:, 8:20].reshape(-1, 3, 4), rows[:, 20:], touches.normals, lag)
+        rates = paper_rates(rows[:, 11:23].reshape(-1, 3, 4), rows[:, 23:], touches.normals, lag)
         x, y = np.array(rates) @ working_frame(touches)[:3, :3]
         return solve_pairs(touches, Pairs(newer, newer - lag, y / touches.extent, -x), "chen1996")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -163,7 +164,8 @@ def fit_surface(
 def _run_filter(touches: ContactBatch, prior: Prior | None, quadric: bool) -> SurfaceEstimate:
     """The answer of `recursive` after samples of which only place and normal are known."""
     memory = _memory_of(touches)
-    point, normal = np.sqrt(touches.noise.point_variance), np.sqrt(touches.noise.normal_variance)
+    point, height = (np.sqrt(variance) for variance in touches.noise.tangential_and_height(touches.normals))
+    normal = np.sqrt(touches.noise.normal_variance)
     estimator = RecursiveEstimator(
         sigma_point=math.sqrt(float(np.mean(point**2))),
         sigma_normal=math.sqrt(float(np.mean(normal**2))),
@@ -176,7 +178,8 @@ def _run_filter(touches: ContactBatch, prior: Prior | None, quadric: bool) -> Su
     )
     nowhere = np.eye(4)
     for i, (p, n) in enumerate(zip(touches.points, touches.normals, strict=True)):
-        estimator.add(ContactSample(float(i), p, n, nowhere, nowhere[:3, 2], 0.0, float(point[i]), float(normal[i])))
+        sample = ContactSample(float(i), p, n, nowhere, nowhere[:3, 2], 0.0, float(point[i]), float(normal[i]))
+        estimator.add(replace(sample, sigma_height=float(height[i])))
     answer = estimator.estimate()
     if answer is None:
         raise UsageError(

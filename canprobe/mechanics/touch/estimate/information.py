@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from canprobe.mechanics.touch.estimate.answer import foot
-from canprobe.mechanics.touch.estimate.noise import Correlation, Noise
+from canprobe.mechanics.touch.estimate.noise import Correlation, Noise, SlowErrors
 from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE_INFORMATION
 from canprobe.mechanics.touch.estimate.omitted_terms import OmittedTerms
 from canprobe.mechanics.touch.estimate.prior import NUISANCE_SIGMA, Prior
@@ -34,24 +34,38 @@ class MeasuredContact(NamedTuple):
     Attributes:
         point: (3,) contact point in base, m.
         normal: (3,) outward unit normal of the object there, in base.
-        sigma_point: standard deviation of the point per axis, m.
+        sigma_point: standard deviation of the point along the surface, per axis, m.
+        sigma_height: standard deviation of the point along the normal, m.
         sigma_normal: standard deviation of the normal per tangent axis, rad.
         coupling: coupling of their errors (`Noise.coupling`), 1/m.
+        slow: share of its slow errors (`SlowErrors.share`).
+        way: way over the pad up to this contact, m.
     """
 
     point: Floats
     normal: Floats
     sigma_point: float
+    sigma_height: float
     sigma_normal: float
     coupling: float = 0.0
+    slow: float = 0.0
+    way: float = 0.0
+
+
+def slow_errors(touches: Sequence[MeasuredContact]) -> SlowErrors:
+    """Slow errors of contacts."""
+    share, way = np.array([(t.slow, t.way) for t in touches]).T
+    return SlowErrors(share, way)
 
 
 def batch_design(T_base_work: Floats, length: float, touches: Sequence[MeasuredContact]) -> Design:
     """The design (`residuals.design`) of contacts in a working frame (4, 4), in units of a length (m)."""
     R = T_base_work[:3, :3]
     points = (np.array([t.point for t in touches]) - T_base_work[:3, 3]).dot(R) / length
-    sigma_point = np.array([t.sigma_point for t in touches]) / length
-    noise = Noise(sigma_point, np.array([t.sigma_normal for t in touches]), touches[0].coupling * length)
+    sigma_point, sigma_height, sigma_normal = np.array(
+        [(t.sigma_point, t.sigma_height, t.sigma_normal) for t in touches]
+    ).T
+    noise = Noise(sigma_point / length, sigma_normal, touches[0].coupling * length, sigma_height / length)
     return design(points, np.array([t.normal for t in touches]).dot(R), noise)
 
 
@@ -116,7 +130,14 @@ class InformationFilter:
         self.left_out.reset()
 
     def adopt(  # noqa: PLR0917 - what a batch solution is
-        self, T: Floats, c: Floats, root: Floats, rows: Floats, residuals: Floats, travelled: float
+        self,
+        T: Floats,
+        c: Floats,
+        root: Floats,
+        rows: Floats,
+        residuals: Floats,
+        travelled: float,
+        slow: SlowErrors | None = None,
     ) -> None:
         """Take over a batch solution.
 
@@ -127,16 +148,20 @@ class InformationFilter:
             rows: (n, 3, 18) whitened and weighted rows, evenly spread over the path.
             residuals: (n, 3) minus their residuals.
             travelled: length of the path, m.
+            slow: slow errors of the contacts; None: they have none.
         """
         self.T, self.c = T, c.copy()
         self._inflation = 1.0
         self._path = _Path(travelled, travelled)
         self.root = upper_root(np.concatenate([root, DIFFUSE_INFORMATION * np.eye(9)]))
         self.inverse = inverted_upper(self.root)
-        self.left_out.start(rows, residuals, travelled)
+        self.left_out.start(rows, residuals, travelled, slow)
 
-    def take(self, rows: Floats, residuals: Floats, moved: float) -> None:
-        """Forget over a step of the path (m), then add weighted rows (n, 3, 18) and minus residuals (n, 3): one QR."""
+    def take(self, rows: Floats, residuals: Floats, moved: float, slow: SlowErrors | None = None) -> None:
+        """Forget over a step of the path (m), then add weighted rows (n, 3, 18) and minus residuals (n, 3): one QR.
+
+        `slow` are the slow errors of the contacts; None: they have none.
+        """
         rows, residuals = rows.reshape(-1, 18), residuals.reshape(-1)
         kept = math.exp(-moved / self.length) / self._inflation
         self._inflation = 1.0
@@ -153,7 +178,7 @@ class InformationFilter:
         self.inverse = inverted_upper(self.root)
         step = self.inverse.dot(full[:9, 9])
         self.c = self.c + step
-        self.left_out.take(rows, residuals, step, moved, kept, share**2 - left**2)
+        self.left_out.take(rows, residuals, step, moved, kept, share**2 - left**2, slow)
 
     def equations(self, touches: Sequence[MeasuredContact]) -> tuple[Floats, Floats]:
         """Whitened rows (n, 3, 18) and minus residuals (n, 3) of new contacts, as `take` wants them."""

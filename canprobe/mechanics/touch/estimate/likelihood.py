@@ -18,7 +18,7 @@ from canprobe.mechanics.touch.estimate.answer import (
 )
 from canprobe.mechanics.touch.estimate.known_curvature import TO_Q_SQUARED, curvature_covariance, evidence_of
 from canprobe.mechanics.touch.estimate.misfit import MENTIONED_PROBABILITY, correct, misfit_notes
-from canprobe.mechanics.touch.estimate.noise import Correlation, Noise, make_noise, mixed
+from canprobe.mechanics.touch.estimate.noise import Correlation, Noise, SlowErrors, make_noise, mixed
 from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE_INFORMATION, fit
 from canprobe.mechanics.touch.estimate.observed import decide, nothing_observed, spread_of
 from canprobe.mechanics.touch.estimate.prior import Prior
@@ -45,6 +45,7 @@ class ContactBatch(NamedTuple):
             of the problem.
         distance: length along the path, m.
         correlation: correlation of the noise along the path; None for independent samples.
+        slow: errors that change as the contact moves over the pad; None: there are none.
     """
 
     points: Floats
@@ -53,22 +54,29 @@ class ContactBatch(NamedTuple):
     extent: float
     distance: float
     correlation: Correlation | None = None
+    slow: SlowErrors | None = None
 
     def whitener(self) -> Floats | None:
         """(3, n, n) matrices that make the whitened samples independent; None where they are independent."""
         if self.correlation is None:
             return None
-        return self.correlation.whitener(np.linspace(0.0, self.distance, len(self.points)))
+        return self.correlation.whitener(np.linspace(0.0, self.distance, len(self.points)), self.slow)
 
 
-def make_touches(points: Floats, normals: Floats, noise: Noise, correlation: Correlation | None = None) -> ContactBatch:
+def make_touches(
+    points: Floats,
+    normals: Floats,
+    noise: Noise,
+    correlation: Correlation | None = None,
+    slow: SlowErrors | None = None,
+) -> ContactBatch:
     """A batch of arrays that are already checked, with its extent and length."""
     if correlation is not None:
         instance("correlation", correlation, Correlation)
     floor = _MIN_EXTENT_SIGMAS * math.sqrt(float(np.median(noise.point_variance)))
     offset = points - points[-1]
     extent = max(math.sqrt(float(np.einsum("ij,ij->i", offset, offset).max())), floor)
-    return ContactBatch(points, normals, noise, extent, _travelled(points), correlation)
+    return ContactBatch(points, normals, noise, extent, _travelled(points), correlation, slow)
 
 
 def _travelled(points: Floats) -> float:

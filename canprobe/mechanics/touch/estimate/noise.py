@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,18 +33,27 @@ class Correlation:
     `share · exp(−s / length)`; the rest of the variance, 1 − share, is independent (a first-order autoregression over
     the path plus white noise). A contact that comes back to the same place has an independent error there.
 
+    The centroids of an array err beside this by a part that changes only as the contact moves over the pad
+    (`ContactSample.sigma_slow`): hysteresis, gains of taxels. It is correlated by `exp(−w / pad_length)`, w the way of
+    the contact over the pad between two samples. Where the pad rests it is one error for all samples, which bends no
+    surface.
+
     Attributes:
         length: correlation length, m (the unit of the points).
         share: share of the variance that is correlated, 0 to 1.
         point_share: the same share of the points along the normal, where it differs from that of the normals.
+        pad_length: correlation length of the slow errors along the way over the pad, m; infinite: they are one error.
     """
 
     length: float
     share: float = 1.0
     point_share: float | None = None
+    pad_length: float = math.inf
 
     def __post_init__(self) -> None:
         positive("correlation.length", self.length)
+        if not self.pad_length > 0.0:
+            raise UsageError(f"correlation.pad_length: expected a number above 0, got {self.pad_length}")
         others = {} if self.point_share is None else {"point_share": self.point_share}
         for name, value in {"share": self.share, **others}.items():
             share = float(checked(f"correlation.{name}", value, ()))
@@ -54,18 +65,33 @@ class Correlation:
         """(3,) correlated shares of a sample's three rows: height, and the two parts of the normal."""
         return np.array([self.share if self.point_share is None else self.point_share, self.share, self.share])
 
-    def matrix(self, path: Floats) -> Floats:
-        """Correlations (3, n, n) of the rows of samples at places (n,) along the path, m."""
+    def matrix(self, path: Floats, slow: SlowErrors | None = None) -> Floats:
+        """Correlations (3, n, n) of the rows of samples at places (n,) along the path, m, with their slow errors."""
         R: Floats = self.shares[:, None, None] * np.exp(-np.abs(path[:, None] - path) / self.length)
+        if slow is not None:
+            R[1:] += np.outer(slow.share, slow.share) * np.exp(-np.abs(slow.way[:, None] - slow.way) / self.pad_length)
         here = np.arange(len(path))
         R[:, here, here] = 1.0
         return R
 
-    def whitener(self, path: Floats) -> Floats:
+    def whitener(self, path: Floats, slow: SlowErrors | None = None) -> Floats:
         """(3, n, n) inverse lower Cholesky factors of `matrix`, which 1e-9 keeps regular for samples at one place."""
-        of = {share: R + 1e-9 * np.eye(len(path)) for share, R in zip(self.shares, self.matrix(path), strict=True)}
-        found = {share: inverted_upper(lower_root(R).T).T for share, R in of.items()}  # once for rows that are alike
-        return np.array([found[share] for share in self.shares])
+        R = self.matrix(path, slow) + 1e-9 * np.eye(len(path))
+        tilt = inverted_upper(lower_root(R[1]).T).T  # of both tilts
+        alike = slow is None and self.point_share is None
+        return np.array([tilt if alike else inverted_upper(lower_root(R[0]).T).T, tilt, tilt])
+
+
+class SlowErrors(NamedTuple):
+    """Errors of n contacts along the surface that change only as the contact moves over the pad.
+
+    Attributes:
+        share: (n,) their standard deviation over that of the whole error.
+        way: (n,) way of the contact over the pad up to each of them, m.
+    """
+
+    share: Floats
+    way: Floats
 
 
 def mixed(matrices: Floats, rows: Floats) -> Floats:
@@ -84,11 +110,14 @@ class Noise:
         coupling: error of the outward normal, with its sign turned, over the error of the point along the surface, 1/m:
             0 for independent errors, 1/R_p where both come from one centroid on a probe of that radius. An error e of
             the point then turns the normal by `(K + coupling) e` against the surface.
+        height: (n,) standard deviation of the point along the normal, m; `point` is then that along the surface, per
+            axis. None: the points' noise is the same along all axes, or as its covariances.
     """
 
     point: Floats
     normal: Floats
     coupling: float = 0.0
+    height: Floats | None = None
 
     @property
     def isotropic(self) -> bool:
@@ -101,15 +130,27 @@ class Noise:
         return _mean_variance(self.point)
 
     @property
+    def height_variance(self) -> Floats:
+        """(n,) variance of the points along the normal, m²; `point_variance` where no `height` is stated."""
+        return self.point_variance if self.height is None else self.height**2
+
+    @property
     def normal_variance(self) -> Floats:
         """(n,) variance of the normals per axis, the mean one where axes differ, rad²."""
         return _mean_variance(self.normal)
+
+    def tangential_and_height(self, normals: Floats) -> tuple[Floats, Floats]:
+        """(n,) variances of the points along the surface, per axis, and along the normals (n, 3), m²."""
+        if self.point.ndim == 1:
+            return self.point_variance, self.height_variance
+        height = np.einsum("ni,nij,nj->n", normals, self.point, normals)
+        return 0.5 * (np.trace(self.point, axis1=1, axis2=2) - height), height
 
     def scaled(self, length: float, R: Floats) -> Noise:
         """The same noise in units of a length and in the frame whose axes are the columns of R (3, 3)."""
         point = self.point / length if self.point.ndim == 1 else R.T @ self.point @ R / length**2
         normal = self.normal if self.normal.ndim == 1 else R.T @ self.normal @ R
-        return Noise(point, normal, self.coupling * length)
+        return Noise(point, normal, self.coupling * length, None if self.height is None else self.height / length)
 
     def covariances(self) -> tuple[Floats, Floats]:
         """Covariances (n, 3, 3) of the points, m², and of the normals, rad²."""

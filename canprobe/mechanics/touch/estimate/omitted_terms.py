@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from canprobe.mechanics.touch.estimate.misfit import Averaged, averaged, scales
-from canprobe.mechanics.touch.estimate.noise import Correlation
+from canprobe.mechanics.touch.estimate.noise import Correlation, SlowErrors
 from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, sharpest, size_of
 from canprobe.mechanics.touch.estimate.sandwich import Score
 from canprobe.mechanics.touch.estimate.terms import shifted
@@ -93,18 +93,25 @@ class OmittedTerms:
         self._information = np.zeros((18, 18))
         self._slope = np.zeros(9)
 
-    def start(self, rows: Floats, residuals: Floats, travelled: float) -> None:
+    def start(self, rows: Floats, residuals: Floats, travelled: float, slow: SlowErrors | None = None) -> None:
         """Take a batch's rows (n, 3, 18) and minus residuals (n, 3), evenly spread over a path (m)."""
-        self.score.start(rows, travelled)
+        self.score.start(rows, travelled, slow)
         flat = rows.reshape(-1, 18)
         self._information = flat.T @ flat
         self._slope = flat[:, 9:].T @ residuals.reshape(-1)
 
     def take(  # noqa: PLR0917 - as `Score.take`, and what the sums need
-        self, rows: Floats, residuals: Floats, step: Floats, moved: float, kept: float, known: float
+        self,
+        rows: Floats,
+        residuals: Floats,
+        step: Floats,
+        moved: float,
+        kept: float,
+        known: float,
+        slow: SlowErrors | None = None,
     ) -> None:
         """Take new rows (3n, 18), and minus their residuals (3n,) before the parameters made a step (9,)."""
-        self.score.take(rows, moved, kept, known)
+        self.score.take(rows, moved, kept, known, slow)
         self._information = kept * self._information + rows.T.dot(rows)
         self._slope = kept * self._slope + rows[:, 9:].T.dot(residuals) - self._information[9:, :9].dot(step)
 

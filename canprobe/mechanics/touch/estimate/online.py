@@ -95,7 +95,7 @@ class Gate:
             dropped.not_finite += 1
         elif abs(square - 1.0) > 1e-6:
             dropped.not_unit += 1
-        elif not (_usable(sample.sigma_point) and _usable(sample.sigma_normal)):
+        elif not all(_usable(s) for s in (sample.sigma_point, sample.sigma_height, sample.sigma_normal)):
             dropped.zero_sigma += 1
         elif t <= self._last_t:
             if t == self._last_t:
@@ -108,14 +108,21 @@ class Gate:
             return True
         return False
 
-    def sigmas(self, sample: ContactSample) -> tuple[float, float]:
-        """Standard deviations of a sample's point (m) and normal (rad)."""
+    def sigmas(self, sample: ContactSample) -> tuple[float, float, float]:
+        """Standard deviations of a sample: point along the surface and along the normal (m), normal (rad)."""
         wider = max([DOUBT_SIGMA_SCALE[doubt] for doubt in sample.doubts], default=1.0)
+        point = math.hypot(self.sigma_point if sample.sigma_point is None else sample.sigma_point, sample.sigma_motion)
         return (
-            wider
-            * math.hypot(self.sigma_point if sample.sigma_point is None else sample.sigma_point, sample.sigma_motion),
+            wider * point,
+            wider * (point if sample.sigma_height is None else sample.sigma_height),
             wider * (self.sigma_normal if sample.sigma_normal is None else sample.sigma_normal),
         )
+
+
+def slow_share(sample: ContactSample, sigma_point: float) -> float:
+    """Slow errors of a sample along the surface over its stated ones, `sigma_point` with motion (m): at most 1."""
+    wider = max([DOUBT_SIGMA_SCALE[doubt] for doubt in sample.doubts], default=1.0)
+    return min(wider * sample.sigma_slow / sigma_point, 1.0)
 
 
 def _usable(sigma: float | None) -> bool:

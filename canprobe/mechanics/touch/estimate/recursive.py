@@ -18,14 +18,14 @@ from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import Anchor, Solution, SurfaceEstimate, anchor, build_estimate
 from canprobe.mechanics.touch.estimate.change import ChangeTest
-from canprobe.mechanics.touch.estimate.information import InformationFilter, MeasuredContact
+from canprobe.mechanics.touch.estimate.information import InformationFilter, MeasuredContact, slow_errors
 from canprobe.mechanics.touch.estimate.known_curvature import TO_Q_SQUARED, curvature_covariance, evidence_of
 from canprobe.mechanics.touch.estimate.misfit import misfit_notes
 from canprobe.mechanics.touch.estimate.noise import CHI2_99, CHI2_999, Correlation
 from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE_INFORMATION
 from canprobe.mechanics.touch.estimate.observed import decide, nothing_observed
 from canprobe.mechanics.touch.estimate.omitted_terms import ExpectedMisfit
-from canprobe.mechanics.touch.estimate.online import Dropped, Gate
+from canprobe.mechanics.touch.estimate.online import Dropped, Gate, slow_share
 from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, size_of
 from canprobe.mechanics.touch.estimate.start import Start
@@ -115,6 +115,7 @@ class RecursiveEstimator:
         self._last: MeasuredContact | None = None
         self._pending: deque[_Pending] = deque(maxlen=MAX_PENDING)
         self._travel = Travel(max(UPDATE_TRAVEL_SHARE * self._memory, 3.0 * self._gate.sigma_point))
+        self._pad = Travel(self._gate.sigma_point)
         self._spread = Spread()
         self._change = ChangeTest()
         self._start: Start | None = Start(self._memory, self._prior)
@@ -125,7 +126,10 @@ class RecursiveEstimator:
         """Take one contact."""
         if not self._gate.passes(sample, self.dropped):
             return
-        touch = MeasuredContact(sample.p_base, sample.n_base, *self._gate.sigmas(sample), self._coupling)
+        sigmas = self._gate.sigmas(sample)
+        self._pad.add(sample.r_probe)
+        rolled = slow_share(sample, sigmas[0]), self._pad.total
+        touch = MeasuredContact(sample.p_base, sample.n_base, *sigmas, self._coupling, *rolled)
         moved = self._travel.add(sample.p_base)
         self._pending.append(_Pending(touch, self._travel.weight))
         if self._last is None or self._travel.weight == 1.0:
@@ -222,8 +226,9 @@ class RecursiveEstimator:
         if self._start is not None:
             self._beginning(self._start, moved)
         elif compared:
+            slow = slow_errors([p.touch for p in self._pending])
             root = np.sqrt(self._weigh(moved, compared.weights) * compared.weights)[:, None]
-            self._filter.take(compared.rows * root[:, :, None], compared.residuals * root, moved)
+            self._filter.take(compared.rows * root[:, :, None], compared.residuals * root, moved, slow)
             if self._last is not None:
                 self._filter.follow(self._last.point)
 
@@ -255,7 +260,15 @@ class RecursiveEstimator:
         wider = 1.0 / math.sqrt(self._weigh(moved, np.ones(len(self._pending))))
         touches = [p.touch for p in self._pending]
         start.add(
-            [t._replace(sigma_point=wider * t.sigma_point, sigma_normal=wider * t.sigma_normal) for t in touches], moved
+            [
+                t._replace(
+                    sigma_point=wider * t.sigma_point,
+                    sigma_height=wider * t.sigma_height,
+                    sigma_normal=wider * t.sigma_normal,
+                )
+                for t in touches
+            ],
+            moved,
         )
         self._settled = start.settled
         found = start.solution
@@ -263,7 +276,7 @@ class RecursiveEstimator:
             self._filter.begin(homogeneous(tangent_rotation(-touches[-1].normal), touches[-1].point))
             return
         c = found.target if start.settled else found.c
-        self._filter.adopt(start.T, c, found.root, found.rows, found.residuals_at(c), start.travelled)
+        self._filter.adopt(start.T, c, found.root, found.rows, found.residuals_at(c), start.travelled, start.slow)
         self._doubtful = float(np.count_nonzero(found.weight < 1.0))
         if start.over:
             self._start, self._settled = None, True

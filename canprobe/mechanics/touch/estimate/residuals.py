@@ -1,7 +1,8 @@
 """Residuals of samples and their Jacobian.
 
-A sample (x, n) has three residuals: `f/|∇f|` and the two tangential parts of `∇f/|∇f| − n`. They are whitened by σ_p²
-and `σ_n² I + K² σ_p²`: the point's tangential noise turns the model's normal by K times it.
+A sample (x, n) has three residuals: `f/|∇f|` and the two tangential parts of `∇f/|∇f| − n`. They are whitened by σ_h²,
+the variance of the point along the normal, and `σ_n² I + K² σ_p²`: the point's tangential noise σ_p turns the model's
+normal by K times it.
 """
 
 from __future__ import annotations
@@ -23,19 +24,20 @@ class Design(NamedTuple):
         X: (n, 3) points in the working frame.
         T: (n, 2, 3) tangent axes of the measured normals.
         noise: noise of the samples.
-        point_variance, normal_variance: (n,) variances of the noise per axis.
+        point_variance, height_variance, normal_variance: (n,) variances of the noise per axis.
     """
 
     X: Floats
     T: Floats
     noise: Noise
     point_variance: Floats
+    height_variance: Floats
     normal_variance: Floats
 
 
 def design(points: Floats, normals: Floats, noise: Noise) -> Design:
     """The design of points and outward normals (n, 3) in the working frame."""
-    return Design(points, tangents(normals), noise, noise.point_variance, noise.normal_variance)
+    return Design(points, tangents(normals), noise, noise.point_variance, noise.height_variance, noise.normal_variance)
 
 
 def tangents(normals: Floats) -> Floats:
@@ -57,7 +59,7 @@ def linear_rows(d: Design) -> tuple[Floats, Floats]:
     They are a start and not an answer: the second multiplies the normals' noise into the regressor, which shrinks K by
     some percent.
     """
-    w_p = 1.0 / np.sqrt(d.point_variance)
+    w_p = 1.0 / np.sqrt(d.height_variance)
     w_n = 1.0 / np.sqrt(d.normal_variance + d.noise.coupling**2 * d.point_variance)
     F = terms(d.X, 9)
     A = np.concatenate([F[:, :1] * w_p[:, None, None], d.T @ F[:, 1:] * w_n[:, None, None]], axis=1)
@@ -145,7 +147,7 @@ def _whitener(K: Floats, ghat: Floats, d: Design) -> Floats:
     l11 = np.sqrt(vn + vp * (k11 * k11 + k12 * k12))
     l21 = vp * k12 * (k11 + k22) / l11
     l22 = np.sqrt(vn + vp * (k12 * k12 + k22 * k22) - l21 * l21)
-    W[:, 0, 0], W[:, 1, 1], W[:, 2, 2] = 1.0 / np.sqrt(vp), 1.0 / l11, 1.0 / l22
+    W[:, 0, 0], W[:, 1, 1], W[:, 2, 2] = 1.0 / np.sqrt(d.height_variance), 1.0 / l11, 1.0 / l22
     W[:, 2, 1] = -l21 / (l11 * l22)
     return W
 

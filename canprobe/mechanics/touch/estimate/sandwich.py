@@ -12,8 +12,11 @@ import math
 
 import numpy as np
 
-from canprobe.mechanics.touch.estimate.noise import Correlation, mixed
+from canprobe.mechanics.touch.estimate.noise import Correlation, SlowErrors, mixed
 from canprobe.mechanics.types import Floats
+
+_TILTS = np.array([[0.0], [1.0], [1.0]])
+"""Rows of a contact that a slow error of its centroid changes: both tilts, not the height."""
 
 
 class Score:
@@ -27,15 +30,16 @@ class Score:
     def __init__(self, prior: Floats, correlation: Correlation | None) -> None:
         self._prior = prior
         self._correlation = correlation
-        self._shares = np.zeros((3, 1)) if correlation is None else correlation.shares[:, None]
+        self._shares = np.zeros((3, 1)) if correlation is None else np.sqrt(correlation.shares)[:, None]
         self.reset()
 
     def reset(self) -> None:
         """Forget all rows; the prior stays."""
         self.matrix = self._prior.copy()
-        self._recent = np.zeros((3, len(self.matrix)))
+        self._recent, self._slow = np.zeros((3, len(self.matrix))), np.zeros((3, len(self.matrix)))
+        self._way = 0.0
 
-    def start(self, J: Floats, travelled: float) -> None:
+    def start(self, J: Floats, travelled: float, slow: SlowErrors | None = None) -> None:
         """Take a batch's whitened rows (n, 3, k), evenly spread over a path (m), all in full."""
         self.reset()
         k = len(self.matrix)
@@ -44,11 +48,15 @@ class Score:
             self.matrix += rows.T @ rows
             return
         places = np.linspace(0.0, travelled, len(J))
-        self.matrix += rows.T @ mixed(self._correlation.matrix(places), J).reshape(-1, k)
+        self.matrix += rows.T @ mixed(self._correlation.matrix(places, slow), J).reshape(-1, k)
         fades = np.exp((places - travelled) / self._correlation.length)
         self._recent = self._shares * (fades @ J.reshape(-1, 3 * k)).reshape(3, k)
+        if slow is not None:
+            self._way = float(slow.way[-1])
+            fades = slow.share * np.exp((slow.way - self._way) / self._correlation.pad_length)
+            self._slow = _TILTS * (fades @ J.reshape(-1, 3 * k)).reshape(3, k)
 
-    def take(self, J: Floats, moved: float, kept: float, known: float) -> None:
+    def take(self, J: Floats, moved: float, kept: float, known: float, slow: SlowErrors | None = None) -> None:
         """Take new whitened rows (3n, k) of a step of the path.
 
         Args:
@@ -56,26 +64,34 @@ class Score:
             moved: length of the step, m.
             kept: share of the earlier information that the step leaves.
             known: share of the prior that is put back into the matrix.
+            slow: slow errors of the contacts; None: they have none.
         """
-        self.matrix = kept**2 * self.matrix + known * self._prior + self._added(J, moved, kept)
+        self.matrix = kept**2 * self.matrix + known * self._prior + self._added(J, moved, kept, slow)
 
     def carry(self, back: Floats) -> None:
         """Change to other parameters; back (k, k) is d(old)/d(new)."""
         self.matrix = back.T.dot(self.matrix).dot(back)
-        self._recent = self._recent.dot(back)
+        self._recent, self._slow = self._recent.dot(back), self._slow.dot(back)
 
-    def _added(self, J: Floats, moved: float, kept: float) -> Floats:
+    def _added(self, J: Floats, moved: float, kept: float, slow: SlowErrors | None) -> Floats:
         """(k, k) that new rows add: by themselves, and with earlier rows with which they are correlated."""
         if self._correlation is None:
             return np.asarray(J.T.dot(J), dtype=np.float64)
         n, k = len(J) // 3, J.shape[1]
         fade = math.exp(-moved / (n * self._correlation.length))
-        shared = self._shares * J.reshape(n, 3, k)
+        each = J.reshape(n, 3, k)
         recent, past = kept * self._recent, np.empty((n, 3, k))
         for i in range(n):
             recent *= fade
-            past[i] = recent
-            recent += shared[i]
+            past[i] = self._shares * recent
+            recent += self._shares * each[i]
         self._recent = recent
+        if slow is not None:
+            self._slow *= kept
+            for i, (share, way) in enumerate(zip(slow.share.tolist(), slow.way.tolist(), strict=True)):
+                self._slow *= math.exp((self._way - way) / self._correlation.pad_length)
+                past[i] += share * self._slow
+                self._slow += share * (_TILTS * each[i])
+                self._way = way
         cross = J.T.dot(past.reshape(-1, k))
         return np.asarray(J.T.dot(J) + cross + cross.T, dtype=np.float64)

@@ -16,7 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from canprobe.mechanics.touch.estimate.information import MeasuredContact, batch_design
+from canprobe.mechanics.touch.estimate.information import MeasuredContact, batch_design, slow_errors
+from canprobe.mechanics.touch.estimate.noise import SlowErrors
 from canprobe.mechanics.touch.estimate.nonlinear import linear_start, robust, solve_rows
 from canprobe.mechanics.touch.estimate.observed import MIN_SPREAD, Decision, spread_of
 from canprobe.mechanics.touch.estimate.prior import Prior
@@ -47,6 +48,7 @@ class Start:
     Attributes:
         T: (4, 4) working frame of the solution to base, m.
         solution: the solution so far; None before the first.
+        slow: slow errors of the contacts of the solution.
         settled: whether the last step was small, and all of K was observed or the stretch is over.
         travelled: path so far, m.
     """
@@ -54,6 +56,7 @@ class Start:
     def __init__(self, length: float, prior: Prior) -> None:
         self.T = np.eye(4)
         self.solution: Solved | None = None
+        self.slow: SlowErrors | None = None
         self.settled = False
         self.travelled = 0.0
         self._length = length
@@ -96,7 +99,7 @@ class Start:
             fresh = solved_once(plain, d, self._prior)
             now = fresh if now is None or fresh.cost < now.cost else now
         better = gauss_newton(now, d, self._prior)
-        self.solution = better
+        self.solution, self.slow = better, slow_errors(self._touches)
         known = self.settled or better.decision.rank == 3 or stretch_over
         self.settled = known and better.step < SETTLED_STEP
 

@@ -18,9 +18,10 @@ from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 from canprobe.mechanics.touch.estimate.change import LAST_SAMPLES, MAX_AGREEING_RESIDUAL, looks_changed
 from canprobe.mechanics.touch.estimate.differences import chord_pairs, solve_pairs
 from canprobe.mechanics.touch.estimate.likelihood import ContactBatch, fit_ml, make_touches
-from canprobe.mechanics.touch.estimate.noise import Correlation, make_noise
-from canprobe.mechanics.touch.estimate.online import Dropped, Gate
+from canprobe.mechanics.touch.estimate.noise import Correlation, Noise, SlowErrors
+from canprobe.mechanics.touch.estimate.online import Dropped, Gate, slow_share
 from canprobe.mechanics.touch.estimate.prior import Prior
+from canprobe.mechanics.touch.estimate.travel import Travel
 from canprobe.mechanics.touch.linear_algebra import whole
 from canprobe.mechanics.types import Floats
 
@@ -55,11 +56,13 @@ class WindowEstimator:
         self._gate = Gate(sigma_point, sigma_normal)
         self._prior, self._coupling, self._correlation = prior, coupling, correlation
         self._rows: deque[Sequence[float]] = deque(maxlen=kept)
+        self._pad = Travel(sigma_point)
         self._answer: SurfaceEstimate | None = None
 
     def add(self, sample: ContactSample) -> None:
         """Take one contact."""
         if self._gate.passes(sample, self.dropped):
+            self._pad.add(sample.r_probe)
             self._rows.append(self._row(sample))
             self._answer = None
 
@@ -82,13 +85,16 @@ class WindowEstimator:
         raise NotImplementedError
 
     def _row(self, sample: ContactSample) -> Sequence[float]:
-        """The row that is kept of a sample: point, normal, their standard deviations; a subclass adds what it needs."""
-        return (*sample.p_base.tolist(), *sample.n_base.tolist(), *self._gate.sigmas(sample))
+        """The row that is kept of a sample: point, normal, their noise; a subclass adds what it needs."""
+        sigmas = self._gate.sigmas(sample)
+        slow = slow_share(sample, sigmas[0]), self._pad.total
+        return (*sample.p_base.tolist(), *sample.n_base.tolist(), *sigmas, *slow)
 
     def _touches(self) -> ContactBatch:
         rows = np.array(self._rows)
-        noise = make_noise(len(rows), rows[:, 6], rows[:, 7], self._coupling)
-        return make_touches(rows[:, :3], rows[:, 3:6], noise, self._correlation)
+        noise = Noise(rows[:, 6], rows[:, 8], self._coupling, height=rows[:, 7])
+        slow = SlowErrors(rows[:, 9], rows[:, 10])
+        return make_touches(rows[:, :3], rows[:, 3:6], noise, self._correlation, slow)
 
 
 class MlEstimator(WindowEstimator):
@@ -116,10 +122,10 @@ def _squared_residuals(answer: SurfaceEstimate, touches: ContactBatch) -> Floats
     gradient = answer.surface.gradient(places)
     size = np.sqrt(np.einsum("ij,ij->i", gradient, gradient))
     tilt = gradient / size[:, None] - touches.normals @ answer.T_frame_contact[:3, :3]
-    point = touches.noise.point_variance
+    point, height = touches.noise.point_variance, touches.noise.height_variance
     turn = np.abs(answer.kappa).max() + touches.noise.coupling
     normal = touches.noise.normal_variance + turn**2 * point
-    result: Floats = (answer.surface.value(places) / size) ** 2 / point + np.einsum("ij,ij->i", tilt, tilt) / normal
+    result: Floats = (answer.surface.value(places) / size) ** 2 / height + np.einsum("ij,ij->i", tilt, tilt) / normal
     return result
 
 

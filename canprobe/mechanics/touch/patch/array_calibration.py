@@ -79,29 +79,52 @@ class Lag:
 
 
 @dataclass(frozen=True, slots=True)
-class CentroidErrors:
-    """Errors of the centroid as the place of the contact.
+class ContactNoise:
+    """Noise of the place of a contact: what the estimators, the patch, the servo and the bound know of it.
+
+    The centroid has two errors. They displace the contact along the surface, and turn its normal by themselves over the
+    probe's radius. One changes from image to image; it is larger for light touches, which cover few taxels. The other
+    changes only as the contact moves over the pad: hysteresis, gains of the taxels. Neither changes the height of the
+    contact, as a sphere that is tangent to the surface keeps its height where the centroid errs. The height errs by
+    joint counts and by the depth of the layer.
 
     Attributes:
-        scale, power: parameters of the standard deviation `scale · t^power`, m, with t the level over the peak
-            pressure.
-        correlation: correlation length of a part of the errors along the way over the pad, m.
-        share: share of this part in the variance.
-        latency_s, latency_sigma_s: age of an image at its time stamp, and the standard deviation of this age, s.
-        lag: lag of the centroid behind the contact, which does not depend on the speed.
+        scale, power: parameters of the standard deviation from image to image, `scale · t^power`, m, with t the level
+            over the peak pressure.
+        slow: standard deviation of the slow error, m.
+        slow_way: way over the pad along which it is correlated (e-folding), m.
+        height: standard deviation of the place along the normal, m.
+        assumed: whether the file does not state `slow` and `height`, so that those of the emulated array are assumed.
     """
 
     scale: float
     power: float
-    correlation: float
-    share: float
+    slow: float
+    slow_way: float
+    height: float
+    assumed: bool = False
+
+    def image(self, level_over_peak: float) -> float:
+        """Standard deviation of a centroid per axis from image to image, m."""
+        return self.scale * math.pow(min(max(level_over_peak, 0.0), 1.0), self.power)
+
+    def lateral(self, level_over_peak: float) -> float:
+        """Standard deviation of a contact along the surface per axis, m, slow errors included."""
+        return math.hypot(self.image(level_over_peak), self.slow)
+
+
+@dataclass(frozen=True, slots=True)
+class CentroidDelays:
+    """Delays of the centroid behind the contact.
+
+    Attributes:
+        latency_s, latency_sigma_s: age of an image at its time stamp, and the standard deviation of this age, s.
+        lag: lag of the centroid behind the contact, which does not depend on the speed.
+    """
+
     latency_s: float
     latency_sigma_s: float
     lag: Lag
-
-    def sigma(self, level_over_peak: float) -> float:
-        """Standard deviation of a centroid per axis, m."""
-        return self.scale * math.pow(min(max(level_over_peak, 0.0), 1.0), self.power)
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +177,8 @@ class ArrayCalibration:
         full_scale: pressure of a full count at which it was made, Pa.
         image: parameters of the image model.
         moments: errors of second moments.
-        centroid: errors of the centroid.
+        noise: noise of the place of a contact.
+        centroid: delays of the centroid.
         stiffness: stiffness of the layer from both sources.
         residuals: held-out errors.
         gains: (rows, columns) gains of the taxels over their mean; empty where they were not found or are not used.
@@ -169,7 +193,8 @@ class ArrayCalibration:
     full_scale: float
     image: ImageParameters
     moments: MomentErrors
-    centroid: CentroidErrors
+    noise: ContactNoise
+    centroid: CentroidDelays
     stiffness: StiffnessSources
     residuals: Residuals
     gains: tuple[tuple[float, ...], ...] = ()

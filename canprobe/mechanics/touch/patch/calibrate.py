@@ -14,10 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from canprobe.errors import UsageError
+from canprobe.mechanics.touch.contact import indentation_from_force
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.patch.array_calibration import (
     ArrayCalibration,
-    CentroidErrors,
+    CentroidDelays,
+    ContactNoise,
     ForceReference,
     ImageParameters,
     Lag,
@@ -30,7 +32,7 @@ from canprobe.mechanics.touch.patch.image import PatchCalibration
 from canprobe.mechanics.touch.patch.image_fit import LAST_IMAGE_S, NO_ERRORS, Dwell, Shown, what_is_shown
 from canprobe.mechanics.touch.patch.image_model import USUAL_LIGHTNESS
 from canprobe.mechanics.touch.patch.layer_fit import stiffness_by_depth
-from canprobe.mechanics.touch.patch.pad_fit import fit_centroids
+from canprobe.mechanics.touch.patch.pad_fit import fit_noise
 from canprobe.mechanics.touch.patch.parameter_fit import (
     Pairs,
     ParameterFit,
@@ -151,17 +153,19 @@ def calibrate_array(
     by_depth = stiffness_by_depth(ds, ss, found.forces.tolist(), pad.radius_m, by_images)
     rods = [(d, s) for d, s in good if d.name == "rod"]
     across = _rms(_checked(first, rods, own, seen)[1][:, 0]) if rods else math.nan
-    centroid, scatter = fit_centroids(ds, ss)
+    patch = make_patch_calibration(first, pad)
+    depths = [_depths(d, s, patch, stiffness) for d, s in fitted]
+    noise, centroid, scatter = fit_noise(ds, ss, depths)
     calibration = replace(
         first,
         moments=_moment_errors(errors, ss),
+        noise=noise,
         centroid=centroid,
         stiffness=StiffnessSources(*by_images, *by_depth),
         residuals=Residuals(len(fitted), _rms(force_errors), _rms(errors[:, :2]), _rms(curvatures), across),
         dead=dead if own_gains else (),
     )
     offset, of_object = _offsets(good)
-    patch = make_patch_calibration(calibration, pad)
     forces = np.array([_force(patch, s) for s in ss])
     return ArrayFit(
         calibration=calibration,
@@ -197,7 +201,8 @@ def _blank(  # noqa: PLR0917
         full_scale,
         ImageParameters(1.0, 1.0, 1.0, 0.0, 0.0),
         NO_ERRORS,
-        CentroidErrors(nan, nan, nan, nan, nan, nan, Lag(0.0, 1.0)),
+        ContactNoise(nan, nan, nan, nan, nan),
+        CentroidDelays(nan, nan, Lag(0.0, 1.0)),
         StiffnessSources(nan, nan, nan, nan, nan, nan),
         Residuals(0, nan, nan, nan, nan),
     )
@@ -205,6 +210,13 @@ def _blank(  # noqa: PLR0917
 
 def _force(patch: PatchCalibration, s: Shown) -> float:
     return patch.force_gain * s.total + patch.edge_gain * math.sqrt(s.total)
+
+
+def _depths(dwell: Dwell, s: Shown, patch: PatchCalibration, stiffness: float) -> Floats:
+    """(n,) depth of the layer in each image of a touch, m."""
+    at_1_n = indentation_from_force(1.0, stiffness, patch.radius_m, dwell.kappa)
+    depths: Floats = at_1_n * np.sqrt(patch.force_gain * s.sums + patch.edge_gain * np.sqrt(s.sums))
+    return depths
 
 
 def _checked(

@@ -92,6 +92,8 @@ class Shown(NamedTuple):
         raw: (n, 2) centroids, m.
         usable: whether the touch neither saturates nor leaves the pad.
         push: mean way of the probe's centre, m.
+        pushes: (n,) way of the probe's centre in each image, m.
+        sums: (n,) sum of pressure times area in each image, N.
     """
 
     total: float
@@ -106,6 +108,8 @@ class Shown(NamedTuple):
     raw: Floats
     usable: bool
     push: float
+    pushes: Floats
+    sums: Floats
 
 
 def what_is_shown(dwell: Dwell, plain: PatchCalibration, age_s: float = math.inf) -> Shown:
@@ -162,4 +166,6 @@ def what_is_shown(dwell: Dwell, plain: PatchCalibration, age_s: float = math.inf
         raw=raw,
         usable=bad <= 0.2 * len(kept) and peak < MAX_PEAK_SHARE * plain.full_scale_pa,
         push=float(dwell.push[kept].mean()),
+        pushes=dwell.push[kept],
+        sums=np.array(sums),
     )

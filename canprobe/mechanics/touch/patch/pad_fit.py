@@ -1,4 +1,4 @@
-"""Fits the lag and the scatter of centroids, and the way over which an error of a centroid lasts."""
+"""Fits the noise of the place of a contact, and the lag of the centroid, to touches of known objects."""
 
 from __future__ import annotations
 
@@ -8,19 +8,20 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import least_squares
 
-from canprobe.mechanics.touch.patch.array_calibration import CentroidErrors, Lag
+from canprobe.mechanics.touch.patch.array_calibration import CentroidDelays, ContactNoise, Lag
 from canprobe.mechanics.touch.patch.image_fit import Dwell, Shown
 from canprobe.mechanics.types import Floats
 
 REACH_M, REACH_LOG_SIGMA = 200e-6, 0.2
 """Expected `Lag.reach`, m, and the standard deviation of its logarithm: rolls of one length hardly separate it from
 `Lag.most`."""
-SCATTER_WAY_M = 1e-3
-"""Way over the pad within which centroids scatter as their noise: 20 mm of a scan whose pad follows the normal."""
+MAX_SLOW_WAY_M, SLOW_BIN_M = 0.64e-3, 0.04e-3
+"""Longest way over the pad over which slow errors are compared, that of the contact in about 15 mm of a scan whose pad
+follows the normal; and its steps, m."""
+SLOW_LAGS = (4, 8, 16, 32, 64, 128)
+"""Numbers of images between two centroids that are compared."""
 CORRELATED_FRAMES = 20
 """Number of successive images whose centroids have about the same error."""
-LAG_STEPS, LAG_STEP_M = 16, 1e-4
-"""Number and length (m) of the steps of the autocorrelation along the way over the pad."""
 TIME_CONSTANTS_S = 0.02, 0.3
 """Time constants `Lag.quick_s` and `Lag.slow_s`, s."""
 
@@ -37,10 +38,18 @@ def _means(t: Floats, at: Floats) -> Floats:
     return ways
 
 
-def fit_centroids(dwells: Sequence[Dwell], shown: Sequence[Shown]) -> tuple[CentroidErrors, Floats]:
-    """Errors of centroids, and the (n,) scatter of the centroids of each touch, m.
+def fit_noise(
+    dwells: Sequence[Dwell], shown: Sequence[Shown], depths: Sequence[Floats]
+) -> tuple[ContactNoise, CentroidDelays, Floats]:
+    """Noise of contacts, delays of the centroid, and the (n,) scatter of the centroids of each touch, m.
 
-    Latency and lag are fitted to the rolls to and fro; then the scatter of all touches by load, and its correlation.
+    Latency and lag are fitted to the rolls to and fro. The noise from image to image follows from second differences
+    of centroids in time, by load; the slow error from what they differ by the more, the further they are apart on the
+    pad; that of the height from the way of the probe into the object, less the depth.
+
+    Args:
+        dwells, shown: the touches.
+        depths: (n,) depth in each image of each touch, m.
 
     Hysteresis lags by a way and latency by a time: in the middle of a stroke the way is the same at any speed, which
     separates them. The rolls are as short as those of a scan: over longer ways the centroid lags further.
@@ -62,31 +71,23 @@ def fit_centroids(dwells: Sequence[Dwell], shown: Sequence[Shown]) -> tuple[Cent
     z = least_squares(residuals, np.array([1.0, 1e4 * REACH_M])).x
     most, reach = (1e-4 * z).tolist()
     rest = [left(z, s, _means(s.t_s, s.raw)) for s in shown]
-    sigma = [_scatter(r, s.way) for r, s in zip(rest, shown, strict=True)]
+    sigma = np.array([_from_image_to_image(r) for r in rest])
     power, log_scale = np.polyfit(np.log([s.lightness for s in shown]), np.log(sigma), 1)
-    share, length = _lasting(rest, [s.way for s in shown])
-    found = CentroidErrors(
+    slow, slow_way = _slow(rest, [s.way for s in shown], sigma)
+    heights = [np.var(s.pushes - depth) for s, depth in zip(shown, depths, strict=True)]
+    noise = ContactNoise(
         scale=math.exp(float(log_scale)),
         power=float(power),
-        correlation=length,
-        share=share,
-        latency_s=latency,
-        latency_sigma_s=latency_sigma,
-        lag=Lag(most=max(most, 0.0), reach=abs(reach)),
+        slow=slow,
+        slow_way=slow_way,
+        height=math.sqrt(float(np.mean(heights))),
     )
-    return found, np.array(sigma)
+    return noise, CentroidDelays(latency, latency_sigma, Lag(most=max(most, 0.0), reach=abs(reach))), sigma
 
 
-def _along(way: Floats) -> Floats:
-    """(n,) path over the pad, m, up to each of its places (n, 2)."""
-    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))])
-
-
-def _scatter(r: Floats, way: Floats) -> float:
-    """Standard deviation of errors (n, 2) within `SCATTER_WAY_M`: what lasts longer bends no surface."""
-    part = (_along(way) / SCATTER_WAY_M).astype(int)
-    variances = [r[part == i].var(axis=0, ddof=1).mean() for i in range(part[-1] + 1) if np.sum(part == i) > 4]
-    return math.sqrt(float(np.mean(variances))) if variances else float(r.std())
+def _from_image_to_image(r: Floats) -> float:
+    """Standard deviation of independent errors (n, 2): second differences of anything slower are nearly 0."""
+    return math.sqrt(float(np.mean(np.diff(r, 2, axis=0) ** 2)) / 6.0)
 
 
 def _latency(rolls: Sequence[Shown]) -> tuple[float, float]:
@@ -107,25 +108,27 @@ def _latency(rolls: Sequence[Shown]) -> tuple[float, float]:
     return -float(found[1]), math.sqrt(scatter * CORRELATED_FRAMES)
 
 
-def _lasting(errors: Sequence[Floats], ways: Sequence[Floats]) -> tuple[float, float]:
-    """Share of the variance of errors (n, 2) that lasts along the way over the pad, and over which length, m."""
-    lags = np.zeros(LAG_STEPS)
-    for r, way in zip(errors, ways, strict=True):
-        s = _along(way)
-        grid = np.arange(0.0, s[-1], LAG_STEP_M)
-        if len(grid) < 2 * LAG_STEPS:
-            continue
-        on_grid = np.stack([np.interp(grid, s, r[:, i]) for i in (0, 1)])
-        on_grid -= on_grid.mean(axis=1, keepdims=True)
-        lags += [float((on_grid[:, : len(grid) - k] * on_grid[:, k:]).mean()) for k in range(LAG_STEPS)]
-    if lags[0] <= 0.0:
-        return 0.0, LAG_STEP_M
-    # the mean of each error was subtracted, which shifts the whole autocorrelation down
-    at = LAG_STEP_M * np.arange(1, LAG_STEPS)
+def _slow(errors: Sequence[Floats], ways: Sequence[Floats], sigma: Floats) -> tuple[float, float]:
+    """Standard deviation of the slow part of errors (n, 2), and its correlation length along the pad, m.
+
+    Half the mean square difference of two errors that are w apart on the pad is the variance from image to image plus
+    `slow² (1 − exp(−w / length))`.
+    """
+    count = round(MAX_SLOW_WAY_M / SLOW_BIN_M)
+    sums, pairs = np.zeros(count), np.zeros(count)
+    for r, way, noise in zip(errors, ways, sigma, strict=True):
+        for lag in SLOW_LAGS:
+            place = (np.hypot(*(way[lag:] - way[:-lag]).T) / SLOW_BIN_M).astype(int)
+            half = 0.5 * np.mean((r[lag:] - r[:-lag]) ** 2, axis=1) - noise**2
+            near = place < count
+            sums += np.bincount(place[near], half[near], count)
+            pairs += np.bincount(place[near], minlength=count)
+    w = SLOW_BIN_M * (np.flatnonzero(pairs) + 0.5)
+    D, weight = sums[pairs > 0] / pairs[pairs > 0], np.sqrt(pairs[pairs > 0])
 
     def residuals(z: Floats) -> Floats:
-        rest: Floats = z[0] * np.exp(-at / abs(z[1]) / 1e-3) - z[2] - lags[1:] / lags[0]
+        rest: Floats = weight * (z[0] ** 2 * (1.0 - np.exp(-w / MAX_SLOW_WAY_M / z[1] ** 2)) - 1e10 * D)
         return rest
 
-    share, length, shift = least_squares(residuals, np.array([0.5, 1.0, 0.1])).x.tolist()
-    return min(max(share / (1.0 + max(shift, 0.0)), 0.0), 1.0), abs(length) * 1e-3
+    slow, root = least_squares(residuals, np.array([3.0, 1.0])).x.tolist()
+    return 1e-5 * abs(slow), MAX_SLOW_WAY_M * root**2

@@ -20,7 +20,7 @@ PRIOR = Prior.weak(MEMORY)
 def touches(truth, name, seed, n=72):
     path = truth.path(name, T=truth.any_pose(seed))
     p, normals = path.noisy(*SIGMA, seed)
-    return [MeasuredContact(a, b, *SIGMA) for a, b in zip(p[-n:], normals[-n:], strict=True)]
+    return [MeasuredContact(a, b, SIGMA[0], *SIGMA) for a, b in zip(p[-n:], normals[-n:], strict=True)]
 
 
 def stepwise(found, each=4):
