@@ -25,7 +25,7 @@ examples:
   canprobe study bound --dask tcp://10.0.0.1:8786
   canprobe study faults --seed 4711
   canprobe study regions --draw 2 --against earlier/regions.json
-  canprobe study shapes --draw 7
+  canprobe study arrays --draw 2
   canprobe vcan -- canprobe study faults --vcan
   canprobe vcan --realtime -- canprobe study realtime --soak
 """

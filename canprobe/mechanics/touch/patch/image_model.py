@@ -24,6 +24,7 @@ import numpy as np
 from canprobe.mechanics.touch.linear_algebra import positive, read_only
 from canprobe.mechanics.touch.pad import COUNTS_MAX
 from canprobe.mechanics.touch.patch.array_calibration import ImageParameters, MomentErrors
+from canprobe.mechanics.touch.patch.force_errors import USUAL_LIGHTNESS
 from canprobe.mechanics.touch.patch.moments import Moments
 from canprobe.mechanics.types import Floats
 
@@ -37,9 +38,6 @@ MAX_LIGHTNESS = 0.3
 """Largest level over peak pressure; beyond it too little of a patch is above the level."""
 TAPER_SHARE = 0.1
 """Share of these limits within which, beyond them, the trust in a patch falls to 0."""
-USUAL_LIGHTNESS = 0.05
-"""Level over peak pressure for which `MomentErrors` hold; the errors grow in proportion, as light touches cover few
-taxels."""
 GAIN_LIGHTNESS = 0.25
 """Largest level over peak pressure of the forces of `force_gains`; smaller forces are made larger."""
 _DIFFERENCE_STEP = 1e-3
