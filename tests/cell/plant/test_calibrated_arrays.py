@@ -14,6 +14,7 @@ from canprobe.cell.scene.calibrations import dump_calibration, load_calibration
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.errors import SceneError, UsageError
+from canprobe.lab.studies.array_forces import score_holds
 from canprobe.lab.studies.arrays import RADIUS_M, Presses, measure, random_array
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.patch.array_models import make_patch_calibration
@@ -31,6 +32,10 @@ def touched():
     return list(Presses(config, stiffness, rng).protocol()), config, stiffness
 
 
+def touched_pad(config):
+    return Pad(full_scale_pa=config.full_scale_pa, mount_radius_m=RADIUS_M)
+
+
 def calibrated(touched, dwells=None, **changes):
     values = {
         "reference": "scale",
@@ -41,7 +46,7 @@ def calibrated(touched, dwells=None, **changes):
     } | changes
     return calibrate_array(
         touched[0] if dwells is None else dwells,
-        pad=Pad(full_scale_pa=touched[1].full_scale_pa, mount_radius_m=RADIUS_M),
+        pad=touched_pad(touched[1]),
         **values,
     )
 
@@ -84,6 +89,15 @@ def test_creep_is_found_by_the_arms_way(fit, touched):
     assert abs(force.creep - true) < 2.5 * force.creep_sigma < 0.03
     assert 0.005 < force.array < 0.02 and force.spread == 0.0
     assert f"creep      {100 * force.creep:.1f} ± " in calibration_text(fit)
+
+
+def test_the_force_of_each_second_is_within_what_is_stated(fit, touched):
+    config, stiffness, rng = random_array(111)
+    presses = Presses(config, stiffness, rng)  # the same array
+    score = score_holds(fit.calibration, touched_pad(config), [presses.held() for _ in range(6)])
+    assert score["error_percent"] < 0.7 * score["uncorrected_percent"]
+    # of one array; 95 % of the seconds of many are within 2σ: `canprobe study arrays`
+    assert 0.5 < score["stated_percent"] / score["error_percent"] < 2.0 and score["within_percent"] > 75.0
 
 
 def test_without_a_reference_newtons_are_nominal_and_stiffness_goes_with_them(fit, touched):
