@@ -209,8 +209,8 @@ def open_cell(
         out: folder for the same files as those of `run`; None writes nothing.
         say: called with each step.
         force, observers, bridge: as for `run`.
-        rows_kept: number of cycles whose rows of the log are kept; by default all, about 1 KiB for each. With a
-            number the truth is not kept, and a scan is not scored.
+        rows_kept: number of cycles whose rows of the log are kept; by default all, about 1 KiB for each, in the folder
+            where there is one. With a number the truth is not kept, and a scan is not scored.
 
     Returns:
         The cell; ``with`` brings it up.

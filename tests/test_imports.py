@@ -25,7 +25,19 @@ MODULES = {PACKAGE / name: Path(name) for name in sorted(FILES)}
 WINGS = {
     "fieldbus": ("protocol", "eds", "bus", "node", "drive", "vcan"),
     "mechanics": ("types", "robot", "touch"),
-    "cell": ("npz", "scene", "planning", "master", "tasks", "plant", "emulated", "session", "results", "recorded"),
+    "cell": (
+        "npz",
+        "rows",
+        "scene",
+        "planning",
+        "master",
+        "tasks",
+        "plant",
+        "emulated",
+        "session",
+        "results",
+        "recorded",
+    ),
     "lab": ("bridge", "studies", "gym", "examples"),
 }
 WING_OF = {room: wing for wing, rooms in WINGS.items() for room in rooms} | {wing: wing for wing in WINGS}
@@ -35,7 +47,7 @@ BUS = {"protocol", "eds", "bus"}
 MECHANICS = {"types", "robot", "touch"}
 SCENE = {"protocol", "eds", "node", *MECHANICS, "scene"}
 PLANNING = SCENE | {"planning", "bus"}
-MASTER = PLANNING | {"master", "tasks", "npz"}
+MASTER = PLANNING | {"master", "tasks", "npz", "rows"}
 BOTH = MASTER | {"drive", "plant", "emulated", "session"}
 ALLOWED = {
     "errors": set(),
@@ -50,12 +62,13 @@ ALLOWED = {
     "robot": {"types"},
     "touch": {"types", "robot"},
     "npz": {"bus"},
+    "rows": set(),
     "scene": SCENE,
     "planning": PLANNING,
     "master": MASTER - {"tasks"},
     "tasks": MASTER,
     "plant": SCENE | {"drive"},
-    "emulated": PLANNING | {"drive", "plant", "npz"},
+    "emulated": PLANNING | {"drive", "plant", "npz", "rows"},
     "session": BOTH,
     "results": BOTH,
     "recorded": BOTH | {"results"},
@@ -71,6 +84,7 @@ ALLOWED = {
 ROOT = {"__init__", "__main__", "api", "errors", "moved"}
 # module → packages of its extra; it is imported only where the extra is asked for
 EXTRAS = {
+    "cell/results/lerobot.py": {"pyarrow", "pandas"},
     "lab/bridge/messages.py": {"rosbags"},
     "lab/bridge/mcap_file.py": {"mcap"},
     "lab/bridge/foxglove_live.py": {"foxglove"},

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.master.joint_columns import joint_positions
-from canprobe.cell.results.run_files import LOG, TACTILE, read_log, read_scene, read_summary, read_tactile
+from canprobe.cell.results.run_files import LOG, TACTILE, is_recorded, read_log, read_scene, read_summary, read_tactile
 from canprobe.cell.scene.load import SAVED_AS
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
@@ -25,6 +25,10 @@ from canprobe.lab.bridge.view.instants import JudgedAnswer, Moment, judge
 from canprobe.mechanics.touch.tangent_frames import tangent_rotation
 from canprobe.mechanics.types import Floats
 
+ROWS_SHOWN, ANSWERS_SHOWN = 72_000, 4_000
+"""Cycles, images and answers that are shown, evenly over the run: all of three minutes at 400 Hz. An hour takes no
+longer to draw, and no more memory."""
+
 
 @dataclass(frozen=True, eq=False)  # without slots: `cached_property`
 class RecordedRun:
@@ -32,7 +36,7 @@ class RecordedRun:
 
     Attributes:
         setup: resolved scene.
-        log: the columns of ``log.npz``; every row one cycle.
+        log: the columns of ``log.npz``; every row one cycle, of a long run every k-th.
         answer_rows: rows at which the estimator gave a new answer.
         answers: estimate at each of them.
         taxels: time, s, and counts (rows, columns) of each tactile frame, by rising time of the cycle that used it.
@@ -113,15 +117,18 @@ def read_run(folder: Path, setup: Setup | None = None) -> RecordedRun:
     if not folder.is_dir():
         raise UsageError(f"{folder}: no such folder; expected one that `canprobe run --out DIR` wrote")
     for name in (SAVED_AS, LOG):
-        if not (folder / name).exists():
+        if not is_recorded(folder / name):
             raise UsageError(f"{folder}: no {name} in this folder; expected one that `canprobe run --out DIR` wrote")
     read_summary(folder)
     if setup is None:
         setup = resolve(read_scene(folder))
     log = read_log(folder / LOG, setup)
+    every = -(-len(log["t_s"]) // ROWS_SHOWN) or 1
+    log = {name: np.array(log.pop(name)[::every]) for name in tuple(log)}  # one after the other: each is let go
     if not len(log["t_s"]):
         raise UsageError(f"{folder / LOG}: expected a row for each cycle, got none")
     rows = _new_answers(log)
+    rows = rows[:: -(-len(rows) // ANSWERS_SHOWN) or 1]
     shape = setup.truth.object
     return RecordedRun(
         setup=setup,
@@ -134,9 +141,10 @@ def read_run(folder: Path, setup: Setup | None = None) -> RecordedRun:
 
 def _read_taxels(file: Path, setup: Setup) -> Iterator[tuple[float, NDArray[np.uint8]]]:
     """The images that the cell used; none where there is no file, or of an array that sends features."""
-    columns = read_tactile(file, setup) if file.exists() else {}
+    columns = read_tactile(file, setup) if is_recorded(file) else {}
     if columns and np.isnan(columns["features"]).all():
-        yield from zip(columns["t_s"].tolist(), columns["taxels"], strict=True)
+        every = -(-len(columns["t_s"]) // ROWS_SHOWN) or 1
+        yield from zip(columns["t_s"][::every].tolist(), columns["taxels"][::every], strict=True)
 
 
 def _new_answers(log: dict[str, Floats]) -> NDArray[np.int64]:

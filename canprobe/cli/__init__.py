@@ -33,6 +33,7 @@ from canprobe.fieldbus.bus.real.processor import BLAS_THREADS
 COMMANDS = (
     "scenes",
     "cells",
+    "schema",
     "init",
     "plan",
     "run",
@@ -42,6 +43,7 @@ COMMANDS = (
     "monitor",
     "replay",
     "view",
+    "export",
     "calibrate",
     "study",
     "vcan",

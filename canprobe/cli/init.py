@@ -3,6 +3,7 @@
 The chain comes from a URDF; without one the file begins with the rows of a PUMA 560, to be replaced. EDS or DCF files
 are copied beside the cell file: one for all drives, or one for each joint from the base. The bus has the fastest bit
 rate that all of them and the array have. What no file says (counts a turn, gears) has a placeholder with a comment.
+Two JSON Schemas stand beside the two files: an editor completes and explains their keys.
 """
 
 from __future__ import annotations
@@ -45,13 +46,14 @@ def add_arguments(parser: Parser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Write cell.toml and first.toml, with the files that they name."""
     from canprobe.cell.scene.load import written_by_line
+    from canprobe.cell.scene.schemas import schema_line, schema_name, schema_text
     from canprobe.cli.init_cell import template_cell, urdf_cell
     from canprobe.cli.init_scene import write_with_first_scene
     from canprobe.fieldbus.bus.files import write_text, writing
     from canprobe.mechanics.robot.urdf_visuals import with_meshes_found
 
     folder: Path = args.folder
-    for name in ("cell.toml", "first.toml"):
+    for name in ("cell.toml", "first.toml", schema_name("cell"), schema_name("scene")):
         if (folder / name).exists():
             raise UsageError(f"{folder / name} exists already: choose another folder, or remove it")
     for path in (*args.eds, *([args.urdf] if args.urdf else [])):
@@ -59,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
             raise UsageError(f"{path}: no such file")
     if args.urdf is None and (args.base or args.tip):
         raise UsageError("--base and --tip are links of a URDF: give it with --urdf FILE")
-    cell = f"{written_by_line()}{urdf_cell(args) if args.urdf else template_cell(args)}"
+    cell = f"{schema_line('cell')}{written_by_line()}{urdf_cell(args) if args.urdf else template_cell(args)}"
     with _folder_or_nothing(folder):
         for path in {*args.eds, *([args.urdf] if args.urdf else [])}:
             copy = folder / path.name
@@ -67,7 +69,9 @@ def run(args: argparse.Namespace) -> int:
                 with writing(copy):
                     copy.write_bytes(with_meshes_found(path) if path == args.urdf else path.read_bytes())
         first, no_scan = write_with_first_scene(folder, cell)
-        write_text(folder / "first.toml", f"{written_by_line()}{first}")
+        write_text(folder / "first.toml", f"{schema_line('scene')}{written_by_line()}{first}")
+        for kind in ("cell", "scene"):
+            write_text(folder / schema_name(kind), schema_text(kind))
     print(f"wrote {folder / 'cell.toml'} and {folder / 'first.toml'}")
     if no_scan:
         print(f"first.toml moves the arm freely: a scan was refused: {no_scan}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,13 +13,14 @@ from numpy.typing import NDArray
 
 from canprobe.cell.emulated.array import make_tactile_node
 from canprobe.cell.emulated.raw_array import RawArray
-from canprobe.cell.emulated.truth_columns import TruthColumns, with_units
+from canprobe.cell.emulated.truth_columns import with_units
 from canprobe.cell.planning.model import Plan, PlannedNode
 from canprobe.cell.planning.motion import parked_posture
 from canprobe.cell.planning.units import FEED, GEAR_RATIO, RESOLUTION
 from canprobe.cell.plant.config import PlantConfig, PressMotion
-from canprobe.cell.plant.plant import Plant
+from canprobe.cell.plant.plant import Plant, PlantState, TruthRow, truth_columns
 from canprobe.cell.plant.taxels import TaxelConfig
+from canprobe.cell.rows import BLOCK_ROWS, LazyColumns, Rows
 from canprobe.cell.scene.setup import Setup
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.drive.drive import make_drive_node
@@ -36,41 +38,77 @@ from canprobe.mechanics.types import Floats
 class TruthRecorder(Participant):
     """A silent participant of the bus that notes the plant's state at every SYNC, beside what the nodes measure.
 
-    What is true in that state is computed afterwards: in real time it would make the nodes' next answers late.
-
     Args:
         plant: plant whose truth is recorded.
+        at_once: whether what is true is computed at each SYNC. In real time it would make the nodes' next answers late,
+            and is computed afterwards.
+        folder: folder for the blocks, in a file ``truth.npy``; None keeps them in memory.
 
     Attributes:
         origin_ns: time on the bus's clock that is 0 in the column ``t_s``.
+        rows: rows of the states whose truth is computed; None before the first.
     """
 
     name = "truth recorder"
     hears_every_sync = True
     listens = frozenset((SYNC_ID,))
 
-    def __init__(self, plant: Plant) -> None:
+    def __init__(self, plant: Plant, *, at_once: bool = False, folder: Path | None = None) -> None:
         self._plant = plant
+        self._at_once = at_once
+        self._file = folder / "truth.npy" if folder is not None else None
         self.origin_ns = 0
-        self._rows: list[tuple[int, int, Any]] = []
+        self.rows: Rows | None = None
+        self._stamps: list[tuple[int, int]] = []
+        self._states: list[PlantState] = []
+        self._truths: list[TruthRow] = []
 
     def receive(self, can_id: int, data: bytes, t_ns: int) -> list[Frame]:
         """Take the state of the plant at a SYNC."""
         if can_id == SYNC_ID:
             self._plant.advance(t_ns)
-            self._rows.append((t_ns, data[0] if data else 0, self._plant.state()))
+            self._stamps.append((t_ns, data[0] if data else 0))
+            if not self._at_once:
+                self._states.append(self._plant.state())
+                return []
+            self._truths.append(self._plant.truth_row())
+            if len(self._truths) >= BLOCK_ROWS:
+                self._compute()
         return []
 
-    def arrays(self) -> TruthColumns:
-        """Columns, one row a SYNC: t_s (s), sync_count (0, 1, …), sync_counter (of the frame, 0 without), the truth."""
-        columns: dict[str, NDArray[Any]] = {
-            "t_s": np.array([t_ns - self.origin_ns for t_ns, _, _ in self._rows], dtype=np.float64) * 1e-9,
-            "sync_count": np.arange(len(self._rows), dtype=np.int64),
-            "sync_counter": np.array([counter for _, counter, _ in self._rows], dtype=np.int64),
-        }
+    def columns(self) -> LazyColumns:
+        """A row for each SYNC: t_s (s), sync_count (0, 1, …), sync_counter (of the frame, 0 without), the truth."""
+        return self._compute().columns()
+
+    def remove(self) -> None:
+        """Remove the file; its rows are in ``truth.npz`` by now."""
+        if self.rows is not None:
+            self.rows.remove()
+
+    def _compute(self) -> Rows:
+        """Make rows of what waits."""
+        if not self._stamps and self.rows is not None:
+            return self.rows
+        stamps, states, truths = self._stamps, self._states, self._truths
+        self._stamps, self._states, self._truths = [], [], []
         model = self._plant.config.model
-        prismatic = () if model is None else model.chain.prismatic
-        return with_units(columns | self._plant.truths([state for _, _, state in self._rows]), prismatic)
+        found = truth_columns(truths) if self._at_once else self._plant.truths(states)
+        columns: dict[str, NDArray[Any]] = {
+            "t_s": np.array([t_ns - self.origin_ns for t_ns, _ in stamps], dtype=np.float64) * 1e-9,
+            "sync_count": np.arange(len(stamps), dtype=np.int64) + (0 if self.rows is None else len(self.rows)),
+            "sync_counter": np.array([counter for _, counter in stamps], dtype=np.int64),
+            **{name: column if column.dtype == bool else np.asarray(column, float) for name, column in found.items()},
+        }
+        named = with_units(columns, () if model is None else model.chain.prismatic)
+        if self.rows is None:
+            fields = [(name, column.dtype, column.shape[1:]) for name, column in named.items()]
+            self.rows = Rows(fields, self._file)
+        table = np.empty(len(stamps), self.rows.dtype)
+        for name in self.rows.dtype.names or ():
+            table[name] = named[name]
+        self.rows.add(table.tobytes())
+        self.rows.flush()
+        return self.rows
 
 
 def _set_turn_units(node: SlaveNode, units: float | None) -> None:
@@ -111,6 +149,8 @@ def make_world(
     node_ids: Collection[int],
     *,
     truth: bool = True,
+    at_once: bool = False,
+    folder: Path | None = None,
     without_id: Collection[int] = (),
     homed: bool = True,
 ) -> World:
@@ -122,6 +162,7 @@ def make_world(
         plan: plan of the scene.
         node_ids: ids of the nodes to emulate.
         truth: whether the truth is recorded.
+        at_once, folder: as for `TruthRecorder`.
         without_id: ids of the nodes that start without a node id and wait for LSS to give them one.
         homed: drives that have to be homed start with their zeros, and keep them.
     """
@@ -132,7 +173,8 @@ def make_world(
             continue
         node_id = UNCONFIGURED_ID if node.node_id in without_id else node.node_id
         nodes.append(_node(plan.setup, node, node_id, plant, homed))
-    return World(tuple(nodes), plant, TruthRecorder(plant) if truth else None, _raw_array(plan.setup, plant))
+    recorder = TruthRecorder(plant, at_once=at_once, folder=folder) if truth else None
+    return World(tuple(nodes), plant, recorder, _raw_array(plan.setup, plant))
 
 
 def _raw_array(setup: Setup, plant: Plant) -> RawArray | None:

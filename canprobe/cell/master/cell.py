@@ -72,8 +72,7 @@ class Cell:
 
     Attributes:
         drives, tactile: drives of the arm, and receiver of the array; None in a scene without one.
-        log: one row for each cycle, with times since the first SYNC, so that results do not depend on the time of
-            bring-up; `start_ns` converts them to the run's clock.
+        log: one row for each cycle.
         tactile_log: one row for each tactile frame, on the same clock.
         notes: faults that did not stop the cell.
         watch: states and errors that the nodes report.
@@ -95,8 +94,9 @@ class Cell:
         zeros: Path | None = None,
     ) -> None:
         setup = plan.setup
-        self.log = RunLog(options.rows_kept)
-        self.tactile_log = TactileLog(options.rows_kept)
+        rows = options.rows_folder
+        self.log = RunLog(options.rows_kept, rows)
+        self.tactile_log = TactileLog(options.rows_kept, rows)
         self.drives = make_drives(plan)
         self.tactile = make_tactile(plan)
         self.notes = Notes()
@@ -191,6 +191,7 @@ class Cell:
                 on_arrival=not isinstance(self._port.clock, VirtualClock),
                 kept=self._options.rows_kept,
             )
+            self.log.start_s = self.start_ns * 1e-9
             self.watch.start(self._port.clock.now_ns())
             if self.homing is not None:
                 self.homing.look()
@@ -415,7 +416,7 @@ class Cell:
             overruns=self.cycle.statistics.overruns,
             counters=self._port.counters,
             controller_state=self._port.state,
-            log_failure=self._log_failure(),
+            log_failure=self._log_failure() or self.log.failure,
         )
 
     def _supervise_enabling(self) -> None:
@@ -482,7 +483,8 @@ class Cell:
 
     def _record(self, measurement: Measurement, command: Command | None) -> None:
         assert self.cycle is not None
-        row: dict[str, object] = {"t_s": measurement.t_ns * 1e-9, "sync_late_us": self.cycle.late_ns * 1e-3}
+        t_s = measurement.t_ns * 1e-9 + self.log.start_s
+        row: dict[str, object] = {"t_s": t_s, "sync_late_us": self.cycle.late_ns * 1e-3}
         if self.drives is not None:
             if measurement.q is not None:
                 row.update(joint_columns("q", measurement.q, self._slides))
@@ -497,7 +499,7 @@ class Cell:
         if self.tactile is not None:
             row["tactile_age"] = measurement.tactile_age
             if measurement.tactile is not None:
-                self.tactile_log.add(measurement.t_ns, measurement.tactile)
+                self.tactile_log.add(t_s, self.log.start_s, measurement.tactile)
         self.log.add(row)
         if self._observers is not None:
             self._observers.cycle(self.start_ns, measurement, command)

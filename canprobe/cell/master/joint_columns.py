@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Mapping, MutableSequence
-from dataclasses import astuple, fields
+from collections.abc import Mapping
+from dataclasses import astuple
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.master.controller import TactileSample
-from canprobe.fieldbus.protocol.tactile import Features
+from canprobe.cell.rows import BLOCK_ROWS, LazyColumns, Rows
 from canprobe.mechanics.types import Floats
 
 
@@ -50,30 +50,43 @@ class TactileLog:
 
     Args:
         kept: how many frames are kept, the last ones; None for all.
+        folder: folder for their file, ``tactile.npy``; None keeps them in memory.
     """
 
-    def __init__(self, kept: int | None = None) -> None:
-        self._rows: MutableSequence[tuple[int, TactileSample]] = [] if kept is None else deque(maxlen=kept)
+    def __init__(self, kept: int | None = None, folder: Path | None = None) -> None:
+        self.rows: Rows | None = None
+        self._kept = kept
+        self._file = folder / "tactile.npy" if folder is not None else None
+        self._row: Any = None
+        self._added = 0
 
-    def add(self, t_ns: int, sample: TactileSample) -> None:
-        """Append the sample that became usable in the cycle at ``t_ns``."""
-        self._rows.append((t_ns, sample))
+    def add(self, t_s: float, start_s: float, sample: TactileSample) -> None:
+        """Append the sample that became usable in the cycle at ``t_s``, on the run's clock; 0 of its own is `start_s`.
 
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """One row a frame (m, ...): when it was usable and sampled, s, taxels, their window, features; empty without.
-
-        Features (m, 7) are NaN in a frame of taxels. A device of raw frames has their values (m, rows, columns, axes).
+        A device of raw frames has their values besides; features are NaN in a frame of taxels.
         """
-        if not self._rows:
-            return {}
-        frames = [sample.frame for _, sample in self._rows]
-        none = (np.nan,) * len(fields(Features))
-        raw = [frame.raw for frame in frames if frame.raw is not None]
-        return ({"raw": np.array(raw)} if raw else {}) | {
-            "t_s": np.array([t_ns * 1e-9 for t_ns, _ in self._rows]),
-            "t_sample_s": np.array([sample.t_sample_ns * 1e-9 for _, sample in self._rows]),
-            "t_sigma_s": np.array([sample.t_sigma_s for _, sample in self._rows]),
-            "taxels": np.array([frame.taxels for frame in frames]),
-            "window": np.array([frame.window for frame in frames]),
-            "features": np.array([none if f.features is None else astuple(f.features) for f in frames]),
-        }
+        frame, row = sample.frame, self._row
+        if self.rows is None:
+            raw = [] if frame.raw is None else [("raw", frame.raw.dtype, frame.raw.shape)]
+            times = [(name, np.float64) for name in ("t_s", "t_sample_s", "t_sigma_s")]
+            of_frame = [("taxels", np.uint8, frame.taxels.shape), ("window", np.int64, 4), ("features", np.float64, 7)]
+            row = self._row = np.zeros(1, [*raw, *times, *of_frame])
+            self.rows = Rows(row.dtype, self._file, self._kept)
+        if frame.raw is not None:
+            row["raw"] = frame.raw
+        row["t_s"], row["t_sample_s"], row["t_sigma_s"] = t_s, sample.t_sample_ns * 1e-9 + start_s, sample.t_sigma_s
+        row["taxels"], row["window"] = frame.taxels, frame.window
+        row["features"] = np.nan if frame.features is None else astuple(frame.features)
+        self.rows.add(row.tobytes())
+        self._added += 1
+        if self._file is not None and self._added % BLOCK_ROWS == 0:
+            self.rows.flush()
+
+    def columns(self) -> LazyColumns:
+        """A row for each frame (m, ...): when it was usable and sampled, s, taxels, their window, features."""
+        return LazyColumns({}) if self.rows is None else self.rows.columns()
+
+    def remove(self) -> None:
+        """Remove the file; its rows are in ``tactile.npz`` by now."""
+        if self.rows is not None:
+            self.rows.remove()

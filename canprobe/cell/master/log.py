@@ -1,21 +1,24 @@
-"""The run's log: a row a cycle and a row a tactile frame, in memory; and the notes of what went wrong."""
+"""The run's log: a row a cycle; and the notes of what went wrong."""
 
 from __future__ import annotations
 
 import warnings
 from collections import deque
-from collections.abc import Iterable, MutableSequence, Sequence
+from collections.abc import Iterable, Iterator, MutableSequence, Sequence
 from copy import copy
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.cell.rows import BLOCK_ROWS, NUMBER, LazyColumns, Rows
 from canprobe.mechanics.types import Floats
 
 _NO_NUMBERS = (TypeError, ValueError, OverflowError)
-_Part = tuple[list[int], Sequence[Any] | Floats]
-"""Rows of a column and their values."""
+_Part = tuple[NDArray[np.int64], Sequence[Any] | Floats]
+"""Numbers of rows in the log, and the values of a column there."""
 
 
 class _RowKind:
@@ -23,43 +26,69 @@ class _RowKind:
 
     Args:
         names: names of the columns, in order.
+        file: file of the rows; None keeps them in memory.
+        kept: number of rows that are kept; None for all.
+
+    Attributes:
+        odd: rows with a value that is no number or has another shape, with their number in the log; in memory.
     """
 
-    def __init__(self, names: tuple[str, ...]) -> None:
+    def __init__(self, names: tuple[str, ...], file: Path | None, kept: int | None) -> None:
         self.names = names
+        self.odd: MutableSequence[tuple[int, tuple[Any, ...]]] = [] if kept is None else deque(maxlen=kept)
+        self.rows: Rows | None = None
+        self._file, self._kept = file, kept
         self._block = np.empty(0)
         self._views: list[Floats] = []
 
-    def packed(self, values: Iterable[Any]) -> bytes | tuple[Any, ...]:
-        """A copy of a row's values: one block, or a tuple where one of them is no number or has another shape."""
+    def add(self, number: int, values: Iterable[Any]) -> None:
+        """Append a row with its number in the log; nothing in it changes with the arrays that were given."""
         try:
-            if not self._views:
+            if self.rows is None:
                 self._lay_out([np.asarray(value) for value in values])
             for view, value in zip(self._views, values, strict=True):
                 view[...] = value
         except _NO_NUMBERS:
-            return tuple(copy(value) for value in values)
-        return self._block.tobytes()
-
-    @property
-    def width(self) -> int:
-        """Count of numbers in a block."""
-        return len(self._block)
-
-    def column(self, name: str, blocks: Floats) -> Floats:
-        """The values (n, ...) of a name in blocks (n, width)."""
-        place = self.names.index(name)
-        start, shape = sum(view.size for view in self._views[:place]), self._views[place].shape
-        return blocks[:, start : start + self._views[place].size].reshape(len(blocks), *shape)
+            self.odd.append((number, tuple(copy(value) for value in values)))
+            return
+        assert self.rows is not None
+        self._block[0] = number
+        self.rows.add(self._block.tobytes())
 
     def _lay_out(self, values: Sequence[NDArray[Any]]) -> None:
         if any(value.dtype.kind not in "biuf" for value in values):
-            return
-        self._block = np.empty(sum(value.size for value in values))
-        start = 0
+            raise TypeError("a value that is no number")
+        fields = [(name, np.float64, value.shape) for name, value in zip(self.names, values, strict=True)]
+        self.rows = Rows([(NUMBER, np.float64), *fields], self._file, self._kept)
+        self._block = np.empty(1 + sum(value.size for value in values))
+        start = 1
         for value in values:
             self._views.append(self._block[start : start + value.size].reshape(value.shape))
             start += value.size
+
+    def stored(self, name: str, first: int) -> Iterator[_Part]:
+        """Values of a column from the row `first` of the log on, in blocks."""
+        for block in self.rows.blocks() if self.rows is not None else ():
+            numbers = block[NUMBER].astype(np.int64)
+            start = int(np.searchsorted(numbers, first))
+            if start < len(numbers):
+                yield numbers[start:], block[name][start:]
+
+    def single(self, name: str, first: int) -> Iterator[_Part]:
+        """Values of a column from the row `first` on in odd rows, without None."""
+        place = self.names.index(name)
+        for number, values in self.odd:
+            if number >= first and values[place] is not None:
+                yield np.array([number]), [values[place]]
+
+    def has_rows(self, first: int) -> bool:
+        """Whether there are rows from the row `first` on."""
+        return any(True for _ in self.stored(NUMBER, first)) or any(number >= first for number, _ in self.odd)
+
+
+def since_first_sync(t_s: Floats, start_s: float) -> Floats:
+    """Times on the run's clock, s, as times since the first SYNC at `start_s`, equal to the cell's to the last bit."""
+    return np.asarray(np.round((t_s - start_s) * 1e9).astype(np.int64) * 1e-9)
 
 
 class RunLog:
@@ -67,65 +96,87 @@ class RunLog:
 
     Column names carry their unit as a suffix (``t_s``, ``q_rad``, ``force_n``). Values are numbers or small vectors.
     A row is kept as one block of numbers: sorting its values into columns would cost ten times as much in the cycle,
-    keeping them as they come four times the memory. Nothing in it changes with the arrays that were given.
+    keeping them as they come four times the memory.
 
     Args:
         kept: how many rows are kept, the last ones: a cell that is left running for days must not grow; None for all.
+        folder: folder for the rows, in a file for each kind of row (``log-0.npy``); None keeps them in memory.
+
+    Attributes:
+        start_s: time of the first SYNC on the clock of the rows.
     """
 
-    def __init__(self, kept: int | None = None) -> None:
-        self._rows: MutableSequence[tuple[_RowKind, bytes | tuple[Any, ...]]]
-        self._rows = [] if kept is None else deque(maxlen=kept)
+    def __init__(self, kept: int | None = None, folder: Path | None = None) -> None:
+        self._kept = kept
+        self._folder = folder
+        self.start_s = 0.0
+        self._added = 0
         self._kinds: dict[tuple[str, ...], _RowKind] = {}
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return self._added if self._kept is None else min(self._added, self._kept)
 
     def add(self, row: dict[str, object]) -> None:
         """Append one row."""
         names = tuple(row)
         kind = self._kinds.get(names)
         if kind is None:
-            kind = self._kinds[names] = _RowKind(names)
-        self._rows.append((kind, kind.packed(row.values())))
+            file = self._folder / f"log-{len(self._kinds)}.npy" if self._folder is not None else None
+            kind = self._kinds[names] = _RowKind(names, file, self._kept)
+        kind.add(self._added, row.values())
+        self._added += 1
+        if self._folder is not None and self._added % BLOCK_ROWS == 0:
+            self.flush()
 
-    def arrays(self) -> dict[str, Floats]:
-        """Every column that the rows have, (n,) or (n, k).
+    @property
+    def _stored(self) -> list[Rows]:
+        return [kind.rows for kind in self._kinds.values() if kind.rows is not None]
+
+    def flush(self) -> None:
+        """Write the rows that wait."""
+        for rows in self._stored:
+            rows.flush()
+
+    @property
+    def failure(self) -> str | None:
+        """Why rows are no longer written; None while they are."""
+        return next((rows.failure for rows in self._stored if rows.failure is not None), None)
+
+    def remove(self) -> None:
+        """Remove the files of the rows; they are in ``log.npz`` by now."""
+        for rows in self._stored:
+            rows.remove()
+
+    def columns(self) -> LazyColumns:
+        """Every column that the rows have, (n,) or (n, k); without a row ``t_s`` alone.
 
         A value of another shape than its column's first, or none, is NaN, with a warning: one must not cost the others.
         """
-        kinds = dict.fromkeys(kind for kind, _ in self._rows)
-        columns: dict[str, list[_Part]] = {name: [] for kind in kinds for name in kind.names}
-        blocks: dict[_RowKind, tuple[list[int], list[bytes]]] = {}
-        for i, (kind, values) in enumerate(self._rows):
-            if isinstance(values, bytes):
-                rows, packed = blocks.setdefault(kind, ([], []))
-                rows.append(i)
-                packed.append(values)
-            else:
-                for name, value in zip(kind.names, values, strict=True):
-                    if value is not None:
-                        columns[name].append(([i], [value]))
-        for kind, (rows, packed) in blocks.items():
-            table = np.frombuffer(b"".join(packed)).reshape(len(rows), kind.width)
-            for name in kind.names:
-                columns[name].append((rows, kind.column(name, table)))
-        return {name: self._column(name, parts) for name, parts in columns.items()}
+        first = self._added - len(self)
+        names = dict.fromkeys(name for kind in self._kinds.values() if kind.has_rows(first) for name in kind.names)
+        return LazyColumns({name: partial(self._column, name, first) for name in names or ("t_s",)})
 
-    def _column(self, name: str, parts: list[_Part]) -> Floats:
-        """A column of its parts; the first value of all decides the shape."""
-        parts = sorted(parts, key=lambda part: part[0][0])
+    def arrays(self) -> dict[str, Floats]:
+        """The columns in memory, with ``t_s`` since the first SYNC."""
+        columns = dict(self.columns())
+        return columns | {"t_s": since_first_sync(columns["t_s"], self.start_s)} if "t_s" in columns else columns
+
+    def _column(self, name: str, first: int) -> Floats:
+        """A column; the first value of all decides the shape."""
+        kinds = [kind for kind in self._kinds.values() if name in kind.names]
+        ways = [way(name, first) for kind in kinds for way in (kind.stored, kind.single)]
+        heads = [head for head in (next(way, None) for way in ways) if head is not None]
         try:
-            shape = np.shape(parts[0][1][0]) if parts else ()
+            shape = np.shape(min(heads, key=lambda head: int(head[0][0]))[1][0]) if heads else ()
         except ValueError:  # rows of unequal length
             shape = ()
-        out = np.full((len(self._rows), *shape), np.nan)
+        out = np.full((len(self), *shape), np.nan)
         misfits = 0
-        for rows, values in parts:
+        for numbers, values in (p for kind in kinds for way in (kind.stored, kind.single) for p in way(name, first)):
             if isinstance(values, np.ndarray) and values.shape[1:] == shape:
-                out[rows] = values
+                out[numbers - first] = values
                 continue
-            for i, value in zip(rows, values, strict=True):
+            for i, value in zip(numbers - first, values, strict=True):
                 try:
                     out[i] = value
                 except _NO_NUMBERS:

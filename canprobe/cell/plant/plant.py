@@ -38,6 +38,10 @@ SWITCH_DISTANCE_SHARE = 0.01
 """Distance of the limit switches beyond a joint's range, as a share of the range."""
 
 
+TruthRow = dict[str, float | tuple[float, ...]]
+"""True values of an instant in plain numbers, by name; see `Plant.truth`."""
+
+
 class PlantState(NamedTuple):
     """All that the truth of an instant follows from.
 
@@ -261,9 +265,11 @@ class Plant:
 
     def truths(self, states: Sequence[PlantState]) -> dict[str, Floats]:
         """`truth` of many states, a row each; empty without a state."""
-        rows = [tuple(_true(self._solve(state)).values()) for state in states]
-        names = _true(self._solve(states[0])) if states else ()
-        return {name: np.array(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)}
+        return truth_columns([self.truth_row(state) for state in states])
+
+    def truth_row(self, state: PlantState | None = None) -> TruthRow:
+        """`truth` in plain numbers; that of the present state costs nothing where the array was just sampled."""
+        return _true(self._solution() if state is None else self._solve(state))
 
     def _solution(self) -> _Solution:
         if self._solved is None:
@@ -388,7 +394,12 @@ class _Solution:
     several: bool = False  # it touches in several places or all over, and these are of the deepest
 
 
-def _true(s: _Solution) -> dict[str, float | tuple[float, ...]]:
+def truth_columns(rows: Sequence[TruthRow]) -> dict[str, Floats]:
+    """Columns of truths, one row each; empty without a row."""
+    return {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
+
+
+def _true(s: _Solution) -> TruthRow:
     """The values of `Plant.truth` in plain numbers."""
     return {
         "q": s.q,

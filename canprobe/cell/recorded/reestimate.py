@@ -16,7 +16,7 @@ from canprobe.cell.recorded.cycles import LogCycles, replay_contacts
 from canprobe.cell.recorded.recording import read_recording
 from canprobe.cell.recorded.run_folder import RunFolder, read_run, replay_task
 from canprobe.cell.results.map_score import estimate_columns, map_of_scan
-from canprobe.cell.results.run_files import LOG, TACTILE, TRUTH, needed, read_log, read_scene, read_truth
+from canprobe.cell.results.run_files import LOG, TACTILE, TRUTH, is_recorded, needed, read_log, read_scene, read_truth
 from canprobe.cell.results.summary import finite_or_none, summarise_shape
 from canprobe.cell.results.text import curvature_text, shape_lines
 from canprobe.cell.scene.load import load_scene
@@ -122,7 +122,7 @@ def _summarise(
 
 def _truth(file: Path, setup: Setup) -> dict[str, Floats]:
     """The plant's truth, one row per SYNC; empty without the file, or where nothing happened."""
-    columns = read_truth(file, setup) if file.exists() else {}
+    columns = read_truth(file, setup) if is_recorded(file) else {}
     if not columns or not len(next(iter(columns.values()))):
         return {}
     needed(columns, _SCORED, file)
@@ -145,7 +145,7 @@ def _last(records: Sequence[ShapeRecord], start_s: float) -> dict[str, Any]:
 def _online(folder: Path, setup: Setup, records: Sequence[ShapeRecord]) -> dict[str, Any] | None:
     """Difference of the replayed curvature of the estimator in the loop and the logged one, number by number."""
     path = folder / LOG
-    logged = read_log(path, setup).get("K_per_m") if path.exists() else None
+    logged = read_log(path, setup).get("K_per_m") if is_recorded(path) else None
     if logged is None:
         return None
     online = _changes(logged[np.isfinite(logged).all(axis=(1, 2))])
@@ -276,7 +276,7 @@ def find_log(log: Path) -> tuple[Path, Path | None]:
     if not log.is_dir():
         return log, None
     path = log / "bus.log"
-    if not path.exists() and not (log / TACTILE).exists():
+    if not path.exists() and not is_recorded(log / TACTILE):
         raise UsageError(f"{log}: no bus.log in this folder; expected the folder of a run, or a candump file")
     return path, log
 

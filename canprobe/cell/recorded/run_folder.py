@@ -14,7 +14,7 @@ from canprobe.cell.master.controller import Measurement, TactileSample
 from canprobe.cell.master.joint_columns import joint_positions
 from canprobe.cell.master.tactile_frame import TactileFrame
 from canprobe.cell.planning.model import Plan
-from canprobe.cell.results.run_files import LOG, TACTILE, needed, read_log, read_summary, read_tactile
+from canprobe.cell.results.run_files import LOG, TACTILE, is_recorded, needed, read_log, read_summary, read_tactile
 from canprobe.cell.scene.setup import Setup
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cell.tasks.probing import Phase
@@ -111,7 +111,7 @@ def _frame(taxels: NDArray[np.uint8], window: tuple[int, int, int, int], feature
 
 
 def read_run(folder: Path, setup: Setup) -> RunFolder | None:
-    """The measurements of a run; None where the folder has none, as when the run was killed.
+    """The measurements of a run; None where the folder has none.
 
     Args:
         folder: folder of the run.
@@ -122,7 +122,7 @@ def read_run(folder: Path, setup: Setup) -> RunFolder | None:
     """
     read_summary(folder)
     log, tactile = folder / LOG, folder / TACTILE
-    if not log.exists() or not tactile.exists():
+    if not is_recorded(log) or not is_recorded(tactile):
         return None
     columns, images = read_log(log, setup), read_tactile(tactile, setup)
     needed(columns, ("q_age", *(("q_rad",) if joint_positions(columns) is None else ())), log)

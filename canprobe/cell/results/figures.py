@@ -18,6 +18,7 @@ from canprobe.cell.results.picture import (
     ORANGE,
     SKY,
     box,
+    drawn_rows,
     legend,
     parts,
     picture,
@@ -119,8 +120,9 @@ def _draw_tool(part: SubFigure, result: RunData) -> None:
 def _draw_trajectory(part: SubFigure, result: RunData) -> None:
     """Draw the path of the contact and the surface recovered from it, over the true one."""
     axes = part.add_subplot(projection="3d", computed_zorder=False)
-    points, normals = result.log["contact_mm"] * 1e-3, result.log["normal"]
-    touched = (result.log["phase"] == Phase.SCAN) & np.isfinite(points).all(axis=1)
+    every = drawn_rows(len(result.log["t_s"]))
+    points, normals = result.log["contact_mm"][every] * 1e-3, result.log["normal"][every]
+    touched = (result.log["phase"][every] == Phase.SCAN) & np.isfinite(points).all(axis=1)
     points, normals = points[touched], normals[touched]
     axes.plot(*1e3 * points.T, color=ORANGE, linewidth=0.9, zorder=3)
     shown, azimuth = ["orange: measured path"], -60.0
@@ -140,10 +142,11 @@ def _draw_trajectory(part: SubFigure, result: RunData) -> None:
 
 def _draw_force(part: SubFigure, result: RunData) -> None:
     axes, t = part.subplots(), result.log["t_s"]
+    every = drawn_rows(len(t))
     if "force_n" in result.truth and np.any(result.truth["force_n"] > 0):
         n = min(len(t), len(result.truth["force_n"]))
-        axes.plot(t[:n], result.truth["force_n"][:n], color=INK, linewidth=0.9, label="true (plant)")
-    axes.plot(t, result.log["force_n"], color=BLUE, linewidth=0.9, label="measured (array)")
+        axes.plot(t[:n][every], result.truth["force_n"][:n][every], color=INK, linewidth=0.9, label="true (plant)")
+    axes.plot(t[every], result.log["force_n"][every], color=BLUE, linewidth=0.9, label="measured (array)")
     target = result.summary["contact"]["force_target_n"]
     if target is not None:
         axes.axhline(target, color=GREEN, linestyle="--", label=f"target {target:g} N")
@@ -207,7 +210,8 @@ def _draw_joints(part: SubFigure, result: RunData) -> None:
     arm = result.plan.setup.arm
     q = joint_positions(result.log)
     assert arm is not None and q is not None
-    t, joints = result.log["t_s"], arm.model.joints
+    every, joints = drawn_rows(len(q)), arm.model.joints
+    t, q = result.log["t_s"][every], q[every]
     columns = min(3, len(joints))
     turns = len({joint.prismatic for joint in joints}) == 1
     grid = part.subplots(-(-len(joints) // columns), columns, squeeze=False, sharex=True, sharey=turns)

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
-from canprobe.mechanics.touch.consistency import PARTS, Consistency, check_consistency
+from canprobe.mechanics.touch.consistency import CROSSING_RADIUS_M, PARTS, Consistency, check_consistency
 from canprobe.mechanics.touch.surface_map import LocalPatch, SurfaceMap, merge_patches
 from canprobe.mechanics.types import Floats
 
 SAME_DIRECTION_RAD = math.radians(30.0)
 """Passes whose directions differ by less have the same hysteresis of the array."""
+PAIRS_TESTED = 5000
+"""Pairs of patches near each other that are tested as crossings: their number grows with the square of the time that a
+scan goes over one place, and a test takes a third of a millisecond."""
 
 
 def map_of_scan(
@@ -31,9 +36,8 @@ def map_of_scan(
         The map, the tests at its crossings, and its section of ``summary.json``: None without a test.
     """
     patches = [LocalPatch.of(r.estimate, t_s=start_s + r.t_s, travelled_m=r.travelled_m) for r in tracker.records]
-    path = np.array([sample.p_base for sample in tracker.samples]).reshape(-1, 3)
-    surface_map = merge_patches(patches, path[np.isfinite(path).all(axis=1)], method=method)
-    consistency = check_consistency(surface_map)
+    surface_map = merge_patches(patches, np.frombuffer(tracker.path).reshape(-1, 3), method=method)
+    consistency = _tested(surface_map)
     return (
         surface_map,
         consistency,
@@ -45,6 +49,21 @@ def map_of_scan(
             **{part: _verdict(consistency, part) for part in PARTS},
         },
     )
+
+
+def _tested(surface_map: SurfaceMap) -> Consistency:
+    """The tests at the crossings; where more pairs are near each other than `PAIRS_TESTED`, of every k-th patch."""
+    every = 1
+    while len(points := surface_map.points[::every]):
+        tree = cKDTree(points)
+        if tree.count_neighbors(tree, CROSSING_RADIUS_M) - len(points) <= 2 * PAIRS_TESTED:
+            break
+        every *= 2
+    if every == 1:
+        return check_consistency(surface_map)
+    found = check_consistency(replace(surface_map, patches=surface_map.patches[::every]))
+    crossings = tuple(replace(c, first=every * c.first, second=every * c.second) for c in found.crossings)
+    return Consistency(crossings, found.independent)
 
 
 def _verdict(consistency: Consistency, part: str) -> dict[str, float | None]:

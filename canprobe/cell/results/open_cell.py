@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
@@ -13,22 +14,22 @@ import numpy.typing as npt
 from canprobe.cell.master.array import PatchReader, make_patch_reader
 from canprobe.cell.master.cell import Cell
 from canprobe.cell.master.controller import Command, Controller, Measurement, TactileSample, as_controller
+from canprobe.cell.master.log import since_first_sync
 from canprobe.cell.master.observers import Observers
 from canprobe.cell.master.options import RunOptions, Say
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.result import RunResult
 from canprobe.cell.results.run_data import RunData
+from canprobe.cell.results.run_files import LOG, TACTILE
 from canprobe.cell.results.summary import (
-    log_columns,
     score_methods,
     summarise,
-    tactile_columns,
     truth_of,
     without_nan,
-    write_columns,
     write_files,
     write_summary,
 )
+from canprobe.cell.rows import ROWS_FOLDER
 from canprobe.cell.scene.setup import Setup, Touch
 from canprobe.cell.session.children import Bridges
 from canprobe.cell.session.session import Session
@@ -69,7 +70,8 @@ class OpenCell:
 
     def __init__(self, plan: Plan, options: RunOptions, *, task: Controller | None = None) -> None:
         self.plan = plan
-        self.session = Session(plan, options)
+        folder = None if options.out is None or options.rows_kept is not None else options.out / ROWS_FOLDER
+        self.session = Session(plan, replace(options, rows_folder=folder))
         self._out, self._say, self._early_summary = options.out, options.say, options.early_summary
         self._bridges = Bridges(plan, options.out, virtual=self.session.virtual, say=options.say)
         self._task = task
@@ -178,17 +180,14 @@ class OpenCell:
             self._bridges.end(None)
 
     def _conclude(self, failure: BaseException | None) -> None:
-        log, tactile = log_columns(self.cell), tactile_columns(self.cell)
-        try:
+        with interrupts_held():
+            log, tactile = self.session.keep(LOG, self.cell.log), self.session.keep(TACTILE, self.cell.tactile_log)
             data = self._score(log, tactile, failure)
-        except BaseException:  # the measurements are kept all the same
-            self._write(lambda out: write_columns(log, tactile, out))
-            raise
-        self._result.complete(data)
-        summary, lines = data.summary, self.session.unwritten
-        if isinstance(failure, CanprobeError):
-            failure.summary = summary
-        self._write(lambda out: write_files(data, out))
+            self._result.complete(data)
+            summary, lines = data.summary, self.session.unwritten
+            if isinstance(failure, CanprobeError):
+                failure.summary = summary
+            self._write(lambda out: write_files(data, out))
         if failure is None:
             self._early_summary(summary)
         self._estimate_again(data)
@@ -222,6 +221,7 @@ class OpenCell:
             record,
             estimates,
             None if failure is None else _reason(failure),
+            log=log,
             map_summary=map_summary,
             bridges=self._bridges.status(),
         )
@@ -248,7 +248,7 @@ class OpenCell:
             self._say(f"estimate again with {method}")
             found = estimates_of(setup, tracker, [method], MOST_REPLAYED)
             if truth := truth_of(self.session):
-                scores = score_methods(found, truth, self.cell.log.arrays()["t_s"])
+                scores = score_methods(found, truth, since_first_sync(data.log["t_s"], self.cell.log.start_s))
                 data.summary["shape"]["methods"] |= without_nan(scores)
             start_s = self.cell.start_ns * 1e-9
             data.estimates.update({name: on_run_clock(records, start_s) for name, records in found.items()})

@@ -46,6 +46,13 @@ _LETTER_IN = 0.062
 """Mean width of a letter of a legend, inches."""
 MIN_DEPTH_MM = 6.0
 """Least height of a box, mm, for planes."""
+ROWS_DRAWN = 40_000
+"""Most points of a curve: 100 s of a cell at 400 Hz."""
+
+
+def drawn_rows(count: int) -> slice:
+    """Rows that a picture shows of a number of rows: all, or every k-th of a long run."""
+    return slice(None, None, -(-count // ROWS_DRAWN) or 1)
 
 
 class Sheet(Figure):

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -12,13 +13,16 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.cell.npz import write_npz
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.files import to_frame, write_parquet
 from canprobe.cell.results.run_data import RunData
+from canprobe.cell.results.run_files import LOG, TACTILE
 from canprobe.cell.results.summary import write_files
 from canprobe.cell.results.text import summary_text
 from canprobe.cell.scene.setup import Touch
 from canprobe.cell.session.folder import write_scene
+from canprobe.cell.tasks.from_plan import make_contact_map
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.errors import UsageError, install_line
 from canprobe.mechanics.types import Floats
@@ -30,6 +34,7 @@ if TYPE_CHECKING:
     from canprobe.cell.results.contacts import Contacts, OwnEstimator, Scores
     from canprobe.cell.results.page import Page
     from canprobe.mechanics.touch.consistency import Consistency
+    from canprobe.mechanics.touch.map.contact_map import ContactMap
     from canprobe.mechanics.touch.surface_map import SurfaceMap
 
 _FIELDS = frozenset(field.name for field in fields(RunData))
@@ -138,6 +143,8 @@ class RunResult:
         if folder is None:
             folder = Path(tempfile.mkdtemp(prefix="canprobe-view-"))
             write_scene(self.plan, folder)
+            write_npz(folder / LOG, self.log)
+            write_npz(folder / TACTILE, self.tactile)
             write_files(self.data, folder)
         return page_of(folder, self.plan.setup)
 
@@ -170,6 +177,22 @@ class RunResult:
             self.contacts.samples, task, {**ours, **own}, truth=self.truth, sync_times=self.log["t_s"] - start_s
         )
 
+    def contact_map(self) -> ContactMap:
+        """One surface of all contacts of this scan, whichever pass they are from, with its uncertainty.
+
+        `surface_map` is what the estimator in the loop knew along its path; this map is solved afterwards, and better
+        where passes are near each other (`canprobe study shapes`).
+
+        Raises:
+            UsageError: when nothing was scanned.
+        """
+        task = self.plan.setup.task
+        if self.contacts is None or not len(self.contacts) or not isinstance(task, Touch):
+            raise UsageError("contact_map: expected a scan that touched its object, got no contacts")
+        found = make_contact_map(task)
+        found.add_samples(self.contacts.samples)
+        return found
+
     def to_pandas(self, what: Literal["log", "truth", "estimates"] = "log") -> pandas.DataFrame:
         """A table of the run, by time; vectors are spread over columns, and `attrs["units"]` has every unit.
 
@@ -189,6 +212,32 @@ class RunResult:
             UsageError: the extra `data` is missing.
         """
         write_parquet(self._columns(what), path, self._attrs)
+
+    def to_lerobot(self, folder: Path | str, *, fps: int | None = None) -> None:
+        """Write the run as a LeRobotDataset v3.0 of one episode; `canprobe export` writes several runs.
+
+        Args:
+            folder: folder of the dataset, which must not exist.
+            fps: rows a second, a whole divisor of the cycle's rate; None for the rate.
+
+        Raises:
+            UsageError: the folder exists, `fps` does not divide the rate, or the extra `data` is missing.
+        """
+        from canprobe.cell.results.lerobot import export_lerobot
+
+        with self._folder() as run:
+            export_lerobot([run], folder, fps=fps)
+
+    @contextmanager
+    def _folder(self) -> Iterator[Path]:
+        """The folder with the files of the run; a temporary one where it has none."""
+        if self.out is not None:
+            yield self.out
+            return
+        with tempfile.TemporaryDirectory(prefix="canprobe-run-") as name:
+            write_scene(self.plan, Path(name))
+            write_files(self.data, Path(name))
+            yield Path(name)
 
     @property
     def _attrs(self) -> dict[str, Any]:

@@ -8,6 +8,8 @@ edited, or of another version of canprobe; the message then names file and colum
     log.npz        a row for each cycle: floats, `t_s` rises; columns of users' controllers may have any further shape
     tactile.npz    a row for each tactile frame
     truth.npz      a row for each SYNC
+
+A process that was killed leaves ``rows/`` in the place of the last three, and the readers then read that.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ from numpy.typing import NDArray
 
 from canprobe.cell.emulated.truth_columns import with_present_names
 from canprobe.cell.npz import read_npz
+from canprobe.cell.rows import ROWS_FOLDER, read_left_rows
 from canprobe.cell.scene.load import SAVED_AS, load_scene, written_by_other
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.setup import Setup
@@ -51,6 +54,8 @@ _OF_LOG: _Shapes = {
     "tactile_age": ("f", ()),
     "phase": ("f", ()),
     "force_n": ("f", ()),
+    "force_sigma_n": ("f", ()),
+    "force_sigma_parts_n": ("f", (4,)),
     "contact_mm": ("f", (3,)),
     "normal": ("f", (3,)),
     "kappa_per_m": ("f", (2,)),
@@ -163,7 +168,7 @@ def read_tactile(file: Path, setup: Setup | None = None) -> Columns:
 def read_truth(file: Path, setup: Setup | None = None) -> Columns:
     """The columns of ``truth.npz``; see `read_log`. Former names are understood, with one warning."""
     prismatic = _prismatic(file.parent / LOG) if setup is None or setup.arm is None else setup.arm.model.chain.prismatic
-    columns = with_present_names(read_npz(file, "the true values of a run"), prismatic, file)
+    columns = with_present_names(_columns(file, "the true values of a run"), prismatic, file)
     return _checked(columns, file, _OF_TRUTH, setup)
 
 
@@ -193,7 +198,22 @@ READERS = {LOG: read_log, TACTILE: read_tactile, TRUTH: read_truth}
 
 def _read(file: Path, what: str, shapes: _Shapes, setup: Setup | None) -> Columns:
     """Read the columns of a file and check them."""
-    return _checked(read_npz(file, what), file, shapes, setup)
+    return _checked(_columns(file, what), file, shapes, setup)
+
+
+def is_recorded(file: Path) -> bool:
+    """Whether a run has written a file of columns, or was killed and has left its rows."""
+    return file.exists() or any((file.parent / ROWS_FOLDER).glob(f"{file.stem}*.npy"))
+
+
+def _columns(file: Path, what: str) -> Columns:
+    """The columns of a file; without it, those of the rows that a killed run has left."""
+    if file.exists() or not is_recorded(file):
+        return read_npz(file, what)
+    try:
+        return read_left_rows(file.parent, file.stem)
+    except (OSError, ValueError) as error:
+        raise UsageError(f"{file.parent / ROWS_FOLDER}: expected {what}; cannot be read: {error}") from error
 
 
 def _checked(columns: Columns, file: Path, shapes: _Shapes, setup: Setup | None) -> Columns:

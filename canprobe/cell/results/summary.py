@@ -10,14 +10,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe import __version__
 from canprobe.cell.master.cell import Cell
-from canprobe.cell.npz import write_npz
+from canprobe.cell.master.log import since_first_sync
 from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.run_files import SCHEMA
-from canprobe.cell.results.scores import ShapeScore, bound_of_scan, score_contact, score_measured_force, score_shape
+from canprobe.cell.results.scores import (
+    ShapeScore,
+    bound_of_scan,
+    score_contact,
+    score_measured_force,
+    score_shape,
+    state_force_sigma,
+)
 from canprobe.cell.results.surface_file import save_surface_map
 from canprobe.cell.results.tool_file import FILE, summarise_calibration, tool_text
 from canprobe.cell.results.traffic import LOG, measure_traffic
@@ -31,6 +37,12 @@ from canprobe.errors import ResultsError, UsageError
 from canprobe.fieldbus.bus.files import write_text
 from canprobe.mechanics.types import Floats
 
+FORCE_ERRORS = (
+    *("force_true_bias_n", "force_true_rms_error_n", "force_within_2_sigma_fraction"),
+    *("force_sigma_n", "force_sigma_parts_n", "force_lower_bound_fraction"),
+)
+"""Keys of the summary about how well the force is known."""
+
 
 def summarise(
     session: Session,
@@ -38,15 +50,26 @@ def summarise(
     estimates: dict[str, list[ShapeRecord]],
     stop_reason: str | None,
     *,
+    log: Mapping[str, Floats] | None = None,
     map_summary: dict[str, Any] | None = None,
     bridges: dict[str, dict[str, Any]] | None = None,
 ) -> dict[str, Any]:
-    """The content of ``summary.json``; a value that does not apply is None."""
+    """The content of ``summary.json``; a value that does not apply is None.
+
+    Args:
+        session: the closed session.
+        record: results of the task.
+        estimates: answers of its estimator, by name.
+        stop_reason: why the run ended before its end; None where it did not.
+        log: columns of ``log.npz``; None takes them from the session.
+        map_summary: section of the surface map.
+        bridges: status of each bridge.
+    """
     scene, cell = session.scene, session.cell
     cycle, direct = cell.cycle, scene.bus.direct
     sim_time = cycle.t_ns * 1e-9 if cycle is not None else 0.0
     wall = session.wall_ns * 1e-9
-    log = cell.log.arrays()
+    log = dict(cell.log.columns()) if log is None else log
     contact = _contact(session, record, log)
     summary = {
         "schema": SCHEMA,
@@ -66,7 +89,7 @@ def summarise(
             record.shape,
             estimates,
             truth_of(session),
-            log.get("t_s", np.empty(0)),
+            since_first_sync(log["t_s"], cell.log.start_s),
             map_summary=map_summary,
         ),
         "calibration": summarise_calibration(scene, record.tool),
@@ -80,21 +103,6 @@ def summarise(
         "faults": [*cell.faults, *(session.observers.faults if session.observers is not None else ())],
     }
     return {name: without_nan(value) for name, value in summary.items()}
-
-
-def log_columns(cell: Cell) -> dict[str, Floats]:
-    """The columns of ``log.npz``, on the run's clock; a run that was stopped before its first cycle has no row."""
-    return _on_run_clock({"t_s": np.empty(0), **cell.log.arrays()}, cell)
-
-
-def tactile_columns(cell: Cell) -> dict[str, NDArray[Any]]:
-    """The columns of ``tactile.npz``, on the run's clock; none where no frame was used."""
-    return _on_run_clock(cell.tactile_log.arrays(), cell)
-
-
-def _on_run_clock(columns: dict[str, NDArray[Any]], cell: Cell) -> dict[str, NDArray[Any]]:
-    start_s = cell.start_ns * 1e-9
-    return {name: column + start_s if name in ("t_s", "t_sample_s") else column for name, column in columns.items()}
 
 
 def without_nan(value: Any) -> Any:
@@ -134,15 +142,17 @@ def truth_of(session: Session) -> dict[str, Floats]:
     return session.truth if "force_n" in session.truth else {}
 
 
-def _contact(session: Session, record: TaskRecord, log: dict[str, Floats]) -> dict[str, Any]:
+def _contact(session: Session, record: TaskRecord, log: Mapping[str, Floats]) -> dict[str, Any]:
     task, scan = session.scene.task, record.scan_cycles if session.keeps_all else None
     names = ("force_rms_error_n", "force_max_n", "contact_fraction", "speed_mean_m_s")
     target = task.force_n if task.kind in ("scan", "press") else None
     figures: dict[str, float | None] = dict.fromkeys(names)
     measured: float | None = None
-    error: dict[str, float | None] = dict.fromkeys(("force_true_bias_n", "force_true_rms_error_n"))
+    error: dict[str, Any] = dict.fromkeys(FORCE_ERRORS)
     if scan is not None and scan[1] > scan[0]:
         measured = _rms_off(log["force_n"][scan[0] : scan[1]], task.force_n)
+        if "force_sigma_n" in log:
+            error |= state_force_sigma(log, *scan)
         if truth := truth_of(session):
             figures = score_contact(truth, *scan, task.force_n)
             error |= score_measured_force(log, truth, *scan)
@@ -155,7 +165,7 @@ def _contact(session: Session, record: TaskRecord, log: dict[str, Floats]) -> di
     }
 
 
-def _hidden_force(session: Session, highest: float | None, log: dict[str, Floats]) -> list[str]:
+def _hidden_force(session: Session, highest: float | None, log: Mapping[str, Floats]) -> list[str]:
     """Warning where the true force was above the limit, which acts on the measured force."""
     limit = session.scene.limits.force_max_n
     if not truth_of(session) or highest is None or highest <= limit:
@@ -290,14 +300,6 @@ def _percentiles(values_ns: Sequence[int]) -> dict[str, float | None]:
     return {"p50": p50, "p99": p99, "p999": p999, "max": float(us.max())}
 
 
-def write_columns(log: Mapping[str, Floats], tactile: Mapping[str, NDArray[Any]], out: Path) -> None:
-    """Write the measurements of a run, ``log.npz`` and ``tactile.npz``; for errors see `write_files`."""
-    _write_each(
-        lambda: write_npz(out / "log.npz", log),
-        lambda: write_npz(out / "tactile.npz", tactile) if tactile else None,
-    )
-
-
 def write_files(result: RunData, out: Path) -> None:
     """Write the files of a run into ``out`` that the session has not written, without the figures.
 
@@ -308,7 +310,6 @@ def write_files(result: RunData, out: Path) -> None:
     tool = None if found is None else tool_text(found, result.plan.scene.name)
     _write_each(
         lambda: write_summary(result.summary, out),
-        lambda: write_columns(result.log, result.tactile, out),
         lambda: write_text(out / FILE, tool) if tool is not None else None,
         lambda: save_surface_map(surface_map, out / "surface.npz") if surface_map is not None else None,
     )

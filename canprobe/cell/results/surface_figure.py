@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import SubFigure
 
 from canprobe.cell.results.map_score import SAME_DIRECTION_RAD
-from canprobe.cell.results.picture import BLUE, FAINT, GREEN, INK, ORANGE, legend, parts, picture
+from canprobe.cell.results.picture import BLUE, FAINT, GREEN, INK, ORANGE, drawn_rows, legend, parts, picture
 from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.surface_panels import (
     MapPlane,
@@ -73,7 +73,7 @@ def draw_map(
 
 def _draw_crossings(part: SubFigure, view: MapView) -> None:
     axes = part.subplots()
-    path = view.plane.mm(view.map.path)
+    path = view.plane.mm(view.map.path[drawn_rows(len(view.map.path))])
     axes.plot(path[:, 0], path[:, 1], color=FAINT, linewidth=0.9, zorder=1)
     crossings = view.consistency.crossings
     if crossings:

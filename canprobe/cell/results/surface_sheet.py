@@ -7,7 +7,7 @@ from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, Normalize
 
-from canprobe.cell.results.picture import GREY, INK, ORANGE, Part, box, parts
+from canprobe.cell.results.picture import GREY, INK, ORANGE, Part, box, drawn_rows, parts
 from canprobe.cell.results.surface_panels import MapView, add_sheet, map_surface, rejected, true_surface
 from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.types import Floats
@@ -27,7 +27,9 @@ def draw_map_surface(part: Part, view: MapView) -> None:
     values, what, colours = _values(points, sigma, view.shape)
     norm = _scale(values, signed=view.shape is not None)
     add_sheet(axes, plane.mm(points), colours.with_extremes(bad=GREY)(norm(np.ma.masked_invalid(values))), zorder=2)
-    axes.plot(*plane.mm(view.map.path).T, color=INK, linewidth=0.5, alpha=0.55, zorder=3)
+    axes.plot(
+        *plane.mm(view.map.path[drawn_rows(len(view.map.path))]).T, color=INK, linewidth=0.5, alpha=0.55, zorder=3
+    )
     differ = rejected(view.consistency)
     if differ.any():
         shown.append("orange dots: passes differ, p < 0.05")

@@ -12,7 +12,7 @@ import re
 import types
 import typing
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 
@@ -22,31 +22,42 @@ class MismatchError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """A condition on a value: what is asked for, in words, and whether a value has it."""
+    """A condition on a value.
+
+    Attributes:
+        text: what is asked for, in words.
+        accepts: whether a value has it.
+        schema: the same in the words of JSON Schema, draft 7; empty where these do not express it.
+    """
 
     text: str
     accepts: Callable[[Any], bool]
+    schema: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
 
 def Range(low: float, high: float, *, open_low: bool = False) -> Check:
     """Numbers from `low` to `high`, both included unless `open_low` leaves the lower end out."""
     first, last = (str(end) if isinstance(end, int) else f"{end:g}" for end in (low, high))
     if open_low:
-        return Check(f"above {first} up to {last}", lambda value: value - low >= _MIN_ABOVE_LIMIT and value <= high)
-    return Check(f"from {first} to {last}", lambda value: low <= value <= high)
+        return Check(
+            f"above {first} up to {last}",
+            lambda value: value - low >= _MIN_ABOVE_LIMIT and value <= high,
+            {"exclusiveMinimum": low, "maximum": high},
+        )
+    return Check(f"from {first} to {last}", lambda value: low <= value <= high, {"minimum": low, "maximum": high})
 
 
 def OneOf(values: tuple[int, ...]) -> Check:
     """One of a few numbers."""
-    return Check(f"of {', '.join(map(str, values))}", values.__contains__)
+    return Check(f"of {', '.join(map(str, values))}", values.__contains__, {"enum": list(values)})
 
 
 def Pattern(regex: str, text: str) -> Check:
     """Text that matches a regular expression as a whole."""
-    return Check(text, lambda value: re.fullmatch(regex, value) is not None)
+    return Check(text, lambda value: re.fullmatch(regex, value) is not None, {"pattern": f"^(?:{regex})$"})
 
 
-DISTINCT = Check("all different", lambda value: len(set(value)) == len(value))
+DISTINCT = Check("all different", lambda value: len(set(value)) == len(value), {"uniqueItems": True})
 DIRECTION = Check("not all zero", lambda value: math.hypot(*value) > 1e-9)
 SYMMETRIC = Check("symmetric", lambda value: tuple(zip(*value, strict=True)) == value)
 

@@ -32,7 +32,11 @@ MM = 1e-3
 REVOLUTE_ONLY = Only("kind", ("revolute",))
 PRISMATIC_ONLY = Only("kind", ("prismatic",))
 HOMING_ONLY = Only("zero", ("homing",))
-HOMING_METHOD = Check("from -128 to 127, but not 0", lambda value: -128 <= value <= 127 and value != 0)
+HOMING_METHOD = Check(
+    "from -128 to 127, but not 0",
+    lambda value: -128 <= value <= 127 and value != 0,
+    {"minimum": -128, "maximum": 127, "not": {"const": 0}},
+)
 
 
 @dataclass(frozen=True, slots=True)

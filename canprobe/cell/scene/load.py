@@ -99,8 +99,14 @@ def written_by_line() -> str:
 
 
 def with_writer(document: Mapping[str, Any], file: str) -> tuple[dict[str, Any], str]:
-    """A document without `WRITTEN_BY_KEY`, and the name of its file in messages, with a writer of another version."""
+    """A document without `WRITTEN_BY_KEY`, and the name of its file in messages, with a writer of another version.
+
+    Raises:
+        SceneError: the writer is no text.
+    """
     writer = document.get(WRITTEN_BY_KEY, f"canprobe {__version__}")
+    if not isinstance(writer, str):
+        raise SceneError([f"{file}: {WRITTEN_BY_KEY}: expected text, got {toml_value(writer)}; remove the line"])
     rest = {name: value for name, value in document.items() if name != WRITTEN_BY_KEY}
     return rest, f"{file}{written_by_other(writer)}"
 

@@ -110,7 +110,7 @@ def emulate(
             )
         finally:
             if truth_path is not None and world.recorder is not None:
-                write_npz(truth_path, world.recorder.arrays())
+                write_npz(truth_path, world.recorder.columns())
 
 
 def emulate_eds(

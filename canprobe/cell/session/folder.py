@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 
 from canprobe.cell.planning.model import Plan
+from canprobe.cell.rows import ROWS_FOLDER
 from canprobe.fieldbus.bus.files import make_folder, whole_file, writing
 
 LEFT_BY_RUNS = (
@@ -22,6 +24,7 @@ def prepare_folder(plan: Plan, out: Path) -> None:
         ResultsError: a file cannot be written or removed.
     """
     make_folder(out)
+    shutil.rmtree(out / ROWS_FOLDER, ignore_errors=True)
     for name in LEFT_BY_RUNS:
         with writing(out / name):
             (out / name).unlink(missing_ok=True)

@@ -13,15 +13,19 @@ from functools import cached_property, partial
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
+from numpy.typing import NDArray
+
+from canprobe.cell.emulated.truth_columns import TruthColumns
 from canprobe.cell.master.cell import Cell
 from canprobe.cell.master.controller import Command, Controller, Measurement
 from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.observers import Observers
 from canprobe.cell.master.options import DEFAULT_OPTIONS, RunOptions
-from canprobe.cell.npz import write_npz
+from canprobe.cell.npz import read_npz, write_npz
 from canprobe.cell.planning.bridges import check_bridges
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.model import Plan
+from canprobe.cell.rows import RowFiles
 from canprobe.cell.scene.model import BridgeSettings, Scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.bus_record import BusRecord
@@ -33,12 +37,13 @@ from canprobe.cell.session.links import check_links, need_controllers
 from canprobe.cell.session.rehearsal import shortened
 from canprobe.cell.session.target import LOCKSTEP, VIRTUAL
 from canprobe.cell.tasks.from_plan import make_task
-from canprobe.errors import CanprobeError, UsageError
+from canprobe.errors import CanprobeError, ResultsError, UsageError
 from canprobe.fieldbus.bus.candump import RecordingPort
 from canprobe.fieldbus.bus.clock import MonotonicClock, VirtualClock, elapsed_ns
 from canprobe.fieldbus.bus.files import writing
 from canprobe.fieldbus.bus.joined import JoinedPort
 from canprobe.fieldbus.bus.port import Port, Reports
+from canprobe.fieldbus.bus.real.interrupts import interrupts_held
 from canprobe.fieldbus.bus.real.memory import garbage_collection_paused, reserve_memory
 from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, realtime
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
@@ -94,7 +99,8 @@ class Session:
         """The emulated nodes and their plant on a lockstep bus; their participants may be replaced until it opens."""
         from canprobe.cell.emulated.world import make_world
 
-        return make_world(self.plan, self.scene.emulated_node_ids, truth=self.keeps_all)
+        nodes, folder = self.scene.emulated_node_ids, self.options.rows_folder
+        return make_world(self.plan, nodes, truth=self.keeps_all, at_once=True, folder=folder)
 
     @property
     def cell(self) -> Cell:
@@ -189,6 +195,23 @@ class Session:
             self.unwritten.append(failure)
             self._note(failure)
 
+    def keep(self, name: str, rows: RowFiles) -> dict[str, NDArray[Any]]:
+        """Write the columns of rows into a file of the run's folder, and read them back: large ones are mapped.
+
+        A failure is noted, and the files of the rows stay. The columns then are in memory, as without a folder.
+        """
+        columns = rows.columns()
+        if self.out is None or not columns:
+            return dict(columns)
+        try:
+            with interrupts_held():
+                write_npz(self.out / name, columns)
+        except ResultsError as error:
+            self.note_unwritten(str(error))
+            return dict(columns)
+        rows.remove()
+        return read_npz(self.out / name)
+
     def _note(self, fault: str) -> None:
         if self._cell is not None:
             self._cell.notes.add(fault)
@@ -252,12 +275,7 @@ class Session:
 
     def _keep_truth(self) -> None:
         if self.world.recorder is not None:
-            self.truth = self.world.recorder.arrays()
-            if self.out is not None:
-                try:
-                    write_npz(self.out / "truth.npz", self.truth)
-                except CanprobeError as error:
-                    self.note_unwritten(str(error))
+            self.truth = TruthColumns(self.keep("truth.npz", self.world.recorder))
 
     def _open_real(self) -> Port:
         bus = self.scene.bus

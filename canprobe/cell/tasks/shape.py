@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from array import array
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -17,6 +19,9 @@ if TYPE_CHECKING:
 
 GAP_S = 0.1
 """Time without contact after which an estimator starts afresh: a contact that is regained may be of another surface."""
+SAMPLES_KEPT, RECORDS_KEPT = 40_000, 10_000
+"""Contacts that a tracker keeps, the last ones, and answers, evenly over the scan: 200 s and 400 s of a scan with an
+array of 200 Hz and an answer every 40 ms. A longer scan takes no more memory, and no more time at its end."""
 MAX_CURVATURE = 1e3
 """Largest curvature of an answer, 1/m: no pad measures a ball of 1 mm, so an answer beyond it has diverged."""
 
@@ -51,8 +56,9 @@ class ShapeTracker:
         every: samples between two answers.
 
     Attributes:
-        records: every answer.
-        samples: every contact.
+        records: the answers; of more than `RECORDS_KEPT` every second, every fourth and so on.
+        samples: the contacts; of more than `SAMPLES_KEPT` the last ones.
+        path: coordinates x, y, z of every contact that is finite, m, in base.
         travelled_m: path of the contact, m.
         restarts: how often the estimator diverged and started afresh.
         withheld: answers that could not be computed: of a matrix that is singular or not definite.
@@ -60,13 +66,15 @@ class ShapeTracker:
 
     def __init__(self, estimator: Estimator, every: int) -> None:
         self.records: list[ShapeRecord] = []
-        self.samples: list[ContactSample] = []
+        self.samples: deque[ContactSample] = deque(maxlen=SAMPLES_KEPT)
+        self.path = array("d")
         self.travelled_m = 0.0
         self.restarts = self.withheld = 0
         self._estimator = estimator
         self._every = max(1, every)
         self._waiting: list[ContactSample] = []
-        self._taken = 0
+        self._added = self._taken = self._answers = 0
+        self._record_stride = 1
         self._found: tuple[SurfaceEstimate, float] | None = None
         self._last_withheld = False
 
@@ -77,10 +85,13 @@ class ShapeTracker:
             if sample.t_s - last.t_s > GAP_S:
                 self._estimator.reset()
                 self._waiting.clear()
-                self._taken, self._found = len(self.samples), None
+                self._taken, self._found = self._added, None
             else:
                 self.travelled_m += math.dist(sample.p_base.tolist(), last.p_base.tolist())
+        self._added += 1
         self.samples.append(sample)
+        if all(map(math.isfinite, place := sample.p_base.tolist())):
+            self.path.extend(place)
         self._waiting.append(sample)
 
     def work(self) -> SurfaceEstimate | None:
@@ -108,7 +119,12 @@ class ShapeTracker:
         if self._found is None:
             return None
         (estimate, at_s), self._found = self._found, None
-        self.records.append(ShapeRecord(at_s, self.travelled_m, estimate, t_s))
+        self._answers += 1
+        if self._answers % self._record_stride == 0:
+            self.records.append(ShapeRecord(at_s, self.travelled_m, estimate, t_s))
+            if len(self.records) > RECORDS_KEPT:
+                self._record_stride *= 2
+                del self.records[::2]
         return estimate
 
     def answer_at_once(self, t_s: float) -> SurfaceEstimate | None:

@@ -259,11 +259,11 @@ def test_a_node_hears_the_heartbeat_of_its_neighbour(plant):
 
 def test_truth_recorder_columns(plant):
     recorder = TruthRecorder(plant)
-    assert recorder.arrays()["t_s"].shape == (0,)
+    assert recorder.columns()["t_s"].shape == (0,)
     for k in range(3):
         assert recorder.receive(0x80, bytes((k + 7,)), k * CYCLE) == []
         assert recorder.receive(0x181, bytes(8), k * CYCLE + 1) == []
-    columns = recorder.arrays()
+    columns = recorder.columns()
     assert columns["t_s"].tolist() == [0.0, 0.0025, 0.005]
     assert columns["sync_count"].tolist() == [0, 1, 2]
     assert columns["sync_counter"].tolist() == [7, 8, 9]

@@ -15,6 +15,7 @@ from canprobe.api import results_folder
 from canprobe.cell.master.controller import Command
 from canprobe.cell.npz import read_npz
 from canprobe.cell.results import summary as results
+from canprobe.cell.session import session as recording
 from canprobe.cli import main
 from canprobe.errors import InterfaceError, SafetyStop, UsageError
 from canprobe.fieldbus.bus.candump import CandumpWriter, read_candump
@@ -242,14 +243,14 @@ def test_one_bridge_may_be_named_as_it_is(free, tmp_path):
 
 @pytest.mark.parametrize("name", ["log.npz", "summary.json"])
 def test_an_interrupt_waits_until_the_results_are_written(free, tmp_path, monkeypatch, name):
-    for write in (results.write_text, results.write_npz):
+    for module, write in ((results, results.write_text), (recording, recording.write_npz)):
 
         def interrupted(path, content, write=write):
             if path.name == name:
                 signal.raise_signal(signal.SIGINT)
             write(path, content)
 
-        monkeypatch.setattr(results, write.__name__, interrupted)
+        monkeypatch.setattr(module, write.__name__, interrupted)
     with pytest.raises(KeyboardInterrupt):
         undrawn_run(free, out=tmp_path, duration_s=0.1)
     assert {path.name for path in tmp_path.iterdir()} >= {"summary.json", "log.npz", "scene.toml", "bus.log"}

@@ -28,7 +28,7 @@ def test_the_last_rows_are_those_of_the_whole_log():
 
 def test_fewer_rows_than_are_kept():
     assert filled(RunLog(7), 3).arrays()["q_rad"].shape == (3, 6)
-    assert RunLog(7).arrays() == {}
+    assert list(RunLog(7).arrays()) == ["t_s"]
 
 
 def test_what_a_row_lacks_is_nan_and_what_nobody_knows_too():

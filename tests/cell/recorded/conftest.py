@@ -15,7 +15,6 @@ import canprobe
 from canprobe.cell.emulated.world import make_world
 from canprobe.cell.master.cell import Cell
 from canprobe.cell.npz import write_npz
-from canprobe.cell.results.summary import log_columns, tactile_columns
 from canprobe.cell.scene.load import dump_scene
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.fieldbus.bus.candump import CandumpWriter, RecordingPort
@@ -124,8 +123,8 @@ def delayed_run(tmp_path_factory):
             cell.run(controller)
     recorded = replace(scene, bus=replace(scene.bus, interface="socketcan"))
     (out / "scene.toml").write_text(dump_scene(recorded))
-    write_npz(out / "log.npz", log_columns(cell))
-    write_npz(out / "tactile.npz", tactile_columns(cell))
+    write_npz(out / "log.npz", cell.log.columns())
+    write_npz(out / "tactile.npz", cell.tactile_log.columns())
     return out, controller.task, cell
 
 

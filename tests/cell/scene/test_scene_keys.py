@@ -16,12 +16,14 @@ _spec = importlib.util.spec_from_file_location("generate", DOCS / "generate.py")
 generate = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(generate)
 
-SECTIONS = {name: generate.section_class(hint) for name, hint in typing.get_type_hints(Scene).items()}
+import scene_keys  # noqa: E402 - beside generate.py
+
+SECTIONS = {name: scene_keys.section_class(hint) for name, hint in typing.get_type_hints(Scene).items()}
 
 
 @pytest.mark.parametrize("section", SECTIONS)
 def test_every_key_has_a_meaning(section):
-    texts = generate.meanings(SECTIONS[section])
+    texts = scene_keys.meanings(SECTIONS[section])
     keys = [field.name for field in dataclasses.fields(SECTIONS[section])]
     assert list(texts) == keys
     assert all(text.endswith(".") for text in texts.values())
@@ -41,7 +43,7 @@ def test_all_that_was_measured_is_on_a_page():
 
 
 def test_a_key_has_its_value_unit_default_condition_and_meaning():
-    row = next(line for line in generate.scene_keys().splitlines() if line.startswith("| `speed_mm_s`"))
+    row = next(line for line in scene_keys.scene_keys().splitlines() if line.startswith("| `speed_mm_s`"))
     assert row == (
         "| `speed_mm_s` | a number above 0 up to 200 | mm/s | `25.0` | Speed of the contact over the surface."
         ' *Only with `kind` = `"scan"`.* |'

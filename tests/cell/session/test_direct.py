@@ -7,7 +7,6 @@ import pytest
 
 import canprobe
 from canprobe.cell.master.controller import Command
-from canprobe.cell.results.summary import log_columns
 from canprobe.cell.scene.load import packaged_scenes
 from canprobe.cell.session.session import Session
 from canprobe.cell.session.up import up
@@ -30,7 +29,7 @@ def loaded(name, cell=None, duration_s=0.2, **sections):
 
 
 def assert_same(direct, lockstep):
-    for ours, theirs in ((log_columns(direct.cell), log_columns(lockstep.cell)), (direct.truth, lockstep.truth)):
+    for ours, theirs in ((direct.cell.log.columns(), lockstep.cell.log.columns()), (direct.truth, lockstep.truth)):
         assert ours.keys() == theirs.keys()
         assert [name for name in ours if ours[name].tobytes() != theirs[name].tobytes()] == []
     assert len(direct.truth["t_s"]) == len(direct.cell.log) > 30

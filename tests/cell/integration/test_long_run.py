@@ -1,0 +1,107 @@
+"""Long runs: memory does not grow with their rows, and what ends them leaves what was recorded until then."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from full_disk import room_for
+
+import canprobe
+from canprobe.cell.master.options import RunOptions
+from canprobe.cell.rows import BLOCK_ROWS, ROWS_FOLDER
+from canprobe.cell.session.session import Session
+from canprobe.cell.tasks.from_plan import make_task
+from canprobe.cli import main
+
+COMMAND = [sys.executable, "-m", "canprobe", "run"]
+
+
+def started(out, *words):
+    """A run in a process, once some blocks of its rows are on disk."""
+    process = subprocess.Popen([*COMMAND, *words, "--duration", "3000", "--out", str(out)], stderr=subprocess.PIPE)
+    rows = out / ROWS_FOLDER
+    while not rows.is_dir() or sum(len(np.load(file)) for file in rows.glob("log-*.npy")) < 5 * BLOCK_ROWS:
+        assert process.poll() is None, process.stderr.read()
+        time.sleep(0.05)
+    return process
+
+
+@pytest.mark.parametrize("scene", ["free", "cylinder"])
+def test_a_run_that_is_killed_leaves_its_rows(scene, tmp_path, capsys):
+    process = started(tmp_path, scene, "--bus", "direct")
+    process.kill()
+    process.communicate()
+    assert {path.name for path in tmp_path.iterdir()} == {"scene.toml", ROWS_FOLDER}
+    table = canprobe.load_table(tmp_path / "log.npz")
+    assert len(table) >= 5 * BLOCK_ROWS
+    np.testing.assert_allclose(np.diff(table.index), 0.0025, atol=1e-9)
+    truth = canprobe.load_table(tmp_path / "truth.npz")
+    assert abs(len(truth) - len(table)) <= BLOCK_ROWS
+    both = min(len(truth), len(table))
+    np.testing.assert_allclose(truth["q_rad_1"][:both], table["q_rad_1"][:both], atol=1e-3)
+    if scene == "cylinder":
+        images = canprobe.load_table(tmp_path / "tactile.npz")
+        assert abs(2 * len(images) - len(table)) <= 2 * BLOCK_ROWS
+    whole = canprobe.run("free", bus="direct", duration_s=0.1, out=tmp_path, force=True)
+    assert not (tmp_path / ROWS_FOLDER).exists()
+    assert len(canprobe.load_table(tmp_path / "log.npz")) == len(whole.log["t_s"])
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_leaves_all_files(number, tmp_path):
+    process = started(tmp_path, "cylinder", "--bus", "direct", "--no-figures")
+    process.send_signal(number)
+    process.communicate()
+    assert process.returncode == 128 + number
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert (summary["completed"], summary["stop_reason"]) == (False, "interrupted")
+    files = {"scene.toml", "summary.json", "log.npz", "tactile.npz", "truth.npz", "surface.npz"}
+    assert {path.name for path in tmp_path.iterdir()} == files
+    with np.load(tmp_path / "log.npz") as log:
+        assert 0 <= summary["cycle"]["cycles"] - len(log["t_s"]) <= 1  # an interrupt comes between SYNC and row
+
+
+def test_rows_that_no_longer_fit_on_the_disk_stop_the_run_and_stay(tmp_path, capsys):
+    with room_for(200_000):
+        status = main(["run", "free", "--bus", "direct", "--duration", "60", "--out", str(tmp_path), "--json"])
+    assert status == 3
+    assert f"{tmp_path}/{ROWS_FOLDER}/log-" in capsys.readouterr().err.splitlines()[0]
+    assert not json.loads((tmp_path / "summary.json").read_text())["completed"]
+    assert len(canprobe.load_table(tmp_path / "log.npz")) > 2 * BLOCK_ROWS
+
+
+def test_a_session_alone_leaves_no_rows(tmp_path):
+    """`calibrate array` and the studies read its log from memory and write no file of it."""
+    scene = canprobe.load_scene("free", {"task.duration_s": 1.0, "bus.interface": "direct"})
+    with Session(scene, RunOptions(tmp_path)) as session:
+        session.run(make_task(session.plan))
+    assert len(session.cell.log.arrays()["t_s"]) > 400
+    assert {path.name for path in tmp_path.iterdir()} == {"scene.toml", "truth.npz"}
+
+
+MEMORY = """
+import resource, sys
+import canprobe
+seconds, out = float(sys.argv[1]), sys.argv[2]
+canprobe.run("cylinder", {"scene.figures": False}, bus="direct", duration_s=seconds, out=out)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_two_minutes_take_little_more_memory_than_ten_seconds(tmp_path):
+    """2.9 kB a cycle would be 130 MB."""
+    mib = []
+    for seconds in (10, 120):
+        words = [sys.executable, "-c", MEMORY, str(seconds), str(tmp_path / str(seconds))]
+        env = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
+        mib.append(int(subprocess.run(words, env=env, stdout=subprocess.PIPE, check=True).stdout) / 1024)
+    assert mib[1] < mib[0] + 90
+    with np.load(tmp_path / "120" / "log.npz") as log:
+        assert len(log["t_s"]) > 120 * 400
