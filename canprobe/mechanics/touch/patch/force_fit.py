@@ -24,7 +24,7 @@ MIN_CREEP_SIGMA = 0.006
 """Least standard deviation of the growth per decade: over emulated arrays the fit errs by as much."""
 LONG_TOUCH_S, FIRST_CREEP_S = 7.0, 1.5
 """Least length of a touch that shows creep, s, and the time in which hysteresis settles in it."""
-MIN_ARRAY_SIGMA = 0.007
+MIN_ARRAY_SIGMA = 0.009
 """Least standard deviation of the force: touches at one place do not show how gains differ from place to place."""
 CREEP_ROUNDS = 3
 """Number of rounds of the fit of the growth, which bends the load that it follows."""
