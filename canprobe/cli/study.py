@@ -25,9 +25,12 @@ examples:
   canprobe study bound --dask tcp://10.0.0.1:8786
   canprobe study faults --seed 4711
   canprobe study regions --draw 2 --against earlier/regions.json
+  canprobe study arrays --draw 2
   canprobe vcan -- canprobe study faults --vcan
   canprobe vcan --realtime -- canprobe study realtime --soak
 """
+STUDIES_WITH: Mapping[str, tuple[str, ...]] = {"draw": ("arrays", "regions", "shapes"), "against": ("regions",)}
+"""Studies that have an option, by the option's name."""
 
 
 def add_arguments(parser: Parser) -> None:
@@ -46,7 +49,7 @@ def add_arguments(parser: Parser) -> None:
         "--draw",
         metavar="N",
         type=whole(0, 9999),
-        help="regions: number that all seeds follow from [1]; develop with 2 and above",
+        help="arrays, regions, shapes: number that all cases follow from; others than those of the published figures",
     )
     parser.add_argument(
         "--against", metavar="FILE", type=Path, help="regions: regions.json of an earlier run, to compare with"
@@ -103,8 +106,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _chosen(args: argparse.Namespace) -> dict[str, Any]:
-    """The options that only study regions has, as far as they are given."""
-    return {name: getattr(args, name) for name in ("draw", "against") if getattr(args, name) is not None}
+    """The options that only some studies have, as far as they are given."""
+    return {name: getattr(args, name) for name in STUDIES_WITH if getattr(args, name) is not None}
 
 
 def _refuse_wrong(args: argparse.Namespace, studies: Mapping[str, str]) -> None:
@@ -121,10 +124,11 @@ def _refuse_wrong(args: argparse.Namespace, studies: Mapping[str, str]) -> None:
         args.complain("--seed: the runs on vcan0 depend on the machine's timing and cannot be repeated from a seed")
     if args.soak and args.name != "realtime":
         args.complain(f"--soak: study {args.name} has no such form; only realtime has")
-    chosen = _chosen(args)
-    if chosen and (args.name != "regions" or args.seed is not None):
-        why = "a seed names its draw" if args.name == "regions" else "only regions has it"
-        args.complain(f"--{next(iter(chosen))}: study {args.name}: {why}")
+    for option in _chosen(args):
+        if args.name not in STUDIES_WITH[option]:
+            args.complain(f"--{option}: study {args.name}: only {', '.join(STUDIES_WITH[option])} has it")
+        if args.seed is not None:
+            args.complain(f"--{option}: study {args.name}: a seed names its draw")
 
 
 def _replay(args: argparse.Namespace) -> int:

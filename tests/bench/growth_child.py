@@ -122,14 +122,15 @@ def nodes(n: int, folder: Path) -> float:
     return (process_time() - began) / cycles
 
 
-def seconds(duration: int, folder: Path) -> float:
-    """A scan of some seconds, from its first cycle to its last file."""
-    began: list[float] = []
+def seconds(duration: int, folder: Path) -> tuple[float, float]:
+    """A scan of some seconds, from its first cycle to its last file, and the share of that behind its last cycle."""
+    times: list[float] = []
     canprobe.run(
         "cylinder", bus="direct", duration_s=float(duration), out=folder / "run",
-        progress=lambda *_: began or began.append(process_time()),
+        progress=lambda *_: times.append(process_time()) if len(times) < 2 else times.__setitem__(1, process_time()),
     )  # fmt: skip
-    return process_time() - began[0]
+    ended = process_time()
+    return ended - times[0], (ended - times[1]) / (times[1] - times[0])
 
 
 def contacts(n: int, folder: Path) -> float:
@@ -162,6 +163,6 @@ def runs(n: int, folder: Path) -> float:
 if __name__ == "__main__":
     axis, size = sys.argv[1], int(sys.argv[2])
     with tempfile.TemporaryDirectory() as where:
-        cost = globals()[axis](size, Path(where))
+        cost, *behind = np.atleast_1d(globals()[axis](size, Path(where))).tolist()
     peak = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    print(json.dumps({"s": cost, "mib": peak / 1024}))
+    print(json.dumps({"s": cost, "behind": behind, "mib": peak / 1024}))

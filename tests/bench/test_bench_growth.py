@@ -13,6 +13,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,12 +35,12 @@ AXES = {
 }
 
 
-def measured(axis: str, size: int) -> dict[str, float]:
+def measured(axis: str, size: int) -> dict[str, Any]:
     """Processor time and memory at a size."""
     words = [sys.executable, str(CHILD), axis, str(size)]
     env = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
     done = subprocess.run(words, env=env, stdout=subprocess.PIPE, text=True, check=True)
-    found: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
+    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return found
 
 
@@ -54,8 +55,10 @@ def test_bench_growth(benchmark):
             slope, of_memory = (np.polyfit(logs[0], log, 1)[0] for log in logs[1:])
             steepest = (logs[1][-1] - logs[1][-2]) / (logs[0][-1] - logs[0][-2])
             costs, memory = [f"{scale * one['s']:.3g}" for one in found], [f"{one['mib']:.0f}" for one in found]
+            behind = ", ".join(f"{100 * share:.2g}" for one in found for share in one["behind"])
+            also = f"; behind the last cycle {behind} %" if behind else ""
             rows.append((
-                title, ", ".join(map(str, sizes)), f"{', '.join(costs)} {unit}", f"{slope:.2f}, {steepest:.2f}",
+                title, ", ".join(map(str, sizes)), f"{', '.join(costs)} {unit}{also}", f"{slope:.2f}, {steepest:.2f}",
                 f"{memory[0]} to {memory[-1]} MiB", f"{of_memory:.2f}",
             ))  # fmt: skip
             print(" | ".join(rows[-1]), flush=True)
