@@ -50,15 +50,19 @@ Columns = Mapping[str, str]
 
 TABLES: Mapping[str, tuple[Callable[[Sequence[Row]], Sequence[Row]], Columns]] = {
     "regions": (
-        lambda rows: [row for row in rows if row["group"] == "random"],
+        lambda rows: [row for row in rows if row["group"] in ("kind", "behind a jump", "array")],
         {
-            "random scenes with": "{of}",
-            "scenes": "{scenes}",
+            "scenes by": "{group}",
+            "of": "{of}",
+            "scenes (refused, stopped)": "{scenes} ({refused}, {stopped})",
+            "observed": "{observed:.1%}",
             "regions that hold the truth": "{coverage:.1%} ({coverage_low:.1%} to {coverage_high:.1%})",
             "scenes below 80 %": "{below_80:.1%}",
             "below 40 %": "{below_40:.1%}",
-            "stated over error": "{stated_over_error:.2f}",
+            "stated over error": "{stated_over_error:.2f} ({stated_low:.2f} to {stated_high:.2f})",
             "error, 1/m": "{error_per_m:.2f}",
+            "log score": "{log_score:.2f}",
+            "worst scene": "{worst}",
         },
     ),
     "shapes": (

@@ -1,0 +1,411 @@
+"""The registry of faults: every kind with its clause, the reaction to it, and the conditions that it trips.
+
+The column of conditions is for a node of a cell in motion: node 3, a drive, of the packaged scene `free`. A test throws
+each kind and compares.
+Source: CiA 301 (frames, services), CiA 402-2 (drives).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+
+from canprobe.fieldbus.tools.faults import drive_faults as drive
+from canprobe.fieldbus.tools.faults import frame_faults as link
+from canprobe.fieldbus.tools.faults import service_faults as service
+from canprobe.fieldbus.tools.faults.fault import Effect, Fault, FaultKind, Host, Parameter
+
+_LOST = "pdo_missed drive_late drive_silent"
+"""Conditions of a drive whose TPDOs do not come."""
+
+
+def make_kind(
+    name: str,
+    effect: Callable[[Fault, Host], Effect],
+    what: str,
+    clause: str,
+    reaction: str,
+    *,
+    trips: str = "",
+    incoming: bool | None = None,
+    needs: str = "node",
+    **parameters: Parameter,
+) -> FaultKind:
+    """A row; `trips` are keys of conditions with blanks between them, `parameters` the kind's numbers."""
+    keys = frozenset(trips.split())
+    return FaultKind(name, what, clause, reaction, effect, keys, parameters, incoming, needs)
+
+
+def _ms(default: float, what: str) -> Parameter:
+    return Parameter(default, 0.001, 3_600_000, what)
+
+
+def _code(default: int, what: str) -> Parameter:
+    return Parameter(default, 0, 0xFFFF, what)
+
+
+_ROWS = (
+    make_kind(
+        "drop",
+        link.Drop,
+        "frames are lost",
+        "CiA 301, PDO",
+        "misses them, then the node is lost",
+        trips=_LOST,
+    ),
+    make_kind(
+        "delay",
+        link.Delay,
+        "frames come later",
+        "CiA 301, 1007h",
+        "takes a late PDO for a missed one",
+        ms=_ms(1, "delay, ms"),
+    ),
+    make_kind(
+        "duplicate",
+        link.Duplicate,
+        "frames come twice",
+        "ISO 11898-1, acknowledgement",
+        "takes the first",
+        n=Parameter(2, 2, 100, "number of frames for each"),
+    ),
+    make_kind(
+        "corrupt",
+        link.Corrupt,
+        "a bit is another, or the end is missing",
+        "ISO 11898-1, CRC",
+        "drops what cannot be",
+        trips="pdo_missed drive_late drive_fault",
+    ),
+    make_kind(
+        "reorder",
+        link.Reorder,
+        "a frame comes behind the next ones",
+        "CiA 301, PDO",
+        "goes by the identifier, not by the order",
+        trips=_LOST,
+    ),
+    make_kind(
+        "mute", link.Drop, "the node sends nothing", "CiA 301, 1016h", "stops the others", trips=_LOST, incoming=False
+    ),
+    make_kind(
+        "deaf",
+        link.Drop,
+        "the node hears nothing",
+        "CiA 301, 1016h, 6007h",
+        "the node stops by itself: 8130h, 8250h",
+        trips=f"{_LOST} emcy_communication",
+        incoming=True,
+    ),
+    make_kind(
+        "reboot",
+        link.Reboot,
+        "the power fails for the duration",
+        "CiA 301, boot-up",
+        "sends no targets; configures it anew",
+        trips=f"{_LOST} emcy_communication",
+        incoming=False,
+    ),
+    make_kind(
+        "freeze",
+        link.Freeze,
+        "the node stands still for the duration",
+        "CiA 301, 1016h",
+        "stops the others",
+        trips=f"{_LOST} emcy_communication",
+        incoming=False,
+    ),
+    make_kind(
+        "babble",
+        link.Babble,
+        "frames that nobody asked for; the seed chooses their sort",
+        "ISO 11898-1, arbitration",
+        "stays below the load that it bears",
+        trips="drive_fault",
+        incoming=False,
+        gap_ms=_ms(1, "time between two frames, ms"),
+    ),
+    make_kind(
+        "wrong-data",
+        link.WrongData,
+        "another position, or another tactile header with the right CRC",
+        "CiA 402-2, 6064h",
+        "drops what cannot be",
+        trips=_LOST,
+        incoming=False,
+    ),
+    make_kind(
+        "short",
+        link.Short,
+        "PDOs have a byte too few",
+        "CiA 301, PDO length, 8210h",
+        "does not apply them",
+        trips=_LOST,
+    ),
+    make_kind("long", link.Long, "PDOs have a byte too many", "CiA 301, PDO length, 8220h", "applies or drops them"),
+    make_kind(
+        "burst",
+        link.Duplicate,
+        "frames come many times",
+        "CiA 301, inhibit time",
+        "takes the first",
+        trips=f"{_LOST} emcy_communication",
+        n=Parameter(10, 2, 100, "number of frames for each"),
+    ),
+    make_kind(
+        "wrong-id",
+        link.WrongId,
+        "PDOs come under another identifier",
+        "CiA 301, 18xxh:01",
+        "misses them",
+        trips=_LOST,
+        offset=Parameter(16, -0x180, 0x180, "distance of the identifiers"),
+    ),
+    make_kind(
+        "odd-frames",
+        link.OddFrames,
+        "remote requests and 29-bit frames under the node's PDOs",
+        "CiA 301, COB-ID bits 29 and 30",
+        "ignores them",
+        incoming=False,
+        gap_ms=_ms(1, "time between two frames, ms"),
+    ),
+    make_kind(
+        "sync-jitter",
+        link.SyncJitter,
+        "SYNC reaches the node late, each time otherwise",
+        "CiA 301, 1006h",
+        "bears half a period",
+        incoming=True,
+        us=Parameter(200, 1, 1e6, "longest delay, µs"),
+    ),
+    make_kind(
+        "sync-lost",
+        link.SyncLost,
+        "SYNC does not reach the node",
+        "CiA 301, 1006h, 8100h, 6007h",
+        "the node stops by itself: 8100h",
+        trips=f"{_LOST} emcy_communication",
+        incoming=True,
+    ),
+    make_kind(
+        "sync-double",
+        link.SyncDouble,
+        "SYNC reaches the node twice",
+        "CiA 301, 1019h",
+        "goes by the counter",
+        incoming=True,
+    ),
+    make_kind(
+        "bus-off",
+        link.BusOff,
+        "the controller is off the bus for the duration",
+        "CiA 301, 8140h",
+        "stops the others; the node reports its return",
+        trips=_LOST,
+        incoming=True,
+    ),
+    make_kind(
+        "heartbeat-off",
+        service.HeartbeatOff,
+        "no heartbeat",
+        "CiA 301, 1016h, 8130h, 1029h",
+        "stops the others",
+        trips="heartbeat",
+        incoming=False,
+    ),
+    make_kind(
+        "heartbeat-state",
+        service.HeartbeatState,
+        "the heartbeat reports another state",
+        "CiA 301, heartbeat",
+        "takes the node for what it says",
+        trips="nmt_state",
+        incoming=False,
+        state=Parameter(4, 0, 127, "state: 4 stopped, 127 pre-operational"),
+    ),
+    make_kind("no-boot-up", service.NoBootUp, "no boot-up message", "CiA 301, boot-up", "reads 1000h", incoming=False),
+    make_kind(
+        "nmt",
+        service.Nmt,
+        "the node changes its state by itself",
+        "CiA 301, NMT",
+        "stops the others",
+        trips="nmt_state pdo_missed",
+        incoming=False,
+        command=Parameter(2, 1, 130, "command: 2 stop, 128 pre-operational, 129 reset"),
+    ),
+    make_kind(
+        "sdo-abort",
+        service.SdoAbort,
+        "accesses to one object are aborted",
+        "CiA 301, SDO abort",
+        "names node and object, and does not go on",
+        incoming=True,
+        index=Parameter(0x1017, 0, 0xFFFF, "index of the object"),
+        code=Parameter(0x08000020, 0, 0xFFFFFFFF, "abort code"),
+    ),
+    make_kind(
+        "sdo-silent",
+        service.SdoSilent,
+        "SDO requests are not answered",
+        "CiA 301, SDO, 05040000h",
+        "times out",
+        incoming=True,
+    ),
+    make_kind(
+        "sdo-slow",
+        service.SdoSlow,
+        "SDO answers come late",
+        "CiA 301, SDO, 05040000h",
+        "waits, or times out once",
+        incoming=False,
+        ms=_ms(100, "delay, ms"),
+    ),
+    make_kind(
+        "sdo-toggle",
+        service.SdoToggle,
+        "segments have the wrong toggle bit",
+        "CiA 301, SDO, 05030000h",
+        "aborts the transfer",
+        incoming=False,
+    ),
+    make_kind(
+        "sdo-wrong-object",
+        service.SdoWrongObject,
+        "answers name another object",
+        "CiA 301, SDO",
+        "drops them",
+        incoming=False,
+    ),
+    make_kind(
+        "sdo-size",
+        service.SdoSize,
+        "expedited answers have a byte too few",
+        "CiA 301, SDO, 06070010h",
+        "refuses the value",
+        incoming=False,
+    ),
+    make_kind(
+        "emcy",
+        service.EmcyOnce,
+        "an error in EMCY, 1001h and 1003h, until the end",
+        "CiA 301, EMCY",
+        "stops for a device error",
+        trips="emcy",
+        incoming=False,
+        code=_code(0x5000, "emergency error code"),
+    ),
+    make_kind(
+        "emcy-storm",
+        service.EmcyStorm,
+        "an error comes and goes without an end",
+        "CiA 301, 1015h",
+        "counts, and stays below the load",
+        trips="emcy_communication",
+        incoming=False,
+        gap_ms=_ms(1, "time between two messages, ms"),
+        code=_code(0x8210, "emergency error code"),
+    ),
+    make_kind(
+        "remapped",
+        service.Remapped,
+        "two entries of a TPDO are exchanged",
+        "CiA 301, 1A00h",
+        "reads 1Axxh at bring-up; drops what cannot be",
+        trips="drive_fault",
+        incoming=False,
+    ),
+    make_kind(
+        "drive-fault",
+        drive.DriveFault,
+        "the drive detects a fault",
+        "CiA 402-2, 605Eh, 603Fh",
+        "stops the others; resets by an edge only",
+        trips="drive_fault",
+        incoming=False,
+        needs="drive",
+        code=_code(0x4310, "error code"),
+        resettable=Parameter(1, 0, 1, "0: it comes back after a reset"),
+    ),
+    make_kind(
+        "sto",
+        drive.Sto,
+        "safe torque off",
+        "CiA 402-2, state automaton",
+        "does not enable it again and again",
+        trips="drive_fault",
+        incoming=False,
+        needs="drive",
+    ),
+    make_kind(
+        "mode-refused",
+        drive.ModeRefused,
+        "writes to 6060h are refused",
+        "CiA 402-2, 6060h, 6061h",
+        "sends no targets",
+        incoming=True,
+        needs="drive",
+    ),
+    make_kind(
+        "brake-stuck",
+        drive.BrakeStuck,
+        "the motor stays where it is",
+        "CiA 402-2, 6065h, 8611h",
+        "the drive finds a following error",
+        incoming=False,
+        needs="drive",
+    ),
+    make_kind(
+        "encoder-jump",
+        drive.EncoderJump,
+        "the encoder is wrong by some counts",
+        "CiA 402-2, 6064h",
+        "drops what cannot be",
+        trips=_LOST,
+        incoming=False,
+        needs="drive",
+        counts=Parameter(2000, -(2**31), 2**31 - 1, "error, counts"),
+    ),
+    make_kind(
+        "encoder-frozen",
+        drive.EncoderFrozen,
+        "the encoder keeps its position",
+        "CiA 402-2, 6064h",
+        "the drive finds a following error",
+        incoming=False,
+        needs="drive",
+    ),
+    make_kind(
+        "homing-lost",
+        drive.HomingLost,
+        "the drive forgets that it was homed",
+        "CiA 402-2, homing, bit 12",
+        "moves nothing before it is homed",
+        incoming=False,
+        needs="drive",
+    ),
+    make_kind(
+        "zero-shift",
+        drive.ZeroShift,
+        "the zero of the drive is elsewhere",
+        "CiA 402-2, 607Ch",
+        "does not hold the old zero",
+        trips="drive_fault",
+        incoming=False,
+        needs="drive",
+        counts=Parameter(2000, -(2**31), 2**31 - 1, "way of the zero, units of position"),
+    ),
+    make_kind(
+        "torque-limit",
+        drive.TorqueLimit,
+        "the torque is limited",
+        "CiA 402-2, 6072h, bit 11",
+        "goes no faster than the drive follows",
+        incoming=False,
+        needs="drive",
+        permille=Parameter(10, 0, 10_000, "limit, 1/1000 of the rated torque"),
+    ),
+)
+BUS_FAULTS: Mapping[str, FaultKind] = MappingProxyType({kind.name: kind for kind in _ROWS})
+"""Kinds of faults of nodes, links and drives by name. `canprobe.cell.emulated` adds those of the array."""
