@@ -40,6 +40,8 @@ if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
     from canprobe.mechanics.touch.estimate.fit import fit_surface
     from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
+    from canprobe.mechanics.touch.map.contact_map import ContactMap
+    from canprobe.mechanics.touch.map.fit import fit_map
     from canprobe.mechanics.touch.surface import SurfaceMatrix
     from canprobe.mechanics.touch.surface_map import SurfaceMap
 
@@ -64,6 +66,8 @@ _MODULES = {
     "canprobe.mechanics.touch.estimate.likelihood": ("cramer_rao",),
     "canprobe.mechanics.touch.estimate.answer": ("SurfaceEstimate",),
     "canprobe.mechanics.touch.estimate.fit": ("fit_surface",),
+    "canprobe.mechanics.touch.map.contact_map": ("ContactMap",),
+    "canprobe.mechanics.touch.map.fit": ("fit_map",),
     "canprobe.mechanics.touch.surface": ("SurfaceMatrix",),
     "canprobe.mechanics.touch.surface_map": ("SurfaceMap",),
     "canprobe.cell.results.result": ("RunResult",),
@@ -75,6 +79,7 @@ __all__ = [
     "BusError",
     "CanprobeError",
     "Command",
+    "ContactMap",
     "ContactSample",
     "Contacts",
     "Controller",
@@ -97,6 +102,7 @@ __all__ = [
     "UsageError",
     "__version__",
     "cramer_rao",
+    "fit_map",
     "fit_surface",
     "load_scene",
     "load_surface_map",

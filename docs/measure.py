@@ -1,9 +1,10 @@
 """Measure what the pages say, and write docs/measured.json. `python docs/measure.py [NAME …]`
 
-A name is that of a packaged scene, of a study, or of one of the functions below: `one_scan`, `vcan0`, `pace`, `gym`,
-`learning`, `bridges`. Without names everything is measured but what takes more than half an hour (`LONG`). Measure on a
-machine that does nothing else: computing time is among the figures. Every entry has its own command, date, commit and
-machine, so that one can be measured anew without the others. Then `python docs/generate.py` writes the pages.
+A name is that of a packaged scene, of a study, or one of `OTHERS` below: `one_scan`, `vcan0`, `pace`, `side_by_side`,
+`growth`, `gym`, `learning`, `bridges`. Without names everything is measured but what takes more than half an hour
+(`LONG`). Measure on a machine that does nothing else: computing time is among the figures. Every entry has its own
+command, date, commit and machine, so that one can be measured anew without the others. Then `python docs/generate.py`
+writes the pages.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +38,7 @@ SEEDS, SEEDS_OF_ONE_SCAN = (0, 1, 2), range(10)
 IN_GUEST = "canprobe vcan --realtime -- "
 ON_VCAN0 = "canprobe run cylinder --bus socketcan --channel vcan0 --realtime --patient"
 BENCH = "python -m pytest -n0 --benchmark-only tests/bench/"
-LONG = ("faults", "soak")
+LONG = ("faults", "soak", "growth")
 INTERPRETED = {"python": [sys.executable], "canprobe": [sys.executable, "-m", "canprobe"]}
 COLOURS = 256
 """Of a picture in the documentation."""
@@ -48,15 +50,19 @@ Columns = Mapping[str, str]
 
 TABLES: Mapping[str, tuple[Callable[[Sequence[Row]], Sequence[Row]], Columns]] = {
     "regions": (
-        lambda rows: [row for row in rows if row["group"] == "random"],
+        lambda rows: [row for row in rows if row["group"] in ("kind", "behind a jump", "array")],
         {
-            "random scenes with": "{of}",
-            "scenes": "{scenes}",
+            "scenes by": "{group}",
+            "of": "{of}",
+            "scenes (refused, stopped)": "{scenes} ({refused}, {stopped})",
+            "observed": "{observed:.1%}",
             "regions that hold the truth": "{coverage:.1%} ({coverage_low:.1%} to {coverage_high:.1%})",
             "scenes below 80 %": "{below_80:.1%}",
             "below 40 %": "{below_40:.1%}",
-            "stated over error": "{stated_over_error:.2f}",
+            "stated over error": "{stated_over_error:.2f} ({stated_low:.2f} to {stated_high:.2f})",
             "error, 1/m": "{error_per_m:.2f}",
+            "log score": "{log_score:.2f}",
+            "worst scene": "{worst}",
         },
     ),
     "shapes": (
@@ -215,9 +221,9 @@ def bench(file: str) -> list[Row]:
     return benchmarks
 
 
-def pace() -> Entry:
-    """What a cycle costs."""
-    file = "test_bench_pace.py"
+def bench_table(name: str) -> Entry:
+    """The table of a file of `tests/bench` that makes one."""
+    file = f"test_bench_{name}.py"
     return {"command": f"{BENCH}{file} -s", "table": bench(file)[0]["extra_info"]["table"]}
 
 
@@ -253,7 +259,9 @@ def bridges() -> Entry:
 OTHERS: Mapping[str, Callable[[], Entry]] = {
     "one_scan": one_scan,
     "vcan0": vcan0,
-    "pace": pace,
+    "pace": partial(bench_table, "pace"),
+    "side_by_side": partial(bench_table, "side_by_side"),
+    "growth": partial(bench_table, "growth"),
     "gym": gym,
     "learning": learning,
     "bridges": bridges,

@@ -65,6 +65,10 @@ def add_arguments(parser: Parser) -> None:
         action="store_true",
         help="write a calibration for all arrays of this make, without the gains and dead taxels of this one",
     )
+    parser.add_argument(
+        "--spread", metavar="PERCENT", type=_positive, default=5.0,
+        help="with --make: standard deviation of the force from array to array, by its data sheet [5]",
+    )  # fmt: skip
     parser.add_argument("--yes", action="store_true", help="do not ask for objects; for an emulated cell only")
     add_options(parser, *BUS)
     parser.add_argument("--seed", metavar="N", type=seed, default=0, help="seed of the emulation [0]")
@@ -96,6 +100,7 @@ def run(args: argparse.Namespace) -> int:
         reference=args.force_reference,
         sigma=1e-2 * args.sigma,
         own_gains=not args.make,
+        spread=1e-2 * args.spread,
         seed=args.seed,
     )
     found = calibrate(request, date=today, ask=None if args.yes else _ask, say=_steps(args.report), out=out)

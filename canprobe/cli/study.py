@@ -7,7 +7,9 @@ crash. Cells whose code has changed since are computed again.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from canprobe.cli.argument_types import whole
 from canprobe.cli.common_arguments import add_options, add_verbosity
@@ -22,9 +24,13 @@ examples:
   canprobe study estimators --quick --out runs/estimators
   canprobe study bound --dask tcp://10.0.0.1:8786
   canprobe study faults --seed 4711
+  canprobe study regions --draw 2 --against earlier/regions.json
+  canprobe study arrays --draw 2
   canprobe vcan -- canprobe study faults --vcan
   canprobe vcan --realtime -- canprobe study realtime --soak
 """
+STUDIES_WITH: Mapping[str, tuple[str, ...]] = {"draw": ("arrays", "regions", "shapes"), "against": ("regions",)}
+"""Studies that have an option, by the option's name."""
 
 
 def add_arguments(parser: Parser) -> None:
@@ -37,7 +43,16 @@ def add_arguments(parser: Parser) -> None:
         "--seed",
         metavar="N",
         type=whole(0, 2**63 - 1),
-        help="faults: run only the case of this seed, and report each step",
+        help="faults, regions: run only the case of this seed, and report each step",
+    )
+    parser.add_argument(
+        "--draw",
+        metavar="N",
+        type=whole(0, 9999),
+        help="arrays, regions, shapes: number that all cases follow from; others than those of the published figures",
+    )
+    parser.add_argument(
+        "--against", metavar="FILE", type=Path, help="regions: regions.json of an earlier run, to compare with"
     )
     parser.add_argument(
         "--vcan", action="store_true", help="faults: on a real vcan0; processes are killed and the link is taken down"
@@ -63,18 +78,7 @@ def run(args: argparse.Namespace) -> int:
         else:
             print_table(list(STUDIES.items()))
         return 0
-    if args.name == "soak":
-        args.complain("study soak is now an option of study realtime: canprobe study realtime --soak")
-    if args.name not in STUDIES:
-        known = ", ".join(STUDIES)
-        wrong = f"unknown study {args.name!r}{did_you_mean(args.name, STUDIES)}" if args.name else "expected NAME"
-        args.complain(f"{wrong}; studies: {known}")
-    if args.vcan and args.name != "faults":
-        args.complain(f"--vcan: study {args.name} does not run on vcan0; only faults does")
-    if args.vcan and args.seed is not None:
-        args.complain("--seed: the runs on vcan0 depend on the machine's timing and cannot be repeated from a seed")
-    if args.soak and args.name != "realtime":
-        args.complain(f"--soak: study {args.name} has no such form; only realtime has")
+    _refuse_wrong(args, STUDIES)
     if args.seed is not None:
         return _replay(args)
     from canprobe.lab.studies.result_files import as_document, text_of, write_study
@@ -85,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
     options = {"workers": args.workers, "dask": args.dask, "fresh": args.fresh}
     try:
         with open_sweep(out, say=args.report.say, progress=args.report.bar(".0f cells"), **options) as sweep:
-            result = run_study(args.name, quick=args.quick, sweep=sweep, form=form)
+            result = run_study(args.name, quick=args.quick, sweep=sweep, form=form, **_chosen(args))
     except KeyboardInterrupt:
         args.report.complain(
             f"canprobe: interrupted; finished cells are kept in {out}, the same command computes the rest"
@@ -101,12 +105,40 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _chosen(args: argparse.Namespace) -> dict[str, Any]:
+    """The options that only some studies have, as far as they are given."""
+    return {name: getattr(args, name) for name in STUDIES_WITH if getattr(args, name) is not None}
+
+
+def _refuse_wrong(args: argparse.Namespace, studies: Mapping[str, str]) -> None:
+    """Complain about an unknown study, and about options that it does not have."""
+    if args.name == "soak":
+        args.complain("study soak is now an option of study realtime: canprobe study realtime --soak")
+    if args.name not in studies:
+        known = ", ".join(studies)
+        wrong = f"unknown study {args.name!r}{did_you_mean(args.name, studies)}" if args.name else "expected NAME"
+        args.complain(f"{wrong}; studies: {known}")
+    if args.vcan and args.name != "faults":
+        args.complain(f"--vcan: study {args.name} does not run on vcan0; only faults does")
+    if args.vcan and args.seed is not None:
+        args.complain("--seed: the runs on vcan0 depend on the machine's timing and cannot be repeated from a seed")
+    if args.soak and args.name != "realtime":
+        args.complain(f"--soak: study {args.name} has no such form; only realtime has")
+    for option in _chosen(args):
+        if args.name not in STUDIES_WITH[option]:
+            args.complain(f"--{option}: study {args.name}: only {', '.join(STUDIES_WITH[option])} has it")
+        if args.seed is not None:
+            args.complain(f"--{option}: study {args.name}: a seed names its draw")
+
+
 def _replay(args: argparse.Namespace) -> int:
     """Carry out one numbered run of a study again; status 1 where it fails."""
-    if args.name != "faults":
-        args.complain(f"--seed: expected study faults, got {args.name}")
-    from canprobe.lab.studies.faults import replay
-
+    if args.name == "faults":
+        from canprobe.lab.studies.faults import replay
+    elif args.name == "regions":
+        from canprobe.lab.studies.regions import replay
+    else:
+        args.complain(f"--seed: expected study faults or regions, got {args.name}")
     outcome = replay(args.seed, args.report.say)
     if args.json:
         print_json(outcome)

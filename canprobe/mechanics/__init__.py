@@ -5,6 +5,11 @@ Nothing here depends on a bus, a scene file or a clock. A list of contacts is en
     estimate = fit_surface(points, normals, sigma_point=20e-6, sigma_normal=2e-3)
     estimate.kappa, estimate.observed, estimate.covariance
 
+and many contacts, wherever they are, for a whole surface:
+
+    surface = fit_map(points, normals, sigma_point=20e-6, sigma_normal=2e-3)
+    surface.distance(places), surface.curvature(places), surface.mesh()
+
 - `robot` is any serial arm of 1 to 8 joints: geometry, kinematics and their inverse, dynamics, calibration of the tool.
 - `touch` goes from a tactile image to the local shape of the object, to the map of a whole scan, and to the servo that
   follows a surface. It also holds the true objects of an emulation.
@@ -31,6 +36,8 @@ if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.fit import fit_surface
     from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
     from canprobe.mechanics.touch.estimate.prior import Prior
+    from canprobe.mechanics.touch.map.contact_map import ContactMap
+    from canprobe.mechanics.touch.map.fit import fit_map
     from canprobe.mechanics.touch.objects import make_object
     from canprobe.mechanics.touch.surface import SurfaceMatrix
     from canprobe.mechanics.touch.surface_map import SurfaceMap
@@ -38,6 +45,7 @@ if TYPE_CHECKING:
 _MODULES = {
     "ArmModel": "robot.model",
     "Chain": "robot.chain",
+    "ContactMap": "touch.map.contact_map",
     "ContactSample": "touch.contact",
     "Joint": "robot.model",
     "Prior": "touch.estimate.prior",
@@ -45,6 +53,7 @@ _MODULES = {
     "SurfaceMap": "touch.surface_map",
     "SurfaceMatrix": "touch.surface",
     "cramer_rao": "touch.estimate.likelihood",
+    "fit_map": "touch.map.fit",
     "fit_surface": "touch.estimate.fit",
     "forward": "robot.chain",
     "from_dh": "robot.denavit_hartenberg",
@@ -54,6 +63,7 @@ _MODULES = {
 __all__ = [
     "ArmModel",
     "Chain",
+    "ContactMap",
     "ContactSample",
     "Joint",
     "Prior",
@@ -61,6 +71,7 @@ __all__ = [
     "SurfaceMap",
     "SurfaceMatrix",
     "cramer_rao",
+    "fit_map",
     "fit_surface",
     "forward",
     "from_dh",

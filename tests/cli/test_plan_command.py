@@ -20,7 +20,7 @@ def test_a_rehearsal_says_what_was_done(capsys):
 
 
 def test_a_rehearsal_that_fails_is_refused_with_its_cause(capsys):
-    words = ["plan", "cylinder", "--set", "limits.force_max_n=2.05"]
+    words = ["plan", "cylinder", "--set", "limits.force_max_n=2.1"]
     assert main(words) == 0
     capsys.readouterr()
     assert main([*words, "--rehearse", "--json"]) == 2

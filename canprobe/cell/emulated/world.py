@@ -89,6 +89,8 @@ class TruthRecorder(Participant):
 
     def _compute(self) -> Rows:
         """Make rows of what waits."""
+        if not self._stamps and self.rows is not None:
+            return self.rows
         stamps, states, truths = self._stamps, self._states, self._truths
         self._stamps, self._states, self._truths = [], [], []
         model = self._plant.config.model

@@ -18,6 +18,7 @@ from canprobe.fieldbus.protocol.raw_image import ImageAssembler, RawImage
 from canprobe.fieldbus.protocol.tactile import TactileHeader, TactileMode
 from canprobe.fieldbus.protocol.tactile_assembler import FrameAssembler
 from canprobe.mechanics.touch.pad import COUNTS_MAX
+from canprobe.mechanics.touch.patch.force_reading import ForceReading
 from canprobe.mechanics.touch.patch.image import Patch, PatchCalibration, compute_patch, patch_from_features
 from canprobe.mechanics.touch.patch.silent_taxels import SilentTaxels
 from canprobe.mechanics.types import Floats
@@ -301,8 +302,19 @@ def make_tactile(plan: Plan, sync_overflow: int | None = None) -> ArrayReceiver 
     return TactileReceiver(assembler, cob_ids, sync_overflow or plan.sync.overflow, array.channel)
 
 
+def force_columns(patch: Patch) -> dict[str, float | Floats]:
+    """Columns of the log with the force of a patch, its standard deviation, and the parts of that by their causes."""
+    return {
+        "force_n": patch.force,
+        "force_sigma_n": patch.sigma.total,
+        "force_sigma_parts_n": np.array(patch.sigma),
+    }
+
+
 class PatchReader:
-    """The patch of each tactile sample, in every mode of the array; taxels that do not measure are bridged.
+    """The patch of each tactile sample, in every mode of the array, with a force and its standard deviation.
+
+    Taxels that do not measure are bridged, and creep is corrected.
 
     Args:
         calibration: calibration of the array.
@@ -315,6 +327,7 @@ class PatchReader:
     def __init__(self, calibration: PatchCalibration) -> None:
         pad = calibration.pad
         self._calibration = calibration
+        self._force = ForceReading(calibration)
         self.image = np.zeros(pad.shape, np.uint8)
         self.taxels = (
             SilentTaxels(pad.shape, calibration.dead, blur_pitch=calibration.blur_m / pad.pitch_m)
@@ -324,15 +337,17 @@ class PatchReader:
 
     def read(self, sample: TactileSample) -> Patch:
         """The patch of a sample; samples come in the order of their times."""
-        frame = sample.frame
+        frame, t_s = sample.frame, sample.t_sample_ns * 1e-9
         if frame.features is not None:  # moments do not show which taxels they are made of
-            return patch_from_features(frame.features, self._calibration)
+            return self._force.step(t_s, patch_from_features(frame.features, self._calibration))
         self.image, bridged, share = frame.taxels, 0, 0.0
         self.look(sample)
         if self.taxels is not None:
             self.image, bridged, share = self.taxels.bridged(frame.taxels, frame.window)
         patch = compute_patch(self.image, self._calibration, window=frame.window)
-        return patch._replace(dead=patch.dead + bridged, bridged=share) if bridged else patch
+        if bridged:
+            patch = patch._replace(dead=patch.dead + bridged, bridged=share)
+        return self._force.step(t_s, patch)
 
     def look(self, sample: TactileSample) -> None:
         """Look for taxels that do not measure, without a patch; moments do not show them."""

@@ -282,12 +282,13 @@ def _preload(seen: Seen) -> SafetyStop | None:
     )
 
 
-@_touch("force", "measured force above `limits.force_max_n`", Reaction.RETREAT, _sample)
+@_touch("force", "upper end of the measured force above `limits.force_max_n`", Reaction.RETREAT, _sample)
 def _force(contact: TouchState) -> SafetyStop | None:
     limit = contact.limits.safety.force_max
-    if contact.force <= limit:
+    if contact.force_upper <= limit:
         return None
-    return SafetyStop(f"measured force {contact.force:.2f} N above the limit of {limit:.2f} N")
+    upper = f", or up to {contact.force_upper:.2f} N (2σ)," if contact.force_upper > contact.force else ""
+    return SafetyStop(f"measured force {contact.force:.2f} N{upper} above the limit of {limit:.2f} N")
 
 
 @_touch("force_hidden", "force hidden by a saturated array", Reaction.RETREAT, _hidden)

@@ -14,8 +14,8 @@ from canprobe.fieldbus.bus.port import TimedFrame
 
 MAX_FRAMES = 100_000
 """Frames that are kept for the next observation: bring-up has a few thousand and no cycle."""
-COSTS_KEPT = 100_000
-"""Costs that are kept: a cell may stay up for days."""
+COSTS_KEPT = 20_000
+"""Costs that are kept, of the last four minutes at 400 Hz: a cell may stay up for days."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from canprobe.cell.master.observers import AnyObserver
-from canprobe.cell.rows import ROWS_FOLDER
 
 Say = Callable[[str], None]
 """Called with a line of text for each step."""
@@ -34,6 +33,8 @@ class RunOptions:
         early_summary: called with the summary of a completed run as soon as it holds the estimator in the loop: before
             others estimate again, and before pictures are drawn.
         to_home: the drives are about to be homed; else bring-up refuses one that is not.
+        rows_folder: folder of the rows while the run goes on, whose caller makes files of them at its end; None keeps
+            them in memory.
     """
 
     out: Path | None = None
@@ -42,11 +43,7 @@ class RunOptions:
     rows_kept: int | None = None
     early_summary: Callable[[Mapping[str, Any]], None] = unread
     to_home: bool = False
-
-    @property
-    def rows_folder(self) -> Path | None:
-        """Folder of the rows of a run while it goes on; None where they are kept in memory."""
-        return None if self.out is None or self.rows_kept is not None else self.out / ROWS_FOLDER
+    rows_folder: Path | None = None
 
 
 DEFAULT_OPTIONS = RunOptions()

@@ -20,6 +20,7 @@ from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.setup import SafetyLimits, Touch
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.port import ControllerState, PortCounters
+from canprobe.mechanics.touch.patch.force_errors import upper_end
 from canprobe.mechanics.touch.patch.image import Patch
 from canprobe.mechanics.touch.stops import MAX_BRIDGED_SHARE, TOUCH_FORCE
 
@@ -141,6 +142,7 @@ class TouchState:
         path: the touch is a scan, which may search for a contact that it has lost.
         searched: distance towards the object that was searched since then, m.
         limit: message of a joint or workspace limit that is reached; None without one.
+        force_sigma: standard deviation of the force, N; infinite where the array shows only a lower bound of it.
     """
 
     limits: Limits
@@ -154,9 +156,15 @@ class TouchState:
     path: bool = False
     searched: float = 0.0
     limit: str | None = None
+    force_sigma: float = 0.0
     _hidden_since_ns: int | None = None
     _off_pad_since_ns: int | None = None
     _bridged_since_ns: int | None = None
+
+    @property
+    def force_upper(self) -> float:
+        """Upper end of the measured force, N; of a lower bound the bound itself, as its end is open."""
+        return upper_end(self.force, self.force_sigma) if math.isfinite(self.force_sigma) else self.force
 
     def feel(self, patch: Patch, t_ns: int, *, known: bool = False) -> None:
         """Take the patch of a tactile sample.
@@ -166,7 +174,7 @@ class TouchState:
             t_ns: time of the sample.
             known: the force is known where the array is saturated, too.
         """
-        self.force = patch.force
+        self.force, self.force_sigma = patch.force, patch.sigma.total
         self._hidden_since_ns = _since(self._hidden_since_ns, patch.saturated and not known, t_ns)
         self.hidden_s = _passed_s(self._hidden_since_ns, t_ns)
         off_pad = patch.off_pad and patch.force > TOUCH_FORCE / 2

@@ -17,6 +17,7 @@ import math
 from collections.abc import Iterator, Sequence
 
 from canprobe.cell.planning.contact import BLUR_TAXELS
+from canprobe.cell.planning.force import highest_known_force
 from canprobe.cell.planning.sync import CYCLES_TO_EFFECT
 from canprobe.cell.scene.setup import Array, Calibrate, Probe, Setup, Touch
 from canprobe.mechanics.touch.pad import COUNTS_MAX, THRESHOLD_COUNTS
@@ -86,12 +87,13 @@ def first_touch_problems(setup: Setup, task: Touch | Calibrate, kappa: Sequence[
         return
     depth, speed, after_s = depth_at(shown_n, probe, array, kappa), task.approach.speed, blind_s(setup, task)
     reached_n = force_at(depth + speed * after_s, probe, array, kappa)
-    if reached_n <= limit_n:
+    known_n = highest_known_force(array, probe, limit_n, (0.0,))
+    if reached_n <= known_n:
         return
-    slower = 0.99 * (depth_at(limit_n, probe, array, kappa) - depth) / after_s
+    slower = 0.99 * (depth_at(known_n, probe, array, kappa) - depth) / after_s
     yield (
         f"task.approach_mm_s = {1e3 * speed:g}: the array shows a contact from {shown_n:.2g} N on, and the probe stops "
         f"up to {1e3 * after_s:.0f} ms later (sensor.rate_hz = {array.rate_hz:g}), when {reached_n:.2g} N press, "
-        f"more than limits.force_max_n = {limit_n:g}; lower task.approach_mm_s to {1e3 * slower:.2g}, or raise "
-        "sensor.rate_hz"
+        f"measured up to {reached_n * limit_n / known_n:.2g} N (2σ), more than limits.force_max_n = {limit_n:g}; lower "
+        f"task.approach_mm_s to {1e3 * slower:.2g}, or raise sensor.rate_hz"
     )

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from canprobe.cell.planning.contact import contact_problems, saturation_problem
 from canprobe.cell.planning.first_touch import first_touch_problems
+from canprobe.cell.planning.force import force_problems
 from canprobe.cell.planning.model import JointSpeeds
 from canprobe.cell.planning.surface_path import SurfacePath, in_mm, surface_path
 from canprobe.cell.planning.task_way import joints_on_way, over_path, poles_at_contacts, round_ball
@@ -55,12 +56,13 @@ def check_motion(setup: Setup) -> tuple[JointSpeeds | None, list[str]]:
                 speeds, found = stops.speeds(np.zeros_like(task.arm.q_start)), stops.problems(joints, touching=True)
                 kappas = np.full((1, 2), 1.0 / task.ball_radius)
                 found += [problem] if (problem := saturation_problem(task, kappas)) is not None else []
-                found += first_touch_problems(setup, task, kappas[0].tolist())
+                found += [*force_problems(setup, task), *first_touch_problems(setup, task, kappas[0].tolist())]
             case Touch() as task:
                 path = surface_path(task, setup.truth.object)
                 problems += _hollow_problems(path, task.probe)
                 contacts = [*_along_path(task, path)][_POSES_BEFORE_CONTACT:]
                 speeds, found = _check_touch(task, path, stops, _beginning(setup, task, contacts))
+                found += force_problems(setup, task)
                 if path.hollow_radius > task.probe.radius:
                     found += first_touch_problems(setup, task, path.kappas[0].tolist())
             case _:

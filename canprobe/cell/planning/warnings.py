@@ -11,10 +11,11 @@ from canprobe.cell.planning.window import (
     TOLERATED_LOSS_SHARE,
     cut_patch,
 )
-from canprobe.cell.scene.setup import Setup
+from canprobe.cell.scene.setup import Array, Setup
 from canprobe.fieldbus.protocol.frame_bits import WORST_ERROR_BITS
 from canprobe.mechanics.robot.inverse import FULL_POSE, task_rows
 from canprobe.mechanics.touch.patch.array_calibration import NO_FORCE_REFERENCE
+from canprobe.mechanics.touch.patch.force_errors import UNSTATED
 
 LOCAL_GROUP = "ff11::ca"
 """A multicast group of interface-local scope, which no packet leaves or enters. Source: RFC 4291, 2.7."""
@@ -54,6 +55,20 @@ def _is_interface_local(channel: str) -> bool:
     return group.version == 6 and group.is_multicast and int(group) >> 112 & 0xF == 1
 
 
+def _unstated(array: Array) -> list[str]:
+    """What the calibration of an array does not state, and what is taken for it."""
+    lacking = []
+    if array.calibration.force is UNSTATED:
+        lacking.append(
+            "without section [force] creep is not corrected, and the force is taken to be known to"
+            f" {100 * UNSTATED.array:g} %, {100 * UNSTATED.spread:g} % from array to array and"
+            f" {100 * UNSTATED.creep_sigma:g} % a decade of creep (1σ)"
+        )
+    if array.calibration.noise.assumed:
+        lacking.append("without slow_um and height_um the noise of contacts is taken to be that of the emulated array")
+    return lacking
+
+
 def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
     """Warnings that a user must know before trusting the plan, most important first."""
     cut, bus = cut_patch(setup), setup.bus
@@ -67,10 +82,10 @@ def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
             "sensor.calibration: the array measures in nominal newtons, as good as its stated full scale;"
             " `canprobe calibrate array CELL --force-reference scale` gives them a reference"
         )
-    if setup.array is not None and setup.array.calibration.noise.assumed:
+    if setup.array is not None and setup.array.calibrated and (lacking := _unstated(setup.array)):
         yield (
-            "sensor.calibration: a file of an earlier form, without slow_um and height_um: the noise of contacts is"
-            " taken to be that of the emulated array; `canprobe calibrate array CELL` measures it"
+            f"sensor.calibration: a file of an earlier form: {'; '.join(lacking)};"
+            " `canprobe calibrate array CELL` measures what is missing"
         )
     if cut is not None:
         yield f"{cut.text}; {' or '.join(cut.ways)} leaves less than {100 * TOLERATED_LOSS_SHARE:.0f} % outside"

@@ -14,10 +14,12 @@ from canprobe.mechanics.touch.patch.calibrate import ArrayFit
 def calibration_text(fit: ArrayFit) -> str:
     """The calibration with its residuals and held-out errors, line by line."""
     c, image, noise, centroid = fit.calibration, fit.calibration.image, fit.calibration.noise, fit.calibration.centroid
-    k, unit = c.stiffness, "nominal N" if c.nominal else "N"
+    k, force, unit = c.stiffness, c.force, "nominal N" if c.nominal else "N"
     lines = [
         f"{c.array}: {c.residuals.touches} touches fitted, {fit.left_out} left out (saturated, or off the pad)",
         f"  force      {c.newtons}; scale {image.scale:.3f}" + _percent(c.residuals.force, ", held-out error"),
+        f"             array ± {100 * force.array:.1f} %" + _percent(force.spread or math.nan, ", array to array ±"),
+        f"  creep      {100 * force.creep:.1f} ± {100 * force.creep_sigma:.1f} % a decade of time, corrected",
         f"  stiffness  {k.moments:.4g} {unit}/m³ ± {100 * k.moments_sigma / k.moments:.1f} % by the images;"
         f" {k.depth:.4g} ± {100 * k.depth_sigma / k.depth:.1f} % by the arm's way",
         f"  arm        {1e6 * k.arm_compliance:.1f} ± {1e6 * k.arm_compliance_sigma:.1f} µm/{unit}:"
@@ -71,6 +73,9 @@ def as_document(fit: ArrayFit) -> dict[str, Any]:
         "crosstalk": c.image.crosstalk,
         "memory": c.image.memory,
         "force_error_percent": known(100 * c.residuals.force),
+        "force_array_percent": 100 * c.force.array,
+        "creep_percent_decade": 100 * c.force.creep,
+        "creep_sigma_percent_decade": 100 * c.force.creep_sigma,
         "moments_error_percent": 100 * c.residuals.moments,
         "curvature_error_percent": 100 * c.residuals.curvature,
         "rod_curvature_error_percent": known(100 * c.residuals.rod_curvature),

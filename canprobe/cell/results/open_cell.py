@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
@@ -28,6 +29,7 @@ from canprobe.cell.results.summary import (
     write_files,
     write_summary,
 )
+from canprobe.cell.rows import ROWS_FOLDER
 from canprobe.cell.scene.setup import Setup, Touch
 from canprobe.cell.session.children import Bridges
 from canprobe.cell.session.session import Session
@@ -68,7 +70,8 @@ class OpenCell:
 
     def __init__(self, plan: Plan, options: RunOptions, *, task: Controller | None = None) -> None:
         self.plan = plan
-        self.session = Session(plan, options)
+        folder = None if options.out is None or options.rows_kept is not None else options.out / ROWS_FOLDER
+        self.session = Session(plan, replace(options, rows_folder=folder))
         self._out, self._say, self._early_summary = options.out, options.say, options.early_summary
         self._bridges = Bridges(plan, options.out, virtual=self.session.virtual, say=options.say)
         self._task = task

@@ -54,6 +54,8 @@ _OF_LOG: _Shapes = {
     "tactile_age": ("f", ()),
     "phase": ("f", ()),
     "force_n": ("f", ()),
+    "force_sigma_n": ("f", ()),
+    "force_sigma_parts_n": ("f", (4,)),
     "contact_mm": ("f", (3,)),
     "normal": ("f", (3,)),
     "kappa_per_m": ("f", (2,)),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.noise import Correlation, Noise, SlowErrors
 from canprobe.mechanics.touch.estimate.online import Gate, slow_share
 from canprobe.mechanics.touch.estimate.travel import Travel
+from canprobe.mechanics.touch.patch.force_errors import UPPER_SIGMAS, ForceSigma
 from canprobe.mechanics.touch.surface import SurfaceMatrix
 from canprobe.mechanics.types import Floats
 
@@ -54,6 +56,8 @@ def score_measured_force(
 ) -> dict[str, float]:
     """Error of the force that the array measured: mean and RMS of measured less true, at the instants of its samples.
 
+    Beside them the share of seconds in which the mean error is within twice the stated standard deviation.
+
     Args:
         log: columns of the log, one row a cycle.
         truth: columns of the plant's truth, one row a SYNC.
@@ -64,7 +68,32 @@ def score_measured_force(
     if not known.any():
         return {}
     error = measured[known] - truth["force_n"][sampled[known].astype(int)]
-    return {"force_true_bias_n": float(error.mean()), "force_true_rms_error_n": float(np.sqrt(np.mean(error**2)))}
+    score = {"force_true_bias_n": float(error.mean()), "force_true_rms_error_n": float(np.sqrt(np.mean(error**2)))}
+    if "force_sigma_n" in log:
+        times, sigma = log["t_s"][first:last][known], log["force_sigma_n"][first:last][known]
+        seconds = np.floor(times - times[0]).astype(int)
+        each = [(error[seconds == k].mean(), sigma[seconds == k].mean()) for k in np.unique(seconds)]
+        score["force_within_2_sigma_fraction"] = float(np.mean([abs(e) <= UPPER_SIGMAS * s for e, s in each]))
+    return score
+
+
+def state_force_sigma(log: Mapping[str, Floats], first: int, last: int) -> dict[str, Any]:
+    """The standard deviation of the measured force over a scan, as the samples state it, and its parts by their causes.
+
+    RMS over the samples in which it is finite; those that show only a lower bound of the force are counted.
+
+    Args:
+        log: columns of the log, one row a cycle.
+        first, last: the scan, as SYNC numbers.
+    """
+    sigma = log["force_sigma_n"][first:last]
+    finite = np.isfinite(sigma)
+    score: dict[str, Any] = {"force_lower_bound_fraction": float(np.mean(np.isinf(sigma[~np.isnan(sigma)])))}
+    if finite.any():
+        parts = np.sqrt(np.mean(np.square(log["force_sigma_parts_n"][first:last][finite]), axis=0)).tolist()
+        score["force_sigma_n"] = float(np.sqrt(np.mean(np.square(sigma[finite]))))
+        score["force_sigma_parts_n"] = dict(zip(ForceSigma._fields, parts, strict=True))
+    return score
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,14 @@ from canprobe.cell.master.cell import Cell
 from canprobe.cell.master.log import since_first_sync
 from canprobe.cell.results.run_data import RunData
 from canprobe.cell.results.run_files import SCHEMA
-from canprobe.cell.results.scores import ShapeScore, bound_of_scan, score_contact, score_measured_force, score_shape
+from canprobe.cell.results.scores import (
+    ShapeScore,
+    bound_of_scan,
+    score_contact,
+    score_measured_force,
+    score_shape,
+    state_force_sigma,
+)
 from canprobe.cell.results.surface_file import save_surface_map
 from canprobe.cell.results.tool_file import FILE, summarise_calibration, tool_text
 from canprobe.cell.results.traffic import LOG, measure_traffic
@@ -29,6 +36,12 @@ from canprobe.cell.tasks.task import TaskRecord
 from canprobe.errors import ResultsError, UsageError
 from canprobe.fieldbus.bus.files import write_text
 from canprobe.mechanics.types import Floats
+
+FORCE_ERRORS = (
+    *("force_true_bias_n", "force_true_rms_error_n", "force_within_2_sigma_fraction"),
+    *("force_sigma_n", "force_sigma_parts_n", "force_lower_bound_fraction"),
+)
+"""Keys of the summary about how well the force is known."""
 
 
 def summarise(
@@ -135,9 +148,11 @@ def _contact(session: Session, record: TaskRecord, log: Mapping[str, Floats]) ->
     target = task.force_n if task.kind in ("scan", "press") else None
     figures: dict[str, float | None] = dict.fromkeys(names)
     measured: float | None = None
-    error: dict[str, float | None] = dict.fromkeys(("force_true_bias_n", "force_true_rms_error_n"))
+    error: dict[str, Any] = dict.fromkeys(FORCE_ERRORS)
     if scan is not None and scan[1] > scan[0]:
         measured = _rms_off(log["force_n"][scan[0] : scan[1]], task.force_n)
+        if "force_sigma_n" in log:
+            error |= state_force_sigma(log, *scan)
         if truth := truth_of(session):
             figures = score_contact(truth, *scan, task.force_n)
             error |= score_measured_force(log, truth, *scan)

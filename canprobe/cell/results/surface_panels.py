@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,8 +19,8 @@ from canprobe.mechanics.types import Floats
 
 MARGIN_M, TRUE_POINTS = 5e-3, 34
 """Margin of a true surface beyond the path, m, and its points on each side."""
-MAP_POINTS = 64
-"""Number of points of a map's surface along its longer side."""
+MAP_POINTS, PATCHES_DRAWN = 64, 1000
+"""Number of points of a map's surface along its longer side, and most patches that it is made of: 2 m of path."""
 
 
 class MapView(NamedTuple):
@@ -76,8 +77,11 @@ def true_surface(shape: PlacedShape, path: Floats, plane: MapPlane) -> Floats:
 def map_surface(surface_map: SurfaceMap, plane: MapPlane) -> tuple[Floats, Floats]:
     """The one surface of a map: points (rows, columns, 3) of base, m, and its σ there, m; NaN beyond its patches.
 
-    A grid over the plane of the scan, in a tenth of the time of the triangles that `SurfaceMap.mesh` finds.
+    A grid over the plane of the scan, in a tenth of the time of the triangles that `SurfaceMap.mesh` finds. Of a map
+    of more than `PATCHES_DRAWN` patches every k-th counts: time and memory grow with those that reach a point.
     """
+    every = -(-len(surface_map) // PATCHES_DRAWN)
+    surface_map = surface_map if every == 1 else replace(surface_map, patches=surface_map.patches[::every])
     contacts = plane.mm(surface_map.points)
     low, high = contacts.min(axis=0)[:2] - 1e3 * REACH_M, contacts.max(axis=0)[:2] + 1e3 * REACH_M
     counts = np.ceil(MAP_POINTS * (high - low) / (high - low).max()).astype(int)

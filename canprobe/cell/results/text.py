@@ -54,22 +54,35 @@ def summary_text(summary: dict[str, Any], out: Path | None) -> str:
 
 
 def force_lines(contact: Mapping[str, Any]) -> list[str]:
-    """The force of a touch as text: how well it was held, and the error of its measurement where the truth is known."""
+    """The force of a touch as text: how it was held, how well it is known, and its error where the truth is known."""
     target, off = contact["force_target_n"], contact["force_rms_error_n"]
-    error = contact.get("force_true_rms_error_n")
+    error, sigma = contact.get("force_true_rms_error_n"), contact.get("force_sigma_n")
     which = "true force" if error is not None else "measured force"
     lines = [
         f"  force      target {target:g} N, {which} off it by {off:.3f} N RMS ({100 * off / target:.1f} %),"
         f" highest {contact['force_max_n']:.2f} N"
     ]
+    if sigma is not None:
+        parts = [f"{name} {100 * part / target:.1f} %" for name, part in contact["force_sigma_parts_n"].items() if part]
+        lines.append(f"             measured to ± {100 * sigma / target:.1f} % over a second (1σ: {', '.join(parts)})")
+    if contact.get("force_lower_bound_fraction"):
+        lines.append(
+            f"             in {100 * contact['force_lower_bound_fraction']:.0f} % of the samples the array saturates or"
+            " ends below the contact: the true force is above the measured one"
+        )
     if error is None:
         return [*lines, "             no true force is known here: how wrong the measured one is does not show"]
     bias = contact["force_true_bias_n"]
     return [
         *lines,
         f"             measured less true: mean {bias:+.3f} N ({100 * bias / target:+.1f} %),"
-        f" RMS {error:.3f} N ({100 * error / target:.1f} %)",
+        f" RMS {error:.3f} N ({100 * error / target:.1f} %)" + _within(contact),
     ]
+
+
+def _within(contact: Mapping[str, Any]) -> str:
+    share = contact.get("force_within_2_sigma_fraction")
+    return "" if share is None else f", within 2σ in {100 * share:.0f} % of the seconds"
 
 
 def bridge_lines(bridges: Mapping[str, Mapping[str, Any]]) -> list[str]:

@@ -33,6 +33,7 @@ from canprobe.mechanics.touch.patch.array_calibration import (
     Residuals,
     StiffnessSources,
 )
+from canprobe.mechanics.touch.patch.force_errors import UNSTATED, ForceErrors
 
 SCHEMA = 1
 Share = Annotated[float, Range(0, 1)]
@@ -151,6 +152,22 @@ class ResidualKeys:
 
 
 @dataclass(frozen=True, slots=True)
+class ForceKeys:
+    """`[force]`: errors of the force, relative. A file without this section gets stated ones, with a warning."""
+
+    array_percent: Percent
+    """Error by gains, hysteresis and threshold, from touches that the fit has not seen."""
+    creep_percent: Percent
+    """Growth of the reading under a constant load per decade of time, which is corrected."""
+    creep_sigma_percent: Percent
+    """Standard deviation of `creep_percent`."""
+    creep_decades: Annotated[float, Range(0, 10)]
+    """Decades of creep in the touches that newtons rest on."""
+    spread_percent: Percent = 0.0
+    """Error from one array of a make to the next. 0 in the file of a single array."""
+
+
+@dataclass(frozen=True, slots=True)
 class TaxelKeys:
     """`[taxels]`: taxels of a single array. The file of a make has no such section."""
 
@@ -171,6 +188,7 @@ class CalibrationFile:
     stiffness: StiffnessKeys
     residuals: ResidualKeys
     taxels: TaxelKeys
+    force: ForceKeys | None = None
 
 
 def load_calibration(name_or_path: str | Path) -> ArrayCalibration:
@@ -188,7 +206,7 @@ def load_calibration(name_or_path: str | Path) -> ArrayCalibration:
     file = path.name if name in packaged else name
     document, file = with_writer(read_toml(path, file), file)
     reader = Reader(path.parent)
-    needed = [field.name for field in dataclasses.fields(CalibrationFile)]
+    needed = [field.name for field in dataclasses.fields(CalibrationFile) if field.default is dataclasses.MISSING]
     found = CalibrationFile(**reader.read(CalibrationFile, document, needed))
     if not reader.problems:
         rows = found.taxels.gains
@@ -237,8 +255,19 @@ def _calibration(file: CalibrationFile) -> ArrayCalibration:
             1e-2 * file.residuals.curvature_percent,
             _share(file.residuals.rod_curvature_percent),
         ),
+        force=UNSTATED if file.force is None else _force_errors(file.force),
         gains=file.taxels.gains,
         dead=file.taxels.dead,
+    )
+
+
+def _force_errors(keys: ForceKeys) -> ForceErrors:
+    return ForceErrors(
+        creep=1e-2 * keys.creep_percent,
+        creep_sigma=1e-2 * keys.creep_sigma_percent,
+        creep_decades=keys.creep_decades,
+        array=1e-2 * keys.array_percent,
+        spread=1e-2 * keys.spread_percent,
     )
 
 
@@ -319,6 +348,13 @@ def dump_calibration(calibration: ArrayCalibration) -> str:
             _known(1e2 * c.residuals.rod_curvature),
         ),
         TaxelKeys(c.dead, c.gains),
+        ForceKeys(
+            _rounded(1e2 * c.force.array),
+            _rounded(1e2 * c.force.creep),
+            _rounded(1e2 * c.force.creep_sigma),
+            _rounded(c.force.creep_decades),
+            _rounded(1e2 * c.force.spread),
+        ),
     )
     sections = []
     for section in dataclasses.fields(values):

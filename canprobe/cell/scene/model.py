@@ -332,7 +332,7 @@ class LimitSettings:
     """`[limits]`: where the cell stops for safety."""
 
     force_max_n: Annotated[float, Range(0, 50, open_low=True)] = 5.0
-    """Highest measured force."""
+    """Highest force: the upper end of the measured one, with twice its standard deviation, stays below."""
     preload_max_n: Annotated[float, Range(0, 50)] = 0.15
     """Highest force before the run. The tare of the array would take it for zero."""
     joint_margin_deg: Annotated[float, Range(0, 45)] = 1.0

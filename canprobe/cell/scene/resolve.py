@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,7 @@ from canprobe.mechanics.robot.tool_calibration import ball_approaches
 from canprobe.mechanics.touch.heights import Heights
 from canprobe.mechanics.touch.pad import FLAT_RADIUS_M, Pad
 from canprobe.mechanics.touch.patch.array_calibration import ArrayCalibration
+from canprobe.mechanics.touch.patch.force_errors import UNSTATED
 from canprobe.mechanics.touch.servo import SurfaceGains
 from canprobe.mechanics.touch.strategies import make_strategy
 
@@ -167,6 +169,9 @@ def _array(scene: Scene, radius: float, stiffness: float | None) -> Array | None
     if settings is None:
         return None
     calibration = load_calibration(settings.calibration or EMULATED_ARRAY)
+    calibrated = settings.calibration is not None or settings.emulated
+    if not calibrated:  # creep of the emulated array says nothing about a real one
+        calibration = replace(calibration, force=UNSTATED)
     positions, normals = (
         np.array(one) if one is not None else None for one in (settings.positions_mm, settings.normals)
     )
@@ -191,7 +196,7 @@ def _array(scene: Scene, radius: float, stiffness: float | None) -> Array | None
         rate_hz=settings.rate_hz,
         pad=pad,
         calibration=calibration if stiffness is None else calibration.with_stiffness(stiffness),
-        calibrated=settings.calibration is not None or settings.emulated,
+        calibrated=calibrated,
         raw=None if scene.array_is_node or scene.wire is None else _raw_wire(scene.wire, settings, calibration),
     )
 

@@ -214,7 +214,7 @@ class SafetyLimits:
     """Limits at which the cell stops for safety.
 
     Attributes:
-        force_max: highest measured contact force, N; above it the probe retreats.
+        force_max: highest contact force, N; the probe retreats when the upper end of the measured one is above.
         preload_max: highest force before the run, N; the array's tare takes it for zero.
         joint_margin: distance (n,) kept from the stops of each joint, rad or m; empty without an arm.
         speed_share: share of the joints' speed limits that a motion may use.

@@ -37,6 +37,7 @@ from canprobe.mechanics.robot.inverse import task_rows
 from canprobe.mechanics.touch.contact import direction_to_pad
 from canprobe.mechanics.touch.patch.array_calibration import ForceReference
 from canprobe.mechanics.touch.patch.calibrate import ArrayFit, calibrate_array
+from canprobe.mechanics.touch.patch.force_errors import MAKE_SPREAD
 from canprobe.mechanics.touch.patch.image_fit import Dwell
 from canprobe.mechanics.types import Floats
 
@@ -155,6 +156,7 @@ class CalibrationRequest:
         reference: reference of the newtons.
         sigma: its relative standard deviation.
         own_gains: whether the file is for this array; False: for all arrays of its make.
+        spread: relative standard deviation of the force between the arrays of a make.
         seed: seed of the emulation.
     """
 
@@ -166,6 +168,7 @@ class CalibrationRequest:
     reference: ForceReference = "none"
     sigma: float = 0.01
     own_gains: bool = True
+    spread: float = MAKE_SPREAD
     seed: int = 0
 
 
@@ -246,6 +249,7 @@ def calibrate(
         date=date,
         made_on=f"{moved}; plane, ball of {1e3 * request.ball_radius:g} mm, rod of {1e3 * request.rod_radius:g} mm",
         own_gains=request.own_gains,
+        spread=request.spread,
     )
     return Calibrated(fit, *_without_load(unloaded, array.rate_hz), tuple(notes))
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.master.array import PatchReader
+from canprobe.cell.master.array import PatchReader, force_columns
 from canprobe.cell.master.controller import Command, Measurement
 from canprobe.cell.tasks.task import Task, TaskRecord
 from canprobe.mechanics.touch.patch.image import PatchCalibration
@@ -74,7 +74,7 @@ class ListenTask(Task):
             patch = self._reader.read(measurement.tactile)
             self._columns = {
                 "sample_cycle": float(measurement.tactile.cycle),
-                "force_n": patch.force,
+                **force_columns(patch),
                 "pad_u_mm": patch.u * 1e3,
                 "pad_v_mm": patch.v * 1e3,
             }

@@ -20,6 +20,8 @@ from canprobe.mechanics.touch.patch.moments import MomentImage
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.noise import Correlation
     from canprobe.mechanics.touch.estimate.online import Estimator
+    from canprobe.mechanics.touch.map.contact_map import ContactMap
+    from canprobe.mechanics.touch.patch.image_model import ImageModel
 
 
 HEIGHT_CORRELATION = (2e-3, 0.2)
@@ -101,11 +103,23 @@ def _with_patch(task: Touch, estimator: Estimator, memory: float) -> Estimator:
     from canprobe.mechanics.touch.patch.curvature import PatchCurvature
     from canprobe.mechanics.touch.patch.fused_estimator import PatchedEstimator
 
+    return PatchedEstimator(estimator, PatchCurvature(_image_model(task), SIGMA_STIFFNESS), memory)
+
+
+def _image_model(task: Touch) -> ImageModel:
     array = task.array
     patch = make_patch_calibration(array.calibration, array.pad)
     windowed = array.mode == "window" and int(array.window) <= DEFAULT_WINDOW
-    model = make_image_model(array.calibration, patch, seen=int(array.window) if windowed else None)
-    return PatchedEstimator(estimator, PatchCurvature(model, SIGMA_STIFFNESS), memory)
+    return make_image_model(array.calibration, patch, seen=int(array.window) if windowed else None)
+
+
+def make_contact_map(task: Touch) -> ContactMap:
+    """An empty map for the contacts of a task's pad."""
+    from canprobe.mechanics.touch.map.contact_map import ContactMap  # only where a map is asked for
+    from canprobe.mechanics.touch.map.local_fits import Pad
+    from canprobe.mechanics.touch.map.noise import PAD_NOISE
+
+    return ContactMap(Pad(task.probe.radius, task.probe.stiffness), PAD_NOISE, _image_model(task))
 
 
 def _uses_patch(task: Touch) -> bool:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.cell.master.array import force_columns
 from canprobe.cell.master.conditions import touch_finding
 from canprobe.cell.master.controller import Command, Measurement, TactileSample
 from canprobe.cell.master.supervision import TouchState, limits_of
@@ -152,7 +153,7 @@ class ProbingTask(Task):
         return {
             "phase": float(self.phase),
             "sample_cycle": float(sample.cycle),
-            "force_n": patch.force,
+            **force_columns(patch),
             "pad_u_mm": patch.u * 1e3,
             "pad_v_mm": patch.v * 1e3,
             "contact_mm": contact.p_base * 1e3 if contact is not None else np.full(3, np.nan),

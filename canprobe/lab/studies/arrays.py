@@ -3,7 +3,8 @@
 Each cell is an array drawn at random: stiffness of its layer, full scale, blur, crosstalk, hysteresis, creep, gains. It
 is touched as `canprobe calibrate array` touches it, directly and without a bus: a plane at 4 places with 3 forces, a
 ball at 9 places with 2 forces, three reference loads, short rolls to and fro, a rod to verify. Then quadrics with
-curvatures, forces, places and dwell times by chance are pressed on it, and its calibration says what they are.
+curvatures, forces, places and dwell times by chance are pressed on it, and its calibration says what they are;
+`array_forces` holds some of them for up to a minute.
 
 The images come from `canprobe.cell.plant.taxels`, whose pressure is that of the exact sphere, sampled nine times a
 taxel, with hysteresis, creep and noise; the calibration knows none of its formulas.
@@ -24,12 +25,13 @@ from canprobe.cell.emulated.image_processing import follow
 from canprobe.cell.plant.elastic_contact import depth_for_force
 from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig
 from canprobe.cell.results.picture import BLUE, INK, picture
+from canprobe.lab.studies.array_forces import GROUPS, HOLD_S, HOLDS, result_of, score_holds
 from canprobe.lab.studies.harness import Column, Row, StudyResult
 from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.patch.array_models import make_image_model, make_patch_calibration
-from canprobe.mechanics.touch.patch.calibrate import calibrate_array
+from canprobe.mechanics.touch.patch.calibrate import ArrayFit, calibrate_array
 from canprobe.mechanics.touch.patch.image import PatchCalibration
 from canprobe.mechanics.touch.patch.image_fit import Dwell, what_is_shown
 from canprobe.mechanics.touch.patch.parameter_fit import curvature_errors, moment_errors
@@ -37,8 +39,12 @@ from canprobe.mechanics.types import Floats
 
 RADIUS_M = 0.040
 BALL_PER_M = 40.0
-ARRAYS, QUICK_ARRAYS = range(120, 140), range(120, 122)
-"""Seeds; the calibration was developed with those from 100 to 119."""
+FIRST_ARRAY, ARRAYS, QUICK_ARRAYS = 100, 20, 2
+"""Seed of the first array of draw 0, and number of arrays of a draw."""
+DEVELOPMENT_DRAW, TEST_DRAW = 0, 1
+"""Draws: settings of calibration and force come from the first, and the second was only looked at."""
+OTHER_ARRAY = 10_000
+"""Distance of the seed of the array whose calibration is taken for that of a make."""
 PRESSES = 20
 WINDOW = 8
 FRAME_S, LOADING_S, DWELL_S, APART_S = 0.02, 0.5, 3.0, 2.5
@@ -50,7 +56,7 @@ FORCE_RELATIVE_SIGMA, FORCE_CORRELATION_S = 0.03, 0.1
 ENCODER_M = 3e-6
 EIGHT_M, STROKE_M, STROKE_HZ = (1.5e-3, 0.6e-3), (0.5e-3, 0.0), (0.5, 1.5)
 GOALS = {"force_percent": 2.0, "stiffness_percent": 3.0, "curvature_percent": 5.0}
-MODEL = ("mechanics/touch", "cell/plant", "lab/studies/arrays.py")
+MODEL = ("mechanics/touch", "cell/plant", "lab/studies/arrays.py", "lab/studies/array_forces.py")
 COLUMNS = (
     Column("array", "array"),
     Column("full_scale_kpa", "kPa", ".0f"),
@@ -66,13 +72,16 @@ COLUMNS = (
 )
 
 
-def run(*, quick: bool, sweep: Sweep) -> StudyResult:
-    """Calibrate the arrays and press on them."""
-    seeds = QUICK_ARRAYS if quick else ARRAYS
-    sweep.say(f"{len(seeds)} arrays")
+def run(*, quick: bool, sweep: Sweep, draw: int = TEST_DRAW) -> StudyResult:
+    """Calibrate the arrays of a draw and press on them."""
+    first = FIRST_ARRAY + ARRAYS * draw
+    seeds = range(first, first + (QUICK_ARRAYS if quick else ARRAYS))
+    sweep.say(f"{len(seeds)} arrays, draw {draw}: seeds {seeds[0]} to {seeds[-1]}")
     rows: list[Row] = list(sweep.map(measure, list(seeds), model=MODEL))
+    forces = [row for each in sweep.map(measure_forces, list(seeds), model=MODEL) for row in each]
     facts = measuring_facts(quick, len(seeds), MODEL)
-    return StudyResult("arrays", COLUMNS, rows, findings(rows), facts, partial(draw_arrays, rows))
+    more = (result_of(forces, facts),)
+    return StudyResult("arrays", COLUMNS, rows, findings(rows), facts, partial(draw_arrays, rows), more)
 
 
 def random_array(seed: int) -> tuple[TaxelConfig, float, np.random.Generator]:
@@ -95,10 +104,14 @@ class Presses:
     Args:
         config, stiffness: the array, and the stiffness of its layer, N/m³.
         rng: generator of gains and noise.
+
+    Attributes:
+        forces: (n,) true force at each image of the last touch, N.
     """
 
     def __init__(self, config: TaxelConfig, stiffness: float, rng: np.random.Generator) -> None:
         self._config, self._stiffness, self._rng = config, stiffness, rng
+        self.forces: Floats = np.empty(0)
         self._array, self._t = TaxelArray(config, rng, radius_m=RADIUS_M, stiffness_n_m3=stiffness), 0.0
 
     def dwell(  # noqa: PLR0917
@@ -158,7 +171,7 @@ class Presses:
         for _ in range(round(APART_S / FRAME_S)):
             self._t += FRAME_S
             array.image((0.0, 0.0), 0.0, kappa, axes, self._t)
-        mean = float(np.mean(forces[len(forces) // 3 :]))
+        mean, self.forces = float(np.mean(forces[len(forces) // 3 :])), np.array(forces)
         return Dwell(
             name=name,
             kappa=kappa,
@@ -216,9 +229,30 @@ class Presses:
         dwell = self.dwell("quadric", force, (k1, k2), 0, (x, y), angle, seconds=seconds, heading=heading, hz=hz)
         return replace(dwell, force=force)
 
+    def held(self) -> tuple[Dwell, Floats]:
+        """A random quadric, held for some time, and its true forces (n,), N."""
+        self.rest()
+        rng = self._rng
+        k1, k2 = sorted(rng.uniform(-12.0, 60.0, 2).tolist(), reverse=True)
+        x, y = rng.uniform(-1.5e-3, 1.5e-3, 2).tolist()
+        half = float(rng.uniform(0.0, 1.5e-3))
+        dwell = self.dwell(
+            "quadric",
+            float(rng.uniform(0.5, 3.0)),
+            (k1, k2),
+            0,
+            (x, y),
+            float(rng.uniform(0.0, math.pi)),
+            seconds=float(rng.choice(HOLD_S)),
+            heading=float(rng.uniform(0.0, 2.0 * math.pi)),
+            roll=(half, 0.4 * half),
+            hz=(float(rng.uniform(0.05, 0.5)),),
+        )
+        return dwell, self.forces
 
-def measure(seed: int) -> dict[str, Any]:
-    """Calibrate one array and press on it: a row of the table."""
+
+def _calibrated(seed: int, *, own_gains: bool) -> tuple[ArrayFit, TaxelConfig, float, Presses, Pad]:
+    """The fit of a random array, the array, the stiffness of its layer (N/m³), its presses and its pad."""
     config, stiffness, rng = random_array(seed)
     presses, pad = Presses(config, stiffness, rng), Pad(full_scale_pa=config.full_scale_pa, mount_radius_m=RADIUS_M)
     fit = calibrate_array(
@@ -229,7 +263,31 @@ def measure(seed: int) -> dict[str, Any]:
         array=f"emulated, seed {seed}",
         date="",
         made_on="study arrays",
+        own_gains=own_gains,
     )
+    return fit, config, stiffness, presses, pad
+
+
+def measure_forces(seed: int) -> list[Row]:
+    """Hold quadrics on one array, and read their forces with its own calibration and with another one: two rows."""
+    own, config, _, presses, pad = _calibrated(seed, own_gains=True)
+    other = _calibrated(seed + OTHER_ARRAY, own_gains=False)[0]
+    holds = [presses.held() for _ in range(HOLDS)]
+    return [
+        {
+            "array": seed,
+            "calibration": group,
+            "creep_percent": 100.0 * config.creep_per_decade,
+            "creep_found_percent": 100.0 * fit.calibration.force.creep,
+            **score_holds(fit.calibration, pad, holds),
+        }
+        for group, fit in zip(GROUPS, (own, other), strict=True)
+    ]
+
+
+def measure(seed: int) -> dict[str, Any]:
+    """Calibrate one array and press on it: a row of the table."""
+    fit, config, stiffness, presses, pad = _calibrated(seed, own_gains=True)
     found = fit.calibration
     patch = make_patch_calibration(found, pad)
     model = make_image_model(found, patch, seen=WINDOW)

@@ -1,14 +1,14 @@
-"""Study `regions`: whether the online estimator's 95 % regions hold the truth with the whole sensor on.
+"""Study `regions`: whether the online estimator's 95 % regions hold the truth with the whole sensor on, scene by scene.
 
-Each cell is a lockstep scan of one scene: array with blur, gain spread, hysteresis, creep, crosstalk, noise and 8 bits,
-joint counts, delays, servo and plant. Two groups: packaged scenes with some seeds, and random ones, each with its own
-object, radii, heading, path, force, full scale, stiffness of the layer (in half of them not the stated one) and array.
-Nothing was set on either group.
+Scenes are drawn at random from everything that a cell may meet: five cells, ten kinds of surfaces from planes to rough
+height fields with radii from 12 mm, weaves, straight paths and circles, 0.5 to 3 N, 5 to 40 mm/s, tool errors, arrays
+with blur, gains, hysteresis and creep of their own. Each is scanned without a bus, with the same numbers as in lockstep
+to the last bit. A scene that answers nothing (its plan refuses it, or it is stopped before) is counted, and
+another one is drawn in its place.
 
-Every answer of the estimator in the loop after the first 20 mm is scored against the truth at the instant of its last
-contact: whether the region of (K11, K12, K22) holds it, its error, what it states, and the logarithm of the density
-that it gives the truth. A scan is one draw of errors that last, so intervals come from drawing scenes anew (bootstrap),
-and the scenes that are held seldom are counted. A scene that its plan refuses, or whose touch does, has no answers.
+All seeds follow from the number of the draw. Settings of the estimator come from draws with other numbers than
+`TEST_DRAW`. A scan is one draw of errors that last, so intervals come from drawing scenes anew (bootstrap), and
+scenes are counted whose regions hold the truth seldom. Goals are stated for each kind of surface.
 
 Source: Efron and Tibshirani, "An introduction to the bootstrap", 1993; Gneiting and Raftery, "Strictly proper scoring
 rules, prediction, and estimation", 2007.
@@ -16,44 +16,50 @@ rules, prediction, and estimation", 2007.
 
 from __future__ import annotations
 
+import csv
+import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from canprobe.cell.planning.make import make_plan
-from canprobe.cell.results.picture import BLUE, GREY, INK, SHADE, legend, picture
-from canprobe.cell.results.scores import RUN_IN_M, curvature_tensor
-from canprobe.cell.scene.load import load_scene
-from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.session.session import Session
-from canprobe.cell.tasks.from_plan import make_task
-from canprobe.cell.tasks.shape import ShapeRecord
-from canprobe.errors import PlanError
-from canprobe.lab.studies.harness import CHI2_95_OF_3, FROBENIUS, Column, Row, StudyResult
-from canprobe.lab.studies.random_scenes import random_scene
+from canprobe.errors import UsageError
+from canprobe.fieldbus.bus.files import whole_file
+from canprobe.lab.studies.harness import CHI2_95_OF_3, Column, Row, Say, StudyResult
+from canprobe.lab.studies.random_scenes import FOREIGN, KINDS, SceneSeed
+from canprobe.lab.studies.region_figure import draw_regions
+from canprobe.lab.studies.region_scores import ScoredScan, measure
 from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.types import Floats
 
-PACKAGED = ("cylinder", "sphere", "plane", "saddle", "ellipsoid", "bowl", "torus", "wave", "fillet")
-SEEDS = range(102, 107)
-SCENE_NUMBERS = range(1000, 1270)
-"""Numbers of the random scenes; 0 to 89 were used to look at the estimator's errors."""
-PACKAGED_S, RANDOM_S = 10.0, 5.0
-ASKED_COVERAGE = (0.93, 0.97)
+TEST_DRAW, DEVELOPMENT_DRAW = 1, 2
+SCENES, QUICK_SCENES = 60, 3
+"""Number of scenes of a kind that answer, and be it that K is not observed."""
+TRIES = 4
+"""Most scenes that are drawn for one that answers."""
+COVERAGE_GOAL, STATED_GOAL = (0.93, 0.97), (0.9, 1.4)
+"""Pooled coverage, and geometric mean over scenes of stated over error, of every kind."""
 SELDOM_SHARE, HARDLY_SHARE = 0.8, 0.4
 """Shares of the answers of a scene."""
-DRAWS = 2000
-MODEL = ("fieldbus", "mechanics", "cell", "scenes", "lab/studies/regions.py", "lab/studies/random_scenes.py")
+SELDOM_GOAL, HARDLY_GOAL = 0.08, 0.01
+"""Largest shares of such scenes."""
+WORST = 8
+BOOTSTRAPS = 2000
+MODEL = (
+    "fieldbus", "mechanics", "cell", "scenes", "cells", "arrays", "calibrations", "lab/studies/arrays.py",
+    "lab/studies/random_scenes.py", "lab/studies/region_scores.py",
+)  # fmt: skip
 COLUMNS = (
-    Column("group", "group"),
+    Column("group", "scenes by"),
     Column("of", "of"),
+    Column("seeds", "seeds"),
     Column("scenes", "scenes"),
     Column("refused", "refused"),
+    Column("stopped", "stopped"),
     Column("answers", "answers"),
     Column("observed", "observed", ".3f"),
     Column("coverage", "cover", ".3f"),
@@ -66,186 +72,240 @@ COLUMNS = (
     Column("stated_low", "from", ".2f"),
     Column("stated_high", "to", ".2f"),
     Column("log_score", "log score", ".2f"),
+    Column("worst", "worst seed: cover"),
 )
+COMPARED = (
+    ("refused", "refused", "d"), ("stopped", "stopped", "d"), ("observed", "observed", ".3f"),
+    ("coverage", "coverage", ".3f"), ("stated_over_error", "stated/error", ".2f"), ("log_score", "log score", ".2f"),
+)  # fmt: skip
+"""Figures that are shown beside those of an earlier run."""
+BY: Mapping[str, Callable[[ScoredScan], str]] = {
+    "array": lambda scan: scan.array,
+    "cell": lambda scan: scan.cell,
+    "path": lambda scan: scan.path,
+    "speed": lambda scan: "5–14 mm/s" if scan.speed_mm_s < 14.0 else "14–40 mm/s",
+    "force": lambda scan: "0.5–1.5 N" if scan.force_n < 1.5 else "1.5–3 N",
+    "tool": lambda scan: "true tool" if scan.tool_error_mm == 0.0 else "wrong tool",
+}
+"""Groups of the table besides the kinds of surfaces."""
 
 
-class RegionCase(NamedTuple):
-    """One scan: of a packaged scene with a seed, or ("random") of the random scene of that number."""
+def run(*, quick: bool, sweep: Sweep, draw: int = TEST_DRAW, against: Path | None = None) -> StudyResult:
+    """Scan the scenes of a draw.
 
-    scene: str
-    seed: int
-    duration_s: float
-
-
-class ScoredScan(NamedTuple):
-    """Result of a scan: its scene in words, answers after the run-in, and the scores (n, 4) of those with all of K.
-
-    A score is: squared error and stated variance (Frobenius), squared length of the error in the region's, and the
-    logarithm of the density at the truth.
+    Args:
+        quick: a few scenes of each kind.
+        sweep: computes the scans.
+        draw: number that all seeds follow from.
+        against: result file (`regions.json`) of an earlier run, to compare with.
     """
-
-    kind: str
-    path: str
-    full_scale_kpa: float
-    late: int
-    scores: Floats
-
-
-def run(*, quick: bool, sweep: Sweep) -> StudyResult:
-    """Scan the scenes."""
-    packaged, seeds, numbers = (
-        (PACKAGED[:1], SEEDS[:1], SCENE_NUMBERS[2:4]) if quick else (PACKAGED, SEEDS, SCENE_NUMBERS)
-    )
-    seconds = (1.8, 1.8) if quick else (PACKAGED_S, RANDOM_S)
-    cases = [RegionCase(scene, seed, seconds[0]) for seed in seeds for scene in packaged]
-    cases += [RegionCase("random", number, seconds[1]) for number in numbers]
-    sweep.say(f"{len(cases)} scans of {min(seconds):g} to {max(seconds):g} s")
-    found = sweep.map(measure, cases, model=MODEL)
-    scans = [ScoredScan(*one)._replace(scores=np.array(one[-1]).reshape(-1, 4)) for one in found]
-    groups = {"packaged": scans[: len(packaged) * len(seeds)], "random": scans[len(packaged) * len(seeds) :]}
-    rows = [row for group, mine in groups.items() for row in rows_of(group, mine)]
-    return StudyResult(
-        "regions", COLUMNS, rows, findings(rows), measuring_facts(quick, len(cases), MODEL), partial(draw_regions, rows)
-    )
+    earlier = None if against is None else earlier_rows(against)
+    wanted = QUICK_SCENES if quick else SCENES
+    scans = scan_all(sweep, draw, KINDS, wanted)
+    write_scenes(sweep.folder / "regions_scenes.csv", scans)
+    rows = rows_of(scans)
+    said = findings(rows, scans)
+    if earlier is not None:
+        said += compared(rows, earlier)
+    facts = measuring_facts(quick, len(scans), MODEL) | {"draw": draw}
+    return StudyResult("regions", COLUMNS, rows, said, facts, partial(draw_regions, rows, scans))
 
 
-def measure(case: RegionCase) -> ScoredScan:
-    """One scan."""
-    name, seed, duration = case
-    if name == "random":
-        scene = random_scene(seed, duration)
-    else:
-        scene = load_scene(name, {"scene.seed": seed, "task.duration_s": duration, "shape.also": []})
-    assert scene.object is not None and scene.sensor is not None
-    words = scene.object.kind, scene.task.strategy, scene.sensor.full_scale_kpa
-    try:
-        task: Any = make_task(make_plan(resolve(scene)))
-    except PlanError:
-        return ScoredScan(*words, 0, np.zeros((0, 4)))
-    with Session(scene) as session:
-        session.run(task)
-    times = session.cell.log.arrays()["t_s"]
-    late = [r for r in task.shape.records if r.travelled_m >= RUN_IN_M]
-    return ScoredScan(
-        *words, len(late), np.array([scored(r, session.truth, times) for r in late if r.estimate.rank == 3])
-    )
+def scan_all(sweep: Sweep, draw: int, kinds: Sequence[str], wanted: int) -> list[ScoredScan]:
+    """Scan scenes of each kind until the wanted number of them answers, or `TRIES` times as many are drawn."""
+    scans: dict[str, list[ScoredScan]] = {kind: [] for kind in kinds}
+    while True:
+        todo = []
+        for kind, done in scans.items():
+            missing = wanted - sum(scan.late > 0 for scan in done)
+            numbers = range(len(done), min(len(done) + missing, TRIES * wanted))
+            todo += [SceneSeed(draw, kind, number).value() for number in numbers]
+        if not todo:
+            return [scan for done in scans.values() for scan in done]
+        sweep.say(f"{len(todo)} scans")
+        for answer in sweep.map(measure, todo, model=MODEL):
+            scan = ScoredScan.of(answer)
+            scans[scan.kind].append(scan)
 
 
-def scored(record: ShapeRecord, truth: dict[str, Floats], times: Floats) -> list[float]:
-    """One row of `ScoredScan.scores`, in the axes of the answer."""
-    row = int(np.searchsorted(times, record.t_s - 1e-6))
-    P = record.estimate.T_frame_contact[:3, :2]
-    D = (
-        record.estimate.K
-        - P.T @ curvature_tensor(*(truth[k][row] for k in ("kappa_per_m", "direction1", "direction2"))) @ P
-    )
-    e, C = np.array([D[0, 0], D[0, 1], D[1, 1]]), record.estimate.covariance
-    square = float(e @ np.linalg.solve(C, e))
-    density = -0.5 * (square + float(np.linalg.slogdet(2.0 * math.pi * C)[1]))
-    return [float(e**2 @ FROBENIUS), float(np.diag(C) @ FROBENIUS), square, density]
-
-
-def rows_of(group: str, scans: Sequence[ScoredScan]) -> list[Row]:
-    """Rows of a group: each kind of object, each full scale and path where there are several, and all."""
-    rows = []
-    for field in ("kind", "full_scale_kpa", "path"):
-        values = dict.fromkeys(getattr(scan, field) for scan in scans)
-        if field == "kind" or len(values) > 1:
-            for value in values:
-                name = f"{value:g} kPa" if isinstance(value, float) else str(value)
-                rows.append(row_of(group, name, [scan for scan in scans if getattr(scan, field) == value]))
-    return [*rows, row_of(group, "all", scans)]
+def rows_of(scans: Sequence[ScoredScan]) -> list[Row]:
+    """Rows of the table: each kind, all of them, behind jumps, and the other groups; foreign arrays count apart."""
+    known = [scan for scan in scans if scan.kind != FOREIGN]
+    kinds = dict.fromkeys(scan.kind for scan in scans)
+    rows = [row_of("kind", kind, [scan for scan in scans if scan.kind == kind]) for kind in kinds]
+    rows.append(row_of("kind", "all but foreign", known))
+    jumps = [scan._replace(scores=scan.behind, late=scan.behind_late) for scan in known if scan.behind_late]
+    if jumps:
+        rows.append(row_of("behind a jump", "all but foreign", jumps))
+    for group, name in BY.items():
+        mine = scans if group == "array" else known
+        for value in sorted({name(scan) for scan in mine}):
+            rows.append(row_of(group, value, [scan for scan in mine if name(scan) == value]))
+    return rows
 
 
 def row_of(group: str, name: str, scans: Sequence[ScoredScan]) -> Row:
     """One row of the table."""
-    answering = [scan.scores for scan in scans if len(scan.scores)]
-    answers = np.concatenate(answering) if answering else np.full((1, 4), np.nan)
-    # of each scene: answers, regions that hold the truth, squared errors, stated variances
-    sums = np.array([[len(s), np.sum(s[:, 2] < CHI2_95_OF_3), s[:, 0].sum(), s[:, 1].sum()] for s in answering])
-    sums = sums.reshape(-1, 4)
-    shares = sums[:, 1] / sums[:, 0]
-    drawn = (
-        sums[np.random.default_rng(0).integers(len(sums), size=(DRAWS, len(sums)))].sum(axis=1) if len(sums) else sums
-    )
-    coverage, stated = _interval(drawn[:, 1] / drawn[:, 0]), _interval(np.sqrt(drawn[:, 3] / drawn[:, 2]))
-    total = sums.sum(axis=0)
+    answering = [scan for scan in scans if len(scan.scores)]
+    answers = np.concatenate([scan.scores for scan in answering]) if answering else np.full((1, 5), math.nan)
+    # of each scene: answers, regions that hold the truth, and the logarithm of stated over error
+    sums = np.array([
+        [len(scan.scores), len(scan.scores) * scan.share, math.log(scan.stated_per_m / scan.error_per_m)]
+        for scan in answering
+    ]).reshape(-1, 3)  # fmt: skip
+    drawn = _drawn(sums)
+    coverage, stated = _interval(drawn[:, 1] / drawn[:, 0]), np.exp(_interval(drawn[:, 2] / max(len(sums), 1)))
+    shares = [scan.share for scan in answering]
+    worst = min(answering, key=lambda scan: scan.share, default=None)
+    seeds = sorted(scan.seed for scan in scans)
     return {
-        "group": group, "of": name, "scenes": len(scans), "refused": sum(scan.late == 0 for scan in scans),
-        "answers": int(total[0]), "observed": float(total[0]) / max(sum(scan.late for scan in scans), 1),
-        "coverage": float(np.mean(answers[:, 2] < CHI2_95_OF_3)), "coverage_low": coverage[0],
-        "coverage_high": coverage[1], "below_80": float(np.mean(shares < SELDOM_SHARE)) if len(shares) else math.nan,
-        "below_40": float(np.mean(shares < HARDLY_SHARE)) if len(shares) else math.nan,
-        "error_per_m": math.sqrt(float(np.mean(answers[:, 0]))),
-        "stated_over_error": math.sqrt(float(np.mean(answers[:, 1]) / np.mean(answers[:, 0]))),
-        "stated_low": stated[0], "stated_high": stated[1], "log_score": float(np.mean(answers[:, 3])),
+        "group": group, "of": name,
+        "seeds": f"{seeds[0]}–{seeds[-1]}" if group == "kind" and seeds[0] // 1000 == seeds[-1] // 1000 else "",
+        "scenes": len(scans), "refused": sum(scan.ended.startswith("refused") for scan in scans),
+        "stopped": sum(scan.ended.startswith("stopped") for scan in scans), "answers": int(sums[:, 0].sum()),
+        "observed": float(sums[:, 0].sum()) / max(sum(scan.late for scan in scans), 1),
+        "coverage": float(np.mean(answers[:, 3] < CHI2_95_OF_3)) if answering else math.nan,
+        "coverage_low": coverage[0], "coverage_high": coverage[1],
+        "below_80": float(np.mean(np.array(shares) < SELDOM_SHARE)) if shares else math.nan,
+        "below_40": float(np.mean(np.array(shares) < HARDLY_SHARE)) if shares else math.nan,
+        "error_per_m": math.sqrt(float(np.mean(answers[:, 1]))),
+        "stated_over_error": math.exp(float(np.mean(sums[:, 2]))) if shares else math.nan,
+        "stated_low": stated[0], "stated_high": stated[1], "log_score": float(np.mean(answers[:, 4])),
+        "worst": f"{worst.seed}: {worst.share:.2f}" if worst is not None else "",
     }  # fmt: skip
+
+
+def _drawn(sums: Floats) -> Floats:
+    """Sums over scenes that are drawn anew, a row each."""
+    if not len(sums):
+        return np.full((1, sums.shape[1]), np.nan)
+    drawn: Floats = sums[np.random.default_rng(0).integers(len(sums), size=(BOOTSTRAPS, len(sums)))].sum(axis=1)
+    return drawn
 
 
 def _interval(values: Floats) -> tuple[float, float]:
     """Interval of 95 % of the draws."""
-    if not len(values):
-        return math.nan, math.nan
     low, high = np.quantile(values, [0.025, 0.975])
     return float(low), float(high)
 
 
-def findings(rows: Sequence[Row]) -> list[str]:
-    """Coverage of each group, and the kinds outside what is asked for."""
-    said = []
-    for whole in (row for row in rows if row["of"] == "all"):
-        answering = whole["scenes"] - whole["refused"]
+def findings(rows: Sequence[Row], scans: Sequence[ScoredScan]) -> list[str]:
+    """Coverage of all, each goal with the kinds that miss it, and the worst scenes with the line that repeats one."""
+    kinds = [row for row in rows if row["group"] == "kind"]
+    whole, surfaces = kinds[-1], [row for row in kinds[:-1] if row["answers"]]
+    said = [
+        f"{whole['scenes']} scenes of known arrays, {whole['refused']} refused by their plans and "
+        f"{whole['stopped']} stopped: {100 * whole['coverage']:.1f} % of {whole['answers']} regions hold the truth "
+        f"({100 * whole['coverage_low']:.1f} to {100 * whole['coverage_high']:.1f} by scenes drawn anew), stated over "
+        f"error {whole['stated_over_error']:.2f}, {100 * whole['observed']:.1f} % of the answers observe all of K."
+    ]
+    low, high = COVERAGE_GOAL
+    least, most = STATED_GOAL
+    said += [
+        _goal(
+            f"{100 * low:g}–{100 * high:g} % of the regions of every kind hold the truth",
+            [f"{r['of']} {100 * r['coverage']:.1f} %" for r in surfaces if not low <= r["coverage"] <= high],
+        ),
+        _goal(
+            f"stated over error {least:g}–{most:g} for every kind (geometric mean over scenes)",
+            [
+                f"{r['of']} {r['stated_over_error']:.2f}"
+                for r in surfaces
+                if not least <= r["stated_over_error"] <= most
+            ],
+        ),
+    ]
+    for key, edge, goal in (("below_80", 80, SELDOM_GOAL), ("below_40", 40, HARDLY_GOAL)):
+        most_of = [f"{r['of']} {100 * r[key]:.0f} %" for r in surfaces if r[key] > SELDOM_GOAL]
+        missed = [f"{100 * whole[key]:.1f} %", *most_of] if whole[key] > goal else []
+        said.append(_goal(f"at most {100 * goal:g} % of the scenes below {edge} %", missed))
+    for row in (row for row in rows if row["group"] == "behind a jump"):
         said.append(
-            f"{whole['group']} scenes: {100 * whole['coverage']:.1f} % of {whole['answers']} regions hold the truth "
-            f"({100 * whole['coverage_low']:.1f} to {100 * whole['coverage_high']:.1f} by scenes drawn anew; asked "
-            f"for: 93–97 %), below 80 % in {100 * whole['below_80']:.1f} % of {answering} scenes and below 40 % in "
-            f"{100 * whole['below_40']:.1f} %; stated over error {whole['stated_over_error']:.2f}; "
-            f"{100 * whole['observed']:.1f} % of the answers observe all of K; {whole['refused']} scenes refused."
+            f"Scored apart, up to 1.5 mm behind a jump of the surface: {100 * row['observed']:.0f} % of the answers "
+            f"observe all of K, {100 * row['coverage']:.0f} % of those regions hold the truth, error "
+            f"{row['error_per_m']:.1f} 1/m."
         )
-        outside = [
-            f"{row['of']} {100 * row['coverage']:.1f} %"
-            for row in rows
-            if row["group"] == whole["group"]
-            and row is not whole
-            and not ASKED_COVERAGE[0] <= row["coverage"] <= ASKED_COVERAGE[1]
+    worst = sorted((scan for scan in scans if scan.share < SELDOM_SHARE), key=lambda scan: scan.share)[:WORST]
+    if worst:
+        said.append("The worst scenes, and the line that repeats each:")
+        said += [
+            f"  {100 * scan.share:.0f} %, {in_words(scan)}: canprobe study regions --seed {scan.seed}" for scan in worst
         ]
-        said.append(f"  outside what is asked for: {', '.join(outside) or 'none'}.")
     return said
 
 
-COLOURS = {"packaged": GREY, "random": BLUE}
+def _goal(text: str, missed: Sequence[str]) -> str:
+    return f"Goal: {text}: {'missed by ' + ', '.join(missed) if missed else 'met'}."
 
 
-def draw_regions(rows: Sequence[Row], path: Path) -> None:
-    """Coverage, and stated deviation over error, with their intervals."""
-    names = list(dict.fromkeys(r["of"] for r in rows))
-    title = (
-        "Whether the online estimator knows its error: how often its 95 % regions hold the true curvature,\n"
-        "and the standard deviation that it states over its RMS error (above 1: cautious)\n"
-        "by object, over all, by full scale of the array (kPa) and by path; bars: 95 % over scenes; shade: target"
+def in_words(scan: ScoredScan) -> str:
+    """The scene of a scan in words."""
+    tool = f", tool {scan.tool_error_mm:.2f} mm off" if scan.tool_error_mm else ""
+    return (
+        f"{scan.object} on {scan.cell}, {scan.path}, {scan.speed_mm_s:g} mm/s, {scan.force_n:g} N, {scan.array} array"
+        f" of {scan.full_scale_kpa:.0f} kPa{tool}"
     )
-    with picture(path, title, 4.4) as figure:
-        left, right = figure.subplots(1, 2)
-        left.axhspan(*ASKED_COVERAGE, color=SHADE, linewidth=0, zorder=0)
-        right.axhspan(0.9, 1.15, color=SHADE, linewidth=0, zorder=0)
-        right.axhline(1.0, color=INK, linewidth=0.8)
-        for j, group in enumerate(dict.fromkeys(r["group"] for r in rows)):
-            mine = [r for r in rows if r["group"] == group]
-            x = np.array([names.index(r["of"]) for r in mine]) + 0.3 * (j - 0.5)
-            for axes, value, low, high in (
-                (left, "coverage", "coverage_low", "coverage_high"),
-                (right, "stated_over_error", "stated_low", "stated_high"),
-            ):
-                y = np.array([r[value] for r in mine])
-                bars = np.abs(np.array([[r[low] for r in mine], [r[high] for r in mine]]) - y)
-                style = {"fmt": "o", "markersize": 4, "linewidth": 1, "color": COLOURS[group], "zorder": 3}
-                axes.errorbar(x, y, yerr=bars, label=f"{group} scenes", **style)
-        left.set(title="coverage", ylabel="share of regions")
-        right.set(title="stated over error", ylabel="ratio of RMS", yscale="log")
-        right.set_yticks([0.5, 0.7, 1, 1.5, 2, 3], ["0.5", "0.7", "1", "1.5", "2", "3"])
-        right.minorticks_off()
-        for axes in (left, right):
-            axes.set_xticks(range(len(names)), names, rotation=45, ha="right", rotation_mode="anchor")
-            axes.set_xlim(-0.6, len(names) - 0.4)
-            axes.grid(visible=False, axis="x")
-        legend(figure)
+
+
+def earlier_rows(path: Path) -> dict[str, Row]:
+    """Rows by kind of the result file of an earlier run.
+
+    Raises:
+        UsageError: it is no such file.
+    """
+    try:
+        rows = json.loads(path.read_text(encoding="utf-8"))["rows"]
+        found = {row["of"]: row for row in rows if row["group"] == "kind"}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UsageError(f"--against {path}: expected the regions.json of an earlier run: {error}") from error
+    if not found:
+        raise UsageError(f"--against {path}: expected the regions.json of an earlier run, got one without kinds")
+    return found
+
+
+def compared(rows: Sequence[Row], earlier: Mapping[str, Row]) -> list[str]:
+    """What is withheld, and the log score, beside those of an earlier run, for each kind."""
+    said = ["Now / in the earlier run:"]
+    for row in rows:
+        if row["group"] == "kind" and (before := earlier.get(row["of"])) is not None:
+            pairs = [f"{words} {_shown(row[key], form)} / {_shown(before[key], form)}" for key, words, form in COMPARED]
+            said.append(f"  {row['of']}: {', '.join(pairs)}")
+    return said
+
+
+def _shown(value: float | None, form: str) -> str:
+    return "–" if value is None or math.isnan(value) else format(value, form)
+
+
+def write_scenes(path: Path, scans: Sequence[ScoredScan]) -> None:
+    """Write a CSV file with a line for each scene, its seed first."""
+    facts = [name for name in ScoredScan._fields if name not in ("scores", "behind")]
+    with whole_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+        lines = csv.writer(file)
+        lines.writerow([*facts, "answers", "share", "error_per_m", "stated_per_m"])
+        for scan in scans:
+            found = [scan.share, scan.error_per_m, scan.stated_per_m] if len(scan.scores) else ["", "", ""]
+            lines.writerow([*(getattr(scan, name) for name in facts), len(scan.scores), *found])
+
+
+def replay(seed: int, say: Say) -> dict[str, Any]:
+    """Scan the scene of one seed again and report each answer.
+
+    Returns:
+        The facts of the scan; `failures` says so where less than `SELDOM_SHARE` of the regions hold the truth.
+    """
+    scan = measure(seed)
+    say(f"seed {seed}: {in_words(scan)}")
+    rows = [(row, "") for row in scan.scores.tolist()] + [(row, ", behind a jump") for row in scan.behind.tolist()]
+    for (t_s, error, stated, square, _), where in sorted(rows):
+        held = "holds" if square < CHI2_95_OF_3 else "misses"
+        say(f"  {t_s:.2f} s: error {math.sqrt(error):.2f} 1/m, stated {math.sqrt(stated):.2f}, region {held}{where}")
+    say(f"  {len(scan.scores)} of {scan.late} answers observe all of K{', ' + scan.ended if scan.ended else ''}")
+    failures = []
+    if scan.share < SELDOM_SHARE:
+        failures.append(f"{100 * scan.share:.0f} % of the regions hold the truth")
+        say(f"  FAILURE: {failures[0]}")
+    facts = {name: value for name, value in scan._asdict().items() if name not in ("scores", "behind")}
+    return {**facts, "answers": len(scan.scores), "share": None if math.isnan(scan.share) else scan.share} | {
+        "failures": failures
+    }

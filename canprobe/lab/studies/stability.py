@@ -24,11 +24,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from canprobe.cell.results.picture import AMBER, BLUE, GREY, INK, ORANGE, PINK, legend, log_scale, parts, picture
+from canprobe.cell.results.picture import AMBER, BLUE, GREY, INK, ORANGE, PINK, SKY, legend, log_scale, parts, picture
 from canprobe.lab.studies.harness import Column, Row, StudyResult
 from canprobe.lab.studies.linear_loop import ForceLoop, spectral_radius
 from canprobe.lab.studies.result_files import measuring_facts
-from canprobe.lab.studies.stability_runs import HUNTING_SPREAD, LoopCase, carry_out, loop_of, touch_in_posture
+from canprobe.lab.studies.stability_extremes import run_extremes
+from canprobe.lab.studies.stability_runs import HUNTING_SPREAD, LoopCase, bent_touch, carry_out, loop_of
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.types import Floats
 
@@ -48,7 +49,7 @@ SCAN_S = 1.5
 """Duration of a scan: the curvature is known in its second half."""
 _AT = (-120.0, -122.5, 374.0)
 WIDE_PERCENT = 20.0
-SOUND_ENDS = ("stable", "stopped", "refused")
+SOUND_ENDS = ("stable", "stopped", "approach", "refused")
 MODEL = ("fieldbus", "mechanics", "cell", "lab/studies/stability_runs.py", "lab/studies/linear_loop.py")
 COLUMNS = (
     Column("view", "view"),
@@ -72,7 +73,7 @@ def cases(quick: bool) -> list[LoopCase]:
     if quick:
         return _quick_cases()
     found = [_at(reach, speed) for reach, speed in product(REACHES_MM, (0.0, 25.0))]
-    found += [_bent(wrist, speed) for wrist, speed in product(WRISTS_DEG, (0.0, 25.0))]
+    found += [bent_touch(wrist, speed, SCAN_S if speed else 0.4) for wrist, speed in product(WRISTS_DEG, (0.0, 25.0))]
     found += [_round(probe, radius) for probe, radius in product(RADII_MM, RADII_MM)]
     found += [LoopCase("speed", k, speed_mm_s=v, hold_s=SCAN_S) for v, k in product(SPEEDS_MM_S, (1e4, 4e4))]
     found += [
@@ -106,15 +107,6 @@ def _at(reach_mm: float, speed_mm_s: float) -> LoopCase:
     return LoopCase("pose", 1e4, at_mm=at_mm, speed_mm_s=speed_mm_s, hold_s=SCAN_S if speed_mm_s else 0.4)
 
 
-def _bent(wrist_deg: float, speed_mm_s: float) -> LoopCase:
-    """A touch of a gently curved object in front of the arm, with the wrist bent by an angle."""
-    at_mm, normal, posture_deg = touch_in_posture((90.0, 65.0, 15.0, -360.0, wrist_deg, 0.0))
-    return LoopCase(
-        "pose", 1e4, at_mm=at_mm, normal=normal, posture_deg=posture_deg, kind="sphere", radius_mm=300.0,
-        speed_mm_s=speed_mm_s, hold_s=SCAN_S if speed_mm_s else 0.4,
-    )  # fmt: skip
-
-
 def _round(probe_mm: float, radius_mm: float) -> LoopCase:
     return LoopCase("radii", 1e4, probe_mm=probe_mm, kind="sphere", radius_mm=radius_mm)
 
@@ -140,14 +132,17 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     sweep.say(f"{len(todo)} touches")
     rows = [row_of(case, answer) for case, answer in zip(todo, sweep.map(carry_out, todo, model=MODEL), strict=True)]
     facts = measuring_facts(quick, 1, MODEL)
-    return StudyResult("stability", COLUMNS, rows, findings(rows), facts, partial(draw_stability, rows))
+    more = (run_extremes(quick=quick, sweep=sweep),)
+    return StudyResult("stability", COLUMNS, rows, findings(rows), facts, partial(draw_stability, rows), more)
 
 
 def row_of(case: LoopCase, answer: Row) -> Row:
     """The row of a cell: case, prediction, answer."""
     known = asdict(case)
     del known["at_mm"], known["normal"], known["posture_deg"]
-    return {"what": what_of(case), **known, "eigenvalue": spectral_radius(loop_of(case)), **answer}
+    row = {"what": what_of(case), **known, "eigenvalue": spectral_radius(loop_of(case)), **answer}
+    over = row["ended"] == "stopped" and "above the limit" in row["reason"]
+    return row | {"ended": "approach"} if over and row["contact_n_m"] > approach_limit(row) else row
 
 
 def approach_limit(row: Row, approach_m_s: float = 4e-3, force_max: float = 5.0) -> float:
@@ -164,7 +159,8 @@ def approach_limit(row: Row, approach_m_s: float = 4e-3, force_max: float = 5.0)
 def findings(rows: Sequence[Row]) -> list[str]:
     """Numbers of the ends, whether the prediction holds, and every cell that hunts or fails."""
     ends = Counter(str(row["ended"]) for row in rows)
-    said = [f"{len(rows)} touches: " + ", ".join(f"{number} {end}" for end, number in ends.most_common()) + "."]
+    counted = ", ".join(f"{number} {END_MARKS[end][2]}" for end, number in ends.most_common())
+    said = [f"{len(rows)} touches: {counted}."]
     told = [r for r in rows if r["view"] == "told" and r["ended"] != "refused" and r["contact_n_m"] >= 1e3]
     if told:
         settles = [r for r in told if r["eigenvalue"] < 1.0]
@@ -225,6 +221,7 @@ def _because(row: Row) -> str:
 END_MARKS = {
     "stable": (BLUE, "o", "stable within limits"),
     "stopped": (AMBER, "s", "stopped safely"),
+    "approach": (SKY, "s", "stopped safely at the touch, beyond the limit of the approach"),
     "refused": (GREY, "X", "refused by the plan"),
     "hunting": (PINK, "D", "force not settled"),
     "failed": (ORANGE, "v", "failed"),

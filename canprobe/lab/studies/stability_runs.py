@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Container, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -46,10 +46,10 @@ class LateNode(WrappedNode):
     Args:
         node: the node.
         late_ids: COB-IDs that come late, both ways.
-        late_ns: delay of these frames.
+        late_ns: delay of these frames, of the time at which each comes, ns.
     """
 
-    def __init__(self, node: SlaveNode, late_ids: Container[int], late_ns: int) -> None:
+    def __init__(self, node: SlaveNode, late_ids: Container[int], late_ns: Callable[[int], int]) -> None:
         super().__init__(node)
         self._late_ids, self._late_ns = late_ids, late_ns
         self._in: deque[tuple[int, Frame]] = deque()
@@ -69,7 +69,7 @@ class LateNode(WrappedNode):
     def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
         """Take a frame from the bus, now or later."""
         if can_id in self._late_ids:
-            self._in.append((t_ns + self._late_ns, (can_id, data)))
+            self._in.append((t_ns + self._late_ns(t_ns), (can_id, data)))
             return ()
         return self._sent(self.node.receive(can_id, data, t_ns), t_ns)
 
@@ -90,7 +90,7 @@ class LateNode(WrappedNode):
         now: list[Frame] = []
         for frame in frames:
             if frame[0] in self._late_ids:
-                self._out.append((t_ns + self._late_ns, frame))
+                self._out.append((t_ns + self._late_ns(t_ns), frame))
             else:
                 now.append(frame)
         return now
@@ -277,33 +277,63 @@ def stated_sensing(scene: Scene, kind: type[ContactSensing] = StatedSensing) -> 
     return kind(setup.arm.model, probe.T_flange_probe, patch, probe.radius, probe.stiffness)
 
 
+def bent_touch(wrist_deg: float, speed_mm_s: float, hold_s: float) -> LoopCase:
+    """A touch of a gently curved object in front of the arm, with the wrist bent by an angle; at 0 it is singular."""
+    at_mm, normal, posture_deg = touch_in_posture((90.0, 65.0, 15.0, -360.0, wrist_deg, 0.0))
+    return LoopCase(
+        "pose", 1e4, at_mm=at_mm, normal=normal, posture_deg=posture_deg, kind="sphere", radius_mm=300.0,
+        speed_mm_s=speed_mm_s, hold_s=hold_s,
+    )  # fmt: skip
+
+
+FIGURES = ("force_max_n", "above_ms", "allowed_ms", "error_percent", "spread_percent")
+
+
 def carry_out(case: LoopCase) -> Row:
     """Run a case to its end: `ended`, `reason` and figures of the force; None where there are none."""
-    names = ("force_max_n", "above_ms", "allowed_ms", "error_percent", "spread_percent")
     try:
         session = Session(scene_of(case))
         world = session.world
     except PlanError as refusal:
-        return {"ended": "refused", "reason": str(refusal).splitlines()[0], **dict.fromkeys(names)}
-    task, limits = make_task(session.plan), limits_of(session.plan)
+        return refused_row(refusal)
+    task = make_task(session.plan)
     assert isinstance(task, TouchTask)
     if not case.feels:
         task.sensing = stated_sensing(session.plan.scene)
-    witness = Witness(world.plant, LOOK_NS)
     if case.late_ms > 0.0:
         assert session.scene.sensor is not None
         late_ids = {pdo.cob_id for pdo in session.plan.pdos if pdo.direction == "rpdo"}
         late_ids |= {pdo.cob_id for pdo in session.plan.pdos_of(session.scene.sensor.node_id, "tpdo")}
-        late = [LateNode(node, late_ids, round(case.late_ms * 1e6)) for node in world.nodes]
+        delay_ns = round(case.late_ms * 1e6)
+        late = [LateNode(node, late_ids, lambda _: delay_ns) for node in world.nodes]
         world.participants[: len(late)] = late
-    world.participants.insert(0, witness)
+    return run_touch(session, task, case.force_n, case.late_ms)
+
+
+def refused_row(refusal: PlanError) -> Row:
+    """The end of a case that its plan refuses."""
+    return {"ended": "refused", "reason": str(refusal).splitlines()[0], **dict.fromkeys(FIGURES)}
+
+
+def run_touch(session: Session, task: TouchTask, force_n: float, late_ms: float = 0.0) -> Row:
+    """Run a touch to its end, as `carry_out` returns it.
+
+    Args:
+        session: session with the world as it is to be.
+        task: its task.
+        force_n: wanted force, N.
+        late_ms: delay of targets and tactile frames, ms.
+    """
+    limits = limits_of(session.plan)
+    witness = Witness(session.world.plant, LOOK_NS)
+    session.world.participants.insert(0, witness)
     outcome, error = run_to_end(session, task)
     ended = {"completed": "stable", "hang": "failed", "crash": "failed"}.get(outcome, "stopped")
     plain = error is None or isinstance(error, SafetyStop)
     reason = str(error or "") if plain else f"{type(error).__name__}: {error}"
-    force_error, spread = error_and_spread(session, task, case.force_n)
+    force_error, spread = error_and_spread(session, task, force_n)
     forces = np.array([force for _, force in witness.rows])
-    above_ns, allowed_ns = longest_above(witness.rows, limits.safety.force_max), allowed_above(limits, case.late_ms)
+    above_ns, allowed_ns = longest_above(witness.rows, limits.safety.force_max), allowed_above(limits, late_ms)
     if not np.isfinite(forces).all():
         ended, reason = "failed", "the force is not finite"
     elif above_ns > allowed_ns:
@@ -311,7 +341,7 @@ def carry_out(case: LoopCase) -> Row:
     elif ended == "stable" and not (spread is not None and spread <= 100.0 * HUNTING_SPREAD):
         ended = "hunting"
     figures = (float(forces.max()), above_ns * 1e-6, allowed_ns * 1e-6, force_error, spread)
-    return {"ended": ended, "reason": reason, **dict(zip(names, figures, strict=True))}
+    return {"ended": ended, "reason": reason, **dict(zip(FIGURES, figures, strict=True))}
 
 
 def error_and_spread(session: Session, task: TouchTask, force_n: float) -> tuple[float | None, float | None]:

@@ -184,8 +184,8 @@ STUDIES: Mapping[str, str] = MappingProxyType(
         "estimators": "error of the shape estimators against their run time, with the Cramér–Rao bound",
         "bound": "error and coverage of the estimators over the Cramér–Rao bound: surfaces, sizes, paths and noise",
         "arrays": "how well forty touches calibrate an unknown emulated array",
-        "regions": "whether the online estimator's 95 % regions hold the truth, over packaged and random scenes",
-        "shapes": "surfaces of unknown shapes by every estimator, by local fits and by Gaussian processes",
+        "regions": "whether the online estimator's 95 % regions hold the truth, over scenes drawn at random",
+        "shapes": "surfaces of unknown shapes by the map, every estimator, local fits and Gaussian processes",
         "workprec": "error of the dynamic plant against its run time, and of the whole cell against its computing time",
         "stability": "where the force loop settles, predicted and carried out, and how every other touch ends",
         "realtime": "how well the cycle keeps time on a real vcan0, against plain canopen-python; needs that interface",
@@ -195,7 +195,7 @@ STUDIES: Mapping[str, str] = MappingProxyType(
 """Measured quantity of each study, by its name. The module of that name has `run(*, quick, sweep) -> StudyResult`."""
 
 
-def run_study(name: str, *, quick: bool, sweep: Sweep, form: str = "") -> StudyResult:
+def run_study(name: str, *, quick: bool, sweep: Sweep, form: str = "", **chosen: Any) -> StudyResult:
     """Run a study.
 
     Args:
@@ -203,7 +203,8 @@ def run_study(name: str, *, quick: bool, sweep: Sweep, form: str = "") -> StudyR
         quick: fewer repeats and cases.
         sweep: computes its cells.
         form: variant of it: ``vcan`` of `faults`, with processes on a real vcan0; ``soak`` of `realtime`, an hour.
+        chosen: arguments of this study only.
     """
     module = importlib.import_module(f"canprobe.lab.studies.{name}_{form}" if form else f"canprobe.lab.studies.{name}")
-    result: StudyResult = module.run(quick=quick, sweep=sweep)
+    result: StudyResult = module.run(quick=quick, sweep=sweep, **chosen)
     return result

@@ -16,6 +16,7 @@ Shape:
 
     surface           second-order surfaces in one gauge: XᵀSX = 0 with S symmetric (4, 4), f < 0 inside
     estimate/         local shape from contacts, online and in batches, with what was not observed
+    map/              one surface from all contacts of a scan, with its uncertainty
     surface_map       a whole scan as local patches
     blend, meshing    one surface of those patches, and triangles of it
     crossings         a χ² test where a path crosses itself; `consistency` gives one verdict on all crossings

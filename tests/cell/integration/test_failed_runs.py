@@ -89,4 +89,6 @@ def test_a_file_that_does_not_fit_is_not_there_in_part_and_the_user_is_told(
         f"canprobe: {tmp_path}/log.npz: cannot be written: No space left on device",
     ]
     assert read_json(tmp_path / "summary.json")["stop_reason"] == "stopped"
-    assert not [path.name for path in tmp_path.iterdir() if path.name not in ("bus.log", "scene.toml", "summary.json")]
+    kept = {"bus.log", "scene.toml", "summary.json", "rows"}  # the rows of the run, which found no other place
+    assert {path.name for path in tmp_path.iterdir()} <= kept
+    assert (tmp_path / "rows" / "truth.npy").exists()

@@ -365,10 +365,11 @@ def test_a_way_back_on_which_the_force_grows_ends():
 def test_an_own_controller_that_cannot_retreat_is_taken_off_at_the_force_limit():
     class Pressing(Injected):
         def command(self, measurement, command):
+            self.task.set_target("target_force_n", 4.0)
             return self.task.step(measurement) if measurement.cycle < self.at else Command()
 
-    run = Pressing("press", 5000, lambda _: None, own=True, limits={"force_max_n": 1.0})
-    assert isinstance(run.error, SafetyStop) and "above the limit of 1.00 N" in str(run.error)
+    run = Pressing("press", 5000, lambda _: None, own=True, limits={"force_max_n": 2.5})
+    assert isinstance(run.error, SafetyStop) and "above the limit of 2.50 N" in str(run.error)
     run.assert_drives_off()
-    assert 1.0 < run.session.truth["force_n"].max() < 1.5
+    assert 2.0 < run.session.truth["force_n"].max() < 3.2
     assert run.session.truth["force_n"][-1] == 0.0

@@ -12,7 +12,10 @@ import pytest
 from full_disk import room_for
 
 import canprobe
+from canprobe.cell.master.options import RunOptions
 from canprobe.cell.rows import BLOCK_ROWS, ROWS_FOLDER
+from canprobe.cell.session.session import Session
+from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cli import main
 
 COMMAND = [sys.executable, "-m", "canprobe", "run"]
@@ -70,6 +73,15 @@ def test_rows_that_no_longer_fit_on_the_disk_stop_the_run_and_stay(tmp_path, cap
     assert f"{tmp_path}/{ROWS_FOLDER}/log-" in capsys.readouterr().err.splitlines()[0]
     assert not json.loads((tmp_path / "summary.json").read_text())["completed"]
     assert len(canprobe.load_table(tmp_path / "log.npz")) > 2 * BLOCK_ROWS
+
+
+def test_a_session_alone_leaves_no_rows(tmp_path):
+    """`calibrate array` and the studies read its log from memory and write no file of it."""
+    scene = canprobe.load_scene("free", {"task.duration_s": 1.0, "bus.interface": "direct"})
+    with Session(scene, RunOptions(tmp_path)) as session:
+        session.run(make_task(session.plan))
+    assert len(session.cell.log.arrays()["t_s"]) > 400
+    assert {path.name for path in tmp_path.iterdir()} == {"scene.toml", "truth.npz"}
 
 
 MEMORY = """

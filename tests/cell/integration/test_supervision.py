@@ -567,10 +567,11 @@ def test_an_estimator_that_diverges_starts_afresh():
 def test_an_own_controller_is_stopped_at_the_force_limit():
     class Pressing(Injected):
         def command(self, measurement, command):
+            self.task.set_target("target_force_n", 4.0)
             return self.task.step(measurement) if measurement.cycle < self.at else Command()
 
-    run = Pressing("press", 5000, lambda _: None, own=True, limits={"force_max_n": 1.0})
-    assert "above the limit of 1.00 N" in str(run.error)
+    run = Pressing("press", 5000, lambda _: None, own=True, limits={"force_max_n": 2.5})
+    assert "above the limit of 2.50 N" in str(run.error)
     run.assert_drives_off()
 
 

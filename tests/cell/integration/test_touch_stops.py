@@ -11,8 +11,10 @@ from canprobe.cell.tasks.from_plan import make_task
 from canprobe.errors import SafetyStop
 
 
-def run_until_stopped(session, at_cycle=None, action=None):
+def run_until_stopped(session, at_cycle=None, action=None, target_n=None):
     controller = make_task(session.plan)
+    if target_n is not None:
+        controller.set_target("target_force_n", target_n)
 
     def step(measurement):
         if measurement.cycle == at_cycle:
@@ -33,9 +35,9 @@ def press_session(**changes):
 
 
 def test_force_above_the_limit():
-    reason, truth = run_until_stopped(press_session(limits={"force_max_n": 1.5}))
-    assert "above the limit of 1.50 N" in reason
-    assert np.count_nonzero(truth["force_n"] > 1.5) < 60  # 150 ms: approach until the sample is in, then retreat
+    reason, truth = run_until_stopped(press_session(limits={"force_max_n": 2.5}), target_n=4.0)
+    assert "above the limit of 2.50 N" in reason
+    assert np.count_nonzero(truth["force_n"] > 2.5) < 60  # 150 ms: approach until the sample is in, then retreat
     assert truth["force_n"][-1] == 0.0  # it let go
 
 
@@ -124,7 +126,7 @@ def test_joint_at_its_stop():
 
 def test_a_run_that_is_stopped_leaves_its_summary_with_the_error():
     scene = canprobe.load_scene("press")
-    scene = replace(scene, limits=replace(scene.limits, force_max_n=1.5))
+    scene = replace(scene, limits=replace(scene.limits, force_max_n=2.1))
     with pytest.raises(SafetyStop) as stopped:
         canprobe.run(scene, files=False)
     summary = stopped.value.summary

@@ -1,5 +1,6 @@
 """Each check of the table of conditions at its limit and just beyond it: the runs that inject faults go far beyond."""
 
+import math
 from copy import copy
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,6 +19,7 @@ from canprobe.cell.scene.setup import SafetyLimits
 from canprobe.fieldbus.bus.port import ControllerState, PortCounters
 from canprobe.fieldbus.protocol.cia402 import DriveState
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, NmtState
+from canprobe.mechanics.touch.patch.force_errors import ForceSigma
 
 LIMITS = Limits(SafetyLimits(5.0, 0.15, 0.0, 1.0, 0.8, None), period_ns=2_500_000)
 PASSIVE = {"controller_state": ControllerState.PASSIVE}
@@ -38,14 +40,20 @@ def check(key):
     return BY_KEY[key].check
 
 
-def touch(force=2.0, age=2, lost_s=0.0):
-    return TouchState(LIMITS, force, age, lost_s)
+def touch(force=2.0, age=2, lost_s=0.0, **more):
+    return TouchState(LIMITS, force, age, lost_s, **more)
+
+
+def felt(**patch):
+    return SimpleNamespace(sigma=ForceSigma(), **patch)
 
 
 @pytest.mark.parametrize(
     ("key", "within", "beyond", "told"),
     [
         ("force", touch(5.0), touch(5.001), "5.00 N above the limit of 5.00 N"),
+        ("force", touch(4.8, force_sigma=0.1), touch(4.8, force_sigma=0.101), "4.80 N, or up to 5.00 N (2σ), above"),
+        ("force", touch(4.9, force_sigma=math.inf), touch(5.001, force_sigma=math.inf), "above the limit of 5.00 N"),
         ("sensor_stale", touch(age=12), touch(age=13), "no tactile frame for 13 cycles"),
         ("contact_lost", touch(lost_s=0.0299), touch(lost_s=0.0301), "contact lost"),
         ("drive_late", with_ages(0, 2), with_ages(0, 3), "node 2: no usable TPDO for 3 cycles"),
@@ -115,7 +123,7 @@ def test_only_an_unbroken_run_of_saturated_samples_counts():
     contact = TouchState(LIMITS)
     told = []
     for k, saturated in enumerate((True, True, True, False, True, True)):
-        contact.feel(SimpleNamespace(force=2.0, saturated=saturated, off_pad=False, bridged=0.0), k * PERIOD_NS)
+        contact.feel(felt(force=2.0, saturated=saturated, off_pad=False, bridged=0.0), k * PERIOD_NS)
         told.append(contact.hidden_s)
     assert told == pytest.approx([0.0, 0.005, 0.01, 0.0, 0.0, 0.005])
 
@@ -126,7 +134,7 @@ def supervisor(patches):
 
 
 def findings(saturated):
-    patches = [SimpleNamespace(force=2.0, saturated=one, off_pad=False, bridged=0.0) for one in saturated]
+    patches = [felt(force=2.0, saturated=one, off_pad=False, bridged=0.0) for one in saturated]
     return guarded(patches)
 
 
@@ -149,12 +157,12 @@ def test_a_touch_that_saturates_now_and_then_goes_on():
 
 
 def test_nor_may_its_contact_run_off_the_array():
-    running_off = [SimpleNamespace(force=1.0, saturated=False, off_pad=k > 1, bridged=0.0) for k in range(8)]
+    running_off = [felt(force=1.0, saturated=False, off_pad=k > 1, bridged=0.0) for k in range(8)]
     found = guarded(running_off)
     assert found[:7] == [None] * 7
     assert found[7].condition.key == "off_pad" and found[7].condition.reaction is Reaction.RETREAT
     assert "the true force is above the 1.0 N measured" in str(found[7].error)
-    assert guarded([SimpleNamespace(force=0.05, saturated=False, off_pad=True, bridged=0.0)] * 20) == [None] * 20, (
+    assert guarded([felt(force=0.05, saturated=False, off_pad=True, bridged=0.0)] * 20) == [None] * 20, (
         "no contact at all"
     )
 

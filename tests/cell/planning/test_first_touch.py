@@ -14,6 +14,7 @@ from canprobe.cell.planning.first_touch import depth_at, first_shown_n, force_at
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.plant.pressure import PressureField
 from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig
+from canprobe.cell.scene.load import packaged_files
 from canprobe.cell.scene.resolve import resolve
 from canprobe.errors import PlanError
 from canprobe.mechanics.touch.pad import THRESHOLD_COUNTS, Pad
@@ -112,3 +113,21 @@ def test_a_flat_array_leaves_a_touch_that_went_too_deep_before_it_presses_harder
     result = canprobe.run(scene, files=False)
     assert result.summary["completed"], result.summary["stop_reason"]
     assert result.truth["force_n"].max() < 5.0
+
+
+def test_a_force_that_its_own_deviation_would_stop_is_refused_and_the_named_ones_are_not():
+    scene = canprobe.load_scene("press", {"task.force_n": 2.0, "limits.force_max_n": 2.05})
+    said = problem_of(scene)
+    assert said.startswith("task.force_n = 2: the array measures it to ± 4.") and "(2σ)" in said
+    less = float(re.search(r"lower task.force_n to ([\d.]+)", said)[1])
+    more = float(re.search(r"raise limits.force_max_n to ([\d.]+)", said)[1])
+    assert make_plan(resolve(replace(scene, task=replace(scene.task, force_n=less))))
+    assert make_plan(resolve(replace(scene, limits=replace(scene.limits, force_max_n=more))))
+
+
+def test_a_calibration_without_errors_of_the_force_is_warned_of_once(tmp_path):
+    text = (packaged_files("calibrations")["inch16"]).read_text()
+    (tmp_path / "old.toml").write_text(text[: text.index("[force]")])
+    plan = canprobe.plan("press", {"sensor.calibration": str(tmp_path / "old.toml")})
+    assert ["[force]" in line for line in plan.warnings].count(True) == 1
+    assert not any("[force]" in line for line in canprobe.plan("press").warnings)

@@ -19,6 +19,7 @@ from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.patch.array_models import make_patch_calibration
 from canprobe.mechanics.touch.patch.calibrate import calibrate_array
 from canprobe.mechanics.touch.patch.creep import PadMemory
+from canprobe.mechanics.touch.patch.force_errors import UNSTATED
 from canprobe.mechanics.touch.patch.image import compute_patch
 from canprobe.mechanics.touch.patch.moments import MomentImage
 
@@ -78,6 +79,13 @@ def test_the_arms_compliance_has_its_deviation(fit):
     assert "arm_compliance_sigma_um_n = " in dump_calibration(fit.calibration)
 
 
+def test_creep_is_found_by_the_arms_way(fit, touched):
+    force, true = fit.calibration.force, touched[1].creep_per_decade
+    assert abs(force.creep - true) < 2.5 * force.creep_sigma < 0.03
+    assert 0.005 < force.array < 0.02 and force.spread == 0.0
+    assert f"creep      {100 * force.creep:.1f} ± " in calibration_text(fit)
+
+
 def test_without_a_reference_newtons_are_nominal_and_stiffness_goes_with_them(fit, touched):
     nominal = calibrated(touched, reference="none").calibration
     assert nominal.nominal and "nominal newtons" in nominal.newtons and "nominal newtons" in dump_calibration(nominal)
@@ -106,6 +114,13 @@ def test_a_file_reads_back_and_bad_ones_are_refused(fit, tmp_path):
     assert back.centroid.lag.most == pytest.approx(fit.calibration.centroid.lag.most, rel=1e-4)
     assert back.noise.slow == pytest.approx(fit.calibration.noise.slow, rel=1e-4) and not back.noise.assumed
     assert dump_calibration(back) == text
+    assert back.force.creep == pytest.approx(fit.calibration.force.creep, rel=1e-4)
+    older = text[: text.index("[force]")]
+    path.write_text(older)
+    assert load_calibration(path).force is UNSTATED
+    path.write_text(text.replace("creep_decades = ", "creep_decade = "))
+    with pytest.raises(SceneError, match=r"force\.creep_decades: missing"):
+        load_calibration(path)
     for old, new, what in (
         ("schema = 1", "schema = 2", "calibration.schema"),
         ("blur_mm", "blur_m", "unknown key"),

@@ -21,7 +21,11 @@ def test_the_error_of_the_force_is_measured_less_true(result):
     assert contact["force_true_bias_n"] == pytest.approx(error.mean(), abs=2e-3)
     assert contact["force_true_rms_error_n"] == pytest.approx(np.sqrt(np.mean(error**2)), abs=2e-3)
     # the servo brings what it sees to the target: its distance from it says nothing about the error of the array
-    assert contact["force_measured_rms_error_n"] < 0.5 * contact["force_true_rms_error_n"]
+    assert contact["force_measured_rms_error_n"] < contact["force_true_rms_error_n"]
+    assert contact["force_sigma_n"] == pytest.approx(np.sqrt(np.mean(np.square(log["force_sigma_n"][hold]))), rel=1e-2)
+    parts = contact["force_sigma_parts_n"]
+    assert np.linalg.norm([*parts.values()]) == pytest.approx(contact["force_sigma_n"])
+    assert 0.0 < parts["reference"] < parts["array"] and contact["force_lower_bound_fraction"] == 0.0
 
 
 def test_the_score_takes_the_truth_of_each_sample_s_cycle():
@@ -38,7 +42,8 @@ def test_the_text_tells_both_apart(result):
     lines = summary_text(result.summary, None).splitlines()
     i = next(i for i, line in enumerate(lines) if line.startswith("  force "))
     assert "target 2 N, true force off it by" in lines[i] and "error" not in lines[i]
-    assert "measured less true: mean" in lines[i + 1]
+    assert "measured to ± " in lines[i + 1] and "reference 0.5 %, array 1." in lines[i + 1]
+    assert "measured less true: mean" in lines[i + 2] and "within 2σ in 100 % of the seconds" in lines[i + 2]
 
 
 def test_without_a_truth_nothing_is_called_an_error_of_force(result):

@@ -73,10 +73,20 @@ def test_a_contact_in_doubt_is_worth_less(result):
 def test_fit_surface_takes_them(result):
     c = result.contacts
     fitted = canprobe.fit_surface(
-        c.points[-200:], c.normals[-200:], sigma_point=c.covariances[-200:], sigma_normal=c.sigma_normal,
-        coupling=c.coupling,
-    )  # fmt: skip
-    np.testing.assert_allclose(fitted.kappa, [1 / 0.036, 0.0], atol=2.0)
+        c.points, c.normals, sigma_point=c.covariances, sigma_normal=c.sigma_normal, coupling=c.coupling
+    )
+    np.testing.assert_allclose(fitted.kappa, [1 / 0.036, 0.0], atol=0.5)
+
+
+def test_the_map_of_its_contacts_is_the_true_object(result):
+    found = result.contact_map()
+    rows = np.searchsorted(result.truth["t_s"], result.contacts.t_s[::20] - 1e-6)
+    true = result.truth["contact_point_m"][rows]
+    height, sigma = found.distance(true)
+    assert np.sqrt(np.mean(height**2)) < 30e-6
+    assert np.mean(np.abs(height) < 3.0 * sigma) > 0.95
+    with pytest.raises(UsageError, match="contact_map: expected a scan"):
+        canprobe.run("press", duration_s=0.1, bus="direct", files=False).contact_map()
 
 
 def test_an_own_estimator_stands_beside_ours(result):

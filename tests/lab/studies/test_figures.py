@@ -27,12 +27,16 @@ from canprobe.lab.studies.estimators import draw_estimators
 from canprobe.lab.studies.fault_cases import DRAWN_KINDS
 from canprobe.lab.studies.fault_scenes import draw_ends, draw_faults
 from canprobe.lab.studies.ground import SURFACES
+from canprobe.lab.studies.random_scenes import KINDS, SceneSeed
 from canprobe.lab.studies.realtime import draw_realtime
 from canprobe.lab.studies.realtime_cases import Measured
 from canprobe.lab.studies.realtime_soak import draw_soak
-from canprobe.lab.studies.regions import draw_regions
+from canprobe.lab.studies.region_figure import draw_regions
+from canprobe.lab.studies.region_scores import ScoredScan
+from canprobe.lab.studies.regions import rows_of
+from canprobe.lab.studies.stability_extremes import END_MARKS, EXTREMES, ExtremeCase, draw_extremes, value_in_words
 from canprobe.lab.studies.workprec import draw_workprec
-from canprobe.lab.studies.workprec_cell import FASTER, FIDELITIES, MODES, RATES_HZ, REAL, draw_cell
+from canprobe.lab.studies.workprec_cell import FASTER, FIDELITIES, MODES, RATES_HZ, REAL, draw_cell, over_seeds
 
 COLUMN_PX, WIDEST_PX, LEAST_TYPE_PX, LEAST_BAR_PX = 800, 1400, 9.0, 4.0
 FILLED, TILES = 0.3, 3
@@ -74,7 +78,8 @@ def every_estimator(path):
     rows = [
         {"surface": surface, "sigma_point_um": 1e6 * point, "sigma_normal_mrad": 1e3 * normal, "method": s.method,
          "window_samples": s.window, "lag_samples": s.lag, "add_us": 1e2, "answer_us": cost[s.method] * s.window / 40,
-         "error_percent": 4e7 * point / s.window * (1 + (s.lag or 0) / 10),
+         **{key: share * 4e7 * point / s.window * (1 + (s.lag or 0) / 10)
+            for key, share in (("error_percent", 1.0), ("error_low_percent", 0.8), ("error_high_percent", 1.25))},
          "bound_percent": 2e7 * point / (480 if s.method == "recursive" else s.window)}
         for surface, _ in estimators.GROUNDS
         for point, normal in estimators.NOISES
@@ -84,14 +89,16 @@ def every_estimator(path):
 
 
 def regions(path):
-    kinds = ("cylinder", "ellipsoid", "fillet", "plane", "saddle", "sphere", "torus", "wave", "100 kPa", "all")
-    rows = [
-        {"group": group, "of": kind, "coverage": 0.9 + 0.01 * i, "coverage_low": 0.85, "coverage_high": 1.0}
-        | {"stated_over_error": 0.8 + 0.2 * i, "stated_low": 0.6, "stated_high": 3.0}
-        for i, kind in enumerate(kinds)
-        for group in ("packaged", "random")
-    ]
-    draw_regions(rows, path)
+    rng, scans = np.random.default_rng(0), []
+    for kind, number in itertools.product(KINDS, range(12)):
+        error, ratio = 10 ** rng.uniform(-1, 1), 10 ** rng.normal(-0.03 * KINDS.index(kind), 0.2)
+        square = (error * rng.normal(size=(50, 3))) ** 2 @ (1.0, 1.0, 1.0)
+        stated = np.full(50, 3 * (ratio * error) ** 2)
+        scores = np.stack([np.arange(50), square, stated, 3 * square / stated, -square], axis=1)
+        seed = SceneSeed(2, kind, number).value()
+        facts = (seed, kind, kind, "prbt", "foreign" if kind == "foreign" else "shipped", "weave", 25.0, 2.0, 100.0)
+        scans.append(ScoredScan(*facts, 0.0, "", 60, scores, 0, scores[:0]))
+    draw_regions(rows_of(scans), scans, path)
 
 
 def plant(path, stiffnesses=workprec.STIFFNESSES, steps=workprec.STEPS_US):
@@ -110,8 +117,11 @@ def plant(path, stiffnesses=workprec.STIFFNESSES, steps=workprec.STEPS_US):
 def whole_cell(path):
     rows = [
         {"rate_hz": rate, "mode": mode, "bus": one_of((*REAL, FASTER), i), "fidelity": fidelity, "stiff": "holds",
-         "ended": "done", "method": one_of(("chord", "ml", "recursive"), i), "cost_ms_per_s": 40 + 0.5 * rate + 20 * i,
-         "curvature_percent": 2 - 0.2 * i, "normal_deg": 0.09 - 0.01 * i, "force_percent": 5.8 - 0.3 * i}
+         "reason": "", "method": one_of(("chord", "ml", "recursive"), i)}
+        | over_seeds([
+            {"ended": "done", "cost_ms_per_s": 40 + 0.5 * rate + 20 * i, "curvature_percent": (2 - 0.2 * i) * share,
+             "bound_percent": 0.8, "normal_deg": (0.09 - 0.01 * i) * share, "force_percent": (5.8 - 0.3 * i) * share}
+            for share in (0.9, 1.1)])
         for fidelity in FIDELITIES
         for i, (rate, mode) in enumerate(itertools.product(RATES_HZ, MODES[:1]))
     ]  # fmt: skip
@@ -140,9 +150,18 @@ def map_of_touches(path):
     """Every table beside the map, and of the map four buses with a few contacts."""
     cases = [case for case in stability.cases(False) if case.rate_hz != 200.0 and case.late_ms != 6.0]
     chosen = [case for case in cases if case.view not in stability_figure.VIEWS or case.contact_n_m in (1e3, 1e5)]
-    names = ("stable", "stopped", "refused")
-    rows = [stability.row_of(case, {"ended": one_of(names, i)}) for i, case in enumerate(chosen)]
+    names = ("stable", "stopped", "approach", "refused")
+    rows = [stability.row_of(case, {"ended": one_of(names, i), "reason": REASON}) for i, case in enumerate(chosen)]
     stability_figure.draw_stability(rows, path)
+
+
+def extremes(path):
+    cases = [ExtremeCase(name, value, scan) for name in EXTREMES for value in EXTREMES[name][0] for scan in (0, 1)]
+    draw_extremes(
+        [{"extreme": case.extreme, "value": value_in_words(case), "task": ("press", "scan")[case.scan],
+          "ended": one_of(list(END_MARKS), i)} for i, case in enumerate(cases)],
+        path,
+    )  # fmt: skip
 
 
 def realtime(path):
@@ -197,6 +216,7 @@ PICTURES = {
     "faults, quick": faults(8),
     "faults, vcan": ends,
     "stability": map_of_touches,
+    "stability, extremes": extremes,
     "realtime": realtime,
     "soak": soak,
     "bridges": bridge_bars,

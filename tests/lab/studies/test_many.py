@@ -6,17 +6,19 @@ import sys
 
 import numpy as np
 import pytest
+from waiting import wait_until
 
 import canprobe
 from canprobe.cell.planning.make import make_plan
 from canprobe.errors import SceneError, UsageError
 from canprobe.fieldbus.eds.packaged import eds_path
 from canprobe.lab.studies import many
+from canprobe.lab.studies.cell_store import CellStore
 from canprobe.lab.studies.many import run_many
 from canprobe.lab.studies.sweep import Sweep
 
 QUICK = {"task.clearance_mm": 0.5, "task.duration_s": 0.2}
-VARY = {"limits.force_max_n": [5.0, np.float64(2.01)], "bus.bit_error_rate": [0.0, 1e-5]}
+VARY = {"limits.force_max_n": [5.0, np.float64(2.1)], "bus.bit_error_rate": [0.0, 1e-5]}
 SERIES = ("force_n", "contact_mm", "truth.force_n")
 
 
@@ -34,7 +36,7 @@ def runs(out):
 def test_a_row_for_every_combination_and_seed_failures_too(runs):
     table = runs.table()
     assert len(table) == len(runs) == 8
-    assert table["limits.force_max_n"].tolist() == [5.0] * 4 + [2.01] * 4
+    assert table["limits.force_max_n"].tolist() == [5.0] * 4 + [2.1] * 4
     assert table["seed"].tolist() == [0, 1] * 4
     words = ["done", "done", "refused", "refused", "stopped", "stopped", "refused", "refused"]
     assert table["status"].tolist() == words
@@ -178,3 +180,42 @@ def test_a_script_needs_no_guard(tmp_path):
     assert ended.returncode == 0, ended.stderr
     assert json.loads(ended.stdout) == ["done", "done"] and ended.stderr == ""
     assert (tmp_path / "runs/many-listen/cells.jsonl").is_file()
+
+
+def test_after_a_kill_every_run_is_there_once(tmp_path):
+    kept = tmp_path / "cells.jsonl"
+    script = (
+        "import canprobe, sys\n"
+        "scene = canprobe.load_scene('listen', {'task.duration_s': 0.05})\n"
+        "canprobe.run_many(scene, seeds=60, bus='direct', workers=1, out=sys.argv[1], progress=False)\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", script, str(tmp_path)], stderr=subprocess.PIPE)
+    wait_until(
+        lambda: kept.exists() and kept.read_bytes().count(b"\n") > 8,
+        lambda: process.poll() is None,
+        process.communicate,
+    )
+    process.kill()
+    process.communicate()
+    assert kept.read_bytes().count(b"\n") < 60
+    scene = canprobe.load_scene("listen", {"task.duration_s": 0.05})
+    runs = run_many(scene, seeds=60, bus="direct", workers=1, out=tmp_path, progress=False)
+    assert [outcome["summary"]["seed"] for outcome in runs.outcomes] == list(range(60))
+    store = CellStore(tmp_path)
+    assert len(store.keys()) == 60 == kept.read_bytes().count(b"\n") - store.damaged  # no run twice
+    store.close()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")
+def test_a_dask_scheduler_gives_the_same_table(runs, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, dashboard_address=None, protocol="tcp://"
+    ) as cluster:
+        where = {"workers": cluster.scheduler_address, "out": tmp_path}
+        scene = canprobe.load_scene("press", QUICK)
+        other = run_many(scene, VARY, seeds=2, bus="direct", series=SERIES, every_ms=10, **where)
+    measured = runs.table().drop(columns="wall_time_s")
+    assert measured.equals(other.table().drop(columns="wall_time_s"))
+    assert runs.to_xarray().equals(other.to_xarray())

@@ -16,12 +16,15 @@ from canprobe.lab.studies.shapes.scans import (
     DEVELOPMENT,
     TEST,
     columns_of,
+    drawn,
+    form_of,
     heights_mm,
     object_of,
     samples_of,
+    scene_of,
     truth_under,
 )
-from canprobe.lab.studies.shapes.study import COLUMNS, distance_from, findings, row_of, scored
+from canprobe.lab.studies.shapes.study import COLUMNS, distance_from, findings, over_map, row_of, scored
 from canprobe.mechanics.touch.contact import ContactSample, Doubt, Slope
 from canprobe.mechanics.touch.meshing import mesh_of
 from canprobe.mechanics.touch.objects import Sphere, Torus
@@ -206,10 +209,24 @@ def test_the_words_name_what_is_better():
     assert math.isnan(row["nll"])
     keys = [c.key for c in COLUMNS if isinstance(c, Column)]
     base = {**dict.fromkeys(keys, 1.0), "unit": "mm"}
-    rows = [base | {"method": "ml"}, base | {"method": "quadrics", "accuracy_um": 0.5, "nll": 2.0}]
-    said = findings(rows, [[rows[0], rows[0]], [rows[1] | {"accuracy_um": 0.4}, rows[1] | {"accuracy_um": 0.6}]])
-    assert any(line.startswith("  accuracy: baseline better") and "0.5 (0.4 to 0.6)" in line for line in said)
-    assert any(line.startswith("  NLL: ours better") for line in said)
+    rows = [base | {"method": "map"}, base | {"method": "quadrics", "accuracy_um": 0.5, "nll": 2.0}]
+    each = [[rows[0], rows[0] | {"coverage": 0.8}], [rows[1] | {"accuracy_um": 0.4}, rows[1] | {"accuracy_um": 0.6}]]
+    said = findings(rows, each, "free-2")
+    assert any(line.startswith("  accuracy: quadrics better") and "0.5 (0.4 to 0.6)" in line for line in said)
+    assert any(line.startswith("  NLL: map better") for line in said)
+    assert any(line.startswith("  F at 0.5 mm: as good") for line in said)
+    assert "90.0% hold the truth; on the worst shape 80.0%" in said[-1]
+    apart = over_map(each[1], each[0])
+    assert apart["accuracy_um_over_map"] == pytest.approx(-0.5)
+    assert (apart["nll_over_map_low"], apart["nll_over_map_high"]) == (1.0, 1.0)
+
+
+def test_a_draw_is_repeated_and_like_no_other(tmp_path):
+    assert len(drawn(7)) == len(TEST)
+    for name, other in zip(drawn(7), drawn(8), strict=True):
+        assert form_of(name) == form_of(name) != form_of(other)
+        assert scene_of(name, tmp_path).seed != scene_of(other, tmp_path).seed
+    assert {form_of(name)["kind"] for name in drawn(7)} == {form_of(name)["kind"] for name in TEST}
 
 
 @pytest.mark.timeout(600)  # a second of a whole cell takes long where many share a processor
@@ -222,6 +239,9 @@ def test_a_short_run_of_every_method(tmp_path, capsys):
         assert row["cpu_s"] > 0
         assert row["memory_mb"] > 1
         assert (row["coverage"] is None) == (row["method"] in ("chen1996", "chord"))
+    later = json.loads((tmp_path / "shapes_after.json").read_text())
+    assert {row["method"] for row in later["rows"]} == {method.name for method in METHODS}
+    assert {"accuracy_um_over_map", "nll_over_map_high"} <= set(document["rows"][1])
     digest = hashlib.sha256((tmp_path / "contacts.npz").read_bytes()).hexdigest()
     assert document["facts"]["contacts"] == digest[:16]
     assert (tmp_path / "shapes.png").stat().st_size > 10_000

@@ -11,10 +11,12 @@ from puma_arm import MODELS
 
 from canprobe.cell.plant.ideal_arm import natural_frequency
 from canprobe.cell.scene.geometry import T_flange_probe
+from canprobe.cell.scene.load import load_scene
 from canprobe.lab.studies import stability
 from canprobe.lab.studies.fault_scores import longest_above
 from canprobe.lab.studies.linear_loop import ForceLoop, spectral_radius
 from canprobe.lab.studies.result_files import write_study
+from canprobe.lab.studies.stability_extremes import EXTREMES, ExtremeCase, extreme_scene, judged, sync_delay_ns
 from canprobe.lab.studies.stability_runs import LoopCase, layer_stiffness, loop_of, scene_of, touch_in_posture, upright
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.denavit_hartenberg import rotation_rpy
@@ -146,7 +148,7 @@ class InLine:
 
 ENDINGS = [
     ("stable", ""),
-    ("stopped", "above the limit"),
+    ("approach", "above the limit"),
     ("stopped", "the force does not settle"),
     ("stopped", "no tactile frame"),
     ("refused", "worst-case load"),
@@ -161,7 +163,14 @@ def test_quick_touches_end_as_they_may_and_are_drawn(tmp_path):
         assert (row["ended"], why in row["reason"]) == (ended, True), row
         assert row["above_ms"] is None or row["above_ms"] <= row["allowed_ms"]
     assert "Every touch is stable" in result.findings[-1]
-    assert write_study(result, tmp_path)[-1].stat().st_size > 20_000
+    pictures = [path for path in write_study(result, tmp_path) if path.suffix == ".png"]
+    assert [path.stem for path in pictures] == ["stability", "stability_extremes"]
+    assert all(path.stat().st_size > 10_000 for path in pictures)
+    (extremes,) = result.more
+    assert [(row["extreme"], row["task"], row["ended"]) for row in extremes.rows] == [
+        ("dead rows", "press", "right"),
+        ("dead rows", "scan", "right"),
+    ]
 
 
 def test_findings_name_every_touch_that_ends_otherwise(tmp_path):
@@ -181,3 +190,31 @@ def test_the_approach_limit_is_the_force_over_the_way_that_nobody_sees():
     way = 4e-3 * 0.0175
     assert stability.approach_limit(row) == pytest.approx(2.0 * math.sqrt(10.0) / way)
     assert stability.approach_limit(row | {"late_ms": 6.0}) < stability.approach_limit(row)
+
+
+def test_an_extreme_case_is_right_only_with_its_force_and_its_curvature():
+    sound = {"ended": "stable", "reason": "", "task": "scan", "error_percent": 4.0, "curvature_per_m": 9.0, "held": 0.9}
+    assert judged(sound, 50.0)["ended"] == "right"
+    assert judged(sound | {"held": 0.1}, 50.0) == {"ended": "wrong", "reason": "curvature"}
+    assert judged(sound | {"held": 0.1, "curvature_per_m": 4.0}, 50.0)["ended"] == "right"
+    assert judged(sound | {"held": None}, 50.0) == {"ended": "right", "reason": "curvature not observed"}
+    assert judged(sound | {"error_percent": 21.0}, 50.0) == {"ended": "wrong", "reason": "force"}
+    assert judged(sound | {"ended": "stopped"}, 50.0) == {"ended": "stopped"}
+    assert judged(sound | {"ended": "hunting"}, 50.0)["reason"] == "hunting: the force does not settle"
+
+
+@pytest.mark.parametrize("name", EXTREMES)
+def test_extremes_are_one_thing_of_a_packaged_scene(name):
+    case = ExtremeCase(name, EXTREMES[name][0][-1], scan=True)
+    scene, plain = extreme_scene(case), load_scene("cylinder")
+    assert scene.task.kind == "scan" and not scene.bus.timed
+    if name not in ("joint 5", "jitter of the period"):
+        assert (scene.plant, scene.cycle, scene.object, scene.joints) != (
+            plain.plant, plain.cycle, plain.object, plain.joints,
+        )  # fmt: skip
+
+
+def test_a_sync_is_as_late_for_every_node():
+    delays = [sync_delay_ns(1e6, t_ns) for t_ns in (0, 2_500_000, 5_000_000)]
+    assert delays == [sync_delay_ns(1e6, t_ns) for t_ns in (0, 2_500_000, 5_000_000)]
+    assert len(set(delays)) == 3 and all(0 <= delay < 1_000_000 for delay in delays)

@@ -17,6 +17,7 @@ from canprobe.lab.studies.workprec_cell import (
     findings,
     good,
     measure,
+    over_seeds,
     run_cell,
 )
 
@@ -87,7 +88,7 @@ def test_the_cost_is_that_of_the_scan_alone(monkeypatch):
         observers[0](SimpleNamespace(measurement=None))
         phase = [Phase.APPROACH] * 3 + [Phase.SCAN] * 6 + [Phase.RETREAT]
         log = {"phase": workprec_cell.np.array(phase), "t_s": 0.01 * workprec_cell.np.arange(10)}
-        shape = {"kappa_rms_error_percent": 3.0, "normal_rms_deg": 0.1}
+        shape = {"kappa_rms_error_percent": 3.0, "normal_rms_deg": 0.1, "cramer_rao_ratio": 1.5}
         summary = {"shape": shape, "contact": {"force_rms_error_n": 0.1, "force_target_n": 2.0}}
         return SimpleNamespace(log=log, summary=summary)
 
@@ -97,6 +98,21 @@ def test_the_cost_is_that_of_the_scan_alone(monkeypatch):
     answer = measure(CellCase(BusSetting(100.0, "features", "classical"), "recursive", "ideal", 1.0, 1))
     assert answer["cost_ms_per_s"] == pytest.approx(1e3 * 5.0 / 0.05)
     assert answer["force_percent"] == pytest.approx(5.0)
+    assert answer["bound_percent"] == pytest.approx(2.0)
+
+
+def test_a_row_has_the_spread_of_its_seeds_and_what_differs_beyond_it():
+    scans = [{"ended": "done", "reason": "", "cost_ms_per_s": 100.0 + i, "bound_percent": 1.0, "normal_deg": 0.1,
+              "curvature_percent": 2.0 + i, "force_percent": 4.0} for i in range(3)]  # fmt: skip
+    one = over_seeds(scans)
+    assert (one["cost_ms_per_s"], one["curvature_percent"], one["curvature_percent_range"]) == (100.0, 3.0, "2–4")
+    alike = over_seeds([{**scan, "curvature_percent": 3.5 + i} for i, scan in enumerate(scans)])
+    better = over_seeds([{**scan, "curvature_percent": 0.5 + 0.1 * i} for i, scan in enumerate(scans)])
+    assert workprec_cell._differ(one, alike) == []
+    assert workprec_cell._differ(one, better) == ["curvature"]
+    stopped = over_seeds([*scans, {"ended": "stopped", "reason": "too much"}])
+    assert stopped["force_percent"] is None
+    assert stopped["reason"] == "1 of 4 seeds stopped: too much"
 
 
 def row(method, cost, errors, *, rate=400.0, mode="window", fidelity="ideal"):

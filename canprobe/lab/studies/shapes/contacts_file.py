@@ -33,6 +33,11 @@ class ShapeContacts(NamedTuple):
     touched: Touched
     task: Touch
 
+    def until(self, seconds: float) -> ShapeContacts:
+        """The contacts of the first seconds of the scan."""
+        count = sum(sample.t_s <= self.samples[0].t_s + seconds for sample in self.samples)
+        return self._replace(samples=self.samples[:count], touched=self.touched.some(slice(count)))
+
 
 def write_contacts(path: Path, shapes: Mapping[str, Mapping[str, Any]]) -> str:
     """Write the file of contacts; its SHA-256."""
@@ -53,5 +58,6 @@ def read_contacts(path: Path, name: str) -> ShapeContacts:
     task = resolve(load_scene("cylinder")).task
     assert isinstance(task, Touch)
     sigma = np.hypot(columns["sigma"][:, 0], columns["sigma"][:, 2])
+    height = np.where(np.isnan(columns["sigma"][:, 3]), sigma, columns["sigma"][:, 3])
     normal = np.hypot(SIGMA_NORMAL_RAD, sigma * centroid_coupling(task.probe))
-    return ShapeContacts(samples, Touched(columns["p_base"], columns["n_base"], sigma, normal), task)
+    return ShapeContacts(samples, Touched(columns["p_base"], columns["n_base"], height, normal), task)

@@ -16,11 +16,12 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
-from canprobe.cell.tasks.from_plan import make_shape_estimator
+from canprobe.cell.tasks.from_plan import make_contact_map, make_shape_estimator
 from canprobe.cell.tasks.shape import replay_samples
 from canprobe.lab.studies.shapes.contacts_file import ShapeContacts
 from canprobe.lab.studies.shapes.implicit import ImplicitSurface, Kernel, fit_quadric, rbf, thin_plate
 from canprobe.mechanics.touch.blend import REACH_M, Feet
+from canprobe.mechanics.touch.map.contact_map import ContactMap
 from canprobe.mechanics.touch.surface import SurfaceMatrix
 from canprobe.mechanics.touch.surface_map import SPACING_M, LocalPatch, SurfaceMap, merge_patches
 from canprobe.mechanics.types import Floats
@@ -118,6 +119,44 @@ class Online:
         records = replay_samples(make_shape_estimator(task, self.method), contacts.samples, every)
         patches = [LocalPatch.of(r.estimate, t_s=r.t_s, travelled_m=r.travelled_m) for r in records]
         return MapSurface(merge_patches(patches, contacts.touched.points, method=self.name))
+
+
+class ContactMapSurface:
+    """The surface of a map of all contacts."""
+
+    def __init__(self, contact_map: ContactMap) -> None:
+        self.map = contact_map
+
+    def closest(self, points: Floats) -> Feet:
+        """See `FittedSurface`."""
+        return self.map.closest(points)
+
+    def sigma(self, points: Floats) -> Floats:
+        """See `FittedSurface`."""
+        return self.map.distance(points)[1]
+
+    def curvature(self, points: Floats) -> Floats:
+        """See `FittedSurface`."""
+        return self.map.curvature(points).tensor
+
+
+@dataclass(frozen=True, slots=True)
+class WholeMap:
+    """The map of the package: quartics of all passes with evidence, and the errors that a scan has in common."""
+
+    name: str = "map"
+    budgets: Sequence[float] = (100.0,)
+    unit: str = "% of contacts"
+
+    def develop(self, shapes: Sequence[ShapeContacts]) -> Settings:
+        """Set nothing: its settings were found on the development shapes before."""
+        return {}
+
+    def fit(self, contacts: ShapeContacts, budget: float, settings: Settings) -> ContactMapSurface:
+        """See `Method`."""
+        found = make_contact_map(contacts.task)
+        found.add_samples(contacts.samples)
+        return ContactMapSurface(found)
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,6 +270,7 @@ class Process:
 
 
 METHODS: tuple[Method, ...] = (
+    WholeMap(),
     Online("chen1996"),
     Online("chord"),
     Online("ml"),

@@ -55,6 +55,8 @@ FORMS: Mapping[str, Mapping[str, Any]] = {
     "edge": {"kind": "heights", "made": ("edge", 6)},
 }
 """Shape → keys of `[object]`; heights are `made` by a form and a seed."""
+DRAWN_SHAPES = 12
+"""Number of shapes that a draw has, one of each kind of the test shapes."""
 DEVELOPMENT, TEST = tuple(FORMS)[:8], tuple(FORMS)[8:]
 FIRST_SEED = 260_000
 _PLACE_MM = (-170.0, -175.0, 300.0)
@@ -65,6 +67,44 @@ FOOTPRINT_M, MARGIN_M, GRID_M = 3e-3, 5e-3, 0.5e-3
 EDGE_PER_M = 20.0
 """Change of curvature within the footprint's radius beyond which a point is near an edge."""
 SPACING_MM = 0.5
+
+
+def drawn(draw: int) -> tuple[str, ...]:
+    """Names of shapes that nobody has seen before: sizes, forms, arrays and seeds follow from the number of a draw."""
+    return tuple(f"drawn-{draw}-{kind}" for kind in range(DRAWN_SHAPES))
+
+
+def form_of(name: str) -> dict[str, Any]:
+    """Keys of `[object]` of a shape by its name; those of a draw are within the range of the other shapes."""
+    if name in FORMS:
+        return dict(FORMS[name])
+    draw, kind = (int(part) for part in name.split("-")[1:])
+    rng = np.random.default_rng([262, draw, kind])
+
+    def mm(low: float, high: float) -> float:
+        return round(float(rng.uniform(low, high)), 2)
+
+    made = int(rng.integers(1 << 30))
+    forms: list[dict[str, Any]] = [
+        {"kind": "sphere", "radius_mm": mm(40, 80)},
+        {"kind": "cylinder", "radius_mm": mm(36, 60)},
+        {"kind": "ellipsoid", "radius_x_mm": mm(50, 80), "radius_y_mm": mm(50, 80), "radius_z_mm": mm(50, 65)},
+        {"kind": "saddle", "radius_x_mm": mm(60, 100), "radius_y_mm": -mm(75, 120)},
+        {"kind": "torus", "ring_radius_mm": mm(90, 120), "radius_mm": mm(30, 45)},
+        {"kind": "bowl", "radius_mm": mm(90, 130)},
+        {"kind": "wave", "amplitude_mm": mm(1.5, 2.2), "wavelength_mm": mm(85, 95)},
+        {"kind": "fillet", "radius_mm": mm(22, 28), "angle_deg": mm(32, 40)},
+        *({"kind": "heights", "made": (form, made)} for form in ("free", "fine", "groove", "edge")),
+    ]
+    return forms[kind]
+
+
+def number_of(name: str) -> int:
+    """Number of a shape, which its seeds follow from."""
+    if name in FORMS:
+        return list(FORMS).index(name)
+    draw, kind = (int(part) for part in name.split("-")[1:])
+    return 1000 + DRAWN_SHAPES * draw + kind
 
 
 def heights_mm(form: str, seed: int) -> Floats:
@@ -90,17 +130,17 @@ def heights_mm(form: str, seed: int) -> Floats:
 
 def object_of(name: str, folder: Path) -> ObjectSettings:
     """`[object]` of a shape; its heights are written into a folder."""
-    keys = dict(FORMS[name])
+    keys = form_of(name)
     if "made" in keys:
         keys["file"] = str(folder / f"{name}.npz")
         np.savez(keys["file"], heights=heights_mm(*keys.pop("made")), spacing=SPACING_MM)
-    turn = 37.0 * list(FORMS).index(name) % 180
+    turn = 37.0 * number_of(name) % 180
     return ObjectSettings(position_mm=_PLACE_MM, rotation_deg=(0.0, 0.0, turn), **keys)
 
 
 def scene_of(name: str, folder: Path, seconds: float = SECONDS) -> Scene:
     """The scene of a shape: one array, and one layer in two not of the stated stiffness, of its own."""
-    number = list(FORMS).index(name)
+    number = number_of(name)
     rng = np.random.default_rng([261, number])
     base = load_scene("cylinder")
     assert base.shape is not None

@@ -19,7 +19,7 @@ from canprobe.lab.studies.harness import Column, Row, StudyResult
 from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.shapes.contacts_file import ShapeContacts, read_columns, read_contacts, write_contacts
 from canprobe.lab.studies.shapes.methods import METHODS, FittedSurface, Method
-from canprobe.lab.studies.shapes.scans import DEVELOPMENT, SECONDS, TEST, ScanCase, scan
+from canprobe.lab.studies.shapes.scans import DEVELOPMENT, SECONDS, TEST, ScanCase, drawn, scan
 from canprobe.lab.studies.sweep import Sweep
 from canprobe.mechanics.touch.meshing import Mesh, mesh_of
 from canprobe.mechanics.types import Floats
@@ -35,6 +35,10 @@ TRUTH_STEP = 2
 TIMED_SHAPE = "free-2"
 """Shape on which time and memory are measured; a contact costs the same on all."""
 REPEATS, DRAWS = 3, 2000
+KNOWN_AFTER_S = (2.0, 4.0, 6.0, 8.0)
+"""Times of the scan after which the methods are asked, besides its end."""
+PAIRED = ("accuracy_um", "completeness_um", "f_0.05mm", "f_0.1mm", "normal_mrad", "curvature_per_m", "nll")
+"""Scores whose difference from the map's is taken shape by shape."""
 _SCANS = ("fieldbus", "mechanics", "cell", "scenes", "lab/studies/shapes/scans.py")
 _FITS = ("mechanics/touch", "cell/tasks", "lab/studies/shapes")
 COLUMNS = (
@@ -52,9 +56,21 @@ COLUMNS = (
     Column("memory_mb", "MB", ".1f"),
 )
 
+AFTER = (
+    Column("seconds", "after s", "g"),
+    *(column for column in COLUMNS if column.key not in {"cpu_s", "memory_mb"}),
+)
+AFTER_FINDINGS = (
+    "What is known while the scan goes on, each method within one budget. The truth is that of the whole scan: ground"
+    f" that was not reached yet counts as {1e3 * WORST_M:g} mm in the completeness, and nowhere else.",
+)
+
 
 class MethodFit(NamedTuple):
-    """A method (index in `METHODS`) with settings on a shape of a file of contacts; repeats where it is timed."""
+    """A method (index in `METHODS`) with settings on a shape of a file of contacts; repeats where it is timed.
+
+    `seconds` is how much of the scan it gets.
+    """
 
     method: int
     budget: float
@@ -63,39 +79,58 @@ class MethodFit(NamedTuple):
     path: str
     sha256: str
     repeats: int
+    seconds: float
 
 
-def run(*, quick: bool, sweep: Sweep) -> StudyResult:
-    """Scan the shapes, fit every method within every budget, and score."""
-    develop, test = (DEVELOPMENT[:1], TEST[:1]) if quick else (DEVELOPMENT, TEST)
-    cases = [ScanCase(name, 1.2 if quick else SECONDS) for name in (*develop, *test)]
-    sweep.say(f"{len(cases)} scans of {cases[0].seconds:g} s")
+def run(*, quick: bool, sweep: Sweep, draw: int | None = None) -> StudyResult:
+    """Scan the shapes, fit every method within every budget, and score; with a draw on its shapes."""
+    develop, test = DEVELOPMENT, TEST if draw is None else drawn(draw)
+    if quick:
+        develop, test = develop[:1], test[:1]
+    whole = 1.2 if quick else SECONDS
+    cases = [ScanCase(name, whole) for name in (*develop, *test)]
+    sweep.say(f"{len(cases)} scans of {whole:g} s")
     found = sweep.map(scan, cases, model=_SCANS)
     path = sweep.folder / FILE
     digest = write_contacts(path, {case.shape: columns for case, columns in zip(cases, found, strict=True)})
     sweep.say(f"{path}: SHA-256 {digest}")
     shapes = [read_contacts(path, name) for name in develop]
     settings = [method.develop(shapes) for method in METHODS]
+    every = [(m, budget) for m, method in enumerate(METHODS) for budget in method.budgets]
+    usual = [(m, method.budgets[len(method.budgets) // 2]) for m, method in enumerate(METHODS)]
+    repeats = 1 if quick else REPEATS
 
-    def fits(shapes: Sequence[str]) -> list[MethodFit]:
+    def fits(chosen: Sequence[tuple[int, float]], names: Sequence[str], seconds: float) -> list[MethodFit]:
         return [
-            MethodFit(m, budget, settings[m], shape, str(path), digest, 1 if quick else REPEATS)
-            for m, method in enumerate(METHODS)
-            for budget in (method.budgets[1:2] if quick else method.budgets)
-            for shape in shapes
+            MethodFit(m, budget, settings[m], name, str(path), digest, repeats, seconds)
+            for m, budget in chosen
+            for name in names
         ]
 
-    scores = sweep.map(score, fits(test), model=_FITS)
-    timed = fits([TIMED_SHAPE if TIMED_SHAPE in test else test[0]])
-    costs = sweep.time(cost, timed, model=_FITS)
-    each = [scores[k * len(test) : (k + 1) * len(test)] for k in range(len(timed))]
-    rows = [row_of(METHODS[f.method], f.budget, mine) | c for f, mine, c in zip(timed, each, costs, strict=True)]
-    facts = measuring_facts(quick, len(test), _FITS) | {"contacts": digest[:16]}
-    return StudyResult("shapes", COLUMNS, rows, findings(rows, each), facts, partial(draw_shapes, rows))
+    def rows_of(chosen: Sequence[tuple[int, float]], seconds: float) -> tuple[list[Row], list[list[dict[str, Any]]]]:
+        scores = sweep.map(score, fits(chosen, test, seconds), model=_FITS)
+        each = [scores[k * len(test) : (k + 1) * len(test)] for k in range(len(chosen))]
+        rows = [row_of(METHODS[m], b, mine) for (m, b), mine in zip(chosen, each, strict=True)]
+        return [
+            row | {"seconds": seconds} | over_map(mine, each[0]) for row, mine in zip(rows, each, strict=True)
+        ], each
+
+    chosen = usual if quick else every
+    rows, each = rows_of(chosen, whole)
+    timed = TIMED_SHAPE if TIMED_SHAPE in test else test[0]
+    costs = sweep.time(cost, fits(chosen, [timed], whole), model=_FITS)
+    rows = [row | c for row, c in zip(rows, costs, strict=True)]
+    known = [row for seconds in KNOWN_AFTER_S if seconds < whole for row in rows_of(usual, seconds)[0]]
+    known += [row for row, one in zip(rows, chosen, strict=True) if one in usual]
+    facts = measuring_facts(quick, len(test), _FITS) | {"contacts": digest[:16], "shapes": ", ".join(test)}
+    words = findings(rows, each, timed)
+    after = StudyResult("shapes_after", AFTER, known, AFTER_FINDINGS, facts, partial(draw_after, known))
+    return StudyResult("shapes", COLUMNS, rows, words, facts, partial(draw_shapes, rows), [after])
 
 
 def surface_of(fit: MethodFit, contacts: ShapeContacts) -> tuple[FittedSurface, Mesh]:
     """A method's answer and its mesh; the cost of both is what a method costs."""
+    contacts = contacts.until(fit.seconds)
     surface = METHODS[fit.method].fit(contacts, fit.budget, fit.settings)
     return surface, mesh_of(surface.closest, contacts.touched.points[::20], MESH_CELL_M)
 
@@ -185,39 +220,56 @@ def _draws(count: int) -> Any:
     return np.random.default_rng(0).integers(count, size=(DRAWS, count))
 
 
-def findings(rows: Sequence[Row], each: Sequence[Sequence[Mapping[str, Any]]]) -> list[str]:
-    """The best of the package against the best of the others, score by score; `each` has the scores of every row."""
-    said = [
-        f"Means over {len(each[0])} test shapes. accuracy: map to truth; completeness: truth in the footprint to map;"
-        f" both mean distances, at most {1e3 * WORST_M:g} mm; NLL: of the height in mm; time and memory on"
-        f" {TIMED_SHAPE}. Differences with 95 % of the draws of shapes."
-    ]
-    ours = [k for k, row in enumerate(rows) if row["method"].startswith(("ml", "recursive"))]
-    others = [k for k in range(len(rows)) if k not in ours]
-    for key, heading, best in (
-        ("accuracy_um", "accuracy", min), ("completeness_um", "completeness", min), ("f_0.05mm", "F at 0.05 mm", max),
-        ("f_0.1mm", "F at 0.1 mm", max), ("normal_mrad", "normals", min),
-        ("curvature_per_m", "curvature", min), ("nll", "NLL", min),
-    ):  # fmt: skip
-        known = [[k for k in group if not math.isnan(rows[k][key])] for group in (ours, others)]
-        if not all(known):
-            continue
-        i, j = (best(group, key=lambda k: rows[k][key]) for group in known)
-        less = np.array([a[key] - b[key] for a, b in zip(each[i], each[j], strict=True)])
+def over_map(scores: Sequence[Mapping[str, Any]], of_map: Sequence[Mapping[str, Any]]) -> Row:
+    """Mean differences of a method's scores from the map's, shape by shape, with 95 % of the draws of shapes."""
+    row: Row = {}
+    for key in PAIRED:
+        mine, others = ([math.nan if one.get(key) is None else one[key] for one in all_] for all_ in (of_map, scores))
+        less = np.subtract(others, mine)
         low, high = np.quantile(less[_draws(len(less))].mean(axis=1), [0.025, 0.975])
-        who = "baseline" if (less.mean() > 0.0) == (best is min) else "ours"
+        row |= {f"{key}_over_map": float(less.mean()), f"{key}_over_map_low": low, f"{key}_over_map_high": high}
+    return row
+
+
+def findings(rows: Sequence[Row], each: Sequence[Sequence[Mapping[str, Any]]], timed: str) -> list[str]:
+    """The map against the best of the others, score by score; `each` has the scores of every row, the map's first."""
+    said = [
+        f"Means over {len(each[0])} shapes that no setting was found on. accuracy: map to truth; completeness: truth in"
+        f" the footprint to map; both mean distances, at most {1e3 * WORST_M:g} mm; NLL: of the height in mm; time and"
+        f" memory on {timed}. Differences with 95 % of the draws of shapes."
+    ]
+    for key, heading, best in (
+        ("accuracy_um", "accuracy", min), ("completeness_um", "completeness", min),
+        *((f"f_{limit:g}mm", f"F at {limit:g} mm", max) for limit in LIMITS_MM),
+        ("normal_mrad", "normals", min), ("curvature_per_m", "curvature", min), ("nll", "NLL", min),
+    ):  # fmt: skip
+        others = [k for k in range(1, len(rows)) if not math.isnan(rows[k][key])]
+        if not others or math.isnan(rows[0][key]):
+            continue
+        i = best(others, key=lambda k: rows[k][key])
+        less = np.array([a[key] - b[key] for a, b in zip(each[0], each[i], strict=True)])
+        low, high = np.quantile(less[_draws(len(less))].mean(axis=1), [0.025, 0.975])
         mine, theirs = (
-            f"{r['method']} ({r['budget']:g} {r['unit']}) {r[key]:.3g} in {r['cpu_s']:.2f} s"
-            for r in (rows[i], rows[j])
+            f"{row['method']} ({row['budget']:g} {row['unit']}) {row[key]:.3g} in {row['cpu_s']:.2f} s"
+            for row in (rows[0], rows[i])
         )
+        who = (
+            "as good"
+            if less.mean() == 0.0
+            else f"{rows[i if (less.mean() > 0.0) == (best is min) else 0]['method']} better"
+        )
+        said.append(f"  {heading}: {who}: {mine}; {theirs}; difference {less.mean():.2g} ({low:.2g} to {high:.2g}).")
+    held = [one["coverage"] for one in each[0] if one["coverage"] is not None]
+    if held:
         said.append(
-            f"  {heading}: {who} better: {mine}; {theirs}; difference {less.mean():.2g} ({low:.2g} to {high:.2g})."
+            f"  bands of the map: {statistics.mean(held):.1%} hold the truth; on the worst shape {min(held):.1%}, on"
+            f" the best {max(held):.1%}. An error that a whole scan has in common puts a shape wholly in or out."
         )
     return said
 
 
-COLOURS = {**METHOD_COLOURS, "quadrics": GREEN, "process, RBF": PINK, "process, thin plate": INK}
-MARKERS = {"quadrics": "D", "process, RBF": "^", "process, thin plate": "v"}
+COLOURS = {**METHOD_COLOURS, "map": "black", "quadrics": GREEN, "process, RBF": PINK, "process, thin plate": INK}
+MARKERS = {"map": "*", "quadrics": "D", "process, RBF": "^", "process, thin plate": "v"}
 PANELS = (
     ("f_0.1mm", "F-score at 0.1 mm (1 is best)", False),
     ("accuracy_um", "accuracy: map to truth (µm)", True),
@@ -225,6 +277,13 @@ PANELS = (
     ("normal_mrad", "normals, away from edges (mrad)", True),
     ("curvature_per_m", "curvature, away from edges (1/m)", True),
     ("coverage", "share of 95 % bands that hold the truth", False),
+)
+
+
+AFTER_PANELS = (
+    ("completeness_um", "completeness: truth of the whole scan to map (µm)", True),
+    ("accuracy_um", "accuracy: map to truth (µm)", True),
+    ("curvature_per_m", "curvature, away from edges (1/m)", True),
 )
 
 
@@ -236,18 +295,36 @@ def draw_shapes(rows: Sequence[Row], path: Path) -> None:
     )
     with picture(path, title, 6.6) as figure:
         panels = figure.subplots(2, 3, sharex=True)
-        for axes, (key, heading, logarithmic) in zip(panels.flat, PANELS, strict=True):
-            for name in dict.fromkeys(row["method"] for row in rows):
-                mine = [row for row in rows if row["method"] == name and not math.isnan(row[key])]
-                if not mine:
-                    continue
-                x, y = (np.array([row[k] for row in mine]) for k in ("cpu_s", key))
-                own, _, patched = name.partition(" + ")
-                marker = MARKERS.get(own, "s" if patched else "o")
-                style = "--" if patched else "-"
-                axes.plot(x, y, label=name, color=COLOURS.get(own, SKY), marker=marker, markersize=4, linestyle=style)
-            axes.set_title(heading)
-            log_scale(axes, "xy" if logarithmic else "x")
+        _curves(rows, "cpu_s", panels.flat, PANELS, "x")
         for axes in panels[1]:
             axes.set_xlabel("processor time (s)")
         legend(figure)
+
+
+def draw_after(rows: Sequence[Row], path: Path) -> None:
+    """Scores over the time of the scan, a curve for each method."""
+    title = "What every method knows while the scan goes on, each within one budget; means over the test shapes"
+    with picture(path, title, 3.6) as figure:
+        panels = figure.subplots(1, 3, sharex=True)
+        _curves(rows, "seconds", panels, AFTER_PANELS, "")
+        for axes in panels:
+            axes.set_xlabel("time of the scan (s)")
+        legend(figure)
+
+
+def _curves(
+    rows: Sequence[Row], over: str, panels: Any, what: Sequence[tuple[str, str, bool]], logarithmic: str
+) -> None:
+    for axes, (key, heading, log) in zip(panels, what, strict=True):
+        for name in dict.fromkeys(row["method"] for row in rows):
+            mine = [row for row in rows if row["method"] == name and not math.isnan(row[key])]
+            if not mine:
+                continue
+            x, y = (np.array([row[k] for row in mine]) for k in (over, key))
+            own, _, patched = name.partition(" + ")
+            marker = MARKERS.get(own, "s" if patched else "o")
+            style = "--" if patched else "-"
+            axes.plot(x, y, label=name, color=COLOURS.get(own, SKY), marker=marker, markersize=4, linestyle=style)
+        axes.set_title(heading)
+        if scales := logarithmic + "y" * log:
+            log_scale(axes, scales)

@@ -11,6 +11,9 @@ From an image:
     silent_taxels       finds rows, columns and taxels that do not measure, by several images, and interpolates them
     pad_lag             corrects the lag of the centroid behind the contact
     moments             second moments of an image
+    force_reading       the force of each image in its order, without creep, with its standard deviation
+    force_creep         corrects the creep of the force by two relaxations
+    force_errors        the errors of the force that a calibration states
     creep               traces of earlier places of the patch in the image of an array that creeps
 
 Curvature:
@@ -28,6 +31,7 @@ Calibration:
     parameter_fit       the parameters of the image model
     pad_fit             lag and scatter of centroids
     taxel_gains         the gain of each taxel, and dead ones
+    force_fit           creep, and the scatter of the force against the arm's way
     layer_fit           the stiffness of the layer, by the arm's way into the object
 
 A straight path does not observe the curvature across it; the image of one touch does. The emulated array

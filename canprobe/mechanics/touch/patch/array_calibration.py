@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from canprobe.errors import UsageError
+from canprobe.mechanics.touch.patch.force_errors import UNSTATED, ForceErrors
 
 ForceReference = Literal["scale", "weights", "unit", "none"]
 NO_FORCE_REFERENCE = "nominal newtons: no force reference"
@@ -181,6 +182,7 @@ class ArrayCalibration:
         centroid: delays of the centroid.
         stiffness: stiffness of the layer from both sources.
         residuals: held-out errors.
+        force: errors of the force.
         gains: (rows, columns) gains of the taxels over their mean; empty where they were not found or are not used.
         dead: (row, column) of each taxel that reads nothing under a patch.
     """
@@ -197,6 +199,7 @@ class ArrayCalibration:
     centroid: CentroidDelays
     stiffness: StiffnessSources
     residuals: Residuals
+    force: ForceErrors = UNSTATED
     gains: tuple[tuple[float, ...], ...] = ()
     dead: tuple[tuple[int, int], ...] = ()
 

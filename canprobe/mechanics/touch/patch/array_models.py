@@ -23,9 +23,11 @@ def make_patch_calibration(calibration: ArrayCalibration, pad: Pad) -> PatchCali
     over the scale. At another full scale than that of the calibration, level, threshold and noise are the same counts
     of another pressure; layer, blur, crosstalk and scale stay.
     """
+    reference = 0.0 if calibration.nominal else calibration.force_sigma
+    plain = PatchCalibration(pad, force_errors=calibration.force, reference_sigma=reference)
     if pad.is_flat or not pad.is_grid:
-        return PatchCalibration(pad, force_gain=1.0 / calibration.image.scale, dead=calibration.dead)
-    plain = PatchCalibration(pad, gains=calibration.gains)
+        return replace(plain, force_gain=1.0 / calibration.image.scale, dead=calibration.dead)
+    plain = replace(plain, gains=calibration.gains)
     gain, edge = make_image_model(calibration, plain, seen=None).force_gains(GAIN_FORCES_N, GAIN_CURVATURES)
     return replace(plain, force_gain=gain, edge_gain=edge, dead=calibration.dead, blur_m=calibration.image.blur)
 

@@ -28,9 +28,11 @@ from canprobe.mechanics.touch.patch.array_calibration import (
     StiffnessSources,
 )
 from canprobe.mechanics.touch.patch.array_models import make_image_model, make_patch_calibration
+from canprobe.mechanics.touch.patch.force_errors import MAKE_SPREAD, USUAL_LIGHTNESS
+from canprobe.mechanics.touch.patch.force_fit import fit_force
 from canprobe.mechanics.touch.patch.image import PatchCalibration
 from canprobe.mechanics.touch.patch.image_fit import LAST_IMAGE_S, NO_ERRORS, Dwell, Shown, what_is_shown
-from canprobe.mechanics.touch.patch.image_model import USUAL_LIGHTNESS
+from canprobe.mechanics.touch.patch.image_model import MOMENT_ERROR_POWER
 from canprobe.mechanics.touch.patch.layer_fit import stiffness_by_depth
 from canprobe.mechanics.touch.patch.pad_fit import fit_noise
 from canprobe.mechanics.touch.patch.parameter_fit import (
@@ -96,6 +98,7 @@ def calibrate_array(
     date: str,
     made_on: str,
     own_gains: bool = True,
+    spread: float = MAKE_SPREAD,
 ) -> ArrayFit:
     """Calibrate an array by touches of known objects.
 
@@ -107,6 +110,7 @@ def calibrate_array(
         reference_sigma: relative standard deviation of the reference.
         array, date, made_on: entries of the file.
         own_gains: whether taxel gains are used where they help; False where the file is for all arrays of a make.
+        spread: relative standard deviation of the force between the arrays of a make; not that of one array.
 
     Raises:
         UsageError: there are too few touches, or none has a force where the reference is one.
@@ -156,8 +160,10 @@ def calibrate_array(
     patch = make_patch_calibration(first, pad)
     depths = [_depths(d, s, patch, stiffness) for d, s in fitted]
     noise, centroid, scatter = fit_noise(ds, ss, depths)
+    spread = 0.0 if own_gains else spread
     calibration = replace(
         first,
+        force=fit_force(ds, ss, patch, stiffness, force_errors, spread),
         moments=_moment_errors(errors, ss),
         noise=noise,
         centroid=centroid,
@@ -227,7 +233,8 @@ def _checked(
     model = make_image_model(calibration, patch, seen=seen)
     measured = [_force(patch, s) for _, s in pairs]
     parts = [d for d, _ in pairs], [s for _, s in pairs], measured
-    forces = [f / d.force - 1.0 for f, (d, _) in zip(measured, pairs, strict=True) if d.force is not None]
+    # a reference load is read over the whole touch, and creep is part of it
+    forces = [f * s.crept / d.force - 1.0 for f, (d, s) in zip(measured, pairs, strict=True) if d.force is not None]
     return moment_errors(model, *parts), curvature_errors(model, *parts), np.array(forces)
 
 
@@ -246,7 +253,7 @@ def _held_out(
 
 def _moment_errors(errors: Floats, shown: Sequence[Shown]) -> MomentErrors:
     """Errors of moments from touches that the fit has not seen, with `FORM_SIGMA` for shapes that were not touched."""
-    scaled = errors * np.sqrt(USUAL_LIGHTNESS / np.array([s.lightness for s in shown]))[:, None]
+    scaled = errors * (USUAL_LIGHTNESS / np.array([[s.lightness] for s in shown])) ** (0.5 * MOMENT_ERROR_POWER)
     moment = float(np.mean(scaled[:, :2] ** 2)) + FORM_SIGMA**2
     return MomentErrors(
         moment=moment,

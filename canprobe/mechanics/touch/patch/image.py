@@ -23,6 +23,7 @@ from canprobe.mechanics.touch.linear_algebra import checked, positive, read_only
 from canprobe.mechanics.touch.pad import COUNTS_MAX, THRESHOLD_COUNTS, Pad
 from canprobe.mechanics.touch.patch.beyond_window import MAX_EDGE_SHARE, MIN_PEAK_RATIO, Continuation
 from canprobe.mechanics.touch.patch.dead_taxels import may_be_dead, mended
+from canprobe.mechanics.touch.patch.force_errors import UNSTATED, ForceErrors, ForceSigma
 from canprobe.mechanics.touch.stops import OFF_PAD_EDGE_SHARE, OFF_PAD_SIGMAS, OFF_PAD_TAXELS
 from canprobe.mechanics.types import Floats
 
@@ -66,6 +67,7 @@ class Patch(NamedTuple):
         off_pad: whether the pressure is highest at the pad's edge: a fifth of the contact or more lies beyond it, and
             the force is only a lower bound.
         bridged: share of the force that taxels would measure which do not, interpolated.
+        sigma: standard deviation of the force by its causes; of a single image, whose age in the touch is not known, 0.
     """
 
     force: float
@@ -80,6 +82,7 @@ class Patch(NamedTuple):
     dead: int = 0
     off_pad: bool = False
     bridged: float = 0.0
+    sigma: ForceSigma = ForceSigma()
 
     @property
     def good(self) -> bool:
@@ -114,6 +117,8 @@ class PatchCalibration:
         gains: (rows, columns) gains of the taxels over their mean; empty where all are alike.
         dead: (row, column) of each taxel that is known to read nothing.
         blur_m: standard deviation of the blur by the cover, m; 0 where it is not known.
+        force_errors: errors of the force.
+        reference_sigma: relative standard deviation of the reference of newtons; 0 where there is none.
         pascals: (256,) pressure of each count, Pa.
         weights: (n, 6) area × (1, u, v, uu, uv, vv) of each taxel over its gain, lengths in pitches, the area in m².
         continuation: extrapolation beyond a window.
@@ -126,6 +131,8 @@ class PatchCalibration:
     gains: tuple[tuple[float, ...], ...] = ()
     dead: tuple[tuple[int, int], ...] = ()
     blur_m: float = 0.0
+    force_errors: ForceErrors = UNSTATED
+    reference_sigma: float = 0.0
     pascals: Floats = field(init=False, repr=False)
     weights: Floats = field(init=False, repr=False)
     continuation: Continuation = field(init=False, repr=False)

@@ -21,6 +21,7 @@ from canprobe.errors import UsageError
 from canprobe.mechanics.touch.patch.array_calibration import MomentErrors
 from canprobe.mechanics.touch.patch.creep import PadMemory
 from canprobe.mechanics.touch.patch.dead_taxels import Image
+from canprobe.mechanics.touch.patch.force_errors import STRAIGHT_SHARE
 from canprobe.mechanics.touch.patch.image import PatchCalibration, compute_patch
 from canprobe.mechanics.touch.patch.moments import LEVEL_COUNTS, MomentImage
 from canprobe.mechanics.types import Floats
@@ -34,8 +35,6 @@ TOUCH_SIGMA = 0.012
 FIRST_IMAGE_S, LAST_IMAGE_S = 0.5, 3.5
 """Time from the touch to the first image that is used, and to the last, s: all touches are compared after the same
 creep."""
-MAX_PEAK_SHARE = 0.7
-"""Largest peak over full scale of a touch that is used: taxels bend off before they saturate."""
 MIN_CURVATURE_SHARE = -0.9
 """Least curvature in a search, over that of the probe."""
 MIN_IMAGES = 10
@@ -164,7 +163,7 @@ def what_is_shown(dwell: Dwell, plain: PatchCalibration, age_s: float = math.inf
         way=dwell.expected[kept],
         t_s=dwell.t_s[kept],
         raw=raw,
-        usable=bad <= 0.2 * len(kept) and peak < MAX_PEAK_SHARE * plain.full_scale_pa,
+        usable=bad <= 0.2 * len(kept) and peak < STRAIGHT_SHARE * plain.full_scale_pa,
         push=float(dwell.push[kept].mean()),
         pushes=dwell.push[kept],
         sums=np.array(sums),

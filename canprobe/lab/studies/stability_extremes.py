@@ -1,0 +1,264 @@
+"""Extreme cases of study `stability`, in one table: each ends right, refused by the plan, or stopped with the reason.
+
+A case is the packaged scene `press` or `cylinder` with one thing at an extreme: dead rows of the array, counts of a few
+bits, a layer from 10⁴ to 10¹² N/m³, a servo from 50 to 1000 Hz, an object of 5 mm to 10 m, encoders up to 100 × as
+coarse, a wrist at or near its singular pose, a period that jitters. Nothing else is adapted to it.
+
+`right`: it ran to its end, the true force is within `FORCE_PERCENT` of the target (RMS), and the curvature of a scan is
+within `CURVATURE_SHARE` of κ + 1/R_p, or within what it states, or said to be not observed. `wrong`: it ran to its end
+and is not right, or failed as a touch of `stability_runs` can. Values beyond the limits of a scene file are set too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.lines import Line2D
+
+from canprobe.cell.results.picture import AMBER, BLUE, GREY, ORANGE, legend, picture
+from canprobe.cell.scene.load import load_scene
+from canprobe.cell.scene.model import PlantSettings, Scene
+from canprobe.cell.session.session import Session
+from canprobe.cell.tasks.from_plan import make_task
+from canprobe.cell.tasks.touch import TouchTask
+from canprobe.errors import PlanError
+from canprobe.fieldbus.protocol.frames import SYNC_ID
+from canprobe.lab.studies.harness import CHI2_95_OF_3, Column, Row, StudyResult
+from canprobe.lab.studies.region_scores import scores_of
+from canprobe.lab.studies.result_files import measuring_facts
+from canprobe.lab.studies.stability_runs import LateNode, bent_touch, refused_row, run_touch, scene_of
+from canprobe.lab.studies.sweep import Sweep
+from canprobe.lab.studies.workprec_cell import SENSOR_HZ
+
+EXTREMES: Mapping[str, tuple[tuple[float, ...], str]] = {
+    "dead rows": ((1, 2, 4, 8), "{:g}"),
+    "bits of a count": ((4, 6), "{:g}"),
+    "K/h": (tuple(10.0**n for n in range(4, 13)), "{:.0e} N/m³"),
+    "servo": ((50, 100, 200, 500, 1000), "{:g} Hz"),
+    "radius": ((5, 12, 100, 1000, 10_000), "{:g} mm"),
+    "coarser encoders": ((10, 100), "{:g} ×"),
+    "joint 5": ((0, 3), "{:g} deg"),
+    "jitter of the period": ((5, 20, 50), "{:g} %"),
+}
+"""Thing → its values, and the form of one in words."""
+PROBE_MM = 40.0
+"""Radius of the default probe."""
+HOLD_S, SCAN_S = 1.0, 2.0
+FORCE_PERCENT, CURVATURE_SHARE = 20.0, 0.1
+HELD_SHARE = 0.5
+"""Least share of the answers of a scan whose regions hold the truth: the answers of one memory are one draw."""
+MODEL = (
+    "fieldbus", "mechanics", "cell", "scenes", "cells", "arrays", "calibrations", "lab/studies/stability_runs.py",
+    "lab/studies/stability_extremes.py", "lab/studies/region_scores.py",
+)  # fmt: skip
+COLUMNS = (
+    Column("extreme", "extreme"),
+    Column("value", "value"),
+    Column("task", "task"),
+    Column("ended", "ended"),
+    Column("force_max_n", "max N", ".3g"),
+    Column("error_percent", "force error %", ".0f"),
+    Column("curvature_per_m", "curvature error 1/m", ".2f"),
+    Column("stated_per_m", "stated 1/m", ".2f"),
+    Column("held", "regions hold", ".2f"),
+    Column("reason", "reason"),
+)
+END_MARKS = {
+    "right": (BLUE, "o", "right"),
+    "stopped": (AMBER, "s", "stopped with the reason"),
+    "refused": (GREY, "X", "refused by the plan"),
+    "wrong": (ORANGE, "v", "wrong"),
+}
+"""Colour, marker and words of each end."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExtremeCase:
+    """One case: the extreme thing, its value, and whether the scene is a scan."""
+
+    extreme: str
+    value: float
+    scan: bool
+
+
+def run_extremes(*, quick: bool, sweep: Sweep) -> StudyResult:
+    """Carry out all cases."""
+    cases = [
+        ExtremeCase(name, value, scan)
+        for name, (values, _) in (list(EXTREMES.items())[:1] if quick else EXTREMES.items())
+        for value in (values[:1] if quick else values)
+        for scan in (False, True)
+    ]
+    sweep.say(f"{len(cases)} extreme cases")
+    rows: list[Row] = sweep.map(measure, cases, model=MODEL)
+    facts = measuring_facts(quick, 1, MODEL)
+    return StudyResult("stability_extremes", COLUMNS, rows, findings(rows), facts, partial(draw_extremes, rows))
+
+
+def extreme_scene(case: ExtremeCase) -> Scene:
+    """The scene of a case."""
+    seconds = SCAN_S if case.scan else HOLD_S
+    if case.extreme == "joint 5":
+        return scene_of(bent_touch(case.value, 25.0 * case.scan, seconds))
+    name = "cylinder" if case.scan else "press"
+    scene = load_scene(name, {"task.duration_s": seconds, "task.clearance_mm": 0.5, "bus.timed": False})
+    if scene.shape is not None:
+        scene = replace(scene, shape=replace(scene.shape, also=()))
+    return CHANGES[case.extreme](scene, case.value) if case.extreme in CHANGES else scene
+
+
+def _with_plant(scene: Scene, **keys: Any) -> Scene:
+    return replace(scene, plant=replace(scene.plant or PlantSettings(), **keys))
+
+
+def _with_dead_rows(scene: Scene, rows: float) -> Scene:
+    """Dead rows in the middle of the array, where it touches."""
+    first = 8 - math.ceil(rows / 2)
+    return _with_plant(scene, dead_rows=tuple(range(first, first + int(rows))))
+
+
+def _with_rate(scene: Scene, rate_hz: float) -> Scene:
+    """The rate of the images divides that of the servo."""
+    assert scene.sensor is not None
+    sensor = replace(scene.sensor, rate_hz=SENSOR_HZ.get(rate_hz, min(scene.sensor.rate_hz, rate_hz)))
+    return replace(scene, cycle=replace(scene.cycle, rate_hz=rate_hz), sensor=sensor)
+
+
+def _on_sphere(scene: Scene, radius_mm: float) -> Scene:
+    """A sphere, with a path that turns its normal by 37 deg to both sides at most."""
+    assert scene.object is not None
+    length, width = min(scene.task.length_mm, 1.2 * radius_mm), min(scene.task.width_mm, 0.4 * radius_mm)
+    task = replace(scene.task, length_mm=length, width_mm=width)
+    return replace(scene, task=task, object=replace(scene.object, kind="sphere", radius_mm=radius_mm))
+
+
+def _with_coarser_encoders(scene: Scene, times: float) -> Scene:
+    joints = {
+        name: replace(joint, counts_per_turn=(joint.counts_per_turn or 0.0) / times)
+        for name, joint in scene.joints.items()
+    }
+    return replace(scene, joints=joints)
+
+
+CHANGES: Mapping[str, Callable[[Scene, float], Scene]] = {
+    "dead rows": _with_dead_rows,
+    "bits of a count": lambda scene, bits: _with_plant(scene, adc_bits=int(bits)),
+    "K/h": lambda scene, stiffness: _with_plant(scene, stiffness_n_m3=stiffness),
+    "servo": _with_rate,
+    "radius": _on_sphere,
+    "coarser encoders": _with_coarser_encoders,
+}
+"""Extreme thing → change of a scene to a value of it; a wrist has a touch of its own, jitter changes the bus."""
+
+
+def value_in_words(case: ExtremeCase) -> str:
+    """Value of a case with its unit, such as 1e4 N/m³."""
+    return EXTREMES[case.extreme][1].format(case.value).replace("e+0", "e").replace("e+", "e")
+
+
+def measure(case: ExtremeCase) -> Row:
+    """Carry out a case: its row of the table."""
+    row: Row = {"extreme": case.extreme, "value": value_in_words(case), "task": "scan" if case.scan else "press"}
+    none: Row = dict.fromkeys(("curvature_per_m", "stated_per_m", "held"))
+    scene = extreme_scene(case)
+    try:
+        session = Session(scene)
+        world = session.world
+    except PlanError as refusal:
+        return row | refused_row(refusal) | none
+    task = make_task(session.plan)
+    assert isinstance(task, TouchTask) and world.nodes
+    if case.extreme == "jitter of the period":
+        jitter_ns = 1e-2 * case.value * 1e9 / scene.cycle.rate_hz
+        shaken = [LateNode(node, {SYNC_ID}, partial(sync_delay_ns, jitter_ns)) for node in world.nodes]
+        world.participants[: len(shaken)] = shaken
+    found = row | run_touch(session, task, scene.task.force_n) | none
+    scores = np.zeros((0, 5))
+    if task.shape is not None:
+        late, behind = scores_of(session, task.shape.records)
+        scores = np.array([one for one in (*late, *behind) if one]).reshape(-1, 5)
+    if len(scores):
+        found["curvature_per_m"], found["stated_per_m"] = (float(np.sqrt(scores[:, i].mean())) for i in (1, 2))
+        found["held"] = float(np.mean(scores[:, 3] < CHI2_95_OF_3))
+    return found | judged(found, 1e3 / PROBE_MM + float(np.abs(session.truth["kappa_per_m"][-1]).max()))
+
+
+def sync_delay_ns(jitter_ns: float, t_ns: int) -> int:
+    """Delay of the SYNC of a time, ns: the same for all nodes, as if the master had sent it late."""
+    return int(np.random.default_rng(t_ns).uniform(0.0, jitter_ns))
+
+
+def judged(row: Row, curved_per_m: float) -> Row:
+    """How a case ended, and why.
+
+    Args:
+        row: the row of `run_touch`, with the scores of a scan.
+        curved_per_m: curvature of probe and object together, 1/m.
+    """
+    if row["ended"] in ("stopped", "refused"):
+        return {"ended": row["ended"]}
+    if row["ended"] != "stable":
+        return {"ended": "wrong", "reason": f"{row['ended']}: {row['reason'] or 'the force does not settle'}"}
+    wrong = []
+    if not (row["error_percent"] is not None and row["error_percent"] <= FORCE_PERCENT):
+        wrong.append("force")
+    known = row["held"] is not None
+    if known and row["held"] < HELD_SHARE and row["curvature_per_m"] > CURVATURE_SHARE * curved_per_m:
+        wrong.append("curvature")
+    if wrong:
+        return {"ended": "wrong", "reason": " and ".join(wrong)}
+    return {"ended": "right", "reason": "" if known or row["task"] == "press" else "curvature not observed"}
+
+
+def findings(rows: Sequence[Row]) -> list[str]:
+    """Numbers of the ends, and each case that is wrong."""
+    ends = Counter(str(row["ended"]) for row in rows)
+    counted = ", ".join(f"{ends[end]} {words}" for end, (*_, words) in END_MARKS.items())
+    said = [f"{len(rows)} extreme cases: {counted}."]
+    for row in rows:
+        if row["ended"] == "wrong":
+            force = row["error_percent"]
+            said.append(
+                f"  wrong: {row['task']}, {row['extreme']} {row['value']}: {row['reason']}; true force off by "
+                f"{'–' if force is None else format(force, '.0f')} % (RMS)"
+            )
+    return said
+
+
+def draw_extremes(rows: Sequence[Row], path: Path) -> None:
+    """A panel each for presses and scans: a line for each extreme thing, a mark with its value for each case."""
+    names = list(dict.fromkeys(row["extreme"] for row in rows))
+    title = (
+        "How extreme cases end; nothing else is adapted to them\n"
+        f"right: true force within {FORCE_PERCENT:g} % of its target, curvature within a tenth of κ + 1/R, or within"
+        " what it states, or said to be not observed"
+    )
+    with picture(path, title, 1.8 + 0.62 * len(names)) as figure:
+        panels = figure.subplots(1, 2, sharey=True)
+        for axes, task in zip(panels, ("press", "scan"), strict=True):
+            for line, name in enumerate(names):
+                mine = [row for row in rows if (row["extreme"], row["task"]) == (name, task)]
+                for column, row in enumerate(mine):
+                    colour, marker, _ = END_MARKS[row["ended"]]
+                    axes.plot(column, line, marker, color=colour, markersize=7)
+                    text = row["value"].split()[0]
+                    axes.annotate(text, (column, line), textcoords="offset points", xytext=(0, -15), ha="center")
+            axes.set(
+                title=task,
+                xticks=[],
+                ylim=(len(names) - 0.35, -0.5),
+                xlim=(-0.6, max(len(v) for v, _ in EXTREMES.values()) - 0.4),
+            )
+            axes.grid(visible=False)
+        units = {name: form.partition(" ")[2] for name, (_, form) in EXTREMES.items()}
+        panels[0].set_yticks(range(len(names)), [f"{n} ({units[n]})" if units[n] else n for n in names])
+        legend(
+            figure, [Line2D([], [], color=c, marker=m, linestyle="", label=words) for c, m, words in END_MARKS.values()]
+        )

@@ -1,0 +1,234 @@
+"""Quartics of the nodes round many places at once, with evidence, and the errors that all of them have in common.
+
+Rows of a node at (x, y, z) over the plane, p = c − (R_p − d) n, d = √(2 F √det A / (π k)), A = ½ (I/R_p + K_ref):
+
+    height   z − (d/4) tr(M K_ref) = [φ + (d/4) tr(M ∇²φ)]·a,   M = (I/R_p + K_ref)⁻¹
+    slopes   −n_xy/n_z = ∇φ·a + D θ,   δn = (1/R_p + H) [v, R_p (n + z_p), −x_p, −y_p] θ
+
+since δ ln d = ¼ tr(M δK) and K = −∇²h: a depth that began with another curvature is right in the end. θ are the lag
+along the heading v, the pad's relative scale, and the offsets of the centroid. Each disc gives information about them,
+I_θ += s (Λ_θθ − Λ_θa S⁻¹ Λ_aθ), S with the prior, s the share of its nodes that no other disc counts.
+
+For each deviation g of third derivatives the evidence is −½ ln|S_g| + ½ ln|P_g| + ½ ηᵀ S_g⁻¹ η, P the prior's
+information and η the pull of the data beyond the prior's mean. The answer is the mixture: a smooth surface is taken as
+smooth, and one that changes within millimetres is not.
+
+Source: Rasmussen and Williams, "Gaussian processes for machine learning", 2006, 2.7 and 5.4; Johnson, "Contact
+mechanics", 1985, 4.3 (layer).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from canprobe.mechanics.touch.map import nodes as column
+from canprobe.mechanics.touch.map.discs import MIN_FACING, Discs
+from canprobe.mechanics.touch.map.noise import MapNoise
+from canprobe.mechanics.touch.map.quartic import (
+    LENGTH_M,
+    LOG_HYPERPRIOR,
+    PRIOR_INFORMATION,
+    SECOND,
+    TERMS,
+    fourth_of,
+    terms,
+)
+from canprobe.mechanics.types import Floats
+
+MAX_HOLLOW_SHARE = 0.9
+"""Limit of a hollow over the probe's curvature, in depths."""
+CHANCE_SIGMAS = 2.0
+"""Standard deviations of χ² per degree of freedom by which it must be above 1 to be more than chance."""
+COMMON = 4
+"""Number of common errors."""
+
+
+class Pad(NamedTuple):
+    """A spherical probe with an elastic layer: radius R_p, m, and stiffness K/h, N/m³."""
+
+    radius: float
+    stiffness: float
+
+
+class CommonErrors(NamedTuple):
+    """Errors that a scan has in common: mean (4,) and covariance (4, 4) of lag, scale and offsets (`MapNoise`)."""
+
+    mean: Floats
+    covariance: Floats
+
+
+class LocalFits(NamedTuple):
+    """Fitted quartics, dimensionless (`quartic.LENGTH_M`).
+
+    Attributes:
+        a: (m, 15) derivatives of the height.
+        V: (m, 15, 15) their covariance, that of the common errors included.
+        excess: (m,) χ² per degree of freedom above 1; 0 where the noise explains the contacts.
+        spread: (m, 2, 2) covariance of the nodes in the plane over the variance of their places.
+    """
+
+    a: Floats
+    V: Floats
+    excess: Floats
+    spread: Floats
+
+    @property
+    def K(self) -> Floats:
+        """(m, 2, 2) curvature at the origins along x and y, where the planes are tangent, 1/m."""
+        xx, xy, yy = -self.a[:, SECOND].T / LENGTH_M
+        return np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
+
+
+def fit_discs(
+    rows: Floats, discs: Discs, pad: Pad | None, noise: MapNoise, *, K_ref: Floats, weight: Floats
+) -> tuple[LocalFits, CommonErrors, Floats]:
+    """Fit every disc, and the common errors to all of them.
+
+    Args:
+        rows: (k, COLUMNS) nodes.
+        discs: places and their nodes.
+        pad: the probe; None where centres are contact points.
+        noise: noise of the contacts.
+        K_ref: (m, 2, 2) curvature near the right one, 1/m.
+        weight: (m, n) weights of the nodes of a disc.
+
+    Returns:
+        The fits, the common errors, and (m, n) χ² of the rows of each node.
+    """
+    if pad is not None:
+        K_ref = _followed(K_ref, pad.radius)
+    A, y, places, variance, usual = _rows(rows[discs.nodes], discs, pad, noise, K_ref)
+    root = np.sqrt(np.repeat(weight, 3, axis=1))
+    weighted = (A * root[..., None]).transpose(0, 2, 1)
+    G, b = weighted @ (A * root[..., None]), np.einsum("mik,mk->mi", weighted, y * root)
+    posterior = _Posterior.of(G, b, fourth_of(K_ref * LENGTH_M))
+    common = posterior.common(discs.share, np.array(noise.common))
+    a, V, held = posterior.mixture(common)
+    residual = y - np.einsum("mki,mi->mk", A[..., :TERMS], a) - A[..., TERMS:] @ common.mean
+    chi2 = (residual**2).reshape(len(a), -1, 3).sum(axis=2)
+    total = weight.sum(axis=1)
+    dof = np.maximum(noise.used * total - held, 1.0)
+    expected = dof * (weight * usual).sum(axis=1) / np.maximum(noise.used * total, 1e-300)
+    excess = (weight * chi2).sum(axis=1) / np.maximum(expected, 1e-300) - 1.0
+    excess = np.where(excess > CHANCE_SIGMAS * np.sqrt(2.0 / dof), excess, 0.0)
+    share = weight / np.maximum(total, 1e-300)[:, None]
+    off = places - np.einsum("mn,mni->mi", share, places)[:, None]
+    variance = np.maximum(np.einsum("mn,mn->m", share, variance), 1e-300)
+    spread = np.einsum("mn,mni,mnj->mij", share, off, off) / variance[:, None, None]
+    return LocalFits(a, V, excess, spread), common, chi2
+
+
+def _followed(K: Floats, radius: float) -> Floats:
+    """Curvatures (n, 2, 2) no hollower than a pad of a radius can follow."""
+    values, axes = np.linalg.eigh(K)
+    values = np.maximum(values, -MAX_HOLLOW_SHARE / radius)
+    result: Floats = np.einsum("nij,nj,nkj->nik", axes, values, axes)
+    return result
+
+
+def _rows(
+    node: Floats, discs: Discs, pad: Pad | None, noise: MapNoise, K_ref: Floats
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Whitened rows A (m, 3n, 15 + 4) of (a, θ) and y (m, 3n); places (m, n, 2), m, and their variances (m, n), m².
+
+    The last is (m, n) the χ² that is usual for a node: below one a row where nodes are shorter than the path of an
+    independent sample, as the noise within a node is then that of its neighbours.
+    """
+    m, n = node.shape[:2]
+    normal = node[..., column.NORMAL] @ discs.R
+    at = (node[..., column.CENTRE] - discs.origin[:, None]) @ discs.R
+    tilt = 0.5 * np.trace(K_ref, axis1=1, axis2=2)[:, None]  # normal per lateral error
+    quarter: Floats = np.zeros((m, n))
+    M: Floats = np.zeros_like(K_ref)
+    if pad is not None:
+        relative = np.eye(2) / pad.radius + K_ref
+        root_det = 0.5 * np.sqrt(np.linalg.det(relative))[:, None]
+        depth = node[..., column.ROOT_FORCE] * np.sqrt(2.0 * root_det / (math.pi * pad.stiffness))
+        at = at - (pad.radius - depth)[..., None] * normal
+        quarter, tilt = 0.25 * depth / LENGTH_M, tilt + 1.0 / pad.radius
+        M = np.asarray(np.linalg.inv(relative) / LENGTH_M, np.float64)
+    x, y, z = np.moveaxis(at, -1, 0) / LENGTH_M
+    f, fx, fy, fxx, fxy, fyy = terms(x, y, (0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+    m11, m12, m22 = (M[:, i, j, None, None] for i, j in ((0, 0), (0, 1), (1, 1)))
+    A, values = np.zeros((m, n, 3, TERMS + COMMON)), np.empty((m, n, 3))
+    A[..., 0, :TERMS] = f + quarter[..., None] * (m11 * fxx + 2.0 * m12 * fxy + m22 * fyy)
+    A[..., 1, :TERMS], A[..., 2, :TERMS] = fx, fy
+    values[..., 0] = z - quarter * np.einsum("mij,mij->m", M, K_ref * LENGTH_M)[:, None]
+    values[..., 1:] = -normal[..., :2] / np.maximum(normal[..., 2:], MIN_FACING)
+    if pad is not None:
+        on_pad = pad.radius * (node[..., column.NORMAL] + node[..., column.Z_PAD])
+        for k, way in enumerate(
+            (node[..., column.HEADING], on_pad, -node[..., column.X_PAD], -node[..., column.Y_PAD])
+        ):
+            A[..., 1:, TERMS + k] = -tilt[..., None] * (way @ discs.R)[..., :2]
+    heights, normals = noise.independent(node[..., column.COUNT], node[..., column.PATH])
+    lateral2 = node[..., column.LATERAL2]
+    scale = np.empty((m, n, 3))
+    scale[..., 0] = np.sqrt(heights / node[..., column.HEIGHT2]) * LENGTH_M
+    scale[..., 1:] = np.sqrt(normals / (lateral2 * tilt**2 + node[..., column.NORMAL2]))[..., None]
+    usual = math.isfinite(noise.height) * np.minimum(heights, 1.0)
+    usual = usual + 2.0 * math.isfinite(noise.normal) * np.minimum(normals, 1.0)
+    A *= scale[..., None]
+    return A.reshape(m, -1, TERMS + COMMON), (values * scale).reshape(m, -1), at[..., :2], lateral2, usual
+
+
+class _Posterior(NamedTuple):
+    """Solutions of all discs for every deviation g.
+
+    `inverse` (m, g, 15, 15) is S⁻¹, `log_det` (m, g) ln|S|, `pull` (m, 15) η, `mean` (m, 15) the prior's, and G, b the
+    normal equations of (a, θ).
+    """
+
+    inverse: Floats
+    log_det: Floats
+    pull: Floats
+    mean: Floats
+    G: Floats
+    b: Floats
+
+    @classmethod
+    def of(cls, G: Floats, b: Floats, mean: Floats) -> _Posterior:
+        data = G[:, :TERMS, :TERMS]
+        S = data[:, None] + PRIOR_INFORMATION[:, :, None] * np.eye(TERMS)
+        root = np.linalg.cholesky(S)
+        log_det: Floats = 2.0 * np.log(np.einsum("mgii->mgi", root)).sum(axis=2)
+        pull = b[:, :TERMS] - np.einsum("mij,mj->mi", data, mean)
+        return cls(np.asarray(np.linalg.inv(S), np.float64), log_det, pull, mean, G, b)
+
+    def shares(self, pull: Floats) -> Floats:
+        """(m, g) shares of the deviations in the mixture, by their evidence."""
+        fit = np.einsum("mgi,mi->mg", np.einsum("mgij,mj->mgi", self.inverse, pull), pull)
+        log = 0.5 * (fit - self.log_det + np.log(PRIOR_INFORMATION).sum(axis=1)) + LOG_HYPERPRIOR
+        share = np.exp(log - log.max(axis=1, keepdims=True))
+        result: Floats = share / share.sum(axis=1, keepdims=True)
+        return result
+
+    def common(self, share: Floats, sigma: Floats) -> CommonErrors:
+        """The common errors, with prior standard deviations (4,), from discs that count by a share (m,) each."""
+        if not sigma.any():
+            return CommonErrors(np.zeros(COMMON), np.zeros((COMMON, COMMON)))
+        best = self.inverse[np.arange(len(share)), self.shares(self.pull).argmax(axis=1)]
+        crossed = self.G[:, TERMS:, :TERMS]
+        turn = crossed @ best
+        information = np.einsum("m,mij->ij", share, self.G[:, TERMS:, TERMS:] - turn @ crossed.transpose(0, 2, 1))
+        free = self.b[:, TERMS:] - np.einsum("mij,mj->mi", crossed, self.mean)
+        pull = share @ (free - np.einsum("mij,mj->mi", turn, self.pull))
+        covariance = np.linalg.inv(information + np.diag(sigma**-2.0))
+        return CommonErrors(covariance @ pull, covariance)
+
+    def mixture(self, common: CommonErrors) -> tuple[Floats, Floats, Floats]:
+        """Mean (m, 15), covariance (m, 15, 15), and (m,) the number of terms that the data determine."""
+        crossed = self.G[:, :TERMS, TERMS:]
+        pull = self.pull - crossed @ common.mean
+        share = self.shares(pull)
+        each = np.einsum("mgij,mj->mgi", self.inverse, pull) + self.mean[:, None]
+        turn = self.inverse @ crossed[:, None]
+        V = self.inverse + turn @ common.covariance @ turn.transpose(0, 1, 3, 2)
+        a = np.einsum("mg,mgi->mi", share, each)
+        off = each - a[:, None]
+        V = np.einsum("mg,mgij->mij", share, V) + np.einsum("mg,mgi,mgj->mij", share, off, off)
+        held = TERMS - np.einsum("mg,mgii,gi->m", share, self.inverse, PRIOR_INFORMATION)
+        return a, V, held

@@ -1,0 +1,171 @@
+"""Nodes: contacts averaged over a millimetre of path, in a hash grid.
+
+A node is the mean of the contacts along a millimetre of the way that the contact has really made (`Travel`: noise at
+rest makes no way). A node that falls into the voxel of an older one with the same facing is averaged with it: ground
+that is scanned again adds weight and hardly any memory.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.mechanics.touch.contact import ContactSample, direction_to_pad
+from canprobe.mechanics.touch.estimate.travel import Travel
+from canprobe.mechanics.touch.map.noise import MapNoise
+from canprobe.mechanics.touch.patch.creep import PadMemory
+from canprobe.mechanics.types import Floats
+
+NODE_M = 1e-3
+"""Path of a node, and side of a voxel, m; a single touch counts as one path of this length."""
+JUMP_M = 2e-3
+"""Distance from one contact to the next that is a new touch, m."""
+TRAVEL_STEPS_PER_SIGMA = 4.0
+"""Least step of `Travel`, in standard deviations of the point."""
+CENTRE, NORMAL, X_PAD, Y_PAD, Z_PAD, HEADING = (slice(3 * i, 3 * i + 3) for i in range(6))
+ROOT_FORCE, LATERAL2, HEIGHT2, NORMAL2, PATCH = range(18, 23)
+COUNT, PATH = 23, 24
+COLUMNS = 25
+"""Columns of a node: probe centre, outward normal, axes of the pad, heading, √force (√N), variances of the lateral
+error (m²), of the height (m²), of the normal (rad²), √det of the patch's second moments (m², NaN without an image);
+number of contacts, path (m)."""
+_MEANS = slice(0, COUNT)
+
+
+class NodeGrid:
+    """Nodes of all contacts so far.
+
+    Args:
+        radius: radius of the probe, m; 0 where centres are contact points.
+        sigma_point: usual standard deviation of a contact, m.
+    """
+
+    def __init__(self, radius: float, sigma_point: float) -> None:
+        self._radius = radius
+        self._step = min(TRAVEL_STEPS_PER_SIGMA * sigma_point, 0.5 * NODE_M)
+        self._rows = np.zeros((64, COLUMNS))
+        self._size = 0
+        self._numbers: dict[tuple[int, ...], int] = {}
+        self._travel = Travel(self._step)
+        self._open = np.zeros(COLUMNS)
+        self._begun = self._first = self._last = np.zeros(3)
+        self._begun_at = 0.0
+
+    def __len__(self) -> int:
+        return self._size + int(self._open[COUNT] > 0.0)
+
+    def add(self, rows: Floats) -> None:
+        """Take contacts (n, COLUMNS), in the order of time; their number and path are set here."""
+        points = rows[:, CENTRE] - self._radius * rows[:, NORMAL]
+        begin = 0
+        for i, (point, place) in enumerate(zip(points, points.tolist(), strict=True)):
+            fresh = self._open[COUNT] == 0.0 and begin == i
+            if not fresh and math.dist(place, self._last.tolist()) > JUMP_M:
+                self._take(rows[begin:i])
+                self._close()
+                self._travel, self._begun_at = Travel(self._step), 0.0
+                begin, fresh = i, True
+            if fresh:
+                self._first = point
+            self._last = point
+            self._travel.add(point)
+            if self._travel.total - self._begun_at >= NODE_M:
+                self._take(rows[begin : i + 1])
+                self._close()
+                begin = i + 1
+        self._take(rows[begin:])
+
+    def _take(self, rows: Floats) -> None:
+        self._open[_MEANS] += rows[:, _MEANS].sum(axis=0)
+        self._open[COUNT] += len(rows)
+
+    def _close(self) -> None:
+        """Put the open node into its voxel."""
+        if self._open[COUNT] == 0.0:
+            return
+        row = self._finished()
+        number = self._numbers.setdefault(self._voxel(row), self._size)
+        if number < self._size:
+            old = self._rows[number]
+            share = row[PATH] / (row[PATH] + old[PATH])
+            old[_MEANS] += share * (row[_MEANS] - old[_MEANS])
+            old[COUNT:] += row[COUNT:]
+            old[NORMAL] /= np.linalg.norm(old[NORMAL])
+        else:
+            if self._size == len(self._rows):
+                self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
+            self._rows[self._size] = row
+            self._size += 1
+        self._open = np.zeros(COLUMNS)
+        self._begun_at = self._travel.total
+
+    def _finished(self) -> Floats:
+        """The open node as a mean."""
+        row: Floats = self._open / self._open[COUNT]
+        row[COUNT], row[PATH] = self._open[COUNT], max(self._travel.total - self._begun_at, NODE_M)
+        row[NORMAL] /= np.linalg.norm(row[NORMAL])
+        way = self._last - self._first
+        row[HEADING] = way / max(float(np.linalg.norm(way)), 0.5 * NODE_M)
+        return row
+
+    def _voxel(self, row: Floats) -> tuple[int, ...]:
+        point = row[CENTRE] - self._radius * row[NORMAL]
+        return (*np.floor(point / NODE_M).astype(int).tolist(), facing(row[None, NORMAL])[0])
+
+    @property
+    def rows(self) -> Floats:
+        """(n, COLUMNS) every node, the open one last."""
+        closed = self._rows[: self._size]
+        return np.concatenate([closed, self._finished()[None]]) if self._open[COUNT] > 0.0 else closed.copy()
+
+
+class Traces:
+    """Sizes of patches in images that show traces of where the patch was before (`PadMemory`).
+
+    Args:
+        share: share of those traces in the moments (`ImageModel.memory`).
+    """
+
+    def __init__(self, share: float) -> None:
+        self._share, self._memory = share, PadMemory()
+
+    def size_of(self, sample: ContactSample, radius: float) -> float:
+        """√det of the second moments of a contact's patch, m², NaN without an image; samples in the order of time."""
+        x, y, z = sample.r_probe.tolist()
+        reach = math.sqrt(x * x + y * y + z * z)
+        was = self._memory.add(sample.t_s, *direction_to_pad((x / reach, y / reach, z / reach), radius))
+        if sample.moments is None:
+            return math.nan
+        uu, uv, vv = (now - self._share * then for now, then in zip(sample.moments, was, strict=True))
+        return math.sqrt(max(uu * vv - uv * uv, 0.0))
+
+
+def rows_of(samples: Sequence[ContactSample], radius: float, noise: MapNoise, traces: Traces | None) -> Floats:
+    """Contacts of a pad as rows (n, COLUMNS).
+
+    Args:
+        samples: contacts in the order of time.
+        radius: radius of the probe, m.
+        noise: noise of the map.
+        traces: traces of earlier places of the patch in its images; they go on with these contacts.
+    """
+    rows = np.zeros((len(samples), COLUMNS))
+    T = np.array([sample.T_base_probe for sample in samples]).reshape(-1, 4, 4)
+    rows[:, CENTRE], rows[:, X_PAD], rows[:, Y_PAD], rows[:, Z_PAD] = T[:, :3, 3], T[:, :3, 0], T[:, :3, 1], T[:, :3, 2]
+    rows[:, NORMAL] = np.array([sample.n_base for sample in samples]).reshape(-1, 3)
+    rows[:, NORMAL2], rows[:, PATCH] = noise.normal**2, math.nan
+    for row, sample in zip(rows, samples, strict=True):
+        row[ROOT_FORCE] = math.sqrt(max(sample.force_n, 0.0))
+        row[LATERAL2], row[HEIGHT2] = noise.lateral2(sample), noise.height2(sample)
+        if traces is not None:
+            row[PATCH] = traces.size_of(sample, radius)
+    return rows
+
+
+def facing(normals: Floats) -> NDArray[np.intp]:
+    """(n,) the axis, 0–5, that a normal (n, 3) points along most: x, y, z, −x, −y, −z."""
+    axis: NDArray[np.intp] = np.abs(normals).argmax(axis=1)
+    return axis + np.where(np.take_along_axis(normals, axis[:, None], 1)[:, 0] < 0.0, 3, 0)
