@@ -13,7 +13,8 @@ from canprobe.errors import UsageError
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.tools.faults.fault import Effect, Fault, FaultKind, Host, Parameter
 from canprobe.fieldbus.tools.faults.frame_faults import tactile_ids
-from canprobe.fieldbus.tools.faults.registry import BUS_FAULTS, make_kind
+from canprobe.fieldbus.tools.faults.registry import BUS_FAULTS
+from canprobe.fieldbus.tools.faults.row import make_kind
 from canprobe.mechanics.touch.pad import COUNTS_MAX
 
 _CRC_BYTE = 6

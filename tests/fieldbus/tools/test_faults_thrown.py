@@ -90,6 +90,8 @@ def test_a_node_that_is_not_there_and_a_kind_that_needs_a_drive(line):
         line.nodes.inject("node 6: mute")
 
 
+MEASURED = {0x100300, 0x100301, 0x603F00, 0x604100, 0x606400}
+"""Keys of the error history, the error code, the statusword and the position."""
 READ_1000 = "4000100000000000"
 
 
@@ -195,6 +197,26 @@ def test_a_stuck_brake_is_found_as_a_following_error(line):
         line.word(0x1F)
         line.heard(1000)
     assert line.node.node.dictionary.number(0x603F) == 0x8611
+
+
+@pytest.mark.parametrize("name", BUS_FAULTS)
+def test_no_value_of_a_parameter_makes_the_node_raise_and_the_end_leaves_it_as_it_was(line, name):
+    line.ask(0, "0105")
+    line.ask(0x605, "2f60600008000000")
+    before = dict(line.node.node.dictionary.values)
+    for bound in ("low", "high"):
+        values = "".join(f" {key}={getattr(one, bound)}" for key, one in BUS_FAULTS[name].parameters.items())
+        with inject(line.nodes, f"node 5: {name}{values} seed=3"):
+            for request_text in (READ_1000, "4008100000000000", "6000000000000000", "2f60600008000000"):
+                line.ask(0x605, request_text, ms=0.05)
+                line.ask(0x80, "", ms=0.05)
+            line.heard(2 if bound == "high" else 0.1)
+        line.heard(0.1)
+    line.ask(0, "0105", ms=2)
+    assert line.nodes.faults == []
+    if name not in ("zero-shift", "reboot", "drive-fault"):
+        after = line.node.node.dictionary.values
+        assert {key for key in before if before[key] != after[key]} <= MEASURED
 
 
 def test_on_an_event_and_the_same_again_by_its_seed(line):

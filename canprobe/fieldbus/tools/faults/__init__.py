@@ -16,7 +16,7 @@ cycle; when it ends, what it changed in the node is undone; a node without fault
     frame_faults    the link: lost, late, twice, changed, made up; power and bus-off
     service_faults  heartbeat, NMT, SDO, EMCY, mapping
     drive_faults    CiA 402: fault, torque off, encoder, brake, zero
-    registry        the table of all kinds
+    registry        the table of all kinds; drive_registry has those of a drive, row how a row is written
     text, injection faults as text, and thrown at running nodes
     control         the local channel by which `canprobe inject` reaches served nodes
 

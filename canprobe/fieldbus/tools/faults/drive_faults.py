@@ -171,4 +171,5 @@ class TorqueLimit(DriveEffect):
     def _limit(self, permille: int) -> None:
         dictionary = self.node.dictionary
         if (entry := dictionary.entries.get(key_of(_MAX_TORQUE_INDEX))) is not None:
-            dictionary.write_value(entry, permille)
+            highest = entry.high if entry.high is not None else permille
+            dictionary.write_value(entry, min(permille, int(highest)))

@@ -45,6 +45,7 @@ class FaultKind:
         parameters: its numbers by name.
         incoming: whether it hits frames that the node receives; None: either, as the fault says, else those it sends.
         needs: device that it needs: a node, a drive, or an array.
+        lasts_ns: its duration where a text gives none.
     """
 
     name: str
@@ -56,6 +57,7 @@ class FaultKind:
     parameters: Mapping[str, Parameter] = field(default_factory=dict)
     incoming: bool | None = None
     needs: str = "node"
+    lasts_ns: int = FOREVER_NS
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,8 +6,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 
 from canprobe.errors import UsageError
+from canprobe.fieldbus.drive.drive import DriveApplication
 from canprobe.fieldbus.tools.faults.fault import Fault, FaultKind
 from canprobe.fieldbus.tools.faults.faulty_node import FaultyNode
+from canprobe.fieldbus.tools.faults.frame_faults import HEADER_INDEX
 from canprobe.fieldbus.tools.faults.registry import BUS_FAULTS
 from canprobe.fieldbus.tools.faults.text import parse_fault
 
@@ -38,9 +40,9 @@ class FaultyNodes:
         fault = parse_fault(text, self.kinds)
         node = self._node(fault.node_id, text)
         kind = fault.kind
-        if kind.needs == "drive" and not node.node.dictionary.has_index(0x6040):
+        if kind.needs == "drive" and not isinstance(node.node.application, DriveApplication):
             raise UsageError(f"fault {text!r}: node {fault.node_id} is no CiA 402 drive, which {kind.name} needs")
-        if kind.needs == "array" and node.node.dictionary.has_index(0x6040):
+        if kind.needs == "array" and not node.node.dictionary.has_index(HEADER_INDEX):
             raise UsageError(f"fault {text!r}: node {fault.node_id} is no tactile array, which {kind.name} needs")
         fault = parse_fault(text, self.kinds, node.now_ns if now_ns is None else now_ns)
         node.add(fault)

@@ -7,42 +7,14 @@ Source: CiA 301 (frames, services), CiA 402-2 (drives).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from types import MappingProxyType
 
-from canprobe.fieldbus.tools.faults import drive_faults as drive
 from canprobe.fieldbus.tools.faults import frame_faults as link
 from canprobe.fieldbus.tools.faults import service_faults as service
-from canprobe.fieldbus.tools.faults.fault import Effect, Fault, FaultKind, Host, Parameter
-
-_LOST = "pdo_missed drive_late drive_silent"
-"""Conditions of a drive whose TPDOs do not come."""
-
-
-def make_kind(
-    name: str,
-    effect: Callable[[Fault, Host], Effect],
-    what: str,
-    clause: str,
-    reaction: str,
-    *,
-    trips: str = "",
-    incoming: bool | None = None,
-    needs: str = "node",
-    **parameters: Parameter,
-) -> FaultKind:
-    """A row; `trips` are keys of conditions with blanks between them, `parameters` the kind's numbers."""
-    keys = frozenset(trips.split())
-    return FaultKind(name, what, clause, reaction, effect, keys, parameters, incoming, needs)
-
-
-def _ms(default: float, what: str) -> Parameter:
-    return Parameter(default, 0.001, 3_600_000, what)
-
-
-def _code(default: int, what: str) -> Parameter:
-    return Parameter(default, 0, 0xFFFF, what)
-
+from canprobe.fieldbus.tools.faults.drive_registry import DRIVE_KINDS
+from canprobe.fieldbus.tools.faults.fault import FaultKind, Parameter
+from canprobe.fieldbus.tools.faults.row import LOST, SHORT_NS, error_code, in_ms, make_kind
 
 _ROWS = (
     make_kind(
@@ -51,7 +23,7 @@ _ROWS = (
         "frames are lost",
         "CiA 301, PDO",
         "misses them, then the node is lost",
-        trips=_LOST,
+        trips=LOST,
     ),
     make_kind(
         "delay",
@@ -59,7 +31,7 @@ _ROWS = (
         "frames come later",
         "CiA 301, 1007h",
         "takes a late PDO for a missed one",
-        ms=_ms(1, "delay, ms"),
+        ms=in_ms(1, "delay, ms"),
     ),
     make_kind(
         "duplicate",
@@ -83,10 +55,10 @@ _ROWS = (
         "a frame comes behind the next ones",
         "CiA 301, PDO",
         "goes by the identifier, not by the order",
-        trips=_LOST,
+        trips=LOST,
     ),
     make_kind(
-        "mute", link.Drop, "the node sends nothing", "CiA 301, 1016h", "stops the others", trips=_LOST, incoming=False
+        "mute", link.Drop, "the node sends nothing", "CiA 301, 1016h", "stops the others", trips=LOST, incoming=False
     ),
     make_kind(
         "deaf",
@@ -94,7 +66,7 @@ _ROWS = (
         "the node hears nothing",
         "CiA 301, 1016h, 6007h",
         "the node stops by itself: 8130h, 8250h",
-        trips=f"{_LOST} emcy_communication",
+        trips=f"{LOST} emcy_communication",
         incoming=True,
     ),
     make_kind(
@@ -103,8 +75,9 @@ _ROWS = (
         "the power fails for the duration",
         "CiA 301, boot-up",
         "sends no targets; configures it anew",
-        trips=f"{_LOST} emcy_communication",
+        trips=f"{LOST} emcy_communication",
         incoming=False,
+        lasts_ns=SHORT_NS,
     ),
     make_kind(
         "freeze",
@@ -112,7 +85,7 @@ _ROWS = (
         "the node stands still for the duration",
         "CiA 301, 1016h",
         "stops the others",
-        trips=f"{_LOST} emcy_communication",
+        trips=f"{LOST} emcy_communication",
         incoming=False,
     ),
     make_kind(
@@ -123,7 +96,7 @@ _ROWS = (
         "stays below the load that it bears",
         trips="drive_fault",
         incoming=False,
-        gap_ms=_ms(1, "time between two frames, ms"),
+        gap_ms=in_ms(1, "time between two frames, ms"),
     ),
     make_kind(
         "wrong-data",
@@ -131,7 +104,7 @@ _ROWS = (
         "another position, or another tactile header with the right CRC",
         "CiA 402-2, 6064h",
         "drops what cannot be",
-        trips=_LOST,
+        trips=LOST,
         incoming=False,
     ),
     make_kind(
@@ -140,7 +113,7 @@ _ROWS = (
         "PDOs have a byte too few",
         "CiA 301, PDO length, 8210h",
         "does not apply them",
-        trips=_LOST,
+        trips=LOST,
     ),
     make_kind("long", link.Long, "PDOs have a byte too many", "CiA 301, PDO length, 8220h", "applies or drops them"),
     make_kind(
@@ -149,7 +122,7 @@ _ROWS = (
         "frames come many times",
         "CiA 301, inhibit time",
         "takes the first",
-        trips=f"{_LOST} emcy_communication",
+        trips=f"{LOST} emcy_communication",
         n=Parameter(10, 2, 100, "number of frames for each"),
     ),
     make_kind(
@@ -158,7 +131,7 @@ _ROWS = (
         "PDOs come under another identifier",
         "CiA 301, 18xxh:01",
         "misses them",
-        trips=_LOST,
+        trips=LOST,
         offset=Parameter(16, -0x180, 0x180, "distance of the identifiers"),
     ),
     make_kind(
@@ -168,7 +141,7 @@ _ROWS = (
         "CiA 301, COB-ID bits 29 and 30",
         "ignores them",
         incoming=False,
-        gap_ms=_ms(1, "time between two frames, ms"),
+        gap_ms=in_ms(1, "time between two frames, ms"),
     ),
     make_kind(
         "sync-jitter",
@@ -185,7 +158,7 @@ _ROWS = (
         "SYNC does not reach the node",
         "CiA 301, 1006h, 8100h, 6007h",
         "the node stops by itself: 8100h",
-        trips=f"{_LOST} emcy_communication",
+        trips=f"{LOST} emcy_communication",
         incoming=True,
     ),
     make_kind(
@@ -202,8 +175,9 @@ _ROWS = (
         "the controller is off the bus for the duration",
         "CiA 301, 8140h",
         "stops the others; the node reports its return",
-        trips=_LOST,
+        trips=LOST,
         incoming=True,
+        lasts_ns=SHORT_NS,
     ),
     make_kind(
         "heartbeat-off",
@@ -260,7 +234,7 @@ _ROWS = (
         "CiA 301, SDO, 05040000h",
         "waits, or times out once",
         incoming=False,
-        ms=_ms(100, "delay, ms"),
+        ms=in_ms(100, "delay, ms"),
     ),
     make_kind(
         "sdo-toggle",
@@ -294,7 +268,7 @@ _ROWS = (
         "stops for a device error",
         trips="emcy",
         incoming=False,
-        code=_code(0x5000, "emergency error code"),
+        code=error_code(0x5000, "emergency error code"),
     ),
     make_kind(
         "emcy-storm",
@@ -304,8 +278,8 @@ _ROWS = (
         "counts, and stays below the load",
         trips="emcy_communication",
         incoming=False,
-        gap_ms=_ms(1, "time between two messages, ms"),
-        code=_code(0x8210, "emergency error code"),
+        gap_ms=in_ms(1, "time between two messages, ms"),
+        code=error_code(0x8210, "emergency error code"),
     ),
     make_kind(
         "remapped",
@@ -316,96 +290,7 @@ _ROWS = (
         trips="drive_fault",
         incoming=False,
     ),
-    make_kind(
-        "drive-fault",
-        drive.DriveFault,
-        "the drive detects a fault",
-        "CiA 402-2, 605Eh, 603Fh",
-        "stops the others; resets by an edge only",
-        trips="drive_fault",
-        incoming=False,
-        needs="drive",
-        code=_code(0x4310, "error code"),
-        resettable=Parameter(1, 0, 1, "0: it comes back after a reset"),
-    ),
-    make_kind(
-        "sto",
-        drive.Sto,
-        "safe torque off",
-        "CiA 402-2, state automaton",
-        "does not enable it again and again",
-        trips="drive_fault",
-        incoming=False,
-        needs="drive",
-    ),
-    make_kind(
-        "mode-refused",
-        drive.ModeRefused,
-        "writes to 6060h are refused",
-        "CiA 402-2, 6060h, 6061h",
-        "sends no targets",
-        incoming=True,
-        needs="drive",
-    ),
-    make_kind(
-        "brake-stuck",
-        drive.BrakeStuck,
-        "the motor stays where it is",
-        "CiA 402-2, 6065h, 8611h",
-        "the drive finds a following error",
-        incoming=False,
-        needs="drive",
-    ),
-    make_kind(
-        "encoder-jump",
-        drive.EncoderJump,
-        "the encoder is wrong by some counts",
-        "CiA 402-2, 6064h",
-        "drops what cannot be",
-        trips=_LOST,
-        incoming=False,
-        needs="drive",
-        counts=Parameter(2000, -(2**31), 2**31 - 1, "error, counts"),
-    ),
-    make_kind(
-        "encoder-frozen",
-        drive.EncoderFrozen,
-        "the encoder keeps its position",
-        "CiA 402-2, 6064h",
-        "the drive finds a following error",
-        incoming=False,
-        needs="drive",
-    ),
-    make_kind(
-        "homing-lost",
-        drive.HomingLost,
-        "the drive forgets that it was homed",
-        "CiA 402-2, homing, bit 12",
-        "moves nothing before it is homed",
-        incoming=False,
-        needs="drive",
-    ),
-    make_kind(
-        "zero-shift",
-        drive.ZeroShift,
-        "the zero of the drive is elsewhere",
-        "CiA 402-2, 607Ch",
-        "does not hold the old zero",
-        trips="drive_fault",
-        incoming=False,
-        needs="drive",
-        counts=Parameter(2000, -(2**31), 2**31 - 1, "way of the zero, units of position"),
-    ),
-    make_kind(
-        "torque-limit",
-        drive.TorqueLimit,
-        "the torque is limited",
-        "CiA 402-2, 6072h, bit 11",
-        "goes no faster than the drive follows",
-        incoming=False,
-        needs="drive",
-        permille=Parameter(10, 0, 10_000, "limit, 1/1000 of the rated torque"),
-    ),
+    *DRIVE_KINDS,
 )
 BUS_FAULTS: Mapping[str, FaultKind] = MappingProxyType({kind.name: kind for kind in _ROWS})
 """Kinds of faults of nodes, links and drives by name. `canprobe.cell.emulated` adds those of the array."""

@@ -180,23 +180,30 @@ class EmcyStorm(Babble):
 class Remapped(Effect):
     """The first two entries of the first TPDO that has two are exchanged, in the frames and in 1Axxh."""
 
+    _exchanged: tuple[int, int, int] | None = None
+
     def begin(self, t_ns: int) -> Sequence[Frame]:
         """Exchange them."""
-        self._exchange(t_ns)
-        return ()
-
-    def end(self, t_ns: int) -> Sequence[Frame]:
-        """Exchange them back."""
-        self._exchange(t_ns)
-        return ()
-
-    def _exchange(self, t_ns: int) -> None:
         dictionary = self.node.dictionary
         for index in dictionary.indices_in(range(0x1A00, 0x1C00)):
             if dictionary.number(index) >= 2:
-                first, second = (dictionary.number(index, sub) for sub in (1, 2))
-                dictionary.put(index, 1, second)
-                dictionary.put(index, 2, first)
                 self.host.hits += 1
+                first, second = dictionary.number(index, 1), dictionary.number(index, 2)
+                self._exchanged = index, first, second
+                self._put(second, first, t_ns)
                 break
+        return ()
+
+    def end(self, t_ns: int) -> Sequence[Frame]:
+        """Exchange them back, unless somebody has mapped anew."""
+        if self._exchanged is not None:
+            index, first, second = self._exchanged
+            if [self.node.dictionary.number(index, sub) for sub in (1, 2)] == [second, first]:
+                self._put(first, second, t_ns)
+        return ()
+
+    def _put(self, first: int, second: int, t_ns: int) -> None:
+        assert self._exchanged is not None
+        for sub, entry in ((1, first), (2, second)):
+            self.node.dictionary.put(self._exchanged[0], sub, entry)
         self.node.pdos.reset(t_ns)

@@ -65,7 +65,7 @@ def parse_fault(text: str, kinds: Mapping[str, FaultKind], now_ns: int = 0) -> F
         kind,
         int(match["node"]),
         now_ns + (_time(text, match["at"], match["at_unit"]) if match["at"] else 0),
-        _time(text, match["long"], match["long_unit"]) if match["long"] else FOREVER_NS,
+        _time(text, match["long"], match["long_unit"]) if match["long"] else kind.lasts_ns,
         values,
         common["share"],
         int(common["count"]),
