@@ -1,6 +1,6 @@
 """The wings and rooms of the package: who may import whom, read from the source; no circles.
 
-    fieldbus   protocol < eds < bus < node < drive; vcan          neither numpy nor scipy
+    fieldbus   protocol < eds < bus < node < drive < tools; vcan          neither numpy nor scipy
     mechanics  types < robot < touch
     cell       scene < planning < master < tasks | plant < emulated, then session < results < recorded
     lab        bridge, studies, gym, examples
@@ -23,7 +23,7 @@ FILES = glob.glob("**/*.py", root_dir=PACKAGE, recursive=True)  # it follows the
 MODULES = {PACKAGE / name: Path(name) for name in sorted(FILES)}
 
 WINGS = {
-    "fieldbus": ("protocol", "eds", "bus", "node", "drive", "vcan"),
+    "fieldbus": ("protocol", "eds", "bus", "node", "drive", "tools", "vcan"),
     "mechanics": ("types", "robot", "touch"),
     "cell": (
         "npz",
@@ -48,7 +48,7 @@ MECHANICS = {"types", "robot", "touch"}
 SCENE = {"protocol", "eds", "node", *MECHANICS, "scene"}
 PLANNING = SCENE | {"planning", "bus"}
 MASTER = PLANNING | {"master", "tasks", "npz", "rows"}
-BOTH = MASTER | {"drive", "plant", "emulated", "session"}
+BOTH = MASTER | {"drive", "tools", "plant", "emulated", "session"}
 ALLOWED = {
     "errors": set(),
     "moved": set(),
@@ -57,6 +57,7 @@ ALLOWED = {
     "bus": {"protocol", "eds"},
     "node": BUS,
     "drive": BUS | {"node"},
+    "tools": BUS | {"node", "drive"},
     "vcan": {"bus"},
     "types": set(),
     "robot": {"types"},
@@ -68,7 +69,7 @@ ALLOWED = {
     "master": MASTER - {"tasks"},
     "tasks": MASTER,
     "plant": SCENE | {"drive"},
-    "emulated": PLANNING | {"drive", "plant", "npz", "rows"},
+    "emulated": PLANNING | {"drive", "tools", "plant", "npz", "rows"},
     "session": BOTH,
     "results": BOTH,
     "recorded": BOTH | {"results"},
@@ -109,7 +110,7 @@ EXTRAS = {
 }
 
 EDGE_ONLY = {"time", "socket", "threading", "can", "selectors", "asyncio", "sched"}
-AT_THE_EDGE = {"bus", "vcan"}
+AT_THE_EDGE = {"bus", "tools", "vcan"}
 NUMERIC = {"numpy", "scipy"}
 NEVER_IN_PURE = EDGE_ONLY | {
     "canopen",

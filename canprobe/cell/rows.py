@@ -25,7 +25,7 @@ BLOCK_ROWS = 200
 """Rows between two writes: a process that is killed loses half a second of a cell at 400 Hz."""
 NUMBER = "#"
 """Field of a row: its number, where rows of one table are in several files."""
-_ROWS_READ = 1 << 16
+_ROWS_READ = 1 << 14
 """Rows that are mapped at a time where columns are made."""
 
 

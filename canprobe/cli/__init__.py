@@ -39,6 +39,7 @@ COMMANDS = (
     "run",
     "up",
     "emulate",
+    "inject",
     "scan",
     "monitor",
     "replay",

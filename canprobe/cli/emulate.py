@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from canprobe.cli.argument_types import node_id, node_ids, number_of_32_bits, whole
+from canprobe.cli.argument_types import node_id, node_ids, number_of_32_bits, whole, word
 from canprobe.cli.common_arguments import BUS, add_options, add_scene, add_verbosity
 from canprobe.cli.interrupts import left_by_ctrl_c
 from canprobe.cli.parser import Parser
@@ -34,6 +34,7 @@ examples:
   canprobe emulate --eds drive.eds --node-id 5 --eds io.eds --node-id 20 --channel vcan0
   canprobe emulate free --channel vcan0 --without-id 3,5
   canprobe emulate --eds drive.eds --node-id 255 --serial 0x4711 --channel vcan0
+  canprobe emulate free --channel vcan0 --inject "node 3: heartbeat-off at 5 s"
   canprobe emulate --bus-yml config/bus.yml --channel vcan0
 """
 
@@ -85,6 +86,14 @@ def add_arguments(parser: Parser) -> None:
         type=Path,
         help="folder that keeps what a master stores by 1010h or LSS [nothing is kept]",
     )
+    parser.add_argument(
+        "--inject",
+        metavar="FAULT",
+        action="append",
+        default=[],
+        type=word,
+        help="throw a fault, as 'node 3: mute at 5 s'; may be repeated; `canprobe inject --list` lists them",
+    )
     parser.add_argument("--parent", metavar="PID", type=whole(1, 2**31 - 1), help=argparse.SUPPRESS)  # ends with it
     parser.add_argument("--origin", metavar="NS", type=whole(0, 2**63 - 1), help=argparse.SUPPRESS)  # of its times
     add_verbosity(parser)
@@ -128,6 +137,7 @@ def _scene_server(args: argparse.Namespace) -> Callable[[], None]:
         store_folder=args.store,
         without_id=args.without_id,
         homed=args.parent is not None,  # a run cannot home its emulated nodes
+        faults=args.inject,
         say=args.report.say,
     )
 
@@ -151,6 +161,7 @@ def _eds_server(args: argparse.Namespace) -> Callable[[], None]:
         store_folder=args.store,
         serial_numbers=args.serial,
         in_realtime=args.realtime,
+        faults=args.inject,
         say=args.report.say,
     )
 

@@ -16,11 +16,10 @@ from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cell.tasks.probing import Phase
 from canprobe.errors import CanprobeError
 from canprobe.fieldbus.bus.port import ControllerState
-from canprobe.fieldbus.node.fault import Fault
-from canprobe.fieldbus.node.faulty_node import FaultyNode
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
+from canprobe.fieldbus.tools.faults import Fault, FaultKind
+from canprobe.fieldbus.tools.faults.fault import Effect
 
-LONG_NS = 10_000_000_000
 FREE_CYCLE = 80
 """A cycle in which the arm of `free` moves."""
 HOLD_CYCLE = 700
@@ -37,21 +36,13 @@ class Injected:
         scene = replace(scene, **{k: replace(getattr(scene, k), **v) for k, v in changes.items()})
         self.session = Session(scene, RunOptions(say=self._say))
         self.limits = limits_of(self.session.plan)
-        self.nodes = {}
-        world = self.session.world
-        world.participants[: len(world.nodes)] = map(self._join, world.nodes)
+        self.faulty = self.session.world.make_faulty()
+        self.nodes = {node.node_id: node for node in self.faulty.nodes}
         self.task = make_task(self.session.plan)
         self.at, self.action, self.until, self.own = at, action, at + until, own
         self.injected_ns = self.answered_ns = self.error = None
         self.held = 0
         self._run()
-
-    def _join(self, node):
-        sensor = self.session.scene.sensor
-        of_sensor = sensor is not None and node.node_id == sensor.node_id
-        ids = [pdo.cob_id for pdo in self.session.plan.pdos_of(node.node_id, "tpdo")] if of_sensor else ()
-        self.nodes[node.node_id] = FaultyNode(node, (), ids)
-        return self.nodes[node.node_id]
 
     def _say(self, text):
         if text.startswith("lift off"):
@@ -60,8 +51,8 @@ class Injected:
     def now(self):
         return self.session.lockstep.clock.now_ns()
 
-    def fault(self, kind, node_id, **more):
-        self.nodes[node_id].add(Fault(kind, node_id, self.now(), more.pop("duration_ns", LONG_NS), **more))
+    def inject(self, text):
+        self.faulty.inject(text, self.now())
 
     def step(self, measurement):
         if measurement.cycle == self.at:
@@ -128,10 +119,15 @@ def send(run, frame):
 
 def altered(node, can_id, change):
     """Let a node send an identifier with other data; with None it does not send it."""
-    inner = node._sent
 
-    def sent(frames, t_ns):
-        changed = [(i, change(d) if i == can_id else d) for i, d in frames]
-        return inner([frame for frame in changed if frame[1] is not None], t_ns)
+    class Altered(Effect):
+        def frame(self, frame, t_ns):
+            if frame[0] != can_id:
+                return None
+            data = change(frame[1])
+            return () if data is None else ((can_id, data),)
 
-    node._sent = sent
+    kind = FaultKind("altered", "a test changes it", "", "", Altered, incoming=False)
+    fault = Fault(kind, node.node_id)
+    node.add(fault)
+    return fault

@@ -68,6 +68,7 @@ class TactileApplication(Application):
     """The sensor function of one node. A tare command takes the mean of the next images as zero.
 
     Attributes:
+        distortions: functions that make the sampled image of the true one and its time; faults of the array.
         publish: called with header and content of each frame; it puts them into the objects that the TPDOs carry.
     """
 
@@ -90,6 +91,7 @@ class TactileApplication(Application):
         self._pad = pad or Pad()
         self._latency, self._tare_images = latency_frames, tare_images
         self._pipeline: deque[tuple[int, Raw]] = deque()
+        self.distortions: list[Callable[[Raw, int], Raw]] = []
         self._tare: Floats | None = None
         self._taring: list[Raw] | None = None
         self._frames = 0
@@ -158,6 +160,8 @@ class TactileApplication(Application):
     def _sample(self, t_ns: int) -> None:
         self._plant.advance(t_ns)
         raw = self._plant.sample_image(t_ns)
+        for distort in self.distortions:
+            raw = distort(raw, t_ns)
         self._pipeline.append((t_ns, raw))
         if self._taring is not None:
             self._taring.append(raw)

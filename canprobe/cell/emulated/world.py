@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.emulated.array import make_tactile_node
+from canprobe.cell.emulated.array_faults import CELL_FAULTS
 from canprobe.cell.emulated.raw_array import RawArray
 from canprobe.cell.emulated.truth_columns import with_units
 from canprobe.cell.planning.model import Plan, PlannedNode
@@ -30,6 +31,7 @@ from canprobe.fieldbus.eds.packaged import FULL_SCALE, has_full_scale, load_eds
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol.frames import SYNC_ID, Frame
 from canprobe.fieldbus.protocol.lss import UNCONFIGURED_ID
+from canprobe.fieldbus.tools.faults import Fault, FaultyNode, FaultyNodes
 from canprobe.mechanics.robot.chain import Chain, forward
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.types import Floats
@@ -129,8 +131,8 @@ class World:
         plant: arm, probe, object and array.
         recorder: notes the truth at every SYNC; None where it is not wanted, as it grows with time.
         raw_array: an array that is no node; None without one.
-        participants: participants of the bus: the nodes, or the `FaultyNode` between a node and the bus, and the
-            recorder, which listens only.
+        participants: participants of the bus: the nodes, or after `make_faulty` what stands between a node and the bus,
+            and the recorder, which listens only.
     """
 
     nodes: tuple[SlaveNode, ...]
@@ -142,6 +144,13 @@ class World:
     def __post_init__(self) -> None:
         others = [one for one in (self.raw_array, self.recorder) if one is not None]
         object.__setattr__(self, "participants", [*self.nodes, *others])
+
+    def make_faulty(self, faults: Iterable[Fault] = ()) -> FaultyNodes:
+        """Let the nodes have faults, these and others that are thrown later; called before the buses open."""
+        thrown = tuple(faults)
+        faulty = [FaultyNode(node, thrown) for node in self.nodes]
+        self.participants[: len(faulty)] = faulty
+        return FaultyNodes(faulty, CELL_FAULTS)
 
 
 def make_world(

@@ -32,6 +32,7 @@ from canprobe.fieldbus.bus.real.memory import reserve_memory
 from canprobe.fieldbus.bus.real.processor import DEVICE_PRIORITY, ask_for_processor, realtime
 from canprobe.fieldbus.eds.packaged import check_eds
 from canprobe.fieldbus.protocol.lss import UNCONFIGURED_ID
+from canprobe.fieldbus.tools.faults import FaultyNode, FaultyNodes
 
 if TYPE_CHECKING:
     from canprobe.fieldbus.bus.virtual.lockstep import Participant
@@ -49,6 +50,7 @@ def emulate(
     store_folder: Path | None = None,
     without_id: tuple[int, ...] = (),
     homed: bool = False,
+    faults: Sequence[str] = (),
     say: Say = quiet,
 ) -> None:
     """Serve emulated nodes on a real interface until interrupted, for any master.
@@ -63,10 +65,11 @@ def emulate(
         store_folder: folder with a file for each node, where 1010h and LSS store; None: it forgets at the end.
         without_id: ids of the nodes that start without a node id and wait for LSS.
         homed: whether drives that need homing start with their zeros, and keep them.
+        faults: faults, as `canprobe.fieldbus.tools.faults.parse_fault` reads them; their times count from the start.
         say: called when the nodes are about to be served.
 
     Raises:
-        UsageError: when the scene does not fit, or a file of `store_folder` belongs to another node.
+        UsageError: when the scene does not fit, a fault is wrong, or a file of `store_folder` belongs to another node.
         InterfaceError: when there is no such interface.
         NodeError: when a node on the bus has one of the ids already.
         ResultsError: when `truth_path` or `store_folder` cannot be written; raised before the nodes start.
@@ -92,7 +95,8 @@ def emulate(
         rehearse(plan)
         world = make_world(plan, node_ids, truth=truth_path is not None, without_id=without_id, homed=homed)
         on: dict[str, list[Participant]] = {channel: [] for channel in ports}
-        for node, channel in zip(world.nodes, placed.values(), strict=True):
+        faulty = world.make_faulty()
+        for node, channel in zip(faulty.nodes, placed.values(), strict=True):
             on[channel].append(node)
         if world.raw_array is not None and raw_at is not None:
             on[raw_at].append(world.raw_array)
@@ -103,7 +107,8 @@ def emulate(
         try:
             _serve(
                 [(on[channel], port) for channel, port in ports.items()],
-                world.nodes,
+                faulty,
+                faults,
                 say=say,
                 in_realtime=plan.setup.realtime,
                 cycles_kept=plan.cycles if truth_path is not None else 0,
@@ -120,6 +125,7 @@ def emulate_eds(
     store_folder: Path | None = None,
     serial_numbers: Sequence[int | None] = (),
     in_realtime: bool = False,
+    faults: Sequence[str] = (),
     say: Say = quiet,
 ) -> None:
     """Serve a node from each EDS file on a real interface until interrupted, for any master.
@@ -130,12 +136,13 @@ def emulate_eds(
         store_folder: as for :func:`emulate`.
         serial_numbers: 1018h:04 of each node; None or left out: as its file has it.
         in_realtime: whether to ask for SCHED_FIFO, a processor and locked memory.
+        faults: as for :func:`emulate`.
         say: called with the number of warnings of each file, and when the nodes are served.
 
     Raises:
         EdsError: when a file cannot be served; one line for each fault.
-        UsageError: when a node id is given twice, two nodes without one are the same device, or a file of
-            `store_folder` belongs to another node.
+        UsageError: when a fault is wrong, a node id is given twice, two nodes without one are the same device, or a
+            file of `store_folder` belongs to another node.
         InterfaceError: when there is no such interface.
         NodeError: when a node on the bus has one of the ids already.
         ResultsError: when `store_folder` cannot be written.
@@ -162,7 +169,8 @@ def emulate_eds(
             if node.lss is not None:
                 node.lss.bitrate = target.bitrate
         _keep(nodes, store_folder)
-        _serve([(nodes, port)], nodes, say=say, in_realtime=in_realtime)
+        faulty = FaultyNodes(map(FaultyNode, nodes))
+        _serve([(faulty.nodes, port)], faulty, faults, say=say, in_realtime=in_realtime)
 
 
 def _make_places(truth_path: Path | None, store_folder: Path | None) -> None:
@@ -212,13 +220,16 @@ def _check_addresses(nodes: Sequence[SlaveNode]) -> None:
 
 def _serve(
     buses: Sequence[tuple[Sequence[Participant], Port]],
-    nodes: Sequence[SlaveNode],
+    faulty: FaultyNodes,
+    faults: Sequence[str],
     *,
     say: Say,
     in_realtime: bool,
     cycles_kept: int = 0,
 ) -> None:
+    """Serve nodes until interrupted, and throw the faults that are given and those that come by the control channel."""
     from canprobe.fieldbus.node.serve import serve
+    from canprobe.fieldbus.tools.faults.control import ControlServer
 
     reserve_memory(cycles_kept)
     for _, port in buses:
@@ -226,9 +237,25 @@ def _serve(
     ask_for_processor()
     favour = realtime(DEVICE_PRIORITY, say, processor_from_last=1) if in_realtime else contextlib.nullcontext()
     where = " and ".join(port.channel for _, port in buses)
-    say(f"serving {_named(nodes) or 'the array'} on {where}; Ctrl-C stops them")
-    with favour:
-        serve(buses, lambda: False)
+    clock = buses[0][1].clock
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(favour)
+        servers = []
+        try:
+            servers = [stack.enter_context(ControlServer(port.channel, faulty)) for _, port in buses]
+        except (OSError, UsageError) as error:
+            say(f"warning: `canprobe inject` cannot reach these nodes: {error}")
+        start_ns = clock.now_ns()
+        for text in faults:
+            say(f"fault: {faulty.inject(text, start_ns).words(start_ns)}")
+        say(f"serving {_named([node.node for node in faulty.nodes]) or 'the array'} on {where}; Ctrl-C stops them")
+
+        def look() -> bool:
+            for server in servers:
+                server.poll(clock.now_ns())
+            return False
+
+        serve(buses, look)
 
 
 def _named(nodes: Sequence[SlaveNode]) -> str:

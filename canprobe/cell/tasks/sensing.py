@@ -185,10 +185,11 @@ class ContactSensing:
         depth = self.depth(patch.force)
         # level that is taken off the image, over the peak pressure of the contact
         lightness = self._level_pa / (self.stiffness * depth) if depth > 0.0 else 1.0
+        image_sigma = 0.0 if self._noise is None else self._noise.image(lightness)
         found = contact_sample(
             t_s=t_s,
             T_base_probe=T_base_probe,
-            uv=uv if self._lag is None else self._lag.step(t_s, *uv),
+            uv=uv if self._lag is None else self._lag.step(t_s, *uv, sigma=image_sigma),
             depth=depth,
             radius=self.radius,
             force_n=patch.force,

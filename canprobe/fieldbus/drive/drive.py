@@ -297,6 +297,16 @@ class DriveApplication(Application):
         """Let the drive detect a fault, at the next `advance`: EMCY `code`, fault reaction, fault."""
         self._core.timers.new(partial(self._find_fault, code)).arm(self._core.now_ns)
 
+    def lose_power(self, t_ns: int) -> None:
+        """Go to switch-on disabled: the power stage was cut off."""
+        self._go(DriveState.SWITCH_ON_DISABLED, t_ns)
+
+    def forget_homing(self) -> None:
+        """Be no longer homed, in the homing mode."""
+        for mode in self._modes.values():
+            mode.reset()
+        self._show()
+
     def _find_fault(self, code: int, t_ns: int) -> None:
         """Report a fault that is present, show it in 603Fh, and react."""
         self._faults.append(code)

@@ -33,6 +33,7 @@ class DriveFeedback:
     Attributes:
         counts: motor position at the last `measure`, counts.
         plant_torque: function for the torque that the plant needs for its motion now, permille.
+        distortions: functions that make measured counts of true ones, one after the other; faults of the encoder.
     """
 
     def __init__(
@@ -48,6 +49,7 @@ class DriveFeedback:
         self._core, self._axis, self._plant, self._units, self._noise = node.core, axis, plant, units, noise
         self.counts = 0.0
         self._velocity = 0.0
+        self.distortions: list[Callable[[float], float]] = []
         self._t_ns: int | None = None
         self.plant_torque = partial(plant.torque_permille, axis)
         self._sources: dict[int, Callable[[], float]] = {
@@ -78,6 +80,8 @@ class DriveFeedback:
             counts = self._plant.motor_counts(self._axis)
             if self._noise is not None:
                 counts += self._noise()
+            for distort in self.distortions:
+                counts = distort(counts)
             if last_ns is not None:
                 self._velocity = (counts - self.counts) / (t_ns - last_ns) * 1e9
             self.counts, self._t_ns = counts, t_ns

@@ -65,7 +65,12 @@ class Motion:
     """Reference of one axis, with the last ramp that it gave.
 
     A trajectory goes to the plant as straight ramps of one step each, whose ends lie on it.
+
+    Attributes:
+        blocked: whether the motor gets no reference, as with a stuck brake.
     """
+
+    blocked = False
 
     def __init__(self, axis: int, plant: AxisPlant, timers: Timers) -> None:
         self._axis, self._plant = axis, plant
@@ -100,7 +105,8 @@ class Motion:
         if self._timer.due_ns is not None:
             self._stop()
         self._start, self._end, self._t0, self._t1 = onset, counts, t_ns, end_ns  # inlined `_ramp`, for speed
-        self._plant.set_ramp(self._axis, onset, counts, t_ns, end_ns)
+        if not self.blocked:
+            self._plant.set_ramp(self._axis, onset, counts, t_ns, end_ns)
 
     def demand(self, t_ns: int) -> float:
         """The reference at `t_ns`, counts."""
@@ -181,4 +187,12 @@ class Motion:
 
     def _ramp(self, start: float, end: float, t0_ns: int, t1_ns: int) -> None:
         self._start, self._end, self._t0, self._t1 = start, end, t0_ns, t1_ns
-        self._plant.set_ramp(self._axis, start, end, t0_ns, t1_ns)
+        if not self.blocked:
+            self._plant.set_ramp(self._axis, start, end, t0_ns, t1_ns)
+
+    def block(self, t_ns: int) -> None:
+        """Let the motor stay where it is, whatever the reference: the brake is stuck."""
+        self._plant.advance(t_ns)
+        here = self._plant.motor_counts(self._axis)
+        self._plant.set_ramp(self._axis, here, here, t_ns, t_ns + STEP_NS)
+        self.blocked = True

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from random import Random
 
-from canprobe.fieldbus.node.fault import Fault, FaultKind
+from canprobe.fieldbus.tools.faults import BUS_FAULTS, Fault, FaultKind
 
 PHASES = ("bring-up", "approach", "scan", "retreat", "stop")
 """`listen` has no approach and no retreat, `free` no retreat; the approach of `free` is the enabling."""
@@ -15,11 +15,25 @@ FILES_EVERY = 8
 SENSOR_SHARE = 0.3
 Windows = Mapping[str, tuple[int, int]]
 """Beginning and end of each phase in a run without faults, ns."""
-KINDS = tuple(FaultKind)
-_BOTH_WAYS = (FaultKind.DROP, FaultKind.DELAY, FaultKind.DUPLICATE, FaultKind.CORRUPT)
+DRAWN_KINDS = (
+    "drop",
+    "delay",
+    "duplicate",
+    "corrupt",
+    "reorder",
+    "mute",
+    "deaf",
+    "reboot",
+    "freeze",
+    "babble",
+    "wrong-data",
+)
+"""Kinds of the registry that the study draws."""
+KINDS = tuple(BUS_FAULTS[name] for name in DRAWN_KINDS)
+_BOTH_WAYS = ("drop", "delay", "duplicate", "corrupt")
 """A frame that the wire corrupts is dropped for its CRC-15, all but one in 10¹⁰; a frame that is corrupted here stands
 for errors behind it: in a controller's memory, a driver, a gateway."""
-NEED_TIME = (FaultKind.BABBLE, FaultKind.DELAY, FaultKind.REORDER)
+NEED_TIME = ("babble", "delay", "reorder")
 """Kinds that act by the time that frames take on the bus, or by their order."""
 
 
@@ -45,14 +59,14 @@ class FaultCase:
 
 
 def draw_fault(rng: Random, kind: FaultKind, nodes: tuple[int, ...], window: tuple[int, int]) -> Fault:
-    amount = rng.uniform(2e5, 2e6) if kind is FaultKind.BABBLE else 10 ** rng.uniform(5.0, 7.5)
+    amount_ns = rng.uniform(2e5, 2e6) if kind.name == "babble" else 10 ** rng.uniform(5.0, 7.5)
     return Fault(
         kind,
         node_id=nodes[-1] if rng.random() < SENSOR_SHARE else rng.choice(nodes),
         start_ns=rng.randrange(*window),
         duration_ns=int(10 ** rng.uniform(6.0, 8.7)),
         share=rng.choice((1.0, 1.0, 0.5, 0.1)),
-        incoming=kind is FaultKind.DEAF or (kind in _BOTH_WAYS and rng.random() < 0.4),
-        amount_ns=int(amount),
+        incoming=kind.name in _BOTH_WAYS and rng.random() < 0.4,
+        values={name: int(amount_ns) * 1e-6 for name in ("ms", "gap_ms") if name in kind.parameters},
         seed=rng.randrange(2**32),
     )

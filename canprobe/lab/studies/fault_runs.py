@@ -18,8 +18,6 @@ from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cell.tasks.probing import Phase
 from canprobe.errors import CanprobeError
-from canprobe.fieldbus.node.fault import FaultKind
-from canprobe.fieldbus.node.faulty_node import FaultyNode
 from canprobe.lab.studies.fault_cases import FILES_EVERY, KINDS, NEED_TIME, PHASES, FaultCase, Windows, draw_fault
 from canprobe.lab.studies.fault_scenes import SCENARIOS, scenario_plan, seeded_plan
 from canprobe.lab.studies.fault_scores import Peak, peak_of, score_force, score_log, score_rest, score_summary
@@ -70,7 +68,7 @@ def draw_case(seed: int) -> FaultCase:
     phases = [rng.choice(known) for _ in range(number)]
     kinds = [rng.choice(KINDS) for _ in range(number)]
     # an untimed bus configures all nodes at one instant: no fault could begin within it
-    timed = "bring-up" in phases or any(kind in NEED_TIME for kind in kinds) or rng.random() < 0.1
+    timed = "bring-up" in phases or any(kind.name in NEED_TIME for kind in kinds) or rng.random() < 0.1
     windows = phase_windows(scenario, timed)
     nodes = scenario_plan(scenario, timed).node_ids
     drawn = zip(kinds, phases, strict=True)
@@ -86,7 +84,7 @@ def run_seed(seed: int) -> dict[str, Any]:
         "scenario": case.scenario,
         "timed": case.timed,
         "phase": case.phase,
-        "kinds": sorted({fault.kind.value for fault in case.faults}),
+        "kinds": sorted({fault.kind.name for fault in case.faults}),
         "faults": [str(fault) for fault in case.faults],
         **carry_out(case),
     }
@@ -95,7 +93,7 @@ def run_seed(seed: int) -> dict[str, Any]:
 def carry_out(case: FaultCase) -> dict[str, Any]:
     """Run a case to its end and some time beyond it; its outcome, its figures, and every failure in words."""
     reach = peak(case.scenario)
-    wrong = any(fault.incoming and fault.kind is FaultKind.CORRUPT for fault in case.faults)
+    wrong = any(fault.incoming and fault.kind.name == "corrupt" for fault in case.faults)
     bound = reach.force(len(case.faults), wrong) if reach is not None else None
     if not case.files:
         return _LockstepRun(case).result(bound)
@@ -118,17 +116,11 @@ class _LockstepRun:
         self.task = make_task(self.plan)
         self.begun: dict[Phase, int] = {}
         self.steps = self.stepped_ns = 0
-        world, sensor = self.session.world, self.plan.scene.sensor
+        world = self.session.world
         self.witness = Witness(world.plant, LOOK_NS)
-        self.faulty: dict[int, FaultyNode] = {}
-        for node in world.nodes:
-            if all(fault.node_id != node.node_id for fault in case.faults):
-                continue
-            of_sensor = sensor is not None and node.node_id == sensor.node_id
-            ids = [pdo.cob_id for pdo in self.plan.pdos_of(node.node_id, "tpdo")] if of_sensor else ()
-            self.faulty[node.node_id] = FaultyNode(node, case.faults, ids)
+        self.faulty = world.make_faulty(case.faults)
         # the witness sees what the recorder of the truth would, and more
-        world.participants[:] = [self.witness, *(self.faulty.get(node.node_id, node) for node in world.nodes)]
+        world.participants[:] = [self.witness, *self.faulty.nodes]
         self.outcome, self.error = run_to_end(self.session, self.task, self._count)
         assert self.session.lockstep is not None
         self.clock = self.session.lockstep.clock
@@ -161,7 +153,7 @@ class _LockstepRun:
             failures += found
         force_max, above_ns, found = score_force(self.witness.rows, limits_of(self.plan), bound_n)
         return {
-            "hits": sum(node.hits for node in self.faulty.values()),
+            "hits": sum(node.hits for node in self.faulty.nodes),
             "outcome": self.outcome,
             "reason": reason,
             "force_max_n": force_max,

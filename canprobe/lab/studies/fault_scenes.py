@@ -18,7 +18,7 @@ from canprobe.cell.results.picture import AMBER, BLUE, GREEN, GREY, ORANGE, lege
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
-from canprobe.fieldbus.node.fault import FaultKind
+from canprobe.lab.studies.fault_cases import DRAWN_KINDS
 
 FORCE_MAX_N = 3.0
 _CLEARANCE_MM = 0.3
@@ -108,7 +108,7 @@ def draw_faults(runs: Sequence[Mapping[str, Any]], path: Path) -> None:
         f"How {len(runs)} runs with random faults of nodes and links ended; in brackets: runs with the fault\n"
         f"{failed} failed: they hung or crashed, or force, motion, power or log were not as promised"
     )
-    of_kind = {kind.value: [one["outcome"] for one in runs if kind.value in one["kinds"]] for kind in FaultKind}
+    of_kind = {kind: [one["outcome"] for one in runs if kind in one["kinds"]] for kind in DRAWN_KINDS}
     found = {f"{kind} ({len(ends)})": ends for kind, ends in of_kind.items() if ends}
     forces = [one["force_max_n"] for one in runs if one["force_bound_n"] is not None]
     with picture(path, title, 4.6) as figure:

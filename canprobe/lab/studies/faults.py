@@ -15,8 +15,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from canprobe.fieldbus.node.fault import FaultKind
-from canprobe.lab.studies.fault_cases import PHASES
+from canprobe.lab.studies.fault_cases import DRAWN_KINDS, PHASES
 from canprobe.lab.studies.fault_runs import draw_case, run_seed
 from canprobe.lab.studies.fault_scenes import COLOURS, FORCE_MAX_N, draw_faults
 from canprobe.lab.studies.harness import Column, Row, Say, StudyResult
@@ -60,7 +59,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
 
 def table_rows(runs: Sequence[Mapping[str, Any]]) -> list[Row]:
     """A row for each kind of fault (a run with two kinds is in both), and one for all."""
-    kinds = [(kind.value, [r for r in runs if kind.value in r["kinds"]]) for kind in FaultKind]
+    kinds = [(kind, [r for r in runs if kind in r["kinds"]]) for kind in DRAWN_KINDS]
     return [_row(name, some) for name, some in [*kinds, ("all", list(runs))]]
 
 

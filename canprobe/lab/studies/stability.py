@@ -221,7 +221,7 @@ def _because(row: Row) -> str:
 END_MARKS = {
     "stable": (BLUE, "o", "stable within limits"),
     "stopped": (AMBER, "s", "stopped safely"),
-    "approach": (SKY, "s", "stopped safely at the touch, beyond the limit of the approach"),
+    "approach": (SKY, "s", "stopped at the touch, beyond the limit of the approach"),
     "refused": (GREY, "X", "refused by the plan"),
     "hunting": (PINK, "D", "force not settled"),
     "failed": (ORANGE, "v", "failed"),

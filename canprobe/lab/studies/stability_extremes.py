@@ -31,6 +31,7 @@ from canprobe.cell.tasks.touch import TouchTask
 from canprobe.errors import PlanError
 from canprobe.fieldbus.protocol.frames import SYNC_ID
 from canprobe.lab.studies.harness import CHI2_95_OF_3, Column, Row, StudyResult
+from canprobe.lab.studies.random_scenes import CELLS
 from canprobe.lab.studies.region_scores import scores_of
 from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.stability_runs import LateNode, bent_touch, refused_row, run_touch, scene_of
@@ -56,7 +57,7 @@ HELD_SHARE = 0.5
 """Least share of the answers of a scan whose regions hold the truth: the answers of one memory are one draw."""
 MODEL = (
     "fieldbus", "mechanics", "cell", "scenes", "cells", "arrays", "calibrations", "lab/studies/stability_runs.py",
-    "lab/studies/stability_extremes.py", "lab/studies/region_scores.py",
+    "lab/studies/stability_extremes.py", "lab/studies/region_scores.py", "lab/studies/random_scenes.py",
 )  # fmt: skip
 COLUMNS = (
     Column("extreme", "extreme"),
@@ -132,11 +133,13 @@ def _with_rate(scene: Scene, rate_hz: float) -> Scene:
 
 
 def _on_sphere(scene: Scene, radius_mm: float) -> Scene:
-    """A sphere, with a path that turns its normal by 37 deg to both sides at most."""
+    """A sphere where the arm reaches in all directions; a path turns its normal by 24 deg to both sides at most."""
     assert scene.object is not None
-    length, width = min(scene.task.length_mm, 1.2 * radius_mm), min(scene.task.width_mm, 0.4 * radius_mm)
-    task = replace(scene.task, length_mm=length, width_mm=width)
-    return replace(scene, task=task, object=replace(scene.object, kind="sphere", radius_mm=radius_mm))
+    length, width = min(scene.task.length_mm, 0.8 * radius_mm), min(scene.task.width_mm, 0.3 * radius_mm)
+    place, _ = CELLS["puma260"]
+    task = replace(scene.task, length_mm=length, width_mm=width, start_mm=place)
+    sphere = replace(scene.object, kind="sphere", radius_mm=radius_mm, position_mm=place)
+    return replace(scene, task=task, object=sphere)
 
 
 def _with_coarser_encoders(scene: Scene, times: float) -> Scene:
@@ -237,8 +240,8 @@ def draw_extremes(rows: Sequence[Row], path: Path) -> None:
     names = list(dict.fromkeys(row["extreme"] for row in rows))
     title = (
         "How extreme cases end; nothing else is adapted to them\n"
-        f"right: true force within {FORCE_PERCENT:g} % of its target, curvature within a tenth of κ + 1/R, or within"
-        " what it states, or said to be not observed"
+        f"right: true force within {FORCE_PERCENT:g} % of its target; curvature within a tenth of κ + 1/R_p or within"
+        " what is stated, or not observed"
     )
     with picture(path, title, 1.8 + 0.62 * len(names)) as figure:
         panels = figure.subplots(1, 2, sharey=True)

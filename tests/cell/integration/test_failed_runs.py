@@ -17,8 +17,7 @@ from canprobe.api import OpenCell
 from canprobe.cli import main
 from canprobe.errors import NodeError, SafetyStop
 from canprobe.fieldbus.bus.candump import read_candump
-from canprobe.fieldbus.node.fault import Fault, FaultKind
-from canprobe.fieldbus.node.faulty_node import FaultyNode
+from canprobe.fieldbus.tools.faults import BUS_FAULTS, Fault
 
 MS = 1_000_000
 FILES = {"bus.log", "log.npz", "scene.toml", "summary.json", "truth.npz"}
@@ -28,9 +27,7 @@ def run_with(faults: Sequence[Fault], scene: str, out: Path, monkeypatch: pytest
     class Faulty(OpenCell):
         def __init__(self, *words: Any, **options: Any) -> None:
             super().__init__(*words, **options)
-            world = self.session.world
-            nodes = world.nodes
-            world.participants[: len(nodes)] = [FaultyNode(node, faults) for node in nodes]
+            self.session.world.make_faulty(faults)
 
     monkeypatch.setattr("canprobe.api.OpenCell", Faulty)
     canprobe.run(canprobe.load_scene(scene), out=out, duration_s=seconds, force=True)
@@ -46,7 +43,7 @@ def read_json(path: Path) -> Any:
 @pytest.mark.parametrize("scene", ["press", "cylinder", "calibrate"])
 def test_a_failed_bring_up_leaves_every_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scene: str) -> None:
     (tmp_path / "report.png").write_text("of an earlier run")
-    mute = Fault(FaultKind.DROP, 3, 0, 60_000 * MS)
+    mute = Fault(BUS_FAULTS["drop"], 3, 0, 60_000 * MS)
     with pytest.raises(NodeError, match=r"node 3: \(joint 3\) sent no boot-up") as failed:
         run_with([mute], scene, tmp_path, monkeypatch, 1.0)
     summary = read_json(tmp_path / "summary.json")
@@ -65,7 +62,7 @@ def test_a_failed_bring_up_leaves_every_file(tmp_path: Path, monkeypatch: pytest
 
 def test_a_scan_that_held_has_its_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A drive is not heard for four cycles of the scan; the task is not asked in those that hold."""
-    run_with([Fault(FaultKind.DROP, 3, 2700 * MS, 11 * MS)], "press", tmp_path, monkeypatch, 1.0)
+    run_with([Fault(BUS_FAULTS["drop"], 3, 2700 * MS, 11 * MS)], "press", tmp_path, monkeypatch, 1.0)
     summary = read_json(tmp_path / "summary.json")
     assert summary["completed"] and any(": hold, at " in fault for fault in summary["faults"])
     with np.load(tmp_path / "log.npz") as log:

@@ -20,7 +20,6 @@ from canprobe.cell.tasks.probing import Phase
 from canprobe.errors import SafetyStop
 from canprobe.fieldbus.bus.port import ControllerState
 from canprobe.fieldbus.bus.real.interrupts import Terminated
-from canprobe.fieldbus.node.fault import FaultKind
 from canprobe.fieldbus.protocol.cia402 import DriveState, state_of
 from canprobe.fieldbus.protocol.emcy import Emcy
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, NmtCommand, NmtState, pack_nmt
@@ -41,17 +40,17 @@ def turned(run):
 
 
 def mute(node_id):
-    return "drive_silent", lambda r: r.fault(FaultKind.MUTE, node_id)
+    return "drive_silent", lambda r: r.inject(f"node {node_id}: mute")
 
 
 LOST = {
     "joint 1 is mute": mute(1),
-    "joint 3 boots again": ("nmt_state", lambda r: r.fault(FaultKind.REBOOT, 3, duration_ns=1_000_000)),
-    "joint 5 has a fault": ("drive_fault", lambda r: r.nodes[5].node.application.inject_fault(0x4310)),
-    "joint 6 is frozen": ("drive_silent", lambda r: r.fault(FaultKind.FREEZE, 6)),
+    "joint 3 boots again": ("nmt_state", lambda r: r.inject("node 3: reboot for 1 ms")),
+    "joint 5 has a fault": ("drive_fault", lambda r: r.inject("node 5: drive-fault")),
+    "joint 6 is frozen": ("drive_silent", lambda r: r.inject("node 6: freeze")),
     "joint 2 tells no state": ("drive_fault", lambda r: altered(r.nodes[2], 0x182, lambda d: b"\x01\x06" + d[2:])),
-    "joint 3 has no heartbeat": ("heartbeat", lambda r: altered(r.nodes[3], HEARTBEAT_BASE + 3, lambda _: None)),
-    "the sensor is stopped": ("nmt_state", lambda r: r.nodes[16].node._enter(NmtState.STOPPED, r.now())),
+    "joint 3 has no heartbeat": ("heartbeat", lambda r: r.inject("node 3: heartbeat-off")),
+    "the sensor is stopped": ("nmt_state", lambda r: r.inject("node 16: nmt command=2")),
 }
 
 
@@ -75,8 +74,8 @@ def test_the_probe_is_taken_off(what):
 
 def test_two_lost_drives_leave_four():
     def both(run):
-        run.fault(FaultKind.MUTE, 2)
-        run.fault(FaultKind.MUTE, 6)
+        run.inject("node 2: mute")
+        run.inject("node 6: mute")
 
     run = Injected("press", HOLD_CYCLE, both)
     run.assert_within("drive_silent").assert_drives_off()
@@ -120,7 +119,7 @@ def test_nothing_lifts_where_another_condition_says_stop(other):
     """A drive is lost in the same cycle: the reaction to that alone would be to lift."""
 
     def both(run):
-        run.fault(FaultKind.REBOOT, 3, duration_ns=1_000_000)
+        run.inject("node 3: reboot for 1 ms")
         if other == "bus-off":
             run.session.cell._port.state = ControllerState.BUS_OFF
         else:
@@ -169,7 +168,7 @@ def bus_off(run):
 
 
 def drive_fault(run):
-    run.nodes[4].node.application.inject_fault(0x4310)
+    run.inject("node 4: drive-fault")
 
 
 def disabled(node_id):
@@ -199,7 +198,7 @@ def test_a_disabled_drive_stands_still_and_the_others_lift():
     """The sensor is what the cell is stopped for; the drive is found by its power state alone."""
 
     def both(run):
-        run.fault(FaultKind.REBOOT, 16, duration_ns=1_000_000)
+        run.inject("node 16: reboot for 1 ms")
         disabled(2)(run)
 
     run = Injected("press", HOLD_CYCLE, both)
@@ -210,7 +209,7 @@ def test_a_disabled_drive_stands_still_and_the_others_lift():
 
 def test_a_drive_with_an_alarm_stands_still_also_where_another_one_had_one_before():
     def alarms(run):
-        run.nodes[1].node.application.inject_fault(0x4310)
+        run.inject("node 1: drive-fault")
         send(run, (EMCY_BASE + 1, Emcy(0x4310, 0x09).pack()))
         send(run, (EMCY_BASE + 2, Emcy(0x4210, 0x09).pack()))
 
@@ -356,7 +355,7 @@ def test_a_way_back_on_which_the_force_grows_ends():
     def misfeel(run):
         force = count(2.0, 0.01)
         run.session.cell.supervisor.felt = lambda: next(force)
-        run.fault(FaultKind.MUTE, 4)
+        run.inject("node 4: mute")
 
     run = Injected("press", HOLD_CYCLE, misfeel)
     run.assert_drives_off()

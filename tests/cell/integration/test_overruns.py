@@ -7,7 +7,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from injected import Injected
+from injected import Injected, altered
 from wrapped import Wrapped
 
 import canprobe
@@ -103,13 +103,10 @@ class PatientScan(Injected):
         changes = {"arm": {"missed_syncs": PATIENT_SYNCS}, "task": {"speed_mm_s": 25.0, "duration_s": 20.0}}
         super().__init__(scene, FIRST, lambda _: None, until=SPACING * len(EPISODES), **changes)
 
-    def _join(self, node):
-        faulty = super()._join(node)
-        send, cob_id = faulty._sent, 0x180 + node.node_id
-        faulty._sent = lambda frames, t_ns: send(
-            [frame for frame in frames if frame[0] != cob_id or node.node_id not in self.lost], t_ns
-        )
-        return faulty
+    def _run(self):
+        for i, node in self.nodes.items():
+            altered(node, 0x180 + i, lambda data, i=i: None if i in self.lost else data)
+        super()._run()
 
     def _stall(self, measurement, late_sync):
         number, since = divmod(measurement.cycle - FIRST, SPACING)

@@ -23,8 +23,6 @@ from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.probing import Phase
 from canprobe.errors import CanprobeError, InterfaceError, NodeError, ResultsError, SafetyStop
 from canprobe.fieldbus.bus.port import ControllerState
-from canprobe.fieldbus.node.fault import FaultKind
-from canprobe.fieldbus.node.faulty_node import FaultyNode
 from canprobe.fieldbus.protocol.cia402 import DriveState, state_of
 from canprobe.fieldbus.protocol.emcy import Emcy
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, NmtCommand, NmtState, pack_nmt
@@ -33,27 +31,27 @@ from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID
 
 
 def test_heartbeat_lost():
-    run = Injected("free", FREE_CYCLE, lambda r: altered(r.nodes[3], HEARTBEAT_BASE + 3, lambda _: None))
+    run = Injected("free", FREE_CYCLE, lambda r: r.inject("node 3: heartbeat-off"))
     run.assert_within("heartbeat").assert_drives_off()
     assert isinstance(run.error, NodeError) and run.error.node_id == 3 and "heartbeat" in str(run.error)
 
 
 @pytest.mark.parametrize("node_id", [2, 6])
 def test_a_node_that_boots_again(node_id):
-    run = Injected("free", FREE_CYCLE, lambda r: r.fault(FaultKind.REBOOT, node_id, duration_ns=1_000_000))
+    run = Injected("free", FREE_CYCLE, lambda r: r.inject(f"node {node_id}: reboot for 1 ms"))
     run.assert_within("nmt_state").assert_drives_off()
     assert isinstance(run.error, NodeError) and run.error.node_id == node_id
     assert "INITIALISING" in str(run.error) or "PRE_OPERATIONAL" in str(run.error)
 
 
 def test_a_sensor_that_leaves_operation_in_contact():
-    run = Injected("press", HOLD_CYCLE, lambda r: r.nodes[16].node._enter(NmtState.STOPPED, r.now()))
+    run = Injected("press", HOLD_CYCLE, lambda r: r.inject("node 16: nmt command=2"))
     run.assert_within("nmt_state").assert_drives_off()
     assert "node 16: left operation: NMT state STOPPED" in str(run.error)
 
 
 def test_a_drive_fault():
-    run = Injected("free", FREE_CYCLE, lambda r: r.nodes[2].node.application.inject_fault(0x4310))
+    run = Injected("free", FREE_CYCLE, lambda r: r.inject("node 2: drive-fault"))
     run.assert_within("drive_fault").assert_drives_off()
     assert run.error.node_id == 2 and "4310h" in str(run.error)
 
@@ -134,8 +132,7 @@ def not_enabled(told, *changes):
                 altered(participants[node_id - 1], cob_id, change)
 
     session = Session(canprobe.load_scene("free"), RunOptions(say=say))
-    participants = session.world.participants
-    participants[:6] = map(FaultyNode, participants[:6])
+    participants = session.world.make_faulty().nodes
     with pytest.raises(CanprobeError, match=told), session:
         session.run(lambda _: Command(done=True))
     words = session.cell.log.arrays()["statusword"]
@@ -190,11 +187,10 @@ def test_a_moving_arm_is_stopped_before_it_is_disabled():
 class NeverHeard(Injected):
     """An array that lives and sends no frame."""
 
-    def _join(self, node):
-        joined = super()._join(node)
-        for pdo in self.session.plan.pdos_of(16, "tpdo") if node.node_id == 16 else ():
-            altered(joined, pdo.cob_id, lambda _: None)
-        return joined
+    def _run(self):
+        for pdo in self.session.plan.pdos_of(16, "tpdo"):
+            altered(self.nodes[16], pdo.cob_id, lambda _: None)
+        super()._run()
 
 
 def test_an_own_controller_does_not_go_on_with_an_array_that_was_never_heard():
@@ -206,18 +202,11 @@ def test_an_own_controller_does_not_go_on_with_an_array_that_was_never_heard():
 # PDOs
 
 
-@pytest.mark.parametrize("kind", [FaultKind.DROP, FaultKind.DELAY, FaultKind.CORRUPT])
-def test_missed_pdos_are_lived_with(kind):
-    def lose(run):
-        if kind is FaultKind.CORRUPT:
-            twice = iter((5, 5))
-            altered(run.nodes[5], 0x185, lambda data: data[: next(twice, 8)])
-            return
-        run.fault(kind, 5, duration_ns=8_000_000, amount_ns=2_000_000)
-
-    run = Injected("free", FREE_CYCLE, lose, until=20)
+@pytest.mark.parametrize("fault", ["drop for 8 ms", "delay ms=2 for 8 ms", "short count=2"])
+def test_missed_pdos_are_lived_with(fault):
+    run = Injected("free", FREE_CYCLE, lambda r: r.inject(f"node 5: {fault}"), until=20)
     run.assert_counted("pdo_missed")
-    if kind is FaultKind.CORRUPT:
+    if fault.startswith("short"):
         assert run.session.cell.drives.malformed > 0
 
 
@@ -227,28 +216,14 @@ def test_a_silent_drive():
     assert "node 5: lost: no usable TPDO for 6 cycles" in str(run.error)
 
 
-def test_torn_frames_are_dropped():
-    def lose(run):
-        node = run.nodes[16]
-        inner = node._sent
-        until = run.now() + 15_000_000
-        node._sent = lambda frames, t: inner([f for f in frames if f[0] != 0x515 or t > until], t)
-
-    Injected("press", HOLD_CYCLE, lose, until=40).assert_counted("torn_frame")
-
-
-def test_corrupt_frames_are_dropped():
-    def corrupt(run):
-        run.fault(FaultKind.CORRUPT, 16, duration_ns=15_000_000)
-
-    Injected("press", HOLD_CYCLE, corrupt, until=40).assert_counted("torn_frame")
+@pytest.mark.parametrize("fault", ["torn", "corrupt", "header-crc"])
+def test_tactile_frames_that_are_torn_or_corrupt_are_dropped(fault):
+    run = Injected("press", HOLD_CYCLE, lambda r: r.inject(f"node 16: {fault} for 15 ms"), until=40)
+    run.assert_counted("torn_frame")
 
 
 def test_a_frame_that_names_another_sync():
-    def shift(run):
-        run.fault(FaultKind.WRONG_DATA, 16, duration_ns=15_000_000, seed=4)
-
-    run = Injected("press", HOLD_CYCLE, shift, until=40)
+    run = Injected("press", HOLD_CYCLE, lambda r: r.inject("node 16: wrong-data seed=4 for 15 ms"), until=40)
     run.assert_counted("sync_mismatch")
     assert run.session.truth["force_n"].max() < 3.0
 
@@ -262,7 +237,7 @@ def test_a_stale_sensor_makes_the_probe_retreat():
 
 def test_a_drive_that_is_late_makes_all_of_them_hold():
     """Four cycles without node 5: the others stand still meanwhile, then all go on."""
-    run = Injected("free", FREE_CYCLE, lambda r: r.fault(FaultKind.MUTE, 5, duration_ns=9_000_000), until=40)
+    run = Injected("free", FREE_CYCLE, lambda r: r.inject("node 5: mute for 9 ms"), until=40)
     assert run.error is None
     targets = np.isfinite(run.session.cell.log.arrays()["q_target_rad"][:, 0])
     held = np.flatnonzero(~targets[run.at : run.until]) + run.at
@@ -273,12 +248,12 @@ def test_a_drive_that_is_late_makes_all_of_them_hold():
 
 def test_a_wrong_position_is_not_believed():
     def lie(run):
-        altered(run.nodes[2], 0x182, lambda d: d[:2] + pack("<i", unpack("<i", d[2:6])[0] + 60) + d[6:])
+        run.lie = altered(run.nodes[2], 0x182, lambda d: d[:2] + pack("<i", unpack("<i", d[2:6])[0] + 60) + d[6:])
 
     class Liar(Injected):
         def after(self, measurement):
             if measurement.cycle == self.at + 2:
-                self.nodes[2]._sent = type(self.nodes[2])._sent.__get__(self.nodes[2])
+                self.nodes[2].remove(self.lie)
 
     run = Liar("free", FREE_CYCLE, lie, until=40)
     run.assert_counted("pdo_missed")
@@ -539,10 +514,7 @@ def test_a_statusword_of_no_state_is_told_with_its_drive_and_the_others_are_stop
 
 def test_a_drive_that_is_never_in_a_state_is_not_enabled():
     session = Session(canprobe.load_scene("free"))
-
-    participants = session.world.participants
-    participants[2] = FaultyNode(participants[2])
-    altered(participants[2], 0x183, lambda d: b"\x01\x06" + d[2:])
+    altered(session.world.make_faulty().nodes[2], 0x183, lambda d: b"\x01\x06" + d[2:])
     told = r"node 3: \(joint 3\) is in no CiA 402 state \(statusword 0x0601\) 2 s after the command to enable operation"
     with pytest.raises(NodeError, match=told), session:
         session.run(lambda _: Command())

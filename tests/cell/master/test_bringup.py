@@ -22,8 +22,7 @@ from canprobe.fieldbus.bus.sdo import upload
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.eds.packaged import eds_path
 from canprobe.fieldbus.node.abort import Abort, SdoAbort
-from canprobe.fieldbus.node.fault import Fault, FaultKind
-from canprobe.fieldbus.node.faulty_node import FaultyNode
+from canprobe.fieldbus.tools.faults import BUS_FAULTS, Fault
 
 MS = 1_000_000
 
@@ -43,7 +42,8 @@ def open_session(tmp_path, *, faults=(), change=None, nodes=None, beside=(), sce
             nodes[node.node_id] = node
         if change is not None:
             change(node)
-    world.participants[:] = [*beside, *(FaultyNode(node, faults) for node in world.nodes), world.recorder]
+    world.make_faulty(faults)
+    world.participants[:0] = beside
     return session
 
 
@@ -161,7 +161,7 @@ def test_the_nodes_are_configured_side_by_side(tmp_path):
 
 
 def test_a_lost_answer_is_asked_for_again(tmp_path):
-    lost = Fault(FaultKind.DROP, 3, 300 * MS, 300 * MS)
+    lost = Fault(BUS_FAULTS["drop"], 3, 300 * MS, 300 * MS)
     with open_session(tmp_path, faults=[lost]) as session:
         done = done_to(session)
     assert done.pop(2) == "configured, software 1.0, 1 requests repeated"
@@ -169,7 +169,7 @@ def test_a_lost_answer_is_asked_for_again(tmp_path):
 
 
 def test_a_node_that_does_not_answer_is_named_with_the_entry(tmp_path):
-    mute = Fault(FaultKind.DROP, 3, 300 * MS, 9000 * MS)
+    mute = Fault(BUS_FAULTS["drop"], 3, 300 * MS, 9000 * MS)
     with pytest.raises(NodeError, match=r"node 3: \(joint 3\) read of 1018h:01 failed: No SDO response") as failed:
         open_session(tmp_path, faults=[replace(mute, incoming=True)]).__enter__()
     assert failed.value.node_id == 3
@@ -337,7 +337,7 @@ def test_any_write_over_sdo_takes_the_date_back():
 
 
 def test_a_node_that_boots_late_is_reset_again(tmp_path):
-    dark = Fault(FaultKind.FREEZE, 2, 200 * MS, 400 * MS)
+    dark = Fault(BUS_FAULTS["freeze"], 2, 200 * MS, 400 * MS)
     with open_session(tmp_path, faults=[dark], boot_up_s=0.2, retries=3):
         pass
     resets = [d for _, i, d in frames(tmp_path) if i == 0 and d[0] == 0x81]
@@ -465,7 +465,7 @@ def test_what_a_node_sent_before_we_listened_is_in_its_error_history(tmp_path):
 
 def late(by_s, **bring_up):
     """Each answer of node 3 comes late."""
-    fault = Fault(FaultKind.DELAY, 3, 0, 9000 * MS, amount_ns=round(by_s * 1e9))
+    fault = Fault(BUS_FAULTS["delay"], 3, 0, 9000 * MS, values={"ms": 1e3 * by_s})
     return {"faults": [fault], "sdo_s": 0.05, "retries": 2, **bring_up}
 
 

@@ -23,10 +23,9 @@ from canprobe.cell.tasks.joint_finding import Answer
 from canprobe.errors import CanprobeError, NodeError, UsageError
 from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus, Participant
-from canprobe.fieldbus.node.fault import Fault, FaultKind
-from canprobe.fieldbus.node.faulty_node import FaultyNode
 from canprobe.fieldbus.protocol.cia402 import DriveState
 from canprobe.fieldbus.protocol.frames import NmtCommand, pack_nmt
+from canprobe.fieldbus.tools.faults import BUS_FAULTS, Fault, FaultyNode
 
 HOMED = {"zero": "homing", "homing_acceleration_deg_s2": 1000.0, "homing_speed_deg_s": 100.0}
 BEYOND = 0.01
@@ -370,7 +369,7 @@ def test_another_master_that_comes_while_homing_is_named(tmp_path):
 
 
 def test_a_node_that_is_lost_stops_the_joint_that_is_homed(tmp_path):
-    fault = Fault(FaultKind.MUTE, 3, 3_000_000_000, 10_000_000_000)
+    fault = Fault(BUS_FAULTS["mute"], 3, 3_000_000_000, 10_000_000_000)
     bench = Bench(scene_of([17], homing_speed_deg_s=10.0), tmp_path, faults=(fault,))
     with pytest.raises(NodeError, match="node 3: lost: no heartbeat within its time-out"):
         bench.home()

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import threading
+
 import pytest
 
 from canprobe.cell.planning.warnings import LOCAL_GROUP
 from canprobe.cli import main
-from canprobe.fieldbus.bus.clock import VirtualClock
+from canprobe.fieldbus.bus.clock import MonotonicClock, VirtualClock
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 from canprobe.fieldbus.eds.packaged import load_eds
 
@@ -24,7 +26,12 @@ def served(monkeypatch):
         monkeypatch.setattr(
             "canprobe.cell.session.emulation.ask_for_processor", lambda: False
         )  # not for the tests' own process
-        monkeypatch.setattr("canprobe.fieldbus.node.serve.serve", lambda buses, stop: act(buses[0][0]))
+
+        def serve(buses, stop):
+            emulate.look = stop
+            act(buses[0][0])
+
+        monkeypatch.setattr("canprobe.fieldbus.node.serve.serve", serve)
         return main(["emulate", *what, *options])
 
     return emulate
@@ -39,6 +46,49 @@ def change(participants):
         node.start(0)
         assert ask(node, f"23676000{node.node_id:02x}020000") == "6067600000000000"  # 6067h
         assert node.receive(0x600 + node.node_id, SAVE_ALL, 0)[0][1][0] == 0x60
+
+
+READ_1000 = bytes.fromhex("4000100000000000")
+
+
+def test_faults_are_thrown_from_the_start_and_while_the_nodes_are_served(served, capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    answers = []
+
+    def inject(*words):
+        """`canprobe inject` in another thread, as the process serves meanwhile."""
+        status = []
+        thread = threading.Thread(target=lambda: status.append(main(["inject", "--channel", "lockstep", *words])))
+        thread.start()
+        while thread.is_alive():
+            assert not served.look()
+        return status[0]
+
+    def act(participants):
+        first, second = participants[:2]
+        for node in (first, second):
+            node.start(0)
+        t_ns = MonotonicClock().now_ns()
+
+        def heard(node):
+            return len(node.receive(0x600 + node.node_id, READ_1000, t_ns + 1_000_000_000))
+
+        answers.append((heard(first), heard(second)))
+        answers.append(inject("node 1: mute"))
+        answers.append((heard(first), heard(second)))
+        answers.append(inject("node 3: mute"))
+        answers.append(inject("--clear"))
+        answers.append((heard(first), heard(second)))
+
+    monkeypatch.setattr("canprobe.fieldbus.bus.virtual.lockstep.LockstepPort.channel", "lockstep")
+    monkeypatch.setattr("canprobe.fieldbus.bus.virtual.lockstep.LockstepPort.clock", MonotonicClock())
+    assert served(act, "--inject", "node 2: sdo-silent") == 0
+    assert answers == [(1, 0), 0, (0, 0), 2, 0, (1, 1)]
+    told = capsys.readouterr()
+    assert "thrown: mute at node 1" in told.out and "ended: sdo-silent at node 2" in told.out
+    assert "no node 3 is emulated here; nodes: 1, 2" in told.err
+    assert served(act, "--inject", "node 2: sdo-silence") == 2
+    assert "did you mean sdo-silent?" in capsys.readouterr().err
 
 
 def test_stored_values_are_there_again_each_with_its_node(served, tmp_path):

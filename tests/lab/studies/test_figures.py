@@ -18,13 +18,13 @@ import canprobe
 from canprobe.cell.results.figures import draw_run
 from canprobe.cell.results.plan_figure import draw_plan
 from canprobe.cell.results.surface_figure import draw_surface
-from canprobe.fieldbus.node.fault import FaultKind
 from canprobe.lab.studies import estimators, stability, workprec
 from canprobe.lab.studies import stability as stability_figure
 from canprobe.lab.studies.bound_cases import NOISES, SIZES_M
 from canprobe.lab.studies.bound_figure import draw_bound
 from canprobe.lab.studies.cycle_times import CycleTimes
 from canprobe.lab.studies.estimators import draw_estimators
+from canprobe.lab.studies.fault_cases import DRAWN_KINDS
 from canprobe.lab.studies.fault_scenes import draw_ends, draw_faults
 from canprobe.lab.studies.ground import SURFACES
 from canprobe.lab.studies.random_scenes import KINDS, SceneSeed
@@ -132,7 +132,7 @@ def faults(count):
     rng = np.random.default_rng(0)
     ends = ("completed", "stopped for safety", "bus or node failure", "bring-up refused")
     runs = [
-        {"kinds": [one_of(list(FaultKind), i).value], "outcome": rng.choice(ends), "force_bound_n": 3.0, "failures": [],
+        {"kinds": [one_of(DRAWN_KINDS, i)], "outcome": rng.choice(ends), "force_bound_n": 3.0, "failures": [],
          "force_max_n": rng.normal(2.3, 0.04)}
         for i in range(count)
     ]  # fmt: skip

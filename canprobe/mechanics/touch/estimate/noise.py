@@ -65,6 +65,10 @@ class Correlation:
         """(3,) correlated shares of a sample's three rows: height, and the two parts of the normal."""
         return np.array([self.share if self.point_share is None else self.point_share, self.share, self.share])
 
+    def height_inflation(self, spacing: float) -> float:
+        """Variance of a mean of many heights this far apart along the path, m, over that of independent ones."""
+        return 1.0 + 2.0 * float(self.shares[0]) * self.length / spacing
+
     def matrix(self, path: Floats, slow: SlowErrors | None = None) -> Floats:
         """Correlations (3, n, n) of the rows of samples at places (n,) along the path, m, with their slow errors."""
         R: Floats = self.shares[:, None, None] * np.exp(-np.abs(path[:, None] - path) / self.length)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -75,8 +76,9 @@ class RecursiveEstimator:
         prior: prior on c13, c23, c33; None for `Prior.weak` over the memory. A prior on curvature is refused, as
             forgetting would wear it away.
         coupling: coupling of the errors of point and normal (`Noise`), 1/m.
-        correlation: correlation of the noise along the path. The samples are weighed as if they were independent; the
-            covariance is what such an answer has under correlated noise.
+        correlation: correlation of the noise along the path. Heights are taken as independent ones of a larger variance
+            (`Correlation.height_inflation`), which keeps their balance with the tilts. The tilts are weighed as if they
+            were independent; the covariance is what such an answer has under correlated noise.
         quadric: whether the surface is known to be a quadric; otherwise cubic and quartic terms are allowed for
             (`OmittedTerms`).
 
@@ -106,6 +108,10 @@ class RecursiveEstimator:
         if math.isfinite(self._prior.sigma_curvature):
             raise UsageError("prior: expected none on curvature itself for 'recursive', got " + self._prior.name)
         self._caution = 1.0 if correlation is None else CORRELATED_ALARM_SCALE
+        self._taller = 1.0
+        if correlation is not None:
+            self._taller = math.sqrt(correlation.height_inflation(self._memory / window))
+            correlation = replace(correlation, point_share=0.0)
         self._filter = InformationFilter(self._memory, self._prior, correlation)
         self.reset()
 
@@ -126,10 +132,18 @@ class RecursiveEstimator:
         """Take one contact."""
         if not self._gate.passes(sample, self.dropped):
             return
-        sigmas = self._gate.sigmas(sample)
+        point, height, normal = self._gate.sigmas(sample)
         self._pad.add(sample.r_probe)
-        rolled = slow_share(sample, sigmas[0]), self._pad.total
-        touch = MeasuredContact(sample.p_base, sample.n_base, *sigmas, self._coupling, *rolled)
+        touch = MeasuredContact(
+            sample.p_base,
+            sample.n_base,
+            sigma_point=point,
+            sigma_height=self._taller * height,
+            sigma_normal=normal,
+            coupling=self._coupling,
+            slow=slow_share(sample, point),
+            way=self._pad.total,
+        )
         moved = self._travel.add(sample.p_base)
         self._pending.append(_Pending(touch, self._travel.weight))
         if self._last is None or self._travel.weight == 1.0:

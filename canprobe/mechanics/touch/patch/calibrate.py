@@ -32,6 +32,7 @@ from canprobe.mechanics.touch.patch.force_errors import MAKE_SPREAD, USUAL_LIGHT
 from canprobe.mechanics.touch.patch.force_fit import fit_force
 from canprobe.mechanics.touch.patch.image import PatchCalibration
 from canprobe.mechanics.touch.patch.image_fit import LAST_IMAGE_S, NO_ERRORS, Dwell, Shown, what_is_shown
+from canprobe.mechanics.touch.patch.image_model import MOMENT_ERROR_POWER
 from canprobe.mechanics.touch.patch.layer_fit import stiffness_by_depth
 from canprobe.mechanics.touch.patch.pad_fit import fit_noise
 from canprobe.mechanics.touch.patch.parameter_fit import (
@@ -252,7 +253,7 @@ def _held_out(
 
 def _moment_errors(errors: Floats, shown: Sequence[Shown]) -> MomentErrors:
     """Errors of moments from touches that the fit has not seen, with `FORM_SIGMA` for shapes that were not touched."""
-    scaled = errors * np.sqrt(USUAL_LIGHTNESS / np.array([s.lightness for s in shown]))[:, None]
+    scaled = errors * (USUAL_LIGHTNESS / np.array([[s.lightness] for s in shown])) ** (0.5 * MOMENT_ERROR_POWER)
     moment = float(np.mean(scaled[:, :2] ** 2)) + FORM_SIGMA**2
     return MomentErrors(
         moment=moment,

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 USUAL_LIGHTNESS = 0.05
-"""Level over peak pressure for which relative errors of force and moments hold; their variance grows in proportion."""
+"""Level over peak pressure for which relative errors of force and moments hold; light touches have larger ones."""
 UPPER_SIGMAS = 2.0
 """Standard deviations from a measured force to its upper end, which the supervision compares with the limit."""
 BRIDGED_SIGMA = 0.1

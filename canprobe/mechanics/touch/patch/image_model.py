@@ -38,6 +38,9 @@ MAX_LIGHTNESS = 0.3
 """Largest level over peak pressure; beyond it too little of a patch is above the level."""
 TAPER_SHARE = 0.1
 """Share of these limits within which, beyond them, the trust in a patch falls to 0."""
+MOMENT_ERROR_POWER = 0.3
+"""Power of the lightness with which variances of moments grow: light touches cover few taxels. Over 45 random scenes
+the errors are 1.0 % at a lightness of 0.05 and 1.4 % at 0.15; one calibration has too few touches to show it."""
 GAIN_LIGHTNESS = 0.25
 """Largest level over peak pressure of the forces of `force_gains`; smaller forces are made larger."""
 _DIFFERENCE_STEP = 1e-3
@@ -282,7 +285,7 @@ class ImageModel:
     def _information(self, frames: float, lightness: float) -> Floats:
         """(3, 3) inverse covariance of the relative residuals of V11, V12, V22."""
         e = self.errors
-        noise, more = e.frame_sigma**2 / max(frames, 1.0), lightness / USUAL_LIGHTNESS
+        noise, more = e.frame_sigma**2 / max(frames, 1.0), (lightness / USUAL_LIGHTNESS) ** MOMENT_ERROR_POWER
         moment, both = more * e.moment + noise, more * e.both
         det, shear = moment * moment - both * both, 1.0 / (more * e.shear + noise)
         return np.array(((moment / det, 0.0, -both / det), (0.0, shear, 0.0), (-both / det, 0.0, moment / det)))

@@ -93,6 +93,23 @@ def test_it_comes_close_to_a_pad_with_play():
     assert np.std(left[200:]) < 0.65 * np.std(before[200:])
 
 
+def test_noise_of_centroids_is_not_taken_for_a_way():
+    """At rest little of it gets into the places; a way far beyond the noise is corrected as before."""
+    centroids = 60e-6 * np.random.default_rng(3).normal(size=(2000, 2))
+    added = []
+    for sigma in (0.0, 60e-6):
+        pad = PadLag(LAG)
+        out = [pad.step(5e-3 * k, *uv, sigma=sigma) for k, uv in enumerate(centroids.tolist())]
+        added.append(np.std(out - centroids))
+    assert added[1] < 0.7 * added[0]
+    far = []
+    for sigma in (0.0, 20e-6):
+        pad = PadLag(LAG)
+        places = [pad.step(5e-3 * k, 5e-6 * k, 0.0, sigma)[0] for k in range(400)]
+        far.append(places[-1] - 5e-6 * 399)
+    assert far[1] == pytest.approx(far[0], rel=0.02)
+
+
 def test_a_new_contact_starts_without_a_past():
     pad = PadLag(LAG)
     pad.step(0.0, 0.0, 0.0)

@@ -1,0 +1,183 @@
+"""Faults of the tactile array: rows, images and frames that are wrong; and the registry with them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+
+import numpy as np
+
+from canprobe.cell.emulated.array import TactileApplication
+from canprobe.cell.emulated.image_processing import Raw
+from canprobe.errors import UsageError
+from canprobe.fieldbus.protocol.frames import Frame
+from canprobe.fieldbus.tools.faults.fault import Effect, Fault, FaultKind, Host, Parameter
+from canprobe.fieldbus.tools.faults.frame_faults import tactile_ids
+from canprobe.fieldbus.tools.faults.registry import BUS_FAULTS
+from canprobe.fieldbus.tools.faults.row import make_kind
+from canprobe.mechanics.touch.pad import COUNTS_MAX
+
+_CRC_BYTE = 6
+"""First byte of the CRC in a tactile header."""
+
+
+class ImageFault(Effect):
+    """Base class of faults of the image that the array samples."""
+
+    def __init__(self, fault: Fault, host: Host) -> None:
+        super().__init__(fault, host)
+        if not isinstance(self.node.application, TactileApplication):
+            raise UsageError(f"{self.node.name}: fault {fault.kind.name} needs a CANopen array")
+        self._array = self.node.application
+        self._begun_ns = 0
+
+    def begin(self, t_ns: int) -> Sequence[Frame]:
+        """Change the images from now on."""
+        self._begun_ns = t_ns
+        self._array.distortions.append(self._sampled)
+        return ()
+
+    def end(self, t_ns: int) -> Sequence[Frame]:
+        """Leave the images as they are."""
+        self._array.distortions.remove(self._sampled)
+        return ()
+
+    def _sampled(self, raw: Raw, t_ns: int) -> Raw:
+        self.host.hits += 1
+        return self.changed(raw, (t_ns - self._begun_ns) * 1e-9)
+
+    def changed(self, raw: Raw, held_s: float) -> Raw:
+        """The image that is sampled, of counts; `held_s`: time since the beginning, s."""
+        return raw
+
+
+class DeadRows(ImageFault):
+    """Some rows of taxels measure nothing."""
+
+    def changed(self, raw: Raw, held_s: float) -> Raw:
+        """Blank them."""
+        image = raw.copy()
+        first = int(self.fault.value("first"))
+        image[first : first + int(self.fault.value("rows"))] = 0
+        return image
+
+
+class StuckImage(ImageFault):
+    """The array samples the same image again and again; its counters go on."""
+
+    _kept: Raw | None = None
+
+    def changed(self, raw: Raw, held_s: float) -> Raw:
+        """The first image of the fault."""
+        self._kept = raw if self._kept is None else self._kept
+        return self._kept
+
+
+class Drift(ImageFault):
+    """All taxels drift upward."""
+
+    def changed(self, raw: Raw, held_s: float) -> Raw:
+        """Add what has come together, in whole counts where the array has such."""
+        image = raw.copy()
+        image[...] = np.minimum(raw + self.fault.value("counts_s") * held_s, COUNTS_MAX)
+        return image
+
+
+class Saturation(ImageFault):
+    """Every taxel that is pressed is at full scale."""
+
+    def changed(self, raw: Raw, held_s: float) -> Raw:
+        """Raise them."""
+        image = raw.copy()
+        image[raw > 0] = COUNTS_MAX
+        return image
+
+
+class Torn(Effect):
+    """One PDO of each tactile frame is lost, the header never."""
+
+    def batch(self, frames: list[Frame], t_ns: int) -> list[Frame]:
+        """Lose one of them."""
+        taxels = tactile_ids(self.node)[1:]
+        there = [frame for frame in frames if frame[0] in taxels]
+        if not there or self.rng.random() >= self.fault.share:
+            return frames
+        self.host.hits += 1
+        lost = self.rng.choice(there)
+        return [frame for frame in frames if frame is not lost]
+
+
+class HeaderCrc(Effect):
+    """The CRC of each tactile header is wrong."""
+
+    def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:
+        """Change a bit of it."""
+        can_id, data = frame
+        if can_id not in tactile_ids(self.node)[:1] or len(data) <= _CRC_BYTE:
+            return None
+        return ((can_id, data[:_CRC_BYTE] + bytes((data[_CRC_BYTE] ^ 1,)) + data[_CRC_BYTE + 1 :]),)
+
+
+_ROWS = (
+    make_kind(
+        "dead-rows",
+        DeadRows,
+        "rows of taxels measure nothing",
+        "tactile node, 2100h",
+        "names them; interpolates, or retreats",
+        incoming=False,
+        needs="array",
+        first=Parameter(7, 0, 255, "first row, 0-based"),
+        rows=Parameter(1, 1, 256, "number of rows"),
+    ),
+    make_kind(
+        "stuck-image",
+        StuckImage,
+        "the same image again and again",
+        "tactile node, 2120h",
+        "does not press on",
+        incoming=False,
+        needs="array",
+    ),
+    make_kind(
+        "drift",
+        Drift,
+        "all taxels drift upward",
+        "tactile node, 2003h",
+        "retreats at the limit of the force",
+        incoming=False,
+        needs="array",
+        counts_s=Parameter(5, 0, 1e6, "rate, counts/s"),
+    ),
+    make_kind(
+        "saturation",
+        Saturation,
+        "every pressed taxel is at full scale",
+        "tactile node, 2005h",
+        "retreats",
+        incoming=False,
+        needs="array",
+    ),
+    make_kind(
+        "torn",
+        Torn,
+        "a PDO of each tactile frame is lost",
+        "tactile node, 2120h",
+        "drops the frame, and counts it",
+        trips="torn_frame",
+        incoming=False,
+        needs="array",
+    ),
+    make_kind(
+        "header-crc",
+        HeaderCrc,
+        "the CRC of each tactile header is wrong",
+        "tactile node, 2120h",
+        "drops the frame, and counts it",
+        trips="torn_frame",
+        incoming=False,
+        needs="array",
+    ),
+)
+CELL_FAULTS: Mapping[str, FaultKind] = MappingProxyType({**BUS_FAULTS, **{kind.name: kind for kind in _ROWS}})
+"""Kinds of faults of the nodes of a cell by name."""

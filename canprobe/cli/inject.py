@@ -1,0 +1,91 @@
+"""Throw faults at emulated nodes while they are served, by `canprobe emulate` or a run on a real bus.
+
+A fault is written as: node N: NAME [k=v …] [at T | on EVENT] [for D]. Times count from now; events are boot-up,
+operational, enabled and sync. --list prints all kinds with the clause, what happens, and what a conforming peer does.
+Only the user who serves the nodes may throw faults.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from canprobe.cli.argument_types import word
+from canprobe.cli.common_arguments import add_options, add_verbosity
+from canprobe.cli.output import print_json, print_table
+from canprobe.cli.parser import Parser
+from canprobe.errors import UsageError
+
+HELP = "throw faults at emulated nodes"
+EXAMPLE = """\
+examples:
+  canprobe inject --list
+  canprobe inject --channel vcan0 "node 3: heartbeat-off for 2 s"
+  canprobe inject --channel vcan0 "node 3: delay ms=2 share=0.5 seed=7" "node 16: torn at 1 s"
+  canprobe inject --channel vcan0 --clear
+"""
+
+
+def add_arguments(parser: Parser) -> None:
+    """Add the command's arguments."""
+    parser.add_argument("faults", metavar="FAULT", nargs="*", type=word, help="fault, such as 'node 3: mute for 2 s'")
+    parser.add_argument("--list", action="store_true", help="list the kinds of faults, and end")
+    parser.add_argument("--clear", action="store_true", help="end the faults that hold, before others are thrown")
+    parser.add_argument("--channel", metavar="CH", type=word, default="vcan0", help="channel of the nodes [vcan0]")
+    add_options(parser, "--json")
+    add_verbosity(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """List the kinds, or throw faults."""
+    if args.list:
+        return _list(args)
+    if not args.faults and not args.clear:
+        raise UsageError("inject: name a FAULT, or --clear, or --list")
+    from canprobe.fieldbus.tools.faults.control import request_faults
+
+    done = request_faults(args.channel, args.faults, clear=args.clear)
+    if args.json:
+        print_json(done)
+    else:
+        for what, faults in done.items():
+            for fault in faults:
+                print(f"{what}: {fault}")
+    return 0
+
+
+def _list(args: argparse.Namespace) -> int:
+    from canprobe.cell.emulated.array_faults import CELL_FAULTS
+
+    rows = [
+        {
+            "name": kind.name,
+            "parameters": {
+                name: {"default": one.default, "low": one.low, "high": one.high, "what": one.what}
+                for name, one in kind.parameters.items()
+            },
+            "what": kind.what,
+            "clause": kind.clause,
+            "reaction": kind.reaction,
+            "conditions": sorted(kind.conditions),
+            "needs": kind.needs,
+        }
+        for kind in CELL_FAULTS.values()
+    ]
+    if args.json:
+        print_json(rows)
+        return 0
+    print_table(
+        [
+            ("fault", "what happens", "clause", "expected reaction"),
+            *(
+                (
+                    " ".join([kind.name, *(f"{name}={one.default:g}" for name, one in kind.parameters.items())]),
+                    kind.what,
+                    kind.clause,
+                    kind.reaction,
+                )
+                for kind in CELL_FAULTS.values()
+            ),
+        ]
+    )
+    return 0

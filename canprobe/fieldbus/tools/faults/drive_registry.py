@@ -1,0 +1,100 @@
+"""The rows of the registry that are faults of a CiA 402 drive. Source: CiA 402-2."""
+
+from __future__ import annotations
+
+from canprobe.fieldbus.tools.faults import drive_faults as drive
+from canprobe.fieldbus.tools.faults.fault import Parameter
+from canprobe.fieldbus.tools.faults.row import LOST, error_code, make_kind
+
+DRIVE_KINDS = (
+    make_kind(
+        "drive-fault",
+        drive.DriveFault,
+        "the drive detects a fault",
+        "CiA 402-2, 605Eh, 603Fh",
+        "stops the others; resets by an edge only",
+        trips="drive_fault",
+        incoming=False,
+        needs="drive",
+        code=error_code(0x4310, "error code"),
+        resettable=Parameter(1, 0, 1, "0: it comes back after a reset"),
+    ),
+    make_kind(
+        "sto",
+        drive.Sto,
+        "safe torque off",
+        "CiA 402-2, state automaton",
+        "does not enable it again and again",
+        trips="drive_fault",
+        incoming=False,
+        needs="drive",
+    ),
+    make_kind(
+        "mode-refused",
+        drive.ModeRefused,
+        "writes to 6060h are refused",
+        "CiA 402-2, 6060h, 6061h",
+        "sends no targets",
+        incoming=True,
+        needs="drive",
+    ),
+    make_kind(
+        "brake-stuck",
+        drive.BrakeStuck,
+        "the motor stays where it is",
+        "CiA 402-2, 6065h, 8611h",
+        "the drive finds a following error",
+        incoming=False,
+        needs="drive",
+    ),
+    make_kind(
+        "encoder-jump",
+        drive.EncoderJump,
+        "the encoder is wrong by some counts",
+        "CiA 402-2, 6064h",
+        "drops what cannot be",
+        trips=LOST,
+        incoming=False,
+        needs="drive",
+        counts=Parameter(2000, -(2**31), 2**31 - 1, "error, counts"),
+    ),
+    make_kind(
+        "encoder-frozen",
+        drive.EncoderFrozen,
+        "the encoder keeps its position",
+        "CiA 402-2, 6064h",
+        "the drive finds a following error",
+        incoming=False,
+        needs="drive",
+    ),
+    make_kind(
+        "homing-lost",
+        drive.HomingLost,
+        "the drive forgets that it was homed",
+        "CiA 402-2, homing, bit 12",
+        "moves nothing before it is homed",
+        incoming=False,
+        needs="drive",
+    ),
+    make_kind(
+        "zero-shift",
+        drive.ZeroShift,
+        "the zero of the drive is elsewhere",
+        "CiA 402-2, 607Ch",
+        "does not hold the old zero",
+        trips="drive_fault",
+        incoming=False,
+        needs="drive",
+        counts=Parameter(2000, -(2**31), 2**31 - 1, "way of the zero, units of position"),
+    ),
+    make_kind(
+        "torque-limit",
+        drive.TorqueLimit,
+        "the torque is limited",
+        "CiA 402-2, 6072h, bit 11",
+        "goes no faster than the drive follows",
+        incoming=False,
+        needs="drive",
+        permille=Parameter(10, 0, 10_000, "limit, 1/1000 of the rated torque"),
+    ),
+)

@@ -1,0 +1,211 @@
+"""A node whose faults happen: it stands between the node and a bus, and is attached in the node's place.
+
+Faults may be added and taken away at any time. One holds from the next frame or deadline of the node on. Without a
+fault the node behaves as itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from heapq import heappop, heappush
+
+from canprobe.fieldbus.node.slave_node import SlaveNode
+from canprobe.fieldbus.node.wrapped import WrappedNode
+from canprobe.fieldbus.protocol.cia402 import DriveState, state_of
+from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, SYNC_ID, Frame, NmtState
+from canprobe.fieldbus.tools.faults.fault import FOREVER_NS, Effect, Fault
+
+EVENTS = ("boot-up", "operational", "enabled", "sync")
+"""Events of a node at which a fault may begin: its next boot-up, NMT start, operation enabled, or SYNC."""
+
+
+class FaultyNode(WrappedNode):
+    """One node and its faults.
+
+    Args:
+        node: the node.
+        faults: faults; those of other nodes are left out.
+
+    Attributes:
+        hits: number of frames that were changed, lost, moved or made up, and of reboots.
+        now_ns: time of the last frame or deadline.
+    """
+
+    def __init__(self, node: SlaveNode, faults: Iterable[Fault] = ()) -> None:
+        super().__init__(node)
+        self.hits = 0
+        self.now_ns = 0
+        self._pending: list[Fault] = []
+        self._effects: list[Effect] = []
+        self._later: list[tuple[int, int, bool, Frame]] = []
+        self._count = 0
+        self._swapped: list[Frame] = []
+        self._said: list[Frame] = []
+        self._busy = False
+        self._before: frozenset[str] = frozenset()
+        for fault in faults:
+            if fault.node_id == node.node_id:
+                self.add(fault)
+
+    def add(self, fault: Fault) -> None:
+        """Add a fault; it happens from its start or event on, or from now on."""
+        self._pending.append(fault)
+        self._busy = True
+        if fault.event:
+            self._before = self._events()
+
+    def remove(self, fault: Fault) -> None:
+        """End a fault at the next frame or deadline of the node; nothing happens where it is over."""
+        self._pending = [one for one in self._pending if one is not fault]
+        for effect in self._effects:
+            if effect.fault is fault:
+                effect.end_ns = min(effect.end_ns, self.now_ns)
+
+    @property
+    def faults(self) -> list[Fault]:
+        """Faults that hold, and those that are to come."""
+        return [*(effect.fault for effect in self._effects), *self._pending]
+
+    @property
+    def next_deadline_ns(self) -> int | None:
+        """The next deadline of the node, while its time goes on, and of the faults."""
+        own = self.node.next_deadline_ns
+        if not self._busy:
+            return own
+        due = [self._later[0][0]] if self._later else []
+        due += [fault.start_ns for fault in self._pending if not fault.event]
+        due += [effect.end_ns for effect in self._effects]
+        due += [effect.due_ns for effect in self._effects if effect.due_ns is not None]
+        if own is not None:
+            due.append(max([own, *(effect.end_ns for effect in self._effects if effect.dark)]))
+        first = min(due, default=FOREVER_NS)
+        return first if first < FOREVER_NS else None
+
+    def start(self, t_ns: int) -> Sequence[Frame]:
+        """Power on."""
+        self.now_ns = t_ns
+        return self._finished(self.node.start(t_ns), (), t_ns)
+
+    def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
+        """Take a frame from the bus, which may not reach the node."""
+        self.now_ns = t_ns
+        if not self._busy:
+            return self.node.receive(can_id, data, t_ns)
+        ready = self._turn(t_ns)
+        if self._is_dark():
+            self.hits += 1
+            return ready
+        out: list[Frame] = []
+        for frame in self._through([(can_id, data)], t_ns, incoming=True):
+            out += self.node.receive(*frame, t_ns)
+        return [*ready, *self._finished(out, (), t_ns, synchronised=can_id == SYNC_ID)]
+
+    def advance(self, t_ns: int) -> Sequence[Frame]:
+        """Do what is due in the node and in its faults."""
+        self.now_ns = t_ns
+        if not self._busy:
+            return self.node.advance(t_ns)
+        ready = self._turn(t_ns)
+        answers: list[Frame] = []
+        while self._later and self._later[0][0] <= t_ns:
+            _, _, incoming, frame = heappop(self._later)
+            if not incoming:
+                ready.append(frame)
+            elif not self._is_dark():
+                answers += self.node.receive(*frame, t_ns)
+        own = self.node.next_deadline_ns
+        if own is not None and own <= t_ns and not self._is_dark():
+            answers += self.node.advance(t_ns)
+        made = [f for e in self._effects if e.due_ns is not None and e.due_ns <= t_ns for f in e.advance(t_ns)]
+        out = [*ready, *self._finished(answers, made, t_ns)]
+        self._busy = bool(self._pending or self._effects or self._later or self._swapped)
+        return out
+
+    def later(self, frame: Frame, t_ns: int, *, incoming: bool) -> None:
+        """Let a frame go on at `t_ns`."""
+        self._count += 1
+        heappush(self._later, (t_ns, self._count, incoming, frame))
+
+    def swap(self, frame: Frame) -> None:
+        """Send a frame behind those that the node sends next."""
+        self._swapped.append(frame)
+
+    def say(self, frame: Frame) -> None:
+        """Send a frame that the node did not make, with its next answers."""
+        self._said.append(frame)
+
+    def _is_dark(self) -> bool:
+        return any(effect.dark for effect in self._effects)
+
+    def _turn(self, t_ns: int) -> list[Frame]:
+        """Begin and end the faults whose time has come."""
+        out: list[Frame] = []
+        for fault in [one for one in self._pending if not one.event and one.start_ns <= t_ns]:
+            self._pending.remove(fault)
+            out += self._begin(fault, t_ns)
+        for effect in [one for one in self._effects if one.end_ns <= t_ns or one.left <= 0]:
+            self._effects.remove(effect)
+            out += effect.end(t_ns)
+        return [] if self._is_dark() else out
+
+    def _begin(self, fault: Fault, t_ns: int) -> Sequence[Frame]:
+        effect = fault.kind.effect(fault, self)
+        effect.end_ns = t_ns + fault.duration_ns
+        self._effects.append(effect)
+        return effect.begin(t_ns)
+
+    def _finished(
+        self, frames: Sequence[Frame], made: Sequence[Frame], t_ns: int, *, synchronised: bool = False
+    ) -> list[Frame]:
+        """What the bus gets of the node's frames, of those that faults make, and of those said in its name."""
+        sent = self._sent(frames, t_ns)
+        said, self._said = self._said, []
+        out = [*sent, *made, *said, *(frame for effect in self._effects for frame in effect.watch(t_ns))]
+        if any(fault.event for fault in self._pending):
+            booted = any(can_id == HEARTBEAT_BASE + self.node_id and data == b"\0" for can_id, data in frames)
+            now = self._events()
+            new = (now - self._before) | ({"boot-up"} if booted else set()) | ({"sync"} if synchronised else set())
+            self._before = now
+            for fault in [one for one in self._pending if one.event in new]:
+                self._pending.remove(fault)
+                out += self._begin(fault, t_ns)
+        return out
+
+    def _events(self) -> frozenset[str]:
+        """States of the node that are events when it comes into them."""
+        enabled = state_of(self.node.dictionary.number(0x6041)) is DriveState.OPERATION_ENABLED
+        operational = self.node.state is NmtState.OPERATIONAL
+        return frozenset(name for name, holds in (("enabled", enabled), ("operational", operational)) if holds)
+
+    def _sent(self, frames: Sequence[Frame], t_ns: int) -> Sequence[Frame]:
+        """Those of the node's frames that reach the bus now."""
+        if not frames:
+            return frames
+        if self._is_dark():
+            self.hits += len(frames)
+            return ()
+        batch = list(frames)
+        for effect in self._effects:
+            batch = effect.batch(batch, t_ns)
+        sent = self._through(batch, t_ns, incoming=False)
+        return [*sent, *self._unswapped()] if sent else sent
+
+    def _unswapped(self) -> list[Frame]:
+        swapped, self._swapped = self._swapped, []
+        return swapped
+
+    def _through(self, frames: list[Frame], t_ns: int, *, incoming: bool) -> list[Frame]:
+        for effect in self._effects:
+            if effect.fault.hears is incoming and effect.left > 0:
+                frames = [out for frame in frames for out in self._hit(effect, frame, t_ns)]
+        return frames
+
+    def _hit(self, effect: Effect, frame: Frame, t_ns: int) -> Sequence[Frame]:
+        if effect.rng.random() >= effect.fault.share or effect.left <= 0:
+            return (frame,)
+        out = effect.frame(frame, t_ns)
+        if out is None:
+            return (frame,)
+        self.hits += 1
+        effect.left -= 1
+        return out

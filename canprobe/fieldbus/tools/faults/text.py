@@ -1,0 +1,121 @@
+"""Faults as people write them: `node 3: delay ms=2 share=0.5 at 5 s for 200 ms`.
+
+    node N: NAME [k=v …] [at T | on EVENT] [for D]
+
+T and D have a unit, s, ms or us. Besides the parameters of the kind, k is share (0…1), count (frames, then it is over),
+seed, or direction (in, out). Numbers may be hexadecimal, such as 0x1017.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable, Mapping
+
+from canprobe.errors import UsageError
+from canprobe.fieldbus.tools.faults.fault import ENDLESS_HITS, FOREVER_NS, Fault, FaultKind, Parameter
+from canprobe.fieldbus.tools.faults.faulty_node import EVENTS
+
+FORM = "node N: NAME [k=v …] [at T | on EVENT] [for D], such as: node 3: heartbeat-off at 5 s for 200 ms"
+_FORM = re.compile(
+    r"\s*node\s+(?P<node>\d+)\s*:\s*(?P<name>[\w-]+)(?P<values>(?:\s+[\w-]+=\S+)*)"
+    r"(?:\s+at\s+(?P<at>[\d.eE+-]+)\s*(?P<at_unit>[a-zµ]+)|\s+on\s+(?P<event>[\w-]+))?"
+    r"(?:\s+for\s+(?P<long>[\d.eE+-]+)\s*(?P<long_unit>[a-zµ]+))?\s*"
+)
+_UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "µs": 1_000}
+_DIRECTIONS = {"in": True, "out": False}
+_COMMON = {
+    "share": Parameter(1.0, 0.0, 1.0, "share of the frames that it hits"),
+    "count": Parameter(ENDLESS_HITS, 1, ENDLESS_HITS, "number of frames, then it is over"),
+    "seed": Parameter(0, 0, 2**63 - 1, "seed of its random choices"),
+}
+
+
+def parse_fault(text: str, kinds: Mapping[str, FaultKind], now_ns: int = 0) -> Fault:
+    """Read one fault.
+
+    Args:
+        text: the fault.
+        kinds: kinds that it may be.
+        now_ns: time on the clock of the bus from which `at` counts, and at which a fault without `at` begins.
+
+    Raises:
+        UsageError: the text is no fault, or a kind, parameter, value or event is unknown.
+    """
+    match = _FORM.fullmatch(text)
+    if match is None:
+        raise UsageError(f"fault {text!r}: expected {FORM}")
+    kind = kinds.get(match["name"])
+    if kind is None:
+        raise UsageError(
+            f"fault {text!r}: unknown kind {match['name']!r}{_near(match['name'], kinds)};"
+            " `canprobe inject --list` lists them"
+        )
+    if not 1 <= int(match["node"]) <= 127:
+        raise UsageError(f"fault {text!r}: expected a node from 1 to 127, got {match['node']}")
+    event = match["event"] or ""
+    if event and event not in EVENTS:
+        raise UsageError(f"fault {text!r}: unknown event {event!r}{_near(event, EVENTS)}; events: {', '.join(EVENTS)}")
+    given = dict(word.split("=", 1) for word in match["values"].split())
+    incoming = _direction(text, kind, given.pop("direction", None))
+    known = {**kind.parameters, **_COMMON}
+    values = {name: _number(text, name, value, known) for name, value in given.items()}
+    common = {name: values.pop(name, parameter.default) for name, parameter in _COMMON.items()}
+    return Fault(
+        kind,
+        int(match["node"]),
+        now_ns + (_time(text, match["at"], match["at_unit"]) if match["at"] else 0),
+        _time(text, match["long"], match["long_unit"]) if match["long"] else kind.lasts_ns,
+        values,
+        common["share"],
+        int(common["count"]),
+        incoming,
+        int(common["seed"]),
+        event,
+    )
+
+
+def _near(word: str, known: Iterable[str]) -> str:
+    close = difflib.get_close_matches(word, list(known), n=1)
+    return f"; did you mean {close[0]}?" if close else ""
+
+
+def _direction(text: str, kind: FaultKind, given: str | None) -> bool | None:
+    if given is None:
+        return None
+    if given not in _DIRECTIONS:
+        raise UsageError(f"fault {text!r}: expected direction=in or direction=out, got {given!r}")
+    if kind.incoming is not None and kind.incoming is not _DIRECTIONS[given]:
+        raise UsageError(f"fault {text!r}: {kind.name} has its own direction; leave direction= out")
+    return _DIRECTIONS[given]
+
+
+def _number(text: str, name: str, value: str, known: Mapping[str, Parameter]) -> float:
+    parameter = known.get(name)
+    if parameter is None:
+        raise UsageError(
+            f"fault {text!r}: unknown parameter {name!r}{_near(name, known)};"
+            f" it takes {', '.join([*known, 'direction'])}"
+        )
+    try:
+        number: float = int(value, 0)
+    except ValueError:
+        try:
+            number = float(value)
+        except ValueError:
+            number = float("nan")
+    if not parameter.low <= number <= parameter.high:
+        raise UsageError(
+            f"fault {text!r}: {name}: expected {parameter.what}, {parameter.low:g} to {parameter.high:g}, got {value!r}"
+        )
+    return number
+
+
+def _time(text: str, number: str, unit: str) -> int:
+    try:
+        seconds = float(number)
+    except ValueError:
+        seconds = -1.0
+    if unit not in _UNITS_NS or not 0.0 <= seconds * _UNITS_NS.get(unit, 1) < FOREVER_NS:
+        raise UsageError(f"fault {text!r}: expected a time such as 5 s or 200 ms, got '{number} {unit}'")
+    return round(seconds * _UNITS_NS[unit])

@@ -1,0 +1,27 @@
+"""Each kind of fault, thrown at a node of a cell in motion, trips the conditions of its row and no others."""
+
+from __future__ import annotations
+
+import pytest
+from injected import FREE_CYCLE, HOLD_CYCLE, Injected
+
+from canprobe.cell.emulated.array_faults import CELL_FAULTS
+from canprobe.cell.master.conditions import BY_KEY
+
+PASSING = ("reboot", "freeze", "bus-off")
+"""Kinds that do something at their end, too."""
+
+
+def test_the_registry_has_every_kind_once_and_names_conditions_that_there_are():
+    assert len(CELL_FAULTS) == 48
+    assert {key for kind in CELL_FAULTS.values() for key in kind.conditions} <= set(BY_KEY)
+    assert all(kind.what and kind.clause and kind.reaction for kind in CELL_FAULTS.values())
+
+
+@pytest.mark.parametrize("name", CELL_FAULTS)
+def test_a_kind_trips_the_conditions_that_it_declares(name):
+    kind = CELL_FAULTS[name]
+    scene, node_id, at = ("press", 16, HOLD_CYCLE) if kind.needs == "array" else ("free", 3, FREE_CYCLE)
+    text = f"node {node_id}: {name} seed=1" + (" for 20 ms" if name in PASSING else "")
+    run = Injected(scene, at, lambda run: run.inject(text), until=110)
+    assert set(run.session.cell.supervisor.first) == kind.conditions
