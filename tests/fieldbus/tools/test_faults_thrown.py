@@ -257,7 +257,7 @@ def test_faults_over_the_control_channel(line, tmp_path, monkeypatch):
         assert done[0]["thrown"] == done[1]["ended"] == ["mute at node 5, 0.0000 s for 2000.0 ms, 100 %"]
         (path,) = control_folder().iterdir()
         assert path.stat().st_mode & 0o777 == 0o600 and control_folder().stat().st_mode & 0o777 == 0o700
-    assert list(control_folder().iterdir()) == []
+    assert not path.parent.exists()
     os.chmod(control_folder(), 0o755)
     with pytest.raises(UsageError, match="mode 700"):
         ControlServer("vcan7", line.nodes)

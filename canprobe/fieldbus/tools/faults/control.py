@@ -45,6 +45,11 @@ def control_folder() -> Path:
     return folder
 
 
+def _remove_empty(folder: Path) -> None:
+    with contextlib.suppress(OSError):  # another process has its socket there
+        folder.rmdir()
+
+
 def _name(channel: str) -> str:
     """Beginning of the names of the sockets of a channel; the number of the process follows."""
     return f"inject-{re.sub(r'[^A-Za-z0-9._-]', '_', channel)}-"
@@ -77,6 +82,7 @@ class ControlServer:
         for line in [self._socket, *self._lines]:
             line.close()
         self._path.unlink(missing_ok=True)
+        _remove_empty(self._path.parent)
 
     def poll(self, now_ns: int) -> None:
         """Answer what has come; never waits.
@@ -139,6 +145,7 @@ def request_faults(channel: str, faults: Sequence[str], *, clear: bool = False) 
             nodes_of[path] = answer["nodes"]
             done["ended"] += answer["ended"]
     if not nodes_of:
+        _remove_empty(control_folder())
         raise InterfaceError(
             f"{channel}: no process of this user serves nodes there; type: canprobe emulate SCENE --channel {channel}"
         )
