@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 
 import pytest
@@ -14,7 +13,7 @@ from canprobe.fieldbus.drive.from_eds import make_eds_node
 from canprobe.fieldbus.eds.packaged import load_eds
 from canprobe.fieldbus.protocol.cia402 import DriveState, state_of
 from canprobe.fieldbus.tools.faults import BUS_FAULTS, FaultyNode, FaultyNodes, inject, parse_fault
-from canprobe.fieldbus.tools.faults.control import ControlServer, control_folder, request_faults
+from canprobe.fieldbus.tools.faults.control import ControlServer, request_faults
 
 MS, S = 1_000_000, 1_000_000_000
 
@@ -234,8 +233,7 @@ def test_on_an_event_and_the_same_again_by_its_seed(line):
     assert answered(1) == answered(1) != answered(2)
 
 
-def test_faults_over_the_control_channel(line, tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+def test_faults_over_the_control_channel(line):
     with pytest.raises(InterfaceError, match="no process of this user serves nodes there"):
         request_faults("vcan7", ["node 5: mute"])
     with ControlServer("vcan7", line.nodes) as server:
@@ -255,9 +253,23 @@ def test_faults_over_the_control_channel(line, tmp_path, monkeypatch):
         thread.join()
         assert over.is_set()
         assert done[0]["thrown"] == done[1]["ended"] == ["mute at node 5, 0.0000 s for 2000.0 ms, 100 %"]
-        (path,) = control_folder().iterdir()
-        assert path.stat().st_mode & 0o777 == 0o600 and control_folder().stat().st_mode & 0o777 == 0o700
-    assert not path.parent.exists()
-    os.chmod(control_folder(), 0o755)
-    with pytest.raises(UsageError, match="mode 700"):
-        ControlServer("vcan7", line.nodes)
+    with pytest.raises(InterfaceError, match="no process of this user serves nodes there"):
+        request_faults("vcan7", ["node 5: mute"])
+
+
+def test_another_user_throws_no_faults(line, monkeypatch):
+    """Root may reach the process, which refuses; others do not see one of their own."""
+    monkeypatch.setattr("canprobe.fieldbus.tools.faults.control._user", lambda _: 4711)
+    said = []
+
+    def client():
+        with pytest.raises((UsageError, InterfaceError)) as refused:
+            request_faults("vcan8", ["node 5: mute"])
+        said.append(str(refused.value))
+
+    with ControlServer("vcan8", line.nodes) as server:
+        thread = threading.Thread(target=client)
+        thread.start()
+        while thread.is_alive():
+            server.poll(line.clock.now_ns())
+    assert any(words in said[0] for words in ("only the user who serves the nodes", "no process of this user"))

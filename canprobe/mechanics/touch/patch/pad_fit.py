@@ -18,6 +18,8 @@ REACH_M, REACH_LOG_SIGMA = 200e-6, 0.2
 MAX_SLOW_WAY_M, SLOW_BIN_M = 0.64e-3, 0.04e-3
 """Longest way over the pad over which slow errors are compared, that of the contact in about 15 mm of a scan whose pad
 follows the normal; and its steps, m."""
+MAX_SLOW_LENGTH_SHARE = 2.0
+"""Longest correlation length of slow errors over that way. Where they still grow at its end, nothing says how far."""
 SLOW_LAGS = (4, 8, 16, 32, 64, 128)
 """Numbers of images between two centroids that are compared."""
 CORRELATED_FRAMES = 20
@@ -130,5 +132,6 @@ def _slow(errors: Sequence[Floats], ways: Sequence[Floats], sigma: Floats) -> tu
         rest: Floats = weight * (z[0] ** 2 * (1.0 - np.exp(-w / MAX_SLOW_WAY_M / z[1] ** 2)) - 1e10 * D)
         return rest
 
-    slow, root = least_squares(residuals, np.array([3.0, 1.0])).x.tolist()
-    return 1e-5 * abs(slow), MAX_SLOW_WAY_M * root**2
+    least, most = math.sqrt(SLOW_BIN_M / MAX_SLOW_WAY_M), math.sqrt(MAX_SLOW_LENGTH_SHARE)
+    slow, root = least_squares(residuals, np.array([3.0, 1.0]), bounds=([0.0, least], [np.inf, most])).x.tolist()
+    return 1e-5 * slow, MAX_SLOW_WAY_M * root**2
