@@ -2,8 +2,8 @@
 
 Scenes are drawn at random from everything that a cell may meet: five cells, eleven kinds of surfaces from planes to
 rough height fields with radii from 12 mm, weaves, straight paths and circles, 0.5 to 3 N, 5 to 40 mm/s, tool errors,
-arrays with blur, gains, hysteresis and creep of their own. Each is scanned without a bus, with the same numbers as in lockstep
-to the last bit. A scene that answers nothing (its plan refuses it, or it is stopped before) is counted, and
+arrays with blur, gains, hysteresis and creep of their own. Each is scanned without a bus, with the same numbers as in
+lockstep to the last bit. A scene that answers nothing (its plan refuses it, or it is stopped before) is counted, and
 another one is drawn in its place.
 
 All seeds follow from the number of the draw. Settings of the estimator come from draws with other numbers than

@@ -51,7 +51,7 @@ def change(participants):
 READ_1000 = bytes.fromhex("4000100000000000")
 
 
-def test_faults_are_thrown_from_the_start_and_while_the_nodes_are_served(served, capsys):
+def test_faults_are_thrown_from_the_start_and_while_the_nodes_are_served(served, capsys, monkeypatch):
     answers = []
 
     def inject(*words):
