@@ -34,7 +34,8 @@ def serve(bus, monkeypatch):
 
     def attach(buses, stop):
         ((participants, _),) = buses
-        nodes[:] = [one for one in participants if hasattr(one, "lss")]
+        inner = (getattr(one, "node", one) for one in participants)  # without the wrapping for faults
+        nodes[:] = [one for one in inner if hasattr(one, "lss")]
         for node in nodes:
             bus.attach(node)
 

@@ -98,7 +98,7 @@ def test_the_raw_folder_replays_to_the_same_estimates(dataset, folders, capsys):
 
 
 def test_one_result_at_a_divisor_of_the_rate(tmp_path):
-    result = canprobe.run(canprobe.load_scene("free", SHORT), bus="direct")
+    result = canprobe.run(canprobe.load_scene("free", SHORT), bus="direct", files=False)
     result.to_lerobot(tmp_path / "free", fps=50)
     rows = parquet.read_table(tmp_path / "free" / ROW).to_pandas()
     np.testing.assert_allclose(np.stack(rows["observation.state"]), result.log["q_rad"][::8], atol=1e-6)

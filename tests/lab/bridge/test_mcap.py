@@ -103,7 +103,10 @@ def by_cycle(recorded, rows):
 
 
 def test_force_and_contact_are_those_the_task_logged(recorded, decoded):
-    """To rounding, though both were computed again, in another process, from the measurement alone."""
+    """The force to rounding, the place to 0.2 µm: both were computed again, in another process, from the measurement.
+
+    The correction of the centroid's lag rests on the stiffness of the layer that the task found in its touch.
+    """
     cycle, force, points = (recorded.log(name) for name in ("sample_cycle", "force_n", "contact_mm"))
     new = np.flatnonzero(np.isfinite(cycle) & (np.diff(cycle, prepend=-1) != 0))
     wrenches = by_cycle(recorded, decoded["/wrench"])
@@ -115,7 +118,7 @@ def test_force_and_contact_are_those_the_task_logged(recorded, decoded):
     contacts = by_cycle(recorded, tf)
     found = [vector(contacts[cycle[row]].transforms[0].transform.translation) for row in touched]
     assert len(found) > 100
-    np.testing.assert_allclose(found, points[touched] * 1e-3, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found, points[touched] * 1e-3, rtol=0, atol=2e-7)
 
 
 def vector(v):
