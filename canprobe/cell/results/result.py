@@ -142,10 +142,7 @@ class RunResult:
         folder = self.out
         if folder is None:
             folder = Path(tempfile.mkdtemp(prefix="canprobe-view-"))
-            write_scene(self.plan, folder)
-            write_npz(folder / LOG, self.log)
-            write_npz(folder / TACTILE, self.tactile)
-            write_files(self.data, folder)
+            self._write_all(folder)
         return page_of(folder, self.plan.setup)
 
     def score(self, *methods: str, **own: Callable[[], OwnEstimator]) -> Scores:
@@ -235,9 +232,14 @@ class RunResult:
             yield self.out
             return
         with tempfile.TemporaryDirectory(prefix="canprobe-run-") as name:
-            write_scene(self.plan, Path(name))
-            write_files(self.data, Path(name))
+            self._write_all(Path(name))
             yield Path(name)
+
+    def _write_all(self, folder: Path) -> None:
+        write_scene(self.plan, folder)
+        write_npz(folder / LOG, self.log)
+        write_npz(folder / TACTILE, self.tactile)
+        write_files(self.data, folder)
 
     @property
     def _attrs(self) -> dict[str, Any]:
