@@ -243,6 +243,15 @@ def test_no_modules_import_each_other_in_a_circle(typed):
     assert not graph, {name: sorted(targets & set(graph)) for name, targets in graph.items()}
 
 
+def test_no_class_has_the_name_of_another():
+    places = {}
+    for path, relative in MODULES.items():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                places.setdefault(node.name, []).append(str(relative))
+    assert {name: where for name, where in places.items() if len(where) > 1} == {}
+
+
 @pytest.mark.parametrize("door", ["canprobe", "canprobe.fieldbus", "canprobe.mechanics"])
 def test_every_public_name_of_a_door_can_be_had(door):
     module = importlib.import_module(door)

@@ -65,7 +65,7 @@ class Feature:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Episode:
+class RunRows:
     """A run as rows: its task in words, the robot, rows a second, and its features."""
 
     robot: str
@@ -122,10 +122,10 @@ class _Dataset:
         import pyarrow as arrow
         from pyarrow import parquet
 
-        first: Episode | None = None
+        first: RunRows | None = None
         writer = None
         for number, source in enumerate(sources):
-            episode = read_episode(source, fps)
+            episode = rows_of_run(source, fps)
             first = first or episode
             _refuse_another(first, episode, sources[0], source)
             table = arrow.table(self._arrays(number, episode))
@@ -149,7 +149,7 @@ class _Dataset:
         make_folder(path.parent)
         return path
 
-    def _arrays(self, number: int, episode: Episode) -> dict[str, Any]:
+    def _arrays(self, number: int, episode: RunRows) -> dict[str, Any]:
         """The columns of an episode as Arrow arrays, with those that number its rows."""
         import pyarrow as arrow
 
@@ -170,7 +170,7 @@ class _Dataset:
             for name, values in columns.items()
         }
 
-    def _note(self, number: int, episode: Episode) -> None:
+    def _note(self, number: int, episode: RunRows) -> None:
         chunk, file = divmod(self._file, FILES_IN_CHUNK)
         stats = {name: _statistics(feature.values) for name, feature in episode.features.items()}
         self._rows.append(
@@ -190,7 +190,7 @@ class _Dataset:
         )
         self._frames += len(episode)
 
-    def _write_meta(self, first: Episode) -> None:
+    def _write_meta(self, first: RunRows) -> None:
         import pandas
 
         index = {"dtype": "int64", "shape": [1], "names": None}
@@ -219,7 +219,7 @@ class _Dataset:
         pandas.DataFrame(self._rows).to_parquet(self._path(EPISODES_PATH), index=False)
 
 
-def read_episode(source: Path, fps: int | None = None) -> Episode:
+def rows_of_run(source: Path, fps: int | None = None) -> RunRows:
     """A run of a folder as rows.
 
     Args:
@@ -249,7 +249,7 @@ def read_episode(source: Path, fps: int | None = None) -> Episode:
     features["timestamp"] = Feature(None, (np.arange(count) / used).astype(np.float32))
     task = scene.title or scene.name
     seed = scene.seed if summary is None else int(summary.get("seed") or 0)
-    return Episode(scene.cell.name, task, seed, used, features)
+    return RunRows(scene.cell.name, task, seed, used, features)
 
 
 def _divisor(rate_hz: float, fps: int | None) -> int:
@@ -379,7 +379,7 @@ def _pooled(rows: Sequence[dict[str, Any]], feature: str) -> dict[str, list[Any]
     return {**{key: value.tolist() for key, value in found.items()}, "count": [int(counts.sum())]}
 
 
-def _refuse_another(first: Episode, episode: Episode, at: Path, source: Path) -> None:
+def _refuse_another(first: RunRows, episode: RunRows, at: Path, source: Path) -> None:
     """Refuse an episode whose columns mean something else than those of the first."""
     if episode.fps != first.fps:
         raise UsageError(f"{source}: expected {first.fps} rows a second, as {at} has, got {episode.fps}: give fps")

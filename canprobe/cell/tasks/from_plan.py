@@ -116,10 +116,10 @@ def _image_model(task: Touch) -> ImageModel:
 def make_contact_map(task: Touch) -> ContactMap:
     """An empty map for the contacts of a task's pad."""
     from canprobe.mechanics.touch.map.contact_map import ContactMap  # only where a map is asked for
-    from canprobe.mechanics.touch.map.local_fits import Pad
+    from canprobe.mechanics.touch.map.local_fits import PadLayer
     from canprobe.mechanics.touch.map.noise import PAD_NOISE
 
-    return ContactMap(Pad(task.probe.radius, task.probe.stiffness), PAD_NOISE, _image_model(task))
+    return ContactMap(PadLayer(task.probe.radius, task.probe.stiffness), PAD_NOISE, _image_model(task))
 
 
 def _uses_patch(task: Touch) -> bool:

@@ -10,7 +10,7 @@ from canprobe.fieldbus.node.entry import key_of
 from canprobe.fieldbus.protocol.cia402 import DriveState
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.tools.faults.fault import Effect, Fault, Host
-from canprobe.fieldbus.tools.faults.service_faults import SdoAbort
+from canprobe.fieldbus.tools.faults.service_faults import ObjectAborted
 
 VALUE_ABORT_CODE = 0x06090030
 _MODE_INDEX = 0x6060
@@ -66,7 +66,7 @@ class Sto(DriveEffect):
         return self.node.advance(t_ns)
 
 
-class ModeRefused(SdoAbort):
+class ModeRefused(ObjectAborted):
     """Writes to 6060h are refused."""
 
     def index(self, data: bytes) -> int:
@@ -94,7 +94,7 @@ class BrakeStuck(DriveEffect):
         return ()
 
 
-class Encoder(DriveEffect):
+class EncoderFault(DriveEffect):
     """Base class of faults of the encoder."""
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
@@ -113,7 +113,7 @@ class Encoder(DriveEffect):
         return counts
 
 
-class EncoderJump(Encoder):
+class EncoderJump(EncoderFault):
     """The encoder is wrong by so many counts from the beginning on."""
 
     def measured(self, counts: float) -> float:
@@ -121,7 +121,7 @@ class EncoderJump(Encoder):
         return counts + self.fault.value("counts")
 
 
-class EncoderFrozen(Encoder):
+class EncoderFrozen(EncoderFault):
     """The encoder keeps the last position."""
 
     _kept: float | None = None

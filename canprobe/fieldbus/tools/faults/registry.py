@@ -211,7 +211,7 @@ _ROWS = (
     ),
     make_kind(
         "sdo-abort",
-        service.SdoAbort,
+        service.ObjectAborted,
         "accesses to one object are aborted",
         "CiA 301, SDO abort",
         "names node and object, and does not go on",

@@ -78,7 +78,7 @@ class SdoAnswer(Effect):
         return None
 
 
-class SdoAbort(Effect):
+class ObjectAborted(Effect):
     """Accesses to one object are aborted."""
 
     def frame(self, frame: Frame, t_ns: int) -> Sequence[Frame] | None:

@@ -24,7 +24,7 @@ from canprobe.mechanics.touch.estimate.observed import MIN_SPREAD
 from canprobe.mechanics.touch.linear_algebra import checked, positive, real
 from canprobe.mechanics.touch.map import nodes as column
 from canprobe.mechanics.touch.map.discs import Discs, one_sheet
-from canprobe.mechanics.touch.map.local_fits import CommonErrors, LocalFits, Pad, fit_discs
+from canprobe.mechanics.touch.map.local_fits import CommonErrors, PadLayer, Quartics, fit_discs
 from canprobe.mechanics.touch.map.nodes import NodeGrid, Traces, rows_of
 from canprobe.mechanics.touch.map.noise import MapNoise
 from canprobe.mechanics.touch.map.quartic import LENGTH_M, SECOND, heights_and_slopes, terms
@@ -80,7 +80,7 @@ class _Cells(NamedTuple):
     """Solved cells; `known` (m, 3): whether height, slopes and curvature were observed, `rank` (m,) of the latter."""
 
     discs: Discs
-    fits: LocalFits
+    fits: Quartics
     excess: Floats
     offset: Floats
     known: NDArray[np.bool_]
@@ -117,7 +117,7 @@ class ContactMap:
         common: errors that the whole scan has in common, once solved.
     """
 
-    def __init__(self, pad: Pad | None, noise: MapNoise, image_model: ImageModel | None = None) -> None:
+    def __init__(self, pad: PadLayer | None, noise: MapNoise, image_model: ImageModel | None = None) -> None:
         self.pad, self.noise = pad, noise
         self.nodes = NodeGrid(0.0 if pad is None else pad.radius, noise.lateral)
         self.common: CommonErrors | None = None
@@ -268,7 +268,7 @@ class ContactMap:
             offset = 0.5 * stiffness.sigma * depth
         return _Cells(discs, fits, excess, offset, *_observed(fits), tree, cKDTree(points))
 
-    def _stiffness(self, rows: Floats, points: Floats, discs: Discs, fits: LocalFits) -> Stiffness | None:
+    def _stiffness(self, rows: Floats, points: Floats, discs: Discs, fits: Quartics) -> Stiffness | None:
         """The layer's stiffness from touch and images at the curvature of the fits; None without a layer."""
         if self._stated is None:
             return None
@@ -346,7 +346,7 @@ class ContactMap:
         return _Blend(feet, which, np.where(reached[:, None], weight, 0.0), xy, size)
 
 
-def _observed(fits: LocalFits) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
+def _observed(fits: Quartics) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
     """Whether height, slopes and all of K were observed (m, 3), and the rank of K (m,)."""
     V = fits.V
     height = V[:, 0, 0] * LENGTH_M**2 < MAX_HEIGHT_SIGMA_M**2

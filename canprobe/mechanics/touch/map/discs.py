@@ -12,7 +12,7 @@ from canprobe.mechanics.touch.map.nodes import NORMAL, PATH, facing
 from canprobe.mechanics.touch.tangent_frames import tangent_rotation
 from canprobe.mechanics.types import Floats
 
-CELL_M = 3e-3
+FIT_CELL_M = 3e-3
 """Side of a cell, m."""
 MIN_RADIUS_M, MAX_RADIUS_M, NODES_WANTED = 5.5e-3, 12e-3, 45
 """Least and largest radius of a disc, m, and the nodes that it should hold."""
@@ -45,7 +45,7 @@ class Discs(NamedTuple):
     def of(cls, points: Floats, rows: Floats) -> Discs:
         """Cells of nodes with contact points (n, 3), m, and columns (n, COLUMNS)."""
         normals = rows[:, NORMAL]
-        keys = np.column_stack([np.floor(points / CELL_M).astype(np.int64), facing(normals)])
+        keys = np.column_stack([np.floor(points / FIT_CELL_M).astype(np.int64), facing(normals)])
         owner = np.unique(keys, axis=0, return_inverse=True)[1].ravel()
         for _ in range(2):  # sheets that share a cell and a facing part from its first node
             first = np.unique(owner, return_index=True)[1][owner]

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.linear_algebra import positive, real
 from canprobe.mechanics.touch.map.contact_map import ContactMap
-from canprobe.mechanics.touch.map.local_fits import Pad
+from canprobe.mechanics.touch.map.local_fits import PadLayer
 from canprobe.mechanics.touch.map.noise import USUAL_SIGMA_M, MapNoise
 
 USUAL_SIGMA_NORMAL = 2e-3
@@ -66,7 +66,7 @@ def fit_map(
             raise UsageError(
                 "forces: expected with probe_radius (m) and stiffness (N/m³) of the layer, got them without"
             )
-        pad = Pad(positive("probe_radius", probe_radius), positive("stiffness", stiffness))
+        pad = PadLayer(positive("probe_radius", probe_radius), positive("stiffness", stiffness))
     elif probe_radius is not None or stiffness is not None:
         raise UsageError("probe_radius, stiffness: expected with forces, got them without")
     found = ContactMap(pad, noise)

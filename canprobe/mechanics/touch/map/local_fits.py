@@ -46,7 +46,7 @@ COMMON = 4
 """Number of common errors."""
 
 
-class Pad(NamedTuple):
+class PadLayer(NamedTuple):
     """A spherical probe with an elastic layer: radius R_p, m, and stiffness K/h, N/m³."""
 
     radius: float
@@ -60,7 +60,7 @@ class CommonErrors(NamedTuple):
     covariance: Floats
 
 
-class LocalFits(NamedTuple):
+class Quartics(NamedTuple):
     """Fitted quartics, dimensionless (`quartic.LENGTH_M`).
 
     Attributes:
@@ -83,8 +83,8 @@ class LocalFits(NamedTuple):
 
 
 def fit_discs(
-    rows: Floats, discs: Discs, pad: Pad | None, noise: MapNoise, *, K_ref: Floats, weight: Floats
-) -> tuple[LocalFits, CommonErrors, Floats]:
+    rows: Floats, discs: Discs, pad: PadLayer | None, noise: MapNoise, *, K_ref: Floats, weight: Floats
+) -> tuple[Quartics, CommonErrors, Floats]:
     """Fit every disc, and the common errors to all of them.
 
     Args:
@@ -118,7 +118,7 @@ def fit_discs(
     off = places - np.einsum("mn,mni->mi", share, places)[:, None]
     variance = np.maximum(np.einsum("mn,mn->m", share, variance), 1e-300)
     spread = np.einsum("mn,mni,mnj->mij", share, off, off) / variance[:, None, None]
-    return LocalFits(a, V, excess, spread), common, chi2
+    return Quartics(a, V, excess, spread), common, chi2
 
 
 def _followed(K: Floats, radius: float) -> Floats:
@@ -130,7 +130,7 @@ def _followed(K: Floats, radius: float) -> Floats:
 
 
 def _rows(
-    node: Floats, discs: Discs, pad: Pad | None, noise: MapNoise, K_ref: Floats
+    node: Floats, discs: Discs, pad: PadLayer | None, noise: MapNoise, K_ref: Floats
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Whitened rows A (m, 3n, 15 + 4) of (a, θ) and y (m, 3n); places (m, n, 2), m, and their variances (m, n), m².
 
