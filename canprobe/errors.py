@@ -18,9 +18,10 @@ All can be imported from `canprobe`.
 
 from __future__ import annotations
 
+import difflib
 import errno
 import stat
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -188,3 +189,9 @@ def install_line(extra: str) -> str:
         wanted += f" @ {f'{vcs}+' if vcs else ''}{origin['url']}"
     by_pipx = os.path.exists(os.path.join(sys.prefix, "pipx_metadata.json"))
     return f"{'pipx runpip canprobe' if by_pipx else 'pip'} install {editable}'{wanted}'"
+
+
+def did_you_mean(got: str, known: Iterable[str], cutoff: float = 0.5) -> str:
+    """The text `; did you mean X?`, empty when no known word is close."""
+    close = difflib.get_close_matches(got, list(known), n=1, cutoff=cutoff)
+    return f"; did you mean {close[0]}?" if close else ""

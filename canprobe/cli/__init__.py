@@ -25,8 +25,8 @@ import canprobe
 from canprobe.cell.session.terminal import Report
 from canprobe.cli.completion import complete
 from canprobe.cli.interrupts import termination_interrupts
-from canprobe.cli.parser import Parser, did_you_mean
-from canprobe.errors import EXTRA_OF, CanprobeError, install_line
+from canprobe.cli.parser import Parser
+from canprobe.errors import EXTRA_OF, CanprobeError, did_you_mean, install_line
 from canprobe.fieldbus.bus.real.interrupts import Terminated
 from canprobe.fieldbus.bus.real.processor import BLAS_THREADS
 

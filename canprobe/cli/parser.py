@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import difflib
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any, NoReturn
+
+from canprobe.errors import did_you_mean
 
 
 class _Formatter(argparse.RawDescriptionHelpFormatter):
@@ -42,9 +43,3 @@ class Parser(argparse.ArgumentParser):
         """Report unknown arguments and exit."""
         hint = did_you_mean(words[0], self._option_string_actions, 0.7) if words[0].startswith("-") else ""
         self.error(f"unrecognized arguments: {' '.join(words)}{hint}")
-
-
-def did_you_mean(got: str, known: Iterable[str], cutoff: float = 0.5) -> str:
-    """The text `; did you mean X?`, empty when no known word is close."""
-    close = difflib.get_close_matches(got, list(known), n=1, cutoff=cutoff)
-    return f"; did you mean {close[0]}?" if close else ""

@@ -14,7 +14,8 @@ from typing import Any
 from canprobe.cli.argument_types import whole
 from canprobe.cli.common_arguments import add_options, add_verbosity
 from canprobe.cli.output import print_json, print_table
-from canprobe.cli.parser import Parser, did_you_mean
+from canprobe.cli.parser import Parser
+from canprobe.errors import did_you_mean
 from canprobe.fieldbus.bus.real.interrupts import interrupts_repeated
 
 HELP = "measure accuracy, limits, faults and timing"

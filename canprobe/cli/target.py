@@ -7,8 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from canprobe.cli.common_arguments import PATIENT_SYNCS
-from canprobe.cli.parser import did_you_mean
-from canprobe.errors import UsageError
+from canprobe.errors import UsageError, did_you_mean
 
 if TYPE_CHECKING:
     from canprobe.cell.scene.model import Scene

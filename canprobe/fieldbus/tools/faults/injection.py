@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 
 from canprobe.errors import UsageError
 from canprobe.fieldbus.drive.drive import DriveApplication
@@ -44,7 +45,7 @@ class FaultyNodes:
             raise UsageError(f"fault {text!r}: node {fault.node_id} is no CiA 402 drive, which {kind.name} needs")
         if kind.needs == "array" and not node.node.dictionary.has_index(HEADER_INDEX):
             raise UsageError(f"fault {text!r}: node {fault.node_id} is no tactile array, which {kind.name} needs")
-        fault = parse_fault(text, self.kinds, node.now_ns if now_ns is None else now_ns)
+        fault = replace(fault, start_ns=fault.start_ns + (node.now_ns if now_ns is None else now_ns))
         node.add(fault)
         return fault
 

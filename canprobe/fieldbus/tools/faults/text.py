@@ -8,11 +8,10 @@ seed, or direction (in, out). Numbers may be hexadecimal, such as 0x1017.
 
 from __future__ import annotations
 
-import difflib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
-from canprobe.errors import UsageError
+from canprobe.errors import UsageError, did_you_mean
 from canprobe.fieldbus.tools.faults.fault import ENDLESS_HITS, FOREVER_NS, Fault, FaultKind, Parameter
 from canprobe.fieldbus.tools.faults.faulty_node import EVENTS
 
@@ -48,14 +47,16 @@ def parse_fault(text: str, kinds: Mapping[str, FaultKind], now_ns: int = 0) -> F
     kind = kinds.get(match["name"])
     if kind is None:
         raise UsageError(
-            f"fault {text!r}: unknown kind {match['name']!r}{_near(match['name'], kinds)};"
+            f"fault {text!r}: unknown kind {match['name']!r}{did_you_mean(match['name'], kinds, 0.6)};"
             " `canprobe inject --list` lists them"
         )
     if not 1 <= int(match["node"]) <= 127:
         raise UsageError(f"fault {text!r}: expected a node from 1 to 127, got {match['node']}")
     event = match["event"] or ""
     if event and event not in EVENTS:
-        raise UsageError(f"fault {text!r}: unknown event {event!r}{_near(event, EVENTS)}; events: {', '.join(EVENTS)}")
+        raise UsageError(
+            f"fault {text!r}: unknown event {event!r}{did_you_mean(event, EVENTS, 0.6)}; events: {', '.join(EVENTS)}"
+        )
     given = dict(word.split("=", 1) for word in match["values"].split())
     incoming = _direction(text, kind, given.pop("direction", None))
     known = {**kind.parameters, **_COMMON}
@@ -75,11 +76,6 @@ def parse_fault(text: str, kinds: Mapping[str, FaultKind], now_ns: int = 0) -> F
     )
 
 
-def _near(word: str, known: Iterable[str]) -> str:
-    close = difflib.get_close_matches(word, list(known), n=1)
-    return f"; did you mean {close[0]}?" if close else ""
-
-
 def _direction(text: str, kind: FaultKind, given: str | None) -> bool | None:
     if given is None:
         return None
@@ -94,7 +90,7 @@ def _number(text: str, name: str, value: str, known: Mapping[str, Parameter]) ->
     parameter = known.get(name)
     if parameter is None:
         raise UsageError(
-            f"fault {text!r}: unknown parameter {name!r}{_near(name, known)};"
+            f"fault {text!r}: unknown parameter {name!r}{did_you_mean(name, known, 0.6)};"
             f" it takes {', '.join([*known, 'direction'])}"
         )
     try:
