@@ -51,7 +51,7 @@ def to_frame(columns: Mapping[str, NDArray[Any]], attrs: Mapping[str, Any] | Non
         UsageError: pandas is missing, or columns differ in length.
     """
     values, units = _scalars(columns)
-    frame = _need("pandas", "a table").DataFrame(values)
+    frame = needed_module("pandas", "a table").DataFrame(values)
     if "t_s" in values:
         frame = frame.set_index("t_s")
     frame.attrs = {**(attrs or {}), "units": units}
@@ -73,7 +73,7 @@ def load_table(path: Path | str) -> pandas.DataFrame:
     source = Path(path)
     if source.suffix == ".npz":
         return to_frame(READERS.get(source.name, read_npz)(source))
-    reader, arrow = _need("pandas", "a table"), _need("pyarrow", "Parquet")
+    reader, arrow = needed_module("pandas", "a table"), needed_module("pyarrow", "Parquet")
     try:
         frame: pandas.DataFrame = reader.read_parquet(regular_file(source), engine="pyarrow")
     except (OSError, arrow.ArrowException) as error:
@@ -90,7 +90,7 @@ def write_parquet(
         UsageError: the extra is missing, or columns differ in length.
         ResultsError: the file cannot be written.
     """
-    arrow, parquet = _need("pyarrow", "Parquet"), _need("pyarrow.parquet", "Parquet")
+    arrow, parquet = needed_module("pyarrow", "Parquet"), needed_module("pyarrow.parquet", "Parquet")
     values, units = _scalars(columns)
     arrays = {name: arrow.array(column) for name, column in values.items()}
     fields = [arrow.field(name, array.type, metadata={"unit": units[name]}) for name, array in arrays.items()]
@@ -114,7 +114,12 @@ def _scalars(columns: Mapping[str, NDArray[Any]]) -> tuple[dict[str, NDArray[Any
     return found, units
 
 
-def _need(module: str, purpose: str) -> Any:
+def needed_module(module: str, purpose: str) -> Any:
+    """A module of the extra `data`, imported.
+
+    Raises:
+        UsageError: it is missing; the message says what for, and the line to type.
+    """
     try:
         return importlib.import_module(module)
     except ImportError as error:

@@ -17,7 +17,6 @@ Source: Hugging Face LeRobot 0.6.1, `lerobot/datasets`, format v3.0.
 
 from __future__ import annotations
 
-import importlib
 import json
 import os
 import shutil
@@ -29,10 +28,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.cell.master.joint_columns import joint_positions
+from canprobe.cell.results.files import needed_module
 from canprobe.cell.results.run_files import LOG, TACTILE, read_log, read_scene, read_summary, read_tactile
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.scene.setup import Setup
-from canprobe.errors import UsageError, install_line
+from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.files import make_folder, writing
 from canprobe.mechanics.touch.pad import COUNTS_MAX
 
@@ -92,8 +93,7 @@ def export_lerobot(runs: Sequence[Path | str], folder: Path | str, *, fps: int |
         ResultsError: the dataset cannot be written; nothing of it is left.
     """
     for module in ("pyarrow", "pandas"):
-        if importlib.util.find_spec(module) is None:
-            raise UsageError(f"a LeRobot dataset needs {module}: {install_line('data')}")
+        needed_module(module, "a LeRobot dataset")
     target, sources = Path(folder), [Path(run) for run in runs]
     if not sources:
         raise UsageError("expected folders of runs, got none")
@@ -283,10 +283,10 @@ def _refuse_gaps(file: Path, times: NDArray[Any], rate_hz: float) -> None:
 def _arm_features(setup: Setup, log: Columns, rows: slice) -> Iterator[tuple[str, Feature]]:
     """State, action and torque of the joints; held where the cell had none."""
     assert setup.arm is not None
-    slides = np.array(setup.arm.model.chain.prismatic, dtype=bool)
     names = [f"{joint.name}.pos" for joint in setup.arm.model.joints]
-    q = _held(_joints(log, "q", slides), 0.0)
-    target = _joints(log, "q_target", slides)
+    unknown = np.full((len(log["t_s"]), len(names)), np.nan)
+    q, target = (unknown if (found := joint_positions(log, name)) is None else found for name in ("q", "q_target"))
+    q = _held(q, 0.0)
     yield "observation.state", Feature(names, q[rows].astype(np.float32))
     yield "action", Feature(names, _held(target, q)[rows].astype(np.float32))
     if "torque_permille" in log:
@@ -295,15 +295,6 @@ def _arm_features(setup: Setup, log: Columns, rows: slice) -> Iterator[tuple[str
             "observation.torque",
             Feature([f"{joint.name}.torque_permille" for joint in setup.arm.model.joints], torque),
         )
-
-
-def _joints(log: Columns, name: str, slides: NDArray[Any]) -> NDArray[Any]:
-    """A joint vector: rad for joints that turn, m for those that slide."""
-    turning, sliding = log.get(f"{name}_rad"), log.get(f"{name}_m")
-    whole = turning if turning is not None else sliding
-    if whole is None:
-        return np.full((len(log["t_s"]), len(slides)), np.nan)
-    return whole if turning is None or sliding is None else np.where(slides, sliding, turning)
 
 
 def _held(values: NDArray[Any], before: NDArray[Any] | float) -> NDArray[Any]:
