@@ -12,8 +12,7 @@ from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.noise import Correlation, Noise, SlowErrors
-from canprobe.mechanics.touch.estimate.online import Gate, slow_share
-from canprobe.mechanics.touch.estimate.travel import Travel
+from canprobe.mechanics.touch.estimate.online import Gate, PadWay
 from canprobe.mechanics.touch.patch.force_errors import UPPER_SIGMAS, ForceSigma
 from canprobe.mechanics.touch.surface import SurfaceMatrix
 from canprobe.mechanics.types import Floats
@@ -196,9 +195,8 @@ def bound_of_scan(
     normals = np.array([s.n_base for s in samples])
     gate = Gate(1.0, sigma_normal)
     point, height, normal = np.array([gate.sigmas(s) for s in samples]).T
-    share = np.array([slow_share(s, sigma) for s, sigma in zip(samples, point.tolist(), strict=True)])
-    pad = Travel(float(np.median(point)))
-    way = np.array([(pad.add(s.r_probe), pad.total)[1] for s in samples])
+    pad = PadWay(float(np.median(point)))
+    share, way = np.array([pad.step(s, sigma) for s, sigma in zip(samples, point.tolist(), strict=True)]).T
     path = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
     if len(path) < 3 or path[-1] < max(RUN_IN_M, memory_m):
         return None

@@ -14,7 +14,13 @@ from canprobe.cell.master.controller import Measurement, TactileSample
 from canprobe.mechanics.robot.chain import ending_in, forward
 from canprobe.mechanics.robot.model import ArmModel
 from canprobe.mechanics.robot.motors import position_sigma
-from canprobe.mechanics.touch.contact import ContactSample, Slope, contact_sample, indentation_from_force
+from canprobe.mechanics.touch.contact import (
+    HOLLOW_LIMIT_SHARE,
+    ContactSample,
+    Slope,
+    contact_sample,
+    indentation_from_force,
+)
 from canprobe.mechanics.touch.layer_stiffness import stiffness_from_slope
 from canprobe.mechanics.touch.patch.array_calibration import ContactNoise, Lag
 from canprobe.mechanics.touch.patch.dead_taxels import mended
@@ -29,9 +35,6 @@ if TYPE_CHECKING:
 
 MAX_STIFFNESS_RATIO = 6.0
 """Largest ratio of the measured slope and the slope by the stated stiffness on a plane; the slope is limited to it."""
-HOLLOW_LIMIT_SHARE = 0.9
-"""Limit of a hollow: curvature over −1/radius of the probe up to which there is one patch of contact."""
-
 
 HISTORY_CYCLES = 64
 """Cycles whose joints are kept."""

@@ -18,6 +18,7 @@ import numpy as np
 
 from canprobe.cell.results.picture import BLUE, INK, ORANGE, legend, picture
 from canprobe.lab.studies.harness import Column, Row, StudyResult
+from canprobe.mechanics.touch.linear_algebra import rms
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.patch.array_calibration import ArrayCalibration
 from canprobe.mechanics.touch.patch.array_models import make_patch_calibration
@@ -74,16 +75,12 @@ def score_holds(
     raw, error, stated = np.array(seconds).T
     return {
         "seconds": len(seconds),
-        "uncorrected_percent": 100.0 * _rms(raw),
-        "error_percent": 100.0 * _rms(error),
-        "stated_percent": 100.0 * _rms(stated),
+        "uncorrected_percent": 100.0 * rms(raw),
+        "error_percent": 100.0 * rms(error),
+        "stated_percent": 100.0 * rms(stated),
         "within_percent": 100.0 * float(np.mean(np.abs(error) <= UPPER_SIGMAS * stated)),
         "bound_percent": 100.0 * bounds / (bounds + len(seconds)),
     }
-
-
-def _rms(values: Floats) -> float:
-    return math.sqrt(float(np.mean(np.square(values))))
 
 
 def findings(rows: Sequence[Row]) -> list[str]:

@@ -29,6 +29,7 @@ from canprobe.lab.studies.array_forces import GROUPS, HOLD_S, HOLDS, result_of, 
 from canprobe.lab.studies.harness import Column, Row, StudyResult
 from canprobe.lab.studies.result_files import measuring_facts
 from canprobe.lab.studies.sweep import Sweep
+from canprobe.mechanics.touch.linear_algebra import rms
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.patch.array_models import make_image_model, make_patch_calibration
 from canprobe.mechanics.touch.patch.calibrate import ArrayFit, calibrate_array
@@ -310,16 +311,12 @@ def measure(seed: int) -> dict[str, Any]:
         "blur": config.blur_pitch,
         "crosstalk": config.crosstalk,
         "left_out": fit.left_out,
-        "force_percent": _rms_percent(np.array(forces)),
+        "force_percent": 100.0 * rms(np.array(forces)),
         "stiffness_percent": 100.0 * (found.stiffness.moments / stiffness - 1.0),
         "by_depth_percent": 100.0 * (found.stiffness.depth / stiffness - 1.0),
-        "moments_percent": _rms_percent(np.array(moments)),
-        "curvature_percent": _rms_percent(np.array(curvatures)),
+        "moments_percent": 100.0 * rms(np.array(moments)),
+        "curvature_percent": 100.0 * rms(np.array(curvatures)),
     }
-
-
-def _rms_percent(values: Floats) -> float:
-    return 100.0 * math.sqrt(float(np.mean(np.square(values))))
 
 
 def findings(rows: Sequence[Row]) -> list[str]:

@@ -43,6 +43,7 @@ from canprobe.mechanics.robot.inverse import inverse_near
 from canprobe.mechanics.robot.model import ArmModel, joints_to_units, units_to_joints
 from canprobe.mechanics.robot.motors import units_per_motor
 from canprobe.mechanics.robot.probe_poses import probe_pose, start_posture
+from canprobe.mechanics.touch.linear_algebra import rms
 from canprobe.mechanics.touch.objects import make_object
 from canprobe.mechanics.types import Floats
 
@@ -258,14 +259,10 @@ def errors(truth: dict[str, Floats], seen: dict[str, Floats]) -> dict[str, float
     """RMS errors of an integration."""
     taxels = (seen["taxels"] - truth["taxels"])[:, np.any(truth["taxels"] > 0.0, axis=0)]
     return {
-        "force_percent": 100.0 * _rms(seen["force"] - truth["force"]) / _rms(truth["force"]),
-        "position_um": 1e6 * _rms(np.linalg.norm(seen["centre"] - truth["centre"], axis=1)),
-        "taxel_counts": 255.0 / FULL_SCALE_PA * _rms(taxels),
+        "force_percent": 100.0 * rms(seen["force"] - truth["force"]) / rms(truth["force"]),
+        "position_um": 1e6 * rms(np.linalg.norm(seen["centre"] - truth["centre"], axis=1)),
+        "taxel_counts": 255.0 / FULL_SCALE_PA * rms(taxels),
     }
-
-
-def _rms(values: Floats) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def verdict(row: Row) -> str:

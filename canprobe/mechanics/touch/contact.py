@@ -19,6 +19,9 @@ from canprobe.errors import UsageError
 from canprobe.mechanics.touch.linear_algebra import positive
 from canprobe.mechanics.types import Floats
 
+HOLLOW_LIMIT_SHARE = 0.9
+"""Limit of a hollow: curvature over −1/radius of the probe up to which there is one patch of contact."""
+
 
 class Doubt(Enum):
     """Why the place of a contact is known less well than usual."""

@@ -22,6 +22,11 @@ _T = TypeVar("_T")
 _UPPER, _IDENTITY = np.triu(np.ones((16, 16))), np.eye(16)
 
 
+def rms(values: Floats) -> float:
+    """Root of the mean square; NaN where there is no value."""
+    return math.sqrt(float(np.mean(np.square(values)))) if len(values) else math.nan
+
+
 def upper_root(A: Floats) -> Floats:
     """The upper triangular R of a QR decomposition, Rᵀ R = Aᵀ A."""
     qr, _, _, _ = dgeqrf(A)

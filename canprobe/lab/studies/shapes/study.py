@@ -21,6 +21,7 @@ from canprobe.lab.studies.shapes.contacts_file import ShapeContacts, read_column
 from canprobe.lab.studies.shapes.methods import METHODS, FittedSurface, Method
 from canprobe.lab.studies.shapes.scans import DEVELOPMENT, SECONDS, TEST, ScanCase, drawn, scan
 from canprobe.lab.studies.sweep import Sweep
+from canprobe.mechanics.touch.linear_algebra import rms
 from canprobe.mechanics.touch.meshing import Mesh, mesh_of
 from canprobe.mechanics.types import Floats
 
@@ -178,8 +179,8 @@ def scored(surface: FittedSurface, mesh: Mesh, truth: Mapping[str, Floats]) -> d
         "completeness_um": 1e6 * float(np.minimum(away, WORST_M).mean()),
         "missed": float(missed.mean()),
         **{f"f_{limit:g}mm": _harmonic(p, r) for limit, p, r in zip(LIMITS_MM, hit, found, strict=True)},
-        "normal_mrad": 1e3 * _rms(turned),
-        "curvature_per_m": _rms(bent[np.isfinite(bent)]),
+        "normal_mrad": 1e3 * rms(turned),
+        "curvature_per_m": rms(bent[np.isfinite(bent)]),
         "nll": float(np.mean(density)) if len(z) else None,
         "coverage": float(np.mean(np.abs(z) < 1.96)) if len(z) else None,
     }  # fmt: skip
@@ -197,10 +198,6 @@ def distance_from(points: Floats, normals: Floats, tensors: Floats, at: Floats) 
 
 def _harmonic(a: float, b: float) -> float:
     return 2.0 * a * b / (a + b) if a + b else 0.0
-
-
-def _rms(values: Floats) -> float:
-    return math.sqrt(float(np.mean(values**2))) if len(values) else math.nan
 
 
 def row_of(method: Method, budget: float, scores: Sequence[Mapping[str, Any]]) -> Row:

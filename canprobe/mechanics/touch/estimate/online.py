@@ -9,6 +9,7 @@ from typing import Protocol
 
 from canprobe.mechanics.touch.contact import ContactSample, Doubt
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
+from canprobe.mechanics.touch.estimate.travel import Travel
 from canprobe.mechanics.touch.linear_algebra import positive
 
 
@@ -110,7 +111,7 @@ class Gate:
 
     def sigmas(self, sample: ContactSample) -> tuple[float, float, float]:
         """Standard deviations of a sample: point along the surface and along the normal (m), normal (rad)."""
-        wider = max([DOUBT_SIGMA_SCALE[doubt] for doubt in sample.doubts], default=1.0)
+        wider = _widening(sample)
         point = math.hypot(self.sigma_point if sample.sigma_point is None else sample.sigma_point, sample.sigma_motion)
         return (
             wider * point,
@@ -119,10 +120,29 @@ class Gate:
         )
 
 
-def slow_share(sample: ContactSample, sigma_point: float) -> float:
-    """Slow errors of a sample along the surface over its stated ones, `sigma_point` with motion (m): at most 1."""
-    wider = max([DOUBT_SIGMA_SCALE[doubt] for doubt in sample.doubts], default=1.0)
-    return min(wider * sample.sigma_slow / sigma_point, 1.0)
+class PadWay:
+    """Follows contacts over the pad, along whose way their slow errors change.
+
+    Args:
+        sigma_point: standard deviation of a point, m: noise at rest makes no way.
+    """
+
+    def __init__(self, sigma_point: float) -> None:
+        self._travel = Travel(sigma_point)
+
+    def step(self, sample: ContactSample, sigma_point: float) -> tuple[float, float]:
+        """Take a contact with its standard deviation along the surface, as `Gate.sigmas` gives it, m.
+
+        Returns:
+            Slow errors of the contact over this standard deviation, at most 1; and the way over the pad up to it, m.
+        """
+        self._travel.add(sample.r_probe)
+        return min(_widening(sample) * sample.sigma_slow / sigma_point, 1.0), self._travel.total
+
+
+def _widening(sample: ContactSample) -> float:
+    """Factor on the standard deviations of a contact by the doubts about its image."""
+    return max([DOUBT_SIGMA_SCALE[doubt] for doubt in sample.doubts], default=1.0)
 
 
 def _usable(sigma: float | None) -> bool:

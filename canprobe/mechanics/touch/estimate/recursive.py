@@ -26,7 +26,7 @@ from canprobe.mechanics.touch.estimate.noise import CHI2_99, CHI2_999, Correlati
 from canprobe.mechanics.touch.estimate.nonlinear import DIFFUSE_INFORMATION
 from canprobe.mechanics.touch.estimate.observed import decide, nothing_observed
 from canprobe.mechanics.touch.estimate.omitted_terms import ExpectedMisfit
-from canprobe.mechanics.touch.estimate.online import Dropped, Gate, slow_share
+from canprobe.mechanics.touch.estimate.online import Dropped, Gate, PadWay
 from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.estimate.quadric import C_PER_Q, size_of
 from canprobe.mechanics.touch.estimate.start import Start
@@ -121,7 +121,7 @@ class RecursiveEstimator:
         self._last: MeasuredContact | None = None
         self._pending: deque[_Pending] = deque(maxlen=MAX_PENDING)
         self._travel = Travel(max(UPDATE_TRAVEL_SHARE * self._memory, 3.0 * self._gate.sigma_point))
-        self._pad = Travel(self._gate.sigma_point)
+        self._pad = PadWay(self._gate.sigma_point)
         self._spread = Spread()
         self._change = ChangeTest()
         self._start: Start | None = Start(self._memory, self._prior)
@@ -133,7 +133,7 @@ class RecursiveEstimator:
         if not self._gate.passes(sample, self.dropped):
             return
         point, height, normal = self._gate.sigmas(sample)
-        self._pad.add(sample.r_probe)
+        slow, way = self._pad.step(sample, point)
         touch = MeasuredContact(
             sample.p_base,
             sample.n_base,
@@ -141,8 +141,8 @@ class RecursiveEstimator:
             sigma_height=self._taller * height,
             sigma_normal=normal,
             coupling=self._coupling,
-            slow=slow_share(sample, point),
-            way=self._pad.total,
+            slow=slow,
+            way=way,
         )
         moved = self._travel.add(sample.p_base)
         self._pending.append(_Pending(touch, self._travel.weight))

@@ -19,9 +19,8 @@ from canprobe.mechanics.touch.estimate.change import LAST_SAMPLES, MAX_AGREEING_
 from canprobe.mechanics.touch.estimate.differences import chord_pairs, solve_pairs
 from canprobe.mechanics.touch.estimate.likelihood import ContactBatch, fit_ml, make_touches
 from canprobe.mechanics.touch.estimate.noise import Correlation, Noise, SlowErrors
-from canprobe.mechanics.touch.estimate.online import Dropped, Gate, slow_share
+from canprobe.mechanics.touch.estimate.online import Dropped, Gate, PadWay
 from canprobe.mechanics.touch.estimate.prior import Prior
-from canprobe.mechanics.touch.estimate.travel import Travel
 from canprobe.mechanics.touch.linear_algebra import whole
 from canprobe.mechanics.types import Floats
 
@@ -56,13 +55,12 @@ class WindowEstimator:
         self._gate = Gate(sigma_point, sigma_normal)
         self._prior, self._coupling, self._correlation = prior, coupling, correlation
         self._rows: deque[Sequence[float]] = deque(maxlen=kept)
-        self._pad = Travel(sigma_point)
+        self._pad = PadWay(sigma_point)
         self._answer: SurfaceEstimate | None = None
 
     def add(self, sample: ContactSample) -> None:
         """Take one contact."""
         if self._gate.passes(sample, self.dropped):
-            self._pad.add(sample.r_probe)
             self._rows.append(self._row(sample))
             self._answer = None
 
@@ -87,8 +85,7 @@ class WindowEstimator:
     def _row(self, sample: ContactSample) -> Sequence[float]:
         """The row that is kept of a sample: point, normal, their noise; a subclass adds what it needs."""
         sigmas = self._gate.sigmas(sample)
-        slow = slow_share(sample, sigmas[0]), self._pad.total
-        return (*sample.p_base.tolist(), *sample.n_base.tolist(), *sigmas, *slow)
+        return (*sample.p_base.tolist(), *sample.n_base.tolist(), *sigmas, *self._pad.step(sample, sigmas[0]))
 
     def _touches(self) -> ContactBatch:
         rows = np.array(self._rows)

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.blend import REACH_M, Feet
-from canprobe.mechanics.touch.contact import ContactSample, Slope
+from canprobe.mechanics.touch.contact import HOLLOW_LIMIT_SHARE, ContactSample, Slope
 from canprobe.mechanics.touch.estimate.observed import MIN_SPREAD
 from canprobe.mechanics.touch.linear_algebra import checked, positive, real
 from canprobe.mechanics.touch.map import nodes as column
@@ -273,7 +273,7 @@ class ContactMap:
         if self._stated is None:
             return None
         kappa, tree = np.linalg.eigvalsh(fits.K), cKDTree(discs.origin)
-        kappa = np.maximum(kappa, -0.9 / self._stated.radius)
+        kappa = np.maximum(kappa, -HOLLOW_LIMIT_SHARE / self._stated.radius)
         slope = images = None
         if self._touch is not None:
             of_touch, place = self._touch

@@ -24,6 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from canprobe.mechanics.touch.contact import HOLLOW_LIMIT_SHARE
 from canprobe.mechanics.touch.map import nodes as column
 from canprobe.mechanics.touch.map.discs import MIN_FACING, Discs
 from canprobe.mechanics.touch.map.noise import MapNoise
@@ -38,8 +39,6 @@ from canprobe.mechanics.touch.map.quartic import (
 )
 from canprobe.mechanics.types import Floats
 
-MAX_HOLLOW_SHARE = 0.9
-"""Limit of a hollow over the probe's curvature, in depths."""
 CHANCE_SIGMAS = 2.0
 """Standard deviations of χ² per degree of freedom by which it must be above 1 to be more than chance."""
 COMMON = 4
@@ -124,7 +123,7 @@ def fit_discs(
 def _followed(K: Floats, radius: float) -> Floats:
     """Curvatures (n, 2, 2) no hollower than a pad of a radius can follow."""
     values, axes = np.linalg.eigh(K)
-    values = np.maximum(values, -MAX_HOLLOW_SHARE / radius)
+    values = np.maximum(values, -HOLLOW_LIMIT_SHARE / radius)
     result: Floats = np.einsum("nij,nj,nkj->nik", axes, values, axes)
     return result
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import indentation_from_force
+from canprobe.mechanics.touch.linear_algebra import rms
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.patch.array_calibration import (
     ArrayCalibration,
@@ -156,7 +157,7 @@ def calibrate_array(
     by_images = stiffness, stiffness * math.sqrt(float(found.covariance[0, 0]))
     by_depth = stiffness_by_depth(ds, ss, found.forces.tolist(), pad.radius_m, by_images)
     rods = [(d, s) for d, s in good if d.name == "rod"]
-    across = _rms(_checked(first, rods, own, seen)[1][:, 0]) if rods else math.nan
+    across = rms(_checked(first, rods, own, seen)[1][:, 0]) if rods else math.nan
     patch = make_patch_calibration(first, pad)
     depths = [_depths(d, s, patch, stiffness) for d, s in fitted]
     noise, centroid, scatter = fit_noise(ds, ss, depths)
@@ -168,7 +169,7 @@ def calibrate_array(
         noise=noise,
         centroid=centroid,
         stiffness=StiffnessSources(*by_images, *by_depth),
-        residuals=Residuals(len(fitted), _rms(force_errors), _rms(errors[:, :2]), _rms(curvatures), across),
+        residuals=Residuals(len(fitted), rms(force_errors), rms(errors[:, :2]), rms(curvatures), across),
         dead=dead if own_gains else (),
     )
     offset, of_object = _offsets(good)
@@ -188,10 +189,6 @@ def calibrate_array(
         offset=offset,
         object_offset=of_object,
     )
-
-
-def _rms(values: Floats) -> float:
-    return math.sqrt(float(np.mean(np.square(values)))) if len(values) else math.nan
 
 
 def _blank(  # noqa: PLR0917
@@ -282,7 +279,7 @@ def _by_gains(pairs: Pairs, calibration: ArrayCalibration, plain: PatchCalibrati
         check = [(d, what_is_shown(d, own, LAST_IMAGE_S)) for d, _ in pairs[1 - half :: 2]]
         gained.append(_checked(calibration, check, plain, seen)[0][:, :2])
         alike.append(_checked(calibration, pairs[1 - half :: 2], plain, seen)[0][:, :2])
-    return _rms(np.concatenate(gained)), _rms(np.concatenate(alike))
+    return rms(np.concatenate(gained)), rms(np.concatenate(alike))
 
 
 def _offsets(pairs: Pairs) -> tuple[Floats, Floats]:

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from canprobe.mechanics.touch.linear_algebra import rms
 from canprobe.mechanics.touch.patch.force_creep import ForceCreep
 from canprobe.mechanics.touch.patch.force_errors import USUAL_LIGHTNESS, ForceErrors
 from canprobe.mechanics.touch.patch.image import PatchCalibration, compute_patch
@@ -55,9 +56,9 @@ def fit_force(  # noqa: PLR0917
     corrected, decades = np.array([_corrected(d, f, creep, full=d.force is not None) for d, f in pairs]).T
     more = np.sqrt(np.maximum(np.array([s.lightness for s in shown]) / USUAL_LIGHTNESS, 1.0))
     scatter = _scatter(dwells, shown, corrected, np.array(units)) / more
-    array = _rms(scatter)
+    array = rms(scatter)
     if len(held_out):
-        array = math.hypot(array, _rms(held_out) / _rms(more[loads]))
+        array = math.hypot(array, rms(held_out) / rms(more[loads]))
     used = loads or list(range(len(dwells)))
     return ForceErrors(
         creep=creep,
@@ -66,10 +67,6 @@ def fit_force(  # noqa: PLR0917
         array=max(array, MIN_ARRAY_SIGMA),
         spread=spread,
     )
-
-
-def _rms(values: Floats) -> float:
-    return math.sqrt(float(np.mean(np.square(values))))
 
 
 def _det(dwell: Dwell, radius: float) -> float:
