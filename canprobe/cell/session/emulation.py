@@ -52,6 +52,7 @@ def emulate(
     homed: bool = False,
     faults: Sequence[str] = (),
     say: Say = quiet,
+    outlasts: bool = False,
 ) -> None:
     """Serve emulated nodes on a real interface until interrupted, for any master.
 
@@ -67,6 +68,7 @@ def emulate(
         homed: whether drives that need homing start with their zeros, and keep them.
         faults: faults, as `canprobe.fieldbus.tools.faults.parse_fault` reads them; their times count from the start.
         say: called when the nodes are about to be served.
+        outlasts: whether the nodes outlast an interface that is down for a while.
 
     Raises:
         UsageError: when the scene does not fit, a fault is wrong, or a file of `store_folder` belongs to another node.
@@ -112,6 +114,7 @@ def emulate(
                 say=say,
                 in_realtime=plan.setup.realtime,
                 cycles_kept=plan.cycles if truth_path is not None else 0,
+                outlasts=outlasts,
             )
         finally:
             if truth_path is not None and world.recorder is not None:
@@ -226,6 +229,7 @@ def _serve(
     say: Say,
     in_realtime: bool,
     cycles_kept: int = 0,
+    outlasts: bool = False,
 ) -> None:
     """Serve nodes until interrupted, and throw the faults that are given and those that come by the control channel."""
     from canprobe.fieldbus.node.serve import serve
@@ -255,7 +259,7 @@ def _serve(
                 server.poll(clock.now_ns())
             return False
 
-        serve(buses, look)
+        serve(buses, look, outlasts=outlasts)
 
 
 def _named(nodes: Sequence[SlaveNode]) -> str:

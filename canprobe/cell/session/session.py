@@ -76,6 +76,7 @@ class Session:
 
     Attributes:
         record: record of the buses, from the entry on; every time in the files of the run counts from its `origin_ns`.
+        around: puts something round the cell's port, such as a meter; set before the session is entered.
         unwritten: files that could not be written, each with the reason; the cell's faults list them too.
     """
 
@@ -94,11 +95,13 @@ class Session:
         self.observers = Observers(options.observers) if options.observers else None
         self._say = options.say
         self._stack = ExitStack()
+        self._open_buses = self._stack.enter_context(ExitStack())  # left last, also those that were opened again
         self._entered = self._left = False
         self._cell: Cell | None = None
         self._direct: Callable[..., Cycle] | None = None
         self._recovery: Recovery | None = None
         self._child: EmulatorChild | None = None
+        self.around: Callable[[Port], Port] = lambda port: port
 
     @cached_property
     def world(self) -> World:
@@ -148,7 +151,7 @@ class Session:
             self._say(f"warning: {warning}")
         self.record = self._stack.enter_context(BusRecord(self.plan, self.out, self.observers))
         try:
-            port = self._open()
+            port = self.around(self._open())
             self.steps.time_s = lambda: (port.clock.now_ns() - self.record.origin_ns) * 1e-9
             self._cell = self._make_cell(port)
             if not self.virtual:
@@ -353,7 +356,7 @@ class Session:
         for port in before.values():
             port.close()
         ports = open_ports(self.plan, clock, lambda channel: Reports(self.record.error_writer(channel), self._note))
-        self._ports = self._stack.enter_context(ports)
+        self._ports = self._open_buses.enter_context(ports)
         for name, port in before.items():
             self._ports[name].counters.add(port.counters)
         return {name: RecordingPort(port, self.record.writer(name)) for name, port in self._ports.items()}
