@@ -157,13 +157,18 @@ def _rows_expected(rows: Sequence[int], cycles: int) -> float:
 
 
 def _longest_in_a_minute(ascending: Sequence[int], seconds: float) -> float:
-    """Longest time to expect in a minute, ns, by an exponential tail behind the 99th percentile."""
+    """Longest time to expect in a minute, ns: by an exponential tail behind the 99th percentile, or by its last steps.
+
+    On a full bus answers have a bound: the longest lies close to the 99.9th percentile, and no longer ones follow.
+    """
     beyond = ascending[int(0.99 * len(ascending)) :]
     if len(beyond) < MIN_TAIL:
         return float(beyond[-1] if beyond else 0)
     mean_excess = sum(beyond) / len(beyond) - beyond[0]
     number = len(beyond) * max(1.0, MINUTE_S / seconds)
-    return max(float(beyond[-1]), beyond[0] + mean_excess * math.log(number))
+    longest, last_steps = beyond[-1], beyond[-1] - beyond[int(0.9 * len(beyond))]
+    more = math.log(max(1.0, MINUTE_S / seconds)) / math.log(10.0) * last_steps
+    return min(longest + 2.0 * more, max(float(longest), beyond[0] + mean_excess * math.log(number)))
 
 
 def _fit_rate(figures: LinkFigures, limits: LinkLimits, rate_hz: float) -> float | None:
