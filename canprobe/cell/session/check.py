@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +15,9 @@ from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.first_second import link_limits
 from canprobe.cell.session.session import Session
 from canprobe.errors import InterfaceError, UsageError
+from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.port import ControllerState, Port
+from canprobe.fieldbus.bus.real.processor import MASTER_PRIORITY, realtime
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE
 from canprobe.fieldbus.tools.link import (
     Fitness,
@@ -23,8 +26,11 @@ from canprobe.fieldbus.tools.link import (
     LinkVerdict,
     judge_link,
 )
-from canprobe.fieldbus.tools.link.machine import machine_facts
+from canprobe.fieldbus.tools.link.figures import quantile, us
+from canprobe.fieldbus.tools.link.machine import machine_facts, wake_lateness
 
+IDLE_S = 1.0
+"""Time of the loop that does nothing."""
 SETTLE_S = 0.3
 """Time of cycles before the measurement, until both sides run at their usual speed."""
 
@@ -141,6 +147,7 @@ def measure_link(session: Session, seconds: float) -> LinkReport:
         return meters[0]
 
     session.around = metered
+    machine = {} if session.virtual else _machine(plan)
     with session:
         cell, meter = session.cell, meters[0]
         session.options.say(f"measure for {seconds:g} s, with the drives disabled")
@@ -175,9 +182,18 @@ def measure_link(session: Session, seconds: float) -> LinkReport:
         tuple(bus.channel for bus in plan.buses),
         judge_link(figures, link_limits(plan)),
         figures,
-        {} if session.virtual else machine_facts(plan.buses[0].channel),
+        machine,
         tuple(found.remarks) if found is not None else (),
     )
+
+
+def _machine(plan: Plan) -> dict[str, str]:
+    """Facts of the machine, with the lateness of a loop that does nothing, before anything is opened."""
+    with realtime(MASTER_PRIORITY, quiet) if plan.setup.realtime else contextlib.nullcontext():
+        late = wake_lateness(MonotonicClock(), plan.sync.period_ns, round(IDLE_S * 1e9 / plan.sync.period_ns))
+    shown = [_us(us(quantile(late, share))) for share in (0.5, 0.99, 1.0)]
+    text = "p50 {}, p99 {}, at most {}, without a bus".format(*shown)
+    return {"wakes_late_by": text, **machine_facts(plan.buses[0].channel)}
 
 
 def _traffic(plan: Plan) -> dict[str, Any]:
