@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from canprobe.cell.master.options import Say, quiet
 from canprobe.cell.npz import write_npz
@@ -39,6 +39,19 @@ if TYPE_CHECKING:
     from canprobe.fieldbus.node.slave_node import SlaveNode
 
 
+class Onlooker(Protocol):
+    """Somebody who looks on while nodes are served, and says when that ends."""
+
+    def tap(self, port: Port) -> Port:
+        """A port in the place of the port of the nodes."""
+
+    def begin(self, nodes: FaultyNodes, now_ns: int) -> None:
+        """The nodes are about to be served."""
+
+    def look(self, now_ns: int) -> bool:
+        """Look after each wait; whether serving ends."""
+
+
 def emulate(
     scene: Scene,
     target: Target,
@@ -51,6 +64,7 @@ def emulate(
     without_id: tuple[int, ...] = (),
     homed: bool = False,
     faults: Sequence[str] = (),
+    onlooker: Onlooker | None = None,
     say: Say = quiet,
 ) -> None:
     """Serve emulated nodes on a real interface until interrupted, for any master.
@@ -66,6 +80,7 @@ def emulate(
         without_id: ids of the nodes that start without a node id and wait for LSS.
         homed: whether drives that need homing start with their zeros, and keep them.
         faults: faults, as `canprobe.fieldbus.tools.faults.parse_fault` reads them; their times count from the start.
+        onlooker: looks on, and may end the serving.
         say: called when the nodes are about to be served.
 
     Raises:
@@ -109,6 +124,7 @@ def emulate(
                 [(on[channel], port) for channel, port in ports.items()],
                 faulty,
                 faults,
+                onlooker,
                 say=say,
                 in_realtime=plan.setup.realtime,
                 cycles_kept=plan.cycles if truth_path is not None else 0,
@@ -126,6 +142,7 @@ def emulate_eds(
     serial_numbers: Sequence[int | None] = (),
     in_realtime: bool = False,
     faults: Sequence[str] = (),
+    onlooker: Onlooker | None = None,
     say: Say = quiet,
 ) -> None:
     """Serve a node from each EDS file on a real interface until interrupted, for any master.
@@ -136,7 +153,7 @@ def emulate_eds(
         store_folder: as for :func:`emulate`.
         serial_numbers: 1018h:04 of each node; None or left out: as its file has it.
         in_realtime: whether to ask for SCHED_FIFO, a processor and locked memory.
-        faults: as for :func:`emulate`.
+        faults, onlooker: as for :func:`emulate`.
         say: called with the number of warnings of each file, and when the nodes are served.
 
     Raises:
@@ -170,7 +187,7 @@ def emulate_eds(
                 node.lss.bitrate = target.bitrate
         _keep(nodes, store_folder)
         faulty = FaultyNodes(map(FaultyNode, nodes))
-        _serve([(faulty.nodes, port)], faulty, faults, say=say, in_realtime=in_realtime)
+        _serve([(faulty.nodes, port)], faulty, faults, onlooker, say=say, in_realtime=in_realtime)
 
 
 def _make_places(truth_path: Path | None, store_folder: Path | None) -> None:
@@ -222,6 +239,7 @@ def _serve(
     buses: Sequence[tuple[Sequence[Participant], Port]],
     faulty: FaultyNodes,
     faults: Sequence[str],
+    onlooker: Onlooker | None,
     *,
     say: Say,
     in_realtime: bool,
@@ -253,8 +271,11 @@ def _serve(
         def look() -> bool:
             for server in servers:
                 server.poll(clock.now_ns())
-            return False
+            return onlooker is not None and onlooker.look(clock.now_ns())
 
+        if onlooker is not None:
+            buses = [(nodes, onlooker.tap(port)) for nodes, port in buses]
+            onlooker.begin(faulty, start_ns)
         serve(buses, look)
 
 

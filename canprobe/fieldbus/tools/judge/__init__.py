@@ -12,6 +12,7 @@ Frames come in, of a log or of nodes that are served here; findings go out, each
     rules       the table of all rules
     judging     `Judge`: events to rules, findings to a report
     record      a candump log as frames
+    bench       a master on nodes that are served here; command starts and ends it, injections throws faults meanwhile
 
 Guards against false alarms: a node is judged after its state was seen; three SYNCs after an NMT start and frames that
 may have waited in a queue are passed over; what is wrong counts when it is wrong twice in a row, but for faults that
@@ -22,9 +23,10 @@ Several axes in one node (objects from 6800h on) are not known.
 Start reading at `bus_state`, then `rule`, then `enable`.
 """
 
+from canprobe.fieldbus.tools.judge.bench import MasterBench, first_answers, write_log
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.judging import Judge, judge_frames
 from canprobe.fieldbus.tools.judge.record import read_record
 from canprobe.fieldbus.tools.judge.rules import RULES
 
-__all__ = ["RULES", "BusFrame", "Judge", "judge_frames", "read_record"]
+__all__ = ["RULES", "BusFrame", "Judge", "MasterBench", "first_answers", "judge_frames", "read_record", "write_log"]
