@@ -140,7 +140,7 @@ def _judge_served(args: argparse.Namespace) -> int:
     output = args.output or Path(tempfile.mkstemp(prefix="canprobe-judge-", suffix=".txt")[1])
     faults = () if args.passive else args.inject or None
     bench = MasterBench(args.command, args.seconds, faults, output)
-    target, serve = _server(args, bench)
+    target, serve = _server(args, bench, nodes)
     try:
         with left_by_ctrl_c():
             serve()
@@ -158,9 +158,12 @@ def _judge_served(args: argparse.Namespace) -> int:
     return _TIMED_OUT if bench.timed_out else _status_of_command(bench)
 
 
-def _server(args: argparse.Namespace, bench: MasterBench) -> tuple[Target, Callable[[], None]]:
-    """The bus, and the function that serves the nodes on it."""
+def _server(
+    args: argparse.Namespace, bench: MasterBench, nodes: Mapping[int, Description]
+) -> tuple[Target, Callable[[], None]]:
+    """The bus, and the function that serves the nodes on it; drives stand away from 0, where a jump to 0 is seen."""
     from canprobe import api
+    from canprobe.fieldbus.tools.judge import start_position
 
     channels = args.channel or [(None, None)]
     if len(channels) > 1 or channels[0][0] is not None:
@@ -168,7 +171,8 @@ def _server(args: argparse.Namespace, bench: MasterBench) -> tuple[Target, Calla
     if args.scene is None:
         target = real_target(args.bus, channels[0][1], args.bitrate)
         files = eds_files(args)
-        return target, lambda: api.emulate_eds(files, target, onlooker=bench, say=args.report.say)
+        positions = [start_position(node) for node in nodes.values()]
+        return target, lambda: api.emulate_eds(files, target, positions=positions, onlooker=bench, say=args.report.say)
     scene = loaded(args)
     target = scene_target(args, scene)
     node_ids = (*scene.drives, *([scene.sensor.node_id] if scene.sensor and scene.array_is_node else ()))
@@ -226,7 +230,8 @@ def _report_of(
         if answer is not None:
             times.append((answer.t_ns - one.begin_ns) * 1e-6)
             text = f"first answer {times[-1]:.1f} ms later: {answer}"
-        facts[f"fault {number}"] = f"{one.text}, held from {one.begin_ns * 1e-9:.3f} s; {text}"
+        span = f"from {one.begin_ns * 1e-9:.3f} to {one.end_ns * 1e-9:.3f} s"
+        facts[f"fault {number}"] = f"{one.text} {span}; {text}"
     report = judge.report("the master", facts, log=None if args.log is None else str(args.log))
     if times:
         report.distributions["first answer to a fault"] = tuple(times)

@@ -281,6 +281,35 @@ class ZerosFirst(Master):
         self.cycle({1: 0}, {1: 5000})
 
 
+class ZerosUnseen(ZerosFirst):
+    def configure(self, drive):
+        super().configure(drive)
+        del self.frames[-2:]  # the read of 6064h
+
+
+class ZeroMode(Master):
+    numbers = (6,)
+
+    def configure(self, drive):
+        super().configure(drive)
+        self.write(1, 0x1400, 1, 0x80000201, 4)
+        self.write(1, 0x1600, 0, 0, 1)
+        for subindex, word in enumerate((0x60400010, 0x60600008, 0x607A0020), 1):
+            self.write(1, 0x1600, subindex, word, 4)
+        self.write(1, 0x1600, 0, 3, 1)
+        self.write(1, 0x1400, 1, 0x201, 4)
+
+    def send(self, drive, word, target):
+        mode = 8 if self.count else 0
+        self.put(0x201, struct.pack("<Hbi", word, mode, target))
+        drive.obey(word)
+        drive.target = target
+
+    def start(self):
+        super().start()
+        self.read(1, 0x6061, 0, 1)
+
+
 class SaysNothing(Master):
     numbers = (7,)
 

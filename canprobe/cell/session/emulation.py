@@ -140,6 +140,7 @@ def emulate_eds(
     *,
     store_folder: Path | None = None,
     serial_numbers: Sequence[int | None] = (),
+    positions: Sequence[int] = (),
     in_realtime: bool = False,
     faults: Sequence[str] = (),
     onlooker: Onlooker | None = None,
@@ -152,6 +153,7 @@ def emulate_eds(
         target: the bus.
         store_folder: as for :func:`emulate`.
         serial_numbers: 1018h:04 of each node; None or left out: as its file has it.
+        positions: place of the motor of each drive at first, counts; left out: 0.
         in_realtime: whether to ask for SCHED_FIFO, a processor and locked memory.
         faults, onlooker: as for :func:`emulate`.
         say: called with the number of warnings of each file, and when the nodes are served.
@@ -170,11 +172,13 @@ def emulate_eds(
     if twice := sorted({node_id for node_id in node_ids if node_ids.count(node_id) > 1}):
         raise UsageError(f"node id {twice[0]} is given to more than one EDS file")
     nodes: list[SlaveNode] = []
-    for (name, node_id), serial in zip_longest(files, serial_numbers):
+    for (name, node_id), serial, position in zip_longest(files, serial_numbers, positions):
         reading = check_eds(name, 1 if node_id == UNCONFIGURED_ID else node_id)
         od = reading.usable()
         speaks_lss = node_id == UNCONFIGURED_ID or od.device_information.LSS_supported
-        nodes.append(make_eds_node(od, node_id, eds=name if speaks_lss else None, serial=serial))
+        nodes.append(
+            make_eds_node(od, node_id, eds=name if speaks_lss else None, serial=serial, position=position or 0)
+        )
         if warnings := len(reading.warnings):
             check = f"canprobe eds check {name} --node-id {od.node_id}"
             say(f"{name}: {warnings} warning{'s' * (warnings > 1)}; `{check}` lists them")

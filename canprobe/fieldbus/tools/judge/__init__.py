@@ -23,10 +23,20 @@ Several axes in one node (objects from 6800h on) are not known.
 Start reading at `bus_state`, then `rule`, then `enable`.
 """
 
-from canprobe.fieldbus.tools.judge.bench import MasterBench, first_answers, write_log
+from canprobe.fieldbus.tools.judge.bench import MasterBench, first_answers, start_position, write_log
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.judging import Judge, judge_frames
 from canprobe.fieldbus.tools.judge.record import read_record
 from canprobe.fieldbus.tools.judge.rules import RULES
 
-__all__ = ["RULES", "BusFrame", "Judge", "MasterBench", "first_answers", "judge_frames", "read_record", "write_log"]
+__all__ = [
+    "RULES",
+    "BusFrame",
+    "Judge",
+    "MasterBench",
+    "first_answers",
+    "judge_frames",
+    "read_record",
+    "start_position",
+    "write_log",
+]

@@ -22,6 +22,10 @@ from canprobe.fieldbus.tools.judge.judging import Judge
 
 _AFTER_NS = 500_000_000
 """Time for which the nodes are served after the end of the command."""
+_ANSWER_NS = 5_000_000_000
+"""Time after the end of a fault up to which the master may answer it."""
+_START = 100_000
+"""Place of a drive at first, counts, where its limits do not ask for less."""
 
 
 class HeardPort(PlainPort):
@@ -85,7 +89,7 @@ class MasterBench:
         self.command: MasterCommand | None = None
         self.injections: Injections | None = None
         self._words, self._seconds, self._faults, self._output = command, seconds, faults, output
-        self._begin_ns = 0
+        self._begin_ns = self._last_ns = 0
         self._ended_ns: int | None = None
 
     def tap(self, port: Port) -> Port:
@@ -103,6 +107,7 @@ class MasterBench:
         """Throw faults, look at the command, and end the bench when its time has come."""
         assert self.injections is not None
         self.injections.look(now_ns)
+        self._last_ns = now_ns
         if self._ended_ns is not None:
             return now_ns - self._ended_ns > _AFTER_NS
         late = self._seconds is not None and now_ns - self._begin_ns > self._seconds * 1e9
@@ -141,8 +146,15 @@ class MasterBench:
         judge = Judge(nodes, served=True, bitrate=bitrate, charges_ns=spans)
         for frame in self.record():
             judge.take(frame)
-        judge.finish()
+        judge.finish(self._last_ns - self._begin_ns)
         return judge
+
+
+def start_position(description: Description) -> int:
+    """Place of a served drive at first, counts: away from 0, and within its software limits (607Dh)."""
+    limit = description.entry(0x607D, 2)
+    high = limit.initial if limit is not None else None
+    return min(high // 10, _START) if isinstance(high, int) and high > 0 else _START
 
 
 def write_log(frames: Sequence[BusFrame], path: Path, channel: str) -> None:
@@ -161,7 +173,8 @@ def first_answers(
 ) -> list[BusFrame | None]:
     """The first frame after each fault by which the master does something else than before; None without one.
 
-    An NMT command, a controlword with another command, or an SDO request to a node that had none for a second.
+    It counts up to the next fault, and up to five seconds after the fault's end: an NMT command, a controlword with
+    another command, or an SDO request to a node that had none for a second.
     """
     bus = BusState(nodes, served=True)
     answers: list[BusFrame | None] = [None] * len(thrown)
@@ -170,9 +183,9 @@ def first_answers(
         for event in bus.take(frame):
             if not _is_new(event, asked_ns):
                 continue
-            for number, one in enumerate(thrown):
-                if answers[number] is None and one.begin_ns <= frame.t_ns:
-                    answers[number] = event.frame
+            before = [number for number, one in enumerate(thrown) if one.begin_ns <= frame.t_ns]
+            if before and answers[before[-1]] is None and frame.t_ns < thrown[before[-1]].end_ns + _ANSWER_NS:
+                answers[before[-1]] = event.frame
     return answers
 
 

@@ -27,7 +27,7 @@ class Thrown:
     """A fault that was thrown.
 
     Attributes:
-        text: the fault in words.
+        text: node, kind and values of the fault.
         node_id: its node.
         begin_ns, end_ns: when it held.
     """
@@ -70,7 +70,9 @@ class Injections:
         holding = [fault for node in self._nodes.nodes for fault in node.holding]
         for fault in holding:
             if fault not in self._holding:
-                one = Thrown(fault.words(now_ns), fault.node_id, self._last_ns, now_ns)
+                given = "".join(f" {name}={value:g}" for name, value in fault.values.items())
+                text = f"node {fault.node_id}: {fault.kind.name}{given}"
+                one = Thrown(text, fault.node_id, self._last_ns, now_ns)
                 self._holding[fault] = one
                 self.thrown.append(one)
         for fault in [fault for fault in self._holding if fault not in holding]:

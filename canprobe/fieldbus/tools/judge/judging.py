@@ -53,8 +53,13 @@ class Judge:
             for see in self._ears.get(type(event), ()):
                 see(event)
 
-    def finish(self) -> list[Rule]:
-        """End the bus; return the rules that found something."""
+    def finish(self, end_ns: int = 0) -> list[Rule]:
+        """End the bus; return the rules that found something.
+
+        Args:
+            end_ns: time up to which the bus was heard, where that is later than its last frame.
+        """
+        self.bus.now_ns = max(self.bus.now_ns, end_ns)
         for rule in self.rules:
             rule.end()
         return [rule for rule in self.rules if rule.count]

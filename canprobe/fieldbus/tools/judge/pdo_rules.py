@@ -9,7 +9,7 @@ from canprobe.fieldbus.protocol.cia402 import OperationMode
 from canprobe.fieldbus.protocol.frames import INVALID_FLAG
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame, place_text
 from canprobe.fieldbus.tools.judge.enable import frame_of
-from canprobe.fieldbus.tools.judge.events import BusEvent, RequestSeen, RpdoSeen, SyncSeen, TargetSeen
+from canprobe.fieldbus.tools.judge.events import BusEvent, RequestSeen, RpdoSeen, StatusSeen, SyncSeen, TargetSeen
 from canprobe.fieldbus.tools.judge.rule import QUEUED_NS, Rule, Severity
 from canprobe.fieldbus.tools.judge.seen_node import (
     CONTROLWORD,
@@ -39,12 +39,20 @@ class ZeroFilled(Rule):
     source = "measured with canopen 2.4.1, BaseNode402"
     expected = "the first RPDO has the actual values of all objects in it"
     hint = "fill in 6061h as 6060h and 6064h as 607Ah before the RPDO is sent"
-    hears = (RpdoSeen,)
+    hears = (RpdoSeen, StatusSeen)
+
+    def begin(self) -> None:
+        """Remember nothing yet."""
+        self._unjudged: dict[int, BusFrame] = {}
 
     def see(self, event: BusEvent) -> None:
-        """Compare the first frame with what the objects were."""
-        assert isinstance(event, RpdoSeen)
+        """Compare the first frame with what the objects were, and a target of 0 with the position once it is seen."""
+        assert isinstance(event, RpdoSeen | StatusSeen)
         node = event.node
+        if isinstance(event, StatusSeen):
+            if node.node_id in self._unjudged and node.known(POSITION) is not None:
+                self._judge_target(node, self._unjudged.pop(node.node_id))
+            return
         if node.rpdo_counts[event.pdo.number] != 1:
             return
         self.looked += 1
@@ -52,17 +60,22 @@ class ZeroFilled(Rule):
             index = place[0]
             if value or index not in _PROFILE or index in _HARMLESS:
                 continue
-            shown = node.known(*place)
-            was = event.before[place]
-            if index == TARGET_POSITION and (position := node.known(POSITION)) is not None:
-                far = abs(position.value) > node.tolerance(self.bus.period_ns)
-                was, shown = (position.value if far else 0), position
-            elif index == MODE and (display := node.known(MODE_DISPLAY)) is not None:
-                was, shown = display.value, display
-            if was:
-                what = f"{index:04X}h:{place[1]:02X} is 0 in the first RPDO {event.pdo.number}; it was {was}"
-                before = frame_of(shown) if shown is not None and shown.frame is not event.frame else None
-                self.blame(what, before, event.frame, node_id=node.node_id)
+            if index == TARGET_POSITION:
+                if node.known(POSITION) is None:
+                    self._unjudged[node.node_id] = event.frame
+                else:
+                    self._judge_target(node, event.frame)
+                continue
+            shown = node.known(MODE_DISPLAY) if index == MODE else None
+            if was := (shown.value if shown is not None else event.before[place]):
+                what = f"{place_text(place)} is 0 in the first RPDO {event.pdo.number}; it was {was}"
+                self.blame(what, frame_of(shown), event.frame, node_id=node.node_id)
+
+    def _judge_target(self, node: SeenNode, first: BusFrame) -> None:
+        position = node.known(POSITION)
+        if position is not None and abs(position.value) > node.tolerance(self.bus.period_ns):
+            what = f"607Ah is 0 in the first RPDO, and the axis is at {position.value}"
+            self.blame(what, position.frame, first, node_id=node.node_id)
 
 
 class NeverSent(Rule):

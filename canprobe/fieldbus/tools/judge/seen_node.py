@@ -150,8 +150,9 @@ class SeenNode:
         return self._served or self.booted or index in self._touched
 
     def take(self, place: Place, value: int, frame: BusFrame) -> None:
-        """Take the value of an object, written or read."""
-        self._known[place] = Known(value, frame)
+        """Take the value of an object, written or read. A mode that is asked for again keeps its first time."""
+        if place[0] != MODE or self.number(MODE) != value:
+            self._known[place] = Known(value, frame)
         if 0x1400 <= place[0] < 0x1C00:
             self.read_pdos()
         if place[0] == POSITION:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import deque
 
-from canprobe.fieldbus.protocol.cia402 import OperationMode
+from canprobe.fieldbus.protocol.cia402 import DriveCommand, OperationMode, command_of
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.enable import frame_of
 from canprobe.fieldbus.tools.judge.events import BusEvent, SyncSeen, TargetSeen
 from canprobe.fieldbus.tools.judge.rule import Rule, Severity
-from canprobe.fieldbus.tools.judge.seen_node import TARGET_POSITION
+from canprobe.fieldbus.tools.judge.seen_node import CONTROLWORD, TARGET_POSITION
 
 _INTERPOLATION_TIME = 0x60C2
 
@@ -107,7 +107,7 @@ class InterpolationTime(Rule):
     expected = "in CSP, 60C2h equals the period of SYNC"
     hint = "write 60C2h:01 and :02 for the period, and read them back"
     hears = (TargetSeen,)
-    _ENOUGH, _SHARE = 20, 0.05
+    _ENOUGH, _SHARE = 5, 0.05
 
     def begin(self) -> None:
         """Remember nothing yet."""
@@ -117,7 +117,9 @@ class InterpolationTime(Rule):
         """Compare once for each node."""
         assert isinstance(event, TargetSeen)
         node = event.node
-        cyclic = node.mode == OperationMode.CYCLIC_SYNC_POSITION and event.index == TARGET_POSITION and node.enabled
+        word = node.number(CONTROLWORD) or 0
+        cyclic = node.mode == OperationMode.CYCLIC_SYNC_POSITION and event.index == TARGET_POSITION
+        cyclic = cyclic and command_of(word) is DriveCommand.ENABLE_OPERATION
         synchronous = event.pdo is not None and event.pdo.synchronous
         if node.node_id in self._judged or not (cyclic and synchronous) or node.syncs < self._ENOUGH:
             return
