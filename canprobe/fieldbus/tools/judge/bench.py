@@ -10,7 +10,7 @@ from pathlib import Path
 from canprobe.fieldbus.bus.candump import CandumpWriter
 from canprobe.fieldbus.bus.port import ControllerState, PlainPort, Port, TimedFrame
 from canprobe.fieldbus.eds.description import Description
-from canprobe.fieldbus.protocol.cia402 import command_of
+from canprobe.fieldbus.protocol.cia402 import DriveCommand, command_of
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.tools.faults import FaultyNodes
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
@@ -178,10 +178,10 @@ def first_answers(
     """
     bus = BusState(nodes, served=True)
     answers: list[BusFrame | None] = [None] * len(thrown)
-    asked_ns: dict[int, int] = {}
+    habits = _Habits()
     for frame in frames:
         for event in bus.take(frame):
-            if not _is_new(event, asked_ns):
+            if not habits.is_new(event):
                 continue
             before = [number for number, one in enumerate(thrown) if one.begin_ns <= frame.t_ns]
             if before and answers[before[-1]] is None and frame.t_ns < thrown[before[-1]].end_ns + _ANSWER_NS:
@@ -189,12 +189,22 @@ def first_answers(
     return answers
 
 
-def _is_new(event: BusEvent, asked_ns: dict[int, int]) -> bool:
-    """Whether the master does something else than before."""
-    if isinstance(event, RequestSeen):
-        before = asked_ns.get(event.node.node_id)
-        asked_ns[event.node.node_id] = event.frame.t_ns
-        return before is None or event.frame.t_ns - before > 1_000_000_000
-    if isinstance(event, ControlSeen):
-        return event.before is None or command_of(event.word) is not command_of(event.before)
-    return isinstance(event, NmtSeen)
+class _Habits:
+    """What the master did last: its command to each node, and when it asked each."""
+
+    def __init__(self) -> None:
+        self._commands: dict[int, DriveCommand | None] = {}
+        self._asked_ns: dict[int, int] = {}
+
+    def is_new(self, event: BusEvent) -> bool:
+        """Take an event; whether the master does something else than before."""
+        if isinstance(event, RequestSeen):
+            before_ns = self._asked_ns.get(event.node.node_id)
+            self._asked_ns[event.node.node_id] = event.frame.t_ns
+            return before_ns is None or event.frame.t_ns - before_ns > 1_000_000_000
+        if isinstance(event, ControlSeen):
+            command = command_of(event.word)
+            before = self._commands.get(event.node.node_id)
+            self._commands[event.node.node_id] = command
+            return command is not before
+        return isinstance(event, NmtSeen)

@@ -21,7 +21,7 @@ from canprobe.fieldbus.tools.judge.events import (
 )
 from canprobe.fieldbus.tools.judge.rule import QUEUED_NS, Rule, Severity
 from canprobe.fieldbus.tools.judge.seen_node import SeenNode
-from canprobe.fieldbus.tools.judge.targets import Onward, window_of
+from canprobe.fieldbus.tools.judge.targets import Onward
 
 _COMMUNICATION = (0x81, 0x82)
 """High bytes of codes on communication, after which a node may go on."""
@@ -58,7 +58,7 @@ class TargetsAfterFault(Rule):
             elif node.state in (DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON):
                 self._onward.pop(node_id, None)
         elif (onward := self._onward.get(node_id)) is not None and onward.goes_on(event):
-            what = f"{(event.frame.t_ns - onward.since_ns) * 1e-6:.0f} ms after the fault the targets go on"
+            what = f"{(event.frame.t_ns - onward.cause.t_ns) * 1e-6:.0f} ms after the fault the targets go on"
             self.blame(what, onward.cause, event.frame, node_id=node_id)
             del self._onward[node_id]
 
@@ -66,7 +66,7 @@ class TargetsAfterFault(Rule):
         if node.node_id not in self._onward:
             self.looked += 1
             since_ns = frame.t_ns + 2 * self.bus.period_ns + QUEUED_NS
-            self._onward[node.node_id] = Onward(since_ns, window_of(self.bus.period_ns), frame)
+            self._onward[node.node_id] = Onward(node, since_ns, self.bus.period_ns, frame)
 
 
 class ResetTakenForError(Rule):
@@ -138,7 +138,9 @@ class BootUpIgnored(Rule):
             unasked = event.before is NmtState.OPERATIONAL
             if event.state is NmtState.INITIALISING and unasked:
                 self.looked += 1
-                self._onward[node_id] = Onward(event.frame.t_ns + QUEUED_NS, window_of(self.bus.period_ns), event.frame)
+                self._onward[node_id] = Onward(
+                    event.node, event.frame.t_ns + QUEUED_NS, self.bus.period_ns, event.frame
+                )
                 if event.node.configured:
                     self._stale[node_id] = event.frame
         elif isinstance(event, AnswerSeen):
@@ -148,7 +150,7 @@ class BootUpIgnored(Rule):
         elif isinstance(event, TargetSeen):
             onward = self._onward.get(node_id)
             if onward is not None and onward.goes_on(event):
-                what = f"targets go on {(event.frame.t_ns - onward.since_ns) * 1e-6:.0f} ms after a boot-up"
+                what = f"targets go on {(event.frame.t_ns - onward.cause.t_ns) * 1e-6:.0f} ms after a boot-up"
                 self.blame(what, onward.cause, event.frame, node_id=node_id)
                 del self._onward[node_id]
         elif node_id in self._stale and event.node.operational and enables(event):
@@ -173,6 +175,7 @@ class LossIgnored(Rule):
         self._onward: dict[int, Onward] = {}
         self._beat: dict[int, BusFrame] = {}
         self._report: dict[int, int] = {}
+        self._blamed: set[int] = set()
 
     def see(self, event: BusEvent) -> None:
         """Find nodes whose heartbeat is overdue, and follow the targets from then on."""
@@ -181,6 +184,7 @@ class LossIgnored(Rule):
             self._beat[node_id] = event.frame
             if self._lost.pop(node_id, None) is not None:
                 self._onward.clear()
+                self._blamed.clear()
         elif isinstance(event, StatusSeen):
             self._report[event.node.node_id] = event.frame.t_ns
         elif isinstance(event, SyncSeen):
@@ -214,18 +218,18 @@ class LossIgnored(Rule):
 
     def _follow(self, event: TargetSeen) -> None:
         node_id = event.node.node_id
-        if self.silent and node_id in self._lost:
+        if node_id in self._blamed or (self.silent and node_id in self._lost):
             return
         (lost_id, last), *_ = self._lost.items()
         since_ns = last.t_ns + self._limit_ns(self.bus.nodes[lost_id])
-        onward = self._onward.setdefault(node_id, Onward(since_ns, window_of(self.bus.period_ns), last))
+        onward = self._onward.setdefault(node_id, Onward(event.node, since_ns, self.bus.period_ns, last))
         if onward.goes_on(event):
             what = (
                 f"the last {'sign' if self.silent else 'heartbeat'} of node {lost_id} is"
                 f" {(event.frame.t_ns - last.t_ns) * 1e-6:.0f} ms old, and the targets of node {node_id} go on"
             )
             self.blame(what, last, event.frame, node_id=lost_id)
-            onward.since_ns = 1 << 62  # once
+            self._blamed.add(node_id)
 
 
 class MuteIgnored(LossIgnored):

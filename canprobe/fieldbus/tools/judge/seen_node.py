@@ -33,7 +33,7 @@ _SPEED_LIMIT, _SPEED_UNIT, _SOFT_LIMITS, _RANGE = 0x607F, 0x60A9, 0x607D, 0x607B
 _UNLIMITED = 0x7FFFFFFF
 _FRESH_NS = 300_000_000
 """Age up to which positions show whether an axis moves."""
-_MOVING_SHARE = 0.02
+_MOVING_SHARE = 0.01
 """Share of the largest speed from which on an axis moves."""
 
 
@@ -272,11 +272,16 @@ class SeenNode:
         low, high = self.soft_limits() or (self.value(_RANGE, 1), self.value(_RANGE, 2))
         return float(high - low) if low is not None and high is not None and low < high else float(1 << 32)
 
-    def moves(self, t_ns: int) -> bool:
-        """Whether the axis moves: by 606Ch, or by the last positions."""
+    @property
+    def least_speed(self) -> float:
+        """Speed from which on the axis moves, user units a second."""
         speed = self.value(_SPEED_LIMIT) or 0
         usable = 0 < speed < _UNLIMITED and not self.value(_SPEED_UNIT)
-        least = _MOVING_SHARE * speed if usable else 1e-4 * self._range()
+        return _MOVING_SHARE * speed if usable else 1e-4 * self._range()
+
+    def moves(self, t_ns: int) -> bool:
+        """Whether the axis moves: by 606Ch, or by the last positions."""
+        least = self.least_speed
         shown = self.known(VELOCITY)
         if shown is not None and t_ns - shown.t_ns < _FRESH_NS:
             return abs(shown.value) > least

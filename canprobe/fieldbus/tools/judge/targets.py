@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from canprobe.fieldbus.protocol.cia402 import FOLLOWING_ERROR_BIT, HALT_BIT, DriveCommand, OperationMode, command_of
 from canprobe.fieldbus.protocol.frames import NmtCommand
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
@@ -20,6 +18,7 @@ from canprobe.fieldbus.tools.judge.events import (
 from canprobe.fieldbus.tools.judge.rule import Rule, Severity
 from canprobe.fieldbus.tools.judge.seen_node import (
     CONTROLWORD,
+    INTERPOLATION_DATA,
     POSITION,
     STATUSWORD,
     TARGET_POSITION,
@@ -32,6 +31,8 @@ _POSITION_MODES = (
     OperationMode.INTERPOLATED_POSITION,
     OperationMode.CYCLIC_SYNC_POSITION,
 )
+_CREEP_SHARE = 0.2
+"""Share of the speed of a moving axis below which targets stand, as those that follow a noisy position."""
 _LOST_SHARE = 3.0
 """A step of so many limits is blamed at once; less may be the way of lost frames."""
 
@@ -57,44 +58,40 @@ class ModeWhileMoving(Rule):
             self.blame(what, *motion_of(node), event.frame, node_id=node.node_id)
 
 
-@dataclass(slots=True)
 class Onward:
     """Whether the targets of an axis go on undiminished after some time.
 
-    Two windows follow each other after `since_ns`; the axis goes on where the way in the second is as long as in the
-    first. A ramp down to a stop is shorter.
+    The way of the targets is summed in windows that follow each other. An axis that is stopped has less way in each of
+    them, and none in the end. The axis goes on where a window has as much as the one before. In modes of velocity and
+    torque, where a target that stays is a motion, its amount takes the place of the way.
 
-    Attributes:
+    Args:
+        node: the node.
         since_ns: time from which on targets should not go on.
-        window_ns: length of a window.
-        cause: frame that shows why they should not.
+        period_ns: period of SYNC; a window has 20 of them, and at least 50 ms.
+        cause: frame that shows why targets should not go on.
     """
 
-    since_ns: int
-    window_ns: int
-    cause: BusFrame | None
-    first: float = 0.0
-    second: float = 0.0
-    changes: int = 0
+    def __init__(self, node: SeenNode, since_ns: int, period_ns: int, cause: BusFrame) -> None:
+        self.cause = cause
+        self._begin_ns = since_ns
+        self._window_ns = max(50_000_000, 20 * period_ns)
+        self._least = _CREEP_SHARE * node.least_speed * self._window_ns * 1e-9
+        self._before: float | None = None
+        self._way = 0.0
 
     def goes_on(self, event: TargetSeen) -> bool:
-        """Take a target; whether both windows are over, and the way has not become shorter."""
-        since_ns = event.frame.t_ns - self.since_ns
-        step = abs(event.value - event.before) if event.before is not None else 0
-        if since_ns < 0:
-            return False
-        if since_ns < self.window_ns:
-            self.first += step
-        elif since_ns < 2 * self.window_ns:
-            self.second += step
-        else:
-            return self.first > 0 and self.second >= 0.9 * self.first
-        return False
-
-
-def window_of(period_ns: int) -> int:
-    """Window in which the way of targets is measured: 20 periods, at least 50 ms."""
-    return max(50_000_000, 20 * period_ns)
+        """Take a target; whether a window that is over has at least 90 % of the way of the one before."""
+        found, cyclic = False, event.index in (TARGET_POSITION, INTERPOLATION_DATA)
+        while event.frame.t_ns >= self._begin_ns + self._window_ns:
+            least = self._least if cyclic else 0.0
+            before = self._before
+            found = found or (before is not None and before > least and self._way >= 0.9 * before)
+            self._before, self._way = (0.0 if before == 0.0 else self._way), 0.0
+            self._begin_ns += self._window_ns
+        if event.frame.t_ns >= self._begin_ns and event.before is not None:
+            self._way += abs(event.value - event.before) if cyclic else abs(event.value)
+        return found
 
 
 class StepTooLarge(Rule):
@@ -179,7 +176,7 @@ class FollowingErrorIgnored(Rule):
         if isinstance(event, StatusSeen):
             lags = bool(event.word >> FOLLOWING_ERROR_BIT & 1) and node.enabled and node.mode in _POSITION_MODES
             if self.in_a_row(node_id, lags, 4):
-                self._onward[node_id] = Onward(event.frame.t_ns, window_of(self.bus.period_ns), event.frame)
+                self._onward[node_id] = Onward(node, event.frame.t_ns, self.bus.period_ns, event.frame)
             elif not lags:
                 self._onward.pop(node_id, None)
             return
