@@ -126,7 +126,11 @@ def _judge_record(args: argparse.Namespace) -> int:
     if len(named) > 1:
         raise UsageError("judge: a log is judged for one channel: --channel CH")
     frames = read_record(args.record, named[0] if named else None)
-    judge = judge_frames(frames, _descriptions(args), bitrate=args.bitrate or 1_000_000)
+    nodes = _descriptions(args, named[0] if named else None)
+    judge = judge_frames(frames, nodes, bitrate=args.bitrate or 1_000_000)
+    if not any(node.seen or node.addressed for node in judge.bus.nodes.values()):
+        ids = ", ".join(map(str, nodes))
+        raise UsageError(f"judge: {args.record} has no frame of node {ids} or to it: which nodes does the log have?")
     facts = {**_facts(args), "frames": str(judge.frame_count)}
     report = judge.report(f"the master in {args.record}", facts, log=str(args.record))
     _print(args, report)
@@ -155,6 +159,9 @@ def _judge_served(args: argparse.Namespace) -> int:
     _print(args, report)
     if report.exit_status:
         return report.exit_status
+    if not any(frame.from_node is False for frame in bench.frames):
+        say(f"judge: no master was heard on {target.channel}: does it use this channel and bit rate?")
+        return max(3, _TIMED_OUT if bench.timed_out else _status_of_command(bench))
     return _TIMED_OUT if bench.timed_out else _status_of_command(bench)
 
 
@@ -191,8 +198,8 @@ def _status_of_command(bench: MasterBench) -> int:
     return 3
 
 
-def _descriptions(args: argparse.Namespace) -> Mapping[int, Description]:
-    """What is known of each node, by its id."""
+def _descriptions(args: argparse.Namespace, channel: str | None = None) -> Mapping[int, Description]:
+    """What is known of each node, by its id; of a scene with several channels, those on one of them."""
     from canprobe.fieldbus.eds.description import Description
     from canprobe.fieldbus.eds.packaged import load_eds
 
@@ -204,7 +211,9 @@ def _descriptions(args: argparse.Namespace) -> Mapping[int, Description]:
         from canprobe.cell.planning.make import make_plan
         from canprobe.cell.scene.resolve import resolve
 
-        files = [(node.eds, node.node_id) for node in make_plan(resolve(loaded(args))).nodes]
+        planned = make_plan(resolve(loaded(args))).nodes
+        several = len({node.channel for node in planned}) > 1
+        files = [(node.eds, node.node_id) for node in planned if not several or channel in (None, node.channel)]
     return {one: Description(load_eds(name, one)) for name, one in files}
 
 

@@ -49,6 +49,12 @@ def test_a_log_of_a_good_master_and_what_became_better(tmp_path, capsys):
     assert "01 target at enable" in capsys.readouterr().out
 
 
+def test_a_log_of_other_nodes(tmp_path, capsys):
+    log = log_of(Master(), tmp_path / "good.log")
+    assert main(["judge", "--eds", "puma260_joint", "--node-id", "9", "--record", log]) == 2
+    assert "has no frame of node 9 or to it" in capsys.readouterr().err
+
+
 def test_the_log_of_a_run_has_nothing_to_blame(tmp_path, capsys):
     canprobe.run("free", duration_s=0.5, out=tmp_path / "run")
     assert main(["judge", "free", "--record", str(tmp_path / "run" / "bus.log"), "--json"]) == 0
@@ -85,6 +91,8 @@ def test_a_command_that_fails_and_one_that_never_ends(group, tmp_path, capsys):
     out = ("--passive", "--output", str(tmp_path / "out.txt"))
     assert main(["judge", *NODE, *out, "--", "sh", "-c", "echo no adapter; exit 7"]) == 3
     assert "ended with status 7" in (told := capsys.readouterr().err) and "no adapter" in told
+    assert "no master was heard" in told
     assert main(["judge", *NODE, *out, "--seconds", "0.2", "--", "sleep", "30"]) == 124
+    assert main(["judge", *NODE, *out, "--seconds", "0.2"]) == 3, "nobody came"
     assert main(["judge", *NODE, *out, "--", "/nowhere/master"]) == 2
     assert "/nowhere/master: cannot be started: No such file" in capsys.readouterr().err

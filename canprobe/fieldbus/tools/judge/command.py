@@ -68,7 +68,9 @@ class MasterCommand:
         return False
 
     def close(self) -> None:
-        """End it and wait for its end, and close the file."""
+        """End it and wait for its end, end what it left running, and close the file."""
         while not self.press_on():
             time.sleep(0.02)
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
         self._file.close()
