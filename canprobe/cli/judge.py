@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 from canprobe.cli.argument_types import node_id, seconds, word
 from canprobe.cli.common_arguments import BUS, add_options, add_scene, add_verbosity
 from canprobe.cli.emulate import eds_files, scene_target
-from canprobe.cli.interrupts import left_by_ctrl_c
+from canprobe.cli.interrupts import first_ctrl_c, left_by_ctrl_c
 from canprobe.cli.output import print_json, print_table
 from canprobe.cli.parser import Parser
 from canprobe.cli.progress import say
@@ -146,7 +146,7 @@ def _judge_served(args: argparse.Namespace) -> int:
     bench = MasterBench(args.command, args.seconds, faults, output)
     target, serve = _server(args, bench, nodes)
     try:
-        with left_by_ctrl_c():
+        with left_by_ctrl_c(), first_ctrl_c(bench.ask):
             serve()
     finally:
         bench.close()

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import sys
+import threading
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -96,3 +99,12 @@ def test_a_command_that_fails_and_one_that_never_ends(group, tmp_path, capsys):
     assert main(["judge", *NODE, *out, "--seconds", "0.2"]) == 3, "nobody came"
     assert main(["judge", *NODE, *out, "--", "/nowhere/master"]) == 2
     assert "/nowhere/master: cannot be started: No such file" in capsys.readouterr().err
+
+
+def test_ctrl_c_ends_the_command_while_the_nodes_are_served(group, tmp_path, capsys):
+    master = "import can, time\nbus = can.Bus()\nbus.send(can.Message(arbitration_id=0x80, is_extended_id=False))\n"
+    master += "try:\n    time.sleep(30)\nfinally:\n    bus.shutdown()\n    print('in order')"
+    threading.Timer(1.5, os.kill, (os.getpid(), signal.SIGINT)).start()
+    out = tmp_path / "out.txt"
+    assert main(["judge", *NODE, "--passive", "--output", str(out), "--", sys.executable, "-c", master]) == 0
+    assert "in order" in out.read_text() and "KeyboardInterrupt" in out.read_text()

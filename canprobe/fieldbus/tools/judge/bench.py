@@ -76,6 +76,7 @@ class MasterBench:
 
     Attributes:
         frames: frames of the bus.
+        asked: whether somebody has asked for the end; the nodes are served until the command has ended.
         timed_out: whether the command was still running after `seconds`.
         status: exit status of the command; None where it was ended by us, or there is none.
     """
@@ -84,7 +85,7 @@ class MasterBench:
         self, command: Sequence[str], seconds: float | None, faults: Sequence[str] | None, output: Path
     ) -> None:
         self.frames: list[BusFrame] = []
-        self.timed_out = False
+        self.asked = self.timed_out = False
         self.status: int | None = None
         self.command: MasterCommand | None = None
         self.injections: Injections | None = None
@@ -110,18 +111,21 @@ class MasterBench:
         self._last_ns = now_ns
         if self._ended_ns is not None:
             return now_ns - self._ended_ns > _AFTER_NS
-        late = self._seconds is not None and now_ns - self._begin_ns > self._seconds * 1e9
+        over = self._seconds is not None and now_ns - self._begin_ns > self._seconds * 1e9
         if self.command is None:
-            return late
-        if not late and not self.timed_out:
+            return over or self.asked
+        if not (over or self.asked or self.timed_out):
             self.status = self.command.status
-            if self.status is not None:
-                self._ended_ns = now_ns
+            self._ended_ns = None if self.status is None else now_ns
             return False
-        self.timed_out = True
+        self.timed_out = self.timed_out or not self.asked
         if self.command.press_on():
             self._ended_ns = now_ns
         return False
+
+    def ask(self) -> None:
+        """Ask for the end."""
+        self.asked = True
 
     def close(self) -> None:
         """End the command."""

@@ -69,8 +69,13 @@ class MasterCommand:
 
     def close(self) -> None:
         """End it and wait for its end, end what it left running, and close the file."""
-        while not self.press_on():
-            time.sleep(0.02)
+        try:
+            while not self.press_on():
+                time.sleep(0.02)
+        finally:  # a second Ctrl-C leaves nothing behind, too
+            self._kill()
+            self._file.close()
+
+    def _kill(self) -> None:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
-        self._file.close()
