@@ -31,6 +31,8 @@ _SIGNED = frozenset({MODE, MODE_DISPLAY, POSITION, VELOCITY, 0x6077, 0x60C2}) | 
 """Objects that are signed where no EDS says it. 60C2h:02 is, too."""
 _SPEED_LIMIT, _SPEED_UNIT, _SOFT_LIMITS, _RANGE = 0x607F, 0x60A9, 0x607D, 0x607B
 _UNLIMITED = 0x7FFFFFFF
+_NOISE = 20
+"""Least tolerance of a position, user units: an axis that is held is never quite still."""
 _FRESH_NS = 300_000_000
 """Age up to which positions show whether an axis moves."""
 _MOVING_SHARE = 0.01
@@ -261,7 +263,7 @@ class SeenNode:
     def tolerance(self, period_ns: int) -> float:
         """Difference of positions that is not a jump: the way of a period, or 0.1 % of the range."""
         limit = self.step_limit(period_ns) if period_ns else None
-        return limit if limit is not None else 0.001 * self._range()
+        return max(limit, _NOISE) if limit is not None else 0.001 * self._range()
 
     def soft_limits(self) -> tuple[int, int] | None:
         """Limits of positions (607Dh); None where there are none."""
