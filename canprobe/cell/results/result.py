@@ -31,8 +31,9 @@ if TYPE_CHECKING:
     import pandas
     from matplotlib.figure import Figure
 
-    from canprobe.cell.results.contacts import Contacts, OwnEstimator, Scores
+    from canprobe.cell.results.contacts import Contacts, Scores
     from canprobe.cell.results.page import Page
+    from canprobe.cell.tasks.own_estimators import OwnEstimator
     from canprobe.mechanics.touch.consistency import Consistency
     from canprobe.mechanics.touch.map.contact_map import ContactMap
     from canprobe.mechanics.touch.surface_map import SurfaceMap

@@ -28,7 +28,7 @@ from canprobe.fieldbus.bus.files import make_folder
 from canprobe.fieldbus.bus.port import Port, Reports
 from canprobe.fieldbus.bus.presence import answering_nodes
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
-from canprobe.fieldbus.bus.real.memory import reserve_memory
+from canprobe.fieldbus.bus.real.memory import garbage_collection_paused, reserve_memory
 from canprobe.fieldbus.bus.real.processor import DEVICE_PRIORITY, ask_for_processor, realtime
 from canprobe.fieldbus.eds.packaged import check_eds
 from canprobe.fieldbus.protocol.lss import UNCONFIGURED_ID
@@ -255,7 +255,8 @@ def _serve(
                 server.poll(clock.now_ns())
             return False
 
-        serve(buses, look)
+        with garbage_collection_paused():
+            serve(buses, look)
 
 
 def _named(nodes: Sequence[SlaveNode]) -> str:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from canprobe.cell.master.controller import Controller
 from canprobe.cell.planning.model import Plan
+from canprobe.cell.scene.offers import find_offer
 from canprobe.cell.scene.setup import Array, Calibrate, Free, Probe, Setup, Touch
 from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, replay_samples
@@ -68,20 +69,24 @@ def contact_correlation(array: Array) -> Correlation:
 
 def make_shape_estimator(task: Touch, method: str) -> Estimator:
     """An estimator by its name, with the settings of a scan."""
-    from canprobe.mechanics.touch.estimate.fit import make_estimator  # only where a shape is asked for
+    from canprobe.mechanics.touch.estimate.fit import METHODS, make_estimator  # only where a shape is asked for
 
     assert task.shape is not None and task.scan is not None
     memory = task.shape.memory
     window = max(8, round(memory / task.scan.speed * task.array.rate_hz))
-    estimator = make_estimator(
-        method,
-        sigma_point=_typical_sigma(task),
-        sigma_normal=SIGMA_NORMAL_RAD,
-        memory_m=memory,
-        window=window,
-        correlation=contact_correlation(task.array),
-        coupling=centroid_coupling(task.probe),
-    )
+    settings: dict[str, Any] = {
+        "sigma_point": _typical_sigma(task),
+        "sigma_normal": SIGMA_NORMAL_RAD,
+        "memory_m": memory,
+        "window": window,
+        "correlation": contact_correlation(task.array),
+        "coupling": centroid_coupling(task.probe),
+    }
+    if method not in METHODS and (offer := find_offer("estimator", method)) is not None:
+        from canprobe.cell.tasks.own_estimators import OfferedEstimator, RenewedEstimator
+
+        return RenewedEstimator(lambda: OfferedEstimator(offer, settings))
+    estimator = make_estimator(method, **settings)
     if method not in PATCH_METHODS:
         return estimator
     from canprobe.mechanics.touch.estimate.following import FollowingEstimator

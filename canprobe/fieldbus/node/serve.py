@@ -8,7 +8,6 @@ from itertools import groupby
 from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.joined import wait_for_any
 from canprobe.fieldbus.bus.port import Port, TimedFrame
-from canprobe.fieldbus.bus.real.memory import garbage_collection_paused
 from canprobe.fieldbus.bus.virtual.lockstep import Attachment, LockstepBus, Participant
 from canprobe.fieldbus.protocol.frames import SYNC_ID, Frame
 
@@ -149,7 +148,8 @@ class _Served:
 def serve(buses: Sequence[tuple[Sequence[Participant], Port]], stop: Callable[[], bool]) -> None:
     """Power on the nodes and serve them until `stop()` is true.
 
-    Nodes hear what is on their own bus. All of them may share one plant: they work one after the other.
+    Nodes hear what is on their own bus. All of them may share one plant: they work one after the other. A process that
+    only serves does better with `garbage_collection_paused` round it.
 
     Args:
         buses: participants, for example `SlaveNode`s, and port of each bus; the participants live on the ports' clock.
@@ -157,18 +157,17 @@ def serve(buses: Sequence[tuple[Sequence[Participant], Port]], stop: Callable[[]
     """
     ports = [port for _, port in buses]
     clock = ports[0].clock
-    with garbage_collection_paused():
-        now_ns = clock.now_ns()
-        served = [_Served(nodes, port, now_ns) for nodes, port in buses]
-        while not stop():
-            until_ns = min([now_ns + _MAX_WAIT_NS, *(due for one in served if (due := one.get_ready()) is not None)])
-            if len(ports) == 1:
-                received = [ports[0].wait_and_drain(until_ns)]
-            else:
-                wait_for_any(ports, until_ns)
-                received = [port.drain() for port in ports]
-            # The last arrival serves as present time, which saves a reading of the clock before the answers leave.
-            arrivals_ns = [frames[-1][2] for frames in received if frames]
-            now_ns = max(now_ns, *arrivals_ns) if arrivals_ns else clock.now_ns()
-            for one, frames in zip(served, received, strict=True):
-                one.step(frames, now_ns)
+    now_ns = clock.now_ns()
+    served = [_Served(nodes, port, now_ns) for nodes, port in buses]
+    while not stop():
+        until_ns = min([now_ns + _MAX_WAIT_NS, *(due for one in served if (due := one.get_ready()) is not None)])
+        if len(ports) == 1:
+            received = [ports[0].wait_and_drain(until_ns)]
+        else:
+            wait_for_any(ports, until_ns)
+            received = [port.drain() for port in ports]
+        # The last arrival serves as present time, which saves a reading of the clock before the answers leave.
+        arrivals_ns = [frames[-1][2] for frames in received if frames]
+        now_ns = max(now_ns, *arrivals_ns) if arrivals_ns else clock.now_ns()
+        for one, frames in zip(served, received, strict=True):
+            one.step(frames, now_ns)

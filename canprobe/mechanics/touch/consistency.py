@@ -29,7 +29,7 @@ SIGNIFICANCE_LEVEL = 0.05
 PARTS = ("curvature", "normal", "height", "joint")
 
 
-class Verdict(NamedTuple):
+class ConsistencyVerdict(NamedTuple):
     """One part of the tests over all crossings.
 
     Attributes:
@@ -59,7 +59,7 @@ class Consistency:
     crossings: tuple[Crossing, ...]
     independent: tuple[int, ...]
 
-    def verdict(self, part: str = "joint", angles: tuple[float, float] = (0.0, math.inf)) -> Verdict:
+    def verdict(self, part: str = "joint", angles: tuple[float, float] = (0.0, math.inf)) -> ConsistencyVerdict:
         """The tests of one part, over the crossings whose passes differ in direction by an angle in a range.
 
         Args:
@@ -78,8 +78,8 @@ class Consistency:
         tests = {i: test for i, test in tests.items() if test.dof}
         dof = sum(test.dof for test in tests.values())
         if not dof:
-            return Verdict(0, math.nan, math.nan, fisher([]))
-        return Verdict(
+            return ConsistencyVerdict(0, math.nan, math.nan, fisher([]))
+        return ConsistencyVerdict(
             len(tests),
             sum(test.p < SIGNIFICANCE_LEVEL for test in tests.values()) / len(tests),
             sum(test.chi2 for test in tests.values()) / dof,
