@@ -40,6 +40,7 @@ COMMANDS = (
     "up",
     "emulate",
     "inject",
+    "judge",
     "scan",
     "monitor",
     "replay",
