@@ -172,10 +172,14 @@ class Bench(SdoClient):
                 self.deviates(f"no EMCY {code:04X}h ({describe(code)}) came")
             self.pass_time(min(0.005, (until_ns - self.now_ns) * 1e-9))
 
+    def errors(self) -> list[Emcy]:
+        """EMCY messages that have come and report an error."""
+        self.pass_time(0)
+        return [emcy for emcy, _ in self.emergencies if not is_no_error(emcy.code)]
+
     def unasked(self) -> list[Emcy]:
         """EMCY messages that report an error nobody asked for; all are taken."""
-        self.pass_time(0)
-        found = [emcy for emcy, _ in self.emergencies if not is_no_error(emcy.code) and emcy.code not in self.asked]
+        found = [emcy for emcy in self.errors() if emcy.code not in self.asked]
         self.emergencies.clear()
         return found
 

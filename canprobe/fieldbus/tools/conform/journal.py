@@ -143,7 +143,7 @@ class Journal:
     def _line(self, place: Place) -> str:
         before = self.values.get(place)
         return f"{place_text(*place)}: " + (
-            f"restored to {before.hex(' ')}" if before is not None else "refused, nothing to restore"
+            f"restored to {before.hex(' ')}" if before is not None else "written, nothing to put back"
         )
 
 

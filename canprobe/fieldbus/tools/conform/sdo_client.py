@@ -116,8 +116,9 @@ class SdoClient(FrameLink):
             self.notes.append(f"{what}: {abort_text(code)}, the exact code is {accepted[0]:08X}h")
 
     def is_silent(self) -> bool:
-        """Whether the device sends no SDO answer for the time of a silence."""
-        return not self.during(self.times.silence_s, [SDO_TX_BASE + self.node_id])
+        """Whether no SDO answer has come, and none comes for the time of a silence."""
+        self.pass_time(self.times.silence_s)
+        return not self.taken(SDO_TX_BASE + self.node_id)
 
 
 def pack_request(command: int, index: int, subindex: int, data: bytes = b"") -> bytes:

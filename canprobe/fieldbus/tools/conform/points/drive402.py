@@ -24,7 +24,7 @@ from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.device import CONTROLWORD, STATUSWORD
 from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
 from canprobe.fieldbus.tools.conform.point import conformance_point
-from canprobe.fieldbus.tools.conform.sdo_client import pack_write
+from canprobe.fieldbus.tools.conform.sdo_client import SdoRefused, pack_write
 
 AUTOMATON = "CiA 402-2, finite state automaton"
 _WORDS = {
@@ -63,7 +63,7 @@ def _command(bench: Bench, command: DriveCommand) -> None:
 @contextmanager
 def _at_rest(bench: Bench, mode: int = 0) -> Iterator[None]:
     """The drive switched off in a mode, with its target where it is; switched off afterwards, whatever happens."""
-    modes = bench.number(_MODES) if bench.device.has(_MODES) else 0
+    modes = _supported(bench)
     mode = mode or next((m for m in (_PROFILE_POSITION, 8, 9, 10, 3, 7) if modes >> m - 1 & 1), 0)
     if not mode or (modes and not modes >> mode - 1 & 1):
         raise PointNotApplicable(f"6502h does not list mode {mode}")
@@ -74,6 +74,14 @@ def _at_rest(bench: Bench, mode: int = 0) -> Iterator[None]:
         yield
     finally:
         _off(bench)
+
+
+def _supported(bench: Bench) -> int:
+    """6502h; 0 where the drive has none."""
+    try:
+        return int.from_bytes(bench.upload(_MODES), "little")
+    except SdoRefused:
+        return 0
 
 
 def _off(bench: Bench) -> None:
@@ -132,7 +140,7 @@ def supported_modes(bench: Bench) -> None:
 )
 def mode_display(bench: Bench) -> None:
     """Every mode from 1 to 10, with the power stage off."""
-    modes = bench.number(_MODES)
+    modes = _supported(bench)
     _off(bench)
     for mode in range(1, 11):
         request = pack_write(_MODE, 0, bytes((mode,)))
@@ -189,7 +197,7 @@ def illegal_commands(bench: Bench) -> None:
 )
 def quick_stop(bench: Bench) -> None:
     """Quick stop at rest, with the option that the drive has."""
-    option = bench.number(0x605A) if bench.device.has(0x605A) or bench.device.described(0x605A) else 2
+    option = bench.number(0x605A) if bench.device.described(0x605A) is not None else 2
     stays = option in (5, 6, 7, 8)
     with _at_rest(bench):
         _go(bench, DriveState.OPERATION_ENABLED)
@@ -230,3 +238,5 @@ def homing(bench: Bench) -> None:
             if word >> HOMING_ERROR_BIT & 1 or bench.now_ns >= until_ns:
                 bench.deviates(f"homing is not attained: 6041h is {word:04X}h")
             bench.pass_time(0.01)
+        if word >> HOMING_ERROR_BIT & 1:
+            bench.deviates(f"homing is attained with an error: 6041h is {word:04X}h")

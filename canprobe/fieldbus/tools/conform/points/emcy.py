@@ -6,7 +6,7 @@ The error that is provoked is a SYNC of the wrong length (8240h), which a right 
 from __future__ import annotations
 
 from canprobe.fieldbus.protocol.emcy import SYNC_LENGTH_CODE, is_no_error
-from canprobe.fieldbus.protocol.frames import NmtCommand
+from canprobe.fieldbus.protocol.frames import EMCY_BASE, NmtCommand
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.accepted import accepted_text
 from canprobe.fieldbus.tools.conform.bench import Bench
@@ -24,6 +24,8 @@ def _provoke(bench: Bench) -> int:
     plain_sync(bench)
     bench.nmt(NmtCommand.START)
     bench.pass_time(0.01)
+    bench.sync()
+    bench.pass_time(bench.times.slack_s)
     bench.sync(1)
     try:
         return bench.emcy(SYNC_LENGTH_CODE)[1]
@@ -88,7 +90,16 @@ def identifier(bench: Bench) -> None:
         bench.notes.append(f"1014h is {value:08X}h, the default is {0x80 + bench.node_id:08X}h")
     if value >> 31:
         raise PointNotApplicable("bit 31 of 1014h says that there is no EMCY")
-    _provoke(bench)
+    others = [can_id for can_id in range(EMCY_BASE + 1, EMCY_BASE + 128) if can_id != bench.emcy_id]
+    for can_id in others:
+        bench.taken(can_id)
+    try:
+        _provoke(bench)
+    except PointNotApplicable:
+        code = SYNC_LENGTH_CODE.to_bytes(2, "little")
+        if any(frame.data[:2] == code for can_id in others for frame in bench.taken(can_id)):
+            bench.deviates(f"EMCY comes under another identifier than 1014h, {bench.emcy_id:03X}h")
+        raise
     _end(bench)
 
 

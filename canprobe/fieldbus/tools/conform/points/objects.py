@@ -15,6 +15,7 @@ from canprobe.fieldbus.tools.conform.permits import WriteRule, rule_of
 from canprobe.fieldbus.tools.conform.point import conformance_point
 from canprobe.fieldbus.tools.conform.sdo_client import ABORT, SdoRefused, pack_request, pack_write
 
+_MANDATORY = ((0x1000, 0), (0x1001, 0), (0x1018, 1))
 _SHOWN = 5
 """Entries that a verdict names."""
 _MAY_HAVE_NOTHING = (0x08000024, 0x08000022, 0x08000021)
@@ -39,7 +40,8 @@ def read_all(bench: Bench) -> None:
     """Every readable entry of the EDS: it is there, and as long as its type."""
     wrong = []
     for entry in bench.device.entries():
-        if not entry.readable or rule_of(entry.index) is WriteRule.HISTORY:
+        mandatory = (entry.index, entry.subindex) in _MANDATORY  # which point 92 reads
+        if not entry.readable or mandatory or rule_of(entry.index) is WriteRule.HISTORY:
             continue
         place, size = place_text(entry.index, entry.subindex), -(-entry.bits // 8) if entry.is_integer else 0
         try:
@@ -184,7 +186,7 @@ def identity(bench: Bench) -> None:
 @conformance_point(92, "objects", "mandatory objects", "CiA 301, object dictionary", "1000h, 1001h, 1018h:01")
 def mandatory_objects(bench: Bench) -> None:
     """The objects that every device has."""
-    for place in ((0x1000, 0), (0x1001, 0), (0x1018, 1)):
+    for place in _MANDATORY:
         try:
             bench.upload(*place)
         except SdoRefused as refused:

@@ -194,7 +194,7 @@ def short_rpdo(bench: Bench) -> None:
     _start(bench)
     bench.send(cob_id, bytes(length))
     bench.pass_time(bench.times.slack_s)
-    if bench.emergencies:
+    if bench.errors():
         bench.deviates("EMCY after an RPDO of the right length")
     bench.send(cob_id, bytes(length - 1))
     bench.emcy(PDO_TOO_SHORT_CODE)
@@ -259,7 +259,7 @@ def rpdo_event_timer(bench: Bench) -> None:
     for _ in range(2):
         last_ns = bench.send(cob_id, bytes(length))
         bench.pass_time(0.5e-3 * _WATCHED_MS)
-    if bench.emergencies:
+    if bench.errors():
         bench.deviates("EMCY before the first RPDO, or while they come in time")
     try:
         _, t_ns = bench.emcy(RPDO_TIMEOUT_CODE, 1e-3 * _WATCHED_MS)

@@ -95,6 +95,7 @@ def no_transfer(bench: Bench) -> None:
 def client_abort(bench: Bench) -> None:
     """The client aborts a download."""
     _segmented_download(bench)
+    bench.taken(SDO_TX_BASE + bench.node_id)
     _abort(bench)
     if not bench.is_silent():
         bench.deviates("the abort of the client is answered")

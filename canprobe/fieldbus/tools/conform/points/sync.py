@@ -66,7 +66,7 @@ def lost_sync(bench: Bench) -> None:
     for _ in range(5):
         last_ns = bench.sync()
         bench.pass_time(_PERIOD_US * 1e-6)
-    if bench.emergencies:
+    if bench.errors():
         bench.deviates("EMCY although SYNC comes in its period")
     try:
         _, t_ns = bench.emcy(SYNC_LOST_CODE, 3e-6 * _PERIOD_US)
