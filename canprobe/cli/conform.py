@@ -63,7 +63,7 @@ def add_arguments(parser: Parser) -> None:
         | {"help": "python-can interface, or lockstep [that of python-can's configuration, else socketcan]"},
     )
     parser.add_argument("--channel", metavar="CH", type=channel, default=(None, None), help="channel [can0]")
-    parser.add_argument("--bitrate", **OPTIONS["--bitrate"] | {"help": "bit rate [1000000]"})
+    parser.add_argument("--bitrate", metavar="BIT/S", type=whole(50_000, 1_000_000), help="bit rate [1000000]")
     parser.add_argument("--points", metavar="LIST", type=word, help="groups, numbers or points [all]")
     parser.add_argument(
         "--write",
@@ -118,6 +118,7 @@ def run(args: argparse.Namespace) -> int:
             snapshot=args.snapshot or (None if virtual else Path(f"conform-node{args.node}.snapshot.json")),
             keep_snapshot=args.snapshot is not None,
             listen_s=args.listen,
+            bitrate=args.bitrate or 1_000_000,
             times=BenchTimes() if virtual else times,
             ask=_ask if sys.stdin.isatty() else None,
         )

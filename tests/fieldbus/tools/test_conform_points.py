@@ -7,6 +7,7 @@ but be seen by another one, too, `ALSO` says so.
 from __future__ import annotations
 
 from binascii import crc_hqx
+from functools import partial
 
 import pytest
 from defects import (
@@ -25,8 +26,11 @@ from defects import (
 )
 from examined import NODE_ID, Examined, eds_device, failed
 
-from canprobe.fieldbus.drive.from_eds import make_eds_node
+from canprobe.fieldbus.bus.clock import VirtualClock
+from canprobe.fieldbus.bus.virtual.timed import TimedBus
 from canprobe.fieldbus.eds.packaged import load_eds
+from canprobe.fieldbus.node.quirks import Quirks
+from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol.cia402 import DriveState, state_of
 from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG, NmtState
 from canprobe.fieldbus.tools.conform import POINTS, ExaminationSettings, WriteList
@@ -210,8 +214,8 @@ DEFECTS = {
     "nmt 2 reset communication": nmt(0x82, lambda d: own_value(d, 0x101700)),
     "nmt 2 reset node": nmt(0x81, lambda d: []),
     "nmt 3 wrong commands": stopped_by(lambda i, text: (i, text) == (0, "8305")),
-    "nmt 4 initialisation": says(
-        lambda d, i, text: [(ANSWER, "4300100012000000")] * ((i, text) == (HEARTBEAT, "00")) + [(i, text)]
+    "nmt 4 initialisation": hears(
+        lambda d, i, text: [(ANSWER, "4300100012000000")] if i == REQUEST and state(d) == 0 else None
     ),
     "nmt 5 stopped": hears(
         lambda d, i, text: [(ANSWER, "4300100012000000")] if i == REQUEST and state(d) == NmtState.STOPPED else None
@@ -323,9 +327,11 @@ def whole_eds(tmp_path_factory):
     return write_whole_device(tmp_path_factory.mktemp("eds"))
 
 
-def whole(eds, defect=lambda node: node):
-    od = load_eds(eds, NODE_ID)
-    return Examined(make_eds_node(od, NODE_ID, eds=eds), od, wrap=defect)
+def whole(eds, defect=lambda node: node, **slow):
+    """The device, which takes 100 ms to boot."""
+    od, quirks = load_eds(eds, NODE_ID), Quirks(boot_ns=100 * MS, **slow)
+    node = SlaveNode(od, NODE_ID, od_of=partial(load_eds, eds), quirks=quirks)
+    return Examined(node, od, wrap=defect)
 
 
 def test_every_point_has_its_defect():
@@ -339,6 +345,21 @@ def test_a_device_without_a_defect_passes_every_point_of_cia_301(whole_eds):
     assert failed(report) == {}
     rest = {row.group for row in report.rows if row.verdict is Verdict.NOT_APPLICABLE}
     assert rest == {"drive402"}
+
+
+@pytest.mark.parametrize("bitrate", [1_000_000, 50_000])
+@pytest.mark.parametrize("eds", ["puma260_joint", "tactile_array", "prbt_joint"])
+def test_no_point_fails_on_our_nodes_on_a_bus_with_a_bit_rate(eds, bitrate):
+    device = eds_device(eds, bus=TimedBus(VirtualClock(), bitrate=bitrate))
+    report = device.run(ExaminationSettings(motion=True, bitrate=bitrate))
+    assert failed(report) == {}
+    assert len(report.distributions["SDO answer under load"]) == 50
+    low, high = min(report.distributions["SDO answer"]), max(report.distributions["SDO answer under load"])
+    assert 200 * 1e3 / bitrate < low < high < 1200 * 1e3 / bitrate  # two frames of some 120 bits; load before each
+
+
+def test_no_point_fails_on_a_node_that_is_slow(whole_eds):
+    assert failed(whole(whole_eds, sdo_ns=20 * MS, tpdo_delay_ns=3 * MS).run()) == {}
 
 
 @pytest.mark.parametrize("title", DEFECTS)

@@ -33,6 +33,7 @@ class Bench(SdoClient):
         device: the device.
         permits: gate for what is sent.
         times: how long is waited.
+        bitrate: bit rate of the bus, bit/s.
         fd: whether the bus carries CAN FD frames.
 
     Attributes:
@@ -42,10 +43,17 @@ class Bench(SdoClient):
     """
 
     def __init__(
-        self, port: Port, device: ExaminedDevice, permits: Permits, times: BenchTimes, *, fd: bool = False
+        self,
+        port: Port,
+        device: ExaminedDevice,
+        permits: Permits,
+        times: BenchTimes,
+        *,
+        bitrate: int = 1_000_000,
+        fd: bool = False,
     ) -> None:
         super().__init__(port, device.node_id, permits, times)
-        self.device, self.fd = device, fd
+        self.device, self.bitrate, self.fd = device, bitrate, fd
         self.notes = []
         self.asked: set[int] = set()
         self.distributions: dict[str, tuple[float, ...]] = {}

@@ -51,6 +51,7 @@ class ExaminationSettings:
         keep_snapshot: whether that file stays when all is put back.
         listen_s: time in which the bus is heard first, s.
         times: how long the bench waits.
+        bitrate: bit rate of the bus, bit/s, for the background load.
         fd: whether the bus carries CAN FD frames.
         ask: function that asks a person to do something by hand, and returns whether it was done; None: nobody is
             there.
@@ -62,6 +63,7 @@ class ExaminationSettings:
     keep_snapshot: bool = False
     listen_s: float = 1.0
     times: BenchTimes = field(default_factory=BenchTimes)
+    bitrate: int = 1_000_000
     fd: bool = False
     ask: Callable[[str], bool] | None = None
 
@@ -136,7 +138,9 @@ class Examination:
         written = settings.written.with_motion() if settings.motion else settings.written
         permits = Permits(self._node_id, surroundings, written)
         device = ExaminedDevice(self._node_id, self._description)
-        self.bench = bench = Bench(self._port, device, permits, settings.times, fd=settings.fd)
+        self.bench = bench = Bench(
+            self._port, device, permits, settings.times, bitrate=settings.bitrate, fd=settings.fd
+        )
         try:
             bench.first_answer = bench.request(0x40, 0x1000)
         except CanprobeError as error:

@@ -37,17 +37,24 @@ class SdoClient(FrameLink):
     def ask(self, request: bytes) -> bytes:
         """Send a request; return the eight bytes of the answer.
 
+        An answer that names another entry is a late one to an earlier request, as long as the right one comes, too.
+
         Raises:
             Deviation: no answer came, or one of another length.
         """
-        self.taken(SDO_TX_BASE + self.node_id)
-        self.send(SDO_RX_BASE + self.node_id, request)
-        frame = self.next(SDO_TX_BASE + self.node_id, self.times.sdo_s)
-        if frame is None:
+        answer_id, answer = SDO_TX_BASE + self.node_id, None
+        self.taken(answer_id)
+        until_ns = self.send(SDO_RX_BASE + self.node_id, request) + round(self.times.sdo_s * 1e9)
+        named = request[0] >> 5 in (1, 2) or request[0] & 0xE1 == 0xC0 or request[0] & 0xE3 == 0xA0
+        while (frame := self.next(answer_id, max(0, until_ns - self.now_ns) * 1e-9)) is not None:
+            answer = frame.data
+            if len(answer) != 8 or not named or place_of(answer) == place_of(request):
+                break
+        if answer is None:
             raise Deviation(f"no answer within {self.times.sdo_s:g} s to: {sdo_text(request)}")
-        if len(frame.data) != 8:
-            raise Deviation(f"an SDO answer has 8 bytes, this one has {len(frame.data)}")
-        return frame.data
+        if len(answer) != 8:
+            raise Deviation(f"an SDO answer has 8 bytes, this one has {len(answer)}")
+        return answer
 
     def request(self, command: int, index: int = 0, subindex: int = 0, data: bytes = b"") -> bytes:
         """Send a request with a multiplexer; return the answer."""

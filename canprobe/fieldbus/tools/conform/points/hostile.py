@@ -24,6 +24,7 @@ from canprobe.fieldbus.tools.conform.sdo_client import ABORT, pack_request
 
 _READ_TYPE = pack_request(0x40, 0x1000, 0)
 _FD_BYTES = 12
+_PACE_S = 0.02
 
 
 @conformance_point(93, "hostile", "SDO of every length", "CiA 301, SDO: eight bytes", "0 to 7 bytes are not answered")
@@ -34,8 +35,7 @@ def sdo_lengths(bench: Bench) -> None:
     for length in range(8):
         bench.taken(answer_id)
         bench.send(SDO_RX_BASE + bench.node_id, _READ_TYPE[:length])
-        bench.pass_time(0.01)
-        if bench.taken(answer_id):
+        if not bench.is_silent():
             answered.append(length)
     if any(length < 4 for length in answered):
         bench.deviates(f"requests of {answered} bytes are answered")
@@ -98,11 +98,12 @@ def every_command(bench: Bench) -> None:
         if command >> 5 == 1 and command & 2 and (4 - (command >> 2 & 3) if command & 1 else 4) != len(value):
             continue  # a value that is shorter than that of 1000h
         bench.send(SDO_RX_BASE + bench.node_id, pack_request(command, 0x1000, 0, value))
-        bench.pass_time(0.002)
-        if wrong := [frame for frame in bench.taken(answer_id) if len(frame.data) != 8]:
-            bench.deviates(f"command {command:02X}h is answered with {len(wrong[0].data)} bytes")
+        frame = bench.next(answer_id, _PACE_S)
+        if frame is not None and len(frame.data) != 8:
+            bench.deviates(f"command {command:02X}h is answered with {len(frame.data)} bytes")
     bench.send(SDO_RX_BASE + bench.node_id, pack_request(ABORT, 0x1000, 0, bytes.fromhex("00000008")))
-    bench.pass_time(0.01)
+    while not bench.is_silent():
+        pass  # answers that come late
     bench.serves("all command bytes")
 
 

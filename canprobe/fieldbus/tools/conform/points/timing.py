@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE, NmtCommand
+from canprobe.fieldbus.protocol.response_times import NS_PER_S
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.pdo_setup import synchronous_tpdo
 from canprobe.fieldbus.tools.conform.point import conformance_point
@@ -17,8 +18,8 @@ _SYNC_PERIOD_S, _HEARTBEAT_MS = 0.01, 50
 _BEAT_SHARE = 0.2
 _LOAD_IDS = (0x06A, 0x06B)
 """Identifiers above the device's in the arbitration that belong to no service."""
-_LOAD_GAP_NS = 260_000
-"""Half of 1 Mbit/s: a frame of eight bytes takes about 130 µs."""
+_LOAD_GAP_BITS = 260
+"""Time between two of them: one of eight bytes has about 130 bits, so that the load is a half."""
 _LOADED_COUNT = 50
 
 
@@ -94,7 +95,7 @@ def under_load(bench: Bench) -> None:
     """Frames of higher priority take half the bus, while 1000h is read and the heartbeat runs."""
     bench.need((0x1017, 0))
     bench.put(0x1017, 0, _HEARTBEAT_MS)
-    bench.load = [(can_id, bytes(range(8))) for can_id in _LOAD_IDS], _LOAD_GAP_NS
+    bench.load = [(can_id, bytes(range(8))) for can_id in _LOAD_IDS], _LOAD_GAP_BITS * NS_PER_S // bench.bitrate
     began_ns = bench.now_ns
     beats = bench.during(4e-3 * _HEARTBEAT_MS, [HEARTBEAT_BASE + bench.node_id])
     bench.distributions[f"{SDO_TIME} under load"] = _sdo_times(bench, _LOADED_COUNT)
