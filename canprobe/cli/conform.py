@@ -170,9 +170,11 @@ def _finish(args: argparse.Namespace, report: Report, baseline: Report | None) -
 
 
 def _points(args: argparse.Namespace) -> tuple[Point, ...]:
+    from canprobe.fieldbus.tools.conform.own_points import read_points
     from canprobe.fieldbus.tools.conform.registry import POINTS, chosen_points
 
-    return chosen_points(POINTS, (args.points or "").split(","))
+    own = () if args.own is None else read_points(args.own)
+    return chosen_points((*POINTS, *own), (args.points or "").split(","))
 
 
 def _description(args: argparse.Namespace) -> Description | None:

@@ -32,6 +32,7 @@ class DefectiveNode(WrappedNode):
     """The node and its defect.
 
     Attributes:
+        starts: how often it got its power.
         last, before: identifier and data of the frame that it heard last, and of the one before.
         count: a counter for the defect.
     """
@@ -42,7 +43,7 @@ class DefectiveNode(WrappedNode):
         self.last: tuple[int, str] = (0, "")
         self.before: tuple[int, str] = (0, "")
         self._heard = self.before
-        self.count = self.t_ns = 0
+        self.count = self.t_ns = self.starts = 0
         self._later: list[tuple[int, Frame]] = []
 
     @property
@@ -65,6 +66,7 @@ class DefectiveNode(WrappedNode):
         return [(i, data.hex()) for i, data in self.node.receive(can_id, bytes.fromhex(text), self.t_ns)]
 
     def start(self, t_ns: int) -> list[Frame]:
+        self.t_ns, self.starts = t_ns, self.starts + 1
         return self._said(self.node.start(t_ns))
 
     def receive(self, can_id: int, data: bytes, t_ns: int) -> list[Frame]:

@@ -63,13 +63,20 @@ class Examined:
     ) -> None:
         self.node, self.description = node, None if od is None else Description(od)
         self.bus = bus or LockstepBus(VirtualClock(), fd=True)
-        for participant in (wrap(node), *others):
+        self.participant = wrap(node)
+        for participant in (self.participant, *others):
             self.bus.attach(participant)
         self.port = WatchedPort(self.bus.port())
 
     def run(self, settings: ExaminationSettings | None = None, points: Sequence[Point] = POINTS) -> Report:
         """Examine it."""
         return Examination(self.port, NODE_ID, self.description, settings).run(points)
+
+    def switch(self, _question: str = "") -> bool:
+        """Take the device's power and give it back, as somebody who is asked to."""
+        self.bus.detach(self.participant)
+        self.bus.attach(self.participant)
+        return True
 
     @property
     def values(self) -> dict[int, object]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NoReturn
 
 from canprobe.fieldbus.bus.port import Port
@@ -39,6 +40,7 @@ class Bench(SdoClient):
     Attributes:
         distributions: measured times by name, ms.
         first_answer: answer to the first read of 1000h, by which is seen that the device serves.
+        by_hand: function that asks a person to do something, and returns whether it was done.
         asked: codes of EMCY messages that the point provoked; others fail it.
     """
 
@@ -58,6 +60,7 @@ class Bench(SdoClient):
         self.asked: set[int] = set()
         self.distributions: dict[str, tuple[float, ...]] = {}
         self.first_answer = b""
+        self.by_hand: Callable[[str], bool] = lambda _: False
         self._changed_ns = 0
 
     def number(self, index: int, subindex: int = 0) -> int:

@@ -141,6 +141,7 @@ class Examination:
         self.bench = bench = Bench(
             self._port, device, permits, settings.times, bitrate=settings.bitrate, fd=settings.fd
         )
+        bench.by_hand = self._by_hand
         try:
             bench.first_answer = bench.request(0x40, 0x1000)
         except CanprobeError as error:
@@ -210,6 +211,12 @@ class Examination:
         if verdict is Verdict.PASS:
             detail = "; ".join(bench.notes)
         return self._row(point, verdict, detail, written, (bench.now_ns - began_ns) * 1e-9)
+
+    def _by_hand(self, step: str) -> bool:
+        """Let a person do something, and let the report list it."""
+        done = self.settings.ask is not None and self.settings.ask(step)
+        self.report.manual.append(f"{step}: {'done' if done else 'not done, as nobody confirmed it'}")
+        return done
 
     def _lacks(self, point: Point) -> str:
         """Why a point does not apply; empty where it does."""

@@ -41,6 +41,19 @@ def boot_up(bench: Bench) -> None:
 
 
 @conformance_point(
+    1, "nmt", "power on", "CiA 301, NMT boot-up", "700h+id with 00h after the power came back", needs="nmt"
+)
+def power_on(bench: Bench) -> None:
+    """The device announces itself when it gets its power, which a person switches."""
+    before = bench.boots
+    if not bench.by_hand(f"switch node {bench.node_id} off and on, then confirm"):
+        raise PointNotApplicable("it needs somebody who switches the device off and on")
+    bench.pass_time(bench.times.boot_s)
+    if bench.boots == before:
+        bench.deviates("no boot-up message after the power came back")
+
+
+@conformance_point(
     2,
     "nmt",
     "reset communication",
