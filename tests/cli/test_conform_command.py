@@ -66,3 +66,21 @@ def test_wrong_use_is_said_in_a_line(arguments, text, capsys, monkeypatch):
     assert main(arguments) == 2
     err = capsys.readouterr().err
     assert text in err and "Traceback" not in err
+
+
+def test_a_plan_reads_the_times_of_a_report(tmp_path, capsys):
+    path = tmp_path / "conform.json"
+    assert main([*ARGS, "--points", "timing", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    path.write_text(json.dumps(document), encoding="utf-8")
+    assert main(["plan", "cylinder", "--measured", str(path), "--json"]) == 0
+    times = json.loads(capsys.readouterr().out)
+    assert times["as_planned"] and {row["node_id"] for row in times["times"]} == {1, 2, 3, 4, 5, 6}
+    document["distributions"]["SYNC to TPDO"][7] = 2.6  # ms, at 400 Hz
+    path.write_text(json.dumps(document), encoding="utf-8")
+    assert main(["plan", "cylinder", "--measured", str(path)]) == 3
+    assert "2.600 ms of 2.5 ms, 50 times  longer than the plan allows" in capsys.readouterr().out
+    document["facts"]["product"] = "0x1"
+    path.write_text(json.dumps(document), encoding="utf-8")
+    assert main(["plan", "cylinder", "--measured", str(path)]) == 2
+    assert "no node of the plan is a device" in capsys.readouterr().err

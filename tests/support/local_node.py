@@ -1,14 +1,25 @@
-"""canopen-python's LocalNode on a lockstep bus: it receives, answers and sends its heartbeat in virtual time."""
+"""canopen-python's LocalNode on a lockstep bus: it receives, answers and sends its heartbeat in virtual time.
+
+`python tests/support/local_node.py` prints what `conform` finds in it, as docs/measure.py wants it.
+"""
 
 from __future__ import annotations
 
+import importlib.metadata
+import json
+import logging
 from collections.abc import Sequence
 from typing import Any
 
 import canopen
 
-from canprobe.fieldbus.bus.virtual.lockstep import Participant
+from canprobe.fieldbus.bus.clock import VirtualClock
+from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus, Participant
+from canprobe.fieldbus.eds.description import Description
+from canprobe.fieldbus.eds.packaged import load_eds
 from canprobe.fieldbus.protocol.frames import Frame
+from canprobe.fieldbus.tools.conform import Examination, ExaminationSettings
+from canprobe.fieldbus.tools.reports import Report, Verdict
 
 
 class _Periodic:
@@ -70,7 +81,7 @@ class LocalNodeOnBus(Participant):
             try:
                 self.network.notify(can_id, bytearray(data), t_ns * 1e-9)
             except Exception:  # its thread logs it and goes on
-                self.failures = True
+                logging.getLogger(__name__).debug("LocalNode raises", exc_info=True)
         return self._sent()
 
     def advance(self, t_ns: int) -> Sequence[Frame]:
@@ -84,3 +95,25 @@ class LocalNodeOnBus(Participant):
     def _sent(self) -> list[Frame]:
         sent, self.out = self.out, []
         return sent
+
+
+def examined(node_id: int = 5) -> Report:
+    """The examination of a LocalNode with the EDS of our drives."""
+    od = load_eds("puma260_joint", node_id)
+    bus = LockstepBus(VirtualClock(), fd=True)
+    bus.attach(LocalNodeOnBus(node_id, od))
+    logging.disable(logging.CRITICAL)
+    try:
+        return Examination(bus.port(), node_id, Description(od), ExaminationSettings(fd=True)).run()
+    finally:
+        logging.disable(logging.NOTSET)
+
+
+if __name__ == "__main__":
+    report = examined()
+    counts = {verdict: number for verdict, number in report.counts().items()}
+    rows = [[row.clause, f"{row.group} {row.name}", row.detail] for row in report.rows if row.verdict is Verdict.FAIL]
+    version = importlib.metadata.version("canopen")
+    table = [["clause", "point", "what it does"], *sorted(rows, key=lambda row: row[0])]
+    found = f"canopen {version}: " + ", ".join(f"{number} {verdict}" for verdict, number in counts.items())
+    print(json.dumps({"table": table, "findings": [found]}))

@@ -213,6 +213,7 @@ DEFECTS = {
     "sdo 23 block upload": says(
         lambda d, i, text: [(i, text[:2] + "0000" + text[6:] if i == ANSWER and d.last[1].startswith("a2") else text)]
     ),
+    "sdo 23 acknowledgement of 128": answers("a2807f", "c1"),
     "sdo 23 block download": answers("d5" + CRC, "a1"),
     "sdo 23 CRC of a block": answers("d5" + WRONG_CRC, "a1"),
     "sdo 23 sequence of a block": answers("821027", "a2027f"),

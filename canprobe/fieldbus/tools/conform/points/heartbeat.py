@@ -7,7 +7,7 @@ from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, RTR_FLAG, NmtState
 from canprobe.fieldbus.tools.conform import accepted
 from canprobe.fieldbus.tools.conform.accepted import accepted_text
 from canprobe.fieldbus.tools.conform.bench import Bench
-from canprobe.fieldbus.tools.conform.outcome import PointNotApplicable
+from canprobe.fieldbus.tools.conform.outcome import Deviation, PointNotApplicable
 from canprobe.fieldbus.tools.conform.point import conformance_point
 from canprobe.fieldbus.tools.conform.sdo_client import pack_write
 
@@ -75,7 +75,10 @@ def _need_guarding(bench: Bench) -> None:
 )
 def guarding(bench: Bench) -> None:
     """Remote requests: the state of each answer, and its toggle bit."""
-    bench.reset()
+    try:
+        bench.reset()  # the toggle bit begins anew
+    except Deviation as error:
+        raise PointNotApplicable("the device does not boot when it is told to, which is point 1") from error
     _need_guarding(bench)
     answers = []
     for state in (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL, NmtState.STOPPED, NmtState.PRE_OPERATIONAL):

@@ -66,17 +66,10 @@ def _configuration(bench: Bench) -> Iterator[None]:
     answer = _select(bench, _address(bench))
     try:
         if answer is None:
-            _without_lss(bench)
+            raise PointNotApplicable("the device does not answer switch state selective, which is point 66")
         yield
     finally:
         _release(bench)
-
-
-def _without_lss(bench: Bench) -> None:
-    description = bench.device.description
-    if description is not None and description.od.device_information.LSS_supported:
-        bench.deviates("no answer to switch state selective; the EDS says LSS_Supported=1")
-    raise PointNotApplicable("the device does not speak LSS")
 
 
 @conformance_point(
@@ -93,8 +86,13 @@ def switch_selective(bench: Bench) -> None:
     if _select(bench, (*numbers[:3], numbers[3] ^ 1)) is not None:
         _release(bench)
         bench.deviates("another serial number is answered")
-    with _configuration(bench):
-        answer = _ask(bench, pack_lss(LssCommand.INQUIRE_NODE_ID))
+    if _select(bench, numbers) is None:
+        description = bench.device.description
+        if description is not None and description.od.device_information.LSS_supported:
+            bench.deviates("no answer to its own numbers; the EDS says LSS_Supported=1")
+        raise PointNotApplicable("the device does not speak LSS")
+    answer = _ask(bench, pack_lss(LssCommand.INQUIRE_NODE_ID))
+    _release(bench)
     if answer is None:
         bench.deviates("the device answers no inquiry after it was selected")
     if _ask(bench, pack_lss(LssCommand.INQUIRE_NODE_ID), silent=True) is not None:

@@ -164,25 +164,36 @@ def _block_answer(bench: Bench, request: bytes) -> bytes:
     return answer
 
 
-@conformance_point(23, "sdo", "block upload", BLOCKS, "the same bytes as in segments, with the right CRC")
-def block_upload(bench: Bench) -> None:
-    """A text in blocks of 127 segments."""
-    index = next((i for i in (0x1008, 0x1009, 0x100A) if bench.device.has(i)), 0x1000)
+def _text_index(bench: Bench) -> int:
+    """A text of the device. Raises PointNotApplicable."""
+    index = next((i for i in (0x1008, 0x1009, 0x100A) if bench.device.has(i)), 0x1008)
     bench.need((index, 0), written=False)
-    wanted = bench.device.values[index, 0]
+    return index
+
+
+def _block_segments(bench: Bench, index: int) -> tuple[bytes, int, int]:
+    """Begin a block upload; return the bytes of its first block, the number of segments, and the bit of the CRC."""
     answer = _block_answer(bench, pack_request(0xA4, index, 0, bytes((127, 0))))
     if answer[0] >> 5 != 6:
         bench.deviates(f"a block upload is answered with {answer.hex(' ')}")
-    with_crc = answer[0] & 4
     bench.taken(SDO_TX_BASE + bench.node_id)
     bench.send(SDO_RX_BASE + bench.node_id, b"\xa3" + bytes(7))
     value, number, last = b"", 0, False
-    while not last:
+    while not last and number < 127:
         frame = bench.next(SDO_TX_BASE + bench.node_id, bench.times.sdo_s)
         number += 1
         if frame is None or len(frame.data) != 8 or frame.data[0] & 0x7F != number:
             bench.deviates(f"segment {number} of a block does not come, or has another number")
         value, last = value + frame.data[1:], bool(frame.data[0] & 0x80)
+    return value, number, answer[0] & 4
+
+
+@conformance_point(23, "sdo", "block upload", BLOCKS, "the same bytes as in segments, with the right CRC")
+def block_upload(bench: Bench) -> None:
+    """A text in blocks of 127 segments."""
+    index = _text_index(bench)
+    wanted = bench.device.values[index, 0]
+    value, number, with_crc = _block_segments(bench, index)
     end = bench.ask(bytes((0xA2, number, 127)) + bytes(5))
     if end[0] & 0xE3 != 0xC1:
         bench.deviates(f"the end of a block upload is {end.hex(' ')}")
@@ -192,6 +203,15 @@ def block_upload(bench: Bench) -> None:
         bench.deviates(f"a block upload of {index:04X}h gives {value.hex()}, segments gave {wanted.hex()}")
     if with_crc and int.from_bytes(end[1:3], "little") != crc_hqx(value, 0):
         bench.deviates("the CRC of a block upload is wrong")
+    bench.serves("the transfer")
+
+
+@conformance_point(23, "sdo", "acknowledgement of 128", BLOCKS, accepted_text(accepted.SEQUENCE))
+def acknowledgement_of_128(bench: Bench) -> None:
+    """A block upload, of which more segments are acknowledged than a block can have."""
+    index = _text_index(bench)
+    _block_segments(bench, index)
+    bench.must_refuse(bytes((0xA2, 128, 127)) + bytes(5), accepted.SEQUENCE, "an acknowledgement of 128 segments")
     bench.serves("the transfer")
 
 

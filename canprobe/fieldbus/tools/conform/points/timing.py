@@ -14,7 +14,9 @@ from canprobe.fieldbus.tools.conform.sdo_client import pack_request
 SDO_TIME, SYNC_TIME, HEARTBEAT_TIME = "SDO answer", "SYNC to TPDO", "heartbeat period"
 """Names of the distributions."""
 _SDO_COUNT, _SYNC_COUNT, _BEAT_COUNT = 100, 50, 20
-_SYNC_PERIOD_S, _HEARTBEAT_MS = 0.01, 50
+_SYNC_PERIOD_S = 0.01
+HEARTBEAT_MS = 50
+"""Period that 1017h gets."""
 _BEAT_SHARE = 0.2
 _LOAD_IDS = (0x06A, 0x06B)
 """Identifiers above the device's in the arbitration that belong to no service."""
@@ -72,12 +74,12 @@ def sync_time(bench: Bench) -> None:
 def heartbeat_time(bench: Bench) -> None:
     """Twenty periods of 50 ms."""
     bench.need((0x1017, 0))
-    bench.put(0x1017, 0, _HEARTBEAT_MS)
-    frames = bench.during((_BEAT_COUNT + 2) * 1e-3 * _HEARTBEAT_MS, [HEARTBEAT_BASE + bench.node_id])
+    bench.put(0x1017, 0, HEARTBEAT_MS)
+    frames = bench.during((_BEAT_COUNT + 2) * 1e-3 * HEARTBEAT_MS, [HEARTBEAT_BASE + bench.node_id])
     gaps = tuple((b.t_ns - a.t_ns) * 1e-6 for a, b in pairwise(frames[1:]))
     bench.distributions[HEARTBEAT_TIME] = gaps
-    allowed_ms = _BEAT_SHARE * _HEARTBEAT_MS + bench.times.slack_s * 1e3
-    if not gaps or max(abs(gap - _HEARTBEAT_MS) for gap in gaps) > allowed_ms:
+    allowed_ms = _BEAT_SHARE * HEARTBEAT_MS + bench.times.slack_s * 1e3
+    if not gaps or max(abs(gap - HEARTBEAT_MS) for gap in gaps) > allowed_ms:
         bench.deviates(
             f"heartbeat periods from {min(gaps, default=0):.1f} to {max(gaps, default=0):.1f} ms, 1017h is 50 ms"
         )
@@ -94,10 +96,10 @@ def heartbeat_time(bench: Bench) -> None:
 def under_load(bench: Bench) -> None:
     """Frames of higher priority take half the bus, while 1000h is read and the heartbeat runs."""
     bench.need((0x1017, 0))
-    bench.put(0x1017, 0, _HEARTBEAT_MS)
+    bench.put(0x1017, 0, HEARTBEAT_MS)
     bench.load = [(can_id, bytes(range(8))) for can_id in _LOAD_IDS], _LOAD_GAP_BITS * NS_PER_S // bench.bitrate
     began_ns = bench.now_ns
-    beats = bench.during(4e-3 * _HEARTBEAT_MS, [HEARTBEAT_BASE + bench.node_id])
+    beats = bench.during(4e-3 * HEARTBEAT_MS, [HEARTBEAT_BASE + bench.node_id])
     bench.distributions[f"{SDO_TIME} under load"] = _sdo_times(bench, _LOADED_COUNT)
     if len(beats) < 3:
         bench.deviates(f"{len(beats)} heartbeats in {(bench.now_ns - began_ns) * 1e-6:.0f} ms under load")
