@@ -167,6 +167,18 @@ class OpenCell:
         self.session.run(runs, progress)
         return self._result
 
+    def resume(self) -> None:
+        """Ask for motion in a cell that was opened with ``recover=True`` and has come back from a loss.
+
+        A controller that is held goes on in the next cycle. May be called from any thread, an observer, or `progress`.
+        Where no controller is held, as after one that the loss has ended, the cell is brought up again for the next.
+
+        Raises:
+            UsageError: the cell was not opened with ``recover=True``, or is closed.
+            BusError, SafetyStop: the cell cannot be brought up again.
+        """
+        self.session.resume()
+
     def open_to_requests(self, task: Controller) -> Controller:
         """The task, which other tools may start, stop and change where the scene allows it."""
         return self._bridges.open_to_requests(task)
