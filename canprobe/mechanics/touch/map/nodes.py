@@ -78,6 +78,18 @@ class NodeGrid:
                 begin = i + 1
         self._take(rows[begin:])
 
+    def put(self, rows: Floats) -> None:
+        """Take nodes (n, COLUMNS) as they are."""
+        for row in rows:
+            self._numbers.setdefault(self._voxel(row), self._size)
+            self._append(row)
+
+    def _append(self, row: Floats) -> None:
+        if self._size == len(self._rows):
+            self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
+        self._rows[self._size] = row
+        self._size += 1
+
     def _take(self, rows: Floats) -> None:
         self._open[_MEANS] += rows[:, _MEANS].sum(axis=0)
         self._open[COUNT] += len(rows)
@@ -95,10 +107,7 @@ class NodeGrid:
             old[COUNT:] += row[COUNT:]
             old[NORMAL] /= np.linalg.norm(old[NORMAL])
         else:
-            if self._size == len(self._rows):
-                self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
-            self._rows[self._size] = row
-            self._size += 1
+            self._append(row)
         self._open = np.zeros(COLUMNS)
         self._begun_at = self._travel.total
 
