@@ -87,7 +87,13 @@ def make_shape_estimator(task: Touch, method: str) -> Estimator:
     from canprobe.mechanics.touch.estimate.following import FollowingEstimator
 
     scale = SCALE_ERROR + ROLLING_SCALE_ERROR * task.scan.rolling_share
-    return FollowingEstimator(_with_patch(task, estimator, memory) if _uses_patch(task) else estimator, memory, scale)
+    inner = _with_patch(task, estimator, memory) if _uses_patch(task) else estimator
+    following = FollowingEstimator(inner, memory, scale)
+    if not task.shape.revisit:
+        return following
+    from canprobe.mechanics.touch.map.known_ground import RevisitingEstimator
+
+    return RevisitingEstimator(following, make_surface_map(task), memory)
 
 
 def _typical_sigma(task: Touch) -> float:

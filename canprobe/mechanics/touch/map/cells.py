@@ -120,7 +120,7 @@ def solve_cells(rows: Floats, points: Floats, pad: PadLayer | None, noise: MapNo
     if pad is not None:
         stiffness = evidence.stiffness(rows, points, pad, discs, fits.K)
         pad = pad._replace(stiffness=stiffness.value)
-    weight = weight * np.minimum(1.0, ROBUST_CHI2 / np.maximum(chi2, 1e-300))
+    weight = robust(weight, chi2)
     fits, common, _ = fit_discs(rows, discs, pad, noise, K_ref=fits.K, weight=weight)
     tree, offset = cKDTree(discs.origin), np.zeros(m)
     excess = np.array([fits.excess[near].max() for near in tree.query_ball_point(discs.origin, EXCESS_REACH_M)])
@@ -129,10 +129,16 @@ def solve_cells(rows: Floats, points: Floats, pad: PadLayer | None, noise: MapNo
         force = (discs.weight * rows[discs.nodes, column.ROOT_FORCE]).sum(axis=1) / discs.weight.sum(axis=1)
         depth = force * np.sqrt(np.sqrt(np.maximum(det, 0.0)) / (math.pi * pad.stiffness))
         offset = 0.5 * stiffness.sigma * depth
-    return Cells(discs, fits, excess, offset, *_observed(fits), tree, cKDTree(points), common, stiffness)
+    return Cells(discs, fits, excess, offset, *observed_of(fits), tree, cKDTree(points), common, stiffness)
 
 
-def _observed(fits: Quartics) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
+def robust(weight: Floats, chi2: Floats) -> Floats:
+    """Weights (m, n) of nodes, less where their χ² is large."""
+    result: Floats = weight * np.minimum(1.0, ROBUST_CHI2 / np.maximum(chi2, 1e-300))
+    return result
+
+
+def observed_of(fits: Quartics) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
     """Whether height, slopes and all of K were observed (m, 3), and the rank of K (m,)."""
     V = fits.V
     height = V[:, 0, 0] * LENGTH_M**2 < MAX_HEIGHT_SIGMA_M**2

@@ -61,9 +61,7 @@ class Discs(NamedTuple):
         )
         up /= np.linalg.norm(up, axis=1)[:, None]
         tree = cKDTree(points)
-        radius = np.full(len(origin), MAX_RADIUS_M)
-        if len(points) >= NODES_WANTED:
-            radius = np.clip(np.asarray(tree.query(origin, [NODES_WANTED])[0])[:, 0], MIN_RADIUS_M, MAX_RADIUS_M)
+        radius = _radius(tree, origin)
         starts = range(0, len(origin), DISCS_AT_ONCE)
         found = [
             _members(normals, tree, *(values[i : i + DISCS_AT_ONCE] for values in (origin, up, radius))) for i in starts
@@ -78,9 +76,24 @@ class Discs(NamedTuple):
         R = np.array([tangent_rotation(n) for n in up.tolist()])
         return cls(origin, R, nodes, weight, np.minimum(share, 1.0))
 
+    @classmethod
+    def at(cls, place: Floats, R: Floats, points: Floats, rows: Floats) -> Discs:
+        """One disc at a place (3,), m, with axes R (3, 3), of nodes as for `of`."""
+        tree, origin = cKDTree(points), place[None]
+        nodes, weight = _members(rows[:, NORMAL], tree, origin, R[None, :, 2], _radius(tree, origin))
+        return cls(origin, R[None], nodes, weight, np.ones(1))
+
     def part(self, which: slice) -> Discs:
         """Some of the discs."""
         return Discs(self.origin[which], self.R[which], self.nodes[which], self.weight[which], self.share[which])
+
+
+def _radius(tree: cKDTree, origin: Floats) -> Floats:
+    """(m,) radius of discs at places (m, 3), m, by the number of nodes that they should hold."""
+    if tree.n < NODES_WANTED:
+        return np.full(len(origin), MAX_RADIUS_M)
+    wanted: Floats = np.asarray(tree.query(origin, [NODES_WANTED])[0])[:, 0]
+    return np.clip(wanted, MIN_RADIUS_M, MAX_RADIUS_M)
 
 
 def _members(
