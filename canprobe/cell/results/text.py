@@ -140,5 +140,5 @@ def _map_text(surface: Mapping[str, Any]) -> str:
     return (
         f"{surface['contacts']} contacts in {surface['nodes']} nodes, σ {surface['sigma_um']:.0f} µm"
         + (f"; RMS error {off:.0f} µm" if off is not None else "")
-        + f"; passes disagree on {100 * surface['disagree_fraction']:.0f} %"
+        + f"; contacts disagree on {100 * surface['disagree_fraction']:.0f} %"
     )

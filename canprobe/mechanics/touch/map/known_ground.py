@@ -38,6 +38,8 @@ MEMORIES_BETWEEN = 2.0
 BLUR_M = 2e-3
 """Distance within which a change of curvature counts as an error, m. The value was set on the development shapes of
 `study shapes`: 0 states too little on a fillet, 3 mm gives away what free forms gain."""
+MAX_WAITING = 10_000
+"""Most contacts that wait to become ground: a contact at rest adds none beyond 50 s of an array of 200 Hz."""
 MAX_EXCESS = 1.0
 """Largest χ² per degree of freedom above 1 of the contacts of a map that is believed."""
 MIN_NODES = 4
@@ -79,7 +81,8 @@ class RevisitingEstimator:
         self._inner.add(sample)
         if self._inner.dropped.total == before:
             self._travel.add(sample.p_base)
-            self._waiting.append((self._travel.total, sample))
+            if len(self._waiting) < MAX_WAITING:
+                self._waiting.append((self._travel.total, sample))
 
     def reset(self) -> None:
         """Forget everything but the settings and the ground."""

@@ -208,7 +208,7 @@ class SurfaceMap:
         return excess
 
     def _disagreement(self, blend: _Blend) -> tuple[Floats]:
-        excess: Floats = np.einsum("nk,nk->n", blend.weight, self.solved().excess[blend.cells])
+        excess: Floats = np.einsum("nk,nk->n", blend.weight, self.solved().fits.excess[blend.cells])
         return (excess + 0.0 * blend.feet.normal[:, 0],)
 
     def mesh(self, *, cell: float = CELL_M) -> Mesh:
