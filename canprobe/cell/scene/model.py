@@ -325,6 +325,8 @@ class ShapeSettings:
     """Other estimators that compute on the same contacts after the run, for the report."""
     patch: bool = True
     """Use the second moments of the tactile images where the path leaves a curvature open."""
+    revisit: bool = False
+    """Join the answers of `recursive` and `ml` with a map of what the probe touched there in earlier passes."""
     every_ms: Annotated[float, Range(0, 10_000, open_low=True)] = 40.0
     """Time between two estimates. Every contact is used."""
 
