@@ -354,6 +354,10 @@ class PatchReader:
         if self.taxels is not None and sample.frame.features is None:
             self.taxels.look(sample.frame.taxels, sample.frame.window, sample.t_sample_ns)
 
+    def widen(self, spread: float) -> None:
+        """State forces with this relative standard deviation from now on: the calibration is another array's."""
+        self._force.widen(spread)
+
     @property
     def found(self) -> int:
         """Number of taxels that were found not to measure."""

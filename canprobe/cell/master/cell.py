@@ -130,6 +130,7 @@ class Cell:
         self._running = False
         self._retreats_for: CanprobeError | None = None
         self._controller = Controller()
+        self._remarks_noted = 0
         for node_id in self.watch.node_ids:
             for base in (HEARTBEAT_BASE, EMCY_BASE):
                 self._network.subscribe(base + node_id, self.watch.push)
@@ -235,7 +236,7 @@ class Cell:
         """The first half of `run`: enable the drives for a controller, which `advance` then runs."""
         runs = as_controller(controller)
         with self._one_at_a_time(), self._naming_another_master():
-            self._controller, self._retreats_for = runs, None
+            self._controller, self._retreats_for, self._remarks_noted = runs, None, 0
             self._enable()
 
     def advance(self, cycles: int | None, progress: Callable[[Measurement], None] = lambda _: None) -> bool:
@@ -407,6 +408,10 @@ class Cell:
         self._note_alarms()
         seen = self.supervisor.seen
         seen.restarts = self._controller.restarts
+        for remark in self._controller.remarks[self._remarks_noted :]:
+            self._remarks_noted += 1
+            self.notes.add(remark, t_s=(self.start_ns + measurement.t_ns) * 1e-9)
+            self._say(remark)
         if self._reader is not None and measurement.tactile is not None:
             self._reader.look(measurement.tactile)
             seen.silent_taxels = self._reader.found

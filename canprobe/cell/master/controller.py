@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -160,6 +160,11 @@ class Controller:
     def restarts(self) -> int:
         """How often the estimator of this controller diverged and started again."""
         return 0
+
+    @property
+    def remarks(self) -> Sequence[str]:
+        """What the controller has found to be wrong with the cell, a line each; more come, and none goes."""
+        return ()
 
 
 class _Function(Controller):

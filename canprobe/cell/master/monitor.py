@@ -21,6 +21,7 @@ from canprobe.fieldbus.protocol.emcy import Emcy, describe, is_no_error
 from canprobe.fieldbus.protocol.frame_bits import best_case_bits, best_case_fd_bits
 from canprobe.fieldbus.protocol.frames import CLASSIC_BYTES, EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, unpack_heartbeat
 from canprobe.mechanics.robot.model import units_to_joints
+from canprobe.mechanics.touch.patch.calibration_check import CalibrationCheck
 
 SECOND_NS = 1_000_000_000
 
@@ -62,6 +63,7 @@ class CellView:
         sync_hz: SYNCs in the last second.
         sync_jitter_us: 99th percentile and largest distance of a SYNC interval from the planned one, µs.
         torn_frames: tactile frames that were not whole.
+        array: how the array is not as its calibration says, by its images alone; None where it is.
     """
 
     channel: str
@@ -76,6 +78,7 @@ class CellView:
     sync_hz: float = 0.0
     sync_jitter_us: tuple[float, float] | None = None
     torn_frames: int = 0
+    array: str | None = None
 
     def as_document(self) -> dict[str, Any]:
         """The state as `--json` prints it."""
@@ -105,6 +108,10 @@ class Monitor:
         self._counts: list[int | None] = [None] * len(axes)
         self._tactile = make_tactile(plan)
         self._reader = make_patch_reader(plan.setup)
+        array = plan.setup.array
+        self._check: CalibrationCheck | None = None
+        if array is not None:
+            self._check = CalibrationCheck.of(array.calibration, array.pad, images=array.mode != "features")
         self._heard: dict[int, int] = {}
         self._first_ns: int | None = None
         self._recent: dict[str, deque[tuple[int, float]]] = {channel: deque() for channel in channels}
@@ -161,6 +168,10 @@ class Monitor:
             self._view.taxels = frame.taxels
             patch = self._reader.read(TactileSample(frame, t_ns, 0)) if self._reader is not None else None
             self._view.force_n = patch.force if patch is not None else None
+            if patch is not None and self._check is not None:
+                self._check.see(t_ns * 1e-9, frame.taxels, frame.window, patch)
+                self._check.work()
+                self._view.array = self._check.finding
 
     def _take_heartbeat(self, node: NodeView, data: bytes, t_ns: int) -> None:
         try:

@@ -15,6 +15,7 @@ from canprobe.cell.tasks.touch import TouchTask
 from canprobe.fieldbus.protocol.tactile import DEFAULT_WINDOW
 from canprobe.mechanics.touch.contact import indentation_from_force
 from canprobe.mechanics.touch.patch.array_models import make_image_model, make_patch_calibration
+from canprobe.mechanics.touch.patch.calibration_check import CalibrationCheck
 from canprobe.mechanics.touch.patch.moments import MomentImage
 
 if TYPE_CHECKING:
@@ -164,7 +165,9 @@ def make_task(plan: Plan) -> Controller:
     """The controller of the plan's task; what the task does not need is not even imported."""
     period_s, task = plan.sync.period_ns * 1e-9, plan.setup.task
     if isinstance(task, Touch):
-        return TouchTask(plan, task, make_sensing(task), make_shape_tracker(plan.setup))
+        array = task.array
+        check = CalibrationCheck.of(array.calibration, array.pad, images=array.mode != "features")
+        return TouchTask(plan, task, make_sensing(task), make_shape_tracker(plan.setup), check)
     if isinstance(task, Calibrate):
         from canprobe.cell.tasks.calibrate import CalibrateTask
 

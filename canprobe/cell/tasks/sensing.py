@@ -160,6 +160,11 @@ class ContactSensing:
         """Place contacts as another sensing did that had this depth at 1 N, m."""
         self._depth_at_1_n = depth
 
+    @property
+    def slope(self) -> Slope | None:
+        """Slope that the last touch showed; None before."""
+        return self._slope
+
     def set_slope(self, slope: Slope) -> None:
         """Take the slope that a touch showed; depths follow from it until the object's curvature is known."""
         flat = 1.0 / float(indentation_from_force(1.0, self.stiffness, self.radius, np.zeros(2)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 from canprobe.mechanics.touch.pad import COUNTS_MAX
 from canprobe.mechanics.touch.patch.force_creep import ForceCreep
@@ -23,6 +24,10 @@ class ForceReading:
         self._full_pa = calibration.full_scale_pa
         self._level_pa = self._full_pa * (calibration.threshold_counts + 1) / COUNTS_MAX
         self._creep = ForceCreep(self._errors.creep)
+
+    def widen(self, spread: float) -> None:
+        """State forces with this relative standard deviation between arrays from now on, where it is the larger one."""
+        self._errors = replace(self._errors, spread=max(spread, self._errors.spread))
 
     def step(self, t_s: float, patch: Patch) -> Patch:
         """The patch of an image with its force and the standard deviation of it.
