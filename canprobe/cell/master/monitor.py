@@ -170,8 +170,8 @@ class Monitor:
             self._view.force_n = patch.force if patch is not None else None
             if patch is not None and self._check is not None:
                 self._check.see(t_ns * 1e-9, frame.taxels, frame.window, patch)
-                self._check.work()
-                self._view.array = self._check.finding
+                if self._check.work():
+                    self._view.array = self._check.finding
 
     def _take_heartbeat(self, node: NodeView, data: bytes, t_ns: int) -> None:
         try:

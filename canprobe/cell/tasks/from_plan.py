@@ -95,8 +95,7 @@ def _typical_sigma(task: Touch) -> float:
     """Standard deviation of a contact at the wanted force on a plane, m, for contacts that state none."""
     probe = task.probe
     depth = indentation_from_force(task.force, probe.stiffness, probe.radius, (0.0, 0.0))
-    level_pa = MomentImage(make_patch_calibration(task.array.calibration, task.array.pad)).level_pa
-    return task.array.calibration.noise.lateral(level_pa / (probe.stiffness * float(depth)))
+    return task.array.calibration.noise.lateral(task.array.pad.lightness(probe.stiffness * float(depth)))
 
 
 def _with_patch(task: Touch, estimator: Estimator, memory: float) -> Estimator:

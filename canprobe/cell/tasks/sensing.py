@@ -121,7 +121,7 @@ class ContactSensing:
         self.dropped = 0
         self.reader = PatchReader(calibration)
         self._noise = noise
-        self._level_pa = MomentImage(calibration).level_pa
+        self._pad = calibration.pad
         self._moment_image = moment_image
         self._lag = None if lag is None else PadLag(lag)
         self._history = JointHistory()
@@ -191,8 +191,7 @@ class ContactSensing:
             return None
         t_s, uv = sample.t_sample_ns * 1e-9, (patch.u, patch.v)
         depth = self.depth(patch.force)
-        # level that is taken off the image, over the peak pressure of the contact
-        lightness = self._level_pa / (self.stiffness * depth) if depth > 0.0 else 1.0
+        lightness = self._pad.lightness(patch.peak_pa)
         image_sigma = 0.0 if self._noise is None else self._noise.image(lightness)
         found = contact_sample(
             t_s=t_s,

@@ -153,8 +153,7 @@ class TouchTask(ProbingTask):
 
     def _doubt(self, check: CalibrationCheck) -> None:
         """Answer with less certainty where the array is not as its calibration says."""
-        check.work()
-        if (finding := check.finding) is None:
+        if not check.work() or (finding := check.finding) is None:
             return
         self.sensing.reader.widen(check.force_spread)
         if self.shape is not None:

@@ -39,12 +39,10 @@ if TYPE_CHECKING:
 
 LOOK_S = 0.15
 """Time between two images that are fitted, s: a fit takes a millisecond."""
-MIN_IMAGES, MAX_IMAGES = 16, 48
-"""Number of images from which on blur and disagreement are judged, and at which the check ends."""
-MIN_TRIES = 20
-"""Number of images after which something is said, so that it holds all signs: not every image can be fitted."""
-MIN_ANSWERS, MAX_ANSWERS = 40, 200
-"""The same of answers, for the stiffness."""
+MIN_TRIES, MAX_TRIES = 20, 64
+"""Number of images after which something is said, so that it holds all signs, and at which the check ends."""
+MIN_IMAGES, MIN_ANSWERS = 16, 40
+"""Number of images with a fit from which on blur and disagreement are judged, and of answers, for the stiffness."""
 MAX_RATIO = 1.22
 """Ratio of blur or stiffness to the calibration's, up or down, beyond which it is another array's."""
 MAX_DISAGREEMENT, DISAGREEMENT_SIGMAS = 0.3, 4.0
@@ -93,26 +91,26 @@ class CalibrationCheck:
             window: first row, first column, rows, columns that were sent.
             patch: its patch.
         """
-        if t_s < self._next_s or len(self._blurs) >= MAX_IMAGES:
+        if t_s < self._next_s or self._tries >= MAX_TRIES:
             return
         if patch.cut_by_pad or patch.dead or patch.peak_pa > STRAIGHT_SHARE * self._pad.full_scale_pa:
             return
         self._next_s = t_s + LOOK_S
         self._waiting = image, window
 
-    def work(self) -> None:
-        """Fit the image that waits."""
+    def work(self) -> bool:
+        """Fit the image that waits; whether there was one, so that there may be a `finding`."""
         if self._waiting is None:
-            return
+            return False
         (image, window), self._waiting = self._waiting, None
         self._tries += 1
         found = fit_blur(image, window, blur=self._blur, crosstalk=self._crosstalk, gains=self._gains)
-        if found is None:
-            return
-        self._blurs.append(math.log(found.blur / self._blur))
-        if self._curvature is not None and found.bend > 0.0:
-            stiffness = self._stiffness_of_bend * found.bend / self._curvature
-            self._by_images.append(math.log(stiffness / self._stiffness))
+        if found is not None:
+            self._blurs.append(math.log(found.blur / self._blur))
+            if self._curvature is not None and found.bend > 0.0:
+                stiffness = self._stiffness_of_bend * found.bend / self._curvature
+                self._by_images.append(math.log(stiffness / self._stiffness))
+        return True
 
     def take(self, answer: SurfaceEstimate, slope: Slope | None) -> None:
         """Take an answer of the estimator, and the slope that the touch showed.
@@ -121,7 +119,9 @@ class CalibrationCheck:
             answer: answer at the last contact.
             slope: slope of the root of the force over the push; None where the touch showed none.
         """
-        if answer.stiffness is not None and len(self._by_answers) < MAX_ANSWERS:
+        if self._tries >= MAX_TRIES:
+            return
+        if answer.stiffness is not None:
             self._by_answers.append(math.log(answer.stiffness / self._stiffness))
         radius, kappa = self._pad.radius_m, answer.kappa
         if not answer.observed.all() or float(kappa[1]) < -HOLLOW_LIMIT_SHARE / radius:
