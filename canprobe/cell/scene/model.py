@@ -83,7 +83,7 @@ class SceneInfo:
     seed: Annotated[int, Range(0, 2**63 - 1)] = 0
     """Seed of all random numbers. In lockstep the same seed gives the same `bus.log`."""
     figures: bool = True
-    """Draw `report.png`, `surface.png` and `report.html` after a run. false saves seconds."""
+    """Draw `report.png` and `surface.png` after a run. false saves a second."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,6 +16,7 @@ from canprobe.cell.tasks.touch import TouchTask
 from canprobe.fieldbus.protocol.tactile import DEFAULT_WINDOW
 from canprobe.mechanics.touch.contact import indentation_from_force
 from canprobe.mechanics.touch.patch.array_models import make_image_model, make_patch_calibration
+from canprobe.mechanics.touch.patch.calibration_check import CalibrationCheck
 from canprobe.mechanics.touch.patch.moments import MomentImage
 
 if TYPE_CHECKING:
@@ -105,8 +106,7 @@ def _typical_sigma(task: Touch) -> float:
     """Standard deviation of a contact at the wanted force on a plane, m, for contacts that state none."""
     probe = task.probe
     depth = indentation_from_force(task.force, probe.stiffness, probe.radius, (0.0, 0.0))
-    level_pa = MomentImage(make_patch_calibration(task.array.calibration, task.array.pad)).level_pa
-    return task.array.calibration.noise.lateral(level_pa / (probe.stiffness * float(depth)))
+    return task.array.calibration.noise.lateral(task.array.pad.lightness(probe.stiffness * float(depth)))
 
 
 def _with_patch(task: Touch, estimator: Estimator, memory: float) -> Estimator:
@@ -177,7 +177,9 @@ def make_task(plan: Plan) -> Controller:
     """The controller of the plan's task; what the task does not need is not even imported."""
     period_s, task = plan.sync.period_ns * 1e-9, plan.setup.task
     if isinstance(task, Touch):
-        return TouchTask(plan, task, make_sensing(task), make_shape_tracker(plan.setup))
+        array = task.array
+        check = CalibrationCheck.of(array.calibration, array.pad, images=array.mode != "features")
+        return TouchTask(plan, task, make_sensing(task), make_shape_tracker(plan.setup), check)
     if isinstance(task, Calibrate):
         from canprobe.cell.tasks.calibrate import CalibrateTask
 
