@@ -1,5 +1,6 @@
-"""What pages do not say by themselves: keys of a scene and imports, from the code; all that was measured, from
-docs/measured.json; with `notebooks`, what these show. The figures of the packaged scenes go into the package too.
+"""What pages do not say by themselves: keys of a scene, points of `conform` and imports, from the code; all that was
+measured, from docs/measured.json; with `notebooks`, what these show. The figures of the packaged scenes go into the
+package too.
 
 `python docs/generate.py [notebooks]`
 """
@@ -14,6 +15,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from conform_page import conform_page
 from room_imports import imports_svg
 from scene_keys import scene_keys
 from schemas import FILES, schema_of
@@ -141,6 +143,8 @@ def pages() -> Iterator[tuple[Path, str]]:
     yield EXPECTED, expected_figures(measured)
     yield DOCS / "gallery.md", gallery(measured)
     yield DOCS / "scene-keys.md", scene_keys()
+    page = DOCS / "conform.md"
+    yield page, conform_page(page.read_text(encoding="utf-8"))
     for file in FILES:
         yield SCHEMAS / f"{file}.json", json.dumps(schema_of(file), ensure_ascii=False, indent=1) + "\n"
     yield DOCS / "img" / "imports.svg", imports_svg()

@@ -40,6 +40,7 @@ COMMANDS = (
     "up",
     "emulate",
     "inject",
+    "conform",
     "judge",
     "scan",
     "monitor",

@@ -139,6 +139,7 @@ def _scene_server(args: argparse.Namespace) -> Callable[[], None]:
         homed=args.parent is not None,  # a run cannot home its emulated nodes
         faults=args.inject,
         say=args.report.say,
+        outlasts=args.parent is not None,  # the run decides whether it comes back
     )
 
 

@@ -28,7 +28,7 @@ from canprobe.fieldbus.bus.files import make_folder
 from canprobe.fieldbus.bus.port import Port, Reports
 from canprobe.fieldbus.bus.presence import answering_nodes
 from canprobe.fieldbus.bus.pumped import PumpedNetwork
-from canprobe.fieldbus.bus.real.memory import reserve_memory
+from canprobe.fieldbus.bus.real.memory import garbage_collection_paused, reserve_memory
 from canprobe.fieldbus.bus.real.processor import DEVICE_PRIORITY, ask_for_processor, realtime
 from canprobe.fieldbus.eds.packaged import check_eds
 from canprobe.fieldbus.protocol.lss import UNCONFIGURED_ID
@@ -66,6 +66,7 @@ def emulate(
     faults: Sequence[str] = (),
     onlooker: Onlooker | None = None,
     say: Say = quiet,
+    outlasts: bool = False,
 ) -> None:
     """Serve emulated nodes on a real interface until interrupted, for any master.
 
@@ -82,6 +83,7 @@ def emulate(
         faults: faults, as `canprobe.fieldbus.tools.faults.parse_fault` reads them; their times count from the start.
         onlooker: looks on, and may end the serving.
         say: called when the nodes are about to be served.
+        outlasts: whether the nodes outlast an interface that is down for a while.
 
     Raises:
         UsageError: when the scene does not fit, a fault is wrong, or a file of `store_folder` belongs to another node.
@@ -128,6 +130,7 @@ def emulate(
                 say=say,
                 in_realtime=plan.setup.realtime,
                 cycles_kept=plan.cycles if truth_path is not None else 0,
+                outlasts=outlasts,
             )
         finally:
             if truth_path is not None and world.recorder is not None:
@@ -248,6 +251,7 @@ def _serve(
     say: Say,
     in_realtime: bool,
     cycles_kept: int = 0,
+    outlasts: bool = False,
 ) -> None:
     """Serve nodes until interrupted, and throw the faults that are given and those that come by the control channel."""
     from canprobe.fieldbus.node.serve import serve
@@ -280,7 +284,8 @@ def _serve(
         if onlooker is not None:
             buses = [(nodes, onlooker.tap(port)) for nodes, port in buses]
             onlooker.begin(faulty, start_ns)
-        serve(buses, look)
+        with garbage_collection_paused():
+            serve(buses, look, outlasts=outlasts)
 
 
 def _named(nodes: Sequence[SlaveNode]) -> str:
