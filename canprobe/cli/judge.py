@@ -142,16 +142,17 @@ def _judge_served(args: argparse.Namespace) -> int:
 
     nodes = _descriptions(args)
     output = args.output or Path(tempfile.mkstemp(prefix="canprobe-judge-", suffix=".txt")[1])
-    faults = () if args.passive else args.inject or None
-    bench = MasterBench(args.command, args.seconds, faults, output)
-    target, serve = _server(args, bench, nodes)
+    bench = MasterBench(args.command, args.seconds, () if args.passive else args.inject or None, output)
     try:
+        target, serve = _server(args, bench, nodes)
         with left_by_ctrl_c(), first_ctrl_c(bench.ask):
             serve()
     finally:
         bench.close()
         if args.output is None and not output.stat().st_size:
             output.unlink()
+    if bench.command is not None and output.exists():
+        args.report.say(f"output of {args.command[0]}: {output}")
     judge = bench.judged(nodes, target.bitrate)
     if args.log is not None:
         write_log(bench.record(), args.log, target.channel)
@@ -177,7 +178,7 @@ def _server(
         raise UsageError("judge: the nodes are served on one channel, without a name: --channel CH")
     if args.scene is None:
         target = real_target(args.bus, channels[0][1], args.bitrate)
-        files = eds_files(args)
+        files = eds_files(args, "judge")
         positions = [start_position(node) for node in nodes.values()]
         return target, lambda: api.emulate_eds(files, target, positions=positions, onlooker=bench, say=args.report.say)
     scene = loaded(args)
@@ -204,7 +205,7 @@ def _descriptions(args: argparse.Namespace, channel: str | None = None) -> Mappi
     from canprobe.fieldbus.eds.packaged import load_eds
 
     if args.scene is None:
-        files = eds_files(args)
+        files = eds_files(args, "judge")
         if any(one == 255 for _, one in files):
             raise UsageError("judge: nodes without an id (255) are not judged")
     else:

@@ -70,6 +70,7 @@ def test_the_log_of_a_run_has_nothing_to_blame(tmp_path, capsys):
     [
         (["--record", "x.log"], "name a SCENE or a cell, or else --eds FILE"),
         ([*NODE, "--record", "x.log", "--passive", "--", "true"], "COMMAND belongs to served nodes"),
+        (["--eds", "puma260_joint", "--channel", "x"], "judge: 1 --eds, but 0 --node-id"),
         ([*NODE, "--passive", "--inject", "node 1: mute"], "choose one"),
         ([*NODE, "--record", "/nowhere/x.log"], "/nowhere/x.log: No such file"),
         ([*NODE, "--bus", "lockstep", "--channel", "x"], "lockstep"),
