@@ -30,6 +30,7 @@ class WaitsForBootUp(Rule):
     expected = "a node that is there already is asked for 1000h, or reset"
     hint = "do not wait for a boot-up that came before the master"
     hears = (OtherHeartbeatSeen, SyncSeen)
+    answers = True
 
     def begin(self) -> None:
         """Remember nothing yet."""

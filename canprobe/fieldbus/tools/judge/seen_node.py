@@ -92,6 +92,8 @@ class SeenNode:
         nmt: NMT state as last seen, or commanded; None before.
         booted: whether a boot-up was seen.
         seen: whether the node has sent anything.
+        answers: whether it has sent anything but a boot-up.
+        asked: whether it got an SDO request.
         started_ns: time of the last NMT start; None while it is not started.
         syncs: number of SYNCs since then.
         heartbeats_ns: times of the last heartbeats.
@@ -108,7 +110,7 @@ class SeenNode:
         self._served = served
         self.nmt: NmtState | None = None
         self.nmt_ns = 0
-        self.booted = self.seen = self.addressed = self.configured = self.stored = False
+        self.booted = self.seen = self.answers = self.asked = self.addressed = self.configured = self.stored = False
         self.started_ns: int | None = None
         self.syncs = 0
         self.heartbeats_ns: deque[int] = deque(maxlen=8)
