@@ -308,6 +308,9 @@ DEFECTS = {
     "hostile 97 CAN FD frames": hears(
         lambda d, i, text: [(ANSWER, "4300100012000000")] if i == REQUEST and len(text) == 24 else None
     ),
+    "hostile 99 own frames": says(
+        lambda d, i, text: [(i, text), *([(i | EFF_FLAG, text)] if (i, text) == (HEARTBEAT, "00") else [])]
+    ),
     "hostile 98 identifiers of nobody": stopped_by(lambda i, text: i == LSS and len(text) < 16),
     "timing 100 SDO": hears(lost_answer),
     "timing 101 SYNC to TPDO": hears(lost_tpdo),

@@ -111,7 +111,7 @@ class Examination:
 
         Raises:
             NodeError: the device does not answer.
-            InterfaceError: the interface failed, and what was written could not be put back.
+            BenchFailure: something else ended the examination, and what was written could not be put back.
         """
         self._meet()
         try:
@@ -120,9 +120,15 @@ class Examination:
                 row = self._examine(point)
                 self.report.rows.append(row)
                 on_row(row, number, len(points))
-        finally:
+        except BaseException:
             with interrupts_held():
                 self._leave()
+            raise
+        with interrupts_held():
+            try:
+                self._leave()
+            except BenchFailure as error:
+                self.report.rows.append(ReportRow("bench", "put back", Verdict.ERROR, detail=str(error)))
         self.report.left_out += LEFT_OUT
         self.report.distributions.update(self.bench.distributions)
         return self.report
