@@ -22,6 +22,7 @@ from canprobe.fieldbus.protocol.frames import NmtState
 from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.device import CONTROLWORD, RPDOS, ExaminedDevice
 from canprobe.fieldbus.tools.conform.frame_link import BenchTimes
+from canprobe.fieldbus.tools.conform.frame_text import frame_text
 from canprobe.fieldbus.tools.conform.journal import Journal, restorable
 from canprobe.fieldbus.tools.conform.outcome import (
     BenchFailure,
@@ -199,7 +200,10 @@ class Examination:
             verdict, detail = Verdict.FAIL, str(error)
         except CanprobeError as error:
             verdict, detail = Verdict.ERROR, str(error)
-        self._frames = tuple(bench.sent), tuple(bench.came)
+        sent, came = (
+            tuple(frame_text(*frame, self._node_id) for frame in frames) for frames in (bench.sent, bench.came)
+        )
+        self._frames = sent, came
         if not self._ended:
             try:
                 with interrupts_held():
