@@ -34,6 +34,7 @@ from canprobe.fieldbus.tools.conform.outcome import (
 from canprobe.fieldbus.tools.conform.permits import Permits, WriteList
 from canprobe.fieldbus.tools.conform.point import Point
 from canprobe.fieldbus.tools.conform.registry import LEFT_OUT, POINTS
+from canprobe.fieldbus.tools.conform.sdo_client import SdoRefused
 from canprobe.fieldbus.tools.conform.surroundings import hear
 from canprobe.fieldbus.tools.reports import Report, ReportRow, Verdict
 
@@ -196,7 +197,7 @@ class Examination:
             self.report.left_out.append((f"{point.group} {point.title}", str(error)))
         except PointNotApplicable as error:
             verdict, detail = Verdict.NOT_APPLICABLE, str(error)
-        except Deviation as error:
+        except (Deviation, SdoRefused) as error:
             verdict, detail = Verdict.FAIL, str(error)
         except CanprobeError as error:
             verdict, detail = Verdict.ERROR, str(error)
@@ -283,8 +284,15 @@ class Examination:
             except Deviation:
                 raise error from None
             written = self.journal.restore(bench, all_of_it=True)
+        if commanded and bench.asked and not self._is_well():
+            bench.reset()  # an error that was provoked and stays would fail the points that follow
+            written += self.journal.restore(bench, all_of_it=True)
         self._boots = bench.boots
         return written
+
+    def _is_well(self) -> bool:
+        """Whether 1001h shows no error that was not there before."""
+        return not self.bench.number(0x1001) & ~self.bench.device.number(0x1001)
 
     def _leave(self) -> None:
         """Put back everything, and bring the device into the state that it had.
