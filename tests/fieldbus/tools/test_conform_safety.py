@@ -197,6 +197,7 @@ def test_beside_others_it_leaves_out_what_could_disturb_them(frame, never):
     assert not {can_id for can_id in ids if can_id > 0x7FF or 0x060 <= can_id < 0x080}  # 29 bits, background load
     assert any("alone" in why for _, why in report.left_out)
     assert {row.verdict for row in report.rows if row.group == "lss"} == {Verdict.NOT_APPLICABLE}
+    assert ("warning" in report.facts) is (frame[0] in (0x000, 0x609))  # who commands may also watch its heartbeat
 
 
 def test_it_does_not_begin_beside_another_client_of_the_device():

@@ -174,7 +174,7 @@ class Examination:
         self.report.facts["error history (1003h) before"] = ", ".join(history) or "empty"
         self.report.facts["bus"] = f"{self._port.channel}, beside the device: {surroundings.text()}"
         if surroundings.lacks("nmt") and device.has(0x1017):
-            bench.notes.append("another master may watch the heartbeat that 1017h changes")
+            self.report.facts["warning"] = "another master may watch the heartbeat of the device, which points change"
 
     def _examine(self, point: Point) -> ReportRow:
         """One point: run it, put back what it wrote, look for what it left behind."""
