@@ -22,10 +22,12 @@ from schemas import FILES, schema_of
 
 from canprobe.cell.results.expected import FIGURES, expected_text, range_text, seeds_text
 from canprobe.cell.scene.load import packaged_scenes
+from canprobe.fieldbus.tools.judge import RULES
 
 DOCS = Path(__file__).parent
 EXPECTED = DOCS.parent / "canprobe" / "scenes" / "expected.json"
 SCHEMAS = DOCS.parent / "canprobe" / "schemas"
+RULES_MARKED = re.compile(r"(<!-- rules -->).*?(<!-- /rules -->)", re.DOTALL)
 MARKED = re.compile(r"(<!-- measured (\w+) -->).*?(<!-- /measured -->)", re.DOTALL)
 GALLERY = """\
 # Gallery of scenes
@@ -128,6 +130,13 @@ def gallery(measured: Mapping[str, Any]) -> str:
     return "\n\n".join(rows) + "\n"
 
 
+def with_rules(page: str) -> str:
+    """The page on the judge of masters, with all rules between its marks."""
+    heads = ("rule", "fault of a master", "severity", "what a good one does", "source")
+    rows = [(f"{r.number:02}", r.name, r.severity.value, r.expected, r.source) for r in RULES]
+    return RULES_MARKED.sub(lambda found: f"{found[1]}\n\n{_table([heads, *rows])}\n\n{found[2]}", page)
+
+
 def pages() -> Iterator[tuple[Path, str]]:
     """Every file that is generated, wholly or between marks, and its text."""
     measured = read_measured()
@@ -141,6 +150,8 @@ def pages() -> Iterator[tuple[Path, str]]:
     yield DOCS / "img" / "imports.svg", imports_svg()
     readme = DOCS.parent / "README.md"
     yield readme, with_accuracy(readme.read_text(encoding="utf-8"), measured)
+    judge = DOCS / "judge.md"
+    yield judge, with_rules(judge.read_text(encoding="utf-8"))
     for page in sorted(DOCS.glob("*.md")):
         text = page.read_text(encoding="utf-8")
         if MARKED.search(text):

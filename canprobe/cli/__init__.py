@@ -41,6 +41,7 @@ COMMANDS = (
     "emulate",
     "inject",
     "conform",
+    "judge",
     "scan",
     "monitor",
     "replay",

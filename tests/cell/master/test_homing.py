@@ -223,6 +223,22 @@ def test_the_record_names_what_homing_wrote(tmp_path):
     assert entry["position"] == -entry["objects"]["607Ch:00"]
 
 
+def test_a_run_records_where_it_leaves_a_joint(tmp_path):
+    """Without it the next cell would take the motion of the run for one by hand."""
+    bench = Bench(scene_of([35]), tmp_path)
+    bench.home()
+
+    def move(measurement):
+        target = measurement.q + np.array([2e-3, 0, 0, 0, 0, 0])
+        return Command(q_target=target, done=measurement.cycle > 60)
+
+    with bench.cell() as cell:
+        cell.run(move)
+    before = json.loads(bench.record.read_text())["nodes"]["1"]
+    q, truth = bench.run()
+    assert q == pytest.approx(truth, abs=2e-4) and abs(before["position"] + before["objects"]["607Ch:00"]) > 40
+
+
 def test_emulated_drives_of_a_run_start_homed_and_can_be_homed(capsys):
     scene = scene_of([0, 0, 0, 18, 17, 35], emulated=True)
     asked, said = [], []
