@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from canprobe.mechanics.touch.surface import SurfaceMatrix
     from canprobe.mechanics.touch.surface_map import SurfaceMap
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 sys.meta_path.insert(0, MovedModules())
 
