@@ -21,6 +21,7 @@ from canprobe.errors import SceneError, UsageError
 from canprobe.fieldbus.drive.from_eds import make_eds_node
 from canprobe.fieldbus.eds.packaged import load_eds
 from canprobe.fieldbus.node import stored_file
+from canprobe.fieldbus.tools.conform import journal
 from canprobe.fieldbus.tools.reports import Report, json_file, read_json, write_json
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -44,6 +45,7 @@ def test_the_page_has_the_schemas_of_the_code():
         "`surface.npz`": str(surface_file.FORMAT_VERSION),
         "plan (`plan --json`)": str(report_json.SCHEMA),
         "report of an examination (`*.json`)": str(json_file.SCHEMA),
+        "snapshot of a device (`*.snapshot.json`)": str(journal.SCHEMA),
         "zeros of a cell (`zeros-CELL.json`)": str(homing.SCHEMA),
         "stored parameters of an emulated node (`node*.json`)": str(stored_file.SCHEMA),
     }
@@ -90,7 +92,15 @@ def newer_zeros(folder):
     homing.ZeroRecord(path)
 
 
-@pytest.mark.parametrize("read", [newer_summary, newer_report, newer_node, newer_zeros])
+def newer_snapshot(folder):
+    path = folder / "device.snapshot.json"
+    journal.Journal({(0x1017, 0): b"\0\0"}, path, "a device").note((0x1017, 0))
+    assert journal.Journal.load(path).values == {(0x1017, 0): b"\0\0"}
+    raise_schema(path)
+    journal.Journal.load(path)
+
+
+@pytest.mark.parametrize("read", [newer_summary, newer_report, newer_node, newer_zeros, newer_snapshot])
 def test_a_file_of_a_newer_version_says_so(tmp_path, read):
     with pytest.raises(
         UsageError, match=r"\.json.*: the file is of a newer canprobe: .* up to schema 1, got 2; .*canprobe"

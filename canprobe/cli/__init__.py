@@ -40,6 +40,8 @@ COMMANDS = (
     "up",
     "emulate",
     "inject",
+    "conform",
+    "judge",
     "scan",
     "monitor",
     "replay",

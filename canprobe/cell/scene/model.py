@@ -87,7 +87,7 @@ class SceneInfo:
     seed: Annotated[int, Range(0, 2**63 - 1)] = 0
     """Seed of all random numbers. In lockstep the same seed gives the same `bus.log`."""
     figures: bool = True
-    """Draw `report.png`, `surface.png` and `report.html` after a run. false saves seconds."""
+    """Draw `report.png` and `surface.png` after a run. false saves a second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -329,6 +329,8 @@ class ShapeSettings:
     """Other estimators that compute on the same contacts after the run, for the report."""
     patch: bool = True
     """Use the second moments of the tactile images where the path leaves a curvature open."""
+    revisit: bool = False
+    """Join the answers of `recursive` and `ml` with a map of what the probe touched there in earlier passes."""
     every_ms: Annotated[float, Range(0, 10_000, open_low=True)] = 40.0
     """Time between two estimates. Every contact is used."""
 

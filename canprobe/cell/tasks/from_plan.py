@@ -16,12 +16,13 @@ from canprobe.cell.tasks.touch import TouchTask
 from canprobe.fieldbus.protocol.tactile import DEFAULT_WINDOW
 from canprobe.mechanics.touch.contact import indentation_from_force
 from canprobe.mechanics.touch.patch.array_models import make_image_model, make_patch_calibration
+from canprobe.mechanics.touch.patch.calibration_check import CalibrationCheck
 from canprobe.mechanics.touch.patch.moments import MomentImage
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.noise import Correlation
     from canprobe.mechanics.touch.estimate.online import Estimator
-    from canprobe.mechanics.touch.map.contact_map import ContactMap
+    from canprobe.mechanics.touch.map.surface_map import SurfaceMap
     from canprobe.mechanics.touch.patch.image_model import ImageModel
 
 
@@ -92,15 +93,20 @@ def make_shape_estimator(task: Touch, method: str) -> Estimator:
     from canprobe.mechanics.touch.estimate.following import FollowingEstimator
 
     scale = SCALE_ERROR + ROLLING_SCALE_ERROR * task.scan.rolling_share
-    return FollowingEstimator(_with_patch(task, estimator, memory) if _uses_patch(task) else estimator, memory, scale)
+    inner = _with_patch(task, estimator, memory) if _uses_patch(task) else estimator
+    following = FollowingEstimator(inner, memory, scale)
+    if not task.shape.revisit:
+        return following
+    from canprobe.mechanics.touch.map.known_ground import RevisitingEstimator
+
+    return RevisitingEstimator(following, make_surface_map(task), memory)
 
 
 def _typical_sigma(task: Touch) -> float:
     """Standard deviation of a contact at the wanted force on a plane, m, for contacts that state none."""
     probe = task.probe
     depth = indentation_from_force(task.force, probe.stiffness, probe.radius, (0.0, 0.0))
-    level_pa = MomentImage(make_patch_calibration(task.array.calibration, task.array.pad)).level_pa
-    return task.array.calibration.noise.lateral(level_pa / (probe.stiffness * float(depth)))
+    return task.array.calibration.noise.lateral(task.array.pad.lightness(probe.stiffness * float(depth)))
 
 
 def _with_patch(task: Touch, estimator: Estimator, memory: float) -> Estimator:
@@ -118,13 +124,13 @@ def _image_model(task: Touch) -> ImageModel:
     return make_image_model(array.calibration, patch, seen=int(array.window) if windowed else None)
 
 
-def make_contact_map(task: Touch) -> ContactMap:
+def make_surface_map(task: Touch) -> SurfaceMap:
     """An empty map for the contacts of a task's pad."""
-    from canprobe.mechanics.touch.map.contact_map import ContactMap  # only where a map is asked for
     from canprobe.mechanics.touch.map.local_fits import PadLayer
     from canprobe.mechanics.touch.map.noise import PAD_NOISE
+    from canprobe.mechanics.touch.map.surface_map import SurfaceMap  # only where a shape is asked for
 
-    return ContactMap(PadLayer(task.probe.radius, task.probe.stiffness), PAD_NOISE, _image_model(task))
+    return SurfaceMap(PadLayer(task.probe.radius, task.probe.stiffness), PAD_NOISE, _image_model(task))
 
 
 def _uses_patch(task: Touch) -> bool:
@@ -132,13 +138,15 @@ def _uses_patch(task: Touch) -> bool:
     return task.shape is not None and task.shape.patch and task.array.mode != "features"
 
 
-def make_shape_tracker(setup: Setup) -> ShapeTracker | None:
-    """The estimator in the loop; None where the setup estimates no shape."""
+def make_shape_tracker(setup: Setup, *, with_map: bool = True) -> ShapeTracker | None:
+    """The estimator in the loop, and the map of its contacts; None where the setup estimates no shape."""
     task = setup.task
     if not isinstance(task, Touch) or task.shape is None:
         return None
     samples = max(1, round(task.shape.every_s * task.array.rate_hz))
-    return ShapeTracker(make_shape_estimator(task, task.shape.method), samples)
+    return ShapeTracker(
+        make_shape_estimator(task, task.shape.method), samples, make_surface_map(task) if with_map else None
+    )
 
 
 def estimates_of(
@@ -169,7 +177,9 @@ def make_task(plan: Plan) -> Controller:
     """The controller of the plan's task; what the task does not need is not even imported."""
     period_s, task = plan.sync.period_ns * 1e-9, plan.setup.task
     if isinstance(task, Touch):
-        return TouchTask(plan, task, make_sensing(task), make_shape_tracker(plan.setup))
+        array = task.array
+        check = CalibrationCheck.of(array.calibration, array.pad, images=array.mode != "features")
+        return TouchTask(plan, task, make_sensing(task), make_shape_tracker(plan.setup), check)
     if isinstance(task, Calibrate):
         from canprobe.cell.tasks.calibrate import CalibrateTask
 

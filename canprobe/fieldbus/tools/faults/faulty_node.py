@@ -66,7 +66,12 @@ class FaultyNode(WrappedNode):
     @property
     def faults(self) -> list[Fault]:
         """Faults that hold, and those that are to come."""
-        return [*(effect.fault for effect in self._effects), *self._pending]
+        return [*self.holding, *self._pending]
+
+    @property
+    def holding(self) -> list[Fault]:
+        """Faults that hold."""
+        return [effect.fault for effect in self._effects]
 
     @property
     def next_deadline_ns(self) -> int | None:

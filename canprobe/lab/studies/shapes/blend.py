@@ -1,11 +1,11 @@
-"""The surface of a map: patches near a point, blended by distance and covariance, for many points at once.
+"""The surface of patches: those near a point, blended by distance and covariance, for many points at once.
 
 Each patch within `reach` gives the height of its quadric along one common normal through the query point, and its
 normal there. Patch i weighs `w_i = (1 − r_i²/reach²)² g_i / v_i`: r_i is the distance from its contact to the surface
-point, v_i the variance of its height there (from `S_covariance`: it grows with the fourth power of the distance from
-the contact), and g_i is 1 except towards the limb of a quadric and where the patch faces elsewhere. Every factor ends
-with a slope of zero: a patch enters and leaves without a step or a kink. The common normal is the blend of the patches'
-normals, iterated, so that the answer is the closest point.
+point, v_i the variance of its height there (from the covariance of S: it grows with the fourth power of the distance
+from the contact), and g_i is 1 except towards the limb of a quadric and where the patch faces elsewhere. Every factor
+ends with a slope of zero: a patch enters and leaves without a step or a kink. The common normal is the blend of the
+patches' normals, iterated, so that the answer is the closest point.
 
 Valid within `reach` of a contact and for a point nearer to the surface than its radius of curvature; with no patch in
 reach the answer is NaN, never an extrapolation. `sigma` is a mean of the patches' own. Why not that of their weighted
@@ -23,10 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from canprobe.mechanics.touch.meshing import Feet
 from canprobe.mechanics.types import Floats
 
-REACH_M = 4e-3
-"""Default distance from a contact at which its patch no longer counts, m."""
 MIN_FACING_COSINE = 0.5
 """Least cosine between a patch's normal and the surface's; other patches belong to another side of a thin body."""
 _FULL_FACING_COSINE, _LIMB_SHARE = 0.75, 0.25
@@ -36,25 +35,6 @@ UNKNOWN_HEIGHT_SIGMA_M = 1e-4
 _MAX_ROUNDS = 40
 """Most rounds; each shrinks the error of the normal by the height over the radius of curvature."""
 _SETTLED_NORMAL_CHANGE = 1e-8
-
-
-class Feet(NamedTuple):
-    """A surface as seen from n points; NaN where it does not reach.
-
-    Attributes:
-        point: (n, 3) closest points of the surface, m.
-        normal: (n, 3) outward unit normals there.
-        height: (n,) signed distances of the query points from the surface, m, positive outside.
-        sigma: (n,) standard deviations of the surface's height, m; a map gives the weighted mean over the patches that
-            know theirs, NaN where none does.
-        patches: (n,) numbers of patches that were blended.
-    """
-
-    point: Floats
-    normal: Floats
-    height: Floats
-    sigma: Floats
-    patches: NDArray[np.intp]
 
 
 class Quadrics(NamedTuple):
@@ -156,7 +136,7 @@ def feet_on(patches: Quadrics, points: Floats, reach: float) -> Feet:
         normal = normal / np.sqrt(_dot(normal, normal))[:, None]
         found.point[left], found.normal[left], found.height[left] = foot, normal, -height
         found.sigma[left] = np.where(knowing > 0.0, sigma / np.maximum(knowing, 1e-300), math.nan)
-        found.patches[left] = np.bincount(row, weight > 0.0, len(left))
+        found.pieces[left] = np.bincount(row, weight > 0.0, len(left))
         more = np.abs(normal - before).max(axis=1) > _SETTLED_NORMAL_CHANGE
         left, normal, foot = left[more], normal[more], foot[more]
         row, patch = (np.cumsum(more) - 1)[row[more[row]]], patch[more[row]]

@@ -9,12 +9,12 @@ import pytest
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.contact import ContactSample, Slope, indentation_from_force
 from canprobe.mechanics.touch.map import nodes
-from canprobe.mechanics.touch.map.contact_map import ContactMap
 from canprobe.mechanics.touch.map.fit import fit_map
 from canprobe.mechanics.touch.map.local_fits import PadLayer
 from canprobe.mechanics.touch.map.noise import PAD_NOISE, MapNoise
 from canprobe.mechanics.touch.map.quartic import LENGTH_M, fourth_of, heights_and_slopes, terms
 from canprobe.mechanics.touch.map.stiffness import SLOPE_BIAS
+from canprobe.mechanics.touch.map.surface_map import SurfaceMap
 from canprobe.mechanics.touch.patch.array_calibration import ImageParameters, MomentErrors
 from canprobe.mechanics.touch.patch.image_model import ImageModel
 
@@ -222,11 +222,11 @@ def test_the_scan_shows_the_stiffness_of_its_layer(true_share):
     parameters = ImageParameters(stiffness=1.24e8, scale=1.0, blur=1.5e-3, crosstalk=0.0, memory=0.0)
     errors = MomentErrors(moment=1e-3, both=5e-4, shear=1e-3, frame_sigma=0.01)
     model = ImageModel(parameters, radius, 1.6e-3, level=1e3, count=500.0, side=16, seen=16, errors=errors)
-    found = ContactMap(PadLayer(radius, model.stiffness), MapNoise(40e-6, 15e-6, 1e-3), model)
+    found = SurfaceMap(PadLayer(radius, model.stiffness), MapNoise(40e-6, 15e-6, 1e-3), model)
     found.add_samples(list(pad_samples(radius, model.stiffness, true_share * model.stiffness, model)))
     at = on_sphere(PLACES, 0.05)[0]
     assert np.abs(found.distance(at)[0]).max() < 5e-6
-    assert found.pad.stiffness == pytest.approx(true_share * model.stiffness, rel=0.02)
+    assert found.stiffness.value == pytest.approx(true_share * model.stiffness, rel=0.02)
 
 
 def test_an_error_that_the_scan_has_in_common_is_found_and_taken_off():
@@ -247,7 +247,7 @@ def test_an_error_that_the_scan_has_in_common_is_found_and_taken_off():
     at, _, tensor = SHAPES["ball"](PLACES)
     off = {}
     for name, noise in (("common", PAD_NOISE), ("independent", replace(PAD_NOISE, common=(0.0, 0.0, 0.0, 0.0)))):
-        found = ContactMap(PadLayer(radius, 1e8), noise)
+        found = SurfaceMap(PadLayer(radius, 1e8), noise)
         found.add_samples(samples)
         off[name] = np.abs(found.curvature(at).tensor - tensor).max()
         if name == "common":

@@ -10,52 +10,38 @@ normal of a single point, the curvature across a straight line.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.blend import REACH_M, Feet
-from canprobe.mechanics.touch.contact import HOLLOW_LIMIT_SHARE, ContactSample, Slope
-from canprobe.mechanics.touch.estimate.observed import MIN_SPREAD
+from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.linear_algebra import checked, positive, real
 from canprobe.mechanics.touch.map import nodes as column
-from canprobe.mechanics.touch.map.discs import Discs, one_sheet
-from canprobe.mechanics.touch.map.local_fits import CommonErrors, PadLayer, Quartics, fit_discs
+from canprobe.mechanics.touch.map.cells import Cells, LayerEvidence, solve_cells
+from canprobe.mechanics.touch.map.discs import one_sheet
+from canprobe.mechanics.touch.map.local_fits import CommonErrors, PadLayer
 from canprobe.mechanics.touch.map.nodes import NodeGrid, Traces, rows_of
 from canprobe.mechanics.touch.map.noise import MapNoise
-from canprobe.mechanics.touch.map.quartic import LENGTH_M, SECOND, heights_and_slopes, terms
-from canprobe.mechanics.touch.map.stiffness import (
-    MAX_IMAGES,
-    Stiffness,
-    fused_stiffness,
-    log_of_images,
-    log_of_slope,
-)
-from canprobe.mechanics.touch.meshing import CELL_M, Mesh, mesh_of
+from canprobe.mechanics.touch.map.quartic import LENGTH_M, heights_and_slopes, terms
+from canprobe.mechanics.touch.map.stiffness import Stiffness
+from canprobe.mechanics.touch.meshing import CELL_M, Feet, Mesh, mesh_of
 from canprobe.mechanics.touch.patch.image_model import ImageModel
 from canprobe.mechanics.touch.tangent_frames import tangent_rotation
 from canprobe.mechanics.types import Floats
 
+REACH_M = 4e-3
+"""Distance from the nearest contact at which the surface ends, m."""
+PLACES_AT_ONCE = 4096
+"""Places that are asked at once: each takes some 10 kB."""
 NEAREST_CELLS = 4
 """Number of cells that a place asks."""
 BLEND_M, BLEND_ROOM_M = 4.5e-3, 1.5e-3
 """Distance at which a cell ends to count, m, and by how much at least that lies beyond the nearest cell."""
 FOOT_STEPS = 3
 """Steps from a place to its foot; each shrinks the error by the height over the radius of curvature."""
-ROBUST_CHI2 = 6.0
-"""χ² of the rows of a node beyond which it counts less."""
-EXCESS_REACH_M = 4e-3
-"""Distance within which the largest excess of χ² counts, m: about the size of the contact patch."""
-MAX_HEIGHT_SIGMA_M, MAX_SLOPE_SIGMA, MAX_CURVATURE_SIGMA = 1e-3, 0.1, 15.0
-"""Standard deviations of height (m), slope and a combination of curvature (1/m) above which it was not observed; the
-last is compared with 0.3 times the curvature, too."""
-MAX_RELATIVE_SIGMA = 0.3
-STATED_STIFFNESS_SIGMA = 0.2
-"""Standard deviation of ln k where neither a slope nor an image shows it."""
 
 
 class MapCurvature(NamedTuple):
@@ -76,19 +62,6 @@ class MapCurvature(NamedTuple):
     rank: NDArray[np.intp]
 
 
-class _Cells(NamedTuple):
-    """Solved cells; `known` (m, 3): whether height, slopes and curvature were observed, `rank` (m,) of the latter."""
-
-    discs: Discs
-    fits: Quartics
-    excess: Floats
-    offset: Floats
-    known: NDArray[np.bool_]
-    rank: NDArray[np.intp]
-    tree: cKDTree
-    contacts: cKDTree
-
-
 class _Blend(NamedTuple):
     """What the cells near n places say; the last axis but those of vectors is that of the cells.
 
@@ -103,29 +76,34 @@ class _Blend(NamedTuple):
     slope_size: Floats
 
 
-class ContactMap:
+class SurfaceMap:
     """A surface from contacts, one by one or many at once; it is solved when it is asked.
 
     Args:
-        pad: the probe that made the contacts; None: they are points, whatever made them.
+        pad: the probe that made the contacts, with the stated stiffness of its layer; None: they are points, whatever
+            made them.
         noise: noise of the contacts.
         image_model: calibrated model of the probe's array, for the layer's stiffness; None: without.
 
     Attributes:
         nodes: the contacts as nodes.
-        pad: the probe, with the stiffness that the whole scan shows once the map is solved.
-        common: errors that the whole scan has in common, once solved.
+        pad, noise: as given.
     """
 
     def __init__(self, pad: PadLayer | None, noise: MapNoise, image_model: ImageModel | None = None) -> None:
         self.pad, self.noise = pad, noise
         self.nodes = NodeGrid(0.0 if pad is None else pad.radius, noise.lateral)
-        self.common: CommonErrors | None = None
-        self._stated = pad
-        self._model = image_model
+        self._evidence = LayerEvidence(image_model)
         self._traces = None if image_model is None else Traces(image_model.memory)
-        self._touch: tuple[Slope, Floats] | None = None
-        self._solved: _Cells | None = None
+        self._solved: Cells | None = None
+
+    @classmethod
+    def of_nodes(cls, rows: Floats, pad: PadLayer | None, noise: MapNoise, stiffness: Stiffness | None) -> Self:
+        """The map of nodes (n, COLUMNS) whose layer has a stiffness that was found before."""
+        found = cls(pad, noise)
+        found.nodes.put(rows)
+        found._evidence.found = stiffness
+        return found
 
     def __len__(self) -> int:
         return len(self.nodes)
@@ -163,14 +141,14 @@ class ContactMap:
     def add_samples(self, samples: Sequence[ContactSample]) -> None:
         """Take contacts of the pad, in the order of time."""
         assert self.pad is not None
-        for sample in samples[: 1 if self._touch is None else 0]:
+        for sample in samples[: 1 if self._evidence.touch is None else 0]:
             if sample.slope is not None:
-                self._touch = sample.slope, sample.p_base
+                self._evidence.touch = sample.slope, sample.p_base
         self._add(rows_of(samples, self.pad.radius, self.noise, self._traces))
 
     def closest(self, points: ArrayLike) -> Feet:
         """The points of the surface that are closest to given points (n, 3), m; NaN beyond reach of the contacts."""
-        return self._blend(points).feet
+        return Feet(*self._answers(lambda blend: blend.feet, points))
 
     def distance(self, points: ArrayLike) -> tuple[Floats, Floats]:
         """Signed distances (n,) of points (n, 3) from the surface, m, positive outside, and their σ (n,), m."""
@@ -179,7 +157,10 @@ class ContactMap:
 
     def normal(self, points: ArrayLike) -> tuple[Floats, Floats]:
         """Outward unit normals (n, 3) at the feet of points (n, 3), m, and their covariances (n, 3, 3), rad²."""
-        blend = self._blend(points)
+        normal, covariance = self._answers(self._normal, points)
+        return normal, covariance
+
+    def _normal(self, blend: _Blend) -> tuple[Floats, Floats]:
         cells, R = self.solved(), self.solved().discs.R[blend.cells]
         rows = np.stack(terms(*blend.xy, (1, 0), (0, 1)), axis=-2)
         V = rows @ cells.fits.V[blend.cells] @ np.swapaxes(rows, -1, -2)
@@ -189,7 +170,10 @@ class ContactMap:
 
     def curvature(self, points: ArrayLike) -> MapCurvature:
         """Curvature at the feet of points (n, 3), m."""
-        blend, cells = self._blend(points), self.solved()
+        return MapCurvature(*self._answers(self._curvature, points))
+
+    def _curvature(self, blend: _Blend) -> MapCurvature:
+        cells = self.solved()
         R, a = cells.discs.R[blend.cells], cells.fits.a[blend.cells]
         second = np.stack(terms(*blend.xy, (2, 0), (1, 1), (0, 2)), axis=-2) / LENGTH_M
         xx, xy, yy = np.moveaxis(-(second @ a[..., None])[..., 0], -1, 0)
@@ -220,9 +204,12 @@ class ContactMap:
         All passes over a place share one quartic and the scan's common errors. What is left over beyond the noise is
         where they show different surfaces, or one that is rougher than the pad can follow.
         """
-        blend = self._blend(points)
-        excess: Floats = np.einsum("nk,nk->n", blend.weight, self.solved().excess[blend.cells])
-        return excess + 0.0 * blend.feet.normal[:, 0]
+        (excess,) = self._answers(self._disagreement, points)
+        return excess
+
+    def _disagreement(self, blend: _Blend) -> tuple[Floats]:
+        excess: Floats = np.einsum("nk,nk->n", blend.weight, self.solved().fits.excess[blend.cells])
+        return (excess + 0.0 * blend.feet.normal[:, 0],)
 
     def mesh(self, *, cell: float = CELL_M) -> Mesh:
         """The surface as triangles with its σ at every vertex; cells of the lattice have a side `cell`, m.
@@ -239,55 +226,43 @@ class ContactMap:
         result: Floats = rows[:, column.CENTRE] - (self.pad.radius if self.pad else 0.0) * rows[:, column.NORMAL]
         return result
 
-    def solved(self) -> _Cells:
-        """The cells; they are solved where contacts came since."""
+    @property
+    def normals(self) -> Floats:
+        """(n, 3) outward unit normals of the nodes."""
+        result: Floats = self.nodes.rows[:, column.NORMAL]
+        return result
+
+    @property
+    def common(self) -> CommonErrors:
+        """Errors that the whole scan has in common."""
+        return self.solved().common
+
+    @property
+    def stiffness(self) -> Stiffness | None:
+        """Stiffness of the pad's layer that the whole scan shows; None without a pad."""
+        return self.solved().stiffness
+
+    def solved(self) -> Cells:
+        """The cells; they are solved where contacts came since.
+
+        Raises:
+            UsageError: there are no contacts.
+        """
         if not len(self.nodes):
             raise UsageError("map: expected contacts, got none yet; add some first")
         if self._solved is None:
-            self._solved = self._solve()
+            self._solved = solve_cells(self.nodes.rows, self.points, self.pad, self.noise, self._evidence)
         return self._solved
 
-    def _solve(self) -> _Cells:
-        rows, points = self.nodes.rows, self.points
-        discs = Discs.of(points, rows)
-        weight, K = discs.weight, np.zeros((len(discs.origin), 2, 2))
-        fits, _, chi2 = fit_discs(rows, discs, self._stated, self.noise, K_ref=K, weight=weight)
-        stiffness = self._stiffness(rows, points, discs, fits)
-        if self.pad is not None and stiffness is not None:
-            self.pad = self.pad._replace(stiffness=stiffness.value)
-        weight = weight * np.minimum(1.0, ROBUST_CHI2 / np.maximum(chi2, 1e-300))
-        fits, self.common, _ = fit_discs(rows, discs, self.pad, self.noise, K_ref=fits.K, weight=weight)
-        tree = cKDTree(discs.origin)
-        near = tree.query_ball_point(discs.origin, EXCESS_REACH_M)
-        excess = np.array([fits.excess[one].max() for one in near])
-        offset = np.zeros(len(near))
-        if self.pad is not None and stiffness is not None:
-            det = np.linalg.det(np.eye(2) / self.pad.radius + fits.K)
-            force = (discs.weight * rows[discs.nodes, column.ROOT_FORCE]).sum(axis=1) / discs.weight.sum(axis=1)
-            depth = force * np.sqrt(np.sqrt(np.maximum(det, 0.0)) / (math.pi * self.pad.stiffness))
-            offset = 0.5 * stiffness.sigma * depth
-        return _Cells(discs, fits, excess, offset, *_observed(fits), tree, cKDTree(points))
-
-    def _stiffness(self, rows: Floats, points: Floats, discs: Discs, fits: Quartics) -> Stiffness | None:
-        """The layer's stiffness from touch and images at the curvature of the fits; None without a layer."""
-        if self._stated is None:
-            return None
-        kappa, tree = np.linalg.eigvalsh(fits.K), cKDTree(discs.origin)
-        kappa = np.maximum(kappa, -HOLLOW_LIMIT_SHARE / self._stated.radius)
-        slope = images = None
-        if self._touch is not None:
-            of_touch, place = self._touch
-            slope = log_of_slope(of_touch, self._stated.radius, kappa[tree.query(place)[1]])
-        shown = np.flatnonzero(np.isfinite(rows[:, column.PATCH]))
-        if self._model is not None and len(shown):
-            shown = shown[np.linspace(0, len(shown) - 1, min(len(shown), MAX_IMAGES)).round().astype(int)]
-            cell = tree.query(points[shown])[1]
-            force = rows[shown, column.ROOT_FORCE] ** 2
-            images = log_of_images(self._model, rows[shown, column.PATCH], force, kappa[cell])
-        return fused_stiffness(slope, images, Stiffness(self._stated.stiffness, STATED_STIFFNESS_SIGMA))
-
-    def _blend(self, points: ArrayLike) -> _Blend:
+    def _answers(self, answer: Callable[[_Blend], Sequence[NDArray[Any]]], points: ArrayLike) -> list[NDArray[Any]]:
+        """The columns that an answer has for points (n, 3), of some places after the other: memory stays bounded."""
         q = checked("points", points, (None, 3))
+        starts = range(0, max(len(q), 1), PLACES_AT_ONCE)
+        parts = [answer(self._blend(q[i : i + PLACES_AT_ONCE])) for i in starts]
+        return [np.concatenate(column) for column in zip(*parts, strict=True)]
+
+    def _blend(self, q: Floats) -> _Blend:
+        """What the cells say of points (n, 3), m."""
         cells = self.solved()
         discs, count = cells.discs, min(NEAREST_CELLS, len(cells.discs.origin))
         which = cells.tree.query(q, range(1, count + 1))[1].reshape(-1, count)
@@ -344,18 +319,3 @@ class ContactMap:
             np.where(reached, (weight > 0.0).sum(axis=1), 0),
         )
         return _Blend(feet, which, np.where(reached[:, None], weight, 0.0), xy, size)
-
-
-def _observed(fits: Quartics) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
-    """Whether height, slopes and all of K were observed (m, 3), and the rank of K (m,)."""
-    V = fits.V
-    height = V[:, 0, 0] * LENGTH_M**2 < MAX_HEIGHT_SIGMA_M**2
-    slopes = np.maximum(V[:, 1, 1], V[:, 2, 2]) < MAX_SLOPE_SIGMA**2
-    to_q = np.array([1.0, math.sqrt(2.0), 1.0])
-    of_K = V[:, SECOND, SECOND] * np.outer(to_q, to_q) / LENGTH_M**2
-    limit = np.maximum(MAX_CURVATURE_SIGMA, MAX_RELATIVE_SIGMA * np.linalg.norm(fits.K, axis=(1, 2)))
-    certain = (np.linalg.eigvalsh(of_K) < limit[:, None] ** 2).sum(axis=1)
-    low, high = np.linalg.eigvalsh(fits.spread).T
-    spread = (np.stack([low, 0.5 * (low + high), high]) >= MIN_SPREAD).sum(axis=0)
-    rank = np.minimum(certain, spread)
-    return np.stack([height, slopes, rank == 3], axis=1), rank
