@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
@@ -103,9 +104,9 @@ def _row(rule: Rule) -> ReportRow:
     )
 
 
-def judge_frames(frames: Iterable[BusFrame], nodes: Mapping[int, Description], **options: bool | int) -> Judge:
+def judge_frames(frames: Iterable[BusFrame], nodes: Mapping[int, Description], **options: Any) -> Judge:
     """Judge frames that were recorded; options are those of `Judge`."""
-    judge = Judge(nodes, **options)  # type: ignore[arg-type]
+    judge = Judge(nodes, **options)
     for frame in frames:
         judge.take(frame)
     judge.finish()
