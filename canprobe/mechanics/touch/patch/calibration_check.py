@@ -72,7 +72,7 @@ class CalibrationCheck:
         self._curvature: float | None = None
         self._tries = 0
         self._next_s = -math.inf
-        self._waiting: tuple[NDArray[np.uint8], Sequence[int]] | None = None
+        self._waiting: tuple[NDArray[np.uint8], Sequence[int], Patch] | None = None
 
     @classmethod
     def of(cls, calibration: ArrayCalibration, pad: Pad, *, images: bool) -> CalibrationCheck | None:
@@ -93,17 +93,17 @@ class CalibrationCheck:
         """
         if t_s < self._next_s or self._tries >= MAX_TRIES:
             return
-        if patch.cut_by_pad or patch.dead or patch.peak_pa > STRAIGHT_SHARE * self._pad.full_scale_pa:
-            return
         self._next_s = t_s + LOOK_S
-        self._waiting = image, window
+        self._waiting = image, window, patch
 
     def work(self) -> bool:
         """Fit the image that waits; whether there was one, so that there may be a `finding`."""
         if self._waiting is None:
             return False
-        (image, window), self._waiting = self._waiting, None
+        (image, window, patch), self._waiting = self._waiting, None
         self._tries += 1
+        if patch.cut_by_pad or patch.dead or patch.peak_pa > STRAIGHT_SHARE * self._pad.full_scale_pa:
+            return True
         found = fit_blur(image, window, blur=self._blur, crosstalk=self._crosstalk, gains=self._gains)
         if found is not None:
             self._blurs.append(math.log(found.blur / self._blur))
@@ -140,8 +140,14 @@ class CalibrationCheck:
 
     @property
     def stiffness_off(self) -> float:
-        """Logarithm of the stiffness over the calibration's; 0 before it is judged, and within the limit."""
-        return _beyond(_median(self._by_answers, MIN_ANSWERS), math.log(MAX_RATIO))
+        """Logarithm of the stiffness over the calibration's; 0 before it is judged, and within the limit.
+
+        Where the estimator gives no stiffness, touch and images must both show it: the nearer one counts.
+        """
+        off = _median(self._by_answers, MIN_ANSWERS)
+        if len(self._by_answers) < MIN_ANSWERS:
+            off = min(_median(self._by_touch, MIN_ANSWERS), _median(self._by_images, MIN_IMAGES), key=abs)
+        return _beyond(off, math.log(MAX_RATIO))
 
     @property
     def disagreement(self) -> float:
