@@ -1,10 +1,10 @@
 """Measure what the pages say, and write docs/measured.json. `python docs/measure.py [NAME …]`
 
 A name is that of a packaged scene, of a study, or one of `OTHERS` below: `one_scan`, `vcan0`, `pace`, `side_by_side`,
-`growth`, `gym`, `learning`, `bridges`. Without names everything is measured but what takes more than half an hour
-(`LONG`). Measure on a machine that does nothing else: computing time is among the figures. Every entry has its own
-command, date, commit and machine, so that one can be measured anew without the others. Then `python docs/generate.py`
-writes the pages.
+`growth`, `gym`, `learning`, `bridges`, `local_node`. Without names everything is measured but what takes more than
+half an hour (`LONG`). Measure on a machine that does nothing else: computing time is among the figures. Every entry has
+its own command, date, commit and machine, so that one can be measured anew without the others. Then
+`python docs/generate.py` writes the pages.
 """
 
 from __future__ import annotations
@@ -256,7 +256,14 @@ def bridges() -> Entry:
     return {"command": command} | _found("bridges", json.loads(printed(f"{command} --json")))
 
 
+def local_node() -> Entry:
+    """What `canprobe conform` finds in canopen-python's LocalNode."""
+    command = "python tests/support/local_node.py"
+    return {"command": command} | json.loads(printed(command))
+
+
 OTHERS: Mapping[str, Callable[[], Entry]] = {
+    "local_node": local_node,
     "one_scan": one_scan,
     "vcan0": vcan0,
     "pace": partial(bench_table, "pace"),

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from canprobe.cell.master.array import RawReceiver, make_patch_reader, make_tactile
+from canprobe.cell.master.array import ArrayReceiver, RawReceiver, make_patch_reader, make_tactile
 from canprobe.cell.master.bringup import BringUp
 from canprobe.cell.master.controller import (
     Command,
@@ -32,7 +32,7 @@ from canprobe.cell.master.notes import Notes
 from canprobe.cell.master.observers import Observers
 from canprobe.cell.master.options import DEFAULT_OPTIONS, RunOptions
 from canprobe.cell.master.raw_array_start import RawArrayStart
-from canprobe.cell.master.supervision import Finding, Reaction, Seen, limits_of
+from canprobe.cell.master.supervision import Condition, Finding, Reaction, Seen, limits_of
 from canprobe.cell.master.supervisor import JointGuard, Supervisor
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.cell.planning.configuration import make_setups
@@ -78,6 +78,7 @@ class Cell:
             brought up and reached over the port.
         origin_ns: time on the port's clock from which the run counts, as ``bus.log`` does.
         zeros: file that records the zeros of real drives that are homed.
+        before: stopped cell of the same run, whose log, notes, counters and time this one continues.
 
     Attributes:
         drives, tactile: drives of the arm, and receiver of the array; None in a scene without one.
@@ -88,6 +89,9 @@ class Cell:
         supervisor: the checks, from bring-up on.
         cycle: None before bring-up is done.
         homing: homing of the drives without an absolute encoder; None where there are none.
+        bring_up: the steps of bring-up.
+        stopped_by: condition that stopped the cell; None where something else did.
+        doubted: nodes that may have been without power, so that a drive has to be homed; set before entering.
     """
 
     def __init__(
@@ -101,14 +105,15 @@ class Cell:
         direct: Callable[..., Cycle] | None = None,
         origin_ns: int = 0,
         zeros: Path | None = None,
+        before: Cell | None = None,
     ) -> None:
         setup = plan.setup
         rows = options.rows_folder
-        self.log = RunLog(options.rows_kept, rows)
-        self.tactile_log = TactileLog(options.rows_kept, rows)
+        self.log: RunLog = RunLog(options.rows_kept, rows) if before is None else before.log
+        self.tactile_log: TactileLog = TactileLog(options.rows_kept, rows) if before is None else before.tactile_log
         self.drives = make_drives(plan)
-        self.tactile = make_tactile(plan)
-        self.notes = Notes()
+        self.tactile: ArrayReceiver | None = make_tactile(plan) if before is None else before.tactile
+        self.notes: Notes = Notes() if before is None else before.notes
         self.watch = NodeWatch(plan.node_ids)
         self.cycle: Cycle | None = None
         guard = JointGuard(plan) if setup.arm is not None else None
@@ -126,7 +131,13 @@ class Cell:
         self._network = PumpedNetwork(port, other=self._other)
         self._make_cycle = direct or Cycle
         setups = make_setups(plan) if direct is None else ()  # without setups, bring-up only takes its time
-        self._bring_up = BringUp(self._network, self.watch, setups, setup.bring_up, self._say)
+        self.bring_up = BringUp(
+            self._network, self.watch, setups, setup.bring_up, self._say, listened=before is not None
+        )
+        self.stopped_by: Condition | None = None
+        self.doubted: frozenset[int] = frozenset()
+        self._stopped = False
+        self._before = before
         self._raw_array = (
             RawArrayStart(self.tactile, self._network, setup.bring_up.boot_up_s, self._say)
             if isinstance(self.tactile, RawReceiver)
@@ -143,6 +154,17 @@ class Cell:
         for node_id in self.watch.node_ids:
             for base in (HEARTBEAT_BASE, EMCY_BASE):
                 self._network.subscribe(base + node_id, self.watch.push)
+        if before is not None:
+            self._count_on(before)
+
+    def _count_on(self, before: Cell) -> None:
+        """Continue the counters of the cell before."""
+        if self.drives is not None and before.drives is not None:
+            for name in ("late", "missed", "malformed", "implausible"):
+                setattr(self.drives, name, getattr(before.drives, name))
+        self.watch.communication = before.watch.communication
+        seen, earlier = self.supervisor, before.supervisor
+        seen.counts, seen.first, seen.seen.overruns = earlier.counts, earlier.first, earlier.seen.overruns
 
     @property
     def start_ns(self) -> int:
@@ -179,7 +201,7 @@ class Cell:
         Raises:
             BusError: when there is one.
         """
-        self._bring_up.listen()
+        self.bring_up.listen()
 
     def hear(self, frames: Iterable[TimedFrame]) -> None:
         """Take frames that arrived before bring-up, while another reader waited on the port."""
@@ -188,7 +210,7 @@ class Cell:
 
     def __enter__(self) -> Cell:
         try:
-            self._bring_up.run()
+            self.bring_up.run()
             if self._raw_array is not None:
                 self._raw_array.start()
             self.cycle = self._make_cycle(
@@ -200,15 +222,22 @@ class Cell:
                 other=self._network.feed,
                 on_arrival=not isinstance(self._port.clock, VirtualClock),
                 kept=self._options.rows_kept,
+                **({} if self._before is None else {"before": self._before.cycle}),
             )
+            if self._before is not None and self.tactile is not None:
+                self.tactile.newest_cycle = self.cycle.number  # its age counts from the first SYNC of this cell
+            self._before = None
             self.log.start_s = self.start_ns * 1e-9
             self.watch.start(self._port.clock.now_ns())
             if self.homing is not None:
                 self.homing.look()
+                self.homing.doubt(self.doubted)
                 if not self._options.to_home:
                     self.homing.refuse_unhomed()
         except BaseException as error:
-            self.close()
+            self.stop()
+            if not self._options.recover:
+                self.close()
             self._name_another_master(error)
             raise
         return self
@@ -356,7 +385,7 @@ class Cell:
         self._say("enable the drives")
         self.drives.goal = DriveState.SWITCH_ON_DISABLED
         times = self._plan.setup.bring_up
-        with self._bring_up.confirm_modes(times.enable_s) as modes:
+        with self.bring_up.confirm_modes(times.enable_s) as modes:
             self._cycle_until((), WARM_UP_S, check=modes.serve)
             while modes.waiting:
                 self._cycle_until((), self._one_cycle_s, check=modes.serve)
@@ -439,6 +468,7 @@ class Cell:
     def _supervise_enabling(self) -> None:
         finding = self.supervisor.finding(enabling=True)
         if finding is not None and finding.condition.reaction is not Reaction.HOLD:
+            self.stopped_by = finding.condition
             raise finding.error
 
     def _supervise_homing(self) -> None:
@@ -463,7 +493,7 @@ class Cell:
         return self._holding
 
     def _react(self, finding: Finding) -> None:
-        reaction = finding.condition.reaction
+        self.stopped_by, reaction = finding.condition, finding.condition.reaction
         if reaction is Reaction.RETREAT and self._controller.lets_go:
             self._retreats_for = self._retreats_for or finding.error
             self._controller.retreat(str(finding.error))
@@ -524,7 +554,18 @@ class Cell:
     # the way out
 
     def close(self) -> None:
-        """Stop safely and close the bus: quick stop, disable, pre-operational. Never raises; failures are faults."""
+        """Stop safely and close the bus. Never raises; failures are faults."""
+        self.stop()
+        self._try(self._port.close)
+        self._note_silent_taxels()
+        for line in self.supervisor.notes():
+            self.notes.add(line)
+
+    def stop(self) -> None:
+        """Stop safely, once: quick stop, disable, pre-operational. Never raises; failures are faults."""
+        if self._stopped:
+            return
+        self._stopped = True
         self._try(self._stop_drives)
         if force := self.supervisor.pressing():
             free = "free it; a run does not begin while the array measures a force"
@@ -533,11 +574,7 @@ class Cell:
             self._try(self._raw_array.stop)
         if self.homing is not None:
             self._try(self.homing.keep)
-        self._try(self._bring_up.release)
-        self._try(self._port.close)
-        self._note_silent_taxels()
-        for line in self.supervisor.notes():
-            self.notes.add(line)
+        self._try(self.bring_up.release)
 
     def _patch(self, sample: TactileSample) -> Patch:
         assert self._reader is not None

@@ -134,9 +134,12 @@ class Controller:
     Attributes:
         lets_go: True: the controller supervises its contact and takes the probe off the object when `retreat` is
             called. False, the default: the cell does both.
+        can_go_on: True: after the cell has come back from a loss (``recover`` of `canprobe.open_cell`) the controller
+            goes on from where the arm stands, once motion is asked for. False, the default: a loss ends it.
     """
 
     lets_go: bool = False
+    can_go_on: bool = False
 
     @property
     def reader(self) -> SampleReader | None:
@@ -175,6 +178,17 @@ class Controller:
 
         Args:
             reason: reason for `Command.stop_reason`.
+        """
+
+    def asks_to_go_on(self) -> bool:
+        """Whether motion is asked for in a way that the controller knows. Called in each cycle of a hold."""
+        return False
+
+    def go_on(self, measurement: Measurement) -> None:
+        """Prepare to go on after a loss, from where the arm stands. Called before the first step after it.
+
+        Args:
+            measurement: the state of the cell, whose time has gone on meanwhile.
         """
 
     @property

@@ -18,7 +18,7 @@ import contextlib
 import json
 import math
 import shlex
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -69,6 +69,10 @@ _MOVES = {
     **{33: (-1, "the next index pulse"), 34: (1, "the next index pulse")},
 }
 """Direction in which a drive counts, and what it looks for, of the common methods."""
+
+
+class UnhomedError(NodeError):
+    """A drive has to be homed before it may be enabled."""
 
 
 class ZeroRecord:
@@ -167,17 +171,29 @@ class Homing:
             if same and isinstance(then, int) and abs(there - then) <= self._tolerance(axis):
                 self.known.add(axis)
 
+    def doubt(self, node_ids: Collection[int]) -> None:
+        """Take the zeros of drives as lost that may have been without power, whatever they report.
+
+        Raises:
+            CanprobeError: the record cannot be written.
+        """
+        for axis in self.order:
+            if self._drives[axis].node_id in node_ids:
+                self.known.discard(axis)
+                if axis in self._recorded:
+                    self._record.put(self._drives[axis].node_id, None)
+
     def refuse_unhomed(self) -> None:
         """Refuse to go on where a zero is not known.
 
         Raises:
-            NodeError: a drive has to be homed; with the command to type.
+            UnhomedError: a drive has to be homed; with the command to type.
         """
         lacking = [axis for axis in self.order if axis not in self.known]
         if lacking:
             others = ", ".join(f"{self._drives[axis].node_id} ({self._setups[axis].name})" for axis in lacking[1:])
             too = f"; nor are {others}" if others else ""
-            raise NodeError(
+            raise UnhomedError(
                 self._drives[lacking[0]].node_id,
                 f"({self._setups[lacking[0]].name}) is not homed, or was switched off or moved since{too}; type:"
                 f" canprobe up {self._scene} --home --bus {self._bus.interface} --channel {self._bus.channel}",

@@ -30,7 +30,7 @@ from canprobe.cell.results.summary import (
     write_summary,
 )
 from canprobe.cell.rows import ROWS_FOLDER
-from canprobe.cell.scene.setup import Setup, Touch
+from canprobe.cell.scene.setup import Touch
 from canprobe.cell.session.children import Bridges
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import estimates_of
@@ -43,9 +43,8 @@ from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     from canprobe.cell.results.contacts import Contacts
-    from canprobe.mechanics.touch.consistency import Consistency
+    from canprobe.mechanics.touch.map.surface_map import SurfaceMap
     from canprobe.mechanics.touch.patch.image import Patch
-    from canprobe.mechanics.touch.surface_map import SurfaceMap
 
 MOST_REPLAYED = 40
 """Answers of an estimator that computes after the run. Its scores need no more: in a scan that is long enough for them,
@@ -167,6 +166,18 @@ class OpenCell:
         self.session.run(runs, progress)
         return self._result
 
+    def resume(self) -> None:
+        """Ask for motion in a cell that was opened with ``recover=True`` and has come back from a loss.
+
+        A controller that is held goes on in the next cycle. May be called from any thread, an observer, or `progress`.
+        Where no controller is held, as after one that the loss has ended, the cell is brought up again for the next.
+
+        Raises:
+            UsageError: the cell was not opened with ``recover=True``, or is closed.
+            BusError, SafetyStop: the cell cannot be brought up again.
+        """
+        self.session.resume()
+
     def open_to_requests(self, task: Controller) -> Controller:
         """The task, which other tools may start, stop and change where the scene allows it."""
         return self._bridges.open_to_requests(task)
@@ -215,7 +226,7 @@ class OpenCell:
         estimates: dict[str, list[ShapeRecord]] = {}
         if record.shape is not None and setup.shape is not None:
             estimates[setup.shape.method] = record.shape.records
-        surface_map, consistency, map_summary = _mapped(setup, record.shape, start_s)
+        surface_map, map_summary = self._mapped(record.shape)
         summary = summarise(
             self.session,
             record,
@@ -234,7 +245,6 @@ class OpenCell:
             taxels=record.taxels,
             tactile=tactile,
             surface_map=surface_map,
-            consistency=consistency,
             out=self._out,
             contacts=self._contacts(record, start_s),
         )
@@ -265,6 +275,15 @@ class OpenCell:
                 if line not in self.session.unwritten:  # the summary is written twice
                     self.session.note_unwritten(line)
 
+    def _mapped(self, tracker: ShapeTracker | None) -> tuple[SurfaceMap | None, dict[str, Any] | None]:
+        """The surface map of a scan, and its section of the summary."""
+        if tracker is None or tracker.surface_map is None:
+            return None, None
+        from canprobe.cell.results.map_score import summarise_map
+
+        shape = self.plan.setup.truth.object if truth_of(self.session) else None
+        return tracker.surface_map, summarise_map(tracker.surface_map, shape)
+
     def _contacts(self, record: TaskRecord, start_s: float) -> Contacts | None:
         task = self.plan.setup.task
         if record.shape is None or not isinstance(task, Touch):
@@ -272,17 +291,6 @@ class OpenCell:
         from canprobe.cell.results.contacts import contacts_of
 
         return contacts_of(record.shape.samples, task, start_s)
-
-
-def _mapped(
-    setup: Setup, tracker: ShapeTracker | None, start_s: float
-) -> tuple[SurfaceMap | None, Consistency | None, dict[str, Any] | None]:
-    """The surface map of a scan, the tests at its crossings (they take a second), and both for the summary."""
-    if tracker is None or setup.shape is None:
-        return None, None, None
-    from canprobe.cell.results.map_score import map_of_scan
-
-    return map_of_scan(tracker, setup.shape.method, start_s)
 
 
 def _drawings(data: RunData, out: Path) -> dict[str, Callable[[], None]]:

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from canprobe.cell.scene.checks import DIRECTION, DISTINCT, SYMMETRIC, OneOf, Only, Pattern, Range, ScenePath
+from canprobe.cell.scene.checks import DIRECTION, DISTINCT, SYMMETRIC, Check, OneOf, Only, Pattern, Range, ScenePath
 from canprobe.cell.scene.hardware import (
     ArmSettings,
     Auto,
@@ -27,11 +27,13 @@ from canprobe.cell.scene.hardware import (
     TactileModeName,
     Vec3,
 )
+from canprobe.cell.scene.offers import find_offer
 from canprobe.fieldbus.protocol.tactile import WINDOW_SIZES
 
 TaskKind = Literal["scan", "press", "calibrate", "listen", "free"]
 Strategy = Literal["weave", "straight", "circle"]
-ShapeMethod = Literal["recursive", "ml", "chord", "chen1996"]
+OFFERED_ESTIMATOR = Check("that another package offers", lambda name: find_offer("estimator", name) is not None)
+ShapeMethod = Literal["recursive", "ml", "chord", "chen1996"] | Annotated[str, OFFERED_ESTIMATOR]
 ObjectKind = Literal[
     "plane",
     "sphere",
@@ -323,6 +325,8 @@ class ShapeSettings:
     """Other estimators that compute on the same contacts after the run, for the report."""
     patch: bool = True
     """Use the second moments of the tactile images where the path leaves a curvature open."""
+    revisit: bool = False
+    """Join the answers of `recursive` and `ml` with a map of what the probe touched there in earlier passes."""
     every_ms: Annotated[float, Range(0, 10_000, open_low=True)] = 40.0
     """Time between two estimates. Every contact is used."""
 

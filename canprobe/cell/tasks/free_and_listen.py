@@ -55,6 +55,8 @@ class ListenTask(Task):
         period_s: period of the cycle.
     """
 
+    can_go_on = True
+
     def __init__(self, calibration: PatchCalibration, duration_s: float, period_s: float) -> None:
         self._reader = PatchReader(calibration)
         self._left = duration_s
@@ -88,6 +90,8 @@ class ListenTask(Task):
 
 class HoldTask(Task):
     """Stay where the drives are."""
+
+    can_go_on = True
 
     def step(self, _: Measurement) -> Command:
         """Do nothing."""

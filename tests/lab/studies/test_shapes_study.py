@@ -11,7 +11,8 @@ from scipy.stats import multivariate_normal
 from canprobe.cli import main
 from canprobe.lab.studies.harness import Column
 from canprobe.lab.studies.shapes.implicit import ImplicitSurface, Touched, fit_quadric, rbf, thin_plate
-from canprobe.lab.studies.shapes.methods import METHODS, MapSurface, ProcessSurface
+from canprobe.lab.studies.shapes.methods import METHODS, ProcessSurface
+from canprobe.lab.studies.shapes.patches import LocalPatch, PatchSurface
 from canprobe.lab.studies.shapes.scans import (
     DEVELOPMENT,
     TEST,
@@ -29,7 +30,6 @@ from canprobe.mechanics.touch.contact import ContactSample, Doubt, Slope
 from canprobe.mechanics.touch.meshing import mesh_of
 from canprobe.mechanics.touch.objects import Sphere, Torus
 from canprobe.mechanics.touch.surface import SurfaceMatrix
-from canprobe.mechanics.touch.surface_map import LocalPatch, SurfaceMap
 
 RADIUS = 0.05
 KERNELS = pytest.mark.parametrize(("kernel", "length"), [(rbf, 0.03), (thin_plate, 0.1)])
@@ -118,32 +118,26 @@ def test_a_local_fit_has_the_error_that_it_states():
     assert fit_quadric(np.zeros(3), np.array([0.0, 0.0, 1.0]), on_ball(1)) is None
 
 
-def ball_map(lift=0.0, sigma=1e-5):
+def ball_patches(lift=0.0, sigma=1e-5):
     """Exact patches over the top of a ball, all lifted by as much."""
     surface = SurfaceMatrix.sphere(RADIUS).transformed(np.diag([1.0, -1.0, -1.0, 1.0]))
     patches = []
-    for i, (x, y) in enumerate(np.stack(np.meshgrid(*2 * [np.arange(-8e-3, 8.1e-3, 2e-3)]), -1).reshape(-1, 2)):
+    for x, y in np.stack(np.meshgrid(*2 * [np.arange(-8e-3, 8.1e-3, 2e-3)]), -1).reshape(-1, 2):
         T = surface.contact_frame(surface.project([x, y, 0.0]))
         T[:3, 3] -= lift * T[:3, 2]
         P = np.diag([1e-14, 1e-14, sigma**2, *6 * [1e-6]])
-        patches.append(
-            LocalPatch(
-                T_base_contact=T, S=SurfaceMatrix.sphere(RADIUS).S, K_covariance=np.eye(3), S_covariance=P,
-                pose_known=True, observed=[1, 1], combinations=np.eye(3), t_s=i, travelled_m=i, distance_m=0.0,
-                innovation=1.0,
-            )
-        )  # fmt: skip
-    return SurfaceMap(patches=tuple(patches), path=np.array([p.point for p in patches]))
+        patches.append(LocalPatch(T, SurfaceMatrix.sphere(RADIUS).S, P))
+    return patches
 
 
-def score_of(surface_map, truth):
-    surface = MapSurface(surface_map)
-    return scored(surface, mesh_of(surface.closest, surface_map.points, 1e-3), truth)
+def score_of(patches, truth):
+    surface = PatchSurface(patches)
+    return scored(surface, mesh_of(surface.closest, surface.points, 1e-3), truth)
 
 
 def test_surfaces_that_are_known_have_the_scores_that_they_must():
-    exact = ball_map()
-    truth = truth_under(Sphere(np.eye(4), RADIUS), np.repeat(exact.points, 4, axis=0))
+    exact = ball_patches()
+    truth = truth_under(Sphere(np.eye(4), RADIUS), np.repeat(PatchSurface(exact).points, 4, axis=0))
     assert not truth["truth_edge"].any()
     best = score_of(exact, truth)
     assert best["accuracy_um"] < 0.1
@@ -153,16 +147,16 @@ def test_surfaces_that_are_known_have_the_scores_that_they_must():
     assert best["nll"] == pytest.approx(math.log(0.01 * math.sqrt(2 * math.pi)), abs=0.05)
     assert best["normal_mrad"] < 0.01
     assert best["curvature_per_m"] < 2.0  # of the nearest patch: its normal is turned by up to 30 mrad
-    high = score_of(ball_map(lift=0.15e-3), truth)
+    high = score_of(ball_patches(lift=0.15e-3), truth)
     assert high["accuracy_um"] == pytest.approx(150, rel=0.01)
     assert high["completeness_um"] == pytest.approx(150, rel=0.01)
     assert [high[f"f_{mm:g}mm"] for mm in (0.05, 0.1, 0.2, 0.5)] == [0.0, 0.0, 1.0, 1.0]
     assert high["coverage"] == 0.0
-    half = score_of(SurfaceMap(patches=exact.patches[:45], path=exact.path), truth)
+    half = score_of(exact[:45], truth)
     assert half["accuracy_um"] < 0.1  # what is there is right,
     assert 0.2 < half["missed"] < 0.5
     assert half["completeness_um"] == pytest.approx(1e3 * half["missed"], rel=0.01)  # and what is not there counts
-    nothing = score_of(SurfaceMap(patches=(), path=exact.path), truth)
+    nothing = score_of([], truth)
     assert (nothing["f_0.5mm"], nothing["missed"], nothing["nll"]) == (0.0, 1.0, None)
 
 
