@@ -5,6 +5,7 @@
 - `emulated_bus` puts emulated nodes on a bus of a test, in virtual or in real time;
   `judged_bus` judges the master of a test on it.
 - `judge` finds known faults of masters in the frames of a bus.
+- `link` judges whether a bus, its nodes and the machine hold a cycle.
 - `reports` are what examinations of nodes and masters report, for people and for CI servers.
 
 The tools take nodes and ports; they never build them from a cell. Start reading at `faults`.
