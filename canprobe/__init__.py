@@ -40,12 +40,11 @@ if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
     from canprobe.mechanics.touch.estimate.fit import fit_surface
     from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
-    from canprobe.mechanics.touch.map.contact_map import ContactMap
     from canprobe.mechanics.touch.map.fit import fit_map
+    from canprobe.mechanics.touch.map.surface_map import SurfaceMap
     from canprobe.mechanics.touch.surface import SurfaceMatrix
-    from canprobe.mechanics.touch.surface_map import SurfaceMap
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 sys.meta_path.insert(0, MovedModules())
 
@@ -66,10 +65,9 @@ _MODULES = {
     "canprobe.mechanics.touch.estimate.likelihood": ("cramer_rao",),
     "canprobe.mechanics.touch.estimate.answer": ("SurfaceEstimate",),
     "canprobe.mechanics.touch.estimate.fit": ("fit_surface",),
-    "canprobe.mechanics.touch.map.contact_map": ("ContactMap",),
+    "canprobe.mechanics.touch.map.surface_map": ("SurfaceMap",),
     "canprobe.mechanics.touch.map.fit": ("fit_map",),
     "canprobe.mechanics.touch.surface": ("SurfaceMatrix",),
-    "canprobe.mechanics.touch.surface_map": ("SurfaceMap",),
     "canprobe.cell.results.result": ("RunResult",),
     "canprobe.cell.results.traffic": ("measure_traffic",),
 }
@@ -79,7 +77,6 @@ __all__ = [
     "BusError",
     "CanprobeError",
     "Command",
-    "ContactMap",
     "ContactSample",
     "Contacts",
     "Controller",

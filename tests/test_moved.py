@@ -15,7 +15,7 @@ OLD = (
     *("canprobe.tasks.Trajectory", "canprobe.tasks.shape.ShapeRecord", "canprobe.cell.cycle.Observation"),
     *("canprobe.cell.controller.TactileSample", "canprobe.protocol.tactile.TactileFrame"),
     *("canprobe.planning.model.Plan", "canprobe.planning.measured.MeasuredTraffic"),
-    *("canprobe.touch.patch.image.Patch", "canprobe.touch.surface_map.LocalPatch", "canprobe.touch.blend.Feet"),
+    *("canprobe.touch.patch.image.Patch", "canprobe.touch.meshing.Feet"),
     *("canprobe.touch.meshing.Mesh", "canprobe.touch.estimate.noise.Prior"),
     *("canprobe.touch.estimate.noise.Correlation", "canprobe.scene.load.load_scene"),
 )

@@ -20,6 +20,8 @@ from canprobe.lab.bridge.view.surface import GrowingSurface
 
 FRAME_NS, PLOT_NS = 40_000_000, 250_000_000
 """Time on the wall between two pictures, and between two drawings of the plots."""
+SURFACE_REST = 4
+"""Time without a new surface, over that which the last one took: all of it is solved and sent each time."""
 ROW_S, WINDOW_S = 0.05, 30.0
 """Time between two points of a plot, and length of the past that it shows."""
 _OFF_PATH = tuple(phase.name.lower() for phase in OFF_PATH)
@@ -42,11 +44,12 @@ class LiveView:
         self._panel = Panel(server, scene, errors, self._stage)
         self._trail = Trail()
         self._path = GrowingPath(server.scene, self._trail)
-        self._surface = GrowingSurface(server.scene, errors)
+        setup = context.plan.setup
+        self._surface = None if setup.shape is None else GrowingSurface(server.scene, errors, setup.probe.radius)
         self._follower = Follower(shape)
         self._rows: deque[tuple[float, ...]] = deque(maxlen=round(WINDOW_S / ROW_S))
         self._clock = MonotonicClock()
-        self._frame_ns = self._plot_ns = 0
+        self._frame_ns = self._plot_ns = self._surface_ns = 0
 
     @property
     def where(self) -> str:
@@ -62,8 +65,8 @@ class LiveView:
         contact = sample.touch.contact if sample.touch is not None else None
         if contact is not None and moment.phase not in _OFF_PATH:
             self._trail.add(moment.t_s, contact.point, contact.normal)
-        if sample.patch is not None and moment.answer is not None:
-            self._surface.add(moment.answer)
+            if self._surface is not None:
+                self._surface.add(contact)
         if sample.cycle is not None and (not self._rows or moment.t_s >= self._rows[-1][0] + ROW_S):
             self._rows.append(row_of(moment))
         now_ns = self._clock.now_ns()
@@ -76,7 +79,10 @@ class LiveView:
         if now_ns - self._plot_ns >= PLOT_NS:
             self._plot_ns = now_ns
             curves = curves_of(self._rows)
+        if self._surface is not None and now_ns >= self._surface_ns:
             self._surface.refresh()
+            after_ns = self._clock.now_ns()
+            self._surface_ns = after_ns + max(PLOT_NS, SURFACE_REST * (after_ns - now_ns))
         with self._server.atomic():
             self._stage.show(moment)
             self._path.refresh()
@@ -84,7 +90,7 @@ class LiveView:
 
     def close(self, summary: str | None) -> None:
         """Stop the server."""
-        self._show(self._follower.moment, self._plot_ns + PLOT_NS)
+        self._show(self._follower.moment, max(self._plot_ns + PLOT_NS, self._surface_ns))
         self._stack.close()
 
 

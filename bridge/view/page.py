@@ -22,7 +22,7 @@ from canprobe.lab.bridge.view.path import deviation_scale
 from canprobe.lab.bridge.view.path_nodes import LoadedPath
 from canprobe.lab.bridge.view.plots import NAMES, curves_of, row_of
 from canprobe.lab.bridge.view.recorded import RecordedRun
-from canprobe.lab.bridge.view.replay import FRAME_S, answers_of, shape_of, trail_of
+from canprobe.lab.bridge.view.replay import FRAME_S, shape_of, trail_of
 from canprobe.lab.bridge.view.server import open_server
 from canprobe.lab.bridge.view.stage import Stage, legend_of, place_of
 from canprobe.lab.bridge.view.surface import LoadedSurface
@@ -61,8 +61,8 @@ def _record(run: RecordedRun, times: Floats) -> tuple[str, list[str]]:
     with open_server(0) as server:
         stage = Stage(server, run.setup)
         errors = deviation_scale(shape_of(run))
-        path = LoadedPath(server.scene, trail_of(run))
-        surface = LoadedSurface(server.scene, answers_of(run), errors)
+        path = LoadedPath(server.scene, trail := trail_of(run))
+        surface = LoadedSurface(server.scene, run.surface_map, trail, errors)
         recorder = server.get_scene_serializer()
         before = 0.0  # the page's time is that of the run: the first picture stands until its first cycle
         with server.atomic():  # nobody listens: nothing is sent

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from bisect import bisect_right
 from collections.abc import Iterator
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from canprobe.cell.master.joint_columns import joint_positions
 from canprobe.cell.results.run_files import LOG, TACTILE, is_recorded, read_log, read_scene, read_summary, read_tactile
+from canprobe.cell.results.surface_file import SURFACE, load_surface_map
 from canprobe.cell.scene.load import SAVED_AS
 from canprobe.cell.scene.model import Scene
 from canprobe.cell.scene.resolve import resolve
@@ -22,6 +24,9 @@ from canprobe.cell.tasks.probing import Phase
 from canprobe.errors import UsageError
 from canprobe.lab.bridge.sample import ContactFrame, SurfacePatch
 from canprobe.lab.bridge.view.instants import JudgedAnswer, Moment, judge
+from canprobe.lab.bridge.view.path import OFF_PATH
+from canprobe.lab.bridge.view.surface import map_of_points
+from canprobe.mechanics.touch.map.surface_map import SurfaceMap
 from canprobe.mechanics.touch.tangent_frames import tangent_rotation
 from canprobe.mechanics.types import Floats
 
@@ -40,6 +45,7 @@ class RecordedRun:
         answer_rows: rows at which the estimator gave a new answer.
         answers: estimate at each of them.
         taxels: time, s, and counts (rows, columns) of each tactile frame, by rising time of the cycle that used it.
+        surface_map: map of the surface; None where nothing was touched.
     """
 
     setup: Setup
@@ -47,6 +53,7 @@ class RecordedRun:
     answer_rows: NDArray[np.int64]
     answers: tuple[JudgedAnswer, ...]
     taxels: tuple[tuple[float, NDArray[np.uint8]], ...]
+    surface_map: SurfaceMap | None
 
     @property
     def scene(self) -> Scene:
@@ -67,6 +74,11 @@ class RecordedRun:
     def _q(self) -> Floats | None:
         """Joint positions (rows, n), rad or m."""
         return joint_positions(self.log)
+
+    @property
+    def contact_rows(self) -> NDArray[np.intp]:
+        """Rows of the log at which the probe was on its path over the object."""
+        return _contact_rows(self.log)
 
     def times(self, step_s: float) -> Floats:
         """Instants at an even distance from the first cycle to the last, s."""
@@ -136,7 +148,29 @@ def read_run(folder: Path, setup: Setup | None = None) -> RecordedRun:
         answer_rows=rows,
         answers=tuple(judge(_patch(log, row), shape) for row in rows.tolist()),
         taxels=tuple(_read_taxels(folder / TACTILE, setup)),
+        surface_map=_surface_map(folder / SURFACE, log, setup),
     )
+
+
+def _surface_map(file: Path, log: dict[str, Floats], setup: Setup) -> SurfaceMap | None:
+    """The map of a run; of one that was killed, or of an older canprobe, that of the contacts in its log."""
+    if file.exists():
+        with contextlib.suppress(UsageError):
+            found = load_surface_map(file)
+            return found if len(found) else None
+    rows = _contact_rows(log)
+    if setup.shape is None or not len(rows):
+        return None
+    found = map_of_points(setup.probe.radius)
+    found.add(log["contact_mm"][rows] * 1e-3, log["normal"][rows])
+    return found
+
+
+def _contact_rows(log: dict[str, Floats]) -> NDArray[np.intp]:
+    """Rows of a log at which the probe was on its path over the object."""
+    if "contact_mm" not in log:
+        return np.zeros(0, np.intp)
+    return np.flatnonzero(np.isfinite(log["contact_mm"]).all(axis=1) & ~np.isin(log["phase"], OFF_PATH))
 
 
 def _read_taxels(file: Path, setup: Setup) -> Iterator[tuple[float, NDArray[np.uint8]]]:

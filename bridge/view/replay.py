@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
-import numpy as np
-
 from canprobe.cell.scene.geometry import true_object
 from canprobe.fieldbus.bus.clock import MonotonicClock
-from canprobe.lab.bridge.view.instants import JudgedAnswer
 from canprobe.lab.bridge.view.panel import Panel
-from canprobe.lab.bridge.view.path import OFF_PATH, Trail, deviation_scale
+from canprobe.lab.bridge.view.path import Trail, deviation_scale
 from canprobe.lab.bridge.view.path_nodes import LoadedPath
 from canprobe.lab.bridge.view.plots import curves_of, row_of
 from canprobe.lab.bridge.view.recorded import RecordedRun
@@ -75,8 +72,9 @@ class Player:
         self._run = run
         errors = deviation_scale(shape_of(run))
         self._stage = Stage(server, run.setup)
-        self._path = LoadedPath(server.scene, trail_of(run))
-        self._surface = LoadedSurface(server.scene, answers_of(run), errors)
+        trail = trail_of(run)
+        self._path = LoadedPath(server.scene, trail)
+        self._surface = LoadedSurface(server.scene, run.surface_map, trail, errors)
         gui = server.gui
         start = round(float(run.log["t_s"][0]), 2)
         self._slider = gui.add_slider("time (s)", start, max(round(run.duration_s, 2), start + 0.01), 0.01, start)
@@ -111,19 +109,11 @@ def shape_of(run: RecordedRun) -> PlacedShape | None:
     return None if run.scene.object is None else true_object(run.scene.object)
 
 
-def answers_of(run: RecordedRun) -> Iterator[tuple[float, JudgedAnswer]]:
-    """The answers of a run's estimator, each with the instant from which it counted, s."""
-    yield from zip(run.log["t_s"][run.answer_rows].tolist(), run.answers, strict=True)
-
-
 def trail_of(run: RecordedRun) -> Trail:
     """The path of a run's contact."""
-    trail, log = Trail(), run.log
-    if "contact_mm" not in log:
-        return trail
-    touched = np.isfinite(log["contact_mm"]).all(axis=1) & ~np.isin(log["phase"], OFF_PATH)
-    rows = np.nonzero(touched)[0]
-    times, points = log["t_s"][rows].tolist(), log["contact_mm"][rows] * 1e-3
-    for t_s, point, normal in zip(times, points, log["normal"][rows], strict=True):
-        trail.add(t_s, point, normal)
+    trail, rows = Trail(), run.contact_rows
+    if len(rows):
+        points = run.log["contact_mm"][rows] * 1e-3
+        for t_s, point, normal in zip(run.log["t_s"][rows].tolist(), points, run.log["normal"][rows], strict=True):
+            trail.add(t_s, point, normal)
     return trail

@@ -1,84 +1,41 @@
-"""The recovered surface in the browser: answers of the estimator blended into one surface, which grows with them."""
+"""The recovered surface in the browser: the map of all contacts, which grows with them."""
 
 from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from canprobe.lab.bridge.view.instants import JudgedAnswer
-from canprobe.lab.bridge.view.path import DeviationScale
+from canprobe.lab.bridge.sample import ContactFrame
+from canprobe.lab.bridge.view.path import DeviationScale, Trail
 from canprobe.lab.bridge.view.path_nodes import Parts
-from canprobe.mechanics.touch.blend import REACH_M
+from canprobe.mechanics.touch.map.noise import PAD_NOISE
+from canprobe.mechanics.touch.map.surface_map import REACH_M, SurfaceMap
 from canprobe.mechanics.touch.meshing import Mesh
-from canprobe.mechanics.touch.surface_map import SPACING_M, LocalPatch, SurfaceMap
 from canprobe.mechanics.types import Floats
 
-CELL_M = 1e-3
-"""Side of a triangle of the surface, m."""
+CELL_M, NODES_IN_DETAIL = 1e-3, 10_000
+"""Side of a triangle of the surface, m, and nodes of a map beyond which triangles grow, so that they are no more."""
 LIFT_M = 3e-4
 """Distance outward from the true surface, m, so that the two do not flicker through each other."""
 
 
-class BlendedSurface:
-    """Answers as one surface: of those within `SPACING_M` of each other the one with the least deviation.
-
-    Args:
-        scale: scale of the colours, which show the stated deviation of K, 1/m.
-    """
-
-    def __init__(self, scale: DeviationScale) -> None:
-        self._scale = scale
-        self._answers: list[JudgedAnswer] = []
-
-    def __bool__(self) -> bool:
-        return bool(self._answers)
-
-    def add(self, answer: JudgedAnswer) -> bool:
-        """Take an answer; returns whether it has changed the surface."""
-        if not (np.isfinite(answer.sigma) and np.isfinite(answer.patch.K).all()):
-            return False
-        point = _point(answer)
-        near = [a for a in self._answers if float(np.linalg.norm(_point(a) - point)) < SPACING_M]
-        if any(a.sigma <= answer.sigma for a in near):
-            return False
-        self._answers = [*(a for a in self._answers if a not in near), answer]
-        return True
-
-    def mesh(self) -> tuple[Mesh, NDArray[np.uint8]]:
-        """The surface so far, and the colours of its vertices (n, 3)."""
-        mesh = SurfaceMap(patches=tuple(map(_patch, self._answers)), path=np.zeros((0, 3))).mesh(cell=CELL_M)
-        # a place is as well known as the best answer in reach
-        sigmas = np.array([answer.sigma for answer in self._answers])
-        best = [sigmas[near].min(initial=math.inf) for near in _near(mesh.vertices, self._answers)]
-        return mesh, self._scale.colours(np.array(best))
+def map_of_points(probe_radius: float) -> SurfaceMap:
+    """An empty map for contact points and normals that a pad of a radius (m) has reported: the squeeze is off."""
+    turned = math.hypot(PAD_NOISE.normal, PAD_NOISE.lateral / probe_radius)
+    return SurfaceMap(None, replace(PAD_NOISE, normal=turned, common=(0.0, 0.0, 0.0, 0.0)))
 
 
-def _near(vertices: Floats, answers: Sequence[JudgedAnswer]) -> list[list[int]]:
-    """Find for each vertex (n, 3) the indices of the answers within `REACH_M`."""
-    tree = cKDTree([_point(answer) for answer in answers])
-    return [tree.query_ball_point(vertex, REACH_M) for vertex in vertices]
-
-
-def _point(answer: JudgedAnswer) -> Floats:
-    return answer.patch.T_base_contact[:3, 3]
-
-
-def _patch(answer: JudgedAnswer) -> LocalPatch:
-    """An answer as a patch of a map, with the part that is shown: its shape, without the uncertainty of its place."""
-    patch, S, covariance = answer.patch, np.zeros((4, 4)), np.zeros((9, 9))
-    S[:2, :2], S[2, 3], S[3, 2] = 0.5 * patch.K, -0.5, -0.5
-    covariance[6:, 6:] = 0.25 * patch.covariance
-    return LocalPatch(
-        T_base_contact=patch.T_base_contact, S=S, K_covariance=patch.covariance, S_covariance=covariance,
-        pose_known=False, observed=np.ones(2), combinations=np.eye(3), t_s=0.0, travelled_m=0.0, distance_m=REACH_M,
-        innovation=1.0,
-    )  # fmt: skip
+def drawn(surface_map: SurfaceMap, scale: DeviationScale) -> tuple[Mesh, NDArray[np.uint8]]:
+    """Triangles of a map, and the colours of its vertices (n, 3): the deviation of K that it states there."""
+    mesh = surface_map.mesh(cell=CELL_M * max(1.0, math.sqrt(len(surface_map) / NODES_IN_DETAIL)))
+    V = surface_map.curvature(mesh.vertices).covariance
+    return mesh, scale.colours(np.sqrt(V[:, 0, 0] + 2.0 * V[:, 1, 1] + V[:, 2, 2]))
 
 
 class GrowingSurface:
@@ -87,21 +44,24 @@ class GrowingSurface:
     Args:
         api: viser's scene.
         scale: scale of the colours.
+        probe_radius: radius of the probe, m.
     """
 
-    def __init__(self, api: Any, scale: DeviationScale) -> None:
-        self._api, self._surface, self._grown = api, BlendedSurface(scale), False
+    def __init__(self, api: Any, scale: DeviationScale, probe_radius: float) -> None:
+        self._api, self._scale, self._map = api, scale, map_of_points(probe_radius)
+        self._new: list[ContactFrame] = []
 
-    def add(self, answer: JudgedAnswer) -> None:
-        """Take an answer."""
-        self._grown |= self._surface.add(answer)
+    def add(self, contact: ContactFrame) -> None:
+        """Take a contact."""
+        self._new.append(contact)
 
     def refresh(self) -> None:
         """Send the surface if it has changed."""
-        if self._grown:
-            mesh, colours = self._surface.mesh()
+        if self._new:
+            self._map.add([one.point for one in self._new], [one.normal for one in self._new])
+            self._new.clear()
+            mesh, colours = drawn(self._map, self._scale)
             _add(self._api, "/surface", mesh, mesh.triangles, colours)
-            self._grown = False
 
 
 STAGES = 40
@@ -113,25 +73,29 @@ class LoadedSurface(Parts):
 
     Args:
         api: viser's scene.
-        answers: estimates of the run, by rising time, each with its instant, s.
+        surface_map: map of the run; None: nothing was touched.
+        trail: path of the contact in the run.
         scale: scale of the colours.
     """
 
-    def __init__(self, api: Any, answers: Iterable[tuple[float, JudgedAnswer]], scale: DeviationScale) -> None:
-        surface, times, shown = BlendedSurface(scale), list[float](), list[JudgedAnswer]()
-        for t_s, answer in answers:
-            surface.add(answer)
-            times.append(t_s)
-            shown.append(answer)
+    def __init__(self, api: Any, surface_map: SurfaceMap | None, trail: Trail, scale: DeviationScale) -> None:
         super().__init__()
-        if not surface:
+        if surface_map is None or not len(trail):
             return
-        mesh, colours = surface.mesh()
-        first = np.array([min(near, default=len(times) - 1) for near in _near(mesh.vertices, shown)])
-        stage = first[mesh.triangles].max(axis=1) * STAGES // len(times)
+        mesh, colours = drawn(surface_map, scale)
+        first = _first_touched(mesh.vertices, trail)
+        times = np.linspace(trail.times[0], trail.times[-1], STAGES + 1)[1:]
+        stage = np.searchsorted(times, first[mesh.triangles].max(axis=1))
         for number in np.unique(stage):
             node = _add(api, f"/surface/{number:02d}", mesh, mesh.triangles[stage == number], colours, visible=False)
-            self.add(times[-(-number * len(times) // STAGES)], node)
+            self.add(float(times[min(number, STAGES - 1)]), node)
+
+
+def _first_touched(vertices: Floats, trail: Trail) -> Floats:
+    """(n,) the instant of the first contact within reach of each vertex (n, 3), s; of the last where none is."""
+    tree = cKDTree([segment[1] for segment in trail.segments])
+    near = (tree.query_ball_point(vertex, REACH_M) for vertex in vertices)
+    return np.array([trail.times[min(one, default=-1)] for one in near])
 
 
 def _add(api: Any, name: str, mesh: Mesh, triangles: Any, colours: Any, *, visible: bool = True) -> Any:

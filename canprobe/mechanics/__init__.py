@@ -36,21 +36,19 @@ if TYPE_CHECKING:
     from canprobe.mechanics.touch.estimate.fit import fit_surface
     from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
     from canprobe.mechanics.touch.estimate.prior import Prior
-    from canprobe.mechanics.touch.map.contact_map import ContactMap
     from canprobe.mechanics.touch.map.fit import fit_map
+    from canprobe.mechanics.touch.map.surface_map import SurfaceMap
     from canprobe.mechanics.touch.objects import make_object
     from canprobe.mechanics.touch.surface import SurfaceMatrix
-    from canprobe.mechanics.touch.surface_map import SurfaceMap
 
 _MODULES = {
     "ArmModel": "robot.model",
     "Chain": "robot.chain",
-    "ContactMap": "touch.map.contact_map",
     "ContactSample": "touch.contact",
     "Joint": "robot.model",
     "Prior": "touch.estimate.prior",
     "SurfaceEstimate": "touch.estimate.answer",
-    "SurfaceMap": "touch.surface_map",
+    "SurfaceMap": "touch.map.surface_map",
     "SurfaceMatrix": "touch.surface",
     "cramer_rao": "touch.estimate.likelihood",
     "fit_map": "touch.map.fit",
@@ -63,7 +61,6 @@ _MODULES = {
 __all__ = [
     "ArmModel",
     "Chain",
-    "ContactMap",
     "ContactSample",
     "Joint",
     "Prior",

@@ -12,11 +12,18 @@ from time import process_time
 import numpy as np
 
 import canprobe
-from canprobe.cell.results.map_score import map_of_scan
-from canprobe.cell.tasks.shape import ShapeTracker
+from canprobe.cell.master.controller import Command
+from canprobe.cell.master.monitor import Monitor
+from canprobe.cell.master.monitor_text import lines
+from canprobe.cell.master.observers import Observation
+from canprobe.cell.master.options import RunOptions, quiet
+from canprobe.cell.session.session import Session
+from canprobe.cell.session.up import ROWS_OF_UP
+from canprobe.cell.tasks.shape import MAPPED_AT_ONCE
 from canprobe.fieldbus import LockstepBus, PortNetwork, VirtualClock, load_eds, make_eds_node
-from canprobe.mechanics.touch.contact import ContactSample
-from canprobe.mechanics.touch.estimate.fit import make_estimator
+from canprobe.mechanics.touch.map.local_fits import PadLayer
+from canprobe.mechanics.touch.map.noise import PAD_NOISE
+from canprobe.mechanics.touch.map.surface_map import SurfaceMap
 from canprobe.mechanics.touch.surface import SurfaceMatrix
 
 JOINT = """
@@ -134,20 +141,36 @@ def seconds(duration: int, folder: Path) -> tuple[float, float]:
 
 
 def contacts(n: int, folder: Path) -> float:
-    """The map of a scan of n contacts over one place, with the tests at its crossings."""
-    tracker = ShapeTracker(make_estimator("recursive", sigma_point=2e-5, sigma_normal=1e-3), 8)
-    rng, surface = np.random.default_rng(0), SurfaceMatrix.from_curvature([[20.0, 0.0], [0.0, -15.0]])
-    s = np.arange(n) * 0.125e-3
-    x, y = 18e-3 * np.sin(s / 18e-3), 4e-3 * np.sin(s / 3.1e-3)
+    """The map of n contacts over new ground, solved."""
+    rng, surface = np.random.default_rng(0), SurfaceMatrix.from_curvature([[2.0, 0.0], [0.0, -1.5]])
+    line, x = np.divmod(np.arange(n) * 0.125e-3, 0.1)
+    x, y = np.where(line % 2 == 0.0, x, 0.1 - x) - 0.05, 3e-3 * (line - 0.5 * line[-1])
     points = np.stack([x, y, surface.height(x, y)], axis=1)
     normals = surface.normal(points) + 1e-3 * rng.normal(size=points.shape)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     points = points + 2e-5 * rng.normal(size=points.shape)
-    for k in range(n):
-        tracker.add(ContactSample(0.005 * k, points[k], normals[k], np.eye(4), np.array([0.0, 0.0, 0.04]), 1.0))
-        tracker.answer_at_once(0.005 * k)
+    found = SurfaceMap(PadLayer(0.04, 1.2e8), PAD_NOISE)
     began = process_time()
-    map_of_scan(tracker, "recursive")
+    for k in range(0, n, MAPPED_AT_ONCE):
+        part = slice(k, min(k + MAPPED_AT_ONCE, n))
+        found.add(points[part], normals[part], np.full(len(points[part]), 2.0))
+    found.solved()
+    return process_time() - began
+
+
+def held(minutes: int, folder: Path) -> float:
+    """Minutes of a cell that `up` holds and a monitor watches, in virtual time on a lockstep bus."""
+    plan = canprobe.plan("cylinder", {"bus.interface": "lockstep"})
+    monitor, period_ns = Monitor(plan), plan.sync.period_ns
+
+    def watch(observation: Observation) -> None:
+        monitor.push(observation.frames)
+        if observation.t_ns % (40 * period_ns) < period_ns:  # a screen every 0.1 s
+            "".join(lines(monitor.view(observation.t_ns)))
+
+    session = Session(plan, RunOptions(None, quiet, (watch,), ROWS_OF_UP))
+    began = process_time()
+    with session:
+        session.run(lambda measurement: Command(done=measurement.t_ns >= 60e9 * minutes))
     return process_time() - began
 
 

@@ -19,6 +19,7 @@ PROGRAMS = {
     "tshark": ("tshark",),
     "chromium": ("chromium", "chromium-browser", "google-chrome"),
     "user-mode-linux": ("linux.uml",),
+    "spin": ("spin",),
     "build-essential": ("cc",),  # compiles what the guest needs on processors with AMX
 }
 """Programs by the package that brings them; one of them is enough."""

@@ -15,7 +15,15 @@ import numpy as np
 from canprobe.cell.master.array import ArrayReceiver, RawReceiver, make_patch_reader, make_tactile
 from canprobe.cell.master.as_found import FoundNodes
 from canprobe.cell.master.bringup import BringUp
-from canprobe.cell.master.controller import Command, Controller, Measurement, as_controller, check_command
+from canprobe.cell.master.controller import (
+    Command,
+    Controller,
+    Measurement,
+    SampleReader,
+    TactileSample,
+    as_controller,
+    check_command,
+)
 from canprobe.cell.master.cycle import Cycle
 from canprobe.cell.master.drives import make_drives
 from canprobe.cell.master.homing import Homing
@@ -38,6 +46,7 @@ from canprobe.fieldbus.bus.pumped import PumpedNetwork
 from canprobe.fieldbus.bus.real.interrupts import Interrupts
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, DriveState
 from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE
+from canprobe.mechanics.touch.patch.image import Patch
 
 Result = TypeVar("Result")
 
@@ -112,8 +121,8 @@ class Cell:
         self.cycle: Cycle | None = None
         guard = JointGuard(plan) if setup.arm is not None else None
         seen = Seen(limits_of(plan), self.watch, self.drives, self.tactile, port.counters)
-        self._reader = reader = make_patch_reader(setup)
-        self.supervisor = Supervisor(seen, guard, None if guard is None or reader is None else reader.read)
+        self._reader: SampleReader | None = make_patch_reader(setup)
+        self.supervisor = Supervisor(seen, guard, None if guard is None or self._reader is None else self._patch)
         slides = setup.arm.model.chain.prismatic if setup.arm is not None else ()
         self._slides = np.array(slides, dtype=bool) if any(slides) else None
         self._plan = plan
@@ -149,6 +158,7 @@ class Cell:
         self._running = False
         self._retreats_for: CanprobeError | None = None
         self._controller = Controller()
+        self._remarks_noted = 0
         for node_id in self.watch.node_ids:
             for base in (HEARTBEAT_BASE, EMCY_BASE):
                 self._network.subscribe(base + node_id, self.watch.push)
@@ -275,7 +285,10 @@ class Cell:
         """The first half of `run`: enable the drives for a controller, which `advance` then runs."""
         runs = as_controller(controller)
         with self._one_at_a_time(), self._naming_another_master():
-            self._controller, self._retreats_for = runs, None
+            self._controller, self._retreats_for, self._remarks_noted = runs, None, 0
+            if runs.reader is not None:
+                self._note_silent_taxels()
+                self._reader = runs.reader
             self._enable()
 
     def advance(self, cycles: int | None, progress: Callable[[Measurement], None] = lambda _: None) -> bool:
@@ -457,8 +470,12 @@ class Cell:
         self._note_alarms()
         seen = self.supervisor.seen
         seen.restarts = self._controller.restarts
+        for remark in self._controller.remarks[self._remarks_noted :]:
+            self._remarks_noted += 1
+            self.notes.add(remark, t_s=(self.start_ns + measurement.t_ns) * 1e-9)
+            self._say(remark)
         if self._reader is not None and measurement.tactile is not None:
-            self._reader.look(measurement.tactile)
+            self._reader.read(measurement.tactile)
             seen.silent_taxels = self._reader.found
         self.supervisor.step(
             measurement,
@@ -561,8 +578,7 @@ class Cell:
         """Stop safely and close the bus. Never raises; failures are faults."""
         self.stop()
         self._try(self._port.close)
-        if self._reader is not None and (words := self._reader.faults):
-            self.notes.add(words + SILENT_TAXELS)
+        self._note_silent_taxels()
         for line in self.supervisor.notes():
             self.notes.add(line)
 
@@ -582,6 +598,14 @@ class Cell:
         self._try(self.bring_up.release)
         if self.found is not None and self.bring_up.took_over:
             self._try(self.found.restore)
+
+    def _patch(self, sample: TactileSample) -> Patch:
+        assert self._reader is not None
+        return self._reader.read(sample)
+
+    def _note_silent_taxels(self) -> None:
+        if self._reader is not None and (words := self._reader.faults):
+            self.notes.add(words + SILENT_TAXELS)
 
     def _try(self, action: Callable[[], None]) -> None:
         """Run one step of the way out to its end: an interrupt repeats it once, a failure is noted."""

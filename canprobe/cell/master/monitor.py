@@ -31,6 +31,7 @@ from canprobe.fieldbus.protocol.frames import (
     unpack_heartbeat,
 )
 from canprobe.mechanics.robot.model import units_to_joints
+from canprobe.mechanics.touch.patch.calibration_check import CalibrationCheck
 
 SECOND_NS = 1_000_000_000
 LATE_HEARTBEAT_S = 0.25
@@ -99,6 +100,7 @@ class CellView:
         sync_jitter_us: 99th percentile and largest distance of a SYNC interval from the planned one, µs.
         torn_frames: tactile frames that were not whole.
         events: last changes of nodes and drives, and commands to them, each with its time.
+        array: how the array is not as its calibration says, by its images alone; None where it is.
     """
 
     channel: str
@@ -114,6 +116,7 @@ class CellView:
     sync_jitter_us: tuple[float, float] | None = None
     torn_frames: int = 0
     events: list[str] = field(default_factory=list)
+    array: str | None = None
 
     def as_document(self) -> dict[str, Any]:
         """The state as `--json` prints it."""
@@ -143,6 +146,10 @@ class Monitor:
         self._counts: list[int | None] = [None] * len(axes)
         self._tactile = make_tactile(plan)
         self._reader = make_patch_reader(plan.setup)
+        array = plan.setup.array
+        self._check: CalibrationCheck | None = None
+        if array is not None:
+            self._check = CalibrationCheck.of(array.calibration, array.pad, images=array.mode != "features")
         self._heard: dict[int, int] = {}
         self._first_ns: int | None = None
         self._recent: dict[str, deque[tuple[int, float]]] = {channel: deque() for channel in channels}
@@ -220,6 +227,10 @@ class Monitor:
             self._view.taxels = frame.taxels
             patch = self._reader.read(TactileSample(frame, t_ns, 0)) if self._reader is not None else None
             self._view.force_n = patch.force if patch is not None else None
+            if patch is not None and self._check is not None:
+                self._check.see(t_ns * 1e-9, frame.taxels, frame.window, patch)
+                if self._check.work():
+                    self._view.array = self._check.finding
 
     def _take_heartbeat(self, node: NodeView, data: bytes, t_ns: int) -> None:
         try:

@@ -42,6 +42,8 @@ def lines(view: CellView) -> Iterator[str]:
         force = "–" if view.force_n is None else f"{view.force_n:.2f} N"
         yield ""
         yield f"force   {force}   torn frames {view.torn_frames}"
+        if view.array is not None:
+            yield f"array   {view.array}"
         yield from image_lines(view.taxels)
 
 

@@ -15,12 +15,13 @@ from canprobe.cell.planning.model import Plan
 from canprobe.cell.recorded.cycles import LogCycles, replay_contacts
 from canprobe.cell.recorded.recording import read_recording
 from canprobe.cell.recorded.run_folder import RunFolder, read_run, replay_task
-from canprobe.cell.results.map_score import estimate_columns, map_of_scan
+from canprobe.cell.results.map_score import estimate_columns, summarise_map
 from canprobe.cell.results.run_files import LOG, TACTILE, TRUTH, is_recorded, needed, read_log, read_scene, read_truth
 from canprobe.cell.results.summary import finite_or_none, summarise_shape
 from canprobe.cell.results.text import curvature_text, shape_lines
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import Scene
+from canprobe.cell.scene.offers import find_offer
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.scene.setup import Setup
 from canprobe.cell.tasks.from_plan import estimates_of
@@ -28,6 +29,7 @@ from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
 from canprobe.errors import ProtocolError, UsageError
 from canprobe.fieldbus.bus.clock_steps import RecordedBus
 from canprobe.mechanics.touch.estimate.fit import METHODS, unknown_method
+from canprobe.mechanics.touch.map.surface_map import SurfaceMap
 from canprobe.mechanics.types import Floats
 
 SCHEMA = 2
@@ -102,7 +104,8 @@ def _summarise(
     """The summary of a `ReplayResult`; a value that does not apply is None. `folder` has the run's truth and log."""
     truth = _truth(folder / TRUTH, plan.setup) if folder is not None else {}
     tracker = contacts.tracker
-    map_summary = None if plan.scene.shape is None else map_of_scan(tracker, plan.scene.shape.method)[2]
+    shape = plan.setup.truth.object if truth else None
+    map_summary = None if tracker.surface_map is None else summarise_map(tracker.surface_map, shape)
     return {
         "schema": SCHEMA,
         "scene": plan.scene.name,
@@ -223,6 +226,11 @@ class ReplayResult:
     estimates: dict[str, list[ShapeRecord]]
     tracker: ShapeTracker
 
+    @property
+    def surface_map(self) -> SurfaceMap | None:
+        """One surface of all contacts, with its uncertainty."""
+        return self.tracker.surface_map
+
     def text(self) -> str:
         """The summary as text."""
         return replay_text(self.summary)
@@ -297,6 +305,6 @@ def _methods(scene: Scene, method: str | Sequence[str] | None) -> tuple[str, ...
         return (scene.shape.method, *scene.shape.also)
     names = (method,) if isinstance(method, str) else tuple(method)
     for name in names:
-        if name not in METHODS:
+        if name not in METHODS and find_offer("estimator", name) is None:
             raise unknown_method(name)
     return names or (scene.shape.method,)

@@ -1,83 +1,57 @@
-"""The surface map of a scan, and its section of the summary."""
+"""The surface map of a scan in the summary, and estimates as columns."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
-from canprobe.mechanics.touch.consistency import CROSSING_RADIUS_M, PARTS, Consistency, check_consistency
-from canprobe.mechanics.touch.surface_map import LocalPatch, SurfaceMap, merge_patches
+from canprobe.cell.tasks.shape import ShapeRecord
+from canprobe.mechanics.touch.linear_algebra import rms
+from canprobe.mechanics.touch.map import nodes as column
+from canprobe.mechanics.touch.map.surface_map import SurfaceMap
+from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.types import Floats
 
-SAME_DIRECTION_RAD = math.radians(30.0)
-"""Passes whose directions differ by less have the same hysteresis of the array."""
-PAIRS_TESTED = 5000
-"""Pairs of patches near each other that are tested as crossings: their number grows with the square of the time that a
-scan goes over one place, and a test takes a third of a millisecond."""
+MAX_PLACES = 500
+"""Most places at which a map is scored, evenly over its nodes."""
+TWO_SIGMA = 1.96
+_COMMON = ("lag_um", "pad_scale_percent", "pad_x_um", "pad_y_um")
+_TO_UNIT = np.array([1e6, 1e2, 1e6, 1e6])
 
 
-def map_of_scan(
-    tracker: ShapeTracker, method: str, start_s: float = 0.0
-) -> tuple[SurfaceMap, Consistency, dict[str, Any]]:
-    """Merge the answers of the estimator in the loop along a scan.
+def summarise_map(surface_map: SurfaceMap, shape: PlacedShape | None) -> dict[str, Any]:
+    """The section ``shape.map`` of ``summary.json``: None for what does not apply.
 
     Args:
-        tracker: tracker with the answers and the contacts of the scan.
-        method: name of the estimator.
-        start_s: deadline of the first SYNC on the run's clock.
-
-    Returns:
-        The map, the tests at its crossings, and its section of ``summary.json``: None without a test.
+        surface_map: map of the scan.
+        shape: true object; None where nobody knows it.
     """
-    patches = [LocalPatch.of(r.estimate, t_s=start_s + r.t_s, travelled_m=r.travelled_m) for r in tracker.records]
-    surface_map = merge_patches(patches, np.frombuffer(tracker.path).reshape(-1, 3), method=method)
-    consistency = _tested(surface_map)
-    return (
-        surface_map,
-        consistency,
-        {
-            "patches": len(surface_map),
-            "crossings": len(consistency.crossings),
-            "independent_crossings": len(consistency.independent),
-            "consistent": consistency.consistent,
-            **{part: _verdict(consistency, part) for part in PARTS},
-        },
-    )
-
-
-def _tested(surface_map: SurfaceMap) -> Consistency:
-    """The tests at the crossings; where more pairs are near each other than `PAIRS_TESTED`, of every k-th patch."""
-    every = 1
-    while len(points := surface_map.points[::every]):
-        tree = cKDTree(points)
-        if tree.count_neighbors(tree, CROSSING_RADIUS_M) - len(points) <= 2 * PAIRS_TESTED:
-            break
-        every *= 2
-    if every == 1:
-        return check_consistency(surface_map)
-    found = check_consistency(replace(surface_map, patches=surface_map.patches[::every]))
-    crossings = tuple(replace(c, first=every * c.first, second=every * c.second) for c in found.crossings)
-    return Consistency(crossings, found.independent)
-
-
-def _verdict(consistency: Consistency, part: str) -> dict[str, float | None]:
-    whole = consistency.verdict(part)
-    same = consistency.verdict(part, (0.0, SAME_DIRECTION_RAD))
-    other = consistency.verdict(part, (SAME_DIRECTION_RAD, math.inf))
-    figures = {
-        "chi2_per_dof": whole.chi2_per_dof,
-        "share_p_below_0.05": whole.share_below,
-        "share_p_below_0.05_same_direction": same.share_below,
-        "share_p_below_0.05_other_direction": other.share_below,
-        "pooled_p": whole.pooled.p,
-    }
-    return {name: value if math.isfinite(value) else None for name, value in figures.items()}
+    names = ("sigma_um", "disagree_fraction", "stiffness_n_m3", "stiffness_sigma_percent", "common")
+    found: dict[str, Any] = {"contacts": 0, "nodes": len(surface_map)} | dict.fromkeys(names)
+    found |= dict.fromkeys(("rms_error_um", "within_2_sigma_fraction"))
+    if not len(surface_map):
+        return found
+    found["contacts"] = int(surface_map.nodes.rows[:, column.COUNT].sum())
+    places = surface_map.points[:: -(-len(surface_map) // MAX_PLACES)]
+    feet = surface_map.closest(places)
+    known = np.isfinite(feet.sigma)
+    if known.any():
+        found["sigma_um"] = 1e6 * float(np.median(feet.sigma[known]))
+        found["disagree_fraction"] = float(np.mean(surface_map.disagreement(places[known]) > 0.0))
+    if (stiffness := surface_map.stiffness) is not None:
+        found["stiffness_n_m3"], found["stiffness_sigma_percent"] = stiffness.value, 1e2 * stiffness.sigma
+    if any(surface_map.noise.common):
+        mean, sigma = surface_map.common.mean, np.sqrt(np.diag(surface_map.common.covariance))
+        pairs = zip(_COMMON, (mean * _TO_UNIT).tolist(), (sigma * _TO_UNIT).tolist(), strict=True)
+        found["common"] = {name: [value, spread] for name, value, spread in pairs}
+    if shape is not None and known.any():
+        off = np.array([shape.nearest((x, y, z)).distance for x, y, z in feet.point[known].tolist()])
+        found["rms_error_um"] = 1e6 * rms(off)
+        found["within_2_sigma_fraction"] = float(np.mean(np.abs(off) < TWO_SIGMA * feet.sigma[known]))
+    return {name: None if isinstance(value, float) and math.isnan(value) else value for name, value in found.items()}
 
 
 def estimate_columns(records: Sequence[ShapeRecord]) -> dict[str, Floats]:

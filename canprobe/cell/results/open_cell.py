@@ -16,7 +16,7 @@ from canprobe.cell.master.cell import Cell
 from canprobe.cell.master.controller import Command, Controller, Measurement, TactileSample, as_controller
 from canprobe.cell.master.log import since_first_sync
 from canprobe.cell.master.observers import Observers
-from canprobe.cell.master.options import RunOptions, Say
+from canprobe.cell.master.options import RunOptions
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.results.result import RunResult
 from canprobe.cell.results.run_data import RunData
@@ -30,7 +30,7 @@ from canprobe.cell.results.summary import (
     write_summary,
 )
 from canprobe.cell.rows import ROWS_FOLDER
-from canprobe.cell.scene.setup import Setup, Touch
+from canprobe.cell.scene.setup import Touch
 from canprobe.cell.session.children import Bridges
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import estimates_of
@@ -43,9 +43,8 @@ from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     from canprobe.cell.results.contacts import Contacts
-    from canprobe.mechanics.touch.consistency import Consistency
+    from canprobe.mechanics.touch.map.surface_map import SurfaceMap
     from canprobe.mechanics.touch.patch.image import Patch
-    from canprobe.mechanics.touch.surface_map import SurfaceMap
 
 MOST_REPLAYED = 40
 """Answers of an estimator that computes after the run. Its scores need no more: in a scan that is long enough for them,
@@ -206,7 +205,7 @@ class OpenCell:
         summary["bridges"] = self._bridges.end(summary)
         self._write(lambda out: write_summary(summary, out))
         if self._out is not None:
-            for name, draw in _drawings(data, self._out, self._say).items():
+            for name, draw in _drawings(data, self._out).items():
                 self._say(f"draw {name}")
                 if (why := _draw(name, draw)) is not None:
                     self.session.note_unwritten(why)
@@ -227,7 +226,7 @@ class OpenCell:
         estimates: dict[str, list[ShapeRecord]] = {}
         if record.shape is not None and setup.shape is not None:
             estimates[setup.shape.method] = record.shape.records
-        surface_map, consistency, map_summary = _mapped(setup, record.shape, start_s)
+        surface_map, map_summary = self._mapped(record.shape)
         summary = summarise(
             self.session,
             record,
@@ -246,7 +245,6 @@ class OpenCell:
             taxels=record.taxels,
             tactile=tactile,
             surface_map=surface_map,
-            consistency=consistency,
             out=self._out,
             contacts=self._contacts(record, start_s),
         )
@@ -277,6 +275,15 @@ class OpenCell:
                 if line not in self.session.unwritten:  # the summary is written twice
                     self.session.note_unwritten(line)
 
+    def _mapped(self, tracker: ShapeTracker | None) -> tuple[SurfaceMap | None, dict[str, Any] | None]:
+        """The surface map of a scan, and its section of the summary."""
+        if tracker is None or tracker.surface_map is None:
+            return None, None
+        from canprobe.cell.results.map_score import summarise_map
+
+        shape = self.plan.setup.truth.object if truth_of(self.session) else None
+        return tracker.surface_map, summarise_map(tracker.surface_map, shape)
+
     def _contacts(self, record: TaskRecord, start_s: float) -> Contacts | None:
         task = self.plan.setup.task
         if record.shape is None or not isinstance(task, Touch):
@@ -286,19 +293,8 @@ class OpenCell:
         return contacts_of(record.shape.samples, task, start_s)
 
 
-def _mapped(
-    setup: Setup, tracker: ShapeTracker | None, start_s: float
-) -> tuple[SurfaceMap | None, Consistency | None, dict[str, Any] | None]:
-    """The surface map of a scan, the tests at its crossings (they take a second), and both for the summary."""
-    if tracker is None or setup.shape is None:
-        return None, None, None
-    from canprobe.cell.results.map_score import map_of_scan
-
-    return map_of_scan(tracker, setup.shape.method, start_s)
-
-
-def _drawings(data: RunData, out: Path, say: Say) -> dict[str, Callable[[], None]]:
-    """Functions that draw the pictures of a run of at least one cycle; the page is last, as it takes longest."""
+def _drawings(data: RunData, out: Path) -> dict[str, Callable[[], None]]:
+    """Functions that draw the pictures of a run of at least one cycle."""
 
     def report() -> None:
         from canprobe.cell.results.figures import draw_run
@@ -310,16 +306,8 @@ def _drawings(data: RunData, out: Path, say: Say) -> dict[str, Callable[[], None
 
         draw_surface(data, out / "surface.png")
 
-    def page() -> None:
-        from canprobe.cell.results.page import write_page_of
-
-        try:
-            write_page_of(out, data.plan.setup, say)
-        except UsageError as error:  # a controller's column has the name of one of ours and another content
-            say(f"report.html is left out: {error}")
-
     outputs = data.plan.outputs if len(data.log["t_s"]) else ()
-    known = {"report.png": report, "surface.png": surface, "report.html": page}
+    known = {"report.png": report, "surface.png": surface}
     return {name: draw for name, draw in known.items() if name in outputs}
 
 

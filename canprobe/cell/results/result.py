@@ -22,7 +22,6 @@ from canprobe.cell.results.summary import write_files
 from canprobe.cell.results.text import summary_text
 from canprobe.cell.scene.setup import Touch
 from canprobe.cell.session.folder import write_scene
-from canprobe.cell.tasks.from_plan import make_contact_map
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.errors import UsageError, install_line
 from canprobe.mechanics.types import Floats
@@ -31,11 +30,10 @@ if TYPE_CHECKING:
     import pandas
     from matplotlib.figure import Figure
 
-    from canprobe.cell.results.contacts import Contacts, OwnEstimator, Scores
+    from canprobe.cell.results.contacts import Contacts, Scores
     from canprobe.cell.results.page import Page
-    from canprobe.mechanics.touch.consistency import Consistency
-    from canprobe.mechanics.touch.map.contact_map import ContactMap
-    from canprobe.mechanics.touch.surface_map import SurfaceMap
+    from canprobe.cell.tasks.own_estimators import OwnEstimator
+    from canprobe.mechanics.touch.map.surface_map import SurfaceMap
 
 _FIELDS = frozenset(field.name for field in fields(RunData))
 
@@ -56,8 +54,7 @@ class RunResult:
         taxels: counts of the task's last tactile frame (rows, columns), or None.
         tactile: the columns of ``tactile.npz``, one row per tactile frame that the cell used: ``t_s`` of the cycle,
             ``t_sample_s``, ``taxels`` (m, rows, columns), their ``window``, ``features``; empty where there was none.
-        surface_map: the local patches of the online estimator, or None without a shape.
-        consistency: the tests at its crossings, or None.
+        surface_map: one surface of all contacts of the scan, with its uncertainty; None without a shape.
         out: the folder with the files, or None.
         contacts: measured contacts of the scan; None without a shape.
     """
@@ -72,7 +69,6 @@ class RunResult:
     taxels: NDArray[np.uint8] | None
     tactile: dict[str, NDArray[Any]]
     surface_map: SurfaceMap | None
-    consistency: Consistency | None
     out: Path | None
     contacts: Contacts | None
 
@@ -173,22 +169,6 @@ class RunResult:
         return score_estimators(
             self.contacts.samples, task, {**ours, **own}, truth=self.truth, sync_times=self.log["t_s"] - start_s
         )
-
-    def contact_map(self) -> ContactMap:
-        """One surface of all contacts of this scan, whichever pass they are from, with its uncertainty.
-
-        `surface_map` is what the estimator in the loop knew along its path; this map is solved afterwards, and better
-        where passes are near each other (`canprobe study shapes`).
-
-        Raises:
-            UsageError: when nothing was scanned.
-        """
-        task = self.plan.setup.task
-        if self.contacts is None or not len(self.contacts) or not isinstance(task, Touch):
-            raise UsageError("contact_map: expected a scan that touched its object, got no contacts")
-        found = make_contact_map(task)
-        found.add_samples(self.contacts.samples)
-        return found
 
     def to_pandas(self, what: Literal["log", "truth", "estimates"] = "log") -> pandas.DataFrame:
         """A table of the run, by time; vectors are spread over columns, and `attrs["units"]` has every unit.

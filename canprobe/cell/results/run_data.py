@@ -15,8 +15,7 @@ from canprobe.mechanics.types import Floats
 
 if TYPE_CHECKING:
     from canprobe.cell.results.contacts import Contacts
-    from canprobe.mechanics.touch.consistency import Consistency
-    from canprobe.mechanics.touch.surface_map import SurfaceMap
+    from canprobe.mechanics.touch.map.surface_map import SurfaceMap
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +30,5 @@ class RunData:
     taxels: NDArray[np.uint8] | None = None
     tactile: dict[str, NDArray[Any]] = field(default_factory=dict)
     surface_map: SurfaceMap | None = None
-    consistency: Consistency | None = None
     out: Path | None = None
     contacts: Contacts | None = None

@@ -24,7 +24,7 @@ from canprobe.cell.results.scores import (
     score_shape,
     state_force_sigma,
 )
-from canprobe.cell.results.surface_file import save_surface_map
+from canprobe.cell.results.surface_file import SURFACE, save_surface_map
 from canprobe.cell.results.tool_file import FILE, summarise_calibration, tool_text
 from canprobe.cell.results.traffic import LOG, measure_traffic
 from canprobe.cell.scene.setup import Setup
@@ -311,7 +311,7 @@ def write_files(result: RunData, out: Path) -> None:
     _write_each(
         lambda: write_summary(result.summary, out),
         lambda: write_text(out / FILE, tool) if tool is not None else None,
-        lambda: save_surface_map(surface_map, out / "surface.npz") if surface_map is not None else None,
+        lambda: save_surface_map(surface_map, out / SURFACE) if surface_map is not None else None,
     )
 
 

@@ -1,118 +1,114 @@
-"""The figure of a surface map: its surface over the true object, the crossings of passes, and their p-values."""
+"""The figure of a surface map: its surface over the true object, where contacts disagree, and their common errors."""
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import SubFigure
 
-from canprobe.cell.results.map_score import SAME_DIRECTION_RAD
-from canprobe.cell.results.picture import BLUE, FAINT, GREEN, INK, ORANGE, drawn_rows, legend, parts, picture
+from canprobe.cell.results.picture import BLUE, FAINT, GREY, INK, ORANGE, drawn_rows, legend, parts, picture
 from canprobe.cell.results.run_data import RunData
-from canprobe.cell.results.surface_panels import (
-    MapPlane,
-    MapView,
-    rejected,
-)
+from canprobe.cell.results.surface_panels import MapPlane, MapView
 from canprobe.cell.results.surface_sheet import draw_map_surface
-from canprobe.mechanics.touch.consistency import Consistency, check_consistency
+from canprobe.cell.tasks.probing import Phase
+from canprobe.mechanics.touch.map.surface_map import SurfaceMap
 from canprobe.mechanics.touch.shapes import PlacedShape
-from canprobe.mechanics.touch.surface_map import SurfaceMap
+from canprobe.mechanics.types import Floats
 
-PARTS = (("curvature", ORANGE), ("normal", BLUE), ("height", GREEN))
+TWO_SIGMA = 1.96
+COMMON = (("lag", 1e6, "µm"), ("pad scale", 1e2, "%"), ("pad x", 1e6, "µm"), ("pad y", 1e6, "µm"))
+"""Errors that a scan has in common, with their units."""
 
 
 def draw_surface(result: RunData, path: Path) -> None:
     """Draw a run's surface map and write a PNG; a run without a map has none."""
-    if result.surface_map is None or result.consistency is None or not len(result.surface_map):
+    if result.surface_map is None or not len(result.surface_map):
         return
     draw_map(
         result.surface_map,
         path,
-        consistency=result.consistency,
+        walked=_walked(result),
         shape=result.plan.setup.truth.object,
         title=result.plan.scene.title or result.plan.scene.name,
     )
+
+
+def _walked(result: RunData) -> Floats | None:
+    """(n, 3) path of the contact over the surface, m; None where the log has none."""
+    if "contact_mm" not in result.log:
+        return None
+    points: Floats = 1e-3 * result.log["contact_mm"]
+    points = points[(result.log["phase"] == Phase.SCAN) & np.isfinite(points).all(axis=1)]
+    return points[drawn_rows(len(points))] if len(points) else None
 
 
 def draw_map(
     surface_map: SurfaceMap,
     path: Path,
     *,
-    consistency: Consistency | None = None,
+    walked: Floats | None = None,
     shape: PlacedShape | None = None,
     title: str = "",
 ) -> None:
-    """Draw a map: its surface over the true object, crossings in the plane of the scan, their p-values.
+    """Draw a map: its surface over the true object, where passes disagree, and the errors that they have in common.
 
     Args:
-        surface_map: a map with at least one patch.
+        surface_map: a map with at least one contact.
         path: path of the PNG.
-        consistency: tests at its crossings; None: `check_consistency` makes them, which takes a second.
+        walked: (n, 3) path of the contact, m; None: not drawn.
         shape: true object, drawn below the surface and compared with it; None: the colour shows σ.
         title: first line of the title.
     """
-    walked = surface_map.path if len(surface_map.path) else surface_map.points
-    plane = MapPlane.of(walked, surface_map.normals)
-    view = MapView(surface_map, consistency or check_consistency(surface_map), shape, plane)
-    crossings = len(view.consistency.crossings)
-    told = (
-        f"{title}\n{len(surface_map)} patches over {1e3 * surface_map.travelled[-1]:.0f} mm of path by"
-        f" {surface_map.method or 'an estimator'}, {crossings} crossings"
-    )
-    with picture(path, told, 7.8) as figure:
+    points = surface_map.points
+    plane = MapPlane.of(points if walked is None else walked, surface_map.normals)
+    view = MapView(surface_map, walked, shape, plane)
+    common = any(surface_map.noise.common)
+    with picture(
+        path, f"{title}\none surface of {len(surface_map)} nodes, whichever pass they are from", 7.8
+    ) as figure:
         upper, lower = parts(figure, 2, 1, height_ratios=(4, 3))
         draw_map_surface(upper, view)
-        left, *right = parts(lower, 1, 2 if crossings else 1)
-        _draw_crossings(left, view)
+        left, *right = parts(lower, 1, 2 if common else 1)
+        _draw_disagreement(left, view)
         for part in right:
-            _draw_p_values(part, view.consistency)
+            _draw_common(part, surface_map)
 
 
-def _draw_crossings(part: SubFigure, view: MapView) -> None:
+def _draw_disagreement(part: SubFigure, view: MapView) -> None:
     axes = part.subplots()
-    path = view.plane.mm(view.map.path[drawn_rows(len(view.map.path))])
-    axes.plot(path[:, 0], path[:, 1], color=FAINT, linewidth=0.9, zorder=1)
-    crossings = view.consistency.crossings
-    if crossings:
-        places = view.plane.mm(np.array([c.T_base_common[:3, 3] for c in crossings]))
-        differ = rejected(view.consistency)
-        same = np.array([not c.angle >= SAME_DIRECTION_RAD for c in crossings])
-        for is_same, marker, where in ((True, "o", "same direction"), (False, "X", "other direction")):
-            for is_bad, colour, what in ((False, BLUE, "agree"), (True, ORANGE, "differ")):
-                chosen = (same == is_same) & (differ == is_bad)
-                if chosen.any():
-                    axes.scatter(
-                        places[chosen, 0], places[chosen, 1], s=26, marker=marker, color=colour, linewidths=0.4,
-                        edgecolors="white", zorder=3 if is_bad else 2, label=f"{where}: {chosen.sum()} {what}",
-                    )  # fmt: skip
+    if view.path is not None:
+        path = view.plane.mm(view.path)
+        axes.plot(path[:, 0], path[:, 1], color=FAINT, linewidth=0.9, zorder=1)
+    points = view.map.points[drawn_rows(len(view.map))]
+    places, beyond = view.plane.mm(points), view.map.disagreement(points)
+    for chosen, colour, what in ((beyond == 0.0, BLUE, "agree within their noise"), (beyond > 0.0, ORANGE, "disagree")):
+        size = np.clip(8.0 + 8.0 * beyond[chosen], 8.0, 60.0)
+        axes.scatter(
+            places[chosen, 0], places[chosen, 1], s=size, color=colour, linewidths=0.3, edgecolors="white",
+            zorder=2, label=f"{chosen.sum()} nodes {what}",
+        )  # fmt: skip
     axes.set_aspect("equal", adjustable="datalim")
     axes.set(
-        title="path and crossings; differ: p < 0.05 in the joint test",
+        title="where contacts disagree; size: χ² per degree of freedom above 1",
         xlabel="along the scan (mm)",
         ylabel="across (mm)",
     )
     legend(part)
 
 
-def _draw_p_values(part: SubFigure, consistency: Consistency) -> None:
+def _draw_common(part: SubFigure, surface_map: SurfaceMap) -> None:
     axes = part.subplots()
-    axes.plot([0, 1], [0, 1], color=INK, linewidth=0.9, linestyle=":", label="one surface, exact covariances")
-    for name, colour in PARTS:
-        for style, way, low, high in (
-            ("-", "same direction", 0.0, SAME_DIRECTION_RAD),
-            ("--", "other", SAME_DIRECTION_RAD, math.inf),
-        ):
-            tests = [getattr(c, name) for c in consistency.crossings if low <= c.angle < high]
-            p = np.sort([test.p for test in tests if test.dof])
-            if len(p):
-                share = np.arange(1, len(p) + 1) / len(p)
-                axes.step(
-                    [0.0, *p, 1.0], [0.0, *share, 1.0], where="post", color=colour, linestyle=style,
-                    label=f"{name}, {way}",
-                )  # fmt: skip
-    axes.set(xlim=(0, 1), ylim=(0, 1.02), xlabel="p", ylabel="share of crossings below")
-    axes.set_title("p-values of the tests at the crossings\nbelow the dotted line: errors are smaller than stated")
+    prior = np.array(surface_map.noise.common)
+    mean, sigma = surface_map.common.mean, np.sqrt(np.diag(surface_map.common.covariance))
+    rows = np.arange(len(COMMON))
+    axes.barh(rows, 2.0 * TWO_SIGMA, left=-TWO_SIGMA, color=GREY, alpha=0.3, label="believed before, 95 %")
+    axes.errorbar(mean / prior, rows, xerr=TWO_SIGMA * sigma / prior, fmt="o", color=ORANGE, capsize=4, label="found")
+    axes.axvline(0.0, color=INK, linewidth=0.9, linestyle=":")
+    texts = (
+        f"{name}\n{unit * value:.0f} ± {unit * spread:.0f} {of}"
+        for (name, unit, of), value, spread in zip(COMMON, mean, sigma, strict=True)
+    )
+    axes.set_yticks(rows, list(texts))
+    axes.set(title="errors that the whole scan has in common", xlabel="over the standard deviation believed before")
     legend(part)

@@ -1,27 +1,36 @@
 """A surface map as a file: ``surface.npz``, plain arrays, no pickle.
 
-Columns (n patches, m path points; base frame; mixed units are SI in the stated order):
+The file has the nodes of the map (`canprobe.mechanics.touch.map`), from which the surface is solved when it is asked.
+Base frame; n nodes:
 
-=========================  ==========  ==============================================================================
-``format_version``         ()          1
-``method``                 ()          estimator
-``t_s``                    (n,)        instant of the last sample
-``travelled_m``            (n,)        path of the contact until then
-``T_base_contact_m``       (n, 4, 4)   contact frame to base; z is the inward normal
-``S_per_m``                (n, 4, 4)   surface matrix in the contact frame, c34 = −½
-``K_covariance_per_m2``    (n, 3, 3)   of (K11, K12, K22); NaN, infinite where not observed
-``S_covariance_si``        (n, 9, 9)   of (c14, c24, c44, c13, c23, c33, c11, c12, c22): –, –, m, 1/m …
-``pose_known``             (n,)        1 where ``S_covariance_si`` has height and tilt
-``observed``               (n, 2)      1 for each principal curvature that was observed
-``combinations``           (n, 3, 3)   rows: observed combinations of (K11, √2 K12, K22); NaN beyond the rank
-``memory_m``               (n,)        path from which the patch was estimated
-``innovation``             (n,)        mean squared whitened residual per degree of freedom
-``path_m``                 (m, 3)      contact points
-=========================  ==========  ==============================================================================
+=========================  =========  ================================================================================
+``format_version``         ()         2
+``pad_radius_m``           ()         radius of the probe; NaN where the contacts are points
+``pad_stiffness_n_m3``     ()         stated stiffness of its layer; NaN likewise
+``stiffness_n_m3``         ()         stiffness that the contacts show; NaN likewise
+``stiffness_log_sigma``    ()         standard deviation of its logarithm; NaN likewise
+``sigma_lateral_m``        ()         usual standard deviation of a contact along the surface
+``sigma_height_m``         ()         standard deviation of a height; infinite: not used
+``sigma_normal_rad``       ()         standard deviation of a normal; infinite: not used
+``path_per_sample_m``      (3,)       path per independent height, normal, image; 0: every contact is independent
+``sigma_common``           (4,)       of lag (m), relative scale of the pad, its offsets (m); 0: none
+``centre_m``               (n, 3)     centre of the probe; the contact point where there is none
+``normal``                 (n, 3)     outward unit normal of the object
+``pad_axes``               (n, 3, 3)  rows: axes x, y, z of the probe
+``heading``                (n, 3)     direction of the path, shorter where passes differ in it
+``root_force_n``           (n,)       mean √force, √N
+``lateral_variance_m2``    (n,)       variance of the error along the surface
+``height_variance_m2``     (n,)       variance of the height
+``normal_variance_rad2``   (n,)       variance of the normal by itself
+``patch_m2``               (n,)       √det of the second moments of the patch; NaN without an image
+``contacts``               (n,)       number of contacts
+``path_m``                 (n,)       path that they stand for
+=========================  =========  ================================================================================
 """
 
 from __future__ import annotations
 
+import math
 from os import PathLike
 from pathlib import Path
 
@@ -30,40 +39,53 @@ from numpy.typing import NDArray
 
 from canprobe.cell.npz import read_npz, write_npz
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.surface_map import LocalPatch, SurfaceMap
+from canprobe.mechanics.touch.map import nodes as column
+from canprobe.mechanics.touch.map.local_fits import PadLayer
+from canprobe.mechanics.touch.map.noise import MapNoise
+from canprobe.mechanics.touch.map.stiffness import Stiffness
+from canprobe.mechanics.touch.map.surface_map import SurfaceMap
 from canprobe.mechanics.types import Floats
 
-FORMAT_VERSION = 1
-_PER_PATCH: dict[str, tuple[str, tuple[int, ...]]] = {
-    "t_s": ("t_s", ()),
-    "travelled_m": ("travelled_m", ()),
-    "T_base_contact_m": ("T_base_contact", (4, 4)),
-    "S_per_m": ("S", (4, 4)),
-    "K_covariance_per_m2": ("K_covariance", (3, 3)),
-    "S_covariance_si": ("S_covariance", (9, 9)),
-    "pose_known": ("pose_known", ()),
-    "observed": ("observed", (2,)),
-    "combinations": ("combinations", (3, 3)),
-    "memory_m": ("distance_m", ()),
-    "innovation": ("innovation", ()),
+SURFACE, FORMAT_VERSION = "surface.npz", 2
+_OF_LAYER = ("pad_radius_m", "pad_stiffness_n_m3", "stiffness_n_m3", "stiffness_log_sigma")
+_OF_NOISE = ("sigma_lateral_m", "sigma_height_m", "sigma_normal_rad")
+_PER_MAP: dict[str, tuple[int, ...]] = {
+    **dict.fromkeys((*_OF_LAYER, *_OF_NOISE), ()),
+    "path_per_sample_m": (3,),
+    "sigma_common": (4,),
 }
-"""Field of a patch and its shape, by column."""
-_COLUMNS = ("format_version", "method", "path_m", *_PER_PATCH)
+_PER_NODE: dict[str, tuple[slice | int, tuple[int, ...]]] = {
+    "centre_m": (column.CENTRE, (3,)),
+    "normal": (column.NORMAL, (3,)),
+    "pad_axes": (slice(column.X_PAD.start, column.Z_PAD.stop), (3, 3)),
+    "heading": (column.HEADING, (3,)),
+    "root_force_n": (column.ROOT_FORCE, ()),
+    "lateral_variance_m2": (column.LATERAL2, ()),
+    "height_variance_m2": (column.HEIGHT2, ()),
+    "normal_variance_rad2": (column.NORMAL2, ()),
+    "patch_m2": (column.PATCH, ()),
+    "contacts": (column.COUNT, ()),
+    "path_m": (column.PATH, ()),
+}
+"""Columns of a node and their shape, by name."""
+_POSITIVE = (*_OF_NOISE, "lateral_variance_m2", "height_variance_m2", "normal_variance_rad2", "contacts", "path_m")
+_MAY_BE_INFINITE = ("sigma_height_m", "sigma_normal_rad", "height_variance_m2", "normal_variance_rad2")
+_COLUMNS = ("format_version", *_PER_MAP, *_PER_NODE)
+_MAX_LENGTH_ERROR = 1e-6
 
 
 def save_surface_map(surface_map: SurfaceMap, path: str | PathLike[str]) -> None:
     """Write a map to exactly this file (numpy would append ``.npz`` to a name without it)."""
-    columns: dict[str, NDArray[np.generic]] = {
-        "format_version": np.array(FORMAT_VERSION),
-        "method": np.array(surface_map.method),
-        "path_m": surface_map.path,
-    }
-    for name, (field, shape) in _PER_PATCH.items():
-        column = np.full((len(surface_map), *shape), np.nan)
-        for i, patch in enumerate(surface_map.patches):
-            value = np.asarray(getattr(patch, field), np.float64)
-            column[(i, slice(len(value))) if value.ndim else i] = value
-        columns[name] = column
+    pad, noise, rows = surface_map.pad, surface_map.noise, surface_map.nodes.rows
+    found = surface_map.stiffness if len(rows) else None
+    layer = (*(pad or (math.nan, math.nan)), *(found or (math.nan, math.nan)))
+    columns: dict[str, NDArray[np.generic]] = {"format_version": np.array(FORMAT_VERSION)}
+    columns |= {name: np.array(value) for name, value in zip(_OF_LAYER, layer, strict=True)}
+    usual = (noise.lateral, noise.height, noise.normal)
+    columns |= {name: np.array(value) for name, value in zip(_OF_NOISE, usual, strict=True)}
+    columns["path_per_sample_m"] = np.array([noise.height_path, noise.normal_path, noise.image_path])
+    columns["sigma_common"] = np.array(noise.common)
+    columns |= {name: rows[:, where].reshape(-1, *shape) for name, (where, shape) in _PER_NODE.items()}
     write_npz(Path(path), columns)
 
 
@@ -74,7 +96,7 @@ def load_surface_map(path: str | PathLike[str]) -> SurfaceMap:
         path: path of the file, or of the folder of a run.
 
     Returns:
-        The map.
+        The map; it takes more contacts.
 
     Raises:
         UsageError: no such file, not a surface map, another version, or a column that is missing, unknown or wrong;
@@ -82,53 +104,57 @@ def load_surface_map(path: str | PathLike[str]) -> SurfaceMap:
     """
     file = Path(path)
     if file.is_dir():
-        file = file / "surface.npz"
+        file = file / SURFACE
     if not file.exists():
-        raise UsageError(f"{file}: no such file; a run writes surface.npz where its scene asks for a shape")
+        raise UsageError(f"{file}: no such file; a run writes {SURFACE} where its scene asks for a shape")
     columns = read_npz(file, "an npz file with a surface map")
     if (version := columns.get("format_version")) is None:
         raise UsageError(f"{file}: expected a surface map, got a file without 'format_version'")
     if version.shape != () or version != FORMAT_VERSION:
         raise UsageError(
-            f"{file}: expected format_version {FORMAT_VERSION}, got {version}; write it again with this canprobe"
+            f"{file}: expected format_version {FORMAT_VERSION}, got {version} of another canprobe; make the map again"
+            f' of the run\'s contacts: canprobe.replay("{file.parent}").surface_map'
         )
     if missing := [name for name in _COLUMNS if name not in columns]:
         raise UsageError(f"{file}: missing {', '.join(missing)}")
     if unknown := [name for name in columns if name not in _COLUMNS]:
         raise UsageError(f"{file}: unknown {', '.join(unknown)}; expected {', '.join(_COLUMNS)}")
-    method = columns["method"]
-    if method.dtype.kind != "U" or method.shape != ():
-        raise UsageError(f"{file}: method: expected a name, got {method.dtype} of shape {method.shape}")
-    rows = len(columns["t_s"]) if columns["t_s"].ndim else 0
-    wanted = {name: (rows, *shape) for name, (_, shape) in _PER_PATCH.items()}
-    wanted["path_m"] = (len(columns["path_m"]) if columns["path_m"].ndim else 0, 3)
-    for name, shape in wanted.items():
-        if columns[name].shape != shape or columns[name].dtype != np.float64:
-            raise UsageError(
-                f"{file}: {name}: expected float64 of shape {shape}, got {columns[name].dtype} of {columns[name].shape}"
-            )
-    values = {name: columns[name].astype(np.float64) for name in wanted}
-    patches: list[LocalPatch] = []
-    try:
-        for i in range(len(values["t_s"])):
-            patches.append(_patch({field: values[name][i] for name, (field, _) in _PER_PATCH.items()}))
-        return SurfaceMap(patches=tuple(patches), path=values["path_m"], method=str(method))
-    except UsageError as error:
-        raise UsageError(f"{file}: patch {len(patches)}: {error}") from error
-
-
-def _patch(row: dict[str, Floats]) -> LocalPatch:
-    combinations = row["combinations"]
-    return LocalPatch(
-        T_base_contact=row["T_base_contact"],
-        S=row["S"],
-        K_covariance=row["K_covariance"],
-        S_covariance=row["S_covariance"],
-        pose_known=bool(row["pose_known"]),
-        observed=row["observed"],
-        combinations=combinations[np.isfinite(combinations).all(axis=1)],
-        t_s=float(row["t_s"]),
-        travelled_m=float(row["travelled_m"]),
-        distance_m=float(row["distance_m"]),
-        innovation=float(row["innovation"]),
+    n = len(columns["contacts"]) if columns["contacts"].ndim else 0
+    wanted = _PER_MAP | {name: (n, *shape) for name, (_, shape) in _PER_NODE.items()}
+    values = {name: _checked(file, name, columns[name], shape) for name, shape in wanted.items()}
+    if n and not np.allclose(np.linalg.norm(values["normal"], axis=1), 1.0, rtol=0.0, atol=_MAX_LENGTH_ERROR):
+        raise UsageError(f"{file}: normal: expected unit vectors, got others")
+    rows = np.zeros((n, column.COLUMNS))
+    for name, (where, shape) in _PER_NODE.items():
+        rows[:, where] = values[name].reshape(n, math.prod(shape)) if shape else values[name]
+    radius, stated, found, sigma = (float(values[name]) for name in _OF_LAYER)
+    lateral, height, normal = (float(values[name]) for name in _OF_NOISE)
+    lag, scale, x, y = values["sigma_common"].tolist()
+    of_height, of_normal, of_image = values["path_per_sample_m"].tolist()
+    noise = MapNoise(lateral, height, normal, of_height, of_normal, of_image, (lag, scale, x, y))
+    return SurfaceMap.of_nodes(
+        rows,
+        None if math.isnan(radius) else PadLayer(radius, stated),
+        noise,
+        None if math.isnan(found) else Stiffness(found, sigma),
     )
+
+
+def _checked(file: Path, name: str, values: NDArray[np.generic], shape: tuple[int, ...]) -> Floats:
+    """A column of the right kind and shape, with numbers that a map can have."""
+    if values.shape != shape or values.dtype != np.float64:
+        raise UsageError(
+            f"{file}: {name}: expected float64 of shape {shape}, got {values.dtype} of shape {values.shape}"
+        )
+    found = values.astype(np.float64)
+    if name in _OF_LAYER or name == "patch_m2":
+        right = np.isnan(found) | (np.isfinite(found) & (found > 0.0 if name != "patch_m2" else found >= 0.0))
+        expected = "numbers above 0, or NaN"
+    elif name in _POSITIVE:
+        right = (found > 0.0) & (np.isfinite(found) | (name in _MAY_BE_INFINITE))
+        expected = "numbers above 0"
+    else:
+        right, expected = np.isfinite(found), "finite numbers"
+    if not right.all():
+        raise UsageError(f"{file}: {name}: expected {expected}, got {found[~right].ravel()[0]}")
+    return found

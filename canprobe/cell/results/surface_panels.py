@@ -1,33 +1,29 @@
-"""Common data of the panels of a surface figure: the map, its tests, the true object, the plane of the scan."""
+"""Common data of the panels of a surface figure: the map, the path, the true object, the plane of the scan."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from canprobe.mechanics.touch.blend import REACH_M
-from canprobe.mechanics.touch.consistency import SIGNIFICANCE_LEVEL, Consistency
+from canprobe.mechanics.touch.map.surface_map import REACH_M, SurfaceMap
 from canprobe.mechanics.touch.shapes import PlacedShape
-from canprobe.mechanics.touch.surface_map import SurfaceMap
 from canprobe.mechanics.touch.tangent_frames import tangent_rotation
 from canprobe.mechanics.types import Floats
 
 MARGIN_M, TRUE_POINTS = 5e-3, 34
 """Margin of a true surface beyond the path, m, and its points on each side."""
-MAP_POINTS, PATCHES_DRAWN = 64, 1000
-"""Number of points of a map's surface along its longer side, and most patches that it is made of: 2 m of path."""
+MAP_POINTS = 64
+"""Number of points of a map's surface along its longer side."""
 
 
 class MapView(NamedTuple):
-    """A map, its tests, and the plane in which both are drawn; `shape` is the true object or None."""
+    """A map, the path (n, 3), m, of the contact or None, the true object or None, and the plane of the drawing."""
 
     map: SurfaceMap
-    consistency: Consistency
+    path: Floats | None
     shape: PlacedShape | None
     plane: MapPlane
 
@@ -60,11 +56,6 @@ class MapPlane(NamedTuple):
         return result
 
 
-def rejected(consistency: Consistency) -> NDArray[np.bool_]:
-    """Whether the joint test of each crossing rejects one surface (n,)."""
-    return np.array([c.joint.p < SIGNIFICANCE_LEVEL for c in consistency.crossings], dtype=bool)
-
-
 def true_surface(shape: PlacedShape, path: Floats, plane: MapPlane) -> Floats:
     """An object's surface below a path (n, 3): (TRUE_POINTS, TRUE_POINTS, 3) points of base, m."""
     flat = plane.mm(path)
@@ -75,13 +66,10 @@ def true_surface(shape: PlacedShape, path: Floats, plane: MapPlane) -> Floats:
 
 
 def map_surface(surface_map: SurfaceMap, plane: MapPlane) -> tuple[Floats, Floats]:
-    """The one surface of a map: points (rows, columns, 3) of base, m, and its σ there, m; NaN beyond its patches.
+    """The surface of a map: points (rows, columns, 3) of base, m, and its σ there, m; NaN beyond its contacts.
 
-    A grid over the plane of the scan, in a tenth of the time of the triangles that `SurfaceMap.mesh` finds. Of a map
-    of more than `PATCHES_DRAWN` patches every k-th counts: time and memory grow with those that reach a point.
+    A grid over the plane of the scan, in a tenth of the time of the triangles that `SurfaceMap.mesh` finds.
     """
-    every = -(-len(surface_map) // PATCHES_DRAWN)
-    surface_map = surface_map if every == 1 else replace(surface_map, patches=surface_map.patches[::every])
     contacts = plane.mm(surface_map.points)
     low, high = contacts.min(axis=0)[:2] - 1e3 * REACH_M, contacts.max(axis=0)[:2] + 1e3 * REACH_M
     counts = np.ceil(MAP_POINTS * (high - low) / (high - low).max()).astype(int)

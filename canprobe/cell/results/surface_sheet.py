@@ -7,8 +7,8 @@ from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, Normalize
 
-from canprobe.cell.results.picture import GREY, INK, ORANGE, Part, box, drawn_rows, parts
-from canprobe.cell.results.surface_panels import MapView, add_sheet, map_surface, rejected, true_surface
+from canprobe.cell.results.picture import GREY, INK, Part, box, parts
+from canprobe.cell.results.surface_panels import MapView, add_sheet, map_surface, true_surface
 from canprobe.mechanics.touch.shapes import PlacedShape
 from canprobe.mechanics.types import Floats
 
@@ -18,25 +18,21 @@ def draw_map_surface(part: Part, view: MapView) -> None:
     part, scale = parts(part, 1, 2, width_ratios=(8, 1))
     axes = part.add_subplot(projection="3d", computed_zorder=False)
     plane = view.plane
-    shown = ["surface: recovered, as far as its patches reach", "line: path of the contact"]
+    shown, points = ["surface: recovered, as far as 4 mm from a contact"], view.map.points
+    if view.path is not None:
+        shown.append("line: path of the contact")
     if view.shape is not None:
         shown.append("light grey: true surface")
-        near = plane.mm(true_surface(view.shape, view.map.path, plane))
+        near = plane.mm(true_surface(view.shape, points, plane))
         axes.plot_surface(*np.moveaxis(near, 2, 0), color=GREY, alpha=0.25, linewidth=0, shade=True, zorder=1)
     points, sigma = map_surface(view.map, plane)
     values, what, colours = _values(points, sigma, view.shape)
     norm = _scale(values, signed=view.shape is not None)
     add_sheet(axes, plane.mm(points), colours.with_extremes(bad=GREY)(norm(np.ma.masked_invalid(values))), zorder=2)
-    axes.plot(
-        *plane.mm(view.map.path[drawn_rows(len(view.map.path))]).T, color=INK, linewidth=0.5, alpha=0.55, zorder=3
-    )
-    differ = rejected(view.consistency)
-    if differ.any():
-        shown.append("orange dots: passes differ, p < 0.05")
-        places = np.array([c.T_base_common[:3, 3] for c in view.consistency.crossings])[differ]
-        axes.plot(*plane.mm(places).T, "o", color=ORANGE, markersize=3.5, zorder=4)
+    if view.path is not None:
+        axes.plot(*plane.mm(view.path).T, color=INK, linewidth=0.5, alpha=0.55, zorder=3)
     labels = ("along the scan (mm)", "across (mm)", "outward (mm)")
-    box(part, axes, " · ".join(shown[:3]) + "\n" + " · ".join(shown[3:]), labels, elev=42, azim=-68)
+    box(part, axes, " · ".join(shown), labels, elev=42, azim=-68)
     scale.colorbar(ScalarMappable(norm, colours), cax=scale.subplots(), label=what)
 
 

@@ -110,9 +110,7 @@ def shape_lines(shape: dict[str, Any]) -> list[str]:
     lines = [f"  curvature  {estimated}; true {true}"]
     lines += method_lines(shape.get("methods", {}))
     if (surface := shape.get("map")) is not None:
-        lines.append(
-            f"  map        {surface['patches']} patches, {surface['crossings']} crossings" + _crossings(surface)
-        )
+        lines.append(f"  map        {_map_text(surface)}")
     return lines
 
 
@@ -134,11 +132,13 @@ def method_lines(methods: Mapping[str, Mapping[str, Any]]) -> list[str]:
     return lines
 
 
-def _crossings(surface: dict[str, Any]) -> str:
-    shares = (
-        f"{part} {100 * surface[part]['share_p_below_0.05']:.0f} %"
-        for part in ("curvature", "normal", "height")
-        if surface[part]["share_p_below_0.05"] is not None
+def _map_text(surface: Mapping[str, Any]) -> str:
+    """The section ``shape.map`` of a summary as text."""
+    if surface["sigma_um"] is None:
+        return f"{surface['contacts']} contacts, no surface"
+    off = surface["rms_error_um"]
+    return (
+        f"{surface['contacts']} contacts in {surface['nodes']} nodes, σ {surface['sigma_um']:.0f} µm"
+        + (f"; RMS error {off:.0f} µm" if off is not None else "")
+        + f"; contacts disagree on {100 * surface['disagree_fraction']:.0f} %"
     )
-    text = ", ".join(shares)
-    return f"; p below 0.05 of {text}" if text else ""

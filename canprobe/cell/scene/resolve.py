@@ -281,7 +281,7 @@ def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> T
     if settings.kind == "scan":
         scan = _scan(settings, arm)
         if (s := scene.shape) is not None:
-            shape = Shape(s.method, s.also, s.memory_mm * MM, s.every_ms * 1e-3, s.patch)
+            shape = Shape(s.method, s.also, s.memory_mm * MM, s.every_ms * 1e-3, s.patch, s.revisit)
     gains = SurfaceGains(servo.surface_height_hz, servo.surface_tilt_hz)
     return Touch(**touching, gains=gains, scan=scan, shape=shape)
 

@@ -240,6 +240,7 @@ class Shape:
         memory: length of path on which an estimate rests, m, whatever the time.
         every_s: time between two answers; every sample is taken in.
         patch: complete what the path leaves open by the second moments of the images.
+        revisit: join the answers with a map of earlier passes over the same ground.
     """
 
     method: ShapeMethod
@@ -247,6 +248,7 @@ class Shape:
     memory: float
     every_s: float
     patch: bool
+    revisit: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)

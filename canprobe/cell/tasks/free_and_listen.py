@@ -64,6 +64,11 @@ class ListenTask(Task):
         self.taxels: NDArray[np.uint8] | None = None
         self._columns: dict[str, float | Floats] = {}
 
+    @property
+    def reader(self) -> PatchReader:
+        """The reader of its samples."""
+        return self._reader
+
     def record(self) -> TaskRecord:
         """The results so far."""
         return TaskRecord(taxels=self.taxels)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from array import array
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,6 +14,7 @@ if TYPE_CHECKING:
     from canprobe.mechanics.touch.contact import ContactSample
     from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
     from canprobe.mechanics.touch.estimate.online import Estimator
+    from canprobe.mechanics.touch.map.surface_map import SurfaceMap
 
 
 GAP_S = 0.1
@@ -22,6 +22,8 @@ GAP_S = 0.1
 SAMPLES_KEPT, RECORDS_KEPT = 40_000, 10_000
 """Contacts that a tracker keeps, the last ones, and answers, evenly over the scan: 200 s and 400 s of a scan with an
 array of 200 Hz and an answer every 40 ms. A longer scan takes no more memory, and no more time at its end."""
+MAPPED_AT_ONCE = 16
+"""Contacts that the map takes at once, in a cycle of some tens of ms: 0.3 ms, half of what they cost one by one."""
 MAX_CURVATURE = 1e3
 """Largest curvature of an answer, 1/m: no pad measures a ball of 1 mm, so an answer beyond it has diverged."""
 
@@ -54,25 +56,28 @@ class ShapeTracker:
     Args:
         estimator: the online estimator.
         every: samples between two answers.
+        surface_map: map that takes the contacts, too; None: none.
 
     Attributes:
         records: the answers; of more than `RECORDS_KEPT` every second, every fourth and so on.
         samples: the contacts; of more than `SAMPLES_KEPT` the last ones.
-        path: coordinates x, y, z of every contact that is finite, m, in base.
         travelled_m: path of the contact, m.
         restarts: how often the estimator diverged and started afresh.
         withheld: answers that could not be computed: of a matrix that is singular or not definite.
+        doubted: whether the calibration is another array's, so that answers are `widened`.
     """
 
-    def __init__(self, estimator: Estimator, every: int) -> None:
+    def __init__(self, estimator: Estimator, every: int, surface_map: SurfaceMap | None = None) -> None:
         self.records: list[ShapeRecord] = []
         self.samples: deque[ContactSample] = deque(maxlen=SAMPLES_KEPT)
-        self.path = array("d")
         self.travelled_m = 0.0
         self.restarts = self.withheld = 0
+        self.doubted = False
         self._estimator = estimator
         self._every = max(1, every)
+        self._map = surface_map
         self._waiting: list[ContactSample] = []
+        self._unmapped: list[ContactSample] = []
         self._added = self._taken = self._answers = 0
         self._record_stride = 1
         self._found: tuple[SurfaceEstimate, float] | None = None
@@ -90,8 +95,6 @@ class ShapeTracker:
                 self.travelled_m += math.dist(sample.p_base.tolist(), last.p_base.tolist())
         self._added += 1
         self.samples.append(sample)
-        if all(map(math.isfinite, place := sample.p_base.tolist())):
-            self.path.extend(place)
         self._waiting.append(sample)
 
     def work(self) -> SurfaceEstimate | None:
@@ -107,8 +110,23 @@ class ShapeTracker:
                 self._start_afresh()
             if self._taken % self._every == 0:
                 self._answer_at(sample.t_s)
+        if self._map is not None:
+            self._unmapped += [sample for sample in self._waiting if np.isfinite(sample.p_base).all()]
+            if len(self._unmapped) >= MAPPED_AT_ONCE:
+                self._extend_map()
         self._waiting.clear()
         return None if self._found is None else self._found[0]
+
+    @property
+    def surface_map(self) -> SurfaceMap | None:
+        """The map with every contact that was worked on."""
+        self._extend_map()
+        return self._map
+
+    def _extend_map(self) -> None:
+        if self._map is not None:
+            self._map.add_samples(self._unmapped)
+        self._unmapped.clear()
 
     def answer(self, t_s: float) -> SurfaceEstimate | None:
         """The estimate, once, that has been found since it was last asked for.
@@ -151,6 +169,10 @@ class ShapeTracker:
         if has_diverged(estimate):
             self._start_afresh()
             return
+        if self.doubted:
+            from canprobe.mechanics.touch.estimate.widened import widened  # only where a shape is asked for
+
+            estimate = widened(estimate)
         self._found = estimate, at_s
 
     def _start_afresh(self) -> None:

@@ -9,7 +9,6 @@ from canprobe.errors import InterfaceError
 from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.joined import wait_for_any
 from canprobe.fieldbus.bus.port import Port, TimedFrame
-from canprobe.fieldbus.bus.real.memory import garbage_collection_paused
 from canprobe.fieldbus.bus.virtual.lockstep import Attachment, LockstepBus, Participant
 from canprobe.fieldbus.protocol.frames import SYNC_ID, Frame
 
@@ -154,7 +153,8 @@ def serve(
 ) -> None:
     """Power on the nodes and serve them until `stop()` is true.
 
-    Nodes hear what is on their own bus. All of them may share one plant: they work one after the other.
+    Nodes hear what is on their own bus. All of them may share one plant: they work one after the other. A process that
+    only serves does better with `garbage_collection_paused` round it.
 
     Args:
         buses: participants, for example `SlaveNode`s, and port of each bus; the participants live on the ports' clock.
@@ -164,18 +164,16 @@ def serve(
     Raises:
         InterfaceError: an interface is down or lost, unless the nodes outlast it.
     """
-    ports = [port for _, port in buses]
-    clock = ports[0].clock
-    with garbage_collection_paused():
-        now_ns = clock.now_ns()
-        served = [_Served(nodes, port, now_ns) for nodes, port in buses]
-        while not stop():
-            try:
-                now_ns = _turn(served, now_ns)
-            except InterfaceError:
-                if not outlasts:
-                    raise
-                clock.sleep_until_ns(clock.now_ns() + _DOWN_NS)
+    clock = buses[0][1].clock
+    now_ns = clock.now_ns()
+    served = [_Served(nodes, port, now_ns) for nodes, port in buses]
+    while not stop():
+        try:
+            now_ns = _turn(served, now_ns)
+        except InterfaceError:
+            if not outlasts:
+                raise
+            clock.sleep_until_ns(clock.now_ns() + _DOWN_NS)
 
 
 def _turn(served: Sequence[_Served], now_ns: int) -> int:

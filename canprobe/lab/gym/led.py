@@ -57,7 +57,9 @@ class LedTask(TouchTask):
     def __init__(self, plan: Plan) -> None:
         task = plan.setup.task
         assert isinstance(task, Touch) and task.scan is not None
-        super().__init__(plan, replace(task, duration_s=math.inf), make_sensing(task), make_shape_tracker(plan.setup))
+        super().__init__(
+            plan, replace(task, duration_s=math.inf), make_sensing(task), make_shape_tracker(plan.setup, with_map=False)
+        )
         self.axes: Floats = np.asarray(task.approach.axes, dtype=float)
         self.start: Floats = np.asarray(task.approach.start, dtype=float)
         self.wanted_force = task.force

@@ -1,8 +1,9 @@
 """Pure mathematics of touch: from a tactile image to the local shape of the object, and the servo that follows it.
 
-    image ─► Patch, moments ─► ContactSample ─► estimator ─► SurfaceEstimate ─► LocalPatch ─► SurfaceMap ─► Consistency
-       patch/image, moments     contact          estimate/    estimate/answer      surface_map            consistency
-                                   └──────────────────────────────► servo ◄─ curvature
+    image ─► Patch, moments ─► ContactSample ─┬► estimator ─► SurfaceEstimate ─► curvature ─► servo
+       patch/image, moments     contact       │   estimate/   estimate/answer
+                                              └► SurfaceMap ─► Mesh
+                                                  map/         meshing
 
 Reading a touch:
 
@@ -17,9 +18,7 @@ Shape:
     surface           second-order surfaces in one gauge: XᵀSX = 0 with S symmetric (4, 4), f < 0 inside
     estimate/         local shape from contacts, online and in batches, with what was not observed
     map/              one surface from all contacts of a scan, with its uncertainty
-    surface_map       a whole scan as local patches
-    blend, meshing    one surface of those patches, and triangles of it
-    crossings         a χ² test where a path crosses itself; `consistency` gives one verdict on all crossings
+    meshing           triangles of any surface that gives the closest point to a place
     linear_algebra, tangent_frames   small matrices, input checks, frames on a tangent plane
 
 Motion:

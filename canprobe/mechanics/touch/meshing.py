@@ -1,4 +1,4 @@
-"""Triangles of any surface that gives the closest point to a place: maps of patches, and implicit surfaces.
+"""Triangles of any surface that gives the closest point to a place: maps, and implicit surfaces.
 
 A cubic lattice is searched cell by cell outward from seeds, so that only cells near the surface are evaluated. A cell
 with corners inside and outside the body holds one vertex; it starts at the mean of the crossings of the cell's edges
@@ -14,13 +14,32 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.errors import ResultsError, UsageError
-from canprobe.mechanics.touch.blend import Feet
 from canprobe.mechanics.types import Floats
+
+
+class Feet(NamedTuple):
+    """A surface as seen from n points; NaN where it does not reach.
+
+    Attributes:
+        point: (n, 3) closest points of the surface, m.
+        normal: (n, 3) outward unit normals there.
+        height: (n,) signed distances of the query points from the surface, m, positive outside.
+        sigma: (n,) standard deviations of the surface's height, m; NaN where they are not known.
+        pieces: (n,) numbers of local fits that were blended.
+    """
+
+    point: Floats
+    normal: Floats
+    height: Floats
+    sigma: Floats
+    pieces: NDArray[np.intp]
+
 
 Field = Callable[[Floats], Feet]
 """Points (n, 3) → closest points of a surface, NaN where it is not defined."""

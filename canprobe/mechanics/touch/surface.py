@@ -2,7 +2,7 @@
 
 f < 0 inside the body. A contact frame has its origin on the surface and **z along the inward normal**. S and any
 positive multiple of it are the same surface; in its own contact frame a surface is normalised to
-`c14 = c24 = c44 = 0, c34 = -1/2`, so that |∇f| = 1 there and `K = 2 [[c11, c12], [c12, c22]]` is its shape operator:
+`c14 = c24 = c44 = 0, c34 = -1/2`, so that ‖∇f‖ = 1 there and `K = 2 [[c11, c12], [c12, c22]]` is its shape operator:
 principal curvatures are positive where the body is convex.
 
 Source: Chen, Rink and Zhang, "Local object shape from tactile sensing", (1)–(12). (2) lacks a factor 2 on `c34 z`.
@@ -27,7 +27,7 @@ class SurfaceMatrix:
     """A quadric surface in some frame.
 
     Attributes:
-        S: (4, 4) symmetric, read-only; entries of the quadratic part in 1/m when |∇f| = 1.
+        S: (4, 4) symmetric, read-only; entries of the quadratic part in 1/m when ‖∇f‖ = 1.
 
     Raises:
         UsageError: when S is not a finite symmetric 4x4 matrix.
@@ -139,7 +139,7 @@ class SurfaceMatrix:
         return result
 
     def normalised_at(self, point: ArrayLike) -> SurfaceMatrix:
-        """The same surface scaled to |∇f| = 1 at a point (3,).
+        """The same surface scaled to ‖∇f‖ = 1 at a point (3,).
 
         Raises:
             UsageError: where the gradient vanishes.

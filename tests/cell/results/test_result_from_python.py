@@ -78,17 +78,6 @@ def test_fit_surface_takes_them(result):
     np.testing.assert_allclose(fitted.kappa, [1 / 0.036, 0.0], atol=0.5)
 
 
-def test_the_map_of_its_contacts_is_the_true_object(result):
-    found = result.contact_map()
-    rows = np.searchsorted(result.truth["t_s"], result.contacts.t_s[::20] - 1e-6)
-    true = result.truth["contact_point_m"][rows]
-    height, sigma = found.distance(true)
-    assert np.sqrt(np.mean(height**2)) < 30e-6
-    assert np.mean(np.abs(height) < 3.0 * sigma) > 0.95
-    with pytest.raises(UsageError, match="contact_map: expected a scan"):
-        canprobe.run("press", duration_s=0.1, bus="direct", files=False).contact_map()
-
-
 def test_an_own_estimator_stands_beside_ours(result):
     scores = result.score(sphere=LastSphere)
     assert list(scores) == ["recursive", "ml", "sphere"] and LastSphere.made == 1

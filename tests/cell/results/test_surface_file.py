@@ -1,57 +1,75 @@
 """Surface maps as files: what is written is read back bit by bit, and nothing else is read."""
 
+import math
+
 import numpy as np
 import pytest
 
 import canprobe
 from canprobe.cell.results.surface_file import FORMAT_VERSION, load_surface_map, save_surface_map
 from canprobe.errors import UsageError
-from canprobe.mechanics.touch.estimate.fit import fit_surface
-from canprobe.mechanics.touch.surface_map import LocalPatch, SurfaceMap
+from canprobe.mechanics.touch.map import nodes
+from canprobe.mechanics.touch.map.fit import fit_map
+from canprobe.mechanics.touch.map.local_fits import PadLayer
+from canprobe.mechanics.touch.map.noise import PAD_NOISE
+from canprobe.mechanics.touch.map.stiffness import Stiffness
+from canprobe.mechanics.touch.map.surface_map import SurfaceMap
+
+PLACES = np.array([[1e-3, 2e-3, 0.0], [-3e-3, 1e-3, 0.1e-3]])
 
 
 @pytest.fixture(scope="module")
 def surface_map():
-    """Patches of three kinds: all observed, two of three combinations, and from a method without pose."""
+    """A pad over a plane, some of its contacts without an image, and a layer softer than stated."""
     rng = np.random.default_rng(0)
-    u, v = rng.uniform(-8e-3, 8e-3, (2, 80))
-    patches = []
-    for i, (across, method) in enumerate(((v, "ml"), (0 * v, "ml"), (v, "chord"))):
-        normals = np.stack([u, across, np.full_like(u, 0.05)], axis=1)
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        points = 0.05 * normals + 1e-5 * rng.normal(size=normals.shape)
-        estimate = fit_surface(points, normals, sigma_point=2e-5, sigma_normal=1e-3, method=method)
-        patches.append(LocalPatch.of(estimate, t_s=0.1 * i, travelled_m=2e-3 * i))
-    assert [patch.rank for patch in patches] == [3, 2, 3]
-    return SurfaceMap(patches=tuple(patches), path=rng.normal(size=(7, 3)), method="ml")
+    x, y = np.linspace(-8e-3, 8e-3, 120), np.array([-2e-3, 0.0, 2e-3])
+    points = np.array([[a, b, 0.0] for b in y for a in x]) + 2e-5 * rng.normal(size=(360, 3))
+    made = SurfaceMap(PadLayer(0.04, 1.2e8), PAD_NOISE)
+    made.add(points, [[0.0, 0.0, 1.0]] * 360, np.full(360, 2.0))
+    rows = made.nodes.rows
+    rows[::3, nodes.PATCH] = 2e-5
+    return SurfaceMap.of_nodes(rows, made.pad, made.noise, Stiffness(1.0e8, 0.03))
 
 
 def test_what_is_written_is_read_back(surface_map, tmp_path):
     path = tmp_path / "some.map"
     save_surface_map(surface_map, path)
     assert [file.name for file in tmp_path.iterdir()] == ["some.map"]
-    assert canprobe.load_surface_map(path).equals(surface_map)
+    again = canprobe.load_surface_map(path)
+    np.testing.assert_array_equal(again.nodes.rows, surface_map.nodes.rows)
+    for name in ("pad", "noise", "stiffness"):
+        assert getattr(again, name) == getattr(surface_map, name)
+    np.testing.assert_array_equal(again.distance(PLACES), surface_map.distance(PLACES))
+    np.testing.assert_array_equal(again.curvature(PLACES).covariance, surface_map.curvature(PLACES).covariance)
 
 
-def test_an_empty_map_is_a_map(tmp_path):
-    empty = SurfaceMap(patches=(), path=np.zeros((0, 3)))
-    save_surface_map(empty, tmp_path / "surface.npz")
-    assert load_surface_map(tmp_path).equals(empty)  # the folder of a run will do
-
-
-def test_a_difference_is_seen(surface_map, tmp_path):
+def test_a_map_that_was_read_takes_more_contacts(surface_map, tmp_path):
     save_surface_map(surface_map, tmp_path / "a.npz")
-    _rewrite(tmp_path / "a.npz", innovation=lambda column: column + np.array([0.0, 0.0, 1e-15]))
-    assert not load_surface_map(tmp_path / "a.npz").equals(surface_map)
+    again = load_surface_map(tmp_path / "a.npz")
+    again.add([[0.02, 0.0, 0.0]], [[0.0, 0.0, 1.0]], [2.0])
+    assert len(again) == len(surface_map) + 1
+    assert np.isfinite(again.distance([[0.02, 0.0, 0.0]])).all()
+    again.add(surface_map.points[5:6], [[0.0, 0.0, 1.0]], [2.0])
+    again.add([[0.04, 0.0, 0.0]], [[0.0, 0.0, 1.0]], [2.0])
+    assert len(again) == len(surface_map) + 2  # ground that the file knew before is averaged
+
+
+def test_a_map_of_points_and_one_of_nothing_are_maps(tmp_path):
+    points = fit_map(PLACES, [[0.0, 0.0, 1.0]] * 2, sigma_normal=math.inf)
+    save_surface_map(points, tmp_path / "points.npz")
+    again = load_surface_map(tmp_path / "points.npz")
+    assert (again.pad, again.stiffness, again.noise) == (None, None, points.noise)
+    save_surface_map(SurfaceMap(None, PAD_NOISE), tmp_path / "surface.npz")
+    assert len(load_surface_map(tmp_path)) == 0  # the folder of a run will do
 
 
 def test_columns_can_be_read_without_canprobe(surface_map, tmp_path):
     save_surface_map(surface_map, tmp_path / "a.npz")
     with np.load(tmp_path / "a.npz", allow_pickle=False) as columns:
         assert int(columns["format_version"]) == FORMAT_VERSION
-        assert columns["T_base_contact_m"].shape == (3, 4, 4)
-        np.testing.assert_array_equal(columns["S_per_m"][1], surface_map.patches[1].S)
-        assert np.isnan(columns["combinations"][1, 2]).all()
+        assert columns["contacts"].sum() == 360
+        np.testing.assert_array_equal(columns["centre_m"], surface_map.nodes.rows[:, nodes.CENTRE])
+        assert np.isnan(columns["patch_m2"][1])
 
 
 def _rewrite(path, **changes):
@@ -69,21 +87,23 @@ def _rewrite(path, **changes):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"format_version": lambda _: 2}, "expected format_version 1, got 2"),
-        ({"format_version": None}, "without 'format_version'"),
-        ({"S_per_m": None, "t_s": None}, "missing t_s, S_per_m"),
-        ({"colour": lambda _: np.zeros(3)}, "unknown colour; expected format_version, method"),
         (
-            {"S_per_m": lambda c: c[:, :3]},
-            r"S_per_m: expected float64 of shape \(3, 4, 4\), got float64 of \(3, 3, 4\)",
+            {"format_version": lambda _: 1},
+            r'expected format_version 2, got 1 of another canprobe; .*canprobe\.replay\(".*"\)\.surface_map',
         ),
-        ({"t_s": lambda c: c[:2]}, r"expected float64 of shape \(2"),
-        ({"t_s": lambda _: np.array(1.0)}, r"t_s: expected float64 of shape \(0,\), got float64 of \(\)"),
-        ({"path_m": lambda c: c.astype(np.float32)}, "path_m: expected float64 .* got float32"),
-        ({"S_covariance_si": lambda c: c * [[[np.nan]]]}, "patch 0: S_covariance: expected finite numbers"),
-        ({"travelled_m": lambda c: c[::-1]}, r"patches\[1\].travelled_m: expected at least"),
-        ({"method": lambda _: np.array([1.0])}, "method: expected a name, got float64"),
-        ({"method": lambda _: np.array({"a": 1}, dtype=object)}, "cannot be read: method.npy holds Python objects"),
+        ({"format_version": None}, "without 'format_version'"),
+        ({"normal": None, "path_m": None}, "missing normal, path_m"),
+        ({"colour": lambda _: np.zeros(3)}, "unknown colour; expected format_version, pad_radius_m"),
+        ({"pad_axes": lambda c: c[:, :2]}, r"pad_axes: expected float64 of shape \(\d+, 3, 3\), got float64"),
+        ({"contacts": lambda c: c[:2]}, r"expected float64 of shape \(2"),
+        ({"contacts": lambda _: np.array(1.0)}, r"expected float64 of shape \(0"),
+        ({"heading": lambda c: c.astype(np.float32)}, "heading: expected float64 .* got float32"),
+        ({"centre_m": lambda c: c * np.nan}, "centre_m: expected finite numbers, got nan"),
+        ({"normal": lambda c: 2.0 * c}, "normal: expected unit vectors"),
+        ({"contacts": lambda c: 0.0 * c}, "contacts: expected numbers above 0, got 0"),
+        ({"lateral_variance_m2": lambda c: c * np.inf}, "lateral_variance_m2: expected numbers above 0, got inf"),
+        ({"stiffness_n_m3": lambda c: -c}, "stiffness_n_m3: expected numbers above 0, or NaN"),
+        ({"heading": lambda _: np.array({"a": 1}, dtype=object)}, "cannot be read: heading.npy holds Python objects"),
     ],
 )
 def test_wrong_files_are_refused(surface_map, tmp_path, changes, message):

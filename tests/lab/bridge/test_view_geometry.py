@@ -10,14 +10,13 @@ from puma_arm import MODELS
 
 from canprobe.cell.plant.pressure import pad_coordinates
 from canprobe.cell.scene.load import read_cell
-from canprobe.lab.bridge.sample import SurfacePatch
+from canprobe.lab.bridge.sample import ContactFrame
 from canprobe.lab.bridge.view import array_dome as taxels
 from canprobe.lab.bridge.view import bodies as arm
 from canprobe.lab.bridge.view import colours, meshes
 from canprobe.lab.bridge.view import object_sheet as objects
-from canprobe.lab.bridge.view.instants import judge
 from canprobe.lab.bridge.view.path import deviation_scale
-from canprobe.lab.bridge.view.surface import BlendedSurface
+from canprobe.lab.bridge.view.surface import LIFT_M, GrowingSurface
 from canprobe.mechanics.robot.chain import forward, posture
 from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
 from canprobe.mechanics.touch.objects import OBJECT_PARAMETERS, make_object
@@ -230,35 +229,38 @@ def test_ghosts_lie_on_the_exact_surface_with_their_front_outside(name):
 # the recovered surface
 
 
-def answer(direction, sigma, radius=0.05):
-    """What is stated of a ball in a direction from its centre."""
-    T = homogeneous(tangent_rotation(-np.array(direction)), radius * np.array(direction))
-    covariance = (
-        np.diag(sigma**2 * np.array([1 / 3, 1 / 6, 1 / 3])) if math.isfinite(sigma) else np.full((3, 3), math.inf)
-    )
-    return judge(SurfacePatch(0, T, np.eye(2) / radius, covariance, (True, True)), None)
-
-
-def ring(angles, sigma):
-    return [answer((math.sin(a), 0.0, math.cos(a)), sigma) for a in angles]
+def touched(angles, radius=0.05):
+    """Contacts on a ball about the origin, three passes 2 mm apart."""
+    for side in (-0.04, 0.0, 0.04):
+        for a in angles:
+            n = np.array([math.sin(a), side, math.cos(a)]) / math.hypot(1.0, side)
+            yield ContactFrame(homogeneous(tangent_rotation(-n), radius * n))
 
 
 def test_the_recovered_surface_lies_on_the_ball_and_has_the_colours_of_what_is_known():
-    scale = deviation_scale(None)
-    surface = BlendedSurface(scale)
-    for one in ring(np.arange(-0.5, 0.5, 0.05), sigma=1.0):
-        assert surface.add(one)
-    mesh, rgb = surface.mesh()
-    assert np.linalg.norm(mesh.vertices, axis=1) == pytest.approx(0.05, abs=2e-6)
-    assert np.ptp(np.arctan2(mesh.vertices[:, 0], mesh.vertices[:, 2])) == pytest.approx(1.08, abs=0.06)
-    assert (rgb == scale.colours(np.ones(1))).all()
+    class Scene:
+        def __init__(self):
+            self.solids = []
 
+        def add_mesh_trimesh(self, name, solid, **_):
+            self.solids.append((name, solid))
 
-def test_of_two_answers_at_one_place_the_better_known_one_is_drawn():
-    surface = BlendedSurface(deviation_scale(None))
-    answers = (*ring([0.0], 1.0), *ring([0.01], 1.5), *ring([0.01], 0.5))
-    assert [surface.add(one) for one in answers] == [True, False, True]
-    assert not surface.add(answer((0.0, 0.0, 1.0), math.inf))
+    scene, scale = Scene(), deviation_scale(None)
+    surface = GrowingSurface(scene, scale, 0.04)
+    surface.refresh()
+    assert not scene.solids  # nothing was touched
+    for angles in (np.arange(-0.5, 0.0, 0.005), np.arange(0.0, 0.5, 0.005)):
+        for one in touched(angles):
+            surface.add(one)
+        surface.refresh()
+    surface.refresh()  # nothing new: nothing is sent
+    (_, half), (name, solid) = scene.solids
+    assert name == "/surface"
+    assert np.linalg.norm(solid.vertices, axis=1) == pytest.approx(0.05 + LIFT_M, abs=10e-6)
+    assert np.ptp(np.arctan2(solid.vertices[:, 0], solid.vertices[:, 2])) == pytest.approx(1.14, abs=0.06)
+    assert half.area < 0.6 * solid.area
+    known = (solid.visual.vertex_colors[:, :3] != scale.colours(np.array([math.inf]))).any(axis=1)
+    assert known.mean() > 0.9  # three passes show both curvatures
 
 
 # colours

@@ -10,8 +10,10 @@ from scipy.stats import multivariate_normal
 
 from canprobe.cli import main
 from canprobe.lab.studies.harness import Column
+from canprobe.lab.studies.shapes import revisits
 from canprobe.lab.studies.shapes.implicit import ImplicitSurface, Touched, fit_quadric, rbf, thin_plate
-from canprobe.lab.studies.shapes.methods import METHODS, MapSurface, ProcessSurface
+from canprobe.lab.studies.shapes.methods import METHODS, ProcessSurface
+from canprobe.lab.studies.shapes.patches import LocalPatch, PatchSurface
 from canprobe.lab.studies.shapes.scans import (
     DEVELOPMENT,
     TEST,
@@ -29,7 +31,6 @@ from canprobe.mechanics.touch.contact import ContactSample, Doubt, Slope
 from canprobe.mechanics.touch.meshing import mesh_of
 from canprobe.mechanics.touch.objects import Sphere, Torus
 from canprobe.mechanics.touch.surface import SurfaceMatrix
-from canprobe.mechanics.touch.surface_map import LocalPatch, SurfaceMap
 
 RADIUS = 0.05
 KERNELS = pytest.mark.parametrize(("kernel", "length"), [(rbf, 0.03), (thin_plate, 0.1)])
@@ -118,32 +119,26 @@ def test_a_local_fit_has_the_error_that_it_states():
     assert fit_quadric(np.zeros(3), np.array([0.0, 0.0, 1.0]), on_ball(1)) is None
 
 
-def ball_map(lift=0.0, sigma=1e-5):
+def ball_patches(lift=0.0, sigma=1e-5):
     """Exact patches over the top of a ball, all lifted by as much."""
     surface = SurfaceMatrix.sphere(RADIUS).transformed(np.diag([1.0, -1.0, -1.0, 1.0]))
     patches = []
-    for i, (x, y) in enumerate(np.stack(np.meshgrid(*2 * [np.arange(-8e-3, 8.1e-3, 2e-3)]), -1).reshape(-1, 2)):
+    for x, y in np.stack(np.meshgrid(*2 * [np.arange(-8e-3, 8.1e-3, 2e-3)]), -1).reshape(-1, 2):
         T = surface.contact_frame(surface.project([x, y, 0.0]))
         T[:3, 3] -= lift * T[:3, 2]
         P = np.diag([1e-14, 1e-14, sigma**2, *6 * [1e-6]])
-        patches.append(
-            LocalPatch(
-                T_base_contact=T, S=SurfaceMatrix.sphere(RADIUS).S, K_covariance=np.eye(3), S_covariance=P,
-                pose_known=True, observed=[1, 1], combinations=np.eye(3), t_s=i, travelled_m=i, distance_m=0.0,
-                innovation=1.0,
-            )
-        )  # fmt: skip
-    return SurfaceMap(patches=tuple(patches), path=np.array([p.point for p in patches]))
+        patches.append(LocalPatch(T, SurfaceMatrix.sphere(RADIUS).S, P))
+    return patches
 
 
-def score_of(surface_map, truth):
-    surface = MapSurface(surface_map)
-    return scored(surface, mesh_of(surface.closest, surface_map.points, 1e-3), truth)
+def score_of(patches, truth):
+    surface = PatchSurface(patches)
+    return scored(surface, mesh_of(surface.closest, surface.points, 1e-3), truth)
 
 
 def test_surfaces_that_are_known_have_the_scores_that_they_must():
-    exact = ball_map()
-    truth = truth_under(Sphere(np.eye(4), RADIUS), np.repeat(exact.points, 4, axis=0))
+    exact = ball_patches()
+    truth = truth_under(Sphere(np.eye(4), RADIUS), np.repeat(PatchSurface(exact).points, 4, axis=0))
     assert not truth["truth_edge"].any()
     best = score_of(exact, truth)
     assert best["accuracy_um"] < 0.1
@@ -153,16 +148,16 @@ def test_surfaces_that_are_known_have_the_scores_that_they_must():
     assert best["nll"] == pytest.approx(math.log(0.01 * math.sqrt(2 * math.pi)), abs=0.05)
     assert best["normal_mrad"] < 0.01
     assert best["curvature_per_m"] < 2.0  # of the nearest patch: its normal is turned by up to 30 mrad
-    high = score_of(ball_map(lift=0.15e-3), truth)
+    high = score_of(ball_patches(lift=0.15e-3), truth)
     assert high["accuracy_um"] == pytest.approx(150, rel=0.01)
     assert high["completeness_um"] == pytest.approx(150, rel=0.01)
     assert [high[f"f_{mm:g}mm"] for mm in (0.05, 0.1, 0.2, 0.5)] == [0.0, 0.0, 1.0, 1.0]
     assert high["coverage"] == 0.0
-    half = score_of(SurfaceMap(patches=exact.patches[:45], path=exact.path), truth)
+    half = score_of(exact[:45], truth)
     assert half["accuracy_um"] < 0.1  # what is there is right,
     assert 0.2 < half["missed"] < 0.5
     assert half["completeness_um"] == pytest.approx(1e3 * half["missed"], rel=0.01)  # and what is not there counts
-    nothing = score_of(SurfaceMap(patches=(), path=exact.path), truth)
+    nothing = score_of([], truth)
     assert (nothing["f_0.5mm"], nothing["missed"], nothing["nll"]) == (0.0, 1.0, None)
 
 
@@ -221,6 +216,16 @@ def test_the_words_name_what_is_better():
     assert (apart["nll_over_map_low"], apart["nll_over_map_high"]) == (1.0, 1.0)
 
 
+def test_the_words_on_revisits_name_the_least_good(tmp_path):
+    row = {"shape": "a", "share": 0.4, "own_per_m": 1.0, "joined_per_m": 0.5, "own_coverage": 1.0}
+    rows = [row | {"joined_coverage": 0.9}, row | {"shape": "b", "joined_per_m": 2.0, "joined_coverage": 0.8}]
+    (said,) = revisits.findings([*rows, {"shape": "c", "share": 0.0, "own_per_m": None}])
+    assert "has 1.00 of its own error of K" in said and "better on 1, the least good is b: 1.00 and 2.00" in said
+    assert "100% and 85%" in said
+    revisits.draw(rows, tmp_path / "a.png")
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+
+
 def test_a_draw_is_repeated_and_like_no_other(tmp_path):
     assert len(drawn(7)) == len(TEST)
     for name, other in zip(drawn(7), drawn(8), strict=True):
@@ -242,6 +247,8 @@ def test_a_short_run_of_every_method(tmp_path, capsys):
     later = json.loads((tmp_path / "shapes_after.json").read_text())
     assert {row["method"] for row in later["rows"]} == {method.name for method in METHODS}
     assert {"accuracy_um_over_map", "nll_over_map_high"} <= set(document["rows"][1])
+    (back,) = json.loads((tmp_path / "shapes_revisits.json").read_text())["rows"]
+    assert (back["share"], back["own_per_m"]) == (0.0, None)  # 30 mm: it came back to nothing
     digest = hashlib.sha256((tmp_path / "contacts.npz").read_bytes()).hexdigest()
     assert document["facts"]["contacts"] == digest[:16]
     assert (tmp_path / "shapes.png").stat().st_size > 10_000

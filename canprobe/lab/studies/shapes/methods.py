@@ -16,14 +16,14 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
-from canprobe.cell.tasks.from_plan import make_contact_map, make_shape_estimator
+from canprobe.cell.tasks.from_plan import make_shape_estimator, make_surface_map
 from canprobe.cell.tasks.shape import replay_samples
 from canprobe.lab.studies.shapes.contacts_file import ShapeContacts
 from canprobe.lab.studies.shapes.implicit import ImplicitSurface, Kernel, fit_quadric, rbf, thin_plate
-from canprobe.mechanics.touch.blend import REACH_M, Feet
-from canprobe.mechanics.touch.map.contact_map import ContactMap
+from canprobe.lab.studies.shapes.patches import SPACING_M, LocalPatch, PatchSurface, patch_of, spaced
+from canprobe.mechanics.touch.map.surface_map import REACH_M, SurfaceMap
+from canprobe.mechanics.touch.meshing import Feet
 from canprobe.mechanics.touch.surface import SurfaceMatrix
-from canprobe.mechanics.touch.surface_map import SPACING_M, LocalPatch, SurfaceMap, merge_patches
 from canprobe.mechanics.types import Floats
 
 Settings = Mapping[str, float]
@@ -66,31 +66,6 @@ class Method(Protocol):
         """The surface of a shape."""
 
 
-class MapSurface:
-    """The surface of a map of patches; its curvature is that of the nearest patch."""
-
-    def __init__(self, surface_map: SurfaceMap) -> None:
-        self.map = surface_map
-
-    def closest(self, points: Floats) -> Feet:
-        """See `FittedSurface`."""
-        return self.map.closest(points)
-
-    def sigma(self, points: Floats) -> Floats:
-        """See `FittedSurface`."""
-        return self.map.distance(points)[1]
-
-    def curvature(self, points: Floats) -> Floats:
-        """See `FittedSurface`."""
-        if not len(self.map):
-            return np.full((len(points), 3, 3), math.nan)
-        apart, nearest = cKDTree(self.map.points).query(points)
-        P = np.array([patch.T_base_contact[:3, :2] for patch in self.map])
-        K = np.array([2.0 * patch.S[:2, :2] for patch in self.map])
-        tensors = P @ K @ P.transpose(0, 2, 1)
-        return np.where(np.less(apart, REACH_M)[:, None, None], tensors[nearest], math.nan)
-
-
 @dataclass(frozen=True, slots=True)
 class Online:
     """An estimator of the package along the path, as it runs in the loop; its answers every 2 mm make a map."""
@@ -109,7 +84,7 @@ class Online:
         """Set nothing: the packaged estimator is used."""
         return {}
 
-    def fit(self, contacts: ShapeContacts, budget: float, settings: Settings) -> MapSurface:
+    def fit(self, contacts: ShapeContacts, budget: float, settings: Settings) -> PatchSurface:
         """See `Method`."""
         task = contacts.task
         assert task.shape is not None
@@ -117,15 +92,14 @@ class Online:
         assert task.scan is not None
         every = max(1, round(SPACING_M / task.scan.speed * task.array.rate_hz))
         records = replay_samples(make_shape_estimator(task, self.method), contacts.samples, every)
-        patches = [LocalPatch.of(r.estimate, t_s=r.t_s, travelled_m=r.travelled_m) for r in records]
-        return MapSurface(merge_patches(patches, contacts.touched.points, method=self.name))
+        return PatchSurface([patch_of(record.estimate) for record in spaced(records)])
 
 
-class ContactMapSurface:
+class MapSurface:
     """The surface of a map of all contacts."""
 
-    def __init__(self, contact_map: ContactMap) -> None:
-        self.map = contact_map
+    def __init__(self, surface_map: SurfaceMap) -> None:
+        self.map = surface_map
 
     def closest(self, points: Floats) -> Feet:
         """See `FittedSurface`."""
@@ -152,11 +126,11 @@ class WholeMap:
         """Set nothing: its settings were found on the development shapes before."""
         return {}
 
-    def fit(self, contacts: ShapeContacts, budget: float, settings: Settings) -> ContactMapSurface:
+    def fit(self, contacts: ShapeContacts, budget: float, settings: Settings) -> MapSurface:
         """See `Method`."""
-        found = make_contact_map(contacts.task)
+        found = make_surface_map(contacts.task)
         found.add_samples(contacts.samples)
-        return ContactMapSurface(found)
+        return MapSurface(found)
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +145,7 @@ class LocalFits:
         """Set nothing."""
         return {}
 
-    def fit(self, contacts: ShapeContacts, budget: float, settings: Settings) -> MapSurface:
+    def fit(self, contacts: ShapeContacts, budget: float, settings: Settings) -> PatchSurface:
         """See `Method`."""
         p, n, _, _ = contacts.touched
         travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
@@ -181,21 +155,17 @@ class LocalFits:
             j = np.array(near)[n[near] @ n[i] > 0.5]
             found = fit_quadric(p[i], n[i], contacts.touched.some(j))
             if found is not None:
-                patches.append(_patch(*found, t_s=contacts.samples[i].t_s, travelled_m=float(travelled[i])))
-        return MapSurface(SurfaceMap(patches=tuple(patches), path=p, method=self.name))
+                patches.append(_patch(*found))
+        return PatchSurface(patches)
 
 
-def _patch(T: Floats, K: Floats, covariance: Floats, *, t_s: float, travelled_m: float) -> LocalPatch:
+def _patch(T: Floats, K: Floats, covariance: Floats) -> LocalPatch:
     """A patch of a fitted quadric; c13, c23, c33 are 0 and taken as known."""
     of = [2, 0, 1, 6, 7, 8]  # height, slopes and K among the entries of S
     to_S = np.array([1.0, 0.5, 0.5, 0.5, 0.5, 0.5])
     P = np.zeros((9, 9))
     P[np.ix_(of, of)] = covariance * np.outer(to_S, to_S)
-    return LocalPatch(
-        T_base_contact=T, S=SurfaceMatrix.from_curvature(K).S, K_covariance=covariance[3:, 3:], S_covariance=P,
-        pose_known=True, observed=np.ones(2), combinations=np.eye(3), t_s=t_s, travelled_m=travelled_m,
-        distance_m=0.0, innovation=1.0,
-    )  # fmt: skip
+    return LocalPatch(T, SurfaceMatrix.from_curvature(K).S, P)
 
 
 class ProcessSurface:

@@ -1,10 +1,11 @@
 """The map: one surface from all contacts of a scan, with its uncertainty; it grows contact by contact.
 
-    contacts ─► nodes ─► discs round cells ─► quartics and common errors ─► one blended surface ─► mesh
-                nodes    discs                local_fits, quartic, stiffness   contact_map         touch/meshing
+    contacts ─► nodes ─► discs round cells ─► quartics, common errors ─► solved cells ─► one surface ─► mesh
+                nodes    discs                local_fits, quartic         cells,          surface_map    meshing
+                                                                          stiffness
 
-`fit.fit_map` makes a map of points and normals; `ContactMap.add_samples` takes the contacts of a cell's pad. Read
-`contact_map` first, then `local_fits`, where the model stands.
+`fit.fit_map` makes a map of points and normals; `SurfaceMap.add_samples` takes the contacts of a cell's pad. Read
+`surface_map` first, then `cells`, then `local_fits`, where the model stands.
 
 Contacts become nodes, means over a millimetre of path. Round the middle of every occupied cell of 3 mm a quartic is
 fitted to the nodes of one sheet within 5.5 to 12 mm, whichever pass they are from: heights and slopes with the noise of

@@ -8,9 +8,9 @@ from numpy.typing import ArrayLike
 
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch.linear_algebra import positive, real
-from canprobe.mechanics.touch.map.contact_map import ContactMap
 from canprobe.mechanics.touch.map.local_fits import PadLayer
 from canprobe.mechanics.touch.map.noise import USUAL_SIGMA_M, MapNoise
+from canprobe.mechanics.touch.map.surface_map import SurfaceMap
 
 USUAL_SIGMA_NORMAL = 2e-3
 """Standard deviation of a normal where none is given, rad."""
@@ -26,7 +26,7 @@ def fit_map(
     sigma_height: float | None = None,
     probe_radius: float | None = None,
     stiffness: float | None = None,
-) -> ContactMap:
+) -> SurfaceMap:
     """The surface that contacts show, with its uncertainty.
 
     The surface must be smooth over about 3 mm; contacts a few mm apart make one surface, and it ends 4 mm from them.
@@ -49,7 +49,7 @@ def fit_map(
         stiffness: stiffness K/h of its layer, N/m³.
 
     Returns:
-        The map; `ContactMap.add` takes more contacts.
+        The map; `SurfaceMap.add` takes more contacts.
 
     Raises:
         UsageError: an argument has a wrong shape or value; the message names it.
@@ -69,7 +69,7 @@ def fit_map(
         pad = PadLayer(positive("probe_radius", probe_radius), positive("stiffness", stiffness))
     elif probe_radius is not None or stiffness is not None:
         raise UsageError("probe_radius, stiffness: expected with forces, got them without")
-    found = ContactMap(pad, noise)
+    found = SurfaceMap(pad, noise)
     found.add(points, normals, forces)
     return found
 

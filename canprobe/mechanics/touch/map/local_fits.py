@@ -20,6 +20,8 @@ mechanics", 1985, 4.3 (layer).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -43,6 +45,8 @@ CHANCE_SIGMAS = 2.0
 """Standard deviations of χ² per degree of freedom by which it must be above 1 to be more than chance."""
 COMMON = 4
 """Number of common errors."""
+ROWS_AT_ONCE = 60_000
+"""Nodes of discs that are solved at once: some 100 MB."""
 
 
 class PadLayer(NamedTuple):
@@ -57,6 +61,15 @@ class CommonErrors(NamedTuple):
 
     mean: Floats
     covariance: Floats
+
+    @classmethod
+    def of(cls, told: Sequence[tuple[Floats, Floats]], sigma: Floats) -> CommonErrors:
+        """The errors by information (4, 4) and pull (4,) of parts of a map, with prior standard deviations (4,)."""
+        if not told:
+            return cls(np.zeros(COMMON), np.zeros((COMMON, COMMON)))
+        information, pull = (sum(parts) for parts in zip(*told, strict=True))
+        covariance = np.linalg.inv(information + np.diag(sigma**-2.0))
+        return cls(covariance @ pull, covariance)
 
 
 class Quartics(NamedTuple):
@@ -99,25 +112,43 @@ def fit_discs(
     """
     if pad is not None:
         K_ref = _followed(K_ref, pad.radius)
-    A, y, places, variance, usual = _rows(rows[discs.nodes], discs, pad, noise, K_ref)
-    root = np.sqrt(np.repeat(weight, 3, axis=1))
-    weighted = (A * root[..., None]).transpose(0, 2, 1)
-    G, b = weighted @ (A * root[..., None]), np.einsum("mik,mk->mi", weighted, y * root)
-    posterior = _Posterior.of(G, b, fourth_of(K_ref * LENGTH_M))
-    common = posterior.common(discs.share, np.array(noise.common))
+    m, n = weight.shape
+    step = max(1, ROWS_AT_ONCE // n)
+    parts = [slice(i, i + step) for i in range(0, m, step)]
+
+    @lru_cache(maxsize=1)  # a single part is computed once; of many parts only one is in memory
+    def part(number: int) -> tuple[_Rows, _Posterior]:
+        here = parts[number]
+        of_part = _rows(rows, discs.part(here), pad, noise, K_ref[here])
+        root = np.sqrt(np.repeat(weight[here], 3, axis=1))
+        A = of_part.A * root[..., None]
+        weighted = A.transpose(0, 2, 1)
+        G, b = weighted @ A, np.einsum("mik,mk->mi", weighted, of_part.y * root)
+        return of_part, _Posterior.of(G, b, fourth_of(K_ref[here] * LENGTH_M))
+
+    sigma = np.array(noise.common)
+    told = [part(k)[1].about_common(discs.share[here]) for k, here in enumerate(parts)] if sigma.any() else []
+    common = CommonErrors.of(told, sigma)
+    answers = [_answer(*part(k), weight[here], common, noise.used) for k, here in enumerate(parts)]
+    a, V, excess, spread, chi2 = (np.concatenate(values) for values in zip(*answers, strict=True))
+    return Quartics(a, V, excess, spread), common, chi2
+
+
+def _answer(rows: _Rows, posterior: _Posterior, weight: Floats, common: CommonErrors, used: int) -> tuple[Floats, ...]:
+    """The columns of `Quartics`, and χ² of each node, of some discs."""
     a, V, held = posterior.mixture(common)
-    residual = y - np.einsum("mki,mi->mk", A[..., :TERMS], a) - A[..., TERMS:] @ common.mean
+    residual = rows.y - np.einsum("mki,mi->mk", rows.A[..., :TERMS], a) - rows.A[..., TERMS:] @ common.mean
     chi2 = (residual**2).reshape(len(a), -1, 3).sum(axis=2)
     total = weight.sum(axis=1)
-    dof = np.maximum(noise.used * total - held, 1.0)
-    expected = dof * (weight * usual).sum(axis=1) / np.maximum(noise.used * total, 1e-300)
+    dof = np.maximum(used * total - held, 1.0)
+    expected = dof * (weight * rows.usual).sum(axis=1) / np.maximum(used * total, 1e-300)
     excess = (weight * chi2).sum(axis=1) / np.maximum(expected, 1e-300) - 1.0
     excess = np.where(excess > CHANCE_SIGMAS * np.sqrt(2.0 / dof), excess, 0.0)
     share = weight / np.maximum(total, 1e-300)[:, None]
-    off = places - np.einsum("mn,mni->mi", share, places)[:, None]
-    variance = np.maximum(np.einsum("mn,mn->m", share, variance), 1e-300)
+    off = rows.places - np.einsum("mn,mni->mi", share, rows.places)[:, None]
+    variance = np.maximum(np.einsum("mn,mn->m", share, rows.variance), 1e-300)
     spread = np.einsum("mn,mni,mnj->mij", share, off, off) / variance[:, None, None]
-    return Quartics(a, V, excess, spread), common, chi2
+    return a, V, excess, spread, chi2
 
 
 def _followed(K: Floats, radius: float) -> Floats:
@@ -128,14 +159,23 @@ def _followed(K: Floats, radius: float) -> Floats:
     return result
 
 
-def _rows(
-    node: Floats, discs: Discs, pad: PadLayer | None, noise: MapNoise, K_ref: Floats
-) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+class _Rows(NamedTuple):
     """Whitened rows A (m, 3n, 15 + 4) of (a, θ) and y (m, 3n); places (m, n, 2), m, and their variances (m, n), m².
 
-    The last is (m, n) the χ² that is usual for a node: below one a row where nodes are shorter than the path of an
+    `usual` (m, n) is the χ² that is usual for a node: below one a row where nodes are shorter than the path of an
     independent sample, as the noise within a node is then that of its neighbours.
     """
+
+    A: Floats
+    y: Floats
+    places: Floats
+    variance: Floats
+    usual: Floats
+
+
+def _rows(rows: Floats, discs: Discs, pad: PadLayer | None, noise: MapNoise, K_ref: Floats) -> _Rows:
+    """The rows of the nodes (k, COLUMNS) in some discs."""
+    node = rows[discs.nodes]
     m, n = node.shape[:2]
     normal = node[..., column.NORMAL] @ discs.R
     at = (node[..., column.CENTRE] - discs.origin[:, None]) @ discs.R
@@ -171,7 +211,7 @@ def _rows(
     usual = math.isfinite(noise.height) * np.minimum(heights, 1.0)
     usual = usual + 2.0 * math.isfinite(noise.normal) * np.minimum(normals, 1.0)
     A *= scale[..., None]
-    return A.reshape(m, -1, TERMS + COMMON), (values * scale).reshape(m, -1), at[..., :2], lateral2, usual
+    return _Rows(A.reshape(m, -1, TERMS + COMMON), (values * scale).reshape(m, -1), at[..., :2], lateral2, usual)
 
 
 class _Posterior(NamedTuple):
@@ -205,18 +245,15 @@ class _Posterior(NamedTuple):
         result: Floats = share / share.sum(axis=1, keepdims=True)
         return result
 
-    def common(self, share: Floats, sigma: Floats) -> CommonErrors:
-        """The common errors, with prior standard deviations (4,), from discs that count by a share (m,) each."""
-        if not sigma.any():
-            return CommonErrors(np.zeros(COMMON), np.zeros((COMMON, COMMON)))
+    def about_common(self, share: Floats) -> tuple[Floats, Floats]:
+        """Information (4, 4) and pull (4,) about the common errors, of discs that count by a share (m,) each."""
         best = self.inverse[np.arange(len(share)), self.shares(self.pull).argmax(axis=1)]
         crossed = self.G[:, TERMS:, :TERMS]
         turn = crossed @ best
         information = np.einsum("m,mij->ij", share, self.G[:, TERMS:, TERMS:] - turn @ crossed.transpose(0, 2, 1))
         free = self.b[:, TERMS:] - np.einsum("mij,mj->mi", crossed, self.mean)
-        pull = share @ (free - np.einsum("mij,mj->mi", turn, self.pull))
-        covariance = np.linalg.inv(information + np.diag(sigma**-2.0))
-        return CommonErrors(covariance @ pull, covariance)
+        pull: Floats = share @ (free - np.einsum("mij,mj->mi", turn, self.pull))
+        return information, pull
 
     def mixture(self, common: CommonErrors) -> tuple[Floats, Floats, Floats]:
         """Mean (m, 15), covariance (m, 15, 15), and (m,) the number of terms that the data determine."""

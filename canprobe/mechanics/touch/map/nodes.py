@@ -21,6 +21,8 @@ from canprobe.mechanics.types import Floats
 
 NODE_M = 1e-3
 """Path of a node, and side of a voxel, m; a single touch counts as one path of this length."""
+BLOCK_M = 12e-3
+"""Side of a block of nodes that are found together, m: the largest radius of a local fit."""
 JUMP_M = 2e-3
 """Distance from one contact to the next that is a new touch, m."""
 TRAVEL_STEPS_PER_SIGMA = 4.0
@@ -35,6 +37,11 @@ number of contacts, path (m)."""
 _MEANS = slice(0, COUNT)
 
 
+def step_of(sigma_point: float) -> float:
+    """Least step of the path of contacts with a standard deviation (m), m."""
+    return min(TRAVEL_STEPS_PER_SIGMA * sigma_point, 0.5 * NODE_M)
+
+
 class NodeGrid:
     """Nodes of all contacts so far.
 
@@ -45,10 +52,11 @@ class NodeGrid:
 
     def __init__(self, radius: float, sigma_point: float) -> None:
         self._radius = radius
-        self._step = min(TRAVEL_STEPS_PER_SIGMA * sigma_point, 0.5 * NODE_M)
+        self._step = step_of(sigma_point)
         self._rows = np.zeros((64, COLUMNS))
         self._size = 0
         self._numbers: dict[tuple[int, ...], int] = {}
+        self._blocks: dict[tuple[int, ...], list[int]] = {}
         self._travel = Travel(self._step)
         self._open = np.zeros(COLUMNS)
         self._begun = self._first = self._last = np.zeros(3)
@@ -78,6 +86,19 @@ class NodeGrid:
                 begin = i + 1
         self._take(rows[begin:])
 
+    def put(self, rows: Floats) -> None:
+        """Take nodes (n, COLUMNS) as they are."""
+        for row in rows:
+            self._numbers.setdefault(self._voxel(row), self._size)
+            self._append(row)
+
+    def _append(self, row: Floats) -> None:
+        if self._size == len(self._rows):
+            self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
+        self._rows[self._size] = row
+        self._blocks.setdefault(_block(self._point(row)), []).append(self._size)
+        self._size += 1
+
     def _take(self, rows: Floats) -> None:
         self._open[_MEANS] += rows[:, _MEANS].sum(axis=0)
         self._open[COUNT] += len(rows)
@@ -95,10 +116,7 @@ class NodeGrid:
             old[COUNT:] += row[COUNT:]
             old[NORMAL] /= np.linalg.norm(old[NORMAL])
         else:
-            if self._size == len(self._rows):
-                self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
-            self._rows[self._size] = row
-            self._size += 1
+            self._append(row)
         self._open = np.zeros(COLUMNS)
         self._begun_at = self._travel.total
 
@@ -112,14 +130,27 @@ class NodeGrid:
         return row
 
     def _voxel(self, row: Floats) -> tuple[int, ...]:
-        point = row[CENTRE] - self._radius * row[NORMAL]
-        return (*np.floor(point / NODE_M).astype(int).tolist(), facing(row[None, NORMAL])[0])
+        return (*np.floor(self._point(row) / NODE_M).astype(int).tolist(), facing(row[None, NORMAL])[0])
+
+    def _point(self, row: Floats) -> Floats:
+        result: Floats = row[CENTRE] - self._radius * row[NORMAL]
+        return result
+
+    def near(self, place: Floats) -> Floats:
+        """(n, COLUMNS) the closed nodes in the blocks round a place (3,), m: all within `BLOCK_M`, and some beyond."""
+        i, j, k = _block(place)
+        around = ((i + a, j + b, k + c) for a in (-1, 0, 1) for b in (-1, 0, 1) for c in (-1, 0, 1))
+        return self._rows[[number for block in around for number in self._blocks.get(block, ())]]
 
     @property
     def rows(self) -> Floats:
         """(n, COLUMNS) every node, the open one last."""
         closed = self._rows[: self._size]
         return np.concatenate([closed, self._finished()[None]]) if self._open[COUNT] > 0.0 else closed.copy()
+
+
+def _block(point: Floats) -> tuple[int, ...]:
+    return tuple(np.floor(point / BLOCK_M).astype(int).tolist())
 
 
 class Traces:

@@ -14,7 +14,6 @@ from canprobe.mechanics.touch.estimate.likelihood import cramer_rao
 from canprobe.mechanics.touch.estimate.noise import Correlation
 from canprobe.mechanics.touch.estimate.prior import Prior
 from canprobe.mechanics.touch.surface import SurfaceMatrix
-from canprobe.mechanics.touch.surface_map import SurfaceMap
 
 TINY = {"sigma_point": 1e-9, "sigma_normal": 1e-9}
 WEIGHT = np.array([1.0, 2.0, 1.0])
@@ -373,8 +372,6 @@ def bad(points=None, normals=None, **kw):
         (lambda: SurfaceMatrix.plane().value([1j, 0, 0]), "points"),
         (lambda: SurfaceMatrix.plane().normal([0, 0]), "points"),
         (lambda: SurfaceMatrix.plane().height("0", 0.0), "x"),
-        (lambda: SurfaceMap(patches=None, path=np.zeros((1, 3))), "patches"),
-        (lambda: SurfaceMap(patches=(), path=[]), "path"),
         (lambda: SurfaceEstimate.of(np.eye(4), "K"), "K"),
         (lambda: make_estimator("ml", sigma_point=1e-5, sigma_normal=1e-3, window="many"), "window"),
         (lambda: make_estimator("recursive", sigma_point=1e-5, sigma_normal=1e-3, memory_m="20 mm"), "memory_m"),
