@@ -41,6 +41,8 @@ PASSING = frozenset(
 """Keys of the conditions behind which may be a node that was switched off, or a bus that was cut."""
 ANSWER_S = 0.1
 """Longest time to the answer of a node that is there."""
+MASTER_QUIET_S = 2.0
+"""Time for which another master has to be silent: somebody works at the nodes, and may go on."""
 REOPEN_S = 0.5
 """Time between two attempts to open an interface."""
 TRIES = 5
@@ -215,7 +217,7 @@ class Recovery:
             CanprobeError: the loss, where it has lasted too long.
         """
         assert self._lost is not None
-        clock, seen = self._port.clock, _Wait(self._plan)
+        clock, seen = self._port.clock, _Wait(self._plan, self.cell.watch.foreign is not None)
         end_ns, said = clock.now_ns() + self._longest_s * 1e9, ""
         while True:
             self._alive()
@@ -243,13 +245,19 @@ class Recovery:
 
 
 class _Wait:
-    """What was seen of the nodes while the cell waits for them."""
+    """What was seen of the nodes while the cell waits for them.
 
-    def __init__(self, plan: Plan) -> None:
+    Args:
+        plan: plan of the cell.
+        foreign: whether another master was at work.
+    """
+
+    def __init__(self, plan: Plan, foreign: bool) -> None:
         self._plan, self._settings = plan, plan.setup.bring_up
         self._setups = {setup.node_id: setup for setup in make_setups(plan)}
         self._watch = NodeWatch(plan.node_ids)
         self._absent: set[int] = set()
+        self._listen_s = MASTER_QUIET_S if foreign else max(self._settings.listen_s, ANSWER_S)
 
     def look(self, port: Port, must_boot: set[int]) -> str | None:
         """Listen, then ask the nodes that were not heard; why the cell has to wait on, None where it need not."""
@@ -257,8 +265,9 @@ class _Wait:
         watch.foreign = None
         watch.states.clear()
         network = PumpedNetwork(port, other=watch.push)
-        network.pump_until(lambda: watch.foreign is not None, max(self._settings.listen_s, ANSWER_S))
+        network.pump_until(lambda: watch.foreign is not None, self._listen_s)
         if watch.another_master is not None:
+            self._listen_s = MASTER_QUIET_S
             return watch.another_master
         silent = set(watch.node_ids) - set(watch.states)
         missing = silent - set(answering_nodes(network, silent, ANSWER_S))

@@ -64,11 +64,17 @@ def somebody_resets(run):
         "node 1: heartbeat-off for 400 ms",
         "node 4: nmt command=129",
         "node 3: reboot for 100 ms;node 6: bus-off for 1200 ms",
-        somebody_resets,
     ],
 )
 def test_whatever_was_lost_comes_back(action):
     Returning(action).assert_came_back()
+
+
+def test_somebody_who_resets_a_node_has_time_to_go_on():
+    run = Returning(somebody_resets).assert_came_back()
+    assert run.steps("lost: another master is on the bus")
+    (back,) = run.steps("the cell is back after")
+    assert float(back.split()[5]) > 2.0
 
 
 def test_an_interface_that_was_down_comes_back():
