@@ -247,9 +247,10 @@ def _bench_facts(args: argparse.Namespace) -> dict[str, str]:
         or "nothing beyond the default",
     }
     if args.eds is not None:
-        from canprobe.fieldbus.eds.packaged import eds_file
+        from canprobe.fieldbus.eds.packaged import check_eds, eds_file
 
-        path = eds_file(args.eds)
+        path, reading = eds_file(args.eds), check_eds(args.eds, args.node)
+        facts["EDS check"] = f"{len(reading.faults)} faults, {len(reading.warnings)} warnings; canprobe eds check"
         facts["EDS"] = f"{path.name}, SHA-256 {hashlib.sha256(path.read_bytes()).hexdigest()}"
     return facts
 

@@ -23,6 +23,7 @@ from canprobe.fieldbus.tools.conform.bench import Bench
 from canprobe.fieldbus.tools.conform.device import CONTROLWORD, RPDOS, ExaminedDevice
 from canprobe.fieldbus.tools.conform.frame_link import BenchTimes
 from canprobe.fieldbus.tools.conform.frame_text import frame_text
+from canprobe.fieldbus.tools.conform.hints import HINTS
 from canprobe.fieldbus.tools.conform.journal import Journal, restorable
 from canprobe.fieldbus.tools.conform.outcome import (
     BenchFailure,
@@ -351,7 +352,7 @@ class Examination:
             sent=self._frames[0],
             came=self._frames[1],
             detail=detail,
-            hint=point.hint if verdict is Verdict.FAIL else "",
+            hint=(point.hint or HINTS.get(point.number, "")) if verdict is Verdict.FAIL else "",
             severity="wrong" if verdict is Verdict.FAIL else "",
             written=tuple(written),
             seconds=seconds,
