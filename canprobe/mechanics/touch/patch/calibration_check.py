@@ -45,9 +45,9 @@ MIN_IMAGES, MIN_ANSWERS = 16, 40
 """Number of images with a fit from which on blur and disagreement are judged, and of answers, for the stiffness."""
 MAX_RATIO = 1.22
 """Ratio of blur or stiffness to the calibration's, up or down, beyond which it is another array's."""
-MAX_DISAGREEMENT, DISAGREEMENT_SIGMAS = 0.3, 4.0
-"""Difference of the logarithms of two stiffnesses of one layer, and number of standard deviations of the touch's,
-beyond both of which the calibration is another array's."""
+MAX_DISAGREEMENT, MAX_TOUCH_SIGMA = 0.3, 0.08
+"""Difference of the logarithms of two stiffnesses of one layer beyond which the calibration is another array's, and
+largest standard deviation of the touch's at which they are compared: a light touch shows it to 30 % only."""
 
 
 class CalibrationCheck:
@@ -68,11 +68,10 @@ class CalibrationCheck:
         self._by_answers: list[float] = []
         self._by_images: list[float] = []
         self._by_touch: list[float] = []
-        self._touch_sigma = math.inf
         self._curvature: float | None = None
         self._tries = 0
         self._next_s = -math.inf
-        self._waiting: tuple[NDArray[np.uint8], Sequence[int]] | None = None
+        self._waiting: tuple[NDArray[np.uint8], Sequence[int], Patch] | None = None
 
     @classmethod
     def of(cls, calibration: ArrayCalibration, pad: Pad, *, images: bool) -> CalibrationCheck | None:
@@ -93,17 +92,17 @@ class CalibrationCheck:
         """
         if t_s < self._next_s or self._tries >= MAX_TRIES:
             return
-        if patch.cut_by_pad or patch.dead or patch.peak_pa > STRAIGHT_SHARE * self._pad.full_scale_pa:
-            return
         self._next_s = t_s + LOOK_S
-        self._waiting = image, window
+        self._waiting = image, window, patch
 
     def work(self) -> bool:
         """Fit the image that waits; whether there was one, so that there may be a `finding`."""
         if self._waiting is None:
             return False
-        (image, window), self._waiting = self._waiting, None
+        (image, window, patch), self._waiting = self._waiting, None
         self._tries += 1
+        if patch.cut_by_pad or patch.dead or patch.peak_pa > STRAIGHT_SHARE * self._pad.full_scale_pa:
+            return True
         found = fit_blur(image, window, blur=self._blur, crosstalk=self._crosstalk, gains=self._gains)
         if found is not None:
             self._blurs.append(math.log(found.blur / self._blur))
@@ -128,10 +127,13 @@ class CalibrationCheck:
             self._curvature = None
             return
         self._curvature = 0.5 / radius + 0.25 * float(kappa[0] + kappa[1])
-        if slope is not None and len(self._by_touch) < MIN_ANSWERS:
+        if (
+            slope is not None
+            and len(self._by_touch) < MIN_ANSWERS
+            and 2.0 * slope.sigma < MAX_TOUCH_SIGMA * slope.value
+        ):
             by_touch = stiffness_from_slope(slope.value, radius, kappa)
             self._by_touch.append(math.log(by_touch / self._stiffness))
-            self._touch_sigma = 2.0 * slope.sigma / slope.value
 
     @property
     def blur_off(self) -> float:
@@ -140,16 +142,21 @@ class CalibrationCheck:
 
     @property
     def stiffness_off(self) -> float:
-        """Logarithm of the stiffness over the calibration's; 0 before it is judged, and within the limit."""
-        return _beyond(_median(self._by_answers, MIN_ANSWERS), math.log(MAX_RATIO))
+        """Logarithm of the stiffness over the calibration's; 0 before it is judged, and within the limit.
+
+        Where the estimator gives no stiffness, touch and images must both show it: the nearer one counts.
+        """
+        off = _median(self._by_answers, MIN_ANSWERS)
+        if len(self._by_answers) < MIN_ANSWERS:
+            off = min(_median(self._by_touch, MIN_ANSWERS), _median(self._by_images, MIN_IMAGES), key=abs)
+        return _beyond(off, math.log(MAX_RATIO))
 
     @property
     def disagreement(self) -> float:
         """Logarithm of the stiffness by images over that by the touch; 0 as for the others."""
         if len(self._by_touch) < MIN_ANSWERS or len(self._by_images) < MIN_IMAGES:
             return 0.0
-        limit = max(MAX_DISAGREEMENT, DISAGREEMENT_SIGMAS * self._touch_sigma)
-        return _beyond(median(self._by_images) - median(self._by_touch), limit)
+        return _beyond(median(self._by_images) - median(self._by_touch), MAX_DISAGREEMENT)
 
     @property
     def finding(self) -> str | None:
